@@ -1,0 +1,26 @@
+"""The engine that changes nothing: it proves the stream and is the unfiltered row of every table."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+from edgefilter.engines.base import EngineState, Front
+from edgefilter.stft import StftConfig
+from edgefilter.types import Frame, Output
+
+
+class Bypass:
+    """Returns the microphone."""
+
+    name: ClassVar[str] = "bypass"
+    front: ClassVar[Front] = "none"
+
+    def __init__(self, stft: StftConfig = StftConfig()) -> None:
+        self.stft = stft
+        self.lookahead = 0
+
+    def initial_state(self) -> EngineState:
+        return None
+
+    def step(self, frame: Frame, state: EngineState) -> tuple[Output, EngineState]:
+        return Output(frame.mic), state

@@ -1,0 +1,33 @@
+"""The error tree. Each message says what is wrong, what was found, what was expected and what to do, in one line."""
+
+
+class EdgefilterError(Exception):
+    """Base of every error that this package raises on purpose; the command line turns it into one line and exit code 1."""
+
+
+class UsageError(EdgefilterError):
+    """The request itself cannot be met (an unknown engine or device, options that exclude each other); exit code 2."""
+
+
+class AudioFileError(EdgefilterError):
+    """An audio file cannot be read or written, or what it holds is not usable audio."""
+
+
+class DeviceError(EdgefilterError):
+    """A sound device or the audio system failed or vanished."""
+
+
+class ProfileError(EdgefilterError):
+    """A profile file is damaged, of another version, or holds values that no robot has."""
+
+
+class CalibrationError(EdgefilterError):
+    """The calibration recordings do not allow a measurement."""
+
+
+class StftError(EdgefilterError):
+    """A window, hop and FFT size that cannot be inverted."""
+
+
+class SignalError(EdgefilterError):
+    """Samples handed to the library have the wrong shape, type or are not finite."""

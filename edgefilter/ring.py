@@ -1,0 +1,51 @@
+"""A ring buffer of samples that counts what it lost, for one writer and one reader."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from edgefilter.types import Samples
+
+
+class Ring:
+    """First in, first out, fixed capacity, float32.
+
+    Writing never blocks: what does not fit is not stored and is added to `lost`, so an audio callback can write and return.
+    One thread may write while another reads; each side moves only its own counter.
+    """
+
+    def __init__(self, capacity: int) -> None:
+        if capacity <= 0:
+            raise ValueError(f"ring capacity is {capacity}, expected at least one sample")
+        self._data = np.zeros(capacity, np.float32)
+        self._written = 0
+        self._read = 0
+        self.lost = 0
+
+    def __len__(self) -> int:
+        """Samples that can be read now."""
+        return self._written - self._read
+
+    @property
+    def capacity(self) -> int:
+        return self._data.size
+
+    def write(self, samples: Samples) -> int:
+        """Store as many of samples (n,) as fit and return how many; the rest is counted in `lost`."""
+        count = min(samples.size, self._data.size - len(self))
+        at = self._written % self._data.size
+        first = min(count, self._data.size - at)
+        self._data[at : at + first] = samples[:first]
+        self._data[: count - first] = samples[first:count]
+        self.lost += samples.size - count
+        self._written += count
+        return count
+
+    def read(self, count: int) -> Samples:
+        """Return and remove up to count samples, the oldest first, as a new array."""
+        count = min(count, len(self))
+        at = self._read % self._data.size
+        first = min(count, self._data.size - at)
+        out = np.concatenate((self._data[at : at + first], self._data[: count - first]))
+        self._read += count
+        return out
