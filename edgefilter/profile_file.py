@@ -1,0 +1,189 @@
+"""Arrays and a JSON header in one .npz: written atomically, read without trusting a byte of it."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import json
+import math
+import os
+import struct
+import tempfile
+import zipfile
+import zlib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from edgefilter.errors import ProfileError
+
+FORMAT_VERSION = 1
+MAX_FILE_BYTES = 32 * 2**20
+MAX_MEMBERS = 256
+REMEDY = "give a profile written by 'edgefilter calibrate', or calibrate again"
+
+Effects = tuple[tuple[str, Mapping[str, Any]], ...]
+
+
+def write_fields(path: Path, arrays: Mapping[str, np.ndarray], header: Mapping[str, Any], effects: Effects) -> None:
+    """Write arrays, a header of JSON values and the effects to path, whole or not at all; raise ProfileError where that fails."""
+    members = dict(arrays)
+    listed = []
+    for i, (name, values) in enumerate(effects):
+        entry: dict[str, Any] = {"name": name, "values": {}}
+        for key, value in values.items():
+            if isinstance(value, np.ndarray) and value.ndim:
+                member = f"effect_{i}_{len(entry['values'])}"
+                members[member] = _plain(value, f"effects[{i}].{key}")
+                entry["values"][key] = {"array": member}
+            else:
+                entry["values"][key] = value.item() if isinstance(value, np.generic | np.ndarray) else value
+        listed.append(entry)
+    try:
+        text = json.dumps({**header, "effects": listed}, allow_nan=False)
+    except (TypeError, ValueError) as error:
+        raise ProfileError(f"the profile cannot be stored: {error}; expected finite numbers, texts and arrays") from None
+    members["header"] = np.frombuffer(text.encode(), np.uint8)
+    members["version"] = np.array(FORMAT_VERSION, np.int64)
+    _replace(path, members)
+
+
+def _plain(value: np.ndarray, name: str) -> np.ndarray:
+    if value.dtype.kind not in "fiub" or not np.isfinite(value).all():
+        raise ProfileError(f"the profile cannot be stored: {name} is not an array of finite real numbers")
+    return value
+
+
+def _replace(path: Path, members: Mapping[str, np.ndarray]) -> None:
+    """Write to a temporary file beside path, force it to the disk, then rename it over path."""
+    path = path.resolve()
+    if path.exists() and not path.is_file():
+        raise ProfileError(f"{path}: not a file that can be replaced; name a .npz file for the profile")
+    temporary = None
+    try:
+        handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name[:64]}.")
+        with os.fdopen(handle, "wb") as file:
+            np.savez_compressed(file, allow_pickle=False, **members)
+            file.flush()
+            os.fsync(file.fileno())
+        mask = os.umask(0)
+        os.umask(mask)
+        os.chmod(temporary, 0o666 & ~mask)
+        os.replace(temporary, path)
+    except OSError as error:
+        if temporary is not None:
+            with contextlib.suppress(OSError):
+                os.unlink(temporary)
+        raise ProfileError(f"{path}: the profile cannot be written ({error.strerror}); choose another place or free space") from None
+
+
+def read_fields(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any], Effects]:
+    """Return (arrays, header, effects) of a file that write_fields wrote; raise ProfileError, in one line, for any other."""
+    try:
+        if path.is_dir():
+            raise ProfileError(f"{path}: is a folder, expected a profile file; {REMEDY}")
+        if path.stat().st_size > MAX_FILE_BYTES:
+            raise ProfileError(f"{path}: {path.stat().st_size} bytes long, expected at most {MAX_FILE_BYTES}; {REMEDY}")
+        content = path.read_bytes()
+        members = _members(content)
+        return _decode(members)
+    except FileNotFoundError:
+        raise ProfileError(f"{path}: no such file; {REMEDY}") from None
+    except OSError as error:
+        raise ProfileError(f"{path}: cannot be read ({error.strerror}); check the path and its permissions") from None
+    except _Damaged as error:
+        raise ProfileError(f"{path}: {error}; {REMEDY}") from None
+
+
+class _Damaged(Exception):
+    """What is wrong inside the file, without its name and the remedy."""
+
+
+def _members(content: bytes) -> dict[str, np.ndarray]:
+    """All arrays of an .npz, sizes checked before anything is unpacked, nothing unpickled."""
+    if not content.startswith(b"PK\x03\x04"):
+        raise _Damaged(f"not a profile: starts with {content[:4]!r}, expected the zip archive of an .npz")
+    try:
+        with zipfile.ZipFile(io.BytesIO(content)) as archive:
+            infos = archive.infolist()
+            total = sum(info.file_size for info in infos)
+            if len(infos) > MAX_MEMBERS or total > MAX_FILE_BYTES:
+                raise _Damaged(f"unpacks to {total} bytes in {len(infos)} members, expected at most {MAX_FILE_BYTES} in {MAX_MEMBERS}")
+            arrays = {}
+            for info in infos:
+                if info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED) or info.flag_bits & 1:
+                    raise _Damaged(f"member {info.filename!r} is packed in a way that profiles are not")
+                with archive.open(info) as member:
+                    arrays[info.filename.removesuffix(".npy")] = _array(member.read(info.file_size + 1), info.filename)
+            return arrays
+    except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError, struct.error) as error:
+        raise _Damaged(f"truncated or damaged ({error})") from None
+
+
+def _array(content: bytes, name: str) -> np.ndarray:
+    """One .npy array from its bytes; the shape must account for exactly the bytes that are there."""
+    file = io.BytesIO(content)
+    try:
+        version = np.lib.format.read_magic(file)
+        if version != (1, 0):
+            raise _Damaged(f"member {name!r} is in .npy format {version}, expected (1, 0)")
+        shape, fortran, dtype = np.lib.format.read_array_header_1_0(file)
+    except ValueError as error:
+        raise _Damaged(f"member {name!r} is no .npy array ({str(error).splitlines()[0][:80]})") from None
+    if dtype.hasobject or dtype.kind not in "fiub":
+        raise _Damaged(f"member {name!r} holds {dtype} (pickled objects or text), expected numbers")
+    body = content[file.tell() :]
+    if math.prod(shape) * dtype.itemsize != len(body):
+        raise _Damaged(f"member {name!r} claims shape {shape} of {dtype} but holds {len(body)} bytes")
+    return np.frombuffer(body, dtype).reshape(shape, order="F" if fortran else "C")
+
+
+def _decode(members: dict[str, np.ndarray]) -> tuple[dict[str, np.ndarray], dict[str, Any], Effects]:
+    version = members.pop("version", None)
+    if version is None or version.shape != () or version.dtype.kind != "i":
+        raise _Damaged("field version is missing, so this is no profile")
+    if int(version) != FORMAT_VERSION:
+        raise _Damaged(f"version is {int(version)}, expected {FORMAT_VERSION}: made by another release of edgefilter")
+    text = members.pop("header", None)
+    if text is None or text.dtype != np.uint8 or text.ndim != 1:
+        raise _Damaged("field header is missing")
+    try:
+        header = json.loads(bytes(text).decode(), parse_constant=_no_constant)
+    except (ValueError, RecursionError):
+        raise _Damaged("field header is not JSON text") from None
+    if not isinstance(header, dict):
+        raise _Damaged(f"field header is a JSON {type(header).__name__}, expected an object")
+    effects = _effects(header.pop("effects", None), members)
+    return {name: value for name, value in members.items() if not name.startswith("effect_")}, header, effects
+
+
+def _no_constant(text: str) -> float:
+    raise ValueError(text)
+
+
+def _effects(listed: object, members: Mapping[str, np.ndarray]) -> Effects:
+    """The effects from the header's list, arrays put in their places."""
+    if not isinstance(listed, list) or not all(isinstance(entry, dict) for entry in listed):
+        raise _Damaged("field effects is not a list of effects")
+    effects = []
+    for i, entry in enumerate(listed):
+        name, values = entry.get("name"), entry.get("values")
+        if not isinstance(name, str) or not isinstance(values, dict):
+            raise _Damaged(f"effects[{i}] has no name or no values")
+        effects.append((name, {key: _value(value, f"effects[{i}] ({name[:40]}).{key[:40]}", members) for key, value in values.items()}))
+    return tuple(effects)
+
+
+def _value(value: object, where: str, members: Mapping[str, np.ndarray]) -> object:
+    if isinstance(value, dict):
+        array = members.get(str(value.get("array")))
+        if array is None:
+            raise _Damaged(f"{where} refers to an array that is not in the file")
+        if not np.isfinite(array).all():
+            raise _Damaged(f"{where} is not finite, expected finite values")
+        return array
+    if isinstance(value, bool | int | str) or (isinstance(value, float) and math.isfinite(value)):
+        return value
+    raise _Damaged(f"{where} is {type(value).__name__} {str(value)[:20]!r}, expected a finite number, a text or an array")
