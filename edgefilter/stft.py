@@ -90,17 +90,17 @@ class StftConfig:
 
 
 class Analyser:
-    """Holds the last window_length samples; before the first sample there is silence."""
+    """Holds the last window_length samples of each channel; before the first sample there is silence."""
 
-    def __init__(self, config: StftConfig) -> None:
+    def __init__(self, config: StftConfig, channels: int = 1) -> None:
         self.config = config
-        self._recent = np.zeros(config.window_length, np.float32)
+        self._recent = np.zeros((channels, config.window_length), np.float32)
 
     def push(self, hop_samples: Samples) -> Spectrum:
-        """Take the next hop samples (hop,) and return the frame that ends with them, (bins,) complex64."""
+        """Take the next hop of samples (channels, hop); return the frame that ends with them, (channels, bins) complex64."""
         hop = self.config.hop
-        self._recent[:-hop] = self._recent[hop:]
-        self._recent[-hop:] = hop_samples
+        self._recent[:, :-hop] = self._recent[:, hop:]
+        self._recent[:, -hop:] = hop_samples
         return self.config.analyse(self._recent)
 
 

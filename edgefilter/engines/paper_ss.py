@@ -1,0 +1,85 @@
+"""The source paper's spectral subtraction: a binary mask where the robot's voice explains the microphone, smoothed, subtracted."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+from scipy import signal
+
+from edgefilter.engines.base import Front
+from edgefilter.errors import UsageError
+from edgefilter.stft import StftConfig
+from edgefilter.types import Array, Frame, Output, Samples, Spectrum
+
+PAPER_STFT = StftConfig(n_fft=1200, hop=160, window_length=400, window="hann")
+"""601 bins as in the paper; hop and window from the implementation of VoiceFilter that the paper builds on."""
+
+L, I = 3, 1  # noqa: E741 - the paper's letters: half width of the smoothing window in frames and in bins
+
+
+def smoothing_window(half_frames: int = L, half_bins: int = I) -> Array:
+    """Hann window (2 L + 1, 2 I + 1) without its zero end points, normalised to sum 1."""
+
+    def hann(half: int) -> Array:
+        return signal.get_window("hann", 2 * half + 3, fftbins=False)[1:-1]
+
+    window = np.outer(hann(half_frames), hann(half_bins))
+    return window / window.sum()
+
+
+@dataclass(frozen=True, slots=True)
+class PaperSsState:
+    """The last 2 L masks (2 L, bins), already smoothed over frequency, and the last L microphone spectra (L, bins)."""
+
+    masks: Samples
+    spectra: Spectrum
+
+
+class PaperSpectralSubtraction:
+    """Spectral subtraction of Li, Hindriks & Kunneman 2024, eq. (6) and (7), streaming.
+
+    eq. (6)   SM(t, f) = |X_mix(t, f)| <= alpha |A_ref(t, f)| H_m(f) H_s(f)
+              SM^ = Hann(2 L + 1, 2 I + 1) * SM,  L = 3 frames, I = 1 bin
+    eq. (7)   X_est(t, f) = beta sign(X_mix) |X_mix(t, f)| (1 - SM^(t, f)),  sign(X) = X / |X|
+
+    response: (601,) float32, |H_m(f) H_s(f)| of eq. (5), from the profile. sign(X) |X| is X itself, so the phase stays.
+    The paper leaves open, and this implementation takes: hop 160 and a 400-sample Hann analysis window, zero-padded to the
+    1200 points that the paper's 601 bins imply (VoiceFilter's sizes); a Hann smoothing window without its zero end points,
+    normalised to sum 1; digital silence before and after the recording, for which eq. (6) gives SM = 1; and alpha, beta
+    chosen for the lowest word errors on simulated validation conversations (bench/tune_paper_ss.py).
+
+    lookahead is L frames. causal=True moves the window L frames back, so that it needs none (2 L + 1 frames of the past).
+    """
+
+    name: ClassVar[str] = "paper-ss"
+    front: ClassVar[Front] = "paper"
+    stft = PAPER_STFT
+
+    def __init__(self, response: Samples, alpha: float = 2.0, beta: float = 1.0, causal: bool = False) -> None:
+        if response.shape != (self.stft.bins,):
+            raise UsageError(f"response has shape {response.shape}, paper-ss expects ({self.stft.bins},): calibrate this robot again")
+        window = smoothing_window()
+        self._over_time = window.sum(axis=1).astype(np.float32)
+        self._over_bins = window.sum(axis=0).astype(np.float32)
+        self._threshold = (alpha * response).astype(np.float32)
+        self._beta = np.float32(beta)
+        self.lookahead = 0 if causal else L
+
+    def initial_state(self) -> PaperSsState:
+        return PaperSsState(
+            masks=np.tile(self._smooth_bins(np.ones(self.stft.bins, bool)), (2 * L, 1)),
+            spectra=np.zeros((self.lookahead, self.stft.bins), np.complex64),
+        )
+
+    def step(self, frame: Frame, state: PaperSsState) -> tuple[Output, PaperSsState]:
+        mask = np.abs(frame.mic) <= self._threshold * np.abs(frame.reference)
+        masks = np.vstack((state.masks, self._smooth_bins(mask)))
+        spectra = np.vstack((state.spectra, frame.mic))
+        estimate = self._beta * spectra[0] * (1.0 - self._over_time @ masks)
+        return Output(estimate), PaperSsState(masks[1:], spectra[1:])
+
+    def _smooth_bins(self, mask: Array) -> Samples:
+        """The frequency half of the (separable) smoothing window; beyond 0 and 8 kHz the mask is 0."""
+        return np.convolve(mask.astype(np.float32), self._over_bins, mode="same")

@@ -1,0 +1,224 @@
+"""The straight data path: blocks in, alignment, linear stage, engine, overlap-add, finished samples out."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from edgefilter import engines
+from edgefilter.alignment import Aligned, Aligner, PaperAligner
+from edgefilter.canceller import Canceller
+from edgefilter.engines.base import Engine
+from edgefilter.errors import SignalError
+from edgefilter.profile import Profile
+from edgefilter.residual import Residual
+from edgefilter.ring import Ring
+from edgefilter.stft import Analyser, Synthesiser
+from edgefilter.types import SAMPLE_RATE, Frame, Samples, as_samples
+
+
+@dataclass(frozen=True, slots=True)
+class Event:
+    """Something that a user of the stream may want to know: what happened and at which sample of the microphone."""
+
+    kind: str
+    sample: int
+    detail: str
+
+
+class Front:
+    """What stands before the engine: finds the reference in the microphone and subtracts what is linear of it.
+
+    kind "none" passes the microphone, "paper" only delays the reference per utterance, "full" tracks and cancels.
+    """
+
+    def __init__(self, engine: Engine, profile: Profile | None) -> None:
+        stft = engine.stft
+        self.hop = stft.hop
+        self.aligner = self.canceller = self.residual = None
+        if engine.front == "paper":
+            self.aligner = PaperAligner(stft.hop, profile)
+        elif engine.front == "full":
+            response = profile.echo.impulse_response if profile else None
+            self.aligner = Aligner(stft.hop, profile)
+            self.canceller = Canceller(stft.hop, impulse_response=response)
+            self.residual = Residual(stft, profile)
+        self._analyser = Analyser(stft, channels=3 if self.canceller else 2)
+        self._nothing = np.zeros(stft.bins, np.float32)
+        self._fan = profile.noise_bins(stft) if profile else self._nothing
+        self._silence = np.zeros(stft.bins, np.complex64)
+
+    def step(self, mic: Samples, ref: Samples) -> tuple[Frame, Aligned | None]:
+        """One hop (hop,) of both channels to one frame, with what the aligner found."""
+        aligned = self.aligner.step(mic, ref) if self.aligner else None
+        reference = aligned.reference if aligned else ref
+        if not self.canceller:
+            x, r = self._analyser.push(np.stack((mic, reference)))
+            return Frame(x, r, self._silence, x, self._fan, self._nothing), aligned
+        if aligned.realigned:
+            self.canceller.rewrite_reference(self.aligner.history(self.canceller.history))
+        echo = self.canceller.step(mic, reference).echo
+        x, r, e = self._analyser.push(np.stack((mic, reference, echo)))
+        noise, residual = self.residual.step(x, r, e, x - e)
+        return Frame(x, r, e, x - e, noise, residual), aligned
+
+
+class Stream:
+    """Runs one engine over blocks of any length; whatever the partition, the output is bit-identical.
+
+    process returns finished samples, aligned with the input: sample i of all outputs together belongs to sample i of all
+    inputs. Sample n is out once n + latency samples have come in. After flush as many samples are out as went in.
+    """
+
+    def __init__(self, engine: Engine, profile: Profile | None = None) -> None:
+        self.engine = engine
+        self.profile = profile
+        self.reset()
+
+    @property
+    def latency(self) -> int:
+        """Algorithmic latency in samples: the window plus the engine's look-ahead."""
+        return self.engine.stft.window_length + self.engine.lookahead * self.engine.stft.hop
+
+    def reset(self) -> None:
+        """Forget everything; the next sample is the first."""
+        stft = self.engine.stft
+        self.front = Front(self.engine, self.profile)
+        self.events: deque[Event] = deque(maxlen=1000)
+        self.speech_probability: float | None = None
+        self.samples_in = self.samples_out = 0
+        self._state = self.engine.initial_state()
+        self._synthesiser = Synthesiser(stft)
+        self._mic, self._ref = Ring(2 * stft.hop), Ring(2 * stft.hop)
+        self._before_start = self.latency - stft.hop
+
+    def process(self, mic: Samples, ref: Samples) -> Samples:
+        """Take mic (n,) and ref (n,) and return what is finished, 0 to n + latency samples."""
+        mic, ref = as_samples(mic, "mic"), as_samples(ref, "ref")
+        if mic.size != ref.size:
+            raise SignalError(f"mic has {mic.size} samples and ref {ref.size}, expected as many of each: pad the shorter with zeros")
+        self.samples_in += mic.size
+        return self._run(mic, ref)
+
+    def flush(self) -> Samples:
+        """Return the samples that process still holds back; the stream can then only be reset."""
+        missing = self.samples_in - self.samples_out
+        padding = np.zeros(self.latency + self.engine.stft.hop, np.float32)
+        return self._run(padding, padding)[:missing] if missing else np.zeros(0, np.float32)
+
+    def _run(self, mic: Samples, ref: Samples) -> Samples:
+        hop = self.engine.stft.hop
+        done: list[Samples] = []
+        for at in range(0, mic.size, hop):
+            self._mic.write(mic[at : at + hop])
+            self._ref.write(ref[at : at + hop])
+            if len(self._mic) >= hop:
+                done.append(self._step(self._mic.read(hop), self._ref.read(hop)))
+        out = np.concatenate(done) if done else np.zeros(0, np.float32)
+        early = min(self._before_start, out.size)
+        self._before_start -= early
+        self.samples_out += out.size - early
+        return out[early:]
+
+    def _step(self, mic: Samples, ref: Samples) -> Samples:
+        frame, aligned = self.front.step(mic, ref)
+        if aligned and aligned.realigned:
+            self.events.append(Event("realigned", self.samples_in, f"reference arrives after {aligned.delay:.1f} samples"))
+        output, self._state = self.engine.step(frame, self._state)
+        self.speech_probability = output.speech_probability
+        return self._synthesiser.push(output.spectrum)
+
+
+class EgoFilter:
+    """The object to put in front of a recogniser: give it what the microphone hears and what the robot says.
+
+    profile: a Profile, the path of one, or None (then the echo path is learnt from nothing). engine: a name or "auto".
+
+    >>> import numpy as np
+    >>> ego = EgoFilter(engine="bypass")
+    >>> human = np.sin(np.arange(1000) / 10).astype(np.float32)
+    >>> out = np.concatenate((ego.process(human, np.zeros_like(human)), ego.flush()))
+    >>> bool(np.allclose(out, human, atol=1e-6))
+    True
+    """
+
+    def __init__(self, profile: Profile | str | Path | None = None, engine: str = "auto") -> None:
+        self.profile = Profile.load(profile) if isinstance(profile, str | Path) else profile
+        self.engine_name, self.engine_reason = choose(engine)
+        self._stream = Stream(engines.create(self.engine_name, self.profile), self.profile)
+
+    @property
+    def latency(self) -> int:
+        """Algorithmic latency, samples."""
+        return self._stream.latency
+
+    @property
+    def hop(self) -> int:
+        """Samples between two steps of the engine: the block length with the least overhead."""
+        return self._stream.engine.stft.hop
+
+    @property
+    def speech_probability(self) -> float | None:
+        """Probability that the human speaks now, where the engine judges it."""
+        return self._stream.speech_probability
+
+    def process(self, mic_block: Samples, ref_block: Samples) -> Samples:
+        """Take (n,) float samples of both channels, any n; return finished ones, aligned with the input.
+
+        Raises SignalError for another shape or dtype, unequal lengths or samples that are not finite.
+        """
+        return self._stream.process(mic_block, ref_block)
+
+    def announce(self, utterance: Samples) -> None:
+        """Say what the robot will play next (n,); it may start at any time, or never."""
+        if self._stream.front.aligner:
+            self._stream.front.aligner.announce(as_samples(utterance, "utterance"))
+
+    def events(self) -> list[Event]:
+        """What happened since the last call."""
+        happened = list(self._stream.events)
+        self._stream.events.clear()
+        return happened
+
+    def flush(self) -> Samples:
+        """Return the rest, so that as many samples are out as went in."""
+        return self._stream.flush()
+
+    def reset(self) -> None:
+        """Start anew, as after construction."""
+        self._stream.reset()
+
+    def stats(self) -> dict[str, object]:
+        """State of the path, ready for JSON: engine and why, latency, samples, alignment, linear stage."""
+        front = self._stream.front
+        return {
+            "engine": self.engine_name,
+            "engine_reason": self.engine_reason,
+            "latency_ms": 1000 * self.latency / SAMPLE_RATE,
+            "samples": self._stream.samples_in,
+            "alignment": front.aligner.stats() if front.aligner else None,
+            "linear_stage": front.canceller.stats() if front.canceller else None,
+        }
+
+    def adapted_profile(self) -> Profile:
+        """The profile with the echo path as the linear stage has adapted it; raises SignalError where there is none."""
+        canceller = self._stream.front.canceller
+        if canceller is None or self.profile is None:
+            raise SignalError("nothing to write back: give a profile and an engine with a linear stage (linear or ss)")
+        return self.profile.with_impulse_response(canceller.impulse_response())
+
+
+def choose(engine: str) -> tuple[str, str]:
+    """The engine to run for a name or "auto", and why."""
+    if engine != "auto":
+        return engine, "asked for"
+    return "ss", "auto: the strongest engine that this version has"
+
+
+def enhance(mic: Samples, ref: Samples, profile: Profile | str | Path | None = None, engine: str = "auto") -> Samples:
+    """Filter a whole recording (n,) with its reference (n,); the same stream as live. Returns (n,) float32."""
+    ego = EgoFilter(profile, engine)
+    return np.concatenate((ego.process(mic, ref), ego.flush()))
