@@ -1,0 +1,55 @@
+"""Every engine through the conformance suite, inside the real stream."""
+
+import conformance
+import numpy as np
+import pytest
+
+from edgefilter import engines
+from edgefilter.echo.model import PRE_ROLL, EchoModel
+from edgefilter.errors import UsageError
+from edgefilter.profile import Profile
+from edgefilter.stream import EgoFilter, Stream, enhance
+
+
+def robot() -> Profile:
+    """A profile that fits conformance.conversation: direct sound and a short decaying tail."""
+    rng = np.random.default_rng(0)
+    response = np.zeros(2048, np.float32)
+    response[PRE_ROLL : PRE_ROLL + 600] = 0.1 * rng.standard_normal(600) * np.exp(-np.arange(600) / 120)
+    response[PRE_ROLL] = 0.6
+    return Profile(
+        echo=EchoModel(response),
+        delay=900.0,
+        response=np.full(601, 0.6, np.float32),
+        noise_psd=np.full(601, 1e-10, np.float32),
+        band_hz=np.array([[100.0, 8000.0]]),
+        band_snr_db=np.array([40.0]),
+        distortion_db=np.full(4, -40.0),
+    )
+
+
+@pytest.mark.parametrize("check", conformance.CHECKS, ids=lambda check: check.__name__)
+@pytest.mark.parametrize("name", engines.ENGINES)
+def test_engine_conforms(name, check):
+    profile = robot()
+    check(lambda: Stream(engines.create(name, profile), profile))
+
+
+def test_conformance_has_its_checks():
+    assert len(conformance.CHECKS) == 9
+
+
+def test_bypass_returns_its_input_from_the_first_sample():
+    mic, ref = conformance.conversation()
+    # 1e-6: float32 rounding of an FFT, its inverse and two windows, on samples below 1
+    np.testing.assert_allclose(enhance(mic, ref, engine="bypass"), mic, atol=1e-6)
+
+
+def test_an_unknown_engine_names_the_known_ones():
+    with pytest.raises(UsageError, match="unknown engine 'crn'.*linear.*bypass"):
+        EgoFilter(engine="crn")
+
+
+def test_paper_ss_asks_for_a_profile():
+    with pytest.raises(UsageError, match="paper-ss needs.*--profile"):
+        EgoFilter(engine="paper-ss")
