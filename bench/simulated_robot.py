@@ -1,0 +1,188 @@
+"""The physics of a simulated robot: loudspeaker, room, fan, converter clocks. Shares no code with the filter's own echo model."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import pyroomacoustics as pra
+from numpy.typing import NDArray
+from scipy import signal
+
+RATE = 16000
+OVERSAMPLING = 4
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Loudspeaker:
+    """A small moving-coil driver in a closed box; nonlinear force factor and suspension, then linear filters.
+
+    resonance_hz, q: of the linear driver. stiffening, softening_bl, asymmetry: bounded displacement laws, see `play`.
+    drive: how far the signal's displacement reaches into them. filters: (sections, 6) of the enclosure and microphone, at 16 kHz.
+    """
+
+    resonance_hz: float
+    q: float
+    stiffening: float
+    softening_bl: float
+    asymmetry: float
+    drive: float
+    filters: Array
+
+    def play(self, x: Array, linear: bool = False) -> Array:
+        """Sound pressure in front of the driver (n,) for the voltage x (n,), both at 16 kHz.
+
+        The equation of motion (Klippel 2006, "Loudspeaker nonlinearities", eq. (2) and (3), inductance left out)
+
+            u'' + (w/Q) u' + w^2 u = w^2 [ b(u) x - s(u) u ] - (w/Q_e) [ b(u)^2 - 1 ] u'
+
+        has the force factor b(u) = 1 - softening_bl v^2/(1 + v^2) - asymmetry v/(1 + v^2) and the excess stiffness
+        s(u) = stiffening v^2/(1 + v^2), v = drive u; bounded, so that the iteration below converges. Half of the damping is electrical
+        (1/Q_e = 0.5/Q). Solved at four times the rate (so that products of frequencies up to order 7 do not fold back
+        into speech) by fixed-point iteration: the right side is recomputed from the last u, the left side is solved exactly by
+        a bilinear filter. Pressure is the cone's acceleration. linear=True keeps b = 1, s = 0.
+        """
+        up = signal.resample_poly(x, OVERSAMPLING, 1)
+        position, velocity, acceleration = self._mechanics()
+        excess = np.zeros_like(up)
+        for _ in range(0 if linear else 6):
+            u = signal.lfilter(*position, up + excess)
+            v = self.drive * u
+            bound = 1.0 / (1.0 + v * v)
+            force = 1.0 - self.softening_bl * v * v * bound - self.asymmetry * v * bound
+            braking = 0.5 / self.q * (force**2 - 1.0) * signal.lfilter(*velocity, up + excess)
+            excess = (force - 1.0) * up - self.stiffening * v * v * bound * u - braking
+        pressure = signal.lfilter(*acceleration, up + excess)
+        return signal.sosfilt(self.filters, signal.resample_poly(pressure, 1, OVERSAMPLING))
+
+    def _mechanics(self) -> tuple[tuple[Array, Array], ...]:
+        """Bilinear filters at the high rate for u, u'/w and u''/w^2 of w^2 / (s^2 + (w/Q) s + w^2)."""
+        w = 2 * math.pi * self.resonance_hz
+        denominator = [1.0, w / self.q, w * w]
+        high_rate = RATE * OVERSAMPLING
+        numerators = ([w * w], [w, 0.0], [1.0, 0.0, 0.0])
+        return tuple(signal.bilinear(numerator, denominator, high_rate) for numerator in numerators)
+
+
+def draw_loudspeaker(rng: np.random.Generator) -> Loudspeaker:
+    """A driver of a small robot: resonance 180-320 Hz, a treble roll-off, a few broad peaks of the enclosure and the microphone's low cut."""
+    sections = [signal.butter(2, rng.uniform(6300, 7500), "low", fs=RATE, output="sos")]
+    sections.append(signal.butter(1, rng.uniform(40, 90), "high", fs=RATE, output="sos"))
+    for _ in range(4):
+        sections.append(peak_filter(math.exp(rng.uniform(math.log(350), math.log(6000))), rng.uniform(1.0, 4.0), rng.uniform(-5, 5)))
+    return Loudspeaker(
+        resonance_hz=rng.uniform(180, 320),
+        q=rng.uniform(0.6, 1.0),
+        stiffening=rng.uniform(0.3, 0.6),
+        softening_bl=rng.uniform(0.2, 0.5),
+        asymmetry=rng.uniform(-0.3, 0.3),
+        drive=1.0,
+        filters=np.vstack(sections),
+    )
+
+
+def peak_filter(frequency_hz: float, q: float, gain_db: float) -> Array:
+    """(1, 6) peaking section (Bristow-Johnson, "Audio EQ cookbook", peakingEQ)."""
+    w, a = 2 * math.pi * frequency_hz / RATE, 10 ** (gain_db / 40)
+    alpha = math.sin(w) / (2 * q)
+    b = np.array([1 + alpha * a, -2 * math.cos(w), 1 - alpha * a])
+    denominator = np.array([1 + alpha / a, -2 * math.cos(w), 1 - alpha / a])
+    return np.concatenate([b, denominator])[None] / denominator[0]
+
+
+@dataclass(frozen=True)
+class Room:
+    """A shoebox room with a robot's microphone, its loudspeaker and a human; rt60_s is what the impulse response shows."""
+
+    rt60_s: float
+    robot: Array
+    human: Array
+
+
+def draw_room(rng: np.random.Generator, kind: str, robot_m: float, direction: Array, human_m: float) -> Room:
+    """Impulse responses at 16 kHz by the image-source method (Allen & Berkley 1979; pyroomacoustics), without its filter delay.
+
+    kind: "lab" (RT60 0.20-0.26 s) or "office" (0.50-0.75 s). robot_m, direction (3,): where the loudspeaker lies from the
+    microphone; it is a part of the robot, so the same in every room. The human's mouth is human_m away, a little higher.
+    """
+    low, high, scale = {"lab": (0.20, 0.26, 1.0), "office": (0.50, 0.75, 0.9)}[kind]
+    size = scale * np.array([rng.uniform(5.0, 7.0), rng.uniform(4.0, 5.5), rng.uniform(2.6, 3.2) / scale])
+    wanted = rng.uniform(low, high)
+    microphone = np.array([*rng.uniform(1.75, size[:2] - 1.75), rng.uniform(0.9, 1.2)])
+    angle, height = rng.uniform(0, 2 * math.pi), rng.uniform(0.1, 0.5)
+    reach = math.sqrt(human_m**2 - height**2)
+    mouth = microphone + np.array([reach * math.cos(angle), reach * math.sin(angle), height])
+    asked = wanted
+    for _ in range(3):  # Sabine's formula misses the decay of an absorbing room by a quarter: ask again for what came out short
+        robot, human = _image_sources(size, asked, microphone, (microphone + robot_m * direction, mouth))
+        found = float(pra.experimental.measure_rt60(human, fs=RATE, decay_db=30))
+        asked = min(asked * wanted / found, 1.5)
+    return Room(found, robot, human)
+
+
+def _image_sources(size: Array, rt60_s: float, microphone: Array, sources: tuple[Array, ...]) -> list[Array]:
+    absorption, order = pra.inverse_sabine(rt60_s, size)
+    room = pra.ShoeBox(size, fs=RATE, materials=pra.Material(absorption), max_order=min(order, 60))
+    room.add_microphone(microphone)
+    for source in sources:
+        room.add_source(source)
+    room.compute_rir()
+    skip = pra.constants.get("frac_delay_length") // 2
+    return [np.asarray(response[skip:], np.float64) for response in room.rir[0]]
+
+
+def draw_body(rng: np.random.Generator) -> Array:
+    """(64,) sound that the robot's own shell reflects within 4 ms, 8-20 dB below the direct sound."""
+    shell = np.zeros(64)
+    shell[0] = 1.0
+    for delay in rng.integers(3, 64, size=5):
+        shell[delay] += rng.choice([-1, 1]) * 10 ** (-rng.uniform(8, 20) / 20)
+    return shell
+
+
+def draw_fan(rng: np.random.Generator) -> Array:
+    """(1025,) amplitude response of a fan's noise on 0-8000 Hz, of unit total power: flat, then falling, with bumps and a blade line."""
+    f = np.linspace(0, RATE / 2, 1025)
+    corner = math.exp(rng.uniform(math.log(250), math.log(2500)))
+    level_db = -10 * rng.uniform(0.8, 1.3) * np.log10(1 + (f / corner) ** 2)
+    for centre in np.exp(rng.uniform(math.log(60), math.log(4000), size=4)):
+        level_db += rng.uniform(-2, 5) * np.exp(-0.5 * (np.log2((f + 1) / centre) / 0.3) ** 2)
+    level_db += rng.uniform(0, 8) * np.exp(-0.5 * ((f - rng.uniform(90, 240)) / 8.0) ** 2)
+    amplitude = np.maximum(10 ** (level_db / 20), 10 ** (-30 / 20))
+    return amplitude / math.sqrt(np.mean(amplitude**2))
+
+
+def fan_noise(rng: np.random.Generator, amplitude: Array, n: int) -> Array:
+    """(n,) Gaussian noise of unit power with that amplitude response."""
+    taps = signal.firwin2(2047, np.linspace(0, 1, amplitude.size), amplitude)
+    return signal.oaconvolve(rng.standard_normal(n + taps.size - 1), taps, mode="valid")
+
+
+def warp(x: Array, ppm: float, half_width: int = 32) -> Array:
+    """x (n,) read at t (1 + ppm 1e-6), t in samples, by a Kaiser-windowed sinc of 2 half_width taps (beta 9: images below -90 dB)."""
+    if ppm == 0.0:
+        return x.copy()
+    padded = np.concatenate([np.zeros(half_width), x, np.zeros(2 * half_width)])
+    out = np.empty_like(x)
+    offsets = np.arange(-half_width + 1, half_width + 1)
+    for start in range(0, x.size, 1 << 14):
+        position = np.arange(start, min(start + (1 << 14), x.size)) * (1.0 + ppm * 1e-6)
+        whole = np.minimum(np.floor(position).astype(int), x.size)
+        distance = offsets[None] - (position - whole)[:, None]
+        window = np.i0(9.0 * np.sqrt(np.clip(1.0 - (distance / half_width) ** 2, 0.0, 1.0))) / np.i0(9.0)
+        samples = padded[whole[:, None] + offsets[None] + half_width]
+        out[start : start + position.size] = np.sum(samples * np.sinc(distance) * window, axis=1)
+    return out
+
+
+def sweep(peak: float = 0.35) -> Array:
+    """(120000,) exponential sweep, 40-8000 Hz in 6 s after 0.5 s of silence (Farina 2000, eq. (2)), faded over 20 ms, 1 s of silence."""
+    t = np.arange(6 * RATE) / RATE
+    rate = math.log(8000 / 40)
+    x = peak * np.sin(2 * math.pi * 40 * 6 / rate * (np.exp(t * rate / 6) - 1.0))
+    fade = np.sin(0.5 * math.pi * np.arange(320) / 320) ** 2
+    x[:320] *= fade
+    x[-320:] *= fade[::-1]
+    return np.concatenate([np.zeros(RATE // 2), x, np.zeros(RATE)])
