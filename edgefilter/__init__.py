@@ -1,3 +1,10 @@
-"""edgefilter: hear the human while the robot talks."""
+"""edgefilter: hear the human while the robot talks.
+
+EgoFilter goes in front of a recogniser, enhance() filters whole arrays, Profile is the calibrated robot.
+"""
+
+from edgefilter.profile import Profile
+from edgefilter.stream import EgoFilter, Event, enhance
 
 __version__ = "0.1.0"
+__all__ = ["EgoFilter", "Event", "Profile", "enhance"]

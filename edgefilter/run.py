@@ -9,6 +9,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from edgefilter.audio.files import Recorder
+from edgefilter.audio.protocols import Sink, Source
+from edgefilter.errors import EdgefilterError
 from edgefilter.stream import EgoFilter
 from edgefilter.types import SAMPLE_RATE, Block, Samples
 
@@ -34,7 +37,7 @@ class RunReport:
     process_s: float = 0.0
     wall_s: float = 0.0
     interrupted: bool = False
-    failure: str | None = None
+    failure: EdgefilterError | None = None
     filter: dict[str, object] = field(default_factory=dict)
 
     def to_dict(self) -> dict[str, object]:
@@ -51,7 +54,7 @@ class RunReport:
             "real_time_factor": self.process_s / seconds if seconds else None,
             "peak_memory_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
             "interrupted": self.interrupted,
-            "failure": self.failure,
+            "failure": str(self.failure) if self.failure else None,
             **self.filter,
         }
 
@@ -62,17 +65,17 @@ def level_db(x: Samples) -> float:
 
 
 def filter_blocks(
-    source: object,
+    source: Source,
     ego: EgoFilter,
-    sink: object,
-    recorder: object | None = None,
+    sink: Sink,
+    recorder: Recorder | None = None,
     show: Callable[[Progress], None] = lambda progress: None,
     stopped: Callable[[], bool] = lambda: False,
 ) -> RunReport:
     """Run ego over every block of source until it ends or stopped() says so; always flush into sink what was received.
 
-    A failing source (a device that vanished, a truncated file) still gets its samples filtered and flushed; then its error
-    is raised again.
+    A source or sink that fails on the way (a device that vanished, a truncated file, a full disk) ends the run: what was
+    received is filtered and flushed as far as the sink still takes it, and the error stands in report.failure.
     """
     report, progress = RunReport(), Progress()
     began = time.perf_counter()
@@ -96,13 +99,16 @@ def filter_blocks(
         show(progress)
 
     try:
-        for block in source:
-            take(block)
-            if stopped():
-                report.interrupted = True
-                break
-    finally:
-        push(ego.flush())
-        report.wall_s = time.perf_counter() - began
-        report.filter = ego.stats()
+        try:
+            for block in source:
+                take(block)
+                if stopped():
+                    report.interrupted = True
+                    break
+        finally:
+            push(ego.flush())
+    except EdgefilterError as error:
+        report.failure = error
+    report.wall_s = time.perf_counter() - began
+    report.filter = ego.stats()
     return report

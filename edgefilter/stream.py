@@ -94,10 +94,13 @@ class Stream:
         self._synthesiser = Synthesiser(stft)
         self._mic, self._ref = Ring(2 * stft.hop), Ring(2 * stft.hop)
         self._before_start = self.latency - stft.hop
+        self._flushed = False
 
     def process(self, mic: Samples, ref: Samples) -> Samples:
         """Take mic (n,) and ref (n,) and return what is finished, 0 to n + latency samples."""
         mic, ref = as_samples(mic, "mic"), as_samples(ref, "ref")
+        if self._flushed:
+            raise SignalError("the stream has been flushed, its end is written: call reset() before the next recording")
         if mic.size != ref.size:
             raise SignalError(f"mic has {mic.size} samples and ref {ref.size}, expected as many of each: pad the shorter with zeros")
         self.samples_in += mic.size
@@ -105,7 +108,8 @@ class Stream:
 
     def flush(self) -> Samples:
         """Return the samples that process still holds back; the stream can then only be reset."""
-        missing = self.samples_in - self.samples_out
+        missing = 0 if self._flushed else self.samples_in - self.samples_out
+        self._flushed = True
         padding = np.zeros(self.latency + self.engine.stft.hop, np.float32)
         return self._run(padding, padding)[:missing] if missing else np.zeros(0, np.float32)
 

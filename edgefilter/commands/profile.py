@@ -1,0 +1,49 @@
+"""`edgefilter profile show`: what a profile holds, as text, as JSON, as a picture."""
+
+from __future__ import annotations
+
+import argparse
+
+from edgefilter.calibrate import describe
+from edgefilter.commands.display import write_json
+from edgefilter.errors import UsageError
+from edgefilter.profile import Profile
+
+
+def main(args: argparse.Namespace) -> int:
+    profile = Profile.load(args.profile)
+    if args.json:
+        write_json(summary(profile), args.json)
+    if args.json != "-":
+        print(describe(profile))
+    if args.plot:
+        plotter()(profile, args.plot)
+        print(f"drawn to {args.plot}")
+    return 0
+
+
+def summary(profile: Profile) -> dict[str, object]:
+    """The figures of a profile, ready for JSON."""
+    return {
+        "schema": 1,
+        "taps": int(profile.echo.impulse_response.size),
+        "delay_samples": profile.delay,
+        "effects": [{"effect": name, "parameters": dict(values)} for name, values in profile.echo.effects],
+        "bands": [
+            {"low_hz": float(low), "high_hz": float(high), "snr_db": float(snr)}
+            for (low, high), snr in zip(profile.band_hz, profile.band_snr_db)
+        ],
+        "distortion_db": {str(order): float(level) for order, level in enumerate(profile.distortion_db, start=2)},
+        "warnings": list(profile.warnings),
+        "created": profile.created,
+        "source": profile.source,
+    }
+
+
+def plotter():
+    """report.plots.plot_profile, or one line about what to install."""
+    try:
+        from edgefilter.report.plots import plot_profile
+    except ModuleNotFoundError as error:
+        raise UsageError(f"drawing needs {error.name}, which is not installed: pip install 'edgefilter[report]'") from None
+    return plot_profile

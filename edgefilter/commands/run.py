@@ -1,0 +1,127 @@
+"""`edgefilter run`: connect a source, the filter and a sink, show how it goes, say what happened."""
+
+from __future__ import annotations
+
+import argparse
+import signal
+import sys
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+
+from edgefilter.audio.files import FileSink, Recorder, open_source
+from edgefilter.audio.protocols import Sink, Source
+from edgefilter.audio.raw import PcmSink
+from edgefilter.commands.display import display, write_json
+from edgefilter.errors import UsageError
+from edgefilter.run import RunReport, filter_blocks
+from edgefilter.stream import EgoFilter
+from edgefilter.types import SAMPLE_RATE
+
+FILE_ENDINGS = (".wav", ".flac", ".ogg", ".mp3", ".aiff", ".aif", ".w64", ".opus", ".txt", ".raw", ".pcm")
+
+
+def main(args: argparse.Namespace) -> int:
+    _refuse_overwriting(args)
+    ego = EgoFilter(args.profile, args.engine)
+    source = make_source(args.input, args.reference)
+    sink = make_sink(args.output, ego.latency)
+    limit = None if args.seconds is None else round(args.seconds * SAMPLE_RATE)
+    for note in source.notes:
+        say(note)
+    say(f"engine {ego.engine_name} ({ego.engine_reason}), algorithmic latency {1000 * ego.latency / SAMPLE_RATE:.0f} ms")
+    told = len(source.notes)
+    with ExitStack() as stack:
+        stopped = stack.enter_context(stop_on_signal(source))
+        stack.enter_context(source)
+        stack.enter_context(sink)
+        recorder = stack.enter_context(Recorder(args.save_input)) if args.save_input else None
+        show = stack.enter_context(display(source, args.quiet))
+        report = filter_blocks(limited(source, limit), ego, sink, recorder, show, lambda: bool(stopped) or sink.finished)
+    return finish(args, ego, source, sink, report, told)
+
+
+def finish(args: argparse.Namespace, ego: EgoFilter, source: Source, sink: Sink, report: RunReport, told: int) -> int:
+    """Say and write what happened; return the exit code."""
+    for note in [*source.notes[told:], *sink.notes]:
+        say(note)
+    figures = report.to_dict() | {"source": source.stats(), "sink": sink.stats(), "notes": [*source.notes, *sink.notes]}
+    if args.json:
+        write_json(figures, args.json)
+    if args.save_profile:
+        ego.adapted_profile().save(args.save_profile)
+    if report.failure:
+        raise report.failure
+    seconds = report.samples_in / SAMPLE_RATE
+    factor = f", {report.process_s / seconds:.3f} of real time" if seconds else ""
+    how = "stopped after" if report.interrupted else "filtered"
+    say(f"{how} {seconds:.1f} s in {report.wall_s:.1f} s{factor}; {report.samples_out} samples to {args.output}, {report.lost} lost")
+    return 130 if report.interrupted and not source.live else 0
+
+
+def make_source(name: str, reference: str | None) -> Source:
+    """A file or pipe where name is one, else the live devices."""
+    if name == "-" or looks_like_file(name):
+        return open_source(name, reference)
+    from edgefilter.audio.device import LiveSource, monitor_of
+
+    if reference and looks_like_file(reference):
+        raise UsageError(f"live, the reference is a device, found the file {reference}: leave --reference out or name a monitor ('edgefilter devices')")
+    return LiveSource(name, reference or monitor_of("default"))
+
+
+def make_sink(name: str, latency: int) -> Sink:
+    """A file or pipe where name is one, else an output device, which gets the latency as silence first."""
+    if name == "-":
+        return PcmSink()
+    if looks_like_file(name):
+        return FileSink(name)
+    from edgefilter.audio.device import LiveSink
+
+    return LiveSink(name, latency)
+
+
+def looks_like_file(name: str) -> bool:
+    """Whether people who type this mean a file: it exists, has an audio ending, or has a folder in it."""
+    return Path(name).exists() or name.lower().endswith(FILE_ENDINGS) or "/" in name
+
+
+def limited(source: Source, limit: int | None) -> Iterator:
+    """The blocks of source up to limit samples; the last one is cut."""
+    left = limit
+    for block in source:
+        if left is not None and block.mic.size >= left:
+            source.stop()
+            yield type(block)(block.mic[:left], block.ref[:left], block.start, block.lost)
+            return
+        left = None if left is None else left - block.mic.size
+        yield block
+
+
+@contextmanager
+def stop_on_signal(source: Source) -> Iterator[list[int]]:
+    """SIGINT and SIGTERM end the source, and with it the run, in good order; the list then holds the signal."""
+    caught: list[int] = []
+
+    def handle(number: int, _frame: object) -> None:
+        caught.append(number)
+        source.stop()
+
+    before = {number: signal.signal(number, handle) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield caught
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def _refuse_overwriting(args: argparse.Namespace) -> None:
+    for name in (args.input, args.reference, args.profile):
+        if name and name != "-" and Path(name).exists() and Path(args.output).exists() and Path(name).samefile(args.output):
+            raise UsageError(f"--output {args.output} is also an input and would be overwritten: choose another file")
+    if args.json == "-" and args.output == "-":
+        raise UsageError("--json - and --output - would mix on standard output: send one of them to a file")
+
+
+def say(text: str) -> None:
+    print(text, file=sys.stderr)
