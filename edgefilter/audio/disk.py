@@ -1,0 +1,92 @@
+"""A file that an audio encoder writes into and that stays a whole file when the disk fills up."""
+
+from __future__ import annotations
+
+import io
+import os
+from pathlib import Path
+from typing import BinaryIO
+
+_FLAC_FRAME = b"\xff\xf8"  # sync code of a frame of fixed size, RFC 9639, 9.1
+_HEADER = 256  # bytes in which both formats' headers lie
+
+
+class Disk(io.RawIOBase):
+    """A file in the making that stays whole on a full disk.
+
+    The encoders' libraries turn a failed write into an unnamed error and then leave a torn last frame behind. Here a write
+    that does not fit is undone and remembered in `error`, and from then on only the header may still be changed.
+    """
+
+    def __init__(self, path: Path) -> None:
+        super().__init__()
+        self._file: BinaryIO = open(path, "w+b", buffering=0)  # noqa: SIM115 (closed by close)
+        self._end: int | None = None
+        self._flac_frames = 0
+        self.error: OSError | None = None
+
+    def write(self, data: bytes) -> int:  # type: ignore[override]
+        at = self._file.tell()
+        if self._end is not None and at + len(data) > self._end:
+            return len(data)
+        try:
+            done = 0
+            while done < len(data):
+                done += self._file.write(data[done:])
+        except OSError as error:
+            self.error = self.error or error
+            self._end = at if self._end is None else self._end
+            try:
+                self._file.truncate(self._end)
+                self._file.seek(self._end)
+            except OSError:  # a device, not a file: there is nothing to keep whole
+                pass
+        else:
+            self._flac_frames += data[:2] == _FLAC_FRAME
+        return len(data)
+
+    def readinto(self, buffer: bytearray) -> int:  # type: ignore[override]
+        return self._file.readinto(buffer)
+
+    def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
+        return self._file.seek(offset, whence)
+
+    def tell(self) -> int:
+        return self._file.tell()
+
+    def finish(self) -> None:
+        """Close the file after its encoder; if the disk was full, make its header agree with what is there."""
+        try:
+            if self.error:
+                self._repair_header()
+            self._file.close()
+        except OSError as error:
+            self.error = self.error or error
+        self.close()
+
+    def _repair_header(self) -> None:
+        self._file.seek(0)
+        start = self._file.read(_HEADER)
+        if start[:4] == b"fLaC" and len(start) >= 42:
+            self._repair_flac(start)
+        elif start[:4] == b"RIFF" and b"data" in start:
+            self._repair_wav(start)
+
+    def _repair_wav(self, start: bytes) -> None:
+        """Put the bytes that reached the disk into the RIFF and the data chunk, whose sizes count from behind themselves."""
+        end = self._file.seek(0, os.SEEK_END)
+        for at in (4, start.index(b"data") + 4):
+            self._file.seek(at)
+            self._file.write((end - at - 4).to_bytes(4, "little"))
+
+    def _repair_flac(self, start: bytes) -> None:
+        """Put the number of samples that reached the disk into STREAMINFO (RFC 9639, 8.2).
+
+        It starts at byte 8 with the block size, holds the total in the low 36 bits of bytes 18-25 and the MD5 of the sound
+        in bytes 26-41, where zero means unknown. The encoder writes one frame at a time, and every frame but a stream's
+        last has the full size.
+        """
+        total = self._flac_frames * int.from_bytes(start[8:10], "big")
+        fields = int.from_bytes(start[18:26], "big") >> 36 << 36 | total
+        self._file.seek(18)
+        self._file.write(fields.to_bytes(8, "big") + bytes(16))

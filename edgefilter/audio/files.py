@@ -1,0 +1,216 @@
+"""Files as source and sink: a recording with its reference in, a WAV or FLAC out, and the recorder of live input."""
+
+from __future__ import annotations
+
+import errno
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import soundfile
+
+from edgefilter.audio.disk import Disk
+from edgefilter.audio.protocols import Source
+from edgefilter.audio.raw import PcmSource, clip_note, to_pcm16
+from edgefilter.audio.reader import Reader
+from edgefilter.errors import AudioFileError, UsageError
+from edgefilter.types import SAMPLE_RATE, Block, Samples, as_samples
+
+_FORMATS = {".wav": "WAV", ".flac": "FLAC"}
+
+
+def open_source(path: str | Path, reference: str | Path | None = None) -> Source:
+    """The source for a recording and its reference, or for '-', raw stereo (microphone, reference) on standard input."""
+    if str(path) != "-":
+        return FileSource(path, reference)
+    if reference is not None:
+        raise UsageError(f"'-' as input is stereo and already holds the reference, found a second one, {reference}: leave it out")
+    return PcmSource()
+
+
+class FileSource:
+    """A recording and, if there is one, the reference of what the robot said, as blocks of 16 kHz mono.
+
+    The recording decides the length: a shorter reference is followed by silence, a longer one is cut, without one the
+    reference is silence. `notes` says each conversion and is complete after construction.
+    Raises AudioFileError for an unusable file (see Reader).
+    """
+
+    live = False
+
+    def __init__(self, mic_path: str | Path, reference_path: str | Path | None = None, block: int = 4096) -> None:
+        self._mic = Reader(mic_path, "recording")
+        self._reference = None if reference_path is None else Reader(reference_path, "reference")
+        self._block = block
+        self._stopped = False
+        self.total: int | None = self._mic.total
+        self.lost = 0
+        self.notes = list(self._mic.notes)
+        if self._mic.silent:
+            self.notes.append(f"recording {mic_path} is silent: every sample is zero")
+        if self._reference is not None:
+            self.notes += self._reference.notes + _length_notes(self._reference, self._mic.total)
+
+    def __enter__(self) -> FileSource:
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        pass
+
+    def stop(self) -> None:
+        self._stopped = True
+
+    def stats(self) -> dict[str, int]:
+        return {"lost": 0}
+
+    def __iter__(self) -> Iterator[Block]:
+        reference = _Taker(iter(()) if self._reference is None else self._reference.chunks())
+        mic = _Taker(self._mic.chunks())
+        for start in range(0, self._mic.total, self._block):
+            if self._stopped:
+                return
+            count = min(self._block, self._mic.total - start)
+            yield Block(mic.take(count), reference.take(count), start)
+
+
+def _length_notes(reference: Reader, total: int) -> list[str]:
+    """What there is to say about a reference for a recording of total samples."""
+    notes = []
+    if reference.silent:
+        notes.append(f"reference {reference.path} is silent: every sample is zero, so nothing tells the robot's voice from the human's")
+    difference = abs(reference.total - total)
+    if difference:
+        how = "shorter than the recording; silence follows it" if reference.total < total else "longer than the recording; its end is not used"
+        notes.append(f"reference {reference.path} is {difference} samples ({difference / SAMPLE_RATE:.3f} s) {how}")
+    return notes
+
+
+class _Taker:
+    """Chunks of any length in, exactly the asked number of samples out, silence after the last."""
+
+    def __init__(self, chunks: Iterator[Samples]) -> None:
+        self._chunks = chunks
+        self._rest = np.zeros(0, np.float32)
+
+    def take(self, count: int) -> Samples:
+        parts = [self._rest]
+        have = self._rest.size
+        while have < count:
+            chunk = next(self._chunks, None)
+            if chunk is None:
+                chunk = np.zeros(count - have, np.float32)
+            parts.append(chunk)
+            have += chunk.size
+        joined = np.concatenate(parts)
+        self._rest = joined[count:]
+        return joined[:count]
+
+
+class FileSink:
+    """A mono 16 kHz file, WAV or FLAC by suffix, 16-bit PCM (or 32-bit float for WAV).
+
+    Valid up to the last sample however the context is left. `clipped` counts samples beyond full scale.
+    Raises UsageError for another suffix, AudioFileError where the file cannot be written or the disk is full; then what
+    fitted remains, as a valid file.
+
+    >>> import tempfile, numpy as np
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     with FileSink(f"{folder}/human.wav") as sink:
+    ...         sink.write(np.zeros(160, np.float32))
+    ...     FileSource(f"{folder}/human.wav").total
+    160
+    """
+
+    def __init__(self, path: str | Path, float32: bool = False) -> None:
+        self.path = Path(path)
+        self.notes: list[str] = []
+        self.finished = False
+        self.written = 0
+        self.clipped = 0
+        form = _FORMATS.get(self.path.suffix.lower())
+        if form is None:
+            raise UsageError(f"output {self.path} ends in '{self.path.suffix}', expected .wav or .flac: rename it")
+        self._float32 = float32
+        try:
+            self._disk = Disk(self.path)
+        except OSError as error:
+            raise AudioFileError(f"output {self.path} cannot be written: {error.strerror}; name a file in a writable directory") from None
+        try:
+            self._file: soundfile.SoundFile | None = soundfile.SoundFile(
+                self._disk, "w", SAMPLE_RATE, 1, "FLOAT" if float32 else "PCM_16", format=form
+            )
+        except soundfile.LibsndfileError as error:
+            self._disk.finish()
+            raise self._full(self._disk.error or OSError(errno.EIO, str(error))) from None
+
+    def __enter__(self) -> FileSink:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *exc: object) -> None:
+        self.close(quiet=kind is not None)
+
+    def stats(self) -> dict[str, int]:
+        return {"written": self.written, "clipped": self.clipped}
+
+    def write(self, samples: Samples) -> None:
+        if self._float32:
+            data: np.ndarray = as_samples(samples, "output")
+        else:
+            data, clipped = to_pcm16(samples)
+            self.clipped += clipped
+        if self._file is None:
+            raise AudioFileError(f"output {self.path} is closed already")
+        self._file.write(data)
+        if self._disk.error:
+            self.close(quiet=True)
+            raise self._full(self._disk.error)
+        self.written += data.size
+
+    def close(self, quiet: bool = False) -> None:
+        """Finish the file; a second call does nothing. quiet: another error is under way, do not cover it with a full disk."""
+        if self._file is None:
+            return
+        try:
+            self._file.close()
+        finally:
+            self._file = None
+            self._disk.finish()
+        if self.clipped:
+            self.notes.append(clip_note(self.clipped, self.written))
+        if self._disk.error:
+            if not quiet:
+                raise self._full(self._disk.error)
+
+    def _full(self, error: OSError) -> AudioFileError:
+        kept = f"; its first {self.written / SAMPLE_RATE:.1f} s or so are kept" if self.written else ""
+        return AudioFileError(f"output {self.path} cannot be written on: {error.strerror}{kept}; free some space or write elsewhere")
+
+
+class Recorder:
+    """Keeps the input of a run: DIR/mic.wav and DIR/reference.wav, 32-bit float, exactly the samples of the blocks."""
+
+    def __init__(self, directory: str | Path) -> None:
+        self.directory = Path(directory)
+        try:
+            self.directory.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise AudioFileError(f"directory {self.directory} for the input cannot be made: {error.strerror}; name another") from None
+        self._mic = FileSink(self.directory / "mic.wav", float32=True)
+        try:
+            self._reference = FileSink(self.directory / "reference.wav", float32=True)
+        except AudioFileError:
+            self._mic.close(quiet=True)
+            raise
+
+    def __enter__(self) -> Recorder:
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        try:
+            self._mic.__exit__(*exc)
+        finally:
+            self._reference.__exit__(*exc)
+
+    def write(self, block: Block) -> None:
+        self._mic.write(block.mic)
+        self._reference.write(block.ref)

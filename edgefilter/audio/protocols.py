@@ -1,0 +1,50 @@
+"""What the data path asks of the two ends that it connects."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Protocol
+
+from edgefilter.types import Block, Samples
+
+
+class Source(Protocol):
+    """Where blocks come from: a context manager whose iterator ends with the recording, or after stop().
+
+    notes: what was done to the sound on its way in (converted, padded, dropped), one sentence each, for the user to read;
+    complete when the iteration has ended. total: samples per channel at 16 kHz, None if unknown beforehand.
+    lost: samples that were filled with silence or dropped so far. live: blocks arrive in real time.
+    """
+
+    notes: list[str]
+    total: int | None
+    lost: int
+    live: bool
+
+    def __enter__(self) -> Source: ...
+    def __exit__(self, *exc: object) -> None: ...
+    def __iter__(self) -> Iterator[Block]: ...
+    def stop(self) -> None:
+        """End the iteration soon, with everything received so far delivered; may be called from a signal handler."""
+
+    def stats(self) -> dict[str, int]:
+        """Counters by name; all zero for a source that cannot lose anything."""
+
+
+class Sink(Protocol):
+    """Where finished samples go: a context manager that leaves a valid result behind however it is left.
+
+    notes: one sentence each about what happened to the samples; complete after the context has ended.
+    finished: nobody takes samples any more (the program behind a pipe has ended), so there is no point in going on.
+    """
+
+    notes: list[str]
+    finished: bool
+
+    def __enter__(self) -> Sink: ...
+    def __exit__(self, *exc: object) -> None: ...
+    def write(self, samples: Samples) -> None:
+        """Take samples (n,) float32, full scale +-1."""
+
+    def stats(self) -> dict[str, int]:
+        """Counters by name."""

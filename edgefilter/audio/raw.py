@@ -1,0 +1,144 @@
+"""Sixteen-bit PCM: the conversion, and raw sound through pipes (standard input and output)."""
+
+from __future__ import annotations
+
+import errno
+import os
+import select
+import sys
+from collections.abc import Iterator
+from typing import BinaryIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edgefilter.errors import AudioFileError, UsageError
+from edgefilter.types import SAMPLE_RATE, Block, Samples, as_samples
+
+FULL_SCALE = 32768.0
+_READ_BYTES = 1 << 16
+_PATIENCE_S = 0.1  # how soon stop() is noticed while the pipe is silent
+
+
+def to_pcm16(samples: Samples) -> tuple[NDArray[np.int16], int]:
+    """Round samples (n,) to 16 bit and return them with the number that did not fit and was saturated.
+
+    Exact for values that came from 16-bit PCM (k / 32768). Raises SignalError for NaN and infinity.
+    """
+    scaled = np.rint(as_samples(samples, "output") * np.float32(FULL_SCALE))
+    clipped = int(np.count_nonzero((scaled > 32767.0) | (scaled < -32768.0)))
+    return np.clip(scaled, -32768.0, 32767.0).astype(np.int16), clipped
+
+
+def clip_note(clipped: int, written: int) -> str:
+    """The sentence about saturated samples."""
+    return f"{clipped} of {written} output samples exceeded full scale and were clipped: lower the level of the input"
+
+
+class PcmSource:
+    """Raw s16le stereo at 16 kHz, (microphone, reference), from standard input or any binary stream.
+
+    Blocks are as long as the pipe delivers them, so a live pipe is not held up.
+    """
+
+    live = False
+
+    def __init__(self, stream: BinaryIO | None = None) -> None:
+        self._stream = sys.stdin.buffer if stream is None else stream
+        if self._stream.isatty():
+            raise UsageError("'-' reads raw s16le 16 kHz stereo (microphone, reference) from a pipe, found a terminal: pipe sound into it")
+        self.notes: list[str] = []
+        self.total: int | None = None
+        self.lost = 0
+        self._stopped = False
+
+    def __enter__(self) -> PcmSource:
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        pass
+
+    def stop(self) -> None:
+        self._stopped = True
+
+    def stats(self) -> dict[str, int]:
+        return {"lost": 0}
+
+    def __iter__(self) -> Iterator[Block]:
+        start, rest = 0, b""
+        for data in self._pieces():
+            data = rest + data
+            whole = len(data) // 4 * 4
+            rest = data[whole:]
+            stereo = np.frombuffer(data[:whole], "<i2").reshape(-1, 2).astype(np.float32) / np.float32(FULL_SCALE)
+            if len(stereo):
+                yield Block(stereo[:, 0].copy(), stereo[:, 1].copy(), start)
+                start += len(stereo)
+        if rest:
+            self.notes.append(f"standard input ended in the middle of a sample: its last {len(rest)} bytes were ignored (is it s16le stereo?)")
+        if start == 0 and not self._stopped:
+            raise AudioFileError("standard input held no sound, expected raw s16le 16 kHz stereo (microphone, reference): check the program before the pipe")
+        self.total = start
+
+    def _pieces(self) -> Iterator[bytes]:
+        """Yield what arrives, as it arrives, until the end or stop()."""
+        try:
+            handle: int | None = self._stream.fileno()
+        except (OSError, AttributeError):
+            handle = None
+        wait = handle is not None and sys.platform != "win32"
+        while not self._stopped:
+            if wait and not select.select([handle], [], [], _PATIENCE_S)[0]:
+                continue
+            data = self._stream.read(_READ_BYTES) if handle is None else os.read(handle, _READ_BYTES)
+            if not data:
+                return
+            yield data
+
+
+class PcmSink:
+    """Raw s16le mono at 16 kHz to standard output or any binary stream; a reader that goes away ends it quietly."""
+
+    def __init__(self, stream: BinaryIO | None = None) -> None:
+        self._stream = sys.stdout.buffer if stream is None else stream
+        if self._stream.isatty():
+            raise UsageError("'-' writes raw s16le 16 kHz mono, found a terminal: pipe it into a program or name a .wav or .flac file")
+        self.notes: list[str] = []
+        self.finished = False
+        self.written = 0
+        self.clipped = 0
+
+    def __enter__(self) -> PcmSink:
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        if self.clipped:
+            self.notes.append(clip_note(self.clipped, self.written))
+
+    def stats(self) -> dict[str, int]:
+        return {"written": self.written, "clipped": self.clipped}
+
+    def write(self, samples: Samples) -> None:
+        if self.finished:
+            return
+        pcm, clipped = to_pcm16(samples)
+        try:
+            self._write_all(pcm.astype("<i2").tobytes())
+        except OSError as error:
+            if error.errno not in (errno.EPIPE, errno.ECONNRESET):
+                raise AudioFileError(f"standard output cannot be written: {error.strerror}") from None
+            self.finished = True
+            self.notes.append(f"the program behind the pipe stopped reading after {self.written / SAMPLE_RATE:.2f} s")
+            return
+        self.written += pcm.size
+        self.clipped += clipped
+
+    def _write_all(self, data: bytes) -> None:
+        """Past Python's buffer where there is a file handle: nothing is left in it to fail at exit."""
+        try:
+            handle = self._stream.fileno()
+        except (OSError, AttributeError):
+            self._stream.write(data)
+            return
+        while data:
+            data = data[os.write(handle, data) :]

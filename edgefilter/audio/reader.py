@@ -1,0 +1,144 @@
+"""One audio file as a stream of 16 kHz mono samples; everything that can be wrong with the file is found at opening."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import soundfile
+import soxr
+
+from edgefilter.errors import AudioFileError
+from edgefilter.types import SAMPLE_RATE, Array, Samples
+
+_RATES = range(1000, 768001)
+_ENDLESS = 0x7FFFF000  # writers to a pipe put sizes from here up into the header because they cannot know better
+_VALUES = 1 << 16  # samples times channels that are in memory at a time
+
+
+class Reader:
+    """A WAV, FLAC or Ogg file of any rate and channel count, delivered at 16 kHz with its channels averaged.
+
+    role: how messages name the file ("recording"). The file is read once at opening, so that a damaged one is refused
+    before anything is made from it. total: round(n * 16000 / rate) samples. silent: every sample is zero.
+    Raises AudioFileError for a file that is missing, empty, truncated, not audio, or holds NaN or infinity.
+    """
+
+    def __init__(self, path: str | Path, role: str = "recording") -> None:
+        self.path = Path(path)
+        self.role = role
+        self.notes: list[str] = []
+        self.silent = True
+        self._check_is_file()
+        with self._open() as file:
+            self.rate, self.channels = file.samplerate, file.channels
+            self._check_header(file)
+            length = self._scan(file)
+        self.total = (2 * length * SAMPLE_RATE + self.rate) // (2 * self.rate)
+        if self.total == 0:
+            raise self._error(f"holds {length} samples at {self.rate} Hz, expected at least one at {SAMPLE_RATE} Hz: record it again")
+        self._note_conversion()
+
+    def chunks(self) -> Iterator[Samples]:
+        """Yield float32 arrays of any length, `total` samples in all."""
+        resampler = soxr.ResampleStream(self.rate, SAMPLE_RATE, 1, dtype="float32", quality="VHQ")
+        given = 0
+        with self._open() as file:
+            for data in self._blocks(file):
+                mono = data[:, 0] if self.channels == 1 else data.mean(axis=1, dtype=np.float32)
+                if self.rate != SAMPLE_RATE:
+                    mono = resampler.resample_chunk(np.ascontiguousarray(mono))
+                given += mono.size
+                yield mono
+        if self.rate != SAMPLE_RATE:
+            yield resampler.resample_chunk(np.zeros(0, np.float32), last=True)[: self.total - given]
+
+    def _error(self, what: str) -> AudioFileError:
+        return AudioFileError(f"{self.role} {self.path} {what}")
+
+    def _check_is_file(self) -> None:
+        if self.path.is_dir():
+            raise self._error("is a directory, expected an audio file: name a file in it")
+        try:
+            with open(self.path, "rb") as file:
+                start = file.read(16)
+        except FileNotFoundError:
+            raise self._error(f"does not exist: check the path (looked from {Path.cwd()})") from None
+        except OSError as error:
+            raise self._error(f"cannot be read: {error.strerror}") from None
+        if not start:
+            raise self._error("is empty (0 bytes), expected a WAV, FLAC or Ogg file: record or copy it again")
+
+    def _open(self) -> soundfile.SoundFile:
+        try:
+            return soundfile.SoundFile(self.path)
+        except TypeError:  # a name that ends in .raw: soundfile would have to be told rate and format
+            raise self._error("has no header that says its rate; give raw s16le stereo (microphone, reference) on '-' instead") from None
+        except soundfile.LibsndfileError as error:
+            with open(self.path, "rb") as file:
+                start = file.read(12)
+            found = f"starts with {start!r}" if start.isascii() else f"starts with the bytes {start.hex(' ')}"
+            raise self._error(f"is not audio ({found}; {_reason(error)}), expected WAV, FLAC or Ogg: convert it") from None
+
+    def _check_header(self, file: soundfile.SoundFile) -> None:
+        if self.rate not in _RATES:
+            raise self._error(f"says its rate is {self.rate} Hz, expected {_RATES.start} to {_RATES.stop - 1} Hz: its header is damaged")
+        promised = re.search(r"^data\s*: (\d+) \(should be (\d+)\)", file.extra_info, re.MULTILINE)
+        if promised and int(promised[1]) >= _ENDLESS:
+            self.notes.append(f"{self.role} {self.path}: its header gives no length (written to a pipe?); read to the end of the file")
+        elif promised:
+            raise self._error(
+                f"is truncated: it holds {promised[2]} of the {promised[1]} bytes of sound that its header promises; "
+                "copy it again, or re-save what is there"
+            )
+        elif "without an End-Of-Stream flag" in file.extra_info:
+            raise self._error("is truncated: the Ogg stream stops before its end mark; copy it again, or re-save what is there")
+
+    def _blocks(self, file: soundfile.SoundFile) -> Iterator[Array]:
+        """Yield (n, channels) float32 until the end; a decoder that gives up is an error with its place."""
+        size = max(1, _VALUES // self.channels)
+        done = 0
+        while True:
+            try:
+                data = file.read(size, dtype="float32", always_2d=True)
+            except soundfile.LibsndfileError as error:
+                raise self._error(
+                    f"is truncated or damaged after {done / self.rate:.2f} s of {file.frames / self.rate:.2f} s ({_reason(error)}): copy it again"
+                ) from None
+            if not len(data):
+                return
+            done += len(data)
+            yield data
+
+    def _scan(self, file: soundfile.SoundFile) -> int:
+        """Read the whole file for what makes it unusable; return its samples per channel."""
+        length = 0
+        for data in self._blocks(file):
+            if not np.isfinite(data).all():
+                at, channel = (int(i) for i in np.argwhere(~np.isfinite(data))[0])
+                where = f"at sample {length + at} ({(length + at) / self.rate:.3f} s)" + (f" of channel {channel + 1}" if self.channels > 1 else "")
+                raise self._error(f"holds {data[at, channel]} {where}, expected finite samples: repair or cut it")
+            self.silent = self.silent and not data.any()
+            length += len(data)
+        if length == 0:
+            raise self._error("is empty (a header and 0 samples), expected sound: record it again")
+        if length < file.frames:
+            raise self._error(f"is truncated: it holds {length} of the {file.frames} samples that its header promises; copy it again")
+        return length
+
+    def _note_conversion(self) -> None:
+        done = []
+        if self.rate != SAMPLE_RATE:
+            above = f" (it has nothing above {self.rate / 2000:g} kHz)" if self.rate < SAMPLE_RATE else ""
+            done.append(f"{self.rate} Hz resampled to {SAMPLE_RATE} Hz{above}")
+        if self.channels > 1:
+            done.append(f"{self.channels} channels averaged to one")
+        if done:
+            self.notes.append(f"{self.role} {self.path}: {', '.join(done)}")
+
+
+def _reason(error: soundfile.LibsndfileError) -> str:
+    """The library's own words, without its prefix and full stop."""
+    return error.error_string.strip().removeprefix("Error : ").rstrip(".")
