@@ -1,0 +1,175 @@
+"""Exponential sweeps: making one, recognising one, and what deconvolution by one separates (Farina 2000)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import fft, signal
+
+from edgefilter.errors import CalibrationError
+from edgefilter.types import SAMPLE_RATE, Array, Samples
+
+LOW_HZ, HIGH_HZ = 40.0, 7990.0
+LATEST_DIRECT = int(1.6 * SAMPLE_RATE)
+EARLIEST_DIRECT = -2000
+
+
+def generate_sweep(seconds: float = 6.0, level: float = 0.35, lead_s: float = 0.5, tail_s: float = 1.0) -> Samples:
+    """An exponential sweep (n,) float32 of LOW_HZ to HIGH_HZ with silence before and after, to be played for a calibration.
+
+    x(t) = level sin(2 pi f1 T (e^(t/T) - 1)), T = seconds / ln(f2 / f1) (Farina 2000, eq. 5), f1 T rounded to a whole number so
+    that harmonics separate with a defined phase (Novak et al. 2015, eq. 37). Faded in over 20 ms and out over 5 ms.
+
+    >>> sweep = generate_sweep()
+    >>> sweep.shape, sweep.dtype
+    ((120000,), dtype('float32'))
+    """
+    rate = max(1.0, np.round(LOW_HZ * seconds / np.log(HIGH_HZ / LOW_HZ))) / LOW_HZ
+    t = np.arange(round(seconds * SAMPLE_RATE)) / SAMPLE_RATE
+    tone = level * np.sin(2 * np.pi * LOW_HZ * rate * np.expm1(t / rate))
+    up, down = round(0.02 * SAMPLE_RATE), round(0.005 * SAMPLE_RATE)
+    tone[:up] *= np.sin(np.linspace(0, np.pi / 2, up)) ** 2
+    tone[-down:] *= np.cos(np.linspace(0, np.pi / 2, down)) ** 2
+    return np.pad(tone, (round(lead_s * SAMPLE_RATE), round(tail_s * SAMPLE_RATE))).astype(np.float32)
+
+
+@dataclass(frozen=True)
+class SweepLaw:
+    """The instantaneous frequency low_hz * exp((n - start) / rate) of samples start <= n < stop; rate in samples."""
+
+    start: int
+    stop: int
+    low_hz: float
+    high_hz: float
+    rate: float
+
+    def frequency(self, n: Array) -> Array:
+        """Hz at sample n of the reference."""
+        return self.low_hz * np.exp((np.asarray(n) - self.start) / self.rate)
+
+    def lead(self, order: int) -> float:
+        """Samples by which the response of a harmonic order precedes the linear one after deconvolution."""
+        return self.rate * np.log(order)
+
+
+def sweep_law(reference: Samples) -> SweepLaw:
+    """Recognise an exponential sweep; raise CalibrationError where reference is none."""
+    level = float(np.max(np.abs(reference), initial=0.0))
+    if level < 1e-3:
+        raise CalibrationError(f"the sweep reference peaks at {level:.1g}, expected a sweep of at least 0.001: is it the right file?")
+    active = np.flatnonzero(np.abs(reference) > 0.02 * level)
+    start, stop = int(active[0]), int(active[-1]) + 1
+    if stop - start < SAMPLE_RATE // 2:
+        raise CalibrationError(f"the sweep reference sounds for {(stop - start) / SAMPLE_RATE:.2f} s, expected at least 0.5 s of sweep")
+    phase = np.unwrap(np.angle(signal.hilbert(reference[start:stop])))
+    step = (stop - start) // 400
+    middle = np.arange(step * 20, stop - start - step * 20, step)
+    rate_hz = (phase[middle + step // 2] - phase[middle - step // 2]) / (step // 2 * 2) * SAMPLE_RATE / (2 * np.pi)
+    usable = rate_hz > 1.0
+    if usable.mean() < 0.95:
+        raise CalibrationError(_not_a_sweep("its frequency does not rise"))
+    slope, offset = np.polyfit(middle[usable], np.log(rate_hz[usable]), 1)
+    misfit = float(np.sqrt(np.mean((slope * middle[usable] + offset - np.log(rate_hz[usable])) ** 2)))
+    if misfit > 0.03 or slope * (stop - start) < np.log(8.0):
+        raise CalibrationError(_not_a_sweep(f"its frequency departs by {100 * misfit:.0f} % from an exponential rise"))
+    high = min(float(np.exp(offset + slope * (stop - start))), SAMPLE_RATE / 2)
+    return SweepLaw(start, stop, float(np.exp(offset)), high, float(1 / slope))
+
+
+def _not_a_sweep(why: str) -> str:
+    return (
+        f"the sweep reference is not an exponential sweep: {why}; play the one that edgefilter generates, "
+        "and give a stepped sine as the stepped recording, not as the sweep"
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Deconvolution:
+    """Response of the path, circular, with the lag of each sample and what the fan leaves in it.
+
+    response: (n,) float64, lag k at index k (negative lags count from the end). source_energy: (n // 2 + 1,) |S|^2.
+    regularisation: (n // 2 + 1,) lambda in H = Y S* / (|S|^2 + lambda). noise_psd: (n // 2 + 1,) two-sided, per sample.
+    """
+
+    response: Array
+    source_energy: Array
+    regularisation: Array
+    noise_psd: Array
+
+    def cut(self, start: int, length: int) -> Array:
+        """(length,) samples of the response from lag start on."""
+        return np.take(self.response, np.arange(start, start + length), mode="wrap")
+
+    def spectrum(self, part: Array) -> Array:
+        """(n // 2 + 1,) |H|^2 of a part of the response."""
+        return np.abs(fft.rfft(part, self.response.size)) ** 2
+
+    def noise(self, length: float) -> Array:
+        """(n // 2 + 1,) expected |H|^2 that the fan alone leaves in a part of that many samples."""
+        gain = self.source_energy / np.maximum(self.source_energy + self.regularisation, 1e-30) ** 2
+        return length * self.noise_psd * gain
+
+    @property
+    def frequencies(self) -> Array:
+        return np.arange(self.source_energy.size) * SAMPLE_RATE / self.response.size
+
+
+def deconvolve(reference: Samples, recording: Samples, noise_psd: Array, noise_hz: Array, taps: int) -> Deconvolution:
+    """Divide recording by reference in frequency, as far as the fan allows.
+
+    noise_psd: one-sided PSD of the fan at noise_hz. lambda(f) = taps P_nn(f) / P_hh(f) is the Wiener solution for a response of
+    that many taps with the fan as the only noise; P_hh is a first estimate smoothed over a sixth of an octave (Kirkeby & Nelson
+    1999 give the regularised inverse, without the choice of lambda).
+    """
+    n = fft.next_fast_len(reference.size + recording.size, real=True)
+    source = fft.rfft(reference.astype(np.float64), n)
+    cross = fft.rfft(recording.astype(np.float64), n) * source.conj()
+    energy = np.abs(source) ** 2
+    frequencies = np.arange(energy.size) * SAMPLE_RATE / n
+    fan = np.interp(frequencies, noise_hz, noise_psd) / 2 * SAMPLE_RATE + 1e-14
+    floor = np.full(energy.size, 1e-7 * energy.max())
+    first = Deconvolution(fft.irfft(cross / (energy + floor), n), energy, floor, fan)
+    direct = find_direct(first.response)
+    raw = _smooth(first.spectrum(first.cut(direct - 64, taps)), frequencies)
+    below = _smooth(first.noise(taps), frequencies)
+    path = np.maximum(raw - below, 1e-3 * below) + 1e-12 * raw.max()
+    weight = floor * 1e-3 + taps * fan / path
+    return Deconvolution(fft.irfft(cross / (energy + weight), n), energy, weight, fan)
+
+
+def find_direct(response: Array) -> int:
+    """Lag of the largest |h| between EARLIEST_DIRECT and LATEST_DIRECT."""
+    lags = np.arange(EARLIEST_DIRECT, min(LATEST_DIRECT, response.size // 2))
+    return int(lags[np.argmax(np.abs(response[lags]))])
+
+
+def _smooth(power: Array, frequencies: Array) -> Array:
+    """Mean of power over a sixth of an octave, at least 10 Hz."""
+    total = np.concatenate(([0.0], np.cumsum(power)))
+    step = frequencies[1]
+    half = np.maximum(frequencies * (2 ** (1 / 12) - 1), 5.0) / step
+    index = np.arange(power.size)
+    low = np.maximum(np.floor(index - half), 0).astype(int)
+    high = np.minimum(np.ceil(index + half) + 1, power.size).astype(int)
+    return (total[high] - total[low]) / (high - low)
+
+
+def harmonic_distortion(result: Deconvolution, direct: int, law: SweepLaw, orders: tuple[int, ...]) -> Array:
+    """Harmonic distortion (len(orders),) dB: energy of each order's response at k f over the linear one at f, the fan subtracted.
+
+    The response of order k arrives T ln k before the linear one (Farina 2000, eq. 14). f runs from 100 Hz (or the sweep's start)
+    to 95 % of the sweep's end over k. What the fan hides reads at most as the fan's own share, and at least -100 dB.
+    """
+    linear = result.spectrum(result.cut(direct - 128, 4096))
+    frequencies = result.frequencies
+    levels = []
+    for order in orders:
+        gap = law.lead(order + 1) - law.lead(order)
+        length = int(min(4096, 0.8 * gap))
+        part = result.cut(direct - int(round(law.lead(order))) - min(128, length // 4), length)
+        excess = result.spectrum(part) - result.noise(length)
+        inside = (frequencies >= order * max(100.0, law.low_hz)) & (frequencies <= 0.95 * law.high_hz)
+        fundamental = np.interp(frequencies[inside] / order, frequencies, linear)
+        levels.append(10 * np.log10(max(excess[inside].sum() / max(fundamental.sum(), 1e-30), 1e-10)))
+    return np.array(levels)
