@@ -73,6 +73,7 @@ class Profile:
         arrays = {name: np.asarray(getattr(self, name)) for name in _ARRAYS}
         arrays["impulse_response"] = np.asarray(self.echo.impulse_response)
         header = {
+            "pre_roll": PRE_ROLL,
             "delay": float(self.delay),
             "sample_rate": int(self.sample_rate),
             "warnings": list(self.warnings),
@@ -86,12 +87,15 @@ class Profile:
         """Read a profile that save() wrote; raises ProfileError, in one line, for any other file."""
         arrays, header, effects = read_fields(Path(path))
         try:
-            expected = {*_ARRAYS, "impulse_response"}, {"delay", "sample_rate", "warnings", "created", "source"}
+            expected = {*_ARRAYS, "impulse_response"}, {"pre_roll", "delay", "sample_rate", "warnings", "created", "source"}
             for found, names, kind in zip((arrays, header), expected, ("array", "header"), strict=True):
                 if set(found) != names:
                     odd = ", ".join(sorted(names - set(found))) or "nothing"
                     extra = ", ".join(sorted(name[:40] for name in set(found) - names)) or "nothing"
                     raise ProfileError(f"{kind} fields missing: {odd}; unknown: {extra}; {REMEDY}")
+            pre_roll = header.pop("pre_roll")
+            if pre_roll != PRE_ROLL:
+                raise ProfileError(f"pre_roll is {str(pre_roll)[:80]}, expected {PRE_ROLL} samples; {REMEDY}")
             warnings = header.pop("warnings")
             if not isinstance(warnings, list):
                 raise ProfileError(f"warnings is a JSON {type(warnings).__name__}, expected a list of texts; {REMEDY}")

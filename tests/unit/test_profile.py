@@ -224,6 +224,7 @@ def test_nan_text_and_huge_header_values(saved):
         ({"delay": float("nan")}, "not JSON"),
         ({"delay": "soon\nafter"}, "delay is 'soon"),
         ({"delay": 1e9}, "delay is 1000000000.0, expected -64000 to 64000"),
+        ({"pre_roll": PRE_ROLL + 1}, f"pre_roll is {PRE_ROLL + 1}, expected {PRE_ROLL} samples"),
         ({"sample_rate": 44100}, "sample_rate is 44100, expected 16000 Hz"),
         ({"warnings": "text"}, "warnings is a JSON str"),
         ({"warnings": [1]}, "warnings is not all texts"),
