@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 from scipy import signal
 
 from edgefilter.echo.model import PRE_ROLL, EchoModel
 from edgefilter.errors import CalibrationError, SignalError
-from edgefilter.paper_response import response_from_stepped_sine, response_from_sweep
+from edgefilter.paper_response import SteppedLaw, generate_stepped_sine, response_from_stepped_sine, response_from_sweep, stepped_law
 from edgefilter.profile import DISTORTION_ORDERS, GRID_FFT, GRID_HZ, Profile
-from edgefilter.sweep import Deconvolution, SweepLaw, deconvolve, find_direct, harmonic_distortion, sweep_law
+from edgefilter.profile_text import describe
+from edgefilter.sweep import Deconvolution, deconvolve, find_direct, generate_sweep, harmonic_distortion, sweep_law
 from edgefilter.trust import check_found, check_lengths, collect_warnings
 from edgefilter.types import SAMPLE_RATE, Array, Samples, as_samples
+
+__all__ = ["calibrate", "describe", "generate_stepped_sine", "generate_sweep"]
 
 MIN_TAPS, MAX_TAPS = 6400, 16000
 """400 ms and 1 s: what is kept of the impulse response at least and at most."""
@@ -23,8 +24,8 @@ def calibrate(
     sweep_reference: Samples,
     sweep_recording: Samples,
     noise_recording: Samples,
-    stepped_recording: Samples | None = None,
     *,
+    stepped_sine: bool = False,
     created: str = "",
     source: str = "",
 ) -> Profile:
@@ -32,8 +33,8 @@ def calibrate(
 
     sweep_reference (n,): an exponential sweep as it was played, with silence around it (generate_sweep()). sweep_recording (m,):
     what the microphone heard, on the same sample counter to within -2000 samples and 1.6 s. noise_recording (k,): the fan alone,
-    some seconds. stepped_recording: a recording of generate_stepped_sine(); the paper's response is then taken from it instead of
-    from the sweep. All float32, 16 kHz, full scale +-1. created, source: texts for the profile.
+    some seconds. stepped_sine: reference and recording are those of the paper's generate_stepped_sine() instead. All float32, 16 kHz,
+    full scale +-1. created, source: texts for the profile.
 
     What makes the result less than trustworthy is in Profile.warnings. Raises CalibrationError where there is nothing to measure:
     the recording does not contain the sweep, is silent, far too short or not finite, or the reference is no exponential sweep.
@@ -48,7 +49,7 @@ def calibrate(
     """
     named = {"the sweep reference": sweep_reference, "the sweep recording": sweep_recording, "the noise recording": noise_recording}
     reference, recording, noise = (_samples(x, name) for name, x in named.items())
-    law = sweep_law(reference)
+    law = stepped_law(reference) if stepped_sine else sweep_law(reference)
     check_lengths(law, recording, noise)
     noise_psd = fan_psd(noise)
     result = deconvolve(reference, recording, noise_psd, GRID_HZ, MIN_TAPS)
@@ -57,10 +58,11 @@ def calibrate(
     path = impulse_response(result, direct)
     bands = third_octave_bands()
     snr = band_snr_db(result, path, bands)
-    if stepped_recording is None:
-        response = response_from_sweep(reference, recording, noise, direct)
+    if isinstance(law, SteppedLaw):
+        response, distortion = response_from_stepped_sine(law, reference, recording, noise, direct, DISTORTION_ORDERS)
     else:
-        response = response_from_stepped_sine(_samples(stepped_recording, "the stepped-sine recording"), noise, GRID_HZ)
+        response = response_from_sweep(reference, recording, noise, direct)
+        distortion = harmonic_distortion(result, direct, law, DISTORTION_ORDERS)
     return Profile(
         echo=EchoModel(path),
         delay=float(direct),
@@ -68,27 +70,11 @@ def calibrate(
         noise_psd=noise_psd,
         band_hz=bands,
         band_snr_db=snr,
-        distortion_db=harmonic_distortion(result, direct, law, DISTORTION_ORDERS),
+        distortion_db=distortion,
         warnings=tuple(collect_warnings(law, reference, recording, noise, result, path, direct, bands, snr)),
         created=created,
         source=source,
     )
-
-
-def calibrate_live(play_and_record: Callable[[Samples], Samples], seconds: float = 6.0, fan_s: float = 5.0, **texts: str) -> Profile:
-    """Calibrate with a device: play_and_record(playback (n,)) -> recording (n,) on the same sample counter.
-
-    Plays fan_s of silence, from which the fan is taken, and then the sweep. Raises what calibrate() raises.
-    """
-    from edgefilter.sweep import generate_sweep
-
-    sweep = generate_sweep(seconds)
-    quiet = round(fan_s * SAMPLE_RATE)
-    recording = _samples(play_and_record(np.concatenate((np.zeros(quiet, np.float32), sweep))), "the recording")
-    if recording.size < quiet + sweep.size // 2:
-        raise CalibrationError(f"the device recorded {recording.size / SAMPLE_RATE:.1f} s, expected {(quiet + sweep.size) / SAMPLE_RATE:.1f} s")
-    settle = min(SAMPLE_RATE // 2, quiet // 4)
-    return calibrate(sweep, recording[quiet:], recording[settle:quiet], **texts)
 
 
 def _samples(x: object, name: str) -> Samples:

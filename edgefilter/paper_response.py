@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from scipy import signal
 
@@ -9,13 +11,14 @@ from edgefilter.errors import CalibrationError
 from edgefilter.types import SAMPLE_RATE, Array, Samples
 
 STEP_HZ = 13
+STEPS_HZ = np.arange(0, 8001, STEP_HZ, dtype=np.float64)
 STEP_SAMPLES = 1600
 """0.1 s a step, inferred (the paper does not say): one frame of 1200 samples after 400 for the room to settle."""
 FRAME, HOP = 1200, 160
 _WINDOW = signal.get_window("hann", FRAME)
 
 
-def generate_stepped_sine(level: float = 0.35, lead_s: float = 0.5, tail_s: float = 1.0) -> Samples:
+def generate_stepped_sine(amplitude: float = 0.35, lead_s: float = 0.5, tail_s: float = 1.0) -> Samples:
     """The paper's calibration signal (n,) float32: a sine of 0 to 8001 Hz in steps of 13 Hz, 0.1 s each, phase-continuous.
 
     616 steps, the last at 7995 Hz, 63 s with the silence around it.
@@ -23,43 +26,72 @@ def generate_stepped_sine(level: float = 0.35, lead_s: float = 0.5, tail_s: floa
     >>> generate_stepped_sine().shape
     (1009600,)
     """
-    steps = np.repeat(_step_frequencies(), STEP_SAMPLES)
-    tone = level * np.sin(2 * np.pi * np.cumsum(steps) / SAMPLE_RATE)
+    steps = np.repeat(STEPS_HZ, STEP_SAMPLES)
+    tone = amplitude * np.sin(2 * np.pi * np.cumsum(steps) / SAMPLE_RATE)
     return np.pad(tone, (round(lead_s * SAMPLE_RATE), round(tail_s * SAMPLE_RATE))).astype(np.float32)
 
 
-def _step_frequencies() -> Array:
-    return np.arange(0, 8001, STEP_HZ, dtype=np.float64)
+@dataclass(frozen=True)
+class SteppedLaw:
+    """Where a stepped sine lies in its reference: step k sounds in samples start + k STEP_SAMPLES and on."""
+
+    start: int
+    low_hz: float = float(STEP_HZ)
+    high_hz: float = float(STEPS_HZ[-1])
+
+    @property
+    def stop(self) -> int:
+        return self.start + STEP_SAMPLES * STEPS_HZ.size
+
+    def frequency(self, n: Array) -> Array:
+        """Hz at sample n of the reference."""
+        return (np.asarray(n) - self.start) / STEP_SAMPLES * STEP_HZ
+
+    def time(self, hz: float) -> float:
+        """Sample of the reference at which the step of hz sounds."""
+        return self.start + hz / STEP_HZ * STEP_SAMPLES
 
 
-def response_from_stepped_sine(recording: Samples, noise: Samples, frequencies: Array, level: float = 0.35, lead_s: float = 0.5) -> Samples:
-    """|H_m(f) H_s(f)| (len(frequencies),) float32 from a recording (n,) of generate_stepped_sine(level, lead_s).
+def stepped_law(reference: Samples) -> SteppedLaw:
+    """Recognise the stepped sine of generate_stepped_sine() at any level and place; raise CalibrationError where there is none."""
+    pattern = generate_stepped_sine(1.0, 0.0, 0.0).astype(np.float64)
+    energy = float(np.sum(reference.astype(np.float64) ** 2))
+    if reference.size >= pattern.size and energy > 0:
+        match = signal.correlate(reference.astype(np.float64), pattern, "valid", "fft")
+        start = int(np.argmax(np.abs(match)))
+        if abs(match[start]) > 0.9 * np.sqrt(energy * np.sum(pattern**2)):
+            return SteppedLaw(start)
+    raise CalibrationError(
+        "the sweep reference is not the stepped sine of 0-8001 Hz in steps of 13 Hz, 0.1 s each: "
+        "play the one that edgefilter generates, or leave the stepped-sine option out for an exponential sweep"
+    )
+
+
+def response_from_stepped_sine(
+    law: SteppedLaw, reference: Samples, recording: Samples, noise: Samples, delay: int, orders: tuple[int, ...]
+) -> tuple[Samples, Array]:
+    """|H_m(f) H_s(f)| (601,) float32 and the harmonic distortion (len(orders),) dB, from a recording of the stepped sine.
 
     Eq. (3)-(5) of the paper step by step: (|X_m(f)| - |N(f)|) / |A(f)| with one Hann frame of 1200 samples at the end of each step,
-    |N(f)| the mean magnitude of the fan in such a frame, negative differences set to 0. The lag of the recording is found by
-    cross-correlation. Between the steps (13 Hz) the response is interpolated; the 0 Hz step is silent, so below 13 Hz it is 0.
-    Raises CalibrationError where recording does not contain the stepped sine or ends before it.
+    delay samples later in the recording, |N(f)| the mean magnitude of the fan in such a frame, negative differences set to 0.
+    Between the steps the response is interpolated; the 0 Hz step is silent, so it is 0 there. Steps beyond the end of the recording
+    read 0. Distortion of order k: energy at k f over the energy at f, steps from 104 Hz on, the fan's energy subtracted.
     """
-    reference = generate_stepped_sine(level, lead_s).astype(np.float64)
-    correlation = signal.correlate(recording, reference, "full", "fft")
-    lags = np.arange(correlation.size) - (reference.size - 1)
-    near = (lags >= -2000) & (lags <= 2 * SAMPLE_RATE)
-    peak = np.abs(correlation[near])
-    if not peak.max(initial=0.0) > 12 * np.sqrt(np.mean(peak**2)):
-        raise CalibrationError("the stepped-sine recording does not contain the stepped sine: is it the right file?")
-    lag = int(lags[near][np.argmax(peak)])
-    steps = _step_frequencies()
-    ends = round(lead_s * SAMPLE_RATE) + STEP_SAMPLES * np.arange(1, steps.size + 1)
-    if recording.size < ends[-1] + lag:
-        last = steps[np.searchsorted(ends + lag, recording.size)]
-        raise CalibrationError(f"the stepped-sine recording ends at {last:.0f} Hz, expected {steps[-1]:.0f} Hz: record it to its end")
+    ends = law.start + STEP_SAMPLES * np.arange(1, STEPS_HZ.size + 1)
     frames = ends[:, None] + np.arange(-FRAME, 0)
-    played = _tone_magnitude(reference[frames], steps)
-    heard = _tone_magnitude(recording[np.maximum(frames + lag, 0)], steps)
-    fan = np.interp(steps, np.arange(FRAME // 2 + 1) * SAMPLE_RATE / FRAME, mean_magnitude(noise))
-    response = np.maximum(heard - fan, 0.0) / np.maximum(played, 1e-9)
+    padded = np.pad(recording.astype(np.float64), (0, max(0, int(ends[-1]) + delay - recording.size)))[np.maximum(frames + delay, 0)]
+    grid = np.arange(FRAME // 2 + 1) * SAMPLE_RATE / FRAME
+    fan, fan_power = mean_magnitude(noise), np.mean(np.abs(_frames(noise)) ** 2, axis=0)
+    played = _tone_magnitude(reference[frames].astype(np.float64), STEPS_HZ)
+    heard = _tone_magnitude(padded, STEPS_HZ)
+    response = np.maximum(heard - np.interp(STEPS_HZ, grid, fan), 0.0) / np.maximum(played, 1e-9)
     response[0] = 0.0
-    return np.interp(frequencies, steps, response, right=response[-1]).astype(np.float32)
+    levels = []
+    for order in orders:
+        use = (STEPS_HZ >= 104.0) & (STEPS_HZ * order < 7600.0)
+        excess = _tone_magnitude(padded[use], order * STEPS_HZ[use]) ** 2 - np.interp(order * STEPS_HZ[use], grid, fan_power)
+        levels.append(10 * np.log10(max(excess.sum() / max(np.sum(heard[use] ** 2), 1e-30), 1e-10)))
+    return np.interp(grid, STEPS_HZ, response).astype(np.float32), np.array(levels)
 
 
 def _tone_magnitude(frames: Array, frequencies: Array) -> Array:

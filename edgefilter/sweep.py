@@ -15,10 +15,10 @@ LATEST_DIRECT = int(1.6 * SAMPLE_RATE)
 EARLIEST_DIRECT = -2000
 
 
-def generate_sweep(seconds: float = 6.0, level: float = 0.35, lead_s: float = 0.5, tail_s: float = 1.0) -> Samples:
+def generate_sweep(seconds: float = 6.0, amplitude: float = 0.35, lead_s: float = 0.5, tail_s: float = 1.0) -> Samples:
     """An exponential sweep (n,) float32 of LOW_HZ to HIGH_HZ with silence before and after, to be played for a calibration.
 
-    x(t) = level sin(2 pi f1 T (e^(t/T) - 1)), T = seconds / ln(f2 / f1) (Farina 2000, eq. 5), f1 T rounded to a whole number so
+    x(t) = amplitude sin(2 pi f1 T (e^(t/T) - 1)), T = seconds / ln(f2 / f1) (Farina 2000, eq. 5), f1 T rounded to a whole number so
     that harmonics separate with a defined phase (Novak et al. 2015, eq. 37). Faded in over 20 ms and out over 5 ms.
 
     >>> sweep = generate_sweep()
@@ -27,7 +27,7 @@ def generate_sweep(seconds: float = 6.0, level: float = 0.35, lead_s: float = 0.
     """
     rate = max(1.0, np.round(LOW_HZ * seconds / np.log(HIGH_HZ / LOW_HZ))) / LOW_HZ
     t = np.arange(round(seconds * SAMPLE_RATE)) / SAMPLE_RATE
-    tone = level * np.sin(2 * np.pi * LOW_HZ * rate * np.expm1(t / rate))
+    tone = amplitude * np.sin(2 * np.pi * LOW_HZ * rate * np.expm1(t / rate))
     up, down = round(0.02 * SAMPLE_RATE), round(0.005 * SAMPLE_RATE)
     tone[:up] *= np.sin(np.linspace(0, np.pi / 2, up)) ** 2
     tone[-down:] *= np.cos(np.linspace(0, np.pi / 2, down)) ** 2
@@ -47,6 +47,10 @@ class SweepLaw:
     def frequency(self, n: Array) -> Array:
         """Hz at sample n of the reference."""
         return self.low_hz * np.exp((np.asarray(n) - self.start) / self.rate)
+
+    def time(self, hz: float) -> float:
+        """Sample of the reference at which the sweep passes hz."""
+        return self.start + self.rate * float(np.log(hz / self.low_hz))
 
     def lead(self, order: int) -> float:
         """Samples by which the response of a harmonic order precedes the linear one after deconvolution."""

@@ -7,19 +7,21 @@ from scipy import signal
 
 from edgefilter.echo.model import PRE_ROLL
 from edgefilter.errors import CalibrationError
+from edgefilter.paper_response import SteppedLaw
 from edgefilter.sweep import EARLIEST_DIRECT, LATEST_DIRECT, Deconvolution, SweepLaw, deconvolve
 from edgefilter.types import SAMPLE_RATE, Array, Samples
 
+Law = SweepLaw | SteppedLaw
 LOW_SNR_DB = 10.0
 SPEECH_HZ = (110.0, 7200.0)
 """Bands that a warning is about; a small loudspeaker radiates nothing below them, and that is no fault of the calibration."""
 
 
-def check_lengths(law: SweepLaw, recording: Samples, noise: Samples) -> None:
+def check_lengths(law: Law, recording: Samples, noise: Samples) -> None:
     """Raise CalibrationError for recordings with too little in them to start."""
     if noise.size < SAMPLE_RATE // 2:
         raise CalibrationError(f"the noise recording is {noise.size / SAMPLE_RATE:.2f} s long, expected at least 0.5 s of the fan alone")
-    middle = law.start + law.rate * np.log(1000.0 / law.low_hz)
+    middle = law.time(1000.0)
     if recording.size < middle:
         raise CalibrationError(
             f"the sweep recording is {recording.size / SAMPLE_RATE:.2f} s long and ends before the sweep reaches 1 kHz, "
@@ -45,7 +47,7 @@ def check_found(result: Deconvolution, direct: int) -> None:
 
 
 def collect_warnings(
-    law: SweepLaw,
+    law: Law,
     reference: Samples,
     recording: Samples,
     noise: Samples,
@@ -68,7 +70,7 @@ def collect_warnings(
     return [text for text in found if text]
 
 
-def clipping(law: SweepLaw, recording: Samples, direct: int) -> str | None:
+def clipping(law: Law, recording: Samples, direct: int) -> str | None:
     """Samples at full scale, or flat tops below it, and the frequencies that the sweep had there."""
     size = np.abs(recording)
     level = float(size.max())
@@ -89,7 +91,7 @@ def clipping(law: SweepLaw, recording: Samples, direct: int) -> str | None:
     )
 
 
-def short_recording(law: SweepLaw, recording: Samples, direct: int) -> str | None:
+def short_recording(law: Law, recording: Samples, direct: int) -> str | None:
     """A recording that ends before the sweep has passed and rung out."""
     missing = law.stop + direct + SAMPLE_RATE // 5 - recording.size
     if missing <= 0:
@@ -121,11 +123,13 @@ def quiet(recording: Samples) -> str | None:
     return f"too quiet: the recording peaks at {20 * np.log10(level):.0f} dB of full scale, expected above -40 dB, in all bands"
 
 
-def disturbed(law: SweepLaw, reference: Samples, recording: Samples, noise: Samples, result: Deconvolution, direct: int) -> str | None:
-    """Something else in the recording: quarter seconds in which neither the path nor its harmonics explain the sound.
+def disturbed(law: Law, reference: Samples, recording: Samples, noise: Samples, result: Deconvolution, direct: int) -> str | None:
+    """Something else in a sweep's recording: quarter seconds in which neither the path nor its harmonics explain the sound.
 
     What remains has to exceed the fan by 10 dB, a sixth of the explained power there, and the loudest quarter second less 25 dB.
     """
+    if not isinstance(law, SweepLaw):
+        return None
     early = int(law.lead(5.5))
     shift = direct - early
     predicted = signal.oaconvolve(reference.astype(np.float64), result.cut(shift, early + 6400))

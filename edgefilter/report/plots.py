@@ -1,0 +1,111 @@
+"""Pictures of a profile and of a filtered recording; with the rest of report/, the only import of matplotlib."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from edgefilter.echo.model import PRE_ROLL
+from edgefilter.errors import EdgefilterError
+from edgefilter.profile import DISTORTION_ORDERS, GRID_HZ, Profile
+from edgefilter.types import SAMPLE_RATE, Samples
+
+INK, ACCENT, SOFT = "#222222", "#b5442c", "#5b7c99"
+
+
+def plot_profile(profile: Profile, path: str | Path) -> None:
+    """Draw impulse response, decay, both readings of the response with the fan, and the bands, to a PNG, SVG or PDF."""
+    figure = _figure(11, 8)
+    axes = figure.subplots(2, 2)
+    taps = profile.echo.impulse_response.astype(np.float64)
+    ms = (np.arange(taps.size) - PRE_ROLL) / SAMPLE_RATE * 1000
+    first = ms < 40
+    axes[0, 0].plot(ms[first], taps[first], color=INK, linewidth=0.8)
+    _label(axes[0, 0], "Impulse response, first 40 ms", "ms after the direct sound", "amplitude")
+    left = np.cumsum(taps[::-1] ** 2)[::-1]
+    axes[0, 1].plot(ms, _db(taps**2 / max(float(np.max(taps**2)), 1e-30)), color=SOFT, linewidth=0.3, label="|h|")
+    axes[0, 1].plot(ms, _db(left / max(left[0], 1e-30)), color=ACCENT, label="energy still to come")
+    axes[0, 1].set_ylim(-90, 3)
+    axes[0, 1].legend(loc="upper right")
+    _label(axes[0, 1], "Decay", "ms after the direct sound", "dB")
+    _draw_spectra(axes[1, 0], profile)
+    _draw_bands(axes[1, 1], profile)
+    if profile.warnings:
+        figure.suptitle("not to be trusted: " + "; ".join(text.split(":")[0] for text in profile.warnings)[:110], color=ACCENT, fontsize=9)
+    _save(figure, path)
+
+
+def plot_before_after(signals: Mapping[str, Samples], path: str | Path) -> None:
+    """Draw the spectrograms of named recordings (n,), 16 kHz, one below the other on the same scale, to a PNG, SVG or PDF."""
+    figure = _figure(11, 2.4 * len(signals))
+    axes = figure.subplots(len(signals), 1, sharex=True, squeeze=False)[:, 0]
+    peak = max(float(np.max(_spectrogram(samples), initial=1e-12)) for samples in signals.values())
+    for axis, (name, samples) in zip(axes, signals.items(), strict=True):
+        picture = _db(_spectrogram(samples) / peak)
+        extent = (0, samples.size / SAMPLE_RATE, 0, SAMPLE_RATE / 2000)
+        axis.imshow(picture.T, origin="lower", aspect="auto", extent=extent, vmin=-75, vmax=-10, cmap="magma")
+        axis.set_title(name, loc="left", fontsize=10)
+        axis.set_ylabel("kHz")
+    axes[-1].set_xlabel("s")
+    _save(figure, path)
+
+
+def _draw_spectra(axis, profile: Profile) -> None:
+    n = max(1 << 15, profile.echo.impulse_response.size)
+    spectrum = np.abs(np.fft.rfft(profile.echo.impulse_response, n))
+    hz = np.arange(spectrum.size) * SAMPLE_RATE / n
+    axis.semilogx(hz[1:], _db(spectrum[1:] ** 2), color=SOFT, linewidth=0.5, label="from the impulse response")
+    axis.semilogx(GRID_HZ[1:], _db(profile.response[1:] ** 2), color=INK, linewidth=1.2, label="|Hm Hs|, eq. (5) of the paper")
+    fan = axis.twinx()
+    fan.semilogx(GRID_HZ[1:], _db(profile.noise_psd[1:]), color=ACCENT, linewidth=1.0)
+    fan.set_ylabel("fan, dB of full scale² / Hz", color=ACCENT)
+    axis.set_xlim(50, 8000)
+    axis.set_ylim(-60, max(10.0, float(_db(profile.response**2).max()) + 3))
+    axis.legend(loc="lower center", fontsize=8)
+    _label(axis, "Response and fan", "Hz", "dB")
+
+
+def _draw_bands(axis, profile: Profile) -> None:
+    low, high = profile.band_hz.T
+    colours = [ACCENT if snr < 10 else SOFT for snr in profile.band_snr_db]
+    axis.bar(low, profile.band_snr_db, width=high - low, align="edge", color=colours, edgecolor="white")
+    axis.axhline(10, color=INK, linewidth=0.8, linestyle=":")
+    axis.set_xscale("log")
+    orders = ", ".join(f"{order}: {level:.0f}" for order, level in zip(DISTORTION_ORDERS, profile.distortion_db, strict=True))
+    _label(axis, f"Signal-to-noise ratio of the sweep; distortion by order, dB: {orders}", "Hz", "dB")
+
+
+def _label(axis, title: str, x: str, y: str) -> None:
+    axis.set_title(title, loc="left", fontsize=10)
+    axis.set_xlabel(x)
+    axis.set_ylabel(y)
+    axis.grid(alpha=0.25)
+
+
+def _db(power: np.ndarray) -> np.ndarray:
+    return 10 * np.log10(np.maximum(power, 1e-20))
+
+
+def _spectrogram(samples: Samples) -> np.ndarray:
+    """Power (frames, 257) of Hann frames of 512 samples, hop 128."""
+    padded = np.pad(samples, (0, max(0, 512 - samples.size)))
+    frames = np.lib.stride_tricks.sliding_window_view(padded, 512)[::128]
+    return np.abs(np.fft.rfft(frames * np.hanning(512).astype(np.float32), axis=1)) ** 2
+
+
+def _figure(width: float, height: float) -> Figure:
+    figure = Figure(figsize=(width, height), layout="constrained", dpi=110)
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def _save(figure: Figure, path: str | Path) -> None:
+    try:
+        figure.savefig(path)
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or str(error).splitlines()[0]
+        raise EdgefilterError(f"{path}: the picture cannot be written ({reason}); name a .png, .svg or .pdf file in a folder that exists") from None
