@@ -38,6 +38,7 @@ def main(args: argparse.Namespace) -> int:
         recorder = stack.enter_context(Recorder(args.save_input)) if args.save_input else None
         show = stack.enter_context(display(source, args.quiet))
         report = filter_blocks(limited(source, limit), ego, sink, recorder, show, lambda: bool(stopped) or sink.finished)
+        report.interrupted |= bool(stopped)
     return finish(args, ego, source, sink, report, told)
 
 
