@@ -1,0 +1,239 @@
+"""Streaming alignment of the reference to the microphone: each utterance's lag, the clocks' drift, dropped buffers."""
+
+from __future__ import annotations
+
+from collections import deque
+
+import numpy as np
+
+from edgefilter.delay_line import HALF_WIDTH, Aligned, Tape, read_delayed, read_line
+from edgefilter.delay_tracker import STRIDE, DelayMeter, DriftFilter, Measurement
+from edgefilter.echo.model import PRE_ROLL
+from edgefilter.lag_search import Candidate, LagSearch
+from edgefilter.paper_alignment import PaperAligner, paper_lag
+from edgefilter.profile import Profile
+from edgefilter.types import SAMPLE_RATE, Samples
+from edgefilter.utterances import OnsetDetector, Utterance
+
+__all__ = ["Aligned", "Aligner", "PaperAligner", "paper_lag"]
+
+SEARCH_STRIDE = 1024
+"""Samples between two searches of the whole range."""
+CERTAIN, LIKELY = (9.0, 1.6), (6.5, 1.25)
+"""(strength, ratio) at which one search decides, and at which two that agree do; chance stays under 5.5 and 1.2."""
+HEARD = 6.0
+"""Strength of the tracker's peak over the rms of +-REACH lags from which a measurement counts."""
+LOST_BLOCKS = 10
+"""Measurements in speech without a credible peak after which everything is searched again."""
+
+
+class Aligner:
+    """Finds the total delay of the robot's voice in the microphone and delivers the reference at that delay.
+
+    A new utterance is looked for over all lags; the old delay stays the hypothesis until it is confirmed or replaced, but where
+    the microphone is far too quiet to hold it, nothing is delivered. Between utterances delay and drift are carried on.
+    hop: samples per step. profile: its impulse response tells the shape of the arrival. max_lag_s: of the playback, seconds.
+
+    >>> rng = np.random.default_rng(0)
+    >>> voice = rng.standard_normal(16384).astype(np.float32) / 10
+    >>> mic = np.concatenate((np.zeros(2000, np.float32), voice[:-2000]))
+    >>> aligner = Aligner(256)
+    >>> for at in range(0, 16384, 256):
+    ...     aligned = aligner.step(mic[at : at + 256], voice[at : at + 256])
+    >>> aligned.state, round(aligned.delay)
+    ('locked', 2000)
+    """
+
+    def __init__(self, hop: int, profile: Profile | None = None, max_lag_s: float = 1.5) -> None:
+        self.hop = hop
+        self._max_lag = int((max_lag_s + 0.1) * SAMPLE_RATE)
+        self._response = None if profile is None else profile.echo.impulse_response
+        early = None if self._response is None else self._response[: PRE_ROLL + 320]
+        self._lags = LagSearch(self._max_lag, early, PRE_ROLL)
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget everything, as after construction."""
+        length = self._lags.span + SAMPLE_RATE
+        self._mic, self._ref = Tape(length), Tape(length)
+        self._onsets = OnsetDetector(self.hop)
+        self._meter = DelayMeter(self._response, PRE_ROLL)
+        self._drift = DriftFilter()
+        self._open: deque[Utterance] = deque(maxlen=32)
+        self._last_candidate: Candidate | None = None
+        self._suspect: float | None = None
+        self._to_search, self._to_measure = SEARCH_STRIDE, STRIDE // 2
+        self._read_at = float("nan")
+        self._gain: float | None = None
+        self._refuted = False
+        self._confidence, self._lost = 0.0, 0
+        self._counts = {"utterances": 0, "realignments": 0, "jumps": 0, "searches": 0, "announced": 0}
+
+    @property
+    def _known(self) -> bool:
+        return self._drift.delay == self._drift.delay
+
+    def announce(self, utterance: Samples) -> None:
+        """Say what will be played (n,); it may begin at any time or never. The reference comes before the microphone
+        hears it, so that nothing more is needed than to count it."""
+        self._counts["announced"] += 1
+
+    def step(self, mic: Samples, ref: Samples) -> Aligned:
+        """Take the next hop (hop,) of microphone and reference."""
+        self._mic.push(mic)
+        self._ref.push(ref)
+        started = self._onsets.step(ref)
+        if started:
+            self._open.append(started)
+            self._counts["utterances"] += 1
+        self._expire()
+        before = self._read_at
+        if self._known:
+            self._drift.advance(self.hop)
+        switched = self._measure() if self._known else False
+        switched = self._search() or switched
+        return self._deliver(mic, before, switched)
+
+    def history(self, count: int) -> Samples:
+        """The last count aligned samples (count,) float32, the present hop included, as if the present delay had always held."""
+        if not self._known or self._refuted:
+            return np.zeros(count, np.float32)
+        return read_line(self._ref, self._ref.end, count, self._read_at, self._drift.slope, chunk=512)
+
+    def stats(self) -> dict[str, object]:
+        """Delay, drift, confidence, state and what happened so far, ready for JSON."""
+        delay = round(self._drift.delay, 3) if self._known else None
+        deviation = round(float(np.sqrt(self._drift.covariance[0, 0])), 3) if self._known else None
+        found = {"method": "tracking", "state": self._state(), "delay_samples": delay, "deviation_samples": deviation}
+        return {**found, "ppm": round(-1e6 * self._drift.slope, 2), "confidence": round(self._confidence, 3), **self._counts}
+
+    def _state(self) -> str:
+        current = self._onsets.current
+        audible = self._max_lag if not self._known else int(self._drift.delay) + SAMPLE_RATE // 4
+        if self._open and (self._known or current.end + audible > self._ref.end):
+            return "searching"
+        if current is None or current.end + audible < self._ref.end:
+            return "idle"
+        return "locked" if self._known else "searching"
+
+    def _expire(self) -> None:
+        """Give up utterances that would have been heard by now."""
+        if self._open:
+            end = self._open[1].start if len(self._open) > 1 else self._onsets.current.end
+            if self._ref.end > end + self._max_lag + SAMPLE_RATE // 4:
+                self._resolve()
+
+    def _resolve(self) -> None:
+        self._open.popleft()
+        self._last_candidate = None
+        self._refuted = False
+
+    def _search(self) -> bool:
+        """Now and then look for the oldest unresolved utterance over all lags; True if the delay was switched."""
+        self._to_search -= self.hop
+        if not self._open or self._to_search > 0:
+            return False
+        self._to_search = SEARCH_STRIDE
+        self._counts["searches"] += 1
+        found = self._lags.find(self._mic, self._ref, self._ref.end, self._open[0].start)
+        last, self._last_candidate = self._last_candidate, found
+        if found is None or not self._decided(found, last):
+            return False
+        was_refuted = self._refuted
+        self._resolve()
+        self._confidence = min(found.strength / 20.0, 1.0)
+        if self._known and abs(found.lag - self._drift.delay) < 24:
+            return was_refuted
+        return self._switch(float(found.lag), 3.0)
+
+    @staticmethod
+    def _decided(found: Candidate, last: Candidate | None) -> bool:
+        if found.strength > CERTAIN[0] and found.ratio > CERTAIN[1]:
+            return True
+        likely = found.strength > LIKELY[0] and found.ratio > LIKELY[1]
+        return likely and last is not None and abs(found.lag - last.lag) < 8
+
+    def _switch(self, delay: float, deviation: float) -> bool:
+        self._drift.restart(delay, deviation)
+        self._counts["realignments"] += 1
+        self._suspect, self._lost, self._refuted = None, 0, False
+        self._to_measure = min(self._to_measure, 2 * self.hop)
+        return True
+
+    def _measure(self) -> bool:
+        """Now and then measure the error of the present delay; True if it jumped."""
+        self._to_measure -= self.hop
+        if self._to_measure > 0:
+            return False
+        self._to_measure = STRIDE
+        heard_end = self._ref.end - self._drift.delay
+        if self._onsets.current is None or heard_end - STRIDE > self._onsets.current.end:
+            return False
+        found = self._meter.measure(self._mic, self._ref, self._ref.end, self._drift.delay, self._drift.slope)
+        return found is not None and self._judge(found)
+
+    def _judge(self, found: Measurement) -> bool:
+        if found.strength < HEARD:
+            self._note_loss(found)
+            return False
+        small = abs(found.offset) < 1.5 or (abs(found.offset) < 8.0 and self._drift.surprise(found) < 3.0)
+        if small and (self._drift.surprise(found) < 5.0 or abs(found.offset) < 0.3):
+            return self._accept(found)
+        suspect, self._suspect = self._suspect, found.offset
+        sure = found.strength > 14.0 and found.dominance > 3.0 and abs(found.offset) > 8.0
+        agrees = suspect is not None and abs(found.offset - suspect) < 0.7
+        if (agrees and (found.dominance > 1.2 or abs(found.offset) < 8.0)) or sure:
+            self._counts["jumps"] += 1
+            if self._open and self._ref.end - self._drift.delay > self._open[0].start + STRIDE:
+                self._resolve()
+            return self._switch(self._drift.delay + found.offset, 0.3)
+        self._note_loss(found)
+        return False
+
+    def _accept(self, found: Measurement) -> bool:
+        step = self._drift.delay
+        self._drift.correct(found)
+        self._meter.learn(found.offset)
+        self._suspect, self._lost = None, 0
+        self._confidence += 0.2 * (found.explained - self._confidence)
+        self._gain = found.gain if self._gain is None else self._gain + 0.1 * (min(found.gain, 2 * self._gain) - self._gain)
+        was_refuted = self._refuted
+        if self._open and self._ref.end - self._drift.delay > self._open[0].start + STRIDE and found.dominance < 1.01:
+            self._resolve()
+        return was_refuted or abs(self._drift.delay - step) > 0.5
+
+    def _note_loss(self, found: Measurement) -> None:
+        """Speech of the robot should be heard but is not where it was expected: in the end, search everything."""
+        if self._open or self._gain is None or found.gain < 0.25 * self._gain:
+            return
+        self._lost += 1
+        self._confidence *= 0.9
+        if self._lost >= LOST_BLOCKS:
+            self._lost = 0
+            start = int(self._ref.end - self._drift.delay) - SAMPLE_RATE // 2
+            self._open.append(Utterance(start, self._ref.end))
+
+    def _deliver(self, mic: Samples, before: float, switched: bool) -> Aligned:
+        if not self._known:
+            return Aligned(np.zeros(self.hop, np.float32), float("nan"), 0.0, 0.0, self._state(), False)
+        self._read_at = max(self._drift.delay - PRE_ROLL, 0.0)
+        end = self._ref.end
+        start = self._read_at - self._drift.slope * self.hop if switched or before != before else before
+        if self._read_at < HALF_WIDTH:
+            start = self._read_at = float(round(self._read_at))
+        if abs(start - self._read_at) > 0.5:
+            start, switched = self._read_at - self._drift.slope * self.hop, True
+        reference = read_delayed(self._ref, end, self.hop, start, self._read_at)
+        if self._open and not self._refuted and end - self._drift.delay > self._open[0].start:
+            self._refuted = self._cannot_be(mic, reference)
+        if self._refuted:
+            reference = np.zeros(self.hop, np.float32)
+        ppm = -1e6 * self._drift.slope
+        return Aligned(reference, self._drift.delay, ppm, self._confidence, self._state(), switched)
+
+    def _cannot_be(self, mic: Samples, reference: Samples) -> bool:
+        """Whether the microphone holds 10 dB less than the reference at the old delay would bring there."""
+        if self._gain is None:
+            return False
+        expected = self._gain * float(np.dot(reference[: self.hop - PRE_ROLL], reference[: self.hop - PRE_ROLL]))
+        return float(np.dot(mic, mic)) < 0.1 * expected

@@ -1,0 +1,103 @@
+"""Samples by their absolute position, and reading them with a fractional delay that changes smoothly."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
+
+from edgefilter.types import Array, Samples
+
+HALF_WIDTH = 24
+"""Zero crossings of the interpolating sinc on each side; with the window below the error is under -80 dB up to 7.2 kHz."""
+
+
+@dataclass(frozen=True, slots=True)
+class Aligned:
+    """The reference as an aligner delivers it for one hop of the microphone.
+
+    reference: (hop,) float32, delayed so that the robot's direct sound lies PRE_ROLL samples behind it; zeros while no delay is
+    known. delay: samples, total delay of the direct sound at the end of the hop, nan if unknown. ppm: by how much the delay
+    shrinks, 1e-6 samples per sample. confidence: 0 to 1. state: "idle" (nothing of the reference can be audible), "searching",
+    "locked". realigned: the delay was switched discontinuously in this hop.
+    """
+
+    reference: Samples
+    delay: float
+    ppm: float
+    confidence: float
+    state: str
+    realigned: bool
+
+
+class Tape:
+    """The last `capacity` samples of a stream, addressed by the sample counter; samples that never were are zero."""
+
+    def __init__(self, capacity: int) -> None:
+        self._data = np.zeros(2 * capacity, np.float32)
+        self._capacity = capacity
+        self._at = capacity
+        self.end = 0
+
+    def push(self, samples: Samples) -> None:
+        """Append samples (n,), n <= capacity."""
+        if self._at + samples.size > self._data.size:
+            self._data[: self._capacity] = self._data[self._at - self._capacity : self._at]
+            self._at = self._capacity
+        self._data[self._at : self._at + samples.size] = samples
+        self._at += samples.size
+        self.end += samples.size
+
+    def read(self, start: int, stop: int) -> Samples:
+        """Samples start..stop-1 (stop - start,), a view where possible; zeros after the end and before what is kept."""
+        oldest = self.end - self._capacity
+        offset = self._at - self.end
+        if start >= oldest and stop <= self.end:
+            return self._data[start + offset : stop + offset]
+        out = np.zeros(stop - start, np.float32)
+        first, last = min(max(start, oldest), stop), max(min(stop, self.end), start)
+        if last > first:
+            out[first - start : last - start] = self._data[first + offset : last + offset]
+        return out
+
+
+def delay_kernel(fraction: Array) -> Array:
+    """Windowed-sinc filters that delay by fraction (m,) samples, each within about -1..2; (m, 2 * HALF_WIDTH) float32.
+
+    Tap k weighs the sample k - HALF_WIDTH + 1 behind the present one. h(k) = sinc(k - d) w(k - d) with the four-term Nuttall
+    window (1981, eq. 34) taken at the shifted position, so that the filter is exact for a whole number.
+    """
+    position = np.arange(1 - HALF_WIDTH, HALF_WIDTH + 1) - np.asarray(fraction, float)[:, None]
+    phase = np.clip(position / (HALF_WIDTH + 1.0), -1.0, 1.0) * np.pi
+    c = np.cos(phase)
+    window = 0.355768 + 0.487396 * c + 0.144232 * (2 * c * c - 1) + 0.012604 * (4 * c * c - 3) * c
+    return (np.sinc(position) * window).astype(np.float32)
+
+
+def read_delayed(tape: Tape, stop: int, count: int, delay_from: float, delay_to: float) -> Samples:
+    """Samples of the tape for the positions stop - count .. stop - 1 less a delay that runs from delay_from to delay_to.
+
+    Returns (count,) float32. The delay is delay_from just before the first sample and delay_to at the last one. Filters for the
+    two ends and the middle are applied to the whole stretch and interpolated by a parabola, which for a stretch of 256 samples
+    at 300 ppm errs by less than -75 dB at any frequency. Accurate while |delay_to - delay_from| < 0.5.
+    """
+    middle = 0.5 * (delay_from + delay_to)
+    whole = int(np.floor(middle))
+    kernels = delay_kernel(np.array([delay_from, middle, delay_to]) - whole)
+    source = tape.read(stop - count - whole - HALF_WIDTH, stop - whole + HALF_WIDTH - 1)
+    filtered = sliding_window_view(source, 2 * HALF_WIDTH) @ kernels[:, ::-1].T
+    u = np.arange(1, count + 1, dtype=np.float32) / np.float32(count)
+    weights = np.stack(((2 * u - 1) * (u - 1), 4 * u * (1 - u), u * (2 * u - 1)), axis=1)
+    return np.einsum("ij,ij->i", filtered, weights)
+
+
+def read_line(tape: Tape, stop: int, count: int, delay: float, slope: float, chunk: int = 256) -> Samples:
+    """Like read_delayed over any count: the delay is `delay` at the last sample and grows by slope per sample, (count,) float32."""
+    pieces = []
+    for start in range(0, count, chunk):
+        size = min(chunk, count - start)
+        end = stop - count + start + size
+        to = delay - slope * (stop - end)
+        pieces.append(read_delayed(tape, end, size, max(to - slope * size, 0.0), max(to, 0.0)))
+    return np.concatenate(pieces) if pieces else np.zeros(0, np.float32)

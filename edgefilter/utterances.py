@@ -1,0 +1,50 @@
+"""Where the robot's utterances begin and end in the reference."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from edgefilter.types import SAMPLE_RATE, Samples
+
+PAUSE = SAMPLE_RATE // 5
+"""Samples of silence after which the lag may be another one: shorter than any pause between two playbacks, longer than a plosive."""
+FLOOR = 1e-8
+"""Mean square under which a reference is silent whatever came before (-80 dB of full scale)."""
+RANGE = 10**-4.5
+"""A hop this far (45 dB) under the loudest of the last seconds is silence."""
+
+
+@dataclass
+class Utterance:
+    """A stretch of speech in the reference, positions in samples; start lies up to two hops before the first sound."""
+
+    start: int
+    end: int
+
+
+class OnsetDetector:
+    """Cuts the reference into utterances, hop by hop."""
+
+    def __init__(self, hop: int) -> None:
+        self._hop = hop
+        self._peak = 0.0
+        self._decay = 0.1 ** (hop / (10.0 * SAMPLE_RATE))
+        self.now = 0
+        self.current: Utterance | None = None
+        self.active = False
+
+    def step(self, ref: Samples) -> Utterance | None:
+        """Take a hop (hop,) and return the utterance that begins with it, if one does; `current` grows while it lasts."""
+        self.now += self._hop
+        power = float(np.dot(ref, ref)) / self._hop
+        self._peak = max(power, self._peak * self._decay)
+        self.active = power > max(FLOOR, RANGE * self._peak)
+        if not self.active:
+            return None
+        fresh = self.current is None or self.now - self.current.end > PAUSE
+        if fresh:
+            self.current = Utterance(self.now - 2 * self._hop, self.now)
+        self.current.end = self.now
+        return self.current if fresh else None
