@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import argparse
 
-from edgefilter.calibrate import describe
 from edgefilter.commands.display import write_json
 from edgefilter.errors import UsageError
 from edgefilter.profile import Profile
+from edgefilter.profile_text import describe
 
 
 def main(args: argparse.Namespace) -> int:

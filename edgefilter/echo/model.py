@@ -10,8 +10,8 @@ from scipy import signal
 
 from edgefilter.types import Array, Samples
 
-PRE_ROLL = 32
-"""Samples of the impulse response before the direct sound, room for what a band-limited response rings ahead of it."""
+PRE_ROLL = 64
+"""Samples (4 ms) of the impulse response before the direct sound: what equalisers and linear-phase filters of a loudspeaker ring ahead of it."""
 
 Values = Mapping[str, "float | Array"]
 

@@ -21,7 +21,7 @@ LAYERS = [
     {"types", "errors"},
     {"stft", "ring", "metrics"},
     {"echo"},
-    {"profile", "profile_file", "delay_line", "lag_search", "alignment", "canceller", "residual", "engines"},
+    {"profile", "profile_file", "profile_text", "delay_line", "lag_search", "alignment", "canceller", "residual", "engines"},
     {"stream", "audio", "run"},
     {"sweep", "paper_response", "trust", "calibrate"},
     {"report"},
