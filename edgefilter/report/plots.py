@@ -35,7 +35,7 @@ def plot_profile(profile: Profile, path: str | Path) -> None:
     _draw_spectra(axes[1, 0], profile)
     _draw_bands(axes[1, 1], profile)
     if profile.warnings:
-        figure.suptitle("not to be trusted: " + "; ".join(text.split(":")[0] for text in profile.warnings)[:110], color=ACCENT, fontsize=9)
+        figure.suptitle("not to be trusted: " + "; ".join(text.split(":")[0][:60] for text in profile.warnings)[:140], color=ACCENT, fontsize=9)
     _save(figure, path)
 
 
@@ -76,7 +76,7 @@ def _draw_bands(axis, profile: Profile) -> None:
     axis.axhline(10, color=INK, linewidth=0.8, linestyle=":")
     axis.set_xscale("log")
     orders = ", ".join(f"{order}: {level:.0f}" for order, level in zip(DISTORTION_ORDERS, profile.distortion_db, strict=True))
-    _label(axis, f"Signal-to-noise ratio of the sweep; distortion by order, dB: {orders}", "Hz", "dB")
+    _label(axis, f"Signal-to-noise ratio of the sweep by third octave\nharmonic distortion by order, dB: {orders}", "Hz", "dB")
 
 
 def _label(axis, title: str, x: str, y: str) -> None:
