@@ -93,7 +93,8 @@ def read_utterance(rng: np.random.Generator, clips: list[Clip], at_least: float)
 
 def draw_robot(rng: np.random.Generator) -> Robot:
     direction = np.array([*rng.uniform(-1, 1, size=2), rng.uniform(-0.8, -0.1)])
-    return Robot(draw_loudspeaker(rng), draw_body(rng), rng.uniform(0.1, 0.3), direction / np.linalg.norm(direction), int(rng.integers(250, 635)))
+    direction /= np.linalg.norm(direction)
+    return Robot(draw_loudspeaker(rng), draw_body(rng), rng.uniform(0.1, 0.3), direction, int(rng.integers(250, 635)))
 
 
 def with_distortion(robot: Robot, played: Array, response: Array, nl_db: float) -> tuple[Robot, float]:
@@ -164,11 +165,18 @@ def make_script(rng: np.random.Generator, kind: str, voice: list[Clip], human_si
 
 
 def record_all(
-    rng: np.random.Generator, unfiltered_db: tuple[float, float], robot: Robot, paths: tuple[Array, Array], played: Array, clean: Array, span: slice
+    rng: np.random.Generator,
+    unfiltered_db: tuple[float, float],
+    robot: Robot,
+    paths: tuple[Array, Array],
+    played: Array,
+    clean: Array,
+    span: slice,
 ) -> tuple[dict[str, Array], dict[str, float]]:
     """Calibration in the first path's room and conversation in the second's, with all levels set, and the figures that they have.
 
-    The gain makes the sweep peak at 0.22-0.42 of full scale, the human is scaled to the unfiltered SI-SDR, the fan to 4.5-10.5 dB below the human.
+    The gain makes the sweep peak at 0.22-0.42 of full scale; the human is scaled to the unfiltered SI-SDR, the fan to 4.5-10.5 dB
+    below the human.
     """
     excitation = sweep()
     sweep_echo = robot.record(excitation, paths[0])

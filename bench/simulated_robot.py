@@ -67,7 +67,7 @@ class Loudspeaker:
 
 
 def draw_loudspeaker(rng: np.random.Generator) -> Loudspeaker:
-    """A driver of a small robot: resonance 180-320 Hz, a treble roll-off, a few broad peaks of the enclosure and the microphone's low cut."""
+    """A driver of a small robot: resonance 180-320 Hz, treble roll-off, broad peaks of the enclosure, the microphone's low cut."""
     sections = [signal.butter(2, rng.uniform(6300, 7500), "low", fs=RATE, output="sos")]
     sections.append(signal.butter(1, rng.uniform(40, 90), "high", fs=RATE, output="sos"))
     for _ in range(4):

@@ -1,0 +1,105 @@
+"""Two public echo cancellers as rows of the benchmark: SpeexDSP (the system's library, through ctypes) and WebRTC AEC3 (pywebrtc-audio)."""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import numpy as np
+
+from edgefilter.errors import UsageError
+from edgefilter.types import SAMPLE_RATE, Samples, as_samples
+
+FRAME = 256
+"""SpeexDSP samples per call, 16 ms; its manual asks for 10-20 ms."""
+TAIL = 6400
+"""SpeexDSP filter length, 400 ms: an office's reverberation."""
+_SET_ECHO_RATE, _SET_ECHO_STATE = 24, 24  # SPEEX_ECHO_SET_SAMPLING_RATE, SPEEX_PREPROCESS_SET_ECHO_STATE
+SUPPRESSED_DELAY = FRAME
+"""Samples by which SpeexDSP's preprocessor delays the signal (its windows overlap by one frame); removed here."""
+AEC3_DELAY = 128
+"""Samples by which AEC3 delays the signal (it regroups frames of 80 samples into blocks of 64 and back); removed here."""
+
+
+def speexdsp(mic: Samples, ref: Samples) -> Samples:
+    """SpeexDSP's echo canceller alone (MDF, Valin 2007), (n,) float32 for mic and ref (n,); output aligned with the input.
+
+    Raises UsageError where libspeexdsp.so.1 is missing.
+    """
+    return _speexdsp(mic, ref, suppress=False)
+
+
+def speexdsp_suppressed(mic: Samples, ref: Samples) -> Samples:
+    """SpeexDSP's echo canceller followed by its preprocessor (residual echo and noise suppression, default strengths), as in its manual."""
+    return _speexdsp(mic, ref, suppress=True)
+
+
+def aec3(mic: Samples, ref: Samples) -> Samples:
+    """WebRTC AEC3 with its own delay estimator and high-pass, (n,) float32 for mic and ref (n,); output aligned with the input.
+
+    Raises UsageError where pywebrtc-audio is missing.
+    """
+    try:
+        from pywebrtc_audio import EchoCanceller
+    except ImportError as error:
+        raise UsageError("AEC3 needs the package pywebrtc-audio: pip install pywebrtc-audio") from error
+    mic, ref = (np.append(as_samples(x, name), np.zeros(AEC3_DELAY, np.float32)) for x, name in ((mic, "mic"), (ref, "ref")))
+    return np.asarray(EchoCanceller(sample_rate=SAMPLE_RATE).process(mic, ref), np.float32)[AEC3_DELAY:]
+
+
+def _speexdsp(mic: Samples, ref: Samples, suppress: bool) -> Samples:
+    mic, ref = as_samples(mic, "mic"), as_samples(ref, "ref")
+    delay = SUPPRESSED_DELAY if suppress else 0
+    frames = -(-(mic.size + delay) // FRAME)
+    padding = (0, frames * FRAME - mic.size)
+    near, far = (np.rint(np.clip(np.pad(x, padding) * 32768.0, -32768, 32767)).astype(np.int16) for x in (mic, ref))
+    out = np.zeros_like(near)
+    with _echo_state(suppress) as (library, echo, preprocessor):
+        for at in range(0, near.size, FRAME):
+            library.speex_echo_cancellation(echo, _at(near, at), _at(far, at), _at(out, at))
+            if preprocessor:
+                library.speex_preprocess_run(preprocessor, _at(out, at))
+    return out[delay : delay + mic.size].astype(np.float32) / 32768.0
+
+
+@contextmanager
+def _echo_state(suppress: bool) -> Iterator[tuple[ctypes.CDLL, ctypes.c_void_p, ctypes.c_void_p | None]]:
+    library = _load()
+    rate = ctypes.c_int(SAMPLE_RATE)
+    echo = ctypes.c_void_p(library.speex_echo_state_init(FRAME, TAIL))
+    library.speex_echo_ctl(echo, _SET_ECHO_RATE, ctypes.byref(rate))
+    preprocessor = ctypes.c_void_p(library.speex_preprocess_state_init(FRAME, SAMPLE_RATE)) if suppress else None
+    try:
+        if preprocessor:
+            library.speex_preprocess_ctl(preprocessor, _SET_ECHO_STATE, echo)
+        yield library, echo, preprocessor
+    finally:
+        if preprocessor:
+            library.speex_preprocess_state_destroy(preprocessor)
+        library.speex_echo_state_destroy(echo)
+
+
+def _load() -> ctypes.CDLL:
+    try:
+        library = ctypes.CDLL("libspeexdsp.so.1")
+    except OSError as error:
+        raise UsageError("libspeexdsp.so.1 cannot be loaded, expected SpeexDSP 1.2: apt-get install libspeexdsp1") from error
+    pointer, integer = ctypes.c_void_p, ctypes.c_int
+    for name, result, arguments in (
+        ("speex_echo_state_init", pointer, (integer, integer)),
+        ("speex_echo_state_destroy", None, (pointer,)),
+        ("speex_echo_ctl", integer, (pointer, integer, pointer)),
+        ("speex_echo_cancellation", None, (pointer, pointer, pointer, pointer)),
+        ("speex_preprocess_state_init", pointer, (integer, integer)),
+        ("speex_preprocess_state_destroy", None, (pointer,)),
+        ("speex_preprocess_ctl", integer, (pointer, integer, pointer)),
+        ("speex_preprocess_run", integer, (pointer, pointer)),
+    ):
+        function = getattr(library, name)
+        function.restype, function.argtypes = result, arguments
+    return library
+
+
+def _at(samples: np.ndarray, at: int) -> ctypes.c_void_p:
+    return ctypes.c_void_p(samples.ctypes.data + at * samples.itemsize)

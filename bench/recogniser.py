@@ -1,0 +1,143 @@
+"""Word errors by Whisper-base (faster-whisper, int8, one thread), from a folder on this machine; nothing is fetched.
+
+The folder holds a CTranslate2 conversion: model.bin, config.json, tokenizer.json, vocabulary.json. Transcripts are kept in a
+JSON-lines file under the audio's hash, so that no audio is recognised twice.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+import jiwer
+import numpy as np
+
+from edgefilter.errors import UsageError
+from edgefilter.types import Samples, as_samples
+
+SETTINGS = {"language": "en", "beam_size": 1, "temperature": 0.0, "condition_on_previous_text": False, "without_timestamps": True}
+PEAK = 0.5
+"""Every input is scaled to this peak, so that the recogniser does not judge levels."""
+_TEENS = "ten eleven twelve thirteen fourteen fifteen sixteen seventeen eighteen nineteen"
+_SMALL = f"zero one two three four five six seven eight nine {_TEENS}".split()
+_TENS = "_ _ twenty thirty forty fifty sixty seventy eighty ninety".split()
+_ORDINALS = {"one": "first", "two": "second", "three": "third", "five": "fifth", "eight": "eighth", "nine": "ninth", "twelve": "twelfth"}
+_TITLES = {"mr": "mister", "mrs": "missus", "dr": "doctor", "st": "saint"}
+
+
+@dataclass(frozen=True, slots=True)
+class WordErrors:
+    """Errors (substitutions, deletions, insertions) against a text of `words` words."""
+
+    errors: int
+    words: int
+
+    @property
+    def rate(self) -> float:
+        """Word error rate, 0 to far above 1 where words were invented or the robot's were recognised."""
+        return self.errors / self.words
+
+    @property
+    def capped(self) -> float:
+        """The rate, at most 1: worse than hearing nothing counts as hearing nothing."""
+        return min(self.rate, 1.0)
+
+
+def word_errors(text: str, recognised: str) -> WordErrors:
+    """Levenshtein distance in words after `normalise` of both. Raises UsageError for a text without words."""
+    text, recognised = normalise(text), normalise(recognised)
+    if not text:
+        raise UsageError("the text to compare with has no words, expected what the human says: check the transcript")
+    if not recognised:
+        return WordErrors(len(text.split()), len(text.split()))
+    counts = jiwer.process_words(text, recognised)
+    return WordErrors(counts.substitutions + counts.deletions + counts.insertions, len(text.split()))
+
+
+def normalise(text: str) -> str:
+    """Lower case; integers and ordinals as words (1100-1999 read as years); mr, mrs, dr, st spelt out; of the punctuation only
+    apostrophes inside words stay. British and American spellings are left alone (both are in the recordings).
+
+    >>> normalise("Mr. Brown's 3rd dog, born in 1839 -- 21 years!")
+    "mister brown's third dog born in eighteen thirty nine twenty one years"
+    """
+    text = text.lower().replace("\u2019", "'").replace("\u2018", "'")
+    text = re.sub(r"(?<=\d),(?=\d{3})", "", text)
+    text = re.sub(r"\d+(st|nd|rd|th)?", lambda found: f" {_number(found[0])} ", text)
+    text = re.sub(r"[^a-z' ]+", " ", text)
+    words = (word.strip("'") for word in text.split())
+    return " ".join(_TITLES.get(word, word) for word in words if word)
+
+
+def _number(found: str) -> str:
+    digits = found.rstrip("stndrh")
+    words = _spell(int(digits)).split()
+    if digits != found:
+        last = words[-1]
+        words[-1] = _ORDINALS.get(last) or (last[:-1] + "ieth" if last.endswith("y") else last + "th")
+    return " ".join(words)
+
+
+def _spell(n: int) -> str:
+    if n < 20:
+        return _SMALL[n]
+    if n < 100:
+        return _TENS[n // 10] + (f" {_SMALL[n % 10]}" if n % 10 else "")
+    if 1100 <= n < 2000 and n % 100 >= 10:
+        return f"{_spell(n // 100)} {_spell(n % 100)}"
+    for unit, name in ((10**9, "billion"), (10**6, "million"), (1000, "thousand"), (100, "hundred")):
+        if n >= unit:
+            return f"{_spell(n // unit)} {name}" + (f" {_spell(n % unit)}" if n % unit else "")
+    raise AssertionError(n)
+
+
+class Recogniser:
+    """Transcribes with the model in a folder; loads it only for audio that the cache does not know.
+
+    folder: the CTranslate2 model. cache: a JSON-lines file of {"key", "text"}, made where missing, appended to at once.
+    Raises UsageError where the folder holds no model.
+    """
+
+    def __init__(self, folder: Path, cache: Path) -> None:
+        config = folder / "config.json"
+        if not (folder / "model.bin").is_file() or not config.is_file():
+            raise UsageError(f"{folder} holds no model.bin and config.json; expected a CTranslate2 conversion of Whisper-base")
+        identity = f"{(folder / 'model.bin').stat().st_size} {config.read_text()} {SETTINGS} {PEAK}"
+        self._identity = hashlib.sha256(identity.encode()).hexdigest()
+        self._folder, self._cache, self._model = folder, cache, None
+        cache.parent.mkdir(parents=True, exist_ok=True)
+        lines = cache.read_text(encoding="utf-8").splitlines() if cache.exists() else []
+        self._known = {entry["key"]: entry["text"] for entry in map(_entry, lines) if entry}
+
+    def transcribe(self, samples: Samples) -> str:
+        """What Whisper hears in samples (n,), 16 kHz; silence gives an empty text."""
+        samples = as_samples(samples, "samples")
+        peak = float(np.abs(samples).max(initial=0.0))
+        if peak == 0.0:
+            return ""
+        samples = samples * np.float32(PEAK / peak)
+        key = hashlib.sha256(self._identity.encode() + samples.tobytes()).hexdigest()
+        if key not in self._known:
+            self._known[key] = self._recognise(samples)
+            with self._cache.open("a", encoding="utf-8") as lines:
+                lines.write(json.dumps({"key": key, "text": self._known[key]}) + "\n")
+        return self._known[key]
+
+    def _recognise(self, samples: Samples) -> str:
+        if self._model is None:
+            from faster_whisper import WhisperModel
+
+            self._model = WhisperModel(str(self._folder), device="cpu", compute_type="int8", cpu_threads=1, local_files_only=True)
+        segments, _ = self._model.transcribe(samples, **SETTINGS)
+        return " ".join(segment.text.strip() for segment in segments)
+
+
+def _entry(line: str) -> dict | None:
+    """A cache line, or None for the last one of a run that was cut off while writing."""
+    try:
+        return json.loads(line)
+    except json.JSONDecodeError:
+        return None
