@@ -35,9 +35,10 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--conversations", type=Path, required=True)
     parser.add_argument("--whisper", type=Path, required=True)
+    parser.add_argument("--cache", type=Path, default=Path("transcripts.jsonl"), help="transcripts by hash of the audio (default: %(default)s)")
     parser.add_argument("--output", type=Path, required=True)
     args = parser.parse_args()
-    recogniser = Recogniser(args.whisper)
+    recogniser = Recogniser(args.whisper, args.cache)
     folders = sorted(path.parent for path in args.conversations.glob("*/meta.json"))
     rows = {alpha: [] for alpha in ALPHAS}
     for folder in tqdm(folders):
@@ -48,18 +49,18 @@ def main() -> None:
         for alpha in ALPHAS:
             stream = Stream(PaperSpectralSubtraction(profile.response_bins(PAPER_STFT), alpha=alpha), profile)
             out = np.concatenate((stream.process(mic, ref), stream.flush()))
-            errors, words = word_errors(meta["text"], recogniser(out[span]))
-            rows[alpha].append((meta["room"], si_sdr(out[span], clean[span]), errors, words, float(np.abs(out).max())))
+            found = word_errors(meta["text"], recogniser.transcribe(out[span]))
+            rows[alpha].append((meta["room"], si_sdr(out[span], clean[span]), found, float(np.abs(out).max())))
     table = []
     for alpha, results in rows.items():
         for room in ("lab", "office"):
             of = [r for r in results if r[0] == room]
-            wer = sum(min(r[2], r[3]) for r in of) / sum(r[3] for r in of)
+            wer = sum(r[2].capped * r[2].words for r in of) / sum(r[2].words for r in of)
             table.append({"alpha": alpha, "room": room, "capped_wer": wer, "si_sdr_db": float(np.mean([r[1] for r in of])), "conversations": len(of)})
             print(table[-1])
     mean = {alpha: np.mean([row["capped_wer"] for row in table if row["alpha"] == alpha]) for alpha in ALPHAS}
     best = min(mean, key=mean.get)
-    peak = max(r[4] for r in rows[best])
+    peak = max(r[3] for r in rows[best])
     beta = next((b for b in BETAS if b * peak < 1.0), 1.0)
     print(f"alpha {best}, beta {beta} (peak {peak:.2f})")
     args.output.write_text(json.dumps({"alpha": best, "beta": beta, "rows": table}, indent=1) + "\n")

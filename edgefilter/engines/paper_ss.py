@@ -48,7 +48,7 @@ class PaperSpectralSubtraction:
     The paper leaves open, and this implementation takes: hop 160 and a 400-sample Hann analysis window, zero-padded to the
     1200 points that the paper's 601 bins imply (VoiceFilter's sizes); a Hann smoothing window without its zero end points,
     normalised to sum 1; digital silence before and after the recording, for which eq. (6) gives SM = 1; and alpha, beta
-    chosen for the lowest word errors on simulated validation conversations (bench/tune_paper_ss.py).
+    chosen for the lowest word errors on 24 simulated validation conversations (bench/tune_paper_ss.py): alpha 4, beta 2.
 
     lookahead is L frames. causal=True moves the window L frames back, so that it needs none (2 L + 1 frames of the past).
     """
@@ -57,7 +57,7 @@ class PaperSpectralSubtraction:
     front: ClassVar[Front] = "paper"
     stft = PAPER_STFT
 
-    def __init__(self, response: Samples, alpha: float = 2.0, beta: float = 1.0, causal: bool = False) -> None:
+    def __init__(self, response: Samples, alpha: float = 4.0, beta: float = 2.0, causal: bool = False) -> None:
         if response.shape != (self.stft.bins,):
             raise UsageError(f"response has shape {response.shape}, paper-ss expects ({self.stft.bins},): calibrate this robot again")
         window = smoothing_window()
