@@ -65,7 +65,7 @@ class Aligner:
         self._to_search, self._to_measure = SEARCH_STRIDE, STRIDE // 2
         self._read_at = float("nan")
         self._gain: float | None = None
-        self._refuted = False
+        self._refuted = self._trusted = self._measured = False
         self._confidence, self._lost = 0.0, 0
         self._counts = {"utterances": 0, "realignments": 0, "jumps": 0, "searches": 0, "announced": 0}
 
@@ -88,6 +88,7 @@ class Aligner:
             self._counts["utterances"] += 1
         self._expire()
         before = self._read_at
+        self._measured = False
         if self._known:
             self._drift.advance(self.hop)
         switched = self._measure() if self._known else False
@@ -121,21 +122,24 @@ class Aligner:
         if self._open:
             end = self._open[1].start if len(self._open) > 1 else self._onsets.current.end
             if self._ref.end > end + self._max_lag + SAMPLE_RATE // 4:
-                self._resolve()
+                self._resolve(found=False)
 
-    def _resolve(self) -> None:
+    def _resolve(self, found: bool = True) -> None:
         self._open.popleft()
+        self._trusted = found
         self._last_candidate = None
         self._refuted = False
 
     def _search(self) -> bool:
         """Now and then look for the oldest unresolved utterance over all lags; True if the delay was switched."""
         self._to_search -= self.hop
-        if not self._open or self._to_search > 0:
+        if not self._open or self._to_search > 0 or self._measured:
             return False
         self._to_search = SEARCH_STRIDE
         self._counts["searches"] += 1
-        found = self._lags.find(self._mic, self._ref, self._ref.end, self._open[0].start)
+        oldest = self._open[0]
+        heard_out = oldest.after + int(self._drift.delay) if self._trusted else oldest.start
+        found = self._lags.find(self._mic, self._ref, self._ref.end, oldest.start, heard_out)
         last, self._last_candidate = self._last_candidate, found
         if found is None or not self._decided(found, last):
             return False
@@ -163,7 +167,8 @@ class Aligner:
     def _measure(self) -> bool:
         """Now and then measure the error of the present delay; True if it jumped."""
         self._to_measure -= self.hop
-        if self._to_measure > 0:
+        self._measured = self._to_measure <= 0
+        if not self._measured:
             return False
         self._to_measure = STRIDE
         heard_end = self._ref.end - self._drift.delay
@@ -211,6 +216,7 @@ class Aligner:
         if self._lost >= LOST_BLOCKS:
             self._lost = 0
             start = int(self._ref.end - self._drift.delay) - SAMPLE_RATE // 2
+            self._trusted = False
             self._open.append(Utterance(start, self._ref.end))
 
     def _deliver(self, mic: Samples, before: float, switched: bool) -> Aligned:

@@ -13,6 +13,8 @@ from edgefilter.types import Samples
 
 WINDOW = 7168
 """Samples of the microphone that one search looks at, 0.45 s."""
+MINIMUM = 1280
+"""Samples (80 ms) of an utterance that must have been heard before its lag is believed: less of any two sounds may agree by chance."""
 SMOOTHING = 65
 """Bins over which spectra are averaged for the whitening, about 30 Hz: voice harmonics are flattened, so pitch makes no side peak."""
 APART = 320
@@ -46,10 +48,13 @@ class LagSearch:
             spectrum = np.conj(fft.rfft(np.roll(np.pad(response, (0, self._size - response.size)), -pre_roll)))
             self._phase = (spectrum / np.maximum(np.abs(spectrum), 1e-12)).astype(np.complex64)
 
-    def find(self, mic: Tape, ref: Tape, now: int, since: int) -> Candidate | None:
-        """The best lag for what of the reference lies after position `since`; None where there is nothing to compare."""
-        size, skipped = self._size, max(since - (now - WINDOW), 0)
-        if skipped >= WINDOW - 512:
+    def find(self, mic: Tape, ref: Tape, now: int, since: int, mic_since: int) -> Candidate | None:
+        """The best lag between the reference after position `since` and the microphone after `mic_since`.
+
+        None where there is nothing to compare, or where less than MINIMUM of them would overlap at the best lag.
+        """
+        size, skipped = self._size, max(max(mic_since, since) - (now - WINDOW), 0)
+        if skipped >= WINDOW - MINIMUM:
             return None
         x, r = np.zeros(size, np.float32), np.zeros(size, np.float32)
         x[size - WINDOW + skipped :] = mic.read(now - WINDOW + skipped, now)
@@ -60,14 +65,18 @@ class LagSearch:
             return None
         correlation = fft.irfft(self._whiten(fft.rfft(x), fft.rfft(r)), size)[: self.max_lag]
         score = correlation / np.sqrt(overlap + 0.1 * overlap.max())
-        return self._judge(score if self._signed else np.abs(score), overlap)
+        found = self._judge(score if self._signed else np.abs(score), overlap)
+        return None if found is None or now - since - found.lag < MINIMUM else found
 
     def _overlap(self, r: Samples, mic_start: int) -> Samples:
         """(max_lag,) energy of the reference, first difference, that falls under the microphone's window at each lag."""
         step = np.diff(r, prepend=r[:1])
         total = np.concatenate(([0.0], np.cumsum(np.square(step, dtype=np.float64))))
-        lags = np.arange(self.max_lag)
-        return (total[self._size - lags] - total[np.maximum(mic_start - lags, 0)]).astype(np.float32)
+        upper = total[self._size - self.max_lag + 1 : self._size + 1][::-1]
+        lower = np.zeros(self.max_lag)
+        count = min(self.max_lag, mic_start + 1)
+        lower[:count] = total[mic_start - count + 1 : mic_start + 1][::-1]
+        return (upper - lower).astype(np.float32)
 
     def _whiten(self, x: np.ndarray, r: np.ndarray) -> np.ndarray:
         power = _power(x)

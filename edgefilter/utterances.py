@@ -18,10 +18,13 @@ RANGE = 10**-4.5
 
 @dataclass
 class Utterance:
-    """A stretch of speech in the reference, positions in samples; start lies up to two hops before the first sound."""
+    """A stretch of speech in the reference, positions in samples; start lies up to two hops before the first sound.
+
+    after: end of the one before it, which the microphone hears out first, since one loudspeaker plays them in turn."""
 
     start: int
     end: int
+    after: int = -(10**9)
 
 
 class OnsetDetector:
@@ -45,6 +48,7 @@ class OnsetDetector:
             return None
         fresh = self.current is None or self.now - self.current.end > PAUSE
         if fresh:
-            self.current = Utterance(self.now - 2 * self._hop, self.now)
+            after = self.current.end if self.current else -(10**9)
+            self.current = Utterance(self.now - 2 * self._hop, self.now, after)
         self.current.end = self.now
         return self.current if fresh else None
