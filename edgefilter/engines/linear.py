@@ -1,0 +1,26 @@
+"""The engine that trusts the linear stage alone: what the canceller could not predict is the answer."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+from edgefilter.engines.base import EngineState, Front
+from edgefilter.stft import StftConfig
+from edgefilter.types import Frame, Output
+
+
+class Linear:
+    """Returns the linear stage's error: nothing is masked, so the human is not distorted and the fan stays."""
+
+    name: ClassVar[str] = "linear"
+    front: ClassVar[Front] = "full"
+
+    def __init__(self, stft: StftConfig = StftConfig()) -> None:
+        self.stft = stft
+        self.lookahead = 0
+
+    def initial_state(self) -> EngineState:
+        return None
+
+    def step(self, frame: Frame, state: EngineState) -> tuple[Output, EngineState]:
+        return Output(frame.error), state

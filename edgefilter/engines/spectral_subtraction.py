@@ -1,0 +1,45 @@
+"""'ss': a gentle Wiener mask on the linear stage's error, from the power spectra of what is known to be left in it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from edgefilter.engines.base import Front
+from edgefilter.stft import StftConfig
+from edgefilter.types import Frame, Output, Samples
+
+FLOOR = 0.18
+"""Least gain, -15 dB: lower floors raise word errors."""
+MEMORY = 0.9
+"""Decision-directed smoothing of the a-priori signal-to-noise ratio."""
+
+
+@dataclass(frozen=True, slots=True)
+class MaskState:
+    """Power of the previous answer (bins,)."""
+
+    answered: Samples
+
+
+class SpectralSubtraction:
+    """Wiener gain xi / (1 + xi) with the decision-directed a-priori ratio xi of Ephraim & Malah (1984), eq. (51)."""
+
+    name: ClassVar[str] = "ss"
+    front: ClassVar[Front] = "full"
+
+    def __init__(self, stft: StftConfig = StftConfig()) -> None:
+        self.stft = stft
+        self.lookahead = 0
+
+    def initial_state(self) -> MaskState:
+        return MaskState(np.zeros(self.stft.bins, np.float32))
+
+    def step(self, frame: Frame, state: MaskState) -> tuple[Output, MaskState]:
+        unwanted = frame.noise_psd + frame.residual_psd + 1e-12
+        observed = frame.error.real**2 + frame.error.imag**2
+        ratio = MEMORY * state.answered / unwanted + (1.0 - MEMORY) * np.maximum(observed / unwanted - 1.0, 0.0)
+        gain = np.maximum(ratio / (1.0 + ratio), FLOOR).astype(np.float32)
+        return Output(gain * frame.error), MaskState(gain**2 * observed)

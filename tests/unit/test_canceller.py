@@ -1,0 +1,138 @@
+"""The linear stage: it finds a path, starts from a known one, leaves the human alone and survives double talk."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy import signal
+
+from edgefilter.canceller import Canceller
+from edgefilter.errors import SignalError
+
+HOP = 256
+
+
+def path(seed: int = 0, taps: int = 3000) -> np.ndarray:
+    """A decaying random path with its direct sound at 32 samples."""
+    rng = np.random.default_rng(seed)
+    h = 0.03 * rng.standard_normal(taps) * np.exp(-np.arange(taps) / 500)
+    h[:32] = 0.0
+    h[32] = 0.5
+    return h.astype(np.float32)
+
+
+def speechlike(seconds: float, seed: int = 1) -> np.ndarray:
+    """Coloured noise whose level moves at the rate of syllables."""
+    rng = np.random.default_rng(seed)
+    n = int(seconds * 16000)
+    noise = signal.lfilter([1.0], [1.0, -0.9], rng.standard_normal(n))
+    level = 0.55 + 0.45 * np.sin(2 * np.pi * 4 * np.arange(n) / 16000 + rng.uniform(0, 6))
+    return (0.03 * noise * level).astype(np.float32)
+
+
+def run(canceller: Canceller, mic: np.ndarray, reference: np.ndarray) -> np.ndarray:
+    hop = canceller.hop
+    steps = [canceller.step(mic[i : i + hop], reference[i : i + hop]).error for i in range(0, mic.size - hop + 1, hop)]
+    return np.concatenate(steps)
+
+
+def db(x: np.ndarray) -> float:
+    return float(10 * np.log10(np.mean(np.square(x, dtype=np.float64)) + 1e-20))
+
+
+@pytest.mark.parametrize("hop", [160, 256, 200])
+def test_known_path_cancels_to_float_precision_from_the_first_hop(hop: int) -> None:
+    h, x = path(), speechlike(1.0)
+    mic = signal.oaconvolve(x, h)[: x.size].astype(np.float32)
+    error = run(Canceller(hop, 6400, h), mic, x)
+    # float32 transforms leave -100 dB and less; 60 dB is asked for because adaptation noise comes on top
+    assert db(error[: 5 * hop]) < db(mic[: 5 * hop]) - 60
+
+
+def test_unknown_path_is_learnt() -> None:
+    h, x = path(), speechlike(6.0)
+    mic = signal.oaconvolve(x, h)[: x.size].astype(np.float32)
+    error = run(Canceller(HOP, 3200), mic, x)
+    # 20 dB: what the published filter reaches within some seconds on coloured noise without any noise at the microphone
+    assert db(error[-16000:]) < db(mic[-16000:]) - 20
+
+
+def test_error_and_echo_add_up_to_the_microphone_exactly() -> None:
+    x, mic = speechlike(0.5), speechlike(0.5, seed=5)
+    canceller = Canceller(HOP, 1600, path(taps=1600))
+    for i in range(0, x.size - HOP + 1, HOP):
+        out = canceller.step(mic[i : i + HOP], x[i : i + HOP])
+        assert np.array_equal(out.error, mic[i : i + HOP] - out.echo)
+
+
+def test_echo_of_a_hop_depends_on_nothing_later_than_the_hop() -> None:
+    x, h = speechlike(1.0), path()
+    mic = signal.oaconvolve(x, h)[: x.size].astype(np.float32)
+    other = x.copy()
+    other[8192:] = 0.1
+    first, second = run(Canceller(HOP, 3200, h), mic, x), run(Canceller(HOP, 3200, h), mic, other)
+    assert np.array_equal(first[:8192], second[:8192])
+
+
+def test_human_as_loud_as_the_robot_does_not_make_it_diverge() -> None:
+    h, x, human = path(), speechlike(8.0), speechlike(8.0, seed=9)
+    echo = signal.oaconvolve(x, h)[: x.size].astype(np.float32)
+    human *= np.float32(10 ** ((db(echo) - db(human)) / 20))
+    canceller = Canceller(HOP, 3200, h)
+    error = run(canceller, echo + human, x)
+    # the filter was right at the start: what double talk at 0 dB breaks must stay 12 dB below the human
+    assert db(error - human[: error.size]) < db(human) - 12
+
+
+def test_silent_reference_neither_adapts_nor_ages() -> None:
+    h = path(taps=1600)
+    canceller = Canceller(HOP, 1600, h)
+    before = canceller.impulse_response()
+    human = speechlike(2.0)
+    error = run(canceller, human, np.zeros_like(human))
+    assert np.array_equal(error, human[: error.size])
+    assert np.array_equal(canceller.impulse_response(), before)
+
+
+def test_rewritten_reference_equals_a_reference_that_always_had_the_new_delay() -> None:
+    h, x = path(), speechlike(2.0)
+    moved = np.concatenate((np.zeros(300, np.float32), x))[: x.size]
+    at = 64 * HOP
+    switched, always = Canceller(HOP, 3200, h), Canceller(HOP, 3200, h)
+    silence = np.zeros(HOP, np.float32)
+    for i in range(0, at, HOP):
+        switched.step(silence, silence)
+        always.step(silence, moved[i : i + HOP])
+    always._weights[:] = switched._weights
+    switched.rewrite_reference(moved[: at + HOP][-switched.history :])
+    a = switched.step(silence, moved[at : at + HOP]).echo
+    b = always.step(silence, moved[at : at + HOP]).echo
+    # identical spectra up to float32 rounding
+    assert np.abs(b).max() > 1e-3
+    np.testing.assert_allclose(a, b, atol=1e-6)
+
+
+def test_reset_is_a_fresh_start() -> None:
+    x, mic = speechlike(1.0), speechlike(1.0, seed=3)
+    canceller = Canceller(HOP, 1600)
+    first = run(canceller, mic, x)
+    canceller.reset()
+    assert np.array_equal(run(canceller, mic, x), first)
+
+
+def test_adapted_path_can_be_exported() -> None:
+    h, x = path(taps=1600), speechlike(6.0)
+    mic = signal.oaconvolve(x, h)[: x.size].astype(np.float32)
+    canceller = Canceller(HOP, 1600)
+    run(canceller, mic, x)
+    found = canceller.impulse_response()
+    assert found.shape == (canceller.taps,)
+    # within -15 dB of the true path after six seconds from nothing
+    assert db(found[:1600] - h) < db(h) - 15
+
+
+def test_bad_sizes_and_paths_are_refused() -> None:
+    with pytest.raises(SignalError, match="hop=0"):
+        Canceller(0)
+    with pytest.raises(SignalError, match="finite"):
+        Canceller(impulse_response=np.full(64, np.nan, np.float32))
