@@ -62,7 +62,6 @@ class Canceller:
                 raise SignalError("the canceller's impulse response is not a finite (n,) array: calibrate again")
             known = min(self.taps, impulse_response.size)
             self._initial[:known] = impulse_response[:known]
-        self._constraint_at = 0
         self.reset()
 
     @property
@@ -76,7 +75,7 @@ class Canceller:
         shape = (self.partitions, bins)
         self._weights = fft.rfft(self._initial.reshape(self.partitions, self.hop), 2 * self.hop).astype(np.complex64)
         self._doubt = self._prior()
-        self._ageing = (1.0 - TRANSITION**2) * self._doubt_target()
+        self._ageing = (1.0 - TRANSITION**2) * self._doubt
         self._recent = np.zeros(2 * self.hop, np.float32)
         self._spectra = np.zeros((2 * self.partitions, bins), np.complex64)
         self._powers = np.zeros((2 * self.partitions, bins), np.float32)
@@ -87,7 +86,6 @@ class Canceller:
         self._padded = np.zeros(2 * self.hop, np.float32)
         self._hops = 0
         self._active = 0
-        self._constraint_at = 0
 
     def step(self, mic: Samples, reference: Samples) -> CancellerOutput:
         """Cancel one hop: mic, reference (hop,) float32, neither written to."""
@@ -142,13 +140,6 @@ class Canceller:
         """(partitions,) power of a room's decay behind the direct sound, 1 in the first partition."""
         seconds = np.arange(self.partitions) * self.hop / SAMPLE_RATE
         return 10.0 ** (-6.0 * seconds / COLD_RT60_S)
-
-    def _path_power(self) -> np.ndarray:
-        return np.abs(self._weights) ** 2
-
-    def _doubt_target(self) -> np.ndarray:
-        """What the covariance ages towards."""
-        return (self._prior()).astype(np.float32)
 
     def _prior(self) -> np.ndarray:
         """(partitions, bins) covariance before anything was heard."""

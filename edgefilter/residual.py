@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy.ndimage import uniform_filter1d
 
 from edgefilter.stft import StftConfig
 from edgefilter.types import Samples, Spectrum
@@ -12,9 +13,18 @@ from edgefilter.types import Samples, Spectrum
 if TYPE_CHECKING:
     from edgefilter.profile import Profile
 
-LEAKAGE_START = 0.02
-LEAKAGE_MEMORY = 0.98
+LEAKAGE = 0.005
+"""Part of the echo's power that no linear path explains: a loudspeaker's distortion, -23 dB of it at its own frequency."""
+SPREAD, SPREAD_HZ = 0.1, 2000.0
+"""Distortion falls on other frequencies too: this part of the echo's mean over SPREAD_HZ counts as well."""
 TAIL_DECAY = 0.6
+"""Fall of the residual echo per hop, room for what lies beyond the canceller's tail and between its frames."""
+DOUBT = 0.5
+"""Weight of the canceller's own expectation of its misalignment, which counts a path as unknown longer than it is."""
+FAN_START = 1e-9
+"""Fan power per bin before anything was heard and without a profile."""
+FAN_RISE, FAN_FALL = 1.004, 0.97
+"""How fast the fan's estimate follows per hop where there is no profile: up slowly, so that speech does not lift it."""
 
 
 def power(spectrum: Spectrum) -> Samples:
@@ -23,23 +33,31 @@ def power(spectrum: Spectrum) -> Samples:
 
 
 class Residual:
-    """Tracks the fan and the residual echo of one stream; step() once per frame."""
+    """Tracks the fan and the residual echo of one stream; step() once per frame.
+
+    With a profile the fan is the calibrated one; without, it is the slowly rising minimum of the smoothed error.
+    """
 
     def __init__(self, stft: StftConfig, profile: Profile | None = None) -> None:
-        self.stft = stft
+        self._bins = stft.bins
+        self._width = max(1, round(SPREAD_HZ / stft.frequencies[1]))
         self._fan = profile.noise_bins(stft) if profile is not None else None
         self.reset()
 
     def reset(self) -> None:
         """As before the first frame."""
-        bins = self.stft.bins
-        self._noise = np.full(bins, 1e-9, np.float32) if self._fan is None else self._fan.copy()
-        self._echo = np.zeros(bins, np.float32)
-        self._cross = np.full(bins, LEAKAGE_START, np.float32)
-        self._auto = np.ones(bins, np.float32)
+        self._noise = np.full(self._bins, FAN_START, np.float32) if self._fan is None else self._fan.copy()
+        self._smooth = np.zeros(self._bins, np.float32)
+        self._echo = np.zeros(self._bins, np.float32)
 
-    def step(self, mic: Spectrum, reference: Spectrum, echo: Spectrum, error: Spectrum) -> tuple[Samples, Samples]:
-        """Expected |fan|^2 and |residual echo|^2 in error, both (bins,) float32."""
-        loud = power(echo)
-        self._echo = np.maximum(loud, TAIL_DECAY * self._echo)
-        return self._noise, (LEAKAGE_START * self._echo).astype(np.float32)
+    def step(self, echo: Spectrum, error: Spectrum, uncertainty: Samples) -> tuple[Samples, Samples]:
+        """Expected |fan|^2 and |residual echo|^2 in error, both (bins,) float32.
+
+        echo, error: (bins,) of the frame. uncertainty: (bins,), CancellerOutput.uncertainty of the frame's last hop.
+        """
+        self._echo = np.maximum(power(echo), TAIL_DECAY * self._echo)
+        spread = uniform_filter1d(self._echo, self._width, mode="nearest")
+        if self._fan is None:
+            self._smooth = 0.8 * self._smooth + 0.2 * power(error)
+            self._noise = np.clip(self._smooth, FAN_FALL * self._noise, FAN_RISE * self._noise)
+        return self._noise, LEAKAGE * (self._echo + SPREAD * spread) + DOUBT * uncertainty

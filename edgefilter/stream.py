@@ -46,7 +46,7 @@ class Front:
             self.aligner = Aligner(stft.hop, profile)
             self.canceller = Canceller(stft.hop, impulse_response=response)
             self.residual = Residual(stft, profile)
-        self._analyser = Analyser(stft, channels=3 if self.canceller else 2)
+        self._analyser = Analyser(stft, channels=4 if self.canceller else 2)
         self._nothing = np.zeros(stft.bins, np.float32)
         self._fan = profile.noise_bins(stft) if profile else self._nothing
         self._silence = np.zeros(stft.bins, np.complex64)
@@ -60,10 +60,10 @@ class Front:
             return Frame(x, r, self._silence, x, self._fan, self._nothing), aligned
         if aligned.realigned:
             self.canceller.rewrite_reference(self.aligner.history(self.canceller.history))
-        echo = self.canceller.step(mic, reference).echo
-        x, r, e = self._analyser.push(np.stack((mic, reference, echo)))
-        noise, residual = self.residual.step(x, r, e, x - e)
-        return Frame(x, r, e, x - e, noise, residual), aligned
+        linear = self.canceller.step(mic, reference)
+        x, r, e, error = self._analyser.push(np.stack((mic, reference, linear.echo, linear.error)))
+        noise, residual = self.residual.step(e, error, linear.uncertainty)
+        return Frame(x, r, e, error, noise, residual), aligned
 
 
 class Stream:

@@ -32,7 +32,7 @@ def main(args: argparse.Namespace) -> int:
         missing = " ".join(f"--{name.replace('_', '-')} FILE" for name in RECORDINGS if name not in given)
         raise UsageError(f"calibration needs three recordings, missing: {missing} (or --live to make them now)")
     sweep, recording, fan = _record(args) if args.live else (_read(getattr(args, name), name) for name in RECORDINGS)
-    source = f"live: {args.speaker} to {args.input}" if args.live else args.sweep_recording
+    source = f"live: {args.speaker} to {args.input}" if args.live else ", ".join(getattr(args, name) for name in RECORDINGS)
     today = datetime.date.today().isoformat()
     profile = calibrate(sweep, recording, fan, stepped_sine=args.stepped_sine, created=today, source=source)
     profile.save(args.output)
