@@ -1,0 +1,263 @@
+"""Live audio through PortAudio: the only place that imports sounddevice, and not before it is needed.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+
+from edgefilter.audio.lookup import Device, match, monitor
+from edgefilter.audio.pairing import Pairing
+from edgefilter.audio.port import POLL_S, Input, Output
+from edgefilter.errors import DeviceError
+from edgefilter.types import SAMPLE_RATE, Block, Samples
+
+MARGIN_S = 0.04
+"""Silence ahead of a live output, on top of the declared latency, against the jitter of both devices' callbacks."""
+_SLACK_S = 0.3
+
+
+def _sounddevice() -> Any:
+    """Import sounddevice; raise DeviceError, one line, where it or the PortAudio library is missing."""
+    try:
+        import sounddevice
+    except ImportError:
+        raise DeviceError("live audio needs the Python package sounddevice, which is missing: pip install sounddevice") from None
+    except OSError as error:
+        raise DeviceError(f"live audio needs the PortAudio library ({error}): apt install libportaudio2") from None
+    return sounddevice
+
+
+def _devices() -> list[Device]:
+    sd = _sounddevice()
+    systems = [api["name"] for api in sd.query_hostapis()]
+    return [
+        Device(i, d["name"], d["max_input_channels"], d["max_output_channels"], d["default_samplerate"], systems[d["hostapi"]])
+        for i, d in enumerate(sd.query_devices())
+    ]
+
+
+def list_devices() -> list[dict[str, Any]]:
+    """One dict a device: index, name, inputs, outputs (channels), rate (Hz, its own), system."""
+    return [asdict(device) for device in _devices()]
+
+
+def find(name: str | int | Device | None, kind: str) -> Device:
+    """The device called name, numbered so, or with name in its name; None, 'default' and 'mic' are the default one.
+
+    kind: 'input' or 'output'. Raises UsageError for an unknown or ambiguous name, DeviceError without any device.
+    """
+    default = _sounddevice().default.device[0 if kind == "input" else 1]
+    return match(_devices(), name, kind, default)
+
+
+def monitor_of(output: str | int | Device | None = None) -> Device:
+    """The input that hears what output plays (default: the default output); UsageError where there is none."""
+    return monitor(_devices(), find(output, "output"))
+
+
+class LiveSource:
+    """Microphone and reference devices as blocks on the microphone's sample counter, until stop() or `seconds`.
+
+    Raises DeviceError, after everything received has been delivered, when a device stops. reference None: silence.
+    lost: samples left out, filled or moved so far, see stats(): overruns are callbacks that the driver marked, each of which
+    may hide an unknown number of samples.
+    """
+
+    live = True
+
+    def __init__(self, mic: str | int | Device | None, reference: str | int | Device | None = None, seconds: float | None = None) -> None:
+        self._mic = Input(_sounddevice(), find(mic, "input"))
+        self._reference = None if reference is None else Input(_sounddevice(), find(reference, "input"))
+        self._pairing = Pairing()
+        self._stopped = False
+        self.total = None if seconds is None else round(seconds * SAMPLE_RATE)
+        self.notes = [f"microphone: {self._mic.device}", *self._mic.notes]
+        if self._reference is not None:
+            self.notes += [f"reference: {self._reference.device}", *self._reference.notes]
+
+    def __enter__(self) -> LiveSource:
+        try:
+            for port in self._ports():
+                port.open()
+        except DeviceError:
+            self.__exit__()
+            raise
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        for port in self._ports():
+            port.close()
+        troubles = {name: count for name, count in self.stats().items() if count and name != "lost"}
+        if troubles:
+            self.notes.append("live input was not complete: " + ", ".join(f"{count} {name.replace('_', ' ')}" for name, count in troubles.items()))
+
+    def _ports(self) -> list[Input]:
+        """The reference first, so that it is there when the microphone starts."""
+        return [self._mic] if self._reference is None else [self._reference, self._mic]
+
+    def stop(self) -> None:
+        self._stopped = True
+
+    @property
+    def lost(self) -> int:
+        return self.stats()["lost"]
+
+    def stats(self) -> dict[str, int]:
+        """Samples at 16 kHz by what befell them, and callbacks marked as overrun."""
+        counts = {"reference_filled": self._pairing.filled, "reference_dropped": self._pairing.dropped, "reference_inserted": self._pairing.inserted}
+        for name, port in (("microphone", self._mic), ("reference", self._reference)):
+            counts[f"{name}_lost"] = 0 if port is None else round(port.inlet.lost * SAMPLE_RATE / port.rate)
+        lost = sum(counts.values())
+        for name, port in (("microphone", self._mic), ("reference", self._reference)):
+            counts[f"{name}_overruns"] = 0 if port is None else port.inlet.flags
+        return {"lost": lost, **counts}
+
+    def __iter__(self) -> Iterator[Block]:
+        given = reported = 0
+        failure = None
+        self._synchronise()
+        while not self._stopped and failure is None:
+            mic = self._mic.take()
+            block = self._pairing.push(mic, np.zeros_like(mic) if self._reference is None else self._reference.take())
+            try:
+                for port in self._ports():
+                    port.check_alive(port.inlet.calls)
+            except DeviceError as error:
+                failure, rest = error, self._pairing.flush()
+                block = block if rest is None else rest if block is None else _join(block, rest)
+            if block is None:
+                time.sleep(POLL_S)
+                continue
+            left = block.mic.size if self.total is None else min(block.mic.size, self.total - given)
+            lost, reported = self.lost - reported, self.lost
+            yield Block(block.mic[:left], block.ref[:left], block.start, lost)
+            given += left
+            if given == self.total:
+                return
+        if failure is not None:
+            raise failure
+
+    def _synchronise(self) -> None:
+        """Wait for both devices, and begin with what arrives then: a reference that is too new is safe, one too old is not."""
+        while not self._stopped and not all(port.inlet.calls for port in self._ports()):
+            for port in self._ports():
+                port.check_alive(port.inlet.calls)
+            time.sleep(POLL_S)
+        if self._reference is not None:
+            self._reference.take()
+
+
+def _join(first: Block, second: Block) -> Block:
+    return Block(np.concatenate((first.mic, second.mic)), np.concatenate((first.ref, second.ref)), first.start, first.lost + second.lost)
+
+
+class LiveSink:
+    """A loudspeaker or virtual device that first plays `latency` samples of silence, so that sound lags the input evenly.
+
+    MARGIN_S more silence comes before it as a reserve against jitter. wait: hold the writer up when enough is queued (right for
+    a file as source); otherwise, with a live source, what is too much is dropped and counted. An underrun plays silence, is
+    counted, and ends when the reserve is there again. Raises DeviceError when the device stops.
+    """
+
+    def __init__(self, device: str | int | Device | None, latency: int = 0, wait: bool = True) -> None:
+        self._port = Output(_sounddevice(), find(device, "output"), latency, MARGIN_S)
+        self._lead = round(latency * self._port.rate / SAMPLE_RATE) + self._port.margin
+        self._most = self._lead + round(_SLACK_S * self._port.rate)
+        self._wait, self._open = wait, False
+        self.notes = [f"output: {self._port.device}", *self._port.notes]
+        self.finished = False
+        self.written = self.dropped = self.clipped = 0
+
+    def __enter__(self) -> LiveSink:
+        self._port.outlet.ring.write(np.zeros(self._lead, np.float32))
+        return self
+
+    def write(self, samples: Samples) -> None:
+        """Queue samples (n,); the device starts with the first ones."""
+        loud = int(np.count_nonzero(np.abs(samples) > 1.0))
+        self.clipped += loud
+        self._queue(self._port.convert(np.clip(samples, -1.0, 1.0) if loud else samples))
+        self.written += samples.size
+        if not self._open and samples.size:
+            self._port.open()
+            self._open = True
+        if self._open:
+            self._port.check_alive(self._port.outlet.calls)
+
+    def _queue(self, data: Samples) -> None:
+        ring = self._port.outlet.ring
+        piece = self._port.rate // 10
+        for at in range(0, data.size, piece):
+            if self._wait and self._open:
+                self._port.wait_until(self._most)
+            elif len(ring) > self._most:
+                self.dropped += data.size - at
+                return
+            ring.write(data[at : at + piece])
+
+    def stats(self) -> dict[str, int]:
+        """Samples written (16 kHz), clipped; dropped and missing (at the device's rate); underruns: callbacks that found too little."""
+        outlet = self._port.outlet
+        figures = {"written": self.written, "clipped": self.clipped, "underruns": max(outlet.underruns, self._port.flags)}
+        return figures | {"missing": outlet.missing, "dropped": self.dropped + outlet.ring.lost}
+
+    def __exit__(self, kind: type[BaseException] | None, *exc: object) -> None:
+        try:
+            if kind is None and self._open:
+                self._port.outlet.draining.set()
+                self._queue(self._port.convert(np.zeros(0, np.float32), last=True))
+                self._port.wait_until(0)
+        finally:
+            self._port.close(drain=kind is None)
+            troubles = {name: count for name, count in self.stats().items() if count and name != "written"}
+            if troubles:
+                self.notes.append("live output was not complete: " + ", ".join(f"{count} {name}" for name, count in troubles.items()))
+
+
+def play_and_record(
+    output: str | int | Device | None, microphone: str | int | Device | None, samples: Samples, tail_s: float = 1.0
+) -> Samples:
+    """Play samples (n,) at 16 kHz and return what the microphone hears from the moment playing starts, (n + tail,) float32.
+
+    Both are on one sample counter up to a constant: the devices' buffers appear as additional delay, never as an advance.
+    Raises DeviceError where anything was lost on the way, since a calibration with a hole in it measures the hole.
+    """
+    sd = _sounddevice()
+    mic = Input(sd, find(microphone, "input"))
+    speaker = Output(sd, find(output, "output"), samples.size)
+    speaker.outlet.ring.write(speaker.convert(np.ascontiguousarray(samples, np.float32), last=True))
+    speaker.outlet.draining.set()  # nothing follows: silence after the last sample is no underrun
+    begun: list[int] = []
+
+    def mark() -> None:
+        if not begun:
+            begun.append(mic.inlet.received)
+
+    heard: list[Samples] = []
+    wanted = samples.size + round(tail_s * SAMPLE_RATE)
+    try:
+        mic.open()
+        while not mic.inlet.calls:
+            mic.check_alive(mic.inlet.calls)
+            time.sleep(POLL_S)
+        speaker.open(mark)
+        while not begun or sum(part.size for part in heard) < wanted + begun[0] * SAMPLE_RATE / mic.rate:
+            mic.check_alive(mic.inlet.calls)
+            speaker.check_alive(speaker.outlet.calls)
+            heard.append(mic.take())
+            time.sleep(POLL_S)
+    finally:
+        mic.close()
+        speaker.close()
+    if mic.inlet.lost or mic.inlet.flags or speaker.flags:
+        raise DeviceError(
+            f"the recording has holes: {mic.inlet.lost} samples lost, {mic.inlet.flags} overruns, {speaker.flags} underruns; "
+            "close other programs and measure again"
+        )
+    first = round(begun[0] * SAMPLE_RATE / mic.rate)
+    return np.concatenate(heard)[first : first + wanted]

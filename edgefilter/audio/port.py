@@ -1,0 +1,146 @@
+"""One PortAudio stream, opened and watched; sounddevice itself is handed in by device.py.
+
+Callbacks only copy between PortAudio's buffer and a ring and count; everything else happens in the reader's thread.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import soxr
+
+from edgefilter.audio.lookup import Device
+from edgefilter.audio.pairing import Inlet, Outlet
+from edgefilter.errors import DeviceError
+from edgefilter.types import SAMPLE_RATE, Samples
+
+POLL_S = 0.004
+VANISHED_S = 2.0
+BUFFER_S = 2.0
+"""How much sound a ring holds while the filter is busy; beyond it samples are lost, and counted."""
+STREAM_LATENCY_S = 0.05
+
+
+class Port:
+    """One PortAudio stream and how its rate and channels are brought to 16 kHz mono."""
+
+    def __init__(self, sounddevice: Any, device: Device, kind: str) -> None:
+        self._sd = sounddevice
+        self.kind = kind
+        self.device = device
+        self.rate, self.channels = self._settings()
+        self.notes: list[str] = []
+        if self.rate != SAMPLE_RATE:
+            self.notes.append(f"{kind} device '{self.device}' does not run at {SAMPLE_RATE} Hz: opened at {self.rate} Hz and resampled")
+        if self.channels > 1:
+            self.notes.append(f"{kind} device '{self.device}' has no mono: {self.channels} channels " + ("averaged" if kind == "input" else "get the same"))
+        self._stream: Any = None
+        self._heard = 0
+        self._silent_s, self._asked = 0.0, time.monotonic()
+
+    def _settings(self) -> tuple[int, int]:
+        check = self._sd.check_input_settings if self.kind == "input" else self._sd.check_output_settings
+        most = max(2, self.device.channels(self.kind))
+        refusal = ""
+        for rate in (SAMPLE_RATE, round(self.device.rate)):
+            for channels in sorted({1, 2, most}):
+                try:
+                    check(device=self.device.index, channels=channels, dtype="float32", samplerate=rate)
+                    return rate, channels
+                except (self._sd.PortAudioError, ValueError) as error:
+                    refusal = refusal or _words(error)
+        raise DeviceError(f"{self.kind} device '{self.device}' cannot be opened at {SAMPLE_RATE} Hz or {self.device.rate:.0f} Hz: {refusal}")
+
+    def start(self, callback: Any) -> None:
+        make = self._sd.InputStream if self.kind == "input" else self._sd.OutputStream
+        try:
+            self._stream = make(
+                device=self.device.index, channels=self.channels, samplerate=self.rate, dtype="float32", latency=STREAM_LATENCY_S, callback=callback
+            )
+            self._stream.start()
+        except self._sd.PortAudioError as error:
+            raise DeviceError(f"{self.kind} device '{self.device}' cannot be started: {_words(error)}; is another program using it?") from None
+
+    def check_alive(self, calls: int) -> None:
+        """Raise DeviceError once the number of callbacks has stood still for VANISHED_S of the time that we were awake."""
+        now = time.monotonic()
+        awake, self._asked = min(now - self._asked, 0.1), now
+        self._silent_s = 0.0 if calls != self._heard else self._silent_s + awake
+        self._heard = calls
+        if self._silent_s > VANISHED_S:
+            raise DeviceError(
+                f"{self.kind} device '{self.device}' stopped (no sound for {VANISHED_S:.0f} s: unplugged, or the sound server ended); "
+                "what came until then is kept: reconnect it and start again"
+            )
+
+    def close(self, drain: bool = False) -> None:
+        """End the stream; drain: let the device play what it holds already."""
+        if self._stream is None:
+            return
+        try:
+            self._stream.stop() if drain else self._stream.abort()
+            self._stream.close()
+        except self._sd.PortAudioError:  # a device that has vanished cannot be stopped; its loss was reported already
+            pass
+        self._stream = None
+
+
+def _words(error: Exception) -> str:
+    return str(error.args[0] if error.args else error).splitlines()[0]
+
+
+class Input(Port):
+    """An input whose callback fills an Inlet, read as 16 kHz mono."""
+
+    def __init__(self, sounddevice: Any, device: Device) -> None:
+        super().__init__(sounddevice, device, "input")
+        self.inlet = Inlet(round(BUFFER_S * self.rate))
+        self._resampler = None if self.rate == SAMPLE_RATE else soxr.ResampleStream(self.rate, SAMPLE_RATE, 1, dtype="float32")
+
+    def open(self) -> None:
+        inlet = self.inlet
+
+        def callback(indata: np.ndarray, _frames: int, _time: Any, status: Any) -> None:
+            inlet.receive(indata[:, 0] if indata.shape[1] == 1 else indata.mean(axis=1), bool(status.input_overflow))
+
+        self.start(callback)
+
+    def take(self) -> Samples:
+        samples = self.inlet.take()
+        return samples if self._resampler is None else self._resampler.resample_chunk(samples)
+
+
+class Output(Port):
+    """An output whose callback empties an Outlet, fed with 16 kHz mono."""
+
+    def __init__(self, sounddevice: Any, device: Device, queued: int, margin_s: float = 0.0) -> None:
+        super().__init__(sounddevice, device, "output")
+        self.flags = 0
+        self.margin = round(margin_s * self.rate)
+        self.outlet = Outlet(round((BUFFER_S + queued / SAMPLE_RATE) * self.rate) + self.margin, self.margin)
+        self._resampler = None if self.rate == SAMPLE_RATE else soxr.ResampleStream(SAMPLE_RATE, self.rate, 1, dtype="float32")
+
+    def convert(self, samples: Samples, last: bool = False) -> Samples:
+        """samples (n,) at 16 kHz as samples at the device's rate."""
+        return samples if self._resampler is None else self._resampler.resample_chunk(samples, last=last)
+
+    def open(self, before: Callable[[], None] = lambda: None) -> None:
+        """Start the stream; before is called in each callback, ahead of the delivery, by the audio thread."""
+        outlet = self.outlet
+
+        def callback(outdata: np.ndarray, _frames: int, _time: Any, status: Any) -> None:
+            self.flags += bool(status.output_underflow)
+            before()
+            outlet.deliver(outdata[:, 0])
+            outdata[:, 1:] = outdata[:, :1]
+
+        self.start(callback)
+
+    def wait_until(self, queued: int) -> None:
+        """Return when at most queued samples wait in the ring; raises DeviceError when the device stops."""
+        while len(self.outlet.ring) > queued:
+            self.check_alive(self.outlet.calls)
+            time.sleep(POLL_S)
