@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import signal
 
-from edgefilter.types import Array, Samples
+from edgefilter.echo.clock_drift import ClockDrift
+from edgefilter.echo.compression import Compression
+from edgefilter.echo.effect import STAGES, Measurement, Values, complete, find, register
+from edgefilter.echo.loudspeaker import SpeakerNonlinearity
+from edgefilter.echo.playback_gain import PlaybackGain
+from edgefilter.types import SAMPLE_RATE, Samples
 
 PRE_ROLL = 64
 """Samples (4 ms) of the impulse response before the direct sound: what equalisers and linear-phase filters of a loudspeaker ring ahead of it."""
-
-Values = Mapping[str, "float | Array"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,5 +30,51 @@ class EchoModel:
     effects: tuple[tuple[str, Values], ...] = ()
 
     def predict(self, reference: Samples) -> Samples:
-        """The robot's voice at the microphone (n,) for an aligned reference (n,)."""
-        return signal.oaconvolve(reference, self.impulse_response)[: reference.size].astype(np.float32)
+        """The robot's voice at the microphone (n,) for an aligned reference (n,), all effects applied."""
+        return self._predict(reference, self.effects)
+
+    def components(self, reference: Samples) -> dict[str, Samples]:
+        """What each part contributes, (n,) each: "linear", the path alone, then by how much each effect in turn changes it.
+
+        The sum of all components is predict(reference).
+        """
+        parts = {"linear": self._predict(reference, ())}
+        before = parts["linear"]
+        for count, (name, _) in enumerate(self.effects, start=1):
+            after = self._predict(reference, self.effects[:count])
+            parts[name] = after - before
+            before = after
+        return parts
+
+    def with_effect(self, name: str, values: Values) -> EchoModel:
+        """The model with that effect added, or its values replaced; missing values are neutral.
+
+        Raises UsageError for an unknown effect, an unknown parameter or a value out of bounds.
+        """
+        entry = (name, complete(find(name), values))
+        return replace(self, effects=(*(kept for kept in self.effects if kept[0] != name), entry))
+
+    def without_effect(self, name: str) -> EchoModel:
+        """The model without that effect."""
+        return replace(self, effects=tuple(kept for kept in self.effects if kept[0] != name))
+
+    def fit(self, name: str, measurement: Measurement) -> EchoModel:
+        """The model with that effect at the values that explain the measurement best."""
+        return self.with_effect(name, find(name).fit(measurement, self.without_effect(name)))
+
+    def _predict(self, reference: Samples, effects: tuple[tuple[str, Values], ...]) -> Samples:
+        """Source effects, the path, then the rest in the order in which sound meets them."""
+        x = reference
+        chain = sorted(((find(name), values) for name, values in effects), key=lambda pair: STAGES.index(pair[0].stage))
+        for effect, values in chain:
+            if effect.stage == "source":
+                x = effect.apply(x, complete(effect, values), SAMPLE_RATE)
+        x = signal.oaconvolve(x, self.impulse_response)[: reference.size].astype(np.float32)
+        for effect, values in chain:
+            if effect.stage != "source":
+                x = effect.apply(x, complete(effect, values), SAMPLE_RATE)
+        return x
+
+
+for _effect in (PlaybackGain(), SpeakerNonlinearity(), Compression(), ClockDrift()):
+    register(_effect)
