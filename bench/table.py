@@ -57,8 +57,9 @@ def summarise(scores: Sequence[dict]) -> dict:
 def markdown(summaries: dict[str, dict[str, dict[str, dict]]], machine: dict, note: str) -> str:
     """The table as Markdown. summaries[set][room][engine] as from `summarise`."""
     lines = [f"# {note}", "", ", ".join(f"{key} {value}" for key, value in machine.items()), ""]
-    lines += ["Scored over the span in which the human speaks: mean [95 % bootstrap interval over utterances]. WER by Whisper-base is pooled"]
-    lines += ["over all words; 'capped' is the mean of each utterance's rate, at most 100 %. RTF: processing time over audio, one thread."]
+    lines += ["Scored over the span in which the human speaks: mean [95 % bootstrap interval over utterances]. WER by Whisper-base is"]
+    lines += ["pooled over all words, its median is of the utterances' own rates; 'capped' is the mean of those, each at most 100 %."]
+    lines += ["RTF: processing time over audio, one thread. '-true-lag': given each utterance's lag, which no robot knows."]
     for set_name, rooms in summaries.items():
         for room, engines in rooms.items():
             first = next(iter(engines.values()))
