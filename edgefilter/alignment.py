@@ -24,6 +24,8 @@ CERTAIN, LIKELY = (10.0, 2.0), (9.0, 1.5)
 has 18 and 4 after 150 ms; the strongest of 700 wrong peaks had 8.0 and 1.4, and successive windows share most of their samples."""
 HEARD = 6.0
 """Strength of the tracker's peak over the rms of +-REACH lags from which a measurement counts."""
+STRANGE = 10.0
+"""Power over what the robot brings above which it is not the robot that is heard, so that no jump can be seen."""
 LOST_BLOCKS = 10
 """Measurements in speech without a credible peak after which everything is searched again."""
 
@@ -185,6 +187,8 @@ class Aligner:
         small = abs(found.offset) < 1.5 or (abs(found.offset) < 8.0 and self._drift.surprise(found) < 3.0)
         if small and (self._drift.surprise(found) < 5.0 or abs(found.offset) < 0.3):
             return self._accept(found)
+        if self._gain is not None and found.gain > STRANGE * self._gain:
+            return False
         suspect, self._suspect = self._suspect, found.offset
         sure = found.strength > 14.0 and found.dominance > 3.0 and abs(found.offset) > 8.0
         agrees = suspect is not None and abs(found.offset - suspect) < 0.7

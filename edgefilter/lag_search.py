@@ -15,6 +15,8 @@ WINDOW = 7168
 """Samples of the microphone that one search looks at, 0.45 s."""
 MINIMUM = 1280
 """Samples (80 ms) of an utterance that must have been heard before its lag is believed: less of any two sounds may agree by chance."""
+FADE = 256
+_RISE = (0.5 - 0.5 * np.cos(np.pi * (np.arange(FADE) + 0.5) / FADE)).astype(np.float32)
 SMOOTHING = 65
 """Bins over which spectra are averaged for the whitening, about 30 Hz: voice harmonics are flattened, so pitch makes no side peak."""
 APART = 320
@@ -60,6 +62,8 @@ class LagSearch:
         x[size - WINDOW + skipped :] = mic.read(now - WINDOW + skipped, now)
         first = max(since - (now - size), 0)
         r[first:] = ref.read(now - size + first, now)
+        _soften(x[size - WINDOW + skipped :])
+        _soften(r[first:])
         overlap = self._overlap(r, size - WINDOW + skipped)
         if overlap.max() <= 0.0 or not x.any():
             return None
@@ -97,6 +101,12 @@ class LagSearch:
         rest = np.concatenate((score[: max(lag - APART, 0)], score[lag + APART :]))
         second = float(rest.max()) if rest.size else 0.0
         return Candidate(lag, float(score[lag]) / spread, float(score[lag]) / max(second, 1e-12))
+
+
+def _soften(x: Samples) -> None:
+    """Fade both ends of x in place: two hard cuts, whitened, would correlate with one another."""
+    x[:FADE] *= _RISE
+    x[-FADE:] *= _RISE[::-1]
 
 
 def _power(spectrum: np.ndarray) -> Samples:

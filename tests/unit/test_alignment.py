@@ -4,10 +4,11 @@ import numpy as np
 import pytest
 from alignment_scene import HEAD, RATE, fan, hear, known_path, room, run, speech_like, utterances
 
-from edgefilter.alignment import Aligner, PaperAligner, paper_lag
+from edgefilter.alignment import CERTAIN, Aligner, PaperAligner, paper_lag
 from edgefilter.delay_line import Tape, read_delayed, read_line
 from edgefilter.echo.model import PRE_ROLL
 from edgefilter.errors import SignalError
+from edgefilter.lag_search import LagSearch
 
 WITHIN = 0.3 * RATE  # the requirement: an utterance's lag is found within 300 ms of its onset at the microphone
 CLOSE = 16  # the requirement: +-1 ms
@@ -92,6 +93,15 @@ def test_nothing_is_realigned_where_nothing_is_heard(scene):
     hops = run(Aligner(256), mic + fan(rng, mic.size), ref)
     assert any(a.state == "locked" for a in hops)
     assert not any(a.realigned for a in hops[later // 256 :])
+
+
+def test_hard_cuts_of_two_windows_are_no_lag():
+    rng = np.random.default_rng(12)
+    search, mic, ref = LagSearch(25600), Tape(50000), Tape(50000)
+    mic.push(0.1 + 0.1 * np.sin(np.arange(20000) / 20).astype(np.float32) + fan(rng, 20000))
+    ref.push(0.1 + 0.1 * np.sin(np.arange(20000) / 33).astype(np.float32) + fan(rng, 20000))
+    found = search.find(mic, ref, 20000, 17000, 17500)
+    assert found is None or found.strength < CERTAIN[0]  # cut hard, the edges at 20000 agree at lag 0 with a strength of 15
 
 
 def test_the_reference_is_withheld_while_the_old_delay_is_too_short():
