@@ -21,6 +21,14 @@ LATE_DOUBT_DB = -14.0
 """Power of the unknown room's decay, relative to the calibrated path, at the direct sound."""
 NOISE_MEMORY = 0.7
 """Weight of the past in the measurement-noise PSD; small, so that the onset of near-end speech stops the adaptation."""
+GAIN_MEMORY = 0.8
+"""Weight of the past in the correlation of microphone and echo that tells a turned volume; about 80 ms."""
+GAIN_EXCESS = 1.5
+"""A volume was turned where one common factor on the echo lowers the error's power by more than this."""
+PHANTOM = 1.5
+"""Error power over microphone power above which the echo that is being subtracted is not there (yet): the utterance has another lag."""
+PHANTOM_PATIENCE = 120
+"""Hops for which such a stretch is put down to the lag; then the path itself must have changed, and adapting goes on."""
 SILENCE = 1e-10
 """Mean reference power, full scale^2, below which the path is neither adapted nor allowed to age."""
 
@@ -85,6 +93,10 @@ class Canceller:
         self._gain_times_power = np.zeros(shape, np.float32)
         self._padded = np.zeros(2 * self.hop, np.float32)
         self._hops = 0
+        self._phantoms = 0
+        self._fade = 1.0
+        self._correlation = np.zeros(3)
+        self.gain = 1.0
         self._active = 0
 
     def step(self, mic: Samples, reference: Samples) -> CancellerOutput:
@@ -92,6 +104,8 @@ class Canceller:
         spectra, powers = self._push(reference)
         np.multiply(self._weights, spectra, out=self._work)
         echo = fft.irfft(self._work.sum(axis=0))[self.hop :].astype(np.float32, copy=False)
+        echo = self._follow_gain(mic, echo)
+        echo, phantom = self._without_phantom(mic, echo)
         error = mic - echo
         np.multiply(self._doubt, powers, out=self._gain_times_power)
         misalignment = self._gain_times_power.sum(axis=0)
@@ -101,10 +115,39 @@ class Canceller:
         self._noise *= NOISE_MEMORY
         self._noise += (1.0 - NOISE_MEMORY) * error_power
         self._hops += 1
-        if np.dot(reference, reference) > SILENCE * self.hop:
+        if np.dot(reference, reference) > SILENCE * self.hop and not phantom:
             self._active += 1
             self._adapt(spectra, error_spectrum, misalignment)
         return CancellerOutput(echo, error, 0.5 * misalignment)
+
+    def _follow_gain(self, mic: Samples, echo: Samples) -> Samples:
+        """The echo, and the whole path with it, rescaled where one factor explains much of the error: someone turned the volume."""
+        found = np.array((np.dot(mic, mic), np.dot(mic, echo), np.dot(echo, echo)), float)
+        self._correlation = GAIN_MEMORY * self._correlation + (1.0 - GAIN_MEMORY) * found
+        mic_power, cross, echo_power = self._correlation
+        if cross <= 0.0 or echo_power <= SILENCE * self.hop:
+            return echo
+        factor = cross / echo_power
+        error = mic_power - 2.0 * cross + echo_power
+        if error <= GAIN_EXCESS * (mic_power - cross * factor) or not 0.5 < factor < 2.0:
+            return echo
+        self._correlation[:] = 0.0
+        self._weights *= np.float32(factor)
+        self.gain *= factor
+        return echo * np.float32(factor)
+
+    def _without_phantom(self, mic: Samples, echo: Samples) -> tuple[Samples, bool]:
+        """The echo, faded out while subtracting it adds more than it takes, and whether that is so."""
+        error = mic - echo
+        phantom = float(np.dot(error, error)) > PHANTOM * float(np.dot(mic, mic)) and self._phantoms < PHANTOM_PATIENCE
+        self._phantoms = self._phantoms + 1 if phantom else max(0, self._phantoms - 1)
+        gain = 0.0 if phantom else 1.0
+        if gain != self._fade:
+            echo = echo * np.linspace(self._fade, gain, self.hop, dtype=np.float32)
+        elif phantom:
+            echo = np.zeros_like(echo)
+        self._fade = gain
+        return echo, phantom
 
     def _push(self, reference: Samples) -> tuple[np.ndarray, np.ndarray]:
         """Spectra and powers (partitions, bins) of the last reference blocks, the newest first, as views."""
@@ -175,4 +218,4 @@ class Canceller:
 
     def stats(self) -> dict[str, float]:
         """What the stage did so far."""
-        return {"hops": self._hops, "active_hops": self._active, "partitions": self.partitions}
+        return {"hops": self._hops, "active_hops": self._active, "partitions": self.partitions, "gain_db": 20.0 * float(np.log10(self.gain))}
