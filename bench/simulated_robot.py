@@ -69,15 +69,15 @@ class Loudspeaker:
 def draw_loudspeaker(rng: np.random.Generator) -> Loudspeaker:
     """A driver of a small robot: resonance 180-320 Hz, treble roll-off, broad peaks of the enclosure, the microphone's low cut."""
     sections = [signal.butter(2, rng.uniform(6300, 7500), "low", fs=RATE, output="sos")]
-    sections.append(signal.butter(1, rng.uniform(40, 90), "high", fs=RATE, output="sos"))
+    sections.append(signal.butter(2, rng.uniform(110, 210), "high", fs=RATE, output="sos"))
     for _ in range(4):
         sections.append(peak_filter(math.exp(rng.uniform(math.log(350), math.log(6000))), rng.uniform(1.0, 4.0), rng.uniform(-5, 5)))
     return Loudspeaker(
         resonance_hz=rng.uniform(180, 320),
         q=rng.uniform(0.6, 1.0),
-        stiffening=rng.uniform(0.3, 0.6),
-        softening_bl=rng.uniform(0.2, 0.5),
-        asymmetry=rng.uniform(-0.3, 0.3),
+        stiffening=rng.uniform(0.1, 0.3),
+        softening_bl=rng.uniform(0.3, 0.5),
+        asymmetry=rng.choice([-1.0, 1.0]) * rng.uniform(0.4, 0.8),
         drive=1.0,
         filters=np.vstack(sections),
     )
@@ -134,11 +134,11 @@ def _image_sources(size: Array, rt60_s: float, microphone: Array, sources: tuple
 
 
 def draw_body(rng: np.random.Generator) -> Array:
-    """(64,) sound that the robot's own shell reflects within 4 ms, 8-20 dB below the direct sound."""
-    shell = np.zeros(64)
+    """(32,) sound that the robot's own shell reflects within 2 ms, 10-20 dB below the direct sound."""
+    shell = np.zeros(32)
     shell[0] = 1.0
-    for delay in rng.integers(3, 64, size=5):
-        shell[delay] += rng.choice([-1, 1]) * 10 ** (-rng.uniform(8, 20) / 20)
+    for delay in rng.integers(3, 32, size=5):
+        shell[delay] += rng.choice([-1, 1]) * 10 ** (-rng.uniform(10, 20) / 20)
     return shell
 
 
