@@ -1,5 +1,4 @@
-"""Live audio through PortAudio: the only place that imports sounddevice, and not before it is needed.
-"""
+"""Live audio through PortAudio: the only place that imports sounddevice, and not before it is needed."""
 
 from __future__ import annotations
 
@@ -18,6 +17,8 @@ from edgefilter.types import SAMPLE_RATE, Block, Samples
 
 MARGIN_S = 0.04
 """Silence ahead of a live output, on top of the declared latency, against the jitter of both devices' callbacks."""
+LEAD_S, GUARD_S = 0.25, 0.05
+"""play_and_record: silence ahead of the sound, and how far the counters of the two streams may be out at their start."""
 _SLACK_S = 0.3
 
 
@@ -126,7 +127,7 @@ class LiveSource:
             block = self._pairing.push(mic, np.zeros_like(mic) if self._reference is None else self._reference.take())
             try:
                 for port in self._ports():
-                    port.check_alive(port.inlet.calls)
+                    port.check_alive(port.inlet.received)
             except DeviceError as error:
                 failure, rest = error, self._pairing.flush()
                 block = block if rest is None else rest if block is None else _join(block, rest)
@@ -146,7 +147,7 @@ class LiveSource:
         """Wait for both devices, and begin with what arrives then: a reference that is too new is safe, one too old is not."""
         while not self._stopped and not all(port.inlet.calls for port in self._ports()):
             for port in self._ports():
-                port.check_alive(port.inlet.calls)
+                port.check_alive(port.inlet.received)
             time.sleep(POLL_S)
         if self._reference is not None:
             self._reference.take()
@@ -224,13 +225,15 @@ def play_and_record(
 ) -> Samples:
     """Play samples (n,) at 16 kHz and return what the microphone hears from the moment playing starts, (n + tail,) float32.
 
-    Both are on one sample counter up to a constant: the devices' buffers appear as additional delay, never as an advance.
+    Both are on one sample counter up to a constant: the devices' buffers, and GUARD_S, appear as additional delay, so that
+    the sound never seems to be heard before it is played. Silence goes first, since sound servers swallow a stream's start.
     Raises DeviceError where anything was lost on the way, since a calibration with a hole in it measures the hole.
     """
     sd = _sounddevice()
     mic = Input(sd, find(microphone, "input"))
-    speaker = Output(sd, find(output, "output"), samples.size)
-    speaker.outlet.ring.write(speaker.convert(np.ascontiguousarray(samples, np.float32), last=True))
+    played = np.concatenate((np.zeros(round(LEAD_S * SAMPLE_RATE), np.float32), samples.astype(np.float32)))
+    speaker = Output(sd, find(output, "output"), played.size)
+    speaker.outlet.ring.write(speaker.convert(played, last=True))
     speaker.outlet.draining.set()  # nothing follows: silence after the last sample is no underrun
     begun: list[int] = []
 
@@ -240,14 +243,15 @@ def play_and_record(
 
     heard: list[Samples] = []
     wanted = samples.size + round(tail_s * SAMPLE_RATE)
+    skipped = (LEAD_S - GUARD_S) * SAMPLE_RATE
     try:
         mic.open()
         while not mic.inlet.calls:
-            mic.check_alive(mic.inlet.calls)
+            mic.check_alive(mic.inlet.received)
             time.sleep(POLL_S)
         speaker.open(mark)
-        while not begun or sum(part.size for part in heard) < wanted + begun[0] * SAMPLE_RATE / mic.rate:
-            mic.check_alive(mic.inlet.calls)
+        while not begun or sum(part.size for part in heard) < wanted + skipped + 1 + begun[0] * SAMPLE_RATE / mic.rate:
+            mic.check_alive(mic.inlet.received)
             speaker.check_alive(speaker.outlet.calls)
             heard.append(mic.take())
             time.sleep(POLL_S)
@@ -259,5 +263,5 @@ def play_and_record(
             f"the recording has holes: {mic.inlet.lost} samples lost, {mic.inlet.flags} overruns, {speaker.flags} underruns; "
             "close other programs and measure again"
         )
-    first = round(begun[0] * SAMPLE_RATE / mic.rate)
+    first = round(begun[0] * SAMPLE_RATE / mic.rate + skipped)
     return np.concatenate(heard)[first : first + wanted]

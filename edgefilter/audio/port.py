@@ -5,8 +5,11 @@ Callbacks only copy between PortAudio's buffer and a ring and count; everything 
 
 from __future__ import annotations
 
+import os
+import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -22,6 +25,21 @@ VANISHED_S = 2.0
 BUFFER_S = 2.0
 """How much sound a ring holds while the filter is busy; beyond it samples are lost, and counted."""
 STREAM_LATENCY_S = 0.05
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Keep what the C libraries print about every attempt out of the terminal; their refusal comes back as an error code."""
+    sys.stderr.flush()
+    kept = os.dup(2)
+    sink = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(sink, 2)
+    try:
+        yield
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)
+        os.close(sink)
 
 
 class Port:
@@ -48,7 +66,8 @@ class Port:
         for rate in (SAMPLE_RATE, round(self.device.rate)):
             for channels in sorted({1, 2, most}):
                 try:
-                    check(device=self.device.index, channels=channels, dtype="float32", samplerate=rate)
+                    with _quiet():
+                        check(device=self.device.index, channels=channels, dtype="float32", samplerate=rate)
                     return rate, channels
                 except (self._sd.PortAudioError, ValueError) as error:
                     refusal = refusal or _words(error)
@@ -56,20 +75,20 @@ class Port:
 
     def start(self, callback: Any) -> None:
         make = self._sd.InputStream if self.kind == "input" else self._sd.OutputStream
+        settings = {"device": self.device.index, "channels": self.channels, "samplerate": self.rate}
         try:
-            self._stream = make(
-                device=self.device.index, channels=self.channels, samplerate=self.rate, dtype="float32", latency=STREAM_LATENCY_S, callback=callback
-            )
-            self._stream.start()
+            with _quiet():
+                self._stream = make(**settings, dtype="float32", latency=STREAM_LATENCY_S, callback=callback)
+                self._stream.start()
         except self._sd.PortAudioError as error:
             raise DeviceError(f"{self.kind} device '{self.device}' cannot be started: {_words(error)}; is another program using it?") from None
 
-    def check_alive(self, calls: int) -> None:
-        """Raise DeviceError once the number of callbacks has stood still for VANISHED_S of the time that we were awake."""
+    def check_alive(self, progress: int) -> None:
+        """Raise DeviceError once progress, samples or callbacks so far, has stood still for VANISHED_S of the time that we were awake."""
         now = time.monotonic()
         awake, self._asked = min(now - self._asked, 0.1), now
-        self._silent_s = 0.0 if calls != self._heard else self._silent_s + awake
-        self._heard = calls
+        self._silent_s = 0.0 if progress != self._heard else self._silent_s + awake
+        self._heard = progress
         if self._silent_s > VANISHED_S:
             raise DeviceError(
                 f"{self.kind} device '{self.device}' stopped (no sound for {VANISHED_S:.0f} s: unplugged, or the sound server ended); "
@@ -81,8 +100,11 @@ class Port:
         if self._stream is None:
             return
         try:
-            self._stream.stop() if drain else self._stream.abort()
-            self._stream.close()
+            if drain:  # sound servers drop what is in their buffers when a stream ends
+                time.sleep(self._stream.latency + 0.1)
+            with _quiet():
+                self._stream.abort()
+                self._stream.close()
         except self._sd.PortAudioError:  # a device that has vanished cannot be stopped; its loss was reported already
             pass
         self._stream = None
