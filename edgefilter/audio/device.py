@@ -19,6 +19,8 @@ MARGIN_S = 0.04
 """Silence ahead of a live output, on top of the declared latency, against the jitter of both devices' callbacks."""
 LEAD_S, GUARD_S = 0.25, 0.05
 """play_and_record: silence ahead of the sound, and how far the counters of the two streams may be out at their start."""
+SETTLE_S = 0.2
+"""A stream may stall right after its start; so much of each input is discarded before the first block."""
 _SLACK_S = 0.3
 
 
@@ -144,11 +146,15 @@ class LiveSource:
             raise failure
 
     def _synchronise(self) -> None:
-        """Wait for both devices, and begin with what arrives then: a reference that is too new is safe, one too old is not."""
-        while not self._stopped and not all(port.inlet.calls for port in self._ports()):
+        """Wait until both devices run steadily, and begin with what arrives then.
+
+        The reference is emptied last: one that is too new only adds delay, one that is too old would come before its echo.
+        """
+        while not self._stopped and not all(port.inlet.received >= SETTLE_S * port.rate for port in self._ports()):
             for port in self._ports():
                 port.check_alive(port.inlet.received)
             time.sleep(POLL_S)
+        self._mic.take()
         if self._reference is not None:
             self._reference.take()
 

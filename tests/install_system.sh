@@ -1,0 +1,14 @@
+#!/bin/sh
+# Installs what the tests need from the system: virtual sound devices, PortAudio, a browser, SpeexDSP.
+packages="pulseaudio pulseaudio-utils libasound2-plugins libportaudio2 chromium libspeexdsp1"
+missing=""
+for package in $packages; do
+    dpkg -s "$package" >/dev/null 2>&1 || missing="$missing $package"
+done
+[ -z "$missing" ] && exit 0
+if [ "$(id -u)" = 0 ]; then
+    apt-get update -q && DEBIAN_FRONTEND=noninteractive apt-get install -q -y --no-install-recommends $missing
+    exit $?
+fi
+echo "missing:$missing; run: sudo apt-get install -y --no-install-recommends$missing" >&2
+exit 1
