@@ -5,22 +5,30 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import fft
+from scipy import fft, signal
 
-from edgefilter.echo.model import PRE_ROLL
 from edgefilter.errors import SignalError
 from edgefilter.types import SAMPLE_RATE, Samples
 
-TRANSITION = 0.9998
-"""A of the first-order Markov model of the echo path per hop of 16 ms: it forgets with a time constant of 80 s."""
+TRANSITION = 0.9999
+"""A of the first-order Markov model of the echo path per hop of 16 ms: it forgets with a time constant of 160 s."""
 WARM_DOUBT = 0.05
 """Variance of a calibrated path relative to its own power: the robot moved and the room is another."""
-COLD_RT60_S = 1.0
-"""Decay of the covariance prior behind the direct sound where nothing is known, seconds for 60 dB."""
-LATE_DOUBT_DB = -14.0
-"""Power of the unknown room's decay, relative to the calibrated path, at the direct sound."""
-NOISE_MEMORY = 0.7
-"""Weight of the past in the measurement-noise PSD; small, so that the onset of near-end speech stops the adaptation."""
+DECAY_RT60_S = 1.0
+"""Decay of the covariance prior behind the direct sound, seconds for 60 dB."""
+LATE_DOUBT = 0.04
+"""Power of the unknown room's decay at the direct sound, relative to the calibrated path."""
+NOISE_MEMORY = 0.8
+"""Weight of the past in the measurement-noise PSD: 80 ms, so that the onset of near-end speech still stops the adaptation."""
+OWN_SHARE = 0.6
+"""Share of the expected misalignment that is not counted as measurement noise; 1 adapts fastest, 0 is safest in double talk."""
+DISPLACEMENT_HZ = 300.0
+"""Corner of the second-order low-pass that turns the reference into the displacement of the loudspeaker's membrane."""
+DISPLACEMENT_SCALE = 0.1
+"""Displacement, in the reference's full scale, at which the products have the size of the reference."""
+PRODUCT_PARTITIONS = 2
+PRODUCT_DOUBT = 2e-3
+"""Variance of the paths of the nonlinear products relative to the linear path."""
 GAIN_MEMORY = 0.8
 """Weight of the past in the correlation of microphone and echo that tells a turned volume; about 80 ms."""
 GAIN_EXCESS = 1.5
@@ -52,17 +60,20 @@ class Canceller:
     Overlap-save blocks of 2 * hop; partition p covers taps p * hop ... (p + 1) * hop - 1. Diagonal state-space model of Enzner &
     Vary (2006), "Frequency-domain adaptive Kalman filter for acoustic echo control", eq. (27)-(34), partitioned as in Kuech,
     Mabande & Enzner (2014), "State-space architecture of the partitioned-block-based acoustic echo controller".
+    Beside the reference x it hears d x and d^2 x, d being the membrane's displacement (x low-passed): what force factor and
+    stiffness that depend on the displacement add to a moving-coil loudspeaker (Klippel 2006, "Loudspeaker nonlinearities").
+    Their paths are PRODUCT_PARTITIONS long and start at zero; nonlinear=False leaves them out.
     impulse_response (n,) float32 starts the filter; longer than taps it is cut, without it the start is cold.
     Raises SignalError where hop or taps are not positive or the impulse response is not finite.
     """
 
-    def __init__(self, hop: int = 256, taps: int = 6400, impulse_response: Samples | None = None, pre_roll: int = PRE_ROLL) -> None:
+    def __init__(self, hop: int = 256, taps: int = 6400, impulse_response: Samples | None = None, nonlinear: bool = True) -> None:
         if hop < 1 or taps < 1:
             raise SignalError(f"canceller got hop={hop} and taps={taps}, expected both to be at least 1 sample")
         self.hop = hop
         self.partitions = -(-taps // hop)
         self.taps = self.partitions * hop
-        self.pre_roll = pre_roll
+        self.nonlinear = nonlinear
         self._initial = np.zeros(self.taps, np.float32)
         self._warm = impulse_response is not None
         if impulse_response is not None:
@@ -70,54 +81,66 @@ class Canceller:
                 raise SignalError("the canceller's impulse response is not a finite (n,) array: calibrate again")
             known = min(self.taps, impulse_response.size)
             self._initial[:known] = impulse_response[:known]
+        self._lowpass = signal.butter(2, DISPLACEMENT_HZ, fs=SAMPLE_RATE)
         self.reset()
 
     @property
     def history(self) -> int:
         """Reference samples that rewrite_reference wants, the current hop included."""
-        return (self.partitions + 2) * self.hop
+        return (max(self.partitions, PRODUCT_PARTITIONS) + 2) * self.hop
 
     def reset(self) -> None:
         """Back to the start: the calibrated path, or none."""
-        bins = self.hop + 1
+        hop, bins = self.hop, self.hop + 1
         shape = (self.partitions, bins)
-        self._weights = fft.rfft(self._initial.reshape(self.partitions, self.hop), 2 * self.hop).astype(np.complex64)
+        self._weights = fft.rfft(self._initial.reshape(self.partitions, hop), 2 * hop).astype(np.complex64)
         self._doubt = self._prior()
         self._ageing = (1.0 - TRANSITION**2) * self._doubt
-        self._recent = np.zeros(2 * self.hop, np.float32)
+        self._recent = np.zeros(2 * hop, np.float32)
         self._spectra = np.zeros((2 * self.partitions, bins), np.complex64)
         self._powers = np.zeros((2 * self.partitions, bins), np.float32)
         self._newest = 0
+        products = (2, PRODUCT_PARTITIONS, bins) if self.nonlinear else (0, PRODUCT_PARTITIONS, bins)
+        self._product_weights = np.zeros(products, np.complex64)
+        self._product_doubt = np.broadcast_to(PRODUCT_DOUBT * self._path_power(), products).astype(np.float32)
+        self._product_ageing = (1.0 - TRANSITION**2) * self._product_doubt
+        self._product_recent = np.zeros((products[0], 2 * hop), np.float32)
+        self._product_spectra = np.zeros(products, np.complex64)
+        self._displacement = np.zeros(2, np.float32)
         self._noise = np.zeros(bins, np.float32)
         self._work = np.zeros(shape, np.complex64)
-        self._gain_times_power = np.zeros(shape, np.float32)
-        self._padded = np.zeros(2 * self.hop, np.float32)
-        self._hops = 0
-        self._phantoms = 0
-        self._fade = 1.0
+        self._expected = np.zeros(shape, np.float32)
+        self._padded = np.zeros(2 * hop, np.float32)
+        self._hops = self._active = self._phantoms = 0
+        self._fade = self.gain = 1.0
         self._correlation = np.zeros(3)
-        self.gain = 1.0
-        self._active = 0
 
     def step(self, mic: Samples, reference: Samples) -> CancellerOutput:
         """Cancel one hop: mic, reference (hop,) float32, neither written to."""
         spectra, powers = self._push(reference)
         np.multiply(self._weights, spectra, out=self._work)
-        echo = fft.irfft(self._work.sum(axis=0))[self.hop :].astype(np.float32, copy=False)
+        predicted = self._work.sum(axis=0)
+        np.multiply(self._doubt, powers, out=self._expected)
+        misalignment = self._expected.sum(axis=0)
+        products = None
+        if self.nonlinear:
+            self._push_products(reference)
+            predicted += (self._product_weights * self._product_spectra).sum(axis=(0, 1))
+            products = self._product_doubt * _power(self._product_spectra)
+            misalignment += products.sum(axis=(0, 1))
+        echo = fft.irfft(predicted, 2 * self.hop)[self.hop :].astype(np.float32, copy=False)
         echo = self._follow_gain(mic, echo)
         echo, phantom = self._without_phantom(mic, echo)
         error = mic - echo
-        np.multiply(self._doubt, powers, out=self._gain_times_power)
-        misalignment = self._gain_times_power.sum(axis=0)
         self._padded[self.hop :] = error
         error_spectrum = fft.rfft(self._padded)
-        error_power = error_spectrum.real**2 + error_spectrum.imag**2
+        observed = _power(error_spectrum)
         self._noise *= NOISE_MEMORY
-        self._noise += (1.0 - NOISE_MEMORY) * error_power
+        self._noise += (1.0 - NOISE_MEMORY) * np.maximum(observed - 0.5 * OWN_SHARE * misalignment, 0.05 * observed)
         self._hops += 1
         if np.dot(reference, reference) > SILENCE * self.hop and not phantom:
             self._active += 1
-            self._adapt(spectra, error_spectrum, misalignment)
+            self._adapt(spectra, error_spectrum, 1.0 / (misalignment + 2.0 * self._noise + 1e-12), products)
         return CancellerOutput(echo, error, 0.5 * misalignment)
 
     def _follow_gain(self, mic: Samples, echo: Samples) -> Samples:
@@ -133,6 +156,7 @@ class Canceller:
             return echo
         self._correlation[:] = 0.0
         self._weights *= np.float32(factor)
+        self._product_weights *= np.float32(factor)
         self.gain *= factor
         return echo * np.float32(factor)
 
@@ -157,41 +181,55 @@ class Canceller:
         self._newest = (self._newest - 1) % self.partitions
         at, last = self._newest, self._newest + self.partitions
         self._spectra[at] = self._spectra[last] = spectrum
-        self._powers[at] = self._powers[last] = spectrum.real**2 + spectrum.imag**2
+        self._powers[at] = self._powers[last] = _power(spectrum)
         return self._spectra[at:last], self._powers[at:last]
 
-    def _adapt(self, spectra: np.ndarray, error_spectrum: np.ndarray, misalignment: np.ndarray) -> None:
+    def _push_products(self, reference: Samples) -> None:
+        """The same for d x and d^2 x."""
+        self._product_recent[:, : self.hop] = self._product_recent[:, self.hop :]
+        self._product_recent[:, self.hop :] = self._products(reference)
+        self._product_spectra[:, 1:] = self._product_spectra[:, :-1].copy()
+        self._product_spectra[:, 0] = fft.rfft(self._product_recent, axis=1)
+
+    def _products(self, reference: Samples) -> np.ndarray:
+        """(2, n) of the next n samples of the reference; carries the membrane's state on."""
+        moved, self._displacement = signal.lfilter(*self._lowpass, reference, zi=self._displacement)
+        moved /= DISPLACEMENT_SCALE
+        first = moved * reference
+        return np.stack((first, moved * first))
+
+    def _adapt(self, spectra: np.ndarray, error_spectrum: np.ndarray, divisor: np.ndarray, products: np.ndarray | None) -> None:
         """Kalman correction of weights and covariance, Enzner & Vary (2006), eq. (30)-(34)."""
-        divisor = 1.0 / (misalignment + 2.0 * self._noise + 1e-12)
+        step = error_spectrum * divisor
         np.conjugate(spectra, out=self._work)
         self._work *= self._doubt
-        self._work *= error_spectrum * divisor
+        self._work *= step
         self._constrain(self._work)
         self._weights += self._work
-        self._gain_times_power *= -0.5 * divisor
-        self._gain_times_power += 1.0
-        self._doubt *= self._gain_times_power
-        self._doubt *= TRANSITION**2
-        self._doubt += self._ageing
+        shrink = -0.5 * divisor
+        _age(self._doubt, self._expected, shrink, self._ageing)
+        if products is not None:
+            update = self._product_spectra.conj() * self._product_doubt * step
+            self._constrain(update)
+            self._product_weights += update
+            _age(self._product_doubt, products, shrink, self._product_ageing)
 
     def _constrain(self, update: np.ndarray) -> None:
-        """Keep each partition's update to hop taps (Shynk 1992)."""
-        taps = fft.irfft(update, axis=1)
-        update[:] = fft.rfft(taps[:, : self.hop], 2 * self.hop, axis=1)
+        """Keep each partition's update (..., bins) to hop taps (Shynk 1992)."""
+        taps = fft.irfft(update, 2 * self.hop, axis=-1)
+        update[:] = fft.rfft(taps[..., : self.hop], 2 * self.hop, axis=-1)
 
-    def _decay(self) -> np.ndarray:
-        """(partitions,) power of a room's decay behind the direct sound, 1 in the first partition."""
-        seconds = np.arange(self.partitions) * self.hop / SAMPLE_RATE
-        return 10.0 ** (-6.0 * seconds / COLD_RT60_S)
+    def _path_power(self) -> np.ndarray:
+        """(bins,) |H|^2 of the path at the start, summed over partitions; 1 where nothing is known."""
+        return _power(self._weights).sum(axis=0) if self._warm else np.ones(self.hop + 1, np.float32)
 
     def _prior(self) -> np.ndarray:
         """(partitions, bins) covariance before anything was heard."""
-        decay = self._decay()[:, None]
+        seconds = np.arange(self.partitions) * self.hop / SAMPLE_RATE
+        decay = 10.0 ** (-6.0 * seconds / DECAY_RT60_S)[:, None] * np.ones(self.hop + 1)
         if not self._warm:
-            return np.broadcast_to(decay / decay.sum(), (self.partitions, self.hop + 1)).astype(np.float32)
-        power = np.abs(fft.rfft(self._initial.reshape(self.partitions, self.hop), 2 * self.hop)) ** 2
-        total = power.sum(axis=0)
-        return (WARM_DOUBT * power + 10.0 ** (LATE_DOUBT_DB / 10.0) * decay * total).astype(np.float32)
+            return (decay / decay.sum(axis=0)).astype(np.float32)
+        return (WARM_DOUBT * _power(self._weights) + LATE_DOUBT * decay * self._path_power()).astype(np.float32)
 
     def impulse_response(self) -> Samples:
         """The adapted path (taps,) float32, to be written back into a profile."""
@@ -212,10 +250,31 @@ class Canceller:
         blocks = np.lib.stride_tricks.sliding_window_view(past, 2 * self.hop)[:: self.hop][::-1]
         spectra = fft.rfft(blocks, axis=1)[: self.partitions]
         self._spectra[: self.partitions] = self._spectra[self.partitions :] = spectra
-        self._powers[:] = self._spectra.real**2 + self._spectra.imag**2
+        self._powers[:] = _power(self._spectra)
         self._newest = 0
         self._recent[:] = past[-2 * self.hop :]
+        if self.nonlinear:
+            self._displacement = np.zeros(2, np.float32)
+            products = self._products(past)
+            for part in range(PRODUCT_PARTITIONS):
+                end = past.size - part * self.hop
+                self._product_spectra[:, part] = fft.rfft(products[:, max(end - 2 * self.hop, 0) : end], 2 * self.hop, axis=1)
+            self._product_recent[:] = products[:, -2 * self.hop :]
 
     def stats(self) -> dict[str, float]:
         """What the stage did so far."""
         return {"hops": self._hops, "active_hops": self._active, "partitions": self.partitions, "gain_db": 20.0 * float(np.log10(self.gain))}
+
+
+def _power(spectrum: np.ndarray) -> np.ndarray:
+    """|spectrum|^2 without the square root of abs."""
+    return spectrum.real**2 + spectrum.imag**2
+
+
+def _age(doubt: np.ndarray, expected: np.ndarray, shrink: np.ndarray, ageing: np.ndarray) -> None:
+    """Covariance after one observation and one hop of time, in place; expected is overwritten."""
+    expected *= shrink
+    expected += 1.0
+    doubt *= expected
+    doubt *= TRANSITION**2
+    doubt += ageing

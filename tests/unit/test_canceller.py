@@ -97,19 +97,42 @@ def test_silent_reference_neither_adapts_nor_ages() -> None:
 def test_rewritten_reference_equals_a_reference_that_always_had_the_new_delay() -> None:
     h, x = path(), speechlike(2.0)
     moved = np.concatenate((np.zeros(300, np.float32), x))[: x.size]
+    mic = signal.oaconvolve(moved, h)[: x.size].astype(np.float32)
     at = 64 * HOP
     switched, always = Canceller(HOP, 3200, h), Canceller(HOP, 3200, h)
     silence = np.zeros(HOP, np.float32)
     for i in range(0, at, HOP):
         switched.step(silence, silence)
-        always.step(silence, moved[i : i + HOP])
+        always.step(mic[i : i + HOP], moved[i : i + HOP])
     always._weights[:] = switched._weights
     switched.rewrite_reference(moved[: at + HOP][-switched.history :])
-    a = switched.step(silence, moved[at : at + HOP]).echo
-    b = always.step(silence, moved[at : at + HOP]).echo
+    a = switched.step(mic[at : at + HOP], moved[at : at + HOP]).echo
+    b = always.step(mic[at : at + HOP], moved[at : at + HOP]).echo
     # identical spectra up to float32 rounding
     assert np.abs(b).max() > 1e-3
     np.testing.assert_allclose(a, b, atol=1e-6)
+
+
+def test_a_turned_volume_is_followed_within_a_fifth_of_a_second() -> None:
+    h, x = path(), speechlike(4.0)
+    mic = signal.oaconvolve(x, h)[: x.size].astype(np.float32)
+    mic[32_000:] *= np.float32(10 ** (3 / 20))
+    canceller = Canceller(HOP, 3200, h)
+    error = run(canceller, mic, x)
+    after = slice(32_000 + 3200, 32_000 + 9600)
+    # one factor explains the change, so the error falls far below what 3 dB leave (-7.7 dB); 30 dB leaves room for the adaptation
+    assert db(error[after]) < db(mic[after]) - 30
+    assert canceller.stats()["gain_db"] == pytest.approx(3.0, abs=0.2)  # 80 ms of correlation; the rest is adapted
+
+
+def test_an_echo_that_has_not_arrived_yet_is_not_subtracted() -> None:
+    h, x = path(), speechlike(1.6)
+    fan = 1e-4 * np.random.default_rng(2).standard_normal(x.size).astype(np.float32)
+    canceller = Canceller(HOP, 3200, h)
+    error = run(canceller, fan, x)
+    # the first hop fades the echo out; after it the fan passes as it is, and the path is kept for when the echo arrives
+    np.testing.assert_array_equal(error[HOP : 8 * HOP], fan[HOP : 8 * HOP])
+    np.testing.assert_allclose(canceller.impulse_response()[: h.size], h[: canceller.taps], atol=1e-3)  # float32 and one fading hop
 
 
 def test_reset_is_a_fresh_start() -> None:

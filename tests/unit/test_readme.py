@@ -2,6 +2,7 @@
 
 import os
 import re
+import shlex
 import subprocess
 import sys
 from pathlib import Path
@@ -25,10 +26,10 @@ def test_the_python_example_runs(tmp_path):
 
 def test_every_command_line_in_the_readme_parses():
     lines = [line.strip() for block in re.findall(r"```(?:sh|text)\n(.*?)```", README, re.S) for line in block.splitlines()]
-    commands = [line.split("edgefilter ", 1)[1].split("#")[0].split() for line in lines if re.match(r"(\S+/)?edgefilter [a-z]", line)]
+    commands = [line.split("edgefilter ", 1)[1].split("#")[0] for line in lines if re.match(r"(\S+/)?edgefilter [a-z]", line)]
     assert len(commands) >= 5
     for words in commands:
-        build_parser().parse_args(words)
+        build_parser().parse_args(shlex.split(words))
 
 
 def test_links_and_pictures_exist():

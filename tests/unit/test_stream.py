@@ -58,7 +58,7 @@ def test_a_found_reference_is_an_event_and_stands_in_the_stats():
     ego.process(mic, ref)
     events = ego.events()
     assert [event.kind for event in events] == ["realigned"] and ego.events() == []
-    assert ego.stats()["alignment"]["delay"] == pytest.approx(900, abs=16)  # 1 ms, the reach of the aligner
+    assert ego.stats()["alignment"]["delay_samples"] == pytest.approx(900, abs=16)  # 1 ms, the reach of the aligner
 
 
 def test_enhance_lowers_a_purely_linear_echo_by_20_db():
