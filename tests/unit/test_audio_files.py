@@ -1,0 +1,219 @@
+"""Audio files in and out: conversions with their notes, every unusable file with its one line, and a disk that fills up."""
+
+import re
+import resource
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import soundfile
+
+from edgefilter.audio.files import FileSink, FileSource, Recorder, open_source
+from edgefilter.errors import AudioFileError, UsageError
+from edgefilter.types import Block
+
+ROOT = Path(__file__).parents[2]
+
+
+def noise(count, seed=0):
+    return (np.random.default_rng(seed).integers(-9000, 9000, count) / 32768).astype(np.float32)
+
+
+def read(source):
+    blocks = list(source)
+    assert [b.start for b in blocks] == list(np.cumsum([0] + [b.mic.size for b in blocks[:-1]]))
+    return np.concatenate([b.mic for b in blocks]), np.concatenate([b.ref for b in blocks])
+
+
+@pytest.mark.parametrize("suffix", [".wav", ".flac"])
+def test_sixteen_bit_samples_survive_writing_and_reading_exactly(tmp_path, suffix):
+    x = noise(10001)
+    with FileSink(tmp_path / f"x{suffix}") as sink:
+        for start in range(0, x.size, 777):
+            sink.write(x[start : start + 777])
+    source = FileSource(tmp_path / f"x{suffix}")
+    mic, ref = read(source)
+    np.testing.assert_array_equal(mic, x)
+    assert not ref.any() and ref.size == x.size and source.total == x.size and source.notes == []
+
+
+@pytest.mark.parametrize("rate", [8000, 11025, 22050, 44100, 48000, 96000])
+@pytest.mark.parametrize("count", [3, 999, 44101])
+def test_length_at_16_khz_is_exact_and_said(tmp_path, rate, count):
+    soundfile.write(tmp_path / "x.wav", noise(count), rate)
+    source = FileSource(tmp_path / "x.wav")
+    mic, _ = read(source)
+    assert mic.size == source.total == int(np.floor(count * 16000 / rate + 0.5))
+    assert f"{rate} Hz resampled to 16000 Hz" in source.notes[0]
+
+
+def test_a_tone_keeps_its_frequency_phase_and_level_through_the_resampler(tmp_path):
+    soundfile.write(tmp_path / "x.wav", 0.5 * np.sin(2 * np.pi * 1000 * np.arange(44100) / 44100), 44100, subtype="FLOAT")
+    mic, _ = read(FileSource(tmp_path / "x.wav"))
+    expected = 0.5 * np.sin(2 * np.pi * 1000 * np.arange(16000) / 16000)
+    middle = slice(1000, -1000)  # away from the ends, where the tone begins abruptly
+    assert np.abs(mic - expected)[middle].max() < 1e-5  # the resampler's 28 bits and float32
+
+
+def test_channels_are_averaged_and_said(tmp_path):
+    left, right = noise(500, 1), noise(500, 2)
+    soundfile.write(tmp_path / "x.wav", np.stack((left, right), 1), 16000, subtype="FLOAT")
+    source = FileSource(tmp_path / "x.wav")
+    np.testing.assert_allclose(read(source)[0], (left + right) / 2, atol=1e-7)  # float32 rounding
+    assert "2 channels averaged" in source.notes[0]
+
+
+@pytest.mark.parametrize("count, words", [(700, "300 samples .* shorter"), (1300, "300 samples .* longer")])
+def test_reference_of_another_length_is_fitted_and_said(tmp_path, count, words):
+    mic, ref = noise(1000, 1), noise(count, 2)
+    soundfile.write(tmp_path / "m.wav", mic, 16000)
+    soundfile.write(tmp_path / "r.wav", ref, 16000)
+    source = FileSource(tmp_path / "m.wav", tmp_path / "r.wav", block=64)
+    got_mic, got_ref = read(source)
+    np.testing.assert_array_equal(got_mic, mic)
+    np.testing.assert_array_equal(got_ref, np.pad(ref, (0, 300))[:1000])
+    assert re.search(words, source.notes[0])
+
+
+def test_silent_reference_is_said(tmp_path):
+    soundfile.write(tmp_path / "m.wav", noise(100), 16000)
+    soundfile.write(tmp_path / "r.wav", np.zeros(100), 16000)
+    assert "r.wav is silent" in FileSource(tmp_path / "m.wav", tmp_path / "r.wav").notes[0]
+
+
+def broken(folder, kind):
+    path = folder / f"{kind}.wav"
+    if kind == "directory":
+        path.mkdir()
+    elif kind == "nothing":
+        path.write_bytes(b"")
+    elif kind == "header":
+        soundfile.write(path, np.zeros(0), 16000)
+    elif kind == "text":
+        path.write_text("dear diary, this is not audio\n" * 20)
+    elif kind in ("nan", "inf"):
+        x = noise(40000)
+        x[34567] = float(kind)
+        soundfile.write(path, x, 16000, subtype="FLOAT")
+    elif kind.startswith("cut"):
+        soundfile.write(path, noise(40000), 16000, format="FLAC" if kind == "cut-flac" else "WAV")
+        path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    elif kind == "tiny":
+        soundfile.write(path, np.ones(1) * 0.1, 44100)
+    return path
+
+
+@pytest.mark.parametrize(
+    "kind, words",
+    [
+        ("missing", "does not exist"), ("directory", "is a directory"), ("nothing", r"empty \(0 bytes\)"), ("header", "0 samples"),
+        ("text", "is not audio .*dear diary"), ("nan", r"holds nan at sample 34567"), ("inf", r"holds inf at sample 34567"),
+        ("cut-wav", "truncated"), ("cut-flac", "truncated"), ("tiny", "holds 1 samples at 44100 Hz"),
+    ],
+)
+@pytest.mark.parametrize("role", ["recording", "reference"])
+def test_an_unusable_file_is_one_line_that_names_it(tmp_path, kind, words, role):
+    soundfile.write(tmp_path / "good.wav", noise(100), 16000)
+    paths = (broken(tmp_path, kind), tmp_path / "good.wav")
+    with pytest.raises(AudioFileError, match=words) as caught:
+        FileSource(*(paths if role == "recording" else paths[::-1]))
+    assert str(caught.value).startswith(f"{role} {paths[0]}") and "\n" not in str(caught.value)
+
+
+def test_a_wav_written_to_a_pipe_is_read_to_its_end(tmp_path):
+    soundfile.write(tmp_path / "x.wav", noise(1000), 16000)
+    data = bytearray((tmp_path / "x.wav").read_bytes())
+    data[4:8] = data[40:44] = b"\xff" * 4
+    (tmp_path / "x.wav").write_bytes(data)
+    source = FileSource(tmp_path / "x.wav")
+    np.testing.assert_array_equal(read(source)[0], noise(1000))
+    assert "gives no length" in source.notes[0]
+
+
+def test_one_sample_at_16_khz_is_a_recording(tmp_path):
+    soundfile.write(tmp_path / "x.wav", np.full(1, 0.25), 16000)
+    np.testing.assert_array_equal(read(FileSource(tmp_path / "x.wav"))[0], [0.25])
+
+
+def test_clipped_samples_are_counted_and_said(tmp_path):
+    with FileSink(tmp_path / "x.wav") as sink:
+        sink.write(np.array([0.5, 1.5, -1.0, -2.0], np.float32))
+    assert sink.clipped == 2 and "2 of 4 output samples" in sink.notes[0]
+    np.testing.assert_allclose(soundfile.read(tmp_path / "x.wav")[0], [0.5, 32767 / 32768, -1.0, -1.0])
+
+
+@pytest.mark.parametrize("suffix", [".wav", ".flac"])
+def test_file_is_valid_after_an_interrupt(tmp_path, suffix):
+    with pytest.raises(KeyboardInterrupt), FileSink(tmp_path / f"x{suffix}") as sink:
+        sink.write(noise(5000))
+        raise KeyboardInterrupt
+    np.testing.assert_array_equal(read(FileSource(tmp_path / f"x{suffix}"))[0], noise(5000))
+
+
+@pytest.mark.parametrize("name, error, words", [
+    ("x.mp3", UsageError, "expected .wav or .flac"),
+    ("nowhere/x.wav", AudioFileError, "cannot be written: No such file"),
+    ("full.wav", AudioFileError, "No space left on device"),
+    ("full.flac", AudioFileError, "No space left on device"),
+])
+def test_a_place_that_takes_no_file_is_one_line(tmp_path, name, error, words):
+    if name.startswith("full"):
+        (tmp_path / name).symlink_to("/dev/full")
+    with pytest.raises(error, match=words) as caught, FileSink(tmp_path / name) as sink:
+        sink.write(noise(16000))
+    assert name in str(caught.value) and "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("suffix", [".wav", ".flac"])
+def test_what_fitted_on_a_full_disk_stays_a_valid_file(tmp_path, suffix):
+    """A limit on file size fails a write as a full disk does, in its middle, and needs no disk."""
+    path = tmp_path / f"x{suffix}"
+    code = (
+        "import sys, numpy as np\nfrom edgefilter.audio.files import FileSink\nfrom edgefilter.errors import AudioFileError\n"
+        "x = np.load(sys.argv[2])\n"
+        "try:\n    with FileSink(sys.argv[1]) as sink:\n        for i in range(0, x.size, 256): sink.write(x[i:i + 256])\n"
+        "except AudioFileError as error: print(error)\n"
+    )
+    np.save(tmp_path / "x.npy", noise(160000))
+
+    def limit():
+        signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (100001, 100001))
+
+    command = [sys.executable, "-c", code, str(path), str(tmp_path / "x.npy")]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, preexec_fn=limit)
+    assert "cannot be written on" in done.stdout and str(path) in done.stdout and done.stdout.count("\n") == 1, done.stderr
+    kept, _ = read(FileSource(path))
+    assert kept.size > 45000  # nearly what 100001 bytes hold, less the write that failed
+    np.testing.assert_array_equal(kept, noise(160000)[: kept.size])
+
+
+def test_recorder_keeps_the_exact_blocks(tmp_path):
+    mic, ref = noise(999, 1) * np.float32(3.3), noise(999, 2) / np.float32(7)
+    with Recorder(tmp_path / "deep" / "input") as recorder:
+        for at in (0, 500):
+            recorder.write(Block(mic[at : at + 500], ref[at : at + 500], at))
+    source = FileSource(tmp_path / "deep/input/mic.wav", tmp_path / "deep/input/reference.wav")
+    got_mic, got_ref = read(source)
+    np.testing.assert_array_equal(got_mic, mic)
+    np.testing.assert_array_equal(got_ref, ref)
+    assert source.notes == []
+
+
+def test_stop_ends_the_iteration(tmp_path):
+    soundfile.write(tmp_path / "x.wav", noise(1000), 16000)
+    source = FileSource(tmp_path / "x.wav", block=100)
+    seen = 0
+    for _ in source:
+        seen += 1
+        if seen == 3:
+            source.stop()
+    assert seen == 3
+
+
+def test_stdin_with_a_second_reference_is_refused():
+    with pytest.raises(UsageError, match="already holds the reference"):
+        open_source("-", "r.wav")
