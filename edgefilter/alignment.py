@@ -24,8 +24,9 @@ CERTAIN, LIKELY = (10.0, 2.0), (11.5, 1.8)
 has 18 and 4 after 150 ms; the strongest wrong peak in minutes of real speech had 10.8 and 1.7, in successive windows alike."""
 HEARD = 6.0
 """Strength of the tracker's peak over the rms of +-REACH lags from which a measurement counts."""
-FAR = 11.0
-"""The same for jumps of more than 8 samples: true ones have 20 to 30, the robot's words against a human's had up to 9."""
+FAR, EDGE = 8.0, 960.0
+"""The same for jumps of more than 8 samples, and the longest that is believed: the robot's words against a human's made peaks
+of up to 9, but only at the very edge of the tracker's reach."""
 STRANGE = 10.0
 """Power over what the robot brings above which it is not the robot that is heard, so that no jump can be seen."""
 LOST_BLOCKS = 10
@@ -190,7 +191,7 @@ class Aligner:
         if small and (self._drift.surprise(found) < 5.0 or abs(found.offset) < 0.3):
             return self._accept(found)
         too_loud = self._gain is not None and found.gain > STRANGE * self._gain
-        if too_loud or (abs(found.offset) > 8.0 and found.strength < FAR):
+        if too_loud or (abs(found.offset) > 8.0 and found.strength < FAR) or abs(found.offset) > EDGE:
             return False
         suspect, self._suspect = self._suspect, found.offset
         sure = found.strength > 14.0 and found.dominance > 3.0 and abs(found.offset) > 8.0
