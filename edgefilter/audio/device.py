@@ -11,7 +11,7 @@ import numpy as np
 
 from edgefilter.audio.lookup import Device, match, monitor
 from edgefilter.audio.pairing import Pairing
-from edgefilter.audio.port import POLL_S, Input, Output
+from edgefilter.audio.port import POLL_S, START_S, Input, Output
 from edgefilter.errors import DeviceError
 from edgefilter.types import SAMPLE_RATE, Block, Samples
 
@@ -97,7 +97,8 @@ class LiveSource:
             port.close()
         troubles = {name: count for name, count in self.stats().items() if count and name != "lost"}
         if troubles:
-            self.notes.append("live input was not complete: " + ", ".join(f"{count} {name.replace('_', ' ')}" for name, count in troubles.items()))
+            words = ", ".join(f"{count} {name.replace('_', ' ')}" for name, count in troubles.items())
+            self.notes.append(f"live input was not complete: {words}")
 
     def _ports(self) -> list[Input]:
         """The reference first, so that it is there when the microphone starts."""
@@ -112,7 +113,7 @@ class LiveSource:
 
     def stats(self) -> dict[str, int]:
         """Samples at 16 kHz by what befell them, and callbacks marked as overrun."""
-        counts = {"reference_filled": self._pairing.filled, "reference_dropped": self._pairing.dropped, "reference_inserted": self._pairing.inserted}
+        counts = {f"reference_{name}": getattr(self._pairing, name) for name in ("filled", "dropped", "inserted")}
         for name, port in (("microphone", self._mic), ("reference", self._reference)):
             counts[f"{name}_lost"] = 0 if port is None else round(port.inlet.lost * SAMPLE_RATE / port.rate)
         lost = sum(counts.values())
@@ -152,7 +153,7 @@ class LiveSource:
         """
         while not self._stopped and not all(port.inlet.received >= SETTLE_S * port.rate for port in self._ports()):
             for port in self._ports():
-                port.check_alive(port.inlet.received)
+                port.check_alive(port.inlet.received, START_S)
             time.sleep(POLL_S)
         self._mic.take()
         if self._reference is not None:
@@ -194,7 +195,7 @@ class LiveSink:
             self._port.open()
             self._open = True
         if self._open:
-            self._port.check_alive(self._port.outlet.calls)
+            self._port.check_alive(self._port.outlet.calls, START_S)
 
     def _queue(self, data: Samples) -> None:
         ring = self._port.outlet.ring
@@ -253,12 +254,12 @@ def play_and_record(
     try:
         mic.open()
         while not mic.inlet.calls:
-            mic.check_alive(mic.inlet.received)
+            mic.check_alive(mic.inlet.received, START_S)
             time.sleep(POLL_S)
         speaker.open(mark)
         while not begun or sum(part.size for part in heard) < wanted + skipped + 1 + begun[0] * SAMPLE_RATE / mic.rate:
-            mic.check_alive(mic.inlet.received)
-            speaker.check_alive(speaker.outlet.calls)
+            mic.check_alive(mic.inlet.received, START_S)
+            speaker.check_alive(speaker.outlet.calls, START_S)
             heard.append(mic.take())
             time.sleep(POLL_S)
     finally:

@@ -22,6 +22,8 @@ from edgefilter.types import SAMPLE_RATE, Samples
 
 POLL_S = 0.004
 VANISHED_S = 2.0
+START_S = 6.0
+"""How long a device may take to its first samples: a virtual one can hold back its first 2 s."""
 BUFFER_S = 2.0
 """How much sound a ring holds while the filter is busy; beyond it samples are lost, and counted."""
 STREAM_LATENCY_S = 0.05
@@ -54,7 +56,8 @@ class Port:
         if self.rate != SAMPLE_RATE:
             self.notes.append(f"{kind} device '{self.device}' does not run at {SAMPLE_RATE} Hz: opened at {self.rate} Hz and resampled")
         if self.channels > 1:
-            self.notes.append(f"{kind} device '{self.device}' has no mono: {self.channels} channels " + ("averaged" if kind == "input" else "get the same"))
+            how = "averaged" if kind == "input" else "get the same"
+            self.notes.append(f"{kind} device '{self.device}' has no mono: {self.channels} channels {how}")
         self._stream: Any = None
         self._heard = 0
         self._silent_s, self._asked = 0.0, time.monotonic()
@@ -83,15 +86,15 @@ class Port:
         except self._sd.PortAudioError as error:
             raise DeviceError(f"{self.kind} device '{self.device}' cannot be started: {_words(error)}; is another program using it?") from None
 
-    def check_alive(self, progress: int) -> None:
-        """Raise DeviceError once progress, samples or callbacks so far, has stood still for VANISHED_S of the time that we were awake."""
+    def check_alive(self, progress: int, patience_s: float = VANISHED_S) -> None:
+        """Raise DeviceError once progress, samples or callbacks so far, has stood still for patience_s of the time that we were awake."""
         now = time.monotonic()
         awake, self._asked = min(now - self._asked, 0.1), now
         self._silent_s = 0.0 if progress != self._heard else self._silent_s + awake
         self._heard = progress
-        if self._silent_s > VANISHED_S:
+        if self._silent_s > patience_s:
             raise DeviceError(
-                f"{self.kind} device '{self.device}' stopped (no sound for {VANISHED_S:.0f} s: unplugged, or the sound server ended); "
+                f"{self.kind} device '{self.device}' stopped (no sound for {patience_s:.0f} s: unplugged, or the sound server ended); "
                 "what came until then is kept: reconnect it and start again"
             )
 

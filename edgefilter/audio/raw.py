@@ -75,9 +75,12 @@ class PcmSource:
                 yield Block(stereo[:, 0].copy(), stereo[:, 1].copy(), start)
                 start += len(stereo)
         if rest:
-            self.notes.append(f"standard input ended in the middle of a sample: its last {len(rest)} bytes were ignored (is it s16le stereo?)")
+            cut = f"its last {len(rest)} bytes were ignored (is it s16le stereo?)"
+            self.notes.append(f"standard input ended in the middle of a sample: {cut}")
         if start == 0 and not self._stopped:
-            raise AudioFileError("standard input held no sound, expected raw s16le 16 kHz stereo (microphone, reference): check the program before the pipe")
+            raise AudioFileError(
+                "standard input held no sound, expected raw s16le 16 kHz stereo (microphone, reference): check the program before the pipe"
+            )
         self.total = start
 
     def _pieces(self) -> Iterator[bytes]:
