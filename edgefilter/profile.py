@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -102,6 +102,10 @@ class Profile:
             return cls(echo=EchoModel(arrays.pop("impulse_response"), effects), warnings=tuple(warnings), **arrays, **header)
         except ProfileError as error:
             raise ProfileError(f"{path}: {error}") from None
+
+    def with_impulse_response(self, impulse_response: Samples) -> Profile:
+        """The same robot with another path (taps,) float32, for example the one that the running filter has adapted."""
+        return replace(self, echo=replace(self.echo, impulse_response=impulse_response))
 
     def noise_bins(self, stft: StftConfig) -> Samples:
         """Expected |X|^2 (bins,) float32 of the fan in one frame of stft: PSD / 2 * sample rate * sum of the squared window."""

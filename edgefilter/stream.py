@@ -19,6 +19,9 @@ from edgefilter.ring import Ring
 from edgefilter.stft import Analyser, Synthesiser
 from edgefilter.types import SAMPLE_RATE, Frame, Samples, as_samples
 
+TAPS = (2048, 8192)
+"""Least and most taps of the linear stage, 128 to 512 ms; between them the profile's impulse response decides."""
+
 
 @dataclass(frozen=True, slots=True)
 class Event:
@@ -42,14 +45,20 @@ class Front:
         if engine.front == "paper":
             self.aligner = PaperAligner(stft.hop, profile)
         elif engine.front == "full":
-            response = profile.echo.impulse_response if profile else None
             self.aligner = Aligner(stft.hop, profile)
-            self.canceller = Canceller(stft.hop, impulse_response=response)
+            self.canceller = self._make_canceller(profile)
             self.residual = Residual(stft, profile)
+        self._drive = profile.echo.drive if profile else lambda reference: reference
         self._analyser = Analyser(stft, channels=4 if self.canceller else 2)
         self._nothing = np.zeros(stft.bins, np.float32)
         self._fan = profile.noise_bins(stft) if profile else self._nothing
         self._silence = np.zeros(stft.bins, np.complex64)
+
+    def _make_canceller(self, profile: Profile | None) -> Canceller:
+        if profile is None:
+            return Canceller(self.hop)
+        response = profile.echo.impulse_response
+        return Canceller(self.hop, taps=int(np.clip(response.size, *TAPS)), impulse_response=response)
 
     def step(self, mic: Samples, ref: Samples) -> tuple[Frame, Aligned | None]:
         """One hop (hop,) of both channels to one frame, with what the aligner found."""
@@ -59,8 +68,8 @@ class Front:
             x, r = self._analyser.push(np.stack((mic, reference)))
             return Frame(x, r, self._silence, x, self._fan, self._nothing), aligned
         if aligned.realigned:
-            self.canceller.rewrite_reference(self.aligner.history(self.canceller.history))
-        linear = self.canceller.step(mic, reference)
+            self.canceller.rewrite_reference(self._drive(self.aligner.history(self.canceller.history)))
+        linear = self.canceller.step(mic, self._drive(reference))
         x, r, e, error = self._analyser.push(np.stack((mic, reference, linear.echo, linear.error)))
         noise, residual = self.residual.step(e, error, linear.uncertainty)
         return Frame(x, r, e, error, noise, residual), aligned
@@ -207,12 +216,16 @@ class EgoFilter:
             "linear_stage": front.canceller.stats() if front.canceller else None,
         }
 
+    @property
+    def can_adapt(self) -> bool:
+        """Whether there will be an adapted profile: one to start from and a linear stage that learns."""
+        return self.profile is not None and self._stream.front.canceller is not None
+
     def adapted_profile(self) -> Profile:
         """The profile with the echo path as the linear stage has adapted it; raises SignalError where there is none."""
-        canceller = self._stream.front.canceller
-        if canceller is None or self.profile is None:
+        if not self.can_adapt:
             raise SignalError("nothing to write back: give a profile and an engine with a linear stage (linear or ss)")
-        return self.profile.with_impulse_response(canceller.impulse_response())
+        return self.profile.with_impulse_response(self._stream.front.canceller.impulse_response())
 
 
 def choose(engine: str) -> tuple[str, str]:

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
 
+from edgefilter.audio import pulse
 from edgefilter.audio.lookup import Device, match, monitor
 from edgefilter.audio.pairing import Pairing
 from edgefilter.audio.port import POLL_S, START_S, Input, Output
-from edgefilter.errors import DeviceError
+from edgefilter.errors import DeviceError, UsageError
 from edgefilter.types import SAMPLE_RATE, Block, Samples
 
 MARGIN_S = 0.04
@@ -55,12 +56,31 @@ def find(name: str | int | Device | None, kind: str) -> Device:
     kind: 'input' or 'output'. Raises UsageError for an unknown or ambiguous name, DeviceError without any device.
     """
     default = _sounddevice().default.device[0 if kind == "input" else 1]
-    return match(_devices(), name, kind, default)
+    try:
+        return match(_devices(), name, kind, default)
+    except UsageError:
+        if kind == "input" and name in pulse.sources() and (device := _pulse_input(str(name))):
+            return device
+        raise
 
 
 def monitor_of(output: str | int | Device | None = None) -> Device:
     """The input that hears what output plays (default: the default output); UsageError where there is none."""
-    return monitor(_devices(), find(output, "output"))
+    device = find(output, "output")
+    if device.name in pulse.STAND_INS and (source := pulse.default_monitor()):
+        found = _pulse_input(source)
+        if found:
+            return found
+    return monitor(_devices(), device)
+
+
+def _pulse_input(source: str) -> Device | None:
+    """The sound server's source as a device, None where PortAudio has no way to the server."""
+    for name in pulse.STAND_INS:
+        for device in _devices():
+            if device.name == name and device.inputs:
+                return replace(device, name=source, pulse_source=source)
+    return None
 
 
 class LiveSource:

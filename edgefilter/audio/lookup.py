@@ -13,7 +13,10 @@ _DEFAULT_WORDS = ("default", "mic", "speaker")
 
 @dataclass(frozen=True)
 class Device:
-    """A sound device as the audio system lists it: number, name, channels each way, its own rate in Hz, its audio system."""
+    """A sound device as the audio system lists it: number, name, channels each way, its own rate in Hz, its audio system.
+
+    pulse_source: where the device only stands for the sound server, the server's input that is meant.
+    """
 
     index: int
     name: str
@@ -21,6 +24,7 @@ class Device:
     outputs: int
     rate: float
     system: str = ""
+    pulse_source: str = ""
 
     def __str__(self) -> str:
         return self.name

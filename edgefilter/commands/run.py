@@ -24,8 +24,10 @@ FILE_ENDINGS = (".wav", ".flac", ".ogg", ".mp3", ".aiff", ".aif", ".w64", ".opus
 def main(args: argparse.Namespace) -> int:
     _refuse_overwriting(args)
     ego = EgoFilter(args.profile, args.engine)
-    source = make_source(args.input, args.reference)
-    sink = make_sink(args.output, ego.latency)
+    if args.save_profile and not ego.can_adapt:
+        raise UsageError("--save-profile writes back an adapted path: give --profile and an engine with a linear stage (linear or ss)")
+    source = make_source(args.input, args.reference, args.output)
+    sink = make_sink(args.output, ego.latency, wait=not source.live)
     limit = None if args.seconds is None else round(args.seconds * SAMPLE_RATE)
     for note in source.notes:
         say(note)
@@ -60,26 +62,29 @@ def finish(args: argparse.Namespace, ego: EgoFilter, source: Source, sink: Sink,
     return 130 if report.interrupted and not source.live else 0
 
 
-def make_source(name: str, reference: str | None) -> Source:
-    """A file or pipe where name is one, else the live devices."""
+def make_source(name: str, reference: str | None, output: str) -> Source:
+    """A file or pipe where name is one, else the live devices; the reference defaults to the monitor of the output device."""
     if name == "-" or looks_like_file(name):
         return open_source(name, reference)
     from edgefilter.audio.device import LiveSource, monitor_of
 
     if reference and looks_like_file(reference):
         raise UsageError(f"live, the reference is a device, found the file {reference}: leave --reference out or name a monitor ('edgefilter devices')")
-    return LiveSource(name, reference or monitor_of("default"))
+    return LiveSource(name, reference or monitor_of("default" if output == "-" or looks_like_file(output) else output))
 
 
-def make_sink(name: str, latency: int) -> Sink:
-    """A file or pipe where name is one, else an output device, which gets the latency as silence first."""
+def make_sink(name: str, latency: int, wait: bool) -> Sink:
+    """A file or pipe where name is one, else an output device, which gets the latency as silence first.
+
+    wait: let a device that plays slower hold back the source, which a recording can bear and a microphone cannot.
+    """
     if name == "-":
         return PcmSink()
     if looks_like_file(name):
         return FileSink(name)
     from edgefilter.audio.device import LiveSink
 
-    return LiveSink(name, latency)
+    return LiveSink(name, latency, wait=wait)
 
 
 def looks_like_file(name: str) -> bool:

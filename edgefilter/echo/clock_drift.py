@@ -27,6 +27,7 @@ class ClockDrift:
 
     name: ClassVar[str] = "clock_drift"
     stage: ClassVar[Stage] = "time"
+    memoryless: ClassVar[bool] = False
     parameters: ClassVar[tuple[Parameter, ...]] = (
         Parameter("ppm", "1e-6", 0.0, -1000.0, 1000.0),
         Parameter("offset", "samples", 0.0, -32000.0, 32000.0),

@@ -24,6 +24,7 @@ class Compression:
 
     name: ClassVar[str] = "compression"
     stage: ClassVar[Stage] = "source"
+    memoryless: ClassVar[bool] = False
     parameters: ClassVar[tuple[Parameter, ...]] = (
         Parameter("threshold_db", "dB re full scale", -20.0, -80.0, 0.0),
         Parameter("ratio", "dB/dB", 1.0, 1.0, 50.0),

@@ -44,6 +44,7 @@ class Effect(Protocol):
 
     name: ClassVar[str]
     stage: ClassVar[Stage]
+    memoryless: ClassVar[bool]
     parameters: ClassVar[tuple[Parameter, ...]]
 
     def apply(self, x: Samples, values: Values, sample_rate: int) -> Samples:

@@ -21,6 +21,7 @@ class SpeakerNonlinearity:
 
     name: ClassVar[str] = "speaker_nonlinearity"
     stage: ClassVar[Stage] = "source"
+    memoryless: ClassVar[bool] = True
     parameters: ClassVar[tuple[Parameter, ...]] = (
         Parameter("even", "1/full scale", 0.0, -20.0, 20.0),
         Parameter("odd", "1/full scale^2", 0.0, -200.0, 200.0),

@@ -18,6 +18,7 @@ class PlaybackGain:
 
     name: ClassVar[str] = "playback_gain"
     stage: ClassVar[Stage] = "source"
+    memoryless: ClassVar[bool] = True
     parameters: ClassVar[tuple[Parameter, ...]] = (Parameter("gain_db", "dB", 0.0, -60.0, 60.0),)
 
     def apply(self, x: Samples, values: Values, sample_rate: int) -> Samples:

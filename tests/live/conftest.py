@@ -35,12 +35,15 @@ def start_server(folder: Path) -> Server:
     with open(folder / "log", "w") as log:
         process = subprocess.Popen(["pulseaudio", *arguments], env=environment, stdout=log, stderr=log)
     environment |= {"PULSE_SERVER": socket, "ALSA_CONFIG_PATH": str(folder / "asound.conf"), "OMP_NUM_THREADS": "1"}
-    names = {"!default": SINKS[0], **{name: name for name in SINKS}, **{f"{name}_monitor": f"{name}.monitor" for name in SINKS}}
+    names = {**{name: name for name in SINKS}, **{f"{name}_monitor": f"{name}.monitor" for name in SINKS}}
     entries = [f'pcm.{pcm} {{ type pulse\n server "{socket}"\n device "{device}" }}\n' for pcm, device in names.items()]
+    entries += [f'pcm.{pcm} {{ type pulse\n server "{socket}" }}\n' for pcm in ("!default", "pulse")]
     (folder / "asound.conf").write_text("</usr/share/alsa/alsa.conf>\n" + "".join(entries))
     for _ in range(300):
         listed = subprocess.run(["pactl", "list", "short", "sinks"], env=environment, capture_output=True, text=True)
         if all(f"\t{name}\t" in listed.stdout for name in SINKS):
+            subprocess.run(["pactl", "set-default-sink", SINKS[0]], env=environment, check=True)
+            subprocess.run(["pactl", "set-default-source", f"{SINKS[1]}.monitor"], env=environment, check=True)
             return Server(process, environment)
         if process.poll() is not None:
             break

@@ -1,0 +1,102 @@
+"""`edgefilter run --input mic` as on a laptop: default microphone, reference from the default output's monitor, Ctrl-C."""
+
+import json
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import soundfile
+
+ROOT = Path(__file__).parents[2]
+DEMO = ROOT / "edgefilter/demo_data"
+
+
+def edgefilter(*arguments):
+    return [sys.executable, "-m", "edgefilter.cli", *map(str, arguments)]
+
+
+@pytest.fixture(scope="module")
+def conversation(tmp_path_factory):
+    """The first 7 s of the bundled conversation as 16-bit WAV for the players."""
+    folder = tmp_path_factory.mktemp("conversation")
+    for sink, name in (("robot", "reference"), ("robot_mic", "mic")):
+        soundfile.write(folder / f"{sink}.wav", soundfile.read(DEMO / f"{name}.flac", dtype="int16")[0][: 7 * 16000], 16000, "PCM_16")
+    return folder
+
+
+def play(server, folder):
+    return [subprocess.Popen(["paplay", "-d", sink, str(folder / f"{sink}.wav")], env=server.environment) for sink in ("robot", "robot_mic")]
+
+
+def db(x):
+    return 10 * np.log10(np.mean(np.square(x, dtype=np.float64)) + 1e-12)
+
+
+def test_live_run_takes_the_monitor_ends_by_ctrl_c_and_equals_the_file_path(server, conversation, tmp_path):
+    command = edgefilter(
+        "run", "--input", "mic", "--profile", DEMO / "profile.npz", "--output", tmp_path / "live.wav",
+        "--save-input", tmp_path / "heard", "--json", tmp_path / "stats.json",
+    )  # fmt: skip
+    live = subprocess.Popen(command, env=server.environment, cwd=ROOT, stderr=subprocess.PIPE, text=True)
+    heard = tmp_path / "heard/mic.wav"
+    for _ in range(300):  # until the first samples are on disk
+        if heard.exists() and heard.stat().st_size > 10_000:
+            break
+        time.sleep(0.1)
+    for player in play(server, conversation):
+        assert player.wait(timeout=60) == 0
+    time.sleep(1.5)
+    live.send_signal(signal.SIGINT)
+    _, said = live.communicate(timeout=60)
+    assert live.returncode == 0 and "Traceback" not in said, said
+    assert "robot.monitor" in said
+
+    stats = json.loads((tmp_path / "stats.json").read_text())
+    out, mic, ref = (soundfile.read(path, dtype="float32")[0] for path in (tmp_path / "live.wav", heard, tmp_path / "heard/reference.wav"))
+    assert stats["samples_in"] == stats["samples_out"] == out.size == mic.size == ref.size
+    assert db(mic) > -60 and db(ref) > -60
+    again = edgefilter(
+        "run", "--input", heard, "--reference", tmp_path / "heard/reference.wav", "--profile", DEMO / "profile.npz", "--output", tmp_path / "file.wav"
+    )
+    subprocess.run(again, cwd=ROOT, check=True, capture_output=True)
+    assert (tmp_path / "file.wav").read_bytes() == (tmp_path / "live.wav").read_bytes()
+
+    first = int(np.argmax(np.abs(mic) > 0.02))
+    speech = slice(first + 16_000, first + 5 * 16_000)
+    assert db(out[speech]) < db(mic[speech]) - 15  # 25 dB were seen; the players start the two channels at different times
+
+
+def test_an_unknown_device_is_one_line_that_names_the_known_ones(server, tmp_path):
+    result = subprocess.run(
+        edgefilter("run", "--input", "nosuchmic", "--output", tmp_path / "x.wav"), env=server.environment, cwd=ROOT, capture_output=True, text=True
+    )
+    lines = [line for line in result.stderr.splitlines() if line.startswith("edgefilter:")]
+    assert result.returncode == 2 and len(lines) == 1, result.stderr
+    assert "nosuchmic" in lines[0] and "robot_mic_monitor" in lines[0]
+
+
+def test_devices_lists_them_and_the_reference(server):
+    result = subprocess.run(edgefilter("devices"), env=server.environment, cwd=ROOT, capture_output=True, text=True)
+    assert result.returncode == 0, result.stderr
+    assert "robot_mic_monitor" in result.stdout and "reference would come from: robot.monitor" in result.stdout
+
+
+def test_live_calibration_measures_the_virtual_room(server, tmp_path):
+    """The default output is looped into the microphone with a gain of one: the path is a delay."""
+    subprocess.run(
+        ["pactl", "load-module", "module-loopback", "source=robot.monitor", "sink=robot_mic", "latency_msec=30"],
+        env=server.environment, check=True, capture_output=True,
+    )  # fmt: skip
+    result = subprocess.run(
+        edgefilter("calibrate", "--live", "--output", tmp_path / "p.npz", "--json", tmp_path / "p.json"),
+        env=server.environment, cwd=ROOT, capture_output=True, text=True, timeout=120,
+    )  # fmt: skip
+    assert result.returncode == 0, result.stderr
+    figures = json.loads((tmp_path / "p.json").read_text())
+    assert figures["delay_samples"] > 0
+    middle = [band["snr_db"] for band in figures["bands"] if 200 < band["low_hz"] < 5000]
+    assert min(middle) > 30  # there is no fan: 16-bit rounding is all the noise
