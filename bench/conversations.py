@@ -20,7 +20,7 @@ How it compares with a set of ten `paper` conversations simulated by other hands
 - robot removed by the best linear filter of 300 ms, fitted to the first utterance, 19.7 / 15.8; 20.3 / 17.6 dB
 - robot removed by that filter at the onset of the second utterance 17.6 / 14.3; 18.6 / 15.4 dB
 - direct sound over reverberation of that filter 15.7 / 8.3; 15.9 / 10.9 dB
-So the offices here are a little easier. Their nl_db (-22 / -24 dB) does not explain how much a linear filter leaves in their offices, so it
+Their nl_db (-22 / -24 dB) does not explain how much a linear filter leaves in their offices, so it
 was probably measured elsewhere in the chain; here the distortion is set by what a linear filter leaves, and nl_db is -19 / -15 dB.
 """
 
