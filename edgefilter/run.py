@@ -99,16 +99,17 @@ def filter_blocks(
         show(progress)
 
     try:
-        try:
-            for block in source:
-                take(block)
-                if stopped():
-                    report.interrupted = True
-                    break
-        finally:
-            push(ego.flush())
+        for block in source:
+            take(block)
+            if stopped():
+                report.interrupted = True
+                break
     except EdgefilterError as error:
         report.failure = error
+    try:
+        push(ego.flush())
+    except EdgefilterError as error:  # a sink that failed before says so again; its first word is the reason
+        report.failure = report.failure or error
     report.wall_s = time.perf_counter() - began
     report.filter = ego.stats()
     return report

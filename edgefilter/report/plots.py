@@ -47,7 +47,7 @@ def plot_before_after(signals: Mapping[str, Samples], path: str | Path) -> None:
     for axis, (name, samples) in zip(axes, signals.items(), strict=True):
         picture = _db(_spectrogram(samples) / peak)
         extent = (0, samples.size / SAMPLE_RATE, 0, SAMPLE_RATE / 2000)
-        axis.imshow(picture.T, origin="lower", aspect="auto", extent=extent, vmin=-75, vmax=-10, cmap="magma")
+        axis.imshow(picture.T, origin="lower", aspect="auto", extent=extent, vmin=-85, vmax=-35, cmap="magma")
         axis.set_title(name, loc="left", fontsize=10)
         axis.set_ylabel("kHz")
     axes[-1].set_xlabel("s")

@@ -143,7 +143,7 @@ def test_a_full_disk_is_one_line_and_leaves_a_valid_file(speech):
         resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
 
     result = edgefilter("run", "--input", speech / "mic.wav", "--engine", "bypass", "--output", speech / "out.wav", preexec_fn=small_disk)
-    one_line(result, 1, "out.wav")
+    one_line(result, 1, "out.wav", "File too large")
     out, mic = soundfile.read(speech / "out.wav")[0], soundfile.read(speech / "mic.wav")[0]
     assert 1000 < out.size < mic.size
     np.testing.assert_allclose(out, mic[: out.size], atol=2 / 32768)  # one step of 16-bit PCM, and its rounding
