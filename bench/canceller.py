@@ -4,7 +4,8 @@
 
 DIR holds conversations as bench/conversations.py makes them. Three questions, each answered over all of them:
 warm/cold: error over microphone, dB, by seconds of robot speech, with and without the calibrated profile;
-human: SI-SDR of out(robot + human + fan) - out(robot + fan) against the human, that is, what the filter makes of the human alone;
+human: SI-SDR of out(robot + human + fan) - out(robot + fan) against the human, that is, what the filter makes of the human alone
+(a lower bound: two runs adapt differently, and where the one without a human happens to end elsewhere, the difference counts as distortion);
 loud: the same recordings with the human raised to the robot's level: residual echo while both talk, against that with no human.
 """
 
@@ -100,7 +101,7 @@ def main() -> None:
         for start in ("warm", "cold"):
             of = np.nanmedian([row[start] for row in rows if row["room"] == room], axis=0)
             lines.append(f"| {room} | {start} | " + " | ".join(f"{of[round(s * 10) - 1]:.1f}" for s in seconds) + " |")
-    lines += ["", "Double talk, dB, median (least):", "", "| | lab | office |", "| --- | --- | --- |"]
+    lines += ["", "Double talk, dB, median (least). The first two rows are differences of two runs that adapt differently, so lower bounds:", "", "| | lab | office |", "| --- | --- | --- |"]
     for key, text in (
         ("human_si_sdr_db", "the human through `linear` against the human, SI-SDR"),
         ("human_ss_si_sdr_db", "the human through `ss` against the human, SI-SDR"),
