@@ -186,7 +186,7 @@ class EgoFilter:
         return self._stream.process(mic_block, ref_block)
 
     def announce(self, utterance: Samples) -> None:
-        """Say what the robot will play next (n,); it may start at any time, or never."""
+        """Say what the robot will play next (n,); it may start at any time, or never. So far the aligner only counts it."""
         if self._stream.front.aligner:
             self._stream.front.aligner.announce(as_samples(utterance, "utterance"))
 
