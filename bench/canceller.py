@@ -16,13 +16,12 @@ import json
 from pathlib import Path
 
 import numpy as np
-import soundfile
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from quality import Conversation
 from table import machine
 from tqdm import tqdm
 
-from edgefilter.calibrate import calibrate
 from edgefilter.metrics import erle, si_sdr
 from edgefilter.stream import enhance
 from edgefilter.types import SAMPLE_RATE
@@ -31,10 +30,6 @@ ACTIVE = 1e-6
 """Mean square of the reference above which a tenth of a second counts as robot speech."""
 STEP = SAMPLE_RATE // 10
 LONGEST_S = 5.0
-
-
-def read(folder: Path, name: str) -> np.ndarray:
-    return soundfile.read(folder / f"{name}.flac", dtype="float32")[0]
 
 
 def curve(mic: np.ndarray, error: np.ndarray, begin: int) -> np.ndarray:
@@ -47,10 +42,10 @@ def curve(mic: np.ndarray, error: np.ndarray, begin: int) -> np.ndarray:
 
 
 def measure(folder: Path) -> dict[str, object]:
-    meta = json.loads((folder / "meta.json").read_text())
-    profile = calibrate(*(read(folder, name) for name in ("sweep_ref", "sweep_mic", "fan_only")))
-    mic, ref, clean = (read(folder, name) for name in ("mic", "ref", "clean"))
-    span, alone = slice(meta["start"], meta["end"]), mic - clean
+    talk = Conversation(folder)
+    meta, profile, span = talk.meta, talk.profile, talk.span
+    mic, ref, clean = (talk.read(name) for name in ("mic", "ref", "clean"))
+    alone = mic - clean
     heard = slice(0, meta["t_main"])
     begin = int(meta["lag"] + profile.delay + np.argmax(np.abs(ref) > 0.003))
     robot_db, human_db = (10 * np.log10(np.mean(x[span] ** 2)) for x in (alone, clean))

@@ -14,21 +14,16 @@ import json
 from pathlib import Path
 
 import numpy as np
-import soundfile
+from quality import Conversation
 from recogniser import Recogniser, word_errors
 from tqdm import tqdm
 
-from edgefilter.calibrate import calibrate
 from edgefilter.engines.paper_ss import PAPER_STFT, PaperSpectralSubtraction
 from edgefilter.metrics import si_sdr
 from edgefilter.stream import Stream
 
 ALPHAS = (0.25, 0.5, 1.0, 2.0, 4.0, 8.0)
 BETAS = (8.0, 4.0, 2.0, 1.0)
-
-
-def read(folder: Path, name: str) -> np.ndarray:
-    return soundfile.read(folder / f"{name}.flac", dtype="float32")[0]
 
 
 def main() -> None:
@@ -42,10 +37,9 @@ def main() -> None:
     folders = sorted(path.parent for path in args.conversations.glob("*/meta.json"))
     rows = {alpha: [] for alpha in ALPHAS}
     for folder in tqdm(folders):
-        meta = json.loads((folder / "meta.json").read_text())
-        profile = calibrate(*(read(folder, name) for name in ("sweep_ref", "sweep_mic", "fan_only")))
-        span = slice(meta["start"], meta["end"])
-        mic, ref, clean = (read(folder, name) for name in ("mic", "ref", "clean"))
+        talk = Conversation(folder)
+        meta, profile, span = talk.meta, talk.profile, talk.span
+        mic, ref, clean = (talk.read(name) for name in ("mic", "ref", "clean"))
         for alpha in ALPHAS:
             stream = Stream(PaperSpectralSubtraction(profile.response_bins(PAPER_STFT), alpha=alpha), profile)
             out = np.concatenate((stream.process(mic, ref), stream.flush()))

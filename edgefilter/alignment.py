@@ -10,12 +10,9 @@ from edgefilter.delay_line import HALF_WIDTH, Aligned, Tape, read_delayed, read_
 from edgefilter.delay_tracker import STRIDE, DelayMeter, DriftFilter, Measurement
 from edgefilter.echo.model import PRE_ROLL
 from edgefilter.lag_search import Candidate, LagSearch
-from edgefilter.paper_alignment import PaperAligner, paper_lag
 from edgefilter.profile import Profile
 from edgefilter.types import SAMPLE_RATE, Samples
 from edgefilter.utterances import OnsetDetector, Utterance
-
-__all__ = ["Aligned", "Aligner", "PaperAligner", "paper_lag"]
 
 SEARCH_STRIDE = 1024
 """Samples between two searches of the whole range."""

@@ -7,14 +7,11 @@ from scipy import signal
 
 from edgefilter.echo.model import PRE_ROLL, EchoModel
 from edgefilter.errors import CalibrationError, SignalError
-from edgefilter.paper_response import SteppedLaw, generate_stepped_sine, response_from_stepped_sine, response_from_sweep, stepped_law
+from edgefilter.paper_response import SteppedLaw, response_from_stepped_sine, response_from_sweep, stepped_law
 from edgefilter.profile import DISTORTION_ORDERS, GRID_FFT, GRID_HZ, Profile
-from edgefilter.profile_text import describe
-from edgefilter.sweep import Deconvolution, deconvolve, find_direct, generate_sweep, harmonic_distortion, sweep_law
+from edgefilter.sweep import Deconvolution, deconvolve, find_direct, harmonic_distortion, sweep_law
 from edgefilter.trust import check_found, check_lengths, collect_warnings
 from edgefilter.types import SAMPLE_RATE, Array, Samples, as_samples
-
-__all__ = ["calibrate", "describe", "generate_stepped_sine", "generate_sweep"]
 
 MIN_TAPS, MAX_TAPS = 6400, 16000
 """400 ms and 1 s: what is kept of the impulse response at least and at most."""

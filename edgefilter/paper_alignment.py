@@ -9,7 +9,6 @@ from scipy import fft, signal
 
 from edgefilter.delay_line import Aligned, Tape
 from edgefilter.errors import SignalError
-from edgefilter.profile import Profile
 from edgefilter.types import SAMPLE_RATE, Samples
 from edgefilter.utterances import OnsetDetector
 
@@ -51,7 +50,7 @@ class PaperAligner:
     A lag is decided when its normalised correlation is above DECISIVE, at the latest 0.5 s + the longest lag after the onset.
     """
 
-    def __init__(self, hop: int, profile: Profile | None = None, max_lag_s: float = 1.5) -> None:
+    def __init__(self, hop: int, max_lag_s: float = 1.5) -> None:
         self.hop = hop
         self._max_lag = int((max_lag_s + 0.1) * SAMPLE_RATE)
         self._size = fft.next_fast_len(TEMPLATE + STRIDE, real=True)

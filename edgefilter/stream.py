@@ -9,10 +9,12 @@ from pathlib import Path
 import numpy as np
 
 from edgefilter import engines
-from edgefilter.alignment import Aligned, Aligner, PaperAligner
+from edgefilter.alignment import Aligner
 from edgefilter.canceller import Canceller
+from edgefilter.delay_line import Aligned
 from edgefilter.engines.base import Engine
 from edgefilter.errors import SignalError
+from edgefilter.paper_alignment import PaperAligner
 from edgefilter.profile import Profile
 from edgefilter.residual import Residual
 from edgefilter.ring import Ring
@@ -43,7 +45,7 @@ class Front:
         self.hop = stft.hop
         self.aligner = self.canceller = self.residual = None
         if engine.front == "paper":
-            self.aligner = PaperAligner(stft.hop, profile)
+            self.aligner = PaperAligner(stft.hop)
         elif engine.front == "full":
             self.aligner = Aligner(stft.hop, profile)
             self.canceller = self._make_canceller(profile)

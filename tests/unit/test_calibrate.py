@@ -6,11 +6,13 @@ import numpy as np
 import pytest
 from scipy import signal
 
-from edgefilter.calibrate import calibrate, describe, generate_stepped_sine, generate_sweep
+from edgefilter.calibrate import calibrate
 from edgefilter.echo.model import PRE_ROLL
 from edgefilter.errors import CalibrationError
+from edgefilter.paper_response import generate_stepped_sine
 from edgefilter.profile import GRID_HZ, Profile
-from edgefilter.sweep import sweep_law
+from edgefilter.profile_text import describe
+from edgefilter.sweep import generate_sweep, sweep_law
 
 FAN_RMS = 1e-3
 
