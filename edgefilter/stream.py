@@ -10,7 +10,7 @@ import numpy as np
 
 from edgefilter import engines
 from edgefilter.alignment import Aligner
-from edgefilter.canceller import Canceller
+from edgefilter.canceller import Canceller, CancellerOutput
 from edgefilter.delay_line import Aligned
 from edgefilter.engines.base import Engine
 from edgefilter.errors import SignalError
@@ -69,12 +69,23 @@ class Front:
         if not self.canceller:
             x, r = self._analyser.push(np.stack((mic, reference)))
             return Frame(x, r, self._silence, x, self._fan, self._nothing), aligned
-        if aligned.realigned:
-            self.canceller.rewrite_reference(self._drive(self.aligner.history(self.canceller.history)))
-        linear = self.canceller.step(mic, self._drive(reference))
+        linear = self._subtract(mic, aligned)
         x, r, e, error = self._analyser.push(np.stack((mic, reference, linear.echo, linear.error)))
         noise, residual = self.residual.step(e, error, linear.uncertainty)
         return Frame(x, r, e, error, noise, residual), aligned
+
+    def signals(self, mic: Samples, ref: Samples) -> tuple[Samples, Samples]:
+        """One hop (hop,) of both channels to the aligned reference and the linear stage's error, (hop,) each, as training wants them.
+
+        The kind "full" alone has them.
+        """
+        aligned = self.aligner.step(mic, ref)
+        return aligned.reference, self._subtract(mic, aligned).error
+
+    def _subtract(self, mic: Samples, aligned: Aligned) -> CancellerOutput:
+        if aligned.realigned:
+            self.canceller.rewrite_reference(self._drive(self.aligner.history(self.canceller.history)))
+        return self.canceller.step(mic, self._drive(aligned.reference))
 
 
 class Stream:

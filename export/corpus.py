@@ -1,0 +1,75 @@
+"""Folders of speech: those with a transcripts.tsv, and LibriSpeech's speaker/chapter folders."""
+
+from __future__ import annotations
+
+import csv
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import soundfile as sf
+
+from edgefilter.errors import UsageError
+from edgefilter.types import SAMPLE_RATE, Samples
+
+ENDINGS = {".flac", ".wav", ".ogg"}
+SHORTEST_S = 1.0
+
+
+@dataclass(frozen=True)
+class Corpus:
+    """Paths of the utterances of each speaker."""
+
+    speakers: dict[str, tuple[Path, ...]]
+
+    @property
+    def count(self) -> int:
+        """Number of utterances."""
+        return sum(map(len, self.speakers.values()))
+
+    def draw_speaker(self, rng: np.random.Generator) -> str:
+        """Any speaker, however many utterances there are of each."""
+        return str(rng.choice(sorted(self.speakers)))
+
+    def draw(self, rng: np.random.Generator, speaker: str, seconds: float) -> Samples:
+        """Utterances (n,) of that speaker, 0.1 to 0.5 s apart, cut at `seconds`; peak 0.5."""
+        parts: list[Samples] = []
+        wanted, have = round(seconds * SAMPLE_RATE), 0
+        while have < wanted:
+            part = read_speech(self.speakers[speaker][int(rng.integers(len(self.speakers[speaker])))])
+            pause = np.zeros(int(rng.uniform(0.1, 0.5) * SAMPLE_RATE), np.float32)
+            parts += [part, pause]
+            have += part.size + pause.size
+        speech = np.concatenate(parts)[:wanted]
+        return 0.5 / max(float(np.abs(speech).max()), 1e-6) * speech
+
+
+def read_corpus(*folders: Path) -> Corpus:
+    """All utterances below these folders by speaker.
+
+    The speaker comes from transcripts.tsv (path, speaker, seconds, text; no header) where there is one, else from LibriSpeech's names,
+    speaker-chapter-number.flac. Raises UsageError where no speech is found.
+    """
+    speakers: dict[str, list[Path]] = {}
+    for folder in folders:
+        table = folder / "transcripts.tsv"
+        if table.is_file():
+            with table.open(encoding="utf-8", newline="") as lines:
+                rows = [row for row in csv.reader(lines, delimiter="\t", quoting=csv.QUOTE_NONE) if len(row) >= 3]
+            found = [(folder / row[0], row[1]) for row in rows if row[2] != "seconds" and float(row[2]) >= SHORTEST_S]
+        else:
+            found = [(path, path.stem.split("-")[0]) for path in sorted(folder.rglob("*")) if path.suffix in ENDINGS]
+        if not found:
+            raise UsageError(f"{folder} holds no speech: expected transcripts.tsv beside its files, or LibriSpeech's speaker/chapter folders")
+        for path, speaker in found:
+            speakers.setdefault(speaker, []).append(path)
+    return Corpus({speaker: tuple(paths) for speaker, paths in speakers.items()})
+
+
+def read_speech(path: Path) -> Samples:
+    """The utterance (n,) without the silence around it; raises UsageError for another rate or several channels."""
+    samples, rate = sf.read(path, dtype="float32")
+    if rate != SAMPLE_RATE or samples.ndim != 1:
+        raise UsageError(f"{path} has {rate} Hz and shape {samples.shape}, expected {SAMPLE_RATE} Hz mono: convert the corpus first")
+    loud = np.flatnonzero(np.abs(samples) > 0.02 * np.abs(samples).max())
+    return samples[loud[0] : loud[-1] + 1] if loud.size else samples
