@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import fft, signal
+from scipy import fft
 
 from edgefilter.errors import SignalError
 from edgefilter.types import SAMPLE_RATE, Samples
@@ -24,6 +24,8 @@ OWN_SHARE = 0.6
 """Share of the expected misalignment that is not counted as measurement noise; 1 adapts fastest, 0 is safest in double talk."""
 DISPLACEMENT_HZ = 300.0
 """Corner of the second-order low-pass that turns the reference into the displacement of the loudspeaker's membrane."""
+DISPLACEMENT_TAPS = 128
+"""Length of its impulse response, 8 ms: what comes later is 80 dB below its peak."""
 DISPLACEMENT_SCALE = 0.1
 """Displacement, in the reference's full scale, at which the products have the size of the reference."""
 PRODUCT_PARTITIONS = 2
@@ -81,7 +83,7 @@ class Canceller:
                 raise SignalError("the canceller's impulse response is not a finite (n,) array: calibrate again")
             known = min(self.taps, impulse_response.size)
             self._initial[:known] = impulse_response[:known]
-        self._lowpass = signal.butter(2, DISPLACEMENT_HZ, fs=SAMPLE_RATE)
+        self._lowpass = _butterworth(DISPLACEMENT_HZ, DISPLACEMENT_TAPS)
         self.reset()
 
     @property
@@ -106,7 +108,7 @@ class Canceller:
         self._product_ageing = (1.0 - TRANSITION**2) * self._product_doubt
         self._product_recent = np.zeros((products[0], 2 * hop), np.float32)
         self._product_spectra = np.zeros(products, np.complex64)
-        self._displacement = np.zeros(2, np.float32)
+        self._moving = np.zeros(DISPLACEMENT_TAPS - 1, np.float32)
         self._noise = np.zeros(bins, np.float32)
         self._work = np.zeros(shape, np.complex64)
         self._expected = np.zeros(shape, np.float32)
@@ -193,8 +195,9 @@ class Canceller:
 
     def _products(self, reference: Samples) -> np.ndarray:
         """(2, n) of the next n samples of the reference; carries the membrane's state on."""
-        moved, self._displacement = signal.lfilter(*self._lowpass, reference, zi=self._displacement)
-        moved /= DISPLACEMENT_SCALE
+        moving = np.concatenate((self._moving, reference))
+        self._moving = moving[reference.size :]
+        moved = np.convolve(moving, self._lowpass, "valid")
         first = moved * reference
         return np.stack((first, moved * first))
 
@@ -254,7 +257,7 @@ class Canceller:
         self._newest = 0
         self._recent[:] = past[-2 * self.hop :]
         if self.nonlinear:
-            self._displacement = np.zeros(2, np.float32)
+            self._moving = np.zeros(DISPLACEMENT_TAPS - 1, np.float32)
             products = self._products(past)
             for part in range(PRODUCT_PARTITIONS):
                 end = past.size - part * self.hop
@@ -264,6 +267,14 @@ class Canceller:
     def stats(self) -> dict[str, float]:
         """What the stage did so far."""
         return {"hops": self._hops, "active_hops": self._active, "partitions": self.partitions, "gain_db": 20.0 * float(np.log10(self.gain))}
+
+
+def _butterworth(corner_hz: float, taps: int) -> Samples:
+    """Impulse response (taps,) float32 of a second-order Butterworth low-pass by the bilinear transform, over DISPLACEMENT_SCALE."""
+    k = np.tan(np.pi * corner_hz / SAMPLE_RATE)
+    z = np.exp(-2j * np.pi * np.arange(8 * taps // 2 + 1) / (8 * taps))
+    response = k**2 * (1 + z) ** 2 / (k**2 * (1 + z) ** 2 + np.sqrt(2) * k * (1 - z**2) + (1 - z) ** 2)
+    return (fft.irfft(response)[:taps] / DISPLACEMENT_SCALE).astype(np.float32)
 
 
 def _power(spectrum: np.ndarray) -> np.ndarray:

@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections import deque
 
 import numpy as np
-from scipy import fft, signal
+import scipy
+from scipy import fft
 
 from edgefilter.delay_line import Aligned, Tape
 from edgefilter.errors import SignalError
@@ -40,7 +41,7 @@ def paper_lag(recording: Samples, reference: Samples) -> int:
     template = reference[onset : onset + TEMPLATE]
     if recording.size < template.size:
         raise SignalError(f"the recording has {recording.size} samples, expected at least the {template.size} of the search")
-    return int(np.argmax(signal.correlate(recording, template, mode="valid", method="fft"))) - onset
+    return int(np.argmax(scipy.signal.correlate(recording, template, mode="valid", method="fft"))) - onset
 
 
 class PaperAligner:

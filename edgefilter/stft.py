@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from scipy import fft, signal
+from scipy import fft
 
 from edgefilter.errors import StftError
 from edgefilter.types import SAMPLE_RATE, Array, Samples, Spectrum
@@ -66,7 +66,7 @@ class StftConfig:
     def _window64(self) -> Array:
         if self.window == "rectangular":
             return np.ones(self.window_length)
-        hann = signal.get_window("hann", self.window_length, fftbins=True)
+        hann = 0.5 - 0.5 * np.cos(2 * np.pi * np.arange(self.window_length) / self.window_length)
         return np.sqrt(hann) if self.window == "root-hann" else hann
 
     @property

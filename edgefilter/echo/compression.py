@@ -6,7 +6,7 @@ from itertools import product
 from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
-from scipy import signal
+import scipy
 
 from edgefilter.echo.effect import Measurement, Parameter, Stage, Values, level_ratio
 from edgefilter.types import SAMPLE_RATE, Samples
@@ -60,4 +60,4 @@ class Compression:
 def _one_pole(x: np.ndarray, seconds: float, sample_rate: int) -> np.ndarray:
     """Exponential mean with that time constant."""
     keep = np.exp(-1.0 / (seconds * sample_rate))
-    return signal.lfilter([1.0 - keep], [1.0, -keep], x)
+    return scipy.signal.lfilter([1.0 - keep], [1.0, -keep], x)

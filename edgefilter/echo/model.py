@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy import signal
+import scipy
 
 from edgefilter.echo.clock_drift import ClockDrift
 from edgefilter.echo.compression import Compression
@@ -80,7 +80,7 @@ class EchoModel:
         for effect, values in chain:
             if effect.stage == "source":
                 x = effect.apply(x, complete(effect, values), SAMPLE_RATE)
-        x = signal.oaconvolve(x, self.impulse_response)[: reference.size].astype(np.float32)
+        x = scipy.signal.oaconvolve(x, self.impulse_response)[: reference.size].astype(np.float32)
         for effect, values in chain:
             if effect.stage != "source":
                 x = effect.apply(x, complete(effect, values), SAMPLE_RATE)

@@ -72,3 +72,15 @@ def test_importing_the_package_loads_no_heavy_package():
     loaded = set(json.loads(subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout))
     assert "numpy" in loaded
     assert not loaded & set(LEAVES)
+
+
+def test_the_running_filter_loads_no_slow_part_of_scipy():
+    """scipy.signal alone takes as long to import as everything else that a run needs."""
+    code = (
+        "import sys, numpy, edgefilter.commands.run\n"
+        "from edgefilter import EgoFilter\n"
+        "x = numpy.zeros(1000, numpy.float32)\n"
+        "EgoFilter(engine='ss').process(x, x)\n"
+        "print(*(name for name in sys.modules if name in ('scipy.signal', 'scipy.optimize', 'scipy.stats')))"
+    )
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.strip() == ""
