@@ -107,6 +107,10 @@ class Profile:
         """The same robot with another path (taps,) float32, for example the one that the running filter has adapted."""
         return replace(self, echo=replace(self.echo, impulse_response=impulse_response))
 
+    def with_echo(self, echo: EchoModel) -> Profile:
+        """The same robot with another model of its own voice, for example one with an effect added."""
+        return replace(self, echo=echo)
+
     def noise_bins(self, stft: StftConfig) -> Samples:
         """Expected |X|^2 (bins,) float32 of the fan in one frame of stft: PSD / 2 * sample rate * sum of the squared window."""
         psd = np.interp(stft.frequencies, GRID_HZ, self.noise_psd)

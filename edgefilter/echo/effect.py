@@ -7,9 +7,11 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar, Literal, Protocol, TypeAlias
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy import signal
 
 from edgefilter.errors import UsageError
-from edgefilter.types import Array, Samples
+from edgefilter.types import SAMPLE_RATE, Array, Samples
 
 if TYPE_CHECKING:
     from edgefilter.echo.model import EchoModel
@@ -18,11 +20,13 @@ Values: TypeAlias = Mapping[str, "float | Array"]
 Stage: TypeAlias = Literal["source", "path", "time", "microphone", "noise"]
 STAGES: tuple[Stage, ...] = ("source", "path", "time", "microphone", "noise")
 """In the order in which sound meets them."""
+ROUNDING_PSD = 1e-14
+"""One-sided PSD of rounding to 16 bit, full scale^2/Hz: (2^-15)^2 / 12 / 8 kHz."""
 
 
 @dataclass(frozen=True, slots=True)
 class Parameter:
-    """One number of an effect: its unit, the value at which the effect vanishes, and the values that are possible."""
+    """One number of an effect, or an array of such numbers: unit, the value at which the effect vanishes, the values that are possible."""
 
     name: str
     unit: str
@@ -31,16 +35,52 @@ class Parameter:
     high: float
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Measurement:
-    """The robot alone: reference (n,), already aligned, and the recording (n,) of it, float32."""
+    """The robot alone: reference (n,), aligned up to what an effect may do to time, and the recording (n,) of it, float32, 16 kHz.
+
+    noise_psd: (601,) one-sided power spectral density of the fan, full scale^2/Hz, from 0 to 8 kHz; None where it is unknown.
+    fit: (n,) bool, the samples that a fit may use; the others are held out to judge it by. None: all.
+    """
 
     reference: Samples
     recording: Samples
+    noise_psd: Samples | None = None
+    fit: NDArray[np.bool_] | None = None
+
+    @property
+    def weights(self) -> Samples:
+        """(n,) float32, 1 where a fit may use the sample, else 0."""
+        return np.ones(self.recording.size, np.float32) if self.fit is None else self.fit.astype(np.float32)
+
+    def whiten(self, x: Samples) -> Samples:
+        """x (n,) through a zero-phase filter after which the fan is white with variance 1; x itself where the fan is unknown."""
+        return x if self.noise_psd is None else whiten(x, self.noise_psd)
+
+    def error(self, predicted: Samples) -> float:
+        """Weighted sum of squares of the whitened recording minus predicted (n,): what a fit makes small."""
+        residual = self.whiten(self.recording - predicted)
+        return float(np.dot(residual * residual, self.weights))
+
+
+def whiten(x: Samples, noise_psd: Samples) -> Samples:
+    """x (n,) filtered by 1 / sqrt(noise_psd), zero-phase, so that noise of that one-sided PSD gets variance 1.
+
+    The PSD is held above 16 bit rounding noise and 70 dB under its maximum, so that a notch is not amplified beyond reason.
+    """
+    two_sided = np.maximum(noise_psd.astype(np.float64), max(ROUNDING_PSD, 1e-7 * float(noise_psd.max()))) * SAMPLE_RATE / 2
+    taps = np.fft.fftshift(np.fft.irfft(1.0 / np.sqrt(two_sided)))[1:]
+    taps *= np.hanning(taps.size + 2)[1:-1] ** 0.25
+    return signal.oaconvolve(x, taps.astype(np.float32), mode="full")[taps.size // 2 :][: x.size].astype(np.float32)
 
 
 class Effect(Protocol):
-    """One physical effect on the robot's own voice. With every parameter at its neutral value, apply is the identity."""
+    """One physical effect on the robot's own voice. With every parameter at its neutral value, apply is the identity.
+
+    Stage "source" acts on the reference, "path", "time" and "microphone" on the predicted voice at the microphone. An effect of stage
+    "noise" leaves apply the identity and offers one of these instead: noise_psd(values, psd) -> (601,), the fan's PSD after it;
+    variance(reference, values, sample_rate) -> (n,), what it adds to the expected square of each sample.
+    """
 
     name: ClassVar[str]
     stage: ClassVar[Stage]
@@ -95,7 +135,7 @@ def complete(effect: Effect, values: Values) -> dict[str, float | Array]:
         p, found = known[name], np.asarray(value, float)
         if not ((found >= p.low) & (found <= p.high)).all():
             raise UsageError(f"effect {effect.name}: {name} is {value} {p.unit}, expected {p.low:g} to {p.high:g}")
-    return {**neutral(effect), **values}
+    return {**neutral(effect), **{name: value if np.ndim(value) == 0 else np.asarray(value, float) for name, value in values.items()}}
 
 
 def level_ratio(recording: Samples, predicted: Samples) -> float:

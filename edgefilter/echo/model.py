@@ -7,11 +7,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 import scipy
 
-from edgefilter.echo.clock_drift import ClockDrift
-from edgefilter.echo.compression import Compression
-from edgefilter.echo.effect import STAGES, Measurement, Values, complete, find, register
-from edgefilter.echo.loudspeaker import SpeakerNonlinearity
-from edgefilter.echo.playback_gain import PlaybackGain
+from edgefilter.echo import catalogue
+from edgefilter.echo.effect import STAGES, Measurement, Values, complete, find
 from edgefilter.types import SAMPLE_RATE, Samples
 
 PRE_ROLL = 64
@@ -87,5 +84,4 @@ class EchoModel:
         return x
 
 
-for _effect in (PlaybackGain(), SpeakerNonlinearity(), Compression(), ClockDrift()):
-    register(_effect)
+catalogue.load()

@@ -25,6 +25,7 @@ LAYERS = [
     {"lag_search", "delay_tracker", "paper_alignment", "alignment", "canceller", "residual", "engines"},
     {"stream", "audio", "run"},
     {"sweep", "paper_response", "trust", "calibrate"},
+    {"prepare", "compare", "diagnose"},
     {"report"},
     {"commands"},
     {"cli"},

@@ -1,0 +1,23 @@
+"""The effects that come with the package, in the order in which they are listed."""
+
+from __future__ import annotations
+
+from edgefilter.echo.clock_drift import ClockDrift
+from edgefilter.echo.compression import Compression
+from edgefilter.echo.effect import Effect, names, register
+from edgefilter.echo.loudspeaker import SpeakerNonlinearity
+from edgefilter.echo.playback_gain import PlaybackGain
+
+EFFECTS: tuple[Effect, ...] = (
+    PlaybackGain(),
+    SpeakerNonlinearity(),
+    Compression(),
+    ClockDrift(),
+)
+
+
+def load() -> None:
+    """Register all of them, once."""
+    for effect in EFFECTS:
+        if effect.name not in names():
+            register(effect)

@@ -1,0 +1,110 @@
+"""Bring a recording of the robot alone into a state in which it can be held against a prediction: rate, lag, silence."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import soxr
+from numpy.typing import NDArray
+from scipy import fft
+from scipy.ndimage import maximum_filter1d
+
+from edgefilter.echo.effect import Measurement, whiten
+from edgefilter.echo.model import PRE_ROLL
+from edgefilter.errors import SignalError
+from edgefilter.profile import Profile
+from edgefilter.types import SAMPLE_RATE, Samples, as_samples
+
+MAX_OFFSET = 3.0
+"""Seconds by which the recording may lag behind or lead the calibration's."""
+BLOCK = SAMPLE_RATE // 2
+"""Samples of the blocks that are fitted on and judged by in turn."""
+SILENCE_DB = -15.0
+"""The robot is silent where its predicted voice, whitened, is this far under the fan."""
+MIN_SECONDS = 1.0
+
+
+@dataclass(frozen=True, eq=False)
+class Prepared:
+    """A recording beside what the profile predicts, on one sample counter; all arrays (n,).
+
+    measurement: aligned reference, recording, the fan's PSD, the samples to fit on. prediction: of the profile.
+    usable: samples where nobody else talks. active: where the robot is heard. offset: samples of lag against the calibration.
+    human: (start_s, end_s) of other talkers.
+    """
+
+    measurement: Measurement
+    prediction: Samples
+    usable: NDArray[np.bool_]
+    active: NDArray[np.bool_]
+    offset: float
+    human: tuple[tuple[float, float], ...] = ()
+    warnings: tuple[str, ...] = ()
+
+    @property
+    def held_out(self) -> NDArray[np.bool_]:
+        """(n,) samples that no fit has used."""
+        return self.usable & ~self.measurement.fit
+
+
+def prepare(profile: Profile, recording: Samples, reference: Samples, *, sample_rate: int = SAMPLE_RATE) -> Prepared:
+    """Resample to 16 kHz, find the constant lag, mark silence and the blocks to fit on.
+
+    recording (m,), reference (k,): float, full scale +-1, at sample_rate. Raises SignalError for less than a second or where the
+    recording does not contain the reference.
+    """
+    y, x = as_samples(recording, "recording"), as_samples(reference, "reference")
+    if sample_rate != SAMPLE_RATE:
+        y, x = (soxr.resample(signal_, sample_rate, SAMPLE_RATE).astype(np.float32) for signal_ in (y, x))
+    for samples, name in ((y, "recording"), (x, "reference")):
+        if samples.size < MIN_SECONDS * SAMPLE_RATE:
+            raise SignalError(f"the {name} is {samples.size / SAMPLE_RATE:.2f} s long, expected at least {MIN_SECONDS:g} s of the robot's voice")
+    n = y.size
+    x = np.pad(x, (0, max(n - x.size, 0)))[:n]
+    start = profile.delay - PRE_ROLL
+    at_calibration = shift(x, start)
+    predicted = profile.echo.predict(at_calibration)
+    offset = find_offset(whiten(predicted, profile.noise_psd), whiten(y, profile.noise_psd))
+    x = shift(x, start + offset)
+    predicted = profile.echo.predict(x)
+    white = whiten(predicted, profile.noise_psd).astype(np.float64)
+    block = SAMPLE_RATE // 50
+    level = np.add.reduceat(white**2, np.arange(0, n, block)) / block
+    active = np.repeat(maximum_filter1d(level, 11) > 10 ** (SILENCE_DB / 10), block)[:n]
+    fit = np.arange(n) // BLOCK % 2 == 0
+    return Prepared(Measurement(x, y, profile.noise_psd, fit), predicted, np.ones(n, bool), active, offset)
+
+
+def shift(x: Samples, samples: float) -> Samples:
+    """x (n,) later by that many samples, which may be negative or fractional; what leaves either end is lost, silence comes in."""
+    n = fft.next_fast_len(x.size + int(abs(samples)) + 256, real=True)
+    ramp = np.exp(-2j * np.pi * np.arange(n // 2 + 1) / n * samples)
+    return fft.irfft(fft.rfft(x.astype(np.float64), n) * ramp, n)[: x.size].astype(np.float32)
+
+
+def find_offset(predicted: Samples, recording: Samples) -> float:
+    """Samples, to a few thousandths, by which recording (n,) lags behind predicted (n,): the highest peak of their correlation.
+
+    Raises SignalError where no lag stands out.
+    """
+    n = fft.next_fast_len(2 * recording.size, real=True)
+    cross = fft.rfft(recording.astype(np.float64), n) * np.conj(fft.rfft(predicted.astype(np.float64), n))
+    reach = min(int(MAX_OFFSET * SAMPLE_RATE), recording.size - 1)
+    correlation = fft.irfft(cross, n)
+    near = np.concatenate((correlation[-reach:], correlation[: reach + 1]))
+    peak = int(np.argmax(near))
+    if near[peak] < 6.0 * np.sqrt(np.mean(near**2)):
+        raise SignalError("the recording does not contain the reference at any lag up to 3 s: are both of the same utterance?")
+    frequencies = 2 * np.pi * np.arange(cross.size) / n
+    lag = float(peak - reach)
+    for _ in range(8):
+        turned = cross * np.exp(1j * frequencies * lag)
+        slope, bend = -np.sum(frequencies * turned.imag), -np.sum(frequencies**2 * turned.real)
+        if bend >= 0.0:
+            break
+        step = float(np.clip(-slope / bend, -0.5, 0.5))
+        lag += step
+        if abs(step) < 1e-4:
+            break
+    return lag

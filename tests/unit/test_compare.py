@@ -1,0 +1,57 @@
+"""Comparison of a recording with the profile's prediction: nothing left where nothing is missing, and the right place where something is."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+import soxr
+from robot_scene import FAN, profile, record, voice
+
+from edgefilter.compare import compare
+from edgefilter.errors import SignalError
+
+
+def test_nothing_is_left_of_the_robot_that_was_calibrated() -> None:
+    x = voice(8.0)
+    found = compare(profile(), record(x), x)
+    assert abs(found.excess_db) < 0.2  # 8 s of fan are known to 0.05 dB; the whitening's finite length costs about as much
+    assert abs(found.silence_excess_db) < 0.3
+    assert found.human == ()
+
+
+@pytest.mark.parametrize("lag", [-700.0, -12.5, 0.0, 0.25, 3200.0])
+def test_a_constant_lag_is_found_either_way_and_leaves_nothing(lag: float) -> None:
+    x = voice(8.0)
+    found = compare(profile(), record(x, lag=lag), x)
+    assert found.offset_samples == pytest.approx(lag, abs=0.02)  # 0.02 samples leave an error 36 dB below a 4 kHz tone
+    assert found.excess_db < 0.5
+
+
+def test_an_extra_band_of_noise_shows_in_its_band_and_in_the_silence() -> None:
+    x = voice(8.0)
+    recording = record(x)
+    n = np.arange(recording.size) / 16000
+    tones = sum(np.sin(2 * np.pi * f * n + f) for f in range(2100, 2900, 50))
+    found = compare(profile(), recording + (2 * FAN * tones).astype(np.float32), x)
+    bands = {low: excess for low, _, excess in found.bands}
+    assert max(bands, key=bands.get) == 2000.0
+    assert found.silence_excess_db == pytest.approx(found.excess_db, abs=1.0)  # the tones sound all the time
+
+
+def test_another_rate_is_converted() -> None:
+    x = voice(6.0)
+    up = [soxr.resample(s, 16000, 48000) for s in (record(x), x)]
+    assert compare(profile(), *up, sample_rate=48000).excess_db < 0.5  # the converters' roll-off near 8 kHz is all that differs
+
+
+def test_the_dictionary_is_json_and_holds_no_signals() -> None:
+    x = voice(4.0)
+    found = json.loads(json.dumps(compare(profile(), record(x), x).to_dict(), allow_nan=False))
+    assert {"excess_db", "bands", "times", "levels", "lags"} <= set(found) and "residual" not in found
+
+
+def test_a_recording_of_something_else_is_refused() -> None:
+    with pytest.raises(SignalError, match="does not contain the reference"):
+        compare(profile(), FAN * np.random.default_rng(8).standard_normal(64000).astype(np.float32), voice(4.0))
