@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar, Literal, Protocol, TypeAlias
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy import signal
 
 from edgefilter.errors import UsageError
 from edgefilter.types import SAMPLE_RATE, Array, Samples
@@ -71,7 +71,7 @@ def whiten(x: Samples, noise_psd: Samples) -> Samples:
     two_sided = np.maximum(noise_psd.astype(np.float64), max(ROUNDING_PSD, 1e-7 * float(noise_psd.max()))) * SAMPLE_RATE / 2
     taps = np.fft.fftshift(np.fft.irfft(1.0 / np.sqrt(two_sided)))[1:]
     taps *= np.hanning(taps.size + 2)[1:-1] ** 0.25
-    return signal.oaconvolve(x, taps.astype(np.float32), mode="full")[taps.size // 2 :][: x.size].astype(np.float32)
+    return scipy.signal.oaconvolve(x, taps.astype(np.float32), mode="full")[taps.size // 2 :][: x.size].astype(np.float32)
 
 
 class Effect(Protocol):
