@@ -4,7 +4,8 @@ EgoFilter goes in front of a recogniser, enhance() filters whole arrays, Profile
 """
 
 from edgefilter.profile import Profile
-from edgefilter.stream import EgoFilter, Event, enhance
+from edgefilter.stream import EgoFilter, enhance
+from edgefilter.types import Event
 
 __version__ = "0.1.0"
 __all__ = ["EgoFilter", "Event", "Profile", "enhance"]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -13,25 +12,18 @@ from edgefilter.alignment import Aligner
 from edgefilter.canceller import Canceller, CancellerOutput
 from edgefilter.delay_line import Aligned
 from edgefilter.engines.base import Engine
-from edgefilter.errors import SignalError
+from edgefilter.engines.ladder import CANDIDATES, Ladder, climbable
+from edgefilter.errors import EdgefilterError, SignalError, UsageError
 from edgefilter.paper_alignment import PaperAligner
 from edgefilter.profile import Profile
 from edgefilter.residual import Residual
 from edgefilter.ring import Ring
+from edgefilter.stepping import Stepping
 from edgefilter.stft import Analyser, Synthesiser
-from edgefilter.types import SAMPLE_RATE, Frame, Samples, as_samples
+from edgefilter.types import SAMPLE_RATE, Event, Frame, Samples, as_samples
 
 TAPS = (2048, 8192)
 """Least and most taps of the linear stage, 128 to 512 ms; between them the profile's impulse response decides."""
-
-
-@dataclass(frozen=True, slots=True)
-class Event:
-    """Something that a user of the stream may want to know: what happened and at which sample of the microphone."""
-
-    kind: str
-    sample: int
-    detail: str
 
 
 class Front:
@@ -93,11 +85,13 @@ class Stream:
 
     process returns finished samples, aligned with the input: sample i of all outputs together belongs to sample i of all
     inputs. Sample n is out once n + latency samples have come in. After flush as many samples are out as went in.
+    stepping: told the compute time of every hop; what it answers becomes an event.
     """
 
-    def __init__(self, engine: Engine, profile: Profile | None = None) -> None:
+    def __init__(self, engine: Engine, profile: Profile | None = None, stepping: Stepping | None = None) -> None:
         self.engine = engine
         self.profile = profile
+        self.stepping = stepping
         self.reset()
 
     @property
@@ -108,6 +102,8 @@ class Stream:
     def reset(self) -> None:
         """Forget everything; the next sample is the first."""
         stft = self.engine.stft
+        if self.stepping:
+            self.stepping.reset()
         self.front = Front(self.engine, self.profile)
         self.events: deque[Event] = deque(maxlen=1000)
         self.speech_probability: float | None = None
@@ -142,12 +138,22 @@ class Stream:
             self._mic.write(mic[at : at + hop])
             self._ref.write(ref[at : at + hop])
             if len(self._mic) >= hop:
-                done.append(self._step(self._mic.read(hop), self._ref.read(hop)))
+                done.append(self._watched_step(self._mic.read(hop), self._ref.read(hop)))
         out = np.concatenate(done) if done else np.zeros(0, np.float32)
         early = min(self._before_start, out.size)
         self._before_start -= early
         self.samples_out += out.size - early
         return out[early:]
+
+    def _watched_step(self, mic: Samples, ref: Samples) -> Samples:
+        if self.stepping is None:
+            return self._step(mic, ref)
+        began = self.stepping.clock()
+        out = self._step(mic, ref)
+        happened = self.stepping.note(self.stepping.clock() - began)
+        if happened:
+            self.events.append(Event(happened[0], self.samples_in, happened[1]))
+        return out
 
     def _step(self, mic: Samples, ref: Samples) -> Samples:
         frame, aligned = self.front.step(mic, ref)
@@ -161,7 +167,10 @@ class Stream:
 class EgoFilter:
     """The object to put in front of a recogniser: give it what the microphone hears and what the robot says.
 
-    profile: a Profile, the path of one, or None (then the echo path is learnt from nothing). engine: a name or "auto".
+    profile: a Profile, the path of one, or None (then the echo path is learnt from nothing).
+    engine: a name, or "auto" for the strongest that can be made. reason: why it was chosen, for stats.
+    budget_ms: compute per hop to keep to; where more is needed for long, cheaper engines take over (see Stepping), each time with
+    an event. None: the engine stays, and missed deadlines are only counted.
 
     >>> import numpy as np
     >>> ego = EgoFilter(engine="bypass")
@@ -171,10 +180,19 @@ class EgoFilter:
     True
     """
 
-    def __init__(self, profile: Profile | str | Path | None = None, engine: str = "auto") -> None:
+    def __init__(
+        self, profile: Profile | str | Path | None = None, engine: str = "auto", budget_ms: float | None = None, reason: str = "asked for"
+    ) -> None:
         self.profile = Profile.load(profile) if isinstance(profile, str | Path) else profile
-        self.engine_name, self.engine_reason = choose(engine)
-        self._stream = Stream(engines.create(self.engine_name, self.profile), self.profile)
+        best, self.engine_reason = strongest(self.profile) if engine == "auto" else (engines.create(engine, self.profile), reason)
+        ladder = None if budget_ms is None else Ladder(climbable(best, self.profile))
+        self._stream = Stream(ladder or best, self.profile, Stepping(best.stft.hop, ladder, budget_ms))
+
+    @property
+    def engine_name(self) -> str:
+        """The engine at work; while another one takes over, that one."""
+        engine = self._stream.engine
+        return engine.rungs[engine.wanted].name if isinstance(engine, Ladder) else engine.name
 
     @property
     def latency(self) -> int:
@@ -223,10 +241,12 @@ class EgoFilter:
         return {
             "engine": self.engine_name,
             "engine_reason": self.engine_reason,
+            "engines": [engine.name for engine in getattr(self._stream.engine, "rungs", [self._stream.engine])],
             "latency_ms": 1000 * self.latency / SAMPLE_RATE,
             "samples": self._stream.samples_in,
             "alignment": front.aligner.stats() if front.aligner else None,
             "linear_stage": front.canceller.stats() if front.canceller else None,
+            "deadline": self._stream.stepping.stats() if self._stream.stepping else None,
         }
 
     @property
@@ -241,11 +261,15 @@ class EgoFilter:
         return self.profile.with_impulse_response(self._stream.front.canceller.impulse_response())
 
 
-def choose(engine: str) -> tuple[str, str]:
-    """The engine to run for a name or "auto", and why."""
-    if engine != "auto":
-        return engine, "asked for"
-    return "ss", "auto: the strongest engine that this version has"
+def strongest(profile: Profile | None) -> tuple[Engine, str]:
+    """The best engine that can be made here, and a sentence about it that names those that cannot."""
+    missing = ""
+    for name in CANDIDATES:
+        try:
+            return engines.create(name, profile), f"auto: the strongest engine{missing}"
+        except EdgefilterError as error:
+            missing += f"; {name} cannot be used: {error}"
+    raise UsageError(f"no engine can be made{missing}")
 
 
 def enhance(mic: Samples, ref: Samples, profile: Profile | str | Path | None = None, engine: str = "auto") -> Samples:

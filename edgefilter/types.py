@@ -57,6 +57,15 @@ class Output:
     speech_probability: float | None = None
 
 
+@dataclass(frozen=True, slots=True)
+class Event:
+    """Something that a user of the stream may want to know: what happened and at which sample of the microphone."""
+
+    kind: str
+    sample: int
+    detail: str
+
+
 def as_samples(x: object, name: str) -> Samples:
     """Return x as a finite (n,) float32 array without writing into it; raise SignalError otherwise."""
     array = np.asarray(x)

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 from edgefilter.engines.base import Engine
 from edgefilter.errors import UsageError
+from edgefilter.stft import StftConfig
 
 if TYPE_CHECKING:
     from edgefilter.profile import Profile
@@ -14,8 +15,11 @@ ENGINES = ("ss", "linear", "bypass", "paper-ss", "paper-ss-causal")
 NEEDS_PROFILE = ("paper-ss", "paper-ss-causal")
 
 
-def create(name: str, profile: Profile | None = None) -> Engine:
-    """Make an engine by name; raises UsageError for an unknown name or one that cannot work without a profile."""
+def create(name: str, profile: Profile | None = None, stft: StftConfig = StftConfig()) -> Engine:
+    """Make an engine by name; raises UsageError for an unknown name or one that cannot work without a profile.
+
+    stft: for the engines that work with any; the others have their own.
+    """
     if name not in ENGINES:
         raise UsageError(f"unknown engine '{name}': choose one of auto, {', '.join(ENGINES)}")
     if name in NEEDS_PROFILE and profile is None:
@@ -23,15 +27,15 @@ def create(name: str, profile: Profile | None = None) -> Engine:
     if name == "bypass":
         from edgefilter.engines.bypass import Bypass
 
-        return Bypass()
+        return Bypass(stft)
     if name == "linear":
         from edgefilter.engines.linear import Linear
 
-        return Linear()
+        return Linear(stft)
     if name == "ss":
         from edgefilter.engines.spectral_subtraction import SpectralSubtraction
 
-        return SpectralSubtraction()
+        return SpectralSubtraction(stft)
     from edgefilter.engines.paper_ss import PAPER_STFT, PaperSpectralSubtraction
 
     return PaperSpectralSubtraction(profile.response_bins(PAPER_STFT), causal=name == "paper-ss-causal")

@@ -18,12 +18,12 @@ LEAVES = {
     "export": set(),
 }
 LAYERS = [
-    {"types", "errors"},
+    {"types", "errors", "timing"},
     {"stft", "ring", "metrics"},
     {"echo"},
     {"profile", "profile_file", "profile_text", "delay_line", "utterances"},
     {"lag_search", "delay_tracker", "paper_alignment", "alignment", "canceller", "residual", "engines"},
-    {"stream", "audio", "run"},
+    {"stepping", "stream", "audio", "budget", "run"},
     {"sweep", "paper_response", "trust", "calibrate"},
     {"prepare", "compare", "diagnose"},
     {"report"},

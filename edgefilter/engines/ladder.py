@@ -1,0 +1,114 @@
+"""Several engines as one: the best first, and a crossfade instead of a click when another one takes over."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, ClassVar
+
+import numpy as np
+
+from edgefilter import engines
+from edgefilter.engines.base import Engine, EngineState, Front
+from edgefilter.errors import EdgefilterError, UsageError
+from edgefilter.types import Frame, Output
+
+if TYPE_CHECKING:
+    from edgefilter.profile import Profile
+
+CANDIDATES = ("crnn", "ss", "linear")
+"""What "auto" chooses from, best first."""
+DOWN, UP = 4, 32
+"""Frames of a crossfade to a cheaper engine (64 ms, since it has to bring relief), and to a better one (0.5 s, since an engine
+with a memory starts empty and has to settle while it is still quiet)."""
+
+
+@dataclass(frozen=True, slots=True)
+class Voice:
+    """One engine at work: which, its state, and its answers that wait because another engine looks further ahead."""
+
+    rung: int
+    state: EngineState
+    waiting: tuple[Output, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class LadderState:
+    """Who is heard, who is coming in (if anybody), how many frames that one still needs to fill up, and its weight, 0 to 1."""
+
+    heard: Voice
+    coming: Voice | None = None
+    filling: int = 0
+    weight: float = 0.0
+
+
+class Ladder:
+    """An engine that runs one of its rungs; set `wanted` and it crossfades there, frame by frame.
+
+    rungs: best first, all with the same STFT and front, so that alignment and linear stage run on untouched; their look-aheads
+    may differ, all answers come out as late as the latest. A request during a crossfade turns it back, or is met after it.
+    Raises UsageError without rungs, or where they differ in STFT or front.
+    """
+
+    name: ClassVar[str] = "ladder"
+
+    def __init__(self, rungs: Sequence[Engine]) -> None:
+        if not rungs:
+            raise UsageError("no engine to run: name at least one")
+        for rung in rungs[1:]:
+            if (rung.stft, rung.front) != (rungs[0].stft, rungs[0].front):
+                raise UsageError(f"engines {rungs[0].name} and {rung.name} cannot take turns: their STFTs or fronts differ")
+        self.rungs = tuple(rungs)
+        self.stft = rungs[0].stft
+        self.front: Front = rungs[0].front
+        self.lookahead = max(rung.lookahead for rung in rungs)
+        self.wanted = 0
+
+    def initial_state(self) -> LadderState:
+        return LadderState(self._start(self.wanted))
+
+    def step(self, frame: Frame, state: LadderState) -> tuple[Output, LadderState]:
+        if state.coming is None and self.wanted != state.heard.rung:
+            state = LadderState(state.heard, self._start(self.wanted), self.lookahead)
+        output, heard = self._run(state.heard, frame)
+        if state.coming is None:
+            return output, LadderState(heard)
+        other, coming = self._run(state.coming, frame)
+        weight = state.weight if state.filling else self._move(state)
+        if weight == 0.0 and self.wanted == heard.rung:
+            return output, LadderState(heard)
+        if weight == 1.0:
+            return other, LadderState(coming)
+        spectrum = output.spectrum + np.float32(weight) * (other.spectrum - output.spectrum)
+        probability = output.speech_probability if weight < 0.5 else other.speech_probability
+        return Output(spectrum, probability), LadderState(heard, coming, max(state.filling - 1, 0), weight)
+
+    def _move(self, state: LadderState) -> float:
+        """The next weight of the voice that is coming in, towards whichever of the two is nearer to what is wanted."""
+        rungs = state.heard.rung, state.coming.rung
+        goal = 1 if abs(self.wanted - rungs[1]) < abs(self.wanted - rungs[0]) else 0
+        step = 1.0 / (DOWN if rungs[goal] == max(rungs) else UP)
+        return min(state.weight + step, 1.0) if goal else max(state.weight - step, 0.0)
+
+    def _start(self, rung: int) -> Voice:
+        engine = self.rungs[rung]
+        silence = Output(np.zeros(self.stft.bins, np.complex64))
+        return Voice(rung, engine.initial_state(), (silence,) * (self.lookahead - engine.lookahead))
+
+    def _run(self, voice: Voice, frame: Frame) -> tuple[Output, Voice]:
+        output, state = self.rungs[voice.rung].step(frame, voice.state)
+        first, *rest = (*voice.waiting, output)
+        return first, Voice(voice.rung, state, tuple(rest))
+
+
+def climbable(best: Engine, profile: Profile | None) -> list[Engine]:
+    """best and the cheaper candidates that can take turns with it: those that can be made with its STFT and front."""
+    rungs = [best]
+    for name in CANDIDATES[CANDIDATES.index(best.name) + 1 :] if best.name in CANDIDATES else ():
+        try:
+            engine = engines.create(name, profile, best.stft)
+        except EdgefilterError:
+            continue
+        if (engine.stft, engine.front) == (best.stft, best.front):
+            rungs.append(engine)
+    return rungs
