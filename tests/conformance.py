@@ -1,13 +1,21 @@
-"""What every engine must do inside the stream, whatever it computes. Each check takes a function that makes a new stream."""
+"""What every engine must do inside the stream and every effect inside the echo model, whatever they compute.
+
+Each check_ takes a function that makes a new stream, each effect_check_ the name of an effect.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from functools import lru_cache
 
 import numpy as np
+from scipy import signal
 
+from edgefilter.echo import effect as effects
+from edgefilter.echo.effect import Measurement
+from edgefilter.echo.model import PRE_ROLL, EchoModel
 from edgefilter.stream import Stream
-from edgefilter.types import Frame
+from edgefilter.types import SAMPLE_RATE, Frame
 
 MakeStream = Callable[[], Stream]
 
@@ -138,3 +146,114 @@ def check_step_writes_neither_frame_nor_state(make: MakeStream) -> None:
 
 
 CHECKS = [check for name, check in sorted(globals().items()) if name.startswith("check_")]
+
+
+SECONDS = 12
+FAN = 0.002
+"""Amplitude of the fan's low-passed noise, about 25 dB under the robot's voice at the microphone."""
+
+
+@lru_cache(maxsize=4)
+def robot_speech(seconds: float = SECONDS, seed: int = 0) -> np.ndarray:
+    """Speech-like (n,) float32, read-only: voiced pulses of a gliding pitch and hiss through formants, in syllables with pauses."""
+    rng = np.random.default_rng(seed)
+    n = int(seconds * SAMPLE_RATE)
+    t = np.arange(n) / SAMPLE_RATE
+    phase = np.cumsum(130 + 25 * np.sin(2 * np.pi * 0.4 * t) + 10 * np.sin(2 * np.pi * 1.7 * t)) / SAMPLE_RATE
+    pulses = np.diff(np.floor(phase), prepend=0.0) * 8
+    syllables = np.repeat(rng.uniform(0.1, 1.0, n // 3200 + 1) * (rng.uniform(size=n // 3200 + 1) > 0.2), 3200)[:n]
+    x = (pulses + 0.15 * rng.standard_normal(n)) * signal.lfilter(*signal.butter(1, 12, fs=SAMPLE_RATE), syllables)
+    for hz, width in ((500, 80), (1500, 120), (2600, 160)):
+        r = np.exp(-np.pi * width / SAMPLE_RATE)
+        x = signal.lfilter([1.0, -0.7], [1.0, -2 * r * np.cos(2 * np.pi * hz / SAMPLE_RATE), r * r], x)
+    x = (0.7 * x / np.abs(x).max()).astype(np.float32)
+    x.flags.writeable = False
+    return x
+
+
+def robot_model(seed: int = 1) -> EchoModel:
+    """A direct sound, reflections and a tail that falls by 60 dB in 0.25 s."""
+    rng = np.random.default_rng(seed)
+    h = np.zeros(4000)
+    h[PRE_ROLL:] = 0.15 * rng.standard_normal(4000 - PRE_ROLL) * np.exp(-np.arange(4000 - PRE_ROLL) * 6.9 / 4000)
+    h[PRE_ROLL] = 1.0
+    return EchoModel((0.5 * h).astype(np.float32))
+
+
+def fan(n: int, seed: int = 2) -> np.ndarray:
+    """The fan (n,): noise, louder below 1 kHz."""
+    white = np.random.default_rng(seed).standard_normal(n)
+    return (FAN * (signal.lfilter(*signal.butter(1, 1000, fs=SAMPLE_RATE), white) * 2 + 0.2 * white)).astype(np.float32)
+
+
+def robot_alone(name: str | None = None, values: Mapping[str, object] | None = None, gain_db: float = 0.05) -> tuple[Measurement, EchoModel]:
+    """A recording with that effect, the fan, a gain that is a little off and a faint cubic distortion; and the model without the effect."""
+    x, model = robot_speech(), robot_model()
+    truth = model.with_effect(name, values) if name else model
+    drive = x - np.float32(0.005) * x**3
+    noise = fan(x.size)
+    psd = signal.welch(fan(8 * SAMPLE_RATE, seed=3), SAMPLE_RATE, nperseg=1200, detrend=False)[1].astype(np.float32)
+    recording = truth.predict(drive) * np.float32(10 ** (gain_db / 20)) + noise
+    return Measurement(x, recording, psd, np.arange(x.size) // 8000 % 2 == 0), model
+
+
+def held_out_power(measurement: Measurement, predicted: np.ndarray) -> float:
+    """Mean square of the whitened residual on the samples that no fit may use; 1 is the fan alone."""
+    white = measurement.whiten(measurement.recording - predicted)
+    return float(np.mean(white[~measurement.fit].astype(np.float64) ** 2))
+
+
+def effect_check_neutral_is_the_identity(name: str) -> None:
+    x, effect = robot_speech(), effects.find(name)
+    out = effect.apply(x, effects.neutral(effect), SAMPLE_RATE)
+    assert np.array_equal(out, x) and out.dtype == np.float32
+
+
+def effect_check_any_length_goes_through(name: str) -> None:
+    effect = effects.find(name)
+    values = effects.complete(effect, EFFECT_CASES.get(name, {}))
+    for n in (0, 1, 100, 5000):
+        x = robot_speech()[:n]
+        out = effect.apply(x, values, SAMPLE_RATE)
+        assert out.shape == (n,) and out.dtype == np.float32 and np.isfinite(out).all()
+
+
+def effect_check_fit_stays_within_the_bounds_on_hard_input(name: str) -> None:
+    """Silence, noise without a robot, a recording that has nothing to do with the reference."""
+    measurement, model = robot_alone()
+    n = measurement.recording.size
+    silence = np.zeros(n, np.float32)
+    for reference, recording in ((silence, silence), (silence, fan(n)), (robot_speech(), silence), (robot_speech(), np.roll(robot_speech(), 50_000))):
+        hard = Measurement(reference, recording, measurement.noise_psd, measurement.fit)
+        effects.complete(effects.find(name), effects.find(name).fit(hard, model))
+
+
+def effect_check_fit_on_a_neutral_recording_stays_neutral(name: str) -> None:
+    """What the fit adds to a recording with ordinary tolerances stays under a tenth of the fan's power."""
+    measurement, model = robot_alone()
+    fitted = model.fit(name, measurement)
+    change = measurement.whiten(fitted.predict(measurement.reference) - model.predict(measurement.reference) * np.float32(10 ** (0.05 / 20)))
+    assert np.mean(change.astype(np.float64) ** 2) < 0.1, dict(fitted.effects)[name]
+
+
+def effect_check_fit_explains_what_its_own_apply_made(name: str) -> None:
+    """Of what the effect puts over the fan on held-out samples, at most a tenth is left."""
+    if name not in EFFECT_CASES:
+        return
+    measurement, model = robot_alone(name, EFFECT_CASES[name], gain_db=0.0)
+    before = held_out_power(measurement, model.predict(measurement.reference))
+    after = held_out_power(measurement, model.fit(name, measurement).predict(measurement.reference))
+    assert before > 2.0, f"the case is too weak to show anything: {before:.2f} times the fan"
+    assert after - 1.0 < 0.1 * (before - 1.0), f"residual power {before:.2f} -> {after:.2f} times the fan"
+
+
+EFFECT_CASES: dict[str, dict[str, object]] = {
+    "playback_gain": {"gain_db": -2.5},
+    "speaker_nonlinearity": {"even": 0.1, "odd": -0.3, "force_factor": np.array([0.4, 0.2, 0.1]), "stiffness": -1.0},
+    "clock_drift": {"ppm": -80.0, "offset": 3.5},
+    "delay_jump": {"times_s": np.array([3.3, 8.1]), "samples": np.array([37.4, -61.0])},
+    "mic_clipping": {"level": 0.15},
+}
+"""A strength of each effect that its own fit has to find again."""
+
+EFFECT_CHECKS = [check for name, check in sorted(globals().items()) if name.startswith("effect_check_")]

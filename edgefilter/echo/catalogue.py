@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from edgefilter.echo.clock_drift import ClockDrift
 from edgefilter.echo.compression import Compression
+from edgefilter.echo.delay_jump import DelayJump
 from edgefilter.echo.effect import Effect, names, register
 from edgefilter.echo.loudspeaker import SpeakerNonlinearity
+from edgefilter.echo.mic_clipping import MicClipping
 from edgefilter.echo.playback_gain import PlaybackGain
 
 EFFECTS: tuple[Effect, ...] = (
@@ -13,6 +15,8 @@ EFFECTS: tuple[Effect, ...] = (
     SpeakerNonlinearity(),
     Compression(),
     ClockDrift(),
+    DelayJump(),
+    MicClipping(),
 )
 
 

@@ -5,24 +5,25 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
-from scipy import fft
 
 from edgefilter.echo.effect import Measurement, Parameter, Stage, Values
+from edgefilter.echo.fractional import interpolate
+from edgefilter.echo.lag_track import track_lag
 from edgefilter.types import Array, Samples
 
 if TYPE_CHECKING:
     from edgefilter.echo.model import EchoModel
 
-HALF_WIDTH = 16
-"""Samples on either side that the interpolation kernel uses."""
-WINDOW = 16384
-REACH = 400
+PASSES = ((4000, 512), (8000, 16))
+"""Samples of a block and of lag either way: short blocks while the drift smears them, longer ones once it is taken out."""
+STEADY = 0.05
+"""Samples by which a block's lag may err for other reasons than noise."""
 
 
 class ClockDrift:
     """y(n) = x(n - offset + ppm 1e-6 n): a delay that shrinks with positive, grows with negative ppm.
 
-    Interpolation by a Kaiser-windowed sinc (beta 8) of 32 samples; flat to 0.1 dB up to 7 kHz.
+    Interpolation by a Kaiser-windowed sinc of 32 samples, see fractional. Valid where the drift is constant over the recording.
     """
 
     name: ClassVar[str] = "clock_drift"
@@ -39,46 +40,35 @@ class ClockDrift:
         if ppm == 0.0 and offset == 0.0:
             return x.copy()
         n = np.arange(x.size)
-        return _interpolate(x, n - offset + 1e-6 * ppm * n)
+        return interpolate(x, n - offset + 1e-6 * ppm * n)
 
     def fit(self, measurement: Measurement, model: EchoModel) -> Values:
-        """A line through the lags of windows of one second, weighted by their energy (GCC in the model's prediction)."""
-        predicted, recording = model.predict(measurement.reference), measurement.recording
-        times, lags, weights = [], [], []
-        for at in range(0, min(predicted.size, recording.size) - WINDOW + 1, WINDOW // 2):
-            a, b = predicted[at : at + WINDOW], recording[at : at + WINDOW]
-            energy = float(np.sqrt(np.dot(a, a) * np.dot(b, b)))
-            if energy > 0.0:
-                times.append(at + WINDOW / 2)
-                lags.append(_lag(a, b))
-                weights.append(energy)
-        if len(times) < 2:
-            return {"ppm": 0.0, "offset": lags[0] if lags else 0.0}
-        slope, offset = np.polyfit(times, lags, 1, w=np.sqrt(weights))
-        return {"ppm": float(np.clip(-1e6 * slope, -1000.0, 1000.0)), "offset": float(offset)}
+        """A robust line through the lags of all blocks, twice: the second time on the prediction that the first has straightened."""
+        predicted = model.predict(measurement.reference)
+        recording = measurement.whiten(measurement.recording)
+        n, lag = np.arange(predicted.size), np.zeros(predicted.size)
+        for size, reach in PASSES:
+            track = track_lag(measurement.whiten(interpolate(predicted, n - lag)), recording, measurement.fit, size, reach)
+            if track.lag.size < 3:
+                break
+            total = track.lag + np.interp(track.middle, n, lag)
+            slope, offset = robust_line(track.middle, total, track.sigma)
+            lag = offset + slope * n
+        slope = float(np.clip(1e6 * (lag[-1] - lag[0]) / max(n.size - 1, 1), -1000.0, 1000.0)) if n.size else 0.0
+        return {"ppm": -slope, "offset": float(lag[0]) if n.size else 0.0}
 
 
-def _lag(a: Samples, b: Samples) -> float:
-    """By how many samples b is behind a; parabola through the peak of the cross-correlation."""
-    n = 2 * a.size
-    cross = fft.irfft(fft.rfft(b, n) * np.conj(fft.rfft(a, n)), n)
-    near = np.concatenate((cross[-REACH:], cross[: REACH + 1]))
-    k = int(np.clip(np.argmax(near), 1, near.size - 2))
-    left, mid, right = near[k - 1 : k + 2]
-    bend = left - 2.0 * mid + right
-    return float(k - REACH + (0.5 * (left - right) / bend if bend < 0.0 else 0.0))
-
-
-def _interpolate(x: Samples, positions: Array) -> Samples:
-    """x at real positions (n,), in chunks so that memory stays bounded."""
-    out = np.zeros(positions.size, np.float32)
-    padded = np.concatenate((np.zeros(HALF_WIDTH, np.float32), x, np.zeros(HALF_WIDTH + 1, np.float32)))
-    steps = np.arange(-HALF_WIDTH + 1, HALF_WIDTH + 1)
-    for at in range(0, positions.size, 8192):
-        p = positions[at : at + 8192]
-        base = np.floor(p).astype(np.int64)
-        distance = steps[None, :] - (p - base)[:, None]
-        shape = np.i0(8.0 * np.sqrt(np.clip(1.0 - (distance / HALF_WIDTH) ** 2, 0.0, 1.0))) / np.i0(8.0)
-        index = np.clip(base[:, None] + steps[None, :] + HALF_WIDTH, 0, padded.size - 1)
-        out[at : at + 8192] = np.einsum("ij,ij->i", padded[index], np.sinc(distance) * shape)
-    return out
+def robust_line(x: Array, y: Array, sigma: Array) -> tuple[float, float]:
+    """Slope and offset of y (m,) over x (m,): from the median of all pairwise slopes (Theil-Sen), then Tukey's biweight."""
+    i, j = np.triu_indices(x.size, 1)
+    slope = float(np.median((y[j] - y[i]) / (x[j] - x[i])))
+    offset = float(np.median(y - slope * x))
+    spread = np.hypot(sigma, STEADY)
+    for _ in range(10):
+        distance = (y - slope * x - offset) / spread
+        scale = max(float(1.4826 * np.median(np.abs(distance))), 1.0)
+        keep = np.clip(1.0 - (distance / (4.685 * scale)) ** 2, 0.0, None)
+        if np.count_nonzero(keep) < 3:
+            break
+        slope, offset = np.polyfit(x, y, 1, w=keep / spread)
+    return float(slope), float(offset)

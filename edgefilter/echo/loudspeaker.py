@@ -5,40 +5,93 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
+import scipy
 
-from edgefilter.echo.effect import Measurement, Parameter, Stage, Values
-from edgefilter.types import Samples
+from edgefilter.echo.effect import Measurement, Parameter, Stage, Values, level_ratio
+from edgefilter.echo.least_squares import NUISANCE_LEAD, filtered, normal_equations
+from edgefilter.types import SAMPLE_RATE, Array, Samples
 
 if TYPE_CHECKING:
     from edgefilter.echo.model import EchoModel
 
+DISPLACEMENT_HZ = 300.0
+"""Corner of the second-order low-pass that turns the reference into the displacement of the membrane."""
+TAPS = 16
+"""Taps of the filter behind each nonlinear function, where one number each is not enough."""
+RIDGE = 1e-3
+BOUND = 1e4
+SILENT_DB = -120.0
+TERMS = ("even", "odd", "saturation", "force_factor", "stiffness")
+
+
+def displacement(x: Samples, sample_rate: int = SAMPLE_RATE) -> Samples:
+    """The membrane's displacement (n,) for the drive x (n,), in its full scale: stiffness holds it below the resonance, mass above."""
+    return scipy.signal.lfilter(*scipy.signal.butter(2, DISPLACEMENT_HZ, fs=sample_rate), x).astype(np.float32)
+
+
+def distortion_terms(x: Samples, sample_rate: int = SAMPLE_RATE) -> dict[str, Samples]:
+    """Each of TERMS as a signal (n,) for a drive x (n,): x^2, x^3, x |x|, d x, d^2 x with the displacement d."""
+    d = displacement(x, sample_rate)
+    return {"even": x * x, "odd": x * x * x, "saturation": x * np.abs(x), "force_factor": d * x, "stiffness": d * d * x}
+
 
 class SpeakerNonlinearity:
-    """Memoryless polynomial y = x + even x^2 + odd x^3 ahead of the linear path (a Hammerstein model).
+    """y = x + sum of h_k * f_k(x), five nonlinear functions f_k ahead of the linear path, each with a filter h_k of its own.
 
-    Valid while the added terms are well below x; the coefficients are per full scale.
+    A parallel Hammerstein model (Novak et al. 2010, "Nonlinear system identification using exponential swept-sine signals") whose
+    functions are x^2, x^3 and x |x| for amplifier and membrane, and the products d x, d^2 x with the displacement d: the terms that
+    force factor and stiffness add when they depend on the displacement (Klippel 2006, "Loudspeaker nonlinearities").
+    A parameter is one number or the taps (t,) of a causal filter, per full scale. Valid while the added terms are well below x.
     """
 
     name: ClassVar[str] = "speaker_nonlinearity"
     stage: ClassVar[Stage] = "source"
     memoryless: ClassVar[bool] = True
     parameters: ClassVar[tuple[Parameter, ...]] = (
-        Parameter("even", "1/full scale", 0.0, -20.0, 20.0),
-        Parameter("odd", "1/full scale^2", 0.0, -200.0, 200.0),
+        Parameter("even", "1/full scale", 0.0, -BOUND, BOUND),
+        Parameter("odd", "1/full scale^2", 0.0, -BOUND, BOUND),
+        Parameter("saturation", "1/full scale", 0.0, -BOUND, BOUND),
+        Parameter("force_factor", "1/full scale", 0.0, -BOUND, BOUND),
+        Parameter("stiffness", "1/full scale^2", 0.0, -BOUND, BOUND),
+        Parameter("level_db", "dB re the linear voice at the microphone", SILENT_DB, SILENT_DB, 20.0),
     )
 
     def apply(self, x: Samples, values: Values, sample_rate: int) -> Samples:
-        """The polynomial, sample by sample."""
-        square = x * x
-        return x + np.float32(values["even"]) * square + np.float32(values["odd"]) * square * x
+        """x (n,) with its distortion; level_db only reports."""
+        taps = {name: np.atleast_1d(np.asarray(values[name], float)) for name in TERMS}
+        out = x.copy()
+        if any(h.any() for h in taps.values()):
+            for name, term in distortion_terms(x, sample_rate).items():
+                out += filtered([term], taps[name][None])
+        return out
 
     def fit(self, measurement: Measurement, model: EchoModel) -> Values:
-        """Least squares in the three path-filtered powers of the reference; the linear term takes up a change of gain."""
+        """Ridge regression of the whitened recording on the path-filtered terms and the voice itself, with its nuisance filter.
+
+        One number for each term, or a filter for each where Bayes' information criterion says that they pay.
+        """
         x = measurement.reference
-        columns = np.stack([model.predict(power) for power in (x, x * x, x**3)], axis=1).astype(np.float64)
-        scale = np.sqrt((columns**2).sum(axis=0)) + 1e-30
-        weights = np.linalg.lstsq(columns / scale, measurement.recording.astype(np.float64), rcond=1e-9)[0] / scale
-        if weights[0] == 0.0:
-            return {"even": 0.0, "odd": 0.0}
-        even, odd = weights[1:] / weights[0]
-        return {"even": float(np.clip(even, -20.0, 20.0)), "odd": float(np.clip(odd, -200.0, 200.0))}
+        terms = distortion_terms(x)
+        linear = measurement.whiten(model.predict(x))
+        early = np.concatenate((linear[NUISANCE_LEAD:], np.zeros(NUISANCE_LEAD, np.float32)))[: linear.size]
+        columns = [early] + [measurement.whiten(model.predict(terms[name])) for name in TERMS]
+        target = measurement.whiten(measurement.recording)
+        normal = normal_equations(columns, target, TAPS, 0, measurement.fit)
+        weights, left = normal.solve(RIDGE)
+        single = np.zeros(weights.shape, bool)
+        single[0], single[1:, 0] = True, True
+        simple, left_by_simple = normal.solve(RIDGE, single)
+        taps = TAPS
+        variance = max(left / max(normal.count, 1), 1e-30)
+        if (left_by_simple - left) / variance < (~single).sum() * np.log(max(normal.count, 2)):
+            weights, taps = simple, 1
+        gain = level_ratio(filtered(columns[:1], weights[:1]), linear) or 1.0
+        added = filtered(columns[1:], weights[1:])
+        added = added - level_ratio(added, linear) * linear
+        level = 10.0 * np.log10(float(np.mean(added**2)) / (float(np.mean(linear**2)) + 1e-30) + 1e-12)
+        values = {name: _number_or_taps(np.clip(w[:taps] / gain, -BOUND, BOUND)) for name, w in zip(TERMS, weights[1:], strict=True)}
+        return {**values, "level_db": float(np.clip(level, SILENT_DB, 20.0))}
+
+
+def _number_or_taps(weights: Array) -> float | Array:
+    return float(weights[0]) if weights.size == 1 else weights

@@ -26,6 +26,7 @@ class PlaybackGain:
         return x * np.float32(10.0 ** (float(values["gain_db"]) / 20.0))
 
     def fit(self, measurement: Measurement, model: EchoModel) -> Values:
-        """The least-squares gain, held within the bounds."""
-        gain = level_ratio(measurement.recording, model.predict(measurement.reference))
+        """The least-squares gain of the whitened prediction, held within the bounds."""
+        predicted = measurement.whiten(model.predict(measurement.reference)) * measurement.weights
+        gain = level_ratio(measurement.whiten(measurement.recording), predicted)
         return {"gain_db": float(np.clip(20.0 * np.log10(max(gain, 1e-3)), -60.0, 60.0))}

@@ -41,7 +41,6 @@ def test_neutral_values_change_nothing(name: str) -> None:
     ("name", "values", "tolerance"),
     [
         ("playback_gain", {"gain_db": -2.5}, {"gain_db": 0.01}),  # least squares without noise: rounding only
-        ("speaker_nonlinearity", {"even": 0.4, "odd": -0.8}, {"even": 0.01, "odd": 0.02}),
         ("clock_drift", {"ppm": -80.0, "offset": 12.5}, {"ppm": 3.0, "offset": 0.2}),  # parabola through a coloured peak
     ],
 )

@@ -1,0 +1,125 @@
+"""A player or a driver lost or repeated samples: the delay jumps."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, ClassVar
+
+import numpy as np
+
+from edgefilter.echo.clock_drift import STEADY, robust_line
+from edgefilter.echo.effect import Measurement, Parameter, Stage, Values
+from edgefilter.echo.fractional import delayed
+from edgefilter.echo.lag_track import LagTrack, track_lag
+from edgefilter.types import SAMPLE_RATE, Array, Samples
+
+if TYPE_CHECKING:
+    from edgefilter.echo.model import EchoModel
+
+BLOCK, REACH = 4000, 2400
+MOST_JUMPS = 8
+LEAST_JUMP = 0.3
+"""Samples; less is no jump, but a block's lag that is not known better."""
+OUTLIER = 25.0
+"""A block adds at most this to the squared, normalised distance from the steps or the line."""
+COST = 12.0
+"""What each number of a step function has to save in squared, normalised distance, per unit of log(blocks)."""
+
+
+class DelayJump:
+    """The delay grows by samples[i] at times_s[i] and by offset from the start on; piecewise constant, fractional."""
+
+    name: ClassVar[str] = "delay_jump"
+    stage: ClassVar[Stage] = "time"
+    memoryless: ClassVar[bool] = False
+    parameters: ClassVar[tuple[Parameter, ...]] = (
+        Parameter("times_s", "s", 0.0, 0.0, 1e6),
+        Parameter("samples", "samples", 0.0, -48000.0, 48000.0),
+        Parameter("offset", "samples", 0.0, -32000.0, 32000.0),
+    )
+
+    def apply(self, x: Samples, values: Values, sample_rate: int) -> Samples:
+        """x (n,) read with the delay of each moment; outside of x there is silence."""
+        times, steps = (np.atleast_1d(np.asarray(values[name], float)) for name in ("times_s", "samples"))
+        order = np.argsort(times, kind="stable")
+        at = np.clip(np.round(times[order] * sample_rate), 0, x.size).astype(int)
+        delays = float(values["offset"]) + np.concatenate(([0.0], np.cumsum(steps[order])))
+        out = x.copy()
+        for start, stop, delay in zip([0, *at], [*at, x.size], delays, strict=True):
+            if delay != 0.0 and stop > start:
+                out[start:stop] = delayed(x, delay)[start:stop]
+        return out
+
+    def fit(self, measurement: Measurement, model: EchoModel) -> Values:
+        """Steps through the lags of all blocks; none where a straight line, a drift, describes the lags as well.
+
+        How many steps and how high comes from the samples to fit on; where exactly each lies is then looked up in all samples,
+        since a jump may fall between the blocks to fit on.
+        """
+        predicted, recording = measurement.whiten(model.predict(measurement.reference)), measurement.whiten(measurement.recording)
+        track = track_lag(predicted, recording, measurement.fit, BLOCK, REACH)
+        nothing = {"times_s": 0.0, "samples": 0.0, "offset": 0.0}
+        if track.lag.size < 4:
+            return nothing
+        edges, levels = find_steps(track.lag, np.hypot(track.sigma, STEADY))
+        if not 1 <= edges.size <= MOST_JUMPS or _line_is_as_good(track, edges, levels):
+            return nothing
+        times = [_locate(predicted, recording, track, edge, levels[i : i + 2]) for i, edge in enumerate(edges)]
+        return {"times_s": np.array(times) / SAMPLE_RATE, "samples": np.diff(levels), "offset": float(levels[0])}
+
+
+def find_steps(lag: Array, sigma: Array) -> tuple[Array, Array]:
+    """Step function through lag (b,): the first block of each new level, and the levels.
+
+    Optimal partition by dynamic programming (Jackson et al. 2005) with a penalty per level of COST log b, levels by their median.
+    Neighbouring levels closer than LEAST_JUMP are merged.
+    """
+    count = lag.size
+    penalty = COST * np.log(count)
+    best, origin = np.full(count + 1, np.inf), np.zeros(count + 1, int)
+    best[0] = -penalty
+    for stop in range(1, count + 1):
+        for start in range(stop):
+            part = slice(start, stop)
+            total = best[start] + penalty + _misfit(lag[part], np.median(lag[part]), sigma[part])
+            if total < best[stop]:
+                best[stop], origin[stop] = total, start
+    cuts = [count]
+    while cuts[-1] > 0:
+        cuts.append(origin[cuts[-1]])
+    cuts = cuts[::-1]
+    while True:
+        levels = np.array([_level(lag[a:b], sigma[a:b]) for a, b in zip(cuts[:-1], cuts[1:], strict=True)])
+        small = np.flatnonzero(np.abs(np.diff(levels)) < LEAST_JUMP)
+        if not small.size:
+            return np.array(cuts[1:-1], int), levels
+        del cuts[small[0] + 1]
+
+
+def _misfit(lag: Array, level: Array | float, sigma: Array) -> float:
+    return float(np.minimum(((lag - level) / sigma) ** 2, OUTLIER).sum())
+
+
+def _level(lag: Array, sigma: Array) -> float:
+    """Weighted mean of the lags near their median."""
+    middle = float(np.median(lag))
+    near = np.abs(lag - middle) < np.maximum(4 * sigma, 0.5)
+    return float(np.average(lag[near], weights=1 / sigma[near] ** 2)) if near.any() else middle
+
+
+def _line_is_as_good(track: LagTrack, edges: Array, levels: Array) -> bool:
+    sigma = np.hypot(track.sigma, STEADY)
+    slope, offset = robust_line(track.middle, track.lag, track.sigma)
+    line = _misfit(track.lag, slope * track.middle + offset, sigma)
+    steps = _misfit(track.lag, levels[np.searchsorted(edges, np.arange(track.lag.size), side="right")], sigma)
+    return line <= steps + COST * np.log(track.lag.size) * edges.size
+
+
+def _locate(predicted: Samples, recording: Samples, track: LagTrack, edge: int, levels: Array) -> int:
+    """The sample from which on the second delay predicts better than the first, between the blocks before and after."""
+    start = int(track.starts[edge - 1])
+    stop = int(track.starts[edge]) + track.size
+    margin = int(np.abs(levels).max()) + 64
+    low = max(start - margin, 0)
+    around = predicted[low : stop + margin]
+    before, after = ((recording[start:stop] - delayed(around, level)[start - low : stop - low]) ** 2 for level in levels)
+    return start + int(np.argmin(np.concatenate(([0.0], np.cumsum((before - after).astype(np.float64))))))

@@ -1,0 +1,81 @@
+"""By how much a recording lags behind its prediction, block by block."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy
+
+from edgefilter.types import Array, Samples
+
+LEAST_CORRELATION = 0.3
+"""Blocks whose normalised correlation at the best lag is below this say nothing about the lag."""
+
+
+@dataclass(frozen=True, eq=False)
+class LagTrack:
+    """starts (b,): first sample of each block of `size` samples; lag (b,), sigma (b,): samples, the recording behind the prediction."""
+
+    starts: Array
+    size: int
+    lag: Array
+    sigma: Array
+
+    @property
+    def middle(self) -> Array:
+        """(b,) samples, the middle of each block."""
+        return self.starts + self.size / 2
+
+
+def track_lag(predicted: Samples, recording: Samples, fit: np.ndarray | None, size: int, reach: int) -> LagTrack:
+    """Lags of up to +-reach samples of all blocks of `size` samples, every size / 2, that lie in fit and where the robot is heard.
+
+    predicted, recording: (n,), both whitened. The peak of each block's cross-correlation, then Newton's method on the phase of its
+    cross-spectrum: the maximum-likelihood lag in white noise (Knapp & Carter 1976). sigma is the Cramer-Rao bound for what the block
+    leaves unexplained, so it counts distortion and reverberation as noise.
+    """
+    starts = np.arange(0, recording.size - size + 1, size // 2)
+    if fit is not None and starts.size:
+        allowed = np.concatenate(([0], np.cumsum(fit)))
+        starts = starts[allowed[starts + size] - allowed[starts] == size]
+    if not starts.size:
+        return LagTrack(starts, size, np.zeros(0), np.zeros(0))
+    padded = np.pad(predicted, (reach, reach))
+    wide = padded[starts[:, None] + np.arange(size + 2 * reach)]
+    block = recording[starts[:, None] + np.arange(size)]
+    whole, correlation = _coarse(wide, block, reach)
+    near = np.take_along_axis(wide, reach - whole[:, None] + np.arange(size), axis=1)
+    fraction, sigma = _fine(near, block)
+    good = (correlation > LEAST_CORRELATION) & (np.abs(fraction) < 1.5) & np.isfinite(sigma)
+    return LagTrack(starts[good], size, (whole + fraction)[good], sigma[good])
+
+
+def _coarse(wide: Samples, block: Samples, reach: int) -> tuple[Array, Array]:
+    """Whole lags (b,) and the normalised correlation there."""
+    n = scipy.fft.next_fast_len(wide.shape[1], real=True)
+    cross = scipy.fft.irfft(scipy.fft.rfft(wide, n) * np.conj(scipy.fft.rfft(block, n)), n)[:, : 2 * reach + 1]
+    energy = np.cumsum(np.pad(wide.astype(np.float64) ** 2, ((0, 0), (1, 0))), axis=1)
+    size = block.shape[1]
+    energy = energy[:, size : size + 2 * reach + 1] - energy[:, : 2 * reach + 1]
+    own = np.sum(block.astype(np.float64) ** 2, axis=1, keepdims=True)
+    normal = cross / np.sqrt(np.maximum(energy, 1e-3 * energy.max(axis=1, keepdims=True)) * own + 1e-30)
+    peak = np.argmax(normal, axis=1)
+    return reach - peak, np.take_along_axis(normal, peak[:, None], axis=1)[:, 0]
+
+
+def _fine(near: Samples, block: Samples) -> tuple[Array, Array]:
+    """Rest of the lag (b,) and its standard deviation (b,), samples."""
+    window = np.hanning(block.shape[1]).astype(np.float32)
+    a, b = scipy.fft.rfft(near * window), scipy.fft.rfft(block * window)
+    cross = b * np.conj(a)
+    w = 2 * np.pi * np.arange(a.shape[1]) / block.shape[1]
+    lag = np.zeros(a.shape[0])
+    for _ in range(6):
+        turned = cross * np.exp(1j * w * lag[:, None])
+        slope, bend = turned.imag @ w, turned.real @ w**2
+        lag -= np.clip(np.divide(slope, bend, out=np.zeros_like(slope), where=bend > 0), -0.5, 0.5)
+    power = np.abs(a) ** 2
+    gain = (turned.real.sum(axis=1) / np.maximum(power.sum(axis=1), 1e-30))[:, None]
+    left = np.mean(np.abs(b) ** 2 - gain**2 * power, axis=1)
+    return lag, np.sqrt(np.maximum(left, 0) / np.maximum(2 * gain[:, 0] ** 2 * (power @ w**2), 1e-30)) + 1e-3

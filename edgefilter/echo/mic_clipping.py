@@ -1,0 +1,79 @@
+"""The microphone's converter or amplifier runs out of range."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, ClassVar
+
+import numpy as np
+
+from edgefilter.echo.effect import Measurement, Parameter, Stage, Values
+from edgefilter.types import SAMPLE_RATE, Samples
+
+if TYPE_CHECKING:
+    from edgefilter.echo.model import EchoModel
+
+NO_LIMIT = 100.0
+HARD = 100.0
+HARDNESS = (HARD, 10.0, 5.0, 3.0, 2.0)
+STEPS = 1.0 - np.array([0.0, 0.01, 0.02, 0.04, 0.07, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5])
+
+
+class MicClipping:
+    """y = x / (1 + |x / level|^p)^(1/p): an amplifier that saturates at +-level (Rapp 1991, eq. 1), p its hardness.
+
+    p = 2 is a soft limiter; from 100 on it is a hard clip. Level 100, far beyond any converter, stands for no limit.
+    """
+
+    name: ClassVar[str] = "mic_clipping"
+    stage: ClassVar[Stage] = "microphone"
+    memoryless: ClassVar[bool] = True
+    parameters: ClassVar[tuple[Parameter, ...]] = (
+        Parameter("level", "full scale", NO_LIMIT, 1e-4, NO_LIMIT),
+        Parameter("hardness", "", HARD, 1.0, HARD),
+    )
+
+    def apply(self, x: Samples, values: Values, sample_rate: int) -> Samples:
+        """x (n,), limited."""
+        level, hardness = float(values["level"]), float(values["hardness"])
+        if level >= NO_LIMIT:
+            return x.copy()
+        if hardness >= HARD:
+            return np.clip(x, -level, level)
+        over = np.abs(x / np.float32(level)).astype(np.float64)
+        return (x / (1.0 + over**hardness) ** (1.0 / hardness)).astype(np.float32)
+
+    def fit(self, measurement: Measurement, model: EchoModel) -> Values:
+        """The level and hardness that leave the least of the whitened recording, a gain free in each.
+
+        Levels from the recording's largest value downwards; where none beats the prediction as it is, there is no limit.
+        """
+        predicted = model.predict(measurement.reference)
+        recording = measurement.whiten(measurement.recording)
+        chosen = measurement.weights
+        top = float(np.max(np.abs(measurement.recording), initial=0.0))
+        none = {"level": NO_LIMIT, "hardness": HARD}
+        if top <= 1e-4:
+            return none
+
+        def left(level: float, hardness: float) -> float:
+            white = measurement.whiten(self.apply(predicted, {"level": level, "hardness": hardness}, SAMPLE_RATE)) * chosen
+            energy = float(np.dot(white, white))
+            return total - float(np.dot(recording, white)) ** 2 / energy if energy > 0.0 else total
+
+        total = float(np.dot(recording * chosen, recording * chosen))
+        plain = left(NO_LIMIT, HARD)
+        levels = top * STEPS
+        costs = [left(level, HARD) for level in levels]
+        best = int(np.argmin(costs))
+        found = (costs[best], float(levels[best]), HARD)
+        for hardness in HARDNESS[1:]:
+            for factor in (0.85, 1.0, 1.15):
+                level = min(found[1] * factor, 0.99 * NO_LIMIT)
+                found = min(found, (left(level, hardness), level, hardness))
+        for factor in (0.97, 0.985, 1.015, 1.03):
+            level = min(found[1] * factor, 0.99 * NO_LIMIT)
+            found = min(found, (left(level, found[2]), level, found[2]))
+        variance = found[0] / max(chosen.sum(), 1.0)
+        if plain - found[0] <= 2.0 * variance * np.log(max(chosen.sum(), 2.0)):
+            return none
+        return {"level": found[1], "hardness": found[2]}
