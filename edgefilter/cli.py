@@ -56,6 +56,10 @@ def _add_run(commands: argparse._SubParsersAction) -> None:
     run.add_argument("--reference", metavar="FILE|DEVICE", help="what the robot says; live it defaults to the monitor of the default output")
     run.add_argument("--profile", metavar="P.npz", help="calibrated robot, made by 'edgefilter calibrate'")
     run.add_argument("--engine", default="auto", metavar="ENGINE", help=f"auto, {', '.join(ENGINES)} (default: %(default)s)")
+    run.add_argument(
+        "--budget-ms", type=_positive, metavar="B", help="compute per hop (p99) that auto may use, and that a live run keeps to (live default: 8)"
+    )
+    run.add_argument("--remeasure", action="store_true", help="forget how fast the engines were on this machine")
     run.add_argument("--output", required=True, metavar="FILE|DEVICE|-", help="WAV or FLAC file, output device, or raw PCM")
     run.add_argument("--json", metavar="FILE", help="write what happened as JSON")
     run.add_argument("--save-input", metavar="DIR", help="also write what was heard: DIR/mic.wav and DIR/reference.wav")
@@ -102,7 +106,7 @@ def _add_profile(commands: argparse._SubParsersAction) -> None:
 def _positive(text: str) -> float:
     value = float(text)
     if not 0 < value < 1e6:
-        raise argparse.ArgumentTypeError(f"{text} is not a number of seconds above 0")
+        raise argparse.ArgumentTypeError(f"{text} is not a number above 0")
     return value
 
 

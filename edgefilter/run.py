@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import resource
 import time
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
@@ -13,7 +14,10 @@ from edgefilter.audio.files import Recorder
 from edgefilter.audio.protocols import Sink, Source
 from edgefilter.errors import EdgefilterError
 from edgefilter.stream import EgoFilter
-from edgefilter.types import SAMPLE_RATE, Block, Samples
+from edgefilter.types import SAMPLE_RATE, Block, Event, Samples
+
+MOST_EVENTS = 1000
+"""Events that a report keeps, the latest ones."""
 
 
 @dataclass
@@ -39,6 +43,7 @@ class RunReport:
     interrupted: bool = False
     failure: EdgefilterError | None = None
     filter: dict[str, object] = field(default_factory=dict)
+    events: deque[Event] = field(default_factory=lambda: deque(maxlen=MOST_EVENTS))
 
     def to_dict(self) -> dict[str, object]:
         """Ready for JSON."""
@@ -55,6 +60,7 @@ class RunReport:
             "peak_memory_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
             "interrupted": self.interrupted,
             "failure": str(self.failure) if self.failure else None,
+            "events": [{"kind": e.kind, "seconds": e.sample / SAMPLE_RATE, "detail": e.detail} for e in self.events],
             **self.filter,
         }
 
@@ -71,11 +77,13 @@ def filter_blocks(
     recorder: Recorder | None = None,
     show: Callable[[Progress], None] = lambda progress: None,
     stopped: Callable[[], bool] = lambda: False,
+    tell: Callable[[Event], None] = lambda event: None,
 ) -> RunReport:
     """Run ego over every block of source until it ends or stopped() says so; always flush into sink what was received.
 
     A source or sink that fails on the way (a device that vanished, a truncated file, a full disk) ends the run: what was
     received is filtered and flushed as far as the sink still takes it, and the error stands in report.failure.
+    show gets the levels after each block, tell what happened in the filter.
     """
     report, progress = RunReport(), Progress()
     began = time.perf_counter()
@@ -94,6 +102,9 @@ def filter_blocks(
         report.samples_in += block.mic.size
         report.lost += block.lost
         push(out)
+        for event in ego.events():
+            report.events.append(event)
+            tell(event)
         progress.samples, progress.lost = report.samples_in, report.lost
         progress.mic_db, progress.ref_db = level_db(block.mic), level_db(block.ref)
         show(progress)

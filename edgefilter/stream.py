@@ -266,7 +266,7 @@ def strongest(profile: Profile | None) -> tuple[Engine, str]:
     missing = ""
     for name in CANDIDATES:
         try:
-            return engines.create(name, profile), f"auto: the strongest engine{missing}"
+            return engines.create(name, profile), f"auto: the strongest engine, not measured{missing}"
         except EdgefilterError as error:
             missing += f"; {name} cannot be used: {error}"
     raise UsageError(f"no engine can be made{missing}")

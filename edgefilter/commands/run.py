@@ -12,21 +12,24 @@ from pathlib import Path
 from edgefilter.audio.files import FileSink, Recorder, open_source
 from edgefilter.audio.protocols import Sink, Source
 from edgefilter.audio.raw import PcmSink
+from edgefilter.budget import DEFAULT_MS, Choice, choose
+from edgefilter.budget_cache import forget
 from edgefilter.commands.display import display, write_json
 from edgefilter.errors import UsageError
+from edgefilter.profile import Profile
 from edgefilter.run import RunReport, filter_blocks
 from edgefilter.stream import EgoFilter
-from edgefilter.types import SAMPLE_RATE
+from edgefilter.types import SAMPLE_RATE, Event
 
 FILE_ENDINGS = (".wav", ".flac", ".ogg", ".mp3", ".aiff", ".aif", ".w64", ".opus", ".txt", ".raw", ".pcm")
 
 
 def main(args: argparse.Namespace) -> int:
     _refuse_overwriting(args)
-    ego = EgoFilter(args.profile, args.engine)
+    source = make_source(args.input, args.reference, args.output)
+    ego, choice = make_filter(args, source.live)
     if args.save_profile and not ego.can_adapt:
         raise UsageError("--save-profile writes back an adapted path: give --profile and an engine with a linear stage (linear or ss)")
-    source = make_source(args.input, args.reference, args.output)
     sink = make_sink(args.output, ego.latency, wait=not source.live)
     limit = None if args.seconds is None else round(args.seconds * SAMPLE_RATE)
     for note in source.notes:
@@ -39,16 +42,34 @@ def main(args: argparse.Namespace) -> int:
         stack.enter_context(sink)
         recorder = stack.enter_context(Recorder(args.save_input)) if args.save_input else None
         show = stack.enter_context(display(source, args.quiet))
-        report = filter_blocks(limited(source, limit), ego, sink, recorder, show, lambda: bool(stopped) or sink.finished)
+        report = filter_blocks(limited(source, limit), ego, sink, recorder, show, lambda: bool(stopped) or sink.finished, say_step)
         report.interrupted |= bool(stopped)
-    return finish(args, ego, source, sink, report, told)
+    return finish(args, ego, choice, source, sink, report, told)
 
 
-def finish(args: argparse.Namespace, ego: EgoFilter, source: Source, sink: Sink, report: RunReport, told: int) -> int:
+def make_filter(args: argparse.Namespace, live: bool) -> tuple[EgoFilter, Choice | None]:
+    """The filter with the engine that was asked for, or with the one that the measurement chose.
+
+    Live, or where a budget is given, "auto" is measured; a recording has no deadline and gets the strongest engine at once.
+    Live, an engine that was chosen or that has a budget may be replaced by cheaper ones while it runs.
+    """
+    if args.remeasure:
+        forget()
+    choice, engine, reason, budget_ms = None, args.engine, "asked for", args.budget_ms
+    profile = Profile.load(args.profile) if args.profile else None
+    if engine == "auto" and (live or budget_ms):
+        choice = choose(budget_ms or DEFAULT_MS, profile, say=say)
+        engine, reason, budget_ms = choice.engine, choice.reason, choice.budget_ms
+    return EgoFilter(profile, engine, budget_ms if live else None, reason), choice
+
+
+def finish(
+    args: argparse.Namespace, ego: EgoFilter, choice: Choice | None, source: Source, sink: Sink, report: RunReport, told: int
+) -> int:
     """Say and write what happened; return the exit code."""
     for note in [*source.notes[told:], *sink.notes]:
         say(note)
-    figures = report.to_dict() | {"source": source.stats(), "sink": sink.stats(), "notes": [*source.notes, *sink.notes]}
+    figures = report.to_dict() | {"choice": choice.to_dict() if choice else None, "source": source.stats(), "sink": sink.stats(), "notes": [*source.notes, *sink.notes]}
     if args.json:
         write_json(figures, args.json)
     if args.save_profile:
@@ -58,7 +79,8 @@ def finish(args: argparse.Namespace, ego: EgoFilter, source: Source, sink: Sink,
     seconds = report.samples_in / SAMPLE_RATE
     factor = f", {report.process_s / seconds:.3f} of real time" if seconds else ""
     how = "stopped after" if report.interrupted else "filtered"
-    say(f"{how} {seconds:.1f} s in {report.wall_s:.1f} s{factor}; {report.samples_out} samples to {args.output}, {report.lost} lost")
+    missed = f", {report.filter['deadline']['missed_deadlines']} deadlines missed" if source.live else ""
+    say(f"{how} {seconds:.1f} s in {report.wall_s:.1f} s{factor}; {report.samples_out} samples to {args.output}, {report.lost} lost{missed}")
     return 130 if report.interrupted and not source.live else 0
 
 
@@ -131,3 +153,9 @@ def _refuse_overwriting(args: argparse.Namespace) -> None:
 
 def say(text: str) -> None:
     print(text, file=sys.stderr)
+
+
+def say_step(event: Event) -> None:
+    """Tell of a change of engine when it happens, below the level meter where that is shown."""
+    if event.kind in ("stepped_down", "stepped_up", "overloaded"):
+        say(f"{chr(10) if sys.stderr.isatty() else ''}{event.sample / SAMPLE_RATE:.1f} s: {event.kind.replace('_', ' ')} {event.detail}")

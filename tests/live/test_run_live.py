@@ -38,7 +38,7 @@ def db(x):
 
 def test_live_run_takes_the_monitor_ends_by_ctrl_c_and_equals_the_file_path(server, conversation, tmp_path):
     command = edgefilter(
-        "run", "--input", "mic", "--profile", DEMO / "profile.npz", "--output", tmp_path / "live.wav",
+        "run", "--input", "mic", "--profile", DEMO / "profile.npz", "--output", tmp_path / "live.wav", "--engine", "ss",
         "--save-input", tmp_path / "heard", "--json", tmp_path / "stats.json",
     )  # fmt: skip
     live = subprocess.Popen(command, env=server.environment, cwd=ROOT, stderr=subprocess.PIPE, text=True)
@@ -60,14 +60,40 @@ def test_live_run_takes_the_monitor_ends_by_ctrl_c_and_equals_the_file_path(serv
     assert stats["samples_in"] == stats["samples_out"] == out.size == mic.size == ref.size
     assert db(mic) > -60 and db(ref) > -60
     again = edgefilter(
-        "run", "--input", heard, "--reference", tmp_path / "heard/reference.wav", "--profile", DEMO / "profile.npz", "--output", tmp_path / "file.wav"
-    )
+        "run", "--input", heard, "--reference", tmp_path / "heard/reference.wav", "--profile", DEMO / "profile.npz",
+        "--output", tmp_path / "file.wav", "--engine", "ss",
+    )  # fmt: skip
     subprocess.run(again, cwd=ROOT, check=True, capture_output=True)
     assert (tmp_path / "file.wav").read_bytes() == (tmp_path / "live.wav").read_bytes()
 
     first = int(np.argmax(np.abs(mic) > 0.02))
     speech = slice(first + 16_000, first + 5 * 16_000)
     assert db(out[speech]) < db(mic[speech]) - 15  # 25 dB were seen; the players start the two channels at different times
+
+
+def run_for(server, seconds, tmp_path, *more):
+    """A live run of so many seconds without a profile, its words and its figures."""
+    command = edgefilter("run", "--input", "mic", "--output", tmp_path / "live.wav", "--json", tmp_path / "stats.json", "--seconds", seconds, *more)
+    result = subprocess.run(command, env=server.environment, cwd=ROOT, capture_output=True, text=True, timeout=120)
+    assert result.returncode == 0, result.stderr
+    stats = json.loads((tmp_path / "stats.json").read_text())
+    assert stats["samples_in"] == stats["samples_out"] == soundfile.info(tmp_path / "live.wav").frames == round(seconds * 16_000)
+    return result.stderr, stats
+
+
+def test_live_an_engine_over_its_budget_is_left_and_every_sample_is_there(server, tmp_path):
+    """No machine runs a hop in 1 us, so that both engines of the ladder are over the budget."""
+    said, stats = run_for(server, 3, tmp_path, "--engine", "ss", "--budget-ms", "0.001")
+    assert "stepped down from ss to linear" in said and "overloaded" in said
+    assert [event["kind"] for event in stats["events"]] == ["stepped_down", "overloaded"]
+    assert stats["engines"] == ["ss", "linear"] and stats["engine"] == "linear"
+    assert stats["deadline"]["over_budget"] == stats["deadline"]["hops"] and "deadlines missed" in said
+
+
+def test_live_auto_measures_the_engines_and_says_why(server, tmp_path):
+    said, stats = run_for(server, 1, tmp_path, "--budget-ms", "1000")
+    assert stats["engine"] == stats["choice"]["engine"] and stats["choice"]["fits"] and stats["engine_reason"] in said
+    assert stats["choice"]["figures"][0]["hops"] >= 300 and "best engine within 1000 ms, p99" in said
 
 
 def test_an_unknown_device_is_one_line_that_names_the_known_ones(server, tmp_path):

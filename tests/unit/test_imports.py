@@ -18,7 +18,7 @@ LEAVES = {
     "export": set(),
 }
 LAYERS = [
-    {"types", "errors", "timing"},
+    {"types", "errors", "timing", "budget_cache"},
     {"stft", "ring", "metrics"},
     {"echo"},
     {"profile", "profile_file", "profile_text", "delay_line", "utterances"},
