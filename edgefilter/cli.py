@@ -7,6 +7,7 @@ import importlib
 import sys
 
 from edgefilter import __version__
+from edgefilter.echo.user_effects import load_effect
 from edgefilter.engines import ENGINES
 from edgefilter.errors import EdgefilterError, UsageError
 
@@ -31,6 +32,7 @@ def build_parser() -> Parser:
     _add_demo(commands)
     _add_run(commands)
     _add_calibrate(commands)
+    _add_diagnosis(commands)
     _add_devices(commands)
     _add_profile(commands)
     return parser
@@ -65,6 +67,7 @@ def _add_run(commands: argparse._SubParsersAction) -> None:
     run.add_argument("--save-input", metavar="DIR", help="also write what was heard: DIR/mic.wav and DIR/reference.wav")
     run.add_argument("--save-profile", metavar="P2.npz", help="write the profile with the echo path as it was adapted in this run")
     run.add_argument("--seconds", type=_positive, metavar="S", help="stop after S seconds")
+    _effects_option(run)
     run.add_argument("--quiet", action="store_true", help="no progress bar, no level meter")
 
 
@@ -89,6 +92,30 @@ def _add_calibrate(commands: argparse._SubParsersAction) -> None:
     calibrate.add_argument("--json", metavar="FILE", help="write the result as JSON ('-': standard output)")
 
 
+def _add_diagnosis(commands: argparse._SubParsersAction) -> None:
+    compare = commands.add_parser("compare", help="say how far the profile is from a recording of the robot, and where")
+    diagnose = commands.add_parser("diagnose", help="say which physical effects the profile lacks")
+    add = commands.add_parser("add", help="fit an effect to a recording and write a profile that has it")
+    remove = commands.add_parser("remove", help="write a profile without one of its effects")
+    for command in (add, remove):
+        command.add_argument("effect", metavar="EFFECT", help="name of the effect, as 'diagnose' and 'profile show' print it")
+    for command in (compare, diagnose, add, remove):
+        command.add_argument("--profile", required=True, metavar="P.npz", help="calibrated robot, made by 'edgefilter calibrate'")
+        if command is not remove:
+            command.add_argument("--recording", required=True, metavar="MIC", help="the robot alone, as the microphone heard it, from some seconds up")
+            command.add_argument("--reference", required=True, metavar="REF", help="what the robot said, as it was sent to the loudspeaker")
+        if command in (add, remove):
+            command.add_argument("--output", required=True, metavar="P2.npz", help="profile to write")
+        else:
+            command.add_argument("--report", metavar="R.html", help="write a page with pictures and sound, in one file")
+        command.add_argument("--json", metavar="FILE", help="write the result as JSON ('-': standard output)")
+        _effects_option(command)
+
+
+def _effects_option(command: argparse.ArgumentParser) -> None:
+    command.add_argument("--effects", action="append", default=[], metavar="FILE.py", help="an effect of your own (see docs/own_effect.md); repeatable")
+
+
 def _add_devices(commands: argparse._SubParsersAction) -> None:
     devices = commands.add_parser("devices", help="list sound devices and the reference that live use would take")
     devices.add_argument("--json", metavar="FILE", help="write the list as JSON ('-': standard output)")
@@ -101,6 +128,7 @@ def _add_profile(commands: argparse._SubParsersAction) -> None:
     show.add_argument("profile", metavar="P.npz")
     show.add_argument("--plot", metavar="FILE.png", help="draw it")
     show.add_argument("--json", metavar="FILE", help="write it as JSON ('-': standard output)")
+    _effects_option(show)
 
 
 def _positive(text: str) -> float:
@@ -116,6 +144,8 @@ def main(argv: list[str] | None = None) -> int:
     debug = "--debug" in arguments
     try:
         args = build_parser().parse_args(arguments)
+        for file in getattr(args, "effects", []):
+            load_effect(file)
         return importlib.import_module(f"edgefilter.commands.{args.command}").main(args)
     except UsageError as error:
         return _fail(error, 2, debug)

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from edgefilter.echo.effect import names as known_effects
 from edgefilter.echo.model import PRE_ROLL, EchoModel
 from edgefilter.errors import ProfileError
 from edgefilter.profile_file import REMEDY, read_fields, write_fields
@@ -99,6 +100,9 @@ class Profile:
             warnings = header.pop("warnings")
             if not isinstance(warnings, list):
                 raise ProfileError(f"warnings is a JSON {type(warnings).__name__}, expected a list of texts; {REMEDY}")
+            for name, _ in effects:
+                if name not in known_effects():
+                    raise ProfileError(f"holds the effect '{name[:40]}', which does not come with edgefilter; load its file (--effects FILE.py)")
             return cls(echo=EchoModel(arrays.pop("impulse_response"), effects), warnings=tuple(warnings), **arrays, **header)
         except ProfileError as error:
             raise ProfileError(f"{path}: {error}") from None

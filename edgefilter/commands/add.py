@@ -1,0 +1,35 @@
+"""`edgefilter add`: fit an effect to a recording and write a profile that has it."""
+
+from __future__ import annotations
+
+import argparse
+
+import numpy as np
+
+from edgefilter.commands.display import write_json
+from edgefilter.commands.material import load
+from edgefilter.diagnose import add
+from edgefilter.echo.effect import find
+from edgefilter.report.words import UNITS, figure
+
+
+def main(args: argparse.Namespace) -> int:
+    effect = find(args.effect)
+    profile, recording, reference = load(args)
+    fitted, before, after = add(profile, args.effect, recording, reference)
+    fitted.save(args.output)
+    values = dict(fitted.echo.effects)[args.effect]
+    if args.json:
+        figures = {"schema": 1, "effect": args.effect, "excess_before_db": before.excess_db, "excess_after_db": after.excess_db}
+        parameters = {p.name: {"value": np.asarray(values[p.name]).tolist(), "unit": p.unit} for p in effect.parameters}
+        write_json({**figures, "noise_floor_db": before.noise_floor_db, "parameters": parameters, "output": args.output}, args.json)
+    if args.json != "-":
+        print(f"{args.effect} added: {before.excess_db:.1f} dB over the noise floor before, {after.excess_db:.1f} dB after")
+        for p in effect.parameters:
+            value = np.asarray(values[p.name])
+            shown = f"{value.size} values" if value.size > 6 else ", ".join(figure(v) for v in value.ravel())
+            print(f"  {p.name} = {shown} {UNITS.get(p.unit, p.unit)}".rstrip())
+        if after.excess_db >= before.excess_db:
+            print("WARNING     the error did not fall: this effect does not explain the recording")
+        print(f"written to {args.output}")
+    return 0

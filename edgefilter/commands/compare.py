@@ -1,0 +1,25 @@
+"""`edgefilter compare`: how far the profile's prediction is from a recording, and where."""
+
+from __future__ import annotations
+
+import argparse
+
+from edgefilter.commands.display import write_json
+from edgefilter.commands.material import load
+from edgefilter.compare import compare
+from edgefilter.report.html import comparison_page, write_page
+from edgefilter.report.text import comparison_lines
+
+
+def main(args: argparse.Namespace) -> int:
+    profile, recording, reference = load(args)
+    found = compare(profile, recording, reference)
+    if args.json:
+        write_json({"schema": 1, **found.to_dict()}, args.json)
+    if args.json != "-":
+        print("\n".join(comparison_lines(found)))
+    if args.report:
+        write_page(args.report, comparison_page(found, vars(args)))
+        if args.json != "-":
+            print(f"report      {args.report}")
+    return 0

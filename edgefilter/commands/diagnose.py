@@ -1,0 +1,44 @@
+"""`edgefilter diagnose`: which physical effects the profile lacks, on the evidence of a recording."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+from tqdm import tqdm
+
+from edgefilter.commands.display import write_json
+from edgefilter.commands.material import load
+from edgefilter.diagnose import Diagnosis, diagnose
+from edgefilter.report.html import add_command, diagnosis_page, write_page
+from edgefilter.report.text import diagnosis_lines
+
+
+def main(args: argparse.Namespace) -> int:
+    profile, recording, reference = load(args)
+    with _bar() as progress:
+        found = diagnose(profile, recording, reference, progress=progress)
+    if args.json:
+        write_json(found.to_dict(), args.json)
+    if args.json != "-":
+        print("\n".join([*diagnosis_lines(found), *_next_step(found, args)]))
+    if args.report:
+        write_page(args.report, diagnosis_page(profile, found, recording, reference, vars(args)))
+        if args.json != "-":
+            print(f"report      {args.report}")
+    return 0
+
+
+def _next_step(found: Diagnosis, args: argparse.Namespace) -> list[str]:
+    if not found.ranking:
+        return []
+    return [f"next        {add_command(found.ranking[0].effect, vars(args))}"]
+
+
+@contextmanager
+def _bar() -> Iterator[Callable[[str], None]]:
+    """What is being tried and for how long, on a terminal."""
+    with tqdm(bar_format="{elapsed} {desc}", leave=False, disable=None, file=sys.stderr) as bar:
+        yield bar.set_description_str

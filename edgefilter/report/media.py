@@ -1,0 +1,78 @@
+"""Spectrograms as PNG and sound as Opus, both as data addresses that a page carries inside itself."""
+
+from __future__ import annotations
+
+import base64
+import io
+import struct
+import zlib
+
+import numpy as np
+import soundfile
+
+from edgefilter.types import SAMPLE_RATE, Samples
+
+WINDOW, MAX_COLUMNS = 480, 800
+"""Samples of a spectrogram's frame, and how many columns a picture has at most."""
+RANGE_DB, LEVELS = 72.0, 64
+"""Between the darkest and the brightest colour, and how many colours there are."""
+OPUS_COMPRESSION = 0.8
+"""Of libsndfile's range 0 (best) to 1 (smallest): about 55 kbit/s at 16 kHz mono."""
+MAX_SOUND_S = 60
+"""How much of a recording a page carries as sound."""
+_ANCHORS = np.array(
+    [(8, 8, 20), (38, 22, 74), (89, 32, 110), (147, 44, 103), (201, 62, 78), (238, 104, 45), (250, 164, 34), (252, 222, 120), (255, 252, 225)],
+    float,
+)
+"""Dark to bright, each step about as much lighter as the one before."""
+
+
+def spectrogram_db(samples: Samples) -> np.ndarray:
+    """Level (columns, WINDOW // 2 + 1) in dB of full scale per bin, Hann frames, mean power where frames share a column."""
+    hop = WINDOW // 2
+    padded = np.pad(samples, (0, max(0, WINDOW - samples.size)))
+    window = np.hanning(WINDOW).astype(np.float32)
+    count = 1 + (padded.size - WINDOW) // hop
+    columns = min(count, MAX_COLUMNS)
+    edges = np.linspace(0, count, columns + 1).astype(int)
+    power = np.empty((columns, WINDOW // 2 + 1))
+    frames = np.lib.stride_tricks.sliding_window_view(padded, WINDOW)[::hop]
+    for column, (first, last) in enumerate(zip(edges[:-1], edges[1:], strict=True)):
+        power[column] = np.mean(np.abs(np.fft.rfft(frames[first:last] * window, axis=1)) ** 2, axis=0)
+    return 10 * np.log10(np.maximum(power / (window.sum() / 2) ** 2, 1e-20))
+
+
+def spectrogram_png(samples: Samples, top_db: float) -> str:
+    """The spectrogram as a data address, low frequencies at the bottom; top_db is the brightest colour, RANGE_DB below it the darkest."""
+    shade = (spectrogram_db(samples) - (top_db - RANGE_DB)) / RANGE_DB
+    index = np.clip(np.round(shade * (LEVELS - 1)), 0, LEVELS - 1).astype(np.uint8)
+    return _address("image/png", _png(index.T[::-1], colours()))
+
+
+def colours() -> np.ndarray:
+    """(LEVELS, 3) uint8, darkest first."""
+    at = np.linspace(0, len(_ANCHORS) - 1, LEVELS)
+    return np.stack([np.interp(at, np.arange(len(_ANCHORS)), channel) for channel in _ANCHORS.T], axis=1).astype(np.uint8)
+
+
+def sound(samples: Samples, gain: float = 1.0) -> str:
+    """The first MAX_SOUND_S of samples (n,) times gain, as an Opus data address."""
+    buffer = io.BytesIO()
+    loud = np.clip(samples[: MAX_SOUND_S * SAMPLE_RATE] * np.float32(gain), -1.0, 1.0)
+    soundfile.write(buffer, loud, SAMPLE_RATE, format="OGG", subtype="OPUS", compression_level=OPUS_COMPRESSION)
+    return _address("audio/ogg", buffer.getvalue())
+
+
+def _address(kind: str, content: bytes) -> str:
+    return f"data:{kind};base64,{base64.b64encode(content).decode()}"
+
+
+def _png(index: np.ndarray, palette: np.ndarray) -> bytes:
+    """A PNG (ISO/IEC 15948) of index (rows, columns) uint8 into palette (n, 3) uint8."""
+    rows, columns = index.shape
+    lines = np.concatenate((np.zeros((rows, 1), np.uint8), index), axis=1).tobytes()
+    header = struct.pack(">IIBBBBB", columns, rows, 8, 3, 0, 0, 0)
+    chunks = ((b"IHDR", header), (b"PLTE", palette.tobytes()), (b"IDAT", zlib.compress(lines, 9)), (b"IEND", b""))
+    return b"\x89PNG\r\n\x1a\n" + b"".join(
+        struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data)) for name, data in chunks
+    )

@@ -1,0 +1,77 @@
+"""A comparison and a diagnosis as lines for the terminal: figures with small bars."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from edgefilter.compare import Comparison
+from edgefilter.diagnose import Diagnosis, Finding
+from edgefilter.report.words import headline, interval_text, title
+
+BAR_WIDTH = 30
+MAX_TIMES = 12
+"""Rows that the excess by time takes at most; longer recordings are summed up in longer steps."""
+
+
+def comparison_lines(found: Comparison) -> list[str]:
+    """The excess, then where it is: by frequency, time, level and lag, and while the robot is silent."""
+    lines = [
+        f"excess      {found.excess_db:.1f} dB over the noise floor of {found.noise_floor_db:.1f} dBFS",
+        f"lag         {found.offset_samples:+.2f} samples against the calibration, taken out",
+    ]
+    if math.isfinite(found.silence_excess_db):
+        lines.append(f"silence     {found.silence_excess_db:.1f} dB over the noise floor while the robot is silent")
+    if found.human:
+        spans = ", ".join(f"{start:.1f}-{end:.1f} s" for start, end in found.human)
+        lines.append(f"human       somebody talks at {spans}; left out of every figure")
+    lines += [f"WARNING     {text}" for text in found.warnings]
+    lines += _table("by frequency", "Hz", found.bands)
+    lines += _table("by time", "s", coarser(found.times, MAX_TIMES))
+    lines += _table("by level of the robot's voice", "dBFS", found.levels)
+    lines += ["by lag of the correlation with the reference"]
+    lines += [f"  {low:5g} to {high:4g} ms  {100 * share:5.0f} %   {_bar(share)}".rstrip() for low, high, share in found.lags]
+    return lines
+
+
+def diagnosis_lines(found: Diagnosis) -> list[str]:
+    """The verdict in a sentence, the error budget step by step, each finding with its evidence, then where the excess was."""
+    names = [finding.effect for finding in found.ranking]
+    steps = [("the profile as it is", found.comparison.excess_db)]
+    steps += [(f"with {name}", finding.excess_after_db) for name, finding in zip(names, found.ranking, strict=True)]
+    top = max(1.0, *(db for _, db in steps))
+    lines = [f"verdict     {found.verdict}: {headline(found.verdict, names)}", "budget      dB over the noise floor"]
+    lines += [f"  {name:<27} {db:6.1f}  {_bar(db / top)}".rstrip() for name, db in steps]
+    lines.append(f"  {'of it irreducible':<27} {found.irreducible_db:6.1f}  {_bar(found.irreducible_db / top)}".rstrip())
+    for rank, finding in enumerate(found.ranking, start=1):
+        lines += _finding(rank, finding)
+    if found.evidence:
+        lines.append(f"left        {found.remaining_db:.1f} dB: {found.evidence}")
+    return [*lines, *comparison_lines(found.comparison)]
+
+
+def coarser(times: Sequence[tuple[float, float, float]], rows: int) -> list[tuple[float, float, float]]:
+    """Neighbouring (start_s, end_s, excess_db) joined, powers averaged, so that at most `rows` remain."""
+    step = math.ceil(len(times) / rows) if times else 1
+    groups = [times[at : at + step] for at in range(0, len(times), step)]
+    return [(group[0][0], group[-1][1], 10 * math.log10(np.mean([10 ** (db / 10) for _, _, db in group]))) for group in groups]
+
+
+def _finding(rank: int, finding: Finding) -> list[str]:
+    lines = [
+        f"{rank:>2}. {title(finding.effect)} ({finding.effect}): "
+        f"{finding.excess_before_db:.1f} to {finding.excess_after_db:.1f} dB, {100 * finding.share:.0f} % of the excess",
+        f"      {finding.evidence}",
+    ]
+    return lines + [f"      {name} = {interval_text(interval)}" for name, interval in finding.parameters.items()]
+
+
+def _table(heading: str, unit: str, rows: Sequence[tuple[float, float, float]]) -> list[str]:
+    top = max([1.0, *(db for _, _, db in rows)])
+    return [heading] + [f"  {low:5g} to {high:4g} {unit:<4} {db:6.1f} dB  {_bar(db / top)}".rstrip() for low, high, db in rows]
+
+
+def _bar(part: float) -> str:
+    return "#" * round(BAR_WIDTH * min(max(part, 0.0), 1.0))

@@ -1,0 +1,74 @@
+"""The names of effects and verdicts as people say them, for the terminal and the report."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from edgefilter.diagnose import Interval
+
+EFFECTS = {
+    "late_reverb": "late reverberation",
+    "chassis_resonance": "a chassis resonance",
+    "playback_gain": "a turned volume",
+    "bandlimit": "a band limit",
+    "clock_drift": "clock drift",
+    "delay_jump": "a delay jump",
+    "path_change": "a changed path",
+    "compression": "compression",
+    "mic_agc": "a microphone gain control",
+    "speaker_nonlinearity": "loudspeaker nonlinearity",
+    "mic_clipping": "microphone clipping",
+    "rattle": "a rattle",
+    "fan_noise": "changed fan noise",
+}
+
+UNITS = {"1": "", "1e-6": "ppm"}
+"""Units of parameters that read better otherwise."""
+
+
+def spoken(effect: str) -> str:
+    """The effect inside a sentence; one of the user's own by its name without underscores."""
+    return EFFECTS.get(effect, effect.replace("_", " "))
+
+
+def title(effect: str) -> str:
+    """The effect as a heading, without its article."""
+    words = spoken(effect).removeprefix("a ")
+    return words[:1].upper() + words[1:]
+
+
+def joined(words: Iterable[str]) -> str:
+    """ "a, b and c"."""
+    *first, last = list(words) or [""]
+    return f"{', '.join(first)} and {last}" if first else last
+
+
+def headline(verdict: str, effects: Iterable[str]) -> str:
+    """One sentence for the verdict of a diagnosis."""
+    found = joined(spoken(effect) for effect in effects)
+    if verdict == "missing":
+        return f"Missing from the profile: {found}."
+    if verdict == "explained":
+        return "The profile explains this recording."
+    return "Something is in this recording that no known effect explains" + (f", besides {found}." if found else ".")
+
+
+def figure(value: float) -> str:
+    """A number with three significant digits; without an exponent where people would not write one."""
+    value = float(value)
+    if value == 0 or not 1e-4 <= abs(value) < 1e7:
+        return f"{value:.3g}"
+    return f"{value:.{max(0, 2 - math.floor(math.log10(abs(value))))}f}"
+
+
+def interval_text(interval: Interval) -> str:
+    """ "0.61 s (0.56 to 0.66)"; several values one after the other, each with its own range."""
+    values, lows, highs = (np.atleast_1d(x) for x in (interval.value, interval.low, interval.high))
+    unit = UNITS.get(interval.unit, interval.unit)
+    shown = [f"{figure(v)} {unit}".rstrip() + (f" ({figure(low)} to {figure(high)})" if low < high else "") for v, low, high in zip(values, lows, highs)]
+    return ", ".join(shown) or "none"

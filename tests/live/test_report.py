@@ -1,0 +1,181 @@
+"""The report in a browser: switches move the figures, nothing is clipped, nothing is loaded, nothing complains, it prints."""
+
+from __future__ import annotations
+
+import json
+import re
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from browser import Browser
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "unit"))
+from robot_scene import profile, record, voice  # noqa: E402
+
+from edgefilter.compare import describe  # noqa: E402
+from edgefilter.diagnose import Diagnosis, Finding, Interval, diagnose  # noqa: E402
+from edgefilter.prepare import prepare  # noqa: E402
+from edgefilter.report.html import comparison_page, diagnosis_page, write_page  # noqa: E402
+
+NAMES = {"profile": "a robot with a rather long name.npz", "recording": "the office <on> Monday.wav", "reference": "tts.wav", "effects": []}
+CLIPPED = """[...document.querySelectorAll('body *')].filter((e) => e.checkVisibility() && !e.closest('audio')).flatMap((e) => {
+  const r = e.getBoundingClientRect(), wide = document.documentElement.clientWidth;
+  const outside = r.width && (r.right > wide + 0.5 || r.left < -0.5);
+  const cut = getComputedStyle(e).overflowX !== 'visible' && e.scrollWidth > e.clientWidth + 1;
+  return outside || cut ? [e.tagName + '.' + e.className + ' ' + e.textContent.slice(0, 40)] : []; })"""
+OVERLAPPING = """[...document.querySelectorAll('.frame')].flatMap((frame) => ['.under', '.step', '.amount', '.tick'].flatMap((kind) => {
+  const all = [...frame.querySelectorAll(kind)].map((e) => [e.getBoundingClientRect(), e.textContent]);
+  return all.flatMap(([a, x], i) => all.slice(i + 1).filter(([b]) =>
+    a.left < b.right - 1 && b.left < a.right - 1 && a.top < b.bottom - 1 && b.top < a.bottom - 1).map(([, y]) => x + ' | ' + y)); }))"""
+
+
+@pytest.fixture(scope="module")
+def pages(tmp_path_factory):
+    """The folder with a diagnosis of two effects, a comparison, and a diagnosis that found nothing; and the first one's figures."""
+    folder = tmp_path_factory.mktemp("pages")
+    x, robot = voice(6.0), profile()
+    wrong = robot.echo.with_effect("playback_gain", {"gain_db": -3.0}).with_effect("speaker_nonlinearity", {"odd": 4.0})
+    y = record(x, wrong)
+    prepared = prepare(robot, y, x)
+    findings, model = [], robot.echo
+    for name, values in wrong.effects:
+        before = describe(prepared, model.predict(prepared.measurement.reference))
+        model = model.with_effect(name, values)
+        after = describe(prepared, prediction := model.predict(prepared.measurement.reference))
+        shown = {key: Interval(float(v), float(v) - 0.1, float(v) + 0.1, "dB") for key, v in values.items()}
+        findings.append(Finding(name, before.excess_db, after.excess_db, 0.5, shown, f"Evidence for {name}.", values, prediction))
+    found = Diagnosis("missing", describe(prepared), tuple(findings), "Nothing else.", after.excess_db, 0.1, model)
+    write_page(folder / "missing.html", diagnosis_page(robot, found, y, x, NAMES))
+    write_page(folder / "comparison.html", comparison_page(found.comparison, NAMES))
+    clean = record(x)
+    write_page(folder / "explained.html", diagnosis_page(robot, diagnose(robot, clean, x), clean, x, NAMES))
+    return folder, found
+
+
+@pytest.fixture(scope="module")
+def browser():
+    with Browser() as found:
+        yield found
+
+
+def shown_excess(browser) -> float:
+    return float(browser.run("document.getElementById('excess').textContent").split()[0].replace("−", "-"))
+
+
+def stored(folder) -> dict:
+    page = (folder / "missing.html").read_text()
+    return json.loads(re.search(r'id="data">(.*?)</script>', page, re.S)[1])
+
+
+def test_switches_move_the_figure_the_stairs_the_bars_the_picture_and_the_sound(browser, pages):
+    folder, found = pages
+    data = stored(folder)
+    browser.open(folder / "missing.html", 1280)
+    state = """[...document.querySelectorAll('.now-bar')].reduce((sum, e) => sum + parseFloat(e.style.height), 0)"""
+    pieces = "['residual', 'prediction'].flatMap((id) => ['img', 'audio'].map((e) => document.querySelector(`#${id} ${e}`).getAttribute('src')))"
+    steps = "document.querySelectorAll('.stair').length - 4"  # less the first and the last column, each with its irreducible part
+    heights, sources = {}, {}
+    for key, clicked in (("11", None), ("01", 0), ("00", 1), ("10", 0)):
+        if clicked is not None:
+            browser.click(f"#switches [data-effect='{clicked}']")
+        now = data["variants"][key]
+        assert shown_excess(browser) == pytest.approx(now["excess_db"], abs=0.051)  # one decimal is shown
+        kept = [data["media"][now[part][kind]] for part in ("residual", "prediction") for kind in ("picture", "sound")]
+        assert browser.run(pieces) == kept
+        heights[key], sources[key] = browser.run(state), tuple(kept)
+        assert browser.run(steps) == key.count("1")
+        assert f"{abs(now['excess_db']):.1f} dB" in browser.run("document.querySelector('#staircase .plot').ariaLabel")
+    assert len(set(sources.values())) == 4
+    assert heights["11"] < 0.3 * heights["00"]
+    assert data["variants"]["00"]["excess_db"] == pytest.approx(found.comparison.excess_db, abs=0.001)
+    assert data["variants"]["11"]["excess_db"] == pytest.approx(found.remaining_db, abs=0.001)
+    assert browser.console == []
+
+
+def test_it_is_worked_without_a_mouse(browser, pages):
+    folder, _ = pages
+    data = stored(folder)
+    browser.open(folder / "missing.html", 1280)
+    browser.press("Tab", 9)
+    assert browser.run("document.activeElement.dataset.effect") == "0"
+    assert browser.run("getComputedStyle(document.activeElement).outlineStyle") == "solid"
+    browser.press(" ", 32, " ")
+    assert shown_excess(browser) == pytest.approx(data["variants"]["01"]["excess_db"], abs=0.051)
+    unnamed = "[...document.querySelectorAll('input, audio, img, [role=img]')].filter((e) => !(e.labels?.length || e.ariaLabel || e.alt)).length"
+    assert browser.run(unnamed) == 0
+
+
+def test_sound_plays_and_the_residual_is_at_its_true_level(browser, pages):
+    folder, found = pages
+    browser.open(folder / "missing.html", 1280)
+    browser.wait("[...document.querySelectorAll('audio')].every((a) => a.readyState >= 1)")
+    lengths = browser.run("[...document.querySelectorAll('audio')].map((a) => a.duration)")
+    np.testing.assert_allclose(lengths, 6.0, atol=0.1)  # Opus pads to whole packets
+    volume = "document.querySelector('#residual audio').volume"
+    assert browser.run(volume) == pytest.approx(0.1)
+    browser.click("#louder")
+    assert browser.run(volume) == 1.0
+    browser.run("document.querySelector('#recording audio').play()")
+    browser.wait("parseFloat(document.querySelector('#recording .cursor').style.left) > 0")
+
+
+@pytest.mark.parametrize("dark", [False, True])
+@pytest.mark.parametrize("width", [360, 768, 1280])
+@pytest.mark.parametrize("page", ["missing", "comparison", "explained"])
+def test_nothing_is_clipped_or_overlaps_at_any_width(browser, pages, page, width, dark):
+    folder, _ = pages
+    browser.open(folder / f"{page}.html", width, dark=dark)
+    browser.run("document.querySelector('details').open = true")
+    assert browser.run("document.documentElement.scrollWidth") <= width
+    assert browser.run(CLIPPED) == []
+    assert browser.run(OVERLAPPING) == []
+    assert browser.console == []
+
+
+def test_the_checks_see_what_they_look_for(browser, pages):
+    folder, _ = pages
+    browser.open(folder / "missing.html", 360)
+    browser.run("document.querySelector('h2').style.width = '500px'")
+    assert any("H2" in found for found in browser.run(CLIPPED))
+    browser.run("document.querySelectorAll('#bands .under').forEach((e) => (e.style.left = '50%'))")
+    assert browser.run(OVERLAPPING)
+    browser.run("setTimeout(() => { throw new Error('thrown here'); }, 0)")
+    browser.run("new Promise((done) => setTimeout(done, 50))")
+    assert any("thrown here" in line for line in browser.console)
+    browser.console.clear()
+
+
+def test_no_request_leaves_the_file(browser, pages):
+    folder, _ = pages
+    browser.requests.clear()
+    for page in sorted(folder.glob("*.html")):
+        browser.open(page, 1280)
+    assert len(browser.requests) >= 3
+    assert all(url.startswith(("file:", "data:")) for url in browser.requests), browser.requests
+
+
+def test_only_what_applies_is_shown(browser, pages):
+    folder, _ = pages
+    shown = "(s) => document.querySelector(s).checkVisibility()"
+    for page, expected in (("missing", [True, True, True]), ("explained", [False, True, False]), ("comparison", [False, False, False])):
+        browser.open(folder / f"{page}.html", 1280)
+        assert [browser.run(f"({shown})('{part}')") for part in ("#switches", "#budget", "#found")] == expected, page
+    assert "the office <on> Monday.wav" in browser.run("document.body.innerText")
+
+
+def test_it_prints(browser, pages):
+    folder, _ = pages
+    browser.open(folder / "missing.html", 1280)
+    document = browser.pdf()
+    assert document.startswith(b"%PDF") and 2 <= document.count(b"/Type /Page\n") <= 5
+    assert len(document) > 50_000, "the spectrograms are in it"
+    browser.call("Emulation.setEmulatedMedia", media="print")
+    assert browser.run("[...document.querySelectorAll('audio, #louder')].some((e) => e.checkVisibility())") is False
+    browser.call("Emulation.setEmulatedMedia", media="")
+
+
+def test_the_file_of_half_a_minute_stays_small(pages):
+    folder, _ = pages
+    assert (folder / "missing.html").stat().st_size * 30 / 6 < 8e6
