@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from edgefilter.echo.bandlimit import Bandlimit
+from edgefilter.echo.chassis_resonance import ChassisResonance
 from edgefilter.echo.clock_drift import ClockDrift
 from edgefilter.echo.compression import Compression
 from edgefilter.echo.delay_jump import DelayJump
 from edgefilter.echo.effect import Effect, names, register
+from edgefilter.echo.late_reverb import LateReverb
 from edgefilter.echo.loudspeaker import SpeakerNonlinearity
 from edgefilter.echo.mic_clipping import MicClipping
+from edgefilter.echo.path_change import PathChange
 from edgefilter.echo.playback_gain import PlaybackGain
 
 EFFECTS: tuple[Effect, ...] = (
@@ -17,6 +21,10 @@ EFFECTS: tuple[Effect, ...] = (
     ClockDrift(),
     DelayJump(),
     MicClipping(),
+    Bandlimit(),
+    ChassisResonance(),
+    LateReverb(),
+    PathChange(),
 )
 
 

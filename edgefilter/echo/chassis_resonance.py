@@ -1,0 +1,104 @@
+"""A part of the robot's body rings at one frequency."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, ClassVar
+
+import numpy as np
+import scipy
+from numpy.typing import NDArray
+
+from edgefilter.echo.effect import Measurement, Parameter, Stage, Values
+from edgefilter.echo.wiener import Spectra, spectra
+from edgefilter.types import SAMPLE_RATE, Array, Samples
+
+if TYPE_CHECKING:
+    from edgefilter.echo.model import EchoModel
+
+LOWEST_HZ, HIGHEST_HZ = 60.0, 7000.0
+QUALITIES = (4.0, 8.0, 16.0, 32.0, 64.0, 128.0)
+
+
+class ChassisResonance:
+    """y = x + g Re[e^(i phase) r * x], r(n) = 2 (1 - |z|) z^n, z = exp((2 pi i - pi / q) frequency_hz / rate): one mode excited by the sound.
+
+    gain_db: of the added sound at resonance re the sound itself, 20 log10 g.
+    """
+
+    name: ClassVar[str] = "chassis_resonance"
+    stage: ClassVar[Stage] = "path"
+    memoryless: ClassVar[bool] = False
+    parameters: ClassVar[tuple[Parameter, ...]] = (
+        Parameter("frequency_hz", "Hz", 1000.0, 20.0, 8000.0),
+        Parameter("q", "1", 30.0, 0.5, 2000.0),
+        Parameter("gain_db", "dB", -120.0, -120.0, 60.0),
+        Parameter("phase_deg", "degrees", 0.0, -180.0, 180.0),
+    )
+
+    def apply(self, x: Samples, values: Values, sample_rate: int) -> Samples:
+        """x and the ring."""
+        if float(values["gain_db"]) <= -120.0:
+            return x.copy()
+        gain = 10.0 ** (float(values["gain_db"]) / 20.0) * np.exp(1j * np.deg2rad(float(values["phase_deg"])))
+        return x + (gain * _ring(x, float(values["frequency_hz"]), float(values["q"]), sample_rate)).real.astype(np.float32)
+
+    def fit(self, measurement: Measurement, model: EchoModel) -> Values:
+        """Frequency and Q by a search in the whitened cross-spectrum, gain and phase by least squares in time."""
+        predicted = model.predict(measurement.reference)
+        coarse = spectra(measurement, predicted, 1.0)
+        frequency, q = _search(coarse)
+        frequency, q = _refine(spectra(measurement, predicted, 0.1), frequency, q)
+        ring = _ring(predicted, frequency, q, SAMPLE_RATE)
+        columns = np.stack([measurement.whiten(part.astype(np.float32)) for part in (ring.real, -ring.imag)], axis=1) * measurement.weights[:, None]
+        residual = measurement.whiten(measurement.recording - predicted)
+        gain = complex(*np.linalg.lstsq((columns.T @ columns).astype(float), (columns.T @ residual).astype(float), rcond=1e-12)[0])
+        level = 20.0 * np.log10(max(abs(gain), 1e-6))
+        return {"frequency_hz": frequency, "q": q, "gain_db": float(np.clip(level, -120.0, 60.0)), "phase_deg": float(np.rad2deg(np.angle(gain)))}
+
+
+def _pole(frequency: float | Array, q: float | Array, sample_rate: int) -> complex | NDArray[np.complex128]:
+    return np.exp((2j * np.pi - np.pi / np.asarray(q)) * np.asarray(frequency) / sample_rate)
+
+
+def _ring(x: Samples, frequency: float, q: float, sample_rate: int) -> NDArray[np.complex128]:
+    """(n,) complex, r * x."""
+    pole = complex(_pole(frequency, q, sample_rate))
+    return scipy.signal.lfilter([2.0 * (1.0 - abs(pole))], [1.0, -pole], x.astype(complex))
+
+
+def _shape(hz: Array, frequency: Array, q: float) -> NDArray[np.complex128]:
+    """(modes, m) response of the mode at positive frequencies (its image at negative ones is left out)."""
+    pole = _pole(frequency, q, SAMPLE_RATE)
+    return (1.0 - np.abs(pole))[:, None] / (1.0 - pole[:, None] * np.exp(-2j * np.pi * hz[None, :] / SAMPLE_RATE))
+
+
+def _explained(found: Spectra, hz_slice: slice, frequency: Array, q: float) -> Array:
+    """(modes,) squared error that each mode with its best complex gain takes away."""
+    shape = _shape(found.hz[hz_slice], frequency, q)
+    left = found.cross[hz_slice] - found.predicted[hz_slice]
+    return np.abs(shape.conj() @ left) ** 2 / np.maximum((np.abs(shape) ** 2) @ found.predicted[hz_slice], 1e-12)
+
+
+def _search(found: Spectra) -> tuple[float, float]:
+    best = (0.0, 1000.0, 30.0)
+    for q in QUALITIES:
+        for low in np.geomspace(LOWEST_HZ, HIGHEST_HZ, 33)[:-1]:
+            high = low * (HIGHEST_HZ / LOWEST_HZ) ** (1 / 32)
+            frequency = np.geomspace(low, high, max(int(2 * q * np.log(high / low)), 2))
+            reach = max(6.0 / q, 0.1)
+            inside = slice(*np.searchsorted(found.hz, (low * (1 - reach), high * (1 + reach))))
+            gain = _explained(found, inside, frequency, q)
+            k = int(np.argmax(gain))
+            best = max(best, (float(gain[k]), float(frequency[k]), q))
+    return best[1], best[2]
+
+
+def _refine(found: Spectra, frequency: float, q: float) -> tuple[float, float]:
+    def cost(v: Array) -> float:
+        f, quality = frequency * np.exp(v[0] / q), float(np.clip(q * np.exp(v[1]), 0.5, 2000.0))
+        width = 8.0 * frequency / q + 20.0
+        inside = slice(*np.searchsorted(found.hz, (frequency - width, frequency + width)))
+        return -float(_explained(found, inside, np.array([f]), quality)[0])
+
+    v = scipy.optimize.minimize(cost, [0.0, 0.0], method="Nelder-Mead", options={"maxiter": 60, "initial_simplex": [[0, 0], [0.5, 0], [0, 0.5]]}).x
+    return float(np.clip(frequency * np.exp(v[0] / q), 20.0, 8000.0)), float(np.clip(q * np.exp(v[1]), 0.5, 2000.0))

@@ -1,0 +1,86 @@
+"""The robot stands in a room that reverberates more than the one it was calibrated in."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, ClassVar
+
+import numpy as np
+
+from edgefilter.echo.effect import Measurement, Parameter, Stage, Values
+from edgefilter.echo.wiener import convolve_from, fit_filter
+from edgefilter.types import SAMPLE_RATE, Array, Samples
+
+if TYPE_CHECKING:
+    from edgefilter.echo.model import EchoModel
+
+LEAD = 32
+"""Taps before lag 0: what a room of other colour changes in the direct sound."""
+TAPS = 12800
+"""0.8 s: the decay by 60 dB of an office, by 40 dB of a hall."""
+BLOCK = 320
+
+
+class LateReverb:
+    """y = x + taps * x: a long filter behind the calibrated path. Its decay gives the reverberation time.
+
+    rt60_s: from the backward-integrated energy of the taps (Schroeder 1965, eq. 5), between -5 and at most -25 dB, above the noise.
+    level_db: energy of the taps after 10 ms, re the direct path. taps: (k,) lags -LEAD to k - LEAD.
+    """
+
+    name: ClassVar[str] = "late_reverb"
+    stage: ClassVar[Stage] = "path"
+    memoryless: ClassVar[bool] = False
+    parameters: ClassVar[tuple[Parameter, ...]] = (
+        Parameter("rt60_s", "s", 0.0, 0.0, 10.0),
+        Parameter("level_db", "dB", -120.0, -120.0, 40.0),
+        Parameter("taps", "1", 0.0, -10.0, 10.0),
+    )
+
+    def apply(self, x: Samples, values: Values, sample_rate: int) -> Samples:
+        """x and its reverberation."""
+        taps = np.atleast_1d(np.asarray(values["taps"], float))
+        return x.copy() if not taps.any() else x + convolve_from(x, taps, LEAD)
+
+    def fit(self, measurement: Measurement, model: EchoModel) -> Values:
+        """Least squares twice: with a flat prior, then with one that decays as the first result does."""
+        predicted = model.predict(measurement.reference)
+        x, residual = measurement.whiten(predicted), measurement.whiten(measurement.recording - predicted)
+        length = min(TAPS, measurement.recording.size // 4)
+        taps = fit_filter(x, residual, measurement.weights, length, LEAD, prior=decaying_prior(length, 1.0, 1e-4), steps=15)
+        rt60 = reverberation_time(taps[LEAD:])
+        energy, floor = block_energy(taps[LEAD:])
+        prior = decaying_prior(length, min(1.5 * max(rt60, 0.2), 1.5), 2.0 * float(np.max(energy[1:] - floor, initial=1e-7)) / BLOCK)
+        taps = fit_filter(x, residual, measurement.weights, length, LEAD, prior=prior, steps=30)
+        rt60 = reverberation_time(taps[LEAD:])
+        late = float(np.sum(taps[LEAD + SAMPLE_RATE // 100 :] ** 2))
+        return {"rt60_s": rt60, "level_db": float(np.clip(10 * np.log10(late + 1e-12), -120.0, 40.0)), "taps": np.clip(taps, -10.0, 10.0)}
+
+
+def block_energy(taps: Array) -> tuple[Array, float]:
+    """Energy of the taps in blocks of 20 ms, and that of a block of pure noise (the lower quartile of the last third)."""
+    count = taps.size // BLOCK
+    energy = np.sum(taps[: count * BLOCK].reshape(count, BLOCK) ** 2, axis=1)
+    return energy, float(np.quantile(energy[2 * count // 3 :], 0.25)) if count >= 3 else 0.0
+
+
+def reverberation_time(taps: Array) -> float:
+    """RT60 in s of a response (k,) from lag 0; 0 where it does not decay over at least three blocks."""
+    energy, floor = block_energy(taps)
+    net = np.maximum(energy[1:] - floor, 0.0)
+    below = np.flatnonzero(energy[1:] < 2.0 * floor)
+    net = net[: int(below[0])] if below.size else net
+    if net.size < 3 or net.sum() <= 0.0:
+        return 0.0
+    decay = 10 * np.log10(np.cumsum(net[::-1])[::-1] / net.sum() + 1e-12)
+    t = np.arange(net.size) * BLOCK / SAMPLE_RATE
+    used = (decay <= -2.0) & (decay >= -25.0) if (decay >= -25.0).sum() > 4 else decay >= -30.0
+    used[-1] = False
+    if used.sum() < 2:
+        return 0.0
+    slope = float(np.polyfit(t[used], decay[used], 1)[0])
+    return float(np.clip(-60.0 / slope, 0.0, 10.0)) if slope < 0.0 else 0.0
+
+
+def decaying_prior(length: int, rt60: float, level: float) -> Array:
+    """(length,) expected squares of the taps: level at lag 0, falling with rt60."""
+    return level * 10.0 ** (-6.0 * np.abs(np.arange(length) - LEAD) / (rt60 * SAMPLE_RATE))
