@@ -156,7 +156,7 @@ def find_offset(predicted: Samples, recording: Samples) -> float:
     reach = min(int(MAX_OFFSET * SAMPLE_RATE), recording.size - 1)
     near = np.concatenate((correlation[-reach:], correlation[: reach + 1]))
     peak = int(np.argmax(near))
-    if near[peak] < 6.0 * np.sqrt(np.mean(near**2)):
+    if near[peak] < 12.0 * np.sqrt(np.mean(near**2)):
         raise SignalError("the recording does not contain the reference at any lag up to 3 s: are both of the same utterance?")
     return refine_lag(predicted, recording, float(peak - reach))
 
