@@ -58,6 +58,7 @@ def _add_run(commands: argparse._SubParsersAction) -> None:
     run.add_argument("--reference", metavar="FILE|DEVICE", help="what the robot says; live it defaults to the monitor of the default output")
     run.add_argument("--profile", metavar="P.npz", help="calibrated robot, made by 'edgefilter calibrate'")
     run.add_argument("--engine", default="auto", metavar="ENGINE", help=f"auto, {', '.join(ENGINES)} (default: %(default)s)")
+    run.add_argument("--model", metavar="FILE.onnx", help="network for engine crnn or paper-crnn in place of its own")
     run.add_argument(
         "--budget-ms", type=_positive, metavar="B", help="compute per hop (p99) that auto may use, and that a live run keeps to (live default: 8)"
     )

@@ -31,3 +31,7 @@ class StftError(EdgefilterError):
 
 class SignalError(EdgefilterError):
     """Samples handed to the library have the wrong shape, type or are not finite."""
+
+
+class ModelError(EdgefilterError):
+    """A network's model file is missing, damaged, or not the one that the engine needs."""

@@ -11,7 +11,7 @@ from edgefilter import engines
 from edgefilter.alignment import Aligner
 from edgefilter.canceller import Canceller, CancellerOutput
 from edgefilter.delay_line import Aligned
-from edgefilter.engines.base import Engine
+from edgefilter.engines.base import ClipEngine, Engine
 from edgefilter.engines.ladder import CANDIDATES, Ladder, climbable
 from edgefilter.errors import EdgefilterError, SignalError, UsageError
 from edgefilter.paper_alignment import PaperAligner
@@ -32,7 +32,7 @@ class Front:
     kind "none" passes the microphone, "paper" only delays the reference per utterance, "full" tracks and cancels.
     """
 
-    def __init__(self, engine: Engine, profile: Profile | None) -> None:
+    def __init__(self, engine: Engine | ClipEngine, profile: Profile | None) -> None:
         stft = engine.stft
         self.hop = stft.hop
         self.aligner = self.canceller = self.residual = None
@@ -85,10 +85,11 @@ class Stream:
 
     process returns finished samples, aligned with the input: sample i of all outputs together belongs to sample i of all
     inputs. Sample n is out once n + latency samples have come in. After flush as many samples are out as went in.
+    With an engine that waits for the end (waits_for_end) process returns nothing and flush everything.
     stepping: told the compute time of every hop; what it answers becomes an event.
     """
 
-    def __init__(self, engine: Engine, profile: Profile | None = None, stepping: Stepping | None = None) -> None:
+    def __init__(self, engine: Engine | ClipEngine, profile: Profile | None = None, stepping: Stepping | None = None) -> None:
         self.engine = engine
         self.profile = profile
         self.stepping = stepping
@@ -96,8 +97,13 @@ class Stream:
 
     @property
     def latency(self) -> int:
-        """Algorithmic latency in samples: the window plus the engine's look-ahead."""
-        return self.engine.stft.window_length + self.engine.lookahead * self.engine.stft.hop
+        """Algorithmic latency in samples: the window plus the engine's look-ahead; only the window where waits_for_end."""
+        return self.engine.stft.window_length + (self.engine.lookahead or 0) * self.engine.stft.hop
+
+    @property
+    def waits_for_end(self) -> bool:
+        """Whether the engine needs the whole recording before it answers."""
+        return self.engine.lookahead is None
 
     def reset(self) -> None:
         """Forget everything; the next sample is the first."""
@@ -108,7 +114,8 @@ class Stream:
         self.events: deque[Event] = deque(maxlen=1000)
         self.speech_probability: float | None = None
         self.samples_in = self.samples_out = 0
-        self._state = self.engine.initial_state()
+        self._state = None if self.waits_for_end else self.engine.initial_state()
+        self._clip: list[Frame] = []
         self._synthesiser = Synthesiser(stft)
         self._mic, self._ref = Ring(2 * stft.hop), Ring(2 * stft.hop)
         self._before_start = self.latency - stft.hop
@@ -129,7 +136,12 @@ class Stream:
         missing = 0 if self._flushed else self.samples_in - self.samples_out
         self._flushed = True
         padding = np.zeros(self.latency + self.engine.stft.hop, np.float32)
-        return self._run(padding, padding)[:missing] if missing else np.zeros(0, np.float32)
+        if not missing:
+            return np.zeros(0, np.float32)
+        rest = self._run(padding, padding)
+        if self.waits_for_end:
+            rest = self._finish([self._synthesiser.push(spectrum) for spectrum in self.engine.answer(self._clip)])
+        return rest[:missing]
 
     def _run(self, mic: Samples, ref: Samples) -> Samples:
         hop = self.engine.stft.hop
@@ -139,6 +151,10 @@ class Stream:
             self._ref.write(ref[at : at + hop])
             if len(self._mic) >= hop:
                 done.append(self._watched_step(self._mic.read(hop), self._ref.read(hop)))
+        return self._finish(done)
+
+    def _finish(self, done: list[Samples]) -> Samples:
+        """What of the synthesised hops belongs to samples that came in, and not to the silence before them."""
         out = np.concatenate(done) if done else np.zeros(0, np.float32)
         early = min(self._before_start, out.size)
         self._before_start -= early
@@ -159,9 +175,20 @@ class Stream:
         frame, aligned = self.front.step(mic, ref)
         if aligned and aligned.realigned:
             self.events.append(Event("realigned", self.samples_in, f"reference arrives after {aligned.delay:.1f} samples"))
+        if self.waits_for_end:
+            self._collect(frame)
+            return np.zeros(0, np.float32)
         output, self._state = self.engine.step(frame, self._state)
         self.speech_probability = output.speech_probability
         return self._synthesiser.push(output.spectrum)
+
+    def _collect(self, frame: Frame) -> None:
+        self._clip.append(frame)
+        if len(self._clip) > self.engine.longest:
+            seconds = self.engine.longest * self.engine.stft.hop / SAMPLE_RATE
+            raise SignalError(
+                f"the recording is longer than {seconds:.0f} s, which is all that engine {self.engine.name} takes at once: cut it or take another engine"
+            )
 
 
 class EgoFilter:
@@ -169,6 +196,7 @@ class EgoFilter:
 
     profile: a Profile, the path of one, or None (then the echo path is learnt from nothing).
     engine: a name, or "auto" for the strongest that can be made. reason: why it was chosen, for stats.
+    model: the ONNX file that a neural engine, named in engine, loads in place of its own.
     budget_ms: compute per hop to keep to; where more is needed for long, cheaper engines take over (see Stepping), each time with
     an event. None: the engine stays, and missed deadlines are only counted.
 
@@ -181,23 +209,39 @@ class EgoFilter:
     """
 
     def __init__(
-        self, profile: Profile | str | Path | None = None, engine: str = "auto", budget_ms: float | None = None, reason: str = "asked for"
+        self,
+        profile: Profile | str | Path | None = None,
+        engine: str = "auto",
+        budget_ms: float | None = None,
+        reason: str = "asked for",
+        model: str | Path | None = None,
     ) -> None:
+        if engine == "auto" and model is not None:
+            raise UsageError(f"found the model {model} without an engine for it: name one of {', '.join(engines.HAVE_MODEL)}")
         self.profile = Profile.load(profile) if isinstance(profile, str | Path) else profile
-        best, self.engine_reason = strongest(self.profile) if engine == "auto" else (engines.create(engine, self.profile), reason)
-        ladder = None if budget_ms is None else Ladder(climbable(best, self.profile))
+        best, self.engine_reason = strongest(self.profile) if engine == "auto" else (engines.create(engine, self.profile, model=model), reason)
+        ladder = None if budget_ms is None or best.lookahead is None else Ladder(climbable(best, self.profile))
         self._stream = Stream(ladder or best, self.profile, Stepping(best.stft.hop, ladder, budget_ms))
 
     @property
     def engine_name(self) -> str:
         """The engine at work; while another one takes over, that one."""
+        return self._engine.name
+
+    @property
+    def _engine(self) -> Engine | ClipEngine:
         engine = self._stream.engine
-        return engine.rungs[engine.wanted].name if isinstance(engine, Ladder) else engine.name
+        return engine.rungs[engine.wanted] if isinstance(engine, Ladder) else engine
 
     @property
     def latency(self) -> int:
         """Algorithmic latency, samples."""
         return self._stream.latency
+
+    @property
+    def waits_for_end(self) -> bool:
+        """Whether the engine needs the whole recording: process then returns nothing, flush everything."""
+        return self._stream.waits_for_end
 
     @property
     def hop(self) -> int:
@@ -236,13 +280,14 @@ class EgoFilter:
         self._stream.reset()
 
     def stats(self) -> dict[str, object]:
-        """State of the path, ready for JSON: engine and why, latency, samples, alignment, linear stage."""
+        """State of the path, ready for JSON: engine and why, its model, latency, samples, alignment, linear stage."""
         front = self._stream.front
         return {
             "engine": self.engine_name,
             "engine_reason": self.engine_reason,
             "engines": [engine.name for engine in getattr(self._stream.engine, "rungs", [self._stream.engine])],
-            "latency_ms": 1000 * self.latency / SAMPLE_RATE,
+            "model": self._engine.model.describe() if self.engine_name in engines.HAVE_MODEL else None,
+            "latency_ms": None if self.waits_for_end else 1000 * self.latency / SAMPLE_RATE,
             "samples": self._stream.samples_in,
             "alignment": front.aligner.stats() if front.aligner else None,
             "linear_stage": front.canceller.stats() if front.canceller else None,
@@ -272,7 +317,9 @@ def strongest(profile: Profile | None) -> tuple[Engine, str]:
     raise UsageError(f"no engine can be made{missing}")
 
 
-def enhance(mic: Samples, ref: Samples, profile: Profile | str | Path | None = None, engine: str = "auto") -> Samples:
+def enhance(
+    mic: Samples, ref: Samples, profile: Profile | str | Path | None = None, engine: str = "auto", model: str | Path | None = None
+) -> Samples:
     """Filter a whole recording (n,) with its reference (n,); the same stream as live. Returns (n,) float32."""
-    ego = EgoFilter(profile, engine)
+    ego = EgoFilter(profile, engine, model=model)
     return np.concatenate((ego.process(mic, ref), ego.flush()))

@@ -10,7 +10,7 @@ import numpy as np
 import soundfile
 
 from edgefilter.audio.files import FileSink, FileSource
-from edgefilter.commands.display import write_json
+from edgefilter.commands.display import describe_latency, write_json
 from edgefilter.metrics import si_sdr
 from edgefilter.run import filter_blocks
 from edgefilter.stream import EgoFilter
@@ -35,7 +35,7 @@ def main(args: argparse.Namespace) -> int:
     if args.json != "-":
         print(
             f"a simulated robot talks, a human interrupts; filtered with engine {ego.engine_name} "
-            f"({report.process_s / (report.samples_in / SAMPLE_RATE):.3f} of real time, {figures['latency_ms']:.0f} ms latency)\n"
+            f"({report.process_s / (report.samples_in / SAMPLE_RATE):.3f} of real time, {describe_latency(ego)})\n"
             f"SI-SDR of the human: {figures['si_sdr_before_db']:.1f} dB before, {figures['si_sdr_after_db']:.1f} dB after\n"
             f"files: {', '.join(str(file) for file in files)}"
         )

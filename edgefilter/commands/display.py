@@ -14,9 +14,15 @@ from tqdm import tqdm
 from edgefilter.audio.protocols import Source
 from edgefilter.errors import AudioFileError
 from edgefilter.run import Progress
+from edgefilter.stream import EgoFilter
 from edgefilter.types import SAMPLE_RATE
 
 METER_PERIOD_S = 0.1
+
+
+def describe_latency(ego: EgoFilter) -> str:
+    """The algorithmic latency in words."""
+    return "answers at the end of the recording" if ego.waits_for_end else f"algorithmic latency {1000 * ego.latency / SAMPLE_RATE:.0f} ms"
 
 
 @contextmanager

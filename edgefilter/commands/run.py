@@ -14,7 +14,7 @@ from edgefilter.audio.protocols import Sink, Source
 from edgefilter.audio.raw import PcmSink
 from edgefilter.budget import DEFAULT_MS, Choice, choose
 from edgefilter.budget_cache import forget
-from edgefilter.commands.display import display, write_json
+from edgefilter.commands.display import describe_latency, display, write_json
 from edgefilter.errors import UsageError
 from edgefilter.profile import Profile
 from edgefilter.run import RunReport, filter_blocks
@@ -28,13 +28,15 @@ def main(args: argparse.Namespace) -> int:
     _refuse_overwriting(args)
     source = make_source(args.input, args.reference, args.output)
     ego, choice = make_filter(args, source.live)
+    if ego.waits_for_end and source.live:
+        raise UsageError(f"engine {ego.engine_name} needs the whole recording before it answers: give --input FILE or take another engine")
     if args.save_profile and not ego.can_adapt:
         raise UsageError("--save-profile writes back an adapted path: give --profile and an engine with a linear stage (linear or ss)")
     sink = make_sink(args.output, ego.latency, wait=not source.live)
     limit = None if args.seconds is None else round(args.seconds * SAMPLE_RATE)
     for note in source.notes:
         say(note)
-    say(f"engine {ego.engine_name} ({ego.engine_reason}), algorithmic latency {1000 * ego.latency / SAMPLE_RATE:.0f} ms")
+    say(f"engine {ego.engine_name} ({ego.engine_reason}), {describe_latency(ego)}")
     told = len(source.notes)
     with ExitStack() as stack:
         stopped = stack.enter_context(stop_on_signal(source))
@@ -57,10 +59,10 @@ def make_filter(args: argparse.Namespace, live: bool) -> tuple[EgoFilter, Choice
         forget()
     choice, engine, reason, budget_ms = None, args.engine, "asked for", args.budget_ms
     profile = Profile.load(args.profile) if args.profile else None
-    if engine == "auto" and (live or budget_ms):
+    if engine == "auto" and not args.model and (live or budget_ms):
         choice = choose(budget_ms or DEFAULT_MS, profile, say=say)
         engine, reason, budget_ms = choice.engine, choice.reason, choice.budget_ms
-    return EgoFilter(profile, engine, budget_ms if live else None, reason), choice
+    return EgoFilter(profile, engine, budget_ms if live else None, reason, args.model), choice
 
 
 def finish(

@@ -2,28 +2,44 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import TYPE_CHECKING
 
-from edgefilter.engines.base import Engine
+from edgefilter.engines.base import ClipEngine, Engine
 from edgefilter.errors import UsageError
 from edgefilter.stft import StftConfig
 
 if TYPE_CHECKING:
     from edgefilter.profile import Profile
 
-ENGINES = ("ss", "linear", "bypass", "paper-ss", "paper-ss-causal")
+ENGINES = ("crnn", "ss", "linear", "bypass", "paper-ss", "paper-ss-causal", "paper-crnn")
 NEEDS_PROFILE = ("paper-ss", "paper-ss-causal")
+HAVE_MODEL = ("crnn", "paper-crnn")
 
 
-def create(name: str, profile: Profile | None = None, stft: StftConfig = StftConfig()) -> Engine:
-    """Make an engine by name; raises UsageError for an unknown name or one that cannot work without a profile.
+def create(
+    name: str, profile: Profile | None = None, stft: StftConfig = StftConfig(), model: str | Path | None = None
+) -> Engine | ClipEngine:
+    """Make an engine by name.
 
-    stft: for the engines that work with any; the others have their own.
+    stft: for the engines that work with any; the others have their own. model: the file that a neural engine loads in place of its own.
+    Raises UsageError for an unknown name, one that cannot work without a profile or has no use for a model, and ModelError for a
+    model file that does not fit.
     """
     if name not in ENGINES:
         raise UsageError(f"unknown engine '{name}': choose one of auto, {', '.join(ENGINES)}")
     if name in NEEDS_PROFILE and profile is None:
         raise UsageError(f"engine {name} needs the robot's calibrated response: give --profile P.npz (made by 'edgefilter calibrate')")
+    if model is not None and name not in HAVE_MODEL:
+        raise UsageError(f"engine {name} has no network, found the model {model}: leave it out or take one of {', '.join(HAVE_MODEL)}")
+    if name == "crnn":
+        from edgefilter.engines.crnn import Crnn
+
+        return Crnn(model)
+    if name == "paper-crnn":
+        from edgefilter.engines.paper_crnn import PaperCrnn
+
+        return PaperCrnn(model)
     if name == "bypass":
         from edgefilter.engines.bypass import Bypass
 

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, ClassVar, Literal, Protocol, TypeAlias
 
 from edgefilter.stft import StftConfig
-from edgefilter.types import Frame, Output
+from edgefilter.types import Frame, Output, Spectrum
 
 EngineState: TypeAlias = Any
 """Whatever an engine needs between frames; it is made by initial_state and never shared between streams."""
@@ -32,4 +33,19 @@ class Engine(Protocol):
 
     def step(self, frame: Frame, state: EngineState) -> tuple[Output, EngineState]:
         """Answer one frame; neither frame nor state is written to, the returned state replaces the old one."""
+        ...
+
+
+class ClipEngine(Protocol):
+    """Needs the whole recording before it can answer any of it; the stream then gives everything at flush."""
+
+    name: ClassVar[str]
+    front: ClassVar[Front]
+    stft: StftConfig
+    lookahead: None
+    longest: int
+    """Frames that it takes at most; the stream refuses a longer recording."""
+
+    def answer(self, frames: Sequence[Frame]) -> Sequence[Spectrum]:
+        """The human's spectrum (bins,) for each frame of the recording, of which there is at least one."""
         ...

@@ -12,7 +12,7 @@ PACKAGE = Path(__file__).parents[2] / "edgefilter"
 FILES = sorted(PACKAGE.rglob("*.py"))
 LEAVES = {
     "sounddevice": {"audio/device.py"},
-    "onnxruntime": {"engines/crnn.py"},
+    "onnxruntime": {"engines/onnx_session.py"},
     "matplotlib": {"report/plots.py"},
     "torch": set(),
     "export": set(),

@@ -1,0 +1,51 @@
+"""'crnn': a recurrent network masks the linear stage's error and says whether a human speaks."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import ClassVar, TypeAlias
+
+import numpy as np
+
+from edgefilter.engines.base import Front
+from edgefilter.engines.onnx_session import expect_slots, find_model, open_model
+from edgefilter.types import Frame, Output, Samples
+
+EDGE_TYPE, EDGE_VERSION = "edgefilter-crnn", 1
+SPECTRA = ("error", "mic", "reference", "echo")
+"""The graph's first inputs, each (1, bins, 2) float32, real and imaginary part."""
+VARIABLE = "EDGEFILTER_CRNN"
+
+CrnnState: TypeAlias = tuple[Samples, ...]
+"""The network's state tensors; all zeros at the start."""
+
+
+class Crnn:
+    """Runs an exported EdgeCrnn (export/network.py), one frame at a time.
+
+    model: an ONNX file made by export/onnx_export.py; without one the file that the environment variable EDGEFILTER_CRNN names, else
+    the package's own. The file says which STFT it was trained for. Raises ModelError for a file that is not such a model.
+    """
+
+    name: ClassVar[str] = "crnn"
+    front: ClassVar[Front] = "full"
+
+    def __init__(self, model: str | Path | None = None) -> None:
+        path = find_model(model, VARIABLE, "crnn.onnx", "make one with 'python -m export.onnx_export'")
+        self.model = open_model(path, EDGE_TYPE, EDGE_VERSION)
+        self.stft = self.model.stft
+        self.lookahead = 0
+        states = dict(self.model.states)
+        spectrum = (1, self.stft.bins, 2)
+        outputs = {"spectrum": spectrum, "speech_probability": (1,), **{f"next_{name}": shape for name, shape in states.items()}}
+        expect_slots(self.model, {**dict.fromkeys(SPECTRA, spectrum), **states}, outputs)
+        self._outputs = list(outputs)
+
+    def initial_state(self) -> CrnnState:
+        return tuple(np.zeros(shape, np.float32) for _, shape in self.model.states)
+
+    def step(self, frame: Frame, state: CrnnState) -> tuple[Output, CrnnState]:
+        inputs = {name: np.ascontiguousarray(getattr(frame, name)).view(np.float32).reshape(1, -1, 2) for name in SPECTRA}
+        inputs.update(zip((name for name, _ in self.model.states), state))
+        spectrum, probability, *following = self.model.session.run(self._outputs, inputs)
+        return Output(spectrum.reshape(-1).view(np.complex64), float(probability[0])), tuple(following)

@@ -1,0 +1,106 @@
+"""Opens the model files of the neural engines: the only place that imports onnxruntime."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import onnxruntime
+
+from edgefilter.errors import ModelError, StftError
+from edgefilter.stft import StftConfig
+from edgefilter.types import SAMPLE_RATE
+
+FOLDERS = (Path(__file__).parents[1] / "models", Path(__file__).parents[2] / "models")
+"""Where models lie: inside the installed package, or at the top of a checkout."""
+
+
+@dataclass(frozen=True, eq=False)
+class Model:
+    """A model file that was found to fit. training and figures are what it says about itself."""
+
+    path: Path
+    session: onnxruntime.InferenceSession
+    stft: StftConfig
+    training: Mapping[str, object]
+    figures: Mapping[str, object]
+    states: tuple[tuple[str, tuple[int, ...]], ...]
+
+    def describe(self) -> dict[str, object]:
+        """Ready for JSON."""
+        return {"file": str(self.path), "training": dict(self.training), "figures": dict(self.figures)}
+
+
+def find_model(given: str | Path | None, variable: str, name: str, remedy: str) -> Path:
+    """The model file to use: the given one, else the environment variable's, else the package's own; raises ModelError."""
+    chosen = given or os.environ.get(variable)
+    if chosen:
+        path = Path(chosen)
+        if not path.is_file():
+            origin = "" if given else f", which {variable} names,"
+            raise ModelError(f"model {path}{origin} is no file: {remedy}")
+        return path
+    for folder in FOLDERS:
+        if (folder / name).is_file():
+            return folder / name
+    raise ModelError(f"there is no {name} in {FOLDERS[0]}: {remedy}, or name one with --model or {variable}")
+
+
+def open_session(path: Path) -> onnxruntime.InferenceSession:
+    """A session on one core: frames are too small to share, and a second thread that spins costs a whole core.
+
+    Denormal numbers count as zero in the thread that makes the session. Raises ModelError where the file is no ONNX model.
+    """
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = options.inter_op_num_threads = 1
+    options.execution_mode = onnxruntime.ExecutionMode.ORT_SEQUENTIAL
+    options.graph_optimization_level = onnxruntime.GraphOptimizationLevel.ORT_ENABLE_ALL
+    options.log_severity_level = 4
+    options.add_session_config_entry("session.intra_op.allow_spinning", "0")
+    options.add_session_config_entry("session.inter_op.allow_spinning", "0")
+    options.add_session_config_entry("session.set_denormal_as_zero", "1")
+    try:
+        return onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
+    except Exception as error:  # onnxruntime's exceptions share no base of their own
+        raise ModelError(f"model {path} cannot be loaded ({' '.join(str(error).split())[:160]}): export it again") from None
+
+
+def open_model(path: Path, kind: str, version: int) -> Model:
+    """Open a model and refuse it where its metadata is not that of a `kind` of this version at the package's sampling rate."""
+    session = open_session(path)
+    said = session.get_modelmeta().custom_metadata_map
+    _expect(path, "type", said.get("type"), kind)
+    _expect(path, "version", said.get("version"), str(version))
+    _expect(path, "sample_rate", said.get("sample_rate"), str(SAMPLE_RATE))
+    try:
+        stft = StftConfig(int(said["n_fft"]), int(said["hop"]), int(said["window_length"]), said["window"])
+        states = tuple((str(name), tuple(int(size) for size in shape)) for name, shape in json.loads(said.get("states", "[]")))
+        training, figures = json.loads(said["training"]), json.loads(said["figures"])
+    except KeyError as error:
+        raise ModelError(f"model {path} does not say its {error.args[0]}: export it again") from None
+    except (ValueError, TypeError, StftError) as error:
+        raise ModelError(f"model {path} has unusable metadata ({error}): export it again") from None
+    return Model(path, session, stft, training, figures, states)
+
+
+def expect_slots(model: Model, inputs: Mapping[str, tuple], outputs: Mapping[str, tuple]) -> None:
+    """Refuse a model whose inputs or outputs have other names, or shapes that cannot be these; "any" stands for a free size."""
+    for word, slots, wanted in (("inputs", model.session.get_inputs(), inputs), ("outputs", model.session.get_outputs(), outputs)):
+        found = {slot.name: slot.shape for slot in slots}
+        fits = found.keys() == wanted.keys() and all(_may_be(shape, wanted[name]) for name, shape in found.items())
+        if not fits:
+            said, expected = (", ".join(f"{name} {list(shape)}" for name, shape in sorted(each.items())) for each in (found, wanted))
+            raise ModelError(f"model {model.path} has {word} {said}, its metadata wants {expected}: export it again")
+
+
+def _may_be(found: Sequence[int | str | None], wanted: Sequence[int | str]) -> bool:
+    """Whether a graph's shape, in which what is not a number is free, can be the wanted one."""
+    return len(found) == len(wanted) and all(not isinstance(size, int) or size == want for size, want in zip(found, wanted))
+
+
+def _expect(path: Path, key: str, found: str | None, wanted: str) -> None:
+    if found != wanted:
+        raise ModelError(f"model {path} has {key} {found or 'unknown'}, expected {wanted}: take the model that belongs to this engine and version")
