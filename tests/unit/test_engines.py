@@ -38,7 +38,7 @@ def robot() -> Profile:
 @pytest.mark.parametrize("name, check", CASES, ids=lambda value: getattr(value, "__name__", value))
 def test_engine_conforms(name, check):
     profile = robot()
-    check(lambda: Stream(engines.create(name, profile, MODELS.get(name)), profile))
+    check(lambda: Stream(engines.create(name, profile, model=MODELS.get(name)), profile))
 
 
 def test_conformance_has_its_checks():

@@ -180,3 +180,15 @@ def test_the_command_line_takes_a_model_and_reports_it(tmp_path):
     assert done.returncode == 0 and "answers at the end of the recording" in done.stderr, done.stderr
     refused = run("crnn", PAPER)
     assert refused.returncode == 1 and refused.stderr.count("\n") == 1 and "expected edgefilter-crnn" in refused.stderr
+
+
+def test_a_model_needs_its_engine_named():
+    with pytest.raises(UsageError, match="without an engine for it: name one of crnn, paper-crnn"):
+        EgoFilter(model=EDGE)
+
+
+def test_a_budget_does_not_replace_an_engine_that_waits_for_the_end():
+    mic, ref = conformance.conversation(8000)
+    ego = EgoFilter(engine="paper-crnn", model=PAPER, budget_ms=0.001)
+    assert ego.waits_for_end and ego.process(mic, ref).size == 0 and ego.flush().shape == mic.shape
+    assert ego.stats()["latency_ms"] is None
