@@ -1,0 +1,166 @@
+"""Train the edge network on simulated conversations.
+
+    python -m export.train --data DIR --validation DIR --output RUN [--steps 12000] [--seed 1] [--channels 16 32 48 48] [--smoke]
+
+RUN/last.pt is written every --every steps (a second call goes on from there), RUN/best.pt holds the averaged weights with the best
+validation SI-SDR minus a penalty for suppressed speech; TensorBoard reads RUN, and RUN/log.jsonl has the same figures.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import time
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.utils.tensorboard import SummaryWriter
+from tqdm import tqdm
+
+from edgefilter.types import SAMPLE_RATE
+from export.crops import SIGNALS, Batches, Items
+from export.losses import LossWeights, edge_loss, si_sdr
+from export.network import EdgeConfig, EdgeCrnn, count
+
+AVERAGE = 0.998
+"""Weight of the past in the averaged weights, per step."""
+PATIENCE = 12
+"""Validations without a better score before training stops."""
+
+
+def loss_of(network: EdgeCrnn, batch: dict[str, Tensor], weights: LossWeights, half: bool) -> tuple[dict[str, Tensor], Tensor]:
+    """The terms of the loss, and the scaled estimate (batch, frames, bins, 2)."""
+    inputs = [batch[name] for name in SIGNALS[:4]]
+    with torch.autocast("cpu", torch.bfloat16, enabled=half):
+        human, logit, _ = network(*inputs, network.initial_state(inputs[0].shape[0]))
+    scale = batch["scale"][:, None, None, None]
+    return edge_loss(scale * human.float(), logit.float(), scale * batch["clean"], batch["active"], weights), scale * human.float()
+
+
+@torch.no_grad()
+def validate(network: EdgeCrnn, items: Items, weights: LossWeights, seconds: float = 8.0) -> dict[str, float]:
+    """Mean loss terms over the last `seconds` of every item, SI-SDR of the estimate and of the error it started from."""
+    network.eval()
+    batches = Batches(items, network.config.stft, 1, seconds, seed=0, augment=False)
+    sums: dict[str, float] = {}
+    for at in range(0, len(items.names), 8):
+        names = items.names[at : at + 8]
+        batch = batches.spectra([items.crop(name, items.length(name) - batches.samples, batches.samples) for name in names])
+        terms, human = loss_of(network, batch, weights, half=False)
+        scale = batch["scale"][:, None, None, None]
+        terms["si_sdr_db"] = si_sdr(human, scale * batch["clean"])
+        terms["si_sdr_error_db"] = si_sdr(scale * batch["error"], scale * batch["clean"])
+        right = (human.square().sum((2, 3)) > 0.05 * (scale * batch["clean"]).square().sum((2, 3)))[batch["active"] > 0]
+        terms["kept"] = right.float().mean() if right.numel() else torch.tensor(1.0)
+        for name, value in terms.items():
+            sums[name] = sums.get(name, 0.0) + float(value) * len(names) / len(items.names)
+    network.train()
+    return sums
+
+
+def train(options: argparse.Namespace) -> Path:
+    """Run until --steps or until validation stops getting better; returns the best checkpoint."""
+    torch.manual_seed(options.seed)
+    torch.set_num_threads(options.threads)
+    options.output.mkdir(parents=True, exist_ok=True)
+    config = EdgeConfig(2 * options.hop, options.hop, channels=tuple(options.channels), hidden=options.hidden, norm=options.norm)
+    network, weights = EdgeCrnn(config), LossWeights(suppression=options.suppression, si_sdr=options.si_sdr)
+    average = {name: value.clone() for name, value in network.state_dict().items()}
+    optimiser = torch.optim.AdamW(network.parameters(), lr=options.rate, weight_decay=1e-2, betas=(0.9, 0.98))
+    items, held_out = Items(options.data), Items(options.validation)
+    step, best, since = 0, -math.inf, 0
+    last = options.output / "last.pt"
+    if last.exists():
+        saved = torch.load(last, weights_only=False)
+        network.load_state_dict(saved["network"])
+        optimiser.load_state_dict(saved["optimiser"])
+        average, step, best, since = saved["average"], saved["step"], saved["best"], saved["since"]
+    batches = Batches(items, config.stft, options.batch, options.seconds, options.seed + step)
+    print(f"{config} {count(network)} on {len(items.names)} items, from step {step}")
+    began = time.time()
+    with SummaryWriter(options.output) as board, (options.output / "log.jsonl").open("a", encoding="utf-8") as log:
+        for step in (progress := tqdm(range(step, options.steps), initial=step, total=options.steps, unit="step")):
+            for group in optimiser.param_groups:
+                group["lr"] = options.rate * min(1.0, (step + 1) / 300) * (0.5 + 0.5 * math.cos(math.pi * step / options.steps)) + 1e-6
+            terms, _ = loss_of(network, batches.draw(), weights, half=not options.full_precision)
+            optimiser.zero_grad(set_to_none=True)
+            terms["total"].backward()
+            norm = torch.nn.utils.clip_grad_norm_(network.parameters(), 1.0)
+            if torch.isfinite(norm):
+                optimiser.step()
+            keep = min(AVERAGE, (step + 1) / (step + 10))
+            for name, value in network.state_dict().items():
+                if value.dtype.is_floating_point:
+                    average[name].mul_(keep).add_(value, alpha=1 - keep)
+                else:
+                    average[name].copy_(value)
+            progress.set_postfix(loss=f"{float(terms['total']):.4f}", si_sdr=f"{-float(terms['si_sdr']):.1f}")
+            board.add_scalar("train/total", float(terms["total"]), step)
+            if (step + 1) % options.every and step + 1 < options.steps:
+                continue
+            averaged = EdgeCrnn(config)
+            averaged.load_state_dict(average)
+            figures = validate(averaged, held_out, weights)
+            score = -figures["total"]
+            since = 0 if score > best else since + 1
+            state = {"config": network.describe(), "network": average, "step": step + 1, "figures": figures, "seed": options.seed, "items": len(items.names)}
+            if score > best:
+                best = score
+                torch.save(state, options.output / "best.pt")
+            torch.save({"network": network.state_dict(), "optimiser": optimiser.state_dict(), "average": average, "step": step + 1, "best": best, "since": since}, last)
+            for name, value in figures.items():
+                board.add_scalar(f"validation/{name}", value, step + 1)
+            log.write(json.dumps({"step": step + 1, "seconds": round(time.time() - began), "items": len(items.names), **{k: round(v, 5) for k, v in figures.items()}}) + "\n")
+            log.flush()
+            tqdm.write(f"step {step + 1}: " + ", ".join(f"{name} {value:.4g}" for name, value in figures.items()))
+            items.refresh()
+            if since >= PATIENCE:
+                print(f"stopped: {PATIENCE} validations without a better score")
+                break
+    return options.output / "best.pt"
+
+
+def smoke(options: argparse.Namespace) -> None:
+    """A few items of coloured noise instead of speech in --data, so that the whole of train() runs within seconds."""
+    rng = np.random.default_rng(0)
+    for folder in (options.data, options.validation):
+        folder.mkdir(parents=True, exist_ok=True)
+        for index in range(2):
+            human, robot = (rng.standard_normal(3 * SAMPLE_RATE).cumsum() % 7 - 3 for _ in range(2))
+            signals = {"mic": human + 9 * robot, "error": human + robot, "reference": 9 * robot, "clean": human}
+            packed = {name: np.round(1000 * samples).astype(np.int16) for name, samples in signals.items()}
+            np.savez(folder / f"{index:05d}.npz", scale=np.float32(0.9), reference_scale=np.float32(0.9), **packed)
+    options.steps, options.every, options.batch, options.seconds = 4, 2, 2, 1.0
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--data", type=Path, required=True, metavar="DIR")
+    parser.add_argument("--validation", type=Path, required=True, metavar="DIR")
+    parser.add_argument("--output", type=Path, required=True, metavar="DIR")
+    parser.add_argument("--steps", type=int, default=12000)
+    parser.add_argument("--every", type=int, default=500, help="steps between validations")
+    parser.add_argument("--batch", type=int, default=8)
+    parser.add_argument("--seconds", type=float, default=4.0, help="of a crop")
+    parser.add_argument("--rate", type=float, default=1.5e-3, help="learning rate at the start")
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--hop", type=int, default=256)
+    parser.add_argument("--channels", type=int, nargs=4, default=EdgeConfig.channels)
+    parser.add_argument("--hidden", type=int, default=EdgeConfig.hidden)
+    parser.add_argument("--norm", choices=("layer", "batch", "none"), default="layer")
+    parser.add_argument("--suppression", type=float, default=LossWeights.suppression)
+    parser.add_argument("--si-sdr", type=float, default=LossWeights.si_sdr)
+    parser.add_argument("--threads", type=int, default=1)
+    parser.add_argument("--full-precision", action="store_true", help="float32 instead of bfloat16 in the forward pass")
+    parser.add_argument("--smoke", action="store_true", help="make a few seconds of data in --data and --validation and take four steps")
+    options = parser.parse_args()
+    if options.smoke:
+        smoke(options)
+    train(options)
+
+
+if __name__ == "__main__":
+    main()
