@@ -88,6 +88,7 @@ def train(options: argparse.Namespace) -> Path:
             terms, _ = loss_of(network, batches.draw(), weights, half=not options.full_precision)
             optimiser.zero_grad(set_to_none=True)
             terms["total"].backward()
+            shown = {name: float(value.detach()) for name, value in terms.items()}
             norm = torch.nn.utils.clip_grad_norm_(network.parameters(), 1.0)
             if torch.isfinite(norm):
                 optimiser.step()
@@ -97,8 +98,8 @@ def train(options: argparse.Namespace) -> Path:
                     average[name].mul_(keep).add_(value, alpha=1 - keep)
                 else:
                     average[name].copy_(value)
-            progress.set_postfix(loss=f"{float(terms['total']):.4f}", si_sdr=f"{-float(terms['si_sdr']):.1f}")
-            board.add_scalar("train/total", float(terms["total"]), step)
+            progress.set_postfix(loss=f"{shown['total']:.4f}", si_sdr=f"{-shown['si_sdr']:.1f}")
+            board.add_scalar("train/total", shown["total"], step)
             if (step + 1) % options.every and step + 1 < options.steps:
                 continue
             averaged = EdgeCrnn(config)

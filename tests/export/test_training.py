@@ -1,0 +1,137 @@
+"""Dataset, network, losses and the training loop on seconds of sound."""
+
+import json
+
+import numpy as np
+import pytest
+import torch
+from speech import write_librispeech, write_table
+
+from edgefilter.metrics import si_sdr as si_sdr_of_samples
+from edgefilter.stft import StftConfig
+from export import dataset, train
+from export.crops import Batches, Items
+from export.losses import LossWeights, edge_loss, power_law_loss, si_sdr
+from export.network import EdgeConfig, EdgeCrnn, apply_mask, count
+
+SMALL = EdgeConfig(64, 32, channels=(4, 4, 4, 4), hidden=8)
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("data")
+    humans, robots = write_librispeech(folder / "humans", ("1", "2")), write_table(folder / "robots", ("a",))
+    arguments = ["--humans", str(humans), "--robots", str(robots), "--count", "2", "--seed", "4", "--jobs", "1", "--recipe", "paper"]
+    patch = pytest.MonkeyPatch()
+    patch.setattr(dataset, "ROOMS", {"lab": 1, "office": 1})
+    patch.setattr("sys.argv", ["dataset", *arguments, "--output", str(folder / "items")])
+    dataset.main()
+    before = (folder / "items" / "00001.npz").stat().st_mtime_ns
+    dataset.main()
+    patch.undo()
+    assert (folder / "items" / "00001.npz").stat().st_mtime_ns == before  # a second run leaves what is there
+    return folder / "items"
+
+
+def test_the_dataset_holds_what_the_linear_stage_left(data):
+    items = Items(data)
+    assert items.names == ["00000.npz", "00001.npz"]
+    for name in items.names:
+        crop = items.crop(name, 3 * 16000, 16000)
+        robot, left = crop["mic"] - crop["clean"], crop["error"] - crop["clean"]
+        assert np.mean(left**2) < 0.2 * np.mean(robot**2)
+    assert json.loads((data / "dataset.json").read_text())["seed"] == 4
+
+
+def test_batches_are_consistent_after_augmentation(data):
+    batch = Batches(Items(data), StftConfig(), 4, 1.0, seed=1).draw()
+    assert batch["error"].shape == batch["clean"].shape == (4, 61, 257, 2)
+    assert torch.allclose(batch["mic"] - batch["error"], batch["echo"], atol=1e-4)
+
+
+def spectra(frames=9, seed=0):
+    generator = torch.Generator().manual_seed(seed)
+    return [0.1 * torch.randn(1, frames, 33, 2, generator=generator) for _ in range(4)]
+
+
+@pytest.mark.parametrize("norm", ["layer", "batch", "none"])
+def test_frame_by_frame_is_the_whole_clip(norm):
+    torch.manual_seed(1)
+    network = EdgeCrnn(EdgeConfig(64, 32, channels=(4, 4, 4, 4), hidden=8, norm=norm)).eval()
+    inputs = spectra()
+    with torch.no_grad():
+        whole, logits, _ = network(*inputs, network.initial_state())
+        state = network.initial_state()
+        for t in range(9):
+            human, probability, state = network.step(*(x[:, t] for x in inputs), state)
+            assert torch.allclose(human, whole[:, t], atol=1e-5)
+            assert torch.allclose(probability, torch.sigmoid(logits[:, t]), atol=1e-5)
+
+
+def test_the_future_does_not_change_the_past():
+    network = EdgeCrnn(SMALL).eval()
+    inputs = spectra()
+    with torch.no_grad():
+        before, *_ = network(*inputs, network.initial_state())
+        for x in inputs:
+            x[:, 6:] += 1.0
+        after, *_ = network(*inputs, network.initial_state())
+    assert torch.equal(before[:, :6], after[:, :6])
+    assert not torch.allclose(before[:, 6:], after[:, 6:])
+
+
+def test_the_mask_never_amplifies():
+    error = spectra()[0]
+    human = apply_mask(100 * torch.randn(1, 9, 2, 32), error)
+    assert (human.norm(dim=-1) <= error.norm(dim=-1) + 1e-6).all()
+    assert (human[:, :, 0] == 0).all()
+
+
+def test_counts_of_the_default_network():
+    figures = count(EdgeCrnn())
+    assert figures["parameters"] == sum(p.numel() for p in EdgeCrnn().parameters())
+    assert 2e6 < figures["macs_per_frame"] < 6e6
+
+
+def test_the_loss_is_least_at_the_human_and_minds_suppression_more():
+    clean = spectra(40, seed=3)[0] * 10
+    silent, active = torch.zeros(1, 40), torch.ones(1, 40)
+
+    def total(human):
+        return float(edge_loss(human, silent, clean, active, LossWeights(si_sdr=0.0))["total"])
+
+    assert total(clean) < total(0.7 * clean)
+    quieter, louder = total(0.5**2 * clean), total(clean * (2 - 0.25**0.3) ** (1 / 0.3))  # equal steps of the compressed magnitude
+    assert quieter > 1.2 * louder
+
+
+def test_si_sdr_of_spectra_is_that_of_samples():
+    stft, rng = StftConfig(), np.random.default_rng(1)
+    clean, noise = rng.standard_normal((2, 20 * 256)).astype(np.float32)
+    pad = np.zeros(256, np.float32)
+
+    def spectrum(x):
+        frames = torch.from_numpy(np.concatenate((pad, x, pad))).unfold(0, 512, 256) * torch.from_numpy(stft.analysis_window)
+        return torch.view_as_real(torch.fft.rfft(frames))[None]
+
+    found = float(si_sdr(spectrum(clean + 0.3 * noise), spectrum(clean)))
+    assert found == pytest.approx(si_sdr_of_samples(clean + 0.3 * noise, clean), abs=0.1)
+
+
+def test_the_papers_loss_vanishes_at_the_right_mask():
+    mixture = torch.rand(2, 5, 601) + 0.5
+    assert float(power_law_loss(torch.full_like(mixture, 0.5), mixture, 0.5 * mixture)) == pytest.approx(0.0, abs=1e-10)
+    assert float(power_law_loss(torch.ones_like(mixture), mixture, 0.5 * mixture)) > 0.01
+
+
+def test_training_runs_stops_and_goes_on(tmp_path, monkeypatch, capsys):
+    small = ["--hop", "32", "--channels", "4", "4", "4", "4", "--hidden", "8"]
+    arguments = ["--data", str(tmp_path / "d"), "--validation", str(tmp_path / "v"), "--output", str(tmp_path / "run"), *small, "--smoke"]
+    monkeypatch.setattr("sys.argv", ["train", *arguments])
+    train.main()
+    steps = [json.loads(line)["step"] for line in (tmp_path / "run" / "log.jsonl").read_text().splitlines()]
+    assert steps == [2, 4]
+    assert torch.load(tmp_path / "run" / "best.pt", weights_only=False)["config"]["n_fft"] == 64
+    train.main()
+    assert "from step 4" in capsys.readouterr().out
+    assert list((tmp_path / "run").glob("events.*"))
