@@ -18,7 +18,7 @@ from edgefilter.errors import EdgefilterError
 from edgefilter.profile import Profile
 from edgefilter.report.media import MAX_SOUND_S, RANGE_DB, colours, sound, spectrogram_db, spectrogram_png
 from edgefilter.report.variants import MAX_FREE, Choice, compare_variants
-from edgefilter.report.words import headline, interval_text, title
+from edgefilter.report.words import decibels, headline, interval_text, title
 from edgefilter.types import SAMPLE_RATE, Samples
 
 LOUDER = 10.0
@@ -27,7 +27,7 @@ LOUDER = 10.0
 
 def comparison_page(found: Comparison, names: Mapping[str, object]) -> str:
     """The page of a comparison. names: profile, recording, reference, what the files are called."""
-    excess = f"The profile leaves {found.excess_db:.1f} dB over the noise floor unexplained."
+    excess = f"The profile leaves {decibels(found.excess_db)} dB over the noise floor unexplained."
     text = {"kind": "comparison", "headline": excess, "findings": "", "left": "", "irreducible": ""}
     return _page({(): found}, (), text, names)
 
@@ -40,7 +40,7 @@ def diagnosis_page(profile: Profile, found: Diagnosis, recording: Samples, refer
         "headline": headline(found.verdict, [finding.effect for finding in found.ranking]),
         "findings": "".join(_finding(rank, finding, names) for rank, finding in enumerate(found.ranking, start=1)),
         "left": _section("What is left", f"<p>{html.escape(found.evidence)}</p>") if found.evidence else "",
-        "irreducible": f"{found.irreducible_db:.1f} dB",
+        "irreducible": f"{decibels(found.irreducible_db)} dB",
     }
     return _page(variants, found.ranking, text, names, found.irreducible_db)
 
@@ -138,9 +138,9 @@ def _rounded(rows: Iterable[tuple[float, float, float]]) -> list[list[float]]:
 
 def _facts(before: Comparison, after: Comparison, found: bool, irreducible: str) -> str:
     """The figures at the top, as terms and values."""
-    facts = [("Unexplained", f"{before.excess_db:.1f} dB", "over the noise floor, with the profile as it is")]
+    facts = [("Unexplained", f"{decibels(before.excess_db)} dB", "over the noise floor, with the profile as it is")]
     if found:
-        facts.append(("With what was found", f"{after.excess_db:.1f} dB", "over the noise floor"))
+        facts.append(("With what was found", f"{decibels(after.excess_db)} dB", "over the noise floor"))
     facts.append(("Noise floor", f"{before.noise_floor_db:.1f} dBFS", "the fan, from the calibration"))
     if irreducible:
         facts.append(("Irreducible", irreducible, "that no model can predict"))
@@ -155,7 +155,7 @@ def _finding(rank: int, finding: Finding, names: Mapping[str, object]) -> str:
     rows = "".join(f"<tr><th>{html.escape(name)}</th><td>{html.escape(interval_text(x))}</td></tr>" for name, x in finding.parameters.items())
     return (
         f"<li><h3>{html.escape(title(finding.effect))} <code>{html.escape(finding.effect)}</code></h3>"
-        f'<p class="fall">{finding.excess_before_db:.1f} dB &rarr; {finding.excess_after_db:.1f} dB '
+        f'<p class="fall">{decibels(finding.excess_before_db)} dB &rarr; {decibels(finding.excess_after_db)} dB '
         f"<small>{100 * finding.share:.0f} % of what was unexplained</small></p>"
         f"<p>{html.escape(finding.evidence)}</p><table>{rows}</table>"
         f'<p class="command"><code>{_unbroken(add_command(finding.effect, names))}</code></p></li>'

@@ -49,7 +49,7 @@ function drawStaircase(on) {
   const total = (i, level, text) => {
     put(stairPlot, "stair left", { ...column(i), bottom: "0", height: height(level) });
     put(stairPlot, "stair never", { ...column(i), bottom: "0", height: height(Math.min(data.irreducible_db, level)) });
-    amount(i, level, db(level));
+    amount(i, level, round(level));
     label(i, text);
   };
   total(0, base.excess_db, "the profile as it is");
@@ -62,7 +62,7 @@ function drawStaircase(on) {
     put(stairPlot, "tread", { left: (i + 1) * width - gap, width: 2 * gap, bottom: height(level) });
     if (on[i]) put(stairPlot, after > level ? "stair left" : "stair gone", { ...column(i + 1), bottom: height(low), height: height(Math.max(level, after)) - height(low) });
     else put(stairPlot, "tread", { left: (i + 1) * width, width, bottom: height(level) });
-    amount(i + 1, Math.max(level, after), on[i] ? `${after > level ? "+" : "−"}${db(Math.abs(level - after))}` : "off");
+    amount(i + 1, Math.max(level, after), on[i] ? `${after > level ? "+" : "−"}${round(Math.abs(level - after))}` : "off");
     label(i + 1, name);
     told.push(on[i] ? `${name}: to ${db(after)}` : `${name}: off`);
     level = after;
@@ -195,10 +195,10 @@ function draw() {
   drawTables(now);
 }
 
+/* Of many effects only the comparisons that leave out the last ones are there: then a switch moves those behind or before it too. */
 boxes.forEach((box, i) =>
   box.addEventListener("change", () => {
-    if (!variant(chosen())) boxes.forEach((other, k) => (other.checked = box.checked ? k <= i || other.checked : k < i && other.checked));
-    if (!variant(chosen())) boxes.forEach((other, k) => (other.checked = k <= i && box.checked));
+    if (!variant(chosen())) boxes.forEach((other, k) => (other.checked = box.checked ? k <= i : k < i));
     draw();
   }),
 );

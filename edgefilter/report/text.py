@@ -9,7 +9,7 @@ import numpy as np
 
 from edgefilter.compare import Comparison
 from edgefilter.diagnose import Diagnosis, Finding
-from edgefilter.report.words import headline, interval_text, title
+from edgefilter.report.words import decibels, headline, interval_text, title
 
 BAR_WIDTH = 30
 MAX_TIMES = 12
@@ -19,11 +19,11 @@ MAX_TIMES = 12
 def comparison_lines(found: Comparison) -> list[str]:
     """The excess, then where it is: by frequency, time, level and lag, and while the robot is silent."""
     lines = [
-        f"excess      {found.excess_db:.1f} dB over the noise floor of {found.noise_floor_db:.1f} dBFS",
+        f"excess      {decibels(found.excess_db)} dB over the noise floor of {decibels(found.noise_floor_db)} dBFS",
         f"lag         {found.offset_samples:+.2f} samples against the calibration, taken out",
     ]
     if math.isfinite(found.silence_excess_db):
-        lines.append(f"silence     {found.silence_excess_db:.1f} dB over the noise floor while the robot is silent")
+        lines.append(f"silence     {decibels(found.silence_excess_db)} dB over the noise floor while the robot is silent")
     if found.human:
         spans = ", ".join(f"{start:.1f}-{end:.1f} s" for start, end in found.human)
         lines.append(f"human       somebody talks at {spans}; left out of every figure")
@@ -43,13 +43,13 @@ def diagnosis_lines(found: Diagnosis) -> list[str]:
     steps += [(f"with {name}", finding.excess_after_db) for name, finding in zip(names, found.ranking, strict=True)]
     top = max(1.0, *(db for _, db in steps))
     lines = [f"verdict     {found.verdict}: {headline(found.verdict, names)}", "budget      dB over the noise floor"]
-    lines += [f"  {name:<27} {db:6.1f}  {_bar(db / top)}".rstrip() for name, db in steps]
-    lines.append(f"  {'of it irreducible':<27} {found.irreducible_db:6.1f}  {_bar(found.irreducible_db / top)}".rstrip())
+    lines += [f"  {name:<27} {decibels(db):>6}  {_bar(db / top)}".rstrip() for name, db in steps]
+    lines.append(f"  {'of it irreducible':<27} {decibels(found.irreducible_db):>6}  {_bar(found.irreducible_db / top)}".rstrip())
     for rank, finding in enumerate(found.ranking, start=1):
         lines += _finding(rank, finding)
     if found.evidence:
-        lines.append(f"left        {found.remaining_db:.1f} dB: {found.evidence}")
-    return [*lines, *comparison_lines(found.comparison)]
+        lines.append(f"left        {decibels(found.remaining_db)} dB: {found.evidence}")
+    return [*lines, "where       it is with the profile as it is:", *comparison_lines(found.comparison)]
 
 
 def coarser(times: Sequence[tuple[float, float, float]], rows: int) -> list[tuple[float, float, float]]:
@@ -62,7 +62,7 @@ def coarser(times: Sequence[tuple[float, float, float]], rows: int) -> list[tupl
 def _finding(rank: int, finding: Finding) -> list[str]:
     lines = [
         f"{rank:>2}. {title(finding.effect)} ({finding.effect}): "
-        f"{finding.excess_before_db:.1f} to {finding.excess_after_db:.1f} dB, {100 * finding.share:.0f} % of the excess",
+        f"{decibels(finding.excess_before_db)} to {decibels(finding.excess_after_db)} dB, {100 * finding.share:.0f} % of the excess",
         f"      {finding.evidence}",
     ]
     return lines + [f"      {name} = {interval_text(interval)}" for name, interval in finding.parameters.items()]
@@ -70,7 +70,7 @@ def _finding(rank: int, finding: Finding) -> list[str]:
 
 def _table(heading: str, unit: str, rows: Sequence[tuple[float, float, float]]) -> list[str]:
     top = max([1.0, *(db for _, _, db in rows)])
-    return [heading] + [f"  {low:5g} to {high:4g} {unit:<4} {db:6.1f} dB  {_bar(db / top)}".rstrip() for low, high, db in rows]
+    return [heading] + [f"  {low:5.4g} to {high:4.4g} {unit:<4} {decibels(db):>6} dB  {_bar(db / top)}".rstrip() for low, high, db in rows]
 
 
 def _bar(part: float) -> str:

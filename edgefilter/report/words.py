@@ -58,6 +58,11 @@ def headline(verdict: str, effects: Iterable[str]) -> str:
     return "Something is in this recording that no known effect explains" + (f", besides {found}." if found else ".")
 
 
+def decibels(value: float) -> str:
+    """One decimal, and no minus before a zero."""
+    return f"{0.0 if abs(value) < 0.05 else value:.1f}"
+
+
 def figure(value: float) -> str:
     """A number with three significant digits; without an exponent where people would not write one."""
     value = float(value)

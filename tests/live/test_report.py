@@ -49,6 +49,9 @@ def pages(tmp_path_factory):
     found = Diagnosis("missing", describe(prepared), tuple(findings), "Nothing else.", after.excess_db, 0.1, model)
     write_page(folder / "missing.html", diagnosis_page(robot, found, y, x, NAMES))
     write_page(folder / "comparison.html", comparison_page(found.comparison, NAMES))
+    four = [*findings, *(Finding(name, 0.0, 0.0, 0.0, {}, "", {}, prediction) for name in ("compression", "clock_drift"))]
+    many = Diagnosis("missing", found.comparison, tuple(four), "", after.excess_db, 0.1, model)
+    write_page(folder / "many.html", diagnosis_page(robot, many, y, x, NAMES))
     clean = record(x)
     write_page(folder / "explained.html", diagnosis_page(robot, diagnose(robot, clean, x), clean, x, NAMES))
     return folder, found
@@ -94,6 +97,16 @@ def test_switches_move_the_figure_the_stairs_the_bars_the_picture_and_the_sound(
     assert browser.console == []
 
 
+def test_of_many_effects_the_later_ones_are_switched_with_the_earlier(browser, pages):
+    folder, _ = pages
+    browser.open(folder / "many.html", 1280)
+    states = "[...document.querySelectorAll('#switches input')].map((box) => +box.checked).join('')"
+    for clicked, expected in ((1, "1000"), (2, "1110"), (0, "0000"), (3, "1111")):
+        browser.click(f"#switches [data-effect='{clicked}']")
+        assert browser.run(states) == expected
+    assert browser.console == []
+
+
 def test_it_is_worked_without_a_mouse(browser, pages):
     folder, _ = pages
     data = stored(folder)
@@ -123,7 +136,7 @@ def test_sound_plays_and_the_residual_is_at_its_true_level(browser, pages):
 
 @pytest.mark.parametrize("dark", [False, True])
 @pytest.mark.parametrize("width", [360, 768, 1280])
-@pytest.mark.parametrize("page", ["missing", "comparison", "explained"])
+@pytest.mark.parametrize("page", ["missing", "many", "comparison", "explained"])
 def test_nothing_is_clipped_or_overlaps_at_any_width(browser, pages, page, width, dark):
     folder, _ = pages
     browser.open(folder / f"{page}.html", width, dark=dark)
