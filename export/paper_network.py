@@ -61,7 +61,8 @@ def _branch(config: PaperConfig) -> nn.Sequential:
     layers: list[nn.Module] = []
     channels = 1
     for filters, kernel, dilation in zip(config.filters, KERNELS, DILATIONS, strict=True):
-        convolution = nn.Conv2d(channels, filters, kernel, padding="same", dilation=(dilation, 1))
+        same = (dilation * (kernel[0] // 2), kernel[1] // 2)
+        convolution = nn.Conv2d(channels, filters, kernel, padding=same, dilation=(dilation, 1))
         nn.init.kaiming_normal_(convolution.weight, nonlinearity="relu")
         nn.init.zeros_(convolution.bias)
         layers.append(convolution)

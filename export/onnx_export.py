@@ -1,0 +1,190 @@
+"""Convert a trained network to the ONNX file that the runtime loads, and prove that both compute the same.
+
+python -m export.onnx_export CHECKPOINT --output models/crnn.onnx [--int8] [--figures FIGURES.json]
+
+A checkpoint is what torch.save made of a dict: network (a state_dict), config (the fields of its configuration), figures (what it
+reached on validation data) and kind ("edge", also where it is missing, or "paper"); all else in it says how it was trained, and goes
+into the file's metadata like the figures.
+The file is written only once the ONNX checker, the parity test and the size limit have passed; otherwise ModelError says which failed.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import sys
+import warnings
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import onnx
+import torch
+from torch import Tensor, nn
+
+from edgefilter.engines.crnn import EDGE_TYPE, EDGE_VERSION, SPECTRA
+from edgefilter.engines.paper_crnn import PAPER_TYPE, PAPER_VERSION
+from edgefilter.engines.paper_ss import PAPER_STFT
+from edgefilter.errors import EdgefilterError, ModelError
+from edgefilter.stft import StftConfig
+from edgefilter.types import SAMPLE_RATE
+from export import onnx_parity
+from export.network import EdgeConfig, EdgeCrnn
+from export.paper_network import PaperConfig, PaperCrnn
+
+OPSET = 17
+MAX_EDGE_BYTES = 12_000_000
+"""The runtime's model has to fit a robot's disk and caches."""
+
+
+@dataclass(frozen=True)
+class Trained:
+    """A network in evaluation mode, with what its file will say about its training and its figures."""
+
+    network: nn.Module
+    training: Mapping[str, object] = field(default_factory=dict)
+    figures: Mapping[str, object] = field(default_factory=dict)
+
+
+class EdgeGraph(nn.Module):
+    """EdgeCrnn.step with its state as separate tensors, as a graph wants them."""
+
+    def __init__(self, network: nn.Module) -> None:
+        super().__init__()
+        self.network = network
+
+    def forward(self, error: Tensor, mic: Tensor, reference: Tensor, echo: Tensor, *state: Tensor) -> tuple[Tensor, ...]:
+        spectrum, probability, following = self.network.step(error, mic, reference, echo, state)
+        return (spectrum, probability, *following)
+
+
+def load(path: Path) -> Trained:
+    """The network that a checkpoint holds; raises ModelError where it holds none."""
+    try:
+        found = torch.load(path, map_location="cpu", weights_only=True)
+        make = {"edge": lambda c: EdgeCrnn(EdgeConfig(**c)), "paper": lambda c: PaperCrnn(PaperConfig(**c))}[found.get("kind", "edge")]
+        network = make(found["config"])
+        network.load_state_dict(found["network"])
+    except OSError as error:
+        raise ModelError(f"{path}: {error.strerror}; give a checkpoint that export/train.py wrote") from None
+    except Exception as error:
+        raise ModelError(f"{path} is no checkpoint of a network ({' '.join(str(error).split())[:120]}): give one that export/train.py wrote") from None
+    training = {key: value for key, value in found.items() if key not in ("network", "config", "kind", "figures")}
+    return Trained(network.eval(), training, found.get("figures", {}))
+
+
+def export(trained: Trained, path: Path, int8: bool = False) -> list[str]:
+    """Write the network to path, and with int8 a variant beside it where that pays; return what was done, a line a file."""
+    write, compare = (_write_paper, onnx_parity.paper) if isinstance(trained.network, PaperCrnn) else (_write_edge, onnx_parity.edge)
+    unproven = path.with_name(f".{path.name}.unproven")
+    try:
+        write(trained, unproven)
+        apart = compare(trained.network, unproven)
+        _check_size(trained.network, unproven)
+        os.replace(unproven, path)
+    finally:
+        unproven.unlink(missing_ok=True)
+    lines = [f"{path}: {path.stat().st_size / 1e6:.2f} MB, {apart:.1e} from torch at most"]
+    if int8:
+        lines.append(_write_int8(trained.network, path))
+    return lines
+
+
+def _write_edge(trained: Trained, path: Path) -> None:
+    network = trained.network
+    state = network.initial_state()
+    if any(tensor.any() for tensor in state):
+        raise ModelError("the network's initial state is not all zeros, which is what the runtime starts from")
+    config = network.config
+    stft = StftConfig(config.n_fft, config.hop, config.n_fft, config.window)
+    # one tensor object per input: the exporter would merge inputs that are the same object
+    inputs = [torch.randn(1, stft.bins, 2) for _ in SPECTRA] + [torch.randn_like(tensor) for tensor in state]
+    names = [f"state_{i}" for i in range(len(state))]
+    trace(EdgeGraph(network).eval(), inputs, path, [*SPECTRA, *names], ["spectrum", "speech_probability", *(f"next_{name}" for name in names)])
+    states = [[name, list(tensor.shape)] for name, tensor in zip(names, state)]
+    describe(path, EDGE_TYPE, EDGE_VERSION, stft, trained, states=json.dumps(states))
+
+
+def _write_paper(trained: Trained, path: Path) -> None:
+    network = trained.network
+    if network.config.bins != PAPER_STFT.bins:
+        raise ModelError(f"the paper's network has {network.config.bins} bins, its runtime {PAPER_STFT.bins}: train it on {PAPER_STFT.bins}")
+    inputs = [torch.rand(1, 50, network.config.bins) for _ in range(2)]
+    names = ["mic_magnitude", "reference_magnitude"]
+    trace(network, inputs, path, names, ["mask"], {name: {1: "frames"} for name in (*names, "mask")})
+    describe(path, PAPER_TYPE, PAPER_VERSION, PAPER_STFT, trained)
+
+
+def trace(network: nn.Module, inputs: Sequence[Tensor], path: Path, names: list[str], outputs: list[str], dynamic: dict | None = None) -> None:
+    """Write the network's graph for these inputs by torch's tracing exporter; dynamic axes as torch.onnx.export wants them."""
+    with warnings.catch_warnings(), torch.no_grad():
+        warnings.simplefilter("ignore")  # the exporter warns of its own age and of shapes, all of which are fixed or tested here
+        torch.onnx.export(
+            network, tuple(inputs), str(path), input_names=names, output_names=outputs, dynamic_axes=dynamic, opset_version=OPSET, dynamo=False
+        )
+
+
+def describe(path: Path, kind: str, version: int, stft: StftConfig, trained: Trained, **more: str) -> None:
+    """Put the metadata into the file that the runtime checks, and run the ONNX checker over it."""
+    model = onnx.load(str(path))
+    metadata = {
+        "type": kind,
+        "version": str(version),
+        "sample_rate": str(SAMPLE_RATE),
+        "n_fft": str(stft.n_fft),
+        "hop": str(stft.hop),
+        "window_length": str(stft.window_length),
+        "window": stft.window,
+        "training": json.dumps(trained.training),
+        "figures": json.dumps(trained.figures),
+        **more,
+    }
+    onnx.helper.set_model_props(model, metadata)
+    onnx.checker.check_model(model, full_check=True)
+    onnx.save(model, str(path))
+
+
+def _check_size(network: nn.Module, path: Path) -> None:
+    size = path.stat().st_size
+    if not isinstance(network, PaperCrnn) and size > MAX_EDGE_BYTES:
+        raise ModelError(f"the network takes {size / 1e6:.1f} MB, expected at most {MAX_EDGE_BYTES / 1e6:.0f} MB: train a smaller one")
+
+
+def _write_int8(network: nn.Module, path: Path) -> str:
+    """The variant with int8 LSTM weights; GRU weights stay fp32, for which onnxruntime has no int8 kernel."""
+    if not any(node.op_type == "LSTM" for node in onnx.load(str(path)).graph.node):
+        return "no int8 variant: the network has no LSTM, the one layer that it would make faster"
+    import logging
+
+    from onnxruntime.quantization import QuantType, quantize_dynamic
+
+    logging.getLogger().setLevel(logging.ERROR)  # it recommends a pre-processing that changes nothing for a traced graph
+    small = path.with_name(f"{path.stem}_int8.onnx")
+    quantize_dynamic(str(path), str(small), op_types_to_quantize=["LSTM"], weight_type=QuantType.QInt8)
+    apart = onnx_parity.difference(network, small)
+    before, after = onnx_parity.seconds(network, path), onnx_parity.seconds(network, small)
+    said = f"{small}: {small.stat().st_size / 1e6:.2f} MB, {apart:.1e} from torch at most, {after / before:.2f} of the fp32 file's time"
+    return said
+
+
+def main(argv: list[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(prog="python -m export.onnx_export", description="Convert a trained network to the ONNX file that the runtime loads.")
+    parser.add_argument("checkpoint", type=Path, help="what export/train.py wrote")
+    parser.add_argument("--output", type=Path, required=True, metavar="FILE.onnx")
+    parser.add_argument("--int8", action="store_true", help="also write FILE_int8.onnx where the network has an LSTM")
+    parser.add_argument("--figures", type=Path, metavar="FILE.json", help="figures to write into the file, over those of the checkpoint")
+    options = parser.parse_args(argv)
+    try:
+        trained = load(options.checkpoint)
+        if options.figures:
+            trained = Trained(trained.network, trained.training, {**trained.figures, **json.loads(options.figures.read_text())})
+        print("\n".join(export(trained, options.output, options.int8)))
+    except (EdgefilterError, OSError, ValueError) as error:
+        print(f"export: {error}", file=sys.stderr)
+        return 1
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

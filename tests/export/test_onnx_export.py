@@ -1,0 +1,186 @@
+"""From a checkpoint to a file that the runtime accepts, and every way in which a wrong file must not get that far."""
+
+import importlib.util
+import json
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+import onnx
+import pytest
+import torch
+
+from edgefilter.engines.crnn import Crnn
+from edgefilter.engines.onnx_session import open_session
+from edgefilter.engines.paper_crnn import PaperCrnn as PaperEngine
+from edgefilter.errors import ModelError
+from edgefilter.types import Frame
+from export import onnx_export, onnx_parity
+from export.network import EdgeConfig, EdgeCrnn
+from export.onnx_export import Trained, export, load, main
+from export.paper_network import PaperConfig, PaperCrnn
+
+DATA = Path(__file__).parents[1] / "data"
+EDGE = EdgeConfig(n_fft=320, hop=160, channels=(2, 2, 2, 2), hidden=5)
+PAPER = PaperConfig(filters=(1,) * 8, lstm=2, hidden=4)
+
+
+def edge(seed: int = 1) -> EdgeCrnn:
+    """A small network none of whose biases is zero."""
+    torch.manual_seed(seed)
+    network = EdgeCrnn(EDGE).eval()
+    with torch.no_grad():
+        for parameter in network.parameters():
+            parameter.add_(0.05 * torch.randn_like(parameter))
+    return network
+
+
+@pytest.fixture(scope="module")
+def exported(tmp_path_factory) -> tuple[EdgeCrnn, Path]:
+    """A network and the file that the command makes of its checkpoint."""
+    folder = tmp_path_factory.mktemp("model")
+    network = edge()
+    checkpoint = {
+        "network": network.state_dict(),
+        "config": asdict(EDGE),
+        "figures": {"si_sdr_db": 1.5},
+        "data": "none",
+        "seed": 1,
+    }
+    torch.save(checkpoint, folder / "last.pt")
+    (folder / "figures.json").write_text(json.dumps({"wer": 0.3}))
+    words = [folder / "last.pt", "--output", folder / "crnn.onnx", "--int8", "--figures", folder / "figures.json"]
+    assert main([str(word) for word in words]) == 0
+    return network, folder / "crnn.onnx"
+
+
+def test_the_runtime_takes_the_file_and_knows_its_stft_training_and_figures(exported):
+    engine = Crnn(exported[1])
+    assert engine.stft == EDGE.stft
+    assert engine.model.training == {"data": "none", "seed": 1}
+    assert engine.model.figures == {"si_sdr_db": 1.5, "wer": 0.3}
+    assert [shape for _, shape in engine.model.states] == [tuple(tensor.shape) for tensor in exported[0].initial_state()]
+
+
+def test_nothing_but_the_model_is_left_behind(exported):
+    assert sorted(path.name for path in exported[1].parent.iterdir()) == ["crnn.onnx", "figures.json", "last.pt"]
+
+
+def test_the_graph_is_opset_17_and_its_gru_is_torchs(exported):
+    model = onnx.load(exported[1])
+    assert [(opset.domain, opset.version) for opset in model.opset_import] == [("", 17)]
+    grus = [node for node in model.graph.node if node.op_type == "GRU"]
+    assert len(grus) == EDGE.layers
+    for node in grus:
+        assert {a.name: a.i for a in node.attribute}["linear_before_reset"] == 1
+    assert exported[0].memory.bias_hh_l0.abs().min() > 0
+
+
+def test_the_engine_computes_what_torch_computes(exported):
+    network, path = exported
+    engine = Crnn(path)
+    rng = np.random.default_rng(3)
+    nothing = np.zeros(engine.stft.bins, np.float32)
+    ours, theirs = network.initial_state(), engine.initial_state()
+    for _ in range(20):
+        error, mic, reference, echo = (rng.standard_normal((4, engine.stft.bins, 2)) @ (1, 1j)).astype(np.complex64)
+        pairs = [torch.view_as_real(torch.from_numpy(x))[None] for x in (error, mic, reference, echo)]
+        with torch.no_grad():
+            spectrum, probability, ours = network.step(*pairs, ours)
+        output, theirs = engine.step(Frame(mic, reference, echo, error, nothing, nothing), theirs)
+        # 1e-4: the bound of the export, on values of about 1
+        np.testing.assert_allclose(output.spectrum, torch.view_as_complex(spectrum)[0].numpy(), atol=1e-4)
+        assert output.speech_probability == pytest.approx(float(probability[0]), abs=1e-4)
+    for mine, found in zip(ours, theirs, strict=True):
+        np.testing.assert_allclose(found, mine.numpy(), atol=1e-4)
+
+
+def test_parity_runs_a_thousand_frames_and_is_far_below_the_bound(exported):
+    assert onnx_parity.FRAMES == 1000 and onnx_parity.TOLERANCE == 1e-4
+    assert 0 < onnx_parity.edge(exported[0], exported[1], frames=200) < 2e-5
+
+
+def test_parity_sees_a_weight_that_is_off_by_a_little(exported):
+    other = edge()
+    with torch.no_grad():
+        other.memory.bias_hh_l0[0] += 0.02
+    with pytest.raises(ModelError, match="expected at most 1e-04: not written"):
+        onnx_parity.edge(other, exported[1], frames=200)
+
+
+def test_parity_compares_the_state_too(exported):
+    """Answers are right and the state handed on is not: that shows only later, and must not pass."""
+    network = edge()
+
+    def step(*inputs):
+        spectrum, probability, (mic, ref, hidden) = EdgeCrnn.step(network, *inputs)
+        return spectrum, probability, (mic, ref, hidden + 1e-3)
+
+    network.step = step
+    with pytest.raises(ModelError, match="not written"):
+        onnx_parity.edge(network, exported[1], frames=1)
+
+
+def test_a_failed_export_leaves_the_old_file(exported, tmp_path, monkeypatch):
+    path = tmp_path / "crnn.onnx"
+    path.write_text("old")
+    monkeypatch.setattr(onnx_parity, "FRAMES", 10)
+    monkeypatch.setattr(onnx_parity, "TOLERANCE", 0.0)
+    with pytest.raises(ModelError, match="not written"):
+        export(Trained(exported[0]), path)
+    assert path.read_text() == "old" and list(tmp_path.iterdir()) == [path]
+
+
+def test_a_network_that_does_not_fit_12_mb_is_refused(exported, tmp_path, monkeypatch):
+    assert onnx_export.MAX_EDGE_BYTES == 12_000_000
+    monkeypatch.setattr(onnx_export, "MAX_EDGE_BYTES", 10_000)
+    monkeypatch.setattr(onnx_parity, "FRAMES", 10)
+    with pytest.raises(ModelError, match="expected at most 0 MB: train a smaller one"):
+        export(Trained(exported[0]), tmp_path / "crnn.onnx")
+
+
+def test_a_start_that_is_not_silence_is_refused(tmp_path):
+    network = edge()
+    network.initial_state = lambda: tuple(tensor + 1 for tensor in EdgeCrnn.initial_state(network))
+    with pytest.raises(ModelError, match="not all zeros"):
+        export(Trained(network), tmp_path / "crnn.onnx")
+
+
+@pytest.mark.parametrize("content", [b"text", None, {"network": {}}, {"kind": "lstm", "config": {}, "network": {}}, {"config": {"size": 3}, "network": {}}, {"config": {}, "network": {}}])
+def test_what_is_no_checkpoint_is_refused_in_one_line(tmp_path, capsys, content):
+    path = tmp_path / "last.pt"
+    if isinstance(content, bytes):
+        path.write_bytes(content)
+    elif content:
+        torch.save(content, path)
+    assert main([str(path), "--output", str(tmp_path / "crnn.onnx")]) == 1
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1 and "export/train.py" in said
+    assert not (tmp_path / "crnn.onnx").exists()
+
+
+def test_the_papers_network_is_exported_for_clips_of_any_length_and_with_an_int8_lstm(tmp_path):
+    torch.manual_seed(2)
+    network = PaperCrnn(PAPER).eval()
+    torch.save({"kind": "paper", "config": asdict(PAPER), "network": network.state_dict()}, tmp_path / "paper.pt")
+    lines = export(load(tmp_path / "paper.pt"), tmp_path / "paper.onnx", int8=True)
+    assert "from torch at most" in lines[0] and "paper_int8.onnx" in lines[1] and len(lines) == 2
+    small = tmp_path / "paper_int8.onnx"
+    assert small.stat().st_size < 0.75 * (tmp_path / "paper.onnx").stat().st_size
+    assert "DynamicQuantizeLSTM" in {node.op_type for node in onnx.load(small).graph.node}
+    for path, bound in ((tmp_path / "paper.onnx", 1e-4), (small, 0.05)):  # int8: eight bits of weights and of inputs
+        assert PaperEngine(path).model.stft.bins == 601
+        for frames in (3, 70):
+            mic, reference = np.abs(np.random.default_rng(frames).standard_normal((2, 1, frames, 601))).astype(np.float32)
+            found = open_session(path).run(None, {"mic_magnitude": mic, "reference_magnitude": reference})[0]
+            with torch.no_grad():
+                wanted = network(torch.from_numpy(mic), torch.from_numpy(reference)).numpy()
+            assert np.max(np.abs(found - wanted)) < bound
+
+
+def test_the_test_models_are_what_their_script_makes(tmp_path):
+    spec = importlib.util.spec_from_file_location("make_models", DATA / "make_models.py")
+    make_models = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(make_models)
+    assert onnx_parity.edge(make_models.tiny_edge(), DATA / "crnn.onnx", frames=20) < 1e-4
+    assert onnx_parity.paper(make_models.tiny_paper(), DATA / "paper_crnn.onnx") < 1e-4
