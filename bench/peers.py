@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 import numpy as np
@@ -18,6 +18,7 @@ TAIL = 6400
 _SET_ECHO_RATE, _SET_ECHO_STATE = 24, 24  # SPEEX_ECHO_SET_SAMPLING_RATE, SPEEX_PREPROCESS_SET_ECHO_STATE
 SUPPRESSED_DELAY = FRAME
 """Samples by which SpeexDSP's preprocessor delays the signal (its windows overlap by one frame); removed here."""
+AEC3_FRAME = 160
 AEC3_DELAY = 128
 """Samples by which AEC3 delays the signal (it regroups frames of 80 samples into blocks of 64 and back); removed here."""
 
@@ -40,12 +41,18 @@ def aec3(mic: Samples, ref: Samples) -> Samples:
 
     Raises UsageError where pywebrtc-audio is missing.
     """
+    step = aec3_frames()
+    mic, ref = (np.append(as_samples(x, name), np.zeros(AEC3_DELAY, np.float32)) for x, name in ((mic, "mic"), (ref, "ref")))
+    return np.asarray(step(mic, ref), np.float32)[AEC3_DELAY:]
+
+
+def aec3_frames() -> Callable[[Samples, Samples], object]:
+    """A new canceller as a function of mic and ref, (n,) float32; it works on AEC3_FRAME samples at a time, 10 ms."""
     try:
         from pywebrtc_audio import EchoCanceller
     except ImportError as error:
         raise UsageError("AEC3 needs the package pywebrtc-audio: pip install pywebrtc-audio") from error
-    mic, ref = (np.append(as_samples(x, name), np.zeros(AEC3_DELAY, np.float32)) for x, name in ((mic, "mic"), (ref, "ref")))
-    return np.asarray(EchoCanceller(sample_rate=SAMPLE_RATE).process(mic, ref), np.float32)[AEC3_DELAY:]
+    return EchoCanceller(sample_rate=SAMPLE_RATE).process
 
 
 def _speexdsp(mic: Samples, ref: Samples, suppress: bool) -> Samples:
@@ -55,12 +62,23 @@ def _speexdsp(mic: Samples, ref: Samples, suppress: bool) -> Samples:
     padding = (0, frames * FRAME - mic.size)
     near, far = (np.rint(np.clip(np.pad(x, padding) * 32768.0, -32768, 32767)).astype(np.int16) for x in (mic, ref))
     out = np.zeros_like(near)
-    with _echo_state(suppress) as (library, echo, preprocessor):
+    with speexdsp_frames(suppress) as step:
         for at in range(0, near.size, FRAME):
-            library.speex_echo_cancellation(echo, _at(near, at), _at(far, at), _at(out, at))
-            if preprocessor:
-                library.speex_preprocess_run(preprocessor, _at(out, at))
+            step(near[at : at + FRAME], far[at : at + FRAME], out[at : at + FRAME])
     return out[delay : delay + mic.size].astype(np.float32) / 32768.0
+
+
+@contextmanager
+def speexdsp_frames(suppress: bool) -> Iterator[Callable[[np.ndarray, np.ndarray, np.ndarray], None]]:
+    """A new canceller as a function of near, far and out, (FRAME,) contiguous int16 each, that fills out."""
+    with _echo_state(suppress) as (library, echo, preprocessor):
+
+        def step(near: np.ndarray, far: np.ndarray, out: np.ndarray) -> None:
+            library.speex_echo_cancellation(echo, near.ctypes.data, far.ctypes.data, out.ctypes.data)
+            if preprocessor:
+                library.speex_preprocess_run(preprocessor, out.ctypes.data)
+
+        yield step
 
 
 @contextmanager
@@ -100,6 +118,3 @@ def _load() -> ctypes.CDLL:
         function.restype, function.argtypes = result, arguments
     return library
 
-
-def _at(samples: np.ndarray, at: int) -> ctypes.c_void_p:
-    return ctypes.c_void_p(samples.ctypes.data + at * samples.itemsize)

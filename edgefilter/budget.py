@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -33,9 +34,13 @@ SCENE = Path(__file__).parent / "demo_data"
 
 @dataclass(frozen=True, slots=True)
 class Figures:
-    """One engine in the whole path: ms of compute per hop. complete: all PACED hops could be run in time."""
+    """One engine in the whole path: ms of compute per hop. complete: all PACED hops could be run in time.
+
+    model: SHA-256 of the engine's model file, empty where it has none.
+    """
 
     engine: str
+    model: str
     hop_ms: float
     hops: int
     complete: bool
@@ -94,7 +99,7 @@ def choose(
         except EdgefilterError as error:
             skipped[name] = str(error)
             continue
-        if name not in known:
+        if name not in known or known[name].model != _model(engine):
             say(f"measuring engine {name} at the real pace on {cores} cores, about 5 s ...")
             known[name] = measure(engine, profile)
             fresh += 1
@@ -129,7 +134,7 @@ def measure(engine: Engine, profile: Profile | None = None, paced: int = PACED) 
     p50, p95, p99 = np.percentile(slow, (50, 95, 99))
     quick = np.percentile(at_once, (50, 99))
     return Figures(
-        engine.name, 1000 * hop / SAMPLE_RATE, len(slow), len(slow) == paced, *map(float, (p50, p95, p99, max(slow))), *map(float, quick)
+        engine.name, _model(engine), 1000 * hop / SAMPLE_RATE, len(slow), len(slow) == paced, *map(float, (p50, p95, p99, max(slow))), *map(float, quick)
     )
 
 
@@ -173,6 +178,11 @@ def _scene(hop: int) -> Iterator[tuple[Samples, Samples]]:
     while True:
         for at in range(0, mic.size - hop + 1, hop):
             yield mic[at : at + hop], ref[at : at + hop]
+
+
+def _model(engine: Engine) -> str:
+    file = getattr(getattr(engine, "model", None), "path", None)
+    return hashlib.sha256(file.read_bytes()).hexdigest() if file else ""
 
 
 def _taps(profile: Profile | None) -> int | None:

@@ -12,7 +12,6 @@ from contextlib import suppress
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
-PACKAGE = Path(__file__).parent
 PACKAGES = ("edgefilter", "numpy", "scipy", "onnxruntime")
 FILE = "timings.json"
 
@@ -30,15 +29,14 @@ def folder() -> Path:
 
 
 def describe(path: Mapping[str, object]) -> dict[str, object]:
-    """All that a timing depends on: machine, versions, models, and what the caller says of the path."""
+    """What timings depend on: machine, versions, and what the caller says of the path."""
     found: dict[str, object] = {"machine": platform.node(), "processor": processor(), "cores": os.cpu_count(), "python": platform.python_version()}
     for package in PACKAGES:
         try:
             found[package] = version(package)
         except PackageNotFoundError:
             found[package] = "none"
-    models = {str(file.relative_to(PACKAGE)): hashlib.sha256(file.read_bytes()).hexdigest() for file in sorted(PACKAGE.rglob("*.onnx"))}
-    return {**found, "models": models, **path}
+    return {**found, **path}
 
 
 def processor() -> str:

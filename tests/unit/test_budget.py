@@ -7,6 +7,7 @@ import sys
 import time
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -38,7 +39,7 @@ def measured(monkeypatch):
     def pretend(engine, profile):
         asked.append(engine.name)
         p99 = speeds[engine.name]
-        return Figures(engine.name, 16.0, 300, p99 < 16.0, p99 / 3, p99 / 2, p99, 2 * p99, p99 / 4, p99 / 3)
+        return Figures(engine.name, budget._model(engine), 16.0, 300, p99 < 16.0, p99 / 3, p99 / 2, p99, 2 * p99, p99 / 4, p99 / 3)
 
     monkeypatch.setattr(budget, "measure", pretend)
     return speeds, asked
@@ -97,14 +98,23 @@ def test_figures_are_remembered_for_the_same_path_only(measured):
     assert not choose(8.0, profile, LADDER).remembered and asked[-1] == "ss"
 
 
-def test_another_version_or_model_is_measured_again(measured, monkeypatch, tmp_path):
+def test_another_machine_or_version_is_measured_again(measured, monkeypatch):
     choose(8.0, candidates=LADDER)
-    (tmp_path / "crnn.onnx").write_bytes(b"other weights")
-    for name, other in (("PACKAGE", tmp_path), ("processor", lambda: "another processor"), ("version", lambda package: "99")):
+    for name, other in (("processor", lambda: "another processor"), ("version", lambda package: "99")):
         with monkeypatch.context() as changed:
             changed.setattr(budget_cache, name, other)
             assert not choose(8.0, candidates=LADDER).remembered, name
     assert choose(8.0, candidates=LADDER).remembered
+
+
+def test_another_model_file_is_measured_again(measured, monkeypatch, tmp_path):
+    """The engine says which file it runs; its bytes count, not its name."""
+    file = tmp_path / "crnn.onnx"
+    file.write_bytes(b"weights")
+    monkeypatch.setattr(SpectralSubtraction, "model", SimpleNamespace(path=file), raising=False)
+    assert not choose(8.0, candidates=LADDER).remembered and choose(8.0, candidates=LADDER).remembered
+    file.write_bytes(b"other weights")
+    assert not choose(8.0, candidates=LADDER).remembered and choose(8.0, candidates=LADDER).remembered
 
 
 @pytest.mark.parametrize("text", ["", "{", "[]", "{}", '{"x": 3}'])
@@ -176,7 +186,7 @@ def test_an_engine_far_too_slow_is_given_up_in_time():
     hop = np.zeros(256, np.float32)
     took = pace(Stream(Slow()), iter([(hop, hop)] * 300), 300, 0.3)
     assert 1 <= len(took) <= 6
-    assert not fits(replace(Figures("x", 16.0, 300, True, 1, 1, 1, 1, 1, 1), complete=False), 8.0)
+    assert not fits(replace(Figures("x", "", 16.0, 300, True, 1, 1, 1, 1, 1, 1), complete=False), 8.0)
 
 
 def test_the_measurement_is_held_to_the_cores_and_lets_go_afterwards():
@@ -203,7 +213,8 @@ def test_a_recording_gets_the_strongest_engine_unmeasured_unless_a_budget_is_giv
     assert stats["choice"] is None and "strongest engine, not measured" in said
     said, stats = run(tmp_path, "--seconds", "1", "--budget-ms", "500")
     choice = stats["choice"]
-    assert choice["fits"] and not choice["remembered"] and choice["figures"][-1]["hops"] == 300
+    last = choice["figures"][-1]
+    assert not choice["remembered"] and choice["fits"] == (last["hops"] == 300)  # on a machine with more to do fewer can be run in time
     assert stats["engine"] == choice["engine"] and choice["reason"] in said and "measuring engine" in said
     said, stats = run(tmp_path, "--seconds", "1", "--budget-ms", "500")
     assert stats["choice"]["remembered"] and "measuring" not in said

@@ -1,0 +1,70 @@
+"""A private PulseAudio server with null sinks, seen by PortAudio through ALSA by their names and the names of their monitors."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import tempfile
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+SINKS = ("robot", "robot_mic")
+
+
+@dataclass
+class Server:
+    """environment: for the processes that are to use it."""
+
+    process: subprocess.Popen
+    environment: dict
+
+    def stop(self) -> None:
+        self.process.kill()
+        self.process.wait()
+
+
+def start_server(folder: Path, sinks: Sequence[str] = SINKS) -> Server:
+    """Start a server whose files all lie in folder and wait until its sinks are there; the first two are the default output and microphone."""
+    socket = f"unix:{folder}/socket"
+    environment = {**os.environ, "HOME": str(folder), "XDG_RUNTIME_DIR": str(folder), "PULSE_RUNTIME_PATH": str(folder / "run")}
+    arguments = ["-n", "--daemonize=no", "--use-pid-file=no", "--exit-idle-time=-1", "--disable-shm=yes"]
+    modules = [f"module-native-protocol-unix socket={folder}/socket auth-anonymous=1"]
+    modules += [f"module-null-sink sink_name={name} rate=16000 format=s16le channels=1" for name in sinks]
+    for module in modules:
+        arguments += ["-L", module]
+    with open(folder / "log", "w") as log:
+        process = subprocess.Popen(["pulseaudio", *arguments], env=environment, stdout=log, stderr=log)
+    environment |= {"PULSE_SERVER": socket, "ALSA_CONFIG_PATH": str(folder / "asound.conf"), "OMP_NUM_THREADS": "1"}
+    names = {**{name: name for name in sinks}, **{f"{name}_monitor": f"{name}.monitor" for name in sinks}}
+    entries = [f'pcm.{pcm} {{ type pulse\n server "{socket}"\n device "{device}" }}\n' for pcm, device in names.items()]
+    entries += [f'pcm.{pcm} {{ type pulse\n server "{socket}" }}\n' for pcm in ("!default", "pulse")]
+    (folder / "asound.conf").write_text("</usr/share/alsa/alsa.conf>\n" + "".join(entries))
+    for _ in range(300):
+        listed = subprocess.run(["pactl", "list", "short", "sinks"], env=environment, capture_output=True, text=True)
+        if all(f"\t{name}\t" in listed.stdout for name in sinks):
+            subprocess.run(["pactl", "set-default-sink", sinks[0]], env=environment, check=True)
+            subprocess.run(["pactl", "set-default-source", f"{sinks[1]}.monitor"], env=environment, check=True)
+            return Server(process, environment)
+        if process.poll() is not None:
+            break
+        time.sleep(0.1)
+    process.kill()
+    raise RuntimeError("pulseaudio did not start:\n" + (folder / "log").read_text())
+
+
+@contextmanager
+def server(sinks: Sequence[str] = SINKS) -> Iterator[Server]:
+    """A server of one's own for a while. Its folder is short: socket paths hold 107 bytes."""
+    folder = Path(tempfile.mkdtemp(prefix="pulse"))
+    started = None
+    try:
+        started = start_server(folder, sinks)
+        yield started
+    finally:
+        if started:
+            started.stop()
+        shutil.rmtree(folder, ignore_errors=True)
