@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -85,6 +86,7 @@ def reflector(rng: np.random.Generator, place: Place) -> Callable[[float], Array
     return at
 
 
+@functools.cache
 def _sinc_table() -> Array:
     """(PHASES + 1, 2 HALF_WIDTH) Kaiser-windowed sincs (beta 9: images below -90 dB), row p for a position p / PHASES behind a sample."""
     distance = np.arange(-HALF_WIDTH + 1, HALF_WIDTH + 1)[None] - np.arange(PHASES + 1)[:, None] / PHASES
