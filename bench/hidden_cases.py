@@ -55,11 +55,12 @@ APART = {
 """Pairs that are not made: each could pass for the other or hides it."""
 ROBOT_OVER_FAN_DB = {"clear": (23.0, 31.0), "moderate": (20.0, 30.0), "near": (18.0, 30.0), "control": (18.0, 30.0), "pair": (21.0, 31.0)}
 TRIES = 6
+SECONDS = (20.0, 30.0)
 
 
 def read_reference(rng: np.random.Generator, clips: list[Clip]) -> Array:
     """(n,) 20-30 s of sentences of one voice, peak 0.8, with pauses of 0.1-2 s, silence at both ends."""
-    wanted = int(rng.uniform(20, 30) * RATE)
+    wanted = int(rng.uniform(*SECONDS) * RATE)
     parts, size = [np.zeros(int(rng.uniform(0.4, 1.0) * RATE))], 0
     for i in rng.permutation(len(clips)):
         pause = rng.uniform(0.1, 0.5) if rng.random() < 0.6 else rng.uniform(0.8, 2.0)

@@ -236,7 +236,7 @@ def fan_noise_change(rng: np.random.Generator, scene: Scene, chain: Chain, stren
         centre, width = _log_uniform(rng, 300, 5000), rng.uniform(0.1, 0.4)
         shape = np.exp(-0.5 * (np.log2((f + 1) / centre) / width) ** 2)
     elif kind == "lines":
-        blade, width = rng.uniform(110, 380), rng.uniform(2, 8)
+        blade, width = rng.uniform(110, 380), rng.uniform(5, 10)
         shape = sum(rng.uniform(0.2, 1) * np.exp(-0.5 * ((f - k * blade) / (width * k)) ** 2) for k in range(1, int(rng.integers(3, 8))))
     else:
         shape = np.interp(f / speed, f, old) if kind == "faster" else old
@@ -246,7 +246,8 @@ def fan_noise_change(rng: np.random.Generator, scene: Scene, chain: Chain, stren
         return s * shape if kind == "faster" else np.sqrt(old**2 + (s * shape) ** 2)
 
     s = solve(lambda s: decibels(float(np.mean(np.abs(new(s) ** 2 - old**2)))), ENR_DB[strength], 1.0 if kind == "faster" else 0.01, 1000.0)
-    noise = math.sqrt(scene.fan_power) * math.sqrt(np.mean(new(s) ** 2)) * fan_noise(rng, new(s) / math.sqrt(np.mean(new(s) ** 2)), n)
+    noise = fan_noise(rng, new(s), n)
+    noise *= math.sqrt(scene.fan_power * np.mean(new(s) ** 2) / power(noise))
     start = int(rng.uniform(0.15, 0.5) * n) if rng.random() < 0.25 else -RATE
     grown = np.clip((np.arange(n) - start) / (rng.uniform(0.3, 2) * RATE), 0, 1) if start > 0 else np.ones(n)
     fan = np.sqrt(1 - grown) * chain.fan + np.sqrt(grown) * noise

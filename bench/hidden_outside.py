@@ -123,10 +123,11 @@ def packet_loss(rng: np.random.Generator, scene: Scene, chain: Chain, strength: 
         new = 0.6 * x[part.start - length : part.start] if repeats else np.zeros(length)
         new[:32] = (1 - fade) * x[part][:32] + fade * new[:32]
         new[-32:] = fade * x[part][-32:] + (1 - fade) * new[-32:]
-        changed += float(np.sum(signal.oaconvolve(new - x[part], response) ** 2))
-        if lost and changed > wanted:
+        energy = float(np.sum(signal.oaconvolve(new - x[part], response) ** 2))
+        if changed + energy < 1.1 * wanted:
+            played[part], lost, changed = new, lost + 1, changed + energy
+        if changed > 0.9 * wanted:
             break
-        played[part], lost = new, lost + 1
     return replace(chain, played=played), {"lost_packets": lost, "packet_ms": length * 1000 // RATE, "filled_with": "repetition" if repeats else "silence"}
 
 

@@ -169,7 +169,7 @@ def _miss_lines(misses: Sequence[Outcome]) -> list[str]:
         return ["", "No misses."]
     lines = ["", f"Misses ({len(misses)}):", "", "| case | hidden | strength | said | excess, dB | left, dB | evidence |", "| --- " * 7 + "|"]
     for o in misses:
-        hidden = "sealed" if not o.truth else "+".join(o.truth) + ("" if o.raw == o.truth or not o.raw else f" ({'+'.join(o.raw)})")
+        hidden = "sealed" if not o.truth else "+".join(o.truth) + ("" if set(o.raw) == set(o.truth) or not o.raw else f" ({'+'.join(o.raw)})")
         said = o.verdict + (": " + ", ".join(o.named) if o.named else "")
         lines.append(f"| {o.case} | {hidden} | {o.strength} | {said} | {o.excess_db:.1f} | {o.remaining_db:.1f} | {o.evidence.replace('|', '/')} |")
     return lines
