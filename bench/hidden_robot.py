@@ -114,7 +114,7 @@ def draw_scene(rng: np.random.Generator, reference: Array, robot_over_fan_db: fl
     robot_over_fan_db: of the whole recording. Tolerances: offset -60..60 samples, fan +-0.4 dB, gain +-0.1 dB, the microphone moved by
     0.1-0.9 mm, distortion of FAINT_DB over the fan. All recordings together are scaled later, see `hidden_cases.write_case`.
     """
-    place, shell, amplitude = draw_place(rng, rng.uniform(0.18, 0.32)), draw_body(rng), draw_fan(rng)
+    place, shell, amplitude = draw_place(rng, rng.uniform(0.18, 0.32)), draw_shell(rng), draw_hiss(rng)
     move_m = rng.uniform(1e-4, 9e-4)
     moved = place.microphone_moved(move_m * direction(rng))
     tolerances = {"offset_samples": rng.uniform(-60, 60), "fan_db": rng.uniform(-0.4, 0.4), "gain_db": rng.uniform(-0.1, 0.1), "move_mm": 1e3 * move_m}
@@ -134,6 +134,19 @@ def draw_scene(rng: np.random.Generator, reference: Array, robot_over_fan_db: fl
     usual = Chain(reference, loudspeaker, ((0, 0, moved.response()),), noises[2] * 10 ** (tolerances["fan_db"] / 20))
     gain_after = gain * 10 ** (tolerances["gain_db"] / 20)
     return Scene(place, moved, shell, reference, delay, tolerances["offset_samples"], gain, gain_after, fan_power, amplitude, signals, usual, tolerances)
+
+
+def draw_shell(rng: np.random.Generator) -> Array:
+    """(128,) what the robot's own body does: reflections within 2 ms, and 4-10 dB less treble, as the microphone is not in front of the cone."""
+    turn, loss_db = rng.uniform(1200, 3000), rng.uniform(4, 10)
+    low = 10 ** (-loss_db / 20)
+    b, a = signal.bilinear([low, 2 * math.pi * turn], [1.0, 2 * math.pi * turn], RATE)
+    return signal.lfilter(b, a, np.pad(draw_body(rng), (0, 96)))
+
+
+def draw_hiss(rng: np.random.Generator) -> Array:
+    """(1025,) amplitude response of fan, air flow and microphone together on 0-8000 Hz, of unit power: the flow's hiss is 6-13 dB down and flat."""
+    return np.sqrt((draw_fan(rng) ** 2 + (hiss := 10 ** (-rng.uniform(6, 13) / 10))) / (1 + hiss))
 
 
 def with_distortion(loudspeaker: Loudspeaker, played: Array, path: Array, wanted: float) -> tuple[Loudspeaker, float]:
