@@ -19,6 +19,7 @@ sys.path.insert(0, str(BENCH))
 import hidden_acoustics as acoustics  # noqa: E402
 import hidden_cases  # noqa: E402
 import hidden_dynamics as dynamics  # noqa: E402
+import hidden_levels  # noqa: E402
 import hidden_robot  # noqa: E402
 from conversations import Clip  # noqa: E402
 from hidden_catalogue import CATALOGUE, ENR_DB, RANGES  # noqa: E402
@@ -205,6 +206,14 @@ def test_a_case_repeats_and_its_files_are_what_it_says(
         samples, rate = sf.read(tmp_path / "case" / f"{name}.flac")
         assert rate == RATE and np.abs(samples).max() < 1.0
         np.testing.assert_allclose(samples, signals[name], atol=2**-15)
+
+
+def test_levels_of_a_folder(scene: Scene, tmp_path: Path) -> None:
+    hidden_cases.write_case(tmp_path / "c", scene.signals | {"mic": scene.record(scene.usual)}, {})
+    figures = hidden_levels.measure(tmp_path / "c")
+    assert figures["recording over fan, dB"] == pytest.approx(27.0, abs=1.0) and figures["recording, s"] == 5.0
+    bands = [figures[f"recording over fan, {low}-{high} Hz, dB"] for low, high in hidden_levels.BANDS_HZ]
+    assert max(bands) > 27.0 > min(bands)  # the fan is the mean of its bands, and the babble has no treble
 
 
 def test_sets_hide_what_they_promise() -> None:
