@@ -258,14 +258,14 @@ def effect_check_fit_on_a_neutral_recording_stays_neutral(name: str) -> None:
 
 
 def effect_check_fit_explains_what_its_own_apply_made(name: str) -> None:
-    """Of what the effect puts over the fan on held-out samples, at most a tenth is left."""
+    """Of what the effect puts over the fan on held-out samples, at most a tenth is left, or LEFT_OVER."""
     if name not in EFFECT_CASES:
         return
     measurement, model = robot_alone(name, EFFECT_CASES[name], gain_db=0.0)
     before = held_out_power(measurement, model.predict(measurement.reference))
     after = held_out_power(measurement, model.fit(name, measurement).predict(measurement.reference))
     assert before > 2.0, f"the case is too weak to show anything: {before:.2f} times the fan"
-    assert after - 1.0 < 0.1 * (before - 1.0), f"residual power {before:.2f} -> {after:.2f} times the fan"
+    assert after - 1.0 < LEFT_OVER.get(name, 0.1) * (before - 1.0), f"residual power {before:.2f} -> {after:.2f} times the fan"
 
 
 EFFECT_CASES: dict[str, dict[str, object]] = {
@@ -273,8 +273,19 @@ EFFECT_CASES: dict[str, dict[str, object]] = {
     "speaker_nonlinearity": {"even": 0.1, "odd": -0.3, "force_factor": np.array([0.4, 0.2, 0.1]), "stiffness": -1.0},
     "clock_drift": {"ppm": -80.0, "offset": 3.5},
     "delay_jump": {"times_s": np.array([3.3, 8.1]), "samples": np.array([37.4, -61.0])},
+    "compression": {"threshold_db": -20.0, "ratio": 4.0, "attack_ms": 8.0, "release_ms": 200.0, "makeup_db": 3.0},
+    "mic_agc": {"gain_db": 3.0 * np.sin(np.arange(4 * SECONDS) / 5.0)},
     "mic_clipping": {"level": 0.15},
+    "rattle": {
+        "threshold": 0.02,
+        "resonance_hz": 210.0,
+        "outward": 0.004 * np.sin(np.arange(200) * 0.8) * np.exp(-np.arange(200) / 60),
+        "inward": 0.003 * np.cos(np.arange(200) * 0.6) * np.exp(-np.arange(200) / 40),
+    },
 }
 """A strength of each effect that its own fit has to find again."""
+
+LEFT_OVER = {"mic_agc": 0.25, "rattle": 0.4}
+"""The gain within held-out blocks is interpolated; knocks of a regular voice hardly tell resonance and threshold apart."""
 
 EFFECT_CHECKS = [check for name, check in sorted(globals().items()) if name.startswith("effect_check_")]

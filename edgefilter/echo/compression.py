@@ -8,18 +8,37 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 import scipy
 
-from edgefilter.echo.effect import Measurement, Parameter, Stage, Values, level_ratio
-from edgefilter.types import SAMPLE_RATE, Samples
+from edgefilter.echo.effect import Measurement, Parameter, Stage, Values, complete
+from edgefilter.echo.least_squares import Normal, normal_equations
+from edgefilter.types import SAMPLE_RATE, Array, Samples
 
 if TYPE_CHECKING:
     from edgefilter.echo.model import EchoModel
 
+EXCERPT = 8 * SAMPLE_RATE
+"""The loudest stretch of that many samples is fitted."""
+TAPS, LEAD = 8, 4
+"""Of the nuisance filter on the compressed prediction: what is linear, the make-up gain included."""
+THRESHOLDS_DB = (-2.0, -6.0, -11.0, -18.0)
+"""Starting points, relative to the loudest 20 ms of the reference."""
+RELEASES_MS = (60.0, 300.0)
+SILENT_DB = -80.0
+STEEPEST = 0.98
+ITERATIONS = 5
+UNKNOWNS = ("threshold_db", "slope", "attack", "release")
+NUDGE = np.array([0.5, 0.03, 0.15, 0.15])
+"""Steps of the numerical derivatives: dB, dB per dB, natural logarithms of times."""
+LARGEST = np.array([4.0, 0.3, 1.0, 1.0])
+LOWEST = np.array([-80.0, 0.0, np.log(0.3), np.log(5.0)])
+HIGHEST = np.array([0.0, STEEPEST, np.log(200.0), np.log(5000.0)])
+
 
 class Compression:
-    """Feed-forward compressor with a hard knee: above threshold the level rises by 1 / ratio dB per dB.
+    """Feed-forward compressor: above threshold the level rises by 1 / ratio dB per dB, over a knee, then make-up gain.
 
-    The level is the larger of two one-pole means of x^2, a fast one (attack) and the fast one smoothed on (release), so that it
-    rises with the attack and falls with the release time.
+    After Giannoulis, Massberg & Reiss 2012, "Digital dynamic range compressor design": the level is the mean square over the attack
+    time, in dB; the gain computer with a soft knee (their eq. 4) asks for a reduction; that rises at once and falls exponentially
+    with the release time, as in their decoupled peak detector (eq. 17).
     """
 
     name: ClassVar[str] = "compression"
@@ -28,36 +47,106 @@ class Compression:
     parameters: ClassVar[tuple[Parameter, ...]] = (
         Parameter("threshold_db", "dB re full scale", -20.0, -80.0, 0.0),
         Parameter("ratio", "dB/dB", 1.0, 1.0, 50.0),
-        Parameter("attack_s", "s", 0.01, 1e-4, 1.0),
-        Parameter("release_s", "s", 0.2, 1e-3, 5.0),
+        Parameter("attack_ms", "ms", 10.0, 0.1, 1000.0),
+        Parameter("release_ms", "ms", 200.0, 1.0, 5000.0),
+        Parameter("knee_db", "dB", 6.0, 0.0, 30.0),
+        Parameter("makeup_db", "dB", 0.0, -40.0, 40.0),
     )
 
     def apply(self, x: Samples, values: Values, sample_rate: int) -> Samples:
-        """x times the gain that its own level asks for."""
-        if float(values["ratio"]) == 1.0:
-            return x.copy()
-        fast = _one_pole(np.square(x, dtype=np.float64), float(values["attack_s"]), sample_rate)
-        level = np.maximum(fast, _one_pole(fast, float(values["release_s"]), sample_rate))
-        above = np.maximum(10.0 * np.log10(level + 1e-12) - float(values["threshold_db"]), 0.0)
-        gain_db = (1.0 / float(values["ratio"]) - 1.0) * above
-        return (x * 10.0 ** (gain_db / 20.0)).astype(np.float32)
+        """x (n,) times the gain that its own level asks for, times the make-up gain."""
+        slope, makeup = 1.0 - 1.0 / float(values["ratio"]), float(values["makeup_db"])
+        if slope == 0.0:
+            return x * np.float32(10.0 ** (makeup / 20.0))
+        keep = np.exp(-1.0 / (float(values["attack_ms"]) * 1e-3 * sample_rate))
+        power = scipy.signal.lfilter([1.0 - keep], [1.0, -keep], np.square(x, dtype=np.float64))
+        over = 10.0 * np.log10(power + 1e-12) - float(values["threshold_db"])
+        knee = float(values["knee_db"])
+        bent = np.clip(over + knee / 2, 0.0, knee) ** 2 / (2 * knee) if knee > 0.0 else 0.0
+        reduction = bent + np.maximum(over - knee / 2, 0.0)
+        held = _falling_peak(reduction, float(values["release_ms"]) * 1e-3 * sample_rate)
+        return (x * 10.0 ** ((makeup - slope * held) / 20.0)).astype(np.float32)
 
     def fit(self, measurement: Measurement, model: EchoModel) -> Values:
-        """The best of a grid of thresholds and ratios, with the usual attack and release and the best overall gain."""
-        x = measurement.reference
-        peak_db = 10.0 * np.log10(float(np.max(_one_pole(np.square(x, dtype=np.float64), 0.01, SAMPLE_RATE), initial=1e-12)) + 1e-12)
-        best, best_error = {"threshold_db": -20.0, "ratio": 1.0, "attack_s": 0.01, "release_s": 0.2}, np.inf
-        for below, ratio in product((3.0, 6.0, 9.0, 12.0, 18.0, 24.0), (1.0, 1.5, 2.0, 3.0, 5.0, 8.0)):
-            values = {**best, "threshold_db": float(np.clip(peak_db - below, -80.0, 0.0)), "ratio": ratio}
-            predicted = model.predict(self.apply(x, values, SAMPLE_RATE))
-            error = measurement.recording - level_ratio(measurement.recording, predicted) * predicted
-            power = float(np.dot(error, error))
-            if power < best_error:
-                best, best_error = values, power
-        return best
+        """Gauss-Newton in threshold, ratio, attack and release from the best of a coarse grid; a short filter takes up the linear rest.
+
+        No compression where four numbers do not pay for themselves by Bayes' information criterion.
+        """
+        part, fit = _loudest(measurement)
+        x, target = measurement.reference[part], measurement.whiten(measurement.recording[part])
+        blocks = np.square(x[: x.size // 320 * 320], dtype=np.float64).reshape(-1, 320).mean(axis=1)
+        loud_db = 10.0 * np.log10(float(np.max(blocks, initial=0.0)) + 1e-9)
+
+        def predict(unknowns: Array) -> Samples:
+            return measurement.whiten(model.predict(self.apply(x, complete(self, _values(unknowns)), SAMPLE_RATE)))
+
+        def left(predicted: Samples) -> float:
+            return normal_equations([predicted], target, TAPS, LEAD, fit).solve()[1]
+
+        plain = normal_equations([measurement.whiten(model.predict(x))], target, TAPS, LEAD, fit)
+        without = plain.solve()[1]
+        starts = [np.array([loud_db + below, 0.6, np.log(8.0), np.log(release)]) for below, release in product(THRESHOLDS_DB, RELEASES_MS)]
+        starts = [np.clip(start, LOWEST, HIGHEST) for start in starts]
+        costs = [left(predict(start)) for start in starts]
+        best, cost = starts[int(np.argmin(costs))], min(costs)
+        for _ in range(ITERATIONS if loud_db > SILENT_DB else 0):
+            best, now = _gauss_newton(best, cost, predict, left, target, fit)
+            if now > cost * (1.0 - 1e-3):
+                break
+            cost = now
+        worth = len(UNKNOWNS) * np.log(max(plain.count, 2)) * cost / max(plain.count, 1)
+        if without - cost <= worth or best[1] < 0.01:
+            return {"ratio": 1.0}
+        return {**_values(best), "makeup_db": self._makeup(measurement, model, _values(best))}
+
+    def _makeup(self, measurement: Measurement, model: EchoModel, values: Values) -> float:
+        """Least-squares gain over the whole recording, dB."""
+        predicted = measurement.whiten(model.predict(self.apply(measurement.reference, complete(self, values), SAMPLE_RATE)))
+        normal = normal_equations([predicted], measurement.whiten(measurement.recording), 1, 0, measurement.fit)
+        return float(np.clip(20.0 * np.log10(max(float(normal.solve()[0][0, 0]), 1e-2)), -40.0, 40.0))
 
 
-def _one_pole(x: np.ndarray, seconds: float, sample_rate: int) -> np.ndarray:
-    """Exponential mean with that time constant."""
-    keep = np.exp(-1.0 / (seconds * sample_rate))
-    return scipy.signal.lfilter([1.0 - keep], [1.0, -keep], x)
+def _falling_peak(x: Array, samples: float) -> Array:
+    """y(n) = max(x(n), y(n - 1) e^(-1 / samples)) for x >= 0, as a running maximum of ln x + n / samples."""
+    rise = np.arange(x.size) / samples
+    return np.exp(np.maximum.accumulate(np.log(x + 1e-12) + rise) - rise)
+
+
+def _values(unknowns: Array) -> dict[str, float]:
+    threshold, slope, attack, release = (float(u) for u in unknowns)
+    return {"threshold_db": threshold, "ratio": 1.0 / (1.0 - slope), "attack_ms": float(np.exp(attack)), "release_ms": float(np.exp(release))}
+
+
+def _loudest(measurement: Measurement) -> tuple[slice, np.ndarray]:
+    """The stretch with most energy, and its samples to fit on less the first half second, in which the level settles."""
+    x = measurement.reference
+    fit = np.ones(x.size, bool) if measurement.fit is None else measurement.fit
+    start = 0
+    if x.size > EXCERPT:
+        energy = np.concatenate(([0.0], np.cumsum(x.astype(np.float64) ** 2)))
+        start = int(np.argmax(energy[EXCERPT:] - energy[:-EXCERPT]))
+    part = slice(start, start + EXCERPT)
+    chosen = fit[part].copy()
+    if start:
+        chosen[: SAMPLE_RATE // 2] = False
+    return part, chosen
+
+
+def _gauss_newton(at: Array, cost: float, predict, left, target: Samples, fit: np.ndarray) -> tuple[Array, float]:
+    """One step, halved until it helps; the unknowns and cost that it reaches."""
+    base = predict(at)
+    nudge = np.where(at + NUDGE > HIGHEST, -NUDGE, NUDGE)
+    changes = [predict(at + nudge * unit) - base for unit in np.eye(at.size)]
+    use = np.zeros((1 + at.size, TAPS), bool)
+    use[0], use[1:, LEAD] = True, True
+    normal: Normal = normal_equations([base, *changes], target, TAPS, LEAD, fit)
+    weights, _ = normal.solve(1e-4, use)
+    gain = float(weights[0].sum()) or 1.0
+    step = np.clip(weights[1:, LEAD] / gain * nudge, -LARGEST, LARGEST)
+    for _ in range(3):
+        there = np.clip(at + step, LOWEST, HIGHEST)
+        now = left(predict(there))
+        if now < cost:
+            return there, now
+        step = step / 3.0
+    return at, cost

@@ -1,0 +1,98 @@
+"""The fan does not sound as it did at the calibration: another speed, another spectrum."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, ClassVar
+
+import numpy as np
+
+from edgefilter.echo.effect import ROUNDING_PSD, Measurement, Parameter, Stage, Values
+from edgefilter.echo.least_squares import absorbed
+from edgefilter.types import SAMPLE_RATE, Array, Samples
+
+if TYPE_CHECKING:
+    from edgefilter.echo.model import EchoModel
+
+SILENT_DB = -10.0
+"""A frame shows the fan alone where the predicted voice, whitened, is this far under it."""
+FEWEST_FRAMES = 12
+"""Half-overlapping frames of silence; with fewer, the quietest part of all frames at each frequency is taken."""
+QUIET_SHARE = 0.25
+LOWEST_DB, HIGHEST_DB = -60.0, 60.0
+SMOOTH = np.array([0.25, 0.5, 0.25])
+"""Over neighbouring bins of 13.3 Hz: a Hann frame's line is as wide."""
+
+
+class FanNoise:
+    """The fan's power spectrum is another by spectrum_db at each frequency; the voice itself is unchanged.
+
+    spectrum_db: (601,) on the profile's grid, 0 to 8 kHz, or one number. change_db only reports: the change of the fan's total power.
+    """
+
+    name: ClassVar[str] = "fan_noise"
+    stage: ClassVar[Stage] = "noise"
+    memoryless: ClassVar[bool] = True
+    parameters: ClassVar[tuple[Parameter, ...]] = (
+        Parameter("spectrum_db", "dB", 0.0, LOWEST_DB, HIGHEST_DB),
+        Parameter("change_db", "dB", 0.0, LOWEST_DB, HIGHEST_DB),
+    )
+
+    def apply(self, x: Samples, values: Values, sample_rate: int) -> Samples:
+        """x (n,) itself."""
+        return x.copy()
+
+    def noise_psd(self, values: Values, psd: Samples) -> Samples:
+        """The fan's PSD (601,) after the change, from psd (601,) before it."""
+        return (psd * 10.0 ** (np.asarray(values["spectrum_db"], float) / 10.0)).astype(np.float32)
+
+    def fit(self, measurement: Measurement, model: EchoModel) -> Values:
+        """Mean periodogram of the residual in the robot's silences over the calibrated PSD.
+
+        Where the robot is hardly ever silent, the mean of the quietest quarter of all frames at each frequency, divided by what that
+        share of an exponential distribution has as its mean (the idea of Martin 2001, "minimum statistics", without its tracking).
+        """
+        known = measurement.noise_psd
+        if known is None:
+            return {"spectrum_db": 0.0, "change_db": 0.0}
+        voice = absorbed(model.predict(measurement.reference), measurement.recording, measurement.fit)
+        size = 2 * (known.size - 1)
+        residual = _periodograms(measurement.recording - voice, size)
+        if not len(residual):
+            return {"spectrum_db": 0.0, "change_db": 0.0}
+        whole = _frames(measurement.weights, size).all(axis=1)
+        own = np.mean(_frames(measurement.whiten(voice), size) ** 2, axis=1)
+        silent = whole & (own < 10.0 ** (SILENT_DB / 10.0))
+        if silent.sum() >= FEWEST_FRAMES:
+            found = residual[silent].mean(axis=0)
+        else:
+            found = _quiet_mean(residual[whole] if whole.any() else residual)
+        floor = np.maximum(known.astype(np.float64), ROUNDING_PSD)
+        smooth = np.convolve(np.pad(found / floor, 1, mode="edge"), SMOOTH, "valid")
+        total = 10.0 * np.log10(np.sum(smooth * floor) / np.sum(floor) + 1e-30)
+        return {
+            "spectrum_db": np.clip(10.0 * np.log10(smooth + 1e-30), LOWEST_DB, HIGHEST_DB),
+            "change_db": float(np.clip(total, LOWEST_DB, HIGHEST_DB)),
+        }
+
+
+def _frames(x: Samples, size: int) -> Array:
+    """Half-overlapping frames (f, size) of x (n,)."""
+    if x.size < size:
+        return np.zeros((0, size), x.dtype)
+    return np.lib.stride_tricks.sliding_window_view(x, size)[:: size // 2]
+
+
+def _periodograms(x: Samples, size: int) -> Array:
+    """One-sided periodograms (f, size / 2 + 1), full scale^2/Hz, of Hann frames."""
+    window = np.hanning(size + 1)[:-1]
+    power = np.abs(np.fft.rfft(_frames(x, size) * window)) ** 2 / (SAMPLE_RATE * np.sum(window**2))
+    power[:, 1:-1] *= 2.0
+    return power
+
+
+def _quiet_mean(power: Array) -> Array:
+    """Mean (b,) of exponentially distributed power (f, b) from the lowest QUIET_SHARE of its values at each frequency."""
+    kept = max(int(QUIET_SHARE * len(power)), 1)
+    share = kept / len(power)
+    bias = 1.0 + (1.0 - share) * np.log1p(-share) / share if share < 1.0 else 1.0
+    return np.sort(power, axis=0)[:kept].mean(axis=0) / bias
