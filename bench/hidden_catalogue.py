@@ -88,9 +88,12 @@ def speaker_nonlinearity(rng: np.random.Generator, scene: Scene, chain: Chain, s
     if rng.random() < 0.5:
         path = scene.gain_after * signal.oaconvolve(chain.paths[0][2], scene.shell)
         wanted = scene.fan_power * 10 ** (ENR_DB[strength] / 10)
-        driver, _ = with_distortion(chain.loudspeaker, chain.played, path, wanted)
-        found_db = scene.over_fan_db(scene.echo(replace(chain, loudspeaker=driver)) - scene.echo(chain))
-        driver, _ = with_distortion(driver, chain.played, path, wanted * 10 ** ((ENR_DB[strength] - found_db) / 10))
+        for _ in range(4):
+            driver, _ = with_distortion(chain.loudspeaker, chain.played, path, wanted)
+            found_db = scene.over_fan_db(scene.echo(replace(chain, loudspeaker=driver)) - scene.echo(chain))
+            if abs(found_db - ENR_DB[strength]) < 0.5:
+                break
+            wanted *= 10 ** ((ENR_DB[strength] - found_db) / 10)
         return replace(chain, loudspeaker=driver), {"kind": "driver", "drive": driver.drive, "usual_drive": chain.loudspeaker.drive}
     hardness, skew = rng.uniform(1.8, 5.0), rng.uniform(0.8, 1.25)
     change_db = _played_change_db(scene, chain)
@@ -170,7 +173,8 @@ def path_change(rng: np.random.Generator, scene: Scene, chain: Chain, strength: 
         return scene.over_fan_db(signal.oaconvolve(source, np.pad(new, (0, size - new.size)) - np.pad(before, (0, size - before.size)))[:n])
 
     metres = solve(change_db, ENR_DB[strength], *{"head": (1e-3, 0.08), "robot": (2e-3, 0.5), "person": (0.08, 3.0)}[kind], tolerance=0.3)
-    return replace(chain, paths=(chain.paths[0], (start, fade, after(metres)))), {"time_s": start / RATE, "fade_s": fade / RATE, "kind": kind, "m": metres}
+    parameters = {"time_s": start / RATE, "fade_s": fade / RATE, "kind": kind, "m": metres}
+    return replace(chain, paths=(chain.paths[0], (start, fade, after(metres)))), parameters
 
 
 def clock_drift(rng: np.random.Generator, scene: Scene, chain: Chain, strength: str) -> tuple[Chain, dict]:

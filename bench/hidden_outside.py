@@ -23,8 +23,8 @@ Person = Callable[[np.random.Generator], Array]
 Disturbance = Callable[[np.random.Generator, Scene, Chain, str, Person], tuple[Chain, dict]]
 
 CODECS = {
-    "opus": ("libopus", RATE, ["-application", "voip"], ("ogg", "ogg"), (8, 10, 12, 16, 24)),
-    "mp3": ("libmp3lame", RATE, [], ("mp3", "mp3"), (8, 16, 24, 32)),
+    "opus": ("libopus", RATE, ["-application", "voip"], ("ogg", "ogg"), (8, 12, 16, 24, 32, 48)),
+    "mp3": ("libmp3lame", RATE, [], ("mp3", "mp3"), (8, 16, 24, 32, 48, 64)),
     "speex": ("libspeex", RATE, [], ("ogg", "ogg"), (4, 8, 16)),
     "gsm": ("libgsm", 8000, [], ("gsm", "gsm"), (13,)),
     "g726": ("g726", 8000, [], ("wav", "wav"), (16, 24, 32)),
@@ -128,7 +128,8 @@ def packet_loss(rng: np.random.Generator, scene: Scene, chain: Chain, strength: 
             played[part], lost, changed = new, lost + 1, changed + energy
         if changed > 0.9 * wanted:
             break
-    return replace(chain, played=played), {"lost_packets": lost, "packet_ms": length * 1000 // RATE, "filled_with": "repetition" if repeats else "silence"}
+    parameters = {"lost_packets": lost, "packet_ms": length * 1000 // RATE, "filled_with": "repetition" if repeats else "silence"}
+    return replace(chain, played=played), parameters
 
 
 def codec(rng: np.random.Generator, scene: Scene, chain: Chain, strength: str, _: Person) -> tuple[Chain, dict]:
@@ -154,9 +155,10 @@ def through_codec(x: Array, name: str, kbps: int) -> Array:
     quiet, raw = ["ffmpeg", "-v", "error", "-threads", "1"], ["-f", "f32le", "-ac", "1"]
     bits = [] if name == "gsm" else ["-b:a", f"{kbps}k"]
     pcm = signal.resample_poly(x, rate, RATE).astype(np.float32).tobytes()
-    packed = subprocess.run([*quiet, *raw, "-ar", str(rate), "-i", "-", "-c:a", encoder, *bits, *options, "-f", outer, "-"], input=pcm, capture_output=True, check=True)
-    out = subprocess.run([*quiet, "-f", inner, "-i", "-", *raw, "-ar", str(rate), "-"], input=packed.stdout, capture_output=True, check=True)
-    y = signal.resample_poly(np.frombuffer(out.stdout, np.float32).astype(np.float64), RATE, rate)
+    encode = [*quiet, *raw, "-ar", str(rate), "-i", "-", "-c:a", encoder, *bits, *options, "-f", outer, "-"]
+    packed = subprocess.run(encode, input=pcm, capture_output=True, check=True).stdout
+    out = subprocess.run([*quiet, "-f", inner, "-i", "-", *raw, "-ar", str(rate), "-"], input=packed, capture_output=True, check=True).stdout
+    y = signal.resample_poly(np.frombuffer(out, np.float32).astype(np.float64), RATE, rate)
     lags = signal.correlate(y[: 1 << 18], x[: 1 << 18], method="fft")
     lag = int(np.argmax(lags)) - min(x.size, 1 << 18) + 1
     y = y[lag:] if lag >= 0 else np.concatenate([np.zeros(-lag), y])

@@ -117,12 +117,14 @@ def draw_scene(rng: np.random.Generator, reference: Array, robot_over_fan_db: fl
     place, shell, amplitude = draw_place(rng, rng.uniform(0.18, 0.32)), draw_shell(rng), draw_hiss(rng)
     move_m = rng.uniform(1e-4, 9e-4)
     moved = place.microphone_moved(move_m * direction(rng))
-    tolerances = {"offset_samples": rng.uniform(-60, 60), "fan_db": rng.uniform(-0.4, 0.4), "gain_db": rng.uniform(-0.1, 0.1), "move_mm": 1e3 * move_m}
+    offset = rng.uniform(-60, 60)
+    tolerances = {"offset_samples": offset, "fan_db": rng.uniform(-0.4, 0.4), "gain_db": rng.uniform(-0.1, 0.1), "move_mm": 1e3 * move_m}
     excitation, delay = sweep(rng), rng.uniform(140, 700)
     paths = [signal.oaconvolve(p.response(), shell) for p in (place, moved)]
     straight = draw_loudspeaker(rng)
-    echo = signal.oaconvolve(straight.play(reference, linear=True), paths[0])[: reference.size]
-    peak = np.abs(signal.oaconvolve(straight.play(excitation, linear=True), paths[0])).max()
+    whole = signal.oaconvolve(straight.play(np.eye(1, 2048, 256)[0], linear=True), paths[0])
+    echo = signal.oaconvolve(reference, whole)[: reference.size]
+    peak = np.abs(signal.oaconvolve(excitation, whole)).max()
     gain = rng.uniform(0.25, 0.5) / peak
     fan_power = gain**2 * power(echo) * 10 ** (-robot_over_fan_db / 10)
     wanted = fan_power / gain**2 * 10 ** (rng.uniform(*FAINT_DB) / 10)
@@ -133,7 +135,7 @@ def draw_scene(rng: np.random.Generator, reference: Array, robot_over_fan_db: fl
     signals = {"sweep_ref": excitation, "sweep_mic": swept + noises[0], "fan_only": noises[1], "ref": reference}
     usual = Chain(reference, loudspeaker, ((0, 0, moved.response()),), noises[2] * 10 ** (tolerances["fan_db"] / 20))
     gain_after = gain * 10 ** (tolerances["gain_db"] / 20)
-    return Scene(place, moved, shell, reference, delay, tolerances["offset_samples"], gain, gain_after, fan_power, amplitude, signals, usual, tolerances)
+    return Scene(place, moved, shell, reference, delay, offset, gain, gain_after, fan_power, amplitude, signals, usual, tolerances)
 
 
 def draw_shell(rng: np.random.Generator) -> Array:
@@ -150,14 +152,14 @@ def draw_hiss(rng: np.random.Generator) -> Array:
 
 
 def with_distortion(loudspeaker: Loudspeaker, played: Array, path: Array, wanted: float) -> tuple[Loudspeaker, float]:
-    """The driver turned until what its nonlinearity adds behind this path has the wanted power, and the power reached; judged on 8 s."""
-    x = played[: 8 * RATE]
+    """The driver turned until what its nonlinearity adds behind this path has the wanted power, and the power reached; judged on 5 s."""
+    x = played[RATE : 6 * RATE]
     straight = loudspeaker.play(x, linear=True)
 
     def added(drive: float) -> float:
         return power(signal.oaconvolve(replace(loudspeaker, drive=drive).play(x) - straight, path)[: x.size])
 
     drive = 0.3
-    for _ in range(3):
-        drive = float(np.clip(drive * (wanted / added(drive)) ** 0.4, 1e-2, 30.0))
+    for _ in range(2):
+        drive = float(np.clip(drive * (wanted / added(drive)) ** 0.45, 1e-2, 30.0))
     return replace(loudspeaker, drive=drive), added(drive)

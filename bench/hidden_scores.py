@@ -152,7 +152,9 @@ def markdown(name: str, outcomes: Sequence[Outcome], summary: dict) -> str:
 
 def _effect_line(effect: str, row: dict) -> str:
     count = f"{row['top-1']['hits']} of {row['top-1']['n']}"
-    figures = [f"{row[key]:.1f}" for key in ("before_db", "after_db", "after_max_db")] + [f"{row['share_percent']:.0f}"] if "before_db" in row else [""] * 4
+    figures = [""] * 4
+    if "before_db" in row:
+        figures = [*(f"{row[key]:.1f}" for key in ("before_db", "after_db", "after_max_db")), f"{row['share_percent']:.0f}"]
     return "| " + " | ".join([effect, count, *figures]) + " |"
 
 

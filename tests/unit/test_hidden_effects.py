@@ -59,7 +59,8 @@ def test_what_counts_as_a_hit(case: Outcome, hit: bool, label: str) -> None:
 
 def test_summary_counts_by_strength_and_group() -> None:
     cases = [
-        *(outcome("rattle", "missing", "rattle"), outcome("rattle", "missing", "mic_agc", "rattle"), outcome("bandlimit", "explained", strength="near")),
+        *(outcome("rattle", "missing", "rattle"), outcome("rattle", "missing", "mic_agc", "rattle")),
+        outcome("bandlimit", "explained", strength="near"),
         *(outcome("none", "explained"), outcome("none", "missing", "rattle")),
         *(outcome("unknown", "explained"), outcome("unknown", "explained", excess_db=0.5), outcome("unknown", "unexplained")),
         outcome("bandlimit+rattle", "missing", "rattle", "bandlimit", "mic_agc"),
