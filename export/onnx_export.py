@@ -67,9 +67,9 @@ def load(path: Path) -> Trained:
         network = make(found["config"])
         network.load_state_dict(found["network"])
     except OSError as error:
-        raise ModelError(f"{path}: {error.strerror}; give a checkpoint that export/train.py wrote") from None
+        raise ModelError(f"{path}: {error.strerror}; give a checkpoint that training wrote") from None
     except Exception as error:
-        raise ModelError(f"{path} is no checkpoint of a network ({' '.join(str(error).split())[:120]}): give one that export/train.py wrote") from None
+        raise ModelError(f"{path} is no checkpoint of a network ({' '.join(str(error).split())[:120]}): give one that training wrote") from None
     training = {key: value for key, value in found.items() if key not in ("network", "config", "kind", "figures")}
     return Trained(network.eval(), training, found.get("figures", {}))
 
@@ -170,7 +170,7 @@ def _write_int8(network: nn.Module, path: Path) -> str:
 
 def main(argv: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m export.onnx_export", description="Convert a trained network to the ONNX file that the runtime loads.")
-    parser.add_argument("checkpoint", type=Path, help="what export/train.py wrote")
+    parser.add_argument("checkpoint", type=Path, help="best.pt of export/train.py or train_paper.py")
     parser.add_argument("--output", type=Path, required=True, metavar="FILE.onnx")
     parser.add_argument("--int8", action="store_true", help="also write FILE_int8.onnx where the network has an LSTM")
     parser.add_argument("--figures", type=Path, metavar="FILE.json", help="figures to write into the file, over those of the checkpoint")
