@@ -11,6 +11,7 @@ from edgefilter import engines
 from edgefilter.alignment import Aligner
 from edgefilter.canceller import Canceller, CancellerOutput
 from edgefilter.delay_line import Aligned
+from edgefilter.echo.driver import Driver
 from edgefilter.engines.base import ClipEngine, Engine
 from edgefilter.engines.ladder import CANDIDATES, Ladder, climbable
 from edgefilter.errors import EdgefilterError, SignalError, UsageError
@@ -42,7 +43,7 @@ class Front:
             self.aligner = Aligner(stft.hop, profile)
             self.canceller = self._make_canceller(profile)
             self.residual = Residual(stft, profile)
-        self._drive = profile.echo.drive if profile else lambda reference: reference
+        self._drive = profile.echo.driver() if profile else Driver()
         self._analyser = Analyser(stft, channels=4 if self.canceller else 2)
         self._nothing = np.zeros(stft.bins, np.float32)
         self._fan = profile.noise_bins(stft) if profile else self._nothing
@@ -76,7 +77,7 @@ class Front:
 
     def _subtract(self, mic: Samples, aligned: Aligned) -> CancellerOutput:
         if aligned.realigned:
-            self.canceller.rewrite_reference(self._drive(self.aligner.history(self.canceller.history)))
+            self.canceller.rewrite_reference(self._drive.rewritten(self.aligner.history(self.canceller.history), self.hop))
         return self.canceller.step(mic, self._drive(aligned.reference))
 
 

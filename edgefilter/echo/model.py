@@ -8,6 +8,7 @@ import numpy as np
 import scipy
 
 from edgefilter.echo import catalogue
+from edgefilter.echo.driver import Driver
 from edgefilter.echo.effect import STAGES, Measurement, Values, complete, find
 from edgefilter.types import SAMPLE_RATE, Samples
 
@@ -30,16 +31,9 @@ class EchoModel:
         """The robot's voice at the microphone (n,) for an aligned reference (n,), all effects applied."""
         return self._predict(reference, self.effects)
 
-    def drive(self, reference: Samples) -> Samples:
-        """The reference (n,) as the loudspeaker's linear part gets it: the source effects that need no past, so any block will do.
-
-        What has a memory (compression) or moves time (drift) is followed by the running filter instead.
-        """
-        for name, values in self.effects:
-            effect = find(name)
-            if effect.stage == "source" and effect.memoryless:
-                reference = effect.apply(reference, complete(effect, values), SAMPLE_RATE)
-        return reference
+    def driver(self) -> Driver:
+        """What the running filter puts the reference through, hop by hop, before the path: the source effects with a short memory."""
+        return Driver(self.effects)
 
     def components(self, reference: Samples) -> dict[str, Samples]:
         """What each part contributes, (n,) each: "linear", the path alone, then by how much each effect in turn changes it.

@@ -41,6 +41,7 @@ class Rattle:
     name: ClassVar[str] = "rattle"
     stage: ClassVar[Stage] = "source"
     memoryless: ClassVar[bool] = False
+    memory: ClassVar[int] = 1024
     parameters: ClassVar[tuple[Parameter, ...]] = (
         Parameter("threshold", "full scale", NEVER, 1e-5, NEVER),
         Parameter("resonance_hz", "Hz", 200.0, 20.0, 2000.0),

@@ -59,6 +59,8 @@ class _Guarded:
             self.noise_psd = effect.noise_psd
         if hasattr(effect, "variance"):
             self.variance = effect.variance
+        if hasattr(effect, "memory"):
+            self.memory = effect.memory
 
     def apply(self, x: Samples, values: Values, sample_rate: int) -> Samples:
         """The user's apply, its result checked for shape, type and finite values."""

@@ -58,3 +58,38 @@ def test_filters_are_fitted_only_where_they_pay():
     assert np.size(several["even"]) > 1
     # what the fan lets through of a filter that reaches to 1.5 kHz
     assert np.dot(several["even"][:9], late) == pytest.approx(np.dot(late, late), rel=0.25)
+
+
+@pytest.mark.parametrize("sizes", [[256], [1, 700, 13]])
+def test_driven_hop_by_hop_is_the_same_as_at_once(sizes):
+    x = robot_speech()[:20_000]
+    knocks = {"threshold": 0.01, "resonance_hz": 250.0, "outward": np.array([0.0, 0.01, -0.02])}
+    distortion = {"even": 0.3, "force_factor": np.array([0.5, 0.0, 0.4]), "stiffness": -2.0}
+    model = robot_model().with_effect("speaker_nonlinearity", distortion).with_effect("rattle", knocks).with_effect("playback_gain", {"gain_db": 2.0})
+    whole = x
+    for name, values in model.effects:
+        whole = effects.find(name).apply(whole, effects.complete(effects.find(name), values), 16_000)
+    driver, at, out = model.driver(), 0, []
+    while at < x.size:
+        size = sizes[len(out) % len(sizes)]
+        out.append(driver(x[at : at + size]))
+        at += size
+    # the resonance's ringing beyond 1024 samples is 60 dB below the float's last digit but for rounding
+    np.testing.assert_allclose(np.concatenate(out), whole, atol=1e-5)
+    assert np.std(whole - x) > 1e-2
+
+
+def test_driver_goes_on_after_its_past_was_rewritten():
+    x, model = robot_speech()[:8192], robot_model().with_effect("speaker_nonlinearity", {"stiffness": -2.0, "even": np.array([0.0, 0.3])})
+    driver = model.driver()
+    driver(np.full(256, 0.3, np.float32))
+    history = driver.rewritten(x[:4096], 256)
+    again = [driver(x[at : at + 256]) for at in range(4096 - 256, x.size, 256)]
+    whole = model.driver()(x)
+    np.testing.assert_allclose(history, whole[:4096], atol=1e-6)
+    np.testing.assert_allclose(np.concatenate(again), whole[4096 - 256 :], atol=1e-6)
+
+
+def test_compression_is_not_driven_since_it_remembers_seconds():
+    x = robot_speech()[:4096]
+    assert np.array_equal(robot_model().with_effect("compression", {"ratio": 5.0, "threshold_db": -40.0}).driver()(x), x)
