@@ -185,8 +185,24 @@ def test_an_engine_far_too_slow_is_given_up_in_time():
 
     hop = np.zeros(256, np.float32)
     took = pace(Stream(Slow()), iter([(hop, hop)] * 300), 300, 0.3)
-    assert 1 <= len(took) <= 6
+    assert 1 <= len(took) <= 6  # 50 ms each
     assert not fits(replace(Figures("x", "", 16.0, 300, True, 1, 1, 1, 1, 1, 1), complete=False), 8.0)
+
+
+def test_measuring_an_engine_far_too_slow_ends_in_time_and_does_not_fit(monkeypatch):
+    class Slow(Bypass):
+        steps = 0
+
+        def step(self, frame, state):
+            Slow.steps += 1
+            time.sleep(0.03)
+            return super().step(frame, state)
+
+    for name, limit in (("WARM_UP_S", 0.1), ("PACED_S", 0.2), ("AT_ONCE_S", 0.1)):
+        monkeypatch.setattr(budget, name, limit)
+    figures = measure(Slow())
+    assert not figures.complete and Slow.steps <= 4 + 7 + 4 and figures.paced_p50_ms >= 30
+    assert not fits(figures, 1000.0)
 
 
 def test_the_measurement_is_held_to_the_cores_and_lets_go_afterwards():
