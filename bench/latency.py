@@ -1,6 +1,6 @@
 """Latency and cost of the whole path, per hop, beside SpeexDSP and WebRTC AEC3; writes JSON, a Markdown page and a picture.
 
-    python bench/latency.py --output bench/results/latency                  (about 15 minutes; leave the machine alone meanwhile)
+    python bench/latency.py --output bench/results/latency                  (20 minutes; leave the machine alone meanwhile)
     python bench/latency.py --output /tmp/latency --quick                   (a minute, coarse)
 
 Every measurement is a process of its own, held to two cores. Contenders take turns, in reversed order every other round, so that a change of
@@ -132,7 +132,7 @@ def curves(names: Sequence[str], seconds: float, tails: Sequence[int], hops: Seq
         found["tail"].append({"x": taps, **summary([run_hops("ss", seconds, False, taps=taps)])})
     for hop in hops:
         found["hop"].append({"x": hop, **summary([run_hops("ss", seconds, False, hop=hop)])})
-    for model in models if "crnn" in names else ():
+    for model in sorted(models, key=lambda file: file.stat().st_size) if "crnn" in names else ():
         found["model"].append({"x": model.stat().st_size, "name": model.name, **summary([run_hops("crnn", seconds, False, model=model)])})
     return found
 
@@ -148,9 +148,11 @@ def main() -> None:
     args = parser.parse_args()
     names, missing = contenders()
     seconds, rounds, threads, repeats = (1.0, 1, (1,), 1) if args.quick else (args.seconds, args.rounds, (1, 2), 5)
+    before = os.getloadavg()[0]
     ours = [name for name in names if name not in PEERS]
     result = {
-        "machine": {**machine(), "threads": "1 and 2", "cores": f"{CORES} of {os.cpu_count()}", "kernel": platform.release(), "system": platform.system()},
+        "machine": {**machine(), "threads": "1 and 2", "cores": f"{CORES} of {os.cpu_count()}", "kernel": platform.release(), "system": platform.system(),
+                    "load average before": f"{before:.2f}"},
         "seconds": seconds, "rounds": rounds, "missing": missing,
         "rows": matrix(names, seconds, rounds, threads, (False, True)),
         "curves": curves(names, min(seconds, 8.0), *((TAILS[-1:], HOPS[-1:]) if args.quick else (TAILS, HOPS)), args.models),

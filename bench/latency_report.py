@@ -103,15 +103,14 @@ def _curves(curves: dict[str, list[dict]]) -> list[str]:
 
 
 def draw(result: dict, path: Path) -> None:
-    """Distributions of the paced hop, idle and busy, and the curves."""
+    """Distributions of the paced hop, idle and busy, what it is made of, and the curves."""
     import matplotlib
 
     matplotlib.use("Agg")
     from matplotlib import pyplot as plt
 
-    panels = [axis for axis in ("tail", "hop", "model") if result["curves"][axis]]
-    figure, axes = plt.subplots(1, 2 + len(panels), figsize=(5 * (2 + len(panels)), 4.2), layout="constrained")
-    for axis, busy in zip(axes, (False, True)):
+    figure, axes = plt.subplots(2, 3, figsize=(15, 8.4), layout="constrained")
+    for axis, busy in zip(axes[0], (False, True)):
         for number, (name, row) in enumerate(_find(result["rows"], True, busy).items()):
             percent = [float(key) for key in row["quantiles"]]
             axis.plot([max(100 - p, 0.05) for p in percent], list(row["quantiles"].values()), color=f"C{number}", label=name, lw=1.2)
@@ -119,12 +118,27 @@ def draw(result: dict, path: Path) -> None:
         axis.invert_xaxis()
         axis.axhline(16, color="0.6", lw=0.8, ls=":")
         axis.grid(alpha=0.3)
-    axes[0].legend(fontsize=8)
-    titles = {"tail": "taps of the linear stage", "hop": "hop, samples", "model": "model file, bytes"}
-    for axis, panel in zip(axes[2:], panels):
-        x = [row["x"] for row in result["curves"][panel]]
+    axes[0, 0].legend(fontsize=8, loc="best")
+    _draw_stages(axes[0, 2], _find(result["rows"], True))
+    titles = {"tail": "taps of the linear stage", "hop": "hop, samples", "model": "model file, MB"}
+    for axis, (panel, title) in zip(axes[1], titles.items()):
+        x = [row["x"] / (1e6 if panel == "model" else 1) for row in result["curves"][panel]]
         axis.plot(x, [100 * row["real_time_factor"] for row in result["curves"][panel]], "o-", color="C0")
-        axis.set(title=f"cost over {panel}", xlabel=titles[panel], ylabel="% of one core", ylim=(0, None))
+        axis.set(title=f"cost over {panel}" if x else f"cost over {panel}: not measured", xlabel=title, ylabel="% of one core", ylim=(0, None))
         axis.grid(alpha=0.3)
-    figure.savefig(path, dpi=110)
+    figure.savefig(path, dpi=100)
     plt.close(figure)
+
+
+def _draw_stages(axis: object, found: dict[str, dict]) -> None:
+    """Mean ms of each stage, stacked, an engine a bar."""
+    names = [name for name, row in found.items() if row["stages"]]
+    bottom = np.zeros(len(names))
+    for stage in max((found[name]["stages"] for name in names), key=len):
+        parts = [found[name]["stages"].get(stage) for name in names]
+        heights = [part["mean"] * part["hops"] / found[name]["hops"] if part else 0.0 for part, name in zip(parts, names)]
+        axis.bar(names, heights, bottom=bottom, label=stage)
+        bottom += heights
+    axis.bar(names, np.array([found[name]["mean"] for name in names]) - bottom, bottom=bottom, label="rest", color="0.8")
+    axis.set(title="what a paced hop is made of", ylabel="mean ms per hop")
+    axis.legend(fontsize=8, loc="upper left")
