@@ -6,19 +6,24 @@ from collections import deque
 
 import numpy as np
 
+from edgefilter.announced import AHEAD, Announcements
 from edgefilter.delay_line import HALF_WIDTH, Aligned, Tape, read_delayed, read_line
 from edgefilter.delay_tracker import STRIDE, DelayMeter, DriftFilter, Measurement
 from edgefilter.echo.model import PRE_ROLL
-from edgefilter.lag_search import Candidate, LagSearch
+from edgefilter.lag_search import BETWEEN, MINIMUM, WINDOW, Candidate, LagSearch
 from edgefilter.profile import Profile
 from edgefilter.types import SAMPLE_RATE, Samples
 from edgefilter.utterances import OnsetDetector, Utterance
 
-SEARCH_STRIDE = 1024
+SEARCH_STRIDE = 768
 """Samples between two searches of the whole range."""
-CERTAIN, LIKELY = (10.0, 2.0), (11.5, 1.8)
-"""(strength, ratio) at which one search decides, and at which two that agree do. Beside a human as loud as the robot the true lag
-has 18 and 4 after 150 ms; the strongest wrong peak in minutes of real speech had 10.8 and 1.7, in successive windows alike."""
+CERTAIN, CERTAIN_EARLY, EARLY = 30.0, 20.0, 1408
+"""A search's strength times ratio that decides, and what does for a lag at which at most EARLY samples have been heard: they are few,
+so chance has less to choose from. Beside a human as loud as the robot the true lag has a median of 40 after 60 ms, and 150 after
+150 ms; chance, in an hour of other speech while the reference played unheard, 26, and 14 early."""
+SEEN = 5.0
+"""Strength that a lag at which more than a window of the utterance must have been heard already has to show in the window before as
+well; then CERTAIN_EARLY is enough. True lags have 10 there, chance 3.3."""
 HEARD = 6.0
 """Strength of the tracker's peak over the rms of +-REACH lags from which a measurement counts."""
 FAR, EDGE = 8.0, 960.0
@@ -63,32 +68,39 @@ class Aligner:
         self._meter = DelayMeter(self._response, PRE_ROLL)
         self._drift = DriftFilter()
         self._open: deque[Utterance] = deque(maxlen=32)
-        self._last_candidate: Candidate | None = None
+        self._announced, self._expected = Announcements(), None
+        self._found: Candidate | None = None
         self._suspect: float | None = None
-        self._to_search, self._to_measure = SEARCH_STRIDE, STRIDE // 2
+        self._to_search, self._to_measure, self._stage = SEARCH_STRIDE, STRIDE // 2, 0
         self._read_at = float("nan")
         self._gain: float | None = None
         self._refuted = self._trusted = self._measured = False
         self._confidence, self._lost = 0.0, 0
-        self._counts = {"utterances": 0, "realignments": 0, "jumps": 0, "searches": 0, "announced": 0}
+        self._counts = {"utterances": 0, "realignments": 0, "jumps": 0, "searches": 0, "announced": 0, "announced_heard": 0}
 
     @property
     def _known(self) -> bool:
         return self._drift.delay == self._drift.delay
 
     def announce(self, utterance: Samples) -> None:
-        """Say what will be played (n,); it may begin at any time or never. The reference comes before the microphone
-        hears it, so that nothing more is needed than to count it."""
+        """Say what will be played (n,); it may begin at any time or never, and several are played in the order of announcing.
+
+        While the reference channel carries sound, that is the reference and announcements are dropped. While it is silent, the
+        announced utterance is looked for in the microphone for 30 s, and from where it is heard on it is the reference.
+        """
         self._counts["announced"] += 1
+        self._announced.add(utterance)
 
     def step(self, mic: Samples, ref: Samples) -> Aligned:
         """Take the next hop (hop,) of microphone and reference."""
+        ref = self._announced.reference(ref, self._ref.end)
         self._mic.push(mic)
         self._ref.push(ref)
         started = self._onsets.step(ref)
         if started:
             self._open.append(started)
             self._counts["utterances"] += 1
+            self._stage, self._expected = 0 if self._expected else self._stage, None
         self._expire()
         before = self._read_at
         self._measured = False
@@ -113,6 +125,8 @@ class Aligner:
 
     def _state(self) -> str:
         current = self._onsets.current
+        if self._expected is not None:
+            return "searching"
         audible = self._max_lag if not self._known else int(self._drift.delay) + SAMPLE_RATE // 4
         if self._open and (self._known or current.end + audible > self._ref.end):
             return "searching"
@@ -130,22 +144,51 @@ class Aligner:
     def _resolve(self, found: bool = True) -> None:
         self._open.popleft()
         self._trusted = found
-        self._last_candidate = None
+        self._stage = 0
         self._refuted = False
 
     def _search(self) -> bool:
-        """Now and then look for the oldest unresolved utterance over all lags; True if the delay was switched."""
+        """Look for the oldest unresolved utterance over all lags, a step each hop; True if the delay was switched.
+
+        Where there is none, one that was announced is looked for."""
         self._to_search -= self.hop
-        if not self._open or self._to_search > 0 or self._measured:
+        if self._measured or (self._stage == 0 and self._to_search > 0):
             return False
-        self._to_search = SEARCH_STRIDE
-        self._counts["searches"] += 1
-        oldest = self._open[0]
-        heard_out = oldest.after + int(self._drift.delay) if self._trusted else oldest.start
-        found = self._lags.find(self._mic, self._ref, self._ref.end, oldest.start, heard_out)
-        last, self._last_candidate = self._last_candidate, found
-        if found is None or not self._decided(found, last):
+        now, stage = self._ref.end, self._stage
+        if stage == 0:
+            self._expected = None if self._open else self._announced.expected(now)
+            if not self._open and self._expected is None:
+                return False
+            self._to_search, self._stage = SEARCH_STRIDE, 1
+            self._counts["searches"] += 1
+            since = self._open[0].start if self._open else self._expected.start
+            self._lags.prepare(self._expected or self._ref, now, since)
+        elif stage == 1:
+            self._stage = 2
+            heard_out = self._open[0].after + int(self._drift.delay) if self._open and self._trusted else 0
+            self._lags.listen(self._mic, now, heard_out)
+        elif stage == 2:
+            self._stage = 0
+            self._found = self._lags.find()
+            return self._found is not None and self._decide(self._found)
+        else:
+            self._stage = 0
+            return self._lags.before(self._mic, self._expected or self._ref, self._found) > SEEN and self._take(self._found)
+        return False
+
+    def _decide(self, found: Candidate) -> bool:
+        """Take the candidate if it is beyond chance, or have the window before looked at; True if the delay was switched."""
+        evidence = found.strength * found.ratio
+        if found.heard > WINDOW + BETWEEN + MINIMUM and evidence > CERTAIN_EARLY:
+            self._stage = 3
             return False
+        enough = CERTAIN_EARLY if found.heard <= EARLY else CERTAIN
+        return evidence > enough and found.heard <= WINDOW and self._take(found)
+
+    def _take(self, found: Candidate) -> bool:
+        """Believe a candidate; True if the delay was switched."""
+        if self._expected is not None:
+            return self._begin(self._expected.start + found.lag)
         was_refuted = self._refuted
         self._resolve()
         self._confidence = min(found.strength / 20.0, 1.0)
@@ -153,12 +196,13 @@ class Aligner:
             return was_refuted
         return self._switch(float(found.lag), 3.0)
 
-    @staticmethod
-    def _decided(found: Candidate, last: Candidate | None) -> bool:
-        if found.strength > CERTAIN[0] and found.ratio > CERTAIN[1]:
-            return True
-        likely = found.strength > LIKELY[0] and found.ratio > LIKELY[1]
-        return likely and last is not None and abs(found.lag - last.lag) < 8
+    def _begin(self, heard_at: int) -> bool:
+        """What was announced is heard since heard_at: from now on it is the reference."""
+        playback, now = self._announced.begin(heard_at), self._ref.end
+        self._counts["announced_heard"] += 1
+        self._ref.rewrite(playback.start, playback.read(playback.start, now))
+        self._onsets.current = Utterance(playback.start, now)
+        return self._switch(float(AHEAD), 3.0)
 
     def _switch(self, delay: float, deviation: float) -> bool:
         self._drift.restart(delay, deviation)

@@ -83,6 +83,8 @@ class Canceller:
                 raise SignalError("the canceller's impulse response is not a finite (n,) array: calibrate again")
             known = min(self.taps, impulse_response.size)
             self._initial[:known] = impulse_response[:known]
+        self._channels = 3 if nonlinear else 1
+        self._first = [0, self.partitions, self.partitions + PRODUCT_PARTITIONS][: self._channels]
         self._lowpass = _butterworth(DISPLACEMENT_HZ, DISPLACEMENT_TAPS)
         self.reset()
 
@@ -94,20 +96,16 @@ class Canceller:
     def reset(self) -> None:
         """Back to the start: the calibrated path, or none."""
         hop, bins = self.hop, self.hop + 1
-        shape = (self.partitions, bins)
-        self._weights = fft.rfft(self._initial.reshape(self.partitions, hop), 2 * hop).astype(np.complex64)
-        self._doubt = self._prior()
+        products = PRODUCT_PARTITIONS * (self._channels - 1)
+        shape = (self.partitions + products, bins)
+        self._weights = np.zeros(shape, np.complex64)
+        self._weights[: self.partitions] = fft.rfft(self._initial.reshape(self.partitions, hop), 2 * hop)
+        product_doubt = np.broadcast_to(PRODUCT_DOUBT * self._path_power(), (products, bins))
+        self._doubt = np.concatenate((self._prior(), product_doubt)).astype(np.float32)
         self._ageing = (1.0 - TRANSITION**2) * self._doubt
-        self._recent = np.zeros(2 * hop, np.float32)
-        self._spectra = np.zeros((2 * self.partitions, bins), np.complex64)
-        self._powers = np.zeros((2 * self.partitions, bins), np.float32)
-        self._newest = 0
-        products = (2, PRODUCT_PARTITIONS, bins) if self.nonlinear else (0, PRODUCT_PARTITIONS, bins)
-        self._product_weights = np.zeros(products, np.complex64)
-        self._product_doubt = np.broadcast_to(PRODUCT_DOUBT * self._path_power(), products).astype(np.float32)
-        self._product_ageing = (1.0 - TRANSITION**2) * self._product_doubt
-        self._product_recent = np.zeros((products[0], 2 * hop), np.float32)
-        self._product_spectra = np.zeros(products, np.complex64)
+        self._recent = np.zeros((self._channels, 2 * hop), np.float32)
+        self._spectra, self._older_spectra = np.zeros((2, *shape), np.complex64)
+        self._powers, self._older_powers = np.zeros((2, *shape), np.float32)
         self._moving = np.zeros(DISPLACEMENT_TAPS - 1, np.float32)
         self._noise = np.zeros(bins, np.float32)
         self._work = np.zeros(shape, np.complex64)
@@ -119,17 +117,11 @@ class Canceller:
 
     def step(self, mic: Samples, reference: Samples) -> CancellerOutput:
         """Cancel one hop: mic, reference (hop,) float32, neither written to."""
-        spectra, powers = self._push(reference)
-        np.multiply(self._weights, spectra, out=self._work)
+        self._push(reference)
+        np.multiply(self._weights, self._spectra, out=self._work)
         predicted = self._work.sum(axis=0)
-        np.multiply(self._doubt, powers, out=self._expected)
+        np.multiply(self._doubt, self._powers, out=self._expected)
         misalignment = self._expected.sum(axis=0)
-        products = None
-        if self.nonlinear:
-            self._push_products(reference)
-            predicted += (self._product_weights * self._product_spectra).sum(axis=(0, 1))
-            products = self._product_doubt * _power(self._product_spectra)
-            misalignment += products.sum(axis=(0, 1))
         echo = fft.irfft(predicted, 2 * self.hop)[self.hop :].astype(np.float32, copy=False)
         echo = self._follow_gain(mic, echo)
         echo, phantom = self._without_phantom(mic, echo)
@@ -142,7 +134,7 @@ class Canceller:
         self._hops += 1
         if np.dot(reference, reference) > SILENCE * self.hop and not phantom:
             self._active += 1
-            self._adapt(spectra, error_spectrum, 1.0 / (misalignment + 2.0 * self._noise + 1e-12), products)
+            self._adapt(error_spectrum, 1.0 / (misalignment + 2.0 * self._noise + 1e-12))
         return CancellerOutput(echo, error, 0.5 * misalignment)
 
     def _follow_gain(self, mic: Samples, echo: Samples) -> Samples:
@@ -158,7 +150,6 @@ class Canceller:
             return echo
         self._correlation[:] = 0.0
         self._weights *= np.float32(factor)
-        self._product_weights *= np.float32(factor)
         self.gain *= factor
         return echo * np.float32(factor)
 
@@ -175,23 +166,19 @@ class Canceller:
         self._fade = gain
         return echo, phantom
 
-    def _push(self, reference: Samples) -> tuple[np.ndarray, np.ndarray]:
-        """Spectra and powers (partitions, bins) of the last reference blocks, the newest first, as views."""
-        self._recent[: self.hop] = self._recent[self.hop :]
-        self._recent[self.hop :] = reference
-        spectrum = fft.rfft(self._recent)
-        self._newest = (self._newest - 1) % self.partitions
-        at, last = self._newest, self._newest + self.partitions
-        self._spectra[at] = self._spectra[last] = spectrum
-        self._powers[at] = self._powers[last] = _power(spectrum)
-        return self._spectra[at:last], self._powers[at:last]
-
-    def _push_products(self, reference: Samples) -> None:
-        """The same for d x and d^2 x."""
-        self._product_recent[:, : self.hop] = self._product_recent[:, self.hop :]
-        self._product_recent[:, self.hop :] = self._products(reference)
-        self._product_spectra[:, 1:] = self._product_spectra[:, :-1].copy()
-        self._product_spectra[:, 0] = fft.rfft(self._product_recent, axis=1)
+    def _push(self, reference: Samples) -> None:
+        """Take the reference's next hop into the spectra and powers (partitions, bins), the newest first in each channel."""
+        self._recent[:, : self.hop] = self._recent[:, self.hop :]
+        self._recent[0, self.hop :] = reference
+        if self.nonlinear:
+            self._recent[1:, self.hop :] = self._products(reference)
+        fresh = fft.rfft(self._recent, axis=1)
+        self._spectra, self._older_spectra = self._older_spectra, self._spectra
+        self._powers, self._older_powers = self._older_powers, self._powers
+        self._spectra[1:] = self._older_spectra[:-1]
+        self._powers[1:] = self._older_powers[:-1]
+        self._spectra[self._first] = fresh
+        self._powers[self._first] = _power(fresh)
 
     def _products(self, reference: Samples) -> np.ndarray:
         """(2, n) of the next n samples of the reference; carries the membrane's state on."""
@@ -201,30 +188,23 @@ class Canceller:
         first = moved * reference
         return np.stack((first, moved * first))
 
-    def _adapt(self, spectra: np.ndarray, error_spectrum: np.ndarray, divisor: np.ndarray, products: np.ndarray | None) -> None:
+    def _adapt(self, error_spectrum: np.ndarray, divisor: np.ndarray) -> None:
         """Kalman correction of weights and covariance, Enzner & Vary (2006), eq. (30)-(34)."""
-        step = error_spectrum * divisor
-        np.conjugate(spectra, out=self._work)
+        np.conjugate(self._spectra, out=self._work)
         self._work *= self._doubt
-        self._work *= step
-        self._constrain(self._work)
-        self._weights += self._work
-        shrink = -0.5 * divisor
-        _age(self._doubt, self._expected, shrink, self._ageing)
-        if products is not None:
-            update = self._product_spectra.conj() * self._product_doubt * step
-            self._constrain(update)
-            self._product_weights += update
-            _age(self._product_doubt, products, shrink, self._product_ageing)
-
-    def _constrain(self, update: np.ndarray) -> None:
-        """Keep each partition's update (..., bins) to hop taps (Shynk 1992)."""
-        taps = fft.irfft(update, 2 * self.hop, axis=-1)
-        update[:] = fft.rfft(taps[..., : self.hop], 2 * self.hop, axis=-1)
+        self._work *= error_spectrum * divisor
+        taps = fft.irfft(self._work, 2 * self.hop, axis=1)
+        taps[:, self.hop :] = 0.0  # each partition keeps to hop taps (Shynk 1992)
+        self._weights += fft.rfft(taps, axis=1)
+        self._expected *= -0.5 * divisor
+        self._expected += 1.0
+        self._doubt *= self._expected
+        self._doubt *= np.float32(TRANSITION**2)
+        self._doubt += self._ageing
 
     def _path_power(self) -> np.ndarray:
         """(bins,) |H|^2 of the path at the start, summed over partitions; 1 where nothing is known."""
-        return _power(self._weights).sum(axis=0) if self._warm else np.ones(self.hop + 1, np.float32)
+        return _power(self._weights[: self.partitions]).sum(axis=0) if self._warm else np.ones(self.hop + 1, np.float32)
 
     def _prior(self) -> np.ndarray:
         """(partitions, bins) covariance before anything was heard."""
@@ -232,11 +212,11 @@ class Canceller:
         decay = 10.0 ** (-6.0 * seconds / DECAY_RT60_S)[:, None] * np.ones(self.hop + 1)
         if not self._warm:
             return (decay / decay.sum(axis=0)).astype(np.float32)
-        return (WARM_DOUBT * _power(self._weights) + LATE_DOUBT * decay * self._path_power()).astype(np.float32)
+        return (WARM_DOUBT * _power(self._weights[: self.partitions]) + LATE_DOUBT * decay * self._path_power()).astype(np.float32)
 
     def impulse_response(self) -> Samples:
         """The adapted path (taps,) float32, to be written back into a profile."""
-        return fft.irfft(self._weights, axis=1)[:, : self.hop].reshape(-1).astype(np.float32)
+        return fft.irfft(self._weights[: self.partitions], axis=1)[:, : self.hop].reshape(-1).astype(np.float32)
 
     def rewrite_reference(self, history: Samples) -> None:
         """Replace the past of the reference after a realignment.
@@ -250,19 +230,16 @@ class Canceller:
         if count:
             known[wanted - count :] = history[history.size - count :]
         past = known[: wanted - self.hop]
-        blocks = np.lib.stride_tricks.sliding_window_view(past, 2 * self.hop)[:: self.hop][::-1]
-        spectra = fft.rfft(blocks, axis=1)[: self.partitions]
-        self._spectra[: self.partitions] = self._spectra[self.partitions :] = spectra
-        self._powers[:] = _power(self._spectra)
-        self._newest = 0
-        self._recent[:] = past[-2 * self.hop :]
+        channels = [past]
         if self.nonlinear:
             self._moving = np.zeros(DISPLACEMENT_TAPS - 1, np.float32)
-            products = self._products(past)
-            for part in range(PRODUCT_PARTITIONS):
-                end = past.size - part * self.hop
-                self._product_spectra[:, part] = fft.rfft(products[:, max(end - 2 * self.hop, 0) : end], 2 * self.hop, axis=1)
-            self._product_recent[:] = products[:, -2 * self.hop :]
+            channels += list(self._products(past))
+        for first, channel in zip(self._first, channels, strict=True):
+            count = PRODUCT_PARTITIONS if first else self.partitions
+            blocks = np.lib.stride_tricks.sliding_window_view(channel, 2 * self.hop)[:: self.hop][::-1]
+            self._spectra[first : first + count] = fft.rfft(blocks[:count], axis=1)
+        self._powers[:] = _power(self._spectra)
+        self._recent[:] = [channel[-2 * self.hop :] for channel in channels]
 
     def stats(self) -> dict[str, float]:
         """What the stage did so far."""
@@ -281,11 +258,3 @@ def _power(spectrum: np.ndarray) -> np.ndarray:
     """|spectrum|^2 without the square root of abs."""
     return spectrum.real**2 + spectrum.imag**2
 
-
-def _age(doubt: np.ndarray, expected: np.ndarray, shrink: np.ndarray, ageing: np.ndarray) -> None:
-    """Covariance after one observation and one hop of time, in place; expected is overwritten."""
-    expected *= shrink
-    expected += 1.0
-    doubt *= expected
-    doubt *= TRANSITION**2
-    doubt += ageing

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
@@ -49,6 +50,11 @@ class Tape:
         self._at += samples.size
         self.end += samples.size
 
+    def rewrite(self, start: int, samples: Samples) -> None:
+        """Replace what is kept from position start on by samples (n,), which may reach neither before it nor beyond the end."""
+        offset = self._at - self.end + start
+        self._data[offset : offset + samples.size] = samples
+
     def read(self, start: int, stop: int) -> Samples:
         """Samples start..stop-1 (stop - start,), a view where possible; zeros after the end and before what is kept."""
         oldest = self.end - self._capacity
@@ -86,10 +92,15 @@ def read_delayed(tape: Tape, stop: int, count: int, delay_from: float, delay_to:
     whole = int(np.floor(middle))
     kernels = delay_kernel(np.array([delay_from, middle, delay_to]) - whole)
     source = tape.read(stop - count - whole - HALF_WIDTH, stop - whole + HALF_WIDTH - 1)
-    filtered = sliding_window_view(source, 2 * HALF_WIDTH) @ kernels[:, ::-1].T
+    filtered = kernels[:, ::-1] @ np.ascontiguousarray(sliding_window_view(source, count))
+    return np.einsum("ij,ij->j", filtered, _parabola(count))
+
+
+@lru_cache(maxsize=8)
+def _parabola(count: int) -> Array:
+    """(3, count) weights of the values at the start, middle and end of count samples."""
     u = np.arange(1, count + 1, dtype=np.float32) / np.float32(count)
-    weights = np.stack(((2 * u - 1) * (u - 1), 4 * u * (1 - u), u * (2 * u - 1)), axis=1)
-    return np.einsum("ij,ij->i", filtered, weights)
+    return np.stack(((2 * u - 1) * (u - 1), 4 * u * (1 - u), u * (2 * u - 1)))
 
 
 def read_line(tape: Tape, stop: int, count: int, delay: float, slope: float, chunk: int = 256) -> Samples:

@@ -1,4 +1,4 @@
-"""Search of the whole range of lags for one utterance, by whitened cross-correlation."""
+"""Search of the whole range of lags for one utterance, by whitened cross-correlation, a share of the work in each hop."""
 
 from __future__ import annotations
 
@@ -8,28 +8,42 @@ import numpy as np
 from scipy import fft
 from scipy.ndimage import uniform_filter1d
 
+from edgefilter.announced import Playback
 from edgefilter.delay_line import Tape
-from edgefilter.types import Samples
+from edgefilter.types import SAMPLE_RATE, Samples
 
 WINDOW = 7168
 """Samples of the microphone that one search looks at, 0.45 s."""
-MINIMUM = 1280
-"""Samples (80 ms) of an utterance that must have been heard before its lag is believed: less of any two sounds may agree by chance."""
+MINIMUM = 832
+"""Samples (52 ms) of an utterance that must have been heard before its lag is believed: less of any two sounds may agree by chance."""
 FADE = 256
 _RISE = (0.5 - 0.5 * np.cos(np.pi * (np.arange(FADE) + 0.5) / FADE)).astype(np.float32)
-SMOOTHING = 65
-"""Bins over which spectra are averaged for the whitening, about 30 Hz: voice harmonics are flattened, so pitch makes no side peak."""
-APART = 320
-"""Two peaks closer than this (20 ms) are one arrival and its reflections."""
+SMOOTHING_HZ = 32.0
+"""Width over which spectra are averaged for the whitening: voice harmonics are flattened, so pitch makes no side peak."""
+REFLECTIONS, REFLECTED = 320, 0.75
+"""Peaks up to 20 ms behind an arrival may be its reflections and count only this much against it."""
+COARSE = 32
+"""Samples over which the energies that lags let overlap are summed."""
+NEAR, ASIDE = 12, 512
+"""Lags on each side of a peak that are the same peak, and those that an earlier window is compared at."""
+
+BETWEEN = 1024
+"""Samples between the two windows, so that one short agreement does not reach into both."""
 
 
 @dataclass(frozen=True, slots=True)
 class Candidate:
-    """Lag in samples of the highest peak; its height over the rms of the other lags, and over the highest peak elsewhere."""
+    """Lag in samples of the highest peak; its height over the rms of all lags, and over the highest peak elsewhere: two voices
+    of like pitch agree at many lags, a period apart, the robot with itself at one.
+
+    at: sample counter of the microphone at the end of the window. heard: samples of the utterance that it holds if the lag is true.
+    """
 
     lag: int
     strength: float
     ratio: float
+    at: int
+    heard: int
 
 
 class LagSearch:
@@ -38,69 +52,91 @@ class LagSearch:
     Both spectra are divided by the square root of their smoothed power. response (taps,), if known, is the echo path around
     its direct sound at index pre_roll: its phase is taken out, so that early reflections do not pull the peak. Chance peaks
     grow with the root of the energy that a lag lets overlap, so the correlation is divided by that.
+    `prepare`, `listen` and `find` are one search and cost one transform each, so that they can be spread over three hops.
     """
 
     def __init__(self, max_lag: int, response: Samples | None = None, pre_roll: int = 0) -> None:
         self.max_lag = max_lag
-        self._size = fft.next_fast_len(max_lag + WINDOW, real=True)
+        self._size = COARSE * fft.next_fast_len(-(-(max_lag + WINDOW) // COARSE), real=True)
         self.span = self._size
         self._signed = response is not None
-        self._phase = None
-        if response is not None:
-            spectrum = np.conj(fft.rfft(np.roll(np.pad(response, (0, self._size - response.size)), -pre_roll)))
-            self._phase = (spectrum / np.maximum(np.abs(spectrum), 1e-12)).astype(np.complex64)
+        self._phases = {size: _phase(response, pre_roll, size) for size in (self._size, WINDOW + 2 * ASIDE)}
+        self._ends = np.arange(0, self.max_lag, COARSE)
 
-    def find(self, mic: Tape, ref: Tape, now: int, since: int, mic_since: int) -> Candidate | None:
-        """The best lag between the reference after position `since` and the microphone after `mic_since`.
+    def prepare(self, ref: Tape | Playback, now: int, since: int) -> None:
+        """Take the reference between the positions since and now."""
+        size = self._size
+        first = max(since - (now - size), 0)
+        r = np.zeros(size, np.float32)
+        r[first:] = ref.read(now - size + first, now)
+        _soften(r[first:])
+        step = np.diff(r, prepend=r[:1])
+        self._total = np.concatenate(([0.0], np.cumsum(np.square(step, out=step).reshape(-1, COARSE).sum(axis=1), dtype=np.float64)))
+        self._reference = _whitened(fft.rfft(r), 1e-5)
+        self._prepared, self._since = now, since
+
+    def listen(self, mic: Tape, now: int, since: int) -> None:
+        """Take the microphone up to now, but none of it before since; at most WINDOW samples after `prepare`."""
+        skipped = min(max(max(since, self._since) - (now - WINDOW), 0), WINDOW)
+        self._at, self._start = now, self._size - WINDOW + skipped
+        if skipped > WINDOW - MINIMUM:
+            self._cross = None
+            return
+        x = np.zeros(self._size, np.float32)
+        x[self._start :] = mic.read(now - WINDOW + skipped, now)
+        _soften(x[self._start :])
+        self._cross = _whitened(fft.rfft(x), 1e-6) * np.conj(self._reference) if x.any() else None
+        if self._cross is not None:
+            self._cross[: int(100 * self._size / SAMPLE_RATE)] = 0.0
+            self._cross *= self._phases[self._size]
+
+    def find(self) -> Candidate | None:
+        """The best lag between what was prepared and what was listened to.
 
         None where there is nothing to compare, or where less than MINIMUM of them would overlap at the best lag.
         """
-        size, skipped = self._size, max(max(mic_since, since) - (now - WINDOW), 0)
-        if skipped >= WINDOW - MINIMUM:
+        if self._cross is None:
             return None
-        x, r = np.zeros(size, np.float32), np.zeros(size, np.float32)
-        x[size - WINDOW + skipped :] = mic.read(now - WINDOW + skipped, now)
-        first = max(since - (now - size), 0)
-        r[first:] = ref.read(now - size + first, now)
-        _soften(x[size - WINDOW + skipped :])
-        _soften(r[first:])
-        overlap = self._overlap(r, size - WINDOW + skipped)
-        if overlap.max() <= 0.0 or not x.any():
+        late = self._at - self._prepared
+        overlap = self._overlap(late)
+        if overlap.max() <= 0.0:
             return None
-        correlation = fft.irfft(self._whiten(fft.rfft(x), fft.rfft(r)), size)[: self.max_lag]
-        score = correlation / np.sqrt(overlap + 0.1 * overlap.max())
-        found = self._judge(score if self._signed else np.abs(score), overlap)
-        return None if found is None or now - since - found.lag < MINIMUM else found
-
-    def _overlap(self, r: Samples, mic_start: int) -> Samples:
-        """(max_lag,) energy of the reference, first difference, that falls under the microphone's window at each lag."""
-        step = np.diff(r, prepend=r[:1])
-        total = np.concatenate(([0.0], np.cumsum(np.square(step, dtype=np.float64))))
-        upper = total[self._size - self.max_lag + 1 : self._size + 1][::-1]
-        lower = np.zeros(self.max_lag)
-        count = min(self.max_lag, mic_start + 1)
-        lower[:count] = total[mic_start - count + 1 : mic_start + 1][::-1]
-        return (upper - lower).astype(np.float32)
-
-    def _whiten(self, x: np.ndarray, r: np.ndarray) -> np.ndarray:
-        power = _power(x)
-        power_r = _power(r)
-        cross = x * np.conj(r)
-        if self._phase is not None:
-            cross *= self._phase
-        low = int(100 * self._size / 16000)
-        cross[:low] = 0.0
-        return cross / np.sqrt((power + 1e-6 * power.max() + 1e-20) * (power_r + 1e-5 * power_r.max() + 1e-20))
-
-    def _judge(self, score: Samples, overlap: Samples) -> Candidate | None:
-        usable = overlap > 0.05 * overlap.max()
-        spread = float(np.sqrt(np.mean(np.square(score[usable]))))
-        if spread <= 0.0:
-            return None
+        correlation = fft.irfft(self._cross, self._size)
+        score = np.concatenate((correlation[self._size - late :], correlation[: self.max_lag - late]))
+        if not self._signed:
+            np.abs(score, out=score)
+        score *= np.repeat(1.0 / np.sqrt(overlap + 0.1 * overlap.max()), COARSE)[: self.max_lag]
+        usable = np.repeat(overlap > 0.05 * overlap.max(), COARSE)[: self.max_lag]
+        spread = float(np.sqrt(np.dot(score, score * usable) / np.count_nonzero(usable)))
         lag = int(np.argmax(score))
-        rest = np.concatenate((score[: max(lag - APART, 0)], score[lag + APART :]))
-        second = float(rest.max()) if rest.size else 0.0
-        return Candidate(lag, float(score[lag]) / spread, float(score[lag]) / max(second, 1e-12))
+        heard = self._at - self._since - lag
+        if spread <= 0.0 or heard < MINIMUM:
+            return None
+        reflected = REFLECTED * score[lag + NEAR : lag + REFLECTIONS].max(initial=0.0)
+        second = max(score[: max(lag - NEAR, 0)].max(initial=0.0), reflected, score[lag + REFLECTIONS :].max(initial=0.0))
+        return Candidate(lag, float(score[lag]) / spread, float(score[lag]) / max(float(second), 1e-12), self._at, heard)
+
+    def before(self, mic: Tape, ref: Tape | Playback, found: Candidate) -> float:
+        """Strength of the found lag in an earlier window of the microphone, BETWEEN samples before the one that it was found in."""
+        stop = found.at - WINDOW - BETWEEN
+        x = np.zeros(WINDOW + 2 * ASIDE, np.float32)
+        x[ASIDE:-ASIDE] = mic.read(stop - WINDOW, stop)
+        _soften(x[ASIDE:-ASIDE])
+        r = ref.read(stop - WINDOW - found.lag - ASIDE, stop - found.lag + ASIDE).copy()
+        _soften(r)
+        cross = _whitened(fft.rfft(x), 1e-6) * np.conj(_whitened(fft.rfft(r), 1e-5)) * self._phases[x.size]
+        cross[: int(100 * x.size / SAMPLE_RATE)] = 0.0
+        score = np.roll(fft.irfft(cross, x.size), ASIDE)[: 2 * ASIDE]
+        if not self._signed:
+            np.abs(score, out=score)
+        return float(score[ASIDE - NEAR : ASIDE + NEAR].max()) / (float(np.sqrt(np.mean(np.square(score)))) + 1e-20)
+
+    def _overlap(self, late: int) -> Samples:
+        """Energy of the reference, first difference, that falls under the microphone's window, at every COARSE-th lag."""
+        last = self._total.size - 1
+        upper = np.clip((self._size + late - self._ends) // COARSE, 0, last)
+        lower = np.clip((self._start + late - self._ends) // COARSE, 0, last)
+        return (self._total[upper] - self._total[lower]).astype(np.float32)
 
 
 def _soften(x: Samples) -> None:
@@ -109,5 +145,16 @@ def _soften(x: Samples) -> None:
     x[-FADE:] *= _RISE[::-1]
 
 
-def _power(spectrum: np.ndarray) -> Samples:
-    return uniform_filter1d(spectrum.real**2 + spectrum.imag**2, SMOOTHING, mode="nearest")
+def _whitened(spectrum: np.ndarray, floor: float) -> np.ndarray:
+    """The spectrum over the root of its smoothed power."""
+    width = round(SMOOTHING_HZ * 2 * spectrum.size / SAMPLE_RATE)
+    power = uniform_filter1d(spectrum.real**2 + spectrum.imag**2, width, mode="nearest")
+    return spectrum / np.sqrt(power + np.float32(floor * power.max() + 1e-20))
+
+
+def _phase(response: Samples | None, pre_roll: int, size: int) -> np.ndarray | np.complex64:
+    """What takes the response's phase out of a cross-spectrum."""
+    if response is None:
+        return np.complex64(1.0)
+    spectrum = np.conj(fft.rfft(np.roll(np.pad(response, (0, size - response.size)), -pre_roll)))
+    return (spectrum / np.maximum(np.abs(spectrum), 1e-12)).astype(np.complex64)

@@ -262,7 +262,12 @@ class EgoFilter:
         return self._stream.process(mic_block, ref_block)
 
     def announce(self, utterance: Samples) -> None:
-        """Say what the robot will play next (n,); it may start at any time, or never. So far the aligner only counts it."""
+        """Say what the robot will play next (n,) at 16 kHz; it may start at any time, or never, and several queue up.
+
+        For robots without a loopback: while the reference blocks are zeros, the utterance is looked for in the microphone for
+        30 s, and from about 0.1 s after its first sound on it is the reference. A reference channel that carries sound is
+        believed instead, and drops what was announced. Engines that only delay the reference (paper-ss) count announcements.
+        """
         if self._stream.front.aligner:
             self._stream.front.aligner.announce(as_samples(utterance, "utterance"))
 

@@ -5,7 +5,7 @@ import pytest
 from alignment_scene import HEAD, RATE, fan, hear, known_path, room, run, speech_like, utterances
 from scipy import signal
 
-from edgefilter.alignment import CERTAIN, Aligner
+from edgefilter.alignment import CERTAIN_EARLY, Aligner
 from edgefilter.delay_line import Tape, read_delayed, read_line
 from edgefilter.echo.model import PRE_ROLL
 from edgefilter.errors import SignalError
@@ -97,6 +97,33 @@ def test_nothing_is_realigned_where_nothing_is_heard(scene):
     assert not any(a.realigned for a in hops[later // 256 :])
 
 
+def test_a_human_who_for_a_moment_sounds_like_the_muted_robot_realigns_nothing():
+    rng = np.random.default_rng(12)
+    ref, _ = utterances(rng, [3, 4, 4], [2, 2, 2])
+    mic, _ = hear(ref, [(0, 5000)], room(rng, 0.5))
+    later = int(4.5 * RATE)
+    mic[later:] = 0.3 * speech_like(rng, (mic.size - later) / RATE + 0.1)[: mic.size - later]
+    for at, lag in ((int(7.5 * RATE), 14000), (int(13.5 * RATE), 2000)):
+        mic[at : at + 1600] = ref[at - lag : at - lag + 1600]  # 100 ms that agree entirely; searched alone, they are beyond doubt
+    hops = run(Aligner(256, known_path(room(rng, 0.25))), mic + fan(rng, mic.size), ref)
+    assert abs(hops[later // 256].delay - 5000 - HEAD) < 1.0  # the first utterance was heard
+    assert not any(a.realigned for a in hops[later // 256 :])
+
+
+def test_no_step_of_a_search_comes_twice_in_a_hop():
+    rng = np.random.default_rng(13)
+    ref, _ = utterances(rng, [3, 3], [1.5, 1.5])
+    aligner, steps = Aligner(256), []
+    for name in ("prepare", "listen", "find", "before"):
+        inner = getattr(aligner._lags, name)
+        setattr(aligner._lags, name, lambda *given, name=name, inner=inner: (steps.append(name), inner(*given))[1])
+    counts = []
+    for at in range(0, ref.size - 255, 256):
+        aligner.step(fan(rng, 256), ref[at : at + 256])
+        counts.append(len(steps))
+    assert max(np.diff(counts)) == 1 and steps.count("find") > 50  # each costs one large transform or two
+
+
 def test_hard_cuts_of_two_windows_are_no_lag():
     worst = 0.0
     for seed in range(12):
@@ -104,9 +131,12 @@ def test_hard_cuts_of_two_windows_are_no_lag():
         rumble = signal.lfilter([1.0], np.poly([0.995, 0.995]), np.random.default_rng(seed).standard_normal((2, 20000)))
         mic.push((rumble[0] / np.std(rumble)).astype(np.float32))
         ref.push((rumble[1] / np.std(rumble)).astype(np.float32))
-        found = LagSearch(25600).find(mic, ref, 20000, 17000, 17500)
-        worst = max(worst, found.strength if found else 0.0)
-    assert worst < 0.8 * CERTAIN[0]  # unrelated sounds; cut hard, their edges reach 51
+        search = LagSearch(25600)
+        search.prepare(ref, 20000, 17000)
+        search.listen(mic, 20000, 17500)
+        found = search.find()
+        worst = max(worst, found.strength * found.ratio if found else 0.0)
+    assert worst < 0.8 * CERTAIN_EARLY  # unrelated sounds; cut hard, their edges reach 51 and more
 
 
 def test_the_reference_is_withheld_while_the_old_delay_is_too_short():
@@ -137,7 +167,7 @@ def test_delivered_reference_and_history_are_the_delayed_reference(hop):
     assert np.sqrt(np.mean((history - recent) ** 2)) < 0.02 * scale  # both read the same line
 
 
-def test_announcing_changes_nothing_and_reset_starts_anew():
+def test_announcing_what_the_reference_carries_changes_nothing_and_reset_starts_anew():
     rng = np.random.default_rng(6)
     ref, _ = utterances(rng, [2], [0.5])
     mic, truth = hear(ref, [(0, 2000)], room(rng, 0.3))

@@ -105,7 +105,6 @@ def test_rewritten_reference_equals_a_reference_that_always_had_the_new_delay() 
         switched.step(silence, silence)
         always.step(mic[i : i + HOP], moved[i : i + HOP])
     always._weights[:] = switched._weights
-    always._product_weights[:] = switched._product_weights
     switched.rewrite_reference(moved[: at + HOP][-switched.history :])
     a = switched.step(mic[at : at + HOP], moved[at : at + HOP]).echo
     b = always.step(mic[at : at + HOP], moved[at : at + HOP]).echo

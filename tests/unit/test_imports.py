@@ -22,6 +22,7 @@ LAYERS = [
     {"stft", "ring", "metrics"},
     {"echo"},
     {"profile", "profile_file", "profile_text", "delay_line", "utterances"},
+    {"announced"},
     {"lag_search", "delay_tracker", "paper_alignment", "alignment", "canceller", "residual", "engines"},
     {"stepping", "stream", "audio", "budget", "run"},
     {"sweep", "paper_response", "trust", "calibrate"},
