@@ -100,7 +100,8 @@ class Aligner:
         if started:
             self._open.append(started)
             self._counts["utterances"] += 1
-            self._stage, self._expected = 0 if self._expected else self._stage, None
+            if self._expected is not None:
+                self._stage, self._to_search, self._expected = 0, 0, None
         self._expire()
         before = self._read_at
         self._measured = False

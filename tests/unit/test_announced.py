@@ -31,7 +31,7 @@ def test_announced_utterances_are_cancelled_nearly_as_well_as_with_a_reference(p
     assert known > 15.0  # a cold canceller in a room that it can hold; the fan lies 25-30 dB below the robot
     assert announced > known - 2.0  # found a little later, and fractionally elsewhere
     assert told.stats()["alignment"]["announced_heard"] == 2
-    assert [event.kind for event in told.events()] == ["realigned", "realigned"]
+    assert [event.kind for event in told.events() if event.kind == "realigned"] == ["realigned", "realigned"]
 
 
 def test_an_utterance_is_heard_within_300_ms_beside_a_human_as_loud_and_one_never_played_is_given_up():
