@@ -14,7 +14,16 @@ if TYPE_CHECKING:
     from edgefilter.profile import Profile
 
 LEAKAGE = 0.005
-"""Part of the echo's power that no linear path explains: a loudspeaker's distortion, -23 dB of it at its own frequency."""
+"""Part of the echo's power that no linear path explains, -23 dB: a loudspeaker's distortion, at first."""
+LEAST, MOST = 0.0024, 0.1
+"""Bounds on it once it is tracked."""
+LEAKAGE_MEMORY, LEAKAGE_RISE, LEAKAGE_FALL = 0.97, 1.005, 0.9
+"""The part is observed over half a second of the robot's speech; it falls at once and rises by 1.4 dB a second, so that a human's
+sentence hardly lifts it."""
+MARGIN = 3.0
+"""The mask wants to know the loud moments, which distort most; what is tracked is nearer to the quiet ones."""
+AUDIBLE = 60.0
+"""Power of the echo over the fan's from which on its leakage can be told."""
 SPREAD, SPREAD_HZ = 0.1, 2000.0
 """Distortion falls on other frequencies too: this part of the echo's mean over SPREAD_HZ counts as well."""
 TAIL_DECAY = 0.6
@@ -35,7 +44,8 @@ def power(spectrum: Spectrum) -> Samples:
 class Residual:
     """Tracks the fan and the residual echo of one stream; step() once per frame.
 
-    With a profile the fan is the calibrated one; without, it is the slowly rising minimum of the smoothed error.
+    With a profile the fan is the calibrated one; without, it is the slowly rising minimum of the smoothed error. Of the echo a part
+    stays, how much is tracked: the least ratio of error to echo while the robot speaks, for a human can only add to it.
     """
 
     def __init__(self, stft: StftConfig, profile: Profile | None = None) -> None:
@@ -49,6 +59,7 @@ class Residual:
         self._noise = np.full(self._bins, FAN_START, np.float32) if self._fan is None else self._fan.copy()
         self._smooth = np.zeros(self._bins, np.float32)
         self._echo = np.zeros(self._bins, np.float32)
+        self._leakage, self._left, self._brought = LEAKAGE, 0.0, 0.0
 
     def step(self, echo: Spectrum, error: Spectrum, uncertainty: Samples) -> tuple[Samples, Samples]:
         """Expected |fan|^2 and |residual echo|^2 in error, both (bins,) float32.
@@ -60,4 +71,16 @@ class Residual:
         if self._fan is None:
             self._smooth = 0.8 * self._smooth + 0.2 * power(error)
             self._noise = np.clip(self._smooth, FAN_FALL * self._noise, FAN_RISE * self._noise)
-        return self._noise, LEAKAGE * (self._echo + SPREAD * spread) + DOUBT * uncertainty
+        echo = self._echo + SPREAD * spread
+        doubt = DOUBT * uncertainty
+        self._track(float(power(error).sum() - self._noise.sum() - doubt.sum()), float(echo.sum()))
+        return self._noise, np.float32(self._leakage) * echo + doubt
+
+    def _track(self, left: float, brought: float) -> None:
+        """Follow the least part of the echo that stays, from the power left beyond fan and doubt and the echo's power, while it is loud."""
+        if brought < AUDIBLE * float(self._noise.sum()):
+            return
+        self._left += (1.0 - LEAKAGE_MEMORY) * (left - self._left)
+        self._brought += (1.0 - LEAKAGE_MEMORY) * (brought - self._brought)
+        change = MARGIN * max(self._left, 0.0) / self._brought / self._leakage
+        self._leakage = float(np.clip(self._leakage * np.clip(change, LEAKAGE_FALL, LEAKAGE_RISE), LEAST, MOST))

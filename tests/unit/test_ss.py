@@ -63,6 +63,20 @@ def test_residual_grows_with_the_echo_and_decays_after_it():
     assert db(np.sqrt(loud)) < -18  # the echo's distortion, not the echo
 
 
+@pytest.mark.parametrize("part", [0.002, 0.03])
+def test_the_part_of_the_echo_that_stays_is_tracked_and_a_human_hardly_lifts_it(part):
+    residual, rng = Residual(STFT, robot()), np.random.default_rng(5)
+
+    def expected(seconds, human):
+        frames = range(int(seconds * 16000 / STFT.hop))
+        return np.mean([residual.step(noise(rng, 1.0), noise(rng, part) + noise(rng, human), NOTHING)[1] for _ in frames][-60:])
+
+    alone = expected(20, 0.0)
+    assert part < alone < 8 * part  # MARGIN, and the echo's maximum over frames, which is above its mean
+    assert expected(2, 0.5) < 10**0.3 * alone  # 1.4 dB a second
+    assert expected(8, 0.0) < 1.2 * alone  # a memory of half a second forgets what was 250 times as much in 3 s
+
+
 def test_the_fan_of_the_profile_is_taken_as_it_is():
     profile = robot()
     fan, _ = Residual(STFT, profile).step(SILENCE, SILENCE, NOTHING)
