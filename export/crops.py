@@ -89,7 +89,7 @@ class Batches:
         for signal in ("mic", "error"):
             crop[signal] = crop[signal] + gain * crop["clean"]
         crop["clean"] = (1 + gain) * crop["clean"]
-        level, told = 10 ** (rng.uniform(-10, 10) / 20), 10 ** (rng.uniform(-8, 8) / 20)
+        level, told = 10 ** (rng.uniform(-12, 18) / 20), 10 ** (rng.uniform(-8, 8) / 20)
         return {signal: (told if signal == "reference" else level) * samples for signal, samples in crop.items()}
 
     def _swap_human(self, crop: dict[str, np.ndarray]) -> None:

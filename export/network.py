@@ -6,7 +6,7 @@ in the middle, as the two branches of Li, Hindriks & Kunneman (2024), section 3.
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
@@ -128,10 +128,6 @@ class EdgeCrnn(nn.Module):
         earlier = torch.cat((previous.unsqueeze(1), x[:, :-1]), 1)
         both = torch.cat((x, earlier), 2)
         return both.reshape(-1, 12, 1, self.config.bands), x[:, -1]
-
-    def describe(self) -> dict[str, object]:
-        """The configuration, ready for JSON."""
-        return asdict(self.config)
 
 
 def features(spectrum: Tensor) -> Tensor:

@@ -1,9 +1,9 @@
-"""Train the edge network on simulated conversations.
+"""Train the edge network, or the paper's, on simulated conversations.
 
-    python -m export.train --data DIR --validation DIR --output RUN [--steps 12000] [--seed 1] [--channels 16 32 48 48] [--smoke]
+    python -m export.train --data DIR --validation DIR --output RUN [--network edge|paper] [--steps 6000] [--seed 1] [--smoke]
 
 RUN/last.pt is written every --every steps (a second call goes on from there), RUN/best.pt holds the averaged weights with the best
-validation SI-SDR minus a penalty for suppressed speech; TensorBoard reads RUN, and RUN/log.jsonl has the same figures.
+validation loss; TensorBoard reads RUN, and RUN/log.jsonl has the same figures.
 """
 
 from __future__ import annotations
@@ -16,14 +16,15 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from torch import Tensor
+from torch import nn
 from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
 
 from edgefilter.types import SAMPLE_RATE
-from export.crops import SIGNALS, Batches, Items
-from export.losses import LossWeights, edge_loss, si_sdr
-from export.network import EdgeConfig, EdgeCrnn, count
+from export.crops import Batches, Items
+from export.losses import LossWeights, si_sdr
+from export.network import EdgeConfig
+from export.tasks import TASKS, Task
 
 AVERAGE = 0.998
 """Weight of the past in the averaged weights, per step."""
@@ -31,25 +32,16 @@ PATIENCE = 12
 """Validations without a better score before training stops."""
 
 
-def loss_of(network: EdgeCrnn, batch: dict[str, Tensor], weights: LossWeights, half: bool) -> tuple[dict[str, Tensor], Tensor]:
-    """The terms of the loss, and the scaled estimate (batch, frames, bins, 2)."""
-    inputs = [batch[name] for name in SIGNALS[:4]]
-    with torch.autocast("cpu", torch.bfloat16, enabled=half):
-        human, logit, _ = network(*inputs, network.initial_state(inputs[0].shape[0]))
-    scale = batch["scale"][:, None, None, None]
-    return edge_loss(scale * human.float(), logit.float(), scale * batch["clean"], batch["active"], weights), scale * human.float()
-
-
 @torch.no_grad()
-def validate(network: EdgeCrnn, items: Items, weights: LossWeights, seconds: float = 8.0) -> dict[str, float]:
-    """Mean loss terms over the last `seconds` of every item, SI-SDR of the estimate and of the error it started from."""
+def validate(task: Task, network: nn.Module, items: Items, seconds: float) -> dict[str, float]:
+    """Mean loss terms over the last `seconds` of every item, SI-SDR of the estimate and of the linear stage's error, active frames kept."""
     network.eval()
-    batches = Batches(items, network.config.stft, 1, seconds, seed=0, augment=False)
+    batches = Batches(items, task.stft, 1, seconds, seed=0, augment=False)
     sums: dict[str, float] = {}
     for at in range(0, len(items.names), 8):
         names = items.names[at : at + 8]
         batch = batches.spectra([items.crop(name, items.length(name) - batches.samples, batches.samples) for name in names])
-        terms, human = loss_of(network, batch, weights, half=False)
+        terms, human = task.loss(network, batch)
         scale = batch["scale"][:, None, None, None]
         terms["si_sdr_db"] = si_sdr(human, scale * batch["clean"])
         terms["si_sdr_error_db"] = si_sdr(scale * batch["error"], scale * batch["clean"])
@@ -66,8 +58,8 @@ def train(options: argparse.Namespace) -> Path:
     torch.manual_seed(options.seed)
     torch.set_num_threads(options.threads)
     options.output.mkdir(parents=True, exist_ok=True)
-    config = EdgeConfig(2 * options.hop, options.hop, channels=tuple(options.channels), hidden=options.hidden, norm=options.norm)
-    network, weights = EdgeCrnn(config), LossWeights(suppression=options.suppression, si_sdr=options.si_sdr)
+    task = TASKS[options.network](options)
+    network = task.network()
     average = {name: value.clone() for name, value in network.state_dict().items()}
     optimiser = torch.optim.AdamW(network.parameters(), lr=options.rate, weight_decay=1e-2, betas=(0.9, 0.98))
     items, held_out = Items(options.data), Items(options.validation)
@@ -78,14 +70,14 @@ def train(options: argparse.Namespace) -> Path:
         network.load_state_dict(saved["network"])
         optimiser.load_state_dict(saved["optimiser"])
         average, step, best, since = saved["average"], saved["step"], saved["best"], saved["since"]
-    batches = Batches(items, config.stft, options.batch, options.seconds, options.seed + step)
-    print(f"{config} {count(network)} on {len(items.names)} items, from step {step}")
+    batches = Batches(items, task.stft, options.batch, options.seconds, options.seed + step)
+    print(f"{task.describe(network)}; {len(items.names)} items, from step {step}")
     began = time.time()
     with SummaryWriter(options.output) as board, (options.output / "log.jsonl").open("a", encoding="utf-8") as log:
         for step in (progress := tqdm(range(step, options.steps), initial=step, total=options.steps, unit="step")):
             for group in optimiser.param_groups:
                 group["lr"] = options.rate * min(1.0, (step + 1) / 300) * (0.5 + 0.5 * math.cos(math.pi * step / options.steps)) + 1e-6
-            terms, _ = loss_of(network, batches.draw(), weights, half=not options.full_precision)
+            terms, _ = task.loss(network, batches.draw())
             optimiser.zero_grad(set_to_none=True)
             terms["total"].backward()
             shown = {name: float(value.detach()) for name, value in terms.items()}
@@ -102,12 +94,12 @@ def train(options: argparse.Namespace) -> Path:
             board.add_scalar("train/total", shown["total"], step)
             if (step + 1) % options.every and step + 1 < options.steps:
                 continue
-            averaged = EdgeCrnn(config)
+            averaged = task.network()
             averaged.load_state_dict(average)
-            figures = validate(averaged, held_out, weights)
+            figures = validate(task, averaged, held_out, min(8.0, 2 * options.seconds))
             score = -figures["total"]
             since = 0 if score > best else since + 1
-            state = {"config": network.describe(), "network": average, "step": step + 1, "figures": figures, "seed": options.seed, "items": len(items.names)}
+            state = {"kind": task.kind, "config": task.config(), "network": average, "step": step + 1, "figures": figures, "seed": options.seed, "items": len(items.names)}
             if score > best:
                 best = score
                 torch.save(state, options.output / "best.pt")
@@ -142,7 +134,8 @@ def main() -> None:
     parser.add_argument("--data", type=Path, required=True, metavar="DIR")
     parser.add_argument("--validation", type=Path, required=True, metavar="DIR")
     parser.add_argument("--output", type=Path, required=True, metavar="DIR")
-    parser.add_argument("--steps", type=int, default=12000)
+    parser.add_argument("--network", choices=tuple(TASKS), default="edge")
+    parser.add_argument("--steps", type=int, default=6000)
     parser.add_argument("--every", type=int, default=500, help="steps between validations")
     parser.add_argument("--batch", type=int, default=8)
     parser.add_argument("--seconds", type=float, default=4.0, help="of a crop")

@@ -13,6 +13,7 @@ from export import dataset, train
 from export.crops import Batches, Items
 from export.losses import LossWeights, edge_loss, power_law_loss, si_sdr
 from export.network import EdgeConfig, EdgeCrnn, apply_mask, count
+from export.paper_network import PaperConfig
 
 SMALL = EdgeConfig(64, 32, channels=(4, 4, 4, 4), hidden=8)
 
@@ -135,3 +136,13 @@ def test_training_runs_stops_and_goes_on(tmp_path, monkeypatch, capsys):
     train.main()
     assert "from step 4" in capsys.readouterr().out
     assert list((tmp_path / "run").glob("events.*"))
+
+
+def test_the_papers_network_trains_too(tmp_path, monkeypatch):
+    narrow = PaperConfig(filters=(2, 2, 2, 2, 2, 2, 2, 2), lstm=4, hidden=8)
+    monkeypatch.setattr("export.tasks.PaperConfig", lambda batch_norm: narrow)
+    arguments = ["--data", str(tmp_path / "d"), "--validation", str(tmp_path / "v"), "--output", str(tmp_path / "run"), "--network", "paper", "--smoke"]
+    monkeypatch.setattr("sys.argv", ["train", *arguments])
+    train.main()
+    saved = torch.load(tmp_path / "run" / "best.pt", weights_only=True)
+    assert saved["kind"] == "paper" and saved["config"]["lstm"] == 4
