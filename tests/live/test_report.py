@@ -25,6 +25,15 @@ CLIPPED = """[...document.querySelectorAll('body *')].filter((e) => e.checkVisib
   const outside = r.width && (r.right > wide + 0.5 || r.left < -0.5);
   const cut = getComputedStyle(e).overflowX !== 'visible' && e.scrollWidth > e.clientWidth + 1;
   return outside || cut ? [e.tagName + '.' + e.className + ' ' + e.textContent.slice(0, 40)] : []; })"""
+CONTRAST = """(() => {
+  const parts = (c) => c.match(/[\\d.]+/g).map(Number);
+  const ground = (e) => { for (; e; e = e.parentElement) { const c = parts(getComputedStyle(e).backgroundColor); if (c[3] !== 0) return c; } };
+  const light = (c) => c.slice(0, 3).map((v) => v / 255).map((v) => v <= 0.04045 ? v / 12.92 : ((v + 0.055) / 1.055) ** 2.4)
+    .reduce((sum, v, i) => sum + v * [0.2126, 0.7152, 0.0722][i], 0);
+  const texts = [...document.querySelectorAll('body *')].filter((e) => e.checkVisibility() && [...e.childNodes].some((n) => n.nodeType === 3 && n.data.trim()));
+  return Object.fromEntries(texts.map((e, i) => {
+    const [a, b] = [light(parts(getComputedStyle(e).color)), light(ground(e))].sort((x, y) => y - x);
+    return [i + ' ' + e.textContent.trim().slice(0, 30), (a + 0.05) / (b + 0.05)]; })); })()"""
 OVERLAPPING = """[...document.querySelectorAll('.frame')].flatMap((frame) => ['.under', '.step', '.amount', '.tick'].flatMap((kind) => {
   const all = [...frame.querySelectorAll(kind)].map((e) => [e.getBoundingClientRect(), e.textContent]);
   return all.flatMap(([a, x], i) => all.slice(i + 1).filter(([b]) =>
@@ -134,17 +143,26 @@ def test_sound_plays_and_the_residual_is_at_its_true_level(browser, pages):
     browser.wait("parseFloat(document.querySelector('#recording .cursor').style.left) > 0")
 
 
-@pytest.mark.parametrize("dark", [False, True])
 @pytest.mark.parametrize("width", [360, 768, 1280])
 @pytest.mark.parametrize("page", ["missing", "many", "comparison", "explained"])
-def test_nothing_is_clipped_or_overlaps_at_any_width(browser, pages, page, width, dark):
+def test_nothing_is_clipped_or_overlaps_at_any_width(browser, pages, page, width):
     folder, _ = pages
-    browser.open(folder / f"{page}.html", width, dark=dark)
+    browser.open(folder / f"{page}.html", width)
     browser.run("document.querySelector('details').open = true")
     assert browser.run("document.documentElement.scrollWidth") <= width
     assert browser.run(CLIPPED) == []
     assert browser.run(OVERLAPPING) == []
     assert browser.console == []
+
+
+@pytest.mark.parametrize("dark", [False, True])
+def test_every_text_stands_out_from_its_ground(browser, pages, dark):
+    folder, _ = pages
+    browser.open(folder / "missing.html", 1280, dark=dark)
+    contrasts = browser.run(CONTRAST)
+    assert len(contrasts) > 50
+    assert min(contrasts.values()) >= 4.5, min(contrasts, key=contrasts.get)  # WCAG 2.2, 1.4.3
+    assert browser.run("getComputedStyle(document.body).backgroundColor").startswith("rgb(2" if not dark else "rgb(21")
 
 
 def test_the_checks_see_what_they_look_for(browser, pages):
