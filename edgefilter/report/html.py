@@ -16,7 +16,7 @@ from edgefilter.compare import Comparison
 from edgefilter.diagnose import Diagnosis, Finding
 from edgefilter.errors import EdgefilterError
 from edgefilter.profile import Profile
-from edgefilter.report.media import MAX_SOUND_S, RANGE_DB, colours, sound, spectrogram_db, spectrogram_png
+from edgefilter.report.media import MAX_SOUND_S, colour_scale, colours, sound, spectrogram_png
 from edgefilter.report.variants import MAX_FREE, Choice, compare_variants
 from edgefilter.report.words import decibels, headline, interval_text, title
 from edgefilter.types import SAMPLE_RATE, Samples
@@ -70,7 +70,8 @@ def _page(
 ) -> str:
     before, after = variants[(False,) * len(findings)], variants[(True,) * len(findings)]
     seconds = before.recording.size / SAMPLE_RATE
-    data = _data(variants, before, irreducible_db)
+    scale = colour_scale(before.recording)
+    data = _data(variants, before, irreducible_db, scale)
     fields = {key: html.escape(value) if key in ("kind", "headline", "irreducible") else value for key, value in text.items()}
     fields |= {role: html.escape(Path(str(names[role])).name) for role in ("profile", "recording", "reference")}
     fields |= {
@@ -81,8 +82,8 @@ def _page(
         "floor": f"{before.noise_floor_db:.1f}",
         "date": datetime.date.today().isoformat(),
         "gradient": ", ".join("rgb({},{},{})".format(*colour) for colour in colours()[::7].tolist()),
-        "bottom": f"{data['top_db'] - RANGE_DB:.0f}",
-        "top": f"{data['top_db']:.0f}",
+        "bottom": f"{scale[0]:.0f}",
+        "top": f"{scale[1]:.0f}",
         "free": "" if len(findings) <= MAX_FREE else "Later effects build on earlier ones and are switched with them.",
         "style": _asset("page.css"),
         "program": _asset("page.js"),
@@ -91,9 +92,8 @@ def _page(
     return re.sub(r"\{\{(\w+)\}\}", lambda field: fields[field[1]], _asset("page.html"))
 
 
-def _data(variants: Mapping[Choice, Comparison], before: Comparison, irreducible_db: float) -> dict:
+def _data(variants: Mapping[Choice, Comparison], before: Comparison, irreducible_db: float, scale: tuple[float, float]) -> dict:
     """What the program draws; pictures and sounds that occur twice are held once."""
-    top = 5.0 * math.ceil(float(spectrogram_db(before.recording).max()) / 5.0)
     gain = 10 ** (-1 / 20) / max(float(abs(before.recording).max()), 1e-6)
     media: dict[str, str] = {}
 
@@ -106,10 +106,9 @@ def _data(variants: Mapping[Choice, Comparison], before: Comparison, irreducible
         "seconds": before.recording.size / SAMPLE_RATE,
         "floor_db": before.noise_floor_db,
         "irreducible_db": irreducible_db,
-        "top_db": top,
         "louder": LOUDER,
         "human": before.human,
-        "recording": {"picture": keep(spectrogram_png(before.recording, top)), "sound": keep(sound(before.recording, gain))},
+        "recording": {"picture": keep(spectrogram_png(before.recording, scale)), "sound": keep(sound(before.recording, gain))},
         "variants": {
             "".join("01"[on] for on in choice): {
                 "excess_db": round(found.excess_db, 3),
@@ -118,8 +117,8 @@ def _data(variants: Mapping[Choice, Comparison], before: Comparison, irreducible
                 "times": _rounded(found.times),
                 "levels": _rounded(found.levels),
                 "lags": _rounded((low, high, share * _error(found) / max(_error(before), 1e-6)) for low, high, share in found.lags),
-                "prediction": {"picture": keep(spectrogram_png(found.prediction, top)), "sound": keep(sound(found.prediction, gain))},
-                "residual": {"picture": keep(spectrogram_png(found.residual, top)), "sound": keep(sound(found.residual, gain * LOUDER))},
+                "prediction": {"picture": keep(spectrogram_png(found.prediction, scale)), "sound": keep(sound(found.prediction, gain))},
+                "residual": {"picture": keep(spectrogram_png(found.residual, scale)), "sound": keep(sound(found.residual, gain * LOUDER))},
             }
             for choice, found in variants.items()
         },

@@ -14,8 +14,8 @@ from edgefilter.types import SAMPLE_RATE, Samples
 
 WINDOW, MAX_COLUMNS = 480, 800
 """Samples of a spectrogram's frame, and how many columns a picture has at most."""
-RANGE_DB, LEVELS = 72.0, 64
-"""Between the darkest and the brightest colour, and how many colours there are."""
+LEVELS = 64
+"""How many colours there are."""
 OPUS_COMPRESSION = 0.8
 """Of libsndfile's range 0 (best) to 1 (smallest): about 55 kbit/s at 16 kHz mono."""
 MAX_SOUND_S = 60
@@ -42,10 +42,17 @@ def spectrogram_db(samples: Samples) -> np.ndarray:
     return 10 * np.log10(np.maximum(power / (window.sum() / 2) ** 2, 1e-20))
 
 
-def spectrogram_png(samples: Samples, top_db: float) -> str:
-    """The spectrogram as a data address, low frequencies at the bottom; top_db is the brightest colour, RANGE_DB below it the darkest."""
-    shade = (spectrogram_db(samples) - (top_db - RANGE_DB)) / RANGE_DB
-    index = np.clip(np.round(shade * (LEVELS - 1)), 0, LEVELS - 1).astype(np.uint8)
+def colour_scale(samples: Samples) -> tuple[float, float]:
+    """dB of full scale per bin that get the darkest and the brightest colour: from the quiet of a recording (n,) to nearly its loudest."""
+    quiet, loud = np.percentile(spectrogram_db(samples), (20, 99.7))
+    top = 5.0 * float(np.ceil(max(loud, -140.0) / 5.0))
+    return min(5.0 * float(np.floor(quiet / 5.0)), top - 40.0), top
+
+
+def spectrogram_png(samples: Samples, scale: tuple[float, float]) -> str:
+    """The spectrogram as a data address, low frequencies at the bottom, coloured on that scale."""
+    bottom, top = scale
+    index = np.clip(np.round((spectrogram_db(samples) - bottom) / (top - bottom) * (LEVELS - 1)), 0, LEVELS - 1).astype(np.uint8)
     return _address("image/png", _png(index.T[::-1], colours()))
 
 

@@ -41,6 +41,7 @@ function drawStaircase(on) {
   stairs.querySelectorAll(".step").forEach((old) => old.remove());
   const height = (x) => (100 * Math.max(x, 0)) / stairScale.top;
   const columns = boxes.length ? boxes.length + 2 : 1;
+  stairs.style.maxWidth = `${columns * 12}rem`;
   const width = 100 / columns;
   const gap = Math.min(width * 0.14, 3);
   const column = (i) => ({ left: i * width + gap, width: width - 2 * gap });

@@ -16,7 +16,7 @@ from edgefilter.diagnose import Diagnosis, Finding, Interval
 from edgefilter.echo.effect import names
 from edgefilter.report import words
 from edgefilter.report.html import add_command, diagnosis_page
-from edgefilter.report.media import LEVELS, MAX_COLUMNS, RANGE_DB, colours, sound, spectrogram_db, spectrogram_png
+from edgefilter.report.media import LEVELS, MAX_COLUMNS, colour_scale, colours, sound, spectrogram_db, spectrogram_png
 from edgefilter.report.text import coarser, diagnosis_lines
 from edgefilter.report.variants import choices, compare_variants
 
@@ -84,12 +84,22 @@ def test_a_tone_is_at_its_place_and_level_in_the_spectrogram():
     x = (0.5 * np.sin(2 * np.pi * 2000 * n / RATE) * (n >= 2 * RATE)).astype(np.float32)
     level = spectrogram_db(x)
     assert level.max() == pytest.approx(20 * np.log10(0.5), abs=0.1)  # a bin's centre is hit: only the window's samples differ
-    image = Image.open(content(spectrogram_png(x, 0.0)))
+    image = Image.open(content(spectrogram_png(x, (-72.0, 0.0))))
     index = np.asarray(image)
     assert index.shape == (241, level.shape[0]) and image.palette.getdata()[1][:3] == colours()[0].tobytes()
     row = 240 - round(2000 / (8000 / 240))
-    assert index[row, -10] == round((1 + 20 * np.log10(0.5) / RANGE_DB) * (LEVELS - 1)) == index.max()
+    assert index[row, -10] == round((1 + 20 * np.log10(0.5) / 72) * (LEVELS - 1)) == index.max()
     assert not index[:, : level.shape[0] // 2 - 2].any()
+
+
+def test_the_colours_reach_from_the_fan_to_the_voice():
+    x = voice(6.0)
+    fan = 1e-3 * np.random.default_rng(1).standard_normal(x.size).astype(np.float32)
+    bottom, top = colour_scale(x + fan)
+    assert bottom <= np.median(spectrogram_db(fan)) < bottom + 10  # the fan's own scatter and steps of 5 dB
+    assert np.mean(spectrogram_db(x) > top) < 0.003
+    silent_bottom, silent_top = colour_scale(np.zeros(16000, np.float32))
+    assert silent_top - silent_bottom >= 40
 
 
 def test_a_long_recording_gets_a_picture_of_bounded_width():
