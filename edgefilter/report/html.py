@@ -17,8 +17,9 @@ from edgefilter.diagnose import Diagnosis, Finding
 from edgefilter.errors import EdgefilterError
 from edgefilter.profile import Profile
 from edgefilter.report.media import MAX_SOUND_S, colour_scale, colours, sound, spectrogram_png
+from edgefilter.report.text import in_order
 from edgefilter.report.variants import MAX_FREE, Choice, compare_variants
-from edgefilter.report.words import decibels, headline, interval_text, title
+from edgefilter.report.words import decibels, headline, interval_text, sentence, title
 from edgefilter.types import SAMPLE_RATE, Samples
 
 LOUDER = 10.0
@@ -34,15 +35,16 @@ def comparison_page(found: Comparison, names: Mapping[str, object]) -> str:
 
 def diagnosis_page(profile: Profile, found: Diagnosis, recording: Samples, reference: Samples, names: Mapping[str, object]) -> str:
     """The page of a diagnosis, with a switch for each found effect. recording (n,), reference (m,): what was diagnosed."""
-    variants = compare_variants(profile, found.ranking, recording, reference)
+    steps = in_order(found.ranking)
+    variants = compare_variants(profile, steps, recording, reference)
     text = {
         "kind": "diagnosis",
         "headline": headline(found.verdict, [finding.effect for finding in found.ranking]),
         "findings": "".join(_finding(rank, finding, names) for rank, finding in enumerate(found.ranking, start=1)),
-        "left": _section("What is left", f"<p>{html.escape(found.evidence)}</p>") if found.evidence else "",
+        "left": _section("What is left", f"<p>{html.escape(sentence(found.evidence))}</p>") if found.evidence else "",
         "irreducible": f"{decibels(found.irreducible_db)} dB",
     }
-    return _page(variants, found.ranking, text, names, found.irreducible_db)
+    return _page(variants, steps, text, names, found.irreducible_db)
 
 
 def add_command(effect: str, names: Mapping[str, object]) -> str:
@@ -156,7 +158,7 @@ def _finding(rank: int, finding: Finding, names: Mapping[str, object]) -> str:
         f"<li><h3>{html.escape(title(finding.effect))} <code>{html.escape(finding.effect)}</code></h3>"
         f'<p class="fall">{decibels(finding.excess_before_db)} dB &rarr; {decibels(finding.excess_after_db)} dB '
         f"<small>{100 * finding.share:.0f} % of what was unexplained</small></p>"
-        f"<p>{html.escape(finding.evidence)}</p><table>{rows}</table>"
+        f"<p>{html.escape(sentence(finding.evidence))}</p><table>{rows}</table>"
         f'<p class="command"><code>{_unbroken(add_command(finding.effect, names))}</code></p></li>'
     )
 

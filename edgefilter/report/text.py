@@ -9,7 +9,7 @@ import numpy as np
 
 from edgefilter.compare import Comparison
 from edgefilter.diagnose import Diagnosis, Finding
-from edgefilter.report.words import decibels, headline, interval_text, title
+from edgefilter.report.words import decibels, headline, interval_text, sentence, title
 
 BAR_WIDTH = 30
 MAX_TIMES = 12
@@ -40,7 +40,7 @@ def diagnosis_lines(found: Diagnosis) -> list[str]:
     """The verdict in a sentence, the error budget step by step, each finding with its evidence, then where the excess was."""
     names = [finding.effect for finding in found.ranking]
     steps = [("the profile as it is", found.comparison.excess_db)]
-    steps += [(f"with {name}", finding.excess_after_db) for name, finding in zip(names, found.ranking, strict=True)]
+    steps += [(f"with {finding.effect}", finding.excess_after_db) for finding in in_order(found.ranking)]
     top = max(1.0, *(db for _, db in steps))
     lines = [f"verdict     {found.verdict}: {headline(found.verdict, names)}", "budget      dB over the noise floor"]
     lines += [f"  {name:<27} {decibels(db):>6}  {_bar(db / top)}".rstrip() for name, db in steps]
@@ -48,8 +48,13 @@ def diagnosis_lines(found: Diagnosis) -> list[str]:
     for rank, finding in enumerate(found.ranking, start=1):
         lines += _finding(rank, finding)
     if found.evidence:
-        lines.append(f"left        {decibels(found.remaining_db)} dB: {found.evidence}")
+        lines.append(f"left        {decibels(found.remaining_db)} dB: {sentence(found.evidence)}")
     return [*lines, "where       it is with the profile as it is:", *comparison_lines(found.comparison)]
+
+
+def in_order(ranking: Sequence[Finding]) -> list[Finding]:
+    """The findings as one was added after the other, so that each starts where the one before it ended."""
+    return sorted(ranking, key=lambda finding: -finding.excess_before_db)
 
 
 def coarser(times: Sequence[tuple[float, float, float]], rows: int) -> list[tuple[float, float, float]]:
@@ -63,7 +68,7 @@ def _finding(rank: int, finding: Finding) -> list[str]:
     lines = [
         f"{rank:>2}. {title(finding.effect)} ({finding.effect}): "
         f"{decibels(finding.excess_before_db)} to {decibels(finding.excess_after_db)} dB, {100 * finding.share:.0f} % of the excess",
-        f"      {finding.evidence}",
+        f"      {sentence(finding.evidence)}",
     ]
     return lines + [f"      {name} = {interval_text(interval)}" for name, interval in finding.parameters.items()]
 

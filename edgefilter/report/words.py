@@ -48,6 +48,12 @@ def joined(words: Iterable[str]) -> str:
     return f"{', '.join(first)} and {last}" if first else last
 
 
+def sentence(words: str) -> str:
+    """The words with a capital and a full stop, where they have none."""
+    words = words.strip()
+    return words and words[:1].upper() + words[1:] + ("" if words.endswith((".", "!", "?")) else ".")
+
+
 def headline(verdict: str, effects: Iterable[str]) -> str:
     """One sentence for the verdict of a diagnosis."""
     found = joined(spoken(effect) for effect in effects)
