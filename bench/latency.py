@@ -151,8 +151,8 @@ def main() -> None:
     before = os.getloadavg()[0]
     ours = [name for name in names if name not in PEERS]
     result = {
-        "machine": {**machine(), "threads": "1 and 2", "cores": f"{CORES} of {os.cpu_count()}", "kernel": platform.release(), "system": platform.system(),
-                    "load average before": f"{before:.2f}"},
+        "machine": {**machine(), "threads": "1 and 2", "cores": f"{CORES} of {os.cpu_count()}", "kernel": platform.release(),
+                    "system": platform.system(), "load average before": f"{before:.2f}"},
         "seconds": seconds, "rounds": rounds, "missing": missing,
         "rows": matrix(names, seconds, rounds, threads, (False, True)),
         "curves": curves(names, min(seconds, 8.0), *((TAILS[-1:], HOPS[-1:]) if args.quick else (TAILS, HOPS)), args.models),

@@ -51,7 +51,8 @@ def edge(name: str, taps: int | None, hop: int | None) -> Contender:
     if taps:
         response = profile.echo.impulse_response
         profile = profile.with_impulse_response(np.pad(response, (0, max(taps - response.size, 0)))[:taps])
-    engine = engines.create(name, profile) if hop is None else engines.create(name, profile, StftConfig(n_fft=2 * hop, hop=hop, window_length=2 * hop))
+    stft = StftConfig() if hop is None else StftConfig(n_fft=2 * hop, hop=hop, window_length=2 * hop)
+    engine = engines.create(name, profile, stft)
     stream = Stream(engine, profile)
     contender = Contender(engine.stft.hop, stream.process)
     front = stream.front

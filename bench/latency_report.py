@@ -16,9 +16,9 @@ def markdown(result: dict, name: str) -> str:
     """The whole page."""
     rows = result["rows"]
     lines = ["# Latency and cost per hop", "", ", ".join(f"{key} {value}" for key, value in result["machine"].items()), ""]
-    lines += [f"{result['rounds']} round(s) of {result['seconds']:g} s of the bundled conversation for each row, contenders in turns, every process held"]
-    lines += ["to two cores, warm-up (0.5 s) left out. Paced: a hop begins when a device would deliver it. Busy: a second process on each core that never"]
-    lines += ["rests. Missed: hops that took longer than they last. RTF: compute over audio.", ""]
+    lines += [f"{result['rounds']} round(s) of {result['seconds']:g} s of the bundled conversation for each row, contenders in turns, every"]
+    lines += ["process held to two cores, warm-up (0.5 s) left out. Paced: a hop begins when a device would deliver it. Busy: a second process on"]
+    lines += ["each core that never rests. Missed: hops that took longer than they last. RTF: compute over audio.", ""]
     lines += [f"{contender} is not in the table: {why}" for contender, why in result["missing"].items()]
     lines += ["", "| | hop ms | load | threads | pace | p50 | p95 | p99 | max, ms per hop | missed | RTF |", "| --- " * 11 + "|"]
     lines += [_row(row) for row in sorted(rows, key=lambda row: (row["busy"], row["threads"], not row["paced"]))]
@@ -33,7 +33,8 @@ def _q(row: dict, percent: float) -> float:
 def _row(row: dict) -> str:
     times = " | ".join(f"{_q(row, percent):.3f}" for percent in (50, 95, 99, 100))
     place = f"{'busy' if row['busy'] else 'idle'} | {row['threads']} | {'paced' if row['paced'] else 'back to back'}"
-    return f"| {row['contender']} | {1000 * row['hop'] / SAMPLE_RATE:g} | {place} | {times} | {row['missed']} of {row['hops']} | {row['real_time_factor']:.4f} |"
+    name = f"{row['contender']} | {1000 * row['hop'] / SAMPLE_RATE:g}"
+    return f"| {name} | {place} | {times} | {row['missed']} of {row['hops']} | {row['real_time_factor']:.4f} |"
 
 
 def _find(rows: list[dict], paced: bool, busy: bool = False) -> dict[str, dict]:
@@ -71,21 +72,22 @@ def _stages(rows: list[dict]) -> list[str]:
 def _slowest(rows: list[dict]) -> list[str]:
     lines = ["", "## The ten slowest hops", "", "Paced, idle, one thread: second in the conversation, ms, and the stage that took most of it."]
     for name, row in _find(rows, True).items():
-        worst = ", ".join(f"{hop['second']:.2f} s {hop['ms']:.1f}" + (f" ({hop['stage']} {hop['stage_ms']:.1f})" if hop["stage"] else "") for hop in row["slowest"])
-        lines += ["", f"- {name}: {worst}"]
+        stages = [f" ({hop['stage']} {hop['stage_ms']:.1f})" if hop["stage"] else "" for hop in row["slowest"]]
+        lines += ["", f"- {name}: " + ", ".join(f"{hop['second']:.2f} s {hop['ms']:.1f}{stage}" for hop, stage in zip(row["slowest"], stages))]
     return lines
 
 
 def _waits(result: dict) -> list[str]:
-    lines = ["", "## What a user waits for", "", "| | start to first filtered hop, s (median) | memory then, MB | memory at the end, MB |", "| --- " * 4 + "|"]
+    lines = ["", "## What a user waits for", ""]
+    lines += ["| | start to first filtered hop, s (median) | memory then, MB | memory at the end, MB |", "| --- " * 4 + "|"]
     paced = _find(result["rows"], True)
     for name, starts in result["start"].items():
         seconds, memory = (np.median([start[key] for start in starts]) for key in ("seconds", "memory_mb"))
         lines.append(f"| {name} | {seconds:.2f} | {memory:.0f} | {paced[name]['peak_memory_mb']:.0f} |")
     if result["click"]:
         alone = np.nanmedian(result["click"]["devices alone"])
-        lines += ["", "From a click at the microphone to the click at the output, through virtual devices (PulseAudio, PortAudio over ALSA); the declared"]
-        lines += ["latency is the window, and a hop has to be complete before it is filtered.", ""]
+        lines += ["", "From a click at the microphone to the click at the output, through virtual devices (PulseAudio, PortAudio over ALSA);"]
+        lines += ["the declared latency is the window, and a hop has to be complete before it is filtered.", ""]
         lines += ["| | ms (median) | lowest - highest | beyond the devices |", "| --- | --- | --- | --- |"]
         for name, times in result["click"].items():
             middle = np.nanmedian(times)
@@ -114,7 +116,8 @@ def draw(result: dict, path: Path) -> None:
         for number, (name, row) in enumerate(_find(result["rows"], True, busy).items()):
             percent = [float(key) for key in row["quantiles"]]
             axis.plot([max(100 - p, 0.05) for p in percent], list(row["quantiles"].values()), color=f"C{number}", label=name, lw=1.2)
-        axis.set(xscale="log", yscale="log", title=f"paced, {'both cores busy' if busy else 'idle'}", xlabel="hops slower than this, %", ylabel="ms per hop")
+        axis.set(xscale="log", yscale="log", xlabel="hops slower than this, %", ylabel="ms per hop")
+        axis.set_title("paced, both cores busy" if busy else "paced, idle")
         axis.invert_xaxis()
         axis.axhline(16, color="0.6", lw=0.8, ls=":")
         axis.grid(alpha=0.3)

@@ -111,9 +111,8 @@ def choose(
     if fresh and (trouble := budget_cache.keep(about, {name: asdict(figures) for name, figures in known.items()})):
         say(f"the measurement cannot be kept for the next time ({trouble})")
     best = found[-1] if fits(found[-1], budget_ms) else min(found, key=lambda figures: figures.paced_p99_ms)
-    return Choice(
-        best.engine, fits(best, budget_ms), _reason(best, found, skipped, budget_ms, cores) + ("" if fresh else AGAIN), budget_ms, cores, tuple(found), skipped, not fresh
-    )
+    reason = _reason(best, found, skipped, budget_ms, cores) + ("" if fresh else AGAIN)
+    return Choice(best.engine, fits(best, budget_ms), reason, budget_ms, cores, tuple(found), skipped, not fresh)
 
 
 def fits(figures: Figures, budget_ms: float) -> bool:
@@ -130,11 +129,8 @@ def measure(engine: Engine, profile: Profile | None = None, paced: int = PACED) 
         pace(stream, hops, WARM_UP, WARM_UP_S, period_s=0.0)
         slow = pace(stream, hops, paced, PACED_S)
         at_once = pace(stream, hops, paced, AT_ONCE_S, period_s=0.0)
-    p50, p95, p99 = np.percentile(slow, (50, 95, 99))
-    quick = np.percentile(at_once, (50, 99))
-    return Figures(
-        engine.name, _model(engine), 1000 * hop / SAMPLE_RATE, len(slow), len(slow) == paced, *map(float, (p50, p95, p99, max(slow))), *map(float, quick)
-    )
+    times = (*np.percentile(slow, (50, 95, 99, 100)), *np.percentile(at_once, (50, 99)))
+    return Figures(engine.name, _model(engine), 1000 * hop / SAMPLE_RATE, len(slow), len(slow) == paced, *map(float, times))
 
 
 def pace(
@@ -197,11 +193,13 @@ def _reason(best: Figures, found: Sequence[Figures], skipped: dict[str, str], bu
     others = [f"{figures.engine} needs {_needs(figures)}" for figures in found if figures is not best]
     others += [f"{name} cannot be used ({why})" for name, why in skipped.items()]
     against = "".join(f"; {text}" for text in others)
-    measured = f"p99 {_needs(best)} per {best.hop_ms:.0f} ms hop on {cores} cores (p50 {best.paced_p50_ms:.1f} ms, back to back {best.at_once_p50_ms:.1f} ms)"
+    typical = f"p50 {best.paced_p50_ms:.1f} ms, back to back {best.at_once_p50_ms:.1f} ms"
+    measured = f"p99 {_needs(best)} per {best.hop_ms:.0f} ms hop on {cores} cores ({typical})"
     if fits(best, budget_ms):
         return f"auto: best engine within {budget_ms:g} ms, {measured}{against}"
     wish = f"--budget-ms {np.ceil(best.paced_p99_ms):.0f}" if best.complete and best.paced_p99_ms < best.hop_ms else "a faster processor"
-    return f"auto: no engine keeps to {budget_ms:g} ms; {best.engine} is the cheapest, {measured}{against}; {wish}, a free core or fewer programs beside it would help"
+    failure = f"auto: no engine keeps to {budget_ms:g} ms; {best.engine} is the cheapest, {measured}{against}"
+    return f"{failure}; {wish}, a free core or fewer programs beside it would help"
 
 
 def _needs(figures: Figures) -> str:

@@ -29,7 +29,9 @@ class Stepping:
     ladder: the stream's engine, None to count only. clock: seconds, monotonic.
     """
 
-    def __init__(self, hop: int, ladder: Ladder | None = None, budget_ms: float | None = None, clock: Callable[[], float] = time.perf_counter) -> None:
+    def __init__(
+        self, hop: int, ladder: Ladder | None = None, budget_ms: float | None = None, clock: Callable[[], float] = time.perf_counter
+    ) -> None:
         self.hop_ms = 1000 * hop / SAMPLE_RATE
         self.budget_ms = self.hop_ms if budget_ms is None else min(budget_ms, self.hop_ms)
         self.ladder = ladder

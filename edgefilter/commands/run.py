@@ -73,7 +73,8 @@ def finish(
     """Say and write what happened; return the exit code."""
     for note in [*source.notes[told:], *sink.notes]:
         say(note)
-    figures = report.to_dict() | {"choice": choice.to_dict() if choice else None, "source": source.stats(), "sink": sink.stats(), "notes": [*source.notes, *sink.notes]}
+    figures = report.to_dict() | {"choice": choice.to_dict() if choice else None}
+    figures |= {"source": source.stats(), "sink": sink.stats(), "notes": [*source.notes, *sink.notes]}
     if args.json:
         write_json(figures, args.json)
     if args.save_profile:
