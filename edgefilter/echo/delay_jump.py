@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 
 from edgefilter.echo.clock_drift import STEADY, robust_line
-from edgefilter.echo.effect import Measurement, Parameter, Stage, Values
+from edgefilter.echo.effect import Measurement, Parameter, Stage, Values, complete
 from edgefilter.echo.fractional import delayed
 from edgefilter.echo.lag_track import LagTrack, track_lag
 from edgefilter.types import SAMPLE_RATE, Array, Samples
@@ -25,16 +25,27 @@ COST = 12.0
 """What each number of a step function has to save in squared, normalised distance, per unit of log(blocks)."""
 
 
+DIRECT = 64
+"""Samples before the direct sound in the path's impulse response (model.PRE_ROLL)."""
+HISTORY, SETTLED, AFTERMATH = 8000, 640, 6400
+"""Samples: what the path remembers of the time before a jump; what may be unsure of its moment; what shows the jump."""
+SEARCH = (range(-256, 257, 32), range(-24, 25, 8), range(-6, 7, 2), (-1, 0, 1))
+
+
 class DelayJump:
-    """The delay grows by samples[i] at times_s[i] and by offset from the start on; piecewise constant, fractional."""
+    """The reference is played later by samples[i] from times_s[i] on, and by offset from the start on; piecewise constant, fractional.
+
+    What the player puts into the gap where the delay grows: the last samples once more (gap_gain 1) or silence (gap_gain 0).
+    """
 
     name: ClassVar[str] = "delay_jump"
-    stage: ClassVar[Stage] = "time"
+    stage: ClassVar[Stage] = "source"
     memoryless: ClassVar[bool] = False
     parameters: ClassVar[tuple[Parameter, ...]] = (
         Parameter("times_s", "s", 0.0, 0.0, 1e6),
         Parameter("samples", "samples", 0.0, -48000.0, 48000.0),
         Parameter("offset", "samples", 0.0, -32000.0, 32000.0),
+        Parameter("gap_gain", "", 1.0, 0.0, 1.0),
     )
 
     def apply(self, x: Samples, values: Values, sample_rate: int) -> Samples:
@@ -47,6 +58,9 @@ class DelayJump:
         for start, stop, delay in zip([0, *at], [*at, x.size], delays, strict=True):
             if delay != 0.0 and stop > start:
                 out[start:stop] = delayed(x, delay)[start:stop]
+        if float(values["gap_gain"]) != 1.0:
+            for start, step in zip(at, steps[order], strict=True):
+                out[start : start + int(max(step, 0.0))] *= np.float32(values["gap_gain"])
         return out
 
     def fit(self, measurement: Measurement, model: EchoModel) -> Values:
@@ -57,14 +71,46 @@ class DelayJump:
         """
         predicted, recording = measurement.whiten(model.predict(measurement.reference)), measurement.whiten(measurement.recording)
         track = track_lag(predicted, recording, measurement.fit, BLOCK, REACH)
-        nothing = {"times_s": 0.0, "samples": 0.0, "offset": 0.0}
         if track.lag.size < 4:
-            return nothing
+            return {}
         edges, levels = find_steps(track.lag, np.hypot(track.sigma, STEADY))
         if not 1 <= edges.size <= MOST_JUMPS or _line_is_as_good(track, edges, levels):
-            return nothing
+            return {}
         times = [_locate(predicted, recording, track, edge, levels[i : i + 2]) for i, edge in enumerate(edges)]
-        return {"times_s": np.array(times) / SAMPLE_RATE, "samples": np.diff(levels), "offset": float(levels[0])}
+        found = {"times_s": np.array(times) / SAMPLE_RATE, "samples": np.diff(levels), "offset": float(levels[0])}
+        return self._refined(measurement, model, found)
+
+    def _refined(self, measurement: Measurement, model: EchoModel, values: Values) -> Values:
+        """The same with each jump at the moment in the reference, and the gap filled in the way, that predicts best around it."""
+
+        def left(changed: Values, around: int) -> float:
+            part = slice(max(around - HISTORY, 0), around + AFTERMATH)
+            start = part.start / SAMPLE_RATE
+            late = changed["times_s"] > start
+            offset = changed["offset"] + float(changed["samples"][~late].sum())
+            times, steps = (changed["times_s"][late] - start, changed["samples"][late]) if late.any() else (0.0, 0.0)
+            local = complete(self, {"times_s": times, "samples": steps, "offset": offset, "gap_gain": changed["gap_gain"]})
+            predicted = model.predict(self.apply(measurement.reference[part], local, SAMPLE_RATE))
+            rest = measurement.whiten(measurement.recording[part] - predicted)
+            return float(np.sum(rest[around - SETTLED - part.start :].astype(np.float64) ** 2))
+
+        times, total = values["times_s"] * SAMPLE_RATE, {}
+        for gap_gain in (1.0, 0.0) if np.any(values["samples"] > 1.0) else (1.0,):
+            moved = {**values, "times_s": times / SAMPLE_RATE, "gap_gain": gap_gain}
+            cost = 0.0
+            for i, time in enumerate(times):
+                around, at = int(time), time - DIRECT
+                for steps in SEARCH:
+                    tries = []
+                    for step in steps:
+                        moved["times_s"] = moved["times_s"].copy()
+                        moved["times_s"][i] = max(at + step, 0.0) / SAMPLE_RATE
+                        tries.append((left(moved, around), at + step))
+                    least, at = min(tries)
+                moved["times_s"][i] = max(at, 0.0) / SAMPLE_RATE
+                cost += least
+            total[gap_gain] = (cost, moved)
+        return min(total.values(), key=lambda pair: pair[0])[1]
 
 
 def find_steps(lag: Array, sigma: Array) -> tuple[Array, Array]:

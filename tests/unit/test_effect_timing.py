@@ -5,9 +5,10 @@ import pytest
 from conformance import robot_alone, robot_speech
 
 from edgefilter.echo import effect as effects
-from edgefilter.echo.delay_jump import find_steps
+from edgefilter.echo.delay_jump import DIRECT, find_steps
 from edgefilter.echo.fractional import delayed, interpolate
 from edgefilter.echo.lag_track import track_lag
+from edgefilter.echo.model import PRE_ROLL
 
 
 def tone(positions, hz=1000):
@@ -67,13 +68,13 @@ def test_jumps_are_found_to_the_sample_also_between_the_blocks_to_fit_on():
     found = effects.find("delay_jump").fit(measurement, model)
     np.testing.assert_allclose(found["samples"], values["samples"], atol=0.05)
     np.testing.assert_allclose(found["times_s"], values["times_s"], atol=0.01)  # a few ms without energy do not tell
-    assert abs(found["offset"]) < 0.05
+    assert abs(found["offset"]) < 0.05 and DIRECT == PRE_ROLL
 
 
 def test_a_drift_is_no_jump():
     for ppm in (-300.0, -28.0, 60.0):
         found = effects.find("delay_jump").fit(*robot_alone("clock_drift", {"ppm": ppm}))
-        assert not np.any(found["samples"]), ppm
+        assert found == {}, ppm
 
 
 def test_one_odd_block_is_no_jump():
@@ -87,3 +88,17 @@ def test_steps_closer_than_a_third_of_a_sample_are_one():
     lag = np.repeat([0.0, 0.2, 7.0], 15)
     edges, levels = find_steps(lag, np.full(45, 0.05))
     assert list(edges) == [30] and levels == pytest.approx([0.1, 7.0], abs=0.02)
+
+
+def test_silence_in_the_gap_is_told_from_a_repetition():
+    values = {"times_s": 3.3, "samples": 400.0}
+    found = {gap: effects.find("delay_jump").fit(*robot_alone("delay_jump", {**values, "gap_gain": gap})) for gap in (0.0, 1.0)}
+    assert {gap: fitted["gap_gain"] for gap, fitted in found.items()} == {0.0: 0.0, 1.0: 1.0}
+
+
+def test_a_gap_is_silent_for_as_long_as_the_delay_grows():
+    jump = effects.find("delay_jump")
+    x = np.ones(1000, np.float32)
+    values = {"times_s": np.array([0.02, 0.04]), "samples": np.array([100.0, -50.0]), "gap_gain": 0.0}
+    out = jump.apply(x, effects.complete(jump, values), 16_000)
+    assert np.flatnonzero(out < 0.5).tolist() == list(range(320, 420))
