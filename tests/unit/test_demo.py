@@ -7,6 +7,8 @@ import sys
 import pytest
 import soundfile
 
+from edgefilter.stream import EgoFilter
+
 
 @pytest.fixture(scope="module")
 def demo(tmp_path_factory):
@@ -36,4 +38,4 @@ def test_it_draws_before_and_after(demo):
 
 def test_it_says_the_figures_and_that_they_are_simulated(demo):
     text = demo[1]
-    assert "simulated" in text and "SI-SDR" in text and "of real time" in text and "engine ss" in text
+    assert "simulated" in text and "SI-SDR" in text and "of real time" in text and f"engine {EgoFilter().engine_name}" in text
