@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 LOWEST_MS, DECADES, PER_DECADE = 1e-3, 7, 48
@@ -24,7 +26,7 @@ class Histogram:
 
     def add(self, ms: float) -> None:
         """Note one time, ms >= 0."""
-        at = int(PER_DECADE * np.log10(max(ms, LOWEST_MS) / LOWEST_MS))
+        at = int(PER_DECADE * math.log10(max(ms, LOWEST_MS) / LOWEST_MS))
         self._bins[min(at, self._bins.size - 1)] += 1
         self.count += 1
         self.sum_ms += ms
