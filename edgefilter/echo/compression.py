@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 import scipy
 
-from edgefilter.echo.effect import Measurement, Parameter, Stage, Values, complete
+from edgefilter.echo.effect import Measurement, Parameter, Stage, Values, complete, neutral
 from edgefilter.echo.least_squares import Normal, normal_equations
 from edgefilter.types import SAMPLE_RATE, Array, Samples
 
@@ -96,7 +96,7 @@ class Compression:
             cost = now
         worth = len(UNKNOWNS) * np.log(max(plain.count, 2)) * cost / max(plain.count, 1)
         if without - cost <= worth or best[1] < 0.01:
-            return {"ratio": 1.0}
+            return neutral(self)
         return {**_values(best), "makeup_db": self._makeup(measurement, model, _values(best))}
 
     def _makeup(self, measurement: Measurement, model: EchoModel, values: Values) -> float:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 
 from edgefilter.echo.clock_drift import STEADY, robust_line
-from edgefilter.echo.effect import Measurement, Parameter, Stage, Values, complete
+from edgefilter.echo.effect import Measurement, Parameter, Stage, Values, complete, neutral
 from edgefilter.echo.fractional import delayed
 from edgefilter.echo.lag_track import LagTrack, track_lag
 from edgefilter.types import SAMPLE_RATE, Array, Samples
@@ -72,10 +72,10 @@ class DelayJump:
         predicted, recording = measurement.whiten(model.predict(measurement.reference)), measurement.whiten(measurement.recording)
         track = track_lag(predicted, recording, measurement.fit, BLOCK, REACH)
         if track.lag.size < 4:
-            return {}
+            return neutral(self)
         edges, levels = find_steps(track.lag, np.hypot(track.sigma, STEADY))
         if not 1 <= edges.size <= MOST_JUMPS or _line_is_as_good(track, edges, levels):
-            return {}
+            return neutral(self)
         times = [_locate(predicted, recording, track, edge, levels[i : i + 2]) for i, edge in enumerate(edges)]
         found = {"times_s": np.array(times) / SAMPLE_RATE, "samples": np.diff(levels), "offset": float(levels[0])}
         return self._refined(measurement, model, found)

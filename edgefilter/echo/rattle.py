@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 import scipy
 
-from edgefilter.echo.effect import Measurement, Parameter, Stage, Values, complete
+from edgefilter.echo.effect import Measurement, Parameter, Stage, Values, complete, neutral
 from edgefilter.echo.least_squares import absorbed, filtered
 from edgefilter.types import SAMPLE_RATE, Array, Samples
 
@@ -24,6 +24,8 @@ BOUND = 1e4
 RIDGE = 1e-2
 STARTS_HZ, START_SHARES = (160.0, 240.0), (0.5, 0.75)
 """First guesses: resonance, and threshold as the share of the displacement's peaks that stay below."""
+HALF = SAMPLE_RATE
+"""Samples of the stretches that take turns when the sounds are tried on knocks that they were not learnt from."""
 WORTH = 2.5
 """What each tap has to explain, in units of the residual's variance, for the knocks to be real."""
 DECAYS_MS = (2.0, 4.0, 8.0, 16.0, 32.0, 64.0)
@@ -89,7 +91,7 @@ class Rattle:
         found = [explain(*start, COARSE_TAPS) for start in starts]
         best = int(np.argmax([gain for gain, _ in found]))
         if found[best][0] <= 0.0:
-            return {}
+            return neutral(self)
         at, (gain, sounds) = starts[best], found[best]
         for fine in (False, True):
             hits = [_matched(sound, rest, measurement, model) * allowed for sound in sounds]
@@ -98,9 +100,12 @@ class Rattle:
             better = int(fits[1][0] > fits[0][0])
             at, (gain, sounds) = choices[better], fits[better]
         resonance, q, threshold = at
-        count = max(float(measurement.weights.sum()), 1.0)
-        if gain <= WORTH * sounds.size * float(np.dot(rest, rest)) / count:
-            return {}
+        knocks = [k * allowed for k in find_knocks(resonated(x, resonance, q), threshold)]
+        halves = np.arange(x.size) // HALF % 2 == 0
+        if gain <= WORTH * sounds.size * float(np.dot(rest, rest)) / max(float(measurement.weights.sum()), 1.0):
+            return neutral(self)
+        if not _predicts([(k * halves, k * ~halves) for k in knocks], rest, measurement, model):
+            sounds = np.zeros_like(sounds)
         values = {"threshold": threshold, "resonance_hz": resonance, "q": q}
         values |= {name: np.clip(sound, -BOUND, BOUND) for name, sound in zip(("outward", "inward"), sounds, strict=True)}
         return {**values, **self._unpredictable(measurement, model, values)}
@@ -210,16 +215,36 @@ def _agreement(knocks: tuple[Samples, Samples], hits: list[Samples]) -> float:
     return along * abs(along) / energy if energy > 0.0 else 0.0
 
 
+def _predicts(halves: list[tuple[Samples, Samples]], residual: Samples, measurement: Measurement, model: EchoModel) -> bool:
+    """Whether the sounds learnt from one half of the knocks explain some of the other half, both ways round."""
+    normals = [_normal([measurement.whiten(model.predict(knocks[half])) for knocks in halves], residual, TAPS) for half in (0, 1)]
+    total = 0.0
+    for (matrix, right), (other, wanted) in (normals, normals[::-1]):
+        w = _solve(matrix, right)
+        total += float(2 * w @ wanted - w @ other @ w)
+    return total > 0.0
+
+
 def _explained(columns: list[Samples], residual: Samples, taps: int) -> tuple[float, Array]:
-    """Energy explained and weights (C, taps) of residual = sum of columns filtered by so many taps, from correlations."""
+    """Energy explained and weights (C, taps) of residual = sum of columns filtered by so many taps."""
+    matrix, right = _normal(columns, residual, taps)
+    w = _solve(matrix, right)
+    return float(2 * w @ right - w @ matrix @ w), w.reshape(len(columns), taps)
+
+
+def _solve(matrix: Array, right: Array) -> Array:
+    scale = float(matrix.diagonal().mean())
+    if scale <= 0.0:
+        return np.zeros_like(right)
+    return scipy.linalg.solve(matrix + RIDGE * scale * np.eye(right.size), right, assume_a="pos")
+
+
+def _normal(columns: list[Samples], residual: Samples, taps: int) -> tuple[Array, Array]:
+    """Normal equations (C taps, C taps), (C taps,) from correlations."""
     n = scipy.fft.next_fast_len(residual.size + taps, real=True)
     spectra = [scipy.fft.rfft(c.astype(np.float64), n) for c in columns]
     target = scipy.fft.rfft(residual.astype(np.float64), n)
     right = np.concatenate([scipy.fft.irfft(np.conj(s) * target, n)[:taps] for s in spectra])
     lags = [[scipy.fft.irfft(np.conj(a) * b, n) for b in spectra] for a in spectra]
     matrix = np.block([[scipy.linalg.toeplitz(r[:taps], np.concatenate((r[:1], r[:-taps:-1]))) for r in row] for row in lags])
-    scale = float(matrix.diagonal().mean())
-    if scale <= 0.0:
-        return 0.0, np.zeros((len(columns), taps))
-    w = scipy.linalg.solve(matrix + RIDGE * scale * np.eye(right.size), right, assume_a="pos")
-    return float(2 * w @ right - w @ matrix @ w), w.reshape(len(columns), taps)
+    return matrix, right

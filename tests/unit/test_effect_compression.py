@@ -55,5 +55,5 @@ def test_fit_finds_threshold_ratio_and_times():
 
 def test_a_volume_that_was_turned_is_no_compression():
     measurement, model = robot_alone("playback_gain", {"gain_db": -4.0})
-    assert effects.find("compression").fit(measurement, model) == {"ratio": 1.0}
+    assert COMPRESS.fit(measurement, model) == effects.neutral(COMPRESS)
     assert held_out_power(measurement, model.predict(measurement.reference)) > 2.0
