@@ -98,8 +98,8 @@ class EdgeCrnn(nn.Module):
 
     def initial_state(self, batch: int = 1) -> tuple[Tensor, Tensor, Tensor]:
         """All zeros: before the first frame there was silence."""
-        previous = torch.zeros(batch, 6, self.config.bands)
-        return previous, previous.clone(), torch.zeros(self.config.layers, batch, self.config.hidden)
+        zeros = self.inward.weight.new_zeros
+        return zeros(batch, 6, self.config.bands), zeros(batch, 6, self.config.bands), zeros(self.config.layers, batch, self.config.hidden)
 
     def forward(self, error: Tensor, mic: Tensor, reference: Tensor, echo: Tensor, state: tuple[Tensor, ...]) -> tuple[Tensor, Tensor, tuple[Tensor, ...]]:
         """Spectra (batch, frames, bins, 2) to the human's (batch, frames, bins, 2), logits (batch, frames), and the next state."""

@@ -170,7 +170,7 @@ def _write_int8(network: nn.Module, path: Path) -> str:
 
 def main(argv: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m export.onnx_export", description="Convert a trained network to the ONNX file that the runtime loads.")
-    parser.add_argument("checkpoint", type=Path, help="best.pt of export/train.py or train_paper.py")
+    parser.add_argument("checkpoint", type=Path, help="best.pt of export/train.py")
     parser.add_argument("--output", type=Path, required=True, metavar="FILE.onnx")
     parser.add_argument("--int8", action="store_true", help="also write FILE_int8.onnx where the network has an LSTM")
     parser.add_argument("--figures", type=Path, metavar="FILE.json", help="figures to write into the file, over those of the checkpoint")

@@ -59,7 +59,7 @@ class EdgeTask:
 
     def loss(self, network: nn.Module, batch: dict[str, Tensor]) -> tuple[dict[str, Tensor], Tensor]:
         inputs = [batch[name] for name in INPUTS]
-        with torch.autocast("cpu", torch.bfloat16, enabled=self.half and network.training):
+        with torch.autocast(inputs[0].device.type, torch.bfloat16, enabled=self.half and network.training):
             human, logit, _ = network(*inputs, network.initial_state(inputs[0].shape[0]))
         scale = batch["scale"][:, None, None, None]
         human = scale * human.float()

@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from torch import nn
+from torch import Tensor, nn
 from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
 
@@ -36,11 +36,13 @@ PATIENCE = 12
 def validate(task: Task, network: nn.Module, items: Items, seconds: float) -> dict[str, float]:
     """Mean loss terms over the last `seconds` of every item, SI-SDR of the estimate and of the linear stage's error, active frames kept."""
     network.eval()
+    device = next(network.parameters()).device
     batches = Batches(items, task.stft, 1, seconds, seed=0, augment=False)
     sums: dict[str, float] = {}
     for at in range(0, len(items.names), 8):
         names = items.names[at : at + 8]
         batch = batches.spectra([items.crop(name, items.length(name) - batches.samples, batches.samples) for name in names])
+        batch = on(device, batch)
         terms, human = task.loss(network, batch)
         scale = batch["scale"][:, None, None, None]
         terms["si_sdr_db"] = si_sdr(human, scale * batch["clean"])
@@ -53,20 +55,26 @@ def validate(task: Task, network: nn.Module, items: Items, seconds: float) -> di
     return sums
 
 
+def on(device: torch.device, batch: dict[str, Tensor]) -> dict[str, Tensor]:
+    """The batch where the network is."""
+    return {name: value.to(device, non_blocking=True) for name, value in batch.items()}
+
+
 def train(options: argparse.Namespace) -> Path:
-    """Run until --steps or until validation stops getting better; returns the best checkpoint."""
+    """Run until --steps or until validation stops getting better, on a GPU where there is one; returns the best checkpoint."""
     torch.manual_seed(options.seed)
     torch.set_num_threads(options.threads)
     options.output.mkdir(parents=True, exist_ok=True)
     task = TASKS[options.network](options)
-    network = task.network()
+    device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    network = task.network().to(device)
     average = {name: value.clone() for name, value in network.state_dict().items()}
     optimiser = torch.optim.AdamW(network.parameters(), lr=options.rate, weight_decay=1e-2, betas=(0.9, 0.98))
     items, held_out = Items(options.data), Items(options.validation)
     step, best, since = 0, -math.inf, 0
     last = options.output / "last.pt"
     if last.exists():
-        saved = torch.load(last, weights_only=False)
+        saved = torch.load(last, map_location=device, weights_only=True)
         network.load_state_dict(saved["network"])
         optimiser.load_state_dict(saved["optimiser"])
         average, step, best, since = saved["average"], saved["step"], saved["best"], saved["since"]
@@ -77,7 +85,7 @@ def train(options: argparse.Namespace) -> Path:
         for step in (progress := tqdm(range(step, options.steps), initial=step, total=options.steps, unit="step")):
             for group in optimiser.param_groups:
                 group["lr"] = options.rate * min(1.0, (step + 1) / 300) * (0.5 + 0.5 * math.cos(math.pi * step / options.steps)) + 1e-6
-            terms, _ = task.loss(network, batches.draw())
+            terms, _ = task.loss(network, on(device, batches.draw()))
             optimiser.zero_grad(set_to_none=True)
             terms["total"].backward()
             shown = {name: float(value.detach()) for name, value in terms.items()}
@@ -94,7 +102,7 @@ def train(options: argparse.Namespace) -> Path:
             board.add_scalar("train/total", shown["total"], step)
             if (step + 1) % options.every and step + 1 < options.steps:
                 continue
-            averaged = task.network()
+            averaged = task.network().to(device)
             averaged.load_state_dict(average)
             figures = validate(task, averaged, held_out, min(8.0, 2 * options.seconds))
             score = -figures["total"]

@@ -34,7 +34,7 @@ class PaperCrnn:
     longest = MAX_SECONDS * SAMPLE_RATE // PAPER_STFT.hop
 
     def __init__(self, model: str | Path | None = None) -> None:
-        remedy = "train one with 'python -m export.train_paper' and convert it with 'python -m export.onnx_export'"
+        remedy = "train one with 'python -m export.train --network paper' and convert it with 'python -m export.onnx_export'"
         self.model = open_model(find_model(model, VARIABLE, "paper_crnn.onnx", remedy), PAPER_TYPE, PAPER_VERSION)
         if self.model.stft != PAPER_STFT:
             raise ModelError(f"model {self.model.path} is for {self.model.stft}, expected {PAPER_STFT}: train it on that")

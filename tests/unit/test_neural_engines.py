@@ -125,7 +125,7 @@ def test_a_model_for_an_engine_without_one_is_a_mistake():
 
 def test_paper_crnn_without_a_model_says_how_to_make_one(monkeypatch):
     monkeypatch.delenv("EDGEFILTER_PAPER_CRNN", raising=False)
-    with pytest.raises(ModelError, match="export.train_paper.*export.onnx_export"):
+    with pytest.raises(ModelError, match="export.train --network paper.*export.onnx_export"):
         PaperCrnn()
 
 
