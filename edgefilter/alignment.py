@@ -31,8 +31,9 @@ FAR, EDGE = 8.0, 960.0
 of up to 9, but only at the very edge of the tracker's reach."""
 STRANGE = 10.0
 """Power over what the robot brings above which it is not the robot that is heard, so that no jump can be seen."""
-LOST_BLOCKS = 10
-"""Measurements in speech without a credible peak after which everything is searched again."""
+LOST_BLOCKS, NEARBY, NEARBY_SEARCHES = 3, 4096, 10
+"""Measurements in speech without a credible peak after which all lags are searched again: at first as if the present delay had ceased
+NEARBY samples ago, which finds jumps of up to 200 ms, then as if the utterance had begun half a second before."""
 
 
 class Aligner:
@@ -119,10 +120,10 @@ class Aligner:
 
     def stats(self) -> dict[str, object]:
         """Delay, drift, confidence, state and what happened so far, ready for JSON."""
-        delay = round(self._drift.delay, 3) if self._known else None
-        deviation = round(float(np.sqrt(self._drift.covariance[0, 0])), 3) if self._known else None
-        found = {"method": "tracking", "state": self._state(), "delay_samples": delay, "deviation_samples": deviation}
-        return {**found, "ppm": round(-1e6 * self._drift.slope, 2), "confidence": round(self._confidence, 3), **self._counts}
+        deviation = float(np.sqrt(self._drift.covariance[0, 0]))
+        delay, deviation = (round(self._drift.delay, 3), round(deviation, 3)) if self._known else (None, None)
+        found = {"method": "tracking", "state": self._state(), "delay_samples": delay, "deviation_samples": deviation, **self._counts}
+        return {**found, "ppm": round(-1e6 * self._drift.slope, 2), "confidence": round(self._confidence, 3)}
 
     def _state(self) -> str:
         current = self._onsets.current
@@ -149,19 +150,20 @@ class Aligner:
         self._refuted = False
 
     def _search(self) -> bool:
-        """Look for the oldest unresolved utterance over all lags, a step each hop; True if the delay was switched.
-
-        Where there is none, one that was announced is looked for."""
+        """Look for the oldest unresolved utterance, or one that was announced, a step each hop; True if the delay was switched."""
         self._to_search -= self.hop
         if self._measured or (self._stage == 0 and self._to_search > 0):
             return False
-        now, stage = self._ref.end, self._stage
+        now, stage, self._stage = self._ref.end, self._stage, 0
         if stage == 0:
             self._expected = None if self._open else self._announced.expected(now)
             if not self._open and self._expected is None:
                 return False
             self._to_search, self._stage = SEARCH_STRIDE, 1
             self._counts["searches"] += 1
+            if self._open and self._open[0].nearby > 0:
+                self._open[0].nearby -= 1
+                self._open[0].start = now - int(self._drift.delay) - (NEARBY if self._open[0].nearby else SAMPLE_RATE // 2)
             since = self._open[0].start if self._open else self._expected.start
             self._lags.prepare(self._expected or self._ref, now, since)
         elif stage == 1:
@@ -169,11 +171,9 @@ class Aligner:
             heard_out = self._open[0].after + int(self._drift.delay) if self._open and self._trusted else 0
             self._lags.listen(self._mic, now, heard_out)
         elif stage == 2:
-            self._stage = 0
             self._found = self._lags.find()
             return self._found is not None and self._decide(self._found)
         else:
-            self._stage = 0
             return self._lags.before(self._mic, self._expected or self._ref, self._found) > SEEN and self._take(self._found)
         return False
 
@@ -233,7 +233,10 @@ class Aligner:
         if small and (self._drift.surprise(found) < 5.0 or abs(found.offset) < 0.3):
             return self._accept(found)
         too_loud = self._gain is not None and found.gain > STRANGE * self._gain
-        if too_loud or (abs(found.offset) > 8.0 and found.strength < FAR) or abs(found.offset) > EDGE:
+        if too_loud:
+            return False
+        if (abs(found.offset) > 8.0 and found.strength < FAR) or abs(found.offset) > EDGE:
+            self._note_loss(found)
             return False
         suspect, self._suspect = self._suspect, found.offset
         sure = found.strength > 14.0 and found.dominance > 3.0 and abs(found.offset) > 8.0
@@ -243,6 +246,7 @@ class Aligner:
             if self._open and self._ref.end - self._drift.delay > self._open[0].start + STRIDE:
                 self._resolve()
             return self._switch(self._drift.delay + found.offset, 0.3)
+        self._to_measure = STRIDE // 2
         self._note_loss(found)
         return False
 
@@ -263,12 +267,12 @@ class Aligner:
         if self._open or self._gain is None or found.gain < 0.25 * self._gain:
             return
         self._lost += 1
+        self._to_measure = STRIDE // 2
         self._confidence *= 0.9
         if self._lost >= LOST_BLOCKS:
             self._lost = 0
-            start = int(self._ref.end - self._drift.delay) - SAMPLE_RATE // 2
             self._trusted = False
-            self._open.append(Utterance(start, self._ref.end))
+            self._open.append(Utterance(self._ref.end, self._ref.end, nearby=NEARBY_SEARCHES))
 
     def _deliver(self, mic: Samples, before: float, switched: bool) -> Aligned:
         if not self._known:

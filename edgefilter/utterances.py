@@ -20,11 +20,13 @@ RANGE = 10**-4.5
 class Utterance:
     """A stretch of speech in the reference, positions in samples; start lies up to two hops before the first sound.
 
-    after: end of the one before it, which the microphone hears out first, since one loudspeaker plays them in turn."""
+    after: end of the one before it, which the microphone hears out first, since one loudspeaker plays them in turn.
+    nearby: searches left that suppose it to have jumped a short while ago, its start moving along; 0 for one that began."""
 
     start: int
     end: int
     after: int = -(10**9)
+    nearby: int = 0
 
 
 class OnsetDetector:

@@ -60,7 +60,7 @@ def test_drift_is_tracked_without_jitter(ppm):
     assert not any(a.realigned for a in hops[late])
 
 
-@pytest.mark.parametrize("jump", [2, -5, 40, -160, 500, -2500])
+@pytest.mark.parametrize("jump", [2, -5, 40, -160, 500, 1500, -2500])
 def test_dropped_buffers_are_healed_within_200_ms(jump):
     rng = np.random.default_rng(abs(jump))
     ref, _ = utterances(rng, [7], [0.5])
@@ -73,7 +73,7 @@ def test_dropped_buffers_are_healed_within_200_ms(jump):
     truth[at:] += jump
     hops = run(Aligner(256, known_path(room(rng, 0.25))), mic + fan(rng, mic.size), ref)
     error = np.abs(delays(hops) - truth[255::256][: len(hops)])
-    limit = 0.2 if abs(jump) <= 1000 else 1.2  # beyond the tracker's reach the loss must first be noticed, then all lags searched
+    limit = 0.2 if abs(jump) <= 1000 else 0.5  # beyond the tracker's reach the loss must first be noticed, then all lags searched
     healed = (at + int(limit * RATE)) // 256
     assert np.all(error[healed : int(6.5 * RATE) // 256] < 1.0)  # a sample: less than the smallest jump
     assert any(a.realigned for a in hops[at // 256 : healed + 1])
