@@ -26,7 +26,7 @@ def fit_filter(x: Samples, target: Samples, weights: Samples, taps: int, lead: i
     circulant preconditioner; stopping after `steps` leaves out what the data hardly speaks of.
     """
     n = fft.next_fast_len(x.size + taps, real=True)
-    source = fft.rfft(x.astype(np.float64), n)
+    source = fft.rfft(x.astype(np.float32), n)
     share = float(np.mean(weights))
     size = fft.next_fast_len(2 * taps, real=True)
     correlation = fft.irfft(np.abs(source) ** 2, n)
@@ -36,12 +36,12 @@ def fit_filter(x: Samples, target: Samples, weights: Samples, taps: int, lead: i
     scale = np.sqrt(lightest / penalty)
 
     def adjoint(signal_: Array) -> Array:
-        moved = np.zeros(n)
+        moved = np.zeros(n, np.float32)
         moved[: x.size] = signal_ * weights
         return np.take(fft.irfft(fft.rfft(moved) * source.conj(), n), np.arange(-lead, taps - lead), mode="wrap")
 
     def forward(c: Array) -> Array:
-        padded = np.zeros(n)
+        padded = np.zeros(n, np.float32)
         padded[: taps - lead], padded[n - lead :] = c[lead:], c[:lead]
         return fft.irfft(fft.rfft(padded) * source, n)[: x.size]
 
