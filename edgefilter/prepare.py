@@ -22,6 +22,8 @@ BLOCK = SAMPLE_RATE // 2
 """Samples of the blocks that are fitted on and judged by in turn."""
 SILENCE_DB = -15.0
 """The robot is silent where its predicted voice, whitened, is this far under the fan."""
+FAN_TOLERANCE_DB = 1.0
+"""By which the fan of a robot differs from day to day."""
 MIN_SECONDS = 1.0
 TRACK = SAMPLE_RATE
 """Samples of one window of the lag track."""
@@ -77,7 +79,22 @@ def prepare(profile: Profile, recording: Samples, reference: Samples, *, sample_
     level = np.add.reduceat(white**2, np.arange(0, n, block)) / block
     active = np.repeat(maximum_filter1d(level, 11) > 10 ** (SILENCE_DB / 10), block)[:n]
     fit = np.arange(n) // BLOCK % 2 == 0
-    return Prepared(Measurement(x, y, profile.noise_psd, fit), predicted, np.ones(n, bool), active, offset)
+    psd = profile.noise_psd * np.float32(fan_scale(whiten(y, profile.noise_psd)[~active]))
+    return Prepared(Measurement(x, y, psd, fit), predicted, np.ones(n, bool), active, offset)
+
+
+def fan_scale(quiet: Samples) -> float:
+    """How much louder the fan is than in the calibration, in power, from the whitened recording while the robot is silent, (k,).
+
+    1 where the difference is more than FAN_TOLERANCE_DB either way, and so no ordinary one, or where there is too little silence.
+    """
+    if quiet.size < SAMPLE_RATE // 2:
+        return 1.0
+    size = 256
+    frames = quiet[: quiet.size // size * size].reshape(-1, size) * np.hanning(size).astype(np.float32)
+    power = np.mean(np.abs(fft.rfft(frames)) ** 2, axis=0) / np.sum(np.hanning(size) ** 2)
+    scale = float(np.median(power[3:-6]))
+    return scale if abs(10 * np.log10(max(scale, 1e-9))) <= FAN_TOLERANCE_DB else 1.0
 
 
 def shift(x: Samples, samples: float) -> Samples:

@@ -10,19 +10,21 @@ from numpy.typing import NDArray
 from scipy import fft
 
 from edgefilter.echo.effect import Measurement, Parameter, Stage, Values
-from edgefilter.echo.wiener import convolve_from, spectra
+from edgefilter.echo.wiener import convolve_from, fit_filter, spectra
 from edgefilter.types import SAMPLE_RATE, Array, Samples
 
 if TYPE_CHECKING:
     from edgefilter.echo.model import EchoModel
 
 FFT = 1024
+TAPS, LEAD = 192, 64
 
 
 class Bandlimit:
     """Low-pass with the magnitude of a Butterworth filter, |G|^2 = 1 / (1 + (f / cutoff_hz)^(2 order)).
 
     phase: 0 for a linear-phase filter (resamplers, codecs), 1 for a minimum-phase one (analogue), the constant delay taken out.
+    taps: (k,) lags -LEAD to k - LEAD, by which the real filter differs from that one.
     """
 
     name: ClassVar[str] = "bandlimit"
@@ -32,6 +34,7 @@ class Bandlimit:
         Parameter("cutoff_hz", "Hz", 16000.0, 200.0, 16000.0),
         Parameter("order", "1", 8.0, 1.0, 60.0),
         Parameter("phase", "1", 0.0, 0.0, 1.0),
+        Parameter("taps", "1", 0.0, -10.0, 10.0),
     )
 
     def apply(self, x: Samples, values: Values, sample_rate: int) -> Samples:
@@ -40,11 +43,14 @@ class Bandlimit:
             return x.copy()
         hz = np.arange(FFT // 2 + 1) * sample_rate / FFT
         response = low_pass(hz, float(values["cutoff_hz"]), float(values["order"]), float(values["phase"]))
-        return convolve_from(x, fft.fftshift(fft.irfft(response, FFT)), FFT // 2)
+        y = convolve_from(x, fft.fftshift(fft.irfft(response, FFT)), FFT // 2)
+        taps = np.atleast_1d(np.asarray(values["taps"], float))
+        return y + convolve_from(x, taps, LEAD) if taps.any() else y
 
     def fit(self, measurement: Measurement, model: EchoModel) -> Values:
-        """The best of a grid of cut-offs, orders and phases, refined; judged in the whitened cross-spectrum."""
-        found = spectra(measurement, model.predict(measurement.reference), 10.0)
+        """The best of a grid of cut-offs, orders and phases, refined; judged in the whitened cross-spectrum. Then the taps."""
+        predicted = model.predict(measurement.reference)
+        found = spectra(measurement, predicted, 10.0)
 
         def gain(cutoff: float, order: float, phase: float) -> float:
             return found.gain(low_pass(found.hz, cutoff, order, phase))
@@ -56,7 +62,11 @@ class Bandlimit:
             near = product(best[0] * np.array([1 / step, 1.0, step]), np.clip(best[1] * np.array([1 / step**3, 1.0, step**3]), 1.0, 60.0), (0.0, 0.5, 1.0))
             best = max(near, key=lambda values: gain(*values))
             step = 1.0 + (step - 1.0) * 0.6
-        return {"cutoff_hz": float(np.clip(best[0], 200.0, 15999.0)), "order": float(best[1]), "phase": float(best[2])}
+        values = {"cutoff_hz": float(np.clip(best[0], 200.0, 15999.0)), "order": float(best[1]), "phase": float(best[2])}
+        left = measurement.recording - self.apply(predicted, {**values, "taps": 0.0}, SAMPLE_RATE)
+        x = measurement.whiten(predicted)
+        taps = fit_filter(x, measurement.whiten(left), measurement.weights, TAPS, LEAD, prior=np.full(TAPS, 1e-3), steps=15)
+        return {**values, "taps": np.clip(taps, -10.0, 10.0)}
 
 
 def low_pass(hz: Array, cutoff: float, order: float, phase: float) -> NDArray[np.complex128]:

@@ -95,10 +95,10 @@ def _search(found: Spectra) -> tuple[float, float]:
 
 def _refine(found: Spectra, frequency: float, q: float) -> tuple[float, float]:
     def cost(v: Array) -> float:
-        f, quality = frequency * np.exp(v[0] / q), float(np.clip(q * np.exp(v[1]), 0.5, 2000.0))
+        f, quality = float(np.clip(frequency * np.exp(v[0] / q), LOWEST_HZ, HIGHEST_HZ)), float(np.clip(q * np.exp(v[1]), 4.0, 2000.0))
         width = 8.0 * frequency / q + 20.0
         inside = slice(*np.searchsorted(found.hz, (frequency - width, frequency + width)))
         return -float(_explained(found, inside, np.array([f]), quality)[0])
 
     v = scipy.optimize.minimize(cost, [0.0, 0.0], method="Nelder-Mead", options={"maxiter": 60, "initial_simplex": [[0, 0], [0.5, 0], [0, 0.5]]}).x
-    return float(np.clip(frequency * np.exp(v[0] / q), 20.0, 8000.0)), float(np.clip(q * np.exp(v[1]), 0.5, 2000.0))
+    return float(np.clip(frequency * np.exp(v[0] / q), LOWEST_HZ, HIGHEST_HZ)), float(np.clip(q * np.exp(v[1]), 4.0, 2000.0))

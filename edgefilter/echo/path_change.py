@@ -15,6 +15,8 @@ if TYPE_CHECKING:
 
 LEAD = 64
 TAPS = 3072
+EXPECTED = 1e-2
+"""Expected square of a tap."""
 BLOCK = SAMPLE_RATE // 10
 MARGIN = 1.5
 """Seconds at either end within which no change is looked for: there is no telling it from a path that was another all along."""
@@ -51,7 +53,7 @@ class PathChange:
         duration = 0.01
         for _ in range(2):
             after = measurement.weights * (np.arange(x.size) > (time + 0.3) * SAMPLE_RATE)
-            taps = fit_filter(x, residual, after, TAPS, LEAD, prior=_prior(), steps=30)
+            taps = fit_filter(x, residual, after, TAPS, LEAD, prior=np.full(TAPS, EXPECTED), steps=40)
             change = convolve_from(x, taps, LEAD)
             time = _best_time(residual, change, measurement.weights)
         errors = {}
@@ -66,12 +68,6 @@ class PathChange:
 def _fade(n: int, time: float, duration: float, sample_rate: int) -> Samples:
     """(n,) 0 before, 1 after, a line in between."""
     return np.clip((np.arange(n, dtype=np.float32) / sample_rate - time) / max(duration, 1e-4) + 0.5, 0.0, 1.0).astype(np.float32)
-
-
-def _prior() -> Array:
-    """(TAPS,) expected squares of the new path's difference: as large as the path itself near lag 0, then 30 dB less and falling by 60 dB in 0.5 s."""
-    lags = np.abs(np.arange(TAPS) - LEAD)
-    return 0.03 * np.exp(-lags / 12.0) + 1e-3 * 10.0 ** (-6.0 * lags / (0.5 * SAMPLE_RATE))
 
 
 def _step(residual: Samples, x: Samples) -> float:

@@ -1,0 +1,110 @@
+"""From the search's steps and what is left over to the verdict, its findings and its words."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+
+import numpy as np
+
+from edgefilter.compare import describe
+from edgefilter.echo.effect import find
+from edgefilter.echo.model import EchoModel
+from edgefilter.evidence import left_in_words, sentence
+from edgefilter.findings import Diagnosis, Finding, Interval
+from edgefilter.leftover import inspect
+from edgefilter.prepare import BLOCK, Prepared
+from edgefilter.search import Found, Trial, predict
+
+EXPLAINED_DB = 0.8
+"""Excess up to which nothing is missing: what the fan of another day and a faint distortion leave."""
+EXPLAINED_SHARE = 0.3
+"""Less of the excess power than this explained by all findings together is not what happened."""
+UNPREDICTABLE = ("rattle", "bandlimit")
+"""Effects whose own noise stays in the residual."""
+THIRDS_T = 1.69
+"""90 % quantile of Student's t with 2 degrees of freedom over the square root of 3: the interval from three fits to a third each."""
+
+
+def conclude(prepared: Prepared, found: Found, progress: Callable[[str], None] | None = None) -> Diagnosis:
+    """The diagnosis that a search leads to."""
+    comparison = describe(prepared, found.base.prediction)
+    residual = prepared.measurement.recording - found.final.prediction
+    left = inspect(prepared, residual)
+    remaining = found.final.excess_db
+    share = _share(found.base.excess_db, remaining)
+    names = [step.name for step in found.steps]
+    irreducible = max(remaining, 0.0) if set(names) & set(UNPREDICTABLE) else 0.0
+    enough = share >= EXPLAINED_SHARE or bool(set(names) & set(UNPREDICTABLE)) or remaining < EXPLAINED_DB
+    if found.steps and enough:
+        verdict = "missing"
+    elif remaining < EXPLAINED_DB:
+        verdict = "explained"
+    else:
+        verdict = "unexplained"
+    findings = tuple(_findings(prepared, found, progress)) if verdict == "missing" else ()
+    return Diagnosis(
+        verdict=verdict,
+        comparison=comparison,
+        ranking=findings,
+        evidence=left_in_words(prepared, found, left, remaining, EXPLAINED_DB),
+        remaining_db=remaining if findings else found.base.excess_db,
+        irreducible_db=irreducible,
+        model=found.model if findings else found.steps[0].model.without_effect(names[0]) if names else found.model,
+    )
+
+
+def _share(before_db: float, after_db: float) -> float:
+    """Part of the power over the fan that is gone."""
+    before, after = 10 ** (before_db / 10) - 1.0, 10 ** (after_db / 10) - 1.0
+    return float(np.clip(1.0 - after / before, 0.0, 1.0)) if before > 0.0 else 0.0
+
+
+def _findings(prepared: Prepared, found: Found, progress: Callable[[str], None] | None) -> list[Finding]:
+    """Strongest first; each with the excess before and after it in the order in which they were added."""
+    findings, before = [], found.base.excess_db
+    for step in found.steps:
+        after = found.final.excess_db if step is found.steps[-1] else step.verdict.excess_db
+        if progress:
+            progress(f"how well {step.name} is known")
+        intervals = _intervals(prepared, found.model, step)
+        findings.append(
+            Finding(
+                effect=step.name,
+                excess_before_db=before,
+                excess_after_db=after,
+                share=max(_share(found.base.excess_db, after) - _share(found.base.excess_db, before), 0.0),
+                parameters=intervals,
+                evidence=sentence(step, prepared, found.base),
+                values=step.values,
+                prediction=step.verdict.prediction,
+            )
+        )
+        before = after
+    return sorted(findings, key=lambda finding: -finding.share)
+
+
+def _intervals(prepared: Prepared, model: EchoModel, step: Trial) -> Mapping[str, Interval]:
+    """Each scalar parameter, or short list, with the interval that three fits to a third of the recording each give."""
+    effect = find(step.name)
+    block = np.arange(prepared.usable.size) // BLOCK
+    others = model.without_effect(step.name)
+    fits = [effect.fit(replace(prepared.measurement, fit=prepared.usable & (block % 3 == third)), others) for third in range(3)]
+    found = {}
+    for parameter in effect.parameters:
+        value = np.asarray(step.values[parameter.name], float)
+        if value.size > 8:
+            continue
+        found[parameter.name] = _interval(value, [np.asarray(fit[parameter.name], float) for fit in fits], parameter.unit)
+    return found
+
+
+def _interval(value: np.ndarray, fits: list[np.ndarray], unit: str) -> Interval:
+    alike = [fit for fit in fits if fit.shape == value.shape]
+    spread = THIRDS_T * np.std(alike, axis=0, ddof=1) if len(alike) > 1 else np.zeros_like(value)
+    low, high = value - spread, value + spread
+    if value.ndim == 0:
+        return Interval(float(value), float(low), float(high), unit)
+    return Interval(*(tuple(map(float, part)) for part in (value, low, high)), unit)
+
+

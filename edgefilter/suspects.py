@@ -1,0 +1,98 @@
+"""What each effect must show before it is named: its complexity, its least size, and what its parameters must look like."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from edgefilter.echo.effect import Values, find
+from edgefilter.judge import Judge, Verdict
+from edgefilter.types import SAMPLE_RATE
+
+Guard = Callable[[Values, Judge, Verdict, Verdict], bool]
+
+
+@dataclass(frozen=True)
+class Suspect:
+    """complexity: of two effects that explain about as much, the lower one is named. least_gain_db: fall of the held-out level.
+
+    least_size_db: power of what the effect changes, over the fan. guard: False where the parameters say that it is something else.
+    """
+
+    complexity: int
+    least_gain_db: float = 0.05
+    least_size_db: float = -6.0
+    guard: Guard | None = None
+
+
+def _audible_gain(values: Values, *_: object) -> bool:
+    return abs(float(values["gain_db"])) >= 0.2
+
+
+def _cuts_the_band(values: Values, judge: Judge, before: Verdict, after: Verdict) -> bool:
+    """A low-pass and not a colouring: the low-pass alone, without its fine taps, brings half of it."""
+    if float(values["cutoff_hz"]) >= 7700.0:
+        return False
+    plain = find("bandlimit").apply(before.prediction, {**values, "taps": 0.0}, SAMPLE_RATE)
+    return before.level_db - judge.judge(plain).level_db > 0.5 * (before.level_db - after.level_db)
+
+
+def _drifts(values: Values, *_: object) -> bool:
+    return abs(float(values["ppm"])) >= 0.5
+
+
+def _rings(values: Values, *_: object) -> bool:
+    return float(values["q"]) >= 4.0 and 60.0 <= float(values["frequency_hz"]) <= 7000.0
+
+
+def _clean_before(values: Values, judge: Judge, before: Verdict, after: Verdict) -> bool:
+    """Whether the path was the calibrated one until it changed: most of what the effect explains lies after its time, little before."""
+    time = float(values["time_s"])
+    early = judge.active_cells & (judge.starts < time * SAMPLE_RATE)
+    late = judge.active_cells & (judge.starts >= time * SAMPLE_RATE)
+    if early.sum() < 6 or late.sum() < 6:
+        return False
+    level = 10 * np.log10(np.maximum(before.cells, 1e-3)) @ judge.freedom / judge.freedom.sum()
+    explained = 10 * np.log10(np.maximum(after.cells, 1e-3)) @ judge.freedom / judge.freedom.sum()
+    rest = float(np.mean(level[early]) - np.mean(explained[late]))
+    return rest < 0.5 * float(np.mean(level[late]) - np.mean(explained[late]))
+
+
+def _jumps(values: Values, *_: object) -> bool:
+    return bool(np.any(np.abs(np.atleast_1d(np.asarray(values["samples"], float))) >= 0.3))
+
+
+def _reverberates(values: Values, *_: object) -> bool:
+    return float(values["level_db"]) > -100.0
+
+
+SUSPECTS: dict[str, Suspect] = {
+    "playback_gain": Suspect(0, guard=_audible_gain),
+    "clock_drift": Suspect(1, guard=_drifts),
+    "chassis_resonance": Suspect(1, guard=_rings),
+    "bandlimit": Suspect(1, guard=_cuts_the_band),
+    "mic_clipping": Suspect(1, least_size_db=-9.0),
+    "delay_jump": Suspect(1, guard=_jumps),
+    "compression": Suspect(2),
+    "mic_agc": Suspect(3),
+    "speaker_nonlinearity": Suspect(3),
+    "rattle": Suspect(3),
+    "path_change": Suspect(4, guard=_clean_before),
+    "late_reverb": Suspect(4, guard=_reverberates),
+}
+"""Every effect whose presence shows while the robot is heard; the fan is looked at in the silences."""
+OWN = Suspect(3)
+"""An effect of the user's own."""
+NESTED = 0.85
+"""A simpler effect that explains this share of what the best one does is preferred to it."""
+
+
+def choose(gains: dict[str, float]) -> str | None:
+    """The effect to name, from the falls in level that the admissible ones bring; None where there is none."""
+    if not gains:
+        return None
+    most = max(gains.values())
+    enough = [name for name, gain in gains.items() if gain >= NESTED * most]
+    return min(enough, key=lambda name: (SUSPECTS.get(name, OWN).complexity, -gains[name]))
