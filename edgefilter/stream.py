@@ -52,7 +52,7 @@ class Front:
     def _make_canceller(self, profile: Profile | None) -> Canceller:
         if profile is None:
             return Canceller(self.hop)
-        response = profile.echo.impulse_response
+        response = profile.echo.running_response()
         return Canceller(self.hop, taps=int(np.clip(response.size, *TAPS)), impulse_response=response)
 
     def step(self, mic: Samples, ref: Samples) -> tuple[Frame, Aligned | None]:
@@ -309,7 +309,8 @@ class EgoFilter:
         """The profile with the echo path as the linear stage has adapted it; raises SignalError where there is none."""
         if not self.can_adapt:
             raise SignalError("nothing to write back: give a profile and an engine with a linear stage (linear or ss)")
-        return self.profile.with_impulse_response(self._stream.front.canceller.impulse_response())
+        learnt = self._stream.front.canceller.impulse_response()
+        return self.profile.with_echo(self.profile.echo.with_running_response(learnt))
 
 
 def strongest(profile: Profile | None) -> tuple[Engine, str]:

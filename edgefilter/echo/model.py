@@ -15,6 +15,9 @@ from edgefilter.types import SAMPLE_RATE, Samples
 PRE_ROLL = 64
 """Samples (4 ms) of the impulse response before the direct sound: what equalisers and linear-phase filters of a loudspeaker ring ahead of it."""
 
+TAIL = 12800
+"""Samples (0.8 s) by which an effect may lengthen the impulse response."""
+
 
 @dataclass(frozen=True, eq=False)
 class EchoModel:
@@ -34,6 +37,24 @@ class EchoModel:
     def driver(self) -> Driver:
         """What the running filter puts the reference through, hop by hop, before the path: the source effects with a short memory."""
         return Driver(self.effects)
+
+    def running_response(self) -> Samples:
+        """(taps,) the path with all stationary linear effects folded in, as after the last change: what the running filter starts from."""
+        chain = [(find(name), values) for name, values in self.effects]
+        chain = [(effect, complete(effect, values)) for effect, values in chain if effect.stage == "path"]
+        if not chain:
+            return self.impulse_response
+        response = np.pad(self.impulse_response, (0, TAIL))
+        for effect, values in chain:
+            settled = getattr(effect, "settled", None)
+            response = effect.apply(response, settled(values) if settled else values, SAMPLE_RATE)
+        heard = np.flatnonzero(np.abs(response) > 1e-4 * np.abs(response).max(initial=0.0))
+        return response[: max(self.impulse_response.size, int(heard[-1]) + 1 if heard.size else 0)]
+
+    def with_running_response(self, response: Samples) -> EchoModel:
+        """The model whose running_response() is response (taps,): the path effects are in it and so no longer listed."""
+        kept = tuple(entry for entry in self.effects if find(entry[0]).stage != "path")
+        return replace(self, impulse_response=response, effects=kept)
 
     def components(self, reference: Samples) -> dict[str, Samples]:
         """What each part contributes, (n,) each: "linear", the path alone, then by how much each effect in turn changes it.

@@ -45,6 +45,10 @@ class PathChange:
             return x.copy()
         return x + _fade(x.size, float(values["time_s"]), float(values["duration_s"]), sample_rate) * convolve_from(x, taps, LEAD)
 
+    def settled(self, values: Values) -> Values:
+        """Values with which the new path holds from the start."""
+        return {**values, "time_s": -1.0, "duration_s": 0.0} if float(values["time_s"]) < NEVER else values
+
     def fit(self, measurement: Measurement, model: EchoModel) -> Values:
         """The time by the step in the residual, the new path by least squares after it, in turn."""
         predicted = model.predict(measurement.reference)
