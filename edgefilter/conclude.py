@@ -8,11 +8,11 @@ from dataclasses import replace
 import numpy as np
 
 from edgefilter.compare import describe
-from edgefilter.echo.effect import find
+from edgefilter.echo.effect import complete, find
 from edgefilter.echo.model import EchoModel
 from edgefilter.evidence import left_in_words, sentence
 from edgefilter.findings import Diagnosis, Finding, Interval
-from edgefilter.leftover import inspect
+from edgefilter.fan import look_at_fan
 from edgefilter.prepare import BLOCK, Prepared
 from edgefilter.search import Found, Trial, predict
 
@@ -27,30 +27,25 @@ THIRDS_T = 1.69
 
 
 def conclude(prepared: Prepared, found: Found, progress: Callable[[str], None] | None = None) -> Diagnosis:
-    """The diagnosis that a search leads to."""
+    """The diagnosis that a search leads to; the fan is looked at behind what the search has taken out of the voice."""
     comparison = describe(prepared, found.base.prediction)
-    residual = prepared.measurement.recording - found.final.prediction
-    left = inspect(prepared, residual)
+    found, left = look_at_fan(prepared, found)
     remaining = found.final.excess_db
-    share = _share(found.base.excess_db, remaining)
     names = [step.name for step in found.steps]
-    irreducible = max(remaining, 0.0) if set(names) & set(UNPREDICTABLE) else 0.0
-    enough = share >= EXPLAINED_SHARE or bool(set(names) & set(UNPREDICTABLE)) or remaining < EXPLAINED_DB
-    if found.steps and enough:
-        verdict = "missing"
-    elif remaining < EXPLAINED_DB:
-        verdict = "explained"
-    else:
-        verdict = "unexplained"
-    findings = tuple(_findings(prepared, found, progress)) if verdict == "missing" else ()
+    unpredictable = bool(set(names) & set(UNPREDICTABLE))
+    believed = found.steps and (_share(found.base.excess_db, remaining) >= EXPLAINED_SHARE or unpredictable or remaining < EXPLAINED_DB)
+    verdict = "missing" if believed else "explained" if found.base.excess_db < EXPLAINED_DB else "unexplained"
+    if not believed:
+        found = replace(found, steps=(), final=found.base, model=found.start)
+        remaining = found.base.excess_db
     return Diagnosis(
         verdict=verdict,
         comparison=comparison,
-        ranking=findings,
-        evidence=left_in_words(prepared, found, left, remaining, EXPLAINED_DB),
-        remaining_db=remaining if findings else found.base.excess_db,
-        irreducible_db=irreducible,
-        model=found.model if findings else found.steps[0].model.without_effect(names[0]) if names else found.model,
+        ranking=tuple(_findings(prepared, found, progress)),
+        evidence=left_in_words(found, left, remaining, EXPLAINED_DB),
+        remaining_db=remaining,
+        irreducible_db=max(remaining, 0.0) if unpredictable and believed else 0.0,
+        model=found.model,
     )
 
 
@@ -75,7 +70,7 @@ def _findings(prepared: Prepared, found: Found, progress: Callable[[str], None] 
                 excess_after_db=after,
                 share=max(_share(found.base.excess_db, after) - _share(found.base.excess_db, before), 0.0),
                 parameters=intervals,
-                evidence=sentence(step, prepared, found.base),
+                evidence=sentence(step),
                 values=step.values,
                 prediction=step.verdict.prediction,
             )
@@ -89,7 +84,8 @@ def _intervals(prepared: Prepared, model: EchoModel, step: Trial) -> Mapping[str
     effect = find(step.name)
     block = np.arange(prepared.usable.size) // BLOCK
     others = model.without_effect(step.name)
-    fits = [effect.fit(replace(prepared.measurement, fit=prepared.usable & (block % 3 == third)), others) for third in range(3)]
+    thirds = [replace(prepared.measurement, fit=prepared.usable & (block % 3 == third)) for third in range(3)]
+    fits = [complete(effect, effect.fit(third, others)) for third in thirds]
     found = {}
     for parameter in effect.parameters:
         value = np.asarray(step.values[parameter.name], float)

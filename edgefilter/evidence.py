@@ -5,14 +5,12 @@ from __future__ import annotations
 import numpy as np
 
 from edgefilter.echo.effect import Values
-from edgefilter.judge import Verdict
 from edgefilter.leftover import Leftover
-from edgefilter.prepare import Prepared
 from edgefilter.search import Found, Trial
 from edgefilter.types import SAMPLE_RATE
 
 
-def sentence(step: Trial, prepared: Prepared, base: Verdict) -> str:
+def sentence(step: Trial) -> str:
     """What in the data speaks for the effect, with its figures."""
     maker = _SENTENCES.get(step.name)
     if maker is None:
@@ -87,7 +85,7 @@ def _fan_noise(v: Values) -> str:
 _SENTENCES = {name[1:]: maker for name, maker in list(globals().items()) if name.startswith("_") and callable(maker) and name[1:] not in ("number",)}
 
 
-def left_in_words(prepared: Prepared, found: Found, left: Leftover, remaining_db: float, floor_db: float) -> str:
+def left_in_words(found: Found, left: Leftover, remaining_db: float, floor_db: float) -> str:
     """What is in the residual that no finding explains; empty where it is the fan."""
     if remaining_db < floor_db:
         return ""

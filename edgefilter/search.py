@@ -7,7 +7,8 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from edgefilter.echo.effect import Values, find, names, whiten
+from edgefilter.echo.effect import Values, complete, find, names, whiten
+from edgefilter.echo.effect import neutral as neutral_values
 from edgefilter.echo.model import EchoModel
 from edgefilter.judge import Judge, Verdict
 from edgefilter.prepare import Prepared
@@ -35,8 +36,9 @@ class Trial:
 
 @dataclass(frozen=True, eq=False)
 class Found:
-    """The outcome of a search. steps: the accepted effects in their order. tried: of the first round, all that was tried."""
+    """The outcome of a search from a start model. steps: the accepted effects in their order. tried: in the first round."""
 
+    start: EchoModel
     model: EchoModel
     base: Verdict
     final: Verdict
@@ -47,6 +49,7 @@ class Found:
 def search(prepared: Prepared, model: EchoModel, progress: Callable[[str], None] | None = None) -> Found:
     """Add effects to model as long as held-out samples say that they are there."""
     judge = Judge(prepared)
+    start = model
     base = current = judge.judge(predict(model, prepared))
     steps: list[Trial] = []
     first: tuple[Trial, ...] = ()
@@ -54,7 +57,7 @@ def search(prepared: Prepared, model: EchoModel, progress: Callable[[str], None]
         trials = [
             trial
             for name in names()
-            if (name in SUSPECTS or find(name).stage != "noise") and name not in dict(model.effects)
+            if find(name).stage != "noise" and name not in dict(model.effects)
             for trial in [_try(name, prepared, model, judge, current, progress)]
             if trial is not None
         ]
@@ -68,7 +71,7 @@ def search(prepared: Prepared, model: EchoModel, progress: Callable[[str], None]
         model, current = admissible[name].model, admissible[name].verdict
         if len(steps) > 1:
             model, current, steps = _settle(prepared, judge, model, current, steps, progress)
-    return Found(model, base, current, tuple(steps), first)
+    return Found(start, model, base, current, tuple(steps), first)
 
 
 def predict(model: EchoModel, prepared: Prepared) -> Samples:
@@ -89,11 +92,12 @@ def _try(
 ) -> Trial | None:
     if progress:
         progress(f"trying {name}")
-    fitted = model.fit(name, prepared.measurement)
-    values = dict(fitted.effects)[name]
-    prediction = predict(fitted, prepared)
-    if np.array_equal(prediction, before.prediction):
+    effect = find(name)
+    values = complete(effect, effect.fit(prepared.measurement, model))
+    if all(np.array_equal(values[key], neutral) for key, neutral in neutral_values(effect).items()):
         return None
+    fitted = model.with_effect(name, values)
+    prediction = predict(fitted, prepared)
     verdict = judge.judge(prediction)
     return Trial(name, values, fitted, verdict, before.level_db - verdict.level_db, size_db(verdict.prediction - before.prediction, prepared))
 

@@ -64,6 +64,14 @@ def _jumps(values: Values, *_: object) -> bool:
     return bool(np.any(np.abs(np.atleast_1d(np.asarray(values["samples"], float))) >= 0.3))
 
 
+def _follows_the_level(values: Values, *_: object) -> bool:
+    return float(values["ratio"]) >= 1.1
+
+
+def _moves_slowly(values: Values, *_: object) -> bool:
+    return float(values["range_db"]) >= 0.4
+
+
 def _reverberates(values: Values, *_: object) -> bool:
     return float(values["level_db"]) > -100.0
 
@@ -75,8 +83,8 @@ SUSPECTS: dict[str, Suspect] = {
     "bandlimit": Suspect(1, guard=_cuts_the_band),
     "mic_clipping": Suspect(1, least_size_db=-9.0),
     "delay_jump": Suspect(1, guard=_jumps),
-    "compression": Suspect(2),
-    "mic_agc": Suspect(3),
+    "compression": Suspect(2, guard=_follows_the_level),
+    "mic_agc": Suspect(3, guard=_moves_slowly),
     "speaker_nonlinearity": Suspect(3),
     "rattle": Suspect(3),
     "path_change": Suspect(4, guard=_clean_before),

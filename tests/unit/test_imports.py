@@ -26,7 +26,7 @@ LAYERS = [
     {"lag_search", "delay_tracker", "paper_alignment", "alignment", "canceller", "residual", "engines"},
     {"stepping", "stream", "audio", "budget", "run"},
     {"sweep", "paper_response", "trust", "calibrate"},
-    {"prepare", "compare", "judge", "suspects", "search", "leftover", "findings", "evidence", "conclude", "diagnose"},
+    {"prepare", "compare", "judge", "suspects", "search", "leftover", "fan", "findings", "evidence", "conclude", "diagnose"},
     {"report"},
     {"commands"},
     {"cli"},
