@@ -19,12 +19,13 @@ EXCERPT = 8 * SAMPLE_RATE
 """The loudest stretch of that many samples is fitted."""
 TAPS, LEAD = 8, 4
 """Of the nuisance filter on the compressed prediction: what is linear, the make-up gain included."""
-THRESHOLDS_DB = (-2.0, -6.0, -11.0, -18.0)
-"""Starting points, relative to the loudest 20 ms of the reference."""
+THRESHOLDS_DB, SLOPES = (1.0, -3.0, -8.0, -15.0), (0.2, 0.6)
+"""Starting points, relative to the loudest 20 ms of the reference, and dB per dB."""
 RELEASES_MS = (60.0, 300.0)
 SILENT_DB = -80.0
 STEEPEST = 0.98
-ITERATIONS = 5
+ITERATIONS = 6
+DAMPINGS = (1e-4, 1e-2, 0.3)
 UNKNOWNS = ("threshold_db", "slope", "attack", "release")
 NUDGE = np.array([0.5, 0.03, 0.15, 0.15])
 """Steps of the numerical derivatives: dB, dB per dB, natural logarithms of times."""
@@ -85,8 +86,8 @@ class Compression:
 
         plain = normal_equations([measurement.whiten(model.predict(x))], target, TAPS, LEAD, fit)
         without = plain.solve()[1]
-        starts = [np.array([loud_db + below, 0.6, np.log(8.0), np.log(release)]) for below, release in product(THRESHOLDS_DB, RELEASES_MS)]
-        starts = [np.clip(start, LOWEST, HIGHEST) for start in starts]
+        grid = product(THRESHOLDS_DB, SLOPES, RELEASES_MS)
+        starts = [np.clip((loud_db + above, slope, np.log(8.0), np.log(release)), LOWEST, HIGHEST) for above, slope, release in grid]
         costs = [left(predict(start)) for start in starts]
         best, cost = starts[int(np.argmin(costs))], min(costs)
         for _ in range(ITERATIONS if loud_db > SILENT_DB else 0):
@@ -133,20 +134,19 @@ def _loudest(measurement: Measurement) -> tuple[slice, np.ndarray]:
 
 
 def _gauss_newton(at: Array, cost: float, predict, left, target: Samples, fit: np.ndarray) -> tuple[Array, float]:
-    """One step, halved until it helps; the unknowns and cost that it reaches."""
+    """One step, damped and shortened until it helps (Levenberg 1944); the unknowns and cost that it reaches."""
     base = predict(at)
     nudge = np.where(at + NUDGE > HIGHEST, -NUDGE, NUDGE)
     changes = [predict(at + nudge * unit) - base for unit in np.eye(at.size)]
     use = np.zeros((1 + at.size, TAPS), bool)
     use[0], use[1:, LEAD] = True, True
     normal: Normal = normal_equations([base, *changes], target, TAPS, LEAD, fit)
-    weights, _ = normal.solve(1e-4, use)
-    gain = float(weights[0].sum()) or 1.0
-    step = np.clip(weights[1:, LEAD] / gain * nudge, -LARGEST, LARGEST)
-    for _ in range(3):
-        there = np.clip(at + step, LOWEST, HIGHEST)
-        now = left(predict(there))
-        if now < cost:
-            return there, now
-        step = step / 3.0
+    for damping in DAMPINGS:
+        weights, _ = normal.solve(damping, use)
+        step = np.clip(weights[1:, LEAD] / (float(weights[0].sum()) or 1.0) * nudge, -LARGEST, LARGEST)
+        for shorter in (1.0, 0.3):
+            there = np.clip(at + shorter * step, LOWEST, HIGHEST)
+            now = left(predict(there))
+            if now < cost:
+                return there, now
     return at, cost
