@@ -83,7 +83,7 @@ def simulate(recipe: Recipe, seed: int, index: int, humans: Corpus, robots: Corp
     samples = round(recipe.seconds * SAMPLE_RATE)
 
     reference, heard_source, splits = _robot_script(rng, recipe, robots, samples, moving)
-    colour = _colour(rng)
+    colour = draw_colour(rng)
     driver = _Driver.draw(rng, recipe)
     effects = recipe.effects if rng.random() < recipe.effects_share else ()
     model = EchoModel(_path(room.robot, colour), effects)
@@ -179,7 +179,7 @@ def _draw(rng: np.random.Generator, rooms: list[Room]) -> Room:
     return rooms[int(rng.integers(len(rooms)))]
 
 
-def _colour(rng: np.random.Generator) -> Samples:
+def draw_colour(rng: np.random.Generator) -> Samples:
     """(taps,) of loudspeaker, shell and microphone: band limits, broad peaks, reflections of the shell within 2 ms."""
     impulse = np.zeros(1024)
     impulse[0] = 1.0
@@ -189,7 +189,8 @@ def _colour(rng: np.random.Generator) -> Samples:
     impulse = signal.sosfilt(signal.butter(2, rng.uniform(5500, 7800), fs=SAMPLE_RATE, output="sos"), impulse)
     for _ in range(5):
         frequency, gain = 10 ** rng.uniform(math.log10(250), math.log10(6500)), 10 ** (rng.uniform(-7, 7) / 20)
-        b, a = signal.iirpeak(frequency, rng.uniform(0.7, 4.0), fs=SAMPLE_RATE)
+        width = min(frequency / rng.uniform(0.7, 4.0), SAMPLE_RATE / 4)  # beyond half the rate the filter is not stable
+        b, a = signal.iirpeak(frequency, frequency / width, fs=SAMPLE_RATE)
         impulse = impulse + (gain - 1.0) * signal.lfilter(b, a, impulse)
     return impulse.astype(np.float32)
 

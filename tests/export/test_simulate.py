@@ -9,7 +9,7 @@ from speech import RATE, write_librispeech, write_table
 from edgefilter.errors import UsageError
 from export.corpus import read_corpus
 from export.rooms import draw_room
-from export.simulate import PAPER, RECIPES, simulate
+from export.simulate import PAPER, RECIPES, draw_colour, simulate
 
 
 @pytest.fixture(scope="module")
@@ -64,3 +64,9 @@ def test_rooms_decay_as_long_as_asked():
 def test_a_folder_without_speech_is_named(tmp_path):
     with pytest.raises(UsageError, match="holds no speech"):
         read_corpus(tmp_path)
+
+
+def test_the_robots_colour_is_always_stable():
+    for seed in range(300):
+        colour = draw_colour(np.random.default_rng(seed))
+        assert np.isfinite(colour).all() and np.abs(colour[-100:]).max() < 0.1 * np.abs(colour).max()
