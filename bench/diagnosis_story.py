@@ -5,7 +5,8 @@
 
 Conversations are folders as bench/conversations.py makes them: the sweep was recorded in a laboratory, the conversation in the room. What
 the robot says alone, up to the onset of its second utterance, is diagnosed; what comes after it, with the human, is filtered and scored.
-So the figures of the filter are from sound that no fit has seen. Writes OUTPUT.json and OUTPUT.md. --files: keep, for the first
+So the figures of the filter are from sound that no fit has seen. It is filtered twice: "heard before", the filter having heard the first
+utterance as well, and "restarted", the filter having heard nothing before the robot is interrupted. Writes OUTPUT.json and OUTPUT.md. --files: keep, for the first
 conversation, the profile and the recordings that the command line takes.
 """
 
@@ -32,11 +33,12 @@ from edgefilter.metrics import si_sdr
 from edgefilter.profile import Profile
 from edgefilter.types import SAMPLE_RATE
 
-ENGINES = ("linear", "ss")
+ENGINE = "ss"
+STARTS = ("heard before", "restarted")
 
 
 def tell(conversation: Conversation, recogniser: Recogniser | None) -> dict:
-    """One conversation's figures: excess before and after on the robot alone, what was found, SI-SDR and word errors per engine."""
+    """One conversation's figures: excess before and after on the robot alone, what was found, SI-SDR and word errors per start."""
     alone = slice(0, conversation.meta["t_main"])
     recording, reference = conversation.read("mic")[alone], conversation.read("ref")[alone]
     began = time.process_time()
@@ -53,15 +55,16 @@ def tell(conversation: Conversation, recogniser: Recogniser | None) -> dict:
         "seconds": seconds,
         "duration": recording.size / SAMPLE_RATE,
     }
-    for engine in ENGINES:
+    for start in STARTS:
         for name, profile in (("before", conversation.profile), ("after", better)):
-            row[f"{engine}_{name}"] = score(conversation, profile, engine, recogniser)
+            row[f"{start}_{name}"] = score(conversation, profile, 0 if start == "heard before" else conversation.meta["t_main"], recogniser)
     return row
 
 
-def score(conversation: Conversation, profile: Profile, engine: str, recogniser: Recogniser | None) -> dict:
-    """SI-SDR and word errors of the human's stretch of the whole conversation, filtered with that profile."""
-    heard = edgefilter.enhance(conversation.read("mic"), conversation.read("ref"), profile, engine)[conversation.span]
+def score(conversation: Conversation, profile: Profile, start: int, recogniser: Recogniser | None) -> dict:
+    """SI-SDR and word errors of the human's stretch, the conversation from sample start on filtered with that profile."""
+    out = edgefilter.enhance(conversation.read("mic")[start:], conversation.read("ref")[start:], profile, ENGINE)
+    heard = out[conversation.meta["start"] - start : conversation.meta["end"] - start]
     figures = {"si_sdr": si_sdr(heard, conversation.read("clean")[conversation.span])}
     if recogniser:
         errors = word_errors(conversation.meta["text"], recogniser.transcribe(heard))
@@ -71,27 +74,28 @@ def score(conversation: Conversation, profile: Profile, engine: str, recogniser:
 
 def markdown(rows: list[dict], head: dict) -> str:
     """The table of all conversations and a line of means."""
-    columns = ["conversation", "found", "excess dB", *(f"{engine} SI-SDR dB, words wrong %" for engine in ENGINES)]
+    columns = ["conversation", "found", "excess dB", *(f"{start}: SI-SDR dB, words wrong %" for start in STARTS)]
     lines = [f"| {' | '.join(columns)} |", "|" + " --- |" * len(columns)]
     for row in rows:
         found = ", ".join(row["effects"]) or row["verdict"]
         cells = [row["conversation"], found, f"{row['excess_before_db']:.1f} -> {row['excess_after_db']:.1f}"]
-        lines.append(f"| {' | '.join([*cells, *(_change([row], engine) for engine in ENGINES)])} |")
+        lines.append(f"| {' | '.join([*cells, *(_change([row], start) for start in STARTS)])} |")
     before, after = (np.mean([row[f"excess_{when}_db"] for row in rows]) for when in ("before", "after"))
-    lines.append(f"| {' | '.join(['mean', '', f'{before:.1f} -> {after:.1f}', *(_change(rows, engine) for engine in ENGINES)])} |")
+    lines.append(f"| {' | '.join(['mean', '', f'{before:.1f} -> {after:.1f}', *(_change(rows, start) for start in STARTS)])} |")
     slowest = max(rows, key=lambda row: row["seconds"])
     took = f"Diagnosis: at most {slowest['seconds']:.1f} s of one core for {slowest['duration']:.1f} s of recording."
     machine = ", ".join(f"{key}: {value}" for key, value in head.items() if isinstance(value, str))
     return "\n".join([*lines, "", took, "", machine, ""])
 
 
-def _change(rows: list[dict], engine: str) -> str:
+def _change(rows: list[dict], start: str) -> str:
+    """Before -> after: mean SI-SDR, and the mean share of wrong words, at most 100 % an utterance."""
     parts = []
     for when in ("before", "after"):
-        scores = [row[f"{engine}_{when}"] for row in rows]
+        scores = [row[f"{start}_{when}"] for row in rows]
         text = f"{np.mean([s['si_sdr'] for s in scores]):.1f}"
         if "errors" in scores[0]:
-            text += f" / {100 * sum(s['errors'] for s in scores) / sum(s['words'] for s in scores):.0f}"
+            text += f" / {100 * np.mean([min(s['errors'] / s['words'], 1.0) for s in scores]):.0f}"
         parts.append(text)
     return " -> ".join(parts)
 

@@ -132,4 +132,14 @@ def _settle(
         if alone is not None and -alone.gain_db < rule.least_gain_db:
             model, current = alone.model, alone.verdict
             steps = [kept for kept in steps if kept.name != step.name]
-    return model, current, [replace(step, values=dict(model.effects)[step.name]) for step in steps]
+    return model, current, _judged_again(prepared, judge, model, steps)
+
+
+def _judged_again(prepared: Prepared, judge: Judge, model: EchoModel, steps: list[Trial]) -> list[Trial]:
+    """The steps with the values that they have in the end, each judged beside those before it."""
+    settled = []
+    for step in reversed(steps):
+        values = dict(model.effects)[step.name]
+        settled.append(replace(step, values=values, model=model, verdict=judge.judge(predict(model, prepared))))
+        model = model.without_effect(step.name)
+    return settled[::-1]

@@ -36,7 +36,7 @@ def comparison_page(found: Comparison, names: Mapping[str, object]) -> str:
 def diagnosis_page(profile: Profile, found: Diagnosis, recording: Samples, reference: Samples, names: Mapping[str, object]) -> str:
     """The page of a diagnosis, with a switch for each found effect. recording (n,), reference (m,): what was diagnosed."""
     steps = in_order(found.ranking)
-    variants = compare_variants(profile, steps, recording, reference)
+    variants = compare_variants(profile, found.model, steps, recording, reference)
     text = {
         "kind": "diagnosis",
         "headline": headline(found.verdict, [finding.effect for finding in found.ranking]),

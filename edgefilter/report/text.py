@@ -39,8 +39,9 @@ def comparison_lines(found: Comparison) -> list[str]:
 def diagnosis_lines(found: Diagnosis) -> list[str]:
     """The verdict in a sentence, the error budget step by step, each finding with its evidence, then where the excess was."""
     names = [finding.effect for finding in found.ranking]
-    steps = [("the profile as it is", found.comparison.excess_db)]
-    steps += [(f"with {finding.effect}", finding.excess_after_db) for finding in in_order(found.ranking)]
+    added = in_order(found.ranking)
+    steps = [("the profile as it is", added[0].excess_before_db if added else found.comparison.excess_db)]
+    steps += [(f"with {finding.effect}", finding.excess_after_db) for finding in added]
     top = max(1.0, *(db for _, db in steps))
     lines = [f"verdict     {found.verdict}: {headline(found.verdict, names)}", "budget      dB over the noise floor"]
     lines += [f"  {name:<27} {decibels(db):>6}  {_bar(db / top)}".rstrip() for name, db in steps]
@@ -48,7 +49,7 @@ def diagnosis_lines(found: Diagnosis) -> list[str]:
     for rank, finding in enumerate(found.ranking, start=1):
         lines += _finding(rank, finding)
     if found.evidence:
-        lines.append(f"left        {decibels(found.remaining_db)} dB: {sentence(found.evidence)}")
+        lines.append(f"left        {sentence(found.evidence)}")
     return [*lines, "where       it is with the profile as it is:", *comparison_lines(found.comparison)]
 
 

@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from itertools import product
 
 from edgefilter.compare import Comparison, describe
 from edgefilter.diagnose import Finding
-from edgefilter.prepare import prepare
+from edgefilter.echo.effect import complete, find
+from edgefilter.echo.model import EchoModel
+from edgefilter.judge import Judge
+from edgefilter.prepare import Prepared, prepare
 from edgefilter.profile import Profile
 from edgefilter.types import Samples
 
@@ -24,14 +28,33 @@ def choices(count: int) -> list[Choice]:
     return [tuple(i < on for i in range(count)) for on in range(count + 1)]
 
 
-def compare_variants(profile: Profile, findings: Sequence[Finding], recording: Samples, reference: Samples) -> dict[Choice, Comparison]:
-    """For each choice of findings, recording (n,) against the profile with those effects at the values that were found."""
+def compare_variants(
+    profile: Profile, model: EchoModel, findings: Sequence[Finding], recording: Samples, reference: Samples
+) -> dict[Choice, Comparison]:
+    """For each choice of findings, recording (n,) against model, which has them all, without those that are off.
+
+    The excess of each is that of the held-out samples, as the diagnosis judges it; where it is, is shown for all samples.
+    """
     prepared = prepare(profile, recording, reference)
     found = {}
     for choice in choices(len(findings)):
-        model = profile.echo
+        chosen, partial = [], model
         for finding, on in zip(findings, choice, strict=True):
             if on:
-                model = model.with_effect(finding.effect, finding.values)
-        found[choice] = describe(prepared, model.predict(prepared.measurement.reference))
+                chosen.append(finding)
+            else:
+                partial = partial.without_effect(finding.effect)
+        heard = _with_noise(prepared, chosen)
+        verdict = Judge(heard).judge(partial.predict(prepared.measurement.reference))
+        found[choice] = replace(describe(heard, verdict.prediction), excess_db=verdict.excess_db)
     return found
+
+
+def _with_noise(prepared: Prepared, findings: Sequence[Finding]) -> Prepared:
+    """The same recording, the noise to be expected being that with the chosen effects on the fan."""
+    psd = prepared.measurement.noise_psd
+    for finding in findings:
+        effect = find(finding.effect)
+        if hasattr(effect, "noise_psd"):
+            psd = effect.noise_psd(complete(effect, finding.values), psd)
+    return replace(prepared, measurement=replace(prepared.measurement, noise_psd=psd))

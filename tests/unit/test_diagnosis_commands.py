@@ -69,13 +69,17 @@ def test_add_says_so_where_the_error_does_not_fall(scene, tmp_path, capsys):
     assert "the error did not fall" in capsys.readouterr().out
 
 
-def test_diagnose_writes_the_documented_json(scene, capsys):
+def test_diagnose_finds_what_is_missing_and_writes_the_documented_json(scene, capsys):
     assert main(arguments(scene, "diagnose", "--json", "-")) == 0
     found = printed_json(capsys)
+    assert found["verdict"] == "missing" and [entry["effect"] for entry in found["ranking"]] == ["playback_gain"]
+    assert found["ranking"][0]["parameters"]["gain_db"]["value"] == pytest.approx(-3.0, abs=0.02)  # 0.02 dB: -53 dB of the voice
     assert {"schema", "verdict", "excess_db", "noise_floor_db", "ranking", "evidence", "remaining_db", "irreducible_db", "where"} <= set(found)
     assert set(found["where"]) == {"bands", "times", "levels", "lags"}
     assert main(arguments(scene, "diagnose")) == 0
-    assert f"verdict     {found['verdict']}: " in capsys.readouterr().out
+    out = capsys.readouterr().out
+    assert "verdict     missing: Missing from the profile: a turned volume." in out
+    assert "next        edgefilter add playback_gain --profile " in out
 
 
 @pytest.mark.parametrize("command", ["compare", "diagnose"])
@@ -170,9 +174,14 @@ def test_an_effect_of_ones_own_goes_through_every_command(tmp_path, capsys, own_
     chopped = record(x, robot.echo.with_effect("blade_chop", {"rate_hz": 23.0, "cosine": 0.12, "sine": -0.2}))
     soundfile.write(tmp_path / "mic.wav", chopped, RATE, "FLOAT")
     soundfile.write(tmp_path / "ref.wav", x, RATE, "FLOAT")
+    capsys.readouterr()
+    assert main(arguments(tmp_path, "diagnose", *own, "--json", "-")) == 0
+    (found,) = printed_json(capsys)["ranking"]
+    assert found["effect"] == "blade_chop" and found["excess_after_db"] < 0.5 < 3 < found["excess_before_db"]
+    assert found["parameters"]["rate_hz"]["value"] == pytest.approx(23.0, abs=1 / 32)  # the grid's step for 8 s
     assert main(arguments(tmp_path, "add blade_chop", *own, "--output", tmp_path / "better.npz", "--json", tmp_path / "a.json")) == 0
     figures = json.loads((tmp_path / "a.json").read_text())
-    assert figures["excess_after_db"] < 0.5 * figures["excess_before_db"]
+    assert figures["excess_after_db"] < 0.5 < 3 < figures["excess_before_db"]
     capsys.readouterr()
     assert main(["profile", "show", str(tmp_path / "better.npz"), *map(str, own)]) == 0
     assert "blade_chop" in capsys.readouterr().out
