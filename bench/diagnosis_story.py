@@ -6,8 +6,8 @@
 Conversations are folders as bench/conversations.py makes them: the sweep was recorded in a laboratory, the conversation in the room. What
 the robot says alone, up to the onset of its second utterance, is diagnosed; what comes after it, with the human, is filtered and scored.
 So the figures of the filter are from sound that no fit has seen. It is filtered twice: "heard before", the filter having heard the first
-utterance as well, and "restarted", the filter having heard nothing before the robot is interrupted. Writes OUTPUT.json and OUTPUT.md. --files: keep, for the first
-conversation, the profile and the recordings that the command line takes.
+utterance as well, and "restarted", the filter having heard nothing before the robot is interrupted. Writes OUTPUT.json and OUTPUT.md. --files: keep, in a
+folder for each conversation, the profile and the recordings that the command line takes.
 """
 
 from __future__ import annotations
@@ -114,15 +114,15 @@ def main() -> int:
     parser.add_argument("--room", default="office", help="only conversations in this room (default: %(default)s)")
     parser.add_argument("--whisper", type=Path, metavar="DIR", help="recogniser's folder; without it only SI-SDR")
     parser.add_argument("--output", type=Path, required=True, metavar="PATH", help="PATH.json and PATH.md are written")
-    parser.add_argument("--files", type=Path, metavar="DIR", help="keep the first conversation's profile and recordings here")
+    parser.add_argument("--files", type=Path, metavar="DIR", help="keep each conversation's profile and recordings here")
     parser.add_argument("--cache", type=Path, default=Path.home() / ".cache" / "edgefilter-bench", metavar="DIR")
     options = parser.parse_args()
     try:
         recogniser = Recogniser(options.whisper, options.cache / "transcripts.jsonl") if options.whisper else None
         (found,) = find_conversations([options.conversations]).values()
         chosen = [conversation for conversation in found if conversation.meta["room"] == options.room]
-        if options.files:
-            keep(chosen[0], options.files)
+        for conversation in chosen if options.files else ():
+            keep(conversation, options.files / conversation.folder.name)
         rows = [tell(conversation, recogniser) for conversation in tqdm(chosen, disable=not sys.stderr.isatty())]
     except (EdgefilterError, OSError) as error:
         print(f"diagnosis_story: {error}", file=sys.stderr)
