@@ -47,7 +47,7 @@ def main() -> None:
             rows[alpha].append((meta["room"], si_sdr(out[span], clean[span]), found, float(np.abs(out).max())))
     table = []
     for alpha, results in rows.items():
-        for room in ("lab", "office"):
+        for room in sorted({r[0] for r in results}):
             of = [r for r in results if r[0] == room]
             wer = sum(r[2].capped * r[2].words for r in of) / sum(r[2].words for r in of)
             table.append({"alpha": alpha, "room": room, "capped_wer": wer, "si_sdr_db": float(np.mean([r[1] for r in of])), "conversations": len(of)})
