@@ -7,6 +7,7 @@ from dataclasses import asdict, dataclass, field
 import numpy as np
 
 from edgefilter.echo.effect import whiten
+from edgefilter.judge import Judge
 from edgefilter.prepare import Prepared, prepare
 from edgefilter.profile import Profile
 from edgefilter.types import SAMPLE_RATE, Array, Samples
@@ -59,10 +60,11 @@ def _plain(value: object) -> object:
 def compare(profile: Profile, recording: Samples, reference: Samples, *, sample_rate: int = SAMPLE_RATE) -> Comparison:
     """Say how far the profile's prediction for reference (n,) is from recording (m,), both float, full scale +-1, at sample_rate.
 
-    A constant lag of up to MAX_OFFSET seconds either way is found and taken out; of the ordinary tolerances (see prepare) nothing
-    is taken out. Raises SignalError where the recording does not contain the reference.
+    A constant lag of up to MAX_OFFSET seconds either way and the ordinary tolerances (judge.TOLERANCE of the path, prepare's
+    FAN_TOLERANCE_DB of the fan) are taken out. Raises SignalError where the recording does not contain the reference.
     """
-    return describe(prepare(profile, recording, reference, sample_rate=sample_rate))
+    prepared = prepare(profile, recording, reference, sample_rate=sample_rate)
+    return describe(prepared, Judge(prepared).correct(prepared.prediction))
 
 
 def describe(prepared: Prepared, prediction: Samples | None = None) -> Comparison:

@@ -11,15 +11,16 @@ from edgefilter.compare import describe
 from edgefilter.echo.effect import complete, find
 from edgefilter.echo.model import EchoModel
 from edgefilter.evidence import left_in_words, sentence
-from edgefilter.findings import Diagnosis, Finding, Interval
 from edgefilter.fan import look_at_fan
+from edgefilter.findings import Diagnosis, Finding, Interval
+from edgefilter.judge import Judge
 from edgefilter.prepare import BLOCK, Prepared
-from edgefilter.search import Found, Trial, predict
+from edgefilter.search import Found, Trial, floor_level
 
 EXPLAINED_DB = 0.8
 """Excess up to which nothing is missing: what the fan of another day and a faint distortion leave."""
-EXPLAINED_SHARE = 0.3
-"""Less of the excess power than this explained by all findings together is not what happened."""
+EXPLAINED, RATTLING = 0.45, 0.2
+"""Less of the excess level than this explained by all findings together is not what happened; of what rattles, less can be predicted."""
 UNPREDICTABLE = ("rattle", "bandlimit")
 """Effects whose own noise stays in the residual."""
 THIRDS_T = 1.69
@@ -33,8 +34,9 @@ def conclude(prepared: Prepared, found: Found, progress: Callable[[str], None] |
     remaining = found.final.excess_db
     names = [step.name for step in found.steps]
     unpredictable = bool(set(names) & set(UNPREDICTABLE))
-    believed = found.steps and (_share(found.base.excess_db, remaining) >= EXPLAINED_SHARE or unpredictable or remaining < EXPLAINED_DB)
-    verdict = "missing" if believed else "explained" if found.base.excess_db < EXPLAINED_DB else "unexplained"
+    believed = bool(found.steps) and (remaining < EXPLAINED_DB or explained_level(prepared, found) >= (RATTLING if unpredictable else EXPLAINED))
+    quiet = found.base.excess_db < EXPLAINED_DB and not prepared.human
+    verdict = "missing" if believed else "explained" if quiet else "unexplained"
     if not believed:
         found = replace(found, steps=(), final=found.base, model=found.start)
         remaining = found.base.excess_db
@@ -42,11 +44,21 @@ def conclude(prepared: Prepared, found: Found, progress: Callable[[str], None] |
         verdict=verdict,
         comparison=comparison,
         ranking=tuple(_findings(prepared, found, progress)),
-        evidence=left_in_words(found, left, remaining, EXPLAINED_DB),
+        evidence=left_in_words(prepared, found, left, remaining, EXPLAINED_DB),
         remaining_db=remaining,
         irreducible_db=max(remaining, 0.0) if unpredictable and believed else 0.0,
         model=found.model,
     )
+
+
+def explained_level(prepared: Prepared, found: Found) -> float:
+    """Part of the level over the robot's silences that is gone, 0 to 1: of many cells rather than of the loudest."""
+    judge = Judge(prepared)
+    above = found.base.level_db - floor_level(judge, found.base)
+    gone = above - (found.final.level_db - floor_level(judge, found.final))
+    if "fan_noise" in dict(found.model.effects):
+        above, gone = found.base.level_db, found.base.level_db - found.final.level_db
+    return float(np.clip(gone / above, 0.0, 1.0)) if above > 0.0 else 0.0
 
 
 def _share(before_db: float, after_db: float) -> float:

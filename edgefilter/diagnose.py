@@ -7,6 +7,7 @@ from collections.abc import Callable
 from edgefilter.compare import Comparison, compare, describe
 from edgefilter.conclude import conclude
 from edgefilter.findings import Diagnosis, Finding, Interval
+from edgefilter.judge import Judge
 from edgefilter.prepare import prepare
 from edgefilter.profile import Profile
 from edgefilter.search import search
@@ -38,4 +39,5 @@ def add(
     """Fit the effect of that name to a recording and write it into a new profile; the comparisons are those before and after."""
     prepared = prepare(profile, recording, reference, sample_rate=sample_rate)
     fitted = profile.with_echo(profile.echo.fit(name, prepared.measurement))
-    return fitted, describe(prepared), compare(fitted, recording, reference, sample_rate=sample_rate)
+    before = describe(prepared, Judge(prepared).correct(prepared.prediction))
+    return fitted, before, compare(fitted, recording, reference, sample_rate=sample_rate)

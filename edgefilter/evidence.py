@@ -6,6 +6,7 @@ import numpy as np
 
 from edgefilter.echo.effect import Values
 from edgefilter.leftover import Leftover
+from edgefilter.prepare import Prepared
 from edgefilter.search import Found, Trial
 from edgefilter.types import SAMPLE_RATE
 
@@ -85,11 +86,13 @@ def _fan_noise(v: Values) -> str:
 _SENTENCES = {name[1:]: maker for name, maker in list(globals().items()) if name.startswith("_") and callable(maker) and name[1:] not in ("number",)}
 
 
-def left_in_words(found: Found, left: Leftover, remaining_db: float, floor_db: float) -> str:
+def left_in_words(prepared: Prepared, found: Found, left: Leftover, remaining_db: float, floor_db: float) -> str:
     """What is in the residual that no finding explains; empty where it is the fan."""
+    spans = ", ".join(f"{begin:.1f} to {end:.1f} s" for begin, end in prepared.human)
+    talk = f"somebody talks at {spans}, left out of all figures" if spans else ""
     if remaining_db < floor_db:
-        return ""
-    words = []
+        return talk
+    words = [talk] if talk else []
     if left.mains_hz and left.tone_share > 0.3:
         words.append(f"tones at multiples of {left.mains_hz:.0f} Hz, also while the robot is silent")
     elif left.tone_share > 0.5:

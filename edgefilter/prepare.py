@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy import fft
 from scipy.ndimage import maximum_filter1d, uniform_filter1d
 
-from edgefilter.echo.effect import Measurement, whiten
+from edgefilter.echo.effect import Measurement, complete, find, whiten
 from edgefilter.echo.model import PRE_ROLL
 from edgefilter.errors import SignalError
 from edgefilter.profile import Profile
@@ -24,6 +24,11 @@ SILENCE_DB = -15.0
 """The robot is silent where its predicted voice, whitened, is this far under the fan."""
 FAN_TOLERANCE_DB = 1.0
 """By which the fan of a robot differs from day to day."""
+TALK_DB = 8.0
+"""Over the fan: more than a reverberation tail in a pause, less than a soft voice at two metres."""
+GAP_S, EDGE_S = 1.0, 0.2
+PAUSE_S, LAG_STEP = 0.5, 480
+"""Silence of the reference after which a player may have started anew, and samples (30 ms) by which the lag must differ then."""
 MIN_SECONDS = 1.0
 TRACK = SAMPLE_RATE
 """Samples of one window of the lag track."""
@@ -71,16 +76,81 @@ def prepare(profile: Profile, recording: Samples, reference: Samples, *, sample_
     start = profile.delay - PRE_ROLL
     at_calibration = shift(x, start)
     predicted = profile.echo.predict(at_calibration)
-    offset = starting_offset(whiten(predicted, profile.noise_psd), whiten(y, profile.noise_psd))
-    x = shift(x, start + offset)
+    known = expected_noise(profile)
+    offset = starting_offset(whiten(predicted, known), whiten(y, known))
+    pieces = utterance_lags(x, predicted, y, known, offset)
+    x = sum(shift(np.where((np.arange(n) >= begin) & (np.arange(n) < end), x, np.float32(0)), start + lag) for begin, end, lag in pieces)
     predicted = profile.echo.predict(x)
-    white = whiten(predicted, profile.noise_psd).astype(np.float64)
+    white = whiten(predicted, known).astype(np.float64)
     block = SAMPLE_RATE // 50
     level = np.add.reduceat(white**2, np.arange(0, n, block)) / block
     active = np.repeat(maximum_filter1d(level, 11) > 10 ** (SILENCE_DB / 10), block)[:n]
     fit = np.arange(n) // BLOCK % 2 == 0
-    psd = profile.noise_psd * np.float32(fan_scale(whiten(y, profile.noise_psd)[~active]))
-    return Prepared(Measurement(x, y, psd, fit), predicted, np.ones(n, bool), active, offset)
+    quiet = whiten(y, known) ** 2
+    psd = known * np.float32(fan_scale(whiten(y, known)[~active]))
+    human = find_talk(quiet * (known[1] / psd[1]), active)
+    usable = np.ones(n, bool)
+    for begin, end in human:
+        usable[round(begin * SAMPLE_RATE) : round(end * SAMPLE_RATE)] = False
+    warnings = tuple(f"somebody talks at {begin:.1f} to {end:.1f} s: left out" for begin, end in human)
+    if len(pieces) > 1:
+        lags = ", ".join(f"{lag:.1f} from {begin / SAMPLE_RATE:.1f} s" for begin, _, lag in pieces)
+        warnings += (f"the utterances lag by different numbers of samples: {lags}; aligned one by one",)
+    return Prepared(Measurement(x, y, psd, fit & usable), predicted, usable, active, offset, human, warnings)
+
+
+def utterance_lags(x: Samples, predicted: Samples, recording: Samples, psd: Samples, offset: float) -> list[tuple[int, int, float]]:
+    """(first sample, end, lag) of the stretches of the reference x (n,) that share a lag, the whole with `offset` where it is one.
+
+    predicted: for x without an offset. A player starts each utterance anew, so its lag may be another after a pause of PAUSE_S; a
+    difference of less than LAG_STEP is no new start but left for the effects to explain.
+    """
+    block = SAMPLE_RATE // 50
+    level = np.add.reduceat(x.astype(np.float64) ** 2, np.arange(0, x.size, block))
+    loud = np.flatnonzero(level > 10**-4.5 * level.max(initial=0.0))
+    gaps = np.flatnonzero(np.diff(loud) > 50 * PAUSE_S)
+    begins = [0, *(int(loud[gap + 1]) * block for gap in gaps)]
+    white, sought = whiten(predicted, psd), whiten(recording, psd)
+    pieces: list[tuple[int, int, float]] = []
+    for begin, end in zip(begins, [*begins[1:], x.size], strict=True):
+        lag = pieces[-1][2] if pieces else offset
+        if len(begins) > 1 and end - begin > SAMPLE_RATE // 2:
+            inside = (np.arange(x.size) >= begin) & (np.arange(x.size) < end)
+            try:
+                own = find_offset(white * inside, sought)
+            except SignalError:
+                own = lag
+            lag = own if abs(own - lag) > LAG_STEP else lag
+        if pieces and lag == pieces[-1][2]:
+            pieces[-1] = (pieces[-1][0], end, lag)
+        else:
+            pieces.append((begin, end, lag))
+    return pieces
+
+
+def find_talk(power: Samples, active: NDArray[np.bool_]) -> tuple[tuple[float, float], ...]:
+    """(start_s, end_s) where somebody talks, from the whitened recording's square (n,) in the robot's silences.
+
+    Somebody talks where tenths of a second are TALK_DB over the fan while at least a third of the silence is at the fan: a fan that
+    has changed is louder all the time. What lies between two such moments less than GAP_S apart belongs to them, the robot's words
+    included. Nothing is found where it would be more than half of the recording: there is no working around that.
+    """
+    block = SAMPLE_RATE // 10
+    count = power.size // block
+    silent = ~active[: count * block].reshape(count, block).any(axis=1)
+    level = power[: count * block].reshape(count, block).mean(axis=1)
+    loud = silent & (level > 10 ** (TALK_DB / 10))
+    if loud.sum() < 3 or np.mean(level[silent] < 2.0) < 1 / 3:
+        return ()
+    spans: list[list[float]] = []
+    for at in np.flatnonzero(loud) / 10:
+        if spans and at - spans[-1][1] < GAP_S:
+            spans[-1][1] = at + 0.1
+        else:
+            spans.append([at, at + 0.1])
+    kept = [(max(begin - EDGE_S, 0.0), end + EDGE_S) for begin, end in spans if end - begin > 0.25]
+    total = sum(end - begin for begin, end in kept)
+    return tuple((float(begin), float(end)) for begin, end in kept) if 10 * total < 0.5 * count else ()
 
 
 def fan_scale(quiet: Samples) -> float:
@@ -95,6 +165,15 @@ def fan_scale(quiet: Samples) -> float:
     power = np.mean(np.abs(fft.rfft(frames)) ** 2, axis=0) / np.sum(np.hanning(size) ** 2)
     scale = float(np.median(power[3:-6]))
     return scale if abs(10 * np.log10(max(scale, 1e-9))) <= FAN_TOLERANCE_DB else 1.0
+
+
+def expected_noise(profile: Profile) -> Samples:
+    """(601,) PSD of the fan with the profile's own effects on it."""
+    psd = profile.noise_psd
+    for name, values in profile.echo.effects:
+        changed = getattr(find(name), "noise_psd", None)
+        psd = changed(complete(find(name), values), psd) if changed else psd
+    return psd
 
 
 def shift(x: Samples, samples: float) -> Samples:

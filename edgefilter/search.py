@@ -16,6 +16,8 @@ from edgefilter.suspects import OWN, SUSPECTS, choose
 from edgefilter.types import Samples
 
 MOST_EFFECTS = 3
+LAST, ENOUGH = ("rattle",), 0.8
+"""Effects whose fit takes long, and the share of the excess level at which another one has explained it."""
 SCREEN_DB = 0.2
 """Where the residual is no more than this above that of the robot's silences, there is nothing of the voice in it."""
 SECOND_SHARE = 0.2
@@ -54,15 +56,9 @@ def search(prepared: Prepared, model: EchoModel, progress: Callable[[str], None]
     steps: list[Trial] = []
     first: tuple[Trial, ...] = ()
     while len(steps) < MOST_EFFECTS and current.active_db - max(current.silent_db, -0.5) > SCREEN_DB:
-        trials = [
-            trial
-            for name in names()
-            if find(name).stage != "noise" and name not in dict(model.effects)
-            for trial in [_try(name, prepared, model, judge, current, progress)]
-            if trial is not None
-        ]
-        first = first or tuple(trials)
         left = max(current.level_db - floor_level(judge, current), 0.0)
+        trials = _try_all(prepared, model, judge, current, left, progress)
+        first = first or tuple(trials)
         admissible = {t.name: t for t in trials if _admissible(t, judge, current) and (not steps or t.gain_db >= SECOND_SHARE * left)}
         name = choose({key: trial.gain_db for key, trial in admissible.items()})
         if name is None:
@@ -72,6 +68,21 @@ def search(prepared: Prepared, model: EchoModel, progress: Callable[[str], None]
         if len(steps) > 1:
             model, current, steps = _settle(prepared, judge, model, current, steps, progress)
     return Found(start, model, base, current, tuple(steps), first)
+
+
+def _try_all(
+    prepared: Prepared, model: EchoModel, judge: Judge, current: Verdict, left: float, progress: Callable[[str], None] | None
+) -> list[Trial]:
+    """Each effect that the model has not; the LAST ones only where none of the others explains nearly all of what is left."""
+    trials: list[Trial] = []
+    wanted = [name for name in names() if find(name).stage != "noise" and name not in dict(model.effects)]
+    for name in sorted(wanted, key=lambda name: name in LAST):
+        if name in LAST and any(t.gain_db > ENOUGH * left and _admissible(t, judge, current) for t in trials):
+            continue
+        trial = _try(name, prepared, model, judge, current, progress)
+        if trial is not None:
+            trials.append(trial)
+    return trials
 
 
 def predict(model: EchoModel, prepared: Prepared) -> Samples:

@@ -31,9 +31,22 @@ def _audible_gain(values: Values, *_: object) -> bool:
     return abs(float(values["gain_db"])) >= 0.2
 
 
+def _dull_above(cutoff_hz: float, judge: Judge, before: Verdict) -> bool:
+    """Whether the recording's power above the cut-off falls with what it has in common with the reference: a codec's noise keeps it up."""
+    above = judge.band_hz[:, 0] > 1.1 * cutoff_hz
+    heard = judge.cells(judge.prepared.measurement.recording)[judge.active_cells][:, above]
+    expected = judge.cells(before.prediction)[judge.active_cells][:, above]
+    loud = expected > 3.0
+    if loud.sum() < 10:
+        return True
+    return float(np.sum(np.maximum(heard[loud] - 1.0, 0.0))) < 0.5 * float(np.sum(expected[loud]))
+
+
 def _cuts_the_band(values: Values, judge: Judge, before: Verdict, after: Verdict) -> bool:
     """A low-pass and not a colouring: the low-pass alone, without its fine taps, brings half of it."""
     if float(values["cutoff_hz"]) >= 7700.0:
+        return False
+    if not _dull_above(float(values["cutoff_hz"]), judge, before):
         return False
     plain = find("bandlimit").apply(before.prediction, {**values, "taps": 0.0}, SAMPLE_RATE)
     return before.level_db - judge.judge(plain).level_db > 0.5 * (before.level_db - after.level_db)

@@ -40,6 +40,28 @@ def test_an_extra_band_of_noise_shows_in_its_band_and_in_the_silence() -> None:
     assert found.silence_excess_db == pytest.approx(found.excess_db, abs=1.0)  # the tones sound all the time
 
 
+def test_utterances_with_lags_of_their_own_are_aligned_one_by_one() -> None:
+    x = voice(12.0)
+    x[5 * 16000 : 6 * 16000] = 0
+    parts = np.where(np.arange(x.size) < 5.5 * 16000, x, 0).astype(np.float32), np.where(np.arange(x.size) >= 5.5 * 16000, x, 0).astype(np.float32)
+    clean = [record(part, lag=lag, seed=seed) for part, lag, seed in zip(parts, (0.0, 4321.5), (3, 4), strict=True)]
+    found = compare(profile(), clean[0] + clean[1] - FAN * np.random.default_rng(4).standard_normal(x.size).astype(np.float32), x)
+    assert found.excess_db < 0.5
+    assert any("different numbers of samples" in text and "4321.5 from" in text for text in found.warnings)
+
+
+def test_somebody_talking_in_the_pauses_is_left_out_and_said() -> None:
+    x = voice(16.0)
+    x[5 * 16000 : int(6.5 * 16000)] = 0
+    recording = record(x)
+    talk = np.arange(int(5.4 * 16000), int(7.9 * 16000))
+    recording[talk] += (12 * FAN * np.random.default_rng(6).standard_normal(talk.size)).astype(np.float32)
+    found = compare(profile(), recording, x)
+    (begin, end), = found.human
+    assert begin < 5.7 and end > 6.5
+    assert any("somebody talks" in text for text in found.warnings)
+
+
 def test_another_rate_is_converted() -> None:
     x = voice(6.0)
     up = [soxr.resample(s, 16000, 48000) for s in (record(x), x)]
