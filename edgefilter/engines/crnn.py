@@ -1,4 +1,4 @@
-"""'crnn': a recurrent network masks the linear stage's error and says whether a human speaks."""
+"""'crnn': a recurrent network and a Wiener mask, half and half, on the linear stage's error; the network says whether a human speaks."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import numpy as np
 
 from edgefilter.engines.base import Front
 from edgefilter.engines.onnx_session import expect_slots, find_model, open_model
+from edgefilter.engines.spectral_subtraction import MaskState, SpectralSubtraction
 from edgefilter.types import Frame, Output, Samples
 
 EDGE_TYPE, EDGE_VERSION = "edgefilter-crnn", 1
@@ -16,25 +17,31 @@ SPECTRA = ("error", "mic", "reference", "echo")
 """The graph's first inputs, each (1, bins, 2) float32, real and imaginary part."""
 VARIABLE = "EDGEFILTER_CRNN"
 
-CrnnState: TypeAlias = tuple[Samples, ...]
-"""The network's state tensors; all zeros at the start."""
+WIENER_SHARE = 0.5
+"""Part of the answer that comes from the Wiener mask of 'ss'. The two err in different places, and what one deletes the other keeps:
+on validation conversations the mean had fewer word errors and a higher SI-SDR than either."""
+
+CrnnState: TypeAlias = tuple[tuple[Samples, ...], MaskState]
+"""The network's state tensors, all zeros at the start, and the Wiener mask's state."""
 
 
 class Crnn:
     """Runs an exported EdgeCrnn (export/network.py), one frame at a time.
 
     model: an ONNX file made by export/onnx_export.py; without one the file that the environment variable EDGEFILTER_CRNN names, else
-    the package's own. The file says which STFT it was trained for. Raises ModelError for a file that is not such a model.
+    the package's own. The file says which STFT it was trained for. wiener_share: 0 is the network alone, 1 the Wiener mask.
+    Raises ModelError for a file that is not such a model.
     """
 
     name: ClassVar[str] = "crnn"
     front: ClassVar[Front] = "full"
 
-    def __init__(self, model: str | Path | None = None) -> None:
+    def __init__(self, model: str | Path | None = None, wiener_share: float = WIENER_SHARE) -> None:
         path = find_model(model, VARIABLE, "crnn.onnx", "make one with 'python -m export.onnx_export'")
         self.model = open_model(path, EDGE_TYPE, EDGE_VERSION)
         self.stft = self.model.stft
         self.lookahead = 0
+        self._wiener, self._share = SpectralSubtraction(self.stft), np.float32(wiener_share)
         states = dict(self.model.states)
         spectrum = (1, self.stft.bins, 2)
         outputs = {"spectrum": spectrum, "speech_probability": (1,), **{f"next_{name}": shape for name, shape in states.items()}}
@@ -42,10 +49,12 @@ class Crnn:
         self._outputs = list(outputs)
 
     def initial_state(self) -> CrnnState:
-        return tuple(np.zeros(shape, np.float32) for _, shape in self.model.states)
+        return tuple(np.zeros(shape, np.float32) for _, shape in self.model.states), self._wiener.initial_state()
 
     def step(self, frame: Frame, state: CrnnState) -> tuple[Output, CrnnState]:
         inputs = {name: np.ascontiguousarray(getattr(frame, name)).view(np.float32).reshape(1, -1, 2) for name in SPECTRA}
-        inputs.update(zip((name for name, _ in self.model.states), state))
+        inputs.update(zip((name for name, _ in self.model.states), state[0]))
         spectrum, probability, *following = self.model.session.run(self._outputs, inputs)
-        return Output(spectrum.reshape(-1).view(np.complex64), float(probability[0])), tuple(following)
+        masked, mask_state = self._wiener.step(frame, state[1])
+        human = self._share * masked.spectrum + (1 - self._share) * spectrum.reshape(-1).view(np.complex64)
+        return Output(human, float(probability[0])), (tuple(following), mask_state)

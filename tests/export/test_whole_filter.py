@@ -79,7 +79,7 @@ def conversation(seconds: float = 3.0) -> tuple[np.ndarray, np.ndarray]:
 
 
 def python_stream(network: Path, mic: np.ndarray, reference: np.ndarray, path: np.ndarray | None) -> tuple[np.ndarray, Watched]:
-    stream = Stream(Crnn(network))
+    stream = Stream(Crnn(network, wiener_share=0.0))
     stream.front.aligner = NoAlignment()
     stream.front.canceller = Watched(stream.engine.stft.hop, TAPS, path)
     return np.concatenate((stream.process(mic, reference), stream.flush())), stream.front.canceller
@@ -114,7 +114,7 @@ def test_the_graph_equals_the_stream_through_all_that_the_linear_stage_does(made
 
 def test_the_graph_answers_with_the_networks_probability(made):
     mic, reference = conversation(1.0)
-    stream = Stream(Crnn(made[0]))
+    stream = Stream(Crnn(made[0], wiener_share=0.0))
     stream.front.aligner = NoAlignment()
     stream.front.canceller = Canceller(stream.engine.stft.hop, TAPS)
     step, start = open_session(made[1]), open_session(made[2])

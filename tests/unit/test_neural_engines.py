@@ -37,7 +37,7 @@ def spectrum(rng: np.random.Generator, bins: int) -> np.ndarray:
 
 
 def test_crnn_answers_what_onnxruntime_answers_for_the_same_frames():
-    engine = Crnn(EDGE)
+    engine = Crnn(EDGE, wiener_share=0.0)
     session = onnx_session.open_session(EDGE)
     rng = np.random.default_rng(0)
     nothing = np.zeros(engine.stft.bins, np.float32)
@@ -49,7 +49,17 @@ def test_crnn_answers_what_onnxruntime_answers_for_the_same_frames():
         found, probability, *theirs = session.run(None, dict(zip([slot.name for slot in session.get_inputs()], pairs + theirs)))
         np.testing.assert_array_equal(output.spectrum, found[0, :, 0] + 1j * found[0, :, 1])
         assert output.speech_probability == probability[0] and 0 < probability[0] < 1
-    assert any(tensor.any() for tensor in state)
+    assert any(tensor.any() for tensor in state[0])
+
+
+def test_the_answer_is_half_the_networks_and_half_the_wiener_masks():
+    rng = np.random.default_rng(1)
+    bins = Crnn(EDGE).stft.bins
+    power = rng.random(bins).astype(np.float32)
+    frame = Frame(*(spectrum(rng, bins) for _ in range(4)), power, power)
+    network, wiener, both = (engine.step(frame, engine.initial_state())[0].spectrum for engine in (Crnn(EDGE, wiener_share=s) for s in (0.0, 1.0, 0.5)))
+    assert not np.allclose(network, wiener, atol=1e-3)
+    np.testing.assert_allclose(both, (network + wiener) / 2, atol=1e-6)
 
 
 def test_the_stream_tells_the_probability_of_speech():

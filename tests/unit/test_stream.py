@@ -48,8 +48,8 @@ def test_a_found_reference_is_an_event_and_stands_in_the_stats():
     mic, ref = conformance.conversation(48_000)
     ego = EgoFilter(engine="linear")
     ego.process(mic, ref)
-    events = ego.events()
-    assert [event.kind for event in events] == ["realigned"] and ego.events() == []
+    kinds = [event.kind for event in ego.events()]
+    assert kinds.count("realigned") == 1 and set(kinds) <= {"realigned", "overloaded"} and ego.events() == []  # a busy machine may add the latter
     assert ego.stats()["alignment"]["delay_samples"] == pytest.approx(900, abs=16)  # 1 ms, the reach of the aligner
 
 
