@@ -22,7 +22,7 @@ from tqdm import tqdm
 from edgefilter.engines.linear import Linear
 from edgefilter.profile import Profile
 from edgefilter.stft import StftConfig
-from edgefilter.stream import Front
+from edgefilter.front import Front
 from edgefilter.types import Samples
 from export.corpus import Corpus, read_corpus
 from export.rooms import Room, draw_room

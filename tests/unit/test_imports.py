@@ -24,6 +24,7 @@ LAYERS = [
     {"profile", "profile_file", "profile_text", "delay_line", "utterances"},
     {"announced"},
     {"lag_search", "delay_tracker", "paper_alignment", "alignment", "canceller", "residual", "engines"},
+    {"front"},
     {"stepping", "stream", "audio", "budget", "run"},
     {"sweep", "paper_response", "trust", "calibrate"},
     {"prepare", "compare", "judge", "suspects", "search", "leftover", "fan", "findings", "evidence", "conclude", "diagnose"},
