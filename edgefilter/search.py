@@ -19,7 +19,8 @@ MOST_EFFECTS = 3
 LAST, ENOUGH = ("rattle",), 0.8
 """Effects whose fit takes long, and the share of the excess level at which another one has explained it."""
 SCREEN_DB = 0.2
-"""Where the residual is no more than this above that of the robot's silences, there is nothing of the voice in it."""
+"""Where the residual is no more than this above that of the robot's silences, there is nothing of the voice in it; half a dB
+over the fan in these is ordinary, more of it may be a microphone's gain."""
 SECOND_SHARE = 0.2
 """Of the excess level that is left, a further effect has to explain at least this share: less is how the first one's model errs."""
 
@@ -55,7 +56,7 @@ def search(prepared: Prepared, model: EchoModel, progress: Callable[[str], None]
     base = current = judge.judge(predict(model, prepared))
     steps: list[Trial] = []
     first: tuple[Trial, ...] = ()
-    while len(steps) < MOST_EFFECTS and current.active_db - max(current.silent_db, -0.5) > SCREEN_DB:
+    while len(steps) < MOST_EFFECTS and current.active_db - float(np.clip(current.silent_db, -0.5, 0.5)) > SCREEN_DB:
         left = max(current.level_db - floor_level(judge, current), 0.0)
         trials = _try_all(prepared, model, judge, current, left, progress)
         first = first or tuple(trials)

@@ -79,3 +79,11 @@ def low_pass(hz: Array, cutoff: float, order: float, phase: float) -> NDArray[np
     angle = -np.sum(np.angle(1j * ratio[:, None] - poles), axis=1) + np.sum(np.angle(-poles))
     delay = -np.sum((1.0 / poles).real)
     return magnitude * np.exp(1j * phase * (angle + delay * ratio))
+
+
+def measured_response_db(values: Values) -> tuple[Array, Array]:
+    """Frequencies (FFT + 1,) Hz and gain in dB of the filter with its fine taps."""
+    impulse = np.zeros(2 * FFT, np.float32)
+    impulse[FFT] = 1.0
+    response = np.abs(fft.rfft(Bandlimit().apply(impulse, values, SAMPLE_RATE)))
+    return np.arange(FFT + 1) * SAMPLE_RATE / (2 * FFT), 20.0 * np.log10(response + 1e-6)
