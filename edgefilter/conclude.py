@@ -21,6 +21,9 @@ EXPLAINED_DB = 0.8
 """Excess up to which nothing is missing: what the fan of another day and a faint distortion leave."""
 EXPLAINED, RATTLING = 0.45, 0.2
 """Less of the excess level than this explained by all findings together is not what happened; of what rattles, less can be predicted."""
+STILL_THERE = 0.6
+"""Of the excess in dB, more than this left is not explained either."""
+ERRATIC = ("rattle",)
 UNPREDICTABLE = ("rattle", "bandlimit")
 """Effects whose own noise stays in the residual."""
 THIRDS_T = 1.69
@@ -34,7 +37,7 @@ def conclude(prepared: Prepared, found: Found, progress: Callable[[str], None] |
     remaining = found.final.excess_db
     names = [step.name for step in found.steps]
     unpredictable = bool(set(names) & set(UNPREDICTABLE))
-    believed = bool(found.steps) and (remaining < EXPLAINED_DB or explained_level(prepared, found) >= (RATTLING if unpredictable else EXPLAINED))
+    believed = bool(found.steps) and (remaining < EXPLAINED_DB or _enough(prepared, found))
     quiet = found.base.excess_db < EXPLAINED_DB and not prepared.human
     verdict = "missing" if believed else "explained" if quiet else "unexplained"
     if not believed:
@@ -49,6 +52,14 @@ def conclude(prepared: Prepared, found: Found, progress: Callable[[str], None] |
         irreducible_db=max(remaining, 0.0) if unpredictable and believed else 0.0,
         model=found.model,
     )
+
+
+def _enough(prepared: Prepared, found: Found) -> bool:
+    """Whether the findings explain so much that they are what happened."""
+    explained = explained_level(prepared, found)
+    if any(step.name in ERRATIC for step in found.steps):
+        return explained >= RATTLING
+    return explained >= EXPLAINED and found.final.excess_db < STILL_THERE * found.base.excess_db
 
 
 def explained_level(prepared: Prepared, found: Found) -> float:
