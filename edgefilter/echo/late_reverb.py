@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 import scipy
 
-from edgefilter.echo.effect import Measurement, Parameter, Stage, Values
-from edgefilter.echo.wiener import convolve_from, fit_filter
+from edgefilter.echo.effect import Measurement, Parameter, Stage, Values, neutral
+from edgefilter.echo.wiener import convolve_from, fit_supported
 from edgefilter.types import SAMPLE_RATE, Array, Samples
 
 if TYPE_CHECKING:
@@ -45,11 +45,13 @@ class LateReverb:
         return x.copy() if not taps.any() else x + convolve_from(x, taps, LEAD)
 
     def fit(self, measurement: Measurement, model: EchoModel) -> Values:
-        """Least squares in the whitened domain, slightly regularised."""
+        """Least squares in the whitened domain, slightly regularised; neutral where nothing of it holds on other samples."""
         predicted = model.predict(measurement.reference)
         x, residual = measurement.whiten(predicted), measurement.whiten(measurement.recording - predicted)
         length = min(TAPS, measurement.recording.size // 4)
-        taps = fit_filter(x, residual, measurement.weights, length, LEAD, prior=np.full(length, EXPECTED), steps=40)
+        taps = fit_supported(x, residual, measurement.weights, length, LEAD, prior=np.full(length, EXPECTED), steps=40)
+        if not taps.any():
+            return neutral(self)
         response = scipy.signal.oaconvolve(model.impulse_response.astype(np.float64), taps)[LEAD:]
         response[: model.impulse_response.size] += model.impulse_response
         direct = int(np.argmax(np.abs(model.impulse_response)))

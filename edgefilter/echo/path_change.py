@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
-from edgefilter.echo.effect import Measurement, Parameter, Stage, Values
-from edgefilter.echo.wiener import convolve_from, fit_filter
+from edgefilter.echo.effect import Measurement, Parameter, Stage, Values, neutral
+from edgefilter.echo.wiener import convolve_from, fit_supported
 from edgefilter.types import SAMPLE_RATE, Array, Samples
 
 if TYPE_CHECKING:
@@ -20,6 +20,8 @@ EXPECTED = 1e-2
 BLOCK = SAMPLE_RATE // 10
 MARGIN = 1.5
 """Seconds at either end within which no change is looked for: there is no telling it from a path that was another all along."""
+SLACK = 6.0
+"""Squared error, in variances of the fan, by which moments and fades are told apart: less is chance."""
 NEVER = 1e6
 
 
@@ -50,22 +52,28 @@ class PathChange:
         return {**values, "time_s": -1.0, "duration_s": 0.0} if float(values["time_s"]) < NEVER else values
 
     def fit(self, measurement: Measurement, model: EchoModel) -> Values:
-        """The time by the step in the residual, the new path by least squares after it, in turn."""
+        """The time by the step in the residual, the new path by least squares after it, in turn; neutral where it does not help on other samples.
+
+        The moment alone is chosen on all samples, since it may fall between those that the fit may use.
+        """
         predicted = model.predict(measurement.reference)
         x, residual = measurement.whiten(predicted), measurement.whiten(measurement.recording - predicted)
         time = _step(residual, x)
         duration = 0.01
         for _ in range(2):
             after = measurement.weights * (np.arange(x.size) > (time + 0.3) * SAMPLE_RATE)
-            taps = fit_filter(x, residual, after, TAPS, LEAD, prior=np.full(TAPS, EXPECTED), steps=40)
+            taps = fit_supported(x, residual, after, TAPS, LEAD, prior=np.full(TAPS, EXPECTED), steps=40)
+            if not taps.any():
+                return neutral(self)
             change = convolve_from(x, taps, LEAD)
             time = _best_time(residual, change, measurement.weights)
         errors = {}
         for length in (0.01, 0.3, 0.6, 1.0):
             for at in time + np.arange(-0.6, 0.61, 0.1):
                 left = residual - _fade(x.size, at, length, SAMPLE_RATE) * change
-                errors[(at, length)] = float(np.dot(left * left, measurement.weights))
-        time, duration = min(errors, key=errors.get)
+                errors[(at, length)] = float(np.dot(left, left))
+        as_good = [found for found, error in errors.items() if error <= min(errors.values()) + SLACK]
+        time, duration = min(as_good, key=lambda found: (found[1], abs(found[0] - time)))
         return {"time_s": float(np.clip(time, 0.0, x.size / SAMPLE_RATE)), "duration_s": duration, "taps": np.clip(taps, -10.0, 10.0)}
 
 

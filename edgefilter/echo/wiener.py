@@ -66,6 +66,14 @@ def fit_filter(x: Samples, target: Samples, weights: Samples, taps: int, lead: i
     return c
 
 
+def fit_supported(x: Samples, target: Samples, weights: Samples, taps: int, lead: int, prior: Array, steps: int) -> Array:
+    """fit_filter's answer, or zeros where a filter from half of the weighted samples does not help on the other half (blocks of 0.5 s)."""
+    half = np.arange(x.size) // (SAMPLE_RATE // 2) % 4 < 2
+    trial = convolve_from(x, fit_filter(x, target, weights * half, taps, lead, prior, steps // 2), lead)
+    fall = float(np.dot(target * target - (target - trial) ** 2, weights * ~half))
+    return fit_filter(x, target, weights, taps, lead, prior, steps) if fall > 0.0 else np.zeros(taps)
+
+
 def _windowed(correlation: Array, taps: int, size: int) -> Array:
     """The autocorrelation up to lag taps, tapered, as one period of a circulant (size,)."""
     kept = np.zeros(size)

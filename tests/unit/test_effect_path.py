@@ -83,7 +83,8 @@ def test_what_runs_is_the_path_with_its_stationary_effects() -> None:
     resonance = {"frequency_hz": 900.0, "q": 20.0, "gain_db": -3.0}
     full = model.with_effect("chassis_resonance", resonance).with_effect("bandlimit", {"cutoff_hz": 4000.0, "order": 6.0, "phase": 1.0})
     running = EchoModel(full.running_response()).predict(x)
-    np.testing.assert_allclose(running, full.predict(x), atol=2e-4 * np.abs(running).max())  # the ring is cut 80 dB down
+    whole = slice(0, x.size - PRE_ROLL)  # the low-pass rings ahead of sounds that the recording no longer holds
+    np.testing.assert_allclose(running[whole], full.predict(x)[whole], atol=2e-4 * np.abs(running).max())  # the ring is cut 80 dB down
     assert model.running_response() is model.impulse_response
     assert full.with_running_response(full.running_response()).effects == ()
 
