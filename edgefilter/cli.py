@@ -101,7 +101,9 @@ def _add_diagnosis(commands: argparse._SubParsersAction) -> None:
     for command in (add, remove):
         command.add_argument("effect", metavar="EFFECT", help="name of the effect, as 'diagnose' and 'profile show' print it")
     for command in (compare, diagnose, add, remove):
-        command.add_argument("--profile", required=True, metavar="P.npz", help="calibrated robot, made by 'edgefilter calibrate'")
+        needed = command in (add, remove)
+        told = "calibrated robot, made by 'edgefilter calibrate'" + ("" if needed else "; without it the recording itself speaks for the robot")
+        command.add_argument("--profile", required=needed, metavar="P.npz", help=told)
         if command is not remove:
             command.add_argument("--recording", required=True, metavar="MIC", help="the robot alone, as the microphone heard it, from some seconds up")
             command.add_argument("--reference", required=True, metavar="REF", help="what the robot said, as it was sent to the loudspeaker")

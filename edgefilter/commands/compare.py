@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from dataclasses import replace
 
 from edgefilter.commands.display import write_json
 from edgefilter.commands.material import load
@@ -14,6 +15,8 @@ from edgefilter.report.text import comparison_lines
 def main(args: argparse.Namespace) -> int:
     profile, recording, reference = load(args)
     found = compare(profile, recording, reference)
+    if args.profile is None:
+        found = replace(found, warnings=(*profile.warnings, *found.warnings))
     if args.json:
         write_json({"schema": 1, **found.to_dict()}, args.json)
     if args.json != "-":

@@ -6,6 +6,7 @@ import argparse
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 
 from tqdm import tqdm
 
@@ -20,10 +21,12 @@ def main(args: argparse.Namespace) -> int:
     profile, recording, reference = load(args)
     with _bar() as progress:
         found = diagnose(profile, recording, reference, progress=progress)
+    if args.profile is None:
+        found = replace(found, comparison=replace(found.comparison, warnings=(*profile.warnings, *found.comparison.warnings)))
     if args.json:
         write_json(found.to_dict(), args.json)
     if args.json != "-":
-        print("\n".join([*diagnosis_lines(found), *_next_step(found, args)]))
+        print("\n".join([*diagnosis_lines(found, args.profile is not None), *_next_step(found, args)]))
     if args.report:
         write_page(args.report, diagnosis_page(profile, found, recording, reference, vars(args)))
         if args.json != "-":

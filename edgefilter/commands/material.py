@@ -1,4 +1,4 @@
-"""What compare, diagnose and add work on: a profile, a recording of the robot alone and the reference of what it said."""
+"""What compare, diagnose and add work on: a profile (or what the recording itself says of the robot), a recording of the robot alone and the reference of what it said."""
 
 from __future__ import annotations
 
@@ -10,15 +10,19 @@ import numpy as np
 from edgefilter.audio.reader import Reader
 from edgefilter.errors import AudioFileError
 from edgefilter.profile import Profile
+from edgefilter.self_calibration import self_calibrate
 from edgefilter.types import Samples
 
 
 def load(args: argparse.Namespace) -> tuple[Profile, Samples, Samples]:
     """Profile, recording (n,) and reference (m,) of the command line, 16 kHz mono; conversions are said on standard error.
 
-    Raises AudioFileError for a file that is unusable or holds only silence, ProfileError for a damaged profile.
+    Without --profile the profile is made from the recording. Raises AudioFileError for a file that is unusable or holds only silence,
+    ProfileError for a damaged profile, SignalError where there is no profile and nothing to make one from.
     """
-    return Profile.load(args.profile), _read(args.recording, "recording"), _read(args.reference, "reference")
+    profile = None if args.profile is None else Profile.load(args.profile)
+    recording, reference = _read(args.recording, "recording"), _read(args.reference, "reference")
+    return profile or self_calibrate(recording, reference), recording, reference
 
 
 def _read(path: str, role: str) -> Samples:

@@ -27,8 +27,9 @@ LOUDER = 10.0
 
 
 def comparison_page(found: Comparison, names: Mapping[str, object]) -> str:
-    """The page of a comparison. names: profile, recording, reference, what the files are called."""
-    excess = f"The profile leaves {decibels(found.excess_db)} dB over the noise floor unexplained."
+    """The page of a comparison. names: profile (None: the recording itself was taken for it), recording, reference, what the files are called."""
+    profile = "The profile" if names["profile"] else "A stationary linear path made from the recording itself"
+    excess = f"{profile} leaves {decibels(found.excess_db)} dB over the noise floor unexplained."
     text = {"kind": "comparison", "headline": excess, "findings": "", "left": "", "irreducible": ""}
     return _page({(): found}, (), text, names)
 
@@ -39,7 +40,7 @@ def diagnosis_page(profile: Profile, found: Diagnosis, recording: Samples, refer
     variants = compare_variants(profile, found.model, steps, recording, reference)
     text = {
         "kind": "diagnosis",
-        "headline": headline(found.verdict, [finding.effect for finding in found.ranking]),
+        "headline": headline(found.verdict, [finding.effect for finding in found.ranking], bool(names["profile"])),
         "findings": "".join(_finding(rank, finding, names) for rank, finding in enumerate(found.ranking, start=1)),
         "left": _section("What is left", f"<p>{html.escape(sentence(found.evidence))}</p>") if found.evidence else "",
         "irreducible": f"{decibels(found.irreducible_db)} dB",
@@ -48,7 +49,9 @@ def diagnosis_page(profile: Profile, found: Diagnosis, recording: Samples, refer
 
 
 def add_command(effect: str, names: Mapping[str, object]) -> str:
-    """What to type to have that effect in a new profile."""
+    """What to type to have that effect in a new profile; without a profile, to have one at all."""
+    if names["profile"] is None:
+        return "edgefilter calibrate --live --output robot.npz"
     files = " ".join(f"--{role} {shlex.quote(str(names[role]))}" for role in ("profile", "recording", "reference"))
     own = "".join(f" --effects {shlex.quote(str(file))}" for file in names.get("effects") or ())
     output = Path(str(names["profile"])).with_suffix(f".{effect}.npz")
@@ -75,7 +78,7 @@ def _page(
     scale = colour_scale(before.recording)
     data = _data(variants, before, irreducible_db, scale)
     fields = {key: html.escape(value) if key in ("kind", "headline", "irreducible") else value for key, value in text.items()}
-    fields |= {role: html.escape(Path(str(names[role])).name) for role in ("profile", "recording", "reference")}
+    fields |= {role: html.escape(Path(str(names[role] or "none: the recording itself")).name) for role in ("profile", "recording", "reference")}
     fields |= {
         "facts": _facts(before, after, bool(findings), text["irreducible"]),
         "switches": "".join(_switch(i, finding) for i, finding in enumerate(findings)),

@@ -36,21 +36,25 @@ def comparison_lines(found: Comparison) -> list[str]:
     return lines
 
 
-def diagnosis_lines(found: Diagnosis) -> list[str]:
-    """The verdict in a sentence, the error budget step by step, each finding with its evidence, then where the excess was."""
+def diagnosis_lines(found: Diagnosis, calibrated: bool = True) -> list[str]:
+    """The verdict in a sentence, the error budget step by step, each finding with its evidence, then where the excess was.
+
+    calibrated: False where the profile was made from the recording itself.
+    """
     names = [finding.effect for finding in found.ranking]
     added = in_order(found.ranking)
-    steps = [("the profile as it is", added[0].excess_before_db if added else found.comparison.excess_db)]
+    profile = "the profile as it is" if calibrated else "a stationary linear path"
+    steps = [(profile, added[0].excess_before_db if added else found.comparison.excess_db)]
     steps += [(f"with {finding.effect}", finding.excess_after_db) for finding in added]
     top = max(1.0, *(db for _, db in steps))
-    lines = [f"verdict     {found.verdict}: {headline(found.verdict, names)}", "budget      dB over the noise floor"]
+    lines = [f"verdict     {found.verdict}: {headline(found.verdict, names, calibrated)}", "budget      dB over the noise floor"]
     lines += [f"  {name:<27} {decibels(db):>6}  {_bar(db / top)}".rstrip() for name, db in steps]
     lines.append(f"  {'of it irreducible':<27} {decibels(found.irreducible_db):>6}  {_bar(found.irreducible_db / top)}".rstrip())
     for rank, finding in enumerate(found.ranking, start=1):
         lines += _finding(rank, finding)
     if found.evidence:
         lines.append(f"left        {sentence(found.evidence)}")
-    return [*lines, "where       it is with the profile as it is:", *comparison_lines(found.comparison)]
+    return [*lines, f"where       it is with {profile}:", *comparison_lines(found.comparison)]
 
 
 def in_order(ranking: Sequence[Finding]) -> list[Finding]:

@@ -54,9 +54,13 @@ def sentence(words: str) -> str:
     return words and words[:1].upper() + words[1:] + ("" if words.endswith((".", "!", "?")) else ".")
 
 
-def headline(verdict: str, effects: Iterable[str]) -> str:
-    """One sentence for the verdict of a diagnosis."""
+def headline(verdict: str, effects: Iterable[str], calibrated: bool = True) -> str:
+    """One sentence for the verdict of a diagnosis; calibrated: whether there was a profile that could lack something."""
     found = joined(spoken(effect) for effect in effects)
+    if verdict == "missing" and not calibrated:
+        return f"Found in the recording, besides what is stationary and linear: {found}."
+    if verdict == "explained" and not calibrated:
+        return "A stationary linear path explains this recording; what it is made of cannot be told without a calibration."
     if verdict == "missing":
         return f"Missing from the profile: {found}."
     if verdict == "explained":
