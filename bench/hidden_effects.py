@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """Judge the diagnosis on recordings with hidden effects: calibrate from each case's sweep, diagnose, count.
 
-    python bench/hidden_effects.py DIR [DIR ...] [--limit N] [--json] [--output bench/results/hidden_effects]
+    python bench/hidden_effects.py DIR [DIR ...] [--limit N] [--jobs 2] [--json] [--output bench/results/hidden_effects]
 
 A folder holds cases as bench/hidden_cases.py writes them: sweep_ref, sweep_mic, fan_only, ref, mic (FLAC), truth.json (effects, raw, strength).
 Instead of truth.json files it may hold one seals.json: per case a salt and the sha256 of salt + ":" + case + ":" + label. Then the
@@ -16,6 +16,7 @@ import hashlib
 import json
 import sys
 import time
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, replace
 from pathlib import Path
 
@@ -67,31 +68,36 @@ def check_seal(outcome: Outcome, seal: dict) -> Outcome:
     return replace(outcome, sealed_hit=hashlib.sha256(text.encode()).hexdigest() == seal["sha256"])
 
 
-def run(folder: Path, limit: int | None) -> list[Outcome]:
+def outcome(case: Path, seal: dict | None) -> Outcome:
+    """What came of one case, by its truth or its seal."""
+    if seal is not None:
+        return check_seal(judge(case, None), seal)
+    return judge(case, json.loads((case / "truth.json").read_text(encoding="utf-8")))
+
+
+def run(folder: Path, limit: int | None, jobs: int) -> list[Outcome]:
     """Every case of a folder. Raises UsageError where a case has neither truth nor seal."""
     path = folder / "seals.json"
     seals = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
-    outcomes = []
-    for case in tqdm(find_cases(folder, limit), unit="case", desc=str(folder), disable=not sys.stderr.isatty()):
-        truth = case / "truth.json"
-        if truth.exists():
-            outcomes.append(judge(case, json.loads(truth.read_text(encoding="utf-8"))))
-        elif case.name in seals:
-            outcomes.append(check_seal(judge(case, None), seals[case.name]))
-        else:
+    cases = find_cases(folder, limit)
+    for case in cases:
+        if not (case / "truth.json").exists() and case.name not in seals:
             raise UsageError(f"{case} has neither a truth.json nor an entry in {path}; expected one of them")
-    return outcomes
+    sealed = [None if (case / "truth.json").exists() else seals[case.name] for case in cases]
+    with ProcessPoolExecutor(jobs) as pool:
+        return list(tqdm(pool.map(outcome, cases, sealed), total=len(cases), unit="case", desc=str(folder), disable=not sys.stderr.isatty()))
 
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folders", type=Path, nargs="+", metavar="DIR")
     parser.add_argument("--limit", type=int, metavar="N", help="at most N cases of each folder, evenly spread")
+    parser.add_argument("--jobs", type=int, default=1, help="cases at a time; with more than one the seconds per case are not those of a free core")
     parser.add_argument("--json", action="store_true", help="print the figures as JSON instead of Markdown")
     parser.add_argument("--output", type=Path, metavar="PATH", help="also write PATH.md and PATH.json")
     options = parser.parse_args()
     try:
-        results = {folder.resolve().name: run(folder, options.limit) for folder in options.folders}
+        results = {folder.resolve().name: run(folder, options.limit, options.jobs) for folder in options.folders}
     except (UsageError, OSError) as error:
         print(f"hidden_effects: {error}", file=sys.stderr)
         return 1

@@ -123,7 +123,7 @@ def test_folder_without_cases_or_labels_is_refused(folder: Path, tmp_path: Path)
         hidden_effects.find_cases(tmp_path, None)
     (tmp_path / "c00").symlink_to(folder / "c00")
     with pytest.raises(UsageError, match="neither a truth.json nor an entry"):
-        hidden_effects.run(tmp_path, None)
+        hidden_effects.run(tmp_path, None, 1)
 
 
 def test_limit_spreads_over_the_folder(tmp_path: Path) -> None:
