@@ -18,8 +18,8 @@ SPECTRA = ("error", "mic", "reference", "echo")
 VARIABLE = "EDGEFILTER_CRNN"
 
 WIENER_SHARE = 0.5
-"""Part of the answer that comes from the Wiener mask of 'ss'. The two err in different places, and what one deletes the other keeps:
-on validation conversations the mean had fewer word errors and a higher SI-SDR than either."""
+"""Part of the answer that comes from the Wiener mask of 'ss'. The two err in different places, and what one deletes the other keeps: on
+validation conversations the mean had a higher SI-SDR than either, far fewer word errors than the network and about as many as 'ss'."""
 
 CrnnState: TypeAlias = tuple[tuple[Samples, ...], MaskState]
 """The network's state tensors, all zeros at the start, and the Wiener mask's state."""
