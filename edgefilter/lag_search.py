@@ -140,9 +140,10 @@ class LagSearch:
 
 
 def _soften(x: Samples) -> None:
-    """Fade both ends of x in place: two hard cuts, whitened, would correlate with one another."""
-    x[:FADE] *= _RISE
-    x[-FADE:] *= _RISE[::-1]
+    """Fade both ends of x, of any length, in place: two hard cuts, whitened, would correlate with one another."""
+    rise = _RISE[: x.size]
+    x[: rise.size] *= rise
+    x[x.size - rise.size :] *= rise[::-1]
 
 
 def _whitened(spectrum: np.ndarray, floor: float) -> np.ndarray:

@@ -227,3 +227,12 @@ def test_a_tape_is_silent_outside_what_it_holds():
     assert tape.read(-10, 70).tolist() == [0.0] * 10 + [1.0] * 60 + [0.0] * 10
     tape.push(np.full(60, 2, np.float32))
     assert tape.read(10, 30).tolist() == [0.0] * 10 + [1.0] * 10
+
+
+@pytest.mark.parametrize("known", [1, 128, 300])
+def test_a_reference_shorter_than_its_fades_is_searched_too(known):
+    search, tape = LagSearch(24_000), Tape(60_000)
+    tape.push(np.random.default_rng(known).standard_normal(60_000).astype(np.float32))
+    search.prepare(tape, 60_000, 60_000 - known)
+    search.listen(tape, 60_000, 60_000 - known)
+    assert search.find() is None
