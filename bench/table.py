@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import platform
 from collections.abc import Callable, Sequence
 from datetime import datetime, timezone
-from importlib.metadata import PackageNotFoundError, version
-from pathlib import Path
 
 import numpy as np
+
+from edgefilter.budget_cache import processor, versions
 
 RESAMPLES = 2000
 PACKAGES = ("numpy", "scipy", "onnxruntime", "faster-whisper", "ctranslate2", "jiwer", "pywebrtc-audio", "soundfile")
@@ -88,16 +87,5 @@ def _figure(row: dict, name: str, key: str, digits: int) -> str:
 
 def machine() -> dict[str, str]:
     """Processor, Python, package versions and the date, for the head of every result."""
-    names = [line.split(":", 1)[1].strip() for line in _lines(Path("/proc/cpuinfo")) if line.startswith("model name")]
-    found = {"date": datetime.now(timezone.utc).strftime("%Y-%m-%d %H:%M UTC"), "processor": names[0] if names else platform.processor()}
-    found |= {"threads": "1", "python": platform.python_version()}
-    for package in PACKAGES:
-        try:
-            found[package] = version(package)
-        except PackageNotFoundError:
-            found[package] = "none"
-    return found
-
-
-def _lines(path: Path) -> list[str]:
-    return path.read_text(encoding="utf-8").splitlines() if path.exists() else []
+    date = datetime.now(timezone.utc).strftime("%Y-%m-%d %H:%M UTC")
+    return {"date": date, "processor": processor(), "threads": "1", **versions(PACKAGES)}

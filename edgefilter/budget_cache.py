@@ -7,7 +7,7 @@ import json
 import os
 import platform
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -30,13 +30,19 @@ def folder() -> Path:
 
 def describe(path: Mapping[str, object]) -> dict[str, object]:
     """What timings depend on: machine, versions, and what the caller says of the path."""
-    found: dict[str, object] = {"machine": platform.node(), "processor": processor(), "cores": os.cpu_count(), "python": platform.python_version()}
-    for package in PACKAGES:
+    found: dict[str, object] = {"machine": platform.node(), "processor": processor(), "cores": os.cpu_count()}
+    return {**found, **versions(PACKAGES), **path}
+
+
+def versions(packages: Iterable[str]) -> dict[str, str]:
+    """Of Python and of each package, "none" where it is not installed."""
+    found = {"python": platform.python_version()}
+    for package in packages:
         try:
             found[package] = version(package)
         except PackageNotFoundError:
             found[package] = "none"
-    return {**found, **path}
+    return found
 
 
 def processor() -> str:

@@ -248,13 +248,14 @@ def find_offset(predicted: Samples, recording: Samples) -> float:
     Raises SignalError where no lag stands out.
     """
     n = fft.next_fast_len(2 * recording.size, real=True)
-    correlation = fft.irfft(flat_cross(predicted, recording, n), n)
+    cross = flat_cross(predicted, recording, n)
+    correlation = fft.irfft(cross, n)
     reach = min(int(MAX_OFFSET * SAMPLE_RATE), recording.size - 1)
     near = np.concatenate((correlation[-reach:], correlation[: reach + 1]))
     peak = int(np.argmax(near))
     if near[peak] < 12.0 * np.sqrt(np.mean(near**2)):
         raise SignalError("the recording does not contain the reference at any lag up to 3 s: are both of the same utterance?")
-    return refine_lag(predicted, recording, float(peak - reach))
+    return _climb(cross, n, float(peak - reach))
 
 
 def flat_cross(predicted: Samples, recording: Samples, n: int) -> NDArray[np.complex128]:
@@ -268,9 +269,13 @@ def flat_cross(predicted: Samples, recording: Samples, n: int) -> NDArray[np.com
 
 
 def refine_lag(predicted: Samples, recording: Samples, lag: float) -> float:
-    """The fractional lag near `lag` at which predicted (n,) correlates best with recording (n,): Newton steps on the cross-spectrum."""
+    """The fractional lag near `lag` at which predicted (n,) correlates best with recording (n,)."""
     n = fft.next_fast_len(2 * recording.size, real=True)
-    cross = flat_cross(predicted, recording, n)
+    return _climb(flat_cross(predicted, recording, n), n, lag)
+
+
+def _climb(cross: NDArray[np.complex128], n: int, lag: float) -> float:
+    """From `lag` to the top of the correlation whose cross-spectrum this is, of n samples: Newton steps."""
     frequencies = 2 * np.pi * np.arange(cross.size) / n
     for _ in range(8):
         turned = cross * np.exp(1j * frequencies * lag)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -39,14 +39,13 @@ class Trial:
 
 @dataclass(frozen=True, eq=False)
 class Found:
-    """The outcome of a search from a start model. steps: the accepted effects in their order. tried: in the first round."""
+    """The outcome of a search from a start model. steps: the accepted effects in their order."""
 
     start: EchoModel
     model: EchoModel
     base: Verdict
     final: Verdict
     steps: tuple[Trial, ...]
-    tried: tuple[Trial, ...] = field(repr=False, default=())
 
 
 def search(prepared: Prepared, model: EchoModel, progress: Callable[[str], None] | None = None) -> Found:
@@ -55,11 +54,9 @@ def search(prepared: Prepared, model: EchoModel, progress: Callable[[str], None]
     start = model
     base = current = judge.judge(predict(model, prepared))
     steps: list[Trial] = []
-    first: tuple[Trial, ...] = ()
     while len(steps) < MOST_EFFECTS and current.active_db - float(np.clip(current.silent_db, -0.5, 0.5)) > SCREEN_DB:
         left = max(current.level_db - floor_level(judge, current), 0.0)
         trials = _try_all(prepared, model, judge, current, left, progress)
-        first = first or tuple(trials)
         admissible = {t.name: t for t in trials if _admissible(t, judge, current) and (not steps or t.gain_db >= SECOND_SHARE * left)}
         name = choose({key: trial.gain_db for key, trial in admissible.items()})
         if name is None:
@@ -68,7 +65,7 @@ def search(prepared: Prepared, model: EchoModel, progress: Callable[[str], None]
         model, current = admissible[name].model, admissible[name].verdict
         if len(steps) > 1:
             model, current, steps = _settle(prepared, judge, model, current, steps, progress)
-    return Found(start, model, base, current, tuple(steps), first)
+    return Found(start, model, base, current, tuple(steps))
 
 
 def _try_all(

@@ -216,7 +216,7 @@ def _fan(rng: np.random.Generator, samples: int, rms: float) -> tuple[Samples, S
     taps = signal.firwin2(1023, np.linspace(0, 1, GRID_BINS), amplitude)
     noise = signal.oaconvolve(rng.standard_normal(samples + taps.size - 1), taps, mode="valid")
     scale = rms / math.sqrt(np.mean(noise**2))
-    response = np.abs(np.fft.rfft(taps, 2 * (GRID_BINS - 1)))[:GRID_BINS] if taps.size <= 2 * (GRID_BINS - 1) else amplitude
+    response = np.abs(np.fft.rfft(taps, 2 * (GRID_BINS - 1)))[:GRID_BINS]
     return (scale * noise).astype(np.float32), (2 / SAMPLE_RATE * (scale * response) ** 2).astype(np.float32)
 
 

@@ -59,7 +59,6 @@ class PathChange:
         predicted = model.predict(measurement.reference)
         x, residual = measurement.whiten(predicted), measurement.whiten(measurement.recording - predicted)
         time = _step(residual, x)
-        duration = 0.01
         for _ in range(2):
             after = measurement.weights * (np.arange(x.size) > (time + 0.3) * SAMPLE_RATE)
             taps = fit_supported(x, residual, after, TAPS, LEAD, prior=np.full(TAPS, EXPECTED), steps=40)
@@ -72,7 +71,8 @@ class PathChange:
             for at in time + np.arange(-0.6, 0.61, 0.1):
                 left = residual - _fade(x.size, at, length, SAMPLE_RATE) * change
                 errors[(at, length)] = float(np.dot(left, left))
-        as_good = [found for found, error in errors.items() if error <= min(errors.values()) + SLACK]
+        most = min(errors.values()) + SLACK
+        as_good = [found for found, error in errors.items() if error <= most]
         time, duration = min(as_good, key=lambda found: (found[1], abs(found[0] - time)))
         return {"time_s": float(np.clip(time, 0.0, x.size / SAMPLE_RATE)), "duration_s": duration, "taps": np.clip(taps, -10.0, 10.0)}
 

@@ -82,7 +82,8 @@ def test_playing_delivers_every_sample_once_and_then_the_next_is_expected():
     rng = np.random.default_rng(24)
     queue = Announcements()
     queue.add(speech_like(rng, 1))
-    queue.add(speech_like(rng, 1))
+    second = speech_like(rng, 1)
+    queue.add(second)
     first = queue.expected(50000).utterance
     playback = queue.begin(40000)
     assert queue.expected(50000) is None
@@ -92,4 +93,6 @@ def test_playing_delivers_every_sample_once_and_then_the_next_is_expected():
         at += 256
     played = np.concatenate(parts)
     assert np.array_equal(played[: first.size], first) and not played[first.size :].any()
-    assert queue.expected(at) is not None
+    following = queue.expected(at).utterance
+    assert not np.array_equal(following, first)
+    assert np.abs(following).max() == np.abs(second).max()
