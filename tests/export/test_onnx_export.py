@@ -16,6 +16,7 @@ from edgefilter.engines.paper_crnn import PaperCrnn as PaperEngine
 from edgefilter.errors import ModelError
 from edgefilter.types import Frame
 from export import onnx_export, onnx_parity
+from export.edge_graph import EdgeGraph
 from export.network import EdgeConfig, EdgeCrnn
 from export.onnx_export import Trained, export, load, main
 from export.paper_network import PaperConfig, PaperCrnn
@@ -63,7 +64,7 @@ def test_the_runtime_takes_the_file_and_knows_its_stft_training_and_figures(expo
 
 
 def test_nothing_but_the_model_is_left_behind(exported):
-    assert sorted(path.name for path in exported[1].parent.iterdir()) == ["crnn.onnx", "figures.json", "last.pt"]
+    assert sorted(path.name for path in exported[1].parent.iterdir()) == ["crnn.onnx", "crnn_int8.onnx", "figures.json", "last.pt"]
 
 
 def test_the_graph_is_opset_17_and_its_gru_is_torchs(exported):
@@ -93,6 +94,38 @@ def test_the_engine_computes_what_torch_computes(exported):
         assert output.speech_probability == pytest.approx(float(probability[0]), abs=1e-4)
     for mine, found in zip(ours, theirs[0], strict=True):
         np.testing.assert_allclose(found, mine.numpy(), atol=1e-4)
+
+
+@pytest.mark.parametrize("norm", ["layer", "batch", "none"])
+@pytest.mark.parametrize("products", [False, True])
+def test_the_rewritten_graph_answers_like_the_network_whatever_its_shape(norm, products):
+    torch.manual_seed(4)
+    network = EdgeCrnn(EdgeConfig(n_fft=512, hop=256, channels=(3, 4, 5, 6), hidden=7, layers=3, norm=norm)).eval()
+    state = [torch.randn_like(tensor) for tensor in network.initial_state()]
+    spectra = [10.0 ** torch.empty(1, 257, 1).uniform_(-6, 0) * torch.randn(1, 257, 2) for _ in range(4)]
+    with torch.no_grad():
+        spectrum, probability, following = network.step(*spectra, tuple(state))
+        found = EdgeGraph(network, products)(*spectra, *state)
+    for wanted, tensor in zip((spectrum, probability, *following), found, strict=True):
+        torch.testing.assert_close(tensor, wanted, atol=1e-5, rtol=1e-5)
+
+
+def test_the_int8_variant_is_taken_by_the_engine_and_answers_nearly_the_same(exported):
+    small = exported[1].with_name("crnn_int8.onnx")
+    operators = {node.op_type for node in onnx.load(small).graph.node}
+    assert "MatMulInteger" in operators and "GRU" not in operators and "MatMul" not in operators
+    engines = Crnn(exported[1], wiener_share=0.0), Crnn(small, wiener_share=0.0)
+    assert engines[1].model.describe() == {**engines[0].model.describe(), "file": str(small)}
+    rng = np.random.default_rng(5)
+    nothing = np.zeros(engines[0].stft.bins, np.float32)
+    states = [engine.initial_state() for engine in engines]
+    power = apart = 0.0
+    for _ in range(50):
+        frame = Frame(*(rng.standard_normal((4, engines[0].stft.bins, 2)) @ (1, 1j)).astype(np.complex64), nothing, nothing)
+        (wanted, states[0]), (found, states[1]) = (engine.step(frame, state) for engine, state in zip(engines, states))
+        power += np.sum(np.abs(wanted.spectrum) ** 2)
+        apart += np.sum(np.abs(found.spectrum - wanted.spectrum) ** 2)
+    assert 0 < apart < 1e-3 * power, "30 dB: seven bits of weight and eight of input in five units of memory"
 
 
 def test_parity_runs_a_thousand_frames_and_is_far_below_the_bound(exported):
