@@ -17,6 +17,8 @@ from edgefilter.types import SAMPLE_RATE
 SIGNALS = ("error", "mic", "reference", "echo", "clean")
 TARGET_RMS = 0.1
 """At which the human is scaled for the loss."""
+ROBOT_SILENT = 0.06
+"""Share of crops in which the robot says nothing and the fan is faint: the human has to come out untouched."""
 
 
 class Items:
@@ -85,6 +87,8 @@ class Batches:
             return crop
         if rng.random() < 0.4:
             self._swap_human(crop)
+        if rng.random() < ROBOT_SILENT:
+            self._silence_robot(crop)
         gain = 10 ** (rng.uniform(-6, 6) / 20) - 1
         for signal in ("mic", "error"):
             crop[signal] = crop[signal] + gain * crop["clean"]
@@ -103,6 +107,13 @@ class Batches:
         for signal in ("mic", "error"):
             crop[signal] = crop[signal] - crop["clean"] + clean
         crop["clean"] = clean
+
+    def _silence_robot(self, crop: dict[str, np.ndarray]) -> None:
+        """Only the human, and white noise 30 to 60 dB below the loudest sample."""
+        peak = float(np.abs(crop["clean"]).max()) or 0.01
+        noise = 10 ** (-self.rng.uniform(30, 60) / 20) * peak * self.rng.standard_normal(self.samples, np.float32)
+        crop["mic"] = crop["error"] = crop["clean"] + noise
+        crop["reference"] = np.zeros(self.samples, np.float32)
 
     def spectra(self, crops: list[dict[str, np.ndarray]]) -> dict[str, Tensor]:
         """Crops of equal length to a batch."""

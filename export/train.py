@@ -1,8 +1,9 @@
 """Train the edge network, or the paper's, on simulated conversations.
 
-    python -m export.train --data DIR --validation DIR --output RUN [--network edge|paper] [--steps 6000] [--seed 1] [--smoke]
+    python -m export.train --data DIR --validation DIR --output RUN [--network edge|paper] [--steps 6000] [--seed 1] [--start RUN/best.pt] [--smoke]
 
-RUN/last.pt is written every --every steps (a second call goes on from there), RUN/best.pt holds the averaged weights with the best
+--start takes the weights of a trained network of the same shape, to go on with other data: with --data made by export/dataset.py --profile,
+an effect that was found in the field is learned. RUN/last.pt is written every --every steps (a second call goes on from there), RUN/best.pt holds the averaged weights with the best
 validation loss; TensorBoard reads RUN, and RUN/log.jsonl has the same figures.
 """
 
@@ -11,6 +12,7 @@ from __future__ import annotations
 import argparse
 import json
 import math
+import sys
 import time
 from pathlib import Path
 
@@ -20,10 +22,12 @@ from torch import Tensor, nn
 from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
 
+from edgefilter.errors import EdgefilterError, UsageError
 from edgefilter.types import SAMPLE_RATE
 from export.crops import Batches, Items
 from export.losses import LossWeights, si_sdr
 from export.network import EdgeConfig
+from export.onnx_export import load
 from export.tasks import TASKS, Task
 
 AVERAGE = 0.998
@@ -68,6 +72,11 @@ def train(options: argparse.Namespace) -> Path:
     task = TASKS[options.network](options)
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     network = task.network().to(device)
+    if options.start:
+        start = load(options.start).network
+        if start.config != network.config:
+            raise UsageError(f"{options.start} holds a network of {start.config}, expected {network.config}: give the same --hop, --channels, --hidden and --norm")
+        network.load_state_dict(start.state_dict())
     average = {name: value.clone() for name, value in network.state_dict().items()}
     optimiser = torch.optim.AdamW(network.parameters(), lr=options.rate, weight_decay=1e-2, betas=(0.9, 0.98))
     items, held_out = Items(options.data), Items(options.validation)
@@ -137,7 +146,7 @@ def smoke(options: argparse.Namespace) -> None:
     options.steps, options.every, options.batch, options.seconds = 4, 2, 2, 1.0
 
 
-def main() -> None:
+def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--data", type=Path, required=True, metavar="DIR")
     parser.add_argument("--validation", type=Path, required=True, metavar="DIR")
@@ -155,14 +164,20 @@ def main() -> None:
     parser.add_argument("--norm", choices=("layer", "batch", "none"), default="layer")
     parser.add_argument("--suppression", type=float, default=LossWeights.suppression)
     parser.add_argument("--si-sdr", type=float, default=LossWeights.si_sdr)
+    parser.add_argument("--start", type=Path, metavar="CHECKPOINT", help="weights to begin with")
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--full-precision", action="store_true", help="float32 instead of bfloat16 in the forward pass")
     parser.add_argument("--smoke", action="store_true", help="make a few seconds of data in --data and --validation and take four steps")
     options = parser.parse_args()
-    if options.smoke:
-        smoke(options)
-    train(options)
+    try:
+        if options.smoke:
+            smoke(options)
+        train(options)
+    except (EdgefilterError, OSError) as error:
+        print(f"train: {error}", file=sys.stderr)
+        return 1
+    return 0
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

@@ -50,6 +50,14 @@ def test_batches_are_consistent_after_augmentation(data):
     assert torch.allclose(batch["mic"] - batch["error"], batch["echo"], atol=1e-4)
 
 
+def test_a_silent_robot_leaves_the_human_in_the_microphone(data, monkeypatch):
+    monkeypatch.setattr("export.crops.ROBOT_SILENT", 1.0)
+    batch = Batches(Items(data), StftConfig(), 4, 1.0, seed=1).draw()
+    assert not batch["reference"].any() and not batch["echo"].any()
+    noise = (batch["mic"] - batch["clean"]).square().mean()
+    assert 0 < noise < 1e-2 * batch["clean"].square().amax()
+
+
 def spectra(frames=9, seed=0):
     generator = torch.Generator().manual_seed(seed)
     return [0.1 * torch.randn(1, frames, 33, 2, generator=generator) for _ in range(4)]
@@ -136,6 +144,21 @@ def test_training_runs_stops_and_goes_on(tmp_path, monkeypatch, capsys):
     train.main()
     assert "from step 4" in capsys.readouterr().out
     assert list((tmp_path / "run").glob("events.*"))
+
+
+def test_training_starts_from_given_weights_of_the_same_shape(tmp_path, monkeypatch, capsys):
+    def run(name, hidden, *more):
+        folders = ["--data", str(tmp_path / "d"), "--validation", str(tmp_path / "v"), "--output", str(tmp_path / name)]
+        monkeypatch.setattr("sys.argv", ["train", *folders, "--hop", "32", "--channels", "4", "4", "4", "4", "--hidden", hidden, "--smoke", *more])
+        return train.main()
+
+    assert run("first", "8") == 0
+    first = torch.load(tmp_path / "first" / "best.pt", weights_only=False)["network"]
+    assert run("second", "8", "--start", str(tmp_path / "first" / "best.pt"), "--rate", "0", "--seed", "5") == 0
+    second = torch.load(tmp_path / "second" / "best.pt", weights_only=False)["network"]
+    assert all(torch.allclose(first[name], second[name], atol=1e-4) for name in first)
+    assert run("third", "12", "--start", str(tmp_path / "first" / "best.pt")) == 1
+    assert "hidden=12" in capsys.readouterr().err
 
 
 def test_the_papers_network_trains_too(tmp_path, monkeypatch):
