@@ -30,8 +30,10 @@ from export.network import EdgeConfig
 from export.onnx_export import load
 from export.tasks import TASKS, Task
 
-AVERAGE = 0.998
-"""Weight of the past in the averaged weights, per step."""
+WARM_UP = 300
+"""Steps over which the learning rate rises, at most; a tenth of a short training."""
+AVERAGED = 500
+"""Steps over which weights are averaged, at most; a short training averages over its last 25th."""
 PATIENCE = 12
 """Validations without a better score before training stops."""
 
@@ -93,7 +95,7 @@ def train(options: argparse.Namespace) -> Path:
     with SummaryWriter(options.output) as board, (options.output / "log.jsonl").open("a", encoding="utf-8") as log:
         for step in (progress := tqdm(range(step, options.steps), initial=step, total=options.steps, unit="step")):
             for group in optimiser.param_groups:
-                group["lr"] = options.rate * min(1.0, (step + 1) / 300) * (0.5 + 0.5 * math.cos(math.pi * step / options.steps)) + 1e-6
+                group["lr"] = options.rate * min(1.0, (step + 1) / min(WARM_UP, options.steps / 10)) * (0.5 + 0.5 * math.cos(math.pi * step / options.steps)) + 1e-6
             terms, _ = task.loss(network, on(device, batches.draw()))
             optimiser.zero_grad(set_to_none=True)
             terms["total"].backward()
@@ -101,7 +103,7 @@ def train(options: argparse.Namespace) -> Path:
             norm = torch.nn.utils.clip_grad_norm_(network.parameters(), 1.0)
             if torch.isfinite(norm):
                 optimiser.step()
-            keep = min(AVERAGE, (step + 1) / (step + 10))
+            keep = min(1 - 1 / min(AVERAGED, max(2.0, options.steps / 25)), (step + 1) / (step + 10))
             for name, value in network.state_dict().items():
                 if value.dtype.is_floating_point:
                     average[name].mul_(keep).add_(value, alpha=1 - keep)
