@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import fft
 
+from edgefilter import fourier
 from edgefilter.errors import SignalError
 from edgefilter.types import SAMPLE_RATE, Samples
 
@@ -99,7 +99,9 @@ class Canceller:
         products = PRODUCT_PARTITIONS * (self._channels - 1)
         shape = (self.partitions + products, bins)
         self._weights = np.zeros(shape, np.complex64)
-        self._weights[: self.partitions] = fft.rfft(self._initial.reshape(self.partitions, hop), 2 * hop)
+        self._blocks = np.zeros((shape[0], 2 * hop), np.float32)
+        self._blocks[: self.partitions, :hop] = self._initial.reshape(self.partitions, hop)
+        fourier.rfft(self._blocks, out=self._weights)
         product_doubt = np.broadcast_to(PRODUCT_DOUBT * self._path_power(), (products, bins))
         self._doubt = np.concatenate((self._prior(), product_doubt)).astype(np.float32)
         self._ageing = (1.0 - TRANSITION**2) * self._doubt
@@ -113,21 +115,21 @@ class Canceller:
         self._padded = np.zeros(2 * hop, np.float32)
         self._hops = self._active = self._phantoms = 0
         self._fade = self.gain = 1.0
-        self._correlation = np.zeros(3)
+        self._correlation = 0.0, 0.0, 0.0
 
     def step(self, mic: Samples, reference: Samples) -> CancellerOutput:
         """Cancel one hop: mic, reference (hop,) float32, neither written to."""
         self._push(reference)
         np.multiply(self._weights, self._spectra, out=self._work)
-        predicted = self._work.sum(axis=0)
+        predicted = np.add.reduce(self._work, axis=0)
         np.multiply(self._doubt, self._powers, out=self._expected)
-        misalignment = self._expected.sum(axis=0)
-        echo = fft.irfft(predicted, 2 * self.hop)[self.hop :].astype(np.float32, copy=False)
+        misalignment = np.add.reduce(self._expected, axis=0)
+        echo = fourier.irfft(predicted, 2 * self.hop)[self.hop :]
         echo = self._follow_gain(mic, echo)
         echo, phantom = self._without_phantom(mic, echo)
         error = mic - echo
         self._padded[self.hop :] = error
-        error_spectrum = fft.rfft(self._padded)
+        error_spectrum = fourier.rfft(self._padded)
         observed = _power(error_spectrum)
         self._noise *= NOISE_MEMORY
         self._noise += (1.0 - NOISE_MEMORY) * np.maximum(observed - 0.5 * OWN_SHARE * misalignment, 0.05 * observed)
@@ -139,8 +141,8 @@ class Canceller:
 
     def _follow_gain(self, mic: Samples, echo: Samples) -> Samples:
         """The echo, and the whole path with it, rescaled where one factor explains much of the error: someone turned the volume."""
-        found = np.array((np.dot(mic, mic), np.dot(mic, echo), np.dot(echo, echo)), float)
-        self._correlation = GAIN_MEMORY * self._correlation + (1.0 - GAIN_MEMORY) * found
+        found = float(np.dot(mic, mic)), float(np.dot(mic, echo)), float(np.dot(echo, echo))
+        self._correlation = tuple(GAIN_MEMORY * old + (1.0 - GAIN_MEMORY) * new for old, new in zip(self._correlation, found))
         mic_power, cross, echo_power = self._correlation
         if cross <= 0.0 or echo_power <= SILENCE * self.hop:
             return echo
@@ -148,7 +150,7 @@ class Canceller:
         error = mic_power - 2.0 * cross + echo_power
         if error <= GAIN_EXCESS * (mic_power - cross * factor) or not 0.5 < factor < 2.0:
             return echo
-        self._correlation[:] = 0.0
+        self._correlation = 0.0, 0.0, 0.0
         self._weights *= np.float32(factor)
         self.gain *= factor
         return echo * np.float32(factor)
@@ -171,8 +173,10 @@ class Canceller:
         self._recent[:, : self.hop] = self._recent[:, self.hop :]
         self._recent[0, self.hop :] = reference
         if self.nonlinear:
-            self._recent[1:, self.hop :] = self._products(reference)
-        fresh = fft.rfft(self._recent, axis=1)
+            moved = self._displacement(reference)
+            first = np.multiply(moved, reference, out=self._recent[1, self.hop :])
+            np.multiply(moved, first, out=self._recent[2, self.hop :])
+        fresh = fourier.rfft(self._recent)
         self._spectra, self._older_spectra = self._older_spectra, self._spectra
         self._powers, self._older_powers = self._older_powers, self._powers
         self._spectra[1:] = self._older_spectra[:-1]
@@ -180,26 +184,24 @@ class Canceller:
         self._spectra[self._first] = fresh
         self._powers[self._first] = _power(fresh)
 
-    def _products(self, reference: Samples) -> np.ndarray:
-        """(2, n) of the next n samples of the reference; carries the membrane's state on."""
+    def _displacement(self, reference: Samples) -> Samples:
+        """(n,) of the membrane while it plays the next n samples of the reference; carries its state on."""
         moving = np.concatenate((self._moving, reference))
         self._moving = moving[reference.size :]
-        moved = np.convolve(moving, self._lowpass, "valid")
-        first = moved * reference
-        return np.stack((first, moved * first))
+        return np.convolve(moving, self._lowpass, "valid")
 
     def _adapt(self, error_spectrum: np.ndarray, divisor: np.ndarray) -> None:
         """Kalman correction of weights and covariance, Enzner & Vary (2006), eq. (30)-(34)."""
-        np.conjugate(self._spectra, out=self._work)
-        self._work *= self._doubt
-        self._work *= error_spectrum * divisor
-        taps = fft.irfft(self._work, 2 * self.hop, axis=1)
-        taps[:, self.hop :] = 0.0  # each partition keeps to hop taps (Shynk 1992)
-        self._weights += fft.rfft(taps, axis=1)
-        self._expected *= -0.5 * divisor
-        self._expected += 1.0
-        self._doubt *= self._expected
-        self._doubt *= np.float32(TRANSITION**2)
+        work, blocks, expected = self._work, self._blocks, self._expected
+        np.conjugate(self._spectra, out=work)
+        work *= self._doubt
+        work *= error_spectrum * divisor
+        fourier.irfft(work, 2 * self.hop, out=blocks)
+        blocks[:, self.hop :] = 0.0  # each partition keeps to hop taps (Shynk 1992)
+        self._weights += fourier.rfft(blocks, out=work)
+        expected *= (-0.5 * TRANSITION**2) * divisor
+        expected += TRANSITION**2
+        self._doubt *= expected
         self._doubt += self._ageing
 
     def _path_power(self) -> np.ndarray:
@@ -216,7 +218,7 @@ class Canceller:
 
     def impulse_response(self) -> Samples:
         """The adapted path (taps,) float32, to be written back into a profile."""
-        return fft.irfft(self._weights[: self.partitions], axis=1)[:, : self.hop].reshape(-1).astype(np.float32)
+        return fourier.irfft(self._weights[: self.partitions], 2 * self.hop)[:, : self.hop].reshape(-1)
 
     def rewrite_reference(self, history: Samples) -> None:
         """Replace the past of the reference after a realignment.
@@ -233,11 +235,12 @@ class Canceller:
         channels = [past]
         if self.nonlinear:
             self._moving = np.zeros(DISPLACEMENT_TAPS - 1, np.float32)
-            channels += list(self._products(past))
+            moved = self._displacement(past)
+            channels += [moved * past, moved * moved * past]
         for first, channel in zip(self._first, channels, strict=True):
             count = PRODUCT_PARTITIONS if first else self.partitions
             blocks = np.lib.stride_tricks.sliding_window_view(channel, 2 * self.hop)[:: self.hop][::-1]
-            self._spectra[first : first + count] = fft.rfft(blocks[:count], axis=1)
+            self._spectra[first : first + count] = fourier.rfft(np.ascontiguousarray(blocks[:count]))
         self._powers[:] = _power(self._spectra)
         self._recent[:] = [channel[-2 * self.hop :] for channel in channels]
 
@@ -251,7 +254,7 @@ def _butterworth(corner_hz: float, taps: int) -> Samples:
     k = np.tan(np.pi * corner_hz / SAMPLE_RATE)
     z = np.exp(-2j * np.pi * np.arange(8 * taps // 2 + 1) / (8 * taps))
     response = k**2 * (1 + z) ** 2 / (k**2 * (1 + z) ** 2 + np.sqrt(2) * k * (1 - z**2) + (1 - z) ** 2)
-    return (fft.irfft(response)[:taps] / DISPLACEMENT_SCALE).astype(np.float32)
+    return (fourier.irfft(response, 8 * taps)[:taps] / DISPLACEMENT_SCALE).astype(np.float32)
 
 
 def _power(spectrum: np.ndarray) -> np.ndarray:

@@ -52,10 +52,10 @@ class Front:
         aligned = self.aligner.step(mic, ref) if self.aligner else None
         reference = aligned.reference if aligned else ref
         if not self.canceller:
-            x, r = self._analyser.push(np.stack((mic, reference)))
+            x, r = self._analyser.push(mic, reference)
             return Frame(x, r, self._silence, x, self._fan, self._nothing), aligned
         linear = self._subtract(mic, aligned)
-        x, r, e, error = self._analyser.push(np.stack((mic, reference, linear.echo, linear.error)))
+        x, r, e, error = self._analyser.push(mic, reference, linear.echo, linear.error)
         noise, residual = self.residual.step(e, error, linear.uncertainty)
         return Frame(x, r, e, error, noise, residual), aligned
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.ndimage import uniform_filter1d
 
 from edgefilter.stft import StftConfig
 from edgefilter.types import Samples, Spectrum
@@ -50,7 +49,7 @@ class Residual:
 
     def __init__(self, stft: StftConfig, profile: Profile | None = None) -> None:
         self._bins = stft.bins
-        self._width = max(1, round(SPREAD_HZ / stft.frequencies[1]))
+        self._spread = MovingMean(stft.bins, max(1, round(SPREAD_HZ / stft.frequencies[1])))
         self._fan = profile.noise_bins(stft) if profile is not None else None
         self.reset()
 
@@ -66,21 +65,45 @@ class Residual:
 
         echo, error: (bins,) of the frame. uncertainty: (bins,), CancellerOutput.uncertainty of the frame's last hop.
         """
-        self._echo = np.maximum(power(echo), TAIL_DECAY * self._echo)
-        spread = uniform_filter1d(self._echo, self._width, mode="nearest")
+        self._echo *= TAIL_DECAY
+        np.maximum(power(echo), self._echo, out=self._echo)
+        left = power(error)
         if self._fan is None:
-            self._smooth = 0.8 * self._smooth + 0.2 * power(error)
-            self._noise = np.clip(self._smooth, FAN_FALL * self._noise, FAN_RISE * self._noise)
-        echo = self._echo + SPREAD * spread
+            self._smooth = 0.8 * self._smooth + 0.2 * left
+            self._noise = np.minimum(np.maximum(self._smooth, FAN_FALL * self._noise), FAN_RISE * self._noise)
+        brought = self._spread(self._echo)
+        brought *= SPREAD
+        brought += self._echo
         doubt = DOUBT * uncertainty
-        self._track(float(power(error).sum() - self._noise.sum() - doubt.sum()), float(echo.sum()))
-        return self._noise, np.float32(self._leakage) * echo + doubt
+        fan = float(np.add.reduce(self._noise))
+        self._track(float(np.add.reduce(left)) - fan - float(np.add.reduce(doubt)), float(np.add.reduce(brought)), fan)
+        brought *= np.float32(self._leakage)
+        brought += doubt
+        return self._noise, brought
 
-    def _track(self, left: float, brought: float) -> None:
+    def _track(self, left: float, brought: float, fan: float) -> None:
         """Follow the least part of the echo that stays, from the power left beyond fan and doubt and the echo's power, while it is loud."""
-        if brought < AUDIBLE * float(self._noise.sum()):
+        if brought < AUDIBLE * fan:
             return
         self._left += (1.0 - LEAKAGE_MEMORY) * (left - self._left)
         self._brought += (1.0 - LEAKAGE_MEMORY) * (brought - self._brought)
         change = MARGIN * max(self._left, 0.0) / self._brought / self._leakage
-        self._leakage = float(np.clip(self._leakage * np.clip(change, LEAKAGE_FALL, LEAKAGE_RISE), LEAST, MOST))
+        change = min(max(change, LEAKAGE_FALL), LEAKAGE_RISE)
+        self._leakage = min(max(self._leakage * change, LEAST), MOST)
+
+
+class MovingMean:
+    """Mean over width neighbours, half of them before; beyond the ends the end counts on: scipy.ndimage.uniform_filter1d in plain numpy."""
+
+    def __init__(self, size: int, width: int) -> None:
+        self._size, self._width, self._before = size, width, width // 2
+        self._padded = np.zeros(size + width, np.float64)
+
+    def __call__(self, x: Samples) -> Samples:
+        """x (size,) to its means (size,) float32; neither is kept."""
+        padded, start = self._padded, self._before + 1
+        padded[1:start] = x[0]
+        padded[start : start + self._size] = x
+        padded[start + self._size :] = x[-1]
+        sums = np.add.accumulate(padded)
+        return ((sums[self._width :] - sums[: -self._width]) / self._width).astype(np.float32)

@@ -44,6 +44,7 @@ class Stepping:
         self.missed = self.over_budget = self.steps = 0
         self.behind_ms = self.most_behind_ms = 0.0
         self._recent: deque[bool] = deque(maxlen=self._hops(WINDOW_S))
+        self._late = 0
         self._calm_hops = self._calm_late = 0
         self._patience_s = PATIENCE_S
         self._since_up: int | None = None
@@ -60,12 +61,13 @@ class Stepping:
         self.over_budget += late
         self.behind_ms = max(0.0, self.behind_ms + ms - self.hop_ms)
         self.most_behind_ms = max(self.most_behind_ms, self.behind_ms)
+        self._late += late - (self._recent[0] if len(self._recent) == self._recent.maxlen else 0)
         self._recent.append(late)
         self._calm_hops += 1
         self._calm_late += late
         if self._since_up is not None:
             self._since_up += 1
-        if sum(self._recent) >= OVERLOADED * self._recent.maxlen:
+        if self._late >= OVERLOADED * self._recent.maxlen:
             return self._down()
         return self._up()
 
@@ -79,8 +81,9 @@ class Stepping:
         return max(1, round(1000 * seconds / self.hop_ms))
 
     def _down(self) -> tuple[str, str] | None:
-        why = f"{sum(self._recent)} of the last {len(self._recent)} hops took more than {self.budget_ms:.1f} ms"
+        why = f"{self._late} of the last {len(self._recent)} hops took more than {self.budget_ms:.1f} ms"
         self._recent.clear()
+        self._late = 0
         self._calm_hops = self._calm_late = 0
         if self.ladder is None or self.ladder.wanted == len(self.ladder.rungs) - 1:
             first, self._told = not self._told, True

@@ -8,6 +8,7 @@ from functools import cached_property
 import numpy as np
 from scipy import fft
 
+from edgefilter import fourier
 from edgefilter.errors import StftError
 from edgefilter.types import SAMPLE_RATE, Array, Samples, Spectrum
 
@@ -80,10 +81,6 @@ class StftConfig:
         """Spectrum (..., bins) complex64 of window_samples (..., window_length)."""
         return fft.rfft(window_samples * self.analysis_window, self.n_fft)
 
-    def synthesise(self, spectrum: Spectrum) -> Samples:
-        """Weighted samples (window_length,) float32 of one spectrum (bins,), ready to be overlapped and added."""
-        return fft.irfft(spectrum, self.n_fft)[: self.window_length] * self.synthesis_window
-
     def noise_gain(self) -> float:
         """Expected |spectrum|^2 of white noise of unit variance: the sum of the squared window."""
         return float(np.sum(self._window64**2))
@@ -95,13 +92,17 @@ class Analyser:
     def __init__(self, config: StftConfig, channels: int = 1) -> None:
         self.config = config
         self._recent = np.zeros((channels, config.window_length), np.float32)
+        self._padded = np.zeros((channels, config.n_fft), np.float32)
+        self._windowed, self._window = self._padded[:, : config.window_length], config.analysis_window
 
-    def push(self, hop_samples: Samples) -> Spectrum:
-        """Take the next hop of samples (channels, hop); return the frame that ends with them, (channels, bins) complex64."""
-        hop = self.config.hop
-        self._recent[:, :-hop] = self._recent[:, hop:]
-        self._recent[:, -hop:] = hop_samples
-        return self.config.analyse(self._recent)
+    def push(self, *hop_samples: Samples) -> Spectrum:
+        """Take the next hop of samples (hop,) of each channel; return the frame that ends with them, (channels, bins) complex64."""
+        recent, hop = self._recent, self.config.hop
+        recent[:, :-hop] = recent[:, hop:]
+        for channel, samples in zip(recent, hop_samples, strict=True):
+            channel[-hop:] = samples
+        np.multiply(recent, self._window, out=self._windowed)
+        return fourier.rfft(self._padded)
 
 
 class Synthesiser:
@@ -110,12 +111,16 @@ class Synthesiser:
     def __init__(self, config: StftConfig) -> None:
         self.config = config
         self._sum = np.zeros(config.window_length, np.float32)
+        self._frame = np.zeros(config.n_fft, np.float32)
+        self._weighted, self._window = self._frame[: config.window_length], config.synthesis_window
 
     def push(self, spectrum: Spectrum) -> Samples:
-        """Add one frame (bins,) and return the (hop,) samples that no later frame will change."""
-        hop = self.config.hop
-        self._sum += self.config.synthesise(spectrum)
-        done = self._sum[:hop].copy()
-        self._sum[:-hop] = self._sum[hop:]
-        self._sum[-hop:] = 0.0
+        """Add one frame (bins,) complex64 and return the (hop,) samples that no later frame will change."""
+        total, hop = self._sum, self.config.hop
+        fourier.irfft(np.asarray(spectrum, np.complex64), self.config.n_fft, out=self._frame)
+        self._weighted *= self._window
+        total += self._weighted
+        done = total[:hop].copy()
+        total[:-hop] = total[hop:]
+        total[-hop:] = 0.0
         return done

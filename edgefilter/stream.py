@@ -86,6 +86,9 @@ class Stream:
         hop = self.engine.stft.hop
         done: list[Samples] = []
         for at in range(0, mic.size, hop):
+            if mic.size - at >= hop and not len(self._mic):
+                done.append(self._watched_step(mic[at : at + hop].copy(), ref[at : at + hop].copy()))
+                continue
             self._mic.write(mic[at : at + hop])
             self._ref.write(ref[at : at + hop])
             if len(self._mic) >= hop:
@@ -94,7 +97,9 @@ class Stream:
 
     def _finish(self, done: list[Samples]) -> Samples:
         """What of the synthesised hops belongs to samples that came in, and not to the silence before them."""
-        out = np.concatenate(done) if done else np.zeros(0, np.float32)
+        if not done:
+            return np.zeros(0, np.float32)
+        out = done[0] if len(done) == 1 else np.concatenate(done)
         early = min(self._before_start, out.size)
         self._before_start -= early
         self.samples_out += out.size - early

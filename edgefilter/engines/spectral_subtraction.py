@@ -25,7 +25,7 @@ class MaskState:
 
 
 class SpectralSubtraction:
-    """Wiener gain xi / (1 + xi) with the decision-directed a-priori ratio xi of Ephraim & Malah (1984), eq. (51)."""
+    """Wiener gain xi / (1 + xi) with the decision-directed a-priori ratio xi of Ephraim & Malah (1984), eq. (51); xi = wanted / unwanted."""
 
     name: ClassVar[str] = "ss"
     front: ClassVar[Front] = "full"
@@ -40,6 +40,6 @@ class SpectralSubtraction:
     def step(self, frame: Frame, state: MaskState) -> tuple[Output, MaskState]:
         unwanted = frame.noise_psd + frame.residual_psd + 1e-12
         observed = frame.error.real**2 + frame.error.imag**2
-        ratio = MEMORY * state.answered / unwanted + (1.0 - MEMORY) * np.maximum(observed / unwanted - 1.0, 0.0)
-        gain = np.maximum(ratio / (1.0 + ratio), FLOOR).astype(np.float32)
-        return Output(gain * frame.error), MaskState(gain**2 * observed)
+        wanted = MEMORY * state.answered + (1.0 - MEMORY) * np.maximum(observed - unwanted, 0.0)
+        gain = np.maximum(wanted / (wanted + unwanted), FLOOR)
+        return Output(gain * frame.error), MaskState(gain * gain * observed)

@@ -19,7 +19,7 @@ LEAVES = {
 }
 LAYERS = [
     {"types", "errors", "timing", "budget_cache"},
-    {"stft", "ring", "metrics"},
+    {"fourier", "stft", "ring", "metrics"},
     {"echo"},
     {"profile", "profile_file", "profile_text", "delay_line", "utterances"},
     {"announced"},
