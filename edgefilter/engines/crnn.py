@@ -29,7 +29,7 @@ class Crnn:
     """Runs an exported EdgeCrnn (export/network.py), one frame at a time.
 
     model: an ONNX file made by export/onnx_export.py; without one the file that the environment variable EDGEFILTER_CRNN names, else
-    the package's own. The file says which STFT it was trained for. wiener_share: 0 is the network alone, 1 the Wiener mask.
+    the package's own, whose recurrent layer has int8 weights: a hop finds them cold, and reads a quarter of the bytes. The file says which STFT it was trained for. wiener_share: 0 is the network alone, 1 the Wiener mask.
     Raises ModelError for a file that is not such a model.
     """
 
@@ -37,7 +37,7 @@ class Crnn:
     front: ClassVar[Front] = "full"
 
     def __init__(self, model: str | Path | None = None, wiener_share: float = WIENER_SHARE) -> None:
-        path = find_model(model, VARIABLE, "crnn.onnx", "make one with 'python -m export.onnx_export'")
+        path = find_model(model, VARIABLE, "crnn_int8.onnx", "make one with 'python -m export.onnx_export --int8'")
         self.model = open_model(path, EDGE_TYPE, EDGE_VERSION)
         self.stft = self.model.stft
         self.lookahead = 0

@@ -154,6 +154,14 @@ def test_parity_compares_the_state_too(exported):
         onnx_parity.edge(network, exported[1], frames=1)
 
 
+def test_an_int8_variant_that_is_too_far_away_is_not_written(exported, monkeypatch, tmp_path):
+    monkeypatch.setattr(onnx_parity, "FRAMES", 50)
+    monkeypatch.setattr(onnx_parity, "LEAST_DB", 100.0)
+    with pytest.raises(ModelError, match="expected at least 100 dB: not written"):
+        export(Trained(exported[0]), tmp_path / "crnn.onnx", int8=True)
+    assert [path.name for path in tmp_path.iterdir()] == ["crnn.onnx"]
+
+
 def test_a_failed_export_leaves_the_old_file(exported, tmp_path, monkeypatch):
     path = tmp_path / "crnn.onnx"
     path.write_text("old")

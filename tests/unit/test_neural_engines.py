@@ -116,16 +116,22 @@ def test_a_file_that_is_no_model_is_refused(tmp_path):
 
 def test_the_model_comes_from_the_option_then_the_variable_then_the_package(tmp_path, monkeypatch):
     monkeypatch.setattr(onnx_session, "FOLDERS", (tmp_path / "models", tmp_path))
-    with pytest.raises(ModelError, match="no crnn.onnx.*--model or EDGEFILTER_CRNN"):
+    with pytest.raises(ModelError, match="no crnn_int8.onnx.*--model or EDGEFILTER_CRNN"):
         Crnn()
-    (tmp_path / "crnn.onnx").write_bytes(EDGE.read_bytes())
-    assert Crnn().model.path == tmp_path / "crnn.onnx"
+    (tmp_path / "crnn_int8.onnx").write_bytes(EDGE.read_bytes())
+    assert Crnn().model.path == tmp_path / "crnn_int8.onnx"
     monkeypatch.setenv("EDGEFILTER_CRNN", str(EDGE))
     assert Crnn().model.path == EDGE
-    assert Crnn(tmp_path / "crnn.onnx").model.path == tmp_path / "crnn.onnx"
+    assert Crnn(tmp_path / "crnn_int8.onnx").model.path == tmp_path / "crnn_int8.onnx"
     monkeypatch.setenv("EDGEFILTER_CRNN", str(tmp_path / "gone.onnx"))
     with pytest.raises(ModelError, match="gone.onnx, which EDGEFILTER_CRNN names, is no file"):
         Crnn()
+
+
+def test_the_packages_int8_file_is_of_the_same_training_as_the_exact_one():
+    exact, used = Crnn(Path(__file__).parents[2] / "models/crnn.onnx").model, Crnn().model
+    assert used.path.name == "crnn_int8.onnx"
+    assert (used.training, used.figures, used.states, used.stft) == (exact.training, exact.figures, exact.states, exact.stft)
 
 
 def test_a_model_for_an_engine_without_one_is_a_mistake():
