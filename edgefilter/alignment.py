@@ -8,8 +8,9 @@ import numpy as np
 
 from edgefilter.announced import AHEAD, Announcements
 from edgefilter.delay_line import HALF_WIDTH, Aligned, Tape, read_delayed, read_line
-from edgefilter.delay_tracker import STRIDE, DelayMeter, DriftFilter, Measurement
+from edgefilter.delay_tracker import REACH, STRIDE, DelayMeter, DriftFilter, Measurement
 from edgefilter.echo.model import PRE_ROLL
+from edgefilter.jumps import JumpWitness
 from edgefilter.lag_search import BETWEEN, MINIMUM, WINDOW, Candidate, LagSearch
 from edgefilter.profile import Profile
 from edgefilter.types import SAMPLE_RATE, Samples
@@ -26,11 +27,9 @@ SEEN = 5.0
 well; then CERTAIN_EARLY is enough. True lags have 10 there, chance 3.3."""
 HEARD = 6.0
 """Strength of the tracker's peak over the rms of +-REACH lags from which a measurement counts."""
-FAR, EDGE = 8.0, 960.0
-"""The same for jumps of more than 8 samples, and the longest that is believed: the robot's words against a human's made peaks
-of up to 9, but only at the very edge of the tracker's reach."""
-STRANGE = 10.0
-"""Power over what the robot brings above which it is not the robot that is heard, so that no jump can be seen."""
+FAINT, STRANGE, EDGE = 0.25, 10.0, 64
+"""Power over what the robot brings below which and above which it is not the robot that is heard, so that no jump can be seen, and
+samples at the edge of the looks' reach at which none is believed."""
 LOST_BLOCKS, NEARBY, NEARBY_SEARCHES = 3, 4096, 10
 """Measurements in speech without a credible peak after which all lags are searched again: at first as if the present delay had ceased
 NEARBY samples ago, which finds jumps of up to 200 ms, then as if the utterance had begun half a second before."""
@@ -71,7 +70,7 @@ class Aligner:
         self._open: deque[Utterance] = deque(maxlen=32)
         self._announced, self._expected = Announcements(), None
         self._found: Candidate | None = None
-        self._suspect: float | None = None
+        self._witness, self._segments = JumpWitness(), 0
         self._to_search, self._to_measure, self._stage = SEARCH_STRIDE, STRIDE // 2, 0
         self._read_at = float("nan")
         self._gain: float | None = None
@@ -120,8 +119,7 @@ class Aligner:
 
     def stats(self) -> dict[str, object]:
         """Delay, drift, confidence, state and what happened so far, ready for JSON."""
-        deviation = float(np.sqrt(self._drift.covariance[0, 0]))
-        delay, deviation = (round(self._drift.delay, 3), round(deviation, 3)) if self._known else (None, None)
+        delay, deviation = (round(self._drift.delay, 3), round(self._drift.deviation, 3)) if self._known else (None, None)
         found = {"method": "tracking", "state": self._state(), "delay_samples": delay, "deviation_samples": deviation, **self._counts}
         return {**found, "ppm": round(-1e6 * self._drift.slope, 2), "confidence": round(self._confidence, 3)}
 
@@ -157,7 +155,8 @@ class Aligner:
         now, stage, self._stage = self._ref.end, self._stage, 0
         if stage == 0:
             self._expected = None if self._open else self._announced.expected(now)
-            if not self._open and self._expected is None:
+            too_soon = self._open and now + 2 * self.hop - self._open[0].start < MINIMUM and not self._open[0].nearby
+            if too_soon or (not self._open and self._expected is None):
                 return False
             self._to_search, self._stage = SEARCH_STRIDE, 1
             self._counts["searches"] += 1
@@ -208,7 +207,8 @@ class Aligner:
     def _switch(self, delay: float, deviation: float) -> bool:
         self._drift.restart(delay, deviation)
         self._counts["realignments"] += 1
-        self._suspect, self._lost, self._refuted = None, 0, False
+        self._lost, self._refuted = 0, False
+        self._witness.forget()
         self._to_measure = min(self._to_measure, 2 * self.hop)
         return True
 
@@ -217,12 +217,14 @@ class Aligner:
         self._to_measure -= self.hop
         self._measured = self._to_measure <= 0
         if not self._measured:
+            self._meter.learn()
             return False
         self._to_measure = STRIDE
         heard_end = self._ref.end - self._drift.delay
         if self._onsets.current is None or heard_end - STRIDE > self._onsets.current.end:
             return False
-        found = self._meter.measure(self._mic, self._ref, self._ref.end, self._drift.delay, self._drift.slope)
+        self._segments = 1 if self._lost or (self._open and self._open[0].nearby) else 0
+        found = self._meter.measure(self._mic, self._ref, self._ref.end, self._drift.delay, self._drift.slope, self._segments)
         return found is not None and self._judge(found)
 
     def _judge(self, found: Measurement) -> bool:
@@ -232,16 +234,13 @@ class Aligner:
         small = abs(found.offset) < 1.5 or (abs(found.offset) < 8.0 and self._drift.surprise(found) < 3.0)
         if small and (self._drift.surprise(found) < 5.0 or abs(found.offset) < 0.3):
             return self._accept(found)
-        too_loud = self._gain is not None and found.gain > STRANGE * self._gain
-        if too_loud:
+        gain = found.gain if self._gain is None else self._gain
+        if found.gain > STRANGE * gain:
             return False
-        if (abs(found.offset) > 8.0 and found.strength < FAR) or abs(found.offset) > EDGE:
+        if not FAINT < found.gain_there / gain < STRANGE or abs(found.offset) > (2 * self._segments + 1) * REACH - EDGE:
             self._note_loss(found)
             return False
-        suspect, self._suspect = self._suspect, found.offset
-        sure = found.strength > 14.0 and found.dominance > 3.0 and abs(found.offset) > 8.0
-        agrees = suspect is not None and abs(found.offset - suspect) < 0.7
-        if (agrees and (found.dominance > 1.2 or abs(found.offset) < 8.0)) or sure:
+        if self._witness.convinced(found):
             self._counts["jumps"] += 1
             if self._open and self._ref.end - self._drift.delay > self._open[0].start + STRIDE:
                 self._resolve()
@@ -253,8 +252,9 @@ class Aligner:
     def _accept(self, found: Measurement) -> bool:
         step = self._drift.delay
         self._drift.correct(found)
-        self._meter.learn(found.offset)
-        self._suspect, self._lost = None, 0
+        self._meter.confirm(found.offset)
+        self._lost = 0
+        self._witness.forget()
         self._confidence += 0.2 * (found.explained - self._confidence)
         self._gain = found.gain if self._gain is None else self._gain + 0.1 * (min(found.gain, 2 * self._gain) - self._gain)
         was_refuted = self._refuted

@@ -52,20 +52,21 @@ class LagSearch:
     Both spectra are divided by the square root of their smoothed power. response (taps,), if known, is the echo path around
     its direct sound at index pre_roll: its phase is taken out, so that early reflections do not pull the peak. Chance peaks
     grow with the root of the energy that a lag lets overlap, so the correlation is divided by that.
-    `prepare`, `listen` and `find` are one search and cost one transform each, so that they can be spread over three hops.
+    `prepare`, `listen` and `find` are one search and cost one transform each, so that they can be spread over three hops; while
+    the reference to be looked at is short, so are the transforms.
     """
 
     def __init__(self, max_lag: int, response: Samples | None = None, pre_roll: int = 0) -> None:
         self.max_lag = max_lag
-        self._size = COARSE * fft.next_fast_len(-(-(max_lag + WINDOW) // COARSE), real=True)
-        self.span = self._size
+        self.span = self._size = COARSE * fft.next_fast_len(-(-(max_lag + WINDOW) // COARSE), real=True)
         self._signed = response is not None
-        self._phases = {size: _phase(response, pre_roll, size) for size in (self._size, WINDOW + 2 * ASIDE)}
-        self._ends = np.arange(0, self.max_lag, COARSE)
+        self._short = COARSE * fft.next_fast_len(-(-self.span // (2 * COARSE)), real=True)
+        self._phases = {size: _phase(response, pre_roll, size) for size in (self.span, self._short, WINDOW + 2 * ASIDE)}
 
     def prepare(self, ref: Tape | Playback, now: int, since: int) -> None:
         """Take the reference between the positions since and now."""
-        size = self._size
+        self._size = size = self._short if now - since <= self._short - WINDOW else self.span
+        self._reach = min(self.max_lag, size - WINDOW)
         first = max(since - (now - size), 0)
         r = np.zeros(size, np.float32)
         r[first:] = ref.read(now - size + first, now)
@@ -102,11 +103,11 @@ class LagSearch:
         if overlap.max() <= 0.0:
             return None
         correlation = fft.irfft(self._cross, self._size)
-        score = np.concatenate((correlation[self._size - late :], correlation[: self.max_lag - late]))
+        score = np.concatenate((correlation[self._size - late :], correlation[: self._reach - late]))
         if not self._signed:
             np.abs(score, out=score)
-        score *= np.repeat(1.0 / np.sqrt(overlap + 0.1 * overlap.max()), COARSE)[: self.max_lag]
-        usable = np.repeat(overlap > 0.05 * overlap.max(), COARSE)[: self.max_lag]
+        score *= np.repeat(1.0 / np.sqrt(overlap + 0.1 * overlap.max()), COARSE)[: self._reach]
+        usable = np.repeat(overlap > 0.05 * overlap.max(), COARSE)[: self._reach]
         spread = float(np.sqrt(np.dot(score, score * usable) / np.count_nonzero(usable)))
         lag = int(np.argmax(score))
         heard = self._at - self._since - lag
@@ -134,8 +135,9 @@ class LagSearch:
     def _overlap(self, late: int) -> Samples:
         """Energy of the reference, first difference, that falls under the microphone's window, at every COARSE-th lag."""
         last = self._total.size - 1
-        upper = np.clip((self._size + late - self._ends) // COARSE, 0, last)
-        lower = np.clip((self._start + late - self._ends) // COARSE, 0, last)
+        lags = np.arange(0, self._reach, COARSE)
+        upper = np.clip((self._size + late - lags) // COARSE, 0, last)
+        lower = np.clip((self._start + late - lags) // COARSE, 0, last)
         return (self._total[upper] - self._total[lower]).astype(np.float32)
 
 
@@ -150,7 +152,8 @@ def _whitened(spectrum: np.ndarray, floor: float) -> np.ndarray:
     """The spectrum over the root of its smoothed power."""
     width = round(SMOOTHING_HZ * 2 * spectrum.size / SAMPLE_RATE)
     power = uniform_filter1d(spectrum.real**2 + spectrum.imag**2, width, mode="nearest")
-    return spectrum / np.sqrt(power + np.float32(floor * power.max() + 1e-20))
+    power += np.float32(floor * power.max() + 1e-20)
+    return spectrum * (np.float32(1.0) / np.sqrt(power, out=power))
 
 
 def _phase(response: Samples | None, pre_roll: int, size: int) -> np.ndarray | np.complex64:

@@ -1,5 +1,7 @@
 """Alignment: each utterance's lag, drift, jumps, and nothing found where nothing is."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from alignment_scene import HEAD, RATE, fan, hear, known_path, room, run, speech_like, utterances
@@ -7,8 +9,10 @@ from scipy import signal
 
 from edgefilter.alignment import CERTAIN_EARLY, Aligner
 from edgefilter.delay_line import Tape, read_delayed, read_line
+from edgefilter.delay_tracker import Measurement
 from edgefilter.echo.model import PRE_ROLL
 from edgefilter.errors import SignalError
+from edgefilter.jumps import JumpWitness
 from edgefilter.lag_search import LagSearch
 from edgefilter.paper_alignment import PaperAligner, paper_lag
 
@@ -73,7 +77,7 @@ def test_dropped_buffers_are_healed_within_200_ms(jump):
     truth[at:] += jump
     hops = run(Aligner(256, known_path(room(rng, 0.25))), mic + fan(rng, mic.size), ref)
     error = np.abs(delays(hops) - truth[255::256][: len(hops)])
-    limit = 0.2 if abs(jump) <= 1000 else 0.5  # beyond the tracker's reach the loss must first be noticed, then all lags searched
+    limit = 0.2 if abs(jump) <= 1000 else 0.5  # those the tracker only sees once it has noticed the loss
     healed = (at + int(limit * RATE)) // 256
     assert np.all(error[healed : int(6.5 * RATE) // 256] < 1.0)  # a sample: less than the smallest jump
     assert any(a.realigned for a in hops[at // 256 : healed + 1])
@@ -108,6 +112,30 @@ def test_a_human_who_for_a_moment_sounds_like_the_muted_robot_realigns_nothing()
     hops = run(Aligner(256, known_path(room(rng, 0.25))), mic + fan(rng, mic.size), ref)
     assert abs(hops[later // 256].delay - 5000 - HEAD) < 1.0  # the first utterance was heard
     assert not any(a.realigned for a in hops[later // 256 :])
+
+
+def test_a_faint_agreement_while_the_robot_is_muted_is_no_jump():
+    rng = np.random.default_rng(14)
+    ref, _ = utterances(rng, [9], [0.5])
+    mic, _ = hear(ref, [(0, 5000)], room(rng, 0.3))
+    muted, faint = int(4.0 * RATE), 0.03 * np.std(mic) / np.std(ref)
+    mic[muted:] = 0.0
+    for at in range(muted + 4000, ref.size - 3000, 8000):
+        mic[at : at + 3000] = faint * ref[at - 5300 : at - 2300]  # 190 ms of the robot 300 samples late, but 30 dB below its voice
+    hops = run(Aligner(256, known_path(room(rng, 0.25))), mic + fan(rng, mic.size, 1e-4), ref)
+    assert abs(hops[muted // 256].delay - 5000 - HEAD) < 1.0
+    assert not any(a.realigned for a in hops[muted // 256 :])
+
+
+def test_a_missed_look_or_another_suspicion_does_not_undo_a_jump_that_is_seen_again():
+    look = Measurement(100.0, 0.01, 10.0, 1.6, 5.0, 0.5, 1.0, 1.0)
+    other = replace(look, offset=-300.0, strength=8.0, ratio=1.1)
+    witness = JumpWitness()
+    assert not witness.convinced(look) and not witness.convinced(other) and not witness.convinced(replace(look, strength=9.0))
+    assert witness.convinced(look)  # 16 of evidence, faded to 11 by the other look, and two more
+    witness.forget()
+    assert not witness.convinced(look)
+    assert not JumpWitness().convinced(replace(look, offset=5.0)) and JumpWitness().convinced(replace(look, offset=5.0, strength=13.0))
 
 
 def test_no_step_of_a_search_comes_twice_in_a_hop():
