@@ -1,11 +1,12 @@
 """Latency and cost of the whole path, per hop, beside SpeexDSP and WebRTC AEC3; writes JSON, a Markdown page and a picture.
 
-    python bench/latency.py --output bench/results/latency                  (20 minutes; leave the machine alone meanwhile)
+    python bench/latency.py --output bench/results/latency                  (13 minutes; leave the machine alone meanwhile)
     python bench/latency.py --output /tmp/latency --quick                   (a minute, coarse)
 
 Every measurement is a process of its own, held to two cores. Contenders take turns, in reversed order every other round, so that a change of
 the machine's speed meets all of them. Paced: a hop begins when a device would deliver it, the processor idles in between. Busy: each of the two
-cores also runs a process that never rests. The sound is the bundled conversation (simulated robot), from its start in every round.
+cores also runs a process that never rests; such rows are paced and of one thread only. A second thread is allowed to our engines alone: the
+peers have none to use. The sound is the bundled conversation (simulated robot), from its start in every round.
 """
 
 from __future__ import annotations
@@ -100,17 +101,18 @@ def slowest(run: dict, count: int = 10) -> list[dict]:
 
 
 def matrix(names: Sequence[str], seconds: float, rounds: int, threads: Sequence[int], loads: Sequence[bool]) -> list[dict]:
-    """Every contender under every condition, in turns."""
+    """Every contender under every condition, in turns; the peers with one thread, busy cores with one thread and paced."""
     rows = []
     for busy in loads:
-        for count in threads:
-            for paced in (False, True):
+        for count in threads[:1] if busy else threads:
+            for paced in (True,) if busy else (False, True):
                 runs: dict[str, list[dict]] = defaultdict(list)
+                present = [name for name in names if count == 1 or name not in PEERS]
                 with load(busy):
                     for turn in range(rounds):
-                        for name in names if turn % 2 == 0 else names[::-1]:
+                        for name in present if turn % 2 == 0 else present[::-1]:
                             runs[name].append(run_hops(name, seconds, paced, count))
-                for name in names:
+                for name in present:
                     rows.append({"contender": name, "paced": paced, "threads": count, "busy": busy, **summary(runs[name])})
                 print(f"{'busy' if busy else 'idle'}, {count} threads, {'paced' if paced else 'back to back'}: done", file=sys.stderr)
     return rows

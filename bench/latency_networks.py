@@ -1,7 +1,9 @@
 """Edge networks of several sizes with random weights, for the curve of cost over size: what a frame costs does not depend on the weights.
 
     python bench/latency_networks.py --output DIR                           (needs the export extra)
-    python bench/latency.py --models DIR/*.onnx --output bench/results/latency
+    python bench/latency.py --models DIR/*_int8.onnx --output bench/results/latency
+
+Of each there is the fp32 file and the int8 variant, which is what the engine runs.
 """
 
 from __future__ import annotations
@@ -32,7 +34,7 @@ def main() -> None:
     args.output.mkdir(parents=True, exist_ok=True)
     for width in WIDTHS:
         torch.manual_seed(0)
-        print(*export(Trained(EdgeCrnn(widened(width)).eval(), {"data": "none: random weights"}), args.output / f"crnn_{width:g}.onnx"), sep="\n")
+        print(*export(Trained(EdgeCrnn(widened(width)).eval(), {"data": "none: random weights"}), args.output / f"crnn_{width:g}.onnx", int8=True), sep="\n")
 
 
 if __name__ == "__main__":

@@ -18,7 +18,7 @@ def markdown(result: dict, name: str) -> str:
     lines = ["# Latency and cost per hop", "", ", ".join(f"{key} {value}" for key, value in result["machine"].items()), ""]
     lines += [f"{result['rounds']} round(s) of {result['seconds']:g} s of the bundled conversation for each row, contenders in turns, every"]
     lines += ["process held to two cores, warm-up (0.5 s) left out. Paced: a hop begins when a device would deliver it. Busy: a second process on"]
-    lines += ["each core that never rests. Missed: hops that took longer than they last. RTF: compute over audio.", ""]
+    lines += ["each core that never rests; measured paced and with one thread only. Missed: hops that took longer than they last. RTF: compute over audio.", ""]
     lines += [f"{contender} is not in the table: {why}" for contender, why in result["missing"].items()]
     lines += ["", "| | hop ms | load | threads | pace | p50 | p95 | p99 | max, ms per hop | missed | RTF |", "| --- " * 11 + "|"]
     lines += [_row(row) for row in sorted(rows, key=lambda row: (row["busy"], row["threads"], not row["paced"]))]
