@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import threading
+from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar, TypeAlias
 
 import numpy as np
 
 from edgefilter.engines.base import Front
-from edgefilter.engines.onnx_session import expect_slots, find_model, open_model
+from edgefilter.engines.onnx_session import FixedPlaces, expect_slots, find_model, open_model
 from edgefilter.engines.spectral_subtraction import MaskState, SpectralSubtraction
-from edgefilter.types import Frame, Output, Samples
+from edgefilter.types import Frame, Output, Samples, Spectrum
 
 EDGE_TYPE, EDGE_VERSION = "edgefilter-crnn", 1
 SPECTRA = ("error", "mic", "reference", "echo")
@@ -46,15 +48,44 @@ class Crnn:
         spectrum = (1, self.stft.bins, 2)
         outputs = {"spectrum": spectrum, "speech_probability": (1,), **{f"next_{name}": shape for name, shape in states.items()}}
         expect_slots(self.model, {**dict.fromkeys(SPECTRA, spectrum), **states}, outputs)
-        self._outputs = list(outputs)
+        self._own = threading.local()
 
     def initial_state(self) -> CrnnState:
         return tuple(np.zeros(shape, np.float32) for _, shape in self.model.states), self._wiener.initial_state()
 
     def step(self, frame: Frame, state: CrnnState) -> tuple[Output, CrnnState]:
-        inputs = {name: np.ascontiguousarray(getattr(frame, name)).view(np.float32).reshape(1, -1, 2) for name in SPECTRA}
-        inputs.update(zip((name for name, _ in self.model.states), state[0]))
-        spectrum, probability, *following = self.model.session.run(self._outputs, inputs)
+        places = self._places()
+        places.error[:], places.mic[:], places.reference[:], places.echo[:] = frame.error, frame.mic, frame.reference, frame.echo
+        for place, tensor in zip(places.states, state[0]):
+            place[...] = tensor
+        places.slots.run()
+        following = tuple(place.copy() for place in places.next_states)
         masked, mask_state = self._wiener.step(frame, state[1])
-        human = self._share * masked.spectrum + (1 - self._share) * spectrum.reshape(-1).view(np.complex64)
-        return Output(human, float(probability[0])), (tuple(following), mask_state)
+        human = self._share * masked.spectrum + (1 - self._share) * places.spectrum
+        return Output(human, float(places.probability[0])), (following, mask_state)
+
+    def _places(self) -> Places:
+        """This thread's own, since several streams may share the engine."""
+        if not hasattr(self._own, "places"):
+            slots = FixedPlaces(self.model.session)
+            names = [name for name, _ in self.model.states]
+            spectra = (slots.inputs[name].view(np.complex64).reshape(-1) for name in SPECTRA)
+            states, next_states = [slots.inputs[name] for name in names], [slots.outputs[f"next_{name}"] for name in names]
+            spectrum = slots.outputs["spectrum"].view(np.complex64).reshape(-1)
+            self._own.places = Places(slots, *spectra, spectrum, slots.outputs["speech_probability"], states, next_states)
+        return self._own.places
+
+
+@dataclass(frozen=True)
+class Places:
+    """Where one frame's inputs go and its outputs come, spectra (bins,) complex64."""
+
+    slots: FixedPlaces
+    error: Spectrum
+    mic: Spectrum
+    reference: Spectrum
+    echo: Spectrum
+    spectrum: Spectrum
+    probability: Samples
+    states: list[Samples]
+    next_states: list[Samples]

@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import conformance
@@ -50,6 +51,20 @@ def test_crnn_answers_what_onnxruntime_answers_for_the_same_frames():
         np.testing.assert_array_equal(output.spectrum, found[0, :, 0] + 1j * found[0, :, 1])
         assert output.speech_probability == probability[0] and 0 < probability[0] < 1
     assert any(tensor.any() for tensor in state[0])
+
+
+def test_streams_in_several_threads_share_an_engine_without_mixing():
+    engine = Crnn(EDGE)
+    sounds = [conformance.conversation(12000, seed=seed) for seed in range(4)]
+
+    def run(sound: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
+        stream = Stream(engine)
+        return np.concatenate([stream.process(sound[0][at : at + 256], sound[1][at : at + 256]) for at in range(0, 12000, 256)])
+
+    alone = [run(sound) for sound in sounds]
+    with ThreadPoolExecutor(4) as pool:
+        for wanted, found in zip(alone, pool.map(run, sounds)):
+            np.testing.assert_array_equal(found, wanted)
 
 
 def test_the_answer_is_half_the_networks_and_half_the_wiener_masks():
