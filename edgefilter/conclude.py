@@ -49,7 +49,7 @@ def conclude(prepared: Prepared, found: Found, progress: Callable[[str], None] |
         ranking=tuple(_findings(prepared, found, progress)),
         evidence=left_in_words(prepared, found, left, remaining, EXPLAINED_DB),
         remaining_db=remaining,
-        irreducible_db=max(remaining, 0.0) if unpredictable and believed else 0.0,
+        irreducible_db=max(remaining, found.final.irreducible_db, 0.0) if unpredictable and believed else 0.0,
         model=found.model,
     )
 

@@ -76,7 +76,11 @@ def _mic_clipping(v: Values) -> str:
 
 
 def _rattle(v: Values) -> str:
-    return "short bursts at high frequencies follow the moments at which the membrane is driven far"
+    side = {1.0: "outward", -1.0: "inward"}.get(_number(v, "side"), "far")
+    return (
+        f"short bursts, {_number(v, 'rate_hz'):.0f} a second, follow the moments at which the membrane is driven {side}, and not the voice's level; "
+        "what of them no waveform predicts is shown as irreducible"
+    )
 
 
 def _fan_noise(v: Values) -> str:

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
+from scipy.ndimage import uniform_filter1d
 
-from edgefilter.echo.effect import whiten
+from edgefilter.echo.effect import ROUNDING_PSD, whiten
 from edgefilter.echo.least_squares import normal_equations
+from edgefilter.echo.model import EchoModel
 from edgefilter.echo.wiener import convolve_from
 from edgefilter.prepare import Prepared
 from edgefilter.types import SAMPLE_RATE, Array, Samples
@@ -24,6 +27,7 @@ class Verdict:
     """Of one prediction. level_db: mean over time-frequency cells of the residual's dB over the fan, each cell by its degrees of freedom.
 
     excess_db: mean power of the held-out whitened residual, dB. active_db, silent_db: while the robot is heard, and is not.
+    What a model says that no waveform predicts counts as fan in these; irreducible_db: the excess over the fan alone then, else 0.
     cells: (times, bands) power over the fan. prediction: (n,) with the ordinary tolerances taken up.
     """
 
@@ -31,6 +35,7 @@ class Verdict:
     excess_db: float
     active_db: float
     silent_db: float
+    irreducible_db: float
     cells: Array = field(repr=False)
     prediction: Samples = field(repr=False)
 
@@ -71,22 +76,51 @@ class Judge:
         ratio = power.mean(axis=1) / self._expected
         return np.add.reduceat(ratio[:, : self._edges[-1]], self._edges[:-1], axis=1) / self.freedom
 
-    def judge(self, prediction: Samples, correct: bool = True) -> Verdict:
-        """The verdict on a prediction (n,), by default with the ordinary tolerances taken up first."""
+    def of(self, model: EchoModel) -> Verdict:
+        """The verdict on a model: on what it predicts, with what it says that no waveform predicts counted as fan."""
+        reference = self.prepared.measurement.reference
+        return self.judge(model.predict(reference), unpredictable=model.unpredictable(reference))
+
+    def judge(self, prediction: Samples, correct: bool = True, unpredictable: Sequence[tuple[Samples, Array]] = ()) -> Verdict:
+        """The verdict on a prediction (n,), by default with the ordinary tolerances taken up first.
+
+        unpredictable: as EchoModel.unpredictable gives it, noise that is expected on top of the fan.
+        """
         corrected = self.correct(prediction) if correct else prediction
         residual = self.prepared.measurement.recording - corrected
-        cells = self.cells(residual)
+        cells = self.cells(residual) / self._expected_cells(unpredictable)
         weights = np.broadcast_to(self.freedom, cells.shape)
-        white = whiten(residual, self.psd).astype(np.float64) ** 2
+        plain = whiten(residual, self.psd).astype(np.float64) ** 2
+        white = self._over_expected(plain, unpredictable) if unpredictable else plain
         held, active = self.prepared.held_out, self.prepared.active
         return Verdict(
             level_db=float(np.average(10 * np.log10(np.maximum(cells, 1e-3)), weights=weights)) if cells.size else 0.0,
             excess_db=_db(white[held]),
             active_db=_db(white[held & active]),
             silent_db=_db(white[held & ~active]),
+            irreducible_db=_db(plain[held]) if unpredictable else 0.0,
             cells=cells,
             prediction=corrected,
         )
+
+    def _expected_cells(self, unpredictable: Sequence[tuple[Samples, Array]]) -> Array | float:
+        """(times, bands) what is expected in the held-out cells, 1 where that is the fan alone."""
+        expected: Array | float = 1.0
+        span = FRAME + HOP * (FRAMES_PER_CELL - 1)
+        for variance, colour in unpredictable:
+            total = np.concatenate(([0.0], np.cumsum(variance, dtype=np.float64)))
+            mean = (total[self.starts + span] - total[self.starts]) / span
+            bins = np.arange(FRAME // 2 + 1) * (colour.size - 1) / (FRAME // 2)
+            share = np.interp(bins, np.arange(colour.size), colour / self.psd)
+            expected = expected + mean[:, None] * (np.add.reduceat(share[: self._edges[-1]], self._edges[:-1]) / self.freedom)
+        return expected
+
+    def _over_expected(self, power: Array, unpredictable: Sequence[tuple[Samples, Array]]) -> Array:
+        """power (n,) of the whitened residual over what is expected, both smoothed over 16 ms: when a knock comes is known to some ms."""
+        expected = np.ones_like(power)
+        for variance, colour in unpredictable:
+            expected += variance * float(np.mean(colour / np.maximum(self.psd, max(ROUNDING_PSD, 1e-7 * float(self.psd.max())))))
+        return uniform_filter1d(power, HOP) / uniform_filter1d(expected, HOP)
 
     def correct(self, prediction: Samples) -> Samples:
         """prediction (n,) through the short filter that brings it closest to the recording, no further from 1 than TOLERANCE."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
@@ -10,13 +11,14 @@ import numpy as np
 from edgefilter.echo.effect import Values, complete, find, names, whiten
 from edgefilter.echo.effect import neutral as neutral_values
 from edgefilter.echo.model import EchoModel
+from edgefilter.errors import UsageError
 from edgefilter.judge import Judge, Verdict
 from edgefilter.prepare import Prepared
 from edgefilter.suspects import OWN, SUSPECTS, choose
-from edgefilter.types import Samples
+from edgefilter.types import SAMPLE_RATE, Samples
 
 MOST_EFFECTS = 3
-LAST, ENOUGH = ("rattle",), 0.8
+LAST, ENOUGH = ("rattle",), 0.4
 """Effects whose fit takes long, and the share of the excess level at which another one has explained it."""
 SCREEN_DB = 0.2
 """Where the residual is no more than this above that of the robot's silences, there is nothing of the voice in it; half a dB
@@ -52,7 +54,7 @@ def search(prepared: Prepared, model: EchoModel, progress: Callable[[str], None]
     """Add effects to model as long as held-out samples say that they are there."""
     judge = Judge(prepared)
     start = model
-    base = current = judge.judge(predict(model, prepared))
+    base = current = judge.of(model)
     steps: list[Trial] = []
     while len(steps) < MOST_EFFECTS and current.active_db - float(np.clip(current.silent_db, -0.5, 0.5)) > SCREEN_DB:
         left = max(current.level_db - floor_level(judge, current), 0.0)
@@ -102,13 +104,17 @@ def _try(
     if progress:
         progress(f"trying {name}")
     effect = find(name)
-    values = complete(effect, effect.fit(prepared.measurement, model))
+    try:
+        values = complete(effect, effect.fit(prepared.measurement, model))
+    except (UsageError, ArithmeticError, np.linalg.LinAlgError) as error:
+        warnings.warn(f"{name} could not be fitted and is left out: {error}", stacklevel=2)
+        return None
     if all(np.array_equal(values[key], neutral) for key, neutral in neutral_values(effect).items()):
         return None
     fitted = model.with_effect(name, values)
-    prediction = predict(fitted, prepared)
-    verdict = judge.judge(prediction)
-    return Trial(name, values, fitted, verdict, before.level_db - verdict.level_db, size_db(verdict.prediction - before.prediction, prepared))
+    verdict = judge.of(fitted)
+    size = max(size_db(verdict.prediction - before.prediction, prepared), noise_size_db(fitted, prepared))
+    return Trial(name, values, fitted, verdict, before.level_db - verdict.level_db, size)
 
 
 def size_db(change: Samples, prepared: Prepared) -> float:
@@ -117,6 +123,14 @@ def size_db(change: Samples, prepared: Prepared) -> float:
     fan = float(psd.sum()) * 8000.0 / (psd.size - 1)
     plain, white = float(np.mean(change.astype(float) ** 2)) / fan, float(np.mean(whiten(change, psd).astype(float) ** 2))
     return float(10 * np.log10(max(plain, white, 1e-12)))
+
+
+def noise_size_db(model: EchoModel, prepared: Prepared) -> float:
+    """Mean power over the fan, in dB, of what the model says that no waveform predicts."""
+    psd = prepared.measurement.noise_psd
+    fan = float(psd.sum()) * (SAMPLE_RATE / 2) / (psd.size - 1)
+    power = sum(float(np.mean(variance)) for variance, _ in model.unpredictable(prepared.measurement.reference))
+    return float(10 * np.log10(max(power / fan, 1e-12)))
 
 
 def _admissible(trial: Trial, judge: Judge, before: Verdict) -> bool:
@@ -149,6 +163,6 @@ def _judged_again(prepared: Prepared, judge: Judge, model: EchoModel, steps: lis
     settled = []
     for step in reversed(steps):
         values = dict(model.effects)[step.name]
-        settled.append(replace(step, values=values, model=model, verdict=judge.judge(predict(model, prepared))))
+        settled.append(replace(step, values=values, model=model, verdict=judge.of(model)))
         model = model.without_effect(step.name)
     return settled[::-1]

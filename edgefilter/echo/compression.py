@@ -115,7 +115,8 @@ def _falling_peak(x: Array, samples: float) -> Array:
 
 def _values(unknowns: Array) -> dict[str, float]:
     threshold, slope, attack, release = (float(u) for u in unknowns)
-    return {"threshold_db": threshold, "ratio": 1.0 / (1.0 - slope), "attack_ms": float(np.exp(attack)), "release_ms": float(np.exp(release))}
+    attack_ms, release_ms = float(np.clip(np.exp(attack), 0.1, 1000.0)), float(np.clip(np.exp(release), 1.0, 5000.0))
+    return {"threshold_db": threshold, "ratio": 1.0 / (1.0 - slope), "attack_ms": attack_ms, "release_ms": release_ms}
 
 
 def _loudest(measurement: Measurement) -> tuple[slice, np.ndarray]:

@@ -79,7 +79,8 @@ class Effect(Protocol):
 
     Stage "source" acts on the reference, "path", "time" and "microphone" on the predicted voice at the microphone. An effect of stage
     "noise" leaves apply the identity and offers one of these instead: noise_psd(values, psd) -> (601,), the fan's PSD after it;
-    variance(reference, values, sample_rate) -> (n,), what it adds to the expected square of each sample. An effect of stage "source"
+    variance(reference, values, sample_rate) -> (n,), what it adds to the expected square of each sample, and colour(values) -> (601,), the
+    density of that per Hz, 0 to 8 kHz, with an integral of 1. An effect of stage "source"
     that is not memoryless may name a memory, samples of the past that it needs: then the running filter applies it, too.
     """
 

@@ -10,7 +10,7 @@ import scipy
 from edgefilter.echo import catalogue
 from edgefilter.echo.driver import Driver
 from edgefilter.echo.effect import STAGES, Measurement, Values, complete, find
-from edgefilter.types import SAMPLE_RATE, Samples
+from edgefilter.types import SAMPLE_RATE, Array, Samples
 
 PRE_ROLL = 64
 """Samples (4 ms) of the impulse response before the direct sound: what equalisers and linear-phase filters of a loudspeaker ring ahead of it."""
@@ -33,6 +33,18 @@ class EchoModel:
     def predict(self, reference: Samples) -> Samples:
         """The robot's voice at the microphone (n,) for an aligned reference (n,), all effects applied."""
         return self._predict(reference, self.effects)
+
+    def unpredictable(self, reference: Samples) -> tuple[tuple[Samples, Array], ...]:
+        """Of each effect that adds noise of its own: its expected square (n,) at the microphone, and its density (601,) per Hz of integral 1."""
+        chain = sorted(((find(name), complete(find(name), values)) for name, values in self.effects), key=lambda pair: STAGES.index(pair[0].stage))
+        noisy = [(effect, values) for effect, values in chain if hasattr(effect, "variance")]
+        if not noisy:
+            return ()
+        x = reference
+        for effect, values in chain:
+            if effect.stage == "time" or (effect.stage == "source" and not hasattr(effect, "variance")):
+                x = effect.apply(x, values, SAMPLE_RATE)
+        return tuple((effect.variance(x, values, SAMPLE_RATE), effect.colour(values)) for effect, values in noisy)
 
     def driver(self) -> Driver:
         """What the running filter puts the reference through, hop by hop, before the path: the source effects with a short memory."""

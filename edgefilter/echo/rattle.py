@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import astuple, replace
 from itertools import product
 from typing import TYPE_CHECKING, ClassVar
 
@@ -9,26 +10,26 @@ import numpy as np
 import scipy
 
 from edgefilter.echo.effect import Measurement, Parameter, Stage, Values, complete, neutral
+from edgefilter.echo.knock_power import BAND_HZ, BANDS, DECAYS_MS, Trigger, colour_of_knocks, find_knocks, find_trigger, one_side, resonated, ringing_of
 from edgefilter.echo.least_squares import absorbed, filtered
 from edgefilter.types import SAMPLE_RATE, Array, Samples
 
 if TYPE_CHECKING:
     from edgefilter.echo.model import EchoModel
 
-TAPS, COARSE_TAPS = 320, 96
-"""20 ms of ringing after a knock; 6 ms are enough to find out what sets it off."""
+TAPS = 320
+"""20 ms of ringing after a knock."""
 DIRECT = 64
 """Samples before the direct sound in the path's impulse response (model.PRE_ROLL)."""
 NEVER = 100.0
 BOUND = 1e4
 RIDGE = 1e-2
-STARTS_HZ, START_SHARES = (160.0, 240.0), (0.5, 0.75)
-"""First guesses: resonance, and threshold as the share of the displacement's peaks that stay below."""
 HALF = SAMPLE_RATE
 """Samples of the stretches that take turns when the sounds are tried on knocks that they were not learnt from."""
 WORTH = 2.5
-"""What each tap has to explain, in units of the residual's variance, for the knocks to be real."""
-DECAYS_MS = (2.0, 4.0, 8.0, 16.0, 32.0, 64.0)
+"""What each tap has to explain, in units of the residual's variance, for the sounds to be real."""
+REFINED = 3
+GRID_HZ = np.linspace(0.0, SAMPLE_RATE / 2, 601)
 
 
 class Rattle:
@@ -37,7 +38,9 @@ class Rattle:
     d is the drive through the membrane's resonance, w^2 / (s^2 + s w / q + w^2). An impact excites the modes of the loose part in
     proportion to the speed at which it is hit (Klippel 2006, "Loudspeaker nonlinearities", irregular distortion), so a knock is as
     high as d' per ms over threshold: outward (t,) taps is the sound of pushes, inward that of pulls. threshold: full scale of the
-    drive. No two knocks are alike: power and decay_ms say what variance() adds. rate_hz, knocks per second, only reports.
+    drive. side: 1 where only pushes knock, -1 only pulls, 0 both. No two knocks are alike: what no waveform predicts is noise that
+    starts at each knock, with power (16,) in bands of 500 Hz for a height of 1, and decays in decay_ms. rate_hz, knocks per second,
+    only reports.
     """
 
     name: ClassVar[str] = "rattle"
@@ -48,6 +51,7 @@ class Rattle:
         Parameter("threshold", "full scale", NEVER, 1e-5, NEVER),
         Parameter("resonance_hz", "Hz", 200.0, 20.0, 2000.0),
         Parameter("q", "", 1.0, 0.1, 20.0),
+        Parameter("side", "", 0.0, -1.0, 1.0),
         Parameter("outward", "", 0.0, -BOUND, BOUND),
         Parameter("inward", "", 0.0, -BOUND, BOUND),
         Parameter("power", "full scale^2", 0.0, 0.0, 1.0),
@@ -65,84 +69,75 @@ class Rattle:
 
     def variance(self, reference: Samples, values: Values, sample_rate: int) -> Samples:
         """What knocks add to the expected square of each sample (n,) at the microphone, for an aligned reference (n,)."""
-        power = float(values["power"])
-        if power == 0.0:
-            return np.zeros_like(reference)
-        moved = resonated(reference, float(values["resonance_hz"]), float(values["q"]), sample_rate)
-        knocks = np.sum(find_knocks(moved, float(values["threshold"])), axis=0)
-        return power * _ringing(knocks, float(values["decay_ms"]), sample_rate)
+        power = float(np.sum(values["power"]))
+        return power * ringing_of(_heard(reference, values, sample_rate), float(values["decay_ms"]), DIRECT, sample_rate)
+
+    def colour(self, values: Values) -> Array:
+        """(601,) the spectral density of that, 0 to 8 kHz, per Hz: its integral is 1."""
+        power = np.broadcast_to(np.asarray(values["power"], float), (BANDS,)) + 1e-30
+        return (power / power.sum() / BAND_HZ)[np.minimum(GRID_HZ / BAND_HZ, BANDS - 1).astype(int)]
 
     def fit(self, measurement: Measurement, model: EchoModel) -> Values:
-        """Resonance, q and threshold whose knocks explain most of the whitened residual, with the least-squares sounds.
+        """What sets the knocks off is found by when the residual is loud; then come the least-squares sounds, and the power of the rest.
 
-        Some guesses are fitted with short sounds. The best of these serves as a matched filter, which shows how hard the robot
-        was hit at each moment; the resonance, q and threshold whose knocks agree best with that are then fitted in full.
+        Where the sounds explain something, they serve as matched filters, which show how hard the robot was hit at each moment, and
+        resonance, q and threshold are refined by these. Neutral where the residual follows the voice's level rather than knocks.
         """
         x = measurement.reference
         predicted, target = measurement.whiten(model.predict(x)), measurement.whiten(measurement.recording)
-        rest = (target - absorbed(predicted, target, measurement.fit)) * measurement.weights
-        allowed = _roomy(measurement)
-
-        def explain(resonance: float, q: float, threshold: float, taps: int) -> tuple[float, Array]:
-            knocks = [k * allowed for k in find_knocks(resonated(x, resonance, q), threshold)]
-            return _explained([measurement.whiten(model.predict(k)) for k in knocks], rest, taps)
-
-        starts = [(hz, 1.0, _threshold(resonated(x, hz, 1.0), share)) for hz in STARTS_HZ for share in START_SHARES]
-        found = [explain(*start, COARSE_TAPS) for start in starts]
-        best = int(np.argmax([gain for gain, _ in found]))
-        if found[best][0] <= 0.0:
+        left = target - absorbed(predicted, target, measurement.fit)
+        trigger = find_trigger(x, left, predicted, measurement.fit, DIRECT)
+        if trigger is None:
             return neutral(self)
-        at, (gain, sounds) = starts[best], found[best]
-        for fine in (False, True):
+        rest, allowed = left * measurement.weights, _roomy(measurement)
+
+        def knocks_of(at: Trigger) -> list[Samples]:
+            trains = find_knocks(resonated(x, at.resonance_hz, at.q), at.threshold)
+            return [train * allowed if at.side * way >= 0.0 else np.zeros_like(train) for train, way in zip(trains, (1.0, -1.0), strict=True)]
+
+        def explain(at: Trigger) -> tuple[float, Array]:
+            return _explained([measurement.whiten(model.predict(k)) for k in knocks_of(at)], rest, TAPS)
+
+        at, (gain, sounds) = trigger, explain(trigger)
+        for _ in range(REFINED):
             hits = [_matched(sound, rest, measurement, model) * allowed for sound in sounds]
-            choices = [at, _best_agreement(x, hits, _fine(*at) if fine else _coarse(x))]
-            fits = [explain(*choice, TAPS) for choice in choices]
-            better = int(fits[1][0] > fits[0][0])
-            at, (gain, sounds) = choices[better], fits[better]
-        resonance, q, threshold = at
-        knocks = [k * allowed for k in find_knocks(resonated(x, resonance, q), threshold)]
+            other = _best_agreement(x, hits, _fine(at))
+            gain_then, sounds_then = explain(other)
+            if gain_then <= gain:
+                break
+            at, gain, sounds = other, gain_then, sounds_then
         halves = np.arange(x.size) // HALF % 2 == 0
-        if gain <= WORTH * sounds.size * float(np.dot(rest, rest)) / max(float(measurement.weights.sum()), 1.0):
-            return neutral(self)
-        if not _predicts([(k * halves, k * ~halves) for k in knocks], rest, measurement, model):
-            sounds = np.zeros_like(sounds)
-        values = {"threshold": threshold, "resonance_hz": resonance, "q": q}
-        values |= {name: np.clip(sound, -BOUND, BOUND) for name, sound in zip(("outward", "inward"), sounds, strict=True)}
+        worth = WORTH * sounds.size * float(np.dot(rest, rest)) / max(float(measurement.weights.sum()), 1.0)
+        if gain <= worth or not _predicts([(k * halves, k * ~halves) for k in knocks_of(at)], rest, measurement, model):
+            at, sounds = trigger, np.zeros((2, 1))
+        values = dict(zip(("resonance_hz", "q", "threshold", "side"), astuple(at), strict=True))
+        values |= {name: _number_or_taps(np.clip(sound, -BOUND, BOUND)) for name, sound in zip(("outward", "inward"), sounds, strict=True)}
         return {**values, **self._unpredictable(measurement, model, values)}
 
-    def _unpredictable(self, measurement: Measurement, model: EchoModel, values: Values) -> dict[str, float]:
-        """power, decay_ms and rate_hz from the square of what the predictable knocks leave."""
+    def _unpredictable(self, measurement: Measurement, model: EchoModel, values: Values) -> dict[str, float | Array]:
+        """power, decay_ms and rate_hz from what the predictable knocks leave."""
         x = measurement.reference
-        knocks = np.sum(find_knocks(resonated(x, values["resonance_hz"], values["q"]), values["threshold"]), axis=0)
-        predicted = model.predict(self.apply(x, complete(self, values), SAMPLE_RATE))
-        square = (measurement.recording - absorbed(predicted, measurement.recording, measurement.fit)).astype(np.float64) ** 2
-        square = (square - _fan_power(measurement, square)) * measurement.weights
-        best = (0.0, 0.0, 5.0)
-        for decay in DECAYS_MS:
-            shape = _ringing(knocks, decay, SAMPLE_RATE).astype(np.float64)
-            along, energy = float(np.dot(square, shape)), float(np.dot(shape**2, measurement.weights))
-            if along > 0.0 and energy > 0.0:
-                best = max(best, (along**2 / energy, along / energy, decay))
-        return {"power": min(best[1], 1.0), "decay_ms": best[2], "rate_hz": np.count_nonzero(knocks) * SAMPLE_RATE / max(x.size, 1)}
+        knocks = _heard(x, values, SAMPLE_RATE)
+        predicted = measurement.whiten(model.predict(self.apply(x, complete(self, values), SAMPLE_RATE)))
+        target = measurement.whiten(measurement.recording)
+        left = target - absorbed(predicted, target, measurement.fit)
+        fits = {decay: colour_of_knocks(left, ringing_of(knocks, decay, DIRECT), measurement.fit) for decay in DECAYS_MS}
+        decay = max(fits, key=lambda decay: fits[decay][0])
+        fan = np.full(GRID_HZ.size, 2.0 / SAMPLE_RATE) if measurement.noise_psd is None else np.maximum(measurement.noise_psd, 1e-14)
+        bands = np.minimum(GRID_HZ / BAND_HZ, BANDS - 1).astype(int)
+        density = fits[decay][1] * np.bincount(bands) / np.bincount(bands, 1.0 / fan)
+        rate = np.count_nonzero(knocks) * SAMPLE_RATE / max(x.size, 1)
+        return {"power": np.clip(density * BAND_HZ, 0.0, 1.0), "decay_ms": decay, "rate_hz": rate}
 
 
-def resonated(x: Samples, resonance_hz: float, q: float, sample_rate: int = SAMPLE_RATE) -> Samples:
-    """Displacement (n,) of a membrane with that resonance for the drive x (n,), in its full scale."""
-    w = 2.0 * np.pi * resonance_hz
-    return scipy.signal.lfilter(*scipy.signal.bilinear([w * w], [1.0, w / q, w * w], sample_rate), x).astype(np.float32)
+def _heard(x: Samples, values: Values, sample_rate: int) -> Samples:
+    """(n,) the knocks of a drive x (n,), on the side that knocks."""
+    moved = resonated(x, float(values["resonance_hz"]), float(values["q"]), sample_rate)
+    return one_side(find_knocks(moved, float(values["threshold"])), float(values["side"]))
 
 
-def find_knocks(moved: Samples, threshold: float) -> tuple[Samples, Samples]:
-    """Two pulse trains (n,) for a displacement (n,): where it rises above threshold, and where it falls below -threshold.
-
-    The height is the speed over threshold, per millisecond.
-    """
-    outward, inward = np.zeros_like(moved), np.zeros_like(moved)
-    for train, way in ((outward, moved), (inward, -moved)):
-        beyond = way > threshold
-        at = 1 + np.flatnonzero(beyond[1:] & ~beyond[:-1])
-        train[at] = (way[at] - way[at - 1]) * np.float32(SAMPLE_RATE / 1000 / threshold)
-    return outward, inward
+def _number_or_taps(weights: Array) -> float | Array:
+    return float(weights[0]) if weights.size == 1 else weights
 
 
 def _roomy(measurement: Measurement) -> np.ndarray:
@@ -154,29 +149,6 @@ def _roomy(measurement: Measurement) -> np.ndarray:
     return total[ring:] - total[:-ring] >= ring if total.size > ring else np.zeros(measurement.recording.size, bool)
 
 
-def _threshold(moved: Samples, share: float) -> float:
-    """The value that this share of the peaks of |moved| (n,) stays below; peaks under 5 % of the largest do not count."""
-    size = np.abs(moved)
-    peaks = size[1:-1][(size[1:-1] > size[:-2]) & (size[1:-1] >= size[2:])]
-    peaks = peaks[peaks > 0.05 * peaks.max()] if peaks.size else peaks
-    return float(np.clip(np.quantile(peaks, share), 1e-5, NEVER)) if peaks.size else NEVER
-
-
-def _ringing(knocks: Samples, decay_ms: float, sample_rate: int) -> Samples:
-    """Squared heights of knocks (n,), decaying by 1/e in decay_ms, from the moment at which their direct sound arrives; (n,)."""
-    keep = np.exp(-1.0 / (decay_ms * 1e-3 * sample_rate))
-    late = np.concatenate((np.zeros(DIRECT), knocks.astype(np.float64) ** 2))[: knocks.size]
-    return scipy.signal.lfilter([1.0], [1.0, -keep], late).astype(np.float32)
-
-
-def _fan_power(measurement: Measurement, square: Array) -> float:
-    """The fan's variance, full scale^2; where it is unknown, the quiet tenth of the residual's 20 ms blocks."""
-    if measurement.noise_psd is not None:
-        return float(measurement.noise_psd.sum()) * SAMPLE_RATE / 2 / (measurement.noise_psd.size - 1)
-    blocks = square[: square.size // 320 * 320].reshape(-1, 320).mean(axis=1)
-    return float(np.quantile(blocks, 0.1)) if blocks.size else 0.0
-
-
 def _matched(sound: Array, rest: Samples, measurement: Measurement, model: EchoModel) -> Samples:
     """Correlation (n,) of the residual with the whitened sound of one knock at the microphone."""
     length, at = 4096, 1024
@@ -186,32 +158,28 @@ def _matched(sound: Array, rest: Samples, measurement: Measurement, model: EchoM
     return scipy.signal.oaconvolve(rest, heard[::-1])[length - 1 - at :][: rest.size].astype(np.float32)
 
 
-def _coarse(x: Samples) -> list[tuple[float, float, float]]:
-    """Resonances, qs and thresholds to choose from at first."""
-    grid = product((130.0, 165.0, 205.0, 255.0, 320.0), (0.75, 1.2), (0.35, 0.5, 0.62, 0.73, 0.83, 0.93))
-    return [(hz, q, _threshold(resonated(x, hz, q), share)) for hz, q, share in grid]
+def _fine(at: Trigger) -> list[Trigger]:
+    """Neighbours of a trigger."""
+    steps = product((0.85, 0.92, 0.96, 1.0, 1.04, 1.09, 1.18), (0.75, 1.0, 1.3), (0.7, 0.8, 0.9, 0.96, 1.0, 1.04, 1.1, 1.2, 1.35))
+    return [replace(at, resonance_hz=at.resonance_hz * a, q=at.q * b, threshold=at.threshold * c) for a, b, c in steps]
 
 
-def _fine(resonance: float, q: float, threshold: float) -> list[tuple[float, float, float]]:
-    """Neighbours of a choice."""
-    steps = product((0.93, 0.97, 1.0, 1.03, 1.07), (0.85, 1.0, 1.18), (0.85, 0.93, 1.0, 1.08, 1.18))
-    return [(resonance * a, q * b, threshold * c) for a, b, c in steps]
-
-
-def _best_agreement(x: Samples, hits: list[Samples], choices: list[tuple[float, float, float]]) -> tuple[float, float, float]:
-    """Of (resonance, q, threshold) the one whose knocks fit the matched filter's output best."""
+def _best_agreement(x: Samples, hits: list[Samples], choices: list[Trigger]) -> Trigger:
+    """The one whose knocks fit the matched filter's output best; neighbours in resonance and q follow each other."""
     moved, best = {}, (-np.inf, choices[0])
-    for resonance, q, threshold in choices:
-        if (resonance, q) not in moved:
-            moved = {(resonance, q): resonated(x, resonance, q)}
-        best = max(best, (_agreement(find_knocks(moved[resonance, q], threshold), hits), (resonance, q, threshold)))
+    for choice in choices:
+        key = choice.resonance_hz, choice.q
+        if key not in moved:
+            moved = {key: resonated(x, *key)}
+        agreement = _agreement(find_knocks(moved[key], choice.threshold), hits)
+        best = max(best, (agreement, choice), key=lambda pair: pair[0])
     return best[1]
 
 
 def _agreement(knocks: tuple[Samples, Samples], hits: list[Samples]) -> float:
     """How much of the residual's energy knocks of these heights explain, in units of one knock's energy, overlaps neglected."""
-    along = sum(float(np.dot(k, hit)) for k, hit in zip(knocks, hits, strict=True))
-    energy = sum(float(np.dot(k, k)) for k in knocks)
+    heard = [(k, hit) for k, hit in zip(knocks, hits, strict=True) if hit.any()]
+    along, energy = sum(float(np.dot(k, hit)) for k, hit in heard), sum(float(np.dot(k, k)) for k, _ in heard)
     return along * abs(along) / energy if energy > 0.0 else 0.0
 
 

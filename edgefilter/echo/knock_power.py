@@ -1,0 +1,174 @@
+"""When a residual is loud: at the moments of knocks, or wherever the voice is; and how loud a knock is at each frequency."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import scipy
+from numpy.typing import NDArray
+
+from edgefilter.types import SAMPLE_RATE, Array, Samples
+
+FRAME, HOP, BANDS = 128, 64, 16
+"""Frames of 8 ms every 4 ms, in bands of 500 Hz: short enough for single knocks."""
+BAND_HZ = SAMPLE_RATE / 2 / BANDS
+RESONANCES_HZ, Q = (120.0, 160.0, 210.0, 280.0, 370.0), 1.0
+SHARES = (0.3, 0.45, 0.6, 0.7, 0.8, 0.88, 0.94)
+"""Thresholds to try, as the share of the displacement's peaks that stay below."""
+SIDES = (1.0, -1.0, 0.0)
+DECAY_MS, DECAYS_MS = 4.0, (1.0, 2.0, 4.0, 8.0, 16.0, 32.0)
+BETTER = 3.0
+"""By how many times more of the log likelihood knocks must explain than noise that follows the voice's level."""
+LEAST = 150.0
+"""Log likelihood, in nats, that knocks must bring on samples that they were not learnt from."""
+FOLD = SAMPLE_RATE
+"""Samples of the stretches that take turns in that."""
+ROUNDS = 4
+
+
+@dataclass(frozen=True)
+class Trigger:
+    """What sets off knocks: a displacement through a resonance that exceeds threshold outward (side 1), inward (-1) or either way (0)."""
+
+    resonance_hz: float
+    q: float
+    threshold: float
+    side: float
+
+
+def find_trigger(x: Samples, residual: Samples, predicted: Samples, fit: NDArray[np.bool_] | None, late: int) -> Trigger | None:
+    """The trigger whose knocks explain best when the whitened residual (n,) is loud; None where the voice's level explains it as well.
+
+    x (n,): the drive. predicted (n,): the whitened voice. late: samples until a knock is heard. The residual's power in a cell of time
+    and frequency is taken as exponentially distributed around a constant plus what each source adds, in a colour of its own: maximum
+    likelihood by the multiplicative updates of Fevotte, Bertin & Durrieu 2009 ("Nonnegative matrix factorization with the
+    Itakura-Saito divergence", eq. 2.22, with the exponent 1/2 that makes them monotonic).
+    """
+    power, voice = band_power(residual), band_power(predicted)
+    middle = np.arange(len(power)) * HOP + FRAME // 2
+    use = np.ones(len(power), bool) if fit is None else fit[middle]
+    folds = [use & (middle // FOLD % 2 == parity) for parity in (0, 1)]
+    if min(fold.sum() for fold in folds) < 4 * BANDS:
+        return None
+    one = np.ones((len(power), 1), np.float32)
+    seen, best = power[use], (-np.inf, None, one)
+    for resonance in RESONANCES_HZ:
+        moved = resonated(x, resonance, Q)
+        for share in SHARES:
+            threshold = quantile_of_peaks(moved, share)
+            trains = find_knocks(moved, threshold)
+            for side in SIDES:
+                source = _roughly_ringing(one_side(trains, side), late, len(power))
+                sources = [one[use], source[use]]
+                likelihood = _likelihood(seen, sources, _colours(seen, sources, ROUNDS))
+                if likelihood > best[0]:
+                    best = (likelihood, Trigger(resonance, Q, threshold, side), source)
+    if best[1] is None:
+        return None
+    smoothed = scipy.signal.lfilter([0.2], [1.0, -0.8], voice, axis=0).astype(np.float32)
+    nothing, by_knocks, by_voice = (_crossed(power, sources, folds) for sources in ([one], [one, best[2]], [one, voice, smoothed]))
+    return best[1] if by_knocks - nothing > max(BETTER * (by_voice - nothing), LEAST) else None
+
+
+def colour_of_knocks(residual: Samples, ringing: Samples, fit: NDArray[np.bool_] | None) -> tuple[float, Array]:
+    """Log likelihood and (BANDS,) the power in each band, over the fan, that ringing (n,) at 1 adds to a whitened residual (n,)."""
+    power, source = band_power(residual), _frames(ringing).mean(axis=1, keepdims=True)
+    use = slice(None) if fit is None else fit[np.arange(len(power)) * HOP + FRAME // 2]
+    scale = float(source.mean())
+    if scale <= 0.0:
+        return -np.inf, np.zeros(BANDS)
+    sources = [np.ones_like(source)[use], (source / scale)[use].astype(np.float32)]
+    colours = _colours(power[use], sources, 4 * ROUNDS)
+    return _likelihood(power[use], sources, colours), colours[1] / scale
+
+
+def resonated(x: Samples, resonance_hz: float, q: float, sample_rate: int = SAMPLE_RATE) -> Samples:
+    """Displacement (n,) of a membrane with that resonance for the drive x (n,), in its full scale."""
+    w = 2.0 * np.pi * resonance_hz
+    return scipy.signal.lfilter(*scipy.signal.bilinear([w * w], [1.0, w / q, w * w], sample_rate), x).astype(np.float32)
+
+
+def find_knocks(moved: Samples, threshold: float) -> tuple[Samples, Samples]:
+    """Two pulse trains (n,) for a displacement (n,): where it rises above threshold, and where it falls below -threshold.
+
+    The height is the speed over threshold, per millisecond.
+    """
+    outward, inward = np.zeros_like(moved), np.zeros_like(moved)
+    for train, way in ((outward, moved), (inward, -moved)):
+        beyond = way > threshold
+        at = 1 + np.flatnonzero(beyond[1:] & ~beyond[:-1])
+        train[at] = (way[at] - way[at - 1]) * np.float32(SAMPLE_RATE / 1000 / threshold)
+    return outward, inward
+
+
+def one_side(trains: tuple[Samples, Samples], side: float) -> Samples:
+    """(n,) of the trains outward and inward what belongs to a side: 1, -1, or 0 for both."""
+    outward, inward = trains
+    return outward if side > 0.0 else inward if side < 0.0 else outward + inward
+
+
+def quantile_of_peaks(moved: Samples, share: float) -> float:
+    """The value that this share of the peaks of |moved| (n,) stays below; peaks under 5 % of the largest do not count."""
+    size = np.abs(moved)
+    peaks = size[1:-1][(size[1:-1] > size[:-2]) & (size[1:-1] >= size[2:])]
+    peaks = peaks[peaks > 0.05 * peaks.max()] if peaks.size else peaks
+    return float(np.clip(np.quantile(peaks, share), 1e-5, 100.0)) if peaks.size else 100.0
+
+
+def ringing_of(knocks: Samples, decay_ms: float, late: int, sample_rate: int = SAMPLE_RATE) -> Samples:
+    """Squared heights of knocks (n,), decaying by 1/e in decay_ms, `late` samples later; (n,)."""
+    keep = np.exp(-1.0 / (decay_ms * 1e-3 * sample_rate))
+    delayed = np.concatenate((np.zeros(late), knocks.astype(np.float64) ** 2))[: knocks.size]
+    return scipy.signal.lfilter([1.0], [1.0, -keep], delayed).astype(np.float32)
+
+
+def band_power(x: Samples) -> Samples:
+    """(frames, BANDS) mean power of x (n,) in each band, 1 for white noise of variance 1; the lowest bin is left out."""
+    window = np.hanning(FRAME + 1)[:-1].astype(np.float32)
+    power = np.abs(scipy.fft.rfft(_frames(x) * window, axis=1)[:, 1:]) ** 2 / np.sum(window**2)
+    return power.reshape(len(power), BANDS, -1).mean(axis=2).astype(np.float32)
+
+
+def _frames(x: Samples) -> Samples:
+    return np.lib.stride_tricks.sliding_window_view(x, FRAME)[::HOP] if x.size >= FRAME else np.zeros((0, FRAME), np.float32)
+
+
+def _roughly_ringing(knocks: Samples, late: int, frames: int) -> Samples:
+    """(frames, 1) the squared heights of knocks (n,) in each hop, decaying, with a mean of 1."""
+    at = np.flatnonzero(knocks)
+    hops = np.bincount(np.minimum((at + late) // HOP, frames), knocks[at].astype(np.float64) ** 2, frames + 1)
+    keep = np.exp(-HOP / (DECAY_MS * 1e-3 * SAMPLE_RATE))
+    rung = scipy.signal.lfilter([1.0], [1.0, -keep], hops)
+    both = rung[:frames] + rung[1:]
+    return (both / (both.mean() + 1e-30)).astype(np.float32)[:, None]
+
+
+def _colours(power: Samples, sources: Sequence[Samples], rounds: int) -> list[Samples]:
+    """(BANDS,) for each source (t, 1 or BANDS): how much of it is in each band of power (t, BANDS)."""
+    colours = [np.full(BANDS, 1.0 if i == 0 else 0.3, np.float32) / max(float(source.mean()), 1e-12) for i, source in enumerate(sources)]
+    for _ in range(rounds):
+        inverse = 1.0 / _expected(sources, colours)
+        surprise = power * inverse * inverse
+        changes = [(np.sum(s * surprise, axis=0) + 1e-12) / (np.sum(s * inverse, axis=0) + 1e-9) for s in sources]
+        colours = [colour * np.sqrt(change) for colour, change in zip(colours, changes, strict=True)]
+    return colours
+
+
+def _expected(sources: Sequence[Samples], colours: Sequence[Samples]) -> Samples:
+    return sum(source * colour for source, colour in zip(sources, colours, strict=True)) + np.float32(1e-6)
+
+
+def _likelihood(power: Samples, sources: Sequence[Samples], colours: Sequence[Samples]) -> float:
+    expected = _expected(sources, colours)
+    return -float(np.sum(np.log(expected) + power / expected))
+
+
+def _crossed(power: Samples, sources: Sequence[Samples], folds: Sequence[NDArray[np.bool_]]) -> float:
+    """Log likelihood of each fold with the colours learnt from the other."""
+    total = 0.0
+    for learnt, seen in (folds, folds[::-1]):
+        colours = _colours(power[learnt], [s[learnt] for s in sources], 3 * ROUNDS)
+        total += _likelihood(power[seen], [s[seen] for s in sources], colours)
+    return total
