@@ -19,11 +19,10 @@ from edgefilter.search import Found, Trial, floor_level
 
 EXPLAINED_DB = 0.8
 """Excess up to which nothing is missing: what the fan of another day and a faint distortion leave."""
-EXPLAINED, RATTLING = 0.45, 0.2
-"""Less of the excess level than this explained by all findings together is not what happened; of what rattles, less can be predicted."""
+EXPLAINED = 0.45
+"""Less of the excess level than this explained by all findings together is not what happened."""
 STILL_THERE = 0.6
 """Of the excess in dB, more than this left is not explained either."""
-ERRATIC = ("rattle",)
 UNPREDICTABLE = ("rattle", "bandlimit")
 """Effects whose own noise stays in the residual."""
 THIRDS_T = 1.69
@@ -57,8 +56,6 @@ def conclude(prepared: Prepared, found: Found, progress: Callable[[str], None] |
 def _enough(prepared: Prepared, found: Found) -> bool:
     """Whether the findings explain so much that they are what happened."""
     explained = explained_level(prepared, found)
-    if any(step.name in ERRATIC for step in found.steps):
-        return explained >= RATTLING
     return explained >= EXPLAINED and found.final.excess_db < STILL_THERE * found.base.excess_db
 
 
