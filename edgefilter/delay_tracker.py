@@ -6,9 +6,9 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import fft
 from scipy.ndimage import uniform_filter1d
 
+from edgefilter import fourier
 from edgefilter.delay_line import Tape
 from edgefilter.types import Samples
 
@@ -71,7 +71,7 @@ class DelayMeter:
             early = np.zeros(SIZE, np.float32)
             count = min(pre_roll + EARLY[1], response.size)
             early[:count] = response[:count]
-            self._prior = fft.rfft(np.roll(early, -pre_roll)).astype(np.complex64)
+            self._prior = fourier.rfft(np.roll(early, -pre_roll)).astype(np.complex64)
             self._prior_blocks = 16.0
         self._known_scale = response is not None
         self._cross: np.ndarray | None = None
@@ -94,7 +94,7 @@ class DelayMeter:
         energy, drive = float(np.dot(x, x)), float(np.dot(inner, inner))
         if not (drive > 1e-9 and energy > 1e-12):
             return None
-        m, a, w = fft.rfft(self._framed, axis=1)
+        m, a, w = fourier.rfft(self._framed)
         m *= _turn(self._omega, centre - whole)
         power_a, power_m = _power(a), _power(m)
         if self._cross is None:
@@ -109,9 +109,9 @@ class DelayMeter:
         for segment in range(1, segments + 1):
             for shift in (-2 * REACH * segment, 2 * REACH * segment):
                 wide = self._reference(ref, start - shift, slope, np.empty(SIZE, np.float32))
-                products.insert(0 if shift < 0 else len(products), m * np.conj(fft.rfft(wide)))
+                products.insert(0 if shift < 0 else len(products), m * np.conj(fourier.rfft(wide)))
                 references.insert(0 if shift < 0 else len(references), wide)
-        likelihood = np.roll(fft.irfft(products, SIZE), REACH, axis=1)[:, : 2 * REACH].ravel()
+        likelihood = np.roll(fourier.irfft(np.array(products), SIZE), REACH, axis=1)[:, : 2 * REACH].ravel()
         overlap = np.concatenate([_overlap(reference) for reference in references])
         likelihood /= np.sqrt(overlap + 0.1 * overlap.max())
         expected = likelihood.size // 2
@@ -159,9 +159,9 @@ class DelayMeter:
         self._cross = 0.98 * self._cross + rate * cross * _turn(self._omega, offset)
         self._power = 0.98 * self._power + rate * power
         self._blocks = 0.98 * self._blocks + 1.0
-        impulse = fft.irfft(self._cross / (self._power + 1e-3 * self._power.mean()), SIZE)
+        impulse = fourier.irfft(self._cross / (self._power + 1e-3 * self._power.mean()), SIZE)
         impulse[EARLY[1] : SIZE - EARLY[0]] = 0.0
-        self.response = fft.rfft(impulse).astype(np.complex64)
+        self.response = fourier.rfft(impulse).astype(np.complex64)
 
     def _start(self, power_m: Samples, power_a: Samples) -> None:
         smooth = uniform_filter1d(power_a, 65, mode="nearest")
