@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import subprocess
 import sys
 import tempfile
@@ -149,8 +150,8 @@ def judge(result: dict) -> list[str]:
     return troubles
 
 
-def markdown(result: dict) -> str:
-    """A page of its own."""
+def markdown(result: dict, name: str) -> str:
+    """A page of its own; name: of the picture beside it, without suffix."""
     seconds = result["samples_in"] / SAMPLE_RATE
     lines = [f"# Soak: {seconds / 60:.0f} minutes of `{result['engine']}`, {'live' if result['kind'] == 'live' else 'faster than real time'}", ""]
     lines += [", ".join(f"{key} {value}" for key, value in result["machine"].items()), ""]
@@ -166,7 +167,26 @@ def markdown(result: dict) -> str:
     for part in result["slices"]:
         times = " | ".join("" if part[key] is None else f"{part[key]:.3f}" for key in ("p50_ms", "p99_ms", "bypass_ms"))
         lines.append(f"| {part['seconds'] / 60:.1f} | {part['memory_mb']:.1f} | {times} |")
-    return "\n".join(lines) + "\n"
+    return "\n".join([*lines, "", f"![memory and time]({name}.png)", ""])
+
+
+def draw(result: dict, path: Path) -> None:
+    """Memory over the run, and beside it, where blocks were timed, their median over a bypassed one's."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot as plt
+
+    timed = result["kind"] == "file"
+    figure, axes = plt.subplots(1, 1 + timed, figsize=(5 + 5 * timed, 3.5), layout="constrained", squeeze=False)
+    minutes = [part["seconds"] / 60 for part in result["slices"]]
+    axes[0, 0].plot(minutes, [part["memory_mb"] for part in result["slices"]], "o-")
+    axes[0, 0].set(title="resident memory", xlabel="minutes", ylabel="MB", ylim=(0, None))
+    if timed:
+        axes[0, 1].plot(minutes, [part["p50_ms"] / part["bypass_ms"] for part in result["slices"]], "o-")
+        axes[0, 1].set(title="median block over a bypassed one", xlabel="minutes", ylim=(0, None))
+    figure.savefig(path, dpi=100)
+    plt.close(figure)
 
 
 def main() -> int:
@@ -175,15 +195,17 @@ def main() -> int:
     parser.add_argument("--live", type=float, metavar="MINUTES", help="run live on a virtual device instead")
     parser.add_argument("--engine", default="auto")
     parser.add_argument("--slices", type=int, default=20)
-    parser.add_argument("--output", type=Path, help="without suffix; .json and .md are written")
+    parser.add_argument("--output", type=Path, help="without suffix; .json, .md and .png are written")
     args = parser.parse_args()
     result = live(args.live, args.engine, args.slices) if args.live else from_file(args.minutes, args.engine, args.slices)
-    result["machine"] = machine()
+    result["machine"] = {**machine(), "load average": f"{os.getloadavg()[0]:.1f}"}
     result["troubles"] = judge(result)
+    page = markdown(result, args.output.name if args.output else "soak")
     if args.output:
         args.output.with_suffix(".json").write_text(json.dumps(result, indent=1) + "\n")
-        args.output.with_suffix(".md").write_text(markdown(result))
-    print(markdown(result))
+        args.output.with_suffix(".md").write_text(page)
+        draw(result, args.output.with_suffix(".png"))
+    print(page)
     return 1 if result["troubles"] else 0
 
 

@@ -107,7 +107,8 @@ def test_one_minute_of_audio_does_not_drift(tmp_path: Path, monkeypatch: pytest.
     assert soak.main() == 0
     found = json.loads((tmp_path / "soak.json").read_text())
     assert found["samples_in"] == found["samples_out"] == 60 * 16000 and len(found["slices"]) == 20
-    assert "nothing drifted" in (tmp_path / "soak.md").read_text()
+    page = (tmp_path / "soak.md").read_text()
+    assert "nothing drifted" in page and "(soak.png)" in page and (tmp_path / "soak.png").stat().st_size > 5_000
 
 
 def test_a_leak_lost_samples_and_slowing_down_are_found() -> None:
