@@ -38,7 +38,7 @@ GROWTH_MB = 3.0
 """Most growth of memory from the warm-up to the end; an array that grew by one frame a hop would add 115 MB an hour."""
 SETTLING_S = 15.0
 SLOWER = 1.3
-"""Most growth of the median block's processor time over that of a bypassed block, second half over first. A shared machine changes its
+"""Most growth of a block's processor time over that of a bypassed block, second half over first. A shared machine changes its
 speed by more than that, and the bypass with it."""
 
 
@@ -143,11 +143,17 @@ def judge(result: dict) -> list[str]:
         troubles.append(f"memory grew by {growth:.1f} MB")
     if result["kind"] == "file":
         half = len(settled) // 2
-        first, second = (float(np.median([part["p50_ms"] / part["bypass_ms"] for part in parts])) for parts in (settled[:half], settled[half:]))
+        first, second = (_over_bypass(parts) for parts in (settled[:half], settled[half:]))
         result["slower"] = second / first
         if second > SLOWER * first:
             troubles.append(f"a block took {first:.1f} times as long as a bypassed one in the first half and {second:.1f} times in the second")
     return troubles
+
+
+def _over_bypass(parts: list[dict]) -> float:
+    """A block's time over a bypassed one's. The mean, since a slice in which the robot is mostly silent costs two thirds of another; of the
+    bypassed block, which costs the same whatever is heard, the median."""
+    return float(np.mean([part["p50_ms"] for part in parts]) / np.median([part["bypass_ms"] for part in parts]))
 
 
 def markdown(result: dict, name: str) -> str:
@@ -158,7 +164,7 @@ def markdown(result: dict, name: str) -> str:
     lines += [f"{result['samples_in']} samples in, {result['samples_out']} out, {result['lost']} lost;"]
     lines += [f"memory grew by {result['memory_growth_mb']:+.2f} MB after the warm-up;"]
     if result["kind"] == "file":
-        lines += [f"against a bypassed one, the median block took {result['slower']:.2f} times as long in the second half as in the first."]
+        lines += [f"against a bypassed one, a block took {result['slower']:.2f} times as long in the second half as in the first."]
     else:
         deadline = result["deadline"]
         lines += [f"{deadline['missed_deadlines']} of {deadline['hops']} hops missed their deadline, p99 {deadline['compute']['p99_ms']:.1f} ms."]

@@ -119,12 +119,14 @@ def test_a_leak_lost_samples_and_slowing_down_are_found() -> None:
     assert soak.judge(result()) == []
     assert soak.judge(result(samples_out=99)) == ["100 samples in, 99 out"]
     assert soak.judge(result(lost=3)) == ["3 samples lost"]
-    leaking, slowing, throttled = result(), result(), result()
+    leaking, slowing, throttled, bimodal = result(), result(), result(), result()
     for number in range(20):
         for key in ("p50_ms", "bypass_ms"):
             throttled["slices"][number][key] *= 1 + 0.1 * number
         leaking["slices"][number]["memory_mb"] += number
         slowing["slices"][number]["p50_ms"] += 0.1 * number
+        bimodal["slices"][number]["p50_ms"] = 1.6 if number % 2 == number // 10 else 1.0
     assert "memory grew by 17.0 MB" in soak.judge(leaking)[0]
     assert "in the second" in soak.judge(slowing)[0]
+    assert soak.judge(bimodal) == []  # the robot spoke in five slices of one half and in four of the other
     assert soak.judge(throttled) == []  # the machine became slower, not the filter
