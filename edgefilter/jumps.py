@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from edgefilter.delay_tracker import Measurement
+from edgefilter.delay_tracker import REACH, Measurement
 
-JUMP, SMALL_JUMP, SMALL = 30.0, 20.0, 8.0
-"""Evidence, summed over looks that agree, from which a jump is believed, and what does for one of up to SMALL samples, where chance
-has less to choose from. In 14 minutes each of human speech and of fan noise while the reference played unheard, twice as densely looked
-at as in use, single looks reached 24 and 19, a tenth as often 5 less; consecutive ones, which overlap by three quarters, agreed on
-11 each at most."""
+SMALL, SMALL_JUMP, JUMP, FAR_JUMP = 8.0, 20.0, 30.0, 50.0
+"""Evidence, summed over looks that agree, from which a jump is believed: of up to SMALL samples, of up to REACH, and beyond, for chance
+has more to choose from. In 7 minutes each of human speech and of fan noise while the reference played unheard, looked at twice as
+densely as in use, the sums reached 19 and 14 within REACH, 29 and 13 beyond. Their tails are exponential: 30 comes about once in 100
+hours of such speech, 50 beyond REACH once in 5 if all looks went that far."""
 AGREE = 0.7
 """Samples within which two looks see the same jump."""
 FORGET = 0.7
@@ -42,4 +42,5 @@ class JumpWitness:
                 return False
             self._evidence = found.evidence
         self._offset = found.offset
-        return self._evidence > (JUMP if abs(found.offset) > SMALL else SMALL_JUMP)
+        size = abs(found.offset)
+        return self._evidence > (SMALL_JUMP if size <= SMALL else JUMP if size <= REACH else FAR_JUMP)
