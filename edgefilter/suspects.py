@@ -8,10 +8,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from edgefilter.echo.bandlimit import measured_response_db
-from edgefilter.echo.effect import Values, find
+from edgefilter.echo.effect import Values, find, whiten
+from edgefilter.echo.gain_law import STEP, by_step
 from edgefilter.judge import Judge, Verdict
 from edgefilter.types import SAMPLE_RATE
 
+FAN_ALONE = 1.6
+"""Times the fan's power up to which a step of 25 ms may show nothing else."""
 Guard = Callable[[Values, Judge, Verdict, Verdict], bool]
 
 
@@ -50,7 +53,7 @@ def _cuts_the_band(values: Values, judge: Judge, before: Verdict, after: Verdict
     if not _dull_above(float(values["cutoff_hz"]), judge, before):
         return False
     hz, gain_db = measured_response_db(values)
-    passed = gain_db[(hz > 300.0) & (hz < 0.7 * float(values["cutoff_hz"]))]
+    passed = gain_db[(hz > min(300.0, 0.3 * float(values["cutoff_hz"]))) & (hz < 0.7 * float(values["cutoff_hz"]))]
     stopped = gain_db[hz > 1.2 * float(values["cutoff_hz"])]
     if stopped.size and passed.size:
         return float(np.std(passed)) < 2.0 and float(np.median(stopped)) < float(np.median(passed)) - 6.0
@@ -91,6 +94,24 @@ def _moves_slowly(values: Values, *_: object) -> bool:
     return float(values["range_db"]) >= 0.4
 
 
+def _fan_follows(values: Values, judge: Judge, before: Verdict, after: Verdict) -> bool:
+    """Whether the fan moves with the gain, as it does behind a microphone's control and does not behind a player's.
+
+    By the likelihood of the residual's power in steps where little but the fan is left, its level constant or times the gain's square.
+    """
+    if not _moves_slowly(values):
+        return False
+    measurement = judge.prepared.measurement
+    gain = find("mic_agc").apply(np.ones_like(measurement.recording), values, SAMPLE_RATE)
+    white = whiten(measurement.recording - after.prediction, measurement.noise_psd).astype(np.float64) ** 2
+    square, power = (by_step(x) / STEP for x in (gain.astype(np.float64) ** 2, white))
+    low = (power < FAN_ALONE * square) & (by_step(judge.prepared.usable.astype(float)) == STEP)
+    if low.sum() < 20:
+        return False
+    moving, still = np.log(np.mean(power[low] / square[low])) + np.mean(np.log(square[low])), np.log(np.mean(power[low]))
+    return bool(moving < still)
+
+
 def _reverberates(values: Values, *_: object) -> bool:
     return float(values["level_db"]) > -100.0
 
@@ -103,7 +124,7 @@ SUSPECTS: dict[str, Suspect] = {
     "mic_clipping": Suspect(1, least_size_db=-9.0),
     "delay_jump": Suspect(1, guard=_jumps),
     "compression": Suspect(2, guard=_follows_the_level),
-    "mic_agc": Suspect(3, guard=_moves_slowly),
+    "mic_agc": Suspect(1, guard=_fan_follows),
     "speaker_nonlinearity": Suspect(3),
     "rattle": Suspect(3),
     "path_change": Suspect(4, guard=_clean_before),

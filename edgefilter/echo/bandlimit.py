@@ -18,12 +18,15 @@ if TYPE_CHECKING:
 
 FFT = 1024
 TAPS, LEAD = 192, 64
+DELAYS = np.arange(-8.0, 8.01, 0.1)
+"""Samples: the lag at which a band-limited recording is found is that of its loudest frequencies."""
 
 
 class Bandlimit:
     """Low-pass with the magnitude of a Butterworth filter, |G|^2 = 1 / (1 + (f / cutoff_hz)^(2 order)).
 
-    phase: 0 for a linear-phase filter (resamplers, codecs), 1 for a minimum-phase one (analogue), the constant delay taken out.
+    phase: 0 for a linear-phase filter (resamplers, codecs), 1 for a minimum-phase one (analogue), the delay at low frequencies taken
+    out; delay: what of it a lag found without the filter does not take up.
     taps: (k,) lags -LEAD to k - LEAD, by which the real filter differs from that one.
     """
 
@@ -34,6 +37,7 @@ class Bandlimit:
         Parameter("cutoff_hz", "Hz", 16000.0, 200.0, 16000.0),
         Parameter("order", "1", 8.0, 1.0, 60.0),
         Parameter("phase", "1", 0.0, 0.0, 1.0),
+        Parameter("delay", "samples", 0.0, -100.0, 100.0),
         Parameter("taps", "1", 0.0, -10.0, 10.0),
     )
 
@@ -43,26 +47,32 @@ class Bandlimit:
             return x.copy()
         hz = np.arange(FFT // 2 + 1) * sample_rate / FFT
         response = low_pass(hz, float(values["cutoff_hz"]), float(values["order"]), float(values["phase"]))
+        response = response * np.exp(-2j * np.pi * hz / sample_rate * float(values["delay"]))
         y = convolve_from(x, fft.fftshift(fft.irfft(response, FFT)), FFT // 2)
         taps = np.atleast_1d(np.asarray(values["taps"], float))
         return y + convolve_from(x, taps, LEAD) if taps.any() else y
 
     def fit(self, measurement: Measurement, model: EchoModel) -> Values:
-        """The best of a grid of cut-offs, orders and phases, refined; judged in the whitened cross-spectrum. Then the taps."""
+        """The best of a grid of cut-offs, orders and phases, refined, each at its best delay; judged in the whitened cross-spectrum. Then the taps."""
         predicted = model.predict(measurement.reference)
-        found = spectra(measurement, predicted, 10.0)
+        found = spectra(measurement, predicted, 20.0)
+        turns = np.exp(-2j * np.pi * np.outer(found.hz, DELAYS) / SAMPLE_RATE)
+        turned = found.cross[:, None] * turns.conj()
 
-        def gain(cutoff: float, order: float, phase: float) -> float:
-            return found.gain(low_pass(found.hz, cutoff, order, phase))
+        def gain(cutoff: float, order: float, phase: float) -> tuple[float, float]:
+            response = low_pass(found.hz, cutoff, order, phase)
+            along = 2.0 * (response.conj() @ turned).real
+            at = int(np.argmax(along))
+            return float(along[at] - np.abs(response) ** 2 @ found.predicted), float(DELAYS[at])
 
-        grid = product(np.geomspace(1000.0, 7800.0, 40), (1.0, 2.0, 4.0, 8.0, 16.0, 40.0), (0.0, 1.0))
-        best = max(grid, key=lambda values: gain(*values))
+        grid = product(np.geomspace(200.0, 7800.0, 60), (1.0, 2.0, 4.0, 8.0, 16.0, 40.0), (0.0, 1.0))
+        best = max(grid, key=lambda values: gain(*values)[0])
         step = 1.03
         for _ in range(5):
             near = product(best[0] * np.array([1 / step, 1.0, step]), np.clip(best[1] * np.array([1 / step**3, 1.0, step**3]), 1.0, 60.0), (0.0, 0.5, 1.0))
-            best = max(near, key=lambda values: gain(*values))
+            best = max(near, key=lambda values: gain(*values)[0])
             step = 1.0 + (step - 1.0) * 0.6
-        values = {"cutoff_hz": float(np.clip(best[0], 200.0, 15999.0)), "order": float(best[1]), "phase": float(best[2])}
+        values = {"cutoff_hz": float(np.clip(best[0], 200.0, 15999.0)), "order": float(best[1]), "phase": float(best[2]), "delay": gain(*best)[1]}
         left = measurement.recording - self.apply(predicted, {**values, "taps": 0.0}, SAMPLE_RATE)
         x = measurement.whiten(predicted)
         taps = fit_filter(x, measurement.whiten(left), measurement.weights, TAPS, LEAD, prior=np.full(TAPS, 1e-3), steps=15)
