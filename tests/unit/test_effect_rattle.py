@@ -80,3 +80,26 @@ def test_knocks_that_are_never_alike_go_into_the_variance():
     assert 2.0 <= values["decay_ms"] <= 16.0  # 4 ms were simulated; the sound's imperfect estimate adds its own 4 ms
     left = recording - model.with_effect("rattle", values).predict(x) - fan(x.size)
     assert RATTLE.variance(x, values, 16_000).mean() == pytest.approx(np.mean(left**2), rel=0.5)
+
+
+def test_noise_that_follows_the_voice_is_no_rattle():
+    x, model = irregular_voice(), robot_model()
+    base, _ = robot_alone()
+    voice = model.predict(x)
+    loudness = np.sqrt(signal.lfilter([0.01], [1, -0.99], voice.astype(float) ** 2))
+    codec = (0.1 * loudness * np.random.default_rng(4).standard_normal(x.size)).astype(np.float32)
+    measurement = replace(base, reference=x, recording=voice + codec + fan(x.size))
+    assert held_out_power(measurement, voice) > 1.5
+    assert RATTLE.fit(measurement, model)["threshold"] == 100.0
+
+
+def test_the_model_says_where_and_at_which_frequencies_its_noise_is():
+    x, power = irregular_voice(), np.zeros(16)
+    power[4] = 1e-4
+    model = robot_model().with_effect("rattle", {"threshold": 0.12, "power": power}).with_effect("playback_gain", {"gain_db": 6.0})
+    ((variance, colour),) = model.unpredictable(x)
+    louder = RATTLE.variance(x * np.float32(10 ** (6 / 20)), dict(model.effects)["rattle"], 16_000)
+    np.testing.assert_allclose(variance, louder)
+    hz = np.arange(601) * 8000 / 600
+    assert colour[(hz > 1999) & (hz < 2501)].sum() > 0.999 * colour.sum() and colour.sum() * 8000 / 600 == pytest.approx(1.0, abs=0.06)
+    assert robot_model().unpredictable(x) == ()
