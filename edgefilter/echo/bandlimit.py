@@ -53,7 +53,7 @@ class Bandlimit:
         return y + convolve_from(x, taps, LEAD) if taps.any() else y
 
     def fit(self, measurement: Measurement, model: EchoModel) -> Values:
-        """The best of a grid of cut-offs, orders and phases, refined, each at its best delay; judged in the whitened cross-spectrum. Then the taps."""
+        """The best of a grid of cut-offs, orders and phases, refined, each at its best delay; judged in the whitened cross-spectrum. Then taps."""
         predicted = model.predict(measurement.reference)
         found = spectra(measurement, predicted, 20.0)
         turns = np.exp(-2j * np.pi * np.outer(found.hz, DELAYS) / SAMPLE_RATE)

@@ -59,7 +59,8 @@ def follow(level_db: Array, voice: Samples, recording: Samples, weights: Samples
 
     found = best(np.array(ATTACKS_S), np.array(RELEASES_S), np.array([NO_HOLD_DB, loud[0] - 10.0, loud[0], loud[1]]), -loud[1:])
     attack, release, hold, start = found[2]
-    finer = best(attack * np.array(FINER), release * np.array(FINER), hold + np.array([-5.0, 0.0, 5.0]), start + np.array([-6.0, -3.0, 0.0, 3.0, 6.0]))
+    around, starts = np.array(FINER), start + np.arange(-6.0, 6.1, 3.0)
+    finer = best(attack * around, release * around, hold + np.array([-5.0, 0.0, 5.0]), starts)
     misfit, curve, _ = min(found, finer, key=lambda law: law[0])
     return GainLaw(curve, misfit, float(trust @ (gain_db - middle) ** 2), int(sure.sum()))
 

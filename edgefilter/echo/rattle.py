@@ -10,7 +10,18 @@ import numpy as np
 import scipy
 
 from edgefilter.echo.effect import Measurement, Parameter, Stage, Values, complete, neutral
-from edgefilter.echo.knock_power import BAND_HZ, BANDS, DECAYS_MS, Trigger, colour_of_knocks, find_knocks, find_trigger, one_side, resonated, ringing_of
+from edgefilter.echo.knock_power import (
+    BAND_HZ,
+    BANDS,
+    DECAYS_MS,
+    Trigger,
+    colour_of_knocks,
+    find_knocks,
+    find_trigger,
+    one_side,
+    resonated,
+    ringing_of,
+)
 from edgefilter.echo.least_squares import absorbed, filtered
 from edgefilter.types import SAMPLE_RATE, Array, Samples
 
