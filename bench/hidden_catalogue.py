@@ -55,6 +55,8 @@ def bandlimit(rng: np.random.Generator, scene: Scene, chain: Chain, strength: st
         down = RATE * 0.46 / cutoff
         up = 60
         rate = round(up * down)
+        while math.gcd(up, rate) > 1:  # resample_poly would cancel the factor, and the taps would cut at another frequency
+            rate += 1
         taps = signal.firwin(60 * 20 + 1, 2 * cutoff / (RATE * up), window=("kaiser", rng.uniform(5, 9)))
         low = signal.resample_poly(chain.played, up, rate, window=taps)
         played = signal.resample_poly(low, rate, up, window=signal.firwin(20 * rate + 1, 2 * cutoff / (RATE * up), window=("kaiser", 7)))
