@@ -13,7 +13,7 @@ from edgefilter.delay_tracker import Measurement
 from edgefilter.echo.model import PRE_ROLL
 from edgefilter.errors import SignalError
 from edgefilter.jumps import JumpWitness
-from edgefilter.lag_search import LagSearch
+from edgefilter.lag_search import Candidate, LagSearch
 from edgefilter.paper_alignment import PaperAligner, paper_lag
 
 WITHIN = 0.3 * RATE  # the requirement: an utterance's lag is found within 300 ms of its onset at the microphone
@@ -136,6 +136,16 @@ def test_a_missed_look_or_another_suspicion_does_not_undo_a_jump_that_is_seen_ag
     witness.forget()
     assert not witness.convinced(look)
     assert not JumpWitness().convinced(replace(look, offset=5.0)) and JumpWitness().convinced(replace(look, offset=5.0, strength=13.0))
+
+
+def test_an_early_lag_that_chance_can_reach_has_to_be_found_twice_in_a_row():
+    aligner = Aligner(256)
+    aligner.step(np.zeros(256, np.float32), speech_like(np.random.default_rng(15), 1)[4000:4256])
+    doubtful = Candidate(lag=2000, strength=12.5, ratio=2.0, at=256, heard=1274)  # 25 of evidence; chance has reached 22
+    elsewhere, late = replace(doubtful, lag=2500), replace(doubtful, heard=5000)
+    assert not any(aligner._decide(found) for found in (doubtful, elsewhere, doubtful, late, late))
+    assert aligner._decide(replace(doubtful, lag=2001))
+    assert aligner.stats()["realignments"] == 1
 
 
 def test_no_step_of_a_search_comes_twice_in_a_hop():
