@@ -167,7 +167,8 @@ def markdown(result: dict, name: str) -> str:
         lines += [f"against a bypassed one, a block took {result['slower']:.2f} times as long in the second half as in the first."]
     else:
         deadline = result["deadline"]
-        lines += [f"{deadline['missed_deadlines']} of {deadline['hops']} hops missed their deadline, p99 {deadline['compute']['p99_ms']:.1f} ms."]
+        lines += [f"{deadline['missed_deadlines']} of {deadline['hops']} hops missed their deadline, p99 {deadline['compute']['p99_ms']:.1f} ms;"]
+        lines += [f"{deadline['steps']} steps down or up between engines to keep to {deadline['budget_ms']:g} ms, the engine above is the last."]
     lines += ["", f"Verdict: {'; '.join(result['troubles']) or 'nothing drifted'}.", ""]
     lines += ["| minute | memory MB | p50 | p99 | bypassed, ms per 20 ms block |", "| --- " * 5 + "|"]
     for part in result["slices"]:
@@ -186,11 +187,11 @@ def draw(result: dict, path: Path) -> None:
     timed = result["kind"] == "file"
     figure, axes = plt.subplots(1, 1 + timed, figsize=(5 + 5 * timed, 3.5), layout="constrained", squeeze=False)
     minutes = [part["seconds"] / 60 for part in result["slices"]]
-    axes[0, 0].plot(minutes, [part["memory_mb"] for part in result["slices"]], "o-")
-    axes[0, 0].set(title="resident memory", xlabel="minutes", ylabel="MB", ylim=(0, None))
-    if timed:
-        axes[0, 1].plot(minutes, [part["p50_ms"] / part["bypass_ms"] for part in result["slices"]], "o-")
-        axes[0, 1].set(title="median block over a bypassed one", xlabel="minutes", ylim=(0, None))
+    panels = [("resident memory, MB", [part["memory_mb"] for part in result["slices"]])]
+    panels += [("median block over a bypassed one", [part["p50_ms"] / part["bypass_ms"] for part in result["slices"]])] if timed else []
+    for axis, (title, values) in zip(axes[0], panels):
+        axis.plot(minutes, values, "o-")
+        axis.set(title=title, xlabel="minutes", ylim=(0, 1.2 * max(values)))
     figure.savefig(path, dpi=100)
     plt.close(figure)
 
