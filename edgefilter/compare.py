@@ -86,7 +86,7 @@ def describe(prepared: Prepared, prediction: Samples | None = None) -> Compariso
             for at in range(0, use.size, TIME_STEP)
             if use[at : at + TIME_STEP].any()
         ),
-        levels=_by_level(prediction, power),
+        levels=_by_level(prediction, whiten(prediction, psd), power),
         lags=_by_lag(white * use, whiten(measurement.reference, psd)),
         silence_excess_db=_db(np.mean(power[silent])) if silent.sum() > SAMPLE_RATE // 10 else float("nan"),
         human=prepared.human,
@@ -122,16 +122,17 @@ def _by_band(residual: Samples, psd: Samples, use: Array) -> tuple[tuple[float, 
     return tuple(found)
 
 
-def _by_level(prediction: Samples, power: Array) -> tuple[tuple[float, float, float], ...]:
-    """Excess by the level of the predicted voice in blocks of 20 ms."""
+def _by_level(prediction: Samples, white: Samples, power: Array) -> tuple[tuple[float, float, float], ...]:
+    """Excess by the level of the predicted voice in blocks of 20 ms, those in which it, whitened, is no less than the fan."""
     block = SAMPLE_RATE // 50
     count = prediction.size // block
-    level = 10 * np.log10(np.mean(prediction[: count * block].reshape(count, block).astype(np.float64) ** 2, axis=1) + 1e-12)
-    excess = power[: count * block].reshape(count, block).mean(axis=1)
+    voice, over_fan, excess = (x[: count * block].reshape(count, block) for x in (prediction.astype(float) ** 2, white.astype(float) ** 2, power))
+    level, excess = 10 * np.log10(voice.mean(axis=1) + 1e-12), excess.mean(axis=1)
     steps = np.floor(level / LEVEL_STEP_DB)
+    audible = np.isfinite(excess) & (over_fan.mean(axis=1) >= 1.0)
     found = []
-    for step in np.unique(steps[np.isfinite(excess) & (level > -100)]):
-        inside = (steps == step) & np.isfinite(excess)
+    for step in np.unique(steps[audible]):
+        inside = (steps == step) & audible
         if inside.sum() >= 5:
             found.append((float(step * LEVEL_STEP_DB), float((step + 1) * LEVEL_STEP_DB), _db(np.mean(excess[inside]))))
     return tuple(found)

@@ -8,14 +8,14 @@ from dataclasses import replace
 import numpy as np
 
 from edgefilter.compare import describe
-from edgefilter.echo.effect import complete, find
+from edgefilter.echo.effect import complete, find, whiten
 from edgefilter.echo.model import EchoModel
 from edgefilter.evidence import left_in_words, sentence
 from edgefilter.fan import look_at_fan
 from edgefilter.findings import Diagnosis, Finding, Interval
 from edgefilter.judge import Judge
 from edgefilter.prepare import BLOCK, Prepared
-from edgefilter.search import Found, Trial, floor_level
+from edgefilter.trials import Found, Trial, floor_level
 
 EXPLAINED_DB = 0.8
 """Excess up to which nothing is missing: what the fan of another day and a faint distortion leave."""
@@ -23,6 +23,10 @@ EXPLAINED = 0.45
 """Less of the excess level than this explained by all findings together is not what happened."""
 STILL_THERE = 0.6
 """Of the excess in dB, more than this left is not explained either."""
+PART, PART_LEVEL = 0.5, 0.3
+"""Share of the excess power and of its level that findings must explain to be named beside what none explains."""
+MUCH_DB = 3.0
+"""Over the silences: what the model of an effect that is really there does not leave."""
 UNPREDICTABLE = ("rattle", "bandlimit")
 """Effects whose own noise stays in the residual."""
 THIRDS_T = 1.69
@@ -32,23 +36,22 @@ THIRDS_T = 1.69
 def conclude(prepared: Prepared, found: Found, progress: Callable[[str], None] | None = None) -> Diagnosis:
     """The diagnosis that a search leads to; the fan is looked at behind what the search has taken out of the voice."""
     comparison = describe(prepared, found.base.prediction)
-    found, left = look_at_fan(prepared, found)
+    found, left = look_at_fan(found)
     remaining = found.final.excess_db
-    names = [step.name for step in found.steps]
-    unpredictable = bool(set(names) & set(UNPREDICTABLE))
+    unpredictable = any(step.name in UNPREDICTABLE for step in found.steps)
     believed = bool(found.steps) and (remaining < EXPLAINED_DB or _enough(prepared, found))
     quiet = found.base.excess_db < EXPLAINED_DB and not prepared.human
-    verdict = "missing" if believed else "explained" if quiet else "unexplained"
-    if not believed:
+    verdict = "missing" if believed and not _much_left(found) else "explained" if quiet else "unexplained"
+    if not believed and (quiet or not _partly(prepared, found)):
         found = replace(found, steps=(), final=found.base, model=found.start)
         remaining = found.base.excess_db
     return Diagnosis(
         verdict=verdict,
         comparison=comparison,
-        ranking=tuple(_findings(prepared, found, progress)),
+        ranking=tuple(_findings(found, progress)),
         evidence=left_in_words(prepared, found, left, remaining, EXPLAINED_DB),
         remaining_db=remaining,
-        irreducible_db=max(remaining, found.final.irreducible_db, 0.0) if unpredictable and believed else 0.0,
+        irreducible_db=max(remaining, found.final.irreducible_db, 0.0) if unpredictable and verdict == "missing" else 0.0,
         model=found.model,
     )
 
@@ -57,6 +60,22 @@ def _enough(prepared: Prepared, found: Found) -> bool:
     """Whether the findings explain so much that they are what happened."""
     explained = explained_level(prepared, found)
     return explained >= EXPLAINED and found.final.excess_db < STILL_THERE * found.base.excess_db
+
+
+def _partly(prepared: Prepared, found: Found) -> bool:
+    """Whether the findings explain enough to be named beside something that none explains."""
+    return _share(found.base.excess_db, found.final.excess_db) >= PART and explained_level(prepared, found) >= PART_LEVEL
+
+
+def _much_left(found: Found) -> bool:
+    """Whether the findings leave so much, also of the samples that they were fitted to, that something else is there besides.
+
+    What they leave of the others alone is how well a recording of that length teaches them.
+    """
+    measurement, silent = found.prepared.measurement, float(np.clip(found.final.silent_db, -0.5, 0.5))
+    fitted = whiten(measurement.recording - found.final.prediction, measurement.noise_psd)[measurement.fit & found.prepared.active]
+    fitted_db = 10 * np.log10(float(np.mean(fitted.astype(np.float64) ** 2)) + 1e-12) if fitted.size else 0.0
+    return min(fitted_db, found.final.active_db) - silent > MUCH_DB
 
 
 def explained_level(prepared: Prepared, found: Found) -> float:
@@ -75,14 +94,14 @@ def _share(before_db: float, after_db: float) -> float:
     return float(np.clip(1.0 - after / before, 0.0, 1.0)) if before > 0.0 else 0.0
 
 
-def _findings(prepared: Prepared, found: Found, progress: Callable[[str], None] | None) -> list[Finding]:
+def _findings(found: Found, progress: Callable[[str], None] | None) -> list[Finding]:
     """Strongest first; each with the excess before and after it in the order in which they were added."""
     findings, before = [], found.base.excess_db
     for step in found.steps:
         after = found.final.excess_db if step is found.steps[-1] else step.verdict.excess_db
         if progress:
             progress(f"how well {step.name} is known")
-        intervals = _intervals(prepared, found.model, step)
+        intervals = _intervals(found.prepared, found.model, step)
         findings.append(
             Finding(
                 effect=step.name,
@@ -116,8 +135,9 @@ def _intervals(prepared: Prepared, model: EchoModel, step: Trial) -> Mapping[str
 
 
 def _interval(value: np.ndarray, fits: list[np.ndarray], unit: str) -> Interval:
+    """From the scatter of the fits, and from how far their mean is off: what a third teaches otherwise than the half is known no better."""
     alike = [fit for fit in fits if fit.shape == value.shape]
-    spread = THIRDS_T * np.std(alike, axis=0, ddof=1) if len(alike) > 1 else np.zeros_like(value)
+    spread = np.hypot(THIRDS_T * np.std(alike, axis=0, ddof=1), np.mean(alike, axis=0) - value) if len(alike) > 1 else np.zeros_like(value)
     low, high = value - spread, value + spread
     if value.ndim == 0:
         return Interval(float(value), float(low), float(high), unit)

@@ -7,7 +7,7 @@ import numpy as np
 from edgefilter.echo.effect import Values
 from edgefilter.leftover import Leftover
 from edgefilter.prepare import Prepared
-from edgefilter.search import Found, Trial
+from edgefilter.trials import Found, Trial
 from edgefilter.types import SAMPLE_RATE
 
 

@@ -27,6 +27,9 @@ FAN_TOLERANCE_DB = 1.0
 TALK_DB = 8.0
 """Over the fan: more than a reverberation tail in a pause, less than a soft voice at two metres."""
 GAP_S, EDGE_S = 1.0, 0.2
+CUT, CUT_DB, TAIL_S = 32, -30.0, 0.3
+"""A reference begins or ends in the middle of a word where that many samples at its end are no further below its loudest 20 ms; what was said before
+still sounds for TAIL_S."""
 PAUSE_S, LAG_STEP = 0.5, 480
 """Silence of the reference after which a player may have started anew, and samples (30 ms) by which the lag must differ then."""
 MIN_SECONDS = 1.0
@@ -79,7 +82,8 @@ def prepare(profile: Profile, recording: Samples, reference: Samples, *, sample_
     known = expected_noise(profile)
     offset = starting_offset(whiten(predicted, known), whiten(y, known))
     pieces = utterance_lags(x, predicted, y, known, offset)
-    x = sum(shift(np.where((np.arange(n) >= begin) & (np.arange(n) < end), x, np.float32(0)), start + lag) for begin, end, lag in pieces)
+    begin, end = known_span(x, start + pieces[0][2], start + pieces[-1][2])
+    x = sum(shift(np.where((np.arange(n) >= first) & (np.arange(n) < last), x, np.float32(0)), start + lag) for first, last, lag in pieces)
     predicted = profile.echo.predict(x)
     white = whiten(predicted, known).astype(np.float64)
     block = SAMPLE_RATE // 50
@@ -90,13 +94,32 @@ def prepare(profile: Profile, recording: Samples, reference: Samples, *, sample_
     psd = known * np.float32(fan_scale(whiten(y, known)[~active]))
     human = find_talk(quiet * (known[1] / psd[1]), active)
     usable = np.ones(n, bool)
-    for begin, end in human:
-        usable[round(begin * SAMPLE_RATE) : round(end * SAMPLE_RATE)] = False
-    warnings = tuple(f"somebody talks at {begin:.1f} to {end:.1f} s: left out" for begin, end in human)
+    for first, last in human:
+        usable[round(first * SAMPLE_RATE) : round(last * SAMPLE_RATE)] = False
+    warnings = tuple(f"somebody talks at {first:.1f} to {last:.1f} s: left out" for first, last in human)
+    if end - begin < n and end - begin > n // 2:
+        usable[:begin], usable[end:] = False, False
+        warnings += (f"the reference is cut in the middle of a word: only {begin / SAMPLE_RATE:.1f} to {end / SAMPLE_RATE:.1f} s are looked at",)
     if len(pieces) > 1:
-        lags = ", ".join(f"{lag:.1f} from {begin / SAMPLE_RATE:.1f} s" for begin, _, lag in pieces)
+        lags = ", ".join(f"{lag:.1f} from {first / SAMPLE_RATE:.1f} s" for first, _, lag in pieces)
         warnings += (f"the utterances lag by different numbers of samples: {lags}; aligned one by one",)
     return Prepared(Measurement(x, y, psd, fit & usable), predicted, usable, active, offset, human, warnings)
+
+
+def known_span(x: Samples, first_lag: float, last_lag: float) -> tuple[int, int]:
+    """(begin, end) samples of a recording (n,) of which the reference x (n,) knows what the robot says.
+
+    first_lag, last_lag: of the recording behind x. What was said before a reference that begins in the middle of a word, and after one
+    that ends there, is heard but unknown.
+    """
+    n, block = x.size, SAMPLE_RATE // 50
+    loud = 10 ** (CUT_DB / 10) * float(np.max(np.add.reduceat(x.astype(np.float64) ** 2, np.arange(0, n, block)) / block))
+    said = np.flatnonzero(x)
+    stop = int(said[-1]) + 1 if said.size else 0
+    begins, ends = (float(np.mean(x[part].astype(np.float64) ** 2)) > loud for part in (slice(0, CUT), slice(max(stop - CUT, 0), max(stop, 1))))
+    begin = max(round(first_lag + TAIL_S * SAMPLE_RATE), 0) if begins else 0
+    end = min(max(round(stop + last_lag), 0), n) if ends else n
+    return min(begin, end), end
 
 
 def utterance_lags(x: Samples, predicted: Samples, recording: Samples, psd: Samples, offset: float) -> list[tuple[int, int, float]]:

@@ -1,168 +1,113 @@
-"""The search for missing effects: try all, accept the best, look again, take back what has become superfluous."""
+"""The search for missing effects: try all, accept the best, look again, take back what has become superfluous or was taken for another."""
 
 from __future__ import annotations
 
-import warnings
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator
 
-import numpy as np
-
-from edgefilter.echo.effect import Values, complete, find, names, whiten
-from edgefilter.echo.effect import neutral as neutral_values
 from edgefilter.echo.model import EchoModel
-from edgefilter.errors import UsageError
-from edgefilter.judge import Judge, Verdict
+from edgefilter.fan import changed_fan
 from edgefilter.prepare import Prepared
+from edgefilter.settle import settle, simpler_beside
 from edgefilter.suspects import OWN, SUSPECTS, choose
-from edgefilter.types import SAMPLE_RATE, Samples
+from edgefilter.trials import LAST, Found, Trial, Workbench
 
 MOST_EFFECTS = 3
-LAST, ENOUGH = ("rattle",), 0.4
-"""Effects whose fit takes long, and the share of the excess level at which another one has explained it."""
-SCREEN_DB = 0.2
-"""Where the residual is no more than this above that of the robot's silences, there is nothing of the voice in it; half a dB
-over the fan in these is ordinary, more of it may be a microphone's gain."""
+SCREEN_DB, SCREEN_AGAIN_DB = 0.2, 0.6
+"""Where the residual is no more than this above that of the robot's silences, there is nothing of the voice in it, or nothing beside an effect that
+was found, whose model errs a little; half a dB over the fan in the silences is ordinary, more of it may be a microphone's gain."""
 SECOND_SHARE = 0.2
 """Of the excess level that is left, a further effect has to explain at least this share: less is how the first one's model errs."""
-
-
-@dataclass(frozen=True, eq=False)
-class Trial:
-    """One effect added to a model: its values, the model with it, what the judge says, and its size over the fan in dB."""
-
-    name: str
-    values: Values
-    model: EchoModel
-    verdict: Verdict
-    gain_db: float
-    size_db: float
-
-
-@dataclass(frozen=True, eq=False)
-class Found:
-    """The outcome of a search from a start model. steps: the accepted effects in their order."""
-
-    start: EchoModel
-    model: EchoModel
-    base: Verdict
-    final: Verdict
-    steps: tuple[Trial, ...]
+STARTS, START_SHARE = 2, 0.1
+"""Further effects to begin with where the best one has not led to an explanation, and the share of the level that each must explain by itself."""
+NEARLY = 0.85
+"""Share of the level that is explained where no other start is tried."""
+BETTER = 0.05
+"""Of the level explained, what another start must explain more to be preferred."""
 
 
 def search(prepared: Prepared, model: EchoModel, progress: Callable[[str], None] | None = None) -> Found:
-    """Add effects to model as long as held-out samples say that they are there."""
-    judge = Judge(prepared)
-    start = model
-    base = current = judge.of(model)
-    steps: list[Trial] = []
-    while len(steps) < MOST_EFFECTS and current.active_db - float(np.clip(current.silent_db, -0.5, 0.5)) > SCREEN_DB:
-        left = max(current.level_db - floor_level(judge, current), 0.0)
-        trials = _try_all(prepared, model, judge, current, left, progress)
-        admissible = {t.name: t for t in trials if _admissible(t, judge, current) and (not steps or t.gain_db >= SECOND_SHARE * left)}
+    """Add effects to model as long as held-out samples say that they are there.
+
+    Greedy from the effect that explains most by itself, and where that does not lead to an explanation from the next ones: of two
+    effects at once, the louder may hide what speaks for the other, and a third may look most like both.
+    """
+    bench, start = Workbench(prepared, progress), model
+    base = bench.verdict(model)
+    fan = changed_fan(prepared, model, base)
+    if fan is not None:
+        prepared, step = fan
+        bench, model = Workbench(prepared, progress), step.model
+    runs: list[EchoModel] = []
+    for first in _starts(bench, model):
+        runs.append(_grow(bench, model, first))
+        if bench.heard(runs[-1]) <= SCREEN_AGAIN_DB or bench.left(runs[-1]) <= (1.0 - NEARLY) * bench.left(model):
+            break
+    best = _best(bench, model, runs)
+    steps = _in_steps(bench, model, best)
+    return Found(prepared, start, best, base, bench.verdict(best), ((step, *steps) if fan is not None else steps))
+
+
+def _starts(bench: Workbench, model: EchoModel) -> Iterator[Trial]:
+    """The trial to begin with, then others that explain a good part, named or not, since what hides them may be found beside them."""
+    if bench.heard(model) <= SCREEN_DB:
+        return
+    trials = bench.attempt_all(model)
+    admissible = {t.name: t for t in trials if bench.admissible(t, model)}
+    name = choose({key: trial.gain_db for key, trial in admissible.items()})
+    if name is not None:
+        yield admissible[name]
+    least = max(START_SHARE * bench.left(model), 0.1)
+    others = sorted((t for t in trials if t.name != name and t.name not in LAST and t.gain_db >= least), key=lambda t: -t.gain_db)
+    yield from others[:STARTS]
+
+
+def _grow(bench: Workbench, start: EchoModel, first: Trial) -> EchoModel:
+    """The model with first and all that can be named beside it."""
+    model = simpler_beside(bench, start, first.model)
+    while _count(start, model) < MOST_EFFECTS and bench.heard(model) > SCREEN_AGAIN_DB:
+        least = SECOND_SHARE * bench.left(model)
+        admissible = {t.name: t for t in bench.attempt_all(model) if t.gain_db >= least and bench.admissible(t, model)}
         name = choose({key: trial.gain_db for key, trial in admissible.items()})
         if name is None:
             break
-        steps.append(admissible[name])
-        model, current = admissible[name].model, admissible[name].verdict
-        if len(steps) > 1:
-            model, current, steps = _settle(prepared, judge, model, current, steps, progress)
-    return Found(start, model, base, current, tuple(steps))
+        model, before = settle(bench, start, admissible[name].model), model
+        model = simpler_beside(bench, start, model)
+        if bench.verdict(model).level_db >= bench.verdict(before).level_db:
+            model = before
+            break
+    return model
 
 
-def _try_all(
-    prepared: Prepared, model: EchoModel, judge: Judge, current: Verdict, left: float, progress: Callable[[str], None] | None
-) -> list[Trial]:
-    """Each effect that the model has not; the LAST ones only where none of the others explains nearly all of what is left."""
-    trials: list[Trial] = []
-    wanted = [name for name in names() if find(name).stage != "noise" and name not in dict(model.effects)]
-    for name in sorted(wanted, key=lambda name: name in LAST):
-        if name in LAST and any(t.gain_db > ENOUGH * left and _admissible(t, judge, current) for t in trials):
-            continue
-        trial = _try(name, prepared, model, judge, current, progress)
-        if trial is not None:
-            trials.append(trial)
-    return trials
+def _count(start: EchoModel, model: EchoModel) -> int:
+    return len(model.effects) - len(start.effects)
 
 
-def predict(model: EchoModel, prepared: Prepared) -> Samples:
-    """(n,) of the model for the prepared reference."""
-    return model.predict(prepared.measurement.reference)
+def _best(bench: Workbench, start: EchoModel, runs: list[EchoModel]) -> EchoModel:
+    """The run that explains most of those whose effects can all be named; the earlier and simpler one where others hardly explain more."""
+    base = bench.verdict(start).level_db
+    valid = [run for run in runs if all(_stands(bench, run, name) for name, _ in run.effects[len(start.effects) :])]
+    best = start
+    for run in sorted(valid, key=lambda run: sum(SUSPECTS.get(name, OWN).complexity for name, _ in run.effects[len(start.effects) :])):
+        most = base - bench.verdict(best).level_db
+        if base - bench.verdict(run).level_db > most + BETTER * abs(most):
+            best = run
+    return best
 
 
-def floor_level(judge: Judge, verdict: Verdict) -> float:
-    """Level in dB of the cells in which the robot is silent, 0 where it never is: what is left when everything is explained."""
-    quiet = verdict.cells[~judge.active_cells]
-    if quiet.shape[0] < 4:
-        return 0.0
-    return float(np.average(10 * np.log10(np.maximum(quiet, 1e-3)).mean(axis=0), weights=judge.freedom))
+def _stands(bench: Workbench, model: EchoModel, name: str) -> bool:
+    """Whether an effect can be named beside the model's others."""
+    others = model.without_effect(name)
+    return bench.admissible(bench.beside(name, others, model), others)
 
 
-def _try(
-    name: str, prepared: Prepared, model: EchoModel, judge: Judge, before: Verdict, progress: Callable[[str], None] | None
-) -> Trial | None:
-    if progress:
-        progress(f"trying {name}")
-    effect = find(name)
-    try:
-        values = complete(effect, effect.fit(prepared.measurement, model))
-    except (UsageError, ArithmeticError, np.linalg.LinAlgError) as error:
-        warnings.warn(f"{name} could not be fitted and is left out: {error}", stacklevel=2)
-        return None
-    if all(np.array_equal(values[key], neutral) for key, neutral in neutral_values(effect).items()):
-        return None
-    fitted = model.with_effect(name, values)
-    verdict = judge.of(fitted)
-    size = max(size_db(verdict.prediction - before.prediction, prepared), noise_size_db(fitted, prepared))
-    return Trial(name, values, fitted, verdict, before.level_db - verdict.level_db, size)
-
-
-def size_db(change: Samples, prepared: Prepared) -> float:
-    """Power of a change of the prediction (n,) over the fan in dB: as it is or whitened, whichever is more."""
-    psd = prepared.measurement.noise_psd
-    fan = float(psd.sum()) * 8000.0 / (psd.size - 1)
-    plain, white = float(np.mean(change.astype(float) ** 2)) / fan, float(np.mean(whiten(change, psd).astype(float) ** 2))
-    return float(10 * np.log10(max(plain, white, 1e-12)))
-
-
-def noise_size_db(model: EchoModel, prepared: Prepared) -> float:
-    """Mean power over the fan, in dB, of what the model says that no waveform predicts."""
-    psd = prepared.measurement.noise_psd
-    fan = float(psd.sum()) * (SAMPLE_RATE / 2) / (psd.size - 1)
-    power = sum(float(np.mean(variance)) for variance, _ in model.unpredictable(prepared.measurement.reference))
-    return float(10 * np.log10(max(power / fan, 1e-12)))
-
-
-def _admissible(trial: Trial, judge: Judge, before: Verdict) -> bool:
-    rule = SUSPECTS.get(trial.name, OWN)
-    if trial.gain_db < rule.least_gain_db or trial.size_db < rule.least_size_db:
-        return False
-    return rule.guard is None or rule.guard(trial.values, judge, before, trial.verdict)
-
-
-def _settle(
-    prepared: Prepared, judge: Judge, model: EchoModel, current: Verdict, steps: list[Trial], progress: Callable[[str], None] | None
-) -> tuple[EchoModel, Verdict, list[Trial]]:
-    """Fit the earlier effects again beside the new one; drop those without which the rest explains as much."""
-    for earlier in steps[:-1]:
-        again = _try(earlier.name, prepared, model.without_effect(earlier.name), judge, current, progress)
-        if again is not None and again.verdict.level_db < current.level_db:
-            model, current = again.model, again.verdict
-    for step in list(steps[:-1]):
-        newest = steps[-1].name
-        alone = _try(newest, prepared, model.without_effect(step.name).without_effect(newest), judge, current, progress)
-        rule = SUSPECTS.get(step.name, OWN)
-        if alone is not None and -alone.gain_db < rule.least_gain_db:
-            model, current = alone.model, alone.verdict
-            steps = [kept for kept in steps if kept.name != step.name]
-    return model, current, _judged_again(prepared, judge, model, steps)
-
-
-def _judged_again(prepared: Prepared, judge: Judge, model: EchoModel, steps: list[Trial]) -> list[Trial]:
-    """The steps with the values that they have in the end, each judged beside those before it."""
-    settled = []
-    for step in reversed(steps):
-        values = dict(model.effects)[step.name]
-        settled.append(replace(step, values=values, model=model, verdict=judge.of(model)))
-        model = model.without_effect(step.name)
-    return settled[::-1]
+def _in_steps(bench: Workbench, start: EchoModel, model: EchoModel) -> tuple[Trial, ...]:
+    """The effects that a model has beyond the start, each with what it explains beside those before it, the largest first."""
+    names, steps = [name for name, _ in model.effects[len(start.effects) :]], []
+    values, model = dict(model.effects), start
+    while names:
+        tries = {name: model.with_effect(name, values[name]) for name in names}
+        name = min(tries, key=lambda name: bench.verdict(tries[name]).level_db)
+        steps.append(bench.beside(name, model, tries[name]))
+        model = tries[name]
+        names.remove(name)
+    return tuple(steps)

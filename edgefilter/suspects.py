@@ -66,7 +66,7 @@ def _drifts(values: Values, *_: object) -> bool:
 
 
 def _rings(values: Values, *_: object) -> bool:
-    return float(values["q"]) >= 4.0 and 60.0 <= float(values["frequency_hz"]) <= 7000.0
+    return float(values["q"]) > 4.2 and 62.0 <= float(values["frequency_hz"]) <= 6800.0
 
 
 def _clean_before(values: Values, judge: Judge, before: Verdict, after: Verdict) -> bool:

@@ -32,6 +32,8 @@ NUDGE = np.array([0.5, 0.03, 0.15, 0.15])
 LARGEST = np.array([4.0, 0.3, 1.0, 1.0])
 LOWEST = np.array([-80.0, 0.0, np.log(0.3), np.log(5.0)])
 HIGHEST = np.array([0.0, STEEPEST, np.log(200.0), np.log(5000.0)])
+TIMED = ("clock_drift", "delay_jump", "path_change", "mic_agc")
+"""Effects that know what time it is: with one of them the first stretch of a recording is fitted, not the loudest."""
 
 
 class Compression:
@@ -73,7 +75,7 @@ class Compression:
 
         No compression where four numbers do not pay for themselves by Bayes' information criterion.
         """
-        part, fit = _loudest(measurement)
+        part, fit = _loudest(measurement, any(name in TIMED for name, _ in model.effects))
         x, target = measurement.reference[part], measurement.whiten(measurement.recording[part])
         blocks = np.square(x[: x.size // 320 * 320], dtype=np.float64).reshape(-1, 320).mean(axis=1)
         loud_db = 10.0 * np.log10(float(np.max(blocks, initial=0.0)) + 1e-9)
@@ -119,12 +121,12 @@ def _values(unknowns: Array) -> dict[str, float]:
     return {"threshold_db": threshold, "ratio": 1.0 / (1.0 - slope), "attack_ms": attack_ms, "release_ms": release_ms}
 
 
-def _loudest(measurement: Measurement) -> tuple[slice, np.ndarray]:
-    """The stretch with most energy, and its samples to fit on less the first half second, in which the level settles."""
+def _loudest(measurement: Measurement, first: bool) -> tuple[slice, np.ndarray]:
+    """The stretch with most energy, or the first one, and its samples to fit on less the first half second, in which the level settles."""
     x = measurement.reference
     fit = np.ones(x.size, bool) if measurement.fit is None else measurement.fit
     start = 0
-    if x.size > EXCERPT:
+    if x.size > EXCERPT and not first:
         energy = np.concatenate(([0.0], np.cumsum(x.astype(np.float64) ** 2)))
         start = int(np.argmax(energy[EXCERPT:] - energy[:-EXCERPT]))
     part = slice(start, start + EXCERPT)

@@ -1,0 +1,94 @@
+"""Several effects at once: fitted again beside each other, exchanged for simpler ones, dropped where the others explain as much."""
+
+from __future__ import annotations
+
+from edgefilter.echo.model import EchoModel
+from edgefilter.suspects import OWN, SUSPECTS, choose
+from edgefilter.trials import LAST, Workbench
+
+ROUNDS, WORTH_DB = 3, 0.02
+"""Rounds of fitting each effect beside the others, and the fall in level below which no further one is worth its time."""
+FLEXIBLE = ("late_reverb", "path_change", "bandlimit", "speaker_nonlinearity", "compression", "mic_agc")
+"""Effects with so many numbers that they take up what a simpler one beside them does."""
+SIMPLE = 1
+"""Complexity up to which an effect is simple beside any of those."""
+CONFIRMED = 0.1
+"""Of the level that a flexible effect leaves, what a simpler one beside it must explain."""
+
+
+def settle(bench: Workbench, start: EchoModel, model: EchoModel) -> EchoModel:
+    """The model with its effects beyond start fitted beside each other; exchanged or dropped where that is simpler and explains as much."""
+    *earlier, newest = (name for name, _ in model.effects[len(start.effects) :])
+    model = refit(bench, start, model)
+    for name in earlier:
+        model = _exchange(bench, start, model, name)
+    return _drop(bench, model, [name for name in earlier if name in dict(model.effects)], newest)
+
+
+def refit(bench: Workbench, start: EchoModel, model: EchoModel) -> EchoModel:
+    """Each effect beyond start fitted beside the others, in turn, as long as the held-out level falls."""
+    names = [name for name, _ in model.effects[len(start.effects) :]]
+    if len(names) < 2:
+        return model
+    waiting = names[:-1]
+    for _ in range(ROUNDS):
+        before = bench.verdict(model).level_db
+        for name in waiting:
+            again = bench.attempt(name, model.without_effect(name))
+            if again is not None and again.verdict.level_db < bench.verdict(model).level_db:
+                model = again.model
+        if before - bench.verdict(model).level_db < WORTH_DB:
+            break
+        waiting = names
+    return model
+
+
+def _exchange(bench: Workbench, start: EchoModel, model: EchoModel, name: str) -> EchoModel:
+    """The model with another effect instead of that one where, beside the others, the other is the one to name."""
+    others = model.without_effect(name)
+    trials = {t.name: t for t in bench.attempt_all(others, _complexity(name)) if t.name not in LAST and bench.admissible(t, others)}
+    trials[name] = bench.beside(name, others, model)
+    chosen = choose({key: trial.gain_db for key, trial in trials.items()})
+    if chosen is None or chosen == name:
+        return model
+    changed = refit(bench, start, trials[chosen].model)
+    most = bench.verdict(others).level_db - bench.verdict(model).level_db
+    return changed if bench.verdict(others).level_db - bench.verdict(changed).level_db > 0.85 * most else model
+
+
+def _drop(bench: Workbench, model: EchoModel, earlier: list[str], newest: str) -> EchoModel:
+    """The model without the earlier effects that the newest one, fitted without them, explains as well."""
+    for name in earlier:
+        alone = bench.attempt(newest, model.without_effect(name).without_effect(newest))
+        rule = SUSPECTS.get(name, OWN)
+        if alone is not None and alone.verdict.level_db - bench.verdict(model).level_db < rule.least_gain_db:
+            model = alone.model
+    return model
+
+
+def simpler_beside(bench: Workbench, start: EchoModel, model: EchoModel) -> EchoModel:
+    """The model with a simpler effect beside a flexible one where both together explain more than the flexible one alone."""
+    for name in [name for name, _ in model.effects[len(start.effects) :] if name in FLEXIBLE]:
+        if _count(start, model) > 2:
+            break
+        others = model.without_effect(name)
+        simple = [t for t in bench.attempt_all(others, max(_complexity(name) - 1, SIMPLE)) if t.name not in FLEXIBLE and bench.admissible(t, others)]
+        least = max(CONFIRMED * bench.left(model), 0.05)
+        for trial in sorted(simple, key=lambda t: -t.gain_db)[:2]:
+            both = bench.attempt(name, trial.model)
+            if both is None or not bench.admissible(both, trial.model):
+                continue
+            joint = refit(bench, start, both.model)
+            confirmed = bench.beside(trial.name, model, joint)
+            if confirmed.gain_db >= least and bench.admissible(confirmed, joint.without_effect(trial.name)):
+                model = joint
+                break
+    return model
+
+
+def _complexity(name: str) -> int:
+    return SUSPECTS.get(name, OWN).complexity
+
+
+def _count(start: EchoModel, model: EchoModel) -> int:
+    return len(model.effects) - len(start.effects)

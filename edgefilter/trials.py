@@ -1,0 +1,158 @@
+"""One effect tried on a model of a recording: what it explains on held-out samples, and whether that is enough to name it."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TypeAlias
+
+import numpy as np
+
+from edgefilter.echo.effect import Values, complete, find, names, whiten
+from edgefilter.echo.effect import neutral as neutral_values
+from edgefilter.echo.model import EchoModel
+from edgefilter.errors import UsageError
+from edgefilter.judge import Judge, Verdict
+from edgefilter.prepare import Prepared
+from edgefilter.suspects import OWN, SUSPECTS
+from edgefilter.types import SAMPLE_RATE, Samples
+
+LAST, ENOUGH, LITTLE_DB = ("rattle",), 0.4, 0.1
+"""Effects whose fit takes long: tried where no other explains this share of the level above the silences, and where that is no less than so much."""
+
+Signature: TypeAlias = tuple[tuple[str | bytes, ...], ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Trial:
+    """One effect added to a model: its values, the model with it, what the judge says, and its size over the fan in dB."""
+
+    name: str
+    values: Values
+    model: EchoModel
+    verdict: Verdict
+    gain_db: float
+    size_db: float
+
+
+@dataclass(frozen=True, eq=False)
+class Found:
+    """The outcome of a search from a start model. steps: the accepted effects in their order.
+
+    prepared: what final was judged on; its fan is another than at the calibration where fan_noise is the first of the steps.
+    """
+
+    prepared: Prepared
+    start: EchoModel
+    model: EchoModel
+    base: Verdict
+    final: Verdict
+    steps: tuple[Trial, ...]
+
+
+class Workbench:
+    """Tries effects on models of one prepared recording and remembers what came of it."""
+
+    def __init__(self, prepared: Prepared, progress: Callable[[str], None] | None = None) -> None:
+        self.prepared = prepared
+        self.judge = Judge(prepared)
+        self._progress = progress
+        self._verdicts: dict[Signature, Verdict] = {}
+        self._trials: dict[tuple[Signature, str], Trial | None] = {}
+
+    def verdict(self, model: EchoModel) -> Verdict:
+        """What the judge says of a model."""
+        key = signature(model)
+        if key not in self._verdicts:
+            self._verdicts[key] = self.judge.of(model)
+        return self._verdicts[key]
+
+    def heard(self, model: EchoModel) -> float:
+        """dB over the robot's silences, of half a dB either way, that a model leaves while the robot is heard."""
+        verdict = self.verdict(model)
+        return verdict.active_db - float(np.clip(verdict.silent_db, -0.5, 0.5))
+
+    def left(self, model: EchoModel) -> float:
+        """Level in dB over that of the silences."""
+        verdict = self.verdict(model)
+        return max(verdict.level_db - floor_level(self.judge, verdict), 0.0)
+
+    def attempt(self, name: str, model: EchoModel) -> Trial | None:
+        """The effect of that name fitted beside what the model has; None where its fit finds nothing."""
+        key = signature(model), name
+        if key not in self._trials:
+            self._trials[key] = self._attempt(name, model)
+        return self._trials[key]
+
+    def _attempt(self, name: str, model: EchoModel) -> Trial | None:
+        if self._progress:
+            self._progress(f"trying {name}")
+        effect = find(name)
+        try:
+            values = complete(effect, effect.fit(self.prepared.measurement, model))
+        except (UsageError, ArithmeticError, np.linalg.LinAlgError) as error:
+            warnings.warn(f"{name} could not be fitted and is left out: {error}", stacklevel=2)
+            return None
+        if all(np.array_equal(values[key], neutral) for key, neutral in neutral_values(effect).items()):
+            return None
+        return self.beside(name, model, model.with_effect(name, values))
+
+    def beside(self, name: str, others: EchoModel, model: EchoModel) -> Trial:
+        """What the effect of that name explains that model has and others has not."""
+        before, after = self.verdict(others), self.verdict(model)
+        size = max(size_db(after.prediction - before.prediction, self.prepared), noise_size_db(name, model, self.prepared))
+        return Trial(name, dict(model.effects)[name], model, after, before.level_db - after.level_db, size)
+
+    def attempt_all(self, model: EchoModel, most: int = 9) -> list[Trial]:
+        """Each effect that the model has not and whose complexity is at most `most`.
+
+        The LAST ones only where none of the others explains nearly all of what is left.
+        """
+        wanted = [name for name in names() if find(name).stage != "noise" and name not in dict(model.effects)]
+        wanted = [name for name in wanted if SUSPECTS.get(name, OWN).complexity <= most]
+        found, left = [], self.left(model)
+        for name in sorted(wanted, key=lambda name: name in LAST):
+            if name in LAST and (left < LITTLE_DB or any(t.gain_db > ENOUGH * left and self.admissible(t, model) for t in found)):
+                continue
+            if (trial := self.attempt(name, model)) is not None:
+                found.append(trial)
+        return found
+
+    def admissible(self, trial: Trial, model: EchoModel) -> bool:
+        """Whether a trial on a model explains enough to be named, and its values look like that effect."""
+        rule = SUSPECTS.get(trial.name, OWN)
+        if trial.gain_db < rule.least_gain_db or trial.size_db < rule.least_size_db:
+            return False
+        return rule.guard is None or rule.guard(trial.values, self.judge, self.verdict(model), trial.verdict)
+
+
+def signature(model: EchoModel) -> Signature:
+    """By which models with the same effects at the same values are known, in whichever order these were fitted."""
+    return tuple(sorted((name, *(np.asarray(value, float).tobytes() for _, value in sorted(values.items()))) for name, values in model.effects))
+
+
+def floor_level(judge: Judge, verdict: Verdict) -> float:
+    """Level in dB of the cells in which the robot is silent, 0 where it never is: what is left when everything is explained."""
+    quiet = verdict.cells[~judge.active_cells]
+    if quiet.shape[0] < 4:
+        return 0.0
+    return float(np.average(10 * np.log10(np.maximum(quiet, 1e-3)).mean(axis=0), weights=judge.freedom))
+
+
+def size_db(change: Samples, prepared: Prepared) -> float:
+    """Power of a change of the prediction (n,) over the fan in dB: as it is or whitened, whichever is more."""
+    psd = prepared.measurement.noise_psd
+    fan = float(psd.sum()) * (SAMPLE_RATE / 2) / (psd.size - 1)
+    plain, white = float(np.mean(change.astype(float) ** 2)) / fan, float(np.mean(whiten(change, psd).astype(float) ** 2))
+    return float(10 * np.log10(max(plain, white, 1e-12)))
+
+
+def noise_size_db(name: str, model: EchoModel, prepared: Prepared) -> float:
+    """Mean power over the fan, in dB, of what the model says of that effect that no waveform predicts."""
+    if not hasattr(find(name), "variance"):
+        return -120.0
+    psd = prepared.measurement.noise_psd
+    fan = float(psd.sum()) * (SAMPLE_RATE / 2) / (psd.size - 1)
+    power = sum(float(np.mean(variance)) for variance, _ in model.unpredictable(prepared.measurement.reference))
+    return float(10 * np.log10(max(power / fan, 1e-12)))
