@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import numpy as np
+
+from edgefilter.echo.bandlimit import measured_response_db
 from edgefilter.echo.model import EchoModel
 from edgefilter.suspects import OWN, SUSPECTS, choose
 from edgefilter.trials import LAST, Workbench
@@ -12,6 +15,8 @@ FLEXIBLE = ("late_reverb", "path_change", "bandlimit", "speaker_nonlinearity", "
 """Effects with so many numbers that they take up what a simpler one beside them does."""
 SIMPLE = 1
 """Complexity up to which an effect is simple beside any of those."""
+PASSED_HZ, HEARD_DB = 300.0, 0.4
+"""From where on a band limit passes the voice, and the gain there that is more than an ordinary tolerance and the fit's error."""
 CONFIRMED = 0.1
 """Of the level that a flexible effect leaves, what a simpler one beside it must explain."""
 
@@ -66,8 +71,23 @@ def _drop(bench: Workbench, model: EchoModel, earlier: list[str], newest: str) -
     return model
 
 
+def _volume_beside(bench: Workbench, model: EchoModel) -> EchoModel:
+    """The model with the gain that a band limit's filter has in its passband as a turned volume beside it, where that explains as much."""
+    values = dict(model.effects).get("bandlimit")
+    if values is None or "playback_gain" in dict(model.effects):
+        return model
+    hz, gain_db = measured_response_db(values)
+    passed = gain_db[(hz > PASSED_HZ) & (hz < 0.6 * float(values["cutoff_hz"]))]
+    if not passed.size or abs(float(np.median(passed))) < HEARD_DB or float(np.std(passed)) > 0.75 * HEARD_DB:
+        return model
+    louder = model.without_effect("bandlimit").with_effect("playback_gain", {"gain_db": float(np.median(passed))})
+    both = bench.attempt("bandlimit", louder)
+    return both.model if both is not None and both.verdict.level_db < bench.verdict(model).level_db + WORTH_DB else model
+
+
 def simpler_beside(bench: Workbench, start: EchoModel, model: EchoModel) -> EchoModel:
     """The model with a simpler effect beside a flexible one where both together explain more than the flexible one alone."""
+    model = _volume_beside(bench, model)
     for name in [name for name, _ in model.effects[len(start.effects) :] if name in FLEXIBLE]:
         if _count(start, model) > 2:
             break
