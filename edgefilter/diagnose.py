@@ -5,12 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 
-from edgefilter.compare import Comparison, describe
+from edgefilter.compare import Comparison, compare, describe
 from edgefilter.conclude import conclude
-from edgefilter.echo.effect import find
 from edgefilter.findings import Diagnosis, Finding, Interval
 from edgefilter.judge import Judge
-from edgefilter.prepare import expected_noise, prepare
+from edgefilter.prepare import prepare
 from edgefilter.profile import Profile
 from edgefilter.search import search
 from edgefilter.types import SAMPLE_RATE, Samples
@@ -40,14 +39,10 @@ def add(
 ) -> tuple[Profile, Comparison, Comparison]:
     """Fit the effect of that name to a recording and write it into a new profile; the comparisons are those before and after.
 
-    The comparison after says how well a fit to half of the recording, in blocks, predicts the other half; what is written is fitted to
-    all of it, which predicts other recordings better.
+    Fitted to all of the recording: that predicts other recordings of the robot better than the fit to half of it by which diagnose()
+    judges. So the comparison after, of this recording, is of samples that the fit has used.
     """
     prepared = prepare(profile, recording, reference, sample_rate=sample_rate)
-    judge, measurement = Judge(prepared), prepared.measurement
-    before = describe(prepared, judge.correct(prepared.prediction))
-    judged = profile.with_echo(profile.echo.fit(name, measurement))
-    written = profile.with_echo(profile.echo.fit(name, replace(measurement, fit=prepared.usable)))
-    now = replace(prepared, measurement=replace(measurement, noise_psd=expected_noise(judged))) if find(name).stage == "noise" else prepared
-    verdict = Judge(now).judge(judged.echo.predict(measurement.reference))
-    return written, before, replace(describe(now, verdict.prediction), excess_db=verdict.excess_db)
+    before = describe(prepared, Judge(prepared).correct(prepared.prediction))
+    fitted = profile.with_echo(profile.echo.fit(name, replace(prepared.measurement, fit=prepared.usable)))
+    return fitted, before, compare(fitted, recording, reference, sample_rate=sample_rate)

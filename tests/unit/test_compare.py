@@ -62,6 +62,22 @@ def test_somebody_talking_in_the_pauses_is_left_out_and_said() -> None:
     assert any("somebody talks" in text for text in found.warnings)
 
 
+def test_a_reference_cut_in_the_middle_of_words_is_only_believed_in_between() -> None:
+    x = voice(10.0)
+    recording = record(x)
+    begin, end = 5000, 8 * 16000 + 16000  # both inside a word: the pauses are the last half of every other second
+    found = compare(profile(), recording[begin:], x[begin:end])
+    assert found.excess_db < 0.5  # 10 dB and more where what was said before and after it counts
+    assert found.times[0][1] > 0.3 and found.times[-1][0] < (end - begin) / 16000 + 0.5
+    assert any("middle of a word" in text for text in found.warnings)
+
+
+def test_levels_are_those_at_which_the_voice_is_heard_over_the_fan() -> None:
+    x = voice(8.0)
+    found = compare(profile(), record(x), x)
+    assert found.levels and all(high > found.noise_floor_db - 6.0 for _, high, _ in found.levels)
+
+
 def test_another_rate_is_converted() -> None:
     x = voice(6.0)
     up = [soxr.resample(s, 16000, 48000) for s in (record(x), x)]

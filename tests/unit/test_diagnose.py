@@ -65,6 +65,24 @@ def test_two_effects_at_once_are_both_found() -> None:
     assert found.remaining_db < 1.0
 
 
+def test_a_turned_volume_is_found_beside_a_fan_that_hides_it() -> None:
+    x = voice(SECONDS)
+    louder = 2.0 * signal.sosfilt(signal.butter(2, [300, 900], "band", fs=16000, output="sos"), fan(9)) * 2
+    found = diagnose(profile(), (0.8 * echo(x) + fan() + louder).astype(np.float32), x)
+    assert (found.verdict, sorted(names(found))) == ("missing", ["fan_noise", "playback_gain"])
+    assert found.remaining_db < 0.5
+
+
+def test_things_that_slam_now_and_then_are_no_fan() -> None:
+    x = voice(SECONDS)
+    slams = np.zeros(x.size)
+    for at in (1.6, 3.7, 9.65):
+        part = slams[round(at * 16000) :][:3200]
+        part += 40 * FAN * np.random.default_rng(round(at)).standard_normal(part.size) * np.exp(-np.arange(part.size) / 500)
+    found = diagnose(profile(), (echo(x) + fan() + slams).astype(np.float32), x)
+    assert "fan_noise" not in names(found) and found.verdict == "unexplained"
+
+
 def test_mains_hum_is_not_an_effect_and_is_described() -> None:
     x = voice(SECONDS)
     t = np.arange(x.size) / 16000
