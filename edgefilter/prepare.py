@@ -99,7 +99,7 @@ def prepare(profile: Profile, recording: Samples, reference: Samples, *, sample_
     warnings = tuple(f"somebody talks at {first:.1f} to {last:.1f} s: left out" for first, last in human)
     if end - begin < n and end - begin > n // 2:
         usable[:begin], usable[end:] = False, False
-        warnings += (f"the reference is cut in the middle of a word: only {begin / SAMPLE_RATE:.1f} to {end / SAMPLE_RATE:.1f} s are looked at",)
+        warnings += (f"the reference is cut in mid-word: only {begin / SAMPLE_RATE:.1f} to {end / SAMPLE_RATE:.1f} s are judged",)
     if len(pieces) > 1:
         lags = ", ".join(f"{lag:.1f} from {first / SAMPLE_RATE:.1f} s" for first, _, lag in pieces)
         warnings += (f"the utterances lag by different numbers of samples: {lags}; aligned one by one",)
