@@ -27,6 +27,8 @@ PART, PART_LEVEL = 0.5, 0.3
 """Share of the excess power and of its level that findings must explain to be named beside what none explains."""
 MUCH_DB = 3.0
 """Over the silences: what the model of an effect that is really there does not leave."""
+NEARLY_ALL = 0.99
+"""Share of the excess power with which what is left may be the imprecision of the model itself."""
 UNPREDICTABLE = ("rattle", "bandlimit")
 """Effects whose own noise stays in the residual."""
 THIRDS_T = 1.69
@@ -75,7 +77,7 @@ def _much_left(found: Found) -> bool:
     measurement, silent = found.prepared.measurement, float(np.clip(found.final.silent_db, -0.5, 0.5))
     fitted = whiten(measurement.recording - found.final.prediction, measurement.noise_psd)[measurement.fit & found.prepared.active]
     fitted_db = 10 * np.log10(float(np.mean(fitted.astype(np.float64) ** 2)) + 1e-12) if fitted.size else 0.0
-    return min(fitted_db, found.final.active_db) - silent > MUCH_DB
+    return min(fitted_db, found.final.active_db) - silent > MUCH_DB and _share(found.base.excess_db, found.final.excess_db) < NEARLY_ALL
 
 
 def explained_level(prepared: Prepared, found: Found) -> float:

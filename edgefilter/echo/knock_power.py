@@ -38,8 +38,8 @@ class Trigger:
     side: float
 
 
-def find_trigger(x: Samples, residual: Samples, predicted: Samples, fit: NDArray[np.bool_] | None, late: int) -> Trigger | None:
-    """The trigger whose knocks explain best when the whitened residual (n,) is loud; None where the voice's level explains it as well.
+def find_trigger(x: Samples, residual: Samples, predicted: Samples, fit: NDArray[np.bool_] | None, late: int) -> tuple[Trigger | None, bool]:
+    """The trigger whose knocks explain best when the whitened residual (n,) is loud, and whether the voice's level explains it less well.
 
     x (n,): the drive. predicted (n,): the whitened voice. late: samples until a knock is heard. The residual's power in a cell of time
     and frequency is taken as exponentially distributed around a constant plus what each source adds, in a colour of its own: maximum
@@ -51,7 +51,7 @@ def find_trigger(x: Samples, residual: Samples, predicted: Samples, fit: NDArray
     use = np.ones(len(power), bool) if fit is None else fit[middle]
     folds = [use & (middle // FOLD % 2 == parity) for parity in (0, 1)]
     if min(fold.sum() for fold in folds) < 4 * BANDS:
-        return None
+        return None, False
     one = np.ones((len(power), 1), np.float32)
     seen, best = power[use], (-np.inf, None, one)
     for resonance in RESONANCES_HZ:
@@ -66,10 +66,10 @@ def find_trigger(x: Samples, residual: Samples, predicted: Samples, fit: NDArray
                 if likelihood > best[0]:
                     best = (likelihood, Trigger(resonance, Q, threshold, side), source)
     if best[1] is None:
-        return None
+        return None, False
     smoothed = scipy.signal.lfilter([0.2], [1.0, -0.8], voice, axis=0).astype(np.float32)
     nothing, by_knocks, by_voice = (_crossed(power, sources, folds) for sources in ([one], [one, best[2]], [one, voice, smoothed]))
-    return best[1] if by_knocks - nothing > max(BETTER * (by_voice - nothing), LEAST) else None
+    return best[1], by_knocks - nothing > max(BETTER * (by_voice - nothing), LEAST)
 
 
 def colour_of_knocks(residual: Samples, ringing: Samples, fit: NDArray[np.bool_] | None) -> tuple[float, Array]:

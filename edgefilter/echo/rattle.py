@@ -14,11 +14,14 @@ from edgefilter.echo.knock_power import (
     BAND_HZ,
     BANDS,
     DECAYS_MS,
+    RESONANCES_HZ,
+    SHARES,
     Trigger,
     colour_of_knocks,
     find_knocks,
     find_trigger,
     one_side,
+    quantile_of_peaks,
     resonated,
     ringing_of,
 )
@@ -92,12 +95,13 @@ class Rattle:
         """What sets the knocks off is found by when the residual is loud; then come the least-squares sounds, and the power of the rest.
 
         Where the sounds explain something, they serve as matched filters, which show how hard the robot was hit at each moment, and
-        resonance, q and threshold are refined by these. Neutral where the residual follows the voice's level rather than knocks.
+        resonance, q and threshold are refined by these. Neutral where the residual follows the voice's level rather than knocks and
+        no sound learnt from some knocks explains others.
         """
         x = measurement.reference
         predicted, target = measurement.whiten(model.predict(x)), measurement.whiten(measurement.recording)
         left = target - absorbed(predicted, target, measurement.fit)
-        trigger = find_trigger(x, left, predicted, measurement.fit, DIRECT)
+        trigger, told = find_trigger(x, left, predicted, measurement.fit, DIRECT)
         if trigger is None:
             return neutral(self)
         rest, allowed = left * measurement.weights, _roomy(measurement)
@@ -110,16 +114,17 @@ class Rattle:
             return _explained([measurement.whiten(model.predict(k)) for k in knocks_of(at)], rest, TAPS)
 
         at, (gain, sounds) = trigger, explain(trigger)
-        for _ in range(REFINED):
+        for again in range(REFINED):
             hits = [_matched(sound, rest, measurement, model) * allowed for sound in sounds]
-            other = _best_agreement(x, hits, _fine(at))
+            other = _best_agreement(x, hits, _fine(at) if again else _coarse(x))
             gain_then, sounds_then = explain(other)
-            if gain_then <= gain:
-                break
-            at, gain, sounds = other, gain_then, sounds_then
+            if gain_then > gain:
+                at, gain, sounds = other, gain_then, sounds_then
         halves = np.arange(x.size) // HALF % 2 == 0
         worth = WORTH * sounds.size * float(np.dot(rest, rest)) / max(float(measurement.weights.sum()), 1.0)
         if gain <= worth or not _predicts([(k * halves, k * ~halves) for k in knocks_of(at)], rest, measurement, model):
+            if not told:
+                return neutral(self)
             at, sounds = trigger, np.zeros((2, 1))
         values = dict(zip(("resonance_hz", "q", "threshold", "side"), astuple(at), strict=True))
         values |= {name: _number_or_taps(np.clip(sound, -BOUND, BOUND)) for name, sound in zip(("outward", "inward"), sounds, strict=True)}
@@ -167,6 +172,12 @@ def _matched(sound: Array, rest: Samples, measurement: Measurement, model: EchoM
     knock[at : at + sound.size] = sound
     heard = measurement.whiten(model.predict(knock))
     return scipy.signal.oaconvolve(rest, heard[::-1])[length - 1 - at :][: rest.size].astype(np.float32)
+
+
+def _coarse(x: Samples) -> list[Trigger]:
+    """All over the range, either side knocking."""
+    moved = [(hz, q, resonated(x, hz, q)) for hz, q in product(RESONANCES_HZ, (0.7, 1.0, 1.6))]
+    return [Trigger(hz, q, quantile_of_peaks(d, share), 0.0) for hz, q, d in moved for share in SHARES]
 
 
 def _fine(at: Trigger) -> list[Trigger]:
