@@ -95,8 +95,8 @@ class Rattle:
         """What sets the knocks off is found by when the residual is loud; then come the least-squares sounds, and the power of the rest.
 
         Where the sounds explain something, they serve as matched filters, which show how hard the robot was hit at each moment, and
-        resonance, q and threshold are refined by these. Neutral where the residual follows the voice's level rather than knocks and
-        no sound learnt from some knocks explains others.
+        resonance, q and threshold are refined by these. Neutral where the residual follows the voice's level rather than knocks, unless
+        sounds learnt from some knocks explain others, and more than as long a linear filter of the voice does.
         """
         x = measurement.reference
         predicted, target = measurement.whiten(model.predict(x)), measurement.whiten(measurement.recording)
@@ -122,6 +122,8 @@ class Rattle:
                 at, gain, sounds = other, gain_then, sounds_then
         halves = np.arange(x.size) // HALF % 2 == 0
         worth = WORTH * sounds.size * float(np.dot(rest, rest)) / max(float(measurement.weights.sum()), 1.0)
+        if not told and gain <= _explained([predicted * measurement.weights], rest, 2 * TAPS)[0]:
+            return neutral(self)
         if gain <= worth or not _predicts([(k * halves, k * ~halves) for k in knocks_of(at)], rest, measurement, model):
             if not told:
                 return neutral(self)
