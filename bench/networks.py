@@ -113,7 +113,7 @@ def judge(name: str, engine_of: object, conversations: list[quality.Conversation
         rows.append(
             {
                 "engine": name,
-                "conversation": str(conversation.folder.name),
+                "conversation": f"{conversation.folder.parent.name}/{conversation.folder.name}",
                 "room": conversation.meta["room"],
                 "si_sdr": si_sdr(out, conversation.read("clean")[conversation.span]),
                 "errors": errors.errors,
@@ -125,10 +125,10 @@ def judge(name: str, engine_of: object, conversations: list[quality.Conversation
     return rows
 
 
-def markdown(facts: list[dict], rows: list[dict], head: dict) -> str:
+def markdown(facts: list[dict], rows: list[dict], head: dict, picture: str) -> str:
     """Both tables."""
     rooms = sorted({row["room"] for row in rows})
-    count_of = {room: len({row["conversation"] for row in rows if row["room"] == room}) for room in rooms}
+    count_of = {room: sum(row["room"] == room and row["engine"] == rows[0]["engine"] for row in rows) for room in rooms}
     lines = ["# Networks", "", ", ".join(f"{key} {value}" for key, value in head.items()), ""]
     lines += ["| run | shape | parameters | MMAC/s | ms a hop hot, p50 / p99 | paced | steps | items | validation SI-SDR, dB | loss |", "| --- " * 10 + "|"]
     for fact in facts:
@@ -145,7 +145,7 @@ def markdown(facts: list[dict], rows: list[dict], head: dict) -> str:
             figures = table.summarise([row for row in rows if row["engine"] == engine and row["room"] == room])
             cells += [_cell(figures, "si_sdr", "si_sdr_mean", 1), _cell(figures, "wer_capped", "wer_capped", 0)]
         lines.append("| " + " | ".join(cells) + " |")
-    return "\n".join([*lines, "", "![learning curves](networks.png)"]) + "\n"
+    return "\n".join([*lines, "", f"![learning curves]({picture})"]) + "\n"
 
 
 def _cell(figures: dict, name: str, key: str, digits: int) -> str:
@@ -204,7 +204,7 @@ def main() -> int:
     content = {"schema": 1, "machine": head, "runs": [fact | {"curve": run.curve} for fact, run in zip(facts, runs)], "utterances": rows}
     options.output.with_suffix(".json").write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
     plot(runs, options.output.with_suffix(".png"))
-    text = markdown(facts, rows, head)
+    text = markdown(facts, rows, head, options.output.with_suffix(".png").name)
     options.output.with_suffix(".md").write_text(text, encoding="utf-8")
     print(text)
     return 0
