@@ -29,7 +29,7 @@ from tqdm import tqdm
 
 from edgefilter.calibrate import calibrate
 from edgefilter.diagnose import diagnose
-from edgefilter.errors import EdgefilterError, UsageError
+from edgefilter.errors import UsageError
 
 SIGNALS = ("sweep_ref", "sweep_mic", "fan_only", "ref", "mic")
 
@@ -56,8 +56,8 @@ def judge(case: Path, truth: dict | None) -> Outcome:
         said |= {"verdict": found.verdict, "named": tuple(finding.effect for finding in found.ranking), "remaining_db": found.remaining_db}
         said |= {"before_db": tuple(f.excess_before_db for f in found.ranking), "after_db": tuple(f.excess_after_db for f in found.ranking)}
         said |= {"share": tuple(f.share for f in found.ranking), "excess_db": found.comparison.excess_db, "evidence": found.evidence}
-    except EdgefilterError as error:
-        said["evidence"] = str(error)
+    except Exception as error:  # whatever it is, it is a miss of this case, and the other cases are scored
+        said["evidence"] = f"{type(error).__name__}: {error}"
     seconds = time.perf_counter() - started
     return Outcome(case.name, tuple(sorted(known["effects"])), tuple(known["raw"]), known["strength"], **said, seconds=seconds)
 

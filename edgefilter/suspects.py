@@ -139,8 +139,8 @@ NESTED = 0.85
 
 def choose(gains: dict[str, float]) -> str | None:
     """The effect to name, from the falls in level that the admissible ones bring; None where there is none."""
-    if not gains:
+    most = max(gains.values(), default=0.0)
+    if not most > 0.0:
         return None
-    most = max(gains.values())
     enough = [name for name, gain in gains.items() if gain >= NESTED * most]
     return min(enough, key=lambda name: (SUSPECTS.get(name, OWN).complexity, -gains[name]))

@@ -13,6 +13,7 @@ from edgefilter.compare import compare
 from edgefilter.diagnose import Diagnosis, add, diagnose
 from edgefilter.echo.model import PRE_ROLL, EchoModel
 from edgefilter.prepare import shift
+from edgefilter.suspects import choose
 
 SECONDS = 12.0
 
@@ -117,3 +118,8 @@ def test_the_dictionary_has_the_published_keys_and_is_json() -> None:
     entry = said["ranking"][0]
     assert set(entry) == {"effect", "excess_before_db", "excess_after_db", "share", "parameters", "evidence"}
     assert entry["parameters"]["gain_db"]["value"] == pytest.approx(-0.915, abs=0.05)
+
+
+def test_no_effect_is_chosen_where_none_lowers_the_level():
+    assert choose({}) is None and choose({"rattle": -0.2, "playback_gain": -0.1}) is None
+    assert choose({"playback_gain": 0.9, "late_reverb": 1.0}) == "playback_gain"
