@@ -9,6 +9,7 @@ from edgefilter.canceller import Canceller, CancellerOutput
 from edgefilter.delay_line import Aligned
 from edgefilter.echo.driver import Driver
 from edgefilter.engines.base import ClipEngine, Engine
+from edgefilter.onset_gate import OnsetGate
 from edgefilter.paper_alignment import PaperAligner
 from edgefilter.profile import Profile
 from edgefilter.residual import Residual
@@ -33,6 +34,7 @@ class Front:
             self.aligner = PaperAligner(stft.hop)
         elif engine.front == "full":
             self.aligner = Aligner(stft.hop, profile)
+            self._gate = OnsetGate(stft.hop, float(np.sum(np.square(profile.echo.impulse_response))) if profile else None)
             self.canceller = self._make_canceller(profile)
             self.residual = Residual(stft, profile)
         self._drive = profile.echo.driver() if profile else Driver()
@@ -54,7 +56,7 @@ class Front:
         if not self.canceller:
             x, r = self._analyser.push(mic, reference)
             return Frame(x, r, self._silence, x, self._fan, self._nothing), aligned
-        linear = self._subtract(mic, aligned)
+        mic, linear = self._subtract(mic, ref, aligned)
         x, r, e, error = self._analyser.push(mic, reference, linear.echo, linear.error)
         noise, residual = self.residual.step(e, error, linear.uncertainty)
         return Frame(x, r, e, error, noise, residual), aligned
@@ -65,9 +67,11 @@ class Front:
         The kind "full" alone has them.
         """
         aligned = self.aligner.step(mic, ref)
-        return aligned.reference, self._subtract(mic, aligned).error
+        return aligned.reference, self._subtract(mic, ref, aligned)[1].error
 
-    def _subtract(self, mic: Samples, aligned: Aligned) -> CancellerOutput:
+    def _subtract(self, mic: Samples, ref: Samples, aligned: Aligned) -> tuple[Samples, CancellerOutput]:
+        """The microphone behind the gate, and the linear stage's hop."""
+        mic = self._gate.step(mic, ref, aligned)
         if aligned.realigned:
             self.canceller.rewrite_reference(self._drive.rewritten(self.aligner.history(self.canceller.history), self.hop))
-        return self.canceller.step(mic, self._drive(aligned.reference))
+        return mic, self.canceller.step(mic, self._drive(aligned.reference))

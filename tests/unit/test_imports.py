@@ -23,7 +23,7 @@ LAYERS = [
     {"echo"},
     {"profile", "profile_file", "profile_text", "delay_line", "utterances"},
     {"announced"},
-    {"lag_search", "delay_tracker", "jumps", "paper_alignment", "alignment", "canceller", "residual", "engines"},
+    {"lag_search", "delay_tracker", "jumps", "paper_alignment", "alignment", "onset_gate", "canceller", "residual", "engines"},
     {"front"},
     {"stepping", "stream", "audio", "budget", "run"},
     {"sweep", "paper_response", "trust", "calibrate"},

@@ -1,0 +1,72 @@
+"""Keeps the robot's first sounds out while the lag of its utterance is not known yet."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from edgefilter.delay_line import Aligned
+from edgefilter.types import SAMPLE_RATE, Samples
+
+GATE = np.float32(0.03)
+"""Gain while the gate is shut, -30 dB: a robot that is 20-26 dB above the human ends near the fan, and the human was inaudible."""
+LOUD, EXPLAINED = 0.05, 100.0
+"""Microphone power over the loudest that the robot has brought there from which on it can only be the robot, 7 to 13 dB above a human
+20-26 dB below; and over what the reference brings at the present delay, from which on that delay does not explain it: single sounds
+pass a room 10 dB better than speech does."""
+LONGEST = SAMPLE_RATE // 4
+"""Samples for which the gate stays shut at most: a human as loud as the robot, beside a muted loudspeaker, loses no more per utterance."""
+USUAL, FORGET = 1e-2, 0.1 ** (1 / (10 * SAMPLE_RATE))
+"""Mean square that the loudest hop of a voice is taken to have at first (-20 dB of full scale), so that a soft first sound makes nobody
+else loud; and its decay per sample of speech, 10 dB in 10 s, since the volume may have been turned."""
+LEARNING = 0.1
+"""Share of a loud hop in the running gain from the reference to the microphone."""
+RAMP = 64
+"""Samples, 4 ms, over which the gate opens and shuts."""
+
+
+class OnsetGate:
+    """Lowers the microphone where it holds the robot at a delay that the aligner is still looking for.
+
+    hop: samples per step. gain: power at the microphone over the reference's, None if there is no profile; then the gate learns it
+    while the delay is known, and until then it stays open.
+    """
+
+    def __init__(self, hop: int, gain: float | None = None) -> None:
+        self._hop = hop
+        self._gain = gain
+        self._decay = FORGET**hop
+        self._loudest = USUAL * hop
+        self._shut = 0
+        self._last = np.float32(1.0)
+        self._rise = (np.arange(RAMP, dtype=np.float32) + 1) / RAMP
+
+    def step(self, mic: Samples, ref: Samples, aligned: Aligned) -> Samples:
+        """mic (hop,) as it is, or with the robot lowered. ref: (hop,) as it was played. aligned: what the aligner made of both."""
+        heard, played, explained = (float(np.dot(x, x)) for x in (mic, ref, aligned.reference))
+        if played > 1e-3 * self._loudest:
+            self._loudest = max(played, self._decay * self._loudest)
+        if aligned.state != "searching":
+            self._shut = 0
+            if aligned.state == "locked" and explained > 0.1 * self._loudest:
+                now = heard / explained
+                self._gain = now if self._gain is None else self._gain + LEARNING * (min(now, 2 * self._gain) - self._gain)
+            return self._apply(mic, np.float32(1.0))
+        if not self._shut and not self._alone(heard, explained):
+            return mic
+        self._shut += self._hop
+        return self._apply(mic, GATE if self._shut <= LONGEST else np.float32(1.0))
+
+    def _alone(self, heard: float, explained: float) -> bool:
+        """Whether a hop of this power can only be the robot, and not at the present delay."""
+        if self._gain is None:
+            return False
+        return heard > LOUD * self._gain * self._loudest and heard > EXPLAINED * self._gain * explained
+
+    def _apply(self, mic: Samples, gain: np.float32) -> Samples:
+        if gain == self._last == 1.0:
+            return mic
+        out = gain * mic
+        edge = min(RAMP, mic.size)
+        out[:edge] = (self._last + (gain - self._last) * self._rise[:edge]) * mic[:edge]
+        self._last = gain
+        return out
