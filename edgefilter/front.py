@@ -29,12 +29,12 @@ class Front:
     def __init__(self, engine: Engine | ClipEngine, profile: Profile | None) -> None:
         stft = engine.stft
         self.hop = stft.hop
-        self.aligner = self.canceller = self.residual = None
+        self.aligner = self.gate = self.canceller = self.residual = None
         if engine.front == "paper":
             self.aligner = PaperAligner(stft.hop)
         elif engine.front == "full":
             self.aligner = Aligner(stft.hop, profile)
-            self._gate = OnsetGate(stft.hop, float(np.sum(np.square(profile.echo.impulse_response))) if profile else None)
+            self.gate = OnsetGate(stft.hop, float(np.sum(np.square(profile.echo.impulse_response))) if profile else None)
             self.canceller = self._make_canceller(profile)
             self.residual = Residual(stft, profile)
         self._drive = profile.echo.driver() if profile else Driver()
@@ -71,7 +71,7 @@ class Front:
 
     def _subtract(self, mic: Samples, ref: Samples, aligned: Aligned) -> tuple[Samples, CancellerOutput]:
         """The microphone behind the gate, and the linear stage's hop."""
-        mic = self._gate.step(mic, ref, aligned)
+        mic = self.gate.step(mic, ref, aligned)
         if aligned.realigned:
             self.canceller.rewrite_reference(self._drive.rewritten(self.aligner.history(self.canceller.history), self.hop))
         return mic, self.canceller.step(mic, self._drive(aligned.reference))

@@ -7,8 +7,9 @@ import numpy as np
 from edgefilter.delay_line import Aligned
 from edgefilter.types import SAMPLE_RATE, Samples
 
-GATE = np.float32(0.03)
-"""Gain while the gate is shut, -30 dB: a robot that is 20-26 dB above the human ends near the fan, and the human was inaudible."""
+GATE = np.float32(0.003)
+"""Gain while the gate is shut, -50 dB: what is left of a robot that is 20-26 dB above the human no network takes for somebody, and
+the human was inaudible anyway."""
 LOUD, EXPLAINED = 0.05, 100.0
 """Microphone power over the loudest that the robot has brought there from which on it can only be the robot, 7 to 13 dB above a human
 20-26 dB below; and over what the reference brings at the present delay, from which on that delay does not explain it: single sounds
@@ -40,6 +41,11 @@ class OnsetGate:
         self._last = np.float32(1.0)
         self._rise = (np.arange(RAMP, dtype=np.float32) + 1) / RAMP
 
+    @property
+    def shut(self) -> bool:
+        """Whether the last hop could only be the robot."""
+        return 0 < self._shut <= LONGEST
+
     def step(self, mic: Samples, ref: Samples, aligned: Aligned) -> Samples:
         """mic (hop,) as it is, or with the robot lowered. ref: (hop,) as it was played. aligned: what the aligner made of both."""
         heard, played, explained = (float(np.dot(x, x)) for x in (mic, ref, aligned.reference))
@@ -54,7 +60,7 @@ class OnsetGate:
         if not self._shut and not self._alone(heard, explained):
             return mic
         self._shut += self._hop
-        return self._apply(mic, GATE if self._shut <= LONGEST else np.float32(1.0))
+        return self._apply(mic, GATE if self.shut else np.float32(1.0))
 
     def _alone(self, heard: float, explained: float) -> bool:
         """Whether a hop of this power can only be the robot, and not at the present delay."""

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from edgefilter import engines
+from edgefilter.barge_in import BargeIn
 from edgefilter.engines.base import ClipEngine, Engine
 from edgefilter.engines.ladder import CANDIDATES, Ladder, climbable
 from edgefilter.errors import EdgefilterError, SignalError, UsageError
@@ -44,6 +45,11 @@ class Stream:
         """Whether the engine needs the whole recording before it answers."""
         return self.engine.lookahead is None
 
+    @property
+    def human_speaks(self) -> bool:
+        """Between the events speech_started and speech_stopped."""
+        return self._barge_in.speaking
+
     def reset(self) -> None:
         """Forget everything; the next sample is the first."""
         stft = self.engine.stft
@@ -52,7 +58,8 @@ class Stream:
         self.front = Front(self.engine, self.profile)
         self.events: deque[Event] = deque(maxlen=1000)
         self.speech_probability: float | None = None
-        self.samples_in = self.samples_out = 0
+        self._barge_in = BargeIn(stft.hop / SAMPLE_RATE)
+        self.samples_in = self.samples_out = self._stepped = 0
         self._state = None if self.waits_for_end else self.engine.initial_state()
         self._clip: list[Frame] = []
         self._synthesiser = Synthesiser(stft)
@@ -112,18 +119,22 @@ class Stream:
         out = self._step(mic, ref)
         happened = self.stepping.note(self.stepping.clock() - began)
         if happened:
-            self.events.append(Event(happened[0], self.samples_in, happened[1]))
+            self.events.append(Event(happened[0], self._stepped, happened[1]))
         return out
 
     def _step(self, mic: Samples, ref: Samples) -> Samples:
+        self._stepped += mic.size
         frame, aligned = self.front.step(mic, ref)
         if aligned and aligned.realigned:
-            self.events.append(Event("realigned", self.samples_in, f"reference arrives after {aligned.delay:.1f} samples"))
+            self.events.append(Event("realigned", self._stepped, f"reference arrives after {aligned.delay:.1f} samples"))
         if self.waits_for_end:
             self._collect(frame)
             return np.zeros(0, np.float32)
         output, self._state = self.engine.step(frame, self._state)
-        self.speech_probability = output.speech_probability
+        only_robot = self.front.gate is not None and self.front.gate.shut
+        self.speech_probability = 0.0 if only_robot and output.speech_probability else output.speech_probability
+        if talk := self._barge_in.note(self.speech_probability):
+            self.events.append(Event(talk, self._stepped, f"probability {self.speech_probability or 0.0:.2f}"))
         return self._synthesiser.push(output.spectrum)
 
     def _collect(self, frame: Frame) -> None:
@@ -197,6 +208,11 @@ class EgoFilter:
         """Probability that the human speaks now, where the engine judges it."""
         return self._stream.speech_probability
 
+    @property
+    def human_speaks(self) -> bool:
+        """Whether the human is speaking, pauses of half a second included; always False where the engine does not judge it."""
+        return self._stream.human_speaks
+
     def process(self, mic_block: Samples, ref_block: Samples) -> Samples:
         """Take (n,) float samples of both channels, any n; return finished ones, aligned with the input.
 
@@ -215,7 +231,7 @@ class EgoFilter:
             self._stream.front.aligner.announce(as_samples(utterance, "utterance"))
 
     def events(self) -> list[Event]:
-        """What happened since the last call."""
+        """What happened since the last call: realigned, speech_started, speech_stopped, overloaded, stepped_down, stepped_up."""
         happened = list(self._stream.events)
         self._stream.events.clear()
         return happened

@@ -60,7 +60,7 @@ class Output:
 
 @dataclass(frozen=True, slots=True)
 class Event:
-    """Something that a user of the stream may want to know: what happened and at which sample of the microphone."""
+    """Something that a user of the stream may want to know: what happened and by which sample of the microphone, whole hops."""
 
     kind: str
     sample: int

@@ -8,6 +8,7 @@ import signal
 import sys
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
+from functools import partial
 from pathlib import Path
 
 from edgefilter.audio.files import FileSink, Recorder, open_source
@@ -46,7 +47,7 @@ def main(args: argparse.Namespace) -> int:
         recorder = stack.enter_context(Recorder(args.save_input)) if args.save_input else None
         show = stack.enter_context(display(source, args.quiet))
         stack.enter_context(garbage_of_this_run_only())
-        report = filter_blocks(limited(source, limit), ego, sink, recorder, show, lambda: bool(stopped) or sink.finished, say_step)
+        report = filter_blocks(limited(source, limit), ego, sink, recorder, show, lambda: bool(stopped) or sink.finished, partial(say_event, live=source.live))
         report.interrupted |= bool(stopped)
     return finish(args, ego, choice, source, sink, report, told)
 
@@ -170,7 +171,7 @@ def say(text: str) -> None:
     print(text, file=sys.stderr)
 
 
-def say_step(event: Event) -> None:
-    """Tell of a change of engine when it happens, below the level meter where that is shown."""
-    if event.kind in ("stepped_down", "stepped_up", "overloaded"):
+def say_event(event: Event, live: bool) -> None:
+    """Tell of a change of engine when it happens, below the level meter where that is shown; live, also of the human's speech."""
+    if event.kind in ("stepped_down", "stepped_up", "overloaded") or (live and event.kind.startswith("speech")):
         say(f"{chr(10) if sys.stderr.isatty() else ''}{event.sample / SAMPLE_RATE:.1f} s: {event.kind.replace('_', ' ')} {event.detail}")

@@ -25,7 +25,7 @@ LAYERS = [
     {"announced"},
     {"lag_search", "delay_tracker", "jumps", "paper_alignment", "alignment", "onset_gate", "canceller", "residual", "engines"},
     {"front"},
-    {"stepping", "stream", "audio", "budget", "run"},
+    {"stepping", "barge_in", "stream", "audio", "budget", "run"},
     {"sweep", "paper_response", "trust", "calibrate"},
     {"prepare", "self_calibration", "compare", "judge", "suspects", "trials", "fan", "settle", "search", "leftover", "findings", "evidence", "conclude", "diagnose"},
     {"report"},
