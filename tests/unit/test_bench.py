@@ -13,6 +13,7 @@ from scipy import signal
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "bench"))
 
+import barge_in  # noqa: E402
 import conversations  # noqa: E402
 import peers  # noqa: E402
 import quality  # noqa: E402
@@ -22,6 +23,7 @@ import table  # noqa: E402
 
 from edgefilter.errors import UsageError  # noqa: E402
 from edgefilter.metrics import erle, si_sdr  # noqa: E402
+from edgefilter.types import Event  # noqa: E402
 
 RATE = 16000
 
@@ -293,3 +295,19 @@ def test_folder_without_conversations_is_one_line(
 ) -> None:
     code, _ = run_quality(monkeypatch, tmp_path, tmp_path / "q", "clean")
     assert code == 1 and "holds no */meta.json" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("before", "after", "delay", "shown"), [(None, 0.1, 100.0, "2 of 2 | 0 | 0"), (0.5, None, 0.0, "1 of 1 | 1 | 0"), (None, None, None, "1 of 2 | 0 | 1")])
+def test_barge_in_counts_from_the_humans_first_sound(live: Path, monkeypatch: pytest.MonkeyPatch, before, after, delay, shown) -> None:
+    conversation = quality.find_conversations([live])["live"][0]
+    power = barge_in.frame_power(conversation.read("clean"))
+    onset = int(np.flatnonzero(power > 10**-2.5 * power.max())[0]) * barge_in.FRAME
+    said = [] if before is None else [Event("speech_started", onset - int(before * RATE), "")]
+    said += [] if after is None else [Event("speech_started", onset + int(after * RATE), "")]
+    heard = []
+    monkeypatch.setattr(barge_in, "talk", lambda conversation, mic: heard.append(mic) or (said if len(heard) == 1 else [Event("speech_started", 5, "")] * 3))
+    row = barge_in.measure(conversation)
+    assert row["delay_ms"] == delay and row["early"] == (before is not None) and row["alarms"] == 3
+    np.testing.assert_array_equal(heard[1], conversation.read("mic") - conversation.read("clean"))
+    text = barge_in.markdown([{"set": "live", **row}, {"set": "live", **row, "delay_ms": 50.0, "early": False}], {"date": "today"})
+    assert f"| {shown} | 6 in " in text
