@@ -12,6 +12,13 @@ from edgefilter.echo.effect import Measurement
 from edgefilter.types import SAMPLE_RATE, Array, Samples
 
 
+BLOCK = SAMPLE_RATE // 2
+"""Samples that are transformed at once, those between two changes of the samples that diagnose() fits on."""
+
+SETTLED = 1e-6
+"""A step that explains less than this part of what all before it have explained is the last."""
+
+
 def convolve_from(x: Samples, taps: Array, lead: int) -> Samples:
     """sum_k taps[k] x(n - k + lead), (n,) float32."""
     n = fft.next_fast_len(x.size + taps.size, real=True)
@@ -25,40 +32,31 @@ def fit_filter(x: Samples, target: Samples, weights: Samples, taps: int, lead: i
     but a tiny one. Preconditioned conjugate gradients on the normal equations (Golub & Van Loan, Matrix Computations, 11.5) with a
     circulant preconditioner; stopping after `steps` leaves out what the data hardly speaks of.
     """
-    n = fft.next_fast_len(x.size + taps, real=True)
-    source = fft.rfft(x.astype(np.float32), n)
+    blocks = _Blocks(x, weights, taps, lead)
     share = float(np.mean(weights))
     size = fft.next_fast_len(2 * taps, real=True)
-    correlation = fft.irfft(np.abs(source) ** 2, n)
-    power = np.maximum(fft.rfft(_windowed(correlation, taps, size)).real, 0.0) * max(share, 1e-6)
+    power = np.maximum(fft.rfft(_windowed(blocks.correlation(), taps, size)).real, 0.0) * max(share, 1e-6)
     penalty = np.full(taps, 1e-9 * float(power.max()) + 1e-12) if prior is None else 1.0 / np.maximum(prior, 1e-12)
     lightest = float(np.min(penalty))
     scale = np.sqrt(lightest / penalty)
-
-    def adjoint(signal_: Array) -> Array:
-        moved = np.zeros(n, np.float32)
-        moved[: x.size] = signal_ * weights
-        return np.take(fft.irfft(fft.rfft(moved) * source.conj(), n), np.arange(-lead, taps - lead), mode="wrap")
-
-    def forward(c: Array) -> Array:
-        padded = np.zeros(n, np.float32)
-        padded[: taps - lead], padded[n - lead :] = c[lead:], c[:lead]
-        return fft.irfft(fft.rfft(padded) * source, n)[: x.size]
 
     def condition(v: Array) -> Array:
         return scale * fft.irfft(fft.rfft(scale * v, size) / (power + lightest), size)[:taps]
 
     c = np.zeros(taps)
-    left = adjoint(target)
+    left = blocks.adjoint(target)
     turned = condition(left)
     direction, energy = turned.copy(), float(np.dot(left, turned))
-    first = energy
+    first, explained = energy, 0.0
     for _ in range(steps):
         if energy <= 1e-8 * first:
             break
-        image = adjoint(forward(direction)) + penalty * direction
+        image = blocks.normal(direction) + penalty * direction
         step = energy / float(np.dot(direction, image))
         c += step * direction
+        explained += step * energy
+        if step * energy < SETTLED * explained:
+            break
         left -= step * image
         turned = condition(left)
         energy, before = float(np.dot(left, turned)), energy
@@ -72,6 +70,44 @@ def fit_supported(x: Samples, target: Samples, weights: Samples, taps: int, lead
     trial = convolve_from(x, fit_filter(x, target, weights * half, taps, lead, prior, steps // 2), lead)
     fall = float(np.dot(target * target - (target - trial) ** 2, weights * ~half))
     return fit_filter(x, target, weights, taps, lead, prior, steps) if fall > 0.0 else np.zeros(taps)
+
+
+class _Blocks:
+    """x (n,) in the blocks of a weighted convolution, those without weight left out: overlap-save with transforms that stay in the cache."""
+
+    def __init__(self, x: Samples, weights: Samples, taps: int, lead: int) -> None:
+        self._taps = taps
+        self._size, self._new = fft.next_fast_len(taps - 1 + BLOCK, real=True), BLOCK
+        count = -(-x.size // self._new)
+        padded = np.pad(np.asarray(weights, np.float32), (0, count * self._new - x.size)).reshape(count, self._new)
+        self._used = np.flatnonzero(padded.any(axis=1))
+        self._weights = padded[self._used]
+        self._x = x.astype(np.float32)
+        before = np.concatenate((np.zeros(taps - 1 - lead, np.float32), self._x, np.zeros(lead + count * self._new - x.size + self._size, np.float32)))
+        pieces = before[self._used[:, None] * self._new + np.arange(self._size)]
+        self._source = fft.rfft(pieces, axis=1)
+
+    def correlation(self) -> Array:
+        """(taps,) autocorrelation of x at lags from 0 on."""
+        n = fft.next_fast_len(self._x.size + self._taps, real=True)
+        return fft.irfft(np.abs(fft.rfft(self._x, n)) ** 2, n)[: self._taps]
+
+    def adjoint(self, target: Samples) -> Array:
+        """(taps,) sum w(n) target(n) x(n - k + lead)."""
+        whole = np.zeros((int(self._used[-1]) + 1) * self._new if self._used.size else 0, np.float32)
+        whole[: target.size] = target[: whole.size]
+        return self._correlated(whole.reshape(-1, self._new)[self._used] * self._weights)
+
+    def normal(self, c: Array) -> Array:
+        """(taps,) adjoint of x filtered by c (taps,)."""
+        spectrum = fft.rfft(c.astype(np.float32), self._size)
+        filtered = fft.irfft(self._source * spectrum, self._size, axis=1)[:, self._taps - 1 : self._taps - 1 + self._new]
+        return self._correlated(filtered * self._weights)
+
+    def _correlated(self, signals: Samples) -> Array:
+        moved = np.zeros((signals.shape[0], self._size), np.float32)
+        moved[:, self._taps - 1 : self._taps - 1 + self._new] = signals
+        return fft.irfft(np.einsum("bf,bf->f", fft.rfft(moved, axis=1), self._source.conj()), self._size)[: self._taps].astype(np.float64)
 
 
 def _windowed(correlation: Array, taps: int, size: int) -> Array:
