@@ -57,6 +57,7 @@ class Judge:
         hz = np.arange(FRAME // 2 + 1) * SAMPLE_RATE / FRAME
         expected = np.interp(hz, np.arange(self.psd.size) * 0.5 * SAMPLE_RATE / (self.psd.size - 1), self.psd) / 2 * SAMPLE_RATE
         self._expected = np.maximum(expected, 1e-12 * expected.max()) * float(np.sum(self._window**2))
+        self._rows = measurement.fit & prepared.usable & prepared.active & (np.arange(n) % 3 == 0)
         starts = np.arange(0, n - FRAME - HOP * (FRAMES_PER_CELL - 1) + 1, HOP * FRAMES_PER_CELL)
         span = FRAME + HOP * (FRAMES_PER_CELL - 1)
         held = np.concatenate(([0], np.cumsum(prepared.held_out)))
@@ -78,8 +79,8 @@ class Judge:
 
     def of(self, model: EchoModel) -> Verdict:
         """The verdict on a model: on what it predicts, with what it says that no waveform predicts counted as fan."""
-        reference = self.prepared.measurement.reference
-        return self.judge(model.predict(reference), unpredictable=model.unpredictable(reference))
+        measurement = self.prepared.measurement
+        return self.judge(measurement.heard(model)[0], unpredictable=model.unpredictable(measurement.reference))
 
     def judge(self, prediction: Samples, correct: bool = True, unpredictable: Sequence[tuple[Samples, Array]] = ()) -> Verdict:
         """The verdict on a prediction (n,), by default with the ordinary tolerances taken up first.
@@ -126,10 +127,8 @@ class Judge:
         """prediction (n,) through the short filter that brings it closest to the recording, no further from 1 than TOLERANCE."""
         measurement = self.prepared.measurement
         x = whiten(prediction, self.psd)
-        target = whiten(measurement.recording - prediction, self.psd)
-        rows = measurement.fit & self.prepared.usable & self.prepared.active
-        rows &= np.arange(rows.size) % 3 == 0
-        weights, _ = normal_equations([x], target, TOLERANCE_TAPS, TOLERANCE_LEAD, rows).solve(1e-5)
+        target = measurement.white_recording - x
+        weights, _ = normal_equations([x], target, TOLERANCE_TAPS, TOLERANCE_LEAD, self._rows).solve(1e-5)
         response = np.fft.rfft(weights[0], 256)
         bounded = np.fft.irfft(response * np.minimum(1.0, TOLERANCE / np.maximum(np.abs(response), 1e-12)), 256)
         return prediction + convolve_from(prediction, np.roll(bounded, 96), 96 + TOLERANCE_LEAD)

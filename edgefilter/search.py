@@ -12,9 +12,9 @@ from edgefilter.suspects import OWN, SUSPECTS, choose
 from edgefilter.trials import LAST, Found, Trial, Workbench
 
 MOST_EFFECTS = 3
-SCREEN_DB, SCREEN_AGAIN_DB = 0.2, 0.6
-"""Where the residual is no more than this above that of the robot's silences, there is nothing of the voice in it, or nothing beside an effect that
-was found, whose model errs a little; half a dB over the fan in the silences is ordinary, more of it may be a microphone's gain."""
+SCREEN_DB = 0.2
+"""Where the residual is no more than this above that of the robot's silences, there is nothing of the voice in it; half a dB over the fan in the
+silences is ordinary, more of it may be a microphone's gain."""
 SECOND_SHARE = 0.2
 """Of the excess level that is left, a further effect has to explain at least this share: less is how the first one's model errs."""
 STARTS, START_SHARE = 2, 0.1
@@ -40,7 +40,7 @@ def search(prepared: Prepared, model: EchoModel, progress: Callable[[str], None]
     runs: list[EchoModel] = []
     for first in _starts(bench, model):
         runs.append(_grow(bench, model, first))
-        if bench.heard(runs[-1]) <= SCREEN_AGAIN_DB or bench.left(runs[-1]) <= (1.0 - NEARLY) * bench.left(model):
+        if bench.tired or bench.explained(runs[-1]) or bench.left(runs[-1]) <= (1.0 - NEARLY) * bench.left(model):
             break
     best = _best(bench, model, runs)
     steps = _in_steps(bench, model, best)
@@ -64,7 +64,7 @@ def _starts(bench: Workbench, model: EchoModel) -> Iterator[Trial]:
 def _grow(bench: Workbench, start: EchoModel, first: Trial) -> EchoModel:
     """The model with first and all that can be named beside it."""
     model = simpler_beside(bench, start, first.model)
-    while _count(start, model) < MOST_EFFECTS and bench.heard(model) > SCREEN_AGAIN_DB:
+    while _count(start, model) < MOST_EFFECTS and not bench.explained(model):
         least = SECOND_SHARE * bench.left(model)
         admissible = {t.name: t for t in bench.attempt_all(model) if t.gain_db >= least and bench.admissible(t, model)}
         name = choose({key: trial.gain_db for key, trial in admissible.items()})

@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from edgefilter.echo.bandlimit import measured_response_db
+from edgefilter.echo.effect import find, names
 from edgefilter.echo.model import EchoModel
-from edgefilter.suspects import OWN, SUSPECTS, choose
+from edgefilter.suspects import OWN, SUSPECTS, Suspect, choose
 from edgefilter.trials import LAST, Workbench
 
 ROUNDS, WORTH_DB = 3, 0.02
@@ -25,26 +26,26 @@ def settle(bench: Workbench, start: EchoModel, model: EchoModel) -> EchoModel:
     """The model with its effects beyond start fitted beside each other; exchanged or dropped where that is simpler and explains as much."""
     *earlier, newest = (name for name, _ in model.effects[len(start.effects) :])
     model = refit(bench, start, model)
-    for name in earlier:
+    for name in earlier if not bench.tired else ():
         model = _exchange(bench, start, model, name)
     return _drop(bench, model, [name for name in earlier if name in dict(model.effects)], newest)
 
 
 def refit(bench: Workbench, start: EchoModel, model: EchoModel) -> EchoModel:
     """Each effect beyond start fitted beside the others, in turn, as long as the held-out level falls."""
-    names = [name for name, _ in model.effects[len(start.effects) :]]
-    if len(names) < 2:
+    fitted = [name for name, _ in model.effects[len(start.effects) :]]
+    if len(fitted) < 2:
         return model
-    waiting = names[:-1]
+    waiting = fitted[:-1]
     for _ in range(ROUNDS):
         before = bench.verdict(model).level_db
         for name in waiting:
             again = bench.attempt(name, model.without_effect(name))
-            if again is not None and again.verdict.level_db < bench.verdict(model).level_db:
+            if again is not None and again.verdict.level_db < bench.verdict(model).level_db - 0.5 * WORTH_DB:
                 model = again.model
         if before - bench.verdict(model).level_db < WORTH_DB:
             break
-        waiting = names
+        waiting = fitted
     return model
 
 
@@ -89,10 +90,10 @@ def simpler_beside(bench: Workbench, start: EchoModel, model: EchoModel) -> Echo
     """The model with a simpler effect beside a flexible one where both together explain more than the flexible one alone."""
     model = _volume_beside(bench, model)
     for name in [name for name, _ in model.effects[len(start.effects) :] if name in FLEXIBLE]:
-        if _count(start, model) > 2:
+        if _count(start, model) > 2 or bench.tired or bench.explained(others := model.without_effect(name)):
             break
-        others = model.without_effect(name)
-        simple = [t for t in bench.attempt_all(others, max(_complexity(name) - 1, SIMPLE)) if t.name not in FLEXIBLE and bench.admissible(t, others)]
+        wanted = [key for key, rule in _suspects(others) if key not in FLEXIBLE and key not in LAST and rule.complexity <= max(_complexity(name) - 1, SIMPLE)]
+        simple = [t for key in wanted if (t := bench.attempt_alike(key, others)) is not None and bench.admissible(t, others)]
         least = max(CONFIRMED * bench.left(model), 0.05)
         for trial in sorted(simple, key=lambda t: -t.gain_db)[:2]:
             both = bench.attempt(name, trial.model)
@@ -104,6 +105,11 @@ def simpler_beside(bench: Workbench, start: EchoModel, model: EchoModel) -> Echo
                 model = joint
                 break
     return model
+
+
+def _suspects(model: EchoModel) -> list[tuple[str, Suspect]]:
+    """Every effect that acts on the voice and that the model has not, with what it must show."""
+    return [(name, SUSPECTS.get(name, OWN)) for name in names() if find(name).stage != "noise" and name not in dict(model.effects)]
 
 
 def _complexity(name: str) -> int:

@@ -21,6 +21,12 @@ from edgefilter.types import SAMPLE_RATE, Samples
 LAST, ENOUGH, LITTLE_DB = ("rattle",), 0.4, 0.1
 """Effects whose fit takes long: tried where no other explains this share of the level above the silences, and where that is no less than so much."""
 
+HEARD_DB, FAN_DB = 0.6, 0.2
+"""Where the residual is no more than the first above that of the robot's silences, or no more than the second above the calibrated fan, there is
+nothing beside the effects that were found, whose models err a little."""
+MOST_TRIALS = 60
+"""So many fits take half a minute at most."""
+
 Signature: TypeAlias = tuple[tuple[str | bytes, ...], ...]
 
 
@@ -60,6 +66,7 @@ class Workbench:
         self._progress = progress
         self._verdicts: dict[Signature, Verdict] = {}
         self._trials: dict[tuple[Signature, str], Trial | None] = {}
+        self._alike: dict[tuple[frozenset[str], str], Trial | None] = {}
 
     def verdict(self, model: EchoModel) -> Verdict:
         """What the judge says of a model."""
@@ -73,6 +80,10 @@ class Workbench:
         verdict = self.verdict(model)
         return verdict.active_db - float(np.clip(verdict.silent_db, -0.5, 0.5))
 
+    def explained(self, model: EchoModel) -> bool:
+        """Whether a model leaves so little while the robot is heard that nothing further can be told in it."""
+        return self.heard(model) <= HEARD_DB or self.verdict(model).active_db <= FAN_DB
+
     def left(self, model: EchoModel) -> float:
         """Level in dB over that of the silences."""
         verdict = self.verdict(model)
@@ -83,7 +94,18 @@ class Workbench:
         key = signature(model), name
         if key not in self._trials:
             self._trials[key] = self._attempt(name, model)
+            self._alike[frozenset(dict(model.effects)), name] = self._trials[key]
         return self._trials[key]
+
+    @property
+    def tired(self) -> bool:
+        """Whether so much was tried that a doubtful case is left as it is."""
+        return len(self._trials) >= MOST_TRIALS
+
+    def attempt_alike(self, name: str, model: EchoModel) -> Trial | None:
+        """attempt(), or what came of it beside the same effects at other values: enough to choose what is worth a closer look."""
+        key = frozenset(dict(model.effects)), name
+        return self._alike[key] if key in self._alike else self.attempt(name, model)
 
     def _attempt(self, name: str, model: EchoModel) -> Trial | None:
         if self._progress:

@@ -54,8 +54,8 @@ class Bandlimit:
 
     def fit(self, measurement: Measurement, model: EchoModel) -> Values:
         """The best of a grid of cut-offs, orders and phases, refined, each at its best delay; judged in the whitened cross-spectrum. Then taps."""
-        predicted = model.predict(measurement.reference)
-        found = spectra(measurement, predicted, 20.0)
+        predicted, x = measurement.heard(model)
+        found = spectra(measurement, x, 20.0)
         turns = np.exp(-2j * np.pi * np.outer(found.hz, DELAYS) / SAMPLE_RATE)
         turned = found.cross[:, None] * turns.conj()
 
@@ -73,9 +73,8 @@ class Bandlimit:
             best = max(near, key=lambda values: gain(*values)[0])
             step = 1.0 + (step - 1.0) * 0.6
         values = {"cutoff_hz": float(np.clip(best[0], 200.0, 15999.0)), "order": float(best[1]), "phase": float(best[2]), "delay": gain(*best)[1]}
-        left = measurement.recording - self.apply(predicted, {**values, "taps": 0.0}, SAMPLE_RATE)
-        x = measurement.whiten(predicted)
-        taps = fit_filter(x, measurement.whiten(left), measurement.weights, TAPS, LEAD, prior=np.full(TAPS, 1e-3), steps=15)
+        left = measurement.white_recording - self.apply(x, {**values, "taps": 0.0}, SAMPLE_RATE)
+        taps = fit_filter(x, left, measurement.weights, TAPS, LEAD, prior=np.full(TAPS, 1e-3), steps=15)
         return {**values, "taps": np.clip(taps, -10.0, 10.0)}
 
 

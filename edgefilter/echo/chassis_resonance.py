@@ -44,13 +44,13 @@ class ChassisResonance:
 
     def fit(self, measurement: Measurement, model: EchoModel) -> Values:
         """Frequency and Q by a search in the whitened cross-spectrum, gain and phase by least squares in time."""
-        predicted = model.predict(measurement.reference)
-        coarse = spectra(measurement, predicted, 1.0)
+        predicted, white = measurement.heard(model)
+        coarse = spectra(measurement, white, 1.0)
         frequency, q = _search(coarse)
-        frequency, q = _refine(spectra(measurement, predicted, 0.1), frequency, q)
+        frequency, q = _refine(spectra(measurement, white, 0.1), frequency, q)
         ring = _ring(predicted, frequency, q, SAMPLE_RATE)
         columns = np.stack([measurement.whiten(part.astype(np.float32)) for part in (ring.real, -ring.imag)], axis=1) * measurement.weights[:, None]
-        residual = measurement.whiten(measurement.recording - predicted)
+        residual = measurement.white_recording - white
         gain = complex(*np.linalg.lstsq((columns.T @ columns).astype(float), (columns.T @ residual).astype(float), rcond=1e-12)[0])
         level = 20.0 * np.log10(max(abs(gain), 1e-6))
         return {"frequency_hz": frequency, "q": q, "gain_db": float(np.clip(level, -120.0, 60.0)), "phase_deg": float(np.rad2deg(np.angle(gain)))}

@@ -92,6 +92,8 @@ class Compression:
         starts = [np.clip((loud_db + above, slope, np.log(8.0), np.log(release)), LOWEST, HIGHEST) for above, slope, release in grid]
         costs = [left(predict(start)) for start in starts]
         best, cost = starts[int(np.argmin(costs))], min(costs)
+        if cost >= without:
+            return neutral(self)
         for _ in range(ITERATIONS if loud_db > SILENT_DB else 0):
             best, now = _gauss_newton(best, cost, predict, left, target, fit)
             if now > cost * (1.0 - 1e-3):
@@ -105,7 +107,7 @@ class Compression:
     def _makeup(self, measurement: Measurement, model: EchoModel, values: Values) -> float:
         """Least-squares gain over the whole recording, dB."""
         predicted = measurement.whiten(model.predict(self.apply(measurement.reference, complete(self, values), SAMPLE_RATE)))
-        normal = normal_equations([predicted], measurement.whiten(measurement.recording), 1, 0, measurement.fit)
+        normal = normal_equations([predicted], measurement.white_recording, 1, 0, measurement.fit)
         return float(np.clip(20.0 * np.log10(max(float(normal.solve()[0][0, 0]), 1e-2)), -40.0, 40.0))
 
 

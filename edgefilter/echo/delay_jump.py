@@ -69,7 +69,7 @@ class DelayJump:
         How many steps and how high comes from the samples to fit on; where exactly each lies is then looked up in all samples,
         since a jump may fall between the blocks to fit on.
         """
-        predicted, recording = measurement.whiten(model.predict(measurement.reference)), measurement.whiten(measurement.recording)
+        predicted, recording = measurement.heard(model)[1], measurement.white_recording
         track = track_lag(predicted, recording, measurement.fit, BLOCK, REACH)
         if track.lag.size < 4:
             return neutral(self)

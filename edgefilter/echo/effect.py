@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, ClassVar, Literal, Protocol, TypeAlias
 
 import numpy as np
@@ -22,6 +22,10 @@ STAGES: tuple[Stage, ...] = ("source", "path", "time", "microphone", "noise")
 """In the order in which sound meets them."""
 ROUNDING_PSD = 1e-14
 """One-sided PSD of rounding to 16 bit, full scale^2/Hz: (2^-15)^2 / 12 / 8 kHz."""
+
+
+REMEMBERED = 6
+"""Models whose predictions a measurement keeps."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,6 +51,8 @@ class Measurement:
     recording: Samples
     noise_psd: Samples | None = None
     fit: NDArray[np.bool_] | None = None
+    _heard: dict[EchoModel, tuple[Samples, Samples]] = field(default_factory=dict, init=False, repr=False)
+    _white: list[Samples] = field(default_factory=list, init=False, repr=False)
 
     @property
     def weights(self) -> Samples:
@@ -56,6 +62,24 @@ class Measurement:
     def whiten(self, x: Samples) -> Samples:
         """x (n,) through a zero-phase filter after which the fan is white with variance 1; x itself where the fan is unknown."""
         return x if self.noise_psd is None else whiten(x, self.noise_psd)
+
+    @property
+    def white_recording(self) -> Samples:
+        """(n,) the recording, whitened."""
+        if not self._white:
+            self._white.append(self.whiten(self.recording))
+        return self._white[0]
+
+    def heard(self, model: EchoModel) -> tuple[Samples, Samples]:
+        """(n,), (n,) what a model predicts for the reference, and that whitened; remembered for the latest few models, not to be written to."""
+        known = self._heard.pop(model, None)
+        if known is None:
+            predicted = model.predict(self.reference)
+            known = predicted, self.whiten(predicted)
+            while len(self._heard) >= REMEMBERED:
+                del self._heard[next(iter(self._heard))]
+        self._heard[model] = known
+        return known
 
     def error(self, predicted: Samples) -> float:
         """Weighted sum of squares of the whitened recording minus predicted (n,): what a fit makes small."""

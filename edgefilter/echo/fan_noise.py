@@ -54,7 +54,7 @@ class FanNoise:
         known = measurement.noise_psd
         if known is None:
             return {"spectrum_db": 0.0, "change_db": 0.0}
-        voice = absorbed(model.predict(measurement.reference), measurement.recording, measurement.fit)
+        voice = absorbed(measurement.heard(model)[0], measurement.recording, measurement.fit)
         size = 2 * (known.size - 1)
         residual = _periodograms(measurement.recording - voice, size)
         if not len(residual):

@@ -46,8 +46,8 @@ class LateReverb:
 
     def fit(self, measurement: Measurement, model: EchoModel) -> Values:
         """Least squares in the whitened domain, slightly regularised; neutral where nothing of it holds on other samples."""
-        predicted = model.predict(measurement.reference)
-        x, residual = measurement.whiten(predicted), measurement.whiten(measurement.recording - predicted)
+        x = measurement.heard(model)[1]
+        residual = measurement.white_recording - x
         length = min(TAPS, measurement.recording.size // 4)
         taps = fit_supported(x, residual, measurement.weights, length, LEAD, prior=np.full(length, EXPECTED), steps=40)
         if not taps.any():

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 from numpy.lib.stride_tricks import sliding_window_view
 
 from edgefilter.types import Array, Samples
@@ -54,19 +55,21 @@ def normal_equations(columns: Sequence[Samples], target: Samples, taps: int, lea
     padded = [np.concatenate((np.zeros(taps - 1 - lead, np.float32), c, np.zeros(lead, np.float32))) for c in columns]
     windows = [sliding_window_view(c, taps)[:, ::-1] for c in padded]
     matrix, right, energy, count = np.zeros((size, size)), np.zeros(size), 0.0, 0
-    for at in range(0, n, CHUNK):
-        chosen = slice(at, at + CHUNK)
+    used = None if fit is None else np.flatnonzero(fit)
+    for at in range(0, n if used is None else used.size, CHUNK):
+        chosen = slice(at, at + CHUNK) if used is None else used[at : at + CHUNK]
         rows = np.concatenate([w[chosen] for w in windows], axis=1)
         y = target[chosen]
-        if fit is not None:
-            if not fit[chosen].any():
-                continue
-            rows, y = rows[fit[chosen]], y[fit[chosen]]
         matrix += rows.T @ rows
         right += rows.T @ y
         energy += float(np.dot(y, y))
         count += y.size
     return Normal(matrix, right, energy, count, taps)
+
+
+def short_filter(x: Samples, taps: Samples) -> Samples:
+    """The full convolution of x (n,) and taps (t,), (n + t - 1,): by the way that is faster for a hop, or for a recording."""
+    return scipy.signal.oaconvolve(x, taps).astype(np.float32) if x.size > CHUNK and taps.size > 4 else np.convolve(x, taps)
 
 
 def filtered(columns: Sequence[Samples], weights: Array, lead: int = 0) -> Samples:
@@ -75,7 +78,7 @@ def filtered(columns: Sequence[Samples], weights: Array, lead: int = 0) -> Sampl
     out = np.zeros(n, np.float32)
     for column, w in zip(columns, weights, strict=True):
         if n and w.any():
-            out += np.convolve(np.concatenate((column, np.zeros(lead, np.float32))), w.astype(np.float32))[lead : lead + n]
+            out += short_filter(np.concatenate((column, np.zeros(lead, np.float32))), w.astype(np.float32))[lead : lead + n]
     return out
 
 

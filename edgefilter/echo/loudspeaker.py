@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 
 from edgefilter.echo.effect import Measurement, Parameter, Stage, Values, level_ratio
-from edgefilter.echo.least_squares import NUISANCE_LEAD, filtered, normal_equations
+from edgefilter.echo.least_squares import NUISANCE_LEAD, filtered, normal_equations, short_filter
 from edgefilter.types import SAMPLE_RATE, Array, Samples
 
 if TYPE_CHECKING:
@@ -25,7 +25,7 @@ TERMS = ("even", "odd", "saturation", "force_factor", "stiffness")
 
 def displacement(x: Samples, sample_rate: int = SAMPLE_RATE) -> Samples:
     """The membrane's displacement (n,) for the drive x (n,), in its full scale: stiffness holds it below the resonance, mass above."""
-    return np.convolve(x, _butterworth(sample_rate))[: x.size] if x.size else x.copy()
+    return short_filter(x, _butterworth(sample_rate))[: x.size] if x.size else x.copy()
 
 
 def _butterworth(sample_rate: int) -> Samples:
@@ -79,10 +79,10 @@ class SpeakerNonlinearity:
         """
         x = measurement.reference
         terms = distortion_terms(x)
-        linear = measurement.whiten(model.predict(x))
+        linear = measurement.heard(model)[1]
         early = np.concatenate((linear[NUISANCE_LEAD:], np.zeros(NUISANCE_LEAD, np.float32)))[: linear.size]
         columns = [early] + [measurement.whiten(model.predict(terms[name])) for name in TERMS]
-        target = measurement.whiten(measurement.recording)
+        target = measurement.white_recording
         normal = normal_equations(columns, target, TAPS, 0, measurement.fit)
         weights, left = normal.solve(RIDGE)
         single = np.zeros(weights.shape, bool)

@@ -59,9 +59,8 @@ class MicAgc:
         The latter by penalised least squares of the gain at the knots: from the voice where it sounds, from the fan's power where it
         does not. It is a smoothing spline of first order (Eilers & Marx 1996, with second differences), which bridges what is not fitted.
         """
-        heard = model.predict(measurement.reference)
-        predicted = measurement.whiten(heard)
-        recording = measurement.whiten(measurement.recording)
+        heard, predicted = measurement.heard(model)
+        recording = measurement.white_recording
         voice = absorbed(predicted, recording, measurement.fit)
         energy = float(np.dot(predicted, predicted))
         overall = float(np.dot(voice, predicted)) / energy if energy > 0.0 else 1.0

@@ -47,8 +47,7 @@ class MicClipping:
 
         Levels from the recording's largest value downwards; where none beats the prediction as it is, there is no limit.
         """
-        predicted = model.predict(measurement.reference)
-        recording = measurement.whiten(measurement.recording)
+        predicted, recording = measurement.heard(model)[0], measurement.white_recording
         chosen = measurement.weights
         top = float(np.max(np.abs(measurement.recording), initial=0.0))
         none = {"level": NO_LIMIT, "hardness": HARD}

@@ -56,8 +56,8 @@ class PathChange:
 
         The moment alone is chosen on all samples, since it may fall between those that the fit may use.
         """
-        predicted = model.predict(measurement.reference)
-        x, residual = measurement.whiten(predicted), measurement.whiten(measurement.recording - predicted)
+        x = measurement.heard(model)[1]
+        residual = measurement.white_recording - x
         time = _step(residual, x)
         for _ in range(2):
             after = measurement.weights * (np.arange(x.size) > (time + 0.3) * SAMPLE_RATE)

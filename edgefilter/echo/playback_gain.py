@@ -27,6 +27,6 @@ class PlaybackGain:
 
     def fit(self, measurement: Measurement, model: EchoModel) -> Values:
         """The least-squares gain of the whitened prediction, held within the bounds."""
-        predicted = measurement.whiten(model.predict(measurement.reference)) * measurement.weights
-        gain = level_ratio(measurement.whiten(measurement.recording), predicted)
+        predicted = measurement.heard(model)[1] * measurement.weights
+        gain = level_ratio(measurement.white_recording, predicted)
         return {"gain_db": float(np.clip(20.0 * np.log10(max(gain, 1e-3)), -60.0, 60.0))}

@@ -99,7 +99,7 @@ class Rattle:
         sounds learnt from some knocks explain others, and more than as long a linear filter of the voice does.
         """
         x = measurement.reference
-        predicted, target = measurement.whiten(model.predict(x)), measurement.whiten(measurement.recording)
+        predicted, target = measurement.heard(model)[1], measurement.white_recording
         left = target - absorbed(predicted, target, measurement.fit)
         trigger, told = find_trigger(x, left, predicted, measurement.fit, DIRECT)
         if trigger is None:
@@ -137,7 +137,7 @@ class Rattle:
         x = measurement.reference
         knocks = _heard(x, values, SAMPLE_RATE)
         predicted = measurement.whiten(model.predict(self.apply(x, complete(self, values), SAMPLE_RATE)))
-        target = measurement.whiten(measurement.recording)
+        target = measurement.white_recording
         left = target - absorbed(predicted, target, measurement.fit)
         fits = {decay: colour_of_knocks(left, ringing_of(knocks, decay, DIRECT), measurement.fit) for decay in DECAYS_MS}
         decay = max(fits, key=lambda decay: fits[decay][0])

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 from scipy import fft
 
@@ -21,8 +22,8 @@ SETTLED = 1e-6
 
 def convolve_from(x: Samples, taps: Array, lead: int) -> Samples:
     """sum_k taps[k] x(n - k + lead), (n,) float32."""
-    n = fft.next_fast_len(x.size + taps.size, real=True)
-    return fft.irfft(fft.rfft(x, n) * fft.rfft(taps.astype(np.float32), n), n)[lead : lead + x.size].astype(np.float32)
+    y = scipy.signal.oaconvolve(x, taps.astype(np.float32))
+    return np.pad(y, (0, max(lead + x.size - y.size, 0)))[lead : lead + x.size].astype(np.float32)
 
 
 def fit_filter(x: Samples, target: Samples, weights: Samples, taps: int, lead: int, prior: Array | None = None, steps: int = 12) -> Array:
@@ -133,10 +134,10 @@ class Spectra:
         return float(np.sum(self.predicted - 2.0 * self.cross.real) - np.sum(own))
 
 
-def spectra(measurement: Measurement, predicted: Samples, resolution_hz: float) -> Spectra:
-    """Auto- and cross-spectra of predicted (n,) and the recording over the fit samples, averaged to resolution_hz."""
-    p = measurement.whiten(predicted) * measurement.weights
-    y = measurement.whiten(measurement.recording) * measurement.weights
+def spectra(measurement: Measurement, white: Samples, resolution_hz: float) -> Spectra:
+    """Auto- and cross-spectra of a whitened prediction (n,) and the recording over the fit samples, averaged to resolution_hz."""
+    p = white * measurement.weights
+    y = measurement.white_recording * measurement.weights
     n = fft.next_fast_len(p.size, real=True)
     a, b = fft.rfft(p.astype(np.float64), n), fft.rfft(y.astype(np.float64), n)
     width = max(int(resolution_hz * n / SAMPLE_RATE), 1)
