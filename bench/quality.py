@@ -15,6 +15,7 @@ Scores are kept in --cache by recording and code, so that a run that was cut off
 from __future__ import annotations
 
 import argparse
+import ast
 import hashlib
 import json
 import sys
@@ -32,6 +33,7 @@ from recogniser import Recogniser, word_errors
 from tqdm import tqdm
 
 import edgefilter
+from edgefilter.engines import HAVE_MODEL
 from edgefilter.errors import EdgefilterError, UsageError
 from edgefilter.metrics import si_sdr
 from edgefilter.types import SAMPLE_RATE, Samples
@@ -108,12 +110,29 @@ def processor(name: str) -> Processor:
 
 
 def code_version(name: str) -> str:
-    """Hash of the code that makes a row: changed code is scored anew."""
-    package = Path(edgefilter.__file__).parent
+    """Hash of the code that makes a row: changed code is scored anew. Of the package it is what filtering and calibrating import."""
     bench = Path(__file__).parent
-    own = name in ("unfiltered", "clean") or name.startswith(("speexdsp", "aec3"))
-    files = [bench / "peers.py"] if own else [*sorted(package.rglob("*.py")), *sorted(package.rglob("*.onnx"))]
+    if name in ("unfiltered", "clean") or name.startswith(("speexdsp", "aec3")):
+        files = [bench / "peers.py"]
+    else:
+        package = Path(edgefilter.__file__).parent
+        models = [*package.rglob("*.onnx"), *package.parent.glob("models/*.onnx")] if name.removesuffix(TRUE_LAG) in HAVE_MODEL else []
+        files = sorted(imported_by({package / "stream.py", package / "calibrate.py", *package.glob("engines/*.py")}, package)) + sorted(models)
     return hashlib.sha256(b"".join(path.read_bytes() for path in files)).hexdigest()
+
+
+def imported_by(files: set[Path], package: Path) -> set[Path]:
+    """These files of the package and all of it that they import, at whatever place in the code."""
+    found, new = set(), set(files)
+    while new:
+        path = new.pop()
+        found.add(path)
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.ImportFrom) and node.module and node.module.split(".")[0] == package.name:
+                place = package.parent.joinpath(*node.module.split("."))
+                asked = {place.with_suffix(".py"), place / "__init__.py", *((place / f"{alias.name}.py") for alias in node.names)}
+                new |= {file for file in asked if file.exists()} - found
+    return found
 
 
 def score(conversation: Conversation, engine: str, recogniser: Recogniser | None) -> dict:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import sys
 from pathlib import Path
 
@@ -311,3 +312,22 @@ def test_barge_in_counts_from_the_humans_first_sound(live: Path, monkeypatch: py
     np.testing.assert_array_equal(heard[1], conversation.read("mic") - conversation.read("clean"))
     text = barge_in.markdown([{"set": "live", **row}, {"set": "live", **row, "delay_ms": 50.0, "early": False}], {"date": "today"})
     assert f"| {shown} | 6 in " in text
+
+
+def test_a_row_is_scored_anew_where_its_code_or_its_network_changed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    tree = tmp_path / "edgefilter"
+    shutil.copytree(Path(quality.edgefilter.__file__).parent, tree)
+    (tmp_path / "models").mkdir()
+    monkeypatch.setattr(quality.edgefilter, "__file__", str(tree / "__init__.py"))
+
+    def versions() -> list[str]:
+        return [quality.code_version(name) for name in ("aec3", "ss", "crnn")]
+
+    def changed_by(path: Path) -> list[bool]:
+        before = versions()
+        path.write_bytes((path.read_bytes() if path.exists() else b"") + b"\n")
+        return [a != b for a, b in zip(before, versions(), strict=True)]
+
+    assert changed_by(tmp_path / "models/crnn_int8.onnx") == [False, False, True]
+    assert changed_by(tree / "canceller.py") == [False, True, True]
+    assert changed_by(tree / "diagnose.py") == [False, False, False]
