@@ -124,7 +124,10 @@ def summary(runs: list[dict]) -> dict:
     stages = {name: figures(sum((run["stages"][name] for run in runs), []), hop) for name in runs[0]["stages"]}
     slow = sorted((row for run in runs for row in slowest(run)), key=lambda row: -row["ms"])[:10]
     memory = max(run["peak_memory_mb"] for run in runs)
-    return {"hop": hop, **figures(sum((run["took"] for run in runs), []), hop), "stages": stages, "slowest": slow, "peak_memory_mb": memory}
+    pairs = [(run["stages"].get("alignment", ()), run["stages"].get("canceller", ())) for run in runs]
+    front = [a + b for first, second in pairs for a, b in zip(first, second)]
+    both = {"front": figures(front, hop)} if front else {}
+    return {"hop": hop, **figures(sum((run["took"] for run in runs), []), hop), **both, "stages": stages, "slowest": slow, "peak_memory_mb": memory}
 
 
 def curves(names: Sequence[str], seconds: float, tails: Sequence[int], hops: Sequence[int], models: Sequence[Path]) -> dict[str, list[dict]]:

@@ -40,6 +40,8 @@ def test_stages_add_up_to_less_than_the_whole_and_to_most_of_it(rows: list[dict]
     stages = rows[0]["stages"]
     assert set(stages) == {"alignment", "canceller", "residual", "analysis", "engine", "overlap-add"}
     parts = sum(part["quantiles"]["50"] for part in stages.values())  # medians, since what interrupts a hop can fall between stages
+    front = rows[0]["front"]
+    assert front["hops"] == rows[0]["hops"] and front["mean"] == pytest.approx(stages["alignment"]["mean"] + stages["canceller"]["mean"])
     assert 0.5 * rows[0]["quantiles"]["50"] < parts < 1.1 * rows[0]["quantiles"]["50"]
 
 
@@ -51,7 +53,7 @@ def test_the_page_and_the_picture_are_made(rows: list[dict], tmp_path: Path) -> 
     result |= {"start": starts, "click": {latency_live.ALONE: [100.0, float("nan")], "ss": [140.0, 150.0]}}
     page = latency_report.markdown(json.loads(json.dumps(result)), "latency")
     rows_found = ("| ss | 16 | idle | 1 | paced |", "| aec3 | 10 |", "| ss | 145 | 140 - 150 | +45 |")
-    for words in (*rows_found, "crnn is not in the table: no model", "real-time factor"):
+    for words in (*rows_found, "crnn is not in the table: no model", "real-time factor", "alignment and canceller"):
         assert words in page
     latency_report.draw(result | {"rows": [*rows, *({**row, "busy": True} for row in rows)]}, tmp_path / "latency.png")
     assert (tmp_path / "latency.png").stat().st_size > 10_000
