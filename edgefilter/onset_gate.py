@@ -21,6 +21,8 @@ USUAL, FORGET = 1e-2, 0.1 ** (1 / (10 * SAMPLE_RATE))
 else loud; and its decay per sample of speech, 10 dB in 10 s, since the volume may have been turned."""
 LEARNING = 0.1
 """Share of a loud hop in the running gain from the reference to the microphone."""
+SETTLE = SAMPLE_RATE // 4
+"""Samples after a lag was found in which a network, which had the robot without its reference until then, still takes it for a human."""
 RAMP = 64
 """Samples, 4 ms, over which the gate opens and shuts."""
 
@@ -37,9 +39,14 @@ class OnsetGate:
         self._gain = gain
         self._decay = FORGET**hop
         self._loudest = USUAL * hop
-        self._shut = 0
+        self._shut = self._settling = 0
         self._last = np.float32(1.0)
         self._rise = (np.arange(RAMP, dtype=np.float32) + 1) / RAMP
+
+    @property
+    def suspect(self) -> bool:
+        """Whether what sounds like a human may well be the robot: the gate is shut, or the lag was found a moment ago."""
+        return self.shut or self._settling > 0
 
     @property
     def shut(self) -> bool:
@@ -48,6 +55,7 @@ class OnsetGate:
 
     def step(self, mic: Samples, ref: Samples, aligned: Aligned) -> Samples:
         """mic (hop,) as it is, or with the robot lowered. ref: (hop,) as it was played. aligned: what the aligner made of both."""
+        self._settling = SETTLE if aligned.realigned else self._settling - self._hop
         heard, played, explained = (float(np.dot(x, x)) for x in (mic, ref, aligned.reference))
         if played > 1e-3 * self._loudest:
             self._loudest = max(played, self._decay * self._loudest)

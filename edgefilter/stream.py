@@ -131,8 +131,8 @@ class Stream:
             self._collect(frame)
             return np.zeros(0, np.float32)
         output, self._state = self.engine.step(frame, self._state)
-        only_robot = self.front.gate is not None and self.front.gate.shut
-        self.speech_probability = 0.0 if only_robot and output.speech_probability else output.speech_probability
+        suspect = self.front.gate is not None and self.front.gate.suspect
+        self.speech_probability = 0.0 if suspect and output.speech_probability else output.speech_probability
         if talk := self._barge_in.note(self.speech_probability):
             self.events.append(Event(talk, self._stepped, f"probability {self.speech_probability or 0.0:.2f}"))
         return self._synthesiser.push(output.spectrum)

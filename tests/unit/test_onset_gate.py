@@ -6,7 +6,7 @@ from alignment_scene import RATE, fan, hear, known_path, room, run, utterances
 
 from edgefilter.alignment import Aligner
 from edgefilter.delay_line import Aligned
-from edgefilter.onset_gate import GATE, LONGEST, RAMP, OnsetGate
+from edgefilter.onset_gate import GATE, LONGEST, RAMP, SETTLE, OnsetGate
 
 HOP = 256
 
@@ -84,3 +84,12 @@ def test_the_gate_opens_and_shuts_without_a_step():
     out = np.concatenate([gate.step(ones, ones, aligned) for aligned in (locked, lost, lost, locked)])
     assert np.all(out[:HOP] == 1.0) and np.isclose(out[2 * HOP], GATE) and out[-1] == 1.0
     assert np.abs(np.diff(out)).max() <= 1.01 / RAMP
+
+
+def test_after_a_lag_was_found_a_voice_is_suspect_for_a_moment():
+    gate, ones = OnsetGate(HOP, 1.0), np.ones(HOP, np.float32)
+    suspect = []
+    for realigned in (False, True, *[False] * 30):
+        gate.step(ones, ones, Aligned(ones, 0.0, 0.0, 1.0, "locked", realigned))
+        suspect.append(gate.suspect)
+    assert not suspect[0] and suspect[1] and sum(suspect) == round(SETTLE / HOP + 0.5) and not gate.shut
