@@ -64,23 +64,28 @@ def compare(profile: Profile, recording: Samples, reference: Samples, *, sample_
     FAN_TOLERANCE_DB of the fan) are taken out. Raises SignalError where the recording does not contain the reference.
     """
     prepared = prepare(profile, recording, reference, sample_rate=sample_rate)
-    return describe(prepared, Judge(prepared).correct(prepared.prediction))
+    gain = profile.echo.microphone_gain(prepared.prediction.size)
+    return describe(prepared, Judge(prepared).correct(prepared.prediction), gain)
 
 
-def describe(prepared: Prepared, prediction: Samples | None = None) -> Comparison:
-    """The comparison of a prepared recording with prediction (n,), by default that of the profile."""
+def describe(prepared: Prepared, prediction: Samples | None = None, gain: Samples | None = None) -> Comparison:
+    """The comparison of a prepared recording with prediction (n,), by default that of the profile.
+
+    gain: (n,) of the microphone, which the fan passed as well: it is taken out of the residual before that is held against the fan.
+    """
     measurement = prepared.measurement
     prediction = prepared.prediction if prediction is None else prediction
     residual = measurement.recording - prediction
     psd = measurement.noise_psd
-    white = whiten(residual, psd)
+    flat = residual if gain is None else residual / gain
+    white = whiten(flat, psd)
     use = prepared.usable
     power = np.where(use, white.astype(np.float64) ** 2, np.nan)
     silent = use & ~prepared.active
     return Comparison(
         excess_db=_db(np.mean(power[use])) if use.any() else float("nan"),
         noise_floor_db=_db(float(np.sum(psd)) * (SAMPLE_RATE / 2) / (psd.size - 1)),
-        bands=_by_band(residual, psd, use),
+        bands=_by_band(flat, psd, use),
         times=tuple(
             (at / SAMPLE_RATE, min(at + TIME_STEP, use.size) / SAMPLE_RATE, _db(np.nanmean(power[at : at + TIME_STEP])))
             for at in range(0, use.size, TIME_STEP)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -12,7 +13,7 @@ from edgefilter.judge import Judge, Verdict
 from edgefilter.leftover import Leftover, inspect
 from edgefilter.prepare import Prepared
 from edgefilter.trials import Found, Trial
-from edgefilter.types import SAMPLE_RATE, Samples
+from edgefilter.types import Array, Samples
 
 NAME = "fan_noise"
 LEAST_CHANGE_DB = 1.0
@@ -56,7 +57,7 @@ def look_at_fan(found: Found) -> tuple[Found, Leftover]:
     """
     prepared = found.prepared
     measurement, model = prepared.measurement, found.model
-    gain = microphone_gain(found, measurement.recording.size)
+    gain = model.microphone_gain(measurement.recording.size)
     residual = (measurement.recording - found.final.prediction) / gain
     left = inspect(prepared, residual)
     final = found.final
@@ -97,16 +98,12 @@ def _with_fan(prepared: Prepared, values: Values) -> Prepared:
     return replace(prepared, measurement=replace(measurement, noise_psd=find(NAME).noise_psd(values, measurement.noise_psd)))
 
 
-def microphone_gain(found: Found, size: int) -> Samples:
-    """(size,) the gain that the model's automatic gain control gives the microphone at each moment; ones without one."""
-    values = dict(found.model.effects).get("mic_agc")
-    ones = np.ones(size, np.float32)
-    return ones if values is None else find("mic_agc").apply(ones, values, SAMPLE_RATE)
+def judge_behind(gain: Samples, prepared: Prepared, prediction: Samples, unpredictable: Sequence[tuple[Samples, Array]] = ()) -> Verdict:
+    """The verdict on an already corrected prediction (n,), with a microphone's gain (n,) taken out of the residual."""
+    flat = replace(prepared, measurement=replace(prepared.measurement, recording=(prepared.measurement.recording - prediction) / gain))
+    return replace(Judge(flat).judge(np.zeros_like(prediction), correct=False, unpredictable=unpredictable), prediction=prediction)
 
 
 def _judged(prepared: Prepared, found: Found, gain: Samples) -> Verdict:
-    """The verdict on the already corrected prediction that a search ends with, with the gain taken out of the residual."""
-    measurement, prediction = prepared.measurement, found.final.prediction
-    flat = replace(prepared, measurement=replace(measurement, recording=(measurement.recording - prediction) / gain))
-    expected = found.model.unpredictable(measurement.reference)
-    return replace(Judge(flat).judge(np.zeros_like(prediction), correct=False, unpredictable=expected), prediction=prediction)
+    """The verdict on what a search ends with."""
+    return judge_behind(gain, prepared, found.final.prediction, found.model.unpredictable(prepared.measurement.reference))

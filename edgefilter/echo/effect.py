@@ -105,7 +105,8 @@ class Effect(Protocol):
     "noise" leaves apply the identity and offers one of these instead: noise_psd(values, psd) -> (601,), the fan's PSD after it;
     variance(reference, values, sample_rate) -> (n,), what it adds to the expected square of each sample, and colour(values) -> (601,), the
     density of that per Hz, 0 to 8 kHz, with an integral of 1. An effect of stage "source"
-    that is not memoryless may name a memory, samples of the past that it needs: then the running filter applies it, too.
+    that is not memoryless may name a memory, samples of the past that it needs: then the running filter applies it, too. One of stage
+    "microphone" that gives the fan the same gain as the voice says scales_fan = True.
     """
 
     name: ClassVar[str]

@@ -38,6 +38,7 @@ class MicAgc:
     name: ClassVar[str] = "mic_agc"
     stage: ClassVar[Stage] = "microphone"
     memoryless: ClassVar[bool] = False
+    scales_fan: ClassVar[bool] = True
     parameters: ClassVar[tuple[Parameter, ...]] = (
         Parameter("gain_db", "dB", 0.0, -60.0, 60.0),
         Parameter("knots_hz", "1/s", KNOTS_HZ, 0.01, 1000.0),

@@ -81,6 +81,15 @@ class EchoModel:
             before = after
         return parts
 
+    def microphone_gain(self, size: int) -> Samples:
+        """(size,) the gain that an effect behind the microphone gives voice and fan alike at each moment; ones without one."""
+        gain = np.ones(size, np.float32)
+        for name, values in self.effects:
+            effect = find(name)
+            if getattr(effect, "scales_fan", False):
+                gain = effect.apply(gain, complete(effect, values), SAMPLE_RATE)
+        return gain
+
     def with_effect(self, name: str, values: Values) -> EchoModel:
         """The model with that effect added, or its values replaced; missing values are neutral.
 

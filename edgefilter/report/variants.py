@@ -10,6 +10,7 @@ from edgefilter.compare import Comparison, describe
 from edgefilter.diagnose import Finding
 from edgefilter.echo.effect import complete, find
 from edgefilter.echo.model import EchoModel
+from edgefilter.fan import judge_behind
 from edgefilter.judge import Judge
 from edgefilter.prepare import Prepared, prepare
 from edgefilter.profile import Profile
@@ -45,8 +46,9 @@ def compare_variants(
             else:
                 partial = partial.without_effect(finding.effect)
         heard = _with_noise(prepared, chosen)
-        verdict = Judge(heard).judge(partial.predict(prepared.measurement.reference))
-        found[choice] = replace(describe(heard, verdict.prediction), excess_db=verdict.excess_db)
+        prediction = Judge(heard).correct(partial.predict(prepared.measurement.reference))
+        gain = partial.microphone_gain(prediction.size)
+        found[choice] = replace(describe(heard, prediction, gain), excess_db=judge_behind(gain, heard, prediction).excess_db)
     return found
 
 

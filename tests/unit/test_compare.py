@@ -93,3 +93,18 @@ def test_the_dictionary_is_json_and_holds_no_signals() -> None:
 def test_a_recording_of_something_else_is_refused() -> None:
     with pytest.raises(SignalError, match="does not contain the reference"):
         compare(profile(), FAN * np.random.default_rng(8).standard_normal(64000).astype(np.float32), voice(4.0))
+
+
+def test_a_microphone_gain_in_the_profile_is_that_of_the_fan_as_well() -> None:
+    """A slow gain of +6 dB in the middle: the louder fan behind it is what the profile, which knows the gain, expects."""
+    x = voice(10.0)
+    gain_db = 6 * np.hanning(400)
+    n = np.arange(x.size) * 40 / 16000
+    recording = (record(x) * 10 ** (np.interp(n, np.arange(400), gain_db) / 20)).astype(np.float32)
+    plain = profile()
+    known = plain.with_echo(plain.echo.with_effect("mic_agc", {"gain_db": gain_db, "knots_hz": 40.0}))
+    found = compare(known, recording, x)
+    assert compare(plain, recording, x).excess_db > 3.0
+    assert abs(found.excess_db) < 0.3 and abs(found.silence_excess_db) < 0.3
+    assert max(abs(excess) for _, _, excess in found.bands) < 1.0
+    np.testing.assert_allclose(found.recording - found.prediction, found.residual, atol=1e-6)

@@ -149,3 +149,12 @@ def test_the_command_to_add_is_one_that_a_shell_reads():
     assert add_command("tilt", names) == (
         "edgefilter add tilt --profile 'my robot.npz' --recording m.wav --reference r.wav --effects own.py --output 'my robot.tilt.npz'"
     )
+
+
+def test_a_switched_on_gain_control_is_judged_as_the_diagnosis_judges_it():
+    x, robot = voice(6.0), profile()
+    gain_db = 6 * np.hanning(240)
+    model = robot.echo.with_effect("mic_agc", {"gain_db": gain_db, "knots_hz": 40.0})
+    y = (record(x) * 10 ** (np.interp(np.arange(x.size) * 40 / 16000, np.arange(240), gain_db) / 20)).astype(np.float32)
+    found = compare_variants(robot, model, [finding("mic_agc", {"gain_db": gain_db, "knots_hz": 40.0})], y, x)
+    assert abs(found[(True,)].excess_db) < 0.3 and abs(found[(True,)].silence_excess_db) < 0.3 < 3 < found[(False,)].excess_db
