@@ -31,7 +31,8 @@ def _late_reverb(v: Values) -> str:
 
 
 def _chassis_resonance(v: Values) -> str:
-    return f"the residual rings at one frequency, {_number(v, 'frequency_hz'):.0f} Hz with Q {_number(v, 'q'):.0f}, whenever the voice excites it"
+    modes = [f"{hz:.0f} Hz with Q {q:.0f}" for hz, q in zip(np.atleast_1d(v["frequency_hz"]), np.atleast_1d(v["q"]), strict=True)]
+    return f"the residual rings at {'one frequency' if len(modes) == 1 else 'two frequencies'}, {' and '.join(modes)}, whenever the voice excites it"
 
 
 def _playback_gain(v: Values) -> str:

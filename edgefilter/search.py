@@ -19,6 +19,8 @@ SECOND_SHARE = 0.2
 """Of the excess level that is left, a further effect has to explain at least this share: less is how the first one's model errs."""
 STARTS, START_SHARE = 2, 0.1
 """Further effects to begin with where the best one has not led to an explanation, and the share of the level that each must explain by itself."""
+LONG, SIMPLE_SHARE = 4, 0.3
+"""Complexity of long filters, and the share of the level that one explains from which on a simple effect may be half of it."""
 NEARLY = 0.85
 """Share of the level that is explained where no other start is tried."""
 BETTER = 0.05
@@ -41,6 +43,7 @@ def search(prepared: Prepared, model: EchoModel, progress: Callable[[str], None]
     for first in _starts(bench, model):
         runs.append(_grow(bench, model, first))
         if bench.tired or bench.explained(runs[-1]) or bench.left(runs[-1]) <= (1.0 - NEARLY) * bench.left(model):
+            runs.extend(_grow(bench, model, simple, LONG - 1) for simple in _simpler_start(bench, model, runs[-1]))
             break
     best = _best(bench, model, runs)
     steps = _in_steps(bench, model, best)
@@ -61,12 +64,23 @@ def _starts(bench: Workbench, model: EchoModel) -> Iterator[Trial]:
     yield from others[:STARTS]
 
 
-def _grow(bench: Workbench, start: EchoModel, first: Trial) -> EchoModel:
-    """The model with first and all that can be named beside it."""
+def _simpler_start(bench: Workbench, start: EchoModel, run: EchoModel) -> list[Trial]:
+    """The simple effect, none or one, that explains a good part of what one long filter does: two of them may look like that filter."""
+    added = [name for name, _ in run.effects[len(start.effects) :]]
+    if bench.tired or len(added) != 1 or SUSPECTS.get(added[0], OWN).complexity < LONG:
+        return []
+    most = bench.verdict(start).level_db - bench.verdict(run).level_db
+    tried = [t for name, rule in SUSPECTS.items() if rule.complexity <= 1 and (t := bench.attempt(name, start)) is not None]
+    simple = [t for t in tried if t.gain_db >= SIMPLE_SHARE * most and bench.admissible(t, start)]
+    return sorted(simple, key=lambda t: -t.gain_db)[:1]
+
+
+def _grow(bench: Workbench, start: EchoModel, first: Trial, most: int = 9) -> EchoModel:
+    """The model with first and all of complexity up to `most` that can be named beside it."""
     model = simpler_beside(bench, start, first.model)
     while _count(start, model) < MOST_EFFECTS and not bench.explained(model):
         least = SECOND_SHARE * bench.left(model)
-        admissible = {t.name: t for t in bench.attempt_all(model) if t.gain_db >= least and bench.admissible(t, model)}
+        admissible = {t.name: t for t in bench.attempt_all(model, most) if t.gain_db >= least and bench.admissible(t, model)}
         name = choose({key: trial.gain_db for key, trial in admissible.items()})
         if name is None:
             break

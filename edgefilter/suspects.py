@@ -66,7 +66,8 @@ def _drifts(values: Values, *_: object) -> bool:
 
 
 def _rings(values: Values, *_: object) -> bool:
-    return float(values["q"]) > 4.2 and 62.0 <= float(values["frequency_hz"]) <= 6800.0
+    q, hz = np.atleast_1d(values["q"]), np.atleast_1d(values["frequency_hz"])
+    return bool(np.all(q > 4.2) and np.all(hz >= 62.0) and np.all(hz <= 6800.0))
 
 
 def _clean_before(values: Values, judge: Judge, before: Verdict, after: Verdict) -> bool:

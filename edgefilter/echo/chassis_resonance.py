@@ -1,4 +1,4 @@
-"""A part of the robot's body rings at one frequency."""
+"""A part of the robot's body rings, at one frequency or at two."""
 
 from __future__ import annotations
 
@@ -17,12 +17,14 @@ if TYPE_CHECKING:
 
 LOWEST_HZ, HIGHEST_HZ = 60.0, 7000.0
 QUALITIES = (4.0, 8.0, 16.0, 32.0, 64.0, 128.0)
+MODES, NEXT = 2, 0.05
+"""Modes that are looked for, and the part of what the first explains that a further one must."""
 
 
 class ChassisResonance:
-    """y = x + g Re[e^(i phase) r * x], r(n) = 2 (1 - |z|) z^n, z = exp((2 pi i - pi / q) frequency_hz / rate): one mode excited by the sound.
+    """y = x + g Re[e^(i phase) r * x], r(n) = 2 (1 - |z|) z^n, z = exp((2 pi i - pi / q) frequency_hz / rate): a mode excited by the sound.
 
-    gain_db: of the added sound at resonance re the sound itself, 20 log10 g.
+    gain_db: of the added sound at resonance re the sound itself, 20 log10 g. Each parameter is a number, or an array with one for each mode.
     """
 
     name: ClassVar[str] = "chassis_resonance"
@@ -37,23 +39,42 @@ class ChassisResonance:
 
     def apply(self, x: Samples, values: Values, sample_rate: int) -> Samples:
         """x and the ring."""
-        if float(values["gain_db"]) <= -120.0:
-            return x.copy()
-        gain = 10.0 ** (float(values["gain_db"]) / 20.0) * np.exp(1j * np.deg2rad(float(values["phase_deg"])))
-        return x + (gain * _ring(x, float(values["frequency_hz"]), float(values["q"]), sample_rate)).real.astype(np.float32)
+        y = x.copy()
+        for frequency, q, gain_db, phase in np.broadcast(*(np.atleast_1d(np.asarray(values[p.name], float)) for p in self.parameters)):
+            if gain_db > -120.0:
+                gain = 10.0 ** (gain_db / 20.0) * np.exp(1j * np.deg2rad(phase))
+                y += (gain * _ring(x, frequency, q, sample_rate)).real.astype(np.float32)
+        return y
 
     def fit(self, measurement: Measurement, model: EchoModel) -> Values:
-        """Frequency and Q by a search in the whitened cross-spectrum, gain and phase by least squares in time."""
+        """Frequency and Q by a search in the whitened cross-spectrum, gain and phase by least squares in time; then, if it pays, another mode."""
         predicted, white = measurement.heard(model)
-        coarse = spectra(measurement, white, 1.0)
-        frequency, q = _search(coarse)
-        frequency, q = _refine(spectra(measurement, white, 0.1), frequency, q)
-        ring = _ring(predicted, frequency, q, SAMPLE_RATE)
-        columns = np.stack([measurement.whiten(part.astype(np.float32)) for part in (ring.real, -ring.imag)], axis=1) * measurement.weights[:, None]
+        coarse, fine = (spectra(measurement, white, resolution_hz) for resolution_hz in (1.0, 0.1))
         residual = measurement.white_recording - white
-        gain = complex(*np.linalg.lstsq((columns.T @ columns).astype(float), (columns.T @ residual).astype(float), rcond=1e-12)[0])
-        level = 20.0 * np.log10(max(abs(gain), 1e-6))
-        return {"frequency_hz": frequency, "q": q, "gain_db": float(np.clip(level, -120.0, 60.0)), "phase_deg": float(np.rad2deg(np.angle(gain)))}
+        modes: list[tuple[float, float]] = []
+        columns, gains, explained = np.zeros((white.size, 0), np.float32), np.zeros(0), 0.0
+        for _ in range(MODES):
+            mode = _refine(_without(fine, modes, gains), *_search(_without(coarse, modes, gains)))
+            ring = _ring(predicted, *mode, SAMPLE_RATE)
+            added = np.stack([measurement.whiten(part.astype(np.float32)) for part in (ring.real, -ring.imag)], axis=1) * measurement.weights[:, None]
+            tried = np.concatenate((columns, added), axis=1)
+            right = (tried.T @ residual).astype(float)
+            solved = np.linalg.lstsq((tried.T @ tried).astype(float), right, rcond=1e-12)[0]
+            if modes and float(solved @ right) < (1.0 + NEXT) * explained:
+                break
+            modes, columns, gains, explained = [*modes, mode], tried, solved, float(solved @ right)
+        complex_gains = gains[::2] + 1j * gains[1::2]
+        level = np.clip(20.0 * np.log10(np.maximum(np.abs(complex_gains), 1e-6)), -120.0, 60.0)
+        found = np.array([*zip(*modes, strict=True), level, np.rad2deg(np.angle(complex_gains))])[:, np.argsort(-level)]
+        return {p.name: row if row.size > 1 else float(row[0]) for p, row in zip(self.parameters, found, strict=True)}
+
+
+def _without(found: Spectra, modes: list[tuple[float, float]], gains: Array) -> Spectra:
+    """The spectra with what modes of these gains (2 modes,), real and imaginary, explain taken out of the cross-spectrum."""
+    cross = found.cross
+    for (frequency, q), real, imaginary in zip(modes, gains[::2], gains[1::2], strict=True):
+        cross = cross - (real + 1j * imaginary) * _shape(found.hz, np.array([frequency]), q)[0] * found.predicted
+    return Spectra(found.hz, found.predicted, cross)
 
 
 def _pole(frequency: float | Array, q: float | Array, sample_rate: int) -> complex | NDArray[np.complex128]:
