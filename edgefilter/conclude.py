@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from edgefilter.band_edge import cut_by_power
 from edgefilter.compare import describe
 from edgefilter.echo.effect import complete, find, whiten
 from edgefilter.echo.model import EchoModel
@@ -45,8 +46,9 @@ def conclude(prepared: Prepared, found: Found, progress: Callable[[str], None] |
     quiet = found.base.excess_db < EXPLAINED_DB and not prepared.human
     verdict = "missing" if believed and not _much_left(found) else "explained" if quiet else "unexplained"
     if not believed and (quiet or not _partly(prepared, found)):
-        found = replace(found, steps=(), final=found.base, model=found.start)
-        remaining = found.base.excess_db
+        sure = None if quiet else cut_by_power(found)
+        found = sure or replace(found, steps=(), final=found.base, model=found.start)
+        remaining = found.final.excess_db
     return Diagnosis(
         verdict=verdict,
         comparison=comparison,

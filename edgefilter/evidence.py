@@ -110,6 +110,8 @@ def left_in_words(prepared: Prepared, found: Found, left: Leftover, remaining_db
         weights = 10 * np.log10(np.maximum(final.cells, 1e-3)).mean(axis=0)
         top = int(np.argmax(weights))
         words.append(f"a residual that follows the robot's voice, strongest around {_band(top, final.cells.shape[1])}")
+        if "bandlimit" in dict(found.model.effects):
+            words.append("a codec that cuts the band leaves such noise")
     if not words:
         words.append("a residual spread over the whole recording")
     return f"{remaining_db:.1f} dB over the noise floor that no effect of the catalogue explains: " + "; ".join(words)

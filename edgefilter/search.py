@@ -19,6 +19,8 @@ SECOND_SHARE = 0.2
 """Of the excess level that is left, a further effect has to explain at least this share: less is how the first one's model errs."""
 STARTS, START_SHARE = 2, 0.1
 """Further effects to begin with where the best one has not led to an explanation, and the share of the level that each must explain by itself."""
+POWER_SHARE = 0.6
+"""Of the power over the fan, what a further effect may leave at most that explains less of the level than that."""
 LONG, SIMPLE_SHARE = 4, 0.3
 """Complexity of long filters, and the share of the level that one explains from which on a simple effect may be half of it."""
 NEARLY = 0.85
@@ -80,7 +82,7 @@ def _grow(bench: Workbench, start: EchoModel, first: Trial, most: int = 9) -> Ec
     model = simpler_beside(bench, start, first.model)
     while _count(start, model) < MOST_EFFECTS and not bench.explained(model):
         least = SECOND_SHARE * bench.left(model)
-        admissible = {t.name: t for t in bench.attempt_all(model, most) if t.gain_db >= least and bench.admissible(t, model)}
+        admissible = {t.name: t for t in bench.attempt_all(model, most) if (t.gain_db >= least or _halves(bench, model, t)) and bench.admissible(t, model)}
         name = choose({key: trial.gain_db for key, trial in admissible.items()})
         if name is None:
             break
@@ -90,6 +92,12 @@ def _grow(bench: Workbench, start: EchoModel, first: Trial, most: int = 9) -> Ec
             model = before
             break
     return model
+
+
+def _halves(bench: Workbench, model: EchoModel, trial: Trial) -> bool:
+    """Whether a trial takes away about half of the power over the fan, though in so few cells that the level hardly falls: a narrow ring does."""
+    before, after = (10 ** (verdict.active_db / 10) - 1.0 for verdict in (bench.verdict(model), trial.verdict))
+    return after < POWER_SHARE * before
 
 
 def _count(start: EchoModel, model: EchoModel) -> int:

@@ -24,8 +24,8 @@ LAST, ENOUGH, LITTLE_DB = ("rattle",), 0.4, 0.1
 HEARD_DB, FAN_DB = 0.6, 0.2
 """Where the residual is no more than the first above that of the robot's silences, or no more than the second above the calibrated fan, there is
 nothing beside the effects that were found, whose models err a little."""
-MOST_TRIALS = 60
-"""So many fits take half a minute at most."""
+COSTS, DEAR = {"rattle": 8, "compression": 2}, 60
+"""Of a fit in quarters of a second, 1 for all others, and the sum of them after which only what is in plain sight is looked for."""
 
 Signature: TypeAlias = tuple[tuple[str | bytes, ...], ...]
 
@@ -66,6 +66,7 @@ class Workbench:
         self._progress = progress
         self._verdicts: dict[Signature, Verdict] = {}
         self._trials: dict[tuple[Signature, str], Trial | None] = {}
+        self._cost = 0
         self._alike: dict[tuple[frozenset[str], str], Trial | None] = {}
 
     def verdict(self, model: EchoModel) -> Verdict:
@@ -94,13 +95,14 @@ class Workbench:
         key = signature(model), name
         if key not in self._trials:
             self._trials[key] = self._attempt(name, model)
+            self._cost += COSTS.get(name, 1)
             self._alike[frozenset(dict(model.effects)), name] = self._trials[key]
         return self._trials[key]
 
     @property
     def tired(self) -> bool:
         """Whether so much was tried that a doubtful case is left as it is."""
-        return len(self._trials) >= MOST_TRIALS
+        return self._cost >= DEAR
 
     def attempt_alike(self, name: str, model: EchoModel) -> Trial | None:
         """attempt(), or what came of it beside the same effects at other values: enough to choose what is worth a closer look."""
@@ -135,7 +137,7 @@ class Workbench:
         wanted = [name for name in wanted if SUSPECTS.get(name, OWN).complexity <= most]
         found, left = [], self.left(model)
         for name in sorted(wanted, key=lambda name: name in LAST):
-            if name in LAST and (left < LITTLE_DB or any(t.gain_db > ENOUGH * left and self.admissible(t, model) for t in found)):
+            if name in LAST and (self.tired or left < LITTLE_DB or any(t.gain_db > ENOUGH * left and self.admissible(t, model) for t in found)):
                 continue
             if (trial := self.attempt(name, model)) is not None:
                 found.append(trial)

@@ -17,8 +17,8 @@ if TYPE_CHECKING:
 
 LOWEST_HZ, HIGHEST_HZ = 60.0, 7000.0
 QUALITIES = (4.0, 8.0, 16.0, 32.0, 64.0, 128.0)
-MODES, NEXT = 2, 0.05
-"""Modes that are looked for, and the part of what the first explains that a further one must."""
+MODES, NEXT, CLEAR_Q = 2, 0.05, 8.0
+"""Modes that are looked for, the part of what the first explains that a further one must, and the least Q of that: broader ones are no modes."""
 
 
 class ChassisResonance:
@@ -55,6 +55,8 @@ class ChassisResonance:
         columns, gains, explained = np.zeros((white.size, 0), np.float32), np.zeros(0), 0.0
         for _ in range(MODES):
             mode = _refine(_without(fine, modes, gains), *_search(_without(coarse, modes, gains)))
+            if modes and mode[1] < CLEAR_Q:
+                break
             ring = _ring(predicted, *mode, SAMPLE_RATE)
             added = np.stack([measurement.whiten(part.astype(np.float32)) for part in (ring.real, -ring.imag)], axis=1) * measurement.weights[:, None]
             tried = np.concatenate((columns, added), axis=1)

@@ -9,10 +9,12 @@ import pytest
 from robot_scene import DELAY, FAN, path, profile, record, voice
 from scipy import signal
 
+from edgefilter.band_edge import band_edge
 from edgefilter.compare import compare
 from edgefilter.diagnose import Diagnosis, add, diagnose
 from edgefilter.echo.model import PRE_ROLL, EchoModel
-from edgefilter.prepare import shift
+from edgefilter.judge import Judge
+from edgefilter.prepare import prepare, shift
 from edgefilter.suspects import choose
 
 SECONDS = 12.0
@@ -99,6 +101,22 @@ def test_what_no_effect_makes_is_unexplained() -> None:
     found = diagnose(profile(), (ring + fan()).astype(np.float32), x)
     assert (found.verdict, names(found)) == ("unexplained", [])
     assert "follows the robot's voice" in found.evidence
+
+
+def test_a_band_limit_shows_in_the_power_where_a_codecs_noise_hides_it() -> None:
+    x, low = voice(SECONDS), signal.butter(12, 4000.0, fs=16000, output="sos")
+    passed = signal.sosfiltfilt(low, echo(x))
+    noise = signal.sosfiltfilt(low, 0.3 * passed * np.random.default_rng(5).standard_normal(x.size))
+    found = diagnose(profile(), (passed + noise + fan()).astype(np.float32), x)
+    assert (found.verdict, names(found)) == ("unexplained", ["bandlimit"])
+    assert found.ranking[0].parameters["cutoff_hz"].value == pytest.approx(4000.0, rel=0.15)  # edges of bands a sixth of an octave wide
+    assert "codec" in found.evidence
+
+
+def test_a_band_edge_is_not_seen_where_the_volume_was_turned() -> None:
+    x = voice(SECONDS)
+    judge = Judge(prepare(profile(), (0.4 * echo(x) + fan()).astype(np.float32), x))
+    assert band_edge(judge, judge.prepared.prediction) is None
 
 
 def test_an_added_effect_lowers_the_error_of_another_recording() -> None:

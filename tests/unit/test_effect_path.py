@@ -57,6 +57,15 @@ def test_a_resonance_is_found_with_its_frequency_and_q() -> None:
     assert left < 0.5
 
 
+def test_two_resonances_are_found_with_their_frequencies_loudest_first() -> None:
+    rng, x = np.random.default_rng(5), voice(12.0)
+    clean = EchoModel(path()).predict(shift(x, DELAY - PRE_ROLL)).astype(float)
+    ringing = clean + sum(gain * signal.lfilter(*signal.iirpeak(hz, 40.0, fs=16000), clean) for hz, gain in ((820.0, 0.5), (1900.0, 0.8)))
+    left, values = excess_db("chassis_resonance", measure(ringing + FAN * rng.standard_normal(x.size), x))
+    np.testing.assert_allclose(values["frequency_hz"], (1900.0, 820.0), rtol=0.005)
+    assert left < 0.5
+
+
 @pytest.mark.parametrize("filters", [signal.butter(6, 3000.0, fs=16000, output="sos"), signal.cheby1(8, 0.5, 5000.0, fs=16000, output="sos")])
 def test_a_low_pass_is_found_whatever_its_kind(filters: np.ndarray) -> None:
     rng, x = np.random.default_rng(6), voice(12.0)
