@@ -48,7 +48,7 @@ def judge(case: Path, truth: dict | None) -> Outcome:
     """Diagnose one case; an error of the product is its answer."""
     signals = {name: sf.read(case / f"{name}.flac", dtype="float32")[0] for name in SIGNALS}
     known = {"effects": [], "raw": [], "strength": "sealed"} if truth is None else {"raw": truth["effects"]} | truth
-    started = time.perf_counter()
+    started = time.process_time()
     said: dict = {"verdict": "error", "named": (), "before_db": (), "after_db": (), "share": (), "excess_db": np.nan, "remaining_db": np.nan}
     try:
         profile = calibrate(*(signals[name] for name in SIGNALS[:3]))
@@ -58,7 +58,7 @@ def judge(case: Path, truth: dict | None) -> Outcome:
         said |= {"share": tuple(f.share for f in found.ranking), "excess_db": found.comparison.excess_db, "evidence": found.evidence}
     except Exception as error:  # whatever it is, it is a miss of this case, and the other cases are scored
         said["evidence"] = f"{type(error).__name__}: {error}"
-    seconds = time.perf_counter() - started
+    seconds = time.process_time() - started
     return Outcome(case.name, tuple(sorted(known["effects"])), tuple(known["raw"]), known["strength"], **said, seconds=seconds)
 
 

@@ -82,7 +82,8 @@ def _grow(bench: Workbench, start: EchoModel, first: Trial, most: int = 9) -> Ec
     model = simpler_beside(bench, start, first.model)
     while _count(start, model) < MOST_EFFECTS and not bench.explained(model):
         least = SECOND_SHARE * bench.left(model)
-        admissible = {t.name: t for t in bench.attempt_all(model, most) if (t.gain_db >= least or _halves(bench, model, t)) and bench.admissible(t, model)}
+        much = [t for t in bench.attempt_all(model, most) if t.gain_db >= least or _halves(bench, model, t)]
+        admissible = {t.name: t for t in much if bench.admissible(t, model)}
         name = choose({key: trial.gain_db for key, trial in admissible.items()})
         if name is None:
             break

@@ -92,7 +92,8 @@ def simpler_beside(bench: Workbench, start: EchoModel, model: EchoModel) -> Echo
     for name in [name for name, _ in model.effects[len(start.effects) :] if name in FLEXIBLE]:
         if _count(start, model) > 2 or bench.tired or bench.explained(others := model.without_effect(name)):
             break
-        wanted = [key for key, rule in _suspects(others) if key not in FLEXIBLE and key not in LAST and rule.complexity <= max(_complexity(name) - 1, SIMPLE)]
+        most = max(_complexity(name) - 1, SIMPLE)
+        wanted = [key for key, rule in _suspects(others) if key not in (*FLEXIBLE, *LAST) and rule.complexity <= most]
         simple = [t for key in wanted if (t := bench.attempt_alike(key, others)) is not None and bench.admissible(t, others)]
         least = max(CONFIRMED * bench.left(model), 0.05)
         for trial in sorted(simple, key=lambda t: -t.gain_db)[:2]:

@@ -84,7 +84,8 @@ class _Blocks:
         self._used = np.flatnonzero(padded.any(axis=1))
         self._weights = padded[self._used]
         self._x = x.astype(np.float32)
-        before = np.concatenate((np.zeros(taps - 1 - lead, np.float32), self._x, np.zeros(lead + count * self._new - x.size + self._size, np.float32)))
+        after = lead + count * self._new - x.size + self._size
+        before = np.concatenate((np.zeros(taps - 1 - lead, np.float32), self._x, np.zeros(after, np.float32)))
         pieces = before[self._used[:, None] * self._new + np.arange(self._size)]
         self._source = fft.rfft(pieces, axis=1)
 
