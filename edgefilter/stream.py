@@ -205,7 +205,7 @@ class EgoFilter:
 
     @property
     def speech_probability(self) -> float | None:
-        """Probability that the human speaks now, where the engine judges it."""
+        """Probability that the human speaks now, where the engine judges it; 0 while it may well be the robot (OnsetGate.suspect)."""
         return self._stream.speech_probability
 
     @property
