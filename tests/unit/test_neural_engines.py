@@ -81,7 +81,7 @@ def test_the_stream_tells_the_probability_of_speech():
     mic, ref = conformance.conversation(4000)
     ego = EgoFilter(engine="crnn", model=EDGE)
     assert ego.speech_probability is None
-    ego.process(mic, ref)
+    ego.process(mic, np.zeros_like(ref))  # nobody but the human can be heard
     assert 0 < ego.speech_probability < 1
 
 
