@@ -12,7 +12,8 @@ from edgefilter.echo.effect import find, whiten
 from edgefilter.echo.model import PRE_ROLL, EchoModel
 from edgefilter.echo.wiener import convolve_from, fit_filter
 from edgefilter.errors import SignalError
-from edgefilter.prepare import BLOCK, MAX_OFFSET, MIN_SECONDS, shift
+from edgefilter.offset import MAX_OFFSET, shift
+from edgefilter.prepare import BLOCK, MIN_SECONDS
 from edgefilter.profile import DISTORTION_ORDERS, GRID_FFT, GRID_HZ, Profile
 from edgefilter.types import SAMPLE_RATE, Samples, as_samples
 

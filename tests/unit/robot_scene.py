@@ -6,7 +6,7 @@ import numpy as np
 from scipy import signal
 
 from edgefilter.echo.model import PRE_ROLL, EchoModel
-from edgefilter.prepare import shift
+from edgefilter.offset import shift
 from edgefilter.profile import Profile
 
 FAN = 1e-3

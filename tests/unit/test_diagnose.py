@@ -14,7 +14,8 @@ from edgefilter.compare import compare
 from edgefilter.diagnose import Diagnosis, add, diagnose
 from edgefilter.echo.model import PRE_ROLL, EchoModel
 from edgefilter.judge import Judge
-from edgefilter.prepare import prepare, shift
+from edgefilter.offset import shift
+from edgefilter.prepare import prepare
 from edgefilter.suspects import choose
 
 SECONDS = 12.0

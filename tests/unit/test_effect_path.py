@@ -10,7 +10,8 @@ from scipy import signal
 from edgefilter.echo.effect import Measurement, find
 from edgefilter.echo.model import PRE_ROLL, EchoModel
 from edgefilter.echo.wiener import fit_filter
-from edgefilter.prepare import prepare, shift
+from edgefilter.offset import shift
+from edgefilter.prepare import prepare
 
 
 def measure(recording: np.ndarray, x: np.ndarray) -> Measurement:

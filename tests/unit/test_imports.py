@@ -27,7 +27,7 @@ LAYERS = [
     {"front"},
     {"stepping", "barge_in", "stream", "audio", "budget", "run"},
     {"sweep", "paper_response", "trust", "calibrate"},
-    {"prepare", "self_calibration", "compare", "judge", "suspects", "trials", "fan", "settle", "search", "leftover", "band_edge", "findings", "evidence", "conclude", "diagnose"},
+    {"offset", "prepare", "self_calibration", "compare", "judge", "suspects", "trials", "fan", "settle", "search", "leftover", "band_edge", "findings", "evidence", "conclude", "diagnose"},
     {"report"},
     {"commands"},
     {"cli"},

@@ -12,7 +12,7 @@ from robot_scene import DELAY, FAN, path, record, voice
 from edgefilter.cli import main
 from edgefilter.echo.model import EchoModel
 from edgefilter.errors import SignalError
-from edgefilter.prepare import shift
+from edgefilter.offset import shift
 from edgefilter.self_calibration import ABSORBED, find_drift, self_calibrate
 
 RATE = 16000
