@@ -48,7 +48,9 @@ class FileSource:
         self.notes = list(self._mic.notes)
         if self._mic.silent:
             self.notes.append(f"recording {mic_path} is silent: every sample is zero")
-        if self._reference is not None:
+        if self._reference is None:
+            self.notes.append("no reference: nothing tells the robot's voice from the human's; give it with --reference")
+        else:
             self.notes += self._reference.notes + _length_notes(self._reference, self._mic.total)
 
     def __enter__(self) -> FileSource:
