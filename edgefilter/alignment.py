@@ -73,13 +73,9 @@ class Aligner:
         self._witness, self._segments = JumpWitness(), 0
         self._to_search, self._to_measure, self._stage = SEARCH_STRIDE, STRIDE // 2, 0
         self._gain: float | None = None
-        self._refuted = self._trusted = self._measured = False
+        self._known = self._refuted = self._trusted = self._measured = False
         self._confidence, self._lost = 0.0, 0
         self._counts = {"utterances": 0, "realignments": 0, "jumps": 0, "searches": 0, "announced": 0, "announced_heard": 0}
-
-    @property
-    def _known(self) -> bool:
-        return self._drift.delay == self._drift.delay
 
     def announce(self, utterance: Samples) -> None:
         """Say what will be played (n,); it may begin at any time or never, and several are played in the order of announcing.
@@ -101,7 +97,8 @@ class Aligner:
             self._counts["utterances"] += 1
             if self._expected is not None:
                 self._stage, self._to_search, self._expected = 0, 0, None
-        self._expire()
+        if self._open:
+            self._expire()
         before = self._read_at
         self._measured = False
         if self._known:
@@ -135,10 +132,9 @@ class Aligner:
 
     def _expire(self) -> None:
         """Give up utterances that would have been heard by now."""
-        if self._open:
-            end = self._open[1].start if len(self._open) > 1 else self._onsets.current.end
-            if self._ref.end > end + self._max_lag + SAMPLE_RATE // 4:
-                self._resolve(found=False)
+        end = self._open[1].start if len(self._open) > 1 else self._onsets.current.end
+        if self._ref.end > end + self._max_lag + SAMPLE_RATE // 4:
+            self._resolve(found=False)
 
     def _resolve(self, found: bool = True) -> None:
         self._open.popleft()
@@ -207,6 +203,7 @@ class Aligner:
 
     def _switch(self, delay: float, deviation: float) -> bool:
         self._drift.restart(delay, deviation)
+        self._known = True
         self._counts["realignments"] += 1
         self._lost, self._refuted = 0, False
         self._witness.forget()

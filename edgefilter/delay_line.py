@@ -90,12 +90,16 @@ def _kernel_table() -> tuple[Array, Array]:
     return np.ascontiguousarray(table[:-1]), np.diff(table, axis=0)
 
 
-def _kernels(delay_from: float, middle: float, delay_to: float) -> Array:
-    """Filters (3, 2 * HALF_WIDTH) for three delays of -1 to 2, last tap first, from the table."""
+def _kernels(*delays: float) -> Array:
+    """Filters (m, 2 * HALF_WIDTH) for m delays of -1 to 2, last tap first, from the table."""
     table, step = _kernel_table()
-    at = (np.array((delay_from, middle, delay_to)) + 1.0) * PHASES
-    below = at.astype(np.intp)
-    return table[below] + (at - below).astype(np.float32)[:, None] * step[below]
+    filters = np.empty((len(delays), 2 * HALF_WIDTH), np.float32)
+    for row, delay in zip(filters, delays):
+        at = (delay + 1.0) * PHASES
+        below = int(at)
+        np.multiply(step[below], at - below, out=row)
+        row += table[below]
+    return filters
 
 
 def read_delayed(tape: Tape, stop: int, count: int, delay_from: float, delay_to: float) -> Samples:
@@ -109,9 +113,12 @@ def read_delayed(tape: Tape, stop: int, count: int, delay_from: float, delay_to:
     whole = math.floor(middle)
     source = tape.read(stop - count - whole - HALF_WIDTH, stop - whole + HALF_WIDTH - 1)
     shifted = np.ndarray((2 * HALF_WIDTH, count), np.float32, source, 0, 2 * source.strides)
-    filtered = _kernels(delay_from - whole, middle - whole, delay_to - whole) @ np.ascontiguousarray(shifted)
+    filtered = _kernels(delay_from - whole, middle - whole, delay_to - whole).dot(shifted)
     filtered *= _parabola(count)
-    return filtered.sum(axis=0)
+    start, centre, end = filtered
+    start += centre
+    start += end
+    return start
 
 
 @lru_cache(maxsize=8)
