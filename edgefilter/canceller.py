@@ -126,24 +126,25 @@ class Canceller:
         misalignment = np.add.reduce(self._expected, axis=0)
         echo = fourier.irfft(predicted, 2 * self.hop)[self.hop :]
         echo = self._follow_gain(mic, echo)
-        echo, phantom = self._without_phantom(mic, echo)
-        error = mic - echo
+        echo, error, phantom = self._without_phantom(mic, echo)
         self._padded[self.hop :] = error
         error_spectrum = fourier.rfft(self._padded)
         observed = _power(error_spectrum)
         self._noise *= NOISE_MEMORY
         self._noise += (1.0 - NOISE_MEMORY) * np.maximum(observed - 0.5 * OWN_SHARE * misalignment, 0.05 * observed)
         self._hops += 1
-        if np.dot(reference, reference) > SILENCE * self.hop and not phantom:
+        if reference.dot(reference) > SILENCE * self.hop and not phantom:
             self._active += 1
             self._adapt(error_spectrum, 1.0 / (misalignment + 2.0 * self._noise + 1e-12))
         return CancellerOutput(echo, error, 0.5 * misalignment)
 
     def _follow_gain(self, mic: Samples, echo: Samples) -> Samples:
         """The echo, and the whole path with it, rescaled where one factor explains much of the error: someone turned the volume."""
-        found = float(np.dot(mic, mic)), float(np.dot(mic, echo)), float(np.dot(echo, echo))
-        self._correlation = tuple(GAIN_MEMORY * old + (1.0 - GAIN_MEMORY) * new for old, new in zip(self._correlation, found))
         mic_power, cross, echo_power = self._correlation
+        mic_power = GAIN_MEMORY * mic_power + (1.0 - GAIN_MEMORY) * float(mic.dot(mic))
+        cross = GAIN_MEMORY * cross + (1.0 - GAIN_MEMORY) * float(mic.dot(echo))
+        echo_power = GAIN_MEMORY * echo_power + (1.0 - GAIN_MEMORY) * float(echo.dot(echo))
+        self._correlation = mic_power, cross, echo_power
         if cross <= 0.0 or echo_power <= SILENCE * self.hop:
             return echo
         factor = cross / echo_power
@@ -155,18 +156,17 @@ class Canceller:
         self.gain *= factor
         return echo * np.float32(factor)
 
-    def _without_phantom(self, mic: Samples, echo: Samples) -> tuple[Samples, bool]:
-        """The echo, faded out while subtracting it adds more than it takes, and whether that is so."""
+    def _without_phantom(self, mic: Samples, echo: Samples) -> tuple[Samples, Samples, bool]:
+        """Echo and error, the echo faded out while subtracting it adds more than it takes, and whether that is so."""
         error = mic - echo
-        phantom = float(np.dot(error, error)) > PHANTOM * float(np.dot(mic, mic)) and self._phantoms < PHANTOM_PATIENCE
+        phantom = float(error.dot(error)) > PHANTOM * float(mic.dot(mic)) and self._phantoms < PHANTOM_PATIENCE
         self._phantoms = self._phantoms + 1 if phantom else max(0, self._phantoms - 1)
-        gain = 0.0 if phantom else 1.0
-        if gain != self._fade:
-            echo = echo * np.linspace(self._fade, gain, self.hop, dtype=np.float32)
-        elif phantom:
-            echo = np.zeros_like(echo)
-        self._fade = gain
-        return echo, phantom
+        before, self._fade = self._fade, 0.0 if phantom else 1.0
+        if before == self._fade == 1.0:
+            return echo, error, phantom
+        silent = before == self._fade
+        echo = np.zeros_like(echo) if silent else echo * np.linspace(before, self._fade, self.hop, dtype=np.float32)
+        return echo, mic - echo, phantom
 
     def _push(self, reference: Samples) -> None:
         """Take the reference's next hop into the spectra and powers (partitions, bins), the newest first in each channel."""
@@ -181,8 +181,8 @@ class Canceller:
         self._powers, self._older_powers = self._older_powers, self._powers
         self._spectra[1:] = self._older_spectra[:-1]
         self._powers[1:] = self._older_powers[:-1]
-        self._spectra[self._first] = fresh
-        self._powers[self._first] = _power(fresh)
+        for row, spectrum, power in zip(self._first, fresh, _power(fresh)):
+            self._spectra[row], self._powers[row] = spectrum, power
 
     def _displacement(self, reference: Samples) -> Samples:
         """(n,) of the membrane while it plays the next n samples of the reference; carries its state on."""
