@@ -57,7 +57,7 @@ class Announcements:
 
     def reference(self, ref: Samples, now: int) -> Samples:
         """The reference (n,) for the hop that begins at position now: the channel's own, or what is being played."""
-        if (self._waiting or self._playing) and float(np.dot(ref, ref)) > FLOOR * ref.size:
+        if (self._waiting or self._playing) and float(ref.dot(ref)) > FLOOR * ref.size:
             self._waiting.clear()
             self._playing = None
         if self._playing is None:

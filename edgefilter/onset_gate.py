@@ -56,7 +56,7 @@ class OnsetGate:
     def step(self, mic: Samples, ref: Samples, aligned: Aligned) -> Samples:
         """mic (hop,) as it is, or with the robot lowered. ref: (hop,) as it was played. aligned: what the aligner made of both."""
         self._settling = SETTLE if aligned.realigned else self._settling - self._hop
-        heard, played, explained = (float(np.dot(x, x)) for x in (mic, ref, aligned.reference))
+        heard, played, explained = float(mic.dot(mic)), float(ref.dot(ref)), float(aligned.reference.dot(aligned.reference))
         if played > 1e-3 * self._loudest:
             self._loudest = max(played, self._decay * self._loudest)
         if aligned.state != "searching":

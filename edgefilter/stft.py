@@ -92,6 +92,7 @@ class Analyser:
     def __init__(self, config: StftConfig, channels: int = 1) -> None:
         self.config = config
         self._recent = np.zeros((channels, config.window_length), np.float32)
+        self._newest = list(self._recent[:, -config.hop :])
         self._padded = np.zeros((channels, config.n_fft), np.float32)
         self._windowed, self._window = self._padded[:, : config.window_length], config.analysis_window
 
@@ -99,8 +100,8 @@ class Analyser:
         """Take the next hop of samples (hop,) of each channel; return the frame that ends with them, (channels, bins) complex64."""
         recent, hop = self._recent, self.config.hop
         recent[:, :-hop] = recent[:, hop:]
-        for channel, samples in zip(recent, hop_samples, strict=True):
-            channel[-hop:] = samples
+        for newest, samples in zip(self._newest, hop_samples, strict=True):
+            newest[:] = samples
         np.multiply(recent, self._window, out=self._windowed)
         return fourier.rfft(self._padded)
 

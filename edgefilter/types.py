@@ -68,14 +68,14 @@ class Event:
 
 
 def as_samples(x: object, name: str) -> Samples:
-    """Return x as a finite (n,) float32 array without writing into it; raise SignalError otherwise."""
+    """Return x as a finite (n,) float32 array, contiguous, without writing into it; raise SignalError otherwise."""
     array = np.asarray(x)
     if array.dtype.kind != "f":
         raise SignalError(f"{name} has dtype {array.dtype}, expected float samples in +-1: divide integer PCM by its full scale")
     if array.ndim != 1:
         raise SignalError(f"{name} has shape {array.shape}, expected one channel of shape (n,)")
-    array = array.astype(np.float32, copy=False)
-    if not math.isfinite(np.dot(array, array)) and not np.isfinite(array).all():
+    array = np.ascontiguousarray(array, np.float32)
+    if not math.isfinite(array.dot(array)) and not np.isfinite(array).all():
         bad = int(np.argmin(np.isfinite(array)))
         raise SignalError(f"{name} holds {array[bad]} at sample {bad}, expected finite samples: repair or cut the recording")
     return array

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
-
 from edgefilter.types import SAMPLE_RATE, Samples
 
 PAUSE = SAMPLE_RATE // 5
@@ -43,7 +41,7 @@ class OnsetDetector:
     def step(self, ref: Samples) -> Utterance | None:
         """Take a hop (hop,) and return the utterance that begins with it, if one does; `current` grows while it lasts."""
         self.now += self._hop
-        power = float(np.dot(ref, ref)) / self._hop
+        power = float(ref.dot(ref)) / self._hop
         self._peak = max(power, self._peak * self._decay)
         self.active = power > max(FLOOR, RANGE * self._peak)
         if not self.active:

@@ -25,6 +25,8 @@ class Driver:
 
     def __call__(self, block: Samples) -> Samples:
         """block (n,) after the effects, (n,); it follows the last one."""
+        if not self._chain:
+            return block
         x = np.concatenate((self._past, block)) if self._memory else block
         self._past = x[x.size - self._memory :]
         for effect, values in self._chain:
