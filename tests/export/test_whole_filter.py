@@ -46,9 +46,9 @@ class Watched(Canceller):
         return echo
 
     def _without_phantom(self, mic, echo):
-        echo, phantom = super()._without_phantom(mic, echo)
+        echo, error, phantom = super()._without_phantom(mic, echo)
         self.phantom += phantom
-        return echo, phantom
+        return echo, error, phantom
 
 
 @pytest.fixture(scope="module", params=[256, 160])
