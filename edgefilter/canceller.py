@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -43,8 +43,7 @@ SILENCE = 1e-10
 """Mean reference power, full scale^2, below which the path is neither adapted nor allowed to age."""
 
 
-@dataclass(frozen=True, slots=True)
-class CancellerOutput:
+class CancellerOutput(NamedTuple):
     """One hop of the linear stage.
 
     echo, error: (hop,) float32 with error = mic - echo exactly. uncertainty: (hop + 1,) float32, what the filter itself expects

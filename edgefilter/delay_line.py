@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 
@@ -16,8 +16,7 @@ PHASES = 256
 """Delays per sample at which the filters are tabulated; linear interpolation between them errs by less than -100 dB."""
 
 
-@dataclass(frozen=True, slots=True)
-class Aligned:
+class Aligned(NamedTuple):
     """The reference as an aligner delivers it for one hop of the microphone.
 
     reference: (hop,) float32, delayed so that the robot's direct sound lies PRE_ROLL samples behind it; zeros while no delay is

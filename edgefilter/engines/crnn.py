@@ -11,7 +11,7 @@ import numpy as np
 
 from edgefilter.engines.base import Front
 from edgefilter.engines.onnx_session import FixedPlaces, expect_slots, find_model, open_model
-from edgefilter.engines.spectral_subtraction import MaskState, SpectralSubtraction
+from edgefilter.engines.spectral_subtraction import SpectralSubtraction
 from edgefilter.types import Frame, Output, Samples, Spectrum
 
 EDGE_TYPE, EDGE_VERSION = "edgefilter-crnn", 1
@@ -23,7 +23,7 @@ WIENER_SHARE = 0.5
 """Part of the answer that comes from the Wiener mask of 'ss'. The two err in different places, and what one deletes the other keeps: on
 validation conversations the mean had a higher SI-SDR than either, far fewer word errors than the network and about as many as 'ss'."""
 
-CrnnState: TypeAlias = tuple[tuple[Samples, ...], MaskState]
+CrnnState: TypeAlias = tuple[tuple[Samples, ...], Samples]
 """The network's state tensors, all zeros at the start, and the Wiener mask's state."""
 
 

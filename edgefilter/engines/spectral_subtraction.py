@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
@@ -17,15 +16,11 @@ MEMORY = 0.8
 """Decision-directed smoothing of the a-priori signal-to-noise ratio; the usual 0.98 smears onsets and costs words."""
 
 
-@dataclass(frozen=True, slots=True)
-class MaskState:
-    """Power of the previous answer (bins,)."""
-
-    answered: Samples
-
-
 class SpectralSubtraction:
-    """Wiener gain xi / (1 + xi) with the decision-directed a-priori ratio xi of Ephraim & Malah (1984), eq. (51); xi = wanted / unwanted."""
+    """Wiener gain xi / (1 + xi) with the decision-directed a-priori ratio xi of Ephraim & Malah (1984), eq. (51); xi = wanted / unwanted.
+
+    The state is the power of the previous answer (bins,).
+    """
 
     name: ClassVar[str] = "ss"
     front: ClassVar[Front] = "full"
@@ -34,12 +29,12 @@ class SpectralSubtraction:
         self.stft = stft
         self.lookahead = 0
 
-    def initial_state(self) -> MaskState:
-        return MaskState(np.zeros(self.stft.bins, np.float32))
+    def initial_state(self) -> Samples:
+        return np.zeros(self.stft.bins, np.float32)
 
-    def step(self, frame: Frame, state: MaskState) -> tuple[Output, MaskState]:
+    def step(self, frame: Frame, state: Samples) -> tuple[Output, Samples]:
         unwanted = frame.noise_psd + frame.residual_psd + 1e-12
         observed = frame.error.real**2 + frame.error.imag**2
-        wanted = MEMORY * state.answered + (1.0 - MEMORY) * np.maximum(observed - unwanted, 0.0)
+        wanted = MEMORY * state + (1.0 - MEMORY) * np.maximum(observed - unwanted, 0.0)
         gain = np.maximum(wanted / (wanted + unwanted), FLOOR)
-        return Output(gain * frame.error), MaskState(gain * gain * observed)
+        return Output(gain * frame.error), gain * gain * observed
