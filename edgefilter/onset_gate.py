@@ -7,7 +7,7 @@ import numpy as np
 from edgefilter.delay_line import Aligned
 from edgefilter.types import SAMPLE_RATE, Samples
 
-GATE = np.float32(0.003)
+GATE = 0.003
 """Gain while the gate is shut, -50 dB: what is left of a robot that is 20-26 dB above the human no network takes for somebody, and
 the human was inaudible anyway."""
 LOUD, EXPLAINED = 0.05, 100.0
@@ -40,7 +40,7 @@ class OnsetGate:
         self._decay = FORGET**hop
         self._loudest = USUAL * hop
         self._shut = self._settling = 0
-        self._last = np.float32(1.0)
+        self._last = 1.0
         self._rise = (np.arange(RAMP, dtype=np.float32) + 1) / RAMP
 
     @property
@@ -64,11 +64,11 @@ class OnsetGate:
             if aligned.state == "locked" and explained > 0.1 * self._loudest:
                 now = heard / explained
                 self._gain = now if self._gain is None else self._gain + LEARNING * (min(now, 2 * self._gain) - self._gain)
-            return self._apply(mic, np.float32(1.0))
+            return self._apply(mic, 1.0)
         if not self._shut and not self._alone(heard, explained):
             return mic
         self._shut += self._hop
-        return self._apply(mic, GATE if self.shut else np.float32(1.0))
+        return self._apply(mic, GATE if self.shut else 1.0)
 
     def _alone(self, heard: float, explained: float) -> bool:
         """Whether a hop of this power can only be the robot, and not at the present delay."""
@@ -76,7 +76,7 @@ class OnsetGate:
             return False
         return heard > LOUD * self._gain * self._loudest and heard > EXPLAINED * self._gain * explained
 
-    def _apply(self, mic: Samples, gain: np.float32) -> Samples:
+    def _apply(self, mic: Samples, gain: float) -> Samples:
         if gain == self._last == 1.0:
             return mic
         out = gain * mic

@@ -56,6 +56,7 @@ class Residual:
     def reset(self) -> None:
         """As before the first frame."""
         self._noise = np.full(self._bins, FAN_START, np.float32) if self._fan is None else self._fan.copy()
+        self._noise_power = float(np.add.reduce(self._noise))
         self._smooth = np.zeros(self._bins, np.float32)
         self._echo = np.zeros(self._bins, np.float32)
         self._leakage, self._left, self._brought = LEAKAGE, 0.0, 0.0
@@ -67,24 +68,23 @@ class Residual:
         """
         self._echo *= TAIL_DECAY
         np.maximum(power(echo), self._echo, out=self._echo)
-        left = power(error)
         if self._fan is None:
-            self._smooth = 0.8 * self._smooth + 0.2 * left
+            self._smooth = 0.8 * self._smooth + 0.2 * power(error)
             self._noise = np.minimum(np.maximum(self._smooth, FAN_FALL * self._noise), FAN_RISE * self._noise)
+            self._noise_power = float(np.add.reduce(self._noise))
         brought = self._spread(self._echo)
         brought *= SPREAD
         brought += self._echo
         doubt = DOUBT * uncertainty
-        fan = float(np.add.reduce(self._noise))
-        self._track(float(np.add.reduce(left)) - fan - float(np.add.reduce(doubt)), float(np.add.reduce(brought)), fan)
+        loud = float(np.add.reduce(brought))
+        if loud >= AUDIBLE * self._noise_power:
+            self._track(float(np.vdot(error, error).real) - self._noise_power - float(np.add.reduce(doubt)), loud)
         brought *= np.float32(self._leakage)
         brought += doubt
         return self._noise, brought
 
-    def _track(self, left: float, brought: float, fan: float) -> None:
-        """Follow the least part of the echo that stays, from the power left beyond fan and doubt and the echo's power, while it is loud."""
-        if brought < AUDIBLE * fan:
-            return
+    def _track(self, left: float, brought: float) -> None:
+        """Follow the least part of the echo that stays, from the power left beyond fan and doubt and the power of a loud echo."""
         self._left += (1.0 - LEAKAGE_MEMORY) * (left - self._left)
         self._brought += (1.0 - LEAKAGE_MEMORY) * (brought - self._brought)
         change = MARGIN * max(self._left, 0.0) / self._brought / self._leakage
