@@ -62,7 +62,7 @@ class DelayMeter:
         self._omega = (2 * np.pi * np.arange(SIZE // 2 + 1) / SIZE).astype(np.float32)
         self._omega_squared = np.square(self._omega)
         band = (self._omega > 2 * np.pi * 120 / 16000) & (self._omega < 2 * np.pi * 7000 / 16000)
-        self._band = band.astype(np.float32)
+        self._band, self._band_size = band.astype(np.float32), float(np.count_nonzero(band))
         self._ramp = np.arange(-SIZE // 2, SIZE // 2, dtype=np.float32)
         self._framed = np.zeros((3, SIZE), np.float32)
         self._prior = np.ones(self._omega.size, np.complex64)
@@ -91,17 +91,16 @@ class DelayMeter:
         np.multiply(mic.read(now - FRAME, now), self._window, out=x[REACH:-REACH])
         self._reference(ref, start, slope, wide)
         np.multiply(wide[REACH:-REACH], self._window, out=inner[REACH:-REACH])
-        energy, drive = float(np.dot(x, x)), float(np.dot(inner, inner))
+        energy, drive = float(x.dot(x)), float(inner.dot(inner))
         if not (drive > 1e-9 and energy > 1e-12):
             return None
         m, a, w = fourier.rfft(self._framed)
         m *= _turn(self._omega, centre - whole)
-        power_a, power_m = _power(a), _power(m)
+        power_a = _power(a)
         if self._cross is None:
-            self._start(power_m, power_a)
+            self._start(_power(m), power_a)
         self._last = (m * np.conj(a), power_a)
-        left = uniform_filter1d(_power(m - self.response * a), 31, mode="nearest")
-        power_m = uniform_filter1d(power_m, 31, mode="nearest")
+        left, power_m = uniform_filter1d(_power(np.array((m - self.response * a, m))), 31, mode="nearest")
         weight = self._band / (left + 0.05 * power_m + (1e-6 * power_m.max() + 1e-20))
         m *= np.conj(self.response)
         m *= weight
@@ -111,7 +110,8 @@ class DelayMeter:
                 wide = self._reference(ref, start - shift, slope, np.empty(SIZE, np.float32))
                 products.insert(0 if shift < 0 else len(products), m * np.conj(fourier.rfft(wide)))
                 references.insert(0 if shift < 0 else len(references), wide)
-        likelihood = np.roll(fourier.irfft(np.array(products), SIZE), REACH, axis=1)[:, : 2 * REACH].ravel()
+        correlation = fourier.irfft(np.array(products), SIZE)
+        likelihood = np.concatenate((correlation[:, -REACH:], correlation[:, :REACH]), axis=1).ravel()
         overlap = np.concatenate([_overlap(reference) for reference in references])
         likelihood /= np.sqrt(overlap + 0.1 * overlap.max())
         expected = likelihood.size // 2
@@ -120,8 +120,8 @@ class DelayMeter:
         part, inside = divmod(at, 2 * REACH)
         offset = at - inside + REACH - expected + self._refine(products[part], inside - REACH)
         there = references[part][SIZE - FRAME - inside : SIZE - inside] * self._window
-        information = 2.0 * float(np.dot(self._omega_squared, _power(self.response) * power_a * weight)) * FRAME / SIZE
-        explained = 1.0 - float(np.dot(self._band, left / (power_m + 1e-20))) / float(np.sum(self._band))
+        information = 2.0 * float(self._omega_squared.dot(_power(self.response) * power_a * weight)) * FRAME / SIZE
+        explained = 1.0 - float(self._band.dot(left / (power_m + 1e-20))) / self._band_size
         return Measurement(
             offset=offset,
             variance=4.0 / (information + 1e-9) + 1e-4,
@@ -130,7 +130,7 @@ class DelayMeter:
             dominance=peak / max(near, 1e-20),
             explained=min(max(explained, 0.0), 1.0),
             gain=energy / drive,
-            gain_there=energy / (float(np.dot(there, there)) + 1e-12),
+            gain_there=energy / (float(there.dot(there)) + 1e-12),
         )
 
     def _reference(self, ref: Tape, start: int, slope: float, out: Samples) -> Samples:
@@ -154,8 +154,8 @@ class DelayMeter:
             return
         offset, self._confirmed = self._confirmed, None
         cross, power = self._last
-        level = float(np.sum(self._power) / (np.sum(power) + 1e-20)) / self._blocks
-        rate = float(np.clip(level, 0.03, 3.0))
+        level = float(np.add.reduce(self._power) / (np.add.reduce(power) + 1e-20)) / self._blocks
+        rate = min(max(level, 0.03), 3.0)
         self._cross = 0.98 * self._cross + rate * cross * _turn(self._omega, offset)
         self._power = 0.98 * self._power + rate * power
         self._blocks = 0.98 * self._blocks + 1.0
@@ -176,11 +176,11 @@ class DelayMeter:
         offset = 0.0
         for _ in range(3):
             z = product * _turn(self._omega, whole + offset)
-            slope = -float(np.dot(self._omega, z.imag))
-            curvature = -float(np.dot(self._omega_squared, z.real))
+            slope = -float(self._omega.dot(z.imag))
+            curvature = -float(self._omega_squared.dot(z.real))
             if curvature >= 0.0:
                 break
-            offset = float(np.clip(offset - slope / curvature, -1.0, 1.0))
+            offset = min(max(offset - slope / curvature, -1.0), 1.0)
         return whole + offset
 
 
@@ -243,19 +243,20 @@ def _highest(likelihood: Samples, reach: int) -> tuple[int, float, float, float]
     """Index of the highest peak at most reach from the middle, its height, strength and ratio among the lags there."""
     first = likelihood.size // 2 - reach
     inner = likelihood[first : first + 2 * reach]
-    at = int(np.argmax(inner))
+    at = int(inner.argmax())
     peak = float(inner[at])
     elsewhere = max(inner[: max(at - SAME, 0)].max(initial=0.0), inner[at + SAME :].max(initial=0.0))
-    rms = math.sqrt(float(np.dot(inner, inner)) / inner.size)
+    rms = math.sqrt(float(inner.dot(inner)) / inner.size)
     return first + at, peak, peak / (rms + 1e-20), peak / max(float(elsewhere), 1e-20)
 
 
 def _overlap(reference: Samples) -> Samples:
     """Energy of the reference's first difference under the middle half of the frame, at offsets -REACH to REACH - 1, (2 REACH,)."""
-    total = np.cumsum(np.square(np.diff(reference)), dtype=np.float64)
     earliest, half = FRAME // 4, FRAME // 2
-    energy = total[earliest + half + 1 : earliest + half + 1 + 2 * REACH] - total[earliest + 1 : earliest + 1 + 2 * REACH]
-    return energy[::-1].astype(np.float32)
+    latest = earliest + half + 2 * REACH
+    change = reference[earliest + 2 : latest + 2] - reference[earliest + 1 : latest + 1]
+    total = np.cumsum(np.square(change, out=change), dtype=np.float64)
+    return (total[half:] - total[:-half])[::-1].astype(np.float32)
 
 
 def _power(spectrum: np.ndarray) -> Samples:
