@@ -85,6 +85,7 @@ class Canceller:
         self._channels = 3 if nonlinear else 1
         self._first = [0, self.partitions, self.partitions + PRODUCT_PARTITIONS][: self._channels]
         self._lowpass = _butterworth(DISPLACEMENT_HZ, DISPLACEMENT_TAPS)
+        self._lowpass_reversed = self._lowpass[::-1].copy()
         self.reset()
 
     @property
@@ -187,7 +188,7 @@ class Canceller:
         """(n,) of the membrane while it plays the next n samples of the reference; carries its state on."""
         moving = np.concatenate((self._moving, reference))
         self._moving = moving[reference.size :]
-        return np.convolve(moving, self._lowpass, "valid")
+        return np.correlate(moving, self._lowpass_reversed, "valid")
 
     def _adapt(self, error_spectrum: np.ndarray, divisor: np.ndarray) -> None:
         """Kalman correction of weights and covariance, Enzner & Vary (2006), eq. (30)-(34)."""

@@ -83,22 +83,21 @@ def delay_kernel(fraction: Array) -> Array:
 
 
 @lru_cache(maxsize=1)
-def _kernel_table() -> tuple[Array, Array]:
+def _kernel_table() -> tuple[list[Array], list[Array]]:
     """The filters for delays of -1 to 2, every 1 / PHASES, last tap first, and their differences."""
     table = delay_kernel(np.arange(3 * PHASES + 1) / PHASES - 1.0)[:, ::-1]
-    return np.ascontiguousarray(table[:-1]), np.diff(table, axis=0)
+    return list(np.ascontiguousarray(table[:-1])), list(np.diff(table, axis=0))
 
 
 def _kernels(*delays: float) -> Array:
     """Filters (m, 2 * HALF_WIDTH) for m delays of -1 to 2, last tap first, from the table."""
     table, step = _kernel_table()
-    filters = np.empty((len(delays), 2 * HALF_WIDTH), np.float32)
-    for row, delay in zip(filters, delays):
+    filters = []
+    for delay in delays:
         at = (delay + 1.0) * PHASES
         below = int(at)
-        np.multiply(step[below], at - below, out=row)
-        row += table[below]
-    return filters
+        filters.append(table[below] + (at - below) * step[below])
+    return np.array(filters)
 
 
 def read_delayed(tape: Tape, stop: int, count: int, delay_from: float, delay_to: float) -> Samples:

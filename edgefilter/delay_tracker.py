@@ -140,7 +140,7 @@ class DelayMeter:
         out *= 8.0
         out += x[:-4]
         out -= x[4:]
-        out *= self._ramp * np.float32(slope / -12.0)
+        out *= self._ramp * (slope / -12.0)
         out += x[2:-2]
         return out
 
@@ -154,20 +154,22 @@ class DelayMeter:
             return
         offset, self._confirmed = self._confirmed, None
         cross, power = self._last
-        level = float(np.add.reduce(self._power) / (np.add.reduce(power) + 1e-20)) / self._blocks
+        level = float(self._total / (np.add.reduce(power) + 1e-20)) / self._blocks
         rate = min(max(level, 0.03), 3.0)
         self._cross = 0.98 * self._cross + rate * cross * _turn(self._omega, offset)
         self._power = 0.98 * self._power + rate * power
+        self._total = np.add.reduce(self._power)
         self._blocks = 0.98 * self._blocks + 1.0
-        impulse = fourier.irfft(self._cross / (self._power + 1e-3 * self._power.mean()), SIZE)
+        impulse = fourier.irfft(self._cross / (self._power + 1e-3 * (self._total / self._power.size)), SIZE)
         impulse[EARLY[1] : SIZE - EARLY[0]] = 0.0
-        self.response = fourier.rfft(impulse).astype(np.complex64)
+        self.response = fourier.rfft(impulse)
 
     def _start(self, power_m: Samples, power_a: Samples) -> None:
         smooth = uniform_filter1d(power_a, 65, mode="nearest")
         scale = 1.0 if self._known_scale else 0.7 * float(np.sqrt(power_m.sum() / power_a.sum()))
         self._blocks = self._prior_blocks
         self._power = self._blocks * smooth
+        self._total = np.add.reduce(self._power)
         self._cross = self._blocks * smooth * self._prior * np.float32(scale)
         self.response = self._prior * np.float32(scale)
 
@@ -233,7 +235,7 @@ class DriftFilter:
 
 def _turn(omega: Samples, delay: float) -> np.ndarray:
     """exp(j omega delay), complex64; several times as fast as np.exp of a complex array."""
-    angle, turn = omega * np.float32(delay), np.empty(omega.size, np.complex64)
+    angle, turn = omega * delay, np.empty(omega.size, np.complex64)
     np.cos(angle, out=turn.real)
     np.sin(angle, out=turn.imag)
     return turn

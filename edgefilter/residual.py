@@ -79,7 +79,7 @@ class Residual:
         loud = float(np.add.reduce(brought))
         if loud >= AUDIBLE * self._noise_power:
             self._track(float(np.vdot(error, error).real) - self._noise_power - float(np.add.reduce(doubt)), loud)
-        brought *= np.float32(self._leakage)
+        brought *= self._leakage
         brought += doubt
         return self._noise, brought
 
