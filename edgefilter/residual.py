@@ -49,7 +49,8 @@ class Residual:
 
     def __init__(self, stft: StftConfig, profile: Profile | None = None) -> None:
         self._bins = stft.bins
-        self._spread = MovingMean(stft.bins, max(1, round(SPREAD_HZ / stft.frequencies[1])))
+        width = max(1, round(SPREAD_HZ / stft.frequencies[1]))
+        self._spread = np.full(width, SPREAD / width, np.float32)
         self._fan = profile.noise_bins(stft) if profile is not None else None
         self.reset()
 
@@ -58,7 +59,9 @@ class Residual:
         self._noise = np.full(self._bins, FAN_START, np.float32) if self._fan is None else self._fan.copy()
         self._noise_power = float(np.add.reduce(self._noise))
         self._smooth = np.zeros(self._bins, np.float32)
-        self._echo = np.zeros(self._bins, np.float32)
+        before = self._spread.size // 2  # beyond its ends the echo counts as what it is there
+        self._extended = np.zeros(self._bins + self._spread.size - 1, np.float32)
+        self._below, self._echo, self._above = np.split(self._extended, (before, before + self._bins))
         self._leakage, self._left, self._brought = LEAKAGE, 0.0, 0.0
 
     def step(self, echo: Spectrum, error: Spectrum, uncertainty: Samples) -> tuple[Samples, Samples]:
@@ -72,8 +75,8 @@ class Residual:
             self._smooth = 0.8 * self._smooth + 0.2 * power(error)
             self._noise = np.minimum(np.maximum(self._smooth, FAN_FALL * self._noise), FAN_RISE * self._noise)
             self._noise_power = float(np.add.reduce(self._noise))
-        brought = self._spread(self._echo)
-        brought *= SPREAD
+        self._below[:], self._above[:] = self._echo[0], self._echo[-1]
+        brought = np.correlate(self._extended, self._spread, "valid")
         brought += self._echo
         doubt = DOUBT * uncertainty
         loud = float(np.add.reduce(brought))
@@ -90,20 +93,3 @@ class Residual:
         change = MARGIN * max(self._left, 0.0) / self._brought / self._leakage
         change = min(max(change, LEAKAGE_FALL), LEAKAGE_RISE)
         self._leakage = min(max(self._leakage * change, LEAST), MOST)
-
-
-class MovingMean:
-    """Mean over width neighbours, half of them before; beyond the ends the end counts on: scipy.ndimage.uniform_filter1d in plain numpy."""
-
-    def __init__(self, size: int, width: int) -> None:
-        self._size, self._width, self._before = size, width, width // 2
-        self._padded = np.zeros(size + width, np.float64)
-
-    def __call__(self, x: Samples) -> Samples:
-        """x (size,) to its means (size,) float32; neither is kept."""
-        padded, start = self._padded, self._before + 1
-        padded[1:start] = x[0]
-        padded[start : start + self._size] = x
-        padded[start + self._size :] = x[-1]
-        sums = np.add.accumulate(padded)
-        return ((sums[self._width :] - sums[: -self._width]) / self._width).astype(np.float32)

@@ -20,14 +20,14 @@ class Histogram:
     """
 
     def __init__(self) -> None:
-        self._bins = np.zeros(DECADES * PER_DECADE, np.int64)
+        self._bins = [0] * (DECADES * PER_DECADE)
         self.count = 0
         self.sum_ms = self.max_ms = 0.0
 
     def add(self, ms: float) -> None:
         """Note one time, ms >= 0."""
         at = int(PER_DECADE * math.log10(max(ms, LOWEST_MS) / LOWEST_MS))
-        self._bins[min(at, self._bins.size - 1)] += 1
+        self._bins[min(at, len(self._bins) - 1)] += 1
         self.count += 1
         self.sum_ms += ms
         self.max_ms = max(self.max_ms, ms)
