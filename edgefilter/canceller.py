@@ -106,8 +106,8 @@ class Canceller:
         self._doubt = np.concatenate((self._prior(), product_doubt)).astype(np.float32)
         self._ageing = (1.0 - TRANSITION**2) * self._doubt
         self._recent = np.zeros((self._channels, 2 * hop), np.float32)
-        self._spectra, self._older_spectra = np.zeros((2, *shape), np.complex64)
-        self._powers, self._older_powers = np.zeros((2, *shape), np.float32)
+        self._all_spectra, self._all_powers = np.zeros((2 * shape[0], bins), np.complex64), np.zeros((2 * shape[0], bins), np.float32)
+        self._slide(to=shape[0])
         self._moving = np.zeros(DISPLACEMENT_TAPS - 1, np.float32)
         self._noise = np.zeros(bins, np.float32)
         self._work = np.zeros(shape, np.complex64)
@@ -177,12 +177,18 @@ class Canceller:
             first = np.multiply(moved, reference, out=self._recent[1, self.hop :])
             np.multiply(moved, first, out=self._recent[2, self.hop :])
         fresh = fourier.rfft(self._recent)
-        self._spectra, self._older_spectra = self._older_spectra, self._spectra
-        self._powers, self._older_powers = self._older_powers, self._powers
-        self._spectra[1:] = self._older_spectra[:-1]
-        self._powers[1:] = self._older_powers[:-1]
+        rows = len(self._doubt)
+        if self._at == 0:
+            self._all_spectra[rows:], self._all_powers[rows:] = self._spectra, self._powers
+            self._slide(to=rows)
+        self._slide(to=self._at - 1)
         for row, spectrum, power in zip(self._first, fresh, _power(fresh)):
             self._spectra[row], self._powers[row] = spectrum, power
+
+    def _slide(self, to: int) -> None:
+        """Look at the rows from `to` on: one place on, all of the past is one place further down without being copied."""
+        self._at, rows = to, slice(to, to + len(self._doubt))
+        self._spectra, self._powers = self._all_spectra[rows], self._all_powers[rows]
 
     def _displacement(self, reference: Samples) -> Samples:
         """(n,) of the membrane while it plays the next n samples of the reference; carries its state on."""
@@ -239,8 +245,8 @@ class Canceller:
             channels += [moved * past, moved * moved * past]
         for first, channel in zip(self._first, channels, strict=True):
             count = PRODUCT_PARTITIONS if first else self.partitions
-            blocks = np.lib.stride_tricks.sliding_window_view(channel, 2 * self.hop)[:: self.hop][::-1]
-            self._spectra[first : first + count] = fourier.rfft(np.ascontiguousarray(blocks[:count]))
+            hops = channel.reshape(-1, self.hop)[::-1]
+            self._spectra[first : first + count] = fourier.rfft(np.concatenate((hops[1 : count + 1], hops[:count]), axis=1))
         self._powers[:] = _power(self._spectra)
         self._recent[:] = [channel[-2 * self.hop :] for channel in channels]
 
