@@ -7,7 +7,7 @@ from collections import deque
 import numpy as np
 
 from edgefilter.announced import AHEAD, Announcements
-from edgefilter.delay_line import HALF_WIDTH, Aligned, Tape, read_delayed, read_line
+from edgefilter.delay_line import HALF_WIDTH, Aligned, Tape, kernel_table, read_delayed, read_line
 from edgefilter.delay_tracker import REACH, STRIDE, DelayMeter, DriftFilter, Measurement
 from edgefilter.echo.model import PRE_ROLL
 from edgefilter.jumps import JumpWitness
@@ -58,6 +58,7 @@ class Aligner:
         self._response = None if profile is None else profile.echo.impulse_response
         early = None if self._response is None else self._response[: PRE_ROLL + 320]
         self._lags = LagSearch(self._max_lag, early, PRE_ROLL)
+        kernel_table()
         self.reset()
 
     def reset(self) -> None:

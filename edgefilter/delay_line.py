@@ -83,20 +83,20 @@ def delay_kernel(fraction: Array) -> Array:
 
 
 @lru_cache(maxsize=1)
-def _kernel_table() -> tuple[list[Array], list[Array]]:
-    """The filters for delays of -1 to 2, every 1 / PHASES, last tap first, and their differences."""
+def kernel_table() -> tuple[list[Array], list[Array]]:
+    """The filters for delays of -1 to 2, every 1 / PHASES, last tap first, and their differences; made at the first call, in some ms."""
     table = delay_kernel(np.arange(3 * PHASES + 1) / PHASES - 1.0)[:, ::-1]
     return list(np.ascontiguousarray(table[:-1])), list(np.diff(table, axis=0))
 
 
 def _kernels(*delays: float) -> Array:
     """Filters (m, 2 * HALF_WIDTH) for m delays of -1 to 2, last tap first, from the table."""
-    table, step = _kernel_table()
+    table, step = kernel_table()
     filters = []
     for delay in delays:
         at = (delay + 1.0) * PHASES
         below = int(at)
-        filters.append(table[below] + (at - below) * step[below])
+        filters.append(table[below] + step[below] * (at - below))
     return np.array(filters)
 
 
@@ -113,10 +113,7 @@ def read_delayed(tape: Tape, stop: int, count: int, delay_from: float, delay_to:
     shifted = np.ndarray((2 * HALF_WIDTH, count), np.float32, source, 0, 2 * source.strides)
     filtered = _kernels(delay_from - whole, middle - whole, delay_to - whole).dot(shifted)
     filtered *= _parabola(count)
-    start, centre, end = filtered
-    start += centre
-    start += end
-    return start
+    return filtered[0] + filtered[1] + filtered[2]
 
 
 @lru_cache(maxsize=8)
