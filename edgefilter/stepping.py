@@ -95,10 +95,12 @@ class Stepping:
         return "stepped_down", f"{self._move(1)}: {why}"
 
     def _up(self) -> tuple[str, str] | None:
+        if self.ladder is None or self.ladder.wanted == 0:
+            return None
         calm = self._hops(self._patience_s)
         if self._calm_late > CALM * calm:
             self._calm_hops = self._calm_late = 0
-        if self.ladder is None or self.ladder.wanted == 0 or self._calm_hops < calm:
+        if self._calm_hops < calm:
             return None
         self._calm_hops = self._calm_late = self._since_up = 0
         return "stepped_up", f"{self._move(-1)}: {self._patience_s:.0f} s within {self.budget_ms:.1f} ms"
