@@ -100,7 +100,8 @@ class DelayMeter:
         if self._cross is None:
             self._start(_power(m), power_a)
         self._last = (m * np.conj(a), power_a)
-        left, power_m = uniform_filter1d(_power(np.array((m - self.response * a, m))), 31, mode="nearest")
+        powers = _power(np.array((m - self.response * a, m)))  # smoothed into an array of ours: to make its own takes scipy as long again
+        left, power_m = uniform_filter1d(powers, 31, output=np.empty_like(powers), mode="nearest")
         weight = self._band / (left + 0.05 * power_m + (1e-6 * power_m.max() + 1e-20))
         m *= np.conj(self.response)
         m *= weight
@@ -257,7 +258,7 @@ def _overlap(reference: Samples) -> Samples:
     earliest, half = FRAME // 4, FRAME // 2
     latest = earliest + half + 2 * REACH
     change = reference[earliest + 2 : latest + 2] - reference[earliest + 1 : latest + 1]
-    total = np.cumsum(np.square(change, out=change), dtype=np.float64)
+    total = np.add.accumulate(np.square(change, out=change).astype(np.float64))
     return (total[half:] - total[:-half])[::-1].astype(np.float32)
 
 

@@ -151,7 +151,8 @@ def _soften(x: Samples) -> None:
 def _whitened(spectrum: np.ndarray, floor: float) -> np.ndarray:
     """The spectrum over the root of its smoothed power."""
     width = round(SMOOTHING_HZ * 2 * spectrum.size / SAMPLE_RATE)
-    power = uniform_filter1d(spectrum.real**2 + spectrum.imag**2, width, mode="nearest")
+    power = spectrum.real**2 + spectrum.imag**2
+    power = uniform_filter1d(power, width, output=np.empty_like(power), mode="nearest")
     power += np.float32(floor * power.max() + 1e-20)
     return spectrum * (np.float32(1.0) / np.sqrt(power, out=power))
 
