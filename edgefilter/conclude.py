@@ -9,7 +9,7 @@ import numpy as np
 
 from edgefilter.band_edge import cut_by_power
 from edgefilter.compare import describe
-from edgefilter.echo.effect import complete, find, whiten
+from edgefilter.echo.effect import complete, find
 from edgefilter.echo.model import EchoModel
 from edgefilter.evidence import left_in_words, sentence
 from edgefilter.fan import look_at_fan
@@ -76,10 +76,8 @@ def _much_left(found: Found) -> bool:
 
     What they leave of the others alone is how well a recording of that length teaches them.
     """
-    measurement, silent = found.prepared.measurement, float(np.clip(found.final.silent_db, -0.5, 0.5))
-    fitted = whiten(measurement.recording - found.final.prediction, measurement.noise_psd)[measurement.fit & found.prepared.active]
-    fitted_db = 10 * np.log10(float(np.mean(fitted.astype(np.float64) ** 2)) + 1e-12) if fitted.size else 0.0
-    return min(fitted_db, found.final.active_db) - silent > MUCH_DB and _share(found.base.excess_db, found.final.excess_db) < NEARLY_ALL
+    silent = float(np.clip(found.final.silent_db, -0.5, 0.5))
+    return min(found.final.fitted_db, found.final.active_db) - silent > MUCH_DB and _share(found.base.excess_db, found.final.excess_db) < NEARLY_ALL
 
 
 def explained_level(prepared: Prepared, found: Found) -> float:

@@ -26,7 +26,8 @@ TOLERANCE_TAPS, TOLERANCE_LEAD = 32, 16
 class Verdict:
     """Of one prediction. level_db: mean over time-frequency cells of the residual's dB over the fan, each cell by its degrees of freedom.
 
-    excess_db: mean power of the held-out whitened residual, dB. active_db, silent_db: while the robot is heard, and is not.
+    excess_db: mean power of the held-out whitened residual, dB. active_db, silent_db: while the robot is heard, and is not. fitted_db: of the
+    samples to fit on, while it is heard.
     What a model says that no waveform predicts counts as fan in these; irreducible_db: the excess over the fan alone then, else 0.
     cells: (times, bands) power over the fan. prediction: (n,) with the ordinary tolerances taken up.
     """
@@ -35,6 +36,7 @@ class Verdict:
     excess_db: float
     active_db: float
     silent_db: float
+    fitted_db: float
     irreducible_db: float
     cells: Array = field(repr=False)
     prediction: Samples = field(repr=False)
@@ -99,6 +101,7 @@ class Judge:
             excess_db=_db(white[held]),
             active_db=_db(white[held & active]),
             silent_db=_db(white[held & ~active]),
+            fitted_db=_db(white[self.prepared.measurement.fit & active]),
             irreducible_db=_db(plain[held]) if unpredictable else 0.0,
             cells=cells,
             prediction=corrected,

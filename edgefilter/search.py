@@ -9,7 +9,7 @@ from edgefilter.fan import changed_fan
 from edgefilter.prepare import Prepared
 from edgefilter.settle import settle, simpler_beside
 from edgefilter.suspects import OWN, SUSPECTS, choose
-from edgefilter.trials import LAST, Found, Trial, Workbench
+from edgefilter.trials import LAST, LONG, Found, Trial, Workbench
 
 MOST_EFFECTS = 3
 SCREEN_DB = 0.2
@@ -19,10 +19,8 @@ SECOND_SHARE = 0.2
 """Of the excess level that is left, a further effect has to explain at least this share: less is how the first one's model errs."""
 STARTS, START_SHARE = 2, 0.1
 """Further effects to begin with where the best one has not led to an explanation, and the share of the level that each must explain by itself."""
-POWER_SHARE = 0.6
-"""Of the power over the fan, what a further effect may leave at most that explains less of the level than that."""
-LONG, SIMPLE_SHARE = 4, 0.3
-"""Complexity of long filters, and the share of the level that one explains from which on a simple effect may be half of it."""
+SIMPLE_SHARE = 0.3
+"""Of the level that one long filter explains, what a simple effect must explain to be taken for half of it."""
 NEARLY = 0.85
 """Share of the level that is explained where no other start is tried."""
 BETTER = 0.05
@@ -82,7 +80,7 @@ def _grow(bench: Workbench, start: EchoModel, first: Trial, most: int = 9) -> Ec
     model = simpler_beside(bench, start, first.model)
     while _count(start, model) < MOST_EFFECTS and not bench.explained(model):
         least = SECOND_SHARE * bench.left(model)
-        much = [t for t in bench.attempt_all(model, most) if t.gain_db >= least or _halves(bench, model, t)]
+        much = [t for t in bench.attempt_all(model, most) if t.gain_db >= least or bench.halves(t, model)]
         admissible = {t.name: t for t in much if bench.admissible(t, model)}
         name = choose({key: trial.gain_db for key, trial in admissible.items()})
         if name is None:
@@ -95,12 +93,6 @@ def _grow(bench: Workbench, start: EchoModel, first: Trial, most: int = 9) -> Ec
     return model
 
 
-def _halves(bench: Workbench, model: EchoModel, trial: Trial) -> bool:
-    """Whether a trial takes away about half of the power over the fan, though in so few cells that the level hardly falls: a narrow ring does."""
-    before, after = (10 ** (verdict.active_db / 10) - 1.0 for verdict in (bench.verdict(model), trial.verdict))
-    return after < POWER_SHARE * before
-
-
 def _count(start: EchoModel, model: EchoModel) -> int:
     return len(model.effects) - len(start.effects)
 
@@ -108,13 +100,20 @@ def _count(start: EchoModel, model: EchoModel) -> int:
 def _best(bench: Workbench, start: EchoModel, runs: list[EchoModel]) -> EchoModel:
     """The run that explains most of those whose effects can all be named; the earlier and simpler one where others hardly explain more."""
     base = bench.verdict(start).level_db
-    valid = [run for run in runs if all(_stands(bench, run, name) for name, _ in run.effects[len(start.effects) :])]
+    valid = [_standing(bench, start, run) for run in runs]
     best = start
     for run in sorted(valid, key=lambda run: sum(SUSPECTS.get(name, OWN).complexity for name, _ in run.effects[len(start.effects) :])):
         most = base - bench.verdict(best).level_db
         if base - bench.verdict(run).level_db > most + BETTER * abs(most):
             best = run
     return best
+
+
+def _standing(bench: Workbench, start: EchoModel, run: EchoModel) -> EchoModel:
+    """The run without the effects that cannot be named beside its others, the latest first."""
+    while fallen := [name for name, _ in run.effects[len(start.effects) :] if not _stands(bench, run, name)]:
+        run = run.without_effect(fallen[-1])
+    return run
 
 
 def _stands(bench: Workbench, model: EchoModel, name: str) -> bool:

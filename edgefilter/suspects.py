@@ -15,6 +15,8 @@ from edgefilter.types import SAMPLE_RATE
 
 FAN_ALONE = 1.6
 """Times the fan's power up to which a step of 25 ms may show nothing else."""
+MISSING_DB = -0.3
+"""Under the fan: where the residual is so little of what a model expects, some of what it expects is not there."""
 Guard = Callable[[Values, Judge, Verdict, Verdict], bool]
 
 
@@ -113,6 +115,11 @@ def _fan_follows(values: Values, judge: Judge, before: Verdict, after: Verdict) 
     return bool(moving < still)
 
 
+def _knocks_where_fitted(values: Values, judge: Judge, before: Verdict, after: Verdict) -> bool:
+    """Whether the knocks' noise is there on the samples fitted to as well: what a long filter errs by is on the held-out ones alone."""
+    return after.fitted_db >= MISSING_DB + min(after.silent_db, 0.0)
+
+
 def _reverberates(values: Values, *_: object) -> bool:
     return float(values["level_db"]) > -100.0
 
@@ -127,7 +134,7 @@ SUSPECTS: dict[str, Suspect] = {
     "compression": Suspect(2, guard=_follows_the_level),
     "mic_agc": Suspect(1, guard=_fan_follows),
     "speaker_nonlinearity": Suspect(3),
-    "rattle": Suspect(3),
+    "rattle": Suspect(3, guard=_knocks_where_fitted),
     "path_change": Suspect(4, guard=_clean_before),
     "late_reverb": Suspect(4, guard=_reverberates),
 }

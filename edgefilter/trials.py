@@ -27,6 +27,11 @@ nothing beside the effects that were found, whose models err a little."""
 COSTS, DEAR = {"rattle": 8, "compression": 2}, 60
 """Of a fit in quarters of a second, 1 for all others, and the sum of them after which only what is in plain sight is looked for."""
 
+POWER_SHARE = 0.6
+"""Of the power over the fan, what an effect may leave at most that takes about half of it away."""
+LONG = 4
+"""Complexity of long filters: half a minute does not teach all their taps, so what they leave of the samples fitted to says little."""
+
 Signature: TypeAlias = tuple[tuple[str | bytes, ...], ...]
 
 
@@ -128,16 +133,26 @@ class Workbench:
         size = max(size_db(after.prediction - before.prediction, self.prepared), noise_size_db(name, model, self.prepared))
         return Trial(name, dict(model.effects)[name], model, after, before.level_db - after.level_db, size)
 
+    def halves(self, trial: Trial, model: EchoModel) -> bool:
+        """Whether a trial takes away about half of the power over the fan, though the level hardly falls.
+
+        A narrow ring does so, in few cells. Beside a long filter an effect may do so where that filter was fitted and so leaves no more
+        than there is besides: of the held-out samples the filter itself leaves the most.
+        """
+        before, after = self.verdict(model), trial.verdict
+        where_fitted = SUSPECTS.get(trial.name, OWN).complexity < LONG and _over_fan(after.fitted_db) < POWER_SHARE * _over_fan(before.fitted_db)
+        return where_fitted or _over_fan(after.active_db) < POWER_SHARE * _over_fan(before.active_db)
+
     def attempt_all(self, model: EchoModel, most: int = 9) -> list[Trial]:
         """Each effect that the model has not and whose complexity is at most `most`.
 
-        The LAST ones only where none of the others explains nearly all of what is left.
+        The LAST ones only where none of the others explains much of what is left.
         """
         wanted = [name for name in names() if find(name).stage != "noise" and name not in dict(model.effects)]
         wanted = [name for name in wanted if SUSPECTS.get(name, OWN).complexity <= most]
         found, left = [], self.left(model)
         for name in sorted(wanted, key=lambda name: name in LAST):
-            if name in LAST and (self.tired or left < LITTLE_DB or any(t.gain_db > ENOUGH * left and self.admissible(t, model) for t in found)):
+            if name in LAST and (self.tired or left < LITTLE_DB or any((t.gain_db > ENOUGH * left or self.halves(t, model)) and self.admissible(t, model) for t in found)):
                 continue
             if (trial := self.attempt(name, model)) is not None:
                 found.append(trial)
@@ -149,6 +164,11 @@ class Workbench:
         if trial.gain_db < rule.least_gain_db or trial.size_db < rule.least_size_db:
             return False
         return rule.guard is None or rule.guard(trial.values, self.judge, self.verdict(model), trial.verdict)
+
+
+def _over_fan(level_db: float) -> float:
+    """Power over the fan's, the fan taken off."""
+    return max(10 ** (level_db / 10) - 1.0, 0.0)
 
 
 def signature(model: EchoModel) -> Signature:

@@ -13,10 +13,11 @@ from edgefilter.band_edge import band_edge
 from edgefilter.compare import compare
 from edgefilter.diagnose import Diagnosis, add, diagnose
 from edgefilter.echo.model import PRE_ROLL, EchoModel
-from edgefilter.judge import Judge
+from edgefilter.judge import Judge, Verdict
 from edgefilter.offset import shift
 from edgefilter.prepare import prepare
-from edgefilter.suspects import choose
+from edgefilter.suspects import SUSPECTS, choose
+from edgefilter.trials import Trial, Workbench
 
 SECONDS = 12.0
 
@@ -142,3 +143,20 @@ def test_the_dictionary_has_the_published_keys_and_is_json() -> None:
 def test_no_effect_is_chosen_where_none_lowers_the_level():
     assert choose({}) is None and choose({"rattle": -0.2, "playback_gain": -0.1}) is None
     assert choose({"playback_gain": 0.9, "late_reverb": 1.0}) == "playback_gain"
+
+
+def verdict(active_db: float, fitted_db: float) -> Verdict:
+    return Verdict(active_db, active_db, active_db, 0.0, fitted_db, 0.0, np.ones((4, 4)), np.zeros(16000, np.float32))
+
+
+@pytest.mark.parametrize("fitted_db, stands", [(0.1, True), (-1.5, False)])
+def test_knocks_that_are_missing_where_a_filter_was_fitted_are_that_filters_error(fitted_db, stands):
+    assert SUSPECTS["rattle"].guard({}, None, verdict(5.0, 1.0), verdict(2.0, fitted_db)) is stands
+
+
+@pytest.mark.parametrize("name, fitted_db, halved", [("speaker_nonlinearity", 0.5, True), ("speaker_nonlinearity", 2.0, False), ("late_reverb", 0.5, False)])
+def test_half_of_what_a_long_filter_leaves_where_it_was_fitted_is_enough(name, fitted_db, halved):
+    found = prepare(profile(), record(voice(4.0)), voice(4.0))
+    bench, model = Workbench(found), EchoModel(path())
+    bench.verdict = lambda asked: verdict(6.0, 2.5)
+    assert bench.halves(Trial(name, {}, model, verdict(5.0, fitted_db), 0.5, 3.0), model) is halved
