@@ -8,7 +8,7 @@ import numpy as np
 import scipy
 
 from edgefilter.echo.effect import Measurement, Parameter, Stage, Values, neutral
-from edgefilter.echo.wiener import convolve_from, fit_supported
+from edgefilter.echo.wiener import convolve_from, fit_filter, fit_supported
 from edgefilter.types import SAMPLE_RATE, Array, Samples
 
 if TYPE_CHECKING:
@@ -19,7 +19,9 @@ LEAD = 32
 TAPS = 12800
 """0.8 s: the decay by 60 dB of an office, by 40 dB of a hall."""
 EXPECTED = 1e-3
-"""Expected square of a tap, the same at all lags: a prior that falls as the room's response does makes the iteration slow."""
+"""Expected square of a tap before anything is known of the room, the same at all lags."""
+SLOWER = 1.7
+"""The squares that are expected once the room is known decay in this many times its reverberation time, so that none of it is cut away."""
 BLOCK = 320
 
 
@@ -45,7 +47,10 @@ class LateReverb:
         return x.copy() if not taps.any() else x + convolve_from(x, taps, LEAD)
 
     def fit(self, measurement: Measurement, model: EchoModel) -> Values:
-        """Least squares in the whitened domain, slightly regularised; neutral where nothing of it holds on other samples."""
+        """Least squares in the whitened domain, slightly regularised; neutral where nothing of it holds on other samples.
+
+        Then once more with taps expected to decay as the room that was found does: some seconds of speech do not teach ten thousand.
+        """
         x = measurement.heard(model)[1]
         residual = measurement.white_recording - x
         length = min(TAPS, measurement.recording.size // 4)
@@ -56,6 +61,8 @@ class LateReverb:
         response[: model.impulse_response.size] += model.impulse_response
         direct = int(np.argmax(np.abs(model.impulse_response)))
         rt60 = reverberation_time(response[direct : taps.size - LEAD])
+        if rt60 > 0.0:
+            taps = fit_filter(x, residual, measurement.weights, length, LEAD, prior=decaying(taps, SLOWER * rt60), steps=60)
         late = float(np.sum(taps[LEAD + SAMPLE_RATE // 100 :] ** 2))
         return {"rt60_s": rt60, "level_db": float(np.clip(10 * np.log10(late + 1e-12), -120.0, 40.0)), "taps": np.clip(taps, -10.0, 10.0)}
 
@@ -65,6 +72,19 @@ def block_energy(taps: Array) -> tuple[Array, float]:
     count = taps.size // BLOCK
     energy = np.sum(taps[: count * BLOCK].reshape(count, BLOCK) ** 2, axis=1)
     return energy, float(np.quantile(energy[2 * count // 3 :], 0.25)) if count >= 3 else 0.0
+
+
+def decaying(taps: Array, rt60_s: float) -> Array:
+    """(k,) expected squares of taps (k,) with the energy that these have above their noise, decaying with that reverberation time.
+
+    The first block, which holds what another room changes in the direct sound, is expected as it was found.
+    """
+    energy, floor = block_energy(taps)
+    blocks = np.arange(energy.size)
+    total = float(np.sum(np.maximum(energy[1:] - floor, 0.0))) / float(np.sum(10 ** (-6.0 * blocks[1:] * BLOCK / SAMPLE_RATE / rt60_s)))
+    expected = total / BLOCK * 10 ** (-6.0 * (np.arange(taps.size) - BLOCK / 2) / SAMPLE_RATE / rt60_s)
+    expected[:BLOCK] = np.maximum(expected[:BLOCK], energy[0] / BLOCK)
+    return expected
 
 
 def reverberation_time(taps: Array) -> float:
