@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from edgefilter.judge import Judge
+from edgefilter.judge import FRAMES_PER_CELL, Judge
 from edgefilter.trials import Found, Trial, size_db
 from edgefilter.types import Samples
 
@@ -31,7 +31,7 @@ def band_edge(judge: Judge, prediction: Samples) -> float | None:
     fan = quiet.mean(axis=0) if len(quiet) >= 4 else np.ones(heard.shape[1])
     voice = (heard[active].mean(axis=0) - fan) * judge.freedom
     wanted = expected.mean(axis=0) * judge.freedom
-    variance = (fan + expected.mean(axis=0)) ** 2 * judge.freedom / (judge.frames * INDEPENDENT)
+    variance = (fan + expected.mean(axis=0)) ** 2 * judge.freedom / (FRAMES_PER_CELL * INDEPENDENT)
     error = np.sqrt(np.cumsum(variance[::-1])[::-1] * (1.0 / active.sum() + 1.0 / max(len(quiet), 4)))
     there, due = (np.cumsum(x[::-1])[::-1] for x in (voice, wanted))
     for i in np.flatnonzero((there < GONE * due) & (due - there > SURE * error)):

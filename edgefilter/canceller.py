@@ -84,8 +84,7 @@ class Canceller:
             self._initial[:known] = impulse_response[:known]
         self._channels = 3 if nonlinear else 1
         self._first = [0, self.partitions, self.partitions + PRODUCT_PARTITIONS][: self._channels]
-        self._lowpass = _butterworth(DISPLACEMENT_HZ, DISPLACEMENT_TAPS)
-        self._lowpass_reversed = self._lowpass[::-1].copy()
+        self._lowpass_reversed = _butterworth(DISPLACEMENT_HZ, DISPLACEMENT_TAPS)[::-1].copy()
         self.reset()
 
     @property

@@ -70,7 +70,7 @@ class Judge:
         edges = np.unique(np.concatenate(([2], np.round(np.geomspace(4, FRAME // 2 - 6, 26)).astype(int))))
         self._edges = edges
         self.band_hz = np.stack((hz[edges[:-1]], hz[edges[1:]]), axis=1)
-        self.freedom, self.frames = np.diff(edges).astype(float), FRAMES_PER_CELL
+        self.freedom = np.diff(edges).astype(float)
 
     def cells(self, residual: Samples) -> Array:
         """(times, bands) power of the residual (n,) over the fan's, in the held-out cells."""

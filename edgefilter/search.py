@@ -8,8 +8,8 @@ from edgefilter.echo.model import EchoModel
 from edgefilter.fan import changed_fan
 from edgefilter.prepare import Prepared
 from edgefilter.settle import settle, simpler_beside
-from edgefilter.suspects import OWN, SUSPECTS, choose
-from edgefilter.trials import LAST, LONG, Found, Trial, Workbench
+from edgefilter.suspects import choose, suspect
+from edgefilter.trials import LAST, LONG, Found, Trial, Workbench, added
 
 MOST_EFFECTS = 3
 SCREEN_DB = 0.2
@@ -66,19 +66,18 @@ def _starts(bench: Workbench, model: EchoModel) -> Iterator[Trial]:
 
 def _simpler_start(bench: Workbench, start: EchoModel, run: EchoModel) -> list[Trial]:
     """The simple effect, none or one, that explains a good part of what one long filter does: two of them may look like that filter."""
-    added = [name for name, _ in run.effects[len(start.effects) :]]
-    if bench.tired or len(added) != 1 or SUSPECTS.get(added[0], OWN).complexity < LONG:
+    found = added(start, run)
+    if bench.tired or len(found) != 1 or suspect(found[0]).complexity < LONG:
         return []
     most = bench.verdict(start).level_db - bench.verdict(run).level_db
-    tried = [t for name, rule in SUSPECTS.items() if rule.complexity <= 1 and (t := bench.attempt(name, start)) is not None]
-    simple = [t for t in tried if t.gain_db >= SIMPLE_SHARE * most and bench.admissible(t, start)]
+    simple = [t for t in bench.attempt_all(start, 1) if t.gain_db >= SIMPLE_SHARE * most and bench.admissible(t, start)]
     return sorted(simple, key=lambda t: -t.gain_db)[:1]
 
 
 def _grow(bench: Workbench, start: EchoModel, first: Trial, most: int = 9) -> EchoModel:
     """The model with first and all of complexity up to `most` that can be named beside it."""
     model = simpler_beside(bench, start, first.model)
-    while _count(start, model) < MOST_EFFECTS and not bench.explained(model):
+    while len(added(start, model)) < MOST_EFFECTS and not bench.explained(model):
         least = SECOND_SHARE * bench.left(model)
         much = [t for t in bench.attempt_all(model, most) if t.gain_db >= least or bench.halves(t, model)]
         admissible = {t.name: t for t in much if bench.admissible(t, model)}
@@ -93,16 +92,12 @@ def _grow(bench: Workbench, start: EchoModel, first: Trial, most: int = 9) -> Ec
     return model
 
 
-def _count(start: EchoModel, model: EchoModel) -> int:
-    return len(model.effects) - len(start.effects)
-
-
 def _best(bench: Workbench, start: EchoModel, runs: list[EchoModel]) -> EchoModel:
     """The run that explains most of those whose effects can all be named; the earlier and simpler one where others hardly explain more."""
     base = bench.verdict(start).level_db
     valid = [_standing(bench, start, run) for run in runs]
     best = start
-    for run in sorted(valid, key=lambda run: sum(SUSPECTS.get(name, OWN).complexity for name, _ in run.effects[len(start.effects) :])):
+    for run in sorted(valid, key=lambda run: sum(suspect(name).complexity for name in added(start, run))):
         most = base - bench.verdict(best).level_db
         if base - bench.verdict(run).level_db > most + BETTER * abs(most):
             best = run
@@ -111,7 +106,7 @@ def _best(bench: Workbench, start: EchoModel, runs: list[EchoModel]) -> EchoMode
 
 def _standing(bench: Workbench, start: EchoModel, run: EchoModel) -> EchoModel:
     """The run without the effects that cannot be named beside its others, the latest first."""
-    while fallen := [name for name, _ in run.effects[len(start.effects) :] if not _stands(bench, run, name)]:
+    while fallen := [name for name in added(start, run) if not _stands(bench, run, name)]:
         run = run.without_effect(fallen[-1])
     return run
 
@@ -124,7 +119,7 @@ def _stands(bench: Workbench, model: EchoModel, name: str) -> bool:
 
 def _in_steps(bench: Workbench, start: EchoModel, model: EchoModel) -> tuple[Trial, ...]:
     """The effects that a model has beyond the start, each with what it explains beside those before it, the largest first."""
-    names, steps = [name for name, _ in model.effects[len(start.effects) :]], []
+    names, steps = added(start, model), []
     values, model = dict(model.effects), start
     while names:
         tries = {name: model.with_effect(name, values[name]) for name in names}

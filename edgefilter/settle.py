@@ -5,10 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from edgefilter.echo.bandlimit import measured_response_db
-from edgefilter.echo.effect import find, names
 from edgefilter.echo.model import EchoModel
-from edgefilter.suspects import OWN, SUSPECTS, Suspect, choose
-from edgefilter.trials import LAST, Workbench
+from edgefilter.suspects import choose, suspect
+from edgefilter.trials import LAST, Workbench, absent, added
 
 ROUNDS, WORTH_DB = 3, 0.02
 """Rounds of fitting each effect beside the others, and the fall in level below which no further one is worth its time."""
@@ -24,7 +23,7 @@ CONFIRMED = 0.1
 
 def settle(bench: Workbench, start: EchoModel, model: EchoModel) -> EchoModel:
     """The model with its effects beyond start fitted beside each other; exchanged or dropped where that is simpler and explains as much."""
-    *earlier, newest = (name for name, _ in model.effects[len(start.effects) :])
+    *earlier, newest = added(start, model)
     model = refit(bench, start, model)
     for name in earlier if not bench.tired else ():
         model = _exchange(bench, start, model, name)
@@ -33,7 +32,7 @@ def settle(bench: Workbench, start: EchoModel, model: EchoModel) -> EchoModel:
 
 def refit(bench: Workbench, start: EchoModel, model: EchoModel) -> EchoModel:
     """Each effect beyond start fitted beside the others, in turn, as long as the held-out level falls."""
-    fitted = [name for name, _ in model.effects[len(start.effects) :]]
+    fitted = added(start, model)
     if len(fitted) < 2:
         return model
     waiting = fitted[:-1]
@@ -52,7 +51,7 @@ def refit(bench: Workbench, start: EchoModel, model: EchoModel) -> EchoModel:
 def _exchange(bench: Workbench, start: EchoModel, model: EchoModel, name: str) -> EchoModel:
     """The model with another effect instead of that one where, beside the others, the other is the one to name."""
     others = model.without_effect(name)
-    trials = {t.name: t for t in bench.attempt_all(others, _complexity(name)) if t.name not in LAST and bench.admissible(t, others)}
+    trials = {t.name: t for t in bench.attempt_all(others, suspect(name).complexity) if t.name not in LAST and bench.admissible(t, others)}
     trials[name] = bench.beside(name, others, model)
     chosen = choose({key: trial.gain_db for key, trial in trials.items()})
     if chosen is None or chosen == name:
@@ -66,8 +65,7 @@ def _drop(bench: Workbench, model: EchoModel, earlier: list[str], newest: str) -
     """The model without the earlier effects that the newest one, fitted without them, explains as well."""
     for name in earlier:
         alone = bench.attempt(newest, model.without_effect(name).without_effect(newest))
-        rule = SUSPECTS.get(name, OWN)
-        if alone is not None and alone.verdict.level_db - bench.verdict(model).level_db < rule.least_gain_db:
+        if alone is not None and alone.verdict.level_db - bench.verdict(model).level_db < suspect(name).least_gain_db:
             model = alone.model
     return model
 
@@ -89,11 +87,11 @@ def _volume_beside(bench: Workbench, model: EchoModel) -> EchoModel:
 def simpler_beside(bench: Workbench, start: EchoModel, model: EchoModel) -> EchoModel:
     """The model with a simpler effect beside a flexible one where both together explain more than the flexible one alone."""
     model = _volume_beside(bench, model)
-    for name in [name for name, _ in model.effects[len(start.effects) :] if name in FLEXIBLE]:
-        if _count(start, model) > 2 or bench.tired or bench.explained(others := model.without_effect(name)):
+    for name in [name for name in added(start, model) if name in FLEXIBLE]:
+        others = model.without_effect(name)
+        if len(added(start, model)) > 2 or bench.tired or bench.explained(others):
             break
-        most = max(_complexity(name) - 1, SIMPLE)
-        wanted = [key for key, rule in _suspects(others) if key not in (*FLEXIBLE, *LAST) and rule.complexity <= most]
+        wanted = [key for key in absent(others, max(suspect(name).complexity - 1, SIMPLE)) if key not in (*FLEXIBLE, *LAST)]
         simple = [t for key in wanted if (t := bench.attempt_alike(key, others)) is not None and bench.admissible(t, others)]
         least = max(CONFIRMED * bench.left(model), 0.05)
         for trial in sorted(simple, key=lambda t: -t.gain_db)[:2]:
@@ -106,16 +104,3 @@ def simpler_beside(bench: Workbench, start: EchoModel, model: EchoModel) -> Echo
                 model = joint
                 break
     return model
-
-
-def _suspects(model: EchoModel) -> list[tuple[str, Suspect]]:
-    """Every effect that acts on the voice and that the model has not, with what it must show."""
-    return [(name, SUSPECTS.get(name, OWN)) for name in names() if find(name).stage != "noise" and name not in dict(model.effects)]
-
-
-def _complexity(name: str) -> int:
-    return SUSPECTS.get(name, OWN).complexity
-
-
-def _count(start: EchoModel, model: EchoModel) -> int:
-    return len(model.effects) - len(start.effects)

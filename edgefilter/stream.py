@@ -64,7 +64,6 @@ class Stream:
         self._clip: list[Frame] = []
         self._synthesiser = Synthesiser(stft)
         self._mic, self._ref = Ring(2 * stft.hop), Ring(2 * stft.hop)
-        self._waiting = 0
         self._before_start = self.latency - stft.hop
         self._flushed = False
 
@@ -94,14 +93,13 @@ class Stream:
         hop = self.engine.stft.hop
         done: list[Samples] = []
         for at in range(0, mic.size, hop):
-            if mic.size - at >= hop and not self._waiting:
+            if mic.size - at >= hop and not len(self._mic):
                 done.append(self._watched_step(mic[at : at + hop], ref[at : at + hop]))
                 continue
             self._mic.write(mic[at : at + hop])
             self._ref.write(ref[at : at + hop])
             if len(self._mic) >= hop:
                 done.append(self._watched_step(self._mic.read(hop), self._ref.read(hop)))
-            self._waiting = len(self._mic)
         return self._finish(done)
 
     def _finish(self, done: list[Samples]) -> Samples:
@@ -129,7 +127,7 @@ class Stream:
         frame, aligned = self.front.step(mic, ref)
         if aligned and aligned.realigned:
             self.events.append(Event("realigned", self._stepped, f"reference arrives after {aligned.delay:.1f} samples"))
-        if self.engine.lookahead is None:
+        if self.waits_for_end:
             self._collect(frame)
             return np.zeros(0, np.float32)
         output, self._state = self.engine.step(frame, self._state)

@@ -141,6 +141,13 @@ SUSPECTS: dict[str, Suspect] = {
 """Every effect whose presence shows while the robot is heard; the fan is looked at in the silences."""
 OWN = Suspect(3)
 """An effect of the user's own."""
+
+
+def suspect(name: str) -> Suspect:
+    """What the effect of that name must show."""
+    return SUSPECTS.get(name, OWN)
+
+
 NESTED = 0.85
 """A simpler effect that explains this share of what the best one does is preferred to it."""
 
@@ -151,4 +158,4 @@ def choose(gains: dict[str, float]) -> str | None:
     if not most > 0.0:
         return None
     enough = [name for name, gain in gains.items() if gain >= NESTED * most]
-    return min(enough, key=lambda name: (SUSPECTS.get(name, OWN).complexity, -gains[name]))
+    return min(enough, key=lambda name: (suspect(name).complexity, -gains[name]))

@@ -15,7 +15,7 @@ from edgefilter.echo.model import EchoModel
 from edgefilter.errors import UsageError
 from edgefilter.judge import Judge, Verdict
 from edgefilter.prepare import Prepared
-from edgefilter.suspects import OWN, SUSPECTS
+from edgefilter.suspects import suspect
 from edgefilter.types import SAMPLE_RATE, Samples
 
 LAST, ENOUGH, LITTLE_DB = ("rattle",), 0.4, 0.1
@@ -140,7 +140,7 @@ class Workbench:
         than there is besides: of the held-out samples the filter itself leaves the most.
         """
         before, after = self.verdict(model), trial.verdict
-        where_fitted = SUSPECTS.get(trial.name, OWN).complexity < LONG and _over_fan(after.fitted_db) < POWER_SHARE * _over_fan(before.fitted_db)
+        where_fitted = suspect(trial.name).complexity < LONG and _over_fan(after.fitted_db) < POWER_SHARE * _over_fan(before.fitted_db)
         return where_fitted or _over_fan(after.active_db) < POWER_SHARE * _over_fan(before.active_db)
 
     def attempt_all(self, model: EchoModel, most: int = 9) -> list[Trial]:
@@ -148,11 +148,11 @@ class Workbench:
 
         The LAST ones only where none of the others explains much of what is left.
         """
-        wanted = [name for name in names() if find(name).stage != "noise" and name not in dict(model.effects)]
-        wanted = [name for name in wanted if SUSPECTS.get(name, OWN).complexity <= most]
         found, left = [], self.left(model)
-        for name in sorted(wanted, key=lambda name: name in LAST):
-            if name in LAST and (self.tired or left < LITTLE_DB or any((t.gain_db > ENOUGH * left or self.halves(t, model)) and self.admissible(t, model) for t in found)):
+        for name in sorted(absent(model, most), key=lambda name: name in LAST):
+            if name in LAST and (self.tired or left < LITTLE_DB):
+                continue
+            if name in LAST and any((t.gain_db > ENOUGH * left or self.halves(t, model)) and self.admissible(t, model) for t in found):
                 continue
             if (trial := self.attempt(name, model)) is not None:
                 found.append(trial)
@@ -160,10 +160,20 @@ class Workbench:
 
     def admissible(self, trial: Trial, model: EchoModel) -> bool:
         """Whether a trial on a model explains enough to be named, and its values look like that effect."""
-        rule = SUSPECTS.get(trial.name, OWN)
+        rule = suspect(trial.name)
         if trial.gain_db < rule.least_gain_db or trial.size_db < rule.least_size_db:
             return False
         return rule.guard is None or rule.guard(trial.values, self.judge, self.verdict(model), trial.verdict)
+
+
+def absent(model: EchoModel, most: int) -> list[str]:
+    """Names of the effects on the voice that a model has not and whose complexity is at most `most`."""
+    return [name for name in names() if find(name).stage != "noise" and name not in dict(model.effects) and suspect(name).complexity <= most]
+
+
+def added(start: EchoModel, model: EchoModel) -> list[str]:
+    """Names of the effects that a model has beyond the start it was made from, the latest last."""
+    return [name for name, _ in model.effects[len(start.effects) :]]
 
 
 def _over_fan(level_db: float) -> float:

@@ -60,7 +60,7 @@ class Front(nn.Module):
         self.register_buffer("ramp", torch.linspace(0.0, 1.0, self.hop))
         kernel = np.zeros((self.hop + linear.DISPLACEMENT_TAPS - 1, self.hop))
         for column in range(self.hop):
-            kernel[column : column + linear.DISPLACEMENT_TAPS, column] = oracle._lowpass[::-1]
+            kernel[column : column + linear.DISPLACEMENT_TAPS, column] = oracle._lowpass_reversed
         self.register_buffer("lowpass", _float(kernel))
 
     def forward(self, mic: Tensor, reference: Tensor, *state: Tensor) -> tuple[Tensor, ...]:

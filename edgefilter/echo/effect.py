@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import TYPE_CHECKING, ClassVar, Literal, Protocol, TypeAlias
 
 import numpy as np
@@ -22,8 +23,6 @@ STAGES: tuple[Stage, ...] = ("source", "path", "time", "microphone", "noise")
 """In the order in which sound meets them."""
 ROUNDING_PSD = 1e-14
 """One-sided PSD of rounding to 16 bit, full scale^2/Hz: (2^-15)^2 / 12 / 8 kHz."""
-
-
 REMEMBERED = 6
 """Models whose predictions a measurement keeps."""
 
@@ -39,7 +38,7 @@ class Parameter:
     high: float
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class Measurement:
     """The robot alone: reference (n,), aligned up to what an effect may do to time, and the recording (n,) of it, float32, 16 kHz.
 
@@ -52,7 +51,6 @@ class Measurement:
     noise_psd: Samples | None = None
     fit: NDArray[np.bool_] | None = None
     _heard: dict[EchoModel, tuple[Samples, Samples]] = field(default_factory=dict, init=False, repr=False)
-    _white: list[Samples] = field(default_factory=list, init=False, repr=False)
 
     @property
     def weights(self) -> Samples:
@@ -63,12 +61,10 @@ class Measurement:
         """x (n,) through a zero-phase filter after which the fan is white with variance 1; x itself where the fan is unknown."""
         return x if self.noise_psd is None else whiten(x, self.noise_psd)
 
-    @property
+    @cached_property
     def white_recording(self) -> Samples:
         """(n,) the recording, whitened."""
-        if not self._white:
-            self._white.append(self.whiten(self.recording))
-        return self._white[0]
+        return self.whiten(self.recording)
 
     def heard(self, model: EchoModel) -> tuple[Samples, Samples]:
         """(n,), (n,) what a model predicts for the reference, and that whitened; remembered for the latest few models, not to be written to."""

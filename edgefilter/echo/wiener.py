@@ -12,10 +12,8 @@ from scipy import fft
 from edgefilter.echo.effect import Measurement
 from edgefilter.types import SAMPLE_RATE, Array, Samples
 
-
 BLOCK = SAMPLE_RATE // 2
 """Samples that are transformed at once, those between two changes of the samples that diagnose() fits on."""
-
 SETTLED = 1e-6
 """A step that explains less than this part of what all before it have explained is the last."""
 
