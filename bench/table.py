@@ -7,7 +7,7 @@ from datetime import datetime, timezone
 
 import numpy as np
 
-from edgefilter.budget_cache import processor, versions
+from edgefilter.filter.budget_cache import processor, versions
 
 RESAMPLES = 2000
 PACKAGES = ("numpy", "scipy", "onnxruntime", "faster-whisper", "ctranslate2", "jiwer", "pywebrtc-audio", "soundfile")

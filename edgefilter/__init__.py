@@ -3,8 +3,8 @@
 EgoFilter goes in front of a recogniser, enhance() filters whole arrays, Profile is the calibrated robot.
 """
 
-from edgefilter.profile import Profile
-from edgefilter.stream import EgoFilter, enhance
+from edgefilter.filter.stream import EgoFilter, enhance
+from edgefilter.profile.data import Profile
 from edgefilter.types import Event
 
 __version__ = "0.1.0"

@@ -13,6 +13,8 @@ from edgefilter.errors import SignalError
 
 SAMPLE_RATE = 16000
 """Samples per second of everything inside; sources convert at the door."""
+PRE_ROLL = 64
+"""Samples (4 ms) of the impulse response before the direct sound: what equalisers and linear-phase filters of a loudspeaker ring ahead of it."""
 
 Array: TypeAlias = NDArray[np.floating]
 Samples: TypeAlias = NDArray[np.float32]

@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
+from edgefilter.dsp.stft import StftConfig
 from edgefilter.errors import UsageError
-from edgefilter.stft import StftConfig
 from edgefilter.types import SAMPLE_RATE
 
 SIGNALS = ("error", "mic", "reference", "echo", "clean")

@@ -19,10 +19,10 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
+from edgefilter.dsp.stft import StftConfig
 from edgefilter.engines.linear import Linear
-from edgefilter.profile import Profile
-from edgefilter.stft import StftConfig
-from edgefilter.front import Front
+from edgefilter.filter.front_end import Front
+from edgefilter.profile.data import Profile
 from edgefilter.types import Samples
 from export.corpus import Corpus, read_corpus
 from export.rooms import Room, draw_room

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import leaky_relu
 
-from edgefilter.stft import StftConfig
+from edgefilter.dsp.stft import StftConfig
 
 COMPRESSION = 0.3
 """Exponent of the magnitude features; the robot is 25 dB above the human, so levels have to be brought together."""

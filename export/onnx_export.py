@@ -24,11 +24,11 @@ import onnx
 import torch
 from torch import Tensor, nn
 
+from edgefilter.dsp.stft import StftConfig
 from edgefilter.engines.crnn import EDGE_TYPE, EDGE_VERSION, SPECTRA
 from edgefilter.engines.paper_crnn import PAPER_TYPE, PAPER_VERSION
 from edgefilter.engines.paper_ss import PAPER_STFT
 from edgefilter.errors import EdgefilterError, ModelError
-from edgefilter.stft import StftConfig
 from edgefilter.types import SAMPLE_RATE
 from export import onnx_parity
 from export.edge_graph import EdgeGraph

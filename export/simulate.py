@@ -12,11 +12,11 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy import signal
 
-from edgefilter.echo.clock_drift import ClockDrift
 from edgefilter.echo.effect import Values
-from edgefilter.echo.model import PRE_ROLL, EchoModel
-from edgefilter.profile import GRID_BINS, GRID_HZ, Profile
-from edgefilter.types import SAMPLE_RATE, Samples
+from edgefilter.echo.effects.clock_drift import ClockDrift
+from edgefilter.echo.model import EchoModel
+from edgefilter.profile.data import GRID_BINS, GRID_HZ, Profile
+from edgefilter.types import PRE_ROLL, SAMPLE_RATE, Samples
 from export.corpus import Corpus
 from export.rooms import Room
 

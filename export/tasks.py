@@ -9,8 +9,8 @@ from typing import ClassVar, Protocol
 import torch
 from torch import Tensor, nn
 
+from edgefilter.dsp.stft import StftConfig
 from edgefilter.engines.paper_ss import PAPER_STFT
-from edgefilter.stft import StftConfig
 from export.losses import LossWeights, edge_loss, power_law_loss, si_sdr
 from export.network import EdgeConfig, EdgeCrnn, count
 from export.paper_network import PaperConfig, PaperCrnn, parameter_count

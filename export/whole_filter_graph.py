@@ -8,10 +8,10 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from edgefilter import canceller as linear
-from edgefilter.canceller import Canceller
+from edgefilter.dsp.stft import StftConfig
 from edgefilter.engines.crnn import SPECTRA
-from edgefilter.stft import StftConfig
+from edgefilter.filter import canceller as linear
+from edgefilter.filter.canceller import Canceller
 from edgefilter.types import SAMPLE_RATE
 
 CANCELLER_STATES = (
@@ -46,7 +46,7 @@ class Fourier(nn.Module):
 
 
 class Front(nn.Module):
-    """edgefilter.canceller.Canceller.step and the analysis of its four signals, hop by hop, as one graph."""
+    """edgefilter.filter.canceller.Canceller.step and the analysis of its four signals, hop by hop, as one graph."""
 
     def __init__(self, stft: StftConfig, taps: int) -> None:
         super().__init__()

@@ -13,9 +13,9 @@ from scipy import signal
 
 from edgefilter.echo import effect as effects
 from edgefilter.echo.effect import Measurement
-from edgefilter.echo.model import PRE_ROLL, EchoModel
-from edgefilter.stream import Stream
-from edgefilter.types import SAMPLE_RATE, Frame
+from edgefilter.echo.model import EchoModel
+from edgefilter.filter.stream import Stream
+from edgefilter.types import PRE_ROLL, SAMPLE_RATE, Frame
 
 MakeStream = Callable[[], Stream]
 

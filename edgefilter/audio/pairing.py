@@ -7,7 +7,7 @@ from collections import deque
 
 import numpy as np
 
-from edgefilter.ring import Ring
+from edgefilter.dsp.ring import Ring
 from edgefilter.types import SAMPLE_RATE, Block, Samples
 
 MAX_WAIT = SAMPLE_RATE // 4

@@ -11,13 +11,13 @@ import numpy as np
 
 from edgefilter.audio.files import FileSink
 from edgefilter.audio.reader import Reader
-from edgefilter.calibrate import calibrate
+from edgefilter.calibration.calibrate import calibrate
+from edgefilter.calibration.stepped_sine import generate_stepped_sine
+from edgefilter.calibration.sweep import generate_sweep
 from edgefilter.commands.display import write_json
 from edgefilter.commands.profile import summary
 from edgefilter.errors import UsageError
-from edgefilter.paper_response import generate_stepped_sine
-from edgefilter.profile_text import describe
-from edgefilter.sweep import generate_sweep
+from edgefilter.profile.text import describe
 from edgefilter.types import SAMPLE_RATE, Samples
 
 FAN_SECONDS = 5

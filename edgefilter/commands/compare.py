@@ -7,7 +7,7 @@ from dataclasses import replace
 
 from edgefilter.commands.display import write_json
 from edgefilter.commands.material import load
-from edgefilter.compare import compare
+from edgefilter.diagnosis.compare import compare
 from edgefilter.report.html import comparison_page, write_page
 from edgefilter.report.text import comparison_lines
 

@@ -11,9 +11,9 @@ import soundfile
 
 from edgefilter.audio.files import FileSink, FileSource
 from edgefilter.commands.display import describe_latency, write_json
-from edgefilter.metrics import si_sdr
-from edgefilter.run import filter_blocks
-from edgefilter.stream import EgoFilter
+from edgefilter.dsp.metrics import si_sdr
+from edgefilter.filter.stream import EgoFilter
+from edgefilter.session import filter_blocks
 from edgefilter.types import SAMPLE_RATE, Samples
 
 DATA = Path(__file__).parents[1] / "demo_data"

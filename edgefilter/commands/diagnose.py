@@ -12,7 +12,7 @@ from tqdm import tqdm
 
 from edgefilter.commands.display import write_json
 from edgefilter.commands.material import load
-from edgefilter.diagnose import Diagnosis, diagnose
+from edgefilter.diagnosis.diagnose import Diagnosis, diagnose
 from edgefilter.report.html import add_command, diagnosis_page, write_page
 from edgefilter.report.text import diagnosis_lines
 

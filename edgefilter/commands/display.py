@@ -13,8 +13,8 @@ from tqdm import tqdm
 
 from edgefilter.audio.protocols import Source
 from edgefilter.errors import AudioFileError
-from edgefilter.run import Progress
-from edgefilter.stream import EgoFilter
+from edgefilter.filter.stream import EgoFilter
+from edgefilter.session import Progress
 from edgefilter.types import SAMPLE_RATE
 
 METER_PERIOD_S = 0.1

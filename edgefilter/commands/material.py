@@ -8,9 +8,9 @@ import sys
 import numpy as np
 
 from edgefilter.audio.reader import Reader
+from edgefilter.calibration.from_recording import self_calibrate
 from edgefilter.errors import AudioFileError
-from edgefilter.profile import Profile
-from edgefilter.self_calibration import self_calibrate
+from edgefilter.profile.data import Profile
 from edgefilter.types import Samples
 
 

@@ -6,8 +6,8 @@ import argparse
 
 from edgefilter.commands.display import write_json
 from edgefilter.errors import UsageError
-from edgefilter.profile import Profile
-from edgefilter.profile_text import describe
+from edgefilter.profile.data import Profile
+from edgefilter.profile.text import describe
 
 
 def main(args: argparse.Namespace) -> int:

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 from edgefilter.commands.display import write_json
 from edgefilter.errors import UsageError
-from edgefilter.profile import Profile
+from edgefilter.profile.data import Profile
 
 
 def main(args: argparse.Namespace) -> int:

@@ -14,13 +14,13 @@ from pathlib import Path
 from edgefilter.audio.files import FileSink, Recorder, open_source
 from edgefilter.audio.protocols import Sink, Source
 from edgefilter.audio.raw import PcmSink
-from edgefilter.budget import DEFAULT_MS, Choice, choose
-from edgefilter.budget_cache import forget
 from edgefilter.commands.display import describe_latency, display, write_json
 from edgefilter.errors import UsageError
-from edgefilter.profile import Profile
-from edgefilter.run import RunReport, filter_blocks
-from edgefilter.stream import EgoFilter
+from edgefilter.filter.budget import DEFAULT_MS, Choice, choose
+from edgefilter.filter.budget_cache import forget
+from edgefilter.filter.stream import EgoFilter
+from edgefilter.profile.data import Profile
+from edgefilter.session import RunReport, filter_blocks
 from edgefilter.types import SAMPLE_RATE, Event
 
 FILE_ENDINGS = (".wav", ".flac", ".ogg", ".mp3", ".aiff", ".aif", ".w64", ".opus", ".txt", ".raw", ".pcm")

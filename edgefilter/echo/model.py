@@ -7,13 +7,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 import scipy
 
-from edgefilter.echo import catalogue
-from edgefilter.echo.driver import Driver
 from edgefilter.echo.effect import STAGES, Measurement, Values, complete, find
+from edgefilter.echo.effects import catalogue
+from edgefilter.echo.source_chain import Driver
 from edgefilter.types import SAMPLE_RATE, Array, Samples
-
-PRE_ROLL = 64
-"""Samples (4 ms) of the impulse response before the direct sound: what equalisers and linear-phase filters of a loudspeaker ring ahead of it."""
 
 TAIL = 12800
 """Samples (0.8 s) by which an effect may lengthen the impulse response."""

@@ -5,12 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from edgefilter.dsp.stft import StftConfig
 from edgefilter.engines.base import ClipEngine, Engine
 from edgefilter.errors import UsageError
-from edgefilter.stft import StftConfig
 
 if TYPE_CHECKING:
-    from edgefilter.profile import Profile
+    from edgefilter.profile.data import Profile
 
 ENGINES = ("crnn", "ss", "linear", "bypass", "paper-ss", "paper-ss-causal", "paper-crnn")
 NEEDS_PROFILE = ("paper-ss", "paper-ss-causal")

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any, ClassVar, Literal, Protocol, TypeAlias
 
-from edgefilter.stft import StftConfig
+from edgefilter.dsp.stft import StftConfig
 from edgefilter.types import Frame, Output, Spectrum
 
 EngineState: TypeAlias = Any

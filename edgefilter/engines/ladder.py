@@ -14,7 +14,7 @@ from edgefilter.errors import EdgefilterError, UsageError
 from edgefilter.types import Frame, Output
 
 if TYPE_CHECKING:
-    from edgefilter.profile import Profile
+    from edgefilter.profile.data import Profile
 
 CANDIDATES = ("crnn", "ss", "linear")
 """What "auto" chooses from, best first."""

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import ClassVar
 
+from edgefilter.dsp.stft import StftConfig
 from edgefilter.engines.base import EngineState, Front
-from edgefilter.stft import StftConfig
 from edgefilter.types import Frame, Output
 
 

@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 import onnxruntime
 
+from edgefilter.dsp.stft import StftConfig
 from edgefilter.errors import ModelError, StftError
-from edgefilter.stft import StftConfig
 from edgefilter.types import SAMPLE_RATE
 
 FOLDERS = (Path(__file__).parents[1] / "models", Path(__file__).parents[2] / "models")

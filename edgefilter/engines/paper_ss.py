@@ -8,9 +8,9 @@ from typing import ClassVar
 import numpy as np
 from scipy import signal
 
+from edgefilter.dsp.stft import StftConfig
 from edgefilter.engines.base import Front
 from edgefilter.errors import UsageError
-from edgefilter.stft import StftConfig
 from edgefilter.types import Array, Frame, Output, Samples, Spectrum
 
 PAPER_STFT = StftConfig(n_fft=1200, hop=160, window_length=400, window="hann")

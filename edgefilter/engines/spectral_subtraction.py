@@ -6,8 +6,8 @@ from typing import ClassVar
 
 import numpy as np
 
+from edgefilter.dsp.stft import StftConfig
 from edgefilter.engines.base import Front
-from edgefilter.stft import StftConfig
 from edgefilter.types import Frame, Output, Samples
 
 FLOOR = 0.18

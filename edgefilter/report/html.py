@@ -12,10 +12,10 @@ from collections.abc import Iterable, Mapping, Sequence
 from importlib import resources
 from pathlib import Path
 
-from edgefilter.compare import Comparison
-from edgefilter.diagnose import Diagnosis, Finding
+from edgefilter.diagnosis.compare import Comparison
+from edgefilter.diagnosis.diagnose import Diagnosis, Finding
 from edgefilter.errors import EdgefilterError
-from edgefilter.profile import Profile
+from edgefilter.profile.data import Profile
 from edgefilter.report.media import MAX_SOUND_S, colour_scale, colours, sound, spectrogram_png
 from edgefilter.report.text import in_order
 from edgefilter.report.variants import MAX_FREE, Choice, compare_variants

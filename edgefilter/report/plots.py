@@ -9,10 +9,9 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from edgefilter.echo.model import PRE_ROLL
 from edgefilter.errors import EdgefilterError
-from edgefilter.profile import DISTORTION_ORDERS, GRID_HZ, Profile
-from edgefilter.types import SAMPLE_RATE, Samples
+from edgefilter.profile.data import DISTORTION_ORDERS, GRID_HZ, Profile
+from edgefilter.types import PRE_ROLL, SAMPLE_RATE, Samples
 
 INK, ACCENT, SOFT = "#222222", "#b5442c", "#5b7c99"
 

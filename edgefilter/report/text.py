@@ -7,8 +7,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from edgefilter.compare import Comparison
-from edgefilter.diagnose import Diagnosis, Finding
+from edgefilter.diagnosis.compare import Comparison
+from edgefilter.diagnosis.diagnose import Diagnosis, Finding
 from edgefilter.report.words import decibels, headline, interval_text, sentence, title
 
 BAR_WIDTH = 30

@@ -6,14 +6,14 @@ from collections.abc import Sequence
 from dataclasses import replace
 from itertools import product
 
-from edgefilter.compare import Comparison, describe
-from edgefilter.diagnose import Finding
+from edgefilter.diagnosis.compare import Comparison, describe
+from edgefilter.diagnosis.diagnose import Finding
+from edgefilter.diagnosis.noise_change import judge_behind
+from edgefilter.diagnosis.prepare import Prepared, prepare
+from edgefilter.diagnosis.score import Judge
 from edgefilter.echo.effect import complete, find
 from edgefilter.echo.model import EchoModel
-from edgefilter.fan import judge_behind
-from edgefilter.judge import Judge
-from edgefilter.prepare import Prepared, prepare
-from edgefilter.profile import Profile
+from edgefilter.profile.data import Profile
 from edgefilter.types import Samples
 
 MAX_FREE = 3

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 if TYPE_CHECKING:
-    from edgefilter.diagnose import Interval
+    from edgefilter.diagnosis.diagnose import Interval
 
 EFFECTS = {
     "late_reverb": "late reverberation",

@@ -18,8 +18,8 @@ import pyroomacoustics
 import soundfile
 from scipy import signal
 
-from edgefilter.calibrate import calibrate
-from edgefilter.sweep import generate_sweep
+from edgefilter.calibration.calibrate import calibrate
+from edgefilter.calibration.sweep import generate_sweep
 
 RATE = 16000
 ROOM, RT60_S = (5.2, 4.1, 2.8), 0.35

@@ -4,12 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from speech import RATE, write_librispeech, write_table
 
 from edgefilter.errors import UsageError
 from export.corpus import read_corpus
 from export.rooms import draw_room
 from export.simulate import PAPER, RECIPES, draw_colour, simulate
+from tests.export.speech import RATE, write_librispeech, write_table
 
 
 @pytest.fixture(scope="module")

@@ -5,15 +5,15 @@ import json
 import numpy as np
 import pytest
 import torch
-from speech import write_librispeech, write_table
 
-from edgefilter.metrics import si_sdr as si_sdr_of_samples
-from edgefilter.stft import StftConfig
+from edgefilter.dsp.metrics import si_sdr as si_sdr_of_samples
+from edgefilter.dsp.stft import StftConfig
 from export import dataset, train
 from export.crops import Batches, Items
 from export.losses import LossWeights, edge_loss, power_law_loss, si_sdr
 from export.network import EdgeConfig, EdgeCrnn, apply_mask, count
 from export.paper_network import PaperConfig
+from tests.export.speech import write_librispeech, write_table
 
 SMALL = EdgeConfig(64, 32, channels=(4, 4, 4, 4), hidden=8)
 

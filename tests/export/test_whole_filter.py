@@ -11,11 +11,11 @@ import pytest
 import soundfile
 import torch
 
-from edgefilter.canceller import Canceller
-from edgefilter.delay_line import Aligned
+from edgefilter.alignment.delay_line import Aligned
 from edgefilter.engines.crnn import EDGE_TYPE, EDGE_VERSION, Crnn
 from edgefilter.engines.onnx_session import open_model, open_session
-from edgefilter.stream import Stream
+from edgefilter.filter.canceller import Canceller
+from edgefilter.filter.stream import Stream
 from export import onnx_parity
 from export.network import EdgeConfig, EdgeCrnn
 from export.onnx_export import Trained, export

@@ -1,14 +1,10 @@
 """Servers of virtual sound devices: two null sinks, seen by PortAudio by the names robot, robot_mic and their monitors."""
 
-import sys
 from contextlib import ExitStack
-from pathlib import Path
 
 import pytest
 
-sys.path.insert(0, str(Path(__file__).parents[2] / "bench"))
-
-import virtual_sound  # noqa: E402
+from bench.measure import virtual_sound
 
 
 @pytest.fixture

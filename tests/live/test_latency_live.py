@@ -3,8 +3,7 @@
 import json
 import sys
 
-import latency_live
-import soak
+from bench.measure import latency_live, soak
 
 
 def test_a_click_comes_back_no_sooner_than_the_window_allows():

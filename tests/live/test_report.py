@@ -4,19 +4,15 @@ from __future__ import annotations
 
 import json
 import re
-import sys
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
-from browser import Browser
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "unit"))
-from robot_scene import profile, record, voice  # noqa: E402
-
-from edgefilter.diagnose import Finding, diagnose  # noqa: E402
-from edgefilter.report.html import comparison_page, diagnosis_page, write_page  # noqa: E402
+from edgefilter.diagnosis.diagnose import Finding, diagnose
+from edgefilter.report.html import comparison_page, diagnosis_page, write_page
+from tests.diagnosis.robot_scene import profile, record, voice
+from tests.live.browser import Browser
 
 NAMES = {"profile": "a robot with a rather long name.npz", "recording": "the office <on> Monday.wav", "reference": "tts.wav", "effects": []}
 CLIPPED = """[...document.querySelectorAll('body *')].filter((e) => e.checkVisibility() && !e.closest('audio')).flatMap((e) => {

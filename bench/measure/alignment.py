@@ -1,0 +1,295 @@
+#!/usr/bin/env python3
+"""Measure alignment: lag errors, time to align, drift, jumps, false realignments, half an hour of speech, cost per hop.
+
+    python bench/alignment.py --voices robot/val --speech human/val --output bench/results/alignment
+
+--voices and --speech are folders of recordings (16 kHz mono; the robot's voice, and humans). Rooms, clocks and fan are simulated with
+a known truth (tests/unit/alignment_scene.py). Writes OUTPUT.json, OUTPUT.md and OUTPUT.png. About 6 minutes on one core. --seed
+says which scenes are drawn: thresholds were set on seeds below 100000, so that a report takes another. --only-cost times a few
+conversations on a machine left alone, 10 s, and puts the cost into an OUTPUT.json that is there.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import soundfile as sf
+from scipy import signal
+
+from bench.simulate.alignment_scene import HEAD, RATE, fan, hear, known_path, room, run
+from bench.table import machine
+from edgefilter.alignment.aligner import Aligner
+
+HOP = 256
+CLOSE = 16
+JUMPS = (2, 3, 5, 8, 16, 40, 100, 250, 500, 1500)
+REACH = 960
+"""Jumps beyond this need a search of all lags."""
+
+
+class Corpus:
+    """Recordings of a folder, drawn at random, level 0.05 rms."""
+
+    def __init__(self, folder: Path) -> None:
+        self.files = sorted(p for p in folder.rglob("*") if p.suffix in (".flac", ".ogg", ".wav"))
+        if not self.files:
+            sys.exit(f"{folder} holds no recordings, expected .flac, .ogg or .wav files: check --voices and --speech")
+
+    def draw(self, rng: np.random.Generator, seconds: float | None = None) -> np.ndarray:
+        parts: list[np.ndarray] = []
+        while not parts or (seconds and sum(p.size for p in parts) < seconds * RATE):
+            x = sf.read(self.files[rng.integers(len(self.files))], dtype="float32")[0]
+            parts.append(x)
+        x = np.concatenate(parts)[: int(seconds * RATE) if seconds else None]
+        return 0.05 * x / (np.std(x) + 1e-9)
+
+
+def aligner(rng: np.random.Generator, with_profile: bool) -> Aligner:
+    return Aligner(HOP, known_path(room(rng, 0.25)) if with_profile else None)
+
+
+def onset(x: np.ndarray) -> int:
+    return int(np.argmax(np.abs(x) > 0.02 * np.abs(x).max()))
+
+
+def conversation(rng: np.random.Generator, voices: Corpus, speech: Corpus) -> dict:
+    """Three utterances, each with its own lag, in a room of RT60 0.2-0.75 s, clocks up to 300 ppm apart, a human 0-20 dB lower."""
+    parts, at, starts = [np.zeros(RATE // 2, np.float32)], RATE // 2, []
+    for _ in range(3):
+        x, pause = voices.draw(rng)[: 5 * RATE], np.zeros(int(rng.uniform(1.8, 2.5) * RATE), np.float32)
+        starts.append(at + onset(x))
+        parts += [x, pause]
+        at += x.size + pause.size
+    ref = np.concatenate(parts)
+    lags, ppm = rng.uniform(0, 1.5 * RATE, 3).round(), rng.uniform(-300, 300)
+    rt60 = rng.uniform(0.2, 0.75)
+    mic, truth = hear(ref, [(s - 2000, lag) for s, lag in zip(starts, lags, strict=True)], room(rng, rt60), ppm)
+    level = rng.uniform(-20, 0)
+    human = speech.draw(rng, mic.size / RATE)
+    human = np.pad(human, (0, mic.size - human.size)) * np.std(mic) / np.std(human) * 10 ** (level / 20)
+    mic = (mic + human + fan(rng, mic.size, 0.03 * np.std(mic))).astype(np.float32)
+    return {"ref": ref, "mic": mic, "truth": truth, "starts": starts, "lags": lags, "ppm": ppm, "rt60": rt60, "human_db": level}
+
+
+def judge_conversation(scene: dict, hops: list) -> list[dict]:
+    error = np.array([a.delay for a in hops]) - scene["truth"][HOP - 1 :: HOP][: len(hops)]
+    rows = []
+    for i, (start, lag) in enumerate(zip(scene["starts"], scene["lags"], strict=True)):
+        first = int(start + lag + HEAD) // HOP
+        stop = min(first + int(2.5 * RATE) // HOP, len(hops))
+        good = np.abs(error[first:stop]) < CLOSE
+        bad = np.flatnonzero(~good)
+        aligned = 0 if bad.size == 0 else bad[-1] + 1
+        at_300 = error[first + int(0.3 * RATE) // HOP]
+        rows.append({"utterance": i, "time_ms": float(aligned * HOP / 16) if aligned < good.size else None,
+                     "error_300ms": None if np.isnan(at_300) else float(at_300), "final_error": float(error[stop - 1]),
+                     "rt60": scene["rt60"], "human_db": scene["human_db"]})  # fmt: skip
+    return rows
+
+
+def lag_trials(seed: int, count: int, voices: Corpus, speech: Corpus, costs: list) -> dict:
+    out = {}
+    for with_profile in (True, False):
+        rows, drift = [], []
+        for i in range(count):
+            rng = np.random.default_rng(seed + i)
+            scene = conversation(rng, voices, speech)
+            a, hops = aligner(rng, with_profile), []
+            for at in range(0, scene["ref"].size - HOP + 1, HOP):
+                begin = time.perf_counter()
+                hops.append(a.step(scene["mic"][at : at + HOP], scene["ref"][at : at + HOP]))
+                costs.append(time.perf_counter() - begin)
+            rows += judge_conversation(scene, hops)
+            known = np.flatnonzero([x.delay == x.delay for x in hops])
+            if known.size:
+                drift.append(np.abs(np.array([x.ppm for x in hops[known[0] : known[0] + 600]]) - scene["ppm"]))
+        length = min(d.size for d in drift)
+        out["profile" if with_profile else "no profile"] = {"rows": rows, "drift": np.percentile([d[:length] for d in drift], [50, 95], axis=0).tolist()}
+    return out
+
+
+def cost_trials(seed: int, voices: Corpus, speech: Corpus) -> dict:
+    """ms per hop over six conversations with a profile and without, the first tenth left out; others: processes running beside (Linux)."""
+    costs, running = [], [Path("/proc/loadavg").read_text().split()[3]]
+    lag_trials(seed, 6, voices, speech, costs)
+    running.append(Path("/proc/loadavg").read_text().split()[3])
+    ms = 1e3 * np.array(costs[len(costs) // 10 :])
+    p50, p95, p99, worst = np.percentile(ms, [50, 95, 99, 100])
+    others = max(int(count.split("/")[0]) - 1 for count in running)
+    return {"ms": {"p50": p50, "p95": p95, "p99": p99, "max": worst, "mean": float(ms.mean())}, "others": others}
+
+
+def jump_trials(seed: int, repeats: int, voices: Corpus) -> list[dict]:
+    """Jumps of 2 to 500 samples, and of 1500, beyond the tracker's reach; longer and shorter delays in turn."""
+    rows = []
+    for size in JUMPS:
+        for k in range(2 * repeats):
+            jump, rng = size * (-1) ** k, np.random.default_rng(seed + 1000 + 100 * size + k)
+            ref = np.concatenate((np.zeros(4000, np.float32), voices.draw(rng, 9)))
+            mic, truth = hear(ref, [(0, 7000.0)], room(rng, rng.uniform(0.2, 0.75)), 80.0)
+            at = int(rng.uniform(5, 6) * RATE)
+            cut = np.s_[at : at + size]
+            mic = np.delete(mic, cut) if jump < 0 else np.insert(mic, at, np.zeros(size, np.float32))
+            truth = np.delete(truth, cut) if jump < 0 else np.insert(truth, at, np.full(size, np.nan))
+            truth[at:] += jump
+            hops = run(aligner(rng, True), mic + fan(rng, mic.size), ref)
+            error = np.array([a.delay for a in hops]) - truth[HOP - 1 :: HOP][: len(hops)]
+            first = at // HOP + 1
+            bad = np.flatnonzero(~(np.abs(error[first : first + 125]) < 0.7))
+            healed = 0 if bad.size == 0 else int(bad[-1] + 1)
+            frames = ref[max(at - 7000, 0) :][: healed * HOP].reshape(-1, HOP)
+            speaking = int(np.sum(np.mean(frames**2, axis=1) > 1e-2 * np.mean(ref**2)))
+            rows.append({"jump": jump, "ms": healed * HOP / 16, "ms_of_speech": speaking * HOP / 16, "healed": healed < 125})
+    return rows
+
+
+def false_trials(seed: int, minutes: int, voices: Corpus, speech: Corpus) -> dict:
+    """Realignments in `minutes` minutes each, every minute after the robot has spoken once."""
+    counts = {}
+    for name in ("silence", "human", "loud human", "noise", "unheard robot, silence", "unheard robot, human"):
+        for with_profile in (True, False):
+            found = sum(false_minute(np.random.default_rng(seed + 31 + i), name, with_profile, voices, speech) for i in range(minutes))
+            counts[f"{name}, {'' if with_profile else 'no '}profile"] = found
+    return counts
+
+
+def false_minute(rng: np.random.Generator, name: str, with_profile: bool, voices: Corpus, speech: Corpus) -> int:
+    ref = np.concatenate((np.zeros(4000, np.float32), voices.draw(rng, 5), np.zeros(60 * RATE, np.float32)))
+    mic = hear(ref, [(0, 9000.0)], room(rng, 0.6))[0]
+    later = 7 * RATE
+    if "human" in name:
+        mic[later:] += (5.0 if "loud" in name else 1.0) * speech.draw(rng, (mic.size - later) / RATE)
+    if name == "noise":
+        mic[later:] += 0.1 * rng.standard_normal(mic.size - later).astype(np.float32)
+    if "unheard" in name:
+        for at in range(later, ref.size - 6 * RATE, 6 * RATE):
+            ref[at : at + 4 * RATE] = voices.draw(rng, 4)
+    hops = run(aligner(rng, with_profile), mic + fan(rng, mic.size), ref)
+    return int(sum(a.realigned for a in hops[later // HOP :]))
+
+
+def long_speech(seed: int, voices: Corpus, minutes: int, ppm: float = 100.0) -> dict:
+    rng = np.random.default_rng(seed + 77)
+    parts: list[np.ndarray] = [np.zeros(RATE, np.float32)]
+    while sum(p.size for p in parts) < minutes * 60 * RATE:
+        parts += [voices.draw(rng), np.zeros(int(rng.uniform(0.5, 2) * RATE), np.float32)]
+    ref = np.concatenate(parts)[: minutes * 60 * RATE]
+    heard = signal.oaconvolve(ref, room(rng, 0.5).astype(np.float32))[: ref.size]
+    a, errors, ppms, realigned = aligner(rng, True), [], [], 0
+    for start in range(0, ref.size, 30 * RATE):
+        stop = min(start + 30 * RATE, ref.size)
+        t, first = np.arange(start, stop), max(start - 40000, 0)
+        delay = 14000 - ppm * 1e-6 * t
+        fine = signal.resample_poly(heard[first:stop], 8, 1)
+        mic = np.interp((t - delay - first) * 8, np.arange(fine.size), fine, left=0.0) + fan(rng, stop - start)
+        hops = run(a, mic.astype(np.float32), ref[start:stop])
+        realigned += sum(x.realigned for x in hops)
+        errors += [x.delay - d for x, d in zip(hops, (delay + HEAD)[HOP - 1 :: HOP], strict=False)]
+        ppms += [x.ppm for x in hops]
+    e, p, minute, warm = np.array(errors), np.array(ppms) - ppm, int(60 * RATE / HOP), int(10 * RATE / HOP)
+    spans = {"first minute (after 10 s)": slice(warm, minute), "last minute": slice(-minute, None)}
+    rows = {n: {"rms_jitter": float(np.std(e[s])), "mean_error": float(np.mean(e[s])), "worst_error": float(np.max(np.abs(e[s] - np.mean(e[s])))),
+                "rms_ppm_error": float(np.sqrt(np.mean(p[s] ** 2)))} for n, s in spans.items()}  # fmt: skip
+    return {"parts": rows, "realigned": int(realigned), "error": e[:: max(e.size // 3000, 1)].tolist(), "ppm_error": p[:: max(p.size // 3000, 1)].tolist()}
+
+
+def summarise(result: dict) -> str:
+    about = ", ".join(f"{key} {value}" for key, value in result["machine"].items())
+    lines = [f"# Alignment\n\n{about}\n\nSimulated rooms (RT60 0.2-0.75 s), voices and speech from recordings; `bench/alignment.py --seed {result['seed']}`.\n",
+             "| | within 1 ms at 300 ms | ever | time to align p50 / p95, ms | final error p50 / p95, samples |", "| --- | --- | --- | --- | --- |"]  # fmt: skip
+    for name, block in result["lags"].items():
+        rows = block["rows"]
+        at = np.mean([r["error_300ms"] is not None and abs(r["error_300ms"]) < CLOSE for r in rows])
+        times = [r["time_ms"] if r["time_ms"] is not None else 9999.0 for r in rows]
+        final = np.abs([r["final_error"] for r in rows])
+        ever = np.mean([r["time_ms"] is not None for r in rows])
+        t50, t95 = np.percentile(times, [50, 95])
+        f50, f95 = np.nanpercentile(final, [50, 95])
+        lines.append(f"| {name}, {len(rows)} utterances | {100 * at:.1f} % | {100 * ever:.1f} % | {t50:.0f} / {t95:.0f} | {f50:.2f} / {f95:.2f} |")
+    for name, block in result["lags"].items():
+        d = np.array(block["drift"])
+        at = {s: d[:, min(int(s * RATE / HOP), d.shape[1] - 1)] for s in (1, 2, 5)}
+        lines.append(f"\nDrift error ({name}), median / p95 ppm after the first lock: " + ", ".join(f"{s} s {v[0]:.1f} / {v[1]:.1f}" for s, v in at.items()))
+    for name, inside in ((f"of 2 to {JUMPS[-2]} samples", True), (f"of {JUMPS[-1]} samples, beyond the tracker's reach", False)):
+        jumps = [r for r in result["jumps"] if (abs(r["jump"]) < REACH) == inside]
+        p50, p95, worst = np.percentile([r["ms_of_speech"] for r in jumps], [50, 95, 100])
+        within = np.mean([r["healed"] and r["ms_of_speech"] <= 200 for r in jumps])
+        lines.append(f"\n{len(jumps)} jumps {name}: healed (to 0.7 samples) after p50 {p50:.0f}, p95 {p95:.0f}, max {worst:.0f} ms of speech; {100 * within:.0f} % within 200 ms.")
+    lines.append(f"\nFalse realignments in {result['false_minutes']} minutes each: " + ", ".join(f"{k}: {v}" for k, v in result["false"].items()))
+    for name, r in result["long"]["parts"].items():
+        lines.append(f"\n{result['long_minutes']} minutes at 100 ppm, {name}: jitter {r['rms_jitter']:.4f} samples rms, mean {r['mean_error']:+.3f}, at most {r['worst_error']:.3f} from it, drift error {r['rms_ppm_error']:.2f} ppm rms")
+    cost = result["cost"]
+    busy = f" (beside {cost['others']} running processes: not to be quoted)" if cost["others"] else " (nothing else running)"
+    lines.append(f"\nRealignments in it: {result['long']['realigned']} (1 is the first lock)\n\nCost per hop of {HOP}, ms{busy}: " + ", ".join(f"{k} {v:.3f}" for k, v in cost["ms"].items()))
+    return "\n".join(lines) + "\n"
+
+
+def draw(result: dict, path: Path) -> None:
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    figure, ((a, b, c), (d, e, f)) = plt.subplots(2, 3, figsize=(15, 8), constrained_layout=True)
+    for name, block in result["lags"].items():
+        error = np.sort([abs(r["error_300ms"]) if r["error_300ms"] is not None else 1e5 for r in block["rows"]])
+        share = (np.arange(error.size) + 1) / error.size
+        a.semilogx(np.maximum(error, 1e-3), share, label=name)
+        times = np.sort([r["time_ms"] if r["time_ms"] is not None else 1e4 for r in block["rows"]])
+        b.plot(np.minimum(times, 1000), share, label=name)
+        seconds = np.arange(len(block["drift"][0])) * HOP / RATE
+        c.semilogy(seconds, block["drift"][0], label=f"{name}, median")
+        c.semilogy(seconds, block["drift"][1], "--", label=f"{name}, 95 %")
+    a.axvline(CLOSE, color="k", lw=0.5)
+    b.axvline(300, color="k", lw=0.5)
+    a.set(title="Lag error 300 ms after the onset", xlabel="samples", ylabel="share of utterances")
+    b.set(title="Time to align (within 1 ms, to stay)", xlabel="ms", ylabel="share of utterances")
+    c.set(title="Drift error", xlabel="s after first lock", ylabel="ppm")
+    d.semilogx([abs(r["jump"]) for r in result["jumps"]], [r["ms_of_speech"] for r in result["jumps"]], "o", alpha=0.6)
+    d.axhline(200, color="k", lw=0.5)
+    d.set(title="Jump healed after", xlabel="jump, samples", ylabel="ms of robot speech")
+    error = np.array(result["long"]["error"])
+    e.plot(np.linspace(0, result["long_minutes"], error.size), error, lw=0.7)
+    e.set(title="Delay error in long speech, 100 ppm", xlabel="minutes", ylabel="samples", ylim=(-0.5, 0.5))
+    f.plot(np.linspace(0, result["long_minutes"], error.size), result["long"]["ppm_error"], lw=0.7)
+    f.set(title="Drift error in long speech", xlabel="minutes", ylabel="ppm", ylim=(-2, 2))
+    for axis in (a, b, c):
+        axis.legend(fontsize=8)
+    figure.savefig(path, dpi=90)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--voices", type=Path, required=True)
+    parser.add_argument("--speech", type=Path, required=True)
+    parser.add_argument("--count", type=int, default=30, help="conversations of three utterances")
+    parser.add_argument("--minutes", type=int, default=30, help="of drifting speech")
+    parser.add_argument("--false-minutes", type=int, default=5, help="of each kind of sound that is not the robot")
+    parser.add_argument("--repeats", type=int, default=3, help="jumps of each size and direction")
+    parser.add_argument("--only-cost", action="store_true", help="measure the cost anew, keep the rest of OUTPUT.json")
+    parser.add_argument("--seed", type=int, default=900000)
+    parser.add_argument("--output", type=Path, default=Path("bench/results/alignment"))
+    options = parser.parse_args()
+    voices, speech, stored = Corpus(options.voices), Corpus(options.speech), options.output.with_suffix(".json")
+    if options.only_cost:
+        result = json.loads(stored.read_text())
+    else:
+        result = {"machine": machine(), "seed": options.seed, "lags": lag_trials(options.seed, options.count, voices, speech, [])}
+        result["jumps"] = jump_trials(options.seed, options.repeats, voices)
+        result["false"], result["false_minutes"] = false_trials(options.seed, options.false_minutes, voices, speech), options.false_minutes
+        result["long"], result["long_minutes"] = long_speech(options.seed, voices, options.minutes), options.minutes
+    result["cost"] = cost_trials(options.seed, voices, speech)
+    options.output.parent.mkdir(parents=True, exist_ok=True)
+    stored.write_text(json.dumps(result))
+    options.output.with_suffix(".md").write_text(summarise(result))
+    draw(result, options.output.with_suffix(".png"))
+    print(summarise(result))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,220 @@
+"""The long run: an hour of audio faster than real time, or minutes live on a virtual device; memory, time per hop and samples must not drift.
+
+    OMP_NUM_THREADS=1 python bench/soak.py --minutes 60 --output bench/results/soak
+    OMP_NUM_THREADS=1 python bench/soak.py --live 10 --output bench/results/soak_live    (needs PulseAudio)
+
+Exit code 1 where something drifted. The sound is the bundled conversation over and over, the reference with a clock that is PPM fast, so that
+the alignment has work to do for ever. Memory and processor time per block are read once in every slice; the first tenth of the run, 15 s
+at least, is warm-up.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+import soundfile
+
+import edgefilter
+from bench.measure import virtual_sound
+from bench.table import machine
+from edgefilter import EgoFilter
+from edgefilter.types import SAMPLE_RATE
+
+DEMO = Path(edgefilter.__file__).parent / "demo_data"
+PPM = 50.0
+BLOCK = 320
+"""Samples a block, 20 ms: no multiple of any hop."""
+GROWTH_MB = 3.0
+"""Most growth of memory from the warm-up to the end; an array that grew by one frame a hop would add 115 MB an hour."""
+SETTLING_S = 15.0
+SLOWER = 1.3
+"""Most growth of a block's processor time over that of a bypassed block, second half over first. A shared machine changes its
+speed by more than that, and the bypass with it."""
+
+
+@dataclass
+class Slice:
+    """One part of the run: audio so far (s), resident memory (MB), processor time per block and that of a bypassed block (ms)."""
+
+    seconds: float
+    memory_mb: float
+    p50_ms: float | None = None
+    p99_ms: float | None = None
+    bypass_ms: float | None = None
+
+
+def memory_mb(pid: int | str = "self") -> float:
+    """Resident memory of a process now, MB (Linux)."""
+    return int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * 4096 / 2**20
+
+
+def blocks(total: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """total samples of the conversation in a loop, the reference on its own clock."""
+    mic, ref = (soundfile.read(DEMO / f"{name}.flac", dtype="float32")[0] for name in ("mic", "reference"))
+    for at in range(0, total, BLOCK):
+        count = min(BLOCK, total - at)
+        place = np.arange(at, at + count) * (1.0 + PPM * 1e-6)
+        whole = place.astype(np.int64)
+        part = (place - whole).astype(np.float32)
+        reference = (1 - part) * ref[whole % ref.size] + part * ref[(whole + 1) % ref.size]
+        yield mic[np.arange(at, at + count) % mic.size], reference
+
+
+def from_file(minutes: float, engine: str, slices: int) -> dict:
+    """So many minutes of audio through the whole path as fast as it goes."""
+    ego, yardstick = EgoFilter(DEMO / "profile.npz", engine), EgoFilter(engine="bypass")
+    total, done, out, took, bypassed, parts = round(60 * minutes * SAMPLE_RATE), 0, 0, [], [], []
+    for number, (mic, ref) in enumerate(blocks(total)):
+        start = time.thread_time()
+        finished = ego.process(mic, ref)
+        took.append(1000 * (time.thread_time() - start))
+        if number % 10 == 0:
+            start = time.thread_time()
+            yardstick.process(mic, ref)
+            bypassed.append(1000 * (time.thread_time() - start))
+        ego.events()
+        out, done = out + finished.size, done + mic.size
+        if done * slices // total > len(parts):
+            p50, p99 = np.percentile(took, (50, 99))
+            parts.append(Slice(done / SAMPLE_RATE, memory_mb(), float(p50), float(p99), float(np.median(bypassed))))
+            took.clear()
+            bypassed.clear()
+    out += ego.flush().size
+    return {"kind": "file", "engine": ego.engine_name, "samples_in": done, "samples_out": out, "lost": 0, "slices": [asdict(part) for part in parts]}
+
+
+def live(minutes: float, engine: str, slices: int) -> dict:
+    """So many minutes of `edgefilter run` between virtual devices, which players feed with the conversation."""
+    with virtual_sound.server() as server, tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        seconds = 60 * minutes
+        players = [_play(server, sink, recording, seconds, folder) for sink, recording in (("robot", "reference"), ("robot_mic", "mic"))]
+        command = [sys.executable, "-m", "edgefilter.cli", "run", "--input", "mic", "--profile", str(DEMO / "profile.npz"), "--engine", engine]
+        command += ["--output", str(folder / "out.wav"), "--json", str(folder / "stats.json"), "--seconds", str(seconds), "--quiet"]
+        run = subprocess.Popen(command, env=server.environment, stderr=subprocess.PIPE, text=True)
+        began, parts = time.monotonic(), []
+        while run.poll() is None:
+            time.sleep(min(1.0, seconds / slices / 2))
+            elapsed = time.monotonic() - began
+            if elapsed * slices / seconds > len(parts) + 1 and run.poll() is None:
+                parts.append(Slice(elapsed, memory_mb(run.pid)))
+        for player in players:
+            player.kill()
+            player.wait()
+        if run.returncode:
+            raise SystemExit(f"{' '.join(command)} failed: {run.stderr.read()}")
+        stats = json.loads((folder / "stats.json").read_text())
+    found = {"kind": "live", "engine": stats["engine"], "samples_in": stats["samples_in"], "samples_out": stats["samples_out"]}
+    found |= {"lost": stats["samples_lost"], "source": stats["source"], "deadline": stats["deadline"]}
+    return {**found, "slices": [asdict(part) for part in parts]}
+
+
+def _play(server: virtual_sound.Server, sink: str, recording: str, seconds: float, folder: Path) -> subprocess.Popen:
+    samples = soundfile.read(DEMO / f"{recording}.flac", dtype="int16")[0]
+    path = folder / f"{sink}.wav"
+    with soundfile.SoundFile(path, "w", SAMPLE_RATE, 1, "PCM_16") as file:
+        for _ in range(int((seconds + 30) * SAMPLE_RATE / samples.size) + 1):
+            file.write(samples)
+    return subprocess.Popen(["paplay", "-d", sink, str(path)], env=server.environment)
+
+
+def judge(result: dict) -> list[str]:
+    """What drifted, in words; empty where nothing did."""
+    troubles = []
+    if result["samples_in"] != result["samples_out"]:
+        troubles.append(f"{result['samples_in']} samples in, {result['samples_out']} out")
+    if result["lost"]:
+        troubles.append(f"{result['lost']} samples lost")
+    after = max(0.1 * result["slices"][-1]["seconds"], SETTLING_S)
+    settled = [part for part in result["slices"] if part["seconds"] >= after]
+    growth = settled[-1]["memory_mb"] - settled[0]["memory_mb"]
+    result["memory_growth_mb"] = growth
+    if growth > GROWTH_MB:
+        troubles.append(f"memory grew by {growth:.1f} MB")
+    if result["kind"] == "file":
+        half = len(settled) // 2
+        first, second = (_over_bypass(parts) for parts in (settled[:half], settled[half:]))
+        result["slower"] = second / first
+        if second > SLOWER * first:
+            troubles.append(f"a block took {first:.1f} times as long as a bypassed one in the first half and {second:.1f} times in the second")
+    return troubles
+
+
+def _over_bypass(parts: list[dict]) -> float:
+    """A block's time over a bypassed one's. The mean, since a slice in which the robot is mostly silent costs two thirds of another; of the
+    bypassed block, which costs the same whatever is heard, the median."""
+    return float(np.mean([part["p50_ms"] for part in parts]) / np.median([part["bypass_ms"] for part in parts]))
+
+
+def markdown(result: dict, name: str) -> str:
+    """A page of its own; name: of the picture beside it, without suffix."""
+    seconds = result["samples_in"] / SAMPLE_RATE
+    lines = [f"# Soak: {seconds / 60:.0f} minutes of `{result['engine']}`, {'live' if result['kind'] == 'live' else 'faster than real time'}", ""]
+    lines += [", ".join(f"{key} {value}" for key, value in result["machine"].items()), ""]
+    lines += [f"{result['samples_in']} samples in, {result['samples_out']} out, {result['lost']} lost;"]
+    lines += [f"memory grew by {result['memory_growth_mb']:+.2f} MB after the warm-up;"]
+    if result["kind"] == "file":
+        lines += [f"against a bypassed one, a block took {result['slower']:.2f} times as long in the second half as in the first."]
+    else:
+        deadline = result["deadline"]
+        lines += [f"{deadline['missed_deadlines']} of {deadline['hops']} hops missed their deadline, p99 {deadline['compute']['p99_ms']:.1f} ms;"]
+        lines += [f"{deadline['steps']} steps down or up between engines to keep to {deadline['budget_ms']:g} ms, the engine above is the last."]
+    lines += ["", f"Verdict: {'; '.join(result['troubles']) or 'nothing drifted'}.", ""]
+    lines += ["| minute | memory MB | p50 | p99 | bypassed, ms per 20 ms block |", "| --- " * 5 + "|"]
+    for part in result["slices"]:
+        times = " | ".join("" if part[key] is None else f"{part[key]:.3f}" for key in ("p50_ms", "p99_ms", "bypass_ms"))
+        lines.append(f"| {part['seconds'] / 60:.1f} | {part['memory_mb']:.1f} | {times} |")
+    return "\n".join([*lines, "", f"![memory and time]({name}.png)", ""])
+
+
+def draw(result: dict, path: Path) -> None:
+    """Memory over the run, and beside it, where blocks were timed, their median over a bypassed one's."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot as plt
+
+    timed = result["kind"] == "file"
+    figure, axes = plt.subplots(1, 1 + timed, figsize=(5 + 5 * timed, 3.5), layout="constrained", squeeze=False)
+    minutes = [part["seconds"] / 60 for part in result["slices"]]
+    panels = [("resident memory, MB", [part["memory_mb"] for part in result["slices"]])]
+    panels += [("median block over a bypassed one", [part["p50_ms"] / part["bypass_ms"] for part in result["slices"]])] if timed else []
+    for axis, (title, values) in zip(axes[0], panels):
+        axis.plot(minutes, values, "o-")
+        axis.set(title=title, xlabel="minutes", ylim=(0, 1.2 * max(values)))
+    figure.savefig(path, dpi=100)
+    plt.close(figure)
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--minutes", type=float, default=60.0, help="of audio, faster than real time (default: %(default)s)")
+    parser.add_argument("--live", type=float, metavar="MINUTES", help="run live on a virtual device instead")
+    parser.add_argument("--engine", default="auto")
+    parser.add_argument("--slices", type=int, default=20)
+    parser.add_argument("--output", type=Path, help="without suffix; .json, .md and .png are written")
+    args = parser.parse_args()
+    result = live(args.live, args.engine, args.slices) if args.live else from_file(args.minutes, args.engine, args.slices)
+    result["machine"] = {**machine(), "load average": f"{os.getloadavg()[0]:.1f}"}
+    result["troubles"] = judge(result)
+    page = markdown(result, args.output.name if args.output else "soak")
+    if args.output:
+        args.output.with_suffix(".json").write_text(json.dumps(result, indent=1) + "\n")
+        args.output.with_suffix(".md").write_text(page)
+        draw(result, args.output.with_suffix(".png"))
+    print(page)
+    return 1 if result["troubles"] else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

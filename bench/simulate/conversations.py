@@ -1,0 +1,240 @@
+#!/usr/bin/env python3
+"""Simulate whole conversations with a robot, to judge and tune the filter on: the robot speaks, pauses, speaks again, a human interrupts.
+
+    python bench/conversations.py --speech human/val --voices robot/val robot/train --kind live --count 24 --seed 1 --output DIR
+
+--speech and --voices are folders with a transcripts.tsv (path, speaker, seconds, text). Each conversation is a folder: sweep_ref,
+sweep_mic, fan_only (always recorded in a laboratory), ref, mic, clean (the human at the microphone, already inside mic), all FLAC,
+16 kHz, 16 bit, and meta.json: room, rt60, voice, speaker, text, positions in samples (start and end of the human in mic, t_main: onset of
+the second utterance in ref, lag), snr_fan and sisdr_mix over [start, end], nl_db (distortion relative to the linear loudspeaker, best
+gain removed), delay (of the direct sound in sweep_mic), seed.
+True delay of the reference in mic: lag + delay - ppm 1e-6 t. Kinds: `paper`, one lag of 50-300 ms; `live`, lag before t_main and lag2
+after (0-1.2 s each), volume turned by up to 3 dB between them (volume_db), clocks 10-300 ppm apart (either sign).
+Even conversations take place in the laboratory (RT60 0.20-0.26 s), odd ones in an office (0.50-0.75 s).
+Item i of a seed is the same whatever --count is.
+
+How it compares with a set of ten `paper` conversations simulated by other hands (lab / office means: theirs; then 60 of these with --distortion strong):
+- unfiltered SI-SDR -21.6 / -26.3; -22.2 / -26.1 dB
+- human over fan (snr_fan) 6.0 / 6.7; 7.4 / 7.3 dB
+- robot over fan while it speaks alone 29 / 34; 30 / 34 dB
+- robot removed by the best linear filter of 300 ms, fitted to the first utterance, 19.7 / 15.8; 20.3 / 17.6 dB
+- robot removed by that filter at the onset of the second utterance 17.6 / 14.3; 18.6 / 15.4 dB
+- direct sound over reverberation of that filter 15.7 / 8.3; 15.9 / 10.9 dB
+Their nl_db is -22 / -24 dB, that of the strong set -19 / -15 dB, that of the moderate set as theirs.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import json
+import math
+import sys
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import soundfile as sf
+from scipy import signal
+from tqdm import tqdm
+
+from bench.simulate.simulated_robot import RATE, Array, Loudspeaker, draw_body, draw_fan, draw_loudspeaker, draw_room, fan_noise, sweep, warp
+from edgefilter.dsp.metrics import si_sdr
+
+UNFILTERED_DB = {"lab": (-22.0, 1.0), "office": (-26.2, 0.9)}
+"""Mean and standard deviation of the unfiltered SI-SDR (Li, Hindriks & Kunneman 2024, Table 2: -22.0 and -26.3 dB)."""
+
+DISTORTION_DB = {
+    "moderate": {"lab": (-26.0, -21.0), "office": (-27.0, -21.0)},
+    "strong": {"lab": (-21.0, -17.0), "office": (-17.5, -13.5)},
+}
+"""Range of the loudspeaker's distortion at the microphone.
+
+moderate: the nl_db that the set described above states. strong: so much that the best linear filter of 300 ms leaves about as much of the
+robot as in that set, although in an office a part of what it leaves there is reverberation behind the 300 ms.
+"""
+
+
+@dataclass(frozen=True)
+class Clip:
+    path: Path
+    speaker: str
+    text: str
+
+
+@dataclass(frozen=True)
+class Robot:
+    """What does not change between rooms: loudspeaker, shell, geometry, converter delay, gain."""
+
+    loudspeaker: Loudspeaker
+    shell: Array
+    distance_m: float
+    direction: Array
+    bulk: int
+
+    def record(self, x: Array, response: Array, linear: bool = False) -> Array:
+        """Microphone samples (n,) of the played samples x (n,) for a room's impulse response, without fan or human."""
+        path = signal.oaconvolve(response, self.shell)
+        heard = signal.oaconvolve(self.loudspeaker.play(x, linear), path)[: x.size - self.bulk]
+        return np.concatenate([np.zeros(self.bulk), heard])
+
+
+def read_clips(folder: Path, seconds: tuple[float, float]) -> list[Clip]:
+    """The clips of a folder that have a text and a length between these bounds."""
+    table = folder / "transcripts.tsv"
+    if not table.is_file():
+        sys.exit(f"{table} is missing; expected a folder of speech with its transcripts.tsv (path, speaker, seconds, text)")
+    with table.open(encoding="utf-8", newline="") as lines:
+        rows = [row for row in csv.reader(lines, delimiter="\t", quoting=csv.QUOTE_NONE) if len(row) == 4 and row[3]]
+    clips = [Clip(folder / row[0], row[1], row[3]) for row in rows if seconds[0] <= float(row[2]) <= seconds[1]]
+    if not clips:
+        sys.exit(f"{table} lists no clip of {seconds[0]}-{seconds[1]} s with a text; expected at least one")
+    return clips
+
+
+def read_speech(clip: Clip) -> Array:
+    samples, rate = sf.read(clip.path)
+    if rate != RATE or samples.ndim != 1:
+        sys.exit(f"{clip.path} has {rate} Hz and shape {samples.shape}; expected {RATE} Hz mono")
+    loud = np.flatnonzero(np.abs(samples) > 0.01 * np.abs(samples).max())
+    return samples[loud[0] : loud[-1] + 1]
+
+
+def read_utterance(rng: np.random.Generator, clips: list[Clip], at_least: float) -> Array:
+    """Sentences of one voice in random order until they last at_least seconds, 0.1-0.4 s apart."""
+    parts: list[Array] = []
+    for i in rng.permutation(len(clips)):
+        parts += [read_speech(clips[i]), np.zeros(int(rng.uniform(0.1, 0.4) * RATE))]
+        if sum(part.size for part in parts[:-1]) >= at_least * RATE:
+            break
+    return np.concatenate(parts[:-1])
+
+
+def draw_robot(rng: np.random.Generator) -> Robot:
+    direction = np.array([*rng.uniform(-1, 1, size=2), rng.uniform(-0.8, -0.1)])
+    direction /= np.linalg.norm(direction)
+    return Robot(draw_loudspeaker(rng), draw_body(rng), rng.uniform(0.1, 0.3), direction, int(rng.integers(250, 635)))
+
+
+def with_distortion(robot: Robot, played: Array, response: Array, nl_db: float) -> tuple[Robot, float]:
+    """The robot with its drive turned until the voice is distorted by nl_db (bisection), and the figure reached."""
+    straight = robot.record(played, response, linear=True)
+    low, high = math.log(0.01), math.log(100.0)
+    for _ in range(9):
+        middle = 0.5 * (low + high)
+        robot = replace(robot, loudspeaker=replace(robot.loudspeaker, drive=math.exp(middle)))
+        found = -si_sdr(robot.record(played, response), straight)
+        low, high = (middle, high) if found < nl_db else (low, middle)
+    return robot, found
+
+
+def draw_lags(rng: np.random.Generator, kind: str, pause: int) -> tuple[int, int, float, float]:
+    """Lag of either utterance in samples, ppm, volume change in dB; the second never starts while the first is still heard."""
+    if kind == "paper":
+        lag = int(rng.uniform(0.05, 0.3) * RATE)
+        return lag, lag, 0.0, 0.0
+    ppm = rng.choice([-1.0, 1.0]) * math.exp(rng.uniform(math.log(10), math.log(300)))
+    while True:
+        first, second = (int(lag * RATE) for lag in rng.uniform(0.0, 1.2, size=2))
+        if second > first - pause + RATE // 10 and abs(second - first) > 320:
+            return first, second, ppm, rng.uniform(-3, 3)
+
+
+def make_conversation(seed: int, index: int, kind: str, speech: list[Clip], voices: dict[str, list[Clip]], distortion: str = "moderate") -> tuple[dict[str, Array], dict]:
+    """Signals by name (n,) float64 and the contents of meta.json, for item index of this seed."""
+    rng = np.random.default_rng([seed, index])
+    human_clip = speech[np.random.default_rng(seed).permutation(len(speech))[index % len(speech)]]
+    voice = str(rng.choice(sorted(voices)))
+    room_name = "office" if index % 2 else "lab"
+    robot, human_m = draw_robot(rng), rng.uniform(1.0, 1.5)
+    laboratory = draw_room(rng, "lab", robot.distance_m, robot.direction, human_m)
+    room = draw_room(rng, "office", robot.distance_m, robot.direction, human_m) if room_name == "office" else laboratory
+    human = read_speech(human_clip)
+    script, ref, played = make_script(rng, kind, voices[voice], human.size)
+    robot, nl_db = with_distortion(robot, played, room.robot, rng.uniform(*DISTORTION_DB[distortion][room_name]))
+
+    start = script["onset"] + robot.bulk
+    voiced = signal.oaconvolve(human, room.human)[: ref.size - start]
+    clean = np.concatenate([np.zeros(start), voiced, np.zeros(ref.size - start - voiced.size)])
+    end = min(start + human.size + RATE // 10, ref.size)
+    signals, scores = record_all(rng, UNFILTERED_DB[room_name], robot, (laboratory.robot, room.robot), played, clean, slice(start, end))
+    impulse = np.eye(1, 4096)[0]
+    delay = int(np.argmax(np.abs(robot.record(impulse, laboratory.robot, linear=True))))
+    del script["onset"]
+    meta = {"room": room_name, "rt60": room.rt60_s, "voice": voice, "speaker": human_clip.speaker, "text": human_clip.text}
+    meta |= {"start": start, "end": end, **script, **scores, "nl_db": nl_db, "live": kind == "live", "delay": delay, "seed": [seed, index]}
+    return {"ref": ref, **signals}, meta
+
+
+def make_script(rng: np.random.Generator, kind: str, voice: list[Clip], human_size: int) -> tuple[dict, Array, Array]:
+    """When who speaks: the meta entries (and the human's `onset` before converter delay), ref (n,), and what the converter plays (n,)."""
+    wait, pause, lead = (int(s * RATE) for s in (rng.uniform(0.5, 1.6), rng.uniform(0.5, 1.1), 0.45))
+    first = read_utterance(rng, voice, 4.0)
+    second = read_utterance(rng, voice, (wait + human_size) / RATE + rng.uniform(0.3, 1.0))
+    first, second = (0.7 * speech / max(np.abs(first).max(), np.abs(second).max()) for speech in (first, second))
+    lag, lag2, ppm, volume_db = draw_lags(rng, kind, pause)
+    t_main = lead + first.size + pause
+    ref, played = np.zeros((2, t_main + second.size + max(lag, lag2) + RATE // 2))
+    ref[lead : lead + first.size], ref[t_main : t_main + second.size] = first, second
+    played[lead + lag : lead + lag + first.size] = first
+    played[t_main + lag2 : t_main + lag2 + second.size] = 10 ** (volume_db / 20) * second
+    script = {"lag": lag, "t_main": t_main, "onset": t_main + lag2 + wait}
+    script |= {"lag2": lag2, "ppm": ppm, "volume_db": volume_db} if kind == "live" else {}
+    return script, ref, warp(played, ppm)
+
+
+def record_all(
+    rng: np.random.Generator,
+    unfiltered_db: tuple[float, float],
+    robot: Robot,
+    paths: tuple[Array, Array],
+    played: Array,
+    clean: Array,
+    span: slice,
+) -> tuple[dict[str, Array], dict[str, float]]:
+    """Calibration in the first path's room and conversation in the second's, with all levels set, and the figures that they have.
+
+    The gain makes the sweep peak at 0.22-0.42 of full scale; the human is scaled to the unfiltered SI-SDR, the fan to 4.5-10.5 dB
+    below the human.
+    """
+    excitation = sweep()
+    sweep_echo = robot.record(excitation, paths[0])
+    gain = rng.uniform(0.22, 0.42) / np.abs(sweep_echo).max()
+    echo = gain * robot.record(played, paths[1])
+    echo *= min(1.0, 0.9 / np.abs(echo).max())
+    mean, deviation = unfiltered_db
+    target_db = mean + deviation * np.clip(rng.standard_normal(), -2, 2)
+    clean = clean * math.sqrt(np.mean(echo[span] ** 2) / np.mean(clean[span] ** 2)) * 10 ** (target_db / 20)
+    snr_fan = rng.uniform(4.5, 10.5)
+    level, spectrum = math.sqrt(np.mean(clean[span] ** 2)) * 10 ** (-snr_fan / 20), draw_fan(rng)
+    fan = [level * fan_noise(rng, spectrum, n) for n in (excitation.size, 8 * RATE, clean.size)]
+    mic = echo + clean + fan[2]
+    signals = {"sweep_ref": excitation, "sweep_mic": gain * sweep_echo + fan[0], "fan_only": fan[1], "mic": mic, "clean": clean}
+    return signals, {"snr_fan": snr_fan, "sisdr_mix": si_sdr(mic[span], clean[span])}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--speech", type=Path, required=True, metavar="DIR", help="human speech")
+    parser.add_argument("--voices", type=Path, required=True, nargs="+", metavar="DIR", help="the robot's voices")
+    parser.add_argument("--output", type=Path, required=True, metavar="DIR")
+    parser.add_argument("--kind", choices=("paper", "live"), required=True)
+    parser.add_argument("--distortion", choices=tuple(DISTORTION_DB), default="moderate", help="of the loudspeaker (default: %(default)s)")
+    parser.add_argument("--count", type=int, default=24)
+    parser.add_argument("--seed", type=int, default=1)
+    options = parser.parse_args()
+    speech = read_clips(options.speech, (3.0, 12.0))
+    voices: dict[str, list[Clip]] = {}
+    for clip in (clip for folder in options.voices for clip in read_clips(folder, (1.0, 15.0))):
+        voices.setdefault(clip.speaker, []).append(clip)
+    for index in tqdm(range(options.count), unit="conversation", desc=str(options.output)):
+        signals, meta = make_conversation(options.seed, index, options.kind, speech, voices, options.distortion)
+        folder = options.output / f"{meta['room']}_{index:02d}"
+        folder.mkdir(parents=True, exist_ok=True)
+        for name, samples in signals.items():
+            sf.write(folder / f"{name}.flac", samples, RATE, subtype="PCM_16")
+        (folder / "meta.json").write_text(json.dumps(meta, indent=1) + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,297 @@
+"""Streaming alignment of the reference to the microphone: each utterance's lag, the clocks' drift, dropped buffers."""
+
+from __future__ import annotations
+
+from collections import deque
+
+import numpy as np
+
+from edgefilter.alignment.announced import AHEAD, Announcements
+from edgefilter.alignment.delay_line import HALF_WIDTH, Aligned, Tape, kernel_table, read_delayed, read_line
+from edgefilter.alignment.delay_tracker import REACH, STRIDE, DelayMeter, DriftFilter, Measurement
+from edgefilter.alignment.jumps import JumpWitness
+from edgefilter.alignment.lag_search import BETWEEN, MINIMUM, WINDOW, Candidate, LagSearch
+from edgefilter.alignment.utterances import OnsetDetector, Utterance
+from edgefilter.profile.data import Profile
+from edgefilter.types import PRE_ROLL, SAMPLE_RATE, Samples
+
+SEARCH_STRIDE = 768
+"""Samples between two searches of the whole range."""
+CERTAIN, CERTAIN_EARLY, EARLY = 30.0, 20.0, 2432
+"""A search's strength times ratio that decides, and what does when two searches in a row find it at one lag of which at most EARLY samples
+were heard, so that a third of them were new. Beside a human as loud as the robot the true lag has a median of 40 after 60 ms, and
+150 after 150 ms; chance, in an hour of other speech while the reference played unheard, 26, and 22 early."""
+SEEN = 5.0
+"""Strength that a lag at which more than a window of the utterance must have been heard already has to show in the window before as
+well; then CERTAIN_EARLY is enough. True lags have 10 there, chance 3.3."""
+HEARD = 6.0
+"""Strength of the tracker's peak over the rms of +-REACH lags from which a measurement counts."""
+FAINT, STRANGE, EDGE = 0.25, 10.0, 64
+"""Power over what the robot brings below which and above which it is not the robot that is heard, so that no jump can be seen, and
+samples at the edge of the looks' reach at which none is believed."""
+LOST_BLOCKS, NEARBY, NEARBY_SEARCHES = 3, 4096, 10
+"""Measurements in speech without a credible peak after which all lags are searched again: at first as if the present delay had ceased
+NEARBY samples ago, which finds jumps of up to 200 ms, then as if the utterance had begun half a second before."""
+
+
+class Aligner:
+    """Finds the total delay of the robot's voice in the microphone and delivers the reference at that delay.
+
+    A new utterance is looked for over all lags; the old delay stays the hypothesis until it is confirmed or replaced, but where
+    the microphone is far too quiet to hold it, nothing is delivered. Between utterances delay and drift are carried on.
+    hop: samples per step. profile: its impulse response tells the shape of the arrival. max_lag_s: of the playback, seconds.
+
+    >>> rng = np.random.default_rng(0)
+    >>> voice = rng.standard_normal(16384).astype(np.float32) / 10
+    >>> mic = np.concatenate((np.zeros(2000, np.float32), voice[:-2000]))
+    >>> aligner = Aligner(256)
+    >>> for at in range(0, 16384, 256):
+    ...     aligned = aligner.step(mic[at : at + 256], voice[at : at + 256])
+    >>> aligned.state, round(aligned.delay)
+    ('locked', 2000)
+    """
+
+    def __init__(self, hop: int, profile: Profile | None = None, max_lag_s: float = 1.5) -> None:
+        self.hop = hop
+        self._max_lag = int((max_lag_s + 0.1) * SAMPLE_RATE)
+        self._response = None if profile is None else profile.echo.impulse_response
+        early = None if self._response is None else self._response[: PRE_ROLL + 320]
+        self._lags = LagSearch(self._max_lag, early, PRE_ROLL)
+        kernel_table()
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget everything, as after construction."""
+        length = self._lags.span + SAMPLE_RATE
+        self._mic, self._ref = Tape(length), Tape(length)
+        self._onsets = OnsetDetector(self.hop)
+        self._meter = DelayMeter(self._response, PRE_ROLL)
+        self._drift = DriftFilter()
+        self._open: deque[Utterance] = deque(maxlen=32)
+        self._announced, self._expected = Announcements(), None
+        self._found, self._doubted, self._read_at = None, float("nan"), float("nan")
+        self._witness, self._segments = JumpWitness(), 0
+        self._to_search, self._to_measure, self._stage = SEARCH_STRIDE, STRIDE // 2, 0
+        self._gain: float | None = None
+        self._known = self._refuted = self._trusted = self._measured = False
+        self._confidence, self._lost = 0.0, 0
+        self._counts = {"utterances": 0, "realignments": 0, "jumps": 0, "searches": 0, "announced": 0, "announced_heard": 0}
+
+    def announce(self, utterance: Samples) -> None:
+        """Say what will be played (n,); it may begin at any time or never, and several are played in the order of announcing.
+
+        While the reference channel carries sound, that is the reference and announcements are dropped. While it is silent, the
+        announced utterance is looked for in the microphone for 30 s, and from where it is heard on it is the reference.
+        """
+        self._counts["announced"] += 1
+        self._announced.add(utterance)
+
+    def step(self, mic: Samples, ref: Samples) -> Aligned:
+        """Take the next hop (hop,) of microphone and reference."""
+        ref = self._announced.reference(ref, self._ref.end)
+        self._mic.push(mic)
+        self._ref.push(ref)
+        started = self._onsets.step(ref)
+        if started:
+            self._open.append(started)
+            self._counts["utterances"] += 1
+            if self._expected is not None:
+                self._stage, self._to_search, self._expected = 0, 0, None
+        if self._open:
+            self._expire()
+        before = self._read_at
+        self._measured = False
+        if self._known:
+            self._drift.advance(self.hop)
+        switched = self._measure() if self._known else False
+        switched = self._search() or switched
+        return self._deliver(mic, before, switched)
+
+    def history(self, count: int) -> Samples:
+        """The last count aligned samples (count,) float32, the present hop included, as if the present delay had always held."""
+        if not self._known or self._refuted:
+            return np.zeros(count, np.float32)
+        return read_line(self._ref, self._ref.end, count, self._read_at, self._drift.slope, chunk=512)
+
+    def stats(self) -> dict[str, object]:
+        """Delay, drift, confidence, state and what happened so far, ready for JSON."""
+        delay, deviation = (round(self._drift.delay, 3), round(self._drift.deviation, 3)) if self._known else (None, None)
+        found = {"method": "tracking", "state": self._state(), "delay_samples": delay, "deviation_samples": deviation, **self._counts}
+        return {**found, "ppm": round(-1e6 * self._drift.slope, 2), "confidence": round(self._confidence, 3)}
+
+    def _state(self) -> str:
+        current = self._onsets.current
+        if self._expected is not None:
+            return "searching"
+        audible = self._max_lag if not self._known else int(self._drift.delay) + SAMPLE_RATE // 4
+        if self._open and (self._known or current.end + audible > self._ref.end):
+            return "searching"
+        if current is None or current.end + audible < self._ref.end:
+            return "idle"
+        return "locked" if self._known else "searching"
+
+    def _expire(self) -> None:
+        """Give up utterances that would have been heard by now."""
+        end = self._open[1].start if len(self._open) > 1 else self._onsets.current.end
+        if self._ref.end > end + self._max_lag + SAMPLE_RATE // 4:
+            self._resolve(found=False)
+
+    def _resolve(self, found: bool = True) -> None:
+        self._open.popleft()
+        self._trusted = found
+        self._stage = 0
+        self._refuted = False
+
+    def _search(self) -> bool:
+        """Look for the oldest unresolved utterance, or one that was announced, a step each hop; True if the delay was switched."""
+        self._to_search -= self.hop
+        if self._measured or (self._stage == 0 and self._to_search > 0):
+            return False
+        now, stage, self._stage = self._ref.end, self._stage, 0
+        if stage == 0:
+            self._expected = None if self._open else self._announced.expected(now)
+            too_soon = self._open and now + 2 * self.hop - self._open[0].start < MINIMUM and not self._open[0].nearby
+            if too_soon or (not self._open and self._expected is None):
+                return False
+            self._to_search, self._stage = SEARCH_STRIDE, 1
+            self._counts["searches"] += 1
+            if self._open and self._open[0].nearby > 0:
+                self._open[0].nearby -= 1
+                self._open[0].start = now - int(self._drift.delay) - (NEARBY if self._open[0].nearby else SAMPLE_RATE // 2)
+            since = self._open[0].start if self._open else self._expected.start
+            self._lags.prepare(self._expected or self._ref, now, since)
+        elif stage == 1:
+            self._stage = 2
+            heard_out = self._open[0].after + int(self._drift.delay) if self._open and self._trusted else 0
+            self._lags.listen(self._mic, now, heard_out)
+        elif stage == 2:
+            self._found = self._lags.find()
+            return self._found is not None and self._decide(self._found)
+        else:
+            return self._lags.before(self._mic, self._expected or self._ref, self._found) > SEEN and self._take(self._found)
+        return False
+
+    def _decide(self, found: Candidate) -> bool:
+        """Take the candidate if it is beyond chance, or have the window before looked at; True if the delay was switched."""
+        evidence = found.strength * found.ratio
+        if found.heard > WINDOW + BETWEEN + MINIMUM and evidence > CERTAIN_EARLY:
+            self._stage = 3
+            return False
+        place = found.lag + (self._expected.start if self._expected else 0)
+        again, self._doubted = abs(place - self._doubted) <= 2, place if evidence > CERTAIN_EARLY else float("nan")
+        enough = CERTAIN_EARLY if again and found.heard <= EARLY else CERTAIN
+        return evidence > enough and found.heard <= WINDOW and self._take(found)
+
+    def _take(self, found: Candidate) -> bool:
+        """Believe a candidate; True if the delay was switched."""
+        if self._expected is not None:
+            return self._begin(self._expected.start + found.lag)
+        was_refuted = self._refuted
+        self._resolve()
+        self._confidence = min(found.strength / 20.0, 1.0)
+        if self._known and abs(found.lag - self._drift.delay) < 24:
+            return was_refuted
+        return self._switch(float(found.lag), 3.0)
+
+    def _begin(self, heard_at: int) -> bool:
+        """What was announced is heard since heard_at: from now on it is the reference."""
+        playback, now = self._announced.begin(heard_at), self._ref.end
+        self._counts["announced_heard"] += 1
+        self._ref.rewrite(playback.start, playback.read(playback.start, now))
+        self._onsets.current = Utterance(playback.start, now)
+        return self._switch(float(AHEAD), 3.0)
+
+    def _switch(self, delay: float, deviation: float) -> bool:
+        self._drift.restart(delay, deviation)
+        self._known = True
+        self._counts["realignments"] += 1
+        self._lost, self._refuted = 0, False
+        self._witness.forget()
+        self._to_measure = min(self._to_measure, 2 * self.hop)
+        return True
+
+    def _measure(self) -> bool:
+        """Now and then measure the error of the present delay; True if it jumped."""
+        self._to_measure -= self.hop
+        self._measured = self._to_measure <= 0
+        if not self._measured:
+            self._meter.learn()
+            return False
+        self._to_measure = STRIDE
+        if self._onsets.current is None or self._ref.end - self._drift.delay - STRIDE > self._onsets.current.end:
+            return False
+        self._segments = 1 if self._lost or (self._open and self._open[0].nearby) else 0
+        found = self._meter.measure(self._mic, self._ref, self._ref.end, self._drift.delay, self._drift.slope, self._segments)
+        return found is not None and self._judge(found)
+
+    def _judge(self, found: Measurement) -> bool:
+        if found.strength < HEARD:
+            self._note_loss(found)
+            return False
+        small = abs(found.offset) < 1.5 or (abs(found.offset) < 8.0 and self._drift.surprise(found) < 3.0)
+        if small and (self._drift.surprise(found) < 5.0 or abs(found.offset) < 0.3):
+            return self._accept(found)
+        gain = found.gain if self._gain is None else self._gain
+        if found.gain > STRANGE * gain:
+            return False
+        if not FAINT < found.gain_there / gain < STRANGE or abs(found.offset) > (2 * self._segments + 1) * REACH - EDGE:
+            self._note_loss(found)
+            return False
+        if self._witness.convinced(found):
+            self._counts["jumps"] += 1
+            if self._open and self._ref.end - self._drift.delay > self._open[0].start + STRIDE:
+                self._resolve()
+            return self._switch(self._drift.delay + found.offset, 0.3)
+        self._to_measure = STRIDE // 2
+        self._note_loss(found)
+        return False
+
+    def _accept(self, found: Measurement) -> bool:
+        step = self._drift.delay
+        self._drift.correct(found)
+        self._meter.confirm(found.offset)
+        self._lost = 0
+        self._witness.forget()
+        self._confidence += 0.2 * (found.explained - self._confidence)
+        self._gain = found.gain if self._gain is None else self._gain + 0.1 * (min(found.gain, 2 * self._gain) - self._gain)
+        was_refuted = self._refuted
+        if self._open and self._ref.end - self._drift.delay > self._open[0].start + STRIDE and found.dominance < 1.01:
+            self._resolve()
+        return was_refuted or abs(self._drift.delay - step) > 0.5
+
+    def _note_loss(self, found: Measurement) -> None:
+        """Speech of the robot should be heard but is not where it was expected: in the end, search everything."""
+        if self._open or self._gain is None or found.gain < 0.25 * self._gain:
+            return
+        self._lost += 1
+        self._to_measure = STRIDE // 2
+        self._confidence *= 0.9
+        if self._lost >= LOST_BLOCKS:
+            self._lost = 0
+            self._trusted = False
+            self._open.append(Utterance(self._ref.end, self._ref.end, nearby=NEARBY_SEARCHES))
+
+    def _deliver(self, mic: Samples, before: float, switched: bool) -> Aligned:
+        if not self._known:
+            return Aligned(np.zeros(self.hop, np.float32), float("nan"), 0.0, 0.0, self._state(), False)
+        self._read_at = max(self._drift.delay - PRE_ROLL, 0.0)
+        end = self._ref.end
+        start = self._read_at - self._drift.slope * self.hop if switched or before != before else before
+        if self._read_at < HALF_WIDTH:
+            start = self._read_at = float(round(self._read_at))
+        if abs(start - self._read_at) > 0.5:
+            start, switched = self._read_at - self._drift.slope * self.hop, True
+        reference = read_delayed(self._ref, end, self.hop, start, self._read_at)
+        if self._open and not self._refuted and end - self._drift.delay > self._open[0].start:
+            self._refuted = self._cannot_be(mic, reference)
+        if self._refuted:
+            reference = np.zeros(self.hop, np.float32)
+        ppm = -1e6 * self._drift.slope
+        return Aligned(reference, self._drift.delay, ppm, self._confidence, self._state(), switched)
+
+    def _cannot_be(self, mic: Samples, reference: Samples) -> bool:
+        """Whether the microphone holds 10 dB less than the reference at the old delay would bring there."""
+        if self._gain is None:
+            return False
+        expected = self._gain * float(np.dot(reference[: self.hop - PRE_ROLL], reference[: self.hop - PRE_ROLL]))
+        return float(np.dot(mic, mic)) < 0.1 * expected

@@ -1,0 +1,266 @@
+"""Fine tracking of one delay: sub-sample error from the cross-spectrum, a Kalman filter over (delay, drift), jumps."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.ndimage import uniform_filter1d
+
+from edgefilter.alignment.delay_line import Tape
+from edgefilter.dsp import fourier
+from edgefilter.types import Samples
+
+FRAME = 2048
+"""Samples of microphone in one measurement, Hann-weighted."""
+STRIDE = 1024
+"""Samples between two measurements."""
+REACH = 1024
+"""Largest jump that the tracker sees, samples; beyond it the whole range is searched."""
+SIZE = FRAME + 2 * REACH
+SAME = 12
+"""Lags on each side of a peak that are the same peak."""
+EARLY = (48, 400)
+"""Samples before and after the direct sound that the learnt response keeps."""
+
+
+@dataclass(frozen=True, slots=True)
+class Measurement:
+    """offset: delay error, samples (positive: the microphone is later). variance: samples^2. strength: height of the peak over
+    the rms of all lags. ratio: height over the highest peak elsewhere. dominance: height over the best within 2 samples of the expected
+    delay. explained: share of the microphone's whitened power that the early response explains, 0 to 1. gain: power ratio of
+    microphone to reference; gain_there: the same if the offset is true."""
+
+    offset: float
+    variance: float
+    strength: float
+    ratio: float
+    dominance: float
+    explained: float
+    gain: float
+    gain_there: float
+
+    @property
+    def evidence(self) -> float:
+        """Strength times ratio: how far the peak stands out of chance."""
+        return self.strength * self.ratio
+
+
+class DelayMeter:
+    """Measures the delay of the microphone against the reference read at an expected delay.
+
+    The likelihood of an offset tau under M = H A exp(-j omega tau) + V is Re sum conj(H) G exp(j omega tau) / S_V with G = M conj(A)
+    and S_V the smoothed power of what H A leaves unexplained (Hannan & Thomson 1973 weights). H, the early response relative to
+    the direct sound, starts from the profile (or from a pure delay) and is learnt; each cross-spectrum is shifted by its own
+    offset first, so that learning does not move the delay. Peaks are compared after division by the root of the energy that a lag
+    lets overlap, with which chance peaks grow.
+    """
+
+    def __init__(self, response: Samples | None, pre_roll: int) -> None:
+        self._window = np.hanning(FRAME + 1)[:FRAME].astype(np.float32)
+        self._omega = (2 * np.pi * np.arange(SIZE // 2 + 1) / SIZE).astype(np.float32)
+        self._omega_squared = np.square(self._omega)
+        band = (self._omega > 2 * np.pi * 120 / 16000) & (self._omega < 2 * np.pi * 7000 / 16000)
+        self._band, self._band_size = band.astype(np.float32), float(np.count_nonzero(band))
+        self._ramp = np.arange(-SIZE // 2, SIZE // 2, dtype=np.float32)
+        self._framed = np.zeros((3, SIZE), np.float32)
+        self._prior = np.ones(self._omega.size, np.complex64)
+        self._prior_blocks = 4.0
+        if response is not None:
+            early = np.zeros(SIZE, np.float32)
+            count = min(pre_roll + EARLY[1], response.size)
+            early[:count] = response[:count]
+            self._prior = fourier.rfft(np.roll(early, -pre_roll)).astype(np.complex64)
+            self._prior_blocks = 16.0
+        self._known_scale = response is not None
+        self._cross: np.ndarray | None = None
+        self._power: Samples | None = None
+        self._confirmed: float | None = None
+        self.response = self._prior
+
+    def measure(self, mic: Tape, ref: Tape, now: int, delay: float, slope: float, segments: int = 0) -> Measurement | None:
+        """Compare the last FRAME samples of mic with the reference at the expected delay; None where either is silent.
+
+        segments: so many times 2 REACH further lags on each side are looked at as well.
+        """
+        centre = delay - slope * (FRAME / 2)
+        whole = round(centre)
+        start = now - FRAME - REACH - whole
+        x, inner, wide = self._framed
+        np.multiply(mic.read(now - FRAME, now), self._window, out=x[REACH:-REACH])
+        self._reference(ref, start, slope, wide)
+        np.multiply(wide[REACH:-REACH], self._window, out=inner[REACH:-REACH])
+        energy, drive = float(x.dot(x)), float(inner.dot(inner))
+        if not (drive > 1e-9 and energy > 1e-12):
+            return None
+        m, a, w = fourier.rfft(self._framed)
+        m *= _turn(self._omega, centre - whole)
+        power_a = _power(a)
+        if self._cross is None:
+            self._start(_power(m), power_a)
+        self._last = (m * np.conj(a), power_a)
+        powers = _power(np.array((m - self.response * a, m)))  # smoothed into an array of ours: to make its own takes scipy as long again
+        left, power_m = uniform_filter1d(powers, 31, output=np.empty_like(powers), mode="nearest")
+        weight = self._band / (left + 0.05 * power_m + (1e-6 * power_m.max() + 1e-20))
+        m *= np.conj(self.response)
+        m *= weight
+        products, references = [m * np.conj(w)], [wide]
+        for segment in range(1, segments + 1):
+            for shift in (-2 * REACH * segment, 2 * REACH * segment):
+                wide = self._reference(ref, start - shift, slope, np.empty(SIZE, np.float32))
+                products.insert(0 if shift < 0 else len(products), m * np.conj(fourier.rfft(wide)))
+                references.insert(0 if shift < 0 else len(references), wide)
+        correlation = fourier.irfft(np.array(products), SIZE)
+        likelihood = np.concatenate((correlation[:, -REACH:], correlation[:, :REACH]), axis=1).ravel()
+        overlap = np.concatenate([_overlap(reference) for reference in references])
+        likelihood /= np.sqrt(overlap + 0.1 * overlap.max())
+        expected = likelihood.size // 2
+        near = float(likelihood[expected - 2 : expected + 3].max())
+        at, peak, strength, ratio = max((_highest(likelihood, reach) for reach in {REACH, expected}), key=lambda found: found[2] * found[3])
+        part, inside = divmod(at, 2 * REACH)
+        offset = at - inside + REACH - expected + self._refine(products[part], inside - REACH)
+        there = references[part][SIZE - FRAME - inside : SIZE - inside] * self._window
+        information = 2.0 * float(self._omega_squared.dot(_power(self.response) * power_a * weight)) * FRAME / SIZE
+        explained = 1.0 - float(self._band.dot(left / (power_m + 1e-20))) / self._band_size
+        return Measurement(
+            offset=offset,
+            variance=4.0 / (information + 1e-9) + 1e-4,
+            strength=strength,
+            ratio=ratio,
+            dominance=peak / max(near, 1e-20),
+            explained=min(max(explained, 0.0), 1.0),
+            gain=energy / drive,
+            gain_there=energy / (float(there.dot(there)) + 1e-12),
+        )
+
+    def _reference(self, ref: Tape, start: int, slope: float, out: Samples) -> Samples:
+        """SIZE samples of the reference from start on, the drift about their middle undone by the first term of a Taylor series."""
+        x = ref.read(start - 2, start + SIZE + 2)
+        np.subtract(x[3:-1], x[1:-3], out=out)
+        out *= 8.0
+        out += x[:-4]
+        out -= x[4:]
+        out *= self._ramp * (slope / -12.0)
+        out += x[2:-2]
+        return out
+
+    def confirm(self, offset: float) -> None:
+        """The last measurement was believed, with this offset: `learn`, when there is time, takes it into the response."""
+        self._confirmed = offset
+
+    def learn(self) -> None:
+        """Take what was confirmed last, if it has not been taken yet, into the response: its cross-spectrum, shifted by its offset."""
+        if self._confirmed is None:
+            return
+        offset, self._confirmed = self._confirmed, None
+        cross, power = self._last
+        level = float(self._total / (np.add.reduce(power) + 1e-20)) / self._blocks
+        rate = min(max(level, 0.03), 3.0)
+        self._cross = 0.98 * self._cross + rate * cross * _turn(self._omega, offset)
+        self._power = 0.98 * self._power + rate * power
+        self._total = np.add.reduce(self._power)
+        self._blocks = 0.98 * self._blocks + 1.0
+        impulse = fourier.irfft(self._cross / (self._power + 1e-3 * (self._total / self._power.size)), SIZE)
+        impulse[EARLY[1] : SIZE - EARLY[0]] = 0.0
+        self.response = fourier.rfft(impulse)
+
+    def _start(self, power_m: Samples, power_a: Samples) -> None:
+        smooth = uniform_filter1d(power_a, 65, mode="nearest")
+        scale = 1.0 if self._known_scale else 0.7 * float(np.sqrt(power_m.sum() / power_a.sum()))
+        self._blocks = self._prior_blocks
+        self._power = self._blocks * smooth
+        self._total = np.add.reduce(self._power)
+        self._cross = self._blocks * smooth * self._prior * np.float32(scale)
+        self.response = self._prior * np.float32(scale)
+
+    def _refine(self, product: np.ndarray, whole: int) -> float:
+        """Newton steps on the likelihood from its highest whole sample, at most one sample away."""
+        offset = 0.0
+        for _ in range(3):
+            z = product * _turn(self._omega, whole + offset)
+            slope = -float(self._omega.dot(z.imag))
+            curvature = -float(self._omega_squared.dot(z.real))
+            if curvature >= 0.0:
+                break
+            offset = min(max(offset - slope / curvature, -1.0), 1.0)
+        return whole + offset
+
+
+class DriftFilter:
+    """Kalman filter over the delay (samples) and its slope (samples per sample), constant-slope model."""
+
+    def __init__(self) -> None:
+        self.delay, self.slope = float("nan"), 0.0
+        self._variance, self._covariance, self._slope_variance = 4.0, 0.0, (150e-6) ** 2
+
+    @property
+    def deviation(self) -> float:
+        """Standard deviation of the delay, samples."""
+        return math.sqrt(self._variance)
+
+    def restart(self, delay: float, deviation: float) -> None:
+        """Another delay, known to +-deviation samples; the slope stays, the clocks are the same."""
+        self.delay = delay
+        self._variance, self._covariance = deviation**2, 0.0
+
+    def advance(self, samples: int) -> None:
+        """Let `samples` samples pass."""
+        self.delay += self.slope * samples
+        self._variance += samples * (2.0 * self._covariance + samples * self._slope_variance) + 1e-6 * samples / STRIDE
+        self._covariance += samples * self._slope_variance
+        self._slope_variance += (0.15e-6) ** 2 * samples / STRIDE
+
+    def surprise(self, measurement: Measurement) -> float:
+        """The measured offset in standard deviations of what was to be expected."""
+        return abs(measurement.offset) / math.sqrt(self._expected()[2] + measurement.variance)
+
+    def correct(self, measurement: Measurement) -> None:
+        """Take in a measured offset, which holds for the middle of its frame."""
+        delay, slope, spread = self._expected()
+        gain = measurement.offset / (spread + measurement.variance)
+        self.delay += delay * gain
+        self.slope = min(max(self.slope + slope * gain, -600e-6), 600e-6)
+        spread += measurement.variance
+        self._variance -= delay * delay / spread
+        self._covariance -= delay * slope / spread
+        self._slope_variance -= slope * slope / spread
+
+    def _expected(self) -> tuple[float, float, float]:
+        """Covariance of the offset in the middle of the frame with the delay, with the slope, and its variance."""
+        half = FRAME / 2.0
+        delay = self._variance - half * self._covariance
+        slope = self._covariance - half * self._slope_variance
+        return delay, slope, delay - half * slope
+
+
+def _turn(omega: Samples, delay: float) -> np.ndarray:
+    """exp(j omega delay), complex64; several times as fast as np.exp of a complex array."""
+    angle, turn = omega * delay, np.empty(omega.size, np.complex64)
+    np.cos(angle, out=turn.real)
+    np.sin(angle, out=turn.imag)
+    return turn
+
+
+def _highest(likelihood: Samples, reach: int) -> tuple[int, float, float, float]:
+    """Index of the highest peak at most reach from the middle, its height, strength and ratio among the lags there."""
+    first = likelihood.size // 2 - reach
+    inner = likelihood[first : first + 2 * reach]
+    at = int(inner.argmax())
+    peak = float(inner[at])
+    elsewhere = max(inner[: max(at - SAME, 0)].max(initial=0.0), inner[at + SAME :].max(initial=0.0))
+    rms = math.sqrt(float(inner.dot(inner)) / inner.size)
+    return first + at, peak, peak / (rms + 1e-20), peak / max(float(elsewhere), 1e-20)
+
+
+def _overlap(reference: Samples) -> Samples:
+    """Energy of the reference's first difference under the middle half of the frame, at offsets -REACH to REACH - 1, (2 REACH,)."""
+    earliest, half = FRAME // 4, FRAME // 2
+    latest = earliest + half + 2 * REACH
+    change = reference[earliest + 2 : latest + 2] - reference[earliest + 1 : latest + 1]
+    total = np.add.accumulate(np.square(change, out=change).astype(np.float64))
+    return (total[half:] - total[:-half])[::-1].astype(np.float32)
+
+
+def _power(spectrum: np.ndarray) -> Samples:
+    return spectrum.real**2 + spectrum.imag**2

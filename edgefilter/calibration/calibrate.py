@@ -1,0 +1,128 @@
+"""Calibration: from a recorded sweep and the fan alone to a Profile."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy import signal
+
+from edgefilter.calibration.checks import check_found, check_lengths, collect_warnings
+from edgefilter.calibration.stepped_sine import SteppedLaw, response_from_stepped_sine, response_from_sweep, stepped_law
+from edgefilter.calibration.sweep import Deconvolution, deconvolve, find_direct, harmonic_distortion, sweep_law
+from edgefilter.echo.model import EchoModel
+from edgefilter.errors import CalibrationError, SignalError
+from edgefilter.profile.data import DISTORTION_ORDERS, GRID_FFT, GRID_HZ, Profile
+from edgefilter.types import PRE_ROLL, SAMPLE_RATE, Array, Samples, as_samples
+
+MIN_TAPS, MAX_TAPS = 6400, 16000
+"""400 ms and 1 s: what is kept of the impulse response at least and at most."""
+
+
+def calibrate(
+    sweep_reference: Samples,
+    sweep_recording: Samples,
+    noise_recording: Samples,
+    *,
+    stepped_sine: bool = False,
+    created: str = "",
+    source: str = "",
+) -> Profile:
+    """Measure the robot's own voice at its microphone.
+
+    sweep_reference (n,): an exponential sweep as it was played, with silence around it (generate_sweep()). sweep_recording (m,):
+    what the microphone heard, on the same sample counter to within -2000 samples and 1.6 s. noise_recording (k,): the fan alone,
+    some seconds. stepped_sine: reference and recording are those of the paper's generate_stepped_sine() instead. All float32, 16 kHz,
+    full scale +-1. created, source: texts for the profile.
+
+    What makes the result less than trustworthy is in Profile.warnings. Raises CalibrationError where there is nothing to measure:
+    the recording does not contain the sweep, is silent, far too short or not finite, or the reference is no exponential sweep.
+
+    >>> from edgefilter.calibration.sweep import generate_sweep
+    >>> rng = np.random.default_rng(0)
+    >>> sweep = generate_sweep()
+    >>> recording = 0.5 * np.roll(sweep, 300) + 1e-4 * rng.standard_normal(sweep.size).astype(np.float32)
+    >>> profile = calibrate(sweep, recording, 1e-4 * rng.standard_normal(64000).astype(np.float32))
+    >>> profile.delay, round(float(profile.response[100]), 2)
+    (300.0, 0.5)
+    """
+    named = {"the sweep reference": sweep_reference, "the sweep recording": sweep_recording, "the noise recording": noise_recording}
+    reference, recording, noise = (_samples(x, name) for name, x in named.items())
+    law = stepped_law(reference) if stepped_sine else sweep_law(reference)
+    check_lengths(law, recording, noise)
+    noise_psd = fan_psd(noise)
+    result = deconvolve(reference, recording, noise_psd, GRID_HZ, MIN_TAPS)
+    direct = find_direct(result.response)
+    check_found(result, direct)
+    path = impulse_response(result, direct)
+    bands = third_octave_bands()
+    snr = band_snr_db(result, path, bands)
+    if isinstance(law, SteppedLaw):
+        response, distortion = response_from_stepped_sine(law, reference, recording, noise, direct, DISTORTION_ORDERS)
+    else:
+        response = response_from_sweep(reference, recording, noise, direct)
+        distortion = harmonic_distortion(result, direct, law, DISTORTION_ORDERS)
+    return Profile(
+        echo=EchoModel(path),
+        delay=float(direct),
+        response=response,
+        noise_psd=noise_psd,
+        band_hz=bands,
+        band_snr_db=snr,
+        distortion_db=distortion,
+        warnings=tuple(collect_warnings(law, reference, recording, noise, result, path, direct, bands, snr)),
+        created=created,
+        source=source,
+    )
+
+
+def _samples(x: object, name: str) -> Samples:
+    try:
+        return as_samples(x, name)
+    except SignalError as error:
+        raise CalibrationError(str(error)) from None
+
+
+def fan_psd(noise: Samples) -> Samples:
+    """One-sided PSD (601,) float32, full scale^2/Hz, on GRID_HZ: Welch's mean over Hann frames of 1200 samples, half overlapping."""
+    return signal.welch(noise, SAMPLE_RATE, nperseg=GRID_FFT, detrend=False)[1].astype(np.float32)
+
+
+def impulse_response(result: Deconvolution, direct: int) -> Samples:
+    """(MIN_TAPS to MAX_TAPS,) float32 from PRE_ROLL before the direct sound to where the decay has sunk into the fan.
+
+    The knee is the first 20 ms in which the response is not 3 dB above what the fan leaves there. The response is kept to 50 ms
+    beyond it, at least MIN_TAPS, and faded by half a cosine from the knee (at most the last quarter where there is none) to the end.
+    """
+    path = result.cut(direct - PRE_ROLL, MAX_TAPS)
+    block = SAMPLE_RATE // 50
+    energy = np.add.reduceat(path**2, np.arange(0, path.size, block))
+    floor = block * 2 * result.noise(1.0).sum() / result.response.size
+    below = np.flatnonzero(energy[2:] < 2 * floor)
+    knee = int(below[0] + 2) * block if below.size else MAX_TAPS
+    length = int(np.clip(knee + SAMPLE_RATE // 20, MIN_TAPS, MAX_TAPS))
+    fade = length - min(max(knee, length // 4), 3 * length // 4) if knee < length else length // 4
+    path = path[:length].copy()
+    path[-fade:] *= np.cos(np.linspace(0, np.pi / 2, fade)) ** 2
+    return path.astype(np.float32)
+
+
+def third_octave_bands() -> Array:
+    """(B, 2) Hz, edges of the base-ten third-octave bands of 50 Hz to 8 kHz (IEC 61260-1, 5.4), the last one cut at 8 kHz."""
+    centres = 1000.0 * 10 ** (np.arange(-13, 10) / 10)
+    edges = np.stack((centres * 10**-0.05, centres * 10**0.05), axis=1)
+    return np.minimum(edges, SAMPLE_RATE / 2)
+
+
+def band_snr_db(result: Deconvolution, path: Samples, bands: Array) -> Array:
+    """(B,) dB, the energy of the sweep's coherent part in each band over that of the fan in a window as long as the response.
+
+    The coherent part is what the impulse response predicts, less what the fan itself put into it; limited to -20 to 120 dB.
+    """
+    energy = result.spectrum(path) * result.source_energy
+    fan = path.size * result.noise_psd
+    own = fan * (result.source_energy / (result.source_energy + result.regularisation + 1e-30)) ** 2
+    levels = []
+    for low, high in bands:
+        inside = (result.frequencies >= low) & (result.frequencies < high)
+        ratio = (energy - own)[inside].sum() / fan[inside].sum()
+        levels.append(10 * np.log10(np.clip(ratio, 1e-2, 1e12)))
+    return np.array(levels)

@@ -1,0 +1,200 @@
+"""What makes a calibration untrustworthy, said in words that name the bands."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy import signal
+
+from edgefilter.calibration.stepped_sine import SteppedLaw
+from edgefilter.calibration.sweep import EARLIEST_DIRECT, LATEST_DIRECT, Deconvolution, SweepLaw, deconvolve
+from edgefilter.errors import CalibrationError
+from edgefilter.types import PRE_ROLL, SAMPLE_RATE, Array, Samples
+
+Law = SweepLaw | SteppedLaw
+LOW_SNR_DB = 10.0
+SPEECH_HZ = (110.0, 7200.0)
+"""Bands that a warning is about; a small loudspeaker radiates nothing below them, and that is no fault of the calibration."""
+
+
+def check_lengths(law: Law, recording: Samples, noise: Samples) -> None:
+    """Raise CalibrationError for recordings with too little in them to start."""
+    if noise.size < SAMPLE_RATE // 2:
+        raise CalibrationError(f"the noise recording is {noise.size / SAMPLE_RATE:.2f} s long, expected at least 0.5 s of the fan alone")
+    middle = law.time(1000.0)
+    if recording.size < middle:
+        raise CalibrationError(
+            f"the sweep recording is {recording.size / SAMPLE_RATE:.2f} s long and ends before the sweep reaches 1 kHz, "
+            f"expected at least {law.stop / SAMPLE_RATE:.2f} s: record the whole sweep"
+        )
+    if np.max(np.abs(recording)) == 0.0:
+        raise CalibrationError("the sweep recording is silent, every sample 0: is the microphone muted?")
+
+
+def check_found(result: Deconvolution, direct: int) -> None:
+    """Raise CalibrationError unless the deconvolved response has one clear arrival.
+
+    Its peak over its root mean square in the range of lags: 30 to 160 measured where the recording holds the sweep, down to a
+    sweep 15 dB below the fan; 2 to 10 for speech, noise, tones and other sweeps.
+    """
+    nearby = result.cut(EARLIEST_DIRECT, LATEST_DIRECT - EARLIEST_DIRECT)
+    contrast = abs(result.response[direct]) / max(float(np.sqrt(np.mean(nearby**2))), 1e-30)
+    if not contrast > 18.0:
+        raise CalibrationError(
+            f"the sweep recording does not contain the sweep: the best match stands out {contrast:.0f} times, expected at least 18; "
+            "is it the right file, and was the robot loud enough?"
+        )
+
+
+def collect_warnings(
+    law: Law,
+    reference: Samples,
+    recording: Samples,
+    noise: Samples,
+    result: Deconvolution,
+    path: Samples,
+    direct: int,
+    bands: Array,
+    snr: Array,
+) -> list[str]:
+    """All that is doubtful about a calibration, the gravest first; empty where nothing is."""
+    found = [
+        clipping(law, recording, direct),
+        short_recording(law, recording, direct),
+        low_snr(bands, snr),
+        quiet(recording),
+        disturbed(law, reference, recording, noise, result, direct),
+        early_arrivals(result, path, direct),
+        *doubtful_noise(reference, noise, result, direct),
+    ]
+    return [text for text in found if text]
+
+
+def clipping(law: Law, recording: Samples, direct: int) -> str | None:
+    """Samples at full scale, or flat tops below it, and the frequencies that the sweep had there."""
+    size = np.abs(recording)
+    level = float(size.max())
+    top = size >= 0.999 if level >= 0.999 else size > 0.995 * level
+    still = np.abs(np.diff(recording)) < 2e-5
+    flat = np.zeros(size.size, bool)
+    run = still[:-2] & still[1:-1] & still[2:] & top[:-3]
+    for k in range(4):
+        flat[k : size.size - 3 + k] |= run
+    clipped = np.flatnonzero(flat | (size >= 0.9999))
+    if clipped.size < 8:
+        return None
+    hz = law.frequency(clipped - direct)
+    low, high = np.clip(np.percentile(hz, [2, 98]), law.low_hz, law.high_hz)
+    return (
+        f"clipped: {clipped.size} samples at {level:.2f} of full scale, {low:.0f}-{high:.0f} Hz; "
+        "lower the playback volume or the microphone gain and calibrate again"
+    )
+
+
+def short_recording(law: Law, recording: Samples, direct: int) -> str | None:
+    """A recording that ends before the sweep has passed and rung out."""
+    missing = law.stop + direct + SAMPLE_RATE // 5 - recording.size
+    if missing <= 0:
+        return None
+    edge = min(float(law.frequency(recording.size - direct - SAMPLE_RATE // 5)), law.high_hz)
+    return f"too short: the recording ends {missing / SAMPLE_RATE:.2f} s early, {edge:.0f}-{law.high_hz:.0f} Hz is missing or cut off"
+
+
+def low_snr(bands: Array, snr: Array) -> str | None:
+    """Bands of speech in which the fan hides the sweep."""
+    inside = (bands[:, 1] > SPEECH_HZ[0]) & (bands[:, 0] < SPEECH_HZ[1] - 100)
+    runs: list[list[int]] = []
+    for i in np.flatnonzero(inside & (snr < LOW_SNR_DB)):
+        if runs and runs[-1][-1] == i - 1:
+            runs[-1].append(int(i))
+        else:
+            runs.append([int(i)])
+    if not runs:
+        return None
+    parts = ", ".join(f"{bands[run[0], 0]:.0f}-{bands[run[-1], 1]:.0f} Hz ({snr[run].min():.0f} dB)" for run in runs)
+    return f"low signal-to-noise ratio, below {LOW_SNR_DB:.0f} dB, in {parts}: play the sweep louder or longer"
+
+
+def quiet(recording: Samples) -> str | None:
+    """A recording that uses so little of the converter's range that its steps matter."""
+    level = float(np.max(np.abs(recording)))
+    if level >= 0.01:
+        return None
+    return f"too quiet: the recording peaks at {20 * np.log10(level):.0f} dB of full scale, expected above -40 dB, in all bands"
+
+
+def disturbed(law: Law, reference: Samples, recording: Samples, noise: Samples, result: Deconvolution, direct: int) -> str | None:
+    """Something else in a sweep's recording: quarter seconds in which neither the path nor its harmonics explain the sound.
+
+    What remains has to exceed the fan by 10 dB, a sixth of the explained power there, and the loudest quarter second less 25 dB.
+    """
+    if not isinstance(law, SweepLaw):
+        return None
+    early = int(law.lead(5.5))
+    shift = direct - early
+    predicted = signal.oaconvolve(reference.astype(np.float64), result.cut(shift, early + 6400))
+    first, last = max(shift, 0), min(shift + predicted.size, recording.size)
+    heard = np.zeros(recording.size)
+    heard[first:last] = predicted[first - shift : last - shift]
+    block = SAMPLE_RATE // 4
+    count = recording.size // block
+
+    def power(x: Array) -> Array:
+        return np.mean(x[: count * block].reshape(count, block) ** 2, axis=1)
+
+    rest, own = power(recording - heard), power(heard)
+    limit = np.maximum(own / 6, max(10 * float(np.mean(noise.astype(np.float64) ** 2)), own.max() * 10**-2.5, 1e-9))
+    bad = np.flatnonzero(rest > limit)
+    if not bad.size:
+        return None
+    hz = np.clip(law.frequency(bad * block + block / 2 - direct), law.low_hz, law.high_hz)
+    return (
+        f"something else than the sweep sounds in {bad.size * 0.25:.2f} s of the recording (from {bad[0] * 0.25:.2f} s on), "
+        f"while the sweep was at {hz.min():.0f}-{hz.max():.0f} Hz; calibrate again in silence"
+    )
+
+
+def early_arrivals(result: Deconvolution, path: Samples, direct: int) -> str | None:
+    """Sound that reaches the microphone too far ahead of the strongest arrival to be kept."""
+    lost = float(np.sum(result.cut(direct - PRE_ROLL - 480, 480) ** 2)) / max(float(np.sum(path.astype(np.float64) ** 2)), 1e-30)
+    if lost < 0.003:
+        return None
+    return (
+        f"{10 * np.log10(lost):.0f} dB of the robot's voice, in all bands, arrives more than {PRE_ROLL} samples before its "
+        "strongest part and is not in the impulse response"
+    )
+
+
+def doubtful_noise(reference: Samples, noise: Samples, result: Deconvolution, direct: int) -> list[str]:
+    """A noise recording that is short, silent, unsteady, or contains the robot."""
+    texts = []
+    if noise.size < 2 * SAMPLE_RATE:
+        texts.append(f"the noise recording is only {noise.size / SAMPLE_RATE:.1f} s long, expected 5 s: the fan is known roughly, in all bands")
+    if np.max(np.abs(noise)) == 0.0:
+        return [*texts, "the noise recording is silent, every sample 0: signal-to-noise ratios mean nothing, in all bands"]
+    again = deconvolve(reference, noise, np.full(2, 1e-10), np.array([0.0, SAMPLE_RATE / 2]), 6400)
+    nearby = np.abs(again.cut(EARLIEST_DIRECT, LATEST_DIRECT - EARLIEST_DIRECT))
+    if nearby.max() > 18.0 * np.sqrt(np.mean(nearby**2)):
+        return [*texts, "the noise recording contains the sweep: record the fan while the robot is silent; noise is overstated in all bands"]
+    shape, share, high = _unsteady(noise)
+    if shape > 6.0:
+        texts.append(
+            f"the noise recording is not steady: {share:.0f} % of it stands out, by up to {shape:.0f} dB around {high:.0f} Hz; "
+            "a voice or a bang? record the fan alone"
+        )
+    return texts
+
+
+def _unsteady(noise: Samples) -> tuple[float, float, float]:
+    """(dB by which the loudest 100 ms stand out of the median in any octave, percent of such times above 3 dB, centre Hz)."""
+    block = SAMPLE_RATE // 10
+    count = max(noise.size // block, 1)
+    frames = noise[: count * block].reshape(count, -1).astype(np.float64)
+    spectra = np.abs(np.fft.rfft(frames * signal.get_window("hann", frames.shape[1]), axis=1)) ** 2
+    hz = np.arange(spectra.shape[1]) * SAMPLE_RATE / frames.shape[1]
+    worst = (0.0, 0.0, 0.0)
+    for centre in (250.0, 500.0, 1000.0, 2000.0, 4000.0):
+        level = 10 * np.log10(spectra[:, (hz >= centre / 1.414) & (hz < centre * 1.414)].sum(axis=1) + 1e-14)
+        above = level - np.median(level)
+        if above.max() > worst[0]:
+            worst = (float(above.max()), 100 * float(np.mean(above > 3.0)), centre)
+    return worst

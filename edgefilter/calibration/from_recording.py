@@ -1,0 +1,261 @@
+"""A provisional profile without a calibration: the path and the fan as one recording of the robot shows them."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import fft, signal
+from scipy.ndimage import binary_closing, uniform_filter1d
+
+from edgefilter.calibration.calibrate import third_octave_bands
+from edgefilter.diagnosis.offset import MAX_OFFSET, shift
+from edgefilter.diagnosis.prepare import BLOCK, MIN_SECONDS
+from edgefilter.echo.effect import find, whiten
+from edgefilter.echo.model import EchoModel
+from edgefilter.echo.wiener import convolve_from, fit_filter
+from edgefilter.errors import SignalError
+from edgefilter.profile.data import DISTORTION_ORDERS, GRID_FFT, GRID_HZ, Profile
+from edgefilter.types import PRE_ROLL, SAMPLE_RATE, Samples, as_samples
+
+SOURCE = "made from the recording itself: what is stationary and linear is taken for the robot"
+ABSORBED = ("playback_gain", "bandlimit", "chassis_resonance", "late_reverb")
+"""Stationary linear effects: the path fitted to a recording holds them already, so that nothing can tell them from the robot."""
+TAPS = 4096
+SMOOTHING_HZ, LOWEST_HZ = 32.0, 100.0
+"""Width over which spectra are averaged before they are flattened, and from where on they count."""
+STANDS_OUT = 8.0
+"""Times the root mean square of all lags that the true one reaches; 4.5 measured where there is no robot, 10 to 87 where there is."""
+LEAST_DROP_DB, OTHERS_DB = 3.0, 6.0
+"""What the path must take away of its best fifth of unseen blocks, and how far above the robot something is that is not the robot's."""
+WINDOW, UPSAMPLED = SAMPLE_RATE, 4
+MAX_PPM, PPM_STEP, DRIFT_REACH = 400.0, 2.0, 400
+DRIFT_GAIN = 1.1
+"""By this factor the correlation along a sloping line must exceed that along a level one."""
+REACH = 512
+"""Samples ahead of the highest correlation in which the direct sound is looked for."""
+DECAYS_S = (0.15, 0.4)
+"""Reverberation times that the penalty on the taps supposes; the one that predicts best is kept."""
+TAIL_S = 0.3
+SILENT_DB = -45.0
+"""The reference is silent this far under its loudest tenth of a second."""
+LEAST_FRAMES = 8
+MOMENT = SAMPLE_RATE // 20
+"""Samples over which the disturbance is measured that the fit gives way to."""
+
+
+def self_calibrate(recording: Samples, reference: Samples) -> Profile:
+    """The profile that recording (n,) of the robot playing reference (m,), float, full scale +-1, 16 kHz, speaks of itself.
+
+    The path is a regularised least-squares filter on every other half second, those that prepare() fits on, so that the others say
+    how well it predicts. Samples weigh the less the more the first fit leaves of them (iteratively reweighted least squares, Huber
+    1981), so that a talker does not bend it. The fan is what the robot's silences hold. ABSORBED effects are in it at their neutral
+    values, so that no search claims them. Raises SignalError where the recording does not contain the reference.
+    """
+    y, x = as_samples(recording, "recording"), as_samples(reference, "reference")
+    for samples, name in ((y, "recording"), (x, "reference")):
+        if samples.size < MIN_SECONDS * SAMPLE_RATE:
+            raise SignalError(f"the {name} is {samples.size / SAMPLE_RATE:.2f} s long, expected at least {MIN_SECONDS:g} s of the robot's voice")
+    x = np.pad(x, (0, max(y.size - x.size, 0)))[: y.size]
+    lag = find_lag(y, x)
+    ppm, behind = find_drift(y, shift(x, lag))
+    lag += behind
+    psd, seconds = fan_in_silences(y, silences(shift(x, lag)))
+    target = whiten(y, psd)
+    fit = (np.arange(y.size) // BLOCK % 2 == 0).astype(np.float32)
+    sound = whiten(_drifting(shift(x, lag - REACH), ppm), psd)
+    even = fit / np.maximum(uniform_filter1d(target**2, MOMENT, mode="nearest"), 1.0)
+    rough = fit_filter(sound, target, even, 2 * REACH, 0, np.full(2 * REACH, 1e-2))
+    delay = lag - REACH + int(np.argmax(np.abs(rough)))
+    weights = fit * disturbance(target - convolve_from(sound, rough, 0))
+    sound = whiten(_drifting(shift(x, delay - PRE_ROLL), ppm), psd)
+    path = fit_path(sound, target, weights, float(np.square(rough).max()))
+    predicted = convolve_from(sound, path, 0)
+    _check_learned(target, predicted, fit, delay, ppm)
+    bands, snr = _snr_by_band(predicted)
+    return Profile(
+        echo=_with_absorbed(EchoModel(path.astype(np.float32))),
+        delay=float(delay),
+        response=np.abs(fft.rfft(path, 16 * GRID_FFT))[::16].astype(np.float32),
+        noise_psd=psd,
+        band_hz=bands,
+        band_snr_db=snr,
+        distortion_db=np.zeros(len(DISTORTION_ORDERS)),
+        warnings=tuple(_warnings(seconds, others(target, predicted))),
+        source=SOURCE,
+    )
+
+
+def _with_absorbed(echo: EchoModel) -> EchoModel:
+    for name in ABSORBED:
+        echo = echo.with_effect(name, {})
+    return echo
+
+
+def find_lag(recording: Samples, reference: Samples) -> int:
+    """Samples by which recording (n,) lags behind reference (n,), from their generalised cross-correlation (Knapp & Carter 1976, PHAT).
+
+    Both spectra are flattened, so that a talker who is louder than the robot does not hide it. Raises SignalError where no lag
+    stands out: the highest of independent values at all lags is 4 to 5 times their root mean square.
+    """
+    n = fft.next_fast_len(2 * recording.size, real=True)
+    width = max(int(SMOOTHING_HZ * n / SAMPLE_RATE), 1)
+    cross = np.ones(n // 2 + 1, np.complex128)
+    for spectrum in (fft.rfft(recording.astype(np.float64), n), fft.rfft(reference.astype(np.float64), n).conj()):
+        power = uniform_filter1d(np.abs(spectrum) ** 2, width, mode="nearest")
+        cross *= spectrum / np.sqrt(power + 1e-6 * power.max() + 1e-20)
+    cross[: int(LOWEST_HZ * n / SAMPLE_RATE)] = 0.0
+    reach = min(int(MAX_OFFSET * SAMPLE_RATE), recording.size - 1)
+    near = np.abs(np.take(fft.irfft(cross, n), np.arange(-reach, reach + 1), mode="wrap"))
+    lag = int(np.argmax(near)) - reach
+    if not near.max() > STANDS_OUT * np.sqrt(np.mean(near**2)):
+        level = 10 * np.log10(float(np.mean(reference.astype(np.float64) ** 2)) + 1e-12)
+        raise SignalError(
+            f"the recording does not contain the reference (of {level:.0f} dBFS) at any lag up to {MAX_OFFSET:g} s, so there is no robot in it "
+            "to learn from: give a recording in which the robot talks, or a calibration (--profile)"
+        )
+    return lag
+
+
+def _drifting(x: Samples, ppm: float) -> Samples:
+    return find("clock_drift").apply(x, {"ppm": ppm, "offset": 0.0}, SAMPLE_RATE) if ppm else x
+
+
+def find_drift(recording: Samples, reference: Samples) -> tuple[float, int]:
+    """(ppm, lag): the line along which recording (n,) lags behind reference (n,), and where it starts, in parts of a million and samples.
+
+    Of all lines of up to MAX_PPM the one on which the correlations of windows of a second, spectra flattened, add up to most; 0 ppm
+    where it brings less than DRIFT_GAIN of what no drift does. Lags of up to DRIFT_REACH.
+    """
+    size, part = 4 * WINDOW, slice(2 * WINDOW, 3 * WINDOW)
+    padded = np.pad(reference, (2 * WINDOW, 2 * WINDOW))
+    starts = np.arange(0, recording.size - WINDOW + 1, WINDOW // 2)
+    width = max(int(SMOOTHING_HZ * size / SAMPLE_RATE), 1)
+    near = np.arange(-DRIFT_REACH * UPSAMPLED, DRIFT_REACH * UPSAMPLED + 1)
+    rows = np.zeros((starts.size, near.size))
+    for row, start in zip(rows, starts, strict=True):
+        heard = np.zeros(size)
+        heard[part] = recording[start : start + WINDOW]
+        cross = np.ones(size // 2 + 1, np.complex128)
+        for spectrum in (fft.rfft(heard), fft.rfft(padded[start : start + size].astype(np.float64)).conj()):
+            power = uniform_filter1d(np.abs(spectrum) ** 2, width, mode="nearest")
+            cross *= spectrum / np.sqrt(power + 1e-6 * power.max() + 1e-20)
+        cross[: int(LOWEST_HZ * size / SAMPLE_RATE)] = 0.0
+        row[:] = np.take(fft.irfft(np.pad(cross, (0, (UPSAMPLED - 1) * size // 2)), UPSAMPLED * size), near, mode="wrap")
+    grid = np.arange(-MAX_PPM, MAX_PPM + PPM_STEP, PPM_STEP)
+    middles = starts + WINDOW / 2
+    sums = []
+    for ppm in grid:
+        moves = np.round(-ppm * 1e-6 * middles * UPSAMPLED).astype(int)
+        sums.append(np.abs(sum(np.take(row, np.arange(near.size) + move, mode="wrap") for row, move in zip(rows, moves, strict=True))))
+    heights = np.array([line.max() for line in sums])
+    best = int(np.argmax(heights))
+    if heights[best] < DRIFT_GAIN * heights[grid.size // 2]:
+        best = grid.size // 2
+    return float(grid[best]), round((int(np.argmax(sums[best])) - DRIFT_REACH * UPSAMPLED) / UPSAMPLED)
+
+
+def silences(reference: Samples) -> NDArray[np.bool_]:
+    """(n,) where an aligned reference (n,) is silent and has been for TAIL_S."""
+    block = SAMPLE_RATE // 10
+    level = np.add.reduceat(reference.astype(np.float64) ** 2, np.arange(0, reference.size, block))
+    loud = level > 10 ** (SILENT_DB / 10) * level.max(initial=1e-30)
+    after = round(TAIL_S * 10)
+    near = np.convolve(loud, np.ones(after + 2))[1 : 1 + loud.size] > 0
+    return ~np.repeat(near, block)[: reference.size]
+
+
+def fan_in_silences(recording: Samples, silent: NDArray[np.bool_]) -> tuple[Samples, float]:
+    """PSD (601,) float32 of the quieter half of the silent frames, and how many seconds those are.
+
+    Where silent (n,) leaves fewer than LEAST_FRAMES, the quietest twentieth of all frames is taken, and 0 seconds are said.
+    """
+    step = GRID_FFT // 2
+    frames = np.lib.stride_tricks.sliding_window_view(recording, GRID_FFT)[::step]
+    window = signal.get_window("hann", GRID_FFT).astype(np.float32)
+    power = np.abs(fft.rfft(frames * window, axis=1)) ** 2
+    whole = np.lib.stride_tricks.sliding_window_view(silent, GRID_FFT)[::step].all(axis=1)
+    share = 0.5 if whole.sum() >= LEAST_FRAMES else 0.05
+    at = np.flatnonzero(whole) if share == 0.5 else np.arange(power.shape[0])
+    order = at[np.argsort(np.log(power[at] + 1e-12).mean(axis=1))]
+    kept = power[order[: max(int(share * order.size), LEAST_FRAMES // 2)]]
+    psd = 2 * uniform_filter1d(kept.mean(axis=0), 5, mode="nearest") / (SAMPLE_RATE * float(np.sum(window**2)))
+    return psd.astype(np.float32), kept.shape[0] * step / SAMPLE_RATE if share == 0.5 else 0.0
+
+
+def disturbance(residual: Samples) -> Samples:
+    """(n,) 0 to 1, one over the power of the whitened residual (n,) around each sample: what a fit should trust it."""
+    return 1.0 / np.maximum(uniform_filter1d(residual**2, MOMENT, mode="nearest"), 1.0)
+
+
+def fit_path(sound: Samples, target: Samples, weights: Samples, peak: float) -> Samples:
+    """(TAPS,) path from sound to target (n,), both whitened, weights (n,), peak: the square of the direct sound's tap.
+
+    The penalty supposes a decay; the one of DECAYS_S is kept whose fit to three quarters of the weighted samples predicts the rest best.
+    """
+    rest = np.arange(target.size) // (BLOCK // 4) % 4 == 3
+
+    def left(prior: Samples) -> float:
+        taps = fit_filter(sound, target, weights * ~rest, TAPS, 0, prior)
+        return float(np.sum(weights * rest * (target - convolve_from(sound, taps, 0)) ** 2))
+
+    best = min((decay_prior(seconds, peak) for seconds in DECAYS_S), key=left)
+    taps = fit_filter(sound, target, weights, TAPS, 0, best, steps=12)
+    weights = np.where(weights > 0.0, disturbance(target - convolve_from(sound, taps, 0)), 0.0).astype(np.float32)
+    return fit_filter(sound, target, weights, TAPS, 0, best, steps=20)
+
+
+def decay_prior(seconds: float, peak: float) -> Samples:
+    """(TAPS,) expected squares: the direct sound's, and from 2 ms on 15 dB less, falling by 60 dB in that time; before it 25 dB less."""
+    at = np.arange(TAPS) - PRE_ROLL
+    late = 10**-1.5 * 10 ** (-6 * np.maximum(at, 0) / (seconds * SAMPLE_RATE))
+    return peak * np.where(at < -16, 10**-2.5, np.where(at < 32, 1.0, late))
+
+
+def _snr_by_band(predicted: Samples) -> tuple[np.ndarray, np.ndarray]:
+    """Third-octave bands (B, 2) Hz and the mean power of the whitened prediction in each over the fan's, dB."""
+    bands = third_octave_bands()
+    density = signal.welch(predicted, SAMPLE_RATE, nperseg=GRID_FFT, detrend=False)[1] * SAMPLE_RATE / 2
+    means = [density[(GRID_HZ >= low - 7) & (GRID_HZ < high + 7)].mean() for low, high in bands]
+    return bands, 10 * np.log10(np.clip(np.array(means, np.float64), 1e-2, 1e12))
+
+
+def _by_block(x: Samples) -> np.ndarray:
+    """Mean square of x (n,) in each whole BLOCK."""
+    return np.square(x[: x.size // BLOCK * BLOCK].astype(np.float64)).reshape(-1, BLOCK).mean(axis=1)
+
+
+def _check_learned(target: Samples, predicted: Samples, fit: Samples, delay: float, ppm: float) -> None:
+    """Raise SignalError unless the prediction takes LEAST_DROP_DB away in a fifth of the blocks that no fit has used."""
+    drop = 10 * np.log10((_by_block(target) + 1e-12) / (_by_block(target - predicted) + 1e-12))
+    held = drop[_by_block(fit) == 0.0]
+    if held.size and float(np.quantile(held, 0.8)) >= LEAST_DROP_DB:
+        return
+    clocks = f", clocks {abs(ppm):.0f} ppm apart" if ppm else ""
+    raise SignalError(
+        f"the robot is in the recording (lag {1000 * delay / SAMPLE_RATE:.0f} ms{clocks}) but too faint beside what else is heard to learn its path "
+        "from: does a human talk nearly all the time? give a recording in which the robot talks alone, or a calibration (--profile)"
+    )
+
+
+def others(target: Samples, predicted: Samples) -> list[tuple[float, float]]:
+    """(start_s, end_s) where what the prediction (n,) leaves of target (n,), both whitened, is OTHERS_DB above the prediction and the fan.
+
+    Moments of a second or less between them belong to them.
+    """
+    rest = _by_block(target - predicted)
+    loud = rest > 10 ** (OTHERS_DB / 10) * np.maximum(_by_block(predicted), 10.0)
+    loud = binary_closing(np.pad(loud, 2), np.ones(3))[2:-2]
+    edges = np.flatnonzero(np.diff(np.concatenate(([False], loud, [False]))))
+    return [(begin * BLOCK / SAMPLE_RATE, end * BLOCK / SAMPLE_RATE) for begin, end in edges.reshape(-1, 2)]
+
+
+def _warnings(seconds: float, talk: list[tuple[float, float]]) -> list[str]:
+    told = ["no calibration: a gain, a band limit, a resonance and the room's reverberation are part of the path made here and cannot be told"]
+    if seconds == 0.0:
+        told.append("the robot is hardly silent here: the quietest moments of the recording stand for the fan")
+    elif seconds < 0.5:
+        told.append(f"only {seconds:.1f} s of the robot's silence: the fan is known roughly")
+    if talk:
+        spans = ", ".join(f"{begin:.1f} to {end:.1f} s" for begin, end in talk)
+        told.append(f"a human talks, or something else louder than the robot sounds, at {spans}: what is left there is not the robot's")
+    return told

@@ -1,0 +1,75 @@
+"""What is left of a recording when the robot's voice is taken out: the fan, tones, somebody talking, or something unknown, in words."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.ndimage import median_filter
+
+from edgefilter.diagnosis.prepare import Prepared
+from edgefilter.echo.effect import whiten
+from edgefilter.types import SAMPLE_RATE, Array, Samples
+
+LINE_FFT = 16384
+LINE_OVER_FLOOR = 10.0
+"""Times the median of its surroundings that a bin of a long spectrum must reach to be a tone (noise alone reaches 3 in 1000 means of 30)."""
+BLOCK = SAMPLE_RATE // 10
+
+
+@dataclass(frozen=True, eq=False)
+class Leftover:
+    """tones_hz: (k,) of the strongest tones, loudest first; mains_hz: 50 or 60 where most of their power lies on its multiples, else 0.
+
+    tone_share: of the residual's power over the fan, in tones. quiet_db: excess while the robot is silent, its median over blocks of 0.1 s;
+    swing_db: by how much those blocks differ (90 % to 10 % quantile) beyond what noise does. level_slope: by how many dB the excess
+    grows per dB of the robot's level.
+    """
+
+    tones_hz: Array
+    mains_hz: float
+    tone_share: float
+    quiet_db: float
+    quiet_mean_db: float
+    swing_db: float
+
+
+def inspect(prepared: Prepared, residual: Samples) -> Leftover:
+    """Look at what a model leaves of a prepared recording, residual (n,)."""
+    psd = prepared.measurement.noise_psd
+    tones, mains, share = _tones(residual, psd)
+    quiet = prepared.usable & ~prepared.active
+    white = whiten(residual, psd).astype(np.float64) ** 2
+    count = white.size // BLOCK
+    whole = quiet[: count * BLOCK].reshape(count, BLOCK).all(axis=1)
+    power = white[: count * BLOCK].reshape(count, BLOCK).mean(axis=1)[whole]
+    if power.size < 5:
+        return Leftover(tones, mains, share, float("nan"), float("nan"), 0.0)
+    low, middle, high = 10 * np.log10(np.quantile(power, (0.1, 0.5, 0.9)) + 1e-12)
+    return Leftover(tones, mains, share, float(middle), float(10 * np.log10(power.mean() + 1e-12)), float(high - low))
+
+
+def _tones(residual: Samples, psd: Samples) -> tuple[Array, float, float]:
+    """Frequencies of tones, loudest first, the mains frequency they belong to (0: none), and their share of the power over the fan."""
+    if residual.size < 2 * LINE_FFT:
+        return np.zeros(0), 0.0, 0.0
+    frames = np.lib.stride_tricks.sliding_window_view(residual, LINE_FFT)[:: LINE_FFT // 2]
+    power = np.median(np.abs(np.fft.rfft(frames * np.hanning(LINE_FFT).astype(np.float32), axis=1)) ** 2, axis=0)
+    hz = np.arange(power.size) * SAMPLE_RATE / LINE_FFT
+    floor = median_filter(power, 81, mode="nearest")
+    expected = np.interp(hz, np.arange(psd.size) * 0.5 * SAMPLE_RATE / (psd.size - 1), psd) / 2 * SAMPLE_RATE * 0.375 * LINE_FFT * np.log(2)
+    peak = (power > LINE_OVER_FLOOR * floor) & (power > LINE_OVER_FLOOR * expected) & (power >= np.maximum(np.roll(power, 1), np.roll(power, -1)))
+    peak[:20] = False
+    at = np.flatnonzero(peak)
+    at = at[np.argsort(-power[at])][:40]
+    if not at.size:
+        return np.zeros(0), 0.0, 0.0
+    over = float(np.maximum(power - expected, 0.0).sum())
+    near = np.unique(np.clip(at[:, None] + np.arange(-2, 3), 0, power.size - 1))
+    share = float(np.maximum(power - expected, 0.0)[near].sum()) / max(over, 1e-30)
+    mains = 0.0
+    for grid in (50.0, 60.0):
+        off = np.abs(hz[at] / grid - np.round(hz[at] / grid)) * grid
+        if power[at][off < 0.8].sum() > 0.8 * power[at].sum() and (off < 0.8).sum() >= 2:
+            mains = grid
+    return hz[at], mains, share

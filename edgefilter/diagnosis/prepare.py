@@ -1,0 +1,193 @@
+"""Bring a recording of the robot alone into a state in which it can be held against a prediction: rate, lag, silence."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import soxr
+from numpy.typing import NDArray
+from scipy import fft
+from scipy.ndimage import maximum_filter1d
+
+from edgefilter.diagnosis.offset import find_offset, shift, starting_offset
+from edgefilter.echo.effect import Measurement, complete, find, whiten
+from edgefilter.errors import SignalError
+from edgefilter.profile.data import Profile
+from edgefilter.types import PRE_ROLL, SAMPLE_RATE, Samples, as_samples
+
+BLOCK = SAMPLE_RATE // 2
+"""Samples of the blocks that are fitted on and judged by in turn."""
+SILENCE_DB = -15.0
+"""The robot is silent where its predicted voice, whitened, is this far under the fan."""
+FAN_TOLERANCE_DB = 1.0
+"""By which the fan of a robot differs from day to day."""
+TALK_DB = 8.0
+"""Over the fan: more than a reverberation tail in a pause, less than a soft voice at two metres."""
+GAP_S, EDGE_S = 1.0, 0.2
+CUT, CUT_DB, TAIL_S = 32, -30.0, 0.3
+"""A reference begins or ends in the middle of a word where that many samples at its end are no further below its loudest 20 ms; what was said before
+still sounds for TAIL_S."""
+PAUSE_S, LAG_STEP = 0.5, 480
+"""Silence of the reference after which a player may have started anew, and samples (30 ms) by which the lag must differ then."""
+MIN_SECONDS = 1.0
+
+
+@dataclass(frozen=True, eq=False)
+class Prepared:
+    """A recording beside what the profile predicts, on one sample counter; all arrays (n,).
+
+    measurement: aligned reference, recording, the fan's PSD, the samples to fit on. prediction: of the profile.
+    usable: samples where nobody else talks. active: where the robot is heard. offset: samples of lag against the calibration.
+    human: (start_s, end_s) of other talkers.
+    """
+
+    measurement: Measurement
+    prediction: Samples
+    usable: NDArray[np.bool_]
+    active: NDArray[np.bool_]
+    offset: float
+    human: tuple[tuple[float, float], ...] = ()
+    warnings: tuple[str, ...] = ()
+
+    @property
+    def held_out(self) -> NDArray[np.bool_]:
+        """(n,) samples that no fit has used."""
+        return self.usable & ~self.measurement.fit
+
+
+def prepare(profile: Profile, recording: Samples, reference: Samples, *, sample_rate: int = SAMPLE_RATE) -> Prepared:
+    """Resample to 16 kHz, find the constant lag, mark silence and the blocks to fit on.
+
+    recording (m,), reference (k,): float, full scale +-1, at sample_rate. Raises SignalError for less than a second or where the
+    recording does not contain the reference.
+    """
+    y, x = as_samples(recording, "recording"), as_samples(reference, "reference")
+    if sample_rate != SAMPLE_RATE:
+        y, x = (soxr.resample(signal_, sample_rate, SAMPLE_RATE).astype(np.float32) for signal_ in (y, x))
+    for samples, name in ((y, "recording"), (x, "reference")):
+        if samples.size < MIN_SECONDS * SAMPLE_RATE:
+            raise SignalError(f"the {name} is {samples.size / SAMPLE_RATE:.2f} s long, expected at least {MIN_SECONDS:g} s of the robot's voice")
+    n = y.size
+    x = np.pad(x, (0, max(n - x.size, 0)))[:n]
+    start = profile.delay - PRE_ROLL
+    at_calibration = shift(x, start)
+    predicted = profile.echo.predict(at_calibration)
+    known = expected_noise(profile)
+    offset = starting_offset(whiten(predicted, known), whiten(y, known))
+    pieces = utterance_lags(x, predicted, y, known, offset)
+    begin, end = known_span(x, start + pieces[0][2], start + pieces[-1][2])
+    x = sum(shift(np.where((np.arange(n) >= first) & (np.arange(n) < last), x, np.float32(0)), start + lag) for first, last, lag in pieces)
+    predicted = profile.echo.predict(x)
+    white = whiten(predicted, known).astype(np.float64)
+    block = SAMPLE_RATE // 50
+    level = np.add.reduceat(white**2, np.arange(0, n, block)) / block
+    active = np.repeat(maximum_filter1d(level, 11) > 10 ** (SILENCE_DB / 10), block)[:n]
+    fit = np.arange(n) // BLOCK % 2 == 0
+    quiet = whiten(y, known) ** 2
+    psd = known * np.float32(fan_scale(whiten(y, known)[~active]))
+    human = find_talk(quiet * (known[1] / psd[1]), active)
+    usable = np.ones(n, bool)
+    for first, last in human:
+        usable[round(first * SAMPLE_RATE) : round(last * SAMPLE_RATE)] = False
+    warnings = tuple(f"somebody talks at {first:.1f} to {last:.1f} s: left out" for first, last in human)
+    if end - begin < n and end - begin > n // 2:
+        usable[:begin], usable[end:] = False, False
+        warnings += (f"the reference is cut in mid-word: only {begin / SAMPLE_RATE:.1f} to {end / SAMPLE_RATE:.1f} s are judged",)
+    if len(pieces) > 1:
+        lags = ", ".join(f"{lag:.1f} from {first / SAMPLE_RATE:.1f} s" for first, _, lag in pieces)
+        warnings += (f"the utterances lag by different numbers of samples: {lags}; aligned one by one",)
+    return Prepared(Measurement(x, y, psd, fit & usable), predicted, usable, active, offset, human, warnings)
+
+
+def known_span(x: Samples, first_lag: float, last_lag: float) -> tuple[int, int]:
+    """(begin, end) samples of a recording (n,) of which the reference x (n,) knows what the robot says.
+
+    first_lag, last_lag: of the recording behind x. What was said before a reference that begins in the middle of a word, and after one
+    that ends there, is heard but unknown.
+    """
+    n, block = x.size, SAMPLE_RATE // 50
+    loud = 10 ** (CUT_DB / 10) * float(np.max(np.add.reduceat(x.astype(np.float64) ** 2, np.arange(0, n, block)) / block))
+    said = np.flatnonzero(x)
+    stop = int(said[-1]) + 1 if said.size else 0
+    begins, ends = (float(np.mean(x[part].astype(np.float64) ** 2)) > loud for part in (slice(0, CUT), slice(max(stop - CUT, 0), max(stop, 1))))
+    begin = max(round(first_lag + TAIL_S * SAMPLE_RATE), 0) if begins else 0
+    end = min(max(round(stop + last_lag), 0), n) if ends else n
+    return min(begin, end), end
+
+
+def utterance_lags(x: Samples, predicted: Samples, recording: Samples, psd: Samples, offset: float) -> list[tuple[int, int, float]]:
+    """(first sample, end, lag) of the stretches of the reference x (n,) that share a lag, the whole with `offset` where it is one.
+
+    predicted: for x without an offset. A player starts each utterance anew, so its lag may be another after a pause of PAUSE_S; a
+    difference of less than LAG_STEP is no new start but left for the effects to explain.
+    """
+    block = SAMPLE_RATE // 50
+    level = np.add.reduceat(x.astype(np.float64) ** 2, np.arange(0, x.size, block))
+    loud = np.flatnonzero(level > 10**-4.5 * level.max(initial=0.0))
+    gaps = np.flatnonzero(np.diff(loud) > 50 * PAUSE_S)
+    begins = [0, *(int(loud[gap + 1]) * block for gap in gaps)]
+    white, sought = whiten(predicted, psd), whiten(recording, psd)
+    pieces: list[tuple[int, int, float]] = []
+    for begin, end in zip(begins, [*begins[1:], x.size], strict=True):
+        lag = pieces[-1][2] if pieces else offset
+        if len(begins) > 1 and end - begin > SAMPLE_RATE // 2:
+            inside = (np.arange(x.size) >= begin) & (np.arange(x.size) < end)
+            try:
+                own = find_offset(white * inside, sought)
+            except SignalError:
+                own = lag
+            lag = own if abs(own - lag) > LAG_STEP else lag
+        if pieces and lag == pieces[-1][2]:
+            pieces[-1] = (pieces[-1][0], end, lag)
+        else:
+            pieces.append((begin, end, lag))
+    return pieces
+
+
+def find_talk(power: Samples, active: NDArray[np.bool_]) -> tuple[tuple[float, float], ...]:
+    """(start_s, end_s) where somebody talks, from the whitened recording's square (n,) in the robot's silences.
+
+    Somebody talks where tenths of a second are TALK_DB over the fan while at least a third of the silence is at the fan: a fan that
+    has changed is louder all the time. What lies between two such moments less than GAP_S apart belongs to them, the robot's words
+    included. Nothing is found where it would be more than half of the recording: there is no working around that.
+    """
+    block = SAMPLE_RATE // 10
+    count = power.size // block
+    silent = ~active[: count * block].reshape(count, block).any(axis=1)
+    level = power[: count * block].reshape(count, block).mean(axis=1)
+    loud = silent & (level > 10 ** (TALK_DB / 10))
+    if loud.sum() < 3 or np.mean(level[silent] < 2.0) < 1 / 3:
+        return ()
+    spans: list[list[float]] = []
+    for at in np.flatnonzero(loud) / 10:
+        if spans and at - spans[-1][1] < GAP_S:
+            spans[-1][1] = at + 0.1
+        else:
+            spans.append([at, at + 0.1])
+    kept = [(max(begin - EDGE_S, 0.0), end + EDGE_S) for begin, end in spans if end - begin > 0.25]
+    total = sum(end - begin for begin, end in kept)
+    return tuple((float(begin), float(end)) for begin, end in kept) if 10 * total < 0.5 * count else ()
+
+
+def fan_scale(quiet: Samples) -> float:
+    """How much louder the fan is than in the calibration, in power, from the whitened recording while the robot is silent, (k,).
+
+    1 where the difference is more than FAN_TOLERANCE_DB either way, and so no ordinary one, or where there is too little silence.
+    """
+    if quiet.size < SAMPLE_RATE // 2:
+        return 1.0
+    size = 256
+    frames = quiet[: quiet.size // size * size].reshape(-1, size) * np.hanning(size).astype(np.float32)
+    power = np.mean(np.abs(fft.rfft(frames)) ** 2, axis=0) / np.sum(np.hanning(size) ** 2)
+    scale = float(np.median(power[3:-6]))
+    return scale if abs(10 * np.log10(max(scale, 1e-9))) <= FAN_TOLERANCE_DB else 1.0
+
+
+def expected_noise(profile: Profile) -> Samples:
+    """(601,) PSD of the fan with the profile's own effects on it."""
+    psd = profile.noise_psd
+    for name, values in profile.echo.effects:
+        changed = getattr(find(name), "noise_psd", None)
+        psd = changed(complete(find(name), values), psd) if changed else psd
+    return psd

@@ -1,0 +1,141 @@
+"""How well a prediction explains a recording on the samples that no fit has used."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy.ndimage import uniform_filter1d
+
+from edgefilter.diagnosis.prepare import Prepared
+from edgefilter.echo.effect import ROUNDING_PSD, whiten
+from edgefilter.echo.least_squares import normal_equations
+from edgefilter.echo.model import EchoModel
+from edgefilter.echo.wiener import convolve_from
+from edgefilter.types import SAMPLE_RATE, Array, Samples
+
+FRAME, HOP = 512, 256
+FRAMES_PER_CELL = 8
+TOLERANCE = 0.012
+"""An ordinary robot's path differs from its calibration by this share at each frequency (0.1 dB, 0.7 degrees)."""
+TOLERANCE_TAPS, TOLERANCE_LEAD = 32, 16
+
+
+@dataclass(frozen=True, eq=False)
+class Verdict:
+    """Of one prediction. level_db: mean over time-frequency cells of the residual's dB over the fan, each cell by its degrees of freedom.
+
+    excess_db: mean power of the held-out whitened residual, dB. active_db, silent_db: while the robot is heard, and is not. fitted_db: of the
+    samples to fit on, while it is heard.
+    What a model says that no waveform predicts counts as fan in these; irreducible_db: the excess over the fan alone then, else 0.
+    cells: (times, bands) power over the fan. prediction: (n,) with the ordinary tolerances taken up.
+    """
+
+    level_db: float
+    excess_db: float
+    active_db: float
+    silent_db: float
+    fitted_db: float
+    irreducible_db: float
+    cells: Array = field(repr=False)
+    prediction: Samples = field(repr=False)
+
+
+class Judge:
+    """Holds a prepared recording against predictions.
+
+    The log likelihood of a residual that is Gaussian with an unknown variance in each cell of time and frequency is, but for a
+    constant, minus half the sum of the degrees of freedom times the log of the measured power (Whittle 1953): what counts is that
+    the residual sinks in many cells, not that one loud passage does.
+    """
+
+    def __init__(self, prepared: Prepared) -> None:
+        self.prepared = prepared
+        measurement = prepared.measurement
+        self.psd = measurement.noise_psd
+        n = measurement.recording.size
+        self._window = np.hanning(FRAME + 1)[:-1].astype(np.float32)
+        hz = np.arange(FRAME // 2 + 1) * SAMPLE_RATE / FRAME
+        expected = np.interp(hz, np.arange(self.psd.size) * 0.5 * SAMPLE_RATE / (self.psd.size - 1), self.psd) / 2 * SAMPLE_RATE
+        self._expected = np.maximum(expected, 1e-12 * expected.max()) * float(np.sum(self._window**2))
+        self._rows = measurement.fit & prepared.usable & prepared.active & (np.arange(n) % 3 == 0)
+        starts = np.arange(0, n - FRAME - HOP * (FRAMES_PER_CELL - 1) + 1, HOP * FRAMES_PER_CELL)
+        span = FRAME + HOP * (FRAMES_PER_CELL - 1)
+        held = np.concatenate(([0], np.cumsum(prepared.held_out)))
+        heard = np.concatenate(([0], np.cumsum(prepared.active)))
+        whole = held[starts + span] - held[starts] >= 0.9 * span
+        self.starts = starts[whole]
+        self.active_cells = (heard[self.starts + span] - heard[self.starts]) > 0.3 * span
+        edges = np.unique(np.concatenate(([2], np.round(np.geomspace(4, FRAME // 2 - 6, 26)).astype(int))))
+        self._edges = edges
+        self.band_hz = np.stack((hz[edges[:-1]], hz[edges[1:]]), axis=1)
+        self.freedom = np.diff(edges).astype(float)
+
+    def cells(self, residual: Samples) -> Array:
+        """(times, bands) power of the residual (n,) over the fan's, in the held-out cells."""
+        index = self.starts[:, None, None] + np.arange(FRAMES_PER_CELL)[:, None] * HOP + np.arange(FRAME)
+        power = np.abs(np.fft.rfft(residual[index] * self._window)) ** 2
+        ratio = power.mean(axis=1) / self._expected
+        return np.add.reduceat(ratio[:, : self._edges[-1]], self._edges[:-1], axis=1) / self.freedom
+
+    def of(self, model: EchoModel) -> Verdict:
+        """The verdict on a model: on what it predicts, with what it says that no waveform predicts counted as fan."""
+        measurement = self.prepared.measurement
+        return self.judge(measurement.heard(model)[0], unpredictable=model.unpredictable(measurement.reference))
+
+    def judge(self, prediction: Samples, correct: bool = True, unpredictable: Sequence[tuple[Samples, Array]] = ()) -> Verdict:
+        """The verdict on a prediction (n,), by default with the ordinary tolerances taken up first.
+
+        unpredictable: as EchoModel.unpredictable gives it, noise that is expected on top of the fan.
+        """
+        corrected = self.correct(prediction) if correct else prediction
+        residual = self.prepared.measurement.recording - corrected
+        cells = self.cells(residual) / self._expected_cells(unpredictable)
+        weights = np.broadcast_to(self.freedom, cells.shape)
+        plain = whiten(residual, self.psd).astype(np.float64) ** 2
+        white = self._over_expected(plain, unpredictable) if unpredictable else plain
+        held, active = self.prepared.held_out, self.prepared.active
+        return Verdict(
+            level_db=float(np.average(10 * np.log10(np.maximum(cells, 1e-3)), weights=weights)) if cells.size else 0.0,
+            excess_db=_db(white[held]),
+            active_db=_db(white[held & active]),
+            silent_db=_db(white[held & ~active]),
+            fitted_db=_db(white[self.prepared.measurement.fit & active]),
+            irreducible_db=_db(plain[held]) if unpredictable else 0.0,
+            cells=cells,
+            prediction=corrected,
+        )
+
+    def _expected_cells(self, unpredictable: Sequence[tuple[Samples, Array]]) -> Array | float:
+        """(times, bands) what is expected in the held-out cells, 1 where that is the fan alone."""
+        expected: Array | float = 1.0
+        span = FRAME + HOP * (FRAMES_PER_CELL - 1)
+        for variance, colour in unpredictable:
+            total = np.concatenate(([0.0], np.cumsum(variance, dtype=np.float64)))
+            mean = (total[self.starts + span] - total[self.starts]) / span
+            bins = np.arange(FRAME // 2 + 1) * (colour.size - 1) / (FRAME // 2)
+            share = np.interp(bins, np.arange(colour.size), colour / self.psd)
+            expected = expected + mean[:, None] * (np.add.reduceat(share[: self._edges[-1]], self._edges[:-1]) / self.freedom)
+        return expected
+
+    def _over_expected(self, power: Array, unpredictable: Sequence[tuple[Samples, Array]]) -> Array:
+        """power (n,) of the whitened residual over what is expected, both smoothed over 16 ms: when a knock comes is known to some ms."""
+        expected = np.ones_like(power)
+        for variance, colour in unpredictable:
+            expected += variance * float(np.mean(colour / np.maximum(self.psd, max(ROUNDING_PSD, 1e-7 * float(self.psd.max())))))
+        return uniform_filter1d(power, HOP) / uniform_filter1d(expected, HOP)
+
+    def correct(self, prediction: Samples) -> Samples:
+        """prediction (n,) through the short filter that brings it closest to the recording, no further from 1 than TOLERANCE."""
+        measurement = self.prepared.measurement
+        x = whiten(prediction, self.psd)
+        target = measurement.white_recording - x
+        weights, _ = normal_equations([x], target, TOLERANCE_TAPS, TOLERANCE_LEAD, self._rows).solve(1e-5)
+        response = np.fft.rfft(weights[0], 256)
+        bounded = np.fft.irfft(response * np.minimum(1.0, TOLERANCE / np.maximum(np.abs(response), 1e-12)), 256)
+        return prediction + convolve_from(prediction, np.roll(bounded, 96), 96 + TOLERANCE_LEAD)
+
+
+def _db(power: Array) -> float:
+    return float(10.0 * np.log10(max(float(np.mean(power)), 1e-12))) if power.size else 0.0

@@ -1,0 +1,73 @@
+"""Player and microphone count time with two crystals."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, ClassVar
+
+import numpy as np
+
+from edgefilter.dsp.fractional_delay import interpolate
+from edgefilter.echo.effect import Measurement, Parameter, Stage, Values
+from edgefilter.echo.lag_track import track_lag
+from edgefilter.types import Array, Samples
+
+if TYPE_CHECKING:
+    from edgefilter.echo.model import EchoModel
+
+PASSES = ((4000, 512), (8000, 16))
+"""Samples of a block and of lag either way: short blocks while the drift smears them, longer ones once it is taken out."""
+STEADY = 0.05
+"""Samples by which a block's lag may err for other reasons than noise."""
+
+
+class ClockDrift:
+    """y(n) = x(n - offset + ppm 1e-6 n): a delay that shrinks with positive, grows with negative ppm.
+
+    Interpolation by a Kaiser-windowed sinc of 32 samples, see fractional. Valid where the drift is constant over the recording.
+    """
+
+    name: ClassVar[str] = "clock_drift"
+    stage: ClassVar[Stage] = "time"
+    memoryless: ClassVar[bool] = False
+    parameters: ClassVar[tuple[Parameter, ...]] = (
+        Parameter("ppm", "1e-6", 0.0, -1000.0, 1000.0),
+        Parameter("offset", "samples", 0.0, -32000.0, 32000.0),
+    )
+
+    def apply(self, x: Samples, values: Values, sample_rate: int) -> Samples:
+        """x (n,) read at the drifting clock; outside of x there is silence."""
+        ppm, offset = float(values["ppm"]), float(values["offset"])
+        if ppm == 0.0 and offset == 0.0:
+            return x.copy()
+        n = np.arange(x.size)
+        return interpolate(x, n - offset + 1e-6 * ppm * n)
+
+    def fit(self, measurement: Measurement, model: EchoModel) -> Values:
+        """A robust line through the lags of all blocks, twice: the second time on the prediction that the first has straightened."""
+        predicted, recording = measurement.heard(model)[0], measurement.white_recording
+        n, lag = np.arange(predicted.size), np.zeros(predicted.size)
+        for size, reach in PASSES:
+            track = track_lag(measurement.whiten(interpolate(predicted, n - lag)), recording, measurement.fit, size, reach)
+            if track.lag.size < 3:
+                break
+            total = track.lag + np.interp(track.middle, n, lag)
+            slope, offset = robust_line(track.middle, total, track.sigma)
+            lag = offset + slope * n
+        slope = float(np.clip(1e6 * (lag[-1] - lag[0]) / max(n.size - 1, 1), -1000.0, 1000.0)) if n.size else 0.0
+        return {"ppm": -slope, "offset": float(lag[0]) if n.size else 0.0}
+
+
+def robust_line(x: Array, y: Array, sigma: Array) -> tuple[float, float]:
+    """Slope and offset of y (m,) over x (m,): from the median of all pairwise slopes (Theil-Sen), then Tukey's biweight."""
+    i, j = np.triu_indices(x.size, 1)
+    slope = float(np.median((y[j] - y[i]) / (x[j] - x[i])))
+    offset = float(np.median(y - slope * x))
+    spread = np.hypot(sigma, STEADY)
+    for _ in range(10):
+        distance = (y - slope * x - offset) / spread
+        scale = max(float(1.4826 * np.median(np.abs(distance))), 1.0)
+        keep = np.clip(1.0 - (distance / (4.685 * scale)) ** 2, 0.0, None)
+        if np.count_nonzero(keep) < 3:
+            break
+        slope, offset = np.polyfit(x, y, 1, w=keep / spread)
+    return float(slope), float(offset)

@@ -1,0 +1,171 @@
+"""A player or a driver lost or repeated samples: the delay jumps."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, ClassVar
+
+import numpy as np
+
+from edgefilter.dsp.fractional_delay import delayed
+from edgefilter.echo.effect import Measurement, Parameter, Stage, Values, complete, neutral
+from edgefilter.echo.effects.clock_drift import STEADY, robust_line
+from edgefilter.echo.lag_track import LagTrack, track_lag
+from edgefilter.types import SAMPLE_RATE, Array, Samples
+
+if TYPE_CHECKING:
+    from edgefilter.echo.model import EchoModel
+
+BLOCK, REACH = 4000, 2400
+MOST_JUMPS = 8
+LEAST_JUMP = 0.3
+"""Samples; less is no jump, but a block's lag that is not known better."""
+OUTLIER = 25.0
+"""A block adds at most this to the squared, normalised distance from the steps or the line."""
+COST = 12.0
+"""What each number of a step function has to save in squared, normalised distance, per unit of log(blocks)."""
+
+
+DIRECT = 64
+"""Samples before the direct sound in the path's impulse response (model.PRE_ROLL)."""
+HISTORY, SETTLED, AFTERMATH = 8000, 640, 6400
+"""Samples: what the path remembers of the time before a jump; what may be unsure of its moment; what shows the jump."""
+SEARCH = (range(-256, 257, 32), range(-24, 25, 8), range(-6, 7, 2), (-1, 0, 1))
+
+
+class DelayJump:
+    """The reference is played later by samples[i] from times_s[i] on, and by offset from the start on; piecewise constant, fractional.
+
+    What the player puts into the gap where the delay grows: the last samples once more (gap_gain 1) or silence (gap_gain 0).
+    """
+
+    name: ClassVar[str] = "delay_jump"
+    stage: ClassVar[Stage] = "source"
+    memoryless: ClassVar[bool] = False
+    parameters: ClassVar[tuple[Parameter, ...]] = (
+        Parameter("times_s", "s", 0.0, 0.0, 1e6),
+        Parameter("samples", "samples", 0.0, -48000.0, 48000.0),
+        Parameter("offset", "samples", 0.0, -32000.0, 32000.0),
+        Parameter("gap_gain", "", 1.0, 0.0, 1.0),
+    )
+
+    def apply(self, x: Samples, values: Values, sample_rate: int) -> Samples:
+        """x (n,) read with the delay of each moment; outside of x there is silence."""
+        times, steps = (np.atleast_1d(np.asarray(values[name], float)) for name in ("times_s", "samples"))
+        order = np.argsort(times, kind="stable")
+        at = np.clip(np.round(times[order] * sample_rate), 0, x.size).astype(int)
+        delays = float(values["offset"]) + np.concatenate(([0.0], np.cumsum(steps[order])))
+        out = x.copy()
+        for start, stop, delay in zip([0, *at], [*at, x.size], delays, strict=True):
+            if delay != 0.0 and stop > start:
+                out[start:stop] = delayed(x, delay)[start:stop]
+        if float(values["gap_gain"]) != 1.0:
+            for start, step in zip(at, steps[order], strict=True):
+                out[start : start + int(max(step, 0.0))] *= np.float32(values["gap_gain"])
+        return out
+
+    def fit(self, measurement: Measurement, model: EchoModel) -> Values:
+        """Steps through the lags of all blocks; none where a straight line, a drift, describes the lags as well.
+
+        How many steps and how high comes from the samples to fit on; where exactly each lies is then looked up in all samples,
+        since a jump may fall between the blocks to fit on.
+        """
+        predicted, recording = measurement.heard(model)[1], measurement.white_recording
+        track = track_lag(predicted, recording, measurement.fit, BLOCK, REACH)
+        if track.lag.size < 4:
+            return neutral(self)
+        edges, levels = find_steps(track.lag, np.hypot(track.sigma, STEADY))
+        if not 1 <= edges.size <= MOST_JUMPS or _line_is_as_good(track, edges, levels):
+            return neutral(self)
+        times = [_locate(predicted, recording, track, edge, levels[i : i + 2]) for i, edge in enumerate(edges)]
+        found = {"times_s": np.array(times) / SAMPLE_RATE, "samples": np.diff(levels), "offset": float(levels[0])}
+        return self._refined(measurement, model, found)
+
+    def _refined(self, measurement: Measurement, model: EchoModel, values: Values) -> Values:
+        """The same with each jump at the moment in the reference, and the gap filled in the way, that predicts best around it."""
+
+        def left(changed: Values, around: int) -> float:
+            part = slice(max(around - HISTORY, 0), around + AFTERMATH)
+            start = part.start / SAMPLE_RATE
+            late = changed["times_s"] > start
+            offset = changed["offset"] + float(changed["samples"][~late].sum())
+            times, steps = (changed["times_s"][late] - start, changed["samples"][late]) if late.any() else (0.0, 0.0)
+            local = complete(self, {"times_s": times, "samples": steps, "offset": offset, "gap_gain": changed["gap_gain"]})
+            predicted = model.predict(self.apply(measurement.reference[part], local, SAMPLE_RATE))
+            rest = measurement.whiten(measurement.recording[part] - predicted)
+            return float(np.sum(rest[around - SETTLED - part.start :].astype(np.float64) ** 2))
+
+        times, total = values["times_s"] * SAMPLE_RATE, {}
+        for gap_gain in (1.0, 0.0) if np.any(values["samples"] > 1.0) else (1.0,):
+            moved = {**values, "times_s": times / SAMPLE_RATE, "gap_gain": gap_gain}
+            cost = 0.0
+            for i, time in enumerate(times):
+                around, at = int(time), time - DIRECT
+                for steps in SEARCH:
+                    tries = []
+                    for step in steps:
+                        moved["times_s"] = moved["times_s"].copy()
+                        moved["times_s"][i] = max(at + step, 0.0) / SAMPLE_RATE
+                        tries.append((left(moved, around), at + step))
+                    least, at = min(tries)
+                moved["times_s"][i] = max(at, 0.0) / SAMPLE_RATE
+                cost += least
+            total[gap_gain] = (cost, moved)
+        return min(total.values(), key=lambda pair: pair[0])[1]
+
+
+def find_steps(lag: Array, sigma: Array) -> tuple[Array, Array]:
+    """Step function through lag (b,): the first block of each new level, and the levels.
+
+    Optimal partition by dynamic programming (Jackson et al. 2005) with a penalty per level of COST log b, levels by their median.
+    Neighbouring levels closer than LEAST_JUMP are merged.
+    """
+    count = lag.size
+    penalty = COST * np.log(count)
+    best, origin = np.full(count + 1, np.inf), np.zeros(count + 1, int)
+    best[0] = -penalty
+    for stop in range(1, count + 1):
+        for start in range(stop):
+            part = slice(start, stop)
+            total = best[start] + penalty + _misfit(lag[part], np.median(lag[part]), sigma[part])
+            if total < best[stop]:
+                best[stop], origin[stop] = total, start
+    cuts = [count]
+    while cuts[-1] > 0:
+        cuts.append(origin[cuts[-1]])
+    cuts = cuts[::-1]
+    while True:
+        levels = np.array([_level(lag[a:b], sigma[a:b]) for a, b in zip(cuts[:-1], cuts[1:], strict=True)])
+        small = np.flatnonzero(np.abs(np.diff(levels)) < LEAST_JUMP)
+        if not small.size:
+            return np.array(cuts[1:-1], int), levels
+        del cuts[small[0] + 1]
+
+
+def _misfit(lag: Array, level: Array | float, sigma: Array) -> float:
+    return float(np.minimum(((lag - level) / sigma) ** 2, OUTLIER).sum())
+
+
+def _level(lag: Array, sigma: Array) -> float:
+    """Weighted mean of the lags near their median."""
+    middle = float(np.median(lag))
+    near = np.abs(lag - middle) < np.maximum(4 * sigma, 0.5)
+    return float(np.average(lag[near], weights=1 / sigma[near] ** 2)) if near.any() else middle
+
+
+def _line_is_as_good(track: LagTrack, edges: Array, levels: Array) -> bool:
+    sigma = np.hypot(track.sigma, STEADY)
+    slope, offset = robust_line(track.middle, track.lag, track.sigma)
+    line = _misfit(track.lag, slope * track.middle + offset, sigma)
+    steps = _misfit(track.lag, levels[np.searchsorted(edges, np.arange(track.lag.size), side="right")], sigma)
+    return line <= steps + COST * np.log(track.lag.size) * edges.size
+
+
+def _locate(predicted: Samples, recording: Samples, track: LagTrack, edge: int, levels: Array) -> int:
+    """The sample from which on the second delay predicts better than the first, between the blocks before and after."""
+    start = int(track.starts[edge - 1])
+    stop = int(track.starts[edge]) + track.size
+    margin = int(np.abs(levels).max()) + 64
+    low = max(start - margin, 0)
+    around = predicted[low : stop + margin]
+    before, after = ((recording[start:stop] - delayed(around, level)[start - low : stop - low]) ** 2 for level in levels)
+    return start + int(np.argmin(np.concatenate(([0.0], np.cumsum((before - after).astype(np.float64))))))

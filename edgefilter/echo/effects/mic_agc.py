@@ -1,0 +1,163 @@
+"""An automatic gain control at the microphone: the gain of voice and fan alike drifts with time."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, ClassVar
+
+import numpy as np
+import scipy
+
+from edgefilter.echo.effect import Measurement, Parameter, Stage, Values
+from edgefilter.echo.effects.gain_law import STEP, by_step, follow
+from edgefilter.echo.least_squares import absorbed
+from edgefilter.types import SAMPLE_RATE, Array, Samples
+
+if TYPE_CHECKING:
+    from edgefilter.echo.model import EchoModel
+
+KNOTS_HZ = 4.0
+"""Knots per second of a gain curve that follows no law."""
+BEND = 0.01
+"""Standard deviation of the change of slope of the gain from knot to knot that is expected, relative to the gain."""
+BENDS = 0.5
+"""Of the mean square of the gain's movement, a law must leave less than this to be followed."""
+FRAME = SAMPLE_RATE // 8
+SILENT = 0.1
+"""A frame shows the fan alone where the predicted voice has less than this part of its power."""
+FAN_TRUST = 0.25
+"""Weight of a silent frame relative to what white noise would deserve: the fan itself is only known to some tenths of a dB."""
+
+
+class MicAgc:
+    """y(t) = g(t) x(t), g in dB piecewise linear between its knots; what the microphone hears of the fan gets the same gain.
+
+    gain_db: (k,) at 0, 1 / knots_hz, 2 / knots_hz ..., the last one held, or one number. range_db and time_constant_s only report: the
+    spread of the gain between its 5th and 95th percentile, and the lag at which the gain's autocovariance has fallen to 1/e.
+    """
+
+    name: ClassVar[str] = "mic_agc"
+    stage: ClassVar[Stage] = "microphone"
+    memoryless: ClassVar[bool] = False
+    scales_fan: ClassVar[bool] = True
+    parameters: ClassVar[tuple[Parameter, ...]] = (
+        Parameter("gain_db", "dB", 0.0, -60.0, 60.0),
+        Parameter("knots_hz", "1/s", KNOTS_HZ, 0.01, 1000.0),
+        Parameter("range_db", "dB", 0.0, 0.0, 120.0),
+        Parameter("time_constant_s", "s", 0.0, 0.0, 1e4),
+    )
+
+    def apply(self, x: Samples, values: Values, sample_rate: int) -> Samples:
+        """x (n,) times the gain of each moment."""
+        knots = np.atleast_1d(np.asarray(values["gain_db"], float))
+        if not knots.any():
+            return x.copy()
+        position = np.arange(x.size) * (float(values["knots_hz"]) / sample_rate)
+        return (x * 10.0 ** (np.interp(position, np.arange(knots.size), knots) / 20.0)).astype(np.float32)
+
+    def fit(self, measurement: Measurement, model: EchoModel) -> Values:
+        """A law by which the gain follows the level, where there is one, and what differs from it slowly.
+
+        The latter by penalised least squares of the gain at the knots: from the voice where it sounds, from the fan's power where it
+        does not. It is a smoothing spline of first order (Eilers & Marx 1996, with second differences), which bridges what is not fitted.
+        """
+        heard, predicted = measurement.heard(model)
+        recording = measurement.white_recording
+        voice = absorbed(predicted, recording, measurement.fit)
+        energy = float(np.dot(predicted, predicted))
+        overall = float(np.dot(voice, predicted)) / energy if energy > 0.0 else 1.0
+        overall = overall if overall > 1e-3 else 1.0
+        law = _law(heard, voice, recording, measurement)
+        matrix, right = _from_voice(voice * law, recording, measurement)
+        if measurement.noise_psd is not None:
+            for_fan, wanted = _from_fan(voice, recording, measurement, overall, law)
+            matrix[1] += for_fan
+            right += wanted
+        gain = law * _at_samples(_smooth(matrix, right), law.size)
+        if not _pays(gain, voice, recording, measurement):
+            return {"gain_db": float(np.clip(20.0 * np.log10(overall), -60.0, 60.0)), "range_db": 0.0, "time_constant_s": 0.0}
+        step = int(SAMPLE_RATE / KNOTS_HZ) if np.all(law == 1.0) else STEP
+        curve = 20.0 * np.log10(np.clip(np.append(gain, gain[-1:])[::step] * overall, 1e-3, 1e3))
+        low, high = np.percentile(curve, [5, 95])
+        knots_hz = SAMPLE_RATE / step
+        return {"gain_db": curve, "knots_hz": knots_hz, "range_db": float(high - low), "time_constant_s": _time_constant(curve, knots_hz)}
+
+
+def _law(heard: Samples, voice: Samples, recording: Samples, measurement: Measurement) -> Samples:
+    """(n,) the gain by the law, ones where no law explains a good part; heard (n,): the predicted voice as the microphone gets it."""
+    ones = np.ones(heard.size, np.float32)
+    if measurement.noise_psd is None:
+        return ones
+    fan = float(measurement.noise_psd.sum()) * SAMPLE_RATE / 2 / (measurement.noise_psd.size - 1)
+    level = 10.0 * np.log10(by_step(heard.astype(np.float64) ** 2) / STEP + fan + 1e-12)
+    law = follow(level, voice, recording, measurement.weights)
+    if law is None or law.misfit > BENDS * law.plain:
+        return ones
+    position = (np.arange(heard.size) + 0.5) / STEP - 0.5
+    return (10.0 ** (np.interp(position, np.arange(law.curve_db.size), law.curve_db) / 20.0)).astype(np.float32)
+
+
+def _at_samples(knots: Array, n: int) -> Array:
+    """(n,) linear between knots KNOTS_HZ a second."""
+    return np.interp(np.arange(n) * (KNOTS_HZ / SAMPLE_RATE), np.arange(knots.size), knots)
+
+
+def _pays(curve: Array, voice: Samples, recording: Samples, measurement: Measurement) -> bool:
+    """Whether the curve (n,) explains more than a constant by what Bayes' criterion asks for half as many numbers as a spline has knots."""
+    constant, varying = (float(np.dot(rest**2, measurement.weights)) for rest in (recording - voice, recording - curve * voice))
+    count = max(float(measurement.weights.sum()), 2.0)
+    return constant - varying > 0.5 * curve.size * KNOTS_HZ / SAMPLE_RATE * np.log(count) * varying / count
+
+
+def _from_voice(voice: Samples, recording: Samples, measurement: Measurement) -> tuple[Array, Array]:
+    """Normal equations of recording = voice * sum of knot gains times hats: upper and main diagonal (2, k), right side (k,)."""
+    position = np.arange(voice.size) * (KNOTS_HZ / SAMPLE_RATE)
+    left = position.astype(np.int64)
+    count = int(left[-1]) + 2 if left.size else 2
+    up = position - left
+    power = voice.astype(np.float64) ** 2 * measurement.weights
+    cross = voice.astype(np.float64) * recording * measurement.weights
+
+    def total(weights: Array, at: Array) -> Array:
+        return np.bincount(at, weights, count)
+
+    main = total(power * (1 - up) ** 2, left) + total(power * up**2, left + 1)
+    upper = np.zeros(count)
+    upper[1:] = total(power * up * (1 - up), left)[:-1]
+    return np.stack((upper, main)), total(cross * (1 - up), left) + total(cross * up, left + 1)
+
+
+def _from_fan(voice: Samples, recording: Samples, measurement: Measurement, overall: float, law: Samples) -> tuple[Array, Array]:
+    """What the fan's power says: to the main diagonal and the right side (k,), from frames to fit on in which the robot is silent."""
+    count = int((voice.size - 1) * KNOTS_HZ / SAMPLE_RATE) + 2
+    frames = voice.size // FRAME
+    cut = slice(0, frames * FRAME)
+    own, heard, by_law = (np.mean(x[cut].reshape(frames, FRAME).astype(np.float64) ** 2, axis=1) for x in (voice, recording, law))
+    usable = measurement.weights[cut].reshape(frames, FRAME).all(axis=1) & (own < SILENT)
+    knot = np.round((np.arange(frames) + 0.5) * FRAME / SAMPLE_RATE * KNOTS_HZ).astype(int)[usable]
+    weight = FAN_TRUST * 2 * FRAME
+    wanted = np.sqrt(heard[usable] / by_law[usable]) / overall
+    return np.bincount(knot, np.full(knot.size, weight), count), np.bincount(knot, weight * wanted, count)
+
+
+def _smooth(matrix: Array, right: Array) -> Array:
+    """Gain (k,) around 1: solves the normal equations with a penalty on second differences (a pentadiagonal system)."""
+    count = right.size
+    bands = np.zeros((3, count))
+    bands[1], bands[2] = matrix[0], matrix[1] + 1e-6
+    stiff = 1.0 / BEND**2
+    difference = (1.0, -2.0, 1.0)
+    for i in range(3):
+        for j in range(i, 3):
+            bands[2 - (j - i), j : count - 2 + j] += stiff * difference[i] * difference[j]
+    return scipy.linalg.solveh_banded(bands, right + 1e-6)
+
+
+def _time_constant(curve: Array, knots_hz: float) -> float:
+    """Seconds until the autocovariance of curve (k,) has fallen to 1/e of its variance; 0 where it is constant."""
+    moved = curve - curve.mean()
+    variance = float(np.dot(moved, moved))
+    if variance < 1e-12:
+        return 0.0
+    covariance = np.correlate(moved, moved, "full")[curve.size - 1 :] / variance
+    below = np.flatnonzero(covariance < np.exp(-1.0))
+    return float(below[0] if below.size else curve.size) / knots_hz

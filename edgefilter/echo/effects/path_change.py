@@ -1,0 +1,109 @@
+"""The robot or something near it moved during the recording: from then on the path is another."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, ClassVar
+
+import numpy as np
+
+from edgefilter.echo.effect import Measurement, Parameter, Stage, Values, neutral
+from edgefilter.echo.wiener import convolve_from, fit_supported
+from edgefilter.types import SAMPLE_RATE, Samples
+
+if TYPE_CHECKING:
+    from edgefilter.echo.model import EchoModel
+
+LEAD = 64
+TAPS = 3072
+EXPECTED = 1e-2
+"""Expected square of a tap."""
+BLOCK = SAMPLE_RATE // 10
+MARGIN = 1.5
+"""Seconds at either end within which no change is looked for: there is no telling it from a path that was another all along."""
+SLACK = 6.0
+"""Squared error, in variances of the fan, by which moments and fades are told apart: less is chance."""
+NEVER = 1e6
+
+
+class PathChange:
+    """y = x until time_s, then x + taps * x, faded over in duration_s around it.
+
+    taps: (k,) lags -LEAD to k - LEAD: the new path behind the calibrated one. A time_s of 1e6 s is never.
+    """
+
+    name: ClassVar[str] = "path_change"
+    stage: ClassVar[Stage] = "path"
+    memoryless: ClassVar[bool] = False
+    parameters: ClassVar[tuple[Parameter, ...]] = (
+        Parameter("time_s", "s", NEVER, 0.0, NEVER),
+        Parameter("duration_s", "s", 0.01, 0.0, 10.0),
+        Parameter("taps", "1", 0.0, -10.0, 10.0),
+    )
+
+    def apply(self, x: Samples, values: Values, sample_rate: int) -> Samples:
+        """x through the old path, then the new."""
+        taps = np.atleast_1d(np.asarray(values["taps"], float))
+        if not taps.any() or float(values["time_s"]) >= x.size / sample_rate:
+            return x.copy()
+        return x + _fade(x.size, float(values["time_s"]), float(values["duration_s"]), sample_rate) * convolve_from(x, taps, LEAD)
+
+    def settled(self, values: Values) -> Values:
+        """Values with which the new path holds from the start."""
+        return {**values, "time_s": -1.0, "duration_s": 0.0} if float(values["time_s"]) < NEVER else values
+
+    def fit(self, measurement: Measurement, model: EchoModel) -> Values:
+        """The time by the step in the residual, the new path by least squares after it, in turn; neutral where it does not help on other samples.
+
+        The moment alone is chosen on all samples, since it may fall between those that the fit may use.
+        """
+        x = measurement.heard(model)[1]
+        residual = measurement.white_recording - x
+        time = _step(residual, x)
+        for _ in range(2):
+            after = measurement.weights * (np.arange(x.size) > (time + 0.3) * SAMPLE_RATE)
+            taps = fit_supported(x, residual, after, TAPS, LEAD, prior=np.full(TAPS, EXPECTED), steps=40)
+            if not taps.any():
+                return neutral(self)
+            change = convolve_from(x, taps, LEAD)
+            time = _best_time(residual, change, measurement.weights)
+        errors = {}
+        for length in (0.01, 0.3, 0.6, 1.0):
+            for at in time + np.arange(-0.6, 0.61, 0.1):
+                left = residual - _fade(x.size, at, length, SAMPLE_RATE) * change
+                errors[(at, length)] = float(np.dot(left, left))
+        most = min(errors.values()) + SLACK
+        as_good = [found for found, error in errors.items() if error <= most]
+        time, duration = min(as_good, key=lambda found: (found[1], abs(found[0] - time)))
+        return {"time_s": float(np.clip(time, 0.0, x.size / SAMPLE_RATE)), "duration_s": duration, "taps": np.clip(taps, -10.0, 10.0)}
+
+
+def _fade(n: int, time: float, duration: float, sample_rate: int) -> Samples:
+    """(n,) 0 before, 1 after, a line in between."""
+    return np.clip((np.arange(n, dtype=np.float32) / sample_rate - time) / max(duration, 1e-4) + 0.5, 0.0, 1.0).astype(np.float32)
+
+
+def _step(residual: Samples, x: Samples) -> float:
+    """Seconds at which the residual, in proportion to the prediction, rises most clearly: two means of its log in blocks of 100 ms."""
+    count = residual.size // BLOCK
+    power, drive = (np.mean(s[: count * BLOCK].astype(float).reshape(count, BLOCK) ** 2, axis=1) for s in (residual, x))
+    loud = drive > 10.0
+    ratio = np.where(loud, np.log(np.maximum(power, 1.0) / np.where(loud, drive, 1.0)), 0.0)
+    total, number = np.cumsum(ratio * loud), np.cumsum(loud)
+    first = max(int(MARGIN * SAMPLE_RATE / BLOCK), 1)
+    best, at = -np.inf, count // 2
+    for k in range(first, count - first):
+        before, after = number[k - 1], number[-1] - number[k - 1]
+        if min(before, after) < 5:
+            continue
+        rise = (total[-1] - total[k - 1]) / after - total[k - 1] / before
+        score = rise * np.sqrt(before * after / (before + after))
+        if score > best:
+            best, at = score, k
+    return at * BLOCK / SAMPLE_RATE
+
+
+def _best_time(residual: Samples, change: Samples, weights: Samples) -> float:
+    """Seconds from which on the change fits better than none: the split of least squared error."""
+    without = np.cumsum((residual.astype(float) ** 2 - (residual - change).astype(float) ** 2) * weights)
+    edge = int(MARGIN * SAMPLE_RATE)
+    return (edge + int(np.argmin(without[edge : max(without.size - edge, edge + 1)]))) / SAMPLE_RATE

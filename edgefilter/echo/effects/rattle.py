@@ -1,0 +1,242 @@
+"""Something loose on the robot: it knocks when the membrane moves too far."""
+
+from __future__ import annotations
+
+from dataclasses import astuple, replace
+from itertools import product
+from typing import TYPE_CHECKING, ClassVar
+
+import numpy as np
+import scipy
+
+from edgefilter.echo.effect import Measurement, Parameter, Stage, Values, complete, neutral
+from edgefilter.echo.effects.knock_power import (
+    BAND_HZ,
+    BANDS,
+    DECAYS_MS,
+    RESONANCES_HZ,
+    SHARES,
+    Trigger,
+    colour_of_knocks,
+    find_knocks,
+    find_trigger,
+    one_side,
+    quantile_of_peaks,
+    resonated,
+    ringing_of,
+)
+from edgefilter.echo.least_squares import absorbed, filtered
+from edgefilter.types import SAMPLE_RATE, Array, Samples
+
+if TYPE_CHECKING:
+    from edgefilter.echo.model import EchoModel
+
+TAPS = 320
+"""20 ms of ringing after a knock."""
+DIRECT = 64
+"""Samples before the direct sound in the path's impulse response (model.PRE_ROLL)."""
+NEVER = 100.0
+BOUND = 1e4
+RIDGE = 1e-2
+HALF = SAMPLE_RATE
+"""Samples of the stretches that take turns when the sounds are tried on knocks that they were not learnt from."""
+WORTH = 2.5
+"""What each tap has to explain, in units of the residual's variance, for the sounds to be real."""
+REFINED = 3
+GRID_HZ = np.linspace(0.0, SAMPLE_RATE / 2, 601)
+
+
+class Rattle:
+    """y = x + h * k: a knock k at every moment at which the displacement |d| rises through threshold, h its sound, ahead of the path.
+
+    d is the drive through the membrane's resonance, w^2 / (s^2 + s w / q + w^2). An impact excites the modes of the loose part in
+    proportion to the speed at which it is hit (Klippel 2006, "Loudspeaker nonlinearities", irregular distortion), so a knock is as
+    high as d' per ms over threshold: outward (t,) taps is the sound of pushes, inward that of pulls. threshold: full scale of the
+    drive. side: 1 where only pushes knock, -1 only pulls, 0 both. No two knocks are alike: what no waveform predicts is noise that
+    starts at each knock, with power (16,) in bands of 500 Hz for a height of 1, and decays in decay_ms. rate_hz, knocks per second,
+    only reports.
+    """
+
+    name: ClassVar[str] = "rattle"
+    stage: ClassVar[Stage] = "source"
+    memoryless: ClassVar[bool] = False
+    memory: ClassVar[int] = 1024
+    parameters: ClassVar[tuple[Parameter, ...]] = (
+        Parameter("threshold", "full scale", NEVER, 1e-5, NEVER),
+        Parameter("resonance_hz", "Hz", 200.0, 20.0, 2000.0),
+        Parameter("q", "", 1.0, 0.1, 20.0),
+        Parameter("side", "", 0.0, -1.0, 1.0),
+        Parameter("outward", "", 0.0, -BOUND, BOUND),
+        Parameter("inward", "", 0.0, -BOUND, BOUND),
+        Parameter("power", "full scale^2", 0.0, 0.0, 1.0),
+        Parameter("decay_ms", "ms", 5.0, 0.1, 1000.0),
+        Parameter("rate_hz", "1/s", 0.0, 0.0, 8000.0),
+    )
+
+    def apply(self, x: Samples, values: Values, sample_rate: int) -> Samples:
+        """x (n,) and its knocks."""
+        sounds = [np.atleast_1d(np.asarray(values[name], float)) for name in ("outward", "inward")]
+        if not any(h.any() for h in sounds):
+            return x.copy()
+        knocks = find_knocks(resonated(x, float(values["resonance_hz"]), float(values["q"]), sample_rate), float(values["threshold"]))
+        return x + sum(filtered([k], h[None]) for k, h in zip(knocks, sounds, strict=True))
+
+    def variance(self, reference: Samples, values: Values, sample_rate: int) -> Samples:
+        """What knocks add to the expected square of each sample (n,) at the microphone, for an aligned reference (n,)."""
+        power = float(np.sum(values["power"]))
+        return power * ringing_of(_heard(reference, values, sample_rate), float(values["decay_ms"]), DIRECT, sample_rate)
+
+    def colour(self, values: Values) -> Array:
+        """(601,) the spectral density of that, 0 to 8 kHz, per Hz: its integral is 1."""
+        power = np.broadcast_to(np.asarray(values["power"], float), (BANDS,)) + 1e-30
+        return (power / power.sum() / BAND_HZ)[np.minimum(GRID_HZ / BAND_HZ, BANDS - 1).astype(int)]
+
+    def fit(self, measurement: Measurement, model: EchoModel) -> Values:
+        """What sets the knocks off is found by when the residual is loud; then come the least-squares sounds, and the power of the rest.
+
+        Where the sounds explain something, they serve as matched filters, which show how hard the robot was hit at each moment, and
+        resonance, q and threshold are refined by these. Neutral where the residual follows the voice's level rather than knocks, unless
+        sounds learnt from some knocks explain others, and more than as long a linear filter of the voice does.
+        """
+        x = measurement.reference
+        predicted, target = measurement.heard(model)[1], measurement.white_recording
+        left = target - absorbed(predicted, target, measurement.fit)
+        trigger, told = find_trigger(x, left, predicted, measurement.fit, DIRECT)
+        if trigger is None:
+            return neutral(self)
+        rest, allowed = left * measurement.weights, _roomy(measurement)
+
+        def knocks_of(at: Trigger) -> list[Samples]:
+            trains = find_knocks(resonated(x, at.resonance_hz, at.q), at.threshold)
+            return [train * allowed if at.side * way >= 0.0 else np.zeros_like(train) for train, way in zip(trains, (1.0, -1.0), strict=True)]
+
+        def explain(at: Trigger) -> tuple[float, Array]:
+            return _explained([measurement.whiten(model.predict(k)) for k in knocks_of(at)], rest, TAPS)
+
+        at, (gain, sounds) = trigger, explain(trigger)
+        for again in range(REFINED):
+            hits = [_matched(sound, rest, measurement, model) * allowed for sound in sounds]
+            other = _best_agreement(x, hits, _fine(at) if again else _coarse(x))
+            gain_then, sounds_then = explain(other)
+            if gain_then > gain:
+                at, gain, sounds = other, gain_then, sounds_then
+        halves = np.arange(x.size) // HALF % 2 == 0
+        worth = WORTH * sounds.size * float(np.dot(rest, rest)) / max(float(measurement.weights.sum()), 1.0)
+        if not told and gain <= _explained([predicted * measurement.weights], rest, 2 * TAPS)[0]:
+            return neutral(self)
+        if gain <= worth or not _predicts([(k * halves, k * ~halves) for k in knocks_of(at)], rest, measurement, model):
+            if not told:
+                return neutral(self)
+            at, sounds = trigger, np.zeros((2, 1))
+        values = dict(zip(("resonance_hz", "q", "threshold", "side"), astuple(at), strict=True))
+        values |= {name: _number_or_taps(np.clip(sound, -BOUND, BOUND)) for name, sound in zip(("outward", "inward"), sounds, strict=True)}
+        return {**values, **self._unpredictable(measurement, model, values)}
+
+    def _unpredictable(self, measurement: Measurement, model: EchoModel, values: Values) -> dict[str, float | Array]:
+        """power, decay_ms and rate_hz from what the predictable knocks leave."""
+        x = measurement.reference
+        knocks = _heard(x, values, SAMPLE_RATE)
+        predicted = measurement.whiten(model.predict(self.apply(x, complete(self, values), SAMPLE_RATE)))
+        target = measurement.white_recording
+        left = target - absorbed(predicted, target, measurement.fit)
+        fits = {decay: colour_of_knocks(left, ringing_of(knocks, decay, DIRECT), measurement.fit) for decay in DECAYS_MS}
+        decay = max(fits, key=lambda decay: fits[decay][0])
+        fan = np.full(GRID_HZ.size, 2.0 / SAMPLE_RATE) if measurement.noise_psd is None else np.maximum(measurement.noise_psd, 1e-14)
+        bands = np.minimum(GRID_HZ / BAND_HZ, BANDS - 1).astype(int)
+        density = fits[decay][1] * np.bincount(bands) / np.bincount(bands, 1.0 / fan)
+        rate = np.count_nonzero(knocks) * SAMPLE_RATE / max(x.size, 1)
+        return {"power": np.clip(density * BAND_HZ, 0.0, 1.0), "decay_ms": decay, "rate_hz": rate}
+
+
+def _heard(x: Samples, values: Values, sample_rate: int) -> Samples:
+    """(n,) the knocks of a drive x (n,), on the side that knocks."""
+    moved = resonated(x, float(values["resonance_hz"]), float(values["q"]), sample_rate)
+    return one_side(find_knocks(moved, float(values["threshold"])), float(values["side"]))
+
+
+def _number_or_taps(weights: Array) -> float | Array:
+    return float(weights[0]) if weights.size == 1 else weights
+
+
+def _roomy(measurement: Measurement) -> np.ndarray:
+    """(n,) bool: where a knock can ring for TAPS and on through the path within samples to fit on."""
+    if measurement.fit is None:
+        return np.ones(measurement.recording.size, bool)
+    ring = 2 * TAPS
+    total = np.concatenate((np.cumsum(measurement.fit), np.full(ring, np.count_nonzero(measurement.fit))))
+    return total[ring:] - total[:-ring] >= ring if total.size > ring else np.zeros(measurement.recording.size, bool)
+
+
+def _matched(sound: Array, rest: Samples, measurement: Measurement, model: EchoModel) -> Samples:
+    """Correlation (n,) of the residual with the whitened sound of one knock at the microphone."""
+    length, at = 4096, 1024
+    knock = np.zeros(length, np.float32)
+    knock[at : at + sound.size] = sound
+    heard = measurement.whiten(model.predict(knock))
+    return scipy.signal.oaconvolve(rest, heard[::-1])[length - 1 - at :][: rest.size].astype(np.float32)
+
+
+def _coarse(x: Samples) -> list[Trigger]:
+    """All over the range, either side knocking."""
+    moved = [(hz, q, resonated(x, hz, q)) for hz, q in product(RESONANCES_HZ, (0.7, 1.0, 1.6))]
+    return [Trigger(hz, q, quantile_of_peaks(d, share), 0.0) for hz, q, d in moved for share in SHARES]
+
+
+def _fine(at: Trigger) -> list[Trigger]:
+    """Neighbours of a trigger."""
+    steps = product((0.85, 0.92, 0.96, 1.0, 1.04, 1.09, 1.18), (0.75, 1.0, 1.3), (0.7, 0.8, 0.9, 0.96, 1.0, 1.04, 1.1, 1.2, 1.35))
+    return [replace(at, resonance_hz=at.resonance_hz * a, q=at.q * b, threshold=at.threshold * c) for a, b, c in steps]
+
+
+def _best_agreement(x: Samples, hits: list[Samples], choices: list[Trigger]) -> Trigger:
+    """The one whose knocks fit the matched filter's output best; neighbours in resonance and q follow each other."""
+    moved, best = {}, (-np.inf, choices[0])
+    for choice in choices:
+        key = choice.resonance_hz, choice.q
+        if key not in moved:
+            moved = {key: resonated(x, *key)}
+        agreement = _agreement(find_knocks(moved[key], choice.threshold), hits)
+        best = max(best, (agreement, choice), key=lambda pair: pair[0])
+    return best[1]
+
+
+def _agreement(knocks: tuple[Samples, Samples], hits: list[Samples]) -> float:
+    """How much of the residual's energy knocks of these heights explain, in units of one knock's energy, overlaps neglected."""
+    heard = [(k, hit) for k, hit in zip(knocks, hits, strict=True) if hit.any()]
+    along, energy = sum(float(np.dot(k, hit)) for k, hit in heard), sum(float(np.dot(k, k)) for k, _ in heard)
+    return along * abs(along) / energy if energy > 0.0 else 0.0
+
+
+def _predicts(halves: list[tuple[Samples, Samples]], residual: Samples, measurement: Measurement, model: EchoModel) -> bool:
+    """Whether the sounds learnt from one half of the knocks explain some of the other half, both ways round."""
+    normals = [_normal([measurement.whiten(model.predict(knocks[half])) for knocks in halves], residual, TAPS) for half in (0, 1)]
+    total = 0.0
+    for (matrix, right), (other, wanted) in (normals, normals[::-1]):
+        w = _solve(matrix, right)
+        total += float(2 * w @ wanted - w @ other @ w)
+    return total > 0.0
+
+
+def _explained(columns: list[Samples], residual: Samples, taps: int) -> tuple[float, Array]:
+    """Energy explained and weights (C, taps) of residual = sum of columns filtered by so many taps."""
+    matrix, right = _normal(columns, residual, taps)
+    w = _solve(matrix, right)
+    return float(2 * w @ right - w @ matrix @ w), w.reshape(len(columns), taps)
+
+
+def _solve(matrix: Array, right: Array) -> Array:
+    scale = float(matrix.diagonal().mean())
+    if scale <= 0.0:
+        return np.zeros_like(right)
+    return scipy.linalg.solve(matrix + RIDGE * scale * np.eye(right.size), right, assume_a="pos")
+
+
+def _normal(columns: list[Samples], residual: Samples, taps: int) -> tuple[Array, Array]:
+    """Normal equations (C taps, C taps), (C taps,) from correlations."""
+    n = scipy.fft.next_fast_len(residual.size + taps, real=True)
+    spectra = [scipy.fft.rfft(c.astype(np.float64), n) for c in columns]
+    target = scipy.fft.rfft(residual.astype(np.float64), n)
+    right = np.concatenate([scipy.fft.irfft(np.conj(s) * target, n)[:taps] for s in spectra])
+    lags = [[scipy.fft.irfft(np.conj(a) * b, n) for b in spectra] for a in spectra]
+    matrix = np.block([[scipy.linalg.toeplitz(r[:taps], np.concatenate((r[:1], r[:-taps:-1]))) for r in row] for row in lags])
+    return matrix, right

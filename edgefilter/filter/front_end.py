@@ -1,0 +1,77 @@
+"""What stands before the engine: alignment, linear stage and what is known of the rest, one hop at a time."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from edgefilter.alignment.aligner import Aligner
+from edgefilter.alignment.delay_line import Aligned
+from edgefilter.alignment.paper import PaperAligner
+from edgefilter.dsp.stft import Analyser
+from edgefilter.echo.source_chain import Driver
+from edgefilter.engines.base import ClipEngine, Engine
+from edgefilter.filter.canceller import Canceller, CancellerOutput
+from edgefilter.filter.onset_gate import OnsetGate
+from edgefilter.filter.residual_echo import Residual
+from edgefilter.profile.data import Profile
+from edgefilter.types import Frame, Samples
+
+TAPS = (2048, 8192)
+"""Least and most taps of the linear stage, 128 to 512 ms; between them the profile's impulse response decides."""
+
+
+class Front:
+    """Finds the reference in the microphone and subtracts what is linear of it.
+
+    kind "none" passes the microphone, "paper" only delays the reference per utterance, "full" tracks and cancels.
+    """
+
+    def __init__(self, engine: Engine | ClipEngine, profile: Profile | None) -> None:
+        stft = engine.stft
+        self.hop = stft.hop
+        self.aligner = self.gate = self.canceller = self.residual = None
+        if engine.front == "paper":
+            self.aligner = PaperAligner(stft.hop)
+        elif engine.front == "full":
+            self.aligner = Aligner(stft.hop, profile)
+            self.gate = OnsetGate(stft.hop, float(np.sum(np.square(profile.echo.impulse_response))) if profile else None)
+            self.canceller = self._make_canceller(profile)
+            self.residual = Residual(stft, profile)
+        self._drive = profile.echo.driver() if profile else Driver()
+        self._analyser = Analyser(stft, channels=4 if self.canceller else 2)
+        self._nothing = np.zeros(stft.bins, np.float32)
+        self._fan = profile.noise_bins(stft) if profile else self._nothing
+        self._silence = np.zeros(stft.bins, np.complex64)
+
+    def _make_canceller(self, profile: Profile | None) -> Canceller:
+        if profile is None:
+            return Canceller(self.hop)
+        response = profile.echo.running_response()
+        return Canceller(self.hop, taps=int(np.clip(response.size, *TAPS)), impulse_response=response)
+
+    def step(self, mic: Samples, ref: Samples) -> tuple[Frame, Aligned | None]:
+        """One hop (hop,) of both channels to one frame, with what the aligner found."""
+        aligned = self.aligner.step(mic, ref) if self.aligner else None
+        reference = aligned.reference if aligned else ref
+        if not self.canceller:
+            x, r = self._analyser.push(mic, reference)
+            return Frame(x, r, self._silence, x, self._fan, self._nothing), aligned
+        mic, linear = self._subtract(mic, ref, aligned)
+        x, r, e, error = self._analyser.push(mic, reference, linear.echo, linear.error)
+        noise, residual = self.residual.step(e, error, linear.uncertainty)
+        return Frame(x, r, e, error, noise, residual), aligned
+
+    def signals(self, mic: Samples, ref: Samples) -> tuple[Samples, Samples]:
+        """One hop (hop,) of both channels to the aligned reference and the linear stage's error, (hop,) each, as training wants them.
+
+        The kind "full" alone has them.
+        """
+        aligned = self.aligner.step(mic, ref)
+        return aligned.reference, self._subtract(mic, ref, aligned)[1].error
+
+    def _subtract(self, mic: Samples, ref: Samples, aligned: Aligned) -> tuple[Samples, CancellerOutput]:
+        """The microphone behind the gate, and the linear stage's hop."""
+        mic = self.gate.step(mic, ref, aligned)
+        if aligned.realigned:
+            self.canceller.rewrite_reference(self._drive.rewritten(self.aligner.history(self.canceller.history), self.hop))
+        return mic, self.canceller.step(mic, self._drive(aligned.reference))

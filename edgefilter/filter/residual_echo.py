@@ -1,0 +1,95 @@
+"""How much of the robot and of its fan is left in the linear stage's error, as power spectra that a mask can use."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from edgefilter.dsp.stft import StftConfig
+from edgefilter.types import Samples, Spectrum
+
+if TYPE_CHECKING:
+    from edgefilter.profile.data import Profile
+
+LEAKAGE = 0.005
+"""Part of the echo's power that no linear path explains, -23 dB: a loudspeaker's distortion, at first."""
+LEAST, MOST = 0.0024, 0.1
+"""Bounds on it once it is tracked."""
+LEAKAGE_MEMORY, LEAKAGE_RISE, LEAKAGE_FALL = 0.97, 1.005, 0.9
+"""The part is observed over half a second of the robot's speech; it falls at once and rises by 1.4 dB a second, so that a human's
+sentence hardly lifts it."""
+MARGIN = 3.0
+"""The mask wants to know the loud moments, which distort most; what is tracked is nearer to the quiet ones."""
+AUDIBLE = 60.0
+"""Power of the echo over the fan's from which on its leakage can be told."""
+SPREAD, SPREAD_HZ = 0.1, 2000.0
+"""Distortion falls on other frequencies too: this part of the echo's mean over SPREAD_HZ counts as well."""
+TAIL_DECAY = 0.6
+"""Fall of the residual echo per hop, room for what lies beyond the canceller's tail and between its frames."""
+DOUBT = 0.5
+"""Weight of the canceller's own expectation of its misalignment, which counts a path as unknown longer than it is."""
+FAN_START = 1e-9
+"""Fan power per bin before anything was heard and without a profile."""
+FAN_RISE, FAN_FALL = 1.004, 0.97
+"""How fast the fan's estimate follows per hop where there is no profile: up slowly, so that speech does not lift it."""
+
+
+def power(spectrum: Spectrum) -> Samples:
+    """|spectrum|^2 of any shape, without the square root of abs."""
+    return spectrum.real**2 + spectrum.imag**2
+
+
+class Residual:
+    """Tracks the fan and the residual echo of one stream; step() once per frame.
+
+    With a profile the fan is the calibrated one; without, it is the slowly rising minimum of the smoothed error. Of the echo a part
+    stays, how much is tracked: the least ratio of error to echo while the robot speaks, for a human can only add to it.
+    """
+
+    def __init__(self, stft: StftConfig, profile: Profile | None = None) -> None:
+        self._bins = stft.bins
+        width = max(1, round(SPREAD_HZ / stft.frequencies[1]))
+        self._spread = np.full(width, SPREAD / width, np.float32)
+        self._fan = profile.noise_bins(stft) if profile is not None else None
+        self.reset()
+
+    def reset(self) -> None:
+        """As before the first frame."""
+        self._noise = np.full(self._bins, FAN_START, np.float32) if self._fan is None else self._fan.copy()
+        self._noise_power = float(np.add.reduce(self._noise))
+        self._smooth = np.zeros(self._bins, np.float32)
+        before = self._spread.size // 2  # beyond its ends the echo counts as what it is there
+        self._extended = np.zeros(self._bins + self._spread.size - 1, np.float32)
+        self._below, self._echo, self._above = np.split(self._extended, (before, before + self._bins))
+        self._leakage, self._left, self._brought = LEAKAGE, 0.0, 0.0
+
+    def step(self, echo: Spectrum, error: Spectrum, uncertainty: Samples) -> tuple[Samples, Samples]:
+        """Expected |fan|^2 and |residual echo|^2 in error, both (bins,) float32.
+
+        echo, error: (bins,) of the frame. uncertainty: (bins,), CancellerOutput.uncertainty of the frame's last hop.
+        """
+        self._echo *= TAIL_DECAY
+        np.maximum(power(echo), self._echo, out=self._echo)
+        if self._fan is None:
+            self._smooth = 0.8 * self._smooth + 0.2 * power(error)
+            self._noise = np.minimum(np.maximum(self._smooth, FAN_FALL * self._noise), FAN_RISE * self._noise)
+            self._noise_power = float(np.add.reduce(self._noise))
+        self._below[:], self._above[:] = self._echo[0], self._echo[-1]
+        brought = np.correlate(self._extended, self._spread, "valid")
+        brought += self._echo
+        doubt = DOUBT * uncertainty
+        loud = float(np.add.reduce(brought))
+        if loud >= AUDIBLE * self._noise_power:
+            self._track(float(np.vdot(error, error).real) - self._noise_power - float(np.add.reduce(doubt)), loud)
+        brought *= self._leakage
+        brought += doubt
+        return self._noise, brought
+
+    def _track(self, left: float, brought: float) -> None:
+        """Follow the least part of the echo that stays, from the power left beyond fan and doubt and the power of a loud echo."""
+        self._left += (1.0 - LEAKAGE_MEMORY) * (left - self._left)
+        self._brought += (1.0 - LEAKAGE_MEMORY) * (brought - self._brought)
+        change = MARGIN * max(self._left, 0.0) / self._brought / self._leakage
+        change = min(max(change, LEAKAGE_FALL), LEAKAGE_RISE)
+        self._leakage = min(max(self._leakage * change, LEAST), MOST)

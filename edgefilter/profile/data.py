@@ -1,0 +1,168 @@
+"""The profile: what calibration measured of one robot in one place, in one versioned file that holds no code."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from edgefilter.dsp.stft import StftConfig
+from edgefilter.echo.effect import names as known_effects
+from edgefilter.echo.model import EchoModel
+from edgefilter.errors import ProfileError
+from edgefilter.profile.file import REMEDY, read_fields, write_fields
+from edgefilter.types import PRE_ROLL, SAMPLE_RATE, Array, Samples
+
+GRID_FFT = 1200
+"""FFT length of the profile's frequency grid, the paper's 601 bins."""
+GRID_BINS = GRID_FFT // 2 + 1
+GRID_HZ = np.arange(GRID_BINS) * SAMPLE_RATE / GRID_FFT
+"""(601,) Hz, 0 to 8000 in steps of 13.33."""
+DISTORTION_ORDERS = (2, 3, 4, 5)
+MAX_TAPS = 4 * SAMPLE_RATE
+MAX_DELAY = 4 * SAMPLE_RATE
+
+_ARRAYS = ("response", "noise_psd", "band_hz", "band_snr_db", "distortion_db")
+
+
+@dataclass(frozen=True, eq=False)
+class Profile:
+    """The robot's own voice at its microphone, as calibrated; checked on construction, so on load as well.
+
+    echo: the path from reference to microphone, its impulse response starting PRE_ROLL samples before the direct sound.
+    delay: index of the direct sound in the calibration recording, samples.
+    response: (601,) float32, the paper's |H_m(f) H_s(f)|, eq. (3)-(5), on GRID_HZ.
+    noise_psd: (601,) float32, one-sided power spectral density of the fan, full scale^2/Hz, on GRID_HZ.
+    band_hz: (B, 2) Hz, edges of the third-octave bands; band_snr_db: (B,) dB, the sweep's coherent part over the fan.
+    distortion_db: (4,) dB, harmonic distortion of orders 2 to 5 over the linear response (Farina 2000).
+    warnings: why and in which bands the calibration is not to be trusted. created: ISO date. source: what it was made from.
+    Raises ProfileError where a field has the wrong shape or type, is not finite or out of range.
+    """
+
+    echo: EchoModel
+    delay: float
+    response: Samples
+    noise_psd: Samples
+    band_hz: Array
+    band_snr_db: Array
+    distortion_db: Array
+    sample_rate: int = SAMPLE_RATE
+    warnings: tuple[str, ...] = ()
+    created: str = ""
+    source: str = ""
+
+    def __post_init__(self) -> None:
+        _check_arrays(self)
+        _check_numbers(self)
+
+    def save(self, path: str | Path) -> None:
+        """Write one .npz atomically: the file at path is the old one or the whole new one, also on a full disk.
+
+        Raises ProfileError where it cannot be written.
+
+        >>> import tempfile
+        >>> flat, path = np.ones(601, np.float32), np.zeros(6400, np.float32)
+        >>> path[PRE_ROLL] = 0.5
+        >>> bands = np.array([[900.0, 1100.0]])
+        >>> profile = Profile(EchoModel(path), 300.0, flat / 2, flat * 1e-9, bands, np.array([40.0]), np.full(4, -50.0))
+        >>> file = Path(tempfile.mkdtemp()) / "robot.npz"
+        >>> profile.save(file)
+        >>> Profile.load(file).delay
+        300.0
+        """
+        arrays = {name: np.asarray(getattr(self, name)) for name in _ARRAYS}
+        arrays["impulse_response"] = np.asarray(self.echo.impulse_response)
+        header = {
+            "pre_roll": PRE_ROLL,
+            "delay": float(self.delay),
+            "sample_rate": int(self.sample_rate),
+            "warnings": list(self.warnings),
+            "created": self.created,
+            "source": self.source,
+        }
+        write_fields(Path(path), arrays, header, self.echo.effects)
+
+    @classmethod
+    def load(cls, path: str | Path) -> Profile:
+        """Read a profile that save() wrote; raises ProfileError, in one line, for any other file."""
+        arrays, header, effects = read_fields(Path(path))
+        try:
+            expected = {*_ARRAYS, "impulse_response"}, {"pre_roll", "delay", "sample_rate", "warnings", "created", "source"}
+            for found, names, kind in zip((arrays, header), expected, ("array", "header"), strict=True):
+                if set(found) != names:
+                    odd = ", ".join(sorted(names - set(found))) or "nothing"
+                    extra = ", ".join(sorted(name[:40] for name in set(found) - names)) or "nothing"
+                    raise ProfileError(f"{kind} fields missing: {odd}; unknown: {extra}; {REMEDY}")
+            pre_roll = header.pop("pre_roll")
+            if pre_roll != PRE_ROLL:
+                raise ProfileError(f"pre_roll is {str(pre_roll)[:80]}, expected {PRE_ROLL} samples; {REMEDY}")
+            warnings = header.pop("warnings")
+            if not isinstance(warnings, list):
+                raise ProfileError(f"warnings is a JSON {type(warnings).__name__}, expected a list of texts; {REMEDY}")
+            for name, _ in effects:
+                if name not in known_effects():
+                    raise ProfileError(f"holds the effect '{name[:40]}', which does not come with edgefilter; load its file (--effects FILE.py)")
+            return cls(echo=EchoModel(arrays.pop("impulse_response"), effects), warnings=tuple(warnings), **arrays, **header)
+        except ProfileError as error:
+            raise ProfileError(f"{path}: {error}") from None
+
+    def with_impulse_response(self, impulse_response: Samples) -> Profile:
+        """The same robot with another path (taps,) float32, for example the one that the running filter has adapted."""
+        return replace(self, echo=replace(self.echo, impulse_response=impulse_response))
+
+    def with_echo(self, echo: EchoModel) -> Profile:
+        """The same robot with another model of its own voice, for example one with an effect added."""
+        return replace(self, echo=echo)
+
+    def noise_bins(self, stft: StftConfig) -> Samples:
+        """Expected |X|^2 (bins,) float32 of the fan in one frame of stft: PSD / 2 * sample rate * sum of the squared window."""
+        psd = np.interp(stft.frequencies, GRID_HZ, self.noise_psd)
+        return (psd / 2 * SAMPLE_RATE * stft.noise_gain()).astype(np.float32)
+
+    def response_bins(self, stft: StftConfig) -> Samples:
+        """The paper's |H_m(f) H_s(f)| (bins,) float32 at the frequencies of stft; the stored values where n_fft is 1200."""
+        return np.interp(stft.frequencies, GRID_HZ, self.response).astype(np.float32)
+
+
+def _fail(name: str, found: object, expected: str) -> None:
+    raise ProfileError(f"{name} is {str(found)[:80]}, expected {expected}; {REMEDY}")
+
+
+def _check_arrays(profile: Profile) -> None:
+    """Raise ProfileError at the first array that no calibration would have written: (shape, dtype, lowest, highest)."""
+    taps = np.asarray(profile.echo.impulse_response).shape
+    bands = np.asarray(profile.band_snr_db).shape
+    rules = {
+        "impulse_response": (taps, np.float32, -1e3, 1e3),
+        "response": ((GRID_BINS,), np.float32, 0.0, 1e6),
+        "noise_psd": ((GRID_BINS,), np.float32, 0.0, 1.0),
+        "band_hz": ((*bands, 2), np.float64, 0.0, SAMPLE_RATE / 2),
+        "band_snr_db": (bands, np.float64, -300.0, 300.0),
+        "distortion_db": ((len(DISTORTION_ORDERS),), np.float64, -300.0, 300.0),
+    }
+    if len(taps) != 1 or not 2 * PRE_ROLL <= taps[0] <= MAX_TAPS:
+        _fail("impulse_response", f"of shape {taps}", f"({2 * PRE_ROLL} to {MAX_TAPS},)")
+    if len(bands) != 1 or bands[0] > 100:
+        _fail("band_snr_db", f"of shape {bands}", "(number of bands,)")
+    for name, (shape, dtype, low, high) in rules.items():
+        value = np.asarray(profile.echo.impulse_response if name == "impulse_response" else getattr(profile, name))
+        if value.shape != shape or value.dtype != dtype:
+            _fail(name, f"{value.dtype} of shape {value.shape}", f"{np.dtype(dtype)} of shape {shape}")
+        wrong = ~((value >= low) & (value <= high))
+        if wrong.any():
+            at = int(np.argmax(wrong))
+            _fail(name, f"{value.ravel()[at]:g} at position {at}", f"{low:g} to {high:g}")
+
+
+def _check_numbers(profile: Profile) -> None:
+    """Raise ProfileError for a header value of the wrong type or out of range."""
+    if isinstance(profile.sample_rate, bool) or profile.sample_rate != SAMPLE_RATE:
+        _fail("sample_rate", repr(profile.sample_rate), f"{SAMPLE_RATE} Hz")
+    if isinstance(profile.delay, bool) or not isinstance(profile.delay, int | float | np.number) or not abs(profile.delay) <= MAX_DELAY:
+        _fail("delay", repr(profile.delay), f"-{MAX_DELAY} to {MAX_DELAY} samples")
+    for name in ("created", "source"):
+        if not isinstance(getattr(profile, name), str):
+            _fail(name, type(getattr(profile, name)).__name__, "a text")
+    if not all(isinstance(text, str) for text in profile.warnings):
+        _fail("warnings", "not all texts", "texts")

@@ -1,0 +1,55 @@
+"""A profile in words and figures, for the terminal."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from edgefilter.profile.data import DISTORTION_ORDERS, Profile
+from edgefilter.types import PRE_ROLL, SAMPLE_RATE, Array, Samples
+
+HIDDEN_DB = -99.0
+"""Distortion at or below this was not above the fan."""
+
+
+def describe(profile: Profile) -> str:
+    """Lines of text: path, decay, fan, distortion, a bar for each band's signal-to-noise ratio, effects, warnings."""
+    path = profile.echo.impulse_response
+    fan = 10 * np.log10(max(float(profile.noise_psd.sum()) * SAMPLE_RATE / 1200, 1e-20))
+    distortion = ", ".join(
+        f"{order}: {'below the fan' if level <= HIDDEN_DB else f'{level:.1f} dB'}"
+        for order, level in zip(DISTORTION_ORDERS, profile.distortion_db, strict=True)
+    )
+    lines = [
+        f"made        {profile.created or 'date unknown'}" + (f" from {profile.source}" if profile.source else ""),
+        f"path        {path.size} taps ({1000 * path.size / SAMPLE_RATE:.0f} ms), direct sound at {profile.delay:.0f} samples "
+        f"({1000 * profile.delay / SAMPLE_RATE:.1f} ms), gain {_gain_db(path):.1f} dB",
+        f"decay       {_decay(path)}",
+        f"fan         {fan:.1f} dB of full scale",
+        f"distortion  orders {distortion}",
+        "signal-to-noise ratio of the sweep, by third octave",
+        *(_band_line(edges, float(snr)) for edges, snr in zip(profile.band_hz, profile.band_snr_db, strict=True)),
+    ]
+    for name, values in profile.echo.effects:
+        figures = ", ".join(f"{key} = array {value.shape}" if np.ndim(value) else f"{key} = {value}" for key, value in values.items())
+        lines.append(f"effect      {name}: {figures}")
+    lines.extend(f"WARNING     {text}" for text in profile.warnings)
+    if not profile.warnings:
+        lines.append("trust       nothing doubtful found")
+    return "\n".join(lines)
+
+
+def _band_line(edges: Array, snr: float) -> str:
+    bar = "#" * int(np.clip(round(snr / 2), 0, 40))
+    return f"  {edges[0]:5.0f} - {edges[1]:4.0f} Hz {snr:6.1f} dB  {bar}".rstrip()
+
+
+def _gain_db(path: Samples) -> float:
+    return 10 * float(np.log10(max(np.sum(path.astype(np.float64) ** 2), 1e-20)))
+
+
+def _decay(path: Samples) -> str:
+    """Times at which the remaining energy (Schroeder 1965) has fallen by 10, 20 and 30 dB, counted from the direct sound."""
+    left = np.cumsum(path[::-1].astype(np.float64) ** 2)[::-1]
+    left = 10 * np.log10(np.maximum(left / max(left[0], 1e-30), 1e-20))
+    times = [(db, int(np.argmax(left < -db))) for db in (10, 20, 30) if left.min() < -db]
+    return ", ".join(f"-{db} dB after {1000 * max(n - PRE_ROLL, 0) / SAMPLE_RATE:.0f} ms" for db, n in times) or "less than 10 dB"

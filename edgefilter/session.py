@@ -1,0 +1,126 @@
+"""The main job: pull blocks from a source, filter them, push what is finished into a sink, and account for it."""
+
+from __future__ import annotations
+
+import resource
+import time
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from edgefilter.audio.files import Recorder
+from edgefilter.audio.protocols import Sink, Source
+from edgefilter.errors import EdgefilterError
+from edgefilter.filter.stream import EgoFilter
+from edgefilter.types import SAMPLE_RATE, Block, Event, Samples
+
+MOST_EVENTS = 1000
+"""Events that a report keeps, the latest ones."""
+
+
+@dataclass
+class Progress:
+    """What a display may show after each block."""
+
+    samples: int = 0
+    lost: int = 0
+    mic_db: float = -120.0
+    ref_db: float = -120.0
+    out_db: float = -120.0
+
+
+@dataclass
+class RunReport:
+    """What one run did; every figure measured in it."""
+
+    samples_in: int = 0
+    samples_out: int = 0
+    lost: int = 0
+    process_s: float = 0.0
+    wall_s: float = 0.0
+    interrupted: bool = False
+    failure: EdgefilterError | None = None
+    filter: dict[str, object] = field(default_factory=dict)
+    events: deque[Event] = field(default_factory=lambda: deque(maxlen=MOST_EVENTS))
+
+    def to_dict(self) -> dict[str, object]:
+        """Ready for JSON."""
+        seconds = self.samples_in / SAMPLE_RATE
+        return {
+            "schema": 1,
+            "seconds": seconds,
+            "samples_in": self.samples_in,
+            "samples_out": self.samples_out,
+            "samples_lost": self.lost,
+            "process_s": self.process_s,
+            "wall_s": self.wall_s,
+            "real_time_factor": self.process_s / seconds if seconds else None,
+            "peak_memory_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
+            "interrupted": self.interrupted,
+            "failure": str(self.failure) if self.failure else None,
+            "events": [{"kind": e.kind, "seconds": e.sample / SAMPLE_RATE, "detail": e.detail} for e in self.events],
+            **self.filter,
+        }
+
+
+def level_db(x: Samples) -> float:
+    """RMS level of x (n,) in dB of full scale; -120 for silence."""
+    return float(10 * np.log10(np.mean(np.square(x, dtype=np.float64)) + 1e-12)) if x.size else -120.0
+
+
+def filter_blocks(
+    source: Source,
+    ego: EgoFilter,
+    sink: Sink,
+    recorder: Recorder | None = None,
+    show: Callable[[Progress], None] = lambda progress: None,
+    stopped: Callable[[], bool] = lambda: False,
+    tell: Callable[[Event], None] = lambda event: None,
+) -> RunReport:
+    """Run ego over every block of source until it ends or stopped() says so; always flush into sink what was received.
+
+    A source or sink that fails on the way (a device that vanished, a truncated file, a full disk) ends the run: what was
+    received is filtered and flushed as far as the sink still takes it, and the error stands in report.failure.
+    show gets the levels after each block, tell what happened in the filter.
+    """
+    report, progress = RunReport(), Progress()
+    began = time.perf_counter()
+
+    def push(out: Samples) -> None:
+        sink.write(out)
+        report.samples_out += out.size
+        progress.out_db = level_db(out) if out.size else progress.out_db
+
+    def take(block: Block) -> None:
+        if recorder is not None:
+            recorder.write(block)
+        start = time.perf_counter()
+        out = ego.process(block.mic, block.ref)
+        report.process_s += time.perf_counter() - start
+        report.samples_in += block.mic.size
+        report.lost += block.lost
+        push(out)
+        for event in ego.events():
+            report.events.append(event)
+            tell(event)
+        progress.samples, progress.lost = report.samples_in, report.lost
+        progress.mic_db, progress.ref_db = level_db(block.mic), level_db(block.ref)
+        show(progress)
+
+    try:
+        for block in source:
+            take(block)
+            if stopped():
+                report.interrupted = True
+                break
+    except EdgefilterError as error:
+        report.failure = error
+    try:
+        push(ego.flush())
+    except EdgefilterError as error:  # a sink that failed before says so again; its first word is the reason
+        report.failure = report.failure or error
+    report.wall_s = time.perf_counter() - began
+    report.filter = ego.stats()
+    return report

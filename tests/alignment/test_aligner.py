@@ -1,0 +1,276 @@
+"""Alignment: each utterance's lag, drift, jumps, and nothing found where nothing is."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy import signal
+
+from bench.simulate.alignment_scene import HEAD, RATE, fan, hear, known_path, room, run, speech_like, utterances
+from edgefilter.alignment.aligner import CERTAIN_EARLY, Aligner
+from edgefilter.alignment.delay_line import Tape, read_delayed, read_line
+from edgefilter.alignment.delay_tracker import Measurement
+from edgefilter.alignment.jumps import JumpWitness
+from edgefilter.alignment.lag_search import Candidate, LagSearch
+from edgefilter.alignment.paper import PaperAligner, paper_lag
+from edgefilter.errors import SignalError
+from edgefilter.types import PRE_ROLL
+
+WITHIN = 0.3 * RATE  # the requirement: an utterance's lag is found within 300 ms of its onset at the microphone
+CLOSE = 16  # the requirement: +-1 ms
+
+
+def delays(hops):
+    return np.array([a.delay for a in hops])
+
+
+def time_to_align(hops, truth, arrival, hop):
+    """Samples from arrival to the first hop from which on the delay stays within CLOSE of the truth for 0.5 s."""
+    d, end = delays(hops), (np.arange(len(hops)) + 1) * hop - 1
+    good = np.abs(d - truth[end]) < CLOSE
+    for k in range(int(arrival // hop), len(hops)):
+        if good[k : k + RATE // 2 // hop].all():
+            return max(end[k] + 1 - arrival, 0)
+    return np.inf
+
+
+@pytest.mark.parametrize("hop", [256, 160])
+@pytest.mark.parametrize("profile", [True, False])
+def test_every_utterance_gets_its_own_lag_in_an_office_beside_a_human_as_loud(hop, profile):
+    rng = np.random.default_rng(hop + profile)
+    ref, onsets = utterances(rng, [3, 3, 2], [1.5, 2.2, 2.2])
+    lags = [4000, 900, 23500]
+    mic, truth = hear(ref, list(zip(onsets, lags, strict=True)), room(rng, 0.75))
+    human = speech_like(rng, mic.size / RATE)
+    human *= np.std(mic) / np.std(human)
+    mic = mic + human + fan(rng, mic.size)
+    aligner = Aligner(hop, known_path(room(rng, 0.25)) if profile else None)
+    hops = run(aligner, mic, ref)
+    for onset, lag in zip(onsets, lags, strict=True):
+        assert time_to_align(hops, truth, onset + lag + HEAD, hop) <= WITHIN
+
+
+@pytest.mark.parametrize("ppm", [300.0, -300.0])
+def test_drift_is_tracked_without_jitter(ppm):
+    rng = np.random.default_rng(5)
+    ref, onsets = utterances(rng, [12], [0.5])
+    mic, truth = hear(ref, [(0, 6000)], room(rng, 0.5), ppm)
+    hops = run(Aligner(256, known_path(room(rng, 0.25))), mic + fan(rng, mic.size), ref)
+    late = slice(len(hops) // 2, len(hops) - 40)
+    error = (delays(hops) - truth[255::256][: len(hops)])[late]
+    assert abs(hops[-1].ppm - ppm) < 3.0  # 3 ppm move the delay by 0.05 samples in a second, what jitter is allowed
+    assert np.std(error) < 0.05  # the requirement on jitter
+    assert abs(np.mean(error)) < 1.0  # a constant part of a sample is the canceller's to learn
+    assert not any(a.realigned for a in hops[late])
+
+
+@pytest.mark.parametrize("jump", [2, -5, 40, -160, 500, 1500, -2500])
+def test_dropped_buffers_are_healed_within_200_ms(jump):
+    rng = np.random.default_rng(abs(jump))
+    ref, _ = utterances(rng, [7], [0.5])
+    mic, truth = hear(ref, [(0, 6000)], room(rng, 0.5), 80.0)
+    at = int(4.0 * RATE) + 77
+    if jump < 0:
+        mic, truth = np.delete(mic, np.s_[at : at - jump]), np.delete(truth, np.s_[at : at - jump])
+    else:
+        mic, truth = np.insert(mic, at, np.zeros(jump, np.float32)), np.insert(truth, at, np.full(jump, np.nan))
+    truth[at:] += jump
+    hops = run(Aligner(256, known_path(room(rng, 0.25))), mic + fan(rng, mic.size), ref)
+    error = np.abs(delays(hops) - truth[255::256][: len(hops)])
+    limit = 0.2 if abs(jump) <= 1000 else 0.5  # those the tracker only sees once it has noticed the loss
+    healed = (at + int(limit * RATE)) // 256
+    assert np.all(error[healed : int(6.5 * RATE) // 256] < 1.0)  # a sample: less than the smallest jump
+    assert any(a.realigned for a in hops[at // 256 : healed + 1])
+
+
+@pytest.mark.parametrize("scene", ["silence", "human", "noise", "unheard robot and human", "gain and human in a pause"])
+def test_nothing_is_realigned_where_nothing_is_heard(scene):
+    rng = np.random.default_rng(11)
+    ref, _ = utterances(rng, [4], [8])
+    mic, _ = hear(ref, [(0, 5000)], room(rng, 0.5))
+    later = int(5.0 * RATE)
+    if scene == "human" or scene == "gain and human in a pause":
+        mic[later:] += (2.0 if scene == "human" else 0.1) * speech_like(rng, (mic.size - later) / RATE + 0.1)[: mic.size - later]
+    if scene == "noise":
+        mic[later:] += 0.3 * rng.standard_normal(mic.size - later).astype(np.float32)
+    if scene == "unheard robot and human":
+        ref[later : later + 4 * RATE] = speech_like(rng, 4)
+        mic[later:] += speech_like(rng, (mic.size - later) / RATE + 0.1)[: mic.size - later]
+    hops = run(Aligner(256), mic + fan(rng, mic.size), ref)
+    assert any(a.state == "locked" for a in hops)
+    assert not any(a.realigned for a in hops[later // 256 :])
+
+
+def test_a_human_who_for_a_moment_sounds_like_the_muted_robot_realigns_nothing():
+    rng = np.random.default_rng(12)
+    ref, _ = utterances(rng, [3, 4, 4], [2, 2, 2])
+    mic, _ = hear(ref, [(0, 5000)], room(rng, 0.5))
+    later = int(4.5 * RATE)
+    mic[later:] = 0.3 * speech_like(rng, (mic.size - later) / RATE + 0.1)[: mic.size - later]
+    for at, lag in ((int(7.5 * RATE), 14000), (int(13.5 * RATE), 2000)):
+        mic[at : at + 1600] = ref[at - lag : at - lag + 1600]  # 100 ms that agree entirely; searched alone, they are beyond doubt
+    hops = run(Aligner(256, known_path(room(rng, 0.25))), mic + fan(rng, mic.size), ref)
+    assert abs(hops[later // 256].delay - 5000 - HEAD) < 1.0  # the first utterance was heard
+    assert not any(a.realigned for a in hops[later // 256 :])
+
+
+def test_a_faint_agreement_while_the_robot_is_muted_is_no_jump():
+    rng = np.random.default_rng(14)
+    ref, _ = utterances(rng, [9], [0.5])
+    mic, _ = hear(ref, [(0, 5000)], room(rng, 0.3))
+    muted, faint = int(4.0 * RATE), 0.03 * np.std(mic) / np.std(ref)
+    mic[muted:] = 0.0
+    for at in range(muted + 4000, ref.size - 3000, 8000):
+        mic[at : at + 3000] = faint * ref[at - 5300 : at - 2300]  # 190 ms of the robot 300 samples late, but 30 dB below its voice
+    hops = run(Aligner(256, known_path(room(rng, 0.25))), mic + fan(rng, mic.size, 1e-4), ref)
+    assert abs(hops[muted // 256].delay - 5000 - HEAD) < 1.0
+    assert not any(a.realigned for a in hops[muted // 256 :])
+
+
+def test_a_missed_look_or_another_suspicion_does_not_undo_a_jump_that_is_seen_again():
+    look = Measurement(100.0, 0.01, 10.0, 1.6, 5.0, 0.5, 1.0, 1.0)
+    other = replace(look, offset=-300.0, strength=8.0, ratio=1.1)
+    witness = JumpWitness()
+    assert not witness.convinced(look) and not witness.convinced(other) and not witness.convinced(replace(look, strength=9.0))
+    assert witness.convinced(look)  # 16 of evidence, faded to 11 by the other look, and two more
+    witness.forget()
+    assert not witness.convinced(look)
+    assert not JumpWitness().convinced(replace(look, offset=5.0)) and JumpWitness().convinced(replace(look, offset=5.0, strength=13.0))
+
+
+def test_an_early_lag_that_chance_can_reach_has_to_be_found_twice_in_a_row():
+    aligner = Aligner(256)
+    aligner.step(np.zeros(256, np.float32), speech_like(np.random.default_rng(15), 1)[4000:4256])
+    doubtful = Candidate(lag=2000, strength=12.5, ratio=2.0, at=256, heard=1274)  # 25 of evidence; chance has reached 22
+    elsewhere, late = replace(doubtful, lag=2500), replace(doubtful, heard=5000)
+    assert not any(aligner._decide(found) for found in (doubtful, elsewhere, doubtful, late, late))
+    assert aligner._decide(replace(doubtful, lag=2001))
+    assert aligner.stats()["realignments"] == 1
+
+
+def test_no_step_of_a_search_comes_twice_in_a_hop():
+    rng = np.random.default_rng(13)
+    ref, _ = utterances(rng, [3, 3], [1.5, 1.5])
+    aligner, steps = Aligner(256), []
+    for name in ("prepare", "listen", "find", "before"):
+        inner = getattr(aligner._lags, name)
+        setattr(aligner._lags, name, lambda *given, name=name, inner=inner: (steps.append(name), inner(*given))[1])
+    counts = []
+    for at in range(0, ref.size - 255, 256):
+        aligner.step(fan(rng, 256), ref[at : at + 256])
+        counts.append(len(steps))
+    assert max(np.diff(counts)) == 1 and steps.count("find") > 50  # each costs one large transform or two
+
+
+def test_hard_cuts_of_two_windows_are_no_lag():
+    worst = 0.0
+    for seed in range(12):
+        mic, ref = Tape(50000), Tape(50000)
+        rumble = signal.lfilter([1.0], np.poly([0.995, 0.995]), np.random.default_rng(seed).standard_normal((2, 20000)))
+        mic.push((rumble[0] / np.std(rumble)).astype(np.float32))
+        ref.push((rumble[1] / np.std(rumble)).astype(np.float32))
+        search = LagSearch(25600)
+        search.prepare(ref, 20000, 17000)
+        search.listen(mic, 20000, 17500)
+        found = search.find()
+        worst = max(worst, found.strength * found.ratio if found else 0.0)
+    assert worst < 0.8 * CERTAIN_EARLY  # unrelated sounds; cut hard, their edges reach 51 and more
+
+
+def test_the_reference_is_withheld_while_the_old_delay_is_too_short():
+    rng = np.random.default_rng(3)
+    ref, onsets = utterances(rng, [3, 3], [1.0, 1.5])
+    mic, _ = hear(ref, list(zip(onsets, [1000, 16000], strict=True)), room(rng, 0.3))
+    hops = run(Aligner(256), mic + fan(rng, mic.size, 0.0005), ref)
+    delivered = np.concatenate([a.reference for a in hops])
+    early = delivered[onsets[1] + 1000 : onsets[1] + 15500]
+    heard = delivered[onsets[1] + 18000 : onsets[1] + 16000 + 40000]
+    assert np.mean(early**2) < 0.01 * np.mean(heard**2)  # 20 dB: the canceller must not bring in speech that is yet to come
+
+
+@pytest.mark.parametrize("hop", [256, 160])
+def test_delivered_reference_and_history_are_the_delayed_reference(hop):
+    rng = np.random.default_rng(4)
+    ref, _ = utterances(rng, [4], [0.5])
+    mic, _ = hear(ref, [(0, 3000)], np.array([0.0] * HEAD + [0.5]))
+    aligner = Aligner(hop)
+    hops = run(aligner, mic[: 3 * RATE // hop * hop], ref)
+    recent = np.concatenate([a.reference for a in hops])[-4000:]
+    history = aligner.history(4000)
+    wanted = ref[: 3 * RATE // hop * hop]
+    delay = int(3000 + HEAD - PRE_ROLL)
+    exact = wanted[wanted.size - 4000 - delay : wanted.size - delay]
+    scale = np.sqrt(np.mean(exact**2))
+    assert np.sqrt(np.mean((history - exact) ** 2)) < 0.05 * scale  # 0.02 samples of delay error turn 2 kHz by 1.6 %
+    assert np.sqrt(np.mean((history - recent) ** 2)) < 0.02 * scale  # both read the same line
+
+
+def test_announcing_what_the_reference_carries_changes_nothing_and_reset_starts_anew():
+    rng = np.random.default_rng(6)
+    ref, _ = utterances(rng, [2], [0.5])
+    mic, truth = hear(ref, [(0, 2000)], room(rng, 0.3))
+    mic.setflags(write=False)
+    ref.setflags(write=False)
+    plain = run(Aligner(256), mic, ref)
+    aligner = Aligner(256)
+    aligner.announce(ref)
+    told = run(aligner, mic, ref)
+    aligner.reset()
+    again = run(aligner, mic, ref)
+    for one, two, three in zip(plain, told, again, strict=True):
+        assert np.array_equal(one.reference, two.reference) and np.array_equal(one.reference, three.reference)
+    assert aligner.stats()["state"] in ("locked", "idle") and abs(aligner.stats()["delay_samples"] - truth[-1]) < 0.1  # the jitter of a locked delay is far below
+
+
+def test_paper_lag_of_a_recording_and_its_errors():
+    rng = np.random.default_rng(8)
+    voice = speech_like(rng, 2)
+    recording = np.concatenate((np.zeros(4321, np.float32), voice)) + fan(rng, 4321 + voice.size)
+    assert paper_lag(recording, voice) == 4321
+    with pytest.raises(SignalError, match="reference is silent"):
+        paper_lag(recording, np.zeros(16000, np.float32))
+    with pytest.raises(SignalError, match="recording has 100 samples"):
+        paper_lag(recording[:100], voice)
+
+
+@pytest.mark.parametrize("hop", [256, 160])
+def test_paper_aligner_decides_every_utterance(hop):
+    rng = np.random.default_rng(9)
+    ref, onsets = utterances(rng, [3, 3], [1.5, 2.5])
+    lags = [5000, 900]
+    mic, _ = hear(ref, list(zip(onsets, lags, strict=True)), room(rng, 0.25))
+    hops = run(PaperAligner(hop), mic + fan(rng, mic.size), ref)
+    for onset, lag in zip(onsets, lags, strict=True):
+        decided = hops[(onset + lag + 8000 + 2048 + 2 * hop) // hop]  # half a second, then the stride in which lags are judged
+        assert abs(decided.delay - lag - HEAD) < CLOSE
+    assert sum(a.realigned for a in hops) == 2
+
+
+def test_a_delay_line_delays_a_sine_by_a_moving_fraction():
+    tape, n = Tape(8000), np.arange(10000)
+    for frequency, allowed in ((1000, 1e-4), (5000, 3e-4), (6500, 3e-3)):  # float32 and the window's transition band at 7-8 kHz
+        tape = Tape(8000)
+        for at in range(0, 10000, 250):
+            tape.push(np.sin(2 * np.pi * frequency / RATE * n[at : at + 250]).astype(np.float32))
+        got = read_delayed(tape, 9500, 256, 1000.3, 1000.377)
+        position = 9500 - 256 + np.arange(256) - (1000.3 + 0.077 * np.arange(1, 257) / 256)
+        assert np.max(np.abs(got - np.sin(2 * np.pi * frequency / RATE * position))) < allowed
+        line = read_line(tape, 9500, 600, 1000.377, 0.077 / 256)
+        assert np.max(np.abs(line[-256:] - got)) < 1e-4  # their parabolas have other nodes; -80 dB
+
+
+def test_a_tape_is_silent_outside_what_it_holds():
+    tape = Tape(100)
+    tape.push(np.ones(60, np.float32))
+    assert tape.read(-10, 70).tolist() == [0.0] * 10 + [1.0] * 60 + [0.0] * 10
+    tape.push(np.full(60, 2, np.float32))
+    assert tape.read(10, 30).tolist() == [0.0] * 10 + [1.0] * 10
+
+
+@pytest.mark.parametrize("known", [1, 128, 300])
+def test_a_reference_shorter_than_its_fades_is_searched_too(known):
+    search, tape = LagSearch(24_000), Tape(60_000)
+    tape.push(np.random.default_rng(known).standard_normal(60_000).astype(np.float32))
+    search.prepare(tape, 60_000, 60_000 - known)
+    search.listen(tape, 60_000, 60_000 - known)
+    assert search.find() is None

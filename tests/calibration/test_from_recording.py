@@ -1,0 +1,86 @@
+"""Without a calibration: the path and the fan from the recording itself, on a simulated robot, and what must not be claimed then."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+import soundfile
+
+from edgefilter.calibration.from_recording import ABSORBED, find_drift, self_calibrate
+from edgefilter.cli import main
+from edgefilter.diagnosis.offset import shift
+from edgefilter.echo.model import EchoModel
+from edgefilter.errors import SignalError
+from tests.diagnosis.robot_scene import DELAY, FAN, path, record, voice
+
+RATE = 16000
+
+
+@pytest.fixture(scope="module")
+def said():
+    return voice(10.0)
+
+
+@pytest.fixture(scope="module")
+def alone(said):
+    return self_calibrate(record(said), said)
+
+
+def test_path_lag_and_fan_are_those_of_the_robot(said, alone):
+    assert alone.delay == DELAY
+    early = slice(0, 800)
+    error = alone.echo.impulse_response[early] - path()[early]
+    assert np.sum(error**2) < 0.01 * np.sum(path()[early] ** 2)
+    assert 10 * np.log10(np.mean(alone.noise_psd) / (FAN**2 / 8000)) == pytest.approx(0.0, abs=1.0)  # some 15 frames, the quieter half
+    assert "made from the recording" in alone.source and "cannot be told" in alone.warnings[0]
+
+
+def test_drift_is_found_and_sized(said):
+    drifting = record(said, EchoModel(path()).with_effect("clock_drift", {"ppm": -120.0}))
+    ppm, lag = find_drift(drifting, shift(said, DELAY - 10))
+    assert ppm == pytest.approx(-120.0, abs=6.0)  # 6 ppm: one sample in 10 s
+    assert lag == pytest.approx(10, abs=1)
+    assert find_drift(record(said), shift(said, DELAY))[0] == 0.0
+
+
+def test_a_talker_is_said_and_bends_the_path_little(said, alone):
+    talk = voice(10.0, seed=77) * (np.arange(said.size) > 6 * RATE)
+    made = self_calibrate(record(said) + talk, said)
+    (told,) = [text for text in made.warnings if "human talks" in text]
+    assert "6." in told.split(" at ")[1]
+    error = made.echo.impulse_response[:800] - path()[:800]
+    assert np.sum(error**2) < 0.05 * np.sum(path()[:800] ** 2)
+    assert not any("human talks" in text for text in alone.warnings)
+
+
+def test_without_a_robot_it_is_one_line(said):
+    with pytest.raises(SignalError, match="no robot in it to learn from"):
+        self_calibrate(voice(10.0, seed=5), said)
+    with pytest.raises(SignalError, match="does a human talk nearly all the time"):
+        self_calibrate(0.1 * record(said) + voice(10.0, seed=5), said)
+
+
+def test_what_is_stationary_is_not_claimed_and_what_moves_is(tmp_path, said, capsys):
+    said = said[: 6 * RATE]
+    changed = EchoModel(path()).with_effect("playback_gain", {"gain_db": 6.0}).with_effect("clock_drift", {"ppm": -120.0})
+    soundfile.write(tmp_path / "ref.wav", said, RATE, "FLOAT")
+    soundfile.write(tmp_path / "mic.wav", record(said, changed), RATE, "FLOAT")
+    files = ["--recording", str(tmp_path / "mic.wav"), "--reference", str(tmp_path / "ref.wav")]
+    assert main(["compare", *files]) == 0
+    assert "cannot be told" in capsys.readouterr().out
+    assert main(["diagnose", *files, "--json", "-", "--report", str(tmp_path / "d.html")]) == 0
+    told = json.loads(capsys.readouterr().out)
+    names = [entry["effect"] for entry in told["ranking"]]
+    assert names[0] == "clock_drift" and not set(names) & set(ABSORBED)
+    assert told["ranking"][0]["parameters"]["ppm"]["value"] == pytest.approx(-120.0, abs=5.0)
+    assert any("cannot be told" in text for text in told["warnings"])
+    page = (tmp_path / "d.html").read_text()
+    assert "none: the recording itself" in page and "besides what is stationary and linear" in page
+    assert "edgefilter</span> <span>calibrate" in page and "edgefilter</span> <span>add" not in page
+
+
+def test_add_needs_a_profile(tmp_path, capsys):
+    assert main(["add", "clock_drift", "--recording", "m.wav", "--reference", "r.wav", "--output", str(tmp_path / "p.npz")]) == 2
+    assert "--profile" in capsys.readouterr().err

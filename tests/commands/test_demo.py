@@ -1,0 +1,41 @@
+"""The demo as a newcomer runs it."""
+
+import json
+import subprocess
+import sys
+
+import pytest
+import soundfile
+
+from edgefilter.filter.stream import EgoFilter
+
+
+@pytest.fixture(scope="module")
+def demo(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("demo")
+    result = subprocess.run(
+        [sys.executable, "-m", "edgefilter.cli", "demo", "--output", folder, "--json", folder / "demo.json"], capture_output=True, text=True
+    )
+    assert result.returncode == 0, result.stderr
+    return folder, result.stdout
+
+
+def test_it_filters_the_bundled_recording_and_the_human_stands_out(demo):
+    folder, _ = demo
+    figures = json.loads((folder / "demo.json").read_text())
+    assert soundfile.info(folder / "filtered.wav").frames == soundfile.info(folder / "microphone.wav").frames == figures["samples_in"]
+    assert -27 < figures["si_sdr_before_db"] < -19  # the bundled recording is fixed; the robot is 20-26 dB above the human
+    assert figures["si_sdr_after_db"] > 0  # more than 20 dB better; 5.8 dB when the recording was bundled
+
+
+def test_it_draws_before_and_after(demo):
+    from matplotlib import image
+
+    picture = image.imread(demo[0] / "before_after.png")
+    assert picture.shape[0] > 400 and picture.shape[1] > 600
+    assert picture[..., :3].std() > 0.1  # not an empty canvas
+
+
+def test_it_says_the_figures_and_that_they_are_simulated(demo):
+    text = demo[1]
+    assert "simulated" in text and "SI-SDR" in text and "of real time" in text and f"engine {EgoFilter().engine_name}" in text

@@ -1,0 +1,48 @@
+"""A small robot for tests of comparison and diagnosis: its profile, its voice with pauses, and recordings of it."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy import signal
+
+from edgefilter.diagnosis.offset import shift
+from edgefilter.echo.model import EchoModel
+from edgefilter.profile.data import Profile
+from edgefilter.types import PRE_ROLL
+
+FAN = 1e-3
+DELAY = 400.0
+
+
+def path(seed: int = 1) -> np.ndarray:
+    """(6400,) direct sound and a room of 0.2 s reverberation time, 20 dB below it."""
+    rng = np.random.default_rng(seed)
+    h = np.zeros(6400)
+    h[PRE_ROLL] = 0.5
+    tail = np.arange(6400 - PRE_ROLL - 60)
+    h[PRE_ROLL + 60 :] = 0.01 * rng.standard_normal(tail.size) * np.exp(-6.9 * tail / (0.2 * 16000))
+    return h.astype(np.float32)
+
+
+def profile(h: np.ndarray | None = None) -> Profile:
+    """The robot with that path and a white fan."""
+    bands = np.array([[900.0, 1100.0]])
+    psd = np.full(601, FAN**2 / 8000, np.float32)
+    return Profile(EchoModel(path() if h is None else h), DELAY, np.ones(601, np.float32), psd, bands, np.array([40.0]), np.full(4, -60.0))
+
+
+def voice(seconds: float = 8.0, seed: int = 0) -> np.ndarray:
+    """(n,) noise with the spectrum and the syllables of speech, a pause of 0.5 s every 2 s, peak about 0.5."""
+    rng = np.random.default_rng(seed)
+    n = round(seconds * 16000)
+    t = np.arange(n) / 16000
+    coloured = signal.lfilter([1.0], [1.0, -0.9], rng.standard_normal(n))
+    syllables = np.clip(np.interp(t, knots := np.arange(0, seconds + 1, 0.12), rng.uniform(-0.3, 1.0, knots.size)), 0.0, None)
+    return (0.06 * coloured * syllables * (t % 2.0 < 1.5)).astype(np.float32)
+
+
+def record(x: np.ndarray, model: EchoModel | None = None, lag: float = 0.0, seed: int = 3) -> np.ndarray:
+    """(n,) what the microphone hears of x through model (default: the calibrated path), lag samples later than in the calibration."""
+    model = EchoModel(path()) if model is None else model
+    clean = model.predict(shift(x, DELAY - PRE_ROLL + lag))
+    return clean + (FAN * np.random.default_rng(seed).standard_normal(x.size)).astype(np.float32)

@@ -1,0 +1,163 @@
+"""The whole loop on a small robot: what is hidden is named, nothing is named where nothing is, what is added lowers the error."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from scipy import signal
+
+from edgefilter.diagnosis.band_edge import band_edge
+from edgefilter.diagnosis.compare import compare
+from edgefilter.diagnosis.diagnose import Diagnosis, add, diagnose
+from edgefilter.diagnosis.offset import shift
+from edgefilter.diagnosis.prepare import prepare
+from edgefilter.diagnosis.score import Judge, Verdict
+from edgefilter.diagnosis.suspects import SUSPECTS, choose
+from edgefilter.diagnosis.trials import Trial, Workbench
+from edgefilter.echo.model import EchoModel
+from edgefilter.types import PRE_ROLL
+from tests.diagnosis.robot_scene import DELAY, FAN, path, profile, record, voice
+
+SECONDS = 12.0
+
+
+def fan(seed: int = 3) -> np.ndarray:
+    return FAN * np.random.default_rng(seed).standard_normal(round(SECONDS * 16000))
+
+
+def echo(x: np.ndarray) -> np.ndarray:
+    return EchoModel(path()).predict(shift(x, DELAY - PRE_ROLL)).astype(float)
+
+
+def names(found: Diagnosis) -> list[str]:
+    return [finding.effect for finding in found.ranking]
+
+
+def test_nothing_is_missing_where_nothing_is_hidden() -> None:
+    x = voice(SECONDS)
+    # the ordinary: 0.1 dB of gain, a fan 0.4 dB up, a faint squared term 10 dB under the fan
+    recording = 1.0116 * echo(x) + 1.047 * fan() + 0.3 * FAN * np.clip(echo(x) ** 2 / np.std(echo(x) ** 2), -3, 3)
+    found = diagnose(profile(), recording.astype(np.float32), x)
+    assert (found.verdict, names(found), found.evidence) == ("explained", [], "")
+
+
+@pytest.mark.parametrize(
+    ("effect", "change"),
+    [
+        ("playback_gain", lambda x: echo(x) * 10 ** (-0.9 / 20)),
+        ("chassis_resonance", lambda x: echo(x) + 0.5 * signal.lfilter(*signal.iirpeak(700.0, 50.0, fs=16000), echo(x))),
+        ("bandlimit", lambda x: signal.sosfilt(signal.butter(5, 3400.0, fs=16000, output="sos"), echo(x))),
+        ("mic_clipping", lambda x: np.clip(echo(x), -0.06, 0.06)),
+        ("fan_noise", lambda x: echo(x) + 1.5 * signal.sosfilt(signal.butter(2, [300, 900], "band", fs=16000, output="sos"), fan(9)) * 2),
+    ],
+)
+def test_one_hidden_effect_is_named_alone_and_leaves_nothing(effect: str, change) -> None:
+    x = voice(SECONDS)
+    found = diagnose(profile(), (change(x) + fan()).astype(np.float32), x)
+    assert (found.verdict, names(found)) == ("missing", [effect])
+    assert found.remaining_db < 1.0  # the product's promise for linear effects and clipping
+    assert found.ranking[0].share > 0.6
+    for interval in found.ranking[0].parameters.values():
+        assert np.all(np.asarray(interval.low) <= np.asarray(interval.value)) and np.all(np.asarray(interval.value) <= np.asarray(interval.high))
+
+
+def test_two_effects_at_once_are_both_found() -> None:
+    x = voice(SECONDS)
+    clipped = np.clip(echo(x) + 0.6 * signal.lfilter(*signal.iirpeak(1200.0, 30.0, fs=16000), echo(x)), -0.06, 0.06)
+    found = diagnose(profile(), (clipped + fan()).astype(np.float32), x)
+    assert sorted(names(found)) == ["chassis_resonance", "mic_clipping"]
+    assert found.remaining_db < 1.0
+
+
+def test_a_turned_volume_is_found_beside_a_fan_that_hides_it() -> None:
+    x = voice(SECONDS)
+    louder = 2.0 * signal.sosfilt(signal.butter(2, [300, 900], "band", fs=16000, output="sos"), fan(9)) * 2
+    found = diagnose(profile(), (0.8 * echo(x) + fan() + louder).astype(np.float32), x)
+    assert (found.verdict, sorted(names(found))) == ("missing", ["fan_noise", "playback_gain"])
+    assert found.remaining_db < 0.5
+
+
+def test_things_that_slam_now_and_then_are_no_fan() -> None:
+    x = voice(SECONDS)
+    slams = np.zeros(x.size)
+    for at in (1.6, 3.7, 9.65):
+        part = slams[round(at * 16000) :][:3200]
+        part += 40 * FAN * np.random.default_rng(round(at)).standard_normal(part.size) * np.exp(-np.arange(part.size) / 500)
+    found = diagnose(profile(), (echo(x) + fan() + slams).astype(np.float32), x)
+    assert "fan_noise" not in names(found) and found.verdict == "unexplained"
+
+
+def test_mains_hum_is_not_an_effect_and_is_described() -> None:
+    x = voice(SECONDS)
+    t = np.arange(x.size) / 16000
+    hum = sum(3 * FAN / k * np.sin(2 * np.pi * 50 * k * t + k) for k in (1, 3, 5, 7))
+    found = diagnose(profile(), (echo(x) + fan() + hum).astype(np.float32), x)
+    assert (found.verdict, names(found)) == ("unexplained", [])
+    assert "multiples of 50 Hz" in found.evidence and "silent" in found.evidence
+
+
+def test_what_no_effect_makes_is_unexplained() -> None:
+    x = voice(SECONDS)
+    ring = echo(x) * (1.0 + 0.15 * np.sin(2 * np.pi * 170 * np.arange(x.size) / 16000))
+    found = diagnose(profile(), (ring + fan()).astype(np.float32), x)
+    assert (found.verdict, names(found)) == ("unexplained", [])
+    assert "follows the robot's voice" in found.evidence
+
+
+def test_a_band_limit_shows_in_the_power_where_a_codecs_noise_hides_it() -> None:
+    x, low = voice(SECONDS), signal.butter(12, 4000.0, fs=16000, output="sos")
+    passed = signal.sosfiltfilt(low, echo(x))
+    noise = signal.sosfiltfilt(low, 0.3 * passed * np.random.default_rng(5).standard_normal(x.size))
+    found = diagnose(profile(), (passed + noise + fan()).astype(np.float32), x)
+    assert (found.verdict, names(found)) == ("unexplained", ["bandlimit"])
+    assert found.ranking[0].parameters["cutoff_hz"].value == pytest.approx(4000.0, rel=0.15)  # edges of bands a sixth of an octave wide
+    assert "codec" in found.evidence
+
+
+def test_a_band_edge_is_not_seen_where_the_volume_was_turned() -> None:
+    x = voice(SECONDS)
+    judge = Judge(prepare(profile(), (0.4 * echo(x) + fan()).astype(np.float32), x))
+    assert band_edge(judge, judge.prepared.prediction) is None
+
+
+def test_an_added_effect_lowers_the_error_of_another_recording() -> None:
+    x, other = voice(SECONDS), voice(8.0, seed=21)
+    robot = EchoModel(path()).with_effect("chassis_resonance", {"frequency_hz": 640.0, "q": 35.0, "gain_db": -2.0})
+    knowing, before, after = add(profile(), "chassis_resonance", record(x, robot), x)
+    assert after.excess_db < 0.5 < 3.0 < before.excess_db
+    recording = record(other, robot, seed=22)
+    assert compare(knowing, recording, other).excess_db < 0.5 < compare(profile(), recording, other).excess_db - 2.0
+
+
+def test_the_dictionary_has_the_published_keys_and_is_json() -> None:
+    x = voice(SECONDS)
+    found = diagnose(profile(), (echo(x) * 0.9 + fan()).astype(np.float32), x)
+    said = json.loads(json.dumps(found.to_dict(), allow_nan=False))
+    assert said["schema"] == 1 and set(said["where"]) == {"bands", "times", "levels", "lags"}
+    entry = said["ranking"][0]
+    assert set(entry) == {"effect", "excess_before_db", "excess_after_db", "share", "parameters", "evidence"}
+    assert entry["parameters"]["gain_db"]["value"] == pytest.approx(-0.915, abs=0.05)
+
+
+def test_no_effect_is_chosen_where_none_lowers_the_level():
+    assert choose({}) is None and choose({"rattle": -0.2, "playback_gain": -0.1}) is None
+    assert choose({"playback_gain": 0.9, "late_reverb": 1.0}) == "playback_gain"
+
+
+def verdict(active_db: float, fitted_db: float) -> Verdict:
+    return Verdict(active_db, active_db, active_db, 0.0, fitted_db, 0.0, np.ones((4, 4)), np.zeros(16000, np.float32))
+
+
+@pytest.mark.parametrize("fitted_db, stands", [(0.1, True), (-1.5, False)])
+def test_knocks_that_are_missing_where_a_filter_was_fitted_are_that_filters_error(fitted_db, stands):
+    assert SUSPECTS["rattle"].guard({}, None, verdict(5.0, 1.0), verdict(2.0, fitted_db)) is stands
+
+
+@pytest.mark.parametrize("name, fitted_db, halved", [("speaker_nonlinearity", 0.5, True), ("speaker_nonlinearity", 2.0, False), ("late_reverb", 0.5, False)])
+def test_half_of_what_a_long_filter_leaves_where_it_was_fitted_is_enough(name, fitted_db, halved):
+    found = prepare(profile(), record(voice(4.0)), voice(4.0))
+    bench, model = Workbench(found), EchoModel(path())
+    bench.verdict = lambda asked: verdict(6.0, 2.5)
+    assert bench.halves(Trial(name, {}, model, verdict(5.0, fitted_db), 0.5, 3.0), model) is halved

@@ -1,0 +1,130 @@
+"""Effects of the path: each found again in a recording that was made by other means than the fit uses."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy import signal
+
+from edgefilter.diagnosis.offset import shift
+from edgefilter.diagnosis.prepare import prepare
+from edgefilter.echo.effect import Measurement, find
+from edgefilter.echo.effects.late_reverb import EXPECTED, LEAD
+from edgefilter.echo.model import EchoModel
+from edgefilter.echo.wiener import convolve_from, fit_filter
+from edgefilter.types import PRE_ROLL
+from tests.diagnosis.robot_scene import DELAY, FAN, path, profile, record, voice
+
+
+def measure(recording: np.ndarray, x: np.ndarray) -> Measurement:
+    psd = np.full(601, FAN**2 / 8000, np.float32)
+    fit = np.arange(x.size) // 8000 % 2 == 0
+    return Measurement(shift(x, DELAY - PRE_ROLL), recording.astype(np.float32), psd, fit)
+
+
+def excess_db(name: str, measurement: Measurement) -> tuple[float, dict]:
+    model = EchoModel(path()).fit(name, measurement)
+    white = measurement.whiten(measurement.recording - model.predict(measurement.reference))[~measurement.fit]
+    return 10 * np.log10(np.mean(white.astype(float) ** 2)), dict(dict(model.effects)[name])
+
+
+def test_the_long_filter_is_the_least_squares_one() -> None:
+    rng = np.random.default_rng(0)
+    x, h = rng.standard_normal(3000).astype(np.float32), rng.standard_normal(20)
+    y = np.convolve(x, h)[4 : 4 + x.size].astype(np.float32) + 0.1 * rng.standard_normal(x.size).astype(np.float32)
+    weights = (np.arange(x.size) // 500 % 2).astype(np.float32)
+    columns = np.stack([np.concatenate((np.zeros(24), x, np.zeros(24)))[24 + 4 - k : 24 + 4 - k + x.size] for k in range(20)], axis=1)
+    expected = np.linalg.lstsq(columns * weights[:, None], y * weights, rcond=None)[0]
+    np.testing.assert_allclose(fit_filter(x, y, weights, 20, 4, steps=40), expected, atol=1e-4)  # single-precision transforms
+
+
+def in_an_office(seconds: float) -> Measurement:
+    """The robot in a room with a reverberation time of 0.5 s."""
+    rng, x = np.random.default_rng(4), voice(seconds)
+    t = np.arange(10_000)
+    room = np.pad(path(), (0, 6000))
+    room[PRE_ROLL + 160 : PRE_ROLL + 160 + t.size] += 0.012 * rng.standard_normal(t.size) * 10 ** (-3 * t / (0.5 * 16000))
+    clean = signal.fftconvolve(shift(x, DELAY - PRE_ROLL), room)[: x.size]
+    return measure(clean + FAN * rng.standard_normal(x.size), x)
+
+
+def test_late_reverberation_and_its_time_are_found() -> None:
+    left, values = excess_db("late_reverb", in_an_office(12.0))
+    assert left < 1.0  # the product's promise for linear effects
+    assert values["rt60_s"] == pytest.approx(0.5, rel=0.2)  # the calibrated tail of 0.2 s is in it as well
+
+
+def test_what_is_known_of_a_decaying_room_helps_where_little_was_heard() -> None:
+    office, model = in_an_office(6.0), EchoModel(path())
+    left, values = excess_db("late_reverb", office)
+    x = office.heard(model)[1]
+    flat = fit_filter(x, office.white_recording - x, office.weights, values["taps"].size, LEAD, prior=np.full(values["taps"].size, EXPECTED), steps=40)
+    with_flat = office.white_recording - x - convolve_from(x, flat, LEAD)
+    assert left < 10 * np.log10(np.mean(with_flat[~office.fit].astype(float) ** 2)) - 0.5
+
+
+def test_a_resonance_is_found_with_its_frequency_and_q() -> None:
+    rng, x = np.random.default_rng(5), voice(12.0)
+    clean = EchoModel(path()).predict(shift(x, DELAY - PRE_ROLL)).astype(float)
+    ringing = clean + 0.8 * signal.lfilter(*signal.iirpeak(820.0, 40.0, fs=16000), clean)
+    left, values = excess_db("chassis_resonance", measure(ringing + FAN * rng.standard_normal(x.size), x))
+    assert values["frequency_hz"] == pytest.approx(820.0, rel=0.005)
+    assert values["q"] == pytest.approx(40.0, rel=0.2)
+    assert left < 0.5
+
+
+def test_two_resonances_are_found_with_their_frequencies_loudest_first() -> None:
+    rng, x = np.random.default_rng(5), voice(12.0)
+    clean = EchoModel(path()).predict(shift(x, DELAY - PRE_ROLL)).astype(float)
+    ringing = clean + sum(gain * signal.lfilter(*signal.iirpeak(hz, 40.0, fs=16000), clean) for hz, gain in ((820.0, 0.5), (1900.0, 0.8)))
+    left, values = excess_db("chassis_resonance", measure(ringing + FAN * rng.standard_normal(x.size), x))
+    np.testing.assert_allclose(values["frequency_hz"], (1900.0, 820.0), rtol=0.005)
+    assert left < 0.5
+
+
+@pytest.mark.parametrize("filters", [signal.butter(6, 3000.0, fs=16000, output="sos"), signal.cheby1(8, 0.5, 5000.0, fs=16000, output="sos")])
+def test_a_low_pass_is_found_whatever_its_kind(filters: np.ndarray) -> None:
+    rng, x = np.random.default_rng(6), voice(12.0)
+    clean = signal.sosfilt(filters, EchoModel(path()).predict(shift(x, DELAY - PRE_ROLL)).astype(float))
+    recording = (clean + FAN * rng.standard_normal(x.size)).astype(np.float32)
+    left, values = excess_db("bandlimit", prepare(profile(), recording, x).measurement)  # takes out the filter's delay
+    hz, response = signal.sosfreqz(filters, 4096, fs=16000)
+    half_power = hz[np.flatnonzero(np.abs(response) > 0.707)[-1]]
+    assert values["cutoff_hz"] == pytest.approx(half_power, rel=0.15)  # a ripple filter is no Butterworth filter
+    assert left < 1.0
+
+
+def test_a_changed_path_is_found_with_its_time() -> None:
+    x = voice(16.0)
+    before, after = record(x), record(x, EchoModel(shift(path(seed=2), 0.4)))
+    left, values = excess_db("path_change", measure(np.where(np.arange(x.size) < 7.0 * 16000, before, after), x))
+    assert values["time_s"] == pytest.approx(7.0, abs=0.15)  # the next sound after it
+    assert left < 1.0
+
+
+def test_what_runs_is_the_path_with_its_stationary_effects() -> None:
+    x = voice(3.0)
+    model = EchoModel(path())
+    resonance = {"frequency_hz": 900.0, "q": 20.0, "gain_db": -3.0}
+    full = model.with_effect("chassis_resonance", resonance).with_effect("bandlimit", {"cutoff_hz": 4000.0, "order": 6.0, "phase": 1.0})
+    running = EchoModel(full.running_response()).predict(x)
+    whole = slice(0, x.size - PRE_ROLL)  # the low-pass rings ahead of sounds that the recording no longer holds
+    np.testing.assert_allclose(running[whole], full.predict(x)[whole], atol=2e-4 * np.abs(running).max())  # the ring is cut 80 dB down
+    assert model.running_response() is model.impulse_response
+    assert full.with_running_response(full.running_response()).effects == ()
+
+
+def test_the_new_path_runs_after_a_change() -> None:
+    taps = np.zeros(200)
+    taps[64] = 0.5
+    change = EchoModel(path()).with_effect("path_change", {"time_s": 9.0, "taps": taps})
+    np.testing.assert_allclose(change.running_response()[:6400], 1.5 * path(), atol=1e-6)
+    assert find("path_change").settled({"time_s": 1e6}) == {"time_s": 1e6}
+
+
+def test_reverberation_lengthens_the_running_filter() -> None:
+    taps = np.zeros(9000)
+    taps[8000] = 0.3
+    running = EchoModel(path()).with_effect("late_reverb", {"taps": taps, "rt60_s": 0.5, "level_db": -10.0}).running_response()
+    assert running.size > 8000 + PRE_ROLL - 32
+    assert profile(running).echo.impulse_response.size == running.size

@@ -1,0 +1,131 @@
+"""Effects of the user's own: a good file is one effect more, each kind of broken file is one line that says what is wrong."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from edgefilter.diagnosis.prepare import prepare
+from edgefilter.echo import effect, user_effects
+from edgefilter.echo.effect import Measurement, find, names
+from edgefilter.echo.user_effects import load_effect
+from edgefilter.errors import UsageError
+from tests.diagnosis.robot_scene import profile, record, voice
+
+DOCUMENT = Path(__file__).parents[2] / "docs/own_effect.md"
+GOOD = """
+import numpy as np
+from edgefilter.echo.effect import Parameter
+
+class Tilt:
+    name = "tilt"
+    stage = "path"
+    memoryless = False
+    parameters = (Parameter("amount", "1", 0.0, -1.0, 1.0),)
+
+    def apply(self, x, values, sample_rate):
+        return (x + values["amount"] * np.append(0, x[:-1])).astype(np.float32)
+
+    def fit(self, measurement, model):
+        return {"amount": 0.5}
+"""
+
+
+@pytest.fixture(autouse=True)
+def own_registry(monkeypatch):
+    monkeypatch.setattr(effect, "_REGISTRY", dict(effect._REGISTRY))
+    monkeypatch.setattr(user_effects, "_loaded", {})
+
+
+@pytest.fixture
+def write(tmp_path):
+    def put(text: str, name: str = "mine.py") -> Path:
+        (tmp_path / name).write_text(text)
+        return tmp_path / name
+
+    return put
+
+
+def test_a_good_file_is_one_effect_more_and_loads_once(write):
+    path = write(GOOD)
+    assert load_effect(path) == "tilt" == load_effect(path)
+    assert "tilt" in names()
+    x = voice(2.0)
+    model = profile().echo
+    tilted = model.with_effect("tilt", {"amount": 0.5}).predict(x)
+    plain = model.predict(x)
+    np.testing.assert_allclose(tilted[1:], plain[1:] + 0.5 * plain[:-1], atol=1e-6)  # rounding of float32
+    assert model.fit("tilt", Measurement(x, tilted)).effects == (("tilt", {"amount": 0.5}),)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("class Tilt:", "class Tilt", "line 5 is not Python"),
+        ("import numpy as np", "import nunpy", "stops with ModuleNotFoundError: No module named 'nunpy'"),
+        ("import numpy as np", "raise SystemExit(3)", "stops with SystemExit: 3"),
+        ("class Tilt:", "class Other:\n    def apply(self): ...\nclass Tilt:", "found Other, Tilt"),
+        ("def apply", "def transform", "found none"),
+        ("memoryless = False", "", "class Tilt lacks memoryless"),
+        ('name = "tilt"', 'name = "clock_drift"', "'clock_drift' exists already"),
+        ('name = "tilt"', 'name = "my tilt"', "name is 'my tilt'"),
+        ('stage = "path"', 'stage = "room"', "stage is 'room', expected one of source"),
+        ('(Parameter("amount", "1", 0.0, -1.0, 1.0),)', '("amount",)', "not a tuple of Parameter"),
+        ('0.0, -1.0, 1.0', '3.0, -1.0, 1.0', "neutral amount=3 is outside"),
+        ('0.0, -1.0, 1.0', '0.5, -1.0, 1.0', "changes the signal at the neutral values"),
+        (".astype(np.float32)", "", "float64 of shape (4000,), expected finite float32"),
+        ("return (x +", "x[0] = 0; return (x +", "apply stops at line 12 with ValueError: assignment destination is read-only"),
+        ('parameters = (P', 'def __init__(self, depth): ...\n    parameters = (P', "Tilt() stops with TypeError"),
+    ],
+)
+def test_a_broken_file_is_one_line_and_registers_nothing(write, old, new, words):
+    before = names()
+    assert old in GOOD
+    path = write(GOOD.replace(old, new))
+    with pytest.raises(UsageError, match=re.escape(words)) as caught:
+        load_effect(path)
+    assert "\n" not in str(caught.value) and str(path) in str(caught.value)
+    assert names() == before
+
+
+def test_a_file_that_is_not_there_or_not_python_is_one_line(tmp_path, write):
+    with pytest.raises(UsageError, match="no such file"):
+        load_effect(tmp_path / "none.py")
+    with pytest.raises(UsageError, match="ends in .py"):
+        load_effect(write(GOOD, "mine.txt"))
+
+
+@pytest.mark.parametrize(
+    ("result", "words"),
+    [
+        ("None", "fit gives NoneType"),
+        ('{"much": 1.0}', "no parameter 'much'"),
+        ('{"amount": 7.0}', "expected -1 to 1"),
+        ("1 / 0", "fit stops at line 15 with ZeroDivisionError"),
+    ],
+)
+def test_a_fit_that_fails_is_one_line(write, result, words):
+    load_effect(write(GOOD.replace('{"amount": 0.5}', result)))
+    x = voice(1.0)
+    with pytest.raises(UsageError, match=words):
+        profile().echo.fit("tilt", Measurement(x, x))
+
+
+def documented_file(folder: Path) -> Path:
+    """The example of the documentation, as a file of the name that it says."""
+    (code,) = re.findall(r"```python\n(\"\"\"blade_chop.py.*?)```", DOCUMENT.read_text(), re.S)
+    (folder / "blade_chop.py").write_text(code)
+    return folder / "blade_chop.py"
+
+
+def test_the_documented_effect_finds_its_own_parameters(tmp_path):
+    load_effect(documented_file(tmp_path))
+    x, robot = voice(8.0), profile()
+    true = {"rate_hz": 23.0, "cosine": 0.12, "sine": -0.2}
+    prepared = prepare(robot, record(x, robot.echo.with_effect("blade_chop", true)), x)
+    found = find("blade_chop").fit(prepared.measurement, robot.echo)
+    assert found["rate_hz"] == pytest.approx(23.0, abs=1 / 32)  # the grid's step for 8 s
+    assert np.hypot(found["cosine"], found["sine"]) == pytest.approx(np.hypot(0.12, 0.2), rel=0.05)  # 8 s of a voice with pauses

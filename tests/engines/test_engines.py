@@ -1,0 +1,62 @@
+"""Every engine through the conformance suite, inside the real stream."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from edgefilter import engines
+from edgefilter.echo.model import EchoModel
+from edgefilter.errors import UsageError
+from edgefilter.filter.stream import EgoFilter, Stream, enhance
+from edgefilter.profile.data import Profile
+from edgefilter.types import PRE_ROLL
+from tests import conformance
+
+DATA = Path(__file__).parents[1] / "data"
+MODELS = {"crnn": DATA / "crnn.onnx", "paper-crnn": DATA / "paper_crnn.onnx"}
+"""Networks of the smallest size; tests/data/make_models.py makes them."""
+CASES = [(name, check) for name in engines.ENGINES for check in (conformance.CLIP_CHECKS if name == "paper-crnn" else conformance.CHECKS)]
+
+
+def robot() -> Profile:
+    """A profile that fits conformance.conversation: direct sound and a short decaying tail."""
+    rng = np.random.default_rng(0)
+    response = np.zeros(2048, np.float32)
+    response[PRE_ROLL : PRE_ROLL + 600] = 0.1 * rng.standard_normal(600) * np.exp(-np.arange(600) / 120)
+    response[PRE_ROLL] = 0.6
+    return Profile(
+        echo=EchoModel(response),
+        delay=900.0,
+        response=np.full(601, 0.6, np.float32),
+        noise_psd=np.full(601, 1e-10, np.float32),
+        band_hz=np.array([[100.0, 8000.0]]),
+        band_snr_db=np.array([40.0]),
+        distortion_db=np.full(4, -40.0),
+    )
+
+
+@pytest.mark.parametrize("name, check", CASES, ids=lambda value: getattr(value, "__name__", value))
+def test_engine_conforms(name, check):
+    profile = robot()
+    check(lambda: Stream(engines.create(name, profile, model=MODELS.get(name)), profile))
+
+
+def test_conformance_has_its_checks():
+    assert len(conformance.CHECKS) == 9 and len(conformance.CLIP_CHECKS) == 8
+
+
+def test_bypass_returns_its_input_from_the_first_sample():
+    mic, ref = conformance.conversation()
+    # 1e-6: float32 rounding of an FFT, its inverse and two windows, on samples below 1
+    np.testing.assert_allclose(enhance(mic, ref, engine="bypass"), mic, atol=1e-6)
+
+
+def test_an_unknown_engine_names_the_known_ones():
+    with pytest.raises(UsageError, match="unknown engine 'crn'.*linear.*bypass"):
+        EgoFilter(engine="crn")
+
+
+def test_paper_ss_asks_for_a_profile():
+    with pytest.raises(UsageError, match="paper-ss needs.*--profile"):
+        EgoFilter(engine="paper-ss")

@@ -1,0 +1,225 @@
+"""The neural engines load real files, run them as they should be run, and refuse every other file in one line."""
+
+import subprocess
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+import onnx
+import pytest
+import soundfile
+
+from edgefilter.engines import create, onnx_session
+from edgefilter.engines.crnn import Crnn
+from edgefilter.engines.paper_crnn import PaperCrnn
+from edgefilter.errors import ModelError, SignalError, UsageError
+from edgefilter.filter.stream import EgoFilter, Stream, enhance
+from edgefilter.types import Frame
+from tests import conformance
+
+DATA = Path(__file__).parents[1] / "data"
+EDGE, PAPER = DATA / "crnn.onnx", DATA / "paper_crnn.onnx"
+
+
+def changed(folder: Path, metadata: dict[str, str | None], source: Path = EDGE) -> Path:
+    """A copy of the model whose metadata says something else, or nothing where None."""
+    model = onnx.load(source)
+    kept = {entry.key: entry.value for entry in model.metadata_props} | metadata
+    del model.metadata_props[:]
+    onnx.helper.set_model_props(model, {key: value for key, value in kept.items() if value is not None})
+    path = folder / "changed.onnx"
+    onnx.save(model, path)
+    return path
+
+
+def spectrum(rng: np.random.Generator, bins: int) -> np.ndarray:
+    return (rng.standard_normal(bins) + 1j * rng.standard_normal(bins)).astype(np.complex64)
+
+
+def test_crnn_answers_what_onnxruntime_answers_for_the_same_frames():
+    engine = Crnn(EDGE, wiener_share=0.0)
+    session = onnx_session.open_session(EDGE)
+    rng = np.random.default_rng(0)
+    nothing = np.zeros(engine.stft.bins, np.float32)
+    state, theirs = engine.initial_state(), [np.zeros(shape, np.float32) for _, shape in engine.model.states]
+    for _ in range(5):
+        error, mic, reference, echo = (spectrum(rng, engine.stft.bins) for _ in range(4))
+        output, state = engine.step(Frame(mic=mic, reference=reference, echo=echo, error=error, noise_psd=nothing, residual_psd=nothing), state)
+        pairs = [np.stack((x.real, x.imag), axis=-1)[None] for x in (error, mic, reference, echo)]
+        found, probability, *theirs = session.run(None, dict(zip([slot.name for slot in session.get_inputs()], pairs + theirs)))
+        np.testing.assert_array_equal(output.spectrum, found[0, :, 0] + 1j * found[0, :, 1])
+        assert output.speech_probability == probability[0] and 0 < probability[0] < 1
+    assert any(tensor.any() for tensor in state[0])
+
+
+def test_streams_in_several_threads_share_an_engine_without_mixing():
+    engine = Crnn(EDGE)
+    sounds = [conformance.conversation(12000, seed=seed) for seed in range(4)]
+
+    def run(sound: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
+        stream = Stream(engine)
+        return np.concatenate([stream.process(sound[0][at : at + 256], sound[1][at : at + 256]) for at in range(0, 12000, 256)])
+
+    alone = [run(sound) for sound in sounds]
+    with ThreadPoolExecutor(4) as pool:
+        for wanted, found in zip(alone, pool.map(run, sounds)):
+            np.testing.assert_array_equal(found, wanted)
+
+
+def test_the_answer_is_half_the_networks_and_half_the_wiener_masks():
+    rng = np.random.default_rng(1)
+    bins = Crnn(EDGE).stft.bins
+    power = rng.random(bins).astype(np.float32)
+    frame = Frame(*(spectrum(rng, bins) for _ in range(4)), power, power)
+    network, wiener, both = (engine.step(frame, engine.initial_state())[0].spectrum for engine in (Crnn(EDGE, wiener_share=s) for s in (0.0, 1.0, 0.5)))
+    assert not np.allclose(network, wiener, atol=1e-3)
+    np.testing.assert_allclose(both, (network + wiener) / 2, atol=1e-6)
+
+
+def test_the_stream_tells_the_probability_of_speech():
+    mic, ref = conformance.conversation(4000)
+    ego = EgoFilter(engine="crnn", model=EDGE)
+    assert ego.speech_probability is None
+    ego.process(mic, np.zeros_like(ref))  # nobody but the human can be heard
+    assert 0 < ego.speech_probability < 1
+
+
+def test_stats_name_the_model_and_what_it_says_of_itself():
+    stats = EgoFilter(engine="crnn", model=EDGE).stats()
+    assert stats["model"] == {"file": str(EDGE), "training": {"data": "none: random weights", "seed": 0}, "figures": {}}
+    assert EgoFilter(engine="ss").stats()["model"] is None
+
+
+def test_one_thread_without_spinning_and_with_denormals_as_zero():
+    options = onnx_session.open_session(EDGE).get_session_options()
+    assert options.intra_op_num_threads == options.inter_op_num_threads == 1
+    assert options.get_session_config_entry("session.intra_op.allow_spinning") == "0"
+    assert options.get_session_config_entry("session.set_denormal_as_zero") == "1"
+
+
+@pytest.mark.parametrize(
+    "metadata, words",
+    [
+        ({"type": "edgefilter-paper-crnn"}, "type edgefilter-paper-crnn, expected edgefilter-crnn"),
+        ({"type": None}, "type unknown, expected edgefilter-crnn"),
+        ({"version": "2"}, "version 2, expected 1"),
+        ({"sample_rate": "48000"}, "sample_rate 48000, expected 16000"),
+        ({"hop": None}, "does not say its hop"),
+        ({"training": None}, "does not say its training"),
+        ({"hop": "many"}, "unusable metadata.*many"),
+        ({"hop": "512"}, "unusable metadata.*inverted"),
+        ({"n_fft": "1024"}, r"inputs .*error \[1, 257, 2\].*wants.*error \[1, 513, 2\]"),
+        ({"states": "[]"}, "inputs .*state_0"),
+        ({"states": '[["state_0", [1, 6, 9]], ["state_1", [1, 6, 256]], ["state_2", [2, 1, 6]]]'}, r"wants.*state_0 \[1, 6, 9\]"),
+        ({"states": "nonsense"}, "unusable metadata"),
+    ],
+)
+def test_a_model_that_does_not_fit_is_refused_in_one_line(tmp_path, metadata, words):
+    with pytest.raises(ModelError, match=words) as caught:
+        Crnn(changed(tmp_path, metadata))
+    assert "\n" not in str(caught.value)
+
+
+def test_a_file_that_is_no_model_is_refused(tmp_path):
+    (tmp_path / "text.onnx").write_text("this is not a model")
+    (tmp_path / "cut.onnx").write_bytes(EDGE.read_bytes()[:3000])
+    for name in ("text.onnx", "cut.onnx"):
+        with pytest.raises(ModelError, match="cannot be loaded"):
+            Crnn(tmp_path / name)
+
+
+def test_the_model_comes_from_the_option_then_the_variable_then_the_package(tmp_path, monkeypatch):
+    monkeypatch.setattr(onnx_session, "FOLDERS", (tmp_path / "models", tmp_path))
+    with pytest.raises(ModelError, match="no crnn_int8.onnx.*--model or EDGEFILTER_CRNN"):
+        Crnn()
+    (tmp_path / "crnn_int8.onnx").write_bytes(EDGE.read_bytes())
+    assert Crnn().model.path == tmp_path / "crnn_int8.onnx"
+    monkeypatch.setenv("EDGEFILTER_CRNN", str(EDGE))
+    assert Crnn().model.path == EDGE
+    assert Crnn(tmp_path / "crnn_int8.onnx").model.path == tmp_path / "crnn_int8.onnx"
+    monkeypatch.setenv("EDGEFILTER_CRNN", str(tmp_path / "gone.onnx"))
+    with pytest.raises(ModelError, match="gone.onnx, which EDGEFILTER_CRNN names, is no file"):
+        Crnn()
+
+
+def test_the_packages_int8_file_is_of_the_same_training_as_the_exact_one():
+    exact, used = Crnn(Path(__file__).parents[2] / "models/crnn.onnx").model, Crnn().model
+    assert used.path.name == "crnn_int8.onnx"
+    assert (used.training, used.figures, used.states, used.stft) == (exact.training, exact.figures, exact.states, exact.stft)
+
+
+def test_a_model_for_an_engine_without_one_is_a_mistake():
+    with pytest.raises(UsageError, match="engine ss has no network"):
+        create("ss", model=EDGE)
+
+
+def test_paper_crnn_without_a_model_says_how_to_make_one(monkeypatch):
+    monkeypatch.delenv("EDGEFILTER_PAPER_CRNN", raising=False)
+    with pytest.raises(ModelError, match="export.train --network paper.*export.onnx_export"):
+        PaperCrnn()
+
+
+def test_each_engine_refuses_the_others_model():
+    with pytest.raises(ModelError, match="type edgefilter-crnn, expected edgefilter-paper-crnn"):
+        PaperCrnn(EDGE)
+    with pytest.raises(ModelError, match="type edgefilter-paper-crnn, expected edgefilter-crnn"):
+        Crnn(PAPER)
+
+
+def test_paper_crnn_refuses_another_stft(tmp_path):
+    with pytest.raises(ModelError, match="hop=200.*expected.*hop=160"):
+        PaperCrnn(changed(tmp_path, {"hop": "200"}, PAPER))
+
+
+def test_paper_crnn_masks_the_mixtures_magnitude_and_keeps_its_phase():
+    engine = PaperCrnn(PAPER)
+    rng = np.random.default_rng(1)
+    bins = engine.stft.bins
+    mic, ref = (np.stack([spectrum(rng, bins) for _ in range(7)]) for _ in range(2))
+    nothing = np.zeros(bins, np.float32)
+    answer = np.stack(engine.answer([Frame(m, r, m, m, nothing, nothing) for m, r in zip(mic, ref)]))
+    mask = onnx_session.open_session(PAPER).run(None, {"mic_magnitude": np.abs(mic)[None], "reference_magnitude": np.abs(ref)[None]})[0][0]
+    assert mask.std() > 1e-4
+    np.testing.assert_array_equal(answer, mask * mic)
+
+
+def test_paper_crnn_refuses_a_recording_that_is_too_long_before_it_fills_the_memory():
+    engine = PaperCrnn(PAPER)
+    engine.longest = 100
+    stream = Stream(engine)
+    mic, ref = conformance.conversation(17_000)
+    with pytest.raises(SignalError, match="longer than 1 s.*paper-crnn"):
+        stream.process(mic, ref)
+    mic, ref = conformance.conversation(15_000)
+    assert enhance(mic, ref, engine="paper-crnn", model=PAPER).shape == mic.shape
+
+
+def test_the_command_line_takes_a_model_and_reports_it(tmp_path):
+    mic, ref = conformance.conversation()
+    soundfile.write(tmp_path / "mic.wav", mic, 16000, "FLOAT")
+    soundfile.write(tmp_path / "ref.wav", ref, 16000, "FLOAT")
+
+    def run(engine: str, model: Path) -> subprocess.CompletedProcess:
+        words = ["run", "--input", "mic.wav", "--reference", "ref.wav", "--engine", engine, "--model", str(model), "--output", "out.wav"]
+        return subprocess.run([sys.executable, "-m", "edgefilter.cli", *words], cwd=tmp_path, capture_output=True, text=True)
+
+    done = run("crnn", EDGE)
+    assert done.returncode == 0 and "algorithmic latency 32 ms" in done.stderr, done.stderr
+    np.testing.assert_allclose(soundfile.read(tmp_path / "out.wav")[0], enhance(mic, ref, engine="crnn", model=EDGE), atol=2**-15)
+    done = run("paper-crnn", PAPER)
+    assert done.returncode == 0 and "answers at the end of the recording" in done.stderr, done.stderr
+    refused = run("crnn", PAPER)
+    assert refused.returncode == 1 and refused.stderr.count("\n") == 1 and "expected edgefilter-crnn" in refused.stderr
+
+
+def test_a_model_needs_its_engine_named():
+    with pytest.raises(UsageError, match="without an engine for it: name one of crnn, paper-crnn"):
+        EgoFilter(model=EDGE)
+
+
+def test_a_budget_does_not_replace_an_engine_that_waits_for_the_end():
+    mic, ref = conformance.conversation(8000)
+    ego = EgoFilter(engine="paper-crnn", model=PAPER, budget_ms=0.001)
+    assert ego.waits_for_end and ego.process(mic, ref).size == 0 and ego.flush().shape == mic.shape
+    assert ego.stats()["latency_ms"] is None

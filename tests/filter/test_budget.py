@@ -1,0 +1,238 @@
+"""The measured choice: best first, the first that fits, remembered for this machine; and honest words where nothing fits."""
+
+import json
+import os
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from edgefilter.engines.bypass import Bypass
+from edgefilter.engines.spectral_subtraction import SpectralSubtraction
+from edgefilter.errors import UsageError
+from edgefilter.filter import budget, budget_cache
+from edgefilter.filter.budget import Figures, choose, fits, held_to, measure, pace
+from edgefilter.filter.stream import Stream
+from edgefilter.profile.data import Profile
+
+DEMO = budget.SCENE
+
+
+@pytest.fixture(autouse=True)
+def cache(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.setenv("LOCALAPPDATA", str(tmp_path / "cache"))
+    return budget_cache.folder()
+
+
+@pytest.fixture
+def measured(monkeypatch):
+    """Engines as slow as this says, p99 in ms; the list of those that were measured."""
+    speeds = {"ss": 6.0, "linear": 2.0, "bypass": 0.1}
+    asked = []
+
+    def pretend(engine, profile):
+        asked.append(engine.name)
+        p99 = speeds[engine.name]
+        return Figures(engine.name, budget._model(engine), 16.0, 300, p99 < 16.0, p99 / 3, p99 / 2, p99, 2 * p99, p99 / 4, p99 / 3)
+
+    monkeypatch.setattr(budget, "measure", pretend)
+    return speeds, asked
+
+
+LADDER = ("ss", "linear", "bypass")
+
+
+@pytest.mark.parametrize(
+    ("budget_ms", "engine", "asked"), [(8.0, "ss", ["ss"]), (6.0, "ss", ["ss"]), (5.9, "linear", ["ss", "linear"]), (1.0, "bypass", list(LADDER))]
+)
+def test_the_best_engine_that_fits_is_taken_and_no_further_one_is_measured(measured, budget_ms, engine, asked):
+    choice = choose(budget_ms, candidates=LADDER)
+    assert (choice.engine, choice.fits, measured[1]) == (engine, True, asked)
+    assert choice.to_dict()["figures"][-1]["paced_p99_ms"] <= budget_ms
+    assert f"within {budget_ms:g} ms" in choice.reason and f"{choice.figures[-1].paced_p99_ms:.1f} ms" in choice.reason
+    for beaten in asked[:-1]:
+        assert f"{beaten} needs {measured[0][beaten]:.1f} ms" in choice.reason
+    json.dumps(choice.to_dict())
+
+
+def test_nothing_fits_takes_the_cheapest_and_says_what_would_help(measured):
+    choice = choose(0.05, candidates=("ss", "linear"))
+    assert (choice.engine, choice.fits) == ("linear", False)
+    assert "no engine keeps to 0.05 ms" in choice.reason and "--budget-ms 2" in choice.reason and "free core" in choice.reason
+    assert "\n" not in choice.reason
+
+
+def test_an_engine_that_cannot_keep_up_never_fits(measured):
+    measured[0].update(ss=50.0, linear=40.0)
+    choice = choose(1000.0, candidates=("ss", "linear"))
+    assert not choice.fits and choice.engine == "linear" and "faster processor" in choice.reason
+
+
+def test_an_engine_that_cannot_be_made_is_skipped_and_named(measured):
+    choice = choose(8.0, candidates=("paper-ss", "linear"))
+    assert choice.engine == "linear" and list(choice.skipped) == ["paper-ss"] and "paper-ss cannot be used" in choice.reason
+    with pytest.raises(UsageError, match="no engine can be made: paper-ss"):
+        choose(8.0, candidates=("paper-ss",))
+
+
+def test_figures_are_remembered_for_the_same_path_only(measured):
+    _, asked = measured
+    profile = Profile.load(DEMO / "profile.npz")
+    first = choose(8.0, profile, LADDER)
+    again = choose(8.0, profile, LADDER)
+    assert asked == ["ss"] and not first.remembered and again.remembered and again.figures == first.figures
+    assert "--remeasure" in again.reason
+    assert choose(3.0, profile, LADDER).engine == "linear" and asked == ["ss", "linear"]  # only what is missing
+    assert choose(3.0, profile, LADDER).remembered
+    longer = profile.with_impulse_response(np.pad(profile.echo.impulse_response, (0, 256)))
+    choose(8.0, longer, LADDER)
+    choose(8.0, None, LADDER)
+    assert asked == ["ss", "linear", "ss", "ss"]
+    budget_cache.forget()
+    assert not choose(8.0, profile, LADDER).remembered and asked[-1] == "ss"
+
+
+def test_another_machine_or_version_is_measured_again(measured, monkeypatch):
+    choose(8.0, candidates=LADDER)
+    for name, other in (("processor", lambda: "another processor"), ("version", lambda package: "99")):
+        with monkeypatch.context() as changed:
+            changed.setattr(budget_cache, name, other)
+            assert not choose(8.0, candidates=LADDER).remembered, name
+    assert choose(8.0, candidates=LADDER).remembered
+
+
+def test_another_model_file_is_measured_again(measured, monkeypatch, tmp_path):
+    """The engine says which file it runs; its bytes count, not its name."""
+    file = tmp_path / "crnn.onnx"
+    file.write_bytes(b"weights")
+    monkeypatch.setattr(SpectralSubtraction, "model", SimpleNamespace(path=file), raising=False)
+    assert not choose(8.0, candidates=LADDER).remembered and choose(8.0, candidates=LADDER).remembered
+    file.write_bytes(b"other weights")
+    assert not choose(8.0, candidates=LADDER).remembered and choose(8.0, candidates=LADDER).remembered
+
+
+@pytest.mark.parametrize("text", ["", "{", "[]", "{}", '{"x": 3}'])
+def test_a_damaged_cache_is_measured_again(measured, cache, text):
+    cache.mkdir(parents=True)
+    (cache / budget_cache.FILE).write_text(text)
+    assert choose(8.0, candidates=LADDER).engine == "ss" and choose(8.0, candidates=LADDER).remembered
+
+
+def test_an_old_layout_in_the_cache_is_measured_again(measured, cache):
+    choose(8.0, candidates=LADDER)
+    file = cache / budget_cache.FILE
+    file.write_text(file.read_text().replace("paced_p99_ms", "p99"))
+    assert not choose(8.0, candidates=LADDER).remembered
+
+
+def test_a_cache_that_cannot_be_written_is_said(measured, cache):
+    cache.parent.mkdir()
+    cache.write_text("a file where the folder should be")
+    said = []
+    assert choose(8.0, candidates=LADDER, say=said.append).engine == "ss"
+    assert any("cannot be kept" in line and str(cache) in line for line in said)
+
+
+def test_the_cache_lies_where_the_platform_wants_it(monkeypatch, tmp_path):
+    monkeypatch.setattr(Path, "home", lambda: tmp_path)
+    monkeypatch.setattr(sys, "platform", "linux")
+    assert budget_cache.folder() == tmp_path / "cache/edgefilter"
+    for ignored in ("", "relative/folder"):
+        monkeypatch.setenv("XDG_CACHE_HOME", ignored)
+        assert budget_cache.folder() == tmp_path / ".cache/edgefilter"
+    monkeypatch.setattr(sys, "platform", "darwin")
+    assert budget_cache.folder() == tmp_path / "Library/Caches/edgefilter"
+    monkeypatch.setattr(sys, "platform", "win32")
+    assert budget_cache.folder() == tmp_path / "cache/edgefilter"
+
+
+def test_measuring_runs_the_whole_path_at_the_real_pace():
+    began = time.perf_counter()
+    figures = measure(SpectralSubtraction(), Profile.load(DEMO / "profile.npz"), paced=40)
+    assert time.perf_counter() - began >= 39 * 0.016
+    assert (figures.engine, figures.hop_ms, figures.hops, figures.complete) == ("ss", 16.0, 40, True)
+    assert 0 < figures.paced_p50_ms <= figures.paced_p95_ms <= figures.paced_p99_ms <= figures.paced_max_ms
+    assert 0 < figures.at_once_p50_ms <= figures.at_once_p99_ms
+
+
+def test_pace_begins_a_hop_each_period_and_counts_only_the_work():
+    begun = []
+
+    class Stub(Stream):
+        def process(self, mic, ref):
+            begun.append(time.perf_counter())
+            time.sleep(0.002)
+            return super().process(mic, ref)
+
+    hop = np.zeros(256, np.float32)
+    before = time.perf_counter()
+    took = pace(Stub(Bypass()), iter([(hop, hop)] * 10), 10, 5.0)
+    assert np.all(np.array(begun) - before >= np.arange(10) * 0.016 - 1e-4)  # never early; the resolution of sleep
+    assert len(took) == 10 and min(took) >= 2.0
+
+
+def test_an_engine_far_too_slow_is_given_up_in_time():
+    class Slow(Bypass):
+        def step(self, frame, state):
+            time.sleep(0.05)
+            return super().step(frame, state)
+
+    hop = np.zeros(256, np.float32)
+    took = pace(Stream(Slow()), iter([(hop, hop)] * 300), 300, 0.3)
+    assert 1 <= len(took) <= 6  # 50 ms each
+    assert not fits(replace(Figures("x", "", 16.0, 300, True, 1, 1, 1, 1, 1, 1), complete=False), 8.0)
+
+
+def test_measuring_an_engine_far_too_slow_ends_in_time_and_does_not_fit(monkeypatch):
+    class Slow(Bypass):
+        steps = 0
+
+        def step(self, frame, state):
+            Slow.steps += 1
+            time.sleep(0.03)
+            return super().step(frame, state)
+
+    for name, limit in (("WARM_UP_S", 0.1), ("PACED_S", 0.2), ("AT_ONCE_S", 0.1)):
+        monkeypatch.setattr(budget, name, limit)
+    figures = measure(Slow())
+    assert not figures.complete and Slow.steps <= 4 + 7 + 4 and figures.paced_p50_ms >= 30
+    assert not fits(figures, 1000.0)
+
+
+def test_the_measurement_is_held_to_the_cores_and_lets_go_afterwards():
+    before = os.sched_getaffinity(0)
+    with held_to(1):
+        assert len(os.sched_getaffinity(0)) == 1
+    assert os.sched_getaffinity(0) == before
+    with pytest.raises(RuntimeError), held_to(1):
+        raise RuntimeError
+    assert os.sched_getaffinity(0) == before
+
+
+def run(folder, *more):
+    result = subprocess.run(
+        [sys.executable, "-m", "edgefilter.cli", "run", "--input", DEMO / "human.flac", "--output", folder / "out.wav", "--json", folder / "j", *more],
+        capture_output=True, text=True, timeout=120,
+    )  # fmt: skip
+    assert result.returncode == 0, result.stderr
+    return result.stderr, json.loads((folder / "j").read_text())
+
+
+def test_a_recording_gets_the_strongest_engine_unmeasured_unless_a_budget_is_given(tmp_path):
+    said, stats = run(tmp_path, "--seconds", "1")
+    assert stats["choice"] is None and "strongest engine, not measured" in said
+    said, stats = run(tmp_path, "--seconds", "1", "--budget-ms", "500")
+    choice = stats["choice"]
+    last = choice["figures"][-1]
+    assert not choice["remembered"] and choice["fits"] == (last["hops"] == 300)  # on a machine with more to do fewer can be run in time
+    assert stats["engine"] == choice["engine"] and choice["reason"] in said and "measuring engine" in said
+    said, stats = run(tmp_path, "--seconds", "1", "--budget-ms", "500")
+    assert stats["choice"]["remembered"] and "measuring" not in said
+    said, stats = run(tmp_path, "--seconds", "1", "--remeasure")
+    assert stats["choice"] is None and not list(budget_cache.folder().iterdir())

@@ -1,0 +1,169 @@
+"""The linear stage: it finds a path, starts from a known one, leaves the human alone and survives double talk."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy import signal
+
+from edgefilter.errors import SignalError
+from edgefilter.filter.canceller import DISPLACEMENT_HZ, DISPLACEMENT_SCALE, DISPLACEMENT_TAPS, Canceller, _butterworth
+
+HOP = 256
+
+
+def path(seed: int = 0, taps: int = 3000) -> np.ndarray:
+    """A decaying random path with its direct sound at 32 samples."""
+    rng = np.random.default_rng(seed)
+    h = 0.03 * rng.standard_normal(taps) * np.exp(-np.arange(taps) / 500)
+    h[:32] = 0.0
+    h[32] = 0.5
+    return h.astype(np.float32)
+
+
+def speechlike(seconds: float, seed: int = 1) -> np.ndarray:
+    """Coloured noise whose level moves at the rate of syllables."""
+    rng = np.random.default_rng(seed)
+    n = int(seconds * 16000)
+    noise = signal.lfilter([1.0], [1.0, -0.9], rng.standard_normal(n))
+    level = 0.55 + 0.45 * np.sin(2 * np.pi * 4 * np.arange(n) / 16000 + rng.uniform(0, 6))
+    return (0.03 * noise * level).astype(np.float32)
+
+
+def run(canceller: Canceller, mic: np.ndarray, reference: np.ndarray) -> np.ndarray:
+    hop = canceller.hop
+    steps = [canceller.step(mic[i : i + hop], reference[i : i + hop]).error for i in range(0, mic.size - hop + 1, hop)]
+    return np.concatenate(steps)
+
+
+def db(x: np.ndarray) -> float:
+    return float(10 * np.log10(np.mean(np.square(x, dtype=np.float64)) + 1e-20))
+
+
+@pytest.mark.parametrize("hop", [160, 256, 200])
+def test_known_path_cancels_to_float_precision_from_the_first_hop(hop: int) -> None:
+    h, x = path(), speechlike(1.0)
+    mic = signal.oaconvolve(x, h)[: x.size].astype(np.float32)
+    error = run(Canceller(hop, 6400, h), mic, x)
+    # float32 transforms leave -100 dB and less; 60 dB is asked for because adaptation noise comes on top
+    assert db(error[: 5 * hop]) < db(mic[: 5 * hop]) - 60
+
+
+def test_unknown_path_is_learnt() -> None:
+    h, x = path(), speechlike(6.0)
+    mic = signal.oaconvolve(x, h)[: x.size].astype(np.float32)
+    error = run(Canceller(HOP, 3200), mic, x)
+    # 20 dB: what the published filter reaches within some seconds on coloured noise without any noise at the microphone
+    assert db(error[-16000:]) < db(mic[-16000:]) - 20
+
+
+def test_error_and_echo_add_up_to_the_microphone_exactly() -> None:
+    x, mic = speechlike(0.5), speechlike(0.5, seed=5)
+    canceller = Canceller(HOP, 1600, path(taps=1600))
+    for i in range(0, x.size - HOP + 1, HOP):
+        out = canceller.step(mic[i : i + HOP], x[i : i + HOP])
+        assert np.array_equal(out.error, mic[i : i + HOP] - out.echo)
+
+
+def test_echo_of_a_hop_depends_on_nothing_later_than_the_hop() -> None:
+    x, h = speechlike(1.0), path()
+    mic = signal.oaconvolve(x, h)[: x.size].astype(np.float32)
+    other = x.copy()
+    other[8192:] = 0.1
+    first, second = run(Canceller(HOP, 3200, h), mic, x), run(Canceller(HOP, 3200, h), mic, other)
+    assert np.array_equal(first[:8192], second[:8192])
+
+
+def test_human_as_loud_as_the_robot_does_not_make_it_diverge() -> None:
+    h, x, human = path(), speechlike(8.0), speechlike(8.0, seed=9)
+    echo = signal.oaconvolve(x, h)[: x.size].astype(np.float32)
+    human *= np.float32(10 ** ((db(echo) - db(human)) / 20))
+    canceller = Canceller(HOP, 3200, h)
+    error = run(canceller, echo + human, x)
+    # the filter was right at the start: what double talk at 0 dB breaks must stay 12 dB below the human
+    assert db(error - human[: error.size]) < db(human) - 12
+
+
+def test_silent_reference_neither_adapts_nor_ages() -> None:
+    h = path(taps=1600)
+    canceller = Canceller(HOP, 1600, h)
+    before = canceller.impulse_response()
+    human = speechlike(2.0)
+    error = run(canceller, human, np.zeros_like(human))
+    assert np.array_equal(error, human[: error.size])
+    assert np.array_equal(canceller.impulse_response(), before)
+
+
+def test_rewritten_reference_equals_a_reference_that_always_had_the_new_delay() -> None:
+    h, x = path(), speechlike(2.0)
+    moved = np.concatenate((np.zeros(300, np.float32), x))[: x.size]
+    mic = signal.oaconvolve(moved, h)[: x.size].astype(np.float32)
+    at = 64 * HOP
+    switched, always = Canceller(HOP, 3200, h), Canceller(HOP, 3200, h)
+    silence = np.zeros(HOP, np.float32)
+    for i in range(0, at, HOP):
+        switched.step(silence, silence)
+        always.step(mic[i : i + HOP], moved[i : i + HOP])
+    always._weights[:] = switched._weights
+    switched.rewrite_reference(moved[: at + HOP][-switched.history :])
+    a = switched.step(mic[at : at + HOP], moved[at : at + HOP]).echo
+    b = always.step(mic[at : at + HOP], moved[at : at + HOP]).echo
+    # identical spectra up to float32 rounding
+    assert np.abs(b).max() > 1e-3
+    np.testing.assert_allclose(a, b, atol=1e-6)
+
+
+def test_a_turned_volume_is_followed_within_a_fifth_of_a_second() -> None:
+    h, x = path(), speechlike(4.0)
+    mic = signal.oaconvolve(x, h)[: x.size].astype(np.float32)
+    mic[32_000:] *= np.float32(10 ** (3 / 20))
+    canceller = Canceller(HOP, 3200, h)
+    error = run(canceller, mic, x)
+    after = slice(32_000 + 3200, 32_000 + 9600)
+    # one factor explains the change, so the error falls far below what 3 dB leave (-7.7 dB); 30 dB leaves room for the adaptation
+    assert db(error[after]) < db(mic[after]) - 30
+    assert canceller.stats()["gain_db"] == pytest.approx(3.0, abs=0.2)  # 80 ms of correlation; the rest is adapted
+
+
+def test_an_echo_that_has_not_arrived_yet_is_not_subtracted() -> None:
+    h, x = path(), speechlike(1.6)
+    fan = 1e-4 * np.random.default_rng(2).standard_normal(x.size).astype(np.float32)
+    canceller = Canceller(HOP, 3200, h)
+    error = run(canceller, fan, x)
+    # the first hop fades the echo out; after it the fan passes as it is, and the path is kept for when the echo arrives
+    np.testing.assert_array_equal(error[HOP : 8 * HOP], fan[HOP : 8 * HOP])
+    np.testing.assert_allclose(canceller.impulse_response()[: h.size], h[: canceller.taps], atol=1e-3)  # float32 and one fading hop
+
+
+def test_reset_is_a_fresh_start() -> None:
+    x, mic = speechlike(1.0), speechlike(1.0, seed=3)
+    canceller = Canceller(HOP, 1600)
+    first = run(canceller, mic, x)
+    canceller.reset()
+    assert np.array_equal(run(canceller, mic, x), first)
+
+
+def test_adapted_path_can_be_exported() -> None:
+    h, x = path(taps=1600), speechlike(6.0)
+    mic = signal.oaconvolve(x, h)[: x.size].astype(np.float32)
+    canceller = Canceller(HOP, 1600)
+    run(canceller, mic, x)
+    found = canceller.impulse_response()
+    assert found.shape == (canceller.taps,)
+    # within -15 dB of the true path after six seconds from nothing
+    assert db(found[:1600] - h) < db(h) - 15
+
+
+def test_bad_sizes_and_paths_are_refused() -> None:
+    with pytest.raises(SignalError, match="hop=0"):
+        Canceller(0)
+    with pytest.raises(SignalError, match="finite"):
+        Canceller(impulse_response=np.full(64, np.nan, np.float32))
+
+
+def test_the_membrane_is_a_butterworth_low_pass():
+    b, a = signal.butter(2, DISPLACEMENT_HZ, fs=16000)
+    exact = signal.lfilter(b, a, np.eye(1, 1024)[0]) / DISPLACEMENT_SCALE
+    response = _butterworth(DISPLACEMENT_HZ, DISPLACEMENT_TAPS)
+    np.testing.assert_allclose(response, exact[: response.size], atol=1e-6 * exact.max())  # float32 rounding
+    assert np.abs(exact[response.size :]).max() < 1e-4 * exact.max()  # what is cut off: 80 dB down

@@ -1,0 +1,95 @@
+"""Before the lag of an utterance is known, what can only be the robot is lowered; nobody else is."""
+
+import numpy as np
+import pytest
+
+from bench.simulate.alignment_scene import RATE, fan, hear, known_path, room, run, utterances
+from edgefilter.alignment.aligner import Aligner
+from edgefilter.alignment.delay_line import Aligned
+from edgefilter.filter.onset_gate import GATE, LONGEST, RAMP, SETTLE, OnsetGate
+
+HOP = 256
+
+
+def spoken(rng: np.random.Generator, seconds: list[float], pauses: list[float]) -> tuple[np.ndarray, list[int]]:
+    """Utterances that begin loud, and their onsets."""
+    ref, onsets = utterances(rng, seconds, pauses)
+    for onset in onsets:
+        ref[onset : onset + RATE // 12] = 0.0
+    return 2.0 * ref, onsets
+
+
+def gated(mic: np.ndarray, ref: np.ndarray, h: np.ndarray, known: bool = True) -> tuple[np.ndarray, np.ndarray, list[Aligned]]:
+    """Whole hops of the microphone, the same behind the gate, (hops, HOP) each, and what the aligner found."""
+    path = known_path(h)
+    gate = OnsetGate(HOP, float(np.sum(path.echo.impulse_response**2)) if known else None)
+    found = run(Aligner(HOP, path if known else None), mic, ref)
+    mics, refs = (x[: len(found) * HOP].reshape(-1, HOP) for x in (mic, ref))
+    return mics, np.array([gate.step(m, r, aligned) for m, r, aligned in zip(mics, refs, found, strict=True)]), found
+
+
+@pytest.mark.parametrize("lags", [(3000, 9000), (9000, 2000)])
+@pytest.mark.parametrize("known", [True, False])
+def test_the_robot_is_lowered_until_its_lag_is_found(lags, known):
+    rng = np.random.default_rng(1)
+    h = room(rng, 0.3)
+    ref, onsets = spoken(rng, [2.0, 2.0], [1.5, 1.0])
+    mic = hear(ref, [(0, lags[0]), (onsets[1] - 100, lags[1])], h)[0] + fan(rng, ref.size, 0.001)
+    mic, out, found = gated(mic, ref, h, known)
+    searching = np.array([aligned.state == "searching" for aligned in found])
+    loud = np.square(mic).sum(1)
+    explained = np.array([np.dot(aligned.reference, aligned.reference) for aligned in found])
+    burst = (loud > 0.1 * loud.max()) & (explained < 0.01 * explained.max()) & searching
+    second = np.arange(loud.size) > loud.size // 2
+    for part in (second, ~second) if known else (second,):
+        assert np.any(burst & part)
+        assert np.mean(out[burst & part] ** 2) < 0.1 * np.mean(mic[burst & part] ** 2)
+    assert np.array_equal(out[~searching, RAMP:], mic[~searching, RAMP:])
+
+
+@pytest.mark.parametrize("level", [0.0, 0.1])
+def test_a_human_20_db_below_the_robot_beside_a_muted_loudspeaker_is_untouched(level):
+    rng = np.random.default_rng(2)
+    h = room(rng, 0.3)
+    ref, _ = spoken(rng, [2.0, 2.0], [1.5, 1.0])
+    human = utterances(rng, [4.0], [ref.size / RATE])[0][: ref.size]
+    human *= level * hear(ref, [(0, 3000)], h)[0].std() / human.std()
+    mic, out, found = gated(human + fan(rng, ref.size, 0.001), ref, h)
+    assert any(aligned.state == "searching" for aligned in found)
+    assert np.array_equal(out, mic)
+
+
+def test_a_human_as_loud_as_the_robot_beside_a_muted_loudspeaker_loses_a_quarter_second_per_utterance():
+    rng = np.random.default_rng(4)
+    h = room(rng, 0.3)
+    ref, onsets = spoken(rng, [2.0, 2.0], [3.0, 2.0])
+    human = utterances(rng, [8.0], [2.0])[0][: ref.size]
+    human *= hear(ref, [(0, 3000)], h)[0].std() / human.std()
+    mic, out, _ = gated(human, ref, h)
+    assert 0 < np.count_nonzero(out != mic) <= len(onsets) * (LONGEST + HOP + 2 * RAMP)
+
+
+def test_soft_first_sounds_of_a_voice_make_nobody_loud():
+    rng = np.random.default_rng(5)
+    ref = (1e-4 * rng.standard_normal(2 * RATE)).astype(np.float32)
+    mic, out, found = gated(fan(rng, ref.size, 0.005), ref, room(rng, 0.3))
+    assert any(aligned.state == "searching" for aligned in found)
+    assert np.array_equal(out, mic)
+
+
+def test_the_gate_opens_and_shuts_without_a_step():
+    gate, ones = OnsetGate(HOP, 1.0), np.ones(HOP, np.float32)
+    lost = Aligned(0 * ones, float("nan"), 0.0, 0.0, "searching", False)
+    locked = Aligned(ones, 0.0, 0.0, 1.0, "locked", True)
+    out = np.concatenate([gate.step(ones, ones, aligned) for aligned in (locked, lost, lost, locked)])
+    assert np.all(out[:HOP] == 1.0) and np.isclose(out[2 * HOP], GATE) and out[-1] == 1.0
+    assert np.abs(np.diff(out)).max() <= 1.01 / RAMP
+
+
+def test_after_a_lag_was_found_a_voice_is_suspect_for_a_moment():
+    gate, ones = OnsetGate(HOP, 1.0), np.ones(HOP, np.float32)
+    suspect = []
+    for realigned in (False, True, *[False] * 30):
+        gate.step(ones, ones, Aligned(ones, 0.0, 0.0, 1.0, "locked", realigned))
+        suspect.append(gate.suspect)
+    assert not suspect[0] and suspect[1] and sum(suspect) == round(SETTLE / HOP + 0.5) and not gate.shut

@@ -1,0 +1,67 @@
+"""EgoFilter as people embed it: what it refuses, what it tells."""
+
+import numpy as np
+import pytest
+
+from edgefilter import EgoFilter, enhance
+from edgefilter.errors import SignalError
+from tests import conformance
+
+
+@pytest.mark.parametrize(
+    ("mic", "ref", "message"),
+    [
+        (np.zeros(100, np.int16), np.zeros(100, np.float32), "dtype int16.*divide"),
+        (np.zeros((2, 100), np.float32), np.zeros(100, np.float32), r"shape \(2, 100\).*one channel"),
+        (np.full(3, np.nan, np.float32), np.zeros(3, np.float32), "nan at sample 0"),
+        (np.zeros(3, np.float32), np.array([0, 0, np.inf], np.float32), "inf at sample 2"),
+        (np.zeros(3, np.float32), np.zeros(4, np.float32), "3 samples and ref 4"),
+    ],
+)
+def test_unusable_blocks_are_refused_and_change_nothing(mic, ref, message):
+    good = np.random.default_rng(0).standard_normal(3000).astype(np.float32)
+    ego = EgoFilter(engine="bypass")
+    first = ego.process(good[:1000], good[:1000])
+    with pytest.raises(SignalError, match=message):
+        ego.process(mic, ref)
+    out = np.concatenate((first, ego.process(good[1000:], good[1000:]), ego.flush()))
+    assert np.array_equal(out, enhance(good, good, engine="bypass"))
+
+
+def test_after_flush_only_reset_helps():
+    ego = EgoFilter(engine="bypass")
+    ego.process(*conformance.conversation(1000))
+    assert ego.flush().size > 0 and ego.flush().size == 0
+    with pytest.raises(SignalError, match="reset"):
+        ego.process(*conformance.conversation(1000))
+    ego.reset()
+    assert ego.process(*conformance.conversation(1000)).size > 0
+
+
+def test_float64_input_is_taken_without_writing_into_it():
+    mic, ref = (x.astype(np.float64) for x in conformance.conversation(4000))
+    mic.flags.writeable = ref.flags.writeable = False
+    np.testing.assert_array_equal(enhance(mic, ref, engine="linear"), enhance(mic.astype(np.float32), ref.astype(np.float32), engine="linear"))
+
+
+def test_a_found_reference_is_an_event_and_stands_in_the_stats():
+    mic, ref = conformance.conversation(48_000)
+    ego = EgoFilter(engine="linear")
+    ego.process(mic, ref)
+    kinds = [event.kind for event in ego.events()]
+    assert kinds.count("realigned") == 1 and set(kinds) <= {"realigned", "overloaded"} and ego.events() == []  # a busy machine may add the latter
+    assert ego.stats()["alignment"]["delay_samples"] == pytest.approx(900, abs=16)  # 1 ms, the reach of the aligner
+
+
+def test_enhance_lowers_a_purely_linear_echo_by_20_db():
+    rng = np.random.default_rng(3)
+    ref = (0.1 * rng.standard_normal(96_000)).astype(np.float32)
+    mic = np.concatenate((np.zeros(900, np.float32), 0.5 * ref[:-900]))
+    out = enhance(mic, ref, engine="linear")
+    last = slice(-32_000, None)
+    assert 10 * np.log10(np.mean(out[last] ** 2) / np.mean(mic[last] ** 2)) < -20  # a plain delay; 26 dB and more were seen
+
+
+def test_adapted_profile_needs_a_linear_stage():
+    with pytest.raises(SignalError, match="linear stage"):
+        EgoFilter(engine="bypass").adapted_profile()

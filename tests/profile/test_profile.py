@@ -1,0 +1,294 @@
+"""The profile file: exact round trip, atomic write, and one line for whatever is not a profile."""
+
+import io
+import json
+import os
+import pickle
+import resource
+import zipfile
+
+import numpy as np
+import pytest
+
+from edgefilter.dsp.stft import StftConfig
+from edgefilter.echo.model import EchoModel
+from edgefilter.errors import ProfileError
+from edgefilter.profile.data import GRID_BINS, GRID_HZ, Profile
+from edgefilter.types import PRE_ROLL
+
+FIELDS = ("response", "noise_psd", "band_hz", "band_snr_db", "distortion_db")
+
+
+def make(effects=(), **changes):
+    rng = np.random.default_rng(7)
+    path = rng.standard_normal(6400).astype(np.float32) * np.exp(-np.arange(6400, dtype=np.float32) / 400)
+    values = {
+        "delay": 431.25 + 1 / 3,
+        "response": rng.random(GRID_BINS).astype(np.float32),
+        "noise_psd": (rng.random(GRID_BINS) * 1e-8).astype(np.float32),
+        "band_hz": np.array([[89.1, 112.2], [112.2, 141.3]]),
+        "band_snr_db": np.array([12.5, 33.1]),
+        "distortion_db": np.array([-31.0, -28.5, -45.2, -50.1]),
+        "warnings": ("low SNR in 89-112 Hz", "übersteuert"),
+        "created": "2026-01-02T03:04:05+00:00",
+        "source": "S.wav, R.wav, FAN.wav",
+    }
+    return Profile(EchoModel(path, effects), **{**values, **changes})
+
+
+def members(path):
+    with zipfile.ZipFile(path) as archive:
+        return {name: archive.read(name) for name in archive.namelist()}
+
+
+def rewrite(path, **changes):
+    """The file at path with .npy members replaced by bytes or arrays (None: left out)."""
+    content = members(path)
+    for name, value in changes.items():
+        if isinstance(value, np.ndarray):
+            file = io.BytesIO()
+            np.save(file, value)
+            value = file.getvalue()
+        content[f"{name}.npy"] = value
+    with zipfile.ZipFile(path, "w") as archive:
+        for name, value in content.items():
+            if value is not None:
+                archive.writestr(name, value)
+
+
+def edit_header(path, **changes):
+    header = json.loads(bytes(np.load(path)["header"]))
+    header.update(changes)
+    rewrite(path, header=np.frombuffer(json.dumps(header).encode(), np.uint8))
+
+
+@pytest.fixture
+def saved(tmp_path):
+    path = tmp_path / "robot.npz"
+    make((("playback_gain", {"gain_db": 1.5}),)).save(path)
+    return path
+
+
+def refused(path, match):
+    with pytest.raises(ProfileError, match=match) as caught:
+        Profile.load(path)
+    text = str(caught.value)
+    assert "\n" not in text and str(path) in text and len(text) < 400
+    return text
+
+
+def test_round_trip_is_bit_exact_with_effects(tmp_path):
+    curve = np.linspace(0, 1, 7) / 3
+    effects = (
+        ("compression", {"rt60_s": 0.1 + 0.2, "tail": np.arange(50, dtype=np.float32) / 7}),
+        ("clock_drift", {"times_s": curve, "grid": np.asfortranarray(np.arange(6.0).reshape(2, 3)), "kind": "steps", "on": True, "count": 3}),
+    )
+    before = make(effects)
+    before.save(tmp_path / "p.npz")
+    after = Profile.load(tmp_path / "p.npz")
+    for name in FIELDS:
+        a, b = getattr(before, name), getattr(after, name)
+        assert a.dtype == b.dtype and a.shape == b.shape and a.tobytes() == b.tobytes(), name
+    assert before.echo.impulse_response.tobytes() == after.echo.impulse_response.tobytes()
+    for name in ("delay", "sample_rate", "warnings", "created", "source"):
+        assert getattr(before, name) == getattr(after, name), name
+    assert [name for name, _ in after.echo.effects] == ["compression", "clock_drift"]
+    for (_, a), (_, b) in zip(effects, after.echo.effects, strict=True):
+        assert list(a) == list(b)
+        for key in a:
+            assert type(a[key]) is type(b[key]) and np.array_equal(a[key], b[key]), key
+    assert after.echo.effects[0][1]["tail"].dtype == np.float32
+
+
+def test_saving_what_was_loaded_gives_the_same_bytes(saved, tmp_path):
+    Profile.load(saved).save(tmp_path / "again.npz")
+    assert members(saved) == members(tmp_path / "again.npz")
+
+
+def test_fan_power_on_the_stft_grid_is_what_white_noise_of_that_psd_has():
+    rng = np.random.default_rng(3)
+    variance = 2.5e-5
+    profile = make(noise_psd=np.full(GRID_BINS, variance / 8000, np.float32))
+    stft = StftConfig()
+    frames = rng.standard_normal((4000, stft.window_length)).astype(np.float32) * np.sqrt(variance)
+    measured = np.mean(np.abs(stft.analyse(frames)) ** 2, axis=0)
+    expected = profile.noise_bins(stft)
+    assert expected.shape == (stft.bins,) and expected.dtype == np.float32
+    # 4000 independent frames: one sigma is 1.6 % (2.2 % at the real-valued first and last bin)
+    np.testing.assert_allclose(measured, expected, rtol=0.1)
+
+
+def test_response_is_exact_on_its_own_grid_and_interpolated_elsewhere():
+    profile = make(response=(GRID_HZ / 8000).astype(np.float32))
+    own = profile.response_bins(StftConfig(1200, 160, 1200, "hann"))
+    assert np.array_equal(own, profile.response)
+    # a straight line is interpolated exactly, to float32 rounding
+    np.testing.assert_allclose(profile.response_bins(StftConfig()), np.arange(257) / 256, atol=1e-6)
+
+
+@pytest.mark.parametrize("keep", [0, 1, 10, 200, 0.5, 0.99, -1])
+def test_truncated(saved, keep):
+    content = saved.read_bytes()
+    saved.write_bytes(content[: int(keep * len(content)) if isinstance(keep, float) else keep])
+    refused(saved, "not a profile|truncated or damaged")
+
+
+def test_every_flipped_byte_is_refused_or_harmless(saved):
+    content = bytearray(saved.read_bytes())
+    rng = np.random.default_rng(1)
+    for at in rng.integers(0, len(content), 150):
+        damaged = content.copy()
+        damaged[at] ^= 0xFF
+        saved.write_bytes(damaged)
+        try:
+            profile = Profile.load(saved)
+        except ProfileError as error:
+            assert "\n" not in str(error)
+        else:
+            assert profile.delay == make().delay
+
+
+def test_no_such_file_folder_and_other_types(tmp_path):
+    refused(tmp_path / "absent.npz", "no such file")
+    refused(tmp_path, "is a folder")
+    other = tmp_path / "song.npz"
+    other.write_bytes(b"RIFF\x00\x00\x00\x00WAVE")
+    refused(other, "starts with b'RIFF'")
+    with zipfile.ZipFile(other, "w") as archive:
+        archive.writestr("readme.txt", "hello")
+    refused(other, "no .npy array")
+    np.savez(other, x=np.zeros(3))
+    refused(other, "version is missing")
+
+
+def test_pickled_objects_are_never_loaded(saved, tmp_path):
+    class Bomb:
+        def __reduce__(self):
+            return (os.mkdir, (str(tmp_path / "executed"),))
+
+    rewrite(saved, response=np.array([Bomb()], dtype=object))
+    refused(saved, "pickled objects")
+    saved.write_bytes(pickle.dumps(Bomb()))
+    refused(saved, "not a profile")
+    assert not (tmp_path / "executed").exists()
+
+
+def test_decompression_bomb_is_refused_without_unpacking(saved):
+    with zipfile.ZipFile(saved, "a", zipfile.ZIP_DEFLATED) as archive, archive.open("bomb.npy", "w", force_zip64=True) as member:
+        for _ in range(64):
+            member.write(bytes(2**20))
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    refused(saved, "unpacks to 67")
+    # kilobytes; the bomb is 65536 of them
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 20000
+
+
+def test_array_that_claims_more_than_it_holds(saved):
+    file = io.BytesIO()
+    np.lib.format.write_array_header_1_0(file, {"descr": "<f4", "fortran_order": False, "shape": (2**40,)})
+    rewrite(saved, response=file.getvalue())
+    refused(saved, "claims shape")
+
+
+def test_huge_file(saved):
+    with open(saved, "ab") as file:
+        file.truncate(2**30)
+    refused(saved, "1073741824 bytes long")
+
+
+@pytest.mark.parametrize("value", [2, 0, -1, 2**40])
+def test_another_version(saved, value):
+    rewrite(saved, version=np.array(value))
+    refused(saved, f"version is {value}, expected 1")
+
+
+@pytest.mark.parametrize("name", [*FIELDS, "impulse_response"])
+def test_missing_misshapen_and_not_finite_arrays(saved, name):
+    original = saved.read_bytes()
+    value = np.load(saved)[name]
+    for change, match in [
+        (None, f"missing: {name}"),
+        (value[:-1] if name not in ("band_hz", "impulse_response") else value.reshape(2, -1).T[:1], name[:5]),
+        (value.astype(np.int32), f"{name} is int32"),
+        (np.where(np.arange(value.size).reshape(value.shape) == 1, np.nan, value).astype(value.dtype), f"{name} is nan at position 1"),
+        (np.full_like(value, np.inf), f"{name} is inf at position 0"),
+        (np.full_like(value, 1e20), f"{name} is 1e\\+20"),
+    ]:
+        saved.write_bytes(original)
+        rewrite(saved, **{name: change})
+        refused(saved, match)
+
+
+def test_nan_text_and_huge_header_values(saved):
+    original = saved.read_bytes()
+    for change, match in [
+        ({"delay": float("nan")}, "not JSON"),
+        ({"delay": "soon\nafter"}, "delay is 'soon"),
+        ({"delay": 1e9}, "delay is 1000000000.0, expected -64000 to 64000"),
+        ({"pre_roll": PRE_ROLL + 1}, f"pre_roll is {PRE_ROLL + 1}, expected {PRE_ROLL} samples"),
+        ({"sample_rate": 44100}, "sample_rate is 44100, expected 16000 Hz"),
+        ({"warnings": "text"}, "warnings is a JSON str"),
+        ({"warnings": [1]}, "warnings is not all texts"),
+        ({"created": 5}, "created is int"),
+        ({"surprise": 5}, "unknown: surprise"),
+        ({"effects": {}}, "not a list"),
+        ({"effects": [{"name": 3, "values": {}}]}, "no name"),
+        ({"effects": [{"name": "a", "values": {"b": [1]}}]}, "effects\\[0\\] \\(a\\).b is list"),
+        ({"effects": [{"name": "a", "values": {"b": {"array": "effect_9_9"}}}]}, "not in the file"),
+    ]:
+        saved.write_bytes(original)
+        edit_header(saved, **change)
+        refused(saved, match)
+
+
+@pytest.mark.parametrize(
+    ("changes", "match"),
+    [
+        ({"response": np.zeros(600, np.float32)}, "response is float32 of shape \\(600,\\)"),
+        ({"noise_psd": np.full(601, -1e-9, np.float32)}, "noise_psd is -1e-09 at position 0, expected 0 to 1"),
+        ({"delay": float("nan")}, "delay is nan"),
+    ],
+)
+def test_construction_checks_too(changes, match):
+    with pytest.raises(ProfileError, match=match):
+        make(**changes)
+
+
+def test_impulse_response_shorter_than_twice_the_pre_roll_is_refused():
+    good = make()
+    with pytest.raises(ProfileError, match="impulse_response"):
+        Profile(EchoModel(np.ones(2 * PRE_ROLL - 1, np.float32)), good.delay, *(getattr(good, name) for name in FIELDS))
+
+
+def test_effect_that_cannot_be_stored_leaves_the_old_file(saved):
+    before = saved.read_bytes()
+    for value in (np.array([1.0, np.nan]), float("inf"), object(), np.array([object()])):
+        with pytest.raises(ProfileError, match="cannot be stored"):
+            make((("rattle", {"level": value}),)).save(saved)
+    assert saved.read_bytes() == before and os.listdir(saved.parent) == ["robot.npz"]
+
+
+def test_full_disk_leaves_the_old_file_and_no_rubbish(saved):
+    """The file size limit makes write() fail half-way with a real OSError, as a full disk does."""
+    import signal
+
+    before = saved.read_bytes()
+    handler = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (4096, hard))
+    try:
+        with pytest.raises(ProfileError, match="cannot be written \\(File too large\\)"):
+            make().save(saved)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+        signal.signal(signal.SIGXFSZ, handler)
+    assert saved.read_bytes() == before and os.listdir(saved.parent) == ["robot.npz"]
+
+
+def test_unwritable_targets(tmp_path):
+    with pytest.raises(ProfileError, match="cannot be written \\(No such file or directory\\)"):
+        make().save(tmp_path / "absent" / "p.npz")
+    with pytest.raises(ProfileError, match="not a file that can be replaced"):
+        make().save(tmp_path)
+    with pytest.raises(ProfileError, match="not a file that can be replaced"):
+        make().save("/dev/null")

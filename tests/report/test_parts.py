@@ -1,0 +1,160 @@
+"""What the reports are made of: words, lines for the terminal, pictures and sound as data addresses, subsets of effects."""
+
+from __future__ import annotations
+
+import base64
+import io
+
+import numpy as np
+import pytest
+import soundfile
+from PIL import Image
+
+from edgefilter.diagnosis.compare import compare
+from edgefilter.diagnosis.diagnose import Diagnosis, Finding, Interval
+from edgefilter.echo.effect import names
+from edgefilter.report import words
+from edgefilter.report.html import add_command, diagnosis_page
+from edgefilter.report.media import LEVELS, MAX_COLUMNS, colour_scale, colours, sound, spectrogram_db, spectrogram_png
+from edgefilter.report.text import coarser, diagnosis_lines
+from edgefilter.report.variants import choices, compare_variants
+from tests.diagnosis.robot_scene import profile, record, voice
+
+RATE = 16000
+
+
+def content(address: str) -> io.BytesIO:
+    return io.BytesIO(base64.b64decode(address.split(",", 1)[1]))
+
+
+def finding(name: str, values: dict, before: float = 9.0, after: float = 1.0) -> Finding:
+    intervals = {key: Interval(value, value - 0.1, value + 0.1, "dB") for key, value in values.items()}
+    return Finding(name, before, after, 0.9, intervals, f"Evidence for {name}.", values, np.zeros(0, np.float32))
+
+
+@pytest.mark.parametrize(
+    ("interval", "text"),
+    [
+        (Interval(0.614, 0.561, 0.66, "s"), "0.614 s (0.561 to 0.660)"),
+        (Interval(80.04, 79.0, 81.2, "1e-6"), "80.0 ppm (79.0 to 81.2)"),
+        (Interval((7.5, 12.0), (7.4, 11.9), (7.6, 12.1), "s"), "7.50 s (7.40 to 7.60), 12.0 s (11.9 to 12.1)"),
+        (Interval(4.0, 4.0, 4.0, "1"), "4.00"),
+        (Interval(-31250.0, -31250.0, -31250.0, "samples"), "-31250 samples"),
+        (Interval(2e-9, 1e-9, 3e-9, "1"), "2e-09 (1e-09 to 3e-09)"),
+    ],
+)
+def test_parameters_read_as_people_write_them(interval, text):
+    assert words.interval_text(interval) == text
+
+
+def test_sentences_for_the_three_verdicts():
+    assert words.headline("missing", ["late_reverb", "clock_drift"]) == "Missing from the profile: late reverberation and clock drift."
+    assert words.headline("explained", []) == "The profile explains this recording."
+    assert "no known effect explains." in words.headline("unexplained", [])
+    assert words.headline("unexplained", ["my_own"]).endswith("besides my own.")
+    assert words.decibels(-0.04) == "0.0"
+
+
+def test_every_built_in_effect_has_a_name_for_people():
+    assert set(names()) <= set(words.EFFECTS)
+
+
+def test_the_terminal_says_verdict_budget_parameters_and_what_is_left():
+    x = voice(4.0)
+    found = compare(profile(), record(x), x)
+    two = (finding("late_reverb", {"rt60_s": 0.61}), finding("my_own", {"depth": 2.0}, 1.0, 0.3))
+    lines = diagnosis_lines(Diagnosis("missing", found, two, "A hum at 50 Hz.", 0.3, 0.1, profile().echo))
+    text = "\n".join(lines)
+    assert lines[0] == "verdict     missing: Missing from the profile: late reverberation and my own."
+    for part in ("with late_reverb", "rt60_s = 0.610 dB (0.510 to 0.710)", "9.0 to 1.0 dB, 90 %", "Evidence for my_own.", "left        A hum at 50 Hz."):
+        assert part in text, part
+    bars = [len(line) - len(line.rstrip("#")) for line in lines if line.startswith("  with ")]
+    assert bars[0] > bars[1] > 0
+
+
+def test_long_recordings_are_summed_up_by_power():
+    times = [(i / 2, (i + 1) / 2, 10.0 if i % 2 else 0.0) for i in range(60)]
+    rows = coarser(times, 12)
+    assert len(rows) <= 12 and rows[0][0] == 0.0 and rows[-1][1] == 30.0
+    assert rows[1][2] == pytest.approx(10 * np.log10((1 + 10 + 1 + 10 + 10) / 5))  # rows of five half seconds, the second starts with a loud one
+
+
+def test_a_tone_is_at_its_place_and_level_in_the_spectrogram():
+    n = np.arange(4 * RATE)
+    x = (0.5 * np.sin(2 * np.pi * 2000 * n / RATE) * (n >= 2 * RATE)).astype(np.float32)
+    level = spectrogram_db(x)
+    assert level.max() == pytest.approx(20 * np.log10(0.5), abs=0.1)  # a bin's centre is hit: only the window's samples differ
+    image = Image.open(content(spectrogram_png(x, (-72.0, 0.0))))
+    index = np.asarray(image)
+    assert index.shape == (241, level.shape[0]) and image.palette.getdata()[1][:3] == colours()[0].tobytes()
+    row = 240 - round(2000 / (8000 / 240))
+    assert index[row, -10] == round((1 + 20 * np.log10(0.5) / 72) * (LEVELS - 1)) == index.max()
+    assert not index[:, : level.shape[0] // 2 - 2].any()
+
+
+def test_the_colours_reach_from_the_fan_to_the_voice():
+    x = voice(6.0)
+    fan = 1e-3 * np.random.default_rng(1).standard_normal(x.size).astype(np.float32)
+    bottom, top = colour_scale(x + fan)
+    assert bottom <= np.median(spectrogram_db(fan)) < bottom + 10  # the fan's own scatter and steps of 5 dB
+    assert np.mean(spectrogram_db(x) > top) < 0.003
+    silent_bottom, silent_top = colour_scale(np.zeros(16000, np.float32))
+    assert silent_top - silent_bottom >= 40
+
+
+def test_a_long_recording_gets_a_picture_of_bounded_width():
+    x = voice(60.0)
+    assert spectrogram_db(x).shape[0] == MAX_COLUMNS
+    assert spectrogram_db(x[:100]).shape[0] == 1
+
+
+def test_sound_is_what_was_recorded():
+    x = voice(3.0)
+    heard, rate = soundfile.read(content(sound(x, 1.0)))
+    heard = heard[:: rate // RATE] if rate != RATE else heard
+    assert abs(heard.size - x.size) <= 1
+    assert np.corrcoef(heard, x)[0, 1] > 0.9  # Opus keeps the waveform of what is loud
+
+
+def test_all_subsets_of_a_few_effects_and_the_prefixes_of_many():
+    assert len(choices(3)) == 8 and choices(3)[0] == (False,) * 3 and choices(3)[-1] == (True,) * 3
+    assert choices(4) == [tuple(i < on for i in range(4)) for on in range(5)]
+    assert choices(0) == [()]
+
+
+def test_subsets_are_compared_on_one_alignment():
+    x, robot = voice(6.0), profile()
+    model = robot.echo.with_effect("playback_gain", {"gain_db": -3.0})
+    y = record(x, model)
+    found = compare_variants(robot, model, [finding("playback_gain", {"gain_db": -3.0})], y, x)
+    assert found[(True,)].excess_db < 0.3 < 3 < found[(False,)].excess_db  # 0.3 dB: see the comparison's own tests
+    assert found[(True,)].offset_samples == found[(False,)].offset_samples
+
+
+def test_four_effects_give_five_comparisons_in_the_page():
+    x, robot = voice(3.0), profile()
+    y = record(x)
+    four = [finding(name, {}) for name in ("playback_gain", "clock_drift", "compression", "speaker_nonlinearity")]
+    model = robot.echo
+    for one in four:
+        model = model.with_effect(one.effect, one.values)
+    found = Diagnosis("missing", compare(robot, y, x), tuple(four), "", 0.1, 0.0, model)
+    page = diagnosis_page(robot, found, y, x, {"profile": "p", "recording": "m", "reference": "r"})
+    assert page.count('"excess_db"') == 5 and "switched with them" in page
+    assert page.count("data:image/png") == 3, "recording, prediction, residual: with neutral values all five comparisons share them"
+
+
+def test_the_command_to_add_is_one_that_a_shell_reads():
+    names = {"profile": "my robot.npz", "recording": "m.wav", "reference": "r.wav", "effects": ["own.py"]}
+    assert add_command("tilt", names) == (
+        "edgefilter add tilt --profile 'my robot.npz' --recording m.wav --reference r.wav --effects own.py --output 'my robot.tilt.npz'"
+    )
+
+
+def test_a_switched_on_gain_control_is_judged_as_the_diagnosis_judges_it():
+    x, robot = voice(6.0), profile()
+    gain_db = 6 * np.hanning(240)
+    model = robot.echo.with_effect("mic_agc", {"gain_db": gain_db, "knots_hz": 40.0})
+    y = (record(x) * 10 ** (np.interp(np.arange(x.size) * 40 / 16000, np.arange(240), gain_db) / 20)).astype(np.float32)
+    found = compare_variants(robot, model, [finding("mic_agc", {"gain_db": gain_db, "knots_hz": 40.0})], y, x)
+    assert abs(found[(True,)].excess_db) < 0.3 and abs(found[(True,)].silence_excess_db) < 0.3 < 3 < found[(False,)].excess_db

@@ -1,0 +1,45 @@
+"""What the README and docs/ promise to type is what works."""
+
+import os
+import re
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from edgefilter.cli import build_parser
+
+ROOT = Path(__file__).parents[1]
+DOCUMENTS = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+README = (ROOT / "README.md").read_text()
+
+
+def test_the_python_example_runs(tmp_path):
+    examples = re.findall(r"```python\n(.*?)```", README, re.S)
+    assert len(examples) == 1
+    code = examples[0]
+    assert len([line for line in code.splitlines() if line.strip()]) <= 12
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    result = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, env=environment, capture_output=True, text=True)
+    assert result.returncode == 0, result.stderr
+    assert "dB" in result.stdout
+
+
+@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: path.name)
+def test_every_command_line_parses(document):
+    blocks = re.findall(r"```(?:sh|text)\n(.*?)```", document.read_text(), re.S)
+    lines = [line.strip() for block in blocks for line in block.replace("\\\n", " ").splitlines()]
+    commands = [line.split("edgefilter ", 1)[1].split("#")[0] for line in lines if re.match(r"(\S+/)?edgefilter [a-z]", line)]
+    assert len(commands) >= 3
+    for words in commands:
+        build_parser().parse_args(shlex.split(words))
+
+
+@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: path.name)
+def test_links_and_pictures_exist(document):
+    targets = [target for target in re.findall(r"\]\(([^)#]+)\)", document.read_text()) if "://" not in target]
+    assert targets or document.name != "README.md"
+    for target in targets:
+        assert (document.parent / target).exists(), target
