@@ -3,7 +3,7 @@
 EgoFilter goes in front of a recogniser, enhance() filters whole arrays, Profile is the calibrated robot.
 """
 
-from edgefilter.filter.stream import EgoFilter, enhance
+from edgefilter.filter.ego_filter import EgoFilter, enhance
 from edgefilter.profile.data import Profile
 from edgefilter.types import Event
 

@@ -13,7 +13,7 @@ import numpy as np
 from edgefilter.audio.files import Recorder
 from edgefilter.audio.protocols import Sink, Source
 from edgefilter.errors import EdgefilterError
-from edgefilter.filter.stream import EgoFilter
+from edgefilter.filter.ego_filter import EgoFilter
 from edgefilter.types import SAMPLE_RATE, Block, Event, Samples
 
 MOST_EVENTS = 1000

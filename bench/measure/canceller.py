@@ -23,7 +23,7 @@ from tqdm import tqdm
 from bench.measure.quality import Conversation
 from bench.table import machine
 from edgefilter.dsp.metrics import erle, si_sdr
-from edgefilter.filter.stream import enhance
+from edgefilter.filter.ego_filter import enhance
 from edgefilter.types import SAMPLE_RATE
 
 ACTIVE = 1e-6

@@ -117,7 +117,7 @@ def code_version(name: str) -> str:
     else:
         package = Path(edgefilter.__file__).parent
         models = [*package.rglob("*.onnx"), *package.parent.glob("models/*.onnx")] if name.removesuffix(TRUE_LAG) in HAVE_MODEL else []
-        files = sorted(imported_by({package / "filter" / "stream.py", package / "calibration" / "calibrate.py", *package.glob("engines/*.py")}, package)) + sorted(models)
+        files = sorted(imported_by({package / "filter" / "ego_filter.py", package / "calibration" / "calibrate.py", *package.glob("engines/*.py")}, package)) + sorted(models)
     return hashlib.sha256(b"".join(path.read_bytes() for path in files)).hexdigest()
 
 

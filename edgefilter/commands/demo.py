@@ -12,7 +12,7 @@ import soundfile
 from edgefilter.audio.files import FileSink, FileSource
 from edgefilter.commands.display import describe_latency, write_json
 from edgefilter.dsp.metrics import si_sdr
-from edgefilter.filter.stream import EgoFilter
+from edgefilter.filter.ego_filter import EgoFilter
 from edgefilter.session import filter_blocks
 from edgefilter.types import SAMPLE_RATE, Samples
 

@@ -13,7 +13,7 @@ from tqdm import tqdm
 
 from edgefilter.audio.protocols import Source
 from edgefilter.errors import AudioFileError
-from edgefilter.filter.stream import EgoFilter
+from edgefilter.filter.ego_filter import EgoFilter
 from edgefilter.session import Progress
 from edgefilter.types import SAMPLE_RATE
 

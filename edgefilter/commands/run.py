@@ -18,7 +18,7 @@ from edgefilter.commands.display import describe_latency, display, write_json
 from edgefilter.errors import UsageError
 from edgefilter.filter.budget import DEFAULT_MS, Choice, choose
 from edgefilter.filter.budget_cache import forget
-from edgefilter.filter.stream import EgoFilter
+from edgefilter.filter.ego_filter import EgoFilter
 from edgefilter.profile.data import Profile
 from edgefilter.session import RunReport, filter_blocks
 from edgefilter.types import SAMPLE_RATE, Event

@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 from collections import deque
-from pathlib import Path
 
 import numpy as np
 
-from edgefilter import engines
 from edgefilter.dsp.ring import Ring
 from edgefilter.dsp.stft import Synthesiser
 from edgefilter.engines.base import ClipEngine, Engine
-from edgefilter.engines.ladder import CANDIDATES, Ladder, climbable
-from edgefilter.errors import EdgefilterError, SignalError, UsageError
+from edgefilter.errors import SignalError
 from edgefilter.filter.barge_in import BargeIn
 from edgefilter.filter.front_end import Front
 from edgefilter.filter.stepping import Stepping
@@ -145,148 +142,3 @@ class Stream:
             raise SignalError(
                 f"the recording is longer than {seconds:.0f} s, which is all that engine {self.engine.name} takes at once: cut it or take another engine"
             )
-
-
-class EgoFilter:
-    """The object to put in front of a recogniser: give it what the microphone hears and what the robot says.
-
-    profile: a Profile, the path of one, or None (then the echo path is learnt from nothing).
-    engine: a name, or "auto" for the strongest that can be made. reason: why it was chosen, for stats.
-    model: the ONNX file that a neural engine, named in engine, loads in place of its own.
-    budget_ms: compute per hop to keep to; where more is needed for long, cheaper engines take over (see Stepping), each time with
-    an event. None: the engine stays, and missed deadlines are only counted.
-
-    >>> import numpy as np
-    >>> ego = EgoFilter(engine="bypass")
-    >>> human = np.sin(np.arange(1000) / 10).astype(np.float32)
-    >>> out = np.concatenate((ego.process(human, np.zeros_like(human)), ego.flush()))
-    >>> bool(np.allclose(out, human, atol=1e-6))
-    True
-    """
-
-    def __init__(
-        self,
-        profile: Profile | str | Path | None = None,
-        engine: str = "auto",
-        budget_ms: float | None = None,
-        reason: str = "asked for",
-        model: str | Path | None = None,
-    ) -> None:
-        if engine == "auto" and model is not None:
-            raise UsageError(f"found the model {model} without an engine for it: name one of {', '.join(engines.HAVE_MODEL)}")
-        self.profile = Profile.load(profile) if isinstance(profile, str | Path) else profile
-        best, self.engine_reason = strongest(self.profile) if engine == "auto" else (engines.create(engine, self.profile, model=model), reason)
-        ladder = None if budget_ms is None or best.lookahead is None else Ladder(climbable(best, self.profile))
-        self._stream = Stream(ladder or best, self.profile, Stepping(best.stft.hop, ladder, budget_ms))
-
-    @property
-    def engine_name(self) -> str:
-        """The engine at work; while another one takes over, that one."""
-        return self._engine.name
-
-    @property
-    def _engine(self) -> Engine | ClipEngine:
-        engine = self._stream.engine
-        return engine.rungs[engine.wanted] if isinstance(engine, Ladder) else engine
-
-    @property
-    def latency(self) -> int:
-        """Algorithmic latency, samples."""
-        return self._stream.latency
-
-    @property
-    def waits_for_end(self) -> bool:
-        """Whether the engine needs the whole recording: process then returns nothing, flush everything."""
-        return self._stream.waits_for_end
-
-    @property
-    def hop(self) -> int:
-        """Samples between two steps of the engine: the block length with the least overhead."""
-        return self._stream.engine.stft.hop
-
-    @property
-    def speech_probability(self) -> float | None:
-        """Probability that the human speaks now, where the engine judges it; 0 while it may well be the robot (OnsetGate.suspect)."""
-        return self._stream.speech_probability
-
-    @property
-    def human_speaks(self) -> bool:
-        """Whether the human is speaking, pauses of half a second included; always False where the engine does not judge it."""
-        return self._stream.human_speaks
-
-    def process(self, mic_block: Samples, ref_block: Samples) -> Samples:
-        """Take (n,) float samples of both channels, any n; return finished ones, aligned with the input.
-
-        Raises SignalError for another shape or dtype, unequal lengths or samples that are not finite.
-        """
-        return self._stream.process(mic_block, ref_block)
-
-    def announce(self, utterance: Samples) -> None:
-        """Say what the robot will play next (n,) at 16 kHz; it may start at any time, or never, and several queue up.
-
-        For robots without a loopback: while the reference blocks are zeros, the utterance is looked for in the microphone for
-        30 s, and from about 0.1 s after its first sound on it is the reference. A reference channel that carries sound is
-        believed instead, and drops what was announced. Engines that only delay the reference (paper-ss) count announcements.
-        """
-        if self._stream.front.aligner:
-            self._stream.front.aligner.announce(as_samples(utterance, "utterance"))
-
-    def events(self) -> list[Event]:
-        """What happened since the last call: realigned, speech_started, speech_stopped, overloaded, stepped_down, stepped_up."""
-        happened = list(self._stream.events)
-        self._stream.events.clear()
-        return happened
-
-    def flush(self) -> Samples:
-        """Return the rest, so that as many samples are out as went in."""
-        return self._stream.flush()
-
-    def reset(self) -> None:
-        """Start anew, as after construction."""
-        self._stream.reset()
-
-    def stats(self) -> dict[str, object]:
-        """State of the path, ready for JSON: engine and why, its model, latency, samples, alignment, linear stage."""
-        front = self._stream.front
-        return {
-            "engine": self.engine_name,
-            "engine_reason": self.engine_reason,
-            "engines": [engine.name for engine in getattr(self._stream.engine, "rungs", [self._stream.engine])],
-            "model": self._engine.model.describe() if self.engine_name in engines.HAVE_MODEL else None,
-            "latency_ms": None if self.waits_for_end else 1000 * self.latency / SAMPLE_RATE,
-            "samples": self._stream.samples_in,
-            "alignment": front.aligner.stats() if front.aligner else None,
-            "linear_stage": front.canceller.stats() if front.canceller else None,
-            "deadline": self._stream.stepping.stats() if self._stream.stepping else None,
-        }
-
-    @property
-    def can_adapt(self) -> bool:
-        """Whether there will be an adapted profile: one to start from and a linear stage that learns."""
-        return self.profile is not None and self._stream.front.canceller is not None
-
-    def adapted_profile(self) -> Profile:
-        """The profile with the echo path as the linear stage has adapted it; raises SignalError where there is none."""
-        if not self.can_adapt:
-            raise SignalError("nothing to write back: give a profile and an engine with a linear stage (linear or ss)")
-        learnt = self._stream.front.canceller.impulse_response()
-        return self.profile.with_echo(self.profile.echo.with_running_response(learnt))
-
-
-def strongest(profile: Profile | None) -> tuple[Engine, str]:
-    """The best engine that can be made here, and a sentence about it that names those that cannot."""
-    missing = ""
-    for name in CANDIDATES:
-        try:
-            return engines.create(name, profile), f"auto: the strongest engine, not measured{missing}"
-        except EdgefilterError as error:
-            missing += f"; {name} cannot be used: {error}"
-    raise UsageError(f"no engine can be made{missing}")
-
-
-def enhance(
-    mic: Samples, ref: Samples, profile: Profile | str | Path | None = None, engine: str = "auto", model: str | Path | None = None
-) -> Samples:
-    """Filter a whole recording (n,) with its reference (n,); the same stream as live. Returns (n,) float32."""
-    ego = EgoFilter(profile, engine, model=model)
-    return np.concatenate((ego.process(mic, ref), ego.flush()))

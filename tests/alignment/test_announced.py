@@ -6,7 +6,7 @@ import pytest
 from bench.simulate.alignment_scene import HEAD, RATE, fan, hear, room, run, speech_like, utterances
 from edgefilter.alignment.aligner import Aligner
 from edgefilter.alignment.announced import AHEAD, PATIENCE, Announcements
-from edgefilter.filter.stream import EgoFilter
+from edgefilter.filter.ego_filter import EgoFilter
 
 
 def erle_db(mic, out, span):

@@ -7,7 +7,7 @@ import sys
 import pytest
 import soundfile
 
-from edgefilter.filter.stream import EgoFilter
+from edgefilter.filter.ego_filter import EgoFilter
 
 
 @pytest.fixture(scope="module")
