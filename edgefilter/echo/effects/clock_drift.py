@@ -23,7 +23,7 @@ STEADY = 0.05
 class ClockDrift:
     """y(n) = x(n - offset + ppm 1e-6 n): a delay that shrinks with positive, grows with negative ppm.
 
-    Interpolation by a Kaiser-windowed sinc of 32 samples, see fractional. Valid where the drift is constant over the recording.
+    Interpolation by a windowed sinc of 48 samples, see dsp.fractional_delay. Valid where the drift is constant over the recording.
     """
 
     name: ClassVar[str] = "clock_drift"
