@@ -8,8 +8,9 @@ from scipy import fft, signal
 from scipy.ndimage import binary_closing, uniform_filter1d
 
 from edgefilter.calibration.calibrate import third_octave_bands
-from edgefilter.diagnosis.offset import MAX_OFFSET, shift
+from edgefilter.diagnosis.offset import MAX_OFFSET
 from edgefilter.diagnosis.prepare import BLOCK, MIN_SECONDS
+from edgefilter.dsp.fractional_delay import delayed
 from edgefilter.echo.effect import find, whiten
 from edgefilter.echo.model import EchoModel
 from edgefilter.echo.wiener import convolve_from, fit_filter
@@ -57,17 +58,17 @@ def self_calibrate(recording: Samples, reference: Samples) -> Profile:
             raise SignalError(f"the {name} is {samples.size / SAMPLE_RATE:.2f} s long, expected at least {MIN_SECONDS:g} s of the robot's voice")
     x = np.pad(x, (0, max(y.size - x.size, 0)))[: y.size]
     lag = find_lag(y, x)
-    ppm, behind = find_drift(y, shift(x, lag))
+    ppm, behind = find_drift(y, delayed(x, lag))
     lag += behind
-    psd, seconds = fan_in_silences(y, silences(shift(x, lag)))
+    psd, seconds = fan_in_silences(y, silences(delayed(x, lag)))
     target = whiten(y, psd)
     fit = (np.arange(y.size) // BLOCK % 2 == 0).astype(np.float32)
-    sound = whiten(_drifting(shift(x, lag - REACH), ppm), psd)
+    sound = whiten(_drifting(delayed(x, lag - REACH), ppm), psd)
     even = fit / np.maximum(uniform_filter1d(target**2, MOMENT, mode="nearest"), 1.0)
     rough = fit_filter(sound, target, even, 2 * REACH, 0, np.full(2 * REACH, 1e-2))
     delay = lag - REACH + int(np.argmax(np.abs(rough)))
     weights = fit * disturbance(target - convolve_from(sound, rough, 0))
-    sound = whiten(_drifting(shift(x, delay - PRE_ROLL), ppm), psd)
+    sound = whiten(_drifting(delayed(x, delay - PRE_ROLL), ppm), psd)
     path = fit_path(sound, target, weights, float(np.square(rough).max()))
     predicted = convolve_from(sound, path, 0)
     _check_learned(target, predicted, fit, delay, ppm)

@@ -1,4 +1,4 @@
-"""By how much a whole recording lags behind what a profile predicts, and moving one onto the other."""
+"""By how much a whole recording lags behind what a profile predicts."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from scipy import fft
 from scipy.ndimage import uniform_filter1d
 
+from edgefilter.dsp.fractional_delay import delayed
 from edgefilter.errors import SignalError
 from edgefilter.types import SAMPLE_RATE, Samples
 
@@ -18,13 +19,6 @@ TRACK = SAMPLE_RATE
 """Samples of one window of the lag track."""
 TRACK_REACH = 1600
 """Samples by which the lag may move away from that of the whole recording and still be followed."""
-
-
-def shift(x: Samples, samples: float) -> Samples:
-    """x (n,) later by that many samples, which may be negative or fractional; what leaves either end is lost, silence comes in."""
-    n = fft.next_fast_len(x.size + int(abs(samples)) + 256, real=True)
-    ramp = np.exp(-2j * np.pi * np.arange(n // 2 + 1) / n * samples)
-    return fft.irfft(fft.rfft(x.astype(np.float64), n) * ramp, n)[: x.size].astype(np.float32)
 
 
 def starting_offset(predicted: Samples, recording: Samples) -> float:
@@ -46,7 +40,7 @@ def starting_offset(predicted: Samples, recording: Samples) -> float:
     stop = next((window.stop for window, lag in zip(clear, lags, strict=True) if abs(lag - first) > 0.3), clear[-1].stop)
     stop = max(min(stop - TRACK // 2, clear[0].start + 4 * TRACK), clear[0].start + TRACK)
     part = slice(max(clear[0].start - TRACK // 2, 0), stop)
-    moved = shift(predicted, first)
+    moved = delayed(predicted, first)
     return first + refine_lag(moved[part], recording[part], 0.0)
 
 
@@ -65,7 +59,7 @@ def lag_track(predicted: Samples, recording: Samples, around: float) -> list[Lag
 
     Windows in which the prediction does not stand out of the fan are left out.
     """
-    moved = shift(predicted, around)
+    moved = delayed(predicted, around)
     size = fft.next_fast_len(TRACK + 2 * TRACK_REACH, real=True)
     found = []
     for start in range(0, recording.size - TRACK + 1, TRACK // 2):

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 from scipy import fft
 from scipy.ndimage import maximum_filter1d
 
-from edgefilter.diagnosis.offset import find_offset, shift, starting_offset
+from edgefilter.diagnosis.offset import find_offset, starting_offset
+from edgefilter.dsp.fractional_delay import delayed
 from edgefilter.echo.effect import Measurement, complete, find, whiten
 from edgefilter.errors import SignalError
 from edgefilter.profile.data import Profile
@@ -71,13 +72,13 @@ def prepare(profile: Profile, recording: Samples, reference: Samples, *, sample_
     n = y.size
     x = np.pad(x, (0, max(n - x.size, 0)))[:n]
     start = profile.delay - PRE_ROLL
-    at_calibration = shift(x, start)
+    at_calibration = delayed(x, start)
     predicted = profile.echo.predict(at_calibration)
     known = expected_noise(profile)
     offset = starting_offset(whiten(predicted, known), whiten(y, known))
     pieces = utterance_lags(x, predicted, y, known, offset)
     begin, end = known_span(x, start + pieces[0][2], start + pieces[-1][2])
-    x = sum(shift(np.where((np.arange(n) >= first) & (np.arange(n) < last), x, np.float32(0)), start + lag) for first, last, lag in pieces)
+    x = sum(delayed(np.where((np.arange(n) >= first) & (np.arange(n) < last), x, np.float32(0)), start + lag) for first, last, lag in pieces)
     predicted = profile.echo.predict(x)
     white = whiten(predicted, known).astype(np.float64)
     block = SAMPLE_RATE // 50

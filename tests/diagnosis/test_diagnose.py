@@ -11,7 +11,7 @@ from scipy import signal
 from edgefilter.diagnosis.band_edge import band_edge
 from edgefilter.diagnosis.compare import compare
 from edgefilter.diagnosis.diagnose import Diagnosis, add, diagnose
-from edgefilter.diagnosis.offset import shift
+from edgefilter.dsp.fractional_delay import delayed
 from edgefilter.diagnosis.prepare import prepare
 from edgefilter.diagnosis.score import Judge, Verdict
 from edgefilter.diagnosis.suspects import SUSPECTS, choose
@@ -28,7 +28,7 @@ def fan(seed: int = 3) -> np.ndarray:
 
 
 def echo(x: np.ndarray) -> np.ndarray:
-    return EchoModel(path()).predict(shift(x, DELAY - PRE_ROLL)).astype(float)
+    return EchoModel(path()).predict(delayed(x, DELAY - PRE_ROLL)).astype(float)
 
 
 def names(found: Diagnosis) -> list[str]:
