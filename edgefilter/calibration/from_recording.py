@@ -8,22 +8,20 @@ from scipy import fft, signal
 from scipy.ndimage import binary_closing, uniform_filter1d
 
 from edgefilter.calibration.calibrate import third_octave_bands
-from edgefilter.diagnosis.offset import MAX_OFFSET
-from edgefilter.diagnosis.prepare import BLOCK, MIN_SECONDS
 from edgefilter.dsp.fractional_delay import delayed
+from edgefilter.dsp.lag import correlation_near, flat_cross, highest
 from edgefilter.echo.effect import find, whiten
 from edgefilter.echo.model import EchoModel
+from edgefilter.echo.recording import BLOCK, MAX_OFFSET, fitted_blocks, paired
 from edgefilter.echo.wiener import convolve_from, fit_filter
 from edgefilter.errors import SignalError
 from edgefilter.profile.data import DISTORTION_ORDERS, GRID_FFT, GRID_HZ, Profile
-from edgefilter.types import PRE_ROLL, SAMPLE_RATE, Samples, as_samples
+from edgefilter.types import PRE_ROLL, SAMPLE_RATE, Samples
 
 SOURCE = "made from the recording itself: what is stationary and linear is taken for the robot"
 ABSORBED = ("playback_gain", "bandlimit", "chassis_resonance", "late_reverb")
 """Stationary linear effects: the path fitted to a recording holds them already, so that nothing can tell them from the robot."""
 TAPS = 4096
-SMOOTHING_HZ, LOWEST_HZ = 32.0, 100.0
-"""Width over which spectra are averaged before they are flattened, and from where on they count."""
 STANDS_OUT = 8.0
 """Times the root mean square of all lags that the true one reaches; 4.5 measured where there is no robot, 10 to 87 where there is."""
 LEAST_DROP_DB, OTHERS_DB = 3.0, 6.0
@@ -52,17 +50,13 @@ def self_calibrate(recording: Samples, reference: Samples) -> Profile:
     1981), so that a talker does not bend it. The fan is what the robot's silences hold. ABSORBED effects are in it at their neutral
     values, so that no search claims them. Raises SignalError where the recording does not contain the reference.
     """
-    y, x = as_samples(recording, "recording"), as_samples(reference, "reference")
-    for samples, name in ((y, "recording"), (x, "reference")):
-        if samples.size < MIN_SECONDS * SAMPLE_RATE:
-            raise SignalError(f"the {name} is {samples.size / SAMPLE_RATE:.2f} s long, expected at least {MIN_SECONDS:g} s of the robot's voice")
-    x = np.pad(x, (0, max(y.size - x.size, 0)))[: y.size]
+    y, x = paired(recording, reference)
     lag = find_lag(y, x)
     ppm, behind = find_drift(y, delayed(x, lag))
     lag += behind
     psd, seconds = fan_in_silences(y, silences(delayed(x, lag)))
     target = whiten(y, psd)
-    fit = (np.arange(y.size) // BLOCK % 2 == 0).astype(np.float32)
+    fit = fitted_blocks(y.size).astype(np.float32)
     sound = whiten(_drifting(delayed(x, lag - REACH), ppm), psd)
     even = fit / np.maximum(uniform_filter1d(target**2, MOMENT, mode="nearest"), 1.0)
     rough = fit_filter(sound, target, even, 2 * REACH, 0, np.full(2 * REACH, 1e-2))
@@ -99,16 +93,9 @@ def find_lag(recording: Samples, reference: Samples) -> int:
     stands out: the highest of independent values at all lags is 4 to 5 times their root mean square.
     """
     n = fft.next_fast_len(2 * recording.size, real=True)
-    width = max(int(SMOOTHING_HZ * n / SAMPLE_RATE), 1)
-    cross = np.ones(n // 2 + 1, np.complex128)
-    for spectrum in (fft.rfft(recording.astype(np.float64), n), fft.rfft(reference.astype(np.float64), n).conj()):
-        power = uniform_filter1d(np.abs(spectrum) ** 2, width, mode="nearest")
-        cross *= spectrum / np.sqrt(power + 1e-6 * power.max() + 1e-20)
-    cross[: int(LOWEST_HZ * n / SAMPLE_RATE)] = 0.0
-    reach = min(int(MAX_OFFSET * SAMPLE_RATE), recording.size - 1)
-    near = np.abs(np.take(fft.irfft(cross, n), np.arange(-reach, reach + 1), mode="wrap"))
-    lag = int(np.argmax(near)) - reach
-    if not near.max() > STANDS_OUT * np.sqrt(np.mean(near**2)):
+    near = np.abs(correlation_near(flat_cross(reference, recording, n), n, min(int(MAX_OFFSET * SAMPLE_RATE), recording.size - 1)))
+    lag, height = highest(near)
+    if not height > STANDS_OUT:
         level = 10 * np.log10(float(np.mean(reference.astype(np.float64) ** 2)) + 1e-12)
         raise SignalError(
             f"the recording does not contain the reference (of {level:.0f} dBFS) at any lag up to {MAX_OFFSET:g} s, so there is no robot in it "
@@ -130,17 +117,12 @@ def find_drift(recording: Samples, reference: Samples) -> tuple[float, int]:
     size, part = 4 * WINDOW, slice(2 * WINDOW, 3 * WINDOW)
     padded = np.pad(reference, (2 * WINDOW, 2 * WINDOW))
     starts = np.arange(0, recording.size - WINDOW + 1, WINDOW // 2)
-    width = max(int(SMOOTHING_HZ * size / SAMPLE_RATE), 1)
     near = np.arange(-DRIFT_REACH * UPSAMPLED, DRIFT_REACH * UPSAMPLED + 1)
     rows = np.zeros((starts.size, near.size))
     for row, start in zip(rows, starts, strict=True):
         heard = np.zeros(size)
         heard[part] = recording[start : start + WINDOW]
-        cross = np.ones(size // 2 + 1, np.complex128)
-        for spectrum in (fft.rfft(heard), fft.rfft(padded[start : start + size].astype(np.float64)).conj()):
-            power = uniform_filter1d(np.abs(spectrum) ** 2, width, mode="nearest")
-            cross *= spectrum / np.sqrt(power + 1e-6 * power.max() + 1e-20)
-        cross[: int(LOWEST_HZ * size / SAMPLE_RATE)] = 0.0
+        cross = flat_cross(padded[start : start + size], heard, size)
         row[:] = np.take(fft.irfft(np.pad(cross, (0, (UPSAMPLED - 1) * size // 2)), UPSAMPLED * size), near, mode="wrap")
     grid = np.arange(-MAX_PPM, MAX_PPM + PPM_STEP, PPM_STEP)
     middles = starts + WINDOW / 2

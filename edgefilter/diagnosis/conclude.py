@@ -11,12 +11,13 @@ from edgefilter.diagnosis.band_edge import cut_by_power
 from edgefilter.diagnosis.compare import describe
 from edgefilter.diagnosis.evidence import left_in_words, sentence
 from edgefilter.diagnosis.noise_change import look_at_fan
-from edgefilter.diagnosis.prepare import BLOCK, Prepared
+from edgefilter.diagnosis.prepare import Prepared
 from edgefilter.diagnosis.result import Diagnosis, Finding, Interval
 from edgefilter.diagnosis.score import Judge
 from edgefilter.diagnosis.trials import Found, Trial, floor_level
 from edgefilter.echo.effect import complete, find
 from edgefilter.echo.model import EchoModel
+from edgefilter.echo.recording import BLOCK
 
 EXPLAINED_DB = 0.8
 """Excess up to which nothing is missing: what the fan of another day and a faint distortion leave."""

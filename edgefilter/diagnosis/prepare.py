@@ -13,12 +13,11 @@ from scipy.ndimage import maximum_filter1d
 from edgefilter.diagnosis.offset import find_offset, starting_offset
 from edgefilter.dsp.fractional_delay import delayed
 from edgefilter.echo.effect import Measurement, complete, find, whiten
+from edgefilter.echo.recording import fitted_blocks, paired
 from edgefilter.errors import SignalError
 from edgefilter.profile.data import Profile
 from edgefilter.types import PRE_ROLL, SAMPLE_RATE, Samples, as_samples
 
-BLOCK = SAMPLE_RATE // 2
-"""Samples of the blocks that are fitted on and judged by in turn."""
 SILENCE_DB = -15.0
 """The robot is silent where its predicted voice, whitened, is this far under the fan."""
 FAN_TOLERANCE_DB = 1.0
@@ -31,7 +30,6 @@ CUT, CUT_DB, TAIL_S = 32, -30.0, 0.3
 still sounds for TAIL_S."""
 PAUSE_S, LAG_STEP = 0.5, 480
 """Silence of the reference after which a player may have started anew, and samples (30 ms) by which the lag must differ then."""
-MIN_SECONDS = 1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,11 +64,8 @@ def prepare(profile: Profile, recording: Samples, reference: Samples, *, sample_
     y, x = as_samples(recording, "recording"), as_samples(reference, "reference")
     if sample_rate != SAMPLE_RATE:
         y, x = (soxr.resample(signal_, sample_rate, SAMPLE_RATE).astype(np.float32) for signal_ in (y, x))
-    for samples, name in ((y, "recording"), (x, "reference")):
-        if samples.size < MIN_SECONDS * SAMPLE_RATE:
-            raise SignalError(f"the {name} is {samples.size / SAMPLE_RATE:.2f} s long, expected at least {MIN_SECONDS:g} s of the robot's voice")
+    y, x = paired(y, x)
     n = y.size
-    x = np.pad(x, (0, max(n - x.size, 0)))[:n]
     start = profile.delay - PRE_ROLL
     at_calibration = delayed(x, start)
     predicted = profile.echo.predict(at_calibration)
@@ -84,7 +79,7 @@ def prepare(profile: Profile, recording: Samples, reference: Samples, *, sample_
     block = SAMPLE_RATE // 50
     level = np.add.reduceat(white**2, np.arange(0, n, block)) / block
     active = np.repeat(maximum_filter1d(level, 11) > 10 ** (SILENCE_DB / 10), block)[:n]
-    fit = np.arange(n) // BLOCK % 2 == 0
+    fit = fitted_blocks(n)
     quiet = whiten(y, known) ** 2
     psd = known * np.float32(fan_scale(whiten(y, known)[~active]))
     human = find_talk(quiet * (known[1] / psd[1]), active)

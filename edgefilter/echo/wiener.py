@@ -10,10 +10,9 @@ from numpy.typing import NDArray
 from scipy import fft
 
 from edgefilter.echo.effect import Measurement
+from edgefilter.echo.recording import BLOCK
 from edgefilter.types import SAMPLE_RATE, Array, Samples
 
-BLOCK = SAMPLE_RATE // 2
-"""Samples that are transformed at once, those between two changes of the samples that diagnose() fits on."""
 SETTLED = 1e-6
 """A step that explains less than this part of what all before it have explained is the last."""
 
@@ -64,15 +63,18 @@ def fit_filter(x: Samples, target: Samples, weights: Samples, taps: int, lead: i
 
 
 def fit_supported(x: Samples, target: Samples, weights: Samples, taps: int, lead: int, prior: Array, steps: int) -> Array:
-    """fit_filter's answer, or zeros where a filter from half of the weighted samples does not help on the other half (blocks of 0.5 s)."""
-    half = np.arange(x.size) // (SAMPLE_RATE // 2) % 4 < 2
+    """fit_filter's answer, or zeros where a filter from half of the weighted samples does not help on the other half (BLOCKs, two by two)."""
+    half = np.arange(x.size) // BLOCK % 4 < 2
     trial = convolve_from(x, fit_filter(x, target, weights * half, taps, lead, prior, steps // 2), lead)
     fall = float(np.dot(target * target - (target - trial) ** 2, weights * ~half))
     return fit_filter(x, target, weights, taps, lead, prior, steps) if fall > 0.0 else np.zeros(taps)
 
 
 class _Blocks:
-    """x (n,) in the blocks of a weighted convolution, those without weight left out: overlap-save with transforms that stay in the cache."""
+    """x (n,) in the blocks of a weighted convolution, those without weight left out: overlap-save.
+
+    The blocks are those between two changes of the samples that are fitted on, so that half of them drop out; their transforms stay in the cache.
+    """
 
     def __init__(self, x: Samples, weights: Samples, taps: int, lead: int) -> None:
         self._taps = taps
