@@ -121,7 +121,7 @@ class DelayMeter:
         near = float(likelihood[expected - 2 : expected + 3].max())
         at, peak, strength, ratio = max((_highest(likelihood, reach) for reach in {REACH, expected}), key=lambda found: found[2] * found[3])
         part, inside = divmod(at, 2 * REACH)
-        offset = at - inside + REACH - expected + climb(products[part], self._omega, inside - REACH, steps=3, longest=2.0)
+        offset = at - inside + REACH - expected + climb(products[part], self._omega, inside - REACH, steps=3)
         there = references[part][SIZE - FRAME - inside : SIZE - inside] * self._window
         information = 2.0 * float(self._omega_squared.dot(power(self.response) * power_a * weight)) * FRAME / SIZE
         explained = 1.0 - float(self._band.dot(left / (power_m + 1e-20))) / self._band_size

@@ -73,11 +73,10 @@ def turn(omega: Array, delay: float) -> np.ndarray:
     return turned
 
 
-def climb(cross: np.ndarray, omega: Array, lag: float, steps: int = 8, tolerance: float = 0.0, longest: float = LONGEST) -> float:
+def climb(cross: np.ndarray, omega: Array, lag: float, steps: int = 8, tolerance: float = 0.0) -> float:
     """The lag, at most one sample from `lag`, at the top of the correlation whose cross-spectrum (bins,) this is.
 
     omega: (bins,) radians per sample. Newton's method on Re sum cross exp(j omega lag), up to `steps` steps or one under the tolerance.
-    longest: of a step, samples.
     """
     squared, moved = np.square(omega), 0.0
     for _ in range(steps):
@@ -87,7 +86,7 @@ def climb(cross: np.ndarray, omega: Array, lag: float, steps: int = 8, tolerance
         curvature = -float(squared.dot(turned.real))
         if curvature >= 0.0:
             break
-        step = min(max(-slope / curvature, -longest), longest)
+        step = min(max(-slope / curvature, -LONGEST), LONGEST)
         moved = min(max(moved + step, -1.0), 1.0)
         if abs(step) < tolerance:
             break
