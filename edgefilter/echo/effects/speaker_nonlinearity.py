@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
+from edgefilter.dsp.membrane import DISPLACEMENT_TAPS, displacement_taps
 from edgefilter.echo.effect import Measurement, Parameter, Stage, Values, level_ratio
 from edgefilter.echo.least_squares import NUISANCE_LEAD, filtered, normal_equations, short_filter
 from edgefilter.types import SAMPLE_RATE, Array, Samples
@@ -13,8 +14,6 @@ from edgefilter.types import SAMPLE_RATE, Array, Samples
 if TYPE_CHECKING:
     from edgefilter.echo.model import EchoModel
 
-DISPLACEMENT_HZ, DISPLACEMENT_TAPS = 300.0, 128
-"""Corner of the second-order low-pass that turns the reference into the displacement of the membrane; 8 ms later it is 80 dB down."""
 TAPS = 16
 """Taps of the filter behind each nonlinear function, where one number each is not enough."""
 RIDGE = 1e-3
@@ -24,15 +23,8 @@ TERMS = ("even", "odd", "saturation", "force_factor", "stiffness")
 
 
 def displacement(x: Samples, sample_rate: int = SAMPLE_RATE) -> Samples:
-    """The membrane's displacement (n,) for the drive x (n,), in its full scale: stiffness holds it below the resonance, mass above."""
-    return short_filter(x, _butterworth(sample_rate))[: x.size] if x.size else x.copy()
-
-
-def _butterworth(sample_rate: int) -> Samples:
-    """Impulse response (DISPLACEMENT_TAPS,) of w^2 / (s^2 + sqrt(2) w s + w^2), sampled, with a gain of 1 at 0 Hz."""
-    t = np.sqrt(2.0) * np.pi * DISPLACEMENT_HZ * np.arange(DISPLACEMENT_TAPS) / sample_rate
-    taps = np.exp(-t) * np.sin(t)
-    return (taps / taps.sum()).astype(np.float32)
+    """The membrane's displacement (n,) for the drive x (n,), in its full scale."""
+    return short_filter(x, displacement_taps(sample_rate).astype(np.float32))[: x.size] if x.size else x.copy()
 
 
 def distortion_terms(x: Samples, sample_rate: int = SAMPLE_RATE) -> dict[str, Samples]:
