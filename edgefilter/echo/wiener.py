@@ -28,7 +28,8 @@ def fit_filter(x: Samples, target: Samples, weights: Samples, taps: int, lead: i
 
     x, target: (n,), whitened, so that the noise has variance 1. weights: (n,) 0 to 1. prior: (taps,) expected c^2; None: no penalty
     but a tiny one. Preconditioned conjugate gradients on the normal equations (Golub & Van Loan, Matrix Computations, 11.5) with a
-    circulant preconditioner; stopping after `steps` leaves out what the data hardly speaks of.
+    circulant preconditioner; stopping after `steps` leaves out what the data hardly speaks of. Not scipy's cg: what a step explains, by
+    which this one stops, can be had from its iterates only as a difference, which the transforms' float32 drowns.
     """
     blocks = _Blocks(x, weights, taps, lead)
     share = float(np.mean(weights))

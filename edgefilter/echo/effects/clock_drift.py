@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
+import scipy
 
 from edgefilter.dsp.fractional_delay import interpolate
 from edgefilter.echo.effect import Measurement, Parameter, Stage, Values
@@ -59,9 +60,7 @@ class ClockDrift:
 
 def robust_line(x: Array, y: Array, sigma: Array) -> tuple[float, float]:
     """Slope and offset of y (m,) over x (m,): from the median of all pairwise slopes (Theil-Sen), then Tukey's biweight."""
-    i, j = np.triu_indices(x.size, 1)
-    slope = float(np.median((y[j] - y[i]) / (x[j] - x[i])))
-    offset = float(np.median(y - slope * x))
+    slope, offset, *_ = scipy.stats.theilslopes(y, x, method="joint")
     spread = np.hypot(sigma, STEADY)
     for _ in range(10):
         distance = (y - slope * x - offset) / spread
