@@ -7,9 +7,10 @@ from numpy.typing import NDArray
 from scipy import fft, signal
 from scipy.ndimage import binary_closing, uniform_filter1d
 
-from edgefilter.calibration.calibrate import third_octave_bands
 from edgefilter.dsp.fractional_delay import delayed
+from edgefilter.dsp.frames import all_block_power, block_power, decibels, frames
 from edgefilter.dsp.lag import correlation_near, flat_cross, highest
+from edgefilter.dsp.psd import ROUNDING_PSD, periodograms, third_octave_bands
 from edgefilter.echo.effect import find, whiten
 from edgefilter.echo.model import EchoModel
 from edgefilter.echo.recording import BLOCK, MAX_OFFSET, fitted_blocks, paired
@@ -96,7 +97,7 @@ def find_lag(recording: Samples, reference: Samples) -> int:
     near = np.abs(correlation_near(flat_cross(reference, recording, n), n, min(int(MAX_OFFSET * SAMPLE_RATE), recording.size - 1)))
     lag, height = highest(near)
     if not height > STANDS_OUT:
-        level = 10 * np.log10(float(np.mean(reference.astype(np.float64) ** 2)) + 1e-12)
+        level = decibels(np.mean(np.square(reference, dtype=np.float64)))
         raise SignalError(
             f"the recording does not contain the reference (of {level:.0f} dBFS) at any lag up to {MAX_OFFSET:g} s, so there is no robot in it "
             "to learn from: give a recording in which the robot talks, or a calibration (--profile)"
@@ -140,7 +141,7 @@ def find_drift(recording: Samples, reference: Samples) -> tuple[float, int]:
 def silences(reference: Samples) -> NDArray[np.bool_]:
     """(n,) where an aligned reference (n,) is silent and has been for TAIL_S."""
     block = SAMPLE_RATE // 10
-    level = np.add.reduceat(reference.astype(np.float64) ** 2, np.arange(0, reference.size, block))
+    level = all_block_power(reference, block)
     loud = level > 10 ** (SILENT_DB / 10) * level.max(initial=1e-30)
     after = round(TAIL_S * 10)
     near = np.convolve(loud, np.ones(after + 2))[1 : 1 + loud.size] > 0
@@ -153,15 +154,13 @@ def fan_in_silences(recording: Samples, silent: NDArray[np.bool_]) -> tuple[Samp
     Where silent (n,) leaves fewer than LEAST_FRAMES, the quietest twentieth of all frames is taken, and 0 seconds are said.
     """
     step = GRID_FFT // 2
-    frames = np.lib.stride_tricks.sliding_window_view(recording, GRID_FFT)[::step]
-    window = signal.get_window("hann", GRID_FFT).astype(np.float32)
-    power = np.abs(fft.rfft(frames * window, axis=1)) ** 2
-    whole = np.lib.stride_tricks.sliding_window_view(silent, GRID_FFT)[::step].all(axis=1)
+    power = periodograms(recording, GRID_FFT)
+    whole = frames(silent, GRID_FFT, step).all(axis=1)
     share = 0.5 if whole.sum() >= LEAST_FRAMES else 0.05
     at = np.flatnonzero(whole) if share == 0.5 else np.arange(power.shape[0])
-    order = at[np.argsort(np.log(power[at] + 1e-12).mean(axis=1))]
+    order = at[np.argsort(np.log(np.maximum(power[at], ROUNDING_PSD)).mean(axis=1))]
     kept = power[order[: max(int(share * order.size), LEAST_FRAMES // 2)]]
-    psd = 2 * uniform_filter1d(kept.mean(axis=0), 5, mode="nearest") / (SAMPLE_RATE * float(np.sum(window**2)))
+    psd = uniform_filter1d(kept.mean(axis=0), 5, mode="nearest")
     return psd.astype(np.float32), kept.shape[0] * step / SAMPLE_RATE if share == 0.5 else 0.0
 
 
@@ -202,15 +201,10 @@ def _snr_by_band(predicted: Samples) -> tuple[np.ndarray, np.ndarray]:
     return bands, 10 * np.log10(np.clip(np.array(means, np.float64), 1e-2, 1e12))
 
 
-def _by_block(x: Samples) -> np.ndarray:
-    """Mean square of x (n,) in each whole BLOCK."""
-    return np.square(x[: x.size // BLOCK * BLOCK].astype(np.float64)).reshape(-1, BLOCK).mean(axis=1)
-
-
 def _check_learned(target: Samples, predicted: Samples, fit: Samples, delay: float, ppm: float) -> None:
     """Raise SignalError unless the prediction takes LEAST_DROP_DB away in a fifth of the blocks that no fit has used."""
-    drop = 10 * np.log10((_by_block(target) + 1e-12) / (_by_block(target - predicted) + 1e-12))
-    held = drop[_by_block(fit) == 0.0]
+    drop = decibels(block_power(target, BLOCK)) - decibels(block_power(target - predicted, BLOCK))
+    held = drop[block_power(fit, BLOCK) == 0.0]
     if held.size and float(np.quantile(held, 0.8)) >= LEAST_DROP_DB:
         return
     clocks = f", clocks {abs(ppm):.0f} ppm apart" if ppm else ""
@@ -225,8 +219,8 @@ def others(target: Samples, predicted: Samples) -> list[tuple[float, float]]:
 
     Moments of a second or less between them belong to them.
     """
-    rest = _by_block(target - predicted)
-    loud = rest > 10 ** (OTHERS_DB / 10) * np.maximum(_by_block(predicted), 10.0)
+    rest = block_power(target - predicted, BLOCK)
+    loud = rest > 10 ** (OTHERS_DB / 10) * np.maximum(block_power(predicted, BLOCK), 10.0)
     loud = binary_closing(np.pad(loud, 2), np.ones(3))[2:-2]
     edges = np.flatnonzero(np.diff(np.concatenate(([False], loud, [False]))))
     return [(begin * BLOCK / SAMPLE_RATE, end * BLOCK / SAMPLE_RATE) for begin, end in edges.reshape(-1, 2)]

@@ -8,6 +8,8 @@ import numpy as np
 from scipy.ndimage import median_filter
 
 from edgefilter.diagnosis.prepare import Prepared
+from edgefilter.dsp.frames import block_power, blocks, decibels
+from edgefilter.dsp.psd import frequencies, periodograms
 from edgefilter.echo.effect import whiten
 from edgefilter.types import SAMPLE_RATE, Array, Samples
 
@@ -39,25 +41,22 @@ def inspect(prepared: Prepared, residual: Samples) -> Leftover:
     psd = prepared.measurement.noise_psd
     tones, mains, share = _tones(residual, psd)
     quiet = prepared.usable & ~prepared.active
-    white = whiten(residual, psd).astype(np.float64) ** 2
-    count = white.size // BLOCK
-    whole = quiet[: count * BLOCK].reshape(count, BLOCK).all(axis=1)
-    power = white[: count * BLOCK].reshape(count, BLOCK).mean(axis=1)[whole]
+    white = whiten(residual, psd)
+    power = block_power(white, BLOCK)[blocks(quiet, BLOCK).all(axis=1)]
     if power.size < 5:
         return Leftover(tones, mains, share, float("nan"), float("nan"), 0.0)
-    low, middle, high = 10 * np.log10(np.quantile(power, (0.1, 0.5, 0.9)) + 1e-12)
-    return Leftover(tones, mains, share, float(middle), float(10 * np.log10(power.mean() + 1e-12)), float(high - low))
+    low, middle, high = decibels(np.quantile(power, (0.1, 0.5, 0.9)))
+    return Leftover(tones, mains, share, float(middle), float(decibels(power.mean())), float(high - low))
 
 
 def _tones(residual: Samples, psd: Samples) -> tuple[Array, float, float]:
     """Frequencies of tones, loudest first, the mains frequency they belong to (0: none), and their share of the power over the fan."""
     if residual.size < 2 * LINE_FFT:
         return np.zeros(0), 0.0, 0.0
-    frames = np.lib.stride_tricks.sliding_window_view(residual, LINE_FFT)[:: LINE_FFT // 2]
-    power = np.median(np.abs(np.fft.rfft(frames * np.hanning(LINE_FFT).astype(np.float32), axis=1)) ** 2, axis=0)
-    hz = np.arange(power.size) * SAMPLE_RATE / LINE_FFT
+    power = np.median(periodograms(residual, LINE_FFT), axis=0)
+    hz = frequencies(power.size)
     floor = median_filter(power, 81, mode="nearest")
-    expected = np.interp(hz, np.arange(psd.size) * 0.5 * SAMPLE_RATE / (psd.size - 1), psd) / 2 * SAMPLE_RATE * 0.375 * LINE_FFT * np.log(2)
+    expected = np.interp(hz, frequencies(psd.size), psd) * np.log(2)
     peak = (power > LINE_OVER_FLOOR * floor) & (power > LINE_OVER_FLOOR * expected) & (power >= np.maximum(np.roll(power, 1), np.roll(power, -1)))
     peak[:20] = False
     at = np.flatnonzero(peak)

@@ -11,7 +11,10 @@ from scipy import fft
 from scipy.ndimage import maximum_filter1d
 
 from edgefilter.diagnosis.offset import find_offset, starting_offset
+from edgefilter.dsp.fourier import power
 from edgefilter.dsp.fractional_delay import delayed
+from edgefilter.dsp.frames import all_block_power, blocks, decibels
+from edgefilter.dsp.psd import hann
 from edgefilter.echo.effect import Measurement, complete, find, whiten
 from edgefilter.echo.recording import fitted_blocks, paired
 from edgefilter.errors import SignalError
@@ -75,9 +78,9 @@ def prepare(profile: Profile, recording: Samples, reference: Samples, *, sample_
     begin, end = known_span(x, start + pieces[0][2], start + pieces[-1][2])
     x = sum(delayed(np.where((np.arange(n) >= first) & (np.arange(n) < last), x, np.float32(0)), start + lag) for first, last, lag in pieces)
     predicted = profile.echo.predict(x)
-    white = whiten(predicted, known).astype(np.float64)
+    white = whiten(predicted, known)
     block = SAMPLE_RATE // 50
-    level = np.add.reduceat(white**2, np.arange(0, n, block)) / block
+    level = all_block_power(white, block)
     active = np.repeat(maximum_filter1d(level, 11) > 10 ** (SILENCE_DB / 10), block)[:n]
     fit = fitted_blocks(n)
     quiet = whiten(y, known) ** 2
@@ -103,7 +106,7 @@ def known_span(x: Samples, first_lag: float, last_lag: float) -> tuple[int, int]
     that ends there, is heard but unknown.
     """
     n, block = x.size, SAMPLE_RATE // 50
-    loud = 10 ** (CUT_DB / 10) * float(np.max(np.add.reduceat(x.astype(np.float64) ** 2, np.arange(0, n, block)) / block))
+    loud = 10 ** (CUT_DB / 10) * float(np.max(all_block_power(x, block)))
     said = np.flatnonzero(x)
     stop = int(said[-1]) + 1 if said.size else 0
     begins, ends = (float(np.mean(x[part].astype(np.float64) ** 2)) > loud for part in (slice(0, CUT), slice(max(stop - CUT, 0), max(stop, 1))))
@@ -119,7 +122,7 @@ def utterance_lags(x: Samples, predicted: Samples, recording: Samples, psd: Samp
     difference of less than LAG_STEP is no new start but left for the effects to explain.
     """
     block = SAMPLE_RATE // 50
-    level = np.add.reduceat(x.astype(np.float64) ** 2, np.arange(0, x.size, block))
+    level = all_block_power(x, block)
     loud = np.flatnonzero(level > 10**-4.5 * level.max(initial=0.0))
     gaps = np.flatnonzero(np.diff(loud) > 50 * PAUSE_S)
     begins = [0, *(int(loud[gap + 1]) * block for gap in gaps)]
@@ -141,7 +144,7 @@ def utterance_lags(x: Samples, predicted: Samples, recording: Samples, psd: Samp
     return pieces
 
 
-def find_talk(power: Samples, active: NDArray[np.bool_]) -> tuple[tuple[float, float], ...]:
+def find_talk(square: Samples, active: NDArray[np.bool_]) -> tuple[tuple[float, float], ...]:
     """(start_s, end_s) where somebody talks, from the whitened recording's square (n,) in the robot's silences.
 
     Somebody talks where tenths of a second are TALK_DB over the fan while at least a third of the silence is at the fan: a fan that
@@ -149,9 +152,9 @@ def find_talk(power: Samples, active: NDArray[np.bool_]) -> tuple[tuple[float, f
     included. Nothing is found where it would be more than half of the recording: there is no working around that.
     """
     block = SAMPLE_RATE // 10
-    count = power.size // block
-    silent = ~active[: count * block].reshape(count, block).any(axis=1)
-    level = power[: count * block].reshape(count, block).mean(axis=1)
+    count = square.size // block
+    silent = ~blocks(active, block).any(axis=1)
+    level = blocks(square, block).mean(axis=1)
     loud = silent & (level > 10 ** (TALK_DB / 10))
     if loud.sum() < 3 or np.mean(level[silent] < 2.0) < 1 / 3:
         return ()
@@ -173,11 +176,10 @@ def fan_scale(quiet: Samples) -> float:
     """
     if quiet.size < SAMPLE_RATE // 2:
         return 1.0
-    size = 256
-    frames = quiet[: quiet.size // size * size].reshape(-1, size) * np.hanning(size).astype(np.float32)
-    power = np.mean(np.abs(fft.rfft(frames)) ** 2, axis=0) / np.sum(np.hanning(size) ** 2)
-    scale = float(np.median(power[3:-6]))
-    return scale if abs(10 * np.log10(max(scale, 1e-9))) <= FAN_TOLERANCE_DB else 1.0
+    window = hann(256)
+    spectrum = np.mean(power(fft.rfft(blocks(quiet, 256) * window)), axis=0) / np.sum(window**2)
+    scale = float(np.median(spectrum[3:-6]))
+    return scale if abs(decibels(scale)) <= FAN_TOLERANCE_DB else 1.0
 
 
 def expected_noise(profile: Profile) -> Samples:

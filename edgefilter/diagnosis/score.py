@@ -9,11 +9,13 @@ import numpy as np
 from scipy.ndimage import uniform_filter1d
 
 from edgefilter.diagnosis.prepare import Prepared
-from edgefilter.echo.effect import ROUNDING_PSD, whiten
+from edgefilter.dsp.frames import decibels
+from edgefilter.dsp.psd import floored, frequencies, hann, variance_at
+from edgefilter.echo.effect import whiten
 from edgefilter.echo.least_squares import normal_equations
 from edgefilter.echo.model import EchoModel
 from edgefilter.echo.wiener import convolve_from
-from edgefilter.types import SAMPLE_RATE, Array, Samples
+from edgefilter.types import Array, Samples
 
 FRAME, HOP = 512, 256
 FRAMES_PER_CELL = 8
@@ -55,10 +57,9 @@ class Judge:
         measurement = prepared.measurement
         self.psd = measurement.noise_psd
         n = measurement.recording.size
-        self._window = np.hanning(FRAME + 1)[:-1].astype(np.float32)
-        hz = np.arange(FRAME // 2 + 1) * SAMPLE_RATE / FRAME
-        expected = np.interp(hz, np.arange(self.psd.size) * 0.5 * SAMPLE_RATE / (self.psd.size - 1), self.psd) / 2 * SAMPLE_RATE
-        self._expected = np.maximum(expected, 1e-12 * expected.max()) * float(np.sum(self._window**2))
+        self._window = hann(FRAME).astype(np.float32)
+        hz = frequencies(FRAME // 2 + 1)
+        self._expected = variance_at(hz, floored(self.psd)) * float(np.sum(self._window**2))
         self._rows = measurement.fit & prepared.usable & prepared.active & (np.arange(n) % 3 == 0)
         starts = np.arange(0, n - FRAME - HOP * (FRAMES_PER_CELL - 1) + 1, HOP * FRAMES_PER_CELL)
         span = FRAME + HOP * (FRAMES_PER_CELL - 1)
@@ -123,7 +124,7 @@ class Judge:
         """power (n,) of the whitened residual over what is expected, both smoothed over 16 ms: when a knock comes is known to some ms."""
         expected = np.ones_like(power)
         for variance, colour in unpredictable:
-            expected += variance * float(np.mean(colour / np.maximum(self.psd, max(ROUNDING_PSD, 1e-7 * float(self.psd.max())))))
+            expected += variance * float(np.mean(colour / floored(self.psd)))
         return uniform_filter1d(power, HOP) / uniform_filter1d(expected, HOP)
 
     def correct(self, prediction: Samples) -> Samples:
@@ -138,4 +139,4 @@ class Judge:
 
 
 def _db(power: Array) -> float:
-    return float(10.0 * np.log10(max(float(np.mean(power)), 1e-12))) if power.size else 0.0
+    return float(decibels(np.mean(power))) if power.size else 0.0

@@ -12,11 +12,13 @@ import numpy as np
 from edgefilter.diagnosis.prepare import Prepared
 from edgefilter.diagnosis.score import Judge, Verdict
 from edgefilter.diagnosis.suspects import suspect
+from edgefilter.dsp.frames import decibels
+from edgefilter.dsp.psd import total_power
 from edgefilter.echo.effect import Values, complete, find, names, whiten
 from edgefilter.echo.effect import neutral as neutral_values
 from edgefilter.echo.model import EchoModel
 from edgefilter.errors import UsageError
-from edgefilter.types import SAMPLE_RATE, Samples
+from edgefilter.types import Samples
 
 LAST, ENOUGH, LITTLE_DB = ("rattle",), 0.4, 0.1
 """Effects whose fit takes long: tried where no other explains this share of the level above the silences, and where that is no less than so much."""
@@ -191,15 +193,15 @@ def floor_level(judge: Judge, verdict: Verdict) -> float:
     quiet = verdict.cells[~judge.active_cells]
     if quiet.shape[0] < 4:
         return 0.0
-    return float(np.average(10 * np.log10(np.maximum(quiet, 1e-3)).mean(axis=0), weights=judge.freedom))
+    return float(np.average(decibels(quiet, 1e-3).mean(axis=0), weights=judge.freedom))
 
 
 def size_db(change: Samples, prepared: Prepared) -> float:
     """Power of a change of the prediction (n,) over the fan in dB: as it is or whitened, whichever is more."""
     psd = prepared.measurement.noise_psd
-    fan = float(psd.sum()) * (SAMPLE_RATE / 2) / (psd.size - 1)
+    fan = total_power(psd)
     plain, white = float(np.mean(change.astype(float) ** 2)) / fan, float(np.mean(whiten(change, psd).astype(float) ** 2))
-    return float(10 * np.log10(max(plain, white, 1e-12)))
+    return float(decibels(max(plain, white)))
 
 
 def noise_size_db(name: str, model: EchoModel, prepared: Prepared) -> float:
@@ -207,6 +209,6 @@ def noise_size_db(name: str, model: EchoModel, prepared: Prepared) -> float:
     if not hasattr(find(name), "variance"):
         return -120.0
     psd = prepared.measurement.noise_psd
-    fan = float(psd.sum()) * (SAMPLE_RATE / 2) / (psd.size - 1)
+    fan = total_power(psd)
     power = sum(float(np.mean(variance)) for variance, _ in model.unpredictable(prepared.measurement.reference))
-    return float(10 * np.log10(max(power / fan, 1e-12)))
+    return float(decibels(power / fan))

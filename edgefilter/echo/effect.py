@@ -11,6 +11,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
+from edgefilter.dsp.psd import floored
 from edgefilter.errors import UsageError
 from edgefilter.types import SAMPLE_RATE, Array, Samples
 
@@ -21,8 +22,6 @@ Values: TypeAlias = Mapping[str, "float | Array"]
 Stage: TypeAlias = Literal["source", "path", "time", "microphone", "noise"]
 STAGES: tuple[Stage, ...] = ("source", "path", "time", "microphone", "noise")
 """In the order in which sound meets them."""
-ROUNDING_PSD = 1e-14
-"""One-sided PSD of rounding to 16 bit, full scale^2/Hz: (2^-15)^2 / 12 / 8 kHz."""
 REMEMBERED = 6
 """Models whose predictions a measurement keeps."""
 
@@ -86,10 +85,9 @@ class Measurement:
 def whiten(x: Samples, noise_psd: Samples) -> Samples:
     """x (n,) filtered by 1 / sqrt(noise_psd), zero-phase, so that noise of that one-sided PSD gets variance 1.
 
-    The PSD is held above 16 bit rounding noise and 70 dB under its maximum, so that a notch is not amplified beyond reason.
+    The PSD is floored, so that a notch is not amplified beyond reason.
     """
-    two_sided = np.maximum(noise_psd.astype(np.float64), max(ROUNDING_PSD, 1e-7 * float(noise_psd.max()))) * SAMPLE_RATE / 2
-    taps = np.fft.fftshift(np.fft.irfft(1.0 / np.sqrt(two_sided)))[1:]
+    taps = np.fft.fftshift(np.fft.irfft(1.0 / np.sqrt(floored(noise_psd) * SAMPLE_RATE / 2)))[1:]
     taps *= np.hanning(taps.size + 2)[1:-1] ** 0.25
     return scipy.signal.oaconvolve(x, taps.astype(np.float32), mode="full")[taps.size // 2 :][: x.size].astype(np.float32)
 

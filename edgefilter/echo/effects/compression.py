@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 import scipy
 
+from edgefilter.dsp.frames import block_power, decibels
 from edgefilter.echo.effect import Measurement, Parameter, Stage, Values, complete, neutral
 from edgefilter.echo.least_squares import Normal, normal_equations
 from edgefilter.types import SAMPLE_RATE, Array, Samples
@@ -77,8 +78,7 @@ class Compression:
         """
         part, fit = _loudest(measurement, any(name in TIMED for name, _ in model.effects))
         x, target = measurement.reference[part], measurement.whiten(measurement.recording[part])
-        blocks = np.square(x[: x.size // 320 * 320], dtype=np.float64).reshape(-1, 320).mean(axis=1)
-        loud_db = 10.0 * np.log10(float(np.max(blocks, initial=0.0)) + 1e-9)
+        loud_db = float(decibels(np.max(block_power(x, SAMPLE_RATE // 50), initial=0.0), 1e-9))
 
         def predict(unknowns: Array) -> Samples:
             return measurement.whiten(model.predict(self.apply(x, complete(self, _values(unknowns)), SAMPLE_RATE)))

@@ -6,9 +6,11 @@ from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
-from edgefilter.echo.effect import ROUNDING_PSD, Measurement, Parameter, Stage, Values
+from edgefilter.dsp.frames import frames
+from edgefilter.dsp.psd import floored, periodograms
+from edgefilter.echo.effect import Measurement, Parameter, Stage, Values
 from edgefilter.echo.least_squares import absorbed
-from edgefilter.types import SAMPLE_RATE, Array, Samples
+from edgefilter.types import Array, Samples
 
 if TYPE_CHECKING:
     from edgefilter.echo.model import EchoModel
@@ -56,38 +58,23 @@ class FanNoise:
             return {"spectrum_db": 0.0, "change_db": 0.0}
         voice = absorbed(measurement.heard(model)[0], measurement.recording, measurement.fit)
         size = 2 * (known.size - 1)
-        residual = _periodograms(measurement.recording - voice, size)
+        residual = periodograms(measurement.recording - voice, size)
         if not len(residual):
             return {"spectrum_db": 0.0, "change_db": 0.0}
-        whole = _frames(measurement.weights, size).all(axis=1)
-        own = np.mean(_frames(measurement.whiten(voice), size) ** 2, axis=1)
+        whole = frames(measurement.weights, size, size // 2).all(axis=1)
+        own = np.mean(frames(measurement.whiten(voice), size, size // 2) ** 2, axis=1)
         silent = whole & (own < 10.0 ** (SILENT_DB / 10.0))
         if silent.sum() >= FEWEST_FRAMES:
             found = residual[silent].mean(axis=0)
         else:
             found = _quiet_mean(residual[whole] if whole.any() else residual)
-        floor = np.maximum(known.astype(np.float64), ROUNDING_PSD)
+        floor = floored(known)
         smooth = np.convolve(np.pad(found / floor, 1, mode="edge"), SMOOTH, "valid")
         total = 10.0 * np.log10(np.sum(smooth * floor) / np.sum(floor) + 1e-30)
         return {
             "spectrum_db": np.clip(10.0 * np.log10(smooth + 1e-30), LOWEST_DB, HIGHEST_DB),
             "change_db": float(np.clip(total, LOWEST_DB, HIGHEST_DB)),
         }
-
-
-def _frames(x: Samples, size: int) -> Array:
-    """Half-overlapping frames (f, size) of x (n,)."""
-    if x.size < size:
-        return np.zeros((0, size), x.dtype)
-    return np.lib.stride_tricks.sliding_window_view(x, size)[:: size // 2]
-
-
-def _periodograms(x: Samples, size: int) -> Array:
-    """One-sided periodograms (f, size / 2 + 1), full scale^2/Hz, of Hann frames."""
-    window = np.hanning(size + 1)[:-1]
-    power = np.abs(np.fft.rfft(_frames(x, size) * window)) ** 2 / (SAMPLE_RATE * np.sum(window**2))
-    power[:, 1:-1] *= 2.0
-    return power
 
 
 def _quiet_mean(power: Array) -> Array:

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 import scipy
 
+from edgefilter.dsp.frames import blocks
 from edgefilter.echo.effect import Measurement, Parameter, Stage, Values, neutral
 from edgefilter.echo.wiener import convolve_from, fit_filter, fit_supported
 from edgefilter.types import SAMPLE_RATE, Array, Samples
@@ -69,8 +70,8 @@ class LateReverb:
 
 def block_energy(taps: Array) -> tuple[Array, float]:
     """Energy of the taps in blocks of 20 ms, and that of a block of pure noise (the lower quartile of the last third)."""
-    count = taps.size // BLOCK
-    energy = np.sum(taps[: count * BLOCK].reshape(count, BLOCK) ** 2, axis=1)
+    energy = np.sum(blocks(taps, BLOCK) ** 2, axis=1)
+    count = energy.size
     return energy, float(np.quantile(energy[2 * count // 3 :], 0.25)) if count >= 3 else 0.0
 
 

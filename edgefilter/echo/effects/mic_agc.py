@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 import scipy
 
+from edgefilter.dsp.frames import block_power, blocks
 from edgefilter.echo.effect import Measurement, Parameter, Stage, Values
 from edgefilter.echo.effects.gain_law import STEP, by_step, follow
 from edgefilter.echo.least_squares import absorbed
@@ -129,11 +130,9 @@ def _from_voice(voice: Samples, recording: Samples, measurement: Measurement) ->
 def _from_fan(voice: Samples, recording: Samples, measurement: Measurement, overall: float, law: Samples) -> tuple[Array, Array]:
     """What the fan's power says: to the main diagonal and the right side (k,), from frames to fit on in which the robot is silent."""
     count = int((voice.size - 1) * KNOTS_HZ / SAMPLE_RATE) + 2
-    frames = voice.size // FRAME
-    cut = slice(0, frames * FRAME)
-    own, heard, by_law = (np.mean(x[cut].reshape(frames, FRAME).astype(np.float64) ** 2, axis=1) for x in (voice, recording, law))
-    usable = measurement.weights[cut].reshape(frames, FRAME).all(axis=1) & (own < SILENT)
-    knot = np.round((np.arange(frames) + 0.5) * FRAME / SAMPLE_RATE * KNOTS_HZ).astype(int)[usable]
+    own, heard, by_law = (block_power(x, FRAME) for x in (voice, recording, law))
+    usable = blocks(measurement.weights, FRAME).all(axis=1) & (own < SILENT)
+    knot = np.round((np.arange(own.size) + 0.5) * FRAME / SAMPLE_RATE * KNOTS_HZ).astype(int)[usable]
     weight = FAN_TRUST * 2 * FRAME
     wanted = np.sqrt(heard[usable] / by_law[usable]) / overall
     return np.bincount(knot, np.full(knot.size, weight), count), np.bincount(knot, weight * wanted, count)

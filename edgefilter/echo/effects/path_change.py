@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
+from edgefilter.dsp.frames import block_power
 from edgefilter.echo.effect import Measurement, Parameter, Stage, Values, neutral
 from edgefilter.echo.wiener import convolve_from, fit_supported
 from edgefilter.types import SAMPLE_RATE, Samples
@@ -84,8 +85,8 @@ def _fade(n: int, time: float, duration: float, sample_rate: int) -> Samples:
 
 def _step(residual: Samples, x: Samples) -> float:
     """Seconds at which the residual, in proportion to the prediction, rises most clearly: two means of its log in blocks of 100 ms."""
-    count = residual.size // BLOCK
-    power, drive = (np.mean(s[: count * BLOCK].astype(float).reshape(count, BLOCK) ** 2, axis=1) for s in (residual, x))
+    power, drive = block_power(residual, BLOCK), block_power(x, BLOCK)
+    count = power.size
     loud = drive > 10.0
     ratio = np.where(loud, np.log(np.maximum(power, 1.0) / np.where(loud, drive, 1.0)), 0.0)
     total, number = np.cumsum(ratio * loud), np.cumsum(loud)

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 import scipy
 
+from edgefilter.dsp.psd import floored
 from edgefilter.echo.effect import Measurement, Parameter, Stage, Values, complete, neutral
 from edgefilter.echo.effects.knock_power import (
     BAND_HZ,
@@ -141,7 +142,7 @@ class Rattle:
         left = target - absorbed(predicted, target, measurement.fit)
         fits = {decay: colour_of_knocks(left, ringing_of(knocks, decay, DIRECT), measurement.fit) for decay in DECAYS_MS}
         decay = max(fits, key=lambda decay: fits[decay][0])
-        fan = np.full(GRID_HZ.size, 2.0 / SAMPLE_RATE) if measurement.noise_psd is None else np.maximum(measurement.noise_psd, 1e-14)
+        fan = np.full(GRID_HZ.size, 2.0 / SAMPLE_RATE) if measurement.noise_psd is None else floored(measurement.noise_psd)
         bands = np.minimum(GRID_HZ / BAND_HZ, BANDS - 1).astype(int)
         density = fits[decay][1] * np.bincount(bands) / np.bincount(bands, 1.0 / fan)
         rate = np.count_nonzero(knocks) * SAMPLE_RATE / max(x.size, 1)
