@@ -8,7 +8,7 @@ import numpy as np
 
 from edgefilter.diagnosis.prepare import Prepared, prepare
 from edgefilter.diagnosis.score import Judge
-from edgefilter.echo.effect import whiten
+from edgefilter.echo.measurement import whiten
 from edgefilter.profile.data import Profile
 from edgefilter.types import SAMPLE_RATE, Array, Samples
 

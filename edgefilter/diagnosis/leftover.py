@@ -8,7 +8,7 @@ import numpy as np
 from scipy.ndimage import median_filter
 
 from edgefilter.diagnosis.prepare import Prepared
-from edgefilter.echo.effect import whiten
+from edgefilter.echo.measurement import whiten
 from edgefilter.types import SAMPLE_RATE, Array, Samples
 
 LINE_FFT = 16384

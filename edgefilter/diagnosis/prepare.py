@@ -11,7 +11,7 @@ from scipy import fft
 from scipy.ndimage import maximum_filter1d
 
 from edgefilter.diagnosis.offset import find_offset, shift, starting_offset
-from edgefilter.echo.effect import Measurement, complete, find, whiten
+from edgefilter.echo.measurement import Measurement, whiten
 from edgefilter.errors import SignalError
 from edgefilter.profile.data import Profile
 from edgefilter.types import PRE_ROLL, SAMPLE_RATE, Samples, as_samples
@@ -73,7 +73,7 @@ def prepare(profile: Profile, recording: Samples, reference: Samples, *, sample_
     start = profile.delay - PRE_ROLL
     at_calibration = shift(x, start)
     predicted = profile.echo.predict(at_calibration)
-    known = expected_noise(profile)
+    known = profile.echo.expected_noise(profile.noise_psd)
     offset = starting_offset(whiten(predicted, known), whiten(y, known))
     pieces = utterance_lags(x, predicted, y, known, offset)
     begin, end = known_span(x, start + pieces[0][2], start + pieces[-1][2])
@@ -182,12 +182,3 @@ def fan_scale(quiet: Samples) -> float:
     power = np.mean(np.abs(fft.rfft(frames)) ** 2, axis=0) / np.sum(np.hanning(size) ** 2)
     scale = float(np.median(power[3:-6]))
     return scale if abs(10 * np.log10(max(scale, 1e-9))) <= FAN_TOLERANCE_DB else 1.0
-
-
-def expected_noise(profile: Profile) -> Samples:
-    """(601,) PSD of the fan with the profile's own effects on it."""
-    psd = profile.noise_psd
-    for name, values in profile.echo.effects:
-        changed = getattr(find(name), "noise_psd", None)
-        psd = changed(complete(find(name), values), psd) if changed else psd
-    return psd
