@@ -11,8 +11,9 @@ from functools import lru_cache
 import numpy as np
 from scipy import signal
 
-from edgefilter.echo import effect as effects
-from edgefilter.echo.effect import Measurement
+from edgefilter.echo.effect import complete, neutral
+from edgefilter.echo.effects import catalogue
+from edgefilter.echo.measurement import Measurement
 from edgefilter.echo.model import EchoModel
 from edgefilter.filter.stream import Stream
 from edgefilter.types import PRE_ROLL, SAMPLE_RATE, Frame
@@ -225,14 +226,14 @@ def held_out_power(measurement: Measurement, predicted: np.ndarray) -> float:
 
 
 def effect_check_neutral_is_the_identity(name: str) -> None:
-    x, effect = robot_speech(), effects.find(name)
-    out = effect.apply(x, effects.neutral(effect), SAMPLE_RATE)
+    x, effect = robot_speech(), catalogue.find(name)
+    out = effect.apply(x, neutral(effect), SAMPLE_RATE)
     assert np.array_equal(out, x) and out.dtype == np.float32
 
 
 def effect_check_any_length_goes_through(name: str) -> None:
-    effect = effects.find(name)
-    values = effects.complete(effect, EFFECT_CASES.get(name, {}))
+    effect = catalogue.find(name)
+    values = complete(effect, EFFECT_CASES.get(name, {}))
     for n in (0, 1, 100, 5000):
         x = robot_speech()[:n]
         out = effect.apply(x, values, SAMPLE_RATE)
@@ -246,7 +247,7 @@ def effect_check_fit_stays_within_the_bounds_on_hard_input(name: str) -> None:
     silence = np.zeros(n, np.float32)
     for reference, recording in ((silence, silence), (silence, fan(n)), (robot_speech(), silence), (robot_speech(), np.roll(robot_speech(), 50_000))):
         hard = Measurement(reference, recording, measurement.noise_psd, measurement.fit)
-        effects.complete(effects.find(name), effects.find(name).fit(hard, model))
+        complete(catalogue.find(name), catalogue.find(name).fit(hard, model))
 
 
 def effect_check_fit_on_a_neutral_recording_stays_neutral(name: str) -> None:

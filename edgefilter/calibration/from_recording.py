@@ -7,11 +7,12 @@ from numpy.typing import NDArray
 from scipy import fft, signal
 from scipy.ndimage import binary_closing, uniform_filter1d
 
-from edgefilter.dsp.fractional_delay import delayed
+from edgefilter.dsp.fractional_delay import delayed, interpolate
 from edgefilter.dsp.frames import all_block_power, block_power, decibels, frames
 from edgefilter.dsp.lag import correlation_near, flat_cross, highest
 from edgefilter.dsp.psd import ROUNDING_PSD, periodograms, third_octave_bands
-from edgefilter.echo.effect import find, whiten
+from edgefilter.echo.effects.catalogue import find, names
+from edgefilter.echo.measurement import whiten
 from edgefilter.echo.model import EchoModel
 from edgefilter.echo.recording import BLOCK, MAX_OFFSET, fitted_blocks, paired
 from edgefilter.echo.wiener import convolve_from, fit_filter
@@ -20,8 +21,6 @@ from edgefilter.profile.data import DISTORTION_ORDERS, GRID_FFT, GRID_HZ, Profil
 from edgefilter.types import PRE_ROLL, SAMPLE_RATE, Samples
 
 SOURCE = "made from the recording itself: what is stationary and linear is taken for the robot"
-ABSORBED = ("playback_gain", "bandlimit", "chassis_resonance", "late_reverb")
-"""Stationary linear effects: the path fitted to a recording holds them already, so that nothing can tell them from the robot."""
 TAPS = 4096
 STANDS_OUT = 8.0
 """Times the root mean square of all lags that the true one reaches; 4.5 measured where there is no robot, 10 to 87 where there is."""
@@ -48,8 +47,8 @@ def self_calibrate(recording: Samples, reference: Samples) -> Profile:
 
     The path is a regularised least-squares filter on every other half second, those that prepare() fits on, so that the others say
     how well it predicts. Samples weigh the less the more the first fit leaves of them (iteratively reweighted least squares, Huber
-    1981), so that a talker does not bend it. The fan is what the robot's silences hold. ABSORBED effects are in it at their neutral
-    values, so that no search claims them. Raises SignalError where the recording does not contain the reference.
+    1981), so that a talker does not bend it. The fan is what the robot's silences hold. Stationary linear effects, which the path
+    holds already, are in it at their neutral values, so that no search claims them. Raises SignalError where the recording does not contain the reference.
     """
     y, x = paired(recording, reference)
     lag = find_lag(y, x)
@@ -82,7 +81,7 @@ def self_calibrate(recording: Samples, reference: Samples) -> Profile:
 
 
 def _with_absorbed(echo: EchoModel) -> EchoModel:
-    for name in ABSORBED:
+    for name in (name for name in names() if find(name).absorbed):
         echo = echo.with_effect(name, {})
     return echo
 
@@ -106,7 +105,9 @@ def find_lag(recording: Samples, reference: Samples) -> int:
 
 
 def _drifting(x: Samples, ppm: float) -> Samples:
-    return find("clock_drift").apply(x, {"ppm": ppm, "offset": 0.0}, SAMPLE_RATE) if ppm else x
+    """x (n,) read at a clock that is ppm faster."""
+    n = np.arange(x.size)
+    return interpolate(x, n + 1e-6 * ppm * n) if ppm else x
 
 
 def find_drift(recording: Samples, reference: Samples) -> tuple[float, int]:

@@ -9,7 +9,7 @@ import numpy as np
 from edgefilter.commands.display import write_json
 from edgefilter.commands.material import load
 from edgefilter.diagnosis.diagnose import add
-from edgefilter.echo.effect import find
+from edgefilter.echo.effects.catalogue import find
 from edgefilter.report.words import UNITS, figure
 
 

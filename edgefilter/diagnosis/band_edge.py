@@ -6,14 +6,13 @@ import numpy as np
 
 from edgefilter.diagnosis.score import FRAMES_PER_CELL, Judge
 from edgefilter.diagnosis.trials import Found, Trial, size_db
+from edgefilter.echo.effects.catalogue import find, names
 from edgefilter.types import Samples
 
-NAME = "bandlimit"
 GONE, SURE = 0.25, 4.0
 """Of the predicted power above the edge no more than this part is there, and what is missing is so many standard deviations."""
 PASSED = (0.8, 1.2)
 """Between these times the predicted power is what lies well below the edge: the band is cut, not the volume turned."""
-ORDER = 16.0
 INDEPENDENT = 0.6
 """Part of a cell's half-overlapping Hann frames that counts as independent."""
 
@@ -45,13 +44,17 @@ def band_edge(judge: Judge, prediction: Samples) -> float | None:
 def cut_by_power(found: Found) -> Found | None:
     """The outcome of a search with nothing but a band limit, where the recording's power shows one and the residual falls by it; else None."""
     judge = Judge(found.prepared)
-    edge = None if NAME in dict(found.start.effects) else band_edge(judge, found.base.prediction)
+    edge = band_edge(judge, found.base.prediction)
     if edge is None:
         return None
-    model = found.start.with_effect(NAME, {"cutoff_hz": edge, "order": ORDER})
-    after = judge.of(model)
-    gain = found.base.level_db - after.level_db
-    if gain <= 0.0:
-        return None
-    step = Trial(NAME, dict(model.effects)[NAME], model, after, gain, size_db(after.prediction - found.base.prediction, found.prepared))
-    return Found(found.prepared, found.start, model, found.base, after, (step,))
+    absent = [name for name in names() if name not in dict(found.start.effects)]
+    cuts = [(name, values) for name in absent if (values := find(name).cutting_above(edge)) is not None]
+    for name, values in cuts:
+        model = found.start.with_effect(name, values)
+        after = judge.of(model)
+        gain = found.base.level_db - after.level_db
+        if gain > 0.0:
+            size = size_db(after.prediction - found.base.prediction, found.prepared)
+            step = Trial(name, dict(model.effects)[name], model, after, gain, size)
+            return Found(found.prepared, found.start, model, found.base, after, (step,))
+    return None

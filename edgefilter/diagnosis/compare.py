@@ -10,7 +10,7 @@ from edgefilter.diagnosis.prepare import Prepared, prepare
 from edgefilter.diagnosis.score import Judge
 from edgefilter.dsp.frames import block_power, blocks, decibels, frames
 from edgefilter.dsp.psd import floored, frequencies, periodograms, total_power
-from edgefilter.echo.effect import whiten
+from edgefilter.echo.measurement import whiten
 from edgefilter.profile.data import Profile
 from edgefilter.types import SAMPLE_RATE, Array, Samples
 

@@ -15,7 +15,8 @@ from edgefilter.diagnosis.prepare import Prepared
 from edgefilter.diagnosis.result import Diagnosis, Finding, Interval
 from edgefilter.diagnosis.score import Judge
 from edgefilter.diagnosis.trials import Found, Trial, floor_level
-from edgefilter.echo.effect import complete, find
+from edgefilter.echo.effect import complete
+from edgefilter.echo.effects.catalogue import find
 from edgefilter.echo.model import EchoModel
 from edgefilter.echo.recording import BLOCK
 
@@ -31,8 +32,6 @@ MUCH_DB = 3.0
 """Over the silences: what the model of an effect that is really there does not leave."""
 NEARLY_ALL = 0.99
 """Share of the excess power with which what is left may be the imprecision of the model itself."""
-UNPREDICTABLE = ("rattle", "bandlimit")
-"""Effects whose own noise stays in the residual."""
 THIRDS_T = 1.69
 """90 % quantile of Student's t with 2 degrees of freedom over the square root of 3: the interval from three fits to a third each."""
 
@@ -42,7 +41,7 @@ def conclude(prepared: Prepared, found: Found, progress: Callable[[str], None] |
     comparison = describe(prepared, found.base.prediction)
     found, left = look_at_fan(found)
     remaining = found.final.excess_db
-    unpredictable = any(step.name in UNPREDICTABLE for step in found.steps)
+    unpredictable = any(find(step.name).leaves_noise for step in found.steps)
     believed = bool(found.steps) and (remaining < EXPLAINED_DB or _enough(prepared, found))
     quiet = found.base.excess_db < EXPLAINED_DB and not prepared.human
     verdict = "missing" if believed and not _much_left(found) else "explained" if quiet else "unexplained"
@@ -86,7 +85,7 @@ def explained_level(prepared: Prepared, found: Found) -> float:
     judge = Judge(prepared)
     above = found.base.level_db - floor_level(judge, found.base)
     gone = above - (found.final.level_db - floor_level(judge, found.final))
-    if "fan_noise" in dict(found.model.effects):
+    if any(find(name).stage == "noise" for name, _ in found.model.effects):
         above, gone = found.base.level_db, found.base.level_db - found.final.level_db
     return float(np.clip(gone / above, 0.0, 1.0)) if above > 0.0 else 0.0
 

@@ -10,7 +10,7 @@ from scipy.ndimage import median_filter
 from edgefilter.diagnosis.prepare import Prepared
 from edgefilter.dsp.frames import block_power, blocks, decibels
 from edgefilter.dsp.psd import frequencies, periodograms
-from edgefilter.echo.effect import whiten
+from edgefilter.echo.measurement import whiten
 from edgefilter.types import SAMPLE_RATE, Array, Samples
 
 LINE_FFT = 16384

@@ -15,7 +15,7 @@ from edgefilter.dsp.fourier import power
 from edgefilter.dsp.fractional_delay import delayed
 from edgefilter.dsp.frames import all_block_power, blocks, decibels
 from edgefilter.dsp.psd import hann
-from edgefilter.echo.effect import Measurement, complete, find, whiten
+from edgefilter.echo.measurement import Measurement, whiten
 from edgefilter.echo.recording import fitted_blocks, paired
 from edgefilter.errors import SignalError
 from edgefilter.profile.data import Profile
@@ -72,7 +72,7 @@ def prepare(profile: Profile, recording: Samples, reference: Samples, *, sample_
     start = profile.delay - PRE_ROLL
     at_calibration = delayed(x, start)
     predicted = profile.echo.predict(at_calibration)
-    known = expected_noise(profile)
+    known = profile.echo.expected_noise(profile.noise_psd)
     offset = starting_offset(whiten(predicted, known), whiten(y, known))
     pieces = utterance_lags(x, predicted, y, known, offset)
     begin, end = known_span(x, start + pieces[0][2], start + pieces[-1][2])
@@ -180,12 +180,3 @@ def fan_scale(quiet: Samples) -> float:
     spectrum = np.mean(power(fft.rfft(blocks(quiet, 256) * window)), axis=0) / np.sum(window**2)
     scale = float(np.median(spectrum[3:-6]))
     return scale if abs(decibels(scale)) <= FAN_TOLERANCE_DB else 1.0
-
-
-def expected_noise(profile: Profile) -> Samples:
-    """(601,) PSD of the fan with the profile's own effects on it."""
-    psd = profile.noise_psd
-    for name, values in profile.echo.effects:
-        changed = getattr(find(name), "noise_psd", None)
-        psd = changed(complete(find(name), values), psd) if changed else psd
-    return psd

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.ndimage import uniform_filter1d
@@ -11,8 +10,9 @@ from scipy.ndimage import uniform_filter1d
 from edgefilter.diagnosis.prepare import Prepared
 from edgefilter.dsp.frames import decibels
 from edgefilter.dsp.psd import floored, frequencies, hann, variance_at
-from edgefilter.echo.effect import whiten
+from edgefilter.echo.evidence import Score
 from edgefilter.echo.least_squares import normal_equations
+from edgefilter.echo.measurement import Measurement, whiten
 from edgefilter.echo.model import EchoModel
 from edgefilter.echo.wiener import convolve_from
 from edgefilter.types import Array, Samples
@@ -22,26 +22,6 @@ FRAMES_PER_CELL = 8
 TOLERANCE = 0.012
 """An ordinary robot's path differs from its calibration by this share at each frequency (0.1 dB, 0.7 degrees)."""
 TOLERANCE_TAPS, TOLERANCE_LEAD = 32, 16
-
-
-@dataclass(frozen=True, eq=False)
-class Verdict:
-    """Of one prediction. level_db: mean over time-frequency cells of the residual's dB over the fan, each cell by its degrees of freedom.
-
-    excess_db: mean power of the held-out whitened residual, dB. active_db, silent_db: while the robot is heard, and is not. fitted_db: of the
-    samples to fit on, while it is heard.
-    What a model says that no waveform predicts counts as fan in these; irreducible_db: the excess over the fan alone then, else 0.
-    cells: (times, bands) power over the fan. prediction: (n,) with the ordinary tolerances taken up.
-    """
-
-    level_db: float
-    excess_db: float
-    active_db: float
-    silent_db: float
-    fitted_db: float
-    irreducible_db: float
-    cells: Array = field(repr=False)
-    prediction: Samples = field(repr=False)
 
 
 class Judge:
@@ -73,6 +53,20 @@ class Judge:
         self.band_hz = np.stack((hz[edges[:-1]], hz[edges[1:]]), axis=1)
         self.freedom = np.diff(edges).astype(float)
 
+    @property
+    def measurement(self) -> Measurement:
+        """The recording beside its reference."""
+        return self.prepared.measurement
+
+    @property
+    def usable(self) -> Array:
+        """(n,) bool, samples where nobody else talks."""
+        return self.prepared.usable
+
+    def level_db(self, prediction: Samples) -> float:
+        """Score.level_db of a prediction (n,)."""
+        return self.judge(prediction).level_db
+
     def cells(self, residual: Samples) -> Array:
         """(times, bands) power of the residual (n,) over the fan's, in the held-out cells."""
         index = self.starts[:, None, None] + np.arange(FRAMES_PER_CELL)[:, None] * HOP + np.arange(FRAME)
@@ -80,13 +74,13 @@ class Judge:
         ratio = power.mean(axis=1) / self._expected
         return np.add.reduceat(ratio[:, : self._edges[-1]], self._edges[:-1], axis=1) / self.freedom
 
-    def of(self, model: EchoModel) -> Verdict:
-        """The verdict on a model: on what it predicts, with what it says that no waveform predicts counted as fan."""
+    def of(self, model: EchoModel) -> Score:
+        """The score of a model: on what it predicts, with what it says that no waveform predicts counted as fan."""
         measurement = self.prepared.measurement
         return self.judge(measurement.heard(model)[0], unpredictable=model.unpredictable(measurement.reference))
 
-    def judge(self, prediction: Samples, correct: bool = True, unpredictable: Sequence[tuple[Samples, Array]] = ()) -> Verdict:
-        """The verdict on a prediction (n,), by default with the ordinary tolerances taken up first.
+    def judge(self, prediction: Samples, correct: bool = True, unpredictable: Sequence[tuple[Samples, Array]] = ()) -> Score:
+        """The score of a prediction (n,), by default with the ordinary tolerances taken up first.
 
         unpredictable: as EchoModel.unpredictable gives it, noise that is expected on top of the fan.
         """
@@ -97,7 +91,7 @@ class Judge:
         plain = whiten(residual, self.psd).astype(np.float64) ** 2
         white = self._over_expected(plain, unpredictable) if unpredictable else plain
         held, active = self.prepared.held_out, self.prepared.active
-        return Verdict(
+        return Score(
             level_db=float(np.average(10 * np.log10(np.maximum(cells, 1e-3)), weights=weights)) if cells.size else 0.0,
             excess_db=_db(white[held]),
             active_db=_db(white[held & active]),

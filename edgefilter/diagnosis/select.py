@@ -7,8 +7,9 @@ from collections.abc import Callable, Iterator
 from edgefilter.diagnosis.noise_change import changed_fan
 from edgefilter.diagnosis.prepare import Prepared
 from edgefilter.diagnosis.settle import settle, simpler_beside
-from edgefilter.diagnosis.suspects import choose, suspect
-from edgefilter.diagnosis.trials import LAST, LONG, Found, Trial, Workbench, added
+from edgefilter.diagnosis.suspects import choose
+from edgefilter.diagnosis.trials import LONG, Found, Trial, Workbench, added
+from edgefilter.echo.effects.catalogue import find
 from edgefilter.echo.model import EchoModel
 
 MOST_EFFECTS = 3
@@ -60,14 +61,14 @@ def _starts(bench: Workbench, model: EchoModel) -> Iterator[Trial]:
     if name is not None:
         yield admissible[name]
     least = max(START_SHARE * bench.left(model), 0.1)
-    others = sorted((t for t in trials if t.name != name and t.name not in LAST and t.gain_db >= least), key=lambda t: -t.gain_db)
+    others = sorted((t for t in trials if t.name != name and not find(t.name).last_resort and t.gain_db >= least), key=lambda t: -t.gain_db)
     yield from others[:STARTS]
 
 
 def _simpler_start(bench: Workbench, start: EchoModel, run: EchoModel) -> list[Trial]:
     """The simple effect, none or one, that explains a good part of what one long filter does: two of them may look like that filter."""
     found = added(start, run)
-    if bench.tired or len(found) != 1 or suspect(found[0]).complexity < LONG:
+    if bench.tired or len(found) != 1 or find(found[0]).complexity < LONG:
         return []
     most = bench.verdict(start).level_db - bench.verdict(run).level_db
     simple = [t for t in bench.attempt_all(start, 1) if t.gain_db >= SIMPLE_SHARE * most and bench.admissible(t, start)]
@@ -97,7 +98,7 @@ def _best(bench: Workbench, start: EchoModel, runs: list[EchoModel]) -> EchoMode
     base = bench.verdict(start).level_db
     valid = [_standing(bench, start, run) for run in runs]
     best = start
-    for run in sorted(valid, key=lambda run: sum(suspect(name).complexity for name in added(start, run))):
+    for run in sorted(valid, key=lambda run: sum(find(name).complexity for name in added(start, run))):
         most = base - bench.verdict(best).level_db
         if base - bench.verdict(run).level_db > most + BETTER * abs(most):
             best = run

@@ -2,21 +2,17 @@
 
 from __future__ import annotations
 
-import numpy as np
-
-from edgefilter.diagnosis.suspects import choose, suspect
-from edgefilter.diagnosis.trials import LAST, Workbench, absent, added
-from edgefilter.echo.effects.bandlimit import measured_response_db
+from edgefilter.diagnosis.suspects import choose
+from edgefilter.diagnosis.trials import Workbench, absent, added
+from edgefilter.echo.effects.catalogue import find, names
 from edgefilter.echo.model import EchoModel
 
 ROUNDS, WORTH_DB = 3, 0.02
 """Rounds of fitting each effect beside the others, and the fall in level below which no further one is worth its time."""
-FLEXIBLE = ("late_reverb", "path_change", "bandlimit", "speaker_nonlinearity", "compression", "mic_agc")
-"""Effects with so many numbers that they take up what a simpler one beside them does."""
 SIMPLE = 1
-"""Complexity up to which an effect is simple beside any of those."""
-PASSED_HZ, HEARD_DB = 300.0, 0.4
-"""From where on a band limit passes the voice, and the gain there that is more than an ordinary tolerance and the fit's error."""
+"""Complexity up to which an effect is simple beside any flexible one."""
+HEARD_DB = 0.4
+"""A gain in a filter's passband that is more than an ordinary tolerance and the fit's error."""
 CONFIRMED = 0.1
 """Of the level that a flexible effect leaves, what a simpler one beside it must explain."""
 
@@ -51,7 +47,7 @@ def refit(bench: Workbench, start: EchoModel, model: EchoModel) -> EchoModel:
 def _exchange(bench: Workbench, start: EchoModel, model: EchoModel, name: str) -> EchoModel:
     """The model with another effect instead of that one where, beside the others, the other is the one to name."""
     others = model.without_effect(name)
-    trials = {t.name: t for t in bench.attempt_all(others, suspect(name).complexity) if t.name not in LAST and bench.admissible(t, others)}
+    trials = {t.name: t for t in bench.attempt_all(others, find(name).complexity) if not find(t.name).last_resort and bench.admissible(t, others)}
     trials[name] = bench.beside(name, others, model)
     chosen = choose({key: trial.gain_db for key, trial in trials.items()})
     if chosen is None or chosen == name:
@@ -65,33 +61,33 @@ def _drop(bench: Workbench, model: EchoModel, earlier: list[str], newest: str) -
     """The model without the earlier effects that the newest one, fitted without them, explains as well."""
     for name in earlier:
         alone = bench.attempt(newest, model.without_effect(name).without_effect(newest))
-        if alone is not None and alone.verdict.level_db - bench.verdict(model).level_db < suspect(name).least_gain_db:
+        if alone is not None and alone.verdict.level_db - bench.verdict(model).level_db < find(name).least_gain_db:
             model = alone.model
     return model
 
 
 def _volume_beside(bench: Workbench, model: EchoModel) -> EchoModel:
-    """The model with the gain that a band limit's filter has in its passband as a turned volume beside it, where that explains as much."""
-    values = dict(model.effects).get("bandlimit")
-    if values is None or "playback_gain" in dict(model.effects):
-        return model
-    hz, gain_db = measured_response_db(values)
-    passed = gain_db[(hz > PASSED_HZ) & (hz < 0.6 * float(values["cutoff_hz"]))]
-    if not passed.size or abs(float(np.median(passed))) < HEARD_DB or float(np.std(passed)) > 0.75 * HEARD_DB:
-        return model
-    louder = model.without_effect("bandlimit").with_effect("playback_gain", {"gain_db": float(np.median(passed))})
-    both = bench.attempt("bandlimit", louder)
-    return both.model if both is not None and both.verdict.level_db < bench.verdict(model).level_db + WORTH_DB else model
+    """The model with the gain that a filter has in its passband as a turned volume beside it, where that explains as much."""
+    for name, values in model.effects:
+        gain_db = find(name).passband_gain_db(values)
+        if gain_db is None or abs(gain_db) < HEARD_DB:
+            continue
+        gains = [(other, plain) for other in names() if (plain := find(other).plain_gain(gain_db)) is not None and other not in dict(model.effects)]
+        for other, plain in gains:
+            both = bench.attempt(name, model.without_effect(name).with_effect(other, plain))
+            if both is not None and both.verdict.level_db < bench.verdict(model).level_db + WORTH_DB:
+                return both.model
+    return model
 
 
 def simpler_beside(bench: Workbench, start: EchoModel, model: EchoModel) -> EchoModel:
     """The model with a simpler effect beside a flexible one where both together explain more than the flexible one alone."""
     model = _volume_beside(bench, model)
-    for name in [name for name in added(start, model) if name in FLEXIBLE]:
+    for name in [name for name in added(start, model) if find(name).flexible]:
         others = model.without_effect(name)
         if len(added(start, model)) > 2 or bench.tired or bench.explained(others):
             break
-        wanted = [key for key in absent(others, max(suspect(name).complexity - 1, SIMPLE)) if key not in (*FLEXIBLE, *LAST)]
+        wanted = [key for key in absent(others, max(find(name).complexity - 1, SIMPLE)) if not (find(key).flexible or find(key).last_resort)]
         simple = [t for key in wanted if (t := bench.attempt_alike(key, others)) is not None and bench.admissible(t, others)]
         least = max(CONFIRMED * bench.left(model), 0.05)
         for trial in sorted(simple, key=lambda t: -t.gain_db)[:2]:

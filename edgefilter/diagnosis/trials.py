@@ -10,24 +10,26 @@ from typing import TypeAlias
 import numpy as np
 
 from edgefilter.diagnosis.prepare import Prepared
-from edgefilter.diagnosis.score import Judge, Verdict
-from edgefilter.diagnosis.suspects import suspect
+from edgefilter.diagnosis.score import Judge
 from edgefilter.dsp.frames import decibels
 from edgefilter.dsp.psd import total_power
-from edgefilter.echo.effect import Values, complete, find, names, whiten
+from edgefilter.echo.effect import complete
 from edgefilter.echo.effect import neutral as neutral_values
+from edgefilter.echo.effects.catalogue import find, names
+from edgefilter.echo.evidence import Evidence, Score
+from edgefilter.echo.measurement import Values, whiten
 from edgefilter.echo.model import EchoModel
 from edgefilter.errors import UsageError
 from edgefilter.types import Samples
 
-LAST, ENOUGH, LITTLE_DB = ("rattle",), 0.4, 0.1
-"""Effects whose fit takes long: tried where no other explains this share of the level above the silences, and where that is no less than so much."""
+ENOUGH, LITTLE_DB = 0.4, 0.1
+"""A last resort is tried where no other explains this share of the level above the silences, and where that is no less than so much."""
 
 HEARD_DB, FAN_DB = 0.6, 0.2
 """Where the residual is no more than the first above that of the robot's silences, or no more than the second above the calibrated fan, there is
 nothing beside the effects that were found, whose models err a little."""
-COSTS, DEAR = {"rattle": 8, "compression": 2}, 60
-"""Of a fit in quarters of a second, 1 for all others, and the sum of them after which only what is in plain sight is looked for."""
+DEAR = 60
+"""Sum of the costs of all fits after which only what is in plain sight is looked for."""
 
 POWER_SHARE = 0.6
 """Of the power over the fan, what an effect may leave at most that takes about half of it away."""
@@ -44,7 +46,7 @@ class Trial:
     name: str
     values: Values
     model: EchoModel
-    verdict: Verdict
+    verdict: Score
     gain_db: float
     size_db: float
 
@@ -59,8 +61,8 @@ class Found:
     prepared: Prepared
     start: EchoModel
     model: EchoModel
-    base: Verdict
-    final: Verdict
+    base: Score
+    final: Score
     steps: tuple[Trial, ...]
 
 
@@ -71,12 +73,12 @@ class Workbench:
         self.prepared = prepared
         self.judge = Judge(prepared)
         self._progress = progress
-        self._verdicts: dict[Signature, Verdict] = {}
+        self._verdicts: dict[Signature, Score] = {}
         self._trials: dict[tuple[Signature, str], Trial | None] = {}
         self._cost = 0
         self._alike: dict[tuple[frozenset[str], str], Trial | None] = {}
 
-    def verdict(self, model: EchoModel) -> Verdict:
+    def verdict(self, model: EchoModel) -> Score:
         """What the judge says of a model."""
         key = signature(model)
         if key not in self._verdicts:
@@ -102,7 +104,7 @@ class Workbench:
         key = signature(model), name
         if key not in self._trials:
             self._trials[key] = self._attempt(name, model)
-            self._cost += COSTS.get(name, 1)
+            self._cost += find(name).cost
             self._alike[frozenset(dict(model.effects)), name] = self._trials[key]
         return self._trials[key]
 
@@ -142,19 +144,19 @@ class Workbench:
         than there is besides: of the held-out samples the filter itself leaves the most.
         """
         before, after = self.verdict(model), trial.verdict
-        where_fitted = suspect(trial.name).complexity < LONG and _over_fan(after.fitted_db) < POWER_SHARE * _over_fan(before.fitted_db)
+        where_fitted = find(trial.name).complexity < LONG and _over_fan(after.fitted_db) < POWER_SHARE * _over_fan(before.fitted_db)
         return where_fitted or _over_fan(after.active_db) < POWER_SHARE * _over_fan(before.active_db)
 
     def attempt_all(self, model: EchoModel, most: int = 9) -> list[Trial]:
         """Each effect that the model has not and whose complexity is at most `most`.
 
-        The LAST ones only where none of the others explains much of what is left.
+        The last resorts only where none of the others explains much of what is left.
         """
         found, left = [], self.left(model)
-        for name in sorted(absent(model, most), key=lambda name: name in LAST):
-            if name in LAST and (self.tired or left < LITTLE_DB):
+        for name in sorted(absent(model, most), key=lambda name: find(name).last_resort):
+            if find(name).last_resort and (self.tired or left < LITTLE_DB):
                 continue
-            if name in LAST and any((t.gain_db > ENOUGH * left or self.halves(t, model)) and self.admissible(t, model) for t in found):
+            if find(name).last_resort and any((t.gain_db > ENOUGH * left or self.halves(t, model)) and self.admissible(t, model) for t in found):
                 continue
             if (trial := self.attempt(name, model)) is not None:
                 found.append(trial)
@@ -162,15 +164,15 @@ class Workbench:
 
     def admissible(self, trial: Trial, model: EchoModel) -> bool:
         """Whether a trial on a model explains enough to be named, and its values look like that effect."""
-        rule = suspect(trial.name)
-        if trial.gain_db < rule.least_gain_db or trial.size_db < rule.least_size_db:
+        effect = find(trial.name)
+        if trial.gain_db < effect.least_gain_db or trial.size_db < effect.least_size_db:
             return False
-        return rule.guard is None or rule.guard(trial.values, self.judge, self.verdict(model), trial.verdict)
+        return effect.plausible(Evidence(trial.values, model, self.judge, self.verdict(model), trial.verdict))
 
 
 def absent(model: EchoModel, most: int) -> list[str]:
     """Names of the effects on the voice that a model has not and whose complexity is at most `most`."""
-    return [name for name in names() if find(name).stage != "noise" and name not in dict(model.effects) and suspect(name).complexity <= most]
+    return [name for name in names() if find(name).stage != "noise" and name not in dict(model.effects) and find(name).complexity <= most]
 
 
 def added(start: EchoModel, model: EchoModel) -> list[str]:
@@ -188,7 +190,7 @@ def signature(model: EchoModel) -> Signature:
     return tuple(sorted((name, *(np.asarray(value, float).tobytes() for _, value in sorted(values.items()))) for name, values in model.effects))
 
 
-def floor_level(judge: Judge, verdict: Verdict) -> float:
+def floor_level(judge: Judge, verdict: Score) -> float:
     """Level in dB of the cells in which the robot is silent, 0 where it never is: what is left when everything is explained."""
     quiet = verdict.cells[~judge.active_cells]
     if quiet.shape[0] < 4:
@@ -206,7 +208,7 @@ def size_db(change: Samples, prepared: Prepared) -> float:
 
 def noise_size_db(name: str, model: EchoModel, prepared: Prepared) -> float:
     """Mean power over the fan, in dB, of what the model says of that effect that no waveform predicts."""
-    if not hasattr(find(name), "variance"):
+    if not find(name).adds_noise:
         return -120.0
     psd = prepared.measurement.noise_psd
     fan = total_power(psd)

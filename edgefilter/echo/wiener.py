@@ -9,7 +9,7 @@ import scipy
 from numpy.typing import NDArray
 from scipy import fft
 
-from edgefilter.echo.effect import Measurement
+from edgefilter.echo.measurement import Measurement
 from edgefilter.echo.recording import BLOCK
 from edgefilter.types import SAMPLE_RATE, Array, Samples
 

@@ -11,7 +11,8 @@ from edgefilter.diagnosis.diagnose import Finding
 from edgefilter.diagnosis.noise_change import judge_behind
 from edgefilter.diagnosis.prepare import Prepared, prepare
 from edgefilter.diagnosis.score import Judge
-from edgefilter.echo.effect import complete, find
+from edgefilter.echo.effect import complete
+from edgefilter.echo.effects.catalogue import find
 from edgefilter.echo.model import EchoModel
 from edgefilter.profile.data import Profile
 from edgefilter.types import Samples
@@ -57,6 +58,5 @@ def _with_noise(prepared: Prepared, findings: Sequence[Finding]) -> Prepared:
     psd = prepared.measurement.noise_psd
     for finding in findings:
         effect = find(finding.effect)
-        if hasattr(effect, "noise_psd"):
-            psd = effect.noise_psd(complete(effect, finding.values), psd)
+        psd = effect.noise_psd(complete(effect, finding.values), psd)
     return replace(prepared, measurement=replace(prepared.measurement, noise_psd=psd))

@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 import soundfile
 
-from edgefilter.calibration.from_recording import ABSORBED, find_drift, self_calibrate
+from edgefilter.calibration.from_recording import find_drift, self_calibrate
 from edgefilter.cli import main
 from edgefilter.dsp.fractional_delay import delayed
+from edgefilter.echo.effects.catalogue import EFFECTS
 from edgefilter.echo.model import EchoModel
 from edgefilter.errors import SignalError
 from tests.diagnosis.robot_scene import DELAY, FAN, path, record, voice
@@ -73,7 +74,7 @@ def test_what_is_stationary_is_not_claimed_and_what_moves_is(tmp_path, said, cap
     assert main(["diagnose", *files, "--json", "-", "--report", str(tmp_path / "d.html")]) == 0
     told = json.loads(capsys.readouterr().out)
     names = [entry["effect"] for entry in told["ranking"]]
-    assert names[0] == "clock_drift" and not set(names) & set(ABSORBED)
+    assert names[0] == "clock_drift" and not set(names) & {effect.name for effect in EFFECTS if effect.absorbed}
     assert told["ranking"][0]["parameters"]["ppm"]["value"] == pytest.approx(-120.0, abs=5.0)
     assert any("cannot be told" in text for text in told["warnings"])
     page = (tmp_path / "d.html").read_text()

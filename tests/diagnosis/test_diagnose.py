@@ -13,9 +13,11 @@ from edgefilter.diagnosis.compare import compare
 from edgefilter.diagnosis.diagnose import Diagnosis, add, diagnose
 from edgefilter.dsp.fractional_delay import delayed
 from edgefilter.diagnosis.prepare import prepare
-from edgefilter.diagnosis.score import Judge, Verdict
-from edgefilter.diagnosis.suspects import SUSPECTS, choose
+from edgefilter.diagnosis.score import Judge
+from edgefilter.diagnosis.suspects import choose
 from edgefilter.diagnosis.trials import Trial, Workbench
+from edgefilter.echo.effects.catalogue import find
+from edgefilter.echo.evidence import Evidence, Score
 from edgefilter.echo.model import EchoModel
 from edgefilter.types import PRE_ROLL
 from tests.diagnosis.robot_scene import DELAY, FAN, path, profile, record, voice
@@ -146,13 +148,13 @@ def test_no_effect_is_chosen_where_none_lowers_the_level():
     assert choose({"playback_gain": 0.9, "late_reverb": 1.0}) == "playback_gain"
 
 
-def verdict(active_db: float, fitted_db: float) -> Verdict:
-    return Verdict(active_db, active_db, active_db, 0.0, fitted_db, 0.0, np.ones((4, 4)), np.zeros(16000, np.float32))
+def verdict(active_db: float, fitted_db: float) -> Score:
+    return Score(active_db, active_db, active_db, 0.0, fitted_db, 0.0, np.ones((4, 4)), np.zeros(16000, np.float32))
 
 
 @pytest.mark.parametrize("fitted_db, stands", [(0.1, True), (-1.5, False)])
 def test_knocks_that_are_missing_where_a_filter_was_fitted_are_that_filters_error(fitted_db, stands):
-    assert SUSPECTS["rattle"].guard({}, None, verdict(5.0, 1.0), verdict(2.0, fitted_db)) is stands
+    assert find("rattle").plausible(Evidence({}, EchoModel(path()), None, verdict(5.0, 1.0), verdict(2.0, fitted_db))) is stands
 
 
 @pytest.mark.parametrize("name, fitted_db, halved", [("speaker_nonlinearity", 0.5, True), ("speaker_nonlinearity", 2.0, False), ("late_reverb", 0.5, False)])

@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 import numpy as np
 
 from edgefilter.dsp.frames import frames
 from edgefilter.dsp.psd import floored, periodograms
-from edgefilter.echo.effect import Measurement, Parameter, Stage, Values
+from edgefilter.echo.effect import Effect, Parameter, Stage, first
 from edgefilter.echo.least_squares import absorbed
+from edgefilter.echo.measurement import Measurement, Values, VoiceModel
 from edgefilter.types import Array, Samples
-
-if TYPE_CHECKING:
-    from edgefilter.echo.model import EchoModel
 
 SILENT_DB = -10.0
 """A frame shows the fan alone where the predicted voice, whitened, is this far under it."""
@@ -25,7 +23,7 @@ SMOOTH = np.array([0.25, 0.5, 0.25])
 """Over neighbouring bins of 13.3 Hz: a Hann frame's line is as wide."""
 
 
-class FanNoise:
+class FanNoise(Effect):
     """The fan's power spectrum is another by spectrum_db at each frequency; the voice itself is unchanged.
 
     spectrum_db: (601,) on the profile's grid, 0 to 8 kHz, or one number. change_db only reports: the change of the fan's total power.
@@ -33,21 +31,18 @@ class FanNoise:
 
     name: ClassVar[str] = "fan_noise"
     stage: ClassVar[Stage] = "noise"
-    memoryless: ClassVar[bool] = True
+    title: ClassVar[str] = "changed fan noise"
+    memory: ClassVar[int | None] = 0
     parameters: ClassVar[tuple[Parameter, ...]] = (
         Parameter("spectrum_db", "dB", 0.0, LOWEST_DB, HIGHEST_DB),
         Parameter("change_db", "dB", 0.0, LOWEST_DB, HIGHEST_DB),
     )
 
-    def apply(self, x: Samples, values: Values, sample_rate: int) -> Samples:
-        """x (n,) itself."""
-        return x.copy()
-
     def noise_psd(self, values: Values, psd: Samples) -> Samples:
         """The fan's PSD (601,) after the change, from psd (601,) before it."""
         return (psd * 10.0 ** (np.asarray(values["spectrum_db"], float) / 10.0)).astype(np.float32)
 
-    def fit(self, measurement: Measurement, model: EchoModel) -> Values:
+    def fit(self, measurement: Measurement, model: VoiceModel) -> Values:
         """Mean periodogram of the residual in the robot's silences over the calibrated PSD.
 
         Where the robot is hardly ever silent, the mean of the quietest quarter of all frames at each frequency, divided by what that
@@ -75,6 +70,10 @@ class FanNoise:
             "spectrum_db": np.clip(10.0 * np.log10(smooth + 1e-30), LOWEST_DB, HIGHEST_DB),
             "change_db": float(np.clip(total, LOWEST_DB, HIGHEST_DB)),
         }
+
+    def sentence(self, values: Values) -> str:
+        """By how much."""
+        return f"the noise is {first(values, 'change_db'):+.1f} dB off the calibrated fan, with the robot's voice and without it"
 
 
 def _quiet_mean(power: Array) -> Array:

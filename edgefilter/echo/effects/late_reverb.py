@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 import numpy as np
 import scipy
 
 from edgefilter.dsp.frames import blocks
-from edgefilter.echo.effect import Measurement, Parameter, Stage, Values, neutral
+from edgefilter.echo.effect import Effect, Parameter, Stage, first, neutral
+from edgefilter.echo.evidence import Evidence
+from edgefilter.echo.measurement import Measurement, Values, VoiceModel
 from edgefilter.echo.wiener import convolve_from, fit_filter, fit_supported
 from edgefilter.types import SAMPLE_RATE, Array, Samples
-
-if TYPE_CHECKING:
-    from edgefilter.echo.model import EchoModel
 
 LEAD = 32
 """Taps before lag 0: what a room of other colour changes in the direct sound."""
@@ -26,7 +25,7 @@ SLOWER = 1.7
 BLOCK = 320
 
 
-class LateReverb:
+class LateReverb(Effect):
     """y = x + taps * x: a long filter behind the calibrated path. Its decay gives the reverberation time.
 
     rt60_s: from the backward-integrated energy of the whole new response (Schroeder 1965, eq. 5), the first 20 ms left out, above the noise.
@@ -35,7 +34,10 @@ class LateReverb:
 
     name: ClassVar[str] = "late_reverb"
     stage: ClassVar[Stage] = "path"
-    memoryless: ClassVar[bool] = False
+    title: ClassVar[str] = "late reverberation"
+    absorbed: ClassVar[bool] = True
+    complexity: ClassVar[int] = 4
+    flexible: ClassVar[bool] = True
     parameters: ClassVar[tuple[Parameter, ...]] = (
         Parameter("rt60_s", "s", 0.0, 0.0, 10.0),
         Parameter("level_db", "dB", -120.0, -120.0, 40.0),
@@ -47,7 +49,7 @@ class LateReverb:
         taps = np.atleast_1d(np.asarray(values["taps"], float))
         return x.copy() if not taps.any() else x + convolve_from(x, taps, LEAD)
 
-    def fit(self, measurement: Measurement, model: EchoModel) -> Values:
+    def fit(self, measurement: Measurement, model: VoiceModel) -> Values:
         """Least squares in the whitened domain, slightly regularised; neutral where nothing of it holds on other samples.
 
         Then once more with taps expected to decay as the room that was found does: some seconds of speech do not teach ten thousand.
@@ -66,6 +68,17 @@ class LateReverb:
             taps = fit_filter(x, residual, measurement.weights, length, LEAD, prior=decaying(taps, SLOWER * rt60), steps=60)
         late = float(np.sum(taps[LEAD + SAMPLE_RATE // 100 :] ** 2))
         return {"rt60_s": rt60, "level_db": float(np.clip(10 * np.log10(late + 1e-12), -120.0, 40.0)), "taps": np.clip(taps, -10.0, 10.0)}
+
+    def sentence(self, values: Values) -> str:
+        """How long the room sounds."""
+        return (
+            f"the recording goes on sounding after the calibrated response has died away: a reverberation of {first(values, 'rt60_s'):.2f} s that holds "
+            "from the first second to the last"
+        )
+
+    def plausible(self, evidence: Evidence) -> bool:
+        """There is some."""
+        return float(evidence.values["level_db"]) > -100.0
 
 
 def block_energy(taps: Array) -> tuple[Array, float]:

@@ -8,8 +8,9 @@ from scipy import signal
 
 from edgefilter.dsp.fractional_delay import delayed
 from edgefilter.diagnosis.prepare import prepare
-from edgefilter.echo.effect import Measurement, find
+from edgefilter.echo.effects.catalogue import find
 from edgefilter.echo.effects.late_reverb import EXPECTED, LEAD
+from edgefilter.echo.measurement import Measurement
 from edgefilter.echo.model import EchoModel
 from edgefilter.echo.wiener import convolve_from, fit_filter
 from edgefilter.types import PRE_ROLL
