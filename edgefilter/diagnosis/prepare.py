@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import soxr
@@ -11,7 +11,8 @@ from scipy import fft
 from scipy.ndimage import maximum_filter1d
 
 from edgefilter.diagnosis.offset import find_offset, shift, starting_offset
-from edgefilter.echo.measurement import Measurement, whiten
+from edgefilter.echo.measurement import Measurement, held_up, whiten
+from edgefilter.echo.model import EchoModel
 from edgefilter.errors import SignalError
 from edgefilter.profile.data import Profile
 from edgefilter.types import PRE_ROLL, SAMPLE_RATE, Samples, as_samples
@@ -37,12 +38,14 @@ MIN_SECONDS = 1.0
 class Prepared:
     """A recording beside what the profile predicts, on one sample counter; all arrays (n,).
 
-    measurement: aligned reference, recording, the fan's PSD, the samples to fit on. prediction: of the profile.
+    measurement: aligned reference, recording, the fan's PSD, the samples to fit on. model: the profile's, less the events of other
+    recordings. prediction: of that model.
     usable: samples where nobody else talks. active: where the robot is heard. offset: samples of lag against the calibration.
     human: (start_s, end_s) of other talkers.
     """
 
     measurement: Measurement
+    model: EchoModel
     prediction: Samples
     usable: NDArray[np.bool_]
     active: NDArray[np.bool_]
@@ -54,6 +57,10 @@ class Prepared:
     def held_out(self) -> NDArray[np.bool_]:
         """(n,) samples that no fit has used."""
         return self.usable & ~self.measurement.fit
+
+    def behind(self, noise_psd: Samples) -> Prepared:
+        """The same with another fan, of PSD (601,)."""
+        return replace(self, measurement=replace(self.measurement, noise_psd=held_up(noise_psd)))
 
 
 def prepare(profile: Profile, recording: Samples, reference: Samples, *, sample_rate: int = SAMPLE_RATE) -> Prepared:
@@ -72,13 +79,14 @@ def prepare(profile: Profile, recording: Samples, reference: Samples, *, sample_
     x = np.pad(x, (0, max(n - x.size, 0)))[:n]
     start = profile.delay - PRE_ROLL
     at_calibration = shift(x, start)
-    predicted = profile.echo.predict(at_calibration)
-    known = profile.echo.expected_noise(profile.noise_psd)
+    model = profile.echo.during(Measurement(x, y))
+    predicted = model.predict(at_calibration)
+    known = held_up(model.expected_noise(profile.noise_psd))
     offset = starting_offset(whiten(predicted, known), whiten(y, known))
     pieces = utterance_lags(x, predicted, y, known, offset)
     begin, end = known_span(x, start + pieces[0][2], start + pieces[-1][2])
     x = sum(shift(np.where((np.arange(n) >= first) & (np.arange(n) < last), x, np.float32(0)), start + lag) for first, last, lag in pieces)
-    predicted = profile.echo.predict(x)
+    predicted = model.predict(x)
     white = whiten(predicted, known).astype(np.float64)
     block = SAMPLE_RATE // 50
     level = np.add.reduceat(white**2, np.arange(0, n, block)) / block
@@ -97,7 +105,7 @@ def prepare(profile: Profile, recording: Samples, reference: Samples, *, sample_
     if len(pieces) > 1:
         lags = ", ".join(f"{lag:.1f} from {first / SAMPLE_RATE:.1f} s" for first, _, lag in pieces)
         warnings += (f"the utterances lag by different numbers of samples: {lags}; aligned one by one",)
-    return Prepared(Measurement(x, y, psd, fit & usable), predicted, usable, active, offset, human, warnings)
+    return Prepared(Measurement(x, y, psd, fit & usable), model, predicted, usable, active, offset, human, warnings)
 
 
 def known_span(x: Samples, first_lag: float, last_lag: float) -> tuple[int, int]:
