@@ -8,8 +8,11 @@ import numpy as np
 from scipy.ndimage import median_filter
 
 from edgefilter.diagnosis.prepare import Prepared
+from edgefilter.diagnosis.score import Judge
+from edgefilter.diagnosis.trials import Found
 from edgefilter.dsp.frames import block_power, blocks, decibels
 from edgefilter.dsp.psd import frequencies, periodograms
+from edgefilter.echo.effects.catalogue import find
 from edgefilter.echo.measurement import whiten
 from edgefilter.types import SAMPLE_RATE, Array, Samples
 
@@ -72,3 +75,28 @@ def _tones(residual: Samples, psd: Samples) -> tuple[Array, float, float]:
         if power[at][off < 0.8].sum() > 0.8 * power[at].sum() and (off < 0.8).sum() >= 2:
             mains = grid
     return hz[at], mains, share
+
+
+def left_in_words(found: Found, left: Leftover, remaining_db: float, floor_db: float) -> str:
+    """What is in the residual that no finding explains; empty where it is the fan."""
+    spans = ", ".join(f"{begin:.1f} to {end:.1f} s" for begin, end in found.prepared.human)
+    talk = f"somebody talks at {spans}, left out of all figures" if spans else ""
+    if remaining_db < floor_db:
+        return talk
+    words = [talk] if talk else []
+    if left.mains_hz and left.tone_share > 0.3:
+        words.append(f"tones at multiples of {left.mains_hz:.0f} Hz, also while the robot is silent")
+    elif left.tone_share > 0.5:
+        words.append("tones at " + ", ".join(f"{hz:.0f}" for hz in left.tones_hz[:4]) + " Hz")
+    final = found.final
+    active = final.active_db - max(left.quiet_mean_db if np.isfinite(left.quiet_mean_db) else 0.0, 0.0)
+    if np.isfinite(left.quiet_db) and left.quiet_mean_db > 1.0 and not words:
+        words.append("sound of its own while the robot is silent" + (", coming and going" if left.swing_db > 6.0 else ""))
+    if active > 1.0:
+        weights = 10 * np.log10(np.maximum(final.cells, 1e-3)).mean(axis=0)
+        low, high = Judge(found.prepared).band_hz[int(np.argmax(weights))]
+        words.append(f"a residual that follows the robot's voice, strongest around {low:.0f} to {high:.0f} Hz")
+        words += [find(name).noise_words for name, _ in found.model.effects if find(name).noise_words]
+    if not words:
+        words.append("a residual spread over the whole recording")
+    return f"{remaining_db:.1f} dB over the noise floor that no effect of the catalogue explains: " + "; ".join(words)

@@ -2,40 +2,31 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
+from edgefilter.diagnosis.criteria import Criteria
 from edgefilter.diagnosis.leftover import Leftover, inspect
 from edgefilter.diagnosis.prepare import Prepared
 from edgefilter.diagnosis.score import Judge
 from edgefilter.diagnosis.trials import Found, Trial
-from edgefilter.dsp.psd import ROUNDING_PSD
 from edgefilter.echo.effect import complete
 from edgefilter.echo.effects.catalogue import find, names
 from edgefilter.echo.evidence import Score
 from edgefilter.echo.measurement import Measurement, Values
 from edgefilter.echo.model import EchoModel
-from edgefilter.types import Array, Samples
 
-LEAST_CHANGE_DB = 1.0
-"""By less than this a fan differs from day to day."""
-STEADY_DB, SPARSE_DB = 1.5, 0.7
-"""Whitened by its own spectrum, the loud and the quiet tenth of a second of a fan differ by less than the first, a talker's by much more; and its mean
-is no more than the second above its median, that of something that slams now and then is."""
-COLOURED_DB, FLAT_DB = 0.7, 2.0
-"""A gain behind the microphone changes the fan by less than the first from frequency to frequency, and by less than the second over all while it is steady."""
 BAND = 20
 """Bins of 13.3 Hz over which the change is averaged before that is judged."""
 
 
-def changed_fan(prepared: Prepared, model: EchoModel, base: Score) -> tuple[Prepared, Trial] | None:
+def changed_fan(prepared: Prepared, model: EchoModel, base: Score, criteria: Criteria) -> tuple[Prepared, Trial] | None:
     """The recording prepared with the fan as the robot's silences have it, and what changed it as a step; None where it is the calibrated one.
 
     Only where there are silences and the change has a colour of its own: before the voice is explained, a gain cannot be told from it.
     """
-    residual = prepared.measurement.recording - base.prediction
+    residual = (prepared.measurement.recording - base.prediction) / model.microphone_gain(base.prediction.size)
     left = inspect(prepared, residual)
     if not np.isfinite(left.quiet_mean_db) or left.mains_hz:
         return None
@@ -43,17 +34,17 @@ def changed_fan(prepared: Prepared, model: EchoModel, base: Score) -> tuple[Prep
         now, values = _with_fan(prepared, name, prepared.measurement, model)
         change = _change_db(prepared, now)
         most = max(change, left.quiet_mean_db)
-        if most < LEAST_CHANGE_DB or (_colour_db(prepared, now) < COLOURED_DB and most < FLAT_DB):
+        if most < criteria.fan_change_db or (_colour_db(prepared, now) < criteria.fan_coloured_db and most < criteria.fan_flat_db):
             continue
-        if not _steady(inspect(now, residual)):
+        if not _steady(inspect(now, residual), criteria):
             continue
-        after = Judge(now).judge(base.prediction, correct=False)
+        after = Judge(now).of(model)
         if abs(after.silent_db) < 0.5 * abs(base.silent_db):
             return now, Trial(name, values, model.with_effect(name, values), after, base.level_db - after.level_db, change)
     return None
 
 
-def look_at_fan(found: Found) -> tuple[Found, Leftover]:
+def look_at_fan(found: Found, criteria: Criteria) -> tuple[Found, Leftover]:
     """The search's outcome with the final residual judged against the fan as it is now, and with what changed the fan where it is another.
 
     A microphone gain in the model is taken out of the residual first: the fan passed through it.
@@ -63,10 +54,6 @@ def look_at_fan(found: Found) -> tuple[Found, Leftover]:
     gain = model.microphone_gain(measurement.recording.size)
     residual = (measurement.recording - found.final.prediction) / gain
     left = inspect(prepared, residual)
-    final = found.final
-    if not np.array_equal(gain, np.ones_like(gain)):
-        final = _judged(prepared, found, gain)
-    found = replace(found, final=final)
     if any(find(name).stage == "noise" for name, _ in model.effects):
         return found, left
     heard = bool(np.isfinite(left.quiet_mean_db))
@@ -74,14 +61,14 @@ def look_at_fan(found: Found) -> tuple[Found, Leftover]:
         now, values = _with_fan(prepared, name, replace(measurement, recording=measurement.recording / gain), model)
         change = _change_db(prepared, now)
         change = max(change, left.quiet_mean_db) if heard else change
-        if abs(change) < LEAST_CHANGE_DB or left.mains_hz or (heard and abs(left.quiet_mean_db) <= 0.5 * LEAST_CHANGE_DB):
+        if abs(change) < criteria.fan_change_db or left.mains_hz or (heard and abs(left.quiet_mean_db) <= 0.5 * criteria.fan_change_db):
             continue
-        after = _judged(now, found, gain)
+        after = Judge(now).of(model)
         behind = inspect(now, residual)
-        if not _steady(behind) or ((after.silent_db > 0.5 * final.silent_db) if heard else (after.excess_db > LEAST_CHANGE_DB)):
+        if not _steady(behind, criteria) or ((after.silent_db > 0.5 * found.final.silent_db) if heard else (after.excess_db > criteria.fan_change_db)):
             continue
         changed = model.with_effect(name, values)
-        step = Trial(name, values, changed, after, final.level_db - after.level_db, change)
+        step = Trial(name, values, changed, after, found.final.level_db - after.level_db, change)
         return replace(found, prepared=now, model=changed, final=after, steps=(*found.steps, step)), behind
     return found, left
 
@@ -91,38 +78,26 @@ def _of_the_fan(model: EchoModel) -> list[str]:
     return [name for name in names() if find(name).stage == "noise" and name not in dict(model.effects)]
 
 
-def _steady(left: Leftover) -> bool:
+def _steady(left: Leftover, criteria: Criteria) -> bool:
     """Whether what is left of the silences, whitened by the new fan's spectrum, is a fan; True where there are no silences."""
-    return left.swing_db < STEADY_DB and not left.quiet_mean_db - left.quiet_db > SPARSE_DB
+    return left.swing_db < criteria.fan_steady_db and not left.quiet_mean_db - left.quiet_db > criteria.fan_sparse_db
 
 
 def _with_fan(prepared: Prepared, name: str, measurement: Measurement, model: EchoModel) -> tuple[Prepared, Values]:
     """The recording with the fan's PSD as that effect, fitted to the measurement, has it; and the values of the fit."""
     values = complete(find(name), find(name).fit(measurement, model))
-    psd = find(name).noise_psd(values, prepared.measurement.noise_psd)
-    return replace(prepared, measurement=replace(prepared.measurement, noise_psd=psd)), values
+    return prepared.behind(find(name).noise_psd(values, prepared.measurement.noise_psd)), values
 
 
 def _change_db(before: Prepared, after: Prepared) -> float:
     """Change of the fan's whole power."""
     was, now = (float(np.sum(prepared.measurement.noise_psd, dtype=np.float64)) for prepared in (before, after))
-    return 10.0 * np.log10((now + ROUNDING_PSD) / (was + ROUNDING_PSD))
+    return 10.0 * np.log10(now / was)
 
 
 def _colour_db(before: Prepared, after: Prepared) -> float:
     """Standard deviation over frequency of the fan's change, dB."""
-    was, now = (prepared.measurement.noise_psd.astype(np.float64) + ROUNDING_PSD for prepared in (before, after))
+    was, now = (prepared.measurement.noise_psd.astype(np.float64) for prepared in (before, after))
     spectrum = 10.0 * np.log10(now / was)
     count = spectrum.size // BAND
     return float(np.std(spectrum[: count * BAND].reshape(count, BAND).mean(axis=1)))
-
-
-def judge_behind(gain: Samples, prepared: Prepared, prediction: Samples, unpredictable: Sequence[tuple[Samples, Array]] = ()) -> Score:
-    """The score of an already corrected prediction (n,), with a microphone's gain (n,) taken out of the residual."""
-    flat = replace(prepared, measurement=replace(prepared.measurement, recording=(prepared.measurement.recording - prediction) / gain))
-    return replace(Judge(flat).judge(np.zeros_like(prediction), correct=False, unpredictable=unpredictable), prediction=prediction)
-
-
-def _judged(prepared: Prepared, found: Found, gain: Samples) -> Score:
-    """The score of what a search ends with."""
-    return judge_behind(gain, prepared, found.final.prediction, found.model.unpredictable(prepared.measurement.reference))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import soxr
@@ -14,8 +14,9 @@ from edgefilter.diagnosis.offset import find_offset, starting_offset
 from edgefilter.dsp.fourier import power
 from edgefilter.dsp.fractional_delay import delayed
 from edgefilter.dsp.frames import all_block_power, blocks, decibels
-from edgefilter.dsp.psd import hann
+from edgefilter.dsp.psd import floored, hann
 from edgefilter.echo.measurement import Measurement, whiten
+from edgefilter.echo.model import EchoModel
 from edgefilter.echo.recording import fitted_blocks, paired
 from edgefilter.errors import SignalError
 from edgefilter.profile.data import Profile
@@ -39,12 +40,14 @@ PAUSE_S, LAG_STEP = 0.5, 480
 class Prepared:
     """A recording beside what the profile predicts, on one sample counter; all arrays (n,).
 
-    measurement: aligned reference, recording, the fan's PSD, the samples to fit on. prediction: of the profile.
+    measurement: aligned reference, recording, the fan's PSD, the samples to fit on. model: the profile's, less the events of other
+    recordings. prediction: of that model.
     usable: samples where nobody else talks. active: where the robot is heard. offset: samples of lag against the calibration.
     human: (start_s, end_s) of other talkers.
     """
 
     measurement: Measurement
+    model: EchoModel
     prediction: Samples
     usable: NDArray[np.bool_]
     active: NDArray[np.bool_]
@@ -56,6 +59,10 @@ class Prepared:
     def held_out(self) -> NDArray[np.bool_]:
         """(n,) samples that no fit has used."""
         return self.usable & ~self.measurement.fit
+
+    def behind(self, noise_psd: Samples) -> Prepared:
+        """The same with another fan, of PSD (601,)."""
+        return replace(self, measurement=replace(self.measurement, noise_psd=floored(noise_psd).astype(np.float32)))
 
 
 def prepare(profile: Profile, recording: Samples, reference: Samples, *, sample_rate: int = SAMPLE_RATE) -> Prepared:
@@ -71,13 +78,14 @@ def prepare(profile: Profile, recording: Samples, reference: Samples, *, sample_
     n = y.size
     start = profile.delay - PRE_ROLL
     at_calibration = delayed(x, start)
-    predicted = profile.echo.predict(at_calibration)
-    known = profile.echo.expected_noise(profile.noise_psd)
+    model = profile.echo.during(Measurement(x, y))
+    predicted = model.predict(at_calibration)
+    known = floored(model.expected_noise(profile.noise_psd)).astype(np.float32)
     offset = starting_offset(whiten(predicted, known), whiten(y, known))
     pieces = utterance_lags(x, predicted, y, known, offset)
     begin, end = known_span(x, start + pieces[0][2], start + pieces[-1][2])
     x = sum(delayed(np.where((np.arange(n) >= first) & (np.arange(n) < last), x, np.float32(0)), start + lag) for first, last, lag in pieces)
-    predicted = profile.echo.predict(x)
+    predicted = model.predict(x)
     white = whiten(predicted, known)
     block = SAMPLE_RATE // 50
     level = all_block_power(white, block)
@@ -96,7 +104,7 @@ def prepare(profile: Profile, recording: Samples, reference: Samples, *, sample_
     if len(pieces) > 1:
         lags = ", ".join(f"{lag:.1f} from {first / SAMPLE_RATE:.1f} s" for first, _, lag in pieces)
         warnings += (f"the utterances lag by different numbers of samples: {lags}; aligned one by one",)
-    return Prepared(Measurement(x, y, psd, fit & usable), predicted, usable, active, offset, human, warnings)
+    return Prepared(Measurement(x, y, psd, fit & usable), model, predicted, usable, active, offset, human, warnings)
 
 
 def known_span(x: Samples, first_lag: float, last_lag: float) -> tuple[int, int]:

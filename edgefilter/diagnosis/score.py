@@ -9,7 +9,7 @@ from scipy.ndimage import uniform_filter1d
 
 from edgefilter.diagnosis.prepare import Prepared
 from edgefilter.dsp.frames import decibels
-from edgefilter.dsp.psd import floored, frequencies, hann, variance_at
+from edgefilter.dsp.psd import frequencies, hann, total_power, variance_at
 from edgefilter.echo.evidence import Score
 from edgefilter.echo.least_squares import normal_equations
 from edgefilter.echo.measurement import Measurement, whiten
@@ -36,10 +36,11 @@ class Judge:
         self.prepared = prepared
         measurement = prepared.measurement
         self.psd = measurement.noise_psd
+        self._fan = total_power(self.psd)
         n = measurement.recording.size
         self._window = hann(FRAME).astype(np.float32)
         hz = frequencies(FRAME // 2 + 1)
-        self._expected = variance_at(hz, floored(self.psd)) * float(np.sum(self._window**2))
+        self._expected = variance_at(hz, self.psd) * float(np.sum(self._window**2))
         self._rows = measurement.fit & prepared.usable & prepared.active & (np.arange(n) % 3 == 0)
         starts = np.arange(0, n - FRAME - HOP * (FRAMES_PER_CELL - 1) + 1, HOP * FRAMES_PER_CELL)
         span = FRAME + HOP * (FRAMES_PER_CELL - 1)
@@ -77,18 +78,21 @@ class Judge:
     def of(self, model: EchoModel) -> Score:
         """The score of a model: on what it predicts, with what it says that no waveform predicts counted as fan."""
         measurement = self.prepared.measurement
-        return self.judge(measurement.heard(model)[0], unpredictable=model.unpredictable(measurement.reference))
+        gain = model.microphone_gain(measurement.recording.size)
+        return self.judge(measurement.heard(model)[0], model.unpredictable(measurement.reference), gain)
 
-    def judge(self, prediction: Samples, correct: bool = True, unpredictable: Sequence[tuple[Samples, Array]] = ()) -> Score:
-        """The score of a prediction (n,), by default with the ordinary tolerances taken up first.
+    def judge(self, prediction: Samples, unpredictable: Sequence[tuple[Samples, Array]] = (), gain: Samples | None = None) -> Score:
+        """The score of a prediction (n,), with the ordinary tolerances taken up first.
 
-        unpredictable: as EchoModel.unpredictable gives it, noise that is expected on top of the fan.
+        unpredictable: as EchoModel.unpredictable gives it, noise that is expected on top of the fan. gain: (n,) of the microphone, which
+        the fan passed as well: it is taken out of the residual before that is held against the fan. The cells keep it: as a likelihood
+        their level has to be that of the recording as it is.
         """
-        corrected = self.correct(prediction) if correct else prediction
+        corrected = self.correct(prediction)
         residual = self.prepared.measurement.recording - corrected
         cells = self.cells(residual) / self._expected_cells(unpredictable)
         weights = np.broadcast_to(self.freedom, cells.shape)
-        plain = whiten(residual, self.psd).astype(np.float64) ** 2
+        plain = whiten(residual if gain is None else residual / gain, self.psd).astype(np.float64) ** 2
         white = self._over_expected(plain, unpredictable) if unpredictable else plain
         held, active = self.prepared.held_out, self.prepared.active
         return Score(
@@ -101,6 +105,23 @@ class Judge:
             cells=cells,
             prediction=corrected,
         )
+
+    def floor_level(self, score: Score) -> float:
+        """Level in dB of the cells in which the robot is silent, 0 where it never is: what is left when everything is explained."""
+        quiet = score.cells[~self.active_cells]
+        if quiet.shape[0] < 4:
+            return 0.0
+        return float(np.average(10 * np.log10(np.maximum(quiet, 1e-3)).mean(axis=0), weights=self.freedom))
+
+    def size_db(self, change: Samples) -> float:
+        """Power of a change of the prediction (n,) over the fan in dB: as it is or whitened, whichever is more."""
+        plain, white = float(np.mean(change.astype(float) ** 2)) / self._fan, float(np.mean(whiten(change, self.psd).astype(float) ** 2))
+        return float(10 * np.log10(max(plain, white, 1e-12)))
+
+    def noise_size_db(self, model: EchoModel) -> float:
+        """Mean power over the fan, in dB, of what a model says that no waveform predicts."""
+        power = sum(float(np.mean(variance)) for variance, _ in model.unpredictable(self.measurement.reference))
+        return float(10 * np.log10(max(power / self._fan, 1e-12)))
 
     def _expected_cells(self, unpredictable: Sequence[tuple[Samples, Array]]) -> Array | float:
         """(times, bands) what is expected in the held-out cells, 1 where that is the fan alone."""
@@ -118,7 +139,7 @@ class Judge:
         """power (n,) of the whitened residual over what is expected, both smoothed over 16 ms: when a knock comes is known to some ms."""
         expected = np.ones_like(power)
         for variance, colour in unpredictable:
-            expected += variance * float(np.mean(colour / floored(self.psd)))
+            expected += variance * float(np.mean(colour / self.psd))
         return uniform_filter1d(power, HOP) / uniform_filter1d(expected, HOP)
 
     def correct(self, prediction: Samples) -> Samples:

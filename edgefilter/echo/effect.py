@@ -28,6 +28,10 @@ class Parameter:
     high: float
 
 
+RECORDING = Parameter("recording", "fingerprint", 0.0, 0.0, 2.0**52)
+"""Every event's last parameter: the recording in which it happened (Measurement.fingerprint); 0 for whichever is looked at."""
+
+
 class Effect:
     """One physical effect on the robot's own voice. With every parameter at its neutral value, apply is the identity.
 
@@ -38,7 +42,7 @@ class Effect:
     What the model asks:
     memory: samples of the past that apply needs, 0 for none; None where it needs more than the running filter looks back at every hop.
     scales_fan: whether the fan gets the same gain as the voice. event: whether the values belong to one recording (moments, a gain's
-    curve) rather than to the robot. absorbed: whether a linear path fitted to a recording holds the effect already.
+    curve) rather than to the robot: they get a parameter RECORDING besides their own, and in other recordings the effect is left out. absorbed: whether a linear path fitted to a recording holds the effect already.
 
     What the diagnosis asks:
     title: as it reads inside a sentence ("a turned volume"); by default the name. complexity: of two effects that explain about as much
@@ -112,6 +116,17 @@ class Effect:
         """Values with which the effect is that gain and nothing else; None for an effect that is more than a gain."""
         return None
 
+    def __init_subclass__(cls, **named: object) -> None:
+        super().__init_subclass__(**named)
+        own = vars(cls).get("parameters")
+        if cls.event and isinstance(own, tuple) and RECORDING not in own:
+            cls.parameters = (*own, RECORDING)
+
+    @property
+    def told(self) -> tuple[Parameter, ...]:
+        """The parameters that say something to people."""
+        return tuple(p for p in self.parameters if p is not RECORDING)
+
     @property
     def adds_noise(self) -> bool:
         """Whether variance() is more than nothing."""
@@ -138,6 +153,19 @@ def complete(effect: Effect, values: Values) -> dict[str, float | Array]:
         if not ((found >= p.low) & (found <= p.high)).all():
             raise UsageError(f"effect {effect.name}: {name} is {value} {p.unit}, expected {p.low:g} to {p.high:g}")
     return {**neutral(effect), **{name: value if np.ndim(value) == 0 else np.asarray(value, float) for name, value in values.items()}}
+
+
+def fitted(effect: Effect, measurement: Measurement, model: VoiceModel) -> dict[str, float | Array]:
+    """All values of an effect fitted to a measurement; those of an event, unless it vanishes, say in which recording it happened."""
+    values = complete(effect, effect.fit(measurement, model))
+    if effect.event and not vanishes(effect, values):
+        values[RECORDING.name] = measurement.fingerprint
+    return values
+
+
+def vanishes(effect: Effect, values: Values) -> bool:
+    """Whether all values are the neutral ones."""
+    return all(np.array_equal(values[name], value) for name, value in neutral(effect).items())
 
 
 def first(values: Values, name: str) -> float:

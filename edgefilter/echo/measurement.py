@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -67,6 +68,12 @@ class Measurement:
         return x if self.noise_psd is None else whiten(x, self.noise_psd)
 
     @cached_property
+    def fingerprint(self) -> float:
+        """A whole number of 52 bits that tells this recording from others, from its samples at 16 bit."""
+        digest = hashlib.sha256(np.round(self.recording * 32768.0).astype(np.int32).tobytes()).digest()
+        return float(int.from_bytes(digest[:8], "big") >> 12)
+
+    @cached_property
     def white_recording(self) -> Samples:
         """(n,) the recording, whitened."""
         return self.whiten(self.recording)
@@ -89,10 +96,7 @@ class Measurement:
 
 
 def whiten(x: Samples, noise_psd: Samples) -> Samples:
-    """x (n,) filtered by 1 / sqrt(noise_psd), zero-phase, so that noise of that one-sided PSD gets variance 1.
-
-    The PSD is floored, so that a notch is not amplified beyond reason.
-    """
+    """x (n,) filtered by 1 / sqrt(noise_psd), floored, zero-phase, so that noise of that one-sided PSD gets variance 1."""
     taps = np.fft.fftshift(np.fft.irfft(1.0 / np.sqrt(floored(noise_psd) * SAMPLE_RATE / 2)))[1:]
     taps *= np.hanning(taps.size + 2)[1:-1] ** 0.25
     return scipy.signal.oaconvolve(x, taps.astype(np.float32), mode="full")[taps.size // 2 :][: x.size].astype(np.float32)

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import scipy
 
-from edgefilter.echo.effect import complete
+from edgefilter.echo.effect import RECORDING, complete, fitted
 from edgefilter.echo.effects.catalogue import chain, find
 from edgefilter.echo.measurement import Measurement, Values
 from edgefilter.echo.source_chain import Driver
@@ -111,7 +111,13 @@ class EchoModel:
 
     def fit(self, name: str, measurement: Measurement) -> EchoModel:
         """The model with that effect at the values that explain the measurement best."""
-        return self.with_effect(name, find(name).fit(measurement, self.without_effect(name)))
+        return self.with_effect(name, fitted(find(name), measurement, self.without_effect(name)))
+
+    def during(self, measurement: Measurement) -> EchoModel:
+        """The model without the events of other recordings: a jump or a moment's move does not come again at the same second of another one."""
+        here = (0.0, measurement.fingerprint)
+        kept = tuple((name, values) for name, values in self.effects if not find(name).event or values.get(RECORDING.name, 0.0) in here)
+        return self if len(kept) == len(self.effects) else replace(self, effects=kept)
 
     def _predict(self, reference: Samples, effects: tuple[tuple[str, Values], ...]) -> Samples:
         """Source effects, the path, then the rest, each in the catalogue's order."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,11 +11,11 @@ from scipy import signal
 
 from edgefilter.diagnosis.band_edge import band_edge
 from edgefilter.diagnosis.compare import compare
+from edgefilter.diagnosis.criteria import Criteria
 from edgefilter.diagnosis.diagnose import Diagnosis, add, diagnose
 from edgefilter.dsp.fractional_delay import delayed
 from edgefilter.diagnosis.prepare import prepare
 from edgefilter.diagnosis.score import Judge
-from edgefilter.diagnosis.suspects import choose
 from edgefilter.diagnosis.trials import Trial, Workbench
 from edgefilter.echo.effects.catalogue import find
 from edgefilter.echo.evidence import Evidence, Score
@@ -121,7 +122,7 @@ def test_a_band_limit_shows_in_the_power_where_a_codecs_noise_hides_it() -> None
 def test_a_band_edge_is_not_seen_where_the_volume_was_turned() -> None:
     x = voice(SECONDS)
     judge = Judge(prepare(profile(), (0.4 * echo(x) + fan()).astype(np.float32), x))
-    assert band_edge(judge, judge.prepared.prediction) is None
+    assert band_edge(judge, judge.prepared.prediction, Criteria()) is None
 
 
 def test_an_added_effect_lowers_the_error_of_another_recording() -> None:
@@ -144,8 +145,11 @@ def test_the_dictionary_has_the_published_keys_and_is_json() -> None:
 
 
 def test_no_effect_is_chosen_where_none_lowers_the_level():
-    assert choose({}) is None and choose({"rattle": -0.2, "playback_gain": -0.1}) is None
-    assert choose({"playback_gain": 0.9, "late_reverb": 1.0}) == "playback_gain"
+    bench, score = Workbench(prepare(profile(), record(voice(4.0)), voice(4.0)), Criteria()), verdict(1.0, 1.0)
+    trials = {name: Trial(name, {}, EchoModel(path()), score, gain_db, 0.0) for name, gain_db in (("playback_gain", 0.9), ("late_reverb", 1.0))}
+    assert bench.preferred([]) is None and bench.preferred([replace(trials["late_reverb"], gain_db=-0.1)]) is None
+    assert bench.preferred(trials.values()) is trials["playback_gain"]
+    assert bench.preferred([replace(trials["playback_gain"], gain_db=0.8), trials["late_reverb"]]) is trials["late_reverb"]
 
 
 def verdict(active_db: float, fitted_db: float) -> Score:
@@ -160,6 +164,6 @@ def test_knocks_that_are_missing_where_a_filter_was_fitted_are_that_filters_erro
 @pytest.mark.parametrize("name, fitted_db, halved", [("speaker_nonlinearity", 0.5, True), ("speaker_nonlinearity", 2.0, False), ("late_reverb", 0.5, False)])
 def test_half_of_what_a_long_filter_leaves_where_it_was_fitted_is_enough(name, fitted_db, halved):
     found = prepare(profile(), record(voice(4.0)), voice(4.0))
-    bench, model = Workbench(found), EchoModel(path())
-    bench.verdict = lambda asked: verdict(6.0, 2.5)
+    bench, model = Workbench(found, Criteria()), EchoModel(path())
+    bench.score = lambda asked: verdict(6.0, 2.5)
     assert bench.halves(Trial(name, {}, model, verdict(5.0, fitted_db), 0.5, 3.0), model) is halved

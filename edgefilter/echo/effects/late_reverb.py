@@ -23,6 +23,10 @@ EXPECTED = 1e-3
 SLOWER = 1.7
 """The squares that are expected once the room is known decay in this many times its reverberation time, so that none of it is cut away."""
 BLOCK = 320
+EARLY, LATE_SHARE = round(0.03 * SAMPLE_RATE), 0.1
+"""Samples up to which reflections are early, and the share of the added energy that comes after those where the room is another."""
+LONGER = 1.1
+"""By this factor the reverberation time exceeds the calibration's, beyond what a fit to half a minute of speech errs by."""
 
 
 class LateReverb(Effect):
@@ -77,8 +81,16 @@ class LateReverb(Effect):
         )
 
     def plausible(self, evidence: Evidence) -> bool:
-        """There is some."""
-        return float(evidence.values["level_db"]) > -100.0
+        """Whether what it adds is reverberation: a good part comes later than early reflections do, and decays more slowly than at the calibration.
+
+        A loudspeaker of another colour or a path that moved are stationary, too, and a filter this long takes up either.
+        """
+        taps = np.atleast_1d(np.asarray(evidence.values["taps"], float))
+        before = evidence.model.impulse_response
+        direct = int(np.argmax(np.abs(before)))
+        added = scipy.signal.oaconvolve(before.astype(np.float64), taps)[LEAD + direct :] ** 2
+        late = float(np.sum(added[EARLY:])) / max(float(np.sum(added)), 1e-30)
+        return late >= LATE_SHARE and float(evidence.values["rt60_s"]) > LONGER * reverberation_time(before[direct:].astype(np.float64))
 
 
 def block_energy(taps: Array) -> tuple[Array, float]:
