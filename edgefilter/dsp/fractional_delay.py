@@ -1,4 +1,4 @@
-"""Reading a signal between its samples: one windowed sinc where the delay moves, the spectrum's phase where it is constant."""
+"""Reading a signal between its samples: a windowed sinc where the delay moves, the spectrum's phase where it holds."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from scipy import fft
 from edgefilter.types import Array, Samples
 
 HALF_WIDTH = 24
-"""Zero crossings of the interpolating sinc on each side. With the window below its error is under -110 dB up to 6 kHz, -90 dB at 6.8 kHz,
--55 dB at 7 kHz and -35 dB at 7.2 kHz, at the worst fraction."""
+"""Zero crossings of the interpolating sinc on each side. With the window below its error is under -110 dB up to 6 kHz,
+-90 dB at 6.8 kHz, -55 dB at 7 kHz and -35 dB at 7.2 kHz, at the worst fraction."""
 PHASES = 256
 """Delays per sample at which the filters are tabulated; linear interpolation between them errs by less than -100 dB."""
 CHUNK = 8192
@@ -22,8 +22,8 @@ MARGIN = 256
 def kernel(fraction: Array) -> Samples:
     """Windowed-sinc filters that delay by fraction (m,) samples, each within about -1..2; (m, 2 * HALF_WIDTH) float32.
 
-    Tap k weighs the sample k - HALF_WIDTH + 1 behind the present one. h(k) = sinc(k - d) w(k - d) with the four-term Nuttall
-    window (1981, eq. 34) taken at the shifted position, so that the filter is exact for a whole number.
+    Tap k weighs the sample k - HALF_WIDTH + 1 behind the present one. h(k) = sinc(k - d) w(k - d) with the four-term
+    Nuttall window (1981, eq. 34) taken at the shifted position, so that the filter is exact for a whole number.
     """
     position = np.arange(1 - HALF_WIDTH, HALF_WIDTH + 1) - np.asarray(fraction, float)[:, None]
     phase = np.clip(position / (HALF_WIDTH + 1.0), -1.0, 1.0) * np.pi
@@ -34,9 +34,9 @@ def kernel(fraction: Array) -> Samples:
 
 @lru_cache(maxsize=1)
 def tabulated() -> tuple[Samples, Samples]:
-    """The filters for delays of -1 to 2, every 1 / PHASES, last tap first, and their differences, (3 * PHASES, 2 * HALF_WIDTH) each.
+    """The filters for delays of -1 to 2, every 1 / PHASES, last tap first, and their differences.
 
-    Made at the first call, in some ms.
+    (3 * PHASES, 2 * HALF_WIDTH) each. Made at the first call, in some ms.
     """
     table = kernel(np.arange(3 * PHASES + 1) / PHASES - 1.0)[:, ::-1]
     return np.ascontiguousarray(table[:-1]), np.diff(table, axis=0)
@@ -59,9 +59,10 @@ def interpolate(x: Samples, positions: Array) -> Samples:
 
 
 def delayed(x: Array, samples: float) -> Samples:
-    """x (n,) later by a constant number of samples, fractional or negative; (n,) float32, silence moves in, what leaves is lost.
+    """x (n,) later by a constant number of samples, fractional or negative; (n,) float32, silence moves in.
 
-    By the phase of its spectrum, which keeps all of the band: above 7 kHz, where the kernel falls off, a voice may still be over the fan.
+    By the phase of its spectrum, which keeps all of the band: above 7 kHz, where the kernel falls off, a voice may
+    still be over the fan.
     """
     if abs(samples) >= x.size:
         return np.zeros(x.size, np.float32)

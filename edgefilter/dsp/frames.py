@@ -9,7 +9,7 @@ from edgefilter.types import Array, Samples
 
 
 def frames(x: NDArray, size: int, hop: int) -> NDArray:
-    """(f, size) frames of x (n,), hop samples apart, a view that is not to be written to; none where x is shorter than one."""
+    """(f, size) frames of x (n,), hop samples apart, a view not to be written to; none where x is shorter."""
     if x.size < size:
         return np.zeros((0, size), x.dtype)
     return np.lib.stride_tricks.sliding_window_view(x, size)[::hop]

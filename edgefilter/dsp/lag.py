@@ -1,4 +1,4 @@
-"""By how much one signal lags behind another: cross-spectra of flat magnitude, the highest correlation, and its top between the samples."""
+"""By how much one signal lags behind another: flat cross-spectra, their highest correlation and its top."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from edgefilter.dsp.fourier import power
 from edgefilter.types import SAMPLE_RATE, Array, Samples
 
 SMOOTHING_HZ = 32.0
-"""Width over which a spectrum's power is averaged before it is divided by: voice harmonics are flattened, so pitch makes no side peak."""
+"""Width over which the power that a spectrum is divided by is averaged: harmonics are flattened, no pitch peaks."""
 LIKELY_HZ = 50.0
 """The same where the prediction's power weighs a cross-spectrum."""
 LOWEST_HZ = 100.0
@@ -29,7 +29,8 @@ def smoothed_power(spectrum: np.ndarray, width_hz: float) -> Array:
 def flattened(spectrum: np.ndarray, floor: float) -> np.ndarray:
     """The spectrum (bins,) over the root of its smoothed power, which counts as no less than floor times its maximum.
 
-    Two of these, one conjugated, make the cross-spectrum of the phase transform (Knapp & Carter 1976), but for the smoothing.
+    Two of these, one conjugated, make the cross-spectrum of the phase transform (Knapp & Carter 1976), but for
+    the smoothing.
     """
     weight = smoothed_power(spectrum, SMOOTHING_HZ)
     weight += weight.dtype.type(floor * weight.max() + 1e-20)
@@ -37,19 +38,21 @@ def flattened(spectrum: np.ndarray, floor: float) -> np.ndarray:
 
 
 def flat_cross(a: Samples, b: Samples, n: int) -> np.ndarray:
-    """(n // 2 + 1,) cross-spectrum of b with a, both flattened, rumble left out: for signals of which nothing is known."""
-    cross = flattened(fft.rfft(b.astype(np.float64), n), 1e-6) * flattened(fft.rfft(a.astype(np.float64), n), 1e-6).conj()
+    """(n // 2 + 1,) cross-spectrum of b with a, both flattened, without rumble: for unknown signals."""
+    first, second = (flattened(fft.rfft(x.astype(np.float64), n), 1e-6) for x in (a, b))
+    cross = second * first.conj()
     cross[: int(LOWEST_HZ * n / SAMPLE_RATE)] = 0.0
     return cross
 
 
 def likely_cross(predicted: Samples, recording: Samples, n: int) -> np.ndarray:
-    """(n // 2 + 1,) cross-spectrum Y P* / (|P|^2 + N) of two signals in noise of variance 1: flat where the voice stands out of it, else nothing.
+    """(n // 2 + 1,) cross-spectrum Y P* / (|P|^2 + N) of two signals in noise of variance 1.
 
-    The maximum-likelihood weighting of Knapp & Carter (1976) for an error in proportion to the voice.
+    Flat where the voice stands out of the noise, nothing elsewhere. The maximum-likelihood weighting of Knapp & Carter (1976) for an error in proportion to the voice.
     """
     source = fft.rfft(predicted.astype(np.float64), n)
-    return fft.rfft(recording.astype(np.float64), n) * source.conj() / (smoothed_power(source, LIKELY_HZ) + recording.size)
+    heard = fft.rfft(recording.astype(np.float64), n)
+    return heard * source.conj() / (smoothed_power(source, LIKELY_HZ) + recording.size)
 
 
 def correlation_near(cross: np.ndarray, n: int, reach: int) -> Array:
@@ -76,7 +79,8 @@ def turn(omega: Array, delay: float) -> np.ndarray:
 def climb(cross: np.ndarray, omega: Array, lag: float, steps: int = 8, tolerance: float = 0.0) -> float:
     """The lag, at most one sample from `lag`, at the top of the correlation whose cross-spectrum (bins,) this is.
 
-    omega: (bins,) radians per sample. Newton's method on Re sum cross exp(j omega lag), up to `steps` steps or one under the tolerance.
+    omega: (bins,) radians per sample. Newton's method on Re sum cross exp(j omega lag), up to `steps` steps or one
+    under the tolerance.
     """
     squared, moved = np.square(omega), 0.0
     for _ in range(steps):

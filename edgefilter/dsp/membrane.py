@@ -19,7 +19,8 @@ DISPLACEMENT_TAPS = 128
 def displacement_taps(sample_rate: int = SAMPLE_RATE) -> Array:
     """Impulse response (DISPLACEMENT_TAPS,) float64, not to be written to, of the low-pass; its gain is 1 at 0 Hz.
 
-    A Butterworth low-pass by the bilinear transform, sampled in frequency, so that the running filter needs no scipy.signal.
+    A Butterworth low-pass by the bilinear transform, sampled in frequency, so that the running filter needs no
+    scipy.signal.
     """
     k = np.tan(np.pi * DISPLACEMENT_HZ / sample_rate)
     z = np.exp(-2j * np.pi * np.arange(8 * DISPLACEMENT_TAPS // 2 + 1) / (8 * DISPLACEMENT_TAPS))

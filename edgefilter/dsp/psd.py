@@ -39,7 +39,10 @@ def floored(psd: Samples) -> Array:
 
 
 def variance_at(hz: Array, psd: Samples) -> Array:
-    """Two-sided density per sample of the PSD (bins,) at hz: |spectrum|^2 of such noise is that times the sum of the squared window."""
+    """Two-sided density per sample of the PSD (bins,) at hz.
+
+    |spectrum|^2 of such noise is that times the sum of the squared window.
+    """
     return np.interp(hz, frequencies(psd.size), psd) / 2 * SAMPLE_RATE
 
 
@@ -49,7 +52,7 @@ def total_power(psd: Samples) -> float:
 
 
 def third_octave_bands() -> Array:
-    """(B, 2) Hz, edges of the base-ten third-octave bands of 50 Hz to 8 kHz (IEC 61260-1, 5.4), the last one cut at 8 kHz."""
+    """(B, 2) Hz, third-octave bands of 50 Hz to 8 kHz (IEC 61260-1, 5.4, base ten), the last cut at 8 kHz."""
     centres = 1000.0 * 10 ** (np.arange(-13, 10) / 10)
     edges = np.stack((centres * 10**-0.05, centres * 10**0.05), axis=1)
     return np.minimum(edges, SAMPLE_RATE / 2)

@@ -1,4 +1,4 @@
-"""A recording of the robot beside its reference: how long it must be, how far it may lag, and which samples are fitted on."""
+"""A recording of the robot beside its reference: its least length, its largest lag, the samples that are fitted on."""
 
 from __future__ import annotations
 
@@ -21,9 +21,13 @@ def fitted_blocks(n: int) -> NDArray[np.bool_]:
 
 
 def paired(recording: object, reference: object) -> tuple[Samples, Samples]:
-    """Both as float32 of the recording's length, silence behind a shorter reference; SignalError where either is under MIN_SECONDS."""
+    """Both as float32 of the recording's length, silence behind a shorter reference.
+
+    Raises SignalError where either is shorter than MIN_SECONDS.
+    """
     y, x = as_samples(recording, "recording"), as_samples(reference, "reference")
     for samples, name in ((y, "recording"), (x, "reference")):
         if samples.size < MIN_SECONDS * SAMPLE_RATE:
-            raise SignalError(f"the {name} is {samples.size / SAMPLE_RATE:.2f} s long, expected at least {MIN_SECONDS:g} s of the robot's voice")
+            seconds = samples.size / SAMPLE_RATE
+            raise SignalError(f"the {name} is {seconds:.2f} s long, expected at least {MIN_SECONDS:g} s of the robot's voice")
     return y, np.pad(x, (0, max(y.size - x.size, 0)))[: y.size]
