@@ -7,6 +7,7 @@ import importlib
 import sys
 
 from edgefilter import __version__
+from edgefilter.commands.outputs import check_outputs
 from edgefilter.echo.user_effects import load_effect
 from edgefilter.engines import ENGINES
 from edgefilter.errors import EdgefilterError, UsageError
@@ -147,6 +148,7 @@ def main(argv: list[str] | None = None) -> int:
     debug = "--debug" in arguments
     try:
         args = build_parser().parse_args(arguments)
+        check_outputs(args)
         for file in getattr(args, "effects", []):
             load_effect(file)
         return importlib.import_module(f"edgefilter.commands.{args.command}").main(args)

@@ -27,7 +27,6 @@ FILE_ENDINGS = (".wav", ".flac", ".ogg", ".mp3", ".aiff", ".aif", ".w64", ".opus
 
 
 def main(args: argparse.Namespace) -> int:
-    _refuse_overwriting(args)
     source = make_source(args.input, args.reference, args.output)
     ego, choice = make_filter(args, source.live)
     if ego.waits_for_end and source.live:
@@ -157,14 +156,6 @@ def stop_on_signal(source: Source) -> Iterator[list[int]]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
-
-
-def _refuse_overwriting(args: argparse.Namespace) -> None:
-    for name in (args.input, args.reference, args.profile):
-        if name and name != "-" and Path(name).exists() and Path(args.output).exists() and Path(name).samefile(args.output):
-            raise UsageError(f"--output {args.output} is also an input and would be overwritten: choose another file")
-    if args.json == "-" and args.output == "-":
-        raise UsageError("--json - and --output - would mix on standard output: send one of them to a file")
 
 
 def say(text: str) -> None:
