@@ -7,8 +7,8 @@ import io
 import json
 import math
 import os
+import secrets
 import struct
-import tempfile
 import zipfile
 import zlib
 from collections.abc import Mapping
@@ -61,21 +61,16 @@ def _replace(path: Path, members: Mapping[str, np.ndarray]) -> None:
     path = path.resolve()
     if path.exists() and not path.is_file():
         raise ProfileError(f"{path}: not a file that can be replaced; name a .npz file for the profile")
-    temporary = None
+    temporary = path.with_name(f".{path.name[:32]}.{secrets.token_hex(8)}")
     try:
-        handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name[:64]}.")
-        with os.fdopen(handle, "wb") as file:
+        with open(temporary, "xb") as file:  # not tempfile: its files are the owner's alone, and the umask can only be read by changing it
             np.savez_compressed(file, allow_pickle=False, **members)
             file.flush()
             os.fsync(file.fileno())
-        mask = os.umask(0)
-        os.umask(mask)
-        os.chmod(temporary, 0o666 & ~mask)
         os.replace(temporary, path)
     except OSError as error:
-        if temporary is not None:
-            with contextlib.suppress(OSError):
-                os.unlink(temporary)
+        with contextlib.suppress(OSError):
+            temporary.unlink()
         raise ProfileError(f"{path}: the profile cannot be written ({error.strerror}); choose another place or free space") from None
 
 

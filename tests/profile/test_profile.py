@@ -285,6 +285,24 @@ def test_full_disk_leaves_the_old_file_and_no_rubbish(saved):
     assert saved.read_bytes() == before and os.listdir(saved.parent) == ["robot.npz"]
 
 
+def test_saving_does_not_open_all_files_of_other_threads_to_everybody(tmp_path, monkeypatch):
+    """The umask belongs to the process: to read it is to change it, for as long as another thread may need to make a file."""
+    before = os.umask(0o027)
+    try:
+        with monkeypatch.context() as changed:
+            changed.setattr(os, "umask", lambda mask: pytest.fail(f"the umask of the whole process was set to {mask:o}"))
+            make().save(tmp_path / "p.npz")
+        assert (tmp_path / "p.npz").stat().st_mode & 0o777 == 0o640
+    finally:
+        os.umask(before)
+
+
+def test_a_name_as_long_as_a_file_system_takes_can_be_saved(tmp_path):
+    name = "\N{ROBOT FACE}" * 62 + ".npz"  # 252 bytes of UTF-8
+    make().save(tmp_path / name)
+    assert Profile.load(tmp_path / name).delay == make().delay
+
+
 def test_unwritable_targets(tmp_path):
     with pytest.raises(ProfileError, match="cannot be written \\(No such file or directory\\)"):
         make().save(tmp_path / "absent" / "p.npz")
