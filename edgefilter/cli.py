@@ -9,7 +9,7 @@ import sys
 from edgefilter import __version__
 from edgefilter.commands.outputs import check_outputs
 from edgefilter.echo.user_effects import load_effect
-from edgefilter.engines import ENGINES
+from edgefilter.engines import ENGINES, HAVE_MODEL
 from edgefilter.errors import EdgefilterError, UsageError
 
 
@@ -59,7 +59,7 @@ def _add_run(commands: argparse._SubParsersAction) -> None:
     run.add_argument("--reference", metavar="FILE|DEVICE", help="what the robot says; live it defaults to the monitor of the default output")
     run.add_argument("--profile", metavar="P.npz", help="calibrated robot, made by 'edgefilter calibrate'")
     run.add_argument("--engine", default="auto", metavar="ENGINE", help=f"auto, {', '.join(ENGINES)} (default: %(default)s)")
-    run.add_argument("--model", metavar="FILE.onnx", help="network for engine crnn or paper-crnn in place of its own")
+    run.add_argument("--model", metavar="FILE.onnx", help=f"network for engine {' or '.join(HAVE_MODEL)} in place of its own")
     run.add_argument(
         "--budget-ms", type=_positive, metavar="B", help="compute per hop (p99) that auto may use, and that a live run keeps to (live default: 8)"
     )
