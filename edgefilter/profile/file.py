@@ -38,13 +38,15 @@ def write_fields(path: Path, arrays: Mapping[str, np.ndarray], header: Mapping[s
                 member = f"effect_{i}_{len(entry['values'])}"
                 members[member] = _plain(value, f"effects[{i}].{key}")
                 entry["values"][key] = {"array": member}
-            else:
+            elif isinstance(value, bool | int | float | np.generic | np.ndarray):
                 entry["values"][key] = value.item() if isinstance(value, np.generic | np.ndarray) else value
+            else:
+                raise ProfileError(f"the profile cannot be stored: effects[{i}].{key} is {type(value).__name__}, expected a number or an array")
         listed.append(entry)
     try:
         text = json.dumps({**header, "effects": listed}, allow_nan=False)
     except (TypeError, ValueError) as error:
-        raise ProfileError(f"the profile cannot be stored: {error}; expected finite numbers, texts and arrays") from None
+        raise ProfileError(f"the profile cannot be stored: {error}; expected finite numbers and arrays") from None
     members["header"] = np.frombuffer(text.encode(), np.uint8)
     members["version"] = np.array(FORMAT_VERSION, np.int64)
     _replace(path, members)
@@ -125,10 +127,12 @@ def _array(content: bytes, name: str) -> np.ndarray:
         if version != (1, 0):
             raise _Damaged(f"member {name!r} is in .npy format {version}, expected (1, 0)")
         shape, fortran, dtype = np.lib.format.read_array_header_1_0(file)
-    except ValueError as error:
-        raise _Damaged(f"member {name!r} is no .npy array ({str(error).splitlines()[0][:80]})") from None
+    except Exception as error:  # numpy's parser lets whatever Python's own raises through: TokenError, RecursionError, TypeError
+        raise _Damaged(f"member {name!r} is no .npy array ({' '.join(str(error).split())[:80]})") from None
     if dtype.hasobject or dtype.kind not in "fiub":
         raise _Damaged(f"member {name!r} holds {dtype} (pickled objects or text), expected numbers")
+    if any(type(size) is not int or size < 0 for size in shape):
+        raise _Damaged(f"member {name!r} claims shape {shape}, expected sizes from 0 up")
     body = content[file.tell() :]
     if math.prod(shape) * dtype.itemsize != len(body):
         raise _Damaged(f"member {name!r} claims shape {shape} of {dtype} but holds {len(body)} bytes")
@@ -179,6 +183,6 @@ def _value(value: object, where: str, members: Mapping[str, np.ndarray]) -> obje
         if not np.isfinite(array).all():
             raise _Damaged(f"{where} is not finite, expected finite values")
         return array
-    if isinstance(value, bool | int | str) or (isinstance(value, float) and math.isfinite(value)):
+    if isinstance(value, bool | int) or (isinstance(value, float) and math.isfinite(value)):
         return value
-    raise _Damaged(f"{where} is {type(value).__name__} {str(value)[:20]!r}, expected a finite number, a text or an array")
+    raise _Damaged(f"{where} is {type(value).__name__} {str(value)[:20]!r}, expected a finite number or an array")
