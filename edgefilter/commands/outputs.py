@@ -60,6 +60,11 @@ def check_outputs(args: argparse.Namespace) -> None:
     Files are compared by what they are, not by how they are written: `..`, symbolic and hard links are seen through. Raises UsageError
     for that, and for '-' where standard output cannot be meant; EdgefilterError where a result could not be written in the end.
     """
+    for option in (*READ, *WRITTEN, "save_input"):
+        given = getattr(args, option, None)
+        for path in given if isinstance(given, list) else [given]:
+            if path is not None and (not path or "\0" in path):
+                raise UsageError(f"--{option.replace('_', '-')} is {path!r}, which names no file: give a name or leave the option out")
     read, written = list(_read(args)), list(_written(args))
     for number, output in enumerate(written):
         if output.path == "-" and output.stream is None:
@@ -75,6 +80,9 @@ def check_outputs(args: argparse.Namespace) -> None:
     for output in written:
         if output.at_end:
             _check_writable(output)
+    for command, option in FOLDERS:
+        if command == args.command and getattr(args, option) is not None:
+            _check_folder(f"--{option.replace('_', '-')}", getattr(args, option))
 
 
 def _read(args: argparse.Namespace) -> Iterator[Place]:
@@ -128,3 +136,14 @@ def _check_writable(place: Place) -> None:
     else:
         return
     raise EdgefilterError(f"{place} cannot be written: {os.strerror(why)}; name a file in a folder that exists and can be written to")
+
+
+def _check_folder(role: str, path: str) -> None:
+    """Raise EdgefilterError where a folder neither is nor can be made, before other outputs are begun."""
+    above = os.path.realpath(path)
+    while not os.path.lexists(above):
+        above = os.path.dirname(above)
+    if not os.path.isdir(above):
+        raise EdgefilterError(f"{role} {path} cannot be made: {above} is no folder; name another")
+    if not os.access(above, os.W_OK):
+        raise EdgefilterError(f"{role} {path} cannot be made or written: {os.strerror(errno.EACCES)}; name another")

@@ -47,7 +47,7 @@ def diagnosis_page(profile: Profile, found: Diagnosis, recording: Samples, refer
 def write_page(path: str | Path, page: str) -> None:
     """Write the page; raises EdgefilterError where it cannot be written."""
     try:
-        Path(path).write_text(page, encoding="utf-8")
+        Path(path).write_text(page, encoding="utf-8", errors="backslashreplace")
     except OSError as error:
         raise EdgefilterError(f"{path}: the report cannot be written ({error.strerror}); name a .html file in a folder that exists") from None
 
