@@ -60,7 +60,7 @@ def _add_run(commands: argparse._SubParsersAction) -> None:
     run.add_argument("--reference", metavar="FILE|DEVICE", help="what the robot says; live it defaults to the monitor of the default output")
     run.add_argument("--profile", metavar="P.npz", help="calibrated robot, made by 'edgefilter calibrate'")
     run.add_argument("--engine", default="auto", metavar="ENGINE", help=f"auto, {', '.join(ENGINES)} (default: %(default)s)")
-    run.add_argument("--model", metavar="FILE.onnx", help=f"network for engine {' or '.join(HAVE_MODEL)} in place of its own")
+    run.add_argument("--model", metavar="FILE.onnx", help=f"network for {' or '.join(HAVE_MODEL)} in place of its own")
     run.add_argument(
         "--budget-ms", type=_positive, metavar="B", help="compute per hop (p99) that auto may use, and that a live run keeps to (live default: 8)"
     )
@@ -89,7 +89,8 @@ def _add_calibrate(commands: argparse._SubParsersAction) -> None:
     calibrate.add_argument("--live", action="store_true", help="play the sweep on --speaker and record it on --input")
     calibrate.add_argument("--speaker", default="default", metavar="DEVICE", help="output device for --live (default: %(default)s)")
     calibrate.add_argument("--input", default="mic", metavar="DEVICE", help="input device for --live (default: %(default)s)")
-    calibrate.add_argument("--level-db", type=_level, default=-12.0, metavar="DB", help="peak of the played sweep, dB of full scale (default: %(default)s)")
+    peak = "peak of the played sweep, dB of full scale (default: %(default)s)"
+    calibrate.add_argument("--level-db", type=_level, default=-12.0, metavar="DB", help=peak)
     calibrate.add_argument("--save-input", metavar="DIR", help="with --live: also keep the recordings")
     calibrate.add_argument("--output", required=True, metavar="P.npz", help="profile to write")
     calibrate.add_argument("--json", metavar="FILE", help="write the result as JSON ('-': standard output)")
@@ -189,7 +190,7 @@ def _run(arguments: list[str]) -> int:
 
 
 def _forget_output() -> None:
-    """Where standard output takes nothing any more, let what is left go nowhere, since Python tries once more at exit."""
+    """Where standard output takes nothing any more, let what is left go nowhere: Python tries once more at exit."""
     try:
         sys.stdout.flush()
     except OSError:

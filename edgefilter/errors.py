@@ -34,4 +34,4 @@ class SignalError(EdgefilterError):
 
 
 class ModelError(EdgefilterError):
-    """A network's model file is missing, damaged, or not the one that the engine needs, or the library that runs it cannot be loaded."""
+    """A network's model file is missing, damaged or not the one that the engine needs, or what runs it is broken."""

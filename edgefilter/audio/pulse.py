@@ -11,7 +11,7 @@ from contextlib import contextmanager
 STAND_INS = ("pulse", "default", "pipewire")
 """PortAudio devices that lead to the sound server, the most direct first."""
 OPENING = threading.RLock()
-"""Held while a stream is opened: what that changes belongs to the whole process, so that two at once would undo each other's."""
+"""Held while a stream is opened: what that changes is the whole process's, and two at once would undo each other's."""
 
 
 def sources() -> list[str]:
@@ -29,8 +29,9 @@ def default_monitor() -> str | None:
 def reading_from(source: str) -> Iterator[None]:
     """While a stream is opened: let the stand-in lead to this source; '' changes nothing.
 
-    PortAudio opens the devices of its list and takes no name of the server's. The environment is all that libpulse reads beside
-    that, once, when the stream connects (pulseaudio(1), PULSE_SOURCE); so the variable is set for that moment, for one stream at a time.
+    PortAudio opens the devices of its list and takes no name of the server's. The environment is all that libpulse
+    reads beside that, once, when the stream connects (pulseaudio(1), PULSE_SOURCE); so the variable is set for that
+    moment, for one stream at a time.
     """
     if not source:
         yield

@@ -27,7 +27,7 @@ class Reader:
 
     role: how messages name the file ("recording"). The file is read once at opening, so that a damaged one is refused
     before anything is made from it. total: round(n * 16000 / rate) samples. silent: every sample is zero.
-    Raises AudioFileError for a file that is missing, empty, truncated, not audio, or holds NaN, infinity or what no recording holds.
+    Raises AudioFileError for a file that is missing, empty, truncated, not audio, or holds what no recording does.
     """
 
     def __init__(self, path: str | Path, role: str = "recording") -> None:
@@ -126,7 +126,8 @@ class Reader:
                 where = f"at sample {length + at} ({(length + at) / self.rate:.3f} s)" + (f" of channel {channel + 1}" if self.channels > 1 else "")
                 raise self._error(f"holds {data[at, channel]} {where}, expected finite samples: repair or cut it")
             if np.abs(data).max() > _LOUDEST:
-                raise self._error(f"holds {data.flat[np.abs(data).argmax()]:g}, expected samples of a full scale of 1: its header or its scaling is wrong")
+                loudest = data.flat[np.abs(data).argmax()]
+                raise self._error(f"holds {loudest:g}, expected samples of a full scale of 1: its scaling is wrong")
             self.silent = self.silent and not data.any()
             length += len(data)
         if length == 0:

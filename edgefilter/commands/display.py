@@ -74,11 +74,12 @@ def _bar_of(level_db: float, width: int = 10) -> str:
 
 
 def report_part(name: str) -> ModuleType:
-    """The module edgefilter.report.NAME; raises UsageError, one line about what to install, where a package that it draws with is missing."""
+    """The module edgefilter.report.NAME; raises UsageError, which says what to install, where a package is missing."""
     try:
         return importlib.import_module(f"edgefilter.report.{name}")
     except ModuleNotFoundError as error:
-        raise UsageError(f"pictures and reports need {error.name}, which is not installed: pip install 'edgefilter[report]'") from None
+        remedy = "pip install 'edgefilter[report]'"
+        raise UsageError(f"pictures and reports need {error.name}, which is not installed: {remedy}") from None
 
 
 def write_json(data: object, path: str) -> None:

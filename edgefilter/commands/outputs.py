@@ -1,4 +1,4 @@
-"""What each command reads and writes, and the one check that nothing is both, or written twice, or written where nothing can be."""
+"""What each command reads and writes, and the check that nothing is both, written twice, or impossible to write."""
 
 from __future__ import annotations
 
@@ -13,7 +13,17 @@ from pathlib import Path
 
 from edgefilter.errors import EdgefilterError, UsageError
 
-READ = ("input", "reference", "profile", "model", "recording", "effects", "sweep_reference", "sweep_recording", "noise_recording")
+READ = (
+    "input",
+    "reference",
+    "profile",
+    "model",
+    "recording",
+    "effects",
+    "sweep_reference",
+    "sweep_recording",
+    "noise_recording",
+)
 """Options that may name a file to read; a name that is no file, such as a device's, cannot be overwritten."""
 WRITTEN = ("output", "json", "report", "save_profile", "plot")
 """Options that may name a file to write."""
@@ -42,7 +52,7 @@ class Place:
         return f"{self.role} {self.path}"
 
     def status(self) -> os.stat_result | None:
-        """Of a file that exists and can be destroyed by writing; None for one that does not exist, for a pipe, a terminal, a device."""
+        """Of a file that writing can destroy; None where there is none, for a pipe, a terminal, a device."""
         try:
             found = os.stat(self.path) if self.stream is None else os.fstat(self.stream)
         except OSError:
@@ -55,16 +65,19 @@ class Place:
 
 
 def check_outputs(args: argparse.Namespace) -> None:
-    """Refuse the arguments, before anything is touched, where a file that would be written is also read or written twice.
+    """Refuse the arguments, before anything is touched, where a file to be written is also read, or written twice.
 
-    Files are compared by what they are, not by how they are written: `..`, symbolic and hard links are seen through. Raises UsageError
-    for that, and for '-' where standard output cannot be meant; EdgefilterError where a result could not be written in the end.
+    Files are compared by what they are, not by how they are written: `..`, symbolic and hard links are seen through.
+    Raises UsageError for that, and for '-' where standard output cannot be meant; EdgefilterError where a result could
+    not be written in the end.
     """
     for option in (*READ, *WRITTEN, "save_input"):
         given = getattr(args, option, None)
         for path in given if isinstance(given, list) else [given]:
             if path is not None and (not path or "\0" in path):
-                raise UsageError(f"--{option.replace('_', '-')} is {path!r}, which names no file: give a name or leave the option out")
+                raise UsageError(
+                    f"--{option.replace('_', '-')} is {path!r}, which names no file: give one or leave the option out"
+                )
     read, written = list(_read(args)), list(_written(args))
     for number, output in enumerate(written):
         if output.path == "-" and output.stream is None:
@@ -75,8 +88,12 @@ def check_outputs(args: argparse.Namespace) -> None:
         for other in written[:number]:
             if output.stream is not None and other.stream is not None:
                 raise UsageError(f"{output} and {other} would mix on standard output: send one of them to a file")
-            if _same(output, other) or (output.stream is other.stream is None and not _device(output) and output.name() == other.name()):
-                raise UsageError(f"{output} and {other} are the same file and one would overwrite the other: choose another file")
+            if _same(output, other) or (
+                output.stream is other.stream is None and not _device(output) and output.name() == other.name()
+            ):
+                raise UsageError(
+                    f"{output} and {other} are the same file and one would overwrite the other: choose another file"
+                )
     for output in written:
         if output.at_end:
             _check_writable(output)
@@ -86,7 +103,7 @@ def check_outputs(args: argparse.Namespace) -> None:
 
 
 def _read(args: argparse.Namespace) -> Iterator[Place]:
-    """Every file that the command may read: those that options name, those that the environment names, and the package's own."""
+    """Every file that the command may read: those that options and the environment name, and the package's own."""
     for option in READ:
         given = getattr(args, option, None)
         for path in given if isinstance(given, list) else [given]:
@@ -125,7 +142,7 @@ def _device(place: Place) -> bool:
 
 
 def _check_writable(place: Place) -> None:
-    """Raise EdgefilterError where writing is bound to fail, so that it is said before minutes of work and not after them."""
+    """Raise EdgefilterError where writing is bound to fail, so that it is said before minutes of work, not after."""
     folder = os.path.dirname(os.path.realpath(place.path))
     if os.path.isdir(place.path):
         why = errno.EISDIR
@@ -135,7 +152,9 @@ def _check_writable(place: Place) -> None:
         why = errno.EACCES
     else:
         return
-    raise EdgefilterError(f"{place} cannot be written: {os.strerror(why)}; name a file in a folder that exists and can be written to")
+    raise EdgefilterError(
+        f"{place} cannot be written: {os.strerror(why)}; name a file in a folder that exists and can be written to"
+    )
 
 
 def _check_folder(role: str, path: str) -> None:

@@ -33,7 +33,9 @@ def main(args: argparse.Namespace) -> int:
     if ego.waits_for_end and source.live:
         raise UsageError(f"engine {ego.engine_name} needs the whole recording before it answers: give --input FILE or take another engine")
     if args.save_profile and not ego.can_adapt:
-        raise UsageError(f"--save-profile writes back an adapted path: give --profile and an engine with a linear stage ({', '.join(HAVE_LINEAR_STAGE)})")
+        names = ", ".join(HAVE_LINEAR_STAGE)
+        needed = f"give --profile and an engine with a linear stage ({names})"
+        raise UsageError(f"--save-profile writes back an adapted path: {needed}")
     sink = make_sink(args.output, ego.latency, wait=not source.live)
     limit = None if args.seconds is None else round(args.seconds * SAMPLE_RATE)
     for note in source.notes:

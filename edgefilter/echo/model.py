@@ -61,10 +61,10 @@ class EchoModel:
         return response[: max(self.impulse_response.size, int(heard[-1]) + 1 if heard.size else 0)]
 
     def with_running_response(self, response: Samples, gain: float = 1.0) -> EchoModel:
-        """The model whose running_response() begins with response (taps,) and goes on, behind it, as that of this model times gain.
+        """The model whose running_response() begins with response (taps,) and goes on as that of this one times gain.
 
-        The path effects have been applied to both parts and cannot be taken out again (a band limit has no inverse); they are in the
-        impulse response now, and listing them would apply them twice.
+        The path effects have been applied to both parts and cannot be taken out again (a band limit has no inverse);
+        they are in the impulse response now, and listing them would apply them twice.
         """
         rest = self.running_response()[response.size :] * np.float32(gain)
         kept = tuple(entry for entry in self.effects if find(entry[0]).stage != "path")

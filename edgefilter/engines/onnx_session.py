@@ -16,7 +16,7 @@ from edgefilter.types import SAMPLE_RATE
 
 try:
     import onnxruntime
-except Exception as error:  # a broken installation raises whatever its binary part does: ImportError, OSError, AttributeError
+except Exception as error:  # a broken installation raises what its binary part does: ImportError, OSError
     said = " ".join(f"{type(error).__name__}: {error}".split())[:160]
     raise ModelError(f"onnxruntime cannot be loaded ({said}): pip install --force-reinstall onnxruntime") from None
 

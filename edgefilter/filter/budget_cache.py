@@ -49,10 +49,13 @@ def processor() -> str:
     return names[0] if names else platform.processor()
 
 
-def recall(about: Mapping[str, object], kinds: Mapping[str, type], say: Callable[[str], None] = lambda text: None) -> dict[str, dict]:
+def recall(
+    about: Mapping[str, object], kinds: Mapping[str, type], say: Callable[[str], None] = lambda text: None
+) -> dict[str, dict]:
     """Engine -> figures as kept by `keep` for exactly this description.
 
-    kinds: name and type of every figure. An engine whose figures are others is left out, and a damaged file holds nothing; say is told why.
+    kinds: name and type of every figure. An engine whose figures are others is left out, and a damaged file holds
+    nothing; say is told why.
     """
     everything, trouble = _read()
     kept = everything.get(_key(about), {})
@@ -101,7 +104,9 @@ def _read() -> tuple[dict, str]:
         return {}, f"it cannot be read ({error.strerror})"
     except (ValueError, RecursionError):
         return {}, "it is not JSON"
-    return (found, "") if isinstance(found, dict) else ({}, f"it holds a JSON {type(found).__name__}, expected an object")
+    if not isinstance(found, dict):
+        return {}, f"it holds a JSON {type(found).__name__}, expected an object"
+    return found, ""
 
 
 def _unlike(figures: object, kinds: Mapping[str, type]) -> str:

@@ -138,7 +138,7 @@ class EgoFilter:
     def adapted_profile(self) -> Profile:
         """The profile with the echo path as the linear stage has adapted it; raises SignalError where there is none.
 
-        What of the path is longer than the linear stage is the profile's own, as loud as the volume was turned meanwhile.
+        What of the path is longer than the linear stage is the profile's own, as loud as the volume was turned.
         """
         if not self.can_adapt:
             names = ", ".join(engines.HAVE_LINEAR_STAGE)

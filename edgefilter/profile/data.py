@@ -103,7 +103,8 @@ class Profile:
             warnings = header.pop("warnings")
             if not isinstance(warnings, list):
                 raise ProfileError(f"warnings is a JSON {type(warnings).__name__}, expected a list of texts; {REMEDY}")
-            profile = cls(echo=EchoModel(arrays.pop("impulse_response"), effects), warnings=tuple(warnings), **arrays, **header)
+            echo = EchoModel(arrays.pop("impulse_response"), effects)
+            profile = cls(echo=echo, warnings=tuple(warnings), **arrays, **header)
             _check_effects(profile.echo)
             return profile
         except ProfileError as error:
@@ -163,17 +164,19 @@ def _check_effects(echo: EchoModel) -> None:
     probe[::40] = 0.1
     for name, values in echo.effects:
         if name not in known_effects():
-            raise ProfileError(f"holds the effect '{name[:40]}', which does not come with edgefilter; load its file (--effects FILE.py)")
+            remedy = "load its file (--effects FILE.py)"
+            raise ProfileError(f"holds the effect '{name[:40]}', which does not come with edgefilter; {remedy}")
         try:
             complete(find(name), values)
             alone = EchoModel(echo.impulse_response, ((name, values),))
             with np.errstate(all="ignore"):
-                made = [alone.predict(probe), alone.running_response(), *(part for pair in alone.unpredictable(probe) for part in pair)]
+                added = [part for pair in alone.unpredictable(probe) for part in pair]
+                made = [alone.predict(probe), alone.running_response(), *added]
         except Exception as error:  # whatever arrays of wrong shapes do to an effect's arithmetic
             told = " ".join(str(error).split())[:160]
             raise ProfileError(f"the values of its effect {name} cannot be used ({told}); {REMEDY}") from None
         if not all(np.isfinite(part).all() for part in made):
-            raise ProfileError(f"the values of its effect {name} cannot be used (what they make is not finite); {REMEDY}")
+            raise ProfileError(f"the values of its effect {name} cannot be used (the result is not finite); {REMEDY}")
 
 
 def _check_numbers(profile: Profile) -> None:

@@ -41,7 +41,8 @@ def write_fields(path: Path, arrays: Mapping[str, np.ndarray], header: Mapping[s
             elif isinstance(value, bool | int | float | np.generic | np.ndarray):
                 entry["values"][key] = value.item() if isinstance(value, np.generic | np.ndarray) else value
             else:
-                raise ProfileError(f"the profile cannot be stored: effects[{i}].{key} is {type(value).__name__}, expected a number or an array")
+                found = f"effects[{i}].{key} is {type(value).__name__}"
+                raise ProfileError(f"the profile cannot be stored: {found}, expected a number or an array")
         listed.append(entry)
     try:
         text = json.dumps({**header, "effects": listed}, allow_nan=False)
@@ -65,7 +66,8 @@ def _replace(path: Path, members: Mapping[str, np.ndarray]) -> None:
         raise ProfileError(f"{path}: not a file that can be replaced; name a .npz file for the profile")
     temporary = path.with_name(f".{path.name[:32]}.{secrets.token_hex(8)}")
     try:
-        with open(temporary, "xb") as file:  # not tempfile: its files are the owner's alone, and the umask can only be read by changing it
+        # not tempfile: its files are the owner's alone, and the umask that others have can only be read by changing it
+        with open(temporary, "xb") as file:
             np.savez_compressed(file, allow_pickle=False, **members)
             file.flush()
             os.fsync(file.fileno())
@@ -127,7 +129,7 @@ def _array(content: bytes, name: str) -> np.ndarray:
         if version != (1, 0):
             raise _Damaged(f"member {name!r} is in .npy format {version}, expected (1, 0)")
         shape, fortran, dtype = np.lib.format.read_array_header_1_0(file)
-    except Exception as error:  # numpy's parser lets whatever Python's own raises through: TokenError, RecursionError, TypeError
+    except Exception as error:  # numpy lets through what Python's own parser raises: TokenError, RecursionError
         raise _Damaged(f"member {name!r} is no .npy array ({' '.join(str(error).split())[:80]})") from None
     if dtype.hasobject or dtype.kind not in "fiub":
         raise _Damaged(f"member {name!r} holds {dtype} (pickled objects or text), expected numbers")

@@ -20,6 +20,7 @@ from edgefilter.report.variants import MAX_FREE, Choice, compare_variants
 from edgefilter.report.words import decibels, headline, interval_text, sentence, title
 from edgefilter.types import SAMPLE_RATE, Samples
 
+ROLES = ("profile", "recording", "reference")
 LOUDER = 10.0
 """How much louder than the recording the residual is stored; the page turns it down to its true level, or not (20 dB)."""
 
@@ -63,7 +64,7 @@ def _page(
     scale = colour_scale(before.recording)
     fields = {
         **text,
-        **{role: Path(str(names[role] or "none: the recording itself")).name for role in ("profile", "recording", "reference")},
+        **{role: Path(str(names[role] or "none: the recording itself")).name for role in ROLES},
         "facts": _facts(before, after if steps else None, irreducible_db),
         "switches": [title(finding.effect) for finding in steps],
         "notes": _notes(before),
@@ -82,7 +83,7 @@ def _page(
 
 
 def _template() -> jinja2.Template:
-    """page.html; whatever is put into it is text, escaped unless the page itself calls it safe, and all of it has to be there."""
+    """page.html; what is put into it is text, escaped unless the page calls it safe, and all of it has to be there."""
     page = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined, keep_trailing_newline=True)
     page.policies["json.dumps_kwargs"] = {"allow_nan": False, "separators": (",", ":")}
     return page.from_string(_asset("page.html"))

@@ -54,4 +54,6 @@ def test_two_streams_opened_at_once_do_not_silence_standard_error_for_good():
         "one.start(); two.start(); one.join(); two.join()\n"
         "os.write(2, b'still heard')"
     )
-    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stderr == "still heard"
+    assert (
+        subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stderr == "still heard"
+    )

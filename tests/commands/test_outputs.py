@@ -60,11 +60,34 @@ def run(heard, *more):
 
 
 def test_save_input_over_the_recording_that_is_being_filtered_does_not_destroy_it(heard, capsys):
-    refused(heard, capsys, run(heard, "--output", "out.wav", "--save-input", heard), "--save-input", "mic.wav", "overwritten")
-    refused(heard, capsys, run(heard, "--output", "out.wav", "--save-input", "../heard"), "--save-input", "mic.wav", "overwritten")
+    refused(
+        heard,
+        capsys,
+        run(heard, "--output", "out.wav", "--save-input", heard),
+        "--save-input",
+        "mic.wav",
+        "overwritten",
+    )
+    refused(
+        heard,
+        capsys,
+        run(heard, "--output", "out.wav", "--save-input", "../heard"),
+        "--save-input",
+        "mic.wav",
+        "overwritten",
+    )
 
 
-@pytest.mark.parametrize("typed", ["../heard/mic.wav", "../heard/../heard/mic.wav", "../heard/soft.wav", "../heard/hard.json", "../heard/inside/mic.wav"])
+@pytest.mark.parametrize(
+    "typed",
+    [
+        "../heard/mic.wav",
+        "../heard/../heard/mic.wav",
+        "../heard/soft.wav",
+        "../heard/hard.json",
+        "../heard/inside/mic.wav",
+    ],
+)
 @pytest.mark.parametrize("option", ["--json", "--output", "--save-profile"])
 def test_an_input_is_recognised_however_its_path_is_typed(heard, capsys, typed, option):
     rest = [] if option == "--output" else ["--output", "out.wav"]
@@ -100,7 +123,9 @@ def every_pair():
 @pytest.mark.parametrize(("command", "given", "option", "file"), list(every_pair()))
 def test_no_command_writes_over_what_it_reads(heard, capsys, command, given, option, file):
     words = [*command, *(heard / word if "." in word else word for word in given), option, heard / file]
-    needed = ["--output", "x.wav"] if option != "--output" and command[0] in ("run", "add", "remove", "calibrate") else []
+    needed = (
+        ["--output", "x.wav"] if option != "--output" and command[0] in ("run", "add", "remove", "calibrate") else []
+    )
     refused(heard, capsys, [*words, *needed], option, "also an input", file)
 
 
@@ -113,7 +138,13 @@ def test_the_demo_does_not_write_over_its_own_recording(heard, capsys):
 
 def test_a_model_that_the_environment_names_is_not_written_over(heard, capsys, monkeypatch):
     monkeypatch.setenv("EDGEFILTER_CRNN", str(heard / "robot.npz"))
-    refused(heard, capsys, run(heard, "--output", "o.wav", "--json", heard / "robot.npz"), "also an input", "EDGEFILTER_CRNN")
+    refused(
+        heard,
+        capsys,
+        run(heard, "--output", "o.wav", "--json", heard / "robot.npz"),
+        "also an input",
+        "EDGEFILTER_CRNN",
+    )
 
 
 @pytest.mark.parametrize(
@@ -122,9 +153,25 @@ def test_a_model_that_the_environment_names_is_not_written_over(heard, capsys, m
         (["run", "--input", "mic.wav", "--output", "o.wav", "--json", "./o.wav"], ("--json", "--output")),
         (["run", "--input", "mic.wav", "--output", "new/mic.wav", "--save-input", "new"], ("--save-input", "--output")),
         (["run", "--input", "mic.wav", "--output", "o.wav", "--json", "O.WAV"], ("--json", "--output")),
-        (["compare", "--recording", "mic.wav", "--reference", "reference.wav", "--json", "r", "--report", "../heard/r"], ("--report", "--json")),
+        (
+            [
+                "compare",
+                "--recording",
+                "mic.wav",
+                "--reference",
+                "reference.wav",
+                "--json",
+                "r",
+                "--report",
+                "../heard/r",
+            ],
+            ("--report", "--json"),
+        ),
         (["demo", "--output", "d", "--json", "d/filtered.wav"], ("--json", "--output")),
-        (["calibrate", "--live", "--output", "s/sweep_recording.wav", "--save-input", "s"], ("--save-input", "--output")),
+        (
+            ["calibrate", "--live", "--output", "s/sweep_recording.wav", "--save-input", "s"],
+            ("--save-input", "--output"),
+        ),
     ],
 )
 def test_two_outputs_that_are_one_file_are_refused(heard, capsys, monkeypatch, words, parts):
@@ -134,7 +181,9 @@ def test_two_outputs_that_are_one_file_are_refused(heard, capsys, monkeypatch, w
 
 def test_standard_input_and_output_are_seen_through(heard):
     def program(*words, **streams):
-        return subprocess.run([sys.executable, "-m", "edgefilter.cli", *map(str, words)], stderr=subprocess.PIPE, text=True, **streams)
+        return subprocess.run(
+            [sys.executable, "-m", "edgefilter.cli", *map(str, words)], stderr=subprocess.PIPE, text=True, **streams
+        )
 
     before = content(heard)
     with open(heard / "mic.wav", "rb") as file:
@@ -150,11 +199,24 @@ def test_standard_input_and_output_are_seen_through(heard):
 
 def test_devices_and_streams_that_writing_cannot_destroy_are_allowed_twice(heard):
     assert main([str(word) for word in run(heard, "--output", "o.wav", "--json", "/dev/null", "--quiet")]) == 0
-    words = ["compare", "--recording", heard / "none.wav", "--reference", "/dev/null", "--json", "/dev/null", "--report", "/dev/null"]
+    words = [
+        "compare",
+        "--recording",
+        heard / "none.wav",
+        "--reference",
+        "/dev/null",
+        "--json",
+        "/dev/null",
+        "--report",
+        "/dev/null",
+    ]
     assert main([str(word) for word in words]) == 1  # for the recording that is not there, not for the devices
 
 
-@pytest.mark.parametrize(("path", "why"), [("no/x", "No such file"), ("../heard", "Is a directory"), ("../heard/own.py/x", "Not a directory")])
+@pytest.mark.parametrize(
+    ("path", "why"),
+    [("no/x", "No such file"), ("../heard", "Is a directory"), ("../heard/own.py/x", "Not a directory")],
+)
 @pytest.mark.parametrize("option", ["--json", "--save-profile"])
 def test_a_result_that_could_not_be_written_in_the_end_is_said_before_the_work(heard, capsys, option, path, why):
     words = [str(word) for word in run(heard, "--output", "o.wav", option, path)]
@@ -166,8 +228,16 @@ def test_a_result_that_could_not_be_written_in_the_end_is_said_before_the_work(h
 
 
 def test_a_dash_where_no_stream_is_meant_is_refused(heard, capsys):
-    refused(heard, capsys, run(heard, "--output", "o.wav", "--save-profile", "-"), "--save-profile -", "standard output")
-    refused(heard, capsys, ["remove", "rattle", "--profile", heard / "robot.npz", "--output", "-"], "--output -", "standard output")
+    refused(
+        heard, capsys, run(heard, "--output", "o.wav", "--save-profile", "-"), "--save-profile -", "standard output"
+    )
+    refused(
+        heard,
+        capsys,
+        ["remove", "rattle", "--profile", heard / "robot.npz", "--output", "-"],
+        "--output -",
+        "standard output",
+    )
 
 
 def test_every_option_of_every_command_is_known_to_the_check():

@@ -7,8 +7,8 @@ import sys
 import pytest
 import soundfile
 
-from edgefilter.report.html import comparison_page
 from edgefilter.diagnosis.compare import compare
+from edgefilter.report.html import comparison_page
 from tests.diagnosis.robot_scene import profile, record, voice
 
 
@@ -55,7 +55,12 @@ def test_names_of_files_and_effects_are_text_in_the_page_and_never_markup():
     x = voice(3.0)
     found = compare(profile(), record(x), x)
     page = comparison_page(found, {"profile": "<b>bold.npz", "recording": "a&b\"'.wav", "reference": "{{ 7 * 7 }}.wav"})
-    assert "<b>bold" not in page and "&lt;b&gt;bold.npz" in page and "a&amp;b&#34;&#39;.wav" in page and "{{ 7 * 7 }}.wav" in page
+    assert (
+        "<b>bold" not in page
+        and "&lt;b&gt;bold.npz" in page
+        and "a&amp;b&#34;&#39;.wav" in page
+        and "{{ 7 * 7 }}.wav" in page
+    )
     data = page.split('id="data">')[1].split("</script>")[0]
     assert "<" not in data and json.loads(data)["variants"][""]["excess_db"] == round(found.excess_db, 3)
 

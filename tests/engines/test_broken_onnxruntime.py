@@ -35,7 +35,10 @@ def program(request, tmp_path):
 def test_auto_steps_down_to_ss_and_says_why(program):
     done = program()
     assert done.returncode == 0, done.stderr
-    assert "engine ss (auto" in done.stderr and f"crnn cannot be used: onnxruntime cannot be loaded ({program.error}" in done.stderr
+    assert (
+        "engine ss (auto" in done.stderr
+        and f"crnn cannot be used: onnxruntime cannot be loaded ({program.error}" in done.stderr
+    )
 
 
 def test_the_network_asked_for_by_name_is_one_line(program):

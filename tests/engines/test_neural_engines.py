@@ -156,7 +156,8 @@ def test_the_packages_int8_file_is_of_the_same_training_as_the_exact_one():
 def test_the_exact_network_filters_the_demo_as_the_int8_one_does():
     """Both files are run: each brings the human out, and what int8 weights change is far under the answer."""
     mic, ref, human = (soundfile.read(DEMO / f"{name}.flac", dtype="float32")[0] for name in ("mic", "reference", "human"))
-    exact, small = (enhance(mic, ref, DEMO / "profile.npz", "crnn", model) for model in (ROOT / "models/crnn.onnx", ROOT / "models/crnn_int8.onnx"))
+    models = (ROOT / "models/crnn.onnx", ROOT / "models/crnn_int8.onnx")
+    exact, small = (enhance(mic, ref, DEMO / "profile.npz", "crnn", model) for model in models)
     speaking = np.flatnonzero(human)
     span = slice(speaking[0], speaking[-1] + 1)
     for out in (exact, small):

@@ -112,7 +112,10 @@ def counted_by_hand(config):
     return {"parameters": weights + biases + norms + linear + gru, "macs_per_frame": macs + linear + gru}
 
 
-@pytest.mark.parametrize("config", [EdgeConfig(), SMALL, EdgeConfig(channels=(8, 16, 24, 40), hidden=96, layers=1)], ids=["default", "small", "other"])
+OTHER = EdgeConfig(channels=(8, 16, 24, 40), hidden=96, layers=1)
+
+
+@pytest.mark.parametrize("config", [EdgeConfig(), SMALL, OTHER], ids=["default", "small", "other"])
 def test_counts_are_those_of_the_layers_sizes(config):
     assert count(EdgeCrnn(config)) == counted_by_hand(config)
 

@@ -121,14 +121,18 @@ def test_another_model_file_is_measured_again(measured, monkeypatch, tmp_path):
     assert not choose(8.0, candidates=LADDER).remembered and choose(8.0, candidates=LADDER).remembered
 
 
-@pytest.mark.parametrize(("text", "why"), [("", "not JSON"), ("{", "not JSON"), ("[]", "JSON list"), ("{}", None), ('{"x": 3}', None), ("[" * 9999, "not JSON")])
+@pytest.mark.parametrize(
+    ("text", "why"),
+    [("", "not JSON"), ("{", "not JSON"), ("[]", "JSON list"), ("{}", None), ('{"x": 3}', None), ("[" * 9999, "not JSON")],
+)
 def test_a_damaged_cache_is_measured_again(measured, cache, text, why):
     cache.mkdir(parents=True)
     (cache / budget_cache.FILE).write_text(text)
     said = []
     assert choose(8.0, candidates=LADDER, say=said.append).engine == "ss" and choose(8.0, candidates=LADDER).remembered
     told = [line for line in said if "are not used" in line]
-    assert len(told) == (why is not None) and all(why in line and str(cache / budget_cache.FILE) in line for line in told)
+    assert len(told) == (why is not None)
+    assert all(why in line and str(cache / budget_cache.FILE) in line for line in told)
 
 
 def test_an_old_layout_in_the_cache_is_measured_again(measured, cache):

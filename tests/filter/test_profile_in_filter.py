@@ -69,7 +69,8 @@ def long_robot(taps=16_000, effects=(), decay=16_000):
 def room(taps=12_000):
     """A late_reverb as it is fitted."""
     rng = np.random.default_rng(4)
-    return "late_reverb", {"rt60_s": 0.8, "level_db": -10.0, "taps": 0.01 * rng.standard_normal(taps) * np.exp(-np.arange(taps) / 3000)}
+    decay = 0.01 * np.exp(-np.arange(taps) / 3000)
+    return "late_reverb", {"rt60_s": 0.8, "level_db": -10.0, "taps": decay * rng.standard_normal(taps)}
 
 
 def test_the_path_behind_the_linear_stage_is_not_cut_off_where_it_is_written_back(reference, tmp_path):
