@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import argparse
 import importlib
+import os
 import sys
 
 from edgefilter import __version__
+from edgefilter.commands.outputs import check_outputs
 from edgefilter.echo.user_effects import load_effect
-from edgefilter.engines import ENGINES
+from edgefilter.engines import ENGINES, HAVE_MODEL
 from edgefilter.errors import EdgefilterError, UsageError
 
 
@@ -58,7 +60,7 @@ def _add_run(commands: argparse._SubParsersAction) -> None:
     run.add_argument("--reference", metavar="FILE|DEVICE", help="what the robot says; live it defaults to the monitor of the default output")
     run.add_argument("--profile", metavar="P.npz", help="calibrated robot, made by 'edgefilter calibrate'")
     run.add_argument("--engine", default="auto", metavar="ENGINE", help=f"auto, {', '.join(ENGINES)} (default: %(default)s)")
-    run.add_argument("--model", metavar="FILE.onnx", help="network for engine crnn or paper-crnn in place of its own")
+    run.add_argument("--model", metavar="FILE.onnx", help=f"network for {' or '.join(HAVE_MODEL)} in place of its own")
     run.add_argument(
         "--budget-ms", type=_positive, metavar="B", help="compute per hop (p99) that auto may use, and that a live run keeps to (live default: 8)"
     )
@@ -87,7 +89,8 @@ def _add_calibrate(commands: argparse._SubParsersAction) -> None:
     calibrate.add_argument("--live", action="store_true", help="play the sweep on --speaker and record it on --input")
     calibrate.add_argument("--speaker", default="default", metavar="DEVICE", help="output device for --live (default: %(default)s)")
     calibrate.add_argument("--input", default="mic", metavar="DEVICE", help="input device for --live (default: %(default)s)")
-    calibrate.add_argument("--level-db", type=float, default=-12.0, metavar="DB", help="peak of the played sweep, dB of full scale (default: %(default)s)")
+    peak = "peak of the played sweep, dB of full scale (default: %(default)s)"
+    calibrate.add_argument("--level-db", type=_level, default=-12.0, metavar="DB", help=peak)
     calibrate.add_argument("--save-input", metavar="DIR", help="with --live: also keep the recordings")
     calibrate.add_argument("--output", required=True, metavar="P.npz", help="profile to write")
     calibrate.add_argument("--json", metavar="FILE", help="write the result as JSON ('-': standard output)")
@@ -135,9 +138,21 @@ def _add_profile(commands: argparse._SubParsersAction) -> None:
 
 
 def _positive(text: str) -> float:
-    value = float(text)
-    if not 0 < value < 1e6:
-        raise argparse.ArgumentTypeError(f"{text} is not a number above 0")
+    return _number(text, 0.0, 1e6, "a number above 0")
+
+
+def _level(text: str) -> float:
+    """Of a peak: at most full scale, and above what 16 bit can hold."""
+    return _number(text, -90.0, 0.0, "a level from -90 to 0 dB of full scale", closed=True)
+
+
+def _number(text: str, low: float, high: float, expected: str, closed: bool = False) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = float("nan")
+    if not (low <= value <= high if closed else low < value < high):
+        raise argparse.ArgumentTypeError(f"'{text}' is not {expected}")
     return value
 
 
@@ -145,22 +160,43 @@ def main(argv: list[str] | None = None) -> int:
     """Run one command; every expected failure is one line on standard error."""
     arguments = sys.argv[1:] if argv is None else argv
     debug = "--debug" in arguments
+    if hasattr(sys.stdout, "reconfigure"):  # a file name that the terminal's encoding lacks is no reason to stop
+        sys.stdout.reconfigure(errors="backslashreplace")
     try:
-        args = build_parser().parse_args(arguments)
-        for file in getattr(args, "effects", []):
-            load_effect(file)
-        return importlib.import_module(f"edgefilter.commands.{args.command}").main(args)
+        code = _run(arguments)
+        sys.stdout.flush()  # what is still buffered fails here, with a reason, or at exit, with a traceback
+        return code
     except UsageError as error:
         return _fail(error, 2, debug)
     except EdgefilterError as error:
         return _fail(error, 1, debug)
     except BrokenPipeError:
+        _forget_output()
         return 1
     except KeyboardInterrupt:
         print("edgefilter: interrupted", file=sys.stderr)
         return 130
     except OSError as error:
+        _forget_output()
         return _fail(f"{error.filename or 'system'}: {error.strerror or error}", 1, debug)
+
+
+def _run(arguments: list[str]) -> int:
+    args = build_parser().parse_args(arguments)
+    check_outputs(args)
+    for file in getattr(args, "effects", []):
+        load_effect(file)
+    return importlib.import_module(f"edgefilter.commands.{args.command}").main(args)
+
+
+def _forget_output() -> None:
+    """Where standard output takes nothing any more, let what is left go nowhere: Python tries once more at exit."""
+    try:
+        sys.stdout.flush()
+    except OSError:
+        nowhere = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(nowhere, sys.stdout.fileno())
+        os.close(nowhere)
 
 
 def _fail(error: object, code: int, debug: bool) -> int:

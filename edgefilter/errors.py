@@ -34,4 +34,4 @@ class SignalError(EdgefilterError):
 
 
 class ModelError(EdgefilterError):
-    """A network's model file is missing, damaged, or not the one that the engine needs."""
+    """A network's model file is missing, damaged or not the one that the engine needs, or what runs it is broken."""

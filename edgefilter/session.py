@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import resource
+import sys
 import time
 from collections import deque
 from collections.abc import Callable
@@ -16,6 +16,11 @@ from edgefilter.dsp.frames import decibels
 from edgefilter.errors import EdgefilterError
 from edgefilter.filter.ego_filter import EgoFilter
 from edgefilter.types import SAMPLE_RATE, Block, Event, Samples
+
+try:
+    import resource
+except ModuleNotFoundError:  # Windows has no such module
+    resource = None
 
 MOST_EVENTS = 1000
 """Events that a report keeps, the latest ones."""
@@ -58,12 +63,22 @@ class RunReport:
             "process_s": self.process_s,
             "wall_s": self.wall_s,
             "real_time_factor": self.process_s / seconds if seconds else None,
-            "peak_memory_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
+            "peak_memory_mb": peak_memory_mb(),
             "interrupted": self.interrupted,
             "failure": str(self.failure) if self.failure else None,
             "events": [{"kind": e.kind, "seconds": e.sample / SAMPLE_RATE, "detail": e.detail} for e in self.events],
             **self.filter,
         }
+
+
+def peak_memory_mb() -> float | None:
+    """The most memory that this process has had, in MiB; None on Windows, whose Python does not tell.
+
+    getrusage counts in kibibytes on Linux and in bytes on macOS (getrusage(2) of each).
+    """
+    if resource is None:
+        return None
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (2**20 if sys.platform == "darwin" else 2**10)
 
 
 def level_db(x: Samples) -> float:

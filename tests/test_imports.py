@@ -14,6 +14,7 @@ LEAVES = {
     "sounddevice": {"audio/device.py"},
     "onnxruntime": {"engines/onnx_session.py"},
     "matplotlib": {"report/plots.py"},
+    "jinja2": {"report/html.py"},
     "torch": set(),
     "export": set(),
 }

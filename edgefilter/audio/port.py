@@ -17,7 +17,7 @@ import soxr
 
 from edgefilter.audio.lookup import Device
 from edgefilter.audio.pairing import Inlet, Outlet
-from edgefilter.audio.pulse import reading_from
+from edgefilter.audio.pulse import OPENING, reading_from
 from edgefilter.errors import DeviceError
 from edgefilter.types import SAMPLE_RATE, Samples
 
@@ -33,16 +33,17 @@ STREAM_LATENCY_S = 0.05
 @contextmanager
 def _quiet() -> Iterator[None]:
     """Keep what the C libraries print about every attempt out of the terminal; their refusal comes back as an error code."""
-    sys.stderr.flush()
-    kept = os.dup(2)
-    sink = os.open(os.devnull, os.O_WRONLY)
-    os.dup2(sink, 2)
-    try:
-        yield
-    finally:
-        os.dup2(kept, 2)
-        os.close(kept)
-        os.close(sink)
+    with OPENING:
+        sys.stderr.flush()
+        kept = os.dup(2)
+        sink = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(sink, 2)
+        try:
+            yield
+        finally:
+            os.dup2(kept, 2)
+            os.close(kept)
+            os.close(sink)
 
 
 class Port:

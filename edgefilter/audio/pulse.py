@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import os
 import subprocess
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 
 STAND_INS = ("pulse", "default", "pipewire")
 """PortAudio devices that lead to the sound server, the most direct first."""
+OPENING = threading.RLock()
+"""Held while a stream is opened: what that changes is the whole process's, and two at once would undo each other's."""
 
 
 def sources() -> list[str]:
@@ -24,17 +27,25 @@ def default_monitor() -> str | None:
 
 @contextmanager
 def reading_from(source: str) -> Iterator[None]:
-    """While a stream is opened: let the stand-in lead to this source (libpulse reads PULSE_SOURCE then); '' changes nothing."""
-    before = os.environ.get("PULSE_SOURCE")
-    if source:
-        os.environ["PULSE_SOURCE"] = source
-    try:
+    """While a stream is opened: let the stand-in lead to this source; '' changes nothing.
+
+    PortAudio opens the devices of its list and takes no name of the server's. The environment is all that libpulse
+    reads beside that, once, when the stream connects (pulseaudio(1), PULSE_SOURCE); so the variable is set for that
+    moment, for one stream at a time.
+    """
+    if not source:
         yield
-    finally:
-        if source:
-            os.environ.pop("PULSE_SOURCE")
-        if before is not None:
-            os.environ["PULSE_SOURCE"] = before
+        return
+    with OPENING:
+        before = os.environ.get("PULSE_SOURCE")
+        os.environ["PULSE_SOURCE"] = source
+        try:
+            yield
+        finally:
+            if before is None:
+                os.environ.pop("PULSE_SOURCE", None)
+            else:
+                os.environ["PULSE_SOURCE"] = before
 
 
 def _pactl(*words: str) -> str:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import re
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -15,6 +17,8 @@ from edgefilter.types import SAMPLE_RATE, Array, Samples
 
 _RATES = range(1000, 768001)
 _ENDLESS = 0x7FFFF000  # writers to a pipe put sizes from here up into the header because they cannot know better
+_LOUDEST = 1e6
+"""No recording is 120 dB over full scale; squares of more do not fit into float32 for long."""
 _VALUES = 1 << 16  # samples times channels that are in memory at a time
 
 
@@ -23,7 +27,7 @@ class Reader:
 
     role: how messages name the file ("recording"). The file is read once at opening, so that a damaged one is refused
     before anything is made from it. total: round(n * 16000 / rate) samples. silent: every sample is zero.
-    Raises AudioFileError for a file that is missing, empty, truncated, not audio, or holds NaN or infinity.
+    Raises AudioFileError for a file that is missing, empty, truncated, not audio, or holds what no recording does.
     """
 
     def __init__(self, path: str | Path, role: str = "recording") -> None:
@@ -73,7 +77,8 @@ class Reader:
 
     def _open(self) -> soundfile.SoundFile:
         try:
-            return soundfile.SoundFile(self.path)
+            # as bytes: soundfile itself cannot encode a name that is no text
+            return soundfile.SoundFile(self.path if sys.platform == "win32" else os.fsencode(self.path))
         except TypeError:  # a name that ends in .raw: soundfile would have to be told rate and format
             raise self._error("has no header that says its rate; give raw s16le stereo (microphone, reference) on '-' instead") from None
         except soundfile.LibsndfileError as error:
@@ -120,6 +125,9 @@ class Reader:
                 at, channel = (int(i) for i in np.argwhere(~np.isfinite(data))[0])
                 where = f"at sample {length + at} ({(length + at) / self.rate:.3f} s)" + (f" of channel {channel + 1}" if self.channels > 1 else "")
                 raise self._error(f"holds {data[at, channel]} {where}, expected finite samples: repair or cut it")
+            if np.abs(data).max() > _LOUDEST:
+                loudest = data.flat[np.abs(data).argmax()]
+                raise self._error(f"holds {loudest:g}, expected samples of a full scale of 1: its scaling is wrong")
             self.silent = self.silent and not data.any()
             length += len(data)
         if length == 0:

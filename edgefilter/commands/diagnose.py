@@ -10,14 +10,14 @@ from dataclasses import replace
 
 from tqdm import tqdm
 
-from edgefilter.commands.display import write_json
+from edgefilter.commands.display import report_part, write_json
 from edgefilter.commands.material import load
 from edgefilter.diagnosis.diagnose import Diagnosis, diagnose
-from edgefilter.report.html import add_command, diagnosis_page, write_page
-from edgefilter.report.text import diagnosis_lines
+from edgefilter.report.text import add_command, diagnosis_lines
 
 
 def main(args: argparse.Namespace) -> int:
+    html = report_part("html") if args.report else None
     profile, recording, reference = load(args)
     with _bar() as progress:
         found = diagnose(profile, recording, reference, progress=progress)
@@ -27,8 +27,8 @@ def main(args: argparse.Namespace) -> int:
         write_json(found.to_dict(), args.json)
     if args.json != "-":
         print("\n".join([*diagnosis_lines(found, args.profile is not None), *_next_step(found, args)]))
-    if args.report:
-        write_page(args.report, diagnosis_page(profile, found, recording, reference, vars(args)))
+    if html:
+        html.write_page(args.report, html.diagnosis_page(profile, found, recording, reference, vars(args)))
         if args.json != "-":
             print(f"report      {args.report}")
     return 0

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+import importlib
 import json
 import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from types import ModuleType
 
 from tqdm import tqdm
 
 from edgefilter.audio.protocols import Source
-from edgefilter.errors import AudioFileError
+from edgefilter.errors import AudioFileError, UsageError
 from edgefilter.filter.ego_filter import EgoFilter
 from edgefilter.session import Progress
 from edgefilter.types import SAMPLE_RATE
@@ -69,6 +71,15 @@ def meter_line(progress: Progress) -> str:
 def _bar_of(level_db: float, width: int = 10) -> str:
     filled = round(width * min(max((level_db + 60) / 60, 0), 1))
     return "#" * filled + "." * (width - filled)
+
+
+def report_part(name: str) -> ModuleType:
+    """The module edgefilter.report.NAME; raises UsageError, which says what to install, where a package is missing."""
+    try:
+        return importlib.import_module(f"edgefilter.report.{name}")
+    except ModuleNotFoundError as error:
+        remedy = "pip install 'edgefilter[report]'"
+        raise UsageError(f"pictures and reports need {error.name}, which is not installed: {remedy}") from None
 
 
 def write_json(data: object, path: str) -> None:

@@ -4,21 +4,22 @@ from __future__ import annotations
 
 import argparse
 
-from edgefilter.commands.display import write_json
-from edgefilter.errors import UsageError
+from edgefilter.commands.display import report_part, write_json
 from edgefilter.profile.data import Profile
 from edgefilter.profile.text import describe
 
 
 def main(args: argparse.Namespace) -> int:
+    plots = report_part("plots") if args.plot else None
     profile = Profile.load(args.profile)
     if args.json:
         write_json(summary(profile), args.json)
     if args.json != "-":
         print(describe(profile))
-    if args.plot:
-        plotter()(profile, args.plot)
-        print(f"drawn to {args.plot}")
+    if plots:
+        plots.plot_profile(profile, args.plot)
+        if args.json != "-":
+            print(f"drawn to {args.plot}")
     return 0
 
 
@@ -38,12 +39,3 @@ def summary(profile: Profile) -> dict[str, object]:
         "created": profile.created,
         "source": profile.source,
     }
-
-
-def plotter():
-    """report.plots.plot_profile, or one line about what to install."""
-    try:
-        from edgefilter.report.plots import plot_profile
-    except ModuleNotFoundError as error:
-        raise UsageError(f"drawing needs {error.name}, which is not installed: pip install 'edgefilter[report]'") from None
-    return plot_profile

@@ -15,7 +15,8 @@ from edgefilter.audio.files import FileSink, Recorder, open_source
 from edgefilter.audio.protocols import Sink, Source
 from edgefilter.audio.raw import PcmSink
 from edgefilter.commands.display import describe_latency, display, write_json
-from edgefilter.errors import UsageError
+from edgefilter.engines import HAVE_LINEAR_STAGE
+from edgefilter.errors import EdgefilterError, UsageError
 from edgefilter.filter.budget import DEFAULT_MS, Choice, choose
 from edgefilter.filter.budget_cache import forget
 from edgefilter.filter.ego_filter import EgoFilter
@@ -27,13 +28,14 @@ FILE_ENDINGS = (".wav", ".flac", ".ogg", ".mp3", ".aiff", ".aif", ".w64", ".opus
 
 
 def main(args: argparse.Namespace) -> int:
-    _refuse_overwriting(args)
     source = make_source(args.input, args.reference, args.output)
     ego, choice = make_filter(args, source.live)
     if ego.waits_for_end and source.live:
         raise UsageError(f"engine {ego.engine_name} needs the whole recording before it answers: give --input FILE or take another engine")
     if args.save_profile and not ego.can_adapt:
-        raise UsageError("--save-profile writes back an adapted path: give --profile and an engine with a linear stage (linear or ss)")
+        names = ", ".join(HAVE_LINEAR_STAGE)
+        needed = f"give --profile and an engine with a linear stage ({names})"
+        raise UsageError(f"--save-profile writes back an adapted path: {needed}")
     sink = make_sink(args.output, ego.latency, wait=not source.live)
     limit = None if args.seconds is None else round(args.seconds * SAMPLE_RATE)
     for note in source.notes:
@@ -76,18 +78,30 @@ def finish(
         say(note)
     figures = report.to_dict() | {"choice": choice.to_dict() if choice else None}
     figures |= {"source": source.stats(), "sink": sink.stats(), "notes": [*source.notes, *sink.notes]}
-    if args.json:
-        write_json(figures, args.json)
-    if args.save_profile:
-        ego.adapted_profile().save(args.save_profile)
-    if report.failure:
-        raise report.failure
+    failure = report.failure
+    for write, path in ((partial(write_json, figures), args.json), (partial(save_profile, ego), args.save_profile)):
+        try:
+            if path:
+                write(path)
+        except EdgefilterError as error:  # what else there is to write is still written
+            failure = failure or error
+    if failure:
+        raise failure
     seconds = report.samples_in / SAMPLE_RATE
     factor = f", {report.process_s / seconds:.3f} of real time" if seconds else ""
     how = "stopped after" if report.interrupted else "filtered"
     missed = f", {report.filter['deadline']['missed_deadlines']} deadlines missed" if source.live else ""
     say(f"{how} {seconds:.1f} s in {report.wall_s:.1f} s{factor}; {report.samples_out} samples to {args.output}, {report.lost} lost{missed}")
     return 130 if report.interrupted and not source.live else 0
+
+
+def save_profile(ego: EgoFilter, path: str) -> None:
+    """Write the adapted profile and say which effects have become part of its path."""
+    adapted = ego.adapted_profile()
+    adapted.save(path)
+    left = {name for name, _ in adapted.echo.effects}
+    held = ", ".join(name for name, _ in ego.profile.echo.effects if name not in left)
+    say(f"the adapted path is in {path}" + (f"; {held} is part of it now and no longer listed" if held else ""))
 
 
 def make_source(name: str, reference: str | None, output: str) -> Source:
@@ -157,14 +171,6 @@ def stop_on_signal(source: Source) -> Iterator[list[int]]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
-
-
-def _refuse_overwriting(args: argparse.Namespace) -> None:
-    for name in (args.input, args.reference, args.profile):
-        if name and name != "-" and Path(name).exists() and Path(args.output).exists() and Path(name).samefile(args.output):
-            raise UsageError(f"--output {args.output} is also an input and would be overwritten: choose another file")
-    if args.json == "-" and args.output == "-":
-        raise UsageError("--json - and --output - would mix on standard output: send one of them to a file")
 
 
 def say(text: str) -> None:

@@ -48,7 +48,8 @@ def flat_cross(a: Samples, b: Samples, n: int) -> np.ndarray:
 def likely_cross(predicted: Samples, recording: Samples, n: int) -> np.ndarray:
     """(n // 2 + 1,) cross-spectrum Y P* / (|P|^2 + N) of two signals in noise of variance 1.
 
-    Flat where the voice stands out of the noise, nothing elsewhere. The maximum-likelihood weighting of Knapp & Carter (1976) for an error in proportion to the voice.
+    Flat where the voice stands out of the noise, nothing elsewhere. The maximum-likelihood weighting of Knapp &
+    Carter (1976) for an error in proportion to the voice.
     """
     source = fft.rfft(predicted.astype(np.float64), n)
     heard = fft.rfft(recording.astype(np.float64), n)

@@ -60,10 +60,15 @@ class EchoModel:
         heard = np.flatnonzero(np.abs(response) > 1e-4 * np.abs(response).max(initial=0.0))
         return response[: max(self.impulse_response.size, int(heard[-1]) + 1 if heard.size else 0)]
 
-    def with_running_response(self, response: Samples) -> EchoModel:
-        """The model whose running_response() is response (taps,): the path effects are in it and so no longer listed."""
+    def with_running_response(self, response: Samples, gain: float = 1.0) -> EchoModel:
+        """The model whose running_response() begins with response (taps,) and goes on as that of this one times gain.
+
+        The path effects have been applied to both parts and cannot be taken out again (a band limit has no inverse);
+        they are in the impulse response now, and listing them would apply them twice.
+        """
+        rest = self.running_response()[response.size :] * np.float32(gain)
         kept = tuple(entry for entry in self.effects if find(entry[0]).stage != "path")
-        return replace(self, impulse_response=response, effects=kept)
+        return replace(self, impulse_response=np.concatenate((response, rest)).astype(np.float32), effects=kept)
 
     def components(self, reference: Samples) -> dict[str, Samples]:
         """What each part contributes, (n,) each: "linear", the path alone, then by how much each effect in turn changes it.

@@ -15,6 +15,8 @@ if TYPE_CHECKING:
 ENGINES = ("crnn", "ss", "linear", "bypass", "paper-ss", "paper-ss-causal", "paper-crnn")
 NEEDS_PROFILE = ("paper-ss", "paper-ss-causal")
 HAVE_MODEL = ("crnn", "paper-crnn")
+HAVE_LINEAR_STAGE = ("crnn", "ss", "linear")
+"""Those whose front is "full": an echo path is adapted before them."""
 
 
 def create(

@@ -9,11 +9,16 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import onnxruntime
 
 from edgefilter.dsp.stft import StftConfig
 from edgefilter.errors import ModelError, StftError
 from edgefilter.types import SAMPLE_RATE
+
+try:
+    import onnxruntime
+except Exception as error:  # a broken installation raises what its binary part does: ImportError, OSError
+    said = " ".join(f"{type(error).__name__}: {error}".split())[:160]
+    raise ModelError(f"onnxruntime cannot be loaded ({said}): pip install --force-reinstall onnxruntime") from None
 
 FOLDERS = (Path(__file__).parents[1] / "models", Path(__file__).parents[2] / "models")
 """Where models lie: inside the installed package, or at the top of a checkout."""

@@ -7,8 +7,9 @@ import os
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import get_type_hints
 
 import numpy as np
 import soundfile
@@ -53,7 +54,7 @@ class Figures:
     at_once_p99_ms: float
 
 
-FIELDS = {field.name for field in fields(Figures)}
+KINDS = get_type_hints(Figures)
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,7 +91,7 @@ def choose(
     """
     cores = min(CORES, len(_allowed()))
     about = budget_cache.describe({"held_to": cores, "taps": _taps(profile), "effects": _effects(profile)})
-    known = {name: Figures(**kept) for name, kept in budget_cache.recall(about).items() if kept.keys() == FIELDS}
+    known = {name: Figures(**kept) for name, kept in budget_cache.recall(about, KINDS, say).items()}
     found: list[Figures] = []
     skipped: dict[str, str] = {}
     fresh = 0

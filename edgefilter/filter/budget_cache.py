@@ -6,11 +6,12 @@ import hashlib
 import json
 import os
 import platform
-import sys
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
+
+import platformdirs
 
 PACKAGES = ("edgefilter", "numpy", "scipy", "onnxruntime")
 FILE = "timings.json"
@@ -18,14 +19,7 @@ FILE = "timings.json"
 
 def folder() -> Path:
     """The user's cache folder by the platform's rules: XDG_CACHE_HOME or ~/.cache, ~/Library/Caches, LOCALAPPDATA."""
-    if sys.platform == "darwin":
-        base = Path.home() / "Library/Caches"
-    elif sys.platform == "win32":
-        base = Path(os.environ.get("LOCALAPPDATA", Path.home() / "AppData/Local"))
-    else:
-        named = os.environ.get("XDG_CACHE_HOME", "")
-        base = Path(named) if Path(named).is_absolute() else Path.home() / ".cache"  # a relative one is to be ignored, says the rule
-    return base / "edgefilter"
+    return platformdirs.user_cache_path("edgefilter", appauthor=False, opinion=False)
 
 
 def describe(path: Mapping[str, object]) -> dict[str, object]:
@@ -55,19 +49,38 @@ def processor() -> str:
     return names[0] if names else platform.processor()
 
 
-def recall(about: Mapping[str, object]) -> dict[str, dict]:
-    """Engine -> figures as kept by `keep` for exactly this description; empty where there are none or the file is damaged."""
-    kept = _read().get(_key(about), {})
-    return kept.get("engines", {}) if isinstance(kept, dict) else {}
+def recall(
+    about: Mapping[str, object], kinds: Mapping[str, type], say: Callable[[str], None] = lambda text: None
+) -> dict[str, dict]:
+    """Engine -> figures as kept by `keep` for exactly this description.
+
+    kinds: name and type of every figure. An engine whose figures are others is left out, and a damaged file holds
+    nothing; say is told why.
+    """
+    everything, trouble = _read()
+    kept = everything.get(_key(about), {})
+    listed = kept.get("engines") if isinstance(kept, dict) else None
+    if not trouble and kept and not isinstance(listed, dict):
+        trouble = "its entry for this machine holds no engines"
+    found = {}
+    for name, figures in (listed if isinstance(listed, dict) else {}).items():
+        wrong = _unlike(figures, kinds)
+        if wrong:
+            trouble = f"{name}: {wrong}"
+        else:
+            found[name] = figures
+    if trouble:
+        say(f"the measurements kept in {folder() / FILE} are not used: {trouble}")
+    return found
 
 
 def keep(about: Mapping[str, object], engines: Mapping[str, dict]) -> str | None:
     """Write figures, atomically; returns why that was impossible, None when it was done."""
-    everything = _read() | {_key(about): {"about": dict(about), "engines": dict(engines)}}
+    everything = _read()[0] | {_key(about): {"about": dict(about), "engines": dict(engines)}}
     draft = folder() / f"{FILE}.{os.getpid()}"
     try:
         folder().mkdir(parents=True, exist_ok=True)
-        draft.write_text(json.dumps(everything, indent=1) + "\n")
+        draft.write_text(json.dumps(everything, indent=1) + "\n", encoding="utf-8")
         draft.replace(folder() / FILE)
     except OSError as error:
         with suppress(OSError):
@@ -81,12 +94,31 @@ def forget() -> None:
     (folder() / FILE).unlink(missing_ok=True)
 
 
-def _read() -> dict:
+def _read() -> tuple[dict, str]:
+    """What is kept, and what is wrong with it; a file that is not there is an empty one."""
     try:
-        found = json.loads((folder() / FILE).read_text())
-    except (OSError, ValueError):
-        return {}
-    return found if isinstance(found, dict) else {}
+        found = json.loads((folder() / FILE).read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        return {}, ""
+    except OSError as error:
+        return {}, f"it cannot be read ({error.strerror})"
+    except (ValueError, RecursionError):
+        return {}, "it is not JSON"
+    if not isinstance(found, dict):
+        return {}, f"it holds a JSON {type(found).__name__}, expected an object"
+    return found, ""
+
+
+def _unlike(figures: object, kinds: Mapping[str, type]) -> str:
+    """What of figures is not of the kinds; empty where all is."""
+    if not isinstance(figures, dict) or figures.keys() != kinds.keys():
+        return f"expected {', '.join(kinds)}"
+    for name, kind in kinds.items():
+        value = figures[name]
+        good = type(value) in ((int, float) if kind is float else (kind,))
+        if not good or (kind in (int, float) and not 0 <= value < float("inf")):
+            return f"{name} is {str(value)[:40]!r}, expected type {kind.__name__}"
+    return ""
 
 
 def _key(about: Mapping[str, object]) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,7 @@ from edgefilter.engines.ladder import CANDIDATES, Ladder, climbable
 from edgefilter.errors import EdgefilterError, SignalError, UsageError
 from edgefilter.filter.stepping import Stepping
 from edgefilter.filter.stream import Stream
-from edgefilter.profile.data import Profile
+from edgefilter.profile.data import MAX_TAPS, Profile
 from edgefilter.types import SAMPLE_RATE, Event, Samples, as_samples
 
 
@@ -135,11 +136,16 @@ class EgoFilter:
         return self.profile is not None and self._stream.front.canceller is not None
 
     def adapted_profile(self) -> Profile:
-        """The profile with the echo path as the linear stage has adapted it; raises SignalError where there is none."""
+        """The profile with the echo path as the linear stage has adapted it; raises SignalError where there is none.
+
+        What of the path is longer than the linear stage is the profile's own, as loud as the volume was turned.
+        """
         if not self.can_adapt:
-            raise SignalError("nothing to write back: give a profile and an engine with a linear stage (linear or ss)")
-        learnt = self._stream.front.canceller.impulse_response()
-        return self.profile.with_echo(self.profile.echo.with_running_response(learnt))
+            names = ", ".join(engines.HAVE_LINEAR_STAGE)
+            raise SignalError(f"nothing to write back: give a profile and an engine with a linear stage ({names})")
+        canceller = self._stream.front.canceller
+        echo = self.profile.echo.with_running_response(canceller.impulse_response(), canceller.gain)
+        return self.profile.with_echo(replace(echo, impulse_response=echo.impulse_response[:MAX_TAPS]))
 
 
 def strongest(profile: Profile | None) -> tuple[Engine, str]:

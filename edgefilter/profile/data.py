@@ -8,7 +8,12 @@ from pathlib import Path
 import numpy as np
 
 from edgefilter.dsp.stft import StftConfig
+<<<<<<< HEAD
 from edgefilter.echo.effects.catalogue import names as known_effects
+=======
+from edgefilter.echo.effect import complete, find
+from edgefilter.echo.effect import names as known_effects
+>>>>>>> main
 from edgefilter.echo.model import EchoModel
 from edgefilter.errors import ProfileError
 from edgefilter.profile.file import REMEDY, read_fields, write_fields
@@ -22,6 +27,8 @@ GRID_HZ = np.arange(GRID_BINS) * SAMPLE_RATE / GRID_FFT
 DISTORTION_ORDERS = (2, 3, 4, 5)
 MAX_TAPS = 4 * SAMPLE_RATE
 MAX_DELAY = 4 * SAMPLE_RATE
+PROBE = 1600
+"""Samples of sound on which the effects of a loaded profile are tried."""
 
 _ARRAYS = ("response", "noise_psd", "band_hz", "band_snr_db", "distortion_db")
 
@@ -100,10 +107,10 @@ class Profile:
             warnings = header.pop("warnings")
             if not isinstance(warnings, list):
                 raise ProfileError(f"warnings is a JSON {type(warnings).__name__}, expected a list of texts; {REMEDY}")
-            for name, _ in effects:
-                if name not in known_effects():
-                    raise ProfileError(f"holds the effect '{name[:40]}', which does not come with edgefilter; load its file (--effects FILE.py)")
-            return cls(echo=EchoModel(arrays.pop("impulse_response"), effects), warnings=tuple(warnings), **arrays, **header)
+            echo = EchoModel(arrays.pop("impulse_response"), effects)
+            profile = cls(echo=echo, warnings=tuple(warnings), **arrays, **header)
+            _check_effects(profile.echo)
+            return profile
         except ProfileError as error:
             raise ProfileError(f"{path}: {error}") from None
 
@@ -153,6 +160,27 @@ def _check_arrays(profile: Profile) -> None:
         if wrong.any():
             at = int(np.argmax(wrong))
             _fail(name, f"{value.ravel()[at]:g} at position {at}", f"{low:g} to {high:g}")
+
+
+def _check_effects(echo: EchoModel) -> None:
+    """Raise ProfileError for an effect that is unknown, or whose values are not those that it can be applied with."""
+    probe = np.zeros(PROBE, np.float32)
+    probe[::40] = 0.1
+    for name, values in echo.effects:
+        if name not in known_effects():
+            remedy = "load its file (--effects FILE.py)"
+            raise ProfileError(f"holds the effect '{name[:40]}', which does not come with edgefilter; {remedy}")
+        try:
+            complete(find(name), values)
+            alone = EchoModel(echo.impulse_response, ((name, values),))
+            with np.errstate(all="ignore"):
+                added = [part for pair in alone.unpredictable(probe) for part in pair]
+                made = [alone.predict(probe), alone.running_response(), *added]
+        except Exception as error:  # whatever arrays of wrong shapes do to an effect's arithmetic
+            told = " ".join(str(error).split())[:160]
+            raise ProfileError(f"the values of its effect {name} cannot be used ({told}); {REMEDY}") from None
+        if not all(np.isfinite(part).all() for part in made):
+            raise ProfileError(f"the values of its effect {name} cannot be used (the result is not finite); {REMEDY}")
 
 
 def _check_numbers(profile: Profile) -> None:

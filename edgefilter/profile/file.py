@@ -7,8 +7,8 @@ import io
 import json
 import math
 import os
+import secrets
 import struct
-import tempfile
 import zipfile
 import zlib
 from collections.abc import Mapping
@@ -38,13 +38,16 @@ def write_fields(path: Path, arrays: Mapping[str, np.ndarray], header: Mapping[s
                 member = f"effect_{i}_{len(entry['values'])}"
                 members[member] = _plain(value, f"effects[{i}].{key}")
                 entry["values"][key] = {"array": member}
-            else:
+            elif isinstance(value, bool | int | float | np.generic | np.ndarray):
                 entry["values"][key] = value.item() if isinstance(value, np.generic | np.ndarray) else value
+            else:
+                found = f"effects[{i}].{key} is {type(value).__name__}"
+                raise ProfileError(f"the profile cannot be stored: {found}, expected a number or an array")
         listed.append(entry)
     try:
         text = json.dumps({**header, "effects": listed}, allow_nan=False)
     except (TypeError, ValueError) as error:
-        raise ProfileError(f"the profile cannot be stored: {error}; expected finite numbers, texts and arrays") from None
+        raise ProfileError(f"the profile cannot be stored: {error}; expected finite numbers and arrays") from None
     members["header"] = np.frombuffer(text.encode(), np.uint8)
     members["version"] = np.array(FORMAT_VERSION, np.int64)
     _replace(path, members)
@@ -61,21 +64,17 @@ def _replace(path: Path, members: Mapping[str, np.ndarray]) -> None:
     path = path.resolve()
     if path.exists() and not path.is_file():
         raise ProfileError(f"{path}: not a file that can be replaced; name a .npz file for the profile")
-    temporary = None
+    temporary = path.with_name(f".{path.name[:32]}.{secrets.token_hex(8)}")
     try:
-        handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name[:64]}.")
-        with os.fdopen(handle, "wb") as file:
+        # not tempfile: its files are the owner's alone, and the umask that others have can only be read by changing it
+        with open(temporary, "xb") as file:
             np.savez_compressed(file, allow_pickle=False, **members)
             file.flush()
             os.fsync(file.fileno())
-        mask = os.umask(0)
-        os.umask(mask)
-        os.chmod(temporary, 0o666 & ~mask)
         os.replace(temporary, path)
     except OSError as error:
-        if temporary is not None:
-            with contextlib.suppress(OSError):
-                os.unlink(temporary)
+        with contextlib.suppress(OSError):
+            temporary.unlink()
         raise ProfileError(f"{path}: the profile cannot be written ({error.strerror}); choose another place or free space") from None
 
 
@@ -130,10 +129,12 @@ def _array(content: bytes, name: str) -> np.ndarray:
         if version != (1, 0):
             raise _Damaged(f"member {name!r} is in .npy format {version}, expected (1, 0)")
         shape, fortran, dtype = np.lib.format.read_array_header_1_0(file)
-    except ValueError as error:
-        raise _Damaged(f"member {name!r} is no .npy array ({str(error).splitlines()[0][:80]})") from None
+    except Exception as error:  # numpy lets through what Python's own parser raises: TokenError, RecursionError
+        raise _Damaged(f"member {name!r} is no .npy array ({' '.join(str(error).split())[:80]})") from None
     if dtype.hasobject or dtype.kind not in "fiub":
         raise _Damaged(f"member {name!r} holds {dtype} (pickled objects or text), expected numbers")
+    if any(type(size) is not int or size < 0 for size in shape):
+        raise _Damaged(f"member {name!r} claims shape {shape}, expected sizes from 0 up")
     body = content[file.tell() :]
     if math.prod(shape) * dtype.itemsize != len(body):
         raise _Damaged(f"member {name!r} claims shape {shape} of {dtype} but holds {len(body)} bytes")
@@ -184,6 +185,6 @@ def _value(value: object, where: str, members: Mapping[str, np.ndarray]) -> obje
         if not np.isfinite(array).all():
             raise _Damaged(f"{where} is not finite, expected finite values")
         return array
-    if isinstance(value, bool | int | str) or (isinstance(value, float) and math.isfinite(value)):
+    if isinstance(value, bool | int) or (isinstance(value, float) and math.isfinite(value)):
         return value
-    raise _Damaged(f"{where} is {type(value).__name__} {str(value)[:20]!r}, expected a finite number, a text or an array")
+    raise _Damaged(f"{where} is {type(value).__name__} {str(value)[:20]!r}, expected a finite number or an array")

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+import shlex
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 
 import numpy as np
 
@@ -55,6 +57,16 @@ def diagnosis_lines(found: Diagnosis, calibrated: bool = True) -> list[str]:
     if found.evidence:
         lines.append(f"left        {sentence(found.evidence)}")
     return [*lines, f"where       it is with {profile}:", *comparison_lines(found.comparison)]
+
+
+def add_command(effect: str, names: Mapping[str, object]) -> str:
+    """What to type to have that effect in a new profile; without a profile, to have one at all."""
+    if names["profile"] is None:
+        return "edgefilter calibrate --live --output robot.npz"
+    files = " ".join(f"--{role} {shlex.quote(str(names[role]))}" for role in ("profile", "recording", "reference"))
+    own = "".join(f" --effects {shlex.quote(str(file))}" for file in names.get("effects") or ())
+    output = Path(str(names["profile"])).with_suffix(f".{effect}.npz")
+    return f"edgefilter add {effect} {files}{own} --output {shlex.quote(str(output))}"
 
 
 def in_order(ranking: Sequence[Finding]) -> list[Finding]:

@@ -72,15 +72,41 @@ def test_pacing_waits_for_each_hop_and_is_not_counted() -> None:
 def test_busy_cores_are_busy_and_freed() -> None:
     with latency.load(True):
         time.sleep(0.3)
-        running = [pid for pid in os.listdir("/proc") if pid.isdigit() and b"while True: pass" in _command(pid)]
-        assert len(running) >= min(latency.CORES, os.cpu_count())
+        started = _counting()
+        assert len(started) == min(latency.CORES, len(os.sched_getaffinity(0)))
+        spent = sum(_cpu_ticks(pid) for pid in started)
+        time.sleep(0.5)
+        assert sum(_cpu_ticks(pid) for pid in started) > spent, "they hold no core"
+    assert not _counting()
     with latency.load(False):
-        pass
+        assert not _counting()
+    with pytest.raises(RuntimeError), latency.load(True):
+        raise RuntimeError
+    assert not _counting()
 
 
-def _command(pid: str) -> bytes:
+def _counting() -> set[str]:
+    """The children of this process that only count; one that has ended but was not waited for is one, too."""
+    own = str(os.getpid()).encode()
+    return {pid for pid in os.listdir("/proc") if pid.isdigit() and _stat(pid)[1:2] == [own] and _is_load(pid)}
+
+
+def _is_load(pid: str) -> bool:
+    return b"while True: pass" in _read(pid, "cmdline") or _stat(pid)[0] == b"Z"
+
+
+def _stat(pid: str) -> list[bytes]:
+    """State, parent and so on: the fields of proc_pid_stat(5) from the third on."""
+    return _read(pid, "stat").rpartition(b")")[2].split()
+
+
+def _cpu_ticks(pid: str) -> int:
+    return int(_stat(pid)[11])
+
+
+def _read(pid: str, file: str) -> bytes:
     try:
-        return Path(f"/proc/{pid}/cmdline").read_bytes()
+        return Path(f"/proc/{pid}/{file}").read_bytes()
     except OSError:
         return b""
 

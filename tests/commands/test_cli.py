@@ -156,6 +156,7 @@ def test_a_full_disk_is_one_line_and_leaves_a_valid_file(speech):
         (["run", "--engin", "ss"], ["--engin"]),
         (["run", "--seconds", "-3"], ["--seconds"]),
         (["run", "--engine", "paper-ss"], ["--profile"]),
+        (["run", "--engine", "bypass", "--save-profile", "p.npz"], ["--save-profile", "(crnn, ss, linear)"]),
         (["fly"], ["fly"]),
         ([], ["COMMAND"]),
     ],

@@ -25,7 +25,7 @@ def test_it_filters_the_bundled_recording_and_the_human_stands_out(demo):
     figures = json.loads((folder / "demo.json").read_text())
     assert soundfile.info(folder / "filtered.wav").frames == soundfile.info(folder / "microphone.wav").frames == figures["samples_in"]
     assert -27 < figures["si_sdr_before_db"] < -19  # the bundled recording is fixed; the robot is 20-26 dB above the human
-    assert figures["si_sdr_after_db"] > 0  # more than 20 dB better; 5.8 dB when the recording was bundled
+    assert figures["si_sdr_after_db"] > 9.2  # 9.5 is promised, int8 sums differ between processors; random weights give 3.7
 
 
 def test_it_draws_before_and_after(demo):

@@ -7,7 +7,7 @@ import pytest
 
 from edgefilter import engines
 from edgefilter.echo.model import EchoModel
-from edgefilter.errors import UsageError
+from edgefilter.errors import SignalError, UsageError
 from edgefilter.filter.ego_filter import EgoFilter, enhance
 from edgefilter.filter.stream import Stream
 from edgefilter.profile.data import Profile
@@ -61,3 +61,10 @@ def test_an_unknown_engine_names_the_known_ones():
 def test_paper_ss_asks_for_a_profile():
     with pytest.raises(UsageError, match="paper-ss needs.*--profile"):
         EgoFilter(engine="paper-ss")
+
+
+def test_messages_about_the_linear_stage_name_every_engine_that_has_one():
+    classes = {name: type(engines.create(name, robot(), model=MODELS.get(name))) for name in engines.ENGINES}
+    assert {name for name, made in classes.items() if made.front == "full"} == set(engines.HAVE_LINEAR_STAGE)
+    with pytest.raises(SignalError, match=r"\(crnn, ss, linear\)"):
+        EgoFilter(engine="bypass").adapted_profile()

@@ -10,7 +10,11 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
+import platformdirs
 import pytest
+from platformdirs.macos import MacOS
+from platformdirs.unix import Unix
+from platformdirs.windows import Windows
 
 from edgefilter.engines.bypass import Bypass
 from edgefilter.engines.spectral_subtraction import SpectralSubtraction
@@ -117,18 +121,64 @@ def test_another_model_file_is_measured_again(measured, monkeypatch, tmp_path):
     assert not choose(8.0, candidates=LADDER).remembered and choose(8.0, candidates=LADDER).remembered
 
 
-@pytest.mark.parametrize("text", ["", "{", "[]", "{}", '{"x": 3}'])
-def test_a_damaged_cache_is_measured_again(measured, cache, text):
+@pytest.mark.parametrize(
+    ("text", "why"),
+    [("", "not JSON"), ("{", "not JSON"), ("[]", "JSON list"), ("{}", None), ('{"x": 3}', None), ("[" * 9999, "not JSON")],
+)
+def test_a_damaged_cache_is_measured_again(measured, cache, text, why):
     cache.mkdir(parents=True)
     (cache / budget_cache.FILE).write_text(text)
-    assert choose(8.0, candidates=LADDER).engine == "ss" and choose(8.0, candidates=LADDER).remembered
+    said = []
+    assert choose(8.0, candidates=LADDER, say=said.append).engine == "ss" and choose(8.0, candidates=LADDER).remembered
+    told = [line for line in said if "are not used" in line]
+    assert len(told) == (why is not None)
+    assert all(why in line and str(cache / budget_cache.FILE) in line for line in told)
 
 
 def test_an_old_layout_in_the_cache_is_measured_again(measured, cache):
     choose(8.0, candidates=LADDER)
     file = cache / budget_cache.FILE
     file.write_text(file.read_text().replace("paced_p99_ms", "p99"))
-    assert not choose(8.0, candidates=LADDER).remembered
+    said = []
+    assert not choose(8.0, candidates=LADDER, say=said.append).remembered
+    assert any("are not used: ss: expected engine, model" in line for line in said)
+
+
+@pytest.mark.parametrize(
+    ("place", "value", "why"),
+    [
+        ((), 3, "holds no engines"),
+        (("engines",), ["ss"], "holds no engines"),
+        (("engines",), None, "holds no engines"),
+        (("engines", "ss"), "fast", "ss: expected engine"),
+        (("engines", "ss"), [1.0], "ss: expected engine"),
+        (("engines", "ss", "paced_p99_ms"), "fast", "ss: paced_p99_ms is 'fast', expected type float"),
+        (("engines", "ss", "paced_p99_ms"), None, "paced_p99_ms is 'None'"),
+        (("engines", "ss", "paced_p99_ms"), True, "paced_p99_ms is 'True'"),
+        (("engines", "ss", "paced_p99_ms"), float("nan"), "paced_p99_ms is 'nan'"),
+        (("engines", "ss", "paced_p99_ms"), -1.0, "paced_p99_ms is '-1.0'"),
+        (("engines", "ss", "hops"), 300.5, "hops is '300.5', expected type int"),
+        (("engines", "ss", "complete"), 1, "complete is '1', expected type bool"),
+        (("engines", "ss", "model"), {"a": 1}, "model is"),
+    ],
+)
+def test_a_cache_of_valid_json_with_wrong_types_inside_is_ignored_and_said(measured, cache, place, value, why):
+    choose(8.0, candidates=LADDER)
+    file = cache / budget_cache.FILE
+    content = json.loads(file.read_text())
+    (entry,) = content
+    at = content
+    *way, last = (entry, *place)
+    for step in way:
+        at = at[step]
+    at[last] = value
+    file.write_text(json.dumps(content))
+    said = []
+    choice = choose(8.0, candidates=LADDER, say=said.append)
+    assert choice.engine == "ss" and not choice.remembered
+    told = [line for line in said if "are not used" in line]
+    assert len(told) == 1 and why in told[0] and "\n" not in told[0], said
+    assert choose(8.0, candidates=LADDER).remembered
 
 
 def test_a_cache_that_cannot_be_written_is_said(measured, cache):
@@ -140,16 +190,18 @@ def test_a_cache_that_cannot_be_written_is_said(measured, cache):
 
 
 def test_the_cache_lies_where_the_platform_wants_it(monkeypatch, tmp_path):
-    monkeypatch.setattr(Path, "home", lambda: tmp_path)
-    monkeypatch.setattr(sys, "platform", "linux")
+    monkeypatch.setattr(platformdirs, "PlatformDirs", Unix)
+    monkeypatch.setenv("HOME", str(tmp_path))
     assert budget_cache.folder() == tmp_path / "cache/edgefilter"
     for ignored in ("", "relative/folder"):
         monkeypatch.setenv("XDG_CACHE_HOME", ignored)
         assert budget_cache.folder() == tmp_path / ".cache/edgefilter"
-    monkeypatch.setattr(sys, "platform", "darwin")
+    monkeypatch.delenv("XDG_CACHE_HOME")
+    monkeypatch.setattr(platformdirs, "PlatformDirs", MacOS)
     assert budget_cache.folder() == tmp_path / "Library/Caches/edgefilter"
-    monkeypatch.setattr(sys, "platform", "win32")
-    assert budget_cache.folder() == tmp_path / "cache/edgefilter"
+    monkeypatch.setattr(platformdirs, "PlatformDirs", Windows)
+    monkeypatch.setattr("platformdirs.windows.get_win_folder", lambda name: str(tmp_path / name))
+    assert budget_cache.folder() == tmp_path / "CSIDL_LOCAL_APPDATA/edgefilter"
 
 
 def test_measuring_runs_the_whole_path_at_the_real_pace():

@@ -5,6 +5,7 @@ import pytest
 from scipy import signal
 
 from edgefilter import EgoFilter, Profile, enhance
+from edgefilter.echo.model import EchoModel
 from edgefilter.types import PRE_ROLL
 from tests.engines.test_engines import robot
 
@@ -53,3 +54,66 @@ def test_the_adapted_path_written_into_a_profile_starts_better_than_the_old_one(
     start = slice(4_000, 12_000)
     before, after = (db(enhance(mic, reference, profile, "linear")[start]) for profile in (old, tmp_path / "adapted.npz"))
     assert after < before - 6  # four seconds of learning against none; 3 dB would already be a different path
+
+
+def long_robot(taps=16_000, effects=(), decay=16_000):
+    """A robot in a hall: its path decays by 60 dB within so many taps, by default twice what the linear stage holds."""
+    rng = np.random.default_rng(3)
+    path = np.zeros(taps, np.float32)
+    n = np.arange(taps - PRE_ROLL)
+    path[PRE_ROLL:] = 0.05 * rng.standard_normal(n.size) * np.exp(-n * 6.9 / decay)
+    path[PRE_ROLL] = 0.6
+    return robot().with_echo(EchoModel(path, effects))
+
+
+def room(taps=12_000):
+    """A late_reverb as it is fitted."""
+    rng = np.random.default_rng(4)
+    decay = 0.01 * np.exp(-np.arange(taps) / 3000)
+    return "late_reverb", {"rt60_s": 0.8, "level_db": -10.0, "taps": decay * rng.standard_normal(taps)}
+
+
+def test_the_path_behind_the_linear_stage_is_not_cut_off_where_it_is_written_back(reference, tmp_path):
+    old = long_robot()
+    ego = EgoFilter(old, "linear")
+    held = ego.stats()["linear_stage"]["partitions"] * ego.hop
+    assert held == 8192
+    ego.process(echo_of(old, reference), reference)
+    ego.adapted_profile().save(tmp_path / "adapted.npz")
+    new = Profile.load(tmp_path / "adapted.npz").echo.impulse_response
+    np.testing.assert_array_equal(new[held:], old.echo.impulse_response[held:])
+    assert not np.array_equal(new[:held], old.echo.impulse_response[:held])
+
+
+def test_path_effects_are_neither_lost_nor_applied_twice_where_the_path_is_written_back(reference):
+    band = ("bandlimit", {"cutoff_hz": 5000.0, "order": 4.0, "phase": 0.0, "delay": 0.0, "taps": 0.0})
+    old = long_robot(6_000, (("playback_gain", {"gain_db": -3.0}), room(), band))
+    ego = EgoFilter(old, "linear")
+    ego.process(np.zeros(8_000, np.float32), np.zeros(8_000, np.float32))  # nothing is heard, so nothing is learnt
+    new = ego.adapted_profile()
+    assert [name for name, _ in new.echo.effects] == ["playback_gain"]
+    before, after = old.echo.running_response(), new.echo.running_response()
+    assert before.size > 15_000  # the room reaches far behind the linear stage
+    np.testing.assert_allclose(after, before, atol=1e-6)  # rounding of the stage's transforms, on a path of 0.6
+    # what running_response leaves away is 80 dB under the path's peak at each tap, and the band limit's 64 samples before it
+    heard, still = old.echo.predict(reference), new.echo.predict(reference)
+    assert db(still - heard) < db(heard) - 50
+    twice = EgoFilter(new, "linear").adapted_profile().echo.running_response()
+    np.testing.assert_allclose(twice, after, atol=1e-6)
+
+
+def test_the_kept_end_of_the_path_follows_the_volume_that_was_turned(reference):
+    old = long_robot()
+    ego = EgoFilter(old, "linear")
+    ego.process(np.float32(1.6) * echo_of(old, reference), reference)
+    turned = 10 ** (ego.stats()["linear_stage"]["gain_db"] / 20)
+    assert turned > 1.3
+    new = ego.adapted_profile().echo.impulse_response
+    np.testing.assert_allclose(new[8192:], turned * old.echo.impulse_response[8192:], rtol=1e-5)  # float32
+
+
+def test_the_longest_path_with_reverberation_behind_it_can_still_be_written_back(tmp_path):
+    old = long_robot(64_000, (room(),), decay=200_000)
+    assert old.echo.running_response().size > 64_000
+    EgoFilter(old, "linear").adapted_profile().save(tmp_path / "adapted.npz")
+    assert Profile.load(tmp_path / "adapted.npz").echo.impulse_response.size == 64_000

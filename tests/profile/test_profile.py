@@ -14,6 +14,7 @@ from edgefilter.dsp.stft import StftConfig
 from edgefilter.echo.model import EchoModel
 from edgefilter.errors import ProfileError
 from edgefilter.profile.data import GRID_BINS, GRID_HZ, Profile
+from edgefilter.profile.file import read_fields, write_fields
 from edgefilter.types import PRE_ROLL
 
 FIELDS = ("response", "noise_psd", "band_hz", "band_snr_db", "distortion_db")
@@ -77,11 +78,20 @@ def refused(path, match):
     return text
 
 
+def same_effects(first, second):
+    assert [name for name, _ in first] == [name for name, _ in second]
+    for (_, a), (_, b) in zip(first, second, strict=True):
+        assert list(a) == list(b)
+        for key in a:
+            assert type(a[key]) is type(b[key]) and np.array_equal(a[key], b[key]), key
+            assert np.asarray(a[key]).dtype == np.asarray(b[key]).dtype, key
+
+
 def test_round_trip_is_bit_exact_with_effects(tmp_path):
     curve = np.linspace(0, 1, 7) / 3
     effects = (
-        ("compression", {"rt60_s": 0.1 + 0.2, "tail": np.arange(50, dtype=np.float32) / 7}),
-        ("clock_drift", {"times_s": curve, "grid": np.asfortranarray(np.arange(6.0).reshape(2, 3)), "kind": "steps", "on": True, "count": 3}),
+        ("late_reverb", {"rt60_s": 0.1 + 0.2, "taps": np.arange(50, dtype=np.float32) / 7}),
+        ("mic_agc", {"gain_db": curve, "knots_hz": 3}),
     )
     before = make(effects)
     before.save(tmp_path / "p.npz")
@@ -92,12 +102,62 @@ def test_round_trip_is_bit_exact_with_effects(tmp_path):
     assert before.echo.impulse_response.tobytes() == after.echo.impulse_response.tobytes()
     for name in ("delay", "sample_rate", "warnings", "created", "source"):
         assert getattr(before, name) == getattr(after, name), name
-    assert [name for name, _ in after.echo.effects] == ["compression", "clock_drift"]
-    for (_, a), (_, b) in zip(effects, after.echo.effects, strict=True):
-        assert list(a) == list(b)
-        for key in a:
-            assert type(a[key]) is type(b[key]) and np.array_equal(a[key], b[key]), key
-    assert after.echo.effects[0][1]["tail"].dtype == np.float32
+    same_effects(effects, after.echo.effects)
+
+
+def test_the_file_keeps_every_kind_of_number_and_shape_of_array(tmp_path):
+    arrays = {"grid": np.asfortranarray(np.arange(6.0).reshape(2, 3)), "none": np.zeros((0, 4), np.float32)}
+    values = {**arrays, "on": True, "count": 3, "third": 1 / 3}
+    effects = (("any", values), ("another", {"grid": np.arange(4, dtype=np.int8)}))
+    write_fields(tmp_path / "f.npz", {"x": np.zeros(3)}, {"text": "übersteuert"}, effects)
+    arrays, header, found = read_fields(tmp_path / "f.npz")
+    assert list(arrays) == ["x"] and header == {"text": "übersteuert"}
+    same_effects(effects, found)
+
+
+@pytest.mark.parametrize("shape", ["(-601, -1)", "(601, -1, -1)", "(-1,)", "(True, 601)", "(601.0,)", "((601,),)"])
+def test_an_array_of_a_shape_that_cannot_be_is_refused_in_one_line(saved, shape):
+    body = np.load(saved)["response"].tobytes()
+    text = f"{{'descr': '<f4', 'fortran_order': False, 'shape': {shape}, }}"
+    text += " " * (-(len(text) + 11) % 64) + "\n"
+    rewrite(saved, response=b"\x93NUMPY\x01\x00" + len(text).to_bytes(2, "little") + text.encode() + body)
+    refused(saved, "response.npy' (claims shape|is no .npy array)")
+
+
+RECORDS = "{'descr': [('a', '<f4')], 'fortran_order': False, 'shape': (3,)}"
+HOSTILE_HEADERS = ["{", "(" * 2000, "{'descr': '<f4'", "\x00", "'" * 3, RECORDS, "[" * 60 + "]" * 60, "9" * 5000]
+
+
+@pytest.mark.parametrize("text", HOSTILE_HEADERS, ids=range(len(HOSTILE_HEADERS)))
+def test_an_array_with_a_header_that_is_none_is_refused_in_one_line(saved, text):
+    rewrite(saved, response=b"\x93NUMPY\x01\x00" + len(text).to_bytes(2, "little") + text.encode())
+    refused(saved, "response.npy'")
+
+
+@pytest.mark.parametrize(
+    ("name", "values", "match"),
+    [
+        ("playback_gain", {"gain_db": "loud"}, "gain_db is str 'loud', expected a finite number or an array"),
+        ("playback_gain", {"gain_db": 1e9}, "playback_gain cannot be used .*gain_db is 1000000000.0 dB, expected -60 to 60"),
+        ("playback_gain", {"volume": 1.0}, "playback_gain cannot be used .*no parameter 'volume'"),
+        ("playback_gain", {"gain_db": np.zeros(2)}, "playback_gain cannot be used"),
+        ("delay_jump", {"times_s": np.array([0.01, 0.02, 0.03]), "samples": np.array([1.0, 2.0])}, "delay_jump cannot be used"),
+        ("late_reverb", {"taps": np.full((3, 3), 0.1)}, "late_reverb cannot be used"),
+        ("path_change", {"time_s": 100.0, "taps": np.full((3, 3), 0.1)}, "path_change cannot be used"),
+        ("compression", {"ratio": np.array([2.0, 3.0])}, "compression cannot be used"),
+    ],
+)
+def test_an_effect_value_that_cannot_be_applied_is_refused_in_one_line(saved, name, values, match):
+    with np.load(saved) as content:
+        header = json.loads(bytes(content["header"]))
+    arrays = {f"effect_0_{i}": value for i, value in enumerate(values.values()) if isinstance(value, np.ndarray)}
+    listed = {
+        key: {"array": f"effect_0_{i}"} if isinstance(value, np.ndarray) else value
+        for i, (key, value) in enumerate(values.items())
+    }
+    header["effects"] = [{"name": name, "values": listed}]
+    rewrite(saved, header=np.frombuffer(json.dumps(header).encode(), np.uint8), **arrays)
+    refused(saved, match)
 
 
 def test_saving_what_was_loaded_gives_the_same_bytes(saved, tmp_path):
@@ -262,7 +322,7 @@ def test_impulse_response_shorter_than_twice_the_pre_roll_is_refused():
 
 def test_effect_that_cannot_be_stored_leaves_the_old_file(saved):
     before = saved.read_bytes()
-    for value in (np.array([1.0, np.nan]), float("inf"), object(), np.array([object()])):
+    for value in (np.array([1.0, np.nan]), float("inf"), object(), np.array([object()]), "loud"):
         with pytest.raises(ProfileError, match="cannot be stored"):
             make((("rattle", {"level": value}),)).save(saved)
     assert saved.read_bytes() == before and os.listdir(saved.parent) == ["robot.npz"]
@@ -283,6 +343,24 @@ def test_full_disk_leaves_the_old_file_and_no_rubbish(saved):
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
         signal.signal(signal.SIGXFSZ, handler)
     assert saved.read_bytes() == before and os.listdir(saved.parent) == ["robot.npz"]
+
+
+def test_saving_does_not_open_all_files_of_other_threads_to_everybody(tmp_path, monkeypatch):
+    """The umask belongs to the process: to read it is to change it, for as long as another thread may need to make a file."""
+    before = os.umask(0o027)
+    try:
+        with monkeypatch.context() as changed:
+            changed.setattr(os, "umask", lambda mask: pytest.fail(f"the umask of the whole process was set to {mask:o}"))
+            make().save(tmp_path / "p.npz")
+        assert (tmp_path / "p.npz").stat().st_mode & 0o777 == 0o640
+    finally:
+        os.umask(before)
+
+
+def test_a_name_as_long_as_a_file_system_takes_can_be_saved(tmp_path):
+    name = "\N{ROBOT FACE}" * 62 + ".npz"  # 252 bytes of UTF-8
+    make().save(tmp_path / name)
+    assert Profile.load(tmp_path / name).delay == make().delay
 
 
 def test_unwritable_targets(tmp_path):
