@@ -12,6 +12,7 @@ import numpy as np
 
 from edgefilter.audio.files import Recorder
 from edgefilter.audio.protocols import Sink, Source
+from edgefilter.dsp.frames import decibels
 from edgefilter.errors import EdgefilterError
 from edgefilter.filter.ego_filter import EgoFilter
 from edgefilter.types import SAMPLE_RATE, Block, Event, Samples
@@ -82,7 +83,7 @@ def peak_memory_mb() -> float | None:
 
 def level_db(x: Samples) -> float:
     """RMS level of x (n,) in dB of full scale; -120 for silence."""
-    return float(10 * np.log10(np.mean(np.square(x, dtype=np.float64)) + 1e-12)) if x.size else -120.0
+    return float(decibels(np.mean(np.square(x, dtype=np.float64)))) if x.size else -120.0
 
 
 def filter_blocks(

@@ -106,16 +106,25 @@ class EdgeCrnn(nn.Module):
         batch, frames = error.shape[:2]
         mic_x, mic_last = self._with_previous(torch.cat((features(error), features(mic)), 2), state[0])
         ref_x, ref_last = self._with_previous(torch.cat((features(reference), features(echo)), 2), state[1])
-        m1, r1 = self.mic_1(mic_x), self.ref_1(ref_x)
+        met, skips = self.encode(mic_x, ref_x)
+        remembered, hidden = self.memory(torch.relu(self.inward(met.reshape(batch, frames, -1))), state[2])
+        raw = self.decode(remembered, met, skips).reshape(batch, frames, 2, self.config.bands)
+        return apply_mask(raw.float(), error), self.speech(remembered).squeeze(-1), (mic_last, ref_last, hidden)
+
+    def encode(self, mic: Tensor, reference: Tensor) -> tuple[Tensor, tuple[Tensor, ...]]:
+        """Features of either branch beside those of the frame before, (n, 12, 1, bands), to where both meet, and the skips to the decoder."""
+        m1, r1 = self.mic_1(mic), self.ref_1(reference)
         m2, r2 = self.mic_2(m1), self.ref_2(r1)
         j1 = self.joint_1(torch.cat((m2, r2), 1))
-        j2 = self.joint_2(j1)
-        remembered, hidden = self.memory(torch.relu(self.inward(j2.reshape(batch, frames, -1))), state[2])
-        y = torch.relu(self.outward(remembered)).reshape(j2.shape)
-        y = self.up_3(torch.cat((self.up_4(torch.cat((y, j2), 1)), j1), 1))
+        return self.joint_2(j1), (m1, r1, m2, r2, j1)
+
+    def decode(self, remembered: Tensor, met: Tensor, skips: tuple[Tensor, ...]) -> Tensor:
+        """The GRU's output with what `encode` gave to the raw mask (n, 2, 1, bands)."""
+        m1, r1, m2, r2, j1 = skips
+        y = torch.relu(self.outward(remembered)).reshape(met.shape)
+        y = self.up_3(torch.cat((self.up_4(torch.cat((y, met), 1)), j1), 1))
         y = self.up_1(torch.cat((self.up_2(torch.cat((y, m2, r2), 1)), m1, r1), 1))
-        raw = self.mask(y).reshape(batch, frames, 2, self.config.bands)
-        return apply_mask(raw.float(), error), self.speech(remembered).squeeze(-1), (mic_last, ref_last, hidden)
+        return self.mask(y)
 
     def step(self, error: Tensor, mic: Tensor, reference: Tensor, echo: Tensor, state: tuple[Tensor, ...]) -> tuple[Tensor, Tensor, tuple[Tensor, ...]]:
         """One frame: spectra (1, bins, 2) to the human's (1, bins, 2), the probability (1,) that somebody speaks, and the next state."""
@@ -132,20 +141,29 @@ class EdgeCrnn(nn.Module):
 
 def features(spectrum: Tensor) -> Tensor:
     """(batch, frames, bins, 2) to real, imaginary part and magnitude, all compressed, (batch, frames, 3, bins - 1); 0 Hz is left out."""
-    x = spectrum[:, :, 1:]
-    power = (x * x).sum(-1, keepdim=True) + FLOOR**2
-    parts = torch.cat((x * power ** ((COMPRESSION - 1) / 2), power ** (COMPRESSION / 2)), -1)
-    return parts.permute(0, 1, 3, 2)
+    return compressed(spectrum[:, :, 1:].transpose(-1, -2))
+
+
+def compressed(parts: Tensor) -> Tensor:
+    """Real and imaginary parts (..., 2, bands) to these and the magnitude, (..., 3, bands), all times the magnitude to COMPRESSION - 1.
+
+    A power is the exponential of a logarithm: onnxruntime vectorises both, and its power not.
+    """
+    power = (parts * parts).sum(-2, keepdim=True) + FLOOR**2
+    return torch.cat((parts, power.sqrt()), -2) * torch.exp((COMPRESSION - 1) / 2 * torch.log(power))
 
 
 def apply_mask(raw: Tensor, error: Tensor) -> Tensor:
-    """error (batch, frames, bins, 2) times a complex mask of magnitude tanh |raw|; raw is (batch, frames, 2, bins - 1), 0 Hz is silenced."""
-    size = torch.sqrt((raw * raw).sum(2, keepdim=True) + 1e-8)
-    mask = raw * (torch.tanh(size) / size)
-    real, imaginary = mask[:, :, 0], mask[:, :, 1]
-    x, y = error[:, :, 1:, 0], error[:, :, 1:, 1]
-    human = torch.stack((real * x - imaginary * y, real * y + imaginary * x), -1)
-    return torch.cat((torch.zeros_like(error[:, :, :1]), human), 2)
+    """error (..., bins, 2) times a complex mask of magnitude tanh |raw|; raw is (..., 2, bins - 1), 0 Hz is silenced."""
+    return nn.functional.pad(masked(raw, error[..., 1:, :].transpose(-1, -2)), (1, 0)).transpose(-1, -2).contiguous()
+
+
+def masked(raw: Tensor, error: Tensor) -> Tensor:
+    """The same with real and imaginary parts as rows: raw, error and the result (..., 2, bins - 1)."""
+    size = torch.sqrt((raw * raw).sum(-2, keepdim=True) + 1e-8)
+    real, imaginary = (raw * (torch.tanh(size) / size)).split(1, -2)
+    x, y = error.split(1, -2)
+    return torch.cat((real * x - imaginary * y, real * y + imaginary * x), -2)
 
 
 def count(network: EdgeCrnn) -> dict[str, float]:

@@ -12,8 +12,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy import signal
 
-from edgefilter.echo.effect import Values
 from edgefilter.echo.effects.clock_drift import ClockDrift
+from edgefilter.echo.measurement import Values
 from edgefilter.echo.model import EchoModel
 from edgefilter.profile.data import GRID_BINS, GRID_HZ, Profile
 from edgefilter.types import PRE_ROLL, SAMPLE_RATE, Samples

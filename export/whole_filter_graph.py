@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from edgefilter.dsp.membrane import DISPLACEMENT_TAPS
 from edgefilter.dsp.stft import StftConfig
 from edgefilter.engines.crnn import SPECTRA
 from edgefilter.filter import canceller as linear
@@ -58,9 +59,9 @@ class Front(nn.Module):
         self.analysis = self.fourier if alike else Fourier(stft.n_fft, stft.window_length)
         self.register_buffer("window", _float(stft.analysis_window))
         self.register_buffer("ramp", torch.linspace(0.0, 1.0, self.hop))
-        kernel = np.zeros((self.hop + linear.DISPLACEMENT_TAPS - 1, self.hop))
+        kernel = np.zeros((self.hop + DISPLACEMENT_TAPS - 1, self.hop))
         for column in range(self.hop):
-            kernel[column : column + linear.DISPLACEMENT_TAPS, column] = oracle._lowpass_reversed
+            kernel[column : column + DISPLACEMENT_TAPS, column] = oracle._lowpass_reversed
         self.register_buffer("lowpass", _float(kernel))
 
     def forward(self, mic: Tensor, reference: Tensor, *state: Tensor) -> tuple[Tensor, ...]:
@@ -181,7 +182,7 @@ class Start(nn.Module):
             "product_ageing": ageing * product_doubt,
             "product_spectra": torch.zeros(2, 2, linear.PRODUCT_PARTITIONS, bins),
             "product_recent": torch.zeros(2, hop),
-            "moving": torch.zeros(linear.DISPLACEMENT_TAPS - 1),
+            "moving": torch.zeros(DISPLACEMENT_TAPS - 1),
             "noise": torch.zeros(bins),
             "correlation": torch.zeros(3),
             "phantoms": torch.zeros(1),

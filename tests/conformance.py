@@ -11,8 +11,9 @@ from functools import lru_cache
 import numpy as np
 from scipy import signal
 
-from edgefilter.echo import effect as effects
-from edgefilter.echo.effect import Measurement
+from edgefilter.echo.effect import complete, neutral
+from edgefilter.echo.effects import catalogue
+from edgefilter.echo.measurement import Measurement
 from edgefilter.echo.model import EchoModel
 from edgefilter.filter.stream import Stream
 from edgefilter.types import PRE_ROLL, SAMPLE_RATE, Frame
@@ -220,11 +221,11 @@ def robot_alone(name: str | None = None, values: Mapping[str, object] | None = N
 
 def changed_fan(name: str | None, values: Mapping[str, object], n: int) -> np.ndarray:
     """The fan (n,), its spectrum as an effect of stage "noise" says."""
-    if name is None or effects.find(name).stage != "noise":
+    if name is None or catalogue.find(name).stage != "noise":
         return fan(n)
     hz = np.linspace(0, SAMPLE_RATE / 2, 601)
-    effect = effects.find(name)
-    gain = np.sqrt(effect.noise_psd(effects.complete(effect, values), np.ones(601, np.float32)))
+    effect = catalogue.find(name)
+    gain = np.sqrt(effect.noise_psd(complete(effect, values), np.ones(601, np.float32)))
     spectrum = np.fft.rfft(fan(n)) * np.interp(np.fft.rfftfreq(n, 1 / SAMPLE_RATE), hz, gain)
     return np.fft.irfft(spectrum, n).astype(np.float32)
 
@@ -236,14 +237,14 @@ def held_out_power(measurement: Measurement, predicted: np.ndarray) -> float:
 
 
 def effect_check_neutral_is_the_identity(name: str) -> None:
-    x, effect = robot_speech(), effects.find(name)
-    out = effect.apply(x, effects.neutral(effect), SAMPLE_RATE)
+    x, effect = robot_speech(), catalogue.find(name)
+    out = effect.apply(x, neutral(effect), SAMPLE_RATE)
     assert np.array_equal(out, x) and out.dtype == np.float32
 
 
 def effect_check_any_length_goes_through(name: str) -> None:
-    effect = effects.find(name)
-    values = effects.complete(effect, EFFECT_CASES[name])
+    effect = catalogue.find(name)
+    values = complete(effect, EFFECT_CASES[name])
     for n in (0, 1, 100, 5000):
         x = robot_speech()[:n]
         out = effect.apply(x, values, SAMPLE_RATE)
@@ -257,15 +258,15 @@ def effect_check_fit_stays_within_the_bounds_on_hard_input(name: str) -> None:
     silence = np.zeros(n, np.float32)
     for reference, recording in ((silence, silence), (silence, fan(n)), (robot_speech(), silence), (robot_speech(), np.roll(robot_speech(), 50_000))):
         hard = Measurement(reference, recording, measurement.noise_psd, measurement.fit)
-        effects.complete(effects.find(name), effects.find(name).fit(hard, model))
+        complete(catalogue.find(name), catalogue.find(name).fit(hard, model))
 
 
 def effect_check_fit_on_a_neutral_recording_stays_neutral(name: str) -> None:
     """What the fit adds to a recording with ordinary tolerances stays under a tenth of the fan's power."""
     measurement, model = robot_alone()
     fitted = model.fit(name, measurement)
-    if effects.find(name).stage == "noise":
-        expected = effects.find(name).noise_psd(dict(fitted.effects)[name], measurement.noise_psd)
+    if catalogue.find(name).stage == "noise":
+        expected = catalogue.find(name).noise_psd(dict(fitted.effects)[name], measurement.noise_psd)
         assert abs(float(np.sum(expected) / np.sum(measurement.noise_psd)) - 1.0) < 0.1, dict(fitted.effects)[name]
     change = measurement.whiten(fitted.predict(measurement.reference) - model.predict(measurement.reference) * np.float32(10 ** (0.05 / 20)))
     assert np.mean(change.astype(np.float64) ** 2) < 0.1, dict(fitted.effects)[name]
@@ -276,8 +277,8 @@ def effect_check_fit_explains_what_its_own_apply_made(name: str) -> None:
     measurement, model = robot_alone(name, EFFECT_CASES[name], gain_db=0.0)
     before = held_out_power(measurement, model.predict(measurement.reference))
     fitted = model.fit(name, measurement)
-    if effects.find(name).stage == "noise":
-        expected = effects.find(name).noise_psd(dict(fitted.effects)[name], measurement.noise_psd)
+    if catalogue.find(name).stage == "noise":
+        expected = catalogue.find(name).noise_psd(dict(fitted.effects)[name], measurement.noise_psd)
         measurement = Measurement(measurement.reference, measurement.recording, expected, measurement.fit)
     after = held_out_power(measurement, fitted.predict(measurement.reference))
     assert before > 2.0, f"the case is too weak to show anything: {before:.2f} times the fan"

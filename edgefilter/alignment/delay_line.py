@@ -8,13 +8,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from edgefilter.dsp.fractional_delay import HALF_WIDTH, PHASES, tabulated
 from edgefilter.types import Array, Samples
-
-HALF_WIDTH = 24
-"""Zero crossings of the interpolating sinc on each side; with the window below the error is under -80 dB up to 7.2 kHz."""
-PHASES = 256
-"""Delays per sample at which the filters are tabulated; linear interpolation between them errs by less than -100 dB."""
-
 
 class Aligned(NamedTuple):
     """The reference as an aligner delivers it for one hop of the microphone.
@@ -69,24 +64,11 @@ class Tape:
         return out
 
 
-def delay_kernel(fraction: Array) -> Array:
-    """Windowed-sinc filters that delay by fraction (m,) samples, each within about -1..2; (m, 2 * HALF_WIDTH) float32.
-
-    Tap k weighs the sample k - HALF_WIDTH + 1 behind the present one. h(k) = sinc(k - d) w(k - d) with the four-term Nuttall
-    window (1981, eq. 34) taken at the shifted position, so that the filter is exact for a whole number.
-    """
-    position = np.arange(1 - HALF_WIDTH, HALF_WIDTH + 1) - np.asarray(fraction, float)[:, None]
-    phase = np.clip(position / (HALF_WIDTH + 1.0), -1.0, 1.0) * np.pi
-    c = np.cos(phase)
-    window = 0.355768 + 0.487396 * c + 0.144232 * (2 * c * c - 1) + 0.012604 * (4 * c * c - 3) * c
-    return (np.sinc(position) * window).astype(np.float32)
-
-
 @lru_cache(maxsize=1)
-def kernel_table() -> tuple[list[Array], list[Array]]:
-    """The filters for delays of -1 to 2, every 1 / PHASES, last tap first, and their differences; made at the first call, in some ms."""
-    table = delay_kernel(np.arange(3 * PHASES + 1) / PHASES - 1.0)[:, ::-1]
-    return list(np.ascontiguousarray(table[:-1])), list(np.diff(table, axis=0))
+def kernel_table() -> tuple[list[Samples], list[Samples]]:
+    """The rows of the kernel table and of its slopes: one row of a list is found several times as fast as one of an array."""
+    table, step = tabulated()
+    return list(table), list(step)
 
 
 def _kernels(*delays: float) -> Array:

@@ -10,6 +10,8 @@ from scipy.ndimage import uniform_filter1d
 
 from edgefilter.alignment.delay_line import Tape
 from edgefilter.dsp import fourier
+from edgefilter.dsp.fourier import power
+from edgefilter.dsp.lag import climb, turn
 from edgefilter.types import Samples
 
 FRAME = 2048
@@ -95,12 +97,12 @@ class DelayMeter:
         if not (drive > 1e-9 and energy > 1e-12):
             return None
         m, a, w = fourier.rfft(self._framed)
-        m *= _turn(self._omega, centre - whole)
-        power_a = _power(a)
+        m *= turn(self._omega, centre - whole)
+        power_a = power(a)
         if self._cross is None:
-            self._start(_power(m), power_a)
+            self._start(power(m), power_a)
         self._last = (m * np.conj(a), power_a)
-        powers = _power(np.array((m - self.response * a, m)))  # smoothed into an array of ours: to make its own takes scipy as long again
+        powers = power(np.array((m - self.response * a, m)))  # smoothed into an array of ours: to make its own takes scipy as long again
         left, power_m = uniform_filter1d(powers, 31, output=np.empty_like(powers), mode="nearest")
         weight = self._band / (left + 0.05 * power_m + (1e-6 * power_m.max() + 1e-20))
         m *= np.conj(self.response)
@@ -119,9 +121,9 @@ class DelayMeter:
         near = float(likelihood[expected - 2 : expected + 3].max())
         at, peak, strength, ratio = max((_highest(likelihood, reach) for reach in {REACH, expected}), key=lambda found: found[2] * found[3])
         part, inside = divmod(at, 2 * REACH)
-        offset = at - inside + REACH - expected + self._refine(products[part], inside - REACH)
+        offset = at - inside + REACH - expected + climb(products[part], self._omega, inside - REACH, steps=3)
         there = references[part][SIZE - FRAME - inside : SIZE - inside] * self._window
-        information = 2.0 * float(self._omega_squared.dot(_power(self.response) * power_a * weight)) * FRAME / SIZE
+        information = 2.0 * float(self._omega_squared.dot(power(self.response) * power_a * weight)) * FRAME / SIZE
         explained = 1.0 - float(self._band.dot(left / (power_m + 1e-20))) / self._band_size
         return Measurement(
             offset=offset,
@@ -157,7 +159,7 @@ class DelayMeter:
         cross, power = self._last
         level = float(self._total / (np.add.reduce(power) + 1e-20)) / self._blocks
         rate = min(max(level, 0.03), 3.0)
-        self._cross = 0.98 * self._cross + rate * cross * _turn(self._omega, offset)
+        self._cross = 0.98 * self._cross + rate * cross * turn(self._omega, offset)
         self._power = 0.98 * self._power + rate * power
         self._total = np.add.reduce(self._power)
         self._blocks = 0.98 * self._blocks + 1.0
@@ -173,18 +175,6 @@ class DelayMeter:
         self._total = np.add.reduce(self._power)
         self._cross = self._blocks * smooth * self._prior * np.float32(scale)
         self.response = self._prior * np.float32(scale)
-
-    def _refine(self, product: np.ndarray, whole: int) -> float:
-        """Newton steps on the likelihood from its highest whole sample, at most one sample away."""
-        offset = 0.0
-        for _ in range(3):
-            z = product * _turn(self._omega, whole + offset)
-            slope = -float(self._omega.dot(z.imag))
-            curvature = -float(self._omega_squared.dot(z.real))
-            if curvature >= 0.0:
-                break
-            offset = min(max(offset - slope / curvature, -1.0), 1.0)
-        return whole + offset
 
 
 class DriftFilter:
@@ -234,14 +224,6 @@ class DriftFilter:
         return delay, slope, delay - half * slope
 
 
-def _turn(omega: Samples, delay: float) -> np.ndarray:
-    """exp(j omega delay), complex64; several times as fast as np.exp of a complex array."""
-    angle, turn = omega * delay, np.empty(omega.size, np.complex64)
-    np.cos(angle, out=turn.real)
-    np.sin(angle, out=turn.imag)
-    return turn
-
-
 def _highest(likelihood: Samples, reach: int) -> tuple[int, float, float, float]:
     """Index of the highest peak at most reach from the middle, its height, strength and ratio among the lags there."""
     first = likelihood.size // 2 - reach
@@ -260,7 +242,3 @@ def _overlap(reference: Samples) -> Samples:
     change = reference[earliest + 2 : latest + 2] - reference[earliest + 1 : latest + 1]
     total = np.add.accumulate(np.square(change, out=change).astype(np.float64))
     return (total[half:] - total[:-half])[::-1].astype(np.float32)
-
-
-def _power(spectrum: np.ndarray) -> Samples:
-    return spectrum.real**2 + spectrum.imag**2

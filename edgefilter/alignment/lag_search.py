@@ -6,10 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy import fft
-from scipy.ndimage import uniform_filter1d
 
 from edgefilter.alignment.announced import Playback
 from edgefilter.alignment.delay_line import Tape
+from edgefilter.dsp.lag import LOWEST_HZ, flattened
 from edgefilter.types import SAMPLE_RATE, Samples
 
 WINDOW = 7168
@@ -18,8 +18,6 @@ MINIMUM = 832
 """Samples (52 ms) of an utterance that must have been heard before its lag is believed: less of any two sounds may agree by chance."""
 FADE = 256
 _RISE = (0.5 - 0.5 * np.cos(np.pi * (np.arange(FADE) + 0.5) / FADE)).astype(np.float32)
-SMOOTHING_HZ = 32.0
-"""Width over which spectra are averaged for the whitening: voice harmonics are flattened, so pitch makes no side peak."""
 REFLECTIONS, REFLECTED = 320, 0.75
 """Peaks up to 20 ms behind an arrival may be its reflections and count only this much against it."""
 COARSE = 32
@@ -73,7 +71,7 @@ class LagSearch:
         _soften(r[first:])
         step = np.diff(r, prepend=r[:1])
         self._total = np.concatenate(([0.0], np.cumsum(np.square(step, out=step).reshape(-1, COARSE).sum(axis=1), dtype=np.float64)))
-        self._reference = _whitened(fft.rfft(r), 1e-5)
+        self._reference = flattened(fft.rfft(r), 1e-5)
         self._prepared, self._since = now, since
 
     def listen(self, mic: Tape, now: int, since: int) -> None:
@@ -86,9 +84,9 @@ class LagSearch:
         x = np.zeros(self._size, np.float32)
         x[self._start :] = mic.read(now - WINDOW + skipped, now)
         _soften(x[self._start :])
-        self._cross = _whitened(fft.rfft(x), 1e-6) * np.conj(self._reference) if x.any() else None
+        self._cross = flattened(fft.rfft(x), 1e-6) * np.conj(self._reference) if x.any() else None
         if self._cross is not None:
-            self._cross[: int(100 * self._size / SAMPLE_RATE)] = 0.0
+            self._cross[: int(LOWEST_HZ * self._size / SAMPLE_RATE)] = 0.0
             self._cross *= self._phases[self._size]
 
     def find(self) -> Candidate | None:
@@ -125,8 +123,8 @@ class LagSearch:
         _soften(x[ASIDE:-ASIDE])
         r = ref.read(stop - WINDOW - found.lag - ASIDE, stop - found.lag + ASIDE).copy()
         _soften(r)
-        cross = _whitened(fft.rfft(x), 1e-6) * np.conj(_whitened(fft.rfft(r), 1e-5)) * self._phases[x.size]
-        cross[: int(100 * x.size / SAMPLE_RATE)] = 0.0
+        cross = flattened(fft.rfft(x), 1e-6) * np.conj(flattened(fft.rfft(r), 1e-5)) * self._phases[x.size]
+        cross[: int(LOWEST_HZ * x.size / SAMPLE_RATE)] = 0.0
         score = np.roll(fft.irfft(cross, x.size), ASIDE)[: 2 * ASIDE]
         if not self._signed:
             np.abs(score, out=score)
@@ -146,15 +144,6 @@ def _soften(x: Samples) -> None:
     rise = _RISE[: x.size]
     x[: rise.size] *= rise
     x[x.size - rise.size :] *= rise[::-1]
-
-
-def _whitened(spectrum: np.ndarray, floor: float) -> np.ndarray:
-    """The spectrum over the root of its smoothed power."""
-    width = round(SMOOTHING_HZ * 2 * spectrum.size / SAMPLE_RATE)
-    power = spectrum.real**2 + spectrum.imag**2
-    power = uniform_filter1d(power, width, output=np.empty_like(power), mode="nearest")
-    power += np.float32(floor * power.max() + 1e-20)
-    return spectrum * (np.float32(1.0) / np.sqrt(power, out=power))
 
 
 def _phase(response: Samples | None, pre_roll: int, size: int) -> np.ndarray | np.complex64:

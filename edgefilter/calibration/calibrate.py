@@ -8,6 +8,8 @@ from scipy import signal
 from edgefilter.calibration.checks import check_found, check_lengths, collect_warnings
 from edgefilter.calibration.stepped_sine import SteppedLaw, response_from_stepped_sine, response_from_sweep, stepped_law
 from edgefilter.calibration.sweep import Deconvolution, deconvolve, find_direct, harmonic_distortion, sweep_law
+from edgefilter.dsp.frames import all_block_power
+from edgefilter.dsp.psd import third_octave_bands
 from edgefilter.echo.model import EchoModel
 from edgefilter.errors import CalibrationError, SignalError
 from edgefilter.profile.data import DISTORTION_ORDERS, GRID_FFT, GRID_HZ, Profile
@@ -94,7 +96,7 @@ def impulse_response(result: Deconvolution, direct: int) -> Samples:
     """
     path = result.cut(direct - PRE_ROLL, MAX_TAPS)
     block = SAMPLE_RATE // 50
-    energy = np.add.reduceat(path**2, np.arange(0, path.size, block))
+    energy = block * all_block_power(path, block)
     floor = block * 2 * result.noise(1.0).sum() / result.response.size
     below = np.flatnonzero(energy[2:] < 2 * floor)
     knee = int(below[0] + 2) * block if below.size else MAX_TAPS
@@ -103,13 +105,6 @@ def impulse_response(result: Deconvolution, direct: int) -> Samples:
     path = path[:length].copy()
     path[-fade:] *= np.cos(np.linspace(0, np.pi / 2, fade)) ** 2
     return path.astype(np.float32)
-
-
-def third_octave_bands() -> Array:
-    """(B, 2) Hz, edges of the base-ten third-octave bands of 50 Hz to 8 kHz (IEC 61260-1, 5.4), the last one cut at 8 kHz."""
-    centres = 1000.0 * 10 ** (np.arange(-13, 10) / 10)
-    edges = np.stack((centres * 10**-0.05, centres * 10**0.05), axis=1)
-    return np.minimum(edges, SAMPLE_RATE / 2)
 
 
 def band_snr_db(result: Deconvolution, path: Samples, bands: Array) -> Array:

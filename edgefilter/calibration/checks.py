@@ -7,6 +7,9 @@ from scipy import signal
 
 from edgefilter.calibration.stepped_sine import SteppedLaw
 from edgefilter.calibration.sweep import EARLIEST_DIRECT, LATEST_DIRECT, Deconvolution, SweepLaw, deconvolve
+from edgefilter.dsp.fourier import power
+from edgefilter.dsp.frames import blocks
+from edgefilter.dsp.psd import frequencies, hann
 from edgefilter.errors import CalibrationError
 from edgefilter.types import PRE_ROLL, SAMPLE_RATE, Array, Samples
 
@@ -187,10 +190,8 @@ def doubtful_noise(reference: Samples, noise: Samples, result: Deconvolution, di
 def _unsteady(noise: Samples) -> tuple[float, float, float]:
     """(dB by which the loudest 100 ms stand out of the median in any octave, percent of such times above 3 dB, centre Hz)."""
     block = SAMPLE_RATE // 10
-    count = max(noise.size // block, 1)
-    frames = noise[: count * block].reshape(count, -1).astype(np.float64)
-    spectra = np.abs(np.fft.rfft(frames * signal.get_window("hann", frames.shape[1]), axis=1)) ** 2
-    hz = np.arange(spectra.shape[1]) * SAMPLE_RATE / frames.shape[1]
+    spectra = power(np.fft.rfft(blocks(noise, block) * hann(block), axis=1))
+    hz = frequencies(spectra.shape[1])
     worst = (0.0, 0.0, 0.0)
     for centre in (250.0, 500.0, 1000.0, 2000.0, 4000.0):
         level = 10 * np.log10(spectra[:, (hz >= centre / 1.414) & (hz < centre * 1.414)].sum(axis=1) + 1e-14)

@@ -7,22 +7,21 @@ from numpy.typing import NDArray
 from scipy import fft, signal
 from scipy.ndimage import binary_closing, uniform_filter1d
 
-from edgefilter.calibration.calibrate import third_octave_bands
-from edgefilter.diagnosis.offset import MAX_OFFSET, shift
-from edgefilter.diagnosis.prepare import BLOCK, MIN_SECONDS
-from edgefilter.echo.effect import find, whiten
+from edgefilter.dsp.fractional_delay import delayed, interpolate
+from edgefilter.dsp.frames import all_block_power, block_power, decibels, frames
+from edgefilter.dsp.lag import correlation_near, flat_cross, highest
+from edgefilter.dsp.psd import ROUNDING_PSD, periodograms, third_octave_bands
+from edgefilter.echo.effects.catalogue import find, names
+from edgefilter.echo.measurement import whiten
 from edgefilter.echo.model import EchoModel
+from edgefilter.echo.recording import BLOCK, MAX_OFFSET, fitted_blocks, paired
 from edgefilter.echo.wiener import convolve_from, fit_filter
 from edgefilter.errors import SignalError
 from edgefilter.profile.data import DISTORTION_ORDERS, GRID_FFT, GRID_HZ, Profile
-from edgefilter.types import PRE_ROLL, SAMPLE_RATE, Samples, as_samples
+from edgefilter.types import PRE_ROLL, SAMPLE_RATE, Samples
 
 SOURCE = "made from the recording itself: what is stationary and linear is taken for the robot"
-ABSORBED = ("playback_gain", "bandlimit", "chassis_resonance", "late_reverb")
-"""Stationary linear effects: the path fitted to a recording holds them already, so that nothing can tell them from the robot."""
 TAPS = 4096
-SMOOTHING_HZ, LOWEST_HZ = 32.0, 100.0
-"""Width over which spectra are averaged before they are flattened, and from where on they count."""
 STANDS_OUT = 8.0
 """Times the root mean square of all lags that the true one reaches; 4.5 measured where there is no robot, 10 to 87 where there is."""
 LEAST_DROP_DB, OTHERS_DB = 3.0, 6.0
@@ -48,26 +47,22 @@ def self_calibrate(recording: Samples, reference: Samples) -> Profile:
 
     The path is a regularised least-squares filter on every other half second, those that prepare() fits on, so that the others say
     how well it predicts. Samples weigh the less the more the first fit leaves of them (iteratively reweighted least squares, Huber
-    1981), so that a talker does not bend it. The fan is what the robot's silences hold. ABSORBED effects are in it at their neutral
-    values, so that no search claims them. Raises SignalError where the recording does not contain the reference.
+    1981), so that a talker does not bend it. The fan is what the robot's silences hold. Stationary linear effects, which the path
+    holds already, are in it at their neutral values, so that no search claims them. Raises SignalError where the recording does not contain the reference.
     """
-    y, x = as_samples(recording, "recording"), as_samples(reference, "reference")
-    for samples, name in ((y, "recording"), (x, "reference")):
-        if samples.size < MIN_SECONDS * SAMPLE_RATE:
-            raise SignalError(f"the {name} is {samples.size / SAMPLE_RATE:.2f} s long, expected at least {MIN_SECONDS:g} s of the robot's voice")
-    x = np.pad(x, (0, max(y.size - x.size, 0)))[: y.size]
+    y, x = paired(recording, reference)
     lag = find_lag(y, x)
-    ppm, behind = find_drift(y, shift(x, lag))
+    ppm, behind = find_drift(y, delayed(x, lag))
     lag += behind
-    psd, seconds = fan_in_silences(y, silences(shift(x, lag)))
+    psd, seconds = fan_in_silences(y, silences(delayed(x, lag)))
     target = whiten(y, psd)
-    fit = (np.arange(y.size) // BLOCK % 2 == 0).astype(np.float32)
-    sound = whiten(_drifting(shift(x, lag - REACH), ppm), psd)
+    fit = fitted_blocks(y.size).astype(np.float32)
+    sound = whiten(_drifting(delayed(x, lag - REACH), ppm), psd)
     even = fit / np.maximum(uniform_filter1d(target**2, MOMENT, mode="nearest"), 1.0)
     rough = fit_filter(sound, target, even, 2 * REACH, 0, np.full(2 * REACH, 1e-2))
     delay = lag - REACH + int(np.argmax(np.abs(rough)))
     weights = fit * disturbance(target - convolve_from(sound, rough, 0))
-    sound = whiten(_drifting(shift(x, delay - PRE_ROLL), ppm), psd)
+    sound = whiten(_drifting(delayed(x, delay - PRE_ROLL), ppm), psd)
     path = fit_path(sound, target, weights, float(np.square(rough).max()))
     predicted = convolve_from(sound, path, 0)
     _check_learned(target, predicted, fit, delay, ppm)
@@ -86,7 +81,7 @@ def self_calibrate(recording: Samples, reference: Samples) -> Profile:
 
 
 def _with_absorbed(echo: EchoModel) -> EchoModel:
-    for name in ABSORBED:
+    for name in (name for name in names() if find(name).absorbed):
         echo = echo.with_effect(name, {})
     return echo
 
@@ -98,17 +93,10 @@ def find_lag(recording: Samples, reference: Samples) -> int:
     stands out: the highest of independent values at all lags is 4 to 5 times their root mean square.
     """
     n = fft.next_fast_len(2 * recording.size, real=True)
-    width = max(int(SMOOTHING_HZ * n / SAMPLE_RATE), 1)
-    cross = np.ones(n // 2 + 1, np.complex128)
-    for spectrum in (fft.rfft(recording.astype(np.float64), n), fft.rfft(reference.astype(np.float64), n).conj()):
-        power = uniform_filter1d(np.abs(spectrum) ** 2, width, mode="nearest")
-        cross *= spectrum / np.sqrt(power + 1e-6 * power.max() + 1e-20)
-    cross[: int(LOWEST_HZ * n / SAMPLE_RATE)] = 0.0
-    reach = min(int(MAX_OFFSET * SAMPLE_RATE), recording.size - 1)
-    near = np.abs(np.take(fft.irfft(cross, n), np.arange(-reach, reach + 1), mode="wrap"))
-    lag = int(np.argmax(near)) - reach
-    if not near.max() > STANDS_OUT * np.sqrt(np.mean(near**2)):
-        level = 10 * np.log10(float(np.mean(reference.astype(np.float64) ** 2)) + 1e-12)
+    near = np.abs(correlation_near(flat_cross(reference, recording, n), n, min(int(MAX_OFFSET * SAMPLE_RATE), recording.size - 1)))
+    lag, height = highest(near)
+    if not height > STANDS_OUT:
+        level = decibels(np.mean(np.square(reference, dtype=np.float64)))
         raise SignalError(
             f"the recording does not contain the reference (of {level:.0f} dBFS) at any lag up to {MAX_OFFSET:g} s, so there is no robot in it "
             "to learn from: give a recording in which the robot talks, or a calibration (--profile)"
@@ -117,7 +105,9 @@ def find_lag(recording: Samples, reference: Samples) -> int:
 
 
 def _drifting(x: Samples, ppm: float) -> Samples:
-    return find("clock_drift").apply(x, {"ppm": ppm, "offset": 0.0}, SAMPLE_RATE) if ppm else x
+    """x (n,) read at a clock that is ppm faster."""
+    n = np.arange(x.size)
+    return interpolate(x, n + 1e-6 * ppm * n) if ppm else x
 
 
 def find_drift(recording: Samples, reference: Samples) -> tuple[float, int]:
@@ -129,17 +119,12 @@ def find_drift(recording: Samples, reference: Samples) -> tuple[float, int]:
     size, part = 4 * WINDOW, slice(2 * WINDOW, 3 * WINDOW)
     padded = np.pad(reference, (2 * WINDOW, 2 * WINDOW))
     starts = np.arange(0, recording.size - WINDOW + 1, WINDOW // 2)
-    width = max(int(SMOOTHING_HZ * size / SAMPLE_RATE), 1)
     near = np.arange(-DRIFT_REACH * UPSAMPLED, DRIFT_REACH * UPSAMPLED + 1)
     rows = np.zeros((starts.size, near.size))
     for row, start in zip(rows, starts, strict=True):
         heard = np.zeros(size)
         heard[part] = recording[start : start + WINDOW]
-        cross = np.ones(size // 2 + 1, np.complex128)
-        for spectrum in (fft.rfft(heard), fft.rfft(padded[start : start + size].astype(np.float64)).conj()):
-            power = uniform_filter1d(np.abs(spectrum) ** 2, width, mode="nearest")
-            cross *= spectrum / np.sqrt(power + 1e-6 * power.max() + 1e-20)
-        cross[: int(LOWEST_HZ * size / SAMPLE_RATE)] = 0.0
+        cross = flat_cross(padded[start : start + size], heard, size)
         row[:] = np.take(fft.irfft(np.pad(cross, (0, (UPSAMPLED - 1) * size // 2)), UPSAMPLED * size), near, mode="wrap")
     grid = np.arange(-MAX_PPM, MAX_PPM + PPM_STEP, PPM_STEP)
     middles = starts + WINDOW / 2
@@ -157,7 +142,7 @@ def find_drift(recording: Samples, reference: Samples) -> tuple[float, int]:
 def silences(reference: Samples) -> NDArray[np.bool_]:
     """(n,) where an aligned reference (n,) is silent and has been for TAIL_S."""
     block = SAMPLE_RATE // 10
-    level = np.add.reduceat(reference.astype(np.float64) ** 2, np.arange(0, reference.size, block))
+    level = all_block_power(reference, block)
     loud = level > 10 ** (SILENT_DB / 10) * level.max(initial=1e-30)
     after = round(TAIL_S * 10)
     near = np.convolve(loud, np.ones(after + 2))[1 : 1 + loud.size] > 0
@@ -170,15 +155,13 @@ def fan_in_silences(recording: Samples, silent: NDArray[np.bool_]) -> tuple[Samp
     Where silent (n,) leaves fewer than LEAST_FRAMES, the quietest twentieth of all frames is taken, and 0 seconds are said.
     """
     step = GRID_FFT // 2
-    frames = np.lib.stride_tricks.sliding_window_view(recording, GRID_FFT)[::step]
-    window = signal.get_window("hann", GRID_FFT).astype(np.float32)
-    power = np.abs(fft.rfft(frames * window, axis=1)) ** 2
-    whole = np.lib.stride_tricks.sliding_window_view(silent, GRID_FFT)[::step].all(axis=1)
+    power = periodograms(recording, GRID_FFT)
+    whole = frames(silent, GRID_FFT, step).all(axis=1)
     share = 0.5 if whole.sum() >= LEAST_FRAMES else 0.05
     at = np.flatnonzero(whole) if share == 0.5 else np.arange(power.shape[0])
-    order = at[np.argsort(np.log(power[at] + 1e-12).mean(axis=1))]
+    order = at[np.argsort(np.log(np.maximum(power[at], ROUNDING_PSD)).mean(axis=1))]
     kept = power[order[: max(int(share * order.size), LEAST_FRAMES // 2)]]
-    psd = 2 * uniform_filter1d(kept.mean(axis=0), 5, mode="nearest") / (SAMPLE_RATE * float(np.sum(window**2)))
+    psd = uniform_filter1d(kept.mean(axis=0), 5, mode="nearest")
     return psd.astype(np.float32), kept.shape[0] * step / SAMPLE_RATE if share == 0.5 else 0.0
 
 
@@ -219,15 +202,10 @@ def _snr_by_band(predicted: Samples) -> tuple[np.ndarray, np.ndarray]:
     return bands, 10 * np.log10(np.clip(np.array(means, np.float64), 1e-2, 1e12))
 
 
-def _by_block(x: Samples) -> np.ndarray:
-    """Mean square of x (n,) in each whole BLOCK."""
-    return np.square(x[: x.size // BLOCK * BLOCK].astype(np.float64)).reshape(-1, BLOCK).mean(axis=1)
-
-
 def _check_learned(target: Samples, predicted: Samples, fit: Samples, delay: float, ppm: float) -> None:
     """Raise SignalError unless the prediction takes LEAST_DROP_DB away in a fifth of the blocks that no fit has used."""
-    drop = 10 * np.log10((_by_block(target) + 1e-12) / (_by_block(target - predicted) + 1e-12))
-    held = drop[_by_block(fit) == 0.0]
+    drop = decibels(block_power(target, BLOCK)) - decibels(block_power(target - predicted, BLOCK))
+    held = drop[block_power(fit, BLOCK) == 0.0]
     if held.size and float(np.quantile(held, 0.8)) >= LEAST_DROP_DB:
         return
     clocks = f", clocks {abs(ppm):.0f} ppm apart" if ppm else ""
@@ -242,8 +220,8 @@ def others(target: Samples, predicted: Samples) -> list[tuple[float, float]]:
 
     Moments of a second or less between them belong to them.
     """
-    rest = _by_block(target - predicted)
-    loud = rest > 10 ** (OTHERS_DB / 10) * np.maximum(_by_block(predicted), 10.0)
+    rest = block_power(target - predicted, BLOCK)
+    loud = rest > 10 ** (OTHERS_DB / 10) * np.maximum(block_power(predicted, BLOCK), 10.0)
     loud = binary_closing(np.pad(loud, 2), np.ones(3))[2:-2]
     edges = np.flatnonzero(np.diff(np.concatenate(([False], loud, [False]))))
     return [(begin * BLOCK / SAMPLE_RATE, end * BLOCK / SAMPLE_RATE) for begin, end in edges.reshape(-1, 2)]

@@ -7,6 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import signal
 
+from edgefilter.dsp.fourier import power
+from edgefilter.dsp.frames import frames
+from edgefilter.dsp.psd import hann
 from edgefilter.errors import CalibrationError
 from edgefilter.types import SAMPLE_RATE, Array, Samples
 
@@ -15,7 +18,7 @@ STEPS_HZ = np.arange(0, 8001, STEP_HZ, dtype=np.float64)
 STEP_SAMPLES = 1600
 """0.1 s a step, inferred (the paper does not say): one frame of 1200 samples after 400 for the room to settle."""
 FRAME, HOP = 1200, 160
-_WINDOW = signal.get_window("hann", FRAME)
+_WINDOW = hann(FRAME)
 
 
 def generate_stepped_sine(amplitude: float = 0.35, lead_s: float = 0.5, tail_s: float = 1.0) -> Samples:
@@ -78,11 +81,11 @@ def response_from_stepped_sine(
     read 0. Distortion of order k: energy at k f over the energy at f, steps from 104 Hz on, the fan's energy subtracted.
     """
     ends = law.start + STEP_SAMPLES * np.arange(1, STEPS_HZ.size + 1)
-    frames = ends[:, None] + np.arange(-FRAME, 0)
-    padded = np.pad(recording.astype(np.float64), (0, max(0, int(ends[-1]) + delay - recording.size)))[np.maximum(frames + delay, 0)]
+    at = ends[:, None] + np.arange(-FRAME, 0)
+    padded = np.pad(recording.astype(np.float64), (0, max(0, int(ends[-1]) + delay - recording.size)))[np.maximum(at + delay, 0)]
     grid = np.arange(FRAME // 2 + 1) * SAMPLE_RATE / FRAME
-    fan, fan_power = mean_magnitude(noise), np.mean(np.abs(_frames(noise)) ** 2, axis=0)
-    played = _tone_magnitude(reference[frames].astype(np.float64), STEPS_HZ)
+    fan, fan_power = mean_magnitude(noise), np.mean(power(_frames(noise)), axis=0)
+    played = _tone_magnitude(reference[at].astype(np.float64), STEPS_HZ)
     heard = _tone_magnitude(padded, STEPS_HZ)
     response = np.maximum(heard - np.interp(STEPS_HZ, grid, fan), 0.0) / np.maximum(played, 1e-9)
     response[0] = 0.0
@@ -94,10 +97,10 @@ def response_from_stepped_sine(
     return np.interp(grid, STEPS_HZ, response).astype(np.float32), np.array(levels)
 
 
-def _tone_magnitude(frames: Array, frequencies: Array) -> Array:
-    """|DFT| of each Hann-weighted frame (k, FRAME) at its own frequency (k,)."""
+def _tone_magnitude(pieces: Array, frequencies: Array) -> Array:
+    """|DFT| of each Hann-weighted piece (k, FRAME) at its own frequency (k,)."""
     turn = np.exp(-2j * np.pi * frequencies[:, None] / SAMPLE_RATE * np.arange(FRAME))
-    return np.abs(np.sum(frames * _WINDOW * turn, axis=1))
+    return np.abs(np.sum(pieces * _WINDOW * turn, axis=1))
 
 
 def mean_magnitude(samples: Samples) -> Array:
@@ -126,4 +129,4 @@ def response_from_sweep(reference: Samples, recording: Samples, noise: Samples, 
 def _frames(samples: Samples) -> Array:
     """(frames, 601) complex spectra."""
     padded = np.pad(samples, (0, max(0, FRAME - samples.size)))
-    return np.fft.rfft(np.lib.stride_tricks.sliding_window_view(padded, FRAME)[::HOP] * _WINDOW, axis=1)
+    return np.fft.rfft(frames(padded, FRAME, HOP) * _WINDOW, axis=1)

@@ -4,21 +4,17 @@ from __future__ import annotations
 
 import numpy as np
 
+from edgefilter.diagnosis.criteria import Criteria
 from edgefilter.diagnosis.score import FRAMES_PER_CELL, Judge
-from edgefilter.diagnosis.trials import Found, Trial, size_db
+from edgefilter.diagnosis.trials import Found, Trial
+from edgefilter.echo.effects.catalogue import find, names
 from edgefilter.types import Samples
 
-NAME = "bandlimit"
-GONE, SURE = 0.25, 4.0
-"""Of the predicted power above the edge no more than this part is there, and what is missing is so many standard deviations."""
-PASSED = (0.8, 1.2)
-"""Between these times the predicted power is what lies well below the edge: the band is cut, not the volume turned."""
-ORDER = 16.0
 INDEPENDENT = 0.6
 """Part of a cell's half-overlapping Hann frames that counts as independent."""
 
 
-def band_edge(judge: Judge, prediction: Samples) -> float | None:
+def band_edge(judge: Judge, prediction: Samples, criteria: Criteria) -> float | None:
     """Frequency in Hz above which the voice of prediction (n,) is missing from the recording's power; None where it is all there.
 
     The power over that of the robot's silences, summed over all bands above an edge, is held against the predicted one.
@@ -34,24 +30,29 @@ def band_edge(judge: Judge, prediction: Samples) -> float | None:
     variance = (fan + expected.mean(axis=0)) ** 2 * judge.freedom / (FRAMES_PER_CELL * INDEPENDENT)
     error = np.sqrt(np.cumsum(variance[::-1])[::-1] * (1.0 / active.sum() + 1.0 / max(len(quiet), 4)))
     there, due = (np.cumsum(x[::-1])[::-1] for x in (voice, wanted))
-    for i in np.flatnonzero((there < GONE * due) & (due - there > SURE * error)):
+    for i in np.flatnonzero((there < criteria.edge_gone * due) & (due - there > criteria.edge_sure * error)):
         edge = float(judge.band_hz[i, 0])
         below = (judge.band_hz[:, 0] >= 0.25 * edge) & (judge.band_hz[:, 1] <= 0.7 * edge)
-        if below.any() and PASSED[0] <= voice[below].sum() / wanted[below].sum() <= PASSED[1]:
+        low, high = criteria.edge_passed
+        if below.any() and low <= voice[below].sum() / wanted[below].sum() <= high:
             return edge
     return None
 
 
-def cut_by_power(found: Found) -> Found | None:
+def cut_by_power(found: Found, criteria: Criteria) -> Found | None:
     """The outcome of a search with nothing but a band limit, where the recording's power shows one and the residual falls by it; else None."""
     judge = Judge(found.prepared)
-    edge = None if NAME in dict(found.start.effects) else band_edge(judge, found.base.prediction)
+    edge = band_edge(judge, found.base.prediction, criteria)
     if edge is None:
         return None
-    model = found.start.with_effect(NAME, {"cutoff_hz": edge, "order": ORDER})
-    after = judge.of(model)
-    gain = found.base.level_db - after.level_db
-    if gain <= 0.0:
-        return None
-    step = Trial(NAME, dict(model.effects)[NAME], model, after, gain, size_db(after.prediction - found.base.prediction, found.prepared))
-    return Found(found.prepared, found.start, model, found.base, after, (step,))
+    absent = [name for name in names() if name not in dict(found.start.effects)]
+    cuts = [(name, values) for name in absent if (values := find(name).cutting_above(edge)) is not None]
+    for name, values in cuts:
+        model = found.start.with_effect(name, values)
+        after = judge.of(model)
+        gain = found.base.level_db - after.level_db
+        if gain > 0.0:
+            size = judge.size_db(after.prediction - found.base.prediction)
+            step = Trial(name, dict(model.effects)[name], model, after, gain, size)
+            return Found(found.prepared, found.start, model, found.base, after, (step,), found.notes)
+    return None

@@ -8,7 +8,11 @@ import numpy as np
 
 from edgefilter.diagnosis.prepare import Prepared, prepare
 from edgefilter.diagnosis.score import Judge
-from edgefilter.echo.effect import whiten
+from edgefilter.dsp.frames import block_power, blocks, decibels, frames
+from edgefilter.dsp.psd import frequencies, periodograms, total_power
+from edgefilter.echo.evidence import Score
+from edgefilter.echo.measurement import whiten
+from edgefilter.echo.model import EchoModel
 from edgefilter.profile.data import Profile
 from edgefilter.types import SAMPLE_RATE, Array, Samples
 
@@ -22,7 +26,8 @@ LAG_EDGES_MS = (-20.0, -4.0, 0.0, 4.0, 10.0, 30.0, 100.0, 200.0, 400.0, 800.0)
 class Comparison:
     """A recording against its prediction. Decibels of excess are of the residual, whitened by the fan's PSD, over the fan.
 
-    excess_db: of the whole; 0 means that nothing is unexplained. noise_floor_db: the fan, dB re full scale.
+    excess_db: of the samples that no diagnosis fits on, every second half second, as Judge scores them: the one figure that compare, add,
+    diagnose and the report show; 0 means that nothing is unexplained. All else is of the whole. noise_floor_db: the fan, dB re full scale.
     bands: (low_hz, high_hz, excess_db). times: (start_s, end_s, excess_db). levels: (low_dbfs, high_dbfs, excess_db) by the level of
     the predicted voice. lags: (low_ms, high_ms, share) of the residual's correlation with the reference, by lag.
     silence_excess_db: while the robot is silent; nan where it never is. human: (start_s, end_s) where somebody talks, left out.
@@ -60,40 +65,39 @@ def _plain(value: object) -> object:
 def compare(profile: Profile, recording: Samples, reference: Samples, *, sample_rate: int = SAMPLE_RATE) -> Comparison:
     """Say how far the profile's prediction for reference (n,) is from recording (m,), both float, full scale +-1, at sample_rate.
 
-    A constant lag of up to MAX_OFFSET seconds either way and the ordinary tolerances (judge.TOLERANCE of the path, prepare's
+    A constant lag of up to MAX_OFFSET seconds either way and the ordinary tolerances (score.TOLERANCE of the path, prepare's
     FAN_TOLERANCE_DB of the fan) are taken out. Raises SignalError where the recording does not contain the reference.
     """
     prepared = prepare(profile, recording, reference, sample_rate=sample_rate)
-    gain = profile.echo.microphone_gain(prepared.prediction.size)
-    return describe(prepared, Judge(prepared).correct(prepared.prediction), gain)
+    return describe(prepared, prepared.model)
 
 
-def describe(prepared: Prepared, prediction: Samples | None = None, gain: Samples | None = None) -> Comparison:
-    """The comparison of a prepared recording with prediction (n,), by default that of the profile.
+def describe(prepared: Prepared, model: EchoModel, score: Score | None = None) -> Comparison:
+    """The comparison of a prepared recording with what a model predicts; score: the judge's of that model, where it is known.
 
-    gain: (n,) of the microphone, which the fan passed as well: it is taken out of the residual before that is held against the fan.
+    A gain of the microphone is taken out of the residual before that is held against the fan, which passed it as well.
     """
-    measurement = prepared.measurement
-    prediction = prepared.prediction if prediction is None else prediction
+    score = score or Judge(prepared).of(model)
+    measurement, prediction = prepared.measurement, score.prediction
     residual = measurement.recording - prediction
     psd = measurement.noise_psd
-    flat = residual if gain is None else residual / gain
+    flat = residual / model.microphone_gain(residual.size)
     white = whiten(flat, psd)
     use = prepared.usable
     power = np.where(use, white.astype(np.float64) ** 2, np.nan)
     silent = use & ~prepared.active
     return Comparison(
-        excess_db=_db(np.mean(power[use])) if use.any() else float("nan"),
-        noise_floor_db=_db(float(np.sum(psd)) * (SAMPLE_RATE / 2) / (psd.size - 1)),
+        excess_db=score.excess_db,
+        noise_floor_db=float(decibels(total_power(psd))),
         bands=_by_band(flat, psd, use),
         times=tuple(
-            (at / SAMPLE_RATE, min(at + TIME_STEP, use.size) / SAMPLE_RATE, _db(np.nanmean(power[at : at + TIME_STEP])))
+            (at / SAMPLE_RATE, min(at + TIME_STEP, use.size) / SAMPLE_RATE, float(decibels(np.nanmean(power[at : at + TIME_STEP]))))
             for at in range(0, use.size, TIME_STEP)
             if use[at : at + TIME_STEP].any()
         ),
         levels=_by_level(prediction, whiten(prediction, psd), power),
         lags=_by_lag(white * use, whiten(measurement.reference, psd)),
-        silence_excess_db=_db(np.mean(power[silent])) if silent.sum() > SAMPLE_RATE // 10 else float("nan"),
+        silence_excess_db=float(decibels(np.mean(power[silent]))) if silent.sum() > SAMPLE_RATE // 10 else float("nan"),
         human=prepared.human,
         offset_samples=prepared.offset,
         warnings=prepared.warnings,
@@ -103,43 +107,32 @@ def describe(prepared: Prepared, prediction: Samples | None = None, gain: Sample
     )
 
 
-def _db(power: float) -> float:
-    return float(10.0 * np.log10(max(float(power), 1e-12)))
-
-
 def _by_band(residual: Samples, psd: Samples, use: Array) -> tuple[tuple[float, float, float], ...]:
     """Mean PSD of the residual in each band over the fan's."""
     size = 2 * (psd.size - 1)
-    hop = size // 2
-    count = max((residual.size - size) // hop + 1, 0)
-    frames = np.lib.stride_tricks.sliding_window_view(residual, size)[::hop][:count]
-    whole = np.lib.stride_tricks.sliding_window_view(use, size)[::hop][:count].all(axis=1)
+    whole = frames(use, size, size // 2).all(axis=1)
     if not whole.any():
         return ()
-    window = np.hanning(size)
-    density = 2 * np.mean(np.abs(np.fft.rfft(frames[whole] * window)) ** 2, axis=0) / (SAMPLE_RATE * np.sum(window**2))
-    hz = np.arange(psd.size) * SAMPLE_RATE / size
-    ratio = density / np.maximum(psd, 1e-14)
+    hz = frequencies(psd.size)
+    ratio = np.mean(periodograms(residual, size)[whole], axis=0) / psd
     found = []
     for low, high in zip(BAND_EDGES[:-1], BAND_EDGES[1:], strict=True):
         inside = (hz >= low) & (hz < high)
-        found.append((low, high, _db(np.mean(ratio[inside]))))
+        found.append((low, high, float(decibels(np.mean(ratio[inside])))))
     return tuple(found)
 
 
 def _by_level(prediction: Samples, white: Samples, power: Array) -> tuple[tuple[float, float, float], ...]:
     """Excess by the level of the predicted voice in blocks of 20 ms, those in which it, whitened, is no less than the fan."""
     block = SAMPLE_RATE // 50
-    count = prediction.size // block
-    voice, over_fan, excess = (x[: count * block].reshape(count, block) for x in (prediction.astype(float) ** 2, white.astype(float) ** 2, power))
-    level, excess = 10 * np.log10(voice.mean(axis=1) + 1e-12), excess.mean(axis=1)
+    level, excess = decibels(block_power(prediction, block)), blocks(power, block).mean(axis=1)
     steps = np.floor(level / LEVEL_STEP_DB)
-    audible = np.isfinite(excess) & (over_fan.mean(axis=1) >= 1.0)
+    audible = np.isfinite(excess) & (block_power(white, block) >= 1.0)
     found = []
     for step in np.unique(steps[audible]):
         inside = (steps == step) & audible
         if inside.sum() >= 5:
-            found.append((float(step * LEVEL_STEP_DB), float((step + 1) * LEVEL_STEP_DB), _db(np.mean(excess[inside]))))
+            found.append((float(step * LEVEL_STEP_DB), float((step + 1) * LEVEL_STEP_DB), float(decibels(np.mean(excess[inside])))))
     return tuple(found)
 
 

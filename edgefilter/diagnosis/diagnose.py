@@ -5,12 +5,20 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 
+import numpy as np
+
+from edgefilter.diagnosis.band_edge import cut_by_power
 from edgefilter.diagnosis.compare import Comparison, compare, describe
-from edgefilter.diagnosis.conclude import conclude
-from edgefilter.diagnosis.prepare import prepare
+from edgefilter.diagnosis.criteria import Criteria
+from edgefilter.diagnosis.findings import findings_of, share_of
+from edgefilter.diagnosis.leftover import left_in_words
+from edgefilter.diagnosis.noise_change import look_at_fan
+from edgefilter.diagnosis.prepare import Prepared, prepare
 from edgefilter.diagnosis.result import Diagnosis, Finding, Interval
 from edgefilter.diagnosis.score import Judge
 from edgefilter.diagnosis.select import search
+from edgefilter.diagnosis.trials import Found
+from edgefilter.echo.effects.catalogue import find
 from edgefilter.profile.data import Profile
 from edgefilter.types import SAMPLE_RATE, Samples
 
@@ -24,14 +32,15 @@ def diagnose(
     *,
     sample_rate: int = SAMPLE_RATE,
     progress: Callable[[str], None] | None = None,
+    criteria: Criteria | None = None,
 ) -> Diagnosis:
     """Say which effects recording (m,) of the robot playing reference (k,) shows that the profile lacks.
 
-    progress: called with a short text before each trial. Raises SignalError where the recording does not contain the reference.
+    progress: called with a short text before each trial. criteria: when an effect is named, by default Criteria(). Raises SignalError where the recording does not contain the reference.
     """
     prepared = prepare(profile, recording, reference, sample_rate=sample_rate)
-    found = search(prepared, profile.echo, progress)
-    return conclude(prepared, found, progress)
+    criteria = criteria or Criteria()
+    return conclude(prepared, search(prepared, prepared.model, criteria, progress), criteria, progress)
 
 
 def add(
@@ -40,9 +49,67 @@ def add(
     """Fit the effect of that name to a recording and write it into a new profile; the comparisons are those before and after.
 
     Fitted to all of the recording: that predicts other recordings of the robot better than the fit to half of it by which diagnose()
-    judges. So the comparison after, of this recording, is of samples that the fit has used.
+    judges. So the comparison after, of this recording, is of samples that the fit has used. An event (a jump, a moment's move) is kept
+    with the recording in which it happened: of any other the profile predicts what it did before.
     """
     prepared = prepare(profile, recording, reference, sample_rate=sample_rate)
-    before = describe(prepared, Judge(prepared).correct(prepared.prediction))
-    fitted = profile.with_echo(profile.echo.fit(name, replace(prepared.measurement, fit=prepared.usable)))
-    return fitted, before, compare(fitted, recording, reference, sample_rate=sample_rate)
+    before = describe(prepared, prepared.model)
+    values = dict(prepared.model.fit(name, replace(prepared.measurement, fit=prepared.usable)).effects)[name]
+    knowing = profile.with_echo(profile.echo.with_effect(name, values))
+    return knowing, before, compare(knowing, recording, reference, sample_rate=sample_rate)
+
+
+def conclude(prepared: Prepared, found: Found, criteria: Criteria, progress: Callable[[str], None] | None = None) -> Diagnosis:
+    """The diagnosis that a search leads to; the fan is looked at behind what the search has taken out of the voice."""
+    comparison = describe(prepared, found.start, found.base)
+    found, left = look_at_fan(found, criteria)
+    unpredictable = any(find(step.name).leaves_noise for step in found.steps)
+    believed = bool(found.steps) and (found.final.excess_db < criteria.explained_db or _enough(prepared, found, criteria))
+    quiet = found.base.excess_db < criteria.explained_db and not prepared.human
+    verdict = "missing" if believed and not _much_left(found, criteria) else "explained" if quiet else "unexplained"
+    if not believed and (quiet or not _partly(prepared, found, criteria)):
+        sure = None if quiet else cut_by_power(found, criteria)
+        found = sure or replace(found, steps=(), final=found.base, model=found.start)
+    remaining = found.final.excess_db
+    findings, doubts = findings_of(found, progress)
+    return Diagnosis(
+        verdict=verdict,
+        comparison=replace(comparison, warnings=(*comparison.warnings, *found.notes, *doubts)),
+        ranking=findings,
+        evidence=left_in_words(found, left, remaining, criteria.explained_db),
+        remaining_db=remaining,
+        irreducible_db=max(remaining, found.final.irreducible_db, 0.0) if unpredictable and verdict == "missing" else 0.0,
+        model=found.model,
+    )
+
+
+def _enough(prepared: Prepared, found: Found, criteria: Criteria) -> bool:
+    """Whether the findings explain so much that they are what happened."""
+    much = explained_level(prepared, found) >= criteria.explained_share
+    return much and found.final.excess_db < criteria.still_there * found.base.excess_db
+
+
+def _partly(prepared: Prepared, found: Found, criteria: Criteria) -> bool:
+    """Whether the findings explain enough to be named beside something that none explains."""
+    power = share_of(found.base.excess_db, found.final.excess_db)
+    return power >= criteria.part_share and explained_level(prepared, found) >= criteria.part_level
+
+
+def _much_left(found: Found, criteria: Criteria) -> bool:
+    """Whether the findings leave so much, also of the samples that they were fitted to, that something else is there besides.
+
+    What they leave of the others alone is how well a recording of that length teaches them.
+    """
+    silent = float(np.clip(found.final.silent_db, -0.5, 0.5))
+    left = min(found.final.fitted_db, found.final.active_db) - silent
+    return left > criteria.much_db and share_of(found.base.excess_db, found.final.excess_db) < criteria.nearly_all
+
+
+def explained_level(prepared: Prepared, found: Found) -> float:
+    """Part of the level over the robot's silences that is gone, 0 to 1: of many cells rather than of the loudest."""
+    judge = Judge(prepared)
+    above = found.base.level_db - judge.floor_level(found.base)
+    gone = above - (found.final.level_db - judge.floor_level(found.final))
+    if any(find(name).stage == "noise" for name, _ in found.model.effects):
+        above, gone = found.base.level_db, found.base.level_db - found.final.level_db
+    return float(np.clip(gone / above, 0.0, 1.0)) if above > 0.0 else 0.0

@@ -8,7 +8,12 @@ import numpy as np
 from scipy.ndimage import median_filter
 
 from edgefilter.diagnosis.prepare import Prepared
-from edgefilter.echo.effect import whiten
+from edgefilter.diagnosis.score import Judge
+from edgefilter.diagnosis.trials import Found
+from edgefilter.dsp.frames import block_power, blocks, decibels
+from edgefilter.dsp.psd import frequencies, periodograms
+from edgefilter.echo.effects.catalogue import find
+from edgefilter.echo.measurement import whiten
 from edgefilter.types import SAMPLE_RATE, Array, Samples
 
 LINE_FFT = 16384
@@ -39,25 +44,22 @@ def inspect(prepared: Prepared, residual: Samples) -> Leftover:
     psd = prepared.measurement.noise_psd
     tones, mains, share = _tones(residual, psd)
     quiet = prepared.usable & ~prepared.active
-    white = whiten(residual, psd).astype(np.float64) ** 2
-    count = white.size // BLOCK
-    whole = quiet[: count * BLOCK].reshape(count, BLOCK).all(axis=1)
-    power = white[: count * BLOCK].reshape(count, BLOCK).mean(axis=1)[whole]
+    white = whiten(residual, psd)
+    power = block_power(white, BLOCK)[blocks(quiet, BLOCK).all(axis=1)]
     if power.size < 5:
         return Leftover(tones, mains, share, float("nan"), float("nan"), 0.0)
-    low, middle, high = 10 * np.log10(np.quantile(power, (0.1, 0.5, 0.9)) + 1e-12)
-    return Leftover(tones, mains, share, float(middle), float(10 * np.log10(power.mean() + 1e-12)), float(high - low))
+    low, middle, high = decibels(np.quantile(power, (0.1, 0.5, 0.9)))
+    return Leftover(tones, mains, share, float(middle), float(decibels(power.mean())), float(high - low))
 
 
 def _tones(residual: Samples, psd: Samples) -> tuple[Array, float, float]:
     """Frequencies of tones, loudest first, the mains frequency they belong to (0: none), and their share of the power over the fan."""
     if residual.size < 2 * LINE_FFT:
         return np.zeros(0), 0.0, 0.0
-    frames = np.lib.stride_tricks.sliding_window_view(residual, LINE_FFT)[:: LINE_FFT // 2]
-    power = np.median(np.abs(np.fft.rfft(frames * np.hanning(LINE_FFT).astype(np.float32), axis=1)) ** 2, axis=0)
-    hz = np.arange(power.size) * SAMPLE_RATE / LINE_FFT
+    power = np.median(periodograms(residual, LINE_FFT), axis=0)
+    hz = frequencies(power.size)
     floor = median_filter(power, 81, mode="nearest")
-    expected = np.interp(hz, np.arange(psd.size) * 0.5 * SAMPLE_RATE / (psd.size - 1), psd) / 2 * SAMPLE_RATE * 0.375 * LINE_FFT * np.log(2)
+    expected = np.interp(hz, frequencies(psd.size), psd) * np.log(2)
     peak = (power > LINE_OVER_FLOOR * floor) & (power > LINE_OVER_FLOOR * expected) & (power >= np.maximum(np.roll(power, 1), np.roll(power, -1)))
     peak[:20] = False
     at = np.flatnonzero(peak)
@@ -73,3 +75,28 @@ def _tones(residual: Samples, psd: Samples) -> tuple[Array, float, float]:
         if power[at][off < 0.8].sum() > 0.8 * power[at].sum() and (off < 0.8).sum() >= 2:
             mains = grid
     return hz[at], mains, share
+
+
+def left_in_words(found: Found, left: Leftover, remaining_db: float, floor_db: float) -> str:
+    """What is in the residual that no finding explains; empty where it is the fan."""
+    spans = ", ".join(f"{begin:.1f} to {end:.1f} s" for begin, end in found.prepared.human)
+    talk = f"somebody talks at {spans}, left out of all figures" if spans else ""
+    if remaining_db < floor_db:
+        return talk
+    words = [talk] if talk else []
+    if left.mains_hz and left.tone_share > 0.3:
+        words.append(f"tones at multiples of {left.mains_hz:.0f} Hz, also while the robot is silent")
+    elif left.tone_share > 0.5:
+        words.append("tones at " + ", ".join(f"{hz:.0f}" for hz in left.tones_hz[:4]) + " Hz")
+    final = found.final
+    active = final.active_db - max(left.quiet_mean_db if np.isfinite(left.quiet_mean_db) else 0.0, 0.0)
+    if np.isfinite(left.quiet_db) and left.quiet_mean_db > 1.0 and not words:
+        words.append("sound of its own while the robot is silent" + (", coming and going" if left.swing_db > 6.0 else ""))
+    if active > 1.0:
+        weights = 10 * np.log10(np.maximum(final.cells, 1e-3)).mean(axis=0)
+        low, high = Judge(found.prepared).band_hz[int(np.argmax(weights))]
+        words.append(f"a residual that follows the robot's voice, strongest around {low:.0f} to {high:.0f} Hz")
+        words += [find(name).noise_words for name, _ in found.model.effects if find(name).noise_words]
+    if not words:
+        words.append("a residual spread over the whole recording")
+    return f"{remaining_db:.1f} dB over the noise floor that no effect of the catalogue explains: " + "; ".join(words)

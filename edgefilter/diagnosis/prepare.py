@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import soxr
@@ -10,14 +10,18 @@ from numpy.typing import NDArray
 from scipy import fft
 from scipy.ndimage import maximum_filter1d
 
-from edgefilter.diagnosis.offset import find_offset, shift, starting_offset
-from edgefilter.echo.effect import Measurement, complete, find, whiten
+from edgefilter.diagnosis.offset import find_offset, starting_offset
+from edgefilter.dsp.fourier import power
+from edgefilter.dsp.fractional_delay import delayed
+from edgefilter.dsp.frames import all_block_power, blocks, decibels
+from edgefilter.dsp.psd import floored, hann
+from edgefilter.echo.measurement import Measurement, whiten
+from edgefilter.echo.model import EchoModel
+from edgefilter.echo.recording import fitted_blocks, paired
 from edgefilter.errors import SignalError
 from edgefilter.profile.data import Profile
 from edgefilter.types import PRE_ROLL, SAMPLE_RATE, Samples, as_samples
 
-BLOCK = SAMPLE_RATE // 2
-"""Samples of the blocks that are fitted on and judged by in turn."""
 SILENCE_DB = -15.0
 """The robot is silent where its predicted voice, whitened, is this far under the fan."""
 FAN_TOLERANCE_DB = 1.0
@@ -30,19 +34,20 @@ CUT, CUT_DB, TAIL_S = 32, -30.0, 0.3
 still sounds for TAIL_S."""
 PAUSE_S, LAG_STEP = 0.5, 480
 """Silence of the reference after which a player may have started anew, and samples (30 ms) by which the lag must differ then."""
-MIN_SECONDS = 1.0
 
 
 @dataclass(frozen=True, eq=False)
 class Prepared:
     """A recording beside what the profile predicts, on one sample counter; all arrays (n,).
 
-    measurement: aligned reference, recording, the fan's PSD, the samples to fit on. prediction: of the profile.
+    measurement: aligned reference, recording, the fan's PSD, the samples to fit on. model: the profile's, less the events of other
+    recordings. prediction: of that model.
     usable: samples where nobody else talks. active: where the robot is heard. offset: samples of lag against the calibration.
     human: (start_s, end_s) of other talkers.
     """
 
     measurement: Measurement
+    model: EchoModel
     prediction: Samples
     usable: NDArray[np.bool_]
     active: NDArray[np.bool_]
@@ -55,6 +60,10 @@ class Prepared:
         """(n,) samples that no fit has used."""
         return self.usable & ~self.measurement.fit
 
+    def behind(self, noise_psd: Samples) -> Prepared:
+        """The same with another fan, of PSD (601,)."""
+        return replace(self, measurement=replace(self.measurement, noise_psd=floored(noise_psd).astype(np.float32)))
+
 
 def prepare(profile: Profile, recording: Samples, reference: Samples, *, sample_rate: int = SAMPLE_RATE) -> Prepared:
     """Resample to 16 kHz, find the constant lag, mark silence and the blocks to fit on.
@@ -65,25 +74,23 @@ def prepare(profile: Profile, recording: Samples, reference: Samples, *, sample_
     y, x = as_samples(recording, "recording"), as_samples(reference, "reference")
     if sample_rate != SAMPLE_RATE:
         y, x = (soxr.resample(signal_, sample_rate, SAMPLE_RATE).astype(np.float32) for signal_ in (y, x))
-    for samples, name in ((y, "recording"), (x, "reference")):
-        if samples.size < MIN_SECONDS * SAMPLE_RATE:
-            raise SignalError(f"the {name} is {samples.size / SAMPLE_RATE:.2f} s long, expected at least {MIN_SECONDS:g} s of the robot's voice")
+    y, x = paired(y, x)
     n = y.size
-    x = np.pad(x, (0, max(n - x.size, 0)))[:n]
     start = profile.delay - PRE_ROLL
-    at_calibration = shift(x, start)
-    predicted = profile.echo.predict(at_calibration)
-    known = expected_noise(profile)
+    at_calibration = delayed(x, start)
+    model = profile.echo.during(Measurement(x, y))
+    predicted = model.predict(at_calibration)
+    known = floored(model.expected_noise(profile.noise_psd)).astype(np.float32)
     offset = starting_offset(whiten(predicted, known), whiten(y, known))
     pieces = utterance_lags(x, predicted, y, known, offset)
     begin, end = known_span(x, start + pieces[0][2], start + pieces[-1][2])
-    x = sum(shift(np.where((np.arange(n) >= first) & (np.arange(n) < last), x, np.float32(0)), start + lag) for first, last, lag in pieces)
-    predicted = profile.echo.predict(x)
-    white = whiten(predicted, known).astype(np.float64)
+    x = sum(delayed(np.where((np.arange(n) >= first) & (np.arange(n) < last), x, np.float32(0)), start + lag) for first, last, lag in pieces)
+    predicted = model.predict(x)
+    white = whiten(predicted, known)
     block = SAMPLE_RATE // 50
-    level = np.add.reduceat(white**2, np.arange(0, n, block)) / block
+    level = all_block_power(white, block)
     active = np.repeat(maximum_filter1d(level, 11) > 10 ** (SILENCE_DB / 10), block)[:n]
-    fit = np.arange(n) // BLOCK % 2 == 0
+    fit = fitted_blocks(n)
     quiet = whiten(y, known) ** 2
     psd = known * np.float32(fan_scale(whiten(y, known)[~active]))
     human = find_talk(quiet * (known[1] / psd[1]), active)
@@ -97,7 +104,7 @@ def prepare(profile: Profile, recording: Samples, reference: Samples, *, sample_
     if len(pieces) > 1:
         lags = ", ".join(f"{lag:.1f} from {first / SAMPLE_RATE:.1f} s" for first, _, lag in pieces)
         warnings += (f"the utterances lag by different numbers of samples: {lags}; aligned one by one",)
-    return Prepared(Measurement(x, y, psd, fit & usable), predicted, usable, active, offset, human, warnings)
+    return Prepared(Measurement(x, y, psd, fit & usable), model, predicted, usable, active, offset, human, warnings)
 
 
 def known_span(x: Samples, first_lag: float, last_lag: float) -> tuple[int, int]:
@@ -107,7 +114,7 @@ def known_span(x: Samples, first_lag: float, last_lag: float) -> tuple[int, int]
     that ends there, is heard but unknown.
     """
     n, block = x.size, SAMPLE_RATE // 50
-    loud = 10 ** (CUT_DB / 10) * float(np.max(np.add.reduceat(x.astype(np.float64) ** 2, np.arange(0, n, block)) / block))
+    loud = 10 ** (CUT_DB / 10) * float(np.max(all_block_power(x, block)))
     said = np.flatnonzero(x)
     stop = int(said[-1]) + 1 if said.size else 0
     begins, ends = (float(np.mean(x[part].astype(np.float64) ** 2)) > loud for part in (slice(0, CUT), slice(max(stop - CUT, 0), max(stop, 1))))
@@ -123,7 +130,7 @@ def utterance_lags(x: Samples, predicted: Samples, recording: Samples, psd: Samp
     difference of less than LAG_STEP is no new start but left for the effects to explain.
     """
     block = SAMPLE_RATE // 50
-    level = np.add.reduceat(x.astype(np.float64) ** 2, np.arange(0, x.size, block))
+    level = all_block_power(x, block)
     loud = np.flatnonzero(level > 10**-4.5 * level.max(initial=0.0))
     gaps = np.flatnonzero(np.diff(loud) > 50 * PAUSE_S)
     begins = [0, *(int(loud[gap + 1]) * block for gap in gaps)]
@@ -145,7 +152,7 @@ def utterance_lags(x: Samples, predicted: Samples, recording: Samples, psd: Samp
     return pieces
 
 
-def find_talk(power: Samples, active: NDArray[np.bool_]) -> tuple[tuple[float, float], ...]:
+def find_talk(square: Samples, active: NDArray[np.bool_]) -> tuple[tuple[float, float], ...]:
     """(start_s, end_s) where somebody talks, from the whitened recording's square (n,) in the robot's silences.
 
     Somebody talks where tenths of a second are TALK_DB over the fan while at least a third of the silence is at the fan: a fan that
@@ -153,9 +160,9 @@ def find_talk(power: Samples, active: NDArray[np.bool_]) -> tuple[tuple[float, f
     included. Nothing is found where it would be more than half of the recording: there is no working around that.
     """
     block = SAMPLE_RATE // 10
-    count = power.size // block
-    silent = ~active[: count * block].reshape(count, block).any(axis=1)
-    level = power[: count * block].reshape(count, block).mean(axis=1)
+    count = square.size // block
+    silent = ~blocks(active, block).any(axis=1)
+    level = blocks(square, block).mean(axis=1)
     loud = silent & (level > 10 ** (TALK_DB / 10))
     if loud.sum() < 3 or np.mean(level[silent] < 2.0) < 1 / 3:
         return ()
@@ -177,17 +184,7 @@ def fan_scale(quiet: Samples) -> float:
     """
     if quiet.size < SAMPLE_RATE // 2:
         return 1.0
-    size = 256
-    frames = quiet[: quiet.size // size * size].reshape(-1, size) * np.hanning(size).astype(np.float32)
-    power = np.mean(np.abs(fft.rfft(frames)) ** 2, axis=0) / np.sum(np.hanning(size) ** 2)
-    scale = float(np.median(power[3:-6]))
-    return scale if abs(10 * np.log10(max(scale, 1e-9))) <= FAN_TOLERANCE_DB else 1.0
-
-
-def expected_noise(profile: Profile) -> Samples:
-    """(601,) PSD of the fan with the profile's own effects on it."""
-    psd = profile.noise_psd
-    for name, values in profile.echo.effects:
-        changed = getattr(find(name), "noise_psd", None)
-        psd = changed(complete(find(name), values), psd) if changed else psd
-    return psd
+    window = hann(256)
+    spectrum = np.mean(power(fft.rfft(blocks(quiet, 256) * window)), axis=0) / np.sum(window**2)
+    scale = float(np.median(spectrum[3:-6]))
+    return scale if abs(decibels(scale)) <= FAN_TOLERANCE_DB else 1.0

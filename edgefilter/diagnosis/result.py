@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import Literal, TypeAlias
 
 from edgefilter.diagnosis.compare import Comparison
-from edgefilter.echo.effect import Values
+from edgefilter.echo.measurement import Values
 from edgefilter.echo.model import EchoModel
 from edgefilter.types import Samples
 

@@ -3,43 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.ndimage import uniform_filter1d
 
 from edgefilter.diagnosis.prepare import Prepared
-from edgefilter.echo.effect import ROUNDING_PSD, whiten
+from edgefilter.dsp.frames import decibels
+from edgefilter.dsp.psd import frequencies, hann, total_power, variance_at
+from edgefilter.echo.evidence import Score
 from edgefilter.echo.least_squares import normal_equations
+from edgefilter.echo.measurement import Measurement, whiten
 from edgefilter.echo.model import EchoModel
 from edgefilter.echo.wiener import convolve_from
-from edgefilter.types import SAMPLE_RATE, Array, Samples
+from edgefilter.types import Array, Samples
 
 FRAME, HOP = 512, 256
 FRAMES_PER_CELL = 8
 TOLERANCE = 0.012
 """An ordinary robot's path differs from its calibration by this share at each frequency (0.1 dB, 0.7 degrees)."""
 TOLERANCE_TAPS, TOLERANCE_LEAD = 32, 16
-
-
-@dataclass(frozen=True, eq=False)
-class Verdict:
-    """Of one prediction. level_db: mean over time-frequency cells of the residual's dB over the fan, each cell by its degrees of freedom.
-
-    excess_db: mean power of the held-out whitened residual, dB. active_db, silent_db: while the robot is heard, and is not. fitted_db: of the
-    samples to fit on, while it is heard.
-    What a model says that no waveform predicts counts as fan in these; irreducible_db: the excess over the fan alone then, else 0.
-    cells: (times, bands) power over the fan. prediction: (n,) with the ordinary tolerances taken up.
-    """
-
-    level_db: float
-    excess_db: float
-    active_db: float
-    silent_db: float
-    fitted_db: float
-    irreducible_db: float
-    cells: Array = field(repr=False)
-    prediction: Samples = field(repr=False)
 
 
 class Judge:
@@ -54,11 +36,11 @@ class Judge:
         self.prepared = prepared
         measurement = prepared.measurement
         self.psd = measurement.noise_psd
+        self._fan = total_power(self.psd)
         n = measurement.recording.size
-        self._window = np.hanning(FRAME + 1)[:-1].astype(np.float32)
-        hz = np.arange(FRAME // 2 + 1) * SAMPLE_RATE / FRAME
-        expected = np.interp(hz, np.arange(self.psd.size) * 0.5 * SAMPLE_RATE / (self.psd.size - 1), self.psd) / 2 * SAMPLE_RATE
-        self._expected = np.maximum(expected, 1e-12 * expected.max()) * float(np.sum(self._window**2))
+        self._window = hann(FRAME).astype(np.float32)
+        hz = frequencies(FRAME // 2 + 1)
+        self._expected = variance_at(hz, self.psd) * float(np.sum(self._window**2))
         self._rows = measurement.fit & prepared.usable & prepared.active & (np.arange(n) % 3 == 0)
         starts = np.arange(0, n - FRAME - HOP * (FRAMES_PER_CELL - 1) + 1, HOP * FRAMES_PER_CELL)
         span = FRAME + HOP * (FRAMES_PER_CELL - 1)
@@ -72,6 +54,20 @@ class Judge:
         self.band_hz = np.stack((hz[edges[:-1]], hz[edges[1:]]), axis=1)
         self.freedom = np.diff(edges).astype(float)
 
+    @property
+    def measurement(self) -> Measurement:
+        """The recording beside its reference."""
+        return self.prepared.measurement
+
+    @property
+    def usable(self) -> Array:
+        """(n,) bool, samples where nobody else talks."""
+        return self.prepared.usable
+
+    def level_db(self, prediction: Samples) -> float:
+        """Score.level_db of a prediction (n,)."""
+        return self.judge(prediction).level_db
+
     def cells(self, residual: Samples) -> Array:
         """(times, bands) power of the residual (n,) over the fan's, in the held-out cells."""
         index = self.starts[:, None, None] + np.arange(FRAMES_PER_CELL)[:, None] * HOP + np.arange(FRAME)
@@ -79,24 +75,27 @@ class Judge:
         ratio = power.mean(axis=1) / self._expected
         return np.add.reduceat(ratio[:, : self._edges[-1]], self._edges[:-1], axis=1) / self.freedom
 
-    def of(self, model: EchoModel) -> Verdict:
-        """The verdict on a model: on what it predicts, with what it says that no waveform predicts counted as fan."""
+    def of(self, model: EchoModel) -> Score:
+        """The score of a model: on what it predicts, with what it says that no waveform predicts counted as fan."""
         measurement = self.prepared.measurement
-        return self.judge(measurement.heard(model)[0], unpredictable=model.unpredictable(measurement.reference))
+        gain = model.microphone_gain(measurement.recording.size)
+        return self.judge(measurement.heard(model)[0], model.unpredictable(measurement.reference), gain)
 
-    def judge(self, prediction: Samples, correct: bool = True, unpredictable: Sequence[tuple[Samples, Array]] = ()) -> Verdict:
-        """The verdict on a prediction (n,), by default with the ordinary tolerances taken up first.
+    def judge(self, prediction: Samples, unpredictable: Sequence[tuple[Samples, Array]] = (), gain: Samples | None = None) -> Score:
+        """The score of a prediction (n,), with the ordinary tolerances taken up first.
 
-        unpredictable: as EchoModel.unpredictable gives it, noise that is expected on top of the fan.
+        unpredictable: as EchoModel.unpredictable gives it, noise that is expected on top of the fan. gain: (n,) of the microphone, which
+        the fan passed as well: it is taken out of the residual before that is held against the fan. The cells keep it: as a likelihood
+        their level has to be that of the recording as it is.
         """
-        corrected = self.correct(prediction) if correct else prediction
+        corrected = self.correct(prediction)
         residual = self.prepared.measurement.recording - corrected
         cells = self.cells(residual) / self._expected_cells(unpredictable)
         weights = np.broadcast_to(self.freedom, cells.shape)
-        plain = whiten(residual, self.psd).astype(np.float64) ** 2
+        plain = whiten(residual if gain is None else residual / gain, self.psd).astype(np.float64) ** 2
         white = self._over_expected(plain, unpredictable) if unpredictable else plain
         held, active = self.prepared.held_out, self.prepared.active
-        return Verdict(
+        return Score(
             level_db=float(np.average(10 * np.log10(np.maximum(cells, 1e-3)), weights=weights)) if cells.size else 0.0,
             excess_db=_db(white[held]),
             active_db=_db(white[held & active]),
@@ -106,6 +105,23 @@ class Judge:
             cells=cells,
             prediction=corrected,
         )
+
+    def floor_level(self, score: Score) -> float:
+        """Level in dB of the cells in which the robot is silent, 0 where it never is: what is left when everything is explained."""
+        quiet = score.cells[~self.active_cells]
+        if quiet.shape[0] < 4:
+            return 0.0
+        return float(np.average(10 * np.log10(np.maximum(quiet, 1e-3)).mean(axis=0), weights=self.freedom))
+
+    def size_db(self, change: Samples) -> float:
+        """Power of a change of the prediction (n,) over the fan in dB: as it is or whitened, whichever is more."""
+        plain, white = float(np.mean(change.astype(float) ** 2)) / self._fan, float(np.mean(whiten(change, self.psd).astype(float) ** 2))
+        return float(10 * np.log10(max(plain, white, 1e-12)))
+
+    def noise_size_db(self, model: EchoModel) -> float:
+        """Mean power over the fan, in dB, of what a model says that no waveform predicts."""
+        power = sum(float(np.mean(variance)) for variance, _ in model.unpredictable(self.measurement.reference))
+        return float(10 * np.log10(max(power / self._fan, 1e-12)))
 
     def _expected_cells(self, unpredictable: Sequence[tuple[Samples, Array]]) -> Array | float:
         """(times, bands) what is expected in the held-out cells, 1 where that is the fan alone."""
@@ -123,7 +139,7 @@ class Judge:
         """power (n,) of the whitened residual over what is expected, both smoothed over 16 ms: when a knock comes is known to some ms."""
         expected = np.ones_like(power)
         for variance, colour in unpredictable:
-            expected += variance * float(np.mean(colour / np.maximum(self.psd, max(ROUNDING_PSD, 1e-7 * float(self.psd.max())))))
+            expected += variance * float(np.mean(colour / self.psd))
         return uniform_filter1d(power, HOP) / uniform_filter1d(expected, HOP)
 
     def correct(self, prediction: Samples) -> Samples:
@@ -138,4 +154,4 @@ class Judge:
 
 
 def _db(power: Array) -> float:
-    return float(10.0 * np.log10(max(float(np.mean(power)), 1e-12))) if power.size else 0.0
+    return float(decibels(np.mean(power))) if power.size else 0.0

@@ -1,105 +1,187 @@
-"""The search for missing effects: try all, accept the best, look again, take back what has become superfluous or was taken for another."""
+"""Stepwise selection of the effects that a profile lacks: forward, refit, backward, on held-out samples (Efroymson 1960).
+
+Forward: every effect is fitted beside those accepted so far, and the simplest of those that explain nearly most is accepted. Refit: all
+are fitted beside each other. Backward: what the newest one has made superfluous is exchanged for something simpler, or dropped. Stepwise
+selection ends in local optima; so it is begun anew from the next best effects where the best one does not lead to an explanation.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 
+from edgefilter.diagnosis.criteria import Criteria
 from edgefilter.diagnosis.noise_change import changed_fan
 from edgefilter.diagnosis.prepare import Prepared
-from edgefilter.diagnosis.settle import settle, simpler_beside
-from edgefilter.diagnosis.suspects import choose, suspect
-from edgefilter.diagnosis.trials import LAST, LONG, Found, Trial, Workbench, added
+from edgefilter.diagnosis.trials import Found, Trial, Workbench, added
+from edgefilter.echo.effects.catalogue import find, names
 from edgefilter.echo.model import EchoModel
 
-MOST_EFFECTS = 3
-SCREEN_DB = 0.2
-"""Where the residual is no more than this above that of the robot's silences, there is nothing of the voice in it; half a dB over the fan in the
-silences is ordinary, more of it may be a microphone's gain."""
-SECOND_SHARE = 0.2
-"""Of the excess level that is left, a further effect has to explain at least this share: less is how the first one's model errs."""
-STARTS, START_SHARE = 2, 0.1
-"""Further effects to begin with where the best one has not led to an explanation, and the share of the level that each must explain by itself."""
-SIMPLE_SHARE = 0.3
-"""Of the level that one long filter explains, what a simple effect must explain to be taken for half of it."""
-NEARLY = 0.85
-"""Share of the level that is explained where no other start is tried."""
-BETTER = 0.05
-"""Of the level explained, what another start must explain more to be preferred."""
 
-
-def search(prepared: Prepared, model: EchoModel, progress: Callable[[str], None] | None = None) -> Found:
-    """Add effects to model as long as held-out samples say that they are there.
-
-    Greedy from the effect that explains most by itself, and where that does not lead to an explanation from the next ones: of two
-    effects at once, the louder may hide what speaks for the other, and a third may look most like both.
-    """
-    bench, start = Workbench(prepared, progress), model
-    base = bench.verdict(model)
-    fan = changed_fan(prepared, model, base)
+def search(prepared: Prepared, model: EchoModel, criteria: Criteria, progress: Callable[[str], None] | None = None) -> Found:
+    """Add effects to model as long as held-out samples say that they are there."""
+    bench, start = Workbench(prepared, criteria, progress), model
+    base = bench.score(model)
+    fan = changed_fan(prepared, model, base, criteria)
     if fan is not None:
         prepared, step = fan
-        bench, model = Workbench(prepared, progress), step.model
-    runs: list[EchoModel] = []
-    for first in _starts(bench, model):
-        runs.append(_grow(bench, model, first))
-        if bench.tired or bench.explained(runs[-1]) or bench.left(runs[-1]) <= (1.0 - NEARLY) * bench.left(model):
-            runs.extend(_grow(bench, model, simple, LONG - 1) for simple in _simpler_start(bench, model, runs[-1]))
-            break
-    best = _best(bench, model, runs)
+        bench, model = Workbench(prepared, criteria, progress), step.model
+    best = _best(bench, model, list(_runs(bench, model)))
     steps = _in_steps(bench, model, best)
-    return Found(prepared, start, best, base, bench.verdict(best), ((step, *steps) if fan is not None else steps))
+    return Found(prepared, start, best, base, bench.score(best), ((step, *steps) if fan is not None else steps), bench.notes)
 
 
-def _starts(bench: Workbench, model: EchoModel) -> Iterator[Trial]:
+def _runs(bench: Workbench, start: EchoModel) -> Iterator[EchoModel]:
+    """What each beginning leads to, until one explains nearly all; then, where that is one long filter, what half of it may lead to."""
+    criteria = bench.criteria
+    for first in _starts(bench, start):
+        run = _stepwise(bench, start, first)
+        yield run
+        if bench.explained(run) or bench.left(run) <= (1.0 - criteria.nearly) * bench.left(start):
+            for simple in _half_of_a_filter(bench, start, run):
+                yield _stepwise(bench, start, simple, criteria.long_filter - 1)
+            return
+
+
+def _starts(bench: Workbench, start: EchoModel) -> Iterator[Trial]:
     """The trial to begin with, then others that explain a good part, named or not, since what hides them may be found beside them."""
-    if bench.heard(model) <= SCREEN_DB:
+    criteria = bench.criteria
+    if bench.heard(start) <= criteria.silent_db:
         return
-    trials = bench.attempt_all(model)
-    admissible = {t.name: t for t in trials if bench.admissible(t, model)}
-    name = choose({key: trial.gain_db for key, trial in admissible.items()})
-    if name is not None:
-        yield admissible[name]
-    least = max(START_SHARE * bench.left(model), 0.1)
-    others = sorted((t for t in trials if t.name != name and t.name not in LAST and t.gain_db >= least), key=lambda t: -t.gain_db)
-    yield from others[:STARTS]
+    trials = bench.attempt_all(start)
+    first = bench.preferred(t for t in trials if bench.admissible(t, start))
+    if first is not None:
+        yield first
+    least = max(criteria.start_share * bench.left(start), criteria.start_db)
+    others = [t for t in trials if t is not first and not find(t.name).last_resort and t.gain_db >= least]
+    yield from sorted(others, key=lambda t: -t.gain_db)[: criteria.starts]
 
 
-def _simpler_start(bench: Workbench, start: EchoModel, run: EchoModel) -> list[Trial]:
+def _half_of_a_filter(bench: Workbench, start: EchoModel, run: EchoModel) -> list[Trial]:
     """The simple effect, none or one, that explains a good part of what one long filter does: two of them may look like that filter."""
     found = added(start, run)
-    if bench.tired or len(found) != 1 or suspect(found[0]).complexity < LONG:
+    if len(found) != 1 or find(found[0]).complexity < bench.criteria.long_filter:
         return []
-    most = bench.verdict(start).level_db - bench.verdict(run).level_db
-    simple = [t for t in bench.attempt_all(start, 1) if t.gain_db >= SIMPLE_SHARE * most and bench.admissible(t, start)]
+    least = bench.criteria.half_share * (bench.score(start).level_db - bench.score(run).level_db)
+    simple = [t for t in bench.attempt_all(start, bench.criteria.simple) if t.gain_db >= least and bench.admissible(t, start)]
     return sorted(simple, key=lambda t: -t.gain_db)[:1]
 
 
-def _grow(bench: Workbench, start: EchoModel, first: Trial, most: int = 9) -> EchoModel:
+def _stepwise(bench: Workbench, start: EchoModel, first: Trial, most: int = 9) -> EchoModel:
     """The model with first and all of complexity up to `most` that can be named beside it."""
-    model = simpler_beside(bench, start, first.model)
-    while len(added(start, model)) < MOST_EFFECTS and not bench.explained(model):
-        least = SECOND_SHARE * bench.left(model)
-        much = [t for t in bench.attempt_all(model, most) if t.gain_db >= least or bench.halves(t, model)]
-        admissible = {t.name: t for t in much if bench.admissible(t, model)}
-        name = choose({key: trial.gain_db for key, trial in admissible.items()})
-        if name is None:
+    model = split(bench, start, first.model)
+    while len(added(start, model)) < bench.criteria.most_effects and not bench.explained(model):
+        newest = forward(bench, model, most)
+        if newest is None:
             break
-        model, before = settle(bench, start, admissible[name].model), model
-        model = simpler_beside(bench, start, model)
-        if bench.verdict(model).level_db >= bench.verdict(before).level_db:
-            model = before
+        grown = split(bench, start, backward(bench, start, refit(bench, start, newest.model), newest.name))
+        if bench.score(grown).level_db >= bench.score(model).level_db:
             break
+        model = grown
+    return model
+
+
+def forward(bench: Workbench, model: EchoModel, most: int = 9) -> Trial | None:
+    """The effect to accept next: it explains a good part of what is left, and looks like what it is."""
+    least = bench.criteria.second_share * bench.left(model)
+    much = [t for t in bench.attempt_all(model, most) if t.gain_db >= least or bench.halves(t, model)]
+    return bench.preferred(t for t in much if bench.admissible(t, model))
+
+
+def refit(bench: Workbench, start: EchoModel, model: EchoModel) -> EchoModel:
+    """Each effect beyond start fitted beside the others, in turn, as long as the held-out level falls."""
+    listed, worth = added(start, model), bench.criteria.worth_db
+    if len(listed) < 2:
+        return model
+    waiting = listed[:-1]  # the newest was just fitted beside them
+    for _ in range(bench.criteria.rounds):
+        before = bench.score(model).level_db
+        for name in waiting:
+            again = bench.attempt(name, model.without_effect(name))
+            if again is not None and again.score.level_db < bench.score(model).level_db - 0.5 * worth:
+                model = again.model
+        if before - bench.score(model).level_db < worth:
+            break
+        waiting = listed
+    return model
+
+
+def backward(bench: Workbench, start: EchoModel, model: EchoModel, newest: str) -> EchoModel:
+    """The model without what the newest effect has made superfluous: an earlier one exchanged for the one to name beside it, or dropped."""
+    earlier = [name for name in added(start, model) if name != newest]
+    for name in earlier:
+        model = _exchange(bench, start, model, name)
+    for name in [name for name in earlier if name in dict(model.effects)]:
+        alone = bench.attempt(newest, model.without_effect(name).without_effect(newest))
+        if alone is not None and alone.score.level_db - bench.score(model).level_db < find(name).least_gain_db:
+            model = alone.model
+    return model
+
+
+def _exchange(bench: Workbench, start: EchoModel, model: EchoModel, name: str) -> EchoModel:
+    """The model with another effect instead of that one where, beside the others, the other is the one to name."""
+    others = model.without_effect(name)
+    trials = bench.attempt_all(others, find(name).complexity)
+    rivals = [t for t in trials if t.name != name and not find(t.name).last_resort and bench.admissible(t, others)]
+    chosen = bench.preferred([*rivals, bench.beside(name, others, model)])
+    if chosen is None or chosen.name == name:
+        return model
+    changed = refit(bench, start, chosen.model)
+    without = bench.score(others).level_db
+    most = without - bench.score(model).level_db
+    return changed if without - bench.score(changed).level_db > bench.criteria.exchange_share * most else model
+
+
+def split(bench: Workbench, start: EchoModel, model: EchoModel) -> EchoModel:
+    """The model with a simpler effect beside a flexible one where both together explain more than the flexible one alone."""
+    model = _volume_beside(bench, model)
+    for name in [name for name in added(start, model) if find(name).flexible]:
+        others = model.without_effect(name)
+        if len(added(start, model)) > 2 or bench.explained(others):
+            break
+        model = _with_simpler(bench, start, model, name)
+    return model
+
+
+def _volume_beside(bench: Workbench, model: EchoModel) -> EchoModel:
+    """The model with the gain that a filter has in its passband as a turned volume beside it, where that explains as much."""
+    for name, values in model.effects:
+        gain_db = find(name).passband_gain_db(values)
+        if gain_db is None or abs(gain_db) < bench.criteria.passband_db:
+            continue
+        gains = [(other, plain) for other in names() if (plain := find(other).plain_gain(gain_db)) is not None and other not in dict(model.effects)]
+        for other, plain in gains:
+            both = bench.attempt(name, model.without_effect(name).with_effect(other, plain))
+            if both is not None and both.score.level_db < bench.score(model).level_db + bench.criteria.worth_db:
+                return both.model
+    return model
+
+
+def _with_simpler(bench: Workbench, start: EchoModel, model: EchoModel, name: str) -> EchoModel:
+    """The model with a simpler effect beside the flexible one of that name, of the two that explain most by themselves, or as it is."""
+    criteria, others = bench.criteria, model.without_effect(name)
+    absent = bench.absent(others, max(find(name).complexity - 1, criteria.simple))
+    wanted = [key for key in absent if not (find(key).flexible or find(key).last_resort)]
+    simple = [t for key in wanted if (t := bench.attempt_alike(key, others)) is not None and bench.admissible(t, others)]
+    least = max(criteria.confirmed_share * bench.left(model), criteria.confirmed_db)
+    for trial in sorted(simple, key=lambda t: -t.gain_db)[:2]:
+        both = bench.attempt(name, trial.model)
+        if both is None or not bench.admissible(both, trial.model):
+            continue
+        joint = refit(bench, start, both.model)
+        confirmed = bench.beside(trial.name, model, joint)
+        if confirmed.gain_db >= least and bench.admissible(confirmed, joint.without_effect(trial.name)):
+            return joint
     return model
 
 
 def _best(bench: Workbench, start: EchoModel, runs: list[EchoModel]) -> EchoModel:
     """The run that explains most of those whose effects can all be named; the earlier and simpler one where others hardly explain more."""
-    base = bench.verdict(start).level_db
+    base = bench.score(start).level_db
     valid = [_standing(bench, start, run) for run in runs]
     best = start
-    for run in sorted(valid, key=lambda run: sum(suspect(name).complexity for name in added(start, run))):
-        most = base - bench.verdict(best).level_db
-        if base - bench.verdict(run).level_db > most + BETTER * abs(most):
+    for run in sorted(valid, key=lambda run: sum(find(name).complexity for name in added(start, run))):
+        most = base - bench.score(best).level_db
+        if base - bench.score(run).level_db > most + bench.criteria.better * abs(most):
             best = run
     return best
 
@@ -119,12 +201,12 @@ def _stands(bench: Workbench, model: EchoModel, name: str) -> bool:
 
 def _in_steps(bench: Workbench, start: EchoModel, model: EchoModel) -> tuple[Trial, ...]:
     """The effects that a model has beyond the start, each with what it explains beside those before it, the largest first."""
-    names, steps = added(start, model), []
+    left, steps = added(start, model), []
     values, model = dict(model.effects), start
-    while names:
-        tries = {name: model.with_effect(name, values[name]) for name in names}
-        name = min(tries, key=lambda name: bench.verdict(tries[name]).level_db)
+    while left:
+        tries = {name: model.with_effect(name, values[name]) for name in left}
+        name = min(tries, key=lambda name: bench.score(tries[name]).level_db)
         steps.append(bench.beside(name, model, tries[name]))
         model = tries[name]
-        names.remove(name)
+        left.remove(name)
     return tuple(steps)

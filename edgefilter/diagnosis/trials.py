@@ -2,112 +2,104 @@
 
 from __future__ import annotations
 
-import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import TypeAlias
 
 import numpy as np
 
+from edgefilter.diagnosis.criteria import Criteria
 from edgefilter.diagnosis.prepare import Prepared
-from edgefilter.diagnosis.score import Judge, Verdict
-from edgefilter.diagnosis.suspects import suspect
-from edgefilter.echo.effect import Values, complete, find, names, whiten
-from edgefilter.echo.effect import neutral as neutral_values
+from edgefilter.diagnosis.score import Judge
+from edgefilter.echo.effect import fitted, vanishes
+from edgefilter.echo.effects.catalogue import find, names
+from edgefilter.echo.evidence import Evidence, Score
+from edgefilter.echo.measurement import Values
 from edgefilter.echo.model import EchoModel
 from edgefilter.errors import UsageError
-from edgefilter.types import SAMPLE_RATE, Samples
-
-LAST, ENOUGH, LITTLE_DB = ("rattle",), 0.4, 0.1
-"""Effects whose fit takes long: tried where no other explains this share of the level above the silences, and where that is no less than so much."""
-
-HEARD_DB, FAN_DB = 0.6, 0.2
-"""Where the residual is no more than the first above that of the robot's silences, or no more than the second above the calibrated fan, there is
-nothing beside the effects that were found, whose models err a little."""
-COSTS, DEAR = {"rattle": 8, "compression": 2}, 60
-"""Of a fit in quarters of a second, 1 for all others, and the sum of them after which only what is in plain sight is looked for."""
-
-POWER_SHARE = 0.6
-"""Of the power over the fan, what an effect may leave at most that takes about half of it away."""
-LONG = 4
-"""Complexity of long filters: half a minute does not teach all their taps, so what they leave of the samples fitted to says little."""
 
 Signature: TypeAlias = tuple[tuple[str | bytes, ...], ...]
 
 
 @dataclass(frozen=True, eq=False)
 class Trial:
-    """One effect added to a model: its values, the model with it, what the judge says, and its size over the fan in dB."""
+    """One effect added to a model: its values, the model with it, its score, the fall in level and the effect's size over the fan in dB."""
 
     name: str
     values: Values
     model: EchoModel
-    verdict: Verdict
+    score: Score
     gain_db: float
     size_db: float
 
 
 @dataclass(frozen=True, eq=False)
 class Found:
-    """The outcome of a search from a start model. steps: the accepted effects in their order.
+    """The outcome of a search from a start model. steps: the accepted effects in their order. notes: what the reader must know of the search.
 
-    prepared: what final was judged on; its fan is another than at the calibration where fan_noise is the first of the steps.
+    prepared: what final was scored on; its fan is another than at the calibration where a changed fan is the first of the steps.
     """
 
     prepared: Prepared
     start: EchoModel
     model: EchoModel
-    base: Verdict
-    final: Verdict
+    base: Score
+    final: Score
     steps: tuple[Trial, ...]
+    notes: tuple[str, ...] = ()
 
 
 class Workbench:
     """Tries effects on models of one prepared recording and remembers what came of it."""
 
-    def __init__(self, prepared: Prepared, progress: Callable[[str], None] | None = None) -> None:
-        self.prepared = prepared
+    def __init__(self, prepared: Prepared, criteria: Criteria, progress: Callable[[str], None] | None = None) -> None:
+        self.prepared, self.criteria = prepared, criteria
         self.judge = Judge(prepared)
         self._progress = progress
-        self._verdicts: dict[Signature, Verdict] = {}
+        self._scores: dict[Signature, Score] = {}
         self._trials: dict[tuple[Signature, str], Trial | None] = {}
-        self._cost = 0
         self._alike: dict[tuple[frozenset[str], str], Trial | None] = {}
+        self._cost = 0
+        self._failed: dict[str, str] = {}
+        self._refused = False
 
-    def verdict(self, model: EchoModel) -> Verdict:
-        """What the judge says of a model."""
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What could not be tried, and why."""
+        spent = f"the search was stopped after fits of {self._cost / 4:.0f} s: something further may be in the recording"
+        return (*self._failed.values(), *((spent,) if self._refused else ()))
+
+    def score(self, model: EchoModel) -> Score:
+        """The judge's score of a model."""
         key = signature(model)
-        if key not in self._verdicts:
-            self._verdicts[key] = self.judge.of(model)
-        return self._verdicts[key]
+        if key not in self._scores:
+            self._scores[key] = self.judge.of(model)
+        return self._scores[key]
 
     def heard(self, model: EchoModel) -> float:
         """dB over the robot's silences, of half a dB either way, that a model leaves while the robot is heard."""
-        verdict = self.verdict(model)
-        return verdict.active_db - float(np.clip(verdict.silent_db, -0.5, 0.5))
+        score = self.score(model)
+        return score.active_db - float(np.clip(score.silent_db, -0.5, 0.5))
 
     def explained(self, model: EchoModel) -> bool:
         """Whether a model leaves so little while the robot is heard that nothing further can be told in it."""
-        return self.heard(model) <= HEARD_DB or self.verdict(model).active_db <= FAN_DB
+        return self.heard(model) <= self.criteria.heard_db or self.score(model).active_db <= self.criteria.fan_db
 
     def left(self, model: EchoModel) -> float:
         """Level in dB over that of the silences."""
-        verdict = self.verdict(model)
-        return max(verdict.level_db - floor_level(self.judge, verdict), 0.0)
+        score = self.score(model)
+        return max(score.level_db - self.judge.floor_level(score), 0.0)
 
     def attempt(self, name: str, model: EchoModel) -> Trial | None:
-        """The effect of that name fitted beside what the model has; None where its fit finds nothing."""
+        """The effect of that name fitted beside what the model has; None where its fit finds nothing, or no further one may be made."""
         key = signature(model), name
         if key not in self._trials:
-            self._trials[key] = self._attempt(name, model)
-            self._cost += COSTS.get(name, 1)
-            self._alike[frozenset(dict(model.effects)), name] = self._trials[key]
+            if self._cost >= self.criteria.most_cost:
+                self._refused = True
+                return None
+            self._trials[key] = self._alike[frozenset(dict(model.effects)), name] = self._attempt(name, model)
+            self._cost += find(name).cost
         return self._trials[key]
-
-    @property
-    def tired(self) -> bool:
-        """Whether so much was tried that a doubtful case is left as it is."""
-        return self._cost >= DEAR
 
     def attempt_alike(self, name: str, model: EchoModel) -> Trial | None:
         """attempt(), or what came of it beside the same effects at other values: enough to choose what is worth a closer look."""
@@ -119,18 +111,18 @@ class Workbench:
             self._progress(f"trying {name}")
         effect = find(name)
         try:
-            values = complete(effect, effect.fit(self.prepared.measurement, model))
+            values = fitted(effect, self.prepared.measurement, model)
         except (UsageError, ArithmeticError, np.linalg.LinAlgError) as error:
-            warnings.warn(f"{name} could not be fitted and is left out: {error}", stacklevel=2)
+            self._failed[name] = f"{name} could not be fitted and was left out: {error}"
             return None
-        if all(np.array_equal(values[key], neutral) for key, neutral in neutral_values(effect).items()):
-            return None
-        return self.beside(name, model, model.with_effect(name, values))
+        return None if vanishes(effect, values) else self.beside(name, model, model.with_effect(name, values))
 
     def beside(self, name: str, others: EchoModel, model: EchoModel) -> Trial:
         """What the effect of that name explains that model has and others has not."""
-        before, after = self.verdict(others), self.verdict(model)
-        size = max(size_db(after.prediction - before.prediction, self.prepared), noise_size_db(name, model, self.prepared))
+        before, after = self.score(others), self.score(model)
+        size = self.judge.size_db(after.prediction - before.prediction)
+        if find(name).adds_noise:
+            size = max(size, self.judge.noise_size_db(model))
         return Trial(name, dict(model.effects)[name], model, after, before.level_db - after.level_db, size)
 
     def halves(self, trial: Trial, model: EchoModel) -> bool:
@@ -139,36 +131,43 @@ class Workbench:
         A narrow ring does so, in few cells. Beside a long filter an effect may do so where that filter was fitted and so leaves no more
         than there is besides: of the held-out samples the filter itself leaves the most.
         """
-        before, after = self.verdict(model), trial.verdict
-        where_fitted = suspect(trial.name).complexity < LONG and _over_fan(after.fitted_db) < POWER_SHARE * _over_fan(before.fitted_db)
-        return where_fitted or _over_fan(after.active_db) < POWER_SHARE * _over_fan(before.active_db)
+        before, after, most = self.score(model), trial.score, self.criteria.power_share
+        short = find(trial.name).complexity < self.criteria.long_filter
+        where_fitted = short and _over_fan(after.fitted_db) < most * _over_fan(before.fitted_db)
+        return where_fitted or _over_fan(after.active_db) < most * _over_fan(before.active_db)
 
     def attempt_all(self, model: EchoModel, most: int = 9) -> list[Trial]:
         """Each effect that the model has not and whose complexity is at most `most`.
 
-        The LAST ones only where none of the others explains much of what is left.
+        The last resorts only where none of the others explains much of what is left.
         """
-        found, left = [], self.left(model)
-        for name in sorted(absent(model, most), key=lambda name: name in LAST):
-            if name in LAST and (self.tired or left < LITTLE_DB):
-                continue
-            if name in LAST and any((t.gain_db > ENOUGH * left or self.halves(t, model)) and self.admissible(t, model) for t in found):
-                continue
-            if (trial := self.attempt(name, model)) is not None:
-                found.append(trial)
-        return found
+        left, absent = self.left(model), self.absent(model, most)
+        found = [trial for name in absent if not find(name).last_resort and (trial := self.attempt(name, model)) is not None]
+        resorts = [name for name in absent if find(name).last_resort]
+        enough = self.criteria.last_resort_share * left
+        if not resorts or left < self.criteria.last_resort_db:
+            return found
+        if any((t.gain_db > enough or self.halves(t, model)) and self.admissible(t, model) for t in found):
+            return found
+        return found + [trial for name in resorts if (trial := self.attempt(name, model)) is not None]
 
     def admissible(self, trial: Trial, model: EchoModel) -> bool:
         """Whether a trial on a model explains enough to be named, and its values look like that effect."""
-        rule = suspect(trial.name)
-        if trial.gain_db < rule.least_gain_db or trial.size_db < rule.least_size_db:
+        effect = find(trial.name)
+        if trial.gain_db < effect.least_gain_db or trial.size_db < effect.least_size_db:
             return False
-        return rule.guard is None or rule.guard(trial.values, self.judge, self.verdict(model), trial.verdict)
+        return effect.plausible(Evidence(trial.values, model, self.judge, self.score(model), trial.score))
 
+    def preferred(self, trials: Iterable[Trial]) -> Trial | None:
+        """Of admissible trials the simplest of those that explain nearly as much as the best; None where none lowers the level."""
+        trials = list(trials)
+        most = max((trial.gain_db for trial in trials), default=0.0)
+        enough = [trial for trial in trials if most > 0.0 and trial.gain_db >= self.criteria.nested * most]
+        return min(enough, key=lambda trial: (find(trial.name).complexity, -trial.gain_db), default=None)
 
-def absent(model: EchoModel, most: int) -> list[str]:
-    """Names of the effects on the voice that a model has not and whose complexity is at most `most`."""
-    return [name for name in names() if find(name).stage != "noise" and name not in dict(model.effects) and suspect(name).complexity <= most]
+    def absent(self, model: EchoModel, most: int) -> list[str]:
+        """Names of the effects on the voice that a model has not and whose complexity is at most `most`."""
+        return [name for name in names() if find(name).stage != "noise" and name not in dict(model.effects) and find(name).complexity <= most]
 
 
 def added(start: EchoModel, model: EchoModel) -> list[str]:
@@ -176,37 +175,11 @@ def added(start: EchoModel, model: EchoModel) -> list[str]:
     return [name for name, _ in model.effects[len(start.effects) :]]
 
 
-def _over_fan(level_db: float) -> float:
-    """Power over the fan's, the fan taken off."""
-    return max(10 ** (level_db / 10) - 1.0, 0.0)
-
-
 def signature(model: EchoModel) -> Signature:
-    """By which models with the same effects at the same values are known, in whichever order these were fitted."""
+    """By which models with the same effects at the same values are known: they predict the same, in whichever order these were fitted."""
     return tuple(sorted((name, *(np.asarray(value, float).tobytes() for _, value in sorted(values.items()))) for name, values in model.effects))
 
 
-def floor_level(judge: Judge, verdict: Verdict) -> float:
-    """Level in dB of the cells in which the robot is silent, 0 where it never is: what is left when everything is explained."""
-    quiet = verdict.cells[~judge.active_cells]
-    if quiet.shape[0] < 4:
-        return 0.0
-    return float(np.average(10 * np.log10(np.maximum(quiet, 1e-3)).mean(axis=0), weights=judge.freedom))
-
-
-def size_db(change: Samples, prepared: Prepared) -> float:
-    """Power of a change of the prediction (n,) over the fan in dB: as it is or whitened, whichever is more."""
-    psd = prepared.measurement.noise_psd
-    fan = float(psd.sum()) * (SAMPLE_RATE / 2) / (psd.size - 1)
-    plain, white = float(np.mean(change.astype(float) ** 2)) / fan, float(np.mean(whiten(change, psd).astype(float) ** 2))
-    return float(10 * np.log10(max(plain, white, 1e-12)))
-
-
-def noise_size_db(name: str, model: EchoModel, prepared: Prepared) -> float:
-    """Mean power over the fan, in dB, of what the model says of that effect that no waveform predicts."""
-    if not hasattr(find(name), "variance"):
-        return -120.0
-    psd = prepared.measurement.noise_psd
-    fan = float(psd.sum()) * (SAMPLE_RATE / 2) / (psd.size - 1)
-    power = sum(float(np.mean(variance)) for variance, _ in model.unpredictable(prepared.measurement.reference))
-    return float(10 * np.log10(max(power / fan, 1e-12)))
+def _over_fan(level_db: float) -> float:
+    """Power over the fan's, the fan taken off."""
+    return max(10 ** (level_db / 10) - 1.0, 0.0)

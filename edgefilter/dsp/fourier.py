@@ -35,6 +35,11 @@ def irfft(spectrum: Spectrum, n: int, out: Samples | None = None) -> Samples:
     return _kernel.c2r(spectrum, (spectrum.ndim - 1,), n, False, 2, out, 1)
 
 
+def power(spectrum: np.ndarray) -> np.ndarray:
+    """|spectrum|^2 without the square root of abs, real and of the same precision."""
+    return spectrum.real**2 + spectrum.imag**2
+
+
 def _into(out: np.ndarray | None, found: np.ndarray) -> np.ndarray:
     if out is None:
         return found

@@ -1,30 +1,20 @@
-"""What one physical effect has to offer, and the registry in which effects are found by name."""
+"""One physical effect on the robot's own voice: the base class, whose hooks are all that the rest of the package knows of it."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
-from functools import cached_property
-from typing import TYPE_CHECKING, ClassVar, Literal, Protocol, TypeAlias
+from dataclasses import dataclass
+from typing import ClassVar, Literal, TypeAlias
 
 import numpy as np
-import scipy
-from numpy.typing import NDArray
 
+from edgefilter.echo.evidence import Evidence
+from edgefilter.echo.measurement import Measurement, Values, VoiceModel
 from edgefilter.errors import UsageError
-from edgefilter.types import SAMPLE_RATE, Array, Samples
+from edgefilter.types import Array, Samples
 
-if TYPE_CHECKING:
-    from edgefilter.echo.model import EchoModel
-
-Values: TypeAlias = Mapping[str, "float | Array"]
 Stage: TypeAlias = Literal["source", "path", "time", "microphone", "noise"]
 STAGES: tuple[Stage, ...] = ("source", "path", "time", "microphone", "noise")
 """In the order in which sound meets them."""
-ROUNDING_PSD = 1e-14
-"""One-sided PSD of rounding to 16 bit, full scale^2/Hz: (2^-15)^2 / 12 / 8 kHz."""
-REMEMBERED = 6
-"""Models whose predictions a measurement keeps."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,110 +28,114 @@ class Parameter:
     high: float
 
 
-@dataclass(frozen=True, eq=False)
-class Measurement:
-    """The robot alone: reference (n,), aligned up to what an effect may do to time, and the recording (n,) of it, float32, 16 kHz.
-
-    noise_psd: (601,) one-sided power spectral density of the fan, full scale^2/Hz, from 0 to 8 kHz; None where it is unknown.
-    fit: (n,) bool, the samples that a fit may use; the others are held out to judge it by. None: all.
-    """
-
-    reference: Samples
-    recording: Samples
-    noise_psd: Samples | None = None
-    fit: NDArray[np.bool_] | None = None
-    _heard: dict[EchoModel, tuple[Samples, Samples]] = field(default_factory=dict, init=False, repr=False)
-
-    @property
-    def weights(self) -> Samples:
-        """(n,) float32, 1 where a fit may use the sample, else 0."""
-        return np.ones(self.recording.size, np.float32) if self.fit is None else self.fit.astype(np.float32)
-
-    def whiten(self, x: Samples) -> Samples:
-        """x (n,) through a zero-phase filter after which the fan is white with variance 1; x itself where the fan is unknown."""
-        return x if self.noise_psd is None else whiten(x, self.noise_psd)
-
-    @cached_property
-    def white_recording(self) -> Samples:
-        """(n,) the recording, whitened."""
-        return self.whiten(self.recording)
-
-    def heard(self, model: EchoModel) -> tuple[Samples, Samples]:
-        """(n,), (n,) what a model predicts for the reference, and that whitened; remembered for the latest few models, not to be written to."""
-        known = self._heard.pop(model, None)
-        if known is None:
-            predicted = model.predict(self.reference)
-            known = predicted, self.whiten(predicted)
-            while len(self._heard) >= REMEMBERED:
-                del self._heard[next(iter(self._heard))]
-        self._heard[model] = known
-        return known
-
-    def error(self, predicted: Samples) -> float:
-        """Weighted sum of squares of the whitened recording minus predicted (n,): what a fit makes small."""
-        residual = self.whiten(self.recording - predicted)
-        return float(np.dot(residual * residual, self.weights))
+RECORDING = Parameter("recording", "fingerprint", 0.0, 0.0, 2.0**52)
+"""Every event's last parameter: the recording in which it happened (Measurement.fingerprint); 0 for whichever is looked at."""
 
 
-def whiten(x: Samples, noise_psd: Samples) -> Samples:
-    """x (n,) filtered by 1 / sqrt(noise_psd), zero-phase, so that noise of that one-sided PSD gets variance 1.
-
-    The PSD is held above 16 bit rounding noise and 70 dB under its maximum, so that a notch is not amplified beyond reason.
-    """
-    two_sided = np.maximum(noise_psd.astype(np.float64), max(ROUNDING_PSD, 1e-7 * float(noise_psd.max()))) * SAMPLE_RATE / 2
-    taps = np.fft.fftshift(np.fft.irfft(1.0 / np.sqrt(two_sided)))[1:]
-    taps *= np.hanning(taps.size + 2)[1:-1] ** 0.25
-    return scipy.signal.oaconvolve(x, taps.astype(np.float32), mode="full")[taps.size // 2 :][: x.size].astype(np.float32)
-
-
-class Effect(Protocol):
+class Effect:
     """One physical effect on the robot's own voice. With every parameter at its neutral value, apply is the identity.
 
-    Stage "source" acts on the reference, "path", "time" and "microphone" on the predicted voice at the microphone. An effect of stage
-    "noise" leaves apply the identity and offers one of these instead: noise_psd(values, psd) -> (601,), the fan's PSD after it;
-    variance(reference, values, sample_rate) -> (n,), what it adds to the expected square of each sample, and colour(values) -> (601,), the
-    density of that per Hz, 0 to 8 kHz, with an integral of 1. An effect of stage "source"
-    that is not memoryless may name a memory, samples of the past that it needs: then the running filter applies it, too. One of stage
-    "microphone" that gives the fan the same gain as the voice says scales_fan = True.
+    A subclass gives name, stage and parameters, and overrides what differs from the defaults below; no other module knows an effect by name.
+    Stage "source" acts on the reference, "path", "time" and "microphone" on the predicted voice at the microphone; "noise" changes the
+    noise that is expected and leaves the voice alone.
+
+    What the model asks:
+    memory: samples of the past that apply needs, 0 for none; None where it needs more than the running filter looks back at every hop.
+    scales_fan: whether the fan gets the same gain as the voice. event: whether the values belong to one recording (moments, a gain's
+    curve) rather than to the robot: they get a parameter RECORDING besides their own, and in other recordings the effect is left out. absorbed: whether a linear path fitted to a recording holds the effect already.
+
+    What the diagnosis asks:
+    title: as it reads inside a sentence ("a turned volume"); by default the name. complexity: of two effects that explain about as much
+    the lower one is named; from 4 on it is a long filter, which half a minute does not teach. least_gain_db: fall of the held-out level
+    and least_size_db: power over the fan of what changes, below which it is not named. cost: of a fit, in quarters of a second.
+    last_resort: whether it is tried only where no other explains much. flexible: whether it has so many numbers that it takes up what
+    a simpler effect beside it does. leaves_noise: whether it leaves noise in the residual that no waveform predicts; noise_words: what
+    is said of that where a residual is described.
     """
 
     name: ClassVar[str]
     stage: ClassVar[Stage]
-    memoryless: ClassVar[bool]
     parameters: ClassVar[tuple[Parameter, ...]]
 
+    memory: ClassVar[int | None] = None
+    scales_fan: ClassVar[bool] = False
+    event: ClassVar[bool] = False
+    absorbed: ClassVar[bool] = False
+
+    title: ClassVar[str] = ""
+    complexity: ClassVar[int] = 3
+    least_gain_db: ClassVar[float] = 0.05
+    least_size_db: ClassVar[float] = -6.0
+    cost: ClassVar[int] = 1
+    last_resort: ClassVar[bool] = False
+    flexible: ClassVar[bool] = False
+    leaves_noise: ClassVar[bool] = False
+    noise_words: ClassVar[str] = ""
+
     def apply(self, x: Samples, values: Values, sample_rate: int) -> Samples:
-        """The signal (n,) after the effect; x is not written to."""
-        ...
+        """The signal (n,) after the effect; x is not written to. By default x itself, as for an effect of stage "noise"."""
+        return x.copy()
 
-    def fit(self, measurement: Measurement, model: EchoModel) -> Values:
-        """Values with which the model, this effect added, comes closest to the recording (least squares)."""
-        ...
+    def fit(self, measurement: Measurement, model: VoiceModel) -> Values:
+        """Values with which the model, this effect added, comes closest to the recording (least squares); by default the neutral ones."""
+        return neutral(self)
 
+    def noise_psd(self, values: Values, psd: Samples) -> Samples:
+        """The fan's PSD (601,) with the effect, from psd (601,) without it."""
+        return psd
 
-_REGISTRY: dict[str, Effect] = {}
+    def variance(self, reference: Samples, values: Values, sample_rate: int) -> Samples:
+        """What the effect adds to the expected square of each sample (n,) at the microphone, for an aligned reference (n,)."""
+        return np.zeros(reference.size, np.float32)
 
+    def colour(self, values: Values) -> Array:
+        """(601,) the spectral density of that, 0 to 8 kHz, per Hz: its integral is 1. By default white."""
+        return np.full(601, 1.0 / 8000.0)
 
-def register(effect: Effect) -> None:
-    """Make an effect known by its name; raises UsageError where the name is taken or a neutral value is out of bounds."""
-    if effect.name in _REGISTRY:
-        raise UsageError(f"effect '{effect.name}' is defined twice: rename one of them")
-    for p in effect.parameters:
-        if not p.low <= p.neutral <= p.high:
-            raise UsageError(f"effect {effect.name}: neutral {p.name}={p.neutral:g} is outside {p.low:g} to {p.high:g}")
-    _REGISTRY[effect.name] = effect
+    def settled(self, values: Values) -> Values:
+        """Values with which the effect is from the start what it is at a recording's end: what the running filter begins with."""
+        return values
 
+    def sentence(self, values: Values) -> str:
+        """What in a recording speaks for the effect, with its figures; empty: nothing but that the residual falls."""
+        return ""
 
-def names() -> tuple[str, ...]:
-    """All known effects."""
-    return tuple(_REGISTRY)
+    def plausible(self, evidence: Evidence) -> bool:
+        """Whether the values, and what they explain, look like this effect rather than another."""
+        return True
 
+    def cutting_above(self, hz: float) -> Values | None:
+        """Values with which the effect takes away all that lies above hz; None for an effect that does no such thing."""
+        return None
 
-def find(name: str) -> Effect:
-    """The effect of that name; raises UsageError with the known names."""
-    if name not in _REGISTRY:
-        raise UsageError(f"unknown effect '{name}': choose one of {', '.join(sorted(_REGISTRY))}")
-    return _REGISTRY[name]
+    def passband_gain_db(self, values: Values) -> float | None:
+        """The gain in dB that the effect gives to all of the voice that it passes; None where there is no one such gain."""
+        return None
+
+    def plain_gain(self, gain_db: float) -> Values | None:
+        """Values with which the effect is that gain and nothing else; None for an effect that is more than a gain."""
+        return None
+
+    def __init_subclass__(cls, **named: object) -> None:
+        super().__init_subclass__(**named)
+        own = vars(cls).get("parameters")
+        if cls.event and isinstance(own, tuple) and RECORDING not in own:
+            cls.parameters = (*own, RECORDING)
+
+    @property
+    def told(self) -> tuple[Parameter, ...]:
+        """The parameters that say something to people."""
+        return tuple(p for p in self.parameters if p is not RECORDING)
+
+    @property
+    def adds_noise(self) -> bool:
+        """Whether variance() is more than nothing."""
+        return type(self).variance is not Effect.variance
+
+    @property
+    def timed(self) -> bool:
+        """Whether what it does depends on when the recording began."""
+        return self.event or self.stage == "time"
 
 
 def neutral(effect: Effect) -> dict[str, float]:
@@ -161,7 +155,19 @@ def complete(effect: Effect, values: Values) -> dict[str, float | Array]:
     return {**neutral(effect), **{name: value if np.ndim(value) == 0 else np.asarray(value, float) for name, value in values.items()}}
 
 
-def level_ratio(recording: Samples, predicted: Samples) -> float:
-    """Least-squares gain from predicted to recording, both (n,); 1 where nothing was predicted."""
-    energy = float(np.dot(predicted, predicted))
-    return float(np.dot(recording, predicted)) / energy if energy > 0.0 else 1.0
+def fitted(effect: Effect, measurement: Measurement, model: VoiceModel) -> dict[str, float | Array]:
+    """All values of an effect fitted to a measurement; those of an event, unless it vanishes, say in which recording it happened."""
+    values = complete(effect, effect.fit(measurement, model))
+    if effect.event and not vanishes(effect, values):
+        values[RECORDING.name] = measurement.fingerprint
+    return values
+
+
+def vanishes(effect: Effect, values: Values) -> bool:
+    """Whether all values are the neutral ones."""
+    return all(np.array_equal(values[name], value) for name, value in neutral(effect).items())
+
+
+def first(values: Values, name: str) -> float:
+    """A parameter as one number: the first where it holds several."""
+    return float(np.ravel(values[name])[0])

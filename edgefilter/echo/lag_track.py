@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import scipy
 
+from edgefilter.dsp.lag import climb
 from edgefilter.types import Array, Samples
 
 LEAST_CORRELATION = 0.3
@@ -15,12 +16,16 @@ LEAST_CORRELATION = 0.3
 
 @dataclass(frozen=True, eq=False)
 class LagTrack:
-    """starts (b,): first sample of each block of `size` samples; lag (b,), sigma (b,): samples, the recording behind the prediction."""
+    """starts (b,): first sample of each block of `size` samples; lag (b,), sigma (b,): samples, the recording behind the prediction.
+
+    correlation (b,): of the block with the prediction at that lag, 0 to 1.
+    """
 
     starts: Array
     size: int
     lag: Array
     sigma: Array
+    correlation: Array
 
     @property
     def middle(self) -> Array:
@@ -40,15 +45,15 @@ def track_lag(predicted: Samples, recording: Samples, fit: np.ndarray | None, si
         allowed = np.concatenate(([0], np.cumsum(fit)))
         starts = starts[allowed[starts + size] - allowed[starts] == size]
     if not starts.size:
-        return LagTrack(starts, size, np.zeros(0), np.zeros(0))
+        return LagTrack(starts, size, np.zeros(0), np.zeros(0), np.zeros(0))
     padded = np.pad(predicted, (reach, reach))
     wide = padded[starts[:, None] + np.arange(size + 2 * reach)]
     block = recording[starts[:, None] + np.arange(size)]
     whole, correlation = _coarse(wide, block, reach)
     near = np.take_along_axis(wide, reach - whole[:, None] + np.arange(size), axis=1)
     fraction, sigma = _fine(near, block)
-    good = (correlation > LEAST_CORRELATION) & (np.abs(fraction) < 1.5) & np.isfinite(sigma)
-    return LagTrack(starts[good], size, (whole + fraction)[good], sigma[good])
+    good = (correlation > LEAST_CORRELATION) & (np.abs(fraction) < 1.0) & np.isfinite(sigma)
+    return LagTrack(starts[good], size, (whole + fraction)[good], sigma[good], correlation[good])
 
 
 def _coarse(wide: Samples, block: Samples, reach: int) -> tuple[Array, Array]:
@@ -70,11 +75,8 @@ def _fine(near: Samples, block: Samples) -> tuple[Array, Array]:
     a, b = scipy.fft.rfft(near * window), scipy.fft.rfft(block * window)
     cross = b * np.conj(a)
     w = 2 * np.pi * np.arange(a.shape[1]) / block.shape[1]
-    lag = np.zeros(a.shape[0])
-    for _ in range(6):
-        turned = cross * np.exp(1j * w * lag[:, None])
-        slope, bend = turned.imag @ w, turned.real @ w**2
-        lag -= np.clip(np.divide(slope, bend, out=np.zeros_like(slope), where=bend > 0), -0.5, 0.5)
+    lag = np.array([climb(row, w, 0.0, steps=6) for row in cross])
+    turned = cross * np.exp(1j * w * lag[:, None])
     power = np.abs(a) ** 2
     gain = (turned.real.sum(axis=1) / np.maximum(power.sum(axis=1), 1e-30))[:, None]
     left = np.mean(np.abs(b) ** 2 - gain**2 * power, axis=1)

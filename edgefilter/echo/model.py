@@ -7,8 +7,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 import scipy
 
-from edgefilter.echo.effect import STAGES, Measurement, Values, complete, find
-from edgefilter.echo.effects import catalogue
+from edgefilter.echo.effect import RECORDING, complete, fitted
+from edgefilter.echo.effects.catalogue import chain, find
+from edgefilter.echo.measurement import Measurement, Values
 from edgefilter.echo.source_chain import Driver
 from edgefilter.types import SAMPLE_RATE, Array, Samples
 
@@ -21,7 +22,8 @@ class EchoModel:
     """A linear path and the effects around it.
 
     impulse_response: (taps,) float32 from the reference to the microphone, starting PRE_ROLL samples before the direct sound.
-    effects: (name, values) in the order in which they were added.
+    effects: (name, values) in the order in which they were added; applied they are in the catalogue's, so that the order in which effects
+    were found changes nothing that is predicted.
     """
 
     impulse_response: Samples
@@ -33,13 +35,13 @@ class EchoModel:
 
     def unpredictable(self, reference: Samples) -> tuple[tuple[Samples, Array], ...]:
         """Of each effect that adds noise of its own: its expected square (n,) at the microphone, and its density (601,) per Hz of integral 1."""
-        chain = sorted(((find(name), complete(find(name), values)) for name, values in self.effects), key=lambda pair: STAGES.index(pair[0].stage))
-        noisy = [(effect, values) for effect, values in chain if hasattr(effect, "variance")]
+        applied = chain(self.effects)
+        noisy = [(effect, values) for effect, values in applied if effect.adds_noise]
         if not noisy:
             return ()
         x = reference
-        for effect, values in chain:
-            if effect.stage == "time" or (effect.stage == "source" and not hasattr(effect, "variance")):
+        for effect, values in applied:
+            if effect.stage == "time" or (effect.stage == "source" and not effect.adds_noise):
                 x = effect.apply(x, values, SAMPLE_RATE)
         return tuple((effect.variance(x, values, SAMPLE_RATE), effect.colour(values)) for effect, values in noisy)
 
@@ -49,14 +51,12 @@ class EchoModel:
 
     def running_response(self) -> Samples:
         """(taps,) the path with all stationary linear effects folded in, as after the last change: what the running filter starts from."""
-        chain = [(find(name), values) for name, values in self.effects]
-        chain = [(effect, complete(effect, values)) for effect, values in chain if effect.stage == "path"]
-        if not chain:
+        linear = [(effect, values) for effect, values in chain(self.effects) if effect.stage == "path"]
+        if not linear:
             return self.impulse_response
         response = np.pad(self.impulse_response, (0, TAIL))
-        for effect, values in chain:
-            settled = getattr(effect, "settled", None)
-            response = effect.apply(response, settled(values) if settled else values, SAMPLE_RATE)
+        for effect, values in linear:
+            response = effect.apply(response, effect.settled(values), SAMPLE_RATE)
         heard = np.flatnonzero(np.abs(response) > 1e-4 * np.abs(response).max(initial=0.0))
         return response[: max(self.impulse_response.size, int(heard[-1]) + 1 if heard.size else 0)]
 
@@ -86,11 +86,21 @@ class EchoModel:
     def microphone_gain(self, size: int) -> Samples:
         """(size,) the gain that an effect behind the microphone gives voice and fan alike at each moment; ones without one."""
         gain = np.ones(size, np.float32)
-        for name, values in self.effects:
-            effect = find(name)
-            if getattr(effect, "scales_fan", False):
-                gain = effect.apply(gain, complete(effect, values), SAMPLE_RATE)
+        for effect, values in chain(self.effects):
+            if effect.scales_fan:
+                gain = effect.apply(gain, values, SAMPLE_RATE)
         return gain
+
+    def expected_noise(self, psd: Samples) -> Samples:
+        """(601,) PSD of the fan with the model's effects on it, from psd (601,) of the calibration."""
+        for effect, values in chain(self.effects):
+            psd = effect.noise_psd(values, psd)
+        return psd
+
+    @property
+    def timed(self) -> bool:
+        """Whether what the model predicts depends on when the recording began."""
+        return any(find(name).timed for name, _ in self.effects)
 
     def with_effect(self, name: str, values: Values) -> EchoModel:
         """The model with that effect added, or its values replaced; missing values are neutral.
@@ -106,20 +116,22 @@ class EchoModel:
 
     def fit(self, name: str, measurement: Measurement) -> EchoModel:
         """The model with that effect at the values that explain the measurement best."""
-        return self.with_effect(name, find(name).fit(measurement, self.without_effect(name)))
+        return self.with_effect(name, fitted(find(name), measurement, self.without_effect(name)))
+
+    def during(self, measurement: Measurement) -> EchoModel:
+        """The model without the events of other recordings: a jump or a moment's move does not come again at the same second of another one."""
+        here = (0.0, measurement.fingerprint)
+        kept = tuple((name, values) for name, values in self.effects if not find(name).event or values.get(RECORDING.name, 0.0) in here)
+        return self if len(kept) == len(self.effects) else replace(self, effects=kept)
 
     def _predict(self, reference: Samples, effects: tuple[tuple[str, Values], ...]) -> Samples:
-        """Source effects, the path, then the rest in the order in which sound meets them."""
-        x = reference
-        chain = sorted(((find(name), values) for name, values in effects), key=lambda pair: STAGES.index(pair[0].stage))
-        for effect, values in chain:
+        """Source effects, the path, then the rest, each in the catalogue's order."""
+        x, applied = reference, chain(effects)
+        for effect, values in applied:
             if effect.stage == "source":
-                x = effect.apply(x, complete(effect, values), SAMPLE_RATE)
+                x = effect.apply(x, values, SAMPLE_RATE)
         x = scipy.signal.oaconvolve(x, self.impulse_response)[: reference.size].astype(np.float32)
-        for effect, values in chain:
+        for effect, values in applied:
             if effect.stage != "source":
-                x = effect.apply(x, complete(effect, values), SAMPLE_RATE)
+                x = effect.apply(x, values, SAMPLE_RATE)
         return x
-
-
-catalogue.load()

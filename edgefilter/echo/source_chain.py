@@ -6,21 +6,21 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from edgefilter.echo.effect import Values, complete, find
+from edgefilter.echo.effects.catalogue import chain
+from edgefilter.echo.measurement import Values
 from edgefilter.types import SAMPLE_RATE, Samples
 
 
 class Driver:
     """Applies the source effects of a model to successive blocks; those with a memory also see what came before a block.
 
-    effects: (name, values). Left out is what needs more of the past than a filter can look back at every hop (compression), and what
-    acts behind the path.
+    effects: (name, values). Left out is what needs more of the past than a filter can look back at every hop, as a compressor with its
+    release does, and what acts behind the path.
     """
 
     def __init__(self, effects: Sequence[tuple[str, Values]] = ()) -> None:
-        known = [(find(name), values) for name, values in effects]
-        self._chain = [(effect, complete(effect, values)) for effect, values in known if effect.stage == "source" and _memory(effect) is not None]
-        self._memory = sum(_memory(effect) for effect, _ in self._chain)
+        self._chain = [(effect, values) for effect, values in chain(effects) if effect.stage == "source" and effect.memory is not None]
+        self._memory = sum(effect.memory for effect, _ in self._chain)
         self._past = np.zeros(self._memory, np.float32)
 
     def __call__(self, block: Samples) -> Samples:
@@ -40,8 +40,3 @@ class Driver:
         before = np.concatenate((np.zeros(self._memory, np.float32), history[: history.size - hop]))
         self._past = before[before.size - self._memory :]
         return driven
-
-
-def _memory(effect: object) -> int | None:
-    """Samples of the past that an effect needs; None for more than a hop's work allows."""
-    return 0 if effect.memoryless else getattr(effect, "memory", None)

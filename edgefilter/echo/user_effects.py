@@ -1,26 +1,27 @@
-"""Effects of the user's own: a Python file with one class that follows the Effect protocol, registered beside the others."""
+"""Effects of the user's own: a Python file with one class that has the hooks of Effect, known beside the others."""
 
 from __future__ import annotations
 
+import functools
 import importlib.util
 import sys
 import traceback
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from types import ModuleType
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from edgefilter.echo.effect import STAGES, Effect, Measurement, Parameter, Values, complete, names, neutral, register
+from edgefilter.echo.effect import STAGES, Effect, Parameter, complete, neutral
+from edgefilter.echo.effects.catalogue import names, register
 from edgefilter.errors import EdgefilterError, UsageError
-from edgefilter.types import SAMPLE_RATE, Samples
+from edgefilter.types import SAMPLE_RATE
 
-if TYPE_CHECKING:
-    from edgefilter.echo.model import EchoModel
-
-REQUIRED = ("name", "stage", "memoryless", "parameters", "apply", "fit")
+REQUIRED = ("name", "stage", "parameters", "fit")
+"""What no effect can do without; the rest has the defaults of Effect."""
+HOOKS = tuple(name for name, value in vars(Effect).items() if callable(value) and not name.startswith("_"))
 PROBE_SAMPLES = 4000
+PSD_BINS = 601
 _loaded: dict[Path, str] = {}
 
 
@@ -28,8 +29,9 @@ def load_effect(path: str | Path) -> str:
     """Run the Python file at path, register the effect that its one class defines, and return the effect's name.
 
     The file is code and runs with the caller's rights. A file that was loaded before is not run again.
-    Raises UsageError, in one line, where there is no such file, it does not run, holds no such class or more than one, the class lacks
-    a part of the Effect protocol, its name is taken, or its neutral values are not the identity.
+    A class that does not derive from Effect gets its defaults all the same. Raises UsageError, in one line, where there is no such file,
+    it does not run, holds no such class or more than one, the class lacks what every effect has, its name is taken, or its neutral
+    values are not the identity.
 
     >>> import tempfile
     >>> file = Path(tempfile.mkdtemp()) / "broken.py"
@@ -42,50 +44,74 @@ def load_effect(path: str | Path) -> str:
     path = Path(path)
     if path.resolve() in _loaded:
         return _loaded[path.resolve()]
-    effect = _Guarded(path, _instance(path, _run(path)))
+    effect = _instance(path, _guarded(path, _effect_class(path, _run(path))))
     _check(path, effect)
     register(effect)
     _loaded[path.resolve()] = effect.name
     return effect.name
 
 
-class _Guarded:
-    """The user's effect; what its methods raise becomes one line that names the file and the line in it."""
+def _guarded(path: Path, mine: type[Effect]) -> type[Effect]:
+    """A subclass of the user's class: what its hooks raise becomes one line that names the file and the line in it, what they give is checked."""
+    own = [name for name in HOOKS if getattr(mine, name) is not getattr(Effect, name)]
+    return type(mine.__name__, (mine,), {name: _in_one_line(path, getattr(mine, name), _RESULTS.get(name)) for name in own})
 
-    def __init__(self, path: Path, effect: Effect) -> None:
-        self._path, self._effect = path, effect
-        self.name, self.stage, self.memoryless, self.parameters = effect.name, effect.stage, effect.memoryless, effect.parameters
-        if hasattr(effect, "noise_psd"):
-            self.noise_psd = effect.noise_psd
-        if hasattr(effect, "variance"):
-            self.variance = effect.variance
-        if hasattr(effect, "memory"):
-            self.memory = effect.memory
 
-    def apply(self, x: Samples, values: Values, sample_rate: int) -> Samples:
-        """The user's apply, its result checked for shape, type and finite values."""
-        out = self._call(self._effect.apply, x, values, sample_rate)
-        if not isinstance(out, np.ndarray) or out.shape != x.shape or out.dtype != np.float32 or not np.isfinite(out).all():
-            what = f"{out.dtype} of shape {out.shape}" if isinstance(out, np.ndarray) else type(out).__name__
-            raise UsageError(f"{self._path}: apply gives {what}, expected finite float32 of shape {x.shape}, the shape of its input")
-        return out
+def _in_one_line(path: Path, hook: Callable, check: Callable | None) -> Callable:
+    """The hook, guarded. check(effect, result, first argument) raises UsageError for a result that would fail later."""
 
-    def fit(self, measurement: Measurement, model: EchoModel) -> Values:
-        """The user's fit, its result checked for names and bounds."""
-        values = self._call(self._effect.fit, measurement, model)
-        if not isinstance(values, Mapping):
-            raise UsageError(f"{self._path}: fit gives {type(values).__name__}, expected a dict from parameter names to values")
-        return complete(self._effect, values)
-
-    def _call(self, method: Callable[..., object], *arguments: object) -> object:
+    @functools.wraps(hook)
+    def call(effect: Effect, *arguments: object, **named: object) -> object:
         try:
-            return method(*arguments)
+            result = hook(effect, *arguments, **named)
         except EdgefilterError:
             raise
         except Exception as error:
-            lines = [frame.lineno for frame in traceback.extract_tb(error.__traceback__) if frame.filename == str(self._path.resolve())]
+            lines = [frame.lineno for frame in traceback.extract_tb(error.__traceback__) if frame.filename == str(path.resolve())]
             where = f" at line {lines[-1]}" if lines else ""
-            raise UsageError(f"{self._path}: {method.__name__} stops{where} with {_told(error)}") from error
+            raise UsageError(f"{path}: {hook.__name__} stops{where} with {_told(error)}") from error
+        if check is None:
+            return result
+        try:
+            return check(effect, result, arguments[0])
+        except UsageError as error:
+            raise UsageError(f"{path}: {hook.__name__} {error}") from None
+
+    return call
+
+
+def _like_input(effect: Effect, result: object, x: np.ndarray) -> np.ndarray:
+    if not isinstance(result, np.ndarray) or result.shape != x.shape or result.dtype != np.float32 or not np.isfinite(result).all():
+        raise UsageError(f"gives {_kind(result)}, expected finite float32 of shape {x.shape}, the shape of its input")
+    return result
+
+
+def _values(effect: Effect, result: object, *_: object) -> Mapping[str, object]:
+    if not isinstance(result, Mapping):
+        raise UsageError(f"gives {type(result).__name__}, expected a dict from parameter names to values")
+    try:
+        return complete(effect, result)
+    except UsageError as error:
+        raise UsageError(f"gives a wrong value: {error}") from None
+
+
+def _power(size: int | None) -> Callable:
+    """A check for finite numbers of at least 0, size of them, or as many as the input has."""
+
+    def check(effect: Effect, result: object, given: object) -> np.ndarray:
+        shape = (PSD_BINS,) if size else np.shape(given)
+        if not isinstance(result, np.ndarray) or result.shape != shape or not np.isfinite(result).all() or (result < 0).any():
+            raise UsageError(f"gives {_kind(result)}, expected finite numbers of shape {shape}, none below 0")
+        return result
+
+    return check
+
+
+_RESULTS = {"apply": _like_input, "fit": _values, "variance": _power(None), "noise_psd": _power(PSD_BINS), "colour": _power(PSD_BINS)}
+
+
+def _kind(result: object) -> str:
+    return f"{result.dtype} of shape {result.shape}" if isinstance(result, np.ndarray) else type(result).__name__
 
 
 def _run(path: Path) -> ModuleType:
@@ -107,21 +133,26 @@ def _run(path: Path) -> ModuleType:
     return module
 
 
-def _instance(path: Path, module: ModuleType) -> Effect:
-    """The one effect that the module defines."""
-    classes = [
-        value for value in vars(module).values() if isinstance(value, type) and value.__module__ == module.__name__ and hasattr(value, "apply")
-    ]
+def _effect_class(path: Path, module: ModuleType) -> type[Effect]:
+    """The one effect that the module defines, with the defaults of Effect."""
+    own = [value for value in vars(module).values() if isinstance(value, type) and value.__module__ == module.__name__]
+    classes = [value for value in own if issubclass(value, Effect) or "apply" in vars(value)]
     if len(classes) != 1:
         found = ", ".join(value.__name__ for value in classes) or "none"
         raise UsageError(f"{path}: expected one class with apply and fit, found {found}; keep each effect in a file of its own")
-    missing = [part for part in REQUIRED if not hasattr(classes[0], part)]
+    (mine,) = classes
+    given = {part for base in mine.__mro__ if base not in (Effect, object) for part in vars(base)}
+    missing = [part for part in REQUIRED if part not in given]
     if missing:
-        raise UsageError(f"{path}: class {classes[0].__name__} lacks {', '.join(missing)}; an effect has {', '.join(REQUIRED)}")
+        raise UsageError(f"{path}: class {mine.__name__} lacks {', '.join(missing)}; an effect has {', '.join(REQUIRED)}")
+    return mine if issubclass(mine, Effect) else type(mine.__name__, (mine, Effect), {})
+
+
+def _instance(path: Path, mine: type[Effect]) -> Effect:
     try:
-        return classes[0]()
+        return mine()
     except Exception as error:
-        raise UsageError(f"{path}: {classes[0].__name__}() stops with {_told(error)}; an effect is made without arguments") from error
+        raise UsageError(f"{path}: {mine.__name__}() stops with {_told(error)}; an effect is made without arguments") from error
 
 
 def _check(path: Path, effect: Effect) -> None:

@@ -9,11 +9,10 @@ import scipy
 from numpy.typing import NDArray
 from scipy import fft
 
-from edgefilter.echo.effect import Measurement
+from edgefilter.echo.measurement import Measurement
+from edgefilter.echo.recording import BLOCK
 from edgefilter.types import SAMPLE_RATE, Array, Samples
 
-BLOCK = SAMPLE_RATE // 2
-"""Samples that are transformed at once, those between two changes of the samples that diagnose() fits on."""
 SETTLED = 1e-6
 """A step that explains less than this part of what all before it have explained is the last."""
 
@@ -29,7 +28,8 @@ def fit_filter(x: Samples, target: Samples, weights: Samples, taps: int, lead: i
 
     x, target: (n,), whitened, so that the noise has variance 1. weights: (n,) 0 to 1. prior: (taps,) expected c^2; None: no penalty
     but a tiny one. Preconditioned conjugate gradients on the normal equations (Golub & Van Loan, Matrix Computations, 11.5) with a
-    circulant preconditioner; stopping after `steps` leaves out what the data hardly speaks of.
+    circulant preconditioner; stopping after `steps` leaves out what the data hardly speaks of. Not scipy's cg: what a step explains, by
+    which this one stops, can be had from its iterates only as a difference, which the transforms' float32 drowns.
     """
     blocks = _Blocks(x, weights, taps, lead)
     share = float(np.mean(weights))
@@ -64,15 +64,18 @@ def fit_filter(x: Samples, target: Samples, weights: Samples, taps: int, lead: i
 
 
 def fit_supported(x: Samples, target: Samples, weights: Samples, taps: int, lead: int, prior: Array, steps: int) -> Array:
-    """fit_filter's answer, or zeros where a filter from half of the weighted samples does not help on the other half (blocks of 0.5 s)."""
-    half = np.arange(x.size) // (SAMPLE_RATE // 2) % 4 < 2
+    """fit_filter's answer, or zeros where a filter from half of the weighted samples does not help on the other half (BLOCKs, two by two)."""
+    half = np.arange(x.size) // BLOCK % 4 < 2
     trial = convolve_from(x, fit_filter(x, target, weights * half, taps, lead, prior, steps // 2), lead)
     fall = float(np.dot(target * target - (target - trial) ** 2, weights * ~half))
     return fit_filter(x, target, weights, taps, lead, prior, steps) if fall > 0.0 else np.zeros(taps)
 
 
 class _Blocks:
-    """x (n,) in the blocks of a weighted convolution, those without weight left out: overlap-save with transforms that stay in the cache."""
+    """x (n,) in the blocks of a weighted convolution, those without weight left out: overlap-save.
+
+    The blocks are those between two changes of the samples that are fitted on, so that half of them drop out; their transforms stay in the cache.
+    """
 
     def __init__(self, x: Samples, weights: Samples, taps: int, lead: int) -> None:
         self._taps = taps

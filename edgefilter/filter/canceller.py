@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from edgefilter.dsp import fourier
+from edgefilter.dsp.membrane import DISPLACEMENT_TAPS, displacement_taps
 from edgefilter.errors import SignalError
 from edgefilter.types import SAMPLE_RATE, Samples
 
@@ -22,10 +23,6 @@ NOISE_MEMORY = 0.8
 """Weight of the past in the measurement-noise PSD: 80 ms, so that the onset of near-end speech still stops the adaptation."""
 OWN_SHARE = 0.6
 """Share of the expected misalignment that is not counted as measurement noise; 1 adapts fastest, 0 is safest in double talk."""
-DISPLACEMENT_HZ = 300.0
-"""Corner of the second-order low-pass that turns the reference into the displacement of the loudspeaker's membrane."""
-DISPLACEMENT_TAPS = 128
-"""Length of its impulse response, 8 ms: what comes later is 80 dB below its peak."""
 DISPLACEMENT_SCALE = 0.1
 """Displacement, in the reference's full scale, at which the products have the size of the reference."""
 PRODUCT_PARTITIONS = 2
@@ -84,7 +81,7 @@ class Canceller:
             self._initial[:known] = impulse_response[:known]
         self._channels = 3 if nonlinear else 1
         self._first = [0, self.partitions, self.partitions + PRODUCT_PARTITIONS][: self._channels]
-        self._lowpass_reversed = _butterworth(DISPLACEMENT_HZ, DISPLACEMENT_TAPS)[::-1].copy()
+        self._lowpass_reversed = (displacement_taps() / DISPLACEMENT_SCALE).astype(np.float32)[::-1].copy()
         self.reset()
 
     @property
@@ -128,7 +125,7 @@ class Canceller:
         echo, error, phantom = self._without_phantom(mic, echo)
         self._padded[self.hop :] = error
         error_spectrum = fourier.rfft(self._padded)
-        observed = _power(error_spectrum)
+        observed = fourier.power(error_spectrum)
         self._noise *= NOISE_MEMORY
         self._noise += (1.0 - NOISE_MEMORY) * np.maximum(observed - 0.5 * OWN_SHARE * misalignment, 0.05 * observed)
         self._hops += 1
@@ -181,7 +178,7 @@ class Canceller:
             self._all_spectra[rows:], self._all_powers[rows:] = self._spectra, self._powers
             self._slide(to=rows)
         self._slide(to=self._at - 1)
-        for row, spectrum, power in zip(self._first, fresh, _power(fresh)):
+        for row, spectrum, power in zip(self._first, fresh, fourier.power(fresh)):
             self._spectra[row], self._powers[row] = spectrum, power
 
     def _slide(self, to: int) -> None:
@@ -211,7 +208,7 @@ class Canceller:
 
     def _path_power(self) -> np.ndarray:
         """(bins,) |H|^2 of the path at the start, summed over partitions; 1 where nothing is known."""
-        return _power(self._weights[: self.partitions]).sum(axis=0) if self._warm else np.ones(self.hop + 1, np.float32)
+        return fourier.power(self._weights[: self.partitions]).sum(axis=0) if self._warm else np.ones(self.hop + 1, np.float32)
 
     def _prior(self) -> np.ndarray:
         """(partitions, bins) covariance before anything was heard."""
@@ -219,7 +216,7 @@ class Canceller:
         decay = 10.0 ** (-6.0 * seconds / DECAY_RT60_S)[:, None] * np.ones(self.hop + 1)
         if not self._warm:
             return (decay / decay.sum(axis=0)).astype(np.float32)
-        return (WARM_DOUBT * _power(self._weights[: self.partitions]) + LATE_DOUBT * decay * self._path_power()).astype(np.float32)
+        return (WARM_DOUBT * fourier.power(self._weights[: self.partitions]) + LATE_DOUBT * decay * self._path_power()).astype(np.float32)
 
     def impulse_response(self) -> Samples:
         """The adapted path (taps,) float32, to be written back into a profile."""
@@ -246,23 +243,9 @@ class Canceller:
             count = PRODUCT_PARTITIONS if first else self.partitions
             hops = channel.reshape(-1, self.hop)[::-1]
             self._spectra[first : first + count] = fourier.rfft(np.concatenate((hops[1 : count + 1], hops[:count]), axis=1))
-        self._powers[:] = _power(self._spectra)
+        self._powers[:] = fourier.power(self._spectra)
         self._recent[:] = [channel[-2 * self.hop :] for channel in channels]
 
     def stats(self) -> dict[str, float]:
         """What the stage did so far."""
         return {"hops": self._hops, "active_hops": self._active, "partitions": self.partitions, "gain_db": 20.0 * float(np.log10(self.gain))}
-
-
-def _butterworth(corner_hz: float, taps: int) -> Samples:
-    """Impulse response (taps,) float32 of a second-order Butterworth low-pass by the bilinear transform, over DISPLACEMENT_SCALE."""
-    k = np.tan(np.pi * corner_hz / SAMPLE_RATE)
-    z = np.exp(-2j * np.pi * np.arange(8 * taps // 2 + 1) / (8 * taps))
-    response = k**2 * (1 + z) ** 2 / (k**2 * (1 + z) ** 2 + np.sqrt(2) * k * (1 - z**2) + (1 - z) ** 2)
-    return (fourier.irfft(response, 8 * taps)[:taps] / DISPLACEMENT_SCALE).astype(np.float32)
-
-
-def _power(spectrum: np.ndarray) -> np.ndarray:
-    """|spectrum|^2 without the square root of abs."""
-    return spectrum.real**2 + spectrum.imag**2
-

@@ -8,8 +8,9 @@ from pathlib import Path
 import numpy as np
 
 from edgefilter.dsp.stft import StftConfig
-from edgefilter.echo.effect import complete, find
-from edgefilter.echo.effect import names as known_effects
+from edgefilter.echo.effect import complete
+from edgefilter.echo.effects.catalogue import find
+from edgefilter.echo.effects.catalogue import names as known_effects
 from edgefilter.echo.model import EchoModel
 from edgefilter.errors import ProfileError
 from edgefilter.profile.file import REMEDY, read_fields, write_fields

@@ -10,6 +10,9 @@ import zlib
 import numpy as np
 import soundfile
 
+from edgefilter.dsp.fourier import power
+from edgefilter.dsp.frames import decibels, frames
+from edgefilter.dsp.psd import hann
 from edgefilter.types import SAMPLE_RATE, Samples
 
 WINDOW, MAX_COLUMNS = 480, 800
@@ -31,15 +34,15 @@ def spectrogram_db(samples: Samples) -> np.ndarray:
     """Level (columns, WINDOW // 2 + 1) in dB of full scale per bin, Hann frames, mean power where frames share a column."""
     hop = WINDOW // 2
     padded = np.pad(samples, (0, max(0, WINDOW - samples.size)))
-    window = np.hanning(WINDOW).astype(np.float32)
+    window = hann(WINDOW).astype(np.float32)
     count = 1 + (padded.size - WINDOW) // hop
     columns = min(count, MAX_COLUMNS)
     edges = np.linspace(0, count, columns + 1).astype(int)
-    power = np.empty((columns, WINDOW // 2 + 1))
-    frames = np.lib.stride_tricks.sliding_window_view(padded, WINDOW)[::hop]
+    level = np.empty((columns, WINDOW // 2 + 1))
+    pieces = frames(padded, WINDOW, hop)
     for column, (first, last) in enumerate(zip(edges[:-1], edges[1:], strict=True)):
-        power[column] = np.mean(np.abs(np.fft.rfft(frames[first:last] * window, axis=1)) ** 2, axis=0)
-    return 10 * np.log10(np.maximum(power / (window.sum() / 2) ** 2, 1e-20))
+        level[column] = np.mean(power(np.fft.rfft(pieces[first:last] * window, axis=1)), axis=0)
+    return decibels(level / (window.sum() / 2) ** 2, 1e-20)
 
 
 def colour_scale(samples: Samples) -> tuple[float, float]:

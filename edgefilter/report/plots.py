@@ -9,6 +9,9 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from edgefilter.dsp.fourier import power
+from edgefilter.dsp.frames import decibels, frames
+from edgefilter.dsp.psd import hann
 from edgefilter.errors import EdgefilterError
 from edgefilter.profile.data import DISTORTION_ORDERS, GRID_HZ, Profile
 from edgefilter.types import PRE_ROLL, SAMPLE_RATE, Samples
@@ -26,8 +29,8 @@ def plot_profile(profile: Profile, path: str | Path) -> None:
     axes[0, 0].plot(ms[first], taps[first], color=INK, linewidth=0.8)
     _label(axes[0, 0], "Impulse response, first 40 ms", "ms after the direct sound", "amplitude")
     left = np.cumsum(taps[::-1] ** 2)[::-1]
-    axes[0, 1].plot(ms, _db(taps**2 / max(float(np.max(taps**2)), 1e-30)), color=SOFT, linewidth=0.3, label="|h|")
-    axes[0, 1].plot(ms, _db(left / max(left[0], 1e-30)), color=ACCENT, label="energy still to come")
+    axes[0, 1].plot(ms, decibels(taps**2 / max(float(np.max(taps**2)), 1e-30), 1e-20), color=SOFT, linewidth=0.3, label="|h|")
+    axes[0, 1].plot(ms, decibels(left / max(left[0], 1e-30), 1e-20), color=ACCENT, label="energy still to come")
     axes[0, 1].set_ylim(-90, 3)
     axes[0, 1].legend(loc="upper right")
     _label(axes[0, 1], "Decay", "ms after the direct sound", "dB")
@@ -44,7 +47,7 @@ def plot_before_after(signals: Mapping[str, Samples], path: str | Path) -> None:
     axes = figure.subplots(len(signals), 1, sharex=True, squeeze=False)[:, 0]
     peak = max(float(np.max(_spectrogram(samples), initial=1e-12)) for samples in signals.values())
     for axis, (name, samples) in zip(axes, signals.items(), strict=True):
-        picture = _db(_spectrogram(samples) / peak)
+        picture = decibels(_spectrogram(samples) / peak, 1e-20)
         extent = (0, samples.size / SAMPLE_RATE, 0, SAMPLE_RATE / 2000)
         axis.imshow(picture.T, origin="lower", aspect="auto", extent=extent, vmin=-85, vmax=-35, cmap="magma")
         axis.set_title(name, loc="left", fontsize=10)
@@ -57,13 +60,13 @@ def _draw_spectra(axis, profile: Profile) -> None:
     n = max(1 << 15, profile.echo.impulse_response.size)
     spectrum = np.abs(np.fft.rfft(profile.echo.impulse_response, n))
     hz = np.arange(spectrum.size) * SAMPLE_RATE / n
-    axis.semilogx(hz[1:], _db(spectrum[1:] ** 2), color=SOFT, linewidth=0.5, label="from the impulse response")
-    axis.semilogx(GRID_HZ[1:], _db(profile.response[1:] ** 2), color=INK, linewidth=1.2, label="|Hm Hs|, eq. (5) of the paper")
+    axis.semilogx(hz[1:], decibels(spectrum[1:] ** 2, 1e-20), color=SOFT, linewidth=0.5, label="from the impulse response")
+    axis.semilogx(GRID_HZ[1:], decibels(profile.response[1:] ** 2, 1e-20), color=INK, linewidth=1.2, label="|Hm Hs|, eq. (5) of the paper")
     fan = axis.twinx()
-    fan.semilogx(GRID_HZ[1:], _db(profile.noise_psd[1:]), color=ACCENT, linewidth=1.0)
+    fan.semilogx(GRID_HZ[1:], decibels(profile.noise_psd[1:], 1e-20), color=ACCENT, linewidth=1.0)
     fan.set_ylabel("fan, dB of full scale² / Hz", color=ACCENT)
     axis.set_xlim(50, 8000)
-    axis.set_ylim(-60, max(10.0, float(_db(profile.response**2).max()) + 3))
+    axis.set_ylim(-60, max(10.0, float(decibels(profile.response**2, 1e-20).max()) + 3))
     axis.legend(loc="lower center", fontsize=8)
     _label(axis, "Response and fan", "Hz", "dB")
 
@@ -85,15 +88,10 @@ def _label(axis, title: str, x: str, y: str) -> None:
     axis.grid(alpha=0.25)
 
 
-def _db(power: np.ndarray) -> np.ndarray:
-    return 10 * np.log10(np.maximum(power, 1e-20))
-
-
 def _spectrogram(samples: Samples) -> np.ndarray:
     """Power (frames, 257) of Hann frames of 512 samples, hop 128."""
     padded = np.pad(samples, (0, max(0, 512 - samples.size)))
-    frames = np.lib.stride_tricks.sliding_window_view(padded, 512)[::128]
-    return np.abs(np.fft.rfft(frames * np.hanning(512).astype(np.float32), axis=1)) ** 2
+    return power(np.fft.rfft(frames(padded, 512, 128) * hann(512).astype(np.float32), axis=1))
 
 
 def _figure(width: float, height: float) -> Figure:

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from itertools import product
 
 from edgefilter.diagnosis.compare import Comparison, describe
 from edgefilter.diagnosis.diagnose import Finding
-from edgefilter.diagnosis.noise_change import judge_behind
 from edgefilter.diagnosis.prepare import Prepared, prepare
-from edgefilter.diagnosis.score import Judge
-from edgefilter.echo.effect import complete, find
+from edgefilter.echo.effect import complete
+from edgefilter.echo.effects.catalogue import find
 from edgefilter.echo.model import EchoModel
 from edgefilter.profile.data import Profile
 from edgefilter.types import Samples
@@ -34,7 +32,7 @@ def compare_variants(
 ) -> dict[Choice, Comparison]:
     """For each choice of findings, recording (n,) against model, which has them all, without those that are off.
 
-    The excess of each is that of the held-out samples, as the diagnosis judges it; where it is, is shown for all samples.
+    The excess of each is the diagnosis's; where it is, is shown for all samples.
     """
     prepared = prepare(profile, recording, reference)
     found = {}
@@ -45,10 +43,7 @@ def compare_variants(
                 chosen.append(finding)
             else:
                 partial = partial.without_effect(finding.effect)
-        heard = _with_noise(prepared, chosen)
-        prediction = Judge(heard).correct(partial.predict(prepared.measurement.reference))
-        gain = partial.microphone_gain(prediction.size)
-        found[choice] = replace(describe(heard, prediction, gain), excess_db=judge_behind(gain, heard, prediction).excess_db)
+        found[choice] = describe(_with_noise(prepared, chosen), partial)
     return found
 
 
@@ -57,6 +52,5 @@ def _with_noise(prepared: Prepared, findings: Sequence[Finding]) -> Prepared:
     psd = prepared.measurement.noise_psd
     for finding in findings:
         effect = find(finding.effect)
-        if hasattr(effect, "noise_psd"):
-            psd = effect.noise_psd(complete(effect, finding.values), psd)
-    return replace(prepared, measurement=replace(prepared.measurement, noise_psd=psd))
+        psd = effect.noise_psd(complete(effect, finding.values), psd)
+    return prepared.behind(psd)

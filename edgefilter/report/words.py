@@ -8,32 +8,18 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from edgefilter.echo.effects.catalogue import find, names
+
 if TYPE_CHECKING:
     from edgefilter.diagnosis.diagnose import Interval
-
-EFFECTS = {
-    "late_reverb": "late reverberation",
-    "chassis_resonance": "a chassis resonance",
-    "playback_gain": "a turned volume",
-    "bandlimit": "a band limit",
-    "clock_drift": "clock drift",
-    "delay_jump": "a delay jump",
-    "path_change": "a changed path",
-    "compression": "compression",
-    "mic_agc": "a microphone gain control",
-    "speaker_nonlinearity": "loudspeaker nonlinearity",
-    "mic_clipping": "microphone clipping",
-    "rattle": "a rattle",
-    "fan_noise": "changed fan noise",
-}
 
 UNITS = {"1": "", "1e-6": "ppm"}
 """Units of parameters that read better otherwise."""
 
 
 def spoken(effect: str) -> str:
-    """The effect inside a sentence; one of the user's own by its name without underscores."""
-    return EFFECTS.get(effect, effect.replace("_", " "))
+    """The effect inside a sentence; one without a title, or whose file is not loaded, by its name without underscores."""
+    return (find(effect).title if effect in names() else "") or effect.replace("_", " ")
 
 
 def title(effect: str) -> str:

@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 import soundfile
 
-from edgefilter.calibration.from_recording import ABSORBED, find_drift, self_calibrate
+from edgefilter.calibration.from_recording import find_drift, self_calibrate
 from edgefilter.cli import main
-from edgefilter.diagnosis.offset import shift
+from edgefilter.dsp.fractional_delay import delayed
+from edgefilter.echo.effects.catalogue import EFFECTS
 from edgefilter.echo.model import EchoModel
 from edgefilter.errors import SignalError
 from tests.diagnosis.robot_scene import DELAY, FAN, path, record, voice
@@ -39,10 +40,10 @@ def test_path_lag_and_fan_are_those_of_the_robot(said, alone):
 
 def test_drift_is_found_and_sized(said):
     drifting = record(said, EchoModel(path()).with_effect("clock_drift", {"ppm": -120.0}))
-    ppm, lag = find_drift(drifting, shift(said, DELAY - 10))
+    ppm, lag = find_drift(drifting, delayed(said, DELAY - 10))
     assert ppm == pytest.approx(-120.0, abs=6.0)  # 6 ppm: one sample in 10 s
     assert lag == pytest.approx(10, abs=1)
-    assert find_drift(record(said), shift(said, DELAY))[0] == 0.0
+    assert find_drift(record(said), delayed(said, DELAY))[0] == 0.0
 
 
 def test_a_talker_is_said_and_bends_the_path_little(said, alone):
@@ -73,7 +74,7 @@ def test_what_is_stationary_is_not_claimed_and_what_moves_is(tmp_path, said, cap
     assert main(["diagnose", *files, "--json", "-", "--report", str(tmp_path / "d.html")]) == 0
     told = json.loads(capsys.readouterr().out)
     names = [entry["effect"] for entry in told["ranking"]]
-    assert names[0] == "clock_drift" and not set(names) & set(ABSORBED)
+    assert names[0] == "clock_drift" and not set(names) & {effect.name for effect in EFFECTS if effect.absorbed}
     assert told["ranking"][0]["parameters"]["ppm"]["value"] == pytest.approx(-120.0, abs=5.0)
     assert any("cannot be told" in text for text in told["warnings"])
     page = (tmp_path / "d.html").read_text()

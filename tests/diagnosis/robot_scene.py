@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy import signal
 
-from edgefilter.diagnosis.offset import shift
+from edgefilter.dsp.fractional_delay import delayed
 from edgefilter.echo.model import EchoModel
 from edgefilter.profile.data import Profile
 from edgefilter.types import PRE_ROLL
@@ -44,5 +44,5 @@ def voice(seconds: float = 8.0, seed: int = 0) -> np.ndarray:
 def record(x: np.ndarray, model: EchoModel | None = None, lag: float = 0.0, seed: int = 3) -> np.ndarray:
     """(n,) what the microphone hears of x through model (default: the calibrated path), lag samples later than in the calibration."""
     model = EchoModel(path()) if model is None else model
-    clean = model.predict(shift(x, DELAY - PRE_ROLL + lag))
+    clean = model.predict(delayed(x, DELAY - PRE_ROLL + lag))
     return clean + (FAN * np.random.default_rng(seed).standard_normal(x.size)).astype(np.float32)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,12 +11,14 @@ from scipy import signal
 
 from edgefilter.diagnosis.band_edge import band_edge
 from edgefilter.diagnosis.compare import compare
+from edgefilter.diagnosis.criteria import Criteria
 from edgefilter.diagnosis.diagnose import Diagnosis, add, diagnose
-from edgefilter.diagnosis.offset import shift
+from edgefilter.dsp.fractional_delay import delayed
 from edgefilter.diagnosis.prepare import prepare
-from edgefilter.diagnosis.score import Judge, Verdict
-from edgefilter.diagnosis.suspects import SUSPECTS, choose
+from edgefilter.diagnosis.score import Judge
 from edgefilter.diagnosis.trials import Trial, Workbench
+from edgefilter.echo.effects.catalogue import find
+from edgefilter.echo.evidence import Evidence, Score
 from edgefilter.echo.model import EchoModel
 from edgefilter.types import PRE_ROLL
 from tests.diagnosis.robot_scene import DELAY, FAN, path, profile, record, voice
@@ -28,7 +31,7 @@ def fan(seed: int = 3) -> np.ndarray:
 
 
 def echo(x: np.ndarray) -> np.ndarray:
-    return EchoModel(path()).predict(shift(x, DELAY - PRE_ROLL)).astype(float)
+    return EchoModel(path()).predict(delayed(x, DELAY - PRE_ROLL)).astype(float)
 
 
 def names(found: Diagnosis) -> list[str]:
@@ -119,7 +122,7 @@ def test_a_band_limit_shows_in_the_power_where_a_codecs_noise_hides_it() -> None
 def test_a_band_edge_is_not_seen_where_the_volume_was_turned() -> None:
     x = voice(SECONDS)
     judge = Judge(prepare(profile(), (0.4 * echo(x) + fan()).astype(np.float32), x))
-    assert band_edge(judge, judge.prepared.prediction) is None
+    assert band_edge(judge, judge.prepared.prediction, Criteria()) is None
 
 
 def test_an_added_effect_lowers_the_error_of_another_recording() -> None:
@@ -142,22 +145,25 @@ def test_the_dictionary_has_the_published_keys_and_is_json() -> None:
 
 
 def test_no_effect_is_chosen_where_none_lowers_the_level():
-    assert choose({}) is None and choose({"rattle": -0.2, "playback_gain": -0.1}) is None
-    assert choose({"playback_gain": 0.9, "late_reverb": 1.0}) == "playback_gain"
+    bench, score = Workbench(prepare(profile(), record(voice(4.0)), voice(4.0)), Criteria()), verdict(1.0, 1.0)
+    trials = {name: Trial(name, {}, EchoModel(path()), score, gain_db, 0.0) for name, gain_db in (("playback_gain", 0.9), ("late_reverb", 1.0))}
+    assert bench.preferred([]) is None and bench.preferred([replace(trials["late_reverb"], gain_db=-0.1)]) is None
+    assert bench.preferred(trials.values()) is trials["playback_gain"]
+    assert bench.preferred([replace(trials["playback_gain"], gain_db=0.8), trials["late_reverb"]]) is trials["late_reverb"]
 
 
-def verdict(active_db: float, fitted_db: float) -> Verdict:
-    return Verdict(active_db, active_db, active_db, 0.0, fitted_db, 0.0, np.ones((4, 4)), np.zeros(16000, np.float32))
+def verdict(active_db: float, fitted_db: float) -> Score:
+    return Score(active_db, active_db, active_db, 0.0, fitted_db, 0.0, np.ones((4, 4)), np.zeros(16000, np.float32))
 
 
 @pytest.mark.parametrize("fitted_db, stands", [(0.1, True), (-1.5, False)])
 def test_knocks_that_are_missing_where_a_filter_was_fitted_are_that_filters_error(fitted_db, stands):
-    assert SUSPECTS["rattle"].guard({}, None, verdict(5.0, 1.0), verdict(2.0, fitted_db)) is stands
+    assert find("rattle").plausible(Evidence({}, EchoModel(path()), None, verdict(5.0, 1.0), verdict(2.0, fitted_db))) is stands
 
 
 @pytest.mark.parametrize("name, fitted_db, halved", [("speaker_nonlinearity", 0.5, True), ("speaker_nonlinearity", 2.0, False), ("late_reverb", 0.5, False)])
 def test_half_of_what_a_long_filter_leaves_where_it_was_fitted_is_enough(name, fitted_db, halved):
     found = prepare(profile(), record(voice(4.0)), voice(4.0))
-    bench, model = Workbench(found), EchoModel(path())
-    bench.verdict = lambda asked: verdict(6.0, 2.5)
+    bench, model = Workbench(found, Criteria()), EchoModel(path())
+    bench.score = lambda asked: verdict(6.0, 2.5)
     assert bench.halves(Trial(name, {}, model, verdict(5.0, fitted_db), 0.5, 3.0), model) is halved

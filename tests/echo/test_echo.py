@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 from scipy import signal
 
-from edgefilter.echo import effect as effects
-from edgefilter.echo.effect import Measurement
+from edgefilter.echo.effect import complete, neutral
+from edgefilter.echo.effects import catalogue
+from edgefilter.echo.measurement import Measurement
 from edgefilter.echo.model import EchoModel
 from edgefilter.errors import UsageError
 from edgefilter.types import PRE_ROLL
@@ -30,12 +31,12 @@ def rms(x: np.ndarray) -> float:
     return float(np.sqrt(np.mean(np.square(x, dtype=np.float64))))
 
 
-@pytest.mark.parametrize("name", effects.names())
+@pytest.mark.parametrize("name", catalogue.names())
 def test_neutral_values_change_nothing(name: str) -> None:
     x = speech(1.0)
     x.flags.writeable = False
-    effect = effects.find(name)
-    assert np.array_equal(effect.apply(x, effects.neutral(effect), 16000), x)
+    effect = catalogue.find(name)
+    assert np.array_equal(effect.apply(x, neutral(effect), 16000), x)
 
 
 @pytest.mark.parametrize(
@@ -65,8 +66,8 @@ def test_fitted_compression_explains_most_of_a_compressor() -> None:
 
 def test_compression_turns_down_the_loud_only() -> None:
     tone = np.sin(2 * np.pi * 500 * np.arange(32000) / 16000).astype(np.float32)
-    compress = effects.find("compression")
-    values = effects.complete(compress, {"threshold_db": -20.0, "ratio": 2.0})
+    compress = catalogue.find("compression")
+    values = complete(compress, {"threshold_db": -20.0, "ratio": 2.0})
     quiet, loud = 0.05 * tone, 0.5 * tone
     assert rms(compress.apply(quiet, values, 16000)[16000:]) == pytest.approx(rms(quiet[16000:]), rel=1e-3)
     # 0.5 sin has a level of -9.03 dB, 10.97 dB above the threshold: half of that comes off; ripple of the 10 ms mean < 0.3 dB
@@ -77,7 +78,7 @@ def test_compression_turns_down_the_loud_only() -> None:
 def test_drift_of_100_ppm_moves_a_tone_by_its_delay() -> None:
     n = np.arange(48000)
     tone = np.sin(2 * np.pi * 1000 * n / 16000).astype(np.float32)
-    moved = effects.find("clock_drift").apply(tone, {"ppm": 100.0, "offset": 3.25}, 16000)
+    moved = catalogue.find("clock_drift").apply(tone, {"ppm": 100.0, "offset": 3.25}, 16000)
     expected = np.sin(2 * np.pi * 1000 * (n - 3.25 + 1e-4 * n) / 16000)
     # the 32-sample kernel is 70 dB clean at 1 kHz
     assert np.abs(moved - expected)[100:-100].max() < 1e-3

@@ -9,8 +9,10 @@ import numpy as np
 import pytest
 
 from edgefilter.diagnosis.prepare import prepare
-from edgefilter.echo import effect, user_effects
-from edgefilter.echo.effect import Measurement, find, names
+from edgefilter.echo import user_effects
+from edgefilter.echo.effects import catalogue
+from edgefilter.echo.effects.catalogue import find, names
+from edgefilter.echo.measurement import Measurement
 from edgefilter.echo.user_effects import load_effect
 from edgefilter.errors import UsageError
 from tests.diagnosis.robot_scene import profile, record, voice
@@ -23,7 +25,6 @@ from edgefilter.echo.effect import Parameter
 class Tilt:
     name = "tilt"
     stage = "path"
-    memoryless = False
     parameters = (Parameter("amount", "1", 0.0, -1.0, 1.0),)
 
     def apply(self, x, values, sample_rate):
@@ -36,7 +37,7 @@ class Tilt:
 
 @pytest.fixture(autouse=True)
 def own_registry(monkeypatch):
-    monkeypatch.setattr(effect, "_REGISTRY", dict(effect._REGISTRY))
+    monkeypatch.setattr(catalogue, "_known", dict(catalogue._known))
     monkeypatch.setattr(user_effects, "_loaded", {})
 
 
@@ -69,7 +70,7 @@ def test_a_good_file_is_one_effect_more_and_loads_once(write):
         ("import numpy as np", "raise SystemExit(3)", "stops with SystemExit: 3"),
         ("class Tilt:", "class Other:\n    def apply(self): ...\nclass Tilt:", "found Other, Tilt"),
         ("def apply", "def transform", "found none"),
-        ("memoryless = False", "", "class Tilt lacks memoryless"),
+        ('stage = "path"', "", "class Tilt lacks stage"),
         ('name = "tilt"', 'name = "clock_drift"', "'clock_drift' exists already"),
         ('name = "tilt"', 'name = "my tilt"', "name is 'my tilt'"),
         ('stage = "path"', 'stage = "room"', "stage is 'room', expected one of source"),
@@ -77,7 +78,7 @@ def test_a_good_file_is_one_effect_more_and_loads_once(write):
         ('0.0, -1.0, 1.0', '3.0, -1.0, 1.0', "neutral amount=3 is outside"),
         ('0.0, -1.0, 1.0', '0.5, -1.0, 1.0', "changes the signal at the neutral values"),
         (".astype(np.float32)", "", "float64 of shape (4000,), expected finite float32"),
-        ("return (x +", "x[0] = 0; return (x +", "apply stops at line 12 with ValueError: assignment destination is read-only"),
+        ("return (x +", "x[0] = 0; return (x +", "apply stops at line 11 with ValueError: assignment destination is read-only"),
         ('parameters = (P', 'def __init__(self, depth): ...\n    parameters = (P', "Tilt() stops with TypeError"),
     ],
 )
@@ -104,7 +105,7 @@ def test_a_file_that_is_not_there_or_not_python_is_one_line(tmp_path, write):
         ("None", "fit gives NoneType"),
         ('{"much": 1.0}', "no parameter 'much'"),
         ('{"amount": 7.0}', "expected -1 to 1"),
-        ("1 / 0", "fit stops at line 15 with ZeroDivisionError"),
+        ("1 / 0", "fit stops at line 14 with ZeroDivisionError"),
     ],
 )
 def test_a_fit_that_fails_is_one_line(write, result, words):
@@ -112,6 +113,56 @@ def test_a_fit_that_fails_is_one_line(write, result, words):
     x = voice(1.0)
     with pytest.raises(UsageError, match=words):
         profile().echo.fit("tilt", Measurement(x, x))
+
+
+NOISY = """
+import numpy as np
+from edgefilter.echo.effect import Effect, Parameter
+
+class Hiss(Effect):
+    name = "hiss"
+    stage = "noise"
+    parameters = (Parameter("power", "full scale^2", 0.0, 0.0, 1.0),)
+
+    def fit(self, measurement, model):
+        return {"power": 1e-4}
+
+    def variance(self, reference, values, sample_rate):
+        return np.full(reference.size, values["power"])
+
+    def colour(self, values):
+        return np.full(601, 1 / 8000)
+"""
+
+
+def test_a_noise_effect_of_the_users_own_does_not_crash_the_model(write):
+    load_effect(write(NOISY))
+    x = voice(1.0)
+    ((variance, colour),) = profile().echo.with_effect("hiss", {"power": 1e-3}).unpredictable(x)
+    assert variance == pytest.approx(1e-3) and colour.sum() * 8000 / 601 == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize(
+    ("hook", "words"),
+    [
+        ("def variance(self, reference, values, sample_rate):\n        return 1 / 0", "variance stops at line 14 with ZeroDivisionError"),
+        ("def variance(self, reference, values, sample_rate):\n        return values", "variance gives dict, expected finite numbers of shape (16000,)"),
+        ("def colour(self, values):\n        return np.ones(7)", "colour gives float64 of shape (7,), expected finite numbers of shape (601,)"),
+    ],
+)
+def test_a_noise_hook_that_fails_is_one_line(write, hook, words):
+    before, after = NOISY.split("    def variance")
+    load_effect(write(f"{before}    {hook}\n" if "variance" in hook else f"{before}    def variance{after}\n    {hook}\n"))
+    with pytest.raises(UsageError, match=re.escape(words)):
+        profile().echo.with_effect("hiss", {"power": 1e-3}).unpredictable(voice(1.0))
+
+
+def test_what_a_users_class_says_of_itself_is_kept(write):
+    told = "    memory, scales_fan, complexity, title = 0, True, 1, 'a tilt'\n\n    def settled(self, values):\n        return {**values, 'amount': 0.25}\n"
+    load_effect(write(GOOD.replace("    def apply", told + "\n    def apply")))
+    tilt = find("tilt")
+    assert (tilt.memory, tilt.scales_fan, tilt.complexity, tilt.title, tilt.cost) == (0, True, 1, "a tilt", 1)
+    assert tilt.settled({"amount": 1.0}) == {"amount": 0.25} and tilt.sentence({"amount": 1.0}) == ""
 
 
 def documented_file(folder: Path) -> Path:

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 import soundfile
 
-from edgefilter import engines
 
 BREAKS = {
     "ImportError": "ImportError('DLL load failed while importing onnxruntime_pybind11_state')",

@@ -12,7 +12,7 @@ from PIL import Image
 
 from edgefilter.diagnosis.compare import compare
 from edgefilter.diagnosis.diagnose import Diagnosis, Finding, Interval
-from edgefilter.echo.effect import names
+from edgefilter.echo.effects.catalogue import EFFECTS
 from edgefilter.report import words
 from edgefilter.report.html import add_command, diagnosis_page
 from edgefilter.report.media import LEVELS, MAX_COLUMNS, colour_scale, colours, sound, spectrogram_db, spectrogram_png
@@ -56,7 +56,7 @@ def test_sentences_for_the_three_verdicts():
 
 
 def test_every_built_in_effect_has_a_name_for_people():
-    assert set(names()) <= set(words.EFFECTS)
+    assert all(effect.title and words.spoken(effect.name) == effect.title for effect in EFFECTS)
 
 
 def test_the_terminal_says_verdict_budget_parameters_and_what_is_left():

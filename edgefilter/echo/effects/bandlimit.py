@@ -3,26 +3,30 @@
 from __future__ import annotations
 
 from itertools import product
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
-from edgefilter.echo.effect import Measurement, Parameter, Stage, Values
+from edgefilter.echo.effect import Effect, Parameter, Stage, first
+from edgefilter.echo.evidence import Evidence
+from edgefilter.echo.measurement import Measurement, Values, VoiceModel
 from edgefilter.echo.wiener import convolve_from, fit_filter, spectra
 from edgefilter.types import SAMPLE_RATE, Array, Samples
-
-if TYPE_CHECKING:
-    from edgefilter.echo.model import EchoModel
 
 FFT = 1024
 TAPS, LEAD = 192, 64
 DELAYS = np.arange(-8.0, 8.01, 0.1)
 """Samples: the lag at which a band-limited recording is found is that of its loudest frequencies."""
+HIGHEST_HZ = 7700.0
+"""Above it, too near the end of all bands, no cut-off can be seen."""
+PASSED_HZ, FLAT_DB = 300.0, 0.3
+"""From where on a band limit passes the voice, and the standard deviation of a gain over frequency that is one gain."""
+STEEP = 16.0
 
 
-class Bandlimit:
+class Bandlimit(Effect):
     """Low-pass with the magnitude of a Butterworth filter, |G|^2 = 1 / (1 + (f / cutoff_hz)^(2 order)).
 
     phase: 0 for a linear-phase filter (resamplers, codecs), 1 for a minimum-phase one (analogue), the delay at low frequencies taken
@@ -32,7 +36,12 @@ class Bandlimit:
 
     name: ClassVar[str] = "bandlimit"
     stage: ClassVar[Stage] = "path"
-    memoryless: ClassVar[bool] = False
+    title: ClassVar[str] = "a band limit"
+    absorbed: ClassVar[bool] = True
+    complexity: ClassVar[int] = 1
+    flexible: ClassVar[bool] = True
+    leaves_noise: ClassVar[bool] = True
+    noise_words: ClassVar[str] = "a codec that cuts the band leaves such noise"
     parameters: ClassVar[tuple[Parameter, ...]] = (
         Parameter("cutoff_hz", "Hz", 16000.0, 200.0, 16000.0),
         Parameter("order", "1", 8.0, 1.0, 60.0),
@@ -52,7 +61,7 @@ class Bandlimit:
         taps = np.atleast_1d(np.asarray(values["taps"], float))
         return y + convolve_from(x, taps, LEAD) if taps.any() else y
 
-    def fit(self, measurement: Measurement, model: EchoModel) -> Values:
+    def fit(self, measurement: Measurement, model: VoiceModel) -> Values:
         """The best of a grid of cut-offs, orders and phases, refined, each at its best delay; judged in the whitened cross-spectrum. Then taps."""
         predicted, x = measurement.heard(model)
         found = spectra(measurement, x, 20.0)
@@ -76,6 +85,46 @@ class Bandlimit:
         left = measurement.white_recording - self.apply(x, {**values, "taps": 0.0}, SAMPLE_RATE)
         taps = fit_filter(x, left, measurement.weights, TAPS, LEAD, prior=np.full(TAPS, 1e-3), steps=15)
         return {**values, "taps": np.clip(taps, -10.0, 10.0)}
+
+    def sentence(self, values: Values) -> str:
+        """From where on there is nothing."""
+        return f"what the recording has in common with the reference falls off above {first(values, 'cutoff_hz'):.0f} Hz"
+
+    def plausible(self, evidence: Evidence) -> bool:
+        """A low-pass and not a colouring: flat below the cut-off, little above it; near 8 kHz, where that cannot be seen, the low-pass alone helps."""
+        values, cutoff = evidence.values, float(evidence.values["cutoff_hz"])
+        if cutoff >= HIGHEST_HZ or not _dull_above(cutoff, evidence):
+            return False
+        hz, gain_db = measured_response_db(values)
+        passed = gain_db[(hz > min(PASSED_HZ, 0.3 * cutoff)) & (hz < 0.7 * cutoff)]
+        stopped = gain_db[hz > 1.2 * cutoff]
+        if stopped.size and passed.size:
+            return float(np.std(passed)) < 2.0 and float(np.median(stopped)) < float(np.median(passed)) - 6.0
+        plain = self.apply(evidence.before.prediction, {**values, "taps": 0.0}, SAMPLE_RATE)
+        fall = evidence.before.level_db - evidence.after.level_db
+        return evidence.before.level_db - evidence.grid.level_db(plain) > 0.5 * fall
+
+    def cutting_above(self, hz: float) -> Values:
+        """A steep low-pass."""
+        return {"cutoff_hz": hz, "order": STEEP}
+
+    def passband_gain_db(self, values: Values) -> float | None:
+        """The gain that the fine taps have in the passband, where that is flat."""
+        hz, gain_db = measured_response_db(values)
+        passed = gain_db[(hz > PASSED_HZ) & (hz < 0.6 * float(values["cutoff_hz"]))]
+        return float(np.median(passed)) if passed.size and float(np.std(passed)) <= FLAT_DB else None
+
+
+def _dull_above(cutoff_hz: float, evidence: Evidence) -> bool:
+    """Whether the recording's power above the cut-off falls with what it has in common with the reference: a codec's noise keeps it up."""
+    grid = evidence.grid
+    above = grid.band_hz[:, 0] > 1.1 * cutoff_hz
+    heard = grid.cells(grid.measurement.recording)[grid.active_cells][:, above]
+    expected = grid.cells(evidence.before.prediction)[grid.active_cells][:, above]
+    loud = expected > 3.0
+    if loud.sum() < 10:
+        return True
+    return float(np.sum(np.maximum(heard[loud] - 1.0, 0.0))) < 0.5 * float(np.sum(expected[loud]))
 
 
 def low_pass(hz: Array, cutoff: float, order: float, phase: float) -> NDArray[np.complex128]:

@@ -1,8 +1,15 @@
-"""The effects that come with the package, in the order in which they are listed."""
+"""The effects that the package knows: its own, in the order in which sound meets them, and those of the user.
+
+A new effect is a file in this folder and a line in EFFECTS. Where its line stands matters: within a stage effects do not commute (a
+compressor behind a turned volume is not one before it), so EchoModel applies them in the order of this list, whichever was found first.
+Effects of the user's own come after these within their stage, by name.
+"""
 
 from __future__ import annotations
 
-from edgefilter.echo.effect import Effect, names, register
+from collections.abc import Iterable
+
+from edgefilter.echo.effect import STAGES, Effect, complete
 from edgefilter.echo.effects.bandlimit import Bandlimit
 from edgefilter.echo.effects.chassis_resonance import ChassisResonance
 from edgefilter.echo.effects.clock_drift import ClockDrift
@@ -16,26 +23,54 @@ from edgefilter.echo.effects.path_change import PathChange
 from edgefilter.echo.effects.playback_gain import PlaybackGain
 from edgefilter.echo.effects.rattle import Rattle
 from edgefilter.echo.effects.speaker_nonlinearity import SpeakerNonlinearity
+from edgefilter.echo.measurement import Values
+from edgefilter.errors import UsageError
+from edgefilter.types import Array
 
 EFFECTS: tuple[Effect, ...] = (
     PlaybackGain(),
-    SpeakerNonlinearity(),
     Compression(),
-    ClockDrift(),
     DelayJump(),
-    MicAgc(),
-    MicClipping(),
+    SpeakerNonlinearity(),
+    Rattle(),
     Bandlimit(),
     ChassisResonance(),
     LateReverb(),
     PathChange(),
-    Rattle(),
+    ClockDrift(),
+    MicAgc(),
+    MicClipping(),
     FanNoise(),
 )
+"""From the player's volume to the microphone's converter, then the noise."""
+_PLACE = {effect.name: place for place, effect in enumerate(EFFECTS)}
+_known: dict[str, Effect] = {effect.name: effect for effect in EFFECTS}
 
 
-def load() -> None:
-    """Register all of them, once."""
-    for effect in EFFECTS:
-        if effect.name not in names():
-            register(effect)
+def register(effect: Effect) -> None:
+    """Make an effect known by its name; raises UsageError where the name is taken or a neutral value is out of bounds."""
+    if effect.name in _known:
+        raise UsageError(f"effect '{effect.name}' is defined twice: rename one of them")
+    for p in effect.parameters:
+        if not p.low <= p.neutral <= p.high:
+            raise UsageError(f"effect {effect.name}: neutral {p.name}={p.neutral:g} is outside {p.low:g} to {p.high:g}")
+    _known[effect.name] = effect
+
+
+def names() -> tuple[str, ...]:
+    """All known effects."""
+    return tuple(_known)
+
+
+def find(name: str) -> Effect:
+    """The effect of that name; raises UsageError with the known names."""
+    if name not in _known:
+        raise UsageError(f"unknown effect '{name}': choose one of {', '.join(sorted(_known))}")
+    return _known[name]
+
+
+def chain(effects: Iterable[tuple[str, Values]]) -> list[tuple[Effect, dict[str, float | Array]]]:
+    """Each effect with all of its values, in the order in which they are applied: by stage, then as EFFECTS lists them, then by name."""
+    found = [(find(name), values) for name, values in effects]
+    found.sort(key=lambda pair: (STAGES.index(pair[0].stage), _PLACE.get(pair[0].name, len(_PLACE)), pair[0].name))
+    return [(effect, complete(effect, values)) for effect, values in found]

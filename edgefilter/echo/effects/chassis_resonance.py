@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from edgefilter.echo.effect import Measurement, Parameter, Stage, Values
+from edgefilter.echo.effect import Effect, Parameter, Stage
+from edgefilter.echo.evidence import Evidence
+from edgefilter.echo.measurement import Measurement, Values, VoiceModel
 from edgefilter.echo.wiener import Spectra, spectra
 from edgefilter.types import SAMPLE_RATE, Array, Samples
-
-if TYPE_CHECKING:
-    from edgefilter.echo.model import EchoModel
 
 LOWEST_HZ, HIGHEST_HZ = 60.0, 7000.0
 QUALITIES = (4.0, 8.0, 16.0, 32.0, 64.0, 128.0)
@@ -21,7 +20,7 @@ MODES, NEXT, CLEAR_Q = 2, 0.05, 8.0
 """Modes that are looked for, the part of what the first explains that a further one must, and the least Q of that: broader ones are no modes."""
 
 
-class ChassisResonance:
+class ChassisResonance(Effect):
     """y = x + g Re[e^(i phase) r * x], r(n) = 2 (1 - |z|) z^n, z = exp((2 pi i - pi / q) frequency_hz / rate): a mode excited by the sound.
 
     gain_db: of the added sound at resonance re the sound itself, 20 log10 g. Each parameter is a number, or an array with one for each mode.
@@ -29,7 +28,9 @@ class ChassisResonance:
 
     name: ClassVar[str] = "chassis_resonance"
     stage: ClassVar[Stage] = "path"
-    memoryless: ClassVar[bool] = False
+    title: ClassVar[str] = "a chassis resonance"
+    absorbed: ClassVar[bool] = True
+    complexity: ClassVar[int] = 1
     parameters: ClassVar[tuple[Parameter, ...]] = (
         Parameter("frequency_hz", "Hz", 1000.0, 20.0, 8000.0),
         Parameter("q", "1", 30.0, 0.5, 2000.0),
@@ -46,7 +47,7 @@ class ChassisResonance:
                 y += (gain * _ring(x, frequency, q, sample_rate)).real.astype(np.float32)
         return y
 
-    def fit(self, measurement: Measurement, model: EchoModel) -> Values:
+    def fit(self, measurement: Measurement, model: VoiceModel) -> Values:
         """Frequency and Q by a search in the whitened cross-spectrum, gain and phase by least squares in time; then, if it pays, another mode."""
         predicted, white = measurement.heard(model)
         coarse, fine = (spectra(measurement, white, resolution_hz) for resolution_hz in (1.0, 0.1))
@@ -69,6 +70,17 @@ class ChassisResonance:
         level = np.clip(20.0 * np.log10(np.maximum(np.abs(complex_gains), 1e-6)), -120.0, 60.0)
         found = np.array([*zip(*modes, strict=True), level, np.rad2deg(np.angle(complex_gains))])[:, np.argsort(-level)]
         return {p.name: row if row.size > 1 else float(row[0]) for p, row in zip(self.parameters, found, strict=True)}
+
+    def sentence(self, values: Values) -> str:
+        """Where it rings, and how sharply."""
+        modes = [f"{hz:.0f} Hz with Q {q:.0f}" for hz, q in zip(np.atleast_1d(values["frequency_hz"]), np.atleast_1d(values["q"]), strict=True)]
+        where = "one frequency" if len(modes) == 1 else "two frequencies"
+        return f"the residual rings at {where}, {' and '.join(modes)}, whenever the voice excites it"
+
+    def plausible(self, evidence: Evidence) -> bool:
+        """Sharp enough for a mode, and none that the search's bounds have cut off."""
+        q, hz = (np.atleast_1d(evidence.values[name]) for name in ("q", "frequency_hz"))
+        return bool(np.all(q > 4.2) and np.all(hz >= 62.0) and np.all(hz <= 6800.0))
 
 
 def _without(found: Spectra, modes: list[tuple[float, float]], gains: Array) -> Spectra:

@@ -2,33 +2,35 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 import numpy as np
+import scipy
 
 from edgefilter.dsp.fractional_delay import interpolate
-from edgefilter.echo.effect import Measurement, Parameter, Stage, Values
+from edgefilter.echo.effect import Effect, Parameter, Stage, first
+from edgefilter.echo.evidence import Evidence
 from edgefilter.echo.lag_track import track_lag
+from edgefilter.echo.measurement import Measurement, Values, VoiceModel
 from edgefilter.types import Array, Samples
-
-if TYPE_CHECKING:
-    from edgefilter.echo.model import EchoModel
 
 PASSES = ((4000, 512), (8000, 16))
 """Samples of a block and of lag either way: short blocks while the drift smears them, longer ones once it is taken out."""
 STEADY = 0.05
 """Samples by which a block's lag may err for other reasons than noise."""
+LEAST_PPM = 0.5
 
 
-class ClockDrift:
+class ClockDrift(Effect):
     """y(n) = x(n - offset + ppm 1e-6 n): a delay that shrinks with positive, grows with negative ppm.
 
-    Interpolation by a Kaiser-windowed sinc of 32 samples, see fractional. Valid where the drift is constant over the recording.
+    Interpolation by a windowed sinc of 48 samples, see dsp.fractional_delay. Valid where the drift is constant over the recording.
     """
 
     name: ClassVar[str] = "clock_drift"
     stage: ClassVar[Stage] = "time"
-    memoryless: ClassVar[bool] = False
+    title: ClassVar[str] = "clock drift"
+    complexity: ClassVar[int] = 1
     parameters: ClassVar[tuple[Parameter, ...]] = (
         Parameter("ppm", "1e-6", 0.0, -1000.0, 1000.0),
         Parameter("offset", "samples", 0.0, -32000.0, 32000.0),
@@ -42,7 +44,7 @@ class ClockDrift:
         n = np.arange(x.size)
         return interpolate(x, n - offset + 1e-6 * ppm * n)
 
-    def fit(self, measurement: Measurement, model: EchoModel) -> Values:
+    def fit(self, measurement: Measurement, model: VoiceModel) -> Values:
         """A robust line through the lags of all blocks, twice: the second time on the prediction that the first has straightened."""
         predicted, recording = measurement.heard(model)[0], measurement.white_recording
         n, lag = np.arange(predicted.size), np.zeros(predicted.size)
@@ -56,12 +58,18 @@ class ClockDrift:
         slope = float(np.clip(1e6 * (lag[-1] - lag[0]) / max(n.size - 1, 1), -1000.0, 1000.0)) if n.size else 0.0
         return {"ppm": -slope, "offset": float(lag[0]) if n.size else 0.0}
 
+    def sentence(self, values: Values) -> str:
+        """How fast the lag grows."""
+        return f"the lag grows along a line, by {abs(first(values, 'ppm')):.1f} samples in a million"
+
+    def plausible(self, evidence: Evidence) -> bool:
+        """More than two clocks differ that are one."""
+        return abs(float(evidence.values["ppm"])) >= LEAST_PPM
+
 
 def robust_line(x: Array, y: Array, sigma: Array) -> tuple[float, float]:
     """Slope and offset of y (m,) over x (m,): from the median of all pairwise slopes (Theil-Sen), then Tukey's biweight."""
-    i, j = np.triu_indices(x.size, 1)
-    slope = float(np.median((y[j] - y[i]) / (x[j] - x[i])))
-    offset = float(np.median(y - slope * x))
+    slope, offset, *_ = scipy.stats.theilslopes(y, x, method="joint")
     spread = np.hypot(sigma, STEADY)
     for _ in range(10):
         distance = (y - slope * x - offset) / spread

@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 from itertools import product
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 import numpy as np
 import scipy
 
-from edgefilter.echo.effect import Measurement, Parameter, Stage, Values, complete, neutral
+from edgefilter.dsp.frames import block_power, decibels
+from edgefilter.echo.effect import Effect, Parameter, Stage, complete, first, neutral
+from edgefilter.echo.evidence import Evidence
 from edgefilter.echo.least_squares import Normal, normal_equations
+from edgefilter.echo.measurement import Measurement, Values, VoiceModel
 from edgefilter.types import SAMPLE_RATE, Array, Samples
-
-if TYPE_CHECKING:
-    from edgefilter.echo.model import EchoModel
 
 EXCERPT = 8 * SAMPLE_RATE
 """The loudest stretch of that many samples is fitted."""
@@ -32,11 +32,9 @@ NUDGE = np.array([0.5, 0.03, 0.15, 0.15])
 LARGEST = np.array([4.0, 0.3, 1.0, 1.0])
 LOWEST = np.array([-80.0, 0.0, np.log(0.3), np.log(5.0)])
 HIGHEST = np.array([0.0, STEEPEST, np.log(200.0), np.log(5000.0)])
-TIMED = ("clock_drift", "delay_jump", "path_change", "mic_agc")
-"""Effects that know what time it is: with one of them the first stretch of a recording is fitted, not the loudest."""
 
 
-class Compression:
+class Compression(Effect):
     """Feed-forward compressor: above threshold the level rises by 1 / ratio dB per dB, over a knee, then make-up gain.
 
     After Giannoulis, Massberg & Reiss 2012, "Digital dynamic range compressor design": the level is the mean square over the attack
@@ -46,7 +44,10 @@ class Compression:
 
     name: ClassVar[str] = "compression"
     stage: ClassVar[Stage] = "source"
-    memoryless: ClassVar[bool] = False
+    title: ClassVar[str] = "compression"
+    complexity: ClassVar[int] = 2
+    cost: ClassVar[int] = 2
+    flexible: ClassVar[bool] = True
     parameters: ClassVar[tuple[Parameter, ...]] = (
         Parameter("threshold_db", "dB re full scale", -20.0, -80.0, 0.0),
         Parameter("ratio", "dB/dB", 1.0, 1.0, 50.0),
@@ -70,15 +71,14 @@ class Compression:
         held = _falling_peak(reduction, float(values["release_ms"]) * 1e-3 * sample_rate)
         return (x * 10.0 ** ((makeup - slope * held) / 20.0)).astype(np.float32)
 
-    def fit(self, measurement: Measurement, model: EchoModel) -> Values:
+    def fit(self, measurement: Measurement, model: VoiceModel) -> Values:
         """Gauss-Newton in threshold, ratio, attack and release from the best of a coarse grid; a short filter takes up the linear rest.
 
         No compression where four numbers do not pay for themselves by Bayes' information criterion.
         """
-        part, fit = _loudest(measurement, any(name in TIMED for name, _ in model.effects))
+        part, fit = _loudest(measurement, from_start=model.timed)
         x, target = measurement.reference[part], measurement.whiten(measurement.recording[part])
-        blocks = np.square(x[: x.size // 320 * 320], dtype=np.float64).reshape(-1, 320).mean(axis=1)
-        loud_db = 10.0 * np.log10(float(np.max(blocks, initial=0.0)) + 1e-9)
+        loud_db = float(decibels(np.max(block_power(x, SAMPLE_RATE // 50), initial=0.0), 1e-9))
 
         def predict(unknowns: Array) -> Samples:
             return measurement.whiten(model.predict(self.apply(x, complete(self, _values(unknowns)), SAMPLE_RATE)))
@@ -104,11 +104,22 @@ class Compression:
             return neutral(self)
         return {**_values(best), "makeup_db": self._makeup(measurement, model, _values(best))}
 
-    def _makeup(self, measurement: Measurement, model: EchoModel, values: Values) -> float:
+    def _makeup(self, measurement: Measurement, model: VoiceModel, values: Values) -> float:
         """Least-squares gain over the whole recording, dB."""
         predicted = measurement.whiten(model.predict(self.apply(measurement.reference, complete(self, values), SAMPLE_RATE)))
         normal = normal_equations([predicted], measurement.white_recording, 1, 0, measurement.fit)
         return float(np.clip(20.0 * np.log10(max(float(normal.solve()[0][0, 0]), 1e-2)), -40.0, 40.0))
+
+    def sentence(self, values: Values) -> str:
+        """From where on the level is held down, and by how much."""
+        return (
+            f"the voice is turned down when it has been loud: above {first(values, 'threshold_db'):.0f} dB by {first(values, 'ratio'):.1f} to 1, "
+            "while the fan is as loud as ever"
+        )
+
+    def plausible(self, evidence: Evidence) -> bool:
+        """The gain follows the level."""
+        return float(evidence.values["ratio"]) >= 1.1
 
 
 def _falling_peak(x: Array, samples: float) -> Array:
@@ -123,12 +134,12 @@ def _values(unknowns: Array) -> dict[str, float]:
     return {"threshold_db": threshold, "ratio": 1.0 / (1.0 - slope), "attack_ms": attack_ms, "release_ms": release_ms}
 
 
-def _loudest(measurement: Measurement, first: bool) -> tuple[slice, np.ndarray]:
-    """The stretch with most energy, or the first one, and its samples to fit on less the first half second, in which the level settles."""
+def _loudest(measurement: Measurement, from_start: bool) -> tuple[slice, np.ndarray]:
+    """The stretch with most energy, or where the model knows what time it is the first one, and its samples to fit on less the first half second, in which the level settles."""
     x = measurement.reference
     fit = np.ones(x.size, bool) if measurement.fit is None else measurement.fit
     start = 0
-    if x.size > EXCERPT and not first:
+    if x.size > EXCERPT and not from_start:
         energy = np.concatenate(([0.0], np.cumsum(x.astype(np.float64) ** 2)))
         start = int(np.argmax(energy[EXCERPT:] - energy[:-EXCERPT]))
     part = slice(start, start + EXCERPT)

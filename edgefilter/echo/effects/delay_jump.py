@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 import numpy as np
 
 from edgefilter.dsp.fractional_delay import delayed
-from edgefilter.echo.effect import Measurement, Parameter, Stage, Values, complete, neutral
+from edgefilter.echo.effect import Effect, Parameter, Stage, complete, neutral
 from edgefilter.echo.effects.clock_drift import STEADY, robust_line
+from edgefilter.echo.evidence import Evidence
 from edgefilter.echo.lag_track import LagTrack, track_lag
+from edgefilter.echo.measurement import Measurement, Values, VoiceModel
 from edgefilter.types import SAMPLE_RATE, Array, Samples
-
-if TYPE_CHECKING:
-    from edgefilter.echo.model import EchoModel
 
 BLOCK, REACH = 4000, 2400
 MOST_JUMPS = 8
@@ -32,7 +31,7 @@ HISTORY, SETTLED, AFTERMATH = 8000, 640, 6400
 SEARCH = (range(-256, 257, 32), range(-24, 25, 8), range(-6, 7, 2), (-1, 0, 1))
 
 
-class DelayJump:
+class DelayJump(Effect):
     """The reference is played later by samples[i] from times_s[i] on, and by offset from the start on; piecewise constant, fractional.
 
     What the player puts into the gap where the delay grows: the last samples once more (gap_gain 1) or silence (gap_gain 0).
@@ -40,7 +39,9 @@ class DelayJump:
 
     name: ClassVar[str] = "delay_jump"
     stage: ClassVar[Stage] = "source"
-    memoryless: ClassVar[bool] = False
+    title: ClassVar[str] = "a delay jump"
+    event: ClassVar[bool] = True
+    complexity: ClassVar[int] = 1
     parameters: ClassVar[tuple[Parameter, ...]] = (
         Parameter("times_s", "s", 0.0, 0.0, 1e6),
         Parameter("samples", "samples", 0.0, -48000.0, 48000.0),
@@ -63,7 +64,7 @@ class DelayJump:
                 out[start : start + int(max(step, 0.0))] *= np.float32(values["gap_gain"])
         return out
 
-    def fit(self, measurement: Measurement, model: EchoModel) -> Values:
+    def fit(self, measurement: Measurement, model: VoiceModel) -> Values:
         """Steps through the lags of all blocks; none where a straight line, a drift, describes the lags as well.
 
         How many steps and how high comes from the samples to fit on; where exactly each lies is then looked up in all samples,
@@ -80,7 +81,7 @@ class DelayJump:
         found = {"times_s": np.array(times) / SAMPLE_RATE, "samples": np.diff(levels), "offset": float(levels[0])}
         return self._refined(measurement, model, found)
 
-    def _refined(self, measurement: Measurement, model: EchoModel, values: Values) -> Values:
+    def _refined(self, measurement: Measurement, model: VoiceModel, values: Values) -> Values:
         """The same with each jump at the moment in the reference, and the gap filled in the way, that predicts best around it."""
 
         def left(changed: Values, around: int) -> float:
@@ -111,6 +112,16 @@ class DelayJump:
                 cost += least
             total[gap_gain] = (cost, moved)
         return min(total.values(), key=lambda pair: pair[0])[1]
+
+    def sentence(self, values: Values) -> str:
+        """Each step and its moment."""
+        times, samples = np.atleast_1d(values["times_s"]), np.atleast_1d(values["samples"])
+        steps = ", ".join(f"{n:+.1f} samples at {t:.2f} s" for t, n in zip(times, samples, strict=True))
+        return f"the lag is constant but for steps: {steps}"
+
+    def plausible(self, evidence: Evidence) -> bool:
+        """At least one step that is a step."""
+        return bool(np.any(np.abs(np.atleast_1d(np.asarray(evidence.values["samples"], float))) >= LEAST_JUMP))
 
 
 def find_steps(lag: Array, sigma: Array) -> tuple[Array, Array]:

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 import numpy as np
 
-from edgefilter.echo.effect import ROUNDING_PSD, Measurement, Parameter, Stage, Values
+from edgefilter.dsp.frames import frames
+from edgefilter.dsp.psd import floored, periodograms
+from edgefilter.echo.effect import Effect, Parameter, Stage, first
 from edgefilter.echo.least_squares import absorbed
-from edgefilter.types import SAMPLE_RATE, Array, Samples
-
-if TYPE_CHECKING:
-    from edgefilter.echo.model import EchoModel
+from edgefilter.echo.measurement import Measurement, Values, VoiceModel
+from edgefilter.types import Array, Samples
 
 SILENT_DB = -10.0
 """A frame shows the fan alone where the predicted voice, whitened, is this far under it."""
@@ -23,7 +23,7 @@ SMOOTH = np.array([0.25, 0.5, 0.25])
 """Over neighbouring bins of 13.3 Hz: a Hann frame's line is as wide."""
 
 
-class FanNoise:
+class FanNoise(Effect):
     """The fan's power spectrum is another by spectrum_db at each frequency; the voice itself is unchanged.
 
     spectrum_db: (601,) on the profile's grid, 0 to 8 kHz, or one number. change_db only reports: the change of the fan's total power.
@@ -31,21 +31,18 @@ class FanNoise:
 
     name: ClassVar[str] = "fan_noise"
     stage: ClassVar[Stage] = "noise"
-    memoryless: ClassVar[bool] = True
+    title: ClassVar[str] = "changed fan noise"
+    memory: ClassVar[int | None] = 0
     parameters: ClassVar[tuple[Parameter, ...]] = (
         Parameter("spectrum_db", "dB", 0.0, LOWEST_DB, HIGHEST_DB),
         Parameter("change_db", "dB", 0.0, LOWEST_DB, HIGHEST_DB),
     )
 
-    def apply(self, x: Samples, values: Values, sample_rate: int) -> Samples:
-        """x (n,) itself."""
-        return x.copy()
-
     def noise_psd(self, values: Values, psd: Samples) -> Samples:
         """The fan's PSD (601,) after the change, from psd (601,) before it."""
         return (psd * 10.0 ** (np.asarray(values["spectrum_db"], float) / 10.0)).astype(np.float32)
 
-    def fit(self, measurement: Measurement, model: EchoModel) -> Values:
+    def fit(self, measurement: Measurement, model: VoiceModel) -> Values:
         """Mean periodogram of the residual in the robot's silences over the calibrated PSD.
 
         Where the robot is hardly ever silent, the mean of the quietest quarter of all frames at each frequency, divided by what that
@@ -56,17 +53,17 @@ class FanNoise:
             return {"spectrum_db": 0.0, "change_db": 0.0}
         voice = absorbed(measurement.heard(model)[0], measurement.recording, measurement.fit)
         size = 2 * (known.size - 1)
-        residual = _periodograms(measurement.recording - voice, size)
+        residual = periodograms(measurement.recording - voice, size)
         if not len(residual):
             return {"spectrum_db": 0.0, "change_db": 0.0}
-        whole = _frames(measurement.weights, size).all(axis=1)
-        own = np.mean(_frames(measurement.whiten(voice), size) ** 2, axis=1)
+        whole = frames(measurement.weights, size, size // 2).all(axis=1)
+        own = np.mean(frames(measurement.whiten(voice), size, size // 2) ** 2, axis=1)
         silent = whole & (own < 10.0 ** (SILENT_DB / 10.0))
         if silent.sum() >= FEWEST_FRAMES:
             found = residual[silent].mean(axis=0)
         else:
             found = _quiet_mean(residual[whole] if whole.any() else residual)
-        floor = np.maximum(known.astype(np.float64), ROUNDING_PSD)
+        floor = floored(known)
         smooth = np.convolve(np.pad(found / floor, 1, mode="edge"), SMOOTH, "valid")
         total = 10.0 * np.log10(np.sum(smooth * floor) / np.sum(floor) + 1e-30)
         return {
@@ -74,20 +71,9 @@ class FanNoise:
             "change_db": float(np.clip(total, LOWEST_DB, HIGHEST_DB)),
         }
 
-
-def _frames(x: Samples, size: int) -> Array:
-    """Half-overlapping frames (f, size) of x (n,)."""
-    if x.size < size:
-        return np.zeros((0, size), x.dtype)
-    return np.lib.stride_tricks.sliding_window_view(x, size)[:: size // 2]
-
-
-def _periodograms(x: Samples, size: int) -> Array:
-    """One-sided periodograms (f, size / 2 + 1), full scale^2/Hz, of Hann frames."""
-    window = np.hanning(size + 1)[:-1]
-    power = np.abs(np.fft.rfft(_frames(x, size) * window)) ** 2 / (SAMPLE_RATE * np.sum(window**2))
-    power[:, 1:-1] *= 2.0
-    return power
+    def sentence(self, values: Values) -> str:
+        """By how much."""
+        return f"the noise is {first(values, 'change_db'):+.1f} dB off the calibrated fan, with the robot's voice and without it"
 
 
 def _quiet_mean(power: Array) -> Array:

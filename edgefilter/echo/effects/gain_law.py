@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from edgefilter.dsp.frames import blocks
 from edgefilter.types import SAMPLE_RATE, Array, Samples
 
 STEP = SAMPLE_RATE // 40
@@ -67,8 +68,7 @@ def follow(level_db: Array, voice: Samples, recording: Samples, weights: Samples
 
 def by_step(x: Array) -> Array:
     """(k,) sums of x (n,) over whole steps."""
-    count = x.size // STEP
-    return x[: count * STEP].reshape(count, STEP).sum(axis=1, dtype=np.float64)
+    return blocks(x, STEP).sum(axis=1, dtype=np.float64)
 
 
 def _driven(level_db: Array, attack_s: Array, release_s: Array, hold_db: Array, start_db: Array) -> Array:

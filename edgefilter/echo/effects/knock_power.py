@@ -9,6 +9,9 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
+from edgefilter.dsp.fourier import power
+from edgefilter.dsp.frames import frames
+from edgefilter.dsp.psd import hann
 from edgefilter.types import SAMPLE_RATE, Array, Samples
 
 FRAME, HOP, BANDS = 128, 64, 16
@@ -74,7 +77,7 @@ def find_trigger(x: Samples, residual: Samples, predicted: Samples, fit: NDArray
 
 def colour_of_knocks(residual: Samples, ringing: Samples, fit: NDArray[np.bool_] | None) -> tuple[float, Array]:
     """Log likelihood and (BANDS,) the power in each band, over the fan, that ringing (n,) at 1 adds to a whitened residual (n,)."""
-    power, source = band_power(residual), _frames(ringing).mean(axis=1, keepdims=True)
+    power, source = band_power(residual), frames(ringing, FRAME, HOP).mean(axis=1, keepdims=True)
     use = slice(None) if fit is None else fit[np.arange(len(power)) * HOP + FRAME // 2]
     scale = float(source.mean())
     if scale <= 0.0:
@@ -126,13 +129,9 @@ def ringing_of(knocks: Samples, decay_ms: float, late: int, sample_rate: int = S
 
 def band_power(x: Samples) -> Samples:
     """(frames, BANDS) mean power of x (n,) in each band, 1 for white noise of variance 1; the lowest bin is left out."""
-    window = np.hanning(FRAME + 1)[:-1].astype(np.float32)
-    power = np.abs(scipy.fft.rfft(_frames(x) * window, axis=1)[:, 1:]) ** 2 / np.sum(window**2)
-    return power.reshape(len(power), BANDS, -1).mean(axis=2).astype(np.float32)
-
-
-def _frames(x: Samples) -> Samples:
-    return np.lib.stride_tricks.sliding_window_view(x, FRAME)[::HOP] if x.size >= FRAME else np.zeros((0, FRAME), np.float32)
+    window = hann(FRAME).astype(np.float32)
+    bins = power(scipy.fft.rfft(frames(x, FRAME, HOP) * window, axis=1)[:, 1:]) / np.sum(window**2)
+    return bins.reshape(len(bins), BANDS, -1).mean(axis=2).astype(np.float32)
 
 
 def _roughly_ringing(knocks: Samples, late: int, frames: int) -> Samples:

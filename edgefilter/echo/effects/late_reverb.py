@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 import numpy as np
 import scipy
 
-from edgefilter.echo.effect import Measurement, Parameter, Stage, Values, neutral
+from edgefilter.dsp.frames import blocks
+from edgefilter.echo.effect import Effect, Parameter, Stage, first, neutral
+from edgefilter.echo.evidence import Evidence
+from edgefilter.echo.measurement import Measurement, Values, VoiceModel
 from edgefilter.echo.wiener import convolve_from, fit_filter, fit_supported
 from edgefilter.types import SAMPLE_RATE, Array, Samples
-
-if TYPE_CHECKING:
-    from edgefilter.echo.model import EchoModel
 
 LEAD = 32
 """Taps before lag 0: what a room of other colour changes in the direct sound."""
@@ -23,9 +23,13 @@ EXPECTED = 1e-3
 SLOWER = 1.7
 """The squares that are expected once the room is known decay in this many times its reverberation time, so that none of it is cut away."""
 BLOCK = 320
+EARLY, LATE_SHARE = round(0.03 * SAMPLE_RATE), 0.1
+"""Samples up to which reflections are early, and the share of the added energy that comes after those where the room is another."""
+LONGER = 1.1
+"""By this factor the reverberation time exceeds the calibration's, beyond what a fit to half a minute of speech errs by."""
 
 
-class LateReverb:
+class LateReverb(Effect):
     """y = x + taps * x: a long filter behind the calibrated path. Its decay gives the reverberation time.
 
     rt60_s: from the backward-integrated energy of the whole new response (Schroeder 1965, eq. 5), the first 20 ms left out, above the noise.
@@ -34,7 +38,10 @@ class LateReverb:
 
     name: ClassVar[str] = "late_reverb"
     stage: ClassVar[Stage] = "path"
-    memoryless: ClassVar[bool] = False
+    title: ClassVar[str] = "late reverberation"
+    absorbed: ClassVar[bool] = True
+    complexity: ClassVar[int] = 4
+    flexible: ClassVar[bool] = True
     parameters: ClassVar[tuple[Parameter, ...]] = (
         Parameter("rt60_s", "s", 0.0, 0.0, 10.0),
         Parameter("level_db", "dB", -120.0, -120.0, 40.0),
@@ -46,7 +53,7 @@ class LateReverb:
         taps = np.atleast_1d(np.asarray(values["taps"], float))
         return x.copy() if not taps.any() else x + convolve_from(x, taps, LEAD)
 
-    def fit(self, measurement: Measurement, model: EchoModel) -> Values:
+    def fit(self, measurement: Measurement, model: VoiceModel) -> Values:
         """Least squares in the whitened domain, slightly regularised; neutral where nothing of it holds on other samples.
 
         Then once more with taps expected to decay as the room that was found does: some seconds of speech do not teach ten thousand.
@@ -66,11 +73,30 @@ class LateReverb:
         late = float(np.sum(taps[LEAD + SAMPLE_RATE // 100 :] ** 2))
         return {"rt60_s": rt60, "level_db": float(np.clip(10 * np.log10(late + 1e-12), -120.0, 40.0)), "taps": np.clip(taps, -10.0, 10.0)}
 
+    def sentence(self, values: Values) -> str:
+        """How long the room sounds."""
+        return (
+            f"the recording goes on sounding after the calibrated response has died away: a reverberation of {first(values, 'rt60_s'):.2f} s that holds "
+            "from the first second to the last"
+        )
+
+    def plausible(self, evidence: Evidence) -> bool:
+        """Whether what it adds is reverberation: a good part comes later than early reflections do, and decays more slowly than at the calibration.
+
+        A loudspeaker of another colour or a path that moved are stationary, too, and a filter this long takes up either.
+        """
+        taps = np.atleast_1d(np.asarray(evidence.values["taps"], float))
+        before = evidence.model.impulse_response
+        direct = int(np.argmax(np.abs(before)))
+        added = scipy.signal.oaconvolve(before.astype(np.float64), taps)[LEAD + direct :] ** 2
+        late = float(np.sum(added[EARLY:])) / max(float(np.sum(added)), 1e-30)
+        return late >= LATE_SHARE and float(evidence.values["rt60_s"]) > LONGER * reverberation_time(before[direct:].astype(np.float64))
+
 
 def block_energy(taps: Array) -> tuple[Array, float]:
     """Energy of the taps in blocks of 20 ms, and that of a block of pure noise (the lower quartile of the last third)."""
-    count = taps.size // BLOCK
-    energy = np.sum(taps[: count * BLOCK].reshape(count, BLOCK) ** 2, axis=1)
+    energy = np.sum(blocks(taps, BLOCK) ** 2, axis=1)
+    count = energy.size
     return energy, float(np.quantile(energy[2 * count // 3 :], 0.25)) if count >= 3 else 0.0
 
 

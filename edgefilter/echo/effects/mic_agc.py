@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 import numpy as np
 import scipy
 
-from edgefilter.echo.effect import Measurement, Parameter, Stage, Values
+from edgefilter.dsp.frames import block_power, blocks
+from edgefilter.echo.effect import Effect, Parameter, Stage
 from edgefilter.echo.effects.gain_law import STEP, by_step, follow
+from edgefilter.echo.evidence import Evidence
 from edgefilter.echo.least_squares import absorbed
+from edgefilter.echo.measurement import Measurement, Values, VoiceModel
 from edgefilter.types import SAMPLE_RATE, Array, Samples
-
-if TYPE_CHECKING:
-    from edgefilter.echo.model import EchoModel
 
 KNOTS_HZ = 4.0
 """Knots per second of a gain curve that follows no law."""
@@ -21,6 +21,10 @@ BEND = 0.01
 """Standard deviation of the change of slope of the gain from knot to knot that is expected, relative to the gain."""
 BENDS = 0.5
 """Of the mean square of the gain's movement, a law must leave less than this to be followed."""
+LEAST_RANGE_DB = 0.4
+"""A gain that moves by less stands still."""
+FAN_ALONE = 1.6
+"""Times the fan's power up to which a step of 25 ms may show nothing else."""
 FRAME = SAMPLE_RATE // 8
 SILENT = 0.1
 """A frame shows the fan alone where the predicted voice has less than this part of its power."""
@@ -28,7 +32,7 @@ FAN_TRUST = 0.25
 """Weight of a silent frame relative to what white noise would deserve: the fan itself is only known to some tenths of a dB."""
 
 
-class MicAgc:
+class MicAgc(Effect):
     """y(t) = g(t) x(t), g in dB piecewise linear between its knots; what the microphone hears of the fan gets the same gain.
 
     gain_db: (k,) at 0, 1 / knots_hz, 2 / knots_hz ..., the last one held, or one number. range_db and time_constant_s only report: the
@@ -37,7 +41,10 @@ class MicAgc:
 
     name: ClassVar[str] = "mic_agc"
     stage: ClassVar[Stage] = "microphone"
-    memoryless: ClassVar[bool] = False
+    title: ClassVar[str] = "a microphone gain control"
+    event: ClassVar[bool] = True
+    complexity: ClassVar[int] = 1
+    flexible: ClassVar[bool] = True
     scales_fan: ClassVar[bool] = True
     parameters: ClassVar[tuple[Parameter, ...]] = (
         Parameter("gain_db", "dB", 0.0, -60.0, 60.0),
@@ -54,7 +61,7 @@ class MicAgc:
         position = np.arange(x.size) * (float(values["knots_hz"]) / sample_rate)
         return (x * 10.0 ** (np.interp(position, np.arange(knots.size), knots) / 20.0)).astype(np.float32)
 
-    def fit(self, measurement: Measurement, model: EchoModel) -> Values:
+    def fit(self, measurement: Measurement, model: VoiceModel) -> Values:
         """A law by which the gain follows the level, where there is one, and what differs from it slowly.
 
         The latter by penalised least squares of the gain at the knots: from the voice where it sounds, from the fan's power where it
@@ -80,6 +87,27 @@ class MicAgc:
         low, high = np.percentile(curve, [5, 95])
         knots_hz = SAMPLE_RATE / step
         return {"gain_db": curve, "knots_hz": knots_hz, "range_db": float(high - low), "time_constant_s": _time_constant(curve, knots_hz)}
+
+    def sentence(self, values: Values) -> str:
+        """What tells it from a player's control."""
+        return "voice and fan rise and fall together with a slow gain"
+
+    def plausible(self, evidence: Evidence) -> bool:
+        """Whether the fan moves with the gain, as it does behind a microphone's control and does not behind a player's.
+
+        By the likelihood of the residual's power in steps where little but the fan is left, its level constant or times the gain's square.
+        """
+        if float(evidence.values["range_db"]) < LEAST_RANGE_DB:
+            return False
+        measurement = evidence.grid.measurement
+        gain = self.apply(np.ones_like(measurement.recording), evidence.values, SAMPLE_RATE)
+        white = measurement.whiten(measurement.recording - evidence.after.prediction).astype(np.float64) ** 2
+        square, power = (by_step(x) / STEP for x in (gain.astype(np.float64) ** 2, white))
+        low = (power < FAN_ALONE * square) & (by_step(evidence.grid.usable.astype(float)) == STEP)
+        if low.sum() < 20:
+            return False
+        moving, still = np.log(np.mean(power[low] / square[low])) + np.mean(np.log(square[low])), np.log(np.mean(power[low]))
+        return bool(moving < still)
 
 
 def _law(heard: Samples, voice: Samples, recording: Samples, measurement: Measurement) -> Samples:
@@ -129,11 +157,9 @@ def _from_voice(voice: Samples, recording: Samples, measurement: Measurement) ->
 def _from_fan(voice: Samples, recording: Samples, measurement: Measurement, overall: float, law: Samples) -> tuple[Array, Array]:
     """What the fan's power says: to the main diagonal and the right side (k,), from frames to fit on in which the robot is silent."""
     count = int((voice.size - 1) * KNOTS_HZ / SAMPLE_RATE) + 2
-    frames = voice.size // FRAME
-    cut = slice(0, frames * FRAME)
-    own, heard, by_law = (np.mean(x[cut].reshape(frames, FRAME).astype(np.float64) ** 2, axis=1) for x in (voice, recording, law))
-    usable = measurement.weights[cut].reshape(frames, FRAME).all(axis=1) & (own < SILENT)
-    knot = np.round((np.arange(frames) + 0.5) * FRAME / SAMPLE_RATE * KNOTS_HZ).astype(int)[usable]
+    own, heard, by_law = (block_power(x, FRAME) for x in (voice, recording, law))
+    usable = blocks(measurement.weights, FRAME).all(axis=1) & (own < SILENT)
+    knot = np.round((np.arange(own.size) + 0.5) * FRAME / SAMPLE_RATE * KNOTS_HZ).astype(int)[usable]
     weight = FAN_TRUST * 2 * FRAME
     wanted = np.sqrt(heard[usable] / by_law[usable]) / overall
     return np.bincount(knot, np.full(knot.size, weight), count), np.bincount(knot, weight * wanted, count)

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 import numpy as np
 
-from edgefilter.echo.effect import Measurement, Parameter, Stage, Values
+from edgefilter.echo.effect import Effect, Parameter, Stage, first
+from edgefilter.echo.measurement import Measurement, Values, VoiceModel
 from edgefilter.types import SAMPLE_RATE, Samples
-
-if TYPE_CHECKING:
-    from edgefilter.echo.model import EchoModel
 
 NO_LIMIT = 100.0
 HARD = 100.0
@@ -18,7 +16,7 @@ HARDNESS = (HARD, 10.0, 5.0, 3.0, 2.0)
 STEPS = 1.0 - np.array([0.0, 0.01, 0.02, 0.04, 0.07, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5])
 
 
-class MicClipping:
+class MicClipping(Effect):
     """y = x / (1 + |x / level|^p)^(1/p): an amplifier that saturates at +-level (Rapp 1991, eq. 1), p its hardness.
 
     p = 2 is a soft limiter; from 100 on it is a hard clip. Level 100, far beyond any converter, stands for no limit.
@@ -26,7 +24,10 @@ class MicClipping:
 
     name: ClassVar[str] = "mic_clipping"
     stage: ClassVar[Stage] = "microphone"
-    memoryless: ClassVar[bool] = True
+    title: ClassVar[str] = "microphone clipping"
+    complexity: ClassVar[int] = 1
+    least_size_db: ClassVar[float] = -9.0
+    memory: ClassVar[int | None] = 0
     parameters: ClassVar[tuple[Parameter, ...]] = (
         Parameter("level", "full scale", NO_LIMIT, 1e-4, NO_LIMIT),
         Parameter("hardness", "", HARD, 1.0, HARD),
@@ -42,7 +43,7 @@ class MicClipping:
         over = np.abs(x / np.float32(level)).astype(np.float64)
         return (x / (1.0 + over**hardness) ** (1.0 / hardness)).astype(np.float32)
 
-    def fit(self, measurement: Measurement, model: EchoModel) -> Values:
+    def fit(self, measurement: Measurement, model: VoiceModel) -> Values:
         """The level and hardness that leave the least of the whitened recording, a gain free in each.
 
         Levels from the recording's largest value downwards; where none beats the prediction as it is, there is no limit.
@@ -76,3 +77,7 @@ class MicClipping:
         if plain - found[0] <= 2.0 * variance * np.log(max(chosen.sum(), 2.0)):
             return none
         return {"level": found[1], "hardness": found[2]}
+
+    def sentence(self, values: Values) -> str:
+        """The level that the recording does not exceed."""
+        return f"the predicted peaks exceed {first(values, 'level'):.3f} of full scale and the recorded ones do not"

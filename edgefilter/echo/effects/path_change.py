@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 import numpy as np
 
-from edgefilter.echo.effect import Measurement, Parameter, Stage, Values, neutral
+from edgefilter.dsp.frames import block_power
+from edgefilter.echo.effect import Effect, Parameter, Stage, first, neutral
+from edgefilter.echo.evidence import Evidence
+from edgefilter.echo.measurement import Measurement, Values, VoiceModel
 from edgefilter.echo.wiener import convolve_from, fit_supported
 from edgefilter.types import SAMPLE_RATE, Samples
-
-if TYPE_CHECKING:
-    from edgefilter.echo.model import EchoModel
 
 LEAD = 64
 TAPS = 3072
@@ -25,7 +25,7 @@ SLACK = 6.0
 NEVER = 1e6
 
 
-class PathChange:
+class PathChange(Effect):
     """y = x until time_s, then x + taps * x, faded over in duration_s around it.
 
     taps: (k,) lags -LEAD to k - LEAD: the new path behind the calibrated one. A time_s of 1e6 s is never.
@@ -33,7 +33,10 @@ class PathChange:
 
     name: ClassVar[str] = "path_change"
     stage: ClassVar[Stage] = "path"
-    memoryless: ClassVar[bool] = False
+    title: ClassVar[str] = "a changed path"
+    event: ClassVar[bool] = True
+    complexity: ClassVar[int] = 4
+    flexible: ClassVar[bool] = True
     parameters: ClassVar[tuple[Parameter, ...]] = (
         Parameter("time_s", "s", NEVER, 0.0, NEVER),
         Parameter("duration_s", "s", 0.01, 0.0, 10.0),
@@ -51,7 +54,7 @@ class PathChange:
         """Values with which the new path holds from the start."""
         return {**values, "time_s": -1.0, "duration_s": 0.0} if float(values["time_s"]) < NEVER else values
 
-    def fit(self, measurement: Measurement, model: EchoModel) -> Values:
+    def fit(self, measurement: Measurement, model: VoiceModel) -> Values:
         """The time by the step in the residual, the new path by least squares after it, in turn; neutral where it does not help on other samples.
 
         The moment alone is chosen on all samples, since it may fall between those that the fit may use.
@@ -76,6 +79,21 @@ class PathChange:
         time, duration = min(as_good, key=lambda found: (found[1], abs(found[0] - time)))
         return {"time_s": float(np.clip(time, 0.0, x.size / SAMPLE_RATE)), "duration_s": duration, "taps": np.clip(taps, -10.0, 10.0)}
 
+    def sentence(self, values: Values) -> str:
+        """When."""
+        return f"until {first(values, 'time_s'):.2f} s the calibrated path holds, from then on another one"
+
+    def plausible(self, evidence: Evidence) -> bool:
+        """Whether the path was the calibrated one until it changed: most of what the effect explains lies after its time, little before."""
+        grid, time = evidence.grid, float(evidence.values["time_s"])
+        early = grid.active_cells & (grid.starts < time * SAMPLE_RATE)
+        late = grid.active_cells & (grid.starts >= time * SAMPLE_RATE)
+        if early.sum() < 6 or late.sum() < 6:
+            return False
+        level, explained = (10 * np.log10(np.maximum(score.cells, 1e-3)) @ grid.freedom / grid.freedom.sum() for score in (evidence.before, evidence.after))
+        rest = float(np.mean(level[early]) - np.mean(explained[late]))
+        return rest < 0.5 * float(np.mean(level[late]) - np.mean(explained[late]))
+
 
 def _fade(n: int, time: float, duration: float, sample_rate: int) -> Samples:
     """(n,) 0 before, 1 after, a line in between."""
@@ -84,8 +102,8 @@ def _fade(n: int, time: float, duration: float, sample_rate: int) -> Samples:
 
 def _step(residual: Samples, x: Samples) -> float:
     """Seconds at which the residual, in proportion to the prediction, rises most clearly: two means of its log in blocks of 100 ms."""
-    count = residual.size // BLOCK
-    power, drive = (np.mean(s[: count * BLOCK].astype(float).reshape(count, BLOCK) ** 2, axis=1) for s in (residual, x))
+    power, drive = block_power(residual, BLOCK), block_power(x, BLOCK)
+    count = power.size
     loud = drive > 10.0
     ratio = np.where(loud, np.log(np.maximum(power, 1.0) / np.where(loud, drive, 1.0)), 0.0)
     total, number = np.cumsum(ratio * loud), np.cumsum(loud)

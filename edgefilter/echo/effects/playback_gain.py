@@ -2,31 +2,49 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 import numpy as np
 
-from edgefilter.echo.effect import Measurement, Parameter, Stage, Values, level_ratio
+from edgefilter.echo.effect import Effect, Parameter, Stage, first
+from edgefilter.echo.evidence import Evidence
+from edgefilter.echo.measurement import Measurement, Values, VoiceModel, level_ratio
 from edgefilter.types import Samples
 
-if TYPE_CHECKING:
-    from edgefilter.echo.model import EchoModel
+LEAST_DB = 0.2
+"""A gain of less is no turned volume."""
 
 
-class PlaybackGain:
+class PlaybackGain(Effect):
     """One gain for all frequencies, before the loudspeaker."""
 
     name: ClassVar[str] = "playback_gain"
     stage: ClassVar[Stage] = "source"
-    memoryless: ClassVar[bool] = True
+    title: ClassVar[str] = "a turned volume"
+    absorbed: ClassVar[bool] = True
+    complexity: ClassVar[int] = 0
+    memory: ClassVar[int | None] = 0
     parameters: ClassVar[tuple[Parameter, ...]] = (Parameter("gain_db", "dB", 0.0, -60.0, 60.0),)
 
     def apply(self, x: Samples, values: Values, sample_rate: int) -> Samples:
         """x times the gain."""
         return x * np.float32(10.0 ** (float(values["gain_db"]) / 20.0))
 
-    def fit(self, measurement: Measurement, model: EchoModel) -> Values:
+    def fit(self, measurement: Measurement, model: VoiceModel) -> Values:
         """The least-squares gain of the whitened prediction, held within the bounds."""
         predicted = measurement.heard(model)[1] * measurement.weights
         gain = level_ratio(measurement.white_recording, predicted)
         return {"gain_db": float(np.clip(20.0 * np.log10(max(gain, 1e-3)), -60.0, 60.0))}
+
+    def sentence(self, values: Values) -> str:
+        """By how much, and which way."""
+        gain_db = first(values, "gain_db")
+        return f"the voice is {abs(gain_db):.2f} dB {'louder' if gain_db > 0 else 'softer'} at all frequencies and levels alike"
+
+    def plausible(self, evidence: Evidence) -> bool:
+        """More than a gain differs from day to day."""
+        return abs(float(evidence.values["gain_db"])) >= LEAST_DB
+
+    def plain_gain(self, gain_db: float) -> Values:
+        """The effect is nothing else."""
+        return {"gain_db": gain_db}

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from dataclasses import astuple, replace
 from itertools import product
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 import numpy as np
 import scipy
 
-from edgefilter.echo.effect import Measurement, Parameter, Stage, Values, complete, neutral
+from edgefilter.dsp.psd import floored
+from edgefilter.echo.effect import Effect, Parameter, Stage, complete, first, neutral
 from edgefilter.echo.effects.knock_power import (
     BAND_HZ,
     BANDS,
@@ -25,11 +26,10 @@ from edgefilter.echo.effects.knock_power import (
     resonated,
     ringing_of,
 )
+from edgefilter.echo.evidence import Evidence
 from edgefilter.echo.least_squares import absorbed, filtered
+from edgefilter.echo.measurement import Measurement, Values, VoiceModel
 from edgefilter.types import SAMPLE_RATE, Array, Samples
-
-if TYPE_CHECKING:
-    from edgefilter.echo.model import EchoModel
 
 TAPS = 320
 """20 ms of ringing after a knock."""
@@ -43,10 +43,12 @@ HALF = SAMPLE_RATE
 WORTH = 2.5
 """What each tap has to explain, in units of the residual's variance, for the sounds to be real."""
 REFINED = 3
+MISSING_DB = -0.3
+"""Under the fan: where the residual is so little of what a model expects, some of what it expects is not there."""
 GRID_HZ = np.linspace(0.0, SAMPLE_RATE / 2, 601)
 
 
-class Rattle:
+class Rattle(Effect):
     """y = x + h * k: a knock k at every moment at which the displacement |d| rises through threshold, h its sound, ahead of the path.
 
     d is the drive through the membrane's resonance, w^2 / (s^2 + s w / q + w^2). An impact excites the modes of the loose part in
@@ -59,8 +61,11 @@ class Rattle:
 
     name: ClassVar[str] = "rattle"
     stage: ClassVar[Stage] = "source"
-    memoryless: ClassVar[bool] = False
-    memory: ClassVar[int] = 1024
+    title: ClassVar[str] = "a rattle"
+    cost: ClassVar[int] = 8
+    last_resort: ClassVar[bool] = True
+    leaves_noise: ClassVar[bool] = True
+    memory: ClassVar[int | None] = 1024
     parameters: ClassVar[tuple[Parameter, ...]] = (
         Parameter("threshold", "full scale", NEVER, 1e-5, NEVER),
         Parameter("resonance_hz", "Hz", 200.0, 20.0, 2000.0),
@@ -91,7 +96,7 @@ class Rattle:
         power = np.broadcast_to(np.asarray(values["power"], float), (BANDS,)) + 1e-30
         return (power / power.sum() / BAND_HZ)[np.minimum(GRID_HZ / BAND_HZ, BANDS - 1).astype(int)]
 
-    def fit(self, measurement: Measurement, model: EchoModel) -> Values:
+    def fit(self, measurement: Measurement, model: VoiceModel) -> Values:
         """What sets the knocks off is found by when the residual is loud; then come the least-squares sounds, and the power of the rest.
 
         Where the sounds explain something, they serve as matched filters, which show how hard the robot was hit at each moment, and
@@ -132,7 +137,7 @@ class Rattle:
         values |= {name: _number_or_taps(np.clip(sound, -BOUND, BOUND)) for name, sound in zip(("outward", "inward"), sounds, strict=True)}
         return {**values, **self._unpredictable(measurement, model, values)}
 
-    def _unpredictable(self, measurement: Measurement, model: EchoModel, values: Values) -> dict[str, float | Array]:
+    def _unpredictable(self, measurement: Measurement, model: VoiceModel, values: Values) -> dict[str, float | Array]:
         """power, decay_ms and rate_hz from what the predictable knocks leave."""
         x = measurement.reference
         knocks = _heard(x, values, SAMPLE_RATE)
@@ -141,11 +146,23 @@ class Rattle:
         left = target - absorbed(predicted, target, measurement.fit)
         fits = {decay: colour_of_knocks(left, ringing_of(knocks, decay, DIRECT), measurement.fit) for decay in DECAYS_MS}
         decay = max(fits, key=lambda decay: fits[decay][0])
-        fan = np.full(GRID_HZ.size, 2.0 / SAMPLE_RATE) if measurement.noise_psd is None else np.maximum(measurement.noise_psd, 1e-14)
+        fan = np.full(GRID_HZ.size, 2.0 / SAMPLE_RATE) if measurement.noise_psd is None else floored(measurement.noise_psd)
         bands = np.minimum(GRID_HZ / BAND_HZ, BANDS - 1).astype(int)
         density = fits[decay][1] * np.bincount(bands) / np.bincount(bands, 1.0 / fan)
         rate = np.count_nonzero(knocks) * SAMPLE_RATE / max(x.size, 1)
         return {"power": np.clip(density * BAND_HZ, 0.0, 1.0), "decay_ms": decay, "rate_hz": rate}
+
+    def sentence(self, values: Values) -> str:
+        """How often, and at which moments of the membrane's movement."""
+        side = {1.0: "outward", -1.0: "inward"}.get(first(values, "side"), "far")
+        return (
+            f"short bursts, {first(values, 'rate_hz'):.0f} a second, follow the moments at which the membrane is driven {side}, and not the voice's level; "
+            "what of them no waveform predicts is shown as irreducible"
+        )
+
+    def plausible(self, evidence: Evidence) -> bool:
+        """Whether the knocks' noise is there on the samples fitted to as well: what a long filter errs by is on the held-out ones alone."""
+        return evidence.after.fitted_db >= MISSING_DB + min(evidence.after.silent_db, 0.0)
 
 
 def _heard(x: Samples, values: Values, sample_rate: int) -> Samples:
@@ -167,7 +184,7 @@ def _roomy(measurement: Measurement) -> np.ndarray:
     return total[ring:] - total[:-ring] >= ring if total.size > ring else np.zeros(measurement.recording.size, bool)
 
 
-def _matched(sound: Array, rest: Samples, measurement: Measurement, model: EchoModel) -> Samples:
+def _matched(sound: Array, rest: Samples, measurement: Measurement, model: VoiceModel) -> Samples:
     """Correlation (n,) of the residual with the whitened sound of one knock at the microphone."""
     length, at = 4096, 1024
     knock = np.zeros(length, np.float32)
@@ -207,7 +224,7 @@ def _agreement(knocks: tuple[Samples, Samples], hits: list[Samples]) -> float:
     return along * abs(along) / energy if energy > 0.0 else 0.0
 
 
-def _predicts(halves: list[tuple[Samples, Samples]], residual: Samples, measurement: Measurement, model: EchoModel) -> bool:
+def _predicts(halves: list[tuple[Samples, Samples]], residual: Samples, measurement: Measurement, model: VoiceModel) -> bool:
     """Whether the sounds learnt from one half of the knocks explain some of the other half, both ways round."""
     normals = [_normal([measurement.whiten(model.predict(knocks[half])) for knocks in halves], residual, TAPS) for half in (0, 1)]
     total = 0.0

@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 import numpy as np
 
-from edgefilter.echo.effect import Measurement, Parameter, Stage, Values, level_ratio
+from edgefilter.dsp.membrane import DISPLACEMENT_TAPS, displacement_taps
+from edgefilter.echo.effect import Effect, Parameter, Stage, first
 from edgefilter.echo.least_squares import NUISANCE_LEAD, filtered, normal_equations, short_filter
+from edgefilter.echo.measurement import Measurement, Values, VoiceModel, level_ratio
 from edgefilter.types import SAMPLE_RATE, Array, Samples
 
-if TYPE_CHECKING:
-    from edgefilter.echo.model import EchoModel
-
-DISPLACEMENT_HZ, DISPLACEMENT_TAPS = 300.0, 128
-"""Corner of the second-order low-pass that turns the reference into the displacement of the membrane; 8 ms later it is 80 dB down."""
 TAPS = 16
 """Taps of the filter behind each nonlinear function, where one number each is not enough."""
 RIDGE = 1e-3
@@ -24,15 +21,8 @@ TERMS = ("even", "odd", "saturation", "force_factor", "stiffness")
 
 
 def displacement(x: Samples, sample_rate: int = SAMPLE_RATE) -> Samples:
-    """The membrane's displacement (n,) for the drive x (n,), in its full scale: stiffness holds it below the resonance, mass above."""
-    return short_filter(x, _butterworth(sample_rate))[: x.size] if x.size else x.copy()
-
-
-def _butterworth(sample_rate: int) -> Samples:
-    """Impulse response (DISPLACEMENT_TAPS,) of w^2 / (s^2 + sqrt(2) w s + w^2), sampled, with a gain of 1 at 0 Hz."""
-    t = np.sqrt(2.0) * np.pi * DISPLACEMENT_HZ * np.arange(DISPLACEMENT_TAPS) / sample_rate
-    taps = np.exp(-t) * np.sin(t)
-    return (taps / taps.sum()).astype(np.float32)
+    """The membrane's displacement (n,) for the drive x (n,), in its full scale."""
+    return short_filter(x, displacement_taps(sample_rate).astype(np.float32))[: x.size] if x.size else x.copy()
 
 
 def distortion_terms(x: Samples, sample_rate: int = SAMPLE_RATE) -> dict[str, Samples]:
@@ -41,7 +31,7 @@ def distortion_terms(x: Samples, sample_rate: int = SAMPLE_RATE) -> dict[str, Sa
     return {"even": x * x, "odd": x * x * x, "saturation": x * np.abs(x), "force_factor": d * x, "stiffness": d * d * x}
 
 
-class SpeakerNonlinearity:
+class SpeakerNonlinearity(Effect):
     """y = x + sum of h_k * f_k(x), five nonlinear functions f_k ahead of the linear path, each with a filter h_k of its own.
 
     A parallel Hammerstein model (Novak et al. 2010, "Nonlinear system identification using exponential swept-sine signals") whose
@@ -52,8 +42,9 @@ class SpeakerNonlinearity:
 
     name: ClassVar[str] = "speaker_nonlinearity"
     stage: ClassVar[Stage] = "source"
-    memoryless: ClassVar[bool] = False
-    memory: ClassVar[int] = DISPLACEMENT_TAPS + TAPS
+    title: ClassVar[str] = "loudspeaker nonlinearity"
+    flexible: ClassVar[bool] = True
+    memory: ClassVar[int | None] = DISPLACEMENT_TAPS + TAPS
     parameters: ClassVar[tuple[Parameter, ...]] = (
         Parameter("even", "1/full scale", 0.0, -BOUND, BOUND),
         Parameter("odd", "1/full scale^2", 0.0, -BOUND, BOUND),
@@ -72,7 +63,7 @@ class SpeakerNonlinearity:
                 out += filtered([term], taps[name][None])
         return out
 
-    def fit(self, measurement: Measurement, model: EchoModel) -> Values:
+    def fit(self, measurement: Measurement, model: VoiceModel) -> Values:
         """Ridge regression of the whitened recording on the path-filtered terms and the voice itself, with its nuisance filter.
 
         One number for each term, or a filter for each where Bayes' information criterion says that they pay.
@@ -98,6 +89,11 @@ class SpeakerNonlinearity:
         level = 10.0 * np.log10(float(np.mean(added**2)) / (float(np.mean(linear**2)) + 1e-30) + 1e-12)
         values = {name: _number_or_taps(np.clip(w[:taps] / gain, -BOUND, BOUND)) for name, w in zip(TERMS, weights[1:], strict=True)}
         return {**values, "level_db": float(np.clip(level, SILENT_DB, 20.0))}
+
+    def sentence(self, values: Values) -> str:
+        """How strong the distortion is."""
+        level_db = first(values, "level_db")
+        return f"products of the reference with itself, {level_db:.0f} dB re the voice, are in the residual: no linear path makes them"
 
 
 def _number_or_taps(weights: Array) -> float | Array:

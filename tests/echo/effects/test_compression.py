@@ -3,17 +3,18 @@
 import numpy as np
 import pytest
 
-from edgefilter.echo import effect as effects
+from edgefilter.echo.effect import complete, neutral
+from edgefilter.echo.effects import catalogue
 from edgefilter.echo.effects.compression import _falling_peak
 from tests.conformance import held_out_power, robot_alone
 
-COMPRESS = effects.find("compression")
+COMPRESS = catalogue.find("compression")
 
 
 def gain_db(level, values):
     """Settled gain of a 1 kHz tone with that RMS level, dB."""
     tone = (10 ** (level / 20) * np.sqrt(2) * np.sin(2 * np.pi * np.arange(32_000) / 16)).astype(np.float32)
-    out = COMPRESS.apply(tone, effects.complete(COMPRESS, values), 16_000)
+    out = COMPRESS.apply(tone, complete(COMPRESS, values), 16_000)
     return 20 * np.log10(np.std(out[-8000:]) / np.std(tone[-8000:]))
 
 
@@ -27,7 +28,7 @@ def test_static_curve_of_ratio_4_above_minus_20_db_with_a_knee_of_6_db(level, ex
 
 def test_release_is_the_time_to_1_over_e_of_the_reduction_in_db():
     tone = np.sin(2 * np.pi * np.arange(48_000) / 16).astype(np.float32) * np.where(np.arange(48_000) < 16_000, 0.5, 1e-3).astype(np.float32)
-    values = effects.complete(COMPRESS, {"threshold_db": -20.0, "ratio": 4.0, "attack_ms": 1.0, "release_ms": 300.0})
+    values = complete(COMPRESS, {"threshold_db": -20.0, "ratio": 4.0, "attack_ms": 1.0, "release_ms": 300.0})
     gain = 20 * np.log10(np.abs(COMPRESS.apply(tone, values, 16_000)) + 1e-12) - 20 * np.log10(np.abs(tone) + 1e-12)
     peaks = np.abs(np.sin(2 * np.pi * np.arange(48_000) / 16)) > 0.9
     before, after = gain[14_000:15_900][peaks[14_000:15_900]].mean(), gain[20_700:20_900][peaks[20_700:20_900]].mean()
@@ -55,5 +56,5 @@ def test_fit_finds_threshold_ratio_and_times():
 
 def test_a_volume_that_was_turned_is_no_compression():
     measurement, model = robot_alone("playback_gain", {"gain_db": -4.0})
-    assert COMPRESS.fit(measurement, model) == effects.neutral(COMPRESS)
+    assert COMPRESS.fit(measurement, model) == neutral(COMPRESS)
     assert held_out_power(measurement, model.predict(measurement.reference)) > 2.0

@@ -2,11 +2,11 @@
 
 import pytest
 
-from edgefilter.echo import effect as effects
+from edgefilter.echo.effects import catalogue
 from tests.conformance import EFFECT_CHECKS
 
 
 @pytest.mark.parametrize("check", EFFECT_CHECKS, ids=lambda check: check.__name__.removeprefix("effect_check_"))
-@pytest.mark.parametrize("name", effects.names())
+@pytest.mark.parametrize("name", catalogue.names())
 def test_conformance(name, check):
     check(name)

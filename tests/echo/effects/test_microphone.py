@@ -6,24 +6,25 @@ import numpy as np
 import pytest
 from scipy import signal
 
-from edgefilter.echo import effect as effects
+from edgefilter.echo.effect import complete
+from edgefilter.echo.effects import catalogue
 from tests.conformance import fan, robot_alone
 
 
 def test_a_hard_clip_is_found_at_its_level():
     measurement, model = robot_alone()
     clipped = np.clip(measurement.recording, -0.2, 0.2)
-    found = effects.find("mic_clipping").fit(replace(measurement, recording=clipped), model)
+    found = catalogue.find("mic_clipping").fit(replace(measurement, recording=clipped), model)
     assert found["level"] == pytest.approx(0.2, rel=0.01) and found["hardness"] == 100.0
 
 
 def test_a_soft_limiter_is_found_soft():
-    found = effects.find("mic_clipping").fit(*robot_alone("mic_clipping", {"level": 0.2, "hardness": 3.0}))
+    found = catalogue.find("mic_clipping").fit(*robot_alone("mic_clipping", {"level": 0.2, "hardness": 3.0}))
     assert found["hardness"] < 10.0 and found["level"] == pytest.approx(0.2, rel=0.15)
 
 
 def test_soft_limiter_never_exceeds_its_level_and_keeps_small_values():
-    clip = effects.find("mic_clipping")
+    clip = catalogue.find("mic_clipping")
     x = np.linspace(-5, 5, 1001, dtype=np.float32)
     out = clip.apply(x, {"level": 0.5, "hardness": 4.0}, 16_000)
     assert np.abs(out).max() <= 0.5 and np.all(np.diff(out) >= 0)
@@ -33,24 +34,24 @@ def test_soft_limiter_never_exceeds_its_level_and_keeps_small_values():
 
 def test_a_loud_recording_below_any_limit_is_left_alone():
     measurement, model = robot_alone("playback_gain", {"gain_db": 3.0})
-    found = effects.find("mic_clipping").fit(measurement, model)
+    found = catalogue.find("mic_clipping").fit(measurement, model)
     predicted = model.predict(measurement.reference)
     # a faint cubic distortion, which every loudspeaker has, may look like the beginning of a limiter
-    assert np.abs(effects.find("mic_clipping").apply(predicted, found, 16_000) - predicted).max() < 0.05 * np.abs(predicted).max()
+    assert np.abs(catalogue.find("mic_clipping").apply(predicted, found, 16_000) - predicted).max() < 0.05 * np.abs(predicted).max()
 
 
 def through_agc(curve_db, gain_db=0.0):
     """A recording whose voice and fan both got that gain, knots every 0.25 s; and the model."""
     measurement, model = robot_alone(gain_db=gain_db)
-    agc = effects.find("mic_agc")
-    recording = agc.apply(measurement.recording, effects.complete(agc, {"gain_db": curve_db}), 16_000)
+    agc = catalogue.find("mic_agc")
+    recording = agc.apply(measurement.recording, complete(agc, {"gain_db": curve_db}), 16_000)
     return replace(measurement, recording=recording), model
 
 
 def test_gain_control_is_followed_through_speech_and_pauses():
     t = np.arange(48) / 4.0
     curve = 4.0 * np.sin(2 * np.pi * t / 7.0) - 1.0
-    found = effects.find("mic_agc").fit(*through_agc(curve))
+    found = catalogue.find("mic_agc").fit(*through_agc(curve))
     # half of the blocks are held out, their knots interpolated
     assert np.sqrt(np.mean((found["gain_db"][:48] - curve) ** 2)) < 0.4
     assert found["range_db"] == pytest.approx(np.ptp(np.percentile(curve, [5, 95])), abs=0.7)
@@ -58,13 +59,13 @@ def test_gain_control_is_followed_through_speech_and_pauses():
 
 
 def test_gain_control_at_a_step_between_knots_is_linear_in_db():
-    agc = effects.find("mic_agc")
-    out = agc.apply(np.ones(8000, np.float32), effects.complete(agc, {"gain_db": np.array([0.0, 6.0])}), 16_000)
+    agc = catalogue.find("mic_agc")
+    out = agc.apply(np.ones(8000, np.float32), complete(agc, {"gain_db": np.array([0.0, 6.0])}), 16_000)
     np.testing.assert_allclose(20 * np.log10(out[[0, 1000, 2000, 4000, 7999]]), [0.0, 1.5, 3.0, 6.0, 6.0], atol=1e-3)
 
 
 def test_a_constant_gain_is_one_number_without_range():
-    found = effects.find("mic_agc").fit(*robot_alone("playback_gain", {"gain_db": -2.0}))
+    found = catalogue.find("mic_agc").fit(*robot_alone("playback_gain", {"gain_db": -2.0}))
     assert np.ndim(found["gain_db"]) == 0 and found["gain_db"] == pytest.approx(-2.0, abs=0.2) and found["range_db"] == 0.0
 
 
@@ -72,7 +73,7 @@ def test_fan_that_is_louder_in_a_band_is_found_in_that_band():
     measurement, model = robot_alone()
     band = signal.sosfilt(signal.butter(6, [2000, 3000], "band", fs=16_000, output="sos"), np.random.default_rng(5).standard_normal(192_000))
     louder = replace(measurement, recording=measurement.recording + (0.002 * band).astype(np.float32))
-    found = effects.find("fan_noise").fit(louder, model)
+    found = catalogue.find("fan_noise").fit(louder, model)
     hz = np.arange(601) * 8000 / 600
     inside, outside = (hz > 2200) & (hz < 2800), (hz < 1500) | (hz > 3600)
     # white noise of variance 0.002^2 has a one-sided PSD of that over 8 kHz
@@ -84,9 +85,9 @@ def test_fan_that_is_louder_in_a_band_is_found_in_that_band():
 def test_fan_change_is_that_of_its_power_and_its_psd_follows():
     measurement, model = robot_alone()
     silent = replace(measurement, reference=np.zeros_like(measurement.reference), recording=2 * fan(192_000, seed=9))
-    found = effects.find("fan_noise").fit(silent, model)
+    found = catalogue.find("fan_noise").fit(silent, model)
     assert found["change_db"] == pytest.approx(20 * np.log10(2), abs=0.3)
-    changed = effects.find("fan_noise").noise_psd(found, measurement.noise_psd)
+    changed = catalogue.find("fan_noise").noise_psd(found, measurement.noise_psd)
     assert changed.shape == (601,) and changed.dtype == np.float32
     assert 10 * np.log10(changed.sum() / measurement.noise_psd.sum()) == pytest.approx(found["change_db"], abs=0.1)
 
@@ -96,10 +97,10 @@ def test_fan_is_found_under_a_robot_that_never_pauses():
     measurement, model = robot_alone()
     reference = (0.1 * rng.standard_normal(192_000)).astype(np.float32)
     recording = model.predict(reference) + np.float32(10 ** (3 / 20)) * fan(192_000, seed=8)
-    found = effects.find("fan_noise").fit(replace(measurement, reference=reference, recording=recording), model)
+    found = catalogue.find("fan_noise").fit(replace(measurement, reference=reference, recording=recording), model)
     assert found["change_db"] == pytest.approx(3.0, abs=0.5)
 
 
 def test_calibrated_fan_has_not_changed():
-    found = effects.find("fan_noise").fit(*robot_alone())
+    found = catalogue.find("fan_noise").fit(*robot_alone())
     assert abs(found["change_db"]) < 0.3 and np.abs(np.median(found["spectrum_db"])) < 0.3

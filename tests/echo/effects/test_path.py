@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 from scipy import signal
 
-from edgefilter.diagnosis.offset import shift
+from edgefilter.dsp.fractional_delay import delayed
 from edgefilter.diagnosis.prepare import prepare
-from edgefilter.echo.effect import Measurement, find
+from edgefilter.echo.effects.catalogue import find
 from edgefilter.echo.effects.late_reverb import EXPECTED, LEAD
+from edgefilter.echo.measurement import Measurement
 from edgefilter.echo.model import EchoModel
 from edgefilter.echo.wiener import convolve_from, fit_filter
 from edgefilter.types import PRE_ROLL
@@ -19,7 +20,7 @@ from tests.diagnosis.robot_scene import DELAY, FAN, path, profile, record, voice
 def measure(recording: np.ndarray, x: np.ndarray) -> Measurement:
     psd = np.full(601, FAN**2 / 8000, np.float32)
     fit = np.arange(x.size) // 8000 % 2 == 0
-    return Measurement(shift(x, DELAY - PRE_ROLL), recording.astype(np.float32), psd, fit)
+    return Measurement(delayed(x, DELAY - PRE_ROLL), recording.astype(np.float32), psd, fit)
 
 
 def excess_db(name: str, measurement: Measurement) -> tuple[float, dict]:
@@ -44,7 +45,7 @@ def in_an_office(seconds: float) -> Measurement:
     t = np.arange(10_000)
     room = np.pad(path(), (0, 6000))
     room[PRE_ROLL + 160 : PRE_ROLL + 160 + t.size] += 0.012 * rng.standard_normal(t.size) * 10 ** (-3 * t / (0.5 * 16000))
-    clean = signal.fftconvolve(shift(x, DELAY - PRE_ROLL), room)[: x.size]
+    clean = signal.fftconvolve(delayed(x, DELAY - PRE_ROLL), room)[: x.size]
     return measure(clean + FAN * rng.standard_normal(x.size), x)
 
 
@@ -65,7 +66,7 @@ def test_what_is_known_of_a_decaying_room_helps_where_little_was_heard() -> None
 
 def test_a_resonance_is_found_with_its_frequency_and_q() -> None:
     rng, x = np.random.default_rng(5), voice(12.0)
-    clean = EchoModel(path()).predict(shift(x, DELAY - PRE_ROLL)).astype(float)
+    clean = EchoModel(path()).predict(delayed(x, DELAY - PRE_ROLL)).astype(float)
     ringing = clean + 0.8 * signal.lfilter(*signal.iirpeak(820.0, 40.0, fs=16000), clean)
     left, values = excess_db("chassis_resonance", measure(ringing + FAN * rng.standard_normal(x.size), x))
     assert values["frequency_hz"] == pytest.approx(820.0, rel=0.005)
@@ -75,7 +76,7 @@ def test_a_resonance_is_found_with_its_frequency_and_q() -> None:
 
 def test_two_resonances_are_found_with_their_frequencies_loudest_first() -> None:
     rng, x = np.random.default_rng(5), voice(12.0)
-    clean = EchoModel(path()).predict(shift(x, DELAY - PRE_ROLL)).astype(float)
+    clean = EchoModel(path()).predict(delayed(x, DELAY - PRE_ROLL)).astype(float)
     ringing = clean + sum(gain * signal.lfilter(*signal.iirpeak(hz, 40.0, fs=16000), clean) for hz, gain in ((820.0, 0.5), (1900.0, 0.8)))
     left, values = excess_db("chassis_resonance", measure(ringing + FAN * rng.standard_normal(x.size), x))
     np.testing.assert_allclose(values["frequency_hz"], (1900.0, 820.0), rtol=0.005)
@@ -85,7 +86,7 @@ def test_two_resonances_are_found_with_their_frequencies_loudest_first() -> None
 @pytest.mark.parametrize("filters", [signal.butter(6, 3000.0, fs=16000, output="sos"), signal.cheby1(8, 0.5, 5000.0, fs=16000, output="sos")])
 def test_a_low_pass_is_found_whatever_its_kind(filters: np.ndarray) -> None:
     rng, x = np.random.default_rng(6), voice(12.0)
-    clean = signal.sosfilt(filters, EchoModel(path()).predict(shift(x, DELAY - PRE_ROLL)).astype(float))
+    clean = signal.sosfilt(filters, EchoModel(path()).predict(delayed(x, DELAY - PRE_ROLL)).astype(float))
     recording = (clean + FAN * rng.standard_normal(x.size)).astype(np.float32)
     left, values = excess_db("bandlimit", prepare(profile(), recording, x).measurement)  # takes out the filter's delay
     hz, response = signal.sosfreqz(filters, 4096, fs=16000)
@@ -96,7 +97,7 @@ def test_a_low_pass_is_found_whatever_its_kind(filters: np.ndarray) -> None:
 
 def test_a_changed_path_is_found_with_its_time() -> None:
     x = voice(16.0)
-    before, after = record(x), record(x, EchoModel(shift(path(seed=2), 0.4)))
+    before, after = record(x), record(x, EchoModel(delayed(path(seed=2), 0.4)))
     left, values = excess_db("path_change", measure(np.where(np.arange(x.size) < 7.0 * 16000, before, after), x))
     assert values["time_s"] == pytest.approx(7.0, abs=0.15)  # the next sound after it
     assert left < 1.0

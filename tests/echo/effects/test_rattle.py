@@ -6,12 +6,13 @@ import numpy as np
 import pytest
 from scipy import signal
 
-from edgefilter.echo import effect as effects
+from edgefilter.echo.effect import complete
+from edgefilter.echo.effects import catalogue
 from edgefilter.echo.effects.rattle import DIRECT, find_knocks, resonated
 from edgefilter.types import PRE_ROLL
 from tests.conformance import fan, held_out_power, robot_alone, robot_model
 
-RATTLE = effects.find("rattle")
+RATTLE = catalogue.find("rattle")
 SOUND = np.sin(np.arange(200) * 0.8) * np.exp(-np.arange(200) / 60)
 
 
@@ -59,12 +60,12 @@ def test_variance_rings_after_each_knock_when_it_is_heard():
     assert DIRECT == PRE_ROLL
     x = np.zeros(8000, np.float32)
     x[1000:1400] = 0.5
-    values = effects.complete(RATTLE, {"threshold": 0.2, "power": 1e-4, "decay_ms": 5.0})
+    values = complete(RATTLE, {"threshold": 0.2, "power": 1e-4, "decay_ms": 5.0})
     variance = RATTLE.variance(x, values, 16_000)
     knock = int(np.flatnonzero(find_knocks(resonated(x, 200.0, 1.0), 0.2)[0])[0])
     assert variance[: knock + DIRECT].max() == 0.0 and variance[knock + DIRECT] > 0.0
     assert variance[knock + DIRECT + 80] / variance[knock + DIRECT] == pytest.approx(np.exp(-1), rel=0.01)
-    assert not RATTLE.variance(x, effects.complete(RATTLE, {}), 16_000).any()
+    assert not RATTLE.variance(x, complete(RATTLE, {}), 16_000).any()
 
 
 def test_knocks_that_are_never_alike_go_into_the_variance():
@@ -76,7 +77,7 @@ def test_knocks_that_are_never_alike_go_into_the_variance():
     truth = {"threshold": 0.12, "resonance_hz": 200.0, "outward": 0.004 * SOUND}
     recording = model.with_effect("rattle", truth).predict(x) + fan(x.size) + (0.0004 * wild).astype(np.float32)
     measurement = replace(base, reference=x, recording=recording)
-    values = effects.complete(RATTLE, RATTLE.fit(measurement, model))
+    values = complete(RATTLE, RATTLE.fit(measurement, model))
     assert 2.0 <= values["decay_ms"] <= 16.0  # 4 ms were simulated; the sound's imperfect estimate adds its own 4 ms
     left = recording - model.with_effect("rattle", values).predict(x) - fan(x.size)
     assert RATTLE.variance(x, values, 16_000).mean() == pytest.approx(np.mean(left**2), rel=0.5)

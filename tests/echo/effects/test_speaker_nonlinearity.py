@@ -4,17 +4,18 @@ import numpy as np
 import pytest
 from scipy import signal
 
-from edgefilter.echo import effect as effects
-from edgefilter.echo.effect import Measurement
+from edgefilter.echo.effect import complete
+from edgefilter.echo.effects import catalogue
 from edgefilter.echo.effects.speaker_nonlinearity import displacement
+from edgefilter.echo.measurement import Measurement
 from tests.conformance import robot_alone, robot_model, robot_speech
 
 
 def test_two_tones_through_even_give_their_sum_and_difference():
     t = np.arange(16_000) / 16_000
     x = (0.3 * np.sin(2 * np.pi * 1000 * t) + 0.3 * np.sin(2 * np.pi * 1700 * t)).astype(np.float32)
-    distort = effects.find("speaker_nonlinearity")
-    out = distort.apply(x, effects.complete(distort, {"even": 0.5}), 16_000)
+    distort = catalogue.find("speaker_nonlinearity")
+    out = distort.apply(x, complete(distort, {"even": 0.5}), 16_000)
     spectrum = np.abs(np.fft.rfft(out - x)) / 8000
     # 0.5 * (a + b)^2: products at 700 and 2700 Hz of 0.5 * 0.3^2, octaves of half of that
     np.testing.assert_allclose(spectrum[[700, 2700, 2000, 3400]], [0.045, 0.045, 0.0225, 0.0225], rtol=1e-3)
@@ -31,7 +32,7 @@ def test_without_noise_the_fit_returns_the_coefficients():
     x, model = robot_speech(), robot_model()
     truth = {"even": 0.4, "odd": -0.8}
     recording = model.with_effect("speaker_nonlinearity", truth).predict(x)
-    found = effects.find("speaker_nonlinearity").fit(Measurement(x, recording), model)
+    found = catalogue.find("speaker_nonlinearity").fit(Measurement(x, recording), model)
     total = {name: float(np.sum(found[name])) for name in truth}
     # the ridge of 1e-3 and the filter on the linear part, which takes up the odd term's share of the voice, bias by a few per cent
     assert total["even"] == pytest.approx(0.4, rel=0.05) and total["odd"] == pytest.approx(-0.8, rel=0.15)
@@ -45,12 +46,12 @@ def test_level_is_that_of_the_distortion_at_the_microphone():
     added = measurement.whiten(model.with_effect("speaker_nonlinearity", values).predict(x)) - linear
     added -= np.dot(added, linear) / np.dot(linear, linear) * linear
     expected = 10 * np.log10(np.mean(added**2) / np.mean(linear**2))
-    found = effects.find("speaker_nonlinearity").fit(measurement, model)["level_db"]
+    found = catalogue.find("speaker_nonlinearity").fit(measurement, model)["level_db"]
     assert found == pytest.approx(expected, abs=1.0)  # the fan is 10 dB above this distortion: its estimate varies by some tenths
 
 
 def test_filters_are_fitted_only_where_they_pay():
-    fit = effects.find("speaker_nonlinearity").fit
+    fit = catalogue.find("speaker_nonlinearity").fit
     one = fit(*robot_alone("speaker_nonlinearity", {"odd": -0.5}))
     assert all(np.ndim(one[name]) == 0 for name in ("even", "odd", "saturation", "force_factor", "stiffness"))
     late = signal.firwin(9, 1500, fs=16_000) * 0.8
@@ -67,8 +68,8 @@ def test_driven_hop_by_hop_is_the_same_as_at_once(sizes):
     distortion = {"even": 0.3, "force_factor": np.array([0.5, 0.0, 0.4]), "stiffness": -2.0}
     model = robot_model().with_effect("speaker_nonlinearity", distortion).with_effect("rattle", knocks).with_effect("playback_gain", {"gain_db": 2.0})
     whole = x
-    for name, values in model.effects:
-        whole = effects.find(name).apply(whole, effects.complete(effects.find(name), values), 16_000)
+    for effect, values in catalogue.chain(model.effects):
+        whole = effect.apply(whole, values, 16_000)
     driver, at, out = model.driver(), 0, []
     while at < x.size:
         size = sizes[len(out) % len(sizes)]

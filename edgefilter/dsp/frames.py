@@ -1,0 +1,36 @@
+"""A signal in pieces: overlapping frames, whole blocks, the power of each, in decibels."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edgefilter.types import Array, Samples
+
+
+def frames(x: NDArray, size: int, hop: int) -> NDArray:
+    """(f, size) frames of x (n,), hop samples apart, a view not to be written to; none where x is shorter."""
+    if x.size < size:
+        return np.zeros((0, size), x.dtype)
+    return np.lib.stride_tricks.sliding_window_view(x, size)[::hop]
+
+
+def blocks(x: NDArray, size: int) -> NDArray:
+    """(k, size) the whole blocks of x (n,), a view; what is left at the end is left out."""
+    count = x.size // size
+    return x[: count * size].reshape(count, size)
+
+
+def block_power(x: Samples, size: int) -> Array:
+    """(k,) float64, mean square of x (n,) in each whole block."""
+    return np.square(blocks(x, size), dtype=np.float64).mean(axis=1)
+
+
+def all_block_power(x: Samples, size: int) -> Array:
+    """(k,) float64, mean square in each block, the last one counted as if silence followed."""
+    return np.add.reduceat(x.astype(np.float64) ** 2, np.arange(0, x.size, size)) / size
+
+
+def decibels(power: Array | float, least: float = 1e-12) -> Array:
+    """10 lg of a power, at least that of `least`."""
+    return 10.0 * np.log10(np.maximum(power, least))

@@ -1,0 +1,103 @@
+"""By how much one signal lags behind another: flat cross-spectra, their highest correlation and its top."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy import fft
+from scipy.ndimage import uniform_filter1d
+
+from edgefilter.dsp.fourier import power
+from edgefilter.types import SAMPLE_RATE, Array, Samples
+
+SMOOTHING_HZ = 32.0
+"""Width over which the power that a spectrum is divided by is averaged: harmonics are flattened, no pitch peaks."""
+LIKELY_HZ = 50.0
+"""The same where the prediction's power weighs a cross-spectrum."""
+LOWEST_HZ = 100.0
+"""A voice and its room begin here; what lies below is rumble."""
+LONGEST = 0.5
+"""Samples of one Newton step: halfway between two samples a longer one jumps to and fro across the top."""
+
+
+def smoothed_power(spectrum: np.ndarray, width_hz: float) -> Array:
+    """|spectrum|^2 (..., bins), averaged over width_hz."""
+    raw = power(spectrum)
+    width = max(round(width_hz * 2 * spectrum.shape[-1] / SAMPLE_RATE), 1)
+    return uniform_filter1d(raw, width, output=np.empty_like(raw), mode="nearest")
+
+
+def flattened(spectrum: np.ndarray, floor: float) -> np.ndarray:
+    """The spectrum (bins,) over the root of its smoothed power, which counts as no less than floor times its maximum.
+
+    Two of these, one conjugated, make the cross-spectrum of the phase transform (Knapp & Carter 1976), but for
+    the smoothing.
+    """
+    weight = smoothed_power(spectrum, SMOOTHING_HZ)
+    weight += weight.dtype.type(floor * weight.max() + 1e-20)
+    return spectrum * (weight.dtype.type(1.0) / np.sqrt(weight, out=weight))
+
+
+def flat_cross(a: Samples, b: Samples, n: int) -> np.ndarray:
+    """(n // 2 + 1,) cross-spectrum of b with a, both flattened, without rumble: for unknown signals."""
+    first, second = (flattened(fft.rfft(x.astype(np.float64), n), 1e-6) for x in (a, b))
+    cross = second * first.conj()
+    cross[: int(LOWEST_HZ * n / SAMPLE_RATE)] = 0.0
+    return cross
+
+
+def likely_cross(predicted: Samples, recording: Samples, n: int) -> np.ndarray:
+    """(n // 2 + 1,) cross-spectrum Y P* / (|P|^2 + N) of two signals in noise of variance 1.
+
+    Flat where the voice stands out of the noise, nothing elsewhere. The maximum-likelihood weighting of Knapp &
+    Carter (1976) for an error in proportion to the voice.
+    """
+    source = fft.rfft(predicted.astype(np.float64), n)
+    heard = fft.rfft(recording.astype(np.float64), n)
+    return heard * source.conj() / (smoothed_power(source, LIKELY_HZ) + recording.size)
+
+
+def correlation_near(cross: np.ndarray, n: int, reach: int) -> Array:
+    """(2 reach + 1,) the correlation at lags -reach to reach of which this is the spectrum, n samples long."""
+    correlation = fft.irfft(cross, n)
+    return np.concatenate((correlation[n - reach :], correlation[: reach + 1]))
+
+
+def highest(near: Array) -> tuple[int, float]:
+    """Lag of the highest value of near (2 reach + 1,), and its height over the root mean square of all."""
+    at = int(np.argmax(near))
+    return at - near.size // 2, float(near[at]) / max(float(np.sqrt(np.mean(np.square(near)))), 1e-30)
+
+
+def turn(omega: Array, delay: float) -> np.ndarray:
+    """exp(j omega delay), complex64 for a float32 omega; several times as fast as np.exp of a complex array."""
+    angle = omega * delay
+    turned = np.empty(omega.size, np.complex64 if omega.dtype == np.float32 else np.complex128)
+    np.cos(angle, out=turned.real)
+    np.sin(angle, out=turned.imag)
+    return turned
+
+
+def climb(cross: np.ndarray, omega: Array, lag: float, steps: int = 8, tolerance: float = 0.0) -> float:
+    """The lag, at most one sample from `lag`, at the top of the correlation whose cross-spectrum (bins,) this is.
+
+    omega: (bins,) radians per sample. Newton's method on Re sum cross exp(j omega lag), up to `steps` steps or one
+    under the tolerance.
+    """
+    squared, moved = np.square(omega), 0.0
+    for _ in range(steps):
+        turned = turn(omega, lag + moved)
+        np.multiply(cross, turned, out=turned)
+        slope = -float(omega.dot(turned.imag))
+        curvature = -float(squared.dot(turned.real))
+        if curvature >= 0.0:
+            break
+        step = min(max(-slope / curvature, -LONGEST), LONGEST)
+        moved = min(max(moved + step, -1.0), 1.0)
+        if abs(step) < tolerance:
+            break
+    return lag + moved
+
+
+def top(cross: np.ndarray, n: int, lag: float) -> float:
+    """`climb` for a cross-spectrum (n // 2 + 1,) of n samples, to a ten-thousandth of a sample."""
+    return climb(cross, 2 * np.pi * np.arange(cross.size) / n, lag, tolerance=1e-4)

@@ -1,0 +1,58 @@
+"""Power spectral densities: one-sided, full scale^2 per Hz, from 0 to 8 kHz, unless said otherwise."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy import fft
+
+from edgefilter.dsp.fourier import power
+from edgefilter.dsp.frames import frames
+from edgefilter.types import SAMPLE_RATE, Array, Samples
+
+ROUNDING_PSD = 1e-14
+"""PSD of rounding to 16 bit: (2^-15)^2 / 12 / 8 kHz, rounded down."""
+NOTCH = 1e-7
+"""A PSD counts as no less than this part of its maximum, 70 dB, so that a notch is not amplified beyond reason."""
+
+
+def hann(size: int) -> Array:
+    """(size,) float64, the periodic Hann window, whose shifted copies add up to a constant."""
+    return np.hanning(size + 1)[:-1]
+
+
+def periodograms(x: Samples, size: int) -> Array:
+    """(f, size / 2 + 1) PSD of each half-overlapping Hann frame of x (n,): their mean is Welch's estimate (1967)."""
+    window = hann(size)
+    found = power(fft.rfft(frames(x, size, size // 2) * window, axis=1)) / (SAMPLE_RATE * np.sum(window**2))
+    found[:, 1:-1] *= 2.0
+    return found
+
+
+def frequencies(bins: int) -> Array:
+    """(bins,) Hz, 0 to 8 kHz."""
+    return np.arange(bins) * (0.5 * SAMPLE_RATE / (bins - 1))
+
+
+def floored(psd: Samples) -> Array:
+    """The PSD (bins,), float64, as one divides by it: held above 16 bit rounding noise and 70 dB under its maximum."""
+    return np.maximum(psd.astype(np.float64), max(ROUNDING_PSD, NOTCH * float(psd.max())))
+
+
+def variance_at(hz: Array, psd: Samples) -> Array:
+    """Two-sided density per sample of the PSD (bins,) at hz.
+
+    |spectrum|^2 of such noise is that times the sum of the squared window.
+    """
+    return np.interp(hz, frequencies(psd.size), psd) / 2 * SAMPLE_RATE
+
+
+def total_power(psd: Samples) -> float:
+    """Mean square of noise of that PSD (bins,)."""
+    return float(np.sum(psd)) * (SAMPLE_RATE / 2) / (psd.size - 1)
+
+
+def third_octave_bands() -> Array:
+    """(B, 2) Hz, third-octave bands of 50 Hz to 8 kHz (IEC 61260-1, 5.4, base ten), the last cut at 8 kHz."""
+    centres = 1000.0 * 10 ** (np.arange(-13, 10) / 10)
+    edges = np.stack((centres * 10**-0.05, centres * 10**0.05), axis=1)
+    return np.minimum(edges, SAMPLE_RATE / 2)

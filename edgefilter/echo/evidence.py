@@ -1,0 +1,74 @@
+"""What speaks for an effect: how well a recording is explained before and after it, and the cells in which that is judged."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edgefilter.echo.measurement import Measurement, Values, VoiceModel
+from edgefilter.types import Array, Samples
+
+
+@dataclass(frozen=True, eq=False)
+class Score:
+    """Of one prediction. level_db: mean over time-frequency cells of the residual's dB over the fan, each cell by its degrees of freedom.
+
+    excess_db: mean power of the held-out whitened residual, dB. active_db, silent_db: while the robot is heard, and is not. fitted_db: of the
+    samples to fit on, while it is heard.
+    What a model says that no waveform predicts counts as fan in these; irreducible_db: the excess over the fan alone then, else 0.
+    cells: (times, bands) power over the fan. prediction: (n,) with the ordinary tolerances taken up.
+    """
+
+    level_db: float
+    excess_db: float
+    active_db: float
+    silent_db: float
+    fitted_db: float
+    irreducible_db: float
+    cells: Array = field(repr=False)
+    prediction: Samples = field(repr=False)
+
+
+class Grid(Protocol):
+    """The recording in cells of time and frequency, held-out ones alone, as the judge of a diagnosis cuts it.
+
+    starts: (times,) first sample of each. active_cells: (times,) bool, where the robot is heard. band_hz: (bands, 2) edges. freedom: (bands,)
+    degrees of freedom of a cell. usable: (n,) bool, samples where nobody else talks.
+    """
+
+    starts: Array
+    active_cells: NDArray[np.bool_]
+    band_hz: Array
+    freedom: Array
+
+    @property
+    def measurement(self) -> Measurement:
+        """The recording beside its reference."""
+        ...
+
+    @property
+    def usable(self) -> NDArray[np.bool_]:
+        """(n,) samples where nobody else talks."""
+        ...
+
+    def cells(self, residual: Samples) -> Array:
+        """(times, bands) power of a signal (n,) over the fan's."""
+        ...
+
+    def level_db(self, prediction: Samples) -> float:
+        """Score.level_db of another prediction (n,)."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class Evidence:
+    """One effect added to a model of a recording: its values, the model without it, the scores before and after."""
+
+    values: Values
+    model: VoiceModel
+    grid: Grid
+    before: Score
+    after: Score

@@ -1,0 +1,108 @@
+"""A recording of the robot alone as a fit gets it, and the whitening by which it is judged."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Protocol, TypeAlias
+
+import numpy as np
+import scipy
+from numpy.typing import NDArray
+
+from edgefilter.dsp.psd import floored
+from edgefilter.types import SAMPLE_RATE, Array, Samples
+
+Values: TypeAlias = Mapping[str, "float | Array"]
+"""The parameters of one effect by name."""
+REMEMBERED = 6
+"""Models whose predictions a measurement keeps."""
+
+
+class VoiceModel(Protocol):
+    """What an effect's fit may ask of the model that it is added to; EchoModel is one."""
+
+    @property
+    def impulse_response(self) -> Samples:
+        """(taps,) the linear path, starting PRE_ROLL samples before the direct sound."""
+        ...
+
+    @property
+    def effects(self) -> tuple[tuple[str, Values], ...]:
+        """(name, values) of what the model has already."""
+        ...
+
+    @property
+    def timed(self) -> bool:
+        """Whether what the model predicts depends on when the recording began."""
+        ...
+
+    def predict(self, reference: Samples) -> Samples:
+        """The robot's voice at the microphone (n,) for an aligned reference (n,)."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class Measurement:
+    """The robot alone: reference (n,), aligned up to what an effect may do to time, and the recording (n,) of it, float32, 16 kHz.
+
+    noise_psd: (601,) one-sided power spectral density of the fan, full scale^2/Hz, from 0 to 8 kHz; None where it is unknown.
+    fit: (n,) bool, the samples that a fit may use; the others are held out to judge it by. None: all.
+    """
+
+    reference: Samples
+    recording: Samples
+    noise_psd: Samples | None = None
+    fit: NDArray[np.bool_] | None = None
+    _heard: dict[VoiceModel, tuple[Samples, Samples]] = field(default_factory=dict, init=False, repr=False)
+
+    @property
+    def weights(self) -> Samples:
+        """(n,) float32, 1 where a fit may use the sample, else 0."""
+        return np.ones(self.recording.size, np.float32) if self.fit is None else self.fit.astype(np.float32)
+
+    def whiten(self, x: Samples) -> Samples:
+        """x (n,) through a zero-phase filter after which the fan is white with variance 1; x itself where the fan is unknown."""
+        return x if self.noise_psd is None else whiten(x, self.noise_psd)
+
+    @cached_property
+    def fingerprint(self) -> float:
+        """A whole number of 52 bits that tells this recording from others, from its samples at 16 bit."""
+        digest = hashlib.sha256(np.round(self.recording * 32768.0).astype(np.int32).tobytes()).digest()
+        return float(int.from_bytes(digest[:8], "big") >> 12)
+
+    @cached_property
+    def white_recording(self) -> Samples:
+        """(n,) the recording, whitened."""
+        return self.whiten(self.recording)
+
+    def heard(self, model: VoiceModel) -> tuple[Samples, Samples]:
+        """(n,), (n,) what a model predicts for the reference, and that whitened; remembered for the latest few models, not to be written to."""
+        known = self._heard.pop(model, None)
+        if known is None:
+            predicted = model.predict(self.reference)
+            known = predicted, self.whiten(predicted)
+            while len(self._heard) >= REMEMBERED:
+                del self._heard[next(iter(self._heard))]
+        self._heard[model] = known
+        return known
+
+    def error(self, predicted: Samples) -> float:
+        """Weighted sum of squares of the whitened recording minus predicted (n,): what a fit makes small."""
+        residual = self.whiten(self.recording - predicted)
+        return float(np.dot(residual * residual, self.weights))
+
+
+def whiten(x: Samples, noise_psd: Samples) -> Samples:
+    """x (n,) filtered by 1 / sqrt(noise_psd), floored, zero-phase, so that noise of that one-sided PSD gets variance 1."""
+    taps = np.fft.fftshift(np.fft.irfft(1.0 / np.sqrt(floored(noise_psd) * SAMPLE_RATE / 2)))[1:]
+    taps *= np.hanning(taps.size + 2)[1:-1] ** 0.25
+    return scipy.signal.oaconvolve(x, taps.astype(np.float32), mode="full")[taps.size // 2 :][: x.size].astype(np.float32)
+
+
+def level_ratio(recording: Samples, predicted: Samples) -> float:
+    """Least-squares gain from predicted to recording, both (n,); 1 where nothing was predicted."""
+    energy = float(np.dot(predicted, predicted))
+    return float(np.dot(recording, predicted)) / energy if energy > 0.0 else 1.0

@@ -1,0 +1,33 @@
+"""A recording of the robot beside its reference: its least length, its largest lag, the samples that are fitted on."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edgefilter.errors import SignalError
+from edgefilter.types import SAMPLE_RATE, Samples, as_samples
+
+MIN_SECONDS = 1.0
+MAX_OFFSET = 3.0
+"""Seconds by which a recording may lag behind its reference or lead it."""
+BLOCK = SAMPLE_RATE // 2
+"""Samples of the blocks that are fitted on and judged by in turn."""
+
+
+def fitted_blocks(n: int) -> NDArray[np.bool_]:
+    """(n,) every other BLOCK, from the first on: what a fit may use, so that the rest can judge it."""
+    return np.arange(n) // BLOCK % 2 == 0
+
+
+def paired(recording: object, reference: object) -> tuple[Samples, Samples]:
+    """Both as float32 of the recording's length, silence behind a shorter reference.
+
+    Raises SignalError where either is shorter than MIN_SECONDS.
+    """
+    y, x = as_samples(recording, "recording"), as_samples(reference, "reference")
+    for samples, name in ((y, "recording"), (x, "reference")):
+        if samples.size < MIN_SECONDS * SAMPLE_RATE:
+            seconds = samples.size / SAMPLE_RATE
+            raise SignalError(f"the {name} is {seconds:.2f} s long, expected at least {MIN_SECONDS:g} s of the robot's voice")
+    return y, np.pad(x, (0, max(y.size - x.size, 0)))[: y.size]
