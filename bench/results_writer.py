@@ -33,7 +33,7 @@ CHUNK = 1 << 20
 def stamp(
     data: Mapping[str, Sequence[Path]] | None = None,
     engine_names: Iterable[str] = (),
-    models: Mapping[str, Path] | None = None,
+    models: Mapping[str, Path | None] | None = None,
 ) -> dict:
     """What a result is made with and from, ready for JSON; take it before measuring.
 
@@ -45,38 +45,40 @@ def stamp(
     engine_names
         Engines that run; the model files that the package would load for them are hashed.
     models
-        Further model files by name, for example ``{"WHISPER": folder / "model.bin"}``.
+        Further models by name, a file or a folder each: ``{"WHISPER": folder}``; None where none is used.
 
     Returns
     -------
     dict
-        command, commit, dirty, data (a list of what, folder, files, bytes, sha256), models (by name: bytes, sha256), machine, date (UTC).
+        command, commit, dirty, data (a list of what, folder, files, bytes, sha256), models (by name: files, bytes, sha256 - of one
+        file that of its content), machine, date (UTC).
 
     Raises
     ------
     UsageError
         For a folder or file that is not there.
     """
-    data, files = dict(data or {}), {**models_of(engine_names), **(models or {})}
+    data = dict(data or {})
+    files = models_of(engine_names) | {name: path for name, path in (models or {}).items() if path is not None}
     commit, dirty = revision()
     return {
         "command": command(data, files),
         "commit": commit,
         "dirty": dirty,
         "data": [{"what": what, "folder": path.resolve().name, **digest(path)} for what, paths in data.items() for path in paths],
-        "models": {name: _of_one_file(path) for name, path in files.items()},
+        "models": {name: _of_model(path) for name, path in files.items()},
         "machine": machine(),
         "date": datetime.now(timezone.utc).strftime("%Y-%m-%d %H:%M UTC"),
     }
 
 
-def write(output: Path, made_with: Mapping, title: str, page: str, content: Mapping) -> str:
-    """Write OUTPUT.json and OUTPUT.md and return the page.
+def write(output: Path | None, made_with: Mapping, title: str, page: str, content: Mapping) -> str:
+    """Write OUTPUT.json and OUTPUT.md and return the page; without an output only return it.
 
     Parameters
     ----------
     output
-        Where to, without suffix; its folder is made.
+        Where to, without suffix; its folder is made where it is missing.
     made_with
         From `stamp`; the JSON file holds it under "stamp", the page in a short head.
     title
@@ -87,9 +89,11 @@ def write(output: Path, made_with: Mapping, title: str, page: str, content: Mapp
         The figures; numbers that are not finite become null.
     """
     text = "\n".join([f"# {title}", "", *head(made_with), "", page.strip("\n"), ""])
-    output.parent.mkdir(parents=True, exist_ok=True)
-    _beside(output, ".json").write_text(to_json({"schema": SCHEMA, "title": title, "stamp": made_with, **content}), encoding="utf-8")
-    _beside(output, ".md").write_text(text, encoding="utf-8")
+    if output:
+        output.parent.mkdir(parents=True, exist_ok=True)
+        whole = {"schema": SCHEMA, "title": title, "stamp": made_with, **content}
+        _beside(output, ".json").write_text(to_json(whole), encoding="utf-8")
+        _beside(output, ".md").write_text(text, encoding="utf-8")
     return text
 
 
@@ -174,7 +178,7 @@ def machine() -> dict[str, str]:
 def command(data: Mapping[str, Sequence[Path]], models: Mapping[str, Path]) -> str:
     """The command line that runs now, without the folders of this machine: data and models by what they are, other paths by their last part."""
     known = {path.resolve(): f"{what}/{path.resolve().name}" for what, paths in data.items() for path in paths}
-    known |= {place: name for name, path in models.items() for place in (path.resolve(), path.resolve().parent) if place not in known}
+    known |= {path.resolve(): name for name, path in models.items()}
     spec = getattr(sys.modules["__main__"], "__spec__", None)
     program = spec.name if spec and spec.name.startswith("bench.") else Path(sys.argv[0]).stem
     return " ".join(["python", "-m", program, *(_without_folders(argument, known) for argument in sys.argv[1:])])
@@ -200,11 +204,10 @@ def _git(*arguments: str) -> str:
     return done.stdout
 
 
-def _of_one_file(path: Path) -> dict:
-    try:
-        return {"bytes": path.stat().st_size, "sha256": _sha256(path).hexdigest()}
-    except OSError as error:
-        raise UsageError(f"model {path} cannot be read ({error.strerror}), expected a file: check the path") from None
+def _of_model(path: Path) -> dict:
+    if path.is_file():
+        return {"files": 1, "bytes": path.stat().st_size, "sha256": _sha256(path).hexdigest()}
+    return digest(path)
 
 
 def _sha256(path: Path) -> hashlib._Hash:

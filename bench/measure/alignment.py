@@ -1,12 +1,11 @@
-#!/usr/bin/env python3
 """Measure alignment: lag errors, time to align, drift, jumps, false realignments, half an hour of speech, cost per hop.
 
-    python bench/alignment.py --voices robot/val --speech human/val --output bench/results/alignment
+    python -m bench.measure.alignment --voices ROBOT/val --speech HUMAN/val --output bench/results/alignment
 
 --voices and --speech are folders of recordings (16 kHz mono; the robot's voice, and humans). Rooms, clocks and fan are simulated with
-a known truth (tests/unit/alignment_scene.py). Writes OUTPUT.json, OUTPUT.md and OUTPUT.png. About 6 minutes on one core. --seed
+a known truth (bench/simulate/alignment_scene.py). Writes OUTPUT.json, OUTPUT.md and OUTPUT.png. About 6 minutes on one core. --seed
 says which scenes are drawn: thresholds were set on seeds below 100000, so that a report takes another. --only-cost times a few
-conversations on a machine left alone, 10 s, and puts the cost into an OUTPUT.json that is there.
+conversations on a machine left alone, 10 s, and puts the cost, with a stamp of its own, into an OUTPUT.json that is there.
 """
 
 from __future__ import annotations
@@ -21,8 +20,10 @@ import numpy as np
 import soundfile as sf
 from scipy import signal
 
+from bench import results_writer
+from bench.measure import picture
+from bench.measure.intervals import percentiles
 from bench.simulate.alignment_scene import HEAD, RATE, fan, hear, known_path, room, run
-from bench.table import machine
 from edgefilter.alignment.aligner import Aligner
 
 HOP = 256
@@ -119,9 +120,8 @@ def cost_trials(seed: int, voices: Corpus, speech: Corpus) -> dict:
     lag_trials(seed, 6, voices, speech, costs)
     running.append(Path("/proc/loadavg").read_text().split()[3])
     ms = 1e3 * np.array(costs[len(costs) // 10 :])
-    p50, p95, p99, worst = np.percentile(ms, [50, 95, 99, 100])
     others = max(int(count.split("/")[0]) - 1 for count in running)
-    return {"ms": {"p50": p50, "p95": p95, "p99": p99, "max": worst, "mean": float(ms.mean())}, "others": others}
+    return {"ms": {**percentiles(ms, 50, 95, 99, 100), "mean": float(ms.mean())}, "others": others}
 
 
 def jump_trials(seed: int, repeats: int, voices: Corpus) -> list[dict]:
@@ -199,8 +199,7 @@ def long_speech(seed: int, voices: Corpus, minutes: int, ppm: float = 100.0) -> 
 
 
 def summarise(result: dict) -> str:
-    about = ", ".join(f"{key} {value}" for key, value in result["machine"].items())
-    lines = [f"# Alignment\n\n{about}\n\nSimulated rooms (RT60 0.2-0.75 s), voices and speech from recordings; `bench/alignment.py --seed {result['seed']}`.\n",
+    lines = [f"Simulated rooms (RT60 0.2-0.75 s), voices and speech from recordings; seed {result['seed']}.\n",
              "| | within 1 ms at 300 ms | ever | time to align p50 / p95, ms | final error p50 / p95, samples |", "| --- | --- | --- | --- | --- |"]  # fmt: skip
     for name, block in result["lags"].items():
         rows = block["rows"]
@@ -229,13 +228,9 @@ def summarise(result: dict) -> str:
     return "\n".join(lines) + "\n"
 
 
-def draw(result: dict, path: Path) -> None:
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    figure, ((a, b, c), (d, e, f)) = plt.subplots(2, 3, figsize=(15, 8), constrained_layout=True)
+def draw(result: dict, output: Path) -> None:
+    """Distributions of lag error, time to align and drift; jumps; the long run."""
+    figure, (a, b, c, d, e, f) = picture.panels(2, 3, (15, 8))
     for name, block in result["lags"].items():
         error = np.sort([abs(r["error_300ms"]) if r["error_300ms"] is not None else 1e5 for r in block["rows"]])
         share = (np.arange(error.size) + 1) / error.size
@@ -260,7 +255,7 @@ def draw(result: dict, path: Path) -> None:
     f.set(title="Drift error in long speech", xlabel="minutes", ylabel="ppm", ylim=(-2, 2))
     for axis in (a, b, c):
         axis.legend(fontsize=8)
-    figure.savefig(path, dpi=90)
+    picture.save(figure, output, dpi=90)
 
 
 def main() -> None:
@@ -275,20 +270,20 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=900000)
     parser.add_argument("--output", type=Path, default=Path("bench/results/alignment"))
     options = parser.parse_args()
-    voices, speech, stored = Corpus(options.voices), Corpus(options.speech), options.output.with_suffix(".json")
+    voices, speech = Corpus(options.voices), Corpus(options.speech)
+    made_with = results_writer.stamp({"ROBOT": [options.voices], "HUMAN": [options.speech]})
     if options.only_cost:
-        result = json.loads(stored.read_text())
+        result = json.loads(options.output.with_suffix(".json").read_text(encoding="utf-8"))
+        stamp_of_cost, made_with = made_with, result.get("stamp") or sys.exit(f"{options.output}.json has no stamp: measure all of it anew")
     else:
-        result = {"machine": machine(), "seed": options.seed, "lags": lag_trials(options.seed, options.count, voices, speech, [])}
+        result = {"seed": options.seed, "lags": lag_trials(options.seed, options.count, voices, speech, [])}
         result["jumps"] = jump_trials(options.seed, options.repeats, voices)
         result["false"], result["false_minutes"] = false_trials(options.seed, options.false_minutes, voices, speech), options.false_minutes
         result["long"], result["long_minutes"] = long_speech(options.seed, voices, options.minutes), options.minutes
-    result["cost"] = cost_trials(options.seed, voices, speech)
-    options.output.parent.mkdir(parents=True, exist_ok=True)
-    stored.write_text(json.dumps(result))
-    options.output.with_suffix(".md").write_text(summarise(result))
-    draw(result, options.output.with_suffix(".png"))
-    print(summarise(result))
+        stamp_of_cost = made_with
+    result["cost"] = {**cost_trials(options.seed, voices, speech), "stamp": stamp_of_cost}
+    draw(result, options.output)
+    print(results_writer.write(options.output, made_with, "Alignment", summarise(result), result))
 
 
 if __name__ == "__main__":

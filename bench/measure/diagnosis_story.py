@@ -1,9 +1,8 @@
-#!/usr/bin/env python3
 """A robot calibrated in one room is heard in another: compare, diagnose, add what is missing, and filter with both profiles.
 
-    python bench/diagnosis_story.py --conversations DIR --room office --whisper DIR --output bench/results/diagnosis_story [--files DIR]
+    python -m bench.measure.diagnosis_story --conversations DIR --room office --whisper DIR --output bench/results/diagnosis_story [--files DIR]
 
-Conversations are folders as bench/conversations.py makes them: the sweep was recorded in a laboratory, the conversation in the room. What
+Conversations are folders as bench.simulate.conversations makes them: the sweep was recorded in a laboratory, the conversation in the room. What
 the robot says alone, up to the onset of its second utterance, is diagnosed; what comes after it, with the human, is filtered and scored.
 So the figures of the filter are from sound that no fit has seen. It is filtered twice: "heard before", the filter having heard the first
 utterance as well, and "restarted", the filter having heard nothing before the robot is interrupted. Writes OUTPUT.json and OUTPUT.md. --files: keep, in a
@@ -13,18 +12,16 @@ folder for each conversation, the profile and the recordings that the command li
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 import time
 from pathlib import Path
 
 import numpy as np
 import soundfile as sf
-from tqdm import tqdm
 
 import edgefilter
-from bench import table
-from bench.measure.quality import Conversation, find_conversations
+from bench import results_writer
+from bench.measure.conversation import Conversation, every, find_conversations, progress
 from bench.measure.recogniser import Recogniser, word_errors
 from edgefilter.diagnosis.compare import compare
 from edgefilter.diagnosis.diagnose import diagnose
@@ -72,20 +69,19 @@ def score(conversation: Conversation, profile: Profile, start: int, recogniser: 
     return figures
 
 
-def markdown(rows: list[dict], head: dict) -> str:
+def markdown(rows: list[dict]) -> str:
     """The table of all conversations and a line of means."""
     columns = ["conversation", "found", "excess dB", *(f"{start}: SI-SDR dB, words wrong %" for start in STARTS)]
-    lines = [f"| {' | '.join(columns)} |", "|" + " --- |" * len(columns)]
+    lines = []
     for row in rows:
         found = ", ".join(row["effects"]) or row["verdict"]
-        cells = [row["conversation"], found, f"{row['excess_before_db']:.1f} -> {row['excess_after_db']:.1f}"]
-        lines.append(f"| {' | '.join([*cells, *(_change([row], start) for start in STARTS)])} |")
+        excess = f"{row['excess_before_db']:.1f} -> {row['excess_after_db']:.1f}"
+        lines.append([row["conversation"], found, excess, *(_change([row], start) for start in STARTS)])
     before, after = (np.mean([row[f"excess_{when}_db"] for row in rows]) for when in ("before", "after"))
-    lines.append(f"| {' | '.join(['mean', '', f'{before:.1f} -> {after:.1f}', *(_change(rows, start) for start in STARTS)])} |")
+    lines.append(["mean", "", f"{before:.1f} -> {after:.1f}", *(_change(rows, start) for start in STARTS)])
     slowest = max(rows, key=lambda row: row["seconds"])
     took = f"Diagnosis: at most {slowest['seconds']:.1f} s of one core for {slowest['duration']:.1f} s of recording."
-    machine = ", ".join(f"{key}: {value}" for key, value in head.items() if isinstance(value, str))
-    return "\n".join([*lines, "", took, "", machine, ""])
+    return "\n".join([*results_writer.table(columns, lines), "", took, ""])
 
 
 def _change(rows: list[dict], start: str) -> str:
@@ -119,19 +115,18 @@ def main() -> int:
     options = parser.parse_args()
     try:
         recogniser = Recogniser(options.whisper, options.cache / "transcripts.jsonl") if options.whisper else None
-        (found,) = find_conversations([options.conversations]).values()
-        chosen = [conversation for conversation in found if conversation.meta["room"] == options.room]
+        found = every(find_conversations([options.conversations]))
+        chosen = [conversation for _, conversation in found if conversation.meta["room"] == options.room]
+        models = {"WHISPER": options.whisper}
+        made_with = results_writer.stamp({"conversations": [options.conversations]}, [ENGINE], models)
         for conversation in chosen if options.files else ():
             keep(conversation, options.files / conversation.folder.name)
-        rows = [tell(conversation, recogniser) for conversation in tqdm(chosen, disable=not sys.stderr.isatty())]
+        rows = [tell(conversation, recogniser) for conversation in progress(chosen)]
     except (EdgefilterError, OSError) as error:
         print(f"diagnosis_story: {error}", file=sys.stderr)
         return 1
-    head = table.machine()
-    options.output.parent.mkdir(parents=True, exist_ok=True)
-    options.output.with_suffix(".json").write_text(json.dumps({"schema": 1, "machine": head, "conversations": rows}, indent=1) + "\n")
-    options.output.with_suffix(".md").write_text(text := markdown(rows, head))
-    print(text)
+    title = f"The story of a robot that was calibrated in a laboratory: {options.room}"
+    print(results_writer.write(options.output, made_with, title, markdown(rows), {"conversations": rows}))
     return 0
 
 

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+
+from bench.measure.intervals import wilson
 
 STRENGTHS = ("clear", "moderate", "near")
 EXPLAINED_LIMIT_DB = 1.0
@@ -64,19 +65,6 @@ class Outcome:
         if self.group in ("controls", "outside"):
             return self.label == self.truth[0]
         return self.first == self.truth[0] if self.group == "singles" else set(self.truth) <= set(self.named)
-
-
-def wilson(hits: int, n: int) -> tuple[float, float]:
-    """95 % interval of a proportion (Wilson 1927), as numbers from 0 to 1.
-
-    >>> [round(bound, 3) for bound in wilson(0, 100)]
-    [0.0, 0.037]
-    """
-    if n == 0:
-        return 0.0, 1.0
-    z, p = 1.959964, hits / n
-    centre, half = p + z * z / (2 * n), z * math.sqrt(p * (1 - p) / n + z * z / (4 * n * n))
-    return max(0.0, (centre - half) / (1 + z * z / n)), min(1.0, (centre + half) / (1 + z * z / n))
 
 
 def counted(flags: Iterable[bool]) -> dict:

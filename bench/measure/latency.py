@@ -1,7 +1,7 @@
 """Latency and cost of the whole path, per hop, beside SpeexDSP and WebRTC AEC3; writes JSON, a Markdown page and a picture.
 
-    python bench/latency.py --output bench/results/latency                  (13 minutes; leave the machine alone meanwhile)
-    python bench/latency.py --output /tmp/latency --quick                   (a minute, coarse)
+    python -m bench.measure.latency --output bench/results/latency          (13 minutes; leave the machine alone meanwhile)
+    python -m bench.measure.latency --output /tmp/latency --quick           (a minute, coarse)
 
 Every measurement is a process of its own, held to two cores. Contenders take turns, in reversed order every other round, so that a change of
 the machine's speed meets all of them. Paced: a hop begins when a device would deliver it, the processor idles in between. Busy: each of the two
@@ -24,9 +24,10 @@ from pathlib import Path
 
 import numpy as np
 
+from bench import results_writer
 from bench.measure import latency_live, latency_report
-from bench.measure.latency_hops import PEERS, WARM_UP_S
-from bench.table import machine
+from bench.measure.intervals import percentiles
+from bench.measure.latency_hops import DEMO, PEERS, WARM_UP_S
 from edgefilter import engines
 from edgefilter.engines.ladder import CANDIDATES
 from edgefilter.errors import EdgefilterError
@@ -79,7 +80,7 @@ def load(busy: bool) -> Iterator[None]:
 
 def figures(took: Sequence[float], hop: int) -> dict:
     """ms per hop in quantiles, hops longer than themselves, and the part of real time."""
-    quantiles = {str(q): float(np.percentile(took, q)) for q in QUANTILES}
+    quantiles = dict(zip(map(str, QUANTILES), percentiles(took, *QUANTILES).values(), strict=True))
     period = 1000 * hop / SAMPLE_RATE
     return {"hops": len(took), "mean": float(np.mean(took)), "missed": int(np.sum(np.array(took) > period)), "quantiles": quantiles,
             "real_time_factor": float(np.mean(took) / period)}  # fmt: skip
@@ -153,20 +154,19 @@ def main() -> None:
     seconds, rounds, threads, repeats = (1.0, 1, (1,), 1) if args.quick else (args.seconds, args.rounds, (1, 2), 5)
     before = os.getloadavg()[0]
     ours = [name for name in names if name not in PEERS]
+    made_with = results_writer.stamp({"DEMO": [DEMO]}, ours, {model.name: model for model in args.models})
     result = {
-        "machine": {**machine(), "threads": "1 and 2", "cores": f"{CORES} of {os.cpu_count()}", "kernel": platform.release(),
-                    "system": platform.system(), "load average before": f"{before:.2f}"},
+        "conditions": {"threads": "1 and 2", "cores": f"{CORES} of {os.cpu_count()}", "kernel": platform.release(),
+                       "load average before": f"{before:.2f}"},
         "seconds": seconds, "rounds": rounds, "missing": missing,
         "rows": matrix(names, seconds, rounds, threads, (False, True)),
         "curves": curves(names, min(seconds, 8.0), *((TAILS[-1:], HOPS[-1:]) if args.quick else (TAILS, HOPS)), args.models),
         "start": {name: [latency_live.start(name) for _ in range(repeats)] for name in ours},
         "click": {} if args.no_devices else {name: latency_live.round_trip(name, repeats) for name in (latency_live.ALONE, *ours)},
     }  # fmt: skip
-    args.output.parent.mkdir(parents=True, exist_ok=True)
-    args.output.with_suffix(".json").write_text(json.dumps(result, indent=1) + "\n")
-    args.output.with_suffix(".md").write_text(latency_report.markdown(result, args.output.name))
-    latency_report.draw(result, args.output.with_suffix(".png"))
-    print(args.output.with_suffix(".md").read_text())
+    latency_report.draw(result, args.output)
+    page = latency_report.markdown(result, args.output.name)
+    print(results_writer.write(args.output, made_with, "Latency and cost per hop", page, result))
 
 
 if __name__ == "__main__":

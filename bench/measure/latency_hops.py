@@ -1,6 +1,6 @@
 """One contender, hop by hop, in a process of its own; prints the milliseconds of every hop and stage as JSON.
 
-    python bench/latency_hops.py --contender ss --seconds 8 --paced --cores 2
+    python -m bench.measure.latency_hops --contender ss --seconds 8 --paced --cores 2
 
 Contenders are the engines, each in the whole path, and the peers speexdsp, speexdsp-suppressed and aec3. The sound is the bundled
 conversation (simulated robot). Warm-up hops are left out. Threads are set by the caller's environment (OMP_NUM_THREADS).

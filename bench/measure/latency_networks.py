@@ -1,7 +1,7 @@
 """Edge networks of several sizes with random weights, for the curve of cost over size: what a frame costs does not depend on the weights.
 
-    python bench/latency_networks.py --output DIR                           (needs the export extra)
-    python bench/latency.py --models DIR/*_int8.onnx --output bench/results/latency
+    python -m bench.measure.latency_networks --output DIR                   (needs the export extra)
+    python -m bench.measure.latency --models DIR/*_int8.onnx --output bench/results/latency
 
 Of each there is the fp32 file and the int8 variant, which is what the engine runs.
 """

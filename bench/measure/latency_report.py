@@ -1,11 +1,13 @@
-"""The page and the picture of bench/latency.py."""
+"""The page and the picture of latency.py."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
 import numpy as np
+from matplotlib.axes import Axes
 
+from bench.measure import picture
 from edgefilter.types import SAMPLE_RATE
 
 AIMS = {"crnn": ((1.5, 5.0), (0.8, 2.0), (0.06, 0.03)), "ss": ((0.6, 2.0), (0.3, 1.0), (0.025, 0.012))}
@@ -16,9 +18,9 @@ FRONT_AIM = 0.3
 
 
 def markdown(result: dict, name: str) -> str:
-    """The whole page."""
+    """The page below its head; name: of the picture beside it, without suffix."""
     rows = result["rows"]
-    lines = ["# Latency and cost per hop", "", ", ".join(f"{key} {value}" for key, value in result["machine"].items()), ""]
+    lines = [", ".join(f"{key} {value}" for key, value in result["conditions"].items()) + ".", ""]
     lines += [f"{result['rounds']} round(s) of {result['seconds']:g} s of the bundled conversation for each row, contenders in turns, every"]
     lines += ["process held to two cores, warm-up (0.5 s) left out. Paced: a hop begins when a device would deliver it. Busy: a second process on"]
     lines += ["each core that never rests; measured paced and with one thread only. Missed: hops that took longer than they last. RTF: compute over audio.", ""]
@@ -110,15 +112,10 @@ def _curves(curves: dict[str, list[dict]]) -> list[str]:
     return lines
 
 
-def draw(result: dict, path: Path) -> None:
+def draw(result: dict, output: Path) -> None:
     """Distributions of the paced hop, idle and busy, what it is made of, and the curves."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from matplotlib import pyplot as plt
-
-    figure, axes = plt.subplots(2, 3, figsize=(15, 8.4), layout="constrained")
-    for axis, busy in zip(axes[0], (False, True)):
+    figure, axes = picture.panels(2, 3, (15, 8.4))
+    for axis, busy in zip(axes, (False, True)):
         for number, (name, row) in enumerate(_find(result["rows"], True, busy).items()):
             percent = [float(key) for key in row["quantiles"]]
             axis.plot([max(100 - p, 0.05) for p in percent], list(row["quantiles"].values()), color=f"C{number}", label=name, lw=1.2)
@@ -127,19 +124,18 @@ def draw(result: dict, path: Path) -> None:
         axis.invert_xaxis()
         axis.axhline(16, color="0.6", lw=0.8, ls=":")
         axis.grid(alpha=0.3)
-    axes[0, 0].legend(fontsize=8, loc="best")
-    _draw_stages(axes[0, 2], _find(result["rows"], True))
+    axes[0].legend(fontsize=8, loc="best")
+    _draw_stages(axes[2], _find(result["rows"], True))
     titles = {"tail": "taps of the linear stage", "hop": "hop, samples", "model": "model file, MB"}
-    for axis, (panel, title) in zip(axes[1], titles.items()):
+    for axis, (panel, title) in zip(axes[3:], titles.items(), strict=True):
         x = [row["x"] / (1e6 if panel == "model" else 1) for row in result["curves"][panel]]
         axis.plot(x, [100 * row["real_time_factor"] for row in result["curves"][panel]], "o-", color="C0")
         axis.set(title=f"cost over {panel}" if x else f"cost over {panel}: not measured", xlabel=title, ylabel="% of one core", ylim=(0, None))
         axis.grid(alpha=0.3)
-    figure.savefig(path, dpi=100)
-    plt.close(figure)
+    picture.save(figure, output)
 
 
-def _draw_stages(axis: object, found: dict[str, dict]) -> None:
+def _draw_stages(axis: Axes, found: dict[str, dict]) -> None:
     """Mean ms of each stage, stacked, an engine a bar."""
     names = [name for name, row in found.items() if row["stages"]]
     bottom = np.zeros(len(names))

@@ -1,7 +1,7 @@
 """The long run: an hour of audio faster than real time, or minutes live on a virtual device; memory, time per hop and samples must not drift.
 
-    OMP_NUM_THREADS=1 python bench/soak.py --minutes 60 --output bench/results/soak
-    OMP_NUM_THREADS=1 python bench/soak.py --live 10 --output bench/results/soak_live    (needs PulseAudio)
+    OMP_NUM_THREADS=1 python -m bench.measure.soak --minutes 60 --output bench/results/soak
+    OMP_NUM_THREADS=1 python -m bench.measure.soak --live 10 --output bench/results/soak_live    (needs PulseAudio)
 
 Exit code 1 where something drifted. The sound is the bundled conversation over and over, the reference with a clock that is PPM fast, so that
 the alignment has work to do for ever. Memory and processor time per block are read once in every slice; the first tenth of the run, 15 s
@@ -25,8 +25,9 @@ import numpy as np
 import soundfile
 
 import edgefilter
-from bench.measure import virtual_sound
-from bench.table import machine
+from bench import results_writer
+from bench.measure import picture, virtual_sound
+from bench.measure.intervals import percentiles
 from edgefilter import EgoFilter
 from edgefilter.types import SAMPLE_RATE
 
@@ -85,8 +86,7 @@ def from_file(minutes: float, engine: str, slices: int) -> dict:
         ego.events()
         out, done = out + finished.size, done + mic.size
         if done * slices // total > len(parts):
-            p50, p99 = np.percentile(took, (50, 99))
-            parts.append(Slice(done / SAMPLE_RATE, memory_mb(), float(p50), float(p99), float(np.median(bypassed))))
+            parts.append(Slice(done / SAMPLE_RATE, memory_mb(), *percentiles(took, 50, 99).values(), float(np.median(bypassed))))
             took.clear()
             bypassed.clear()
     out += ego.flush().size
@@ -157,10 +157,8 @@ def _over_bypass(parts: list[dict]) -> float:
 
 
 def markdown(result: dict, name: str) -> str:
-    """A page of its own; name: of the picture beside it, without suffix."""
-    seconds = result["samples_in"] / SAMPLE_RATE
-    lines = [f"# Soak: {seconds / 60:.0f} minutes of `{result['engine']}`, {'live' if result['kind'] == 'live' else 'faster than real time'}", ""]
-    lines += [", ".join(f"{key} {value}" for key, value in result["machine"].items()), ""]
+    """The page below its title; name: of the picture beside it, without suffix."""
+    lines = [f"Load average at the end {result['load_average']:.1f}.", ""]
     lines += [f"{result['samples_in']} samples in, {result['samples_out']} out, {result['lost']} lost;"]
     lines += [f"memory grew by {result['memory_growth_mb']:+.2f} MB after the warm-up;"]
     if result["kind"] == "file":
@@ -170,30 +168,32 @@ def markdown(result: dict, name: str) -> str:
         lines += [f"{deadline['missed_deadlines']} of {deadline['hops']} hops missed their deadline, p99 {deadline['compute']['p99_ms']:.1f} ms;"]
         lines += [f"{deadline['steps']} steps down or up between engines to keep to {deadline['budget_ms']:g} ms, the engine above is the last."]
     lines += ["", f"Verdict: {'; '.join(result['troubles']) or 'nothing drifted'}.", ""]
-    lines += ["| minute | memory MB | p50 | p99 | bypassed, ms per 20 ms block |", "| --- " * 5 + "|"]
+    cells = []
     for part in result["slices"]:
-        times = " | ".join("" if part[key] is None else f"{part[key]:.3f}" for key in ("p50_ms", "p99_ms", "bypass_ms"))
-        lines.append(f"| {part['seconds'] / 60:.1f} | {part['memory_mb']:.1f} | {times} |")
+        times = ["" if part[key] is None else f"{part[key]:.3f}" for key in ("p50_ms", "p99_ms", "bypass_ms")]
+        cells.append([f"{part['seconds'] / 60:.1f}", f"{part['memory_mb']:.1f}", *times])
+    lines += results_writer.table(["minute", "memory MB", "p50", "p99", "bypassed, ms per 20 ms block"], cells)
     return "\n".join([*lines, "", f"![memory and time]({name}.png)", ""])
 
 
-def draw(result: dict, path: Path) -> None:
+def title(result: dict) -> str:
+    """How long, of what, how."""
+    minutes = result["samples_in"] / SAMPLE_RATE / 60
+    return f"Soak: {minutes:.0f} minutes of `{result['engine']}`, {'live' if result['kind'] == 'live' else 'faster than real time'}"
+
+
+def draw(result: dict, output: Path) -> None:
     """Memory over the run, and beside it, where blocks were timed, their median over a bypassed one's."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from matplotlib import pyplot as plt
-
     timed = result["kind"] == "file"
-    figure, axes = plt.subplots(1, 1 + timed, figsize=(5 + 5 * timed, 3.5), layout="constrained", squeeze=False)
+    figure, axes = picture.panels(1, 1 + timed, (5 + 5 * timed, 3.5))
     minutes = [part["seconds"] / 60 for part in result["slices"]]
-    panels = [("resident memory, MB", [part["memory_mb"] for part in result["slices"]])]
-    panels += [("median block over a bypassed one", [part["p50_ms"] / part["bypass_ms"] for part in result["slices"]])] if timed else []
-    for axis, (title, values) in zip(axes[0], panels):
+    curves = [("resident memory, MB", [part["memory_mb"] for part in result["slices"]])]
+    if timed:
+        curves.append(("median block over a bypassed one", [part["p50_ms"] / part["bypass_ms"] for part in result["slices"]]))
+    for axis, (name, values) in zip(axes, curves, strict=True):
         axis.plot(minutes, values, "o-")
-        axis.set(title=title, xlabel="minutes", ylim=(0, 1.2 * max(values)))
-    figure.savefig(path, dpi=100)
-    plt.close(figure)
+        axis.set(title=name, xlabel="minutes", ylim=(0, 1.2 * max(values)))
+    picture.save(figure, output)
 
 
 def main() -> int:
@@ -204,15 +204,14 @@ def main() -> int:
     parser.add_argument("--slices", type=int, default=20)
     parser.add_argument("--output", type=Path, help="without suffix; .json, .md and .png are written")
     args = parser.parse_args()
+    made_with = results_writer.stamp({"DEMO": [DEMO]}, [args.engine])
     result = live(args.live, args.engine, args.slices) if args.live else from_file(args.minutes, args.engine, args.slices)
-    result["machine"] = {**machine(), "load average": f"{os.getloadavg()[0]:.1f}"}
+    result["load_average"] = os.getloadavg()[0]
     result["troubles"] = judge(result)
     page = markdown(result, args.output.name if args.output else "soak")
     if args.output:
-        args.output.with_suffix(".json").write_text(json.dumps(result, indent=1) + "\n")
-        args.output.with_suffix(".md").write_text(page)
-        draw(result, args.output.with_suffix(".png"))
-    print(page)
+        draw(result, args.output)
+    print(results_writer.write(args.output, made_with, title(result), page, result))
     return 1 if result["troubles"] else 0
 
 

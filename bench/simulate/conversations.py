@@ -1,7 +1,6 @@
-#!/usr/bin/env python3
 """Simulate whole conversations with a robot, to judge and tune the filter on: the robot speaks, pauses, speaks again, a human interrupts.
 
-    python bench/conversations.py --speech human/val --voices robot/val robot/train --kind live --count 24 --seed 1 --output DIR
+    python -m bench.simulate.conversations --speech human/val --voices robot/val robot/train --kind live --count 24 --seed 1 --output DIR
 
 --speech and --voices are folders with a transcripts.tsv (path, speaker, seconds, text). Each conversation is a folder: sweep_ref,
 sweep_mic, fan_only (always recorded in a laboratory), ref, mic, clean (the human at the microphone, already inside mic), all FLAC,

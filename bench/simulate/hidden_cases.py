@@ -1,7 +1,6 @@
-#!/usr/bin/env python3
 """Simulate recordings of a robot with a hidden physical effect, or none, two, or one outside the catalogue, to judge a diagnosis on.
 
-    python bench/hidden_cases.py --voices robot/val robot/train --output DIR --seed 1 --set singles --count 78
+    python -m bench.simulate.hidden_cases --voices robot/val robot/train --output DIR --seed 1 --set singles --count 78
 
 --voices (and --speech, human talkers for the set `outside`): folders with a transcripts.tsv (path, speaker, seconds, text). A case is a folder
 SET_NUMBER: sweep_ref, sweep_mic, fan_only (recorded before the effect), ref, mic, all FLAC, 16 kHz, 16 bit, and truth.json: effects

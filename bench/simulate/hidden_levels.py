@@ -1,7 +1,6 @@
-#!/usr/bin/env python3
 """Levels of recordings with hidden effects, to hold folders of cases against each other: what one simulator makes and another.
 
-    python bench/hidden_levels.py DIR [DIR ...]
+    python -m bench.simulate.hidden_levels DIR [DIR ...]
 
 Prints a Markdown table: median (10th to 90th percentile) over the cases of each folder.
 """

@@ -12,8 +12,7 @@ import pytest
 import soundfile as sf
 from scipy import signal
 
-from bench import table
-from bench.measure import barge_in, peers, quality, recogniser
+from bench.measure import barge_in, conversation, intervals, levels, peers, quality, recogniser, scores
 from bench.simulate import conversations
 from bench.simulate import simulated_robot as robot
 from edgefilter.dsp.metrics import erle, si_sdr
@@ -124,8 +123,8 @@ def test_loudspeaker_is_linear_when_barely_driven_and_distorts_when_driven() -> 
     from dataclasses import replace
 
     driver, x = robot.draw_loudspeaker(np.random.default_rng(2)), babble(2.0, 1).astype(np.float64)
-    levels = [-si_sdr(replace(driver, drive=drive).play(x), driver.play(x, linear=True)) for drive in (1e-4, 1.0, 4.0)]
-    assert levels[0] < -60 and levels[0] < levels[1] - 10 < levels[2] - 15  # asymmetry grows with the drive, 20 dB a decade at least
+    distortion = [-si_sdr(replace(driver, drive=drive).play(x), driver.play(x, linear=True)) for drive in (1e-4, 1.0, 4.0)]
+    assert distortion[0] < -60 and distortion[0] < distortion[1] - 10 < distortion[2] - 15  # asymmetry grows with the drive, 20 dB a decade at least
     doubled = driver.play(2 * x, linear=True)
     np.testing.assert_allclose(doubled, 2 * driver.play(x, linear=True), atol=1e-9)  # float64 rounding
 
@@ -215,24 +214,24 @@ def test_transcripts_are_kept_by_audio_and_survive_a_cut_line(tmp_path: Path, mo
 
 
 def test_summary_adds_up() -> None:
-    scores = [
+    found = [
         {"si_sdr": -2.0, "errors": 1, "words": 10, "seconds": 1.0, "duration": 10.0},
         {"si_sdr": 4.0, "errors": 9, "words": 3, "seconds": 1.0, "duration": 10.0},
         {"problem": "5 samples for 6", "seconds": 1.0, "duration": 10.0},
     ]
-    row = table.summarise(scores)
+    row = scores.summarise(found)
     assert (row["utterances"], row["problems"], row["words"]) == (3, 1, 13)
     assert row["si_sdr_mean"] == row["si_sdr_median"] == pytest.approx(1.0) and row["real_time_factor"] == pytest.approx(0.1)
     assert (row["wer"], row["wer_mean"], row["wer_capped"]) == pytest.approx((1000 / 13, 155.0, 55.0))
     assert row["si_sdr_interval"] == pytest.approx((-2.0, 4.0))  # two utterances: the interval is their range
-    assert "1 outputs unusable" in table.markdown({"s": {"lab": {"ss": row}}}, {"threads": "1"}, "title")
+    assert "1 outputs unusable" in scores.markdown({"s": {"lab": {"ss": row}}})
 
 
 def test_bootstrap_interval_has_the_width_of_the_standard_error() -> None:
     x = np.random.default_rng(5).standard_normal(400)
-    low, high = table.interval(lambda sample: sample.mean(axis=1), x)
+    low, high = intervals.interval(lambda sample: sample.mean(axis=1), x)
     assert high - low == pytest.approx(2 * 1.96 * x.std() / 20, rel=0.08)  # 2000 draws give a quantile to a few per cent
-    assert table.interval(lambda sample: sample.mean(axis=1), x) == (low, high)
+    assert intervals.interval(lambda sample: sample.mean(axis=1), x) == (low, high)
 
 
 def run_quality(monkeypatch: pytest.MonkeyPatch, live: Path, output: Path, engines: str) -> tuple[int, dict]:
@@ -255,18 +254,21 @@ def test_quality_scores_every_row(monkeypatch: pytest.MonkeyPatch, live: Path, t
         assert rows["linear"]["si_sdr_mean"] > rows["unfiltered"]["si_sdr_mean"] + 5  # the robot is 22-26 dB above the human
         assert rows["speexdsp-true-lag"]["si_sdr_mean"] != rows["speexdsp"]["si_sdr_mean"]
     assert "| linear |" in (tmp_path / "q.md").read_text()
+    made_with = found["stamp"]
+    assert made_with["data"][0]["folder"] == "live" and made_with["data"][0]["files"] == 2 * 7 and not made_with["models"]
+    assert made_with["command"].startswith("python -m quality --conversations conversations/live --engines unfiltered,")
 
 
 def test_true_lag_puts_both_utterances_where_they_are_heard(live: Path) -> None:
     for folder in sorted(live.iterdir()):
-        conversation = quality.Conversation(folder)
-        meta, mic, ref = conversation.meta, conversation.read("mic"), conversation.delayed_reference()
-        assert abs(quality.direct_delay(conversation.read("sweep_ref"), conversation.read("sweep_mic")) - meta["delay"]) <= 1  # the fan
+        talk = conversation.Conversation(folder)
+        meta, mic, ref = talk.meta, talk.read("mic"), talk.delayed_reference()
+        assert abs(conversation.direct_delay(talk.read("sweep_ref"), talk.read("sweep_mic")) - meta["delay"]) <= 1  # the fan
         drifting = np.interp(np.arange(ref.size) * (1 + meta["ppm"] * 1e-6), np.arange(ref.size), ref)
         onset = meta["t_main"] + meta["lag2"]
         for part in (slice(0, meta["t_main"]), slice(onset, meta["end"])):
             # half a sample for rounding of the lag, half for the loudspeaker's distortion
-            assert lag_between(mic[part], drifting[part]) == pytest.approx(quality.MARGIN, abs=1)
+            assert lag_between(mic[part], drifting[part]) == pytest.approx(conversation.MARGIN, abs=1)
 
 
 def test_unusable_output_is_counted_not_scored(monkeypatch: pytest.MonkeyPatch, live: Path, tmp_path: Path) -> None:
@@ -294,17 +296,17 @@ def test_folder_without_conversations_is_one_line(
 
 @pytest.mark.parametrize(("before", "after", "delay", "shown"), [(None, 0.1, 100.0, "2 of 2 | 0 | 0"), (0.5, None, 0.0, "1 of 1 | 1 | 0"), (None, None, None, "1 of 2 | 0 | 1")])
 def test_barge_in_counts_from_the_humans_first_sound(live: Path, monkeypatch: pytest.MonkeyPatch, before, after, delay, shown) -> None:
-    conversation = quality.find_conversations([live])["live"][0]
-    power = barge_in.frame_power(conversation.read("clean"))
-    onset = int(np.flatnonzero(power > 10**-2.5 * power.max())[0]) * barge_in.FRAME
+    talk = conversation.find_conversations([live])["live"][0]
+    power = levels.frame_power(talk.read("clean"))
+    onset = int(np.flatnonzero(power > 10**-2.5 * power.max())[0]) * levels.FRAME
     said = [] if before is None else [Event("speech_started", onset - int(before * RATE), "")]
     said += [] if after is None else [Event("speech_started", onset + int(after * RATE), "")]
     heard = []
-    monkeypatch.setattr(barge_in, "talk", lambda conversation, mic: heard.append(mic) or (said if len(heard) == 1 else [Event("speech_started", 5, "")] * 3))
-    row = barge_in.measure(conversation)
+    monkeypatch.setattr(barge_in, "talk", lambda talk, mic: heard.append(mic) or (said if len(heard) == 1 else [Event("speech_started", 5, "")] * 3))
+    row = barge_in.measure(talk)
     assert row["delay_ms"] == delay and row["early"] == (before is not None) and row["alarms"] == 3
-    np.testing.assert_array_equal(heard[1], conversation.read("mic") - conversation.read("clean"))
-    text = barge_in.markdown([{"set": "live", **row}, {"set": "live", **row, "delay_ms": 50.0, "early": False}], {"date": "today"})
+    np.testing.assert_array_equal(heard[1], talk.read("mic") - talk.read("clean"))
+    text = barge_in.markdown([{"set": "live", **row}, {"set": "live", **row, "delay_ms": 50.0, "early": False}])
     assert f"| {shown} | 6 in " in text
 
 
@@ -312,6 +314,7 @@ def test_a_row_is_scored_anew_where_its_code_or_its_network_changed(tmp_path: Pa
     tree = tmp_path / "edgefilter"
     shutil.copytree(Path(quality.edgefilter.__file__).parent, tree)
     (tmp_path / "models").mkdir()
+    (tmp_path / "models/crnn_int8.onnx").touch()
     monkeypatch.setattr(quality.edgefilter, "__file__", str(tree / "__init__.py"))
 
     def versions() -> list[str]:
@@ -319,9 +322,9 @@ def test_a_row_is_scored_anew_where_its_code_or_its_network_changed(tmp_path: Pa
 
     def changed_by(path: Path) -> list[bool]:
         before = versions()
-        path.write_bytes((path.read_bytes() if path.exists() else b"") + b"\n")
+        path.write_bytes(path.read_bytes() + b"\n")
         return [a != b for a, b in zip(before, versions(), strict=True)]
 
     assert changed_by(tmp_path / "models/crnn_int8.onnx") == [False, False, True]
-    assert changed_by(tree / "canceller.py") == [False, True, True]
-    assert changed_by(tree / "diagnose.py") == [False, False, False]
+    assert changed_by(tree / "filter/canceller.py") == [False, True, True]
+    assert changed_by(tree / "diagnosis/diagnose.py") == [False, False, False]

@@ -44,20 +44,23 @@ def test_digest_is_of_names_and_contents_and_not_of_the_place(data: Path, tmp_pa
 def test_an_empty_folder_or_a_missing_model_is_one_line(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="holds no file"):
         results_writer.stamp({"HUMAN": [tmp_path]})
-    with pytest.raises(UsageError, match="cannot be read"):
+    with pytest.raises(UsageError, match="model.bin holds no file"):
         results_writer.stamp(models={"WHISPER": tmp_path / "model.bin"})
 
 
 def test_stamp_and_pages_hold_no_folder_of_this_machine(data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    model, output = tmp_path / "ct2" / "model.bin", tmp_path / "results" / "quality.v1"
-    model.parent.mkdir()
-    model.write_bytes(b"weights")
-    arguments = ["--speech", str(data), "--whisper", str(model.parent), f"--cache={tmp_path}/kept", "--output", str(output), "--seed", "3"]
+    network, whisper, output = tmp_path / "best.pt", tmp_path / "ct2", tmp_path / "results" / "quality.v1"
+    network.write_bytes(b"weights")
+    whisper.mkdir()
+    (whisper / "model.bin").write_bytes(b"words")
+    arguments = ["--speech", str(data), "--whisper", str(whisper), f"--cache={tmp_path}/kept", "--output", str(output), "--seed", "3"]
     monkeypatch.setattr("sys.argv", [str(tmp_path / "quality.py"), *arguments])
-    made_with = results_writer.stamp({"HUMAN": [data]}, models={"WHISPER": model})
+    made_with = results_writer.stamp({"HUMAN": [data]}, models={"WHISPER": whisper, "best.pt": network, "other": None})
     wanted = "python -m quality --speech HUMAN/val --whisper WHISPER --cache=kept --output quality.v1 --seed 3"
     assert made_with["command"] == wanted
-    assert made_with["models"]["WHISPER"]["sha256"] == hashlib.sha256(b"weights").hexdigest()
+    assert set(made_with["models"]) == {"WHISPER", "best.pt"}
+    assert made_with["models"]["best.pt"]["sha256"] == hashlib.sha256(b"weights").hexdigest()
+    assert made_with["models"]["WHISPER"]["sha256"] == results_writer.digest(whisper)["sha256"]
     page = results_writer.write(output, made_with, "Quality", "a page\n", {"rows": []})
     written = [output.with_name(f"quality.v1{suffix}").read_text(encoding="utf-8") for suffix in (".json", ".md")]
     assert written[1] == page and page.startswith(f"# Quality\n\n`{wanted}`\n") and page.endswith("\n\na page\n")

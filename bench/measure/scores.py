@@ -1,27 +1,15 @@
-"""From per-utterance scores to the benchmark's table: means, medians, bootstrap intervals; JSON and Markdown."""
+"""From per-utterance scores to the tables of SI-SDR and word errors: means, medians, bootstrap intervals."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from datetime import datetime, timezone
+from collections.abc import Sequence
 
 import numpy as np
 
-from edgefilter.filter.budget_cache import processor, versions
+from bench.measure.intervals import interval
+from bench.results_writer import table
 
-RESAMPLES = 2000
-PACKAGES = ("numpy", "scipy", "onnxruntime", "faster-whisper", "ctranslate2", "jiwer", "pywebrtc-audio", "soundfile")
-
-
-def interval(statistic: Callable[..., np.ndarray], *columns: Sequence[float]) -> tuple[float, float]:
-    """95 % percentile bootstrap interval (Efron & Tibshirani 1993, ch. 13), resampling utterances; seeded, so that it repeats.
-
-    columns: (n,) each, resampled together; statistic maps (RESAMPLES, n) arrays to (RESAMPLES,).
-    """
-    arrays = [np.asarray(column, np.float64) for column in columns]
-    draws = np.random.default_rng(0).integers(0, arrays[0].size, size=(RESAMPLES, arrays[0].size))
-    low, high = np.percentile(statistic(*(array[draws] for array in arrays)), [2.5, 97.5])
-    return float(low), float(high)
+COLUMNS = ("engine", "SI-SDR dB", "median", "WER %", "median", "capped WER %", "RTF")
 
 
 def summarise(scores: Sequence[dict]) -> dict:
@@ -53,39 +41,34 @@ def summarise(scores: Sequence[dict]) -> dict:
     return row
 
 
-def markdown(summaries: dict[str, dict[str, dict[str, dict]]], machine: dict, note: str) -> str:
+def markdown(summaries: dict[str, dict[str, dict[str, dict]]]) -> str:
     """The table as Markdown. summaries[set][room][engine] as from `summarise`."""
-    lines = [f"# {note}", "", ", ".join(f"{key} {value}" for key, value in machine.items()), ""]
-    lines += ["Scored over the span in which the human speaks: mean [95 % bootstrap interval over utterances]. WER by Whisper-base is"]
+    lines = ["Scored over the span in which the human speaks: mean [95 % bootstrap interval over utterances]. WER by Whisper-base is"]
     lines += ["pooled over all words, its median is of the utterances' own rates; 'capped' is the mean of those, each at most 100 %."]
     lines += ["RTF: processing time over audio, one thread. '-true-lag': given each utterance's lag, which no robot knows."]
     for set_name, rooms in summaries.items():
         for room, engines in rooms.items():
             first = next(iter(engines.values()))
             lines += ["", f"## {set_name}, {room}: {first['utterances']} conversations, {first.get('words', 'no')} words", ""]
-            lines += ["| engine | SI-SDR dB | median | WER % | median | capped WER % | RTF |", "| --- " * 7 + "|"]
-            lines += [_line(engine, row) for engine, row in engines.items()]
+            lines += table(COLUMNS, [_cells(engine, row) for engine, row in engines.items()])
     return "\n".join(lines) + "\n"
 
 
-def _line(engine: str, row: dict) -> str:
-    name = engine + (f" ({row['problems']} outputs unusable)" if row["problems"] else "")
-    if row["problems"] == row["utterances"]:
-        return f"| {name} | | | | | | |"
-    cells = [name, _figure(row, "si_sdr", "si_sdr_mean", 1), f"{row['si_sdr_median']:.1f}"] if "si_sdr_mean" in row else [name, "", ""]
-    if "wer" in row:
-        cells += [_figure(row, "wer", "wer", 0), f"{row['wer_median']:.0f}", _figure(row, "wer_capped", "wer_capped", 0)]
-    else:
-        cells += [""] * 3
-    return "| " + " | ".join([*cells, f"{row['real_time_factor']:.3f}"]) + " |"
-
-
-def _figure(row: dict, name: str, key: str, digits: int) -> str:
-    low, high = row[f"{name}_interval"]
+def figure(row: dict, key: str, digits: int) -> str:
+    """A mean with its interval: key is si_sdr_mean, or one of wer, wer_mean, wer_capped."""
+    low, high = row[f"{'si_sdr' if key == 'si_sdr_mean' else key}_interval"]
     return f"{row[key]:.{digits}f} [{low:.{digits}f}, {high:.{digits}f}]"
 
 
-def machine() -> dict[str, str]:
-    """Processor, Python, package versions and the date, for the head of every result."""
-    date = datetime.now(timezone.utc).strftime("%Y-%m-%d %H:%M UTC")
-    return {"date": date, "processor": processor(), "threads": "1", **versions(PACKAGES)}
+def _cells(engine: str, row: dict) -> list[str]:
+    name = engine + (f" ({row['problems']} outputs unusable)" if row["problems"] else "")
+    if row["problems"] == row["utterances"]:
+        return [name, *[""] * (len(COLUMNS) - 1)]
+    cells = [name, "", ""]
+    if "si_sdr_mean" in row:
+        cells = [name, figure(row, "si_sdr_mean", 1), f"{row['si_sdr_median']:.1f}"]
+    if "wer" in row:
+        cells += [figure(row, "wer", 0), f"{row['wer_median']:.0f}", figure(row, "wer_capped", 0)]
+    else:
+        cells += [""] * 3
+    return [*cells, f"{row['real_time_factor']:.3f}"]
