@@ -50,7 +50,8 @@ def stamp(
     Returns
     -------
     dict
-        command, commit, dirty, data (a list of what, folder, files, bytes, sha256), models (by name: files, bytes, sha256 - of one
+        command, commit, dirty, code (sha256 of the package's Python files: two results with the same one are of the same filter and
+        diagnosis, whatever was committed in between), data (a list of what, folder, files, bytes, sha256), models (by name: files, bytes, sha256 - of one
         file that of its content), machine, date (UTC).
 
     Raises
@@ -65,6 +66,7 @@ def stamp(
         "command": command(data, files),
         "commit": commit,
         "dirty": dirty,
+        "code": code_digest(),
         "data": [{"what": what, "folder": path.resolve().name, **digest(path)} for what, paths in data.items() for path in paths],
         "models": {name: _of_model(path) for name, path in files.items()},
         "machine": machine(),
@@ -154,6 +156,14 @@ def models_of(engine_names: Iterable[str]) -> dict[str, Path]:
                 continue
             found[path.name] = path
     return found
+
+
+def code_digest() -> str:
+    """sha256 over names and contents of the package's Python files."""
+    package, whole = Path(engines.__file__).parents[1], hashlib.sha256()
+    for path in sorted(package.rglob("*.py"), key=lambda p: p.relative_to(package).as_posix()):
+        whole.update(path.relative_to(package).as_posix().encode() + b"\0" + _sha256(path).digest())
+    return whole.hexdigest()
 
 
 def revision() -> tuple[str, bool]:
