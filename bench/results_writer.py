@@ -1,7 +1,7 @@
 """The one writer of results: every JSON file and Markdown page says from which code, data, models and machine it comes.
 
-A program of bench/measure calls `stamp` before it measures, so that the stamp is of what ran and not of what was edited meanwhile,
-and `write` at its end. docs: bench/README.md, "What a stamp says".
+A program of bench/measure calls `stamp` before it measures, so that the stamp is of what ran and not of what was edited
+meanwhile, and `write` at its end. docs: bench/README.md, "What a stamp says".
 """
 
 from __future__ import annotations
@@ -40,8 +40,8 @@ def stamp(
     Parameters
     ----------
     data
-        Folders (or files) that are read, by what they are: ``{"HUMAN": [Path(".../human/val")]}``. Of a folder only its last part is
-        written down, with the number and size of its files and their `digest`.
+        Folders (or files) that are read, by what they are: ``{"HUMAN": [Path("human/val")]}``. Of a folder only its last
+        part is written down, with the number and size of its files and their `digest`.
     engine_names
         Engines that run; the model files that the package would load for them are hashed.
     models
@@ -50,9 +50,9 @@ def stamp(
     Returns
     -------
     dict
-        command, commit, dirty, code (sha256 of the package's Python files: two results with the same one are of the same filter and
-        diagnosis, whatever was committed in between), data (a list of what, folder, files, bytes, sha256), models (by name: files, bytes, sha256 - of one
-        file that of its content), machine, date (UTC).
+        command, commit, dirty, code (sha256 of the package's Python files: two results with the same one are of the
+        same filter and diagnosis, whatever was committed in between), data (what, folder, files, bytes, sha256 of each),
+        models (by name: files, bytes, sha256; of a single file that of its content), machine, date (UTC).
 
     Raises
     ------
@@ -67,7 +67,11 @@ def stamp(
         "commit": commit,
         "dirty": dirty,
         "code": code_digest(),
-        "data": [{"what": what, "folder": path.resolve().name, **digest(path)} for what, paths in data.items() for path in paths],
+        "data": [
+            {"what": what, "folder": path.resolve().name, **digest(path)}
+            for what, paths in data.items()
+            for path in paths
+        ],
         "models": {name: _of_model(path) for name, path in files.items()},
         "machine": machine(),
         "date": datetime.now(timezone.utc).strftime("%Y-%m-%d %H:%M UTC"),
@@ -100,7 +104,10 @@ def write(output: Path | None, made_with: Mapping, title: str, page: str, conten
 
 
 def to_json(content: Mapping) -> str:
-    """JSON as the results folder holds it; numbers that are not finite become null, numpy's numbers and arrays plain ones."""
+    """JSON as the results folder holds it.
+
+    Numbers that are not finite become null, numpy's numbers and arrays plain ones.
+    """
     return json.dumps(_plain(content), indent=1, allow_nan=False) + "\n"
 
 
@@ -116,21 +123,31 @@ def table(columns: Sequence[str], rows: Iterable[Sequence[object]]) -> list[str]
 
 def head(made_with: Mapping) -> list[str]:
     """The stamp as the lines under a page's title: command, code, data, models, machine."""
-    code = f"Code {made_with['commit'][:12]}{' with changes that are not committed' if made_with['dirty'] else ''}, {made_with['date']}."
+    changed = " with changes that are not committed" if made_with["dirty"] else ""
+    code = f"Code {made_with['commit'][:12]}{changed}, {made_with['date']}."
     lines = [f"`{made_with['command']}`", "", code]
-    read = [f"{entry['what']}/{entry['folder']} ({entry['files']} files, {entry['sha256'][:12]})" for entry in made_with["data"]]
+    read = [
+        f"{entry['what']}/{entry['folder']} ({entry['files']} files, {entry['sha256'][:12]})"
+        for entry in made_with["data"]
+    ]
     read += [f"{name} ({entry['sha256'][:12]})" for name, entry in made_with["models"].items()]
     lines += [f"Data and models (sha256): {', '.join(read)}."] if read else []
     return [*lines, ", ".join(f"{key} {value}" for key, value in made_with["machine"].items()) + "."]
 
 
 def digest(path: Path) -> dict:
-    """files, bytes and sha256 of a folder (or of one file): over name, size and content of each file, in the order of their names.
+    """files, bytes and sha256 of a folder (or of one file).
 
-    Names are relative to the folder with "/" between the parts, so that a copy elsewhere has the same digest. Raises UsageError where
-    there is nothing.
+    Over name, size and content of each file, in the order of their names.
+
+    Names are relative to the folder with "/" between the parts, so that a copy elsewhere has the same digest. Raises
+    UsageError where there is nothing.
     """
-    files = [path] if path.is_file() else sorted((p for p in path.rglob("*") if p.is_file()), key=lambda p: p.relative_to(path).as_posix())
+    files = (
+        [path]
+        if path.is_file()
+        else sorted((p for p in path.rglob("*") if p.is_file()), key=lambda p: p.relative_to(path).as_posix())
+    )
     if not files:
         raise UsageError(f"{path} holds no file, expected the data that this result is made from: check the path")
     whole, size = hashlib.sha256(), 0
@@ -143,12 +160,16 @@ def digest(path: Path) -> dict:
 
 
 def models_of(engine_names: Iterable[str]) -> dict[str, Path]:
-    """The model files that the engines of these names load, by file name; engines without a network, and programs that are none, have none.
+    """The model files that the engines of these names load, by file name.
+
+    Engines without a network, and programs that are none, have none.
 
     "auto" may choose any, so it counts as each of them; one whose model is missing has none.
     """
     found = {}
-    for name in dict.fromkeys(engine for asked in engine_names for engine in (engines.HAVE_MODEL if asked == "auto" else (asked,))):
+    for name in dict.fromkeys(
+        engine for asked in engine_names for engine in (engines.HAVE_MODEL if asked == "auto" else (asked,))
+    ):
         if name in engines.HAVE_MODEL:
             try:
                 path = engines.create(name).model.path
@@ -167,7 +188,7 @@ def code_digest() -> str:
 
 
 def revision() -> tuple[str, bool]:
-    """The commit that is checked out, and whether a file differs from it (results do not count: programs write them in a row).
+    """The commit that is checked out, and whether a file other than a result differs from it.
 
     ("unknown", True) where this is no git checkout, or git is missing.
     """
@@ -186,7 +207,10 @@ def machine() -> dict[str, str]:
 
 
 def command(data: Mapping[str, Sequence[Path]], models: Mapping[str, Path]) -> str:
-    """The command line that runs now, without the folders of this machine: data and models by what they are, other paths by their last part."""
+    """The command line that runs now, without the folders of this machine.
+
+    Data and models by what they are, other paths by their last part.
+    """
     known = {path.resolve(): f"{what}/{path.resolve().name}" for what, paths in data.items() for path in paths}
     known |= {path.resolve(): name for name, path in models.items()}
     spec = getattr(sys.modules["__main__"], "__spec__", None)

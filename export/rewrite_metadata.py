@@ -1,9 +1,10 @@
-"""Correct what an ONNX file says of its training, without touching its graph: weights, operators and their bytes stay as they are.
+r"""Correct what an ONNX file says of its training; its graph, weights and operators, stays as it is to the byte.
 
-    python -m export.rewrite_metadata models/crnn.onnx models/crnn_int8.onnx --training '{"step": 16400, "seed": [1, 7], "items": 7129}'
+    python -m export.rewrite_metadata models/crnn.onnx models/crnn_int8.onnx \
+        --training '{"step": 16400, "seed": [1, 7], "items": 7129}'
 
-For a file whose checkpoint is gone, or whose export would not give the same bytes again. Everything else in the metadata stays. Say the
-same in models/MODELS.md; a test compares the two.
+For a file whose checkpoint is gone, or whose export would not give the same bytes again. Everything else in the metadata stays.
+Say the same in models/MODELS.md; a test compares the two.
 """
 
 from __future__ import annotations
@@ -28,7 +29,8 @@ def rewrite(path: Path, training: Mapping[str, object]) -> None:
     path
         An ONNX file that export/onnx_export.py wrote.
     training
-        step (of all stages together), seed (of the only stage, or a list of the stages' seeds), items, and whatever else is known.
+        step (of all stages together), seed (of the only stage, or a list of the stages' seeds), items, and whatever
+        else is known.
 
     Raises
     ------

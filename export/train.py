@@ -144,9 +144,6 @@ def in_stages(before: Mapping[str, object], steps: int, seed: int, items: int) -
     """What a checkpoint says of its training: step of all stages together, seed, items; with --start also each stage's own.
 
     before: what the network that training started from says of its own, empty where it started from nothing.
-
-    >>> in_stages({"step": 600, "seed": 1, "items": 50}, 200, 7, 60)["step"]
-    800
     """
     stage = {"steps": steps, "seed": seed, "items": items}
     if not before:

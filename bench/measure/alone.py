@@ -1,10 +1,10 @@
-"""One of the two alone: how much of a human survives while the robot is silent, and how much of the robot while no human speaks.
+"""How much of a human survives while the robot is silent, and how much of the robot while no human speaks.
 
     python -m bench.measure.alone --conversations DIR [DIR ...] --engines linear,ss,crnn --output bench/results/alone
 
-The human alone: the conversation's clean human at 1, 3 and 10 times its level with white noise 50 dB below, a silent reference; SI-SDR of the
-output against the input. The robot alone: the microphone less the human; level of the output while the robot speaks (from its second second
-on), over that of the fan. Writes OUTPUT.json and OUTPUT.md.
+The human alone: the conversation's clean human at 1, 3 and 10 times its level with white noise 50 dB below, a silent
+reference; SI-SDR of the output against the input. The robot alone: the microphone less the human; level of the output
+while the robot speaks (from its second second on), over that of the fan. Writes OUTPUT.json and OUTPUT.md.
 """
 
 from __future__ import annotations
@@ -49,7 +49,9 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--conversations", type=Path, nargs="+", required=True, metavar="DIR")
     parser.add_argument("--engines", default="linear,ss,crnn", metavar="A,B,...")
-    parser.add_argument("--every", type=int, default=1, metavar="N", help="take every N-th conversation of each folder (default: all)")
+    parser.add_argument(
+        "--every", type=int, default=1, metavar="N", help="take every N-th conversation of each folder (default: all)"
+    )
     parser.add_argument("--output", type=Path, required=True, metavar="PATH")
     options = parser.parse_args()
     try:
@@ -73,8 +75,14 @@ def main() -> int:
 def markdown(rows: list[dict], conversations: int) -> str:
     """Medians, and the worst in brackets."""
     human = [f"human x {gain}" for gain in GAINS]
-    lines = [f"{conversations} conversations: median, and the worst in brackets. The human alone, robot silent, noise 50 dB below:"]
-    lines += ["SI-SDR of the output against the input, by the human's level. The robot alone, while it speaks, from its second second"]
+    lines = [
+        f"{conversations} conversations: median, and the worst in brackets. The human alone, robot silent, noise 50 dB "
+        "below:"
+    ]
+    lines += [
+        "SI-SDR of the output against the input, by the human's level. The robot alone, while it speaks, from its "
+        "second second"
+    ]
     lines += ["on: level of the output over the fan's.", ""]
     cells_of = {}
     for engine in dict.fromkeys(row["engine"] for row in rows):

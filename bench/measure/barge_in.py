@@ -2,9 +2,10 @@
 
     python -m bench.measure.barge_in --conversations DIR [DIR ...] --output bench/results/barge_in
 
-Each conversation is filtered twice: as it is, and less the human, so that every event speech_started in the second is a false alarm.
-Noticed: the first speech_started that ends after the human's first sound (a 20 ms frame within 25 dB of the loudest), or at once where speech had
-been announced before, which counts as early. Writes OUTPUT.json and OUTPUT.md.
+Each conversation is filtered twice: as it is, and less the human, so that every event speech_started in the second is a
+false alarm. Noticed: the first speech_started that ends after the human's first sound (a 20 ms frame within 25 dB of
+the loudest), or at once where speech had been announced before, which counts as early. Writes OUTPUT.json and
+OUTPUT.md.
 """
 
 from __future__ import annotations
@@ -35,7 +36,10 @@ def talk(conversation: Conversation, mic: Samples) -> list[Event]:
 
 
 def measure(conversation: Conversation) -> dict:
-    """delay_ms from the human's first sound until it is noticed, None if never; early: speech was on already; alarms without the human."""
+    """delay_ms from the human's first sound until it is noticed, None if never.
+
+    Early: speech was on already; alarms without the human.
+    """
     mic, clean = conversation.read("mic"), conversation.read("clean")
     power = frame_power(clean)
     onset = int(np.flatnonzero(power > 10**-2.5 * power.max())[0]) * FRAME
@@ -67,7 +71,10 @@ def main() -> int:
 
 def markdown(rows: list[dict]) -> str:
     """A row a set."""
-    lines = [f"Engine `{ENGINE}`. Delay: from the human's first sound to the event `speech_started`, 20-26 dB below the robot that"]
+    lines = [
+        f"Engine `{ENGINE}`. Delay: from the human's first sound to the event `speech_started`, 20-26 dB below the "
+        "robot that"
+    ]
     lines += ["talks meanwhile.", ""]
     columns = ["set", "conversations", "delay p50 / p90, ms", f"within {IN_TIME_MS} ms", "early", "never"]
     cells_of = []

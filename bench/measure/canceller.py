@@ -3,10 +3,11 @@
     OMP_NUM_THREADS=1 python -m bench.measure.canceller --conversations DIR --output bench/results/canceller
 
 DIR holds conversations as bench.simulate.conversations makes them. Three questions, each answered over all of them:
-warm/cold: error over microphone, dB, by seconds of robot speech, with and without the calibrated profile;
-human: SI-SDR of out(robot + human + fan) - out(robot + fan) against the human, that is, what the filter makes of the human alone
-(a lower bound: two runs adapt differently, and where the one without a human happens to end elsewhere, the difference counts as distortion);
-loud: the same recordings with the human raised to the robot's level: residual echo while both talk, against that with no human.
+warm/cold: error over microphone, dB, by seconds of robot speech, with and without the calibrated profile; human: SI-SDR
+of out(robot + human + fan) - out(robot + fan) against the human, that is, what the filter makes of the human alone (a
+lower bound: two runs adapt differently, and where the one without a human happens to end elsewhere, the difference
+counts as distortion); loud: the same recordings with the human raised to the robot's level: residual echo while both
+talk, against that with no human.
 """
 
 from __future__ import annotations
@@ -42,9 +43,16 @@ DOUBLE_TALK = {
 
 
 def curve(mic: np.ndarray, error: np.ndarray, begin: int) -> np.ndarray:
-    """Error over microphone, dB, for each tenth of a second of echo after begin; (LONGEST_S * 10,), nan beyond its end."""
+    """Error over microphone, dB, for each tenth of a second of echo after begin.
+
+    (LONGEST_S * 10,), nan beyond its end.
+    """
     out = np.full(int(LONGEST_S * 10), np.nan)
-    blocks = [slice(at, at + STEP) for at in range(begin, mic.size - STEP, STEP) if np.mean(mic[at : at + STEP] ** 2) > ACTIVE * 10]
+    blocks = [
+        slice(at, at + STEP)
+        for at in range(begin, mic.size - STEP, STEP)
+        if np.mean(mic[at : at + STEP] ** 2) > ACTIVE * 10
+    ]
     for index, block in enumerate(blocks[: out.size]):
         out[index] = -erle(mic[block], error[block])
     return out
@@ -81,7 +89,13 @@ def draw(rows: list[dict[str, object]], output: Path) -> None:
     for room, colour in (("lab", "#33658a"), ("office", "#b3412b")):
         for start, style in (("warm", "-"), ("cold", "--")):
             of = np.array([row[start] for row in rows if row["room"] == room])
-            axis.plot(np.arange(of.shape[1]) / 10 + 0.1, np.nanmedian(of, axis=0), style, color=colour, label=f"{room}, {start} start")
+            axis.plot(
+                np.arange(of.shape[1]) / 10 + 0.1,
+                np.nanmedian(of, axis=0),
+                style,
+                color=colour,
+                label=f"{room}, {start} start",
+            )
     axis.set(xlabel="seconds of robot speech", ylabel="error over microphone, dB (median)", xlim=(0, LONGEST_S))
     axis.grid(alpha=0.3)
     axis.legend()
@@ -90,19 +104,32 @@ def draw(rows: list[dict[str, object]], output: Path) -> None:
 
 def markdown(rows: list[dict[str, object]], name: str) -> str:
     """Both tables; name: of the picture, without suffix."""
-    lines = [f"{len(rows)} simulated conversations.", "", "Error over microphone after seconds of robot speech, dB, median:", ""]
+    lines = [
+        f"{len(rows)} simulated conversations.",
+        "",
+        "Error over microphone after seconds of robot speech, dB, median:",
+        "",
+    ]
     cells = []
     for room in ROOMS:
         for start in ("warm", "cold"):
             of = np.nanmedian([row[start] for row in rows if row["room"] == room], axis=0)
             cells.append([room, start, *(f"{of[round(s * 10) - 1]:.1f}" for s in SHOWN_S)])
     lines += results_writer.table(["room", "start", *(f"{s:.1f} s" for s in SHOWN_S)], cells)
-    lines += ["", "Double talk, dB, median (least). The first two rows are differences of two runs that adapt differently, so lower", "bounds:", ""]
+    lines += [
+        "",
+        "Double talk, dB, median (least). The first two rows are differences of two runs that adapt differently, so "
+        "lower",
+        "bounds:",
+        "",
+    ]
     cells = []
     for key, text in DOUBLE_TALK.items():
         found = [[row[key] for row in rows if row["room"] == room] for room in ROOMS]
         cells.append([text, *(f"{np.median(of):.1f} ({min(of):.1f})" for of in found)])
-    return "\n".join([*lines, *results_writer.table(["", *ROOMS], cells), "", f"![error over microphone]({name}.png)", ""])
+    return "\n".join(
+        [*lines, *results_writer.table(["", *ROOMS], cells), "", f"![error over microphone]({name}.png)", ""]
+    )
 
 
 def main() -> int:
@@ -113,14 +140,20 @@ def main() -> int:
     try:
         found = every(find_conversations(args.conversations))
         if missing := set(ROOMS) - {talk.meta["room"] for _, talk in found}:
-            raise EdgefilterError(f"no conversation in the {', '.join(sorted(missing))}, expected both {' and '.join(ROOMS)}")
+            raise EdgefilterError(
+                f"no conversation in the {', '.join(sorted(missing))}, expected both {' and '.join(ROOMS)}"
+            )
         made_with = results_writer.stamp({"conversations": args.conversations}, ["linear", "ss"])
         rows = [measure(talk) for _, talk in progress(found)]
     except (EdgefilterError, OSError) as error:
         print(f"canceller: {error}", file=sys.stderr)
         return 1
     draw(rows, args.output)
-    print(results_writer.write(args.output, made_with, "The linear stage", markdown(rows, args.output.name), {"rows": rows}))
+    print(
+        results_writer.write(
+            args.output, made_with, "The linear stage", markdown(rows, args.output.name), {"rows": rows}
+        )
+    )
     return 0
 
 

@@ -68,7 +68,7 @@ class Conversation:
 
 
 def direct_delay(sweep_ref: Samples, sweep_mic: Samples) -> int:
-    """Samples by which the direct sound of the sweep arrives later than it was played (peak of the whitened cross-correlation)."""
+    """Samples by which the direct sound of the sweep arrives later than played (peak of the whitened correlation)."""
     size = 1 << (2 * sweep_ref.size).bit_length()
     played = np.fft.rfft(sweep_ref, size)
     power = np.abs(played) ** 2
@@ -82,7 +82,9 @@ def find_conversations(folders: list[Path]) -> dict[str, list[Conversation]]:
     for folder in folders:
         found = [Conversation(path.parent) for path in sorted(folder.glob("*/meta.json"))]
         if not found:
-            raise UsageError(f"{folder} holds no */meta.json, expected conversations: make some with bench.simulate.conversations")
+            raise UsageError(
+                f"{folder} holds no */meta.json, expected conversations: make some with bench.simulate.conversations"
+            )
         sets[folder.resolve().name if folder.resolve().name not in sets else str(folder)] = found
     return sets
 
@@ -92,6 +94,8 @@ def every(sets: dict[str, list[Conversation]], n: int = 1) -> list[tuple[str, Co
     return [(name, conversation) for name, found in sets.items() for conversation in found[::n]]
 
 
-def progress(items: Sequence[Item], unit: str = "recording", name: str | None = None) -> Iterator[Item] | Iterable[Item]:
+def progress(
+    items: Sequence[Item], unit: str = "recording", name: str | None = None
+) -> Iterator[Item] | Iterable[Item]:
     """The items, with a bar where somebody is looking."""
     return tqdm(items, unit=unit, desc=name, disable=not sys.stderr.isatty())

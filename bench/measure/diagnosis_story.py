@@ -1,12 +1,16 @@
-"""A robot calibrated in one room is heard in another: compare, diagnose, add what is missing, and filter with both profiles.
+r"""A robot calibrated in one room is heard in another.
 
-    python -m bench.measure.diagnosis_story --conversations DIR --room office --whisper DIR --output bench/results/diagnosis_story [--files DIR]
+Compare, diagnose, add what is missing, and filter with both profiles.
 
-Conversations are folders as bench.simulate.conversations makes them: the sweep was recorded in a laboratory, the conversation in the room. What
-the robot says alone, up to the onset of its second utterance, is diagnosed; what comes after it, with the human, is filtered and scored.
-So the figures of the filter are from sound that no fit has seen. It is filtered twice: "heard before", the filter having heard the first
-utterance as well, and "restarted", the filter having heard nothing before the robot is interrupted. Writes OUTPUT.json and OUTPUT.md. --files: keep, in a
-folder for each conversation, the profile and the recordings that the command line takes.
+    python -m bench.measure.diagnosis_story --conversations DIR --room office --whisper DIR \
+        --output bench/results/diagnosis_story [--files DIR]
+
+Conversations are folders as bench.simulate.conversations makes them: the sweep was recorded in a laboratory, the
+conversation in the room. What the robot says alone, up to the onset of its second utterance, is diagnosed; what comes
+after it, with the human, is filtered and scored. So the figures of the filter are from sound that no fit has seen. It
+is filtered twice: "heard before", the filter having heard the first utterance as well, and "restarted", the filter
+having heard nothing before the robot is interrupted. Writes OUTPUT.json and OUTPUT.md. --files: keep, in a folder for
+each conversation, the profile and the recordings that the command line takes.
 """
 
 from __future__ import annotations
@@ -35,7 +39,10 @@ STARTS = ("heard before", "restarted")
 
 
 def tell(conversation: Conversation, recogniser: Recogniser | None) -> dict:
-    """One conversation's figures: excess before and after on the robot alone, what was found, SI-SDR and word errors per start."""
+    """One conversation's figures.
+
+    Excess before and after on the robot alone, what was found, SI-SDR and word errors per start.
+    """
     alone = slice(0, conversation.meta["t_main"])
     recording, reference = conversation.read("mic")[alone], conversation.read("ref")[alone]
     began = time.process_time()
@@ -54,12 +61,14 @@ def tell(conversation: Conversation, recogniser: Recogniser | None) -> dict:
     }
     for start in STARTS:
         for name, profile in (("before", conversation.profile), ("after", better)):
-            row[f"{start}_{name}"] = score(conversation, profile, 0 if start == "heard before" else conversation.meta["t_main"], recogniser)
+            row[f"{start}_{name}"] = score(
+                conversation, profile, 0 if start == "heard before" else conversation.meta["t_main"], recogniser
+            )
     return row
 
 
 def score(conversation: Conversation, profile: Profile, start: int, recogniser: Recogniser | None) -> dict:
-    """SI-SDR and word errors of the human's stretch, the conversation from sample start on filtered with that profile."""
+    """SI-SDR and word errors of the human's stretch, the conversation filtered from sample start on."""
     out = edgefilter.enhance(conversation.read("mic")[start:], conversation.read("ref")[start:], profile, ENGINE)
     heard = out[conversation.meta["start"] - start : conversation.meta["end"] - start]
     figures = {"si_sdr": si_sdr(heard, conversation.read("clean")[conversation.span])}
@@ -110,7 +119,9 @@ def main() -> int:
     parser.add_argument("--room", default="office", help="only conversations in this room (default: %(default)s)")
     parser.add_argument("--whisper", type=Path, metavar="DIR", help="recogniser's folder; without it only SI-SDR")
     parser.add_argument("--output", type=Path, required=True, metavar="PATH", help="PATH.json and PATH.md are written")
-    parser.add_argument("--files", type=Path, metavar="DIR", help="keep each conversation's profile and recordings here")
+    parser.add_argument(
+        "--files", type=Path, metavar="DIR", help="keep each conversation's profile and recordings here"
+    )
     parser.add_argument("--cache", type=Path, default=Path.home() / ".cache" / "edgefilter-bench", metavar="DIR")
     options = parser.parse_args()
     try:

@@ -11,7 +11,7 @@ RESAMPLES = 2000
 
 
 def interval(statistic: Callable[..., np.ndarray], *columns: Sequence[float]) -> tuple[float, float]:
-    """95 % percentile bootstrap interval (Efron & Tibshirani 1993, ch. 13), resampling utterances, with a seed of its own.
+    """95 % percentile bootstrap interval (Efron & Tibshirani 1993, ch. 13) over utterances, with a fixed seed.
 
     columns: (n,) each, resampled together; statistic maps (RESAMPLES, n) arrays to (RESAMPLES,).
     """
@@ -41,4 +41,7 @@ def percentiles(values: Sequence[float], *percents: float) -> dict[str, float]:
     {'p50': 2.0, 'max': 3.0}
     """
     found = np.percentile(values, percents)
-    return {"max" if percent == 100 else f"p{percent:g}": float(value) for percent, value in zip(percents, found, strict=True)}
+    return {
+        "max" if percent == 100 else f"p{percent:g}": float(value)
+        for percent, value in zip(percents, found, strict=True)
+    }

@@ -1,10 +1,11 @@
-"""Compare trained networks: size, cost per hop, learning curve, and what they do in the whole path on validation conversations.
+r"""Compare trained networks: size, cost per hop, learning curve, and what they do in the whole path.
 
-    python -m bench.measure.networks --runs RUN [RUN ...] --conversations DIR [DIR ...] --whisper WHISPER --output bench/results/networks
+    python -m bench.measure.networks --runs RUN [RUN ...] --conversations DIR [DIR ...] --whisper WHISPER \
+        --output bench/results/networks
 
-RUN is a folder that export/train.py wrote (best.pt, log.jsonl). Give validation conversations, never test ones: this is what networks are
-chosen by. Writes OUTPUT.json, OUTPUT.md and OUTPUT.png. Times are of the ONNX file alone, in onnxruntime, on one thread: hot, and paced with
-16 ms of sleep and 8 MB of other memory touched between hops.
+RUN is a folder that export/train.py wrote (best.pt, log.jsonl). Give validation conversations, never test ones: this is
+what networks are chosen by. Writes OUTPUT.json, OUTPUT.md and OUTPUT.png. Times are of the ONNX file alone, in
+onnxruntime, on one thread: hot, and paced with 16 ms of sleep and 8 MB of other memory touched between hops.
 """
 
 from __future__ import annotations
@@ -64,7 +65,9 @@ class Run:
     def facts(self) -> dict:
         """Shape, size, cost and validation loss."""
         config, size, last = self.trained.network.config, count(self.trained.network), self.curve[-1]
-        shape = f"{config.n_fft}/{config.hop}, {'-'.join(map(str, config.channels))}, GRU {config.layers} x {config.hidden}, {config.norm} norm"
+        channels = "-".join(map(str, config.channels))
+        gru = f"GRU {config.layers} x {config.hidden}"
+        shape = f"{config.n_fft}/{config.hop}, {channels}, {gru}, {config.norm} norm"
         hot, paced = per_hop(Crnn(self.model))
         return {
             "run": self.folder.name,
@@ -125,7 +128,18 @@ def judge(name: str, engine_of: object, conversations: list[Conversation], recog
     return rows
 
 
-FACTS = ("run", "shape", "parameters", "MMAC/s", "ms a hop hot, p50 / p99", "paced", "steps", "items", "validation SI-SDR, dB", "loss")
+FACTS = (
+    "run",
+    "shape",
+    "parameters",
+    "MMAC/s",
+    "ms a hop hot, p50 / p99",
+    "paced",
+    "steps",
+    "items",
+    "validation SI-SDR, dB",
+    "loss",
+)
 
 
 def markdown(facts: list[dict], rows: list[dict], name: str) -> str:
@@ -140,7 +154,11 @@ def markdown(facts: list[dict], rows: list[dict], name: str) -> str:
         cells.append([fact["run"], fact["shape"], *size, *cost, fact["steps"], fact["items"], *reached])
     lines = results_writer.table(FACTS, cells)
     shown = ", ".join(f"{number} in the {room}" for room, number in count_of.items())
-    lines += ["", f"In the whole path, on validation conversations ({shown}): mean SI-SDR in dB and capped WER in %, with 95 % bootstrap"]
+    lines += [
+        "",
+        f"In the whole path, on validation conversations ({shown}): mean SI-SDR in dB and capped WER in %, with 95 % "
+        "bootstrap",
+    ]
     lines += ["intervals.", ""]
     columns, cells = ["engine", *(column for room in rooms for column in (f"{room}: SI-SDR", "WER"))], []
     for engine in dict.fromkeys(row["engine"] for row in rows):
@@ -170,7 +188,9 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--runs", type=Path, nargs="+", required=True, metavar="RUN")
     parser.add_argument("--conversations", type=Path, nargs="+", required=True, metavar="DIR")
-    parser.add_argument("--every", type=int, default=1, metavar="N", help="take every N-th conversation of each folder (default: all)")
+    parser.add_argument(
+        "--every", type=int, default=1, metavar="N", help="take every N-th conversation of each folder (default: all)"
+    )
     shares = "of the Wiener mask in the answer (default: 0 and the engine's)"
     parser.add_argument("--shares", type=float, nargs="+", default=[0.0, WIENER_SHARE], help=shares)
     parser.add_argument("--whisper", type=Path, required=True, metavar="DIR")
@@ -180,14 +200,20 @@ def main() -> int:
     torch.set_num_threads(1)
     try:
         recogniser = Recogniser(options.whisper, options.cache / "transcripts.jsonl")
-        conversations = [conversation for _, conversation in every(find_conversations(options.conversations), options.every)]
+        conversations = [
+            conversation for _, conversation in every(find_conversations(options.conversations), options.every)
+        ]
         runs = [Run(folder) for folder in options.runs]
         if missing := [str(run.folder) for run in runs if not (run.folder / "best.pt").exists()]:
             raise UsageError(f"{', '.join(missing)}: no best.pt, expected what export/train.py wrote")
         models = {"WHISPER": options.whisper, **{f"{run.folder.name}/best.pt": run.folder / "best.pt" for run in runs}}
         made_with = results_writer.stamp({"conversations": options.conversations}, models=models)
         facts = [run.facts() for run in runs]
-        rows = [row for name in ("linear", "ss") for row in judge(name, lambda name=name: create(name), conversations, recogniser)]
+        rows = [
+            row
+            for name in ("linear", "ss")
+            for row in judge(name, lambda name=name: create(name), conversations, recogniser)
+        ]
         for run in runs:
             for share in options.shares:
                 name = f"{run.folder.name}, {share:g} Wiener"

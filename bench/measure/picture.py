@@ -1,4 +1,7 @@
-"""Figures without a display: matplotlib's object interface, so that no program sets up a backend for the whole process."""
+"""Figures without a display.
+
+Matplotlib's object interface, so that no program sets up a backend for the whole process.
+"""
 
 from __future__ import annotations
 

@@ -1,14 +1,18 @@
-"""Judge engines and public echo cancellers on whole robot conversations: SI-SDR and a recogniser's word errors, per room.
+r"""Judge engines and public echo cancellers on whole robot conversations.
 
-    python -m bench.measure.quality --conversations DIR [DIR ...] --engines unfiltered,paper-ss,linear,ss,speexdsp,aec3,clean \\
+SI-SDR and a recogniser's word errors, per room.
+
+    python -m bench.measure.quality --conversations DIR [DIR ...] \
+        --engines unfiltered,paper-ss,linear,ss,speexdsp,aec3,clean \
         --whisper DIR --output bench/results/quality
 
-Writes OUTPUT.json and OUTPUT.md. Conversations are folders as bench.simulate.conversations makes them. An engine is any of the package's, or
-`unfiltered`, `clean` (the human at the microphone: the bound), `speexdsp`, `speexdsp-suppressed` (with its preprocessor), `aec3`.
-The package's engines get a profile calibrated from the conversation's own sweep and fan recording, and the raw reference. Peers get
-the raw reference too; with `-true-lag` after any name the reference is delayed by each utterance's true lag beforehand (drift and
-volume left in), which no robot knows: a favour to cancellers that have no search of their own.
-Scores are kept in --cache by recording and code, so that a run that was cut off goes on where it stopped.
+Writes OUTPUT.json and OUTPUT.md. Conversations are folders as bench.simulate.conversations makes them. An engine is any
+of the package's, or `unfiltered`, `clean` (the human at the microphone: the bound), `speexdsp`, `speexdsp-suppressed`
+(with its preprocessor), `aec3`. The package's engines get a profile calibrated from the conversation's own sweep and
+fan recording, and the raw reference. Peers get the raw reference too; with `-true-lag` after any name the reference is
+delayed by each utterance's true lag beforehand (drift and volume left in), which no robot knows: a favour to cancellers
+that have no search of their own. Scores are kept in --cache by recording and code, so that a run that was cut off goes
+on where it stopped.
 """
 
 from __future__ import annotations
@@ -42,7 +46,10 @@ NO_ENGINE = ("unfiltered", "clean", *PEERS)
 
 
 def processor(name: str) -> Processor:
-    """The function behind a row's name; a name that is no peer is handed to edgefilter.enhance, which knows its engines."""
+    """The function behind a row's name.
+
+    A name that is no peer is handed to edgefilter.enhance, which knows its engines.
+    """
     if name == "unfiltered":
         return lambda conversation, ref: conversation.read("mic")
     if name == "clean":
@@ -54,13 +61,20 @@ def processor(name: str) -> Processor:
 
 
 def code_version(name: str) -> str:
-    """Hash of the code that makes a row: changed code is scored anew. Of the package it is what filtering and calibrating import."""
+    """Hash of the code that makes a row: changed code is scored anew.
+
+    Of the package it is what filtering and calibrating import.
+    """
     if name in NO_ENGINE:
         files = [Path(peers.__file__)]
     else:
         package = Path(edgefilter.__file__).parent
         models = [*package.rglob("*.onnx"), *package.parent.glob("models/*.onnx")] if name in HAVE_MODEL else []
-        entered = {package / "filter" / "ego_filter.py", package / "calibration" / "calibrate.py", *package.glob("engines/*.py")}
+        entered = {
+            package / "filter" / "ego_filter.py",
+            package / "calibration" / "calibrate.py",
+            *package.glob("engines/*.py"),
+        }
         files = sorted(imported_by(entered, package)) + sorted(models)
     return hashlib.sha256(b"".join(path.read_bytes() for path in files)).hexdigest()
 
@@ -74,13 +88,20 @@ def imported_by(files: set[Path], package: Path) -> set[Path]:
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
             if isinstance(node, ast.ImportFrom) and node.module and node.module.split(".")[0] == package.name:
                 place = package.parent.joinpath(*node.module.split("."))
-                asked = {place.with_suffix(".py"), place / "__init__.py", *((place / f"{alias.name}.py") for alias in node.names)}
+                asked = {
+                    place.with_suffix(".py"),
+                    place / "__init__.py",
+                    *((place / f"{alias.name}.py") for alias in node.names),
+                }
                 new |= {file for file in asked if file.exists()} - found
     return found
 
 
 def score(conversation: Conversation, engine: str, recogniser: Recogniser | None) -> dict:
-    """One row and utterance: si_sdr, errors, words, heard, seconds, duration; or the problem that made the output unusable."""
+    """One row and utterance: si_sdr, errors, words, heard, seconds, duration.
+
+    Or the problem that made the output unusable.
+    """
     base = engine.removesuffix(TRUE_LAG)
     ref = conversation.delayed_reference() if base != engine else conversation.read("ref")
     size, run = ref.size, processor(base)
@@ -127,14 +148,20 @@ class Scores:
         return self._known[key]
 
 
-def run(sets: dict[str, list[Conversation]], engines: list[str], recogniser: Recogniser | None, cache: Path) -> list[dict]:
+def run(
+    sets: dict[str, list[Conversation]], engines: list[str], recogniser: Recogniser | None, cache: Path
+) -> list[dict]:
     """Every score with its set, conversation and engine."""
-    kept = Scores(cache, Path(__file__).with_name("recogniser.py").read_text(encoding="utf-8") if recogniser else "no recogniser")
+    kept = Scores(
+        cache, Path(__file__).with_name("recogniser.py").read_text(encoding="utf-8") if recogniser else "no recogniser"
+    )
     versions = {engine: code_version(engine.removesuffix(TRUE_LAG)) for engine in engines}
     jobs = [(name, conversation, engine) for name, conversation in every(sets) for engine in engines]
     rows = []
     for name, conversation, engine in progress(jobs):
-        made = kept.get(conversation, engine, versions[engine], lambda c=conversation, e=engine: score(c, e, recogniser))
+        made = kept.get(
+            conversation, engine, versions[engine], lambda c=conversation, e=engine: score(c, e, recogniser)
+        )
         rows.append({"set": name, "conversation": conversation.folder.name, "engine": engine, **made})
     return rows
 
@@ -145,7 +172,10 @@ def summarise(rows: list[dict]) -> dict[str, dict[str, dict[str, dict]]]:
     for row in rows:
         groups.setdefault(row["set"], {}).setdefault(row["room"], {}).setdefault(row["engine"], []).append(row)
     return {
-        name: {room: {engine: scores.summarise(found) for engine, found in engines.items()} for room, engines in rooms.items()}
+        name: {
+            room: {engine: scores.summarise(found) for engine, found in engines.items()}
+            for room, engines in rooms.items()
+        }
         for name, rooms in groups.items()
     }
 
@@ -153,7 +183,9 @@ def summarise(rows: list[dict]) -> dict[str, dict[str, dict[str, dict]]]:
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--conversations", type=Path, nargs="+", required=True, metavar="DIR")
-    parser.add_argument("--engines", default="unfiltered,paper-ss,linear,ss,speexdsp,speexdsp-suppressed,aec3,clean", metavar="A,B,...")
+    parser.add_argument(
+        "--engines", default="unfiltered,paper-ss,linear,ss,speexdsp,speexdsp-suppressed,aec3,clean", metavar="A,B,..."
+    )
     parser.add_argument("--whisper", type=Path, metavar="DIR", help="recogniser's folder; without it only SI-SDR")
     parser.add_argument("--output", type=Path, required=True, metavar="PATH", help="PATH.json and PATH.md are written")
     parser.add_argument("--cache", type=Path, default=Path.home() / ".cache" / "edgefilter-bench", metavar="DIR")

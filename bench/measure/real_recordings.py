@@ -2,9 +2,10 @@
 
     OMP_NUM_THREADS=1 python -m bench.measure.real_recordings --recordings DIR --output bench/results/real_recordings
 
-DIR holds pairs NAME_lpb.wav (what the loudspeaker was sent) and NAME_mic.wav, 16 kHz, as in the Microsoft AEC Challenge. The level drop
-(ERLE where nobody else is heard) is measured from START_S on, in half seconds in which the robot talks and what the diagnosed model leaves
-is less than the model's voice; where no path could be learned, over everything from START_S on, human included.
+DIR holds pairs NAME_lpb.wav (what the loudspeaker was sent) and NAME_mic.wav, 16 kHz, as in the Microsoft AEC
+Challenge. The level drop (ERLE where nobody else is heard) is measured from START_S on, in half seconds in which the
+robot talks and what the diagnosed model leaves is less than the model's voice; where no path could be learned, over
+everything from START_S on, human included.
 """
 
 from __future__ import annotations
@@ -68,10 +69,14 @@ def examine(recording: Samples, reference: Samples) -> dict[str, object]:
         notes = [text for text in (*profile.warnings[1:], *found.comparison.warnings, found.evidence) if text]
         row |= {
             "verdict": found.verdict,
-            "says": " ".join([headline(found.verdict, [step.effect for step in steps], calibrated=False), "; ".join(notes)]),
+            "says": " ".join(
+                [headline(found.verdict, [step.effect for step in steps], calibrated=False), "; ".join(notes)]
+            ),
             "excess_db": found.comparison.excess_db,
             "remaining_db": found.remaining_db,
-            "effects": {step.effect: {name: value.to_dict() for name, value in step.parameters.items()} for step in steps},
+            "effects": {
+                step.effect: {name: value.to_dict() for name, value in step.parameters.items()} for step in steps
+            },
             "robot_alone": True,
         }
         if alone.any():
@@ -91,9 +96,18 @@ def markdown(rows: dict[str, dict]) -> str:
         keys = ("excess_db", "remaining_db", "model_db", "linear_db", "ss_db")
         figures = [f"{row[key]:.1f}" if row.get(key) is not None else "" for key in keys]
         cells.append([name, row["verdict"], *figures[:2], over, *figures[2:]])
-    lines += results_writer.table(["recording", "verdict", "excess dB", "left dB", "measured", "model", "linear", "ss"], cells)
-    lines += ["", "Excess: over the fan, with a stationary linear path made from the recording; left: with the effects found."]
-    lines += ["Model, linear, ss: level drop, dB. The thresholds of self_calibration.py were chosen while looking at these recordings.", ""]
+    lines += results_writer.table(
+        ["recording", "verdict", "excess dB", "left dB", "measured", "model", "linear", "ss"], cells
+    )
+    lines += [
+        "",
+        "Excess: over the fan, with a stationary linear path made from the recording; left: with the effects found.",
+    ]
+    lines += [
+        "Model, linear, ss: level drop, dB. The thresholds of self_calibration.py were chosen while looking at these "
+        "recordings.",
+        "",
+    ]
     lines += [f"- {name}: {row['says']}" for name, row in rows.items()]
     return "\n".join(lines) + "\n"
 

@@ -15,10 +15,12 @@ COLUMNS = ("engine", "SI-SDR dB", "median", "WER %", "median", "capped WER %", "
 def summarise(scores: Sequence[dict]) -> dict:
     """Figures of one engine in one room.
 
-    scores: per utterance si_sdr (dB; None for the clean signal itself), errors and words (if recognised), seconds, duration, problem.
+    scores: per utterance si_sdr (dB; None for the clean signal itself), errors and words (if recognised), seconds,
+    duration, problem.
 
-    wer is pooled (all errors over all words), wer_mean the mean of each utterance's own rate (as in the source paper), wer_capped
-    the mean of min(rate, 1). All in %. Utterances with a problem (length, NaN) are counted and left out of the figures.
+    wer is pooled (all errors over all words), wer_mean the mean of each utterance's own rate (as in the source paper),
+    wer_capped the mean of min(rate, 1). All in %. Utterances with a problem (length, NaN) are counted and left out of
+    the figures.
     """
     good = [score for score in scores if not score.get("problem")]
     row: dict = {"utterances": len(scores), "problems": len(scores) - len(good)}
@@ -43,13 +45,25 @@ def summarise(scores: Sequence[dict]) -> dict:
 
 def markdown(summaries: dict[str, dict[str, dict[str, dict]]]) -> str:
     """The table as Markdown. summaries[set][room][engine] as from `summarise`."""
-    lines = ["Scored over the span in which the human speaks: mean [95 % bootstrap interval over utterances]. WER by Whisper-base is"]
-    lines += ["pooled over all words, its median is of the utterances' own rates; 'capped' is the mean of those, each at most 100 %."]
-    lines += ["RTF: processing time over audio, one thread. '-true-lag': given each utterance's lag, which no robot knows."]
+    lines = [
+        "Scored over the span in which the human speaks: mean [95 % bootstrap interval over utterances]. WER by "
+        "Whisper-base is"
+    ]
+    lines += [
+        "pooled over all words, its median is of the utterances' own rates; 'capped' is the mean of those, each at "
+        "most 100 %."
+    ]
+    lines += [
+        "RTF: processing time over audio, one thread. '-true-lag': given each utterance's lag, which no robot knows."
+    ]
     for set_name, rooms in summaries.items():
         for room, engines in rooms.items():
             first = next(iter(engines.values()))
-            lines += ["", f"## {set_name}, {room}: {first['utterances']} conversations, {first.get('words', 'no')} words", ""]
+            lines += [
+                "",
+                f"## {set_name}, {room}: {first['utterances']} conversations, {first.get('words', 'no')} words",
+                "",
+            ]
             lines += table(COLUMNS, [_cells(engine, row) for engine, row in engines.items()])
     return "\n".join(lines) + "\n"
 

@@ -2,9 +2,9 @@
 
     python -m bench.measure.tune_paper_ss --conversations DIR --whisper WHISPER --output bench/results/tune_paper_ss
 
-Eq. (6) and (7) leave the over-subtraction factor alpha and the amplification beta open. Writes word errors and SI-SDR per alpha, OUTPUT.json and
-OUTPUT.md. beta scales the output alone: SI-SDR ignores it, and so does a recogniser that is given a normalised level; it is therefore
-the largest of 1, 2, 4, 8 that clips no validation conversation.
+Eq. (6) and (7) leave the over-subtraction factor alpha and the amplification beta open. Writes word errors and SI-SDR
+per alpha, OUTPUT.json and OUTPUT.md. beta scales the output alone: SI-SDR ignores it, and so does a recogniser that is
+given a normalised level; it is therefore the largest of 1, 2, 4, 8 that clips no validation conversation.
 """
 
 from __future__ import annotations
@@ -41,14 +41,16 @@ def by_room(results: dict[float, list[tuple]]) -> list[dict]:
     for alpha, found in results.items():
         for room in sorted({result[0] for result in found}):
             of = [result for result in found if result[0] == room]
-            wer = sum(errors.capped * errors.words for _, _, errors, _ in of) / sum(errors.words for _, _, errors, _ in of)
+            wer = sum(errors.capped * errors.words for _, _, errors, _ in of) / sum(
+                errors.words for _, _, errors, _ in of
+            )
             mean = float(np.mean([result[1] for result in of]))
             rows.append({"alpha": alpha, "room": room, "capped_wer": wer, "si_sdr_db": mean, "conversations": len(of)})
     return rows
 
 
 def choose(results: dict[float, list[tuple]], rows: list[dict]) -> tuple[float, float, float]:
-    """alpha with the fewest word errors, mean over rooms; beta; the peak without beta."""
+    """Alpha with the fewest word errors, mean over rooms; beta; the peak without beta."""
     mean = {alpha: np.mean([row["capped_wer"] for row in rows if row["alpha"] == alpha]) for alpha in results}
     best = min(mean, key=mean.get)
     peak = max(result[3] for result in results[best])
@@ -66,14 +68,23 @@ def main() -> int:
         recogniser = Recogniser(args.whisper, args.cache / "transcripts.jsonl")
         talks = [talk for _, talk in every(find_conversations([args.conversations]))]
         made_with = results_writer.stamp({"conversations": [args.conversations]}, models={"WHISPER": args.whisper})
-        results = {alpha: [score(talk, alpha, recogniser) for talk in progress(talks, name=f"alpha {alpha:g}")] for alpha in ALPHAS}
+        results = {
+            alpha: [score(talk, alpha, recogniser) for talk in progress(talks, name=f"alpha {alpha:g}")]
+            for alpha in ALPHAS
+        }
     except (EdgefilterError, OSError) as error:
         print(f"tune_paper_ss: {error}", file=sys.stderr)
         return 1
     rows = by_room(results)
     best, beta, peak = choose(results, rows)
-    cells = [[f"{row['alpha']:g}", row["room"], f"{100 * row['capped_wer']:.0f}", f"{row['si_sdr_db']:.1f}"] for row in rows]
-    page = [f"alpha {best:g}, beta {beta:g} (peak {peak:.2f}).", "", *results_writer.table(["alpha", "room", "capped WER %", "SI-SDR dB"], cells)]
+    cells = [
+        [f"{row['alpha']:g}", row["room"], f"{100 * row['capped_wer']:.0f}", f"{row['si_sdr_db']:.1f}"] for row in rows
+    ]
+    page = [
+        f"alpha {best:g}, beta {beta:g} (peak {peak:.2f}).",
+        "",
+        *results_writer.table(["alpha", "room", "capped WER %", "SI-SDR dB"], cells),
+    ]
     content = {"alpha": best, "beta": beta, "rows": rows}
     print(results_writer.write(args.output, made_with, "alpha and beta of paper-ss", "\n".join(page), content))
     return 0

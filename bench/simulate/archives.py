@@ -1,4 +1,7 @@
-"""Downloaded archives of speech: whether they are what they should be, and single recordings and transcripts out of them."""
+"""Downloaded archives of speech.
+
+Whether they are what they should be, and single recordings and transcripts out of them.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +26,8 @@ CHUNK = 1 << 20
 
 
 def archive_name(path: Path) -> str:
-    """
+    """What an archive is called without its suffixes.
+
     >>> archive_name(Path("downloads/test-clean.tar.gz"))
     'test-clean'
     """
@@ -31,7 +35,7 @@ def archive_name(path: Path) -> str:
 
 
 def check(path: Path, published: Mapping[str, str] = MD5) -> dict[str, object]:
-    """bytes and sha256 of an archive; raises UsageError where its publisher's MD5 is known and another one."""
+    """Bytes and sha256 of an archive; raises UsageError where its publisher's MD5 is known and another one."""
     md5, sha256 = hashlib.md5(usedforsecurity=False), hashlib.sha256()
     try:
         with path.open("rb") as file:
@@ -49,8 +53,9 @@ def check(path: Path, published: Mapping[str, str] = MD5) -> dict[str, object]:
 def take(archive: Path, wanted: Mapping[str, Path]) -> dict[str, tuple[float, str]]:
     """Write recordings of a tar archive where they are wanted, as FLAC, and return their seconds and texts.
 
-    LibriSpeech keeps texts in SPEAKER-CHAPTER.trans.txt, speechocean762 in files called `text`; both have a name and the words in a line.
-    The archive is read once, from its beginning to its end; no path inside it decides where anything is written.
+    LibriSpeech keeps texts in SPEAKER-CHAPTER.trans.txt, speechocean762 in files called `text`; both have a name and
+    the words in a line. The archive is read once, from its beginning to its end; no path inside it decides where
+    anything is written.
 
     Parameters
     ----------
@@ -71,15 +76,21 @@ def take(archive: Path, wanted: Mapping[str, Path]) -> dict[str, tuple[float, st
             for member in members:
                 place = PurePosixPath(member.name)
                 if member.isfile() and place.stem in wanted and place.suffix.lower() in (".flac", ".wav"):
-                    seconds[place.stem] = _write(members.extractfile(member).read(), wanted[place.stem], f"{archive}:{place}")
+                    seconds[place.stem] = _write(
+                        members.extractfile(member).read(), wanted[place.stem], f"{archive}:{place}"
+                    )
                 elif member.isfile() and (place.name.endswith(".trans.txt") or place.name == "text"):
                     lines = members.extractfile(member).read().decode("utf-8").splitlines()
-                    texts |= {name: " ".join(words) for name, *words in map(str.split, filter(None, lines)) if name in wanted}
+                    texts |= {
+                        name: " ".join(words) for name, *words in map(str.split, filter(None, lines)) if name in wanted
+                    }
     except (tarfile.TarError, EOFError) as error:
         raise UsageError(f"{archive} cannot be read as a tar archive ({error}): download it again") from None
     for what, found in (("recordings", seconds), ("texts", texts)):
         if missing := [name for name in wanted if name not in found]:
-            raise UsageError(f"{archive} lacks {len(missing)} of {len(wanted)} {what}, {missing[0]} first: is it the right archive?")
+            raise UsageError(
+                f"{archive} lacks {len(missing)} of {len(wanted)} {what}, {missing[0]} first: is it the right archive?"
+            )
     return {name: (seconds[name], texts[name].lower()) for name in wanted}
 
 
@@ -87,7 +98,9 @@ def _write(content: bytes, path: Path, name: str) -> float:
     """Write FLAC; what is FLAC already stays bit for bit. Returns its length in seconds."""
     about = sf.info(io.BytesIO(content))
     if about.samplerate != SAMPLE_RATE or about.channels != 1:
-        raise UsageError(f"{name} has {about.samplerate} Hz and {about.channels} channels, expected {SAMPLE_RATE} Hz mono")
+        raise UsageError(
+            f"{name} has {about.samplerate} Hz and {about.channels} channels, expected {SAMPLE_RATE} Hz mono"
+        )
     path.parent.mkdir(parents=True, exist_ok=True)
     if about.format == "FLAC":
         path.write_bytes(content)

@@ -1,17 +1,20 @@
-"""Build HUMAN, ROBOT and WHISPER, the folders that every benchmark and training starts from, out of public downloads.
+r"""Build HUMAN, ROBOT and WHISPER, the folders that every benchmark and training starts from, out of public downloads.
 
-    python -m bench.simulate.corpora --output DATA --archives train-clean-100.tar.gz test-clean.tar.gz test-other.tar.gz speechocean762.tar.gz
-    python -m bench.simulate.corpora --output DATA --kokoro kokoro-v1.0.int8.onnx voices-v1.0.bin    (or --renderings DIR)
+    python -m bench.simulate.corpora --output DATA --archives train-clean-100.tar.gz test-clean.tar.gz \
+        test-other.tar.gz speechocean762.tar.gz
+    python -m bench.simulate.corpora --output DATA --kokoro kokoro-v1.0.int8.onnx voices-v1.0.bin  (or --renderings DIR)
     python -m bench.simulate.corpora --output DATA --whisper whisper-base
 
-Archives: LibriSpeech (openslr.org/12) and speechocean762 (openslr.org/101), as they were downloaded. DATA/human/train, val and test are each made
-when all archives of theirs were given; DATA/robot likewise has train, val and test, each with a transcripts.tsv (path, speaker, seconds,
-text). Which recordings and sentences: selection.tsv and robot_sentences.tsv beside this file. --whisper takes the folder of
-openai/whisper-base and converts it to DATA/whisper (needs ct2-transformers-converter). Nothing is fetched.
+Archives: LibriSpeech (openslr.org/12) and speechocean762 (openslr.org/101), as they were downloaded. DATA/human/train,
+val and test are each made when all archives of theirs were given; DATA/robot likewise has train, val and test, each
+with a transcripts.tsv (path, speaker, seconds, text). Which recordings and sentences: selection.tsv and
+robot_sentences.tsv beside this file. --whisper takes the folder of openai/whisper-base and converts it to DATA/whisper
+(needs ct2-transformers-converter). Nothing is fetched.
 
-LibriSpeech's archives are held against the checksums published with them. All that was read and made is written down in DATA/checksums.tsv
-(what, files, bytes, sha256); --checksums FILE, somebody else's such file, is compared with it: exit code 1 and a line for each
-difference. Renderings and Whisper's conversion depend on versions of their packages, recordings on nothing.
+LibriSpeech's archives are held against the checksums published with them. All that was read and made is written down in
+DATA/checksums.tsv (what, files, bytes, sha256); --checksums FILE, somebody else's such file, is compared with it: exit
+code 1 and a line for each difference. Renderings and Whisper's conversion depend on versions of their packages,
+recordings on nothing.
 """
 
 from __future__ import annotations
@@ -43,10 +46,16 @@ def human(given: Sequence[Path], output: Path) -> tuple[Sums, list[str]]:
     by_name = {archives.archive_name(path): path for path in given}
     if strange := set(by_name) - {utterance.archive for utterance in selected}:
         known = ", ".join(sorted({utterance.archive for utterance in selected}))
-        raise UsageError(f"nothing is taken from {', '.join(sorted(strange))}, expected archives called {known}: keep their names")
+        raise UsageError(
+            f"nothing is taken from {', '.join(sorted(strange))}, expected archives called {known}: keep their names"
+        )
     needed = {name: {u.archive for u in selected if u.folder == name} for name in SETS}
     complete = [name for name in SETS if needed[name] <= set(by_name)]
-    left_out = [f"human/{name} needs {', '.join(sorted(needed[name] - set(by_name)))} as well" for name in SETS if name not in complete]
+    left_out = [
+        f"human/{name} needs {', '.join(sorted(needed[name] - set(by_name)))} as well"
+        for name in SETS
+        if name not in complete
+    ]
     chosen = [utterance for utterance in selected if utterance.folder in complete]
     sums: Sums = {}
     found: dict[tuple[str, str], tuple[float, str]] = {}
@@ -77,7 +86,9 @@ def robot(render: robot_voices.Renderer, output: Path) -> Sums:
 def whisper(source: Path, output: Path) -> Sums:
     """Convert the folder of openai/whisper-base to DATA/whisper."""
     if not (source / "config.json").is_file() or not (source / "tokenizer.json").is_file():
-        raise UsageError(f"{source} holds no config.json and tokenizer.json, expected a download of openai/whisper-base")
+        raise UsageError(
+            f"{source} holds no config.json and tokenizer.json, expected a download of openai/whisper-base"
+        )
     program = shutil.which(CONVERTER)
     if program is None:
         raise UsageError(f"there is no {CONVERTER}: pip install ctranslate2 transformers torch")
@@ -124,8 +135,12 @@ def build(options: argparse.Namespace) -> int:
         sums |= made
         print(*left_out, sep="\n", file=sys.stderr, end="\n" if left_out else "")
     if options.kokoro or options.renderings:
-        render = robot_voices.renderings(options.renderings) if options.renderings else robot_voices.kokoro(*options.kokoro)
-        sums |= {path.name: results_writer.digest(path) for path in options.kokoro or ()} | robot(render, options.output)
+        render = (
+            robot_voices.renderings(options.renderings) if options.renderings else robot_voices.kokoro(*options.kokoro)
+        )
+        sums |= {path.name: results_writer.digest(path) for path in options.kokoro or ()} | robot(
+            render, options.output
+        )
     if options.whisper:
         sums |= whisper(options.whisper, options.output)
     keep(sums, options.output / "checksums.tsv")
@@ -139,10 +154,18 @@ def build(options: argparse.Namespace) -> int:
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--output", type=Path, required=True, metavar="DATA")
-    parser.add_argument("--archives", type=Path, nargs="+", metavar="ARCHIVE", help="of LibriSpeech and speechocean762, names as published")
+    parser.add_argument(
+        "--archives",
+        type=Path,
+        nargs="+",
+        metavar="ARCHIVE",
+        help="of LibriSpeech and speechocean762, names as published",
+    )
     voices = parser.add_mutually_exclusive_group()
     voices.add_argument("--kokoro", type=Path, nargs=2, metavar=("MODEL", "VOICES"), help="render the robot's voices")
-    voices.add_argument("--renderings", type=Path, metavar="DIR", help="take them from DIR/VOICE/NNN.wav, .flac or .ogg")
+    voices.add_argument(
+        "--renderings", type=Path, metavar="DIR", help="take them from DIR/VOICE/NNN.wav, .flac or .ogg"
+    )
     parser.add_argument("--whisper", type=Path, metavar="DIR", help="a download of openai/whisper-base")
     parser.add_argument("--checksums", type=Path, metavar="FILE", help="compare with this checksums.tsv")
     options = parser.parse_args()

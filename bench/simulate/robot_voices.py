@@ -21,12 +21,15 @@ Renderer = Callable[[Sentence], tuple[np.ndarray, int]]
 def kokoro(model: Path, voices: Path) -> Renderer:
     """Renders with the package kokoro-onnx, British voices (b...) in British English.
 
-    model, voices: kokoro-v1.0.int8.onnx and voices-v1.0.bin of its release of model files. Raises UsageError without the package.
+    model, voices: kokoro-v1.0.int8.onnx and voices-v1.0.bin of its release of model files. Raises UsageError without
+    the package.
     """
     try:
         from kokoro_onnx import Kokoro
     except ImportError as error:
-        raise UsageError("rendering needs the package kokoro-onnx: pip install kokoro-onnx, or give --renderings") from error
+        raise UsageError(
+            "rendering needs the package kokoro-onnx: pip install kokoro-onnx, or give --renderings"
+        ) from error
     engine = Kokoro(str(model), str(voices))
 
     def render(sentence: Sentence) -> tuple[np.ndarray, int]:
@@ -40,10 +43,14 @@ def renderings(folder: Path) -> Renderer:
     """Takes FOLDER/VOICE/NNN.flac, .wav or .ogg, or FOLDER/SET/VOICE/...; raises UsageError for one that is missing."""
 
     def read(sentence: Sentence) -> tuple[np.ndarray, int]:
-        places = [root / f"{sentence.path}{suffix}" for root in (folder, folder / sentence.folder) for suffix in SUFFIXES]
+        places = [
+            root / f"{sentence.path}{suffix}" for root in (folder, folder / sentence.folder) for suffix in SUFFIXES
+        ]
         found = next((place for place in places if place.is_file()), None)
         if found is None:
-            raise UsageError(f"{folder} holds no {sentence.path}.flac, .wav or .ogg, expected a rendering of '{sentence.text}'")
+            raise UsageError(
+                f"{folder} holds no {sentence.path}.flac, .wav or .ogg, expected a rendering of '{sentence.text}'"
+            )
         samples, rate = sf.read(found, dtype="float32", always_2d=True)
         return samples.mean(axis=1), rate
 

@@ -1,7 +1,8 @@
 """Which recordings of public corpora are HUMAN/train, val and test, and which sentences the robot's voices read.
 
-selection.tsv: set, archive, speaker, chapter (empty for speechocean762), utterances ("0-4,9"). robot_sentences.tsv: set, voice, number, text.
-Both are in the order of the transcripts that they lead to: what is simulated from a folder draws by position.
+selection.tsv: set, archive, speaker, chapter (empty for speechocean762), utterances ("0-4,9"). robot_sentences.tsv:
+set, voice, number, text. Both are in the order of the transcripts that they lead to: what is simulated from a folder
+draws by position.
 """
 
 from __future__ import annotations
@@ -73,7 +74,8 @@ def utterance_name(row: dict[str, str], number: int) -> str:
 
 
 def numbers(text: str) -> list[int]:
-    """
+    """Numbers from a list of numbers and ranges.
+
     >>> numbers("0-2,9")
     [0, 1, 2, 9]
     """

@@ -56,15 +56,17 @@ def librispeech(folder: Path, name: str, speaker: str, chapter: str, count: int)
     place = f"LibriSpeech/{name}/{speaker}/{chapter}"
     names = [f"{speaker}-{chapter}-{number:04d}" for number in range(count)]
     files = {f"{place}/{key}.flac": encoded(sound(number), "FLAC") for number, key in enumerate(names)}
-    files[f"{place}/{speaker}-{chapter}.trans.txt"] = "".join(f"{key} THE TEXT OF {i}\n" for i, key in enumerate(names)).encode()
+    files[f"{place}/{speaker}-{chapter}.trans.txt"] = "".join(
+        f"{key} THE TEXT OF {i}\n" for i, key in enumerate(names)
+    ).encode()
     return pack(folder / f"{name}.tar.gz", {"LibriSpeech/SPEAKERS.TXT": b"; of no use here\n", **files})
 
 
 def speechocean(folder: Path) -> Path:
     names = ("000360034", "000360036", "000360099")
     files = {f"speechocean762/WAVE/SPEAKER0036/{name}.WAV": encoded(sound(i), "WAV") for i, name in enumerate(names)}
-    files["speechocean762/train/text"] = "000360034\tWE SPEAK OUT\n".encode()
-    files["speechocean762/test/text"] = "000360036 I COULD DO\n000360099 NOT TAKEN\n".encode()
+    files["speechocean762/train/text"] = b"000360034\tWE SPEAK OUT\n"
+    files["speechocean762/test/text"] = b"000360036 I COULD DO\n000360099 NOT TAKEN\n"
     return pack(folder / "speechocean762.tar.gz", files)
 
 
@@ -77,7 +79,10 @@ def given(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[Path]:
         (tmp_path / name).write_text(text, encoding="utf-8")
     monkeypatch.setattr(selection.read_selection, "__defaults__", (tmp_path / "SELECTION",))
     monkeypatch.setattr(selection.read_sentences, "__defaults__", (tmp_path / "SENTENCES",))
-    made = [librispeech(folder, "train-clean-100", "103", "1240", 2), librispeech(folder, "test-clean", "1089", "134", 10)]
+    made = [
+        librispeech(folder, "train-clean-100", "103", "1240", 2),
+        librispeech(folder, "test-clean", "1089", "134", 10),
+    ]
     made += [librispeech(folder, "test-other", "367", "13", 3), speechocean(folder)]
     for path in made[:3]:
         monkeypatch.setitem(archives.MD5, archives.archive_name(path), hashlib.md5(path.read_bytes()).hexdigest())
@@ -89,7 +94,9 @@ def run(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> int:
     return corpora.main()
 
 
-def test_human_has_the_selected_recordings_and_their_texts(given: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_human_has_the_selected_recordings_and_their_texts(
+    given: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     data = tmp_path / "data"
     assert run(monkeypatch, "--output", data, "--archives", *given) == 0
     told = {name: (data / "human" / name / "transcripts.tsv").read_text(encoding="utf-8") for name in corpora.SETS}
@@ -153,7 +160,12 @@ def test_published_checksums_are_those_of_librispeech() -> None:
     ],
 )
 def test_an_archive_that_is_not_what_it_should_be_is_one_line(
-    damage: str, says: str, given: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    damage: str,
+    says: str,
+    given: list[Path],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     path = given[1]
     place = "LibriSpeech/test-clean/1089/134"
@@ -182,7 +194,10 @@ def test_an_archive_that_is_not_what_it_should_be_is_one_line(
 
 
 def test_no_path_inside_an_archive_decides_where_anything_is_written(tmp_path: Path) -> None:
-    path = pack(tmp_path / "test-clean.tar.gz", {"../../a-1-0000.flac": encoded(sound(0), "FLAC"), "a-1.trans.txt": b"a-1-0000 HI\n"})
+    path = pack(
+        tmp_path / "test-clean.tar.gz",
+        {"../../a-1-0000.flac": encoded(sound(0), "FLAC"), "a-1.trans.txt": b"a-1-0000 HI\n"},
+    )
     target = tmp_path / "in" / "deep" / "here.flac"
     assert archives.take(path, {"a-1-0000": target}) == {"a-1-0000": (0.5, "hi")}
     assert [file for file in tmp_path.rglob("*.flac")] == [target]
@@ -201,7 +216,10 @@ def test_robot_takes_renderings_of_any_rate_and_says_which_is_missing(
     (folder / "af_three").mkdir()
     sf.write(folder / "af_three/001.wav", np.stack((tone, tone), axis=1), 24000)
     assert run(monkeypatch, "--output", tmp_path / "data", "--renderings", folder) == 0
-    for name, row in (("train", "af_one/000.flac\taf_one\t1.00\tthe first sentence"), ("test", "af_three/001.flac\taf_three\t1.00\tthe last")):
+    for name, row in (
+        ("train", "af_one/000.flac\taf_one\t1.00\tthe first sentence"),
+        ("test", "af_three/001.flac\taf_three\t1.00\tthe last"),
+    ):
         assert (tmp_path / "data/robot" / name / "transcripts.tsv").read_text(encoding="utf-8") == row + "\n"
         samples, rate = sf.read(tmp_path / "data/robot" / name / row.split("\t")[0])
         wanted = 0.5 * np.sin(2 * np.pi * 440 * np.arange(RATE) / RATE)
@@ -239,8 +257,14 @@ def test_whisper_is_converted_by_the_published_converter(
     assert run(monkeypatch, "--output", tmp_path / "data", "--whisper", source) == 1
     assert "pip install ctranslate2 transformers torch" in capsys.readouterr().err
     program = programs / corpora.CONVERTER
-    lines = [f"#!{sys.executable}", "import pathlib, sys", "folder = pathlib.Path(sys.argv[sys.argv.index('--output_dir') + 1])"]
-    program.write_text("\n".join([*lines, "folder.mkdir()", "(folder / 'model.bin').write_text(' '.join(sys.argv[1:3]))", ""]))
+    lines = [
+        f"#!{sys.executable}",
+        "import pathlib, sys",
+        "folder = pathlib.Path(sys.argv[sys.argv.index('--output_dir') + 1])",
+    ]
+    program.write_text(
+        "\n".join([*lines, "folder.mkdir()", "(folder / 'model.bin').write_text(' '.join(sys.argv[1:3]))", ""])
+    )
     program.chmod(program.stat().st_mode | stat.S_IXUSR)
     assert run(monkeypatch, "--output", tmp_path / "data", "--whisper", source) == 0
     assert (tmp_path / "data/whisper/model.bin").read_text() == f"--model {source}"
@@ -258,7 +282,9 @@ def test_the_shipped_selection_keeps_test_speakers_and_voices_apart() -> None:
     counts = {name: sum(u.folder == name for u in chosen) for name in corpora.SETS}
     assert counts == {"train": 2851, "val": 92, "test": 120}
     assert {name: sum(s.folder == name for s in read) for name in corpora.SETS} == {"train": 549, "val": 36, "test": 72}
-    assert len({(u.folder, u.path) for u in chosen}) == len(chosen) and len({(s.folder, s.path) for s in read}) == len(read)
+    assert len({(u.folder, u.path) for u in chosen}) == len(chosen) and len({(s.folder, s.path) for s in read}) == len(
+        read
+    )
 
 
 def test_nothing_to_do_is_wrong_usage(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

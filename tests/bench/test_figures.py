@@ -1,7 +1,7 @@
 """The figures of README.md, bench/README.md and docs/diagnosis.md are those of bench/results, and no line mixes runs.
 
-A figure is quoted with the digits that its text has; it must be its result rounded to them. Who moves or rewords a sentence moves
-its pattern here; who measures anew takes the file off UNSTAMPED.
+A figure is quoted with the digits that its text has; it must be its result rounded to them. Who moves or rewords a
+sentence moves its pattern here; who measures anew takes the file off UNSTAMPED.
 """
 
 from __future__ import annotations
@@ -65,7 +65,9 @@ def quality(file: str, kind: str, room: str, engine: str) -> tuple[float, float]
 
 def hop(contender: str, paced: bool) -> dict:
     rows = result("latency")["rows"]
-    (row,) = (r for r in rows if r["contender"] == contender and r["paced"] == paced and r["threads"] == 1 and not r["busy"])
+    (row,) = (
+        r for r in rows if r["contender"] == contender and r["paced"] == paced and r["threads"] == 1 and not r["busy"]
+    )
     return row
 
 
@@ -91,7 +93,12 @@ def barge_in() -> dict:
     rows = result("barge_in")["rows"]
     delays = [np.inf if row["delay_ms"] is None else row["delay_ms"] / 1000 for row in rows if not row["early"]]
     p50, p90 = np.quantile(delays, (0.5, 0.9), method="higher")
-    return {"p50": p50, "p90": p90, "alarms": sum(r["alarms"] for r in rows), "minutes": sum(r["seconds"] for r in rows) / 60}
+    return {
+        "p50": p50,
+        "p90": p90,
+        "alarms": sum(r["alarms"] for r in rows),
+        "minutes": sum(r["seconds"] for r in rows) / 60,
+    }
 
 
 def utterances() -> list[dict]:
@@ -140,35 +147,55 @@ def seconds() -> tuple[float, float]:
 
 DOCUMENTS = ("README.md", "bench/README.md", "docs/diagnosis.md")
 FIGURES: dict[str, tuple[tuple[str, ...], Callable[[], object]]] = {
-    # a pattern with a group a figure: the results that it is from, and a function that makes the figures in the groups' order
+    # a pattern with a group a figure: the results that it is from, and what makes the figures in the groups' order
     rf"unfiltered: {NUMBER} dB in the lab, {NUMBER} dB in the office": (
         ("quality_generated",),
         lambda: [quality("generated", "paper", room, "unfiltered")[0] for room in ("lab", "office")],
     ),
-    rf"`crnn` {NUMBER} / {NUMBER} in the lab, {NUMBER} / {NUMBER} in the office; live {NUMBER} / {NUMBER} and {NUMBER} / {NUMBER}": (
+    rf"`crnn` {NUMBER} / {NUMBER} in the lab, {NUMBER} / {NUMBER} in the office; "
+    rf"live {NUMBER} / {NUMBER} and {NUMBER} / {NUMBER}": (
         ("quality_shared",),
-        lambda: [x for kind in ("paper", "live") for room in ("lab", "office") for x in quality("shared", kind, room, "crnn")],
+        lambda: [
+            x for kind in ("paper", "live") for room in ("lab", "office") for x in quality("shared", kind, room, "crnn")
+        ],
     ),
     rf"[Aa]ligned {NUMBER} ms \(median\) after its first sound": (("alignment",), lambda: [time_to_align()]),
-    rf"p50 / p99: `ss` {NUMBER} / {NUMBER} ms, `crnn` {NUMBER} / {NUMBER} ms": (("latency",), lambda: [*paced("ss"), *paced("crnn")]),
+    rf"p50 / p99: `ss` {NUMBER} / {NUMBER} ms, `crnn` {NUMBER} / {NUMBER} ms": (
+        ("latency",),
+        lambda: [*paced("ss"), *paced("crnn")],
+    ),
     rf"back to back {NUMBER} and {NUMBER} of one core": (
         ("latency",),
         lambda: [hop(name, False)["real_time_factor"] for name in ("ss", "crnn")],
     ),
-    rf"start to first hop {NUMBER} s": (("latency",), lambda: [np.median([s["seconds"] for s in result("latency")["start"]["crnn"]])]),
-    rf"named first in {NUMBER} of {NUMBER}, both of two in {NUMBER} of {NUMBER}, {NUMBER} false alarms in {NUMBER}, all {NUMBER} that are": (
+    rf"start to first hop {NUMBER} s": (
+        ("latency",),
+        lambda: [np.median([s["seconds"] for s in result("latency")["start"]["crnn"]])],
+    ),
+    rf"named first in {NUMBER} of {NUMBER}, both of two in {NUMBER} of {NUMBER}, "
+    rf"{NUMBER} false alarms in {NUMBER}, all {NUMBER} that are": (
         ("hidden_effects",),
-        lambda: [*top_1(), *hidden("pairs: both named"), *hidden("false alarms on controls"), hidden("outside: unexplained")[0]],
+        lambda: [
+            *top_1(),
+            *hidden("pairs: both named"),
+            *hidden("false alarms on controls"),
+            hidden("outside: unexplained")[0],
+        ],
     ),
     rf"`ss` lowers it there by {NUMBER} and {NUMBER} dB": (("real_recordings",), lambda: lowered("ss")),
     rf"with distortion at -\d+ to -\d+ dB `crnn` ends at {NUMBER} dB in the lab \(`ss` {NUMBER}\)": (
         ("quality_generated",),
-        lambda: [np.mean([quality("generated", kind, "lab", e)[0] for kind in ("paper", "live")]) for e in ("crnn", "ss")],
+        lambda: [
+            np.mean([quality("generated", kind, "lab", e)[0] for kind in ("paper", "live")]) for e in ("crnn", "ss")
+        ],
     ),
     rf"and at {NUMBER} to {NUMBER} dB in the office \(`ss` {NUMBER} to {NUMBER}\)": (
         ("quality_generated",),
-        lambda: [quality("generated", kind, "office", e)[0] for e, kinds in
-                 (("crnn", ("live", "paper")), ("ss", ("paper", "live"))) for kind in kinds],
+        lambda: [
+            quality("generated", kind, "office", e)[0]
+            for e, kinds in (("crnn", ("live", "paper")), ("ss", ("paper", "live")))
+            for kind in kinds
+        ],
     ),
     rf"comes out of `crnn` with {NUMBER}-{NUMBER} dB of SI-SDR": (
         ("alone",),
@@ -178,13 +205,15 @@ FIGURES: dict[str, tuple[tuple[str, ...], Callable[[], object]]] = {
         ("alone",),
         lambda: [-np.median(alone("robot")), len(alone("robot")), max(alone("robot"))],
     ),
-    rf"noticed {NUMBER} s \(median; p90 {NUMBER} s\) after the human's first sound, {NUMBER} false alarms in {NUMBER} minutes": (
+    rf"noticed {NUMBER} s \(median; p90 {NUMBER} s\) after the human's first sound, "
+    rf"{NUMBER} false alarms in {NUMBER} minutes": (
         ("barge_in",),
         lambda: [barge_in()[key] for key in ("p50", "p90", "alarms", "minutes")],
     ),
     rf"lag is found \({NUMBER} ms after its first sound, median\)": (("alignment",), lambda: [time_to_align()]),
     rf"{NUMBER} of {NUMBER} utterances within 1 ms of their lag": (("alignment",), lambda: aligned()),
-    rf"{NUMBER} of {NUMBER} dropped buffers of up to 500 samples healed within 200 ms of robot speech, {NUMBER} of {NUMBER} of 1500": (
+    rf"{NUMBER} of {NUMBER} dropped buffers of up to 500 samples healed within 200 ms of robot speech, "
+    rf"{NUMBER} of {NUMBER} of 1500": (
         ("alignment",),
         lambda: [*jumps(False), *jumps(True)],
     ),
@@ -195,21 +224,33 @@ FIGURES: dict[str, tuple[tuple[str, ...], Callable[[], object]]] = {
     ),
     rf"false alarm \| {NUMBER} of {NUMBER} \|": (("hidden_effects",), lambda: hidden("false alarms on controls")),
     rf"both named \| {NUMBER} of {NUMBER} \|": (("hidden_effects",), lambda: hidden("pairs: both named")),
-    rf"catalogue: `unexplained` \| {NUMBER} of {NUMBER} \|": (("hidden_effects",), lambda: hidden("outside: unexplained")),
+    rf"catalogue: `unexplained` \| {NUMBER} of {NUMBER} \|": (
+        ("hidden_effects",),
+        lambda: hidden("outside: unexplained"),
+    ),
     rf"median, longest \| {NUMBER}, {NUMBER} \|": (("hidden_effects",), seconds),
     rf"named first in {NUMBER} of {NUMBER} that hide one effect, both effects in {NUMBER} of {NUMBER}": (
         ("hidden_effects",),
-        lambda: [sum(hidden(f"top-1, {s}", "dev")[i] for s in ("clear", "moderate", "near")) for i in (0, 1)]
-        + [*hidden("pairs: both named", "dev")],
+        lambda: (
+            [sum(hidden(f"top-1, {s}", "dev")[i] for s in ("clear", "moderate", "near")) for i in (0, 1)]
+            + [*hidden("pairs: both named", "dev")]
+        ),
     ),
-    rf"{NUMBER} of {NUMBER} controls raise a false alarm, {NUMBER} of {NUMBER} from outside the catalogue are `unexplained`": (
+    rf"{NUMBER} of {NUMBER} controls raise a false alarm, "
+    rf"{NUMBER} of {NUMBER} from outside the catalogue are `unexplained`": (
         ("hidden_effects",),
         lambda: [*hidden("false alarms on controls", "dev"), *hidden("outside: unexplained", "dev")],
     ),
-    rf"{NUMBER} of {NUMBER} sealed ones match their seal": (("hidden_effects",), lambda: hidden("sealed: exact label", "sealed")),
+    rf"{NUMBER} of {NUMBER} sealed ones match their seal": (
+        ("hidden_effects",),
+        lambda: hidden("sealed: exact label", "sealed"),
+    ),
     rf"\| mean \| \| {NUMBER} -> {NUMBER} \|": (
         ("diagnosis_story",),
-        lambda: [np.mean([r[f"excess_{when}_db"] for r in result("diagnosis_story")["conversations"]]) for when in ("before", "after")],
+        lambda: [
+            np.mean([r[f"excess_{when}_db"] for r in result("diagnosis_story")["conversations"]])
+            for when in ("before", "after")
+        ],
     ),
     rf"\| mean .{{30,60}} \| {NUMBER} / {NUMBER} -> {NUMBER} / {NUMBER} \|": (
         ("diagnosis_story",),
@@ -228,7 +269,12 @@ def table() -> Iterator[tuple[str, list[str]]]:
     """Rows of the README's first table: name and cells."""
     lines = (ROOT / "README.md").read_text(encoding="utf-8").splitlines()
     start = next(i for i, line in enumerate(lines) if line.startswith("| SI-SDR dB / words wrong % |"))
-    assert [cell.strip() for cell in lines[start].strip("|").split("|")][1:] == ["lab", "office", "lab, live", "office, live"]
+    assert [cell.strip() for cell in lines[start].strip("|").split("|")][1:] == [
+        "lab",
+        "office",
+        "lab, live",
+        "office, live",
+    ]
     for line in lines[start + 2 :]:
         if not line.startswith("|"):
             return
@@ -269,9 +315,13 @@ def test_the_story_told_is_the_one_that_was_measured() -> None:
 def assert_one_run(names: set[str], what: str) -> None:
     """Results that share a line have one stamp: the same code and, of each model that both used, the same file."""
     stamps = {name: result(name).get("stamp") for name in names}
-    assert len({stamp is None for stamp in stamps.values()}) == 1, f"{what} mixes results with and without a stamp: {sorted(names)}"
+    assert len({stamp is None for stamp in stamps.values()}) == 1, (
+        f"{what} mixes results with and without a stamp: {sorted(names)}"
+    )
     if None not in stamps.values():
-        assert len({stamp["code"] for stamp in stamps.values()}) == 1, f"{what} mixes runs of different code: {sorted(names)}"
+        assert len({stamp["code"] for stamp in stamps.values()}) == 1, (
+            f"{what} mixes runs of different code: {sorted(names)}"
+        )
         files: dict[str, set[str]] = {}
         for stamp in stamps.values():
             for model, about in stamp["models"].items():
@@ -294,7 +344,9 @@ def test_results_without_a_stamp_are_those_on_the_list() -> None:
 def test_a_stamp_is_of_committed_code_and_stands_on_the_page_as_well() -> None:
     for name in set(FILES) - set(UNSTAMPED):
         stamp, page = result(name)["stamp"], (RESULTS / f"{name}.md").read_text(encoding="utf-8")
-        assert re.fullmatch("[0-9a-f]{40}", stamp["commit"]) and not stamp["dirty"], f"{name} was made by code that is not committed"
+        assert re.fullmatch("[0-9a-f]{40}", stamp["commit"]) and not stamp["dirty"], (
+            f"{name} was made by code that is not committed"
+        )
         assert re.fullmatch("[0-9a-f]{64}", stamp["code"]) and stamp["machine"] and stamp["date"].endswith("UTC")
         hashes = [entry["sha256"] for entry in (*stamp["data"], *stamp["models"].values())]
         assert all(shown[:12] in page for shown in (stamp["commit"], *hashes)) and stamp["command"] in page
@@ -304,11 +356,15 @@ def test_results_name_no_folder_of_a_machine() -> None:
     assert len(FILES) >= 15
     for path in RESULTS.iterdir():
         if path.suffix in (".json", ".md"):
-            found = re.findall(r"(?<![\w.])/(?:home|root|tmp|work|Users|mnt|data)/\S*", path.read_text(encoding="utf-8"))
+            found = re.findall(
+                r"(?<![\w.])/(?:home|root|tmp|work|Users|mnt|data)/\S*", path.read_text(encoding="utf-8")
+            )
             assert not found, f"{path.name}: {found[:3]}"
 
 
-@pytest.mark.parametrize(("shown", "value", "right"), [("9.9", 9.94, True), ("9.9", 9.96, False), ("35", 35.4, True), ("-5.0", -5.04, True)])
+@pytest.mark.parametrize(
+    ("shown", "value", "right"), [("9.9", 9.94, True), ("9.9", 9.96, False), ("35", 35.4, True), ("-5.0", -5.04, True)]
+)
 def test_rounding_is_to_the_digits_that_are_shown(shown: str, value: float, right: bool) -> None:
     if right:
         assert_rounded(shown, value, "")

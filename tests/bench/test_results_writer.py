@@ -48,12 +48,24 @@ def test_an_empty_folder_or_a_missing_model_is_one_line(tmp_path: Path) -> None:
         results_writer.stamp(models={"WHISPER": tmp_path / "model.bin"})
 
 
-def test_stamp_and_pages_hold_no_folder_of_this_machine(data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_stamp_and_pages_hold_no_folder_of_this_machine(
+    data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     network, whisper, output = tmp_path / "best.pt", tmp_path / "ct2", tmp_path / "results" / "quality.v1"
     network.write_bytes(b"weights")
     whisper.mkdir()
     (whisper / "model.bin").write_bytes(b"words")
-    arguments = ["--speech", str(data), "--whisper", str(whisper), f"--cache={tmp_path}/kept", "--output", str(output), "--seed", "3"]
+    arguments = [
+        "--speech",
+        str(data),
+        "--whisper",
+        str(whisper),
+        f"--cache={tmp_path}/kept",
+        "--output",
+        str(output),
+        "--seed",
+        "3",
+    ]
     monkeypatch.setattr("sys.argv", [str(tmp_path / "quality.py"), *arguments])
     made_with = results_writer.stamp({"HUMAN": [data]}, models={"WHISPER": whisper, "best.pt": network, "other": None})
     wanted = "python -m quality --speech HUMAN/val --whisper WHISPER --cache=kept --output quality.v1 --seed 3"
@@ -72,7 +84,9 @@ def test_an_engine_with_a_network_brings_the_hash_of_its_file(monkeypatch: pytes
     path = create("crnn").model.path
     wanted = {path.name: hashlib.sha256(path.read_bytes()).hexdigest()}
     for names in (["ss", "crnn"], ["auto"]):
-        assert {name: entry["sha256"] for name, entry in results_writer.stamp(engine_names=names)["models"].items()} == wanted
+        assert {
+            name: entry["sha256"] for name, entry in results_writer.stamp(engine_names=names)["models"].items()
+        } == wanted
     assert results_writer.stamp(engine_names=["ss", "aec3"])["models"] == {}
 
 
@@ -98,8 +112,18 @@ def test_a_changed_tree_is_dirty_and_changed_results_are_not(tmp_path: Path, mon
 
 
 def test_numbers_become_plain_and_what_is_not_finite_null() -> None:
-    content = {"a": np.float32(0.5), "b": [np.nan, float("inf"), 1], "c": np.arange(2), "d": (np.int64(3), True, None, "x")}
-    assert json.loads(results_writer.to_json(content)) == {"a": 0.5, "b": [None, None, 1], "c": [0, 1], "d": [3, True, None, "x"]}
+    content = {
+        "a": np.float32(0.5),
+        "b": [np.nan, float("inf"), 1],
+        "c": np.arange(2),
+        "d": (np.int64(3), True, None, "x"),
+    }
+    assert json.loads(results_writer.to_json(content)) == {
+        "a": 0.5,
+        "b": [None, None, 1],
+        "c": [0, 1],
+        "d": [3, True, None, "x"],
+    }
 
 
 def test_machine_tells_how_many_threads_were_allowed(monkeypatch: pytest.MonkeyPatch) -> None:

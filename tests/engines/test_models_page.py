@@ -14,14 +14,18 @@ FOR_TESTS = sorted((ROOT / "tests" / "data").glob("*.onnx"))
 
 
 def metadata(path: Path) -> dict[str, str]:
-    return onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"]).get_modelmeta().custom_metadata_map
+    return (
+        onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"]).get_modelmeta().custom_metadata_map
+    )
 
 
 def page() -> dict[str, dict[str, str]]:
     """The rows of the page's first table by file, cells by column."""
     lines = (ROOT / "models" / "MODELS.md").read_text(encoding="utf-8").splitlines()
     start = next(i for i, line in enumerate(lines) if line.startswith("| file |"))
-    head, *rows = ([cell.strip() for cell in line.strip("|").split("|")] for line in lines[start:] if line.startswith("|"))
+    head, *rows = (
+        [cell.strip() for cell in line.strip("|").split("|")] for line in lines[start:] if line.startswith("|")
+    )
     rows = rows[1 : next(i for i, row in enumerate(rows) if len(row) != len(head))]
     return {row[0].split(",")[0]: dict(zip(head, row, strict=True)) for row in rows}
 
@@ -59,7 +63,10 @@ def test_variants_of_a_network_say_the_same_of_its_training() -> None:
 @pytest.mark.parametrize("path", FOR_TESTS, ids=lambda path: path.name)
 def test_networks_for_tests_say_that_nothing_was_trained(path: Path) -> None:
     said = metadata(path)
-    assert json.loads(said["training"]) == {"data": "none: random weights", "seed": 0} and json.loads(said["figures"]) == {}
+    assert (
+        json.loads(said["training"]) == {"data": "none: random weights", "seed": 0}
+        and json.loads(said["figures"]) == {}
+    )
 
 
 def test_there_are_networks_for_tests() -> None:

@@ -28,8 +28,12 @@ def test_training_is_replaced_and_all_else_stays(tmp_path: Path) -> None:
     assert [file.name for file in tmp_path.iterdir()] == [path.name]
 
 
-@pytest.mark.parametrize(("content", "says"), [(b"no model", "cannot be read as an ONNX model"), (None, "no metadata about its training")])
-def test_what_is_no_exported_model_is_one_line_and_stays(content: bytes | None, says: str, tmp_path: Path, capsys) -> None:
+@pytest.mark.parametrize(
+    ("content", "says"), [(b"no model", "cannot be read as an ONNX model"), (None, "no metadata about its training")]
+)
+def test_what_is_no_exported_model_is_one_line_and_stays(
+    content: bytes | None, says: str, tmp_path: Path, capsys
+) -> None:
     path = tmp_path / "m.onnx"
     if content is None:
         model = onnx.load(str(TINY))
