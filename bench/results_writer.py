@@ -40,7 +40,7 @@ def stamp(
     Parameters
     ----------
     data
-        Folders (or files) that are read, by what they are: ``{"HUMAN": [Path("human/val")]}``. Of a folder only its last
+        Folders (or files) that are read, by what they are: ``{"HUMAN": [Path("human/val")]}``. Of a folder its last
         part is written down, with the number and size of its files and their `digest`.
     engine_names
         Engines that run; the model files that the package would load for them are hashed.
@@ -51,7 +51,7 @@ def stamp(
     -------
     dict
         command, commit, dirty, code (sha256 of the package's Python files: two results with the same one are of the
-        same filter and diagnosis, whatever was committed in between), data (what, folder, files, bytes, sha256 of each),
+        same filter and diagnosis, whatever was committed in between), data (what, folder, files, bytes, sha256),
         models (by name: files, bytes, sha256; of a single file that of its content), machine, date (UTC).
 
     Raises
