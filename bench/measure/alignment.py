@@ -28,6 +28,9 @@ from bench.measure.intervals import percentiles
 from bench.simulate.alignment_scene import HEAD, RATE, fan, hear, known_path, room, run
 from edgefilter.alignment.aligner import Aligner
 
+TIMED = 6
+"""Conversations whose hops are timed, with a profile and without."""
+
 
 class Corpus:
     """Recordings of a folder, drawn at random, level 0.05 rms."""
@@ -123,12 +126,12 @@ def lag_trials(seed: int, count: int, voices: Corpus, speech: Corpus, costs: lis
 
 
 def cost_trials(seed: int, voices: Corpus, speech: Corpus) -> dict:
-    """Milliseconds per hop over six conversations with a profile and without, the first tenth left out.
+    """Milliseconds per hop over TIMED conversations with a profile and without, the first tenth left out.
 
     Others: processes running beside (Linux).
     """
     costs, running = [], [Path("/proc/loadavg").read_text().split()[3]]
-    lag_trials(seed, 6, voices, speech, costs)
+    lag_trials(seed, TIMED, voices, speech, costs)
     running.append(Path("/proc/loadavg").read_text().split()[3])
     ms = 1e3 * np.array(costs[len(costs) // 10 :])
     others = max(int(count.split("/")[0]) - 1 for count in running)

@@ -80,6 +80,7 @@ def test_real_recordings_without_an_echo_are_declined(tmp_path: Path, monkeypatc
 
 def test_alignment_and_its_cost_measured_later(clips: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(alignment, "JUMPS", (40, 1500))
+    monkeypatch.setattr(alignment, "TIMED", 1)
     folders = ("--voices", clips, "--speech", clips)
     sizes = ("--count", 1, "--minutes", 1, "--false-minutes", 0, "--repeats", 1, "--seed", 7)
     found, page = run(monkeypatch, alignment, tmp_path / "alignment", *folders, *sizes)
