@@ -14,6 +14,7 @@ import json
 import math
 import sys
 import time
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -74,11 +75,14 @@ def train(options: argparse.Namespace) -> Path:
     task = TASKS[options.network](options)
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     network = task.network().to(device)
+    before: Mapping[str, object] = {}
     if options.start:
-        start = load(options.start).network
-        if start.config != network.config:
-            raise UsageError(f"{options.start} holds a network of {start.config}, expected {network.config}: give the same --hop, --channels, --hidden and --norm")
-        network.load_state_dict(start.state_dict())
+        start = load(options.start)
+        found, wanted, before = start.network.config, network.config, start.training
+        if found != wanted:
+            remedy = "give the same --hop, --channels, --hidden and --norm"
+            raise UsageError(f"{options.start} holds a network of {found}, expected {wanted}: {remedy}")
+        network.load_state_dict(start.network.state_dict())
     average = {name: value.clone() for name, value in network.state_dict().items()}
     optimiser = torch.optim.AdamW(network.parameters(), lr=options.rate, weight_decay=1e-2, betas=(0.9, 0.98))
     items, held_out = Items(options.data), Items(options.validation)
@@ -118,7 +122,8 @@ def train(options: argparse.Namespace) -> Path:
             figures = validate(task, averaged, held_out, min(8.0, 2 * options.seconds))
             score = -figures["total"]
             since = 0 if score > best else since + 1
-            state = {"kind": task.kind, "config": task.config(), "network": average, "step": step + 1, "figures": figures, "seed": options.seed, "items": len(items.names)}
+            said = in_stages(before, step + 1, options.seed, len(items.names))
+            state = {"kind": task.kind, "config": task.config(), "network": average, "figures": figures, **said}
             if score > best:
                 best = score
                 torch.save(state, options.output / "best.pt")
@@ -133,6 +138,19 @@ def train(options: argparse.Namespace) -> Path:
                 print(f"stopped: {PATIENCE} validations without a better score")
                 break
     return options.output / "best.pt"
+
+
+def in_stages(before: Mapping[str, object], steps: int, seed: int, items: int) -> dict[str, object]:
+    """What a checkpoint says of its training: step of all stages together, seed, items; with --start also each stage's own.
+
+    before: what the network that training started from says of its own, empty where it started from nothing.
+    """
+    stage = {"steps": steps, "seed": seed, "items": items}
+    if not before:
+        return {"step": steps, "seed": seed, "items": items}
+    first = {"steps": before.get("step"), "seed": before.get("seed"), "items": before.get("items")}
+    stages = [*before.get("stages", [first]), stage]
+    return {"step": sum(s["steps"] or 0 for s in stages), "seed": [s["seed"] for s in stages], "items": items, "stages": stages}
 
 
 def smoke(options: argparse.Namespace) -> None:

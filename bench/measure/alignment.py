@@ -1,12 +1,12 @@
-#!/usr/bin/env python3
 """Measure alignment: lag errors, time to align, drift, jumps, false realignments, half an hour of speech, cost per hop.
 
-    python bench/alignment.py --voices robot/val --speech human/val --output bench/results/alignment
+    python -m bench.measure.alignment --voices ROBOT/val --speech HUMAN/val --output bench/results/alignment
 
---voices and --speech are folders of recordings (16 kHz mono; the robot's voice, and humans). Rooms, clocks and fan are simulated with
-a known truth (tests/unit/alignment_scene.py). Writes OUTPUT.json, OUTPUT.md and OUTPUT.png. About 6 minutes on one core. --seed
-says which scenes are drawn: thresholds were set on seeds below 100000, so that a report takes another. --only-cost times a few
-conversations on a machine left alone, 10 s, and puts the cost into an OUTPUT.json that is there.
+--voices and --speech are folders of recordings (16 kHz mono; the robot's voice, and humans). Rooms, clocks and fan are
+simulated with a known truth (bench/simulate/alignment_scene.py). Writes OUTPUT.json, OUTPUT.md and OUTPUT.png. About 6
+minutes on one core. --seed says which scenes are drawn: thresholds were set on seeds below 100000, so that a report
+takes another. --only-cost times a few conversations on a machine left alone, 10 s, and puts the cost, with a stamp of
+its own, into an OUTPUT.json that is there.
 """
 
 from __future__ import annotations
@@ -21,15 +21,15 @@ import numpy as np
 import soundfile as sf
 from scipy import signal
 
+from bench import results_writer
+from bench.measure import alignment_report
+from bench.measure.alignment_report import CLOSE, HOP, JUMPS
+from bench.measure.intervals import percentiles
 from bench.simulate.alignment_scene import HEAD, RATE, fan, hear, known_path, room, run
-from bench.table import machine
 from edgefilter.alignment.aligner import Aligner
 
-HOP = 256
-CLOSE = 16
-JUMPS = (2, 3, 5, 8, 16, 40, 100, 250, 500, 1500)
-REACH = 960
-"""Jumps beyond this need a search of all lags."""
+TIMED = 6
+"""Conversations whose hops are timed, with a profile and without."""
 
 
 class Corpus:
@@ -58,7 +58,7 @@ def onset(x: np.ndarray) -> int:
 
 
 def conversation(rng: np.random.Generator, voices: Corpus, speech: Corpus) -> dict:
-    """Three utterances, each with its own lag, in a room of RT60 0.2-0.75 s, clocks up to 300 ppm apart, a human 0-20 dB lower."""
+    """Three utterances with a lag each: RT60 0.2-0.75 s, clocks up to 300 ppm apart, a human 0-20 dB lower."""
     parts, at, starts = [np.zeros(RATE // 2, np.float32)], RATE // 2, []
     for _ in range(3):
         x, pause = voices.draw(rng)[: 5 * RATE], np.zeros(int(rng.uniform(1.8, 2.5) * RATE), np.float32)
@@ -73,7 +73,16 @@ def conversation(rng: np.random.Generator, voices: Corpus, speech: Corpus) -> di
     human = speech.draw(rng, mic.size / RATE)
     human = np.pad(human, (0, mic.size - human.size)) * np.std(mic) / np.std(human) * 10 ** (level / 20)
     mic = (mic + human + fan(rng, mic.size, 0.03 * np.std(mic))).astype(np.float32)
-    return {"ref": ref, "mic": mic, "truth": truth, "starts": starts, "lags": lags, "ppm": ppm, "rt60": rt60, "human_db": level}
+    return {
+        "ref": ref,
+        "mic": mic,
+        "truth": truth,
+        "starts": starts,
+        "lags": lags,
+        "ppm": ppm,
+        "rt60": rt60,
+        "human_db": level,
+    }
 
 
 def judge_conversation(scene: dict, hops: list) -> list[dict]:
@@ -109,19 +118,24 @@ def lag_trials(seed: int, count: int, voices: Corpus, speech: Corpus, costs: lis
             if known.size:
                 drift.append(np.abs(np.array([x.ppm for x in hops[known[0] : known[0] + 600]]) - scene["ppm"]))
         length = min(d.size for d in drift)
-        out["profile" if with_profile else "no profile"] = {"rows": rows, "drift": np.percentile([d[:length] for d in drift], [50, 95], axis=0).tolist()}
+        out["profile" if with_profile else "no profile"] = {
+            "rows": rows,
+            "drift": np.percentile([d[:length] for d in drift], [50, 95], axis=0).tolist(),
+        }
     return out
 
 
 def cost_trials(seed: int, voices: Corpus, speech: Corpus) -> dict:
-    """ms per hop over six conversations with a profile and without, the first tenth left out; others: processes running beside (Linux)."""
+    """Milliseconds per hop over TIMED conversations with a profile and without, the first tenth left out.
+
+    Others: processes running beside (Linux).
+    """
     costs, running = [], [Path("/proc/loadavg").read_text().split()[3]]
-    lag_trials(seed, 6, voices, speech, costs)
+    lag_trials(seed, TIMED, voices, speech, costs)
     running.append(Path("/proc/loadavg").read_text().split()[3])
     ms = 1e3 * np.array(costs[len(costs) // 10 :])
-    p50, p95, p99, worst = np.percentile(ms, [50, 95, 99, 100])
     others = max(int(count.split("/")[0]) - 1 for count in running)
-    return {"ms": {"p50": p50, "p95": p95, "p99": p99, "max": worst, "mean": float(ms.mean())}, "others": others}
+    return {"ms": {**percentiles(ms, 50, 95, 99, 100), "mean": float(ms.mean())}, "others": others}
 
 
 def jump_trials(seed: int, repeats: int, voices: Corpus) -> list[dict]:
@@ -144,7 +158,9 @@ def jump_trials(seed: int, repeats: int, voices: Corpus) -> list[dict]:
             healed = 0 if bad.size == 0 else int(bad[-1] + 1)
             frames = ref[max(at - 7000, 0) :][: healed * HOP].reshape(-1, HOP)
             speaking = int(np.sum(np.mean(frames**2, axis=1) > 1e-2 * np.mean(ref**2)))
-            rows.append({"jump": jump, "ms": healed * HOP / 16, "ms_of_speech": speaking * HOP / 16, "healed": healed < 125})
+            rows.append(
+                {"jump": jump, "ms": healed * HOP / 16, "ms_of_speech": speaking * HOP / 16, "healed": healed < 125}
+            )
     return rows
 
 
@@ -153,7 +169,10 @@ def false_trials(seed: int, minutes: int, voices: Corpus, speech: Corpus) -> dic
     counts = {}
     for name in ("silence", "human", "loud human", "noise", "unheard robot, silence", "unheard robot, human"):
         for with_profile in (True, False):
-            found = sum(false_minute(np.random.default_rng(seed + 31 + i), name, with_profile, voices, speech) for i in range(minutes))
+            found = sum(
+                false_minute(np.random.default_rng(seed + 31 + i), name, with_profile, voices, speech)
+                for i in range(minutes)
+            )
             counts[f"{name}, {'' if with_profile else 'no '}profile"] = found
     return counts
 
@@ -193,74 +212,15 @@ def long_speech(seed: int, voices: Corpus, minutes: int, ppm: float = 100.0) -> 
         ppms += [x.ppm for x in hops]
     e, p, minute, warm = np.array(errors), np.array(ppms) - ppm, int(60 * RATE / HOP), int(10 * RATE / HOP)
     spans = {"first minute (after 10 s)": slice(warm, minute), "last minute": slice(-minute, None)}
-    rows = {n: {"rms_jitter": float(np.std(e[s])), "mean_error": float(np.mean(e[s])), "worst_error": float(np.max(np.abs(e[s] - np.mean(e[s])))),
+    rows = {n: {"rms_jitter": float(np.std(e[s])), "mean_error": float(np.mean(e[s])),
+                "worst_error": float(np.max(np.abs(e[s] - np.mean(e[s])))),
                 "rms_ppm_error": float(np.sqrt(np.mean(p[s] ** 2)))} for n, s in spans.items()}  # fmt: skip
-    return {"parts": rows, "realigned": int(realigned), "error": e[:: max(e.size // 3000, 1)].tolist(), "ppm_error": p[:: max(p.size // 3000, 1)].tolist()}
-
-
-def summarise(result: dict) -> str:
-    about = ", ".join(f"{key} {value}" for key, value in result["machine"].items())
-    lines = [f"# Alignment\n\n{about}\n\nSimulated rooms (RT60 0.2-0.75 s), voices and speech from recordings; `bench/alignment.py --seed {result['seed']}`.\n",
-             "| | within 1 ms at 300 ms | ever | time to align p50 / p95, ms | final error p50 / p95, samples |", "| --- | --- | --- | --- | --- |"]  # fmt: skip
-    for name, block in result["lags"].items():
-        rows = block["rows"]
-        at = np.mean([r["error_300ms"] is not None and abs(r["error_300ms"]) < CLOSE for r in rows])
-        times = [r["time_ms"] if r["time_ms"] is not None else 9999.0 for r in rows]
-        final = np.abs([r["final_error"] for r in rows])
-        ever = np.mean([r["time_ms"] is not None for r in rows])
-        t50, t95 = np.percentile(times, [50, 95])
-        f50, f95 = np.nanpercentile(final, [50, 95])
-        lines.append(f"| {name}, {len(rows)} utterances | {100 * at:.1f} % | {100 * ever:.1f} % | {t50:.0f} / {t95:.0f} | {f50:.2f} / {f95:.2f} |")
-    for name, block in result["lags"].items():
-        d = np.array(block["drift"])
-        at = {s: d[:, min(int(s * RATE / HOP), d.shape[1] - 1)] for s in (1, 2, 5)}
-        lines.append(f"\nDrift error ({name}), median / p95 ppm after the first lock: " + ", ".join(f"{s} s {v[0]:.1f} / {v[1]:.1f}" for s, v in at.items()))
-    for name, inside in ((f"of 2 to {JUMPS[-2]} samples", True), (f"of {JUMPS[-1]} samples, beyond the tracker's reach", False)):
-        jumps = [r for r in result["jumps"] if (abs(r["jump"]) < REACH) == inside]
-        p50, p95, worst = np.percentile([r["ms_of_speech"] for r in jumps], [50, 95, 100])
-        within = np.mean([r["healed"] and r["ms_of_speech"] <= 200 for r in jumps])
-        lines.append(f"\n{len(jumps)} jumps {name}: healed (to 0.7 samples) after p50 {p50:.0f}, p95 {p95:.0f}, max {worst:.0f} ms of speech; {100 * within:.0f} % within 200 ms.")
-    lines.append(f"\nFalse realignments in {result['false_minutes']} minutes each: " + ", ".join(f"{k}: {v}" for k, v in result["false"].items()))
-    for name, r in result["long"]["parts"].items():
-        lines.append(f"\n{result['long_minutes']} minutes at 100 ppm, {name}: jitter {r['rms_jitter']:.4f} samples rms, mean {r['mean_error']:+.3f}, at most {r['worst_error']:.3f} from it, drift error {r['rms_ppm_error']:.2f} ppm rms")
-    cost = result["cost"]
-    busy = f" (beside {cost['others']} running processes: not to be quoted)" if cost["others"] else " (nothing else running)"
-    lines.append(f"\nRealignments in it: {result['long']['realigned']} (1 is the first lock)\n\nCost per hop of {HOP}, ms{busy}: " + ", ".join(f"{k} {v:.3f}" for k, v in cost["ms"].items()))
-    return "\n".join(lines) + "\n"
-
-
-def draw(result: dict, path: Path) -> None:
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    figure, ((a, b, c), (d, e, f)) = plt.subplots(2, 3, figsize=(15, 8), constrained_layout=True)
-    for name, block in result["lags"].items():
-        error = np.sort([abs(r["error_300ms"]) if r["error_300ms"] is not None else 1e5 for r in block["rows"]])
-        share = (np.arange(error.size) + 1) / error.size
-        a.semilogx(np.maximum(error, 1e-3), share, label=name)
-        times = np.sort([r["time_ms"] if r["time_ms"] is not None else 1e4 for r in block["rows"]])
-        b.plot(np.minimum(times, 1000), share, label=name)
-        seconds = np.arange(len(block["drift"][0])) * HOP / RATE
-        c.semilogy(seconds, block["drift"][0], label=f"{name}, median")
-        c.semilogy(seconds, block["drift"][1], "--", label=f"{name}, 95 %")
-    a.axvline(CLOSE, color="k", lw=0.5)
-    b.axvline(300, color="k", lw=0.5)
-    a.set(title="Lag error 300 ms after the onset", xlabel="samples", ylabel="share of utterances")
-    b.set(title="Time to align (within 1 ms, to stay)", xlabel="ms", ylabel="share of utterances")
-    c.set(title="Drift error", xlabel="s after first lock", ylabel="ppm")
-    d.semilogx([abs(r["jump"]) for r in result["jumps"]], [r["ms_of_speech"] for r in result["jumps"]], "o", alpha=0.6)
-    d.axhline(200, color="k", lw=0.5)
-    d.set(title="Jump healed after", xlabel="jump, samples", ylabel="ms of robot speech")
-    error = np.array(result["long"]["error"])
-    e.plot(np.linspace(0, result["long_minutes"], error.size), error, lw=0.7)
-    e.set(title="Delay error in long speech, 100 ppm", xlabel="minutes", ylabel="samples", ylim=(-0.5, 0.5))
-    f.plot(np.linspace(0, result["long_minutes"], error.size), result["long"]["ppm_error"], lw=0.7)
-    f.set(title="Drift error in long speech", xlabel="minutes", ylabel="ppm", ylim=(-2, 2))
-    for axis in (a, b, c):
-        axis.legend(fontsize=8)
-    figure.savefig(path, dpi=90)
+    return {
+        "parts": rows,
+        "realigned": int(realigned),
+        "error": e[:: max(e.size // 3000, 1)].tolist(),
+        "ppm_error": p[:: max(p.size // 3000, 1)].tolist(),
+    }
 
 
 def main() -> None:
@@ -275,20 +235,26 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=900000)
     parser.add_argument("--output", type=Path, default=Path("bench/results/alignment"))
     options = parser.parse_args()
-    voices, speech, stored = Corpus(options.voices), Corpus(options.speech), options.output.with_suffix(".json")
+    voices, speech = Corpus(options.voices), Corpus(options.speech)
+    made_with = results_writer.stamp({"ROBOT": [options.voices], "HUMAN": [options.speech]})
     if options.only_cost:
-        result = json.loads(stored.read_text())
+        result = json.loads(options.output.with_suffix(".json").read_text(encoding="utf-8"))
+        stamp_of_cost, made_with = (
+            made_with,
+            result.get("stamp") or sys.exit(f"{options.output}.json has no stamp: measure all of it anew"),
+        )
     else:
-        result = {"machine": machine(), "seed": options.seed, "lags": lag_trials(options.seed, options.count, voices, speech, [])}
+        result = {"seed": options.seed, "lags": lag_trials(options.seed, options.count, voices, speech, [])}
         result["jumps"] = jump_trials(options.seed, options.repeats, voices)
-        result["false"], result["false_minutes"] = false_trials(options.seed, options.false_minutes, voices, speech), options.false_minutes
+        result["false"], result["false_minutes"] = (
+            false_trials(options.seed, options.false_minutes, voices, speech),
+            options.false_minutes,
+        )
         result["long"], result["long_minutes"] = long_speech(options.seed, voices, options.minutes), options.minutes
-    result["cost"] = cost_trials(options.seed, voices, speech)
-    options.output.parent.mkdir(parents=True, exist_ok=True)
-    stored.write_text(json.dumps(result))
-    options.output.with_suffix(".md").write_text(summarise(result))
-    draw(result, options.output.with_suffix(".png"))
-    print(summarise(result))
+        stamp_of_cost = made_with
+    result["cost"] = {**cost_trials(options.seed, voices, speech), "stamp": stamp_of_cost}
+    alignment_report.draw(result, options.output)
+    print(results_writer.write(options.output, made_with, "Alignment", alignment_report.markdown(result), result))
 
 
 if __name__ == "__main__":

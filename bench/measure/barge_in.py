@@ -1,43 +1,45 @@
-#!/usr/bin/env python3
 """How soon an interrupting human is noticed, and how often the robot is taken for one.
 
-    python bench/barge_in.py --conversations DIR [DIR ...] --output bench/results/barge_in
+    python -m bench.measure.barge_in --conversations DIR [DIR ...] --output bench/results/barge_in
 
-Each conversation is filtered twice: as it is, and less the human, so that every event speech_started in the second is a false alarm.
-Noticed: the first speech_started that ends after the human's first sound (a 20 ms frame within 25 dB of the loudest), or at once where speech had
-been announced before, which counts as early. Writes OUTPUT.json and OUTPUT.md.
+Each conversation is filtered twice: as it is, and less the human, so that every event speech_started in the second is a
+false alarm. Noticed: the first speech_started that ends after the human's first sound (a 20 ms frame within 25 dB of
+the loudest), or at once where speech had been announced before, which counts as early. Writes OUTPUT.json and
+OUTPUT.md.
 """
 
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 from pathlib import Path
 
 import numpy as np
-from tqdm import tqdm
 
-from bench import table
-from bench.measure import quality
-from bench.measure.alone import FRAME, frame_power
+from bench import results_writer
+from bench.measure.conversation import Conversation, every, find_conversations, progress
+from bench.measure.levels import FRAME, frame_power
 from edgefilter import EgoFilter
 from edgefilter.errors import EdgefilterError
 from edgefilter.types import SAMPLE_RATE, Event, Samples
 
+ENGINE = "crnn"
 IN_TIME_MS = 200
 """Barge-in that takes longer is felt as a robot that does not listen."""
 
 
-def talk(conversation: quality.Conversation, mic: Samples) -> list[Event]:
-    """The beginnings and ends of speech that engine crnn notices."""
-    ego = EgoFilter(conversation.profile, engine="crnn")
+def talk(conversation: Conversation, mic: Samples) -> list[Event]:
+    """The beginnings and ends of speech that the engine notices."""
+    ego = EgoFilter(conversation.profile, engine=ENGINE)
     ego.process(mic, conversation.read("ref"))
     return [event for event in ego.events() if event.kind.startswith("speech")]
 
 
-def measure(conversation: quality.Conversation) -> dict:
-    """delay_ms from the human's first sound until it is noticed, None if never; early: speech was on already; alarms without the human."""
+def measure(conversation: Conversation) -> dict:
+    """delay_ms from the human's first sound until it is noticed, None if never.
+
+    Early: speech was on already; alarms without the human.
+    """
     mic, clean = conversation.read("mic"), conversation.read("clean")
     power = frame_power(clean)
     onset = int(np.flatnonzero(power > 10**-2.5 * power.max())[0]) * FRAME
@@ -47,7 +49,8 @@ def measure(conversation: quality.Conversation) -> dict:
     early = bool(before) and before[-1].kind == "speech_started"
     alarms = sum(event.kind == "speech_started" for event in talk(conversation, mic - clean))
     delay = (after[0] - onset) / SAMPLE_RATE * 1000 if after else None
-    return {"conversation": conversation.folder.name, "delay_ms": 0.0 if early else delay, "early": early, "alarms": alarms, "seconds": mic.size / SAMPLE_RATE}
+    found = {"delay_ms": 0.0 if early else delay, "early": early, "alarms": alarms, "seconds": mic.size / SAMPLE_RATE}
+    return {"conversation": conversation.folder.name, **found}
 
 
 def main() -> int:
@@ -56,34 +59,35 @@ def main() -> int:
     parser.add_argument("--output", type=Path, required=True, metavar="PATH")
     options = parser.parse_args()
     try:
-        sets = quality.find_conversations(options.conversations)
-        work = tqdm([(name, found) for name, all_ in sets.items() for found in all_], unit="recording", disable=not sys.stderr.isatty())
-        rows = [{"set": name, **measure(conversation)} for name, conversation in work]
+        sets = find_conversations(options.conversations)
+        made_with = results_writer.stamp({"conversations": options.conversations}, [ENGINE])
+        rows = [{"set": name, **measure(conversation)} for name, conversation in progress(every(sets))]
     except (EdgefilterError, OSError) as error:
         print(f"barge_in: {error}", file=sys.stderr)
         return 1
-    head = table.machine()
-    text = markdown(rows, head)
-    options.output.parent.mkdir(parents=True, exist_ok=True)
-    options.output.with_suffix(".json").write_text(json.dumps({"schema": 1, "machine": head, "rows": rows}, indent=1) + "\n", encoding="utf-8")
-    options.output.with_suffix(".md").write_text(text, encoding="utf-8")
-    print(text)
+    print(results_writer.write(options.output, made_with, "Barge-in", markdown(rows), {"rows": rows}))
     return 0
 
 
-def markdown(rows: list[dict], head: dict) -> str:
+def markdown(rows: list[dict]) -> str:
     """A row a set."""
-    lines = ["# Barge-in", "", ", ".join(f"{key} {value}" for key, value in head.items()), ""]
-    lines += ["Engine `crnn`. Delay: from the human's first sound to the event `speech_started`, 20-26 dB below the robot that talks meanwhile.", ""]
-    lines += [f"| set | conversations | delay p50 / p90, ms | within {IN_TIME_MS} ms | early | never | false alarms a minute, the human left out |", "| --- " * 7 + "|"]
+    lines = [
+        f"Engine `{ENGINE}`. Delay: from the human's first sound to the event `speech_started`, 20-26 dB below the "
+        "robot that"
+    ]
+    lines += ["talks meanwhile.", ""]
+    columns = ["set", "conversations", "delay p50 / p90, ms", f"within {IN_TIME_MS} ms", "early", "never"]
+    cells_of = []
     for name in dict.fromkeys(row["set"] for row in rows):
         own = [row for row in rows if row["set"] == name]
         delays = np.array([np.inf if row["delay_ms"] is None else row["delay_ms"] for row in own if not row["early"]])
         p50, p90 = (np.quantile(delays, share, method="higher") for share in (0.5, 0.9))
         minutes = sum(row["seconds"] for row in own) / 60
-        cells = [name, len(own), f"{p50:.0f} / {p90:.0f}", f"{np.count_nonzero(delays <= IN_TIME_MS)} of {delays.size}", len(own) - delays.size]
+        in_time = f"{np.count_nonzero(delays <= IN_TIME_MS)} of {delays.size}"
+        cells = [name, len(own), f"{p50:.0f} / {p90:.0f}", in_time, len(own) - delays.size, int(np.isinf(delays).sum())]
         alarms = sum(row["alarms"] for row in own)
-        lines.append("| " + " | ".join(map(str, [*cells, int(np.isinf(delays).sum()), f"{alarms} in {minutes:.0f} minutes, {alarms / minutes:.2f}"])) + " |")
+        cells_of.append([*cells, f"{alarms} in {minutes:.0f} minutes, {alarms / minutes:.2f}"])
+    lines += results_writer.table([*columns, "false alarms a minute, the human left out"], cells_of)
     return "\n".join(lines) + "\n"
 
 

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+
+from bench.measure.intervals import wilson
 
 STRENGTHS = ("clear", "moderate", "near")
 EXPLAINED_LIMIT_DB = 1.0
@@ -17,9 +18,10 @@ EXPLAINED_LIMIT_DB = 1.0
 class Outcome:
     """One case: what it hid and what the diagnosis said.
 
-    truth: effects, ("none",), ("unknown",), or empty where it is sealed. raw: what it is in detail. verdict: of the diagnosis, or "error".
-    named: effects of its ranking, in order. before_db, after_db: excess before and after each of them. remaining_db: at the end.
-    sealed_hit: whether the label's hash is that of the answer; None where nothing is sealed.
+    truth: effects, ("none",), ("unknown",), or empty where it is sealed. raw: what it is in detail. verdict: of the
+    diagnosis, or "error". named: effects of its ranking, in order. before_db, after_db: excess before and after each of
+    them. remaining_db: at the end. sealed_hit: whether the label's hash is that of the answer; None where nothing is
+    sealed.
     """
 
     case: str
@@ -58,7 +60,10 @@ class Outcome:
 
     @property
     def hit(self) -> bool:
-        """Singles: named first. Pairs: both named. Controls: nothing named, explained. Outside: unexplained. Sealed: the exact label."""
+        """Singles: named first. Pairs: both named.
+
+        Controls: nothing named, explained. Outside: unexplained. Sealed: the exact label.
+        """
         if self.group == "sealed":
             return bool(self.sealed_hit)
         if self.group in ("controls", "outside"):
@@ -66,29 +71,24 @@ class Outcome:
         return self.first == self.truth[0] if self.group == "singles" else set(self.truth) <= set(self.named)
 
 
-def wilson(hits: int, n: int) -> tuple[float, float]:
-    """95 % interval of a proportion (Wilson 1927), as numbers from 0 to 1.
-
-    >>> [round(bound, 3) for bound in wilson(0, 100)]
-    [0.0, 0.037]
-    """
-    if n == 0:
-        return 0.0, 1.0
-    z, p = 1.959964, hits / n
-    centre, half = p + z * z / (2 * n), z * math.sqrt(p * (1 - p) / n + z * z / (4 * n * n))
-    return max(0.0, (centre - half) / (1 + z * z / n)), min(1.0, (centre + half) / (1 + z * z / n))
-
-
 def counted(flags: Iterable[bool]) -> dict:
     """hits, n, percent and its interval."""
     flags = list(flags)
     low, high = wilson(sum(flags), len(flags))
-    return {"hits": sum(flags), "n": len(flags), "percent": 100 * sum(flags) / max(len(flags), 1), "low": 100 * low, "high": 100 * high}
+    return {
+        "hits": sum(flags),
+        "n": len(flags),
+        "percent": 100 * sum(flags) / max(len(flags), 1),
+        "low": 100 * low,
+        "high": 100 * high,
+    }
 
 
 def summarise(outcomes: Sequence[Outcome]) -> dict:
     """All figures of one folder of cases; groups without a case are left out."""
-    groups = {name: [o for o in outcomes if o.group == name] for name in ("singles", "controls", "pairs", "outside", "sealed")}
+    groups = {
+        name: [o for o in outcomes if o.group == name] for name in ("singles", "controls", "pairs", "outside", "sealed")
+    }
     singles, controls, pairs, outside = (groups[name] for name in ("singles", "controls", "pairs", "outside"))
     counts = {}
     for strength in STRENGTHS:
@@ -101,26 +101,43 @@ def summarise(outcomes: Sequence[Outcome]) -> dict:
     counts["pairs: at least one named"] = counted(bool(set(o.truth) & set(o.named)) for o in pairs)
     counts["pairs: both and no other"] = counted(set(o.truth) == set(o.named) for o in pairs)
     counts["outside: unexplained"] = counted(o.hit for o in outside)
-    counts["outside: explained above 1 dB of excess"] = counted(o.verdict == "explained" and o.excess_db > EXPLAINED_LIMIT_DB for o in outside)
+    counts["outside: explained above 1 dB of excess"] = counted(
+        o.verdict == "explained" and o.excess_db > EXPLAINED_LIMIT_DB for o in outside
+    )
     counts["sealed: exact label"] = counted(bool(o.sealed_hit) for o in groups["sealed"])
     counts = {name: count for name, count in counts.items() if count["n"]}
     seconds = [o.seconds for o in outcomes]
-    times = {"p50": float(np.median(seconds)), "max": float(max(seconds)), "slowest": max(outcomes, key=lambda o: o.seconds).case}
+    times = {
+        "p50": float(np.median(seconds)),
+        "max": float(max(seconds)),
+        "slowest": max(outcomes, key=lambda o: o.seconds).case,
+    }
     by_effect = {}
     for name in sorted({o.truth[0] for o in singles}):
         of = [o for o in singles if o.truth[0] == name]
         by_effect[name] = {"top-1": counted(o.hit for o in of)} | _errors([o for o in of if o.hit])
     kinds = {kind: counted(o.hit for o in outside if o.raw[0] == kind) for kind in sorted({o.raw[0] for o in outside})}
-    return {"counts": counts, "by_effect": by_effect, "outside": kinds, "confusion": confusion(outcomes), "seconds": times}
+    return {
+        "counts": counts,
+        "by_effect": by_effect,
+        "outside": kinds,
+        "confusion": confusion(outcomes),
+        "seconds": times,
+    }
 
 
 def _errors(found: Sequence[Outcome]) -> dict:
-    """Medians and the worst of the held-out excess before and after the effect named first, and of the share that it takes away."""
+    """Medians, and the worst, of the held-out excess before and after the effect named first, and of its share."""
     if not found:
         return {}
     after = [o.after_db[0] for o in found]
     before, share = float(np.median([o.before_db[0] for o in found])), float(np.median([o.share[0] for o in found]))
-    return {"before_db": before, "after_db": float(np.median(after)), "after_max_db": max(after), "share_percent": 100 * share}
+    return {
+        "before_db": before,
+        "after_db": float(np.median(after)),
+        "after_max_db": max(after),
+        "share_percent": 100 * share,
+    }
 
 
 def confusion(outcomes: Sequence[Outcome]) -> dict[str, dict[str, int]]:
@@ -136,16 +153,28 @@ def confusion(outcomes: Sequence[Outcome]) -> dict[str, dict[str, int]]:
 def markdown(name: str, outcomes: Sequence[Outcome], summary: dict) -> str:
     """One folder of cases as a section in Markdown."""
     lines = [f"## {name}: {len(outcomes)} cases", "", "| | cases | % | 95 % interval |", "| --- | --- | --- | --- |"]
-    lines += [f"| {key} | {c['hits']} of {c['n']} | {c['percent']:.0f} | {c['low']:.0f} to {c['high']:.0f} |" for key, c in summary["counts"].items()]
+    lines += [
+        f"| {key} | {c['hits']} of {c['n']} | {c['percent']:.0f} | {c['low']:.0f} to {c['high']:.0f} |"
+        for key, c in summary["counts"].items()
+    ]
     times = summary["seconds"]
     lines += ["", f"Seconds per case: median {times['p50']:.1f}, longest {times['max']:.1f} ({times['slowest']})."]
     if summary["by_effect"]:
-        lines += ["", "| effect | named first | excess before, dB | after | after, worst | share removed, % |", "| --- " * 6 + "|"]
+        lines += [
+            "",
+            "| effect | named first | excess before, dB | after | after, worst | share removed, % |",
+            "| --- " * 6 + "|",
+        ]
         lines += [_effect_line(effect, row) for effect, row in summary["by_effect"].items()]
-        lines += ["", "Excess: held-out, whitened, over the fan; medians of the cases where the effect was named first."]
+        lines += [
+            "",
+            "Excess: held-out, whitened, over the fan; medians of the cases where the effect was named first.",
+        ]
     if summary["outside"]:
         lines += ["", "Outside the catalogue, called unexplained: "]
-        lines[-1] += ", ".join(f"{kind} {count['hits']} of {count['n']}" for kind, count in summary["outside"].items()) + "."
+        lines[-1] += (
+            ", ".join(f"{kind} {count['hits']} of {count['n']}" for kind, count in summary["outside"].items()) + "."
+        )
     lines += _confusion_lines(summary["confusion"]) + _miss_lines([o for o in outcomes if not o.hit])
     return "\n".join(lines) + "\n"
 
@@ -154,7 +183,10 @@ def _effect_line(effect: str, row: dict) -> str:
     count = f"{row['top-1']['hits']} of {row['top-1']['n']}"
     figures = [""] * 4
     if "before_db" in row:
-        figures = [*(f"{row[key]:.1f}" for key in ("before_db", "after_db", "after_max_db")), f"{row['share_percent']:.0f}"]
+        figures = [
+            *(f"{row[key]:.1f}" for key in ("before_db", "after_db", "after_max_db")),
+            f"{row['share_percent']:.0f}",
+        ]
     return "| " + " | ".join([effect, count, *figures]) + " |"
 
 
@@ -162,16 +194,38 @@ def _confusion_lines(matrix: dict[str, dict[str, int]]) -> list[str]:
     if not matrix:
         return []
     columns = sorted(set(matrix) | {name for row in matrix.values() for name in row})
-    lines = ["", "Hidden (rows), named first (columns):", "", "| | " + " | ".join(columns) + " |", "| --- " * (len(columns) + 1) + "|"]
-    return lines + [f"| {name} | " + " | ".join(str(row.get(column, "")) for column in columns) + " |" for name, row in matrix.items()]
+    lines = [
+        "",
+        "Hidden (rows), named first (columns):",
+        "",
+        "| | " + " | ".join(columns) + " |",
+        "| --- " * (len(columns) + 1) + "|",
+    ]
+    return lines + [
+        f"| {name} | " + " | ".join(str(row.get(column, "")) for column in columns) + " |"
+        for name, row in matrix.items()
+    ]
 
 
 def _miss_lines(misses: Sequence[Outcome]) -> list[str]:
     if not misses:
         return ["", "No misses."]
-    lines = ["", f"Misses ({len(misses)}):", "", "| case | hidden | strength | said | excess, dB | left, dB | evidence |", "| --- " * 7 + "|"]
+    lines = [
+        "",
+        f"Misses ({len(misses)}):",
+        "",
+        "| case | hidden | strength | said | excess, dB | left, dB | evidence |",
+        "| --- " * 7 + "|",
+    ]
     for o in misses:
-        hidden = "sealed" if not o.truth else "+".join(o.truth) + ("" if set(o.raw) == set(o.truth) or not o.raw else f" ({'+'.join(o.raw)})")
+        hidden = (
+            "sealed"
+            if not o.truth
+            else "+".join(o.truth) + ("" if set(o.raw) == set(o.truth) or not o.raw else f" ({'+'.join(o.raw)})")
+        )
         said = o.verdict + (": " + ", ".join(o.named) if o.named else "")
-        lines.append(f"| {o.case} | {hidden} | {o.strength} | {said} | {o.excess_db:.1f} | {o.remaining_db:.1f} | {o.evidence.replace('|', '/')} |")
+        lines.append(
+            f"| {o.case} | {hidden} | {o.strength} | {said} | {o.excess_db:.1f} | {o.remaining_db:.1f} "
+            f"| {o.evidence.replace('|', '/')} |"
+        )
     return lines

@@ -1,9 +1,10 @@
 """One contender, hop by hop, in a process of its own; prints the milliseconds of every hop and stage as JSON.
 
-    python bench/latency_hops.py --contender ss --seconds 8 --paced --cores 2
+    python -m bench.measure.latency_hops --contender ss --seconds 8 --paced --cores 2
 
-Contenders are the engines, each in the whole path, and the peers speexdsp, speexdsp-suppressed and aec3. The sound is the bundled
-conversation (simulated robot). Warm-up hops are left out. Threads are set by the caller's environment (OMP_NUM_THREADS).
+Contenders are the engines, each in the whole path, and the peers speexdsp, speexdsp-suppressed and aec3. The sound is
+the bundled conversation (simulated robot). Warm-up hops are left out. Threads are set by the caller's environment
+(OMP_NUM_THREADS).
 """
 
 from __future__ import annotations
@@ -56,8 +57,16 @@ def edge(name: str, taps: int | None, hop: int | None) -> Contender:
     stream = Stream(engine, profile)
     contender = Contender(engine.stft.hop, stream.process)
     front = stream.front
-    parts = (("alignment", front.aligner, "step"), ("canceller", front.canceller, "step"), ("residual", front.residual, "step"))
-    parts += (("analysis", front._analyser, "push"), ("engine", engine, "step"), ("overlap-add", stream._synthesiser, "push"))
+    parts = (
+        ("alignment", front.aligner, "step"),
+        ("canceller", front.canceller, "step"),
+        ("residual", front.residual, "step"),
+    )
+    parts += (
+        ("analysis", front._analyser, "push"),
+        ("engine", engine, "step"),
+        ("overlap-add", stream._synthesiser, "push"),
+    )
     for stage, owner, method in parts:
         if owner is not None:
             setattr(owner, method, _timed(getattr(owner, method), contender.stages[stage]))
@@ -92,7 +101,10 @@ def scene(hop: int, dtype: type) -> Iterator[tuple[np.ndarray, np.ndarray]]:
 
 
 def measure(contender: Contender, seconds: float, paced: bool) -> list[float]:
-    """ms of each hop of so many seconds of audio, after the warm-up; paced: each begins when a device would deliver it."""
+    """Milliseconds of each hop of so many seconds of audio, after the warm-up.
+
+    Paced: each begins when a device would deliver it.
+    """
     sound = scene(contender.hop, contender.dtype)
     period = contender.hop / SAMPLE_RATE if paced else 0.0
     for _ in range(round(WARM_UP_S * SAMPLE_RATE / contender.hop)):
@@ -111,7 +123,7 @@ def measure(contender: Contender, seconds: float, paced: bool) -> list[float]:
 
 
 def peak_memory_mb(pid: int) -> float:
-    """Largest resident memory of a process so far, MB (Linux; getrusage would count what the parent had at the fork)."""
+    """Largest resident memory of a process so far, MB (Linux; getrusage would count the parent's at the fork)."""
     lines = Path(f"/proc/{pid}/status").read_text().splitlines()
     return next(float(line.split()[1]) for line in lines if line.startswith("VmHWM")) / 1024
 
@@ -127,10 +139,21 @@ def main() -> None:
     args = parser.parse_args()
     with ExitStack() as stack:
         stack.enter_context(held_to(args.cores))
-        contender = peer(args.contender, stack) if args.contender in PEERS else edge(args.contender, args.taps, args.hop)
+        contender = (
+            peer(args.contender, stack) if args.contender in PEERS else edge(args.contender, args.taps, args.hop)
+        )
         took = measure(contender, args.seconds, args.paced)
     times = {stage: [round(ms, 5) for ms in values] for stage, values in contender.stages.items()}
-    print(json.dumps({"hop": contender.hop, "took": [round(ms, 5) for ms in took], "stages": times, "peak_memory_mb": peak_memory_mb(os.getpid())}))
+    print(
+        json.dumps(
+            {
+                "hop": contender.hop,
+                "took": [round(ms, 5) for ms in took],
+                "stages": times,
+                "peak_memory_mb": peak_memory_mb(os.getpid()),
+            }
+        )
+    )
 
 
 if __name__ == "__main__":

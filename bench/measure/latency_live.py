@@ -1,7 +1,7 @@
-"""What a user waits for: from process start to the first filtered hop, and from a click at the microphone to the click at the output.
+"""What a user waits for: from process start to the first filtered hop, and from a click to the filtered click.
 
-The click goes round: the filter listens to a virtual device's monitor and plays into that same device, so that the click comes
-back again and again, and the distance between two of them in one recording is the whole way, to the sample.
+The click goes round: the filter listens to a virtual device's monitor and plays into that same device, so that the
+click comes back again and again, and the distance between two of them in one recording is the whole way, to the sample.
 """
 
 from __future__ import annotations
@@ -30,8 +30,21 @@ CLICK = 160
 
 def start(engine: str) -> dict[str, float]:
     """Seconds from process start to the first samples on a pipe, and the memory (MB) at that moment."""
-    mic, ref = (soundfile.read(DEMO / f"{name}.flac", dtype="int16", frames=SAMPLE_RATE)[0] for name in ("mic", "reference"))
-    command = [*COMMAND, "--input", "-", "--output", "-", "--engine", engine, "--profile", str(DEMO / "profile.npz"), "--quiet"]
+    mic, ref = (
+        soundfile.read(DEMO / f"{name}.flac", dtype="int16", frames=SAMPLE_RATE)[0] for name in ("mic", "reference")
+    )
+    command = [
+        *COMMAND,
+        "--input",
+        "-",
+        "--output",
+        "-",
+        "--engine",
+        engine,
+        "--profile",
+        str(DEMO / "profile.npz"),
+        "--quiet",
+    ]
     began = time.perf_counter()
     process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
     process.stdin.write(np.stack((mic, ref), axis=1)[:8192].tobytes())
@@ -50,7 +63,10 @@ def click() -> np.ndarray:
 
 
 def round_trip(engine: str, clicks: int = 3) -> list[float]:
-    """ms from click to click, one a click, through `edgefilter run` live; ALONE: through the same devices without a filter."""
+    """Milliseconds from click to click, one a click, through `edgefilter run` live.
+
+    ALONE: through the same devices without a filter.
+    """
     with virtual_sound.server() as server, tempfile.TemporaryDirectory() as folder:
         wav, heard = Path(folder) / "click.wav", Path(folder) / "heard.raw"
         soundfile.write(wav, np.concatenate((np.zeros(8000, np.int16), click(), np.zeros(1600, np.int16))), SAMPLE_RATE)
@@ -58,12 +74,24 @@ def round_trip(engine: str, clicks: int = 3) -> list[float]:
         if engine == ALONE:
             command = [sys.executable, "-m", "bench.measure.latency_live", *devices]
         else:
-            command = [*COMMAND, "--input", devices[0], "--reference", devices[1], "--output", devices[2], "--engine", engine, "--quiet"]
+            command = [
+                *COMMAND,
+                "--input",
+                devices[0],
+                "--reference",
+                devices[1],
+                "--output",
+                devices[2],
+                "--engine",
+                engine,
+                "--quiet",
+            ]
         found = []
         for _ in range(clicks):
             with open(heard, "wb") as file:
                 recorder = subprocess.Popen(
-                    ["parec", "-d", "robot_mic.monitor", "--rate=16000", "--format=s16le", "--channels=1", "--latency-msec=20"],
+                    ["parec", "-d", "robot_mic.monitor", "--rate=16000", "--format=s16le", "--channels=1"]
+                    + ["--latency-msec=20"],
                     env=server.environment, stdout=file,
                 )  # fmt: skip
                 loop = subprocess.Popen(command, env=server.environment, stderr=subprocess.DEVNULL)
@@ -81,7 +109,9 @@ def round_trip(engine: str, clicks: int = 3) -> list[float]:
 def _wait_for_sound(server: virtual_sound.Server) -> None:
     """Return half a second after somebody has begun to play."""
     for _ in range(300):
-        playing = subprocess.run(["pactl", "list", "short", "sink-inputs"], env=server.environment, capture_output=True, text=True)
+        playing = subprocess.run(
+            ["pactl", "list", "short", "sink-inputs"], env=server.environment, capture_output=True, text=True
+        )
         if playing.stdout.strip():
             break
         time.sleep(0.1)
@@ -89,7 +119,7 @@ def _wait_for_sound(server: virtual_sound.Server) -> None:
 
 
 def distance_ms(recording: np.ndarray) -> float:
-    """ms between the first click in recording (n,) and the next; NaN where there are not two."""
+    """Milliseconds between the first click in recording (n,) and the next; NaN where there are not two."""
     match = np.correlate(recording, click().astype(np.float64), "valid")
     peaks, _ = signal.find_peaks(match, height=0.2 * match.max(), distance=2 * CLICK)
     return 1000 * float(peaks[1] - peaks[0]) / SAMPLE_RATE if peaks.size > 1 else float("nan")

@@ -1,11 +1,11 @@
-#!/usr/bin/env python3
-"""Compare trained networks: size, cost per hop, learning curve, and what they do in the whole path on validation conversations.
+r"""Compare trained networks: size, cost per hop, learning curve, and what they do in the whole path.
 
-    python bench/networks.py --runs RUN [RUN ...] --conversations DIR [DIR ...] --whisper WHISPER --output bench/results/networks
+    python -m bench.measure.networks --runs RUN [RUN ...] --conversations DIR [DIR ...] --whisper WHISPER \
+        --output bench/results/networks
 
-RUN is a folder that export/train.py wrote (best.pt, log.jsonl). Give validation conversations, never test ones: this is what networks are
-chosen by. Writes OUTPUT.json, OUTPUT.md and OUTPUT.png. Times are of the ONNX file alone, in onnxruntime, on one thread: hot, and paced with
-16 ms of sleep and 8 MB of other memory touched between hops.
+RUN is a folder that export/train.py wrote (best.pt, log.jsonl). Give validation conversations, never test ones: this is
+what networks are chosen by. Writes OUTPUT.json, OUTPUT.md and OUTPUT.png. Times are of the ONNX file alone, in
+onnxruntime, on one thread: hot, and paced with 16 ms of sleep and 8 MB of other memory touched between hops.
 """
 
 from __future__ import annotations
@@ -20,10 +20,11 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from tqdm import tqdm
 
-from bench import table
-from bench.measure import quality
+from bench import results_writer
+from bench.measure import picture, scores
+from bench.measure.conversation import Conversation, every, find_conversations, progress
+from bench.measure.intervals import percentiles
 from bench.measure.recogniser import Recogniser, word_errors
 from edgefilter.dsp.metrics import si_sdr
 from edgefilter.engines import create
@@ -64,7 +65,9 @@ class Run:
     def facts(self) -> dict:
         """Shape, size, cost and validation loss."""
         config, size, last = self.trained.network.config, count(self.trained.network), self.curve[-1]
-        shape = f"{config.n_fft}/{config.hop}, {'-'.join(map(str, config.channels))}, GRU {config.layers} x {config.hidden}, {config.norm} norm"
+        channels = "-".join(map(str, config.channels))
+        gru = f"GRU {config.layers} x {config.hidden}"
+        shape = f"{config.n_fft}/{config.hop}, {channels}, {gru}, {config.norm} norm"
         hot, paced = per_hop(Crnn(self.model))
         return {
             "run": self.folder.name,
@@ -96,19 +99,19 @@ def per_hop(engine: Crnn) -> tuple[dict, dict]:
             began = time.perf_counter()
             slots.run()
             found.append(1000 * (time.perf_counter() - began))
-        p50, p99 = np.percentile(found, [50, 99])
-        return {"p50": round(float(p50), 3), "p99": round(float(p99), 3)}
+        return {name: round(ms, 3) for name, ms in percentiles(found, 50, 99).items()}
 
     times(0.0)
     return times(0.0), times(engine.stft.hop / SAMPLE_RATE)
 
 
-def judge(name: str, engine_of: object, conversations: list[quality.Conversation], recogniser: Recogniser) -> list[dict]:
+def judge(name: str, engine_of: object, conversations: list[Conversation], recogniser: Recogniser) -> list[dict]:
     """A row per conversation: room, SI-SDR, word errors."""
     rows = []
-    for conversation in tqdm(conversations, desc=name, unit="recording", disable=not sys.stderr.isatty()):
+    for conversation in progress(conversations, name=name):
         stream = Stream(engine_of(), conversation.profile)
-        out = np.concatenate((stream.process(conversation.read("mic"), conversation.read("ref")), stream.flush()))[conversation.span]
+        out = np.concatenate((stream.process(conversation.read("mic"), conversation.read("ref")), stream.flush()))
+        out = out[conversation.span]
         errors = word_errors(conversation.meta["text"], recogniser.transcribe(out))
         rows.append(
             {
@@ -125,42 +128,50 @@ def judge(name: str, engine_of: object, conversations: list[quality.Conversation
     return rows
 
 
-def markdown(facts: list[dict], rows: list[dict], head: dict, picture: str) -> str:
-    """Both tables."""
+FACTS = (
+    "run",
+    "shape",
+    "parameters",
+    "MMAC/s",
+    "ms a hop hot, p50 / p99",
+    "paced",
+    "steps",
+    "items",
+    "validation SI-SDR, dB",
+    "loss",
+)
+
+
+def markdown(facts: list[dict], rows: list[dict], name: str) -> str:
+    """Both tables; name: of the picture, without suffix."""
     rooms = sorted({row["room"] for row in rows})
     count_of = {room: sum(row["room"] == room and row["engine"] == rows[0]["engine"] for row in rows) for room in rooms}
-    lines = ["# Networks", "", ", ".join(f"{key} {value}" for key, value in head.items()), ""]
-    lines += ["| run | shape | parameters | MMAC/s | ms a hop hot, p50 / p99 | paced | steps | items | validation SI-SDR, dB | loss |", "| --- " * 10 + "|"]
+    cells = []
     for fact in facts:
-        cost = " | ".join(f"{fact[key]['p50']:.2f} / {fact[key]['p99']:.2f}" for key in ("hot_ms", "paced_ms"))
-        size = f"{fact['parameters'] / 1e6:.2f} M | {fact['mmac_per_s']:.0f}"
-        reached = f"{fact['validation']['si_sdr_db']:.2f} | {fact['validation']['total']:.4f}"
-        lines.append(f"| {fact['run']} | {fact['shape']} | {size} | {cost} | {fact['steps']} | {fact['items']} | {reached} |")
+        cost = [f"{fact[key]['p50']:.2f} / {fact[key]['p99']:.2f}" for key in ("hot_ms", "paced_ms")]
+        size = [f"{fact['parameters'] / 1e6:.2f} M", f"{fact['mmac_per_s']:.0f}"]
+        reached = [f"{fact['validation']['si_sdr_db']:.2f}", f"{fact['validation']['total']:.4f}"]
+        cells.append([fact["run"], fact["shape"], *size, *cost, fact["steps"], fact["items"], *reached])
+    lines = results_writer.table(FACTS, cells)
     shown = ", ".join(f"{number} in the {room}" for room, number in count_of.items())
-    lines += ["", f"In the whole path, on validation conversations ({shown}): mean SI-SDR in dB and capped WER in %, with 95 % bootstrap intervals.", ""]
-    lines += ["| engine | " + " | ".join(f"{room}: SI-SDR | WER" for room in rooms) + " |", "| --- " * (1 + 2 * len(rooms)) + "|"]
+    lines += [
+        "",
+        f"In the whole path, on validation conversations ({shown}): mean SI-SDR in dB and capped WER in %, with 95 % "
+        "bootstrap",
+    ]
+    lines += ["intervals.", ""]
+    columns, cells = ["engine", *(column for room in rooms for column in (f"{room}: SI-SDR", "WER"))], []
     for engine in dict.fromkeys(row["engine"] for row in rows):
-        cells = [engine]
+        cells.append([engine])
         for room in rooms:
-            figures = table.summarise([row for row in rows if row["engine"] == engine and row["room"] == room])
-            cells += [_cell(figures, "si_sdr", "si_sdr_mean", 1), _cell(figures, "wer_capped", "wer_capped", 0)]
-        lines.append("| " + " | ".join(cells) + " |")
-    return "\n".join([*lines, "", f"![learning curves]({picture})"]) + "\n"
+            figures = scores.summarise([row for row in rows if row["engine"] == engine and row["room"] == room])
+            cells[-1] += [scores.figure(figures, "si_sdr_mean", 1), scores.figure(figures, "wer_capped", 0)]
+    return "\n".join([*lines, *results_writer.table(columns, cells), "", f"![learning curves]({name}.png)", ""])
 
 
-def _cell(figures: dict, name: str, key: str, digits: int) -> str:
-    low, high = figures[f"{name}_interval"]
-    return f"{figures[key]:.{digits}f} [{low:.{digits}f}, {high:.{digits}f}]"
-
-
-def plot(runs: list[Run], path: Path) -> None:
+def plot(runs: list[Run], output: Path) -> None:
     """Validation loss and SI-SDR over the crops of 4 s that were seen."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from matplotlib import pyplot
-
-    figure, axes = pyplot.subplots(1, 2, figsize=(11, 4), layout="constrained")
+    figure, axes = picture.panels(1, 2, (11, 4))
     for run in runs:
         steps = [entry["step"] for entry in run.curve]
         for axis, key in zip(axes, ("si_sdr_db", "total")):
@@ -170,15 +181,18 @@ def plot(runs: list[Run], path: Path) -> None:
     axes[0].legend()
     for axis in axes:
         axis.grid(alpha=0.3)
-    figure.savefig(path, dpi=110)
+    picture.save(figure, output, dpi=110)
 
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--runs", type=Path, nargs="+", required=True, metavar="RUN")
     parser.add_argument("--conversations", type=Path, nargs="+", required=True, metavar="DIR")
-    parser.add_argument("--every", type=int, default=1, metavar="N", help="take every N-th conversation of each folder (default: all)")
-    parser.add_argument("--shares", type=float, nargs="+", default=[0.0, WIENER_SHARE], help="of the Wiener mask in the answer (default: 0 and the engine's)")
+    parser.add_argument(
+        "--every", type=int, default=1, metavar="N", help="take every N-th conversation of each folder (default: all)"
+    )
+    shares = "of the Wiener mask in the answer (default: 0 and the engine's)"
+    parser.add_argument("--shares", type=float, nargs="+", default=[0.0, WIENER_SHARE], help=shares)
     parser.add_argument("--whisper", type=Path, required=True, metavar="DIR")
     parser.add_argument("--output", type=Path, required=True, metavar="PATH")
     parser.add_argument("--cache", type=Path, default=Path.home() / ".cache" / "edgefilter-bench", metavar="DIR")
@@ -186,27 +200,31 @@ def main() -> int:
     torch.set_num_threads(1)
     try:
         recogniser = Recogniser(options.whisper, options.cache / "transcripts.jsonl")
-        sets = quality.find_conversations(options.conversations)
-        conversations = [conversation for found in sets.values() for conversation in found[:: options.every]]
+        conversations = [
+            conversation for _, conversation in every(find_conversations(options.conversations), options.every)
+        ]
         runs = [Run(folder) for folder in options.runs]
         if missing := [str(run.folder) for run in runs if not (run.folder / "best.pt").exists()]:
             raise UsageError(f"{', '.join(missing)}: no best.pt, expected what export/train.py wrote")
+        models = {"WHISPER": options.whisper, **{f"{run.folder.name}/best.pt": run.folder / "best.pt" for run in runs}}
+        made_with = results_writer.stamp({"conversations": options.conversations}, models=models)
         facts = [run.facts() for run in runs]
-        rows = [row for name in ("linear", "ss") for row in judge(name, lambda name=name: create(name), conversations, recogniser)]
+        rows = [
+            row
+            for name in ("linear", "ss")
+            for row in judge(name, lambda name=name: create(name), conversations, recogniser)
+        ]
         for run in runs:
             for share in options.shares:
-                rows += judge(f"{run.folder.name}, {share:g} Wiener", lambda run=run, share=share: Crnn(run.model, share), conversations, recogniser)
+                name = f"{run.folder.name}, {share:g} Wiener"
+                rows += judge(name, lambda run=run, share=share: Crnn(run.model, share), conversations, recogniser)
     except (EdgefilterError, OSError) as error:
         print(f"networks: {error}", file=sys.stderr)
         return 1
-    head = table.machine()
-    options.output.parent.mkdir(parents=True, exist_ok=True)
-    content = {"schema": 1, "machine": head, "runs": [fact | {"curve": run.curve} for fact, run in zip(facts, runs)], "utterances": rows}
-    options.output.with_suffix(".json").write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
-    plot(runs, options.output.with_suffix(".png"))
-    text = markdown(facts, rows, head, options.output.with_suffix(".png").name)
-    options.output.with_suffix(".md").write_text(text, encoding="utf-8")
-    print(text)
+    plot(runs, options.output)
+    content = {"runs": [fact | {"curve": run.curve} for fact, run in zip(facts, runs)], "utterances": rows}
+    page = markdown(facts, rows, options.output.name)
+    print(results_writer.write(options.output, made_with, "Networks", page, content))
     return 0
 
 

@@ -1,4 +1,7 @@
-"""Two public echo cancellers as rows of the benchmark: SpeexDSP (the system's library, through ctypes) and WebRTC AEC3 (pywebrtc-audio)."""
+"""Two public echo cancellers as rows of the benchmark.
+
+SpeexDSP (the system's library, through ctypes) and WebRTC AEC3 (pywebrtc-audio).
+"""
 
 from __future__ import annotations
 
@@ -20,11 +23,14 @@ SUPPRESSED_DELAY = FRAME
 """Samples by which SpeexDSP's preprocessor delays the signal (its windows overlap by one frame); removed here."""
 AEC3_FRAME = 160
 AEC3_DELAY = 128
-"""Samples by which AEC3 delays the signal (it regroups frames of 80 samples into blocks of 64 and back); removed here."""
+"""Samples by which AEC3 delays the signal (it regroups frames of 80 samples into blocks of 64 and back); removed
+here."""
 
 
 def speexdsp(mic: Samples, ref: Samples) -> Samples:
-    """SpeexDSP's echo canceller alone (MDF, Valin 2007), (n,) float32 for mic and ref (n,); output aligned with the input.
+    """SpeexDSP's echo canceller alone (MDF, Valin 2007), (n,) float32 for mic and ref (n,).
+
+    Output aligned with the input.
 
     Raises UsageError where libspeexdsp.so.1 is missing.
     """
@@ -32,17 +38,21 @@ def speexdsp(mic: Samples, ref: Samples) -> Samples:
 
 
 def speexdsp_suppressed(mic: Samples, ref: Samples) -> Samples:
-    """SpeexDSP's echo canceller followed by its preprocessor (residual echo and noise suppression, default strengths), as in its manual."""
+    """SpeexDSP's echo canceller and its preprocessor (residual echo, noise; default strengths), as in its manual."""
     return _speexdsp(mic, ref, suppress=True)
 
 
 def aec3(mic: Samples, ref: Samples) -> Samples:
-    """WebRTC AEC3 with its own delay estimator and high-pass, (n,) float32 for mic and ref (n,); output aligned with the input.
+    """WebRTC AEC3 with its own delay estimator and high-pass, (n,) float32 for mic and ref (n,).
+
+    Output aligned with the input.
 
     Raises UsageError where pywebrtc-audio is missing.
     """
     step = aec3_frames()
-    mic, ref = (np.append(as_samples(x, name), np.zeros(AEC3_DELAY, np.float32)) for x, name in ((mic, "mic"), (ref, "ref")))
+    mic, ref = (
+        np.append(as_samples(x, name), np.zeros(AEC3_DELAY, np.float32)) for x, name in ((mic, "mic"), (ref, "ref"))
+    )
     return np.asarray(step(mic, ref), np.float32)[AEC3_DELAY:]
 
 
@@ -102,7 +112,9 @@ def _load() -> ctypes.CDLL:
     try:
         library = ctypes.CDLL("libspeexdsp.so.1")
     except OSError as error:
-        raise UsageError("libspeexdsp.so.1 cannot be loaded, expected SpeexDSP 1.2: apt-get install libspeexdsp1") from error
+        raise UsageError(
+            "libspeexdsp.so.1 cannot be loaded, expected SpeexDSP 1.2: apt-get install libspeexdsp1"
+        ) from error
     pointer, integer = ctypes.c_void_p, ctypes.c_int
     for name, result, arguments in (
         ("speex_echo_state_init", pointer, (integer, integer)),
@@ -117,4 +129,3 @@ def _load() -> ctypes.CDLL:
         function = getattr(library, name)
         function.restype, function.argtypes = result, arguments
     return library
-

@@ -1,15 +1,18 @@
-#!/usr/bin/env python3
-"""Judge engines and public echo cancellers on whole robot conversations: SI-SDR and a recogniser's word errors, per room.
+r"""Judge engines and public echo cancellers on whole robot conversations.
 
-    python bench/quality.py --conversations DIR [DIR ...] --engines unfiltered,paper-ss,linear,ss,speexdsp,aec3,clean \\
+SI-SDR and a recogniser's word errors, per room.
+
+    python -m bench.measure.quality --conversations DIR [DIR ...] \
+        --engines unfiltered,paper-ss,linear,ss,speexdsp,aec3,clean \
         --whisper DIR --output bench/results/quality
 
-Writes OUTPUT.json and OUTPUT.md. Conversations are folders as bench/conversations.py makes them. An engine is any of the package's, or
-`unfiltered`, `clean` (the human at the microphone: the bound), `speexdsp`, `speexdsp-suppressed` (with its preprocessor), `aec3`.
-The package's engines get a profile calibrated from the conversation's own sweep and fan recording, and the raw reference. Peers get
-the raw reference too; with `-true-lag` after any name the reference is delayed by each utterance's true lag beforehand (drift and
-volume left in), which no robot knows: a favour to cancellers that have no search of their own.
-Scores are kept in --cache by recording and code, so that a run that was cut off goes on where it stopped.
+Writes OUTPUT.json and OUTPUT.md. Conversations are folders as bench.simulate.conversations makes them. An engine is any
+of the package's, or `unfiltered`, `clean` (the human at the microphone: the bound), `speexdsp`, `speexdsp-suppressed`
+(with its preprocessor), `aec3`. The package's engines get a profile calibrated from the conversation's own sweep and
+fan recording, and the raw reference. Peers get the raw reference too; with `-true-lag` after any name the reference is
+delayed by each utterance's true lag beforehand (drift and volume left in), which no robot knows: a favour to cancellers
+that have no search of their own. Scores are kept in --cache by recording and code, so that a run that was cut off goes
+on where it stopped.
 """
 
 from __future__ import annotations
@@ -21,103 +24,58 @@ import json
 import sys
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
 
 import numpy as np
-import soundfile as sf
-from tqdm import tqdm
 
 import edgefilter
-from bench import table
-from bench.measure import peers
+from bench import results_writer
+from bench.measure import peers, scores
+from bench.measure.conversation import Conversation, every, find_conversations, progress
 from bench.measure.recogniser import Recogniser, word_errors
 from edgefilter.dsp.metrics import si_sdr
 from edgefilter.engines import HAVE_MODEL
-from edgefilter.errors import EdgefilterError, UsageError
+from edgefilter.errors import EdgefilterError
 from edgefilter.types import SAMPLE_RATE, Samples
 
-Processor = Callable[["Conversation", Samples], Samples]
+Processor = Callable[[Conversation, Samples], Samples]
 """Takes a conversation and the reference to use, (n,), and returns (n,) samples aligned with the microphone."""
 TRUE_LAG = "-true-lag"
-MARGIN = 32
-"""Samples by which a true lag is given too short, so that a canceller's causal filter holds the direct sound's rise."""
-
-
-@dataclass(frozen=True)
-class Conversation:
-    """A folder of the generator; signals are read when asked for."""
-
-    folder: Path
-
-    @cached_property
-    def meta(self) -> dict:
-        return json.loads((self.folder / "meta.json").read_text(encoding="utf-8"))
-
-    @cached_property
-    def fingerprint(self) -> str:
-        names = ("mic", "ref", "clean", "sweep_mic", "fan_only")
-        return hashlib.sha256(b"".join((self.folder / f"{name}.flac").read_bytes() for name in names)).hexdigest()
-
-    def read(self, name: str) -> Samples:
-        samples, rate = sf.read(self.folder / f"{name}.flac", dtype="float32")
-        if rate != SAMPLE_RATE:
-            raise UsageError(f"{self.folder / name}.flac has {rate} Hz, expected {SAMPLE_RATE}: make it anew with bench/conversations.py")
-        return samples
-
-    @cached_property
-    def profile(self) -> object:
-        from edgefilter.calibration.calibrate import calibrate
-
-        return calibrate(self.read("sweep_ref"), self.read("sweep_mic"), self.read("fan_only"))
-
-    @property
-    def span(self) -> slice:
-        return slice(self.meta["start"], self.meta["end"])
-
-    def delayed_reference(self) -> Samples:
-        """The reference with each utterance delayed by its true lag and the converters' delay, less MARGIN, (n,)."""
-        ref, at = self.read("ref"), self.meta["t_main"]
-        delay = direct_delay(self.read("sweep_ref"), self.read("sweep_mic")) - MARGIN
-        out = np.zeros_like(ref)
-        for samples, start, lag in ((ref[:at], 0, self.meta["lag"]), (ref[at:], at, self.meta.get("lag2", self.meta["lag"]))):
-            begin = max(start + lag + delay, 0)
-            kept = samples[: max(ref.size - begin, 0)]
-            out[begin : begin + kept.size] += kept
-        return out
-
-
-def direct_delay(sweep_ref: Samples, sweep_mic: Samples) -> int:
-    """Samples by which the direct sound of the sweep arrives later than it was played (peak of the whitened cross-correlation)."""
-    size = 1 << (2 * sweep_ref.size).bit_length()
-    played = np.fft.rfft(sweep_ref, size)
-    power = np.abs(played) ** 2
-    response = np.fft.irfft(np.fft.rfft(sweep_mic, size) * played.conj() / (power + 1e-3 * power.max()))
-    return int(np.argmax(np.abs(response[:SAMPLE_RATE])))
+PEERS = ("speexdsp", "speexdsp-suppressed", "aec3")
+NO_ENGINE = ("unfiltered", "clean", *PEERS)
 
 
 def processor(name: str) -> Processor:
-    """The function behind a row's name; a name that is no peer is handed to edgefilter.enhance, which knows its engines."""
-    own: dict[str, Processor] = {
-        "unfiltered": lambda conversation, ref: conversation.read("mic"),
-        "clean": lambda conversation, ref: conversation.read("clean"),
-        "speexdsp": lambda conversation, ref: peers.speexdsp(conversation.read("mic"), ref),
-        "speexdsp-suppressed": lambda conversation, ref: peers.speexdsp_suppressed(conversation.read("mic"), ref),
-        "aec3": lambda conversation, ref: peers.aec3(conversation.read("mic"), ref),
-    }
-    return own.get(name) or (lambda conversation, ref: edgefilter.enhance(conversation.read("mic"), ref, conversation.profile, name))
+    """The function behind a row's name.
+
+    A name that is no peer is handed to edgefilter.enhance, which knows its engines.
+    """
+    if name == "unfiltered":
+        return lambda conversation, ref: conversation.read("mic")
+    if name == "clean":
+        return lambda conversation, ref: conversation.read("clean")
+    if name in PEERS:
+        peer = getattr(peers, name.replace("-", "_"))
+        return lambda conversation, ref: peer(conversation.read("mic"), ref)
+    return lambda conversation, ref: edgefilter.enhance(conversation.read("mic"), ref, conversation.profile, name)
 
 
 def code_version(name: str) -> str:
-    """Hash of the code that makes a row: changed code is scored anew. Of the package it is what filtering and calibrating import."""
-    bench = Path(__file__).parent
-    if name in ("unfiltered", "clean") or name.startswith(("speexdsp", "aec3")):
-        files = [bench / "peers.py"]
+    """Hash of the code that makes a row: changed code is scored anew.
+
+    Of the package it is what filtering and calibrating import.
+    """
+    if name in NO_ENGINE:
+        files = [Path(peers.__file__)]
     else:
         package = Path(edgefilter.__file__).parent
-        models = [*package.rglob("*.onnx"), *package.parent.glob("models/*.onnx")] if name.removesuffix(TRUE_LAG) in HAVE_MODEL else []
-        files = sorted(imported_by({package / "filter" / "ego_filter.py", package / "calibration" / "calibrate.py", *package.glob("engines/*.py")}, package)) + sorted(models)
+        models = [*package.rglob("*.onnx"), *package.parent.glob("models/*.onnx")] if name in HAVE_MODEL else []
+        entered = {
+            package / "filter" / "ego_filter.py",
+            package / "calibration" / "calibrate.py",
+            *package.glob("engines/*.py"),
+        }
+        files = sorted(imported_by(entered, package)) + sorted(models)
     return hashlib.sha256(b"".join(path.read_bytes() for path in files)).hexdigest()
 
 
@@ -130,17 +88,24 @@ def imported_by(files: set[Path], package: Path) -> set[Path]:
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
             if isinstance(node, ast.ImportFrom) and node.module and node.module.split(".")[0] == package.name:
                 place = package.parent.joinpath(*node.module.split("."))
-                asked = {place.with_suffix(".py"), place / "__init__.py", *((place / f"{alias.name}.py") for alias in node.names)}
+                asked = {
+                    place.with_suffix(".py"),
+                    place / "__init__.py",
+                    *((place / f"{alias.name}.py") for alias in node.names),
+                }
                 new |= {file for file in asked if file.exists()} - found
     return found
 
 
 def score(conversation: Conversation, engine: str, recogniser: Recogniser | None) -> dict:
-    """One row and utterance: si_sdr, errors, words, heard, seconds, duration; or the problem that made the output unusable."""
+    """One row and utterance: si_sdr, errors, words, heard, seconds, duration.
+
+    Or the problem that made the output unusable.
+    """
     base = engine.removesuffix(TRUE_LAG)
     ref = conversation.delayed_reference() if base != engine else conversation.read("ref")
     size, run = ref.size, processor(base)
-    if base not in ("unfiltered", "clean") and not base.startswith(("speexdsp", "aec3")):
+    if base not in NO_ENGINE:
         conversation.profile  # noqa: B018  calibrated here, so that its time is not the engine's
     began = time.perf_counter()
     out = run(conversation, ref)
@@ -158,17 +123,6 @@ def score(conversation: Conversation, engine: str, recogniser: Recogniser | None
         errors = word_errors(conversation.meta["text"], text)
         result |= {"errors": errors.errors, "words": errors.words, "heard": text}
     return result
-
-
-def find_conversations(folders: list[Path]) -> dict[str, list[Conversation]]:
-    """Conversations by the name of their set; raises UsageError for a folder without any."""
-    sets: dict[str, list[Conversation]] = {}
-    for folder in folders:
-        found = [Conversation(path.parent) for path in sorted(folder.glob("*/meta.json"))]
-        if not found:
-            raise UsageError(f"{folder} holds no */meta.json, expected conversations: make some with bench/conversations.py")
-        sets[folder.resolve().name if folder.resolve().name not in sets else str(folder)] = found
-    return sets
 
 
 class Scores:
@@ -194,14 +148,20 @@ class Scores:
         return self._known[key]
 
 
-def run(sets: dict[str, list[Conversation]], engines: list[str], recogniser: Recogniser | None, cache: Path) -> list[dict]:
+def run(
+    sets: dict[str, list[Conversation]], engines: list[str], recogniser: Recogniser | None, cache: Path
+) -> list[dict]:
     """Every score with its set, conversation and engine."""
-    scores = Scores(cache, Path(__file__).with_name("recogniser.py").read_text(encoding="utf-8") if recogniser else "no recogniser")
+    kept = Scores(
+        cache, Path(__file__).with_name("recogniser.py").read_text(encoding="utf-8") if recogniser else "no recogniser"
+    )
     versions = {engine: code_version(engine.removesuffix(TRUE_LAG)) for engine in engines}
-    jobs = [(name, conversation, engine) for name, found in sets.items() for conversation in found for engine in engines]
+    jobs = [(name, conversation, engine) for name, conversation in every(sets) for engine in engines]
     rows = []
-    for name, conversation, engine in tqdm(jobs, unit="recording", disable=not sys.stderr.isatty()):
-        made = scores.get(conversation, engine, versions[engine], lambda c=conversation, e=engine: score(c, e, recogniser))
+    for name, conversation, engine in progress(jobs):
+        made = kept.get(
+            conversation, engine, versions[engine], lambda c=conversation, e=engine: score(c, e, recogniser)
+        )
         rows.append({"set": name, "conversation": conversation.folder.name, "engine": engine, **made})
     return rows
 
@@ -212,7 +172,10 @@ def summarise(rows: list[dict]) -> dict[str, dict[str, dict[str, dict]]]:
     for row in rows:
         groups.setdefault(row["set"], {}).setdefault(row["room"], {}).setdefault(row["engine"], []).append(row)
     return {
-        name: {room: {engine: table.summarise(found) for engine, found in engines.items()} for room, engines in rooms.items()}
+        name: {
+            room: {engine: scores.summarise(found) for engine, found in engines.items()}
+            for room, engines in rooms.items()
+        }
         for name, rooms in groups.items()
     }
 
@@ -220,26 +183,27 @@ def summarise(rows: list[dict]) -> dict[str, dict[str, dict[str, dict]]]:
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--conversations", type=Path, nargs="+", required=True, metavar="DIR")
-    parser.add_argument("--engines", default="unfiltered,paper-ss,linear,ss,speexdsp,speexdsp-suppressed,aec3,clean", metavar="A,B,...")
+    parser.add_argument(
+        "--engines", default="unfiltered,paper-ss,linear,ss,speexdsp,speexdsp-suppressed,aec3,clean", metavar="A,B,..."
+    )
     parser.add_argument("--whisper", type=Path, metavar="DIR", help="recogniser's folder; without it only SI-SDR")
     parser.add_argument("--output", type=Path, required=True, metavar="PATH", help="PATH.json and PATH.md are written")
     parser.add_argument("--cache", type=Path, default=Path.home() / ".cache" / "edgefilter-bench", metavar="DIR")
     parser.add_argument("--title", default="Quality on robot conversations")
     options = parser.parse_args()
+    engines = options.engines.split(",")
     try:
         recogniser = Recogniser(options.whisper, options.cache / "transcripts.jsonl") if options.whisper else None
         sets = find_conversations(options.conversations)
-        rows = run(sets, options.engines.split(","), recogniser, options.cache / "scores.jsonl")
+        own = [engine.removesuffix(TRUE_LAG) for engine in engines]
+        made_with = results_writer.stamp({"conversations": options.conversations}, own, {"WHISPER": options.whisper})
+        rows = run(sets, engines, recogniser, options.cache / "scores.jsonl")
     except (EdgefilterError, OSError) as error:
         print(f"quality: {error}", file=sys.stderr)
         return 1
-    summaries, head = summarise(rows), table.machine()
-    options.output.parent.mkdir(parents=True, exist_ok=True)
-    content = {"schema": 1, "title": options.title, "machine": head, "summary": summaries, "utterances": rows}
-    options.output.with_suffix(".json").write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
-    text = table.markdown(summaries, head, options.title)
-    options.output.with_suffix(".md").write_text(text, encoding="utf-8")
-    print(text)
+    summaries = summarise(rows)
+    content = {"summary": summaries, "utterances": rows}
+    print(results_writer.write(options.output, made_with, options.title, scores.markdown(summaries), content))
     return 0
 
 

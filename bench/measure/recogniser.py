@@ -1,7 +1,7 @@
 """Word errors by Whisper-base (faster-whisper, int8, one thread), from a folder on this machine; nothing is fetched.
 
-The folder holds a CTranslate2 conversion: model.bin, config.json, tokenizer.json, vocabulary.json. Transcripts are kept in a
-JSON-lines file under the audio's hash, so that no audio is recognised twice.
+The folder holds a CTranslate2 conversion: model.bin, config.json, tokenizer.json, vocabulary.json. Transcripts are kept
+in a JSON-lines file under the audio's hash, so that no audio is recognised twice.
 """
 
 from __future__ import annotations
@@ -18,13 +18,27 @@ import numpy as np
 from edgefilter.errors import UsageError
 from edgefilter.types import Samples, as_samples
 
-SETTINGS = {"language": "en", "beam_size": 1, "temperature": 0.0, "condition_on_previous_text": False, "without_timestamps": True}
+SETTINGS = {
+    "language": "en",
+    "beam_size": 1,
+    "temperature": 0.0,
+    "condition_on_previous_text": False,
+    "without_timestamps": True,
+}
 PEAK = 0.5
 """Every input is scaled to this peak, so that the recogniser does not judge levels."""
 _TEENS = "ten eleven twelve thirteen fourteen fifteen sixteen seventeen eighteen nineteen"
 _SMALL = f"zero one two three four five six seven eight nine {_TEENS}".split()
 _TENS = "_ _ twenty thirty forty fifty sixty seventy eighty ninety".split()
-_ORDINALS = {"one": "first", "two": "second", "three": "third", "five": "fifth", "eight": "eighth", "nine": "ninth", "twelve": "twelfth"}
+_ORDINALS = {
+    "one": "first",
+    "two": "second",
+    "three": "third",
+    "five": "fifth",
+    "eight": "eighth",
+    "nine": "ninth",
+    "twelve": "twelfth",
+}
 _TITLES = {"mr": "mister", "mrs": "missus", "dr": "doctor", "st": "saint"}
 
 
@@ -58,8 +72,10 @@ def word_errors(text: str, recognised: str) -> WordErrors:
 
 
 def normalise(text: str) -> str:
-    """Lower case; integers and ordinals as words (1100-1999 read as years); mr, mrs, dr, st spelt out; of the punctuation only
-    apostrophes inside words stay. British and American spellings are left alone (both are in the recordings).
+    """Lower case; integers and ordinals as words (1100-1999 read as years).
+
+    Mr, mrs, dr, st spelt out; of the punctuation only apostrophes inside words stay. British and American spellings are
+    left alone (both are in the recordings).
 
     >>> normalise("Mr. Brown's 3rd dog, born in 1839 -- 21 years!")
     "mister brown's third dog born in eighteen thirty nine twenty one years"
@@ -104,7 +120,9 @@ class Recogniser:
     def __init__(self, folder: Path, cache: Path) -> None:
         config = folder / "config.json"
         if not (folder / "model.bin").is_file() or not config.is_file():
-            raise UsageError(f"{folder} holds no model.bin and config.json; expected a CTranslate2 conversion of Whisper-base")
+            raise UsageError(
+                f"{folder} holds no model.bin and config.json; expected a CTranslate2 conversion of Whisper-base"
+            )
         identity = f"{(folder / 'model.bin').stat().st_size} {config.read_text()} {SETTINGS} {PEAK}"
         self._identity = hashlib.sha256(identity.encode()).hexdigest()
         self._folder, self._cache, self._model = folder, cache, None
@@ -130,7 +148,9 @@ class Recogniser:
         if self._model is None:
             from faster_whisper import WhisperModel
 
-            self._model = WhisperModel(str(self._folder), device="cpu", compute_type="int8", cpu_threads=1, local_files_only=True)
+            self._model = WhisperModel(
+                str(self._folder), device="cpu", compute_type="int8", cpu_threads=1, local_files_only=True
+            )
         segments, _ = self._model.transcribe(samples, **SETTINGS)
         return " ".join(segment.text.strip() for segment in segments)
 

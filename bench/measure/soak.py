@@ -1,11 +1,13 @@
-"""The long run: an hour of audio faster than real time, or minutes live on a virtual device; memory, time per hop and samples must not drift.
+"""The long run: an hour of audio faster than real time, or minutes live on a virtual device.
 
-    OMP_NUM_THREADS=1 python bench/soak.py --minutes 60 --output bench/results/soak
-    OMP_NUM_THREADS=1 python bench/soak.py --live 10 --output bench/results/soak_live    (needs PulseAudio)
+Memory, time per hop and samples must not drift.
 
-Exit code 1 where something drifted. The sound is the bundled conversation over and over, the reference with a clock that is PPM fast, so that
-the alignment has work to do for ever. Memory and processor time per block are read once in every slice; the first tenth of the run, 15 s
-at least, is warm-up.
+    OMP_NUM_THREADS=1 python -m bench.measure.soak --minutes 60 --output bench/results/soak
+    OMP_NUM_THREADS=1 python -m bench.measure.soak --live 10 --output bench/results/soak_live    (needs PulseAudio)
+
+Exit code 1 where something drifted. The sound is the bundled conversation over and over, the reference with a clock
+that is PPM fast, so that the alignment has work to do for ever. Memory and processor time per block are read once in
+every slice; the first tenth of the run, 15 s at least, is warm-up.
 """
 
 from __future__ import annotations
@@ -25,8 +27,9 @@ import numpy as np
 import soundfile
 
 import edgefilter
-from bench.measure import virtual_sound
-from bench.table import machine
+from bench import results_writer
+from bench.measure import picture, virtual_sound
+from bench.measure.intervals import percentiles
 from edgefilter import EgoFilter
 from edgefilter.types import SAMPLE_RATE
 
@@ -38,13 +41,13 @@ GROWTH_MB = 3.0
 """Most growth of memory from the warm-up to the end; an array that grew by one frame a hop would add 115 MB an hour."""
 SETTLING_S = 15.0
 SLOWER = 1.3
-"""Most growth of a block's processor time over that of a bypassed block, second half over first. A shared machine changes its
-speed by more than that, and the bypass with it."""
+"""Most growth of a block's processor time over that of a bypassed block, second half over first. A shared machine
+changes its speed by more than that, and the bypass with it."""
 
 
 @dataclass
 class Slice:
-    """One part of the run: audio so far (s), resident memory (MB), processor time per block and that of a bypassed block (ms)."""
+    """Audio so far (s), resident memory (MB), processor time per block and that of a bypassed block (ms)."""
 
     seconds: float
     memory_mb: float
@@ -59,7 +62,7 @@ def memory_mb(pid: int | str = "self") -> float:
 
 
 def blocks(total: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """total samples of the conversation in a loop, the reference on its own clock."""
+    """Total samples of the conversation in a loop, the reference on its own clock."""
     mic, ref = (soundfile.read(DEMO / f"{name}.flac", dtype="float32")[0] for name in ("mic", "reference"))
     for at in range(0, total, BLOCK):
         count = min(BLOCK, total - at)
@@ -85,12 +88,20 @@ def from_file(minutes: float, engine: str, slices: int) -> dict:
         ego.events()
         out, done = out + finished.size, done + mic.size
         if done * slices // total > len(parts):
-            p50, p99 = np.percentile(took, (50, 99))
-            parts.append(Slice(done / SAMPLE_RATE, memory_mb(), float(p50), float(p99), float(np.median(bypassed))))
+            parts.append(
+                Slice(done / SAMPLE_RATE, memory_mb(), *percentiles(took, 50, 99).values(), float(np.median(bypassed)))
+            )
             took.clear()
             bypassed.clear()
     out += ego.flush().size
-    return {"kind": "file", "engine": ego.engine_name, "samples_in": done, "samples_out": out, "lost": 0, "slices": [asdict(part) for part in parts]}
+    return {
+        "kind": "file",
+        "engine": ego.engine_name,
+        "samples_in": done,
+        "samples_out": out,
+        "lost": 0,
+        "slices": [asdict(part) for part in parts],
+    }
 
 
 def live(minutes: float, engine: str, slices: int) -> dict:
@@ -98,9 +109,31 @@ def live(minutes: float, engine: str, slices: int) -> dict:
     with virtual_sound.server() as server, tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         seconds = 60 * minutes
-        players = [_play(server, sink, recording, seconds, folder) for sink, recording in (("robot", "reference"), ("robot_mic", "mic"))]
-        command = [sys.executable, "-m", "edgefilter.cli", "run", "--input", "mic", "--profile", str(DEMO / "profile.npz"), "--engine", engine]
-        command += ["--output", str(folder / "out.wav"), "--json", str(folder / "stats.json"), "--seconds", str(seconds), "--quiet"]
+        players = [
+            _play(server, sink, recording, seconds, folder)
+            for sink, recording in (("robot", "reference"), ("robot_mic", "mic"))
+        ]
+        command = [
+            sys.executable,
+            "-m",
+            "edgefilter.cli",
+            "run",
+            "--input",
+            "mic",
+            "--profile",
+            str(DEMO / "profile.npz"),
+            "--engine",
+            engine,
+        ]
+        command += [
+            "--output",
+            str(folder / "out.wav"),
+            "--json",
+            str(folder / "stats.json"),
+            "--seconds",
+            str(seconds),
+            "--quiet",
+        ]
         run = subprocess.Popen(command, env=server.environment, stderr=subprocess.PIPE, text=True)
         began, parts = time.monotonic(), []
         while run.poll() is None:
@@ -114,7 +147,12 @@ def live(minutes: float, engine: str, slices: int) -> dict:
         if run.returncode:
             raise SystemExit(f"{' '.join(command)} failed: {run.stderr.read()}")
         stats = json.loads((folder / "stats.json").read_text())
-    found = {"kind": "live", "engine": stats["engine"], "samples_in": stats["samples_in"], "samples_out": stats["samples_out"]}
+    found = {
+        "kind": "live",
+        "engine": stats["engine"],
+        "samples_in": stats["samples_in"],
+        "samples_out": stats["samples_out"],
+    }
     found |= {"lost": stats["samples_lost"], "source": stats["source"], "deadline": stats["deadline"]}
     return {**found, "slices": [asdict(part) for part in parts]}
 
@@ -146,73 +184,94 @@ def judge(result: dict) -> list[str]:
         first, second = (_over_bypass(parts) for parts in (settled[:half], settled[half:]))
         result["slower"] = second / first
         if second > SLOWER * first:
-            troubles.append(f"a block took {first:.1f} times as long as a bypassed one in the first half and {second:.1f} times in the second")
+            troubles.append(
+                f"a block took {first:.1f} times as long as a bypassed one in the first half and "
+                f"{second:.1f} times in the second"
+            )
     return troubles
 
 
 def _over_bypass(parts: list[dict]) -> float:
-    """A block's time over a bypassed one's. The mean, since a slice in which the robot is mostly silent costs two thirds of another; of the
-    bypassed block, which costs the same whatever is heard, the median."""
+    """A block's time over a bypassed one's.
+
+    The mean, since a slice in which the robot is mostly silent costs two thirds of another; of the bypassed block,
+    which costs the same whatever is heard, the median.
+    """
     return float(np.mean([part["p50_ms"] for part in parts]) / np.median([part["bypass_ms"] for part in parts]))
 
 
 def markdown(result: dict, name: str) -> str:
-    """A page of its own; name: of the picture beside it, without suffix."""
-    seconds = result["samples_in"] / SAMPLE_RATE
-    lines = [f"# Soak: {seconds / 60:.0f} minutes of `{result['engine']}`, {'live' if result['kind'] == 'live' else 'faster than real time'}", ""]
-    lines += [", ".join(f"{key} {value}" for key, value in result["machine"].items()), ""]
+    """The page below its title; name: of the picture beside it, without suffix."""
+    lines = [f"Load average at the end {result['load_average']:.1f}.", ""]
     lines += [f"{result['samples_in']} samples in, {result['samples_out']} out, {result['lost']} lost;"]
     lines += [f"memory grew by {result['memory_growth_mb']:+.2f} MB after the warm-up;"]
     if result["kind"] == "file":
-        lines += [f"against a bypassed one, a block took {result['slower']:.2f} times as long in the second half as in the first."]
+        lines += [
+            f"against a bypassed one, a block took {result['slower']:.2f} times as long in the second half as in "
+            "the first."
+        ]
     else:
         deadline = result["deadline"]
-        lines += [f"{deadline['missed_deadlines']} of {deadline['hops']} hops missed their deadline, p99 {deadline['compute']['p99_ms']:.1f} ms;"]
-        lines += [f"{deadline['steps']} steps down or up between engines to keep to {deadline['budget_ms']:g} ms, the engine above is the last."]
+        lines += [
+            f"{deadline['missed_deadlines']} of {deadline['hops']} hops missed their deadline, "
+            f"p99 {deadline['compute']['p99_ms']:.1f} ms;"
+        ]
+        lines += [
+            f"{deadline['steps']} steps down or up between engines to keep to {deadline['budget_ms']:g} ms, "
+            "the engine above is the last."
+        ]
     lines += ["", f"Verdict: {'; '.join(result['troubles']) or 'nothing drifted'}.", ""]
-    lines += ["| minute | memory MB | p50 | p99 | bypassed, ms per 20 ms block |", "| --- " * 5 + "|"]
+    cells = []
     for part in result["slices"]:
-        times = " | ".join("" if part[key] is None else f"{part[key]:.3f}" for key in ("p50_ms", "p99_ms", "bypass_ms"))
-        lines.append(f"| {part['seconds'] / 60:.1f} | {part['memory_mb']:.1f} | {times} |")
+        times = ["" if part[key] is None else f"{part[key]:.3f}" for key in ("p50_ms", "p99_ms", "bypass_ms")]
+        cells.append([f"{part['seconds'] / 60:.1f}", f"{part['memory_mb']:.1f}", *times])
+    lines += results_writer.table(["minute", "memory MB", "p50", "p99", "bypassed, ms per 20 ms block"], cells)
     return "\n".join([*lines, "", f"![memory and time]({name}.png)", ""])
 
 
-def draw(result: dict, path: Path) -> None:
+def title(result: dict) -> str:
+    """How long, of what, how."""
+    minutes = result["samples_in"] / SAMPLE_RATE / 60
+    pace = "live" if result["kind"] == "live" else "faster than real time"
+    return f"Soak: {minutes:.0f} minutes of `{result['engine']}`, {pace}"
+
+
+def draw(result: dict, output: Path) -> None:
     """Memory over the run, and beside it, where blocks were timed, their median over a bypassed one's."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from matplotlib import pyplot as plt
-
     timed = result["kind"] == "file"
-    figure, axes = plt.subplots(1, 1 + timed, figsize=(5 + 5 * timed, 3.5), layout="constrained", squeeze=False)
+    figure, axes = picture.panels(1, 1 + timed, (5 + 5 * timed, 3.5))
     minutes = [part["seconds"] / 60 for part in result["slices"]]
-    panels = [("resident memory, MB", [part["memory_mb"] for part in result["slices"]])]
-    panels += [("median block over a bypassed one", [part["p50_ms"] / part["bypass_ms"] for part in result["slices"]])] if timed else []
-    for axis, (title, values) in zip(axes[0], panels):
+    curves = [("resident memory, MB", [part["memory_mb"] for part in result["slices"]])]
+    if timed:
+        curves.append(
+            ("median block over a bypassed one", [part["p50_ms"] / part["bypass_ms"] for part in result["slices"]])
+        )
+    for axis, (name, values) in zip(axes, curves, strict=True):
         axis.plot(minutes, values, "o-")
-        axis.set(title=title, xlabel="minutes", ylim=(0, 1.2 * max(values)))
-    figure.savefig(path, dpi=100)
-    plt.close(figure)
+        axis.set(title=name, xlabel="minutes", ylim=(0, 1.2 * max(values)))
+    picture.save(figure, output)
 
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--minutes", type=float, default=60.0, help="of audio, faster than real time (default: %(default)s)")
+    parser.add_argument(
+        "--minutes", type=float, default=60.0, help="of audio, faster than real time (default: %(default)s)"
+    )
     parser.add_argument("--live", type=float, metavar="MINUTES", help="run live on a virtual device instead")
     parser.add_argument("--engine", default="auto")
     parser.add_argument("--slices", type=int, default=20)
     parser.add_argument("--output", type=Path, help="without suffix; .json, .md and .png are written")
     args = parser.parse_args()
-    result = live(args.live, args.engine, args.slices) if args.live else from_file(args.minutes, args.engine, args.slices)
-    result["machine"] = {**machine(), "load average": f"{os.getloadavg()[0]:.1f}"}
+    made_with = results_writer.stamp({"DEMO": [DEMO]}, [args.engine])
+    result = (
+        live(args.live, args.engine, args.slices) if args.live else from_file(args.minutes, args.engine, args.slices)
+    )
+    result["load_average"] = os.getloadavg()[0]
     result["troubles"] = judge(result)
     page = markdown(result, args.output.name if args.output else "soak")
     if args.output:
-        args.output.with_suffix(".json").write_text(json.dumps(result, indent=1) + "\n")
-        args.output.with_suffix(".md").write_text(page)
-        draw(result, args.output.with_suffix(".png"))
-    print(page)
+        draw(result, args.output)
+    print(results_writer.write(args.output, made_with, title(result), page, result))
     return 1 if result["troubles"] else 0
 
 

@@ -1,64 +1,94 @@
 """Chooses alpha and beta of the paper's spectral subtraction on validation conversations (never on test ones).
 
-    python bench/tune_paper_ss.py --conversations DIR --whisper DIR --output bench/results/tune_paper_ss.json
+    python -m bench.measure.tune_paper_ss --conversations DIR --whisper WHISPER --output bench/results/tune_paper_ss
 
-Eq. (6) and (7) leave the over-subtraction factor alpha and the amplification beta open. Prints word errors and SI-SDR per alpha.
-beta scales the output alone: SI-SDR ignores it, and so does a recogniser that is given a normalised level; it is therefore
-the largest of 1, 2, 4, 8 that clips no validation conversation.
+Eq. (6) and (7) leave the over-subtraction factor alpha and the amplification beta open. Writes word errors and SI-SDR
+per alpha, OUTPUT.json and OUTPUT.md. beta scales the output alone: SI-SDR ignores it, and so does a recogniser that is
+given a normalised level; it is therefore the largest of 1, 2, 4, 8 that clips no validation conversation.
 """
 
 from __future__ import annotations
 
 import argparse
-import json
+import sys
 from pathlib import Path
 
 import numpy as np
-from tqdm import tqdm
 
-from bench.measure.quality import Conversation
-from bench.measure.recogniser import Recogniser, word_errors
+from bench import results_writer
+from bench.measure.conversation import Conversation, every, find_conversations, progress
+from bench.measure.recogniser import Recogniser, WordErrors, word_errors
 from edgefilter.dsp.metrics import si_sdr
 from edgefilter.engines.paper_ss import PAPER_STFT, PaperSpectralSubtraction
+from edgefilter.errors import EdgefilterError
 from edgefilter.filter.stream import Stream
 
 ALPHAS = (0.25, 0.5, 1.0, 2.0, 4.0, 8.0)
 BETAS = (8.0, 4.0, 2.0, 1.0)
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--conversations", type=Path, required=True)
-    parser.add_argument("--whisper", type=Path, required=True)
-    parser.add_argument("--cache", type=Path, default=Path("transcripts.jsonl"), help="transcripts by hash of the audio (default: %(default)s)")
-    parser.add_argument("--output", type=Path, required=True)
-    args = parser.parse_args()
-    recogniser = Recogniser(args.whisper, args.cache)
-    folders = sorted(path.parent for path in args.conversations.glob("*/meta.json"))
-    rows = {alpha: [] for alpha in ALPHAS}
-    for folder in tqdm(folders):
-        talk = Conversation(folder)
-        meta, profile, span = talk.meta, talk.profile, talk.span
-        mic, ref, clean = (talk.read(name) for name in ("mic", "ref", "clean"))
-        for alpha in ALPHAS:
-            stream = Stream(PaperSpectralSubtraction(profile.response_bins(PAPER_STFT), alpha=alpha), profile)
-            out = np.concatenate((stream.process(mic, ref), stream.flush()))
-            found = word_errors(meta["text"], recogniser.transcribe(out[span]))
-            rows[alpha].append((meta["room"], si_sdr(out[span], clean[span]), found, float(np.abs(out).max())))
-    table = []
-    for alpha, results in rows.items():
-        for room in sorted({r[0] for r in results}):
-            of = [r for r in results if r[0] == room]
-            wer = sum(r[2].capped * r[2].words for r in of) / sum(r[2].words for r in of)
-            table.append({"alpha": alpha, "room": room, "capped_wer": wer, "si_sdr_db": float(np.mean([r[1] for r in of])), "conversations": len(of)})
-            print(table[-1])
-    mean = {alpha: np.mean([row["capped_wer"] for row in table if row["alpha"] == alpha]) for alpha in ALPHAS}
+def score(talk: Conversation, alpha: float, recogniser: Recogniser) -> tuple[str, float, WordErrors, float]:
+    """Room, SI-SDR in dB, word errors, peak of the output."""
+    stream = Stream(PaperSpectralSubtraction(talk.profile.response_bins(PAPER_STFT), alpha=alpha), talk.profile)
+    out = np.concatenate((stream.process(talk.read("mic"), talk.read("ref")), stream.flush()))
+    found = word_errors(talk.meta["text"], recogniser.transcribe(out[talk.span]))
+    return talk.meta["room"], si_sdr(out[talk.span], talk.read("clean")[talk.span]), found, float(np.abs(out).max())
+
+
+def by_room(results: dict[float, list[tuple]]) -> list[dict]:
+    """Capped word errors, weighted by words, and mean SI-SDR per alpha and room."""
+    rows = []
+    for alpha, found in results.items():
+        for room in sorted({result[0] for result in found}):
+            of = [result for result in found if result[0] == room]
+            wer = sum(errors.capped * errors.words for _, _, errors, _ in of) / sum(
+                errors.words for _, _, errors, _ in of
+            )
+            mean = float(np.mean([result[1] for result in of]))
+            rows.append({"alpha": alpha, "room": room, "capped_wer": wer, "si_sdr_db": mean, "conversations": len(of)})
+    return rows
+
+
+def choose(results: dict[float, list[tuple]], rows: list[dict]) -> tuple[float, float, float]:
+    """Alpha with the fewest word errors, mean over rooms; beta; the peak without beta."""
+    mean = {alpha: np.mean([row["capped_wer"] for row in rows if row["alpha"] == alpha]) for alpha in results}
     best = min(mean, key=mean.get)
-    peak = max(r[3] for r in rows[best])
-    beta = next((b for b in BETAS if b * peak < 1.0), 1.0)
-    print(f"alpha {best}, beta {beta} (peak {peak:.2f})")
-    args.output.write_text(json.dumps({"alpha": best, "beta": beta, "rows": table}, indent=1) + "\n")
+    peak = max(result[3] for result in results[best])
+    return best, next((beta for beta in BETAS if beta * peak < 1.0), 1.0), peak
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--conversations", type=Path, required=True, metavar="DIR")
+    parser.add_argument("--whisper", type=Path, required=True, metavar="DIR")
+    parser.add_argument("--cache", type=Path, default=Path.home() / ".cache" / "edgefilter-bench", metavar="DIR")
+    parser.add_argument("--output", type=Path, required=True, metavar="PATH", help="PATH.json and PATH.md are written")
+    args = parser.parse_args()
+    try:
+        recogniser = Recogniser(args.whisper, args.cache / "transcripts.jsonl")
+        talks = [talk for _, talk in every(find_conversations([args.conversations]))]
+        made_with = results_writer.stamp({"conversations": [args.conversations]}, models={"WHISPER": args.whisper})
+        results = {
+            alpha: [score(talk, alpha, recogniser) for talk in progress(talks, name=f"alpha {alpha:g}")]
+            for alpha in ALPHAS
+        }
+    except (EdgefilterError, OSError) as error:
+        print(f"tune_paper_ss: {error}", file=sys.stderr)
+        return 1
+    rows = by_room(results)
+    best, beta, peak = choose(results, rows)
+    cells = [
+        [f"{row['alpha']:g}", row["room"], f"{100 * row['capped_wer']:.0f}", f"{row['si_sdr_db']:.1f}"] for row in rows
+    ]
+    page = [
+        f"alpha {best:g}, beta {beta:g} (peak {peak:.2f}).",
+        "",
+        *results_writer.table(["alpha", "room", "capped WER %", "SI-SDR dB"], cells),
+    ]
+    content = {"alpha": best, "beta": beta, "rows": rows}
+    print(results_writer.write(args.output, made_with, "alpha and beta of paper-ss", "\n".join(page), content))
+    return 0
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

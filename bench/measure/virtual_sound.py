@@ -1,4 +1,4 @@
-"""A private PulseAudio server with null sinks, seen by PortAudio through ALSA by their names and the names of their monitors."""
+"""A private PulseAudio server with null sinks, seen by PortAudio through ALSA by their and their monitors' names."""
 
 from __future__ import annotations
 
@@ -28,9 +28,17 @@ class Server:
 
 
 def start_server(folder: Path, sinks: Sequence[str] = SINKS) -> Server:
-    """Start a server whose files all lie in folder and wait until its sinks are there; the first two are the default output and microphone."""
+    """Start a server whose files all lie in folder and wait until its sinks are there.
+
+    The first two are the default output and microphone.
+    """
     socket = f"unix:{folder}/socket"
-    environment = {**os.environ, "HOME": str(folder), "XDG_RUNTIME_DIR": str(folder), "PULSE_RUNTIME_PATH": str(folder / "run")}
+    environment = {
+        **os.environ,
+        "HOME": str(folder),
+        "XDG_RUNTIME_DIR": str(folder),
+        "PULSE_RUNTIME_PATH": str(folder / "run"),
+    }
     arguments = ["-n", "--daemonize=no", "--use-pid-file=no", "--exit-idle-time=-1", "--disable-shm=yes"]
     modules = [f"module-native-protocol-unix socket={folder}/socket auth-anonymous=1"]
     modules += [f"module-null-sink sink_name={name} rate=16000 format=s16le channels=1" for name in sinks]

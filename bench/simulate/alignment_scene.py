@@ -1,4 +1,7 @@
-"""Scenes with a known truth for judging alignment: speech-like sounds, rooms, drifting clocks, dropped buffers, a fan, a human."""
+"""Scenes with a known truth for judging alignment.
+
+Speech-like sounds, rooms, drifting clocks, dropped buffers, a fan, a human.
+"""
 
 from __future__ import annotations
 
@@ -30,7 +33,9 @@ def speech_like(rng: np.random.Generator, seconds: float) -> np.ndarray:
     while at < n:
         size = int(rng.uniform(0.12, 0.3) * RATE)
         pitch = rng.uniform(90, 220)
-        pulses = signal.sawtooth(2 * np.pi * np.cumsum(np.full(size, pitch) * (1 + 0.05 * np.sin(np.arange(size) / 900))) / RATE)
+        pulses = signal.sawtooth(
+            2 * np.pi * np.cumsum(np.full(size, pitch) * (1 + 0.05 * np.sin(np.arange(size) / 900))) / RATE
+        )
         noise = rng.standard_normal(size)
         source = pulses * rng.uniform(0.3, 1) + noise * rng.uniform(0.1, 0.6)
         for centre in (rng.uniform(300, 800), rng.uniform(1000, 2400), rng.uniform(2500, 4500)):
@@ -43,7 +48,7 @@ def speech_like(rng: np.random.Generator, seconds: float) -> np.ndarray:
 
 
 def room(rng: np.random.Generator, rt60: float, body: np.ndarray | None = None, direct_db: float = 3.0) -> np.ndarray:
-    """Impulse response (n,): a body (shell and near reflections, the same everywhere) and a diffuse tail, direct_db under it."""
+    """Impulse response (n,): a body (the same everywhere) and a diffuse tail, direct_db under it."""
     n = int(rt60 * RATE)
     h = np.zeros(HEAD + n)
     body = robot_body(np.random.default_rng(7)) if body is None else body
@@ -64,7 +69,9 @@ def known_path(h: np.ndarray) -> KnownPath:
     return KnownPath(EchoModel(np.pad(h, (PRE_ROLL - HEAD, 0)).astype(np.float32)))
 
 
-def hear(ref: np.ndarray, lags: list[tuple[int, float]], h: np.ndarray, ppm: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
+def hear(
+    ref: np.ndarray, lags: list[tuple[int, float]], h: np.ndarray, ppm: float = 0.0
+) -> tuple[np.ndarray, np.ndarray]:
     """Microphone (n,) float32 and the true total delay at each of its samples (n,).
 
     lags: (position in ref, lag) from which on each lag holds; the delay shrinks by ppm.
@@ -102,4 +109,6 @@ def utterances(rng: np.random.Generator, seconds: list[float], pauses: list[floa
 def run(aligner, mic: np.ndarray, ref: np.ndarray) -> list:
     """Every hop's Aligned."""
     hop = aligner.hop
-    return [aligner.step(mic[at : at + hop], ref[at : at + hop]) for at in range(0, min(mic.size, ref.size) - hop + 1, hop)]
+    return [
+        aligner.step(mic[at : at + hop], ref[at : at + hop]) for at in range(0, min(mic.size, ref.size) - hop + 1, hop)
+    ]

@@ -1,19 +1,22 @@
-#!/usr/bin/env python3
-"""Simulate whole conversations with a robot, to judge and tune the filter on: the robot speaks, pauses, speaks again, a human interrupts.
+r"""Simulate whole conversations with a robot, to judge and tune the filter on.
 
-    python bench/conversations.py --speech human/val --voices robot/val robot/train --kind live --count 24 --seed 1 --output DIR
+The robot speaks, pauses, speaks again, a human interrupts.
 
---speech and --voices are folders with a transcripts.tsv (path, speaker, seconds, text). Each conversation is a folder: sweep_ref,
-sweep_mic, fan_only (always recorded in a laboratory), ref, mic, clean (the human at the microphone, already inside mic), all FLAC,
-16 kHz, 16 bit, and meta.json: room, rt60, voice, speaker, text, positions in samples (start and end of the human in mic, t_main: onset of
-the second utterance in ref, lag), snr_fan and sisdr_mix over [start, end], nl_db (distortion relative to the linear loudspeaker, best
-gain removed), delay (of the direct sound in sweep_mic), seed.
-True delay of the reference in mic: lag + delay - ppm 1e-6 t. Kinds: `paper`, one lag of 50-300 ms; `live`, lag before t_main and lag2
-after (0-1.2 s each), volume turned by up to 3 dB between them (volume_db), clocks 10-300 ppm apart (either sign).
-Even conversations take place in the laboratory (RT60 0.20-0.26 s), odd ones in an office (0.50-0.75 s).
-Item i of a seed is the same whatever --count is.
+    python -m bench.simulate.conversations --speech human/val --voices robot/val robot/train --kind live \
+        --count 24 --seed 1 --output DIR
 
-How it compares with a set of ten `paper` conversations simulated by other hands (lab / office means: theirs; then 60 of these with --distortion strong):
+--speech and --voices are folders with a transcripts.tsv (path, speaker, seconds, text). Each conversation is a folder:
+sweep_ref, sweep_mic, fan_only (always recorded in a laboratory), ref, mic, clean (the human at the microphone, already
+inside mic), all FLAC, 16 kHz, 16 bit, and meta.json: room, rt60, voice, speaker, text, positions in samples (start and
+end of the human in mic, t_main: onset of the second utterance in ref, lag), snr_fan and sisdr_mix over [start, end],
+nl_db (distortion relative to the linear loudspeaker, best gain removed), delay (of the direct sound in sweep_mic),
+seed. True delay of the reference in mic: lag + delay - ppm 1e-6 t. Kinds: `paper`, one lag of 50-300 ms; `live`, lag
+before t_main and lag2 after (0-1.2 s each), volume turned by up to 3 dB between them (volume_db), clocks 10-300 ppm
+apart (either sign). Even conversations take place in the laboratory (RT60 0.20-0.26 s), odd ones in an office
+(0.50-0.75 s). Item i of a seed is the same whatever --count is.
+
+How it compares with a set of ten `paper` conversations simulated by other hands (lab / office means: theirs; then 60 of
+these with --distortion strong):
 - unfiltered SI-SDR -21.6 / -26.3; -22.2 / -26.1 dB
 - human over fan (snr_fan) 6.0 / 6.7; 7.4 / 7.3 dB
 - robot over fan while it speaks alone 29 / 34; 30 / 34 dB
@@ -38,7 +41,18 @@ import soundfile as sf
 from scipy import signal
 from tqdm import tqdm
 
-from bench.simulate.simulated_robot import RATE, Array, Loudspeaker, draw_body, draw_fan, draw_loudspeaker, draw_room, fan_noise, sweep, warp
+from bench.simulate.simulated_robot import (
+    RATE,
+    Array,
+    Loudspeaker,
+    draw_body,
+    draw_fan,
+    draw_loudspeaker,
+    draw_room,
+    fan_noise,
+    sweep,
+    warp,
+)
 from edgefilter.dsp.metrics import si_sdr
 
 UNFILTERED_DB = {"lab": (-22.0, 1.0), "office": (-26.2, 0.9)}
@@ -50,13 +64,16 @@ DISTORTION_DB = {
 }
 """Range of the loudspeaker's distortion at the microphone.
 
-moderate: the nl_db that the set described above states. strong: so much that the best linear filter of 300 ms leaves about as much of the
-robot as in that set, although in an office a part of what it leaves there is reverberation behind the 300 ms.
+moderate: the nl_db that the set described above states. strong: so much that the best linear filter of 300 ms leaves
+about as much of the robot as in that set, although in an office a part of what it leaves there is reverberation behind
+the 300 ms.
 """
 
 
 @dataclass(frozen=True)
 class Clip:
+    """A recording of a folder of speech, who speaks in it, and what."""
+
     path: Path
     speaker: str
     text: str
@@ -83,7 +100,9 @@ def read_clips(folder: Path, seconds: tuple[float, float]) -> list[Clip]:
     """The clips of a folder that have a text and a length between these bounds."""
     table = folder / "transcripts.tsv"
     if not table.is_file():
-        sys.exit(f"{table} is missing; expected a folder of speech with its transcripts.tsv (path, speaker, seconds, text)")
+        sys.exit(
+            f"{table} is missing; expected a folder of speech with its transcripts.tsv (path, speaker, seconds, text)"
+        )
     with table.open(encoding="utf-8", newline="") as lines:
         rows = [row for row in csv.reader(lines, delimiter="\t", quoting=csv.QUOTE_NONE) if len(row) == 4 and row[3]]
     clips = [Clip(folder / row[0], row[1], row[3]) for row in rows if seconds[0] <= float(row[2]) <= seconds[1]]
@@ -129,7 +148,10 @@ def with_distortion(robot: Robot, played: Array, response: Array, nl_db: float) 
 
 
 def draw_lags(rng: np.random.Generator, kind: str, pause: int) -> tuple[int, int, float, float]:
-    """Lag of either utterance in samples, ppm, volume change in dB; the second never starts while the first is still heard."""
+    """Lag of either utterance in samples, ppm, volume change in dB.
+
+    The second never starts while the first is still heard.
+    """
     if kind == "paper":
         lag = int(rng.uniform(0.05, 0.3) * RATE)
         return lag, lag, 0.0, 0.0
@@ -140,7 +162,9 @@ def draw_lags(rng: np.random.Generator, kind: str, pause: int) -> tuple[int, int
             return first, second, ppm, rng.uniform(-3, 3)
 
 
-def make_conversation(seed: int, index: int, kind: str, speech: list[Clip], voices: dict[str, list[Clip]], distortion: str = "moderate") -> tuple[dict[str, Array], dict]:
+def make_conversation(
+    seed: int, index: int, kind: str, speech: list[Clip], voices: dict[str, list[Clip]], distortion: str = "moderate"
+) -> tuple[dict[str, Array], dict]:
     """Signals by name (n,) float64 and the contents of meta.json, for item index of this seed."""
     rng = np.random.default_rng([seed, index])
     human_clip = speech[np.random.default_rng(seed).permutation(len(speech))[index % len(speech)]]
@@ -157,17 +181,34 @@ def make_conversation(seed: int, index: int, kind: str, speech: list[Clip], voic
     voiced = signal.oaconvolve(human, room.human)[: ref.size - start]
     clean = np.concatenate([np.zeros(start), voiced, np.zeros(ref.size - start - voiced.size)])
     end = min(start + human.size + RATE // 10, ref.size)
-    signals, scores = record_all(rng, UNFILTERED_DB[room_name], robot, (laboratory.robot, room.robot), played, clean, slice(start, end))
+    signals, scores = record_all(
+        rng, UNFILTERED_DB[room_name], robot, (laboratory.robot, room.robot), played, clean, slice(start, end)
+    )
     impulse = np.eye(1, 4096)[0]
     delay = int(np.argmax(np.abs(robot.record(impulse, laboratory.robot, linear=True))))
     del script["onset"]
-    meta = {"room": room_name, "rt60": room.rt60_s, "voice": voice, "speaker": human_clip.speaker, "text": human_clip.text}
-    meta |= {"start": start, "end": end, **script, **scores, "nl_db": nl_db, "live": kind == "live", "delay": delay, "seed": [seed, index]}
+    meta = {
+        "room": room_name,
+        "rt60": room.rt60_s,
+        "voice": voice,
+        "speaker": human_clip.speaker,
+        "text": human_clip.text,
+    }
+    meta |= {
+        "start": start,
+        "end": end,
+        **script,
+        **scores,
+        "nl_db": nl_db,
+        "live": kind == "live",
+        "delay": delay,
+        "seed": [seed, index],
+    }
     return {"ref": ref, **signals}, meta
 
 
 def make_script(rng: np.random.Generator, kind: str, voice: list[Clip], human_size: int) -> tuple[dict, Array, Array]:
-    """When who speaks: the meta entries (and the human's `onset` before converter delay), ref (n,), and what the converter plays (n,)."""
+    """Meta entries (and the human's `onset` before converter delay), ref (n,), and what the converter plays (n,)."""
     wait, pause, lead = (int(s * RATE) for s in (rng.uniform(0.5, 1.6), rng.uniform(0.5, 1.1), 0.45))
     first = read_utterance(rng, voice, 4.0)
     second = read_utterance(rng, voice, (wait + human_size) / RATE + rng.uniform(0.3, 1.0))
@@ -192,10 +233,10 @@ def record_all(
     clean: Array,
     span: slice,
 ) -> tuple[dict[str, Array], dict[str, float]]:
-    """Calibration in the first path's room and conversation in the second's, with all levels set, and the figures that they have.
+    """Calibration in the first path's room, conversation in the second's, with all levels set, and their figures.
 
-    The gain makes the sweep peak at 0.22-0.42 of full scale; the human is scaled to the unfiltered SI-SDR, the fan to 4.5-10.5 dB
-    below the human.
+    The gain makes the sweep peak at 0.22-0.42 of full scale; the human is scaled to the unfiltered SI-SDR, the fan to
+    4.5-10.5 dB below the human.
     """
     excitation = sweep()
     sweep_echo = robot.record(excitation, paths[0])
@@ -209,7 +250,13 @@ def record_all(
     level, spectrum = math.sqrt(np.mean(clean[span] ** 2)) * 10 ** (-snr_fan / 20), draw_fan(rng)
     fan = [level * fan_noise(rng, spectrum, n) for n in (excitation.size, 8 * RATE, clean.size)]
     mic = echo + clean + fan[2]
-    signals = {"sweep_ref": excitation, "sweep_mic": gain * sweep_echo + fan[0], "fan_only": fan[1], "mic": mic, "clean": clean}
+    signals = {
+        "sweep_ref": excitation,
+        "sweep_mic": gain * sweep_echo + fan[0],
+        "fan_only": fan[1],
+        "mic": mic,
+        "clean": clean,
+    }
     return signals, {"snr_fan": snr_fan, "sisdr_mix": si_sdr(mic[span], clean[span])}
 
 
@@ -219,7 +266,12 @@ def main() -> None:
     parser.add_argument("--voices", type=Path, required=True, nargs="+", metavar="DIR", help="the robot's voices")
     parser.add_argument("--output", type=Path, required=True, metavar="DIR")
     parser.add_argument("--kind", choices=("paper", "live"), required=True)
-    parser.add_argument("--distortion", choices=tuple(DISTORTION_DB), default="moderate", help="of the loudspeaker (default: %(default)s)")
+    parser.add_argument(
+        "--distortion",
+        choices=tuple(DISTORTION_DB),
+        default="moderate",
+        help="of the loudspeaker (default: %(default)s)",
+    )
     parser.add_argument("--count", type=int, default=24)
     parser.add_argument("--seed", type=int, default=1)
     options = parser.parse_args()

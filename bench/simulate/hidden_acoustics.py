@@ -1,4 +1,7 @@
-"""Rooms, converter clocks and levels of the simulated robots with a hidden effect. Shares no code with the filter's own echo model."""
+"""Rooms, converter clocks and levels of the simulated robots with a hidden effect.
+
+Shares no code with the filter's own echo model.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +23,10 @@ HALF_WIDTH = 32
 
 @dataclass(frozen=True)
 class Place:
-    """A robot in a shoebox room: size (3,) in m, wall absorption, highest order of reflection, microphone and loudspeaker (3,) in m."""
+    """A robot in a shoebox room.
+
+    Size (3,) in m, wall absorption, highest order of reflection, microphone and loudspeaker (3,) in m.
+    """
 
     size: Array
     absorption: float
@@ -29,7 +35,7 @@ class Place:
     loudspeaker: Array
 
     def response(self) -> Array:
-        """(m,) impulse response by the image-source method (Allen & Berkley 1979; pyroomacoustics), without its filter delay."""
+        """(m,) impulse response by image sources (Allen & Berkley 1979; pyroomacoustics), without its filter delay."""
         room = pra.ShoeBox(self.size, fs=RATE, materials=pra.Material(self.absorption), max_order=self.order)
         room.add_microphone(self.microphone)
         room.add_source(self.loudspeaker)
@@ -46,7 +52,9 @@ class Place:
         return replace(self, microphone=self.microphone + allowed, loudspeaker=self.loudspeaker + allowed)
 
 
-def draw_place(rng: np.random.Generator, rt60_s: float, geometry: Array | None = None, size: Array | None = None) -> Place:
+def draw_place(
+    rng: np.random.Generator, rt60_s: float, geometry: Array | None = None, size: Array | None = None
+) -> Place:
     """A room of this reverberation time (Sabine's formula, +-25 %).
 
     geometry (3,): from microphone to loudspeaker in m, else drawn, 0.1-0.3 m. size (3,) in m, else drawn.
@@ -68,7 +76,7 @@ def direction(rng: np.random.Generator) -> Array:
 
 
 def reflector(rng: np.random.Generator, place: Place) -> Callable[[float], Array]:
-    """Impulse response (m,) of one reflection from a person or a panel that stands a given distance in m from the microphone.
+    """Impulse response (m,) of one reflection from a person or a panel at a given distance in m.
 
     A flat mirror that returns less treble the rougher it is: an image source and a low-pass of first order.
     """
@@ -89,13 +97,16 @@ def reflector(rng: np.random.Generator, place: Place) -> Callable[[float], Array
 
 @functools.cache
 def _sinc_table() -> Array:
-    """(PHASES + 1, 2 HALF_WIDTH) Kaiser-windowed sincs (beta 9: images below -90 dB), row p for a position p / PHASES behind a sample."""
+    """(PHASES + 1, 2 HALF_WIDTH) Kaiser-windowed sincs (beta 9), row p for a position p / PHASES behind a sample."""
     distance = np.arange(-HALF_WIDTH + 1, HALF_WIDTH + 1)[None] - np.arange(PHASES + 1)[:, None] / PHASES
     return np.sinc(distance) * np.i0(9.0 * np.sqrt(np.clip(1.0 - (distance / HALF_WIDTH) ** 2, 0.0, 1.0))) / np.i0(9.0)
 
 
 def read_at(x: Array, positions: Array) -> Array:
-    """x (n,) at any positions (m,) in samples, 0 outside; positions rounded to 1/4096 of a sample (error below -74 dB at 4 kHz)."""
+    """Samples x (n,) at any positions (m,) in samples, 0 outside.
+
+    Positions rounded to 1/4096 of a sample (error below -74 dB at 4 kHz).
+    """
     table = _sinc_table()
     padded = np.pad(x, 2 * HALF_WIDTH)
     windows = np.lib.stride_tricks.sliding_window_view(padded, 2 * HALF_WIDTH)
@@ -110,7 +121,7 @@ def read_at(x: Array, positions: Array) -> Array:
 
 
 def fractional_delay(x: Array, samples: float) -> Array:
-    """x (n,) later by any number of samples >= 0, of the same length."""
+    """Samples x (n,) later by any number of samples >= 0, of the same length."""
     whole = int(np.floor(samples))
     taps = read_at(np.eye(1, 4 * HALF_WIDTH, 2 * HALF_WIDTH)[0], np.arange(4 * HALF_WIDTH) - (samples - whole))
     late = signal.oaconvolve(x, taps)[2 * HALF_WIDTH :][: x.size]
@@ -118,7 +129,7 @@ def fractional_delay(x: Array, samples: float) -> Array:
 
 
 def sweep(rng: np.random.Generator) -> Array:
-    """Exponential sweep from 40 to 8000 Hz (Farina 2000, eq. (2)) of 5-8 s and peak 0.25-0.45, 0.5 s of silence before, 1 s behind."""
+    """Exponential sweep, 40 to 8000 Hz (Farina 2000, eq. (2)), 5-8 s, peak 0.25-0.45, between silence."""
     seconds, peak = rng.uniform(5, 8), rng.uniform(0.25, 0.45)
     n = int(seconds * RATE)
     rate = math.log(8000 / 40)
@@ -138,7 +149,10 @@ def decibels(ratio: float) -> float:
 
 
 def solve(measure: Callable[[float], float], target: float, low: float, high: float, tolerance: float = 0.15) -> float:
-    """The x between low and high (both > 0) where measure (rising or falling in x) is target: bisection of log x; an end if out of reach."""
+    """The x between low and high (both > 0) where measure (rising or falling in x) is target: bisection of log x.
+
+    An end if out of reach.
+    """
     rising = measure(high) > measure(low)
     a, b = math.log(low), math.log(high)
     for _ in range(14):

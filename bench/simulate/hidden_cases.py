@@ -1,16 +1,17 @@
-#!/usr/bin/env python3
-"""Simulate recordings of a robot with a hidden physical effect, or none, two, or one outside the catalogue, to judge a diagnosis on.
+"""Simulate recordings of a robot with a hidden effect, or none, two, or one outside the catalogue.
 
-    python bench/hidden_cases.py --voices robot/val robot/train --output DIR --seed 1 --set singles --count 78
+    python -m bench.simulate.hidden_cases --voices robot/val robot/train --output DIR --seed 1 --set singles --count 78
 
---voices (and --speech, human talkers for the set `outside`): folders with a transcripts.tsv (path, speaker, seconds, text). A case is a folder
-SET_NUMBER: sweep_ref, sweep_mic, fan_only (recorded before the effect), ref, mic, all FLAC, 16 kHz, 16 bit, and truth.json: effects
-(sorted; ["none"] or ["unknown"]), raw (what it is), strength, params, effect_to_noise_db (power of what the effect changes at the microphone
-over the fan), robot_over_fan_db, tolerances, voice, seed. Item i of a seed and set is the same whatever --count is.
+--voices (and --speech, human talkers for the set `outside`): folders with a transcripts.tsv (path, speaker, seconds,
+text). A case is a folder SET_NUMBER: sweep_ref, sweep_mic, fan_only (recorded before the effect), ref, mic, all FLAC,
+16 kHz, 16 bit, and truth.json: effects (sorted; ["none"] or ["unknown"]), raw (what it is), strength, params,
+effect_to_noise_db (power of what the effect changes at the microphone over the fan), robot_over_fan_db, tolerances,
+voice, seed. Item i of a seed and set is the same whatever --count is.
 
-Sets: `singles`, effect i mod 13 of CATALOGUE, strength clear, moderate, near in turn (39 cases are one of each); `controls`, nothing hidden;
-`pairs`, two effects that can be told apart (all but APART), clear or moderate; `outside`, kind i mod 7 of OUTSIDE, clear and moderate in turn.
-Every case, controls included, has the ordinary tolerances of a real robot (hidden_robot.draw_scene).
+Sets: `singles`, effect i mod 13 of CATALOGUE, strength clear, moderate, near in turn (39 cases are one of each);
+`controls`, nothing hidden; `pairs`, two effects that can be told apart (all but APART), clear or moderate; `outside`,
+kind i mod 7 of OUTSIDE, clear and moderate in turn. Every case, controls included, has the ordinary tolerances of a
+real robot (hidden_robot.draw_scene).
 """
 
 from __future__ import annotations
@@ -54,7 +55,13 @@ APART = {
     )
 }
 """Pairs that are not made: each could pass for the other or hides it."""
-ROBOT_OVER_FAN_DB = {"clear": (23.0, 31.0), "moderate": (20.0, 30.0), "near": (18.0, 30.0), "control": (18.0, 30.0), "pair": (21.0, 31.0)}
+ROBOT_OVER_FAN_DB = {
+    "clear": (23.0, 31.0),
+    "moderate": (20.0, 30.0),
+    "near": (18.0, 30.0),
+    "control": (18.0, 30.0),
+    "pair": (21.0, 31.0),
+}
 TRIES = 6
 SECONDS = (20.0, 30.0)
 
@@ -75,7 +82,10 @@ def read_reference(rng: np.random.Generator, clips: list[Clip]) -> Array:
 
 
 def hide(rng: np.random.Generator, scene: Scene, chain: Chain, effect: str, strength: str) -> tuple[Chain, dict, float]:
-    """The chain with this effect, its parameters, and what it changes over the fan in dB; drawn again while out of reach of that strength."""
+    """The chain with this effect, its parameters, and what it changes over the fan in dB.
+
+    Drawn again while out of reach of that strength.
+    """
     physical = effect in RANGES
     best: tuple[float, Chain, dict, float] | None = None
     for _ in range(TRIES):
@@ -90,13 +100,18 @@ def hide(rng: np.random.Generator, scene: Scene, chain: Chain, effect: str, stre
 
 
 def change_db(scene: Scene, before: Chain, after: Chain, fan: dict | None) -> float:
-    """Power of the changed part over the fan; of a fan that changed, the power that its spectrum gained or lost (it is noise either way)."""
+    """Power of the changed part over the fan.
+
+    Of a fan that changed, the power that its spectrum gained or lost (it is noise either way).
+    """
     if fan:
         return fan["spectral_change_db"]
     return scene.over_fan_db(scene.record(after) - scene.record(before))
 
 
-def make_case(seed: int, index: int, kind: str, voices: dict[str, list[Clip]], speech: list[Clip] = ()) -> tuple[dict[str, Array], dict]:
+def make_case(
+    seed: int, index: int, kind: str, voices: dict[str, list[Clip]], speech: list[Clip] = ()
+) -> tuple[dict[str, Array], dict]:
     """Signals by name (n,) float64 and the contents of truth.json, for item index of this seed and set."""
     rng = np.random.default_rng([seed, SETS.index(kind), index])
     effects, strength = draw_effects(rng, index, kind)
@@ -105,14 +120,20 @@ def make_case(seed: int, index: int, kind: str, voices: dict[str, list[Clip]], s
     chain, parameters, found = scene.usual, {}, {}
     for effect in effects:
         if kind == "outside":
-            changed, parameters[effect] = OUTSIDE[effect](rng, scene, chain, strength, lambda rng: read_speech(speech[rng.integers(len(speech))]))
+            changed, parameters[effect] = OUTSIDE[effect](
+                rng, scene, chain, strength, lambda rng: read_speech(speech[rng.integers(len(speech))])
+            )
             found[effect] = parameters[effect].get("incoherent_over_fan_db", change_db(scene, chain, changed, None))
             chain = changed
             continue
         force = strength if kind == "singles" else str(rng.choice(["clear", "moderate"]))
         chain, parameters[effect], found[effect] = hide(rng, scene, chain, effect, force)
     signals = scale(scene.signals | {"mic": scene.record(chain)}, parameters)
-    truth = {"effects": ["unknown"] if kind == "outside" else sorted(effects) or ["none"], "raw": effects or ["none"], "strength": strength}
+    truth = {
+        "effects": ["unknown"] if kind == "outside" else sorted(effects) or ["none"],
+        "raw": effects or ["none"],
+        "strength": strength,
+    }
     truth |= {"params": parameters, "effect_to_noise_db": found}
     truth |= {"robot_over_fan_db": decibels(power(scene.echo(scene.usual)) / scene.fan_power)}
     return signals, truth | {"tolerances": scene.tolerances, "voice": voice, "seed": [seed, index]}

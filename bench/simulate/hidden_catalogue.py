@@ -1,131 +1,24 @@
 """The thirteen physical effects that a recording may hide: each changes a chain by a wanted strength.
 
-An effect is a function (rng, scene, chain, strength) -> (chain, parameters). Strength: "clear", "moderate" or "near", by the power of what
-it changes at the microphone over the fan noise (ENR_DB), except where a physical range says it better (RANGES).
+An effect is a function (rng, scene, chain, strength) -> (chain, parameters). Strength: "clear", "moderate" or "near",
+by the power of what it changes at the microphone over the fan noise (ENR_DB), except where a physical range says it
+better (RANGES).
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 from scipy import signal
 
 from bench.simulate.hidden_acoustics import decibels, direction, draw_place, power, read_at, reflector, solve
-from bench.simulate.hidden_dynamics import agc_gain_db, compressor_gain_db, gain_curve, soft_clip
-from bench.simulate.hidden_robot import Chain, Scene, with_distortion
+from bench.simulate.hidden_dynamics import agc_gain_db, gain_curve, soft_clip
+from bench.simulate.hidden_robot import Chain, Scene
+from bench.simulate.hidden_strength import ENR_DB, RANGES, Effect, log_uniform, sign
+from bench.simulate.hidden_voice import bandlimit, compression, playback_gain, rattle, speaker_nonlinearity
 from bench.simulate.simulated_robot import RATE, Array, fan_noise
-
-Effect = Callable[[np.random.Generator, Scene, Chain, str], tuple[Chain, dict]]
-
-ENR_DB = {"clear": 12.0, "moderate": 5.0, "near": -1.0}
-RANGES = {
-    "late_reverb": {"clear": (0.60, 0.85), "moderate": (0.45, 0.60), "near": (0.36, 0.45)},  # RT60 in s, calibrated at 0.18-0.32
-    "bandlimit": {"clear": (2500, 3800), "moderate": (3800, 5000), "near": (5500, 6600)},  # Hz
-    "clock_drift": {"clear": (100, 300), "moderate": (30, 100), "near": (10, 30)},  # ppm
-    "delay_jump": {"clear": (100, 800), "moderate": (12, 100), "near": (2, 12)},  # samples
-}
-
-
-def _log_uniform(rng: np.random.Generator, low: float, high: float) -> float:
-    return math.exp(rng.uniform(math.log(low), math.log(high)))
-
-
-def _sign(rng: np.random.Generator) -> float:
-    return float(rng.choice([-1.0, 1.0]))
-
-
-def _played_change_db(scene: Scene, chain: Chain) -> Callable[[Array], float]:
-    """How far another played signal (n,) would be over the fan at the microphone, with the loudspeaker taken as linear."""
-    response = scene.linear_response()
-    return lambda played: scene.over_fan_db(signal.oaconvolve(played - chain.played, response)[: played.size])
-
-
-def playback_gain(rng: np.random.Generator, scene: Scene, chain: Chain, strength: str) -> tuple[Chain, dict]:
-    change = 10 ** ((ENR_DB[strength] - scene.over_fan_db(scene.echo(chain))) / 20)
-    gain = 1.0 + change if rng.random() < 0.4 or change > 0.9 else 1.0 - change
-    return replace(chain, played=gain * chain.played), {"gain_db": 20 * math.log10(gain)}
-
-
-def bandlimit(rng: np.random.Generator, scene: Scene, chain: Chain, strength: str) -> tuple[Chain, dict]:
-    """Playback through a converter of a lower rate (its anti-aliasing filter), or an analogue low-pass."""
-    cutoff = _log_uniform(rng, *RANGES["bandlimit"][strength])
-    if rng.random() < 0.5:
-        down = RATE * 0.46 / cutoff
-        up = 60
-        rate = round(up * down)
-        while math.gcd(up, rate) > 1:  # resample_poly would cancel the factor, and the taps would cut at another frequency
-            rate += 1
-        taps = signal.firwin(60 * 20 + 1, 2 * cutoff / (RATE * up), window=("kaiser", rng.uniform(5, 9)))
-        low = signal.resample_poly(chain.played, up, rate, window=taps)
-        played = signal.resample_poly(low, rate, up, window=signal.firwin(20 * rate + 1, 2 * cutoff / (RATE * up), window=("kaiser", 7)))
-        played = np.pad(played, (0, max(chain.played.size - played.size, 0)))[: chain.played.size]
-        return replace(chain, played=played), {"cutoff_hz": cutoff, "kind": "converter", "rate_hz": RATE * up / rate}
-    order = int(rng.integers(3, 9))
-    sections = signal.butter(order, cutoff, fs=RATE, output="sos")
-    low_hz = 300.0
-    delay = -float(np.angle(signal.sosfreqz(sections, [low_hz], fs=RATE)[1][0])) / (2 * math.pi * low_hz) * RATE
-    played = read_at(signal.sosfilt(sections, chain.played), np.arange(chain.played.size) + delay)
-    return replace(chain, played=played), {"cutoff_hz": cutoff, "kind": "butterworth", "order": order}
-
-
-def compression(rng: np.random.Generator, scene: Scene, chain: Chain, strength: str) -> tuple[Chain, dict]:
-    x = chain.played
-    settings = {"ratio": rng.uniform(2, 8), "knee_db": rng.uniform(0, 8), "attack_ms": _log_uniform(rng, 1, 25)}
-    settings["release_ms"] = _log_uniform(rng, 60, 500)
-    makeup = bool(rng.random() < 0.6)
-    change_db = _played_change_db(scene, chain)
-
-    def squeezed(threshold: float) -> Array:
-        y = x * gain_curve(compressor_gain_db(x, threshold_db=20 * math.log10(threshold), **settings), 1, x.size)
-        return y * math.sqrt(power(x) / power(y)) if makeup else y
-
-    threshold = solve(lambda t: change_db(squeezed(t)), ENR_DB[strength], 10 ** (-45 / 20), 0.7)
-    return replace(chain, played=squeezed(threshold)), {"threshold_db": 20 * math.log10(threshold), "makeup": makeup, **settings}
-
-
-def speaker_nonlinearity(rng: np.random.Generator, scene: Scene, chain: Chain, strength: str) -> tuple[Chain, dict]:
-    """A driver that reaches further into its suspension and magnet than when calibrated, or an amplifier that bends."""
-    if rng.random() < 0.5:
-        path = scene.gain_after * signal.oaconvolve(chain.paths[0][2], scene.shell)
-        wanted = scene.fan_power * 10 ** (ENR_DB[strength] / 10)
-        for _ in range(4):
-            driver, _ = with_distortion(chain.loudspeaker, chain.played, path, wanted)
-            found_db = scene.over_fan_db(scene.echo(replace(chain, loudspeaker=driver)) - scene.echo(chain))
-            if abs(found_db - ENR_DB[strength]) < 0.5:
-                break
-            wanted *= 10 ** ((ENR_DB[strength] - found_db) / 10)
-        return replace(chain, loudspeaker=driver), {"kind": "driver", "drive": driver.drive, "usual_drive": chain.loudspeaker.drive}
-    hardness, skew = rng.uniform(1.8, 5.0), rng.uniform(0.8, 1.25)
-    change_db = _played_change_db(scene, chain)
-    level = solve(lambda s: change_db(soft_clip(chain.played, s, skew * s, hardness)), ENR_DB[strength], 0.05, 30.0)
-    parameters = {"kind": "amplifier", "level": level, "skew": skew, "hardness": hardness}
-    return replace(chain, played=soft_clip(chain.played, level, skew * level, hardness)), parameters
-
-
-def rattle(rng: np.random.Generator, scene: Scene, chain: Chain, strength: str) -> tuple[Chain, dict]:
-    """A loose part that the cone's displacement makes strike: ringing modes, each strike of another force and a little late."""
-    w = 2 * math.pi * chain.loudspeaker.resonance_hz
-    displacement = signal.lfilter(*signal.bilinear([w * w], [1.0, w / chain.loudspeaker.q, w * w], RATE), chain.played)
-    rate_hz = _log_uniform(rng, 8, 60)
-    peaks, _ = signal.find_peaks(_sign(rng) * displacement, distance=RATE // 400)
-    heights = np.abs(displacement[peaks])
-    count = min(int(rate_hz * chain.played.size / RATE), peaks.size // 2)
-    threshold = float(np.sort(heights)[-count])
-    struck = heights >= threshold
-    at = peaks[struck] + np.abs(rng.normal(0, 0.0004 * RATE, struck.sum())).astype(int)
-    force = (heights[struck] / threshold - 0.8) * np.exp(rng.normal(0, 0.4, struck.sum()))
-    blows = np.bincount(np.minimum(at, chain.played.size - 1), weights=force, minlength=chain.played.size)
-    modes = [(_log_uniform(rng, 900, 6000), _log_uniform(rng, 0.001, 0.008), rng.uniform(0.3, 1.0)) for _ in range(int(rng.integers(2, 6)))]
-    t = np.arange(int(0.05 * RATE)) / RATE
-    ring = sum(a * np.exp(-t / decay) * np.sin(2 * math.pi * f * t) for f, decay, a in modes)
-    impacts = signal.oaconvolve(blows, ring)[: chain.played.size]
-    unit_db = scene.over_fan_db(scene.echo(replace(chain, impacts=impacts)) - scene.echo(chain))
-    impacts = impacts * 10 ** ((ENR_DB[strength] - unit_db) / 20)
-    parameters = {"threshold": threshold, "impacts_per_s": int(struck.sum()) / chain.played.size * RATE}
-    return replace(chain, impacts=impacts), parameters | {"modes_hz": [round(f) for f, _, _ in modes]}
 
 
 def chassis_resonance(rng: np.random.Generator, scene: Scene, chain: Chain, strength: str) -> tuple[Chain, dict]:
@@ -133,13 +26,17 @@ def chassis_resonance(rng: np.random.Generator, scene: Scene, chain: Chain, stre
     t = np.arange(int(0.35 * RATE)) / RATE
     modes = []
     for _ in range(1 if rng.random() < 0.75 else 2):
-        frequency, q = _log_uniform(rng, 250, 3000), _log_uniform(rng, 15, 90)
+        frequency, q = log_uniform(rng, 250, 3000), log_uniform(rng, 15, 90)
         ring = np.exp(-math.pi * frequency / q * t) * np.cos(2 * math.pi * frequency * t + rng.uniform(0, 2 * math.pi))
         modes.append((frequency, q, ring * math.pi * frequency / q / RATE))
     ringing = np.sum([ring for _, _, ring in modes], axis=0)
     unit_db = scene.over_fan_db(scene.echo(replace(chain, ringing=ringing)) - scene.echo(chain))
     gain = 10 ** ((ENR_DB[strength] - unit_db) / 20)
-    parameters = {"frequency_hz": [f for f, _, _ in modes], "q": [q for _, q, _ in modes], "peak_gain_db": 20 * math.log10(gain)}
+    parameters = {
+        "frequency_hz": [f for f, _, _ in modes],
+        "q": [q for _, q, _ in modes],
+        "peak_gain_db": 20 * math.log10(gain),
+    }
     return replace(chain, ringing=gain * ringing), parameters
 
 
@@ -151,20 +48,26 @@ def late_reverb(rng: np.random.Generator, scene: Scene, chain: Chain, strength: 
     if same_room := bool(rng.random() < 0.4):
         bare = draw_place(rng, rt60_s, size=here.size)
         place = replace(here, absorption=bare.absorption, order=bare.order)
-    return replace(chain, paths=((0, 0, place.response()),)), {"rt60_s": rt60_s, "same_room": same_room, "room_m": place.size.tolist()}
+    return replace(chain, paths=((0, 0, place.response()),)), {
+        "rt60_s": rt60_s,
+        "same_room": same_room,
+        "room_m": place.size.tolist(),
+    }
 
 
 def path_change(rng: np.random.Generator, scene: Scene, chain: Chain, strength: str) -> tuple[Chain, dict]:
     """From some moment on the head has turned, the robot has moved, or a person stands by it."""
     n, before = chain.played.size, chain.paths[0][2]
-    start, fade = int(rng.uniform(0.25, 0.7) * n), int(_log_uniform(rng, 0.05, 0.8) * RATE)
+    start, fade = int(rng.uniform(0.25, 0.7) * n), int(log_uniform(rng, 0.05, 0.8) * RATE)
     kind, step = str(rng.choice(["head", "robot", "person"])), direction(rng)
     mirror = reflector(rng, scene.moved)
 
     def after(metres: float) -> Array:
         if kind == "person":
             extra = mirror(metres)
-            return np.pad(before, (0, max(extra.size - before.size, 0))) + np.pad(extra, (0, max(before.size - extra.size, 0)))
+            return np.pad(before, (0, max(extra.size - before.size, 0))) + np.pad(
+                extra, (0, max(before.size - extra.size, 0))
+            )
         return (scene.moved.microphone_moved if kind == "head" else scene.moved.robot_moved)(metres * step).response()
 
     source = scene.gain_after * signal.oaconvolve(scene.pressure(chain), scene.shell)[:n]
@@ -173,26 +76,35 @@ def path_change(rng: np.random.Generator, scene: Scene, chain: Chain, strength: 
     def change_db(metres: float) -> float:
         new = after(metres)
         size = max(new.size, before.size)
-        return scene.over_fan_db(signal.oaconvolve(source, np.pad(new, (0, size - new.size)) - np.pad(before, (0, size - before.size)))[:n])
+        return scene.over_fan_db(
+            signal.oaconvolve(source, np.pad(new, (0, size - new.size)) - np.pad(before, (0, size - before.size)))[:n]
+        )
 
-    metres = solve(change_db, ENR_DB[strength], *{"head": (1e-3, 0.08), "robot": (2e-3, 0.5), "person": (0.08, 3.0)}[kind], tolerance=0.3)
+    metres = solve(
+        change_db,
+        ENR_DB[strength],
+        *{"head": (1e-3, 0.08), "robot": (2e-3, 0.5), "person": (0.08, 3.0)}[kind],
+        tolerance=0.3,
+    )
     parameters = {"time_s": start / RATE, "fade_s": fade / RATE, "kind": kind, "m": metres}
     return replace(chain, paths=(chain.paths[0], (start, fade, after(metres)))), parameters
 
 
 def clock_drift(rng: np.random.Generator, scene: Scene, chain: Chain, strength: str) -> tuple[Chain, dict]:
     """Converters of two clocks, one of which warms up a little."""
-    ppm, t = _sign(rng) * _log_uniform(rng, *RANGES["clock_drift"][strength]), np.arange(chain.played.size)
-    wander = rng.uniform(0.01, 0.06) * np.sin(2 * math.pi * t / (RATE * rng.uniform(15, 60)) + rng.uniform(0, 2 * math.pi))
+    ppm, t = sign(rng) * log_uniform(rng, *RANGES["clock_drift"][strength]), np.arange(chain.played.size)
+    wander = rng.uniform(0.01, 0.06) * np.sin(
+        2 * math.pi * t / (RATE * rng.uniform(15, 60)) + rng.uniform(0, 2 * math.pi)
+    )
     return replace(chain, lag=-ppm * 1e-6 * t + wander), {"ppm": ppm}
 
 
 def delay_jump(rng: np.random.Generator, scene: Scene, chain: Chain, strength: str) -> tuple[Chain, dict]:
-    """Buffers that run dry (silence or a repetition is put in) or overflow (samples are dropped), somewhere while the robot speaks."""
+    """Buffers that run dry (silence or a repetition is put in) or overflow (samples are dropped) in speech."""
     n, x = chain.played.size, chain.played
     times = np.sort(rng.uniform(0.15, 0.85, size={"clear": 3, "moderate": 2, "near": 1}[strength]))
     times = times[np.insert(np.diff(times) > 0.1, 0, True)]
-    jumps = [_sign(rng) * _log_uniform(rng, *RANGES["delay_jump"][strength]) for _ in times]
+    jumps = [sign(rng) * log_uniform(rng, *RANGES["delay_jump"][strength]) for _ in times]
     starts = (times * n).astype(int)
     starts = np.array([start + int(np.argmax(np.abs(x[start : start + RATE]))) for start in starts])
     lag = np.zeros(n)
@@ -202,14 +114,22 @@ def delay_jump(rng: np.random.Generator, scene: Scene, chain: Chain, strength: s
     if silent := bool(rng.random() < 0.5):
         for start, jump in zip(starts, jumps, strict=True):
             played[start : start + int(max(jump, 0))] = 0.0
-    parameters = {"time_s": (starts / RATE).tolist(), "samples": jumps, "filled_with": "silence" if silent else "repetition"}
+    parameters = {
+        "time_s": (starts / RATE).tolist(),
+        "samples": jumps,
+        "filled_with": "silence" if silent else "repetition",
+    }
     return replace(chain, played=played), parameters
 
 
 def mic_agc(rng: np.random.Generator, scene: Scene, chain: Chain, strength: str) -> tuple[Chain, dict]:
     mic = scene.record(chain)
     level_db = decibels(power(mic))
-    settings = {"target_db": level_db + rng.uniform(-6, 6), "attack_ms": _log_uniform(rng, 40, 600), "release_ms": _log_uniform(rng, 500, 5000)}
+    settings = {
+        "target_db": level_db + rng.uniform(-6, 6),
+        "attack_ms": log_uniform(rng, 40, 600),
+        "release_ms": log_uniform(rng, 500, 5000),
+    }
     settings |= {"limit_db": rng.uniform(8, 20), "hold_db": level_db - rng.uniform(15, 40)}
 
     def steered(x: Array, slope: float) -> Array:
@@ -230,21 +150,31 @@ def mic_clipping(rng: np.random.Generator, scene: Scene, chain: Chain, strength:
         return soft_clip(x, level, skew * level, hardness) if preamplifier else np.clip(x, -level, level)
 
     level = solve(lambda s: scene.over_fan_db(clipped(mic, s) - mic), ENR_DB[strength], 0.02 * peak, 1.5 * peak)
-    parameters = {"level": level, "kind": "preamplifier" if preamplifier else "converter", "level_of_peak": level / peak}
+    parameters = {
+        "level": level,
+        "kind": "preamplifier" if preamplifier else "converter",
+        "level_of_peak": level / peak,
+    }
     return replace(chain, microphone=(*chain.microphone, lambda x: clipped(x, level))), parameters
 
 
 def fan_noise_change(rng: np.random.Generator, scene: Scene, chain: Chain, strength: str) -> tuple[Chain, dict]:
-    """The fan turns faster, is louder, or a bearing or a vent has begun to sing; from the start or from some moment on."""
+    """The fan turns faster, is louder, or a bearing or a vent has begun to sing.
+
+    From the start or from some moment on.
+    """
     f, old = np.linspace(0, RATE / 2, 1025), scene.fan_amplitude
     kind = str(rng.choice(["louder", "faster", "band", "lines"]))
     speed = rng.uniform(1.05, 1.4)
     if kind == "band":
-        centre, width = _log_uniform(rng, 300, 5000), rng.uniform(0.1, 0.4)
+        centre, width = log_uniform(rng, 300, 5000), rng.uniform(0.1, 0.4)
         shape = np.exp(-0.5 * (np.log2((f + 1) / centre) / width) ** 2)
     elif kind == "lines":
         blade, width = rng.uniform(110, 380), rng.uniform(5, 10)
-        shape = sum(rng.uniform(0.2, 1) * np.exp(-0.5 * ((f - k * blade) / (width * k)) ** 2) for k in range(1, int(rng.integers(3, 8))))
+        shape = sum(
+            rng.uniform(0.2, 1) * np.exp(-0.5 * ((f - k * blade) / (width * k)) ** 2)
+            for k in range(1, int(rng.integers(3, 8)))
+        )
     else:
         shape = np.interp(f / speed, f, old) if kind == "faster" else old
     n = chain.fan.size
@@ -252,7 +182,12 @@ def fan_noise_change(rng: np.random.Generator, scene: Scene, chain: Chain, stren
     def new(s: float) -> Array:
         return s * shape if kind == "faster" else np.sqrt(old**2 + (s * shape) ** 2)
 
-    s = solve(lambda s: decibels(float(np.mean(np.abs(new(s) ** 2 - old**2)))), ENR_DB[strength], 1.0 if kind == "faster" else 0.01, 1000.0)
+    s = solve(
+        lambda s: decibels(float(np.mean(np.abs(new(s) ** 2 - old**2)))),
+        ENR_DB[strength],
+        1.0 if kind == "faster" else 0.01,
+        1000.0,
+    )
     noise = fan_noise(rng, new(s), n)
     noise *= math.sqrt(scene.fan_power * np.mean(new(s) ** 2) / power(noise))
     start = int(rng.uniform(0.15, 0.5) * n) if rng.random() < 0.25 else -RATE

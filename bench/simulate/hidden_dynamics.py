@@ -27,7 +27,7 @@ def gain_curve(gain_db: Array, step_ms: int, n: int) -> Array:
 
 
 def smooth(x: Array, rise_ms: float, fall_ms: float, step_ms: int) -> Array:
-    """x (m,) followed by a first-order lag that rises with one time constant and falls with another."""
+    """X (m,) followed by a first-order lag that rises with one time constant and falls with another."""
     rise, fall = (1.0 - math.exp(-step_ms / constant) for constant in (rise_ms, fall_ms))
     out, state = [], float(x[0])
     for value in x.tolist():
@@ -36,8 +36,10 @@ def smooth(x: Array, rise_ms: float, fall_ms: float, step_ms: int) -> Array:
     return np.array(out)
 
 
-def compressor_gain_db(x: Array, threshold_db: float, ratio: float, knee_db: float, attack_ms: float, release_ms: float) -> Array:
-    """(m,) gain per ms of a feed-forward compressor with smoothed gain reduction (Giannoulis, Massberg & Reiss 2012, eq. (4) and (17))."""
+def compressor_gain_db(
+    x: Array, threshold_db: float, ratio: float, knee_db: float, attack_ms: float, release_ms: float
+) -> Array:
+    """(m,) gain per ms of a feed-forward compressor (Giannoulis, Massberg & Reiss 2012, eq. (4) and (17))."""
     over = levels_db(x, STEP_MS) - threshold_db
     bend = np.clip(over + knee_db / 2, 0, knee_db) ** 2 / (2 * max(knee_db, 1e-6))
     reduction = (1.0 - 1.0 / ratio) * np.where(over > knee_db / 2, over, bend)
@@ -45,12 +47,19 @@ def compressor_gain_db(x: Array, threshold_db: float, ratio: float, knee_db: flo
 
 
 def agc_gain_db(
-    mic: Array, slope: float, target_db: float, attack_ms: float, release_ms: float, limit_db: float, hold_db: float, step_ms: int = 5
+    mic: Array,
+    slope: float,
+    target_db: float,
+    attack_ms: float,
+    release_ms: float,
+    limit_db: float,
+    hold_db: float,
+    step_ms: int = 5,
 ) -> Array:
     """(m,) gain of a feedback loop that steers the output's level towards target_db.
 
-    slope 0..1: how much of the deviation it takes away. Falls with attack_ms, rises with release_ms, within +-limit_db; stands still
-    while the input is below hold_db.
+    slope 0..1: how much of the deviation it takes away. Falls with attack_ms, rises with release_ms, within +-limit_db;
+    stands still while the input is below hold_db.
     """
     fast, slow = (1.0 - math.exp(-step_ms / constant) for constant in (attack_ms, release_ms))
     loop = slope / max(1.0 - slope, 0.05)

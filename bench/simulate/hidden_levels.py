@@ -1,7 +1,8 @@
-#!/usr/bin/env python3
-"""Levels of recordings with hidden effects, to hold folders of cases against each other: what one simulator makes and another.
+"""Levels of recordings with hidden effects, to hold folders of cases against each other.
 
-    python bench/hidden_levels.py DIR [DIR ...]
+What one simulator makes and another.
+
+    python -m bench.simulate.hidden_levels DIR [DIR ...]
 
 Prints a Markdown table: median (10th to 90th percentile) over the cases of each folder.
 """
@@ -24,12 +25,23 @@ BANDS_HZ = ((60, 200), (200, 500), (500, 1000), (1000, 2000), (2000, 4000), (400
 def measure(case: Path) -> dict[str, float]:
     """Figures of one case by name."""
     sweep_mic, fan, ref, mic = (sf.read(case / f"{name}.flac")[0] for name in ("sweep_mic", "fan_only", "ref", "mic"))
-    figures = {"recording, s": mic.size / RATE, "reference, dBFS": decibels(power(ref)), "fan, dBFS": decibels(power(fan))}
-    figures |= {"recording over fan, dB": decibels(power(mic) / power(fan)), "sweep over fan, dB": decibels(power(sweep_mic) / power(fan))}
+    figures = {
+        "recording, s": mic.size / RATE,
+        "reference, dBFS": decibels(power(ref)),
+        "fan, dBFS": decibels(power(fan)),
+    }
+    figures |= {
+        "recording over fan, dB": decibels(power(mic) / power(fan)),
+        "sweep over fan, dB": decibels(power(sweep_mic) / power(fan)),
+    }
     figures |= {"recording's peak": float(np.abs(mic).max()), "sweep's peak": float(np.abs(sweep_mic).max())}
     for low, high in BANDS_HZ:
-        figures[f"fan, {low}-{high} Hz, density over its mean, dB"] = decibels(density(fan, low, high) / density(fan, 60, 7800))
-        figures[f"recording over fan, {low}-{high} Hz, dB"] = decibels(density(mic, low, high) / density(fan, low, high))
+        figures[f"fan, {low}-{high} Hz, density over its mean, dB"] = decibels(
+            density(fan, low, high) / density(fan, 60, 7800)
+        )
+        figures[f"recording over fan, {low}-{high} Hz, dB"] = decibels(
+            density(mic, low, high) / density(fan, low, high)
+        )
     return figures
 
 
@@ -42,12 +54,19 @@ def density(x: Array, low: float, high: float) -> float:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folders", type=Path, nargs="+", metavar="DIR")
-    folders = {folder: [measure(path.parent) for path in sorted(folder.glob("*/mic.flac"))] for folder in parser.parse_args().folders}
+    folders = {
+        folder: [measure(path.parent) for path in sorted(folder.glob("*/mic.flac"))]
+        for folder in parser.parse_args().folders
+    }
     print("| | " + " | ".join(f"{folder.name}, {len(cases)} cases" for folder, cases in folders.items()) + " |")
     print("| --- " * (len(folders) + 1) + "|")
     for name in next(iter(folders.values()))[0]:
         spread = [np.percentile([case[name] for case in cases], [50, 10, 90]) for cases in folders.values()]
-        print(f"| {name} | " + " | ".join(f"{middle:.3g} ({low:.3g} to {high:.3g})" for middle, low, high in spread) + " |")
+        print(
+            f"| {name} | "
+            + " | ".join(f"{middle:.3g} ({low:.3g} to {high:.3g})" for middle, low, high in spread)
+            + " |"
+        )
 
 
 if __name__ == "__main__":

@@ -1,7 +1,7 @@
 """What no effect of the catalogue explains: mains hum, a talker, music, doors, codecs, flutter, lost packets.
 
-Functions as in hidden_catalogue, plus `people`: human speech (k,) at 16 kHz to draw a talker from. Strength: power of what cannot be explained at
-the microphone over the fan (of a codec: of what is not coherent with its input).
+Functions as in hidden_catalogue, plus `people`: human speech (k,) at 16 kHz to draw a talker from. Strength: power of
+what cannot be explained at the microphone over the fan (of a codec: of what is not coherent with its input).
 """
 
 from __future__ import annotations
@@ -34,13 +34,13 @@ CODECS = {
 
 
 def _with_sound(scene: Scene, chain: Chain, sound: Array, strength: str) -> Chain:
-    """sound (n,) of any level, added at the microphone at the wanted one."""
+    """Sound (n,) of any level, added at the microphone at the wanted one."""
     sound = sound * 10 ** ((ENR_DB[strength] - scene.over_fan_db(sound)) / 20)
     return replace(chain, others=sound if chain.others is None else chain.others + sound)
 
 
 def _in_room(rng: np.random.Generator, x: Array) -> Array:
-    """x (n,) from a few metres away: direct sound and a tail of 0.3-0.5 s that loses its treble first."""
+    """Samples x (n,) from a few metres away: direct sound and a tail of 0.3-0.5 s that loses its treble first."""
     t = np.arange(RATE // 2) / RATE
     tail = rng.standard_normal(t.size) * np.exp(-6.9 * t / rng.uniform(0.3, 0.5))
     tail = signal.lfilter(*signal.butter(1, 3000, fs=RATE), tail)
@@ -51,10 +51,12 @@ def _in_room(rng: np.random.Generator, x: Array) -> Array:
 
 
 def mains_hum(rng: np.random.Generator, scene: Scene, chain: Chain, strength: str, _: Person) -> tuple[Chain, dict]:
-    """A ground loop: lines at multiples of 50 or 60 Hz, the odd ones stronger, of a mains frequency that wanders by hundredths of a Hz."""
+    """A ground loop: lines at multiples of 50 or 60 Hz, the odd ones stronger, wandering by hundredths of a Hz."""
     n, mains = chain.fan.size, float(rng.choice([50.0, 60.0]))
     wander = np.cumsum(rng.normal(0, 1, n // RATE + 2))
-    frequency = mains + 0.02 * np.interp(np.arange(n) / RATE, np.arange(wander.size), wander / max(np.abs(wander).max(), 1.0))
+    frequency = mains + 0.02 * np.interp(
+        np.arange(n) / RATE, np.arange(wander.size), wander / max(np.abs(wander).max(), 1.0)
+    )
     phase = 2 * math.pi * np.cumsum(frequency) / RATE
     top, hum = int(rng.integers(6, 25)), np.zeros(n)
     for k in range(1, top):
@@ -103,7 +105,9 @@ def door_slams(rng: np.random.Generator, scene: Scene, chain: Chain, strength: s
 def flutter(rng: np.random.Generator, scene: Scene, chain: Chain, strength: str, _: Person) -> tuple[Chain, dict]:
     """A clock that trembles (2-12 Hz), as a bad resampler or a loudspeaker on a spring makes it."""
     rate_hz, t = math.exp(rng.uniform(math.log(2), math.log(12))), np.arange(chain.fan.size) / RATE
-    wave = np.sin(2 * math.pi * rate_hz * t + rng.uniform(0, 6)) + 0.3 * np.sin(2 * math.pi * rate_hz * 2.3 * t + rng.uniform(0, 6))
+    wave = np.sin(2 * math.pi * rate_hz * t + rng.uniform(0, 6)) + 0.3 * np.sin(
+        2 * math.pi * rate_hz * 2.3 * t + rng.uniform(0, 6)
+    )
     echo, usual = scene.echo(chain), np.zeros(t.size) if chain.lag is None else chain.lag
     slope = np.fft.irfft(np.fft.rfft(echo) * 2j * math.pi * np.fft.rfftfreq(echo.size), echo.size)
     samples = solve(lambda s: scene.over_fan_db(s * wave * slope), ENR_DB[strength], 1e-4, 30.0)
@@ -111,13 +115,20 @@ def flutter(rng: np.random.Generator, scene: Scene, chain: Chain, strength: str,
 
 
 def packet_loss(rng: np.random.Generator, scene: Scene, chain: Chain, strength: str, _: Person) -> tuple[Chain, dict]:
-    """The playback is streamed and packets of 10-40 ms are lost: silence, or the last packet again and fading. The clock goes on."""
+    """The playback is streamed and packets of 10-40 ms are lost: silence, or the last packet again and fading.
+
+    The clock goes on.
+    """
     x, length = chain.played, int(rng.choice([10, 20, 40])) * RATE // 1000
     repeats, fade = bool(rng.random() < 0.5), np.linspace(0, 1, 32)
     order = rng.permutation(np.arange(8, x.size // length - 2))
     loud = np.add.reduceat(x**2, np.arange(0, x.size - length, length))
     order = order[loud[order] > 0.05 * loud.mean()]
-    played, wanted, response = x.copy(), scene.fan_power * 10 ** (ENR_DB[strength] / 10) * x.size, scene.linear_response()
+    played, wanted, response = (
+        x.copy(),
+        scene.fan_power * 10 ** (ENR_DB[strength] / 10) * x.size,
+        scene.linear_response(),
+    )
     changed, lost = 0.0, 0
     for packet in order:
         part = slice(packet * length, (packet + 1) * length)
@@ -129,19 +140,29 @@ def packet_loss(rng: np.random.Generator, scene: Scene, chain: Chain, strength: 
             played[part], lost, changed = new, lost + 1, changed + energy
         if changed > 0.9 * wanted:
             break
-    parameters = {"lost_packets": lost, "packet_ms": length * 1000 // RATE, "filled_with": "repetition" if repeats else "silence"}
+    parameters = {
+        "lost_packets": lost,
+        "packet_ms": length * 1000 // RATE,
+        "filled_with": "repetition" if repeats else "silence",
+    }
     return replace(chain, played=played), parameters
 
 
 def codec(rng: np.random.Generator, scene: Scene, chain: Chain, strength: str, _: Person) -> tuple[Chain, dict]:
-    """The playback through a real codec of ffmpeg, at the lowest of its bit rates whose noise does not exceed the strength."""
+    """The playback through a codec of ffmpeg, at its lowest bit rate whose noise does not exceed the strength."""
     name = str(rng.choice(sorted(CODECS)))
     response, tries = scene.linear_response(), []
     for kbps in CODECS[name][-1]:
         played = through_codec(chain.played, name, kbps)
         heard, original = (signal.oaconvolve(x, response)[: x.size] for x in (played, chain.played))
         noise_db = incoherent_db(original, heard) + scene.over_fan_db(heard)
-        tries.append((abs(noise_db - ENR_DB[strength]), {"codec": name, "kbps": kbps, "incoherent_over_fan_db": noise_db}, played))
+        tries.append(
+            (
+                abs(noise_db - ENR_DB[strength]),
+                {"codec": name, "kbps": kbps, "incoherent_over_fan_db": noise_db},
+                played,
+            )
+        )
         if noise_db < ENR_DB[strength]:
             break
     _, parameters, played = min(tries, key=lambda entry: entry[0])
@@ -149,16 +170,20 @@ def codec(rng: np.random.Generator, scene: Scene, chain: Chain, strength: str, _
 
 
 def through_codec(x: Array, name: str, kbps: int) -> Array:
-    """x (n,) encoded and decoded, put back in time; needs ffmpeg."""
+    """Samples x (n,) encoded and decoded, put back in time; needs ffmpeg."""
     encoder, rate, options, (outer, inner), _ = CODECS[name]
     if not shutil.which("ffmpeg"):
-        raise SystemExit("ffmpeg was not found; the set `outside` needs it for its codecs (Debian: apt-get install ffmpeg)")
+        raise SystemExit(
+            "ffmpeg was not found; the set `outside` needs it for its codecs (Debian: apt-get install ffmpeg)"
+        )
     quiet, raw = ["ffmpeg", "-v", "error", "-threads", "1"], ["-f", "f32le", "-ac", "1"]
     bits = [] if name == "gsm" else ["-b:a", f"{kbps}k"]
     pcm = signal.resample_poly(x, rate, RATE).astype(np.float32).tobytes()
     encode = [*quiet, *raw, "-ar", str(rate), "-i", "-", "-c:a", encoder, *bits, *options, "-f", outer, "-"]
     packed = subprocess.run(encode, input=pcm, capture_output=True, check=True).stdout
-    out = subprocess.run([*quiet, "-f", inner, "-i", "-", *raw, "-ar", str(rate), "-"], input=packed, capture_output=True, check=True).stdout
+    out = subprocess.run(
+        [*quiet, "-f", inner, "-i", "-", *raw, "-ar", str(rate), "-"], input=packed, capture_output=True, check=True
+    ).stdout
     y = signal.resample_poly(np.frombuffer(out, np.float32).astype(np.float64), RATE, rate)
     lags = signal.correlate(y[: 1 << 18], x[: 1 << 18], method="fft")
     lag = int(np.argmax(lags)) - min(x.size, 1 << 18) + 1
@@ -167,7 +192,10 @@ def through_codec(x: Array, name: str, kbps: int) -> Array:
 
 
 def incoherent_db(x: Array, y: Array) -> float:
-    """Share of y's power (n,), in dB, that no linear filter of x (n,) explains: its spectrum times one minus the coherence (64 ms, Welch)."""
+    """Share of y's power (n,), in dB, that no linear filter of x (n,) explains.
+
+    Its spectrum times one minus the coherence (64 ms, Welch).
+    """
     _, coherence = signal.coherence(x, y, fs=RATE, nperseg=1024)
     _, spectrum = signal.welch(y, fs=RATE, nperseg=1024)
     return decibels(float(np.sum((1.0 - coherence) * spectrum) / np.sum(spectrum)))

@@ -1,4 +1,7 @@
-"""A simulated robot before and after: what its microphone records while it speaks, with the ordinary tolerances, with or without a change."""
+"""A simulated robot before and after.
+
+What its microphone records while it speaks, with the ordinary tolerances, with or without a change.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +12,16 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from scipy import signal
 
-from bench.simulate.hidden_acoustics import Place, decibels, direction, draw_place, fractional_delay, power, read_at, sweep
+from bench.simulate.hidden_acoustics import (
+    Place,
+    decibels,
+    direction,
+    draw_place,
+    fractional_delay,
+    power,
+    read_at,
+    sweep,
+)
 from bench.simulate.simulated_robot import RATE, Array, Loudspeaker, draw_body, draw_fan, draw_loudspeaker, fan_noise
 
 FAINT_DB = (-16.0, -9.0)
@@ -20,10 +32,10 @@ FAINT_DB = (-16.0, -9.0)
 class Chain:
     """Everything between the reference and the recording. Arrays are (n,) at 16 kHz, n the recording's length.
 
-    played: what the converter plays. impacts: sound that loose parts add at the loudspeaker. paths: (start in samples, length of the
-    fade in samples, impulse response of the room), the first from 0 on. ringing: impulse response added to the path by the chassis, or
-    None. lag: by how many samples the voice comes later than usual, or None. fan: noise. others: other sounds at the microphone.
-    microphone: what amplifier and converter do to the sum.
+    played: what the converter plays. impacts: sound that loose parts add at the loudspeaker. paths: (start in samples,
+    length of the fade in samples, impulse response of the room), the first from 0 on. ringing: impulse response added
+    to the path by the chassis, or None. lag: by how many samples the voice comes later than usual, or None. fan: noise.
+    others: other sounds at the microphone. microphone: what amplifier and converter do to the sum.
     """
 
     played: Array
@@ -41,9 +53,9 @@ class Chain:
 class Scene:
     """One robot on one day: calibration, reference, tolerances; `usual` is the chain when nothing is hidden.
 
-    reference (n,). delay: of the converters in the sweep, samples; offset: what is added to it in the recording. gain: from the room's
-    pressure to full scale, gain_after: with its tolerance. fan_power: of the calibrated noise. fan_amplitude (1025,): its spectrum
-    on 0-8000 Hz, unit power.
+    reference (n,). delay: of the converters in the sweep, samples; offset: what is added to it in the recording. gain:
+    from the room's pressure to full scale, gain_after: with its tolerance. fan_power: of the calibrated noise.
+    fan_amplitude (1025,): its spectrum on 0-8000 Hz, unit power.
     """
 
     place: Place
@@ -99,7 +111,7 @@ class Scene:
         return decibels(power(difference) / self.fan_power)
 
     def linear_response(self) -> Array:
-        """(m,) from what is played to the microphone at small signals, in the usual chain, 256 samples late instead of the converters' delay."""
+        """(m,) from what is played to the microphone at small signals, 256 samples late for the converters' delay."""
         impulse = np.eye(1, 2048, 256)[0]
         path = signal.oaconvolve(self.usual.paths[0][2], self.shell)
         return self.gain_after * signal.oaconvolve(self.usual.loudspeaker.play(impulse, linear=True), path)
@@ -112,14 +124,20 @@ def _gate(n: int, start: int, fade: int) -> Array:
 def draw_scene(rng: np.random.Generator, reference: Array, robot_over_fan_db: float) -> Scene:
     """A robot, its calibration, and another day with the ordinary tolerances.
 
-    robot_over_fan_db: of the whole recording. Tolerances: offset -60..60 samples, fan +-0.4 dB, gain +-0.1 dB, the microphone moved by
-    0.1-0.9 mm, distortion of FAINT_DB over the fan. All recordings together are scaled later, see `hidden_cases.write_case`.
+    robot_over_fan_db: of the whole recording. Tolerances: offset -60..60 samples, fan +-0.4 dB, gain +-0.1 dB, the
+    microphone moved by 0.1-0.9 mm, distortion of FAINT_DB over the fan. All recordings together are scaled later, see
+    `hidden_cases.write_case`.
     """
     place, shell, amplitude = draw_place(rng, rng.uniform(0.18, 0.32)), draw_shell(rng), draw_hiss(rng)
     move_m = rng.uniform(1e-4, 9e-4)
     moved = place.microphone_moved(move_m * direction(rng))
     offset = rng.uniform(-60, 60)
-    tolerances = {"offset_samples": offset, "fan_db": rng.uniform(-0.4, 0.4), "gain_db": rng.uniform(-0.1, 0.1), "move_mm": 1e3 * move_m}
+    tolerances = {
+        "offset_samples": offset,
+        "fan_db": rng.uniform(-0.4, 0.4),
+        "gain_db": rng.uniform(-0.1, 0.1),
+        "move_mm": 1e3 * move_m,
+    }
     excitation, delay = sweep(rng), rng.uniform(140, 700)
     paths = [signal.oaconvolve(p.response(), shell) for p in (place, moved)]
     straight = draw_loudspeaker(rng)
@@ -136,11 +154,28 @@ def draw_scene(rng: np.random.Generator, reference: Array, robot_over_fan_db: fl
     signals = {"sweep_ref": excitation, "sweep_mic": swept + noises[0], "fan_only": noises[1], "ref": reference}
     usual = Chain(reference, loudspeaker, ((0, 0, moved.response()),), noises[2] * 10 ** (tolerances["fan_db"] / 20))
     gain_after = gain * 10 ** (tolerances["gain_db"] / 20)
-    return Scene(place, moved, shell, reference, delay, offset, gain, gain_after, fan_power, amplitude, signals, usual, tolerances)
+    return Scene(
+        place,
+        moved,
+        shell,
+        reference,
+        delay,
+        offset,
+        gain,
+        gain_after,
+        fan_power,
+        amplitude,
+        signals,
+        usual,
+        tolerances,
+    )
 
 
 def draw_shell(rng: np.random.Generator) -> Array:
-    """(128,) what the robot's own body does: reflections within 2 ms, and 4-10 dB less treble, as the microphone is not in front of the cone."""
+    """(128,) what the robot's own body does.
+
+    Reflections within 2 ms, and 4-10 dB less treble, as the microphone is not in front of the cone.
+    """
     turn, loss_db = rng.uniform(1200, 3000), rng.uniform(4, 10)
     low = 10 ** (-loss_db / 20)
     b, a = signal.bilinear([low, 2 * math.pi * turn], [1.0, 2 * math.pi * turn], RATE)
@@ -148,12 +183,18 @@ def draw_shell(rng: np.random.Generator) -> Array:
 
 
 def draw_hiss(rng: np.random.Generator) -> Array:
-    """(1025,) amplitude response of fan, air flow and microphone together on 0-8000 Hz, of unit power: the flow's hiss is 6-13 dB down and flat."""
+    """(1025,) amplitude response of fan, air flow and microphone together on 0-8000 Hz, of unit power.
+
+    The flow's hiss is 6-13 dB down and flat.
+    """
     return np.sqrt((draw_fan(rng) ** 2 + (hiss := 10 ** (-rng.uniform(6, 13) / 10))) / (1 + hiss))
 
 
 def with_distortion(loudspeaker: Loudspeaker, played: Array, path: Array, wanted: float) -> tuple[Loudspeaker, float]:
-    """The driver turned until what its nonlinearity adds behind this path has the wanted power, and the power reached; judged on 5 s."""
+    """The driver turned until what its nonlinearity adds behind this path has the wanted power, and the power reached.
+
+    Judged on 5 s.
+    """
     x = played[RATE : 6 * RATE]
     straight = loudspeaker.play(x, linear=True)
 

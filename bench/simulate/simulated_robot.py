@@ -1,4 +1,7 @@
-"""The physics of a simulated robot: loudspeaker, room, fan, converter clocks. Shares no code with the filter's own echo model."""
+"""The physics of a simulated robot: loudspeaker, room, fan, converter clocks.
+
+Shares no code with the filter's own echo model.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +23,8 @@ class Loudspeaker:
     """A small moving-coil driver in a closed box; nonlinear force factor and suspension, then linear filters.
 
     resonance_hz, q: of the linear driver. stiffening, softening_bl, asymmetry: bounded displacement laws, see `play`.
-    drive: how far the signal's displacement reaches into them. filters: (sections, 6) of the enclosure and microphone, at 16 kHz.
+    drive: how far the signal's displacement reaches into them. filters: (sections, 6) of the enclosure and microphone,
+    at 16 kHz.
     """
 
     resonance_hz: float
@@ -38,11 +42,11 @@ class Loudspeaker:
 
             u'' + (w/Q) u' + w^2 u = w^2 [ b(u) x - s(u) u ] - (w/Q_e) [ b(u)^2 - 1 ] u'
 
-        has the force factor b(u) = 1 - softening_bl v^2/(1 + v^2) - asymmetry v/(1 + v^2) and the excess stiffness
-        s(u) = stiffening v^2/(1 + v^2), v = drive u; bounded, so that the iteration below converges. Half of the damping is electrical
-        (1/Q_e = 0.5/Q). Solved at four times the rate (so that products of frequencies up to order 7 do not fold back
-        into speech) by fixed-point iteration: the right side is recomputed from the last u, the left side is solved exactly by
-        a bilinear filter. Pressure is the cone's acceleration. linear=True keeps b = 1, s = 0.
+        has the force factor b(u) = 1 - softening_bl v^2/(1 + v^2) - asymmetry v/(1 + v^2) and the excess stiffness s(u)
+        = stiffening v^2/(1 + v^2), v = drive u; bounded, so that the iteration below converges. Half of the damping is
+        electrical (1/Q_e = 0.5/Q). Solved at four times the rate (so that products of frequencies up to order 7 do not
+        fold back into speech) by fixed-point iteration: the right side is recomputed from the last u, the left side is
+        solved exactly by a bilinear filter. Pressure is the cone's acceleration. linear=True keeps b = 1, s = 0.
         """
         up = signal.resample_poly(x, OVERSAMPLING, 1)
         position, velocity, acceleration = self._mechanics()
@@ -67,11 +71,16 @@ class Loudspeaker:
 
 
 def draw_loudspeaker(rng: np.random.Generator) -> Loudspeaker:
-    """A driver of a small robot: resonance 180-320 Hz, treble roll-off, broad peaks of the enclosure, the microphone's low cut."""
+    """A driver of a small robot.
+
+    Resonance 180-320 Hz, treble roll-off, broad peaks of the enclosure, the microphone's low cut.
+    """
     sections = [signal.butter(2, rng.uniform(6300, 7500), "low", fs=RATE, output="sos")]
     sections.append(signal.butter(2, rng.uniform(110, 210), "high", fs=RATE, output="sos"))
     for _ in range(4):
-        sections.append(peak_filter(math.exp(rng.uniform(math.log(350), math.log(6000))), rng.uniform(1.0, 4.0), rng.uniform(-5, 5)))
+        sections.append(
+            peak_filter(math.exp(rng.uniform(math.log(350), math.log(6000))), rng.uniform(1.0, 4.0), rng.uniform(-5, 5))
+        )
     return Loudspeaker(
         resonance_hz=rng.uniform(180, 320),
         q=rng.uniform(0.6, 1.0),
@@ -94,7 +103,10 @@ def peak_filter(frequency_hz: float, q: float, gain_db: float) -> Array:
 
 @dataclass(frozen=True)
 class Room:
-    """A shoebox room with a robot's microphone, its loudspeaker and a human; rt60_s is what the impulse response shows."""
+    """A shoebox room with a robot's microphone, its loudspeaker and a human.
+
+    rt60_s is what the impulse response shows.
+    """
 
     rt60_s: float
     robot: Array
@@ -102,10 +114,11 @@ class Room:
 
 
 def draw_room(rng: np.random.Generator, kind: str, robot_m: float, direction: Array, human_m: float) -> Room:
-    """Impulse responses at 16 kHz by the image-source method (Allen & Berkley 1979; pyroomacoustics), without its filter delay.
+    """Impulse responses at 16 kHz by image sources (Allen & Berkley 1979; pyroomacoustics), without filter delay.
 
-    kind: "lab" (RT60 0.20-0.26 s) or "office" (0.50-0.75 s). robot_m, direction (3,): where the loudspeaker lies from the
-    microphone; it is a part of the robot, so the same in every room. The human's mouth is human_m away, a little higher.
+    kind: "lab" (RT60 0.20-0.26 s) or "office" (0.50-0.75 s). robot_m, direction (3,): where the loudspeaker lies from
+    the microphone; it is a part of the robot, so the same in every room. The human's mouth is human_m away, a little
+    higher.
     """
     low, high, scale = {"lab": (0.20, 0.26, 1.0), "office": (0.50, 0.75, 0.9)}[kind]
     size = scale * np.array([rng.uniform(5.0, 7.0), rng.uniform(4.0, 5.5), rng.uniform(2.6, 3.2) / scale])
@@ -115,7 +128,9 @@ def draw_room(rng: np.random.Generator, kind: str, robot_m: float, direction: Ar
     reach = math.sqrt(human_m**2 - height**2)
     mouth = microphone + np.array([reach * math.cos(angle), reach * math.sin(angle), height])
     asked = wanted
-    for _ in range(3):  # Sabine's formula misses the decay of an absorbing room by a quarter: ask again for what came out short
+    for _ in range(
+        3
+    ):  # Sabine's formula misses the decay of an absorbing room by a quarter: ask again for what came out short
         robot, human = _image_sources(size, asked, microphone, (microphone + robot_m * direction, mouth))
         found = float(pra.experimental.measure_rt60(human, fs=RATE, decay_db=30))
         asked = min(asked * wanted / found, 1.5)
@@ -143,7 +158,10 @@ def draw_body(rng: np.random.Generator) -> Array:
 
 
 def draw_fan(rng: np.random.Generator) -> Array:
-    """(1025,) amplitude response of a fan's noise on 0-8000 Hz, of unit total power: flat, then falling, with bumps and a blade line."""
+    """(1025,) amplitude response of a fan's noise on 0-8000 Hz, of unit total power.
+
+    Flat, then falling, with bumps and a blade line.
+    """
     f = np.linspace(0, RATE / 2, 1025)
     corner = math.exp(rng.uniform(math.log(250), math.log(2500)))
     level_db = -10 * rng.uniform(0.8, 1.3) * np.log10(1 + (f / corner) ** 2)
@@ -161,7 +179,7 @@ def fan_noise(rng: np.random.Generator, amplitude: Array, n: int) -> Array:
 
 
 def warp(x: Array, ppm: float, half_width: int = 32) -> Array:
-    """x (n,) read at t (1 + ppm 1e-6), t in samples, by a Kaiser-windowed sinc of 2 half_width taps (beta 9: images below -90 dB)."""
+    """Samples x (n,) read at t (1 + ppm 1e-6) by a Kaiser-windowed sinc of 2 half_width taps (beta 9: -90 dB)."""
     if ppm == 0.0:
         return x.copy()
     padded = np.concatenate([np.zeros(half_width), x, np.zeros(2 * half_width)])
@@ -178,7 +196,7 @@ def warp(x: Array, ppm: float, half_width: int = 32) -> Array:
 
 
 def sweep(peak: float = 0.35) -> Array:
-    """(120000,) exponential sweep, 40-8000 Hz in 6 s after 0.5 s of silence (Farina 2000, eq. (2)), faded over 20 ms, 1 s of silence."""
+    """(120000,) exponential sweep (Farina 2000, eq. (2)), 40-8000 Hz in 6 s, 0.5 s of silence before, 1 s behind."""
     t = np.arange(6 * RATE) / RATE
     rate = math.log(8000 / 40)
     x = peak * np.sin(2 * math.pi * 40 * 6 / rate * (np.exp(t * rate / 6) - 1.0))

@@ -48,7 +48,7 @@ class PaperSpectralSubtraction:
     The paper leaves open, and this implementation takes: hop 160 and a 400-sample Hann analysis window, zero-padded to the
     1200 points that the paper's 601 bins imply (VoiceFilter's sizes); a Hann smoothing window without its zero end points,
     normalised to sum 1; digital silence before and after the recording, for which eq. (6) gives SM = 1; and alpha, beta
-    chosen for the lowest word errors on 24 simulated validation conversations (bench/tune_paper_ss.py): alpha 4, beta 2.
+    chosen for the lowest word errors on 24 simulated validation conversations (bench/measure/tune_paper_ss.py): alpha 4, beta 2.
 
     lookahead is L frames. causal=True moves the window L frames back, so that it needs none (2 L + 1 frames of the past).
     """

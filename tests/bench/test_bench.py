@@ -1,4 +1,7 @@
-"""The benchmark judged by itself: conversations that are what their meta.json says, peers that cancel, figures that add up."""
+"""The benchmark judged by itself.
+
+Conversations that are what their meta.json says, peers that cancel, figures that add up.
+"""
 
 from __future__ import annotations
 
@@ -12,49 +15,13 @@ import pytest
 import soundfile as sf
 from scipy import signal
 
-from bench import table
-from bench.measure import barge_in, peers, quality, recogniser
+from bench.measure import barge_in, conversation, intervals, levels, peers, quality, recogniser, scores
 from bench.simulate import conversations
 from bench.simulate import simulated_robot as robot
 from edgefilter.dsp.metrics import erle, si_sdr
 from edgefilter.errors import UsageError
 from edgefilter.types import Event
-
-RATE = 16000
-
-
-def babble(seconds: float, seed: int) -> np.ndarray:
-    """(n,) noise with the band and the syllables of speech, peak 0.5."""
-    rng = np.random.default_rng(seed)
-    carrier = signal.sosfilt(signal.butter(2, [150, 3500], "band", fs=RATE, output="sos"), rng.standard_normal(int(seconds * RATE)))
-    syllables = np.abs(signal.sosfilt(signal.butter(2, 4.0, fs=RATE, output="sos"), rng.standard_normal(carrier.size)))
-    x = carrier * syllables
-    return (0.5 * x / np.abs(x).max()).astype(np.float32)
-
-
-@pytest.fixture(scope="module")
-def clips(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("speech")
-    rows = []
-    for i in range(6):
-        sf.write(folder / f"{i}.flac", babble(3.2, i), RATE)
-        rows.append(f"{i}.flac\ts{i % 2}\t3.20\tsome words here")
-    (folder / "transcripts.tsv").write_text("\n".join(rows) + "\n", encoding="utf-8")
-    return folder
-
-
-def make(clips: Path, output: Path, kind: str, count: int) -> None:
-    arguments = ["conversations.py", "--speech", clips, "--voices", clips, "--output", output, "--kind", kind, "--count", count]
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(sys, "argv", [str(argument) for argument in arguments])
-        conversations.main()
-
-
-@pytest.fixture(scope="module")
-def live(clips: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    output = tmp_path_factory.mktemp("made") / "live"
-    make(clips, output, "live", 2)
-    return output
+from tests.bench.conftest import RATE, babble, make
 
 
 def read(folder: Path, name: str) -> np.ndarray:
@@ -62,12 +29,15 @@ def read(folder: Path, name: str) -> np.ndarray:
 
 
 def lag_between(mic: np.ndarray, ref: np.ndarray) -> float:
-    """Samples by which ref must be delayed to fit mic: peak of the whitened cross-correlation, interpolated by a parabola."""
+    """Samples by which ref must be delayed to fit mic.
+
+    Peak of the whitened cross-correlation, interpolated by a parabola.
+    """
     size = 1 << (2 * ref.size).bit_length()
     played = np.fft.rfft(ref, size)
     power = np.abs(played) ** 2
     h = np.abs(np.fft.irfft(np.fft.rfft(mic, size) * played.conj() / (power + 1e-2 * power.max())))
-    k = int(np.argmax(h[:RATE * 2]))
+    k = int(np.argmax(h[: RATE * 2]))
     left, top, right = h[k - 1], h[k], h[k + 1]
     return k + 0.5 * (left - right) / (left - 2 * top + right)
 
@@ -84,7 +54,7 @@ def test_live_conversation_has_the_delays_that_its_meta_says(live: Path) -> None
             segment = np.zeros_like(ref)
             segment[at:stop] = ref[at:stop]
             arriving = np.interp(np.arange(ref.size) * (1 + meta["ppm"] * 1e-6) - lag, np.arange(ref.size), segment)
-            # what is left is the delay of the calibration; half a sample for rounding, half for the loudspeaker's distortion
+            # what is left is the delay of the calibration; half a sample for rounding, half for the distortion
             assert lag_between(mic[: stop + lag + RATE // 2], arriving) == pytest.approx(meta["delay"], abs=1)
 
 
@@ -95,9 +65,13 @@ def test_conversation_levels_and_spans(live: Path) -> None:
         span = slice(meta["start"], meta["end"])
         assert not clean[: meta["start"]].any() and clean[span].any()
         assert mic.size == clean.size == read(folder, "ref").size and fan.size == 8 * RATE
-        assert si_sdr(mic[span], clean[span]) == pytest.approx(meta["sisdr_mix"], abs=0.05)  # 16-bit rounding of the clean human
+        assert si_sdr(mic[span], clean[span]) == pytest.approx(
+            meta["sisdr_mix"], abs=0.05
+        )  # 16-bit rounding of the clean human
         fan_db = 10 * np.log10(np.mean(clean[span] ** 2) / np.mean(fan**2))
-        assert fan_db == pytest.approx(meta["snr_fan"], abs=0.5)  # 8 s of narrow-band noise estimate their power to some tenths
+        assert fan_db == pytest.approx(
+            meta["snr_fan"], abs=0.5
+        )  # 8 s of narrow-band noise estimate their power to some tenths
         assert np.abs(mic).max() < 1.0
 
 
@@ -117,15 +91,21 @@ def test_warp_reads_at_the_other_clock(ppm: float) -> None:
     t = np.arange(4 * RATE)
     warped = robot.warp(np.sin(2 * np.pi * 0.31 * t), ppm)
     inside = slice(100, -100)
-    np.testing.assert_allclose(warped[inside], np.sin(2 * np.pi * 0.31 * t * (1 + ppm * 1e-6))[inside], atol=3e-5)  # -90 dB images
+    np.testing.assert_allclose(
+        warped[inside], np.sin(2 * np.pi * 0.31 * t * (1 + ppm * 1e-6))[inside], atol=3e-5
+    )  # -90 dB images
 
 
 def test_loudspeaker_is_linear_when_barely_driven_and_distorts_when_driven() -> None:
     from dataclasses import replace
 
     driver, x = robot.draw_loudspeaker(np.random.default_rng(2)), babble(2.0, 1).astype(np.float64)
-    levels = [-si_sdr(replace(driver, drive=drive).play(x), driver.play(x, linear=True)) for drive in (1e-4, 1.0, 4.0)]
-    assert levels[0] < -60 and levels[0] < levels[1] - 10 < levels[2] - 15  # asymmetry grows with the drive, 20 dB a decade at least
+    distortion = [
+        -si_sdr(replace(driver, drive=drive).play(x), driver.play(x, linear=True)) for drive in (1e-4, 1.0, 4.0)
+    ]
+    assert (
+        distortion[0] < -60 and distortion[0] < distortion[1] - 10 < distortion[2] - 15
+    )  # asymmetry grows with the drive, 20 dB a decade at least
     doubled = driver.play(2 * x, linear=True)
     np.testing.assert_allclose(doubled, 2 * driver.play(x, linear=True), atol=1e-9)  # float64 rounding
 
@@ -139,7 +119,9 @@ def echo_scene() -> tuple[np.ndarray, np.ndarray]:
     return mic.astype(np.float32), ref
 
 
-@pytest.mark.parametrize(("peer", "least_db"), [(peers.speexdsp, 10.0), (peers.speexdsp_suppressed, 20.0), (peers.aec3, 20.0)])
+@pytest.mark.parametrize(
+    ("peer", "least_db"), [(peers.speexdsp, 10.0), (peers.speexdsp_suppressed, 20.0), (peers.aec3, 20.0)]
+)
 def test_peer_cancels_an_echo_without_human(peer, least_db: float) -> None:
     mic, ref = echo_scene()
     out = peer(mic, ref)
@@ -215,58 +197,87 @@ def test_transcripts_are_kept_by_audio_and_survive_a_cut_line(tmp_path: Path, mo
 
 
 def test_summary_adds_up() -> None:
-    scores = [
+    found = [
         {"si_sdr": -2.0, "errors": 1, "words": 10, "seconds": 1.0, "duration": 10.0},
         {"si_sdr": 4.0, "errors": 9, "words": 3, "seconds": 1.0, "duration": 10.0},
         {"problem": "5 samples for 6", "seconds": 1.0, "duration": 10.0},
     ]
-    row = table.summarise(scores)
+    row = scores.summarise(found)
     assert (row["utterances"], row["problems"], row["words"]) == (3, 1, 13)
-    assert row["si_sdr_mean"] == row["si_sdr_median"] == pytest.approx(1.0) and row["real_time_factor"] == pytest.approx(0.1)
+    assert row["si_sdr_mean"] == row["si_sdr_median"] == pytest.approx(1.0) and row[
+        "real_time_factor"
+    ] == pytest.approx(0.1)
     assert (row["wer"], row["wer_mean"], row["wer_capped"]) == pytest.approx((1000 / 13, 155.0, 55.0))
     assert row["si_sdr_interval"] == pytest.approx((-2.0, 4.0))  # two utterances: the interval is their range
-    assert "1 outputs unusable" in table.markdown({"s": {"lab": {"ss": row}}}, {"threads": "1"}, "title")
+    assert "1 outputs unusable" in scores.markdown({"s": {"lab": {"ss": row}}})
 
 
 def test_bootstrap_interval_has_the_width_of_the_standard_error() -> None:
     x = np.random.default_rng(5).standard_normal(400)
-    low, high = table.interval(lambda sample: sample.mean(axis=1), x)
-    assert high - low == pytest.approx(2 * 1.96 * x.std() / 20, rel=0.08)  # 2000 draws give a quantile to a few per cent
-    assert table.interval(lambda sample: sample.mean(axis=1), x) == (low, high)
+    low, high = intervals.interval(lambda sample: sample.mean(axis=1), x)
+    assert high - low == pytest.approx(
+        2 * 1.96 * x.std() / 20, rel=0.08
+    )  # 2000 draws give a quantile to a few per cent
+    assert intervals.interval(lambda sample: sample.mean(axis=1), x) == (low, high)
 
 
 def run_quality(monkeypatch: pytest.MonkeyPatch, live: Path, output: Path, engines: str) -> tuple[int, dict]:
-    arguments = ["quality.py", "--conversations", live, "--engines", engines, "--output", output, "--cache", output.parent / "cache"]
+    arguments = [
+        "quality.py",
+        "--conversations",
+        live,
+        "--engines",
+        engines,
+        "--output",
+        output,
+        "--cache",
+        output.parent / "cache",
+    ]
     monkeypatch.setattr(sys, "argv", [str(argument) for argument in arguments])
     code = quality.main()
     return code, json.loads(output.with_suffix(".json").read_text()) if code == 0 else {}
 
 
 def test_quality_scores_every_row(monkeypatch: pytest.MonkeyPatch, live: Path, tmp_path: Path) -> None:
-    code, found = run_quality(monkeypatch, live, tmp_path / "q", "unfiltered,bypass,speexdsp,speexdsp-true-lag,linear,clean")
+    code, found = run_quality(
+        monkeypatch, live, tmp_path / "q", "unfiltered,bypass,speexdsp,speexdsp-true-lag,linear,clean"
+    )
     assert code == 0 and list(found["summary"]["live"]) == ["lab", "office"]
     for folder in live.iterdir():
         meta = json.loads((folder / "meta.json").read_text())
         rows = found["summary"]["live"][meta["room"]]
         assert not any(row["problems"] for row in rows.values())
-        assert rows["unfiltered"]["si_sdr_mean"] == pytest.approx(meta["sisdr_mix"], abs=0.05)  # 16-bit rounding of the clean human
-        assert rows["bypass"]["si_sdr_mean"] == pytest.approx(rows["unfiltered"]["si_sdr_mean"], abs=1e-3)  # float32 rounding
+        assert rows["unfiltered"]["si_sdr_mean"] == pytest.approx(
+            meta["sisdr_mix"], abs=0.05
+        )  # 16-bit rounding of the clean human
+        assert rows["bypass"]["si_sdr_mean"] == pytest.approx(
+            rows["unfiltered"]["si_sdr_mean"], abs=1e-3
+        )  # float32 rounding
         assert "si_sdr_mean" not in rows["clean"]
-        assert rows["linear"]["si_sdr_mean"] > rows["unfiltered"]["si_sdr_mean"] + 5  # the robot is 22-26 dB above the human
+        assert (
+            rows["linear"]["si_sdr_mean"] > rows["unfiltered"]["si_sdr_mean"] + 5
+        )  # the robot is 22-26 dB above the human
         assert rows["speexdsp-true-lag"]["si_sdr_mean"] != rows["speexdsp"]["si_sdr_mean"]
     assert "| linear |" in (tmp_path / "q.md").read_text()
+    made_with = found["stamp"]
+    assert (
+        made_with["data"][0]["folder"] == "live" and made_with["data"][0]["files"] == 2 * 7 and not made_with["models"]
+    )
+    assert made_with["command"].startswith("python -m quality --conversations conversations/live --engines unfiltered,")
 
 
 def test_true_lag_puts_both_utterances_where_they_are_heard(live: Path) -> None:
     for folder in sorted(live.iterdir()):
-        conversation = quality.Conversation(folder)
-        meta, mic, ref = conversation.meta, conversation.read("mic"), conversation.delayed_reference()
-        assert abs(quality.direct_delay(conversation.read("sweep_ref"), conversation.read("sweep_mic")) - meta["delay"]) <= 1  # the fan
+        talk = conversation.Conversation(folder)
+        meta, mic, ref = talk.meta, talk.read("mic"), talk.delayed_reference()
+        assert (
+            abs(conversation.direct_delay(talk.read("sweep_ref"), talk.read("sweep_mic")) - meta["delay"]) <= 1
+        )  # the fan
         drifting = np.interp(np.arange(ref.size) * (1 + meta["ppm"] * 1e-6), np.arange(ref.size), ref)
         onset = meta["t_main"] + meta["lag2"]
         for part in (slice(0, meta["t_main"]), slice(onset, meta["end"])):
             # half a sample for rounding of the lag, half for the loudspeaker's distortion
-            assert lag_between(mic[part], drifting[part]) == pytest.approx(quality.MARGIN, abs=1)
+            assert lag_between(mic[part], drifting[part]) == pytest.approx(conversation.MARGIN, abs=1)
 
 
 def test_unusable_output_is_counted_not_scored(monkeypatch: pytest.MonkeyPatch, live: Path, tmp_path: Path) -> None:
@@ -292,26 +303,38 @@ def test_folder_without_conversations_is_one_line(
     assert code == 1 and "holds no */meta.json" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize(("before", "after", "delay", "shown"), [(None, 0.1, 100.0, "2 of 2 | 0 | 0"), (0.5, None, 0.0, "1 of 1 | 1 | 0"), (None, None, None, "1 of 2 | 0 | 1")])
-def test_barge_in_counts_from_the_humans_first_sound(live: Path, monkeypatch: pytest.MonkeyPatch, before, after, delay, shown) -> None:
-    conversation = quality.find_conversations([live])["live"][0]
-    power = barge_in.frame_power(conversation.read("clean"))
-    onset = int(np.flatnonzero(power > 10**-2.5 * power.max())[0]) * barge_in.FRAME
+@pytest.mark.parametrize(
+    ("before", "after", "delay", "shown"),
+    [(None, 0.1, 100.0, "2 of 2 | 0 | 0"), (0.5, None, 0.0, "1 of 1 | 1 | 0"), (None, None, None, "1 of 2 | 0 | 1")],
+)
+def test_barge_in_counts_from_the_humans_first_sound(
+    live: Path, monkeypatch: pytest.MonkeyPatch, before, after, delay, shown
+) -> None:
+    talk = conversation.find_conversations([live])["live"][0]
+    power = levels.frame_power(talk.read("clean"))
+    onset = int(np.flatnonzero(power > 10**-2.5 * power.max())[0]) * levels.FRAME
     said = [] if before is None else [Event("speech_started", onset - int(before * RATE), "")]
     said += [] if after is None else [Event("speech_started", onset + int(after * RATE), "")]
     heard = []
-    monkeypatch.setattr(barge_in, "talk", lambda conversation, mic: heard.append(mic) or (said if len(heard) == 1 else [Event("speech_started", 5, "")] * 3))
-    row = barge_in.measure(conversation)
+    monkeypatch.setattr(
+        barge_in,
+        "talk",
+        lambda talk, mic: heard.append(mic) or (said if len(heard) == 1 else [Event("speech_started", 5, "")] * 3),
+    )
+    row = barge_in.measure(talk)
     assert row["delay_ms"] == delay and row["early"] == (before is not None) and row["alarms"] == 3
-    np.testing.assert_array_equal(heard[1], conversation.read("mic") - conversation.read("clean"))
-    text = barge_in.markdown([{"set": "live", **row}, {"set": "live", **row, "delay_ms": 50.0, "early": False}], {"date": "today"})
+    np.testing.assert_array_equal(heard[1], talk.read("mic") - talk.read("clean"))
+    text = barge_in.markdown([{"set": "live", **row}, {"set": "live", **row, "delay_ms": 50.0, "early": False}])
     assert f"| {shown} | 6 in " in text
 
 
-def test_a_row_is_scored_anew_where_its_code_or_its_network_changed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_row_is_scored_anew_where_its_code_or_its_network_changed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     tree = tmp_path / "edgefilter"
     shutil.copytree(Path(quality.edgefilter.__file__).parent, tree)
     (tmp_path / "models").mkdir()
+    (tmp_path / "models/crnn_int8.onnx").touch()
     monkeypatch.setattr(quality.edgefilter, "__file__", str(tree / "__init__.py"))
 
     def versions() -> list[str]:
@@ -319,9 +342,9 @@ def test_a_row_is_scored_anew_where_its_code_or_its_network_changed(tmp_path: Pa
 
     def changed_by(path: Path) -> list[bool]:
         before = versions()
-        path.write_bytes((path.read_bytes() if path.exists() else b"") + b"\n")
+        path.write_bytes(path.read_bytes() + b"\n")
         return [a != b for a, b in zip(before, versions(), strict=True)]
 
     assert changed_by(tmp_path / "models/crnn_int8.onnx") == [False, False, True]
-    assert changed_by(tree / "canceller.py") == [False, True, True]
-    assert changed_by(tree / "diagnose.py") == [False, False, False]
+    assert changed_by(tree / "filter/canceller.py") == [False, True, True]
+    assert changed_by(tree / "diagnosis/diagnose.py") == [False, False, False]

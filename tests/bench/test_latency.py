@@ -44,13 +44,13 @@ def test_the_page_and_the_picture_are_made(rows: list[dict], tmp_path: Path) -> 
     curve = latency.curves(["ss"], 0.3, (2048,), (512,), ())
     assert curve["hop"][0]["hop"] == 512 and curve["tail"][0]["x"] == 2048
     starts = {"ss": [{"seconds": 0.5, "memory_mb": 70.0}]}
-    result = {"machine": {"processor": "x"}, "seconds": 0.5, "rounds": 2, "missing": {"crnn": "no model"}, "rows": rows, "curves": curve}
+    result = {"conditions": {"cores": "2 of 2"}, "seconds": 0.5, "rounds": 2, "missing": {"crnn": "no model"}, "rows": rows, "curves": curve}
     result |= {"start": starts, "click": {latency_live.ALONE: [100.0, float("nan")], "ss": [140.0, 150.0]}}
     page = latency_report.markdown(json.loads(json.dumps(result)), "latency")
     rows_found = ("| ss | 16 | idle | 1 | paced |", "| aec3 | 10 |", "| ss | 145 | 140 - 150 | +45 |")
     for words in (*rows_found, "crnn is not in the table: no model", "real-time factor", "alignment and canceller"):
         assert words in page
-    latency_report.draw(result | {"rows": [*rows, *({**row, "busy": True} for row in rows)]}, tmp_path / "latency.png")
+    latency_report.draw(result | {"rows": [*rows, *({**row, "busy": True} for row in rows)]}, tmp_path / "latency")
     assert (tmp_path / "latency.png").stat().st_size > 10_000
 
 

@@ -43,7 +43,7 @@ def test_networks_are_compared(tmp_path, conversation, monkeypatch):
     assert train.main() == 0
     monkeypatch.setattr(networks, "Recogniser", Deaf)
     monkeypatch.setattr(networks, "HOPS", 3)
-    monkeypatch.setattr(networks.quality.Conversation, "profile", None)
+    monkeypatch.setattr(networks.Conversation, "profile", None)
     out = tmp_path / "results" / "networks"
     arguments = ["--runs", str(run), "--conversations", str(conversation), "--whisper", str(tmp_path), "--output", str(out)]
     monkeypatch.setattr("sys.argv", ["networks", *arguments])

@@ -179,7 +179,11 @@ def test_training_starts_from_given_weights_of_the_same_shape(tmp_path, monkeypa
     assert run("first", "8") == 0
     first = torch.load(tmp_path / "first" / "best.pt", weights_only=False)["network"]
     assert run("second", "8", "--start", str(tmp_path / "first" / "best.pt"), "--rate", "0", "--seed", "5") == 0
-    second = torch.load(tmp_path / "second" / "best.pt", weights_only=False)["network"]
+    found = torch.load(tmp_path / "second" / "best.pt", weights_only=False)
+    second, earlier = found["network"], torch.load(tmp_path / "first" / "best.pt", weights_only=False)
+    assert found["stages"][0] == {"steps": earlier["step"], "seed": earlier["seed"], "items": earlier["items"]}
+    assert found["stages"][1]["seed"] == 5 and found["seed"] == [earlier["seed"], 5]
+    assert found["step"] == earlier["step"] + found["stages"][1]["steps"] > earlier["step"]
     assert all(torch.allclose(first[name], second[name], atol=1e-4) for name in first)
     assert run("third", "12", "--start", str(tmp_path / "first" / "best.pt")) == 1
     assert "hidden=12" in capsys.readouterr().err

@@ -1,0 +1,73 @@
+"""models/MODELS.md and the metadata inside the model files say the same of how a network was trained."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import onnxruntime
+import pytest
+
+ROOT = Path(__file__).parents[2]
+SHIPPED = sorted((ROOT / "models").glob("*.onnx"))
+FOR_TESTS = sorted((ROOT / "tests" / "data").glob("*.onnx"))
+
+
+def metadata(path: Path) -> dict[str, str]:
+    return (
+        onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"]).get_modelmeta().custom_metadata_map
+    )
+
+
+def page() -> dict[str, dict[str, str]]:
+    """The rows of the page's first table by file, cells by column."""
+    lines = (ROOT / "models" / "MODELS.md").read_text(encoding="utf-8").splitlines()
+    start = next(i for i, line in enumerate(lines) if line.startswith("| file |"))
+    head, *rows = (
+        [cell.strip() for cell in line.strip("|").split("|")] for line in lines[start:] if line.startswith("|")
+    )
+    rows = rows[1 : next(i for i, row in enumerate(rows) if len(row) != len(head))]
+    return {row[0].split(",")[0]: dict(zip(head, row, strict=True)) for row in rows}
+
+
+def test_every_file_has_a_row_and_every_row_a_file() -> None:
+    assert len(SHIPPED) >= 2
+    assert sorted(page()) == [path.name for path in SHIPPED]
+
+
+@pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.name)
+def test_steps_seed_items_and_size_are_those_of_the_file(path: Path) -> None:
+    row, said = page()[path.name], json.loads(metadata(path)["training"])
+    seeds = said["seed"] if isinstance(said["seed"], list) else [said["seed"]]
+    assert row["steps"] == str(said["step"])
+    assert row["seed"] == ", ".join(map(str, seeds))
+    assert row["items"] == str(said["items"])
+    assert row["file"] == f"{path.name}, {path.stat().st_size / 1e6:.1f} MB"
+
+
+@pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.name)
+def test_the_stages_add_up_to_the_whole(path: Path) -> None:
+    said = json.loads(metadata(path)["training"])
+    stages = said.get("stages", [{"steps": said["step"], "seed": said["seed"], "items": said["items"]}])
+    assert sum(stage["steps"] for stage in stages) == said["step"]
+    assert [stage["seed"] for stage in stages] == (said["seed"] if "stages" in said else [said["seed"]])
+    assert stages[-1]["items"] == said["items"]
+
+
+def test_variants_of_a_network_say_the_same_of_its_training() -> None:
+    said = {path.name: metadata(path) for path in SHIPPED}
+    assert said["crnn.onnx"]["training"] == said["crnn_int8.onnx"]["training"]
+    assert said["crnn.onnx"]["figures"] == said["crnn_int8.onnx"]["figures"]
+
+
+@pytest.mark.parametrize("path", FOR_TESTS, ids=lambda path: path.name)
+def test_networks_for_tests_say_that_nothing_was_trained(path: Path) -> None:
+    said = metadata(path)
+    assert (
+        json.loads(said["training"]) == {"data": "none: random weights", "seed": 0}
+        and json.loads(said["figures"]) == {}
+    )
+
+
+def test_there_are_networks_for_tests() -> None:
+    assert len(FOR_TESTS) == 2
