@@ -7,8 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
+from bench.measure.real_barge_in import IN_TIME_S, SURE_HOPS, in_time
 from bench.measure.real_scores import ALONE_S, LOUD_DB
-from bench.measure.real_summary import IN_TIME_S, LOW_SER, WARM_S, in_time, mean, seconds, summarise
+from bench.measure.real_summary import LOW_SER, WARM_S, curve, mean, seconds, summarise
 from bench.results_writer import table
 
 LINES = ("tab:gray", "tab:blue", "tab:green", "tab:red", "tab:orange", "tab:brown", "tab:purple", "tab:olive")
@@ -137,7 +138,7 @@ def _barge_in(rows: list[dict], systems: Sequence[str]) -> list[str]:
     body = []
     for system in systems:
         own = [row for row in rows if row["system"] == system]
-        alone = [row for row in own if row.get("false_starts") is not None]
+        alone = [row for row in own if "false_starts" in row]
         if alone:
             starts, hours = [row["false_starts"] for row in alone], sum(row["seconds"] for row in alone) / 3600
             counts = f"{sum(starts)} ({', '.join(map(str, starts))}), {sum(starts) / hours:.0f} an hour"
@@ -160,7 +161,19 @@ def _barge_in(rows: list[dict], systems: Sequence[str]) -> list[str]:
         "never",
     ]
     said = "Delay from the human's first sound, with and without fan; already on and never count as infinitely late."
-    return ["## Barge-in", "", said, "", *table(columns, body), ""]
+    return ["## Barge-in", "", said, "", *table(columns, body), "", *_curves(rows, systems)]
+
+
+def _curves(rows: list[dict], systems: Sequence[str]) -> list[str]:
+    """Each judging system's probability alone as the rule."""
+    points = [
+        (system, point) for system in systems for point in curve([row for row in rows if row["system"] == system])
+    ]
+    if not points:
+        return []
+    body = [[system, at["threshold"], f"{at['false_an_hour']:.0f}", percent(at["in_time"])] for system, at in points]
+    said = f"Begun once the probability alone is at a threshold for {SURE_HOPS} hops; noticed as in the first table."
+    return [said, "", *table(["system", "threshold", "false starts an hour", f"noticed in {IN_TIME_S} s, %"], body), ""]
 
 
 def _notices(rows: list[dict]) -> list[str]:
@@ -172,32 +185,50 @@ def _notices(rows: list[dict]) -> list[str]:
 
 
 def picture(rows: list[dict], systems: Sequence[str], output: Path) -> None:
-    """OUTPUT.png: ERLE over the time since the stream began, and SI-SDR by the human's level against the echo."""
+    """OUTPUT.png: ERLE over time; SI-SDR by the human's level against the echo; false starts against humans noticed."""
     import matplotlib
 
     matplotlib.use("Agg")
     from matplotlib import pyplot
 
-    canvas, (left, right) = pyplot.subplots(1, 2, figsize=(11, 4.2), layout="constrained")
+    canvas, panels = pyplot.subplots(1, 3, figsize=(15, 4.2), layout="constrained")
     for colour, system in zip(LINES * (1 + len(systems) // len(LINES)), systems, strict=False):
-        own = [row for row in rows if row["system"] == system]
-        erles = [row["erle_db"] for row in own if row["part"] == "alone"]
-        if erles:
-            left.plot(_by_second(erles), color=colour, label=system, linewidth=1.2)
-        laid = [row for row in own if row["part"] == "laid" and row["before"] >= WARM_S and not row["fan"]]
-        sers = sorted({row["ser"] for row in laid})
-        if sers:
-            ratios = [mean(row["si_sdr"] for row in laid if row["ser"] == ser) for ser in sers]
-            right.plot(sers, ratios, "o-", color=colour, label=system)
+        _draw(panels, [row for row in rows if row["system"] == system], {"color": colour, "label": system})
+    left, middle, right = panels
     left.set(xlabel="seconds since the stream began", ylabel="ERLE, dB", title="The robot alone (mean over recordings)")
     title = f"Humans laid on it after {WARM_S:.0f} s or more, no fan"
-    right.set(xlabel="human over echo, dB", ylabel="SI-SDR, dB", title=title)
-    for axes in (left, right):
+    middle.set(xlabel="human over echo, dB", ylabel="SI-SDR, dB", title=title)
+    title = "Barge-in: by threshold of the probability; x: as shipped"
+    right.set(
+        xlabel="false starts an hour",
+        ylabel=f"noticed in {IN_TIME_S} s at {LOW_SER:.0f} dB",
+        title=title,
+        ylim=(-0.03, 1.03),
+    )
+    for axes in panels:
         axes.grid(alpha=0.3)
         if axes.get_legend_handles_labels()[0]:
             axes.legend(fontsize=8)
     canvas.savefig(output.parent / f"{output.name}.png", dpi=110)
     pyplot.close(canvas)
+
+
+def _draw(panels: Sequence, rows: list[dict], style: Mapping[str, str]) -> None:
+    """One system in all three panels, where it was measured."""
+    erles = [row["erle_db"] for row in rows if row["part"] == "alone"]
+    if erles:
+        panels[0].plot(_by_second(erles), linewidth=1.2, **style)
+    laid = [row for row in rows if row["part"] == "laid" and row["before"] >= WARM_S and not row["fan"]]
+    sers = sorted({row["ser"] for row in laid})
+    if sers:
+        ratios = [mean(row["si_sdr"] for row in laid if row["ser"] == ser) for ser in sers]
+        panels[1].plot(sers, ratios, "o-", **style)
+    points, of = curve(rows), summarise(rows)
+    if points:
+        panels[2].plot([at["false_an_hour"] for at in points], [at["in_time"] for at in points], ".-", **style)
+        panels[2].plot(
+            3600 * of["false_starts"] / of["alone_s"], of["in_time"], "x", color=style["color"], markersize=10
+        )
 
 
 def _by_second(erles: list[list[float | None]]) -> list[float]:

@@ -8,12 +8,12 @@ from pathlib import Path
 
 import numpy as np
 
-from bench.measure.alone import FRAME, frame_power
+from bench.measure.real_barge_in import THRESHOLDS, first_sound, in_time, noticed, replay, starts
 from bench.measure.real_streams import ECHO_ONLY, Laid, Recording, Signals
 from bench.measure.real_systems import Absent, Heard, listen
 from bench.measure.recogniser import Recogniser, word_errors
 from edgefilter.dsp.metrics import erle, si_sdr
-from edgefilter.types import SAMPLE_RATE, Event, Samples
+from edgefilter.types import SAMPLE_RATE, Samples
 
 TALK_TYPES = {"doubletalk": "dt", "farend": "st", "nearend": "nst"}
 """AECMOS's names for who talks, by the recordings' own."""
@@ -23,7 +23,7 @@ of a nonlinear filter's output is echo."""
 WINDOW_S, STEP_S = 1.0, 0.1
 """The output may not be louder than the microphone over any such window."""
 LOUD_DB = 25.0
-"""A second counts as the robot's talking, and a frame as the human's first sound, within so much of the loudest."""
+"""A second counts as the robot's talking within so much of the loudest."""
 FLOOR = 1e-10
 """-100 dB of full scale, added to powers: below it no difference is heard, and digital silence has no ratio."""
 
@@ -51,8 +51,8 @@ def score(system: str, stream: Recording | Laid, recognition: Recognition | None
     if isinstance(stream, Laid):
         return row | _laid(stream, signals, heard, recognition)
     if stream.kind == ECHO_ONLY:
-        starts = None if heard.events is None else sum(event.kind == "speech_started" for event in heard.events)
-        return row | {"part": "alone", "erle_db": erle_by_second(signals.mic, heard.out), "false_starts": starts}
+        row |= {"part": "alone", "erle_db": erle_by_second(signals.mic, heard.out)}
+        return row if heard.events is None else row | _false_starts(heard)
     return row | {"part": "pairs", "kind": stream.kind, **_pair(stream.kind, signals, heard.out)}
 
 
@@ -69,11 +69,18 @@ def _laid(stream: Laid, signals: Signals, heard: Heard, recognition: Recognition
     row |= {"si_sdr": si_sdr(out, human), "si_sdr_mic": si_sdr(mic, human), "level_db": level_db(out, mic)}
     row["erle_db"] = erle(signals.mic[alone], heard.out[alone]) if stream.before else None
     if heard.events is not None:
-        row |= noticed(heard.events, first_sound(signals.human))
+        onset = first_sound(signals.human)
+        curve = [in_time(noticed(replay(heard.probability, heard.hop, at), onset)) for at in THRESHOLDS]
+        row |= {**noticed(heard.events, onset), "curve": curve}
     if recognition:
-        text = _recogniser(recognition).transcribe(out)
-        row |= {"wer_capped": word_errors(stream.text, text).capped, "heard": text}
+        row["wer_capped"] = word_errors(stream.text, _recogniser(recognition).transcribe(out)).capped
     return row
+
+
+def _false_starts(heard: Heard) -> dict:
+    """Nobody speaks: every beginning is false, of the events and at each of THRESHOLDS."""
+    curve = [starts(replay(heard.probability, heard.hop, at)) for at in THRESHOLDS]
+    return {"false_starts": starts(heard.events), "curve": curve}
 
 
 def _pair(kind: str, signals: Signals, out: Samples) -> dict:
@@ -137,21 +144,3 @@ def erle_by_second(mic: Samples, out: Samples) -> list[float | None]:
         float(10 * np.log10((b + FLOOR) / (a + FLOOR))) if loud else None
         for b, a, loud in zip(before, after, talks, strict=True)
     ]
-
-
-def first_sound(human: Samples) -> int:
-    """First sample of the first 20 ms within LOUD_DB of the human's loudest."""
-    power = frame_power(human)
-    return int(np.flatnonzero(power > 10 ** (-LOUD_DB / 10) * power.max())[0]) * FRAME
-
-
-def noticed(events: list[Event], onset: int) -> dict:
-    """delay_s from the onset to the first speech_started after it, None if there is none.
-
-    early: speech was on already, so nothing is noticed.
-    """
-    talk = [event for event in events if event.kind.startswith("speech")]
-    before = [event.kind for event in talk if event.sample < onset]
-    after = [event.sample for event in talk if event.sample >= onset and event.kind == "speech_started"]
-    early = bool(before) and before[-1] == "speech_started"
-    return {"delay_s": None if early or not after else (after[0] - onset) / SAMPLE_RATE, "early": early}

@@ -6,8 +6,8 @@ from collections.abc import Iterable
 
 import numpy as np
 
-IN_TIME_S = 0.3
-"""Somebody who interrupts is to be noticed by then."""
+from bench.measure.real_barge_in import THRESHOLDS, in_time
+
 LOW_SER, WARM_S = -20.0, 5.0
 """The summary's cases: human at most at this level against the echo, after at least so many seconds of robot alone."""
 
@@ -29,12 +29,13 @@ def summarise(rows: list[dict]) -> dict:
         "wer_capped": mean(row.get("wer_capped") for row in hard),
         "excess_db": max((row["excess_db"] for row in rows), default=None),
         "in_time": mean(in_time(row) for row in laid if row["ser"] == LOW_SER and "early" in row),
+        "curve": curve(rows),
         **_alone([row for row in rows if row["part"] == "alone"]),
     }
 
 
 def _alone(rows: list[dict]) -> dict:
-    erles, starts = seconds(rows), [row["false_starts"] for row in rows if row["false_starts"] is not None]
+    erles, starts = seconds(rows), [row["false_starts"] for row in rows if "false_starts" in row]
     return {
         "erle_median": float(np.median(erles)) if erles else None,
         "erle_p10": float(np.quantile(erles, 0.1)) if erles else None,
@@ -54,6 +55,14 @@ def seconds(alone: list[dict]) -> list[float]:
     return [value for row in alone for value in row["erle_db"] if value is not None]
 
 
-def in_time(row: dict) -> float:
-    """1 where a laid human was noticed within IN_TIME_S, 0 where not."""
-    return float(row["delay_s"] is not None and row["delay_s"] <= IN_TIME_S)
+def curve(rows: list[dict]) -> list[dict]:
+    """One system's probability as the rule: at each threshold false starts an hour, and the share noticed in time."""
+    alone = [row for row in rows if row["part"] == "alone" and "curve" in row]
+    laid = [row for row in rows if row["part"] == "laid" and "curve" in row]
+    asked = [row for row in laid if row["ser"] == LOW_SER and row["before"] >= WARM_S]
+    if not alone or not asked:
+        return []
+    hours = sum(row["seconds"] for row in alone) / 3600
+    false, share = (np.array([row["curve"] for row in part], np.float64) for part in (alone, asked))
+    points = zip(THRESHOLDS, false.sum(axis=0) / hours, share.mean(axis=0), strict=True)
+    return [{"threshold": at, "false_an_hour": float(f), "in_time": float(s)} for at, f, s in points]

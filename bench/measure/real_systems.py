@@ -34,10 +34,15 @@ class Absent(EdgefilterError):
 
 
 class Heard(NamedTuple):
-    """What a system made of a recording: out (n,), aligned with it; events, None where it does not judge who speaks."""
+    """What a system made of a recording: out (n,), aligned with it.
+
+    events, and the human's probability after each hop of so many samples; None where it does not judge who speaks.
+    """
 
     out: Samples
     events: list[Event] | None = None
+    probability: list[float] | None = None
+    hop: int = 0
 
 
 def listen(system: str, mic: Samples, ref: Samples) -> Heard:
@@ -60,8 +65,14 @@ def listen(system: str, mic: Samples, ref: Samples) -> Heard:
 def engine(name: str, mic: Samples, ref: Samples) -> Heard:
     """An engine of the package without a profile, as on its first run on somebody's robot."""
     ego = EgoFilter(engine=name)
-    out = np.concatenate((ego.process(mic, ref), ego.flush()))
-    return Heard(out, None if ego.speech_probability is None else ego.events())
+    parts, probability = [], []
+    for at in range(0, mic.size, ego.hop):
+        parts.append(ego.process(mic[at : at + ego.hop], ref[at : at + ego.hop]))
+        probability.append(ego.speech_probability)
+    out = np.concatenate((*parts, ego.flush()))
+    if ego.speech_probability is None:
+        return Heard(out)
+    return Heard(out, ego.events(), [value or 0.0 for value in probability], ego.hop)
 
 
 def code_version(system: str) -> str:

@@ -8,7 +8,8 @@ import pytest
 import soundfile as sf
 
 from bench.measure import real, real_scores, real_streams, real_systems
-from bench.measure.real_scores import erle_by_second, excess_db, first_sound, noticed
+from bench.measure.real_barge_in import THRESHOLDS, first_sound, in_time, noticed, replay
+from bench.measure.real_scores import erle_by_second, excess_db
 from bench.measure.real_streams import Cells, find_recordings, lay
 from bench.measure.real_summary import summarise
 from edgefilter import Event
@@ -32,7 +33,7 @@ def write_pair(folder, name, ref, mic):
 
 @pytest.fixture
 def recordings(tmp_path):
-    """Two recordings of the robot alone and one of each other kind; loopbacks a little shorter, as recorders leave them."""
+    """Two recordings of the robot alone, one of each other kind; loopbacks a little shorter, as in reality."""
     folder = tmp_path / "recordings"
     folder.mkdir()
     for index, name in enumerate(
@@ -207,10 +208,20 @@ def test_first_sound_skips_silence_and_breath():
 )
 def test_speech_that_was_on_already_is_not_noticed(kinds, expected):
     assert noticed([Event(kind, sample, "") for kind, sample in kinds], 16000) == expected
+    assert in_time(expected) == (expected["delay_s"] is not None)
+
+
+def test_the_rule_of_the_curve_begins_after_three_hops_and_ends_after_half_a_second():
+    hop = RATE // 10
+    probability = [0.9, 0.9, 0.2, 0.9, 0.9, 0.9, 0.6, 0.2, 0.2, 0.2, 0.2, 0.2, 0.9, 0.9]
+    events = [(event.kind, event.sample // hop) for event in replay(probability, hop, 0.8)]
+    assert events == [("speech_started", 6), ("speech_stopped", 12)]
+    assert replay(probability, hop, 0.95) == []
 
 
 def test_summary_takes_quiet_humans_after_a_while_without_fan():
     base = {"part": "laid", "fan": False, "si_sdr_mic": -23.0, "excess_db": -1.0, "delay_s": 0.1, "early": False}
+    base["curve"] = [1, 1, *[0] * (len(THRESHOLDS) - 2)]
     rows = [
         base | {"si_sdr": 4.0, "ser": -20.0, "before": 5.0, "wer_capped": 0.5},
         base | {"si_sdr": -24.0, "ser": -26.0, "before": 20.0, "wer_capped": 1.0},
@@ -220,13 +231,28 @@ def test_summary_takes_quiet_humans_after_a_while_without_fan():
     ]
     found = summarise(rows)
     assert (found["cases"], found["si_sdr"], found["si_sdr_std"], found["si_sdr_worst"]) == (2, -10.0, 14.0, -24.0)
+    assert found["curve"] == []  # nothing is known of false starts
+    alone = {
+        "part": "alone",
+        "seconds": 1800.0,
+        "excess_db": 0.0,
+        "erle_db": [3.0],
+        "false_starts": 2,
+        "curve": [4, *[0] * (len(THRESHOLDS) - 1)],
+    }
+    with_alone = summarise([*rows, alone])
+    assert with_alone["curve"][0] == {"threshold": 0.5, "false_an_hour": 8.0, "in_time": 1.0}
+    assert with_alone["curve"][2] == {"threshold": 0.9, "false_an_hour": 0.0, "in_time": 0.0}
     assert (found["below_microphone"], found["wer_capped"], found["in_time"], found["excess_db"]) == (1, 0.75, 0.5, 2.5)
 
 
 def test_engines_that_judge_who_speaks_report_events_and_others_none(recordings):
     made = find_recordings(recordings, "device1_*")[0].signals()
     assert real_systems.listen("linear", made.mic, made.ref).events is None
-    assert real_systems.listen("crnn", made.mic, made.ref).events is not None
+    judged = real_systems.listen("crnn", made.mic, made.ref)
+    assert judged.events is not None
+    assert len(judged.probability) == -(-made.mic.size // judged.hop)
+    assert max(judged.probability) > 0
 
 
 def broken(folder, case):
