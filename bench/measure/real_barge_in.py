@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from bench.measure.alone import FRAME, frame_power
+from bench.measure.levels import FRAME, frame_power
 from edgefilter.types import SAMPLE_RATE, Event, Samples
 
 IN_TIME_S = 0.3

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from bench.measure.picture import panels, save
 from bench.measure.real_barge_in import IN_TIME_S, SURE_HOPS, in_time
 from bench.measure.real_scores import ALONE_S, LOUD_DB
 from bench.measure.real_summary import LOW_SER, WARM_S, curve, mean, seconds, summarise
@@ -39,20 +40,23 @@ def percent(value: float | None) -> str:
 
 
 def _overview(summary: Mapping[str, dict]) -> list[str]:
-    columns = ["system", "AECMOS echo / human", "SI-SDR dB", "std", "worst", "below the microphone", "capped WER %"]
+    columns = [
+        "system",
+        "AECMOS echo / human",
+        "SI-SDR dB",
+        "std (at one level)",
+        "worst",
+        "below the microphone",
+        "capped WER %",
+    ]
     columns += ["ERLE dB median", "p10", "louder dB", "false starts", f"noticed in {IN_TIME_S} s, %"]
     body = []
     for system, of in summary.items():
         mos = f"{figure(of['echo_mos'], 2)} / {figure(of['human_mos'], 2)}" if of["echo_mos"] is not None else ""
         starts = "" if of["false_starts"] is None else f"{of['false_starts']} in {of['alone_s'] / 60:.0f} min"
         below = f"{of['below_microphone']} of {of['cases']}" if of["cases"] else ""
-        hard = [
-            figure(of["si_sdr"]),
-            figure(of["si_sdr_std"]),
-            figure(of["si_sdr_worst"]),
-            below,
-            percent(of["wer_capped"]),
-        ]
+        spread = f"{figure(of['si_sdr_std'])} ({figure(of['si_sdr_std_level'])})" if of["cases"] else ""
+        hard = [figure(of["si_sdr"]), spread, figure(of["si_sdr_worst"]), below, percent(of["wer_capped"])]
         alone = [figure(of["erle_median"]), figure(of["erle_p10"]), figure(of["excess_db"]), starts]
         body.append([system, mos, *hard, *alone, percent(of["in_time"])])
     notes = [
@@ -186,15 +190,10 @@ def _notices(rows: list[dict]) -> list[str]:
 
 def picture(rows: list[dict], systems: Sequence[str], output: Path) -> None:
     """OUTPUT.png: ERLE over time; SI-SDR by the human's level against the echo; false starts against humans noticed."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from matplotlib import pyplot
-
-    canvas, panels = pyplot.subplots(1, 3, figsize=(15, 4.2), layout="constrained")
+    drawing, axes = panels(1, 3, (15, 4.2))
     for colour, system in zip(LINES * (1 + len(systems) // len(LINES)), systems, strict=False):
-        _draw(panels, [row for row in rows if row["system"] == system], {"color": colour, "label": system})
-    left, middle, right = panels
+        _draw(axes, [row for row in rows if row["system"] == system], {"color": colour, "label": system})
+    left, middle, right = axes
     left.set(xlabel="seconds since the stream began", ylabel="ERLE, dB", title="The robot alone (mean over recordings)")
     title = f"Humans laid on it after {WARM_S:.0f} s or more, no fan"
     middle.set(xlabel="human over echo, dB", ylabel="SI-SDR, dB", title=title)
@@ -205,30 +204,28 @@ def picture(rows: list[dict], systems: Sequence[str], output: Path) -> None:
         title=title,
         ylim=(-0.03, 1.03),
     )
-    for axes in panels:
-        axes.grid(alpha=0.3)
-        if axes.get_legend_handles_labels()[0]:
-            axes.legend(fontsize=8)
-    canvas.savefig(output.parent / f"{output.name}.png", dpi=110)
-    pyplot.close(canvas)
+    for panel in axes:
+        panel.grid(alpha=0.3)
+        if panel.get_legend_handles_labels()[0]:
+            panel.legend(fontsize=8)
+    save(drawing, output, dpi=110)
 
 
-def _draw(panels: Sequence, rows: list[dict], style: Mapping[str, str]) -> None:
+def _draw(axes: Sequence, rows: list[dict], style: Mapping[str, str]) -> None:
     """One system in all three panels, where it was measured."""
     erles = [row["erle_db"] for row in rows if row["part"] == "alone"]
     if erles:
-        panels[0].plot(_by_second(erles), linewidth=1.2, **style)
+        axes[0].plot(_by_second(erles), linewidth=1.2, **style)
     laid = [row for row in rows if row["part"] == "laid" and row["before"] >= WARM_S and not row["fan"]]
     sers = sorted({row["ser"] for row in laid})
     if sers:
         ratios = [mean(row["si_sdr"] for row in laid if row["ser"] == ser) for ser in sers]
-        panels[1].plot(sers, ratios, "o-", **style)
+        axes[1].plot(sers, ratios, "o-", **style)
     points, of = curve(rows), summarise(rows)
     if points:
-        panels[2].plot([at["false_an_hour"] for at in points], [at["in_time"] for at in points], ".-", **style)
-        panels[2].plot(
-            3600 * of["false_starts"] / of["alone_s"], of["in_time"], "x", color=style["color"], markersize=10
-        )
+        axes[2].plot([at["false_an_hour"] for at in points], [at["in_time"] for at in points], ".-", **style)
+        shipped = 3600 * of["false_starts"] / of["alone_s"]
+        axes[2].plot(shipped, of["in_time"], "x", color=style["color"], markersize=10)
 
 
 def _by_second(erles: list[list[float | None]]) -> list[float]:

@@ -24,6 +24,7 @@ def summarise(rows: list[dict]) -> dict:
         "cases": len(hard),
         "si_sdr": mean(ratios),
         "si_sdr_std": float(np.std(ratios)) if ratios else None,
+        "si_sdr_std_level": spread_at_one_level(hard),
         "si_sdr_worst": min(ratios, default=None),
         "below_microphone": sum(row["si_sdr"] < row["si_sdr_mic"] for row in hard),
         "wer_capped": mean(row.get("wer_capped") for row in hard),
@@ -42,6 +43,13 @@ def _alone(rows: list[dict]) -> dict:
         "false_starts": sum(starts) if starts else None,
         "alone_s": sum(row["seconds"] for row in rows),
     }
+
+
+def spread_at_one_level(rows: list[dict]) -> float | None:
+    """Standard deviation of the SI-SDR about the mean of its own level of the human, dB; None without rows."""
+    levels = [[row["si_sdr"] for row in rows if row["ser"] == ser] for ser in {row["ser"] for row in rows}]
+    squares = sum(len(ratios) * np.var(ratios) for ratios in levels)
+    return float(np.sqrt(squares / len(rows))) if rows else None
 
 
 def mean(values: Iterable[float | None]) -> float | None:

@@ -224,13 +224,16 @@ def test_summary_takes_quiet_humans_after_a_while_without_fan():
     base["curve"] = [1, 1, *[0] * (len(THRESHOLDS) - 2)]
     rows = [
         base | {"si_sdr": 4.0, "ser": -20.0, "before": 5.0, "wer_capped": 0.5},
-        base | {"si_sdr": -24.0, "ser": -26.0, "before": 20.0, "wer_capped": 1.0},
+        base | {"si_sdr": 0.0, "ser": -20.0, "before": 20.0, "wer_capped": 0.0},
+        base | {"si_sdr": -25.0, "ser": -26.0, "before": 20.0, "wer_capped": 1.0},
         base | {"si_sdr": 99.0, "ser": -20.0, "before": 5.0, "fan": True, "delay_s": 0.5},
         base | {"si_sdr": 99.0, "ser": -10.0, "before": 5.0, "excess_db": 2.5},
         base | {"si_sdr": 99.0, "ser": -20.0, "before": 0.0},
     ]
     found = summarise(rows)
-    assert (found["cases"], found["si_sdr"], found["si_sdr_std"], found["si_sdr_worst"]) == (2, -10.0, 14.0, -24.0)
+    assert (found["cases"], found["si_sdr"], found["si_sdr_worst"]) == (3, -7.0, -25.0)
+    assert found["si_sdr_std"] == pytest.approx(np.std([4, 0, -25]))
+    assert found["si_sdr_std_level"] == pytest.approx(np.sqrt((4 + 4 + 0) / 3))
     assert found["curve"] == []  # nothing is known of false starts
     alone = {
         "part": "alone",
@@ -243,7 +246,12 @@ def test_summary_takes_quiet_humans_after_a_while_without_fan():
     with_alone = summarise([*rows, alone])
     assert with_alone["curve"][0] == {"threshold": 0.5, "false_an_hour": 8.0, "in_time": 1.0}
     assert with_alone["curve"][2] == {"threshold": 0.9, "false_an_hour": 0.0, "in_time": 0.0}
-    assert (found["below_microphone"], found["wer_capped"], found["in_time"], found["excess_db"]) == (1, 0.75, 0.5, 2.5)
+    assert (found["below_microphone"], found["wer_capped"], found["in_time"], found["excess_db"]) == (
+        1,
+        0.5,
+        2 / 3,
+        2.5,
+    )
 
 
 def test_engines_that_judge_who_speaks_report_events_and_others_none(recordings):
