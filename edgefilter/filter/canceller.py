@@ -134,11 +134,10 @@ class Canceller:
         self.volume = Volume(hop, self._warm)
         self._limiter = EchoLimiter(hop)
 
-    def step(self, mic: Samples, reference: Samples, trusted: bool = True) -> CancellerOutput:
+    def step(self, mic: Samples, reference: Samples, located: bool = True) -> CancellerOutput:
         """Cancel one hop: mic, reference (hop,) float32, neither written to.
 
-        trusted: whether the reference is known to be where the microphone hears it; an echo that is not there is otherwise put
-        down to the lag, and the path left alone.
+        located: whether the reference is known to lie where the microphone hears it; the path is adapted only then.
         """
         self._push(reference)
         np.multiply(self._covariance, self._powers, out=self._expected)
@@ -157,7 +156,7 @@ class Canceller:
         self._noise *= memory
         self._noise += (1.0 - memory) * _power(error_spectrum)
         self._hops += 1
-        if reference.dot(reference) > SILENCE * self.hop and self._limiter.may_adapt(trusted):
+        if located and reference.dot(reference) > SILENCE * self.hop and self._limiter.may_adapt():
             self._active += 1
             if self._limiter.changed:
                 np.maximum(self._covariance, REOPEN * _power(self._weights), out=self._covariance)

@@ -46,13 +46,13 @@ class EchoLimiter:
         self._excessive = left > EXCESS * heard
         return limited
 
-    def may_adapt(self, trusted: bool) -> bool:
-        """Whether the path may be adapted by this hop's error. trusted: the lag is known."""
+    def may_adapt(self) -> bool:
+        """Whether the path may be adapted by this hop's error, the lag being known."""
         self.changed = False
         if not self._excessive:
             self._waited = max(self._waited - 1, 0)
             return True
-        self._waited += trusted
+        self._waited += 1
         if self._waited < self._patience:
             return False
         self.changed, self._waited = True, 0

@@ -11,7 +11,7 @@ from edgefilter.dsp.stft import Analyser, StftConfig
 from edgefilter.echo.source_chain import Driver
 from edgefilter.engines.base import ClipEngine, Engine
 from edgefilter.filter.canceller import Canceller, CancellerOutput
-from edgefilter.filter.onset_gate import OnsetGate
+from edgefilter.filter.onset_gate import GATE, OnsetGate
 from edgefilter.filter.residual_echo import Residual
 from edgefilter.profile.data import Profile
 from edgefilter.types import Frame, Samples
@@ -60,8 +60,13 @@ class Front:
         if not self.canceller:
             x, r = self._analyser.push(mic, reference)
             return Frame(x, r, self._silence, x, self._fan, self._nothing), aligned
-        mic, linear = self._subtract(mic, ref, aligned)
-        spectra = self._analyser.push(mic, reference, linear.echo, linear.error)
+        linear = self._subtract(mic, aligned)
+        signals = np.stack((mic, reference, linear.echo, linear.error))
+        if self.gate and (gain := self.gate.step(mic, ref, aligned)) is not None:
+            signals[[0, 2, 3]] *= gain
+            if self.gate.shuts:
+                self._analyser.scale_past(GATE)
+        spectra = self._analyser.push(*signals)
         if self._low_cut is not None:
             spectra *= self._low_cut
         x, r, e, error = spectra
@@ -74,15 +79,13 @@ class Front:
         The kind "full" alone has them.
         """
         aligned = self.aligner.step(mic, ref)
-        return aligned.reference, self._subtract(mic, ref, aligned)[1].error
+        return aligned.reference, self._subtract(mic, aligned).error
 
-    def _subtract(self, mic: Samples, ref: Samples, aligned: Aligned) -> tuple[Samples, CancellerOutput]:
-        """The microphone behind the gate, and the linear stage's hop."""
-        if self.gate:
-            mic = self.gate.step(mic, ref, aligned)
+    def _subtract(self, mic: Samples, aligned: Aligned) -> CancellerOutput:
+        """The linear stage's hop."""
         if aligned.realigned:
             self.canceller.rewrite_reference(self._drive.rewritten(self.aligner.history(self.canceller.history), self.hop))
-        return mic, self.canceller.step(mic, self._drive(aligned.reference), aligned.state != "searching")
+        return self.canceller.step(mic, self._drive(aligned.reference), aligned.state != "searching")
 
 
 def low_cut(stft: StftConfig) -> Samples:
