@@ -1,10 +1,9 @@
-"""Chooses alpha and beta of the paper's spectral subtraction on validation conversations (never on test ones).
+"""Chooses alpha of the paper's spectral subtraction on validation conversations (never on test ones).
 
-    python bench/tune_paper_ss.py --conversations DIR --whisper DIR --output bench/results/tune_paper_ss.json
+    python -m bench.measure.tune_paper_ss --conversations DIR --whisper DIR --output bench/results/tune_paper_ss.json
 
-Eq. (6) and (7) leave the over-subtraction factor alpha and the amplification beta open. Prints word errors and SI-SDR per alpha.
-beta scales the output alone: SI-SDR ignores it, and so does a recogniser that is given a normalised level; it is therefore
-the largest of 1, 2, 4, 8 that clips no validation conversation.
+Eq. (6) leaves the over-subtraction factor alpha open. Prints word errors and SI-SDR per alpha. beta of eq. (7) scales the output
+alone: SI-SDR ignores it, and so does a recogniser that is given a normalised level.
 """
 
 from __future__ import annotations
@@ -23,7 +22,6 @@ from edgefilter.engines.paper_ss import PAPER_STFT, PaperSpectralSubtraction
 from edgefilter.filter.stream import Stream
 
 ALPHAS = (0.25, 0.5, 1.0, 2.0, 4.0, 8.0)
-BETAS = (8.0, 4.0, 2.0, 1.0)
 
 
 def main() -> None:
@@ -44,7 +42,7 @@ def main() -> None:
             stream = Stream(PaperSpectralSubtraction(profile.response_bins(PAPER_STFT), alpha=alpha), profile)
             out = np.concatenate((stream.process(mic, ref), stream.flush()))
             found = word_errors(meta["text"], recogniser.transcribe(out[span]))
-            rows[alpha].append((meta["room"], si_sdr(out[span], clean[span]), found, float(np.abs(out).max())))
+            rows[alpha].append((meta["room"], si_sdr(out[span], clean[span]), found))
     table = []
     for alpha, results in rows.items():
         for room in sorted({r[0] for r in results}):
@@ -54,10 +52,8 @@ def main() -> None:
             print(table[-1])
     mean = {alpha: np.mean([row["capped_wer"] for row in table if row["alpha"] == alpha]) for alpha in ALPHAS}
     best = min(mean, key=mean.get)
-    peak = max(r[3] for r in rows[best])
-    beta = next((b for b in BETAS if b * peak < 1.0), 1.0)
-    print(f"alpha {best}, beta {beta} (peak {peak:.2f})")
-    args.output.write_text(json.dumps({"alpha": best, "beta": beta, "rows": table}, indent=1) + "\n")
+    print(f"alpha {best}")
+    args.output.write_text(json.dumps({"alpha": best, "rows": table}, indent=1) + "\n")
 
 
 if __name__ == "__main__":

@@ -2,21 +2,23 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from edgefilter.types import SAMPLE_RATE, Samples
 
 MEMORY = 0.8
 """Weight of the past in the smoothed powers per hop of 16 ms; about 80 ms."""
-GROSS = 2.0
-"""Power of a single hop's error over the microphone's, from which on it is limited whatever the smoothed powers say."""
+PART = 64
+"""Samples, 4 ms, of a hop that are looked at by themselves: a loudspeaker can be cut off in mid-word."""
+GROSS = 4.0
+"""Power of such a part's error over the microphone's, from which on it is limited whatever the smoothed powers say: human and robot
+cancel one another in the microphone by so much in hardly any part."""
 EXCESS = 1.5
 """Smoothed error power over smoothed microphone power from which on the path is not adapted: the echo is not there."""
 PATIENCE_S = 0.5
 """Seconds of robot after which an echo that is too loud, the lag being known, is put down to the path."""
-RAMP = 64
-"""Samples, 4 ms, over which the weight changes."""
-
 
 class EchoLimiter:
     """Weighs the echo by gamma = <mic, echo> / <echo, echo>, in 0 to 1, while subtracting all of it would add power.
@@ -25,26 +27,32 @@ class EchoLimiter:
     """
 
     def __init__(self, hop: int) -> None:
+        self._part = math.gcd(hop, PART)
+        self._ramp = (np.arange(self._part, dtype=np.float32) + 1.0) / self._part
         self._patience = round(PATIENCE_S * SAMPLE_RATE / hop)
-        self._ramp = (np.arange(min(RAMP, hop), dtype=np.float32) + 1.0) / min(RAMP, hop)
-        self._heard = self._cross = self._expected = 0.0
-        self._weight = self._before = 1.0
+        self._smoothed = 0.0, 0.0, 0.0
+        self._weights = np.ones(hop // self._part + 1, np.float32)
         self._excessive, self._waited = False, 0
         self.changed = False
 
     def measure(self, mic: Samples, echo: Samples) -> bool:
-        """Take in a hop (hop,) of both; whether the echo is too loud."""
-        heard, cross, expected = float(mic.dot(mic)), float(mic.dot(echo)), float(echo.dot(echo))
-        self._heard += (1.0 - MEMORY) * (heard - self._heard)
-        self._cross += (1.0 - MEMORY) * (cross - self._cross)
-        self._expected += (1.0 - MEMORY) * (expected - self._expected)
+        """Take in a hop (hop,) of both; whether any of the echo is too loud."""
+        now = float(mic.dot(mic)), float(mic.dot(echo)), float(echo.dot(echo))
+        self._smoothed = tuple(MEMORY * before + (1.0 - MEMORY) * fresh for before, fresh in zip(self._smoothed, now))
+        heard, cross, expected = now
         left = heard - 2.0 * cross + expected
-        smoothed = self._heard - 2.0 * self._cross + self._expected
-        limited = left > heard and (smoothed > self._heard or left > GROSS * heard)
-        self._before = self._weight
-        self._weight = min(max(cross / expected, 0.0), 1.0) if limited else 1.0
         self._excessive = left > EXCESS * heard
-        return limited
+        self._weights[0] = self._weights[-1]
+        self._weights[1:] = 1.0
+        if left > heard and self._smoothed[2] > 2.0 * self._smoothed[1]:
+            self._weights[1:] = min(max(cross / expected, 0.0), 1.0)
+        m, e = mic.reshape(-1, self._part), echo.reshape(-1, self._part)
+        heard, cross, expected = (np.einsum("ij,ij->i", a, b) for a, b in ((m, m), (m, e), (e, e)))
+        gross = heard - 2.0 * cross + expected > GROSS * heard
+        if gross.any():
+            weights = np.clip(cross[gross] / expected[gross], 0.0, 1.0)
+            self._weights[1:][gross] = np.minimum(self._weights[1:][gross], weights)
+        return bool(self._weights.min() < 1.0)
 
     def may_adapt(self) -> bool:
         """Whether the path may be adapted by this hop's error, the lag being known."""
@@ -59,10 +67,10 @@ class EchoLimiter:
         return True
 
     def apply(self, echo: Samples) -> Samples:
-        """The echo (hop,) with its weight."""
-        if self._before == self._weight == 1.0:
+        """The echo (hop,) with its weight, which falls at once and rises over a part."""
+        if self._weights.min() == 1.0:
             return echo
-        out = self._weight * echo
-        ramp = self._ramp
-        out[: ramp.size] = (self._before + (self._weight - self._before) * ramp) * echo[: ramp.size]
-        return out
+        target = self._weights[1:]
+        start = np.minimum(self._weights[:-1], target)
+        gain = start[:, None] + (target - start)[:, None] * self._ramp
+        return gain.reshape(-1) * echo
