@@ -156,7 +156,8 @@ class Canceller:
         self._noise *= memory
         self._noise += (1.0 - memory) * _power(error_spectrum)
         self._hops += 1
-        if located and reference.dot(reference) > SILENCE * self.hop and self._limiter.may_adapt():
+        heard = located and reference.dot(reference) > SILENCE * self.hop
+        if heard and not self.volume.suspected and self._limiter.may_adapt():
             self._active += 1
             if self._limiter.changed:
                 np.maximum(self._covariance, REOPEN * _power(self._weights), out=self._covariance)

@@ -15,6 +15,8 @@ PART = 64
 GROSS = 4.0
 """Power of such a part's error over the microphone's, from which on it is limited whatever the smoothed powers say: human and robot
 cancel one another in the microphone by so much in hardly any part."""
+ABSENT = 0.1
+"""Weight below which the echo is not there at all: so much of a correlation is chance."""
 EXCESS = 1.5
 """Smoothed error power over smoothed microphone power from which on the path is not adapted: the echo is not there."""
 PATIENCE_S = 0.5
@@ -45,13 +47,12 @@ class EchoLimiter:
         self._weights[0] = self._weights[-1]
         self._weights[1:] = 1.0
         if left > heard and self._smoothed[2] > 2.0 * self._smoothed[1]:
-            self._weights[1:] = min(max(cross / expected, 0.0), 1.0)
+            self._weights[1:] = _weight(cross / expected)
         m, e = mic.reshape(-1, self._part), echo.reshape(-1, self._part)
         heard, cross, expected = (np.einsum("ij,ij->i", a, b) for a, b in ((m, m), (m, e), (e, e)))
         gross = heard - 2.0 * cross + expected > GROSS * heard
         if gross.any():
-            weights = np.clip(cross[gross] / expected[gross], 0.0, 1.0)
-            self._weights[1:][gross] = np.minimum(self._weights[1:][gross], weights)
+            self._weights[1:][gross] = np.minimum(self._weights[1:][gross], _weight(cross[gross] / expected[gross]))
         return bool(self._weights.min() < 1.0)
 
     def may_adapt(self) -> bool:
@@ -74,3 +75,8 @@ class EchoLimiter:
         start = np.minimum(self._weights[:-1], target)
         gain = start[:, None] + (target - start)[:, None] * self._ramp
         return gain.reshape(-1) * echo
+
+
+def _weight(part: float | np.ndarray) -> np.ndarray:
+    """The echo's weight where so much of it is heard."""
+    return np.where(part < ABSENT, 0.0, np.minimum(part, 1.0))
