@@ -1,10 +1,9 @@
-"""Chooses alpha and beta of the paper's spectral subtraction on validation conversations (never on test ones).
+"""Chooses alpha of the paper's spectral subtraction on validation conversations (never on test ones).
 
     python -m bench.measure.tune_paper_ss --conversations DIR --whisper WHISPER --output bench/results/tune_paper_ss
 
-Eq. (6) and (7) leave the over-subtraction factor alpha and the amplification beta open. Writes word errors and SI-SDR
-per alpha, OUTPUT.json and OUTPUT.md. beta scales the output alone: SI-SDR ignores it, and so does a recogniser that is
-given a normalised level; it is therefore the largest of 1, 2, 4, 8 that clips no validation conversation.
+Eq. (6) leaves the over-subtraction factor alpha open. Writes word errors and SI-SDR per alpha, OUTPUT.json and OUTPUT.md.
+beta of eq. (7) scales the output alone: SI-SDR ignores it, and so does a recogniser that is given a normalised level.
 """
 
 from __future__ import annotations
@@ -24,15 +23,14 @@ from edgefilter.errors import EdgefilterError
 from edgefilter.filter.stream import Stream
 
 ALPHAS = (0.25, 0.5, 1.0, 2.0, 4.0, 8.0)
-BETAS = (8.0, 4.0, 2.0, 1.0)
 
 
-def score(talk: Conversation, alpha: float, recogniser: Recogniser) -> tuple[str, float, WordErrors, float]:
-    """Room, SI-SDR in dB, word errors, peak of the output."""
+def score(talk: Conversation, alpha: float, recogniser: Recogniser) -> tuple[str, float, WordErrors]:
+    """Room, SI-SDR in dB, word errors."""
     stream = Stream(PaperSpectralSubtraction(talk.profile.response_bins(PAPER_STFT), alpha=alpha), talk.profile)
     out = np.concatenate((stream.process(talk.read("mic"), talk.read("ref")), stream.flush()))
     found = word_errors(talk.meta["text"], recogniser.transcribe(out[talk.span]))
-    return talk.meta["room"], si_sdr(out[talk.span], talk.read("clean")[talk.span]), found, float(np.abs(out).max())
+    return talk.meta["room"], si_sdr(out[talk.span], talk.read("clean")[talk.span]), found
 
 
 def by_room(results: dict[float, list[tuple]]) -> list[dict]:
@@ -41,20 +39,18 @@ def by_room(results: dict[float, list[tuple]]) -> list[dict]:
     for alpha, found in results.items():
         for room in sorted({result[0] for result in found}):
             of = [result for result in found if result[0] == room]
-            wer = sum(errors.capped * errors.words for _, _, errors, _ in of) / sum(
-                errors.words for _, _, errors, _ in of
+            wer = sum(errors.capped * errors.words for _, _, errors in of) / sum(
+                errors.words for _, _, errors in of
             )
             mean = float(np.mean([result[1] for result in of]))
             rows.append({"alpha": alpha, "room": room, "capped_wer": wer, "si_sdr_db": mean, "conversations": len(of)})
     return rows
 
 
-def choose(results: dict[float, list[tuple]], rows: list[dict]) -> tuple[float, float, float]:
-    """Alpha with the fewest word errors, mean over rooms; beta; the peak without beta."""
-    mean = {alpha: np.mean([row["capped_wer"] for row in rows if row["alpha"] == alpha]) for alpha in results}
-    best = min(mean, key=mean.get)
-    peak = max(result[3] for result in results[best])
-    return best, next((beta for beta in BETAS if beta * peak < 1.0), 1.0), peak
+def choose(rows: list[dict]) -> float:
+    """Alpha with the fewest word errors, mean over rooms."""
+    mean = {alpha: np.mean([row["capped_wer"] for row in rows if row["alpha"] == alpha]) for alpha in ALPHAS}
+    return min(mean, key=mean.get)
 
 
 def main() -> int:
@@ -76,17 +72,17 @@ def main() -> int:
         print(f"tune_paper_ss: {error}", file=sys.stderr)
         return 1
     rows = by_room(results)
-    best, beta, peak = choose(results, rows)
+    best = choose(rows)
     cells = [
         [f"{row['alpha']:g}", row["room"], f"{100 * row['capped_wer']:.0f}", f"{row['si_sdr_db']:.1f}"] for row in rows
     ]
     page = [
-        f"alpha {best:g}, beta {beta:g} (peak {peak:.2f}).",
+        f"alpha {best:g}.",
         "",
         *results_writer.table(["alpha", "room", "capped WER %", "SI-SDR dB"], cells),
     ]
-    content = {"alpha": best, "beta": beta, "rows": rows}
-    print(results_writer.write(args.output, made_with, "alpha and beta of paper-ss", "\n".join(page), content))
+    content = {"alpha": best, "rows": rows}
+    print(results_writer.write(args.output, made_with, "alpha of paper-ss", "\n".join(page), content))
     return 0
 
 

@@ -144,7 +144,7 @@ class EgoFilter:
             names = ", ".join(engines.HAVE_LINEAR_STAGE)
             raise SignalError(f"nothing to write back: give a profile and an engine with a linear stage ({names})")
         canceller = self._stream.front.canceller
-        echo = self.profile.echo.with_running_response(canceller.impulse_response(), canceller.gain)
+        echo = self.profile.echo.with_running_response(canceller.impulse_response(), canceller.volume.gain)
         return self.profile.with_echo(replace(echo, impulse_response=echo.impulse_response[:MAX_TAPS]))
 
 

@@ -7,17 +7,20 @@ import numpy as np
 from edgefilter.alignment.aligner import Aligner
 from edgefilter.alignment.delay_line import Aligned
 from edgefilter.alignment.paper import PaperAligner
-from edgefilter.dsp.stft import Analyser
+from edgefilter.dsp.stft import Analyser, StftConfig
 from edgefilter.echo.source_chain import Driver
 from edgefilter.engines.base import ClipEngine, Engine
 from edgefilter.filter.canceller import Canceller, CancellerOutput
-from edgefilter.filter.onset_gate import OnsetGate
+from edgefilter.filter.onset_gate import GATE, OnsetGate
 from edgefilter.filter.residual_echo import Residual
 from edgefilter.profile.data import Profile
 from edgefilter.types import Frame, Samples
 
 TAPS = (2048, 8192)
 """Least and most taps of the linear stage, 128 to 512 ms; between them the profile's impulse response decides."""
+
+RUMBLE_HZ, RUMBLE = 80.0, 0.05
+"""Below this frequency a microphone whose path nobody measured hears rooms, not people; it is lowered by 26 dB."""
 
 
 class Front:
@@ -34,11 +37,12 @@ class Front:
             self.aligner = PaperAligner(stft.hop)
         elif engine.front == "full":
             self.aligner = Aligner(stft.hop, profile)
-            self.gate = OnsetGate(stft.hop, float(np.sum(np.square(profile.echo.impulse_response))) if profile else None)
+            self.gate = OnsetGate(stft.hop, float(np.sum(np.square(profile.echo.impulse_response)))) if profile else None
             self.canceller = self._make_canceller(profile)
             self.residual = Residual(stft, profile)
         self._drive = profile.echo.driver() if profile else Driver()
         self._analyser = Analyser(stft, channels=4 if self.canceller else 2)
+        self._low_cut = None if profile or not self.canceller else low_cut(stft)
         self._nothing = np.zeros(stft.bins, np.float32)
         self._fan = profile.noise_bins(stft) if profile else self._nothing
         self._silence = np.zeros(stft.bins, np.complex64)
@@ -56,8 +60,16 @@ class Front:
         if not self.canceller:
             x, r = self._analyser.push(mic, reference)
             return Frame(x, r, self._silence, x, self._fan, self._nothing), aligned
-        mic, linear = self._subtract(mic, ref, aligned)
-        x, r, e, error = self._analyser.push(mic, reference, linear.echo, linear.error)
+        linear = self._subtract(mic, aligned)
+        signals = np.stack((mic, reference, linear.echo, linear.error))
+        if self.gate and (gain := self.gate.step(mic, ref, aligned)) is not None:
+            signals[[0, 2, 3]] *= gain
+            if self.gate.shuts:
+                self._analyser.scale_past(GATE)
+        spectra = self._analyser.push(*signals)
+        if self._low_cut is not None:
+            spectra *= self._low_cut
+        x, r, e, error = spectra
         noise, residual = self.residual.step(e, error, linear.uncertainty)
         return Frame(x, r, e, error, noise, residual), aligned
 
@@ -67,11 +79,15 @@ class Front:
         The kind "full" alone has them.
         """
         aligned = self.aligner.step(mic, ref)
-        return aligned.reference, self._subtract(mic, ref, aligned)[1].error
+        return aligned.reference, self._subtract(mic, aligned).error
 
-    def _subtract(self, mic: Samples, ref: Samples, aligned: Aligned) -> tuple[Samples, CancellerOutput]:
-        """The microphone behind the gate, and the linear stage's hop."""
-        mic = self.gate.step(mic, ref, aligned)
+    def _subtract(self, mic: Samples, aligned: Aligned) -> CancellerOutput:
+        """The linear stage's hop."""
         if aligned.realigned:
             self.canceller.rewrite_reference(self._drive.rewritten(self.aligner.history(self.canceller.history), self.hop))
-        return mic, self.canceller.step(mic, self._drive(aligned.reference))
+        return self.canceller.step(mic, self._drive(aligned.reference), aligned.state != "searching")
+
+
+def low_cut(stft: StftConfig) -> Samples:
+    """(bins,) gain without phase: RUMBLE below RUMBLE_HZ, 1 above."""
+    return np.where(stft.frequencies < RUMBLE_HZ, np.float32(RUMBLE), np.float32(1.0))

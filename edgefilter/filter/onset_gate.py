@@ -24,24 +24,27 @@ LEARNING = 0.1
 SETTLE = SAMPLE_RATE // 4
 """Samples after a lag was found in which a network, which had the robot without its reference until then, still takes it for a human."""
 RAMP = 64
-"""Samples, 4 ms, over which the gate opens and shuts."""
+"""Samples, 4 ms, over which the gate opens; it shuts at once, and what frames still hold of the hop before with it."""
 
 
 class OnsetGate:
     """Lowers the microphone where it holds the robot at a delay that the aligner is still looking for.
 
-    hop: samples per step. gain: power at the microphone over the reference's, None if there is no profile; then the gate learns it
-    while the delay is known, and until then it stays open.
+    hop: samples per step. gain: power at the microphone over the reference's, by the profile; it is followed while the delay is
+    known. shuts: whether it was open in the hop before; what came just before was the first of the robot, and goes with it.
     """
 
-    def __init__(self, hop: int, gain: float | None = None) -> None:
+    def __init__(self, hop: int, gain: float) -> None:
         self._hop = hop
         self._gain = gain
         self._decay = FORGET**hop
         self._loudest = USUAL * hop
         self._shut = self._settling = 0
-        self._last = 1.0
-        self._rise = (np.arange(RAMP, dtype=np.float32) + 1) / RAMP
+        self._closed = np.full(hop, GATE, np.float32)
+        self._opening = np.ones(hop, np.float32)
+        ramp = min(RAMP, hop)
+        self._opening[:ramp] = GATE + (1.0 - GATE) * (np.arange(ramp) + 1) / ramp
+        self.shuts = False
 
     @property
     def suspect(self) -> bool:
@@ -53,34 +56,27 @@ class OnsetGate:
         """Whether the last hop could only be the robot."""
         return 0 < self._shut <= LONGEST
 
-    def step(self, mic: Samples, ref: Samples, aligned: Aligned) -> Samples:
-        """mic (hop,) as it is, or with the robot lowered. ref: (hop,) as it was played. aligned: what the aligner made of both."""
+    def step(self, mic: Samples, ref: Samples, aligned: Aligned) -> Samples | None:
+        """Gain (hop,) for this hop of mic and of all that is made of it, None for 1. ref: (hop,) as it was played.
+
+        aligned: what the aligner made of both.
+        """
         self._settling = SETTLE if aligned.realigned else self._settling - self._hop
         heard, played, explained = float(mic.dot(mic)), float(ref.dot(ref)), float(aligned.reference.dot(aligned.reference))
         if played > 1e-3 * self._loudest:
             self._loudest = max(played, self._decay * self._loudest)
+        before = self.shut
         if aligned.state != "searching":
             self._shut = 0
             if aligned.state == "locked" and explained > 0.1 * self._loudest:
-                now = heard / explained
-                self._gain = now if self._gain is None else self._gain + LEARNING * (min(now, 2 * self._gain) - self._gain)
-            return self._apply(mic, 1.0)
-        if not self._shut and not self._alone(heard, explained):
-            return mic
-        self._shut += self._hop
-        return self._apply(mic, GATE if self.shut else 1.0)
+                self._gain += LEARNING * (min(heard / explained, 2 * self._gain) - self._gain)
+        elif self._shut or self._alone(heard, explained):
+            self._shut += self._hop
+        self.shuts = self.shut and not before
+        if self.shut:
+            return self._closed
+        return self._opening if before else None
 
     def _alone(self, heard: float, explained: float) -> bool:
         """Whether a hop of this power can only be the robot, and not at the present delay."""
-        if self._gain is None:
-            return False
         return heard > LOUD * self._gain * self._loudest and heard > EXPLAINED * self._gain * explained
-
-    def _apply(self, mic: Samples, gain: float) -> Samples:
-        if gain == self._last == 1.0:
-            return mic
-        out = gain * mic
-        edge = min(RAMP, mic.size)
-        out[:edge] = (self._last + (gain - self._last) * self._rise[:edge]) * mic[:edge]
-        self._last = gain
-        return out

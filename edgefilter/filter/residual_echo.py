@@ -27,8 +27,9 @@ SPREAD, SPREAD_HZ = 0.1, 2000.0
 """Distortion falls on other frequencies too: this part of the echo's mean over SPREAD_HZ counts as well."""
 TAIL_DECAY = 0.6
 """Fall of the residual echo per hop, room for what lies beyond the canceller's tail and between its frames."""
-DOUBT = 0.5
-"""Weight of the canceller's own expectation of its misalignment, which counts a path as unknown longer than it is."""
+MISALIGNMENT_WARM, MISALIGNMENT_COLD = 0.5, 2.0
+"""Weight of the canceller's own expectation of its misalignment: it counts a calibrated path as unknown longer than it is, and a path
+that it learnt from nothing as better known than it is."""
 FAN_START = 1e-9
 """Fan power per bin before anything was heard and without a profile."""
 FAN_RISE, FAN_FALL = 1.004, 0.97
@@ -52,6 +53,7 @@ class Residual:
         width = max(1, round(SPREAD_HZ / stft.frequencies[1]))
         self._spread = np.full(width, SPREAD / width, np.float32)
         self._fan = profile.noise_bins(stft) if profile is not None else None
+        self._misalignment = np.float32(MISALIGNMENT_COLD if profile is None else MISALIGNMENT_WARM)
         self.reset()
 
     def reset(self) -> None:
@@ -78,7 +80,7 @@ class Residual:
         self._below[:], self._above[:] = self._echo[0], self._echo[-1]
         brought = np.correlate(self._extended, self._spread, "valid")
         brought += self._echo
-        doubt = DOUBT * uncertainty
+        doubt = self._misalignment * uncertainty
         loud = float(np.add.reduce(brought))
         if loud >= AUDIBLE * self._noise_power:
             self._track(float(np.vdot(error, error).real) - self._noise_power - float(np.add.reduce(doubt)), loud)

@@ -1,0 +1,82 @@
+"""No echo is subtracted that makes the result louder than the microphone: a limiter on the echo's weight."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from edgefilter.types import SAMPLE_RATE, Samples
+
+MEMORY = 0.8
+"""Weight of the past in the smoothed powers per hop of 16 ms; about 80 ms."""
+PART = 64
+"""Samples, 4 ms, of a hop that are looked at by themselves: a loudspeaker can be cut off in mid-word."""
+GROSS = 4.0
+"""Power of such a part's error over the microphone's, from which on it is limited whatever the smoothed powers say: human and robot
+cancel one another in the microphone by so much in hardly any part."""
+ABSENT = 0.1
+"""Weight below which the echo is not there at all: so much of a correlation is chance."""
+EXCESS = 1.5
+"""Smoothed error power over smoothed microphone power from which on the path is not adapted: the echo is not there."""
+PATIENCE_S = 0.5
+"""Seconds of robot after which an echo that is too loud, the lag being known, is put down to the path."""
+
+class EchoLimiter:
+    """Weighs the echo by gamma = <mic, echo> / <echo, echo>, in 0 to 1, while subtracting all of it would add power.
+
+    hop: samples per step. changed: the path must have become another one, told once for each such time.
+    """
+
+    def __init__(self, hop: int) -> None:
+        self._part = math.gcd(hop, PART)
+        self._ramp = (np.arange(self._part, dtype=np.float32) + 1.0) / self._part
+        self._patience = round(PATIENCE_S * SAMPLE_RATE / hop)
+        self._smoothed = 0.0, 0.0, 0.0
+        self._weights = np.ones(hop // self._part + 1, np.float32)
+        self._excessive, self._waited = False, 0
+        self.changed = False
+
+    def measure(self, mic: Samples, echo: Samples) -> bool:
+        """Take in a hop (hop,) of both; whether any of the echo is too loud."""
+        now = float(mic.dot(mic)), float(mic.dot(echo)), float(echo.dot(echo))
+        self._smoothed = tuple(MEMORY * before + (1.0 - MEMORY) * fresh for before, fresh in zip(self._smoothed, now))
+        heard, cross, expected = now
+        left = heard - 2.0 * cross + expected
+        self._excessive = left > EXCESS * heard
+        self._weights[0] = self._weights[-1]
+        self._weights[1:] = 1.0
+        if left > heard and self._smoothed[2] > 2.0 * self._smoothed[1]:
+            self._weights[1:] = _weight(cross / expected)
+        m, e = mic.reshape(-1, self._part), echo.reshape(-1, self._part)
+        heard, cross, expected = (np.einsum("ij,ij->i", a, b) for a, b in ((m, m), (m, e), (e, e)))
+        gross = heard - 2.0 * cross + expected > GROSS * heard
+        if gross.any():
+            self._weights[1:][gross] = np.minimum(self._weights[1:][gross], _weight(cross[gross] / expected[gross]))
+        return bool(self._weights.min() < 1.0)
+
+    def may_adapt(self) -> bool:
+        """Whether the path may be adapted by this hop's error, the lag being known."""
+        self.changed = False
+        if not self._excessive:
+            self._waited = max(self._waited - 1, 0)
+            return True
+        self._waited += 1
+        if self._waited < self._patience:
+            return False
+        self.changed, self._waited = True, 0
+        return True
+
+    def apply(self, echo: Samples) -> Samples:
+        """The echo (hop,) with its weight, which falls at once and rises over a part."""
+        if self._weights.min() == 1.0:
+            return echo
+        target = self._weights[1:]
+        start = np.minimum(self._weights[:-1], target)
+        gain = start[:, None] + (target - start)[:, None] * self._ramp
+        return gain.reshape(-1) * echo
+
+
+def _weight(part: float | np.ndarray) -> np.ndarray:
+    """The echo's weight where so much of it is heard."""
+    return np.where(part < ABSENT, 0.0, np.minimum(part, 1.0))

@@ -1,0 +1,148 @@
+"""Whatever comes in, no engine is louder than the microphone by more than 1 dB over a second."""
+
+import numpy as np
+import pytest
+from scipy.signal import fftconvolve
+
+from bench.simulate.alignment_scene import speech_like
+from edgefilter import Profile, engines, enhance
+from edgefilter.echo.model import EchoModel
+from edgefilter.types import PRE_ROLL, SAMPLE_RATE
+
+SECONDS = 8
+SIZE = SECONDS * SAMPLE_RATE
+INAUDIBLE = 1e-9
+"""Mean square, -90 dB of full scale, added to both sides: of digital silence nothing can be a decibel louder."""
+ENGINES = ("linear", "ss", "crnn", "paper-ss", "paper-ss-causal", "bypass")
+
+
+def room(rng: np.random.Generator, taps: int = 4800) -> np.ndarray:
+    path = np.zeros(taps + PRE_ROLL, np.float32)
+    path[PRE_ROLL:] = rng.standard_normal(taps) * 10.0 ** (-3.0 * np.arange(taps) / 4800) * 0.05
+    path[PRE_ROLL] = 0.6
+    return path
+
+
+def heard(ref: np.ndarray, path: np.ndarray, delay: int) -> np.ndarray:
+    late = np.concatenate((np.zeros(delay, np.float32), ref))[: ref.size]
+    return fftconvolve(late, path)[: ref.size].astype(np.float32)
+
+
+def scene(seed: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Reference, its echo, a human, a fan and the path."""
+    rng = np.random.default_rng(seed)
+    ref = speech_like(rng, SECONDS)[:SIZE].astype(np.float32)
+    human = 0.1 * speech_like(rng, SECONDS)[:SIZE].astype(np.float32)
+    path = room(rng)
+    return ref, heard(ref, path, 900), human, 1e-3 * rng.standard_normal(SIZE).astype(np.float32), path
+
+
+def unrelated_reference() -> tuple[np.ndarray, np.ndarray]:
+    _, _, human, fan, _ = scene()
+    return human + fan, scene(1)[0]
+
+
+def swapped_channels() -> tuple[np.ndarray, np.ndarray]:
+    ref, echo, human, fan, _ = scene()
+    return ref, echo + human + fan
+
+
+def lag_jumps_every_second() -> tuple[np.ndarray, np.ndarray]:
+    ref, _, human, fan, path = scene()
+    echo = np.zeros(SIZE, np.float32)
+    for second, delay in enumerate((300, 4000, 900, 12000, 100, 7000, 2500, 500)):
+        part = slice(second * SAMPLE_RATE, (second + 1) * SAMPLE_RATE)
+        echo[part] = heard(ref, path, delay)[part]
+    return echo + human + fan, ref
+
+
+def volume_turned() -> tuple[np.ndarray, np.ndarray]:
+    ref, echo, human, fan, _ = scene()
+    return np.repeat([0.1, 1.0, 10.0, 0.3, 3.0, 0.1, 10.0, 1.0], SAMPLE_RATE).astype(np.float32) * 0.1 * echo + human + fan, ref
+
+
+def path_changes_at_once() -> tuple[np.ndarray, np.ndarray]:
+    ref, echo, human, fan, _ = scene()
+    other = -heard(ref, room(np.random.default_rng(7)), 900)
+    return np.concatenate((echo[: SIZE // 2], other[SIZE // 2 :])) + human + fan, ref
+
+
+def clipped_and_silent() -> tuple[np.ndarray, np.ndarray]:
+    ref, echo, human, fan, _ = scene()
+    mic = np.clip(5.0 * echo + human + fan, -0.3, 0.3)
+    for channel, at in ((mic, 2), (ref, 3), (mic, 5), (ref, 6)):
+        channel[at * SAMPLE_RATE : at * SAMPLE_RATE + SAMPLE_RATE // 2] = 0.0
+    return mic, ref
+
+
+def loudspeaker_muted_in_mid_word() -> tuple[np.ndarray, np.ndarray]:
+    ref, echo, _, fan, _ = scene()
+    echo[3 * SAMPLE_RATE + 100 : 5 * SAMPLE_RATE] = 0.0
+    return echo + 0.3 * fan, ref
+
+
+def square_wave() -> tuple[np.ndarray, np.ndarray]:
+    ref, _, _, _, _ = scene()
+    return np.sign(np.sin(np.arange(SIZE) * 0.05)).astype(np.float32), ref
+
+
+SCENES = (
+    unrelated_reference,
+    swapped_channels,
+    lag_jumps_every_second,
+    volume_turned,
+    path_changes_at_once,
+    clipped_and_silent,
+    loudspeaker_muted_in_mid_word,
+    square_wave,
+)
+
+
+def profile() -> Profile:
+    """A calibrated robot whose path is that of the scene."""
+    from edgefilter.calibration.calibrate import calibrate
+    from edgefilter.calibration.sweep import generate_sweep
+
+    rng = np.random.default_rng(0)
+    sweep = generate_sweep()
+    return calibrate(sweep, heard(sweep, scene()[4], 300), 1e-3 * rng.standard_normal(4 * SAMPLE_RATE).astype(np.float32))
+
+
+@pytest.fixture(scope="module")
+def calibrated() -> Profile:
+    return profile()
+
+
+def loudest_over_mic_db(mic: np.ndarray, out: np.ndarray) -> float:
+    """Largest level of out over mic, any second, steps of 50 ms."""
+    before, after = (np.concatenate(([0.0], np.cumsum(np.square(x, dtype=np.float64)))) for x in (mic, out))
+    at = np.arange(0, mic.size - SAMPLE_RATE, SAMPLE_RATE // 20)
+    powers = [(total[at + SAMPLE_RATE] - total[at]) / SAMPLE_RATE + INAUDIBLE for total in (before, after)]
+    return float((10 * np.log10(powers[1] / powers[0])).max())
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+@pytest.mark.parametrize("make", SCENES, ids=lambda make: make.__name__)
+def test_never_louder_than_the_microphone(make, engine, calibrated):
+    mic, ref = make()
+    known = (calibrated,) if engine.startswith("paper") else (None, calibrated)
+    for at_hand in known:
+        out = enhance(mic, ref, at_hand, engine)
+        assert np.isfinite(out).all()
+        assert loudest_over_mic_db(mic, out) < 1.0, "calibrated" if at_hand else "not calibrated"
+
+
+def test_the_measure_sees_an_output_that_is_too_loud():
+    mic, _ = unrelated_reference()
+    out = mic.copy()
+    out[3 * SAMPLE_RATE : 4 * SAMPLE_RATE] *= 1.2
+    assert loudest_over_mic_db(mic, out) > 1.5
+
+
+def test_the_profile_of_these_scenes_is_true():
+    """Otherwise the warm half of the tests above would begin with a path that means nothing."""
+    assert isinstance(profile().echo, EchoModel)
+    ref, echo, _, fan, _ = scene()
+    out = enhance(echo + fan, ref, profile(), "linear")
+    assert 10 * np.log10(np.mean(echo[-SAMPLE_RATE:] ** 2) / np.mean(out[-SAMPLE_RATE:] ** 2)) > 20
+    assert set(ENGINES) | {"paper-crnn"} == set(engines.ENGINES)
