@@ -16,7 +16,7 @@ from edgefilter.types import Frame, Output
 if TYPE_CHECKING:
     from edgefilter.profile.data import Profile
 
-CANDIDATES = ("crnn", "ss", "linear")
+CANDIDATES = tuple(name for name, entry in engines.CATALOGUE.items() if entry.automatic)
 """What "auto" chooses from, best first."""
 DOWN, UP = 4, 32
 """Frames of a crossfade to a cheaper engine (64 ms, since it has to bring relief), and to a better one (0.5 s, since an engine
