@@ -8,7 +8,7 @@ import pytest
 
 import edgefilter
 
-MODULES = sorted(module.name for module in pkgutil.walk_packages(edgefilter.__path__, "edgefilter."))
+MODULES = sorted(["edgefilter", *(module.name for module in pkgutil.walk_packages(edgefilter.__path__, "edgefilter."))])
 EXAMPLES = [name for name in MODULES if ">>>" in (importlib.util.find_spec(name).loader.get_source(name) or "")]
 
 
