@@ -30,7 +30,7 @@ def build_parser() -> Parser:
     parser = Parser(prog="edgefilter", description="Hear the human while the robot talks.")
     parser.add_argument("--version", action="version", version=f"edgefilter {__version__}")
     parser.add_argument("--debug", action="store_true", help="show a traceback when something fails")
-    commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
+    commands = parser.add_subparsers(dest="command", metavar="COMMAND")
     _add_demo(commands)
     _add_run(commands)
     _add_calibrate(commands)
@@ -182,7 +182,11 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def _run(arguments: list[str]) -> int:
-    args = build_parser().parse_args(arguments)
+    parser = build_parser()
+    args = parser.parse_args(arguments)
+    if args.command is None:
+        parser.print_help()
+        return 0
     check_outputs(args)
     for file in getattr(args, "effects", []):
         load_effect(file)
