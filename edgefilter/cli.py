@@ -6,6 +6,7 @@ import argparse
 import importlib
 import os
 import sys
+from typing import Any, NoReturn
 
 from edgefilter import __version__
 from edgefilter.commands.outputs import check_outputs
@@ -17,11 +18,11 @@ from edgefilter.errors import EdgefilterError, UsageError
 class Parser(argparse.ArgumentParser):
     """argparse with one line per mistake and no abbreviated flags."""
 
-    def __init__(self, **options: object) -> None:
+    def __init__(self, **options: Any) -> None:
         options.setdefault("formatter_class", argparse.RawDescriptionHelpFormatter)
         super().__init__(allow_abbrev=False, **options)
 
-    def error(self, message: str) -> None:
+    def error(self, message: str) -> NoReturn:
         raise UsageError(f"{message}; see '{self.prog} --help'")
 
 

@@ -5,13 +5,14 @@ from __future__ import annotations
 import sys
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
 from edgefilter.audio.files import Recorder
-from edgefilter.audio.protocols import Sink, Source
+from edgefilter.audio.protocols import Sink
 from edgefilter.dsp.frames import decibels
 from edgefilter.errors import EdgefilterError
 from edgefilter.filter.ego_filter import EgoFilter
@@ -48,7 +49,7 @@ class RunReport:
     wall_s: float = 0.0
     interrupted: bool = False
     failure: EdgefilterError | None = None
-    filter: dict[str, object] = field(default_factory=dict)
+    filter: dict[str, Any] = field(default_factory=dict)
     events: deque[Event] = field(default_factory=lambda: deque(maxlen=MOST_EVENTS))
 
     def to_dict(self) -> dict[str, object]:
@@ -87,7 +88,7 @@ def level_db(x: Samples) -> float:
 
 
 def filter_blocks(
-    source: Source,
+    source: Iterable[Block],
     ego: EgoFilter,
     sink: Sink,
     recorder: Recorder | None = None,
@@ -138,5 +139,5 @@ def filter_blocks(
     except EdgefilterError as error:  # a sink that failed before says so again; its first word is the reason
         report.failure = report.failure or error
     report.wall_s = time.perf_counter() - began
-    report.filter = ego.stats()
+    report.filter = dict(ego.stats())
     return report

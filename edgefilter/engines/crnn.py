@@ -69,10 +69,11 @@ class Crnn:
         if not hasattr(self._own, "places"):
             slots = FixedPlaces(self.model.session)
             names = [name for name, _ in self.model.states]
-            spectra = (slots.inputs[name].view(np.complex64).reshape(-1) for name in SPECTRA)
+            error, mic, reference, echo = (slots.inputs[name].view(np.complex64).reshape(-1) for name in SPECTRA)
             states, next_states = [slots.inputs[name] for name in names], [slots.outputs[f"next_{name}"] for name in names]
             spectrum = slots.outputs["spectrum"].view(np.complex64).reshape(-1)
-            self._own.places = Places(slots, *spectra, spectrum, slots.outputs["speech_probability"], states, next_states)
+            probability = slots.outputs["speech_probability"]
+            self._own.places = Places(slots, error, mic, reference, echo, spectrum, probability, states, next_states)
         return self._own.places
 
 

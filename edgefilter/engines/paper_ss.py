@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import signal
 
 from edgefilter.dsp.stft import StftConfig
@@ -85,7 +86,7 @@ class PaperSpectralSubtraction:
         estimate = self._beta * spectra[0] * (1.0 - self._over_time @ masks)
         return Output(estimate), PaperSsState(masks[1:], spectra[1:])
 
-    def _smooth_bins(self, mask: Array) -> Samples:
+    def _smooth_bins(self, mask: NDArray[np.bool_]) -> Samples:
         """The frequency half of the (separable) smoothing window; beyond 0 and 8 kHz the mask is 0."""
         return np.convolve(mask.astype(np.float32), self._over_bins, mode="same")
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -157,8 +158,9 @@ class Profile:
             warnings = header.pop("warnings")
             if not isinstance(warnings, list):
                 raise ProfileError(f"warnings is a JSON {type(warnings).__name__}, expected a list of texts; {REMEDY}")
-            echo = EchoModel(arrays.pop("impulse_response"), effects)
-            profile = cls(echo=echo, warnings=tuple(warnings), **arrays, **header)
+            fields: dict[str, Any] = {**arrays, **header}  # what type each has is checked on construction
+            echo = EchoModel(fields.pop("impulse_response"), effects)
+            profile = cls(echo=echo, warnings=tuple(warnings), **fields)
             _check_effects(profile.echo)
             return profile
         except ProfileError as error:

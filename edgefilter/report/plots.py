@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
@@ -56,7 +57,7 @@ def plot_before_after(signals: Mapping[str, Samples], path: str | Path) -> None:
     _save(figure, path)
 
 
-def _draw_spectra(axis, profile: Profile) -> None:
+def _draw_spectra(axis: Axes, profile: Profile) -> None:
     n = max(1 << 15, profile.echo.impulse_response.size)
     spectrum = np.abs(np.fft.rfft(profile.echo.impulse_response, n))
     hz = np.arange(spectrum.size) * SAMPLE_RATE / n
@@ -71,7 +72,7 @@ def _draw_spectra(axis, profile: Profile) -> None:
     _label(axis, "Response and fan", "Hz", "dB")
 
 
-def _draw_bands(axis, profile: Profile) -> None:
+def _draw_bands(axis: Axes, profile: Profile) -> None:
     low, high = profile.band_hz.T
     colours = [ACCENT if snr < 10 else SOFT for snr in profile.band_snr_db]
     axis.bar(low, profile.band_snr_db, width=high - low, align="edge", color=colours, edgecolor="white")
@@ -81,7 +82,7 @@ def _draw_bands(axis, profile: Profile) -> None:
     _label(axis, f"Signal-to-noise ratio of the sweep by third octave\nharmonic distortion by order, dB: {orders}", "Hz", "dB")
 
 
-def _label(axis, title: str, x: str, y: str) -> None:
+def _label(axis: Axes, title: str, x: str, y: str) -> None:
     axis.set_title(title, loc="left", fontsize=10)
     axis.set_xlabel(x)
     axis.set_ylabel(y)
