@@ -23,6 +23,7 @@ class Parser(argparse.ArgumentParser):
         super().__init__(allow_abbrev=False, **options)
 
     def error(self, message: str) -> NoReturn:
+        """Raise what main() turns into one line."""
         raise UsageError(f"{message}; see '{self.prog} --help'")
 
 

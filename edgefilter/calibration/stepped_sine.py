@@ -44,6 +44,7 @@ class SteppedLaw:
 
     @property
     def stop(self) -> int:
+        """First sample after the last step."""
         return self.start + STEP_SAMPLES * STEPS_HZ.size
 
     def frequency(self, n: Array) -> Array:

@@ -65,7 +65,7 @@ class Crnn:
         return Output(human, float(places.probability[0])), (following, mask_state)
 
     def _places(self) -> Places:
-        """This thread's own, since several streams may share the engine."""
+        """The places of the calling thread, since several streams may share the engine."""
         if not hasattr(self._own, "places"):
             slots = FixedPlaces(self.model.session)
             names = [name for name, _ in self.model.states]
