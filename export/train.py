@@ -86,18 +86,18 @@ def train(options: argparse.Namespace) -> Path:
     average = {name: value.clone() for name, value in network.state_dict().items()}
     optimiser = torch.optim.AdamW(network.parameters(), lr=options.rate, weight_decay=1e-2, betas=(0.9, 0.98))
     items, held_out = Items(options.data), Items(options.validation)
-    done, best, since = 0, -math.inf, 0
+    step, best, since = 0, -math.inf, 0
     last = options.output / "last.pt"
     if last.exists():
         saved = torch.load(last, map_location=device, weights_only=True)
         network.load_state_dict(saved["network"])
         optimiser.load_state_dict(saved["optimiser"])
-        average, done, best, since = saved["average"], saved["step"], saved["best"], saved["since"]
-    batches = Batches(items, task.stft, options.batch, options.seconds, options.seed + done)
-    print(f"{task.describe(network)}; {len(items.names)} items, from step {done}")
+        average, step, best, since = saved["average"], saved["step"], saved["best"], saved["since"]
+    batches = Batches(items, task.stft, options.batch, options.seconds, options.seed + step)
+    print(f"{task.describe(network)}; {len(items.names)} items, from step {step}")
     began = time.time()
     with SummaryWriter(options.output) as board, (options.output / "log.jsonl").open("a", encoding="utf-8") as log:
-        for step in (progress := tqdm(range(done, options.steps), initial=done, total=options.steps, unit="step")):
+        for step in (progress := tqdm(range(step, options.steps), initial=step, total=options.steps, unit="step")):
             for group in optimiser.param_groups:
                 group["lr"] = options.rate * min(1.0, (step + 1) / min(WARM_UP, options.steps / 10)) * (0.5 + 0.5 * math.cos(math.pi * step / options.steps)) + 1e-6
             terms, _ = task.loss(network, on(device, batches.draw()))

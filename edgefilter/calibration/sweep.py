@@ -134,6 +134,7 @@ class Deconvolution:
 
     @property
     def frequencies(self) -> Array:
+        """(n // 2 + 1,) Hz."""
         return np.arange(self.source_energy.size) * SAMPLE_RATE / self.response.size
 
 
