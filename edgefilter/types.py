@@ -58,7 +58,9 @@ class Output(NamedTuple):
     speech_probability: float | None = None
 
 
-EventKind: TypeAlias = Literal["realigned", "speech_started", "speech_stopped", "overloaded", "stepped_down", "stepped_up"]
+EventKind: TypeAlias = Literal[
+    "realigned", "speech_started", "speech_stopped", "overloaded", "stepped_down", "stepped_up"
+]
 
 
 @dataclass(frozen=True, slots=True)
@@ -144,11 +146,15 @@ def as_samples(x: object, name: str) -> Samples:
     """Return x as a finite (n,) float32 array, contiguous, without writing into it; raise SignalError otherwise."""
     array = np.asarray(x)
     if array.dtype.kind != "f":
-        raise SignalError(f"{name} has dtype {array.dtype}, expected float samples in +-1: divide integer PCM by its full scale")
+        raise SignalError(
+            f"{name} has dtype {array.dtype}, expected float samples in +-1: divide integer PCM by its full scale"
+        )
     if array.ndim != 1:
         raise SignalError(f"{name} has shape {array.shape}, expected one channel of shape (n,)")
     array = np.ascontiguousarray(array, np.float32)
     if not math.isfinite(array.dot(array)) and not np.isfinite(array).all():
         bad = int(np.argmin(np.isfinite(array)))
-        raise SignalError(f"{name} holds {array[bad]} at sample {bad}, expected finite samples: repair or cut the recording")
+        raise SignalError(
+            f"{name} holds {array[bad]} at sample {bad}, expected finite samples: repair or cut the recording"
+        )
     return array

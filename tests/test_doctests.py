@@ -13,7 +13,12 @@ EXAMPLES = [name for name in MODULES if ">>>" in (importlib.util.find_spec(name)
 
 
 def test_examples_were_found():
-    assert {"edgefilter.filter.ego_filter", "edgefilter.alignment.aligner", "edgefilter.calibration.calibrate", "edgefilter.dsp.metrics"} <= set(EXAMPLES)
+    assert {
+        "edgefilter.filter.ego_filter",
+        "edgefilter.alignment.aligner",
+        "edgefilter.calibration.calibrate",
+        "edgefilter.dsp.metrics",
+    } <= set(EXAMPLES)
 
 
 @pytest.mark.parametrize("name", EXAMPLES)

@@ -97,7 +97,9 @@ ARROWS = {arrow for name, path in MODULES.items() if name != "edgefilter" for ar
 def floor(name: str) -> int:
     subject = name.split(".")[1]
     floors = [number for number, subjects in enumerate(LAYERS) if subject in subjects]
-    assert len(floors) == 1, f"edgefilter.{subject} stands on {len(floors)} floors: say in LAYERS on which one it stands"
+    assert len(floors) == 1, (
+        f"edgefilter.{subject} stands on {len(floors)} floors: say in LAYERS on which one it stands"
+    )
     return floors[0]
 
 
@@ -144,7 +146,9 @@ def circles(arrows: set[Arrow]) -> list[list[str]]:
 
 def fresh(code: str) -> str:
     """What a new interpreter prints."""
-    return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=PACKAGE.parent).stdout.strip()
+    return subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=PACKAGE.parent
+    ).stdout.strip()
 
 
 def loaded_by(name: str) -> set[str]:
@@ -161,7 +165,11 @@ def test_files_and_arrows_were_found():
 
 @pytest.mark.parametrize("heavy", LEAVES)
 def test_heavy_packages_are_imported_in_their_leaf_only(heavy):
-    users = {str(path.relative_to(PACKAGE)) for path in FILES if any(name.split(".")[0] == heavy for name, _ in imports(path))}
+    users = {
+        str(path.relative_to(PACKAGE))
+        for path in FILES
+        if any(name.split(".")[0] == heavy for name, _ in imports(path))
+    }
     assert users == LEAVES[heavy]
 
 
@@ -178,7 +186,9 @@ def test_imports_point_downwards():
 def test_nothing_imports_the_door():
     """The version alone is defined there; every other name would be loaded from inside the house by way of the street."""
     inside = {(name, found) for name, path in MODULES.items() if name != "edgefilter" for found, _ in imports(path)}
-    assert {found for _, found in inside if found.rpartition(".")[0] == "edgefilter" and found not in MODULES} <= {"edgefilter.__version__"}
+    assert {found for _, found in inside if found.rpartition(".")[0] == "edgefilter" and found not in MODULES} <= {
+        "edgefilter.__version__"
+    }
     assert not [name for name, found in inside if found == "edgefilter"]
 
 

@@ -28,11 +28,15 @@ NOT_CODE = {
 
 def clean_environment() -> dict[str, str]:
     """The caller's, without what would let a copy of the package elsewhere be found."""
-    return {name: value for name, value in os.environ.items() if name not in ("PYTHONPATH", "PYTHONHOME", "VIRTUAL_ENV")}
+    return {
+        name: value for name, value in os.environ.items() if name not in ("PYTHONPATH", "PYTHONHOME", "VIRTUAL_ENV")
+    }
 
 
 def run(*words: object, **options: object) -> str:
-    done = subprocess.run([str(word) for word in words], capture_output=True, text=True, env=clean_environment(), **options)
+    done = subprocess.run(
+        [str(word) for word in words], capture_output=True, text=True, env=clean_environment(), **options
+    )
     assert done.returncode == 0, done.stdout[-2000:] + done.stderr[-2000:]
     return done.stdout
 
@@ -74,7 +78,9 @@ def test_the_wheel_holds_every_module_and_nothing_that_is_not_read(wheel):
 def test_the_demo_runs_from_it(installed, tmp_path):
     run(installed / "edgefilter", "demo", "--output", tmp_path / "demo", "--json", tmp_path / "demo.json", cwd=tmp_path)
     figures = json.loads((tmp_path / "demo.json").read_text())
-    assert figures["engine"] == "crnn" and figures["si_sdr_after_db"] > 9.0  # README: 9.5 dB; half a decibel for another processor
+    assert (
+        figures["engine"] == "crnn" and figures["si_sdr_after_db"] > 9.0
+    )  # README: 9.5 dB; half a decibel for another processor
     assert (tmp_path / "demo/before_after.png").stat().st_size > 10_000
     where = run(installed / "python", "-c", "import edgefilter; print(edgefilter.__file__)", cwd=tmp_path).strip()
     assert Path(where).is_relative_to(installed.parent)

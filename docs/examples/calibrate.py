@@ -19,6 +19,8 @@ profile = calibrate(sweep, heard, fan, source=", ".join(recordings))
 profile.save(output_path)
 for (low, high), snr in zip(profile.band_hz, profile.band_snr_db):
     print(f"{low:6.0f} to {high:5.0f} Hz: the sweep is {snr:4.0f} dB over the fan")
-print(f"{profile.echo.impulse_response.size / 16:.0f} ms of impulse response; distortion {np.max(profile.distortion_db):.0f} dB")
+print(
+    f"{profile.echo.impulse_response.size / 16:.0f} ms of impulse response; distortion {np.max(profile.distortion_db):.0f} dB"
+)
 for warning in profile.warnings:
     print(f"WARNING {warning}")

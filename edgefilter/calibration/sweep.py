@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy import fft, signal
 
 from edgefilter.errors import CalibrationError
@@ -62,7 +63,7 @@ class SweepLaw:
     high_hz: float
     rate: float
 
-    def frequency(self, n: Array) -> Array:
+    def frequency(self, n: ArrayLike) -> Array:
         """Hz at sample n of the reference."""
         return self.low_hz * np.exp((np.asarray(n) - self.start) / self.rate)
 
@@ -70,7 +71,7 @@ class SweepLaw:
         """Sample of the reference at which the sweep passes hz."""
         return self.start + self.rate * float(np.log(hz / self.low_hz))
 
-    def lead(self, order: int) -> float:
+    def lead(self, order: float) -> float:
         """Samples by which the response of a harmonic order precedes the linear one after deconvolution."""
         return self.rate * np.log(order)
 

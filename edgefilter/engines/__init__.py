@@ -85,8 +85,12 @@ def create(
         raise UsageError(f"unknown engine '{name}': choose one of auto, {', '.join(ENGINES)}")
     entry = CATALOGUE[name]
     if model is not None and entry.takes != "model":
-        raise UsageError(f"engine {name} has no network, found the model {model}: leave it out or take one of {', '.join(HAVE_MODEL)}")
+        raise UsageError(
+            f"engine {name} has no network, found the model {model}: leave it out or take one of {', '.join(HAVE_MODEL)}"
+        )
     if profile is None and entry.takes == "profile":
-        raise UsageError(f"engine {name} needs the robot's calibrated response: give --profile P.npz (made by 'edgefilter calibrate')")
+        raise UsageError(
+            f"engine {name} needs the robot's calibrated response: give --profile P.npz (made by 'edgefilter calibrate')"
+        )
     factory = getattr(importlib.import_module(f"edgefilter.engines.{entry.module}"), entry.factory)
     return factory({"stft": stft, "model": model, "profile": profile}[entry.takes])

@@ -38,7 +38,11 @@ def plot_profile(profile: Profile, path: str | Path) -> None:
     _draw_spectra(axes[1, 0], profile)
     _draw_bands(axes[1, 1], profile)
     if profile.warnings:
-        figure.suptitle("not to be trusted: " + "; ".join(text.split(":")[0][:60] for text in profile.warnings)[:140], color=ACCENT, fontsize=9)
+        figure.suptitle(
+            "not to be trusted: " + "; ".join(text.split(":")[0][:60] for text in profile.warnings)[:140],
+            color=ACCENT,
+            fontsize=9,
+        )
     _save(figure, path)
 
 
@@ -78,8 +82,15 @@ def _draw_bands(axis: Axes, profile: Profile) -> None:
     axis.bar(low, profile.band_snr_db, width=high - low, align="edge", color=colours, edgecolor="white")
     axis.axhline(10, color=INK, linewidth=0.8, linestyle=":")
     axis.set_xscale("log")
-    orders = ", ".join(f"{order}: {level:.0f}" for order, level in zip(DISTORTION_ORDERS, profile.distortion_db, strict=True))
-    _label(axis, f"Signal-to-noise ratio of the sweep by third octave\nharmonic distortion by order, dB: {orders}", "Hz", "dB")
+    orders = ", ".join(
+        f"{order}: {level:.0f}" for order, level in zip(DISTORTION_ORDERS, profile.distortion_db, strict=True)
+    )
+    _label(
+        axis,
+        f"Signal-to-noise ratio of the sweep by third octave\nharmonic distortion by order, dB: {orders}",
+        "Hz",
+        "dB",
+    )
 
 
 def _label(axis: Axes, title: str, x: str, y: str) -> None:
@@ -106,4 +117,6 @@ def _save(figure: Figure, path: str | Path) -> None:
         figure.savefig(path)
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or str(error).splitlines()[0]
-        raise EdgefilterError(f"{path}: the picture cannot be written ({reason}); name a .png, .svg or .pdf file in a folder that exists") from None
+        raise EdgefilterError(
+            f"{path}: the picture cannot be written ({reason}); name a .png, .svg or .pdf file in a folder that exists"
+        ) from None

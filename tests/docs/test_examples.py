@@ -22,7 +22,9 @@ ELSEWHERE = {"whole_filter.py"}
 
 def run(name, *words, stdin=None):
     """What the example prints, and says on standard error."""
-    done = subprocess.run([sys.executable, EXAMPLES / name, *map(str, words)], input=stdin, capture_output=True, cwd=ROOT)
+    done = subprocess.run(
+        [sys.executable, EXAMPLES / name, *map(str, words)], input=stdin, capture_output=True, cwd=ROOT
+    )
     assert done.returncode == 0, done.stderr.decode()
     return done.stdout, done.stderr.decode()
 
@@ -58,18 +60,24 @@ def test_a_file_is_filtered(filtered):
 
 
 def test_blocks_through_a_pipe_give_the_same_and_tell_of_the_human(filtered):
-    stereo = np.stack([soundfile.read(DEMO / f"{name}.flac", dtype="int16")[0] for name in ("mic", "reference")], axis=1)
+    stereo = np.stack(
+        [soundfile.read(DEMO / f"{name}.flac", dtype="int16")[0] for name in ("mic", "reference")], axis=1
+    )
     out, said = run("pipe.py", DEMO / "profile.npz", stdin=stereo.astype("<i2").tobytes())
     np.testing.assert_allclose(np.frombuffer(out, "<i2") / 32768, filtered, atol=1.01 / 32768)  # 16 bits, rounded twice
     words = said.split()
-    assert words.count("speech_started") == 1 and 9.0 < float(words[0]) < 10.0  # the human begins in the second after 9.0 s
+    assert (
+        words.count("speech_started") == 1 and 9.0 < float(words[0]) < 10.0
+    )  # the human begins in the second after 9.0 s
 
 
 def test_an_announced_utterance_is_found_and_removed(tmp_path):
     mic, reference = read(DEMO / "mic.flac"), read(DEMO / "reference.flac")
     soundfile.write(tmp_path / "mic.wav", mic[: 7 * RATE], RATE)
     soundfile.write(tmp_path / "said.wav", reference[round(0.42 * RATE) : round(6.1 * RATE)], RATE)
-    said, _ = run("announce.py", tmp_path / "mic.wav", tmp_path / "said.wav", tmp_path / "human.wav", DEMO / "profile.npz")
+    said, _ = run(
+        "announce.py", tmp_path / "mic.wav", tmp_path / "said.wav", tmp_path / "human.wav", DEMO / "profile.npz"
+    )
     assert b"heard 1 of 1" in said
     speaking = slice(1 * RATE, 5 * RATE)
     assert db(read(tmp_path / "human.wav")[speaking]) < db(mic[speaking]) - 25  # as above
@@ -78,10 +86,14 @@ def test_an_announced_utterance_is_found_and_removed(tmp_path):
 def test_a_calibration_gives_a_profile_with_which_the_missing_effect_is_found_and_added(tmp_path):
     names = ("sweep_ref", "sweep_mic", "fan_only")
     said, _ = run("calibrate.py", *(REVERBERANT / f"{name}.flac" for name in names), tmp_path / "robot.npz")
-    assert b"ms of impulse response" in said and said.count(b"dB over the fan") == 23, "23 third-octave bands from 50 Hz to 8 kHz"
+    assert b"ms of impulse response" in said and said.count(b"dB over the fan") == 23, (
+        "23 third-octave bands from 50 Hz to 8 kHz"
+    )
     files = (REVERBERANT / f"{name}.flac" for name in ("mic", "ref"))
     said, _ = run("diagnose.py", tmp_path / "robot.npz", *files, tmp_path / "better.npz")
     lines = said.decode().splitlines()
     assert lines[1].startswith("missing") and lines[2].startswith("late_reverb: ")
-    assert float(lines[0].split()[0]) > 10 > 3 > float(lines[3].split()[-3])  # dB before and after; 15.7 and 0.0 were seen
+    assert (
+        float(lines[0].split()[0]) > 10 > 3 > float(lines[3].split()[-3])
+    )  # dB before and after; 15.7 and 0.0 were seen
     assert (tmp_path / "better.npz").exists()

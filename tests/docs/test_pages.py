@@ -58,8 +58,12 @@ def test_the_api_page_names_all_that_an_ego_filter_has():
 
 def test_the_architecture_page_names_every_floor():
     picture = ARCHITECTURE.split("```")[1]
-    subjects = {path.stem for path in (ROOT / "edgefilter").iterdir() if path.suffix == ".py" or (path / "__init__.py").exists()}
-    assert subjects - {"__init__"} == {word for line in picture.splitlines() for word in re.findall(r"[a-z]+", line[:38])} - {"text"}
+    subjects = {
+        path.stem for path in (ROOT / "edgefilter").iterdir() if path.suffix == ".py" or (path / "__init__.py").exists()
+    }
+    assert subjects - {"__init__"} == {
+        word for line in picture.splitlines() for word in re.findall(r"[a-z]+", line[:38])
+    } - {"text"}
 
 
 def test_pages_name_no_file_that_is_not_there():
