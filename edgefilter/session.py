@@ -21,7 +21,7 @@ from edgefilter.types import SAMPLE_RATE, Block, Event, Samples
 try:
     import resource
 except ModuleNotFoundError:  # Windows has no such module
-    resource = None
+    resource = None  # type: ignore[assignment]
 
 MOST_EVENTS = 1000
 """Events that a report keeps, the latest ones."""
