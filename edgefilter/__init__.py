@@ -27,8 +27,8 @@ if TYPE_CHECKING:
     from edgefilter.diagnosis.result import Finding as Finding
     from edgefilter.diagnosis.result import Interval as Interval
     from edgefilter.echo.effect import Effect as Effect
-    from edgefilter.echo.effect import Measurement as Measurement
     from edgefilter.echo.effect import Parameter as Parameter
+    from edgefilter.echo.measurement import Measurement as Measurement
     from edgefilter.echo.model import EchoModel as EchoModel
     from edgefilter.echo.user_effects import load_effect as load_effect
     from edgefilter.engines import ENGINES as ENGINES
@@ -57,7 +57,8 @@ _HOMES = {
     "diagnosis.compare": ("Comparison", "compare"),
     "diagnosis.diagnose": ("add", "diagnose"),
     "diagnosis.result": ("Diagnosis", "Finding", "Interval"),
-    "echo.effect": ("Effect", "Measurement", "Parameter"),
+    "echo.effect": ("Effect", "Parameter"),
+    "echo.measurement": ("Measurement",),
     "echo.model": ("EchoModel",),
     "echo.user_effects": ("load_effect",),
     "engines": ("ENGINES",),

@@ -84,7 +84,7 @@ def peak_memory_mb() -> float | None:
 
 def level_db(x: Samples) -> float:
     """RMS level of x (n,) in dB of full scale; -120 for silence."""
-    return float(decibels(np.mean(np.square(x, dtype=np.float64)))) if x.size else -120.0
+    return float(decibels(float(np.mean(np.square(x, dtype=np.float64))))) if x.size else -120.0
 
 
 def filter_blocks(
