@@ -6,6 +6,7 @@ import argparse
 import importlib
 import os
 import sys
+from typing import Any, NoReturn
 
 from edgefilter import __version__
 from edgefilter.commands.outputs import check_outputs
@@ -17,11 +18,12 @@ from edgefilter.errors import EdgefilterError, UsageError
 class Parser(argparse.ArgumentParser):
     """argparse with one line per mistake and no abbreviated flags."""
 
-    def __init__(self, **options: object) -> None:
+    def __init__(self, **options: Any) -> None:
         options.setdefault("formatter_class", argparse.RawDescriptionHelpFormatter)
         super().__init__(allow_abbrev=False, **options)
 
-    def error(self, message: str) -> None:
+    def error(self, message: str) -> NoReturn:
+        """Raise what main() turns into one line."""
         raise UsageError(f"{message}; see '{self.prog} --help'")
 
 
@@ -30,7 +32,7 @@ def build_parser() -> Parser:
     parser = Parser(prog="edgefilter", description="Hear the human while the robot talks.")
     parser.add_argument("--version", action="version", version=f"edgefilter {__version__}")
     parser.add_argument("--debug", action="store_true", help="show a traceback when something fails")
-    commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
+    commands = parser.add_subparsers(dest="command", metavar="COMMAND")
     _add_demo(commands)
     _add_run(commands)
     _add_calibrate(commands)
@@ -182,7 +184,11 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def _run(arguments: list[str]) -> int:
-    args = build_parser().parse_args(arguments)
+    parser = build_parser()
+    args = parser.parse_args(arguments)
+    if args.command is None:
+        parser.print_help()
+        return 0
     check_outputs(args)
     for file in getattr(args, "effects", []):
         load_effect(file)

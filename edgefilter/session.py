@@ -5,13 +5,14 @@ from __future__ import annotations
 import sys
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
 from edgefilter.audio.files import Recorder
-from edgefilter.audio.protocols import Sink, Source
+from edgefilter.audio.protocols import Sink
 from edgefilter.dsp.frames import decibels
 from edgefilter.errors import EdgefilterError
 from edgefilter.filter.ego_filter import EgoFilter
@@ -20,7 +21,7 @@ from edgefilter.types import SAMPLE_RATE, Block, Event, Samples
 try:
     import resource
 except ModuleNotFoundError:  # Windows has no such module
-    resource = None
+    resource = None  # type: ignore[assignment]
 
 MOST_EVENTS = 1000
 """Events that a report keeps, the latest ones."""
@@ -48,7 +49,7 @@ class RunReport:
     wall_s: float = 0.0
     interrupted: bool = False
     failure: EdgefilterError | None = None
-    filter: dict[str, object] = field(default_factory=dict)
+    filter: dict[str, Any] = field(default_factory=dict)
     events: deque[Event] = field(default_factory=lambda: deque(maxlen=MOST_EVENTS))
 
     def to_dict(self) -> dict[str, object]:
@@ -83,11 +84,11 @@ def peak_memory_mb() -> float | None:
 
 def level_db(x: Samples) -> float:
     """RMS level of x (n,) in dB of full scale; -120 for silence."""
-    return float(decibels(np.mean(np.square(x, dtype=np.float64)))) if x.size else -120.0
+    return float(decibels(float(np.mean(np.square(x, dtype=np.float64))))) if x.size else -120.0
 
 
 def filter_blocks(
-    source: Source,
+    source: Iterable[Block],
     ego: EgoFilter,
     sink: Sink,
     recorder: Recorder | None = None,
@@ -138,5 +139,5 @@ def filter_blocks(
     except EdgefilterError as error:  # a sink that failed before says so again; its first word is the reason
         report.failure = report.failure or error
     report.wall_s = time.perf_counter() - began
-    report.filter = ego.stats()
+    report.filter = dict(ego.stats())
     return report

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import NamedTuple, TypeAlias
+from typing import Literal, NamedTuple, TypeAlias, TypedDict
 
 import numpy as np
 from numpy.typing import NDArray
@@ -58,24 +58,103 @@ class Output(NamedTuple):
     speech_probability: float | None = None
 
 
+EventKind: TypeAlias = Literal[
+    "realigned", "speech_started", "speech_stopped", "overloaded", "stepped_down", "stepped_up"
+]
+
+
 @dataclass(frozen=True, slots=True)
 class Event:
-    """Something that a user of the stream may want to know: what happened and by which sample of the microphone, whole hops."""
+    """Something that a user of the stream may want to know.
 
-    kind: str
+    Parameters
+    ----------
+    kind : str
+        What happened. "realigned": the reference was found elsewhere in the microphone. "speech_started", "speech_stopped": of the
+        human, from engines that judge it. "overloaded", "stepped_down", "stepped_up": what too little or enough time led to.
+    sample : int
+        By which sample of the microphone, in whole hops.
+    detail : str
+        The same in words, with figures.
+    """
+
+    kind: EventKind
     sample: int
     detail: str
+
+
+class AlignmentStats(TypedDict, total=False):
+    """What the aligner found. method "tracking" has all keys, "paper" the first, delay_samples, confidence and utterances_aligned."""
+
+    method: Literal["tracking", "paper"]
+    state: Literal["searching", "locked", "idle"]
+    delay_samples: float | None
+    deviation_samples: float | None
+    confidence: float
+    ppm: float
+    utterances: int
+    realignments: int
+    jumps: int
+    searches: int
+    announced: int
+    announced_heard: int
+    utterances_aligned: int
+
+
+class LinearStageStats(TypedDict):
+    """What the canceller did: hops, those in which it adapted, its length in hops, the playback gain that it follows."""
+
+    hops: int
+    active_hops: int
+    partitions: int
+    gain_db: float
+
+
+class DeadlineStats(TypedDict):
+    """Compute per hop, and what came of it; compute: mean_ms, p50_ms, p95_ms, p99_ms, max_ms."""
+
+    hop_ms: float
+    budget_ms: float
+    hops: int
+    missed_deadlines: int
+    over_budget: int
+    most_behind_ms: float
+    steps: int
+    compute: dict[str, float]
+
+
+class Stats(TypedDict):
+    """What EgoFilter.stats() returns, ready for JSON.
+
+    engine, engine_reason: the one at work, and why it was chosen. engines: those that can take turns. model: what a network's file says
+    of itself, None without one. latency_ms: algorithmic, None for an engine that needs the whole recording. samples: taken in so far.
+    alignment, linear_stage: None for engines that go without.
+    """
+
+    engine: str
+    engine_reason: str
+    engines: list[str]
+    model: dict[str, object] | None
+    latency_ms: float | None
+    samples: int
+    alignment: AlignmentStats | None
+    linear_stage: LinearStageStats | None
+    deadline: DeadlineStats | None
 
 
 def as_samples(x: object, name: str) -> Samples:
     """Return x as a finite (n,) float32 array, contiguous, without writing into it; raise SignalError otherwise."""
     array = np.asarray(x)
     if array.dtype.kind != "f":
-        raise SignalError(f"{name} has dtype {array.dtype}, expected float samples in +-1: divide integer PCM by its full scale")
+        raise SignalError(
+            f"{name} has dtype {array.dtype}, expected float samples in +-1: divide integer PCM by its full scale"
+        )
     if array.ndim != 1:
         raise SignalError(f"{name} has shape {array.shape}, expected one channel of shape (n,)")
     array = np.ascontiguousarray(array, np.float32)
     if not math.isfinite(array.dot(array)) and not np.isfinite(array).all():
         bad = int(np.argmin(np.isfinite(array)))
-        raise SignalError(f"{name} holds {array[bad]} at sample {bad}, expected finite samples: repair or cut the recording")
+        raise SignalError(
+            f"{name} holds {array[bad]} at sample {bad}, expected finite samples: repair or cut the recording"
+        )
     return array

@@ -8,12 +8,17 @@ import pytest
 
 import edgefilter
 
-MODULES = sorted(module.name for module in pkgutil.walk_packages(edgefilter.__path__, "edgefilter."))
+MODULES = sorted(["edgefilter", *(module.name for module in pkgutil.walk_packages(edgefilter.__path__, "edgefilter."))])
 EXAMPLES = [name for name in MODULES if ">>>" in (importlib.util.find_spec(name).loader.get_source(name) or "")]
 
 
 def test_examples_were_found():
-    assert {"edgefilter.filter.ego_filter", "edgefilter.alignment.aligner", "edgefilter.calibration.calibrate", "edgefilter.dsp.metrics"} <= set(EXAMPLES)
+    assert {
+        "edgefilter.filter.ego_filter",
+        "edgefilter.alignment.aligner",
+        "edgefilter.calibration.calibrate",
+        "edgefilter.dsp.metrics",
+    } <= set(EXAMPLES)
 
 
 @pytest.mark.parametrize("name", EXAMPLES)

@@ -234,14 +234,14 @@ class LiveSink:
         figures = {"written": self.written, "clipped": self.clipped, "underruns": max(outlet.underruns, self._port.flags)}
         return figures | {"missing": outlet.missing, "dropped": self.dropped + outlet.ring.lost}
 
-    def __exit__(self, kind: type[BaseException] | None, *exc: object) -> None:
+    def __exit__(self, *exc: object) -> None:
         try:
-            if kind is None and self._open:
+            if exc[0] is None and self._open:
                 self._port.outlet.draining.set()
                 self._queue(self._port.convert(np.zeros(0, np.float32), last=True))
                 self._port.wait_until(0)
         finally:
-            self._port.close(drain=kind is None)
+            self._port.close(drain=exc[0] is None)
             troubles = {name: count for name, count in self.stats().items() if count and name != "written"}
             if troubles:
                 self.notes.append("live output was not complete: " + ", ".join(f"{count} {name}" for name, count in troubles.items()))

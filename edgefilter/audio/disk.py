@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 import os
 from pathlib import Path
-from typing import BinaryIO
 
 _FLAC_FRAME = b"\xff\xf8"  # sync code of a frame of fixed size, RFC 9639, 9.1
 _HEADER = 256  # bytes in which both formats' headers lie
@@ -20,7 +19,7 @@ class Disk(io.RawIOBase):
 
     def __init__(self, path: Path) -> None:
         super().__init__()
-        self._file: BinaryIO = open(path, "w+b", buffering=0)  # noqa: SIM115 (closed by close)
+        self._file: io.FileIO = open(path, "w+b", buffering=0)  # noqa: SIM115 (closed by close)
         self._end: int | None = None
         self._flac_frames = 0
         self.error: OSError | None = None

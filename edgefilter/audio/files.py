@@ -148,8 +148,8 @@ class FileSink:
     def __enter__(self) -> FileSink:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, *exc: object) -> None:
-        self.close(quiet=kind is not None)
+    def __exit__(self, *exc: object) -> None:
+        self.close(quiet=exc[0] is not None)
 
     def stats(self) -> dict[str, int]:
         return {"written": self.written, "clipped": self.clipped}

@@ -91,7 +91,7 @@ class PcmSource:
             handle = None
         wait = handle is not None and sys.platform != "win32"
         while not self._stopped:
-            if wait and not select.select([handle], [], [], _PATIENCE_S)[0]:
+            if handle is not None and wait and not select.select([handle], [], [], _PATIENCE_S)[0]:
                 continue
             data = self._stream.read(_READ_BYTES) if handle is None else os.read(handle, _READ_BYTES)
             if not data:

@@ -30,15 +30,38 @@ def calibrate(
 ) -> Profile:
     """Measure the robot's own voice at its microphone.
 
-    sweep_reference (n,): an exponential sweep as it was played, with silence around it (generate_sweep()). sweep_recording (m,):
-    what the microphone heard, on the same sample counter to within -2000 samples and 1.6 s. noise_recording (k,): the fan alone,
-    some seconds. stepped_sine: reference and recording are those of the paper's generate_stepped_sine() instead. All float32, 16 kHz,
-    full scale +-1. created, source: texts for the profile.
+    Parameters
+    ----------
+    sweep_reference : ndarray of float, shape (n,)
+        An exponential sweep as it was played, with silence around it (`generate_sweep`). All three at 16 kHz, full scale +-1.
+    sweep_recording : ndarray of float, shape (m,)
+        What the microphone heard, on the same sample counter to within -2000 samples and 1.6 s.
+    noise_recording : ndarray of float, shape (k,)
+        The fan alone, some seconds.
+    stepped_sine : bool
+        Reference and recording are those of the paper's `generate_stepped_sine` instead.
+    created, source : str
+        Texts for the profile: when, and from what.
 
-    What makes the result less than trustworthy is in Profile.warnings. Raises CalibrationError where there is nothing to measure:
-    the recording does not contain the sweep, is silent, far too short or not finite, or the reference is no exponential sweep.
+    Returns
+    -------
+    Profile
+        What makes it less than trustworthy stands in its `warnings`.
 
-    >>> from edgefilter.calibration.sweep import generate_sweep
+    Raises
+    ------
+    CalibrationError
+        Where there is nothing to measure: the recording does not contain the sweep, is silent, far too short or not finite, or the
+        reference is no exponential sweep.
+
+    Notes
+    -----
+    Deconvolution by an exponential sweep, Farina (2000), harmonics apart as in Novak et al. (2015); the response of each frequency as in
+    Li, Hindriks & Kunneman (2024), eq. (3) to (5).
+
+    Examples
+    --------
+    >>> from edgefilter import generate_sweep
     >>> rng = np.random.default_rng(0)
     >>> sweep = generate_sweep()
     >>> recording = 0.5 * np.roll(sweep, 300) + 1e-4 * rng.standard_normal(sweep.size).astype(np.float32)

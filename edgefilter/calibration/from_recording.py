@@ -43,12 +43,39 @@ MOMENT = SAMPLE_RATE // 20
 
 
 def self_calibrate(recording: Samples, reference: Samples) -> Profile:
-    """The profile that recording (n,) of the robot playing reference (m,), float, full scale +-1, 16 kHz, speaks of itself.
+    """Make a provisional profile from a recording of the robot alone, where there is no calibration.
 
-    The path is a regularised least-squares filter on every other half second, those that prepare() fits on, so that the others say
+    Parameters
+    ----------
+    recording : ndarray of float, shape (n,)
+        The robot at its microphone, 16 kHz, full scale +-1.
+    reference : ndarray of float, shape (m,)
+        What it said, as sent to the loudspeaker.
+
+    Returns
+    -------
+    Profile
+        Path and fan as this recording shows them; its `warnings` say what that cannot tell.
+
+    Raises
+    ------
+    SignalError
+        Where the recording does not contain the reference, or too little of it.
+
+    Notes
+    -----
+    The path is a regularised least-squares filter on every other half second, those that a diagnosis fits on, so that the others say
     how well it predicts. Samples weigh the less the more the first fit leaves of them (iteratively reweighted least squares, Huber
-    1981), so that a talker does not bend it. The fan is what the robot's silences hold. Stationary linear effects, which the path
-    holds already, are in it at their neutral values, so that no search claims them. Raises SignalError where the recording does not contain the reference.
+    1981), so that a talker does not bend it. The fan is what the robot's silences hold. Stationary linear effects are in it at their
+    neutral values, so that no search claims them.
+
+    Examples
+    --------
+    >>> rng = np.random.default_rng(0)
+    >>> said = (0.2 * rng.standard_normal(80_000) * np.repeat(rng.uniform(size=25) > 0.3, 3200)).astype(np.float32)
+    >>> heard = 0.4 * np.roll(said, 300) + 1e-3 * rng.standard_normal(80_000).astype(np.float32)
+    >>> self_calibrate(heard, said).delay
+    300.0
     """
     y, x = paired(recording, reference)
     lag = find_lag(y, x)

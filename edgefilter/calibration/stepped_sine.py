@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 from scipy import signal
 
 from edgefilter.dsp.fourier import power
@@ -44,9 +45,10 @@ class SteppedLaw:
 
     @property
     def stop(self) -> int:
+        """First sample after the last step."""
         return self.start + STEP_SAMPLES * STEPS_HZ.size
 
-    def frequency(self, n: Array) -> Array:
+    def frequency(self, n: ArrayLike) -> Array:
         """Hz at sample n of the reference."""
         return (np.asarray(n) - self.start) / STEP_SAMPLES * STEP_HZ
 
@@ -126,7 +128,7 @@ def response_from_sweep(reference: Samples, recording: Samples, noise: Samples, 
     return np.where(strongest > 1e-3 * strongest.max(), response, 0.0).astype(np.float32)
 
 
-def _frames(samples: Samples) -> Array:
+def _frames(samples: Samples) -> NDArray[np.complex128]:
     """(frames, 601) complex spectra."""
     padded = np.pad(samples, (0, max(0, FRAME - samples.size)))
     return np.fft.rfft(frames(padded, FRAME, HOP) * _WINDOW, axis=1)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy import fft, signal
 
 from edgefilter.errors import CalibrationError
@@ -16,11 +17,29 @@ EARLIEST_DIRECT = -2000
 
 
 def generate_sweep(seconds: float = 6.0, amplitude: float = 0.35, lead_s: float = 0.5, tail_s: float = 1.0) -> Samples:
-    """An exponential sweep (n,) float32 of LOW_HZ to HIGH_HZ with silence before and after, to be played for a calibration.
+    """An exponential sweep with silence before and after, to be played for a calibration.
 
+    Parameters
+    ----------
+    seconds : float
+        Of the sweep, from LOW_HZ to HIGH_HZ.
+    amplitude : float
+        Its peak, full scale 1.
+    lead_s, tail_s : float
+        Of silence before it, and after it for the room to fall silent.
+
+    Returns
+    -------
+    ndarray of float32, shape (n,)
+        At 16 kHz, faded in over 20 ms and out over 5 ms.
+
+    Notes
+    -----
     x(t) = amplitude sin(2 pi f1 T (e^(t/T) - 1)), T = seconds / ln(f2 / f1) (Farina 2000, eq. 5), f1 T rounded to a whole number so
-    that harmonics separate with a defined phase (Novak et al. 2015, eq. 37). Faded in over 20 ms and out over 5 ms.
+    that harmonics separate with a defined phase (Novak et al. 2015, eq. 37).
 
+    Examples
+    --------
     >>> sweep = generate_sweep()
     >>> sweep.shape, sweep.dtype
     ((120000,), dtype('float32'))
@@ -44,7 +63,7 @@ class SweepLaw:
     high_hz: float
     rate: float
 
-    def frequency(self, n: Array) -> Array:
+    def frequency(self, n: ArrayLike) -> Array:
         """Hz at sample n of the reference."""
         return self.low_hz * np.exp((np.asarray(n) - self.start) / self.rate)
 
@@ -52,7 +71,7 @@ class SweepLaw:
         """Sample of the reference at which the sweep passes hz."""
         return self.start + self.rate * float(np.log(hz / self.low_hz))
 
-    def lead(self, order: int) -> float:
+    def lead(self, order: float) -> float:
         """Samples by which the response of a harmonic order precedes the linear one after deconvolution."""
         return self.rate * np.log(order)
 
@@ -116,6 +135,7 @@ class Deconvolution:
 
     @property
     def frequencies(self) -> Array:
+        """(n // 2 + 1,) Hz."""
         return np.arange(self.source_energy.size) * SAMPLE_RATE / self.response.size
 
 

@@ -100,7 +100,8 @@ def save_profile(ego: EgoFilter, path: str) -> None:
     adapted = ego.adapted_profile()
     adapted.save(path)
     left = {name for name, _ in adapted.echo.effects}
-    held = ", ".join(name for name, _ in ego.profile.echo.effects if name not in left)
+    before = ego.profile.echo.effects if ego.profile else ()
+    held = ", ".join(name for name, _ in before if name not in left)
     say(f"the adapted path is in {path}" + (f"; {held} is part of it now and no longer listed" if held else ""))
 
 

@@ -63,10 +63,48 @@ def _plain(value: object) -> object:
 
 
 def compare(profile: Profile, recording: Samples, reference: Samples, *, sample_rate: int = SAMPLE_RATE) -> Comparison:
-    """Say how far the profile's prediction for reference (n,) is from recording (m,), both float, full scale +-1, at sample_rate.
+    """Say how far the profile's prediction of the robot's own voice is from a recording of it, and where.
 
-    A constant lag of up to MAX_OFFSET seconds either way and the ordinary tolerances (score.TOLERANCE of the path, prepare's
-    FAN_TOLERANCE_DB of the fan) are taken out. Raises SignalError where the recording does not contain the reference.
+    Parameters
+    ----------
+    profile : Profile
+        What is held against the recording.
+    recording : ndarray of float, shape (m,)
+        The robot alone at its microphone, some seconds, full scale +-1.
+    reference : ndarray of float, shape (n,)
+        What it said, as sent to the loudspeaker.
+    sample_rate : int
+        Of both; they are converted to 16 kHz.
+
+    Returns
+    -------
+    Comparison
+        Excess over the noise floor in all, by frequency, time, level and lag.
+
+    Raises
+    ------
+    SignalError
+        Where the recording does not contain the reference.
+
+    Notes
+    -----
+    Excess is the power of recording minus prediction, whitened by the fan's power spectral density, over the fan's own: 0 dB where
+    nothing is left to explain. A constant lag of up to MAX_OFFSET seconds either way and the ordinary tolerances of path and fan are
+    taken out.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from edgefilter import calibrate, generate_sweep
+    >>> rng = np.random.default_rng(0)
+    >>> def fan(n):
+    ...     return 1e-3 * rng.standard_normal(n).astype(np.float32)
+    >>> sweep = generate_sweep()
+    >>> profile = calibrate(sweep, 0.5 * np.roll(sweep, 300) + fan(sweep.size), fan(64_000))
+    >>> said = (0.2 * rng.standard_normal(80_000) * np.repeat(rng.uniform(size=25) > 0.3, 3200)).astype(np.float32)
+    >>> heard = 0.4 * np.roll(said, 300) + fan(said.size)
+    >>> compare(profile, heard, said).excess_db > 20
+    True
     """
     prepared = prepare(profile, recording, reference, sample_rate=sample_rate)
     return describe(prepared, prepared.model)

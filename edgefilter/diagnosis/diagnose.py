@@ -34,9 +34,54 @@ def diagnose(
     progress: Callable[[str], None] | None = None,
     criteria: Criteria | None = None,
 ) -> Diagnosis:
-    """Say which effects recording (m,) of the robot playing reference (k,) shows that the profile lacks.
+    """Find out which physical effects a profile lacks, from a recording of the robot alone.
 
-    progress: called with a short text before each trial. criteria: when an effect is named, by default Criteria(). Raises SignalError where the recording does not contain the reference.
+    Parameters
+    ----------
+    profile : Profile
+        What is known of the robot.
+    recording : ndarray of float, shape (m,)
+        The robot alone at its microphone, from some seconds up, full scale +-1.
+    reference : ndarray of float, shape (n,)
+        What it said, as sent to the loudspeaker.
+    sample_rate : int
+        Of both; they are converted to 16 kHz.
+    progress : callable, optional
+        Called with a short text before each trial.
+    criteria : Criteria, optional
+        When an effect is named.
+
+    Returns
+    -------
+    Diagnosis
+        The verdict, and the effects whose presence the data supports, strongest first, with parameters and intervals.
+
+    Raises
+    ------
+    SignalError
+        Where the recording does not contain the reference.
+
+    Notes
+    -----
+    Stepwise selection: every effect is fitted on half of the recording, in blocks of half a second, and judged on the other half
+    (docs/diagnosis.md).
+
+    Examples
+    --------
+    The robot's volume was turned down by 1.9 dB.
+
+    >>> import numpy as np
+    >>> from edgefilter import calibrate, generate_sweep
+    >>> rng = np.random.default_rng(0)
+    >>> def fan(n):
+    ...     return 1e-3 * rng.standard_normal(n).astype(np.float32)
+    >>> sweep = generate_sweep()
+    >>> profile = calibrate(sweep, 0.5 * np.roll(sweep, 300) + fan(sweep.size), fan(64_000))
+    >>> said = (0.2 * rng.standard_normal(80_000) * np.repeat(rng.uniform(size=25) > 0.3, 3200)).astype(np.float32)
+    >>> heard = 0.4 * np.roll(said, 300) + fan(said.size)
+    >>> found = diagnose(profile, heard, said)
+    >>> found.verdict, found.ranking[0].effect, round(found.ranking[0].parameters["gain_db"].value, 1)
+    ('missing', 'playback_gain', -1.9)
     """
     prepared = prepare(profile, recording, reference, sample_rate=sample_rate)
     criteria = criteria or Criteria()
@@ -46,11 +91,51 @@ def diagnose(
 def add(
     profile: Profile, name: str, recording: Samples, reference: Samples, *, sample_rate: int = SAMPLE_RATE
 ) -> tuple[Profile, Comparison, Comparison]:
-    """Fit the effect of that name to a recording and write it into a new profile; the comparisons are those before and after.
+    """Fit an effect to a recording and write it into a new profile.
 
-    Fitted to all of the recording: that predicts other recordings of the robot better than the fit to half of it by which diagnose()
+    Parameters
+    ----------
+    profile : Profile
+        Stays as it is.
+    name : str
+        Of the effect, as a diagnosis prints it.
+    recording, reference, sample_rate
+        As of `diagnose`.
+
+    Returns
+    -------
+    Profile
+        With the effect.
+    Comparison, Comparison
+        Before and after.
+
+    Raises
+    ------
+    UsageError
+        For an unknown effect.
+    SignalError
+        Where the recording does not contain the reference.
+
+    Notes
+    -----
+    Fitted to all of the recording: that predicts other recordings of the robot better than the fit to half of it by which `diagnose`
     judges. So the comparison after, of this recording, is of samples that the fit has used. An event (a jump, a moment's move) is kept
     with the recording in which it happened: of any other the profile predicts what it did before.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from edgefilter import calibrate, generate_sweep
+    >>> rng = np.random.default_rng(0)
+    >>> def fan(n):
+    ...     return 1e-3 * rng.standard_normal(n).astype(np.float32)
+    >>> sweep = generate_sweep()
+    >>> profile = calibrate(sweep, 0.5 * np.roll(sweep, 300) + fan(sweep.size), fan(64_000))
+    >>> said = (0.2 * rng.standard_normal(80_000) * np.repeat(rng.uniform(size=25) > 0.3, 3200)).astype(np.float32)
+    >>> heard = 0.4 * np.roll(said, 300) + fan(said.size)
+    >>> better, before, after = add(profile, "playback_gain", heard, said)
+    >>> [name for name, _ in better.echo.effects], after.excess_db < before.excess_db - 6
+    (['playback_gain'], True)
     """
     prepared = prepare(profile, recording, reference, sample_rate=sample_rate)
     before = describe(prepared, prepared.model)

@@ -28,6 +28,7 @@ class Ring:
 
     @property
     def capacity(self) -> int:
+        """Samples that it holds at most."""
         return self._data.size
 
     def write(self, samples: Samples) -> int:

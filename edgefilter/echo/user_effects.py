@@ -26,13 +26,29 @@ _loaded: dict[Path, str] = {}
 
 
 def load_effect(path: str | Path) -> str:
-    """Run the Python file at path, register the effect that its one class defines, and return the effect's name.
+    """Run the Python file at path and make the effect that its one class defines known.
 
     The file is code and runs with the caller's rights. A file that was loaded before is not run again.
-    A class that does not derive from Effect gets its defaults all the same. Raises UsageError, in one line, where there is no such file,
-    it does not run, holds no such class or more than one, the class lacks what every effect has, its name is taken, or its neutral
-    values are not the identity.
+    A class that does not derive from Effect gets its defaults all the same.
 
+    Parameters
+    ----------
+    path : str or Path
+        A Python file with one class that is an effect (docs/own_effect.md).
+
+    Returns
+    -------
+    str
+        The effect's name.
+
+    Raises
+    ------
+    UsageError
+        In one line, where there is no such file, it does not run, holds no such class or more than one, the class lacks a part of an
+        effect, its name is taken, or its neutral values are not the identity.
+
+    Examples
+    --------
     >>> import tempfile
     >>> file = Path(tempfile.mkdtemp()) / "broken.py"
     >>> _ = file.write_text("def f(:")

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import importlib
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 from edgefilter.dsp.stft import StftConfig
 from edgefilter.engines.base import ClipEngine, Engine
@@ -12,11 +14,38 @@ from edgefilter.errors import UsageError
 if TYPE_CHECKING:
     from edgefilter.profile.data import Profile
 
-ENGINES = ("crnn", "ss", "linear", "bypass", "paper-ss", "paper-ss-causal", "paper-crnn")
-NEEDS_PROFILE = ("paper-ss", "paper-ss-causal")
-HAVE_MODEL = ("crnn", "paper-crnn")
-HAVE_LINEAR_STAGE = ("crnn", "ss", "linear")
-"""Those whose front is "full": an echo path is adapted before them."""
+
+@dataclass(frozen=True, slots=True)
+class Entry:
+    """One engine of the catalogue.
+
+    module: its file in this folder, loaded when the engine is asked for and not before: one of them loads onnxruntime.
+    factory: what makes it there, a class or a function of one argument. takes: that argument, the STFT to work with, the path of a
+    network in place of its own, or the robot's profile. automatic: whether "auto" may choose it. linear_stage: whether an echo path is
+    adapted before it, that is whether its front is "full".
+    """
+
+    module: str
+    factory: str
+    takes: Literal["stft", "model", "profile"]
+    automatic: bool = False
+    linear_stage: bool = False
+
+
+CATALOGUE = {
+    "crnn": Entry("crnn", "Crnn", "model", automatic=True, linear_stage=True),
+    "ss": Entry("spectral_subtraction", "SpectralSubtraction", "stft", automatic=True, linear_stage=True),
+    "linear": Entry("linear", "Linear", "stft", automatic=True, linear_stage=True),
+    "bypass": Entry("bypass", "Bypass", "stft"),
+    "paper-ss": Entry("paper_ss", "paper_ss", "profile"),
+    "paper-ss-causal": Entry("paper_ss", "paper_ss_causal", "profile"),
+    "paper-crnn": Entry("paper_crnn", "PaperCrnn", "model"),
+}
+"""Best first: that is the order in which "auto" tries them."""
+ENGINES = tuple(CATALOGUE)
+NEEDS_PROFILE = tuple(name for name, entry in CATALOGUE.items() if entry.takes == "profile")
+HAVE_MODEL = tuple(name for name, entry in CATALOGUE.items() if entry.takes == "model")
+HAVE_LINEAR_STAGE = tuple(name for name, entry in CATALOGUE.items() if entry.linear_stage)
 
 
 def create(
@@ -24,36 +53,44 @@ def create(
 ) -> Engine | ClipEngine:
     """Make an engine by name.
 
-    stft: for the engines that work with any; the others have their own. model: the file that a neural engine loads in place of its own.
-    Raises UsageError for an unknown name, one that cannot work without a profile or has no use for a model, and ModelError for a
-    model file that does not fit.
+    Parameters
+    ----------
+    name : str
+        One of `ENGINES`.
+    profile : Profile, optional
+        The calibrated robot; the engines of `NEEDS_PROFILE` do not work without.
+    stft : StftConfig, optional
+        For the engines that work with any; the others have their own.
+    model : str or Path, optional
+        The file that an engine of `HAVE_MODEL` loads in place of its own.
+
+    Returns
+    -------
+    Engine or ClipEngine
+        Without state: streams can share it.
+
+    Raises
+    ------
+    UsageError
+        For an unknown name, an engine that lacks its profile, or a model for one that has no use for it.
+    ModelError
+        For a model file that does not fit.
+
+    Examples
+    --------
+    >>> create("linear").stft.hop
+    256
     """
-    if name not in ENGINES:
+    if name not in CATALOGUE:
         raise UsageError(f"unknown engine '{name}': choose one of auto, {', '.join(ENGINES)}")
-    if name in NEEDS_PROFILE and profile is None:
-        raise UsageError(f"engine {name} needs the robot's calibrated response: give --profile P.npz (made by 'edgefilter calibrate')")
-    if model is not None and name not in HAVE_MODEL:
-        raise UsageError(f"engine {name} has no network, found the model {model}: leave it out or take one of {', '.join(HAVE_MODEL)}")
-    if name == "crnn":
-        from edgefilter.engines.crnn import Crnn
-
-        return Crnn(model)
-    if name == "paper-crnn":
-        from edgefilter.engines.paper_crnn import PaperCrnn
-
-        return PaperCrnn(model)
-    if name == "bypass":
-        from edgefilter.engines.bypass import Bypass
-
-        return Bypass(stft)
-    if name == "linear":
-        from edgefilter.engines.linear import Linear
-
-        return Linear(stft)
-    if name == "ss":
-        from edgefilter.engines.spectral_subtraction import SpectralSubtraction
-
-        return SpectralSubtraction(stft)
-    from edgefilter.engines.paper_ss import PAPER_STFT, PaperSpectralSubtraction
-
-    return PaperSpectralSubtraction(profile.response_bins(PAPER_STFT), causal=name == "paper-ss-causal")
+    entry = CATALOGUE[name]
+    if model is not None and entry.takes != "model":
+        raise UsageError(
+            f"engine {name} has no network, found the model {model}: leave it out or take one of {', '.join(HAVE_MODEL)}"
+        )
+    if profile is None and entry.takes == "profile":
+        raise UsageError(
+            f"engine {name} needs the robot's calibrated response: give --profile P.npz (made by 'edgefilter calibrate')"
+        )
+    factory = getattr(importlib.import_module(f"edgefilter.engines.{entry.module}"), entry.factory)
+    return factory({"stft": stft, "model": model, "profile": profile}[entry.takes])

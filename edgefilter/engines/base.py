@@ -23,9 +23,13 @@ class Engine(Protocol):
     """
 
     name: ClassVar[str]
-    front: ClassVar[Front]
     stft: StftConfig
     lookahead: int
+
+    @property
+    def front(self) -> Front:
+        """What the stream has to run before it."""
+        ...
 
     def initial_state(self) -> EngineState:
         """State before the first frame."""

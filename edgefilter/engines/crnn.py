@@ -65,14 +65,15 @@ class Crnn:
         return Output(human, float(places.probability[0])), (following, mask_state)
 
     def _places(self) -> Places:
-        """This thread's own, since several streams may share the engine."""
+        """The places of the calling thread, since several streams may share the engine."""
         if not hasattr(self._own, "places"):
             slots = FixedPlaces(self.model.session)
             names = [name for name, _ in self.model.states]
-            spectra = (slots.inputs[name].view(np.complex64).reshape(-1) for name in SPECTRA)
+            error, mic, reference, echo = (slots.inputs[name].view(np.complex64).reshape(-1) for name in SPECTRA)
             states, next_states = [slots.inputs[name] for name in names], [slots.outputs[f"next_{name}"] for name in names]
             spectrum = slots.outputs["spectrum"].view(np.complex64).reshape(-1)
-            self._own.places = Places(slots, *spectra, spectrum, slots.outputs["speech_probability"], states, next_states)
+            probability = slots.outputs["speech_probability"]
+            self._own.places = Places(slots, error, mic, reference, echo, spectrum, probability, states, next_states)
         return self._own.places
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, ClassVar, cast
 
 import numpy as np
 
@@ -16,7 +16,7 @@ from edgefilter.types import Frame, Output
 if TYPE_CHECKING:
     from edgefilter.profile.data import Profile
 
-CANDIDATES = ("crnn", "ss", "linear")
+CANDIDATES = tuple(name for name, entry in engines.CATALOGUE.items() if entry.automatic)
 """What "auto" chooses from, best first."""
 DOWN, UP = 4, 32
 """Frames of a crossfade to a cheaper engine (64 ms, since it has to bring relief), and to a better one (0.5 s, since an engine
@@ -74,7 +74,7 @@ class Ladder:
         if state.coming is None:
             return output, LadderState(heard)
         other, coming = self._run(state.coming, frame)
-        weight = state.weight if state.filling else self._move(state)
+        weight = state.weight if state.filling else self._move(state.weight, state.heard.rung, state.coming.rung)
         if weight == 0.0 and self.wanted == heard.rung:
             return output, LadderState(heard)
         if weight == 1.0:
@@ -83,12 +83,11 @@ class Ladder:
         probability = output.speech_probability if weight < 0.5 else other.speech_probability
         return Output(spectrum, probability), LadderState(heard, coming, max(state.filling - 1, 0), weight)
 
-    def _move(self, state: LadderState) -> float:
-        """The next weight of the voice that is coming in, towards whichever of the two is nearer to what is wanted."""
-        rungs = state.heard.rung, state.coming.rung
+    def _move(self, weight: float, *rungs: int) -> float:
+        """The next weight of the voice that is coming in (rungs: heard, coming), towards whichever of the two is nearer to what is wanted."""
         goal = 1 if abs(self.wanted - rungs[1]) < abs(self.wanted - rungs[0]) else 0
         step = 1.0 / (DOWN if rungs[goal] == max(rungs) else UP)
-        return min(state.weight + step, 1.0) if goal else max(state.weight - step, 0.0)
+        return min(weight + step, 1.0) if goal else max(weight - step, 0.0)
 
     def _start(self, rung: int) -> Voice:
         engine = self.rungs[rung]
@@ -106,7 +105,7 @@ def climbable(best: Engine, profile: Profile | None) -> list[Engine]:
     rungs = [best]
     for name in CANDIDATES[CANDIDATES.index(best.name) + 1 :] if best.name in CANDIDATES else ():
         try:
-            engine = engines.create(name, profile, best.stft)
+            engine = cast(Engine, engines.create(name, profile, best.stft))  # no candidate needs the whole recording
         except EdgefilterError:
             continue
         if (engine.stft, engine.front) == (best.stft, best.front):

@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import signal
 
 from edgefilter.dsp.stft import StftConfig
 from edgefilter.engines.base import Front
 from edgefilter.errors import UsageError
 from edgefilter.types import Array, Frame, Output, Samples, Spectrum
+
+if TYPE_CHECKING:
+    from edgefilter.profile.data import Profile
 
 PAPER_STFT = StftConfig(n_fft=1200, hop=160, window_length=400, window="hann")
 """601 bins as in the paper; hop and window from the implementation of VoiceFilter that the paper builds on."""
@@ -82,6 +86,16 @@ class PaperSpectralSubtraction:
         estimate = self._beta * spectra[0] * (1.0 - self._over_time @ masks)
         return Output(estimate), PaperSsState(masks[1:], spectra[1:])
 
-    def _smooth_bins(self, mask: Array) -> Samples:
+    def _smooth_bins(self, mask: NDArray[np.bool_]) -> Samples:
         """The frequency half of the (separable) smoothing window; beyond 0 and 8 kHz the mask is 0."""
         return np.convolve(mask.astype(np.float32), self._over_bins, mode="same")
+
+
+def paper_ss(profile: Profile) -> PaperSpectralSubtraction:
+    """The engine for a calibrated robot."""
+    return PaperSpectralSubtraction(profile.response_bins(PAPER_STFT))
+
+
+def paper_ss_causal(profile: Profile) -> PaperSpectralSubtraction:
+    """The engine for a calibrated robot, with its smoothing window in the past."""
+    return PaperSpectralSubtraction(profile.response_bins(PAPER_STFT), causal=True)

@@ -14,18 +14,48 @@ from edgefilter.errors import EdgefilterError, SignalError, UsageError
 from edgefilter.filter.stepping import Stepping
 from edgefilter.filter.stream import Stream
 from edgefilter.profile.data import MAX_TAPS, Profile
-from edgefilter.types import SAMPLE_RATE, Event, Samples, as_samples
+from edgefilter.types import SAMPLE_RATE, Event, Samples, Stats, as_samples
 
 
 class EgoFilter:
     """The object to put in front of a recogniser: give it what the microphone hears and what the robot says.
 
-    profile: a Profile, the path of one, or None (then the echo path is learnt from nothing).
-    engine: a name, or "auto" for the strongest that can be made. reason: why it was chosen, for stats.
-    model: the ONNX file that a neural engine, named in engine, loads in place of its own.
-    budget_ms: compute per hop to keep to; where more is needed for long, cheaper engines take over (see Stepping), each time with
-    an event. None: the engine stays, and missed deadlines are only counted.
+    Parameters
+    ----------
+    profile : Profile, str or Path, optional
+        The calibrated robot, or the file that holds it. Without one the echo path is learnt from nothing.
+    engine : str
+        One of `edgefilter.ENGINES`, or "auto" for the strongest that can be made here.
+    budget_ms : float, optional
+        Compute per hop to keep to. Where more is needed for long, cheaper engines take over (see Stepping), each time with an event.
+        Without a budget the engine stays, and missed deadlines are only counted.
+    reason : str
+        Why an engine that was named was chosen, for `stats`.
+    model : str or Path, optional
+        The ONNX file that a neural engine, named in `engine`, loads in place of its own.
 
+    Attributes
+    ----------
+    profile : Profile or None
+        The calibrated robot, loaded.
+    engine_reason : str
+        Why this engine.
+
+    Raises
+    ------
+    UsageError
+        For an unknown engine, one that lacks its profile, or a model without an engine for it.
+    ProfileError, ModelError
+        For a file that is damaged or of another version.
+
+    Notes
+    -----
+    The path, hop by hop: alignment of the reference, a partitioned-block frequency-domain Kalman filter (Enzner & Vary 2006) that
+    subtracts the echo, the engine's mask on what is left, overlap-add (docs/architecture.md). Samples are float, full scale +-1, at
+    16 kHz, one channel. Any partition into blocks gives the same output to the last bit.
+
+    Examples
+    --------
     >>> import numpy as np
     >>> ego = EgoFilter(engine="bypass")
     >>> human = np.sin(np.arange(1000) / 10).astype(np.float32)
@@ -85,15 +115,40 @@ class EgoFilter:
         return self._stream.human_speaks
 
     def process(self, mic_block: Samples, ref_block: Samples) -> Samples:
-        """Take (n,) float samples of both channels, any n; return finished ones, aligned with the input.
+        """Take the next block of both channels and return the samples that are finished.
 
-        Raises SignalError for another shape or dtype, unequal lengths or samples that are not finite.
+        Parameters
+        ----------
+        mic_block, ref_block : ndarray of float, shape (n,)
+            What the microphone heard and what the robot said meanwhile, any n, on the same sample counter. Never written to.
+
+        Returns
+        -------
+        ndarray of float32, shape (m,)
+            Aligned with the input: sample i of all outputs together belongs to sample i of all inputs. m is 0 to n + latency.
+
+        Raises
+        ------
+        SignalError
+            For another shape or dtype, unequal lengths, samples that are not finite, or after `flush`.
         """
         return self._stream.process(mic_block, ref_block)
 
     def announce(self, utterance: Samples) -> None:
-        """Say what the robot will play next (n,) at 16 kHz; it may start at any time, or never, and several queue up.
+        """Say what the robot will play next; it may start at any time, or never, and several queue up.
 
+        Parameters
+        ----------
+        utterance : ndarray of float, shape (n,)
+            The very audio that will be played, whole, at 16 kHz.
+
+        Raises
+        ------
+        SignalError
+            For another shape or dtype, or samples that are not finite.
+
+        Notes
+        -----
         For robots without a loopback: while the reference blocks are zeros, the utterance is looked for in the microphone for
         30 s, and from about 0.1 s after its first sound on it is the reference. A reference channel that carries sound is
         believed instead, and drops what was announced. Engines that only delay the reference (paper-ss) count announcements.
@@ -102,21 +157,39 @@ class EgoFilter:
             self._stream.front.aligner.announce(as_samples(utterance, "utterance"))
 
     def events(self) -> list[Event]:
-        """What happened since the last call: realigned, speech_started, speech_stopped, overloaded, stepped_down, stepped_up."""
+        """What happened since the last call.
+
+        Returns
+        -------
+        list of Event
+            Oldest first, at most the latest 1000; see `Event` for the kinds.
+        """
         happened = list(self._stream.events)
         self._stream.events.clear()
         return happened
 
     def flush(self) -> Samples:
-        """Return the rest, so that as many samples are out as went in."""
+        """End the recording.
+
+        Returns
+        -------
+        ndarray of float32, shape (m,)
+            The rest, so that as many samples are out as went in. After it, `reset` comes before the next `process`.
+        """
         return self._stream.flush()
 
     def reset(self) -> None:
         """Start anew, as after construction."""
         self._stream.reset()
 
-    def stats(self) -> dict[str, object]:
-        """State of the path, ready for JSON: engine and why, its model, latency, samples, alignment, linear stage."""
+    def stats(self) -> Stats:
+        """State of the path.
+
+        Returns
+        -------
+        Stats
+            Ready for JSON: engine and why, its model, latency, samples, alignment, linear stage, deadlines.
+        """
         front = self._stream.front
         return {
             "engine": self.engine_name,
@@ -136,9 +209,18 @@ class EgoFilter:
         return self.profile is not None and self._stream.front.canceller is not None
 
     def adapted_profile(self) -> Profile:
-        """The profile with the echo path as the linear stage has adapted it; raises SignalError where there is none.
+        """The profile with the echo path as the linear stage has adapted it.
 
-        What of the path is longer than the linear stage is the profile's own, as loud as the volume was turned.
+        Returns
+        -------
+        Profile
+            A new one; `self.profile` stays. What of its path is longer than the linear stage is the profile's own, as loud as the
+            volume was turned.
+
+        Raises
+        ------
+        SignalError
+            Where `can_adapt` is False.
         """
         if not self.can_adapt:
             names = ", ".join(engines.HAVE_LINEAR_STAGE)
@@ -162,6 +244,35 @@ def strongest(profile: Profile | None) -> tuple[Engine, str]:
 def enhance(
     mic: Samples, ref: Samples, profile: Profile | str | Path | None = None, engine: str = "auto", model: str | Path | None = None
 ) -> Samples:
-    """Filter a whole recording (n,) with its reference (n,); the same stream as live. Returns (n,) float32."""
+    """Filter a whole recording with its reference, by the same stream as live.
+
+    Parameters
+    ----------
+    mic, ref : ndarray of float, shape (n,)
+        What the microphone heard and what the robot said, full scale +-1, 16 kHz, on the same sample counter.
+    profile, engine, model
+        As of `EgoFilter`.
+
+    Returns
+    -------
+    ndarray of float32, shape (n,)
+        The human, aligned with the input.
+
+    Raises
+    ------
+    SignalError
+        For another shape or dtype, unequal lengths, or samples that are not finite.
+    UsageError, ProfileError, ModelError
+        As of `EgoFilter`.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> robot = 0.1 * np.random.default_rng(0).standard_normal(48_000)
+    >>> heard = np.convolve(robot, [0.0] * 500 + [0.5, 0.2])[:48_000]
+    >>> left = enhance(heard, robot, engine="linear")[-16_000:]
+    >>> bool(np.mean(left**2) < 0.01 * np.mean(heard[-16_000:] ** 2))
+    True
+    """
     ego = EgoFilter(profile, engine, model=model)
     return np.concatenate((ego.process(mic, ref), ego.flush()))

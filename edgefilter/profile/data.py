@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -34,14 +35,42 @@ _ARRAYS = ("response", "noise_psd", "band_hz", "band_snr_db", "distortion_db")
 class Profile:
     """The robot's own voice at its microphone, as calibrated; checked on construction, so on load as well.
 
-    echo: the path from reference to microphone, its impulse response starting PRE_ROLL samples before the direct sound.
-    delay: index of the direct sound in the calibration recording, samples.
-    response: (601,) float32, the paper's |H_m(f) H_s(f)|, eq. (3)-(5), on GRID_HZ.
-    noise_psd: (601,) float32, one-sided power spectral density of the fan, full scale^2/Hz, on GRID_HZ.
-    band_hz: (B, 2) Hz, edges of the third-octave bands; band_snr_db: (B,) dB, the sweep's coherent part over the fan.
-    distortion_db: (4,) dB, harmonic distortion of orders 2 to 5 over the linear response (Farina 2000).
-    warnings: why and in which bands the calibration is not to be trusted. created: ISO date. source: what it was made from.
-    Raises ProfileError where a field has the wrong shape or type, is not finite or out of range.
+    Parameters
+    ----------
+    echo : EchoModel
+        The path from reference to microphone, its impulse response starting PRE_ROLL samples before the direct sound, and the effects.
+    delay : float
+        Index of the direct sound in the calibration recording, samples.
+    response : ndarray of float32, shape (601,)
+        The paper's |H_m(f) H_s(f)|, eq. (3)-(5), on GRID_HZ.
+    noise_psd : ndarray of float32, shape (601,)
+        One-sided power spectral density of the fan, full scale^2/Hz, on GRID_HZ.
+    band_hz : ndarray of float64, shape (B, 2)
+        Edges of the third-octave bands, Hz.
+    band_snr_db : ndarray of float64, shape (B,)
+        The sweep's coherent part over the fan in each band, dB.
+    distortion_db : ndarray of float64, shape (4,)
+        Harmonic distortion of orders 2 to 5 over the linear response, dB (Farina 2000).
+    sample_rate : int
+        16000.
+    warnings : tuple of str
+        Why and in which bands the calibration is not to be trusted.
+    created, source : str
+        ISO date, and what it was made from.
+
+    Raises
+    ------
+    ProfileError
+        Where a field has the wrong shape or type, is not finite or out of range.
+
+    Examples
+    --------
+    >>> flat, path = np.ones(601, np.float32), np.zeros(6400, np.float32)
+    >>> path[PRE_ROLL] = 0.5
+    >>> bands = np.array([[900.0, 1100.0]])
+    >>> profile = Profile(EchoModel(path), 300.0, flat / 2, flat * 1e-9, bands, np.array([40.0]), np.full(4, -50.0))
+    >>> round(float(profile.echo.predict(np.eye(1, 1000, dtype=np.float32)[0])[PRE_ROLL]), 3)
+    0.5
     """
 
     echo: EchoModel
@@ -63,11 +92,20 @@ class Profile:
     def save(self, path: str | Path) -> None:
         """Write one .npz atomically: the file at path is the old one or the whole new one, also on a full disk.
 
-        Raises ProfileError where it cannot be written.
+        Parameters
+        ----------
+        path : str or Path
+            Where to; arrays and JSON, no code.
 
+        Raises
+        ------
+        ProfileError
+            Where it cannot be written.
+
+        Examples
+        --------
         >>> import tempfile
         >>> flat, path = np.ones(601, np.float32), np.zeros(6400, np.float32)
-        >>> path[PRE_ROLL] = 0.5
         >>> bands = np.array([[900.0, 1100.0]])
         >>> profile = Profile(EchoModel(path), 300.0, flat / 2, flat * 1e-9, bands, np.array([40.0]), np.full(4, -50.0))
         >>> file = Path(tempfile.mkdtemp()) / "robot.npz"
@@ -89,7 +127,23 @@ class Profile:
 
     @classmethod
     def load(cls, path: str | Path) -> Profile:
-        """Read a profile that save() wrote; raises ProfileError, in one line, for any other file."""
+        """Read a profile that `save` wrote.
+
+        Parameters
+        ----------
+        path : str or Path
+            The .npz.
+
+        Returns
+        -------
+        Profile
+            Checked field by field.
+
+        Raises
+        ------
+        ProfileError
+            For any other file, in one line.
+        """
         arrays, header, effects = read_fields(Path(path))
         try:
             expected = {*_ARRAYS, "impulse_response"}, {"pre_roll", "delay", "sample_rate", "warnings", "created", "source"}
@@ -104,8 +158,9 @@ class Profile:
             warnings = header.pop("warnings")
             if not isinstance(warnings, list):
                 raise ProfileError(f"warnings is a JSON {type(warnings).__name__}, expected a list of texts; {REMEDY}")
-            echo = EchoModel(arrays.pop("impulse_response"), effects)
-            profile = cls(echo=echo, warnings=tuple(warnings), **arrays, **header)
+            fields: dict[str, Any] = {**arrays, **header}  # what type each has is checked on construction
+            echo = EchoModel(fields.pop("impulse_response"), effects)
+            profile = cls(echo=echo, warnings=tuple(warnings), **fields)
             _check_effects(profile.echo)
             return profile
         except ProfileError as error:

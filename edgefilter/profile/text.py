@@ -30,7 +30,7 @@ def describe(profile: Profile) -> str:
         *(_band_line(edges, float(snr)) for edges, snr in zip(profile.band_hz, profile.band_snr_db, strict=True)),
     ]
     for name, values in profile.echo.effects:
-        figures = ", ".join(f"{key} = array {value.shape}" if np.ndim(value) else f"{key} = {value}" for key, value in values.items())
+        figures = ", ".join(f"{key} = array {value.shape}" if isinstance(value, np.ndarray) else f"{key} = {value}" for key, value in values.items())
         lines.append(f"effect      {name}: {figures}")
     lines.extend(f"WARNING     {text}" for text in profile.warnings)
     if not profile.warnings:

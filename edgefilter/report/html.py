@@ -7,6 +7,7 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from importlib import resources
 from pathlib import Path
+from typing import Any
 
 import jinja2
 
@@ -25,14 +26,14 @@ LOUDER = 10.0
 """How much louder than the recording the residual is stored; the page turns it down to its true level, or not (20 dB)."""
 
 
-def comparison_page(found: Comparison, names: Mapping[str, object]) -> str:
+def comparison_page(found: Comparison, names: Mapping[str, Any]) -> str:
     """The page of a comparison. names: profile (None: the recording itself was taken for it), recording, reference, what the files are called."""
     profile = "The profile" if names["profile"] else "A stationary linear path made from the recording itself"
     excess = f"{profile} leaves {decibels(found.excess_db)} dB over the noise floor unexplained."
     return _page({(): found}, (), {"kind": "comparison", "headline": excess, "findings": [], "left": ""}, names)
 
 
-def diagnosis_page(profile: Profile, found: Diagnosis, recording: Samples, reference: Samples, names: Mapping[str, object]) -> str:
+def diagnosis_page(profile: Profile, found: Diagnosis, recording: Samples, reference: Samples, names: Mapping[str, Any]) -> str:
     """The page of a diagnosis, with a switch for each found effect. recording (n,), reference (m,): what was diagnosed."""
     steps = in_order(found.ranking)
     variants = compare_variants(profile, found.model, steps, recording, reference)
@@ -57,7 +58,7 @@ def _page(
     variants: Mapping[Choice, Comparison],
     steps: Sequence[Finding],
     text: Mapping[str, object],
-    names: Mapping[str, object],
+    names: Mapping[str, Any],
     irreducible_db: float | None = None,
 ) -> str:
     before, after = variants[(False,) * len(steps)], variants[(True,) * len(steps)]

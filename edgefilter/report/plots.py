@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
@@ -37,7 +38,11 @@ def plot_profile(profile: Profile, path: str | Path) -> None:
     _draw_spectra(axes[1, 0], profile)
     _draw_bands(axes[1, 1], profile)
     if profile.warnings:
-        figure.suptitle("not to be trusted: " + "; ".join(text.split(":")[0][:60] for text in profile.warnings)[:140], color=ACCENT, fontsize=9)
+        figure.suptitle(
+            "not to be trusted: " + "; ".join(text.split(":")[0][:60] for text in profile.warnings)[:140],
+            color=ACCENT,
+            fontsize=9,
+        )
     _save(figure, path)
 
 
@@ -56,7 +61,7 @@ def plot_before_after(signals: Mapping[str, Samples], path: str | Path) -> None:
     _save(figure, path)
 
 
-def _draw_spectra(axis, profile: Profile) -> None:
+def _draw_spectra(axis: Axes, profile: Profile) -> None:
     n = max(1 << 15, profile.echo.impulse_response.size)
     spectrum = np.abs(np.fft.rfft(profile.echo.impulse_response, n))
     hz = np.arange(spectrum.size) * SAMPLE_RATE / n
@@ -71,17 +76,24 @@ def _draw_spectra(axis, profile: Profile) -> None:
     _label(axis, "Response and fan", "Hz", "dB")
 
 
-def _draw_bands(axis, profile: Profile) -> None:
+def _draw_bands(axis: Axes, profile: Profile) -> None:
     low, high = profile.band_hz.T
     colours = [ACCENT if snr < 10 else SOFT for snr in profile.band_snr_db]
     axis.bar(low, profile.band_snr_db, width=high - low, align="edge", color=colours, edgecolor="white")
     axis.axhline(10, color=INK, linewidth=0.8, linestyle=":")
     axis.set_xscale("log")
-    orders = ", ".join(f"{order}: {level:.0f}" for order, level in zip(DISTORTION_ORDERS, profile.distortion_db, strict=True))
-    _label(axis, f"Signal-to-noise ratio of the sweep by third octave\nharmonic distortion by order, dB: {orders}", "Hz", "dB")
+    orders = ", ".join(
+        f"{order}: {level:.0f}" for order, level in zip(DISTORTION_ORDERS, profile.distortion_db, strict=True)
+    )
+    _label(
+        axis,
+        f"Signal-to-noise ratio of the sweep by third octave\nharmonic distortion by order, dB: {orders}",
+        "Hz",
+        "dB",
+    )
 
 
-def _label(axis, title: str, x: str, y: str) -> None:
+def _label(axis: Axes, title: str, x: str, y: str) -> None:
     axis.set_title(title, loc="left", fontsize=10)
     axis.set_xlabel(x)
     axis.set_ylabel(y)
@@ -105,4 +117,6 @@ def _save(figure: Figure, path: str | Path) -> None:
         figure.savefig(path)
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or str(error).splitlines()[0]
-        raise EdgefilterError(f"{path}: the picture cannot be written ({reason}); name a .png, .svg or .pdf file in a folder that exists") from None
+        raise EdgefilterError(
+            f"{path}: the picture cannot be written ({reason}); name a .png, .svg or .pdf file in a folder that exists"
+        ) from None

@@ -6,6 +6,7 @@ import math
 import shlex
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -59,7 +60,7 @@ def diagnosis_lines(found: Diagnosis, calibrated: bool = True) -> list[str]:
     return [*lines, f"where       it is with {profile}:", *comparison_lines(found.comparison)]
 
 
-def add_command(effect: str, names: Mapping[str, object]) -> str:
+def add_command(effect: str, names: Mapping[str, Any]) -> str:
     """What to type to have that effect in a new profile; without a profile, to have one at all."""
     if names["profile"] is None:
         return "edgefilter calibrate --live --output robot.npz"

@@ -158,7 +158,6 @@ def test_a_full_disk_is_one_line_and_leaves_a_valid_file(speech):
         (["run", "--engine", "paper-ss"], ["--profile"]),
         (["run", "--engine", "bypass", "--save-profile", "p.npz"], ["--save-profile", "(crnn, ss, linear)"]),
         (["fly"], ["fly"]),
-        ([], ["COMMAND"]),
     ],
 )
 def test_wrong_usage_is_one_line_and_exit_2(speech, arguments, words):

@@ -1,4 +1,4 @@
-"""Make edgefilter/demo_data: a SIMULATED robot that talks in a simulated room while a recorded human interrupts it.
+"""Make edgefilter/demo_data and tests/data/demo_calibration: a SIMULATED robot that talks in a simulated room while a recorded human interrupts it.
 
 python tests/data/make_demo.py --robot FIRST.flac SECOND.flac --human vm-intro.g722 --output edgefilter/demo_data
 
@@ -32,6 +32,8 @@ STARTS_S, HUMAN_START_S, TOTAL_S = (0.4, 7.6), 9.0, 16.0
 HUMAN_DB, FAN_DB = -23.0, -31.0
 """Human and fan at the microphone, relative to the robot's voice there."""
 PEAK = 0.5
+CALIBRATION = Path(__file__).parent / "demo_calibration"
+"""The recordings that the profile is made from: tests and examples read them, the package does not."""
 
 
 def main() -> None:
@@ -117,11 +119,13 @@ def active_level(x: np.ndarray) -> float:
 
 
 def write(folder: Path, files: dict[str, np.ndarray]) -> None:
-    folder.mkdir(parents=True, exist_ok=True)
+    read = {}
     for name, samples in files.items():
         assert np.abs(samples).max() < 1.0, name
-        soundfile.write(folder / f"{name}.flac", samples, RATE, subtype="PCM_16")
-    read = {name: soundfile.read(folder / f"{name}.flac", dtype="float32")[0] for name in files}
+        path = (CALIBRATION if name in ("sweep_reference", "sweep_recording", "fan") else folder) / f"{name}.flac"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        soundfile.write(path, samples, RATE, subtype="PCM_16")
+        read[name] = soundfile.read(path, dtype="float32")[0]
     profile = calibrate(
         read["sweep_reference"], read["sweep_recording"], read["fan"], source="simulated demo robot: sweep_reference, sweep_recording, fan"
     )
@@ -138,7 +142,7 @@ nonlinearity), with simulated fan noise, by `tests/data/make_demo.py` in the sou
 | file | what | licence |
 | --- | --- | --- |
 | reference.flac | the robot's two utterances as sent to its loudspeaker; neural text-to-speech rendered with Kokoro-82M | CC0 1.0 |
-| sweep_reference.flac, sweep_recording.flac, fan.flac, profile.npz | calibration of the simulated robot | CC0 1.0 |
+| profile.npz | calibration of the simulated robot, from the recordings in `tests/data/demo_calibration` of the repository | CC0 1.0 |
 | human.flac | the human alone at the microphone: a prompt in a simulated room | CC BY-SA 3.0 |
 | mic.flac | robot, human and fan at the microphone | CC BY-SA 3.0 |
 

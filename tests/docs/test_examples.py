@@ -1,0 +1,97 @@
+"""Every program in docs/examples, run as its first lines say, on recordings that the repository has."""
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import soundfile
+
+ROOT = Path(__file__).parents[2]
+EXAMPLES = ROOT / "docs/examples"
+DEMO = ROOT / "edgefilter/demo_data"
+CALIBRATION = ROOT / "tests/data/demo_calibration"
+REVERBERANT = ROOT / "tests/data/hidden/dev/11"
+"""A simulated robot that was carried into a reverberant room after its calibration."""
+RATE = 16000
+
+
+def run(name, *words, stdin=None):
+    """What the example prints, and says on standard error."""
+    done = subprocess.run(
+        [sys.executable, EXAMPLES / name, *map(str, words)], input=stdin, capture_output=True, cwd=ROOT
+    )
+    assert done.returncode == 0, done.stderr.decode()
+    return done.stdout, done.stderr.decode()
+
+
+def read(path):
+    return soundfile.read(path, dtype="float32")[0]
+
+
+def db(x):
+    return 10 * np.log10(np.mean(np.square(x, dtype=np.float64)) + 1e-12)
+
+
+@pytest.fixture(scope="module")
+def filtered(tmp_path_factory):
+    """The bundled conversation as the example for files filters it."""
+    path = tmp_path_factory.mktemp("filtered") / "human.wav"
+    said, _ = run("filter_file.py", DEMO / "mic.flac", DEMO / "reference.flac", path, DEMO / "profile.npz")
+    assert b"16.0 s filtered" in said
+    return read(path)
+
+
+def test_each_example_is_run_here_or_where_it_is_said():
+    text = Path(__file__).read_text()
+    names = {path.name for path in EXAMPLES.glob("*.py")}
+    assert len(names) >= 5 and set(re.findall(r'run\(\s*"(\w+\.py)"', text)) == names
+
+
+def test_a_file_is_filtered(filtered):
+    mic = read(DEMO / "mic.flac")
+    alone = slice(1 * RATE, 5 * RATE)
+    assert filtered.size == mic.size
+    assert db(filtered[alone]) < db(mic[alone]) - 25  # the robot alone, 20 dB over its fan and more; 45 dB were seen
+
+
+def test_blocks_through_a_pipe_give_the_same_and_tell_of_the_human(filtered):
+    stereo = np.stack(
+        [soundfile.read(DEMO / f"{name}.flac", dtype="int16")[0] for name in ("mic", "reference")], axis=1
+    )
+    out, said = run("pipe.py", DEMO / "profile.npz", stdin=stereo.astype("<i2").tobytes())
+    np.testing.assert_allclose(np.frombuffer(out, "<i2") / 32768, filtered, atol=1.01 / 32768)  # 16 bits, rounded twice
+    words = said.split()
+    assert (
+        words.count("speech_started") == 1 and 9.0 < float(words[0]) < 10.0
+    )  # the human begins in the second after 9.0 s
+
+
+def test_an_announced_utterance_is_found_and_removed(tmp_path):
+    mic, reference = read(DEMO / "mic.flac"), read(DEMO / "reference.flac")
+    soundfile.write(tmp_path / "mic.wav", mic[: 7 * RATE], RATE)
+    soundfile.write(tmp_path / "said.wav", reference[round(0.42 * RATE) : round(6.1 * RATE)], RATE)
+    said, _ = run(
+        "announce.py", tmp_path / "mic.wav", tmp_path / "said.wav", tmp_path / "human.wav", DEMO / "profile.npz"
+    )
+    assert b"heard 1 of 1" in said
+    speaking = slice(1 * RATE, 5 * RATE)
+    assert db(read(tmp_path / "human.wav")[speaking]) < db(mic[speaking]) - 25  # as above
+
+
+def test_a_calibration_gives_a_profile_with_which_the_missing_effect_is_found_and_added(tmp_path):
+    names = ("sweep_ref", "sweep_mic", "fan_only")
+    said, _ = run("calibrate.py", *(REVERBERANT / f"{name}.flac" for name in names), tmp_path / "robot.npz")
+    assert b"ms of impulse response" in said and said.count(b"dB over the fan") == 23, (
+        "23 third-octave bands from 50 Hz to 8 kHz"
+    )
+    files = (REVERBERANT / f"{name}.flac" for name in ("mic", "ref"))
+    said, _ = run("diagnose.py", tmp_path / "robot.npz", *files, tmp_path / "better.npz")
+    lines = said.decode().splitlines()
+    assert lines[1].startswith("missing") and lines[2].startswith("late_reverb: ")
+    assert (
+        float(lines[0].split()[0]) > 10 > 3 > float(lines[3].split()[-3])
+    )  # dB before and after; 15.7 and 0.0 were seen
+    assert (tmp_path / "better.npz").exists()

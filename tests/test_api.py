@@ -1,0 +1,57 @@
+"""What `from edgefilter import ...` gives, and the types that it promises."""
+
+import ast
+from pathlib import Path
+from typing import get_args
+
+import numpy as np
+import pytest
+import soundfile
+
+import edgefilter
+from edgefilter import EgoFilter, types
+
+DEMO = Path(edgefilter.__file__).parent / "demo_data"
+
+
+def test_what_a_type_checker_sees_is_what_is_there():
+    tree = ast.parse(Path(edgefilter.__file__).read_text())
+    (block,) = (node for node in tree.body if isinstance(node, ast.If))
+    seen = {alias.asname: f"{node.module}.{alias.name}" for node in block.body for alias in node.names}
+    assert set(seen) == set(edgefilter.__all__) - {"__version__"} and len(seen) >= 30
+    for name, home in seen.items():
+        module, _, original = home.rpartition(".")
+        assert original == name and f"edgefilter.{edgefilter._HOME[name]}" == module
+        value = getattr(edgefilter, name)
+        assert getattr(value, "__module__", module).startswith("edgefilter") or name.isupper()
+
+
+def test_an_unknown_name_is_an_attribute_error_and_dir_lists_the_known():
+    with pytest.raises(AttributeError, match="'edgefilter' has no attribute 'EgoFiltre'"):
+        edgefilter.EgoFiltre  # noqa: B018
+    assert set(edgefilter.__all__) <= set(dir(edgefilter))
+
+
+@pytest.mark.parametrize("engine", ["crnn", "ss", "bypass", "paper-ss"])
+def test_stats_have_the_keys_of_their_type(engine):
+    ego = EgoFilter(DEMO / "profile.npz", engine)
+    ego.process(np.zeros(4000, np.float32), np.zeros(4000, np.float32))
+    found = ego.stats()
+    assert set(found) == set(types.Stats.__annotations__)
+    assert set(found["deadline"]) == set(types.DeadlineStats.__annotations__)
+    assert (found["linear_stage"] is None) == (engine in ("bypass", "paper-ss"))
+    if found["linear_stage"]:
+        assert set(found["linear_stage"]) == set(types.LinearStageStats.__annotations__)
+    tracking = set(types.AlignmentStats.__annotations__) - {"utterances_aligned"}
+    paper = {"method", "delay_samples", "confidence", "utterances_aligned"}
+    assert (
+        set(found["alignment"] or ()) == {"crnn": tracking, "ss": tracking, "bypass": set(), "paper-ss": paper}[engine]
+    )
+
+
+def test_events_are_of_the_kinds_of_their_type():
+    mic, ref = (soundfile.read(DEMO / f"{name}.flac", dtype="float32")[0] for name in ("mic", "reference"))
+    ego = EgoFilter(DEMO / "profile.npz", "crnn")
+    ego.process(mic, ref)
+    kinds = {event.kind for event in ego.events()}
+    assert {"realigned", "speech_started"} <= kinds <= set(get_args(types.EventKind))

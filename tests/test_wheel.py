@@ -1,0 +1,96 @@
+"""What people install: the wheel, in an environment that has nothing but what the wheel asks for. Needs a package index."""
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+import venv
+import zipfile
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+BELONGINGS = ("edgefilter", "models", "pyproject.toml", "README.md", "LICENSE", "NOTICE")
+NOT_CODE = {
+    "edgefilter/py.typed",
+    "edgefilter/demo_data/LICENSE.md",
+    "edgefilter/demo_data/human.flac",
+    "edgefilter/demo_data/mic.flac",
+    "edgefilter/demo_data/profile.npz",
+    "edgefilter/demo_data/reference.flac",
+    "edgefilter/models/MODELS.md",
+    "edgefilter/models/crnn_int8.onnx",
+}
+"""All that is neither Python nor a part of the report's page: the demo's recordings, the network, their licences."""
+
+
+def clean_environment() -> dict[str, str]:
+    """The caller's, without what would let a copy of the package elsewhere be found."""
+    return {
+        name: value for name, value in os.environ.items() if name not in ("PYTHONPATH", "PYTHONHOME", "VIRTUAL_ENV")
+    }
+
+
+def run(*words: object, **options: object) -> str:
+    done = subprocess.run(
+        [str(word) for word in words], capture_output=True, text=True, env=clean_environment(), **options
+    )
+    assert done.returncode == 0, done.stdout[-2000:] + done.stderr[-2000:]
+    return done.stdout
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory):
+    """Built from a copy: a build folder left in the checkout would put files that are long gone into the wheel."""
+    source, out = tmp_path_factory.mktemp("source"), tmp_path_factory.mktemp("wheel")
+    for name in BELONGINGS:
+        if (ROOT / name).is_dir():
+            shutil.copytree(ROOT / name, source / name, ignore=shutil.ignore_patterns("__pycache__"))
+        else:
+            shutil.copy(ROOT / name, source / name)
+    run(sys.executable, "-m", "pip", "wheel", "--quiet", "--no-deps", "--wheel-dir", out, source)
+    (made,) = out.glob("*.whl")
+    return made
+
+
+@pytest.fixture(scope="module")
+def installed(wheel, tmp_path_factory):
+    """The folder of an environment's programs, with the wheel and what its extra `report` asks for."""
+    folder = tmp_path_factory.mktemp("environment")
+    venv.create(folder, with_pip=True)
+    run(folder / "bin/python", "-m", "pip", "install", "--quiet", f"{wheel}[report]")
+    return folder / "bin"
+
+
+def test_the_wheel_holds_every_module_and_nothing_that_is_not_read(wheel):
+    with zipfile.ZipFile(wheel) as archive:
+        names = {name for name in archive.namelist() if ".dist-info/" not in name}
+        licences = {Path(name).name for name in archive.namelist() if ".dist-info/licenses/" in name}
+    modules = {str(path.relative_to(ROOT)) for path in (ROOT / "edgefilter").rglob("*.py")}
+    assert len(modules) > 80 and {name for name in names if name.endswith(".py")} == modules
+    page = {name for name in names if name.startswith("edgefilter/report/") and not name.endswith(".py")}
+    assert page and names - modules - page == NOT_CODE
+    assert licences == {"LICENSE", "NOTICE", "LICENSE.md"}
+
+
+def test_the_demo_runs_from_it(installed, tmp_path):
+    run(installed / "edgefilter", "demo", "--output", tmp_path / "demo", "--json", tmp_path / "demo.json", cwd=tmp_path)
+    figures = json.loads((tmp_path / "demo.json").read_text())
+    assert (
+        figures["engine"] == "crnn" and figures["si_sdr_after_db"] > 9.0
+    )  # README: 9.5 dB; half a decibel for another processor
+    assert (tmp_path / "demo/before_after.png").stat().st_size > 10_000
+    where = run(installed / "python", "-c", "import edgefilter; print(edgefilter.__file__)", cwd=tmp_path).strip()
+    assert Path(where).is_relative_to(installed.parent)
+
+
+def test_every_public_name_can_be_had_from_it(installed, tmp_path):
+    code = "from edgefilter import *; import edgefilter; print(sum(name in globals() for name in edgefilter.__all__) - len(edgefilter.__all__))"
+    assert run(installed / "python", "-c", code, cwd=tmp_path).strip() == "0"
+
+
+def test_edgefilter_alone_shows_what_there_is(installed, tmp_path):
+    help_ = run(installed / "edgefilter", cwd=tmp_path)
+    assert help_ == run(installed / "edgefilter", "--help", cwd=tmp_path) and "calibrate" in help_
