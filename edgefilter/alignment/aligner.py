@@ -9,7 +9,7 @@ import numpy as np
 from edgefilter.alignment.announced import AHEAD, Announcements
 from edgefilter.alignment.delay_line import HALF_WIDTH, Aligned, Tape, kernel_table, read_delayed, read_line
 from edgefilter.alignment.delay_tracker import REACH, STRIDE, DelayMeter, DriftFilter, Measurement
-from edgefilter.alignment.jumps import JumpWitness
+from edgefilter.alignment.jumps import SMALL, JumpWitness
 from edgefilter.alignment.lag_search import BETWEEN, MINIMUM, WINDOW, Candidate, LagSearch
 from edgefilter.alignment.utterances import OnsetDetector, Utterance
 from edgefilter.profile.data import Profile
@@ -29,6 +29,8 @@ HEARD = 6.0
 FAINT, STRANGE, EDGE = 0.25, 10.0, 64
 """Power over what the robot brings below which and above which it is not the robot that is heard, so that no jump can be seen, and
 samples at the edge of the looks' reach at which none is believed."""
+DRIFTED = 1.5
+"""Samples of a sudden error up to which it is put down to the drift: buffers that are lost or repeated have more."""
 LOST_BLOCKS, NEARBY, NEARBY_SEARCHES = 3, 4096, 10
 """Measurements in speech without a credible peak after which all lags are searched again: at first as if the present delay had ceased
 NEARBY samples ago, which finds jumps of up to 200 ms, then as if the utterance had begun half a second before."""
@@ -203,12 +205,21 @@ class Aligner:
 
     def _switch(self, delay: float, deviation: float) -> bool:
         self._drift.restart(delay, deviation)
+        return self._switched()
+
+    def _switched(self) -> bool:
         self._known = True
         self._counts["realignments"] += 1
         self._lost, self._refuted = 0, False
         self._witness.forget()
         self._to_measure = min(self._to_measure, 2 * self.hop)
         return True
+
+    def _jump(self, offset: float) -> bool:
+        if abs(offset) > SMALL:
+            return self._switch(self._drift.delay + offset, 0.3)
+        self._drift.step(offset, 0.3)
+        return self._switched()
 
     def _measure(self) -> bool:
         """Now and then measure the error of the present delay; True if it jumped."""
@@ -228,7 +239,7 @@ class Aligner:
         if found.strength < HEARD:
             self._note_loss(found)
             return False
-        small = abs(found.offset) < 1.5 or (abs(found.offset) < 8.0 and self._drift.surprise(found) < 3.0)
+        small = abs(found.offset) < DRIFTED or (abs(found.offset) < 8.0 and self._drift.surprise(found) < 3.0)
         if small and (self._drift.surprise(found) < 5.0 or abs(found.offset) < 0.3):
             return self._accept(found)
         gain = found.gain if self._gain is None else self._gain
@@ -238,10 +249,12 @@ class Aligner:
             self._note_loss(found)
             return False
         if self._witness.convinced(found):
+            if abs(found.offset) < DRIFTED:
+                return self._accept(found)
             self._counts["jumps"] += 1
             if self._open and self._ref.end - self._drift.delay > self._open[0].start + STRIDE:
                 self._resolve()
-            return self._switch(self._drift.delay + found.offset, 0.3)
+            return self._jump(found.offset)
         self._to_measure = STRIDE // 2
         self._note_loss(found)
         return False
