@@ -31,6 +31,8 @@ UNEXPECTED = 5.0
 LEAN, LEANS, WIDER = 0.3, 1.3, 4.0
 """Weight of a look in the mean of the surprises; that mean from which on they lean to one side, three deviations of what it has by
 chance; and the factor by which the covariance is then widened."""
+BIAS = 0.2
+"""Samples by which looks err alike where the response that is supposed explains nothing of the microphone."""
 DECIDED = 30.0
 """Evidence of a look from which on its peak is the direct sound's."""
 
@@ -259,8 +261,12 @@ class DriftFilter:
         self._slope_variance -= slope * slope / spread
 
     def _noise(self, measurement: Measurement) -> float:
-        """Variance of a look; while the delay is hardly known, one that is weak may have seen another peak than the direct sound's."""
-        return measurement.variance + (1.0 if self._variance > 0.25 and measurement.evidence < DECIDED else 0.0)
+        """Variance of a look, with what its error has in common with its neighbours', which their number does not average out.
+
+        While the delay is hardly known, a weak look may also have seen another peak than the direct sound's.
+        """
+        common = BIAS**2 * (1.0 - measurement.explained)
+        return measurement.variance + common + (1.0 if self._variance > 0.25 and measurement.evidence < DECIDED else 0.0)
 
     def _widen(self, factor: float) -> None:
         """Believe less of delay and slope, by this factor of their covariance, but never less than at the start."""
