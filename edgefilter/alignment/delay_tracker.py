@@ -26,6 +26,8 @@ EARLY = (48, 400)
 
 SLOPE_DEVIATION = 150e-6
 """Standard deviation of two clocks' difference before anything is known, samples per sample."""
+STEEPEST = 600e-6
+"""Slope that is never exceeded; clocks differ by half of it."""
 UNEXPECTED = 5.0
 """Standard deviations from which on a look contradicts what is believed."""
 LEAN, LEANS, WIDER = 0.3, 1.3, 4.0
@@ -224,10 +226,11 @@ class DriftFilter:
         self._lean, self._since = 0.0, 0
 
     def step(self, offset: float, deviation: float) -> None:
-        """The delay is another one by an offset so small that a wrong slope may have brought it about since the last restart."""
+        """The delay is another one by a small offset, which a wrong slope may have brought about since the last look, or a jump."""
         wrong = offset / max(self._since, STRIDE)
+        if abs(self.slope + wrong) < STEEPEST:
+            self._slope_variance = min(self._slope_variance + wrong**2, SLOPE_DEVIATION**2)
         self.restart(self.delay + offset, deviation)
-        self._slope_variance = min(self._slope_variance + wrong**2, SLOPE_DEVIATION**2)
 
     def advance(self, samples: int) -> None:
         """Let `samples` samples pass."""
@@ -255,9 +258,10 @@ class DriftFilter:
         spread += noise
         gain = measurement.offset / spread
         self.delay += delay * gain
-        self.slope = min(max(self.slope + slope * gain, -600e-6), 600e-6)
+        self.slope = min(max(self.slope + slope * gain, -STEEPEST), STEEPEST)
         self._variance -= delay * delay / spread
         self._covariance -= delay * slope / spread
+        self._since = 0
         self._slope_variance -= slope * slope / spread
 
     def _noise(self, measurement: Measurement) -> float:
