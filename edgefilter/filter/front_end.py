@@ -85,7 +85,7 @@ class Front:
         """The linear stage's hop."""
         if aligned.realigned:
             self.canceller.rewrite_reference(self._drive.rewritten(self.aligner.history(self.canceller.history), self.hop))
-        return self.canceller.step(mic, self._drive(aligned.reference), aligned.state != "searching")
+        return self.canceller.step(mic, self._drive(aligned.reference), aligned.state in ("locked", "idle"))
 
 
 def low_cut(stft: StftConfig) -> Samples:
