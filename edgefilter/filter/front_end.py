@@ -22,7 +22,8 @@ TAPS = (2048, 8192)
 RUMBLE_HZ, RUMBLE = 80.0, 0.05
 """Below this frequency a microphone whose path nobody measured hears rooms, not people; it is lowered by 26 dB."""
 
-LOCATED = ("locked", "idle")
+UNLOCATED = ("begun", "announced")
+"""States of the alignment in which the reference may lie elsewhere than the microphone hears it: the path is not adapted."""
 
 
 class FrontEnd:
@@ -87,7 +88,7 @@ class FrontEnd:
         """The linear stage's hop."""
         if aligned.realigned:
             self.canceller.rewrite_reference(self._source.rewritten(self.aligner.history(self.canceller.history), self.hop))
-        return self.canceller.step(mic, self._source(aligned.reference), aligned.state in LOCATED)
+        return self.canceller.step(mic, self._source(aligned.reference), aligned.state not in UNLOCATED)
 
 
 def low_cut(stft: StftConfig) -> Samples:
