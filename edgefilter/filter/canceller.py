@@ -157,7 +157,7 @@ class Canceller:
         self._noise += (1.0 - memory) * fourier.power(error_spectrum)
         self._hops += 1
         heard = located and reference.dot(reference) > SILENCE * self.hop
-        if heard and not self.volume.suspected and self._limiter.may_adapt():
+        if heard and not self.volume.suspected:
             self._active += 1
             if self._limiter.changed:
                 np.maximum(self._covariance, REOPEN * fourier.power(self._weights), out=self._covariance)

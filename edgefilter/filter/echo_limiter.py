@@ -20,14 +20,14 @@ NEAR = 0.1
 ABSENT = 0.1
 """Weight below which the echo is not there at all: so much of a correlation is chance."""
 EXCESS = 1.5
-"""Smoothed error power over smoothed microphone power from which on the path is not adapted: the echo is not there."""
+"""Error power over microphone power from which on the echo is too loud for a filter that is merely not exact."""
 PATIENCE_S = 0.5
-"""Seconds of robot after which an echo that is too loud, the lag being known, is put down to the path."""
+"""Seconds after which an echo that is too loud is put down to another path."""
 
 class EchoLimiter:
     """Weighs the echo by gamma = <mic, echo> / <echo, echo>, in 0 to 1, while subtracting all of it would add power.
 
-    hop: samples per step. changed: the path must have become another one, told once for each such time.
+    hop: samples per step. changed: the path must have become another one; told in one hop each time.
     """
 
     def __init__(self, hop: int) -> None:
@@ -36,7 +36,7 @@ class EchoLimiter:
         self._patience = round(PATIENCE_S * SAMPLE_RATE / hop)
         self._smoothed = 0.0, 0.0, 0.0
         self._weights = np.ones(hop // self._part + 1, np.float32)
-        self._limited = self._excessive = False
+        self._limited = False
         self._waited = 0
         self.changed = False
 
@@ -46,7 +46,7 @@ class EchoLimiter:
         self._smoothed = tuple(MEMORY * before + (1.0 - MEMORY) * fresh for before, fresh in zip(self._smoothed, now))
         heard, cross, expected = now
         left = heard - 2.0 * cross + expected
-        self._excessive = left > EXCESS * heard
+        self._wait(left > EXCESS * heard)
         self._limited = float(self._weights[-1]) < 1.0
         self._weights[0] = self._weights[-1]
         self._weights[1:] = 1.0
@@ -62,17 +62,12 @@ class EchoLimiter:
         self._limited = bool(self._weights.min() < 1.0)
         return self._limited
 
-    def may_adapt(self) -> bool:
-        """Whether the path may be adapted by this hop's error, the lag being known."""
-        self.changed = False
-        if not self._excessive:
-            self._waited = max(self._waited - 1, 0)
-            return True
-        self._waited += 1
-        if self._waited < self._patience:
-            return False
-        self.changed, self._waited = True, 0
-        return True
+    def _wait(self, excessive: bool) -> None:
+        """Tell that the path has changed once the echo was too loud for long enough."""
+        self._waited = self._waited + 1 if excessive else max(self._waited - 1, 0)
+        self.changed = self._waited >= self._patience
+        if self.changed:
+            self._waited = 0
 
     def apply(self, echo: Samples) -> Samples:
         """The echo (hop,) with its weight, which falls at once and rises over a part."""
