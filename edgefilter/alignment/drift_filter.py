@@ -12,7 +12,7 @@ STEEPEST = 600e-6
 """Slope that is never exceeded; clocks differ by half of it."""
 UNEXPECTED = 5.0
 """Standard deviations from which on a look contradicts what is believed."""
-BIAS = 0.2
+BIAS = 0.1
 """Samples by which looks err alike where the response that is supposed explains nothing of the microphone."""
 DECIDED = 30.0
 """Evidence of a look from which on its peak is the direct sound's."""
