@@ -3,7 +3,17 @@
 import numpy as np
 import pytest
 
-from bench.simulate.alignment_scene import RATE, double_talk, fan, hear, known_path, room, run, speech_like, utterances
+from bench.simulate.alignment_scene import (
+    RATE,
+    double_talk,
+    fan,
+    hear,
+    known_path,
+    room,
+    run,
+    speech_like,
+    utterances,
+)
 from edgefilter.alignment.aligner import Aligner
 from edgefilter.alignment.delay_tracker import STRIDE, Measurement
 from edgefilter.alignment.drift_filter import DriftFilter
@@ -113,7 +123,7 @@ def test_states_tell_an_utterance_that_begins_from_one_that_is_lost_and_one_that
     mic[onsets[1] :] = 0.0  # muted before its second utterance
     hops = run(Aligner(256), mic + fan(rng, mic.size), ref)
     states = np.array([a.state for a in hops])
-    at = lambda seconds, start=0: states[int((start + seconds * RATE) // 256)]  # noqa: E731
+    at = lambda seconds, start=0: states[int((start + seconds * RATE) // 256)]
     assert states[0] == "idle" and at(0.1, onsets[0]) == "begun" and np.isnan(hops[onsets[0] // 256 + 6].delay)
     assert at(1.0, onsets[0] + lag) == "locked" and at(-0.2, onsets[1]) == "idle"
     assert at(0.1, onsets[1]) == "begun" and not np.isnan(hops[onsets[1] // 256 + 6].delay)
