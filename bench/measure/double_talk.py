@@ -1,4 +1,3 @@
-#!/usr/bin/env python3
 """Alignment while a human talks from the first second: utterances found, jumps that are none, delay errors; simulated and real.
 
     python -m bench.measure.double_talk --voices robot/val --speech human/val --real real --output bench/results/double_talk

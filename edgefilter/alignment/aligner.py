@@ -11,20 +11,13 @@ from edgefilter.alignment.delay_line import HALF_WIDTH, Aligned, Tape, kernel_ta
 from edgefilter.alignment.delay_tracker import REACH, STRIDE, DelayMeter, Measurement
 from edgefilter.alignment.drift_filter import DriftFilter
 from edgefilter.alignment.jumps import DRIFTED, SMALL, JumpWitness, judge
-from edgefilter.alignment.lag_search import BETWEEN, MINIMUM, WINDOW, Candidate, LagSearch
+from edgefilter.alignment.lag_search import BETWEEN, CERTAIN, CERTAIN_EARLY, EARLY, MINIMUM, SEEN, WINDOW, Candidate, LagSearch
 from edgefilter.alignment.utterances import OnsetDetector, Utterance
 from edgefilter.profile.data import Profile
 from edgefilter.types import PRE_ROLL, SAMPLE_RATE, Samples
 
 SEARCH_STRIDE = 768
 """Samples between two searches of the whole range."""
-CERTAIN, CERTAIN_EARLY, EARLY = 30.0, 20.0, 2432
-"""A search's strength times ratio that decides, and what does when two searches in a row find it at one lag of which at most EARLY samples
-were heard, so that a third of them were new. Beside a human as loud as the robot the true lag has a median of 40 after 60 ms, and
-150 after 150 ms; chance, in an hour of other speech while the reference played unheard, 26, and 22 early."""
-SEEN = 5.0
-"""Strength that a lag at which more than a window of the utterance must have been heard already has to show in the window before as
-well; then CERTAIN_EARLY is enough. True lags have 10 there, chance 3.3."""
 LOST_BLOCKS, NEARBY, NEARBY_SEARCHES = 3, 4096, 10
 """Measurements in speech without a credible peak after which all lags are searched again: at first as if the present delay had ceased
 NEARBY samples ago, which finds jumps of up to 200 ms, then as if the utterance had begun half a second before."""
@@ -119,12 +112,13 @@ class Aligner:
         """One of STATES."""
         if self._expected is not None:
             return "announced"
-        if any(not utterance.nearby for utterance in self._open) and (self._known or self._audible()):
-            return "begun"
-        if self._open and self._known:
-            return "lost"
+        begun = [utterance.start for utterance in self._open if not utterance.lost]
+        if begun and (self._known or self._audible()):
+            return "begun" if self._ref.end <= begun[-1] + self._max_lag + SAMPLE_RATE // 4 else "unfound"
         if not self._audible():
             return "idle"
+        if self._open and self._known:
+            return "lost"
         return "unfound" if self._missed or not self._known else "locked"
 
     def _audible(self) -> bool:
@@ -278,7 +272,7 @@ class Aligner:
         if self._lost >= LOST_BLOCKS:
             self._lost = 0
             self._trusted = False
-            self._open.append(Utterance(self._ref.end, self._ref.end, nearby=NEARBY_SEARCHES))
+            self._open.append(Utterance(self._ref.end, self._ref.end, nearby=NEARBY_SEARCHES, lost=True))
 
     def _deliver(self, mic: Samples, before: float, switched: bool) -> Aligned:
         if not self._known:

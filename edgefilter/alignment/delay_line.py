@@ -21,7 +21,7 @@ class Aligned(NamedTuple):
     "idle": nothing of the reference can be audible.
     "announced": an utterance that was announced is waited for; it may begin at any time or never.
     "begun": an utterance of the robot has begun and is not found yet; delay is the one of the utterance before, or nan.
-    "unfound": it went by without being found, so that its lag is uncertain; delay is an earlier one's, or nan.
+    "unfound": it should have been heard by now, whatever its lag, and was not found: the lag is uncertain, delay as in "begun".
     "lost": it was found, but the last looks did not see it, beside a loud human or after a jump; delay is carried on, with its drift.
     "locked": it was found and its delay is followed.
     """

@@ -12,10 +12,7 @@ STEEPEST = 600e-6
 """Slope that is never exceeded; clocks differ by half of it."""
 UNEXPECTED = 5.0
 """Standard deviations from which on a look contradicts what is believed."""
-LEAN, LEANS, WIDER = 0.3, 1.3, 4.0
-"""Weight of a look in the mean of the surprises; that mean from which on they lean to one side, three deviations of what it has by
-chance; and the factor by which the covariance is then widened."""
-BIAS = 0.2
+BIAS = 0.1
 """Samples by which looks err alike where the response that is supposed explains nothing of the microphone."""
 DECIDED = 30.0
 """Evidence of a look from which on its peak is the direct sound's."""
@@ -24,15 +21,15 @@ DECIDED = 30.0
 class DriftFilter:
     """Kalman filter over the delay (samples) and its slope (samples per sample), constant-slope model.
 
-    What a look claims of its own accuracy does not hold while a human talks as well or the response is still being learnt: the errors
-    of successive looks then agree. So the filter watches whether its surprises lean to one side, and while they do it widens
-    what it believes (fading memory, Sorenson & Sacks 1971), instead of insisting on a slope that a few looks gave it.
+    What a look claims of its own accuracy does not hold while a human talks as well or the response is still being learnt: looks
+    close to one another then err alike. So they weigh less the less they explain, and where looks that agree contradict what is
+    believed, belief is widened until it can follow them (fading memory, Sorenson & Sacks 1971).
     """
 
     def __init__(self) -> None:
         self.delay, self.slope = float("nan"), 0.0
         self._variance, self._covariance, self._slope_variance = 4.0, 0.0, SLOPE_DEVIATION**2
-        self._lean, self._since = 0.0, 0
+        self._since = 0
 
     @property
     def deviation(self) -> float:
@@ -43,7 +40,7 @@ class DriftFilter:
         """Another delay, known to +-deviation samples; the slope stays, the clocks are the same."""
         self.delay = delay
         self._variance, self._covariance = deviation**2, 0.0
-        self._lean, self._since = 0.0, 0
+        self._since = 0
 
     def step(self, offset: float, deviation: float) -> None:
         """The delay is another one by a small offset, which a wrong slope may have brought about since the last look, or a jump."""
@@ -68,12 +65,8 @@ class DriftFilter:
         """Take in a measured offset, which holds for the middle of its frame."""
         noise, spread = self._noise(measurement), self._expected()[2]
         surprise = measurement.offset / math.sqrt(spread + noise)
-        self._lean += LEAN * (min(max(surprise, -UNEXPECTED), UNEXPECTED) - self._lean)
         if abs(surprise) > UNEXPECTED:
             self._widen((measurement.offset**2 - noise) / spread)
-        elif abs(self._lean) > LEANS:
-            self._widen(WIDER)
-            self._lean = 0.0
         delay, slope, spread = self._expected()
         spread += noise
         gain = measurement.offset / spread
