@@ -21,7 +21,7 @@ from tqdm import tqdm
 
 from edgefilter.dsp.stft import StftConfig
 from edgefilter.engines.linear import Linear
-from edgefilter.filter.front_end import Front
+from edgefilter.filter.front_end import FrontEnd
 from edgefilter.profile.data import Profile
 from edgefilter.types import Samples
 from export.corpus import Corpus, read_corpus
@@ -33,7 +33,7 @@ ROOMS = {"lab": 80, "office": 120}
 
 def linear_stage(conversation: Conversation, stft: StftConfig) -> tuple[Samples, Samples]:
     """The aligned reference and the linear stage's error, (n,) each, n a multiple of the hop: the runtime's own front."""
-    front = Front(Linear(stft), conversation.profile)
+    front = FrontEnd(Linear(stft), conversation.profile)
     hop, references, errors = stft.hop, [], []
     for at in range(0, conversation.mic.size - hop + 1, hop):
         reference, error = front.signals(conversation.mic[at : at + hop], conversation.reference[at : at + hop])

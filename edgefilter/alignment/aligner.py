@@ -8,27 +8,16 @@ import numpy as np
 
 from edgefilter.alignment.announced import AHEAD, Announcements
 from edgefilter.alignment.delay_line import HALF_WIDTH, Aligned, Tape, kernel_table, read_delayed, read_line
-from edgefilter.alignment.delay_tracker import REACH, STRIDE, DelayMeter, DriftFilter, Measurement
-from edgefilter.alignment.jumps import JumpWitness
-from edgefilter.alignment.lag_search import BETWEEN, MINIMUM, WINDOW, Candidate, LagSearch
+from edgefilter.alignment.delay_tracker import REACH, STRIDE, DelayMeter, Measurement
+from edgefilter.alignment.drift_filter import DriftFilter
+from edgefilter.alignment.jumps import DRIFTED, SMALL, JumpWitness, judge
+from edgefilter.alignment.lag_search import BETWEEN, CERTAIN, CERTAIN_EARLY, EARLY, MINIMUM, SEEN, WINDOW, Candidate, LagSearch
 from edgefilter.alignment.utterances import OnsetDetector, Utterance
 from edgefilter.profile.data import Profile
 from edgefilter.types import PRE_ROLL, SAMPLE_RATE, Samples
 
 SEARCH_STRIDE = 768
 """Samples between two searches of the whole range."""
-CERTAIN, CERTAIN_EARLY, EARLY = 30.0, 20.0, 2432
-"""A search's strength times ratio that decides, and what does when two searches in a row find it at one lag of which at most EARLY samples
-were heard, so that a third of them were new. Beside a human as loud as the robot the true lag has a median of 40 after 60 ms, and
-150 after 150 ms; chance, in an hour of other speech while the reference played unheard, 26, and 22 early."""
-SEEN = 5.0
-"""Strength that a lag at which more than a window of the utterance must have been heard already has to show in the window before as
-well; then CERTAIN_EARLY is enough. True lags have 10 there, chance 3.3."""
-HEARD = 6.0
-"""Strength of the tracker's peak over the rms of +-REACH lags from which a measurement counts."""
-FAINT, STRANGE, EDGE = 0.25, 10.0, 64
-"""Power over what the robot brings below which and above which it is not the robot that is heard, so that no jump can be seen, and
-samples at the edge of the looks' reach at which none is believed."""
 LOST_BLOCKS, NEARBY, NEARBY_SEARCHES = 3, 4096, 10
 """Measurements in speech without a credible peak after which all lags are searched again: at first as if the present delay had ceased
 NEARBY samples ago, which finds jumps of up to 200 ms, then as if the utterance had begun half a second before."""
@@ -73,7 +62,7 @@ class Aligner:
         self._witness, self._segments = JumpWitness(), 0
         self._to_search, self._to_measure, self._stage = SEARCH_STRIDE, STRIDE // 2, 0
         self._gain: float | None = None
-        self._known = self._refuted = self._trusted = self._measured = False
+        self._known = self._refuted = self._trusted = self._measured = self._missed = False
         self._confidence, self._lost = 0.0, 0
         self._counts = {"utterances": 0, "realignments": 0, "jumps": 0, "searches": 0, "announced": 0, "announced_heard": 0}
 
@@ -120,27 +109,35 @@ class Aligner:
         return {**found, "ppm": round(-1e6 * self._drift.slope, 2), "confidence": round(self._confidence, 3)}
 
     def _state(self) -> str:
-        current = self._onsets.current
+        """One of STATES."""
         if self._expected is not None:
-            return "searching"
-        audible = self._max_lag if not self._known else int(self._drift.delay) + SAMPLE_RATE // 4
-        if self._open and (self._known or current.end + audible > self._ref.end):
-            return "searching"
-        if current is None or current.end + audible < self._ref.end:
+            return "announced"
+        begun = [utterance.start for utterance in self._open if not utterance.lost]
+        if begun and (self._known or self._audible()):
+            return "begun" if self._ref.end <= begun[-1] + self._max_lag + SAMPLE_RATE // 4 else "unfound"
+        if not self._audible():
             return "idle"
-        return "locked" if self._known else "searching"
+        if self._open and self._known:
+            return "lost"
+        return "unfound" if self._missed or not self._known else "locked"
+
+    def _audible(self) -> bool:
+        """Whether something of the reference can still be heard."""
+        reach = self._max_lag if not self._known else int(self._drift.delay) + SAMPLE_RATE // 4
+        return self._onsets.current is not None and self._onsets.current.end + reach >= self._ref.end
 
     def _expire(self) -> None:
         """Give up utterances that would have been heard by now."""
         end = self._open[1].start if len(self._open) > 1 else self._onsets.current.end
         if self._ref.end > end + self._max_lag + SAMPLE_RATE // 4:
             self._resolve(found=False)
+            self._missed = True
 
     def _resolve(self, found: bool = True) -> None:
         self._open.popleft()
         self._trusted = found
         self._stage = 0
-        self._refuted = False
+        self._refuted = self._missed = False
 
     def _search(self) -> bool:
         """Look for the oldest unresolved utterance, or one that was announced, a step each hop; True if the delay was switched."""
@@ -203,9 +200,12 @@ class Aligner:
 
     def _switch(self, delay: float, deviation: float) -> bool:
         self._drift.restart(delay, deviation)
+        return self._switched()
+
+    def _switched(self) -> bool:
         self._known = True
         self._counts["realignments"] += 1
-        self._lost, self._refuted = 0, False
+        self._lost, self._refuted, self._missed = 0, False, False
         self._witness.forget()
         self._to_measure = min(self._to_measure, 2 * self.hop)
         return True
@@ -225,32 +225,35 @@ class Aligner:
         return found is not None and self._judge(found)
 
     def _judge(self, found: Measurement) -> bool:
-        if found.strength < HEARD:
-            self._note_loss(found)
-            return False
-        small = abs(found.offset) < 1.5 or (abs(found.offset) < 8.0 and self._drift.surprise(found) < 3.0)
-        if small and (self._drift.surprise(found) < 5.0 or abs(found.offset) < 0.3):
+        """Take a look into account; True if the delay was switched."""
+        reach = (2 * self._segments + 1) * REACH
+        verdict = judge(found, self._drift.surprise(found), found.gain if self._gain is None else self._gain, reach)
+        if verdict == "there":
             return self._accept(found)
-        gain = found.gain if self._gain is None else self._gain
-        if found.gain > STRANGE * gain:
+        if verdict == "drowned":
             return False
-        if not FAINT < found.gain_there / gain < STRANGE or abs(found.offset) > (2 * self._segments + 1) * REACH - EDGE:
-            self._note_loss(found)
-            return False
-        if self._witness.convinced(found):
-            self._counts["jumps"] += 1
-            if self._open and self._ref.end - self._drift.delay > self._open[0].start + STRIDE:
-                self._resolve()
-            return self._switch(self._drift.delay + found.offset, 0.3)
-        self._to_measure = STRIDE // 2
+        if verdict == "elsewhere":
+            if self._witness.convinced(found):
+                return self._accept(found) if abs(found.offset) < DRIFTED else self._jump(found.offset)
+            self._to_measure = STRIDE // 2
         self._note_loss(found)
         return False
+
+    def _jump(self, offset: float) -> bool:
+        """The delay has jumped by offset."""
+        self._counts["jumps"] += 1
+        if self._open and self._ref.end - self._drift.delay > self._open[0].start + STRIDE:
+            self._resolve()
+        if abs(offset) > SMALL:
+            return self._switch(self._drift.delay + offset, 0.3)
+        self._drift.step(offset, 0.3)
+        return self._switched()
 
     def _accept(self, found: Measurement) -> bool:
         step = self._drift.delay
         self._drift.correct(found)
         self._meter.confirm(found.offset)
-        self._lost = 0
+        self._lost, self._missed = 0, False
         self._witness.forget()
         self._confidence += 0.2 * (found.explained - self._confidence)
         self._gain = found.gain if self._gain is None else self._gain + 0.1 * (min(found.gain, 2 * self._gain) - self._gain)
@@ -269,7 +272,7 @@ class Aligner:
         if self._lost >= LOST_BLOCKS:
             self._lost = 0
             self._trusted = False
-            self._open.append(Utterance(self._ref.end, self._ref.end, nearby=NEARBY_SEARCHES))
+            self._open.append(Utterance(self._ref.end, self._ref.end, nearby=NEARBY_SEARCHES, lost=True))
 
     def _deliver(self, mic: Samples, before: float, switched: bool) -> Aligned:
         if not self._known:

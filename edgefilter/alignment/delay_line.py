@@ -16,8 +16,14 @@ class Aligned(NamedTuple):
 
     reference: (hop,) float32, delayed so that the robot's direct sound lies PRE_ROLL samples behind it; zeros while no delay is
     known. delay: samples, total delay of the direct sound at the end of the hop, nan if unknown. ppm: by how much the delay
-    shrinks, 1e-6 samples per sample. confidence: 0 to 1. state: "idle" (nothing of the reference can be audible), "searching",
-    "locked". realigned: the delay was switched discontinuously in this hop.
+    shrinks, 1e-6 samples per sample. confidence: 0 to 1. realigned: the delay was switched discontinuously in this hop.
+    state: what is known of the utterance that may be heard now:
+    "idle": nothing of the reference can be audible.
+    "announced": an utterance that was announced is waited for; it may begin at any time or never.
+    "begun": an utterance of the robot has begun and is not found yet; delay is the one of the utterance before, or nan.
+    "unfound": it should have been heard by now, whatever its lag, and was not found: the lag is uncertain, delay as in "begun".
+    "lost": it was found, but the last looks did not see it, beside a loud human or after a jump; delay is carried on, with its drift.
+    "locked": it was found and its delay is followed.
     """
 
     reference: Samples

@@ -1,4 +1,4 @@
-"""Fine tracking of one delay: sub-sample error from the cross-spectrum, a Kalman filter over (delay, drift), jumps."""
+"""Looks at one delay: its sub-sample error from the cross-spectrum, and where else within reach the robot may be."""
 
 from __future__ import annotations
 
@@ -175,53 +175,6 @@ class DelayMeter:
         self._total = np.add.reduce(self._power)
         self._cross = self._blocks * smooth * self._prior * np.float32(scale)
         self.response = self._prior * np.float32(scale)
-
-
-class DriftFilter:
-    """Kalman filter over the delay (samples) and its slope (samples per sample), constant-slope model."""
-
-    def __init__(self) -> None:
-        self.delay, self.slope = float("nan"), 0.0
-        self._variance, self._covariance, self._slope_variance = 4.0, 0.0, (150e-6) ** 2
-
-    @property
-    def deviation(self) -> float:
-        """Standard deviation of the delay, samples."""
-        return math.sqrt(self._variance)
-
-    def restart(self, delay: float, deviation: float) -> None:
-        """Another delay, known to +-deviation samples; the slope stays, the clocks are the same."""
-        self.delay = delay
-        self._variance, self._covariance = deviation**2, 0.0
-
-    def advance(self, samples: int) -> None:
-        """Let `samples` samples pass."""
-        self.delay += self.slope * samples
-        self._variance += samples * (2.0 * self._covariance + samples * self._slope_variance) + 1e-6 * samples / STRIDE
-        self._covariance += samples * self._slope_variance
-        self._slope_variance += (0.15e-6) ** 2 * samples / STRIDE
-
-    def surprise(self, measurement: Measurement) -> float:
-        """The measured offset in standard deviations of what was to be expected."""
-        return abs(measurement.offset) / math.sqrt(self._expected()[2] + measurement.variance)
-
-    def correct(self, measurement: Measurement) -> None:
-        """Take in a measured offset, which holds for the middle of its frame."""
-        delay, slope, spread = self._expected()
-        gain = measurement.offset / (spread + measurement.variance)
-        self.delay += delay * gain
-        self.slope = min(max(self.slope + slope * gain, -600e-6), 600e-6)
-        spread += measurement.variance
-        self._variance -= delay * delay / spread
-        self._covariance -= delay * slope / spread
-        self._slope_variance -= slope * slope / spread
-
-    def _expected(self) -> tuple[float, float, float]:
-        """Covariance of the offset in the middle of the frame with the delay, with the slope, and its variance."""
-        half = FRAME / 2.0
-        delay = self._variance - half * self._covariance
-        slope = self._covariance - half * self._slope_variance
-        return delay, slope, delay - half * slope
 
 
 def _highest(likelihood: Samples, reach: int) -> tuple[int, float, float, float]:

@@ -1,4 +1,4 @@
-"""When a jump of the delay is believed: looks of the tracker that agree add up their evidence."""
+"""What one look of the tracker says, and when a jump is believed: looks that agree add up their evidence."""
 
 from __future__ import annotations
 
@@ -13,6 +13,34 @@ AGREE = 0.7
 """Samples within which two looks see the same jump."""
 FORGET = 0.7
 """What is left of a suspicion after a look that saw another jump."""
+HEARD = 6.0
+"""Strength of the tracker's peak over the rms of +-REACH lags from which a look counts."""
+FAINT, STRANGE, EDGE = 0.25, 10.0, 64
+"""Power over what the robot brings below which and above which it is not the robot that is heard, so that no jump can be seen, and
+samples at the edge of the looks' reach at which none is believed."""
+DRIFTED = 1.5
+"""Samples of a sudden error up to which it is put down to the drift: buffers that are lost or repeated have more."""
+EXPECTED, UNLIKELY, TINY = 3.0, 5.0, 0.3
+"""Surprise, in standard deviations, up to which an error of up to SMALL samples is drift, and one of up to DRIFTED; and samples of
+error that are drift whatever the surprise."""
+
+
+def judge(found: Measurement, surprise: float, gain: float, reach: int) -> str:
+    """Whether a look saw the robot where it was expected.
+
+    "there": it did. "elsewhere": it saw it at another delay, if others agree. "unseen": not at all. "drowned": somebody louder hid it.
+    surprise: of its offset, in standard deviations. gain: power that the robot has brought so far. reach: samples on each side.
+    """
+    size = abs(found.offset)
+    if found.strength < HEARD:
+        return "unseen"
+    if (size < DRIFTED and (surprise < UNLIKELY or size < TINY)) or (size < SMALL and surprise < EXPECTED):
+        return "there"
+    if found.gain > STRANGE * gain:
+        return "drowned"
+    if not FAINT < found.gain_there / gain < STRANGE or size > reach - EDGE:
+        return "unseen"
+    return "elsewhere"
 
 
 class JumpWitness:

@@ -83,7 +83,7 @@ class PaperAligner:
         known = self._delay is not None
         now = self._ref.end
         out = self._ref.read(now - self.hop - self._delay, now - self._delay).copy() if known else np.zeros(self.hop, np.float32)
-        state = "searching" if self._onset is not None else "locked" if known else "idle"
+        state = "begun" if self._onset is not None else "locked" if known else "idle"
         return Aligned(out, float(self._delay) if known else float("nan"), 0.0, self._confidence, state, self._delay != before)
 
     def history(self, count: int) -> Samples:

@@ -19,12 +19,14 @@ class Utterance:
     """A stretch of speech in the reference, positions in samples; start lies up to two hops before the first sound.
 
     after: end of the one before it, which the microphone hears out first, since one loudspeaker plays them in turn.
-    nearby: searches left that suppose it to have jumped a short while ago, its start moving along; 0 for one that began."""
+    lost: whether it is one that was followed and is looked for again, not one that began; nearby: searches left that suppose
+    it to have jumped a short while ago, its start moving along."""
 
     start: int
     end: int
     after: int = -(10**9)
     nearby: int = 0
+    lost: bool = False
 
 
 class OnsetDetector:

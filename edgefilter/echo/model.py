@@ -10,7 +10,7 @@ import scipy
 from edgefilter.echo.effect import RECORDING, complete, fitted
 from edgefilter.echo.effects.catalogue import chain, find
 from edgefilter.echo.measurement import Measurement, Values
-from edgefilter.echo.source_chain import Driver
+from edgefilter.echo.source_chain import SourceChain
 from edgefilter.types import SAMPLE_RATE, Array, Samples
 
 TAIL = 12800
@@ -45,9 +45,9 @@ class EchoModel:
                 x = effect.apply(x, values, SAMPLE_RATE)
         return tuple((effect.variance(x, values, SAMPLE_RATE), effect.colour(values)) for effect, values in noisy)
 
-    def driver(self) -> Driver:
+    def source_chain(self) -> SourceChain:
         """What the running filter puts the reference through, hop by hop, before the path: the source effects with a short memory."""
-        return Driver(self.effects)
+        return SourceChain(self.effects)
 
     def running_response(self) -> Samples:
         """(taps,) the path with all stationary linear effects folded in, as after the last change: what the running filter starts from."""

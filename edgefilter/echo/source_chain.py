@@ -11,7 +11,7 @@ from edgefilter.echo.measurement import Values
 from edgefilter.types import SAMPLE_RATE, Samples
 
 
-class Driver:
+class SourceChain:
     """Applies the source effects of a model to successive blocks; those with a memory also see what came before a block.
 
     effects: (name, values). Left out is what needs more of the past than a filter can look back at every hop, as a compressor with its

@@ -11,7 +11,7 @@ from edgefilter.types import Frame, Output, Spectrum
 EngineState: TypeAlias = Any
 """Whatever an engine needs between frames; it is made by initial_state and never shared between streams."""
 
-Front: TypeAlias = Literal["none", "paper", "full"]
+FrontEndKind: TypeAlias = Literal["none", "paper", "full"]
 """What runs before the engine: nothing, the paper's per-utterance alignment, or tracking alignment and the linear stage."""
 
 
@@ -44,7 +44,7 @@ class ClipEngine(Protocol):
     """Needs the whole recording before it can answer any of it; the stream then gives everything at flush."""
 
     name: ClassVar[str]
-    front: ClassVar[Front]
+    front: ClassVar[FrontEndKind]
     stft: StftConfig
     lookahead: None
     longest: int

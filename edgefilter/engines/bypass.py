@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import ClassVar
 
 from edgefilter.dsp.stft import StftConfig
-from edgefilter.engines.base import EngineState, Front
+from edgefilter.engines.base import EngineState, FrontEndKind
 from edgefilter.types import Frame, Output
 
 
@@ -13,7 +13,7 @@ class Bypass:
     """Returns the microphone."""
 
     name: ClassVar[str] = "bypass"
-    front: ClassVar[Front] = "none"
+    front: ClassVar[FrontEndKind] = "none"
 
     def __init__(self, stft: StftConfig = StftConfig()) -> None:
         self.stft = stft

@@ -9,7 +9,7 @@ from typing import ClassVar, TypeAlias
 
 import numpy as np
 
-from edgefilter.engines.base import Front
+from edgefilter.engines.base import FrontEndKind
 from edgefilter.engines.onnx_session import FixedPlaces, expect_slots, find_model, open_model
 from edgefilter.engines.spectral_subtraction import SpectralSubtraction
 from edgefilter.types import Frame, Output, Samples, Spectrum
@@ -36,7 +36,7 @@ class Crnn:
     """
 
     name: ClassVar[str] = "crnn"
-    front: ClassVar[Front] = "full"
+    front: ClassVar[FrontEndKind] = "full"
 
     def __init__(self, model: str | Path | None = None, wiener_share: float = WIENER_SHARE) -> None:
         path = find_model(model, VARIABLE, "crnn_int8.onnx", "make one with 'python -m export.onnx_export --int8'")

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, ClassVar, cast
 import numpy as np
 
 from edgefilter import engines
-from edgefilter.engines.base import Engine, EngineState, Front
+from edgefilter.engines.base import Engine, EngineState, FrontEndKind
 from edgefilter.errors import EdgefilterError, UsageError
 from edgefilter.types import Frame, Output
 
@@ -60,7 +60,7 @@ class Ladder:
                 raise UsageError(f"engines {rungs[0].name} and {rung.name} cannot take turns: their STFTs or fronts differ")
         self.rungs = tuple(rungs)
         self.stft = rungs[0].stft
-        self.front: Front = rungs[0].front
+        self.front: FrontEndKind = rungs[0].front
         self.lookahead = max(rung.lookahead for rung in rungs)
         self.wanted = 0
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import ClassVar
 
 from edgefilter.dsp.stft import StftConfig
-from edgefilter.engines.base import EngineState, Front
+from edgefilter.engines.base import EngineState, FrontEndKind
 from edgefilter.types import Frame, Output
 
 
@@ -13,7 +13,7 @@ class Linear:
     """Returns the linear stage's error: nothing is masked, so the human is not distorted and the fan stays."""
 
     name: ClassVar[str] = "linear"
-    front: ClassVar[Front] = "full"
+    front: ClassVar[FrontEndKind] = "full"
 
     def __init__(self, stft: StftConfig = StftConfig()) -> None:
         self.stft = stft

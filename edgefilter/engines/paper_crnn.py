@@ -8,7 +8,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from edgefilter.engines.base import Front
+from edgefilter.engines.base import FrontEndKind
 from edgefilter.engines.onnx_session import expect_slots, find_model, open_model
 from edgefilter.engines.paper_ss import PAPER_STFT
 from edgefilter.errors import ModelError
@@ -28,7 +28,7 @@ class PaperCrnn:
     """
 
     name: ClassVar[str] = "paper-crnn"
-    front: ClassVar[Front] = "paper"
+    front: ClassVar[FrontEndKind] = "paper"
     stft = PAPER_STFT
     lookahead = None
     longest = MAX_SECONDS * SAMPLE_RATE // PAPER_STFT.hop

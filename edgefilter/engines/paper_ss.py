@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy import signal
 
 from edgefilter.dsp.stft import StftConfig
-from edgefilter.engines.base import Front
+from edgefilter.engines.base import FrontEndKind
 from edgefilter.errors import UsageError
 from edgefilter.types import Array, Frame, Output, Samples, Spectrum
 
@@ -60,7 +60,7 @@ class PaperSpectralSubtraction:
     """
 
     name: ClassVar[str] = "paper-ss"
-    front: ClassVar[Front] = "paper"
+    front: ClassVar[FrontEndKind] = "paper"
     stft = PAPER_STFT
 
     def __init__(self, response: Samples, alpha: float = 4.0, beta: float = 1.0, causal: bool = False) -> None:

@@ -7,7 +7,7 @@ from typing import ClassVar
 import numpy as np
 
 from edgefilter.dsp.stft import StftConfig
-from edgefilter.engines.base import Front
+from edgefilter.engines.base import FrontEndKind
 from edgefilter.types import Frame, Output, Samples
 
 FLOOR = 0.18
@@ -23,7 +23,7 @@ class SpectralSubtraction:
     """
 
     name: ClassVar[str] = "ss"
-    front: ClassVar[Front] = "full"
+    front: ClassVar[FrontEndKind] = "full"
 
     def __init__(self, stft: StftConfig = StftConfig()) -> None:
         self.stft = stft

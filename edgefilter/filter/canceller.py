@@ -29,6 +29,8 @@ VOLUME_REOPENS = 0.02
 """Variance of a path whose volume was turned, relative to its power: the factor is not known exactly."""
 REOPEN = 0.3
 """Variance, relative to its power, of a path that is found to be another one."""
+AGED_ROWS = 4
+"""Partitions whose process noise is worked out anew in a hop, in turn: a path's power changes slowly."""
 SILENCE = 1e-10
 """Mean reference power, full scale^2, below which the path is neither adapted nor allowed to age."""
 
@@ -119,6 +121,7 @@ class Canceller:
         fourier.rfft(self._blocks, out=self._weights)
         product_variance = np.broadcast_to(PRODUCT_VARIANCE * self._path_power(), (products, bins))
         self._covariance = np.concatenate((self._prior(), product_variance)).astype(np.float32)
+        self._ageing, self._aged = (1.0 - self.adaptation.transition**2) * fourier.power(self._weights), 0
         self._recent = np.zeros((self._channels, 2 * hop), np.float32)
         self._all_spectra, self._all_powers = np.zeros((2 * shape[0], bins), np.complex64), np.zeros((2 * shape[0], bins), np.float32)
         self._slide(to=shape[0])
@@ -154,7 +157,7 @@ class Canceller:
         self._noise += (1.0 - memory) * fourier.power(error_spectrum)
         self._hops += 1
         heard = located and reference.dot(reference) > SILENCE * self.hop
-        if heard and not self.volume.suspected and self._limiter.may_adapt():
+        if heard and not self.volume.suspected:
             self._active += 1
             if self._limiter.changed:
                 np.maximum(self._covariance, REOPEN * fourier.power(self._weights), out=self._covariance)
@@ -206,11 +209,14 @@ class Canceller:
         fourier.irfft(work, 2 * self.hop, out=blocks)
         blocks[:, self.hop :] = 0.0  # each partition keeps to hop taps (Shynk 1992)
         self._weights += fourier.rfft(blocks, out=work)
-        expected *= -self.adaptation.certainty * divisor
-        expected += 1.0
+        kept = self.adaptation.transition**2
+        expected *= (-self.adaptation.certainty * kept) * divisor
+        expected += kept
         self._covariance *= expected
-        self._covariance *= self.adaptation.transition**2
-        self._covariance += (1.0 - self.adaptation.transition**2) * fourier.power(self._weights)
+        aged = slice(self._aged, self._aged + AGED_ROWS)
+        self._ageing[aged] = (1.0 - kept) * fourier.power(self._weights[aged])
+        self._aged = aged.stop if aged.stop < len(self._weights) else 0
+        self._covariance += self._ageing
 
     def _path_power(self) -> np.ndarray:
         """(bins,) |H|^2 of the path at the start, summed over partitions; 1 where nothing is known."""

@@ -15,17 +15,19 @@ PART = 64
 GROSS = 4.0
 """Power of such a part's error over the microphone's, from which on it is limited whatever the smoothed powers say: human and robot
 cancel one another in the microphone by so much in hardly any part."""
+NEAR = 0.1
+"""Power of a hop's error over the microphone's up to which no part of it is looked at: whatever is too loud there is 10 dB lower."""
 ABSENT = 0.1
 """Weight below which the echo is not there at all: so much of a correlation is chance."""
 EXCESS = 1.5
-"""Smoothed error power over smoothed microphone power from which on the path is not adapted: the echo is not there."""
+"""Error power over microphone power from which on the echo is too loud for a filter that is merely not exact."""
 PATIENCE_S = 0.5
-"""Seconds of robot after which an echo that is too loud, the lag being known, is put down to the path."""
+"""Seconds after which an echo that is too loud is put down to another path."""
 
 class EchoLimiter:
     """Weighs the echo by gamma = <mic, echo> / <echo, echo>, in 0 to 1, while subtracting all of it would add power.
 
-    hop: samples per step. changed: the path must have become another one, told once for each such time.
+    hop: samples per step. changed: the path must have become another one; told in one hop each time.
     """
 
     def __init__(self, hop: int) -> None:
@@ -34,7 +36,8 @@ class EchoLimiter:
         self._patience = round(PATIENCE_S * SAMPLE_RATE / hop)
         self._smoothed = 0.0, 0.0, 0.0
         self._weights = np.ones(hop // self._part + 1, np.float32)
-        self._excessive, self._waited = False, 0
+        self._limited = False
+        self._waited = 0
         self.changed = False
 
     def measure(self, mic: Samples, echo: Samples) -> bool:
@@ -43,9 +46,12 @@ class EchoLimiter:
         self._smoothed = tuple(MEMORY * before + (1.0 - MEMORY) * fresh for before, fresh in zip(self._smoothed, now))
         heard, cross, expected = now
         left = heard - 2.0 * cross + expected
-        self._excessive = left > EXCESS * heard
+        self._wait(left > EXCESS * heard)
+        self._limited = float(self._weights[-1]) < 1.0
         self._weights[0] = self._weights[-1]
         self._weights[1:] = 1.0
+        if left <= NEAR * heard:
+            return self._limited
         if left > heard and self._smoothed[2] > 2.0 * self._smoothed[1]:
             self._weights[1:] = _weight(cross / expected)
         m, e = mic.reshape(-1, self._part), echo.reshape(-1, self._part)
@@ -53,23 +59,19 @@ class EchoLimiter:
         gross = heard - 2.0 * cross + expected > GROSS * heard
         if gross.any():
             self._weights[1:][gross] = np.minimum(self._weights[1:][gross], _weight(cross[gross] / expected[gross]))
-        return bool(self._weights.min() < 1.0)
+        self._limited = bool(self._weights.min() < 1.0)
+        return self._limited
 
-    def may_adapt(self) -> bool:
-        """Whether the path may be adapted by this hop's error, the lag being known."""
-        self.changed = False
-        if not self._excessive:
-            self._waited = max(self._waited - 1, 0)
-            return True
-        self._waited += 1
-        if self._waited < self._patience:
-            return False
-        self.changed, self._waited = True, 0
-        return True
+    def _wait(self, excessive: bool) -> None:
+        """Tell that the path has changed once the echo was too loud for long enough."""
+        self._waited = self._waited + 1 if excessive else max(self._waited - 1, 0)
+        self.changed = self._waited >= self._patience
+        if self.changed:
+            self._waited = 0
 
     def apply(self, echo: Samples) -> Samples:
         """The echo (hop,) with its weight, which falls at once and rises over a part."""
-        if self._weights.min() == 1.0:
+        if not self._limited:
             return echo
         target = self._weights[1:]
         start = np.minimum(self._weights[:-1], target)

@@ -8,7 +8,7 @@ from edgefilter.alignment.aligner import Aligner
 from edgefilter.alignment.delay_line import Aligned
 from edgefilter.alignment.paper import PaperAligner
 from edgefilter.dsp.stft import Analyser, StftConfig
-from edgefilter.echo.source_chain import Driver
+from edgefilter.echo.source_chain import SourceChain
 from edgefilter.engines.base import ClipEngine, Engine
 from edgefilter.filter.canceller import Canceller, CancellerOutput
 from edgefilter.filter.onset_gate import GATE, OnsetGate
@@ -22,8 +22,11 @@ TAPS = (2048, 8192)
 RUMBLE_HZ, RUMBLE = 80.0, 0.05
 """Below this frequency a microphone whose path nobody measured hears rooms, not people; it is lowered by 26 dB."""
 
+UNLOCATED = ("begun", "announced")
+"""States of the alignment in which the reference may lie elsewhere than the microphone hears it: the path is not adapted."""
 
-class Front:
+
+class FrontEnd:
     """Finds the reference in the microphone and subtracts what is linear of it.
 
     kind "none" passes the microphone, "paper" only delays the reference per utterance, "full" tracks and cancels.
@@ -40,7 +43,7 @@ class Front:
             self.gate = OnsetGate(stft.hop, float(np.sum(np.square(profile.echo.impulse_response)))) if profile else None
             self.canceller = self._make_canceller(profile)
             self.residual = Residual(stft, profile)
-        self._drive = profile.echo.driver() if profile else Driver()
+        self._source = profile.echo.source_chain() if profile else SourceChain()
         self._analyser = Analyser(stft, channels=4 if self.canceller else 2)
         self._low_cut = None if profile or not self.canceller else low_cut(stft)
         self._nothing = np.zeros(stft.bins, np.float32)
@@ -84,8 +87,8 @@ class Front:
     def _subtract(self, mic: Samples, aligned: Aligned) -> CancellerOutput:
         """The linear stage's hop."""
         if aligned.realigned:
-            self.canceller.rewrite_reference(self._drive.rewritten(self.aligner.history(self.canceller.history), self.hop))
-        return self.canceller.step(mic, self._drive(aligned.reference), aligned.state != "searching")
+            self.canceller.rewrite_reference(self._source.rewritten(self.aligner.history(self.canceller.history), self.hop))
+        return self.canceller.step(mic, self._source(aligned.reference), aligned.state not in UNLOCATED)
 
 
 def low_cut(stft: StftConfig) -> Samples:

@@ -66,7 +66,7 @@ class OnsetGate:
         if played > 1e-3 * self._loudest:
             self._loudest = max(played, self._decay * self._loudest)
         before = self.shut
-        if aligned.state != "searching":
+        if aligned.state not in ("begun", "announced"):
             self._shut = 0
             if aligned.state == "locked" and explained > 0.1 * self._loudest:
                 self._gain += LEARNING * (min(heard / explained, 2 * self._gain) - self._gain)

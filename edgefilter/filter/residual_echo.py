@@ -80,16 +80,16 @@ class Residual:
         self._below[:], self._above[:] = self._echo[0], self._echo[-1]
         brought = np.correlate(self._extended, self._spread, "valid")
         brought += self._echo
-        doubt = self._misalignment * uncertainty
+        unknown = self._misalignment * uncertainty
         loud = float(np.add.reduce(brought))
         if loud >= AUDIBLE * self._noise_power:
-            self._track(float(np.vdot(error, error).real) - self._noise_power - float(np.add.reduce(doubt)), loud)
+            self._track(float(np.vdot(error, error).real) - self._noise_power - float(np.add.reduce(unknown)), loud)
         brought *= self._leakage
-        brought += doubt
+        brought += unknown
         return self._noise, brought
 
     def _track(self, left: float, brought: float) -> None:
-        """Follow the least part of the echo that stays, from the power left beyond fan and doubt and the power of a loud echo."""
+        """Follow the least part of the echo that stays, from the power left beyond fan and unknown and the power of a loud echo."""
         self._left += (1.0 - LEAKAGE_MEMORY) * (left - self._left)
         self._brought += (1.0 - LEAKAGE_MEMORY) * (brought - self._brought)
         change = MARGIN * max(self._left, 0.0) / self._brought / self._leakage

@@ -11,7 +11,7 @@ from edgefilter.dsp.stft import Synthesiser
 from edgefilter.engines.base import ClipEngine, Engine
 from edgefilter.errors import SignalError
 from edgefilter.filter.barge_in import BargeIn
-from edgefilter.filter.front_end import Front
+from edgefilter.filter.front_end import FrontEnd
 from edgefilter.filter.stepping import Stepping
 from edgefilter.profile.data import Profile
 from edgefilter.types import SAMPLE_RATE, Event, Frame, Samples, as_samples
@@ -52,7 +52,7 @@ class Stream:
         stft = self.engine.stft
         if self.stepping:
             self.stepping.reset()
-        self.front = Front(self.engine, self.profile)
+        self.front = FrontEnd(self.engine, self.profile)
         self.events: deque[Event] = deque(maxlen=1000)
         self.speech_probability: float | None = None
         self._barge_in = BargeIn(stft.hop / SAMPLE_RATE)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import numpy as np
-
 from edgefilter.types import SAMPLE_RATE, Samples
 
 MEMORY = 0.8
@@ -27,6 +25,7 @@ WITNESSES = 6
 PATIENCE = 25
 """Hops, 0.4 s, in which the witnesses must come, and in which nothing is suspected after a suspicion has ended."""
 SILENCE = 1e-10
+NOTHING = (0.0, 0.0, 0.0)
 
 
 class Volume:
@@ -40,25 +39,20 @@ class Volume:
         self._hop = hop
         self._forget = 0.1 ** (hop / (FORGET_S * SAMPLE_RATE))
         self._known = known
-        self._last = np.zeros(2, np.float32)
         self._peak = 0.0
-        self._powers = np.zeros(3)
+        self._powers = NOTHING
         self.suspected, self._factor, self._count, self._age, self._rest = False, 1.0, 0, 0, 0
-        self._since = np.zeros(3)
+        self._since = NOTHING
         self.gain = 1.0
 
     def follow(self, mic: Samples, echo: Samples) -> float:
         """The factor by which the echo path is to be scaled now, 1 where nothing says so. mic, echo: (hop,)."""
-        both = np.stack((mic, echo))
-        sharp = both.copy()
-        sharp[:, 1:] -= PRE_EMPHASIS * both[:, :-1]
-        sharp[:, 0] -= PRE_EMPHASIS * self._last
-        self._last = both[:, -1]
-        m, e = sharp
-        now = np.array((m.dot(m), m.dot(e), e.dot(e)), float)
+        m, e = mic[1:] - PRE_EMPHASIS * mic[:-1], echo[1:] - PRE_EMPHASIS * echo[:-1]
+        now = float(m.dot(m)), float(m.dot(e)), float(e.dot(e))
         self._peak = max(now[2], self._forget * self._peak)
-        self._powers = MEMORY * self._powers + (1.0 - MEMORY) * now
-        heard, cross, expected = self._powers
+        self._powers = heard, cross, expected = tuple(
+            MEMORY * before + (1.0 - MEMORY) * fresh for before, fresh in zip(self._powers, now)
+        )
         if not self._known:
             self._known = heard > CONVERGED * _left(heard, cross, expected, 1.0) and now[2] > SILENCE * self._hop
             return 1.0
@@ -66,7 +60,7 @@ class Volume:
             return self._confirm(now)
         self._rest = max(self._rest - 1, 0)
         if not self._rest and self._suspicious(heard, cross, expected):
-            self.suspected, self._since = True, np.zeros(3)
+            self.suspected, self._since = True, NOTHING
         return 1.0
 
     def _suspicious(self, heard: float, cross: float, expected: float) -> bool:
@@ -79,10 +73,10 @@ class Volume:
         error = _left(heard, cross, expected, 1.0)
         return error > max(NOTICED * heard, EXCESS * _left(heard, cross, expected, self._factor))
 
-    def _confirm(self, now: np.ndarray) -> float:
+    def _confirm(self, now: tuple[float, float, float]) -> float:
         """Judge the suspected factor by what it leaves of the hops after those that it was found in."""
         if now[2] > AUDIBLE * self._peak:
-            self._since += now
+            self._since = tuple(before + fresh for before, fresh in zip(self._since, now))
             self._count += 1
         self._age += 1
         if self._count < WITNESSES:
@@ -103,7 +97,7 @@ class Volume:
         return min(max(factor, 1.0 / (MOST * self.gain)), MOST / self.gain)
 
     def _drop(self) -> None:
-        self.suspected, self._count, self._age, self._powers = False, 0, 0, np.zeros(3)
+        self.suspected, self._count, self._age, self._powers = False, 0, 0, NOTHING
 
 
 def _left(heard: float, cross: float, expected: float, factor: float) -> float:

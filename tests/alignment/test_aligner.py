@@ -7,11 +7,11 @@ import pytest
 from scipy import signal
 
 from bench.simulate.alignment_scene import HEAD, RATE, fan, hear, known_path, room, run, speech_like, utterances
-from edgefilter.alignment.aligner import CERTAIN_EARLY, Aligner
+from edgefilter.alignment.aligner import Aligner
 from edgefilter.alignment.delay_line import Tape, read_delayed, read_line
 from edgefilter.alignment.delay_tracker import Measurement
 from edgefilter.alignment.jumps import JumpWitness
-from edgefilter.alignment.lag_search import Candidate, LagSearch
+from edgefilter.alignment.lag_search import CERTAIN_EARLY, Candidate, LagSearch
 from edgefilter.alignment.paper import PaperAligner, paper_lag
 from edgefilter.errors import SignalError
 from edgefilter.types import PRE_ROLL

@@ -58,7 +58,7 @@ def test_an_utterance_is_heard_within_300_ms_beside_a_human_as_loud_and_one_neve
     never.announce(speech_like(rng, 3))
     heard = run(never, mic, silent)
     assert not any(a.realigned or a.reference.any() for a in heard)
-    assert never.stats()["state"] == "searching"
+    assert never.stats()["state"] == "announced"
 
 
 def test_waiting_ends_and_a_reference_channel_that_sounds_is_believed():

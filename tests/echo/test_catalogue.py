@@ -86,7 +86,7 @@ def test_the_order_in_which_effects_were_found_changes_no_prediction() -> None:
         assert [effect.name for effect, _ in chain(model.effects)] == ["playback_gain", "compression", "speaker_nonlinearity"]
         predictions.append(model.predict(x))
         # transforms of another length than with the past in front: rounding of float32
-        np.testing.assert_allclose(model.driver()(x), predictions_of_source(model, x), atol=1e-6)
+        np.testing.assert_allclose(model.source_chain()(x), predictions_of_source(model, x), atol=1e-6)
     assert all(np.array_equal(found, predictions[0]) for found in predictions)
 
 

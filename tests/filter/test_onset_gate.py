@@ -39,7 +39,7 @@ def test_the_robot_is_lowered_until_its_lag_is_found(lags):
     ref, onsets = spoken(rng, [2.0, 2.0], [1.5, 1.0])
     mic = hear(ref, [(0, lags[0]), (onsets[1] - 100, lags[1])], h)[0] + fan(rng, ref.size, 0.001)
     mic, out, found = gated(mic, ref, h)
-    searching = np.array([aligned.state == "searching" for aligned in found])
+    searching = np.array([aligned.state == "begun" for aligned in found])
     loud = np.square(mic).sum(1)
     explained = np.array([np.dot(aligned.reference, aligned.reference) for aligned in found])
     burst = (loud > 0.1 * loud.max()) & (explained < 0.01 * explained.max()) & searching
@@ -58,7 +58,7 @@ def test_a_human_20_db_below_the_robot_beside_a_muted_loudspeaker_is_untouched(l
     human = utterances(rng, [4.0], [ref.size / RATE])[0][: ref.size]
     human *= level * hear(ref, [(0, 3000)], h)[0].std() / human.std()
     mic, out, found = gated(human + fan(rng, ref.size, 0.001), ref, h)
-    assert any(aligned.state == "searching" for aligned in found)
+    assert any(aligned.state == "begun" for aligned in found)
     assert np.array_equal(out, mic)
 
 
@@ -76,13 +76,13 @@ def test_soft_first_sounds_of_a_voice_make_nobody_loud():
     rng = np.random.default_rng(5)
     ref = (1e-4 * rng.standard_normal(2 * RATE)).astype(np.float32)
     mic, out, found = gated(fan(rng, ref.size, 0.005), ref, room(rng, 0.3))
-    assert any(aligned.state == "searching" for aligned in found)
+    assert any(aligned.state == "begun" for aligned in found)
     assert np.array_equal(out, mic)
 
 
 def test_the_gate_shuts_at_once_and_opens_without_a_step():
     gate, ones = OnsetGate(HOP, 1.0), np.ones(HOP, np.float32)
-    lost = Aligned(0 * ones, float("nan"), 0.0, 0.0, "searching", False)
+    lost = Aligned(0 * ones, float("nan"), 0.0, 0.0, "begun", False)
     locked = Aligned(ones, 0.0, 0.0, 1.0, "locked", True)
     gains, shuts = [], []
     for aligned in (locked, lost, lost, locked, locked):

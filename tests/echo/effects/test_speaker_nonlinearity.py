@@ -70,7 +70,7 @@ def test_driven_hop_by_hop_is_the_same_as_at_once(sizes):
     whole = x
     for effect, values in catalogue.chain(model.effects):
         whole = effect.apply(whole, values, 16_000)
-    driver, at, out = model.driver(), 0, []
+    driver, at, out = model.source_chain(), 0, []
     while at < x.size:
         size = sizes[len(out) % len(sizes)]
         out.append(driver(x[at : at + size]))
@@ -82,15 +82,15 @@ def test_driven_hop_by_hop_is_the_same_as_at_once(sizes):
 
 def test_driver_goes_on_after_its_past_was_rewritten():
     x, model = robot_speech()[:8192], robot_model().with_effect("speaker_nonlinearity", {"stiffness": -2.0, "even": np.array([0.0, 0.3])})
-    driver = model.driver()
+    driver = model.source_chain()
     driver(np.full(256, 0.3, np.float32))
     history = driver.rewritten(x[:4096], 256)
     again = [driver(x[at : at + 256]) for at in range(4096 - 256, x.size, 256)]
-    whole = model.driver()(x)
+    whole = model.source_chain()(x)
     np.testing.assert_allclose(history, whole[:4096], atol=1e-6)
     np.testing.assert_allclose(np.concatenate(again), whole[4096 - 256 :], atol=1e-6)
 
 
 def test_compression_is_not_driven_since_it_remembers_seconds():
     x = robot_speech()[:4096]
-    assert np.array_equal(robot_model().with_effect("compression", {"ratio": 5.0, "threshold_db": -40.0}).driver()(x), x)
+    assert np.array_equal(robot_model().with_effect("compression", {"ratio": 5.0, "threshold_db": -40.0}).source_chain()(x), x)

@@ -1,0 +1,142 @@
+"""A human talks from the first second on: drift is no jump, a look that errs costs no certainty, states are what they say."""
+
+import numpy as np
+import pytest
+
+from bench.simulate.alignment_scene import (
+    RATE,
+    double_talk,
+    fan,
+    hear,
+    known_path,
+    room,
+    run,
+    speech_like,
+    utterances,
+)
+from edgefilter.alignment.aligner import Aligner
+from edgefilter.alignment.delay_tracker import STRIDE, Measurement
+from edgefilter.alignment.drift_filter import DriftFilter
+
+CLOSE = 16  # the requirement: +-1 ms
+
+
+def look(offset, evidence=30.0, explained=0.1):
+    """What the meter says in double talk: sure of its peak, which explains little of the microphone."""
+    ratio = 2.5
+    return Measurement(offset, 0.05**2, evidence / ratio, ratio, 1.0, explained, 0.3, 0.3)
+
+
+def follow(seen, evidence):
+    """An aligner that found a lag of 1000 and then looks 16 times a second, each look seeing the delay of `seen`."""
+    aligner = Aligner(256)
+    aligner._switch(1000.0, 3.0)
+    for delay, weight in zip(seen, evidence, strict=True):
+        aligner._drift.advance(STRIDE)
+        aligner._judge(look(delay - aligner._drift.delay, weight))
+    return aligner
+
+
+def test_first_looks_that_err_alike_are_no_drift_which_jumps_then_have_to_undo():
+    rng = np.random.default_rng(1)
+    seen = 1000.0 + 0.04 * rng.standard_normal(80)
+    seen[:5] += (0.0, 0.3, 0.5, 0.7, 0.8)  # while the response is learnt: taken at its word, a slope of 200 ppm
+    aligner = follow(seen, np.full(80, 30.0))
+    assert aligner.stats()["jumps"] == 0
+    assert abs(aligner._drift.delay - 1000.0) < 0.2 and abs(aligner._drift.slope) < 10e-6  # 10 ppm: 0.2 samples in a second
+
+
+@pytest.mark.parametrize("ppm", [40.0, -300.0])
+def test_a_weak_first_look_at_a_reflection_gives_no_slope_that_later_looks_refute(ppm):
+    seen = 1000.0 - ppm * 1e-6 * STRIDE * np.arange(1, 65)
+    evidence = np.full(64, 32.0)
+    seen[0] -= 2.5
+    evidence[0] = 17.6
+    aligner = follow(seen, evidence)
+    assert aligner.stats()["jumps"] == 0
+    assert abs(aligner._drift.delay - seen[-1]) < 0.3 and abs(aligner._drift.slope + ppm * 1e-6) < 10e-6
+
+
+def test_drift_that_builds_up_unseen_while_the_human_is_louder_is_no_jump():
+    slope, aligner = 150e-6, Aligner(256)
+    aligner._switch(1000.0, 0.3)
+    truth = 1000.0
+    for second in range(14):
+        for number in range(16):
+            aligner._drift.advance(STRIDE)
+            truth += slope * STRIDE
+            bias = 0.25 * (-1) ** second  # looks of one sentence err alike
+            if number < 6:
+                aligner._judge(look(truth + bias - aligner._drift.delay))
+    assert aligner.stats()["jumps"] == 0
+    assert abs(aligner._drift.delay - truth) < 1.0 and abs(aligner._drift.slope - slope) < 30e-6
+
+
+def test_a_look_that_contradicts_what_is_believed_is_followed_once_it_is_taken():
+    drift = DriftFilter()
+    drift.restart(1000.0, 0.3)
+    for _ in range(160):
+        drift.advance(STRIDE)
+        drift.correct(look(1000.0 - drift.delay))
+    drift.advance(STRIDE)
+    assert drift.surprise(look(1.4)) > 5.0
+    drift.correct(look(1.4))
+    assert abs(drift.delay - 1001.4) < 0.1  # of 1.4; insisting on its 10 s of looks, it would go a tenth of the way
+
+
+def test_a_jump_just_after_a_look_says_nothing_of_the_clocks_and_one_after_a_pause_does():
+    def certainty_after(pause):
+        drift = DriftFilter()
+        drift.restart(1000.0, 0.3)
+        for _ in range(160):
+            drift.advance(STRIDE)
+            drift.correct(look(1000.0 - drift.delay))
+        drift.advance(pause)
+        before = drift._slope_variance
+        drift.step(3.0, 0.3)
+        return drift._slope_variance / before
+
+    assert certainty_after(STRIDE) == 1.0  # 3 samples in 64 ms are no clocks
+    assert certainty_after(2 * RATE) > 100.0  # in 2 s they are 94 ppm
+
+
+@pytest.mark.parametrize(("level_db", "ppm"), [(-10, 150.0), (-10, -300.0), (0, -150.0), (26, 300.0)])
+@pytest.mark.parametrize("profile", [True, False])
+def test_beside_a_human_from_the_first_second_every_utterance_stays_within_a_millisecond(level_db, ppm, profile):
+    rng = np.random.default_rng(30)
+    scene = double_talk(rng, [speech_like(rng, 4), speech_like(rng, 4)], speech_like(rng, 14), level_db, ppm)
+    aligner = Aligner(256, known_path(room(rng, 0.25)) if profile else None)
+    hops = run(aligner, scene.mic, scene.ref)
+    error = np.abs(np.array([a.delay for a in hops]) - scene.truth[255::256][: len(hops)])
+    for begin, end in scene.heard:
+        late = slice((begin + 2 * RATE) // 256, end // 256)
+        assert np.all(error[late] < CLOSE)
+        moves = np.diff([a.delay for a in hops[late]])
+        assert np.abs(moves).max() < 1.5  # samples in a hop: what looks correct, less than any jump
+
+
+def test_states_tell_an_utterance_that_begins_from_one_that_is_lost_and_one_that_never_came():
+    rng = np.random.default_rng(31)
+    ref, onsets = utterances(rng, [3, 6], [1.5, 3])
+    lag = 4000
+    mic, _ = hear(ref, [(0, lag)], room(rng, 0.3))
+    mic[onsets[1] :] = 0.0  # muted before its second utterance
+    hops = run(Aligner(256), mic + fan(rng, mic.size), ref)
+    states = np.array([a.state for a in hops])
+    at = lambda seconds, start=0: states[int((start + seconds * RATE) // 256)]
+    assert states[0] == "idle" and at(0.1, onsets[0]) == "begun" and np.isnan(hops[onsets[0] // 256 + 6].delay)
+    assert at(1.0, onsets[0] + lag) == "locked" and at(-0.2, onsets[1]) == "idle"
+    assert at(0.1, onsets[1]) == "begun" and not np.isnan(hops[onsets[1] // 256 + 6].delay)
+    assert at(2.5, onsets[1]) == "unfound"  # it may be 1.6 s late, and a quarter of a second of it has to be heard
+
+
+def test_a_robot_that_is_not_seen_for_a_moment_is_lost_not_begun():
+    rng = np.random.default_rng(32)
+    ref, _ = utterances(rng, [6], [1])
+    mic, _ = hear(ref, [(0, 4000)], room(rng, 0.3))
+    hidden = slice(3 * RATE, 4 * RATE)
+    mic[hidden] = 3.0 * np.std(mic) * rng.standard_normal(RATE).astype(np.float32)
+    hops = run(Aligner(256), mic + fan(rng, mic.size), ref)
+    states = [a.state for a in hops[hidden.start // 256 : 5 * RATE // 256]]
+    assert "lost" in states and set(states) <= {"locked", "lost"} and states[-1] == "locked"
+    assert all(abs(a.delay - hops[hidden.start // 256].delay) < 1.0 for a in hops[hidden.start // 256 : 5 * RATE // 256])
