@@ -144,12 +144,16 @@ def add(
     return knowing, before, compare(knowing, recording, reference, sample_rate=sample_rate)
 
 
-def conclude(prepared: Prepared, found: Found, criteria: Criteria, progress: Callable[[str], None] | None = None) -> Diagnosis:
+def conclude(
+    prepared: Prepared, found: Found, criteria: Criteria, progress: Callable[[str], None] | None = None
+) -> Diagnosis:
     """The diagnosis that a search leads to; the fan is looked at behind what the search has taken out of the voice."""
     comparison = describe(prepared, found.start, found.base)
     found, left = look_at_fan(found, criteria)
     unpredictable = any(find(step.name).leaves_noise for step in found.steps)
-    believed = bool(found.steps) and (found.final.excess_db < criteria.explained_db or _enough(prepared, found, criteria))
+    believed = bool(found.steps) and (
+        found.final.excess_db < criteria.explained_db or _enough(prepared, found, criteria)
+    )
     quiet = found.base.excess_db < criteria.explained_db and not prepared.human
     verdict = "missing" if believed and not _much_left(found, criteria) else "explained" if quiet else "unexplained"
     if not believed and (quiet or not _partly(prepared, found, criteria)):
@@ -163,7 +167,9 @@ def conclude(prepared: Prepared, found: Found, criteria: Criteria, progress: Cal
         ranking=findings,
         evidence=left_in_words(found, left, remaining, criteria.explained_db),
         remaining_db=remaining,
-        irreducible_db=max(remaining, found.final.irreducible_db, 0.0) if unpredictable and verdict == "missing" else 0.0,
+        irreducible_db=max(remaining, found.final.irreducible_db, 0.0)
+        if unpredictable and verdict == "missing"
+        else 0.0,
         model=found.model,
     )
 
@@ -181,7 +187,8 @@ def _partly(prepared: Prepared, found: Found, criteria: Criteria) -> bool:
 
 
 def _much_left(found: Found, criteria: Criteria) -> bool:
-    """Whether the findings leave so much, also of the samples that they were fitted to, that something else is there besides.
+    """Whether the findings leave so much, also of the samples that they were fitted to, that something else is there
+    besides.
 
     What they leave of the others alone is how well a recording of that length teaches them.
     """

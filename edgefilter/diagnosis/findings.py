@@ -1,4 +1,5 @@
-"""What a search has found, said of each effect by itself: its part of the excess, its parameters and how well these are known."""
+"""What a search has found, said of each effect by itself: its part of the excess, its parameters and how well these are
+known."""
 
 from __future__ import annotations
 
@@ -17,7 +18,8 @@ from edgefilter.echo.recording import BLOCK
 from edgefilter.errors import UsageError
 
 THIRDS_T = 1.69
-"""90 % quantile of Student's t with 2 degrees of freedom over the square root of 3: the interval from three fits to a third each."""
+"""90 % quantile of Student's t with 2 degrees of freedom over the square root of 3: the interval from three fits to a
+third each."""
 
 
 def share_of(before_db: float, after_db: float) -> float:
@@ -27,7 +29,8 @@ def share_of(before_db: float, after_db: float) -> float:
 
 
 def findings_of(found: Found, progress: Callable[[str], None] | None) -> tuple[tuple[Finding, ...], list[str]]:
-    """Strongest first; each with the excess before and after it in the order in which they were added. And what is not known of them."""
+    """Strongest first; each with the excess before and after it in the order in which they were added. And what is not
+    known of them."""
     findings, doubts, before = [], [], found.base.excess_db
     for step in found.steps:
         after = found.final.excess_db if step is found.steps[-1] else step.score.excess_db
@@ -42,7 +45,8 @@ def findings_of(found: Found, progress: Callable[[str], None] | None) -> tuple[t
                 excess_after_db=after,
                 share=max(share_of(found.base.excess_db, after) - share_of(found.base.excess_db, before), 0.0),
                 parameters=intervals,
-                evidence=find(step.name).sentence(step.values) or f"with {step.name} the held-out residual falls by {step.gain_db:.2f} dB",
+                evidence=find(step.name).sentence(step.values)
+                or f"with {step.name} the held-out residual falls by {step.gain_db:.2f} dB",
                 values=step.values,
                 prediction=step.score.prediction,
             )
@@ -52,7 +56,8 @@ def findings_of(found: Found, progress: Callable[[str], None] | None) -> tuple[t
 
 
 def _intervals(prepared: Prepared, model: EchoModel, step: Trial) -> tuple[Mapping[str, Interval], list[str]]:
-    """Each scalar parameter, or short list, with the interval that three fits to a third of the recording each give; and which fits failed.
+    """Each scalar parameter, or short list, with the interval that three fits to a third of the recording each give;
+    and which fits failed.
 
     Where fewer than two thirds can be fitted, a parameter may have any of its possible values.
     """
@@ -65,7 +70,9 @@ def _intervals(prepared: Prepared, model: EchoModel, step: Trial) -> tuple[Mappi
         try:
             fits.append(complete(effect, effect.fit(third, others)))
         except (UsageError, ArithmeticError, np.linalg.LinAlgError) as error:
-            failed.append(f"how well {step.name} is known comes from {len(thirds)} fits to a third of the recording each, and one failed: {error}")
+            failed.append(
+                f"how well {step.name} is known is told by fits to a third of the recording each, and one failed: {error}"
+            )
     found = {}
     for parameter in effect.told:
         value = np.asarray(step.values[parameter.name], float)
@@ -80,9 +87,14 @@ def _intervals(prepared: Prepared, model: EchoModel, step: Trial) -> tuple[Mappi
 
 
 def _spread(value: np.ndarray, fits: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Low and high from the scatter of the fits, and from how far their mean is off: what a third teaches otherwise than the half is known no better."""
+    """Low and high from the scatter of the fits, and from how far their mean is off: what a third teaches otherwise
+    than the half is known no better."""
     alike = [fit for fit in fits if fit.shape == value.shape]
-    spread = np.hypot(THIRDS_T * np.std(alike, axis=0, ddof=1), np.mean(alike, axis=0) - value) if len(alike) > 1 else np.zeros_like(value)
+    spread = (
+        np.hypot(THIRDS_T * np.std(alike, axis=0, ddof=1), np.mean(alike, axis=0) - value)
+        if len(alike) > 1
+        else np.zeros_like(value)
+    )
     return value - spread, value + spread
 
 

@@ -27,9 +27,9 @@ TOLERANCE_TAPS, TOLERANCE_LEAD = 32, 16
 class Judge:
     """Holds a prepared recording against predictions.
 
-    The log likelihood of a residual that is Gaussian with an unknown variance in each cell of time and frequency is, but for a
-    constant, minus half the sum of the degrees of freedom times the log of the measured power (Whittle 1953): what counts is that
-    the residual sinks in many cells, not that one loud passage does.
+    The log likelihood of a residual that is Gaussian with an unknown variance in each cell of time and frequency is,
+    but for a constant, minus half the sum of the degrees of freedom times the log of the measured power (Whittle 1953):
+    what counts is that the residual sinks in many cells, not that one loud passage does.
     """
 
     def __init__(self, prepared: Prepared) -> None:
@@ -81,12 +81,15 @@ class Judge:
         gain = model.microphone_gain(measurement.recording.size)
         return self.judge(measurement.heard(model)[0], model.unpredictable(measurement.reference), gain)
 
-    def judge(self, prediction: Samples, unpredictable: Sequence[tuple[Samples, Array]] = (), gain: Samples | None = None) -> Score:
+    def judge(
+        self, prediction: Samples, unpredictable: Sequence[tuple[Samples, Array]] = (), gain: Samples | None = None
+    ) -> Score:
         """The score of a prediction (n,), with the ordinary tolerances taken up first.
 
-        unpredictable: as EchoModel.unpredictable gives it, noise that is expected on top of the fan. gain: (n,) of the microphone, which
-        the fan passed as well: it is taken out of the residual before that is held against the fan. The cells keep it: as a likelihood
-        their level has to be that of the recording as it is.
+        unpredictable: as EchoModel.unpredictable gives it, noise that is expected on top of the fan. gain: (n,) of the
+        microphone, which
+        the fan passed as well: it is taken out of the residual before that is held against the fan. The cells keep it:
+        as a likelihood their level has to be that of the recording as it is.
         """
         corrected = self.correct(prediction)
         residual = self.prepared.measurement.recording - corrected
@@ -107,7 +110,8 @@ class Judge:
         )
 
     def floor_level(self, score: Score) -> float:
-        """Level in dB of the cells in which the robot is silent, 0 where it never is: what is left when everything is explained."""
+        """Level in dB of the cells in which the robot is silent, 0 where it never is: what is left when everything is
+        explained."""
         quiet = score.cells[~self.active_cells]
         if quiet.shape[0] < 4:
             return 0.0
@@ -115,7 +119,10 @@ class Judge:
 
     def size_db(self, change: Samples) -> float:
         """Power of a change of the prediction (n,) over the fan in dB: as it is or whitened, whichever is more."""
-        plain, white = float(np.mean(change.astype(float) ** 2)) / self._fan, float(np.mean(whiten(change, self.psd).astype(float) ** 2))
+        plain, white = (
+            float(np.mean(change.astype(float) ** 2)) / self._fan,
+            float(np.mean(whiten(change, self.psd).astype(float) ** 2)),
+        )
         return float(10 * np.log10(max(plain, white, 1e-12)))
 
     def noise_size_db(self, model: EchoModel) -> float:
@@ -132,18 +139,22 @@ class Judge:
             mean = (total[self.starts + span] - total[self.starts]) / span
             bins = np.arange(FRAME // 2 + 1) * (colour.size - 1) / (FRAME // 2)
             share = np.interp(bins, np.arange(colour.size), colour / self.psd)
-            expected = expected + mean[:, None] * (np.add.reduceat(share[: self._edges[-1]], self._edges[:-1]) / self.freedom)
+            expected = expected + mean[:, None] * (
+                np.add.reduceat(share[: self._edges[-1]], self._edges[:-1]) / self.freedom
+            )
         return expected
 
     def _over_expected(self, power: Array, unpredictable: Sequence[tuple[Samples, Array]]) -> Array:
-        """power (n,) of the whitened residual over what is expected, both smoothed over 16 ms: when a knock comes is known to some ms."""
+        """power (n,) of the whitened residual over what is expected, both smoothed over 16 ms: when a knock comes is
+        known to some ms."""
         expected = np.ones_like(power)
         for variance, colour in unpredictable:
             expected += variance * float(np.mean(colour / self.psd))
         return uniform_filter1d(power, HOP) / uniform_filter1d(expected, HOP)
 
     def correct(self, prediction: Samples) -> Samples:
-        """prediction (n,) through the short filter that brings it closest to the recording, no further from 1 than TOLERANCE."""
+        """prediction (n,) through the short filter that brings it closest to the recording, no further from 1 than
+        TOLERANCE."""
         measurement = self.prepared.measurement
         x = whiten(prediction, self.psd)
         target = measurement.white_recording - x

@@ -1,8 +1,10 @@
-"""Stepwise selection of the effects that a profile lacks: forward, refit, backward, on held-out samples (Efroymson 1960).
+"""Stepwise selection of the effects that a profile lacks: forward, refit, backward, on held-out samples (Efroymson
+1960).
 
-Forward: every effect is fitted beside those accepted so far, and the simplest of those that explain nearly most is accepted. Refit: all
-are fitted beside each other. Backward: what the newest one has made superfluous is exchanged for something simpler, or dropped. Stepwise
-selection ends in local optima; so it is begun anew from the next best effects where the best one does not lead to an explanation.
+Forward: every effect is fitted beside those accepted so far, and the simplest of those that explain nearly most is
+accepted. Refit: all are fitted beside each other. Backward: what the newest one has made superfluous is exchanged for
+something simpler, or dropped. Stepwise selection ends in local optima; so it is begun anew from the next best effects
+where the best one does not lead to an explanation.
 """
 
 from __future__ import annotations
@@ -17,7 +19,9 @@ from edgefilter.echo.effects.catalogue import find, names
 from edgefilter.echo.model import EchoModel
 
 
-def search(prepared: Prepared, model: EchoModel, criteria: Criteria, progress: Callable[[str], None] | None = None) -> Found:
+def search(
+    prepared: Prepared, model: EchoModel, criteria: Criteria, progress: Callable[[str], None] | None = None
+) -> Found:
     """Add effects to model as long as held-out samples say that they are there."""
     bench, start = Workbench(prepared, criteria, progress), model
     base = bench.score(model)
@@ -27,11 +31,14 @@ def search(prepared: Prepared, model: EchoModel, criteria: Criteria, progress: C
         bench, model = Workbench(prepared, criteria, progress), step.model
     best = _best(bench, model, list(_runs(bench, model)))
     steps = _in_steps(bench, model, best)
-    return Found(prepared, start, best, base, bench.score(best), ((step, *steps) if fan is not None else steps), bench.notes)
+    return Found(
+        prepared, start, best, base, bench.score(best), ((step, *steps) if fan is not None else steps), bench.notes
+    )
 
 
 def _runs(bench: Workbench, start: EchoModel) -> Iterator[EchoModel]:
-    """What each beginning leads to, until one explains nearly all; then, where that is one long filter, what half of it may lead to."""
+    """What each beginning leads to, until one explains nearly all; then, where that is one long filter, what half of it
+    may lead to."""
     criteria = bench.criteria
     for first in _starts(bench, start):
         run = _stepwise(bench, start, first)
@@ -43,7 +50,8 @@ def _runs(bench: Workbench, start: EchoModel) -> Iterator[EchoModel]:
 
 
 def _starts(bench: Workbench, start: EchoModel) -> Iterator[Trial]:
-    """The trial to begin with, then others that explain a good part, named or not, since what hides them may be found beside them."""
+    """The trial to begin with, then others that explain a good part, named or not, since what hides them may be found
+    beside them."""
     criteria = bench.criteria
     if bench.heard(start) <= criteria.silent_db:
         return
@@ -57,12 +65,15 @@ def _starts(bench: Workbench, start: EchoModel) -> Iterator[Trial]:
 
 
 def _half_of_a_filter(bench: Workbench, start: EchoModel, run: EchoModel) -> list[Trial]:
-    """The simple effect, none or one, that explains a good part of what one long filter does: two of them may look like that filter."""
+    """The simple effect, none or one, that explains a good part of what one long filter does: two of them may look like
+    that filter."""
     found = added(start, run)
     if len(found) != 1 or find(found[0]).complexity < bench.criteria.long_filter:
         return []
     least = bench.criteria.half_share * (bench.score(start).level_db - bench.score(run).level_db)
-    simple = [t for t in bench.attempt_all(start, bench.criteria.simple) if t.gain_db >= least and bench.admissible(t, start)]
+    simple = [
+        t for t in bench.attempt_all(start, bench.criteria.simple) if t.gain_db >= least and bench.admissible(t, start)
+    ]
     return sorted(simple, key=lambda t: -t.gain_db)[:1]
 
 
@@ -106,7 +117,8 @@ def refit(bench: Workbench, start: EchoModel, model: EchoModel) -> EchoModel:
 
 
 def backward(bench: Workbench, start: EchoModel, model: EchoModel, newest: str) -> EchoModel:
-    """The model without what the newest effect has made superfluous: an earlier one exchanged for the one to name beside it, or dropped."""
+    """The model without what the newest effect has made superfluous: an earlier one exchanged for the one to name
+    beside it, or dropped."""
     earlier = [name for name in added(start, model) if name != newest]
     for name in earlier:
         model = _exchange(bench, start, model, name)
@@ -132,7 +144,8 @@ def _exchange(bench: Workbench, start: EchoModel, model: EchoModel, name: str) -
 
 
 def split(bench: Workbench, start: EchoModel, model: EchoModel) -> EchoModel:
-    """The model with a simpler effect beside a flexible one where both together explain more than the flexible one alone."""
+    """The model with a simpler effect beside a flexible one where both together explain more than the flexible one
+    alone."""
     model = _volume_beside(bench, model)
     for name in [name for name in added(start, model) if find(name).flexible]:
         others = model.without_effect(name)
@@ -143,12 +156,17 @@ def split(bench: Workbench, start: EchoModel, model: EchoModel) -> EchoModel:
 
 
 def _volume_beside(bench: Workbench, model: EchoModel) -> EchoModel:
-    """The model with the gain that a filter has in its passband as a turned volume beside it, where that explains as much."""
+    """The model with the gain that a filter has in its passband as a turned volume beside it, where that explains as
+    much."""
     for name, values in model.effects:
         gain_db = find(name).passband_gain_db(values)
         if gain_db is None or abs(gain_db) < bench.criteria.passband_db:
             continue
-        gains = [(other, plain) for other in names() if (plain := find(other).plain_gain(gain_db)) is not None and other not in dict(model.effects)]
+        gains = [
+            (other, plain)
+            for other in names()
+            if (plain := find(other).plain_gain(gain_db)) is not None and other not in dict(model.effects)
+        ]
         for other, plain in gains:
             both = bench.attempt(name, model.without_effect(name).with_effect(other, plain))
             if both is not None and both.score.level_db < bench.score(model).level_db + bench.criteria.worth_db:
@@ -157,11 +175,14 @@ def _volume_beside(bench: Workbench, model: EchoModel) -> EchoModel:
 
 
 def _with_simpler(bench: Workbench, start: EchoModel, model: EchoModel, name: str) -> EchoModel:
-    """The model with a simpler effect beside the flexible one of that name, of the two that explain most by themselves, or as it is."""
+    """The model with a simpler effect beside the flexible one of that name, of the two that explain most by themselves,
+    or as it is."""
     criteria, others = bench.criteria, model.without_effect(name)
     absent = bench.absent(others, max(find(name).complexity - 1, criteria.simple))
     wanted = [key for key in absent if not (find(key).flexible or find(key).last_resort)]
-    simple = [t for key in wanted if (t := bench.attempt_alike(key, others)) is not None and bench.admissible(t, others)]
+    simple = [
+        t for key in wanted if (t := bench.attempt_alike(key, others)) is not None and bench.admissible(t, others)
+    ]
     least = max(criteria.confirmed_share * bench.left(model), criteria.confirmed_db)
     for trial in sorted(simple, key=lambda t: -t.gain_db)[:2]:
         both = bench.attempt(name, trial.model)
@@ -175,7 +196,8 @@ def _with_simpler(bench: Workbench, start: EchoModel, model: EchoModel, name: st
 
 
 def _best(bench: Workbench, start: EchoModel, runs: list[EchoModel]) -> EchoModel:
-    """The run that explains most of those whose effects can all be named; the earlier and simpler one where others hardly explain more."""
+    """The run that explains most of those whose effects can all be named; the earlier and simpler one where others
+    hardly explain more."""
     base = bench.score(start).level_db
     valid = [_standing(bench, start, run) for run in runs]
     best = start
@@ -200,7 +222,8 @@ def _stands(bench: Workbench, model: EchoModel, name: str) -> bool:
 
 
 def _in_steps(bench: Workbench, start: EchoModel, model: EchoModel) -> tuple[Trial, ...]:
-    """The effects that a model has beyond the start, each with what it explains beside those before it, the largest first."""
+    """The effects that a model has beyond the start, each with what it explains beside those before it, the largest
+    first."""
     left, steps = added(start, model), []
     values, model = dict(model.effects), start
     while left:

@@ -1,4 +1,5 @@
-"""One effect tried on a model of a recording: what it explains on held-out samples, and whether that is enough to name it."""
+"""One effect tried on a model of a recording: what it explains on held-out samples, and whether that is enough to name
+it."""
 
 from __future__ import annotations
 
@@ -23,7 +24,8 @@ Signature: TypeAlias = tuple[tuple[str | bytes, ...], ...]
 
 @dataclass(frozen=True, eq=False)
 class Trial:
-    """One effect added to a model: its values, the model with it, its score, the fall in level and the effect's size over the fan in dB."""
+    """One effect added to a model: its values, the model with it, its score, the fall in level and the effect's size
+    over the fan in dB."""
 
     name: str
     values: Values
@@ -35,9 +37,11 @@ class Trial:
 
 @dataclass(frozen=True, eq=False)
 class Found:
-    """The outcome of a search from a start model. steps: the accepted effects in their order. notes: what the reader must know of the search.
+    """The outcome of a search from a start model. steps: the accepted effects in their order. notes: what the reader
+    must know of the search.
 
-    prepared: what final was scored on; its fan is another than at the calibration where a changed fan is the first of the steps.
+    prepared: what final was scored on; its fan is another than at the calibration where a changed fan is the first of
+    the steps.
     """
 
     prepared: Prepared
@@ -66,7 +70,9 @@ class Workbench:
     @property
     def notes(self) -> tuple[str, ...]:
         """What could not be tried, and why."""
-        spent = f"the search was stopped after fits of {self._cost / 4:.0f} s: something further may be in the recording"
+        spent = (
+            f"the search was stopped after fits of {self._cost / 4:.0f} s: something further may be in the recording"
+        )
         return (*self._failed.values(), *((spent,) if self._refused else ()))
 
     def score(self, model: EchoModel) -> Score:
@@ -91,7 +97,8 @@ class Workbench:
         return max(score.level_db - self.judge.floor_level(score), 0.0)
 
     def attempt(self, name: str, model: EchoModel) -> Trial | None:
-        """The effect of that name fitted beside what the model has; None where its fit finds nothing, or no further one may be made."""
+        """The effect of that name fitted beside what the model has; None where its fit finds nothing, or no further one
+        may be made."""
         key = signature(model), name
         if key not in self._trials:
             if self._cost >= self.criteria.most_cost:
@@ -102,7 +109,8 @@ class Workbench:
         return self._trials[key]
 
     def attempt_alike(self, name: str, model: EchoModel) -> Trial | None:
-        """attempt(), or what came of it beside the same effects at other values: enough to choose what is worth a closer look."""
+        """attempt(), or what came of it beside the same effects at other values: enough to choose what is worth a
+        closer look."""
         key = frozenset(dict(model.effects)), name
         return self._alike[key] if key in self._alike else self.attempt(name, model)
 
@@ -128,7 +136,8 @@ class Workbench:
     def halves(self, trial: Trial, model: EchoModel) -> bool:
         """Whether a trial takes away about half of the power over the fan, though the level hardly falls.
 
-        A narrow ring does so, in few cells. Beside a long filter an effect may do so where that filter was fitted and so leaves no more
+        A narrow ring does so, in few cells. Beside a long filter an effect may do so where that filter was fitted and
+        so leaves no more
         than there is besides: of the held-out samples the filter itself leaves the most.
         """
         before, after, most = self.score(model), trial.score, self.criteria.power_share
@@ -142,7 +151,9 @@ class Workbench:
         The last resorts only where none of the others explains much of what is left.
         """
         left, absent = self.left(model), self.absent(model, most)
-        found = [trial for name in absent if not find(name).last_resort and (trial := self.attempt(name, model)) is not None]
+        found = [
+            trial for name in absent if not find(name).last_resort and (trial := self.attempt(name, model)) is not None
+        ]
         resorts = [name for name in absent if find(name).last_resort]
         enough = self.criteria.last_resort_share * left
         if not resorts or left < self.criteria.last_resort_db:
@@ -159,7 +170,8 @@ class Workbench:
         return effect.plausible(Evidence(trial.values, model, self.judge, self.score(model), trial.score))
 
     def preferred(self, trials: Iterable[Trial]) -> Trial | None:
-        """Of admissible trials the simplest of those that explain nearly as much as the best; None where none lowers the level."""
+        """Of admissible trials the simplest of those that explain nearly as much as the best; None where none lowers
+        the level."""
         trials = list(trials)
         most = max((trial.gain_db for trial in trials), default=0.0)
         enough = [trial for trial in trials if most > 0.0 and trial.gain_db >= self.criteria.nested * most]
@@ -167,7 +179,11 @@ class Workbench:
 
     def absent(self, model: EchoModel, most: int) -> list[str]:
         """Names of the effects on the voice that a model has not and whose complexity is at most `most`."""
-        return [name for name in names() if find(name).stage != "noise" and name not in dict(model.effects) and find(name).complexity <= most]
+        return [
+            name
+            for name in names()
+            if find(name).stage != "noise" and name not in dict(model.effects) and find(name).complexity <= most
+        ]
 
 
 def added(start: EchoModel, model: EchoModel) -> list[str]:
@@ -176,8 +192,14 @@ def added(start: EchoModel, model: EchoModel) -> list[str]:
 
 
 def signature(model: EchoModel) -> Signature:
-    """By which models with the same effects at the same values are known: they predict the same, in whichever order these were fitted."""
-    return tuple(sorted((name, *(np.asarray(value, float).tobytes() for _, value in sorted(values.items()))) for name, values in model.effects))
+    """By which models with the same effects at the same values are known: they predict the same, in whichever order
+    these were fitted."""
+    return tuple(
+        sorted(
+            (name, *(np.asarray(value, float).tobytes() for _, value in sorted(values.items())))
+            for name, values in model.effects
+        )
+    )
 
 
 def _over_fan(level_db: float) -> float:

@@ -1,4 +1,5 @@
-"""One physical effect on the robot's own voice: the base class, whose hooks are all that the rest of the package knows of it."""
+"""One physical effect on the robot's own voice: the base class, whose hooks are all that the rest of the package knows
+of it."""
 
 from __future__ import annotations
 
@@ -19,7 +20,8 @@ STAGES: tuple[Stage, ...] = ("source", "path", "time", "microphone", "noise")
 
 @dataclass(frozen=True, slots=True)
 class Parameter:
-    """One number of an effect, or an array of such numbers: unit, the value at which the effect vanishes, the values that are possible."""
+    """One number of an effect, or an array of such numbers: unit, the value at which the effect vanishes, the values
+    that are possible."""
 
     name: str
     unit: str
@@ -29,28 +31,32 @@ class Parameter:
 
 
 RECORDING = Parameter("recording", "fingerprint", 0.0, 0.0, 2.0**52)
-"""Every event's last parameter: the recording in which it happened (Measurement.fingerprint); 0 for whichever is looked at."""
+"""Every event's last parameter: the recording in which it happened (Measurement.fingerprint); 0 for whichever is looked
+at."""
 
 
 class Effect:
     """One physical effect on the robot's own voice. With every parameter at its neutral value, apply is the identity.
 
-    A subclass gives name, stage and parameters, and overrides what differs from the defaults below; no other module knows an effect by name.
-    Stage "source" acts on the reference, "path", "time" and "microphone" on the predicted voice at the microphone; "noise" changes the
-    noise that is expected and leaves the voice alone.
+    A subclass gives name, stage and parameters, and overrides what differs from the defaults below; no other module
+    knows an effect by name. Stage "source" acts on the reference, "path", "time" and "microphone" on the predicted
+    voice at the microphone; "noise" changes the noise that is expected and leaves the voice alone.
 
     What the model asks:
-    memory: samples of the past that apply needs, 0 for none; None where it needs more than the running filter looks back at every hop.
-    scales_fan: whether the fan gets the same gain as the voice. event: whether the values belong to one recording (moments, a gain's
-    curve) rather than to the robot: they get a parameter RECORDING besides their own, and in other recordings the effect is left out. absorbed: whether a linear path fitted to a recording holds the effect already.
+    memory: samples of the past that apply needs, 0 for none; None where it needs more than the running filter looks
+    back at every hop.
+    scales_fan: whether the fan gets the same gain as the voice. event: whether the values belong to one recording
+    (moments, a gain's curve) rather than to the robot: they get a parameter RECORDING besides their own, and in other
+    recordings the effect is left out. absorbed: whether a linear path fitted to a recording holds the effect already.
 
     What the diagnosis asks:
-    title: as it reads inside a sentence ("a turned volume"); by default the name. complexity: of two effects that explain about as much
-    the lower one is named; from 4 on it is a long filter, which half a minute does not teach. least_gain_db: fall of the held-out level
-    and least_size_db: power over the fan of what changes, below which it is not named. cost: of a fit, in quarters of a second.
-    last_resort: whether it is tried only where no other explains much. flexible: whether it has so many numbers that it takes up what
-    a simpler effect beside it does. leaves_noise: whether it leaves noise in the residual that no waveform predicts; noise_words: what
-    is said of that where a residual is described.
+    title: as it reads inside a sentence ("a turned volume"); by default the name. complexity: of two effects that
+    explain about as much the lower one is named; from 4 on it is a long filter, which half a minute does not teach.
+    least_gain_db: fall of the held-out level, and least_size_db: power over the fan of what changes, below which it is
+    not named. cost: of a fit, in quarters of a second. last_resort: whether it is tried only where no other explains
+    much. flexible: whether it has so many numbers that it takes up what a simpler effect beside it does.
+    leaves_noise: whether it leaves noise in the residual that no
+    waveform predicts; noise_words: what is said of that where a residual is described.
     """
 
     name: ClassVar[str]
@@ -73,11 +79,13 @@ class Effect:
     noise_words: ClassVar[str] = ""
 
     def apply(self, x: Samples, values: Values, sample_rate: int) -> Samples:
-        """The signal (n,) after the effect; x is not written to. By default x itself, as for an effect of stage "noise"."""
+        """The signal (n,) after the effect; x is not written to. By default x itself, as for an effect of stage
+        "noise"."""
         return x.copy()
 
     def fit(self, measurement: Measurement, model: VoiceModel) -> Values:
-        """Values with which the model, this effect added, comes closest to the recording (least squares); by default the neutral ones."""
+        """Values with which the model, this effect added, comes closest to the recording (least squares); by default
+        the neutral ones."""
         return neutral(self)
 
     def noise_psd(self, values: Values, psd: Samples) -> Samples:
@@ -85,7 +93,8 @@ class Effect:
         return psd
 
     def variance(self, reference: Samples, values: Values, sample_rate: int) -> Samples:
-        """What the effect adds to the expected square of each sample (n,) at the microphone, for an aligned reference (n,)."""
+        """What the effect adds to the expected square of each sample (n,) at the microphone, for an aligned reference
+        (n,)."""
         return np.zeros(reference.size, np.float32)
 
     def colour(self, values: Values) -> Array:
@@ -93,7 +102,8 @@ class Effect:
         return np.full(601, 1.0 / 8000.0)
 
     def settled(self, values: Values) -> Values:
-        """Values with which the effect is from the start what it is at a recording's end: what the running filter begins with."""
+        """Values with which the effect is from the start what it is at a recording's end: what the running filter
+        begins with."""
         return values
 
     def sentence(self, values: Values) -> str:
@@ -105,11 +115,13 @@ class Effect:
         return True
 
     def cutting_above(self, hz: float) -> Values | None:
-        """Values with which the effect takes away all that lies above hz; None for an effect that does no such thing."""
+        """Values with which the effect takes away all that lies above hz; None for an effect that does no such
+        thing."""
         return None
 
     def passband_gain_db(self, values: Values) -> float | None:
-        """The gain in dB that the effect gives to all of the voice that it passes; None where there is no one such gain."""
+        """The gain in dB that the effect gives to all of the voice that it passes; None where there is no one such
+        gain."""
         return None
 
     def plain_gain(self, gain_db: float) -> Values | None:
@@ -144,7 +156,8 @@ def neutral(effect: Effect) -> dict[str, float]:
 
 
 def complete(effect: Effect, values: Values) -> dict[str, float | Array]:
-    """values with the neutral value for each that is missing; raises UsageError for unknown names and values out of bounds."""
+    """values with the neutral value for each that is missing; raises UsageError for unknown names and values out of
+    bounds."""
     known = {p.name: p for p in effect.parameters}
     for name, value in values.items():
         if name not in known:
@@ -152,11 +165,15 @@ def complete(effect: Effect, values: Values) -> dict[str, float | Array]:
         p, found = known[name], np.asarray(value, float)
         if not ((found >= p.low) & (found <= p.high)).all():
             raise UsageError(f"effect {effect.name}: {name} is {value} {p.unit}, expected {p.low:g} to {p.high:g}")
-    return {**neutral(effect), **{name: value if np.ndim(value) == 0 else np.asarray(value, float) for name, value in values.items()}}
+    return {
+        **neutral(effect),
+        **{name: value if np.ndim(value) == 0 else np.asarray(value, float) for name, value in values.items()},
+    }
 
 
 def fitted(effect: Effect, measurement: Measurement, model: VoiceModel) -> dict[str, float | Array]:
-    """All values of an effect fitted to a measurement; those of an event, unless it vanishes, say in which recording it happened."""
+    """All values of an effect fitted to a measurement; those of an event, unless it vanishes, say in which recording it
+    happened."""
     values = complete(effect, effect.fit(measurement, model))
     if effect.event and not vanishes(effect, values):
         values[RECORDING.name] = measurement.fingerprint

@@ -21,9 +21,10 @@ TAIL = 12800
 class EchoModel:
     """A linear path and the effects around it.
 
-    impulse_response: (taps,) float32 from the reference to the microphone, starting PRE_ROLL samples before the direct sound.
-    effects: (name, values) in the order in which they were added; applied they are in the catalogue's, so that the order in which effects
-    were found changes nothing that is predicted.
+    impulse_response: (taps,) float32 from the reference to the microphone, starting PRE_ROLL samples before the direct
+    sound.
+    effects: (name, values) in the order in which they were added; applied they are in the catalogue's, so that the
+    order in which effects were found changes nothing that is predicted.
     """
 
     impulse_response: Samples
@@ -34,7 +35,8 @@ class EchoModel:
         return self._predict(reference, self.effects)
 
     def unpredictable(self, reference: Samples) -> tuple[tuple[Samples, Array], ...]:
-        """Of each effect that adds noise of its own: its expected square (n,) at the microphone, and its density (601,) per Hz of integral 1."""
+        """Of each effect that adds noise of its own: its expected square (n,) at the microphone, and its density (601,)
+        per Hz of integral 1."""
         applied = chain(self.effects)
         noisy = [(effect, values) for effect, values in applied if effect.adds_noise]
         if not noisy:
@@ -46,11 +48,13 @@ class EchoModel:
         return tuple((effect.variance(x, values, SAMPLE_RATE), effect.colour(values)) for effect, values in noisy)
 
     def driver(self) -> Driver:
-        """What the running filter puts the reference through, hop by hop, before the path: the source effects with a short memory."""
+        """What the running filter puts the reference through, hop by hop, before the path: the source effects with a
+        short memory."""
         return Driver(self.effects)
 
     def running_response(self) -> Samples:
-        """(taps,) the path with all stationary linear effects folded in, as after the last change: what the running filter starts from."""
+        """(taps,) the path with all stationary linear effects folded in, as after the last change: what the running
+        filter starts from."""
         linear = [(effect, values) for effect, values in chain(self.effects) if effect.stage == "path"]
         if not linear:
             return self.impulse_response
@@ -71,7 +75,8 @@ class EchoModel:
         return replace(self, impulse_response=np.concatenate((response, rest)).astype(np.float32), effects=kept)
 
     def components(self, reference: Samples) -> dict[str, Samples]:
-        """What each part contributes, (n,) each: "linear", the path alone, then by how much each effect in turn changes it.
+        """What each part contributes, (n,) each: "linear", the path alone, then by how much each effect in turn changes
+        it.
 
         The sum of all components is predict(reference).
         """
@@ -84,7 +89,8 @@ class EchoModel:
         return parts
 
     def microphone_gain(self, size: int) -> Samples:
-        """(size,) the gain that an effect behind the microphone gives voice and fan alike at each moment; ones without one."""
+        """(size,) the gain that an effect behind the microphone gives voice and fan alike at each moment; ones without
+        one."""
         gain = np.ones(size, np.float32)
         for effect, values in chain(self.effects):
             if effect.scales_fan:
@@ -118,10 +124,19 @@ class EchoModel:
         """The model with that effect at the values that explain the measurement best."""
         return self.with_effect(name, fitted(find(name), measurement, self.without_effect(name)))
 
+    def lasting(self) -> EchoModel:
+        """The model without its events: what holds of the robot in any recording."""
+        return replace(self, effects=tuple((name, values) for name, values in self.effects if not find(name).event))
+
     def during(self, measurement: Measurement) -> EchoModel:
-        """The model without the events of other recordings: a jump or a moment's move does not come again at the same second of another one."""
+        """The model without the events of other recordings: a jump or a moment's move does not come again at the same
+        second of another one."""
         here = (0.0, measurement.fingerprint)
-        kept = tuple((name, values) for name, values in self.effects if not find(name).event or values.get(RECORDING.name, 0.0) in here)
+        kept = tuple(
+            (name, values)
+            for name, values in self.effects
+            if not find(name).event or values.get(RECORDING.name, 0.0) in here
+        )
         return self if len(kept) == len(self.effects) else replace(self, effects=kept)
 
     def _predict(self, reference: Samples, effects: tuple[tuple[str, Values], ...]) -> Samples:

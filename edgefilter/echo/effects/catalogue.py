@@ -1,8 +1,8 @@
 """The effects that the package knows: its own, in the order in which sound meets them, and those of the user.
 
-A new effect is a file in this folder and a line in EFFECTS. Where its line stands matters: within a stage effects do not commute (a
-compressor behind a turned volume is not one before it), so EchoModel applies them in the order of this list, whichever was found first.
-Effects of the user's own come after these within their stage, by name.
+A new effect is a file in this folder and a line in EFFECTS. Where its line stands matters: within a stage effects do
+not commute (a compressor behind a turned volume is not one before it), so EchoModel applies them in the order of this
+list, whichever was found first. Effects of the user's own come after these within their stage, by name.
 """
 
 from __future__ import annotations
@@ -48,7 +48,8 @@ _known: dict[str, Effect] = {effect.name: effect for effect in EFFECTS}
 
 
 def register(effect: Effect) -> None:
-    """Make an effect known by its name; raises UsageError where the name is taken or a neutral value is out of bounds."""
+    """Make an effect known by its name; raises UsageError where the name is taken or a neutral value is out of
+    bounds."""
     if effect.name in _known:
         raise UsageError(f"effect '{effect.name}' is defined twice: rename one of them")
     for p in effect.parameters:
@@ -70,7 +71,8 @@ def find(name: str) -> Effect:
 
 
 def chain(effects: Iterable[tuple[str, Values]]) -> list[tuple[Effect, dict[str, float | Array]]]:
-    """Each effect with all of its values, in the order in which they are applied: by stage, then as EFFECTS lists them, then by name."""
+    """Each effect with all of its values, in the order in which they are applied: by stage, then as EFFECTS lists them,
+    then by name."""
     found = [(find(name), values) for name, values in effects]
     found.sort(key=lambda pair: (STAGES.index(pair[0].stage), _PLACE.get(pair[0].name, len(_PLACE)), pair[0].name))
     return [(effect, complete(effect, values)) for effect, values in found]
