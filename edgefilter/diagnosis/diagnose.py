@@ -14,7 +14,7 @@ from edgefilter.diagnosis.findings import findings_of, share_of
 from edgefilter.diagnosis.leftover import left_in_words
 from edgefilter.diagnosis.noise_change import look_at_fan
 from edgefilter.diagnosis.prepare import Prepared, prepare
-from edgefilter.diagnosis.result import Diagnosis, Finding, Interval
+from edgefilter.diagnosis.result import Diagnosis, Finding, Interval, Verdict
 from edgefilter.diagnosis.score import Judge
 from edgefilter.diagnosis.select import search
 from edgefilter.diagnosis.trials import Found
@@ -155,7 +155,7 @@ def conclude(
         found.final.excess_db < criteria.explained_db or _enough(prepared, found, criteria)
     )
     quiet = found.base.excess_db < criteria.explained_db and not prepared.human
-    verdict = "missing" if believed and not _much_left(found, criteria) else "explained" if quiet else "unexplained"
+    verdict: Verdict = "missing" if believed and not _much_left(found, criteria) else "explained" if quiet else "unexplained"
     if not believed and (quiet or not _partly(prepared, found, criteria)):
         sure = None if quiet else cut_by_power(found, criteria)
         found = sure or replace(found, steps=(), final=found.base, model=found.start)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter1d
 
 from edgefilter.diagnosis.prepare import Prepared
@@ -60,8 +61,8 @@ class Judge:
         return self.prepared.measurement
 
     @property
-    def usable(self) -> Array:
-        """(n,) bool, samples where nobody else talks."""
+    def usable(self) -> NDArray[np.bool_]:
+        """(n,) samples where nobody else talks."""
         return self.prepared.usable
 
     def level_db(self, prediction: Samples) -> float:

@@ -42,7 +42,7 @@ class Grid(Protocol):
     edges. freedom: (bands,) degrees of freedom of a cell. usable: (n,) bool, samples where nobody else talks.
     """
 
-    starts: Array
+    starts: NDArray[np.signedinteger]
     active_cells: NDArray[np.bool_]
     band_hz: Array
     freedom: Array
