@@ -15,10 +15,10 @@ from edgefilter.diagnosis.compare import compare
 from edgefilter.diagnosis.criteria import Criteria
 from edgefilter.diagnosis.diagnose import add, diagnose
 from edgefilter.diagnosis.findings import findings_of
-from edgefilter.dsp.fractional_delay import delayed
 from edgefilter.diagnosis.prepare import prepare
 from edgefilter.diagnosis.score import Judge
 from edgefilter.diagnosis.trials import Found, Workbench
+from edgefilter.dsp.fractional_delay import delayed
 from edgefilter.echo.effect import Effect, Parameter
 from edgefilter.echo.effects import catalogue
 from edgefilter.echo.effects.catalogue import find

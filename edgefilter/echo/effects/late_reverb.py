@@ -102,7 +102,7 @@ class LateReverb(Effect):
         after = added.copy()
         after[: before.size] += before[: added.size]
         late = float(np.sum(added[EARLY:] ** 2)) >= LATE_SHARE * float(np.sum(added**2))
-        return late and float(evidence.values["rt60_s"]) > 0.0 and decay(after) > LONGER * decay(before)
+        return late and decay(after) > LONGER * decay(before)
 
 
 def block_energy(taps: Array) -> tuple[Array, float]:
