@@ -1,5 +1,4 @@
-"""Where a recording's band ends, by its power alone: a codec's noise hides in the waveform what its low-pass takes
-away."""
+"""Where a recording's band ends, by its power alone: a codec's noise hides in the waveform what its low-pass takes away."""
 
 from __future__ import annotations
 
@@ -16,8 +15,7 @@ INDEPENDENT = 0.6
 
 
 def band_edge(judge: Judge, prediction: Samples, criteria: Criteria) -> float | None:
-    """Frequency in Hz above which the voice of prediction (n,) is missing from the recording's power; None where it is
-    all there.
+    """Frequency in Hz above which the voice of prediction (n,) is missing from the recording's power; None where it is all there.
 
     The power over that of the robot's silences, summed over all bands above an edge, is held against the predicted one.
     """
@@ -42,8 +40,7 @@ def band_edge(judge: Judge, prediction: Samples, criteria: Criteria) -> float | 
 
 
 def cut_by_power(found: Found, criteria: Criteria) -> Found | None:
-    """The outcome of a search with nothing but a band limit, where the recording's power shows one and the residual
-    falls by it; else None."""
+    """The outcome of a search with nothing but a band limit, where the recording's power shows one and the residual falls by it; else None."""
     judge = Judge(found.prepared)
     edge = band_edge(judge, found.base.prediction, criteria)
     if edge is None:

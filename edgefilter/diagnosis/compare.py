@@ -1,5 +1,4 @@
-"""Compare what the profile predicts of the robot's own voice with a recording of it: how much is left over, and
-where."""
+"""Compare what the profile predicts of the robot's own voice with a recording of it: how much is left over, and where."""
 
 from __future__ import annotations
 
@@ -25,8 +24,7 @@ LAG_EDGES_MS = (-20.0, -4.0, 0.0, 4.0, 10.0, 30.0, 100.0, 200.0, 400.0, 800.0)
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """A recording against its prediction. Decibels of excess are of the residual, whitened by the fan's PSD, over the
-    fan.
+    """A recording against its prediction. Decibels of excess are of the residual, whitened by the fan's PSD, over the fan.
 
     excess_db: of the samples that no diagnosis fits on, every second half second, as Judge scores them: the one figure
     that compare, add, diagnose and the report show; 0 means that nothing is unexplained. All else is of the whole.
@@ -117,8 +115,7 @@ def compare(profile: Profile, recording: Samples, reference: Samples, *, sample_
 
 
 def describe(prepared: Prepared, model: EchoModel, score: Score | None = None) -> Comparison:
-    """The comparison of a prepared recording with what a model predicts; score: the judge's of that model, where it is
-    known.
+    """The comparison of a prepared recording with what a model predicts; score: the judge's of that model, where it is known.
 
     A gain of the microphone is taken out of the residual before that is held against the fan, which passed it as well.
     """
@@ -168,8 +165,7 @@ def _by_band(residual: Samples, psd: Samples, use: Array) -> tuple[tuple[float, 
 
 
 def _by_level(prediction: Samples, white: Samples, power: Array) -> tuple[tuple[float, float, float], ...]:
-    """Excess by the level of the predicted voice in blocks of 20 ms, those in which it, whitened, is no less than the
-    fan."""
+    """Excess by the level of the predicted voice in blocks of 20 ms, those in which it, whitened, is no less than the fan."""
     block = SAMPLE_RATE // 50
     level, excess = decibels(block_power(prediction, block)), blocks(power, block).mean(axis=1)
     steps = np.floor(level / LEVEL_STEP_DB)
@@ -183,8 +179,7 @@ def _by_level(prediction: Samples, white: Samples, power: Array) -> tuple[tuple[
 
 
 def _by_lag(white: Samples, reference: Samples) -> tuple[tuple[float, float, float], ...]:
-    """Share of the squared cross-correlation of residual and reference in each range of lags, both spectra
-    flattened."""
+    """Share of the squared cross-correlation of residual and reference in each range of lags, both spectra flattened."""
     n = 2 * white.size
     a, b = np.fft.rfft(white, n), np.fft.rfft(reference, n)
     cross = np.fft.irfft(a * np.conj(b) / (np.abs(b) ** 2 + 1e-2 * np.mean(np.abs(b) ** 2)), n)

@@ -187,8 +187,7 @@ def _partly(prepared: Prepared, found: Found, criteria: Criteria) -> bool:
 
 
 def _much_left(found: Found, criteria: Criteria) -> bool:
-    """Whether the findings leave so much, also of the samples that they were fitted to, that something else is there
-    besides.
+    """Whether the findings leave so much, also of the samples that they were fitted to, that something else is there besides.
 
     What they leave of the others alone is how well a recording of that length teaches them.
     """

@@ -1,5 +1,4 @@
-"""What a search has found, said of each effect by itself: its part of the excess, its parameters and how well these are
-known."""
+"""What a search has found, said of each effect by itself: its part of the excess, its parameters and how well these are known."""
 
 from __future__ import annotations
 
@@ -29,8 +28,7 @@ def share_of(before_db: float, after_db: float) -> float:
 
 
 def findings_of(found: Found, progress: Callable[[str], None] | None) -> tuple[tuple[Finding, ...], list[str]]:
-    """Strongest first; each with the excess before and after it in the order in which they were added. And what is not
-    known of them."""
+    """Strongest first; each with the excess before and after it in the order in which they were added. And what is not known of them."""
     findings, doubts, before = [], [], found.base.excess_db
     for step in found.steps:
         after = found.final.excess_db if step is found.steps[-1] else step.score.excess_db
@@ -56,8 +54,7 @@ def findings_of(found: Found, progress: Callable[[str], None] | None) -> tuple[t
 
 
 def _intervals(prepared: Prepared, model: EchoModel, step: Trial) -> tuple[Mapping[str, Interval], list[str]]:
-    """Each scalar parameter, or short list, with the interval that three fits to a third of the recording each give;
-    and which fits failed.
+    """Each scalar parameter, or short list, with the interval that three fits to a third of the recording each give; and which fits failed.
 
     Where fewer than two thirds can be fitted, a parameter may have any of its possible values.
     """
@@ -87,8 +84,10 @@ def _intervals(prepared: Prepared, model: EchoModel, step: Trial) -> tuple[Mappi
 
 
 def _spread(value: np.ndarray, fits: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Low and high from the scatter of the fits, and from how far their mean is off: what a third teaches otherwise
-    than the half is known no better."""
+    """Low and high from the scatter of the fits and from how far their mean is off.
+
+    What a third teaches otherwise than the half is known no better.
+    """
     alike = [fit for fit in fits if fit.shape == value.shape]
     spread = (
         np.hypot(THIRDS_T * np.std(alike, axis=0, ddof=1), np.mean(alike, axis=0) - value)

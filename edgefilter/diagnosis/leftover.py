@@ -1,5 +1,4 @@
-"""What is left of a recording when the robot's voice is taken out: the fan, tones, somebody talking, or something
-unknown, in words."""
+"""What is left of a recording when the robot's voice is taken out: the fan, tones, somebody talking, or something unknown, in words."""
 
 from __future__ import annotations
 
@@ -26,8 +25,7 @@ BLOCK = SAMPLE_RATE // 10
 
 @dataclass(frozen=True, eq=False)
 class Leftover:
-    """tones_hz: (k,) of the strongest tones, loudest first; mains_hz: 50 or 60 where most of their power lies on its
-    multiples, else 0.
+    """tones_hz: (k,) of the strongest tones, loudest first; mains_hz: 50 or 60 where most of their power lies on its multiples, else 0.
 
     tone_share: of the residual's power over the fan, in tones. quiet_db: excess while the robot is silent, its median
     over blocks of 0.1 s;
@@ -57,8 +55,7 @@ def inspect(prepared: Prepared, residual: Samples) -> Leftover:
 
 
 def _tones(residual: Samples, psd: Samples) -> tuple[Array, float, float]:
-    """Frequencies of tones, loudest first, the mains frequency they belong to (0: none), and their share of the power
-    over the fan."""
+    """Frequencies of tones, loudest first, the mains frequency they belong to (0: none), and their share of the power over the fan."""
     if residual.size < 2 * LINE_FFT:
         return np.zeros(0), 0.0, 0.0
     power = np.median(periodograms(residual, LINE_FFT), axis=0)

@@ -1,5 +1,4 @@
-"""Whether the fan itself is another than at the calibration: before the search, and once the robot's voice is taken
-out."""
+"""Whether the fan itself is another than at the calibration: before the search, and once the robot's voice is taken out."""
 
 from __future__ import annotations
 
@@ -23,8 +22,7 @@ BAND = 20
 
 
 def changed_fan(prepared: Prepared, model: EchoModel, base: Score, criteria: Criteria) -> tuple[Prepared, Trial] | None:
-    """The recording prepared with the fan as the robot's silences have it, and what changed it as a step; None where it
-    is the calibrated one.
+    """The recording prepared with the fan as the robot's silences have it, and what changed it as a step; None where it is the calibrated one.
 
     Only where there are silences and the change has a colour of its own: before the voice is explained, a gain cannot
     be told from it.
@@ -52,8 +50,7 @@ def changed_fan(prepared: Prepared, model: EchoModel, base: Score, criteria: Cri
 
 
 def look_at_fan(found: Found, criteria: Criteria) -> tuple[Found, Leftover]:
-    """The search's outcome with the final residual judged against the fan as it is now, and with what changed the fan
-    where it is another.
+    """The search's outcome with the final residual judged against the fan as it is now, and with what changed the fan where it is another.
 
     A microphone gain in the model is taken out of the residual first: the fan passed through it.
     """
@@ -93,8 +90,7 @@ def _of_the_fan(model: EchoModel) -> list[str]:
 
 
 def _steady(left: Leftover, criteria: Criteria) -> bool:
-    """Whether what is left of the silences, whitened by the new fan's spectrum, is a fan; True where there are no
-    silences."""
+    """Whether what is left of the silences, whitened by the new fan's spectrum, is a fan; True where there are no silences."""
     return left.swing_db < criteria.fan_steady_db and not left.quiet_mean_db - left.quiet_db > criteria.fan_sparse_db
 
 

@@ -1,5 +1,4 @@
-"""Bring a recording of the robot alone into a state in which it can be held against a prediction: rate, lag,
-silence."""
+"""Bring a recording of the robot alone into a state in which it can be held against a prediction: rate, lag, silence."""
 
 from __future__ import annotations
 
@@ -127,8 +126,7 @@ def known_span(x: Samples, first_lag: float, last_lag: float) -> tuple[int, int]
 
 
 def utterance_lags(x: Samples, predicted: Samples, recording: Samples, psd: Samples, offset: float) -> list[tuple[int, int, float]]:
-    """(first sample, end, lag) of the stretches of the reference x (n,) that share a lag, the whole with `offset` where
-    it is one.
+    """(first sample, end, lag) of the stretches of the reference x (n,) that share a lag, the whole with `offset` where it is one.
 
     predicted: for x without an offset. A player starts each utterance anew, so its lag may be another after a pause of
     PAUSE_S; a difference of less than LAG_STEP is no new start but left for the effects to explain.
@@ -183,8 +181,7 @@ def find_talk(square: Samples, active: NDArray[np.bool_]) -> tuple[tuple[float, 
 
 
 def fan_scale(quiet: Samples) -> float:
-    """How much louder the fan is than in the calibration, in power, from the whitened recording while the robot is
-    silent, (k,).
+    """How much louder the fan is than in the calibration, in power, from the whitened recording while the robot is silent, (k,).
 
     1 where the difference is more than FAN_TOLERANCE_DB either way, and so no ordinary one, or where there is too
     little silence.

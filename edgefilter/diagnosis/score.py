@@ -111,8 +111,7 @@ class Judge:
         )
 
     def floor_level(self, score: Score) -> float:
-        """Level in dB of the cells in which the robot is silent, 0 where it never is: what is left when everything is
-        explained."""
+        """Level in dB of the cells in which the robot is silent, 0 where it never is: what is left when everything is explained."""
         quiet = score.cells[~self.active_cells]
         if quiet.shape[0] < 4:
             return 0.0
@@ -146,16 +145,14 @@ class Judge:
         return expected
 
     def _over_expected(self, power: Array, unpredictable: Sequence[tuple[Samples, Array]]) -> Array:
-        """power (n,) of the whitened residual over what is expected, both smoothed over 16 ms: when a knock comes is
-        known to some ms."""
+        """power (n,) of the whitened residual over what is expected, both smoothed over 16 ms: when a knock comes is known to some ms."""
         expected = np.ones_like(power)
         for variance, colour in unpredictable:
             expected += variance * float(np.mean(colour / self.psd))
         return uniform_filter1d(power, HOP) / uniform_filter1d(expected, HOP)
 
     def correct(self, prediction: Samples) -> Samples:
-        """prediction (n,) through the short filter that brings it closest to the recording, no further from 1 than
-        TOLERANCE."""
+        """prediction (n,) through the short filter that brings it closest to the recording, no further from 1 than TOLERANCE."""
         measurement = self.prepared.measurement
         x = whiten(prediction, self.psd)
         target = measurement.white_recording - x

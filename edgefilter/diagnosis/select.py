@@ -1,5 +1,4 @@
-"""Stepwise selection of the effects that a profile lacks: forward, refit, backward, on held-out samples (Efroymson
-1960).
+"""Stepwise selection of the effects that a profile lacks: forward, refit, backward, on held-out samples (Efroymson 1960).
 
 Forward: every effect is fitted beside those accepted so far, and the simplest of those that explain nearly most is
 accepted. Refit: all are fitted beside each other. Backward: what the newest one has made superfluous is exchanged for
@@ -37,8 +36,7 @@ def search(
 
 
 def _runs(bench: Workbench, start: EchoModel) -> Iterator[EchoModel]:
-    """What each beginning leads to, until one explains nearly all; then, where that is one long filter, what half of it
-    may lead to."""
+    """What each beginning leads to, until one explains nearly all; then, where that is one long filter, what half of it may lead to."""
     criteria = bench.criteria
     for first in _starts(bench, start):
         run = _stepwise(bench, start, first)
@@ -50,8 +48,7 @@ def _runs(bench: Workbench, start: EchoModel) -> Iterator[EchoModel]:
 
 
 def _starts(bench: Workbench, start: EchoModel) -> Iterator[Trial]:
-    """The trial to begin with, then others that explain a good part, named or not, since what hides them may be found
-    beside them."""
+    """The trial to begin with, then others that explain a good part, named or not, since what hides them may be found beside them."""
     criteria = bench.criteria
     if bench.heard(start) <= criteria.silent_db:
         return
@@ -65,8 +62,7 @@ def _starts(bench: Workbench, start: EchoModel) -> Iterator[Trial]:
 
 
 def _half_of_a_filter(bench: Workbench, start: EchoModel, run: EchoModel) -> list[Trial]:
-    """The simple effect, none or one, that explains a good part of what one long filter does: two of them may look like
-    that filter."""
+    """The simple effect, none or one, that explains a good part of what one long filter does: two of them may look like that filter."""
     found = added(start, run)
     if len(found) != 1 or find(found[0]).complexity < bench.criteria.long_filter:
         return []
@@ -117,8 +113,7 @@ def refit(bench: Workbench, start: EchoModel, model: EchoModel) -> EchoModel:
 
 
 def backward(bench: Workbench, start: EchoModel, model: EchoModel, newest: str) -> EchoModel:
-    """The model without what the newest effect has made superfluous: an earlier one exchanged for the one to name
-    beside it, or dropped."""
+    """The model without what the newest effect has made superfluous: an earlier one exchanged for the one to name beside it, or dropped."""
     earlier = [name for name in added(start, model) if name != newest]
     for name in earlier:
         model = _exchange(bench, start, model, name)
@@ -144,8 +139,7 @@ def _exchange(bench: Workbench, start: EchoModel, model: EchoModel, name: str) -
 
 
 def split(bench: Workbench, start: EchoModel, model: EchoModel) -> EchoModel:
-    """The model with a simpler effect beside a flexible one where both together explain more than the flexible one
-    alone."""
+    """The model with a simpler effect beside a flexible one where both together explain more than the flexible one alone."""
     model = _volume_beside(bench, model)
     for name in [name for name in added(start, model) if find(name).flexible]:
         others = model.without_effect(name)
@@ -156,8 +150,7 @@ def split(bench: Workbench, start: EchoModel, model: EchoModel) -> EchoModel:
 
 
 def _volume_beside(bench: Workbench, model: EchoModel) -> EchoModel:
-    """The model with the gain that a filter has in its passband as a turned volume beside it, where that explains as
-    much."""
+    """The model with the gain that a filter has in its passband as a turned volume beside it, where that explains as much."""
     for name, values in model.effects:
         gain_db = find(name).passband_gain_db(values)
         if gain_db is None or abs(gain_db) < bench.criteria.passband_db:
@@ -175,8 +168,7 @@ def _volume_beside(bench: Workbench, model: EchoModel) -> EchoModel:
 
 
 def _with_simpler(bench: Workbench, start: EchoModel, model: EchoModel, name: str) -> EchoModel:
-    """The model with a simpler effect beside the flexible one of that name, of the two that explain most by themselves,
-    or as it is."""
+    """The model with a simpler effect beside the flexible one of that name, of the two that explain most by themselves, or as it is."""
     criteria, others = bench.criteria, model.without_effect(name)
     absent = bench.absent(others, max(find(name).complexity - 1, criteria.simple))
     wanted = [key for key in absent if not (find(key).flexible or find(key).last_resort)]
@@ -196,8 +188,7 @@ def _with_simpler(bench: Workbench, start: EchoModel, model: EchoModel, name: st
 
 
 def _best(bench: Workbench, start: EchoModel, runs: list[EchoModel]) -> EchoModel:
-    """The run that explains most of those whose effects can all be named; the earlier and simpler one where others
-    hardly explain more."""
+    """The run that explains most of those whose effects can all be named; the earlier and simpler one where others hardly explain more."""
     base = bench.score(start).level_db
     valid = [_standing(bench, start, run) for run in runs]
     best = start
@@ -222,8 +213,7 @@ def _stands(bench: Workbench, model: EchoModel, name: str) -> bool:
 
 
 def _in_steps(bench: Workbench, start: EchoModel, model: EchoModel) -> tuple[Trial, ...]:
-    """The effects that a model has beyond the start, each with what it explains beside those before it, the largest
-    first."""
+    """The effects that a model has beyond the start, each with what it explains beside those before it, the largest first."""
     left, steps = added(start, model), []
     values, model = dict(model.effects), start
     while left:

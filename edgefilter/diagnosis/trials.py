@@ -1,5 +1,4 @@
-"""One effect tried on a model of a recording: what it explains on held-out samples, and whether that is enough to name
-it."""
+"""One effect tried on a model of a recording: what it explains on held-out samples, and whether that is enough to name it."""
 
 from __future__ import annotations
 
@@ -24,8 +23,7 @@ Signature: TypeAlias = tuple[tuple[str | bytes, ...], ...]
 
 @dataclass(frozen=True, eq=False)
 class Trial:
-    """One effect added to a model: its values, the model with it, its score, the fall in level and the effect's size
-    over the fan in dB."""
+    """One effect added to a model: its values, the model with it, its score, the fall in level and the effect's size over the fan in dB."""
 
     name: str
     values: Values
@@ -37,8 +35,7 @@ class Trial:
 
 @dataclass(frozen=True, eq=False)
 class Found:
-    """The outcome of a search from a start model. steps: the accepted effects in their order. notes: what the reader
-    must know of the search.
+    """The outcome of a search from a start model. steps: the accepted effects in their order. notes: what the reader must know of the search.
 
     prepared: what final was scored on; its fan is another than at the calibration where a changed fan is the first of
     the steps.
@@ -97,8 +94,7 @@ class Workbench:
         return max(score.level_db - self.judge.floor_level(score), 0.0)
 
     def attempt(self, name: str, model: EchoModel) -> Trial | None:
-        """The effect of that name fitted beside what the model has; None where its fit finds nothing, or no further one
-        may be made."""
+        """The effect of that name fitted beside what the model has; None where its fit finds nothing, or no further one may be made."""
         key = signature(model), name
         if key not in self._trials:
             if self._cost >= self.criteria.most_cost:
@@ -109,8 +105,7 @@ class Workbench:
         return self._trials[key]
 
     def attempt_alike(self, name: str, model: EchoModel) -> Trial | None:
-        """attempt(), or what came of it beside the same effects at other values: enough to choose what is worth a
-        closer look."""
+        """attempt(), or what came of it beside the same effects at other values: enough to choose what is worth a closer look."""
         key = frozenset(dict(model.effects)), name
         return self._alike[key] if key in self._alike else self.attempt(name, model)
 
@@ -170,8 +165,7 @@ class Workbench:
         return effect.plausible(Evidence(trial.values, model, self.judge, self.score(model), trial.score))
 
     def preferred(self, trials: Iterable[Trial]) -> Trial | None:
-        """Of admissible trials the simplest of those that explain nearly as much as the best; None where none lowers
-        the level."""
+        """Of admissible trials the simplest of those that explain nearly as much as the best; None where none lowers the level."""
         trials = list(trials)
         most = max((trial.gain_db for trial in trials), default=0.0)
         enough = [trial for trial in trials if most > 0.0 and trial.gain_db >= self.criteria.nested * most]
@@ -192,8 +186,7 @@ def added(start: EchoModel, model: EchoModel) -> list[str]:
 
 
 def signature(model: EchoModel) -> Signature:
-    """By which models with the same effects at the same values are known: they predict the same, in whichever order
-    these were fitted."""
+    """By which models with the same effects at the same values are known: they predict the same, in whichever order these were fitted."""
     return tuple(
         sorted(
             (name, *(np.asarray(value, float).tobytes() for _, value in sorted(values.items())))

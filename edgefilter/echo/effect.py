@@ -1,5 +1,4 @@
-"""One physical effect on the robot's own voice: the base class, whose hooks are all that the rest of the package knows
-of it."""
+"""One physical effect on the robot's own voice: the base class, whose hooks are all that the rest of the package knows of it."""
 
 from __future__ import annotations
 
@@ -20,8 +19,7 @@ STAGES: tuple[Stage, ...] = ("source", "path", "time", "microphone", "noise")
 
 @dataclass(frozen=True, slots=True)
 class Parameter:
-    """One number of an effect, or an array of such numbers: unit, the value at which the effect vanishes, the values
-    that are possible."""
+    """One number of an effect, or an array of such numbers: unit, the value at which the effect vanishes, the values that are possible."""
 
     name: str
     unit: str
@@ -79,13 +77,11 @@ class Effect:
     noise_words: ClassVar[str] = ""
 
     def apply(self, x: Samples, values: Values, sample_rate: int) -> Samples:
-        """The signal (n,) after the effect; x is not written to. By default x itself, as for an effect of stage
-        "noise"."""
+        """The signal (n,) after the effect; x is not written to. By default x itself, as for an effect of stage "noise"."""
         return x.copy()
 
     def fit(self, measurement: Measurement, model: VoiceModel) -> Values:
-        """Values with which the model, this effect added, comes closest to the recording (least squares); by default
-        the neutral ones."""
+        """Values with which the model, this effect added, comes closest to the recording (least squares); by default the neutral ones."""
         return neutral(self)
 
     def noise_psd(self, values: Values, psd: Samples) -> Samples:
@@ -93,8 +89,7 @@ class Effect:
         return psd
 
     def variance(self, reference: Samples, values: Values, sample_rate: int) -> Samples:
-        """What the effect adds to the expected square of each sample (n,) at the microphone, for an aligned reference
-        (n,)."""
+        """What the effect adds to the expected square of each sample (n,) at the microphone, for an aligned reference (n,)."""
         return np.zeros(reference.size, np.float32)
 
     def colour(self, values: Values) -> Array:
@@ -102,8 +97,7 @@ class Effect:
         return np.full(601, 1.0 / 8000.0)
 
     def settled(self, values: Values) -> Values:
-        """Values with which the effect is from the start what it is at a recording's end: what the running filter
-        begins with."""
+        """Values with which the effect is from the start what it is at a recording's end: what the running filter begins with."""
         return values
 
     def sentence(self, values: Values) -> str:
@@ -115,13 +109,11 @@ class Effect:
         return True
 
     def cutting_above(self, hz: float) -> Values | None:
-        """Values with which the effect takes away all that lies above hz; None for an effect that does no such
-        thing."""
+        """Values with which the effect takes away all that lies above hz; None for an effect that does no such thing."""
         return None
 
     def passband_gain_db(self, values: Values) -> float | None:
-        """The gain in dB that the effect gives to all of the voice that it passes; None where there is no one such
-        gain."""
+        """The gain in dB that the effect gives to all of the voice that it passes; None where there is no one such gain."""
         return None
 
     def plain_gain(self, gain_db: float) -> Values | None:
@@ -156,8 +148,7 @@ def neutral(effect: Effect) -> dict[str, float]:
 
 
 def complete(effect: Effect, values: Values) -> dict[str, float | Array]:
-    """values with the neutral value for each that is missing; raises UsageError for unknown names and values out of
-    bounds."""
+    """values with the neutral value for each that is missing; raises UsageError for unknown names and values out of bounds."""
     known = {p.name: p for p in effect.parameters}
     for name, value in values.items():
         if name not in known:
@@ -172,8 +163,7 @@ def complete(effect: Effect, values: Values) -> dict[str, float | Array]:
 
 
 def fitted(effect: Effect, measurement: Measurement, model: VoiceModel) -> dict[str, float | Array]:
-    """All values of an effect fitted to a measurement; those of an event, unless it vanishes, say in which recording it
-    happened."""
+    """All values of an effect fitted to a measurement; those of an event, unless it vanishes, say in which recording it happened."""
     values = complete(effect, effect.fit(measurement, model))
     if effect.event and not vanishes(effect, values):
         values[RECORDING.name] = measurement.fingerprint

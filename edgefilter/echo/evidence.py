@@ -1,5 +1,4 @@
-"""What speaks for an effect: how well a recording is explained before and after it, and the cells in which that is
-judged."""
+"""What speaks for an effect: how well a recording is explained before and after it, and the cells in which that is judged."""
 
 from __future__ import annotations
 
@@ -15,8 +14,7 @@ from edgefilter.types import Array, Samples
 
 @dataclass(frozen=True, eq=False)
 class Score:
-    """Of one prediction. level_db: mean over time-frequency cells of the residual's dB over the fan, each cell by its
-    degrees of freedom.
+    """Of one prediction. level_db: mean over time-frequency cells of the residual's dB over the fan, each cell by its degrees of freedom.
 
     excess_db: mean power of the held-out whitened residual, dB. active_db, silent_db: while the robot is heard, and is
     not. fitted_db: of the samples to fit on, while it is heard.

@@ -35,8 +35,7 @@ class EchoModel:
         return self._predict(reference, self.effects)
 
     def unpredictable(self, reference: Samples) -> tuple[tuple[Samples, Array], ...]:
-        """Of each effect that adds noise of its own: its expected square (n,) at the microphone, and its density (601,)
-        per Hz of integral 1."""
+        """Of each effect that adds noise of its own: its expected square (n,) at the microphone, and its density (601,) per Hz of integral 1."""
         applied = chain(self.effects)
         noisy = [(effect, values) for effect, values in applied if effect.adds_noise]
         if not noisy:
@@ -48,13 +47,11 @@ class EchoModel:
         return tuple((effect.variance(x, values, SAMPLE_RATE), effect.colour(values)) for effect, values in noisy)
 
     def driver(self) -> Driver:
-        """What the running filter puts the reference through, hop by hop, before the path: the source effects with a
-        short memory."""
+        """What the running filter puts the reference through, hop by hop, before the path: the source effects with a short memory."""
         return Driver(self.effects)
 
     def running_response(self) -> Samples:
-        """(taps,) the path with all stationary linear effects folded in, as after the last change: what the running
-        filter starts from."""
+        """(taps,) the path with all stationary linear effects folded in, as after the last change: what the running filter starts from."""
         linear = [(effect, values) for effect, values in chain(self.effects) if effect.stage == "path"]
         if not linear:
             return self.impulse_response
@@ -75,8 +72,7 @@ class EchoModel:
         return replace(self, impulse_response=np.concatenate((response, rest)).astype(np.float32), effects=kept)
 
     def components(self, reference: Samples) -> dict[str, Samples]:
-        """What each part contributes, (n,) each: "linear", the path alone, then by how much each effect in turn changes
-        it.
+        """What each part contributes, (n,) each: "linear", the path alone, then by how much each effect in turn changes it.
 
         The sum of all components is predict(reference).
         """
@@ -89,8 +85,7 @@ class EchoModel:
         return parts
 
     def microphone_gain(self, size: int) -> Samples:
-        """(size,) the gain that an effect behind the microphone gives voice and fan alike at each moment; ones without
-        one."""
+        """(size,) the gain that an effect behind the microphone gives voice and fan alike at each moment; ones without one."""
         gain = np.ones(size, np.float32)
         for effect, values in chain(self.effects):
             if effect.scales_fan:
@@ -129,8 +124,7 @@ class EchoModel:
         return replace(self, effects=tuple((name, values) for name, values in self.effects if not find(name).event))
 
     def during(self, measurement: Measurement) -> EchoModel:
-        """The model without the events of other recordings: a jump or a moment's move does not come again at the same
-        second of another one."""
+        """The model without the events of other recordings: a jump or a moment's move does not come again at the same second of another one."""
         here = (0.0, measurement.fingerprint)
         kept = tuple(
             (name, values)

@@ -12,8 +12,7 @@ from edgefilter.types import SAMPLE_RATE, Samples
 
 
 class Driver:
-    """Applies the source effects of a model to successive blocks; those with a memory also see what came before a
-    block.
+    """Applies the source effects of a model to successive blocks; those with a memory also see what came before a block.
 
     effects: (name, values). Left out is what needs more of the past than a filter can look back at every hop, as a
     compressor with its release does, and what acts behind the path.
@@ -39,8 +38,7 @@ class Driver:
         return x[self._memory :]
 
     def rewritten(self, history: Samples, hop: int) -> Samples:
-        """history (n,) after the effects, (n,), when the past is another than it was; its last hop will come again as a
-        block."""
+        """history (n,) after the effects, (n,), when the past is another than it was; its last hop will come again as a block."""
         self._past = np.zeros(self._memory, np.float32)
         driven = self(history)
         before = np.concatenate((np.zeros(self._memory, np.float32), history[: history.size - hop]))

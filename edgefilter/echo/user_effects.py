@@ -68,8 +68,7 @@ def load_effect(path: str | Path) -> str:
 
 
 def _guarded(path: Path, mine: type[Effect]) -> type[Effect]:
-    """A subclass of the user's class: what its hooks raise becomes one line that names the file and the line in it,
-    what they give is checked."""
+    """A subclass of the user's class: what its hooks raise becomes one line that names the file and the line in it, what they give is checked."""
     own = [name for name in HOOKS if getattr(mine, name) is not getattr(Effect, name)]
     return type(
         mine.__name__, (mine,), {name: _in_one_line(path, getattr(mine, name), _RESULTS.get(name)) for name in own}

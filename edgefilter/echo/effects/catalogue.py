@@ -48,8 +48,7 @@ _known: dict[str, Effect] = {effect.name: effect for effect in EFFECTS}
 
 
 def register(effect: Effect) -> None:
-    """Make an effect known by its name; raises UsageError where the name is taken or a neutral value is out of
-    bounds."""
+    """Make an effect known by its name; raises UsageError where the name is taken or a neutral value is out of bounds."""
     if effect.name in _known:
         raise UsageError(f"effect '{effect.name}' is defined twice: rename one of them")
     for p in effect.parameters:
@@ -71,8 +70,7 @@ def find(name: str) -> Effect:
 
 
 def chain(effects: Iterable[tuple[str, Values]]) -> list[tuple[Effect, dict[str, float | Array]]]:
-    """Each effect with all of its values, in the order in which they are applied: by stage, then as EFFECTS lists them,
-    then by name."""
+    """Each effect with all of its values, in the order in which they are applied: by stage, then as EFFECTS lists them, then by name."""
     found = [(find(name), values) for name, values in effects]
     found.sort(key=lambda pair: (STAGES.index(pair[0].stage), _PLACE.get(pair[0].name, len(_PLACE)), pair[0].name))
     return [(effect, complete(effect, values)) for effect, values in found]

@@ -60,8 +60,7 @@ class LateReverb(Effect):
         return x.copy() if not taps.any() else x + convolve_from(x, taps, LEAD)
 
     def fit(self, measurement: Measurement, model: VoiceModel) -> Values:
-        """Least squares in the whitened domain, slightly regularised; neutral where nothing of it holds on other
-        samples.
+        """Least squares in the whitened domain, slightly regularised; neutral where nothing of it holds on other samples.
 
         Then once more with taps expected to decay as the room that was found does: some seconds of speech do not teach
         ten thousand.
@@ -89,8 +88,7 @@ class LateReverb(Effect):
         )
 
     def plausible(self, evidence: Evidence) -> bool:
-        """Whether what it adds is reverberation: a good part comes later than early reflections do, and decays more
-        slowly than at the calibration.
+        """Whether what it adds is reverberation: a good part comes later than early reflections do, and decays more slowly than at the calibration.
 
         A loudspeaker of another colour or a path that moved are stationary, too, and a filter this long takes up
         either.
@@ -106,8 +104,7 @@ class LateReverb(Effect):
 
 
 def block_energy(taps: Array) -> tuple[Array, float]:
-    """Energy of the taps in blocks of 20 ms, and that of a block of pure noise (the lower quartile of the last
-    third)."""
+    """Energy of the taps in blocks of 20 ms, and that of a block of pure noise (the lower quartile of the last third)."""
     energy = np.sum(blocks(taps, BLOCK) ** 2, axis=1)
     count = energy.size
     return energy, float(np.quantile(energy[2 * count // 3 :], 0.25)) if count >= 3 else 0.0
@@ -120,8 +117,7 @@ def decay(response: Array) -> int:
 
 
 def decaying(taps: Array, rt60_s: float) -> Array:
-    """(k,) expected squares of taps (k,) with the energy that these have above their noise, decaying with that
-    reverberation time.
+    """(k,) expected squares of taps (k,) with the energy that these have above their noise, decaying with that reverberation time.
 
     The first block, which holds what another room changes in the direct sound, is expected as it was found.
     """
