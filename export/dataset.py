@@ -102,12 +102,12 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--recipe", choices=tuple(RECIPES), default="edge")
     parser.add_argument("--hop", type=int, default=256, help="of the linear stage; the window is twice as long (default: %(default)s)")
-    parser.add_argument("--profile", type=Path, help="add the effects of this profile to half of the items")
+    parser.add_argument("--profile", type=Path, help="add the lasting effects of this profile to half of the items")
     parser.add_argument("--jobs", type=int, default=os.cpu_count())
     options = parser.parse_args()
     recipe = RECIPES[options.recipe]
     if options.profile:
-        recipe = replace(recipe, effects=Profile.load(options.profile).echo.effects)
+        recipe = replace(recipe, effects=Profile.load(options.profile).echo.lasting().effects)
     stft = StftConfig(2 * options.hop, options.hop, 2 * options.hop)
     humans, robots = read_corpus(*options.humans), read_corpus(*options.robots)
     rooms = make_rooms(options.seed, ROOMS, options.jobs)

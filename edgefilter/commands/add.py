@@ -12,6 +12,9 @@ from edgefilter.diagnosis.diagnose import add
 from edgefilter.echo.effects.catalogue import find
 from edgefilter.report.words import UNITS, figure
 
+LEAST_FALL_DB = 0.05
+"""By less the figures that are shown do not differ."""
+
 
 def main(args: argparse.Namespace) -> int:
     effect = find(args.effect)
@@ -32,7 +35,7 @@ def main(args: argparse.Namespace) -> int:
             print(f"  {p.name} = {shown} {UNITS.get(p.unit, p.unit)}".rstrip())
         if effect.event:
             print(f"NOTE        {args.effect} happened in this recording and is kept with it: of others the profile predicts what it did before")
-        if after.excess_db >= before.excess_db:
+        if after.excess_db > before.excess_db - LEAST_FALL_DB:
             print("WARNING     the error did not fall: this effect does not explain the recording")
         print(f"written to {args.output}")
     return 0

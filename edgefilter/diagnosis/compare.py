@@ -26,12 +26,16 @@ LAG_EDGES_MS = (-20.0, -4.0, 0.0, 4.0, 10.0, 30.0, 100.0, 200.0, 400.0, 800.0)
 class Comparison:
     """A recording against its prediction. Decibels of excess are of the residual, whitened by the fan's PSD, over the fan.
 
-    excess_db: of the samples that no diagnosis fits on, every second half second, as Judge scores them: the one figure that compare, add,
-    diagnose and the report show; 0 means that nothing is unexplained. All else is of the whole. noise_floor_db: the fan, dB re full scale.
-    bands: (low_hz, high_hz, excess_db). times: (start_s, end_s, excess_db). levels: (low_dbfs, high_dbfs, excess_db) by the level of
-    the predicted voice. lags: (low_ms, high_ms, share) of the residual's correlation with the reference, by lag.
-    silence_excess_db: while the robot is silent; nan where it never is. human: (start_s, end_s) where somebody talks, left out.
-    offset_samples: lag of the recording against the calibration, constant. recording, prediction, residual: (n,), aligned.
+    excess_db: of the samples that no diagnosis fits on, every second half second, as Judge scores them: the one figure
+    that compare, add, diagnose and the report show; 0 means that nothing is unexplained. All else is of the whole.
+    noise_floor_db: the fan, dB re full scale.
+    bands: (low_hz, high_hz, excess_db). times: (start_s, end_s, excess_db). levels: (low_dbfs, high_dbfs, excess_db) by
+    the level of the predicted voice. lags: (low_ms, high_ms, share) of the residual's correlation with the reference,
+    by lag.
+    silence_excess_db: while the robot is silent; nan where it never is. human: (start_s, end_s) where somebody talks,
+    left out.
+    offset_samples: lag of the recording against the calibration, constant. recording, prediction, residual: (n,),
+    aligned.
     """
 
     excess_db: float
@@ -180,6 +184,13 @@ def _by_lag(white: Samples, reference: Samples) -> tuple[tuple[float, float, flo
     a, b = np.fft.rfft(white, n), np.fft.rfft(reference, n)
     cross = np.fft.irfft(a * np.conj(b) / (np.abs(b) ** 2 + 1e-2 * np.mean(np.abs(b) ** 2)), n)
     edges = [round(ms * SAMPLE_RATE / 1000) for ms in LAG_EDGES_MS]
-    parts = np.array([np.sum(np.take(cross, np.arange(low, high), mode="wrap") ** 2) for low, high in zip(edges[:-1], edges[1:], strict=True)])
+    parts = np.array(
+        [
+            np.sum(np.take(cross, np.arange(low, high), mode="wrap") ** 2)
+            for low, high in zip(edges[:-1], edges[1:], strict=True)
+        ]
+    )
     shares = parts / max(parts.sum(), 1e-30)
-    return tuple((low, high, float(share)) for low, high, share in zip(LAG_EDGES_MS[:-1], LAG_EDGES_MS[1:], shares, strict=True))
+    return tuple(
+        (low, high, float(share)) for low, high, share in zip(LAG_EDGES_MS[:-1], LAG_EDGES_MS[1:], shares, strict=True)
+    )

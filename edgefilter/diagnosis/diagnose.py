@@ -14,7 +14,7 @@ from edgefilter.diagnosis.findings import findings_of, share_of
 from edgefilter.diagnosis.leftover import left_in_words
 from edgefilter.diagnosis.noise_change import look_at_fan
 from edgefilter.diagnosis.prepare import Prepared, prepare
-from edgefilter.diagnosis.result import Diagnosis, Finding, Interval
+from edgefilter.diagnosis.result import Diagnosis, Finding, Interval, Verdict
 from edgefilter.diagnosis.score import Judge
 from edgefilter.diagnosis.select import search
 from edgefilter.diagnosis.trials import Found
@@ -144,14 +144,18 @@ def add(
     return knowing, before, compare(knowing, recording, reference, sample_rate=sample_rate)
 
 
-def conclude(prepared: Prepared, found: Found, criteria: Criteria, progress: Callable[[str], None] | None = None) -> Diagnosis:
+def conclude(
+    prepared: Prepared, found: Found, criteria: Criteria, progress: Callable[[str], None] | None = None
+) -> Diagnosis:
     """The diagnosis that a search leads to; the fan is looked at behind what the search has taken out of the voice."""
     comparison = describe(prepared, found.start, found.base)
     found, left = look_at_fan(found, criteria)
     unpredictable = any(find(step.name).leaves_noise for step in found.steps)
-    believed = bool(found.steps) and (found.final.excess_db < criteria.explained_db or _enough(prepared, found, criteria))
+    believed = bool(found.steps) and (
+        found.final.excess_db < criteria.explained_db or _enough(prepared, found, criteria)
+    )
     quiet = found.base.excess_db < criteria.explained_db and not prepared.human
-    verdict = "missing" if believed and not _much_left(found, criteria) else "explained" if quiet else "unexplained"
+    verdict: Verdict = "missing" if believed and not _much_left(found, criteria) else "explained" if quiet else "unexplained"
     if not believed and (quiet or not _partly(prepared, found, criteria)):
         sure = None if quiet else cut_by_power(found, criteria)
         found = sure or replace(found, steps=(), final=found.base, model=found.start)
@@ -163,7 +167,9 @@ def conclude(prepared: Prepared, found: Found, criteria: Criteria, progress: Cal
         ranking=findings,
         evidence=left_in_words(found, left, remaining, criteria.explained_db),
         remaining_db=remaining,
-        irreducible_db=max(remaining, found.final.irreducible_db, 0.0) if unpredictable and verdict == "missing" else 0.0,
+        irreducible_db=max(remaining, found.final.irreducible_db, 0.0)
+        if unpredictable and verdict == "missing"
+        else 0.0,
         model=found.model,
     )
 

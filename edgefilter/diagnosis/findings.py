@@ -17,7 +17,8 @@ from edgefilter.echo.recording import BLOCK
 from edgefilter.errors import UsageError
 
 THIRDS_T = 1.69
-"""90 % quantile of Student's t with 2 degrees of freedom over the square root of 3: the interval from three fits to a third each."""
+"""90 % quantile of Student's t with 2 degrees of freedom over the square root of 3: the interval from three fits to a
+third each."""
 
 
 def share_of(before_db: float, after_db: float) -> float:
@@ -42,7 +43,8 @@ def findings_of(found: Found, progress: Callable[[str], None] | None) -> tuple[t
                 excess_after_db=after,
                 share=max(share_of(found.base.excess_db, after) - share_of(found.base.excess_db, before), 0.0),
                 parameters=intervals,
-                evidence=find(step.name).sentence(step.values) or f"with {step.name} the held-out residual falls by {step.gain_db:.2f} dB",
+                evidence=find(step.name).sentence(step.values)
+                or f"with {step.name} the held-out residual falls by {step.gain_db:.2f} dB",
                 values=step.values,
                 prediction=step.score.prediction,
             )
@@ -65,7 +67,9 @@ def _intervals(prepared: Prepared, model: EchoModel, step: Trial) -> tuple[Mappi
         try:
             fits.append(complete(effect, effect.fit(third, others)))
         except (UsageError, ArithmeticError, np.linalg.LinAlgError) as error:
-            failed.append(f"how well {step.name} is known comes from {len(thirds)} fits to a third of the recording each, and one failed: {error}")
+            failed.append(
+                f"how well {step.name} is known is told by fits to a third of the recording each, and one failed: {error}"
+            )
     found = {}
     for parameter in effect.told:
         value = np.asarray(step.values[parameter.name], float)
@@ -80,9 +84,16 @@ def _intervals(prepared: Prepared, model: EchoModel, step: Trial) -> tuple[Mappi
 
 
 def _spread(value: np.ndarray, fits: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Low and high from the scatter of the fits, and from how far their mean is off: what a third teaches otherwise than the half is known no better."""
+    """Low and high from the scatter of the fits and from how far their mean is off.
+
+    What a third teaches otherwise than the half is known no better.
+    """
     alike = [fit for fit in fits if fit.shape == value.shape]
-    spread = np.hypot(THIRDS_T * np.std(alike, axis=0, ddof=1), np.mean(alike, axis=0) - value) if len(alike) > 1 else np.zeros_like(value)
+    spread = (
+        np.hypot(THIRDS_T * np.std(alike, axis=0, ddof=1), np.mean(alike, axis=0) - value)
+        if len(alike) > 1
+        else np.zeros_like(value)
+    )
     return value - spread, value + spread
 
 

@@ -18,7 +18,8 @@ from edgefilter.types import SAMPLE_RATE, Array, Samples
 
 LINE_FFT = 16384
 LINE_OVER_FLOOR = 10.0
-"""Times the median of its surroundings that a bin of a long spectrum must reach to be a tone (noise alone reaches 3 in 1000 means of 30)."""
+"""Times the median of its surroundings that a bin of a long spectrum must reach to be a tone (noise alone reaches 3 in
+1000 means of 30)."""
 BLOCK = SAMPLE_RATE // 10
 
 
@@ -26,9 +27,10 @@ BLOCK = SAMPLE_RATE // 10
 class Leftover:
     """tones_hz: (k,) of the strongest tones, loudest first; mains_hz: 50 or 60 where most of their power lies on its multiples, else 0.
 
-    tone_share: of the residual's power over the fan, in tones. quiet_db: excess while the robot is silent, its median over blocks of 0.1 s;
-    swing_db: by how much those blocks differ (90 % to 10 % quantile) beyond what noise does. level_slope: by how many dB the excess
-    grows per dB of the robot's level.
+    tone_share: of the residual's power over the fan, in tones. quiet_db: excess while the robot is silent, its median
+    over blocks of 0.1 s;
+    swing_db: by how much those blocks differ (90 % to 10 % quantile) beyond what noise does. level_slope: by how many
+    dB the excess grows per dB of the robot's level.
     """
 
     tones_hz: Array
@@ -91,7 +93,9 @@ def left_in_words(found: Found, left: Leftover, remaining_db: float, floor_db: f
     final = found.final
     active = final.active_db - max(left.quiet_mean_db if np.isfinite(left.quiet_mean_db) else 0.0, 0.0)
     if np.isfinite(left.quiet_db) and left.quiet_mean_db > 1.0 and not words:
-        words.append("sound of its own while the robot is silent" + (", coming and going" if left.swing_db > 6.0 else ""))
+        words.append(
+            "sound of its own while the robot is silent" + (", coming and going" if left.swing_db > 6.0 else "")
+        )
     if active > 1.0:
         weights = 10 * np.log10(np.maximum(final.cells, 1e-3)).mean(axis=0)
         low, high = Judge(found.prepared).band_hz[int(np.argmax(weights))]

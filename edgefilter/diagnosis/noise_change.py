@@ -24,7 +24,8 @@ BAND = 20
 def changed_fan(prepared: Prepared, model: EchoModel, base: Score, criteria: Criteria) -> tuple[Prepared, Trial] | None:
     """The recording prepared with the fan as the robot's silences have it, and what changed it as a step; None where it is the calibrated one.
 
-    Only where there are silences and the change has a colour of its own: before the voice is explained, a gain cannot be told from it.
+    Only where there are silences and the change has a colour of its own: before the voice is explained, a gain cannot
+    be told from it.
     """
     residual = (prepared.measurement.recording - base.prediction) / model.microphone_gain(base.prediction.size)
     left = inspect(prepared, residual)
@@ -34,13 +35,17 @@ def changed_fan(prepared: Prepared, model: EchoModel, base: Score, criteria: Cri
         now, values = _with_fan(prepared, name, prepared.measurement, model)
         change = _change_db(prepared, now)
         most = max(change, left.quiet_mean_db)
-        if most < criteria.fan_change_db or (_colour_db(prepared, now) < criteria.fan_coloured_db and most < criteria.fan_flat_db):
+        if most < criteria.fan_change_db or (
+            _colour_db(prepared, now) < criteria.fan_coloured_db and most < criteria.fan_flat_db
+        ):
             continue
         if not _steady(inspect(now, residual), criteria):
             continue
         after = Judge(now).of(model)
         if abs(after.silent_db) < 0.5 * abs(base.silent_db):
-            return now, Trial(name, values, model.with_effect(name, values), after, base.level_db - after.level_db, change)
+            return now, Trial(
+                name, values, model.with_effect(name, values), after, base.level_db - after.level_db, change
+            )
     return None
 
 
@@ -61,11 +66,17 @@ def look_at_fan(found: Found, criteria: Criteria) -> tuple[Found, Leftover]:
         now, values = _with_fan(prepared, name, replace(measurement, recording=measurement.recording / gain), model)
         change = _change_db(prepared, now)
         change = max(change, left.quiet_mean_db) if heard else change
-        if abs(change) < criteria.fan_change_db or left.mains_hz or (heard and abs(left.quiet_mean_db) <= 0.5 * criteria.fan_change_db):
+        if (
+            abs(change) < criteria.fan_change_db
+            or left.mains_hz
+            or (heard and abs(left.quiet_mean_db) <= 0.5 * criteria.fan_change_db)
+        ):
             continue
         after = Judge(now).of(model)
         behind = inspect(now, residual)
-        if not _steady(behind, criteria) or ((after.silent_db > 0.5 * found.final.silent_db) if heard else (after.excess_db > criteria.fan_change_db)):
+        if not _steady(behind, criteria) or (
+            (after.silent_db > 0.5 * found.final.silent_db) if heard else (after.excess_db > criteria.fan_change_db)
+        ):
             continue
         changed = model.with_effect(name, values)
         step = Trial(name, values, changed, after, found.final.level_db - after.level_db, change)

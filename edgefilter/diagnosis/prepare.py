@@ -30,19 +30,21 @@ TALK_DB = 8.0
 """Over the fan: more than a reverberation tail in a pause, less than a soft voice at two metres."""
 GAP_S, EDGE_S = 1.0, 0.2
 CUT, CUT_DB, TAIL_S = 32, -30.0, 0.3
-"""A reference begins or ends in the middle of a word where that many samples at its end are no further below its loudest 20 ms; what was said before
-still sounds for TAIL_S."""
+"""A reference begins or ends in the middle of a word where that many samples at its end are no further below its
+loudest 20 ms; what was said before still sounds for TAIL_S."""
 PAUSE_S, LAG_STEP = 0.5, 480
-"""Silence of the reference after which a player may have started anew, and samples (30 ms) by which the lag must differ then."""
+"""Silence of the reference after which a player may have started anew, and samples (30 ms) by which the lag must differ
+then."""
 
 
 @dataclass(frozen=True, eq=False)
 class Prepared:
     """A recording beside what the profile predicts, on one sample counter; all arrays (n,).
 
-    measurement: aligned reference, recording, the fan's PSD, the samples to fit on. model: the profile's, less the events of other
-    recordings. prediction: of that model.
-    usable: samples where nobody else talks. active: where the robot is heard. offset: samples of lag against the calibration.
+    measurement: aligned reference, recording, the fan's PSD, the samples to fit on. model: the profile's, less the
+    events of other recordings. prediction: of that model.
+    usable: samples where nobody else talks. active: where the robot is heard. offset: samples of lag against the
+    calibration.
     human: (start_s, end_s) of other talkers.
     """
 
@@ -68,8 +70,8 @@ class Prepared:
 def prepare(profile: Profile, recording: Samples, reference: Samples, *, sample_rate: int = SAMPLE_RATE) -> Prepared:
     """Resample to 16 kHz, find the constant lag, mark silence and the blocks to fit on.
 
-    recording (m,), reference (k,): float, full scale +-1, at sample_rate. Raises SignalError for less than a second or where the
-    recording does not contain the reference.
+    recording (m,), reference (k,): float, full scale +-1, at sample_rate. Raises SignalError for less than a second or
+    where the recording does not contain the reference.
     """
     y, x = as_samples(recording, "recording"), as_samples(reference, "reference")
     if sample_rate != SAMPLE_RATE:
@@ -110,8 +112,8 @@ def prepare(profile: Profile, recording: Samples, reference: Samples, *, sample_
 def known_span(x: Samples, first_lag: float, last_lag: float) -> tuple[int, int]:
     """(begin, end) samples of a recording (n,) of which the reference x (n,) knows what the robot says.
 
-    first_lag, last_lag: of the recording behind x. What was said before a reference that begins in the middle of a word, and after one
-    that ends there, is heard but unknown.
+    first_lag, last_lag: of the recording behind x. What was said before a reference that begins in the middle of a
+    word, and after one that ends there, is heard but unknown.
     """
     n, block = x.size, SAMPLE_RATE // 50
     loud = 10 ** (CUT_DB / 10) * float(np.max(all_block_power(x, block)))
@@ -126,8 +128,8 @@ def known_span(x: Samples, first_lag: float, last_lag: float) -> tuple[int, int]
 def utterance_lags(x: Samples, predicted: Samples, recording: Samples, psd: Samples, offset: float) -> list[tuple[int, int, float]]:
     """(first sample, end, lag) of the stretches of the reference x (n,) that share a lag, the whole with `offset` where it is one.
 
-    predicted: for x without an offset. A player starts each utterance anew, so its lag may be another after a pause of PAUSE_S; a
-    difference of less than LAG_STEP is no new start but left for the effects to explain.
+    predicted: for x without an offset. A player starts each utterance anew, so its lag may be another after a pause of
+    PAUSE_S; a difference of less than LAG_STEP is no new start but left for the effects to explain.
     """
     block = SAMPLE_RATE // 50
     level = all_block_power(x, block)
@@ -155,9 +157,10 @@ def utterance_lags(x: Samples, predicted: Samples, recording: Samples, psd: Samp
 def find_talk(square: Samples, active: NDArray[np.bool_]) -> tuple[tuple[float, float], ...]:
     """(start_s, end_s) where somebody talks, from the whitened recording's square (n,) in the robot's silences.
 
-    Somebody talks where tenths of a second are TALK_DB over the fan while at least a third of the silence is at the fan: a fan that
-    has changed is louder all the time. What lies between two such moments less than GAP_S apart belongs to them, the robot's words
-    included. Nothing is found where it would be more than half of the recording: there is no working around that.
+    Somebody talks where tenths of a second are TALK_DB over the fan while at least a third of the silence is at the
+    fan: a fan that has changed is louder all the time. What lies between two such moments less than GAP_S apart belongs
+    to them, the robot's words included. Nothing is found where it would be more than half of the recording: there is no
+    working around that.
     """
     block = SAMPLE_RATE // 10
     count = square.size // block
@@ -180,7 +183,8 @@ def find_talk(square: Samples, active: NDArray[np.bool_]) -> tuple[tuple[float, 
 def fan_scale(quiet: Samples) -> float:
     """How much louder the fan is than in the calibration, in power, from the whitened recording while the robot is silent, (k,).
 
-    1 where the difference is more than FAN_TOLERANCE_DB either way, and so no ordinary one, or where there is too little silence.
+    1 where the difference is more than FAN_TOLERANCE_DB either way, and so no ordinary one, or where there is too
+    little silence.
     """
     if quiet.size < SAMPLE_RATE // 2:
         return 1.0

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter1d
 
 from edgefilter.diagnosis.prepare import Prepared
@@ -27,9 +28,9 @@ TOLERANCE_TAPS, TOLERANCE_LEAD = 32, 16
 class Judge:
     """Holds a prepared recording against predictions.
 
-    The log likelihood of a residual that is Gaussian with an unknown variance in each cell of time and frequency is, but for a
-    constant, minus half the sum of the degrees of freedom times the log of the measured power (Whittle 1953): what counts is that
-    the residual sinks in many cells, not that one loud passage does.
+    The log likelihood of a residual that is Gaussian with an unknown variance in each cell of time and frequency is,
+    but for a constant, minus half the sum of the degrees of freedom times the log of the measured power (Whittle 1953):
+    what counts is that the residual sinks in many cells, not that one loud passage does.
     """
 
     def __init__(self, prepared: Prepared) -> None:
@@ -60,8 +61,8 @@ class Judge:
         return self.prepared.measurement
 
     @property
-    def usable(self) -> Array:
-        """(n,) bool, samples where nobody else talks."""
+    def usable(self) -> NDArray[np.bool_]:
+        """(n,) samples where nobody else talks."""
         return self.prepared.usable
 
     def level_db(self, prediction: Samples) -> float:
@@ -81,12 +82,15 @@ class Judge:
         gain = model.microphone_gain(measurement.recording.size)
         return self.judge(measurement.heard(model)[0], model.unpredictable(measurement.reference), gain)
 
-    def judge(self, prediction: Samples, unpredictable: Sequence[tuple[Samples, Array]] = (), gain: Samples | None = None) -> Score:
+    def judge(
+        self, prediction: Samples, unpredictable: Sequence[tuple[Samples, Array]] = (), gain: Samples | None = None
+    ) -> Score:
         """The score of a prediction (n,), with the ordinary tolerances taken up first.
 
-        unpredictable: as EchoModel.unpredictable gives it, noise that is expected on top of the fan. gain: (n,) of the microphone, which
-        the fan passed as well: it is taken out of the residual before that is held against the fan. The cells keep it: as a likelihood
-        their level has to be that of the recording as it is.
+        unpredictable: as EchoModel.unpredictable gives it, noise that is expected on top of the fan. gain: (n,) of the
+        microphone, which
+        the fan passed as well: it is taken out of the residual before that is held against the fan. The cells keep it:
+        as a likelihood their level has to be that of the recording as it is.
         """
         corrected = self.correct(prediction)
         residual = self.prepared.measurement.recording - corrected
@@ -115,7 +119,10 @@ class Judge:
 
     def size_db(self, change: Samples) -> float:
         """Power of a change of the prediction (n,) over the fan in dB: as it is or whitened, whichever is more."""
-        plain, white = float(np.mean(change.astype(float) ** 2)) / self._fan, float(np.mean(whiten(change, self.psd).astype(float) ** 2))
+        plain, white = (
+            float(np.mean(change.astype(float) ** 2)) / self._fan,
+            float(np.mean(whiten(change, self.psd).astype(float) ** 2)),
+        )
         return float(10 * np.log10(max(plain, white, 1e-12)))
 
     def noise_size_db(self, model: EchoModel) -> float:
@@ -132,7 +139,9 @@ class Judge:
             mean = (total[self.starts + span] - total[self.starts]) / span
             bins = np.arange(FRAME // 2 + 1) * (colour.size - 1) / (FRAME // 2)
             share = np.interp(bins, np.arange(colour.size), colour / self.psd)
-            expected = expected + mean[:, None] * (np.add.reduceat(share[: self._edges[-1]], self._edges[:-1]) / self.freedom)
+            expected = expected + mean[:, None] * (
+                np.add.reduceat(share[: self._edges[-1]], self._edges[:-1]) / self.freedom
+            )
         return expected
 
     def _over_expected(self, power: Array, unpredictable: Sequence[tuple[Samples, Array]]) -> Array:

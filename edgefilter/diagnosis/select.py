@@ -1,8 +1,9 @@
 """Stepwise selection of the effects that a profile lacks: forward, refit, backward, on held-out samples (Efroymson 1960).
 
-Forward: every effect is fitted beside those accepted so far, and the simplest of those that explain nearly most is accepted. Refit: all
-are fitted beside each other. Backward: what the newest one has made superfluous is exchanged for something simpler, or dropped. Stepwise
-selection ends in local optima; so it is begun anew from the next best effects where the best one does not lead to an explanation.
+Forward: every effect is fitted beside those accepted so far, and the simplest of those that explain nearly most is
+accepted. Refit: all are fitted beside each other. Backward: what the newest one has made superfluous is exchanged for
+something simpler, or dropped. Stepwise selection ends in local optima; so it is begun anew from the next best effects
+where the best one does not lead to an explanation.
 """
 
 from __future__ import annotations
@@ -17,7 +18,9 @@ from edgefilter.echo.effects.catalogue import find, names
 from edgefilter.echo.model import EchoModel
 
 
-def search(prepared: Prepared, model: EchoModel, criteria: Criteria, progress: Callable[[str], None] | None = None) -> Found:
+def search(
+    prepared: Prepared, model: EchoModel, criteria: Criteria, progress: Callable[[str], None] | None = None
+) -> Found:
     """Add effects to model as long as held-out samples say that they are there."""
     bench, start = Workbench(prepared, criteria, progress), model
     base = bench.score(model)
@@ -27,7 +30,9 @@ def search(prepared: Prepared, model: EchoModel, criteria: Criteria, progress: C
         bench, model = Workbench(prepared, criteria, progress), step.model
     best = _best(bench, model, list(_runs(bench, model)))
     steps = _in_steps(bench, model, best)
-    return Found(prepared, start, best, base, bench.score(best), ((step, *steps) if fan is not None else steps), bench.notes)
+    return Found(
+        prepared, start, best, base, bench.score(best), ((step, *steps) if fan is not None else steps), bench.notes
+    )
 
 
 def _runs(bench: Workbench, start: EchoModel) -> Iterator[EchoModel]:
@@ -62,7 +67,9 @@ def _half_of_a_filter(bench: Workbench, start: EchoModel, run: EchoModel) -> lis
     if len(found) != 1 or find(found[0]).complexity < bench.criteria.long_filter:
         return []
     least = bench.criteria.half_share * (bench.score(start).level_db - bench.score(run).level_db)
-    simple = [t for t in bench.attempt_all(start, bench.criteria.simple) if t.gain_db >= least and bench.admissible(t, start)]
+    simple = [
+        t for t in bench.attempt_all(start, bench.criteria.simple) if t.gain_db >= least and bench.admissible(t, start)
+    ]
     return sorted(simple, key=lambda t: -t.gain_db)[:1]
 
 
@@ -148,7 +155,11 @@ def _volume_beside(bench: Workbench, model: EchoModel) -> EchoModel:
         gain_db = find(name).passband_gain_db(values)
         if gain_db is None or abs(gain_db) < bench.criteria.passband_db:
             continue
-        gains = [(other, plain) for other in names() if (plain := find(other).plain_gain(gain_db)) is not None and other not in dict(model.effects)]
+        gains = [
+            (other, plain)
+            for other in names()
+            if (plain := find(other).plain_gain(gain_db)) is not None and other not in dict(model.effects)
+        ]
         for other, plain in gains:
             both = bench.attempt(name, model.without_effect(name).with_effect(other, plain))
             if both is not None and both.score.level_db < bench.score(model).level_db + bench.criteria.worth_db:
@@ -161,7 +172,9 @@ def _with_simpler(bench: Workbench, start: EchoModel, model: EchoModel, name: st
     criteria, others = bench.criteria, model.without_effect(name)
     absent = bench.absent(others, max(find(name).complexity - 1, criteria.simple))
     wanted = [key for key in absent if not (find(key).flexible or find(key).last_resort)]
-    simple = [t for key in wanted if (t := bench.attempt_alike(key, others)) is not None and bench.admissible(t, others)]
+    simple = [
+        t for key in wanted if (t := bench.attempt_alike(key, others)) is not None and bench.admissible(t, others)
+    ]
     least = max(criteria.confirmed_share * bench.left(model), criteria.confirmed_db)
     for trial in sorted(simple, key=lambda t: -t.gain_db)[:2]:
         both = bench.attempt(name, trial.model)

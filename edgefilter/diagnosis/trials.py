@@ -37,7 +37,8 @@ class Trial:
 class Found:
     """The outcome of a search from a start model. steps: the accepted effects in their order. notes: what the reader must know of the search.
 
-    prepared: what final was scored on; its fan is another than at the calibration where a changed fan is the first of the steps.
+    prepared: what final was scored on; its fan is another than at the calibration where a changed fan is the first of
+    the steps.
     """
 
     prepared: Prepared
@@ -66,7 +67,9 @@ class Workbench:
     @property
     def notes(self) -> tuple[str, ...]:
         """What could not be tried, and why."""
-        spent = f"the search was stopped after fits of {self._cost / 4:.0f} s: something further may be in the recording"
+        spent = (
+            f"the search was stopped after fits of {self._cost / 4:.0f} s: something further may be in the recording"
+        )
         return (*self._failed.values(), *((spent,) if self._refused else ()))
 
     def score(self, model: EchoModel) -> Score:
@@ -128,7 +131,8 @@ class Workbench:
     def halves(self, trial: Trial, model: EchoModel) -> bool:
         """Whether a trial takes away about half of the power over the fan, though the level hardly falls.
 
-        A narrow ring does so, in few cells. Beside a long filter an effect may do so where that filter was fitted and so leaves no more
+        A narrow ring does so, in few cells. Beside a long filter an effect may do so where that filter was fitted and
+        so leaves no more
         than there is besides: of the held-out samples the filter itself leaves the most.
         """
         before, after, most = self.score(model), trial.score, self.criteria.power_share
@@ -142,7 +146,9 @@ class Workbench:
         The last resorts only where none of the others explains much of what is left.
         """
         left, absent = self.left(model), self.absent(model, most)
-        found = [trial for name in absent if not find(name).last_resort and (trial := self.attempt(name, model)) is not None]
+        found = [
+            trial for name in absent if not find(name).last_resort and (trial := self.attempt(name, model)) is not None
+        ]
         resorts = [name for name in absent if find(name).last_resort]
         enough = self.criteria.last_resort_share * left
         if not resorts or left < self.criteria.last_resort_db:
@@ -167,7 +173,11 @@ class Workbench:
 
     def absent(self, model: EchoModel, most: int) -> list[str]:
         """Names of the effects on the voice that a model has not and whose complexity is at most `most`."""
-        return [name for name in names() if find(name).stage != "noise" and name not in dict(model.effects) and find(name).complexity <= most]
+        return [
+            name
+            for name in names()
+            if find(name).stage != "noise" and name not in dict(model.effects) and find(name).complexity <= most
+        ]
 
 
 def added(start: EchoModel, model: EchoModel) -> list[str]:
@@ -177,7 +187,12 @@ def added(start: EchoModel, model: EchoModel) -> list[str]:
 
 def signature(model: EchoModel) -> Signature:
     """By which models with the same effects at the same values are known: they predict the same, in whichever order these were fitted."""
-    return tuple(sorted((name, *(np.asarray(value, float).tobytes() for _, value in sorted(values.items()))) for name, values in model.effects))
+    return tuple(
+        sorted(
+            (name, *(np.asarray(value, float).tobytes() for _, value in sorted(values.items())))
+            for name, values in model.effects
+        )
+    )
 
 
 def _over_fan(level_db: float) -> float:

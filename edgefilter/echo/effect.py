@@ -29,28 +29,32 @@ class Parameter:
 
 
 RECORDING = Parameter("recording", "fingerprint", 0.0, 0.0, 2.0**52)
-"""Every event's last parameter: the recording in which it happened (Measurement.fingerprint); 0 for whichever is looked at."""
+"""Every event's last parameter: the recording in which it happened (Measurement.fingerprint); 0 for whichever is looked
+at."""
 
 
 class Effect:
     """One physical effect on the robot's own voice. With every parameter at its neutral value, apply is the identity.
 
-    A subclass gives name, stage and parameters, and overrides what differs from the defaults below; no other module knows an effect by name.
-    Stage "source" acts on the reference, "path", "time" and "microphone" on the predicted voice at the microphone; "noise" changes the
-    noise that is expected and leaves the voice alone.
+    A subclass gives name, stage and parameters, and overrides what differs from the defaults below; no other module
+    knows an effect by name. Stage "source" acts on the reference, "path", "time" and "microphone" on the predicted
+    voice at the microphone; "noise" changes the noise that is expected and leaves the voice alone.
 
     What the model asks:
-    memory: samples of the past that apply needs, 0 for none; None where it needs more than the running filter looks back at every hop.
-    scales_fan: whether the fan gets the same gain as the voice. event: whether the values belong to one recording (moments, a gain's
-    curve) rather than to the robot: they get a parameter RECORDING besides their own, and in other recordings the effect is left out. absorbed: whether a linear path fitted to a recording holds the effect already.
+    memory: samples of the past that apply needs, 0 for none; None where it needs more than the running filter looks
+    back at every hop.
+    scales_fan: whether the fan gets the same gain as the voice. event: whether the values belong to one recording
+    (moments, a gain's curve) rather than to the robot: they get a parameter RECORDING besides their own, and in other
+    recordings the effect is left out. absorbed: whether a linear path fitted to a recording holds the effect already.
 
     What the diagnosis asks:
-    title: as it reads inside a sentence ("a turned volume"); by default the name. complexity: of two effects that explain about as much
-    the lower one is named; from 4 on it is a long filter, which half a minute does not teach. least_gain_db: fall of the held-out level
-    and least_size_db: power over the fan of what changes, below which it is not named. cost: of a fit, in quarters of a second.
-    last_resort: whether it is tried only where no other explains much. flexible: whether it has so many numbers that it takes up what
-    a simpler effect beside it does. leaves_noise: whether it leaves noise in the residual that no waveform predicts; noise_words: what
-    is said of that where a residual is described.
+    title: as it reads inside a sentence ("a turned volume"); by default the name. complexity: of two effects that
+    explain about as much the lower one is named; from 4 on it is a long filter, which half a minute does not teach.
+    least_gain_db: fall of the held-out level, and least_size_db: power over the fan of what changes, below which it is
+    not named. cost: of a fit, in quarters of a second. last_resort: whether it is tried only where no other explains
+    much. flexible: whether it has so many numbers that it takes up what a simpler effect beside it does.
+    leaves_noise: whether it leaves noise in the residual that no
+    waveform predicts; noise_words: what is said of that where a residual is described.
     """
 
     name: ClassVar[str]
@@ -152,7 +156,10 @@ def complete(effect: Effect, values: Values) -> dict[str, float | Array]:
         p, found = known[name], np.asarray(value, float)
         if not ((found >= p.low) & (found <= p.high)).all():
             raise UsageError(f"effect {effect.name}: {name} is {value} {p.unit}, expected {p.low:g} to {p.high:g}")
-    return {**neutral(effect), **{name: value if np.ndim(value) == 0 else np.asarray(value, float) for name, value in values.items()}}
+    return {
+        **neutral(effect),
+        **{name: value if np.ndim(value) == 0 else np.asarray(value, float) for name, value in values.items()},
+    }
 
 
 def fitted(effect: Effect, measurement: Measurement, model: VoiceModel) -> dict[str, float | Array]:

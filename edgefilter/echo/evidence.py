@@ -16,9 +16,10 @@ from edgefilter.types import Array, Samples
 class Score:
     """Of one prediction. level_db: mean over time-frequency cells of the residual's dB over the fan, each cell by its degrees of freedom.
 
-    excess_db: mean power of the held-out whitened residual, dB. active_db, silent_db: while the robot is heard, and is not. fitted_db: of the
-    samples to fit on, while it is heard.
-    What a model says that no waveform predicts counts as fan in these; irreducible_db: the excess over the fan alone then, else 0.
+    excess_db: mean power of the held-out whitened residual, dB. active_db, silent_db: while the robot is heard, and is
+    not. fitted_db: of the samples to fit on, while it is heard.
+    What a model says that no waveform predicts counts as fan in these; irreducible_db: the excess over the fan alone
+    then, else 0.
     cells: (times, bands) power over the fan. prediction: (n,) with the ordinary tolerances taken up.
     """
 
@@ -35,11 +36,11 @@ class Score:
 class Grid(Protocol):
     """The recording in cells of time and frequency, held-out ones alone, as the judge of a diagnosis cuts it.
 
-    starts: (times,) first sample of each. active_cells: (times,) bool, where the robot is heard. band_hz: (bands, 2) edges. freedom: (bands,)
-    degrees of freedom of a cell. usable: (n,) bool, samples where nobody else talks.
+    starts: (times,) first sample of each. active_cells: (times,) bool, where the robot is heard. band_hz: (bands, 2)
+    edges. freedom: (bands,) degrees of freedom of a cell. usable: (n,) bool, samples where nobody else talks.
     """
 
-    starts: Array
+    starts: NDArray[np.signedinteger]
     active_cells: NDArray[np.bool_]
     band_hz: Array
     freedom: Array

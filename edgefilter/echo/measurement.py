@@ -48,7 +48,8 @@ class VoiceModel(Protocol):
 class Measurement:
     """The robot alone: reference (n,), aligned up to what an effect may do to time, and the recording (n,) of it, float32, 16 kHz.
 
-    noise_psd: (601,) one-sided power spectral density of the fan, full scale^2/Hz, from 0 to 8 kHz; None where it is unknown.
+    noise_psd: (601,) one-sided power spectral density of the fan, full scale^2/Hz, from 0 to 8 kHz; None where it is
+    unknown.
     fit: (n,) bool, the samples that a fit may use; the others are held out to judge it by. None: all.
     """
 
@@ -99,7 +100,9 @@ def whiten(x: Samples, noise_psd: Samples) -> Samples:
     """x (n,) filtered by 1 / sqrt(noise_psd), floored, zero-phase, so that noise of that one-sided PSD gets variance 1."""
     taps = np.fft.fftshift(np.fft.irfft(1.0 / np.sqrt(floored(noise_psd) * SAMPLE_RATE / 2)))[1:]
     taps *= np.hanning(taps.size + 2)[1:-1] ** 0.25
-    return scipy.signal.oaconvolve(x, taps.astype(np.float32), mode="full")[taps.size // 2 :][: x.size].astype(np.float32)
+    return scipy.signal.oaconvolve(x, taps.astype(np.float32), mode="full")[taps.size // 2 :][: x.size].astype(
+        np.float32
+    )
 
 
 def level_ratio(recording: Samples, predicted: Samples) -> float:

@@ -21,9 +21,10 @@ TAIL = 12800
 class EchoModel:
     """A linear path and the effects around it.
 
-    impulse_response: (taps,) float32 from the reference to the microphone, starting PRE_ROLL samples before the direct sound.
-    effects: (name, values) in the order in which they were added; applied they are in the catalogue's, so that the order in which effects
-    were found changes nothing that is predicted.
+    impulse_response: (taps,) float32 from the reference to the microphone, starting PRE_ROLL samples before the direct
+    sound.
+    effects: (name, values) in the order in which they were added; applied they are in the catalogue's, so that the
+    order in which effects were found changes nothing that is predicted.
     """
 
     impulse_response: Samples
@@ -118,10 +119,18 @@ class EchoModel:
         """The model with that effect at the values that explain the measurement best."""
         return self.with_effect(name, fitted(find(name), measurement, self.without_effect(name)))
 
+    def lasting(self) -> EchoModel:
+        """The model without its events: what holds of the robot in any recording."""
+        return replace(self, effects=tuple((name, values) for name, values in self.effects if not find(name).event))
+
     def during(self, measurement: Measurement) -> EchoModel:
         """The model without the events of other recordings: a jump or a moment's move does not come again at the same second of another one."""
         here = (0.0, measurement.fingerprint)
-        kept = tuple((name, values) for name, values in self.effects if not find(name).event or values.get(RECORDING.name, 0.0) in here)
+        kept = tuple(
+            (name, values)
+            for name, values in self.effects
+            if not find(name).event or values.get(RECORDING.name, 0.0) in here
+        )
         return self if len(kept) == len(self.effects) else replace(self, effects=kept)
 
     def _predict(self, reference: Samples, effects: tuple[tuple[str, Values], ...]) -> Samples:

@@ -14,12 +14,16 @@ from edgefilter.types import SAMPLE_RATE, Samples
 class SourceChain:
     """Applies the source effects of a model to successive blocks; those with a memory also see what came before a block.
 
-    effects: (name, values). Left out is what needs more of the past than a filter can look back at every hop, as a compressor with its
-    release does, and what acts behind the path.
+    effects: (name, values). Left out is what needs more of the past than a filter can look back at every hop, as a
+    compressor with its release does, and what acts behind the path.
     """
 
     def __init__(self, effects: Sequence[tuple[str, Values]] = ()) -> None:
-        self._chain = [(effect, values) for effect, values in chain(effects) if effect.stage == "source" and effect.memory is not None]
+        self._chain = [
+            (effect, values)
+            for effect, values in chain(effects)
+            if effect.stage == "source" and effect.memory is not None
+        ]
         self._memory = sum(effect.memory for effect, _ in self._chain)
         self._past = np.zeros(self._memory, np.float32)
 

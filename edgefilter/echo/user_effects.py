@@ -70,7 +70,9 @@ def load_effect(path: str | Path) -> str:
 def _guarded(path: Path, mine: type[Effect]) -> type[Effect]:
     """A subclass of the user's class: what its hooks raise becomes one line that names the file and the line in it, what they give is checked."""
     own = [name for name in HOOKS if getattr(mine, name) is not getattr(Effect, name)]
-    return type(mine.__name__, (mine,), {name: _in_one_line(path, getattr(mine, name), _RESULTS.get(name)) for name in own})
+    return type(
+        mine.__name__, (mine,), {name: _in_one_line(path, getattr(mine, name), _RESULTS.get(name)) for name in own}
+    )
 
 
 def _in_one_line(path: Path, hook: Callable, check: Callable | None) -> Callable:
@@ -83,7 +85,11 @@ def _in_one_line(path: Path, hook: Callable, check: Callable | None) -> Callable
         except EdgefilterError:
             raise
         except Exception as error:
-            lines = [frame.lineno for frame in traceback.extract_tb(error.__traceback__) if frame.filename == str(path.resolve())]
+            lines = [
+                frame.lineno
+                for frame in traceback.extract_tb(error.__traceback__)
+                if frame.filename == str(path.resolve())
+            ]
             where = f" at line {lines[-1]}" if lines else ""
             raise UsageError(f"{path}: {hook.__name__} stops{where} with {_told(error)}") from error
         if check is None:
@@ -97,7 +103,12 @@ def _in_one_line(path: Path, hook: Callable, check: Callable | None) -> Callable
 
 
 def _like_input(effect: Effect, result: object, x: np.ndarray) -> np.ndarray:
-    if not isinstance(result, np.ndarray) or result.shape != x.shape or result.dtype != np.float32 or not np.isfinite(result).all():
+    if (
+        not isinstance(result, np.ndarray)
+        or result.shape != x.shape
+        or result.dtype != np.float32
+        or not np.isfinite(result).all()
+    ):
         raise UsageError(f"gives {_kind(result)}, expected finite float32 of shape {x.shape}, the shape of its input")
     return result
 
@@ -116,14 +127,25 @@ def _power(size: int | None) -> Callable:
 
     def check(effect: Effect, result: object, given: object) -> np.ndarray:
         shape = (PSD_BINS,) if size else np.shape(given)
-        if not isinstance(result, np.ndarray) or result.shape != shape or not np.isfinite(result).all() or (result < 0).any():
+        if (
+            not isinstance(result, np.ndarray)
+            or result.shape != shape
+            or not np.isfinite(result).all()
+            or (result < 0).any()
+        ):
             raise UsageError(f"gives {_kind(result)}, expected finite numbers of shape {shape}, none below 0")
         return result
 
     return check
 
 
-_RESULTS = {"apply": _like_input, "fit": _values, "variance": _power(None), "noise_psd": _power(PSD_BINS), "colour": _power(PSD_BINS)}
+_RESULTS = {
+    "apply": _like_input,
+    "fit": _values,
+    "variance": _power(None),
+    "noise_psd": _power(PSD_BINS),
+    "colour": _power(PSD_BINS),
+}
 
 
 def _kind(result: object) -> str:
@@ -155,12 +177,16 @@ def _effect_class(path: Path, module: ModuleType) -> type[Effect]:
     classes = [value for value in own if issubclass(value, Effect) or "apply" in vars(value)]
     if len(classes) != 1:
         found = ", ".join(value.__name__ for value in classes) or "none"
-        raise UsageError(f"{path}: expected one class with apply and fit, found {found}; keep each effect in a file of its own")
+        raise UsageError(
+            f"{path}: expected one class with apply and fit, found {found}; keep each effect in a file of its own"
+        )
     (mine,) = classes
     given = {part for base in mine.__mro__ if base not in (Effect, object) for part in vars(base)}
     missing = [part for part in REQUIRED if part not in given]
     if missing:
-        raise UsageError(f"{path}: class {mine.__name__} lacks {', '.join(missing)}; an effect has {', '.join(REQUIRED)}")
+        raise UsageError(
+            f"{path}: class {mine.__name__} lacks {', '.join(missing)}; an effect has {', '.join(REQUIRED)}"
+        )
     return mine if issubclass(mine, Effect) else type(mine.__name__, (mine, Effect), {})
 
 
@@ -168,7 +194,9 @@ def _instance(path: Path, mine: type[Effect]) -> Effect:
     try:
         return mine()
     except Exception as error:
-        raise UsageError(f"{path}: {mine.__name__}() stops with {_told(error)}; an effect is made without arguments") from error
+        raise UsageError(
+            f"{path}: {mine.__name__}() stops with {_told(error)}; an effect is made without arguments"
+        ) from error
 
 
 def _check(path: Path, effect: Effect) -> None:
@@ -176,7 +204,9 @@ def _check(path: Path, effect: Effect) -> None:
     if not isinstance(effect.name, str) or not effect.name.isidentifier():
         raise UsageError(f"{path}: name is {effect.name!r}, expected one word of letters, digits and underscores")
     if effect.name in names():
-        raise UsageError(f"{path}: effect '{effect.name}' exists already: choose another name than {', '.join(sorted(names()))}")
+        raise UsageError(
+            f"{path}: effect '{effect.name}' exists already: choose another name than {', '.join(sorted(names()))}"
+        )
     if effect.stage not in STAGES:
         raise UsageError(f"{path}: stage is {effect.stage!r}, expected one of {', '.join(STAGES)}")
     if not effect.parameters or not all(isinstance(p, Parameter) for p in effect.parameters):
@@ -188,7 +218,10 @@ def _check(path: Path, effect: Effect) -> None:
     probe.flags.writeable = False
     found = effect.apply(probe, neutral(effect), SAMPLE_RATE)
     if float(np.max(np.abs(found - probe))) > 1e-5:
-        raise UsageError(f"{path}: apply changes the signal at the neutral values of effect '{effect.name}', expected the identity there")
+        raise UsageError(
+            f"{path}: apply changes the signal at the neutral values of effect '{effect.name}', "
+            "expected the identity there"
+        )
 
 
 def _told(error: BaseException) -> str:

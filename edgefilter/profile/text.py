@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from edgefilter.echo.effects.catalogue import find
 from edgefilter.profile.data import DISTORTION_ORDERS, Profile
 from edgefilter.types import PRE_ROLL, SAMPLE_RATE, Array, Samples
 
@@ -30,8 +31,9 @@ def describe(profile: Profile) -> str:
         *(_band_line(edges, float(snr)) for edges, snr in zip(profile.band_hz, profile.band_snr_db, strict=True)),
     ]
     for name, values in profile.echo.effects:
-        figures = ", ".join(f"{key} = array {value.shape}" if isinstance(value, np.ndarray) else f"{key} = {value}" for key, value in values.items())
-        lines.append(f"effect      {name}: {figures}")
+        told = [(p.name, values[p.name]) for p in find(name).told if p.name in values]
+        figures = ", ".join(f"{key} = array {value.shape}" if isinstance(value, np.ndarray) else f"{key} = {value}" for key, value in told)
+        lines.append(f"effect      {name}{', in one recording' if find(name).event else ''}: {figures}")
     lines.extend(f"WARNING     {text}" for text in profile.warnings)
     if not profile.warnings:
         lines.append("trust       nothing doubtful found")

@@ -15,10 +15,10 @@ from edgefilter.diagnosis.compare import compare
 from edgefilter.diagnosis.criteria import Criteria
 from edgefilter.diagnosis.diagnose import add, diagnose
 from edgefilter.diagnosis.findings import findings_of
-from edgefilter.dsp.fractional_delay import delayed
 from edgefilter.diagnosis.prepare import prepare
 from edgefilter.diagnosis.score import Judge
 from edgefilter.diagnosis.trials import Found, Workbench
+from edgefilter.dsp.fractional_delay import delayed
 from edgefilter.echo.effect import Effect, Parameter
 from edgefilter.echo.effects import catalogue
 from edgefilter.echo.effects.catalogue import find
@@ -37,7 +37,9 @@ def gained(recording: np.ndarray, gain_db: np.ndarray) -> np.ndarray:
     return (recording * 10 ** (np.interp(n, np.arange(gain_db.size), gain_db) / 20)).astype(np.float32)
 
 
-def test_one_recording_has_one_excess_in_compare_add_diagnose_and_report_when_the_profile_holds_a_microphone_gain() -> None:
+def test_one_recording_has_one_excess_in_compare_add_diagnose_and_report_when_the_profile_holds_a_microphone_gain() -> (
+    None
+):
     x, gain_db = voice(10.0), 6 * np.hanning(400)
     plain = profile()
     robot = plain.with_echo(plain.echo.with_effect("mic_agc", {"gain_db": gain_db, "knots_hz": 40.0}))
@@ -58,7 +60,9 @@ def test_a_rattle_in_the_profile_counts_in_compare_as_it_does_in_diagnose() -> N
     knocks = {"threshold": 0.02, "power": 1e-3, "decay_ms": 4.0}
     robot = profile().with_echo(profile().echo.with_effect("rattle", knocks))
     recording = record(x)
-    assert compare(robot, recording, x).excess_db == pytest.approx(diagnose(robot, recording, x).comparison.excess_db, abs=1e-9)
+    assert compare(robot, recording, x).excess_db == pytest.approx(
+        diagnose(robot, recording, x).comparison.excess_db, abs=1e-9
+    )
     assert compare(robot, recording, x).excess_db < compare(profile(), recording, x).excess_db
 
 
@@ -84,7 +88,9 @@ def test_the_words_name_a_band_of_the_judge() -> None:
     ring = tone * np.sin(2 * np.pi * 170 * np.arange(x.size) / RATE)
     recording = (clean + 0.5 * ring + FAN * np.random.default_rng(3).standard_normal(x.size)).astype(np.float32)
     found = diagnose(profile(), recording, x)
-    bands = {f"strongest around {low:.0f} to {high:.0f} Hz" for low, high in Judge(prepare(profile(), recording, x)).band_hz}
+    bands = {
+        f"strongest around {low:.0f} to {high:.0f} Hz" for low, high in Judge(prepare(profile(), recording, x)).band_hz
+    }
     assert found.verdict == "unexplained" and any(band in found.evidence for band in bands), found.evidence
 
 
@@ -135,12 +141,21 @@ def test_a_fit_that_fails_is_a_note_in_the_diagnosis_and_no_python_warning(fragi
         warnings.simplefilter("error")
         found = diagnose(profile(), record(x, EchoModel(path()).with_effect("playback_gain", {"gain_db": -3.0})), x)
     assert [finding.effect for finding in found.ranking] == ["playback_gain"]
-    assert [text for text in found.to_dict()["warnings"] if "fragile could not be fitted" in text and "Singular matrix" in text]
+    assert [
+        text
+        for text in found.to_dict()["warnings"]
+        if "fragile could not be fitted" in text and "Singular matrix" in text
+    ]
 
 
 def test_a_search_that_is_cut_short_says_so() -> None:
     x = voice(6.0)
-    found = diagnose(profile(), record(x, EchoModel(path()).with_effect("playback_gain", {"gain_db": -3.0})), x, criteria=Criteria(most_cost=3))
+    found = diagnose(
+        profile(),
+        record(x, EchoModel(path()).with_effect("playback_gain", {"gain_db": -3.0})),
+        x,
+        criteria=Criteria(most_cost=3),
+    )
     assert any("search was stopped after" in text for text in found.comparison.warnings)
     assert found.verdict in ("missing", "unexplained")
 
@@ -153,7 +168,9 @@ def test_a_jump_is_not_replayed_in_another_recording() -> None:
     jumped, later = record(x, EchoModel(path()).with_effect("delay_jump", JUMP)), record(other, seed=22)
     knowing, before, after = add(profile(), "delay_jump", jumped, x)
     assert after.excess_db < 0.5 < 3.0 < before.excess_db
-    assert compare(knowing, jumped, x).excess_db == after.excess_db  # the recording in which it happened is still explained
+    assert (
+        compare(knowing, jumped, x).excess_db == after.excess_db
+    )  # the recording in which it happened is still explained
     assert compare(knowing, later, other).excess_db == compare(profile(), later, other).excess_db < 0.5
     assert diagnose(knowing, later, other).verdict == "explained"
 
@@ -168,7 +185,14 @@ def test_a_jump_stays_with_its_recording_through_the_files_and_add_says_so(tmp_p
     profile().save(tmp_path / "robot.npz")
 
     def run(command: str, recording: str, robot: str, *more: str) -> str:
-        files = ["--profile", tmp_path / robot, "--recording", tmp_path / recording, "--reference", tmp_path / "ref.wav"]
+        files = [
+            "--profile",
+            tmp_path / robot,
+            "--recording",
+            tmp_path / recording,
+            "--reference",
+            tmp_path / "ref.wav",
+        ]
         assert main([*command.split(), *map(str, (*files, *more))]) == 0
         return capsys.readouterr().out
 
@@ -176,7 +200,10 @@ def test_a_jump_stays_with_its_recording_through_the_files_and_add_says_so(tmp_p
     (note,) = [line for line in out.splitlines() if line.startswith("NOTE")]
     assert "delay_jump happened in this recording" in note and "fingerprint" not in out
     assert Profile.load(tmp_path / "knowing.npz").echo.effects[0][1]["recording"] > 0
-    told = {name: json.loads(run("compare", f"{name}.wav", "knowing.npz", "--json", "-"))["excess_db"] for name in ("mic", "other")}
+    told = {
+        name: json.loads(run("compare", f"{name}.wav", "knowing.npz", "--json", "-"))["excess_db"]
+        for name in ("mic", "other")
+    }
     assert told["mic"] < 0.5 and told["other"] < 0.5
     out = run("add playback_gain", "mic.wav", "robot.npz", "--output", str(tmp_path / "gain.npz"))
     assert "NOTE" not in out

@@ -13,10 +13,10 @@ from edgefilter.diagnosis.band_edge import band_edge
 from edgefilter.diagnosis.compare import compare
 from edgefilter.diagnosis.criteria import Criteria
 from edgefilter.diagnosis.diagnose import Diagnosis, add, diagnose
-from edgefilter.dsp.fractional_delay import delayed
 from edgefilter.diagnosis.prepare import prepare
 from edgefilter.diagnosis.score import Judge
 from edgefilter.diagnosis.trials import Trial, Workbench
+from edgefilter.dsp.fractional_delay import delayed
 from edgefilter.echo.effects.catalogue import find
 from edgefilter.echo.evidence import Evidence, Score
 from edgefilter.echo.model import EchoModel

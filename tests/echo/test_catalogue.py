@@ -1,4 +1,5 @@
-"""The catalogue is the one place that lists effects: no other module spells a name, no import runs in a circle, the order is its own."""
+"""The catalogue is the one place that lists effects: no other module spells a name, no import runs in a circle, the
+order is its own."""
 
 from __future__ import annotations
 
@@ -23,7 +24,9 @@ def spelled(tree: ast.AST) -> set[str]:
     documents = {
         node.body[0].value
         for node in ast.walk(tree)
-        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef) and node.body and isinstance(node.body[0], ast.Expr)
+        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef)
+        and node.body
+        and isinstance(node.body[0], ast.Expr)
     }
     found = set()
     for node in ast.walk(tree):
@@ -58,10 +61,15 @@ def test_an_effect_is_asked_and_not_searched_for_attributes() -> None:
 def test_imports_among_echo_run_in_no_circle() -> None:
     """Those inside functions and those for types alone count."""
     folder = PACKAGE / "echo"
-    modules = {".".join(("edgefilter", *path.relative_to(PACKAGE).with_suffix("").parts)): path for path in folder.rglob("*.py")}
+    modules = {
+        ".".join(("edgefilter", *path.relative_to(PACKAGE).with_suffix("").parts)): path
+        for path in folder.rglob("*.py")
+    }
     needs = {}
     for name, path in modules.items():
-        used = [node for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))) if isinstance(node, ast.ImportFrom)]
+        used = [
+            node for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))) if isinstance(node, ast.ImportFrom)
+        ]
         needs[name] = {node.module for node in used if node.module in modules}
     assert needs["edgefilter.echo.model"]
     while free := [name for name, below in needs.items() if not below]:
@@ -83,7 +91,11 @@ def test_the_order_in_which_effects_were_found_changes_no_prediction() -> None:
         for name in order:
             model = model.with_effect(name, EFFECT_CASES[name])
         assert [name for name, _ in model.effects] == list(order)
-        assert [effect.name for effect, _ in chain(model.effects)] == ["playback_gain", "compression", "speaker_nonlinearity"]
+        assert [effect.name for effect, _ in chain(model.effects)] == [
+            "playback_gain",
+            "compression",
+            "speaker_nonlinearity",
+        ]
         predictions.append(model.predict(x))
         # transforms of another length than with the past in front: rounding of float32
         np.testing.assert_allclose(model.source_chain()(x), predictions_of_source(model, x), atol=1e-6)
@@ -105,6 +117,10 @@ def test_a_users_effect_comes_after_those_of_its_stage() -> None:
 
     catalogue._known["aaa"] = Late()
     try:
-        assert [effect.name for effect, _ in chain((("aaa", {}), ("rattle", {}), ("clock_drift", {})))] == ["rattle", "aaa", "clock_drift"]
+        assert [effect.name for effect, _ in chain((("aaa", {}), ("rattle", {}), ("clock_drift", {})))] == [
+            "rattle",
+            "aaa",
+            "clock_drift",
+        ]
     finally:
         del catalogue._known["aaa"]

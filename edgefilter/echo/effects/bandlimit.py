@@ -91,7 +91,10 @@ class Bandlimit(Effect):
         return f"what the recording has in common with the reference falls off above {first(values, 'cutoff_hz'):.0f} Hz"
 
     def plausible(self, evidence: Evidence) -> bool:
-        """A low-pass and not a colouring: flat below the cut-off, little above it; near 8 kHz, where that cannot be seen, the low-pass alone helps."""
+        """A low-pass and not a colouring: flat below the cut-off, little above it.
+
+        Near 8 kHz, where that cannot be seen, the low-pass alone helps.
+        """
         values, cutoff = evidence.values, float(evidence.values["cutoff_hz"])
         if cutoff >= HIGHEST_HZ or not _dull_above(cutoff, evidence):
             return False
@@ -116,7 +119,7 @@ class Bandlimit(Effect):
 
 
 def _dull_above(cutoff_hz: float, evidence: Evidence) -> bool:
-    """Whether the recording's power above the cut-off falls with what it has in common with the reference: a codec's noise keeps it up."""
+    """Whether the power above the cut-off falls with what is common with the reference: a codec's noise keeps it up."""
     grid = evidence.grid
     above = grid.band_hz[:, 0] > 1.1 * cutoff_hz
     heard = grid.cells(grid.measurement.recording)[grid.active_cells][:, above]

@@ -1,8 +1,8 @@
 """The effects that the package knows: its own, in the order in which sound meets them, and those of the user.
 
-A new effect is a file in this folder and a line in EFFECTS. Where its line stands matters: within a stage effects do not commute (a
-compressor behind a turned volume is not one before it), so EchoModel applies them in the order of this list, whichever was found first.
-Effects of the user's own come after these within their stage, by name.
+A new effect is a file in this folder and a line in EFFECTS. Where its line stands matters: within a stage effects do
+not commute (a compressor behind a turned volume is not one before it), so EchoModel applies them in the order of this
+list, whichever was found first. Effects of the user's own come after these within their stage, by name.
 """
 
 from __future__ import annotations

@@ -113,8 +113,8 @@ class Compression(Effect):
     def sentence(self, values: Values) -> str:
         """From where on the level is held down, and by how much."""
         return (
-            f"the voice is turned down when it has been loud: above {first(values, 'threshold_db'):.0f} dB by {first(values, 'ratio'):.1f} to 1, "
-            "while the fan is as loud as ever"
+            f"the voice is turned down when it has been loud: above {first(values, 'threshold_db'):.0f} dB "
+            f"by {first(values, 'ratio'):.1f} to 1, while the fan is as loud as ever"
         )
 
     def plausible(self, evidence: Evidence) -> bool:
@@ -135,7 +135,10 @@ def _values(unknowns: Array) -> dict[str, float]:
 
 
 def _loudest(measurement: Measurement, from_start: bool) -> tuple[slice, np.ndarray]:
-    """The stretch with most energy, or where the model knows what time it is the first one, and its samples to fit on less the first half second, in which the level settles."""
+    """The stretch with most energy, or the first one where the model knows what time it is; and its samples to fit on.
+
+    The first half second of a later stretch is left out: in it the level settles.
+    """
     x = measurement.reference
     fit = np.ones(x.size, bool) if measurement.fit is None else measurement.fit
     start = 0

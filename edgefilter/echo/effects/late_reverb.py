@@ -21,18 +21,24 @@ TAPS = 12800
 EXPECTED = 1e-3
 """Expected square of a tap before anything is known of the room, the same at all lags."""
 SLOWER = 1.7
-"""The squares that are expected once the room is known decay in this many times its reverberation time, so that none of it is cut away."""
+"""The squares that are expected once the room is known decay in this many times its reverberation time, so that none of
+it is cut away."""
 BLOCK = 320
 EARLY, LATE_SHARE = round(0.03 * SAMPLE_RATE), 0.1
-"""Samples up to which reflections are early, and the share of the added energy that comes after those where the room is another."""
-LONGER = 1.1
-"""By this factor the reverberation time exceeds the calibration's, beyond what a fit to half a minute of speech errs by."""
+"""Samples up to which reflections are early, and the share of the added energy that comes after those where the room is
+another."""
+LONGER, DECAYED = 1.3, 0.01
+"""By this factor the time until DECAYED of the energy is left exceeds the calibration's: 2 to 20 in rooms of 0.4 to 0.8
+s, 0.9 to 1.1 where the change was another one. So far down a sweep's response is clear of its noise, as it need not be
+where a reverberation time is read off."""
+
 
 
 class LateReverb(Effect):
     """y = x + taps * x: a long filter behind the calibrated path. Its decay gives the reverberation time.
 
-    rt60_s: from the backward-integrated energy of the whole new response (Schroeder 1965, eq. 5), the first 20 ms left out, above the noise.
+    rt60_s: from the backward-integrated energy of the whole new response (Schroeder 1965, eq. 5), the first 20 ms left
+    out, above the noise.
     level_db: energy of the taps after 10 ms, re the direct path. taps: (k,) lags -LEAD to k - LEAD.
     """
 
@@ -56,7 +62,8 @@ class LateReverb(Effect):
     def fit(self, measurement: Measurement, model: VoiceModel) -> Values:
         """Least squares in the whitened domain, slightly regularised; neutral where nothing of it holds on other samples.
 
-        Then once more with taps expected to decay as the room that was found does: some seconds of speech do not teach ten thousand.
+        Then once more with taps expected to decay as the room that was found does: some seconds of speech do not teach
+        ten thousand.
         """
         x = measurement.heard(model)[1]
         residual = measurement.white_recording - x
@@ -76,21 +83,24 @@ class LateReverb(Effect):
     def sentence(self, values: Values) -> str:
         """How long the room sounds."""
         return (
-            f"the recording goes on sounding after the calibrated response has died away: a reverberation of {first(values, 'rt60_s'):.2f} s that holds "
-            "from the first second to the last"
+            "the recording goes on sounding after the calibrated response has died away: "
+            f"a reverberation of {first(values, 'rt60_s'):.2f} s that holds from the first second to the last"
         )
 
     def plausible(self, evidence: Evidence) -> bool:
         """Whether what it adds is reverberation: a good part comes later than early reflections do, and decays more slowly than at the calibration.
 
-        A loudspeaker of another colour or a path that moved are stationary, too, and a filter this long takes up either.
+        A loudspeaker of another colour or a path that moved are stationary, too, and a filter this long takes up
+        either.
         """
         taps = np.atleast_1d(np.asarray(evidence.values["taps"], float))
-        before = evidence.model.impulse_response
-        direct = int(np.argmax(np.abs(before)))
-        added = scipy.signal.oaconvolve(before.astype(np.float64), taps)[LEAD + direct :] ** 2
-        late = float(np.sum(added[EARLY:])) / max(float(np.sum(added)), 1e-30)
-        return late >= LATE_SHARE and float(evidence.values["rt60_s"]) > LONGER * reverberation_time(before[direct:].astype(np.float64))
+        direct = int(np.argmax(np.abs(evidence.model.impulse_response)))
+        before = evidence.model.impulse_response[direct:].astype(np.float64)
+        added = scipy.signal.oaconvolve(evidence.model.impulse_response.astype(np.float64), taps)[LEAD + direct :]
+        after = added.copy()
+        after[: before.size] += before[: added.size]
+        late = float(np.sum(added[EARLY:] ** 2)) >= LATE_SHARE * float(np.sum(added**2))
+        return late and decay(after) > LONGER * decay(before)
 
 
 def block_energy(taps: Array) -> tuple[Array, float]:
@@ -98,6 +108,12 @@ def block_energy(taps: Array) -> tuple[Array, float]:
     energy = np.sum(blocks(taps, BLOCK) ** 2, axis=1)
     count = energy.size
     return energy, float(np.quantile(energy[2 * count // 3 :], 0.25)) if count >= 3 else 0.0
+
+
+def decay(response: Array) -> int:
+    """Samples until DECAYED of the energy of a response (k,) from lag 0 is left (Schroeder 1965, eq. 5)."""
+    left = np.cumsum(response[::-1] ** 2)[::-1]
+    return int(np.argmax(left <= DECAYED * left[0]))
 
 
 def decaying(taps: Array, rt60_s: float) -> Array:

@@ -84,13 +84,16 @@ class PathChange(Effect):
         return f"until {first(values, 'time_s'):.2f} s the calibrated path holds, from then on another one"
 
     def plausible(self, evidence: Evidence) -> bool:
-        """Whether the path was the calibrated one until it changed: most of what the effect explains lies after its time, little before."""
+        """Whether the path was the calibrated one until it changed: little of what is explained lies before that."""
         grid, time = evidence.grid, float(evidence.values["time_s"])
         early = grid.active_cells & (grid.starts < time * SAMPLE_RATE)
         late = grid.active_cells & (grid.starts >= time * SAMPLE_RATE)
         if early.sum() < 6 or late.sum() < 6:
             return False
-        level, explained = (10 * np.log10(np.maximum(score.cells, 1e-3)) @ grid.freedom / grid.freedom.sum() for score in (evidence.before, evidence.after))
+        level, explained = (
+            10 * np.log10(np.maximum(score.cells, 1e-3)) @ grid.freedom / grid.freedom.sum()
+            for score in (evidence.before, evidence.after)
+        )
         rest = float(np.mean(level[early]) - np.mean(explained[late]))
         return rest < 0.5 * float(np.mean(level[late]) - np.mean(explained[late]))
 

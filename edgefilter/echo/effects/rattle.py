@@ -156,8 +156,8 @@ class Rattle(Effect):
         """How often, and at which moments of the membrane's movement."""
         side = {1.0: "outward", -1.0: "inward"}.get(first(values, "side"), "far")
         return (
-            f"short bursts, {first(values, 'rate_hz'):.0f} a second, follow the moments at which the membrane is driven {side}, and not the voice's level; "
-            "what of them no waveform predicts is shown as irreducible"
+            f"short bursts, {first(values, 'rate_hz'):.0f} a second, follow the moments at which the membrane is driven {side}, "
+            "and not the voice's level; what of them no waveform predicts is shown as irreducible"
         )
 
     def plausible(self, evidence: Evidence) -> bool:

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy import signal
 
-from edgefilter.dsp.fractional_delay import delayed
 from edgefilter.diagnosis.prepare import prepare
+from edgefilter.dsp.fractional_delay import delayed
 from edgefilter.echo.effects.catalogue import find
 from edgefilter.echo.effects.late_reverb import EXPECTED, LEAD
 from edgefilter.echo.measurement import Measurement
