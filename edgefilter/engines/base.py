@@ -27,7 +27,7 @@ class Engine(Protocol):
     lookahead: int
 
     @property
-    def front(self) -> Front:
+    def front(self) -> FrontEndKind:
         """What the stream has to run before it."""
         ...
 
