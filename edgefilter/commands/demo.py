@@ -12,7 +12,8 @@ import soundfile
 from edgefilter.audio.files import FileSink, FileSource
 from edgefilter.commands.display import describe_latency, write_json
 from edgefilter.dsp.metrics import si_sdr
-from edgefilter.filter.ego_filter import EgoFilter
+from edgefilter.engines import NEEDS_PROFILE
+from edgefilter.filter.ego_filter import EgoFilter, enhance
 from edgefilter.session import filter_blocks
 from edgefilter.types import SAMPLE_RATE, Samples
 
@@ -28,7 +29,7 @@ def main(args: argparse.Namespace) -> int:
         report = filter_blocks(source, ego, sink)
     if report.failure:
         raise report.failure
-    figures = report.to_dict() | scores(filtered)
+    figures = report.to_dict() | scores(_read(filtered), args.engine)
     files = [filtered, *_copy_input(folder), *_draw(folder, filtered)]
     if args.json:
         write_json(figures, args.json)
@@ -36,21 +37,29 @@ def main(args: argparse.Namespace) -> int:
         print(
             f"a simulated robot talks, a human interrupts; filtered with engine {ego.engine_name} "
             f"({report.process_s / (report.samples_in / SAMPLE_RATE):.3f} of real time, {describe_latency(ego)})\n"
-            f"SI-SDR of the human: {figures['si_sdr_before_db']:.1f} dB before, {figures['si_sdr_after_db']:.1f} dB after\n"
+            f"SI-SDR of the human: {figures['si_sdr_before_db']:.1f} dB before, {figures['si_sdr_after_db']:.1f} dB after with the robot's "
+            f"calibration{_without(figures)}\n"
             f"files: {', '.join(str(file) for file in files)}"
         )
     return 0
 
 
-def scores(filtered: Path) -> dict[str, float]:
-    """SI-SDR over the stretch in which the human speaks, before and after."""
-    human, mic, out = (_read(path) for path in (DATA / "human.flac", DATA / "mic.flac", filtered))
+def scores(filtered: Samples, engine: str) -> dict[str, float | None]:
+    """SI-SDR over the stretch in which the human speaks: before, after, and after without the calibration where the engine can do so."""
+    human, mic, ref = (_read(DATA / f"{name}.flac") for name in ("human", "mic", "reference"))
     speaking = np.flatnonzero(human)
     span = slice(speaking[0], speaking[-1] + 1)
+    cold = None if engine in NEEDS_PROFILE else si_sdr(enhance(mic, ref, None, engine)[span], human[span])
     return {
         "si_sdr_before_db": si_sdr(mic[span], human[span]),
-        "si_sdr_after_db": si_sdr(out[span], human[span]),
+        "si_sdr_after_db": si_sdr(filtered[span], human[span]),
+        "si_sdr_after_uncalibrated_db": cold,
     }
+
+
+def _without(figures: dict) -> str:
+    cold = figures["si_sdr_after_uncalibrated_db"]
+    return "" if cold is None else f", {cold:.1f} dB uncalibrated"
 
 
 def _read(path: Path) -> Samples:

@@ -64,10 +64,15 @@ def make_filter(args: argparse.Namespace, live: bool) -> tuple[EgoFilter, Choice
         forget()
     choice, engine, reason, budget_ms = None, args.engine, "asked for", args.budget_ms
     profile = Profile.load(args.profile) if args.profile else None
+    if profile is None and engine != "bypass":
+        say(UNCALIBRATED)
     if engine == "auto" and not args.model and (live or budget_ms):
         choice = choose(budget_ms or DEFAULT_MS, profile, say=say)
         engine, reason, budget_ms = choice.engine, choice.reason, choice.budget_ms
     return EgoFilter(profile, engine, budget_ms if live else None, reason, args.model), choice
+
+
+UNCALIBRATED = "no profile: uncalibrated, the room is learnt from the robot's first seconds ('edgefilter calibrate' measures it beforehand)"
 
 
 def finish(

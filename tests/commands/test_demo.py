@@ -39,3 +39,10 @@ def test_it_draws_before_and_after(demo):
 def test_it_says_the_figures_and_that_they_are_simulated(demo):
     text = demo[1]
     assert "simulated" in text and "SI-SDR" in text and "of real time" in text and f"engine {EgoFilter().engine_name}" in text
+
+
+def test_it_says_what_is_calibrated_and_what_not(demo):
+    folder, text = demo
+    cold = json.loads((folder / "demo.json").read_text())["si_sdr_after_uncalibrated_db"]
+    assert 3.0 < cold < 9.2  # learnt from six seconds of robot: better than random weights, worse than with the calibration
+    assert "with the robot's calibration" in text and f"{cold:.1f} dB uncalibrated" in text
