@@ -1,35 +1,118 @@
-"""When the human began and stopped speaking, from the engine's probability: what a robot that can be interrupted waits for."""
+"""When the human began and stopped speaking: what a robot that can be interrupted waits for."""
 
 from __future__ import annotations
 
-STARTED, STARTED_HOPS = 0.95, 3
-"""Probability that so many hops in a row reach when somebody has begun to speak. On 48 validation conversations 134 ms (median) after
-the human's first sound, and a false alarm in three minutes of the robot alone; 0.9 and 2 hops: 100 ms, and two."""
-STOPPED, PAUSE_S = 0.5, 0.5
-"""Probability below which a hop is silent, and how long the silence lasts when somebody has stopped."""
+import math
+from dataclasses import dataclass
+
+from edgefilter.dsp.stft import StftConfig
+from edgefilter.errors import UsageError
+from edgefilter.filter.excess import Excess
+from edgefilter.types import SAMPLE_RATE, Frame
+
+ODDS_RANGE = (-2.0, 8.0)
+"""Bounds on the network's log-odds of one hop, so that none outweighs a tenth of a second."""
+ODDS_MEMORY_S, EXCESS_MEMORY_S = 0.0313, 0.0449
+"""Time constants over which log-odds and excess are averaged: a voiced sound is longer, a burst of the loudspeaker is
+not."""
+MOST_EXCESS = 2.0
+"""Bound on the excess of one hop: a click is no more than a syllable."""
+CENTRE, SLOPE = 2.85, 1.2
+"""Averaged log-odds of the network at which a human is as likely as not, and the slope of the logistic around it:
+fitted on robots alone and humans laid on them 0 to 26 dB below, on one real loudspeaker, a human in one hop of four."""
+ROOM_EXCESS, ROOM_ODDS = 0.4, 3.2
+"""Mean excess, in standard deviations, of a soft syllable in a silent room (steady noise has -0.3), and the log-odds
+that it is worth at most: the default threshold's."""
+ROOM_SLOPE, ECHO_SLOPE = 9.6, 48.0
+"""Log-odds by which that bound moves per unit of excess and of the robot's share of what is expected; with a tenth of
+it the robot's own, the network decides alone."""
+
+
+@dataclass(frozen=True)
+class BargeInSettings:
+    """When speech counts as begun and as ended.
+
+    threshold: probability that must be reached. Higher (0.98) for a robot that must not be stopped by its own
+    loudspeaker or a running tap, at the price of the softest humans and some 20 ms; lower (0.9) for one that would
+    rather stop once too often. release: probability below which a hop counts as silent; lower than the threshold, so
+    that soft syllables do not end a sentence. min_speech_s: how long the threshold is held before speech has begun; the
+    probability is smoothed already, so that 0 will do, and every 0.1 s comes on top of the delay. min_silence_s: how
+    long the silence lasts before speech has ended; 0.5 s bridges the pauses within a sentence, 0.2 s tells a recogniser
+    sooner.
+    Raises UsageError for probabilities outside 0 to 1, a release above the threshold, or negative times.
+    """
+
+    threshold: float = 0.96
+    release: float = 0.4
+    min_speech_s: float = 0.0
+    min_silence_s: float = 0.5
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.release <= self.threshold < 1.0:
+            found = f"release {self.release} and threshold {self.threshold}"
+            raise UsageError(f"barge-in got {found}, expected probabilities with 0 < release <= threshold < 1")
+        if not (self.min_speech_s >= 0.0 and self.min_silence_s >= 0.0):
+            found = f"min_speech_s {self.min_speech_s} and min_silence_s {self.min_silence_s}"
+            raise UsageError(f"barge-in got {found}, expected seconds, 0 or more")
+
+
+class HumanJudge:
+    """Weighs the network's probability with what robot and room are expected to leave: one stream's, step once a frame.
+
+    A network that was trained on other rooms takes steady noise for somebody. While the robot speaks it knows best;
+    while the robot is silent only the room can be heard, whose level is known, and a human must stand above it.
+    """
+
+    def __init__(self, stft: StftConfig) -> None:
+        hop_s = stft.hop / SAMPLE_RATE
+        self._excess = Excess(stft)
+        self._follow_odds = 1.0 - math.exp(-hop_s / ODDS_MEMORY_S)
+        self._follow_excess = 1.0 - math.exp(-hop_s / EXCESS_MEMORY_S)
+        self._odds = self._above = 0.0
+
+    def step(self, frame: Frame, probability: float, suspect: bool = False) -> float:
+        """Probability that a human speaks, 0 to 1, from the engine's.
+
+        suspect: whether the frame may hold an utterance of the robot that is not found yet; the answer is then 0, and
+        nothing is learned from the frame.
+        """
+        above = self._excess.step(frame.echo, frame.error, learn=not suspect)
+        self._above += self._follow_excess * (min(above, MOST_EXCESS) - self._above)
+        if suspect:
+            self._odds = 0.0
+            return 0.0
+        odds = math.log(max(probability, 1e-9) / max(1.0 - probability, 1e-9))
+        self._odds += self._follow_odds * (min(max(odds, ODDS_RANGE[0]), ODDS_RANGE[1]) - self._odds)
+        room = ROOM_ODDS + ROOM_SLOPE * (self._above - ROOM_EXCESS) + ECHO_SLOPE * self._excess.echo_share
+        return 1.0 / (1.0 + math.exp(-min(SLOPE * (self._odds - CENTRE), room)))
 
 
 class BargeIn:
     """Turns one stream's probabilities into beginnings and ends of speech.
 
-    hop_s: seconds between two probabilities.
+    hop_s: seconds between two probabilities. settings: None for the defaults.
 
     >>> talk = BargeIn(0.016)
-    >>> [talk.note(probability) for probability in (0.2, 0.99, 0.99, 0.99)]
-    [None, None, None, 'speech_started']
+    >>> [talk.note(probability) for probability in (0.2, 0.99)]
+    [None, 'speech_started']
     """
 
-    def __init__(self, hop_s: float) -> None:
-        self._pause = round(PAUSE_S / hop_s)
+    def __init__(self, hop_s: float, settings: BargeInSettings | None = None) -> None:
+        self.settings = settings = settings or BargeInSettings()
+        self._least = max(1, round(settings.min_speech_s / hop_s))
+        self._pause = max(1, round(settings.min_silence_s / hop_s))
         self._sure = self._silent = 0
         self.speaking = False
 
     def note(self, probability: float | None) -> str | None:
-        """Take the probability of a hop, None where the engine does not judge it; return 'speech_started' or 'speech_stopped' or None."""
+        """Take the probability of a hop, None where the engine does not judge it.
+
+        Returns 'speech_started' or 'speech_stopped' or None.
+        """
         probability = probability or 0.0
-        self._sure = self._sure + 1 if probability >= STARTED else 0
-        self._silent = self._silent + 1 if probability < STOPPED else 0
-        if not self.speaking and self._sure >= STARTED_HOPS:
+        self._sure = self._sure + 1 if probability >= self.settings.threshold else 0
+        self._silent = self._silent + 1 if probability < self.settings.release else 0
+        if not self.speaking and self._sure >= self._least:
             self.speaking = True
             return "speech_started"
         if self.speaking and self._silent >= self._pause:

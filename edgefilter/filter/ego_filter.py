@@ -11,6 +11,7 @@ from edgefilter import engines
 from edgefilter.engines.base import ClipEngine, Engine
 from edgefilter.engines.ladder import CANDIDATES, Ladder, climbable
 from edgefilter.errors import EdgefilterError, SignalError, UsageError
+from edgefilter.filter.barge_in import BargeInSettings
 from edgefilter.filter.stepping import Stepping
 from edgefilter.filter.stream import Stream
 from edgefilter.profile.data import MAX_TAPS, Profile
@@ -25,6 +26,7 @@ class EgoFilter:
     model: the ONNX file that a neural engine, named in engine, loads in place of its own.
     budget_ms: compute per hop to keep to; where more is needed for long, cheaper engines take over (see Stepping), each time with
     an event. None: the engine stays, and missed deadlines are only counted.
+    barge_in: when speech counts as begun and ended; None for the defaults, see BargeInSettings for what to choose.
 
     >>> import numpy as np
     >>> ego = EgoFilter(engine="bypass")
@@ -41,13 +43,14 @@ class EgoFilter:
         budget_ms: float | None = None,
         reason: str = "asked for",
         model: str | Path | None = None,
+        barge_in: BargeInSettings | None = None,
     ) -> None:
         if engine == "auto" and model is not None:
             raise UsageError(f"found the model {model} without an engine for it: name one of {', '.join(engines.HAVE_MODEL)}")
         self.profile = Profile.load(profile) if isinstance(profile, str | Path) else profile
         best, self.engine_reason = strongest(self.profile) if engine == "auto" else (engines.create(engine, self.profile, model=model), reason)
         ladder = None if budget_ms is None or best.lookahead is None else Ladder(climbable(best, self.profile))
-        self._stream = Stream(ladder or best, self.profile, Stepping(best.stft.hop, ladder, budget_ms))
+        self._stream = Stream(ladder or best, self.profile, Stepping(best.stft.hop, ladder, budget_ms), barge_in)
 
     @property
     def engine_name(self) -> str:
@@ -76,7 +79,11 @@ class EgoFilter:
 
     @property
     def speech_probability(self) -> float | None:
-        """Probability that the human speaks now, where the engine judges it; 0 while it may well be the robot (OnsetGate.suspect)."""
+        """Probability that the human speaks now, 0 to 1: the network's, weighed with what robot and room are expected to leave.
+
+        None before the first hop and with engines that do not judge it (all but crnn): what stands above the robot's rest is not yet a
+        human, so they give no events of speech either. 0 where an utterance of the robot has begun and is not found yet.
+        """
         return self._stream.speech_probability
 
     @property

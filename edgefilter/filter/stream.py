@@ -10,7 +10,7 @@ from edgefilter.dsp.ring import Ring
 from edgefilter.dsp.stft import Synthesiser
 from edgefilter.engines.base import ClipEngine, Engine
 from edgefilter.errors import SignalError
-from edgefilter.filter.barge_in import BargeIn
+from edgefilter.filter.barge_in import BargeIn, BargeInSettings, HumanJudge
 from edgefilter.filter.front_end import FrontEnd
 from edgefilter.filter.stepping import Stepping
 from edgefilter.profile.data import Profile
@@ -23,13 +23,22 @@ class Stream:
     process returns finished samples, aligned with the input: sample i of all outputs together belongs to sample i of all
     inputs. Sample n is out once n + latency samples have come in. After flush as many samples are out as went in.
     With an engine that waits for the end (waits_for_end) process returns nothing and flush everything.
-    stepping: told the compute time of every hop; what it answers becomes an event.
+    stepping: told the compute time of every hop; what it answers becomes an event. barge_in: when speech counts as begun and ended.
+    speech_probability: of the last hop, weighed with what robot and room leave; engine_probability: as the engine gave it. Both None
+    before the first hop and where the engine does not judge it.
     """
 
-    def __init__(self, engine: Engine | ClipEngine, profile: Profile | None = None, stepping: Stepping | None = None) -> None:
+    def __init__(
+        self,
+        engine: Engine | ClipEngine,
+        profile: Profile | None = None,
+        stepping: Stepping | None = None,
+        barge_in: BargeInSettings | None = None,
+    ) -> None:
         self.engine = engine
         self.profile = profile
         self.stepping = stepping
+        self._barge_in_settings = barge_in or BargeInSettings()
         self.reset()
 
     @property
@@ -55,7 +64,9 @@ class Stream:
         self.front = FrontEnd(self.engine, self.profile)
         self.events: deque[Event] = deque(maxlen=1000)
         self.speech_probability: float | None = None
-        self._barge_in = BargeIn(stft.hop / SAMPLE_RATE)
+        self.engine_probability: float | None = None
+        self._judge = HumanJudge(stft)
+        self._barge_in = BargeIn(stft.hop / SAMPLE_RATE, self._barge_in_settings)
         self.samples_in = self.samples_out = self._stepped = 0
         self._state = None if self.waits_for_end else self.engine.initial_state()
         self._clip: list[Frame] = []
@@ -128,12 +139,16 @@ class Stream:
             self._collect(frame)
             return np.zeros(0, np.float32)
         output, self._state = self.engine.step(frame, self._state)
-        self.speech_probability = output.speech_probability
-        if self.speech_probability and self.front.gate and self.front.gate.suspect:
-            self.speech_probability = 0.0
+        self._judge_speech(frame, output.speech_probability)
+        return self._synthesiser.push(output.spectrum)
+
+    def _judge_speech(self, frame: Frame, probability: float | None) -> None:
+        self.engine_probability = self.speech_probability = probability
+        if probability is not None:
+            suspect = self.front.gate is not None and self.front.gate.suspect
+            self.speech_probability = self._judge.step(frame, probability, suspect)
         if talk := self._barge_in.note(self.speech_probability):
             self.events.append(Event(talk, self._stepped, f"probability {self.speech_probability or 0.0:.2f}"))
-        return self._synthesiser.push(output.spectrum)
 
     def _collect(self, frame: Frame) -> None:
         self._clip.append(frame)

@@ -7,30 +7,162 @@ import soundfile
 from edgefilter import EgoFilter
 from edgefilter.commands.demo import DATA
 from edgefilter.commands.run import say_event
-from edgefilter.filter.barge_in import PAUSE_S, STARTED, STARTED_HOPS, STOPPED, BargeIn
-from edgefilter.types import SAMPLE_RATE, Event
+from edgefilter.dsp.stft import StftConfig
+from edgefilter.errors import UsageError
+from edgefilter.filter.barge_in import BargeIn, BargeInSettings, HumanJudge
+from edgefilter.filter.excess import Excess
+from edgefilter.types import SAMPLE_RATE, Event, Frame
+
+HOP_S = 0.016
+STFT = StftConfig()
+UNSURE = 0.3
 
 
-def noted(probabilities: list[float | None]) -> list[str | None]:
-    talk = BargeIn(0.016)
+def noted(probabilities: list[float | None], settings: BargeInSettings | None = None) -> list[str | None]:
+    talk = BargeIn(HOP_S, settings)
     return [talk.note(probability) for probability in probabilities]
 
 
 def test_a_moment_is_not_speech_and_a_pause_is_not_its_end():
-    pause = round(PAUSE_S / 0.016)
-    assert not any(noted([STARTED] * (STARTED_HOPS - 1) + [0.1] + [STARTED] * (STARTED_HOPS - 1) + [None] * 100))
-    found = noted([STARTED] * STARTED_HOPS + [STOPPED - 0.1] * (pause - 1) + [STOPPED] + [STOPPED - 0.1] * pause)
-    assert [(at, what) for at, what in enumerate(found) if what] == [(STARTED_HOPS - 1, "speech_started"), (len(found) - 1, "speech_stopped")]
+    settings = BargeInSettings(threshold=0.9, release=0.5, min_speech_s=3 * HOP_S, min_silence_s=30 * HOP_S)
+    assert not any(noted([0.9, 0.9, 0.1, 0.9, 0.9] + [None] * 100, settings))
+    found = noted([0.9] * 3 + [0.49] * 29 + [0.5] + [0.49] * 30, settings)
+    happened = [(at, what) for at, what in enumerate(found) if what]
+    assert happened == [(2, "speech_started"), (len(found) - 1, "speech_stopped")]
 
 
 def test_an_engine_that_stops_judging_ends_the_speech():
-    found = noted([1.0] * STARTED_HOPS + [None] * 100)
+    found = noted([1.0] * 3 + [None] * 100)
     assert [what for what in found if what] == ["speech_started", "speech_stopped"]
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"threshold": 1.0}, "release 0.4 and threshold 1.0, expected probabilities"),
+        ({"release": 0.97}, "release 0.97 and threshold 0.96"),
+        ({"release": 0.0}, "release 0.0"),
+        ({"threshold": float("nan")}, "threshold nan"),
+        ({"min_silence_s": -1.0}, "min_silence_s -1.0, expected seconds"),
+    ],
+)
+def test_settings_that_mean_nothing_are_one_line(settings, message):
+    with pytest.raises(UsageError, match=message):
+        BargeInSettings(**settings)
+
+
+class Room:
+    """Frames of a robot whose rest is 20 dB below its echo, of a room's noise, and of a human, all of random phase."""
+
+    def __init__(self, seed: int = 0) -> None:
+        self._rng = np.random.default_rng(seed)
+        self._hops = 0
+
+    def _random(self, level: float) -> np.ndarray:
+        parts = self._rng.standard_normal((2, STFT.bins))
+        return level * (parts[0] + 1j * parts[1])
+
+    def frame(self, robot: float = 0.0, human: float = 0.0) -> Frame:
+        """One hop; the robot's loudness goes up and down four times a second, the room stays at 0.01."""
+        self._hops += 1
+        echo = self._random(robot * (1.0 + 0.9 * np.sin(2 * np.pi * 4 * HOP_S * self._hops)))
+        error = 0.1 * echo * self._random(0.7) + self._random(0.01) + self._random(human)
+        echo, error = echo.astype(np.complex64), error.astype(np.complex64)
+        nothing = np.zeros(STFT.bins, np.float32)
+        return Frame(echo + error, echo, echo, error, nothing, nothing)
+
+
+def test_what_the_robot_leaves_is_learned_and_a_human_stands_above_it():
+    room, excess = Room(), Excess(STFT)
+    alone = [excess.step(frame.echo, frame.error) for frame in (room.frame(robot=1.0) for _ in range(600))]
+    # the rest is 20 dB down where 13 are assumed; the mean of the log of a bin of noise is half a deviation below 0
+    assert np.mean(alone[:30]) < np.mean(alone[400:]) < 0.0
+    assert max(alone[400:]) < 0.75
+    frames = [room.frame(robot=1.0, human=1.0) for _ in range(20)]
+    assert np.mean([excess.step(frame.echo, frame.error) for frame in frames]) > 1.0
+
+
+def test_a_human_who_keeps_talking_does_not_become_what_is_expected():
+    room, excess = Room(), Excess(STFT)
+    for _ in range(600):
+        frame = room.frame(robot=1.0)
+        excess.step(frame.echo, frame.error)
+    syllables = [hop % 16 < 10 for hop in range(190)]  # three seconds
+    frames = [room.frame(robot=1.0, human=float(voiced)) for voiced in syllables]
+    above = np.array([excess.step(frame.echo, frame.error) for frame in frames])
+    assert above[-64:][syllables[-64:]].mean() > 0.75
+
+
+def test_steady_noise_that_the_network_takes_for_somebody_is_nobody_while_the_robot_is_silent():
+    room, judge = Room(), HumanJudge(STFT)
+    threshold = BargeInSettings().threshold
+    assert max(judge.step(room.frame(), 0.9999) for _ in range(300)) < 0.5
+    heard = [judge.step(room.frame(human=0.05), 0.9999) for _ in range(10)]
+    assert max(heard) > threshold  # 14 dB above the room, within 0.16 s
+
+
+def test_while_the_robot_speaks_the_network_decides():
+    room, judge = Room(), HumanJudge(STFT)
+    threshold = BargeInSettings().threshold
+    alone = [judge.step(room.frame(robot=1.0), UNSURE) for _ in range(300)]
+    sure = [judge.step(room.frame(robot=1.0), 0.9999) for _ in range(10)]
+    assert max(alone) < 0.1 and max(sure) > threshold
+
+
+def test_one_sure_hop_does_not_interrupt():
+    room, judge = Room(), HumanJudge(STFT)
+    for _ in range(100):
+        judge.step(room.frame(robot=1.0), UNSURE)
+    assert judge.step(room.frame(robot=1.0), 1.0) < 0.5
+
+
+def test_an_utterance_that_is_not_found_yet_holds_the_probability_down_and_teaches_nothing():
+    room, judge, same = Room(), HumanJudge(STFT), HumanJudge(STFT)
+    for _ in range(100):
+        frame = room.frame(robot=1.0)
+        judge.step(frame, UNSURE)
+        same.step(frame, UNSURE)
+    for _ in range(30):
+        frame = room.frame(robot=1.0, human=10.0)
+        assert judge.step(frame, 1.0, suspect=True) == 0.0
+        same.step(frame, 1.0)
+    frame = room.frame(robot=1.0)
+    judge.step(frame, 0.5), same.step(frame, 0.5)
+    assert np.all(judge._excess._log_gain < same._excess._log_gain)
+
+
+@pytest.mark.parametrize("probability", [0.0, 1.0])
+def test_probabilities_stay_in_0_to_1_whatever_comes(probability):
+    judge, silence = HumanJudge(STFT), np.zeros(STFT.bins, np.complex64)
+    loud = np.full(STFT.bins, 1e6, np.complex64)
+    nothing = np.zeros(STFT.bins, np.float32)
+    for echo, error in [(silence, silence), (loud, silence), (silence, loud), (loud, loud)] * 40:
+        answer = judge.step(Frame(error, echo, echo, error, nothing, nothing), probability)
+        assert 0.0 <= answer <= 1.0
+
+
+def test_an_engine_without_a_network_gives_no_probability_and_no_events():
+    mic, ref = (soundfile.read(DATA / f"{name}.flac", dtype="float32")[0] for name in ("mic", "reference"))
+    ego = EgoFilter(DATA / "profile.npz", engine="ss")
+    ego.process(mic, ref)
+    assert ego.speech_probability is None and not ego.human_speaks
+    assert not [event for event in ego.events() if event.kind.startswith("speech")]
+
+
+def test_the_settings_reach_the_stream():
+    mic, ref = (soundfile.read(DATA / f"{name}.flac", dtype="float32")[0] for name in ("mic", "reference"))
+    found = []
+    for settings in (BargeInSettings(min_speech_s=0.2), BargeInSettings()):
+        ego = EgoFilter(DATA / "profile.npz", engine="crnn", barge_in=settings)
+        ego.process(mic, ref)
+        found.append(next(event.sample for event in ego.events() if event.kind == "speech_started"))
+    assert found[0] >= found[1] + 0.15 * SAMPLE_RATE
 
 
 @pytest.mark.parametrize("alone", [True, False])
 def test_in_the_demo_the_human_is_noticed_and_the_robot_is_not(alone):
-    mic, ref, human = (soundfile.read(DATA / f"{name}.flac", dtype="float32")[0] for name in ("mic", "reference", "human"))
+    names = ("mic", "reference", "human")
+    mic, ref, human = (soundfile.read(DATA / f"{name}.flac", dtype="float32")[0] for name in names)
     ego = EgoFilter(DATA / "profile.npz", engine="crnn")
     ego.process(mic - alone * human, ref)
     talk = [event for event in ego.events() if event.kind.startswith("speech")]
