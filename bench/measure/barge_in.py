@@ -4,8 +4,10 @@
 
 Each conversation is filtered twice: as it is, and less the human, so that every event speech_started in the second is a
 false alarm. Noticed: the first speech_started that ends after the human's first sound (a 20 ms frame within 25 dB of
-the loudest), or at once where speech had been announced before, which counts as early. Writes OUTPUT.json and
-OUTPUT.md.
+the loudest), or at once where speech had been announced before, which counts as early. The second table sweeps the
+threshold of the probability. Writes OUTPUT.json and OUTPUT.md. The same on a real loudspeaker, with a picture:
+
+    python -m bench.measure.real RECORDINGS --parts laid,alone --systems crnn --speech HUMAN --output ...
 """
 
 from __future__ import annotations
@@ -13,12 +15,13 @@ from __future__ import annotations
 import argparse
 import sys
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
 from bench import results_writer
 from bench.measure.conversation import Conversation, every, find_conversations, progress
-from bench.measure.levels import FRAME, frame_power
+from bench.measure.real_barge_in import IN_TIME_S, THRESHOLDS, first_sound, in_time, noticed, replay, starts
 from edgefilter import EgoFilter
 from edgefilter.errors import EdgefilterError
 from edgefilter.types import SAMPLE_RATE, Event, Samples
@@ -28,29 +31,38 @@ IN_TIME_MS = 200
 """Barge-in that takes longer is felt as a robot that does not listen."""
 
 
-def talk(conversation: Conversation, mic: Samples) -> list[Event]:
-    """The beginnings and ends of speech that the engine notices."""
-    ego = EgoFilter(conversation.profile, engine=ENGINE)
-    ego.process(mic, conversation.read("ref"))
-    return [event for event in ego.events() if event.kind.startswith("speech")]
+class Talk(NamedTuple):
+    """The beginnings and ends of speech, and the probability after each hop of so many samples."""
+
+    events: list[Event]
+    probability: list[float]
+    hop: int
+
+
+def talk(conversation: Conversation, mic: Samples) -> Talk:
+    """What the engine notices of the human."""
+    ego, ref = EgoFilter(conversation.profile, engine=ENGINE), conversation.read("ref")
+    probability = []
+    for at in range(0, mic.size, ego.hop):
+        ego.process(mic[at : at + ego.hop], ref[at : at + ego.hop])
+        probability.append(ego.speech_probability or 0.0)
+    return Talk([event for event in ego.events() if event.kind.startswith("speech")], probability, ego.hop)
 
 
 def measure(conversation: Conversation) -> dict:
     """delay_ms from the human's first sound until it is noticed, None if never.
 
-    Early: speech was on already; alarms without the human.
+    Early: speech was on already; alarms without the human. in_time_at, alarms_at: the same at each of THRESHOLDS.
     """
     mic, clean = conversation.read("mic"), conversation.read("clean")
-    power = frame_power(clean)
-    onset = int(np.flatnonzero(power > 10**-2.5 * power.max())[0]) * FRAME
-    heard = talk(conversation, mic)
-    before = [event for event in heard if event.sample < onset]
-    after = [event.sample for event in heard if event.sample >= onset and event.kind == "speech_started"]
-    early = bool(before) and before[-1].kind == "speech_started"
-    alarms = sum(event.kind == "speech_started" for event in talk(conversation, mic - clean))
-    delay = (after[0] - onset) / SAMPLE_RATE * 1000 if after else None
-    found = {"delay_ms": 0.0 if early else delay, "early": early, "alarms": alarms, "seconds": mic.size / SAMPLE_RATE}
-    return {"conversation": conversation.folder.name, **found}
+    onset = first_sound(clean)
+    heard, alone = talk(conversation, mic), talk(conversation, mic - clean)
+    found = noticed(heard.events, onset)
+    delay = None if found["delay_s"] is None else 1000 * found["delay_s"]
+    row = {"delay_ms": 0.0 if found["early"] else delay, "early": found["early"], "alarms": starts(alone.events)}
+    row["in_time_at"] = [in_time(noticed(replay(heard.probability, heard.hop, at), onset)) for at in THRESHOLDS]
+    row["alarms_at"] = [starts(replay(alone.probability, alone.hop, at)) for at in THRESHOLDS]
+    return {"conversation": conversation.folder.name, **row, "seconds": mic.size / SAMPLE_RATE}
 
 
 def main() -> int:
@@ -88,7 +100,18 @@ def markdown(rows: list[dict]) -> str:
         alarms = sum(row["alarms"] for row in own)
         cells_of.append([*cells, f"{alarms} in {minutes:.0f} minutes, {alarms / minutes:.2f}"])
     lines += results_writer.table([*columns, "false alarms a minute, the human left out"], cells_of)
-    return "\n".join(lines) + "\n"
+    return "\n".join([*lines, *curve(rows)]) + "\n"
+
+
+def curve(rows: list[dict]) -> list[str]:
+    """A row a threshold, all sets together."""
+    hours = sum(row["seconds"] for row in rows) / 3600
+    alarms = np.sum([row["alarms_at"] for row in rows], axis=0) / hours
+    shares = np.mean([row["in_time_at"] for row in rows], axis=0)
+    columns = ["threshold of the probability", f"noticed in {IN_TIME_S} s, %", "false alarms an hour"]
+    points = zip(THRESHOLDS, shares, alarms, strict=True)
+    cells = [[at, f"{100 * share:.0f}", f"{count:.0f}"] for at, share, count in points]
+    return ["", *results_writer.table(columns, cells)]
 
 
 if __name__ == "__main__":

@@ -3,21 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from bench.measure.levels import FRAME, frame_power
+from edgefilter.filter.barge_in import BargeIn, BargeInSettings
 from edgefilter.types import SAMPLE_RATE, Event, Samples
 
 IN_TIME_S = 0.3
 """Somebody who interrupts is to be noticed by then."""
 FIRST_DB = 25.0
 """A human's first sound is the first frame within so much of the loudest."""
-THRESHOLDS = (0.5, 0.8, 0.9, 0.95, 0.98, 0.99, 0.995, 0.998, 0.999, 0.9995, 0.9999)
+THRESHOLDS = (0.5, 0.7, 0.8, 0.9, 0.94, 0.96, 0.97, 0.98, 0.985, 0.99, 0.995)
 """Of the probability, from which speech counts as begun: the points of the curve."""
-SURE_HOPS = 3
-SILENT, PAUSE_S = 0.5, 0.5
-"""The curve's rule: so many hops at a threshold begin speech, so many seconds below SILENT end it."""
 
 
 def first_sound(human: Samples) -> int:
@@ -48,12 +47,8 @@ def starts(events: Sequence[Event]) -> int:
 
 
 def replay(probability: Sequence[float], hop: int, threshold: float) -> list[Event]:
-    """The events that the probability alone would give, one value a hop of so many samples."""
-    events, speaking, sure, silent = [], False, 0, 0
-    pause = round(PAUSE_S * SAMPLE_RATE / hop)
-    for index, value in enumerate(probability, start=1):
-        sure, silent = (sure + 1 if value >= threshold else 0), (silent + 1 if value < SILENT else 0)
-        if not speaking and sure >= SURE_HOPS or speaking and silent >= pause:
-            speaking = not speaking
-            events.append(Event("speech_started" if speaking else "speech_stopped", index * hop, "replayed"))
-    return events
+    """The events that the package would give at another threshold, one value a hop of so many samples."""
+    usual = BargeInSettings()
+    rule = BargeIn(hop / SAMPLE_RATE, replace(usual, threshold=threshold, release=min(usual.release, threshold)))
+    found = ((index * hop, rule.note(value)) for index, value in enumerate(probability, start=1))
+    return [Event(kind, sample, "replayed") for sample, kind in found if kind]

@@ -64,7 +64,7 @@ def seconds(alone: list[dict]) -> list[float]:
 
 
 def curve(rows: list[dict]) -> list[dict]:
-    """One system's probability as the rule: at each threshold false starts an hour, and the share noticed in time."""
+    """One system at each threshold of its probability: false starts an hour, and the share noticed in time."""
     alone = [row for row in rows if row["part"] == "alone" and "curve" in row]
     laid = [row for row in rows if row["part"] == "laid" and "curve" in row]
     asked = [row for row in laid if row["ser"] == LOW_SER and row["before"] >= WARM_S]

@@ -316,16 +316,25 @@ def test_barge_in_counts_from_the_humans_first_sound(
     said = [] if before is None else [Event("speech_started", onset - int(before * RATE), "")]
     said += [] if after is None else [Event("speech_started", onset + int(after * RATE), "")]
     heard = []
+    late = [0.0] * (onset // 160 + 10) + [0.93]
+    answers = iter(
+        [
+            lambda mic: heard.append(mic) or (said, late, 160),
+            lambda mic: heard.append(mic) or ([Event("speech_started", 5, "")] * 3, [0.75], 160),
+        ]
+    )
     monkeypatch.setattr(
         barge_in,
         "talk",
-        lambda talk, mic: heard.append(mic) or (said if len(heard) == 1 else [Event("speech_started", 5, "")] * 3),
+        lambda talk, mic: barge_in.Talk(*next(answers)(mic)),
     )
     row = barge_in.measure(talk)
     assert row["delay_ms"] == delay and row["early"] == (before is not None) and row["alarms"] == 3
     np.testing.assert_array_equal(heard[1], talk.read("mic") - talk.read("clean"))
     text = barge_in.markdown([{"set": "live", **row}, {"set": "live", **row, "delay_ms": 50.0, "early": False}])
     assert f"| {shown} | 6 in " in text
+    hours = 2 * row["seconds"] / 3600
+    assert f"| 0.7 | 100 | {2 / hours:.0f} |" in text and "| 0.9 | 100 | 0 |" in text and "| 0.94 | 0 | 0 |" in text
 
 
 def test_a_row_is_scored_anew_where_its_code_or_its_network_changed(
