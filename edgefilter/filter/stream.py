@@ -23,8 +23,8 @@ class Stream:
     process returns finished samples, aligned with the input: sample i of all outputs together belongs to sample i of all
     inputs. Sample n is out once n + latency samples have come in. After flush as many samples are out as went in.
     With an engine that waits for the end (waits_for_end) process returns nothing and flush everything.
-    stepping: told the compute time of every hop; what it answers becomes an event. barge_in: when speech counts as begun and ended.
-    speech_probability: of the last hop, weighed with what robot and room leave; engine_probability: as the engine gave it. Both None
+    stepping: told the compute time of every hop; what it answers becomes an event. barge_in: when speech counts as begun
+    and ended, None for the defaults. speech_probability: of the last hop, weighed with what robot and room leave; None
     before the first hop and where the engine does not judge it.
     """
 
@@ -64,7 +64,6 @@ class Stream:
         self.front = FrontEnd(self.engine, self.profile)
         self.events: deque[Event] = deque(maxlen=1000)
         self.speech_probability: float | None = None
-        self.engine_probability: float | None = None
         self._judge = HumanJudge(stft)
         self._barge_in = BargeIn(stft.hop / SAMPLE_RATE, self._barge_in_settings)
         self.samples_in = self.samples_out = self._stepped = 0
@@ -143,7 +142,7 @@ class Stream:
         return self._synthesiser.push(output.spectrum)
 
     def _judge_speech(self, frame: Frame, probability: float | None) -> None:
-        self.engine_probability = self.speech_probability = probability
+        self.speech_probability = probability
         if probability is not None:
             suspect = self.front.gate is not None and self.front.gate.suspect
             self.speech_probability = self._judge.step(frame, probability, suspect)
