@@ -12,18 +12,21 @@ from edgefilter.types import SAMPLE_RATE, Frame
 
 ODDS_RANGE = (-2.0, 8.0)
 """Bounds on the network's log-odds of one hop, so that none outweighs a tenth of a second."""
-ODDS_MEMORY_S, EXCESS_MEMORY_S = 0.0313, 0.0449
+ODDS_MEMORY_S, EXCESS_MEMORY_S = 0.0133, 0.0449
 """Time constants over which log-odds and excess are averaged: a voiced sound is longer, a burst of the loudspeaker is
 not."""
 MOST_EXCESS = 2.0
 """Bound on the excess of one hop: a click is no more than a syllable."""
-CENTRE, SLOPE = 2.85, 1.2
+CENTRE, SLOPE = 3.25, 1.25
 """Averaged log-odds of the network at which a human is as likely as not, and the slope of the logistic around it:
-fitted on robots alone and humans laid on them 0 to 26 dB below, on one real loudspeaker, a human in one hop of four."""
-ROOM_EXCESS, ROOM_ODDS = 0.4, 3.2
+fitted on robots alone and humans laid on them 0 to 26 dB below, on one real loudspeaker without a profile, a human in
+one hop of four."""
+CENTRE_CALIBRATED = 2.25
+"""The same with a profile: the network was trained on what a calibrated path leaves, and is wrong less often."""
+ROOM_EXCESS, ROOM_ODDS = 0.4, 3.45
 """Mean excess, in standard deviations, of a soft syllable in a silent room (steady noise has -0.3), and the log-odds
 that it is worth at most: the default threshold's."""
-ROOM_SLOPE, ECHO_SLOPE = 9.6, 48.0
+ROOM_SLOPE, ECHO_SLOPE = 10.0, 50.0
 """Log-odds by which that bound moves per unit of excess and of the robot's share of what is expected; with a tenth of
 it the robot's own, the network decides alone."""
 
@@ -32,7 +35,7 @@ it the robot's own, the network decides alone."""
 class BargeInSettings:
     """When speech counts as begun and as ended.
 
-    threshold: probability that must be reached. Higher (0.98) for a robot that must not be stopped by its own
+    threshold: probability that must be reached. Higher (0.985) for a robot that must not be stopped by its own
     loudspeaker or a running tap, at the price of the softest humans and some 20 ms; lower (0.9) for one that would
     rather stop once too often. release: probability below which a hop counts as silent; lower than the threshold, so
     that soft syllables do not end a sentence. min_speech_s: how long the threshold is held before speech has begun; the
@@ -42,7 +45,7 @@ class BargeInSettings:
     Raises UsageError for probabilities outside 0 to 1, a release above the threshold, or negative times.
     """
 
-    threshold: float = 0.96
+    threshold: float = 0.97
     release: float = 0.4
     min_speech_s: float = 0.0
     min_silence_s: float = 0.5
@@ -61,9 +64,11 @@ class HumanJudge:
 
     A network that was trained on other rooms takes steady noise for somebody. While the robot speaks it knows best;
     while the robot is silent only the room can be heard, whose level is known, and a human must stand above it.
+    calibrated: whether the stream has a profile.
     """
 
-    def __init__(self, stft: StftConfig) -> None:
+    def __init__(self, stft: StftConfig, calibrated: bool = False) -> None:
+        self._centre = CENTRE_CALIBRATED if calibrated else CENTRE
         hop_s = stft.hop / SAMPLE_RATE
         self._excess = Excess(stft)
         self._follow_odds = 1.0 - math.exp(-hop_s / ODDS_MEMORY_S)
@@ -84,7 +89,7 @@ class HumanJudge:
         odds = math.log(max(probability, 1e-9) / max(1.0 - probability, 1e-9))
         self._odds += self._follow_odds * (min(max(odds, ODDS_RANGE[0]), ODDS_RANGE[1]) - self._odds)
         room = ROOM_ODDS + ROOM_SLOPE * (self._above - ROOM_EXCESS) + ECHO_SLOPE * self._excess.echo_share
-        return 1.0 / (1.0 + math.exp(-min(SLOPE * (self._odds - CENTRE), room)))
+        return 1.0 / (1.0 + math.exp(-min(SLOPE * (self._odds - self._centre), room)))
 
 
 class BargeIn:

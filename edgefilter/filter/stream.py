@@ -64,7 +64,7 @@ class Stream:
         self.front = FrontEnd(self.engine, self.profile)
         self.events: deque[Event] = deque(maxlen=1000)
         self.speech_probability: float | None = None
-        self._judge = HumanJudge(stft)
+        self._judge = HumanJudge(stft, calibrated=self.profile is not None)
         self._barge_in = BargeIn(stft.hop / SAMPLE_RATE, self._barge_in_settings)
         self.samples_in = self.samples_out = self._stepped = 0
         self._state = None if self.waits_for_end else self.engine.initial_state()

@@ -40,7 +40,7 @@ def test_an_engine_that_stops_judging_ends_the_speech():
     ("settings", "message"),
     [
         ({"threshold": 1.0}, "release 0.4 and threshold 1.0, expected probabilities"),
-        ({"release": 0.97}, "release 0.97 and threshold 0.96"),
+        ({"release": 0.98}, "release 0.98 and threshold 0.97"),
         ({"release": 0.0}, "release 0.0"),
         ({"threshold": float("nan")}, "threshold nan"),
         ({"min_silence_s": -1.0}, "min_silence_s -1.0, expected seconds"),
@@ -109,11 +109,16 @@ def test_while_the_robot_speaks_the_network_decides():
     assert max(alone) < 0.1 and max(sure) > threshold
 
 
-def test_one_sure_hop_does_not_interrupt():
-    room, judge = Room(), HumanJudge(STFT)
-    for _ in range(100):
-        judge.step(room.frame(robot=1.0), UNSURE)
-    assert judge.step(room.frame(robot=1.0), 1.0) < 0.5
+def test_one_sure_hop_does_not_interrupt_a_robot_that_nobody_calibrated():
+    heard = {}
+    for calibrated in (False, True):
+        room, judge = Room(), HumanJudge(STFT, calibrated)
+        for _ in range(100):
+            judge.step(room.frame(robot=1.0), UNSURE)
+        heard[calibrated] = [judge.step(room.frame(robot=1.0), 1.0) for _ in range(3)]
+    threshold = BargeInSettings().threshold
+    assert heard[False][0] < threshold < heard[True][0]
+    assert heard[False][2] > threshold
 
 
 def test_an_utterance_that_is_not_found_yet_holds_the_probability_down_and_teaches_nothing():
