@@ -245,7 +245,7 @@ def test_summary_takes_quiet_humans_after_a_while_without_fan():
     }
     with_alone = summarise([*rows, alone])
     assert with_alone["curve"][0] == {"threshold": 0.5, "false_an_hour": 8.0, "in_time": 1.0}
-    assert with_alone["curve"][2] == {"threshold": 0.9, "false_an_hour": 0.0, "in_time": 0.0}
+    assert with_alone["curve"][2] == {"threshold": THRESHOLDS[2], "false_an_hour": 0.0, "in_time": 0.0}
     assert (found["below_microphone"], found["wer_capped"], found["in_time"], found["excess_db"]) == (
         1,
         0.5,
