@@ -41,6 +41,7 @@ if TYPE_CHECKING:
     from edgefilter.errors import SignalError as SignalError
     from edgefilter.errors import StftError as StftError
     from edgefilter.errors import UsageError as UsageError
+    from edgefilter.filter.barge_in import BargeInSettings as BargeInSettings
     from edgefilter.filter.ego_filter import EgoFilter as EgoFilter
     from edgefilter.filter.ego_filter import enhance as enhance
     from edgefilter.profile.data import Profile as Profile
@@ -73,6 +74,7 @@ _HOMES = {
         "StftError",
         "UsageError",
     ),
+    "filter.barge_in": ("BargeInSettings",),
     "filter.ego_filter": ("EgoFilter", "enhance"),
     "profile.data": ("Profile",),
     "types": ("SAMPLE_RATE", "Event", "Stats"),
