@@ -1,7 +1,7 @@
 """Hear the human while the robot talks: removal of a robot's own voice and fan from its microphone, in real time.
 
-Everything public can be had from here (docs/api.md). Names are loaded when they are first asked for, so that `import edgefilter` costs
-nothing and a program pays for what it uses.
+Everything public can be had from here (docs/api.md). Names are loaded when they are first asked for, so that `import
+edgefilter` costs nothing and a program pays for what it uses.
 
 >>> import numpy as np
 >>> from edgefilter import enhance

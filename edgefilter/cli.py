@@ -44,8 +44,15 @@ def build_parser() -> Parser:
 
 def _add_demo(commands: argparse._SubParsersAction) -> None:
     demo = commands.add_parser("demo", help="filter the bundled recording and show before and after")
-    demo.add_argument("--output", metavar="DIR", default="edgefilter-demo", help="folder for the WAV files and the picture (default: %(default)s)")
-    demo.add_argument("--engine", default="auto", metavar="ENGINE", help=f"auto, {', '.join(ENGINES)} (default: %(default)s)")
+    demo.add_argument(
+        "--output",
+        metavar="DIR",
+        default="edgefilter-demo",
+        help="folder for the WAV files and the picture (default: %(default)s)",
+    )
+    demo.add_argument(
+        "--engine", default="auto", metavar="ENGINE", help=f"auto, {', '.join(ENGINES)} (default: %(default)s)"
+    )
     demo.add_argument("--json", metavar="FILE", help="write the figures as JSON ('-': standard output)")
 
 
@@ -53,24 +60,44 @@ def _add_run(commands: argparse._SubParsersAction) -> None:
     run = commands.add_parser(
         "run",
         help="filter a recording, a pipe or the microphone",
-        description="Filter a recording, a pipe or the microphone.\n\n"
-        "  edgefilter run --input mic.wav --reference tts.wav --profile robot.npz --output human.wav\n"
-        "  edgefilter run --input mic --profile robot.npz --output human.wav      (live; Ctrl-C ends it)\n"
-        "  ... | edgefilter run --input - --output - | ...                        (s16le 16 kHz: stereo in, mono out)",
+        description=(
+            "Filter a recording, a pipe or the microphone.\n\n  edgefilter run --input mic.wav --reference tts.wav"
+            " --profile robot.npz --output human.wav\n  edgefilter run --input mic --profile robot.npz --output"
+            " human.wav      (live; Ctrl-C ends it)\n  ... | edgefilter run --input - --output - | ...                 "
+            "       (s16le 16 kHz: stereo in, mono out)"
+        ),
     )
-    run.add_argument("--input", required=True, metavar="mic|FILE|DEVICE|-", help="microphone device (number or part of its name), recording, or raw PCM")
-    run.add_argument("--reference", metavar="FILE|DEVICE", help="what the robot says; live it defaults to the monitor of the default output")
+    run.add_argument(
+        "--input",
+        required=True,
+        metavar="mic|FILE|DEVICE|-",
+        help="microphone device (number or part of its name), recording, or raw PCM",
+    )
+    run.add_argument(
+        "--reference",
+        metavar="FILE|DEVICE",
+        help="what the robot says; live it defaults to the monitor of the default output",
+    )
     run.add_argument("--profile", metavar="P.npz", help="calibrated robot, made by 'edgefilter calibrate'")
-    run.add_argument("--engine", default="auto", metavar="ENGINE", help=f"auto, {', '.join(ENGINES)} (default: %(default)s)")
+    run.add_argument(
+        "--engine", default="auto", metavar="ENGINE", help=f"auto, {', '.join(ENGINES)} (default: %(default)s)"
+    )
     run.add_argument("--model", metavar="FILE.onnx", help=f"network for {' or '.join(HAVE_MODEL)} in place of its own")
     run.add_argument(
-        "--budget-ms", type=_positive, metavar="B", help="compute per hop (p99) that auto may use, and that a live run keeps to (live default: 8)"
+        "--budget-ms",
+        type=_positive,
+        metavar="B",
+        help="compute per hop (p99) that auto may use, and that a live run keeps to (live default: 8)",
     )
     run.add_argument("--remeasure", action="store_true", help="forget how fast the engines were on this machine")
-    run.add_argument("--output", required=True, metavar="FILE|DEVICE|-", help="WAV or FLAC file, output device, or raw PCM")
+    run.add_argument(
+        "--output", required=True, metavar="FILE|DEVICE|-", help="WAV or FLAC file, output device, or raw PCM"
+    )
     run.add_argument("--json", metavar="FILE", help="write what happened as JSON")
     run.add_argument("--save-input", metavar="DIR", help="also write what was heard: DIR/mic.wav and DIR/reference.wav")
-    run.add_argument("--save-profile", metavar="P2.npz", help="write the profile with the echo path as it was adapted in this run")
+    run.add_argument(
+        "--save-profile", metavar="P2.npz", help="write the profile with the echo path as it was adapted in this run"
+    )
     run.add_argument("--seconds", type=_positive, metavar="S", help="stop after S seconds")
     _effects_option(run)
     run.add_argument("--quiet", action="store_true", help="no progress bar, no level meter")
@@ -80,17 +107,29 @@ def _add_calibrate(commands: argparse._SubParsersAction) -> None:
     calibrate = commands.add_parser(
         "calibrate",
         help="measure the robot's voice and fan at its microphone",
-        description="Measure the robot's voice and fan at its microphone.\n\n"
-        "  edgefilter calibrate --sweep-reference S.wav --sweep-recording R.wav --noise-recording FAN.wav --output P.npz\n"
-        "  edgefilter calibrate --live --output P.npz                             (plays a sweep and records it)",
+        description=(
+            "Measure the robot's voice and fan at its microphone.\n\n  edgefilter calibrate --sweep-reference S.wav"
+            " --sweep-recording R.wav --noise-recording FAN.wav --output P.npz\n  edgefilter calibrate --live --output"
+            " P.npz                             (plays a sweep and records it)"
+        ),
     )
     calibrate.add_argument("--sweep-reference", metavar="S.wav", help="the sweep as it was sent to the loudspeaker")
     calibrate.add_argument("--sweep-recording", metavar="R.wav", help="the sweep as the microphone heard it")
-    calibrate.add_argument("--noise-recording", metavar="FAN.wav", help="the robot silent, its fan running, a few seconds")
-    calibrate.add_argument("--stepped-sine", action="store_true", help="the recordings hold the paper's stepped sine (0-8001 Hz, 13 Hz steps)")
+    calibrate.add_argument(
+        "--noise-recording", metavar="FAN.wav", help="the robot silent, its fan running, a few seconds"
+    )
+    calibrate.add_argument(
+        "--stepped-sine",
+        action="store_true",
+        help="the recordings hold the paper's stepped sine (0-8001 Hz, 13 Hz steps)",
+    )
     calibrate.add_argument("--live", action="store_true", help="play the sweep on --speaker and record it on --input")
-    calibrate.add_argument("--speaker", default="default", metavar="DEVICE", help="output device for --live (default: %(default)s)")
-    calibrate.add_argument("--input", default="mic", metavar="DEVICE", help="input device for --live (default: %(default)s)")
+    calibrate.add_argument(
+        "--speaker", default="default", metavar="DEVICE", help="output device for --live (default: %(default)s)"
+    )
+    calibrate.add_argument(
+        "--input", default="mic", metavar="DEVICE", help="input device for --live (default: %(default)s)"
+    )
     peak = "peak of the played sweep, dB of full scale (default: %(default)s)"
     calibrate.add_argument("--level-db", type=_level, default=-12.0, metavar="DB", help=peak)
     calibrate.add_argument("--save-input", metavar="DIR", help="with --live: also keep the recordings")
@@ -104,14 +143,28 @@ def _add_diagnosis(commands: argparse._SubParsersAction) -> None:
     add = commands.add_parser("add", help="fit an effect to a recording and write a profile that has it")
     remove = commands.add_parser("remove", help="write a profile without one of its effects")
     for command in (add, remove):
-        command.add_argument("effect", metavar="EFFECT", help="name of the effect, as 'diagnose' and 'profile show' print it")
+        command.add_argument(
+            "effect", metavar="EFFECT", help="name of the effect, as 'diagnose' and 'profile show' print it"
+        )
     for command in (compare, diagnose, add, remove):
         needed = command in (add, remove)
-        told = "calibrated robot, made by 'edgefilter calibrate'" + ("" if needed else "; without it the recording itself speaks for the robot")
+        told = "calibrated robot, made by 'edgefilter calibrate'" + (
+            "" if needed else "; without it the recording itself speaks for the robot"
+        )
         command.add_argument("--profile", required=needed, metavar="P.npz", help=told)
         if command is not remove:
-            command.add_argument("--recording", required=True, metavar="MIC", help="the robot alone, as the microphone heard it, from some seconds up")
-            command.add_argument("--reference", required=True, metavar="REF", help="what the robot said, as it was sent to the loudspeaker")
+            command.add_argument(
+                "--recording",
+                required=True,
+                metavar="MIC",
+                help="the robot alone, as the microphone heard it, from some seconds up",
+            )
+            command.add_argument(
+                "--reference",
+                required=True,
+                metavar="REF",
+                help="what the robot said, as it was sent to the loudspeaker",
+            )
         if command in (add, remove):
             command.add_argument("--output", required=True, metavar="P2.npz", help="profile to write")
         else:
@@ -121,7 +174,13 @@ def _add_diagnosis(commands: argparse._SubParsersAction) -> None:
 
 
 def _effects_option(command: argparse.ArgumentParser) -> None:
-    command.add_argument("--effects", action="append", default=[], metavar="FILE.py", help="an effect of your own (see docs/own_effect.md); repeatable")
+    command.add_argument(
+        "--effects",
+        action="append",
+        default=[],
+        metavar="FILE.py",
+        help="an effect of your own (see docs/own_effect.md); repeatable",
+    )
 
 
 def _add_devices(commands: argparse._SubParsersAction) -> None:

@@ -2,7 +2,10 @@
 
 
 class EdgefilterError(Exception):
-    """Base of every error that this package raises on purpose; the command line turns it into one line and exit code 1."""
+    """Base of every error that this package raises on purpose.
+
+    The command line turns it into one line and exit code 1.
+    """
 
 
 class UsageError(EdgefilterError):

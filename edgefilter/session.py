@@ -98,9 +98,9 @@ def filter_blocks(
 ) -> RunReport:
     """Run ego over every block of source until it ends or stopped() says so; always flush into sink what was received.
 
-    A source or sink that fails on the way (a device that vanished, a truncated file, a full disk) ends the run: what was
-    received is filtered and flushed as far as the sink still takes it, and the error stands in report.failure.
-    show gets the levels after each block, tell what happened in the filter.
+    A source or sink that fails on the way (a device that vanished, a truncated file, a full disk) ends the run: what
+    was received is filtered and flushed as far as the sink still takes it, and the error stands in report.failure. show
+    gets the levels after each block, tell what happened in the filter.
     """
     report, progress = RunReport(), Progress()
     began = time.perf_counter()

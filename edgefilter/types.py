@@ -14,7 +14,8 @@ from edgefilter.errors import SignalError
 SAMPLE_RATE = 16000
 """Samples per second of everything inside; sources convert at the door."""
 PRE_ROLL = 64
-"""Samples (4 ms) of the impulse response before the direct sound: what equalisers and linear-phase filters of a loudspeaker ring ahead of it."""
+"""Samples (4 ms) of the impulse response before the direct sound: what equalisers and linear-phase filters of a
+loudspeaker ring ahead of it."""
 
 Array: TypeAlias = NDArray[np.floating]
 Samples: TypeAlias = NDArray[np.float32]
@@ -70,8 +71,9 @@ class Event:
     Parameters
     ----------
     kind : str
-        What happened. "realigned": the reference was found elsewhere in the microphone. "speech_started", "speech_stopped": of the
-        human, from engines that judge it. "overloaded", "stepped_down", "stepped_up": what too little or enough time led to.
+        What happened. "realigned": the reference was found elsewhere in the microphone. "speech_started",
+        "speech_stopped": of the human, from engines that judge it. "overloaded", "stepped_down", "stepped_up": what too
+        little or enough time led to.
     sample : int
         By which sample of the microphone, in whole hops.
     detail : str
@@ -84,7 +86,10 @@ class Event:
 
 
 class AlignmentStats(TypedDict, total=False):
-    """What the aligner found. method "tracking" has all keys, "paper" the first, delay_samples, confidence and utterances_aligned."""
+    """What the aligner found.
+
+    Method "tracking" has all keys, "paper" the first, delay_samples, confidence and utterances_aligned.
+    """
 
     method: Literal["tracking", "paper"]
     state: Literal["searching", "locked", "idle"]
@@ -126,9 +131,9 @@ class DeadlineStats(TypedDict):
 class Stats(TypedDict):
     """What EgoFilter.stats() returns, ready for JSON.
 
-    engine, engine_reason: the one at work, and why it was chosen. engines: those that can take turns. model: what a network's file says
-    of itself, None without one. latency_ms: algorithmic, None for an engine that needs the whole recording. samples: taken in so far.
-    alignment, linear_stage: None for engines that go without.
+    engine, engine_reason: the one at work, and why it was chosen. engines: those that can take turns. model: what a
+    network's file says of itself, None without one. latency_ms: algorithmic, None for an engine that needs the whole
+    recording. samples: taken in so far. alignment, linear_stage: None for engines that go without.
     """
 
     engine: str

@@ -47,8 +47,8 @@ class Corpus:
 def read_corpus(*folders: Path) -> Corpus:
     """All utterances below these folders by speaker.
 
-    The speaker comes from transcripts.tsv (path, speaker, seconds, text; no header) where there is one, else from LibriSpeech's names,
-    speaker-chapter-number.flac. Raises UsageError where no speech is found.
+    The speaker comes from transcripts.tsv (path, speaker, seconds, text; no header) where there is one, else from
+    LibriSpeech's names, speaker-chapter-number.flac. Raises UsageError where no speech is found.
     """
     speakers: dict[str, list[Path]] = {}
     for folder in folders:
@@ -60,7 +60,10 @@ def read_corpus(*folders: Path) -> Corpus:
         else:
             found = [(path, path.stem.split("-")[0]) for path in sorted(folder.rglob("*")) if path.suffix in ENDINGS]
         if not found:
-            raise UsageError(f"{folder} holds no speech: expected transcripts.tsv beside its files, or LibriSpeech's speaker/chapter folders")
+            raise UsageError(
+                f"{folder} holds no speech: expected transcripts.tsv beside its files, or LibriSpeech's speaker/chapter"
+                " folders"
+            )
         for path, speaker in found:
             speakers.setdefault(speaker, []).append(path)
     return Corpus({speaker: tuple(paths) for speaker, paths in speakers.items()})
@@ -70,6 +73,8 @@ def read_speech(path: Path) -> Samples:
     """The utterance (n,) without the silence around it; raises UsageError for another rate or several channels."""
     samples, rate = sf.read(path, dtype="float32")
     if rate != SAMPLE_RATE or samples.ndim != 1:
-        raise UsageError(f"{path} has {rate} Hz and shape {samples.shape}, expected {SAMPLE_RATE} Hz mono: convert the corpus first")
+        raise UsageError(
+            f"{path} has {rate} Hz and shape {samples.shape}, expected {SAMPLE_RATE} Hz mono: convert the corpus first"
+        )
     loud = np.flatnonzero(np.abs(samples) > 0.02 * np.abs(samples).max())
     return samples[loud[0] : loud[-1] + 1] if loud.size else samples

@@ -36,7 +36,9 @@ class Items:
         new = [path for path in sorted(self.folder.glob("*.npz")) if path.name not in self._items]
         for path in tqdm(new, desc=f"read {self.folder}", unit="item", leave=False):
             with np.load(path) as file:
-                self._items[path.name] = {name: file[name] for name in ("mic", "error", "reference", "clean", "scale", "reference_scale")}
+                self._items[path.name] = {
+                    name: file[name] for name in ("mic", "error", "reference", "clean", "scale", "reference_scale")
+                }
         self.names = sorted(self._items)
         return len(self.names)
 
@@ -44,7 +46,10 @@ class Items:
         """(samples,) float32 of each signal but the echo, at their true scale."""
         item = self._items[name]
         return {
-            signal: (item["reference_scale" if signal == "reference" else "scale"] / 32767) * item[signal][start : start + samples].astype(np.float32)
+            signal: (
+                (item["reference_scale" if signal == "reference" else "scale"] / 32767)
+                * item[signal][start : start + samples].astype(np.float32)
+            )
             for signal in ("mic", "error", "reference", "clean")
         }
 
@@ -56,7 +61,9 @@ class Items:
 class Batches:
     """Batches of crops with their augmentation, made on a thread ahead of training."""
 
-    def __init__(self, items: Items, stft: StftConfig, batch: int, seconds: float, seed: int, augment: bool = True) -> None:
+    def __init__(
+        self, items: Items, stft: StftConfig, batch: int, seconds: float, seed: int, augment: bool = True
+    ) -> None:
         self.items, self.stft, self.batch, self.augment = items, stft, batch, augment
         self.samples = int(seconds * SAMPLE_RATE) // stft.hop * stft.hop
         self.rng = np.random.default_rng(seed)
@@ -99,7 +106,9 @@ class Batches:
     def _swap_human(self, crop: dict[str, np.ndarray]) -> None:
         """Put another human, from another conversation, in the place of the one that is there; now and then nobody."""
         other = str(self.rng.choice(self.items.names))
-        clean = self.items.crop(other, int(self.rng.integers(self.items.length(other) - self.samples + 1)), self.samples)["clean"]
+        clean = self.items.crop(
+            other, int(self.rng.integers(self.items.length(other) - self.samples + 1)), self.samples
+        )["clean"]
         here, there = (float(np.sqrt(np.mean(x**2))) for x in (crop["clean"], clean))
         if here == 0.0 or there == 0.0:
             return

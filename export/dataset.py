@@ -2,8 +2,8 @@
 
     python -m export.dataset --humans DIR --robots DIR --output DIR --count 2000 --seed 1 [--recipe edge|paper] [--profile P.npz]
 
-Writes DIR/NNNNN.npz per item (mic, reference, error, clean: (n,) int16 with one scale, about: JSON) and DIR/dataset.json. reference is the
-aligned one; echo = mic - error. A second run goes on where the first stopped.
+Writes DIR/NNNNN.npz per item (mic, reference, error, clean: (n,) int16 with one scale, about: JSON) and
+DIR/dataset.json. reference is the aligned one; echo = mic - error. A second run goes on where the first stopped.
 """
 
 from __future__ import annotations
@@ -48,7 +48,9 @@ def pack(conversation: Conversation, stft: StftConfig) -> dict[str, np.ndarray]:
     signals = {"mic": conversation.mic, "error": error, "clean": conversation.clean, "reference": reference}
     signals = {name: samples[: error.size] for name, samples in signals.items()}
     peak = max(float(np.abs(signals[name]).max()) for name in ("mic", "error", "clean"))
-    scales = {name: max(float(np.abs(reference).max()), 1e-6) if name == "reference" else max(peak, 1e-6) for name in signals}
+    scales = {
+        name: max(float(np.abs(reference).max()), 1e-6) if name == "reference" else max(peak, 1e-6) for name in signals
+    }
     packed = {name: np.round(32767 * samples / scales[name]).astype(np.int16) for name, samples in signals.items()}
     return packed | {"scale": np.float32(scales["mic"]), "reference_scale": np.float32(scales["reference"])}
 
@@ -82,10 +84,26 @@ def _make_room(task: tuple[str, int, int]) -> Room:
     return draw_room(np.random.default_rng([seed, len(kind), number]), kind)
 
 
-def make_dataset(recipe: Recipe, seed: int, count: int, humans: Corpus, robots: Corpus, rooms: list[Room], output: Path, stft: StftConfig, jobs: int) -> Iterator[dict[str, object]]:
+def make_dataset(
+    recipe: Recipe,
+    seed: int,
+    count: int,
+    humans: Corpus,
+    robots: Corpus,
+    rooms: list[Room],
+    output: Path,
+    stft: StftConfig,
+    jobs: int,
+) -> Iterator[dict[str, object]]:
     """Write the items that are not there yet; yields what each is about."""
     output.mkdir(parents=True, exist_ok=True)
-    about = {"recipe": asdict(recipe), "seed": seed, "stft": asdict(stft), "speakers": len(humans.speakers), "voices": len(robots.speakers)}
+    about = {
+        "recipe": asdict(recipe),
+        "seed": seed,
+        "stft": asdict(stft),
+        "speakers": len(humans.speakers),
+        "voices": len(robots.speakers),
+    }
     (output / "dataset.json").write_text(json.dumps(about, indent=1, default=str) + "\n", encoding="utf-8")
     paths = [(index, output / f"{index:05d}.npz") for index in range(count)]
     missing = [(recipe, seed, index, path, stft) for index, path in paths if not path.exists()]
@@ -101,7 +119,9 @@ def main() -> None:
     parser.add_argument("--count", type=int, default=2000)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--recipe", choices=tuple(RECIPES), default="edge")
-    parser.add_argument("--hop", type=int, default=256, help="of the linear stage; the window is twice as long (default: %(default)s)")
+    parser.add_argument(
+        "--hop", type=int, default=256, help="of the linear stage; the window is twice as long (default: %(default)s)"
+    )
     parser.add_argument("--profile", type=Path, help="add the lasting effects of this profile to half of the items")
     parser.add_argument("--jobs", type=int, default=os.cpu_count())
     options = parser.parse_args()

@@ -1,8 +1,8 @@
 """EdgeCrnn.step as a graph of few operators: the same answers and states, in the way that onnxruntime computes one frame fastest.
 
-Encoder, decoder, features and mask are the network's own. Its own here are that the features of all four spectra are computed at once,
-with the frequencies innermost, and that the layers of the GRU hand each other their states: a third of the operators and a quarter of the
-time fall away.
+Encoder, decoder, features and mask are the network's own. Its own here are that the features of all four spectra are
+computed at once, with the frequencies innermost, and that the layers of the GRU hand each other their states: a third
+of the operators and a quarter of the time fall away.
 """
 
 from __future__ import annotations
@@ -14,7 +14,10 @@ from export.network import EdgeCrnn, compressed, masked
 
 
 class EdgeGraph(nn.Module):
-    """What onnx_export traces. products: the GRU as matrix products, which can be quantised, in place of ONNX's GRU operator, which cannot."""
+    """What onnx_export traces.
+
+    Products: the GRU as matrix products, which can be quantised, in place of ONNX's GRU operator, which cannot.
+    """
 
     def __init__(self, network: EdgeCrnn, products: bool = False) -> None:
         super().__init__()
@@ -23,7 +26,14 @@ class EdgeGraph(nn.Module):
         self.memory = nn.ModuleList(layer(network.memory, number) for number in range(network.memory.num_layers))
 
     def forward(
-        self, error: Tensor, mic: Tensor, reference: Tensor, echo: Tensor, mic_last: Tensor, ref_last: Tensor, hidden: Tensor
+        self,
+        error: Tensor,
+        mic: Tensor,
+        reference: Tensor,
+        echo: Tensor,
+        mic_last: Tensor,
+        ref_last: Tensor,
+        hidden: Tensor,
     ) -> tuple[Tensor, ...]:
         """Spectra (1, bins, 2) and EdgeCrnn's state to the human's spectrum (1, bins, 2), the probability (1,) and the next state."""
         network = self.network
@@ -47,7 +57,9 @@ class OperatorLayer(nn.Module):
     def __init__(self, memory: nn.GRU, number: int) -> None:
         super().__init__()
         self.layer = nn.GRU(memory.hidden_size, memory.hidden_size)
-        self.layer.load_state_dict({name: getattr(memory, name.replace("_l0", f"_l{number}")) for name in self.layer.state_dict()})
+        self.layer.load_state_dict(
+            {name: getattr(memory, name.replace("_l0", f"_l{number}")) for name in self.layer.state_dict()}
+        )
 
     def forward(self, x: Tensor, state: Tensor) -> Tensor:
         return self.layer(x, state)[1]
@@ -65,7 +77,10 @@ class ProductLayer(nn.Module):
 
     def forward(self, x: Tensor, state: Tensor) -> Tensor:
         sizes = [2 * self.size, self.size]
-        (x_gates, x_new), (state_gates, state_new) = self.of_input(x).split(sizes, -1), self.of_state(state).split(sizes, -1)
+        (x_gates, x_new), (state_gates, state_new) = (
+            self.of_input(x).split(sizes, -1),
+            self.of_state(state).split(sizes, -1),
+        )
         reset, update = torch.sigmoid(x_gates + state_gates).split(self.size, -1)
         new = torch.tanh(x_new + reset * state_new)
         return new + update * (state - new)

@@ -30,7 +30,9 @@ def compressed(spectrum: Tensor, exponent: float) -> tuple[Tensor, Tensor]:
 
 
 def power_law_loss(mask: Tensor, mixture: Tensor, clean: Tensor, exponent: float = 0.3) -> Tensor:
-    """Mean squared difference of compressed magnitudes (..., bins), as Wang et al. (2019), "VoiceFilter-Lite" and its predecessor, use it.
+    """Mean squared difference of compressed magnitudes (..., bins), as Wang et al.
+
+    (2019), "VoiceFilter-Lite" and its predecessor, use it.
 
     The loss of the paper's CRNN: mask and mixture give the estimate's magnitude.
     """
@@ -40,8 +42,8 @@ def power_law_loss(mask: Tensor, mixture: Tensor, clean: Tensor, exponent: float
 def edge_loss(human: Tensor, logit: Tensor, clean: Tensor, active: Tensor, weights: LossWeights) -> dict[str, Tensor]:
     """Terms and their weighted "total".
 
-    human, clean: (batch, frames, bins, 2), scaled so that speech is near 1. logit, active: (batch, frames).
-    suppression counts once more where the estimate is below the human: words that are gone do not come back (Braun & Tashev 2020
+    human, clean: (batch, frames, bins, 2), scaled so that speech is near 1. logit, active: (batch, frames). suppression
+    counts once more where the estimate is below the human: words that are gone do not come back (Braun & Tashev 2020
     compress likewise; the asymmetry follows Wang et al. 2020, "VoiceFilter-Lite", eq. (2)).
     """
     magnitude, phased = compressed(human, weights.compression)
@@ -59,7 +61,10 @@ def edge_loss(human: Tensor, logit: Tensor, clean: Tensor, active: Tensor, weigh
 
 
 def si_sdr(human: Tensor, clean: Tensor) -> Tensor:
-    """Mean SI-SDR in dB over the items that hold a human; with a root-Hann window at half overlap spectra keep inner products."""
+    """Mean SI-SDR in dB over the items that hold a human.
+
+    With a root-Hann window at half overlap spectra keep inner products.
+    """
     inner = (human * clean).sum((1, 2, 3))
     energy = clean.square().sum((1, 2, 3))
     target = inner.square() / (energy + EPSILON)

@@ -1,7 +1,8 @@
 """The edge CRNN: a causal network that masks the linear stage's error, one frame at a time.
 
-Two encoders, one for what the microphone holds (error, microphone) and one for what the robot said (reference, echo estimate), meet
-in the middle, as the two branches of Li, Hindriks & Kunneman (2024), section 3.2, do; a GRU remembers, a decoder with skips gives a complex mask.
+Two encoders, one for what the microphone holds (error, microphone) and one for what the robot said (reference, echo
+estimate), meet in the middle, as the two branches of Li, Hindriks & Kunneman (2024), section 3.2, do; a GRU remembers,
+a decoder with skips gives a complex mask.
 """
 
 from __future__ import annotations
@@ -22,7 +23,9 @@ FLOOR = 1e-6
 
 @dataclass(frozen=True)
 class EdgeConfig:
-    """channels: of the four encoder stages, each halving the frequencies; the first two exist per branch. hidden, layers: of the GRU.
+    """channels: of the four encoder stages, each halving the frequencies; the first two exist per branch.
+
+    Hidden, layers: of the GRU.
 
     norm: "layer" over each frame, "batch", or "none".
     """
@@ -47,13 +50,22 @@ class EdgeConfig:
 
 
 class Stage(nn.Module):
-    """Convolution along frequency, normalisation over the frame, leaky ReLU; tensors are (frames, channels, 1, frequencies)."""
+    """Convolution along frequency, normalisation over the frame, leaky ReLU.
 
-    def __init__(self, inputs: int, outputs: int, frequencies: int, norm: str, stride: int = 1, kernel: int = 5) -> None:
+    Tensors are (frames, channels, 1, frequencies).
+    """
+
+    def __init__(
+        self, inputs: int, outputs: int, frequencies: int, norm: str, stride: int = 1, kernel: int = 5
+    ) -> None:
         super().__init__()
         self.convolution = nn.Conv2d(inputs, outputs, (1, kernel), (1, stride), (0, kernel // 2), bias=norm != "batch")
         shape = [outputs, 1, frequencies // stride]
-        self.norm = {"layer": lambda: nn.LayerNorm(shape), "batch": lambda: nn.BatchNorm2d(outputs), "none": nn.Identity}[norm]()
+        self.norm = {
+            "layer": lambda: nn.LayerNorm(shape),
+            "batch": lambda: nn.BatchNorm2d(outputs),
+            "none": nn.Identity,
+        }[norm]()
 
     def forward(self, x: Tensor) -> Tensor:
         return leaky_relu(self.norm(self.convolution(x)), 0.1)
@@ -69,7 +81,11 @@ class Upward(nn.Module):
     def forward(self, x: Tensor) -> Tensor:
         y = self.stage(x)
         n, channels, _, frequencies = y.shape
-        return y.reshape(n, 2, channels // 2, frequencies).permute(0, 2, 3, 1).reshape(n, channels // 2, 1, 2 * frequencies)
+        return (
+            y.reshape(n, 2, channels // 2, frequencies)
+            .permute(0, 2, 3, 1)
+            .reshape(n, channels // 2, 1, 2 * frequencies)
+        )
 
 
 class EdgeCrnn(nn.Module):
@@ -99,9 +115,15 @@ class EdgeCrnn(nn.Module):
     def initial_state(self, batch: int = 1) -> tuple[Tensor, Tensor, Tensor]:
         """All zeros: before the first frame there was silence."""
         zeros = self.inward.weight.new_zeros
-        return zeros(batch, 6, self.config.bands), zeros(batch, 6, self.config.bands), zeros(self.config.layers, batch, self.config.hidden)
+        return (
+            zeros(batch, 6, self.config.bands),
+            zeros(batch, 6, self.config.bands),
+            zeros(self.config.layers, batch, self.config.hidden),
+        )
 
-    def forward(self, error: Tensor, mic: Tensor, reference: Tensor, echo: Tensor, state: tuple[Tensor, ...]) -> tuple[Tensor, Tensor, tuple[Tensor, ...]]:
+    def forward(
+        self, error: Tensor, mic: Tensor, reference: Tensor, echo: Tensor, state: tuple[Tensor, ...]
+    ) -> tuple[Tensor, Tensor, tuple[Tensor, ...]]:
         """Spectra (batch, frames, bins, 2) to the human's (batch, frames, bins, 2), logits (batch, frames), and the next state."""
         batch, frames = error.shape[:2]
         mic_x, mic_last = self._with_previous(torch.cat((features(error), features(mic)), 2), state[0])
@@ -126,7 +148,9 @@ class EdgeCrnn(nn.Module):
         y = self.up_1(torch.cat((self.up_2(torch.cat((y, m2, r2), 1)), m1, r1), 1))
         return self.mask(y)
 
-    def step(self, error: Tensor, mic: Tensor, reference: Tensor, echo: Tensor, state: tuple[Tensor, ...]) -> tuple[Tensor, Tensor, tuple[Tensor, ...]]:
+    def step(
+        self, error: Tensor, mic: Tensor, reference: Tensor, echo: Tensor, state: tuple[Tensor, ...]
+    ) -> tuple[Tensor, Tensor, tuple[Tensor, ...]]:
         """One frame: spectra (1, bins, 2) to the human's (1, bins, 2), the probability (1,) that somebody speaks, and the next state."""
         frame = (spectrum.unsqueeze(1) for spectrum in (error, mic, reference, echo))
         human, logit, state = self(*frame, state)
@@ -140,7 +164,10 @@ class EdgeCrnn(nn.Module):
 
 
 def features(spectrum: Tensor) -> Tensor:
-    """(batch, frames, bins, 2) to real, imaginary part and magnitude, all compressed, (batch, frames, 3, bins - 1); 0 Hz is left out."""
+    """(batch, frames, bins, 2) to real, imaginary part and magnitude, all compressed, (batch, frames, 3, bins - 1).
+
+    0 Hz is left out.
+    """
     return compressed(spectrum[:, :, 1:].transpose(-1, -2))
 
 
@@ -154,7 +181,10 @@ def compressed(parts: Tensor) -> Tensor:
 
 
 def apply_mask(raw: Tensor, error: Tensor) -> Tensor:
-    """error (..., bins, 2) times a complex mask of magnitude tanh |raw|; raw is (..., 2, bins - 1), 0 Hz is silenced."""
+    """Error (..., bins, 2) times a complex mask of magnitude tanh |raw|.
+
+    Raw is (..., 2, bins - 1), 0 Hz is silenced.
+    """
     return nn.functional.pad(masked(raw, error[..., 1:, :].transpose(-1, -2)), (1, 0)).transpose(-1, -2).contiguous()
 
 

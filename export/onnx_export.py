@@ -2,10 +2,10 @@
 
 python -m export.onnx_export CHECKPOINT --output models/crnn.onnx [--int8] [--figures FIGURES.json]
 
-A checkpoint is what torch.save made of a dict: network (a state_dict), config (the fields of its configuration), figures (what it
-reached on validation data) and kind ("edge", also where it is missing, or "paper"); all else in it says how it was trained, and goes
-into the file's metadata like the figures.
-The file is written only once the ONNX checker, the parity test and the size limit have passed; otherwise ModelError says which failed.
+A checkpoint is what torch.save made of a dict: network (a state_dict), config (the fields of its configuration),
+figures (what it reached on validation data) and kind ("edge", also where it is missing, or "paper"); all else in it
+says how it was trained, and goes into the file's metadata like the figures. The file is written only once the ONNX
+checker, the parity test and the size limit have passed; otherwise ModelError says which failed.
 """
 
 from __future__ import annotations
@@ -53,20 +53,29 @@ def load(path: Path) -> Trained:
     """The network that a checkpoint holds; raises ModelError where it holds none."""
     try:
         found = torch.load(path, map_location="cpu", weights_only=True)
-        make = {"edge": lambda c: EdgeCrnn(EdgeConfig(**c)), "paper": lambda c: PaperCrnn(PaperConfig(**c))}[found.get("kind", "edge")]
+        make = {"edge": lambda c: EdgeCrnn(EdgeConfig(**c)), "paper": lambda c: PaperCrnn(PaperConfig(**c))}[
+            found.get("kind", "edge")
+        ]
         network = make(found["config"])
         network.load_state_dict(found["network"])
     except OSError as error:
         raise ModelError(f"{path}: {error.strerror}; give a checkpoint that training wrote") from None
     except Exception as error:
-        raise ModelError(f"{path} is no checkpoint of a network ({' '.join(str(error).split())[:120]}): give one that training wrote") from None
+        raise ModelError(
+            f"{path} is no checkpoint of a network ({' '.join(str(error).split())[:120]}): give one that training wrote"
+        ) from None
     training = {key: value for key, value in found.items() if key not in ("network", "config", "kind", "figures")}
     return Trained(network.eval(), training, found.get("figures", {}))
 
 
 def export(trained: Trained, path: Path, int8: bool = False) -> list[str]:
-    """Write the network to path, and with int8 a smaller and faster variant beside it; return what was done, a line a file."""
-    write, compare = (_write_paper, onnx_parity.paper) if isinstance(trained.network, PaperCrnn) else (_write_edge, onnx_parity.edge)
+    """Write the network to path, and with int8 a smaller and faster variant beside it.
+
+    Return what was done, a line a file.
+    """
+    write, compare = (
+        (_write_paper, onnx_parity.paper) if isinstance(trained.network, PaperCrnn) else (_write_edge, onnx_parity.edge)
+    )
     unproven = path.with_name(f".{path.name}.unproven")
     try:
         write(trained, unproven)
@@ -91,7 +100,13 @@ def _write_edge(trained: Trained, path: Path, products: bool = False) -> None:
     # one tensor object per input: the exporter would merge inputs that are the same object
     inputs = [torch.randn(1, stft.bins, 2) for _ in SPECTRA] + [torch.randn_like(tensor) for tensor in state]
     names = [f"state_{i}" for i in range(len(state))]
-    trace(EdgeGraph(network, products).eval(), inputs, path, [*SPECTRA, *names], ["spectrum", "speech_probability", *(f"next_{name}" for name in names)])
+    trace(
+        EdgeGraph(network, products).eval(),
+        inputs,
+        path,
+        [*SPECTRA, *names],
+        ["spectrum", "speech_probability", *(f"next_{name}" for name in names)],
+    )
     states = [[name, list(tensor.shape)] for name, tensor in zip(names, state)]
     describe(path, EDGE_TYPE, EDGE_VERSION, stft, trained, states=json.dumps(states))
 
@@ -99,19 +114,41 @@ def _write_edge(trained: Trained, path: Path, products: bool = False) -> None:
 def _write_paper(trained: Trained, path: Path) -> None:
     network = trained.network
     if network.config.bins != PAPER_STFT.bins:
-        raise ModelError(f"the paper's network has {network.config.bins} bins, its runtime {PAPER_STFT.bins}: train it on {PAPER_STFT.bins}")
+        raise ModelError(
+            f"the paper's network has {network.config.bins} bins, its runtime {PAPER_STFT.bins}: train it on"
+            f" {PAPER_STFT.bins}"
+        )
     inputs = [torch.rand(1, 50, network.config.bins) for _ in range(2)]
     names = ["mic_magnitude", "reference_magnitude"]
     trace(network, inputs, path, names, ["mask"], {name: {1: "frames"} for name in (*names, "mask")})
     describe(path, PAPER_TYPE, PAPER_VERSION, PAPER_STFT, trained)
 
 
-def trace(network: nn.Module, inputs: Sequence[Tensor], path: Path, names: list[str], outputs: list[str], dynamic: dict | None = None) -> None:
-    """Write the network's graph for these inputs by torch's tracing exporter; dynamic axes as torch.onnx.export wants them."""
+def trace(
+    network: nn.Module,
+    inputs: Sequence[Tensor],
+    path: Path,
+    names: list[str],
+    outputs: list[str],
+    dynamic: dict | None = None,
+) -> None:
+    """Write the network's graph for these inputs by torch's tracing exporter.
+
+    Dynamic axes as torch.onnx.export wants them.
+    """
     with warnings.catch_warnings(), torch.no_grad():
-        warnings.simplefilter("ignore")  # the exporter warns of its own age and of shapes, all of which are fixed or tested here
+        warnings.simplefilter(
+            "ignore"
+        )  # the exporter warns of its own age and of shapes, all of which are fixed or tested here
         torch.onnx.export(
-            network, tuple(inputs), str(path), input_names=names, output_names=outputs, dynamic_axes=dynamic, opset_version=OPSET, dynamo=False
+            network,
+            tuple(inputs),
+            str(path),
+            input_names=names,
+            output_names=outputs,
+            dynamic_axes=dynamic,
+            opset_version=OPSET,
+            dynamo=False,
         )
 
 
@@ -138,20 +175,26 @@ def describe(path: Path, kind: str, version: int, stft: StftConfig, trained: Tra
 def _check_size(network: nn.Module, path: Path) -> None:
     size = path.stat().st_size
     if not isinstance(network, PaperCrnn) and size > MAX_EDGE_BYTES:
-        raise ModelError(f"the network takes {size / 1e6:.1f} MB, expected at most {MAX_EDGE_BYTES / 1e6:.0f} MB: train a smaller one")
+        raise ModelError(
+            f"the network takes {size / 1e6:.1f} MB, expected at most {MAX_EDGE_BYTES / 1e6:.0f} MB: train a"
+            " smaller one"
+        )
 
 
 def _write_int8(trained: Trained, path: Path) -> str:
     """The variant with int8 weights of the recurrent layer, where most of a network's weights are.
 
-    onnxruntime has an int8 LSTM; an edge network's GRU is written as matrix products first, and its linear layers go with it. Those get
-    seven bits, an int8 product of eight overflows on processors without VNNI; convolutions stay fp32.
+    onnxruntime has an int8 LSTM; an edge network's GRU is written as matrix products first, and its linear layers go
+    with it. Those get seven bits, an int8 product of eight overflows on processors without VNNI; convolutions stay
+    fp32.
     """
     import logging
 
     from onnxruntime.quantization import QuantType, quantize_dynamic
 
-    logging.getLogger().setLevel(logging.ERROR)  # it recommends a pre-processing that changes nothing for a traced graph
+    logging.getLogger().setLevel(
+        logging.ERROR
+    )  # it recommends a pre-processing that changes nothing for a traced graph
     network, small = trained.network, path.with_name(f"{path.stem}_int8.onnx")
     with tempfile.TemporaryDirectory(dir=path.parent) as folder:
         source, unproven = path, Path(folder, small.name)
@@ -168,16 +211,25 @@ def _write_int8(trained: Trained, path: Path) -> str:
 
 
 def main(argv: list[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(prog="python -m export.onnx_export", description="Convert a trained network to the ONNX file that the runtime loads.")
+    parser = argparse.ArgumentParser(
+        prog="python -m export.onnx_export",
+        description="Convert a trained network to the ONNX file that the runtime loads.",
+    )
     parser.add_argument("checkpoint", type=Path, help="best.pt of export/train.py")
     parser.add_argument("--output", type=Path, required=True, metavar="FILE.onnx")
-    parser.add_argument("--int8", action="store_true", help="also write FILE_int8.onnx, with int8 weights of the recurrent layer")
-    parser.add_argument("--figures", type=Path, metavar="FILE.json", help="figures to write into the file, over those of the checkpoint")
+    parser.add_argument(
+        "--int8", action="store_true", help="also write FILE_int8.onnx, with int8 weights of the recurrent layer"
+    )
+    parser.add_argument(
+        "--figures", type=Path, metavar="FILE.json", help="figures to write into the file, over those of the checkpoint"
+    )
     options = parser.parse_args(argv)
     try:
         trained = load(options.checkpoint)
         if options.figures:
-            trained = Trained(trained.network, trained.training, {**trained.figures, **json.loads(options.figures.read_text())})
+            trained = Trained(
+                trained.network, trained.training, {**trained.figures, **json.loads(options.figures.read_text())}
+            )
         print("\n".join(export(trained, options.output, options.int8)))
     except (EdgefilterError, OSError, ValueError) as error:
         print(f"export: {error}", file=sys.stderr)

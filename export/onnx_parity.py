@@ -25,22 +25,34 @@ WARM_UP = 50
 
 
 def edge(network: nn.Module, path: Path, frames: int | None = None) -> float:
-    """Largest difference over chained frames (FRAMES unless told) and in the final state; raises ModelError where it exceeds TOLERANCE."""
+    """Largest difference over chained frames (FRAMES unless told) and in the final state.
+
+    Raises ModelError where it exceeds TOLERANCE.
+    """
     return _accept(_edge_difference(network, path, FRAMES if frames is None else frames), path)
 
 
 def paper(network: PaperCrnn, path: Path) -> float:
-    """Largest difference of the mask, over clips of another length than the traced one; raises ModelError above TOLERANCE."""
+    """Largest difference of the mask, over clips of another length than the traced one.
+
+    Raises ModelError above TOLERANCE.
+    """
     return _accept(_paper_difference(network, path), path)
 
 
 def int8(network: nn.Module, path: Path) -> str:
-    """How far int8 weights, which are meant to differ, bring a file from its network; raises ModelError for an edge network below LEAST_DB."""
+    """How far int8 weights, which are meant to differ, bring a file from its network.
+
+    Raises ModelError for an edge network below LEAST_DB.
+    """
     if isinstance(network, PaperCrnn):
         return f"{_paper_difference(network, path):.1e} from torch at most"
     ratio = _edge_ratio_db(network, path, FRAMES // 5)
     if not ratio >= LEAST_DB:
-        raise ModelError(f"the exported {path.name} is {ratio:.0f} dB above its error, expected at least {LEAST_DB:.0f} dB: not written")
+        raise ModelError(
+            f"the exported {path.name} is {ratio:.0f} dB above its error, expected at least {LEAST_DB:.0f} dB: not"
+            " written"
+        )
     return f"{ratio:.0f} dB above its error on noise"
 
 
@@ -62,12 +74,18 @@ def seconds(network: nn.Module, path: Path, repeats: int = 5) -> float:
 
 def _accept(apart: float, path: Path) -> float:
     if not apart <= TOLERANCE:
-        raise ModelError(f"the exported {path.name} is {apart:.1e} from the network, expected at most {TOLERANCE:.0e}: not written")
+        raise ModelError(
+            f"the exported {path.name} is {apart:.1e} from the network, expected at most {TOLERANCE:.0e}: not written"
+        )
     return apart
 
 
 def _edge_difference(network: nn.Module, path: Path, frames: int) -> float:
-    return max(float(np.max(np.abs(ours - found))) for wanted, answers in _chained(network, path, frames) for ours, found in zip(wanted, answers, strict=True))
+    return max(
+        float(np.max(np.abs(ours - found)))
+        for wanted, answers in _chained(network, path, frames)
+        for ours, found in zip(wanted, answers, strict=True)
+    )
 
 
 def _edge_ratio_db(network: nn.Module, path: Path, frames: int) -> float:
@@ -99,9 +117,14 @@ def _chained(network: nn.Module, path: Path, frames: int) -> Iterator[tuple[list
 
 
 def _frame(network: nn.Module, rng: np.random.Generator) -> list[Tensor]:
-    """Four spectra (1, bins, 2) whose levels go up and down over 60 dB, as speech does; error is the difference of mic and echo."""
+    """Four spectra (1, bins, 2) whose levels go up and down over 60 dB, as speech does.
+
+    Error is the difference of mic and echo.
+    """
     bins = network.config.n_fft // 2 + 1
-    mic, reference, echo = (10.0 ** rng.uniform(-3, 0, (3, 1, 1, 1)) * rng.standard_normal((3, 1, bins, 2))).astype(np.float32)
+    mic, reference, echo = (10.0 ** rng.uniform(-3, 0, (3, 1, 1, 1)) * rng.standard_normal((3, 1, bins, 2))).astype(
+        np.float32
+    )
     return [torch.from_numpy(x) for x in (mic - echo, mic, reference, echo)]
 
 
@@ -118,7 +141,9 @@ def _paper_difference(network: PaperCrnn, path: Path) -> float:
 
 def _clip(network: PaperCrnn, frames: int, seed: int) -> list[Tensor]:
     rng = np.random.default_rng(seed)
-    return [torch.from_numpy(x) for x in np.abs(rng.standard_normal((2, 1, frames, network.config.bins))).astype(np.float32)]
+    return [
+        torch.from_numpy(x) for x in np.abs(rng.standard_normal((2, 1, frames, network.config.bins))).astype(np.float32)
+    ]
 
 
 def _named(session: object, values: list) -> dict[str, np.ndarray]:

@@ -33,11 +33,11 @@ class PaperConfig:
 class PaperCrnn(nn.Module):
     """CRNN of Li, Hindriks & Kunneman 2024, section 3.3 and Table 1.
 
-    The paper has batch normalisation behind each convolution and then finds that it harms where the interferer is much louder;
-    so here it is an option and off. The paper leaves open, and this implementation takes: zero padding, so that each layer keeps
-    its size; 400 BLSTM units in each direction (VoiceFilter's reading of the same table); magnitudes as they are, not in decibels;
-    and He's initialisation of the convolutions (He et al. 2015, eq. 10), since without batch normalisation torch's default lets
-    the signal fade away over eight layers.
+    The paper has batch normalisation behind each convolution and then finds that it harms where the interferer is much
+    louder; so here it is an option and off. The paper leaves open, and this implementation takes: zero padding, so that
+    each layer keeps its size; 400 BLSTM units in each direction (VoiceFilter's reading of the same table); magnitudes
+    as they are, not in decibels; and He's initialisation of the convolutions (He et al. 2015, eq. 10), since without
+    batch normalisation torch's default lets the signal fade away over eight layers.
     """
 
     def __init__(self, config: PaperConfig = PaperConfig()) -> None:
@@ -46,7 +46,9 @@ class PaperCrnn(nn.Module):
         self.mixture = _branch(config)
         self.reference = _branch(config)
         self.blstm = nn.LSTM(2 * config.filters[-1] * config.bins, config.lstm, batch_first=True, bidirectional=True)
-        self.dense = nn.Sequential(nn.Linear(2 * config.lstm, config.hidden), nn.ReLU(), nn.Linear(config.hidden, config.bins), nn.Sigmoid())
+        self.dense = nn.Sequential(
+            nn.Linear(2 * config.lstm, config.hidden), nn.ReLU(), nn.Linear(config.hidden, config.bins), nn.Sigmoid()
+        )
 
     def forward(self, mic_magnitude: Tensor, reference_magnitude: Tensor) -> Tensor:
         """Mask (batch, frames, bins) in 0-1 for the mixture's magnitude, from both magnitudes (batch, frames, bins)."""
@@ -96,7 +98,10 @@ def macs_per_second(network: PaperCrnn) -> float:
 
 def main() -> None:
     network = PaperCrnn()
-    print(f"{parameter_count(network) / 1e6:.2f} M parameters, {macs_per_second(network) / 1e9:.1f} GMAC per second of audio")
+    print(
+        f"{parameter_count(network) / 1e6:.2f} M parameters, {macs_per_second(network) / 1e9:.1f} GMAC per second of"
+        " audio"
+    )
 
 
 if __name__ == "__main__":

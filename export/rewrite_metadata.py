@@ -3,8 +3,8 @@ r"""Correct what an ONNX file says of its training; its graph, weights and opera
     python -m export.rewrite_metadata models/crnn.onnx models/crnn_int8.onnx \
         --training '{"step": 16400, "seed": [1, 7], "items": 7129}'
 
-For a file whose checkpoint is gone, or whose export would not give the same bytes again. Everything else in the metadata stays.
-Say the same in models/MODELS.md; a test compares the two.
+For a file whose checkpoint is gone, or whose export would not give the same bytes again. Everything else in the
+metadata stays. Say the same in models/MODELS.md; a test compares the two.
 """
 
 from __future__ import annotations

@@ -19,7 +19,10 @@ RANGES = {"lab": ((5.0, 8.0), (4.0, 6.0), (0.15, 0.35)), "office": ((3.0, 5.5), 
 
 @dataclass(frozen=True, eq=False)
 class Room:
-    """robot: (n,) from the loudspeaker to the microphone; humans: HUMANS responses (n,) from 0.7 to 2 m. float32, 16 kHz."""
+    """robot: (n,) from the loudspeaker to the microphone; humans: HUMANS responses (n,) from 0.7 to 2 m.
+
+    Float32, 16 kHz.
+    """
 
     kind: str
     rt60_s: float
@@ -35,7 +38,9 @@ def draw_room(rng: np.random.Generator, kind: str) -> Room:
     absorption, order = pra.inverse_sabine(rt60_s, size)
     room = pra.ShoeBox(size, fs=SAMPLE_RATE, materials=pra.Material(absorption), max_order=min(order, MAX_ORDER))
     margin = 0.5
-    microphone = np.array([rng.uniform(margin, size[0] - margin), rng.uniform(margin, size[1] - margin), rng.uniform(0.6, 1.4)])
+    microphone = np.array(
+        [rng.uniform(margin, size[0] - margin), rng.uniform(margin, size[1] - margin), rng.uniform(0.6, 1.4)]
+    )
     room.add_microphone(microphone)
     loudspeaker = rng.standard_normal(3)
     room.add_source(microphone + rng.uniform(0.06, 0.3) * loudspeaker / np.linalg.norm(loudspeaker))

@@ -1,7 +1,8 @@
 """A conversation with a robot, simulated from speech, rooms and the physical effects: what the network trains on.
 
-Each item is a pure function of (recipe, seed, index). The robot's voice is an EchoModel: a loudspeaker and room response with effects of
-edgefilter.echo around it, drawn at random or taken from a profile that somebody diagnosed in the field.
+Each item is a pure function of (recipe, seed, index). The robot's voice is an EchoModel: a loudspeaker and room
+response with effects of edgefilter.echo around it, drawn at random or taken from a profile that somebody diagnosed in
+the field.
 """
 
 from __future__ import annotations
@@ -25,10 +26,11 @@ from export.rooms import Room
 class Recipe:
     """What conversations are like. Ranges are (low, high), drawn uniformly.
 
-    seconds: of one item. human_gain_db: the human's power over the robot's at the microphone. fan_db: the human over the fan.
-    office: share of small, reverberant rooms. warm: share that starts from a calibrated profile. human: share in which one speaks.
-    distortion_db: the loudspeaker's distortion over its linear sound. lag_s, ppm, volume_db: of `moving` items, a share of all.
-    silence_s: before the human speaks. effects: (name, values) of further effects; effects_share: how many items have them.
+    seconds: of one item. human_gain_db: the human's power over the robot's at the microphone. fan_db: the human over
+    the fan. office: share of small, reverberant rooms. warm: share that starts from a calibrated profile. human: share
+    in which one speaks. distortion_db: the loudspeaker's distortion over its linear sound. lag_s, ppm, volume_db: of
+    `moving` items, a share of all. silence_s: before the human speaks. effects: (name, values) of further effects;
+    effects_share: how many items have them.
     """
 
     seconds: float = 12.0
@@ -58,13 +60,17 @@ PAPER = Recipe(
     moving=0.0,
     silence_s=(0.5, 1.5),
 )
-"""Li, Hindriks & Kunneman (2024), section 4: 5 s, 1800 items in a laboratory and 6200 in an office, human at -25 dB after 0.5-1.5 s."""
+"""Li, Hindriks & Kunneman (2024), section 4: 5 s, 1800 items in a laboratory and 6200 in an office, human at -25 dB
+after 0.5-1.5 s."""
 RECIPES = {"edge": Recipe(), "paper": PAPER}
 
 
 @dataclass(frozen=True, eq=False)
 class Conversation:
-    """mic, clean, reference: (n,) float32; clean is the human at the microphone. profile: of a calibration elsewhere, or None."""
+    """mic, clean, reference: (n,) float32; clean is the human at the microphone.
+
+    Profile: of a calibration elsewhere, or None.
+    """
 
     mic: Samples
     clean: Samples
@@ -99,22 +105,34 @@ def simulate(recipe: Recipe, seed: int, index: int, humans: Corpus, robots: Corp
     human_rms = level * 10 ** (rng.uniform(*recipe.human_gain_db) / 20)
     clean *= human_rms / max(_active_rms(clean), 1e-9)
     quiet = rng.random() < recipe.quiet_fan
-    fan, psd = _fan(rng, samples, human_rms * 10 ** (-(rng.uniform(20, 45) if quiet else rng.uniform(*recipe.fan_db)) / 20))
+    fan, psd = _fan(
+        rng, samples, human_rms * 10 ** (-(rng.uniform(20, 45) if quiet else rng.uniform(*recipe.fan_db)) / 20)
+    )
     profile = None
     if rng.random() < recipe.warm:
-        path = gain * _path(calibration_room.robot / np.abs(calibration_room.robot).max() * np.abs(room.robot).max(), colour)
+        path = gain * _path(
+            calibration_room.robot / np.abs(calibration_room.robot).max() * np.abs(room.robot).max(), colour
+        )
         profile = _profile(path * 10 ** (rng.uniform(-1, 1) / 20), psd * 10 ** (rng.uniform(-0.6, 0.6) / 10))
     mic = np.clip(echo + clean + fan, -1.0, 1.0).astype(np.float32)
-    about = {"room": room.kind, "rt60_s": round(room.rt60_s, 3), "warm": profile is not None, "moving": bool(moving), "quiet_fan": bool(quiet)}
-    return Conversation(mic, clean, reference, profile, about | {"utterances": splits, "effects": [name for name, _ in effects]})
+    about = {
+        "room": room.kind,
+        "rt60_s": round(room.rt60_s, 3),
+        "warm": profile is not None,
+        "moving": bool(moving),
+        "quiet_fan": bool(quiet),
+    }
+    return Conversation(
+        mic, clean, reference, profile, about | {"utterances": splits, "effects": [name for name, _ in effects]}
+    )
 
 
 @dataclass(frozen=True)
 class _Driver:
     """A moving-coil loudspeaker's distortion: products of the signal with bounded functions of the membrane's displacement.
 
-    Klippel (2006), "Loudspeaker nonlinearities": force factor and stiffness depend on the displacement, so the sound holds
-    x f(d) with f a bounded function of displacement d, and a small memoryless part from the amplifier.
+    Klippel (2006), "Loudspeaker nonlinearities": force factor and stiffness depend on the displacement, so the sound
+    holds x f(d) with f a bounded function of displacement d, and a small memoryless part from the amplifier.
     """
 
     resonance_hz: float
@@ -126,10 +144,17 @@ class _Driver:
 
     @classmethod
     def draw(cls, rng: np.random.Generator, recipe: Recipe) -> _Driver:
-        return cls(rng.uniform(120, 420), 10 ** rng.uniform(-0.3, 0.7), rng.uniform(-1, 1), rng.uniform(0, 1), rng.uniform(0, 0.3), rng.uniform(*recipe.distortion_db))
+        return cls(
+            rng.uniform(120, 420),
+            10 ** rng.uniform(-0.3, 0.7),
+            rng.uniform(-1, 1),
+            rng.uniform(0, 1),
+            rng.uniform(0, 0.3),
+            rng.uniform(*recipe.distortion_db),
+        )
 
     def play(self, x: Samples) -> Samples:
-        """x (n,) with the distortion added at level_db over x."""
+        """X (n,) with the distortion added at level_db over x."""
         displacement = signal.sosfilt(signal.butter(2, self.resonance_hz, fs=SAMPLE_RATE, output="sos"), x)
         d = self.drive * displacement / max(_active_rms(displacement), 1e-9)
         bound = 1.0 / (1.0 + d * d)
@@ -140,7 +165,9 @@ class _Driver:
         return (x + added).astype(np.float32)
 
 
-def _robot_script(rng: np.random.Generator, recipe: Recipe, robots: Corpus, samples: int, moving: bool) -> tuple[Samples, Samples, list[list[int]]]:
+def _robot_script(
+    rng: np.random.Generator, recipe: Recipe, robots: Corpus, samples: int, moving: bool
+) -> tuple[Samples, Samples, list[list[int]]]:
     """What the player is told (n,), what comes out of it (n,) with lag and volume, and the utterances' [start, end] in the former."""
     voice = robots.draw_speaker(rng)
     told, played = np.zeros((2, samples), np.float32)
@@ -224,7 +251,16 @@ def _profile(path: Samples, noise_psd: Samples) -> Profile:
     """What a calibration would have written; the fields that only people read are flat."""
     response = np.abs(np.fft.rfft(path, 2 * (GRID_BINS - 1)))[:GRID_BINS].astype(np.float32)
     bands = np.array([[100.0, 8000.0]])
-    return Profile(EchoModel(path), 300.0, response, noise_psd.astype(np.float32), bands, np.array([40.0]), np.full(4, -40.0), source="simulated")
+    return Profile(
+        EchoModel(path),
+        300.0,
+        response,
+        noise_psd.astype(np.float32),
+        bands,
+        np.array([40.0]),
+        np.full(4, -40.0),
+        source="simulated",
+    )
 
 
 def _active_rms(x: Samples) -> float:

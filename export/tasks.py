@@ -43,7 +43,9 @@ class EdgeTask:
     kind: ClassVar[str] = "edge"
 
     def __init__(self, options: argparse.Namespace) -> None:
-        self._config = EdgeConfig(2 * options.hop, options.hop, channels=tuple(options.channels), hidden=options.hidden, norm=options.norm)
+        self._config = EdgeConfig(
+            2 * options.hop, options.hop, channels=tuple(options.channels), hidden=options.hidden, norm=options.norm
+        )
         self.weights = LossWeights(suppression=options.suppression, si_sdr=options.si_sdr)
         self.stft, self.half = self._config.stft, not options.full_precision
 
@@ -55,7 +57,10 @@ class EdgeTask:
 
     def describe(self, network: nn.Module) -> str:
         figures = count(network)
-        return f"edge network, {figures['parameters']} parameters, {figures['macs_per_frame'] * 16000 / self.stft.hop / 1e6:.0f} MMAC/s"
+        return (
+            f"edge network, {figures['parameters']} parameters,"
+            f" {figures['macs_per_frame'] * 16000 / self.stft.hop / 1e6:.0f} MMAC/s"
+        )
 
     def loss(self, network: nn.Module, batch: dict[str, Tensor]) -> tuple[dict[str, Tensor], Tensor]:
         inputs = [batch[name] for name in INPUTS]
@@ -67,7 +72,10 @@ class EdgeTask:
 
 
 class PaperTask:
-    """Li, Hindriks & Kunneman (2024), section 3.2: a magnitude mask on the microphone, which keeps its phase; the linear stage is not used."""
+    """Li, Hindriks & Kunneman (2024), section 3.2: a magnitude mask on the microphone, which keeps its phase.
+
+    The linear stage is not used.
+    """
 
     kind: ClassVar[str] = "paper"
 

@@ -2,9 +2,10 @@
 
     python -m export.train --data DIR --validation DIR --output RUN [--network edge|paper] [--steps 6000] [--seed 1] [--start RUN/best.pt] [--smoke]
 
---start takes the weights of a trained network of the same shape, to go on with other data: with --data made by export/dataset.py --profile,
-an effect that was found in the field is learned. RUN/last.pt is written every --every steps (a second call goes on from there), RUN/best.pt holds the averaged weights with the best
-validation loss; TensorBoard reads RUN, and RUN/log.jsonl has the same figures.
+--start takes the weights of a trained network of the same shape, to go on with other data: with --data made by
+export/dataset.py --profile, an effect that was found in the field is learned. RUN/last.pt is written every --every
+steps (a second call goes on from there), RUN/best.pt holds the averaged weights with the best validation loss;
+TensorBoard reads RUN, and RUN/log.jsonl has the same figures.
 """
 
 from __future__ import annotations
@@ -48,7 +49,9 @@ def validate(task: Task, network: nn.Module, items: Items, seconds: float) -> di
     sums: dict[str, float] = {}
     for at in range(0, len(items.names), 8):
         names = items.names[at : at + 8]
-        batch = batches.spectra([items.crop(name, items.length(name) - batches.samples, batches.samples) for name in names])
+        batch = batches.spectra(
+            [items.crop(name, items.length(name) - batches.samples, batches.samples) for name in names]
+        )
         batch = on(device, batch)
         terms, human = task.loss(network, batch)
         scale = batch["scale"][:, None, None, None]
@@ -68,7 +71,10 @@ def on(device: torch.device, batch: dict[str, Tensor]) -> dict[str, Tensor]:
 
 
 def train(options: argparse.Namespace) -> Path:
-    """Run until --steps or until validation stops getting better, on a GPU where there is one; returns the best checkpoint."""
+    """Run until --steps or until validation stops getting better, on a GPU where there is one.
+
+    Returns the best checkpoint.
+    """
     torch.manual_seed(options.seed)
     torch.set_num_threads(options.threads)
     options.output.mkdir(parents=True, exist_ok=True)
@@ -86,20 +92,25 @@ def train(options: argparse.Namespace) -> Path:
     average = {name: value.clone() for name, value in network.state_dict().items()}
     optimiser = torch.optim.AdamW(network.parameters(), lr=options.rate, weight_decay=1e-2, betas=(0.9, 0.98))
     items, held_out = Items(options.data), Items(options.validation)
-    step, best, since = 0, -math.inf, 0
+    first, best, since = 0, -math.inf, 0
     last = options.output / "last.pt"
     if last.exists():
         saved = torch.load(last, map_location=device, weights_only=True)
         network.load_state_dict(saved["network"])
         optimiser.load_state_dict(saved["optimiser"])
-        average, step, best, since = saved["average"], saved["step"], saved["best"], saved["since"]
-    batches = Batches(items, task.stft, options.batch, options.seconds, options.seed + step)
-    print(f"{task.describe(network)}; {len(items.names)} items, from step {step}")
+        average, first, best, since = saved["average"], saved["step"], saved["best"], saved["since"]
+    batches = Batches(items, task.stft, options.batch, options.seconds, options.seed + first)
+    print(f"{task.describe(network)}; {len(items.names)} items, from step {first}")
     began = time.time()
     with SummaryWriter(options.output) as board, (options.output / "log.jsonl").open("a", encoding="utf-8") as log:
-        for step in (progress := tqdm(range(step, options.steps), initial=step, total=options.steps, unit="step")):
+        for step in (progress := tqdm(range(first, options.steps), initial=first, total=options.steps, unit="step")):
             for group in optimiser.param_groups:
-                group["lr"] = options.rate * min(1.0, (step + 1) / min(WARM_UP, options.steps / 10)) * (0.5 + 0.5 * math.cos(math.pi * step / options.steps)) + 1e-6
+                group["lr"] = (
+                    options.rate
+                    * min(1.0, (step + 1) / min(WARM_UP, options.steps / 10))
+                    * (0.5 + 0.5 * math.cos(math.pi * step / options.steps))
+                    + 1e-6
+                )
             terms, _ = task.loss(network, on(device, batches.draw()))
             optimiser.zero_grad(set_to_none=True)
             terms["total"].backward()
@@ -127,10 +138,30 @@ def train(options: argparse.Namespace) -> Path:
             if score > best:
                 best = score
                 torch.save(state, options.output / "best.pt")
-            torch.save({"network": network.state_dict(), "optimiser": optimiser.state_dict(), "average": average, "step": step + 1, "best": best, "since": since}, last)
+            torch.save(
+                {
+                    "network": network.state_dict(),
+                    "optimiser": optimiser.state_dict(),
+                    "average": average,
+                    "step": step + 1,
+                    "best": best,
+                    "since": since,
+                },
+                last,
+            )
             for name, value in figures.items():
                 board.add_scalar(f"validation/{name}", value, step + 1)
-            log.write(json.dumps({"step": step + 1, "seconds": round(time.time() - began), "items": len(items.names), **{k: round(v, 5) for k, v in figures.items()}}) + "\n")
+            log.write(
+                json.dumps(
+                    {
+                        "step": step + 1,
+                        "seconds": round(time.time() - began),
+                        "items": len(items.names),
+                        **{k: round(v, 5) for k, v in figures.items()},
+                    }
+                )
+                + "\n"
+            )
             log.flush()
             tqdm.write(f"step {step + 1}: " + ", ".join(f"{name} {value:.4g}" for name, value in figures.items()))
             items.refresh()
@@ -141,7 +172,9 @@ def train(options: argparse.Namespace) -> Path:
 
 
 def in_stages(before: Mapping[str, object], steps: int, seed: int, items: int) -> dict[str, object]:
-    """What a checkpoint says of its training: step of all stages together, seed, items; with --start also each stage's own.
+    """What a checkpoint says of its training: step of all stages together, seed, items.
+
+    With --start also each stage's own.
 
     before: what the network that training started from says of its own, empty where it started from nothing.
     """
@@ -150,7 +183,12 @@ def in_stages(before: Mapping[str, object], steps: int, seed: int, items: int) -
         return {"step": steps, "seed": seed, "items": items}
     first = {"steps": before.get("step"), "seed": before.get("seed"), "items": before.get("items")}
     stages = [*before.get("stages", [first]), stage]
-    return {"step": sum(s["steps"] or 0 for s in stages), "seed": [s["seed"] for s in stages], "items": items, "stages": stages}
+    return {
+        "step": sum(s["steps"] or 0 for s in stages),
+        "seed": [s["seed"] for s in stages],
+        "items": items,
+        "stages": stages,
+    }
 
 
 def smoke(options: argparse.Namespace) -> None:
@@ -187,7 +225,9 @@ def main() -> int:
     parser.add_argument("--start", type=Path, metavar="CHECKPOINT", help="weights to begin with")
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--full-precision", action="store_true", help="float32 instead of bfloat16 in the forward pass")
-    parser.add_argument("--smoke", action="store_true", help="make a few seconds of data in --data and --validation and take four steps")
+    parser.add_argument(
+        "--smoke", action="store_true", help="make a few seconds of data in --data and --validation and take four steps"
+    )
     options = parser.parse_args()
     try:
         if options.smoke:

@@ -22,7 +22,10 @@ MakeStream = Callable[[], Stream]
 
 
 def conversation(n: int = 24_000, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
-    """A robot-like reference in bursts, its echo 900 samples later with a decaying tail, a weak human and a fan. Read-only."""
+    """A robot-like reference in bursts, its echo 900 samples later with a decaying tail, a weak human and a fan.
+
+    Read-only.
+    """
     rng = np.random.default_rng(seed)
     bursts = np.repeat(rng.uniform(0, 1, n // 800 + 1) > 0.3, 800)[:n]
     ref = (0.2 * rng.standard_normal(n) * bursts).astype(np.float32)
@@ -163,7 +166,11 @@ def check_the_beginning_depends_on_the_end(make: MakeStream) -> None:
 
 OF_CLIPS = (check_says_nothing_before_the_end, check_the_beginning_depends_on_the_end)
 """What an engine must do that needs the whole recording."""
-OF_STREAMS = (check_declared_latency_is_the_true_one, check_is_causal_beyond_its_latency, check_step_writes_neither_frame_nor_state)
+OF_STREAMS = (
+    check_declared_latency_is_the_true_one,
+    check_is_causal_beyond_its_latency,
+    check_step_writes_neither_frame_nor_state,
+)
 """What only an engine can do that answers frame by frame."""
 _ALL = [check for name, check in sorted(globals().items()) if name.startswith("check_")]
 CHECKS = [check for check in _ALL if check not in OF_CLIPS]
@@ -208,8 +215,13 @@ def fan(n: int, seed: int = 2) -> np.ndarray:
     return (FAN * (signal.lfilter(*signal.butter(1, 1000, fs=SAMPLE_RATE), white) * 2 + 0.2 * white)).astype(np.float32)
 
 
-def robot_alone(name: str | None = None, values: Mapping[str, object] | None = None, gain_db: float = 0.05) -> tuple[Measurement, EchoModel]:
-    """A recording with that effect, the fan, a gain that is a little off and a faint cubic distortion; and the model without the effect."""
+def robot_alone(
+    name: str | None = None, values: Mapping[str, object] | None = None, gain_db: float = 0.05
+) -> tuple[Measurement, EchoModel]:
+    """A recording with that effect, the fan, a gain that is a little off and a faint cubic distortion.
+
+    And the model without the effect.
+    """
     x, model = robot_speech(), robot_model()
     truth = model.with_effect(name, values) if name else model
     drive = x - np.float32(0.005) * x**3
@@ -256,7 +268,12 @@ def effect_check_fit_stays_within_the_bounds_on_hard_input(name: str) -> None:
     measurement, model = robot_alone()
     n = measurement.recording.size
     silence = np.zeros(n, np.float32)
-    for reference, recording in ((silence, silence), (silence, fan(n)), (robot_speech(), silence), (robot_speech(), np.roll(robot_speech(), 50_000))):
+    for reference, recording in (
+        (silence, silence),
+        (silence, fan(n)),
+        (robot_speech(), silence),
+        (robot_speech(), np.roll(robot_speech(), 50_000)),
+    ):
         hard = Measurement(reference, recording, measurement.noise_psd, measurement.fit)
         complete(catalogue.find(name), catalogue.find(name).fit(hard, model))
 
@@ -268,7 +285,9 @@ def effect_check_fit_on_a_neutral_recording_stays_neutral(name: str) -> None:
     if catalogue.find(name).stage == "noise":
         expected = catalogue.find(name).noise_psd(dict(fitted.effects)[name], measurement.noise_psd)
         assert abs(float(np.sum(expected) / np.sum(measurement.noise_psd)) - 1.0) < 0.1, dict(fitted.effects)[name]
-    change = measurement.whiten(fitted.predict(measurement.reference) - model.predict(measurement.reference) * np.float32(10 ** (0.05 / 20)))
+    change = measurement.whiten(
+        fitted.predict(measurement.reference) - model.predict(measurement.reference) * np.float32(10 ** (0.05 / 20))
+    )
     assert np.mean(change.astype(np.float64) ** 2) < 0.1, dict(fitted.effects)[name]
 
 
@@ -282,7 +301,9 @@ def effect_check_fit_explains_what_its_own_apply_made(name: str) -> None:
         measurement = Measurement(measurement.reference, measurement.recording, expected, measurement.fit)
     after = held_out_power(measurement, fitted.predict(measurement.reference))
     assert before > 2.0, f"the case is too weak to show anything: {before:.2f} times the fan"
-    assert abs(after - 1.0) < LEFT_OVER.get(name, 0.1) * (before - 1.0), f"residual power {before:.2f} -> {after:.2f} times the fan"
+    assert abs(after - 1.0) < LEFT_OVER.get(name, 0.1) * (before - 1.0), (
+        f"residual power {before:.2f} -> {after:.2f} times the fan"
+    )
 
 
 def _decaying(taps: int, per: float, seed: int) -> np.ndarray:
@@ -312,6 +333,7 @@ EFFECT_CASES: dict[str, dict[str, object]] = {
 """A strength of each effect that its own fit has to find again."""
 
 LEFT_OVER = {"mic_agc": 0.25, "rattle": 0.4}
-"""The gain within held-out blocks is interpolated; knocks of a regular voice hardly tell resonance and threshold apart."""
+"""The gain within held-out blocks is interpolated; knocks of a regular voice hardly tell resonance and threshold
+apart."""
 
 EFFECT_CHECKS = [check for name, check in sorted(globals().items()) if name.startswith("effect_check_")]

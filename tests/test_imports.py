@@ -44,8 +44,9 @@ LAYERS = (
     {"commands"},
     {"cli"},
 )
-"""Folders and files of the package from the ground up (docs/architecture.md). A subject may import its own and what stands lower, never a
-neighbour on its own floor. edgefilter/__init__.py is the door: it leads to all of them, and nothing in the house goes out to come in."""
+"""Folders and files of the package from the ground up (docs/architecture.md). A subject may import its own and what
+stands lower, never a neighbour on its own floor. edgefilter/__init__.py is the door: it leads to all of them, and
+nothing in the house goes out to come in."""
 STATED = {("types", "errors")}
 """The one arrow between neighbours: as_samples() raises SignalError."""
 
@@ -153,7 +154,10 @@ def fresh(code: str) -> str:
 
 def loaded_by(name: str) -> set[str]:
     """Top-level packages outside the standard library that importing a module brings into a new interpreter."""
-    code = f"import sys, json; before = set(sys.modules); import {name}; print(json.dumps(sorted(set(sys.modules) - before)))"
+    code = (
+        f"import sys, json; before = set(sys.modules); import {name}; print(json.dumps(sorted(set(sys.modules) -"
+        " before)))"
+    )
     return {found.split(".")[0] for found in json.loads(fresh(code))} - set(sys.stdlib_module_names)
 
 

@@ -17,11 +17,9 @@ def test_every_command_starts_where_there_is_no_resource_module(tmp_path):
     soundfile.write(tmp_path / "mic.wav", np.full(4000, 0.1), 16000)
     words = ["run", "--input", "mic.wav", "--engine", "bypass", "--output", "out.wav", "--json", "-", "--quiet"]
     code = (
-        "import sys; sys.modules['resource'] = None\n"
-        "from importlib import import_module\n"
-        "from edgefilter.cli import main\n"
-        "[import_module(f'edgefilter.commands.{name}') for name in 'add calibrate compare demo devices diagnose profile remove'.split()]\n"
-        f"sys.exit(main({words!r}))"
+        "import sys; sys.modules['resource'] = None\nfrom importlib import import_module\nfrom edgefilter.cli import"
+        " main\n[import_module(f'edgefilter.commands.{name}') for name in 'add calibrate compare demo devices"
+        f" diagnose profile remove'.split()]\nsys.exit(main({words!r}))"
     )
     done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr

@@ -1,4 +1,7 @@
-"""What people install: the wheel, in an environment that has nothing but what the wheel asks for. Needs a package index."""
+"""What people install: the wheel, in an environment that has nothing but what the wheel asks for.
+
+Needs a package index.
+"""
 
 import json
 import os
@@ -87,7 +90,10 @@ def test_the_demo_runs_from_it(installed, tmp_path):
 
 
 def test_every_public_name_can_be_had_from_it(installed, tmp_path):
-    code = "from edgefilter import *; import edgefilter; print(sum(name in globals() for name in edgefilter.__all__) - len(edgefilter.__all__))"
+    code = (
+        "from edgefilter import *; import edgefilter; print(sum(name in globals() for name in edgefilter.__all__) -"
+        " len(edgefilter.__all__))"
+    )
     assert run(installed / "python", "-c", code, cwd=tmp_path).strip() == "0"
 
 

@@ -118,8 +118,10 @@ def markdown(rows: list[dict[str, object]], name: str) -> str:
     lines += results_writer.table(["room", "start", *(f"{s:.1f} s" for s in SHOWN_S)], cells)
     lines += [
         "",
-        "Double talk, dB, median (least). The first two rows are differences of two runs that adapt differently, so "
-        "lower",
+        (
+            "Double talk, dB, median (least). The first two rows are differences of two runs that adapt differently, so"
+            " lower"
+        ),
         "bounds:",
         "",
     ]

@@ -1,10 +1,13 @@
-"""Alignment while a human talks from the first second: utterances found, jumps that are none, delay errors; simulated and real.
+"""Alignment while a human talks from the first second: utterances found, jumps that are none, delay errors.
+
+Simulated and real.
 
     python -m bench.measure.double_talk --voices robot/val --speech human/val --real real --output bench/results/double_talk
 
-Simulated: two utterances of 6 s, each with its own lag and no jump within, at every level of the echo over the human (LEVELS) and
-every drift (DRIFTS), with a profile and without; rooms and fan as in bench/measure/alignment.py. Real: recordings of one device whose
-lag is constant, of which nothing is known before, so that whatever moves the delay there is an error. About 3 minutes on one core.
+Simulated: two utterances of 6 s, each with its own lag and no jump within, at every level of the echo over the human
+(LEVELS) and every drift (DRIFTS), with a profile and without; rooms and fan as in bench/measure/alignment.py. Real:
+recordings of one device whose lag is constant, of which nothing is known before, so that whatever moves the delay there
+is an error. About 3 minutes on one core.
 """
 
 from __future__ import annotations
@@ -37,8 +40,9 @@ AFTER = (0.5, 1, 2, 4)
 class Found:
     """What became of one utterance.
 
-    soon: within 1 ms after SOON; stays: and from there to its end. jumps: switches of the delay by the tracker, of which all are
-    false. lost: switches to a place more than 1 ms from the truth. errors: samples, AFTER so many seconds, nan while unknown.
+    soon: within 1 ms after SOON; stays: and from there to its end. jumps: switches of the delay by the tracker, of
+    which all are false. lost: switches to a place more than 1 ms from the truth. errors: samples, AFTER so many
+    seconds, nan while unknown.
     """
 
     level_db: float
@@ -68,7 +72,17 @@ def judge(scene: DoubleTalk, tracker: Aligner, level_db: float, profile: bool) -
         late = error[first + SOON // HOP : stop]
         errors = [float(error[first + int(s * RATE) // HOP]) for s in AFTER]
         lost = int(np.sum(moved[first:stop] & ~(error[first:stop] < CLOSE)))
-        yield Found(level_db, scene.ppm, profile, number, bool(late[0] < CLOSE), bool(np.all(late < CLOSE)), jumps[stop] - jumps[first], lost, errors)
+        yield Found(
+            level_db,
+            scene.ppm,
+            profile,
+            number,
+            bool(late[0] < CLOSE),
+            bool(np.all(late < CLOSE)),
+            jumps[stop] - jumps[first],
+            lost,
+            errors,
+        )
 
 
 def simulated(seed: int, repeats: int, voices: Corpus, speech: Corpus) -> list[Found]:
@@ -105,8 +119,10 @@ def real(folder: Path, patterns: list[str]) -> dict[str, dict]:
 
 def summarise(rows: list[Found], recordings: dict[str, dict]) -> str:
     """Markdown tables."""
-    lines = [] if not rows else ["| | echo over human, dB | within 1 ms after 2 s | and stays | jumps | switches to a wrong place | delay error p95 after "
-             + ", ".join(f"{s:g}" for s in AFTER) + " s, samples |", "| --- | --- | --- | --- | --- | --- | --- |"]  # fmt: skip
+    seconds = ", ".join(f"{s:g}" for s in AFTER)
+    head = ["", "echo over human, dB", "within 1 ms after 2 s", "and stays", "jumps", "switches to a wrong place"]
+    head += [f"delay error p95 after {seconds} s, samples"]
+    lines = ["| " + " | ".join(head) + " |", "| --- " * len(head) + "|"] if rows else []
     for profile in sorted({r.profile for r in rows}, reverse=True):
         for level in (*LEVELS, None):
             some = [r for r in rows if r.profile == profile and level in (r.level_db, None)]
@@ -117,13 +133,19 @@ def summarise(rows: list[Found], recordings: dict[str, dict]) -> str:
                          f"{sum(r.stays for r in some)} | {sum(r.jumps for r in some)} | {sum(r.lost for r in some)} | {p95} |")  # fmt: skip
     for ppm in sorted({abs(r.ppm) for r in rows}):
         some = [r for r in rows if abs(r.ppm) == ppm]
-        lines.append(f"\n{ppm} ppm: {sum(r.stays for r in some)} of {len(some)} within 1 ms after 2 s and from there on, {sum(r.jumps for r in some)} jumps.")
+        lines.append(
+            f"\n{ppm} ppm: {sum(r.stays for r in some)} of {len(some)} within 1 ms after 2 s and from there on,"
+            f" {sum(r.jumps for r in some)} jumps."
+        )
     if recordings:
         lines += ["\n| recording | jumps | realignments | delay, samples | further than 1 ms from it | deviation p50 / p95 / max | known after, s |",
                   "| --- | --- | --- | --- | --- | --- | --- |"]  # fmt: skip
     for name, r in recordings.items():
         way = " / ".join(f"{d:.1f}" for d in r["deviation"])
-        lines.append(f"| {name} | {r['jumps']} | {r['realignments']} | {r['delay']:.1f} | {100 * r['off_share']:.1f} % | {way} | {r['first_s']:.2f} |")
+        lines.append(
+            f"| {name} | {r['jumps']} | {r['realignments']} | {r['delay']:.1f} | {100 * r['off_share']:.1f} % | {way} |"
+            f" {r['first_s']:.2f} |"
+        )
     return "\n".join(lines) + "\n"
 
 
@@ -137,12 +159,21 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=900000)
     parser.add_argument("--output", type=Path, default=Path("bench/results/double_talk"))
     options = parser.parse_args()
-    rows = simulated(options.seed, options.repeats, Corpus(options.voices), Corpus(options.speech)) if options.repeats else []
+    rows = (
+        simulated(options.seed, options.repeats, Corpus(options.voices), Corpus(options.speech))
+        if options.repeats
+        else []
+    )
     recordings = real(options.real, options.pattern) if options.real else {}
     if options.real and not recordings:
-        sys.exit(f"{options.real} holds no {' or '.join(options.pattern)}, expected recordings NAME_mic beside NAME_lpb: check --real and --pattern")
+        sys.exit(
+            f"{options.real} holds no {' or '.join(options.pattern)}, expected recordings NAME_mic beside NAME_lpb:"
+            " check --real and --pattern"
+        )
     options.output.parent.mkdir(parents=True, exist_ok=True)
-    options.output.with_suffix(".json").write_text(json.dumps({"seed": options.seed, "simulated": [asdict(r) for r in rows], "real": recordings}))
+    options.output.with_suffix(".json").write_text(
+        json.dumps({"seed": options.seed, "simulated": [asdict(r) for r in rows], "real": recordings})
+    )
     options.output.with_suffix(".md").write_text(summarise(rows, recordings))
     print(summarise(rows, recordings))
 

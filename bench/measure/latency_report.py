@@ -30,8 +30,10 @@ def markdown(result: dict, name: str) -> str:
         "Busy: a second process on"
     ]
     lines += [
-        "each core that never rests; measured paced and with one thread only. Missed: hops that took longer than they "
-        "last. RTF: compute over audio.",
+        (
+            "each core that never rests; measured paced and with one thread only. Missed: hops that took longer than"
+            " they last. RTF: compute over audio."
+        ),
         "",
     ]
     lines += [f"{contender} is not in the table: {why}" for contender, why in result["missing"].items()]
@@ -149,8 +151,10 @@ def _waits(result: dict) -> list[str]:
         alone = np.nanmedian(result["click"]["devices alone"])
         lines += [
             "",
-            "From a click at the microphone to the click at the output, through virtual devices (PulseAudio, "
-            "PortAudio over ALSA);",
+            (
+                "From a click at the microphone to the click at the output, through virtual devices (PulseAudio, "
+                "PortAudio over ALSA);"
+            ),
         ]
         lines += ["the declared latency is the window, and a hop has to be complete before it is filtered.", ""]
         lines += ["| | ms (median) | lowest - highest | beyond the devices |", "| --- | --- | --- | --- |"]

@@ -156,8 +156,10 @@ def markdown(facts: list[dict], rows: list[dict], name: str) -> str:
     shown = ", ".join(f"{number} in the {room}" for room, number in count_of.items())
     lines += [
         "",
-        f"In the whole path, on validation conversations ({shown}): mean SI-SDR in dB and capped WER in %, with 95 % "
-        "bootstrap",
+        (
+            f"In the whole path, on validation conversations ({shown}): mean SI-SDR in dB and capped WER in %, with 95"
+            " % bootstrap"
+        ),
     ]
     lines += ["intervals.", ""]
     columns, cells = ["engine", *(column for room in rooms for column in (f"{room}: SI-SDR", "WER"))], []

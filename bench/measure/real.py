@@ -1,4 +1,4 @@
-"""How the filter holds on recordings of real devices, without a calibration, beside public echo cancellers.
+r"""How the filter holds on recordings of real devices, without a calibration, beside public echo cancellers.
 
     OMP_NUM_THREADS=1 python -m bench.measure.real RECORDINGS --split report --speech HUMAN --noise FANS \\
         --whisper WHISPER --output bench/results/real

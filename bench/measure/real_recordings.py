@@ -104,8 +104,10 @@ def markdown(rows: dict[str, dict]) -> str:
         "Excess: over the fan, with a stationary linear path made from the recording; left: with the effects found.",
     ]
     lines += [
-        "Model, linear, ss: level drop, dB. The thresholds of self_calibration.py were chosen while looking at these "
-        "recordings.",
+        (
+            "Model, linear, ss: level drop, dB. The thresholds of self_calibration.py were chosen while looking at"
+            " these recordings."
+        ),
         "",
     ]
     lines += [f"- {name}: {row['says']}" for name, row in rows.items()]

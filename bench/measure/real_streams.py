@@ -114,7 +114,7 @@ def read(path: Path) -> Samples:
 
 
 def looped(x: Samples, at: int, n: int) -> Samples:
-    """n samples of x from `at` on, forwards and backwards in turn, so that no join is heard."""
+    """N samples of x from `at` on, forwards and backwards in turn, so that no join is heard."""
     there_and_back = np.concatenate((x, x[::-1]))
     return there_and_back[(at + np.arange(n)) % there_and_back.size].astype(np.float64)
 
@@ -178,7 +178,7 @@ class Cells:
 def lay(
     recordings: list[Recording], speech: Path, noise: Path | None, cells: Cells, cases: int, seed: int
 ) -> list[Laid]:
-    """cases humans on the recordings in turn; case i of a seed has the same human, place and fan in all cells."""
+    """Cases humans on the recordings in turn; case i of a seed has the same human, place and fan in all cells."""
     utterances, fans = transcripts(speech), _fans(noise)
     rng = np.random.default_rng(seed)
     order = rng.permutation(len(utterances))

@@ -2,8 +2,9 @@
 
     python -m bench.measure.tune_paper_ss --conversations DIR --whisper WHISPER --output bench/results/tune_paper_ss
 
-Eq. (6) leaves the over-subtraction factor alpha open. Writes word errors and SI-SDR per alpha, OUTPUT.json and OUTPUT.md.
-beta of eq. (7) scales the output alone: SI-SDR ignores it, and so does a recogniser that is given a normalised level.
+Eq. (6) leaves the over-subtraction factor alpha open. Writes word errors and SI-SDR per alpha, OUTPUT.json and
+OUTPUT.md. beta of eq. (7) scales the output alone: SI-SDR ignores it, and so does a recogniser that is given a
+normalised level.
 """
 
 from __future__ import annotations
@@ -39,9 +40,7 @@ def by_room(results: dict[float, list[tuple]]) -> list[dict]:
     for alpha, found in results.items():
         for room in sorted({result[0] for result in found}):
             of = [result for result in found if result[0] == room]
-            wer = sum(errors.capped * errors.words for _, _, errors in of) / sum(
-                errors.words for _, _, errors in of
-            )
+            wer = sum(errors.capped * errors.words for _, _, errors in of) / sum(errors.words for _, _, errors in of)
             mean = float(np.mean([result[1] for result in of]))
             rows.append({"alpha": alpha, "room": room, "capped_wer": wer, "si_sdr_db": mean, "conversations": len(of)})
     return rows

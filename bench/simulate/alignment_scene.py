@@ -108,8 +108,11 @@ def utterances(rng: np.random.Generator, seconds: list[float], pauses: list[floa
 
 @dataclass
 class DoubleTalk:
-    """A robot that a human talks over from the first sample on: reference and microphone (n,), the true delay at each sample of
-    the microphone (n,), ppm, and from where to where (samples of the microphone) each utterance is heard."""
+    """A robot that a human talks over from the first sample on.
+
+    Reference and microphone (n,), the true delay at each sample of the microphone (n,), ppm, and from where to where
+    (samples of the microphone) each utterance is heard.
+    """
 
     ref: np.ndarray
     mic: np.ndarray
@@ -118,8 +121,12 @@ class DoubleTalk:
     heard: list[tuple[int, int]]
 
 
-def double_talk(rng: np.random.Generator, voices: list[np.ndarray], human: np.ndarray, level_db: float, ppm: float) -> DoubleTalk:
-    """The utterances in turn, each with a lag of its own, 2 s apart; the echo is level_db over the human while both are heard.
+def double_talk(
+    rng: np.random.Generator, voices: list[np.ndarray], human: np.ndarray, level_db: float, ppm: float
+) -> DoubleTalk:
+    """The utterances in turn, each with a lag of its own, 2 s apart.
+
+    The echo is level_db over the human while both are heard.
 
     human: (n,), as long as all of it or longer.
     """
@@ -130,11 +137,20 @@ def double_talk(rng: np.random.Generator, voices: list[np.ndarray], human: np.nd
         at += voice.size + 2 * RATE
     ref = np.concatenate(parts).astype(np.float32)
     lags = rng.uniform(0, 1.4 * RATE, len(voices)).round()
-    echo, truth = hear(ref, [(max(s - 2000, 0), lag) for s, lag in zip(starts, lags, strict=True)], room(rng, rng.uniform(0.2, 0.75)), ppm)
+    echo, truth = hear(
+        ref,
+        [(max(s - 2000, 0), lag) for s, lag in zip(starts, lags, strict=True)],
+        room(rng, rng.uniform(0.2, 0.75)),
+        ppm,
+    )
     ends = [start + voice.size for start, voice in zip(starts, voices, strict=True)]
     heard = [(int(s + lag) + HEAD, int(min(e + lag, ref.size))) for s, e, lag in zip(starts, ends, lags, strict=True)]
     active = np.concatenate([np.arange(*span) for span in heard])
-    human = human[: ref.size] * np.sqrt(np.mean(echo[active] ** 2) / np.mean(human[: ref.size][active] ** 2)) * 10 ** (-level_db / 20)
+    human = (
+        human[: ref.size]
+        * np.sqrt(np.mean(echo[active] ** 2) / np.mean(human[: ref.size][active] ** 2))
+        * 10 ** (-level_db / 20)
+    )
     mic = echo + human + fan(rng, ref.size, 0.03 * np.std(echo))
     return DoubleTalk(ref, mic.astype(np.float32), truth, ppm, heard)
 

@@ -2,9 +2,9 @@
 
     ... | python pipe.py [robot.npz] | ...
 
-Reads signed 16-bit little-endian stereo at 16 kHz from standard input (left the microphone, right what the robot says), writes mono to
-standard output as soon as it is finished, and tells on standard error when the human begins and stops to speak. In a robot the two
-lines that read and write are its audio driver's.
+Reads signed 16-bit little-endian stereo at 16 kHz from standard input (left the microphone, right what the robot says),
+writes mono to standard output as soon as it is finished, and tells on standard error when the human begins and stops to
+speak. In a robot the two lines that read and write are its audio driver's.
 """
 
 import sys

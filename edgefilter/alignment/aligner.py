@@ -8,10 +8,20 @@ import numpy as np
 
 from edgefilter.alignment.announced import AHEAD, Announcements
 from edgefilter.alignment.delay_line import HALF_WIDTH, Aligned, Tape, kernel_table, read_delayed, read_line
-from edgefilter.alignment.delay_tracker import REACH, STRIDE, DelayMeter, Measurement
+from edgefilter.alignment.delay_tracker import REACH, STRIDE, DelayMeasurement, DelayMeter
 from edgefilter.alignment.drift_filter import DriftFilter
 from edgefilter.alignment.jumps import DRIFTED, SMALL, JumpWitness, judge
-from edgefilter.alignment.lag_search import BETWEEN, CERTAIN, CERTAIN_EARLY, EARLY, MINIMUM, SEEN, WINDOW, Candidate, LagSearch
+from edgefilter.alignment.lag_search import (
+    BETWEEN,
+    CERTAIN,
+    CERTAIN_EARLY,
+    EARLY,
+    MINIMUM,
+    SEEN,
+    WINDOW,
+    Candidate,
+    LagSearch,
+)
 from edgefilter.alignment.utterances import OnsetDetector, Utterance
 from edgefilter.profile.data import Profile
 from edgefilter.types import PRE_ROLL, SAMPLE_RATE, Samples
@@ -19,16 +29,18 @@ from edgefilter.types import PRE_ROLL, SAMPLE_RATE, Samples
 SEARCH_STRIDE = 768
 """Samples between two searches of the whole range."""
 LOST_BLOCKS, NEARBY, NEARBY_SEARCHES = 3, 4096, 10
-"""Measurements in speech without a credible peak after which all lags are searched again: at first as if the present delay had ceased
-NEARBY samples ago, which finds jumps of up to 200 ms, then as if the utterance had begun half a second before."""
+"""Measurements in speech without a credible peak after which all lags are searched again: at first as if the present
+delay had ceased NEARBY samples ago, which finds jumps of up to 200 ms, then as if the utterance had begun half a second
+before."""
 
 
 class Aligner:
     """Finds the total delay of the robot's voice in the microphone and delivers the reference at that delay.
 
-    A new utterance is looked for over all lags; the old delay stays the hypothesis until it is confirmed or replaced, but where
-    the microphone is far too quiet to hold it, nothing is delivered. Between utterances delay and drift are carried on.
-    hop: samples per step. profile: its impulse response tells the shape of the arrival. max_lag_s: of the playback, seconds.
+    A new utterance is looked for over all lags; the old delay stays the hypothesis until it is confirmed or replaced,
+    but where the microphone is far too quiet to hold it, nothing is delivered. Between utterances delay and drift are
+    carried on. hop: samples per step. profile: its impulse response tells the shape of the arrival. max_lag_s: of the
+    playback, seconds.
 
     >>> rng = np.random.default_rng(0)
     >>> voice = rng.standard_normal(16384).astype(np.float32) / 10
@@ -64,13 +76,21 @@ class Aligner:
         self._gain: float | None = None
         self._known = self._refuted = self._trusted = self._measured = self._missed = False
         self._confidence, self._lost = 0.0, 0
-        self._counts = {"utterances": 0, "realignments": 0, "jumps": 0, "searches": 0, "announced": 0, "announced_heard": 0}
+        self._counts = {
+            "utterances": 0,
+            "realignments": 0,
+            "jumps": 0,
+            "searches": 0,
+            "announced": 0,
+            "announced_heard": 0,
+        }
 
     def announce(self, utterance: Samples) -> None:
         """Say what will be played (n,); it may begin at any time or never, and several are played in the order of announcing.
 
-        While the reference channel carries sound, that is the reference and announcements are dropped. While it is silent, the
-        announced utterance is looked for in the microphone for 30 s, and from where it is heard on it is the reference.
+        While the reference channel carries sound, that is the reference and announcements are dropped. While it is
+        silent, the announced utterance is looked for in the microphone for 30 s, and from where it is heard on it is
+        the reference.
         """
         self._counts["announced"] += 1
         self._announced.add(utterance)
@@ -104,8 +124,16 @@ class Aligner:
 
     def stats(self) -> dict[str, object]:
         """Delay, drift, confidence, state and what happened so far, ready for JSON."""
-        delay, deviation = (round(self._drift.delay, 3), round(self._drift.deviation, 3)) if self._known else (None, None)
-        found = {"method": "tracking", "state": self._state(), "delay_samples": delay, "deviation_samples": deviation, **self._counts}
+        delay, deviation = (
+            (round(self._drift.delay, 3), round(self._drift.deviation, 3)) if self._known else (None, None)
+        )
+        found = {
+            "method": "tracking",
+            "state": self._state(),
+            "delay_samples": delay,
+            "deviation_samples": deviation,
+            **self._counts,
+        }
         return {**found, "ppm": round(-1e6 * self._drift.slope, 2), "confidence": round(self._confidence, 3)}
 
     def _state(self) -> str:
@@ -140,7 +168,10 @@ class Aligner:
         self._refuted = self._missed = False
 
     def _search(self) -> bool:
-        """Look for the oldest unresolved utterance, or one that was announced, a step each hop; True if the delay was switched."""
+        """Look for the oldest unresolved utterance, or one that was announced, a step each hop.
+
+        True if the delay was switched.
+        """
         self._to_search -= self.hop
         if self._measured or (self._stage == 0 and self._to_search > 0):
             return False
@@ -154,7 +185,9 @@ class Aligner:
             self._counts["searches"] += 1
             if self._open and self._open[0].nearby > 0:
                 self._open[0].nearby -= 1
-                self._open[0].start = now - int(self._drift.delay) - (NEARBY if self._open[0].nearby else SAMPLE_RATE // 2)
+                self._open[0].start = (
+                    now - int(self._drift.delay) - (NEARBY if self._open[0].nearby else SAMPLE_RATE // 2)
+                )
             since = self._open[0].start if self._open else self._expected.start
             self._lags.prepare(self._expected or self._ref, now, since)
         elif stage == 1:
@@ -165,11 +198,16 @@ class Aligner:
             self._found = self._lags.find()
             return self._found is not None and self._decide(self._found)
         else:
-            return self._lags.before(self._mic, self._expected or self._ref, self._found) > SEEN and self._take(self._found)
+            return self._lags.before(self._mic, self._expected or self._ref, self._found) > SEEN and self._take(
+                self._found
+            )
         return False
 
     def _decide(self, found: Candidate) -> bool:
-        """Take the candidate if it is beyond chance, or have the window before looked at; True if the delay was switched."""
+        """Take the candidate if it is beyond chance, or have the window before looked at.
+
+        True if the delay was switched.
+        """
         evidence = found.strength * found.ratio
         if found.heard > WINDOW + BETWEEN + MINIMUM and evidence > CERTAIN_EARLY:
             self._stage = 3
@@ -221,10 +259,12 @@ class Aligner:
         if self._onsets.current is None or self._ref.end - self._drift.delay - STRIDE > self._onsets.current.end:
             return False
         self._segments = 1 if self._lost or (self._open and self._open[0].nearby) else 0
-        found = self._meter.measure(self._mic, self._ref, self._ref.end, self._drift.delay, self._drift.slope, self._segments)
+        found = self._meter.measure(
+            self._mic, self._ref, self._ref.end, self._drift.delay, self._drift.slope, self._segments
+        )
         return found is not None and self._judge(found)
 
-    def _judge(self, found: Measurement) -> bool:
+    def _judge(self, found: DelayMeasurement) -> bool:
         """Take a look into account; True if the delay was switched."""
         reach = (2 * self._segments + 1) * REACH
         verdict = judge(found, self._drift.surprise(found), found.gain if self._gain is None else self._gain, reach)
@@ -249,20 +289,22 @@ class Aligner:
         self._drift.step(offset, 0.3)
         return self._switched()
 
-    def _accept(self, found: Measurement) -> bool:
+    def _accept(self, found: DelayMeasurement) -> bool:
         step = self._drift.delay
         self._drift.correct(found)
         self._meter.confirm(found.offset)
         self._lost, self._missed = 0, False
         self._witness.forget()
         self._confidence += 0.2 * (found.explained - self._confidence)
-        self._gain = found.gain if self._gain is None else self._gain + 0.1 * (min(found.gain, 2 * self._gain) - self._gain)
+        self._gain = (
+            found.gain if self._gain is None else self._gain + 0.1 * (min(found.gain, 2 * self._gain) - self._gain)
+        )
         was_refuted = self._refuted
         if self._open and self._ref.end - self._drift.delay > self._open[0].start + STRIDE and found.dominance < 1.01:
             self._resolve()
         return was_refuted or abs(self._drift.delay - step) > 0.5
 
-    def _note_loss(self, found: Measurement) -> None:
+    def _note_loss(self, found: DelayMeasurement) -> None:
         """Speech of the robot should be heard but is not where it was expected: in the end, search everything."""
         if self._open or self._gain is None or found.gain < 0.25 * self._gain:
             return

@@ -11,7 +11,8 @@ from edgefilter.alignment.utterances import FLOOR
 from edgefilter.types import SAMPLE_RATE, Samples
 
 LEAD = SAMPLE_RATE
-"""Samples before now at which the playback is supposed to have begun: an utterance is recognised while its first second is heard."""
+"""Samples before now at which the playback is supposed to have begun: an utterance is recognised while its first second
+is heard."""
 AHEAD = 4096
 """Samples by which an utterance that was heard goes ahead of the microphone, so that the tracker sees to both sides."""
 PATIENCE = 30 * SAMPLE_RATE
@@ -27,6 +28,7 @@ class Playback:
 
     @property
     def end(self) -> int:
+        """Position behind the last sample."""
         return self.start + self.utterance.size
 
     def read(self, start: int, stop: int) -> Samples:
@@ -68,7 +70,10 @@ class Announcements:
         return played
 
     def expected(self, now: int) -> Playback | None:
-        """The utterance to look for in the microphone up to position now, as if it had begun LEAD samples ago; None if there is none."""
+        """The utterance to look for in the microphone up to position now, as if it had begun LEAD samples ago.
+
+        None if there is none.
+        """
         if not self._waiting or self._playing is not None:
             return None
         self._since = now if self._since is None else self._since
@@ -79,6 +84,9 @@ class Announcements:
         return Playback(self._waiting[0], now - LEAD)
 
     def begin(self, heard_at: int) -> Playback:
-        """The first one waiting was heard to begin at position heard_at; returns where it then lies in the reference."""
+        """The first one waiting was heard to begin at position heard_at.
+
+        Returns where it then lies in the reference.
+        """
         self._playing = Playback(self._waiting.popleft(), heard_at - AHEAD)
         return self._playing

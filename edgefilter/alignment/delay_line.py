@@ -11,19 +11,19 @@ import numpy as np
 from edgefilter.dsp.fractional_delay import HALF_WIDTH, PHASES, tabulated
 from edgefilter.types import Array, Samples
 
+
 class Aligned(NamedTuple):
     """The reference as an aligner delivers it for one hop of the microphone.
 
-    reference: (hop,) float32, delayed so that the robot's direct sound lies PRE_ROLL samples behind it; zeros while no delay is
-    known. delay: samples, total delay of the direct sound at the end of the hop, nan if unknown. ppm: by how much the delay
-    shrinks, 1e-6 samples per sample. confidence: 0 to 1. realigned: the delay was switched discontinuously in this hop.
-    state: what is known of the utterance that may be heard now:
-    "idle": nothing of the reference can be audible.
-    "announced": an utterance that was announced is waited for; it may begin at any time or never.
-    "begun": an utterance of the robot has begun and is not found yet; delay is the one of the utterance before, or nan.
-    "unfound": it should have been heard by now, whatever its lag, and was not found: the lag is uncertain, delay as in "begun".
-    "lost": it was found, but the last looks did not see it, beside a loud human or after a jump; delay is carried on, with its drift.
-    "locked": it was found and its delay is followed.
+    reference: (hop,) float32, delayed so that the robot's direct sound lies PRE_ROLL samples behind it; zeros while no
+    delay is known. delay: samples, total delay of the direct sound at the end of the hop, nan if unknown. ppm: by how
+    much the delay shrinks, 1e-6 samples per sample. confidence: 0 to 1. realigned: the delay was switched
+    discontinuously in this hop. state: what is known of the utterance that may be heard now: "idle": nothing of the
+    reference can be audible. "announced": an utterance that was announced is waited for; it may begin at any time or
+    never. "begun": an utterance of the robot has begun and is not found yet; delay is the one of the utterance before,
+    or nan. "unfound": it should have been heard by now, whatever its lag, and was not found: the lag is uncertain,
+    delay as in "begun". "lost": it was found, but the last looks did not see it, beside a loud human or after a jump;
+    delay is carried on, with its drift. "locked": it was found and its delay is followed.
     """
 
     reference: Samples
@@ -89,11 +89,13 @@ def _kernels(*delays: float) -> Array:
 
 
 def read_delayed(tape: Tape, stop: int, count: int, delay_from: float, delay_to: float) -> Samples:
-    """Samples of the tape for the positions stop - count .. stop - 1 less a delay that runs from delay_from to delay_to.
+    """Samples of the tape for the positions stop - count ..
 
-    Returns (count,) float32. The delay is delay_from just before the first sample and delay_to at the last one. Filters for the
-    two ends and the middle are applied to the whole stretch and interpolated by a parabola, which for a stretch of 256 samples
-    at 300 ppm errs by less than -75 dB at any frequency. |delay_to - delay_from| < 1.
+    Stop - 1 less a delay that runs from delay_from to delay_to.
+
+    Returns (count,) float32. The delay is delay_from just before the first sample and delay_to at the last one. Filters
+    for the two ends and the middle are applied to the whole stretch and interpolated by a parabola, which for a stretch
+    of 256 samples at 300 ppm errs by less than -75 dB at any frequency. |delay_to - delay_from| < 1.
     """
     middle = 0.5 * (delay_from + delay_to)
     whole = math.floor(middle)

@@ -28,11 +28,14 @@ EARLY = (48, 400)
 
 
 @dataclass(frozen=True, slots=True)
-class Measurement:
-    """offset: delay error, samples (positive: the microphone is later). variance: samples^2. strength: height of the peak over
-    the rms of all lags. ratio: height over the highest peak elsewhere. dominance: height over the best within 2 samples of the expected
-    delay. explained: share of the microphone's whitened power that the early response explains, 0 to 1. gain: power ratio of
-    microphone to reference; gain_there: the same if the offset is true."""
+class DelayMeasurement:
+    """offset: delay error, samples (positive: the microphone is later).
+
+    Variance: samples^2. strength: height of the peak over
+    the rms of all lags. ratio: height over the highest peak elsewhere. dominance: height over the best within 2 samples
+    of the expected delay. explained: share of the microphone's whitened power that the early response explains, 0 to 1.
+    gain: power ratio of microphone to reference; gain_there: the same if the offset is true.
+    """
 
     offset: float
     variance: float
@@ -52,11 +55,11 @@ class Measurement:
 class DelayMeter:
     """Measures the delay of the microphone against the reference read at an expected delay.
 
-    The likelihood of an offset tau under M = H A exp(-j omega tau) + V is Re sum conj(H) G exp(j omega tau) / S_V with G = M conj(A)
-    and S_V the smoothed power of what H A leaves unexplained (Hannan & Thomson 1973 weights). H, the early response relative to
-    the direct sound, starts from the profile (or from a pure delay) and is learnt; each cross-spectrum is shifted by its own
-    offset first, so that learning does not move the delay. Peaks are compared after division by the root of the energy that a lag
-    lets overlap, with which chance peaks grow.
+    The likelihood of an offset tau under M = H A exp(-j omega tau) + V is Re sum conj(H) G exp(j omega tau) / S_V with
+    G = M conj(A) and S_V the smoothed power of what H A leaves unexplained (Hannan & Thomson 1973 weights). H, the
+    early response relative to the direct sound, starts from the profile (or from a pure delay) and is learnt; each
+    cross-spectrum is shifted by its own offset first, so that learning does not move the delay. Peaks are compared
+    after division by the root of the energy that a lag lets overlap, with which chance peaks grow.
     """
 
     def __init__(self, response: Samples | None, pre_roll: int) -> None:
@@ -81,7 +84,9 @@ class DelayMeter:
         self._confirmed: float | None = None
         self.response = self._prior
 
-    def measure(self, mic: Tape, ref: Tape, now: int, delay: float, slope: float, segments: int = 0) -> Measurement | None:
+    def measure(
+        self, mic: Tape, ref: Tape, now: int, delay: float, slope: float, segments: int = 0
+    ) -> DelayMeasurement | None:
         """Compare the last FRAME samples of mic with the reference at the expected delay; None where either is silent.
 
         segments: so many times 2 REACH further lags on each side are looked at as well.
@@ -102,7 +107,9 @@ class DelayMeter:
         if self._cross is None:
             self._start(power(m), power_a)
         self._last = (m * np.conj(a), power_a)
-        powers = power(np.array((m - self.response * a, m)))  # smoothed into an array of ours: to make its own takes scipy as long again
+        powers = power(
+            np.array((m - self.response * a, m))
+        )  # smoothed into an array of ours: to make its own takes scipy as long again
         left, power_m = uniform_filter1d(powers, 31, output=np.empty_like(powers), mode="nearest")
         weight = self._band / (left + 0.05 * power_m + (1e-6 * power_m.max() + 1e-20))
         m *= np.conj(self.response)
@@ -119,13 +126,15 @@ class DelayMeter:
         likelihood /= np.sqrt(overlap + 0.1 * overlap.max())
         expected = likelihood.size // 2
         near = float(likelihood[expected - 2 : expected + 3].max())
-        at, peak, strength, ratio = max((_highest(likelihood, reach) for reach in {REACH, expected}), key=lambda found: found[2] * found[3])
+        at, peak, strength, ratio = max(
+            (_highest(likelihood, reach) for reach in {REACH, expected}), key=lambda found: found[2] * found[3]
+        )
         part, inside = divmod(at, 2 * REACH)
         offset = at - inside + REACH - expected + climb(products[part], self._omega, inside - REACH, steps=3)
         there = references[part][SIZE - FRAME - inside : SIZE - inside] * self._window
         information = 2.0 * float(self._omega_squared.dot(power(self.response) * power_a * weight)) * FRAME / SIZE
         explained = 1.0 - float(self._band.dot(left / (power_m + 1e-20))) / self._band_size
-        return Measurement(
+        return DelayMeasurement(
             offset=offset,
             variance=4.0 / (information + 1e-9) + 1e-4,
             strength=strength,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from edgefilter.alignment.delay_tracker import FRAME, STRIDE, Measurement
+from edgefilter.alignment.delay_tracker import FRAME, STRIDE, DelayMeasurement
 
 SLOPE_DEVIATION = 150e-6
 """Standard deviation of two clocks' difference before anything is known, samples per sample."""
@@ -21,9 +21,10 @@ DECIDED = 30.0
 class DriftFilter:
     """Kalman filter over the delay (samples) and its slope (samples per sample), constant-slope model.
 
-    What a look claims of its own accuracy does not hold while a human talks as well or the response is still being learnt: looks
-    close to one another then err alike. So they weigh less the less they explain, and where looks that agree contradict what is
-    believed, belief is widened until it can follow them (fading memory, Sorenson & Sacks 1971).
+    What a look claims of its own accuracy does not hold while a human talks as well or the response is still being
+    learnt: looks close to one another then err alike. So they weigh less the less they explain, and where looks that
+    agree contradict what is believed, belief is widened until it can follow them (fading memory, Sorenson & Sacks
+    1971).
     """
 
     def __init__(self) -> None:
@@ -57,11 +58,11 @@ class DriftFilter:
         self._covariance += samples * self._slope_variance
         self._slope_variance += (0.15e-6) ** 2 * samples / STRIDE
 
-    def surprise(self, measurement: Measurement) -> float:
+    def surprise(self, measurement: DelayMeasurement) -> float:
         """The measured offset in standard deviations of what was to be expected."""
         return abs(measurement.offset) / math.sqrt(self._expected()[2] + self._noise(measurement))
 
-    def correct(self, measurement: Measurement) -> None:
+    def correct(self, measurement: DelayMeasurement) -> None:
         """Take in a measured offset, which holds for the middle of its frame."""
         noise, spread = self._noise(measurement), self._expected()[2]
         surprise = measurement.offset / math.sqrt(spread + noise)
@@ -77,13 +78,15 @@ class DriftFilter:
         self._since = 0
         self._slope_variance -= slope * slope / spread
 
-    def _noise(self, measurement: Measurement) -> float:
+    def _noise(self, measurement: DelayMeasurement) -> float:
         """Variance of a look, with what its error has in common with its neighbours', which their number does not average out.
 
         While the delay is hardly known, a weak look may also have seen another peak than the direct sound's.
         """
         common = BIAS**2 * (1.0 - measurement.explained)
-        return measurement.variance + common + (1.0 if self._variance > 0.25 and measurement.evidence < DECIDED else 0.0)
+        return (
+            measurement.variance + common + (1.0 if self._variance > 0.25 and measurement.evidence < DECIDED else 0.0)
+        )
 
     def _widen(self, factor: float) -> None:
         """Believe less of delay and slope, by this factor of their covariance, but never less than at the start."""

@@ -15,7 +15,8 @@ from edgefilter.types import SAMPLE_RATE, Samples
 WINDOW = 7168
 """Samples of the microphone that one search looks at, 0.45 s."""
 MINIMUM = 832
-"""Samples (52 ms) of an utterance that must have been heard before its lag is believed: less of any two sounds may agree by chance."""
+"""Samples (52 ms) of an utterance that must have been heard before its lag is believed: less of any two sounds may
+agree by chance."""
 FADE = 256
 _RISE = (0.5 - 0.5 * np.cos(np.pi * (np.arange(FADE) + 0.5) / FADE)).astype(np.float32)
 REFLECTIONS, REFLECTED = 320, 0.75
@@ -28,20 +29,22 @@ NEAR, ASIDE = 12, 512
 BETWEEN = 1024
 """Samples between the two windows, so that one short agreement does not reach into both."""
 CERTAIN, CERTAIN_EARLY, EARLY = 30.0, 20.0, 2432
-"""A search's strength times ratio that decides, and what does when two searches in a row find it at one lag of which at most EARLY samples
-were heard, so that a third of them were new. Beside a human as loud as the robot the true lag has a median of 40 after 60 ms, and
-150 after 150 ms; chance, in an hour of other speech while the reference played unheard, 26, and 22 early."""
+"""A search's strength times ratio that decides, and what does when two searches in a row find it at one lag of which at
+most EARLY samples were heard, so that a third of them were new. Beside a human as loud as the robot the true lag has a
+median of 40 after 60 ms, and 150 after 150 ms; chance, in an hour of other speech while the reference played unheard,
+26, and 22 early."""
 SEEN = 5.0
-"""Strength that a lag at which more than a window of the utterance must have been heard already has to show in the window before as
-well; then CERTAIN_EARLY is enough. True lags have 10 there, chance 3.3."""
+"""Strength that a lag at which more than a window of the utterance must have been heard already has to show in the
+window before as well; then CERTAIN_EARLY is enough. True lags have 10 there, chance 3.3."""
 
 
 @dataclass(frozen=True, slots=True)
 class Candidate:
-    """Lag in samples of the highest peak; its height over the rms of all lags, and over the highest peak elsewhere: two voices
-    of like pitch agree at many lags, a period apart, the robot with itself at one.
+    """Lag in samples of the highest peak, its height over the rms of all lags and over the highest peak elsewhere.
 
-    at: sample counter of the microphone at the end of the window. heard: samples of the utterance that it holds if the lag is true.
+    Two voices of like pitch agree at many lags, a period apart, the robot with itself at one.
+    at: sample counter of the microphone at the end of the window. heard: samples of the utterance that it holds if the
+    lag is true.
     """
 
     lag: int
@@ -54,11 +57,11 @@ class Candidate:
 class LagSearch:
     """Generalised cross-correlation (Knapp & Carter 1976) of the last WINDOW samples of mic with the reference before them.
 
-    Both spectra are divided by the square root of their smoothed power. response (taps,), if known, is the echo path around
-    its direct sound at index pre_roll: its phase is taken out, so that early reflections do not pull the peak. Chance peaks
-    grow with the root of the energy that a lag lets overlap, so the correlation is divided by that.
-    `prepare`, `listen` and `find` are one search and cost one transform each, so that they can be spread over three hops; while
-    the reference to be looked at is short, so are the transforms.
+    Both spectra are divided by the square root of their smoothed power. response (taps,), if known, is the echo path
+    around its direct sound at index pre_roll: its phase is taken out, so that early reflections do not pull the peak.
+    Chance peaks grow with the root of the energy that a lag lets overlap, so the correlation is divided by that.
+    `prepare`, `listen` and `find` are one search and cost one transform each, so that they can be spread over three
+    hops; while the reference to be looked at is short, so are the transforms.
     """
 
     def __init__(self, max_lag: int, response: Samples | None = None, pre_roll: int = 0) -> None:
@@ -77,7 +80,9 @@ class LagSearch:
         r[first:] = ref.read(now - size + first, now)
         _soften(r[first:])
         step = np.diff(r, prepend=r[:1])
-        self._total = np.concatenate(([0.0], np.cumsum(np.square(step, out=step).reshape(-1, COARSE).sum(axis=1), dtype=np.float64)))
+        self._total = np.concatenate(
+            ([0.0], np.cumsum(np.square(step, out=step).reshape(-1, COARSE).sum(axis=1), dtype=np.float64))
+        )
         self._reference = flattened(fft.rfft(r), 1e-5)
         self._prepared, self._since = now, since
 
@@ -119,8 +124,12 @@ class LagSearch:
         if spread <= 0.0 or heard < MINIMUM:
             return None
         reflected = REFLECTED * score[lag + NEAR : lag + REFLECTIONS].max(initial=0.0)
-        second = max(score[: max(lag - NEAR, 0)].max(initial=0.0), reflected, score[lag + REFLECTIONS :].max(initial=0.0))
-        return Candidate(lag, float(score[lag]) / spread, float(score[lag]) / max(float(second), 1e-12), self._at, heard)
+        second = max(
+            score[: max(lag - NEAR, 0)].max(initial=0.0), reflected, score[lag + REFLECTIONS :].max(initial=0.0)
+        )
+        return Candidate(
+            lag, float(score[lag]) / spread, float(score[lag]) / max(float(second), 1e-12), self._at, heard
+        )
 
     def before(self, mic: Tape, ref: Tape | Playback, found: Candidate) -> float:
         """Strength of the found lag in an earlier window of the microphone, BETWEEN samples before the one that it was found in."""

@@ -18,7 +18,8 @@ TEMPLATE = SAMPLE_RATE // 2
 STRIDE = 2048
 """Lags that are judged at a time."""
 DECISIVE = 0.35
-"""Normalised correlation above which the lag is taken at once: chance peaks of speech against other speech stay under 0.3."""
+"""Normalised correlation above which the lag is taken at once: chance peaks of speech against other speech stay under
+0.3."""
 CREDIBLE = 0.1
 """Normalised correlation under which the utterance was not heard, and the last lag is kept."""
 
@@ -26,8 +27,8 @@ CREDIBLE = 0.1
 def paper_lag(recording: Samples, reference: Samples) -> int:
     """Samples by which reference (m,) arrives later in recording (n,): the peak of the cross-correlation of its first 0.5 s.
 
-    The 0.5 s begin where the reference rises over -40 dB of its peak. Negative where the recording is ahead.
-    Raises SignalError for a silent reference or a recording shorter than the template (Li et al. 2024, section on alignment).
+    The 0.5 s begin where the reference rises over -40 dB of its peak. Negative where the recording is ahead. Raises
+    SignalError for a silent reference or a recording shorter than the template (Li et al. 2024, section on alignment).
 
     >>> rng = np.random.default_rng(0)
     >>> voice = rng.standard_normal(16000).astype(np.float32)
@@ -36,19 +37,23 @@ def paper_lag(recording: Samples, reference: Samples) -> int:
     """
     loud = np.flatnonzero(np.abs(reference) > 0.01 * np.max(np.abs(reference), initial=0.0))
     if loud.size == 0:
-        raise SignalError("the reference is silent, expected the robot's voice: check which channel or device it comes from")
+        raise SignalError(
+            "the reference is silent, expected the robot's voice: check which channel or device it comes from"
+        )
     onset = int(loud[0])
     template = reference[onset : onset + TEMPLATE]
     if recording.size < template.size:
-        raise SignalError(f"the recording has {recording.size} samples, expected at least the {template.size} of the search")
+        raise SignalError(
+            f"the recording has {recording.size} samples, expected at least the {template.size} of the search"
+        )
     return int(np.argmax(scipy.signal.correlate(recording, template, mode="valid", method="fft"))) - onset
 
 
 class PaperAligner:
     """Streams the paper's method: each utterance's lag from its first 0.5 s; until it is decided the last lag is kept.
 
-    Same interface as Aligner, with whole-sample delays of the full lag (no pre-roll) and no tracking.
-    A lag is decided when its normalised correlation is above DECISIVE, at the latest 0.5 s + the longest lag after the onset.
+    Same interface as Aligner, with whole-sample delays of the full lag (no pre-roll) and no tracking. A lag is decided
+    when its normalised correlation is above DECISIVE, at the latest 0.5 s + the longest lag after the onset.
     """
 
     def __init__(self, hop: int, max_lag_s: float = 1.5) -> None:
@@ -82,9 +87,15 @@ class PaperAligner:
         self._search()
         known = self._delay is not None
         now = self._ref.end
-        out = self._ref.read(now - self.hop - self._delay, now - self._delay).copy() if known else np.zeros(self.hop, np.float32)
+        out = (
+            self._ref.read(now - self.hop - self._delay, now - self._delay).copy()
+            if known
+            else np.zeros(self.hop, np.float32)
+        )
         state = "begun" if self._onset is not None else "locked" if known else "idle"
-        return Aligned(out, float(self._delay) if known else float("nan"), 0.0, self._confidence, state, self._delay != before)
+        return Aligned(
+            out, float(self._delay) if known else float("nan"), 0.0, self._confidence, state, self._delay != before
+        )
 
     def history(self, count: int) -> Samples:
         """The last count aligned samples under the present delay, (count,) float32."""
@@ -95,7 +106,12 @@ class PaperAligner:
 
     def stats(self) -> dict[str, object]:
         """What was found so far, ready for JSON."""
-        return {"method": "paper", "delay_samples": self._delay, "confidence": self._confidence, "utterances_aligned": self._decided}
+        return {
+            "method": "paper",
+            "delay_samples": self._delay,
+            "confidence": self._confidence,
+            "utterances_aligned": self._decided,
+        }
 
     def _begin(self, onset: int | None) -> None:
         self._onset, self._template = onset, None

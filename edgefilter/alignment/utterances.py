@@ -7,7 +7,8 @@ from dataclasses import dataclass
 from edgefilter.types import SAMPLE_RATE, Samples
 
 PAUSE = SAMPLE_RATE // 5
-"""Samples of silence after which the lag may be another one: shorter than any pause between two playbacks, longer than a plosive."""
+"""Samples of silence after which the lag may be another one: shorter than any pause between two playbacks, longer than
+a plosive."""
 FLOOR = 1e-8
 """Mean square under which a reference is silent whatever came before (-80 dB of full scale)."""
 RANGE = 10**-4.5
@@ -19,8 +20,9 @@ class Utterance:
     """A stretch of speech in the reference, positions in samples; start lies up to two hops before the first sound.
 
     after: end of the one before it, which the microphone hears out first, since one loudspeaker plays them in turn.
-    lost: whether it is one that was followed and is looked for again, not one that began; nearby: searches left that suppose
-    it to have jumped a short while ago, its start moving along."""
+    lost: whether it is one that was followed and is looked for again, not one that began; nearby: searches left that
+    suppose it to have jumped a short while ago, its start moving along.
+    """
 
     start: int
     end: int
@@ -41,7 +43,10 @@ class OnsetDetector:
         self.active = False
 
     def step(self, ref: Samples) -> Utterance | None:
-        """Take a hop (hop,) and return the utterance that begins with it, if one does; `current` grows while it lasts."""
+        """Take a hop (hop,) and return the utterance that begins with it, if one does.
+
+        `current` grows while it lasts.
+        """
         self.now += self._hop
         power = float(ref.dot(ref)) / self._hop
         self._peak = max(power, self._peak * self._decay)

@@ -19,7 +19,8 @@ from edgefilter.types import SAMPLE_RATE, Block, Samples
 MARGIN_S = 0.04
 """Silence ahead of a live output, on top of the declared latency, against the jitter of both devices' callbacks."""
 LEAD_S, GUARD_S = 0.25, 0.05
-"""play_and_record: silence ahead of the sound, and how far the counters of the two streams may be out at their start."""
+"""play_and_record: silence ahead of the sound, and how far the counters of the two streams may be out at their
+start."""
 SETTLE_S = 0.2
 """A stream may stall right after its start; so much of each input is discarded before the first block."""
 _SLACK_S = 0.3
@@ -30,7 +31,9 @@ def _sounddevice() -> Any:
     try:
         import sounddevice
     except ImportError:
-        raise DeviceError("live audio needs the Python package sounddevice, which is missing: pip install sounddevice") from None
+        raise DeviceError(
+            "live audio needs the Python package sounddevice, which is missing: pip install sounddevice"
+        ) from None
     except OSError as error:
         raise DeviceError(f"live audio needs the PortAudio library ({error}): apt install libportaudio2") from None
     return sounddevice
@@ -40,7 +43,14 @@ def _devices() -> list[Device]:
     sd = _sounddevice()
     systems = [api["name"] for api in sd.query_hostapis()]
     return [
-        Device(i, d["name"], d["max_input_channels"], d["max_output_channels"], d["default_samplerate"], systems[d["hostapi"]])
+        Device(
+            i,
+            d["name"],
+            d["max_input_channels"],
+            d["max_output_channels"],
+            d["default_samplerate"],
+            systems[d["hostapi"]],
+        )
         for i, d in enumerate(sd.query_devices())
     ]
 
@@ -87,13 +97,15 @@ class LiveSource:
     """Microphone and reference devices as blocks on the microphone's sample counter, until stop() or `seconds`.
 
     Raises DeviceError, after everything received has been delivered, when a device stops. reference None: silence.
-    lost: samples left out, filled or moved so far, see stats(): overruns are callbacks that the driver marked, each of which
-    may hide an unknown number of samples.
+    lost: samples left out, filled or moved so far, see stats(): overruns are callbacks that the driver marked, each of
+    which may hide an unknown number of samples.
     """
 
     live = True
 
-    def __init__(self, mic: str | int | Device | None, reference: str | int | Device | None = None, seconds: float | None = None) -> None:
+    def __init__(
+        self, mic: str | int | Device | None, reference: str | int | Device | None = None, seconds: float | None = None
+    ) -> None:
         self._mic = Input(_sounddevice(), find(mic, "input"))
         self._reference = None if reference is None else Input(_sounddevice(), find(reference, "input"))
         self._pairing = Pairing()
@@ -169,7 +181,8 @@ class LiveSource:
     def _synchronise(self) -> None:
         """Wait until both devices run steadily, and begin with what arrives then.
 
-        The reference is emptied last: one that is too new only adds delay, one that is too old would come before its echo.
+        The reference is emptied last: one that is too new only adds delay, one that is too old would come before its
+        echo.
         """
         while not self._stopped and not all(port.inlet.received >= SETTLE_S * port.rate for port in self._ports()):
             for port in self._ports():
@@ -181,15 +194,20 @@ class LiveSource:
 
 
 def _join(first: Block, second: Block) -> Block:
-    return Block(np.concatenate((first.mic, second.mic)), np.concatenate((first.ref, second.ref)), first.start, first.lost + second.lost)
+    return Block(
+        np.concatenate((first.mic, second.mic)),
+        np.concatenate((first.ref, second.ref)),
+        first.start,
+        first.lost + second.lost,
+    )
 
 
 class LiveSink:
     """A loudspeaker or virtual device that first plays `latency` samples of silence, so that sound lags the input evenly.
 
-    MARGIN_S more silence comes before it as a reserve against jitter. wait: hold the writer up when enough is queued (right for
-    a file as source); otherwise, with a live source, what is too much is dropped and counted. An underrun plays silence, is
-    counted, and ends when the reserve is there again. Raises DeviceError when the device stops.
+    MARGIN_S more silence comes before it as a reserve against jitter. wait: hold the writer up when enough is queued
+    (right for a file as source); otherwise, with a live source, what is too much is dropped and counted. An underrun
+    plays silence, is counted, and ends when the reserve is there again. Raises DeviceError when the device stops.
     """
 
     def __init__(self, device: str | int | Device | None, latency: int = 0, wait: bool = True) -> None:
@@ -229,9 +247,16 @@ class LiveSink:
             ring.write(data[at : at + piece])
 
     def stats(self) -> dict[str, int]:
-        """Samples written (16 kHz), clipped; dropped and missing (at the device's rate); underruns: callbacks that found too little."""
+        """Samples written (16 kHz), clipped; dropped and missing (at the device's rate).
+
+        Underruns: callbacks that found too little.
+        """
         outlet = self._port.outlet
-        figures = {"written": self.written, "clipped": self.clipped, "underruns": max(outlet.underruns, self._port.flags)}
+        figures = {
+            "written": self.written,
+            "clipped": self.clipped,
+            "underruns": max(outlet.underruns, self._port.flags),
+        }
         return figures | {"missing": outlet.missing, "dropped": self.dropped + outlet.ring.lost}
 
     def __exit__(self, *exc: object) -> None:
@@ -244,7 +269,9 @@ class LiveSink:
             self._port.close(drain=exc[0] is None)
             troubles = {name: count for name, count in self.stats().items() if count and name != "written"}
             if troubles:
-                self.notes.append("live output was not complete: " + ", ".join(f"{count} {name}" for name, count in troubles.items()))
+                self.notes.append(
+                    "live output was not complete: " + ", ".join(f"{count} {name}" for name, count in troubles.items())
+                )
 
 
 def play_and_record(
@@ -252,9 +279,10 @@ def play_and_record(
 ) -> Samples:
     """Play samples (n,) at 16 kHz and return what the microphone hears from the moment playing starts, (n + tail,) float32.
 
-    Both are on one sample counter up to a constant: the devices' buffers, and GUARD_S, appear as additional delay, so that
-    the sound never seems to be heard before it is played. Silence goes first, since sound servers swallow a stream's start.
-    Raises DeviceError where anything was lost on the way, since a calibration with a hole in it measures the hole.
+    Both are on one sample counter up to a constant: the devices' buffers, and GUARD_S, appear as additional delay, so
+    that the sound never seems to be heard before it is played. Silence goes first, since sound servers swallow a
+    stream's start. Raises DeviceError where anything was lost on the way, since a calibration with a hole in it
+    measures the hole.
     """
     sd = _sounddevice()
     mic = Input(sd, find(microphone, "input"))
@@ -287,8 +315,8 @@ def play_and_record(
         speaker.close()
     if mic.inlet.lost or mic.inlet.flags or speaker.flags:
         raise DeviceError(
-            f"the recording has holes: {mic.inlet.lost} samples lost, {mic.inlet.flags} overruns, {speaker.flags} underruns; "
-            "close other programs and measure again"
+            f"the recording has holes: {mic.inlet.lost} samples lost, {mic.inlet.flags} overruns, {speaker.flags}"
+            " underruns; close other programs and measure again"
         )
     first = round(begun[0] * SAMPLE_RATE / mic.rate + skipped)
     return np.concatenate(heard)[first : first + wanted]

@@ -13,8 +13,8 @@ _HEADER = 256  # bytes in which both formats' headers lie
 class Disk(io.RawIOBase):
     """A file in the making that stays whole on a full disk.
 
-    The encoders' libraries turn a failed write into an unnamed error and then leave a torn last frame behind. Here a write
-    that does not fit is undone and remembered in `error`, and from then on only the header may still be changed.
+    The encoders' libraries turn a failed write into an unnamed error and then leave a torn last frame behind. Here a
+    write that does not fit is undone and remembered in `error`, and from then on only the header may still be changed.
     """
 
     def __init__(self, path: Path) -> None:
@@ -81,9 +81,9 @@ class Disk(io.RawIOBase):
     def _repair_flac(self, start: bytes) -> None:
         """Put the number of samples that reached the disk into STREAMINFO (RFC 9639, 8.2).
 
-        It starts at byte 8 with the block size, holds the total in the low 36 bits of bytes 18-25 and the MD5 of the sound
-        in bytes 26-41, where zero means unknown. The encoder writes one frame at a time, and every frame but a stream's
-        last has the full size.
+        It starts at byte 8 with the block size, holds the total in the low 36 bits of bytes 18-25 and the MD5 of the
+        sound in bytes 26-41, where zero means unknown. The encoder writes one frame at a time, and every frame but a
+        stream's last has the full size.
         """
         total = self._flac_frames * int.from_bytes(start[8:10], "big")
         fields = int.from_bytes(start[18:26], "big") >> 36 << 36 | total

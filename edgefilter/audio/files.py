@@ -24,7 +24,9 @@ def open_source(path: str | Path, reference: str | Path | None = None) -> Source
     if str(path) != "-":
         return FileSource(path, reference)
     if reference is not None:
-        raise UsageError(f"'-' as input is stereo and already holds the reference, found a second one, {reference}: leave it out")
+        raise UsageError(
+            f"'-' as input is stereo and already holds the reference, found a second one, {reference}: leave it out"
+        )
     return PcmSource()
 
 
@@ -49,7 +51,9 @@ class FileSource:
         if self._mic.silent:
             self.notes.append(f"recording {mic_path} is silent: every sample is zero")
         if self._reference is None:
-            self.notes.append("no reference: nothing tells the robot's voice from the human's; give it with --reference")
+            self.notes.append(
+                "no reference: nothing tells the robot's voice from the human's; give it with --reference"
+            )
         else:
             self.notes += self._reference.notes + _length_notes(self._reference, self._mic.total)
 
@@ -79,10 +83,17 @@ def _length_notes(reference: Reader, total: int) -> list[str]:
     """What there is to say about a reference for a recording of total samples."""
     notes = []
     if reference.silent:
-        notes.append(f"reference {reference.path} is silent: every sample is zero, so nothing tells the robot's voice from the human's")
+        notes.append(
+            f"reference {reference.path} is silent: every sample is zero, so nothing tells the robot's voice from the"
+            " human's"
+        )
     difference = abs(reference.total - total)
     if difference:
-        how = "shorter than the recording; silence follows it" if reference.total < total else "longer than the recording; its end is not used"
+        how = (
+            "shorter than the recording; silence follows it"
+            if reference.total < total
+            else "longer than the recording; its end is not used"
+        )
         notes.append(f"reference {reference.path} is {difference} samples ({difference / SAMPLE_RATE:.3f} s) {how}")
     return notes
 
@@ -136,7 +147,9 @@ class FileSink:
         try:
             self._disk = Disk(self.path)
         except OSError as error:
-            raise AudioFileError(f"output {self.path} cannot be written: {error.strerror}; name a file in a writable directory") from None
+            raise AudioFileError(
+                f"output {self.path} cannot be written: {error.strerror}; name a file in a writable directory"
+            ) from None
         try:
             self._file: soundfile.SoundFile | None = soundfile.SoundFile(
                 self._disk, "w", SAMPLE_RATE, 1, "FLOAT" if float32 else "PCM_16", format=form
@@ -169,7 +182,10 @@ class FileSink:
         self.written += data.size
 
     def close(self, quiet: bool = False) -> None:
-        """Finish the file; a second call does nothing. quiet: another error is under way, do not cover it with a full disk."""
+        """Finish the file; a second call does nothing.
+
+        Quiet: another error is under way, do not cover it with a full disk.
+        """
         if self._file is None:
             return
         try:
@@ -185,7 +201,9 @@ class FileSink:
 
     def _full(self, error: OSError) -> AudioFileError:
         kept = f"; its first {self.written / SAMPLE_RATE:.1f} s or so are kept" if self.written else ""
-        return AudioFileError(f"output {self.path} cannot be written on: {error.strerror}{kept}; free some space or write elsewhere")
+        return AudioFileError(
+            f"output {self.path} cannot be written on: {error.strerror}{kept}; free some space or write elsewhere"
+        )
 
 
 class Recorder:
@@ -196,7 +214,9 @@ class Recorder:
         try:
             self.directory.mkdir(parents=True, exist_ok=True)
         except OSError as error:
-            raise AudioFileError(f"directory {self.directory} for the input cannot be made: {error.strerror}; name another") from None
+            raise AudioFileError(
+                f"directory {self.directory} for the input cannot be made: {error.strerror}; name another"
+            ) from None
         self._mic = FileSink(self.directory / "mic.wav", float32=True)
         try:
             self._reference = FileSink(self.directory / "reference.wav", float32=True)

@@ -44,7 +44,10 @@ def match(devices: Sequence[Device], wanted: str | int | Device | None, kind: st
         return wanted
     usable = [device for device in devices if device.channels(kind)]
     if not usable:
-        raise DeviceError(f"no sound device with an {kind} was found: connect one, or check that the sound server runs ('edgefilter devices')")
+        raise DeviceError(
+            f"no sound device with an {kind} was found: connect one, or check that the sound server runs ('edgefilter"
+            " devices')"
+        )
     text = "default" if wanted is None else str(wanted).strip()
     if text.isdigit():
         found = [device for device in usable if device.index == int(text)]
@@ -58,16 +61,18 @@ def match(devices: Sequence[Device], wanted: str | int | Device | None, kind: st
     if not found:
         raise UsageError(f"{kind} device '{text}' is unknown; expected one of {_names(usable)}")
     if len(found) > 1:
-        raise UsageError(f"{kind} device '{text}' is ambiguous; it matches {_names(found)}: give the number or more of the name")
+        raise UsageError(
+            f"{kind} device '{text}' is ambiguous; it matches {_names(found)}: give the number or more of the name"
+        )
     return found[0]
 
 
 def monitor(devices: Sequence[Device], output: Device) -> Device:
     """The input that hears what output plays, by the names that PulseAudio, PipeWire and Windows give it.
 
-    Understood are 'Monitor of NAME', NAME followed by 'monitor' ('.', '_', '-' or a space between) and 'NAME [Loopback]'.
-    For an output that only stands for another ('default', 'pulse', 'pipewire'), the single monitor there is.
-    Raises UsageError, one line, where there is none or more than one.
+    Understood are 'Monitor of NAME', NAME followed by 'monitor' ('.', '_', '-' or a space between) and 'NAME
+    [Loopback]'. For an output that only stands for another ('default', 'pulse', 'pipewire'), the single monitor there
+    is. Raises UsageError, one line, where there is none or more than one.
     """
     plain = _plain(output.name)
     names = {f"monitor of {plain}", f"{plain} monitor", f"{plain} loopback"}
@@ -78,10 +83,12 @@ def monitor(devices: Sequence[Device], output: Device) -> Device:
     if len(found) == 1:
         return found[0]
     if found:
-        raise UsageError(f"output '{output}' has more than one possible monitor, {_names(found)}: choose one with --reference")
+        raise UsageError(
+            f"output '{output}' has more than one possible monitor, {_names(found)}: choose one with --reference"
+        )
     raise UsageError(
-        f"output '{output}' has no monitor input that hears what the robot says: name an input with --reference, or define one "
-        "for PulseAudio or PipeWire in ~/.asoundrc: pcm.robot_monitor { type pulse device SINK.monitor }"
+        f"output '{output}' has no monitor input that hears what the robot says: name an input with --reference, or"
+        " define one for PulseAudio or PipeWire in ~/.asoundrc: pcm.robot_monitor { type pulse device SINK.monitor }"
     )
 
 

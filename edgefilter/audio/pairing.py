@@ -65,12 +65,14 @@ class Inlet:
 
 
 class Pairing:
-    """Pairs microphone and reference samples; the microphone's counter is the master and every one of its samples comes out.
+    """Pairs microphone and reference samples.
 
-    A microphone sample waits for its reference. After MAX_WAIT samples silence stands in (`filled`), and what arrives late for
-    those places is discarded, so that a stall does not shift the reference. If the counters differ by more than TOLERANCE throughout WINDOW,
-    the clocks differ or a driver lost samples: the reference is cut (`dropped`) or extended with silence (`inserted`) to meet
-    the counter again. Depends on the samples alone, not on the time of day.
+    The microphone's counter is the master and every one of its samples comes out.
+
+    A microphone sample waits for its reference. After MAX_WAIT samples silence stands in (`filled`), and what arrives
+    late for those places is discarded, so that a stall does not shift the reference. If the counters differ by more
+    than TOLERANCE throughout WINDOW, the clocks differ or a driver lost samples: the reference is cut (`dropped`) or
+    extended with silence (`inserted`) to meet the counter again. Depends on the samples alone, not on the time of day.
     """
 
     def __init__(self) -> None:

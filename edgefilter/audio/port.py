@@ -32,7 +32,10 @@ STREAM_LATENCY_S = 0.05
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Keep what the C libraries print about every attempt out of the terminal; their refusal comes back as an error code."""
+    """Keep what the C libraries print about every attempt out of the terminal.
+
+    Their refusal comes back as an error code.
+    """
     with OPENING:
         sys.stderr.flush()
         kept = os.dup(2)
@@ -56,7 +59,10 @@ class Port:
         self.rate, self.channels = self._settings()
         self.notes: list[str] = []
         if self.rate != SAMPLE_RATE:
-            self.notes.append(f"{kind} device '{self.device}' does not run at {SAMPLE_RATE} Hz: opened at {self.rate} Hz and resampled")
+            self.notes.append(
+                f"{kind} device '{self.device}' does not run at {SAMPLE_RATE} Hz: opened at {self.rate} Hz and"
+                " resampled"
+            )
         if self.channels > 1:
             how = "averaged" if kind == "input" else "get the same"
             self.notes.append(f"{kind} device '{self.device}' has no mono: {self.channels} channels {how}")
@@ -76,7 +82,10 @@ class Port:
                     return rate, channels
                 except (self._sd.PortAudioError, ValueError) as error:
                     refusal = refusal or _words(error)
-        raise DeviceError(f"{self.kind} device '{self.device}' cannot be opened at {SAMPLE_RATE} Hz or {self.device.rate:.0f} Hz: {refusal}")
+        raise DeviceError(
+            f"{self.kind} device '{self.device}' cannot be opened at {SAMPLE_RATE} Hz or {self.device.rate:.0f} Hz:"
+            f" {refusal}"
+        )
 
     def start(self, callback: Any) -> None:
         make = self._sd.InputStream if self.kind == "input" else self._sd.OutputStream
@@ -86,7 +95,9 @@ class Port:
                 self._stream = make(**settings, dtype="float32", latency=STREAM_LATENCY_S, callback=callback)
                 self._stream.start()
         except self._sd.PortAudioError as error:
-            raise DeviceError(f"{self.kind} device '{self.device}' cannot be started: {_words(error)}; is another program using it?") from None
+            raise DeviceError(
+                f"{self.kind} device '{self.device}' cannot be started: {_words(error)}; is another program using it?"
+            ) from None
 
     def check_alive(self, progress: int, patience_s: float = VANISHED_S) -> None:
         """Raise DeviceError once progress, samples or callbacks so far, has stood still for patience_s of the time that we were awake."""
@@ -96,8 +107,8 @@ class Port:
         self._heard = progress
         if self._silent_s > patience_s:
             raise DeviceError(
-                f"{self.kind} device '{self.device}' stopped (no sound for {patience_s:.0f} s: unplugged, or the sound server ended); "
-                "what came until then is kept: reconnect it and start again"
+                f"{self.kind} device '{self.device}' stopped (no sound for {patience_s:.0f} s: unplugged, or the sound"
+                " server ended); what came until then is kept: reconnect it and start again"
             )
 
     def close(self, drain: bool = False) -> None:
@@ -125,7 +136,9 @@ class Input(Port):
     def __init__(self, sounddevice: Any, device: Device) -> None:
         super().__init__(sounddevice, device, "input")
         self.inlet = Inlet(round(BUFFER_S * self.rate))
-        self._resampler = None if self.rate == SAMPLE_RATE else soxr.ResampleStream(self.rate, SAMPLE_RATE, 1, dtype="float32")
+        self._resampler = (
+            None if self.rate == SAMPLE_RATE else soxr.ResampleStream(self.rate, SAMPLE_RATE, 1, dtype="float32")
+        )
 
     def open(self) -> None:
         inlet = self.inlet
@@ -148,10 +161,12 @@ class Output(Port):
         self.flags = 0
         self.margin = round(margin_s * self.rate)
         self.outlet = Outlet(round((BUFFER_S + queued / SAMPLE_RATE) * self.rate) + self.margin, self.margin)
-        self._resampler = None if self.rate == SAMPLE_RATE else soxr.ResampleStream(SAMPLE_RATE, self.rate, 1, dtype="float32")
+        self._resampler = (
+            None if self.rate == SAMPLE_RATE else soxr.ResampleStream(SAMPLE_RATE, self.rate, 1, dtype="float32")
+        )
 
     def convert(self, samples: Samples, last: bool = False) -> Samples:
-        """samples (n,) at 16 kHz as samples at the device's rate."""
+        """Samples (n,) at 16 kHz as samples at the device's rate."""
         return samples if self._resampler is None else self._resampler.resample_chunk(samples, last=last)
 
     def open(self, before: Callable[[], None] = lambda: None) -> None:

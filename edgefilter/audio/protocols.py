@@ -11,9 +11,9 @@ from edgefilter.types import Block, Samples
 class Source(Protocol):
     """Where blocks come from: a context manager whose iterator ends with the recording, or after stop().
 
-    notes: what was done to the sound on its way in (converted, padded, dropped), one sentence each, for the user to read;
-    complete when the iteration has ended. total: samples per channel at 16 kHz, None if unknown beforehand.
-    lost: samples that were filled with silence or dropped so far. live: blocks arrive in real time.
+    notes: what was done to the sound on its way in (converted, padded, dropped), one sentence each, for the user to
+    read; complete when the iteration has ended. total: samples per channel at 16 kHz, None if unknown beforehand. lost:
+    samples that were filled with silence or dropped so far. live: blocks arrive in real time.
     """
 
     notes: list[str]

@@ -46,7 +46,10 @@ class PcmSource:
     def __init__(self, stream: BinaryIO | None = None) -> None:
         self._stream = sys.stdin.buffer if stream is None else stream
         if self._stream.isatty():
-            raise UsageError("'-' reads raw s16le 16 kHz stereo (microphone, reference) from a pipe, found a terminal: pipe sound into it")
+            raise UsageError(
+                "'-' reads raw s16le 16 kHz stereo (microphone, reference) from a pipe, found a terminal: pipe sound"
+                " into it"
+            )
         self.notes: list[str] = []
         self.total: int | None = None
         self.lost = 0
@@ -79,7 +82,8 @@ class PcmSource:
             self.notes.append(f"standard input ended in the middle of a sample: {cut}")
         if start == 0 and not self._stopped:
             raise AudioFileError(
-                "standard input held no sound, expected raw s16le 16 kHz stereo (microphone, reference): check the program before the pipe"
+                "standard input held no sound, expected raw s16le 16 kHz stereo (microphone, reference): check the"
+                " program before the pipe"
             )
         self.total = start
 
@@ -105,7 +109,10 @@ class PcmSink:
     def __init__(self, stream: BinaryIO | None = None) -> None:
         self._stream = sys.stdout.buffer if stream is None else stream
         if self._stream.isatty():
-            raise UsageError("'-' writes raw s16le 16 kHz mono, found a terminal: pipe it into a program or name a .wav or .flac file")
+            raise UsageError(
+                "'-' writes raw s16le 16 kHz mono, found a terminal: pipe it into a program or name a .wav or .flac"
+                " file"
+            )
         self.notes: list[str] = []
         self.finished = False
         self.written = 0

@@ -42,7 +42,9 @@ class Reader:
             length = self._scan(file)
         self.total = (2 * length * SAMPLE_RATE + self.rate) // (2 * self.rate)
         if self.total == 0:
-            raise self._error(f"holds {length} samples at {self.rate} Hz, expected at least one at {SAMPLE_RATE} Hz: record it again")
+            raise self._error(
+                f"holds {length} samples at {self.rate} Hz, expected at least one at {SAMPLE_RATE} Hz: record it again"
+            )
         self._note_conversion()
 
     def chunks(self) -> Iterator[Samples]:
@@ -80,26 +82,37 @@ class Reader:
             # as bytes: soundfile itself cannot encode a name that is no text
             return soundfile.SoundFile(self.path if sys.platform == "win32" else os.fsencode(self.path))
         except TypeError:  # a name that ends in .raw: soundfile would have to be told rate and format
-            raise self._error("has no header that says its rate; give raw s16le stereo (microphone, reference) on '-' instead") from None
+            raise self._error(
+                "has no header that says its rate; give raw s16le stereo (microphone, reference) on '-' instead"
+            ) from None
         except soundfile.LibsndfileError as error:
             with open(self.path, "rb") as file:
                 start = file.read(12)
             found = f"starts with {start!r}" if start.isascii() else f"starts with the bytes {start.hex(' ')}"
-            raise self._error(f"is not audio ({found}; {_reason(error)}), expected WAV, FLAC or Ogg: convert it") from None
+            raise self._error(
+                f"is not audio ({found}; {_reason(error)}), expected WAV, FLAC or Ogg: convert it"
+            ) from None
 
     def _check_header(self, file: soundfile.SoundFile) -> None:
         if self.rate not in _RATES:
-            raise self._error(f"says its rate is {self.rate} Hz, expected {_RATES.start} to {_RATES.stop - 1} Hz: its header is damaged")
+            raise self._error(
+                f"says its rate is {self.rate} Hz, expected {_RATES.start} to {_RATES.stop - 1} Hz: its header is"
+                " damaged"
+            )
         promised = re.search(r"^data\s*: (\d+) \(should be (\d+)\)", file.extra_info, re.MULTILINE)
         if promised and int(promised[1]) >= _ENDLESS:
-            self.notes.append(f"{self.role} {self.path}: its header gives no length (written to a pipe?); read to the end of the file")
+            self.notes.append(
+                f"{self.role} {self.path}: its header gives no length (written to a pipe?); read to the end of the file"
+            )
         elif promised:
             raise self._error(
                 f"is truncated: it holds {promised[2]} of the {promised[1]} bytes of sound that its header promises; "
                 "copy it again, or re-save what is there"
             )
         elif "without an End-Of-Stream flag" in file.extra_info:
-            raise self._error("is truncated: the Ogg stream stops before its end mark; copy it again, or re-save what is there")
+            raise self._error(
+                "is truncated: the Ogg stream stops before its end mark; copy it again, or re-save what is there"
+            )
 
     def _blocks(self, file: soundfile.SoundFile) -> Iterator[Array]:
         """Yield (n, channels) float32 until the end; a decoder that gives up is an error with its place."""
@@ -110,7 +123,8 @@ class Reader:
                 data = file.read(size, dtype="float32", always_2d=True)
             except soundfile.LibsndfileError as error:
                 raise self._error(
-                    f"is truncated or damaged after {done / self.rate:.2f} s of {file.frames / self.rate:.2f} s ({_reason(error)}): copy it again"
+                    f"is truncated or damaged after {done / self.rate:.2f} s of {file.frames / self.rate:.2f} s"
+                    f" ({_reason(error)}): copy it again"
                 ) from None
             if not len(data):
                 return
@@ -123,7 +137,9 @@ class Reader:
         for data in self._blocks(file):
             if not np.isfinite(data).all():
                 at, channel = (int(i) for i in np.argwhere(~np.isfinite(data))[0])
-                where = f"at sample {length + at} ({(length + at) / self.rate:.3f} s)" + (f" of channel {channel + 1}" if self.channels > 1 else "")
+                where = f"at sample {length + at} ({(length + at) / self.rate:.3f} s)" + (
+                    f" of channel {channel + 1}" if self.channels > 1 else ""
+                )
                 raise self._error(f"holds {data[at, channel]} {where}, expected finite samples: repair or cut it")
             if np.abs(data).max() > _LOUDEST:
                 loudest = data.flat[np.abs(data).argmax()]
@@ -133,7 +149,9 @@ class Reader:
         if length == 0:
             raise self._error("is empty (a header and 0 samples), expected sound: record it again")
         if length < file.frames:
-            raise self._error(f"is truncated: it holds {length} of the {file.frames} samples that its header promises; copy it again")
+            raise self._error(
+                f"is truncated: it holds {length} of the {file.frames} samples that its header promises; copy it again"
+            )
         return length
 
     def _note_conversion(self) -> None:

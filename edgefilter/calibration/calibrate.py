@@ -33,7 +33,8 @@ def calibrate(
     Parameters
     ----------
     sweep_reference : ndarray of float, shape (n,)
-        An exponential sweep as it was played, with silence around it (`generate_sweep`). All three at 16 kHz, full scale +-1.
+        An exponential sweep as it was played, with silence around it (`generate_sweep`). All three at 16 kHz, full
+        scale +-1.
     sweep_recording : ndarray of float, shape (m,)
         What the microphone heard, on the same sample counter to within -2000 samples and 1.6 s.
     noise_recording : ndarray of float, shape (k,)
@@ -51,13 +52,13 @@ def calibrate(
     Raises
     ------
     CalibrationError
-        Where there is nothing to measure: the recording does not contain the sweep, is silent, far too short or not finite, or the
-        reference is no exponential sweep.
+        Where there is nothing to measure: the recording does not contain the sweep, is silent, far too short or not
+        finite, or the reference is no exponential sweep.
 
     Notes
     -----
-    Deconvolution by an exponential sweep, Farina (2000), harmonics apart as in Novak et al. (2015); the response of each frequency as in
-    Li, Hindriks & Kunneman (2024), eq. (3) to (5).
+    Deconvolution by an exponential sweep, Farina (2000), harmonics apart as in Novak et al. (2015); the response of
+    each frequency as in Li, Hindriks & Kunneman (2024), eq. (3) to (5).
 
     Examples
     --------
@@ -69,7 +70,11 @@ def calibrate(
     >>> profile.delay, round(float(profile.response[100]), 2)
     (300.0, 0.5)
     """
-    named = {"the sweep reference": sweep_reference, "the sweep recording": sweep_recording, "the noise recording": noise_recording}
+    named = {
+        "the sweep reference": sweep_reference,
+        "the sweep recording": sweep_recording,
+        "the noise recording": noise_recording,
+    }
     reference, recording, noise = (_samples(x, name) for name, x in named.items())
     law = stepped_law(reference) if stepped_sine else sweep_law(reference)
     check_lengths(law, recording, noise)
@@ -114,8 +119,9 @@ def fan_psd(noise: Samples) -> Samples:
 def impulse_response(result: Deconvolution, direct: int) -> Samples:
     """(MIN_TAPS to MAX_TAPS,) float32 from PRE_ROLL before the direct sound to where the decay has sunk into the fan.
 
-    The knee is the first 20 ms in which the response is not 3 dB above what the fan leaves there. The response is kept to 50 ms
-    beyond it, at least MIN_TAPS, and faded by half a cosine from the knee (at most the last quarter where there is none) to the end.
+    The knee is the first 20 ms in which the response is not 3 dB above what the fan leaves there. The response is kept
+    to 50 ms beyond it, at least MIN_TAPS, and faded by half a cosine from the knee (at most the last quarter where
+    there is none) to the end.
     """
     path = result.cut(direct - PRE_ROLL, MAX_TAPS)
     block = SAMPLE_RATE // 50
@@ -133,7 +139,8 @@ def impulse_response(result: Deconvolution, direct: int) -> Samples:
 def band_snr_db(result: Deconvolution, path: Samples, bands: Array) -> Array:
     """(B,) dB, the energy of the sweep's coherent part in each band over that of the fan in a window as long as the response.
 
-    The coherent part is what the impulse response predicts, less what the fan itself put into it; limited to -20 to 120 dB.
+    The coherent part is what the impulse response predicts, less what the fan itself put into it; limited to -20 to 120
+    dB.
     """
     energy = result.spectrum(path) * result.source_energy
     fan = path.size * result.noise_psd

@@ -16,18 +16,21 @@ from edgefilter.types import PRE_ROLL, SAMPLE_RATE, Array, Samples
 Law = SweepLaw | SteppedLaw
 LOW_SNR_DB = 10.0
 SPEECH_HZ = (110.0, 7200.0)
-"""Bands that a warning is about; a small loudspeaker radiates nothing below them, and that is no fault of the calibration."""
+"""Bands that a warning is about; a small loudspeaker radiates nothing below them, and that is no fault of the
+calibration."""
 
 
 def check_lengths(law: Law, recording: Samples, noise: Samples) -> None:
     """Raise CalibrationError for recordings with too little in them to start."""
     if noise.size < SAMPLE_RATE // 2:
-        raise CalibrationError(f"the noise recording is {noise.size / SAMPLE_RATE:.2f} s long, expected at least 0.5 s of the fan alone")
+        raise CalibrationError(
+            f"the noise recording is {noise.size / SAMPLE_RATE:.2f} s long, expected at least 0.5 s of the fan alone"
+        )
     middle = law.time(1000.0)
     if recording.size < middle:
         raise CalibrationError(
-            f"the sweep recording is {recording.size / SAMPLE_RATE:.2f} s long and ends before the sweep reaches 1 kHz, "
-            f"expected at least {law.stop / SAMPLE_RATE:.2f} s: record the whole sweep"
+            f"the sweep recording is {recording.size / SAMPLE_RATE:.2f} s long and ends before the sweep reaches 1 kHz,"
+            f" expected at least {law.stop / SAMPLE_RATE:.2f} s: record the whole sweep"
         )
     if np.max(np.abs(recording)) == 0.0:
         raise CalibrationError("the sweep recording is silent, every sample 0: is the microphone muted?")
@@ -36,15 +39,15 @@ def check_lengths(law: Law, recording: Samples, noise: Samples) -> None:
 def check_found(result: Deconvolution, direct: int) -> None:
     """Raise CalibrationError unless the deconvolved response has one clear arrival.
 
-    Its peak over its root mean square in the range of lags: 30 to 160 measured where the recording holds the sweep, down to a
-    sweep 15 dB below the fan; 2 to 10 for speech, noise, tones and other sweeps.
+    Its peak over its root mean square in the range of lags: 30 to 160 measured where the recording holds the sweep,
+    down to a sweep 15 dB below the fan; 2 to 10 for speech, noise, tones and other sweeps.
     """
     nearby = result.cut(EARLIEST_DIRECT, LATEST_DIRECT - EARLIEST_DIRECT)
     contrast = abs(result.response[direct]) / max(float(np.sqrt(np.mean(nearby**2))), 1e-30)
     if not contrast > 18.0:
         raise CalibrationError(
-            f"the sweep recording does not contain the sweep: the best match stands out {contrast:.0f} times, expected at least 18; "
-            "is it the right file, and was the robot loud enough?"
+            f"the sweep recording does not contain the sweep: the best match stands out {contrast:.0f} times, expected"
+            " at least 18; is it the right file, and was the robot loud enough?"
         )
 
 
@@ -99,7 +102,10 @@ def short_recording(law: Law, recording: Samples, direct: int) -> str | None:
     if missing <= 0:
         return None
     edge = min(float(law.frequency(recording.size - direct - SAMPLE_RATE // 5)), law.high_hz)
-    return f"too short: the recording ends {missing / SAMPLE_RATE:.2f} s early, {edge:.0f}-{law.high_hz:.0f} Hz is missing or cut off"
+    return (
+        f"too short: the recording ends {missing / SAMPLE_RATE:.2f} s early, {edge:.0f}-{law.high_hz:.0f} Hz is missing"
+        " or cut off"
+    )
 
 
 def low_snr(bands: Array, snr: Array) -> str | None:
@@ -122,13 +128,19 @@ def quiet(recording: Samples) -> str | None:
     level = float(np.max(np.abs(recording)))
     if level >= 0.01:
         return None
-    return f"too quiet: the recording peaks at {20 * np.log10(level):.0f} dB of full scale, expected above -40 dB, in all bands"
+    return (
+        f"too quiet: the recording peaks at {20 * np.log10(level):.0f} dB of full scale, expected above -40 dB, in all"
+        " bands"
+    )
 
 
-def disturbed(law: Law, reference: Samples, recording: Samples, noise: Samples, result: Deconvolution, direct: int) -> str | None:
+def disturbed(
+    law: Law, reference: Samples, recording: Samples, noise: Samples, result: Deconvolution, direct: int
+) -> str | None:
     """Something else in a sweep's recording: quarter seconds in which neither the path nor its harmonics explain the sound.
 
-    What remains has to exceed the fan by 10 dB, a sixth of the explained power there, and the loudest quarter second less 25 dB.
+    What remains has to exceed the fan by 10 dB, a sixth of the explained power there, and the loudest quarter second
+    less 25 dB.
     """
     if not isinstance(law, SweepLaw):
         return None
@@ -151,19 +163,21 @@ def disturbed(law: Law, reference: Samples, recording: Samples, noise: Samples, 
         return None
     hz = np.clip(law.frequency(bad * block + block / 2 - direct), law.low_hz, law.high_hz)
     return (
-        f"something else than the sweep sounds in {bad.size * 0.25:.2f} s of the recording (from {bad[0] * 0.25:.2f} s on), "
-        f"while the sweep was at {hz.min():.0f}-{hz.max():.0f} Hz; calibrate again in silence"
+        f"something else than the sweep sounds in {bad.size * 0.25:.2f} s of the recording (from {bad[0] * 0.25:.2f} s"
+        f" on), while the sweep was at {hz.min():.0f}-{hz.max():.0f} Hz; calibrate again in silence"
     )
 
 
 def early_arrivals(result: Deconvolution, path: Samples, direct: int) -> str | None:
     """Sound that reaches the microphone too far ahead of the strongest arrival to be kept."""
-    lost = float(np.sum(result.cut(direct - PRE_ROLL - 480, 480) ** 2)) / max(float(np.sum(path.astype(np.float64) ** 2)), 1e-30)
+    lost = float(np.sum(result.cut(direct - PRE_ROLL - 480, 480) ** 2)) / max(
+        float(np.sum(path.astype(np.float64) ** 2)), 1e-30
+    )
     if lost < 0.003:
         return None
     return (
-        f"{10 * np.log10(lost):.0f} dB of the robot's voice, in all bands, arrives more than {PRE_ROLL} samples before its "
-        "strongest part and is not in the impulse response"
+        f"{10 * np.log10(lost):.0f} dB of the robot's voice, in all bands, arrives more than {PRE_ROLL} samples before"
+        " its strongest part and is not in the impulse response"
     )
 
 
@@ -171,18 +185,30 @@ def doubtful_noise(reference: Samples, noise: Samples, result: Deconvolution, di
     """A noise recording that is short, silent, unsteady, or contains the robot."""
     texts = []
     if noise.size < 2 * SAMPLE_RATE:
-        texts.append(f"the noise recording is only {noise.size / SAMPLE_RATE:.1f} s long, expected 5 s: the fan is known roughly, in all bands")
+        texts.append(
+            f"the noise recording is only {noise.size / SAMPLE_RATE:.1f} s long, expected 5 s: the fan is known"
+            " roughly, in all bands"
+        )
     if np.max(np.abs(noise)) == 0.0:
-        return [*texts, "the noise recording is silent, every sample 0: signal-to-noise ratios mean nothing, in all bands"]
+        return [
+            *texts,
+            "the noise recording is silent, every sample 0: signal-to-noise ratios mean nothing, in all bands",
+        ]
     again = deconvolve(reference, noise, np.full(2, 1e-10), np.array([0.0, SAMPLE_RATE / 2]), 6400)
     nearby = np.abs(again.cut(EARLIEST_DIRECT, LATEST_DIRECT - EARLIEST_DIRECT))
     if nearby.max() > 18.0 * np.sqrt(np.mean(nearby**2)):
-        return [*texts, "the noise recording contains the sweep: record the fan while the robot is silent; noise is overstated in all bands"]
+        return [
+            *texts,
+            (
+                "the noise recording contains the sweep: record the fan while the robot is silent; noise is overstated"
+                " in all bands"
+            ),
+        ]
     shape, share, high = _unsteady(noise)
     if shape > 6.0:
         texts.append(
-            f"the noise recording is not steady: {share:.0f} % of it stands out, by up to {shape:.0f} dB around {high:.0f} Hz; "
-            "a voice or a bang? record the fan alone"
+            f"the noise recording is not steady: {share:.0f} % of it stands out, by up to {shape:.0f} dB around"
+            f" {high:.0f} Hz; a voice or a bang? record the fan alone"
         )
     return texts
 

@@ -23,9 +23,11 @@ from edgefilter.types import PRE_ROLL, SAMPLE_RATE, Samples
 SOURCE = "made from the recording itself: what is stationary and linear is taken for the robot"
 TAPS = 4096
 STANDS_OUT = 8.0
-"""Times the root mean square of all lags that the true one reaches; 4.5 measured where there is no robot, 10 to 87 where there is."""
+"""Times the root mean square of all lags that the true one reaches; 4.5 measured where there is no robot, 10 to 87
+where there is."""
 LEAST_DROP_DB, OTHERS_DB = 3.0, 6.0
-"""What the path must take away of its best fifth of unseen blocks, and how far above the robot something is that is not the robot's."""
+"""What the path must take away of its best fifth of unseen blocks, and how far above the robot something is that is not
+the robot's."""
 WINDOW, UPSAMPLED = SAMPLE_RATE, 4
 MAX_PPM, PPM_STEP, DRIFT_REACH = 400.0, 2.0, 400
 DRIFT_GAIN = 1.1
@@ -64,10 +66,10 @@ def self_calibrate(recording: Samples, reference: Samples) -> Profile:
 
     Notes
     -----
-    The path is a regularised least-squares filter on every other half second, those that a diagnosis fits on, so that the others say
-    how well it predicts. Samples weigh the less the more the first fit leaves of them (iteratively reweighted least squares, Huber
-    1981), so that a talker does not bend it. The fan is what the robot's silences hold. Stationary linear effects are in it at their
-    neutral values, so that no search claims them.
+    The path is a regularised least-squares filter on every other half second, those that a diagnosis fits on, so that
+    the others say how well it predicts. Samples weigh the less the more the first fit leaves of them (iteratively
+    reweighted least squares, Huber 1981), so that a talker does not bend it. The fan is what the robot's silences hold.
+    Stationary linear effects are in it at their neutral values, so that no search claims them.
 
     Examples
     --------
@@ -116,23 +118,26 @@ def _with_absorbed(echo: EchoModel) -> EchoModel:
 def find_lag(recording: Samples, reference: Samples) -> int:
     """Samples by which recording (n,) lags behind reference (n,), from their generalised cross-correlation (Knapp & Carter 1976, PHAT).
 
-    Both spectra are flattened, so that a talker who is louder than the robot does not hide it. Raises SignalError where no lag
-    stands out: the highest of independent values at all lags is 4 to 5 times their root mean square.
+    Both spectra are flattened, so that a talker who is louder than the robot does not hide it. Raises SignalError where
+    no lag stands out: the highest of independent values at all lags is 4 to 5 times their root mean square.
     """
     n = fft.next_fast_len(2 * recording.size, real=True)
-    near = np.abs(correlation_near(flat_cross(reference, recording, n), n, min(int(MAX_OFFSET * SAMPLE_RATE), recording.size - 1)))
+    near = np.abs(
+        correlation_near(flat_cross(reference, recording, n), n, min(int(MAX_OFFSET * SAMPLE_RATE), recording.size - 1))
+    )
     lag, height = highest(near)
     if not height > STANDS_OUT:
         level = decibels(np.mean(np.square(reference, dtype=np.float64)))
         raise SignalError(
-            f"the recording does not contain the reference (of {level:.0f} dBFS) at any lag up to {MAX_OFFSET:g} s, so there is no robot in it "
-            "to learn from: give a recording in which the robot talks, or a calibration (--profile)"
+            f"the recording does not contain the reference (of {level:.0f} dBFS) at any lag up to {MAX_OFFSET:g} s, so"
+            " there is no robot in it to learn from: give a recording in which the robot talks, or a calibration"
+            " (--profile)"
         )
     return lag
 
 
 def _drifting(x: Samples, ppm: float) -> Samples:
-    """x (n,) read at a clock that is ppm faster."""
+    """X (n,) read at a clock that is ppm faster."""
     n = np.arange(x.size)
     return interpolate(x, n + 1e-6 * ppm * n) if ppm else x
 
@@ -140,8 +145,8 @@ def _drifting(x: Samples, ppm: float) -> Samples:
 def find_drift(recording: Samples, reference: Samples) -> tuple[float, int]:
     """(ppm, lag): the line along which recording (n,) lags behind reference (n,), and where it starts, in parts of a million and samples.
 
-    Of all lines of up to MAX_PPM the one on which the correlations of windows of a second, spectra flattened, add up to most; 0 ppm
-    where it brings less than DRIFT_GAIN of what no drift does. Lags of up to DRIFT_REACH.
+    Of all lines of up to MAX_PPM the one on which the correlations of windows of a second, spectra flattened, add up to
+    most; 0 ppm where it brings less than DRIFT_GAIN of what no drift does. Lags of up to DRIFT_REACH.
     """
     size, part = 4 * WINDOW, slice(2 * WINDOW, 3 * WINDOW)
     padded = np.pad(reference, (2 * WINDOW, 2 * WINDOW))
@@ -152,13 +157,22 @@ def find_drift(recording: Samples, reference: Samples) -> tuple[float, int]:
         heard = np.zeros(size)
         heard[part] = recording[start : start + WINDOW]
         cross = flat_cross(padded[start : start + size], heard, size)
-        row[:] = np.take(fft.irfft(np.pad(cross, (0, (UPSAMPLED - 1) * size // 2)), UPSAMPLED * size), near, mode="wrap")
+        row[:] = np.take(
+            fft.irfft(np.pad(cross, (0, (UPSAMPLED - 1) * size // 2)), UPSAMPLED * size), near, mode="wrap"
+        )
     grid = np.arange(-MAX_PPM, MAX_PPM + PPM_STEP, PPM_STEP)
     middles = starts + WINDOW / 2
     sums = []
     for ppm in grid:
         moves = np.round(-ppm * 1e-6 * middles * UPSAMPLED).astype(int)
-        sums.append(np.abs(sum(np.take(row, np.arange(near.size) + move, mode="wrap") for row, move in zip(rows, moves, strict=True))))
+        sums.append(
+            np.abs(
+                sum(
+                    np.take(row, np.arange(near.size) + move, mode="wrap")
+                    for row, move in zip(rows, moves, strict=True)
+                )
+            )
+        )
     heights = np.array([line.max() for line in sums])
     best = int(np.argmax(heights))
     if heights[best] < DRIFT_GAIN * heights[grid.size // 2]:
@@ -179,7 +193,8 @@ def silences(reference: Samples) -> NDArray[np.bool_]:
 def fan_in_silences(recording: Samples, silent: NDArray[np.bool_]) -> tuple[Samples, float]:
     """PSD (601,) float32 of the quieter half of the silent frames, and how many seconds those are.
 
-    Where silent (n,) leaves fewer than LEAST_FRAMES, the quietest twentieth of all frames is taken, and 0 seconds are said.
+    Where silent (n,) leaves fewer than LEAST_FRAMES, the quietest twentieth of all frames is taken, and 0 seconds are
+    said.
     """
     step = GRID_FFT // 2
     power = periodograms(recording, GRID_FFT)
@@ -200,7 +215,8 @@ def disturbance(residual: Samples) -> Samples:
 def fit_path(sound: Samples, target: Samples, weights: Samples, peak: float) -> Samples:
     """(TAPS,) path from sound to target (n,), both whitened, weights (n,), peak: the square of the direct sound's tap.
 
-    The penalty supposes a decay; the one of DECAYS_S is kept whose fit to three quarters of the weighted samples predicts the rest best.
+    The penalty supposes a decay; the one of DECAYS_S is kept whose fit to three quarters of the weighted samples
+    predicts the rest best.
     """
     rest = np.arange(target.size) // (BLOCK // 4) % 4 == 3
 
@@ -215,7 +231,10 @@ def fit_path(sound: Samples, target: Samples, weights: Samples, peak: float) -> 
 
 
 def decay_prior(seconds: float, peak: float) -> Samples:
-    """(TAPS,) expected squares: the direct sound's, and from 2 ms on 15 dB less, falling by 60 dB in that time; before it 25 dB less."""
+    """(TAPS,) expected squares: the direct sound's, and from 2 ms on 15 dB less, falling by 60 dB in that time.
+
+    Before it 25 dB less.
+    """
     at = np.arange(TAPS) - PRE_ROLL
     late = 10**-1.5 * 10 ** (-6 * np.maximum(at, 0) / (seconds * SAMPLE_RATE))
     return peak * np.where(at < -16, 10**-2.5, np.where(at < 32, 1.0, late))
@@ -237,8 +256,9 @@ def _check_learned(target: Samples, predicted: Samples, fit: Samples, delay: flo
         return
     clocks = f", clocks {abs(ppm):.0f} ppm apart" if ppm else ""
     raise SignalError(
-        f"the robot is in the recording (lag {1000 * delay / SAMPLE_RATE:.0f} ms{clocks}) but too faint beside what else is heard to learn its path "
-        "from: does a human talk nearly all the time? give a recording in which the robot talks alone, or a calibration (--profile)"
+        f"the robot is in the recording (lag {1000 * delay / SAMPLE_RATE:.0f} ms{clocks}) but too faint beside what"
+        " else is heard to learn its path from: does a human talk nearly all the time? give a recording in which the"
+        " robot talks alone, or a calibration (--profile)"
     )
 
 
@@ -255,12 +275,18 @@ def others(target: Samples, predicted: Samples) -> list[tuple[float, float]]:
 
 
 def _warnings(seconds: float, talk: list[tuple[float, float]]) -> list[str]:
-    told = ["no calibration: a gain, a band limit, a resonance and the room's reverberation are part of the path made here and cannot be told"]
+    told = [
+        "no calibration: a gain, a band limit, a resonance and the room's reverberation are part of the path made here"
+        " and cannot be told"
+    ]
     if seconds == 0.0:
         told.append("the robot is hardly silent here: the quietest moments of the recording stand for the fan")
     elif seconds < 0.5:
         told.append(f"only {seconds:.1f} s of the robot's silence: the fan is known roughly")
     if talk:
         spans = ", ".join(f"{begin:.1f} to {end:.1f} s" for begin, end in talk)
-        told.append(f"a human talks, or something else louder than the robot sounds, at {spans}: what is left there is not the robot's")
+        told.append(
+            f"a human talks, or something else louder than the robot sounds, at {spans}: what is left there is not the"
+            " robot's"
+        )
     return told

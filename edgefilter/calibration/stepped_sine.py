@@ -58,7 +58,10 @@ class SteppedLaw:
 
 
 def stepped_law(reference: Samples) -> SteppedLaw:
-    """Recognise the stepped sine of generate_stepped_sine() at any level and place; raise CalibrationError where there is none."""
+    """Recognise the stepped sine of generate_stepped_sine() at any level and place.
+
+    Raise CalibrationError where there is none.
+    """
     pattern = generate_stepped_sine(1.0, 0.0, 0.0).astype(np.float64)
     energy = float(np.sum(reference.astype(np.float64) ** 2))
     if reference.size >= pattern.size and energy > 0:
@@ -77,14 +80,17 @@ def response_from_stepped_sine(
 ) -> tuple[Samples, Array]:
     """|H_m(f) H_s(f)| (601,) float32 and the harmonic distortion (len(orders),) dB, from a recording of the stepped sine.
 
-    Eq. (3)-(5) of the paper step by step: (|X_m(f)| - |N(f)|) / |A(f)| with one Hann frame of 1200 samples at the end of each step,
-    delay samples later in the recording, |N(f)| the mean magnitude of the fan in such a frame, negative differences set to 0.
-    Between the steps the response is interpolated; the 0 Hz step is silent, so it is 0 there. Steps beyond the end of the recording
-    read 0. Distortion of order k: energy at k f over the energy at f, steps from 104 Hz on, the fan's energy subtracted.
+    Eq. (3)-(5) of the paper step by step: (|X_m(f)| - |N(f)|) / |A(f)| with one Hann frame of 1200 samples at the end
+    of each step, delay samples later in the recording, |N(f)| the mean magnitude of the fan in such a frame, negative
+    differences set to 0. Between the steps the response is interpolated; the 0 Hz step is silent, so it is 0 there.
+    Steps beyond the end of the recording read 0. Distortion of order k: energy at k f over the energy at f, steps from
+    104 Hz on, the fan's energy subtracted.
     """
     ends = law.start + STEP_SAMPLES * np.arange(1, STEPS_HZ.size + 1)
     at = ends[:, None] + np.arange(-FRAME, 0)
-    padded = np.pad(recording.astype(np.float64), (0, max(0, int(ends[-1]) + delay - recording.size)))[np.maximum(at + delay, 0)]
+    padded = np.pad(recording.astype(np.float64), (0, max(0, int(ends[-1]) + delay - recording.size)))[
+        np.maximum(at + delay, 0)
+    ]
     grid = np.arange(FRAME // 2 + 1) * SAMPLE_RATE / FRAME
     fan, fan_power = mean_magnitude(noise), np.mean(power(_frames(noise)), axis=0)
     played = _tone_magnitude(reference[at].astype(np.float64), STEPS_HZ)
@@ -94,7 +100,9 @@ def response_from_stepped_sine(
     levels = []
     for order in orders:
         use = (STEPS_HZ >= 104.0) & (STEPS_HZ * order < 7600.0)
-        excess = _tone_magnitude(padded[use], order * STEPS_HZ[use]) ** 2 - np.interp(order * STEPS_HZ[use], grid, fan_power)
+        excess = _tone_magnitude(padded[use], order * STEPS_HZ[use]) ** 2 - np.interp(
+            order * STEPS_HZ[use], grid, fan_power
+        )
         levels.append(10 * np.log10(max(excess.sum() / max(np.sum(heard[use] ** 2), 1e-30), 1e-10)))
     return np.interp(grid, STEPS_HZ, response).astype(np.float32), np.array(levels)
 
@@ -111,11 +119,13 @@ def mean_magnitude(samples: Samples) -> Array:
 
 
 def response_from_sweep(reference: Samples, recording: Samples, noise: Samples, delay: int) -> Samples:
-    """The paper's |H_m(f) H_s(f)| (601,) float32, eq. (3)-(5), from any sweep: sum_t (|X_m(t,f)| - |N(f)|) / sum_t |A(t,f)|.
+    """The paper's |H_m(f) H_s(f)| (601,) float32, eq.
 
-    Hann frames of 1200 samples, hop 160; for each bin, those frames t in which the reference, delayed by delay samples, is within
-    20 dB of its maximum in that bin. Negative sums are set to 0, and so are bins in which the sweep has no energy
-    (60 dB below its strongest bin). Reverberation that outlasts the frame is not part of this reading.
+    (3)-(5), from any sweep: sum_t (|X_m(t,f)| - |N(f)|) / sum_t |A(t,f)|.
+
+    Hann frames of 1200 samples, hop 160; for each bin, those frames t in which the reference, delayed by delay samples,
+    is within 20 dB of its maximum in that bin. Negative sums are set to 0, and so are bins in which the sweep has no
+    energy (60 dB below its strongest bin). Reverberation that outlasts the frame is not part of this reading.
     """
     played = np.abs(_frames(np.pad(reference, (max(delay, 0), 0))[max(-delay, 0) :]))
     heard = np.abs(_frames(recording))

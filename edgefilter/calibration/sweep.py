@@ -35,8 +35,8 @@ def generate_sweep(seconds: float = 6.0, amplitude: float = 0.35, lead_s: float 
 
     Notes
     -----
-    x(t) = amplitude sin(2 pi f1 T (e^(t/T) - 1)), T = seconds / ln(f2 / f1) (Farina 2000, eq. 5), f1 T rounded to a whole number so
-    that harmonics separate with a defined phase (Novak et al. 2015, eq. 37).
+    x(t) = amplitude sin(2 pi f1 T (e^(t/T) - 1)), T = seconds / ln(f2 / f1) (Farina 2000, eq. 5), f1 T rounded to a
+    whole number so that harmonics separate with a defined phase (Novak et al. 2015, eq. 37).
 
     Examples
     --------
@@ -80,11 +80,15 @@ def sweep_law(reference: Samples) -> SweepLaw:
     """Recognise an exponential sweep; raise CalibrationError where reference is none."""
     level = float(np.max(np.abs(reference), initial=0.0))
     if level < 1e-3:
-        raise CalibrationError(f"the sweep reference peaks at {level:.1g}, expected a sweep of at least 0.001: is it the right file?")
+        raise CalibrationError(
+            f"the sweep reference peaks at {level:.1g}, expected a sweep of at least 0.001: is it the right file?"
+        )
     active = np.flatnonzero(np.abs(reference) > 0.02 * level)
     start, stop = int(active[0]), int(active[-1]) + 1
     if stop - start < SAMPLE_RATE // 2:
-        raise CalibrationError(f"the sweep reference sounds for {(stop - start) / SAMPLE_RATE:.2f} s, expected at least 0.5 s of sweep")
+        raise CalibrationError(
+            f"the sweep reference sounds for {(stop - start) / SAMPLE_RATE:.2f} s, expected at least 0.5 s of sweep"
+        )
     phase = np.unwrap(np.angle(signal.hilbert(reference[start:stop])))
     step = (stop - start) // 400
     middle = np.arange(step * 20, stop - start - step * 20, step)
@@ -142,9 +146,9 @@ class Deconvolution:
 def deconvolve(reference: Samples, recording: Samples, noise_psd: Array, noise_hz: Array, taps: int) -> Deconvolution:
     """Divide recording by reference in frequency, as far as the fan allows.
 
-    noise_psd: one-sided PSD of the fan at noise_hz. lambda(f) = taps P_nn(f) / P_hh(f) is the Wiener solution for a response of
-    that many taps with the fan as the only noise; P_hh is a first estimate smoothed over a sixth of an octave (Kirkeby & Nelson
-    1999 give the regularised inverse, without the choice of lambda).
+    noise_psd: one-sided PSD of the fan at noise_hz. lambda(f) = taps P_nn(f) / P_hh(f) is the Wiener solution for a
+    response of that many taps with the fan as the only noise; P_hh is a first estimate smoothed over a sixth of an
+    octave (Kirkeby & Nelson 1999 give the regularised inverse, without the choice of lambda).
     """
     n = fft.next_fast_len(reference.size + recording.size, real=True)
     source = fft.rfft(reference.astype(np.float64), n)
@@ -182,8 +186,9 @@ def _smooth(power: Array, frequencies: Array) -> Array:
 def harmonic_distortion(result: Deconvolution, direct: int, law: SweepLaw, orders: tuple[int, ...]) -> Array:
     """Harmonic distortion (len(orders),) dB: energy of each order's response at k f over the linear one at f, the fan subtracted.
 
-    The response of order k arrives T ln k before the linear one (Farina 2000, eq. 14). f runs from 100 Hz (or the sweep's start)
-    to 95 % of the sweep's end over k. What the fan hides reads at most as the fan's own share, and at least -100 dB.
+    The response of order k arrives T ln k before the linear one (Farina 2000, eq. 14). f runs from 100 Hz (or the
+    sweep's start) to 95 % of the sweep's end over k. What the fan hides reads at most as the fan's own share, and at
+    least -100 dB.
     """
     linear = result.spectrum(result.cut(direct - 128, 4096))
     frequencies = result.frequencies

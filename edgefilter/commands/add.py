@@ -23,18 +23,32 @@ def main(args: argparse.Namespace) -> int:
     fitted.save(args.output)
     values = dict(fitted.echo.effects)[args.effect]
     if args.json:
-        figures = {"schema": 1, "effect": args.effect, "excess_before_db": before.excess_db, "excess_after_db": after.excess_db}
+        figures = {
+            "schema": 1,
+            "effect": args.effect,
+            "excess_before_db": before.excess_db,
+            "excess_after_db": after.excess_db,
+        }
         figures["this_recording_only"] = effect.event
         parameters = {p.name: {"value": np.asarray(values[p.name]).tolist(), "unit": p.unit} for p in effect.told}
-        write_json({**figures, "noise_floor_db": before.noise_floor_db, "parameters": parameters, "output": args.output}, args.json)
+        write_json(
+            {**figures, "noise_floor_db": before.noise_floor_db, "parameters": parameters, "output": args.output},
+            args.json,
+        )
     if args.json != "-":
-        print(f"{args.effect} added: {before.excess_db:.1f} dB over the noise floor before, {after.excess_db:.1f} dB after")
+        print(
+            f"{args.effect} added: {before.excess_db:.1f} dB over the noise floor before, {after.excess_db:.1f} dB"
+            " after"
+        )
         for p in effect.told:
             value = np.asarray(values[p.name])
             shown = f"{value.size} values" if value.size > 6 else ", ".join(figure(v) for v in value.ravel())
             print(f"  {p.name} = {shown} {UNITS.get(p.unit, p.unit)}".rstrip())
         if effect.event:
-            print(f"NOTE        {args.effect} happened in this recording and is kept with it: of others the profile predicts what it did before")
+            print(
+                f"NOTE        {args.effect} happened in this recording and is kept with it: of others the profile"
+                " predicts what it did before"
+            )
         if after.excess_db > before.excess_db - LEAST_FALL_DB:
             print("WARNING     the error did not fall: this effect does not explain the recording")
         print(f"written to {args.output}")

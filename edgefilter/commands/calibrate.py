@@ -27,12 +27,16 @@ RECORDINGS = ("sweep_reference", "sweep_recording", "noise_recording")
 def main(args: argparse.Namespace) -> int:
     given = [name for name in RECORDINGS if getattr(args, name)]
     if args.live and given:
-        raise UsageError(f"--live makes its own recordings, found --{given[0].replace('_', '-')} too: leave one of them out")
+        raise UsageError(
+            f"--live makes its own recordings, found --{given[0].replace('_', '-')} too: leave one of them out"
+        )
     if not args.live and len(given) < len(RECORDINGS):
         missing = " ".join(f"--{name.replace('_', '-')} FILE" for name in RECORDINGS if name not in given)
         raise UsageError(f"calibration needs three recordings, missing: {missing} (or --live to make them now)")
     sweep, recording, fan = _record(args) if args.live else (_read(getattr(args, name), name) for name in RECORDINGS)
-    source = f"live: {args.speaker} to {args.input}" if args.live else ", ".join(getattr(args, name) for name in RECORDINGS)
+    source = (
+        f"live: {args.speaker} to {args.input}" if args.live else ", ".join(getattr(args, name) for name in RECORDINGS)
+    )
     today = datetime.date.today().isoformat()
     profile = calibrate(sweep, recording, fan, stepped_sine=args.stepped_sine, created=today, source=source)
     profile.save(args.output)

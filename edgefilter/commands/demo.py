@@ -35,11 +35,11 @@ def main(args: argparse.Namespace) -> int:
         write_json(figures, args.json)
     if args.json != "-":
         print(
-            f"a simulated robot talks, a human interrupts; filtered with engine {ego.engine_name} "
-            f"({report.process_s / (report.samples_in / SAMPLE_RATE):.3f} of real time, {describe_latency(ego)})\n"
-            f"SI-SDR of the human: {figures['si_sdr_before_db']:.1f} dB before, {figures['si_sdr_after_db']:.1f} dB after with the robot's "
-            f"calibration{_without(figures)}\n"
-            f"files: {', '.join(str(file) for file in files)}"
+            f"a simulated robot talks, a human interrupts; filtered with engine {ego.engine_name}"
+            f" ({report.process_s / (report.samples_in / SAMPLE_RATE):.3f} of real time,"
+            f" {describe_latency(ego)})\nSI-SDR of the human: {figures['si_sdr_before_db']:.1f} dB before,"
+            f" {figures['si_sdr_after_db']:.1f} dB after with the robot's calibration{_without(figures)}\nfiles:"
+            f" {', '.join(str(file) for file in files)}"
         )
     return 0
 
@@ -81,6 +81,10 @@ def _draw(folder: Path, filtered: Path) -> list[Path]:
         print(f"no picture: {error.name} is not installed (pip install 'edgefilter[report]')", file=sys.stderr)
         return []
     picture = folder / "before_after.png"
-    signals = {"microphone": _read(DATA / "mic.flac"), "filtered": _read(filtered), "the human alone": _read(DATA / "human.flac")}
+    signals = {
+        "microphone": _read(DATA / "mic.flac"),
+        "filtered": _read(filtered),
+        "the human alone": _read(DATA / "human.flac"),
+    }
     plot_before_after(signals, picture)
     return [picture]

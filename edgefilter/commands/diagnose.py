@@ -22,7 +22,9 @@ def main(args: argparse.Namespace) -> int:
     with _bar() as progress:
         found = diagnose(profile, recording, reference, progress=progress)
     if args.profile is None:
-        found = replace(found, comparison=replace(found.comparison, warnings=(*profile.warnings, *found.comparison.warnings)))
+        found = replace(
+            found, comparison=replace(found.comparison, warnings=(*profile.warnings, *found.comparison.warnings))
+        )
     if args.json:
         write_json(found.to_dict(), args.json)
     if args.json != "-":

@@ -24,7 +24,11 @@ METER_PERIOD_S = 0.1
 
 def describe_latency(ego: EgoFilter) -> str:
     """The algorithmic latency in words."""
-    return "answers at the end of the recording" if ego.waits_for_end else f"algorithmic latency {1000 * ego.latency / SAMPLE_RATE:.0f} ms"
+    return (
+        "answers at the end of the recording"
+        if ego.waits_for_end
+        else f"algorithmic latency {1000 * ego.latency / SAMPLE_RATE:.0f} ms"
+    )
 
 
 @contextmanager
@@ -40,7 +44,9 @@ def display(source: Source, quiet: bool) -> Iterator[Callable[[Progress], None]]
 
 def _bar(total: int | None) -> Iterator[Callable[[Progress], None]]:
     form = "{percentage:3.0f}%|{bar}| {n:.0f}/{total:.0f} s  {elapsed}<{remaining}" if total else "{n:.0f} s  {elapsed}"
-    with tqdm(total=total / SAMPLE_RATE if total else None, bar_format=form, delay=1.0, leave=False, disable=None) as bar:
+    with tqdm(
+        total=total / SAMPLE_RATE if total else None, bar_format=form, delay=1.0, leave=False, disable=None
+    ) as bar:
         yield lambda progress: bar.update(progress.samples / SAMPLE_RATE - bar.n)
 
 
@@ -91,4 +97,6 @@ def write_json(data: object, path: str) -> None:
     try:
         Path(path).write_text(text + "\n")
     except OSError as error:
-        raise AudioFileError(f"cannot write {path}: {error.strerror}: choose a folder that exists and can be written") from None
+        raise AudioFileError(
+            f"cannot write {path}: {error.strerror}: choose a folder that exists and can be written"
+        ) from None

@@ -14,7 +14,9 @@ def main(args: argparse.Namespace) -> int:
     profile = Profile.load(args.profile)
     held = [name for name, _ in profile.echo.effects]
     if args.effect not in held:
-        raise UsageError(f"{args.profile} holds no effect '{args.effect}', it holds {', '.join(held) or 'none'}: name one of those")
+        raise UsageError(
+            f"{args.profile} holds no effect '{args.effect}', it holds {', '.join(held) or 'none'}: name one of those"
+        )
     lighter = replace(profile, echo=profile.echo.without_effect(args.effect))
     lighter.save(args.output)
     left = [name for name, _ in lighter.echo.effects]

@@ -31,7 +31,10 @@ def main(args: argparse.Namespace) -> int:
     source = make_source(args.input, args.reference, args.output)
     ego, choice = make_filter(args, source.live)
     if ego.waits_for_end and source.live:
-        raise UsageError(f"engine {ego.engine_name} needs the whole recording before it answers: give --input FILE or take another engine")
+        raise UsageError(
+            f"engine {ego.engine_name} needs the whole recording before it answers: give --input FILE or take another"
+            " engine"
+        )
     if args.save_profile and not ego.can_adapt:
         names = ", ".join(HAVE_LINEAR_STAGE)
         needed = f"give --profile and an engine with a linear stage ({names})"
@@ -49,7 +52,15 @@ def main(args: argparse.Namespace) -> int:
         recorder = stack.enter_context(Recorder(args.save_input)) if args.save_input else None
         show = stack.enter_context(display(source, args.quiet))
         stack.enter_context(garbage_of_this_run_only())
-        report = filter_blocks(limited(source, limit), ego, sink, recorder, show, lambda: bool(stopped) or sink.finished, partial(say_event, live=source.live))
+        report = filter_blocks(
+            limited(source, limit),
+            ego,
+            sink,
+            recorder,
+            show,
+            lambda: bool(stopped) or sink.finished,
+            partial(say_event, live=source.live),
+        )
         report.interrupted |= bool(stopped)
     return finish(args, ego, choice, source, sink, report, told)
 
@@ -57,8 +68,8 @@ def main(args: argparse.Namespace) -> int:
 def make_filter(args: argparse.Namespace, live: bool) -> tuple[EgoFilter, Choice | None]:
     """The filter with the engine that was asked for, or with the one that the measurement chose.
 
-    Live, or where a budget is given, "auto" is measured; a recording has no deadline and gets the strongest engine at once.
-    Live, an engine that was chosen or that has a budget may be replaced by cheaper ones while it runs.
+    Live, or where a budget is given, "auto" is measured; a recording has no deadline and gets the strongest engine at
+    once. Live, an engine that was chosen or that has a budget may be replaced by cheaper ones while it runs.
     """
     if args.remeasure:
         forget()
@@ -72,11 +83,20 @@ def make_filter(args: argparse.Namespace, live: bool) -> tuple[EgoFilter, Choice
     return EgoFilter(profile, engine, budget_ms if live else None, reason, args.model), choice
 
 
-UNCALIBRATED = "no profile: uncalibrated, the room is learnt from the robot's first seconds ('edgefilter calibrate' measures it beforehand)"
+UNCALIBRATED = (
+    "no profile: uncalibrated, the room is learnt from the robot's first seconds ('edgefilter calibrate' measures it"
+    " beforehand)"
+)
 
 
 def finish(
-    args: argparse.Namespace, ego: EgoFilter, choice: Choice | None, source: Source, sink: Sink, report: RunReport, told: int
+    args: argparse.Namespace,
+    ego: EgoFilter,
+    choice: Choice | None,
+    source: Source,
+    sink: Sink,
+    report: RunReport,
+    told: int,
 ) -> int:
     """Say and write what happened; return the exit code."""
     for note in [*source.notes[told:], *sink.notes]:
@@ -96,7 +116,10 @@ def finish(
     factor = f", {report.process_s / seconds:.3f} of real time" if seconds else ""
     how = "stopped after" if report.interrupted else "filtered"
     missed = f", {report.filter['deadline']['missed_deadlines']} deadlines missed" if source.live else ""
-    say(f"{how} {seconds:.1f} s in {report.wall_s:.1f} s{factor}; {report.samples_out} samples to {args.output}, {report.lost} lost{missed}")
+    say(
+        f"{how} {seconds:.1f} s in {report.wall_s:.1f} s{factor}; {report.samples_out} samples to {args.output},"
+        f" {report.lost} lost{missed}"
+    )
     return 130 if report.interrupted and not source.live else 0
 
 
@@ -111,13 +134,19 @@ def save_profile(ego: EgoFilter, path: str) -> None:
 
 
 def make_source(name: str, reference: str | None, output: str) -> Source:
-    """A file or pipe where name is one, else the live devices; the reference defaults to the monitor of the output device."""
+    """A file or pipe where name is one, else the live devices.
+
+    The reference defaults to the monitor of the output device.
+    """
     if name == "-" or looks_like_file(name):
         return open_source(name, reference)
     from edgefilter.audio.device import LiveSource, monitor_of
 
     if reference and looks_like_file(reference):
-        raise UsageError(f"live, the reference is a device, found the file {reference}: leave --reference out or name a monitor ('edgefilter devices')")
+        raise UsageError(
+            f"live, the reference is a device, found the file {reference}: leave --reference out or name a monitor"
+            " ('edgefilter devices')"
+        )
     return LiveSource(name, reference or monitor_of("default" if output == "-" or looks_like_file(output) else output))
 
 
@@ -184,6 +213,12 @@ def say(text: str) -> None:
 
 
 def say_event(event: Event, live: bool) -> None:
-    """Tell of a change of engine when it happens, below the level meter where that is shown; live, also of the human's speech."""
+    """Tell of a change of engine when it happens, below the level meter where that is shown.
+
+    Live, also of the human's speech.
+    """
     if event.kind in ("stepped_down", "stepped_up", "overloaded") or (live and event.kind.startswith("speech")):
-        say(f"{chr(10) if sys.stderr.isatty() else ''}{event.sample / SAMPLE_RATE:.1f} s: {event.kind.replace('_', ' ')} {event.detail}")
+        say(
+            f"{chr(10) if sys.stderr.isatty() else ''}{event.sample / SAMPLE_RATE:.1f} s:"
+            f" {event.kind.replace('_', ' ')} {event.detail}"
+        )

@@ -15,7 +15,9 @@ INDEPENDENT = 0.6
 
 
 def band_edge(judge: Judge, prediction: Samples, criteria: Criteria) -> float | None:
-    """Frequency in Hz above which the voice of prediction (n,) is missing from the recording's power; None where it is all there.
+    """Frequency in Hz above which the voice of prediction (n,) is missing from the recording's power.
+
+    None where it is all there.
 
     The power over that of the robot's silences, summed over all bands above an edge, is held against the predicted one.
     """

@@ -24,7 +24,9 @@ LAG_EDGES_MS = (-20.0, -4.0, 0.0, 4.0, 10.0, 30.0, 100.0, 200.0, 400.0, 800.0)
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """A recording against its prediction. Decibels of excess are of the residual, whitened by the fan's PSD, over the fan.
+    """A recording against its prediction.
+
+    Decibels of excess are of the residual, whitened by the fan's PSD, over the fan.
 
     excess_db: of the samples that no diagnosis fits on, every second half second, as Judge scores them: the one figure
     that compare, add, diagnose and the report show; 0 means that nothing is unexplained. All else is of the whole.
@@ -92,9 +94,9 @@ def compare(profile: Profile, recording: Samples, reference: Samples, *, sample_
 
     Notes
     -----
-    Excess is the power of recording minus prediction, whitened by the fan's power spectral density, over the fan's own: 0 dB where
-    nothing is left to explain. A constant lag of up to MAX_OFFSET seconds either way and the ordinary tolerances of path and fan are
-    taken out.
+    Excess is the power of recording minus prediction, whitened by the fan's power spectral density, over the fan's own:
+    0 dB where nothing is left to explain. A constant lag of up to MAX_OFFSET seconds either way and the ordinary
+    tolerances of path and fan are taken out.
 
     Examples
     --------
@@ -115,7 +117,9 @@ def compare(profile: Profile, recording: Samples, reference: Samples, *, sample_
 
 
 def describe(prepared: Prepared, model: EchoModel, score: Score | None = None) -> Comparison:
-    """The comparison of a prepared recording with what a model predicts; score: the judge's of that model, where it is known.
+    """The comparison of a prepared recording with what a model predicts.
+
+    Score: the judge's of that model, where it is known.
 
     A gain of the microphone is taken out of the residual before that is held against the fan, which passed it as well.
     """
@@ -133,7 +137,11 @@ def describe(prepared: Prepared, model: EchoModel, score: Score | None = None) -
         noise_floor_db=float(decibels(total_power(psd))),
         bands=_by_band(flat, psd, use),
         times=tuple(
-            (at / SAMPLE_RATE, min(at + TIME_STEP, use.size) / SAMPLE_RATE, float(decibels(np.nanmean(power[at : at + TIME_STEP]))))
+            (
+                at / SAMPLE_RATE,
+                min(at + TIME_STEP, use.size) / SAMPLE_RATE,
+                float(decibels(np.nanmean(power[at : at + TIME_STEP]))),
+            )
             for at in range(0, use.size, TIME_STEP)
             if use[at : at + TIME_STEP].any()
         ),
@@ -174,7 +182,13 @@ def _by_level(prediction: Samples, white: Samples, power: Array) -> tuple[tuple[
     for step in np.unique(steps[audible]):
         inside = (steps == step) & audible
         if inside.sum() >= 5:
-            found.append((float(step * LEVEL_STEP_DB), float((step + 1) * LEVEL_STEP_DB), float(decibels(np.mean(excess[inside])))))
+            found.append(
+                (
+                    float(step * LEVEL_STEP_DB),
+                    float((step + 1) * LEVEL_STEP_DB),
+                    float(decibels(np.mean(excess[inside]))),
+                )
+            )
     return tuple(found)
 
 

@@ -1,4 +1,7 @@
-"""Every threshold of the selection in one place, each with its reason; what one effect must show stands in its own file."""
+"""Every threshold of the selection in one place, each with its reason.
+
+What one effect must show stands in its own file.
+"""
 
 from __future__ import annotations
 

@@ -63,8 +63,8 @@ def diagnose(
 
     Notes
     -----
-    Stepwise selection: every effect is fitted on half of the recording, in blocks of half a second, and judged on the other half
-    (docs/diagnosis.md).
+    Stepwise selection: every effect is fitted on half of the recording, in blocks of half a second, and judged on the
+    other half (docs/diagnosis.md).
 
     Examples
     --------
@@ -118,9 +118,10 @@ def add(
 
     Notes
     -----
-    Fitted to all of the recording: that predicts other recordings of the robot better than the fit to half of it by which `diagnose`
-    judges. So the comparison after, of this recording, is of samples that the fit has used. An event (a jump, a moment's move) is kept
-    with the recording in which it happened: of any other the profile predicts what it did before.
+    Fitted to all of the recording: that predicts other recordings of the robot better than the fit to half of it by
+    which `diagnose` judges. So the comparison after, of this recording, is of samples that the fit has used. An event
+    (a jump, a moment's move) is kept with the recording in which it happened: of any other the profile predicts what it
+    did before.
 
     Examples
     --------
@@ -155,7 +156,9 @@ def conclude(
         found.final.excess_db < criteria.explained_db or _enough(prepared, found, criteria)
     )
     quiet = found.base.excess_db < criteria.explained_db and not prepared.human
-    verdict: Verdict = "missing" if believed and not _much_left(found, criteria) else "explained" if quiet else "unexplained"
+    verdict: Verdict = (
+        "missing" if believed and not _much_left(found, criteria) else "explained" if quiet else "unexplained"
+    )
     if not believed and (quiet or not _partly(prepared, found, criteria)):
         sure = None if quiet else cut_by_power(found, criteria)
         found = sure or replace(found, steps=(), final=found.base, model=found.start)
@@ -167,9 +170,9 @@ def conclude(
         ranking=findings,
         evidence=left_in_words(found, left, remaining, criteria.explained_db),
         remaining_db=remaining,
-        irreducible_db=max(remaining, found.final.irreducible_db, 0.0)
-        if unpredictable and verdict == "missing"
-        else 0.0,
+        irreducible_db=(
+            max(remaining, found.final.irreducible_db, 0.0) if unpredictable and verdict == "missing" else 0.0
+        ),
         model=found.model,
     )
 

@@ -28,7 +28,10 @@ def share_of(before_db: float, after_db: float) -> float:
 
 
 def findings_of(found: Found, progress: Callable[[str], None] | None) -> tuple[tuple[Finding, ...], list[str]]:
-    """Strongest first; each with the excess before and after it in the order in which they were added. And what is not known of them."""
+    """Strongest first; each with the excess before and after it in the order in which they were added.
+
+    And what is not known of them.
+    """
     findings, doubts, before = [], [], found.base.excess_db
     for step in found.steps:
         after = found.final.excess_db if step is found.steps[-1] else step.score.excess_db
@@ -54,7 +57,9 @@ def findings_of(found: Found, progress: Callable[[str], None] | None) -> tuple[t
 
 
 def _intervals(prepared: Prepared, model: EchoModel, step: Trial) -> tuple[Mapping[str, Interval], list[str]]:
-    """Each scalar parameter, or short list, with the interval that three fits to a third of the recording each give; and which fits failed.
+    """Each scalar parameter, or short list, with the interval that three fits to a third of the recording each give.
+
+    And which fits failed.
 
     Where fewer than two thirds can be fitted, a parameter may have any of its possible values.
     """
@@ -68,7 +73,8 @@ def _intervals(prepared: Prepared, model: EchoModel, step: Trial) -> tuple[Mappi
             fits.append(complete(effect, effect.fit(third, others)))
         except (UsageError, ArithmeticError, np.linalg.LinAlgError) as error:
             failed.append(
-                f"how well {step.name} is known is told by fits to a third of the recording each, and one failed: {error}"
+                f"how well {step.name} is known is told by fits to a third of the recording each, and one failed:"
+                f" {error}"
             )
     found = {}
     for parameter in effect.told:

@@ -25,7 +25,9 @@ BLOCK = SAMPLE_RATE // 10
 
 @dataclass(frozen=True, eq=False)
 class Leftover:
-    """tones_hz: (k,) of the strongest tones, loudest first; mains_hz: 50 or 60 where most of their power lies on its multiples, else 0.
+    """tones_hz: (k,) of the strongest tones, loudest first.
+
+    Mains_hz: 50 or 60 where most of their power lies on its multiples, else 0.
 
     tone_share: of the residual's power over the fan, in tones. quiet_db: excess while the robot is silent, its median
     over blocks of 0.1 s;
@@ -62,7 +64,11 @@ def _tones(residual: Samples, psd: Samples) -> tuple[Array, float, float]:
     hz = frequencies(power.size)
     floor = median_filter(power, 81, mode="nearest")
     expected = np.interp(hz, frequencies(psd.size), psd) * np.log(2)
-    peak = (power > LINE_OVER_FLOOR * floor) & (power > LINE_OVER_FLOOR * expected) & (power >= np.maximum(np.roll(power, 1), np.roll(power, -1)))
+    peak = (
+        (power > LINE_OVER_FLOOR * floor)
+        & (power > LINE_OVER_FLOOR * expected)
+        & (power >= np.maximum(np.roll(power, 1), np.roll(power, -1)))
+    )
     peak[:20] = False
     at = np.flatnonzero(peak)
     at = at[np.argsort(-power[at])][:40]

@@ -22,7 +22,9 @@ BAND = 20
 
 
 def changed_fan(prepared: Prepared, model: EchoModel, base: Score, criteria: Criteria) -> tuple[Prepared, Trial] | None:
-    """The recording prepared with the fan as the robot's silences have it, and what changed it as a step; None where it is the calibrated one.
+    """The recording prepared with the fan as the robot's silences have it, and what changed it as a step.
+
+    None where it is the calibrated one.
 
     Only where there are silences and the change has a colour of its own: before the voice is explained, a gain cannot
     be told from it.
@@ -90,7 +92,10 @@ def _of_the_fan(model: EchoModel) -> list[str]:
 
 
 def _steady(left: Leftover, criteria: Criteria) -> bool:
-    """Whether what is left of the silences, whitened by the new fan's spectrum, is a fan; True where there are no silences."""
+    """Whether what is left of the silences, whitened by the new fan's spectrum, is a fan.
+
+    True where there are no silences.
+    """
     return left.swing_db < criteria.fan_steady_db and not left.quiet_mean_db - left.quiet_db > criteria.fan_sparse_db
 
 

@@ -23,8 +23,9 @@ TRACK_REACH = 1600
 def starting_offset(predicted: Samples, recording: Samples) -> float:
     """Samples by which recording (n,) lags behind predicted (n,) at its beginning, both whitened.
 
-    Over the whole of it where the lag is constant; where it moves (drift, jumps, a changed path), over the first seconds in which it
-    holds still, so that what happens later is left in the residual. Raises SignalError where no lag stands out.
+    Over the whole of it where the lag is constant; where it moves (drift, jumps, a changed path), over the first
+    seconds in which it holds still, so that what happens later is left in the residual. Raises SignalError where no lag
+    stands out.
     """
     whole = find_offset(predicted, recording)
     track = track_lag(delayed(predicted, whole), recording, None, TRACK, TRACK_REACH)
@@ -52,5 +53,7 @@ def find_offset(predicted: Samples, recording: Samples) -> float:
     cross = likely_cross(predicted, recording, n)
     lag, height = highest(correlation_near(cross, n, min(int(MAX_OFFSET * SAMPLE_RATE), recording.size - 1)))
     if height < STANDS_OUT:
-        raise SignalError("the recording does not contain the reference at any lag up to 3 s: are both of the same utterance?")
+        raise SignalError(
+            "the recording does not contain the reference at any lag up to 3 s: are both of the same utterance?"
+        )
     return top(cross, n, float(lag))

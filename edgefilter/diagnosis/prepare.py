@@ -86,7 +86,10 @@ def prepare(profile: Profile, recording: Samples, reference: Samples, *, sample_
     offset = starting_offset(whiten(predicted, known), whiten(y, known))
     pieces = utterance_lags(x, predicted, y, known, offset)
     begin, end = known_span(x, start + pieces[0][2], start + pieces[-1][2])
-    x = sum(delayed(np.where((np.arange(n) >= first) & (np.arange(n) < last), x, np.float32(0)), start + lag) for first, last, lag in pieces)
+    x = sum(
+        delayed(np.where((np.arange(n) >= first) & (np.arange(n) < last), x, np.float32(0)), start + lag)
+        for first, last, lag in pieces
+    )
     predicted = model.predict(x)
     white = whiten(predicted, known)
     block = SAMPLE_RATE // 50
@@ -102,7 +105,9 @@ def prepare(profile: Profile, recording: Samples, reference: Samples, *, sample_
     warnings = tuple(f"somebody talks at {first:.1f} to {last:.1f} s: left out" for first, last in human)
     if end - begin < n and end - begin > n // 2:
         usable[:begin], usable[end:] = False, False
-        warnings += (f"the reference is cut in mid-word: only {begin / SAMPLE_RATE:.1f} to {end / SAMPLE_RATE:.1f} s are judged",)
+        warnings += (
+            f"the reference is cut in mid-word: only {begin / SAMPLE_RATE:.1f} to {end / SAMPLE_RATE:.1f} s are judged",
+        )
     if len(pieces) > 1:
         lags = ", ".join(f"{lag:.1f} from {first / SAMPLE_RATE:.1f} s" for first, _, lag in pieces)
         warnings += (f"the utterances lag by different numbers of samples: {lags}; aligned one by one",)
@@ -119,13 +124,18 @@ def known_span(x: Samples, first_lag: float, last_lag: float) -> tuple[int, int]
     loud = 10 ** (CUT_DB / 10) * float(np.max(all_block_power(x, block)))
     said = np.flatnonzero(x)
     stop = int(said[-1]) + 1 if said.size else 0
-    begins, ends = (float(np.mean(x[part].astype(np.float64) ** 2)) > loud for part in (slice(0, CUT), slice(max(stop - CUT, 0), max(stop, 1))))
+    begins, ends = (
+        float(np.mean(x[part].astype(np.float64) ** 2)) > loud
+        for part in (slice(0, CUT), slice(max(stop - CUT, 0), max(stop, 1)))
+    )
     begin = max(round(first_lag + TAIL_S * SAMPLE_RATE), 0) if begins else 0
     end = min(max(round(stop + last_lag), 0), n) if ends else n
     return min(begin, end), end
 
 
-def utterance_lags(x: Samples, predicted: Samples, recording: Samples, psd: Samples, offset: float) -> list[tuple[int, int, float]]:
+def utterance_lags(
+    x: Samples, predicted: Samples, recording: Samples, psd: Samples, offset: float
+) -> list[tuple[int, int, float]]:
     """(first sample, end, lag) of the stretches of the reference x (n,) that share a lag, the whole with `offset` where it is one.
 
     predicted: for x without an offset. A player starts each utterance anew, so its lag may be another after a pause of

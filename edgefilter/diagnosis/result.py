@@ -17,7 +17,10 @@ SCHEMA = 1
 
 @dataclass(frozen=True)
 class Interval:
-    """A fitted parameter with the range that 90 % of resampled recordings give; a tuple where there are several (times of jumps)."""
+    """A fitted parameter with the range that 90 % of resampled recordings give.
+
+    A tuple where there are several (times of jumps).
+    """
 
     value: float | tuple[float, ...]
     low: float | tuple[float, ...]
@@ -26,7 +29,9 @@ class Interval:
 
     def to_dict(self) -> dict[str, object]:
         """Ready for JSON."""
-        numbers = {key: list(v) if isinstance(v := getattr(self, key), tuple) else v for key in ("value", "low", "high")}
+        numbers = {
+            key: list(v) if isinstance(v := getattr(self, key), tuple) else v for key in ("value", "low", "high")
+        }
         return {**numbers, "unit": self.unit}
 
 

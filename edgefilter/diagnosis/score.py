@@ -145,14 +145,14 @@ class Judge:
         return expected
 
     def _over_expected(self, power: Array, unpredictable: Sequence[tuple[Samples, Array]]) -> Array:
-        """power (n,) of the whitened residual over what is expected, both smoothed over 16 ms: when a knock comes is known to some ms."""
+        """Power (n,) of the whitened residual over what is expected, both smoothed over 16 ms: when a knock comes is known to some ms."""
         expected = np.ones_like(power)
         for variance, colour in unpredictable:
             expected += variance * float(np.mean(colour / self.psd))
         return uniform_filter1d(power, HOP) / uniform_filter1d(expected, HOP)
 
     def correct(self, prediction: Samples) -> Samples:
-        """prediction (n,) through the short filter that brings it closest to the recording, no further from 1 than TOLERANCE."""
+        """Prediction (n,) through the short filter that brings it closest to the recording, no further from 1 than TOLERANCE."""
         measurement = self.prepared.measurement
         x = whiten(prediction, self.psd)
         target = measurement.white_recording - x

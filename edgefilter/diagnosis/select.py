@@ -36,7 +36,10 @@ def search(
 
 
 def _runs(bench: Workbench, start: EchoModel) -> Iterator[EchoModel]:
-    """What each beginning leads to, until one explains nearly all; then, where that is one long filter, what half of it may lead to."""
+    """What each beginning leads to, until one explains nearly all.
+
+    Then, where that is one long filter, what half of it may lead to.
+    """
     criteria = bench.criteria
     for first in _starts(bench, start):
         run = _stepwise(bench, start, first)
@@ -188,7 +191,10 @@ def _with_simpler(bench: Workbench, start: EchoModel, model: EchoModel, name: st
 
 
 def _best(bench: Workbench, start: EchoModel, runs: list[EchoModel]) -> EchoModel:
-    """The run that explains most of those whose effects can all be named; the earlier and simpler one where others hardly explain more."""
+    """The run that explains most of those whose effects can all be named.
+
+    The earlier and simpler one where others hardly explain more.
+    """
     base = bench.score(start).level_db
     valid = [_standing(bench, start, run) for run in runs]
     best = start

@@ -35,7 +35,9 @@ class Trial:
 
 @dataclass(frozen=True, eq=False)
 class Found:
-    """The outcome of a search from a start model. steps: the accepted effects in their order. notes: what the reader must know of the search.
+    """The outcome of a search from a start model.
+
+    Steps: the accepted effects in their order. notes: what the reader must know of the search.
 
     prepared: what final was scored on; its fan is another than at the calibration where a changed fan is the first of
     the steps.
@@ -80,7 +82,7 @@ class Workbench:
         return self._scores[key]
 
     def heard(self, model: EchoModel) -> float:
-        """dB over the robot's silences, of half a dB either way, that a model leaves while the robot is heard."""
+        """DB over the robot's silences, of half a dB either way, that a model leaves while the robot is heard."""
         score = self.score(model)
         return score.active_db - float(np.clip(score.silent_db, -0.5, 0.5))
 
@@ -94,7 +96,10 @@ class Workbench:
         return max(score.level_db - self.judge.floor_level(score), 0.0)
 
     def attempt(self, name: str, model: EchoModel) -> Trial | None:
-        """The effect of that name fitted beside what the model has; None where its fit finds nothing, or no further one may be made."""
+        """The effect of that name fitted beside what the model has.
+
+        None where its fit finds nothing, or no further one may be made.
+        """
         key = signature(model), name
         if key not in self._trials:
             if self._cost >= self.criteria.most_cost:
@@ -165,7 +170,10 @@ class Workbench:
         return effect.plausible(Evidence(trial.values, model, self.judge, self.score(model), trial.score))
 
     def preferred(self, trials: Iterable[Trial]) -> Trial | None:
-        """Of admissible trials the simplest of those that explain nearly as much as the best; None where none lowers the level."""
+        """Of admissible trials the simplest of those that explain nearly as much as the best.
+
+        None where none lowers the level.
+        """
         trials = list(trials)
         most = max((trial.gain_db for trial in trials), default=0.0)
         enough = [trial for trial in trials if most > 0.0 and trial.gain_db >= self.criteria.nested * most]

@@ -43,7 +43,7 @@ def tabulated() -> tuple[Samples, Samples]:
 
 
 def interpolate(x: Samples, positions: Array) -> Samples:
-    """x (n,) at real positions (m,), samples; (m,) float32; outside of x there is silence."""
+    """X (n,) at real positions (m,), samples; (m,) float32; outside of x there is silence."""
     table, slope = tabulated()
     out = np.zeros(positions.size, np.float32)
     padded = np.pad(x, (2 * HALF_WIDTH, 2 * HALF_WIDTH))
@@ -59,7 +59,7 @@ def interpolate(x: Samples, positions: Array) -> Samples:
 
 
 def delayed(x: Array, samples: float) -> Samples:
-    """x (n,) later by a constant number of samples, fractional or negative; (n,) float32, silence moves in.
+    """X (n,) later by a constant number of samples, fractional or negative; (n,) float32, silence moves in.
 
     By the phase of its spectrum, which keeps all of the band: above 7 kHz, where the kernel falls off, a voice may
     still be over the fan.

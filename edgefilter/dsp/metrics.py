@@ -18,9 +18,9 @@ def si_sdr(estimate: Array, target: Array) -> float:
         SI-SDR = 10 lg( |a target|^2 / |estimate - a target|^2 )
 
     (Le Roux, Wisdom, Erdogan & Hershey 2019, "SDR - half-baked or well done?", eq. (4) and (5); no mean is removed).
-    Computed in float64. inf for an estimate that is a scaled target, -inf for one that holds nothing of it (silence included).
-    One sample of misalignment costs decibels: compensate a known delay first.
-    Raises SignalError for different lengths, samples that are not finite, or a silent or empty target.
+    Computed in float64. inf for an estimate that is a scaled target, -inf for one that holds nothing of it (silence
+    included). One sample of misalignment costs decibels: compensate a known delay first. Raises SignalError for
+    different lengths, samples that are not finite, or a silent or empty target.
 
     >>> import numpy as np
     >>> human = np.sin(np.arange(1600) * 0.3)
@@ -30,7 +30,9 @@ def si_sdr(estimate: Array, target: Array) -> float:
     estimate, target = _pair(estimate, "estimate", target, "target")
     energy = float(target @ target)
     if energy == 0.0:
-        raise SignalError("SI-SDR: the target is silent, expected the human's own samples: check the span that is scored")
+        raise SignalError(
+            "SI-SDR: the target is silent, expected the human's own samples: check the span that is scored"
+        )
     projection = (float(estimate @ target) / energy) * target
     rest = estimate - projection
     return _ratio_db(float(projection @ projection), float(rest @ rest))
@@ -39,7 +41,8 @@ def si_sdr(estimate: Array, target: Array) -> float:
 def erle(mic: Array, error: Array) -> float:
     """Echo return loss enhancement, in dB: how much the power at the microphone fell.
 
-    mic, error: (n,) float of the same samples, while the robot speaks alone (with a human present the figure means nothing).
+    mic, error: (n,) float of the same samples, while the robot speaks alone (with a human present the figure means
+    nothing).
 
         ERLE = 10 lg( sum mic^2 / sum error^2 )
 
@@ -63,7 +66,9 @@ def _pair(a: Array, a_name: str, b: Array, b_name: str) -> tuple[Array, Array]:
     as_samples(a, a_name), as_samples(b, b_name)
     a, b = np.asarray(a, np.float64), np.asarray(b, np.float64)
     if a.size != b.size:
-        raise SignalError(f"{a_name} has {a.size} samples and {b_name} {b.size}, expected as many: cut both to the same span")
+        raise SignalError(
+            f"{a_name} has {a.size} samples and {b_name} {b.size}, expected as many: cut both to the same span"
+        )
     return a, b
 
 

@@ -10,8 +10,8 @@ from edgefilter.types import Samples
 class Ring:
     """First in, first out, fixed capacity, float32.
 
-    Writing never blocks: what does not fit is not stored and is added to `lost`, so an audio callback can write and return.
-    One thread may write while another reads; each side moves only its own counter.
+    Writing never blocks: what does not fit is not stored and is added to `lost`, so an audio callback can write and
+    return. One thread may write while another reads; each side moves only its own counter.
     """
 
     def __init__(self, capacity: int) -> None:

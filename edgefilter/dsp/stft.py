@@ -39,8 +39,8 @@ class StftConfig:
         coverage = self._coverage
         if coverage.min() < 1e-3 * coverage.max():
             raise StftError(
-                f"STFT cannot be inverted: with a {self.window} window of {self.window_length} and hop {self.hop} some samples "
-                f"get {coverage.min():.1e} of weight; use a hop of at most {self.window_length // 2}"
+                f"STFT cannot be inverted: with a {self.window} window of {self.window_length} and hop {self.hop} some"
+                f" samples get {coverage.min():.1e} of weight; use a hop of at most {self.window_length // 2}"
             )
 
     @property
@@ -97,7 +97,10 @@ class Analyser:
         self._windowed, self._window = self._padded[:, : config.window_length], config.analysis_window
 
     def push(self, *hop_samples: Samples) -> Spectrum:
-        """Take the next hop of samples (hop,) of each channel; return the frame that ends with them, (channels, bins) complex64."""
+        """Take the next hop of samples (hop,) of each channel.
+
+        Return the frame that ends with them, (channels, bins) complex64.
+        """
         recent, hop = self._recent, self.config.hop
         recent[:, :-hop] = recent[:, hop:]
         for newest, samples in zip(self._newest, hop_samples, strict=True):

@@ -77,11 +77,17 @@ class Effect:
     noise_words: ClassVar[str] = ""
 
     def apply(self, x: Samples, values: Values, sample_rate: int) -> Samples:
-        """The signal (n,) after the effect; x is not written to. By default x itself, as for an effect of stage "noise"."""
+        """The signal (n,) after the effect; x is not written to.
+
+        By default x itself, as for an effect of stage "noise".
+        """
         return x.copy()
 
     def fit(self, measurement: Measurement, model: VoiceModel) -> Values:
-        """Values with which the model, this effect added, comes closest to the recording (least squares); by default the neutral ones."""
+        """Values with which the model, this effect added, comes closest to the recording (least squares).
+
+        By default the neutral ones.
+        """
         return neutral(self)
 
     def noise_psd(self, values: Values, psd: Samples) -> Samples:
@@ -109,11 +115,17 @@ class Effect:
         return True
 
     def cutting_above(self, hz: float) -> Values | None:
-        """Values with which the effect takes away all that lies above hz; None for an effect that does no such thing."""
+        """Values with which the effect takes away all that lies above hz.
+
+        None for an effect that does no such thing.
+        """
         return None
 
     def passband_gain_db(self, values: Values) -> float | None:
-        """The gain in dB that the effect gives to all of the voice that it passes; None where there is no one such gain."""
+        """The gain in dB that the effect gives to all of the voice that it passes.
+
+        None where there is no one such gain.
+        """
         return None
 
     def plain_gain(self, gain_db: float) -> Values | None:
@@ -148,7 +160,10 @@ def neutral(effect: Effect) -> dict[str, float]:
 
 
 def complete(effect: Effect, values: Values) -> dict[str, float | Array]:
-    """values with the neutral value for each that is missing; raises UsageError for unknown names and values out of bounds."""
+    """Values with the neutral value for each that is missing.
+
+    Raises UsageError for unknown names and values out of bounds.
+    """
     known = {p.name: p for p in effect.parameters}
     for name, value in values.items():
         if name not in known:
@@ -163,7 +178,10 @@ def complete(effect: Effect, values: Values) -> dict[str, float | Array]:
 
 
 def fitted(effect: Effect, measurement: Measurement, model: VoiceModel) -> dict[str, float | Array]:
-    """All values of an effect fitted to a measurement; those of an event, unless it vanishes, say in which recording it happened."""
+    """All values of an effect fitted to a measurement.
+
+    Those of an event, unless it vanishes, say in which recording it happened.
+    """
     values = complete(effect, effect.fit(measurement, model))
     if effect.event and not vanishes(effect, values):
         values[RECORDING.name] = measurement.fingerprint

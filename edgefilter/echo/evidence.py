@@ -14,7 +14,9 @@ from edgefilter.types import Array, Samples
 
 @dataclass(frozen=True, eq=False)
 class Score:
-    """Of one prediction. level_db: mean over time-frequency cells of the residual's dB over the fan, each cell by its degrees of freedom.
+    """Of one prediction.
+
+    Level_db: mean over time-frequency cells of the residual's dB over the fan, each cell by its degrees of freedom.
 
     excess_db: mean power of the held-out whitened residual, dB. active_db, silent_db: while the robot is heard, and is
     not. fitted_db: of the samples to fit on, while it is heard.

@@ -16,7 +16,9 @@ LEAST_CORRELATION = 0.3
 
 @dataclass(frozen=True, eq=False)
 class LagTrack:
-    """starts (b,): first sample of each block of `size` samples; lag (b,), sigma (b,): samples, the recording behind the prediction.
+    """starts (b,): first sample of each block of `size` samples.
+
+    Lag (b,), sigma (b,): samples, the recording behind the prediction.
 
     correlation (b,): of the block with the prediction at that lag, 0 to 1.
     """
@@ -36,9 +38,9 @@ class LagTrack:
 def track_lag(predicted: Samples, recording: Samples, fit: np.ndarray | None, size: int, reach: int) -> LagTrack:
     """Lags of up to +-reach samples of all blocks of `size` samples, every size / 2, that lie in fit and where the robot is heard.
 
-    predicted, recording: (n,), both whitened. The peak of each block's cross-correlation, then Newton's method on the phase of its
-    cross-spectrum: the maximum-likelihood lag in white noise (Knapp & Carter 1976). sigma is the Cramer-Rao bound for what the block
-    leaves unexplained, so it counts distortion and reverberation as noise.
+    predicted, recording: (n,), both whitened. The peak of each block's cross-correlation, then Newton's method on the
+    phase of its cross-spectrum: the maximum-likelihood lag in white noise (Knapp & Carter 1976). sigma is the
+    Cramer-Rao bound for what the block leaves unexplained, so it counts distortion and reverberation as noise.
     """
     starts = np.arange(0, recording.size - size + 1, size // 2)
     if fit is not None and starts.size:

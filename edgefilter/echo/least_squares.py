@@ -12,7 +12,8 @@ from numpy.lib.stride_tricks import sliding_window_view
 from edgefilter.types import Array, Samples
 
 NUISANCE_TAPS, NUISANCE_LEAD = 16, 8
-"""Of the filter on a prediction that takes up what is ordinary: a slightly other gain, a move of less than a millimetre."""
+"""Of the filter on a prediction that takes up what is ordinary: a slightly other gain, a move of less than a
+millimetre."""
 CHUNK = 8192
 """Rows that are multiplied at once, so that memory stays bounded."""
 
@@ -21,7 +22,8 @@ CHUNK = 8192
 class Normal:
     """Normal equations of target(n) = sum over c and k of w[c, k] column_c(n + lead - k), summed over the chosen n.
 
-    matrix: (C * taps, C * taps) float64. right: (C * taps,). energy: of the target over the chosen samples. count: how many these are.
+    matrix: (C * taps, C * taps) float64. right: (C * taps,). energy: of the target over the chosen samples. count: how
+    many these are.
     """
 
     matrix: Array
@@ -37,7 +39,9 @@ class Normal:
         """
         chosen = np.arange(self.right.size) if use is None else np.flatnonzero(use)
         matrix, right = self.matrix[np.ix_(chosen, chosen)], self.right[chosen]
-        scale = np.sqrt(np.repeat(self.matrix.diagonal().reshape(-1, self.taps).mean(axis=1), self.taps))[chosen] + 1e-30
+        scale = (
+            np.sqrt(np.repeat(self.matrix.diagonal().reshape(-1, self.taps).mean(axis=1), self.taps))[chosen] + 1e-30
+        )
         scaled = matrix / scale[:, None] / scale
         w = np.linalg.solve(scaled + ridge * np.eye(scale.size), right / scale) / scale
         left = self.energy - 2.0 * float(w @ right) + float(w @ matrix @ w)
@@ -46,7 +50,9 @@ class Normal:
         return weights.reshape(-1, self.taps), max(left, 0.0)
 
 
-def normal_equations(columns: Sequence[Samples], target: Samples, taps: int, lead: int = 0, fit: np.ndarray | None = None) -> Normal:
+def normal_equations(
+    columns: Sequence[Samples], target: Samples, taps: int, lead: int = 0, fit: np.ndarray | None = None
+) -> Normal:
     """Normal equations for columns (C, n) and a target (n,); fit (n,) bool: the samples that count, None for all.
 
     Tap k of a column is a delay of k - lead samples; outside of a column there is silence.
@@ -69,20 +75,29 @@ def normal_equations(columns: Sequence[Samples], target: Samples, taps: int, lea
 
 def short_filter(x: Samples, taps: Samples) -> Samples:
     """The full convolution of x (n,) and taps (t,), (n + t - 1,): by the way that is faster for a hop, or for a recording."""
-    return scipy.signal.oaconvolve(x, taps).astype(np.float32) if x.size > CHUNK and taps.size > 4 else np.convolve(x, taps)
+    return (
+        scipy.signal.oaconvolve(x, taps).astype(np.float32)
+        if x.size > CHUNK and taps.size > 4
+        else np.convolve(x, taps)
+    )
 
 
 def filtered(columns: Sequence[Samples], weights: Array, lead: int = 0) -> Samples:
-    """sum over c of column_c filtered by weights[c]: (n,) float32; weights (C, taps), tap k a delay of k - lead samples."""
+    """Sum over c of column_c filtered by weights[c]: (n,) float32.
+
+    Weights (C, taps), tap k a delay of k - lead samples.
+    """
     n = columns[0].size
     out = np.zeros(n, np.float32)
     for column, w in zip(columns, weights, strict=True):
         if n and w.any():
-            out += short_filter(np.concatenate((column, np.zeros(lead, np.float32))), w.astype(np.float32))[lead : lead + n]
+            out += short_filter(np.concatenate((column, np.zeros(lead, np.float32))), w.astype(np.float32))[
+                lead : lead + n
+            ]
     return out
 
 
 def absorbed(predicted: Samples, target: Samples, fit: np.ndarray | None = None) -> Samples:
-    """predicted (n,) through the short filter that brings it closest to target (n,): what is left is no ordinary tolerance."""
+    """Predicted (n,) through the short filter that brings it closest to target (n,): what is left is no ordinary tolerance."""
     weights, _ = normal_equations([predicted], target, NUISANCE_TAPS, NUISANCE_LEAD, fit).solve()
     return filtered([predicted], weights, NUISANCE_LEAD)

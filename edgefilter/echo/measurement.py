@@ -65,7 +65,10 @@ class Measurement:
         return np.ones(self.recording.size, np.float32) if self.fit is None else self.fit.astype(np.float32)
 
     def whiten(self, x: Samples) -> Samples:
-        """x (n,) through a zero-phase filter after which the fan is white with variance 1; x itself where the fan is unknown."""
+        """X (n,) through a zero-phase filter after which the fan is white with variance 1.
+
+        X itself where the fan is unknown.
+        """
         return x if self.noise_psd is None else whiten(x, self.noise_psd)
 
     @cached_property
@@ -80,7 +83,10 @@ class Measurement:
         return self.whiten(self.recording)
 
     def heard(self, model: VoiceModel) -> tuple[Samples, Samples]:
-        """(n,), (n,) what a model predicts for the reference, and that whitened; remembered for the latest few models, not to be written to."""
+        """(n,), (n,) what a model predicts for the reference, and that whitened.
+
+        Remembered for the latest few models, not to be written to.
+        """
         known = self._heard.pop(model, None)
         if known is None:
             predicted = model.predict(self.reference)
@@ -97,7 +103,7 @@ class Measurement:
 
 
 def whiten(x: Samples, noise_psd: Samples) -> Samples:
-    """x (n,) filtered by 1 / sqrt(noise_psd), floored, zero-phase, so that noise of that one-sided PSD gets variance 1."""
+    """X (n,) filtered by 1 / sqrt(noise_psd), floored, zero-phase, so that noise of that one-sided PSD gets variance 1."""
     taps = np.fft.fftshift(np.fft.irfft(1.0 / np.sqrt(floored(noise_psd) * SAMPLE_RATE / 2)))[1:]
     taps *= np.hanning(taps.size + 2)[1:-1] ** 0.25
     return scipy.signal.oaconvolve(x, taps.astype(np.float32), mode="full")[taps.size // 2 :][: x.size].astype(

@@ -85,7 +85,10 @@ class EchoModel:
         return parts
 
     def microphone_gain(self, size: int) -> Samples:
-        """(size,) the gain that an effect behind the microphone gives voice and fan alike at each moment; ones without one."""
+        """(size,) the gain that an effect behind the microphone gives voice and fan alike at each moment.
+
+        Ones without one.
+        """
         gain = np.ones(size, np.float32)
         for effect, values in chain(self.effects):
             if effect.scales_fan:

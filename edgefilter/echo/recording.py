@@ -29,5 +29,7 @@ def paired(recording: object, reference: object) -> tuple[Samples, Samples]:
     for samples, name in ((y, "recording"), (x, "reference")):
         if samples.size < MIN_SECONDS * SAMPLE_RATE:
             seconds = samples.size / SAMPLE_RATE
-            raise SignalError(f"the {name} is {seconds:.2f} s long, expected at least {MIN_SECONDS:g} s of the robot's voice")
+            raise SignalError(
+                f"the {name} is {seconds:.2f} s long, expected at least {MIN_SECONDS:g} s of the robot's voice"
+            )
     return y, np.pad(x, (0, max(y.size - x.size, 0)))[: y.size]

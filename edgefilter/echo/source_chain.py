@@ -12,7 +12,9 @@ from edgefilter.types import SAMPLE_RATE, Samples
 
 
 class SourceChain:
-    """Applies the source effects of a model to successive blocks; those with a memory also see what came before a block.
+    """Applies the source effects of a model to successive blocks.
+
+    Those with a memory also see what came before a block.
 
     effects: (name, values). Left out is what needs more of the past than a filter can look back at every hop, as a
     compressor with its release does, and what acts behind the path.
@@ -28,7 +30,7 @@ class SourceChain:
         self._past = np.zeros(self._memory, np.float32)
 
     def __call__(self, block: Samples) -> Samples:
-        """block (n,) after the effects, (n,); it follows the last one."""
+        """Block (n,) after the effects, (n,); it follows the last one."""
         if not self._chain:
             return block
         x = np.concatenate((self._past, block)) if self._memory else block
@@ -38,7 +40,10 @@ class SourceChain:
         return x[self._memory :]
 
     def rewritten(self, history: Samples, hop: int) -> Samples:
-        """history (n,) after the effects, (n,), when the past is another than it was; its last hop will come again as a block."""
+        """History (n,) after the effects, (n,), when the past is another than it was.
+
+        Its last hop will come again as a block.
+        """
         self._past = np.zeros(self._memory, np.float32)
         driven = self(history)
         before = np.concatenate((np.zeros(self._memory, np.float32), history[: history.size - hop]))

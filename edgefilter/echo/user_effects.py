@@ -44,8 +44,8 @@ def load_effect(path: str | Path) -> str:
     Raises
     ------
     UsageError
-        In one line, where there is no such file, it does not run, holds no such class or more than one, the class lacks a part of an
-        effect, its name is taken, or its neutral values are not the identity.
+        In one line, where there is no such file, it does not run, holds no such class or more than one, the class lacks
+        a part of an effect, its name is taken, or its neutral values are not the identity.
 
     Examples
     --------

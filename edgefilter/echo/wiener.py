@@ -23,13 +23,16 @@ def convolve_from(x: Samples, taps: Array, lead: int) -> Samples:
     return np.pad(y, (0, max(lead + x.size - y.size, 0)))[lead : lead + x.size].astype(np.float32)
 
 
-def fit_filter(x: Samples, target: Samples, weights: Samples, taps: int, lead: int, prior: Array | None = None, steps: int = 12) -> Array:
+def fit_filter(
+    x: Samples, target: Samples, weights: Samples, taps: int, lead: int, prior: Array | None = None, steps: int = 12
+) -> Array:
     """(taps,) float64, the filter c that minimises sum w(n) (target(n) - sum_k c[k] x(n - k + lead))^2 + sum c^2 / prior.
 
-    x, target: (n,), whitened, so that the noise has variance 1. weights: (n,) 0 to 1. prior: (taps,) expected c^2; None: no penalty
-    but a tiny one. Preconditioned conjugate gradients on the normal equations (Golub & Van Loan, Matrix Computations, 11.5) with a
-    circulant preconditioner; stopping after `steps` leaves out what the data hardly speaks of. Not scipy's cg: what a step explains, by
-    which this one stops, can be had from its iterates only as a difference, which the transforms' float32 drowns.
+    x, target: (n,), whitened, so that the noise has variance 1. weights: (n,) 0 to 1. prior: (taps,) expected c^2;
+    None: no penalty but a tiny one. Preconditioned conjugate gradients on the normal equations (Golub & Van Loan,
+    Matrix Computations, 11.5) with a circulant preconditioner; stopping after `steps` leaves out what the data hardly
+    speaks of. Not scipy's cg: what a step explains, by which this one stops, can be had from its iterates only as a
+    difference, which the transforms' float32 drowns.
     """
     blocks = _Blocks(x, weights, taps, lead)
     share = float(np.mean(weights))
@@ -63,7 +66,9 @@ def fit_filter(x: Samples, target: Samples, weights: Samples, taps: int, lead: i
     return c
 
 
-def fit_supported(x: Samples, target: Samples, weights: Samples, taps: int, lead: int, prior: Array, steps: int) -> Array:
+def fit_supported(
+    x: Samples, target: Samples, weights: Samples, taps: int, lead: int, prior: Array, steps: int
+) -> Array:
     """fit_filter's answer, or zeros where a filter from half of the weighted samples does not help on the other half (BLOCKs, two by two)."""
     half = np.arange(x.size) // BLOCK % 4 < 2
     trial = convolve_from(x, fit_filter(x, target, weights * half, taps, lead, prior, steps // 2), lead)
@@ -74,7 +79,8 @@ def fit_supported(x: Samples, target: Samples, weights: Samples, taps: int, lead
 class _Blocks:
     """x (n,) in the blocks of a weighted convolution, those without weight left out: overlap-save.
 
-    The blocks are those between two changes of the samples that are fitted on, so that half of them drop out; their transforms stay in the cache.
+    The blocks are those between two changes of the samples that are fitted on, so that half of them drop out; their
+    transforms stay in the cache.
     """
 
     def __init__(self, x: Samples, weights: Samples, taps: int, lead: int) -> None:
@@ -104,13 +110,17 @@ class _Blocks:
     def normal(self, c: Array) -> Array:
         """(taps,) adjoint of x filtered by c (taps,)."""
         spectrum = fft.rfft(c.astype(np.float32), self._size)
-        filtered = fft.irfft(self._source * spectrum, self._size, axis=1)[:, self._taps - 1 : self._taps - 1 + self._new]
+        filtered = fft.irfft(self._source * spectrum, self._size, axis=1)[
+            :, self._taps - 1 : self._taps - 1 + self._new
+        ]
         return self._correlated(filtered * self._weights)
 
     def _correlated(self, signals: Samples) -> Array:
         moved = np.zeros((signals.shape[0], self._size), np.float32)
         moved[:, self._taps - 1 : self._taps - 1 + self._new] = signals
-        return fft.irfft(np.einsum("bf,bf->f", fft.rfft(moved, axis=1), self._source.conj()), self._size)[: self._taps].astype(np.float64)
+        return fft.irfft(np.einsum("bf,bf->f", fft.rfft(moved, axis=1), self._source.conj()), self._size)[
+            : self._taps
+        ].astype(np.float64)
 
 
 def _windowed(correlation: Array, taps: int, size: int) -> Array:
@@ -144,6 +154,9 @@ def spectra(measurement: Measurement, white: Samples, resolution_hz: float) -> S
     a, b = fft.rfft(p.astype(np.float64), n), fft.rfft(y.astype(np.float64), n)
     width = max(int(resolution_hz * n / SAMPLE_RATE), 1)
     count = a.size // width
-    auto, cross = (np.abs(a[: count * width]) ** 2).reshape(count, width), (b * a.conj())[: count * width].reshape(count, width)
+    auto, cross = (
+        (np.abs(a[: count * width]) ** 2).reshape(count, width),
+        (b * a.conj())[: count * width].reshape(count, width),
+    )
     hz = (np.arange(count) + 0.5) * width * SAMPLE_RATE / n - 0.5 * SAMPLE_RATE / n
     return Spectra(hz, 2.0 * auto.sum(axis=1) / n, 2.0 * cross.sum(axis=1) / n)

@@ -20,9 +20,9 @@ class Entry:
     """One engine of the catalogue.
 
     module: its file in this folder, loaded when the engine is asked for and not before: one of them loads onnxruntime.
-    factory: what makes it there, a class or a function of one argument. takes: that argument, the STFT to work with, the path of a
-    network in place of its own, or the robot's profile. automatic: whether "auto" may choose it. linear_stage: whether an echo path is
-    adapted before it, that is whether its front is "full".
+    factory: what makes it there, a class or a function of one argument. takes: that argument, the STFT to work with,
+    the path of a network in place of its own, or the robot's profile. automatic: whether "auto" may choose it.
+    linear_stage: whether an echo path is adapted before it, that is whether its front is "full".
     """
 
     module: str
@@ -86,11 +86,13 @@ def create(
     entry = CATALOGUE[name]
     if model is not None and entry.takes != "model":
         raise UsageError(
-            f"engine {name} has no network, found the model {model}: leave it out or take one of {', '.join(HAVE_MODEL)}"
+            f"engine {name} has no network, found the model {model}: leave it out or take one of"
+            f" {', '.join(HAVE_MODEL)}"
         )
     if profile is None and entry.takes == "profile":
         raise UsageError(
-            f"engine {name} needs the robot's calibrated response: give --profile P.npz (made by 'edgefilter calibrate')"
+            f"engine {name} needs the robot's calibrated response: give --profile P.npz (made by 'edgefilter"
+            " calibrate')"
         )
     factory = getattr(importlib.import_module(f"edgefilter.engines.{entry.module}"), entry.factory)
     return factory({"stft": stft, "model": model, "profile": profile}[entry.takes])

@@ -12,14 +12,15 @@ EngineState: TypeAlias = Any
 """Whatever an engine needs between frames; it is made by initial_state and never shared between streams."""
 
 FrontEndKind: TypeAlias = Literal["none", "paper", "full"]
-"""What runs before the engine: nothing, the paper's per-utterance alignment, or tracking alignment and the linear stage."""
+"""What runs before the engine: nothing, the paper's per-utterance alignment, or tracking alignment and the linear
+stage."""
 
 
 class Engine(Protocol):
     """Turns frames into output spectra.
 
-    With lookahead L the answer to frame t is the output for frame t - L; the first L answers are for the digital silence
-    before the recording, and the stream pushes L more frames of silence at the end.
+    With lookahead L the answer to frame t is the output for frame t - L; the first L answers are for the digital
+    silence before the recording, and the stream pushes L more frames of silence at the end.
     """
 
     name: ClassVar[str]

@@ -1,4 +1,7 @@
-"""'crnn': a recurrent network and a Wiener mask, half and half, on the linear stage's error; the network says whether a human speaks."""
+"""'crnn': a recurrent network and a Wiener mask, half and half, on the linear stage's error.
+
+The network says whether a human speaks.
+"""
 
 from __future__ import annotations
 
@@ -20,8 +23,9 @@ SPECTRA = ("error", "mic", "reference", "echo")
 VARIABLE = "EDGEFILTER_CRNN"
 
 WIENER_SHARE = 0.5
-"""Part of the answer that comes from the Wiener mask of 'ss'. The two err in different places, and what one deletes the other keeps: on
-validation conversations the mean had a higher SI-SDR than either, far fewer word errors than the network and about as many as 'ss'."""
+"""Part of the answer that comes from the Wiener mask of 'ss'. The two err in different places, and what one deletes the
+other keeps: on validation conversations the mean had a higher SI-SDR than either, far fewer word errors than the
+network and about as many as 'ss'."""
 
 CrnnState: TypeAlias = tuple[tuple[Samples, ...], Samples]
 """The network's state tensors, all zeros at the start, and the Wiener mask's state."""
@@ -30,9 +34,10 @@ CrnnState: TypeAlias = tuple[tuple[Samples, ...], Samples]
 class Crnn:
     """Runs an exported EdgeCrnn (export/network.py), one frame at a time.
 
-    model: an ONNX file made by export/onnx_export.py; without one the file that the environment variable EDGEFILTER_CRNN names, else
-    the package's own, whose recurrent layer has int8 weights: a hop finds them cold, and reads a quarter of the bytes. The file says which STFT it was trained for. wiener_share: 0 is the network alone, 1 the Wiener mask.
-    Raises ModelError for a file that is not such a model.
+    model: an ONNX file made by export/onnx_export.py; without one the file that the environment variable
+    EDGEFILTER_CRNN names, else the package's own, whose recurrent layer has int8 weights: a hop finds them cold, and
+    reads a quarter of the bytes. The file says which STFT it was trained for. wiener_share: 0 is the network alone, 1
+    the Wiener mask. Raises ModelError for a file that is not such a model.
     """
 
     name: ClassVar[str] = "crnn"
@@ -46,7 +51,11 @@ class Crnn:
         self._wiener, self._share = SpectralSubtraction(self.stft), np.float32(wiener_share)
         states = dict(self.model.states)
         spectrum = (1, self.stft.bins, 2)
-        outputs = {"spectrum": spectrum, "speech_probability": (1,), **{f"next_{name}": shape for name, shape in states.items()}}
+        outputs = {
+            "spectrum": spectrum,
+            "speech_probability": (1,),
+            **{f"next_{name}": shape for name, shape in states.items()},
+        }
         expect_slots(self.model, {**dict.fromkeys(SPECTRA, spectrum), **states}, outputs)
         self._own = threading.local()
 
@@ -55,7 +64,12 @@ class Crnn:
 
     def step(self, frame: Frame, state: CrnnState) -> tuple[Output, CrnnState]:
         places = self._places()
-        places.error[:], places.mic[:], places.reference[:], places.echo[:] = frame.error, frame.mic, frame.reference, frame.echo
+        places.error[:], places.mic[:], places.reference[:], places.echo[:] = (
+            frame.error,
+            frame.mic,
+            frame.reference,
+            frame.echo,
+        )
         for place, tensor in zip(places.states, state[0]):
             place[...] = tensor
         places.slots.run()
@@ -70,7 +84,10 @@ class Crnn:
             slots = FixedPlaces(self.model.session)
             names = [name for name, _ in self.model.states]
             error, mic, reference, echo = (slots.inputs[name].view(np.complex64).reshape(-1) for name in SPECTRA)
-            states, next_states = [slots.inputs[name] for name in names], [slots.outputs[f"next_{name}"] for name in names]
+            states, next_states = (
+                [slots.inputs[name] for name in names],
+                [slots.outputs[f"next_{name}"] for name in names],
+            )
             spectrum = slots.outputs["spectrum"].view(np.complex64).reshape(-1)
             probability = slots.outputs["speech_probability"]
             self._own.places = Places(slots, error, mic, reference, echo, spectrum, probability, states, next_states)

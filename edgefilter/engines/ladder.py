@@ -19,8 +19,8 @@ if TYPE_CHECKING:
 CANDIDATES = tuple(name for name, entry in engines.CATALOGUE.items() if entry.automatic)
 """What "auto" chooses from, best first."""
 DOWN, UP = 4, 32
-"""Frames of a crossfade to a cheaper engine (64 ms, since it has to bring relief), and to a better one (0.5 s, since an engine
-with a memory starts empty and has to settle while it is still quiet)."""
+"""Frames of a crossfade to a cheaper engine (64 ms, since it has to bring relief), and to a better one (0.5 s, since an
+engine with a memory starts empty and has to settle while it is still quiet)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,9 +45,9 @@ class LadderState:
 class Ladder:
     """An engine that runs one of its rungs; set `wanted` and it crossfades there, frame by frame.
 
-    rungs: best first, all with the same STFT and front, so that alignment and linear stage run on untouched; their look-aheads
-    may differ, all answers come out as late as the latest. A request during a crossfade turns it back, or is met after it.
-    Raises UsageError without rungs, or where they differ in STFT or front.
+    rungs: best first, all with the same STFT and front, so that alignment and linear stage run on untouched; their
+    look-aheads may differ, all answers come out as late as the latest. A request during a crossfade turns it back, or
+    is met after it. Raises UsageError without rungs, or where they differ in STFT or front.
     """
 
     name: ClassVar[str] = "ladder"
@@ -57,7 +57,9 @@ class Ladder:
             raise UsageError("no engine to run: name at least one")
         for rung in rungs[1:]:
             if (rung.stft, rung.front) != (rungs[0].stft, rungs[0].front):
-                raise UsageError(f"engines {rungs[0].name} and {rung.name} cannot take turns: their STFTs or fronts differ")
+                raise UsageError(
+                    f"engines {rungs[0].name} and {rung.name} cannot take turns: their STFTs or fronts differ"
+                )
         self.rungs = tuple(rungs)
         self.stft = rungs[0].stft
         self.front: FrontEndKind = rungs[0].front
@@ -101,7 +103,7 @@ class Ladder:
 
 
 def climbable(best: Engine, profile: Profile | None) -> list[Engine]:
-    """best and the cheaper candidates that can take turns with it: those that can be made with its STFT and front."""
+    """Best and the cheaper candidates that can take turns with it: those that can be made with its STFT and front."""
     rungs = [best]
     for name in CANDIDATES[CANDIDATES.index(best.name) + 1 :] if best.name in CANDIDATES else ():
         try:

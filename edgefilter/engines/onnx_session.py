@@ -43,7 +43,8 @@ class Model:
 class FixedPlaces:
     """A model's inputs and outputs as arrays that stay where they are: write the inputs, run, read the outputs.
 
-    Handing over new arrays at each call takes a tenth of a paced frame. All shapes have to be fixed; one thread at a time.
+    Handing over new arrays at each call takes a tenth of a paced frame. All shapes have to be fixed; one thread at a
+    time.
     """
 
     def __init__(self, session: onnxruntime.InferenceSession) -> None:
@@ -60,7 +61,10 @@ class FixedPlaces:
 
 
 def find_model(given: str | Path | None, variable: str, name: str, remedy: str) -> Path:
-    """The model file to use: the given one, else the environment variable's, else the package's own; raises ModelError."""
+    """The model file to use: the given one, else the environment variable's, else the package's own.
+
+    Raises ModelError.
+    """
     chosen = given or os.environ.get(variable)
     if chosen:
         path = Path(chosen)
@@ -77,7 +81,8 @@ def find_model(given: str | Path | None, variable: str, name: str, remedy: str) 
 def open_session(path: Path) -> onnxruntime.InferenceSession:
     """A session on one core: frames are too small to share, and a second thread that spins costs a whole core.
 
-    Denormal numbers count as zero in the thread that makes the session. Raises ModelError where the file is no ONNX model.
+    Denormal numbers count as zero in the thread that makes the session. Raises ModelError where the file is no ONNX
+    model.
     """
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = options.inter_op_num_threads = 1
@@ -90,7 +95,9 @@ def open_session(path: Path) -> onnxruntime.InferenceSession:
     try:
         return onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
     except Exception as error:  # onnxruntime's exceptions share no base of their own
-        raise ModelError(f"model {path} cannot be loaded ({' '.join(str(error).split())[:160]}): export it again") from None
+        raise ModelError(
+            f"model {path} cannot be loaded ({' '.join(str(error).split())[:160]}): export it again"
+        ) from None
 
 
 def open_model(path: Path, kind: str, version: int) -> Model:
@@ -102,7 +109,9 @@ def open_model(path: Path, kind: str, version: int) -> Model:
     _expect(path, "sample_rate", said.get("sample_rate"), str(SAMPLE_RATE))
     try:
         stft = StftConfig(int(said["n_fft"]), int(said["hop"]), int(said["window_length"]), said["window"])
-        states = tuple((str(name), tuple(int(size) for size in shape)) for name, shape in json.loads(said.get("states", "[]")))
+        states = tuple(
+            (str(name), tuple(int(size) for size in shape)) for name, shape in json.loads(said.get("states", "[]"))
+        )
         training, figures = json.loads(said["training"]), json.loads(said["figures"])
     except KeyError as error:
         raise ModelError(f"model {path} does not say its {error.args[0]}: export it again") from None
@@ -112,20 +121,33 @@ def open_model(path: Path, kind: str, version: int) -> Model:
 
 
 def expect_slots(model: Model, inputs: Mapping[str, tuple], outputs: Mapping[str, tuple]) -> None:
-    """Refuse a model whose inputs or outputs have other names, or shapes that cannot be these; "any" stands for a free size."""
-    for word, slots, wanted in (("inputs", model.session.get_inputs(), inputs), ("outputs", model.session.get_outputs(), outputs)):
+    """Refuse a model whose inputs or outputs have other names, or shapes that cannot be these.
+
+    "any" stands for a free size.
+    """
+    for word, slots, wanted in (
+        ("inputs", model.session.get_inputs(), inputs),
+        ("outputs", model.session.get_outputs(), outputs),
+    ):
         found = {slot.name: slot.shape for slot in slots}
         fits = found.keys() == wanted.keys() and all(_may_be(shape, wanted[name]) for name, shape in found.items())
         if not fits:
-            said, expected = (", ".join(f"{name} {list(shape)}" for name, shape in sorted(each.items())) for each in (found, wanted))
+            said, expected = (
+                ", ".join(f"{name} {list(shape)}" for name, shape in sorted(each.items())) for each in (found, wanted)
+            )
             raise ModelError(f"model {model.path} has {word} {said}, its metadata wants {expected}: export it again")
 
 
 def _may_be(found: Sequence[int | str | None], wanted: Sequence[int | str]) -> bool:
     """Whether a graph's shape, in which what is not a number is free, can be the wanted one."""
-    return len(found) == len(wanted) and all(not isinstance(size, int) or size == want for size, want in zip(found, wanted))
+    return len(found) == len(wanted) and all(
+        not isinstance(size, int) or size == want for size, want in zip(found, wanted)
+    )
 
 
 def _expect(path: Path, key: str, found: str | None, wanted: str) -> None:
     if found != wanted:
-        raise ModelError(f"model {path} has {key} {found or 'unknown'}, expected {wanted}: take the model that belongs to this engine and version")
+        raise ModelError(
+            f"model {path} has {key} {found or 'unknown'}, expected {wanted}: take the model that belongs to this"
+            " engine and version"
+        )

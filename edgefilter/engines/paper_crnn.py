@@ -23,8 +23,9 @@ MAX_SECONDS = 60
 class PaperCrnn:
     """CRNN of Li, Hindriks & Kunneman 2024, section 3.3: a soft mask from both magnitudes, on the mixture, with the mixture's phase.
 
-    model: an ONNX file made by export/onnx_export.py from a PaperCrnn checkpoint; without one the file that the environment
-    variable EDGEFILTER_PAPER_CRNN names. The package brings none. Raises ModelError for a file that is not such a model.
+    model: an ONNX file made by export/onnx_export.py from a PaperCrnn checkpoint; without one the file that the
+    environment variable EDGEFILTER_PAPER_CRNN names. The package brings none. Raises ModelError for a file that is not
+    such a model.
     """
 
     name: ClassVar[str] = "paper-crnn"
@@ -34,10 +35,14 @@ class PaperCrnn:
     longest = MAX_SECONDS * SAMPLE_RATE // PAPER_STFT.hop
 
     def __init__(self, model: str | Path | None = None) -> None:
-        remedy = "train one with 'python -m export.train --network paper' and convert it with 'python -m export.onnx_export'"
+        remedy = (
+            "train one with 'python -m export.train --network paper' and convert it with 'python -m export.onnx_export'"
+        )
         self.model = open_model(find_model(model, VARIABLE, "paper_crnn.onnx", remedy), PAPER_TYPE, PAPER_VERSION)
         if self.model.stft != PAPER_STFT:
-            raise ModelError(f"model {self.model.path} is for {self.model.stft}, expected {PAPER_STFT}: train it on that")
+            raise ModelError(
+                f"model {self.model.path} is for {self.model.stft}, expected {PAPER_STFT}: train it on that"
+            )
         clip = (1, "any", PAPER_STFT.bins)
         expect_slots(self.model, {"mic_magnitude": clip, "reference_magnitude": clip}, {"mask": clip})
 

@@ -49,14 +49,15 @@ class PaperSpectralSubtraction:
     eq. (7)   X_est(t, f) = beta sign(X_mix) |X_mix(t, f)| (1 - SM^(t, f)),  sign(X) = X / |X|
 
     response: (601,) float32, |H_m(f) H_s(f)| of eq. (5), from the profile. sign(X) |X| is X itself, so the phase stays.
-    The paper leaves open, and this implementation takes: hop 160 and a 400-sample Hann analysis window, zero-padded to the
-    1200 points that the paper's 601 bins imply (VoiceFilter's sizes); a Hann smoothing window without its zero end points,
-    normalised to sum 1; digital silence before and after the recording, for which eq. (6) gives SM = 1; and alpha chosen
-    for the lowest word errors on 24 simulated validation conversations (bench/measure/tune_paper_ss.py): 4. beta scales the output
-    alone, which neither SI-SDR nor a recogniser with a normalised level notices; it is 1, the most that is never louder than the
-    microphone.
+    The paper leaves open, and this implementation takes: hop 160 and a 400-sample Hann analysis window, zero-padded to
+    the 1200 points that the paper's 601 bins imply (VoiceFilter's sizes); a Hann smoothing window without its zero end
+    points, normalised to sum 1; digital silence before and after the recording, for which eq. (6) gives SM = 1; and
+    alpha chosen for the lowest word errors on 24 simulated validation conversations (bench/measure/tune_paper_ss.py):
+    4. beta scales the output alone, which neither SI-SDR nor a recogniser with a normalised level notices; it is 1, the
+    most that is never louder than the microphone.
 
-    lookahead is L frames. causal=True moves the window L frames back, so that it needs none (2 L + 1 frames of the past).
+    lookahead is L frames. causal=True moves the window L frames back, so that it needs none (2 L + 1 frames of the
+    past).
     """
 
     name: ClassVar[str] = "paper-ss"
@@ -65,7 +66,9 @@ class PaperSpectralSubtraction:
 
     def __init__(self, response: Samples, alpha: float = 4.0, beta: float = 1.0, causal: bool = False) -> None:
         if response.shape != (self.stft.bins,):
-            raise UsageError(f"response has shape {response.shape}, paper-ss expects ({self.stft.bins},): calibrate this robot again")
+            raise UsageError(
+                f"response has shape {response.shape}, paper-ss expects ({self.stft.bins},): calibrate this robot again"
+            )
         window = smoothing_window()
         self._over_time = window.sum(axis=1).astype(np.float32)
         self._over_bins = window.sum(axis=0).astype(np.float32)

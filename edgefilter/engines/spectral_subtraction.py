@@ -17,7 +17,9 @@ MEMORY = 0.8
 
 
 class SpectralSubtraction:
-    """Wiener gain xi / (1 + xi) with the decision-directed a-priori ratio xi of Ephraim & Malah (1984), eq. (51); xi = wanted / unwanted.
+    """Wiener gain xi / (1 + xi) with the decision-directed a-priori ratio xi of Ephraim & Malah (1984), eq.
+
+    (51); xi = wanted / unwanted.
 
     The state is the power of the previous answer (bins,).
     """

@@ -86,8 +86,9 @@ def choose(
 ) -> Choice:
     """The first of candidates, best first, whose p99 compute per hop at the real pace is within budget_ms.
 
-    Figures of an earlier call on this machine, with these versions, models, cores and this length of path, are used again;
-    what is missing is measured, in less than 6 s an engine. say: told what is going on. Raises UsageError where no candidate can be made.
+    Figures of an earlier call on this machine, with these versions, models, cores and this length of path, are used
+    again; what is missing is measured, in less than 6 s an engine. say: told what is going on. Raises UsageError where
+    no candidate can be made.
     """
     cores = min(CORES, len(_allowed()))
     about = budget_cache.describe({"held_to": cores, "taps": _taps(profile), "effects": _effects(profile)})
@@ -132,13 +133,15 @@ def measure(engine: Engine, profile: Profile | None = None, paced: int = PACED) 
         slow = pace(stream, hops, paced, PACED_S)
         at_once = pace(stream, hops, paced, AT_ONCE_S, period_s=0.0)
     times = (*np.percentile(slow, (50, 95, 99, 100)), *np.percentile(at_once, (50, 99)))
-    return Figures(engine.name, _model(engine), 1000 * hop / SAMPLE_RATE, len(slow), len(slow) == paced, *map(float, times))
+    return Figures(
+        engine.name, _model(engine), 1000 * hop / SAMPLE_RATE, len(slow), len(slow) == paced, *map(float, times)
+    )
 
 
 def pace(
     stream: Stream, hops: Iterator[tuple[Samples, Samples]], count: int, limit_s: float, period_s: float | None = None
 ) -> list[float]:
-    """ms that each of count hops took, one begun every period_s (None: the hop's own length), fewer where limit_s is over first."""
+    """Ms that each of count hops took, one begun every period_s (None: the hop's own length), fewer where limit_s is over first."""
     period_s = stream.engine.stft.hop / SAMPLE_RATE if period_s is None else period_s
     took: list[float] = []
     began = time.perf_counter()
@@ -199,10 +202,16 @@ def _reason(best: Figures, found: Sequence[Figures], skipped: dict[str, str], bu
     measured = f"p99 {_needs(best)} per {best.hop_ms:.0f} ms hop on {cores} cores ({typical})"
     if fits(best, budget_ms):
         return f"auto: best engine within {budget_ms:g} ms, {measured}{against}"
-    wish = f"--budget-ms {np.ceil(best.paced_p99_ms):.0f}" if best.complete and best.paced_p99_ms < best.hop_ms else "a faster processor"
+    wish = (
+        f"--budget-ms {np.ceil(best.paced_p99_ms):.0f}"
+        if best.complete and best.paced_p99_ms < best.hop_ms
+        else "a faster processor"
+    )
     failure = f"auto: no engine keeps to {budget_ms:g} ms; {best.engine} is the cheapest, {measured}{against}"
     return f"{failure}; {wish}, a free core or fewer programs beside it would help"
 
 
 def _needs(figures: Figures) -> str:
-    return f"{figures.paced_p99_ms:.1f} ms" if figures.complete else f"more than the hop ({figures.paced_p50_ms:.0f} ms)"
+    return (
+        f"{figures.paced_p99_ms:.1f} ms" if figures.complete else f"more than the hop ({figures.paced_p50_ms:.0f} ms)"
+    )

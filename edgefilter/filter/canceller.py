@@ -40,9 +40,9 @@ class Adaptation:
     """How the Kalman filter believes that the path moves and how its error is read.
 
     transition: A of the first-order Markov model of the path per hop of 16 ms. noise_memory: weight of the past in the
-    measurement-noise PSD. certainty: share of the gain by which a correction lowers the covariance; overlap-save in theory
-    has 1/2. products: whether d x and d^2 x are heard beside the reference. posterior: whether the error is delivered after
-    the hop's own correction.
+    measurement-noise PSD. certainty: share of the gain by which a correction lowers the covariance; overlap-save in
+    theory has 1/2. products: whether d x and d^2 x are heard beside the reference. posterior: whether the error is
+    delivered after the hop's own correction.
     """
 
     transition: float
@@ -61,8 +61,9 @@ WARM = Adaptation(transition=0.99997, noise_memory=0.9, certainty=0.5, products=
 class CancellerOutput(NamedTuple):
     """One hop of the linear stage.
 
-    echo, error: (hop,) float32 with error = mic - echo exactly. uncertainty: (hop + 1,) float32, what the filter itself expects
-    of |error spectrum|^2 from its misalignment, for a rectangular frame of hop samples, on frequencies 0 to Nyquist.
+    echo, error: (hop,) float32 with error = mic - echo exactly. uncertainty: (hop + 1,) float32, what the filter itself
+    expects of |error spectrum|^2 from its misalignment, for a rectangular frame of hop samples, on frequencies 0 to
+    Nyquist.
     """
 
     echo: Samples
@@ -73,19 +74,23 @@ class CancellerOutput(NamedTuple):
 class Canceller:
     """Predicts the echo of one hop from that hop's reference and corrects itself by what the prediction left.
 
-    Overlap-save blocks of 2 * hop; partition p covers taps p * hop ... (p + 1) * hop - 1. Diagonal state-space model of Enzner &
-    Vary (2006), "Frequency-domain adaptive Kalman filter for acoustic echo control", eq. (27)-(34), partitioned as in Kuech,
-    Mabande & Enzner (2014), "State-space architecture of the partitioned-block-based acoustic echo controller".
-    Beside the reference x it hears d x and d^2 x, d being the membrane's displacement (x low-passed): what force factor and
-    stiffness that depend on the displacement add to a moving-coil loudspeaker (Klippel 2006, "Loudspeaker nonlinearities").
-    Their paths are PRODUCT_PARTITIONS long and start at zero.
-    adaptation: WARM where impulse_response is given, COLD where not, unless said otherwise.
-    impulse_response (n,) float32 starts the filter; longer than taps it is cut, without it the start is cold.
-    Raises SignalError where hop or taps are not positive or the impulse response is not finite.
+    Overlap-save blocks of 2 * hop; partition p covers taps p * hop ... (p + 1) * hop - 1. Diagonal state-space model of
+    Enzner & Vary (2006), "Frequency-domain adaptive Kalman filter for acoustic echo control", eq. (27)-(34),
+    partitioned as in Kuech, Mabande & Enzner (2014), "State-space architecture of the partitioned-block-based acoustic
+    echo controller". Beside the reference x it hears d x and d^2 x, d being the membrane's displacement (x low-passed):
+    what force factor and stiffness that depend on the displacement add to a moving-coil loudspeaker (Klippel 2006,
+    "Loudspeaker nonlinearities"). Their paths are PRODUCT_PARTITIONS long and start at zero. adaptation: WARM where
+    impulse_response is given, COLD where not, unless said otherwise. impulse_response (n,) float32 starts the filter;
+    longer than taps it is cut, without it the start is cold. Raises SignalError where hop or taps are not positive or
+    the impulse response is not finite.
     """
 
     def __init__(
-        self, hop: int = 256, taps: int = 6400, impulse_response: Samples | None = None, adaptation: Adaptation | None = None
+        self,
+        hop: int = 256,
+        taps: int = 6400,
+        impulse_response: Samples | None = None,
+        adaptation: Adaptation | None = None,
     ) -> None:
         if hop < 1 or taps < 1:
             raise SignalError(f"canceller got hop={hop} and taps={taps}, expected both to be at least 1 sample")
@@ -123,7 +128,10 @@ class Canceller:
         self._covariance = np.concatenate((self._prior(), product_variance)).astype(np.float32)
         self._ageing, self._aged = (1.0 - self.adaptation.transition**2) * fourier.power(self._weights), 0
         self._recent = np.zeros((self._channels, 2 * hop), np.float32)
-        self._all_spectra, self._all_powers = np.zeros((2 * shape[0], bins), np.complex64), np.zeros((2 * shape[0], bins), np.float32)
+        self._all_spectra, self._all_powers = (
+            np.zeros((2 * shape[0], bins), np.complex64),
+            np.zeros((2 * shape[0], bins), np.float32),
+        )
         self._slide(to=shape[0])
         self._moving = np.zeros(DISPLACEMENT_TAPS - 1, np.float32)
         self._noise = np.zeros(bins, np.float32)
@@ -220,7 +228,11 @@ class Canceller:
 
     def _path_power(self) -> np.ndarray:
         """(bins,) |H|^2 of the path at the start, summed over partitions; 1 where nothing is known."""
-        return fourier.power(self._weights[: self.partitions]).sum(axis=0) if self._warm else np.ones(self.hop + 1, np.float32)
+        return (
+            fourier.power(self._weights[: self.partitions]).sum(axis=0)
+            if self._warm
+            else np.ones(self.hop + 1, np.float32)
+        )
 
     def _prior(self) -> np.ndarray:
         """(partitions, bins) covariance before anything was heard."""
@@ -228,7 +240,10 @@ class Canceller:
         decay = 10.0 ** (-6.0 * seconds / DECAY_RT60_S)[:, None] * np.ones(self.hop + 1)
         if not self._warm:
             return (decay / decay.sum(axis=0)).astype(np.float32)
-        return (PRIOR_VARIANCE * fourier.power(self._weights[: self.partitions]) + LATE_VARIANCE * decay * self._path_power()).astype(np.float32)
+        return (
+            PRIOR_VARIANCE * fourier.power(self._weights[: self.partitions])
+            + LATE_VARIANCE * decay * self._path_power()
+        ).astype(np.float32)
 
     def impulse_response(self) -> Samples:
         """The adapted path (taps,) float32, to be written back into a profile."""
@@ -237,8 +252,8 @@ class Canceller:
     def rewrite_reference(self, history: Samples) -> None:
         """Replace the past of the reference after a realignment.
 
-        history: (n,) float32, the last n reference samples under the new delay, the hop that is about to be stepped included; what
-        is missing of `self.history` samples counts as silence.
+        history: (n,) float32, the last n reference samples under the new delay, the hop that is about to be stepped
+        included; what is missing of `self.history` samples counts as silence.
         """
         wanted = self.history
         known = np.zeros(wanted, np.float32)
@@ -254,10 +269,17 @@ class Canceller:
         for first, channel in zip(self._first, channels, strict=True):
             count = PRODUCT_PARTITIONS if first else self.partitions
             hops = channel.reshape(-1, self.hop)[::-1]
-            self._spectra[first : first + count] = fourier.rfft(np.concatenate((hops[1 : count + 1], hops[:count]), axis=1))
+            self._spectra[first : first + count] = fourier.rfft(
+                np.concatenate((hops[1 : count + 1], hops[:count]), axis=1)
+            )
         self._powers[:] = fourier.power(self._spectra)
         self._recent[:] = [channel[-2 * self.hop :] for channel in channels]
 
     def stats(self) -> dict[str, float]:
         """What the stage did so far."""
-        return {"hops": self._hops, "active_hops": self._active, "partitions": self.partitions, "gain_db": 20.0 * float(np.log10(self.volume.gain))}
+        return {
+            "hops": self._hops,
+            "active_hops": self._active,
+            "partitions": self.partitions,
+            "gain_db": 20.0 * float(np.log10(self.volume.gain)),
+        }

@@ -13,16 +13,18 @@ MEMORY = 0.8
 PART = 64
 """Samples, 4 ms, of a hop that are looked at by themselves: a loudspeaker can be cut off in mid-word."""
 GROSS = 4.0
-"""Power of such a part's error over the microphone's, from which on it is limited whatever the smoothed powers say: human and robot
-cancel one another in the microphone by so much in hardly any part."""
+"""Power of such a part's error over the microphone's, from which on it is limited whatever the smoothed powers say:
+human and robot cancel one another in the microphone by so much in hardly any part."""
 NEAR = 0.1
-"""Power of a hop's error over the microphone's up to which no part of it is looked at: whatever is too loud there is 10 dB lower."""
+"""Power of a hop's error over the microphone's up to which no part of it is looked at: whatever is too loud there is 10
+dB lower."""
 ABSENT = 0.1
 """Weight below which the echo is not there at all: so much of a correlation is chance."""
 EXCESS = 1.5
 """Error power over microphone power from which on the echo is too loud for a filter that is merely not exact."""
 PATIENCE_S = 0.5
 """Seconds after which an echo that is too loud is put down to another path."""
+
 
 class EchoLimiter:
     """Weighs the echo by gamma = <mic, echo> / <echo, echo>, in 0 to 1, while subtracting all of it would add power.

@@ -28,8 +28,8 @@ class EgoFilter:
     engine : str
         One of `edgefilter.ENGINES`, or "auto" for the strongest that can be made here.
     budget_ms : float, optional
-        Compute per hop to keep to. Where more is needed for long, cheaper engines take over (see Stepping), each time with an event.
-        Without a budget the engine stays, and missed deadlines are only counted.
+        Compute per hop to keep to. Where more is needed for long, cheaper engines take over (see Stepping), each time
+        with an event. Without a budget the engine stays, and missed deadlines are only counted.
     reason : str
         Why an engine that was named was chosen, for `stats`.
     model : str or Path, optional
@@ -53,9 +53,9 @@ class EgoFilter:
 
     Notes
     -----
-    The path, hop by hop: alignment of the reference, a partitioned-block frequency-domain Kalman filter (Enzner & Vary 2006) that
-    subtracts the echo, the engine's mask on what is left, overlap-add (docs/architecture.md). Samples are float, full scale +-1, at
-    16 kHz, one channel. Any partition into blocks gives the same output to the last bit.
+    The path, hop by hop: alignment of the reference, a partitioned-block frequency-domain Kalman filter (Enzner & Vary
+    2006) that subtracts the echo, the engine's mask on what is left, overlap-add (docs/architecture.md). Samples are
+    float, full scale +-1, at 16 kHz, one channel. Any partition into blocks gives the same output to the last bit.
 
     Examples
     --------
@@ -77,9 +77,13 @@ class EgoFilter:
         barge_in: BargeInSettings | None = None,
     ) -> None:
         if engine == "auto" and model is not None:
-            raise UsageError(f"found the model {model} without an engine for it: name one of {', '.join(engines.HAVE_MODEL)}")
+            raise UsageError(
+                f"found the model {model} without an engine for it: name one of {', '.join(engines.HAVE_MODEL)}"
+            )
         self.profile = Profile.load(profile) if isinstance(profile, str | Path) else profile
-        best, self.engine_reason = strongest(self.profile) if engine == "auto" else (engines.create(engine, self.profile, model=model), reason)
+        best, self.engine_reason = (
+            strongest(self.profile) if engine == "auto" else (engines.create(engine, self.profile, model=model), reason)
+        )
         ladder = None if budget_ms is None or best.lookahead is None else Ladder(climbable(best, self.profile))
         self._stream = Stream(ladder or best, self.profile, Stepping(best.stft.hop, ladder, budget_ms), barge_in)
 
@@ -112,14 +116,18 @@ class EgoFilter:
     def speech_probability(self) -> float | None:
         """Probability that the human speaks now, 0 to 1: the network's, weighed with what robot and room are expected to leave.
 
-        None before the first hop and with engines that do not judge it (all but crnn): what stands above the robot's rest is not yet a
-        human, so they give no events of speech either. 0 where an utterance of the robot has begun and is not found yet.
+        None before the first hop and with engines that do not judge it (all but crnn): what stands above the robot's
+        rest is not yet a human, so they give no events of speech either. 0 where an utterance of the robot has begun
+        and is not found yet.
         """
         return self._stream.speech_probability
 
     @property
     def human_speaks(self) -> bool:
-        """Whether the human is speaking, pauses of half a second included; always False where the engine does not judge it."""
+        """Whether the human is speaking, pauses of half a second included.
+
+        Always False where the engine does not judge it.
+        """
         return self._stream.human_speaks
 
     def process(self, mic_block: Samples, ref_block: Samples) -> Samples:
@@ -128,12 +136,14 @@ class EgoFilter:
         Parameters
         ----------
         mic_block, ref_block : ndarray of float, shape (n,)
-            What the microphone heard and what the robot said meanwhile, any n, on the same sample counter. Never written to.
+            What the microphone heard and what the robot said meanwhile, any n, on the same sample counter. Never
+            written to.
 
         Returns
         -------
         ndarray of float32, shape (m,)
-            Aligned with the input: sample i of all outputs together belongs to sample i of all inputs. m is 0 to n + latency.
+            Aligned with the input: sample i of all outputs together belongs to sample i of all inputs. m is 0 to n +
+            latency.
 
         Raises
         ------
@@ -157,9 +167,10 @@ class EgoFilter:
 
         Notes
         -----
-        For robots without a loopback: while the reference blocks are zeros, the utterance is looked for in the microphone for
-        30 s, and from about 0.1 s after its first sound on it is the reference. A reference channel that carries sound is
-        believed instead, and drops what was announced. Engines that only delay the reference (paper-ss) count announcements.
+        For robots without a loopback: while the reference blocks are zeros, the utterance is looked for in the
+        microphone for 30 s, and from about 0.1 s after its first sound on it is the reference. A reference channel that
+        carries sound is believed instead, and drops what was announced. Engines that only delay the reference
+        (paper-ss) count announcements.
         """
         if self._stream.front.aligner:
             self._stream.front.aligner.announce(as_samples(utterance, "utterance"))
@@ -222,8 +233,8 @@ class EgoFilter:
         Returns
         -------
         Profile
-            A new one; `self.profile` stays. What of its path is longer than the linear stage is the profile's own, as loud as the
-            volume was turned.
+            A new one; `self.profile` stays. What of its path is longer than the linear stage is the profile's own, as
+            loud as the volume was turned.
 
         Raises
         ------
@@ -250,7 +261,11 @@ def strongest(profile: Profile | None) -> tuple[Engine, str]:
 
 
 def enhance(
-    mic: Samples, ref: Samples, profile: Profile | str | Path | None = None, engine: str = "auto", model: str | Path | None = None
+    mic: Samples,
+    ref: Samples,
+    profile: Profile | str | Path | None = None,
+    engine: str = "auto",
+    model: str | Path | None = None,
 ) -> Samples:
     """Filter a whole recording with its reference, by the same stream as live.
 

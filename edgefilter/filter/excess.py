@@ -100,8 +100,7 @@ class Excess:
         return float(np.add.reduce(excess)) / excess.size
 
     def _powers(self, error: Spectrum, echo: Spectrum) -> tuple[Samples, Samples]:
-        """(bands,) of either: real and imaginary parts squared and summed in one go, which costs half of doing it by
-        steps."""
+        """(bands,) of either; parts squared and summed in one go, which costs half of doing it by steps."""
         self._spectra[0], self._spectra[1] = error[self._bins], echo[self._bins]
         parts = self._spectra.view(np.float32).reshape(-1)
         np.multiply(parts, parts, out=self._squares)
@@ -122,8 +121,7 @@ class Excess:
         return np.minimum(self._past_least, FLOOR_BIAS * self._least)
 
     def _learn(self, ratio: Samples, share: Samples) -> None:
-        """Follow gain and spread from the log ratio (bands,) and the echo's share (bands,) of what was expected;
-        overwrites both."""
+        """Follow gain and spread from the log ratio and the echo's share of what was expected, (bands,); overwrites both."""
         self._heard_s = min(self._heard_s + self.echo_share * self._lesson_s, LEARN_S)
         step = self._lesson_s / self._heard_s
         np.maximum(ratio, -FALL, out=ratio)

@@ -23,7 +23,8 @@ RUMBLE_HZ, RUMBLE = 80.0, 0.05
 """Below this frequency a microphone whose path nobody measured hears rooms, not people; it is lowered by 26 dB."""
 
 UNLOCATED = ("begun", "announced")
-"""States of the alignment in which the reference may lie elsewhere than the microphone hears it: the path is not adapted."""
+"""States of the alignment in which the reference may lie elsewhere than the microphone hears it: the path is not
+adapted."""
 
 
 class FrontEnd:
@@ -40,7 +41,9 @@ class FrontEnd:
             self.aligner = PaperAligner(stft.hop)
         elif engine.front == "full":
             self.aligner = Aligner(stft.hop, profile)
-            self.gate = OnsetGate(stft.hop, float(np.sum(np.square(profile.echo.impulse_response)))) if profile else None
+            self.gate = (
+                OnsetGate(stft.hop, float(np.sum(np.square(profile.echo.impulse_response)))) if profile else None
+            )
             self.canceller = self._make_canceller(profile)
             self.residual = Residual(stft, profile)
         self._source = profile.echo.source_chain() if profile else SourceChain()
@@ -87,7 +90,9 @@ class FrontEnd:
     def _subtract(self, mic: Samples, aligned: Aligned) -> CancellerOutput:
         """The linear stage's hop."""
         if aligned.realigned:
-            self.canceller.rewrite_reference(self._source.rewritten(self.aligner.history(self.canceller.history), self.hop))
+            self.canceller.rewrite_reference(
+                self._source.rewritten(self.aligner.history(self.canceller.history), self.hop)
+            )
         return self.canceller.step(mic, self._source(aligned.reference), aligned.state not in UNLOCATED)
 
 

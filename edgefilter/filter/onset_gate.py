@@ -8,21 +8,24 @@ from edgefilter.alignment.delay_line import Aligned
 from edgefilter.types import SAMPLE_RATE, Samples
 
 GATE = 0.003
-"""Gain while the gate is shut, -50 dB: what is left of a robot that is 20-26 dB above the human no network takes for somebody, and
-the human was inaudible anyway."""
+"""Gain while the gate is shut, -50 dB: what is left of a robot that is 20-26 dB above the human no network takes for
+somebody, and the human was inaudible anyway."""
 LOUD, EXPLAINED = 0.05, 100.0
-"""Microphone power over the loudest that the robot has brought there from which on it can only be the robot, 7 to 13 dB above a human
-20-26 dB below; and over what the reference brings at the present delay, from which on that delay does not explain it: single sounds
-pass a room 10 dB better than speech does."""
+"""Microphone power over the loudest that the robot has brought there from which on it can only be the robot, 7 to 13 dB
+above a human 20-26 dB below; and over what the reference brings at the present delay, from which on that delay does not
+explain it: single sounds pass a room 10 dB better than speech does."""
 LONGEST = SAMPLE_RATE // 4
-"""Samples for which the gate stays shut at most: a human as loud as the robot, beside a muted loudspeaker, loses no more per utterance."""
+"""Samples for which the gate stays shut at most: a human as loud as the robot, beside a muted loudspeaker, loses no
+more per utterance."""
 USUAL, FORGET = 1e-2, 0.1 ** (1 / (10 * SAMPLE_RATE))
-"""Mean square that the loudest hop of a voice is taken to have at first (-20 dB of full scale), so that a soft first sound makes nobody
-else loud; and its decay per sample of speech, 10 dB in 10 s, since the volume may have been turned."""
+"""Mean square that the loudest hop of a voice is taken to have at first (-20 dB of full scale), so that a soft first
+sound makes nobody else loud; and its decay per sample of speech, 10 dB in 10 s, since the volume may have been
+turned."""
 LEARNING = 0.1
 """Share of a loud hop in the running gain from the reference to the microphone."""
 SETTLE = SAMPLE_RATE // 4
-"""Samples after a lag was found in which a network, which had the robot without its reference until then, still takes it for a human."""
+"""Samples after a lag was found in which a network, which had the robot without its reference until then, still takes
+it for a human."""
 RAMP = 64
 """Samples, 4 ms, over which the gate opens; it shuts at once, and what frames still hold of the hop before with it."""
 
@@ -30,8 +33,9 @@ RAMP = 64
 class OnsetGate:
     """Lowers the microphone where it holds the robot at a delay that the aligner is still looking for.
 
-    hop: samples per step. gain: power at the microphone over the reference's, by the profile; it is followed while the delay is
-    known. shuts: whether it was open in the hop before; what came just before was the first of the robot, and goes with it.
+    hop: samples per step. gain: power at the microphone over the reference's, by the profile; it is followed while the
+    delay is known. shuts: whether it was open in the hop before; what came just before was the first of the robot, and
+    goes with it.
     """
 
     def __init__(self, hop: int, gain: float) -> None:
@@ -62,7 +66,11 @@ class OnsetGate:
         aligned: what the aligner made of both.
         """
         self._settling = SETTLE if aligned.realigned else self._settling - self._hop
-        heard, played, explained = float(mic.dot(mic)), float(ref.dot(ref)), float(aligned.reference.dot(aligned.reference))
+        heard, played, explained = (
+            float(mic.dot(mic)),
+            float(ref.dot(ref)),
+            float(aligned.reference.dot(aligned.reference)),
+        )
         if played > 1e-3 * self._loudest:
             self._loudest = max(played, self._decay * self._loudest)
         before = self.shut

@@ -17,8 +17,8 @@ LEAKAGE = 0.005
 LEAST, MOST = 0.0024, 0.1
 """Bounds on it once it is tracked."""
 LEAKAGE_MEMORY, LEAKAGE_RISE, LEAKAGE_FALL = 0.97, 1.005, 0.9
-"""The part is observed over half a second of the robot's speech; it falls at once and rises by 1.4 dB a second, so that a human's
-sentence hardly lifts it."""
+"""The part is observed over half a second of the robot's speech; it falls at once and rises by 1.4 dB a second, so that
+a human's sentence hardly lifts it."""
 MARGIN = 3.0
 """The mask wants to know the loud moments, which distort most; what is tracked is nearer to the quiet ones."""
 AUDIBLE = 60.0
@@ -28,8 +28,8 @@ SPREAD, SPREAD_HZ = 0.1, 2000.0
 TAIL_DECAY = 0.6
 """Fall of the residual echo per hop, room for what lies beyond the canceller's tail and between its frames."""
 MISALIGNMENT_WARM, MISALIGNMENT_COLD = 0.5, 2.0
-"""Weight of the canceller's own expectation of its misalignment: it counts a calibrated path as unknown longer than it is, and a path
-that it learnt from nothing as better known than it is."""
+"""Weight of the canceller's own expectation of its misalignment: it counts a calibrated path as unknown longer than it
+is, and a path that it learnt from nothing as better known than it is."""
 FAN_START = 1e-9
 """Fan power per bin before anything was heard and without a profile."""
 FAN_RISE, FAN_FALL = 1.004, 0.97
@@ -44,8 +44,9 @@ def power(spectrum: Spectrum) -> Samples:
 class Residual:
     """Tracks the fan and the residual echo of one stream; step() once per frame.
 
-    With a profile the fan is the calibrated one; without, it is the slowly rising minimum of the smoothed error. Of the echo a part
-    stays, how much is tracked: the least ratio of error to echo while the robot speaks, for a human can only add to it.
+    With a profile the fan is the calibrated one; without, it is the slowly rising minimum of the smoothed error. Of the
+    echo a part stays, how much is tracked: the least ratio of error to echo while the robot speaks, for a human can
+    only add to it.
     """
 
     def __init__(self, stft: StftConfig, profile: Profile | None = None) -> None:

@@ -12,25 +12,31 @@ from edgefilter.types import SAMPLE_RATE
 
 WINDOW_S = 1.0
 OVERLOADED = 0.25
-"""Part of the last WINDOW_S of hops over the budget at which the load counts as sustained; a single stall never reaches it."""
+"""Part of the last WINDOW_S of hops over the budget at which the load counts as sustained; a single stall never reaches
+it."""
 CALM = 0.01
 """Part of the hops over the budget up to which the machine has recovered: the budget is promised for 99 of 100."""
 PATIENCE_S, MOST_PATIENCE_S = 10.0, 160.0
-"""Calm seconds before a better engine is tried again; doubled each time that one had to be left within PROVEN_S, up to the most."""
+"""Calm seconds before a better engine is tried again; doubled each time that one had to be left within PROVEN_S, up to
+the most."""
 PROVEN_S = 30.0
 
 
 class Stepping:
     """Watches the compute time of each hop of one stream.
 
-    A hop misses its deadline where its compute took longer than the hop lasts; it is over the budget where it took longer than
-    budget_ms, or than the hop. Where OVERLOADED of the last second are over the budget, the ladder is asked for the next
-    cheaper engine, and after PATIENCE_S of calm for the next better one.
-    ladder: the stream's engine, None to count only. clock: seconds, monotonic.
+    A hop misses its deadline where its compute took longer than the hop lasts; it is over the budget where it took
+    longer than budget_ms, or than the hop. Where OVERLOADED of the last second are over the budget, the ladder is asked
+    for the next cheaper engine, and after PATIENCE_S of calm for the next better one. ladder: the stream's engine, None
+    to count only. clock: seconds, monotonic.
     """
 
     def __init__(
-        self, hop: int, ladder: Ladder | None = None, budget_ms: float | None = None, clock: Callable[[], float] = time.perf_counter
+        self,
+        hop: int,
+        ladder: Ladder | None = None,
+        budget_ms: float | None = None,
+        clock: Callable[[], float] = time.perf_counter,
     ) -> None:
         self.hop_ms = 1000 * hop / SAMPLE_RATE
         self.budget_ms = self.hop_ms if budget_ms is None else min(budget_ms, self.hop_ms)
@@ -73,8 +79,18 @@ class Stepping:
 
     def stats(self) -> dict[str, object]:
         """Ready for JSON: times per hop, missed deadlines, hops over budget, how far behind it was at worst."""
-        found = {"hop_ms": self.hop_ms, "budget_ms": self.budget_ms, "hops": self.times.count, "missed_deadlines": self.missed}
-        found |= {"over_budget": self.over_budget, "most_behind_ms": self.most_behind_ms, "steps": self.steps, "compute": self.times.to_dict()}
+        found = {
+            "hop_ms": self.hop_ms,
+            "budget_ms": self.budget_ms,
+            "hops": self.times.count,
+            "missed_deadlines": self.missed,
+        }
+        found |= {
+            "over_budget": self.over_budget,
+            "most_behind_ms": self.most_behind_ms,
+            "steps": self.steps,
+            "compute": self.times.to_dict(),
+        }
         return found
 
     def _hops(self, seconds: float) -> int:

@@ -20,12 +20,12 @@ from edgefilter.types import SAMPLE_RATE, Event, Frame, Samples, as_samples
 class Stream:
     """Runs one engine over blocks of any length; whatever the partition, the output is bit-identical.
 
-    process returns finished samples, aligned with the input: sample i of all outputs together belongs to sample i of all
-    inputs. Sample n is out once n + latency samples have come in. After flush as many samples are out as went in.
-    With an engine that waits for the end (waits_for_end) process returns nothing and flush everything.
-    stepping: told the compute time of every hop; what it answers becomes an event. barge_in: when speech counts as begun
-    and ended, None for the defaults. speech_probability: of the last hop, weighed with what robot and room leave; None
-    before the first hop and where the engine does not judge it.
+    process returns finished samples, aligned with the input: sample i of all outputs together belongs to sample i of
+    all inputs. Sample n is out once n + latency samples have come in. After flush as many samples are out as went in.
+    With an engine that waits for the end (waits_for_end) process returns nothing and flush everything. stepping: told
+    the compute time of every hop; what it answers becomes an event. barge_in: when speech counts as begun and ended,
+    None for the defaults. speech_probability: of the last hop, weighed with what robot and room leave; None before the
+    first hop and where the engine does not judge it.
     """
 
     def __init__(
@@ -43,7 +43,10 @@ class Stream:
 
     @property
     def latency(self) -> int:
-        """Algorithmic latency in samples: the window plus the engine's look-ahead; only the window where waits_for_end."""
+        """Algorithmic latency in samples: the window plus the engine's look-ahead.
+
+        Only the window where waits_for_end.
+        """
         return self.engine.stft.window_length + (self.engine.lookahead or 0) * self.engine.stft.hop
 
     @property
@@ -80,7 +83,9 @@ class Stream:
         if self._flushed:
             raise SignalError("the stream has been flushed, its end is written: call reset() before the next recording")
         if mic.size != ref.size:
-            raise SignalError(f"mic has {mic.size} samples and ref {ref.size}, expected as many of each: pad the shorter with zeros")
+            raise SignalError(
+                f"mic has {mic.size} samples and ref {ref.size}, expected as many of each: pad the shorter with zeros"
+            )
         self.samples_in += mic.size
         return self._run(mic, ref)
 
@@ -133,7 +138,9 @@ class Stream:
         self._stepped += mic.size
         frame, aligned = self.front.step(mic, ref)
         if aligned and aligned.realigned:
-            self.events.append(Event("realigned", self._stepped, f"reference arrives after {aligned.delay:.1f} samples"))
+            self.events.append(
+                Event("realigned", self._stepped, f"reference arrives after {aligned.delay:.1f} samples")
+            )
         if self.waits_for_end:
             self._collect(frame)
             return np.zeros(0, np.float32)
@@ -154,5 +161,6 @@ class Stream:
         if len(self._clip) > self.engine.longest:
             seconds = self.engine.longest * self.engine.stft.hop / SAMPLE_RATE
             raise SignalError(
-                f"the recording is longer than {seconds:.0f} s, which is all that engine {self.engine.name} takes at once: cut it or take another engine"
+                f"the recording is longer than {seconds:.0f} s, which is all that engine {self.engine.name} takes at"
+                " once: cut it or take another engine"
             )

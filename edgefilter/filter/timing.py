@@ -10,7 +10,9 @@ LOWEST_MS, DECADES, PER_DECADE = 1e-3, 7, 48
 
 
 class Histogram:
-    """Counts times in bins of 5 % width from 1 us to 10 s; mean and maximum are exact, percentiles to the width of a bin.
+    """Counts times in bins of 5 % width from 1 us to 10 s.
+
+    Mean and maximum are exact, percentiles to the width of a bin.
 
     >>> times = Histogram()
     >>> for ms in range(1, 101):
@@ -33,7 +35,7 @@ class Histogram:
         self.max_ms = max(self.max_ms, ms)
 
     def percentile(self, percent: float) -> float:
-        """ms under which percent of the times lie; 0 without any."""
+        """Ms under which percent of the times lie; 0 without any."""
         if not self.count:
             return 0.0
         at = int(np.searchsorted(np.cumsum(self._bins), percent / 100 * self.count))

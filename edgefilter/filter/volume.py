@@ -17,7 +17,8 @@ AUDIBLE, FORGET_S = 0.01, 10.0
 MOST = 10.0
 """Largest factor, 20 dB, by which the volume is followed from where it was at first, up or down."""
 CONVERGED = 10.0
-"""Factor by which an echo path that began unknown must have lowered the microphone's power before a factor on it means anything."""
+"""Factor by which an echo path that began unknown must have lowered the microphone's power before a factor on it means
+anything."""
 PRE_EMPHASIS = 0.95
 """First-order pre-emphasis before the correlation: fan and room rumble below the voice weigh less."""
 WITNESSES = 6

@@ -38,7 +38,8 @@ class Profile:
     Parameters
     ----------
     echo : EchoModel
-        The path from reference to microphone, its impulse response starting PRE_ROLL samples before the direct sound, and the effects.
+        The path from reference to microphone, its impulse response starting PRE_ROLL samples before the direct sound,
+        and the effects.
     delay : float
         Index of the direct sound in the calibration recording, samples.
     response : ndarray of float32, shape (601,)
@@ -146,7 +147,10 @@ class Profile:
         """
         arrays, header, effects = read_fields(Path(path))
         try:
-            expected = {*_ARRAYS, "impulse_response"}, {"pre_roll", "delay", "sample_rate", "warnings", "created", "source"}
+            expected = (
+                {*_ARRAYS, "impulse_response"},
+                {"pre_roll", "delay", "sample_rate", "warnings", "created", "source"},
+            )
             for found, names, kind in zip((arrays, header), expected, ("array", "header"), strict=True):
                 if set(found) != names:
                     odd = ", ".join(sorted(names - set(found))) or "nothing"
@@ -180,7 +184,10 @@ class Profile:
         return (psd / 2 * SAMPLE_RATE * stft.noise_gain()).astype(np.float32)
 
     def response_bins(self, stft: StftConfig) -> Samples:
-        """The paper's |H_m(f) H_s(f)| (bins,) float32 at the frequencies of stft; the stored values where n_fft is 1200."""
+        """The paper's |H_m(f) H_s(f)| (bins,) float32 at the frequencies of stft.
+
+        The stored values where n_fft is 1200.
+        """
         return np.interp(stft.frequencies, GRID_HZ, self.response).astype(np.float32)
 
 
@@ -239,7 +246,11 @@ def _check_numbers(profile: Profile) -> None:
     """Raise ProfileError for a header value of the wrong type or out of range."""
     if isinstance(profile.sample_rate, bool) or profile.sample_rate != SAMPLE_RATE:
         _fail("sample_rate", repr(profile.sample_rate), f"{SAMPLE_RATE} Hz")
-    if isinstance(profile.delay, bool) or not isinstance(profile.delay, int | float | np.number) or not abs(profile.delay) <= MAX_DELAY:
+    if (
+        isinstance(profile.delay, bool)
+        or not isinstance(profile.delay, int | float | np.number)
+        or not abs(profile.delay) <= MAX_DELAY
+    ):
         _fail("delay", repr(profile.delay), f"-{MAX_DELAY} to {MAX_DELAY} samples")
     for name in ("created", "source"):
         if not isinstance(getattr(profile, name), str):

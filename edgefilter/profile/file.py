@@ -28,7 +28,10 @@ Effects = tuple[tuple[str, Mapping[str, Any]], ...]
 
 
 def write_fields(path: Path, arrays: Mapping[str, np.ndarray], header: Mapping[str, Any], effects: Effects) -> None:
-    """Write arrays, a header of JSON values and the effects to path, whole or not at all; raise ProfileError where that fails."""
+    """Write arrays, a header of JSON values and the effects to path, whole or not at all.
+
+    Raise ProfileError where that fails.
+    """
     members = dict(arrays)
     listed = []
     for i, (name, values) in enumerate(effects):
@@ -75,11 +78,16 @@ def _replace(path: Path, members: Mapping[str, np.ndarray]) -> None:
     except OSError as error:
         with contextlib.suppress(OSError):
             temporary.unlink()
-        raise ProfileError(f"{path}: the profile cannot be written ({error.strerror}); choose another place or free space") from None
+        raise ProfileError(
+            f"{path}: the profile cannot be written ({error.strerror}); choose another place or free space"
+        ) from None
 
 
 def read_fields(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any], Effects]:
-    """Return (arrays, header, effects) of a file that write_fields wrote; raise ProfileError, in one line, for any other."""
+    """Return (arrays, header, effects) of a file that write_fields wrote.
+
+    Raise ProfileError, in one line, for any other.
+    """
     try:
         if path.is_dir():
             raise ProfileError(f"{path}: is a folder, expected a profile file; {REMEDY}")
@@ -109,7 +117,10 @@ def _members(content: bytes) -> dict[str, np.ndarray]:
             infos = archive.infolist()
             total = sum(info.file_size for info in infos)
             if len(infos) > MAX_MEMBERS or total > MAX_FILE_BYTES:
-                raise _Damaged(f"unpacks to {total} bytes in {len(infos)} members, expected at most {MAX_FILE_BYTES} in {MAX_MEMBERS}")
+                raise _Damaged(
+                    f"unpacks to {total} bytes in {len(infos)} members, expected at most {MAX_FILE_BYTES} in"
+                    f" {MAX_MEMBERS}"
+                )
             arrays = {}
             for info in infos:
                 if info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED) or info.flag_bits & 1:
@@ -173,7 +184,15 @@ def _effects(listed: object, members: Mapping[str, np.ndarray]) -> Effects:
         name, values = entry.get("name"), entry.get("values")
         if not isinstance(name, str) or not isinstance(values, dict):
             raise _Damaged(f"effects[{i}] has no name or no values")
-        effects.append((name, {key: _value(value, f"effects[{i}] ({name[:40]}).{key[:40]}", members) for key, value in values.items()}))
+        effects.append(
+            (
+                name,
+                {
+                    key: _value(value, f"effects[{i}] ({name[:40]}).{key[:40]}", members)
+                    for key, value in values.items()
+                },
+            )
+        )
     return tuple(effects)
 
 

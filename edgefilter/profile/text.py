@@ -22,8 +22,10 @@ def describe(profile: Profile) -> str:
     )
     lines = [
         f"made        {profile.created or 'date unknown'}" + (f" from {profile.source}" if profile.source else ""),
-        f"path        {path.size} taps ({1000 * path.size / SAMPLE_RATE:.0f} ms), direct sound at {profile.delay:.0f} samples "
-        f"({1000 * profile.delay / SAMPLE_RATE:.1f} ms), gain {_gain_db(path):.1f} dB",
+        (
+            f"path        {path.size} taps ({1000 * path.size / SAMPLE_RATE:.0f} ms), direct sound at"
+            f" {profile.delay:.0f} samples ({1000 * profile.delay / SAMPLE_RATE:.1f} ms), gain {_gain_db(path):.1f} dB"
+        ),
         f"decay       {_decay(path)}",
         f"fan         {fan:.1f} dB of full scale",
         f"distortion  orders {distortion}",
@@ -32,7 +34,10 @@ def describe(profile: Profile) -> str:
     ]
     for name, values in profile.echo.effects:
         told = [(p.name, values[p.name]) for p in find(name).told if p.name in values]
-        figures = ", ".join(f"{key} = array {value.shape}" if isinstance(value, np.ndarray) else f"{key} = {value}" for key, value in told)
+        figures = ", ".join(
+            f"{key} = array {value.shape}" if isinstance(value, np.ndarray) else f"{key} = {value}"
+            for key, value in told
+        )
         lines.append(f"effect      {name}{', in one recording' if find(name).event else ''}: {figures}")
     lines.extend(f"WARNING     {text}" for text in profile.warnings)
     if not profile.warnings:
@@ -54,4 +59,7 @@ def _decay(path: Samples) -> str:
     left = np.cumsum(path[::-1].astype(np.float64) ** 2)[::-1]
     left = 10 * np.log10(np.maximum(left / max(left[0], 1e-30), 1e-20))
     times = [(db, int(np.argmax(left < -db))) for db in (10, 20, 30) if left.min() < -db]
-    return ", ".join(f"-{db} dB after {1000 * max(n - PRE_ROLL, 0) / SAMPLE_RATE:.0f} ms" for db, n in times) or "less than 10 dB"
+    return (
+        ", ".join(f"-{db} dB after {1000 * max(n - PRE_ROLL, 0) / SAMPLE_RATE:.0f} ms" for db, n in times)
+        or "less than 10 dB"
+    )

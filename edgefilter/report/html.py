@@ -23,18 +23,27 @@ from edgefilter.types import SAMPLE_RATE, Samples
 
 ROLES = ("profile", "recording", "reference")
 LOUDER = 10.0
-"""How much louder than the recording the residual is stored; the page turns it down to its true level, or not (20 dB)."""
+"""How much louder than the recording the residual is stored; the page turns it down to its true level, or not (20
+dB)."""
 
 
 def comparison_page(found: Comparison, names: Mapping[str, Any]) -> str:
-    """The page of a comparison. names: profile (None: the recording itself was taken for it), recording, reference, what the files are called."""
+    """The page of a comparison.
+
+    Names: profile (None: the recording itself was taken for it), recording, reference, what the files are called.
+    """
     profile = "The profile" if names["profile"] else "A stationary linear path made from the recording itself"
     excess = f"{profile} leaves {decibels(found.excess_db)} dB over the noise floor unexplained."
     return _page({(): found}, (), {"kind": "comparison", "headline": excess, "findings": [], "left": ""}, names)
 
 
-def diagnosis_page(profile: Profile, found: Diagnosis, recording: Samples, reference: Samples, names: Mapping[str, Any]) -> str:
-    """The page of a diagnosis, with a switch for each found effect. recording (n,), reference (m,): what was diagnosed."""
+def diagnosis_page(
+    profile: Profile, found: Diagnosis, recording: Samples, reference: Samples, names: Mapping[str, Any]
+) -> str:
+    """The page of a diagnosis, with a switch for each found effect.
+
+    Recording (n,), reference (m,): what was diagnosed.
+    """
     steps = in_order(found.ranking)
     variants = compare_variants(profile, found.model, steps, recording, reference)
     text = {
@@ -51,7 +60,9 @@ def write_page(path: str | Path, page: str) -> None:
     try:
         Path(path).write_text(page, encoding="utf-8", errors="backslashreplace")
     except OSError as error:
-        raise EdgefilterError(f"{path}: the report cannot be written ({error.strerror}); name a .html file in a folder that exists") from None
+        raise EdgefilterError(
+            f"{path}: the report cannot be written ({error.strerror}); name a .html file in a folder that exists"
+        ) from None
 
 
 def _page(
@@ -90,7 +101,9 @@ def _template() -> jinja2.Template:
     return page.from_string(_asset("page.html"))
 
 
-def _data(variants: Mapping[Choice, Comparison], before: Comparison, irreducible_db: float, scale: tuple[float, float]) -> dict:
+def _data(
+    variants: Mapping[Choice, Comparison], before: Comparison, irreducible_db: float, scale: tuple[float, float]
+) -> dict:
     """What the program draws; pictures and sounds that occur twice are held once."""
     gain = 10 ** (-1 / 20) / max(float(abs(before.recording).max()), 1e-6)
     media: dict[str, str] = {}
@@ -106,7 +119,10 @@ def _data(variants: Mapping[Choice, Comparison], before: Comparison, irreducible
         "irreducible_db": irreducible_db,
         "louder": LOUDER,
         "human": before.human,
-        "recording": {"picture": keep(spectrogram_png(before.recording, scale)), "sound": keep(sound(before.recording, gain))},
+        "recording": {
+            "picture": keep(spectrogram_png(before.recording, scale)),
+            "sound": keep(sound(before.recording, gain)),
+        },
         "variants": {
             "".join("01"[on] for on in choice): {
                 "excess_db": round(found.excess_db, 3),
@@ -114,9 +130,17 @@ def _data(variants: Mapping[Choice, Comparison], before: Comparison, irreducible
                 "bands": _rounded(found.bands),
                 "times": _rounded(found.times),
                 "levels": _rounded(found.levels),
-                "lags": _rounded((low, high, share * _error(found) / max(_error(before), 1e-6)) for low, high, share in found.lags),
-                "prediction": {"picture": keep(spectrogram_png(found.prediction, scale)), "sound": keep(sound(found.prediction, gain))},
-                "residual": {"picture": keep(spectrogram_png(found.residual, scale)), "sound": keep(sound(found.residual, gain * LOUDER))},
+                "lags": _rounded(
+                    (low, high, share * _error(found) / max(_error(before), 1e-6)) for low, high, share in found.lags
+                ),
+                "prediction": {
+                    "picture": keep(spectrogram_png(found.prediction, scale)),
+                    "sound": keep(sound(found.prediction, gain)),
+                },
+                "residual": {
+                    "picture": keep(spectrogram_png(found.residual, scale)),
+                    "sound": keep(sound(found.residual, gain * LOUDER)),
+                },
             }
             for choice, found in variants.items()
         },
@@ -166,7 +190,9 @@ def _notes(found: Comparison) -> list[str]:
         notes.append(f"Somebody talks at {spans}; those stretches are left out of every figure.")
     seconds = found.recording.size / SAMPLE_RATE
     if seconds > MAX_SOUND_S:
-        notes.append(f"The players hold the first {MAX_SOUND_S} s of {seconds:.0f} s; pictures and figures cover all of it.")
+        notes.append(
+            f"The players hold the first {MAX_SOUND_S} s of {seconds:.0f} s; pictures and figures cover all of it."
+        )
     return notes
 
 

@@ -24,7 +24,17 @@ OPUS_COMPRESSION = 0.8
 MAX_SOUND_S = 60
 """How much of a recording a page carries as sound."""
 _ANCHORS = np.array(
-    [(8, 8, 20), (38, 22, 74), (89, 32, 110), (147, 44, 103), (201, 62, 78), (238, 104, 45), (250, 164, 34), (252, 222, 120), (255, 252, 225)],
+    [
+        (8, 8, 20),
+        (38, 22, 74),
+        (89, 32, 110),
+        (147, 44, 103),
+        (201, 62, 78),
+        (238, 104, 45),
+        (250, 164, 34),
+        (252, 222, 120),
+        (255, 252, 225),
+    ],
     float,
 )
 """Dark to bright, each step about as much lighter as the one before."""
@@ -46,7 +56,7 @@ def spectrogram_db(samples: Samples) -> np.ndarray:
 
 
 def colour_scale(samples: Samples) -> tuple[float, float]:
-    """dB of full scale per bin that get the darkest and the brightest colour: from the quiet of a recording (n,) to nearly its loudest."""
+    """DB of full scale per bin that get the darkest and the brightest colour: from the quiet of a recording (n,) to nearly its loudest."""
     quiet, loud = np.percentile(spectrogram_db(samples), (20, 99.7))
     top = 5.0 * float(np.ceil(max(loud, -140.0) / 5.0))
     return min(5.0 * float(np.floor(quiet / 5.0)), top - 40.0), top
@@ -55,14 +65,18 @@ def colour_scale(samples: Samples) -> tuple[float, float]:
 def spectrogram_png(samples: Samples, scale: tuple[float, float]) -> str:
     """The spectrogram as a data address, low frequencies at the bottom, coloured on that scale."""
     bottom, top = scale
-    index = np.clip(np.round((spectrogram_db(samples) - bottom) / (top - bottom) * (LEVELS - 1)), 0, LEVELS - 1).astype(np.uint8)
+    index = np.clip(np.round((spectrogram_db(samples) - bottom) / (top - bottom) * (LEVELS - 1)), 0, LEVELS - 1).astype(
+        np.uint8
+    )
     return _address("image/png", _png(index.T[::-1], colours()))
 
 
 def colours() -> np.ndarray:
     """(LEVELS, 3) uint8, darkest first."""
     at = np.linspace(0, len(_ANCHORS) - 1, LEVELS)
-    return np.stack([np.interp(at, np.arange(len(_ANCHORS)), channel) for channel in _ANCHORS.T], axis=1).astype(np.uint8)
+    return np.stack([np.interp(at, np.arange(len(_ANCHORS)), channel) for channel in _ANCHORS.T], axis=1).astype(
+        np.uint8
+    )
 
 
 def sound(samples: Samples, gain: float = 1.0) -> str:

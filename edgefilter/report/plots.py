@@ -30,7 +30,9 @@ def plot_profile(profile: Profile, path: str | Path) -> None:
     axes[0, 0].plot(ms[first], taps[first], color=INK, linewidth=0.8)
     _label(axes[0, 0], "Impulse response, first 40 ms", "ms after the direct sound", "amplitude")
     left = np.cumsum(taps[::-1] ** 2)[::-1]
-    axes[0, 1].plot(ms, decibels(taps**2 / max(float(np.max(taps**2)), 1e-30), 1e-20), color=SOFT, linewidth=0.3, label="|h|")
+    axes[0, 1].plot(
+        ms, decibels(taps**2 / max(float(np.max(taps**2)), 1e-30), 1e-20), color=SOFT, linewidth=0.3, label="|h|"
+    )
     axes[0, 1].plot(ms, decibels(left / max(left[0], 1e-30), 1e-20), color=ACCENT, label="energy still to come")
     axes[0, 1].set_ylim(-90, 3)
     axes[0, 1].legend(loc="upper right")
@@ -65,8 +67,16 @@ def _draw_spectra(axis: Axes, profile: Profile) -> None:
     n = max(1 << 15, profile.echo.impulse_response.size)
     spectrum = np.abs(np.fft.rfft(profile.echo.impulse_response, n))
     hz = np.arange(spectrum.size) * SAMPLE_RATE / n
-    axis.semilogx(hz[1:], decibels(spectrum[1:] ** 2, 1e-20), color=SOFT, linewidth=0.5, label="from the impulse response")
-    axis.semilogx(GRID_HZ[1:], decibels(profile.response[1:] ** 2, 1e-20), color=INK, linewidth=1.2, label="|Hm Hs|, eq. (5) of the paper")
+    axis.semilogx(
+        hz[1:], decibels(spectrum[1:] ** 2, 1e-20), color=SOFT, linewidth=0.5, label="from the impulse response"
+    )
+    axis.semilogx(
+        GRID_HZ[1:],
+        decibels(profile.response[1:] ** 2, 1e-20),
+        color=INK,
+        linewidth=1.2,
+        label="|Hm Hs|, eq. (5) of the paper",
+    )
     fan = axis.twinx()
     fan.semilogx(GRID_HZ[1:], decibels(profile.noise_psd[1:], 1e-20), color=ACCENT, linewidth=1.0)
     fan.set_ylabel("fan, dB of full scale² / Hz", color=ACCENT)

@@ -26,7 +26,9 @@ def comparison_lines(found: Comparison) -> list[str]:
         f"lag         {found.offset_samples:+.2f} samples against the calibration, taken out",
     ]
     if math.isfinite(found.silence_excess_db):
-        lines.append(f"silence     {decibels(found.silence_excess_db)} dB over the noise floor while the robot is silent")
+        lines.append(
+            f"silence     {decibels(found.silence_excess_db)} dB over the noise floor while the robot is silent"
+        )
     if found.human:
         spans = ", ".join(f"{start:.1f}-{end:.1f} s" for start, end in found.human)
         lines.append(f"human       somebody talks at {spans}; left out of every figure")
@@ -35,7 +37,9 @@ def comparison_lines(found: Comparison) -> list[str]:
     lines += _table("by time", "s", coarser(found.times, MAX_TIMES))
     lines += _table("by level of the robot's voice", "dBFS", found.levels)
     lines += ["by lag of the correlation with the reference"]
-    lines += [f"  {low:5g} to {high:4g} ms  {100 * share:5.0f} %   {_bar(share)}".rstrip() for low, high, share in found.lags]
+    lines += [
+        f"  {low:5g} to {high:4g} ms  {100 * share:5.0f} %   {_bar(share)}".rstrip() for low, high, share in found.lags
+    ]
     return lines
 
 
@@ -50,9 +54,14 @@ def diagnosis_lines(found: Diagnosis, calibrated: bool = True) -> list[str]:
     steps = [(profile, added[0].excess_before_db if added else found.comparison.excess_db)]
     steps += [(f"with {finding.effect}", finding.excess_after_db) for finding in added]
     top = max(1.0, *(db for _, db in steps))
-    lines = [f"verdict     {found.verdict}: {headline(found.verdict, names, calibrated)}", "budget      dB over the noise floor"]
+    lines = [
+        f"verdict     {found.verdict}: {headline(found.verdict, names, calibrated)}",
+        "budget      dB over the noise floor",
+    ]
     lines += [f"  {name:<27} {decibels(db):>6}  {_bar(db / top)}".rstrip() for name, db in steps]
-    lines.append(f"  {'of it irreducible':<27} {decibels(found.irreducible_db):>6}  {_bar(found.irreducible_db / top)}".rstrip())
+    lines.append(
+        f"  {'of it irreducible':<27} {decibels(found.irreducible_db):>6}  {_bar(found.irreducible_db / top)}".rstrip()
+    )
     for rank, finding in enumerate(found.ranking, start=1):
         lines += _finding(rank, finding)
     if found.evidence:
@@ -79,13 +88,18 @@ def coarser(times: Sequence[tuple[float, float, float]], rows: int) -> list[tupl
     """Neighbouring (start_s, end_s, excess_db) joined, powers averaged, so that at most `rows` remain."""
     step = math.ceil(len(times) / rows) if times else 1
     groups = [times[at : at + step] for at in range(0, len(times), step)]
-    return [(group[0][0], group[-1][1], 10 * math.log10(np.mean([10 ** (db / 10) for _, _, db in group]))) for group in groups]
+    return [
+        (group[0][0], group[-1][1], 10 * math.log10(np.mean([10 ** (db / 10) for _, _, db in group])))
+        for group in groups
+    ]
 
 
 def _finding(rank: int, finding: Finding) -> list[str]:
     lines = [
-        f"{rank:>2}. {title(finding.effect)} ({finding.effect}): "
-        f"{decibels(finding.excess_before_db)} to {decibels(finding.excess_after_db)} dB, {100 * finding.share:.0f} % of the excess",
+        (
+            f"{rank:>2}. {title(finding.effect)} ({finding.effect}): {decibels(finding.excess_before_db)} to"
+            f" {decibels(finding.excess_after_db)} dB, {100 * finding.share:.0f} % of the excess"
+        ),
         f"      {sentence(finding.evidence)}",
     ]
     return lines + [f"      {name} = {interval_text(interval)}" for name, interval in finding.parameters.items()]
@@ -93,7 +107,10 @@ def _finding(rank: int, finding: Finding) -> list[str]:
 
 def _table(heading: str, unit: str, rows: Sequence[tuple[float, float, float]]) -> list[str]:
     top = max([1.0, *(db for _, _, db in rows)])
-    return [heading] + [f"  {low:5.4g} to {high:4.4g} {unit:<4} {decibels(db):>6} dB  {_bar(db / top)}".rstrip() for low, high, db in rows]
+    return [heading] + [
+        f"  {low:5.4g} to {high:4.4g} {unit:<4} {decibels(db):>6} dB  {_bar(db / top)}".rstrip()
+        for low, high, db in rows
+    ]
 
 
 def _bar(part: float) -> str:

@@ -21,7 +21,10 @@ Choice = tuple[bool, ...]
 
 
 def choices(count: int) -> list[Choice]:
-    """Which of count effects are on, for each comparison that a report holds; the one with none comes first, with all last."""
+    """Which of count effects are on, for each comparison that a report holds.
+
+    The one with none comes first, with all last.
+    """
     if count <= MAX_FREE:
         return list(product((False, True), repeat=count))
     return [tuple(i < on for i in range(count)) for on in range(count + 1)]

@@ -29,7 +29,7 @@ def title(effect: str) -> str:
 
 
 def joined(words: Iterable[str]) -> str:
-    """ "a, b and c"."""
+    """Join words as in "a, b and c"."""
     *first, last = list(words) or [""]
     return f"{', '.join(first)} and {last}" if first else last
 
@@ -41,12 +41,17 @@ def sentence(words: str) -> str:
 
 
 def headline(verdict: str, effects: Iterable[str], calibrated: bool = True) -> str:
-    """One sentence for the verdict of a diagnosis; calibrated: whether there was a profile that could lack something."""
+    """One sentence for the verdict of a diagnosis.
+
+    Calibrated: whether there was a profile that could lack something.
+    """
     found = joined(spoken(effect) for effect in effects)
     if verdict == "missing" and not calibrated:
         return f"Found in the recording, besides what is stationary and linear: {found}."
     if verdict == "explained" and not calibrated:
-        return "A stationary linear path explains this recording; what it is made of cannot be told without a calibration."
+        return (
+            "A stationary linear path explains this recording; what it is made of cannot be told without a calibration."
+        )
     if verdict == "missing":
         return f"Missing from the profile: {found}."
     if verdict == "explained":
@@ -68,8 +73,11 @@ def figure(value: float) -> str:
 
 
 def interval_text(interval: Interval) -> str:
-    """ "0.61 s (0.56 to 0.66)"; several values one after the other, each with its own range."""
+    """Say "0.61 s (0.56 to 0.66)"; several values one after the other, each with its own range."""
     values, lows, highs = (np.atleast_1d(x) for x in (interval.value, interval.low, interval.high))
     unit = UNITS.get(interval.unit, interval.unit)
-    shown = [f"{figure(v)} {unit}".rstrip() + (f" ({figure(low)} to {figure(high)})" if low < high else "") for v, low, high in zip(values, lows, highs)]
+    shown = [
+        f"{figure(v)} {unit}".rstrip() + (f" ({figure(low)} to {figure(high)})" if low < high else "")
+        for v, low, high in zip(values, lows, highs)
+    ]
     return ", ".join(shown) or "none"

@@ -9,7 +9,7 @@ from scipy import signal
 from bench.simulate.alignment_scene import HEAD, RATE, fan, hear, known_path, room, run, speech_like, utterances
 from edgefilter.alignment.aligner import Aligner
 from edgefilter.alignment.delay_line import Tape, read_delayed, read_line
-from edgefilter.alignment.delay_tracker import Measurement
+from edgefilter.alignment.delay_tracker import DelayMeasurement
 from edgefilter.alignment.jumps import JumpWitness
 from edgefilter.alignment.lag_search import CERTAIN_EARLY, Candidate, LagSearch
 from edgefilter.alignment.paper import PaperAligner, paper_lag
@@ -90,7 +90,9 @@ def test_nothing_is_realigned_where_nothing_is_heard(scene):
     mic, _ = hear(ref, [(0, 5000)], room(rng, 0.5))
     later = int(5.0 * RATE)
     if scene == "human" or scene == "gain and human in a pause":
-        mic[later:] += (2.0 if scene == "human" else 0.1) * speech_like(rng, (mic.size - later) / RATE + 0.1)[: mic.size - later]
+        mic[later:] += (2.0 if scene == "human" else 0.1) * speech_like(rng, (mic.size - later) / RATE + 0.1)[
+            : mic.size - later
+        ]
     if scene == "noise":
         mic[later:] += 0.3 * rng.standard_normal(mic.size - later).astype(np.float32)
     if scene == "unheard robot and human":
@@ -108,7 +110,9 @@ def test_a_human_who_for_a_moment_sounds_like_the_muted_robot_realigns_nothing()
     later = int(4.5 * RATE)
     mic[later:] = 0.3 * speech_like(rng, (mic.size - later) / RATE + 0.1)[: mic.size - later]
     for at, lag in ((int(7.5 * RATE), 14000), (int(13.5 * RATE), 2000)):
-        mic[at : at + 1600] = ref[at - lag : at - lag + 1600]  # 100 ms that agree entirely; searched alone, they are beyond doubt
+        mic[at : at + 1600] = ref[
+            at - lag : at - lag + 1600
+        ]  # 100 ms that agree entirely; searched alone, they are beyond doubt
     hops = run(Aligner(256, known_path(room(rng, 0.25))), mic + fan(rng, mic.size), ref)
     assert abs(hops[later // 256].delay - 5000 - HEAD) < 1.0  # the first utterance was heard
     assert not any(a.realigned for a in hops[later // 256 :])
@@ -121,27 +125,37 @@ def test_a_faint_agreement_while_the_robot_is_muted_is_no_jump():
     muted, faint = int(4.0 * RATE), 0.03 * np.std(mic) / np.std(ref)
     mic[muted:] = 0.0
     for at in range(muted + 4000, ref.size - 3000, 8000):
-        mic[at : at + 3000] = faint * ref[at - 5300 : at - 2300]  # 190 ms of the robot 300 samples late, but 30 dB below its voice
+        mic[at : at + 3000] = (
+            faint * ref[at - 5300 : at - 2300]
+        )  # 190 ms of the robot 300 samples late, but 30 dB below its voice
     hops = run(Aligner(256, known_path(room(rng, 0.25))), mic + fan(rng, mic.size, 1e-4), ref)
     assert abs(hops[muted // 256].delay - 5000 - HEAD) < 1.0
     assert not any(a.realigned for a in hops[muted // 256 :])
 
 
 def test_a_missed_look_or_another_suspicion_does_not_undo_a_jump_that_is_seen_again():
-    look = Measurement(100.0, 0.01, 10.0, 1.6, 5.0, 0.5, 1.0, 1.0)
+    look = DelayMeasurement(100.0, 0.01, 10.0, 1.6, 5.0, 0.5, 1.0, 1.0)
     other = replace(look, offset=-300.0, strength=8.0, ratio=1.1)
     witness = JumpWitness()
-    assert not witness.convinced(look) and not witness.convinced(other) and not witness.convinced(replace(look, strength=9.0))
+    assert (
+        not witness.convinced(look)
+        and not witness.convinced(other)
+        and not witness.convinced(replace(look, strength=9.0))
+    )
     assert witness.convinced(look)  # 16 of evidence, faded to 11 by the other look, and two more
     witness.forget()
     assert not witness.convinced(look)
-    assert not JumpWitness().convinced(replace(look, offset=5.0)) and JumpWitness().convinced(replace(look, offset=5.0, strength=13.0))
+    assert not JumpWitness().convinced(replace(look, offset=5.0)) and JumpWitness().convinced(
+        replace(look, offset=5.0, strength=13.0)
+    )
 
 
 def test_an_early_lag_that_chance_can_reach_has_to_be_found_twice_in_a_row():
     aligner = Aligner(256)
     aligner.step(np.zeros(256, np.float32), speech_like(np.random.default_rng(15), 1)[4000:4256])
-    doubtful = Candidate(lag=2000, strength=12.5, ratio=2.0, at=256, heard=1274)  # 25 of evidence; chance has reached 22
+    doubtful = Candidate(
+        lag=2000, strength=12.5, ratio=2.0, at=256, heard=1274
+    )  # 25 of evidence; chance has reached 22
     elsewhere, late = replace(doubtful, lag=2500), replace(doubtful, heard=5000)
     assert not any(aligner._decide(found) for found in (doubtful, elsewhere, doubtful, late, late))
     assert aligner._decide(replace(doubtful, lag=2001))
@@ -185,7 +199,9 @@ def test_the_reference_is_withheld_while_the_old_delay_is_too_short():
     delivered = np.concatenate([a.reference for a in hops])
     early = delivered[onsets[1] + 1000 : onsets[1] + 15500]
     heard = delivered[onsets[1] + 18000 : onsets[1] + 16000 + 40000]
-    assert np.mean(early**2) < 0.01 * np.mean(heard**2)  # 20 dB: the canceller must not bring in speech that is yet to come
+    assert np.mean(early**2) < 0.01 * np.mean(
+        heard**2
+    )  # 20 dB: the canceller must not bring in speech that is yet to come
 
 
 @pytest.mark.parametrize("hop", [256, 160])
@@ -219,7 +235,9 @@ def test_announcing_what_the_reference_carries_changes_nothing_and_reset_starts_
     again = run(aligner, mic, ref)
     for one, two, three in zip(plain, told, again, strict=True):
         assert np.array_equal(one.reference, two.reference) and np.array_equal(one.reference, three.reference)
-    assert aligner.stats()["state"] in ("locked", "idle") and abs(aligner.stats()["delay_samples"] - truth[-1]) < 0.1  # the jitter of a locked delay is far below
+    assert (
+        aligner.stats()["state"] in ("locked", "idle") and abs(aligner.stats()["delay_samples"] - truth[-1]) < 0.1
+    )  # the jitter of a locked delay is far below
 
 
 def test_paper_lag_of_a_recording_and_its_errors():
@@ -241,14 +259,20 @@ def test_paper_aligner_decides_every_utterance(hop):
     mic, _ = hear(ref, list(zip(onsets, lags, strict=True)), room(rng, 0.25))
     hops = run(PaperAligner(hop), mic + fan(rng, mic.size), ref)
     for onset, lag in zip(onsets, lags, strict=True):
-        decided = hops[(onset + lag + 8000 + 2048 + 2 * hop) // hop]  # half a second, then the stride in which lags are judged
+        decided = hops[
+            (onset + lag + 8000 + 2048 + 2 * hop) // hop
+        ]  # half a second, then the stride in which lags are judged
         assert abs(decided.delay - lag - HEAD) < CLOSE
     assert sum(a.realigned for a in hops) == 2
 
 
 def test_a_delay_line_delays_a_sine_by_a_moving_fraction():
     tape, n = Tape(8000), np.arange(10000)
-    for frequency, allowed in ((1000, 1e-4), (5000, 3e-4), (6500, 3e-3)):  # float32 and the window's transition band at 7-8 kHz
+    for frequency, allowed in (
+        (1000, 1e-4),
+        (5000, 3e-4),
+        (6500, 3e-3),
+    ):  # float32 and the window's transition band at 7-8 kHz
         tape = Tape(8000)
         for at in range(0, 10000, 250):
             tape.push(np.sin(2 * np.pi * frequency / RATE * n[at : at + 250]).astype(np.float32))

@@ -42,17 +42,23 @@ def test_an_utterance_is_heard_within_300_ms_beside_a_human_as_loud_and_one_neve
     human = speech_like(rng, mic.size / RATE)[: mic.size]
     mic = mic + human * np.std(mic) / np.std(human) + fan(rng, mic.size)
     aligner = Aligner(256)
-    aligner.announce(np.concatenate((np.zeros(3000, np.float32), ref[onsets[0] :])))  # silence before the first sound does not count
+    aligner.announce(
+        np.concatenate((np.zeros(3000, np.float32), ref[onsets[0] :]))
+    )  # silence before the first sound does not count
     silent = np.zeros(mic.size, np.float32)
     hops = run(aligner, mic, silent)
     arrival = start + onsets[0] + lag + HEAD
     first = next(i for i, a in enumerate(hops) if a.realigned)
     assert 0 <= first * 256 + 255 - arrival <= 0.3 * RATE
-    assert all(abs(a.delay - AHEAD) < 300 for a in hops[first:])  # the silence before its first sound is not cut to the sample
+    assert all(
+        abs(a.delay - AHEAD) < 300 for a in hops[first:]
+    )  # the silence before its first sound is not cut to the sample
     late = slice((arrival + RATE) // 256, (arrival + 2 * RATE) // 256)
     played = np.concatenate([a.reference for a in hops[late]])
     wanted = ref[late.start * 256 - start - lag - HEAD + 64 :][: played.size]
-    assert np.corrcoef(played, wanted)[0, 1] > 0.99  # what is delivered is the reference 64 samples ahead of the direct sound
+    assert (
+        np.corrcoef(played, wanted)[0, 1] > 0.99
+    )  # what is delivered is the reference 64 samples ahead of the direct sound
 
     never = Aligner(256)
     never.announce(speech_like(rng, 3))

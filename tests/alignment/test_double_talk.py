@@ -15,7 +15,7 @@ from bench.simulate.alignment_scene import (
     utterances,
 )
 from edgefilter.alignment.aligner import Aligner
-from edgefilter.alignment.delay_tracker import STRIDE, Measurement
+from edgefilter.alignment.delay_tracker import STRIDE, DelayMeasurement
 from edgefilter.alignment.drift_filter import DriftFilter
 
 CLOSE = 16  # the requirement: +-1 ms
@@ -24,7 +24,7 @@ CLOSE = 16  # the requirement: +-1 ms
 def look(offset, evidence=30.0, explained=0.1):
     """What the meter says in double talk: sure of its peak, which explains little of the microphone."""
     ratio = 2.5
-    return Measurement(offset, 0.05**2, evidence / ratio, ratio, 1.0, explained, 0.3, 0.3)
+    return DelayMeasurement(offset, 0.05**2, evidence / ratio, ratio, 1.0, explained, 0.3, 0.3)
 
 
 def follow(seen, evidence):
@@ -43,7 +43,9 @@ def test_first_looks_that_err_alike_are_no_drift_which_jumps_then_have_to_undo()
     seen[:5] += (0.0, 0.3, 0.5, 0.7, 0.8)  # while the response is learnt: taken at its word, a slope of 200 ppm
     aligner = follow(seen, np.full(80, 30.0))
     assert aligner.stats()["jumps"] == 0
-    assert abs(aligner._drift.delay - 1000.0) < 0.2 and abs(aligner._drift.slope) < 10e-6  # 10 ppm: 0.2 samples in a second
+    assert (
+        abs(aligner._drift.delay - 1000.0) < 0.2 and abs(aligner._drift.slope) < 10e-6
+    )  # 10 ppm: 0.2 samples in a second
 
 
 @pytest.mark.parametrize("ppm", [40.0, -300.0])
@@ -123,7 +125,10 @@ def test_states_tell_an_utterance_that_begins_from_one_that_is_lost_and_one_that
     mic[onsets[1] :] = 0.0  # muted before its second utterance
     hops = run(Aligner(256), mic + fan(rng, mic.size), ref)
     states = np.array([a.state for a in hops])
-    at = lambda seconds, start=0: states[int((start + seconds * RATE) // 256)]
+
+    def at(seconds: float, start: int = 0) -> str:
+        return states[int((start + seconds * RATE) // 256)]
+
     assert states[0] == "idle" and at(0.1, onsets[0]) == "begun" and np.isnan(hops[onsets[0] // 256 + 6].delay)
     assert at(1.0, onsets[0] + lag) == "locked" and at(-0.2, onsets[1]) == "idle"
     assert at(0.1, onsets[1]) == "begun" and not np.isnan(hops[onsets[1] // 256 + 6].delay)
@@ -139,4 +144,6 @@ def test_a_robot_that_is_not_seen_for_a_moment_is_lost_not_begun():
     hops = run(Aligner(256), mic + fan(rng, mic.size), ref)
     states = [a.state for a in hops[hidden.start // 256 : 5 * RATE // 256]]
     assert "lost" in states and set(states) <= {"locked", "lost"} and states[-1] == "locked"
-    assert all(abs(a.delay - hops[hidden.start // 256].delay) < 1.0 for a in hops[hidden.start // 256 : 5 * RATE // 256])
+    assert all(
+        abs(a.delay - hops[hidden.start // 256].delay) < 1.0 for a in hops[hidden.start // 256 : 5 * RATE // 256]
+    )

@@ -52,7 +52,9 @@ def test_length_at_16_khz_is_exact_and_said(tmp_path, rate, count):
 
 
 def test_a_tone_keeps_its_frequency_phase_and_level_through_the_resampler(tmp_path):
-    soundfile.write(tmp_path / "x.wav", 0.5 * np.sin(2 * np.pi * 1000 * np.arange(44100) / 44100), 44100, subtype="FLOAT")
+    soundfile.write(
+        tmp_path / "x.wav", 0.5 * np.sin(2 * np.pi * 1000 * np.arange(44100) / 44100), 44100, subtype="FLOAT"
+    )
     mic, _ = read(FileSource(tmp_path / "x.wav"))
     expected = 0.5 * np.sin(2 * np.pi * 1000 * np.arange(16000) / 16000)
     middle = slice(1000, -1000)  # away from the ends, where the tone begins abruptly
@@ -110,9 +112,16 @@ def broken(folder, kind):
 @pytest.mark.parametrize(
     "kind, words",
     [
-        ("missing", "does not exist"), ("directory", "is a directory"), ("nothing", r"empty \(0 bytes\)"), ("header", "0 samples"),
-        ("text", "is not audio .*dear diary"), ("nan", r"holds nan at sample 34567"), ("inf", r"holds inf at sample 34567"),
-        ("cut-wav", "truncated"), ("cut-flac", "truncated"), ("tiny", "holds 1 samples at 44100 Hz"),
+        ("missing", "does not exist"),
+        ("directory", "is a directory"),
+        ("nothing", r"empty \(0 bytes\)"),
+        ("header", "0 samples"),
+        ("text", "is not audio .*dear diary"),
+        ("nan", r"holds nan at sample 34567"),
+        ("inf", r"holds inf at sample 34567"),
+        ("cut-wav", "truncated"),
+        ("cut-flac", "truncated"),
+        ("tiny", "holds 1 samples at 44100 Hz"),
     ],
 )
 @pytest.mark.parametrize("role", ["recording", "reference"])
@@ -154,12 +163,15 @@ def test_file_is_valid_after_an_interrupt(tmp_path, suffix):
     np.testing.assert_array_equal(read(FileSource(tmp_path / f"x{suffix}"))[0], noise(5000))
 
 
-@pytest.mark.parametrize("name, error, words", [
-    ("x.mp3", UsageError, "expected .wav or .flac"),
-    ("nowhere/x.wav", AudioFileError, "cannot be written: No such file"),
-    ("full.wav", AudioFileError, "No space left on device"),
-    ("full.flac", AudioFileError, "No space left on device"),
-])
+@pytest.mark.parametrize(
+    "name, error, words",
+    [
+        ("x.mp3", UsageError, "expected .wav or .flac"),
+        ("nowhere/x.wav", AudioFileError, "cannot be written: No such file"),
+        ("full.wav", AudioFileError, "No space left on device"),
+        ("full.flac", AudioFileError, "No space left on device"),
+    ],
+)
 def test_a_place_that_takes_no_file_is_one_line(tmp_path, name, error, words):
     if name.startswith("full"):
         (tmp_path / name).symlink_to("/dev/full")
@@ -173,10 +185,9 @@ def test_what_fitted_on_a_full_disk_stays_a_valid_file(tmp_path, suffix):
     """A limit on file size fails a write as a full disk does, in its middle, and needs no disk."""
     path = tmp_path / f"x{suffix}"
     code = (
-        "import sys, numpy as np\nfrom edgefilter.audio.files import FileSink\nfrom edgefilter.errors import AudioFileError\n"
-        "x = np.load(sys.argv[2])\n"
-        "try:\n    with FileSink(sys.argv[1]) as sink:\n        for i in range(0, x.size, 256): sink.write(x[i:i + 256])\n"
-        "except AudioFileError as error: print(error)\n"
+        "import sys, numpy as np\nfrom edgefilter.audio.files import FileSink\nfrom edgefilter.errors import"
+        " AudioFileError\nx = np.load(sys.argv[2])\ntry:\n    with FileSink(sys.argv[1]) as sink:\n        for i in"
+        " range(0, x.size, 256): sink.write(x[i:i + 256])\nexcept AudioFileError as error: print(error)\n"
     )
     np.save(tmp_path / "x.npy", noise(160000))
 
@@ -186,7 +197,9 @@ def test_what_fitted_on_a_full_disk_stays_a_valid_file(tmp_path, suffix):
 
     command = [sys.executable, "-c", code, str(path), str(tmp_path / "x.npy")]
     done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, preexec_fn=limit)
-    assert "cannot be written on" in done.stdout and str(path) in done.stdout and done.stdout.count("\n") == 1, done.stderr
+    assert "cannot be written on" in done.stdout and str(path) in done.stdout and done.stdout.count("\n") == 1, (
+        done.stderr
+    )
     kept, _ = read(FileSource(path))
     assert kept.size > 45000  # nearly what 100001 bytes hold, less the write that failed
     np.testing.assert_array_equal(kept, noise(160000)[: kept.size])

@@ -76,7 +76,18 @@ def test_a_full_disk_behind_stdout_is_one_line():
         PcmSink(stream).write(np.zeros(100, np.float32))
 
 
-@pytest.mark.parametrize("wanted, kind, index", [("3", "input", 3), (4, "output", 4), ("speak", "output", 1), ("LINE", "input", 2), ("robot", "output", 4), (None, "input", 6), ("mic", "input", 6)])
+@pytest.mark.parametrize(
+    "wanted, kind, index",
+    [
+        ("3", "input", 3),
+        (4, "output", 4),
+        ("speak", "output", 1),
+        ("LINE", "input", 2),
+        ("robot", "output", 4),
+        (None, "input", 6),
+        ("mic", "input", 6),
+    ],
+)
 def test_a_device_is_found_by_number_name_or_part_of_it(wanted, kind, index):
     assert match(DEVICES, wanted, kind, default=6).index == index
 
@@ -106,10 +117,16 @@ def test_monitors_are_found_by_the_names_of_each_sound_system():
 
 def test_missing_portaudio_names_the_package(tmp_path):
     (tmp_path / "sounddevice.py").write_text("raise OSError('PortAudio library not found')")
-    code = "from edgefilter.audio.device import list_devices\ntry: list_devices()\nexcept Exception as e: print(type(e).__name__, e)"
+    code = (
+        "from edgefilter.audio.device import list_devices\ntry: list_devices()\nexcept Exception as e:"
+        " print(type(e).__name__, e)"
+    )
     environment = os.environ | {"PYTHONPATH": f"{tmp_path}:{Path(__file__).parents[2]}"}
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment)
-    assert done.stdout == "DeviceError live audio needs the PortAudio library (PortAudio library not found): apt install libportaudio2\n"
+    assert (
+        done.stdout == "DeviceError live audio needs the PortAudio library (PortAudio library not found): apt install"
+        " libportaudio2\n"
+    )
 
 
 def test_inlet_keeps_the_place_of_what_it_lost():
@@ -165,11 +182,15 @@ def test_a_stalled_reference_is_filled_and_its_late_samples_do_not_shift_the_res
 def test_clocks_that_differ_stay_within_bounds_and_are_counted(ppm):
     count = 60
     ref_size = 1600 + 1600 * ppm // 1000000
-    pairing, blocks, got_mic, got_ref = pair([np.ones(1600, np.float32)] * count, [np.ones(ref_size, np.float32)] * count)
+    pairing, blocks, got_mic, got_ref = pair(
+        [np.ones(1600, np.float32)] * count, [np.ones(ref_size, np.float32)] * count
+    )
     off = count * 1600 * abs(ppm) / 1e6
     corrected = pairing.dropped if ppm > 0 else pairing.inserted
     assert corrected > 0 and pairing.filled == 0 and (pairing.inserted if ppm > 0 else pairing.dropped) == 0
-    assert off - corrected <= TOLERANCE + 2 * WINDOW * abs(ppm) / 1e6  # what gathers until a difference has lasted for a window
+    assert (
+        off - corrected <= TOLERANCE + 2 * WINDOW * abs(ppm) / 1e6
+    )  # what gathers until a difference has lasted for a window
     assert got_mic.size >= count * 1600 - MAX_WAIT and sum(b.lost for b in blocks) == corrected
 
 

@@ -12,8 +12,6 @@ import pytest
 import soundfile as sf
 from scipy import signal
 
-BENCH = Path(__file__).parents[2] / "bench" / "simulate"
-
 from bench.simulate import hidden_acoustics as acoustics
 from bench.simulate import hidden_cases, hidden_levels, hidden_robot
 from bench.simulate import hidden_dynamics as dynamics
@@ -22,6 +20,7 @@ from bench.simulate.hidden_catalogue import CATALOGUE, ENR_DB, RANGES
 from bench.simulate.hidden_outside import CODECS, OUTSIDE, incoherent_db, through_codec
 from bench.simulate.hidden_robot import Chain, Scene
 
+BENCH = Path(__file__).parents[2] / "bench" / "simulate"
 RATE = 16000
 NAMES = ("sweep_ref", "sweep_mic", "fan_only", "ref", "mic")
 
@@ -29,8 +28,12 @@ NAMES = ("sweep_ref", "sweep_mic", "fan_only", "ref", "mic")
 def babble(seconds: float, seed: int) -> np.ndarray:
     """(n,) noise with the band and the syllables of speech, peak 0.8, silent at both ends."""
     rng = np.random.default_rng(seed)
-    carrier = signal.sosfilt(signal.butter(2, [150, 3500], "band", fs=RATE, output="sos"), rng.standard_normal(int(seconds * RATE)))
-    x = carrier * np.abs(signal.sosfilt(signal.butter(2, 4.0, fs=RATE, output="sos"), rng.standard_normal(carrier.size)))
+    carrier = signal.sosfilt(
+        signal.butter(2, [150, 3500], "band", fs=RATE, output="sos"), rng.standard_normal(int(seconds * RATE))
+    )
+    x = carrier * np.abs(
+        signal.sosfilt(signal.butter(2, 4.0, fs=RATE, output="sos"), rng.standard_normal(carrier.size))
+    )
     x *= signal.windows.tukey(x.size, 0.1)
     return 0.8 * x / np.abs(x).max()
 
@@ -54,12 +57,16 @@ def test_nothing_is_shared_with_the_product_but_its_metrics() -> None:
 def test_fractional_delay_of_a_tone(samples: float) -> None:
     t = np.arange(4000)
     late = acoustics.fractional_delay(np.sin(0.3 * t), samples)
-    np.testing.assert_allclose(late[1000:-100], np.sin(0.3 * (t - samples))[1000:-100], atol=2e-4)  # positions are rounded to 1/4096
+    np.testing.assert_allclose(
+        late[1000:-100], np.sin(0.3 * (t - samples))[1000:-100], atol=2e-4
+    )  # positions are rounded to 1/4096
 
 
 def test_reading_at_another_clock() -> None:
     positions = np.arange(6000) * (1 + 200e-6) - 12.3
-    np.testing.assert_allclose(acoustics.read_at(np.sin(0.5 * np.arange(7000)), positions)[100:], np.sin(0.5 * positions)[100:], atol=3e-4)
+    np.testing.assert_allclose(
+        acoustics.read_at(np.sin(0.5 * np.arange(7000)), positions)[100:], np.sin(0.5 * positions)[100:], atol=3e-4
+    )
 
 
 def test_reflection_arrives_when_geometry_says() -> None:
@@ -69,20 +76,26 @@ def test_reflection_arrives_when_geometry_says() -> None:
 
 
 def test_compressor_in_steady_state_has_its_ratio() -> None:
-    gain = dynamics.compressor_gain_db(np.full(RATE, 0.5), threshold_db=-26.0, ratio=4.0, knee_db=0.0, attack_ms=5.0, release_ms=100.0)
+    gain = dynamics.compressor_gain_db(
+        np.full(RATE, 0.5), threshold_db=-26.0, ratio=4.0, knee_db=0.0, attack_ms=5.0, release_ms=100.0
+    )
     assert gain[-1] == pytest.approx(-0.75 * (20 * np.log10(0.5) + 26.0), abs=0.01)
 
 
 def test_agc_takes_away_its_slope_and_holds_in_silence() -> None:
     mic = np.concatenate([np.full(4 * RATE, 0.05), np.zeros(RATE)])
-    gain = dynamics.agc_gain_db(mic, 0.5, target_db=-20.0, attack_ms=50.0, release_ms=200.0, limit_db=20.0, hold_db=-60.0)
+    gain = dynamics.agc_gain_db(
+        mic, 0.5, target_db=-20.0, attack_ms=50.0, release_ms=200.0, limit_db=20.0, hold_db=-60.0
+    )
     deviation = -20.0 - 20 * np.log10(0.05)
     assert gain[-1] == pytest.approx(0.5 * deviation, abs=0.1) and gain[-150] == gain[-1]
 
 
 def test_soft_clip_leaves_small_signals_and_bounds_large_ones() -> None:
     x = 0.01 * np.sin(0.05 * np.arange(4000))
-    np.testing.assert_allclose(dynamics.soft_clip(x, 1.0, 1.0, 8.0)[200:-200], x[200:-200], atol=2e-5)  # ripple of the resampling filter
+    np.testing.assert_allclose(
+        dynamics.soft_clip(x, 1.0, 1.0, 8.0)[200:-200], x[200:-200], atol=2e-5
+    )  # ripple of the resampling filter
     assert np.abs(dynamics.soft_clip(100 * x, 0.3, 0.3, 8.0)).max() < 0.33
 
 
@@ -94,12 +107,16 @@ def test_solve_finds_what_rises_and_what_falls() -> None:
 def test_scene_has_the_levels_that_it_was_asked_for(scene: Scene) -> None:
     noise = acoustics.power(scene.signals["fan_only"])
     assert acoustics.decibels(noise / scene.fan_power) == pytest.approx(0.0, abs=0.6)  # 8 s of narrow-band noise
-    assert scene.over_fan_db(scene.echo(scene.usual)) == pytest.approx(27.0, abs=0.3)  # gain tolerance, distortion, move
+    assert scene.over_fan_db(scene.echo(scene.usual)) == pytest.approx(
+        27.0, abs=0.3
+    )  # gain tolerance, distortion, move
     straight = replace(scene.usual, loudspeaker=replace(scene.usual.loudspeaker, drive=1e-4))
     assert scene.over_fan_db(scene.echo(scene.usual) - scene.echo(straight)) < -7.0
 
 
-@pytest.mark.parametrize(("effect", "strength"), [(effect, ("clear", "near")[i % 2]) for i, effect in enumerate(CATALOGUE)])
+@pytest.mark.parametrize(
+    ("effect", "strength"), [(effect, ("clear", "near")[i % 2]) for i, effect in enumerate(CATALOGUE)]
+)
 def test_effect_is_as_strong_as_it_says(scene: Scene, effect: str, strength: str) -> None:
     chain, parameters, found = hidden_cases.hide(np.random.default_rng(5), scene, scene.usual, effect, strength)
     assert parameters
@@ -124,7 +141,9 @@ def test_path_is_the_old_one_before_the_change(scene: Scene) -> None:
 def test_drift_moves_the_voice_by_its_ppm(scene: Scene) -> None:
     chain, parameters = made(scene, "clock_drift")
     lag = np.diff(chain.lag[[0, -1]])[0]
-    assert lag == pytest.approx(-parameters["ppm"] * 1e-6 * (chain.lag.size - 1), abs=0.13)  # twice the wander's amplitude
+    assert lag == pytest.approx(
+        -parameters["ppm"] * 1e-6 * (chain.lag.size - 1), abs=0.13
+    )  # twice the wander's amplitude
 
 
 def test_jump_shifts_what_is_played_behind_it(scene: Scene) -> None:
@@ -147,7 +166,9 @@ def test_clipped_recording_never_exceeds_the_level(scene: Scene) -> None:
 def test_changed_fan_is_louder_by_what_it_says(scene: Scene) -> None:
     chain, parameters = made(scene, "fan_noise")
     settled = slice(int((parameters["from_s"] + 2) * RATE) if parameters["from_s"] else 0, None)
-    assert acoustics.decibels(acoustics.power(chain.fan[settled]) / scene.fan_power) == pytest.approx(parameters["change_db"], abs=1.0)
+    assert acoustics.decibels(acoustics.power(chain.fan[settled]) / scene.fan_power) == pytest.approx(
+        parameters["change_db"], abs=1.0
+    )
 
 
 def test_late_reverberation_decays_with_its_rt60(scene: Scene) -> None:
@@ -155,7 +176,9 @@ def test_late_reverberation_decays_with_its_rt60(scene: Scene) -> None:
     decay = np.cumsum(chain.paths[0][2][::-1] ** 2)[::-1]
     decay_db = 10 * np.log10(decay / decay[int(0.02 * RATE)])
     fall = np.flatnonzero(decay_db < -5)[0], np.flatnonzero(decay_db < -25)[0]
-    assert 3 * (fall[1] - fall[0]) / RATE == pytest.approx(parameters["rt60_s"], rel=0.35)  # Sabine's formula misses by a quarter
+    assert 3 * (fall[1] - fall[0]) / RATE == pytest.approx(
+        parameters["rt60_s"], rel=0.35
+    )  # Sabine's formula misses by a quarter
 
 
 @pytest.mark.parametrize("kind", [name for name in OUTSIDE if name != "codec"])
@@ -213,7 +236,10 @@ def test_levels_of_a_folder(scene: Scene, tmp_path: Path) -> None:
 
 
 def test_sets_hide_what_they_promise() -> None:
-    draw = {kind: [hidden_cases.draw_effects(np.random.default_rng(i), i, kind) for i in range(78)] for kind in hidden_cases.SETS}
+    draw = {
+        kind: [hidden_cases.draw_effects(np.random.default_rng(i), i, kind) for i in range(78)]
+        for kind in hidden_cases.SETS
+    }
     singles = {(effects[0], strength) for effects, strength in draw["singles"]}
     assert singles == {(effect, strength) for effect in CATALOGUE for strength in ENR_DB}
     assert all(effects == [] for effects, _ in draw["controls"])

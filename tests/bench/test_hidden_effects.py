@@ -20,13 +20,24 @@ from edgefilter.errors import UsageError
 RATE = 16000
 
 
-def outcome(truth: str, verdict: str, *named: str, strength: str = "clear", excess_db: float = 5.0, sealed_hit: bool | None = None) -> Outcome:
+def outcome(
+    truth: str,
+    verdict: str,
+    *named: str,
+    strength: str = "clear",
+    excess_db: float = 5.0,
+    sealed_hit: bool | None = None,
+) -> Outcome:
     effects = tuple(truth.split("+")) if truth else ()
     numbers = (tuple(5.0 for _ in named), tuple(0.2 for _ in named), tuple(0.9 for _ in named))
-    return Outcome("c", effects, effects, strength, verdict, named, *numbers, excess_db, 0.2, "some words", 1.0, sealed_hit)
+    return Outcome(
+        "c", effects, effects, strength, verdict, named, *numbers, excess_db, 0.2, "some words", 1.0, sealed_hit
+    )
 
 
-@pytest.mark.parametrize(("hits", "n", "low", "high"), [(0, 100, 0.0, 0.0370), (9, 10, 0.5958, 0.9821), (10, 10, 0.7225, 1.0)])
+@pytest.mark.parametrize(
+    ("hits", "n", "low", "high"), [(0, 100, 0.0, 0.0370), (9, 10, 0.5958, 0.9821), (10, 10, 0.7225, 1.0)]
+)
 def test_wilson_interval_against_the_textbook(hits: int, n: int, low: float, high: float) -> None:
     assert hidden_scores.wilson(hits, n) == pytest.approx((low, high), abs=1e-4)
 
@@ -58,7 +69,11 @@ def test_summary_counts_by_strength_and_group() -> None:
         *(outcome("rattle", "missing", "rattle"), outcome("rattle", "missing", "mic_agc", "rattle")),
         outcome("bandlimit", "explained", strength="near"),
         *(outcome("none", "explained"), outcome("none", "missing", "rattle")),
-        *(outcome("unknown", "explained"), outcome("unknown", "explained", excess_db=0.5), outcome("unknown", "unexplained")),
+        *(
+            outcome("unknown", "explained"),
+            outcome("unknown", "explained", excess_db=0.5),
+            outcome("unknown", "unexplained"),
+        ),
         outcome("bandlimit+rattle", "missing", "rattle", "bandlimit", "mic_agc"),
     ]
     summary = hidden_scores.summarise(cases)
@@ -76,9 +91,16 @@ def test_summary_counts_by_strength_and_group() -> None:
         "outside: unexplained": (1, 3),
         "outside: explained above 1 dB of excess": (1, 3),
     }
-    assert summary["confusion"]["rattle"] == {"rattle": 1, "mic_agc": 1} and summary["confusion"]["none"] == {"none": 1, "rattle": 1}
+    assert summary["confusion"]["rattle"] == {"rattle": 1, "mic_agc": 1} and summary["confusion"]["none"] == {
+        "none": 1,
+        "rattle": 1,
+    }
     text = hidden_scores.markdown("made", cases, summary)
-    assert "| top-1, clear | 1 of 2 | 50 |" in text and "Misses (5)" in text and "| rattle | 1 of 2 | 5.0 | 0.2 | 0.2 | 90 |" in text
+    assert (
+        "| top-1, clear | 1 of 2 | 50 |" in text
+        and "Misses (5)" in text
+        and "| rattle | 1 of 2 | 5.0 | 0.2 | 0.2 | 90 |" in text
+    )
 
 
 @pytest.mark.parametrize(("label", "hit"), [("bandlimit+rattle", True), ("rattle", False)])
@@ -91,8 +113,12 @@ def test_seal_opens_for_the_exact_answer_only(label: str, hit: bool) -> None:
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """One sealed control, 8 s long."""
     rng = np.random.default_rng(0)
-    carrier = signal.sosfilt(signal.butter(2, [150, 5000], "band", fs=RATE, output="sos"), rng.standard_normal(8 * RATE))
-    x = carrier * np.abs(signal.sosfilt(signal.butter(2, 4.0, fs=RATE, output="sos"), rng.standard_normal(carrier.size)))
+    carrier = signal.sosfilt(
+        signal.butter(2, [150, 5000], "band", fs=RATE, output="sos"), rng.standard_normal(8 * RATE)
+    )
+    x = carrier * np.abs(
+        signal.sosfilt(signal.butter(2, 4.0, fs=RATE, output="sos"), rng.standard_normal(carrier.size))
+    )
     x *= signal.windows.tukey(x.size, 0.2) * 0.8 / np.abs(x).max()
     scene = draw_scene(rng, x, 25.0)
     case = tmp_path_factory.mktemp("cases") / "c00"
@@ -104,7 +130,9 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return case.parent
 
 
-def test_whole_loop_on_a_sealed_control(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_whole_loop_on_a_sealed_control(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     monkeypatch.setattr(sys, "argv", ["hidden_effects.py", str(folder), "--output", str(tmp_path / "out")])
     assert hidden_effects.main() == 0
     result = json.loads((tmp_path / "out.json").read_text())

@@ -34,9 +34,13 @@ def test_every_contender_is_timed_hop_by_hop_at_its_own_frame(rows: list[dict]) 
 def test_stages_add_up_to_less_than_the_whole_and_to_most_of_it(rows: list[dict]) -> None:
     stages = rows[0]["stages"]
     assert set(stages) == {"alignment", "canceller", "residual", "analysis", "engine", "overlap-add"}
-    parts = sum(part["quantiles"]["50"] for part in stages.values())  # medians, since what interrupts a hop can fall between stages
+    parts = sum(
+        part["quantiles"]["50"] for part in stages.values()
+    )  # medians, since what interrupts a hop can fall between stages
     front = rows[0]["front"]
-    assert front["hops"] == rows[0]["hops"] and front["mean"] == pytest.approx(stages["alignment"]["mean"] + stages["canceller"]["mean"])
+    assert front["hops"] == rows[0]["hops"] and front["mean"] == pytest.approx(
+        stages["alignment"]["mean"] + stages["canceller"]["mean"]
+    )
     assert 0.5 * rows[0]["quantiles"]["50"] < parts < 1.1 * rows[0]["quantiles"]["50"]
 
 
@@ -44,7 +48,14 @@ def test_the_page_and_the_picture_are_made(rows: list[dict], tmp_path: Path) -> 
     curve = latency.curves(["ss"], 0.3, (2048,), (512,), ())
     assert curve["hop"][0]["hop"] == 512 and curve["tail"][0]["x"] == 2048
     starts = {"ss": [{"seconds": 0.5, "memory_mb": 70.0}]}
-    result = {"conditions": {"cores": "2 of 2"}, "seconds": 0.5, "rounds": 2, "missing": {"crnn": "no model"}, "rows": rows, "curves": curve}
+    result = {
+        "conditions": {"cores": "2 of 2"},
+        "seconds": 0.5,
+        "rounds": 2,
+        "missing": {"crnn": "no model"},
+        "rows": rows,
+        "curves": curve,
+    }
     result |= {"start": starts, "click": {latency_live.ALONE: [100.0, float("nan")], "ss": [140.0, 150.0]}}
     page = latency_report.markdown(json.loads(json.dumps(result)), "latency")
     rows_found = ("| ss | 16 | idle | 1 | paced |", "| aec3 | 10 |", "| ss | 145 | 140 - 150 | +45 |")
@@ -59,7 +70,12 @@ def test_the_slowest_hop_is_named_with_its_place_and_stage() -> None:
     quick["took"][40], quick["stages"]["alignment"][40] = 9.0, 8.0
     worst = latency.slowest(quick)
     assert len(worst) == 10
-    assert worst[0] == {"second": pytest.approx(0.5 + 40 * 0.016, abs=0.016), "ms": 9.0, "stage": "alignment", "stage_ms": 8.0}
+    assert worst[0] == {
+        "second": pytest.approx(0.5 + 40 * 0.016, abs=0.016),
+        "ms": 9.0,
+        "stage": "alignment",
+        "stage_ms": 8.0,
+    }
 
 
 def test_pacing_waits_for_each_hop_and_is_not_counted() -> None:
@@ -126,7 +142,9 @@ def test_start_of_the_program_is_timed_to_its_first_samples() -> None:
 
 
 def test_one_minute_of_audio_does_not_drift(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sys, "argv", ["soak.py", "--minutes", "1", "--engine", "ss", "--output", str(tmp_path / "soak")])
+    monkeypatch.setattr(
+        sys, "argv", ["soak.py", "--minutes", "1", "--engine", "ss", "--output", str(tmp_path / "soak")]
+    )
     assert soak.main() == 0
     found = json.loads((tmp_path / "soak.json").read_text())
     assert found["samples_in"] == found["samples_out"] == 60 * 16000 and len(found["slices"]) == 20
@@ -136,7 +154,9 @@ def test_one_minute_of_audio_does_not_drift(tmp_path: Path, monkeypatch: pytest.
 
 def test_a_leak_lost_samples_and_slowing_down_are_found() -> None:
     def result(**changes: object) -> dict:
-        slices = [{"seconds": 60 * i, "memory_mb": 60.0, "p50_ms": 1.0, "p99_ms": 2.0, "bypass_ms": 0.1} for i in range(20)]
+        slices = [
+            {"seconds": 60 * i, "memory_mb": 60.0, "p50_ms": 1.0, "p99_ms": 2.0, "bypass_ms": 0.1} for i in range(20)
+        ]
         return {"kind": "file", "samples_in": 100, "samples_out": 100, "lost": 0, "slices": slices, **changes}
 
     assert soak.judge(result()) == []

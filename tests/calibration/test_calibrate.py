@@ -166,15 +166,28 @@ def warned(profile, pattern):
 
 def test_clipping_is_named_with_its_frequencies(sweep, quiet):
     loud = record(sweep, np.array([1.0]) @ np.array([[1.0]]))
-    peaked = signal.oaconvolve(loud, signal.firwin(257, [700, 1400], pass_zero=False, fs=16000), "same") * 2 + loud * 0.5
-    warned(calibrate(sweep, np.clip(2 * peaked, -1, 1).astype(np.float32), quiet), r"^clipped: \d+ samples at 1.00 of full scale, [5-7]\d\d-1[3-7]\d\d Hz")
+    peaked = (
+        signal.oaconvolve(loud, signal.firwin(257, [700, 1400], pass_zero=False, fs=16000), "same") * 2 + loud * 0.5
+    )
+    warned(
+        calibrate(sweep, np.clip(2 * peaked, -1, 1).astype(np.float32), quiet),
+        r"^clipped: \d+ samples at 1.00 of full scale, [5-7]\d\d-1[3-7]\d\d Hz",
+    )
     warned(calibrate(sweep, np.clip(peaked, -0.5, 0.5).astype(np.float32), quiet), "clipped: .* at 0.50 of full scale")
 
 
 def test_too_quiet_and_low_snr_bands(sweep, quiet):
-    warned(calibrate(sweep, record(sweep, 0.01 * room(), rms=1e-5), 0.01 * quiet), "too quiet: the recording peaks at -[45]\\d dB")
-    hidden = signal.oaconvolve(fan(150000, seed=8), signal.firwin(513, [400, 800], pass_zero=False, fs=16000))[: sweep.size] * 300
-    noisy = signal.oaconvolve(fan(150000, seed=9), signal.firwin(513, [400, 800], pass_zero=False, fs=16000))[:96000] * 300
+    warned(
+        calibrate(sweep, record(sweep, 0.01 * room(), rms=1e-5), 0.01 * quiet),
+        "too quiet: the recording peaks at -[45]\\d dB",
+    )
+    hidden = (
+        signal.oaconvolve(fan(150000, seed=8), signal.firwin(513, [400, 800], pass_zero=False, fs=16000))[: sweep.size]
+        * 300
+    )
+    noisy = (
+        signal.oaconvolve(fan(150000, seed=9), signal.firwin(513, [400, 800], pass_zero=False, fs=16000))[:96000] * 300
+    )
     profile = calibrate(sweep, record(sweep, room(), extra=hidden), (quiet + noisy).astype(np.float32))
     warned(profile, r"low signal-to-noise ratio, below 10 dB, in (355|447)-(708|891) Hz \(")
 
@@ -189,7 +202,10 @@ def test_a_voice_during_the_sweep_or_in_the_fan(sweep, quiet):
     rng = np.random.default_rng(4)
     burst = np.zeros(sweep.size)
     burst[60000:70000] = 0.08 * rng.standard_normal(10000)
-    warned(calibrate(sweep, record(sweep, room(), extra=burst), quiet), r"something else than the sweep sounds in 0.[257]\d? s .*from 3.75 s on")
+    warned(
+        calibrate(sweep, record(sweep, room(), extra=burst), quiet),
+        r"something else than the sweep sounds in 0.[257]\d? s .*from 3.75 s on",
+    )
     spoken = quiet.copy()
     spoken[30000:40000] += 0.005 * rng.standard_normal(10000).astype(np.float32)
     warned(calibrate(sweep, record(sweep, room()), spoken), "noise recording is not steady")
@@ -216,7 +232,12 @@ def test_short_and_silent_noise(sweep, quiet):
 def test_wrong_files(sweep, quiet):
     rng = np.random.default_rng(0)
     tone = np.sin(np.arange(120000) * 0.3).astype(np.float32)
-    wrong = {"noise": 0.1 * rng.standard_normal(120000).astype(np.float32), "tone": tone, "backwards": sweep[::-1].copy(), "fan": fan(120000).astype(np.float32)}
+    wrong = {
+        "noise": 0.1 * rng.standard_normal(120000).astype(np.float32),
+        "tone": tone,
+        "backwards": sweep[::-1].copy(),
+        "fan": fan(120000).astype(np.float32),
+    }
     for name, recording in wrong.items():
         with pytest.raises(CalibrationError, match="does not contain the sweep") as caught:
             calibrate(sweep, recording, quiet)

@@ -34,7 +34,9 @@ def test_path_lag_and_fan_are_those_of_the_robot(said, alone):
     early = slice(0, 800)
     error = alone.echo.impulse_response[early] - path()[early]
     assert np.sum(error**2) < 0.01 * np.sum(path()[early] ** 2)
-    assert 10 * np.log10(np.mean(alone.noise_psd) / (FAN**2 / 8000)) == pytest.approx(0.0, abs=1.0)  # some 15 frames, the quieter half
+    assert 10 * np.log10(np.mean(alone.noise_psd) / (FAN**2 / 8000)) == pytest.approx(
+        0.0, abs=1.0
+    )  # some 15 frames, the quieter half
     assert "made from the recording" in alone.source and "cannot be told" in alone.warnings[0]
 
 
@@ -65,7 +67,9 @@ def test_without_a_robot_it_is_one_line(said):
 
 def test_what_is_stationary_is_not_claimed_and_what_moves_is(tmp_path, said, capsys):
     said = said[: 6 * RATE]
-    changed = EchoModel(path()).with_effect("playback_gain", {"gain_db": 6.0}).with_effect("clock_drift", {"ppm": -120.0})
+    changed = (
+        EchoModel(path()).with_effect("playback_gain", {"gain_db": 6.0}).with_effect("clock_drift", {"ppm": -120.0})
+    )
     soundfile.write(tmp_path / "ref.wav", said, RATE, "FLOAT")
     soundfile.write(tmp_path / "mic.wav", record(said, changed), RATE, "FLOAT")
     files = ["--recording", str(tmp_path / "mic.wav"), "--reference", str(tmp_path / "ref.wav")]
@@ -83,5 +87,10 @@ def test_what_is_stationary_is_not_claimed_and_what_moves_is(tmp_path, said, cap
 
 
 def test_add_needs_a_profile(tmp_path, capsys):
-    assert main(["add", "clock_drift", "--recording", "m.wav", "--reference", "r.wav", "--output", str(tmp_path / "p.npz")]) == 2
+    assert (
+        main(
+            ["add", "clock_drift", "--recording", "m.wav", "--reference", "r.wav", "--output", str(tmp_path / "p.npz")]
+        )
+        == 2
+    )
     assert "--profile" in capsys.readouterr().err

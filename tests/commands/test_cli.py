@@ -16,7 +16,10 @@ RATE = 16000
 
 def edgefilter(*arguments, **options):
     return subprocess.run(
-        [sys.executable, "-m", "edgefilter.cli", *map(str, arguments)], capture_output=True, timeout=120, **{"text": "input" not in options, **options}
+        [sys.executable, "-m", "edgefilter.cli", *map(str, arguments)],
+        capture_output=True,
+        timeout=120,
+        **{"text": "input" not in options, **options},
     )
 
 
@@ -63,7 +66,17 @@ def test_a_pipe_gives_the_same_samples_as_a_file(speech):
     for name, x in (("mic16.wav", mic), ("ref16.wav", ref)):
         soundfile.write(speech / name, x, RATE, "PCM_16")
     for engine in ("bypass", "linear", "ss"):
-        piped = edgefilter("run", "--input", "-", "--output", "-", "--engine", engine, input=np.stack((mic, ref), axis=1).tobytes(), text=False)
+        piped = edgefilter(
+            "run",
+            "--input",
+            "-",
+            "--output",
+            "-",
+            "--engine",
+            engine,
+            input=np.stack((mic, ref), axis=1).tobytes(),
+            text=False,
+        )
         assert piped.returncode == 0, piped.stderr
         assert run(speech, "--reference", speech / "ref16.wav", mic="mic16.wav", engine=engine).returncode == 0
         assert np.array_equal(np.frombuffer(piped.stdout, "<i2"), soundfile.read(speech / "out.wav", dtype="int16")[0])
@@ -75,13 +88,23 @@ def test_other_rates_and_channels_are_converted_and_said_so(speech):
         soundfile.write(speech / "other.flac", 0.1 * rng.standard_normal((rate, channels)), rate)
         result = run(speech, mic="other.flac")
         assert result.returncode == 0 and str(rate) in result.stderr
-        assert soundfile.info(speech / "out.wav").frames == RATE and soundfile.info(speech / "out.wav").samplerate == RATE
+        assert (
+            soundfile.info(speech / "out.wav").frames == RATE and soundfile.info(speech / "out.wav").samplerate == RATE
+        )
 
 
 def test_save_input_run_again_gives_the_identical_output(speech):
     assert run(speech, "--reference", speech / "ref.wav", "--save-input", speech / "heard", engine="ss").returncode == 0
     again = edgefilter(
-        "run", "--input", speech / "heard/mic.wav", "--reference", speech / "heard/reference.wav", "--engine", "ss", "--output", speech / "again.wav"
+        "run",
+        "--input",
+        speech / "heard/mic.wav",
+        "--reference",
+        speech / "heard/reference.wav",
+        "--engine",
+        "ss",
+        "--output",
+        speech / "again.wav",
     )
     assert again.returncode == 0
     assert (speech / "again.wav").read_bytes() == (speech / "out.wav").read_bytes()
@@ -142,7 +165,16 @@ def test_a_full_disk_is_one_line_and_leaves_a_valid_file(speech):
     def small_disk():
         resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
 
-    result = edgefilter("run", "--input", speech / "mic.wav", "--engine", "bypass", "--output", speech / "out.wav", preexec_fn=small_disk)
+    result = edgefilter(
+        "run",
+        "--input",
+        speech / "mic.wav",
+        "--engine",
+        "bypass",
+        "--output",
+        speech / "out.wav",
+        preexec_fn=small_disk,
+    )
     one_line(result, 1, "out.wav", "File too large")
     out, mic = soundfile.read(speech / "out.wav")[0], soundfile.read(speech / "mic.wav")[0]
     assert 1000 < out.size < mic.size
@@ -180,7 +212,18 @@ def test_a_damaged_profile_is_one_line(speech):
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_an_interrupted_run_leaves_a_valid_file_with_what_was_received(tmp_path, number):
     process = subprocess.Popen(
-        [sys.executable, "-m", "edgefilter.cli", "run", "--input", "-", "--output", str(tmp_path / "out.wav"), "--engine", "bypass"],
+        [
+            sys.executable,
+            "-m",
+            "edgefilter.cli",
+            "run",
+            "--input",
+            "-",
+            "--output",
+            str(tmp_path / "out.wav"),
+            "--engine",
+            "bypass",
+        ],
         stdin=subprocess.PIPE,
         stderr=subprocess.PIPE,
     )

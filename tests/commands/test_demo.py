@@ -14,7 +14,9 @@ from edgefilter.filter.ego_filter import EgoFilter
 def demo(tmp_path_factory):
     folder = tmp_path_factory.mktemp("demo")
     result = subprocess.run(
-        [sys.executable, "-m", "edgefilter.cli", "demo", "--output", folder, "--json", folder / "demo.json"], capture_output=True, text=True
+        [sys.executable, "-m", "edgefilter.cli", "demo", "--output", folder, "--json", folder / "demo.json"],
+        capture_output=True,
+        text=True,
     )
     assert result.returncode == 0, result.stderr
     return folder, result.stdout
@@ -23,9 +25,17 @@ def demo(tmp_path_factory):
 def test_it_filters_the_bundled_recording_and_the_human_stands_out(demo):
     folder, _ = demo
     figures = json.loads((folder / "demo.json").read_text())
-    assert soundfile.info(folder / "filtered.wav").frames == soundfile.info(folder / "microphone.wav").frames == figures["samples_in"]
-    assert -27 < figures["si_sdr_before_db"] < -19  # the bundled recording is fixed; the robot is 20-26 dB above the human
-    assert figures["si_sdr_after_db"] > 9.2  # 9.5 is promised, int8 sums differ between processors; random weights give 3.7
+    assert (
+        soundfile.info(folder / "filtered.wav").frames
+        == soundfile.info(folder / "microphone.wav").frames
+        == figures["samples_in"]
+    )
+    assert (
+        -27 < figures["si_sdr_before_db"] < -19
+    )  # the bundled recording is fixed; the robot is 20-26 dB above the human
+    assert (
+        figures["si_sdr_after_db"] > 9.2
+    )  # 9.5 is promised, int8 sums differ between processors; random weights give 3.7
 
 
 def test_it_draws_before_and_after(demo):
@@ -38,11 +48,18 @@ def test_it_draws_before_and_after(demo):
 
 def test_it_says_the_figures_and_that_they_are_simulated(demo):
     text = demo[1]
-    assert "simulated" in text and "SI-SDR" in text and "of real time" in text and f"engine {EgoFilter().engine_name}" in text
+    assert (
+        "simulated" in text
+        and "SI-SDR" in text
+        and "of real time" in text
+        and f"engine {EgoFilter().engine_name}" in text
+    )
 
 
 def test_it_says_what_is_calibrated_and_what_not(demo):
     folder, text = demo
     cold = json.loads((folder / "demo.json").read_text())["si_sdr_after_uncalibrated_db"]
-    assert 3.0 < cold < 9.2  # learnt from six seconds of robot: better than random weights, worse than with the calibration
+    assert (
+        3.0 < cold < 9.2
+    )  # learnt from six seconds of robot: better than random weights, worse than with the calibration
     assert "with the robot's calibration" in text and f"{cold:.1f} dB uncalibrated" in text

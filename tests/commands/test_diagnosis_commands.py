@@ -21,10 +21,14 @@ def scene(tmp_path_factory):
     """A folder with a profile and the recording of a robot whose volume was turned down by 3 dB."""
     folder = tmp_path_factory.mktemp("scene")
     x, robot = voice(8.0), profile()
-    x[118_400:120_000] *= np.linspace(1, 0, 1600, dtype=np.float32)  # the last word ends, else what follows it is not judged
+    x[118_400:120_000] *= np.linspace(
+        1, 0, 1600, dtype=np.float32
+    )  # the last word ends, else what follows it is not judged
     robot.save(folder / "robot.npz")
     soundfile.write(folder / "ref.wav", x, RATE, "FLOAT")
-    soundfile.write(folder / "mic.wav", record(x, robot.echo.with_effect("playback_gain", {"gain_db": -3.0})), RATE, "FLOAT")
+    soundfile.write(
+        folder / "mic.wav", record(x, robot.echo.with_effect("playback_gain", {"gain_db": -3.0})), RATE, "FLOAT"
+    )
     return folder
 
 
@@ -40,7 +44,15 @@ def printed_json(capsys):
 def test_compare_says_how_much_is_unexplained_and_where(scene, capsys):
     assert main(arguments(scene, "compare")) == 0
     out = capsys.readouterr().out
-    for words in ("excess ", "over the noise floor of -60.0 dBFS", "by frequency", "by time", "by level", "by lag", "silence"):
+    for words in (
+        "excess ",
+        "over the noise floor of -60.0 dBFS",
+        "by frequency",
+        "by time",
+        "by level",
+        "by lag",
+        "silence",
+    ):
         assert words in out, out
     assert max(len(line) for line in out.splitlines()) <= 80
     assert main(arguments(scene, "compare", "--json", "-")) == 0
@@ -55,7 +67,10 @@ def test_add_lowers_the_error_and_remove_restores_the_profile(scene, tmp_path, c
     assert "playback_gain added" in out and "gain_db = -3.0" in out and str(better) in out
     figures = json.loads((tmp_path / "add.json").read_text())
     assert figures["excess_after_db"] < 0.5 < figures["excess_before_db"] - 3
-    assert figures["parameters"]["gain_db"] == {"value": pytest.approx(-3.0, abs=0.02), "unit": "dB"}  # 0.02 dB: -53 dB of the voice
+    assert figures["parameters"]["gain_db"] == {
+        "value": pytest.approx(-3.0, abs=0.02),
+        "unit": "dB",
+    }  # 0.02 dB: -53 dB of the voice
     assert main(arguments(scene, "compare", "--json", "-", profile=better)) == 0
     assert printed_json(capsys)["excess_db"] == pytest.approx(figures["excess_after_db"], abs=0.05)
     assert main(["remove", "playback_gain", "--profile", str(better), "--output", str(tmp_path / "as_before.npz")]) == 0
@@ -66,7 +81,10 @@ def test_add_lowers_the_error_and_remove_restores_the_profile(scene, tmp_path, c
 
 def test_add_says_so_where_the_error_does_not_fall(scene, tmp_path, capsys):
     assert main(arguments(scene, "add playback_gain", "--output", tmp_path / "once.npz")) == 0
-    assert main(arguments(scene, "add playback_gain", "--output", tmp_path / "twice.npz", profile=tmp_path / "once.npz")) == 0
+    assert (
+        main(arguments(scene, "add playback_gain", "--output", tmp_path / "twice.npz", profile=tmp_path / "once.npz"))
+        == 0
+    )
     assert "the error did not fall" in capsys.readouterr().out
 
 
@@ -74,8 +92,20 @@ def test_diagnose_finds_what_is_missing_and_writes_the_documented_json(scene, ca
     assert main(arguments(scene, "diagnose", "--json", "-")) == 0
     found = printed_json(capsys)
     assert found["verdict"] == "missing" and [entry["effect"] for entry in found["ranking"]] == ["playback_gain"]
-    assert found["ranking"][0]["parameters"]["gain_db"]["value"] == pytest.approx(-3.0, abs=0.02)  # 0.02 dB: -53 dB of the voice
-    assert {"schema", "verdict", "excess_db", "noise_floor_db", "ranking", "evidence", "remaining_db", "irreducible_db", "where"} <= set(found)
+    assert found["ranking"][0]["parameters"]["gain_db"]["value"] == pytest.approx(
+        -3.0, abs=0.02
+    )  # 0.02 dB: -53 dB of the voice
+    assert {
+        "schema",
+        "verdict",
+        "excess_db",
+        "noise_floor_db",
+        "ranking",
+        "evidence",
+        "remaining_db",
+        "irreducible_db",
+        "where",
+    } <= set(found)
     assert set(found["where"]) == {"bands", "times", "levels", "lags"}
     assert main(arguments(scene, "diagnose")) == 0
     out = capsys.readouterr().out
@@ -121,7 +151,9 @@ def bad(scene):
     robot = profile()
     from dataclasses import replace
 
-    replace(robot, echo=replace(robot.echo, effects=(("blade_chop", {"rate_hz": 23.0, "cosine": 0.1, "sine": 0.0}),))).save(scene / "own.npz")
+    replace(
+        robot, echo=replace(robot.echo, effects=(("blade_chop", {"rate_hz": 23.0, "cosine": 0.1, "sine": 0.0}),))
+    ).save(scene / "own.npz")
     return scene
 
 
@@ -161,10 +193,17 @@ def test_wrong_input_is_one_line_and_exit_1(bad, capsys, monkeypatch, tmp_path, 
 def test_wrong_usage_is_one_line_and_exit_2(scene, tmp_path, capsys):
     out = ["--output", tmp_path / "x.npz"]
     fails_in_one_line(capsys, arguments(scene, "add clok_drift", *out), 2, ["clok_drift", "clock_drift"])
-    fails_in_one_line(capsys, ["remove", "clock_drift", "--profile", scene / "robot.npz", *out], 2, ["holds no effect 'clock_drift'", "none"])
+    fails_in_one_line(
+        capsys,
+        ["remove", "clock_drift", "--profile", scene / "robot.npz", *out],
+        2,
+        ["holds no effect 'clock_drift'", "none"],
+    )
     fails_in_one_line(capsys, ["compare", "--profile", scene / "robot.npz"], 2, ["--recording", "--reference"])
     fails_in_one_line(capsys, arguments(scene, "compare", "--effects", scene / "mic.wav"), 2, ["mic.wav", ".py"])
-    fails_in_one_line(capsys, arguments(scene, "compare", "--report", tmp_path / "no/r.html"), 1, ["r.html", "No such file"])
+    fails_in_one_line(
+        capsys, arguments(scene, "compare", "--report", tmp_path / "no/r.html"), 1, ["r.html", "No such file"]
+    )
 
 
 def test_an_effect_of_ones_own_goes_through_every_command(tmp_path, capsys, own_registry):  # noqa: F811
@@ -180,7 +219,14 @@ def test_an_effect_of_ones_own_goes_through_every_command(tmp_path, capsys, own_
     (found,) = printed_json(capsys)["ranking"]
     assert found["effect"] == "blade_chop" and found["excess_after_db"] < 0.5 < 3 < found["excess_before_db"]
     assert found["parameters"]["rate_hz"]["value"] == pytest.approx(23.0, abs=1 / 32)  # the grid's step for 8 s
-    assert main(arguments(tmp_path, "add blade_chop", *own, "--output", tmp_path / "better.npz", "--json", tmp_path / "a.json")) == 0
+    assert (
+        main(
+            arguments(
+                tmp_path, "add blade_chop", *own, "--output", tmp_path / "better.npz", "--json", tmp_path / "a.json"
+            )
+        )
+        == 0
+    )
     figures = json.loads((tmp_path / "a.json").read_text())
     assert figures["excess_after_db"] < 0.5 < 3 < figures["excess_before_db"]
     capsys.readouterr()

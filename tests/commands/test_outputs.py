@@ -1,4 +1,7 @@
-"""No output of any command is ever one of its inputs, or written twice, however the paths are typed; then nothing is touched."""
+"""No output of any command is ever one of its inputs, or written twice, however the paths are typed.
+
+Then nothing is touched.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +27,10 @@ NEITHER = {
 
 @pytest.fixture
 def heard(tmp_path, monkeypatch):
-    """A folder like one that --save-input made, a profile and a user's effect in it; the working directory is beside it."""
+    """A folder like one that --save-input made, a profile and a user's effect in it.
+
+    The working directory is beside it.
+    """
     folder = tmp_path / "heard"
     folder.mkdir()
     rng = np.random.default_rng(0)

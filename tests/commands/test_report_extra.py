@@ -1,4 +1,7 @@
-"""Pictures and pages need the report extra; everything else goes without it, and what is missing is said before the work."""
+"""Pictures and pages need the report extra.
+
+Everything else goes without it, and what is missing is said before the work.
+"""
 
 import json
 import subprocess
@@ -24,7 +27,10 @@ def scene(tmp_path_factory):
 
 def without(package, folder, *words):
     """The command line where a package is not installed."""
-    code = f"import sys; sys.modules[{package!r}] = None; from edgefilter.cli import main; sys.exit(main({[str(word) for word in words]!r}))"
+    code = (
+        f"import sys; sys.modules[{package!r}] = None; from edgefilter.cli import main;"
+        f" sys.exit(main({[str(word) for word in words]!r}))"
+    )
     return subprocess.run([sys.executable, "-c", code], cwd=folder, capture_output=True, text=True)
 
 

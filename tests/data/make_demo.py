@@ -2,9 +2,9 @@
 
 python tests/data/make_demo.py --robot FIRST.flac SECOND.flac --human vm-intro.g722 --output edgefilter/demo_data
 
-Needs pyroomacoustics and, for .g722, ffmpeg. The shipped files were made from two text-to-speech renderings (Kokoro-82M, CC0) and the
-prompt vm-intro of Debian's asterisk-core-sounds-en-g722 (CC BY-SA 3.0). Nothing in it is a measurement of a real robot.
-"""
+Needs pyroomacoustics and, for .g722, ffmpeg. The shipped files were made from two text-to-speech renderings
+(Kokoro-82M, CC0) and the prompt vm-intro of Debian's asterisk-core-sounds-en-g722 (CC BY-SA 3.0). Nothing in it is a
+measurement of a real robot."""
 
 from __future__ import annotations
 
@@ -38,7 +38,9 @@ CALIBRATION = Path(__file__).parent / "demo_calibration"
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--robot", nargs=2, required=True, type=Path, help="two utterances of the robot's voice, 16 kHz")
+    parser.add_argument(
+        "--robot", nargs=2, required=True, type=Path, help="two utterances of the robot's voice, 16 kHz"
+    )
     parser.add_argument("--human", required=True, type=Path, help="the human, any file that ffmpeg reads")
     parser.add_argument("--output", required=True, type=Path)
     args = parser.parse_args()
@@ -87,7 +89,9 @@ def at_microphone(played: np.ndarray, to_robot: np.ndarray) -> np.ndarray:
 def room_responses() -> tuple[np.ndarray, np.ndarray]:
     """Image-source responses from the robot's loudspeaker and from the human to the robot's microphone."""
     absorption, order = pyroomacoustics.inverse_sabine(RT60_S, ROOM)
-    room = pyroomacoustics.ShoeBox(ROOM, fs=RATE, materials=pyroomacoustics.Material(absorption), max_order=min(order, 30))
+    room = pyroomacoustics.ShoeBox(
+        ROOM, fs=RATE, materials=pyroomacoustics.Material(absorption), max_order=min(order, 30)
+    )
     room.add_source(LOUDSPEAKER)
     room.add_source(HUMAN)
     room.add_microphone(MICROPHONE)
@@ -127,7 +131,10 @@ def write(folder: Path, files: dict[str, np.ndarray]) -> None:
         soundfile.write(path, samples, RATE, subtype="PCM_16")
         read[name] = soundfile.read(path, dtype="float32")[0]
     profile = calibrate(
-        read["sweep_reference"], read["sweep_recording"], read["fan"], source="simulated demo robot: sweep_reference, sweep_recording, fan"
+        read["sweep_reference"],
+        read["sweep_recording"],
+        read["fan"],
+        source="simulated demo robot: sweep_reference, sweep_recording, fan",
     )
     profile.save(folder / "profile.npz")
     (folder / "LICENSE.md").write_text(LICENSE)

@@ -28,7 +28,15 @@ def profile(h: np.ndarray | None = None) -> Profile:
     """The robot with that path and a white fan."""
     bands = np.array([[900.0, 1100.0]])
     psd = np.full(601, FAN**2 / 8000, np.float32)
-    return Profile(EchoModel(path() if h is None else h), DELAY, np.ones(601, np.float32), psd, bands, np.array([40.0]), np.full(4, -60.0))
+    return Profile(
+        EchoModel(path() if h is None else h),
+        DELAY,
+        np.ones(601, np.float32),
+        psd,
+        bands,
+        np.array([40.0]),
+        np.full(4, -60.0),
+    )
 
 
 def voice(seconds: float = 8.0, seed: int = 0) -> np.ndarray:
@@ -37,7 +45,9 @@ def voice(seconds: float = 8.0, seed: int = 0) -> np.ndarray:
     n = round(seconds * 16000)
     t = np.arange(n) / 16000
     coloured = signal.lfilter([1.0], [1.0, -0.9], rng.standard_normal(n))
-    syllables = np.clip(np.interp(t, knots := np.arange(0, seconds + 1, 0.12), rng.uniform(-0.3, 1.0, knots.size)), 0.0, None)
+    syllables = np.clip(
+        np.interp(t, knots := np.arange(0, seconds + 1, 0.12), rng.uniform(-0.3, 1.0, knots.size)), 0.0, None
+    )
     return (0.06 * coloured * syllables * (t % 2.0 < 1.5)).astype(np.float32)
 
 

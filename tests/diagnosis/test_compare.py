@@ -16,7 +16,9 @@ from tests.diagnosis.robot_scene import FAN, profile, record, voice
 def test_nothing_is_left_of_the_robot_that_was_calibrated() -> None:
     x = voice(8.0)
     found = compare(profile(), record(x), x)
-    assert abs(found.excess_db) < 0.2  # 8 s of fan are known to 0.05 dB; the whitening's finite length costs about as much
+    assert (
+        abs(found.excess_db) < 0.2
+    )  # 8 s of fan are known to 0.05 dB; the whitening's finite length costs about as much
     assert abs(found.silence_excess_db) < 0.3
     assert found.human == ()
 
@@ -43,9 +45,14 @@ def test_an_extra_band_of_noise_shows_in_its_band_and_in_the_silence() -> None:
 def test_utterances_with_lags_of_their_own_are_aligned_one_by_one() -> None:
     x = voice(12.0)
     x[5 * 16000 : 6 * 16000] = 0
-    parts = np.where(np.arange(x.size) < 5.5 * 16000, x, 0).astype(np.float32), np.where(np.arange(x.size) >= 5.5 * 16000, x, 0).astype(np.float32)
+    parts = (
+        np.where(np.arange(x.size) < 5.5 * 16000, x, 0).astype(np.float32),
+        np.where(np.arange(x.size) >= 5.5 * 16000, x, 0).astype(np.float32),
+    )
     clean = [record(part, lag=lag, seed=seed) for part, lag, seed in zip(parts, (0.0, 4321.5), (3, 4), strict=True)]
-    found = compare(profile(), clean[0] + clean[1] - FAN * np.random.default_rng(4).standard_normal(x.size).astype(np.float32), x)
+    found = compare(
+        profile(), clean[0] + clean[1] - FAN * np.random.default_rng(4).standard_normal(x.size).astype(np.float32), x
+    )
     assert found.excess_db < 0.5
     assert any("different numbers of samples" in text and "4321.5 from" in text for text in found.warnings)
 
@@ -57,7 +64,7 @@ def test_somebody_talking_in_the_pauses_is_left_out_and_said() -> None:
     talk = np.arange(int(5.4 * 16000), int(7.9 * 16000))
     recording[talk] += (12 * FAN * np.random.default_rng(6).standard_normal(talk.size)).astype(np.float32)
     found = compare(profile(), recording, x)
-    (begin, end), = found.human
+    ((begin, end),) = found.human
     assert begin < 5.7 and end > 6.5
     assert any("somebody talks" in text for text in found.warnings)
 
@@ -81,7 +88,9 @@ def test_levels_are_those_at_which_the_voice_is_heard_over_the_fan() -> None:
 def test_another_rate_is_converted() -> None:
     x = voice(6.0)
     up = [soxr.resample(s, 16000, 48000) for s in (record(x), x)]
-    assert compare(profile(), *up, sample_rate=48000).excess_db < 0.5  # the converters' roll-off near 8 kHz is all that differs
+    assert (
+        compare(profile(), *up, sample_rate=48000).excess_db < 0.5
+    )  # the converters' roll-off near 8 kHz is all that differs
 
 
 def test_the_dictionary_is_json_and_holds_no_signals() -> None:

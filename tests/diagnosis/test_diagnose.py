@@ -50,10 +50,18 @@ def test_nothing_is_missing_where_nothing_is_hidden() -> None:
     ("effect", "change"),
     [
         ("playback_gain", lambda x: echo(x) * 10 ** (-0.9 / 20)),
-        ("chassis_resonance", lambda x: echo(x) + 0.5 * signal.lfilter(*signal.iirpeak(700.0, 50.0, fs=16000), echo(x))),
+        (
+            "chassis_resonance",
+            lambda x: echo(x) + 0.5 * signal.lfilter(*signal.iirpeak(700.0, 50.0, fs=16000), echo(x)),
+        ),
         ("bandlimit", lambda x: signal.sosfilt(signal.butter(5, 3400.0, fs=16000, output="sos"), echo(x))),
         ("mic_clipping", lambda x: np.clip(echo(x), -0.06, 0.06)),
-        ("fan_noise", lambda x: echo(x) + 1.5 * signal.sosfilt(signal.butter(2, [300, 900], "band", fs=16000, output="sos"), fan(9)) * 2),
+        (
+            "fan_noise",
+            lambda x: (
+                echo(x) + 1.5 * signal.sosfilt(signal.butter(2, [300, 900], "band", fs=16000, output="sos"), fan(9)) * 2
+            ),
+        ),
     ],
 )
 def test_one_hidden_effect_is_named_alone_and_leaves_nothing(effect: str, change) -> None:
@@ -63,7 +71,9 @@ def test_one_hidden_effect_is_named_alone_and_leaves_nothing(effect: str, change
     assert found.remaining_db < 1.0  # the product's promise for linear effects and clipping
     assert found.ranking[0].share > 0.6
     for interval in found.ranking[0].parameters.values():
-        assert np.all(np.asarray(interval.low) <= np.asarray(interval.value)) and np.all(np.asarray(interval.value) <= np.asarray(interval.high))
+        assert np.all(np.asarray(interval.low) <= np.asarray(interval.value)) and np.all(
+            np.asarray(interval.value) <= np.asarray(interval.high)
+        )
 
 
 def test_two_effects_at_once_are_both_found() -> None:
@@ -87,7 +97,9 @@ def test_things_that_slam_now_and_then_are_no_fan() -> None:
     slams = np.zeros(x.size)
     for at in (1.6, 3.7, 9.65):
         part = slams[round(at * 16000) :][:3200]
-        part += 40 * FAN * np.random.default_rng(round(at)).standard_normal(part.size) * np.exp(-np.arange(part.size) / 500)
+        part += (
+            40 * FAN * np.random.default_rng(round(at)).standard_normal(part.size) * np.exp(-np.arange(part.size) / 500)
+        )
     found = diagnose(profile(), (echo(x) + fan() + slams).astype(np.float32), x)
     assert "fan_noise" not in names(found) and found.verdict == "unexplained"
 
@@ -115,7 +127,9 @@ def test_a_band_limit_shows_in_the_power_where_a_codecs_noise_hides_it() -> None
     noise = signal.sosfiltfilt(low, 0.3 * passed * np.random.default_rng(5).standard_normal(x.size))
     found = diagnose(profile(), (passed + noise + fan()).astype(np.float32), x)
     assert (found.verdict, names(found)) == ("unexplained", ["bandlimit"])
-    assert found.ranking[0].parameters["cutoff_hz"].value == pytest.approx(4000.0, rel=0.15)  # edges of bands a sixth of an octave wide
+    assert found.ranking[0].parameters["cutoff_hz"].value == pytest.approx(
+        4000.0, rel=0.15
+    )  # edges of bands a sixth of an octave wide
     assert "codec" in found.evidence
 
 
@@ -146,10 +160,15 @@ def test_the_dictionary_has_the_published_keys_and_is_json() -> None:
 
 def test_no_effect_is_chosen_where_none_lowers_the_level():
     bench, score = Workbench(prepare(profile(), record(voice(4.0)), voice(4.0)), Criteria()), verdict(1.0, 1.0)
-    trials = {name: Trial(name, {}, EchoModel(path()), score, gain_db, 0.0) for name, gain_db in (("playback_gain", 0.9), ("late_reverb", 1.0))}
+    trials = {
+        name: Trial(name, {}, EchoModel(path()), score, gain_db, 0.0)
+        for name, gain_db in (("playback_gain", 0.9), ("late_reverb", 1.0))
+    }
     assert bench.preferred([]) is None and bench.preferred([replace(trials["late_reverb"], gain_db=-0.1)]) is None
     assert bench.preferred(trials.values()) is trials["playback_gain"]
-    assert bench.preferred([replace(trials["playback_gain"], gain_db=0.8), trials["late_reverb"]]) is trials["late_reverb"]
+    assert (
+        bench.preferred([replace(trials["playback_gain"], gain_db=0.8), trials["late_reverb"]]) is trials["late_reverb"]
+    )
 
 
 def verdict(active_db: float, fitted_db: float) -> Score:
@@ -158,10 +177,16 @@ def verdict(active_db: float, fitted_db: float) -> Score:
 
 @pytest.mark.parametrize("fitted_db, stands", [(0.1, True), (-1.5, False)])
 def test_knocks_that_are_missing_where_a_filter_was_fitted_are_that_filters_error(fitted_db, stands):
-    assert find("rattle").plausible(Evidence({}, EchoModel(path()), None, verdict(5.0, 1.0), verdict(2.0, fitted_db))) is stands
+    assert (
+        find("rattle").plausible(Evidence({}, EchoModel(path()), None, verdict(5.0, 1.0), verdict(2.0, fitted_db)))
+        is stands
+    )
 
 
-@pytest.mark.parametrize("name, fitted_db, halved", [("speaker_nonlinearity", 0.5, True), ("speaker_nonlinearity", 2.0, False), ("late_reverb", 0.5, False)])
+@pytest.mark.parametrize(
+    "name, fitted_db, halved",
+    [("speaker_nonlinearity", 0.5, True), ("speaker_nonlinearity", 2.0, False), ("late_reverb", 0.5, False)],
+)
 def test_half_of_what_a_long_filter_leaves_where_it_was_fitted_is_enough(name, fitted_db, halved):
     found = prepare(profile(), record(voice(4.0)), voice(4.0))
     bench, model = Workbench(found, Criteria()), EchoModel(path())

@@ -22,8 +22,9 @@ SEALED_HITS = 1
 """Labels that the diagnosis gets today, of the three above; nothing was tuned on them."""
 
 FALL_DB, SHARE = 1.0, 0.05
-"""How far the fall may stay behind the promise, in dB and as a share of the excess power. The promise is held out, of a fit to half of the
-blocks and judged on the other half; the comparison is of all of them, and with other blocks the excess before is another one: by up to 0.9 dB."""
+"""How far the fall may stay behind the promise, in dB and as a share of the excess power. The promise is held out, of a
+fit to half of the blocks and judged on the other half; the comparison is of all of them, and with other blocks the
+excess before is another one: by up to 0.9 dB."""
 
 
 def read(case: Path) -> dict[str, np.ndarray]:
@@ -69,7 +70,10 @@ def test_a_robot_with_nothing_hidden_is_explained() -> None:
     ids=["fan_noise", "delay_jump", "late_reverb", "mic_clipping"],
 )
 def test_the_hidden_effect_is_named_and_its_adding_keeps_the_promise(name: str, lasting: bool) -> None:
-    """Of what lasts, the first part is diagnosed and fitted, and the second judged too, which no fit has seen; a jump belongs to its recording."""
+    """Of what lasts, the first part is diagnosed and fitted, and the second judged too, which no fit has seen.
+
+    A jump belongs to its recording.
+    """
     signals = read(DATA / "dev" / name)
     truth = json.loads((DATA / "dev" / name / "truth.json").read_text())
     profile, cut = calibrated(signals), pause(signals["ref"]) if lasting else signals["ref"].size
@@ -91,13 +95,18 @@ def test_the_hidden_effect_is_named_and_its_adding_keeps_the_promise(name: str, 
 @pytest.fixture(scope="module")
 def sealed() -> dict[str, hidden_effects.Outcome]:
     seals = json.loads((DATA / "sealed" / "seals.json").read_text())
-    return {name: hidden_effects.check_seal(hidden_effects.judge(DATA / "sealed" / name, None), seals[name]) for name in SEALED}
+    return {
+        name: hidden_effects.check_seal(hidden_effects.judge(DATA / "sealed" / name, None), seals[name])
+        for name in SEALED
+    }
 
 
 def test_seals_are_met_as_often_as_they_were(sealed: dict[str, hidden_effects.Outcome]) -> None:
     for name, outcome in sealed.items():
         hit = "hit" if outcome.sealed_hit else "miss"
-        print(f"sealed {name}: {hit}, said {outcome.label}, {outcome.excess_db:.1f} dB, left {outcome.remaining_db:.1f}")
+        print(
+            f"sealed {name}: {hit}, said {outcome.label}, {outcome.excess_db:.1f} dB, left {outcome.remaining_db:.1f}"
+        )
     assert sum(bool(outcome.sealed_hit) for outcome in sealed.values()) >= SEALED_HITS
 
 
@@ -108,4 +117,6 @@ def test_what_is_added_to_a_sealed_case_keeps_the_promise(sealed: dict[str, hidd
     for name, outcome in named.items():
         signals = read(DATA / "sealed" / name)
         _, before, after = add(calibrated(signals), outcome.named[0], signals["mic"], signals["ref"])
-        assert_promise_kept((outcome.before_db[0], outcome.after_db[0], outcome.share[0]), before.excess_db, after.excess_db)
+        assert_promise_kept(
+            (outcome.before_db[0], outcome.after_db[0], outcome.share[0]), before.excess_db, after.excess_db
+        )

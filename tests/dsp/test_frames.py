@@ -5,7 +5,16 @@ import pytest
 from scipy import signal
 
 from edgefilter.dsp.frames import all_block_power, block_power, blocks, decibels, frames
-from edgefilter.dsp.psd import NOTCH, ROUNDING_PSD, floored, frequencies, periodograms, third_octave_bands, total_power, variance_at
+from edgefilter.dsp.psd import (
+    NOTCH,
+    ROUNDING_PSD,
+    floored,
+    frequencies,
+    periodograms,
+    third_octave_bands,
+    total_power,
+    variance_at,
+)
 
 
 def test_frames_are_what_slices_are_and_none_where_the_signal_is_shorter():
@@ -41,7 +50,9 @@ def test_a_density_is_floored_under_its_maximum_and_above_rounding():
 
 def test_white_noise_of_variance_one_has_variance_one_at_every_frequency():
     assert frequencies(601)[-1] == 8000.0
-    np.testing.assert_allclose(variance_at(np.array([0.0, 777.7, 8000.0]), np.full(601, 1 / 8000, np.float32)), 1.0, rtol=1e-6)
+    np.testing.assert_allclose(
+        variance_at(np.array([0.0, 777.7, 8000.0]), np.full(601, 1 / 8000, np.float32)), 1.0, rtol=1e-6
+    )
 
 
 def test_third_octaves_hold_a_thousand_hertz_and_end_at_eight():

@@ -58,4 +58,6 @@ def test_flattening_takes_colour_and_level_away_and_keeps_phase_and_precision(dt
     assert flat.dtype == dtype
     np.testing.assert_allclose(flat / np.abs(flat), spectrum / np.abs(spectrum), atol=1e-4)
     parts = np.array([np.mean(np.abs(part) ** 2) for part in np.array_split(flat, 8)])
-    np.testing.assert_allclose(parts, 1.0, rtol=0.1)  # means over 250 bins of noise that is divided by its own smoothed power
+    np.testing.assert_allclose(
+        parts, 1.0, rtol=0.1
+    )  # means over 250 bins of noise that is divided by its own smoothed power

@@ -18,7 +18,9 @@ def orthogonal_pair(n: int = 4000) -> tuple[np.ndarray, np.ndarray]:
 @pytest.mark.parametrize("level_db", [-26.0, -3.0, 0.0, 12.0])
 def test_si_sdr_of_orthogonal_noise_is_the_power_ratio(level_db: float) -> None:
     human, noise = orthogonal_pair()
-    assert si_sdr(human + 10 ** (-level_db / 20) * noise, human) == pytest.approx(level_db, abs=1e-9)  # float64 rounding
+    assert si_sdr(human + 10 ** (-level_db / 20) * noise, human) == pytest.approx(
+        level_db, abs=1e-9
+    )  # float64 rounding
 
 
 @pytest.mark.parametrize("gain", [1e-3, -0.5, 40.0])
@@ -32,7 +34,9 @@ def test_si_sdr_ignores_scale_of_estimate_and_target(gain: float) -> None:
 
 def test_si_sdr_does_not_remove_the_mean() -> None:
     human, _ = orthogonal_pair()
-    assert si_sdr(human + 1.0, human) == pytest.approx(0.0, abs=1e-9)  # the offset has the human's power; float64 rounding
+    assert si_sdr(human + 1.0, human) == pytest.approx(
+        0.0, abs=1e-9
+    )  # the offset has the human's power; float64 rounding
 
 
 def test_si_sdr_at_its_ends() -> None:

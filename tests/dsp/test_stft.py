@@ -6,7 +6,13 @@ import pytest
 from edgefilter.dsp.stft import Analyser, StftConfig, Synthesiser
 from edgefilter.errors import StftError
 
-GOOD = [StftConfig(), StftConfig(320, 160, 320), StftConfig(1200, 160, 400, "hann"), StftConfig(512, 128, 512, "hann"), StftConfig(64, 64, 64, "rectangular")]
+GOOD = [
+    StftConfig(),
+    StftConfig(320, 160, 320),
+    StftConfig(1200, 160, 400, "hann"),
+    StftConfig(512, 128, 512, "hann"),
+    StftConfig(64, 64, 64, "rectangular"),
+]
 
 
 @pytest.mark.parametrize("config", GOOD, ids=str)
@@ -24,13 +30,19 @@ def test_synthesis_undoes_analysis_for_every_config(config):
 def test_a_frame_is_the_fft_of_the_windowed_zero_padded_segment(config):
     x = np.random.default_rng(1).standard_normal(30 * config.hop).astype(np.float32)
     analyser = Analyser(config)
-    window = np.hanning(config.window_length + 1)[:-1] if config.window != "rectangular" else np.ones(config.window_length)
+    window = (
+        np.hanning(config.window_length + 1)[:-1] if config.window != "rectangular" else np.ones(config.window_length)
+    )
     window = np.sqrt(window) if config.window == "root-hann" else window
     for index, hop in enumerate(x.reshape(-1, config.hop)):
         frame = analyser.push(hop)[0]
         end = (index + 1) * config.hop
-        segment = np.concatenate((np.zeros(max(0, config.window_length - end)), x[max(0, end - config.window_length) : end]))
-        np.testing.assert_allclose(frame, np.fft.rfft(segment * window, config.n_fft), atol=1e-4)  # float32 sums of up to 1200 terms
+        segment = np.concatenate(
+            (np.zeros(max(0, config.window_length - end)), x[max(0, end - config.window_length) : end])
+        )
+        np.testing.assert_allclose(
+            frame, np.fft.rfft(segment * window, config.n_fft), atol=1e-4
+        )  # float32 sums of up to 1200 terms
 
 
 @pytest.mark.parametrize(
@@ -52,5 +64,9 @@ def test_noise_gain_is_the_power_of_white_noise_in_a_bin():
     config = StftConfig()
     analyser = Analyser(config)
     rng = np.random.default_rng(2)
-    power = np.mean([np.abs(analyser.push(rng.standard_normal(config.hop).astype(np.float32))[0, 1:-1]) ** 2 for _ in range(2000)])
-    assert power == pytest.approx(config.noise_gain(), rel=0.02)  # 255 x 2000 half-overlapping frames: standard error 0.2 %
+    power = np.mean(
+        [np.abs(analyser.push(rng.standard_normal(config.hop).astype(np.float32))[0, 1:-1]) ** 2 for _ in range(2000)]
+    )
+    assert power == pytest.approx(
+        config.noise_gain(), rel=0.02
+    )  # 255 x 2000 half-overlapping frames: standard error 0.2 %

@@ -43,7 +43,11 @@ def test_neutral_values_change_nothing(name: str) -> None:
     ("name", "values", "tolerance"),
     [
         ("playback_gain", {"gain_db": -2.5}, {"gain_db": 0.01}),  # least squares without noise: rounding only
-        ("clock_drift", {"ppm": -80.0, "offset": 12.5}, {"ppm": 3.0, "offset": 0.2}),  # parabola through a coloured peak
+        (
+            "clock_drift",
+            {"ppm": -80.0, "offset": 12.5},
+            {"ppm": 3.0, "offset": 0.2},
+        ),  # parabola through a coloured peak
     ],
 )
 def test_fit_finds_what_was_added(name: str, values: dict[str, float], tolerance: dict[str, float]) -> None:
@@ -70,7 +74,8 @@ def test_compression_turns_down_the_loud_only() -> None:
     values = complete(compress, {"threshold_db": -20.0, "ratio": 2.0})
     quiet, loud = 0.05 * tone, 0.5 * tone
     assert rms(compress.apply(quiet, values, 16000)[16000:]) == pytest.approx(rms(quiet[16000:]), rel=1e-3)
-    # 0.5 sin has a level of -9.03 dB, 10.97 dB above the threshold: half of that comes off; ripple of the 10 ms mean < 0.3 dB
+    # 0.5 sin has a level of -9.03 dB, 10.97 dB above the threshold: half of that comes off; ripple of the 10 ms mean <
+    # 0.3 dB
     change_db = 20 * np.log10(rms(compress.apply(loud, values, 16000)[16000:]) / rms(loud[16000:]))
     assert change_db == pytest.approx(-5.49, abs=0.3)
 

@@ -75,11 +75,15 @@ def test_a_good_file_is_one_effect_more_and_loads_once(write):
         ('name = "tilt"', 'name = "my tilt"', "name is 'my tilt'"),
         ('stage = "path"', 'stage = "room"', "stage is 'room', expected one of source"),
         ('(Parameter("amount", "1", 0.0, -1.0, 1.0),)', '("amount",)', "not a tuple of Parameter"),
-        ('0.0, -1.0, 1.0', '3.0, -1.0, 1.0', "neutral amount=3 is outside"),
-        ('0.0, -1.0, 1.0', '0.5, -1.0, 1.0', "changes the signal at the neutral values"),
+        ("0.0, -1.0, 1.0", "3.0, -1.0, 1.0", "neutral amount=3 is outside"),
+        ("0.0, -1.0, 1.0", "0.5, -1.0, 1.0", "changes the signal at the neutral values"),
         (".astype(np.float32)", "", "float64 of shape (4000,), expected finite float32"),
-        ("return (x +", "x[0] = 0; return (x +", "apply stops at line 11 with ValueError: assignment destination is read-only"),
-        ('parameters = (P', 'def __init__(self, depth): ...\n    parameters = (P', "Tilt() stops with TypeError"),
+        (
+            "return (x +",
+            "x[0] = 0; return (x +",
+            "apply stops at line 11 with ValueError: assignment destination is read-only",
+        ),
+        ("parameters = (P", "def __init__(self, depth): ...\n    parameters = (P", "Tilt() stops with TypeError"),
     ],
 )
 def test_a_broken_file_is_one_line_and_registers_nothing(write, old, new, words):
@@ -145,20 +149,34 @@ def test_a_noise_effect_of_the_users_own_does_not_crash_the_model(write):
 @pytest.mark.parametrize(
     ("hook", "words"),
     [
-        ("def variance(self, reference, values, sample_rate):\n        return 1 / 0", "variance stops at line 14 with ZeroDivisionError"),
-        ("def variance(self, reference, values, sample_rate):\n        return values", "variance gives dict, expected finite numbers of shape (16000,)"),
-        ("def colour(self, values):\n        return np.ones(7)", "colour gives float64 of shape (7,), expected finite numbers of shape (601,)"),
+        (
+            "def variance(self, reference, values, sample_rate):\n        return 1 / 0",
+            "variance stops at line 14 with ZeroDivisionError",
+        ),
+        (
+            "def variance(self, reference, values, sample_rate):\n        return values",
+            "variance gives dict, expected finite numbers of shape (16000,)",
+        ),
+        (
+            "def colour(self, values):\n        return np.ones(7)",
+            "colour gives float64 of shape (7,), expected finite numbers of shape (601,)",
+        ),
     ],
 )
 def test_a_noise_hook_that_fails_is_one_line(write, hook, words):
     before, after = NOISY.split("    def variance")
-    load_effect(write(f"{before}    {hook}\n" if "variance" in hook else f"{before}    def variance{after}\n    {hook}\n"))
+    load_effect(
+        write(f"{before}    {hook}\n" if "variance" in hook else f"{before}    def variance{after}\n    {hook}\n")
+    )
     with pytest.raises(UsageError, match=re.escape(words)):
         profile().echo.with_effect("hiss", {"power": 1e-3}).unpredictable(voice(1.0))
 
 
 def test_what_a_users_class_says_of_itself_is_kept(write):
-    told = "    memory, scales_fan, complexity, title = 0, True, 1, 'a tilt'\n\n    def settled(self, values):\n        return {**values, 'amount': 0.25}\n"
+    told = (
+        "    memory, scales_fan, complexity, title = 0, True, 1, 'a tilt'\n\n    def settled(self, values):\n       "
+        " return {**values, 'amount': 0.25}\n"
+    )
     load_effect(write(GOOD.replace("    def apply", told + "\n    def apply")))
     tilt = find("tilt")
     assert (tilt.memory, tilt.scales_fan, tilt.complexity, tilt.title, tilt.cost) == (0, True, 1, "a tilt", 1)
@@ -179,4 +197,6 @@ def test_the_documented_effect_finds_its_own_parameters(tmp_path):
     prepared = prepare(robot, record(x, robot.echo.with_effect("blade_chop", true)), x)
     found = find("blade_chop").fit(prepared.measurement, robot.echo)
     assert found["rate_hz"] == pytest.approx(23.0, abs=1 / 32)  # the grid's step for 8 s
-    assert np.hypot(found["cosine"], found["sine"]) == pytest.approx(np.hypot(0.12, 0.2), rel=0.05)  # 8 s of a voice with pauses
+    assert np.hypot(found["cosine"], found["sine"]) == pytest.approx(
+        np.hypot(0.12, 0.2), rel=0.05
+    )  # 8 s of a voice with pauses

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 import soundfile
 
-
 BREAKS = {
     "ImportError": "ImportError('DLL load failed while importing onnxruntime_pybind11_state')",
     "OSError": "OSError('libgomp.so.1: cannot open shared object file')",

@@ -17,7 +17,11 @@ from tests import conformance
 DATA = Path(__file__).parents[1] / "data"
 MODELS = {"crnn": DATA / "crnn.onnx", "paper-crnn": DATA / "paper_crnn.onnx"}
 """Networks of the smallest size; tests/data/make_models.py makes them."""
-CASES = [(name, check) for name in engines.ENGINES for check in (conformance.CLIP_CHECKS if name == "paper-crnn" else conformance.CHECKS)]
+CASES = [
+    (name, check)
+    for name in engines.ENGINES
+    for check in (conformance.CLIP_CHECKS if name == "paper-crnn" else conformance.CHECKS)
+]
 
 
 def robot() -> Profile:

@@ -49,9 +49,13 @@ def test_crnn_answers_what_onnxruntime_answers_for_the_same_frames():
     state, theirs = engine.initial_state(), [np.zeros(shape, np.float32) for _, shape in engine.model.states]
     for _ in range(5):
         error, mic, reference, echo = (spectrum(rng, engine.stft.bins) for _ in range(4))
-        output, state = engine.step(Frame(mic=mic, reference=reference, echo=echo, error=error, noise_psd=nothing, residual_psd=nothing), state)
+        output, state = engine.step(
+            Frame(mic=mic, reference=reference, echo=echo, error=error, noise_psd=nothing, residual_psd=nothing), state
+        )
         pairs = [np.stack((x.real, x.imag), axis=-1)[None] for x in (error, mic, reference, echo)]
-        found, probability, *theirs = session.run(None, dict(zip([slot.name for slot in session.get_inputs()], pairs + theirs)))
+        found, probability, *theirs = session.run(
+            None, dict(zip([slot.name for slot in session.get_inputs()], pairs + theirs))
+        )
         np.testing.assert_array_equal(output.spectrum, found[0, :, 0] + 1j * found[0, :, 1])
         assert output.speech_probability == probability[0] and 0 < probability[0] < 1
     assert any(tensor.any() for tensor in state[0])
@@ -63,7 +67,9 @@ def test_streams_in_several_threads_share_an_engine_without_mixing():
 
     def run(sound: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
         stream = Stream(engine)
-        return np.concatenate([stream.process(sound[0][at : at + 256], sound[1][at : at + 256]) for at in range(0, 12000, 256)])
+        return np.concatenate(
+            [stream.process(sound[0][at : at + 256], sound[1][at : at + 256]) for at in range(0, 12000, 256)]
+        )
 
     alone = [run(sound) for sound in sounds]
     with ThreadPoolExecutor(4) as pool:
@@ -76,7 +82,10 @@ def test_the_answer_is_half_the_networks_and_half_the_wiener_masks():
     bins = Crnn(EDGE).stft.bins
     power = rng.random(bins).astype(np.float32)
     frame = Frame(*(spectrum(rng, bins) for _ in range(4)), power, power)
-    network, wiener, both = (engine.step(frame, engine.initial_state())[0].spectrum for engine in (Crnn(EDGE, wiener_share=s) for s in (0.0, 1.0, 0.5)))
+    network, wiener, both = (
+        engine.step(frame, engine.initial_state())[0].spectrum
+        for engine in (Crnn(EDGE, wiener_share=s) for s in (0.0, 1.0, 0.5))
+    )
     assert not np.allclose(network, wiener, atol=1e-3)
     np.testing.assert_allclose(both, (network + wiener) / 2, atol=1e-6)
 
@@ -115,7 +124,10 @@ def test_one_thread_without_spinning_and_with_denormals_as_zero():
         ({"hop": "512"}, "unusable metadata.*inverted"),
         ({"n_fft": "1024"}, r"inputs .*error \[1, 257, 2\].*wants.*error \[1, 513, 2\]"),
         ({"states": "[]"}, "inputs .*state_0"),
-        ({"states": '[["state_0", [1, 6, 9]], ["state_1", [1, 6, 256]], ["state_2", [2, 1, 6]]]'}, r"wants.*state_0 \[1, 6, 9\]"),
+        (
+            {"states": '[["state_0", [1, 6, 9]], ["state_1", [1, 6, 256]], ["state_2", [2, 1, 6]]]'},
+            r"wants.*state_0 \[1, 6, 9\]",
+        ),
         ({"states": "nonsense"}, "unusable metadata"),
     ],
 )
@@ -150,12 +162,19 @@ def test_the_model_comes_from_the_option_then_the_variable_then_the_package(tmp_
 def test_the_packages_int8_file_is_of_the_same_training_as_the_exact_one():
     exact, used = Crnn(Path(__file__).parents[2] / "models/crnn.onnx").model, Crnn().model
     assert used.path.name == "crnn_int8.onnx"
-    assert (used.training, used.figures, used.states, used.stft) == (exact.training, exact.figures, exact.states, exact.stft)
+    assert (used.training, used.figures, used.states, used.stft) == (
+        exact.training,
+        exact.figures,
+        exact.states,
+        exact.stft,
+    )
 
 
 def test_the_exact_network_filters_the_demo_as_the_int8_one_does():
     """Both files are run: each brings the human out, and what int8 weights change is far under the answer."""
-    mic, ref, human = (soundfile.read(DEMO / f"{name}.flac", dtype="float32")[0] for name in ("mic", "reference", "human"))
+    mic, ref, human = (
+        soundfile.read(DEMO / f"{name}.flac", dtype="float32")[0] for name in ("mic", "reference", "human")
+    )
     models = (ROOT / "models/crnn.onnx", ROOT / "models/crnn_int8.onnx")
     exact, small = (enhance(mic, ref, DEMO / "profile.npz", "crnn", model) for model in models)
     speaking = np.flatnonzero(human)
@@ -196,7 +215,9 @@ def test_paper_crnn_masks_the_mixtures_magnitude_and_keeps_its_phase():
     mic, ref = (np.stack([spectrum(rng, bins) for _ in range(7)]) for _ in range(2))
     nothing = np.zeros(bins, np.float32)
     answer = np.stack(engine.answer([Frame(m, r, m, m, nothing, nothing) for m, r in zip(mic, ref)]))
-    mask = onnx_session.open_session(PAPER).run(None, {"mic_magnitude": np.abs(mic)[None], "reference_magnitude": np.abs(ref)[None]})[0][0]
+    mask = onnx_session.open_session(PAPER).run(
+        None, {"mic_magnitude": np.abs(mic)[None], "reference_magnitude": np.abs(ref)[None]}
+    )[0][0]
     assert mask.std() > 1e-4
     np.testing.assert_array_equal(answer, mask * mic)
 
@@ -218,12 +239,28 @@ def test_the_command_line_takes_a_model_and_reports_it(tmp_path):
     soundfile.write(tmp_path / "ref.wav", ref, 16000, "FLOAT")
 
     def run(engine: str, model: Path) -> subprocess.CompletedProcess:
-        words = ["run", "--input", "mic.wav", "--reference", "ref.wav", "--engine", engine, "--model", str(model), "--output", "out.wav"]
-        return subprocess.run([sys.executable, "-m", "edgefilter.cli", *words], cwd=tmp_path, capture_output=True, text=True)
+        words = [
+            "run",
+            "--input",
+            "mic.wav",
+            "--reference",
+            "ref.wav",
+            "--engine",
+            engine,
+            "--model",
+            str(model),
+            "--output",
+            "out.wav",
+        ]
+        return subprocess.run(
+            [sys.executable, "-m", "edgefilter.cli", *words], cwd=tmp_path, capture_output=True, text=True
+        )
 
     done = run("crnn", EDGE)
     assert done.returncode == 0 and "algorithmic latency 32 ms" in done.stderr, done.stderr
-    np.testing.assert_allclose(soundfile.read(tmp_path / "out.wav")[0], enhance(mic, ref, engine="crnn", model=EDGE), atol=2**-15)
+    np.testing.assert_allclose(
+        soundfile.read(tmp_path / "out.wav")[0], enhance(mic, ref, engine="crnn", model=EDGE), atol=2**-15
+    )
     done = run("paper-crnn", PAPER)
     assert done.returncode == 0 and "answers at the end of the recording" in done.stderr, done.stderr
     refused = run("crnn", PAPER)

@@ -15,7 +15,9 @@ SILENCE = np.zeros(STFT.bins, np.complex64)
 
 
 def noise(rng, power):
-    return (np.sqrt(power / 2) * (rng.standard_normal(STFT.bins) + 1j * rng.standard_normal(STFT.bins))).astype(np.complex64)
+    return (np.sqrt(power / 2) * (rng.standard_normal(STFT.bins) + 1j * rng.standard_normal(STFT.bins))).astype(
+        np.complex64
+    )
 
 
 def run(errors, fan, residual):
@@ -36,7 +38,9 @@ def test_fan_alone_falls_towards_the_floor_and_never_below_it():
     errors = np.array([noise(rng, 1.0) for _ in range(200)])
     gain = np.abs(run(errors, NOTHING + 1, NOTHING)) / np.abs(errors)
     assert gain.min() == pytest.approx(FLOOR, rel=1e-5)  # float32
-    assert db(run(errors, NOTHING + 1, NOTHING)[20:]) < db(errors[20:]) - 9  # -15 dB is the floor; random peaks rise above it
+    assert (
+        db(run(errors, NOTHING + 1, NOTHING)[20:]) < db(errors[20:]) - 9
+    )  # -15 dB is the floor; random peaks rise above it
 
 
 def test_a_human_20_db_above_what_is_unwanted_passes_within_half_a_decibel():
@@ -48,7 +52,9 @@ def test_a_human_20_db_above_what_is_unwanted_passes_within_half_a_decibel():
 
 def test_nothing_unwanted_changes_nothing():
     errors = np.array([noise(np.random.default_rng(2), 1e-4) for _ in range(20)])
-    np.testing.assert_allclose(run(errors, NOTHING, NOTHING)[1:], errors[1:], rtol=1e-3)  # xi is finite: 1e-12 stands beside 1e-4
+    np.testing.assert_allclose(
+        run(errors, NOTHING, NOTHING)[1:], errors[1:], rtol=1e-3
+    )  # xi is finite: 1e-12 stands beside 1e-4
 
 
 def test_residual_grows_with_the_echo_and_decays_after_it():
@@ -69,7 +75,9 @@ def test_the_part_of_the_echo_that_stays_is_tracked_and_a_human_hardly_lifts_it(
 
     def expected(seconds, human):
         frames = range(int(seconds * 16000 / STFT.hop))
-        return np.mean([residual.step(noise(rng, 1.0), noise(rng, part) + noise(rng, human), NOTHING)[1] for _ in frames][-60:])
+        return np.mean(
+            [residual.step(noise(rng, 1.0), noise(rng, part) + noise(rng, human), NOTHING)[1] for _ in frames][-60:]
+        )
 
     alone = expected(20, 0.0)
     assert part < alone < 8 * part  # MARGIN, and the echo's maximum over frames, which is above its mean

@@ -29,7 +29,13 @@ def conversation(tmp_path):
     human[:16000] = 0
     click = np.zeros(16000)
     click[800] = 0.5
-    for name, samples in {"mic": robot + 0.1 * human, "ref": robot, "clean": 0.1 * human, "sweep_ref": click, "sweep_mic": click}.items():
+    for name, samples in {
+        "mic": robot + 0.1 * human,
+        "ref": robot,
+        "clean": 0.1 * human,
+        "sweep_ref": click,
+        "sweep_mic": click,
+    }.items():
         sf.write(folder / f"{name}.flac", samples, 16000)
     sf.write(folder / "fan_only.flac", 1e-3 * rng.standard_normal(32000), 16000)
     (folder / "meta.json").write_text(json.dumps({"room": "lab", "text": "one two", "start": 16000, "end": 32000}))
@@ -39,13 +45,25 @@ def conversation(tmp_path):
 def test_networks_are_compared(tmp_path, conversation, monkeypatch):
     run = tmp_path / "tiny"
     small = ["--channels", "2", "2", "2", "2", "--hidden", "4", "--smoke"]
-    monkeypatch.setattr("sys.argv", ["train", "--data", str(tmp_path / "d"), "--validation", str(tmp_path / "v"), "--output", str(run), *small])
+    monkeypatch.setattr(
+        "sys.argv",
+        ["train", "--data", str(tmp_path / "d"), "--validation", str(tmp_path / "v"), "--output", str(run), *small],
+    )
     assert train.main() == 0
     monkeypatch.setattr(networks, "Recogniser", Deaf)
     monkeypatch.setattr(networks, "HOPS", 3)
     monkeypatch.setattr(networks.Conversation, "profile", None)
     out = tmp_path / "results" / "networks"
-    arguments = ["--runs", str(run), "--conversations", str(conversation), "--whisper", str(tmp_path), "--output", str(out)]
+    arguments = [
+        "--runs",
+        str(run),
+        "--conversations",
+        str(conversation),
+        "--whisper",
+        str(tmp_path),
+        "--output",
+        str(out),
+    ]
     monkeypatch.setattr("sys.argv", ["networks", *arguments])
     assert networks.main() == 0
     found = json.loads(out.with_suffix(".json").read_text())
@@ -57,7 +75,16 @@ def test_networks_are_compared(tmp_path, conversation, monkeypatch):
 
 def test_a_folder_without_a_network_is_one_line(tmp_path, conversation, monkeypatch, capsys):
     monkeypatch.setattr(networks, "Recogniser", Deaf)
-    arguments = ["--runs", str(tmp_path), "--conversations", str(conversation), "--whisper", str(tmp_path), "--output", str(tmp_path / "o")]
+    arguments = [
+        "--runs",
+        str(tmp_path),
+        "--conversations",
+        str(conversation),
+        "--whisper",
+        str(tmp_path),
+        "--output",
+        str(tmp_path / "o"),
+    ]
     monkeypatch.setattr("sys.argv", ["networks", *arguments])
     assert networks.main() == 1
     assert "no best.pt" in capsys.readouterr().err

@@ -60,11 +60,18 @@ def test_the_runtime_takes_the_file_and_knows_its_stft_training_and_figures(expo
     assert engine.stft == EDGE.stft
     assert engine.model.training == {"data": "none", "seed": 1}
     assert engine.model.figures == {"si_sdr_db": 1.5, "wer": 0.3}
-    assert [shape for _, shape in engine.model.states] == [tuple(tensor.shape) for tensor in exported[0].initial_state()]
+    assert [shape for _, shape in engine.model.states] == [
+        tuple(tensor.shape) for tensor in exported[0].initial_state()
+    ]
 
 
 def test_nothing_but_the_model_is_left_behind(exported):
-    assert sorted(path.name for path in exported[1].parent.iterdir()) == ["crnn.onnx", "crnn_int8.onnx", "figures.json", "last.pt"]
+    assert sorted(path.name for path in exported[1].parent.iterdir()) == [
+        "crnn.onnx",
+        "crnn_int8.onnx",
+        "figures.json",
+        "last.pt",
+    ]
 
 
 def test_the_graph_is_opset_17_and_its_gru_is_torchs(exported):
@@ -121,7 +128,9 @@ def test_the_int8_variant_is_taken_by_the_engine_and_answers_nearly_the_same(exp
     states = [engine.initial_state() for engine in engines]
     power = apart = 0.0
     for _ in range(50):
-        frame = Frame(*(rng.standard_normal((4, engines[0].stft.bins, 2)) @ (1, 1j)).astype(np.complex64), nothing, nothing)
+        frame = Frame(
+            *(rng.standard_normal((4, engines[0].stft.bins, 2)) @ (1, 1j)).astype(np.complex64), nothing, nothing
+        )
         (wanted, states[0]), (found, states[1]) = (engine.step(frame, state) for engine, state in zip(engines, states))
         power += np.sum(np.abs(wanted.spectrum) ** 2)
         apart += np.sum(np.abs(found.spectrum - wanted.spectrum) ** 2)
@@ -187,7 +196,17 @@ def test_a_start_that_is_not_silence_is_refused(tmp_path):
         export(Trained(network), tmp_path / "crnn.onnx")
 
 
-@pytest.mark.parametrize("content", [b"text", None, {"network": {}}, {"kind": "lstm", "config": {}, "network": {}}, {"config": {"size": 3}, "network": {}}, {"config": {}, "network": {}}])
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"text",
+        None,
+        {"network": {}},
+        {"kind": "lstm", "config": {}, "network": {}},
+        {"config": {"size": 3}, "network": {}},
+        {"config": {}, "network": {}},
+    ],
+)
 def test_what_is_no_checkpoint_is_refused_in_one_line(tmp_path, capsys, content):
     path = tmp_path / "last.pt"
     if isinstance(content, bytes):
@@ -212,7 +231,9 @@ def test_the_papers_network_is_exported_for_clips_of_any_length_and_with_an_int8
     for path, bound in ((tmp_path / "paper.onnx", 1e-4), (small, 0.05)):  # int8: eight bits of weights and of inputs
         assert PaperEngine(path).model.stft.bins == 601
         for frames in (3, 70):
-            mic, reference = np.abs(np.random.default_rng(frames).standard_normal((2, 1, frames, 601))).astype(np.float32)
+            mic, reference = np.abs(np.random.default_rng(frames).standard_normal((2, 1, frames, 601))).astype(
+                np.float32
+            )
             found = open_session(path).run(None, {"mic_magnitude": mic, "reference_magnitude": reference})[0]
             with torch.no_grad():
                 wanted = network(torch.from_numpy(mic), torch.from_numpy(reference)).numpy()

@@ -15,7 +15,12 @@ def test_parameters_and_operations_are_those_of_table_1():
     blstm = 2 * 4 * 400 * (2 * 8 * 601 + 400 + 2)
     dense = (800 + 1) * 600 + (600 + 1) * 601
     assert parameter_count(network) == conv + blstm + dense == 33_983_577
-    per_frame = 2 * 601 * (7 * 64 + 7 * 64**2 + 5 * 25 * 64**2 + 64 * 8) + 2 * 4 * 400 * (2 * 8 * 601 + 400) + 800 * 600 + 600 * 601
+    per_frame = (
+        2 * 601 * (7 * 64 + 7 * 64**2 + 5 * 25 * 64**2 + 64 * 8)
+        + 2 * 4 * 400 * (2 * 8 * 601 + 400)
+        + 800 * 600
+        + 600 * 601
+    )
     assert macs_per_second(network) == 100 * per_frame
     assert round(macs_per_second(network) / 1e9) == 68
 
@@ -32,7 +37,10 @@ def test_eight_convolutions_a_branch_with_the_tables_widths_and_dilations():
 
 def test_batch_normalisation_is_an_option_and_off():
     with torch.device("meta"):
-        counts = [sum(isinstance(m, nn.BatchNorm2d) for m in PaperCrnn(PaperConfig(batch_norm=on)).modules()) for on in (False, True)]
+        counts = [
+            sum(isinstance(m, nn.BatchNorm2d) for m in PaperCrnn(PaperConfig(batch_norm=on)).modules())
+            for on in (False, True)
+        ]
     assert counts == [0, 16]
 
 

@@ -22,7 +22,20 @@ SMALL = EdgeConfig(64, 32, channels=(4, 4, 4, 4), hidden=8)
 def data(tmp_path_factory):
     folder = tmp_path_factory.mktemp("data")
     humans, robots = write_librispeech(folder / "humans", ("1", "2")), write_table(folder / "robots", ("a",))
-    arguments = ["--humans", str(humans), "--robots", str(robots), "--count", "2", "--seed", "4", "--jobs", "1", "--recipe", "paper"]
+    arguments = [
+        "--humans",
+        str(humans),
+        "--robots",
+        str(robots),
+        "--count",
+        "2",
+        "--seed",
+        "4",
+        "--jobs",
+        "1",
+        "--recipe",
+        "paper",
+    ]
     patch = pytest.MonkeyPatch()
     patch.setattr(dataset, "ROOMS", {"lab": 1, "office": 1})
     patch.setattr("sys.argv", ["dataset", *arguments, "--output", str(folder / "items")])
@@ -134,7 +147,10 @@ def test_the_loss_is_least_at_the_human_and_minds_suppression_more():
         return float(edge_loss(human, silent, clean, active, LossWeights(si_sdr=0.0))["total"])
 
     assert total(clean) < total(0.7 * clean)
-    quieter, louder = total(0.5**2 * clean), total(clean * (2 - 0.25**0.3) ** (1 / 0.3))  # equal steps of the compressed magnitude
+    quieter, louder = (
+        total(0.5**2 * clean),
+        total(clean * (2 - 0.25**0.3) ** (1 / 0.3)),
+    )  # equal steps of the compressed magnitude
     assert quieter > 1.2 * louder
 
 
@@ -144,7 +160,9 @@ def test_si_sdr_of_spectra_is_that_of_samples():
     pad = np.zeros(256, np.float32)
 
     def spectrum(x):
-        frames = torch.from_numpy(np.concatenate((pad, x, pad))).unfold(0, 512, 256) * torch.from_numpy(stft.analysis_window)
+        frames = torch.from_numpy(np.concatenate((pad, x, pad))).unfold(0, 512, 256) * torch.from_numpy(
+            stft.analysis_window
+        )
         return torch.view_as_real(torch.fft.rfft(frames))[None]
 
     found = float(si_sdr(spectrum(clean + 0.3 * noise), spectrum(clean)))
@@ -159,7 +177,16 @@ def test_the_papers_loss_vanishes_at_the_right_mask():
 
 def test_training_runs_stops_and_goes_on(tmp_path, monkeypatch, capsys):
     small = ["--hop", "32", "--channels", "4", "4", "4", "4", "--hidden", "8"]
-    arguments = ["--data", str(tmp_path / "d"), "--validation", str(tmp_path / "v"), "--output", str(tmp_path / "run"), *small, "--smoke"]
+    arguments = [
+        "--data",
+        str(tmp_path / "d"),
+        "--validation",
+        str(tmp_path / "v"),
+        "--output",
+        str(tmp_path / "run"),
+        *small,
+        "--smoke",
+    ]
     monkeypatch.setattr("sys.argv", ["train", *arguments])
     train.main()
     steps = [json.loads(line)["step"] for line in (tmp_path / "run" / "log.jsonl").read_text().splitlines()]
@@ -173,7 +200,10 @@ def test_training_runs_stops_and_goes_on(tmp_path, monkeypatch, capsys):
 def test_training_starts_from_given_weights_of_the_same_shape(tmp_path, monkeypatch, capsys):
     def run(name, hidden, *more):
         folders = ["--data", str(tmp_path / "d"), "--validation", str(tmp_path / "v"), "--output", str(tmp_path / name)]
-        monkeypatch.setattr("sys.argv", ["train", *folders, "--hop", "32", "--channels", "4", "4", "4", "4", "--hidden", hidden, "--smoke", *more])
+        monkeypatch.setattr(
+            "sys.argv",
+            ["train", *folders, "--hop", "32", "--channels", "4", "4", "4", "4", "--hidden", hidden, "--smoke", *more],
+        )
         return train.main()
 
     assert run("first", "8") == 0
@@ -192,7 +222,17 @@ def test_training_starts_from_given_weights_of_the_same_shape(tmp_path, monkeypa
 def test_the_papers_network_trains_too(tmp_path, monkeypatch):
     narrow = PaperConfig(filters=(2, 2, 2, 2, 2, 2, 2, 2), lstm=4, hidden=8)
     monkeypatch.setattr("export.tasks.PaperConfig", lambda batch_norm: narrow)
-    arguments = ["--data", str(tmp_path / "d"), "--validation", str(tmp_path / "v"), "--output", str(tmp_path / "run"), "--network", "paper", "--smoke"]
+    arguments = [
+        "--data",
+        str(tmp_path / "d"),
+        "--validation",
+        str(tmp_path / "v"),
+        "--output",
+        str(tmp_path / "run"),
+        "--network",
+        "paper",
+        "--smoke",
+    ]
     monkeypatch.setattr("sys.argv", ["train", *arguments])
     train.main()
     saved = torch.load(tmp_path / "run" / "best.pt", weights_only=True)

@@ -1,4 +1,7 @@
-"""The measured choice: best first, the first that fits, remembered for this machine; and honest words where nothing fits."""
+"""The measured choice: best first, the first that fits, remembered for this machine.
+
+And honest words where nothing fits.
+"""
 
 import json
 import os
@@ -42,7 +45,9 @@ def measured(monkeypatch):
     def pretend(engine, profile):
         asked.append(engine.name)
         p99 = speeds[engine.name]
-        return Figures(engine.name, budget._model(engine), 16.0, 300, p99 < 16.0, p99 / 3, p99 / 2, p99, 2 * p99, p99 / 4, p99 / 3)
+        return Figures(
+            engine.name, budget._model(engine), 16.0, 300, p99 < 16.0, p99 / 3, p99 / 2, p99, 2 * p99, p99 / 4, p99 / 3
+        )
 
     monkeypatch.setattr(budget, "measure", pretend)
     return speeds, asked
@@ -52,7 +57,8 @@ LADDER = ("ss", "linear", "bypass")
 
 
 @pytest.mark.parametrize(
-    ("budget_ms", "engine", "asked"), [(8.0, "ss", ["ss"]), (6.0, "ss", ["ss"]), (5.9, "linear", ["ss", "linear"]), (1.0, "bypass", list(LADDER))]
+    ("budget_ms", "engine", "asked"),
+    [(8.0, "ss", ["ss"]), (6.0, "ss", ["ss"]), (5.9, "linear", ["ss", "linear"]), (1.0, "bypass", list(LADDER))],
 )
 def test_the_best_engine_that_fits_is_taken_and_no_further_one_is_measured(measured, budget_ms, engine, asked):
     choice = choose(budget_ms, candidates=LADDER)
@@ -67,7 +73,11 @@ def test_the_best_engine_that_fits_is_taken_and_no_further_one_is_measured(measu
 def test_nothing_fits_takes_the_cheapest_and_says_what_would_help(measured):
     choice = choose(0.05, candidates=("ss", "linear"))
     assert (choice.engine, choice.fits) == ("linear", False)
-    assert "no engine keeps to 0.05 ms" in choice.reason and "--budget-ms 2" in choice.reason and "free core" in choice.reason
+    assert (
+        "no engine keeps to 0.05 ms" in choice.reason
+        and "--budget-ms 2" in choice.reason
+        and "free core" in choice.reason
+    )
     assert "\n" not in choice.reason
 
 
@@ -79,7 +89,11 @@ def test_an_engine_that_cannot_keep_up_never_fits(measured):
 
 def test_an_engine_that_cannot_be_made_is_skipped_and_named(measured):
     choice = choose(8.0, candidates=("paper-ss", "linear"))
-    assert choice.engine == "linear" and list(choice.skipped) == ["paper-ss"] and "paper-ss cannot be used" in choice.reason
+    assert (
+        choice.engine == "linear"
+        and list(choice.skipped) == ["paper-ss"]
+        and "paper-ss cannot be used" in choice.reason
+    )
     with pytest.raises(UsageError, match="no engine can be made: paper-ss"):
         choose(8.0, candidates=("paper-ss",))
 
@@ -122,7 +136,14 @@ def test_another_model_file_is_measured_again(measured, monkeypatch, tmp_path):
 
 @pytest.mark.parametrize(
     ("text", "why"),
-    [("", "not JSON"), ("{", "not JSON"), ("[]", "JSON list"), ("{}", None), ('{"x": 3}', None), ("[" * 9999, "not JSON")],
+    [
+        ("", "not JSON"),
+        ("{", "not JSON"),
+        ("[]", "JSON list"),
+        ("{}", None),
+        ('{"x": 3}', None),
+        ("[" * 9999, "not JSON"),
+    ],
 )
 def test_a_damaged_cache_is_measured_again(measured, cache, text, why):
     cache.mkdir(parents=True)
@@ -268,7 +289,8 @@ def test_the_measurement_is_held_to_the_cores_and_lets_go_afterwards():
 
 def run(folder, *more):
     result = subprocess.run(
-        [sys.executable, "-m", "edgefilter.cli", "run", "--input", DEMO / "human.flac", "--output", folder / "out.wav", "--json", folder / "j", *more],
+        [sys.executable, "-m", "edgefilter.cli", "run", "--input", DEMO / "human.flac"]
+        + ["--output", folder / "out.wav", "--json", folder / "j", *more],
         capture_output=True, text=True, timeout=120,
     )  # fmt: skip
     assert result.returncode == 0, result.stderr
@@ -281,7 +303,9 @@ def test_a_recording_gets_the_strongest_engine_unmeasured_unless_a_budget_is_giv
     said, stats = run(tmp_path, "--seconds", "1", "--budget-ms", "500")
     choice = stats["choice"]
     last = choice["figures"][-1]
-    assert not choice["remembered"] and choice["fits"] == (last["hops"] == 300)  # on a machine with more to do fewer can be run in time
+    assert not choice["remembered"] and choice["fits"] == (
+        last["hops"] == 300
+    )  # on a machine with more to do fewer can be run in time
     assert stats["engine"] == choice["engine"] and choice["reason"] in said and "measuring engine" in said
     said, stats = run(tmp_path, "--seconds", "1", "--budget-ms", "500")
     assert stats["choice"]["remembered"] and "measuring" not in said

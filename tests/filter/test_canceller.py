@@ -32,7 +32,10 @@ def speechlike(seconds: float, seed: int = 1) -> np.ndarray:
 
 def run(canceller: Canceller, mic: np.ndarray, reference: np.ndarray, located: bool = True) -> np.ndarray:
     hop = canceller.hop
-    steps = [canceller.step(mic[i : i + hop], reference[i : i + hop], located).error for i in range(0, mic.size - hop + 1, hop)]
+    steps = [
+        canceller.step(mic[i : i + hop], reference[i : i + hop], located).error
+        for i in range(0, mic.size - hop + 1, hop)
+    ]
     return np.concatenate(steps)
 
 
@@ -120,7 +123,8 @@ def test_a_turned_volume_is_followed_within_a_fifth_of_a_second() -> None:
     canceller = Canceller(HOP, 3200, h)
     error = run(canceller, mic, x)
     after = slice(32_000 + 3200, 32_000 + 9600)
-    # one factor explains the change, so the error falls far below what 3 dB leave (-7.7 dB); 30 dB leaves room for the adaptation
+    # one factor explains the change, so the error falls far below what 3 dB leave (-7.7 dB); 30 dB leaves room for the
+    # adaptation
     assert db(error[after]) < db(mic[after]) - 30
     assert canceller.stats()["gain_db"] == pytest.approx(3.0, abs=0.2)  # 80 ms of correlation; the rest is adapted
 
@@ -158,7 +162,9 @@ def test_an_echo_that_has_not_arrived_yet_is_not_subtracted() -> None:
     error = run(canceller, fan, x, located=False)
     # the first hop fades the echo out; after it the fan passes as it is, and the path is kept for when the echo arrives
     np.testing.assert_array_equal(error[HOP : 8 * HOP], fan[HOP : 8 * HOP])
-    np.testing.assert_allclose(canceller.impulse_response()[: h.size], h[: canceller.taps], atol=1e-3)  # float32 and one fading hop
+    np.testing.assert_allclose(
+        canceller.impulse_response()[: h.size], h[: canceller.taps], atol=1e-3
+    )  # float32 and one fading hop
 
 
 def test_reset_is_a_fresh_start() -> None:

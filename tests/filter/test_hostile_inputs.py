@@ -58,7 +58,12 @@ def lag_jumps_every_second() -> tuple[np.ndarray, np.ndarray]:
 
 def volume_turned() -> tuple[np.ndarray, np.ndarray]:
     ref, echo, human, fan, _ = scene()
-    return np.repeat([0.1, 1.0, 10.0, 0.3, 3.0, 0.1, 10.0, 1.0], SAMPLE_RATE).astype(np.float32) * 0.1 * echo + human + fan, ref
+    return (
+        np.repeat([0.1, 1.0, 10.0, 0.3, 3.0, 0.1, 10.0, 1.0], SAMPLE_RATE).astype(np.float32) * 0.1 * echo
+        + human
+        + fan,
+        ref,
+    )
 
 
 def path_changes_at_once() -> tuple[np.ndarray, np.ndarray]:
@@ -105,7 +110,9 @@ def profile() -> Profile:
 
     rng = np.random.default_rng(0)
     sweep = generate_sweep()
-    return calibrate(sweep, heard(sweep, scene()[4], 300), 1e-3 * rng.standard_normal(4 * SAMPLE_RATE).astype(np.float32))
+    return calibrate(
+        sweep, heard(sweep, scene()[4], 300), 1e-3 * rng.standard_normal(4 * SAMPLE_RATE).astype(np.float32)
+    )
 
 
 @pytest.fixture(scope="module")

@@ -96,8 +96,13 @@ def test_the_gate_shuts_at_once_and_opens_without_a_step():
 
 
 def test_the_robots_onset_in_the_demo_stays_below_the_human():
-    """At 8 s its second utterance begins with another lag; it came through 10 dB louder than the human's peak with crnn."""
-    mic, ref, human = (soundfile.read(DATA / f"{name}.flac", dtype="float32")[0] for name in ("mic", "reference", "human"))
+    """At 8 s its second utterance begins with another lag.
+
+    It came through 10 dB louder than the human's peak with crnn.
+    """
+    mic, ref, human = (
+        soundfile.read(DATA / f"{name}.flac", dtype="float32")[0] for name in ("mic", "reference", "human")
+    )
     for engine, margin in (("crnn", 0.0), ("ss", 3.0), ("linear", 9.0)):
         out = enhance(mic, ref, DATA / "profile.npz", engine)
         onset = np.abs(out[int(7.8 * RATE) : int(9.0 * RATE)]).max()

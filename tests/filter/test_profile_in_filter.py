@@ -25,19 +25,27 @@ def reference():
     return (0.05 * noise * (1 + np.sin(np.arange(noise.size) / 900))).astype(np.float32)
 
 
-@pytest.mark.parametrize(("effect", "values"), [("speaker_nonlinearity", {"even": 2.0, "odd": 8.0}), ("playback_gain", {"gain_db": -9.0})])
+@pytest.mark.parametrize(
+    ("effect", "values"), [("speaker_nonlinearity", {"even": 2.0, "odd": 8.0}), ("playback_gain", {"gain_db": -9.0})]
+)
 def test_an_effect_in_the_profile_lowers_the_residual_of_a_robot_that_has_it(reference, effect, values):
     plain = robot()
     knowing = Profile(**{**plain.__dict__, "echo": plain.echo.with_effect(effect, values)})
-    mic = echo_of(knowing, reference) + 1e-4 * np.random.default_rng(6).standard_normal(reference.size).astype(np.float32)
+    mic = echo_of(knowing, reference) + 1e-4 * np.random.default_rng(6).standard_normal(reference.size).astype(
+        np.float32
+    )
     aligned = slice(8_000, 24_000)
     without, with_it = (db(enhance(mic, reference, profile, "linear")[aligned]) for profile in (plain, knowing))
-    assert with_it < without - 3  # the effect is known exactly; half the residual power is a modest ask, adaptation closes part of the gap
+    assert (
+        with_it < without - 3
+    )  # the effect is known exactly; half the residual power is a modest ask, adaptation closes part of the gap
 
 
 def test_the_tail_is_the_profiles_within_128_and_512_ms(reference):
     for taps, expected in ((600, 2048), (2048, 2048), (5000, 5120), (20_000, 8192)):
-        profile = robot().with_impulse_response(np.r_[np.zeros(PRE_ROLL), 0.5, np.zeros(taps - PRE_ROLL - 1)].astype(np.float32))
+        profile = robot().with_impulse_response(
+            np.r_[np.zeros(PRE_ROLL), 0.5, np.zeros(taps - PRE_ROLL - 1)].astype(np.float32)
+        )
         ego = EgoFilter(profile, "linear")
         assert ego.stats()["linear_stage"]["partitions"] * ego.hop == expected
 
@@ -46,13 +54,21 @@ def test_the_adapted_path_written_into_a_profile_starts_better_than_the_old_one(
     rng = np.random.default_rng(9)
     old = robot()
     moved = old.echo.impulse_response.copy()
-    moved[PRE_ROLL + 40 :] += 0.02 * rng.standard_normal(moved.size - PRE_ROLL - 40).astype(np.float32) * np.exp(-np.arange(moved.size - PRE_ROLL - 40) / 400)
-    mic = echo_of(old.with_impulse_response(moved), reference) + 1e-4 * rng.standard_normal(reference.size).astype(np.float32)
+    moved[PRE_ROLL + 40 :] += (
+        0.02
+        * rng.standard_normal(moved.size - PRE_ROLL - 40).astype(np.float32)
+        * np.exp(-np.arange(moved.size - PRE_ROLL - 40) / 400)
+    )
+    mic = echo_of(old.with_impulse_response(moved), reference) + 1e-4 * rng.standard_normal(reference.size).astype(
+        np.float32
+    )
     ego = EgoFilter(old, "linear")
     ego.process(mic, reference)
     ego.adapted_profile().save(tmp_path / "adapted.npz")
     start = slice(4_000, 12_000)
-    before, after = (db(enhance(mic, reference, profile, "linear")[start]) for profile in (old, tmp_path / "adapted.npz"))
+    before, after = (
+        db(enhance(mic, reference, profile, "linear")[start]) for profile in (old, tmp_path / "adapted.npz")
+    )
     assert after < before - 6  # four seconds of learning against none; 3 dB would already be a different path
 
 
@@ -95,7 +111,8 @@ def test_path_effects_are_neither_lost_nor_applied_twice_where_the_path_is_writt
     before, after = old.echo.running_response(), new.echo.running_response()
     assert before.size > 15_000  # the room reaches far behind the linear stage
     np.testing.assert_allclose(after, before, atol=1e-6)  # rounding of the stage's transforms, on a path of 0.6
-    # what running_response leaves away is 80 dB under the path's peak at each tap, and the band limit's 64 samples before it
+    # what running_response leaves away is 80 dB under the path's peak at each tap, and the band limit's 64 samples
+    # before it
     heard, still = old.echo.predict(reference), new.echo.predict(reference)
     assert db(still - heard) < db(heard) - 50
     twice = EgoFilter(new, "linear").adapted_profile().echo.running_response()

@@ -41,7 +41,9 @@ def test_after_flush_only_reset_helps():
 def test_float64_input_is_taken_without_writing_into_it():
     mic, ref = (x.astype(np.float64) for x in conformance.conversation(4000))
     mic.flags.writeable = ref.flags.writeable = False
-    np.testing.assert_array_equal(enhance(mic, ref, engine="linear"), enhance(mic.astype(np.float32), ref.astype(np.float32), engine="linear"))
+    np.testing.assert_array_equal(
+        enhance(mic, ref, engine="linear"), enhance(mic.astype(np.float32), ref.astype(np.float32), engine="linear")
+    )
 
 
 def test_a_found_reference_is_an_event_and_stands_in_the_stats():
@@ -49,7 +51,9 @@ def test_a_found_reference_is_an_event_and_stands_in_the_stats():
     ego = EgoFilter(engine="linear")
     ego.process(mic, ref)
     kinds = [event.kind for event in ego.events()]
-    assert kinds.count("realigned") == 1 and set(kinds) <= {"realigned", "overloaded"} and ego.events() == []  # a busy machine may add the latter
+    assert (
+        kinds.count("realigned") == 1 and set(kinds) <= {"realigned", "overloaded"} and ego.events() == []
+    )  # a busy machine may add the latter
     assert ego.stats()["alignment"]["delay_samples"] == pytest.approx(900, abs=16)  # 1 ms, the reach of the aligner
 
 
@@ -59,7 +63,9 @@ def test_enhance_lowers_a_purely_linear_echo_by_20_db():
     mic = np.concatenate((np.zeros(900, np.float32), 0.5 * ref[:-900]))
     out = enhance(mic, ref, engine="linear")
     last = slice(-32_000, None)
-    assert 10 * np.log10(np.mean(out[last] ** 2) / np.mean(mic[last] ** 2)) < -20  # a plain delay; 26 dB and more were seen
+    assert (
+        10 * np.log10(np.mean(out[last] ** 2) / np.mean(mic[last] ** 2)) < -20
+    )  # a plain delay; 26 dB and more were seen
 
 
 def test_adapted_profile_needs_a_linear_stage():

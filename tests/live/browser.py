@@ -11,7 +11,15 @@ import tempfile
 import time
 from pathlib import Path
 
-FLAGS = ("--headless=new", "--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage", "--hide-scrollbars", "--mute-audio", "--remote-debugging-pipe")
+FLAGS = (
+    "--headless=new",
+    "--no-sandbox",
+    "--disable-gpu",
+    "--disable-dev-shm-usage",
+    "--hide-scrollbars",
+    "--mute-audio",
+    "--remote-debugging-pipe",
+)
 
 
 class Browser:
@@ -21,9 +29,14 @@ class Browser:
         self.folder = tempfile.TemporaryDirectory(prefix="browser", ignore_cleanup_errors=True)
         commands, self._commands = os.pipe()
         self._answers, answers = os.pipe()
-        script = f'exec chromium {" ".join(FLAGS)} --user-data-dir="{self.folder.name}" about:blank 3<&{commands} 4>&{answers}'
+        script = (
+            f'exec chromium {" ".join(FLAGS)} --user-data-dir="{self.folder.name}" about:blank 3<&{commands}'
+            f" 4>&{answers}"
+        )
         self.log = open(Path(self.folder.name) / "log", "w+")
-        self.process = subprocess.Popen(["bash", "-c", script], pass_fds=(commands, answers), stdout=self.log, stderr=self.log)
+        self.process = subprocess.Popen(
+            ["bash", "-c", script], pass_fds=(commands, answers), stdout=self.log, stderr=self.log
+        )
         os.close(commands), os.close(answers)
         self._buffer, self._count, self._session = b"", 0, None
         self.console: list[str] = []
@@ -81,9 +94,14 @@ class Browser:
     def open(self, path: Path, width: int, height: int = 900, dark: bool = False) -> None:
         """Load a file in a window of that size and wait until it and its media are there."""
         self.call("Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=False)
-        self.call("Emulation.setEmulatedMedia", features=[{"name": "prefers-color-scheme", "value": "dark" if dark else "light"}])
+        self.call(
+            "Emulation.setEmulatedMedia",
+            features=[{"name": "prefers-color-scheme", "value": "dark" if dark else "light"}],
+        )
         self.call("Page.navigate", url=path.resolve().as_uri())
-        self.wait("document.readyState === 'complete' && [...document.images].every((i) => i.complete && i.naturalWidth)")
+        self.wait(
+            "document.readyState === 'complete' && [...document.images].every((i) => i.complete && i.naturalWidth)"
+        )
 
     def run(self, expression: str) -> object:
         """The value of a JavaScript expression in the page; promises are awaited."""
@@ -101,13 +119,20 @@ class Browser:
     def press(self, name: str, code: int, text: str = "") -> None:
         """One key, down and up."""
         for kind in ("keyDown", "keyUp"):
-            self.call("Input.dispatchKeyEvent", type=kind, key=name, code=name if name != " " else "Space", windowsVirtualKeyCode=code, text=text)
+            self.call(
+                "Input.dispatchKeyEvent",
+                type=kind,
+                key=name,
+                code=name if name != " " else "Space",
+                windowsVirtualKeyCode=code,
+                text=text,
+            )
 
     def click(self, selector: str) -> None:
         """The left button on the middle of an element, scrolled into view."""
         x, y = self.run(
-            f"(() => {{ const e = document.querySelector({json.dumps(selector)}); e.scrollIntoView({{block: 'center'}});"
-            " const r = e.getBoundingClientRect(); return [r.x + r.width / 2, r.y + r.height / 2]; })()"
+            f"(() => {{ const e = document.querySelector({json.dumps(selector)}); e.scrollIntoView({{block:"
+            " 'center'}); const r = e.getBoundingClientRect(); return [r.x + r.width / 2, r.y + r.height / 2]; })()"
         )
         for kind in ("mousePressed", "mouseReleased"):
             self.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", clickCount=1)

@@ -1,4 +1,7 @@
-"""What the live tests run in a process of its own, since PortAudio reads the list of devices once. Usage: session.py JOB FOLDER."""
+"""What the live tests run in a process of its own, since PortAudio reads the list of devices once.
+
+Usage: session.py JOB FOLDER.
+"""
 
 import json
 import os
@@ -30,7 +33,9 @@ def receive():
     players = []
 
     def play():
-        players.extend(subprocess.Popen(["paplay", "-d", sink, str(folder / f"{sink}.wav")]) for sink in ("robot", "robot_mic"))
+        players.extend(
+            subprocess.Popen(["paplay", "-d", sink, str(folder / f"{sink}.wav")]) for sink in ("robot", "robot_mic")
+        )
 
     with LiveSource("robot_mic_monitor", monitor_of("robot"), seconds=6) as source:
         mic, ref, blocks = collect(source, play)

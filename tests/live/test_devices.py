@@ -29,7 +29,10 @@ def sounds(tmp_path):
 def run(job, server, folder, *more):
     done = subprocess.run(
         [sys.executable, str(SESSION), job, str(folder), *more],
-        env=server.environment | {"PYTHONPATH": str(ROOT)}, capture_output=True, text=True, timeout=60,
+        env=server.environment | {"PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
+        timeout=60,
     )
     results = [line for line in done.stdout.splitlines() if line.startswith("RESULT ")]
     assert len(results) == 1, done.stderr

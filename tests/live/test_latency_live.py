@@ -16,5 +16,7 @@ def test_twenty_seconds_live_lose_nothing(tmp_path, monkeypatch):
     monkeypatch.setattr(sys, "argv", arguments)
     assert soak.main() == 0
     found = json.loads((tmp_path / "soak.json").read_text())
-    assert found["samples_in"] == found["samples_out"] == round(0.3333 * 60 * 16000) and found["deadline"]["hops"] >= 1240
+    assert (
+        found["samples_in"] == found["samples_out"] == round(0.3333 * 60 * 16000) and found["deadline"]["hops"] >= 1240
+    )
     assert not found["source"]["lost"] and "live" in (tmp_path / "soak.md").read_text()

@@ -14,7 +14,12 @@ from edgefilter.report.html import comparison_page, diagnosis_page, write_page
 from tests.diagnosis.robot_scene import profile, record, voice
 from tests.live.browser import Browser
 
-NAMES = {"profile": "a robot with a rather long name.npz", "recording": "the office <on> Monday.wav", "reference": "tts.wav", "effects": []}
+NAMES = {
+    "profile": "a robot with a rather long name.npz",
+    "recording": "the office <on> Monday.wav",
+    "reference": "tts.wav",
+    "effects": [],
+}
 CLIPPED = """[...document.querySelectorAll('body *')].filter((e) => e.checkVisibility() && !e.closest('audio')).flatMap((e) => {
   const r = e.getBoundingClientRect(), wide = document.documentElement.clientWidth;
   const outside = r.width && (r.right > wide + 0.5 || r.left < -0.5);
@@ -25,7 +30,8 @@ CONTRAST = """(() => {
   const ground = (e) => { for (; e; e = e.parentElement) { const c = parts(getComputedStyle(e).backgroundColor); if (c[3] !== 0) return c; } };
   const light = (c) => c.slice(0, 3).map((v) => v / 255).map((v) => v <= 0.04045 ? v / 12.92 : ((v + 0.055) / 1.055) ** 2.4)
     .reduce((sum, v, i) => sum + v * [0.2126, 0.7152, 0.0722][i], 0);
-  const texts = [...document.querySelectorAll('body *')].filter((e) => e.checkVisibility() && [...e.childNodes].some((n) => n.nodeType === 3 && n.data.trim()));
+  const texts = [...document.querySelectorAll('body *')].filter((e) => e.checkVisibility()
+    && [...e.childNodes].some((n) => n.nodeType === 3 && n.data.trim()));
   return Object.fromEntries(texts.map((e, i) => {
     const [a, b] = [light(parts(getComputedStyle(e).color)), light(ground(e))].sort((x, y) => y - x);
     return [i + ' ' + e.textContent.trim().slice(0, 30), (a + 0.05) / (b + 0.05)]; })); })()"""
@@ -37,7 +43,10 @@ OVERLAPPING = """[...document.querySelectorAll('.frame')].flatMap((frame) => ['.
 
 @pytest.fixture(scope="module")
 def pages(tmp_path_factory):
-    """The folder with a diagnosis of two effects, a comparison, and a diagnosis that found nothing; and the first one's figures."""
+    """The folder with a diagnosis of two effects, a comparison, and a diagnosis that found nothing.
+
+    And the first one's figures.
+    """
     folder = tmp_path_factory.mktemp("pages")
     x, robot = voice(6.0), profile()
     wrong = robot.echo.with_effect("playback_gain", {"gain_db": -3.0}).with_effect("speaker_nonlinearity", {"odd": 4.0})
@@ -75,8 +84,13 @@ def test_switches_move_the_figure_the_stairs_the_bars_the_picture_and_the_sound(
     data = stored(folder)
     browser.open(folder / "missing.html", 1280)
     state = """[...document.querySelectorAll('.now-bar')].reduce((sum, e) => sum + parseFloat(e.style.height), 0)"""
-    pieces = "['residual', 'prediction'].flatMap((id) => ['img', 'audio'].map((e) => document.querySelector(`#${id} ${e}`).getAttribute('src')))"
-    steps = "document.querySelectorAll('.stair').length - 4"  # less the first and the last column, each with its irreducible part
+    pieces = (
+        "['residual', 'prediction'].flatMap((id) => ['img', 'audio'].map((e) => document.querySelector(`#${id}"
+        " ${e}`).getAttribute('src')))"
+    )
+    steps = (  # less the first and the last column, each with its irreducible part
+        "document.querySelectorAll('.stair').length - 4"
+    )
     heights, sources = {}, {}
     for key, clicked in (("11", None), ("01", 0), ("00", 1), ("10", 0)):
         if clicked is not None:
@@ -92,7 +106,9 @@ def test_switches_move_the_figure_the_stairs_the_bars_the_picture_and_the_sound(
     assert heights["11"] < 0.3 * heights["00"]
     gain, bent = found.ranking
     for key, expected in (("00", gain.excess_before_db), ("10", gain.excess_after_db), ("11", found.remaining_db)):
-        assert data["variants"][key]["excess_db"] == pytest.approx(expected, abs=0.002), key  # three decimals are stored
+        assert data["variants"][key]["excess_db"] == pytest.approx(expected, abs=0.002), (
+            key
+        )  # three decimals are stored
     assert bent.excess_before_db == gain.excess_after_db
     assert browser.console == []
 
@@ -116,7 +132,10 @@ def test_it_is_worked_without_a_mouse(browser, pages):
     assert browser.run("getComputedStyle(document.activeElement).outlineStyle") == "solid"
     browser.press(" ", 32, " ")
     assert shown_excess(browser) == pytest.approx(data["variants"]["01"]["excess_db"], abs=0.051)
-    unnamed = "[...document.querySelectorAll('input, audio, img, [role=img]')].filter((e) => !(e.labels?.length || e.ariaLabel || e.alt)).length"
+    unnamed = (
+        "[...document.querySelectorAll('input, audio, img, [role=img]')].filter((e) => !(e.labels?.length ||"
+        " e.ariaLabel || e.alt)).length"
+    )
     assert browser.run(unnamed) == 0
 
 
@@ -181,7 +200,11 @@ def test_no_request_leaves_the_file(browser, pages):
 def test_only_what_applies_is_shown(browser, pages):
     folder, _ = pages
     shown = "(s) => document.querySelector(s).checkVisibility()"
-    for page, expected in (("missing", [True, True, True]), ("explained", [False, True, False]), ("comparison", [False, False, False])):
+    for page, expected in (
+        ("missing", [True, True, True]),
+        ("explained", [False, True, False]),
+        ("comparison", [False, False, False]),
+    ):
         browser.open(folder / f"{page}.html", 1280)
         assert [browser.run(f"({shown})('{part}')") for part in ("#switches", "#budget", "#found")] == expected, page
     assert "the office <on> Monday.wav" in browser.run("document.body.innerText")

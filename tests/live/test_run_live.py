@@ -24,12 +24,20 @@ def conversation(tmp_path_factory):
     """The first 7 s of the bundled conversation as 16-bit WAV for the players."""
     folder = tmp_path_factory.mktemp("conversation")
     for sink, name in (("robot", "reference"), ("robot_mic", "mic")):
-        soundfile.write(folder / f"{sink}.wav", soundfile.read(DEMO / f"{name}.flac", dtype="int16")[0][: 7 * 16000], 16000, "PCM_16")
+        soundfile.write(
+            folder / f"{sink}.wav",
+            soundfile.read(DEMO / f"{name}.flac", dtype="int16")[0][: 7 * 16000],
+            16000,
+            "PCM_16",
+        )
     return folder
 
 
 def play(server, folder):
-    return [subprocess.Popen(["paplay", "-d", sink, str(folder / f"{sink}.wav")], env=server.environment) for sink in ("robot", "robot_mic")]
+    return [
+        subprocess.Popen(["paplay", "-d", sink, str(folder / f"{sink}.wav")], env=server.environment)
+        for sink in ("robot", "robot_mic")
+    ]
 
 
 def db(x):
@@ -56,7 +64,10 @@ def test_live_run_takes_the_monitor_ends_by_ctrl_c_and_equals_the_file_path(serv
     assert "robot.monitor" in said
 
     stats = json.loads((tmp_path / "stats.json").read_text())
-    out, mic, ref = (soundfile.read(path, dtype="float32")[0] for path in (tmp_path / "live.wav", heard, tmp_path / "heard/reference.wav"))
+    out, mic, ref = (
+        soundfile.read(path, dtype="float32")[0]
+        for path in (tmp_path / "live.wav", heard, tmp_path / "heard/reference.wav")
+    )
     assert stats["samples_in"] == stats["samples_out"] == out.size == mic.size == ref.size
     assert db(mic) > -60 and db(ref) > -60
     again = edgefilter(
@@ -68,16 +79,34 @@ def test_live_run_takes_the_monitor_ends_by_ctrl_c_and_equals_the_file_path(serv
 
     first = int(np.argmax(np.abs(mic) > 0.02))
     speech = slice(first + 16_000, first + 5 * 16_000)
-    assert db(out[speech]) < db(mic[speech]) - 15  # 25 dB were seen; the players start the two channels at different times
+    assert (
+        db(out[speech]) < db(mic[speech]) - 15
+    )  # 25 dB were seen; the players start the two channels at different times
 
 
 def run_for(server, seconds, tmp_path, *more):
     """A live run of so many seconds without a profile, its words and its figures."""
-    command = edgefilter("run", "--input", "mic", "--output", tmp_path / "live.wav", "--json", tmp_path / "stats.json", "--seconds", seconds, *more)
+    command = edgefilter(
+        "run",
+        "--input",
+        "mic",
+        "--output",
+        tmp_path / "live.wav",
+        "--json",
+        tmp_path / "stats.json",
+        "--seconds",
+        seconds,
+        *more,
+    )
     result = subprocess.run(command, env=server.environment, cwd=ROOT, capture_output=True, text=True, timeout=120)
     assert result.returncode == 0, result.stderr
     stats = json.loads((tmp_path / "stats.json").read_text())
-    assert stats["samples_in"] == stats["samples_out"] == soundfile.info(tmp_path / "live.wav").frames == round(seconds * 16_000)
+    assert (
+        stats["samples_in"]
+        == stats["samples_out"]
+        == soundfile.info(tmp_path / "live.wav").frames
+        == round(seconds * 16_000)
+    )
     return result.stderr, stats
 
 
@@ -93,13 +122,21 @@ def test_live_an_engine_over_its_budget_is_left_and_every_sample_is_there(server
 def test_live_auto_measures_the_engines_and_says_why(server, tmp_path):
     said, stats = run_for(server, 1, tmp_path, "--budget-ms", "1000")
     choice = stats["choice"]
-    assert stats["engines"][0] == choice["engine"] and choice["reason"] == stats["engine_reason"] and choice["reason"] in said
+    assert (
+        stats["engines"][0] == choice["engine"]
+        and choice["reason"] == stats["engine_reason"]
+        and choice["reason"] in said
+    )
     assert choice["figures"][0]["hops"] > 0 and "1000 ms" in choice["reason"] and "p99" in choice["reason"]
 
 
 def test_an_unknown_device_is_one_line_that_names_the_known_ones(server, tmp_path):
     result = subprocess.run(
-        edgefilter("run", "--input", "nosuchmic", "--output", tmp_path / "x.wav"), env=server.environment, cwd=ROOT, capture_output=True, text=True
+        edgefilter("run", "--input", "nosuchmic", "--output", tmp_path / "x.wav"),
+        env=server.environment,
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
     )
     lines = [line for line in result.stderr.splitlines() if line.startswith("edgefilter:")]
     assert result.returncode == 2 and len(lines) == 1, result.stderr

@@ -138,10 +138,18 @@ def test_an_array_with_a_header_that_is_none_is_refused_in_one_line(saved, text)
     ("name", "values", "match"),
     [
         ("playback_gain", {"gain_db": "loud"}, "gain_db is str 'loud', expected a finite number or an array"),
-        ("playback_gain", {"gain_db": 1e9}, "playback_gain cannot be used .*gain_db is 1000000000.0 dB, expected -60 to 60"),
+        (
+            "playback_gain",
+            {"gain_db": 1e9},
+            "playback_gain cannot be used .*gain_db is 1000000000.0 dB, expected -60 to 60",
+        ),
         ("playback_gain", {"volume": 1.0}, "playback_gain cannot be used .*no parameter 'volume'"),
         ("playback_gain", {"gain_db": np.zeros(2)}, "playback_gain cannot be used"),
-        ("delay_jump", {"times_s": np.array([0.01, 0.02, 0.03]), "samples": np.array([1.0, 2.0])}, "delay_jump cannot be used"),
+        (
+            "delay_jump",
+            {"times_s": np.array([0.01, 0.02, 0.03]), "samples": np.array([1.0, 2.0])},
+            "delay_jump cannot be used",
+        ),
         ("late_reverb", {"taps": np.full((3, 3), 0.1)}, "late_reverb cannot be used"),
         ("path_change", {"time_s": 100.0, "taps": np.full((3, 3), 0.1)}, "path_change cannot be used"),
         ("compression", {"ratio": np.array([2.0, 3.0])}, "compression cannot be used"),
@@ -234,7 +242,10 @@ def test_pickled_objects_are_never_loaded(saved, tmp_path):
 
 
 def test_decompression_bomb_is_refused_without_unpacking(saved):
-    with zipfile.ZipFile(saved, "a", zipfile.ZIP_DEFLATED) as archive, archive.open("bomb.npy", "w", force_zip64=True) as member:
+    with (
+        zipfile.ZipFile(saved, "a", zipfile.ZIP_DEFLATED) as archive,
+        archive.open("bomb.npy", "w", force_zip64=True) as member,
+    ):
         for _ in range(64):
             member.write(bytes(2**20))
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
@@ -270,7 +281,10 @@ def test_missing_misshapen_and_not_finite_arrays(saved, name):
         (None, f"missing: {name}"),
         (value[:-1] if name not in ("band_hz", "impulse_response") else value.reshape(2, -1).T[:1], name[:5]),
         (value.astype(np.int32), f"{name} is int32"),
-        (np.where(np.arange(value.size).reshape(value.shape) == 1, np.nan, value).astype(value.dtype), f"{name} is nan at position 1"),
+        (
+            np.where(np.arange(value.size).reshape(value.shape) == 1, np.nan, value).astype(value.dtype),
+            f"{name} is nan at position 1",
+        ),
         (np.full_like(value, np.inf), f"{name} is inf at position 0"),
         (np.full_like(value, 1e20), f"{name} is 1e\\+20"),
     ]:
@@ -350,7 +364,9 @@ def test_saving_does_not_open_all_files_of_other_threads_to_everybody(tmp_path, 
     before = os.umask(0o027)
     try:
         with monkeypatch.context() as changed:
-            changed.setattr(os, "umask", lambda mask: pytest.fail(f"the umask of the whole process was set to {mask:o}"))
+            changed.setattr(
+                os, "umask", lambda mask: pytest.fail(f"the umask of the whole process was set to {mask:o}")
+            )
             make().save(tmp_path / "p.npz")
         assert (tmp_path / "p.npz").stat().st_mode & 0o777 == 0o640
     finally:

@@ -48,7 +48,10 @@ def test_parameters_read_as_people_write_them(interval, text):
 
 
 def test_sentences_for_the_three_verdicts():
-    assert words.headline("missing", ["late_reverb", "clock_drift"]) == "Missing from the profile: late reverberation and clock drift."
+    assert (
+        words.headline("missing", ["late_reverb", "clock_drift"])
+        == "Missing from the profile: late reverberation and clock drift."
+    )
     assert words.headline("explained", []) == "The profile explains this recording."
     assert "no known effect explains." in words.headline("unexplained", [])
     assert words.headline("unexplained", ["my_own"]).endswith("besides my own.")
@@ -66,7 +69,13 @@ def test_the_terminal_says_verdict_budget_parameters_and_what_is_left():
     lines = diagnosis_lines(Diagnosis("missing", found, two, "A hum at 50 Hz.", 0.3, 0.1, profile().echo))
     text = "\n".join(lines)
     assert lines[0] == "verdict     missing: Missing from the profile: late reverberation and my own."
-    for part in ("with late_reverb", "rt60_s = 0.610 dB (0.510 to 0.710)", "9.0 to 1.0 dB, 90 %", "Evidence for my_own.", "left        A hum at 50 Hz."):
+    for part in (
+        "with late_reverb",
+        "rt60_s = 0.610 dB (0.510 to 0.710)",
+        "9.0 to 1.0 dB, 90 %",
+        "Evidence for my_own.",
+        "left        A hum at 50 Hz.",
+    ):
         assert part in text, part
     bars = [len(line) - len(line.rstrip("#")) for line in lines if line.startswith("  with ")]
     assert bars[0] > bars[1] > 0
@@ -76,14 +85,18 @@ def test_long_recordings_are_summed_up_by_power():
     times = [(i / 2, (i + 1) / 2, 10.0 if i % 2 else 0.0) for i in range(60)]
     rows = coarser(times, 12)
     assert len(rows) <= 12 and rows[0][0] == 0.0 and rows[-1][1] == 30.0
-    assert rows[1][2] == pytest.approx(10 * np.log10((1 + 10 + 1 + 10 + 10) / 5))  # rows of five half seconds, the second starts with a loud one
+    assert rows[1][2] == pytest.approx(
+        10 * np.log10((1 + 10 + 1 + 10 + 10) / 5)
+    )  # rows of five half seconds, the second starts with a loud one
 
 
 def test_a_tone_is_at_its_place_and_level_in_the_spectrogram():
     n = np.arange(4 * RATE)
     x = (0.5 * np.sin(2 * np.pi * 2000 * n / RATE) * (n >= 2 * RATE)).astype(np.float32)
     level = spectrogram_db(x)
-    assert level.max() == pytest.approx(20 * np.log10(0.5), abs=0.1)  # a bin's centre is hit: only the window's samples differ
+    assert level.max() == pytest.approx(
+        20 * np.log10(0.5), abs=0.1
+    )  # a bin's centre is hit: only the window's samples differ
     image = Image.open(content(spectrogram_png(x, (-72.0, 0.0))))
     index = np.asarray(image)
     assert index.shape == (241, level.shape[0]) and image.palette.getdata()[1][:3] == colours()[0].tobytes()
@@ -141,13 +154,17 @@ def test_four_effects_give_five_comparisons_in_the_page():
     found = Diagnosis("missing", compare(robot, y, x), tuple(four), "", 0.1, 0.0, model)
     page = diagnosis_page(robot, found, y, x, {"profile": "p", "recording": "m", "reference": "r"})
     assert page.count('"excess_db"') == 5 and "switched with them" in page
-    assert page.count("data:image/png") == 3, "recording, prediction, residual: with neutral values all five comparisons share them"
+    assert page.count("data:image/png") == 3, (
+        "recording, prediction, residual: with neutral values all five comparisons share them"
+    )
 
 
 def test_the_command_to_add_is_one_that_a_shell_reads():
     names = {"profile": "my robot.npz", "recording": "m.wav", "reference": "r.wav", "effects": ["own.py"]}
-    assert add_command("tilt", names) == (
-        "edgefilter add tilt --profile 'my robot.npz' --recording m.wav --reference r.wav --effects own.py --output 'my robot.tilt.npz'"
+    assert (
+        add_command("tilt", names)
+        == "edgefilter add tilt --profile 'my robot.npz' --recording m.wav --reference r.wav --effects own.py --output"
+        " 'my robot.tilt.npz'"
     )
 
 
@@ -157,4 +174,7 @@ def test_a_switched_on_gain_control_is_judged_as_the_diagnosis_judges_it():
     model = robot.echo.with_effect("mic_agc", {"gain_db": gain_db, "knots_hz": 40.0})
     y = (record(x) * 10 ** (np.interp(np.arange(x.size) * 40 / 16000, np.arange(240), gain_db) / 20)).astype(np.float32)
     found = compare_variants(robot, model, [finding("mic_agc", {"gain_db": gain_db, "knots_hz": 40.0})], y, x)
-    assert abs(found[(True,)].excess_db) < 0.3 and abs(found[(True,)].silence_excess_db) < 0.3 < 3 < found[(False,)].excess_db
+    assert (
+        abs(found[(True,)].excess_db) < 0.3
+        and abs(found[(True,)].silence_excess_db) < 0.3 < 3 < found[(False,)].excess_db
+    )

@@ -17,7 +17,16 @@ def profile(tap=0.5, warnings=()):
     path[PRE_ROLL + 200] = tap
     flat = np.ones(601, np.float32)
     bands = np.array([[100.0, 200.0], [200.0, 400.0]])
-    return Profile(EchoModel(path), 300.0, flat / 2, flat * 1e-9, bands, np.array([5.0, 40.0]), np.full(4, -50.0), warnings=warnings)
+    return Profile(
+        EchoModel(path),
+        300.0,
+        flat / 2,
+        flat * 1e-9,
+        bands,
+        np.array([5.0, 40.0]),
+        np.full(4, -50.0),
+        warnings=warnings,
+    )
 
 
 def pixels(path):
@@ -42,7 +51,9 @@ def test_warnings_are_on_the_picture(tmp_path):
 
 def test_a_tone_is_bright_where_it_sounds(tmp_path):
     tone = np.zeros(32000, np.float32)
-    fade = np.minimum(1, np.minimum(np.arange(16000), np.arange(16000)[::-1]) / 1600)  # no clicks, which are bright at all frequencies
+    fade = np.minimum(
+        1, np.minimum(np.arange(16000), np.arange(16000)[::-1]) / 1600
+    )  # no clicks, which are bright at all frequencies
     tone[16000:] = 0.5 * fade * np.sin(2 * np.pi * 2000 * np.arange(16000) / 16000)
     plot_before_after({"before": tone, "after": np.zeros(32000, np.float32)}, tmp_path / "t.png")
     image = np.asarray(Image.open(tmp_path / "t.png").convert("RGB"), float)

@@ -29,9 +29,9 @@ STEEP = 16.0
 class Bandlimit(Effect):
     """Low-pass with the magnitude of a Butterworth filter, |G|^2 = 1 / (1 + (f / cutoff_hz)^(2 order)).
 
-    phase: 0 for a linear-phase filter (resamplers, codecs), 1 for a minimum-phase one (analogue), the delay at low frequencies taken
-    out; delay: what of it a lag found without the filter does not take up.
-    taps: (k,) lags -LEAD to k - LEAD, by which the real filter differs from that one.
+    phase: 0 for a linear-phase filter (resamplers, codecs), 1 for a minimum-phase one (analogue), the delay at low
+    frequencies taken out; delay: what of it a lag found without the filter does not take up. taps: (k,) lags -LEAD to k
+    - LEAD, by which the real filter differs from that one.
     """
 
     name: ClassVar[str] = "bandlimit"
@@ -51,7 +51,7 @@ class Bandlimit(Effect):
     )
 
     def apply(self, x: Samples, values: Values, sample_rate: int) -> Samples:
-        """x without what lies above the cut-off; a cut-off of 16 kHz is none."""
+        """X without what lies above the cut-off; a cut-off of 16 kHz is none."""
         if float(values["cutoff_hz"]) >= 16000.0:
             return x.copy()
         hz = np.arange(FFT // 2 + 1) * sample_rate / FFT
@@ -62,7 +62,10 @@ class Bandlimit(Effect):
         return y + convolve_from(x, taps, LEAD) if taps.any() else y
 
     def fit(self, measurement: Measurement, model: VoiceModel) -> Values:
-        """The best of a grid of cut-offs, orders and phases, refined, each at its best delay; judged in the whitened cross-spectrum. Then taps."""
+        """The best of a grid of cut-offs, orders and phases, refined, each at its best delay.
+
+        Judged in the whitened cross-spectrum. Then taps.
+        """
         predicted, x = measurement.heard(model)
         found = spectra(measurement, x, 20.0)
         turns = np.exp(-2j * np.pi * np.outer(found.hz, DELAYS) / SAMPLE_RATE)
@@ -78,17 +81,28 @@ class Bandlimit(Effect):
         best = max(grid, key=lambda values: gain(*values)[0])
         step = 1.03
         for _ in range(5):
-            near = product(best[0] * np.array([1 / step, 1.0, step]), np.clip(best[1] * np.array([1 / step**3, 1.0, step**3]), 1.0, 60.0), (0.0, 0.5, 1.0))
+            near = product(
+                best[0] * np.array([1 / step, 1.0, step]),
+                np.clip(best[1] * np.array([1 / step**3, 1.0, step**3]), 1.0, 60.0),
+                (0.0, 0.5, 1.0),
+            )
             best = max(near, key=lambda values: gain(*values)[0])
             step = 1.0 + (step - 1.0) * 0.6
-        values = {"cutoff_hz": float(np.clip(best[0], 200.0, 15999.0)), "order": float(best[1]), "phase": float(best[2]), "delay": gain(*best)[1]}
+        values = {
+            "cutoff_hz": float(np.clip(best[0], 200.0, 15999.0)),
+            "order": float(best[1]),
+            "phase": float(best[2]),
+            "delay": gain(*best)[1],
+        }
         left = measurement.white_recording - self.apply(x, {**values, "taps": 0.0}, SAMPLE_RATE)
         taps = fit_filter(x, left, measurement.weights, TAPS, LEAD, prior=np.full(TAPS, 1e-3), steps=15)
         return {**values, "taps": np.clip(taps, -10.0, 10.0)}
 
     def sentence(self, values: Values) -> str:
         """From where on there is nothing."""
-        return f"what the recording has in common with the reference falls off above {first(values, 'cutoff_hz'):.0f} Hz"
+        return (
+            f"what the recording has in common with the reference falls off above {first(values, 'cutoff_hz'):.0f} Hz"
+        )
 
     def plausible(self, evidence: Evidence) -> bool:
         """A low-pass and not a colouring: flat below the cut-off, little above it.

@@ -17,13 +17,15 @@ from edgefilter.types import SAMPLE_RATE, Array, Samples
 LOWEST_HZ, HIGHEST_HZ = 60.0, 7000.0
 QUALITIES = (4.0, 8.0, 16.0, 32.0, 64.0, 128.0)
 MODES, NEXT, CLEAR_Q = 2, 0.05, 8.0
-"""Modes that are looked for, the part of what the first explains that a further one must, and the least Q of that: broader ones are no modes."""
+"""Modes that are looked for, the part of what the first explains that a further one must, and the least Q of that:
+broader ones are no modes."""
 
 
 class ChassisResonance(Effect):
     """y = x + g Re[e^(i phase) r * x], r(n) = 2 (1 - |z|) z^n, z = exp((2 pi i - pi / q) frequency_hz / rate): a mode excited by the sound.
 
-    gain_db: of the added sound at resonance re the sound itself, 20 log10 g. Each parameter is a number, or an array with one for each mode.
+    gain_db: of the added sound at resonance re the sound itself, 20 log10 g. Each parameter is a number, or an array
+    with one for each mode.
     """
 
     name: ClassVar[str] = "chassis_resonance"
@@ -39,16 +41,21 @@ class ChassisResonance(Effect):
     )
 
     def apply(self, x: Samples, values: Values, sample_rate: int) -> Samples:
-        """x and the ring."""
+        """X and the ring."""
         y = x.copy()
-        for frequency, q, gain_db, phase in np.broadcast(*(np.atleast_1d(np.asarray(values[p.name], float)) for p in self.parameters)):
+        for frequency, q, gain_db, phase in np.broadcast(
+            *(np.atleast_1d(np.asarray(values[p.name], float)) for p in self.parameters)
+        ):
             if gain_db > -120.0:
                 gain = 10.0 ** (gain_db / 20.0) * np.exp(1j * np.deg2rad(phase))
                 y += (gain * _ring(x, frequency, q, sample_rate)).real.astype(np.float32)
         return y
 
     def fit(self, measurement: Measurement, model: VoiceModel) -> Values:
-        """Frequency and Q by a search in the whitened cross-spectrum, gain and phase by least squares in time; then, if it pays, another mode."""
+        """Frequency and Q by a search in the whitened cross-spectrum, gain and phase by least squares in time.
+
+        Then, if it pays, another mode.
+        """
         predicted, white = measurement.heard(model)
         coarse, fine = (spectra(measurement, white, resolution_hz) for resolution_hz in (1.0, 0.1))
         residual = measurement.white_recording - white
@@ -59,7 +66,10 @@ class ChassisResonance(Effect):
             if modes and mode[1] < CLEAR_Q:
                 break
             ring = _ring(predicted, *mode, SAMPLE_RATE)
-            added = np.stack([measurement.whiten(part.astype(np.float32)) for part in (ring.real, -ring.imag)], axis=1) * measurement.weights[:, None]
+            added = (
+                np.stack([measurement.whiten(part.astype(np.float32)) for part in (ring.real, -ring.imag)], axis=1)
+                * measurement.weights[:, None]
+            )
             tried = np.concatenate((columns, added), axis=1)
             right = (tried.T @ residual).astype(float)
             solved = np.linalg.lstsq((tried.T @ tried).astype(float), right, rcond=1e-12)[0]
@@ -73,7 +83,10 @@ class ChassisResonance(Effect):
 
     def sentence(self, values: Values) -> str:
         """Where it rings, and how sharply."""
-        modes = [f"{hz:.0f} Hz with Q {q:.0f}" for hz, q in zip(np.atleast_1d(values["frequency_hz"]), np.atleast_1d(values["q"]), strict=True)]
+        modes = [
+            f"{hz:.0f} Hz with Q {q:.0f}"
+            for hz, q in zip(np.atleast_1d(values["frequency_hz"]), np.atleast_1d(values["q"]), strict=True)
+        ]
         where = "one frequency" if len(modes) == 1 else "two frequencies"
         return f"the residual rings at {where}, {' and '.join(modes)}, whenever the voice excites it"
 
@@ -130,10 +143,17 @@ def _search(found: Spectra) -> tuple[float, float]:
 
 def _refine(found: Spectra, frequency: float, q: float) -> tuple[float, float]:
     def cost(v: Array) -> float:
-        f, quality = float(np.clip(frequency * np.exp(v[0] / q), LOWEST_HZ, HIGHEST_HZ)), float(np.clip(q * np.exp(v[1]), 4.0, 2000.0))
+        f, quality = (
+            float(np.clip(frequency * np.exp(v[0] / q), LOWEST_HZ, HIGHEST_HZ)),
+            float(np.clip(q * np.exp(v[1]), 4.0, 2000.0)),
+        )
         width = 8.0 * frequency / q + 20.0
         inside = slice(*np.searchsorted(found.hz, (frequency - width, frequency + width)))
         return -float(_explained(found, inside, np.array([f]), quality)[0])
 
-    v = scipy.optimize.minimize(cost, [0.0, 0.0], method="Nelder-Mead", options={"maxiter": 60, "initial_simplex": [[0, 0], [0.5, 0], [0, 0.5]]}).x
-    return float(np.clip(frequency * np.exp(v[0] / q), LOWEST_HZ, HIGHEST_HZ)), float(np.clip(q * np.exp(v[1]), 4.0, 2000.0))
+    v = scipy.optimize.minimize(
+        cost, [0.0, 0.0], method="Nelder-Mead", options={"maxiter": 60, "initial_simplex": [[0, 0], [0.5, 0], [0, 0.5]]}
+    ).x
+    return float(np.clip(frequency * np.exp(v[0] / q), LOWEST_HZ, HIGHEST_HZ)), float(
+        np.clip(q * np.exp(v[1]), 4.0, 2000.0)
+    )

@@ -15,7 +15,8 @@ from edgefilter.echo.measurement import Measurement, Values, VoiceModel
 from edgefilter.types import Array, Samples
 
 PASSES = ((4000, 512), (8000, 16))
-"""Samples of a block and of lag either way: short blocks while the drift smears them, longer ones once it is taken out."""
+"""Samples of a block and of lag either way: short blocks while the drift smears them, longer ones once it is taken
+out."""
 STEADY = 0.05
 """Samples by which a block's lag may err for other reasons than noise."""
 LEAST_PPM = 0.5
@@ -24,7 +25,8 @@ LEAST_PPM = 0.5
 class ClockDrift(Effect):
     """y(n) = x(n - offset + ppm 1e-6 n): a delay that shrinks with positive, grows with negative ppm.
 
-    Interpolation by a windowed sinc of 48 samples, see dsp.fractional_delay. Valid where the drift is constant over the recording.
+    Interpolation by a windowed sinc of 48 samples, see dsp.fractional_delay. Valid where the drift is constant over the
+    recording.
     """
 
     name: ClassVar[str] = "clock_drift"
@@ -37,7 +39,7 @@ class ClockDrift(Effect):
     )
 
     def apply(self, x: Samples, values: Values, sample_rate: int) -> Samples:
-        """x (n,) read at the drifting clock; outside of x there is silence."""
+        """X (n,) read at the drifting clock; outside of x there is silence."""
         ppm, offset = float(values["ppm"]), float(values["offset"])
         if ppm == 0.0 and offset == 0.0:
             return x.copy()
@@ -49,7 +51,9 @@ class ClockDrift(Effect):
         predicted, recording = measurement.heard(model)[0], measurement.white_recording
         n, lag = np.arange(predicted.size), np.zeros(predicted.size)
         for size, reach in PASSES:
-            track = track_lag(measurement.whiten(interpolate(predicted, n - lag)), recording, measurement.fit, size, reach)
+            track = track_lag(
+                measurement.whiten(interpolate(predicted, n - lag)), recording, measurement.fit, size, reach
+            )
             if track.lag.size < 3:
                 break
             total = track.lag + np.interp(track.middle, n, lag)

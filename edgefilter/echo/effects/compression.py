@@ -37,9 +37,9 @@ HIGHEST = np.array([0.0, STEEPEST, np.log(200.0), np.log(5000.0)])
 class Compression(Effect):
     """Feed-forward compressor: above threshold the level rises by 1 / ratio dB per dB, over a knee, then make-up gain.
 
-    After Giannoulis, Massberg & Reiss 2012, "Digital dynamic range compressor design": the level is the mean square over the attack
-    time, in dB; the gain computer with a soft knee (their eq. 4) asks for a reduction; that rises at once and falls exponentially
-    with the release time, as in their decoupled peak detector (eq. 17).
+    After Giannoulis, Massberg & Reiss 2012, "Digital dynamic range compressor design": the level is the mean square
+    over the attack time, in dB; the gain computer with a soft knee (their eq. 4) asks for a reduction; that rises at
+    once and falls exponentially with the release time, as in their decoupled peak detector (eq. 17).
     """
 
     name: ClassVar[str] = "compression"
@@ -58,7 +58,7 @@ class Compression(Effect):
     )
 
     def apply(self, x: Samples, values: Values, sample_rate: int) -> Samples:
-        """x (n,) times the gain that its own level asks for, times the make-up gain."""
+        """X (n,) times the gain that its own level asks for, times the make-up gain."""
         slope, makeup = 1.0 - 1.0 / float(values["ratio"]), float(values["makeup_db"])
         if slope == 0.0:
             return x * np.float32(10.0 ** (makeup / 20.0))
@@ -72,7 +72,9 @@ class Compression(Effect):
         return (x * 10.0 ** ((makeup - slope * held) / 20.0)).astype(np.float32)
 
     def fit(self, measurement: Measurement, model: VoiceModel) -> Values:
-        """Gauss-Newton in threshold, ratio, attack and release from the best of a coarse grid; a short filter takes up the linear rest.
+        """Gauss-Newton in threshold, ratio, attack and release from the best of a coarse grid.
+
+        A short filter takes up the linear rest.
 
         No compression where four numbers do not pay for themselves by Bayes' information criterion.
         """
@@ -89,7 +91,10 @@ class Compression(Effect):
         plain = normal_equations([measurement.whiten(model.predict(x))], target, TAPS, LEAD, fit)
         without = plain.solve()[1]
         grid = product(THRESHOLDS_DB, SLOPES, RELEASES_MS)
-        starts = [np.clip((loud_db + above, slope, np.log(8.0), np.log(release)), LOWEST, HIGHEST) for above, slope, release in grid]
+        starts = [
+            np.clip((loud_db + above, slope, np.log(8.0), np.log(release)), LOWEST, HIGHEST)
+            for above, slope, release in grid
+        ]
         costs = [left(predict(start)) for start in starts]
         best, cost = starts[int(np.argmin(costs))], min(costs)
         if cost >= without:
@@ -106,7 +111,9 @@ class Compression(Effect):
 
     def _makeup(self, measurement: Measurement, model: VoiceModel, values: Values) -> float:
         """Least-squares gain over the whole recording, dB."""
-        predicted = measurement.whiten(model.predict(self.apply(measurement.reference, complete(self, values), SAMPLE_RATE)))
+        predicted = measurement.whiten(
+            model.predict(self.apply(measurement.reference, complete(self, values), SAMPLE_RATE))
+        )
         normal = normal_equations([predicted], measurement.white_recording, 1, 0, measurement.fit)
         return float(np.clip(20.0 * np.log10(max(float(normal.solve()[0][0, 0]), 1e-2)), -40.0, 40.0))
 

@@ -32,9 +32,12 @@ SEARCH = (range(-256, 257, 32), range(-24, 25, 8), range(-6, 7, 2), (-1, 0, 1))
 
 
 class DelayJump(Effect):
-    """The reference is played later by samples[i] from times_s[i] on, and by offset from the start on; piecewise constant, fractional.
+    """The reference is played later by samples[i] from times_s[i] on, and by offset from the start on.
 
-    What the player puts into the gap where the delay grows: the last samples once more (gap_gain 1) or silence (gap_gain 0).
+    Piecewise constant, fractional.
+
+    What the player puts into the gap where the delay grows: the last samples once more (gap_gain 1) or silence
+    (gap_gain 0).
     """
 
     name: ClassVar[str] = "delay_jump"
@@ -50,7 +53,7 @@ class DelayJump(Effect):
     )
 
     def apply(self, x: Samples, values: Values, sample_rate: int) -> Samples:
-        """x (n,) read with the delay of each moment; outside of x there is silence."""
+        """X (n,) read with the delay of each moment; outside of x there is silence."""
         times, steps = (np.atleast_1d(np.asarray(values[name], float)) for name in ("times_s", "samples"))
         order = np.argsort(times, kind="stable")
         at = np.clip(np.round(times[order] * sample_rate), 0, x.size).astype(int)
@@ -67,8 +70,8 @@ class DelayJump(Effect):
     def fit(self, measurement: Measurement, model: VoiceModel) -> Values:
         """Steps through the lags of all blocks; none where a straight line, a drift, describes the lags as well.
 
-        How many steps and how high comes from the samples to fit on; where exactly each lies is then looked up in all samples,
-        since a jump may fall between the blocks to fit on.
+        How many steps and how high comes from the samples to fit on; where exactly each lies is then looked up in all
+        samples, since a jump may fall between the blocks to fit on.
         """
         predicted, recording = measurement.heard(model)[1], measurement.white_recording
         track = track_lag(predicted, recording, measurement.fit, BLOCK, REACH)
@@ -90,7 +93,9 @@ class DelayJump(Effect):
             late = changed["times_s"] > start
             offset = changed["offset"] + float(changed["samples"][~late].sum())
             times, steps = (changed["times_s"][late] - start, changed["samples"][late]) if late.any() else (0.0, 0.0)
-            local = complete(self, {"times_s": times, "samples": steps, "offset": offset, "gap_gain": changed["gap_gain"]})
+            local = complete(
+                self, {"times_s": times, "samples": steps, "offset": offset, "gap_gain": changed["gap_gain"]}
+            )
             predicted = model.predict(self.apply(measurement.reference[part], local, SAMPLE_RATE))
             rest = measurement.whiten(measurement.recording[part] - predicted)
             return float(np.sum(rest[around - SETTLED - part.start :].astype(np.float64) ** 2))
@@ -127,8 +132,8 @@ class DelayJump(Effect):
 def find_steps(lag: Array, sigma: Array) -> tuple[Array, Array]:
     """Step function through lag (b,): the first block of each new level, and the levels.
 
-    Optimal partition by dynamic programming (Jackson et al. 2005) with a penalty per level of COST log b, levels by their median.
-    Neighbouring levels closer than LEAST_JUMP are merged.
+    Optimal partition by dynamic programming (Jackson et al. 2005) with a penalty per level of COST log b, levels by
+    their median. Neighbouring levels closer than LEAST_JUMP are merged.
     """
     count = lag.size
     penalty = COST * np.log(count)
@@ -178,5 +183,7 @@ def _locate(predicted: Samples, recording: Samples, track: LagTrack, edge: int, 
     margin = int(np.abs(levels).max()) + 64
     low = max(start - margin, 0)
     around = predicted[low : stop + margin]
-    before, after = ((recording[start:stop] - delayed(around, level)[start - low : stop - low]) ** 2 for level in levels)
+    before, after = (
+        (recording[start:stop] - delayed(around, level)[start - low : stop - low]) ** 2 for level in levels
+    )
     return start + int(np.argmin(np.concatenate(([0.0], np.cumsum((before - after).astype(np.float64))))))

@@ -26,7 +26,8 @@ SMOOTH = np.array([0.25, 0.5, 0.25])
 class FanNoise(Effect):
     """The fan's power spectrum is another by spectrum_db at each frequency; the voice itself is unchanged.
 
-    spectrum_db: (601,) on the profile's grid, 0 to 8 kHz, or one number. change_db only reports: the change of the fan's total power.
+    spectrum_db: (601,) on the profile's grid, 0 to 8 kHz, or one number. change_db only reports: the change of the
+    fan's total power.
     """
 
     name: ClassVar[str] = "fan_noise"
@@ -45,8 +46,9 @@ class FanNoise(Effect):
     def fit(self, measurement: Measurement, model: VoiceModel) -> Values:
         """Mean periodogram of the residual in the robot's silences over the calibrated PSD.
 
-        Where the robot is hardly ever silent, the mean of the quietest quarter of all frames at each frequency, divided by what that
-        share of an exponential distribution has as its mean (the idea of Martin 2001, "minimum statistics", without its tracking).
+        Where the robot is hardly ever silent, the mean of the quietest quarter of all frames at each frequency, divided
+        by what that share of an exponential distribution has as its mean (the idea of Martin 2001, "minimum
+        statistics", without its tracking).
         """
         known = measurement.noise_psd
         if known is None:
@@ -73,7 +75,10 @@ class FanNoise(Effect):
 
     def sentence(self, values: Values) -> str:
         """By how much."""
-        return f"the noise is {first(values, 'change_db'):+.1f} dB off the calibrated fan, with the robot's voice and without it"
+        return (
+            f"the noise is {first(values, 'change_db'):+.1f} dB off the calibrated fan, with the robot's voice and"
+            " without it"
+        )
 
 
 def _quiet_mean(power: Array) -> Array:

@@ -22,8 +22,11 @@ MODEL_DB = 0.3
 
 @dataclass(frozen=True, eq=False)
 class GainLaw:
-    """curve_db: (k,) the gain at the middle of each step, relative to a constant. misfit, plain: weighted mean square of what is left of
-    the measured gains, dB^2, with the law and with a constant. measured: how many steps told their gain."""
+    """curve_db: (k,) the gain at the middle of each step, relative to a constant.
+
+    Misfit, plain: weighted mean square of what is left of
+    the measured gains, dB^2, with the law and with a constant. measured: how many steps told their gain.
+    """
 
     curve_db: Array
     misfit: float
@@ -34,9 +37,9 @@ class GainLaw:
 def follow(level_db: Array, voice: Samples, recording: Samples, weights: Samples) -> GainLaw | None:
     """The law whose gain, driven by the level (k,) in dB of each step, agrees best with that of recording (n,) over voice (n,).
 
-    Both whitened; weights (n,). A feed-forward control in dB with smoothed gain (Giannoulis, Massberg & Reiss 2012, eq. 7 and 16): it
-    falls with the attack time, rises with the release time, and by slope dB per dB; a feed-back control with a linear law is the same
-    with shorter times. None where too little of the voice is heard.
+    Both whitened; weights (n,). A feed-forward control in dB with smoothed gain (Giannoulis, Massberg & Reiss 2012, eq.
+    7 and 16): it falls with the attack time, rises with the release time, and by slope dB per dB; a feed-back control
+    with a linear law is the same with shorter times. None where too little of the voice is heard.
     """
     energy, cross = (by_step(voice * other * weights) for other in (voice, recording))
     sure = (energy > SURE) & (cross > 0.05 * energy)
@@ -58,7 +61,9 @@ def follow(level_db: Array, voice: Samples, recording: Samples, weights: Samples
         i = int(np.argmin(left))
         return float(left[i]), slope[i] * (moved[:, i] - trust @ moved[sure, i]) + middle, tuple(grid[:, i])
 
-    found = best(np.array(ATTACKS_S), np.array(RELEASES_S), np.array([NO_HOLD_DB, loud[0] - 10.0, loud[0], loud[1]]), -loud[1:])
+    found = best(
+        np.array(ATTACKS_S), np.array(RELEASES_S), np.array([NO_HOLD_DB, loud[0] - 10.0, loud[0], loud[1]]), -loud[1:]
+    )
     attack, release, hold, start = found[2]
     around, starts = np.array(FINER), start + np.arange(-6.0, 6.1, 3.0)
     finer = best(attack * around, release * around, hold + np.array([-5.0, 0.0, 5.0]), starts)

@@ -1,4 +1,7 @@
-"""When a residual is loud: at the moments of knocks, or wherever the voice is; and how loud a knock is at each frequency."""
+"""When a residual is loud: at the moments of knocks, or wherever the voice is.
+
+And how loud a knock is at each frequency.
+"""
 
 from __future__ import annotations
 
@@ -41,13 +44,16 @@ class Trigger:
     side: float
 
 
-def find_trigger(x: Samples, residual: Samples, predicted: Samples, fit: NDArray[np.bool_] | None, late: int) -> tuple[Trigger | None, bool]:
+def find_trigger(
+    x: Samples, residual: Samples, predicted: Samples, fit: NDArray[np.bool_] | None, late: int
+) -> tuple[Trigger | None, bool]:
     """The trigger whose knocks explain best when the whitened residual (n,) is loud, and whether the voice's level explains it less well.
 
-    x (n,): the drive. predicted (n,): the whitened voice. late: samples until a knock is heard. The residual's power in a cell of time
-    and frequency is taken as exponentially distributed around a constant plus what each source adds, in a colour of its own: maximum
-    likelihood by the multiplicative updates of Fevotte, Bertin & Durrieu 2009 ("Nonnegative matrix factorization with the
-    Itakura-Saito divergence", eq. 2.22, with the exponent 1/2 that makes them monotonic).
+    x (n,): the drive. predicted (n,): the whitened voice. late: samples until a knock is heard. The residual's power in
+    a cell of time and frequency is taken as exponentially distributed around a constant plus what each source adds, in
+    a colour of its own: maximum likelihood by the multiplicative updates of Fevotte, Bertin & Durrieu 2009
+    ("Nonnegative matrix factorization with the Itakura-Saito divergence", eq. 2.22, with the exponent 1/2 that makes
+    them monotonic).
     """
     power, voice = band_power(residual), band_power(predicted)
     middle = np.arange(len(power)) * HOP + FRAME // 2
@@ -71,7 +77,9 @@ def find_trigger(x: Samples, residual: Samples, predicted: Samples, fit: NDArray
     if best[1] is None:
         return None, False
     smoothed = scipy.signal.lfilter([0.2], [1.0, -0.8], voice, axis=0).astype(np.float32)
-    nothing, by_knocks, by_voice = (_crossed(power, sources, folds) for sources in ([one], [one, best[2]], [one, voice, smoothed]))
+    nothing, by_knocks, by_voice = (
+        _crossed(power, sources, folds) for sources in ([one], [one, best[2]], [one, voice, smoothed])
+    )
     return best[1], by_knocks - nothing > max(BETTER * (by_voice - nothing), LEAST)
 
 
@@ -113,7 +121,10 @@ def one_side(trains: tuple[Samples, Samples], side: float) -> Samples:
 
 
 def quantile_of_peaks(moved: Samples, share: float) -> float:
-    """The value that this share of the peaks of |moved| (n,) stays below; peaks under 5 % of the largest do not count."""
+    """The value that this share of the peaks of |moved| (n,) stays below.
+
+    Peaks under 5 % of the largest do not count.
+    """
     size = np.abs(moved)
     peaks = size[1:-1][(size[1:-1] > size[:-2]) & (size[1:-1] >= size[2:])]
     peaks = peaks[peaks > 0.05 * peaks.max()] if peaks.size else peaks
@@ -128,7 +139,10 @@ def ringing_of(knocks: Samples, decay_ms: float, late: int, sample_rate: int = S
 
 
 def band_power(x: Samples) -> Samples:
-    """(frames, BANDS) mean power of x (n,) in each band, 1 for white noise of variance 1; the lowest bin is left out."""
+    """(frames, BANDS) mean power of x (n,) in each band, 1 for white noise of variance 1.
+
+    The lowest bin is left out.
+    """
     window = hann(FRAME).astype(np.float32)
     bins = power(scipy.fft.rfft(frames(x, FRAME, HOP) * window, axis=1)[:, 1:]) / np.sum(window**2)
     return bins.reshape(len(bins), BANDS, -1).mean(axis=2).astype(np.float32)
@@ -146,7 +160,10 @@ def _roughly_ringing(knocks: Samples, late: int, frames: int) -> Samples:
 
 def _colours(power: Samples, sources: Sequence[Samples], rounds: int) -> list[Samples]:
     """(BANDS,) for each source (t, 1 or BANDS): how much of it is in each band of power (t, BANDS)."""
-    colours = [np.full(BANDS, 1.0 if i == 0 else 0.3, np.float32) / max(float(source.mean()), 1e-12) for i, source in enumerate(sources)]
+    colours = [
+        np.full(BANDS, 1.0 if i == 0 else 0.3, np.float32) / max(float(source.mean()), 1e-12)
+        for i, source in enumerate(sources)
+    ]
     for _ in range(rounds):
         inverse = 1.0 / _expected(sources, colours)
         surprise = power * inverse * inverse

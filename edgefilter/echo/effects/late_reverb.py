@@ -33,7 +33,6 @@ s, 0.9 to 1.1 where the change was another one. So far down a sweep's response i
 where a reverberation time is read off."""
 
 
-
 class LateReverb(Effect):
     """y = x + taps * x: a long filter behind the calibrated path. Its decay gives the reverberation time.
 
@@ -55,12 +54,14 @@ class LateReverb(Effect):
     )
 
     def apply(self, x: Samples, values: Values, sample_rate: int) -> Samples:
-        """x and its reverberation."""
+        """X and its reverberation."""
         taps = np.atleast_1d(np.asarray(values["taps"], float))
         return x.copy() if not taps.any() else x + convolve_from(x, taps, LEAD)
 
     def fit(self, measurement: Measurement, model: VoiceModel) -> Values:
-        """Least squares in the whitened domain, slightly regularised; neutral where nothing of it holds on other samples.
+        """Least squares in the whitened domain, slightly regularised.
+
+        Neutral where nothing of it holds on other samples.
 
         Then once more with taps expected to decay as the room that was found does: some seconds of speech do not teach
         ten thousand.
@@ -76,9 +77,15 @@ class LateReverb(Effect):
         direct = int(np.argmax(np.abs(model.impulse_response)))
         rt60 = reverberation_time(response[direct : taps.size - LEAD])
         if rt60 > 0.0:
-            taps = fit_filter(x, residual, measurement.weights, length, LEAD, prior=decaying(taps, SLOWER * rt60), steps=60)
+            taps = fit_filter(
+                x, residual, measurement.weights, length, LEAD, prior=decaying(taps, SLOWER * rt60), steps=60
+            )
         late = float(np.sum(taps[LEAD + SAMPLE_RATE // 100 :] ** 2))
-        return {"rt60_s": rt60, "level_db": float(np.clip(10 * np.log10(late + 1e-12), -120.0, 40.0)), "taps": np.clip(taps, -10.0, 10.0)}
+        return {
+            "rt60_s": rt60,
+            "level_db": float(np.clip(10 * np.log10(late + 1e-12), -120.0, 40.0)),
+            "taps": np.clip(taps, -10.0, 10.0),
+        }
 
     def sentence(self, values: Values) -> str:
         """How long the room sounds."""
@@ -123,7 +130,9 @@ def decaying(taps: Array, rt60_s: float) -> Array:
     """
     energy, floor = block_energy(taps)
     blocks = np.arange(energy.size)
-    total = float(np.sum(np.maximum(energy[1:] - floor, 0.0))) / float(np.sum(10 ** (-6.0 * blocks[1:] * BLOCK / SAMPLE_RATE / rt60_s)))
+    total = float(np.sum(np.maximum(energy[1:] - floor, 0.0))) / float(
+        np.sum(10 ** (-6.0 * blocks[1:] * BLOCK / SAMPLE_RATE / rt60_s))
+    )
     expected = total / BLOCK * 10 ** (-6.0 * (np.arange(taps.size) - BLOCK / 2) / SAMPLE_RATE / rt60_s)
     expected[:BLOCK] = np.maximum(expected[:BLOCK], energy[0] / BLOCK)
     return expected

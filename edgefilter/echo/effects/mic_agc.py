@@ -29,14 +29,18 @@ FRAME = SAMPLE_RATE // 8
 SILENT = 0.1
 """A frame shows the fan alone where the predicted voice has less than this part of its power."""
 FAN_TRUST = 0.25
-"""Weight of a silent frame relative to what white noise would deserve: the fan itself is only known to some tenths of a dB."""
+"""Weight of a silent frame relative to what white noise would deserve: the fan itself is only known to some tenths of a
+dB."""
 
 
 class MicAgc(Effect):
-    """y(t) = g(t) x(t), g in dB piecewise linear between its knots; what the microphone hears of the fan gets the same gain.
+    """y(t) = g(t) x(t), g in dB piecewise linear between its knots.
 
-    gain_db: (k,) at 0, 1 / knots_hz, 2 / knots_hz ..., the last one held, or one number. range_db and time_constant_s only report: the
-    spread of the gain between its 5th and 95th percentile, and the lag at which the gain's autocovariance has fallen to 1/e.
+    What the microphone hears of the fan gets the same gain.
+
+    gain_db: (k,) at 0, 1 / knots_hz, 2 / knots_hz ..., the last one held, or one number. range_db and time_constant_s
+    only report: the spread of the gain between its 5th and 95th percentile, and the lag at which the gain's
+    autocovariance has fallen to 1/e.
     """
 
     name: ClassVar[str] = "mic_agc"
@@ -54,7 +58,7 @@ class MicAgc(Effect):
     )
 
     def apply(self, x: Samples, values: Values, sample_rate: int) -> Samples:
-        """x (n,) times the gain of each moment."""
+        """X (n,) times the gain of each moment."""
         knots = np.atleast_1d(np.asarray(values["gain_db"], float))
         if not knots.any():
             return x.copy()
@@ -64,8 +68,9 @@ class MicAgc(Effect):
     def fit(self, measurement: Measurement, model: VoiceModel) -> Values:
         """A law by which the gain follows the level, where there is one, and what differs from it slowly.
 
-        The latter by penalised least squares of the gain at the knots: from the voice where it sounds, from the fan's power where it
-        does not. It is a smoothing spline of first order (Eilers & Marx 1996, with second differences), which bridges what is not fitted.
+        The latter by penalised least squares of the gain at the knots: from the voice where it sounds, from the fan's
+        power where it does not. It is a smoothing spline of first order (Eilers & Marx 1996, with second differences),
+        which bridges what is not fitted.
         """
         heard, predicted = measurement.heard(model)
         recording = measurement.white_recording
@@ -81,12 +86,21 @@ class MicAgc(Effect):
             right += wanted
         gain = law * _at_samples(_smooth(matrix, right), law.size)
         if not _pays(gain, voice, recording, measurement):
-            return {"gain_db": float(np.clip(20.0 * np.log10(overall), -60.0, 60.0)), "range_db": 0.0, "time_constant_s": 0.0}
+            return {
+                "gain_db": float(np.clip(20.0 * np.log10(overall), -60.0, 60.0)),
+                "range_db": 0.0,
+                "time_constant_s": 0.0,
+            }
         step = int(SAMPLE_RATE / KNOTS_HZ) if np.all(law == 1.0) else STEP
         curve = 20.0 * np.log10(np.clip(np.append(gain, gain[-1:])[::step] * overall, 1e-3, 1e3))
         low, high = np.percentile(curve, [5, 95])
         knots_hz = SAMPLE_RATE / step
-        return {"gain_db": curve, "knots_hz": knots_hz, "range_db": float(high - low), "time_constant_s": _time_constant(curve, knots_hz)}
+        return {
+            "gain_db": curve,
+            "knots_hz": knots_hz,
+            "range_db": float(high - low),
+            "time_constant_s": _time_constant(curve, knots_hz),
+        }
 
     def sentence(self, values: Values) -> str:
         """What tells it from a player's control."""
@@ -95,7 +109,8 @@ class MicAgc(Effect):
     def plausible(self, evidence: Evidence) -> bool:
         """Whether the fan moves with the gain, as it does behind a microphone's control and does not behind a player's.
 
-        By the likelihood of the residual's power in steps where little but the fan is left, its level constant or times the gain's square.
+        By the likelihood of the residual's power in steps where little but the fan is left, its level constant or times
+        the gain's square.
         """
         if float(evidence.values["range_db"]) < LEAST_RANGE_DB:
             return False
@@ -106,12 +121,18 @@ class MicAgc(Effect):
         low = (power < FAN_ALONE * square) & (by_step(evidence.grid.usable.astype(float)) == STEP)
         if low.sum() < 20:
             return False
-        moving, still = np.log(np.mean(power[low] / square[low])) + np.mean(np.log(square[low])), np.log(np.mean(power[low]))
+        moving, still = (
+            np.log(np.mean(power[low] / square[low])) + np.mean(np.log(square[low])),
+            np.log(np.mean(power[low])),
+        )
         return bool(moving < still)
 
 
 def _law(heard: Samples, voice: Samples, recording: Samples, measurement: Measurement) -> Samples:
-    """(n,) the gain by the law, ones where no law explains a good part; heard (n,): the predicted voice as the microphone gets it."""
+    """(n,) the gain by the law, ones where no law explains a good part.
+
+    Heard (n,): the predicted voice as the microphone gets it.
+    """
     ones = np.ones(heard.size, np.float32)
     if measurement.noise_psd is None:
         return ones
@@ -131,7 +152,9 @@ def _at_samples(knots: Array, n: int) -> Array:
 
 def _pays(curve: Array, voice: Samples, recording: Samples, measurement: Measurement) -> bool:
     """Whether the curve (n,) explains more than a constant by what Bayes' criterion asks for half as many numbers as a spline has knots."""
-    constant, varying = (float(np.dot(rest**2, measurement.weights)) for rest in (recording - voice, recording - curve * voice))
+    constant, varying = (
+        float(np.dot(rest**2, measurement.weights)) for rest in (recording - voice, recording - curve * voice)
+    )
     count = max(float(measurement.weights.sum()), 2.0)
     return constant - varying > 0.5 * curve.size * KNOTS_HZ / SAMPLE_RATE * np.log(count) * varying / count
 
@@ -154,7 +177,9 @@ def _from_voice(voice: Samples, recording: Samples, measurement: Measurement) ->
     return np.stack((upper, main)), total(cross * (1 - up), left) + total(cross * up, left + 1)
 
 
-def _from_fan(voice: Samples, recording: Samples, measurement: Measurement, overall: float, law: Samples) -> tuple[Array, Array]:
+def _from_fan(
+    voice: Samples, recording: Samples, measurement: Measurement, overall: float, law: Samples
+) -> tuple[Array, Array]:
     """What the fan's power says: to the main diagonal and the right side (k,), from frames to fit on in which the robot is silent."""
     count = int((voice.size - 1) * KNOTS_HZ / SAMPLE_RATE) + 2
     own, heard, by_law = (block_power(x, FRAME) for x in (voice, recording, law))

@@ -34,7 +34,7 @@ class MicClipping(Effect):
     )
 
     def apply(self, x: Samples, values: Values, sample_rate: int) -> Samples:
-        """x (n,), limited."""
+        """X (n,), limited."""
         level, hardness = float(values["level"]), float(values["hardness"])
         if level >= NO_LIMIT:
             return x.copy()
@@ -46,7 +46,8 @@ class MicClipping(Effect):
     def fit(self, measurement: Measurement, model: VoiceModel) -> Values:
         """The level and hardness that leave the least of the whitened recording, a gain free in each.
 
-        Levels from the recording's largest value downwards; where none beats the prediction as it is, there is no limit.
+        Levels from the recording's largest value downwards; where none beats the prediction as it is, there is no
+        limit.
         """
         predicted, recording = measurement.heard(model)[0], measurement.white_recording
         chosen = measurement.weights
@@ -56,7 +57,9 @@ class MicClipping(Effect):
             return none
 
         def left(level: float, hardness: float) -> float:
-            white = measurement.whiten(self.apply(predicted, {"level": level, "hardness": hardness}, SAMPLE_RATE)) * chosen
+            white = (
+                measurement.whiten(self.apply(predicted, {"level": level, "hardness": hardness}, SAMPLE_RATE)) * chosen
+            )
             energy = float(np.dot(white, white))
             return total - float(np.dot(recording, white)) ** 2 / energy if energy > 0.0 else total
 

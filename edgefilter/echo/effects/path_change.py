@@ -19,7 +19,8 @@ EXPECTED = 1e-2
 """Expected square of a tap."""
 BLOCK = SAMPLE_RATE // 10
 MARGIN = 1.5
-"""Seconds at either end within which no change is looked for: there is no telling it from a path that was another all along."""
+"""Seconds at either end within which no change is looked for: there is no telling it from a path that was another all
+along."""
 SLACK = 6.0
 """Squared error, in variances of the fan, by which moments and fades are told apart: less is chance."""
 NEVER = 1e6
@@ -44,18 +45,22 @@ class PathChange(Effect):
     )
 
     def apply(self, x: Samples, values: Values, sample_rate: int) -> Samples:
-        """x through the old path, then the new."""
+        """X through the old path, then the new."""
         taps = np.atleast_1d(np.asarray(values["taps"], float))
         if not taps.any() or float(values["time_s"]) >= x.size / sample_rate:
             return x.copy()
-        return x + _fade(x.size, float(values["time_s"]), float(values["duration_s"]), sample_rate) * convolve_from(x, taps, LEAD)
+        return x + _fade(x.size, float(values["time_s"]), float(values["duration_s"]), sample_rate) * convolve_from(
+            x, taps, LEAD
+        )
 
     def settled(self, values: Values) -> Values:
         """Values with which the new path holds from the start."""
         return {**values, "time_s": -1.0, "duration_s": 0.0} if float(values["time_s"]) < NEVER else values
 
     def fit(self, measurement: Measurement, model: VoiceModel) -> Values:
-        """The time by the step in the residual, the new path by least squares after it, in turn; neutral where it does not help on other samples.
+        """The time by the step in the residual, the new path by least squares after it, in turn.
+
+        Neutral where it does not help on other samples.
 
         The moment alone is chosen on all samples, since it may fall between those that the fit may use.
         """
@@ -77,7 +82,11 @@ class PathChange(Effect):
         most = min(errors.values()) + SLACK
         as_good = [found for found, error in errors.items() if error <= most]
         time, duration = min(as_good, key=lambda found: (found[1], abs(found[0] - time)))
-        return {"time_s": float(np.clip(time, 0.0, x.size / SAMPLE_RATE)), "duration_s": duration, "taps": np.clip(taps, -10.0, 10.0)}
+        return {
+            "time_s": float(np.clip(time, 0.0, x.size / SAMPLE_RATE)),
+            "duration_s": duration,
+            "taps": np.clip(taps, -10.0, 10.0),
+        }
 
     def sentence(self, values: Values) -> str:
         """When."""
@@ -100,7 +109,9 @@ class PathChange(Effect):
 
 def _fade(n: int, time: float, duration: float, sample_rate: int) -> Samples:
     """(n,) 0 before, 1 after, a line in between."""
-    return np.clip((np.arange(n, dtype=np.float32) / sample_rate - time) / max(duration, 1e-4) + 0.5, 0.0, 1.0).astype(np.float32)
+    return np.clip((np.arange(n, dtype=np.float32) / sample_rate - time) / max(duration, 1e-4) + 0.5, 0.0, 1.0).astype(
+        np.float32
+    )
 
 
 def _step(residual: Samples, x: Samples) -> float:

@@ -27,7 +27,7 @@ class PlaybackGain(Effect):
     parameters: ClassVar[tuple[Parameter, ...]] = (Parameter("gain_db", "dB", 0.0, -60.0, 60.0),)
 
     def apply(self, x: Samples, values: Values, sample_rate: int) -> Samples:
-        """x times the gain."""
+        """X times the gain."""
         return x * np.float32(10.0 ** (float(values["gain_db"]) / 20.0))
 
     def fit(self, measurement: Measurement, model: VoiceModel) -> Values:
@@ -39,7 +39,10 @@ class PlaybackGain(Effect):
     def sentence(self, values: Values) -> str:
         """By how much, and which way."""
         gain_db = first(values, "gain_db")
-        return f"the voice is {abs(gain_db):.2f} dB {'louder' if gain_db > 0 else 'softer'} at all frequencies and levels alike"
+        return (
+            f"the voice is {abs(gain_db):.2f} dB {'louder' if gain_db > 0 else 'softer'} at all frequencies and levels"
+            " alike"
+        )
 
     def plausible(self, evidence: Evidence) -> bool:
         """More than a gain differs from day to day."""

@@ -51,12 +51,12 @@ GRID_HZ = np.linspace(0.0, SAMPLE_RATE / 2, 601)
 class Rattle(Effect):
     """y = x + h * k: a knock k at every moment at which the displacement |d| rises through threshold, h its sound, ahead of the path.
 
-    d is the drive through the membrane's resonance, w^2 / (s^2 + s w / q + w^2). An impact excites the modes of the loose part in
-    proportion to the speed at which it is hit (Klippel 2006, "Loudspeaker nonlinearities", irregular distortion), so a knock is as
-    high as d' per ms over threshold: outward (t,) taps is the sound of pushes, inward that of pulls. threshold: full scale of the
-    drive. side: 1 where only pushes knock, -1 only pulls, 0 both. No two knocks are alike: what no waveform predicts is noise that
-    starts at each knock, with power (16,) in bands of 500 Hz for a height of 1, and decays in decay_ms. rate_hz, knocks per second,
-    only reports.
+    d is the drive through the membrane's resonance, w^2 / (s^2 + s w / q + w^2). An impact excites the modes of the
+    loose part in proportion to the speed at which it is hit (Klippel 2006, "Loudspeaker nonlinearities", irregular
+    distortion), so a knock is as high as d' per ms over threshold: outward (t,) taps is the sound of pushes, inward
+    that of pulls. threshold: full scale of the drive. side: 1 where only pushes knock, -1 only pulls, 0 both. No two
+    knocks are alike: what no waveform predicts is noise that starts at each knock, with power (16,) in bands of 500 Hz
+    for a height of 1, and decays in decay_ms. rate_hz, knocks per second, only reports.
     """
 
     name: ClassVar[str] = "rattle"
@@ -79,17 +79,21 @@ class Rattle(Effect):
     )
 
     def apply(self, x: Samples, values: Values, sample_rate: int) -> Samples:
-        """x (n,) and its knocks."""
+        """X (n,) and its knocks."""
         sounds = [np.atleast_1d(np.asarray(values[name], float)) for name in ("outward", "inward")]
         if not any(h.any() for h in sounds):
             return x.copy()
-        knocks = find_knocks(resonated(x, float(values["resonance_hz"]), float(values["q"]), sample_rate), float(values["threshold"]))
+        knocks = find_knocks(
+            resonated(x, float(values["resonance_hz"]), float(values["q"]), sample_rate), float(values["threshold"])
+        )
         return x + sum(filtered([k], h[None]) for k, h in zip(knocks, sounds, strict=True))
 
     def variance(self, reference: Samples, values: Values, sample_rate: int) -> Samples:
         """What knocks add to the expected square of each sample (n,) at the microphone, for an aligned reference (n,)."""
         power = float(np.sum(values["power"]))
-        return power * ringing_of(_heard(reference, values, sample_rate), float(values["decay_ms"]), DIRECT, sample_rate)
+        return power * ringing_of(
+            _heard(reference, values, sample_rate), float(values["decay_ms"]), DIRECT, sample_rate
+        )
 
     def colour(self, values: Values) -> Array:
         """(601,) the spectral density of that, 0 to 8 kHz, per Hz: its integral is 1."""
@@ -97,11 +101,14 @@ class Rattle(Effect):
         return (power / power.sum() / BAND_HZ)[np.minimum(GRID_HZ / BAND_HZ, BANDS - 1).astype(int)]
 
     def fit(self, measurement: Measurement, model: VoiceModel) -> Values:
-        """What sets the knocks off is found by when the residual is loud; then come the least-squares sounds, and the power of the rest.
+        """What sets the knocks off is found by when the residual is loud.
 
-        Where the sounds explain something, they serve as matched filters, which show how hard the robot was hit at each moment, and
-        resonance, q and threshold are refined by these. Neutral where the residual follows the voice's level rather than knocks, unless
-        sounds learnt from some knocks explain others, and more than as long a linear filter of the voice does.
+        Then come the least-squares sounds, and the power of the rest.
+
+        Where the sounds explain something, they serve as matched filters, which show how hard the robot was hit at each
+        moment, and resonance, q and threshold are refined by these. Neutral where the residual follows the voice's
+        level rather than knocks, unless sounds learnt from some knocks explain others, and more than as long a linear
+        filter of the voice does.
         """
         x = measurement.reference
         predicted, target = measurement.heard(model)[1], measurement.white_recording
@@ -113,7 +120,10 @@ class Rattle(Effect):
 
         def knocks_of(at: Trigger) -> list[Samples]:
             trains = find_knocks(resonated(x, at.resonance_hz, at.q), at.threshold)
-            return [train * allowed if at.side * way >= 0.0 else np.zeros_like(train) for train, way in zip(trains, (1.0, -1.0), strict=True)]
+            return [
+                train * allowed if at.side * way >= 0.0 else np.zeros_like(train)
+                for train, way in zip(trains, (1.0, -1.0), strict=True)
+            ]
 
         def explain(at: Trigger) -> tuple[float, Array]:
             return _explained([measurement.whiten(model.predict(k)) for k in knocks_of(at)], rest, TAPS)
@@ -134,7 +144,10 @@ class Rattle(Effect):
                 return neutral(self)
             at, sounds = trigger, np.zeros((2, 1))
         values = dict(zip(("resonance_hz", "q", "threshold", "side"), astuple(at), strict=True))
-        values |= {name: _number_or_taps(np.clip(sound, -BOUND, BOUND)) for name, sound in zip(("outward", "inward"), sounds, strict=True)}
+        values |= {
+            name: _number_or_taps(np.clip(sound, -BOUND, BOUND))
+            for name, sound in zip(("outward", "inward"), sounds, strict=True)
+        }
         return {**values, **self._unpredictable(measurement, model, values)}
 
     def _unpredictable(self, measurement: Measurement, model: VoiceModel, values: Values) -> dict[str, float | Array]:
@@ -144,9 +157,15 @@ class Rattle(Effect):
         predicted = measurement.whiten(model.predict(self.apply(x, complete(self, values), SAMPLE_RATE)))
         target = measurement.white_recording
         left = target - absorbed(predicted, target, measurement.fit)
-        fits = {decay: colour_of_knocks(left, ringing_of(knocks, decay, DIRECT), measurement.fit) for decay in DECAYS_MS}
+        fits = {
+            decay: colour_of_knocks(left, ringing_of(knocks, decay, DIRECT), measurement.fit) for decay in DECAYS_MS
+        }
         decay = max(fits, key=lambda decay: fits[decay][0])
-        fan = np.full(GRID_HZ.size, 2.0 / SAMPLE_RATE) if measurement.noise_psd is None else floored(measurement.noise_psd)
+        fan = (
+            np.full(GRID_HZ.size, 2.0 / SAMPLE_RATE)
+            if measurement.noise_psd is None
+            else floored(measurement.noise_psd)
+        )
         bands = np.minimum(GRID_HZ / BAND_HZ, BANDS - 1).astype(int)
         density = fits[decay][1] * np.bincount(bands) / np.bincount(bands, 1.0 / fan)
         rate = np.count_nonzero(knocks) * SAMPLE_RATE / max(x.size, 1)
@@ -156,8 +175,8 @@ class Rattle(Effect):
         """How often, and at which moments of the membrane's movement."""
         side = {1.0: "outward", -1.0: "inward"}.get(first(values, "side"), "far")
         return (
-            f"short bursts, {first(values, 'rate_hz'):.0f} a second, follow the moments at which the membrane is driven {side}, "
-            "and not the voice's level; what of them no waveform predicts is shown as irreducible"
+            f"short bursts, {first(values, 'rate_hz'):.0f} a second, follow the moments at which the membrane is driven"
+            f" {side}, and not the voice's level; what of them no waveform predicts is shown as irreducible"
         )
 
     def plausible(self, evidence: Evidence) -> bool:
@@ -201,7 +220,9 @@ def _coarse(x: Samples) -> list[Trigger]:
 
 def _fine(at: Trigger) -> list[Trigger]:
     """Neighbours of a trigger."""
-    steps = product((0.85, 0.92, 0.96, 1.0, 1.04, 1.09, 1.18), (0.75, 1.0, 1.3), (0.7, 0.8, 0.9, 0.96, 1.0, 1.04, 1.1, 1.2, 1.35))
+    steps = product(
+        (0.85, 0.92, 0.96, 1.0, 1.04, 1.09, 1.18), (0.75, 1.0, 1.3), (0.7, 0.8, 0.9, 0.96, 1.0, 1.04, 1.1, 1.2, 1.35)
+    )
     return [replace(at, resonance_hz=at.resonance_hz * a, q=at.q * b, threshold=at.threshold * c) for a, b, c in steps]
 
 
@@ -224,9 +245,14 @@ def _agreement(knocks: tuple[Samples, Samples], hits: list[Samples]) -> float:
     return along * abs(along) / energy if energy > 0.0 else 0.0
 
 
-def _predicts(halves: list[tuple[Samples, Samples]], residual: Samples, measurement: Measurement, model: VoiceModel) -> bool:
+def _predicts(
+    halves: list[tuple[Samples, Samples]], residual: Samples, measurement: Measurement, model: VoiceModel
+) -> bool:
     """Whether the sounds learnt from one half of the knocks explain some of the other half, both ways round."""
-    normals = [_normal([measurement.whiten(model.predict(knocks[half])) for knocks in halves], residual, TAPS) for half in (0, 1)]
+    normals = [
+        _normal([measurement.whiten(model.predict(knocks[half])) for knocks in halves], residual, TAPS)
+        for half in (0, 1)
+    ]
     total = 0.0
     for (matrix, right), (other, wanted) in (normals, normals[::-1]):
         w = _solve(matrix, right)
@@ -255,5 +281,7 @@ def _normal(columns: list[Samples], residual: Samples, taps: int) -> tuple[Array
     target = scipy.fft.rfft(residual.astype(np.float64), n)
     right = np.concatenate([scipy.fft.irfft(np.conj(s) * target, n)[:taps] for s in spectra])
     lags = [[scipy.fft.irfft(np.conj(a) * b, n) for b in spectra] for a in spectra]
-    matrix = np.block([[scipy.linalg.toeplitz(r[:taps], np.concatenate((r[:1], r[:-taps:-1]))) for r in row] for row in lags])
+    matrix = np.block(
+        [[scipy.linalg.toeplitz(r[:taps], np.concatenate((r[:1], r[:-taps:-1]))) for r in row] for row in lags]
+    )
     return matrix, right

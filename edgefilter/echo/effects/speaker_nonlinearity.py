@@ -34,10 +34,11 @@ def distortion_terms(x: Samples, sample_rate: int = SAMPLE_RATE) -> dict[str, Sa
 class SpeakerNonlinearity(Effect):
     """y = x + sum of h_k * f_k(x), five nonlinear functions f_k ahead of the linear path, each with a filter h_k of its own.
 
-    A parallel Hammerstein model (Novak et al. 2010, "Nonlinear system identification using exponential swept-sine signals") whose
-    functions are x^2, x^3 and x |x| for amplifier and membrane, and the products d x, d^2 x with the displacement d: the terms that
-    force factor and stiffness add when they depend on the displacement (Klippel 2006, "Loudspeaker nonlinearities").
-    A parameter is one number or the taps (t,) of a causal filter, per full scale. Valid while the added terms are well below x.
+    A parallel Hammerstein model (Novak et al. 2010, "Nonlinear system identification using exponential swept-sine
+    signals") whose functions are x^2, x^3 and x |x| for amplifier and membrane, and the products d x, d^2 x with the
+    displacement d: the terms that force factor and stiffness add when they depend on the displacement (Klippel 2006,
+    "Loudspeaker nonlinearities"). A parameter is one number or the taps (t,) of a causal filter, per full scale. Valid
+    while the added terms are well below x.
     """
 
     name: ClassVar[str] = "speaker_nonlinearity"
@@ -55,7 +56,7 @@ class SpeakerNonlinearity(Effect):
     )
 
     def apply(self, x: Samples, values: Values, sample_rate: int) -> Samples:
-        """x (n,) with its distortion; level_db only reports."""
+        """X (n,) with its distortion; level_db only reports."""
         taps = {name: np.atleast_1d(np.asarray(values[name], float)) for name in TERMS}
         out = x.copy()
         if any(h.any() for h in taps.values()):
@@ -87,13 +88,19 @@ class SpeakerNonlinearity(Effect):
         added = filtered(columns[1:], weights[1:])
         added = added - level_ratio(added, linear) * linear
         level = 10.0 * np.log10(float(np.mean(added**2)) / (float(np.mean(linear**2)) + 1e-30) + 1e-12)
-        values = {name: _number_or_taps(np.clip(w[:taps] / gain, -BOUND, BOUND)) for name, w in zip(TERMS, weights[1:], strict=True)}
+        values = {
+            name: _number_or_taps(np.clip(w[:taps] / gain, -BOUND, BOUND))
+            for name, w in zip(TERMS, weights[1:], strict=True)
+        }
         return {**values, "level_db": float(np.clip(level, SILENT_DB, 20.0))}
 
     def sentence(self, values: Values) -> str:
         """How strong the distortion is."""
         level_db = first(values, "level_db")
-        return f"products of the reference with itself, {level_db:.0f} dB re the voice, are in the residual: no linear path makes them"
+        return (
+            f"products of the reference with itself, {level_db:.0f} dB re the voice, are in the residual: no linear"
+            " path makes them"
+        )
 
 
 def _number_or_taps(weights: Array) -> float | Array:

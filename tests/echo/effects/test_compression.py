@@ -18,21 +18,28 @@ def gain_db(level, values):
     return 20 * np.log10(np.std(out[-8000:]) / np.std(tone[-8000:]))
 
 
-@pytest.mark.parametrize(("level", "expected"), [(-40.0, 0.0), (-23.0, -0.0), (-20.0, -0.5625), (-17.0, -2.25), (-10.0, -7.5)])
+@pytest.mark.parametrize(
+    ("level", "expected"), [(-40.0, 0.0), (-23.0, -0.0), (-20.0, -0.5625), (-17.0, -2.25), (-10.0, -7.5)]
+)
 def test_static_curve_of_ratio_4_above_minus_20_db_with_a_knee_of_6_db(level, expected):
-    # in the knee 0.75 (over + 3)^2 / 12 dB come off, above it 0.75 of what is over; ripple of the mean square holds 0.1 dB at most
+    # in the knee 0.75 (over + 3)^2 / 12 dB come off, above it 0.75 of what is over; ripple of the mean square holds 0.1
+    # dB at most
     values = {"threshold_db": -20.0, "ratio": 4.0, "knee_db": 6.0, "attack_ms": 10.0}
     assert gain_db(level, values) == pytest.approx(expected, abs=0.1)
     assert gain_db(level, {**values, "makeup_db": 5.0}) == pytest.approx(expected + 5.0, abs=0.1)
 
 
 def test_release_is_the_time_to_1_over_e_of_the_reduction_in_db():
-    tone = np.sin(2 * np.pi * np.arange(48_000) / 16).astype(np.float32) * np.where(np.arange(48_000) < 16_000, 0.5, 1e-3).astype(np.float32)
+    tone = np.sin(2 * np.pi * np.arange(48_000) / 16).astype(np.float32) * np.where(
+        np.arange(48_000) < 16_000, 0.5, 1e-3
+    ).astype(np.float32)
     values = complete(COMPRESS, {"threshold_db": -20.0, "ratio": 4.0, "attack_ms": 1.0, "release_ms": 300.0})
     gain = 20 * np.log10(np.abs(COMPRESS.apply(tone, values, 16_000)) + 1e-12) - 20 * np.log10(np.abs(tone) + 1e-12)
     peaks = np.abs(np.sin(2 * np.pi * np.arange(48_000) / 16)) > 0.9
     before, after = gain[14_000:15_900][peaks[14_000:15_900]].mean(), gain[20_700:20_900][peaks[20_700:20_900]].mean()
-    assert after == pytest.approx(before * np.exp(-1), rel=0.05)  # 300 ms are 4800 samples; the attack of 1 ms delays the start
+    assert after == pytest.approx(
+        before * np.exp(-1), rel=0.05
+    )  # 300 ms are 4800 samples; the attack of 1 ms delays the start
 
 
 def test_falling_peak_is_the_slow_recursion():

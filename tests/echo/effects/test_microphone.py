@@ -37,7 +37,10 @@ def test_a_loud_recording_below_any_limit_is_left_alone():
     found = catalogue.find("mic_clipping").fit(measurement, model)
     predicted = model.predict(measurement.reference)
     # a faint cubic distortion, which every loudspeaker has, may look like the beginning of a limiter
-    assert np.abs(catalogue.find("mic_clipping").apply(predicted, found, 16_000) - predicted).max() < 0.05 * np.abs(predicted).max()
+    assert (
+        np.abs(catalogue.find("mic_clipping").apply(predicted, found, 16_000) - predicted).max()
+        < 0.05 * np.abs(predicted).max()
+    )
 
 
 def through_agc(curve_db, gain_db=0.0):
@@ -66,12 +69,17 @@ def test_gain_control_at_a_step_between_knots_is_linear_in_db():
 
 def test_a_constant_gain_is_one_number_without_range():
     found = catalogue.find("mic_agc").fit(*robot_alone("playback_gain", {"gain_db": -2.0}))
-    assert np.ndim(found["gain_db"]) == 0 and found["gain_db"] == pytest.approx(-2.0, abs=0.2) and found["range_db"] == 0.0
+    assert (
+        np.ndim(found["gain_db"]) == 0 and found["gain_db"] == pytest.approx(-2.0, abs=0.2) and found["range_db"] == 0.0
+    )
 
 
 def test_fan_that_is_louder_in_a_band_is_found_in_that_band():
     measurement, model = robot_alone()
-    band = signal.sosfilt(signal.butter(6, [2000, 3000], "band", fs=16_000, output="sos"), np.random.default_rng(5).standard_normal(192_000))
+    band = signal.sosfilt(
+        signal.butter(6, [2000, 3000], "band", fs=16_000, output="sos"),
+        np.random.default_rng(5).standard_normal(192_000),
+    )
     louder = replace(measurement, recording=measurement.recording + (0.002 * band).astype(np.float32))
     found = catalogue.find("fan_noise").fit(louder, model)
     hz = np.arange(601) * 8000 / 600

@@ -34,9 +34,13 @@ def test_the_long_filter_is_the_least_squares_one() -> None:
     x, h = rng.standard_normal(3000).astype(np.float32), rng.standard_normal(20)
     y = np.convolve(x, h)[4 : 4 + x.size].astype(np.float32) + 0.1 * rng.standard_normal(x.size).astype(np.float32)
     weights = (np.arange(x.size) // 500 % 2).astype(np.float32)
-    columns = np.stack([np.concatenate((np.zeros(24), x, np.zeros(24)))[24 + 4 - k : 24 + 4 - k + x.size] for k in range(20)], axis=1)
+    columns = np.stack(
+        [np.concatenate((np.zeros(24), x, np.zeros(24)))[24 + 4 - k : 24 + 4 - k + x.size] for k in range(20)], axis=1
+    )
     expected = np.linalg.lstsq(columns * weights[:, None], y * weights, rcond=None)[0]
-    np.testing.assert_allclose(fit_filter(x, y, weights, 20, 4, steps=40), expected, atol=1e-4)  # single-precision transforms
+    np.testing.assert_allclose(
+        fit_filter(x, y, weights, 20, 4, steps=40), expected, atol=1e-4
+    )  # single-precision transforms
 
 
 def in_an_office(seconds: float) -> Measurement:
@@ -44,7 +48,9 @@ def in_an_office(seconds: float) -> Measurement:
     rng, x = np.random.default_rng(4), voice(seconds)
     t = np.arange(10_000)
     room = np.pad(path(), (0, 6000))
-    room[PRE_ROLL + 160 : PRE_ROLL + 160 + t.size] += 0.012 * rng.standard_normal(t.size) * 10 ** (-3 * t / (0.5 * 16000))
+    room[PRE_ROLL + 160 : PRE_ROLL + 160 + t.size] += (
+        0.012 * rng.standard_normal(t.size) * 10 ** (-3 * t / (0.5 * 16000))
+    )
     clean = signal.fftconvolve(delayed(x, DELAY - PRE_ROLL), room)[: x.size]
     return measure(clean + FAN * rng.standard_normal(x.size), x)
 
@@ -59,7 +65,15 @@ def test_what_is_known_of_a_decaying_room_helps_where_little_was_heard() -> None
     office, model = in_an_office(6.0), EchoModel(path())
     left, values = excess_db("late_reverb", office)
     x = office.heard(model)[1]
-    flat = fit_filter(x, office.white_recording - x, office.weights, values["taps"].size, LEAD, prior=np.full(values["taps"].size, EXPECTED), steps=40)
+    flat = fit_filter(
+        x,
+        office.white_recording - x,
+        office.weights,
+        values["taps"].size,
+        LEAD,
+        prior=np.full(values["taps"].size, EXPECTED),
+        steps=40,
+    )
     with_flat = office.white_recording - x - convolve_from(x, flat, LEAD)
     assert left < 10 * np.log10(np.mean(with_flat[~office.fit].astype(float) ** 2)) - 0.5
 
@@ -77,13 +91,17 @@ def test_a_resonance_is_found_with_its_frequency_and_q() -> None:
 def test_two_resonances_are_found_with_their_frequencies_loudest_first() -> None:
     rng, x = np.random.default_rng(5), voice(12.0)
     clean = EchoModel(path()).predict(delayed(x, DELAY - PRE_ROLL)).astype(float)
-    ringing = clean + sum(gain * signal.lfilter(*signal.iirpeak(hz, 40.0, fs=16000), clean) for hz, gain in ((820.0, 0.5), (1900.0, 0.8)))
+    ringing = clean + sum(
+        gain * signal.lfilter(*signal.iirpeak(hz, 40.0, fs=16000), clean) for hz, gain in ((820.0, 0.5), (1900.0, 0.8))
+    )
     left, values = excess_db("chassis_resonance", measure(ringing + FAN * rng.standard_normal(x.size), x))
     np.testing.assert_allclose(values["frequency_hz"], (1900.0, 820.0), rtol=0.005)
     assert left < 0.5
 
 
-@pytest.mark.parametrize("filters", [signal.butter(6, 3000.0, fs=16000, output="sos"), signal.cheby1(8, 0.5, 5000.0, fs=16000, output="sos")])
+@pytest.mark.parametrize(
+    "filters", [signal.butter(6, 3000.0, fs=16000, output="sos"), signal.cheby1(8, 0.5, 5000.0, fs=16000, output="sos")]
+)
 def test_a_low_pass_is_found_whatever_its_kind(filters: np.ndarray) -> None:
     rng, x = np.random.default_rng(6), voice(12.0)
     clean = signal.sosfilt(filters, EchoModel(path()).predict(delayed(x, DELAY - PRE_ROLL)).astype(float))
@@ -107,10 +125,14 @@ def test_what_runs_is_the_path_with_its_stationary_effects() -> None:
     x = voice(3.0)
     model = EchoModel(path())
     resonance = {"frequency_hz": 900.0, "q": 20.0, "gain_db": -3.0}
-    full = model.with_effect("chassis_resonance", resonance).with_effect("bandlimit", {"cutoff_hz": 4000.0, "order": 6.0, "phase": 1.0})
+    full = model.with_effect("chassis_resonance", resonance).with_effect(
+        "bandlimit", {"cutoff_hz": 4000.0, "order": 6.0, "phase": 1.0}
+    )
     running = EchoModel(full.running_response()).predict(x)
     whole = slice(0, x.size - PRE_ROLL)  # the low-pass rings ahead of sounds that the recording no longer holds
-    np.testing.assert_allclose(running[whole], full.predict(x)[whole], atol=2e-4 * np.abs(running).max())  # the ring is cut 80 dB down
+    np.testing.assert_allclose(
+        running[whole], full.predict(x)[whole], atol=2e-4 * np.abs(running).max()
+    )  # the ring is cut 80 dB down
     assert model.running_response() is model.impulse_response
     assert full.with_running_response(full.running_response()).effects == ()
 
@@ -126,6 +148,10 @@ def test_the_new_path_runs_after_a_change() -> None:
 def test_reverberation_lengthens_the_running_filter() -> None:
     taps = np.zeros(9000)
     taps[8000] = 0.3
-    running = EchoModel(path()).with_effect("late_reverb", {"taps": taps, "rt60_s": 0.5, "level_db": -10.0}).running_response()
+    running = (
+        EchoModel(path())
+        .with_effect("late_reverb", {"taps": taps, "rt60_s": 0.5, "level_db": -10.0})
+        .running_response()
+    )
     assert running.size > 8000 + PRE_ROLL - 32
     assert profile(running).echo.impulse_response.size == running.size

@@ -34,7 +34,10 @@ def test_a_knock_is_where_the_displacement_leaves_the_threshold_and_as_high_as_i
 
 def test_the_membrane_resonates():
     t = np.arange(32_000) / 16_000
-    peak = [np.abs(resonated(np.sin(2 * np.pi * hz * t).astype(np.float32), 200.0, 1.5)[16_000:]).max() for hz in (20, 200, 2000)]
+    peak = [
+        np.abs(resonated(np.sin(2 * np.pi * hz * t).astype(np.float32), 200.0, 1.5)[16_000:]).max()
+        for hz in (20, 200, 2000)
+    ]
     assert peak[0] == pytest.approx(1.0, abs=0.02) and peak[1] == pytest.approx(1.5, abs=0.02) and peak[2] < 0.012
 
 
@@ -47,9 +50,15 @@ def test_fit_finds_what_sets_it_off_and_how_it_sounds():
     fitted = model.fit("rattle", measurement)
     found = dict(fitted.effects)["rattle"]
     # resonance, q and threshold trade against each other: near the resonance all three scale what is compared
-    assert found["resonance_hz"] == pytest.approx(200.0, rel=0.1) and found["threshold"] == pytest.approx(0.12, rel=0.25)
+    assert found["resonance_hz"] == pytest.approx(200.0, rel=0.1) and found["threshold"] == pytest.approx(
+        0.12, rel=0.25
+    )
     # another threshold is crossed some samples earlier or later: the sounds agree but for that shift
-    agreement = np.correlate(found["outward"], truth["outward"], "full") / np.linalg.norm(found["outward"]) / np.linalg.norm(truth["outward"])
+    agreement = (
+        np.correlate(found["outward"], truth["outward"], "full")
+        / np.linalg.norm(found["outward"])
+        / np.linalg.norm(truth["outward"])
+    )
     assert agreement.max() > 0.9 and abs(int(np.argmax(agreement)) - 199) <= 4
     before, after = held_out_power(measurement, model.predict(x)), held_out_power(measurement, fitted.predict(x))
     # knocks that barely cross the threshold are missed or invented
@@ -72,7 +81,9 @@ def test_knocks_that_are_never_alike_go_into_the_variance():
     x, model = irregular_voice(), robot_model()
     knocks = find_knocks(resonated(x, 200.0, 1.0), 0.12)[0]
     rng = np.random.default_rng(8)
-    wild = signal.lfilter([1], [1, -0.9], rng.standard_normal(x.size)) * np.sqrt(signal.lfilter([1], [1, -np.exp(-1 / 64)], np.roll(knocks, 64) ** 2))
+    wild = signal.lfilter([1], [1, -0.9], rng.standard_normal(x.size)) * np.sqrt(
+        signal.lfilter([1], [1, -np.exp(-1 / 64)], np.roll(knocks, 64) ** 2)
+    )
     base, _ = robot_alone()
     truth = {"threshold": 0.12, "resonance_hz": 200.0, "outward": 0.004 * SOUND}
     recording = model.with_effect("rattle", truth).predict(x) + fan(x.size) + (0.0004 * wild).astype(np.float32)
@@ -97,10 +108,16 @@ def test_noise_that_follows_the_voice_is_no_rattle():
 def test_the_model_says_where_and_at_which_frequencies_its_noise_is():
     x, power = irregular_voice(), np.zeros(16)
     power[4] = 1e-4
-    model = robot_model().with_effect("rattle", {"threshold": 0.12, "power": power}).with_effect("playback_gain", {"gain_db": 6.0})
+    model = (
+        robot_model()
+        .with_effect("rattle", {"threshold": 0.12, "power": power})
+        .with_effect("playback_gain", {"gain_db": 6.0})
+    )
     ((variance, colour),) = model.unpredictable(x)
     louder = RATTLE.variance(x * np.float32(10 ** (6 / 20)), dict(model.effects)["rattle"], 16_000)
     np.testing.assert_allclose(variance, louder)
     hz = np.arange(601) * 8000 / 600
-    assert colour[(hz > 1999) & (hz < 2501)].sum() > 0.999 * colour.sum() and colour.sum() * 8000 / 600 == pytest.approx(1.0, abs=0.06)
+    assert colour[
+        (hz > 1999) & (hz < 2501)
+    ].sum() > 0.999 * colour.sum() and colour.sum() * 8000 / 600 == pytest.approx(1.0, abs=0.06)
     assert robot_model().unpredictable(x) == ()

@@ -24,8 +24,15 @@ def test_two_tones_through_even_give_their_sum_and_difference():
 
 def test_displacement_follows_the_drive_below_the_resonance_and_falls_above():
     t = np.arange(16_000) / 16_000
-    levels = [np.std(displacement(np.sin(2 * np.pi * hz * t).astype(np.float32))[4000:]) * np.sqrt(2) for hz in (50, 300, 3000)]
-    assert levels[0] == pytest.approx(1.0, abs=0.01) and levels[1] == pytest.approx(np.sqrt(0.5), abs=0.01) and levels[2] < 0.02
+    levels = [
+        np.std(displacement(np.sin(2 * np.pi * hz * t).astype(np.float32))[4000:]) * np.sqrt(2)
+        for hz in (50, 300, 3000)
+    ]
+    assert (
+        levels[0] == pytest.approx(1.0, abs=0.01)
+        and levels[1] == pytest.approx(np.sqrt(0.5), abs=0.01)
+        and levels[2] < 0.02
+    )
 
 
 def test_without_noise_the_fit_returns_the_coefficients():
@@ -34,7 +41,8 @@ def test_without_noise_the_fit_returns_the_coefficients():
     recording = model.with_effect("speaker_nonlinearity", truth).predict(x)
     found = catalogue.find("speaker_nonlinearity").fit(Measurement(x, recording), model)
     total = {name: float(np.sum(found[name])) for name in truth}
-    # the ridge of 1e-3 and the filter on the linear part, which takes up the odd term's share of the voice, bias by a few per cent
+    # the ridge of 1e-3 and the filter on the linear part, which takes up the odd term's share of the voice, bias by a
+    # few per cent
     assert total["even"] == pytest.approx(0.4, rel=0.05) and total["odd"] == pytest.approx(-0.8, rel=0.15)
 
 
@@ -47,7 +55,9 @@ def test_level_is_that_of_the_distortion_at_the_microphone():
     added -= np.dot(added, linear) / np.dot(linear, linear) * linear
     expected = 10 * np.log10(np.mean(added**2) / np.mean(linear**2))
     found = catalogue.find("speaker_nonlinearity").fit(measurement, model)["level_db"]
-    assert found == pytest.approx(expected, abs=1.0)  # the fan is 10 dB above this distortion: its estimate varies by some tenths
+    assert found == pytest.approx(
+        expected, abs=1.0
+    )  # the fan is 10 dB above this distortion: its estimate varies by some tenths
 
 
 def test_filters_are_fitted_only_where_they_pay():
@@ -66,7 +76,12 @@ def test_driven_hop_by_hop_is_the_same_as_at_once(sizes):
     x = robot_speech()[:20_000]
     knocks = {"threshold": 0.01, "resonance_hz": 250.0, "outward": np.array([0.0, 0.01, -0.02])}
     distortion = {"even": 0.3, "force_factor": np.array([0.5, 0.0, 0.4]), "stiffness": -2.0}
-    model = robot_model().with_effect("speaker_nonlinearity", distortion).with_effect("rattle", knocks).with_effect("playback_gain", {"gain_db": 2.0})
+    model = (
+        robot_model()
+        .with_effect("speaker_nonlinearity", distortion)
+        .with_effect("rattle", knocks)
+        .with_effect("playback_gain", {"gain_db": 2.0})
+    )
     whole = x
     for effect, values in catalogue.chain(model.effects):
         whole = effect.apply(whole, values, 16_000)
@@ -81,7 +96,10 @@ def test_driven_hop_by_hop_is_the_same_as_at_once(sizes):
 
 
 def test_driver_goes_on_after_its_past_was_rewritten():
-    x, model = robot_speech()[:8192], robot_model().with_effect("speaker_nonlinearity", {"stiffness": -2.0, "even": np.array([0.0, 0.3])})
+    x, model = (
+        robot_speech()[:8192],
+        robot_model().with_effect("speaker_nonlinearity", {"stiffness": -2.0, "even": np.array([0.0, 0.3])}),
+    )
     driver = model.source_chain()
     driver(np.full(256, 0.3, np.float32))
     history = driver.rewritten(x[:4096], 256)
@@ -93,4 +111,6 @@ def test_driver_goes_on_after_its_past_was_rewritten():
 
 def test_compression_is_not_driven_since_it_remembers_seconds():
     x = robot_speech()[:4096]
-    assert np.array_equal(robot_model().with_effect("compression", {"ratio": 5.0, "threshold_db": -40.0}).source_chain()(x), x)
+    assert np.array_equal(
+        robot_model().with_effect("compression", {"ratio": 5.0, "threshold_db": -40.0}).source_chain()(x), x
+    )

@@ -54,7 +54,9 @@ def test_lag_track_uses_only_blocks_that_may_be_fitted_and_that_correlate():
     heard[64_000:72_000] = np.random.default_rng(1).standard_normal(8000)
     track = track_lag(x, heard, fit, 4000, 50)
     assert track.lag.size > 10
-    assert all(fit[int(s) : int(s) + 4000].all() for s in track.starts) and not np.any((track.starts >= 62_000) & (track.starts < 72_000))
+    assert all(fit[int(s) : int(s) + 4000].all() for s in track.starts) and not np.any(
+        (track.starts >= 62_000) & (track.starts < 72_000)
+    )
     assert np.abs(track.lag - 5.0).max() < 0.01
 
 
@@ -97,7 +99,10 @@ def test_steps_closer_than_a_third_of_a_sample_are_one():
 
 def test_silence_in_the_gap_is_told_from_a_repetition():
     values = {"times_s": 3.3, "samples": 400.0}
-    found = {gap: catalogue.find("delay_jump").fit(*robot_alone("delay_jump", {**values, "gap_gain": gap})) for gap in (0.0, 1.0)}
+    found = {
+        gap: catalogue.find("delay_jump").fit(*robot_alone("delay_jump", {**values, "gap_gain": gap}))
+        for gap in (0.0, 1.0)
+    }
     assert {gap: fitted["gap_gain"] for gap, fitted in found.items()} == {0.0: 0.0, 1.0: 1.0}
 
 
