@@ -13,7 +13,6 @@ is an error. About 3 minutes on one core.
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
@@ -22,6 +21,7 @@ from pathlib import Path
 import numpy as np
 import soundfile as sf
 
+from bench import results_writer
 from bench.measure.alignment import CLOSE, HOP, Corpus, aligner
 from bench.simulate.alignment_scene import RATE, DoubleTalk, double_talk, run
 from edgefilter.alignment.aligner import Aligner
@@ -159,6 +159,10 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=900000)
     parser.add_argument("--output", type=Path, default=Path("bench/results/double_talk"))
     options = parser.parse_args()
+    made_with = results_writer.stamp(
+        {"ROBOT": [options.voices], "HUMAN": [options.speech]}
+        | ({"RECORDINGS": [options.real]} if options.real else {})
+    )
     rows = (
         simulated(options.seed, options.repeats, Corpus(options.voices), Corpus(options.speech))
         if options.repeats
@@ -170,12 +174,9 @@ def main() -> None:
             f"{options.real} holds no {' or '.join(options.pattern)}, expected recordings NAME_mic beside NAME_lpb:"
             " check --real and --pattern"
         )
-    options.output.parent.mkdir(parents=True, exist_ok=True)
-    options.output.with_suffix(".json").write_text(
-        json.dumps({"seed": options.seed, "simulated": [asdict(r) for r in rows], "real": recordings})
-    )
-    options.output.with_suffix(".md").write_text(summarise(rows, recordings))
-    print(summarise(rows, recordings))
+    content = {"seed": options.seed, "simulated": [asdict(r) for r in rows], "real": recordings}
+    page = summarise(rows, recordings)
+    print(results_writer.write(options.output, made_with, "Alignment while a human talks", page, content))
 
 
 if __name__ == "__main__":

@@ -80,7 +80,10 @@ def code_version(name: str) -> str:
 
 
 def imported_by(files: set[Path], package: Path) -> set[Path]:
-    """These files of the package and all of it that they import, at whatever place in the code."""
+    """These files of the package and all of it that they import, at whatever place in the code.
+
+    The package's own __init__ leads to every public name but loads none before it is asked for, so it counts for nothing.
+    """
     found, new = set(), set(files)
     while new:
         path = new.pop()
@@ -93,7 +96,7 @@ def imported_by(files: set[Path], package: Path) -> set[Path]:
                     place / "__init__.py",
                     *((place / f"{alias.name}.py") for alias in node.names),
                 }
-                new |= {file for file in asked if file.exists()} - found
+                new |= {file for file in asked if file.exists()} - found - {package / "__init__.py"}
     return found
 
 
