@@ -75,12 +75,13 @@ def make_filter(args: argparse.Namespace, live: bool) -> tuple[EgoFilter, Choice
         forget()
     choice, engine, reason, budget_ms = None, args.engine, "asked for", args.budget_ms
     profile = Profile.load(args.profile) if args.profile else None
-    if profile is None and engine != "bypass":
-        say(UNCALIBRATED)
     if engine == "auto" and not args.model and (live or budget_ms):
         choice = choose(budget_ms or DEFAULT_MS, profile, say=say)
         engine, reason, budget_ms = choice.engine, choice.reason, choice.budget_ms
-    return EgoFilter(profile, engine, budget_ms if live else None, reason, args.model), choice
+    ego = EgoFilter(profile, engine, budget_ms if live else None, reason, args.model)
+    if profile is None and ego.engine_name in HAVE_LINEAR_STAGE:
+        say(UNCALIBRATED)
+    return ego, choice
 
 
 UNCALIBRATED = (
