@@ -85,24 +85,34 @@ class Event:
     detail: str
 
 
-class AlignmentStats(TypedDict, total=False):
-    """What the aligner found.
+AlignmentState: TypeAlias = Literal["idle", "announced", "begun", "unfound", "lost", "locked"]
+"""What is known of the utterance that may be heard now (edgefilter.alignment.delay_line.Aligned)."""
 
-    Method "tracking" has all keys, "paper" the first, delay_samples, confidence and utterances_aligned.
-    """
 
-    method: Literal["tracking", "paper"]
-    state: Literal["searching", "locked", "idle"]
-    delay_samples: float | None
-    deviation_samples: float | None
-    confidence: float
-    ppm: float
+class AlignmentCounts(TypedDict, total=False):
+    """What the tracking aligner did so far, as often as it did it."""
+
     utterances: int
     realignments: int
     jumps: int
     searches: int
     announced: int
     announced_heard: int
+
+
+class AlignmentStats(AlignmentCounts, total=False):
+    """What the aligner found.
+
+    Method "tracking" has all keys but utterances_aligned; "paper" has the first, delay_samples, confidence and
+    utterances_aligned.
+    """
+
+    method: Literal["tracking", "paper"]
+    state: AlignmentState
+    delay_samples: float | None
+    deviation_samples: float | None
+    confidence: float
+    ppm: float
     utterances_aligned: int
 
 

@@ -57,11 +57,9 @@ def edge(name: str, taps: int | None, hop: int | None) -> Contender:
     stream = Stream(engine, profile)
     contender = Contender(engine.stft.hop, stream.process)
     front = stream.front
-    parts = (
-        ("alignment", front.aligner, "step"),
-        ("canceller", front.canceller, "step"),
-        ("residual", front.residual, "step"),
-    )
+    parts = [("alignment", front.aligner, "step")]
+    if stage := front.linear_stage:
+        parts += [("canceller", stage.canceller, "step"), ("residual", stage.residual, "step")]
     parts += (
         ("analysis", front._analyser, "push"),
         ("engine", engine, "step"),

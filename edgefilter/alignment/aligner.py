@@ -6,7 +6,7 @@ from collections import deque
 
 import numpy as np
 
-from edgefilter.alignment.announced import AHEAD, Announcements
+from edgefilter.alignment.announced import AHEAD, Announcements, Playback
 from edgefilter.alignment.delay_line import HALF_WIDTH, Aligned, Tape, kernel_table, read_delayed, read_line
 from edgefilter.alignment.delay_tracker import REACH, STRIDE, DelayMeasurement, DelayMeter
 from edgefilter.alignment.drift_filter import DriftFilter
@@ -24,7 +24,7 @@ from edgefilter.alignment.lag_search import (
 )
 from edgefilter.alignment.utterances import OnsetDetector, Utterance
 from edgefilter.profile.data import Profile
-from edgefilter.types import PRE_ROLL, SAMPLE_RATE, Samples
+from edgefilter.types import PRE_ROLL, SAMPLE_RATE, AlignmentCounts, AlignmentState, AlignmentStats, Samples
 
 SEARCH_STRIDE = 768
 """Samples between two searches of the whole range."""
@@ -69,14 +69,16 @@ class Aligner:
         self._meter = DelayMeter(self._response, PRE_ROLL)
         self._drift = DriftFilter()
         self._open: deque[Utterance] = deque(maxlen=32)
-        self._announced, self._expected = Announcements(), None
-        self._found, self._doubted, self._read_at = None, float("nan"), float("nan")
+        self._announced = Announcements()
+        self._expected: Playback | None = None
+        self._found: Candidate | None = None
+        self._doubted = self._read_at = float("nan")
         self._witness, self._segments = JumpWitness(), 0
         self._to_search, self._to_measure, self._stage = SEARCH_STRIDE, STRIDE // 2, 0
         self._gain: float | None = None
         self._known = self._refuted = self._trusted = self._measured = self._missed = False
         self._confidence, self._lost = 0.0, 0
-        self._counts = {
+        self._counts: AlignmentCounts = {
             "utterances": 0,
             "realignments": 0,
             "jumps": 0,
@@ -122,22 +124,23 @@ class Aligner:
             return np.zeros(count, np.float32)
         return read_line(self._ref, self._ref.end, count, self._read_at, self._drift.slope, chunk=512)
 
-    def stats(self) -> dict[str, object]:
+    def stats(self) -> AlignmentStats:
         """Delay, drift, confidence, state and what happened so far, ready for JSON."""
         delay, deviation = (
             (round(self._drift.delay, 3), round(self._drift.deviation, 3)) if self._known else (None, None)
         )
-        found = {
+        return {
             "method": "tracking",
             "state": self._state(),
             "delay_samples": delay,
             "deviation_samples": deviation,
             **self._counts,
+            "ppm": round(-1e6 * self._drift.slope, 2),
+            "confidence": round(self._confidence, 3),
         }
-        return {**found, "ppm": round(-1e6 * self._drift.slope, 2), "confidence": round(self._confidence, 3)}
 
-    def _state(self) -> str:
-        """One of STATES."""
+    def _state(self) -> AlignmentState:
+        """What `Aligned` says of each."""
         if self._expected is not None:
             return "announced"
         begun = [utterance.start for utterance in self._open if not utterance.lost]
@@ -152,7 +155,7 @@ class Aligner:
     def _audible(self) -> bool:
         """Whether something of the reference can still be heard."""
         reach = self._max_lag if not self._known else int(self._drift.delay) + SAMPLE_RATE // 4
-        return self._onsets.current is not None and self._onsets.current.end + reach >= self._ref.end
+        return self._onsets.current.end + reach >= self._ref.end
 
     def _expire(self) -> None:
         """Give up utterances that would have been heard by now."""
@@ -188,7 +191,7 @@ class Aligner:
                 self._open[0].start = (
                     now - int(self._drift.delay) - (NEARBY if self._open[0].nearby else SAMPLE_RATE // 2)
                 )
-            since = self._open[0].start if self._open else self._expected.start
+            since = self._expected.start if self._expected else self._open[0].start
             self._lags.prepare(self._expected or self._ref, now, since)
         elif stage == 1:
             self._stage = 2
@@ -197,10 +200,8 @@ class Aligner:
         elif stage == 2:
             self._found = self._lags.find()
             return self._found is not None and self._decide(self._found)
-        else:
-            return self._lags.before(self._mic, self._expected or self._ref, self._found) > SEEN and self._take(
-                self._found
-            )
+        elif found := self._found:
+            return self._lags.before(self._mic, self._expected or self._ref, found) > SEEN and self._take(found)
         return False
 
     def _decide(self, found: Candidate) -> bool:
@@ -256,7 +257,7 @@ class Aligner:
             self._meter.learn()
             return False
         self._to_measure = STRIDE
-        if self._onsets.current is None or self._ref.end - self._drift.delay - STRIDE > self._onsets.current.end:
+        if self._ref.end - self._drift.delay - STRIDE > self._onsets.current.end:
             return False
         self._segments = 1 if self._lost or (self._open and self._open[0].nearby) else 0
         found = self._meter.measure(

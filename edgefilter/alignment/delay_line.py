@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from edgefilter.dsp.fractional_delay import HALF_WIDTH, PHASES, tabulated
-from edgefilter.types import Array, Samples
+from edgefilter.types import AlignmentState, Array, Samples
 
 
 class Aligned(NamedTuple):
@@ -30,7 +30,7 @@ class Aligned(NamedTuple):
     delay: float
     ppm: float
     confidence: float
-    state: str
+    state: AlignmentState
     realigned: bool
 
 

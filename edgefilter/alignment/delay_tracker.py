@@ -12,7 +12,7 @@ from edgefilter.alignment.delay_line import Tape
 from edgefilter.dsp import fourier
 from edgefilter.dsp.fourier import power
 from edgefilter.dsp.lag import climb, turn
-from edgefilter.types import Samples
+from edgefilter.types import Array, Samples
 
 FRAME = 2048
 """Samples of microphone in one measurement, Hann-weighted."""
@@ -79,8 +79,10 @@ class DelayMeter:
             self._prior = fourier.rfft(np.roll(early, -pre_roll)).astype(np.complex64)
             self._prior_blocks = 16.0
         self._known_scale = response is not None
-        self._cross: np.ndarray | None = None
-        self._power: Samples | None = None
+        self._blocks = 0.0  # 0 until the first measurement
+        self._cross = np.zeros_like(self._prior)
+        self._power: Array = np.zeros_like(self._omega)
+        self._total = 0.0
         self._confirmed: float | None = None
         self.response = self._prior
 
@@ -104,7 +106,7 @@ class DelayMeter:
         m, a, w = fourier.rfft(self._framed)
         m *= turn(self._omega, centre - whole)
         power_a = power(a)
-        if self._cross is None:
+        if not self._blocks:
             self._start(power(m), power_a)
         self._last = (m * np.conj(a), power_a)
         powers = power(

@@ -11,7 +11,7 @@ from scipy import fft
 from edgefilter.alignment.delay_line import Aligned, Tape
 from edgefilter.alignment.utterances import OnsetDetector
 from edgefilter.errors import SignalError
-from edgefilter.types import SAMPLE_RATE, Samples
+from edgefilter.types import SAMPLE_RATE, AlignmentState, AlignmentStats, Samples
 
 TEMPLATE = SAMPLE_RATE // 2
 """Samples of the utterance that are searched for: the paper's first 0.5 s."""
@@ -85,17 +85,12 @@ class PaperAligner:
             self._waiting.append(max(started.start, 0))
         before = self._delay
         self._search()
-        known = self._delay is not None
-        now = self._ref.end
-        out = (
-            self._ref.read(now - self.hop - self._delay, now - self._delay).copy()
-            if known
-            else np.zeros(self.hop, np.float32)
-        )
-        state = "begun" if self._onset is not None else "locked" if known else "idle"
-        return Aligned(
-            out, float(self._delay) if known else float("nan"), 0.0, self._confidence, state, self._delay != before
-        )
+        delay, now = self._delay, self._ref.end
+        state: AlignmentState = "begun" if self._onset is not None else "idle" if delay is None else "locked"
+        if delay is None:
+            return Aligned(np.zeros(self.hop, np.float32), float("nan"), 0.0, self._confidence, state, False)
+        out = self._ref.read(now - self.hop - delay, now - delay).copy()
+        return Aligned(out, float(delay), 0.0, self._confidence, state, delay != before)
 
     def history(self, count: int) -> Samples:
         """The last count aligned samples under the present delay, (count,) float32."""
@@ -104,7 +99,7 @@ class PaperAligner:
         end = self._ref.end - self._delay
         return self._ref.read(end - count, end).copy()
 
-    def stats(self) -> dict[str, object]:
+    def stats(self) -> AlignmentStats:
         """What was found so far, ready for JSON."""
         return {
             "method": "paper",
@@ -114,27 +109,29 @@ class PaperAligner:
         }
 
     def _begin(self, onset: int | None) -> None:
-        self._onset, self._template = onset, None
+        self._onset = onset
+        self._template: np.ndarray | None = None
         self._scanned, self._best, self._best_lag = 0, 0.0, 0
 
     def _search(self) -> None:
-        if self._onset is None:
+        onset = self._onset
+        if onset is None:
             if not self._waiting:
                 return
-            self._begin(self._waiting.popleft())
+            onset = self._waiting.popleft()
+            self._begin(onset)
         now = self._ref.end
-        if self._template is None and now >= self._onset + TEMPLATE:
-            template = self._ref.read(self._onset, self._onset + TEMPLATE)
+        if self._template is None and now >= onset + TEMPLATE:
+            template = self._ref.read(onset, onset + TEMPLATE)
             self._energy = float(np.dot(template, template))
             self._template = np.conj(fft.rfft(template, self._size))
-        if self._template is not None and now >= self._onset + self._scanned + STRIDE + TEMPLATE:
-            self._scan()
+        if self._template is not None and now >= onset + self._scanned + STRIDE + TEMPLATE:
+            self._scan(onset + self._scanned, self._template)
 
-    def _scan(self) -> None:
-        """Judge the next STRIDE lags, whose half second of microphone is now complete (overlap-save)."""
-        at = self._onset + self._scanned
+    def _scan(self, at: int, template: np.ndarray) -> None:
+        """Judge the next STRIDE lags, whose half second of microphone, from at on, is now complete (overlap-save)."""
         mic = self._mic.read(at, at + STRIDE + TEMPLATE - 1)
-        correlation = fft.irfft(fft.rfft(mic, self._size) * self._template, self._size)[:STRIDE]
+        correlation = fft.irfft(fft.rfft(mic, self._size) * template, self._size)[:STRIDE]
         total = np.concatenate(([0.0], np.cumsum(np.square(mic, dtype=np.float64))))
         energy = total[TEMPLATE:] - total[:-TEMPLATE]
         score = correlation / np.sqrt((energy + 1e-9) * (self._energy + 1e-9))

@@ -13,6 +13,8 @@ FLOOR = 1e-8
 """Mean square under which a reference is silent whatever came before (-80 dB of full scale)."""
 RANGE = 10**-4.5
 """A hop this far (45 dB) under the loudest of the last seconds is silence."""
+NEVER = -(10**9)
+"""A position long before the first sample."""
 
 
 @dataclass
@@ -26,20 +28,23 @@ class Utterance:
 
     start: int
     end: int
-    after: int = -(10**9)
+    after: int = NEVER
     nearby: int = 0
     lost: bool = False
 
 
 class OnsetDetector:
-    """Cuts the reference into utterances, hop by hop."""
+    """Cuts the reference into utterances, hop by hop.
+
+    current: the last one that began; before the first, one that ended long ago.
+    """
 
     def __init__(self, hop: int) -> None:
         self._hop = hop
         self._peak = 0.0
         self._decay = 0.1 ** (hop / (10.0 * SAMPLE_RATE))
         self.now = 0
-        self.current: Utterance | None = None
+        self.current = Utterance(NEVER, NEVER)
         self.active = False
 
     def step(self, ref: Samples) -> Utterance | None:
@@ -53,9 +58,8 @@ class OnsetDetector:
         self.active = power > max(FLOOR, RANGE * self._peak)
         if not self.active:
             return None
-        fresh = self.current is None or self.now - self.current.end > PAUSE
+        fresh = self.now - self.current.end > PAUSE
         if fresh:
-            after = self.current.end if self.current else -(10**9)
-            self.current = Utterance(self.now - 2 * self._hop, self.now, after)
+            self.current = Utterance(self.now - 2 * self._hop, self.now, self.current.end)
         self.current.end = self.now
         return self.current if fresh else None

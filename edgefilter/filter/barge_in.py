@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from edgefilter.dsp.stft import StftConfig
 from edgefilter.errors import UsageError
 from edgefilter.filter.excess import Excess
-from edgefilter.types import SAMPLE_RATE, Frame
+from edgefilter.types import SAMPLE_RATE, EventKind, Frame
 
 ODDS_RANGE = (-2.0, 8.0)
 """Bounds on the network's log-odds of one hop, so that none outweighs a tenth of a second."""
@@ -109,7 +109,7 @@ class BargeIn:
         self._sure = self._silent = 0
         self.speaking = False
 
-    def note(self, probability: float | None) -> str | None:
+    def note(self, probability: float | None) -> EventKind | None:
         """Take the probability of a hop, None where the engine does not judge it.
 
         Returns 'speech_started' or 'speech_stopped' or None.

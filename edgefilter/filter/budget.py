@@ -15,7 +15,7 @@ import numpy as np
 import soundfile
 
 from edgefilter import engines
-from edgefilter.engines.base import Engine
+from edgefilter.engines.base import ClipEngine, Engine
 from edgefilter.engines.ladder import CANDIDATES
 from edgefilter.errors import EdgefilterError, UsageError
 from edgefilter.filter import budget_cache
@@ -123,7 +123,7 @@ def fits(figures: Figures, budget_ms: float) -> bool:
     return figures.complete and figures.paced_p99_ms <= budget_ms
 
 
-def measure(engine: Engine, profile: Profile | None = None, paced: int = PACED) -> Figures:
+def measure(engine: Engine | ClipEngine, profile: Profile | None = None, paced: int = PACED) -> Figures:
     """Run the bundled conversation through the whole path, first paced at the real hop, then back to back, held to two cores."""
     hop = engine.stft.hop
     hops = _scene(hop)
@@ -180,7 +180,7 @@ def _scene(hop: int) -> Iterator[tuple[Samples, Samples]]:
             yield mic[at : at + hop], ref[at : at + hop]
 
 
-def _model(engine: Engine) -> str:
+def _model(engine: Engine | ClipEngine) -> str:
     file = getattr(getattr(engine, "model", None), "path", None)
     return hashlib.sha256(file.read_bytes()).hexdigest() if file else ""
 

@@ -12,7 +12,7 @@ from edgefilter.dsp.membrane import DISPLACEMENT_TAPS, displacement_taps
 from edgefilter.errors import SignalError
 from edgefilter.filter.echo_limiter import EchoLimiter
 from edgefilter.filter.volume import Volume
-from edgefilter.types import SAMPLE_RATE, Samples
+from edgefilter.types import SAMPLE_RATE, LinearStageStats, Samples
 
 PRIOR_VARIANCE = 0.05
 """Variance of a calibrated path relative to its own power: the robot moved and the room is another."""
@@ -275,7 +275,7 @@ class Canceller:
         self._powers[:] = fourier.power(self._spectra)
         self._recent[:] = [channel[-2 * self.hop :] for channel in channels]
 
-    def stats(self) -> dict[str, float]:
+    def stats(self) -> LinearStageStats:
         """What the stage did so far."""
         return {
             "hops": self._hops,

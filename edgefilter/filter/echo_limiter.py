@@ -34,7 +34,7 @@ class EchoLimiter:
 
     def __init__(self, hop: int) -> None:
         self._part = math.gcd(hop, PART)
-        self._ramp = (np.arange(self._part, dtype=np.float32) + 1.0) / self._part
+        self._ramp: Samples = np.arange(1, self._part + 1, dtype=np.float32) / np.float32(self._part)
         self._patience = round(PATIENCE_S * SAMPLE_RATE / hop)
         self._smoothed = 0.0, 0.0, 0.0
         self._weights = np.ones(hop // self._part + 1, np.float32)
@@ -45,8 +45,12 @@ class EchoLimiter:
     def measure(self, mic: Samples, echo: Samples) -> bool:
         """Take in a hop (hop,) of both; whether any of the echo is too loud."""
         now = float(mic.dot(mic)), float(mic.dot(echo)), float(echo.dot(echo))
-        self._smoothed = tuple(MEMORY * before + (1.0 - MEMORY) * fresh for before, fresh in zip(self._smoothed, now))
-        heard, cross, expected = now
+        before, (heard, cross, expected) = self._smoothed, now
+        self._smoothed = (
+            MEMORY * before[0] + (1.0 - MEMORY) * heard,
+            MEMORY * before[1] + (1.0 - MEMORY) * cross,
+            MEMORY * before[2] + (1.0 - MEMORY) * expected,
+        )
         left = heard - 2.0 * cross + expected
         self._wait(left > EXCESS * heard)
         self._limited = float(self._weights[-1]) < 1.0

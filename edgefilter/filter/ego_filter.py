@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -16,6 +17,9 @@ from edgefilter.filter.stepping import Stepping
 from edgefilter.filter.stream import Stream
 from edgefilter.profile.data import MAX_TAPS, Profile
 from edgefilter.types import SAMPLE_RATE, Event, Samples, Stats, as_samples
+
+if TYPE_CHECKING:
+    from edgefilter.engines.onnx_session import Model
 
 
 class EgoFilter:
@@ -210,22 +214,23 @@ class EgoFilter:
             Ready for JSON: engine and why, its model, latency, samples, alignment, linear stage, deadlines.
         """
         front = self._stream.front
+        model: Model | None = getattr(self._engine, "model", None)
         return {
             "engine": self.engine_name,
             "engine_reason": self.engine_reason,
             "engines": [engine.name for engine in getattr(self._stream.engine, "rungs", [self._stream.engine])],
-            "model": self._engine.model.describe() if self.engine_name in engines.HAVE_MODEL else None,
+            "model": model.describe() if model else None,
             "latency_ms": None if self.waits_for_end else 1000 * self.latency / SAMPLE_RATE,
             "samples": self._stream.samples_in,
             "alignment": front.aligner.stats() if front.aligner else None,
-            "linear_stage": front.canceller.stats() if front.canceller else None,
+            "linear_stage": front.linear_stage.canceller.stats() if front.linear_stage else None,
             "deadline": self._stream.stepping.stats() if self._stream.stepping else None,
         }
 
     @property
     def can_adapt(self) -> bool:
         """Whether there will be an adapted profile: one to start from and a linear stage that learns."""
-        return self.profile is not None and self._stream.front.canceller is not None
+        return self.profile is not None and self._stream.front.linear_stage is not None
 
     def adapted_profile(self) -> Profile:
         """The profile with the echo path as the linear stage has adapted it.
@@ -241,15 +246,16 @@ class EgoFilter:
         SignalError
             Where `can_adapt` is False.
         """
-        if not self.can_adapt:
+        profile, stage = self.profile, self._stream.front.linear_stage
+        if profile is None or stage is None:
             names = ", ".join(engines.HAVE_LINEAR_STAGE)
             raise SignalError(f"nothing to write back: give a profile and an engine with a linear stage ({names})")
-        canceller = self._stream.front.canceller
-        echo = self.profile.echo.with_running_response(canceller.impulse_response(), canceller.volume.gain)
-        return self.profile.with_echo(replace(echo, impulse_response=echo.impulse_response[:MAX_TAPS]))
+        canceller = stage.canceller
+        echo = profile.echo.with_running_response(canceller.impulse_response(), canceller.volume.gain)
+        return profile.with_echo(replace(echo, impulse_response=echo.impulse_response[:MAX_TAPS]))
 
 
-def strongest(profile: Profile | None) -> tuple[Engine, str]:
+def strongest(profile: Profile | None) -> tuple[Engine | ClipEngine, str]:
     """The best engine that can be made here, and a sentence about it that names those that cannot."""
     missing = ""
     for name in CANDIDATES:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from edgefilter.alignment.aligner import Aligner
@@ -27,28 +29,46 @@ UNLOCATED = ("begun", "announced")
 adapted."""
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class LinearStage:
+    """What the kind "full" alone has: the tracked delay, the source's effects, the canceller and what it leaves."""
+
+    aligner: Aligner
+    source: SourceChain
+    canceller: Canceller
+    residual: Residual
+
+    def step(self, mic: Samples, aligned: Aligned) -> CancellerOutput:
+        """One hop (hop,) of the microphone, with what the aligner found in it."""
+        if aligned.realigned:
+            past = self.aligner.history(self.canceller.history)
+            self.canceller.rewrite_reference(self.source.rewritten(past, mic.size))
+        return self.canceller.step(mic, self.source(aligned.reference), aligned.state not in UNLOCATED)
+
+
 class FrontEnd:
     """Finds the reference in the microphone and subtracts what is linear of it.
 
     kind "none" passes the microphone, "paper" only delays the reference per utterance, "full" tracks and cancels.
+    aligner: None for "none". linear_stage: None but for "full". gate: None but for "full" with a profile.
     """
 
     def __init__(self, engine: Engine | ClipEngine, profile: Profile | None) -> None:
         stft = engine.stft
         self.hop = stft.hop
-        self.aligner = self.gate = self.canceller = self.residual = None
+        self.aligner: Aligner | PaperAligner | None = None
+        self.gate: OnsetGate | None = None
+        self.linear_stage: LinearStage | None = None
+        source = profile.echo.source_chain() if profile else SourceChain()
         if engine.front == "paper":
             self.aligner = PaperAligner(stft.hop)
         elif engine.front == "full":
-            self.aligner = Aligner(stft.hop, profile)
-            self.gate = (
-                OnsetGate(stft.hop, float(np.sum(np.square(profile.echo.impulse_response)))) if profile else None
-            )
-            self.canceller = self._make_canceller(profile)
-            self.residual = Residual(stft, profile)
-        self._source = profile.echo.source_chain() if profile else SourceChain()
-        self._analyser = Analyser(stft, channels=4 if self.canceller else 2)
-        self._low_cut = None if profile or not self.canceller else low_cut(stft)
+            self.aligner = aligner = Aligner(stft.hop, profile)
+            if profile:
+                self.gate = OnsetGate(stft.hop, float(np.sum(np.square(profile.echo.impulse_response))))
+            self.linear_stage = LinearStage(aligner, source, self._make_canceller(profile), Residual(stft, profile))
+        self._analyser = Analyser(stft, channels=4 if self.linear_stage else 2)
+        self._low_cut = None if profile or not self.linear_stage else low_cut(stft)
         self._nothing = np.zeros(stft.bins, np.float32)
         self._fan = profile.noise_bins(stft) if profile else self._nothing
         self._silence = np.zeros(stft.bins, np.complex64)
@@ -61,13 +81,14 @@ class FrontEnd:
 
     def step(self, mic: Samples, ref: Samples) -> tuple[Frame, Aligned | None]:
         """One hop (hop,) of both channels to one frame, with what the aligner found."""
-        aligned = self.aligner.step(mic, ref) if self.aligner else None
-        reference = aligned.reference if aligned else ref
-        if not self.canceller:
-            x, r = self._analyser.push(mic, reference)
-            return Frame(x, r, self._silence, x, self._fan, self._nothing), aligned
-        linear = self._subtract(mic, aligned)
-        signals = np.stack((mic, reference, linear.echo, linear.error))
+        stage = self.linear_stage
+        if stage is None:
+            found = self.aligner.step(mic, ref) if self.aligner else None
+            x, r = self._analyser.push(mic, found.reference if found else ref)
+            return Frame(x, r, self._silence, x, self._fan, self._nothing), found
+        aligned = stage.aligner.step(mic, ref)
+        linear = stage.step(mic, aligned)
+        signals = np.stack((mic, aligned.reference, linear.echo, linear.error))
         if self.gate and (gain := self.gate.step(mic, ref, aligned)) is not None:
             signals[[0, 2, 3]] *= gain
             if self.gate.shuts:
@@ -76,7 +97,7 @@ class FrontEnd:
         if self._low_cut is not None:
             spectra *= self._low_cut
         x, r, e, error = spectra
-        noise, residual = self.residual.step(e, error, linear.uncertainty)
+        noise, residual = stage.residual.step(e, error, linear.uncertainty)
         return Frame(x, r, e, error, noise, residual), aligned
 
     def signals(self, mic: Samples, ref: Samples) -> tuple[Samples, Samples]:
@@ -84,16 +105,9 @@ class FrontEnd:
 
         The kind "full" alone has them.
         """
-        aligned = self.aligner.step(mic, ref)
-        return aligned.reference, self._subtract(mic, aligned).error
-
-    def _subtract(self, mic: Samples, aligned: Aligned) -> CancellerOutput:
-        """The linear stage's hop."""
-        if aligned.realigned:
-            self.canceller.rewrite_reference(
-                self._source.rewritten(self.aligner.history(self.canceller.history), self.hop)
-            )
-        return self.canceller.step(mic, self._source(aligned.reference), aligned.state not in UNLOCATED)
+        assert self.linear_stage is not None
+        aligned = self.linear_stage.aligner.step(mic, ref)
+        return aligned.reference, self.linear_stage.step(mic, aligned).error
 
 
 def low_cut(stft: StftConfig) -> Samples:

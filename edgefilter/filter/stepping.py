@@ -8,7 +8,7 @@ from collections.abc import Callable
 
 from edgefilter.engines.ladder import Ladder
 from edgefilter.filter.timing import Histogram
-from edgefilter.types import SAMPLE_RATE
+from edgefilter.types import SAMPLE_RATE, DeadlineStats, EventKind
 
 WINDOW_S = 1.0
 OVERLOADED = 0.25
@@ -42,6 +42,7 @@ class Stepping:
         self.budget_ms = self.hop_ms if budget_ms is None else min(budget_ms, self.hop_ms)
         self.ladder = ladder
         self.clock = clock
+        self._window = self._hops(WINDOW_S)
         self.reset()
 
     def reset(self) -> None:
@@ -49,7 +50,7 @@ class Stepping:
         self.times = Histogram()
         self.missed = self.over_budget = self.steps = 0
         self.behind_ms = self.most_behind_ms = 0.0
-        self._recent: deque[bool] = deque(maxlen=self._hops(WINDOW_S))
+        self._recent: deque[bool] = deque(maxlen=self._window)
         self._late = 0
         self._calm_hops = self._calm_late = 0
         self._patience_s = PATIENCE_S
@@ -58,7 +59,7 @@ class Stepping:
         if self.ladder:
             self.ladder.wanted = 0
 
-    def note(self, compute_s: float) -> tuple[str, str] | None:
+    def note(self, compute_s: float) -> tuple[EventKind, str] | None:
         """Take the compute time of one hop; return what happened and in which words, if anything did."""
         ms = 1000 * compute_s
         self.times.add(ms)
@@ -67,36 +68,33 @@ class Stepping:
         self.over_budget += late
         self.behind_ms = max(0.0, self.behind_ms + ms - self.hop_ms)
         self.most_behind_ms = max(self.most_behind_ms, self.behind_ms)
-        self._late += late - (self._recent[0] if len(self._recent) == self._recent.maxlen else 0)
+        self._late += late - (self._recent[0] if len(self._recent) == self._window else 0)
         self._recent.append(late)
         self._calm_hops += 1
         self._calm_late += late
         if self._since_up is not None:
             self._since_up += 1
-        if self._late >= OVERLOADED * self._recent.maxlen:
+        if self._late >= OVERLOADED * self._window:
             return self._down()
         return self._up()
 
-    def stats(self) -> dict[str, object]:
+    def stats(self) -> DeadlineStats:
         """Ready for JSON: times per hop, missed deadlines, hops over budget, how far behind it was at worst."""
-        found = {
+        return {
             "hop_ms": self.hop_ms,
             "budget_ms": self.budget_ms,
             "hops": self.times.count,
             "missed_deadlines": self.missed,
-        }
-        found |= {
             "over_budget": self.over_budget,
             "most_behind_ms": self.most_behind_ms,
             "steps": self.steps,
             "compute": self.times.to_dict(),
         }
-        return found
 
     def _hops(self, seconds: float) -> int:
         return max(1, round(1000 * seconds / self.hop_ms))
 
-    def _down(self) -> tuple[str, str] | None:
+    def _down(self) -> tuple[EventKind, str] | None:
         why = f"{self._late} of the last {len(self._recent)} hops took more than {self.budget_ms:.1f} ms"
         self._recent.clear()
         self._late = 0
@@ -108,9 +106,9 @@ class Stepping:
             failed = self._since_up < self._hops(PROVEN_S)
             self._patience_s = min(2 * self._patience_s, MOST_PATIENCE_S) if failed else PATIENCE_S
         self._since_up = None
-        return "stepped_down", f"{self._move(1)}: {why}"
+        return "stepped_down", f"{self._move(self.ladder, 1)}: {why}"
 
-    def _up(self) -> tuple[str, str] | None:
+    def _up(self) -> tuple[EventKind, str] | None:
         if self.ladder is None or self.ladder.wanted == 0:
             return None
         calm = self._hops(self._patience_s)
@@ -119,10 +117,10 @@ class Stepping:
         if self._calm_hops < calm:
             return None
         self._calm_hops = self._calm_late = self._since_up = 0
-        return "stepped_up", f"{self._move(-1)}: {self._patience_s:.0f} s within {self.budget_ms:.1f} ms"
+        return "stepped_up", f"{self._move(self.ladder, -1)}: {self._patience_s:.0f} s within {self.budget_ms:.1f} ms"
 
-    def _move(self, by: int) -> str:
-        before = self.ladder.rungs[self.ladder.wanted].name
-        self.ladder.wanted += by
+    def _move(self, ladder: Ladder, by: int) -> str:
+        before = ladder.rungs[ladder.wanted].name
+        ladder.wanted += by
         self.steps += 1
-        return f"from {before} to {self.ladder.rungs[self.ladder.wanted].name}"
+        return f"from {before} to {ladder.rungs[ladder.wanted].name}"

@@ -70,7 +70,7 @@ class Stream:
         self._judge = HumanJudge(stft, calibrated=self.profile is not None)
         self._barge_in = BargeIn(stft.hop / SAMPLE_RATE, self._barge_in_settings)
         self.samples_in = self.samples_out = self._stepped = 0
-        self._state = None if self.waits_for_end else self.engine.initial_state()
+        self._state = None if self.engine.lookahead is None else self.engine.initial_state()
         self._clip: list[Frame] = []
         self._synthesiser = Synthesiser(stft)
         self._mic, self._ref = Ring(2 * stft.hop), Ring(2 * stft.hop)
@@ -97,7 +97,7 @@ class Stream:
         if not missing:
             return np.zeros(0, np.float32)
         rest = self._run(padding, padding)
-        if self.waits_for_end:
+        if self.engine.lookahead is None:
             rest = self._finish([self._synthesiser.push(spectrum) for spectrum in self.engine.answer(self._clip)])
         return rest[:missing]
 
@@ -141,10 +141,11 @@ class Stream:
             self.events.append(
                 Event("realigned", self._stepped, f"reference arrives after {aligned.delay:.1f} samples")
             )
-        if self.waits_for_end:
-            self._collect(frame)
+        engine = self.engine
+        if engine.lookahead is None:
+            self._collect(frame, engine)
             return np.zeros(0, np.float32)
-        output, self._state = self.engine.step(frame, self._state)
+        output, self._state = engine.step(frame, self._state)
         self._judge_speech(frame, output.speech_probability)
         return self._synthesiser.push(output.spectrum)
 
@@ -156,11 +157,11 @@ class Stream:
         if talk := self._barge_in.note(self.speech_probability):
             self.events.append(Event(talk, self._stepped, f"probability {self.speech_probability or 0.0:.2f}"))
 
-    def _collect(self, frame: Frame) -> None:
+    def _collect(self, frame: Frame, engine: ClipEngine) -> None:
         self._clip.append(frame)
-        if len(self._clip) > self.engine.longest:
-            seconds = self.engine.longest * self.engine.stft.hop / SAMPLE_RATE
+        if len(self._clip) > engine.longest:
+            seconds = engine.longest * engine.stft.hop / SAMPLE_RATE
             raise SignalError(
-                f"the recording is longer than {seconds:.0f} s, which is all that engine {self.engine.name} takes at"
+                f"the recording is longer than {seconds:.0f} s, which is all that engine {engine.name} takes at"
                 " once: cut it or take another engine"
             )

@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
+from typing import TypeAlias
+
 from edgefilter.types import SAMPLE_RATE, Samples
+
+Powers: TypeAlias = tuple[float, float, float]
+"""<mic, mic>, <mic, echo> and <echo, echo>."""
 
 MEMORY = 0.8
 """Weight of the past in the correlation of microphone and echo per hop of 16 ms; about 80 ms."""
@@ -26,7 +31,7 @@ WITNESSES = 6
 PATIENCE = 25
 """Hops, 0.4 s, in which the witnesses must come, and in which nothing is suspected after a suspicion has ended."""
 SILENCE = 1e-10
-NOTHING = (0.0, 0.0, 0.0)
+NOTHING: Powers = (0.0, 0.0, 0.0)
 
 
 class Volume:
@@ -51,9 +56,11 @@ class Volume:
         m, e = mic[1:] - PRE_EMPHASIS * mic[:-1], echo[1:] - PRE_EMPHASIS * echo[:-1]
         now = float(m.dot(m)), float(m.dot(e)), float(e.dot(e))
         self._peak = max(now[2], self._forget * self._peak)
-        self._powers = heard, cross, expected = tuple(
-            MEMORY * before + (1.0 - MEMORY) * fresh for before, fresh in zip(self._powers, now)
-        )
+        before = self._powers
+        heard = MEMORY * before[0] + (1.0 - MEMORY) * now[0]
+        cross = MEMORY * before[1] + (1.0 - MEMORY) * now[1]
+        expected = MEMORY * before[2] + (1.0 - MEMORY) * now[2]
+        self._powers = heard, cross, expected
         if not self._known:
             self._known = heard > CONVERGED * _left(heard, cross, expected, 1.0) and now[2] > SILENCE * self._hop
             return 1.0
@@ -74,10 +81,11 @@ class Volume:
         error = _left(heard, cross, expected, 1.0)
         return error > max(NOTICED * heard, EXCESS * _left(heard, cross, expected, self._factor))
 
-    def _confirm(self, now: tuple[float, float, float]) -> float:
+    def _confirm(self, now: Powers) -> float:
         """Judge the suspected factor by what it leaves of the hops after those that it was found in."""
         if now[2] > AUDIBLE * self._peak:
-            self._since = tuple(before + fresh for before, fresh in zip(self._since, now))
+            before = self._since
+            self._since = before[0] + now[0], before[1] + now[1], before[2] + now[2]
             self._count += 1
         self._age += 1
         if self._count < WITNESSES:

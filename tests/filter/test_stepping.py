@@ -122,7 +122,7 @@ def test_alignment_and_linear_stage_run_on_through_a_step():
     assert not np.array_equal(out[settled], alone[0][settled])
     again = slice((160 + UP) * HOP, None)
     np.testing.assert_allclose(out[again], alone[0][again], atol=1e-4)  # the mask's memory of 5 frames began anew
-    assert stream.front.canceller.stats()["hops"] >= mic.size // HOP
+    assert stream.front.linear_stage.canceller.stats()["hops"] >= mic.size // HOP
 
 
 def test_a_step_does_not_click():
