@@ -18,7 +18,7 @@ from edgefilter.echo.recording import BLOCK, MAX_OFFSET, fitted_blocks, paired
 from edgefilter.echo.wiener import convolve_from, fit_filter
 from edgefilter.errors import SignalError
 from edgefilter.profile.data import DISTORTION_ORDERS, GRID_FFT, GRID_HZ, Profile
-from edgefilter.types import PRE_ROLL, SAMPLE_RATE, Samples
+from edgefilter.types import PRE_ROLL, SAMPLE_RATE, Array, Samples
 
 SOURCE = "made from the recording itself: what is stationary and linear is taken for the robot"
 TAPS = 4096
@@ -220,7 +220,7 @@ def fit_path(sound: Samples, target: Samples, weights: Samples, peak: float) -> 
     """
     rest = np.arange(target.size) // (BLOCK // 4) % 4 == 3
 
-    def left(prior: Samples) -> float:
+    def left(prior: Array) -> float:
         taps = fit_filter(sound, target, weights * ~rest, TAPS, 0, prior)
         return float(np.sum(weights * rest * (target - convolve_from(sound, taps, 0)) ** 2))
 
@@ -230,7 +230,7 @@ def fit_path(sound: Samples, target: Samples, weights: Samples, peak: float) -> 
     return fit_filter(sound, target, weights, TAPS, 0, best, steps=20)
 
 
-def decay_prior(seconds: float, peak: float) -> Samples:
+def decay_prior(seconds: float, peak: float) -> Array:
     """(TAPS,) expected squares: the direct sound's, and from 2 ms on 15 dB less, falling by 60 dB in that time.
 
     Before it 25 dB less.

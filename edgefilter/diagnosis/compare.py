@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass, field
 
 import numpy as np
+from numpy.typing import NDArray
 
 from edgefilter.diagnosis.prepare import Prepared, prepare
 from edgefilter.diagnosis.score import Judge
@@ -126,7 +127,7 @@ def describe(prepared: Prepared, model: EchoModel, score: Score | None = None) -
     score = score or Judge(prepared).of(model)
     measurement, prediction = prepared.measurement, score.prediction
     residual = measurement.recording - prediction
-    psd = measurement.noise_psd
+    psd = prepared.noise_psd
     flat = residual / model.microphone_gain(residual.size)
     white = whiten(flat, psd)
     use = prepared.usable
@@ -157,7 +158,7 @@ def describe(prepared: Prepared, model: EchoModel, score: Score | None = None) -
     )
 
 
-def _by_band(residual: Samples, psd: Samples, use: Array) -> tuple[tuple[float, float, float], ...]:
+def _by_band(residual: Samples, psd: Samples, use: NDArray[np.bool_]) -> tuple[tuple[float, float, float], ...]:
     """Mean PSD of the residual in each band over the fan's."""
     size = 2 * (psd.size - 1)
     whole = frames(use, size, size // 2).all(axis=1)

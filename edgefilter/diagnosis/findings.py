@@ -106,4 +106,5 @@ def _spread(value: np.ndarray, fits: list[np.ndarray]) -> tuple[np.ndarray, np.n
 def _interval(value: np.ndarray, low: np.ndarray, high: np.ndarray, unit: str) -> Interval:
     if value.ndim == 0:
         return Interval(float(value), float(low), float(high), unit)
-    return Interval(*(tuple(map(float, part)) for part in (value, low, high)), unit)
+    middle, least, most = (tuple(map(float, part)) for part in (value, low, high))
+    return Interval(middle, least, most, unit)

@@ -45,7 +45,7 @@ class Leftover:
 
 def inspect(prepared: Prepared, residual: Samples) -> Leftover:
     """Look at what a model leaves of a prepared recording, residual (n,)."""
-    psd = prepared.measurement.noise_psd
+    psd = prepared.noise_psd
     tones, mains, share = _tones(residual, psd)
     quiet = prepared.usable & ~prepared.active
     white = whiten(residual, psd)

@@ -102,18 +102,18 @@ def _steady(left: Leftover, criteria: Criteria) -> bool:
 def _with_fan(prepared: Prepared, name: str, measurement: Measurement, model: EchoModel) -> tuple[Prepared, Values]:
     """The recording with the fan's PSD as that effect, fitted to the measurement, has it; and the values of the fit."""
     values = complete(find(name), find(name).fit(measurement, model))
-    return prepared.behind(find(name).noise_psd(values, prepared.measurement.noise_psd)), values
+    return prepared.behind(find(name).noise_psd(values, prepared.noise_psd)), values
 
 
 def _change_db(before: Prepared, after: Prepared) -> float:
     """Change of the fan's whole power."""
-    was, now = (float(np.sum(prepared.measurement.noise_psd, dtype=np.float64)) for prepared in (before, after))
+    was, now = (float(np.sum(prepared.noise_psd, dtype=np.float64)) for prepared in (before, after))
     return 10.0 * np.log10(now / was)
 
 
 def _colour_db(before: Prepared, after: Prepared) -> float:
     """Standard deviation over frequency of the fan's change, dB."""
-    was, now = (prepared.measurement.noise_psd.astype(np.float64) for prepared in (before, after))
+    was, now = (prepared.noise_psd.astype(np.float64) for prepared in (before, after))
     spectrum = 10.0 * np.log10(now / was)
     count = spectrum.size // BAND
     return float(np.std(spectrum[: count * BAND].reshape(count, BAND).mean(axis=1)))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import cast
 
 import numpy as np
 import soxr
@@ -60,7 +61,17 @@ class Prepared:
     @property
     def held_out(self) -> NDArray[np.bool_]:
         """(n,) samples that no fit has used."""
-        return self.usable & ~self.measurement.fit
+        return self.usable & ~self.fit
+
+    @property
+    def fit(self) -> NDArray[np.bool_]:
+        """(n,) the samples to fit on, which prepare() always marks."""
+        return cast("NDArray[np.bool_]", self.measurement.fit)
+
+    @property
+    def noise_psd(self) -> Samples:
+        """(601,) the fan's PSD, which prepare() always knows."""
+        return cast(Samples, self.measurement.noise_psd)
 
     def behind(self, noise_psd: Samples) -> Prepared:
         """The same with another fan, of PSD (601,)."""
@@ -86,10 +97,11 @@ def prepare(profile: Profile, recording: Samples, reference: Samples, *, sample_
     offset = starting_offset(whiten(predicted, known), whiten(y, known))
     pieces = utterance_lags(x, predicted, y, known, offset)
     begin, end = known_span(x, start + pieces[0][2], start + pieces[-1][2])
-    x = sum(
+    shifted = (
         delayed(np.where((np.arange(n) >= first) & (np.arange(n) < last), x, np.float32(0)), start + lag)
         for first, last, lag in pieces
     )
+    x = sum(shifted, np.zeros(n, np.float32))
     predicted = model.predict(x)
     white = whiten(predicted, known)
     block = SAMPLE_RATE // 50

@@ -36,13 +36,13 @@ class Judge:
     def __init__(self, prepared: Prepared) -> None:
         self.prepared = prepared
         measurement = prepared.measurement
-        self.psd = measurement.noise_psd
+        self.psd = prepared.noise_psd
         self._fan = total_power(self.psd)
         n = measurement.recording.size
         self._window = hann(FRAME).astype(np.float32)
         hz = frequencies(FRAME // 2 + 1)
         self._expected = variance_at(hz, self.psd) * float(np.sum(self._window**2))
-        self._rows = measurement.fit & prepared.usable & prepared.active & (np.arange(n) % 3 == 0)
+        self._rows = prepared.fit & prepared.usable & prepared.active & (np.arange(n) % 3 == 0)
         starts = np.arange(0, n - FRAME - HOP * (FRAMES_PER_CELL - 1) + 1, HOP * FRAMES_PER_CELL)
         span = FRAME + HOP * (FRAMES_PER_CELL - 1)
         held = np.concatenate(([0], np.cumsum(prepared.held_out)))
@@ -104,7 +104,7 @@ class Judge:
             excess_db=_db(white[held]),
             active_db=_db(white[held & active]),
             silent_db=_db(white[held & ~active]),
-            fitted_db=_db(white[self.prepared.measurement.fit & active]),
+            fitted_db=_db(white[self.prepared.fit & active]),
             irreducible_db=_db(plain[held]) if unpredictable else 0.0,
             cells=cells,
             prediction=corrected,

@@ -31,6 +31,6 @@ def all_block_power(x: Samples, size: int) -> Array:
     return np.add.reduceat(x.astype(np.float64) ** 2, np.arange(0, x.size, size)) / size
 
 
-def decibels(power: Array | float, least: float = 1e-12) -> Array:
+def decibels(power: Array | np.floating | float, least: float = 1e-12) -> Array:
     """10 lg of a power, at least that of `least`."""
     return 10.0 * np.log10(np.maximum(power, least))

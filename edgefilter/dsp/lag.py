@@ -37,7 +37,7 @@ def flattened(spectrum: np.ndarray, floor: float) -> np.ndarray:
     return spectrum * (weight.dtype.type(1.0) / np.sqrt(weight, out=weight))
 
 
-def flat_cross(a: Samples, b: Samples, n: int) -> np.ndarray:
+def flat_cross(a: Array, b: Array, n: int) -> np.ndarray:
     """(n // 2 + 1,) cross-spectrum of b with a, both flattened, without rumble: for unknown signals."""
     first, second = (flattened(fft.rfft(x.astype(np.float64), n), 1e-6) for x in (a, b))
     cross = second * first.conj()

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy
+from numpy.typing import NDArray
 
 from edgefilter.dsp.lag import climb
 from edgefilter.types import Array, Samples
@@ -23,7 +24,7 @@ class LagTrack:
     correlation (b,): of the block with the prediction at that lag, 0 to 1.
     """
 
-    starts: Array
+    starts: NDArray[np.integer]
     size: int
     lag: Array
     sigma: Array
@@ -35,7 +36,7 @@ class LagTrack:
         return self.starts + self.size / 2
 
 
-def track_lag(predicted: Samples, recording: Samples, fit: np.ndarray | None, size: int, reach: int) -> LagTrack:
+def track_lag(predicted: Samples, recording: Samples, fit: NDArray[np.bool_] | None, size: int, reach: int) -> LagTrack:
     """Lags of up to +-reach samples of all blocks of `size` samples, every size / 2, that lie in fit and where the robot is heard.
 
     predicted, recording: (n,), both whitened. The peak of each block's cross-correlation, then Newton's method on the
@@ -58,7 +59,7 @@ def track_lag(predicted: Samples, recording: Samples, fit: np.ndarray | None, si
     return LagTrack(starts[good], size, (whole + fraction)[good], sigma[good], correlation[good])
 
 
-def _coarse(wide: Samples, block: Samples, reach: int) -> tuple[Array, Array]:
+def _coarse(wide: Samples, block: Samples, reach: int) -> tuple[NDArray[np.integer], Array]:
     """Whole lags (b,) and the normalised correlation there."""
     n = scipy.fft.next_fast_len(wide.shape[1], real=True)
     cross = scipy.fft.irfft(scipy.fft.rfft(wide, n) * np.conj(scipy.fft.rfft(block, n)), n)[:, : 2 * reach + 1]

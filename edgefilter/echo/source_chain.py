@@ -26,7 +26,7 @@ class SourceChain:
             for effect, values in chain(effects)
             if effect.stage == "source" and effect.memory is not None
         ]
-        self._memory = sum(effect.memory for effect, _ in self._chain)
+        self._memory = sum(effect.memory or 0 for effect, _ in self._chain)
         self._past = np.zeros(self._memory, np.float32)
 
     def __call__(self, block: Samples) -> Samples:

@@ -7,8 +7,11 @@ import importlib.util
 import sys
 import traceback
 from collections.abc import Callable, Mapping
+from importlib.abc import Loader
+from importlib.machinery import ModuleSpec
 from pathlib import Path
 from types import ModuleType
+from typing import cast
 
 import numpy as np
 
@@ -126,7 +129,7 @@ def _power(size: int | None) -> Callable:
     """A check for finite numbers of at least 0, size of them, or as many as the input has."""
 
     def check(effect: Effect, result: object, given: object) -> np.ndarray:
-        shape = (PSD_BINS,) if size else np.shape(given)
+        shape = (PSD_BINS,) if size else np.asarray(given).shape
         if (
             not isinstance(result, np.ndarray)
             or result.shape != shape
@@ -139,7 +142,7 @@ def _power(size: int | None) -> Callable:
     return check
 
 
-_RESULTS = {
+_RESULTS: dict[str, Callable] = {
     "apply": _like_input,
     "fit": _values,
     "variance": _power(None),
@@ -159,11 +162,12 @@ def _run(path: Path) -> ModuleType:
     if not path.is_file():
         raise UsageError(f"{path}: no such file; --effects takes the Python file that defines your effect")
     name = f"edgefilter_user_effect_{len(_loaded)}_{path.stem}"
-    spec = importlib.util.spec_from_file_location(name, path.resolve())
+    # None only where no loader goes with the suffix: .py has one
+    spec = cast(ModuleSpec, importlib.util.spec_from_file_location(name, path.resolve()))
     module = importlib.util.module_from_spec(spec)
     sys.modules[name] = module
     try:
-        spec.loader.exec_module(module)
+        cast(Loader, spec.loader).exec_module(module)
     except SyntaxError as error:
         raise UsageError(f"{path}: line {error.lineno} is not Python ({error.msg})") from None
     except (Exception, SystemExit) as error:

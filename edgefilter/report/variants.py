@@ -52,7 +52,7 @@ def compare_variants(
 
 def _with_noise(prepared: Prepared, findings: Sequence[Finding]) -> Prepared:
     """The same recording, the noise to be expected being that with the chosen effects on the fan."""
-    psd = prepared.measurement.noise_psd
+    psd = prepared.noise_psd
     for finding in findings:
         effect = find(finding.effect)
         psd = effect.noise_psd(complete(effect, finding.values), psd)

@@ -116,7 +116,7 @@ def _ring(x: Samples, frequency: float, q: float, sample_rate: int) -> NDArray[n
 
 def _shape(hz: Array, frequency: Array, q: float) -> NDArray[np.complex128]:
     """(modes, m) response of the mode at positive frequencies (its image at negative ones is left out)."""
-    pole = _pole(frequency, q, SAMPLE_RATE)
+    pole = np.asarray(_pole(frequency, q, SAMPLE_RATE))
     return (1.0 - np.abs(pole))[:, None] / (1.0 - pole[:, None] * np.exp(-2j * np.pi * hz[None, :] / SAMPLE_RATE))
 
 

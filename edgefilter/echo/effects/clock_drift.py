@@ -49,7 +49,8 @@ class ClockDrift(Effect):
     def fit(self, measurement: Measurement, model: VoiceModel) -> Values:
         """A robust line through the lags of all blocks, twice: the second time on the prediction that the first has straightened."""
         predicted, recording = measurement.heard(model)[0], measurement.white_recording
-        n, lag = np.arange(predicted.size), np.zeros(predicted.size)
+        n = np.arange(predicted.size)
+        lag: Array = np.zeros(predicted.size)
         for size, reach in PASSES:
             track = track_lag(
                 measurement.whiten(interpolate(predicted, n - lag)), recording, measurement.fit, size, reach

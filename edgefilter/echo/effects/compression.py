@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from itertools import product
 from typing import ClassVar
 
@@ -159,7 +160,14 @@ def _loudest(measurement: Measurement, from_start: bool) -> tuple[slice, np.ndar
     return part, chosen
 
 
-def _gauss_newton(at: Array, cost: float, predict, left, target: Samples, fit: np.ndarray) -> tuple[Array, float]:
+def _gauss_newton(
+    at: Array,
+    cost: float,
+    predict: Callable[[Array], Samples],
+    left: Callable[[Samples], float],
+    target: Samples,
+    fit: np.ndarray,
+) -> tuple[Array, float]:
     """One step, damped and shortened until it helps (Levenberg 1944); the unknowns and cost that it reaches."""
     base = predict(at)
     nudge = np.where(at + NUDGE > HIGHEST, -NUDGE, NUDGE)

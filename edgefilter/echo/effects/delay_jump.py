@@ -81,42 +81,40 @@ class DelayJump(Effect):
         if not 1 <= edges.size <= MOST_JUMPS or _line_is_as_good(track, edges, levels):
             return neutral(self)
         times = [_locate(predicted, recording, track, edge, levels[i : i + 2]) for i, edge in enumerate(edges)]
-        found = {"times_s": np.array(times) / SAMPLE_RATE, "samples": np.diff(levels), "offset": float(levels[0])}
-        return self._refined(measurement, model, found)
+        return self._refined(measurement, model, np.array(times) / SAMPLE_RATE, np.diff(levels), float(levels[0]))
 
-    def _refined(self, measurement: Measurement, model: VoiceModel, values: Values) -> Values:
-        """The same with each jump at the moment in the reference, and the gap filled in the way, that predicts best around it."""
+    def _refined(
+        self, measurement: Measurement, model: VoiceModel, times_s: Array, samples: Array, offset: float
+    ) -> Values:
+        """The values with each jump at the moment in the reference, and the gap filled in the way, that predicts best around it."""
 
-        def left(changed: Values, around: int) -> float:
+        def left(moments: Array, gap_gain: float, around: int) -> float:
             part = slice(max(around - HISTORY, 0), around + AFTERMATH)
             start = part.start / SAMPLE_RATE
-            late = changed["times_s"] > start
-            offset = changed["offset"] + float(changed["samples"][~late].sum())
-            times, steps = (changed["times_s"][late] - start, changed["samples"][late]) if late.any() else (0.0, 0.0)
-            local = complete(
-                self, {"times_s": times, "samples": steps, "offset": offset, "gap_gain": changed["gap_gain"]}
-            )
+            late = moments > start
+            before = offset + float(samples[~late].sum())
+            times, steps = (moments[late] - start, samples[late]) if late.any() else (0.0, 0.0)
+            local = complete(self, {"times_s": times, "samples": steps, "offset": before, "gap_gain": gap_gain})
             predicted = model.predict(self.apply(measurement.reference[part], local, SAMPLE_RATE))
             rest = measurement.whiten(measurement.recording[part] - predicted)
             return float(np.sum(rest[around - SETTLED - part.start :].astype(np.float64) ** 2))
 
-        times, total = values["times_s"] * SAMPLE_RATE, {}
-        for gap_gain in (1.0, 0.0) if np.any(values["samples"] > 1.0) else (1.0,):
-            moved = {**values, "times_s": times / SAMPLE_RATE, "gap_gain": gap_gain}
-            cost = 0.0
+        times, found = times_s * SAMPLE_RATE, []
+        for gap_gain in (1.0, 0.0) if np.any(samples > 1.0) else (1.0,):
+            moved, cost = times / SAMPLE_RATE, 0.0
             for i, time in enumerate(times):
                 around, at = int(time), time - DIRECT
                 for steps in SEARCH:
                     tries = []
                     for step in steps:
-                        moved["times_s"] = moved["times_s"].copy()
-                        moved["times_s"][i] = max(at + step, 0.0) / SAMPLE_RATE
-                        tries.append((left(moved, around), at + step))
+                        moved[i] = max(at + step, 0.0) / SAMPLE_RATE
+                        tries.append((left(moved, gap_gain, around), at + step))
                     least, at = min(tries)
-                moved["times_s"][i] = max(at, 0.0) / SAMPLE_RATE
+                moved[i] = max(at, 0.0) / SAMPLE_RATE
                 cost += least
-            total[gap_gain] = (cost, moved)
-        return min(total.values(), key=lambda pair: pair[0])[1]
+            found.append((cost, gap_gain, moved))
+        _, gap_gain, moved = min(found, key=lambda tried: tried[0])
+        return {"times_s": moved, "samples": samples, "offset": offset, "gap_gain": gap_gain}
 
     def sentence(self, values: Values) -> str:
         """Each step and its moment."""
@@ -157,7 +155,7 @@ def find_steps(lag: Array, sigma: Array) -> tuple[Array, Array]:
         del cuts[small[0] + 1]
 
 
-def _misfit(lag: Array, level: Array | float, sigma: Array) -> float:
+def _misfit(lag: Array, level: Array | np.floating | float, sigma: Array) -> float:
     return float(np.minimum(((lag - level) / sigma) ** 2, OUTLIER).sum())
 
 

@@ -62,7 +62,8 @@ def find_trigger(
     if min(fold.sum() for fold in folds) < 4 * BANDS:
         return None, False
     one = np.ones((len(power), 1), np.float32)
-    seen, best = power[use], (-np.inf, None, one)
+    seen = power[use]
+    best: tuple[float, Trigger | None, Samples] = (-np.inf, None, one)
     for resonance in RESONANCES_HZ:
         moved = resonated(x, resonance, Q)
         for share in SHARES:

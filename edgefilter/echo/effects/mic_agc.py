@@ -6,6 +6,7 @@ from typing import ClassVar
 
 import numpy as np
 import scipy
+from numpy.typing import NDArray
 
 from edgefilter.dsp.frames import block_power, blocks
 from edgefilter.echo.effect import Effect, Parameter, Stage
@@ -168,13 +169,10 @@ def _from_voice(voice: Samples, recording: Samples, measurement: Measurement) ->
     power = voice.astype(np.float64) ** 2 * measurement.weights
     cross = voice.astype(np.float64) * recording * measurement.weights
 
-    def total(weights: Array, at: Array) -> Array:
-        return np.bincount(at, weights, count)
-
-    main = total(power * (1 - up) ** 2, left) + total(power * up**2, left + 1)
+    main = _sums(left, power * (1 - up) ** 2, count) + _sums(left + 1, power * up**2, count)
     upper = np.zeros(count)
-    upper[1:] = total(power * up * (1 - up), left)[:-1]
-    return np.stack((upper, main)), total(cross * (1 - up), left) + total(cross * up, left + 1)
+    upper[1:] = _sums(left, power * up * (1 - up), count)[:-1]
+    return np.stack((upper, main)), _sums(left, cross * (1 - up), count) + _sums(left + 1, cross * up, count)
 
 
 def _from_fan(
@@ -187,7 +185,12 @@ def _from_fan(
     knot = np.round((np.arange(own.size) + 0.5) * FRAME / SAMPLE_RATE * KNOTS_HZ).astype(int)[usable]
     weight = FAN_TRUST * 2 * FRAME
     wanted = np.sqrt(heard[usable] / by_law[usable]) / overall
-    return np.bincount(knot, np.full(knot.size, weight), count), np.bincount(knot, weight * wanted, count)
+    return _sums(knot, np.full(knot.size, weight), count), _sums(knot, weight * wanted, count)
+
+
+def _sums(at: NDArray[np.integer], weights: Array, count: int) -> Array:
+    """(count,) float64, the weights (n,) summed by the knot (n,) that they are at."""
+    return np.asarray(np.bincount(at, weights, count), float)  # numpy's stub gives integers, weights or not
 
 
 def _smooth(matrix: Array, right: Array) -> Array:

@@ -199,7 +199,7 @@ def _roomy(measurement: Measurement) -> np.ndarray:
     if measurement.fit is None:
         return np.ones(measurement.recording.size, bool)
     ring = 2 * TAPS
-    total = np.concatenate((np.cumsum(measurement.fit), np.full(ring, np.count_nonzero(measurement.fit))))
+    total = np.cumsum(np.concatenate((measurement.fit, np.zeros(ring, bool))))
     return total[ring:] - total[:-ring] >= ring if total.size > ring else np.zeros(measurement.recording.size, bool)
 
 
