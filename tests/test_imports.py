@@ -6,6 +6,7 @@ import ast
 import json
 import subprocess
 import sys
+from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -145,6 +146,21 @@ def circles(arrows: set[Arrow]) -> list[list[str]]:
     return found
 
 
+def between_rooms(arrows: set[Arrow]) -> Counter[tuple[str, str]]:
+    """How many imports lead from one room (a folder or a file of the package) to another: (from, to): number."""
+    pairs = {(arrow.importer, arrow.imported) for arrow in arrows}
+    rooms = Counter((importer.split(".")[1], imported.split(".")[1]) for importer, imported in pairs)
+    return Counter(
+        {(importer, imported): count for (importer, imported), count in rooms.items() if importer != imported}
+    )
+
+
+def summary() -> str:
+    """The house in one line, as docs/architecture.md has it and docs/draw_imports.py writes it into its picture."""
+    rooms, arrows, rings = set().union(*LAYERS), between_rooms(ARROWS), circles(ARROWS)
+    return f"{len(rooms)} rooms on {len(LAYERS)} floors, {len(arrows)} arrows between rooms, {len(rings)} circles"
+
+
 def fresh(code: str) -> str:
     """What a new interpreter prints."""
     return subprocess.run(
@@ -207,6 +223,19 @@ def test_an_arrow_that_points_up_and_a_circle_are_seen():
     assert len(upward({up, beside, Arrow("edgefilter.cli", "edgefilter.errors", False)})) == 2
     ring = {Arrow(a, b, False) for a, b in ("ab", "bc", "ca", "cd", "ee")}
     assert sorted(circles(ring)) == [["a", "b", "c"], ["e"]]
+
+
+def test_the_page_and_its_picture_tell_the_counts_of_today():
+    """Where this fails: python -m docs.draw_imports, and the line it prints into the page."""
+    docs = PACKAGE.parent / "docs"
+    assert summary() in " ".join((docs / "architecture.md").read_text().split())
+    assert summary().encode() in (docs / "imports.png").read_bytes()
+
+
+def test_imports_between_rooms_are_counted_once_for_each_pair_of_files():
+    pairs = [("a.x", "b.y"), ("a.z", "b.y"), ("a.x", "a.z"), ("b.y", "c")]
+    arrows = {Arrow(f"p.{a}", f"p.{b}", typing) for a, b in pairs for typing in (False, True)}
+    assert between_rooms(arrows) == {("a", "b"): 2, ("b", "c"): 1}
 
 
 def test_importing_the_package_loads_nothing_and_the_command_line_no_heavy_package():
