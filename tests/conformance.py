@@ -11,7 +11,7 @@ from functools import lru_cache
 import numpy as np
 from scipy import signal
 
-from edgefilter.echo.effect import complete, neutral
+from edgefilter.echo.effect import RECORDING, complete, neutral
 from edgefilter.echo.effects import catalogue
 from edgefilter.echo.measurement import Measurement
 from edgefilter.echo.model import EchoModel
@@ -256,7 +256,7 @@ def effect_check_neutral_is_the_identity(name: str) -> None:
 
 def effect_check_any_length_goes_through(name: str) -> None:
     effect = catalogue.find(name)
-    values = complete(effect, EFFECT_CASES[name])
+    values = complete(effect, effect_case(name))
     for n in (0, 1, 100, 5000):
         x = robot_speech()[:n]
         out = effect.apply(x, values, SAMPLE_RATE)
@@ -293,7 +293,7 @@ def effect_check_fit_on_a_neutral_recording_stays_neutral(name: str) -> None:
 
 def effect_check_fit_explains_what_its_own_apply_made(name: str) -> None:
     """Of what the effect puts over the fan on held-out samples, at most a tenth is left, or LEFT_OVER."""
-    measurement, model = robot_alone(name, EFFECT_CASES[name], gain_db=0.0)
+    measurement, model = robot_alone(name, effect_case(name), gain_db=0.0)
     before = held_out_power(measurement, model.predict(measurement.reference))
     fitted = model.fit(name, measurement)
     if catalogue.find(name).stage == "noise":
@@ -330,7 +330,16 @@ EFFECT_CASES: dict[str, dict[str, object]] = {
         "inward": 0.003 * np.cos(np.arange(200) * 0.6) * np.exp(-np.arange(200) / 40),
     },
 }
-"""A strength of each effect that its own fit has to find again."""
+"""A strength that an effect's own fit has to find again, where half of the way to a bound is not one."""
+
+
+def effect_case(name: str) -> Mapping[str, object]:
+    """The effect at its case, or every number half of the way from neutral to its farther bound."""
+    if name in EFFECT_CASES:
+        return EFFECT_CASES[name]
+    numbers = [p for p in catalogue.find(name).parameters if p is not RECORDING]
+    return {p.name: (p.neutral + max(p.low, p.high, key=lambda bound: abs(bound - p.neutral))) / 2 for p in numbers}
+
 
 LEFT_OVER = {"mic_agc": 0.25, "rattle": 0.4}
 """The gain within held-out blocks is interpolated; knocks of a regular voice hardly tell resonance and threshold

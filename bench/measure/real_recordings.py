@@ -105,8 +105,8 @@ def markdown(rows: dict[str, dict]) -> str:
     ]
     lines += [
         (
-            "Model, linear, ss: level drop, dB. The thresholds of self_calibration.py were chosen while looking at"
-            " these recordings."
+            "Model, linear, ss: level drop, dB. The thresholds of edgefilter/calibration/from_recording.py were chosen"
+            " while looking at these recordings."
         ),
         "",
     ]

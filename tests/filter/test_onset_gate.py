@@ -39,15 +39,15 @@ def test_the_robot_is_lowered_until_its_lag_is_found(lags):
     ref, onsets = spoken(rng, [2.0, 2.0], [1.5, 1.0])
     mic = hear(ref, [(0, lags[0]), (onsets[1] - 100, lags[1])], h)[0] + fan(rng, ref.size, 0.001)
     mic, out, found = gated(mic, ref, h)
-    searching = np.array([aligned.state == "begun" for aligned in found])
+    begun = np.array([aligned.state == "begun" for aligned in found])
     loud = np.square(mic).sum(1)
     explained = np.array([np.dot(aligned.reference, aligned.reference) for aligned in found])
-    burst = (loud > 0.1 * loud.max()) & (explained < 0.01 * explained.max()) & searching
+    burst = (loud > 0.1 * loud.max()) & (explained < 0.01 * explained.max()) & begun
     second = np.arange(loud.size) > loud.size // 2
     for part in (second, ~second):
         assert np.any(burst & part)
         assert np.mean(out[burst & part] ** 2) < 0.1 * np.mean(mic[burst & part] ** 2)
-    assert np.array_equal(out[~searching, RAMP:], mic[~searching, RAMP:])
+    assert np.array_equal(out[~begun, RAMP:], mic[~begun, RAMP:])
 
 
 @pytest.mark.parametrize("level", [0.0, 0.1])

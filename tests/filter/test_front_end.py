@@ -1,0 +1,30 @@
+"""What the front end does to every spectrum."""
+
+import numpy as np
+
+from edgefilter import enhance
+from edgefilter.engines.linear import Linear
+from edgefilter.filter.front_end import RUMBLE, FrontEnd
+from edgefilter.types import SAMPLE_RATE
+from tests.engines.test_engines import robot
+
+
+def test_without_a_profile_rumble_is_lowered_and_with_one_it_is_as_it_was():
+    """A room at 40 Hz under a voice at 400 Hz; the robot is silent."""
+    t = np.arange(2 * SAMPLE_RATE) / SAMPLE_RATE
+    rumble, voice = ((0.1 * np.sin(2 * np.pi * hz * t)).astype(np.float32) for hz in (40, 400))
+    steady = slice(SAMPLE_RATE // 2, -SAMPLE_RATE // 2)
+    for profile, left in ((None, RUMBLE), (robot(), 1.0)):
+        out = enhance(rumble + voice, np.zeros(t.size, np.float32), profile, "linear")[steady]
+        for tone, gain in ((rumble, left), (voice, 1.0)):
+            found = float(out.dot(tone[steady]) / tone[steady].dot(tone[steady]))
+            assert abs(found - gain) < 0.05, (gain, found)  # a window's main lobe reaches 60 Hz beyond the tone
+
+
+def test_all_spectra_of_a_frame_lose_the_same_rumble():
+    """A mask is a ratio of them; one of them alone would be a wrong mask."""
+    front, noise = FrontEnd(Linear(), None), np.random.default_rng(0).standard_normal(512).astype(np.float32)
+    for hop in noise.reshape(2, -1):
+        frame, _ = front.step(hop, 0 * hop)
+    assert np.array_equal(frame.mic, frame.error)
+    assert np.abs(frame.mic[0]) < 0.1 * np.abs(frame.mic[3:]).max()
