@@ -21,7 +21,7 @@ from scipy.sparse.linalg import LinearOperator, lsmr
 
 from bench import results_writer
 from bench.measure.conversation import Conversation, every, find_conversations
-from bench.measure.real_streams import Cells, chosen, find_recordings, lay
+from bench.measure.real_streams import ECHO_ONLY, Cells, chosen, find_recordings, lay
 from edgefilter import enhance
 from edgefilter.errors import EdgefilterError
 from edgefilter.types import SAMPLE_RATE, Samples
@@ -70,13 +70,14 @@ def judge(mic: Samples, ref: Samples, human: Samples, span: slice, out: Samples,
 
 
 def real(options: argparse.Namespace) -> list[dict]:
-    recordings = chosen(find_recordings(options.recordings, options.echo_only), options.split, options.echo_only)
+    found = chosen(find_recordings(options.recordings, options.echo_only), options.split, options.echo_only)
+    recordings = [recording for recording in found if recording.kind == ECHO_ONLY]
     cells = Cells(sers=(10.0, 0.0, -10.0, -20.0), befores=(5.0,))
     rows = []
     for laid in lay(recordings, options.speech, None, cells, options.cases, options.seed):
         mic, ref, human, span = laid.signals()
-        found = judge(mic, ref, human, span, enhance(mic, ref, None, "linear"), ref)
-        rows.append({"kind": "real", "name": laid.name, "ser": laid.ser, **found})
+        judged = judge(mic, ref, human, span, enhance(mic, ref, None, "linear"), ref)
+        rows.append({"kind": "real", "name": laid.name, "ser": laid.ser, **judged})
     return rows
 
 

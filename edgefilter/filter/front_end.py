@@ -21,7 +21,7 @@ from edgefilter.types import Frame, Samples
 TAPS = (2048, 8192)
 """Least and most taps of the linear stage, 128 to 512 ms; between them the profile's impulse response decides."""
 
-RUMBLE_HZ, RUMBLE = 80.0, 0.05
+RUMBLE_HZ, RUMBLE = 90.0, 0.05
 """Below this frequency a microphone whose path nobody measured hears rooms, not people; it is lowered by 26 dB."""
 
 UNLOCATED = ("begun", "announced")
