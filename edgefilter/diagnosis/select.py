@@ -17,6 +17,8 @@ from edgefilter.diagnosis.trials import Found, Trial, Workbench, added
 from edgefilter.echo.effects.catalogue import find, names
 from edgefilter.echo.model import EchoModel
 
+FULL = "the search ended at {} effects with some error left: something further may be in the recording"
+
 
 def search(
     prepared: Prepared, model: EchoModel, criteria: Criteria, progress: Callable[[str], None] | None = None
@@ -30,9 +32,9 @@ def search(
         bench, model = Workbench(prepared, criteria, progress), step.model
     best = _best(bench, model, list(_runs(bench, model)))
     steps = _in_steps(bench, model, best)
-    return Found(
-        prepared, start, best, base, bench.score(best), ((step, *steps) if fan is not None else steps), bench.notes
-    )
+    full = len(added(model, best)) >= criteria.most_effects and not bench.explained(best)
+    notes = (*bench.notes, FULL.format(criteria.most_effects)) if full else bench.notes
+    return Found(prepared, start, best, base, bench.score(best), ((step, *steps) if fan is not None else steps), notes)
 
 
 def _runs(bench: Workbench, start: EchoModel) -> Iterator[EchoModel]:

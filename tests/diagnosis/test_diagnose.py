@@ -15,6 +15,7 @@ from edgefilter.diagnosis.criteria import Criteria
 from edgefilter.diagnosis.diagnose import Diagnosis, add, diagnose
 from edgefilter.diagnosis.prepare import prepare
 from edgefilter.diagnosis.score import Judge
+from edgefilter.diagnosis.select import search
 from edgefilter.diagnosis.trials import Trial, Workbench
 from edgefilter.dsp.fractional_delay import delayed
 from edgefilter.echo.effects.catalogue import find
@@ -82,6 +83,14 @@ def test_two_effects_at_once_are_both_found() -> None:
     found = diagnose(profile(), (clipped + fan()).astype(np.float32), x)
     assert sorted(names(found)) == ["chassis_resonance", "mic_clipping"]
     assert found.remaining_db < 1.0
+
+
+def test_a_search_that_ends_at_its_most_effects_says_so() -> None:
+    x = voice(SECONDS)
+    clipped = np.clip(echo(x) + 0.6 * signal.lfilter(*signal.iirpeak(1200.0, 30.0, fs=16000), echo(x)), -0.06, 0.06)
+    prepared = prepare(profile(), (clipped + fan()).astype(np.float32), x)
+    found = search(prepared, profile().echo, Criteria(most_effects=1))
+    assert [note for note in found.notes if note.startswith("the search ended at 1 effects")]
 
 
 def test_a_turned_volume_is_found_beside_a_fan_that_hides_it() -> None:
