@@ -12,7 +12,7 @@ import numpy as np
 from edgefilter.audio import pulse
 from edgefilter.audio.lookup import Device, match, monitor
 from edgefilter.audio.pairing import Pairing
-from edgefilter.audio.port import POLL_S, START_S, Input, Output
+from edgefilter.audio.port import POLL_S, START_S, InputPort, OutputPort
 from edgefilter.errors import DeviceError, UsageError
 from edgefilter.types import SAMPLE_RATE, Block, Samples
 
@@ -106,8 +106,8 @@ class LiveSource:
     def __init__(
         self, mic: str | int | Device | None, reference: str | int | Device | None = None, seconds: float | None = None
     ) -> None:
-        self._mic = Input(_sounddevice(), find(mic, "input"))
-        self._reference = None if reference is None else Input(_sounddevice(), find(reference, "input"))
+        self._mic = InputPort(_sounddevice(), find(mic, "input"))
+        self._reference = None if reference is None else InputPort(_sounddevice(), find(reference, "input"))
         self._pairing = Pairing()
         self._stopped = False
         self.total = None if seconds is None else round(seconds * SAMPLE_RATE)
@@ -132,7 +132,7 @@ class LiveSource:
             words = ", ".join(f"{count} {name.replace('_', ' ')}" for name, count in troubles.items())
             self.notes.append(f"live input was not complete: {words}")
 
-    def _ports(self) -> list[Input]:
+    def _ports(self) -> list[InputPort]:
         """The reference first, so that it is there when the microphone starts."""
         return [self._mic] if self._reference is None else [self._reference, self._mic]
 
@@ -211,7 +211,7 @@ class LiveSink:
     """
 
     def __init__(self, device: str | int | Device | None, latency: int = 0, wait: bool = True) -> None:
-        self._port = Output(_sounddevice(), find(device, "output"), latency, MARGIN_S)
+        self._port = OutputPort(_sounddevice(), find(device, "output"), latency, MARGIN_S)
         self._lead = round(latency * self._port.rate / SAMPLE_RATE) + self._port.margin
         self._most = self._lead + round(_SLACK_S * self._port.rate)
         self._wait, self._open = wait, False
@@ -285,9 +285,9 @@ def play_and_record(
     measures the hole.
     """
     sd = _sounddevice()
-    mic = Input(sd, find(microphone, "input"))
+    mic = InputPort(sd, find(microphone, "input"))
     played = np.concatenate((np.zeros(round(LEAD_S * SAMPLE_RATE), np.float32), samples.astype(np.float32)))
-    speaker = Output(sd, find(output, "output"), played.size)
+    speaker = OutputPort(sd, find(output, "output"), played.size)
     speaker.outlet.ring.write(speaker.convert(played, last=True))
     speaker.outlet.draining.set()  # nothing follows: silence after the last sample is no underrun
     begun: list[int] = []

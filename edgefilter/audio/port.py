@@ -130,7 +130,7 @@ def _words(error: Exception) -> str:
     return str(error.args[0] if error.args else error).splitlines()[0]
 
 
-class Input(Port):
+class InputPort(Port):
     """An input whose callback fills an Inlet, read as 16 kHz mono."""
 
     def __init__(self, sounddevice: Any, device: Device) -> None:
@@ -153,7 +153,7 @@ class Input(Port):
         return samples if self._resampler is None else self._resampler.resample_chunk(samples)
 
 
-class Output(Port):
+class OutputPort(Port):
     """An output whose callback empties an Outlet, fed with 16 kHz mono."""
 
     def __init__(self, sounddevice: Any, device: Device, queued: int, margin_s: float = 0.0) -> None:
