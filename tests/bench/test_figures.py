@@ -23,7 +23,6 @@ UNSTAMPED = (
     "canceller",
     "diagnosis_story",
     "hidden_effects",
-    "latency",
     "networks",
     "networks_effect",
     "quality_generated",
