@@ -187,7 +187,9 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
 
 def stamp(options: argparse.Namespace) -> dict:
     data = {"RECORDINGS": options.recordings, "HUMAN": options.speech, "FANS": options.noise}
-    return results_writer.stamp({what: [path] for what, path in data.items() if path}, options.systems, {"WHISPER": options.whisper})
+    return results_writer.stamp(
+        {what: [path] for what, path in data.items() if path}, options.systems, {"WHISPER": options.whisper}
+    )
 
 
 def main(arguments: list[str] | None = None) -> int:
