@@ -31,6 +31,7 @@ WITNESSES = 6
 PATIENCE = 25
 """Hops, 0.4 s, in which the witnesses must come, and in which nothing is suspected after a suspicion has ended."""
 SILENCE = 1e-10
+"""Mean square of an echo that is none."""
 NOTHING: Powers = (0.0, 0.0, 0.0)
 
 
