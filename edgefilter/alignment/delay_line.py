@@ -11,6 +11,9 @@ import numpy as np
 from edgefilter.dsp.fractional_delay import HALF_WIDTH, PHASES, tabulated
 from edgefilter.types import AlignmentState, Array, Samples
 
+UNLOCATED: tuple[AlignmentState, ...] = ("begun", "announced")
+"""States of the alignment in which the reference may lie elsewhere than the microphone hears it."""
+
 
 class Aligned(NamedTuple):
     """The reference as an aligner delivers it for one hop of the microphone.

@@ -196,3 +196,8 @@ def vanishes(effect: Effect, values: Values) -> bool:
 def first(values: Values, name: str) -> float:
     """A parameter as one number: the first where it holds several."""
     return float(np.ravel(values[name])[0])
+
+
+def number_or_taps(weights: Array) -> float | Array:
+    """A fitted filter (n,) as a parameter's value: the number itself where it has one tap only."""
+    return float(weights[0]) if weights.size == 1 else weights

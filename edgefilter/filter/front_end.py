@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from edgefilter.alignment.aligner import Aligner
-from edgefilter.alignment.delay_line import Aligned
+from edgefilter.alignment.delay_line import UNLOCATED, Aligned
 from edgefilter.alignment.paper import PaperAligner
 from edgefilter.dsp.stft import Analyser, StftConfig
 from edgefilter.echo.source_chain import SourceChain
@@ -23,10 +23,6 @@ TAPS = (2048, 8192)
 
 RUMBLE_HZ, RUMBLE = 90.0, 0.05
 """Below this frequency a microphone whose path nobody measured hears rooms, not people; it is lowered by 26 dB."""
-
-UNLOCATED = ("begun", "announced")
-"""States of the alignment in which the reference may lie elsewhere than the microphone hears it: the path is not
-adapted."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

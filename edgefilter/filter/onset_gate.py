@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from edgefilter.alignment.delay_line import Aligned
+from edgefilter.alignment.delay_line import UNLOCATED, Aligned
 from edgefilter.types import SAMPLE_RATE, Samples
 
 GATE = 0.003
@@ -74,7 +74,7 @@ class OnsetGate:
         if played > 1e-3 * self._loudest:
             self._loudest = max(played, self._decay * self._loudest)
         before = self.shut
-        if aligned.state not in ("begun", "announced"):
+        if aligned.state not in UNLOCATED:
             self._shut = 0
             if aligned.state == "locked" and explained > 0.1 * self._loudest:
                 self._gain += LEARNING * (min(heard / explained, 2 * self._gain) - self._gain)

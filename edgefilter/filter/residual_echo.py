@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from edgefilter.dsp import fourier
 from edgefilter.dsp.stft import StftConfig
 from edgefilter.types import Samples, Spectrum
 
@@ -34,11 +35,6 @@ FAN_START = 1e-9
 """Fan power per bin before anything was heard and without a profile."""
 FAN_RISE, FAN_FALL = 1.004, 0.97
 """How fast the fan's estimate follows per hop where there is no profile: up slowly, so that speech does not lift it."""
-
-
-def power(spectrum: Spectrum) -> Samples:
-    """|spectrum|^2 of any shape, without the square root of abs."""
-    return spectrum.real**2 + spectrum.imag**2
 
 
 class Residual:
@@ -73,9 +69,10 @@ class Residual:
         echo, error: (bins,) of the frame. uncertainty: (bins,), CancellerOutput.uncertainty of the frame's last hop.
         """
         self._echo *= TAIL_DECAY
-        np.maximum(power(echo), self._echo, out=self._echo)
+        np.maximum(fourier.power(echo), self._echo, out=self._echo)
         if self._fan is None:
-            self._smooth = 0.8 * self._smooth + 0.2 * power(error)
+            self._smooth *= 0.8
+            self._smooth += 0.2 * fourier.power(error)
             self._noise = np.minimum(np.maximum(self._smooth, FAN_FALL * self._noise), FAN_RISE * self._noise)
             self._noise_power = float(np.add.reduce(self._noise))
         self._below[:], self._above[:] = self._echo[0], self._echo[-1]

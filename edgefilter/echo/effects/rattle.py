@@ -10,7 +10,7 @@ import numpy as np
 import scipy
 
 from edgefilter.dsp.psd import floored
-from edgefilter.echo.effect import Effect, Parameter, Stage, complete, first, neutral
+from edgefilter.echo.effect import Effect, Parameter, Stage, complete, first, neutral, number_or_taps
 from edgefilter.echo.effects.knock_power import (
     BAND_HZ,
     BANDS,
@@ -145,7 +145,7 @@ class Rattle(Effect):
             at, sounds = trigger, np.zeros((2, 1))
         values = dict(zip(("resonance_hz", "q", "threshold", "side"), astuple(at), strict=True))
         values |= {
-            name: _number_or_taps(np.clip(sound, -BOUND, BOUND))
+            name: number_or_taps(np.clip(sound, -BOUND, BOUND))
             for name, sound in zip(("outward", "inward"), sounds, strict=True)
         }
         return {**values, **self._unpredictable(measurement, model, values)}
@@ -188,10 +188,6 @@ def _heard(x: Samples, values: Values, sample_rate: int) -> Samples:
     """(n,) the knocks of a drive x (n,), on the side that knocks."""
     moved = resonated(x, float(values["resonance_hz"]), float(values["q"]), sample_rate)
     return one_side(find_knocks(moved, float(values["threshold"])), float(values["side"]))
-
-
-def _number_or_taps(weights: Array) -> float | Array:
-    return float(weights[0]) if weights.size == 1 else weights
 
 
 def _roomy(measurement: Measurement) -> np.ndarray:

@@ -7,10 +7,10 @@ from typing import ClassVar
 import numpy as np
 
 from edgefilter.dsp.membrane import DISPLACEMENT_TAPS, displacement_taps
-from edgefilter.echo.effect import Effect, Parameter, Stage, first
+from edgefilter.echo.effect import Effect, Parameter, Stage, first, number_or_taps
 from edgefilter.echo.least_squares import NUISANCE_LEAD, filtered, normal_equations, short_filter
 from edgefilter.echo.measurement import Measurement, Values, VoiceModel, level_ratio
-from edgefilter.types import SAMPLE_RATE, Array, Samples
+from edgefilter.types import SAMPLE_RATE, Samples
 
 TAPS = 16
 """Taps of the filter behind each nonlinear function, where one number each is not enough."""
@@ -89,7 +89,7 @@ class SpeakerNonlinearity(Effect):
         added = added - level_ratio(added, linear) * linear
         level = 10.0 * np.log10(float(np.mean(added**2)) / (float(np.mean(linear**2)) + 1e-30) + 1e-12)
         values = {
-            name: _number_or_taps(np.clip(w[:taps] / gain, -BOUND, BOUND))
+            name: number_or_taps(np.clip(w[:taps] / gain, -BOUND, BOUND))
             for name, w in zip(TERMS, weights[1:], strict=True)
         }
         return {**values, "level_db": float(np.clip(level, SILENT_DB, 20.0))}
@@ -101,7 +101,3 @@ class SpeakerNonlinearity(Effect):
             f"products of the reference with itself, {level_db:.0f} dB re the voice, are in the residual: no linear"
             " path makes them"
         )
-
-
-def _number_or_taps(weights: Array) -> float | Array:
-    return float(weights[0]) if weights.size == 1 else weights
