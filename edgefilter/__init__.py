@@ -44,6 +44,8 @@ if TYPE_CHECKING:
     from edgefilter.filter.barge_in import BargeInSettings as BargeInSettings
     from edgefilter.filter.ego_filter import EgoFilter as EgoFilter
     from edgefilter.filter.ego_filter import enhance as enhance
+    from edgefilter.learning.background import BackgroundLearner as BackgroundLearner
+    from edgefilter.learning.path_learner import PathLearner as PathLearner
     from edgefilter.profile.data import Profile as Profile
     from edgefilter.types import SAMPLE_RATE as SAMPLE_RATE
     from edgefilter.types import Event as Event
@@ -76,6 +78,8 @@ _HOMES = {
     ),
     "filter.barge_in": ("BargeInSettings",),
     "filter.ego_filter": ("EgoFilter", "enhance"),
+    "learning.background": ("BackgroundLearner",),
+    "learning.path_learner": ("PathLearner",),
     "profile.data": ("Profile",),
     "types": ("SAMPLE_RATE", "Event", "Stats"),
 }

@@ -98,6 +98,14 @@ def _add_run(commands: argparse._SubParsersAction) -> None:
     run.add_argument(
         "--save-profile", metavar="P2.npz", help="write the profile with the echo path as it was adapted in this run"
     )
+    learning = run.add_mutually_exclusive_group()
+    learning.add_argument(
+        "--learn",
+        metavar="P.npz",
+        help="begin with what was learned in earlier runs, where the file exists (else with --profile), go on learning,"
+        " and keep it there",
+    )
+    learning.add_argument("--no-learn", action="store_true", help="do not learn loudspeaker and room while running")
     run.add_argument("--seconds", type=_positive, metavar="S", help="stop after S seconds")
     _effects_option(run)
     run.add_argument("--quiet", action="store_true", help="no progress bar, no level meter")

@@ -60,7 +60,14 @@ class Output(NamedTuple):
 
 
 EventKind: TypeAlias = Literal[
-    "realigned", "speech_started", "speech_stopped", "overloaded", "stepped_down", "stepped_up"
+    "realigned",
+    "speech_started",
+    "speech_stopped",
+    "overloaded",
+    "stepped_down",
+    "stepped_up",
+    "learned",
+    "unlearned",
 ]
 
 
@@ -73,7 +80,7 @@ class Event:
     kind : str
         What happened. "realigned": the reference was found elsewhere in the microphone. "speech_started",
         "speech_stopped": of the human, from engines that judge it. "overloaded", "stepped_down", "stepped_up": what too
-        little or enough time led to.
+        little or enough time led to. "learned", "unlearned": a better echo path was taken over, or given back.
     sample : int
         By which sample of the microphone, in whole hops.
     detail : str
@@ -143,7 +150,8 @@ class Stats(TypedDict):
 
     engine, engine_reason: the one at work, and why it was chosen. engines: those that can take turns. model: what a
     network's file says of itself, None without one. latency_ms: algorithmic, None for an engine that needs the whole
-    recording. samples: taken in so far. alignment, linear_stage: None for engines that go without.
+    recording. samples: taken in so far. alignment, linear_stage: None for engines that go without. learning: what the
+    learner did, None without one.
     """
 
     engine: str
@@ -154,6 +162,7 @@ class Stats(TypedDict):
     samples: int
     alignment: AlignmentStats | None
     linear_stage: LinearStageStats | None
+    learning: dict[str, object] | None
     deadline: DeadlineStats | None
 
 

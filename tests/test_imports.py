@@ -42,6 +42,7 @@ LAYERS = (
     {"calibration"},
     {"diagnosis"},
     {"session", "report"},
+    {"learning"},
     {"commands"},
     {"cli"},
 )

@@ -95,7 +95,7 @@ def self_calibrate(recording: Samples, reference: Samples) -> Profile:
     path = fit_path(sound, target, weights, float(np.square(rough).max()))
     predicted = convolve_from(sound, path, 0)
     _check_learned(target, predicted, fit, delay, ppm)
-    bands, snr = _snr_by_band(predicted)
+    bands, snr = bands_over_fan(predicted)
     return Profile(
         echo=_with_absorbed(EchoModel(path.astype(np.float32))),
         delay=float(delay),
@@ -240,7 +240,7 @@ def decay_prior(seconds: float, peak: float) -> Array:
     return peak * np.where(at < -16, 10**-2.5, np.where(at < 32, 1.0, late))
 
 
-def _snr_by_band(predicted: Samples) -> tuple[np.ndarray, np.ndarray]:
+def bands_over_fan(predicted: Samples) -> tuple[np.ndarray, np.ndarray]:
     """Third-octave bands (B, 2) Hz and the mean power of the whitened prediction in each over the fan's, dB."""
     bands = third_octave_bands()
     density = signal.welch(predicted, SAMPLE_RATE, nperseg=GRID_FFT, detrend=False)[1] * SAMPLE_RATE / 2

@@ -20,6 +20,9 @@ from edgefilter.errors import EdgefilterError, UsageError
 from edgefilter.filter.budget import DEFAULT_MS, Choice, choose
 from edgefilter.filter.budget_cache import forget
 from edgefilter.filter.ego_filter import EgoFilter
+from edgefilter.filter.learner import Learner
+from edgefilter.learning.background import LEAST_CORES, BackgroundLearner, cores
+from edgefilter.learning.path_learner import PathLearner
 from edgefilter.profile.data import Profile
 from edgefilter.session import RunReport, filter_blocks
 from edgefilter.types import SAMPLE_RATE, Event
@@ -74,14 +77,35 @@ def make_filter(args: argparse.Namespace, live: bool) -> tuple[EgoFilter, Choice
     if args.remeasure:
         forget()
     choice, engine, reason, budget_ms = None, args.engine, "asked for", args.budget_ms
-    profile = Profile.load(args.profile) if args.profile else None
+    profile = starting_profile(args)
     if engine == "auto" and not args.model and (live or budget_ms):
         choice = choose(budget_ms or DEFAULT_MS, profile, say=say)
         engine, reason, budget_ms = choice.engine, choice.reason, choice.budget_ms
-    ego = EgoFilter(profile, engine, budget_ms if live else None, reason, args.model)
+    learner = make_learner(args, live, profile)
+    ego = EgoFilter(profile, engine, budget_ms if live else None, reason, args.model, learn=learner)
     if profile is None and ego.engine_name in HAVE_LINEAR_STAGE:
         say(UNCALIBRATED)
     return ego, choice
+
+
+def starting_profile(args: argparse.Namespace) -> Profile | None:
+    """What was learned before, where there is such a file; else the calibration, where one was given."""
+    if args.learn and Path(args.learn).exists():
+        return Profile.load(args.learn)
+    return Profile.load(args.profile) if args.profile else None
+
+
+def make_learner(args: argparse.Namespace, live: bool, profile: Profile | None) -> Learner | None:
+    """A learner in another process for a live run, in this one for a recording; none where it would take the filter's core."""
+    if args.no_learn:
+        return None
+    remember = Path(args.learn) if args.learn else None
+    if not live:
+        return PathLearner(profile, remember)
+    if cores() < LEAST_CORES:
+        say("one core only: loudspeaker and room are not learned while running")
+        return None
+    return BackgroundLearner(profile, remember)
 
 
 UNCALIBRATED = (
@@ -105,7 +129,12 @@ def finish(
     figures = report.to_dict() | {"choice": choice.to_dict() if choice else None}
     figures |= {"source": source.stats(), "sink": sink.stats(), "notes": [*source.notes, *sink.notes]}
     failure = report.failure
-    for write, path in ((partial(write_json, figures), args.json), (partial(save_profile, ego), args.save_profile)):
+    endings = (
+        (partial(write_json, figures), args.json),
+        (partial(save_profile, ego), args.save_profile),
+        (lambda _: ego.close(), True),
+    )
+    for write, path in endings:
         try:
             if path:
                 write(path)
@@ -214,11 +243,13 @@ def say(text: str) -> None:
 
 
 def say_event(event: Event, live: bool) -> None:
-    """Tell of a change of engine when it happens, below the level meter where that is shown.
+    """Tell of a change of engine or path when it happens, below the level meter where that is shown.
 
     Live, also of the human's speech.
     """
-    if event.kind in ("stepped_down", "stepped_up", "overloaded") or (live and event.kind.startswith("speech")):
+    if event.kind in ("stepped_down", "stepped_up", "overloaded", "learned", "unlearned") or (
+        live and event.kind.startswith("speech")
+    ):
         say(
             f"{chr(10) if sys.stderr.isatty() else ''}{event.sample / SAMPLE_RATE:.1f} s:"
             f" {event.kind.replace('_', ' ')} {event.detail}"

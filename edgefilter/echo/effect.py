@@ -53,8 +53,8 @@ class Effect:
     least_gain_db: fall of the held-out level, and least_size_db: power over the fan of what changes, below which it is
     not named. cost: of a fit, in quarters of a second. last_resort: whether it is tried only where no other explains
     much. flexible: whether it has so many numbers that it takes up what a simpler effect beside it does.
-    leaves_noise: whether it leaves noise in the residual that no
-    waveform predicts; noise_words: what is said of that where a residual is described.
+    learned: whether it is fitted anew to what the running filter
+    hears. leaves_noise: whether it leaves noise in the residual that no waveform predicts; noise_words: what is said of that where a residual is described.
     """
 
     name: ClassVar[str]
@@ -73,6 +73,7 @@ class Effect:
     cost: ClassVar[int] = 1
     last_resort: ClassVar[bool] = False
     flexible: ClassVar[bool] = False
+    learned: ClassVar[bool] = False
     leaves_noise: ClassVar[bool] = False
     noise_words: ClassVar[str] = ""
 

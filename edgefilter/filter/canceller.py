@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -12,7 +12,7 @@ from edgefilter.dsp.membrane import DISPLACEMENT_TAPS, displacement_taps
 from edgefilter.errors import SignalError
 from edgefilter.filter.echo_limiter import EchoLimiter
 from edgefilter.filter.volume import Volume
-from edgefilter.types import SAMPLE_RATE, LinearStageStats, Samples
+from edgefilter.types import SAMPLE_RATE, LinearStageStats, Samples, Spectrum
 
 PRIOR_VARIANCE = 0.05
 """Variance of a calibrated path relative to its own power: the robot moved and the room is another."""
@@ -56,6 +56,8 @@ COLD = Adaptation(transition=0.9999, noise_memory=0.95, certainty=0.25, products
 """Without a calibrated path."""
 WARM = Adaptation(transition=0.99997, noise_memory=0.9, certainty=0.5, products=True, posterior=False)
 """From a calibrated path."""
+LEARNED = replace(COLD, products=True)
+"""From a path that an earlier run has learned, and for one that is learned beside the filter."""
 
 
 class CancellerOutput(NamedTuple):
@@ -63,12 +65,28 @@ class CancellerOutput(NamedTuple):
 
     echo, error: (hop,) float32 with error = mic - echo exactly. uncertainty: (hop + 1,) float32, what the filter itself
     expects of |error spectrum|^2 from its misalignment, for a rectangular frame of hop samples, on frequencies 0 to
-    Nyquist.
+    Nyquist. innovation: (hop,), the error of the prediction that knew nothing of this hop of the microphone.
     """
 
     echo: Samples
     error: Samples
     uncertainty: Samples
+    innovation: Samples
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CancellerState:
+    """What a canceller knows of the path: weights (rows, bins), their covariance and the noise (bins,) that it measured.
+
+    volume_gain: by how much the volume was turned since the path was measured.
+    """
+
+    taps: int
+    adaptation: Adaptation
+    weights: Spectrum
+    covariance: Samples
+    noise: Samples
+    volume_gain: float
 
 
 class Canceller:
@@ -158,7 +176,7 @@ class Canceller:
             self._covariance += VOLUME_REOPENS * fourier.power(self._weights)
             echo = echo * np.float32(turned)
         excessive = self._limiter.measure(mic, echo)
-        self._padded[self.hop :] = mic - echo
+        self._padded[self.hop :] = innovation = mic - echo
         error_spectrum = fourier.rfft(self._padded)
         memory = self.adaptation.noise_memory
         self._noise *= memory
@@ -173,7 +191,7 @@ class Canceller:
             if self.adaptation.posterior and not excessive:
                 echo = self._predict()
         echo = self._limiter.apply(echo)
-        return CancellerOutput(echo, mic - echo, 0.5 * misalignment)
+        return CancellerOutput(echo, mic - echo, 0.5 * misalignment, innovation)
 
     def _predict(self) -> Samples:
         """(hop,) echo of the newest hop by the weights as they are."""
@@ -248,6 +266,28 @@ class Canceller:
     def impulse_response(self) -> Samples:
         """The adapted path (taps,) float32, to be written back into a profile."""
         return fourier.irfft(self._weights[: self.partitions], 2 * self.hop)[:, : self.hop].reshape(-1)
+
+    def state(self) -> CancellerState:
+        """Copies of what it knows of the path, without the reference that is under way."""
+        return CancellerState(
+            self.taps,
+            self.adaptation,
+            self._weights.copy(),
+            self._covariance.copy(),
+            self._noise.copy(),
+            self.volume.gain,
+        )
+
+    @classmethod
+    def resumed(cls, state: CancellerState, hop: int) -> Canceller:
+        """A canceller that goes on from that state; its reference is to be rewritten before the next step."""
+        canceller = cls(hop, state.taps, adaptation=state.adaptation)
+        canceller._weights[:], canceller._covariance[:] = state.weights, state.covariance
+        canceller._noise[:] = state.noise
+        canceller._ageing = (1.0 - state.adaptation.transition**2) * fourier.power(canceller._weights)
+        canceller._warm, canceller.volume = True, Volume(hop)
+        canceller.volume.gain = state.volume_gain
+        return canceller
 
     def rewrite_reference(self, history: Samples) -> None:
         """Replace the past of the reference after a realignment.

@@ -13,6 +13,7 @@ from edgefilter.engines.base import ClipEngine, Engine
 from edgefilter.engines.ladder import CANDIDATES, Ladder, climbable
 from edgefilter.errors import EdgefilterError, SignalError, UsageError
 from edgefilter.filter.barge_in import BargeInSettings
+from edgefilter.filter.learner import Learner
 from edgefilter.filter.stepping import Stepping
 from edgefilter.filter.stream import Stream
 from edgefilter.profile.data import MAX_TAPS, Profile
@@ -40,6 +41,9 @@ class EgoFilter:
         The ONNX file that a neural engine, named in `engine`, loads in place of its own.
     barge_in : BargeInSettings, optional
         When speech counts as begun and as ended; `BargeInSettings` says what to choose.
+    learn : BackgroundLearner or PathLearner, optional
+        Learns loudspeaker and room while the filter runs, in another process or, for recordings, in this one; engines
+        without a linear stage do not need it. One learner serves one filter.
 
     Attributes
     ----------
@@ -79,6 +83,7 @@ class EgoFilter:
         reason: str = "asked for",
         model: str | Path | None = None,
         barge_in: BargeInSettings | None = None,
+        learn: Learner | None = None,
     ) -> None:
         if engine == "auto" and model is not None:
             raise UsageError(
@@ -89,7 +94,7 @@ class EgoFilter:
             strongest(self.profile) if engine == "auto" else (engines.create(engine, self.profile, model=model), reason)
         )
         ladder = None if budget_ms is None or best.lookahead is None else Ladder(climbable(best, self.profile))
-        self._stream = Stream(ladder or best, self.profile, Stepping(best.stft.hop, ladder, budget_ms), barge_in)
+        self._stream = Stream(ladder or best, self.profile, Stepping(best.stft.hop, ladder, budget_ms), barge_in, learn)
 
     @property
     def engine_name(self) -> str:
@@ -205,6 +210,17 @@ class EgoFilter:
         """Start anew, as after construction."""
         self._stream.reset()
 
+    def close(self) -> None:
+        """End the learner, which then keeps what it is to remember.
+
+        Raises
+        ------
+        ProfileError
+            Where that cannot be written.
+        """
+        if self._stream.learner:
+            self._stream.learner.close()
+
     def stats(self) -> Stats:
         """State of the path.
 
@@ -224,6 +240,7 @@ class EgoFilter:
             "samples": self._stream.samples_in,
             "alignment": front.aligner.stats() if front.aligner else None,
             "linear_stage": front.linear_stage.canceller.stats() if front.linear_stage else None,
+            "learning": self._stream.learner.stats() if self._stream.learner and front.linear_stage else None,
             "deadline": self._stream.stepping.stats() if self._stream.stepping else None,
         }
 
@@ -251,7 +268,8 @@ class EgoFilter:
             names = ", ".join(engines.HAVE_LINEAR_STAGE)
             raise SignalError(f"nothing to write back: give a profile and an engine with a linear stage ({names})")
         canceller = stage.canceller
-        echo = profile.echo.with_running_response(canceller.impulse_response(), canceller.volume.gain)
+        model = replace(profile.echo, effects=stage.path.effects)
+        echo = model.with_running_response(canceller.impulse_response(), canceller.volume.gain)
         return profile.with_echo(replace(echo, impulse_response=echo.impulse_response[:MAX_TAPS]))
 
 

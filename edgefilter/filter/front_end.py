@@ -2,44 +2,80 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from edgefilter.alignment.aligner import Aligner
 from edgefilter.alignment.delay_line import UNLOCATED, Aligned
 from edgefilter.alignment.paper import PaperAligner
 from edgefilter.dsp.stft import Analyser, StftConfig
-from edgefilter.echo.source_chain import SourceChain
 from edgefilter.engines.base import ClipEngine, Engine
 from edgefilter.filter.canceller import Canceller, CancellerOutput
+from edgefilter.filter.echo_path import EchoPath, starting_path
+from edgefilter.filter.learner import Heard, Learner, Lesson
 from edgefilter.filter.onset_gate import GATE, OnsetGate
 from edgefilter.filter.residual_echo import Residual
 from edgefilter.profile.data import Profile
 from edgefilter.types import Frame, Samples
 
-TAPS = (2048, 8192)
-"""Least and most taps of the linear stage, 128 to 512 ms; between them the profile's impulse response decides."""
-
 RUMBLE_HZ, RUMBLE = 90.0, 0.05
 """Below this frequency a microphone whose path nobody measured hears rooms, not people; it is lowered by 26 dB."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
 class LinearStage:
-    """What the kind "full" alone has: the tracked delay, the source's effects, the canceller and what it leaves."""
+    """What the kind "full" alone has: the tracked delay, the echo path, and what it leaves.
 
-    aligner: Aligner
-    source: SourceChain
-    canceller: Canceller
-    residual: Residual
+    learner: told of every hop; what it answers is adopted with the next one. lesson: the one that was adopted in the
+    latest hop.
+    """
+
+    lesson: Lesson | None = None
+    _next: Lesson | None = None
+    _heard: Heard | None = None
+
+    def __init__(self, aligner: Aligner, path: EchoPath, residual: Residual, learner: Learner | None = None) -> None:
+        self.aligner = aligner
+        self.path = path
+        self.residual = residual
+        self._learner = learner
+        self._fade = np.linspace(0.0, 1.0, aligner.hop, dtype=np.float32)
+        if learner:
+            learner.start(path.state(), aligner.hop)
+
+    @property
+    def canceller(self) -> Canceller:
+        """The adaptive filter in use."""
+        return self.path.canceller
 
     def step(self, mic: Samples, aligned: Aligned) -> CancellerOutput:
         """One hop (hop,) of the microphone, with what the aligner found in it."""
-        if aligned.realigned:
-            past = self.aligner.history(self.canceller.history)
-            self.canceller.rewrite_reference(self.source.rewritten(past, mic.size))
-        return self.canceller.step(mic, self.source(aligned.reference), aligned.state not in UNLOCATED)
+        located = aligned.state not in UNLOCATED
+        past = self._past() if aligned.realigned else None
+        output = self.path.step(mic, aligned.reference, located, past)
+        self.lesson, self._next = self._next, None
+        if self.lesson:
+            output = self._adopt(self.lesson, mic, aligned.reference, located, output)
+        if self._learner:
+            idle = aligned.state == "idle"
+            self._heard = Heard(mic, aligned.reference, output.innovation, located, idle, past, aligned.delay)
+        return output
+
+    def learn(self) -> None:
+        """Tell the learner of the latest hop."""
+        if self._learner and self._heard:
+            self._next = self._learner.hear(self._heard)
+
+    def _adopt(
+        self, lesson: Lesson, mic: Samples, reference: Samples, located: bool, before: CancellerOutput
+    ) -> CancellerOutput:
+        """Fade from what the path of before made of this hop to what the learned one makes of it."""
+        self.path = EchoPath.resumed(lesson.path, self._past(), mic.size)
+        after = self.path.step(mic, reference, located)
+        echo = before.echo + self._fade * (after.echo - before.echo)
+        return CancellerOutput(echo, mic - echo, after.uncertainty, after.innovation)
+
+    def _past(self) -> Samples:
+        wanted = self._learner.past if self._learner else 0
+        return self.aligner.history(max(self.path.canceller.history, wanted))
 
 
 class FrontEnd:
@@ -49,31 +85,30 @@ class FrontEnd:
     aligner: None for "none". linear_stage: None but for "full". gate: None but for "full" with a profile.
     """
 
-    def __init__(self, engine: Engine | ClipEngine, profile: Profile | None) -> None:
+    def __init__(self, engine: Engine | ClipEngine, profile: Profile | None, learner: Learner | None = None) -> None:
         stft = engine.stft
         self.hop = stft.hop
         self.aligner: Aligner | PaperAligner | None = None
         self.gate: OnsetGate | None = None
         self.linear_stage: LinearStage | None = None
-        source = profile.echo.source_chain() if profile else SourceChain()
         if engine.front == "paper":
             self.aligner = PaperAligner(stft.hop)
         elif engine.front == "full":
             self.aligner = aligner = Aligner(stft.hop, profile)
             if profile:
                 self.gate = OnsetGate(stft.hop, float(np.sum(np.square(profile.echo.impulse_response))))
-            self.linear_stage = LinearStage(aligner, source, self._make_canceller(profile), Residual(stft, profile))
+            path = starting_path(profile, stft.hop)
+            self.linear_stage = LinearStage(aligner, path, Residual(stft, profile), learner)
         self._analyser = Analyser(stft, channels=4 if self.linear_stage else 2)
         self._low_cut = None if profile or not self.linear_stage else low_cut(stft)
         self._nothing = np.zeros(stft.bins, np.float32)
         self._fan = profile.noise_bins(stft) if profile else self._nothing
         self._silence = np.zeros(stft.bins, np.complex64)
 
-    def _make_canceller(self, profile: Profile | None) -> Canceller:
-        if profile is None:
-            return Canceller(self.hop)
-        response = profile.echo.running_response()
-        return Canceller(self.hop, taps=int(np.clip(response.size, *TAPS)), impulse_response=response)
+    @property
+    def lesson(self) -> Lesson | None:
+        """What was learned and taken over in the latest hop."""
+        return self.linear_stage.lesson if self.linear_stage else None
 
     def step(self, mic: Samples, ref: Samples) -> tuple[Frame, Aligned | None]:
         """One hop (hop,) of both channels to one frame, with what the aligner found."""

@@ -12,6 +12,7 @@ from edgefilter.engines.base import ClipEngine, Engine
 from edgefilter.errors import SignalError
 from edgefilter.filter.barge_in import BargeIn, BargeInSettings, HumanJudge
 from edgefilter.filter.front_end import FrontEnd
+from edgefilter.filter.learner import Learner
 from edgefilter.filter.stepping import Stepping
 from edgefilter.profile.data import Profile
 from edgefilter.types import SAMPLE_RATE, Event, Frame, Samples, as_samples
@@ -24,7 +25,8 @@ class Stream:
     all inputs. Sample n is out once n + latency samples have come in. After flush as many samples are out as went in.
     With an engine that waits for the end (waits_for_end) process returns nothing and flush everything. stepping: told
     the compute time of every hop; what it answers becomes an event. barge_in: when speech counts as begun and ended,
-    None for the defaults. speech_probability: of the last hop, weighed with what robot and room leave; None before the
+    None for the defaults. learner: of better echo paths, for engines
+    with a linear stage. speech_probability: of the last hop, weighed with what robot and room leave; None before the
     first hop and where the engine does not judge it.
     """
 
@@ -34,10 +36,12 @@ class Stream:
         profile: Profile | None = None,
         stepping: Stepping | None = None,
         barge_in: BargeInSettings | None = None,
+        learner: Learner | None = None,
     ) -> None:
         self.engine = engine
         self.profile = profile
         self.stepping = stepping
+        self.learner = learner
         self._barge_in_settings = barge_in or BargeInSettings()
         self.reset()
 
@@ -64,7 +68,7 @@ class Stream:
         stft = self.engine.stft
         if self.stepping:
             self.stepping.reset()
-        self.front = FrontEnd(self.engine, self.profile)
+        self.front = FrontEnd(self.engine, self.profile, self.learner)
         self.events: deque[Event] = deque(maxlen=1000)
         self.speech_probability: float | None = None
         self._judge = HumanJudge(stft, calibrated=self.profile is not None)
@@ -125,8 +129,14 @@ class Stream:
         return out[early:]
 
     def _watched_step(self, mic: Samples, ref: Samples) -> Samples:
-        if self.stepping is None:
-            return self._step(mic, ref)
+        """One hop; the time that it takes is watched, the learner's is not, which lives in another process where time counts."""
+        out = self._timed_step(mic, ref) if self.stepping else self._step(mic, ref)
+        if self.learner and self.front.linear_stage:
+            self.front.linear_stage.learn()
+        return out
+
+    def _timed_step(self, mic: Samples, ref: Samples) -> Samples:
+        assert self.stepping is not None
         began = self.stepping.clock()
         out = self._step(mic, ref)
         happened = self.stepping.note(self.stepping.clock() - began)
@@ -141,6 +151,8 @@ class Stream:
             self.events.append(
                 Event("realigned", self._stepped, f"reference arrives after {aligned.delay:.1f} samples")
             )
+        if lesson := self.front.lesson:
+            self.events.append(Event(lesson.kind, self._stepped, lesson.detail))
         engine = self.engine
         if engine.lookahead is None:
             self._collect(frame, engine)

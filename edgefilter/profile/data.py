@@ -25,6 +25,8 @@ GRID_HZ = np.arange(GRID_BINS) * SAMPLE_RATE / GRID_FFT
 DISTORTION_ORDERS = (2, 3, 4, 5)
 MAX_TAPS = 4 * SAMPLE_RATE
 MAX_DELAY = 4 * SAMPLE_RATE
+LEARNED = "what the running filter learned"
+"""Source of a profile that no calibration made."""
 PROBE = 1600
 """Samples of sound on which the effects of a loaded profile are tried."""
 
@@ -169,6 +171,11 @@ class Profile:
             return profile
         except ProfileError as error:
             raise ProfileError(f"{path}: {error}") from None
+
+    @property
+    def learned(self) -> bool:
+        """Whether the running filter wrote it: its path is known as well as speech can teach it, not as a sweep can."""
+        return self.source == LEARNED
 
     def with_impulse_response(self, impulse_response: Samples) -> Profile:
         """The same robot with another path (taps,) float32, for example the one that the running filter has adapted."""

@@ -45,6 +45,7 @@ class SpeakerNonlinearity(Effect):
     stage: ClassVar[Stage] = "source"
     title: ClassVar[str] = "loudspeaker nonlinearity"
     flexible: ClassVar[bool] = True
+    learned: ClassVar[bool] = True
     memory: ClassVar[int | None] = DISPLACEMENT_TAPS + TAPS
     parameters: ClassVar[tuple[Parameter, ...]] = (
         Parameter("even", "1/full scale", 0.0, -BOUND, BOUND),

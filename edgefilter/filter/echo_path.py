@@ -1,0 +1,68 @@
+"""The way from the reference to the microphone as it is believed to be: the source's effects and the adaptive filter behind them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from edgefilter.echo.measurement import Values
+from edgefilter.echo.source_chain import SourceChain
+from edgefilter.filter.canceller import LEARNED, WARM, Canceller, CancellerOutput, CancellerState
+from edgefilter.profile.data import Profile
+from edgefilter.types import Samples
+
+TAPS = (2048, 8192)
+"""Least and most taps of the linear stage, 128 to 512 ms; between them the profile's impulse response decides."""
+
+Effects = tuple[tuple[str, Values], ...]
+"""(name, values) of effects."""
+
+
+@dataclass(frozen=True, slots=True)
+class PathState:
+    """An EchoPath at one moment, without the sound that is under way in it: what can be handed to another one."""
+
+    effects: Effects
+    canceller: CancellerState
+
+
+class EchoPath:
+    """Predicts and subtracts the echo: the effects ahead of the loudspeaker, then the canceller.
+
+    effects: of the whole model; those of other stages than "source" are left to the canceller's impulse response.
+    """
+
+    def __init__(self, canceller: Canceller, effects: Effects = ()) -> None:
+        self.effects = effects
+        self.canceller = canceller
+        self._source = SourceChain(effects)
+
+    def step(self, mic: Samples, reference: Samples, located: bool, past: Samples | None = None) -> CancellerOutput:
+        """One hop (hop,) of the microphone and of the aligned reference.
+
+        past: (n,) the aligned reference up to and with this hop where its delay was switched in it, else None.
+        """
+        if past is not None:
+            self.canceller.rewrite_reference(self._source.rewritten(past, mic.size))
+        return self.canceller.step(mic, self._source(reference), located)
+
+    def state(self) -> PathState:
+        """Copies of what it knows."""
+        return PathState(self.effects, self.canceller.state())
+
+    @classmethod
+    def resumed(cls, state: PathState, past: Samples, hop: int) -> EchoPath:
+        """The path of that state. past: (n,) the aligned reference up to and with the hop that is stepped next."""
+        path = cls(Canceller.resumed(state.canceller, hop), state.effects)
+        path.canceller.rewrite_reference(path._source.rewritten(past, hop))
+        return path
+
+
+def starting_path(profile: Profile | None, hop: int) -> EchoPath:
+    """What a filter with that profile, or with none, begins with."""
+    if profile is None:
+        return EchoPath(Canceller(hop))
+    response = profile.echo.running_response()
+    adaptation = LEARNED if profile.learned else WARM
+    return EchoPath(Canceller(hop, int(np.clip(response.size, *TAPS)), response, adaptation), profile.echo.effects)

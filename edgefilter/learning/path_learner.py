@@ -1,0 +1,187 @@
+"""Learning beside the running filter: fit the loudspeaker, replay the last minute with it, and let the result prove itself."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from scipy import signal
+
+from edgefilter.dsp.psd import floored
+from edgefilter.echo.effects.catalogue import EFFECTS
+from edgefilter.echo.measurement import Measurement
+from edgefilter.echo.model import EchoModel
+from edgefilter.filter.canceller import Canceller
+from edgefilter.filter.echo_path import TAPS, EchoPath, Effects, PathState, starting_path
+from edgefilter.filter.learner import Heard, Lesson
+from edgefilter.learning.contest import Rival
+from edgefilter.learning.remember import learned_profile
+from edgefilter.learning.tape import Tape, emphasised
+from edgefilter.profile.data import Profile
+from edgefilter.types import SAMPLE_RATE, Samples
+
+MINUTE = 60.0
+FIRST_S, FACTOR, EVERY_S = 2.0, 1.5, 20.0
+"""Seconds of audible robot until the first fit, the factor to the next one, and the longest wait."""
+AUDIBLE = 1e-2
+"""The robot is audible where the reference's power is within 20 dB of its recent peak, which fades by ..."""
+FADE = 0.9995
+"""... this factor a hop."""
+WORTH_S = 5.0
+"""Seconds of audible robot from which on what was learned may be worth keeping."""
+PSD_FFT = 1200
+TWICE_S = 15.0
+"""Up to as many seconds teach more where they are heard twice."""
+
+
+class PathLearner:
+    """Learns from every hop it is told, and answers with a lesson where a better path has proved itself.
+
+    Parameters
+    ----------
+    profile : Profile, optional
+        What the filter began with.
+    remember : Path, optional
+        Where to keep what was learned, as a profile for the next time: after each fit and at the end, wherever a filter
+        that begins with it leaves less of the last minute than one that begins with `profile`.
+
+    Notes
+    -----
+    It keeps the last minute. Now and then it fits the loudspeaker's effects to it, lets a filter that knows them from
+    the beginning hear the minute, and then runs that filter beside the one in use. Where it predicts clearly better
+    what neither has heard before, it is the lesson; the one that it replaces runs on and comes back where it proves the
+    better one. All follows from the hops alone: the same recording teaches the same.
+
+    Examples
+    --------
+    >>> import edgefilter
+    >>> learner = edgefilter.PathLearner()
+    >>> ego = edgefilter.EgoFilter(engine="linear", learn=learner)
+    >>> learner.stats()["learned"]
+    0
+    """
+
+    past = TAPS[1] + 4 * 256
+    """Samples of the aligned reference that it wants after a switch of the delay."""
+
+    def __init__(self, profile: Profile | None = None, remember: Path | None = None) -> None:
+        self._profile, self._remember = profile, remember
+
+    def start(self, path: PathState, hop: int) -> None:
+        """A stream begins with that path."""
+        self._hop, self._begin = hop, path
+        self._silence = np.zeros(self.past, np.float32)
+        self._tape = Tape(hop, MINUTE)
+        self._running = self._resumed(path)
+        self._rivals: list[Rival] = []
+        self._audible_s, self._next_s, self._peak = 0.0, FIRST_S, 0.0
+        self._counts = {"rounds": 0, "learned": 0, "unlearned": 0, "remembered": 0}
+
+    def hear(self, heard: Heard) -> Lesson | None:
+        """Take one hop; compare, and now and then fit."""
+        self._tape.append(heard)
+        self._running.step(heard.mic, heard.reference, heard.located, heard.past)
+        audible = self._audible(heard)
+        left = emphasised(heard.innovation)
+        for rival in self._rivals:
+            rival.step(heard, left, audible)
+        won = [rival for rival in self._rivals if rival.won]
+        if won:
+            return self._adopt(max(won, key=lambda rival: rival.gain_db))
+        self._rivals = [rival for rival in self._rivals if not rival.over]
+        if audible and self._audible_s >= self._next_s:
+            self._next_s = min(self._next_s * FACTOR, self._next_s + EVERY_S)
+            self._rivals = [rival for rival in self._rivals if rival.before] + self._candidates()
+            self._keep()
+        return None
+
+    def stats(self) -> dict[str, object]:
+        """What was learned so far."""
+        return {**self._counts, "heard_s": round(self._audible_s, 2)}
+
+    def close(self) -> None:
+        """Keep what was learned, where it is to be remembered and worth it.
+
+        Raises
+        ------
+        ProfileError
+            Where the file cannot be written.
+        """
+        self._keep()
+
+    def _audible(self, heard: Heard) -> bool:
+        power = float(heard.reference.dot(heard.reference))
+        self._peak = max(power, FADE * self._peak)
+        audible = heard.located and power > AUDIBLE * self._peak and power > 1e-8
+        self._audible_s += audible * self._hop / SAMPLE_RATE
+        return audible
+
+    def _adopt(self, winner: Rival) -> Lesson:
+        kind = "unlearned" if winner.before else "learned"
+        self._counts[kind] += 1
+        detail = f"{winner.was}: {winner.gain_db:.1f} dB less is left of the robot"
+        self._rivals = [] if winner.before else [Rival(self._running, "the path of before", before=True)]
+        self._running = winner.path
+        return Lesson(winner.path.state(), kind, detail)
+
+    def _candidates(self) -> list[Rival]:
+        """Paths that have heard the whole tape: with what it teaches of the loudspeaker, and without."""
+        self._counts["rounds"] += 1
+        rivals = [
+            Rival(self._fresh(self._fitted()), "loudspeaker and path"),
+            Rival(self._fresh(self._begin.effects), "path"),
+        ]
+        for rival in rivals:
+            for _ in range(2 if self._audible_s < TWICE_S else 1):
+                self._tape.replay(rival.path)
+        return rivals
+
+    def _fitted(self) -> Effects:
+        """The effects in use, those that can be learned as they explain the tape."""
+        mic, reference, innovation = self._tape.signals()
+        peak = float(np.square(reference).max())
+        loud = signal.oaconvolve(np.square(reference), np.full(4800, 1 / 4800))[: mic.size] > 1e-3 * peak / 10
+        use = self._tape.straight() & loud
+        noise = psd(innovation[use])
+        measurement = Measurement(reference, mic, noise, use)
+        effects = self._begin.effects
+        path = self._running.canceller.impulse_response()
+        for effect in EFFECTS:
+            if effect.learned:
+                others = tuple(entry for entry in effects if entry[0] != effect.name)
+                values = effect.fit(measurement, EchoModel(path, tuple(e for e in others if e[0] in SOURCES)))
+                effects = (*others, (effect.name, values))
+        return effects
+
+    def _fresh(self, effects: Effects) -> EchoPath:
+        """The path of the beginning with those effects, before it has heard anything."""
+        begin = self._begin.canceller
+        calibrated = begin.weights.any()
+        response = Canceller.resumed(begin, self._hop).impulse_response() if calibrated else None
+        adaptation = replace(begin.adaptation, products=True)
+        return EchoPath(Canceller(self._hop, TAPS[1], response, adaptation), effects)
+
+    def _keep(self) -> None:
+        """Write the file where whoever begins with it is better off."""
+        if self._remember is None or self._audible_s < WORTH_S:
+            return
+        learned = learned_profile(self._profile, self._running, self._tape)
+        if self._left(learned) < self._left(self._profile):
+            learned.save(self._remember)
+            self._counts["remembered"] += 1
+
+    def _left(self, profile: Profile | None) -> float:
+        """What a filter that begins with that profile leaves of the last minute."""
+        return self._tape.replay(starting_path(profile, self._hop))
+
+    def _resumed(self, state: PathState) -> EchoPath:
+        return EchoPath.resumed(state, self._silence, self._hop)
+
+
+SOURCES = tuple(effect.name for effect in EFFECTS if effect.stage == "source")
+
+
+def psd(x: Samples) -> Samples:
+    """(601,) one-sided power spectral density of x (n,)."""
+    return floored(signal.welch(x, SAMPLE_RATE, nperseg=PSD_FFT, detrend=False)[1]).astype(np.float32)
