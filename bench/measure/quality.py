@@ -9,7 +9,8 @@ SI-SDR and a recogniser's word errors, per room.
 Writes OUTPUT.json and OUTPUT.md. Conversations are folders as bench.simulate.conversations makes them. An engine is any
 of the package's, or `unfiltered`, `clean` (the human at the microphone: the bound), `speexdsp`, `speexdsp-suppressed`
 (with its preprocessor), `aec3`. The package's engines get a profile calibrated from the conversation's own sweep and
-fan recording, and the raw reference. Peers get the raw reference too; with `-true-lag` after any name the reference is
+fan recording, and the raw reference; `-uncalibrated` after a name: no profile; `-learning` after that: it learns while
+it runs. Peers get the raw reference too; with `-true-lag` after any name the reference is
 delayed by each utterance's true lag beforehand (drift and volume left in), which no robot knows: a favour to cancellers
 that have no search of their own. Scores are kept in --cache by recording and code, so that a run that was cut off goes
 on where it stopped.
@@ -30,7 +31,7 @@ import numpy as np
 
 import edgefilter
 from bench import results_writer
-from bench.measure import peers, scores
+from bench.measure import peers, scores, taught
 from bench.measure.conversation import Conversation, every, find_conversations, progress
 from bench.measure.recogniser import Recogniser, word_errors
 from edgefilter.dsp.metrics import si_sdr
@@ -57,7 +58,14 @@ def processor(name: str) -> Processor:
     if name in PEERS:
         peer = getattr(peers, name.replace("-", "_"))
         return lambda conversation, ref: peer(conversation.read("mic"), ref)
-    return lambda conversation, ref: edgefilter.enhance(conversation.read("mic"), ref, conversation.profile, name)
+    wanted = taught.row(name)
+
+    def enhance(conversation: Conversation, ref: Samples) -> Samples:
+        profile = conversation.profile if wanted.calibrated else None
+        learner = taught.learner(wanted, conversation.fingerprint, lambda: profile)
+        return edgefilter.enhance(conversation.read("mic"), ref, profile, wanted.engine, learn=learner)
+
+    return enhance
 
 
 def code_version(name: str) -> str:
@@ -69,11 +77,15 @@ def code_version(name: str) -> str:
         files = [Path(peers.__file__)]
     else:
         package = Path(edgefilter.__file__).parent
-        models = [*package.rglob("*.onnx"), *package.parent.glob("models/*.onnx")] if name in HAVE_MODEL else []
+        wanted = taught.row(name)
+        models = (
+            [*package.rglob("*.onnx"), *package.parent.glob("models/*.onnx")] if wanted.engine in HAVE_MODEL else []
+        )
         entered = {
             package / "filter" / "ego_filter.py",
             package / "calibration" / "calibrate.py",
             *package.glob("engines/*.py"),
+            *([package / "learning" / "path_learner.py"] if wanted.learning else []),
         }
         files = sorted(imported_by(entered, package)) + sorted(models)
     return hashlib.sha256(b"".join(path.read_bytes() for path in files)).hexdigest()
@@ -198,7 +210,7 @@ def main() -> int:
     try:
         recogniser = Recogniser(options.whisper, options.cache / "transcripts.jsonl") if options.whisper else None
         sets = find_conversations(options.conversations)
-        own = [engine.removesuffix(TRUE_LAG) for engine in engines]
+        own = [taught.row(engine.removesuffix(TRUE_LAG)).engine for engine in engines]
         made_with = results_writer.stamp({"conversations": options.conversations}, own, {"WHISPER": options.whisper})
         rows = run(sets, engines, recogniser, options.cache / "scores.jsonl")
     except (EdgefilterError, OSError) as error:

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 import edgefilter
-from bench.measure import peers
+from bench.measure import peers, taught
 from edgefilter import EgoFilter, Event
 from edgefilter.errors import EdgefilterError, UsageError
 from edgefilter.types import Samples
@@ -63,8 +63,10 @@ def listen(system: str, mic: Samples, ref: Samples) -> Heard:
 
 
 def engine(name: str, mic: Samples, ref: Samples) -> Heard:
-    """An engine of the package without a profile, as on its first run on somebody's robot."""
-    ego = EgoFilter(engine=name)
+    """An engine of the package without a profile, as on its first run on somebody's robot; "-learning" behind its name as in `taught`."""
+    wanted = taught.row(name)
+    fingerprint = hashlib.sha256(mic.tobytes() + ref.tobytes()).hexdigest()
+    ego = EgoFilter(engine=wanted.engine, learn=taught.learner(wanted, fingerprint, lambda: None))
     parts, probability = [], []
     for at in range(0, mic.size, ego.hop):
         parts.append(ego.process(mic[at : at + ego.hop], ref[at : at + ego.hop]))

@@ -52,9 +52,9 @@ class Effect:
     explain about as much the lower one is named; from 4 on it is a long filter, which half a minute does not teach.
     least_gain_db: fall of the held-out level, and least_size_db: power over the fan of what changes, below which it is
     not named. cost: of a fit, in quarters of a second. last_resort: whether it is tried only where no other explains
-    much. flexible: whether it has so many numbers that it takes up what a simpler effect beside it does.
-    learned: whether it is fitted anew to what the running filter
-    hears. leaves_noise: whether it leaves noise in the residual that no waveform predicts; noise_words: what is said of that where a residual is described.
+    much. flexible: whether it has so many numbers that it takes up what a simpler effect beside it does. learned:
+    whether it is fitted anew to what the running filter hears. leaves_noise: whether it leaves noise in the residual
+    that no waveform predicts; noise_words: what is said of that where a residual is described.
     """
 
     name: ClassVar[str]

@@ -290,6 +290,7 @@ def enhance(
     profile: Profile | str | Path | None = None,
     engine: str = "auto",
     model: str | Path | None = None,
+    learn: Learner | None = None,
 ) -> Samples:
     """Filter a whole recording with its reference, by the same stream as live.
 
@@ -297,7 +298,7 @@ def enhance(
     ----------
     mic, ref : ndarray of float, shape (n,)
         What the microphone heard and what the robot said, full scale +-1, 16 kHz, on the same sample counter.
-    profile, engine, model
+    profile, engine, model, learn
         As of `EgoFilter`.
 
     Returns
@@ -321,5 +322,5 @@ def enhance(
     >>> bool(np.mean(left**2) < 0.01 * np.mean(heard[-16_000:] ** 2))
     True
     """
-    ego = EgoFilter(profile, engine, model=model)
+    ego = EgoFilter(profile, engine, model=model, learn=learn)
     return np.concatenate((ego.process(mic, ref), ego.flush()))

@@ -19,7 +19,7 @@ from edgefilter.learning.contest import Rival
 from edgefilter.learning.remember import learned_profile
 from edgefilter.learning.tape import Tape, emphasised
 from edgefilter.profile.data import Profile
-from edgefilter.types import SAMPLE_RATE, Samples
+from edgefilter.types import SAMPLE_RATE, EventKind, Samples
 
 MINUTE = 60.0
 FIRST_S, FACTOR, EVERY_S = 2.0, 1.5, 20.0
@@ -67,6 +67,8 @@ class PathLearner:
 
     def __init__(self, profile: Profile | None = None, remember: Path | None = None) -> None:
         self._profile, self._remember = profile, remember
+        self._audible_s = 0.0
+        self._counts = {"rounds": 0, "learned": 0, "unlearned": 0, "remembered": 0}
 
     def start(self, path: PathState, hop: int) -> None:
         """A stream begins with that path."""
@@ -118,7 +120,7 @@ class PathLearner:
         return audible
 
     def _adopt(self, winner: Rival) -> Lesson:
-        kind = "unlearned" if winner.before else "learned"
+        kind: EventKind = "unlearned" if winner.before else "learned"
         self._counts[kind] += 1
         detail = f"{winner.was}: {winner.gain_db:.1f} dB less is left of the robot"
         self._rivals = [] if winner.before else [Rival(self._running, "the path of before", before=True)]

@@ -26,6 +26,7 @@ MARGIN = 64
 
 
 def main() -> None:
+    """Run until the other side closes standard input."""
     if hasattr(os, "nice"):
         os.nice(NICE)
     told = sys.stdin.buffer
@@ -33,7 +34,12 @@ def main() -> None:
     ring = SharedHops(hop, PathLearner.past, sys.argv[1])
     ring.unlink()
     over = threading.Event()
-    threading.Thread(target=lambda: (told.read(), over.set()), daemon=True).start()
+
+    def wait_for_the_end() -> None:
+        told.read()
+        over.set()
+
+    threading.Thread(target=wait_for_the_end, daemon=True).start()
     learner = PathLearner(profile, remember)
     learner.start(path, hop)
     at, behind = 0, 0
@@ -46,14 +52,8 @@ def main() -> None:
             at += 1
             if lesson:
                 ring.post(lesson)
-        ring.report(
-            {
-                **learner.stats(),
-                "cpu_s": round(time.process_time(), 2),
-                "memory_mb": peak_memory_mb(),
-                "fell_behind": behind,
-            }
-        )
+        used = {"cpu_s": round(time.process_time(), 2), "memory_mb": peak_memory_mb()}
+        ring.report({**learner.stats(), **used, "hops": at, "fell_behind": behind})
         over.wait(PAUSE_S)
     learner.close()
 

@@ -1,0 +1,25 @@
+"""A rival takes over only on clear evidence."""
+
+import numpy as np
+
+from edgefilter.learning.contest import LEAST, MOST, Rival
+
+
+def rival(gains):
+    return Rival(None, "a test", gains_db=list(gains))
+
+
+def test_a_clear_and_steady_gain_wins():
+    assert rival([0.5, 0.6] * LEAST).won
+
+
+def test_few_blocks_small_gains_and_scattered_ones_do_not():
+    assert not rival([1.0] * (LEAST - 1)).won
+    assert not rival([0.1, 0.12] * LEAST).won
+    assert not rival([6.0, -5.0] * LEAST).won
+
+
+def test_a_loss_never_wins_and_ends():
+    lost = rival(np.full(MOST, -0.5))
+    assert not lost.won
+    assert lost.over

@@ -1,0 +1,123 @@
+"""What is learned beside the running filter lowers what is left of the robot, and never costs the human anything."""
+
+import numpy as np
+import pytest
+
+from edgefilter import EgoFilter, PathLearner, Profile, ProfileError, enhance
+from edgefilter.types import SAMPLE_RATE
+from tests.learning.scenes import Scene
+
+
+def run(scene, learner=None, block=4096, profile=None):
+    ego = EgoFilter(profile, "linear", learn=learner)
+    out = [
+        ego.process(scene.mic[at : at + block], scene.reference[at : at + block])
+        for at in range(0, scene.mic.size, block)
+    ]
+    kinds = [event.kind for event in ego.events()]
+    return np.concatenate([*out, ego.flush()]), kinds, ego
+
+
+def db(x):
+    return 10 * np.log10(np.mean(np.square(x, dtype=np.float64)) + 1e-12)
+
+
+def seconds(x):
+    return np.array([db(x[at : at + SAMPLE_RATE]) for at in range(0, x.size - SAMPLE_RATE + 1, SAMPLE_RATE // 2)])
+
+
+def si_sdr(out, human):
+    target = np.dot(out, human) / np.dot(human, human) * human
+    return db(target) - db(out - target)
+
+
+@pytest.fixture(scope="module")
+def alone():
+    return Scene()
+
+
+def test_a_distorting_loudspeaker_is_learned_from_its_first_seconds(alone):
+    learner = PathLearner()
+    plain, _, _ = run(alone)
+    learned, kinds, ego = run(alone, learner)
+    assert "learned" in kinds
+    assert db(learned[-4 * SAMPLE_RATE :]) < db(plain[-4 * SAMPLE_RATE :]) - 2.0
+    assert ego.stats()["learning"]["learned"] == kinds.count("learned")
+
+
+def test_the_same_recording_teaches_the_same_whatever_the_blocks(alone):
+    once, _, _ = run(alone, PathLearner(), block=4096)
+    again, _, _ = run(alone, PathLearner(), block=1111)
+    np.testing.assert_array_equal(once, again)
+
+
+@pytest.mark.parametrize(
+    "scene",
+    [
+        Scene(volume=0.4),
+        Scene(moved=23),
+        Scene(lag=1700),
+        Scene(ppm=100.0),
+        Scene(human_db=-10.0),
+        Scene(human_db=0.0, repeats=True),
+    ],
+    ids=["volume", "moved", "lag", "drift", "human", "repeating human"],
+)
+def test_no_second_is_louder_than_without_learning(scene):
+    plain, _, _ = run(scene)
+    learned, _, _ = run(scene, PathLearner())
+    excess = seconds(learned - scene.human) - seconds(plain - scene.human)
+    heard = seconds(plain - scene.human) > -60
+    assert excess[heard].max() < 1.0
+
+
+@pytest.mark.parametrize("repeats", [False, True])
+def test_nothing_of_a_human_who_talks_all_the_time_is_learned(repeats):
+    scene = Scene(human_db=-6.0, repeats=repeats)
+    plain, _, _ = run(scene)
+    learned, _, _ = run(scene, PathLearner())
+    later = slice(6 * SAMPLE_RATE, None)
+    assert si_sdr(learned[later], scene.human[later]) > si_sdr(plain[later], scene.human[later]) - 0.2
+
+
+def test_what_was_learned_is_better_to_begin_with_than_nothing(alone, tmp_path):
+    file = tmp_path / "robot.npz"
+    _, _, ego = run(alone, PathLearner(remember=file))
+    ego.close()
+    profile = Profile.load(file)
+    assert profile.learned
+    begin = slice(0, 3 * SAMPLE_RATE)
+    cold, known = (enhance(alone.mic, alone.reference, p, "linear")[begin] for p in (None, profile))
+    assert db(known) < db(cold) - 3.0
+
+
+def test_in_another_room_what_was_learned_is_no_worse_than_nothing_for_long(alone, tmp_path):
+    file = tmp_path / "robot.npz"
+    _, _, ego = run(alone, PathLearner(remember=file))
+    ego.close()
+    other = Scene()
+    other.mic = Scene(moved=29, seconds=24.0).mic[12 * SAMPLE_RATE :]
+    other.reference = Scene(seconds=24.0).reference[12 * SAMPLE_RATE :]
+    cold, _, _ = run(other)
+    known, _, _ = run(other, PathLearner(Profile.load(file)), profile=Profile.load(file))
+    assert db(known[4 * SAMPLE_RATE :]) < db(cold[4 * SAMPLE_RATE :]) + 0.5
+
+
+def test_too_little_of_the_robot_is_not_remembered(tmp_path):
+    file = tmp_path / "robot.npz"
+    short = Scene(seconds=4.0)
+    _, _, ego = run(short, PathLearner(remember=file))
+    ego.close()
+    assert not file.exists()
+
+
+def test_a_file_that_cannot_be_written_is_an_error_and_leaves_the_old_one(alone, tmp_path):
+    missing = tmp_path / "nowhere" / "robot.npz"
+    learner = PathLearner(remember=missing)
+    with pytest.raises(ProfileError, match="nowhere"):
+        run(alone, learner)[2].close()
+
+
+def test_a_profile_goes_on_from_what_is_in_use(alone):
+    _, _, ego = run(alone, PathLearner(profile=None))
+    assert not ego.can_adapt  # it began without a profile: there is none to write back
