@@ -42,6 +42,11 @@ def main(args: argparse.Namespace) -> int:
         names = ", ".join(HAVE_LINEAR_STAGE)
         needed = f"give --profile and an engine with a linear stage ({names})"
         raise UsageError(f"--save-profile writes back an adapted path: {needed}")
+    if args.learn and ego.stats()["linear_stage"] is None:
+        names = ", ".join(HAVE_LINEAR_STAGE)
+        raise UsageError(
+            f"--learn keeps what a linear stage has learned, which {ego.engine_name} lacks: take one of {names}"
+        )
     sink = make_sink(args.output, ego.latency, wait=not source.live)
     limit = None if args.seconds is None else round(args.seconds * SAMPLE_RATE)
     for note in source.notes:
