@@ -15,7 +15,10 @@ from edgefilter.echo.measurement import level_ratio
 from edgefilter.echo.recording import BLOCK
 from edgefilter.types import Array, Samples
 
-RESONANCES_HZ = (250.0, 160.0, 200.0, 320.0, 400.0)
+RESONANCES_HZ = (250.0, 180.0, 215.0, 300.0, 370.0)
+REACH_HZ = (160.0, 1000.0)
+BESIDE = 1.1
+"""Resonances that are tried to either side of the best of these."""
 EXCURSION, KNEES = 0.7, (0.3, 0.15, 0.6)
 """Where the laws bend, re the largest displacement and the highest sample that the fit has seen; the usual ones first."""
 PEAK = 0.9999
@@ -49,9 +52,9 @@ class Laws:
 
 @dataclass(frozen=True, eq=False)
 class _Part:
-    """Driver or amplifier with one setting: its terms at the microphone (used, k), and what is left with them."""
+    """Driver (setting: its resonance) or amplifier: where it bends, its terms at the microphone (used, k), what is left with them."""
 
-    resonance_hz: float
+    setting: float
     scale: float
     columns: Samples
     left: float
@@ -80,46 +83,78 @@ def fit_laws(
     hear
         What becomes of a signal (n,) at the loudspeaker up to the microphone, whitened.
     before
-        Laws whose resonance, excursion and knee stay as they are; None: these are searched, too.
+        Laws from whose resonance and knee the search sets out, for the parts that bend in them; None: from the usual
+        ones, for both.
     """
-    used = np.flatnonzero(weights > 0.0)
-    halves = _Halves(linear, target, weights, used)
-    base, peak = halves.left(np.zeros((used.size, 0), np.float32)), _peak(x[used])
-    if peak <= 0.0 or base <= 0.0:
+    search = _Search(x, hear, _Halves(linear, target, weights))
+    if search.base <= 0.0 or search.peak <= 0.0:
         return None
-
-    def part(terms: Samples, scale: float, resonance_hz: float = 0.0) -> _Part:
-        columns = np.stack([hear(term)[used] for term in terms], axis=1)
-        return _Part(resonance_hz, scale, columns, halves.left(columns))
-
-    def amplifier(knee: float) -> _Part:
-        return part(amplifier_terms(x, knee), knee)
-
-    def driver(hz: float) -> _Part:
-        excursion = before.excursion if before else EXCURSION * _peak(motion(x, hz)[0][used])
-        return part(driver_terms(x, hz, excursion), excursion, hz)
-
-    promising = (1.0 - PROMISING) * base
-    bend = _best(amplifier, [before.knee] if before else [share * peak for share in KNEES], promising)
-    move = _best(driver, [before.resonance_hz] if before else RESONANCES_HZ, promising)
-    both = np.concatenate((move.columns, bend.columns), axis=1)
-    chosen = min(move, bend, key=lambda one: one.left)
-    columns, left, together = chosen.columns, chosen.left, halves.left(both)
+    bend = search.amplifier(before)
+    move = search.driver(before)
+    parts = [min(move, bend, key=_by_left)]
+    left, together = parts[0].left, search.halves.left(np.concatenate((move.columns, bend.columns), axis=1))
     if together < (1.0 - FURTHER) * left:
-        columns, left = both, together
-    if left > (1.0 - LEAST) * base:
+        parts, left = [move, bend], together
+    if left > (1.0 - LEAST) * search.base:
         return None
-    found, level_db = halves.whole(columns)
-    driving = found[:DRIVER_TERMS] if columns is not bend.columns else np.zeros(DRIVER_TERMS)
-    bending = found[-AMPLIFIER_TERMS:] if columns is not move.columns else np.zeros(AMPLIFIER_TERMS)
-    return Laws(move.resonance_hz, move.scale, driving, bend.scale, bending, level_db, 1.0 - left / base)
+    found, level_db = search.halves.whole(np.concatenate([part.columns for part in parts], axis=1))
+    driving = found[:DRIVER_TERMS] if move in parts else np.zeros(DRIVER_TERMS)
+    bending = found[-AMPLIFIER_TERMS:] if bend in parts else np.zeros(AMPLIFIER_TERMS)
+    return Laws(move.setting, move.scale, driving, bend.scale, bending, level_db, 1.0 - left / search.base)
 
 
-def _best(make: Callable[[float], _Part], settings: Sequence[float], promising: float) -> _Part:
-    """The first setting, or the best of all where that one leaves less than promising."""
-    first = make(settings[0])
-    rest = [make(other) for other in settings[1:]] if first.left < promising else []
-    return min((first, *rest), key=lambda part: part.left)
+class _Search:
+    """Settings of driver and amplifier, each judged by what is left with it on samples that it was not fitted to.
+
+    base: what the linear voice alone leaves there. peak: the highest sample that counts.
+    """
+
+    def __init__(self, x: Samples, hear: Callable[[Samples], Samples], halves: _Halves) -> None:
+        self._x, self._hear, self.halves = x, hear, halves
+        self._nothing = np.zeros((halves.used.size, 0), np.float32)
+        self.base, self.peak = halves.left(self._nothing), _peak(x[halves.used])
+
+    def amplifier(self, before: Laws | None) -> _Part:
+        """The best knee, or the one before."""
+        if before is not None and not before.amplifier.any():
+            return _Part(0.0, before.knee, self._nothing, self.base)
+
+        def make(knee: float) -> _Part:
+            return self._part(0.0, knee, amplifier_terms(self._x, knee))
+
+        return self._best(make, [share * self.peak for share in KNEES] if before is None else [before.knee])
+
+    def driver(self, before: Laws | None) -> _Part:
+        """The best resonance, or the best beside the one before, and excursion."""
+        if before is not None and not before.driver.any():
+            return _Part(before.resonance_hz, before.excursion, self._nothing, self.base)
+
+        def make(hz: float, share: float = EXCURSION) -> _Part:
+            excursion = share * _peak(motion(self._x, hz)[0][self.halves.used])
+            return self._part(hz, excursion, driver_terms(self._x, hz, excursion))
+
+        best = self._best(make, RESONANCES_HZ if before is None else [before.resonance_hz])
+        if self._promising(best):
+            beside = [float(np.clip(best.setting * step, *REACH_HZ)) for step in (1.0 / BESIDE, BESIDE)]
+            best = min(best, *map(make, beside), key=_by_left)
+            best = min(best, make(best.setting, 0.5 * EXCURSION), key=_by_left)
+        return best
+
+    def _best(self, make: Callable[[float], _Part], settings: Sequence[float]) -> _Part:
+        """The first setting, or the best of all where that one is promising."""
+        first = make(settings[0])
+        return min((first, *map(make, settings[1:])), key=_by_left) if self._promising(first) else first
+
+    def _promising(self, part: _Part) -> bool:
+        return part.left < (1.0 - PROMISING) * self.base
+
+    def _part(self, setting: float, scale: float, terms: Samples) -> _Part:
+        columns = self.halves.columns([self._hear(term) for term in terms])
+        return _Part(setting, scale, columns, self.halves.left(columns))
+
+
+def _by_left(part: _Part) -> float:
+    return part.left
 
 
 def _peak(x: Samples) -> float:
@@ -133,12 +168,19 @@ class _Halves:
     move by less than a millimetre.
     """
 
-    def __init__(self, linear: Samples, target: Samples, weights: Samples, used: np.ndarray) -> None:
+    def __init__(self, linear: Samples, target: Samples, weights: Samples) -> None:
+        used = np.flatnonzero(weights > 0.0)
+        first = used // BLOCK % 4 < 2
+        self.used = np.concatenate((used[first], used[~first]))
+        self._split = int(np.count_nonzero(first))
+        self._root = np.sqrt(weights[self.used, None].astype(np.float32))
         lags = np.pad(linear, (NUISANCE_TAPS - 1 - NUISANCE_LEAD, NUISANCE_LEAD))
-        self._linear = sliding_window_view(lags, NUISANCE_TAPS)[:, ::-1][used]
-        self._target = target[used, None]
-        self._weights = weights[used, None].astype(np.float32)
-        self._first = used // BLOCK % 4 < 2
+        self._linear = sliding_window_view(lags, NUISANCE_TAPS)[:, ::-1][self.used] * self._root
+        self._target = target[self.used, None] * self._root
+
+    def columns(self, signals: Sequence[Samples]) -> Samples:
+        """(used, k) signals (n,) at the samples that count, the first half's in front, weighted."""
+        return np.stack([signal[self.used] for signal in signals], axis=1) * self._root
 
     def left(self, columns: Samples) -> float:
         """What the linear voice and columns (used, k), fitted to one half, leave on the other: the sum of both ways."""
@@ -160,10 +202,8 @@ class _Halves:
     def _normal(self, columns: Samples) -> tuple[Array, Array]:
         """Of each half the weighted products of linear voice, columns and target with each other."""
         rows = np.concatenate((self._linear, columns, self._target), axis=1)
-        first, second = (
-            np.float64((rows[half] * self._weights[half]).T @ rows[half]) for half in (self._first, ~self._first)
-        )
-        return first, second
+        first, second = rows[: self._split], rows[self._split :]
+        return np.float64(first.T @ first), np.float64(second.T @ second)
 
 
 def _solved(normal: Array) -> Array:

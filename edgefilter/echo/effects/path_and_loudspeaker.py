@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
 from edgefilter.dsp.psd import periodograms
-from edgefilter.echo.effect import complete, neutral
+from edgefilter.echo.effect import complete
 from edgefilter.echo.effects.late_reverb import SLOWER, decaying, reverberation_time
 from edgefilter.echo.effects.loudspeaker_fit import Laws, fit_laws
 from edgefilter.echo.effects.speaker_nonlinearity import SpeakerNonlinearity, as_values
-from edgefilter.echo.measurement import Values, whiten
+from edgefilter.echo.measurement import whiten
 from edgefilter.echo.wiener import convolve_from, fit_filter
 from edgefilter.types import PRE_ROLL, SAMPLE_RATE, Array, Samples
 
@@ -45,21 +47,20 @@ def fit_path_and_loudspeaker(
         on samples that it was not fitted to.
     """
     w = np.ones(recording.size, np.float32) if weights is None else np.asarray(weights, np.float32)
-    effect, laws = SpeakerNonlinearity(), None
-    values: Values = neutral(effect)
-    response, noise = _refined(reference, recording, w, _first_path(reference, recording, w, taps))
-    for _ in range(ROUNDS):
-        laws = _laws(reference, recording, w, response, noise, laws)
-        if laws is None:
-            values = neutral(effect)
-            response, noise = _refined(reference, recording, w, response)
-            break
-        values = complete(effect, as_values(laws))
-        response, noise = _refined(effect.apply(reference, values, SAMPLE_RATE), recording, w, response)
-    return response.astype(np.float32), dict(values)
+    effect = SpeakerNonlinearity()
+    values = complete(effect, {})
+    laws: Laws | None = None
+    response, noise = refined_path(reference, recording, w, first_path(reference, recording, w, taps))
+    for turn in range(ROUNDS):
+        if laws is not None or turn == 0:
+            hear = hearing(response, noise)
+            laws = fit_laws(reference, whiten(recording, noise), w, hear(reference), hear, laws)
+        values = complete(effect, as_values(laws) if laws is not None else {})
+        response, noise = refined_path(effect.apply(reference, values, SAMPLE_RATE), recording, w, response)
+    return response.astype(np.float32), values
 
 
-def _first_path(x: Samples, y: Samples, weights: Samples, taps: int) -> Array:
+def first_path(x: Samples, y: Samples, weights: Samples, taps: int) -> Array:
     """(taps,) a path, both signals flattened by the recording's spectrum, with a decay that any room may have."""
     heard = _psd(y, weights)
     flat, target = whiten(x, heard), whiten(y, heard)
@@ -68,7 +69,7 @@ def _first_path(x: Samples, y: Samples, weights: Samples, taps: int) -> Array:
     return fit_filter(flat, target, weights, taps, 0, prior, steps=40)
 
 
-def _refined(x: Samples, y: Samples, weights: Samples, response: Array) -> tuple[Array, Samples]:
+def refined_path(x: Samples, y: Samples, weights: Samples, response: Array) -> tuple[Array, Samples]:
     """The path (taps,) once more, with the decay and the noise that an earlier one shows, and that noise's PSD."""
     noise = _psd(y - convolve_from(x, response, 0), weights)
     rt60_s = reverberation_time(response[PRE_ROLL:]) or USUAL_RT60_S
@@ -76,17 +77,10 @@ def _refined(x: Samples, y: Samples, weights: Samples, response: Array) -> tuple
     return fit_filter(whiten(x, noise), whiten(y, noise), weights, response.size, 0, prior, steps=60), noise
 
 
-def _laws(
-    x: Samples, y: Samples, weights: Samples, response: Array, noise: Samples, before: Laws | None
-) -> Laws | None:
-    """The loudspeaker's laws ahead of a path, heard through that path and the whitening at once."""
-    padded = np.pad(response.astype(np.float32), WHITENING)
-    heard_through = whiten(padded, noise)
-
-    def hear(sound: Samples) -> Samples:
-        return convolve_from(sound, heard_through, WHITENING)
-
-    return fit_laws(x, whiten(y, noise), weights, hear(x), hear, before)
+def hearing(response: Array, noise: Samples) -> Callable[[Samples], Samples]:
+    """What a path (taps,) and the whitening by a PSD (601,) make of a signal (n,), in one convolution."""
+    through = whiten(np.pad(response.astype(np.float32), WHITENING), noise)
+    return lambda sound: convolve_from(sound, through, WHITENING)
 
 
 def _psd(x: Samples, weights: Samples) -> Samples:

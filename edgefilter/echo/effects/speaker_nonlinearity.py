@@ -8,7 +8,7 @@ import numpy as np
 
 from edgefilter.dsp.membrane import MOTION_TAPS
 from edgefilter.echo.effect import Effect, Parameter, Stage, first, neutral
-from edgefilter.echo.effects.loudspeaker_fit import Laws, fit_laws
+from edgefilter.echo.effects.loudspeaker_fit import REACH_HZ, Laws, fit_laws
 from edgefilter.echo.effects.loudspeaker_laws import amplifier_terms, driver_terms
 from edgefilter.echo.measurement import Measurement, Values, VoiceModel
 from edgefilter.types import Array, Samples
@@ -36,7 +36,7 @@ class SpeakerNonlinearity(Effect):
     memory: ClassVar[int | None] = MOTION_TAPS
     parameters: ClassVar[tuple[Parameter, ...]] = (
         *(Parameter(name, "1", 0.0, -BOUND, BOUND) for name in (*DRIVER, *AMPLIFIER)),
-        Parameter("resonance_hz", "Hz", 250.0, 160.0, 1000.0),
+        Parameter("resonance_hz", "Hz", 250.0, *REACH_HZ),
         Parameter("excursion", "full scale", 1.0, 1e-4, 100.0),
         Parameter("knee", "full scale", 1.0, 1e-4, 100.0),
         Parameter("level_db", "dB re the linear voice at the microphone", SILENT_DB, SILENT_DB, 20.0),
