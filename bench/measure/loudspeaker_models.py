@@ -19,8 +19,8 @@ from edgefilter.echo.effects.path_and_loudspeaker import (
     hearing,
     refined_path,
 )
-from edgefilter.echo.least_squares import NUISANCE_LEAD, filtered, normal_equations, short_filter
-from edgefilter.echo.measurement import whiten
+from edgefilter.echo.least_squares import NUISANCE_LEAD, NUISANCE_TAPS, filtered, normal_equations, short_filter
+from edgefilter.echo.measurement import level_ratio, whiten
 from edgefilter.types import SAMPLE_RATE, Array, Samples
 
 RIDGE = 1e-3
@@ -112,12 +112,16 @@ def solve(
     hear = hearing(response, noise)
     linear = hear(x)
     early = np.concatenate((linear[NUISANCE_LEAD:], np.zeros(NUISANCE_LEAD, np.float32)))
-    columns = [early, *(hear(term) for term in model.terms(x, setting))]
-    use = np.zeros((len(columns), TAPS), bool)
-    use[0], use[1:, : model.taps] = True, True
-    weights, left = normal_equations(columns, whiten(y, noise), TAPS).solve(RIDGE, use)
-    gain = float(np.dot(filtered(columns[:1], weights[:1]), linear) / np.dot(linear, linear)) or 1.0
-    return weights[1:, : model.taps] / gain, setting, left
+    voice = [late(early, k) for k in range(NUISANCE_TAPS)]
+    heard = [late(hear(term), k) for term in model.terms(x, setting) for k in range(model.taps)]
+    weights, left = normal_equations([*voice, *heard], whiten(y, noise), 1).solve(RIDGE)
+    gain = level_ratio(filtered(voice, weights[:NUISANCE_TAPS]), linear) or 1.0
+    return weights[NUISANCE_TAPS:].reshape(-1, model.taps) / gain, setting, left
+
+
+def late(x: Samples, samples: int) -> Samples:
+    """X (n,) that many samples later."""
+    return np.concatenate((np.zeros(samples, np.float32), x[: x.size - samples]))
 
 
 def fit_effect(x: Samples, y: Samples) -> tuple[Array, Play | None]:

@@ -90,8 +90,9 @@ def as_values(laws: Laws) -> dict[str, float | Array]:
 
 def _pair(values: Values, name: str) -> Array:
     """(2,) float32, zero behind a single number."""
-    given = np.atleast_1d(np.asarray(values[name], np.float32))[:2]
-    return np.pad(given, (0, 2 - given.size))
+    pair, given = np.zeros(2, np.float32), np.ravel(values[name])[:2]
+    pair[: given.size] = given
+    return pair
 
 
 def _amplifier(values: Values) -> Array:
