@@ -113,7 +113,7 @@ def solve(
     linear = hear(x)
     early = np.concatenate((linear[NUISANCE_LEAD:], np.zeros(NUISANCE_LEAD, np.float32)))
     voice = [late(early, k) for k in range(NUISANCE_TAPS)]
-    heard = [late(hear(term), k) for term in model.terms(x, setting) for k in range(model.taps)]
+    heard = [late(term, k) for term in map(hear, model.terms(x, setting)) for k in range(model.taps)]
     weights, left = normal_equations([*voice, *heard], whiten(y, noise), 1).solve(RIDGE)
     gain = level_ratio(filtered(voice, weights[:NUISANCE_TAPS]), linear) or 1.0
     return weights[NUISANCE_TAPS:].reshape(-1, model.taps) / gain, setting, left
