@@ -10,6 +10,7 @@ from edgefilter.echo.effects import catalogue
 from edgefilter.echo.effects.path_and_loudspeaker import fit_path_and_loudspeaker
 from edgefilter.echo.measurement import Measurement
 from edgefilter.echo.model import EchoModel
+from edgefilter.errors import UsageError
 from edgefilter.types import PRE_ROLL
 from tests.conformance import EFFECT_CASES, fan, robot_alone, robot_model, robot_speech
 
@@ -113,6 +114,11 @@ def test_no_value_within_the_bounds_adds_more_than_in_proportion():
     moved = np.abs(motion(x, 250.0)).max(axis=1)
     # each of ten weights of 4 meets |x|, the displacement or the velocity once
     assert np.abs(added(x, largest)).max() <= 8.0 * (3.0 * np.abs(x).max() + moved.sum()) * (1 + 1e-5)
+
+
+def test_values_of_the_polynomial_that_this_effect_was_are_refused_by_name():
+    with pytest.raises(UsageError, match="no parameter 'saturation': it takes force_factor, stiffness, damping"):
+        complete(DISTORT, {"saturation": 0.0, "odd": -0.5})
 
 
 def test_path_and_loudspeaker_are_found_without_a_calibration():
