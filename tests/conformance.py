@@ -312,7 +312,15 @@ def _decaying(taps: int, per: float, seed: int) -> np.ndarray:
 
 EFFECT_CASES: dict[str, dict[str, object]] = {
     "playback_gain": {"gain_db": -2.5},
-    "speaker_nonlinearity": {"even": 0.1, "odd": -0.3, "force_factor": np.array([0.4, 0.2, 0.1]), "stiffness": -1.0},
+    "speaker_nonlinearity": {
+        "force_factor": np.array([0.4, -0.3]),
+        "stiffness": 0.2,
+        "damping": np.array([0.4, -0.2]),
+        "excursion": 0.2,
+        "even": 0.05,
+        "odd": -0.2,
+        "knee": 0.3,
+    },
     "clock_drift": {"ppm": -80.0, "offset": 3.5},
     "delay_jump": {"times_s": np.array([3.3, 8.1]), "samples": np.array([37.4, -61.0])},
     "compression": {"threshold_db": -20.0, "ratio": 4.0, "attack_ms": 8.0, "release_ms": 200.0, "makeup_db": 3.0},

@@ -26,7 +26,8 @@ def reference():
 
 
 @pytest.mark.parametrize(
-    ("effect", "values"), [("speaker_nonlinearity", {"even": 2.0, "odd": 8.0}), ("playback_gain", {"gain_db": -9.0})]
+    ("effect", "values"),
+    [("speaker_nonlinearity", {"even": 1.0, "odd": 1.0, "knee": 0.2}), ("playback_gain", {"gain_db": -9.0})],
 )
 def test_an_effect_in_the_profile_lowers_the_residual_of_a_robot_that_has_it(reference, effect, values):
     plain = robot()
