@@ -14,7 +14,7 @@ from edgefilter.echo.source_chain import SourceChain
 from edgefilter.engines.base import ClipEngine, Engine
 from edgefilter.filter.canceller import Canceller, CancellerOutput
 from edgefilter.filter.onset_gate import GATE, OnsetGate
-from edgefilter.filter.residual_echo import Residual
+from edgefilter.filter.residual_echo import Residual, Unpredictable
 from edgefilter.profile.data import Profile
 from edgefilter.types import Frame, Samples
 
@@ -37,9 +37,13 @@ class LinearStage:
     def step(self, mic: Samples, aligned: Aligned) -> CancellerOutput:
         """One hop (hop,) of the microphone, with what the aligner found in it."""
         if aligned.realigned:
-            past = self.aligner.history(self.canceller.history)
-            self.canceller.rewrite_reference(self.source.rewritten(past, mic.size))
-        return self.canceller.step(mic, self.source(aligned.reference), aligned.state not in UNLOCATED)
+            wanted = max(self.canceller.history, self.source.memory)
+            past = self.source.restart(self.aligner.history(wanted)[: -mic.size])
+            driven = self.source(aligned.reference)
+            self.canceller.rewrite_reference(np.concatenate((past, driven)))
+        else:
+            driven = self.source(aligned.reference)
+        return self.canceller.step(mic, driven, aligned.state not in UNLOCATED)
 
 
 class FrontEnd:
@@ -61,8 +65,9 @@ class FrontEnd:
         elif engine.front == "full":
             self.aligner = aligner = Aligner(stft.hop, profile)
             if profile:
-                self.gate = OnsetGate(stft.hop, float(np.sum(np.square(profile.echo.impulse_response))))
+                self.gate = OnsetGate(stft.hop, float(np.sum(np.square(profile.echo.running_response()))))
             self.linear_stage = LinearStage(aligner, source, self._make_canceller(profile), Residual(stft, profile))
+            self._unpredictable = Unpredictable(stft, source.colours) if source.colours else None
         self._analyser = Analyser(stft, channels=4 if self.linear_stage else 2)
         self._low_cut = None if profile or not self.linear_stage else low_cut(stft)
         self._nothing = np.zeros(stft.bins, np.float32)
@@ -73,7 +78,8 @@ class FrontEnd:
         if profile is None:
             return Canceller(self.hop)
         response = profile.echo.running_response()
-        return Canceller(self.hop, taps=int(np.clip(response.size, *TAPS)), impulse_response=response)
+        taps, voice = int(np.clip(response.size, *TAPS)), profile.echo.voice_chain()
+        return Canceller(self.hop, taps=taps, impulse_response=response, behind=voice or None)
 
     def step(self, mic: Samples, ref: Samples) -> tuple[Frame, Aligned | None]:
         """One hop (hop,) of both channels to one frame, with what the aligner found."""
@@ -93,7 +99,8 @@ class FrontEnd:
         if self._low_cut is not None:
             spectra *= self._low_cut
         x, r, e, error = spectra
-        noise, residual = stage.residual.step(e, error, linear.uncertainty)
+        added = self._unpredictable.step(stage.source.expected) if self._unpredictable else None
+        noise, residual = stage.residual.step(e, error, linear.uncertainty, added)
         return Frame(x, r, e, error, noise, residual), aligned
 
     def signals(self, mic: Samples, ref: Samples) -> tuple[Samples, Samples]:
