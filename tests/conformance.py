@@ -16,7 +16,7 @@ from edgefilter.echo.effect import RECORDING, complete, neutral
 from edgefilter.echo.effects import catalogue
 from edgefilter.echo.measurement import Measurement
 from edgefilter.echo.model import EchoModel
-from edgefilter.echo.running import reach, runner
+from edgefilter.echo.running import reach, stream_form
 from edgefilter.echo.source_chain import SourceChain
 from edgefilter.filter.stream import Stream
 from edgefilter.types import PRE_ROLL, SAMPLE_RATE, Frame
@@ -312,7 +312,7 @@ def effect_check_fit_explains_what_its_own_apply_made(name: str) -> None:
 def effect_check_runs_on_a_stream_as_on_a_recording(name: str) -> None:
     """Ahead of the path, hop by hop, and after a realignment in the middle. Rounding differs by the block: -60 dB."""
     effect, values = catalogue.find(name), complete(catalogue.find(name), effect_case(name))
-    if effect.stage != "source" or runner(effect, values) is None:
+    if effect.stage != "source" or stream_form(effect, values) is None:
         assert np.array_equal(SourceChain([(name, values)])(robot_speech()), robot_speech())
         return
     x, source = robot_speech()[: 4 * SAMPLE_RATE], SourceChain([(name, values)])

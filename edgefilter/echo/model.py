@@ -56,7 +56,7 @@ class EchoModel:
         return VoiceChain(self.effects)
 
     def running_response(self) -> Samples:
-        """(taps,) the path with all effects on it that are filters folded in, as after the last change: what the running filter starts from."""
+        """(taps,) the path with the effects on it that are filters, as after the last change: what the running filter starts from."""
         linear = [(effect, values) for effect, values in chain(self.effects) if is_filter(effect, values)]
         if not linear:
             return self.impulse_response
@@ -69,8 +69,8 @@ class EchoModel:
     def with_running_response(self, response: Samples, gain: float = 1.0) -> EchoModel:
         """The model whose running_response() begins with response (taps,) and goes on as that of this one times gain.
 
-        The effects that are filters have been applied to both parts and cannot be taken out again (a band limit has no inverse);
-        they are in the impulse response now, and listing them would apply them twice.
+        The effects that are filters have been applied to both parts and cannot be taken out again (a band limit has no
+        inverse); they are in the impulse response now, and listing them would apply them twice.
         """
         rest = self.running_response()[response.size :] * np.float32(gain)
         folded = {effect.name for effect, values in chain(self.effects) if is_filter(effect, values)}

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
+from typing import cast
+
 import numpy as np
 
 from edgefilter.echo.effect import Effect, Runner, vanishes
@@ -46,20 +50,24 @@ class ExpectedSquare(Windowed):
         return self._effect.variance(self.window(x), self._values, SAMPLE_RATE)[self._memory :]
 
 
-def runner(effect: Effect, values: Values) -> Runner | None:
-    """The effect on the stream ahead of the path or behind it; None where it is no such effect, changes nothing, or has no such form."""
+def stream_form(effect: Effect, values: Values) -> Callable[[], Runner] | None:
+    """What makes the effect for a stream, ahead of the path or behind it, as before the first sample.
+
+    None where it is no such effect, changes nothing, is a filter on the path, or has no such form.
+    """
     if effect.stage not in ("source", "path", "microphone") or vanishes(effect, values) or is_filter(effect, values):
         return None
-    own = effect.run(values, SAMPLE_RATE)
-    memory = _memory(effect, values) if own is None else None
-    return own if memory is None else Windowed(effect, values, memory)
+    if effect.run(values, SAMPLE_RATE) is not None:
+        return lambda: cast(Runner, effect.run(values, SAMPLE_RATE))
+    memory = _memory(effect, values)
+    return None if memory is None else partial(Windowed, effect, values, memory)
 
 
 def reach(effect: Effect, values: Values) -> str:
     """A sentence on what the running filter makes of the effect, where that is not what apply does; else empty."""
     if effect.run_note or vanishes(effect, values):
         return effect.run_note
-    if effect.stage == "noise" or effect.adds_noise or is_filter(effect, values) or runner(effect, values):
+    if effect.stage == "noise" or effect.adds_noise or is_filter(effect, values) or stream_form(effect, values):
         return ""
     if effect.timed:
         return "the running filter makes nothing of it: it is of this recording's moments"

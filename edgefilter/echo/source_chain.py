@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 
 from edgefilter.echo.effect import Runner
 from edgefilter.echo.effects.catalogue import chain
 from edgefilter.echo.measurement import Values
-from edgefilter.echo.running import ExpectedSquare, Windowed, runner
+from edgefilter.echo.running import ExpectedSquare, Windowed, stream_form
 from edgefilter.types import SAMPLE_RATE, Array, Samples
 
 LONG_MEMORY = SAMPLE_RATE
@@ -25,21 +26,21 @@ class SourceChain:
 
     def __init__(self, effects: Sequence[tuple[str, Values]] = ()) -> None:
         applied = chain(effects)
-        self._effects = [pair for pair in applied if pair[0].stage == "source" or pair[0].adds_noise]
+        self._makers = [
+            (
+                partial(ExpectedSquare, effect, values, effect.memory or 0) if effect.adds_noise else None,
+                stream_form(effect, values) if effect.stage == "source" else None,
+            )
+            for effect, values in applied
+        ]
         self.colours: list[Array] = [effect.colour(values) for effect, values in applied if effect.adds_noise]
         self.expected: list[Samples] = []
         self._links = self._new_links()
         self.memory = LONG_MEMORY if any(run and not isinstance(run, Windowed) for _, run in self._links) else 0
 
     def _new_links(self) -> list[tuple[ExpectedSquare | None, Runner | None]]:
-        """Of each effect the noise that it adds and what it does to the signal, before the first sample."""
-        return [
-            (
-                ExpectedSquare(effect, values, effect.memory or 0) if effect.adds_noise else None,
-                runner(effect, values) if effect.stage == "source" else None,
-            )
-            for effect, values in self._effects
-        ]
+        """Of each effect the noise that it adds and what it does to the signal, as before the first sample."""
+        return [(noise() if noise else None, run() if run else None) for noise, run in self._makers if noise or run]
 
     def __call__(self, block: Samples) -> Samples:
         """Block (n,) after the effects, (n,); it follows the last one."""
@@ -61,19 +62,19 @@ class SourceChain:
 class VoiceChain:
     """Applies to the predicted voice, hop by hop, what acts behind the path and is no filter: the microphone, above all.
 
-    effects: (name, values). gain and filters behind the path are in the impulse response already.
+    effects: (name, values); those that are filters are in the impulse response already.
     """
 
     def __init__(self, effects: Sequence[tuple[str, Values]] = ()) -> None:
-        behind = [runner(effect, values) for effect, values in chain(effects) if effect.stage in ("path", "microphone")]
-        self._runners = [run for run in behind if run]
+        behind = [pair for pair in chain(effects) if pair[0].stage in ("path", "microphone")]
+        self._runners = [make() for effect, values in behind if (make := stream_form(effect, values))]
 
     def __bool__(self) -> bool:
         """Whether anything acts there."""
         return bool(self._runners)
 
     def __call__(self, voice: Samples, heard: Samples) -> Samples:
-        """The voice (n,) as predicted behind the path, as it comes out of the microphone; heard (n,): what did."""
+        """The voice (n,) that the path brings, as the microphone hands it on; heard (n,): all that it handed on."""
         for run in self._runners:
             voice = run(voice, heard)
         return voice

@@ -64,9 +64,11 @@ class FrontEnd:
             self.aligner = PaperAligner(stft.hop)
         elif engine.front == "full":
             self.aligner = aligner = Aligner(stft.hop, profile)
-            if profile:
-                self.gate = OnsetGate(stft.hop, float(np.sum(np.square(profile.echo.running_response()))))
-            self.linear_stage = LinearStage(aligner, source, self._make_canceller(profile), Residual(stft, profile))
+            response = profile.echo.running_response() if profile else None
+            if response is not None:
+                self.gate = OnsetGate(stft.hop, float(np.sum(np.square(response))))
+            canceller = self._make_canceller(profile, response)
+            self.linear_stage = LinearStage(aligner, source, canceller, Residual(stft, profile))
             self._unpredictable = Unpredictable(stft, source.colours) if source.colours else None
         self._analyser = Analyser(stft, channels=4 if self.linear_stage else 2)
         self._low_cut = None if profile or not self.linear_stage else low_cut(stft)
@@ -74,10 +76,9 @@ class FrontEnd:
         self._fan = profile.noise_bins(stft) if profile else self._nothing
         self._silence = np.zeros(stft.bins, np.complex64)
 
-    def _make_canceller(self, profile: Profile | None) -> Canceller:
-        if profile is None:
+    def _make_canceller(self, profile: Profile | None, response: Samples | None) -> Canceller:
+        if profile is None or response is None:
             return Canceller(self.hop)
-        response = profile.echo.running_response()
         taps, voice = int(np.clip(response.size, *TAPS)), profile.echo.voice_chain()
         return Canceller(self.hop, taps=taps, impulse_response=response, behind=voice or None)
 

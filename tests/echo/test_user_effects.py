@@ -14,7 +14,7 @@ from edgefilter.echo import user_effects
 from edgefilter.echo.effects import catalogue
 from edgefilter.echo.effects.catalogue import find, names
 from edgefilter.echo.measurement import Measurement
-from edgefilter.echo.running import reach, runner
+from edgefilter.echo.running import reach, stream_form
 from edgefilter.echo.user_effects import load_effect
 from edgefilter.errors import UsageError
 from tests.diagnosis.robot_scene import profile, record, voice
@@ -247,7 +247,7 @@ def test_a_source_effect_without_memory_runs_on_the_least_past_that_gives_the_sa
 
 def test_an_effect_that_cannot_run_says_so(write):
     load_effect(write(GOOD.replace("np.append(0, x[:-1])", "x * np.sin(np.arange(x.size) / 1000)")))
-    assert runner(find("tilt"), {"amount": 0.5}) is None
+    assert stream_form(find("tilt"), {"amount": 0.5}) is None
     assert "the running filter makes nothing of it" in reach(find("tilt"), {"amount": 0.5})
 
 
