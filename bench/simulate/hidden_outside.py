@@ -39,7 +39,7 @@ def _with_sound(scene: Scene, chain: Chain, sound: Array, strength: str) -> Chai
     return replace(chain, others=sound if chain.others is None else chain.others + sound)
 
 
-def _in_room(rng: np.random.Generator, x: Array) -> Array:
+def in_room(rng: np.random.Generator, x: Array) -> Array:
     """Samples x (n,) from a few metres away: direct sound and a tail of 0.3-0.5 s that loses its treble first."""
     t = np.arange(RATE // 2) / RATE
     tail = rng.standard_normal(t.size) * np.exp(-6.9 * t / rng.uniform(0.3, 0.5))
@@ -71,7 +71,7 @@ def talker(rng: np.random.Generator, scene: Scene, chain: Chain, strength: str, 
         words = person(rng)[: sound.size - at]
         sound[at : at + words.size] = words
         at += words.size + int(rng.uniform(1, 5) * RATE)
-    return _with_sound(scene, chain, _in_room(rng, sound), strength), {}
+    return _with_sound(scene, chain, in_room(rng, sound), strength), {}
 
 
 def music(rng: np.random.Generator, scene: Scene, chain: Chain, strength: str, _: Person) -> tuple[Chain, dict]:
@@ -87,7 +87,7 @@ def music(rng: np.random.Generator, scene: Scene, chain: Chain, strength: str, _
             sound[start : start + excitation.size] += signal.lfilter([1.0], comb, excitation)
         burst = rng.standard_normal(RATE // 20) * np.exp(-np.arange(RATE // 20) / (RATE * 0.01))
         sound[start : start + burst.size] += (2.0 if i % 4 == 0 else 0.5) * burst
-    return _with_sound(scene, chain, _in_room(rng, sound), strength), {"beat_s": beat / RATE}
+    return _with_sound(scene, chain, in_room(rng, sound), strength), {"beat_s": beat / RATE}
 
 
 def door_slams(rng: np.random.Generator, scene: Scene, chain: Chain, strength: str, _: Person) -> tuple[Chain, dict]:
@@ -99,7 +99,7 @@ def door_slams(rng: np.random.Generator, scene: Scene, chain: Chain, strength: s
         blow = signal.sosfilt(signal.butter(2, rng.uniform(300, 3000), fs=RATE, output="sos"), blow)
         part = sound[int(time * n) :][: blow.size]
         part += rng.uniform(0.4, 1.0) * blow[: part.size]
-    return _with_sound(scene, chain, _in_room(rng, sound), strength), {"times_s": (times * n / RATE).tolist()}
+    return _with_sound(scene, chain, in_room(rng, sound), strength), {"times_s": (times * n / RATE).tolist()}
 
 
 def flutter(rng: np.random.Generator, scene: Scene, chain: Chain, strength: str, _: Person) -> tuple[Chain, dict]:

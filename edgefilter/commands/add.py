@@ -10,6 +10,7 @@ from edgefilter.commands.display import write_json
 from edgefilter.commands.material import load
 from edgefilter.diagnosis.diagnose import add
 from edgefilter.echo.effects.catalogue import find
+from edgefilter.echo.running import reach
 from edgefilter.report.words import UNITS, figure
 
 LEAST_FALL_DB = 0.05
@@ -22,6 +23,7 @@ def main(args: argparse.Namespace) -> int:
     fitted, before, after = add(profile, args.effect, recording, reference)
     fitted.save(args.output)
     values = dict(fitted.echo.effects)[args.effect]
+    at_run_time = reach(effect, values)
     if args.json:
         figures = {
             "schema": 1,
@@ -30,6 +32,7 @@ def main(args: argparse.Namespace) -> int:
             "excess_after_db": after.excess_db,
         }
         figures["this_recording_only"] = effect.event
+        figures["at_run_time"] = at_run_time
         parameters = {p.name: {"value": np.asarray(values[p.name]).tolist(), "unit": p.unit} for p in effect.told}
         write_json(
             {**figures, "noise_floor_db": before.noise_floor_db, "parameters": parameters, "output": args.output},
@@ -49,6 +52,8 @@ def main(args: argparse.Namespace) -> int:
                 f"NOTE        {args.effect} happened in this recording and is kept with it: of others the profile"
                 " predicts what it did before"
             )
+        if at_run_time:
+            print(f"NOTE        {at_run_time}")
         if after.excess_db > before.excess_db - LEAST_FALL_DB:
             print("WARNING     the error did not fall: this effect does not explain the recording")
         print(f"written to {args.output}")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar, Literal, TypeAlias
+from typing import ClassVar, Literal, Protocol, TypeAlias
 
 import numpy as np
 
@@ -33,6 +33,17 @@ RECORDING = Parameter("recording", "fingerprint", 0.0, 0.0, 2.0**52)
 at."""
 
 
+class Runner(Protocol):
+    """One effect at work on a stream: what it remembers it carries on from one hop to the next."""
+
+    def __call__(self, x: Samples, heard: Samples | None = None) -> Samples:
+        """What the effect makes of the next samples x (n,), (n,).
+
+        heard: the microphone's samples (n,) of the same moment, for an effect behind the path; None ahead of it.
+        """
+        ...
+
+
 class Effect:
     """One physical effect on the robot's own voice. With every parameter at its neutral value, apply is the identity.
 
@@ -41,8 +52,9 @@ class Effect:
     voice at the microphone; "noise" changes the noise that is expected and leaves the voice alone.
 
     What the model asks:
-    memory: samples of the past that apply needs, 0 for none; None where it needs more than the running filter looks
-    back at every hop.
+    memory: samples of the past that apply needs, 0 for none: on a stream it is given so many at every hop. None where
+    that is not known, or too much: then the running filter asks run(), or tries how many are enough (echo/running.py).
+    run_note: a sentence on what the running filter makes of the effect, where that is not what apply does.
     scales_fan: whether the fan gets the same gain as the voice. event: whether the values belong to one recording
     (moments, a gain's curve) rather than to the robot: they get a parameter RECORDING besides their own, and in other
     recordings the effect is left out. absorbed: whether a linear path fitted to a recording holds the effect already.
@@ -62,6 +74,7 @@ class Effect:
     parameters: ClassVar[tuple[Parameter, ...]]
 
     memory: ClassVar[int | None] = None
+    run_note: ClassVar[str] = ""
     scales_fan: ClassVar[bool] = False
     event: ClassVar[bool] = False
     absorbed: ClassVar[bool] = False
@@ -83,6 +96,13 @@ class Effect:
         By default x itself, as for an effect of stage "noise".
         """
         return x.copy()
+
+    def run(self, values: Values, sample_rate: int) -> Runner | None:
+        """The effect on a stream, for one that remembers more than a few samples or follows what the microphone hears.
+
+        None: there is no such form, apply is what there is.
+        """
+        return None
 
     def fit(self, measurement: Measurement, model: VoiceModel) -> Values:
         """Values with which the model, this effect added, comes closest to the recording (least squares).

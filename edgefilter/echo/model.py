@@ -10,7 +10,8 @@ import scipy
 from edgefilter.echo.effect import RECORDING, complete, fitted
 from edgefilter.echo.effects.catalogue import chain, find
 from edgefilter.echo.measurement import Measurement, Values
-from edgefilter.echo.source_chain import SourceChain
+from edgefilter.echo.running import is_filter
+from edgefilter.echo.source_chain import SourceChain, VoiceChain
 from edgefilter.types import SAMPLE_RATE, Array, Samples
 
 TAIL = 12800
@@ -47,12 +48,16 @@ class EchoModel:
         return tuple((effect.variance(x, values, SAMPLE_RATE), effect.colour(values)) for effect, values in noisy)
 
     def source_chain(self) -> SourceChain:
-        """What the running filter puts the reference through, hop by hop, before the path: the source effects with a short memory."""
+        """What the running filter puts the reference through, hop by hop, before the path."""
         return SourceChain(self.effects)
 
+    def voice_chain(self) -> VoiceChain:
+        """What the running filter puts the predicted voice through, hop by hop, behind the path."""
+        return VoiceChain(self.effects)
+
     def running_response(self) -> Samples:
-        """(taps,) the path with all stationary linear effects folded in, as after the last change: what the running filter starts from."""
-        linear = [(effect, values) for effect, values in chain(self.effects) if effect.stage == "path"]
+        """(taps,) the path with the effects on it that are filters, as after the last change: what the running filter starts from."""
+        linear = [(effect, values) for effect, values in chain(self.effects) if is_filter(effect, values)]
         if not linear:
             return self.impulse_response
         response = np.pad(self.impulse_response, (0, TAIL))
@@ -64,11 +69,12 @@ class EchoModel:
     def with_running_response(self, response: Samples, gain: float = 1.0) -> EchoModel:
         """The model whose running_response() begins with response (taps,) and goes on as that of this one times gain.
 
-        The path effects have been applied to both parts and cannot be taken out again (a band limit has no inverse);
-        they are in the impulse response now, and listing them would apply them twice.
+        The effects that are filters have been applied to both parts and cannot be taken out again (a band limit has no
+        inverse); they are in the impulse response now, and listing them would apply them twice.
         """
         rest = self.running_response()[response.size :] * np.float32(gain)
-        kept = tuple(entry for entry in self.effects if find(entry[0]).stage != "path")
+        folded = {effect.name for effect, values in chain(self.effects) if is_filter(effect, values)}
+        kept = tuple(entry for entry in self.effects if entry[0] not in folded)
         return replace(self, impulse_response=np.concatenate((response, rest)).astype(np.float32), effects=kept)
 
     def components(self, reference: Samples) -> dict[str, Samples]:

@@ -73,8 +73,9 @@ def load_effect(path: str | Path) -> str:
 def _guarded(path: Path, mine: type[Effect]) -> type[Effect]:
     """A subclass of the user's class: what its hooks raise becomes one line that names the file and the line in it, what they give is checked."""
     own = [name for name in HOOKS if getattr(mine, name) is not getattr(Effect, name)]
+    checks: dict[str, Callable] = {**_RESULTS, "run": functools.partial(_runner, path)}
     return type(
-        mine.__name__, (mine,), {name: _in_one_line(path, getattr(mine, name), _RESULTS.get(name)) for name in own}
+        mine.__name__, (mine,), {name: _in_one_line(path, getattr(mine, name), checks.get(name)) for name in own}
     )
 
 
@@ -149,6 +150,15 @@ _RESULTS: dict[str, Callable] = {
     "noise_psd": _power(PSD_BINS),
     "colour": _power(PSD_BINS),
 }
+
+
+def _runner(path: Path, effect: Effect, result: object, *_: object) -> Callable | None:
+    """What run() gave, its calls guarded as the hooks are."""
+    if result is None:
+        return None
+    if not callable(result):
+        raise UsageError(f"gives {type(result).__name__}, expected a callable (x, heard) -> samples, or None")
+    return functools.partial(_in_one_line(path, type(result).__call__, _like_input), result)
 
 
 def _kind(result: object) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -99,7 +100,8 @@ class Canceller:
     what force factor and stiffness that depend on the displacement add to a moving-coil loudspeaker (Klippel 2006,
     "Loudspeaker nonlinearities"). Their paths are PRODUCT_PARTITIONS long and start at zero. adaptation: WARM where
     impulse_response is given, COLD where not, unless said otherwise. impulse_response (n,) float32 starts the filter;
-    longer than taps it is cut, without it the start is cold. Raises SignalError where hop or taps are not positive or
+    longer than taps it is cut, without it the start is cold. behind(echo, mic) (hop,): what the microphone makes of the
+    echo that the path brings, None for nothing. Raises SignalError where hop or taps are not positive or
     the impulse response is not finite.
     """
 
@@ -109,10 +111,12 @@ class Canceller:
         taps: int = 6400,
         impulse_response: Samples | None = None,
         adaptation: Adaptation | None = None,
+        behind: Callable[[Samples, Samples], Samples] | None = None,
     ) -> None:
         if hop < 1 or taps < 1:
             raise SignalError(f"canceller got hop={hop} and taps={taps}, expected both to be at least 1 sample")
         self.hop = hop
+        self.behind = behind
         self.partitions = -(-taps // hop)
         self.taps = self.partitions * hop
         self._warm = impulse_response is not None
@@ -168,7 +172,9 @@ class Canceller:
         self._push(reference)
         np.multiply(self._covariance, self._powers, out=self._expected)
         misalignment = np.add.reduce(self._expected, axis=0)
-        echo = self._predict()
+        path_echo = echo = self._predict()
+        if self.behind:
+            echo = self.behind(echo, mic)
         turned = self.volume.follow(mic, echo)
         if turned != 1.0:
             self._weights *= np.float32(turned)
@@ -189,7 +195,7 @@ class Canceller:
                 np.maximum(self._covariance, REOPEN * fourier.power(self._weights), out=self._covariance)
             self._adapt(error_spectrum, 1.0 / (0.5 * misalignment + self._noise + 1e-12))
             if self.adaptation.posterior and not excessive:
-                echo = self._predict()
+                echo = echo + (self._predict() - path_echo) if self.behind else self._predict()
         echo = self._limiter.apply(echo)
         return CancellerOutput(echo, mic - echo, 0.5 * misalignment, innovation)
 

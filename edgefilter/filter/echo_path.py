@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from edgefilter.echo.measurement import Values
-from edgefilter.echo.source_chain import SourceChain
+from edgefilter.echo.source_chain import SourceChain, VoiceChain
 from edgefilter.filter.canceller import LEARNED, WARM, Canceller, CancellerOutput, CancellerState
 from edgefilter.profile.data import Profile
 from edgefilter.types import Samples
@@ -28,24 +28,33 @@ class PathState:
 
 
 class EchoPath:
-    """Predicts and subtracts the echo: the effects ahead of the loudspeaker, then the canceller.
+    """Predicts and subtracts the echo: the effects ahead of the loudspeaker, the canceller, the microphone behind it.
 
-    effects: of the whole model; those of other stages than "source" are left to the canceller's impulse response.
+    effects: of the whole model; those that are filters on the path are left to the canceller's impulse response.
+    source: what they do ahead of the loudspeaker.
     """
 
     def __init__(self, canceller: Canceller, effects: Effects = ()) -> None:
         self.effects = effects
+        self.source = SourceChain(effects)
         self.canceller = canceller
-        self._source = SourceChain(effects)
+        canceller.behind = VoiceChain(effects) or None
+
+    @property
+    def history(self) -> int:
+        """Reference samples that `past` is to hold at least."""
+        return max(self.canceller.history, self.source.memory)
 
     def step(self, mic: Samples, reference: Samples, located: bool, past: Samples | None = None) -> CancellerOutput:
         """One hop (hop,) of the microphone and of the aligned reference.
 
         past: (n,) the aligned reference up to and with this hop where its delay was switched in it, else None.
         """
-        if past is not None:
-            self.canceller.rewrite_reference(self._source.rewritten(past, mic.size))
-        return self.canceller.step(mic, self._source(reference), located)
+        before = None if past is None else self.source.restart(past[: -mic.size])
+        driven = self.source(reference)
+        if before is not None:
+            self.canceller.rewrite_reference(np.concatenate((before, driven)))
+        return self.canceller.step(mic, driven, located)
 
     def state(self) -> PathState:
         """Copies of what it knows."""
@@ -55,7 +64,8 @@ class EchoPath:
     def resumed(cls, state: PathState, past: Samples, hop: int) -> EchoPath:
         """The path of that state. past: (n,) the aligned reference up to and with the hop that is stepped next."""
         path = cls(Canceller.resumed(state.canceller, hop), state.effects)
-        path.canceller.rewrite_reference(path._source.rewritten(past, hop))
+        before = path.source.restart(past[:-hop])
+        path.canceller.rewrite_reference(np.concatenate((before, np.zeros(hop, np.float32))))
         return path
 
 

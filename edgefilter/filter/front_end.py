@@ -13,7 +13,7 @@ from edgefilter.filter.canceller import Canceller, CancellerOutput
 from edgefilter.filter.echo_path import EchoPath, starting_path
 from edgefilter.filter.learner import Heard, Learner, Lesson
 from edgefilter.filter.onset_gate import GATE, OnsetGate
-from edgefilter.filter.residual_echo import Residual
+from edgefilter.filter.residual_echo import Residual, Unpredictable
 from edgefilter.profile.data import Profile
 from edgefilter.types import Frame, Samples
 
@@ -75,7 +75,7 @@ class LinearStage:
 
     def _past(self) -> Samples:
         wanted = self._learner.past if self._learner else 0
-        return self.aligner.history(max(self.path.canceller.history, wanted))
+        return self.aligner.history(max(self.path.history, wanted))
 
 
 class FrontEnd:
@@ -96,9 +96,11 @@ class FrontEnd:
         elif engine.front == "full":
             self.aligner = aligner = Aligner(stft.hop, profile)
             if profile:
-                self.gate = OnsetGate(stft.hop, float(np.sum(np.square(profile.echo.impulse_response))))
+                self.gate = OnsetGate(stft.hop, float(np.sum(np.square(profile.echo.running_response()))))
             path = starting_path(profile, stft.hop)
             self.linear_stage = LinearStage(aligner, path, Residual(stft, profile), learner)
+            colours = path.source.colours
+            self._unpredictable = Unpredictable(stft, colours) if colours else None
         self._analyser = Analyser(stft, channels=4 if self.linear_stage else 2)
         self._low_cut = None if profile or not self.linear_stage else low_cut(stft)
         self._nothing = np.zeros(stft.bins, np.float32)
@@ -128,7 +130,8 @@ class FrontEnd:
         if self._low_cut is not None:
             spectra *= self._low_cut
         x, r, e, error = spectra
-        noise, residual = stage.residual.step(e, error, linear.uncertainty)
+        added = self._unpredictable.step(stage.path.source.expected) if self._unpredictable else None
+        noise, residual = stage.residual.step(e, error, linear.uncertainty, added)
         return Frame(x, r, e, error, noise, residual), aligned
 
     def signals(self, mic: Samples, ref: Samples) -> tuple[Samples, Samples]:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from edgefilter.dsp import fourier
 from edgefilter.dsp.stft import StftConfig
-from edgefilter.types import Samples, Spectrum
+from edgefilter.types import SAMPLE_RATE, Array, Samples, Spectrum
 
 if TYPE_CHECKING:
     from edgefilter.profile.data import Profile
@@ -63,10 +64,13 @@ class Residual:
         self._below, self._echo, self._above = np.split(self._extended, (before, before + self._bins))
         self._leakage, self._left, self._brought = LEAKAGE, 0.0, 0.0
 
-    def step(self, echo: Spectrum, error: Spectrum, uncertainty: Samples) -> tuple[Samples, Samples]:
+    def step(
+        self, echo: Spectrum, error: Spectrum, uncertainty: Samples, added: Samples | None = None
+    ) -> tuple[Samples, Samples]:
         """Expected |fan|^2 and |residual echo|^2 in error, both (bins,) float32.
 
         echo, error: (bins,) of the frame. uncertainty: (bins,), CancellerOutput.uncertainty of the frame's last hop.
+        added: (bins,), what of the robot no waveform predicts.
         """
         self._echo *= TAIL_DECAY
         np.maximum(fourier.power(echo), self._echo, out=self._echo)
@@ -79,6 +83,8 @@ class Residual:
         brought = np.correlate(self._extended, self._spread, "valid")
         brought += self._echo
         unknown = self._misalignment * uncertainty
+        if added is not None:
+            unknown += added
         loud = float(np.add.reduce(brought))
         if loud >= AUDIBLE * self._noise_power:
             self._track(float(np.vdot(error, error).real) - self._noise_power - float(np.add.reduce(unknown)), loud)
@@ -93,3 +99,24 @@ class Residual:
         change = MARGIN * max(self._left, 0.0) / self._brought / self._leakage
         change = min(max(change, LEAKAGE_FALL), LEAKAGE_RISE)
         self._leakage = min(max(self._leakage * change, LEAST), MOST)
+
+
+class Unpredictable:
+    """What effects that no waveform predicts bring into each frame: expected |spectrum|^2, from their expected squares.
+
+    colours: (601,) spectral density of each per Hz, integral 1, 0 to 8 kHz.
+    """
+
+    def __init__(self, stft: StftConfig, colours: Sequence[Array]) -> None:
+        grid_hz = np.linspace(0.0, SAMPLE_RATE / 2, len(colours[0]))
+        density = [np.interp(stft.frequencies, grid_hz, colour) for colour in colours]
+        self._density = (np.array(density) * SAMPLE_RATE / 2).astype(np.float32)
+        self._weights = np.square(stft.analysis_window)
+        self._squares = np.zeros((len(colours), stft.window_length), np.float32)
+
+    def step(self, squares: Sequence[Samples]) -> Samples:
+        """(bins,) of the frame that ends with this hop; squares: (hop,) of each effect."""
+        hop = squares[0].size
+        self._squares[:, :-hop] = self._squares[:, hop:]
+        self._squares[:, -hop:] = squares
+        return (self._squares @ self._weights) @ self._density

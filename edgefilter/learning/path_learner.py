@@ -62,7 +62,7 @@ class PathLearner:
     0
     """
 
-    past = TAPS[1] + 4 * 256
+    past = SAMPLE_RATE
     """Samples of the aligned reference that it wants after a switch of the delay."""
 
     def __init__(self, profile: Profile | None = None, remember: Path | None = None) -> None:

@@ -186,8 +186,8 @@ class Profile:
         return replace(self, echo=echo)
 
     def noise_bins(self, stft: StftConfig) -> Samples:
-        """Expected |X|^2 (bins,) float32 of the fan in one frame of stft: PSD / 2 * sample rate * sum of the squared window."""
-        psd = np.interp(stft.frequencies, GRID_HZ, self.noise_psd)
+        """Expected |X|^2 (bins,) float32 of the fan, as it is now, in one frame of stft: PSD / 2 * sample rate * sum of the squared window."""
+        psd = np.interp(stft.frequencies, GRID_HZ, self.echo.expected_noise(self.noise_psd))
         return (psd / 2 * SAMPLE_RATE * stft.noise_gain()).astype(np.float32)
 
     def response_bins(self, stft: StftConfig) -> Samples:

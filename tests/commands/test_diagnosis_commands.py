@@ -67,6 +67,7 @@ def test_add_lowers_the_error_and_remove_restores_the_profile(scene, tmp_path, c
     assert "playback_gain added" in out and "gain_db = -3.0" in out and str(better) in out
     figures = json.loads((tmp_path / "add.json").read_text())
     assert figures["excess_after_db"] < 0.5 < figures["excess_before_db"] - 3
+    assert figures["at_run_time"] == "" and "NOTE" not in out
     assert figures["parameters"]["gain_db"] == {
         "value": pytest.approx(-3.0, abs=0.02),
         "unit": "dB",
@@ -86,6 +87,13 @@ def test_add_says_so_where_the_error_does_not_fall(scene, tmp_path, capsys):
         == 0
     )
     assert "the error did not fall" in capsys.readouterr().out
+
+
+def test_add_says_what_the_running_filter_makes_of_an_effect_where_that_is_nothing(scene, tmp_path, capsys):
+    command = arguments(scene, "add clock_drift", "--output", tmp_path / "drift.npz", "--json")
+    assert main([*command, str(tmp_path / "add.json")]) == 0
+    said = json.loads((tmp_path / "add.json").read_text())["at_run_time"]
+    assert "follows the clocks by itself" in said and f"NOTE        {said}" in capsys.readouterr().out
 
 
 def test_diagnose_finds_what_is_missing_and_writes_the_documented_json(scene, capsys):

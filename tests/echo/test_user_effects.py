@@ -8,11 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from edgefilter import enhance
 from edgefilter.diagnosis.prepare import prepare
 from edgefilter.echo import user_effects
 from edgefilter.echo.effects import catalogue
 from edgefilter.echo.effects.catalogue import find, names
 from edgefilter.echo.measurement import Measurement
+from edgefilter.echo.running import reach, stream_form
 from edgefilter.echo.user_effects import load_effect
 from edgefilter.errors import UsageError
 from tests.diagnosis.robot_scene import profile, record, voice
@@ -200,3 +202,66 @@ def test_the_documented_effect_finds_its_own_parameters(tmp_path):
     assert np.hypot(found["cosine"], found["sine"]) == pytest.approx(
         np.hypot(0.12, 0.2), rel=0.05
     )  # 8 s of a voice with pauses
+
+
+def test_the_documented_effect_lowers_what_the_running_filter_leaves(tmp_path):
+    load_effect(documented_file(tmp_path))
+    x, robot = voice(12.0), profile()
+    fitted = {"rate_hz": 23.0, "cosine": 0.12, "sine": -0.2}
+    turned = {"rate_hz": 23.0, "cosine": 0.2, "sine": 0.12}  # another start: the blades stand elsewhere
+    heard = record(x, robot.echo.with_effect("blade_chop", turned))
+    knowing = robot.with_echo(robot.echo.with_effect("blade_chop", fitted))
+    left = [enhance(heard, x, known, "linear")[4 * 16000 :] for known in (robot, knowing)]
+    without, with_it = (10 * np.log10(np.mean(rest.astype(float) ** 2)) for rest in left)
+    assert with_it < without - 6  # as docs/own_effect.md says
+    assert reach(find("blade_chop"), fitted) == ""
+
+
+def test_a_path_effect_that_is_no_filter_is_applied_to_the_voice_and_not_to_the_impulse_response(write):
+    load_effect(write(GOOD.replace("np.append(0, x[:-1])", "x * np.abs(x)")))
+    robot = profile().echo
+    bent = robot.with_effect("tilt", {"amount": 0.5})
+    assert bent.running_response() is robot.impulse_response
+    x = voice(0.5)
+    np.testing.assert_array_equal(bent.voice_chain()(x, x), (x + 0.5 * x * np.abs(x)).astype(np.float32))
+    assert bent.with_running_response(robot.impulse_response).effects == bent.effects
+
+
+def test_a_path_effect_that_is_a_filter_goes_into_the_impulse_response(write):
+    load_effect(write(GOOD))
+    robot = profile().echo
+    tilted = robot.with_effect("tilt", {"amount": 0.5})
+    before, after = robot.impulse_response, tilted.running_response()
+    np.testing.assert_allclose(after[1 : before.size], before[1:] + 0.5 * before[:-1], atol=1e-6)  # float32
+    assert not tilted.voice_chain() and tilted.with_running_response(after).effects == ()
+
+
+def test_a_source_effect_without_memory_runs_on_the_least_past_that_gives_the_same(write):
+    echo = "np.concatenate((np.zeros(200, np.float32), x))[: x.size]"
+    load_effect(write(GOOD.replace('"path"', '"source"').replace("np.append(0, x[:-1])", f"np.abs({echo})")))
+    x, bent = voice(1.0), profile().echo.with_effect("tilt", {"amount": 0.5})
+    source = bent.source_chain()
+    hops = np.concatenate([source(x[at : at + 256]) for at in range(0, x.size - 255, 256)])
+    np.testing.assert_array_equal(hops, find("tilt").apply(x, {"amount": 0.5}, 16000)[: hops.size])
+
+
+def test_an_effect_that_cannot_run_says_so(write):
+    load_effect(write(GOOD.replace("np.append(0, x[:-1])", "x * np.sin(np.arange(x.size) / 1000)")))
+    assert stream_form(find("tilt"), {"amount": 0.5}) is None
+    assert "the running filter makes nothing of it" in reach(find("tilt"), {"amount": 0.5})
+
+
+@pytest.mark.parametrize(
+    ("result", "words"),
+    [
+        ("1 / 0", "run stops at line 17 with ZeroDivisionError"),
+        ("3", "run gives int, expected a callable (x, heard) -> samples, or None"),
+        ("lambda x, heard: x[:7]", "gives float32 of shape (7,), expected finite float32 of shape (16000,)"),
+        ("lambda x, heard: nothing * x", "stops at line 17 with NameError"),
+    ],
+)
+def test_a_run_that_fails_is_one_line(write, result, words):
+    odd = GOOD.replace("np.append(0, x[:-1])", "np.abs(x)")
+    load_effect(write(f"{odd}\n    def run(self, values, sample_rate):\n        return {result}\n"))
+    with pytest.raises(UsageError, match=re.escape(words)):
+        profile().echo.with_effect("tilt", {"amount": 0.5}).voice_chain()(voice(1.0), voice(1.0))

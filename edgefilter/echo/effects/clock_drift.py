@@ -31,6 +31,10 @@ class ClockDrift(Effect):
 
     name: ClassVar[str] = "clock_drift"
     stage: ClassVar[Stage] = "time"
+    run_note: ClassVar[str] = (
+        "the running filter follows the clocks by itself, whatever they did in this recording: adding it changes nothing"
+        " there"
+    )
     title: ClassVar[str] = "clock drift"
     complexity: ClassVar[int] = 1
     parameters: ClassVar[tuple[Parameter, ...]] = (

@@ -10,7 +10,7 @@ import numpy as np
 import scipy
 
 from edgefilter.dsp.frames import block_power, decibels
-from edgefilter.echo.effect import Effect, Parameter, Stage, complete, first, neutral
+from edgefilter.echo.effect import Effect, Parameter, Runner, Stage, complete, first, neutral
 from edgefilter.echo.evidence import Evidence
 from edgefilter.echo.least_squares import Normal, normal_equations
 from edgefilter.echo.measurement import Measurement, Values, VoiceModel
@@ -60,17 +60,11 @@ class Compression(Effect):
 
     def apply(self, x: Samples, values: Values, sample_rate: int) -> Samples:
         """X (n,) times the gain that its own level asks for, times the make-up gain."""
-        slope, makeup = 1.0 - 1.0 / float(values["ratio"]), float(values["makeup_db"])
-        if slope == 0.0:
-            return x * np.float32(10.0 ** (makeup / 20.0))
-        keep = np.exp(-1.0 / (float(values["attack_ms"]) * 1e-3 * sample_rate))
-        power = scipy.signal.lfilter([1.0 - keep], [1.0, -keep], np.square(x, dtype=np.float64))
-        over = 10.0 * np.log10(power + 1e-12) - float(values["threshold_db"])
-        knee = float(values["knee_db"])
-        bent = np.clip(over + knee / 2, 0.0, knee) ** 2 / (2 * knee) if knee > 0.0 else 0.0
-        reduction = bent + np.maximum(over - knee / 2, 0.0)
-        held = _falling_peak(reduction, float(values["release_ms"]) * 1e-3 * sample_rate)
-        return (x * 10.0 ** ((makeup - slope * held) / 20.0)).astype(np.float32)
+        return Compressor(values, sample_rate)(x)
+
+    def run(self, values: Values, sample_rate: int) -> Runner:
+        """The compressor, which carries its level and its reduction on."""
+        return Compressor(values, sample_rate)
 
     def fit(self, measurement: Measurement, model: VoiceModel) -> Values:
         """Gauss-Newton in threshold, ratio, attack and release from the best of a coarse grid.
@@ -130,10 +124,36 @@ class Compression(Effect):
         return float(evidence.values["ratio"]) >= 1.1
 
 
-def _falling_peak(x: Array, samples: float) -> Array:
-    """y(n) = max(x(n), y(n - 1) e^(-1 / samples)) for x >= 0, as a running maximum of ln x + n / samples."""
+class Compressor:
+    """One compressor on a stream: values as of Compression."""
+
+    def __init__(self, values: Values, sample_rate: int) -> None:
+        self._slope, self._makeup = 1.0 - 1.0 / float(values["ratio"]), float(values["makeup_db"])
+        self._threshold, self._knee = float(values["threshold_db"]), float(values["knee_db"])
+        self._keep = np.exp(-1.0 / (float(values["attack_ms"]) * 1e-3 * sample_rate))
+        self._release = float(values["release_ms"]) * 1e-3 * sample_rate
+        self._level, self._held = np.zeros(1), 0.0
+
+    def __call__(self, x: Samples, heard: Samples | None = None) -> Samples:
+        """X (n,), which follows what came before, times its gain."""
+        if self._slope == 0.0:
+            return x * np.float32(10.0 ** (self._makeup / 20.0))
+        square = np.square(x, dtype=np.float64)
+        power, self._level = scipy.signal.lfilter([1.0 - self._keep], [1.0, -self._keep], square, zi=self._level)
+        over, knee = 10.0 * np.log10(power + 1e-12) - self._threshold, self._knee
+        bent = np.clip(over + knee / 2, 0.0, knee) ** 2 / (2 * knee) if knee > 0.0 else 0.0
+        held = _falling_peak(bent + np.maximum(over - knee / 2, 0.0), self._release, self._held)
+        self._held = float(held[-1]) if held.size else self._held
+        return (x * 10.0 ** ((self._makeup - self._slope * held) / 20.0)).astype(np.float32)
+
+
+def _falling_peak(x: Array, samples: float, before: float) -> Array:
+    """y(n) = max(x(n), y(n - 1) e^(-1 / samples)) for x >= 0, as a running maximum of ln x + n / samples; before is y(-1)."""
     rise = np.arange(x.size) / samples
-    return np.exp(np.maximum.accumulate(np.log(x + 1e-12) + rise) - rise)
+    level = np.log(x + 1e-12) + rise
+    if before > 0.0 and level.size:
+        level[0] = max(float(level[0]), float(np.log(before)) - 1.0 / samples)
+    return np.exp(np.maximum.accumulate(level) - rise)
 
 
 def _values(unknowns: Array) -> dict[str, float]:

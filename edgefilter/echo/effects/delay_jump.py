@@ -42,6 +42,9 @@ class DelayJump(Effect):
 
     name: ClassVar[str] = "delay_jump"
     stage: ClassVar[Stage] = "source"
+    run_note: ClassVar[str] = (
+        "the running filter finds jumps by itself, and these were of this recording: adding it changes nothing there"
+    )
     title: ClassVar[str] = "a delay jump"
     event: ClassVar[bool] = True
     complexity: ClassVar[int] = 1

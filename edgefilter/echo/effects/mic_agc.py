@@ -9,7 +9,7 @@ import scipy
 from numpy.typing import NDArray
 
 from edgefilter.dsp.frames import block_power, blocks
-from edgefilter.echo.effect import Effect, Parameter, Stage
+from edgefilter.echo.effect import Effect, Parameter, Runner, Stage
 from edgefilter.echo.effects.gain_law import STEP, by_step, follow
 from edgefilter.echo.evidence import Evidence
 from edgefilter.echo.least_squares import absorbed
@@ -26,6 +26,13 @@ LEAST_RANGE_DB = 0.4
 """A gain that moves by less stands still."""
 FAN_ALONE = 1.6
 """Times the fan's power up to which a step of 25 ms may show nothing else."""
+PERCENTILES = 3.29
+"""Standard deviations from the 5th to the 95th percentile."""
+FASTEST_S = 0.05
+CORRELATED = 16.0
+"""By how much more the samples of a voice vary together than those of white noise."""
+LEFT_MEMORY = 0.2
+"""Share of a hop in the energy that the gain leaves."""
 FRAME = SAMPLE_RATE // 8
 SILENT = 0.1
 """A frame shows the fan alone where the predicted voice has less than this part of its power."""
@@ -47,6 +54,9 @@ class MicAgc(Effect):
     name: ClassVar[str] = "mic_agc"
     stage: ClassVar[Stage] = "microphone"
     title: ClassVar[str] = "a microphone gain control"
+    run_note: ClassVar[str] = (
+        "its curve is of this recording; the running filter follows the gain by itself, as far and as fast as here"
+    )
     event: ClassVar[bool] = True
     complexity: ClassVar[int] = 1
     flexible: ClassVar[bool] = True
@@ -65,6 +75,14 @@ class MicAgc(Effect):
             return x.copy()
         position = np.arange(x.size) * (float(values["knots_hz"]) / sample_rate)
         return (x * 10.0 ** (np.interp(position, np.arange(knots.size), knots) / 20.0)).astype(np.float32)
+
+    def run(self, values: Values, sample_rate: int) -> Runner | None:
+        """A follower of the gain, as far and as fast as it moved in the recording; none where it stood still."""
+        spread = float(values["range_db"])
+        if spread < LEAST_RANGE_DB:
+            return None
+        middle = 10.0 ** (float(np.median(np.asarray(values["gain_db"], float))) / 20.0)
+        return GainFollower(middle, spread, float(values["time_constant_s"]), sample_rate)
 
     def fit(self, measurement: Measurement, model: VoiceModel) -> Values:
         """A law by which the gain follows the level, where there is one, and what differs from it slowly.
@@ -127,6 +145,37 @@ class MicAgc(Effect):
             np.log(np.mean(power[low])),
         )
         return bool(moving < still)
+
+
+class GainFollower:
+    """Puts the gain of the moment on the predicted voice: a scalar Kalman filter on what the microphone heard of it.
+
+    The gain is taken to move around its middle as a first-order Markov process does whose 5th and 95th percentile are
+    range_db apart and whose autocovariance falls to 1/e in time_constant_s. A hop tells it with the variance of what
+    the gain leaves unexplained over the voice's energy, times CORRELATED: a voice's samples are not independent.
+    """
+
+    def __init__(self, middle: float, range_db: float, time_constant_s: float, sample_rate: int) -> None:
+        self._middle, self._rate = middle, sample_rate
+        self._variance = (middle * np.log(10.0) / 20.0 * range_db / PERCENTILES) ** 2
+        self._time_constant = max(time_constant_s, FASTEST_S)
+        self._gain, self._doubt, self._left = middle, self._variance, 0.0
+
+    def __call__(self, x: Samples, heard: Samples | None = None) -> Samples:
+        """X (n,) times the gain, which runs from its last value to what heard (n,) makes of it."""
+        assert heard is not None, "a gain behind the path is followed by what the microphone hears"
+        before = self._gain
+        kept = float(np.exp(-x.size / (self._time_constant * self._rate)))
+        self._gain = self._middle + kept * (self._gain - self._middle)
+        self._doubt = kept**2 * self._doubt + (1.0 - kept**2) * self._variance
+        energy = float(x.dot(x))
+        rest = heard - np.float32(self._gain) * x
+        self._left += LEFT_MEMORY * (float(rest.dot(rest)) - self._left)
+        if energy > 0.0:
+            trust = self._doubt / (self._doubt + CORRELATED * self._left / x.size / energy + 1e-12)
+            self._gain += trust * float(rest.dot(x)) / energy
+            self._doubt *= 1.0 - trust
+        return x * np.linspace(before, self._gain, x.size + 1, dtype=np.float32)[1:]
 
 
 def _law(heard: Samples, voice: Samples, recording: Samples, measurement: Measurement) -> Samples:

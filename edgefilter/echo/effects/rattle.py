@@ -65,7 +65,7 @@ class Rattle(Effect):
     cost: ClassVar[int] = 8
     last_resort: ClassVar[bool] = True
     leaves_noise: ClassVar[bool] = True
-    memory: ClassVar[int | None] = 1024
+    memory: ClassVar[int | None] = 2048
     parameters: ClassVar[tuple[Parameter, ...]] = (
         Parameter("threshold", "full scale", NEVER, 1e-5, NEVER),
         Parameter("resonance_hz", "Hz", 200.0, 20.0, 2000.0),

@@ -1,0 +1,122 @@
+"""What of an effect reaches the running filter, and in which form: folded into the path, on windows of a stream, or its own way."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import cast
+
+import numpy as np
+
+from edgefilter.echo.effect import Effect, Runner, vanishes
+from edgefilter.echo.measurement import Values
+from edgefilter.types import SAMPLE_RATE, Samples
+
+MEMORIES = (0, 64, 256, 1024)
+"""Samples of the past that are tried for an effect that does not say how many it needs."""
+PROBE, ROOM = 2048, 8192
+"""Samples of noise on which an effect is tried, and with the silence around it."""
+SHIFTS = (131, 777)
+"""Samples by which a filter's input is moved to see its output move along: no rate below 2 kHz has both as periods."""
+SAME = 1e-5
+"""Difference, relative in power, up to which two outputs are the same: -50 dB are not heard in what a filter leaves."""
+
+
+class Windowed:
+    """An effect on a stream by apply, at each hop on the hop and so many samples before it."""
+
+    def __init__(self, effect: Effect, values: Values, memory: int) -> None:
+        self._effect, self._values, self._memory = effect, values, memory
+        self._past = np.zeros(memory, np.float32)
+
+    def window(self, x: Samples) -> Samples:
+        """The next samples x (n,) behind the past, (memory + n,)."""
+        if not self._memory:
+            return x
+        whole = np.concatenate((self._past, x))
+        self._past = whole[x.size :]
+        return whole
+
+    def __call__(self, x: Samples, heard: Samples | None = None) -> Samples:
+        """X (n,) after the effect."""
+        return self._effect.apply(self.window(x), self._values, SAMPLE_RATE)[self._memory :]
+
+
+class ExpectedSquare(Windowed):
+    """What an effect that no waveform predicts adds to the expected square of each sample, on a stream."""
+
+    def __call__(self, x: Samples, heard: Samples | None = None) -> Samples:
+        """(n,) of the samples x (n,) that set it off."""
+        return self._effect.variance(self.window(x), self._values, SAMPLE_RATE)[self._memory :]
+
+
+def stream_form(effect: Effect, values: Values) -> Callable[[], Runner] | None:
+    """What makes the effect for a stream, ahead of the path or behind it, as before the first sample.
+
+    None where it is no such effect, changes nothing, is a filter on the path, or has no such form.
+    """
+    if effect.stage not in ("source", "path", "microphone") or vanishes(effect, values) or is_filter(effect, values):
+        return None
+    if effect.run(values, SAMPLE_RATE) is not None:
+        return lambda: cast(Runner, effect.run(values, SAMPLE_RATE))
+    memory = _memory(effect, values)
+    return None if memory is None else partial(Windowed, effect, values, memory)
+
+
+def reach(effect: Effect, values: Values) -> str:
+    """A sentence on what the running filter makes of the effect, where that is not what apply does; else empty."""
+    if effect.run_note or vanishes(effect, values):
+        return effect.run_note
+    if effect.stage == "noise" or effect.adds_noise or is_filter(effect, values) or stream_form(effect, values):
+        return ""
+    if effect.timed:
+        return "the running filter makes nothing of it: it is of this recording's moments"
+    return (
+        f"the running filter makes nothing of it: it needs more than {MEMORIES[-1]} samples of the past, or depends on"
+        " when the recording began; a method run() would tell how it goes on from hop to hop"
+    )
+
+
+def is_filter(effect: Effect, values: Values) -> bool:
+    """Whether an effect of stage "path", as it is at a recording's end, is linear and the same at all times: by trying it."""
+    if effect.stage != "path":
+        return False
+    values = effect.settled(values)
+    a, b = (_probe(seed) for seed in (0, 1))
+    one, other = (effect.apply(x, values, SAMPLE_RATE) for x in (a, b))
+    if not _same(effect.apply(a + 2.0 * b, values, SAMPLE_RATE), one + 2.0 * other):
+        return False
+    return all(_same(effect.apply(np.roll(a, shift), values, SAMPLE_RATE)[shift:], one[:-shift]) for shift in SHIFTS)
+
+
+def _memory(effect: Effect, values: Values) -> int | None:
+    """Samples of the past after which apply on a window is apply on all; None where more than MEMORIES would be needed.
+
+    An effect that says how many it needs is believed, unless it acts on moments of the recording.
+    """
+    if effect.memory is not None:
+        return effect.memory
+    return None if effect.timed else next((m for m in MEMORIES if _goes_by_windows(effect, values, m)), None)
+
+
+def _goes_by_windows(effect: Effect, values: Values, memory: int) -> bool:
+    x = _probe(2)
+    whole = effect.apply(x, values, SAMPLE_RATE)
+    starts = [ROOM // 2 + shift for shift in SHIFTS]
+    return all(
+        _same(effect.apply(x[start:], values, SAMPLE_RATE)[memory:], whole[start + memory :]) for start in starts
+    )
+
+
+def _probe(seed: int) -> Samples:
+    """(2 ROOM,) noise of changing level in the middle of silence."""
+    rng = np.random.default_rng(seed)
+    x = np.zeros(2 * ROOM, np.float32)
+    level = 0.2 * (1.0 + np.sin(np.arange(PROBE) / 100.0))
+    x[ROOM // 2 : ROOM // 2 + PROBE] = level * rng.standard_normal(PROBE)
+    return x
+
+
+def _same(found: Samples, expected: Samples) -> bool:
+    difference = found.astype(np.float64) - expected
+    return float(difference @ difference) <= SAME * float(np.sum(expected.astype(np.float64) ** 2))
