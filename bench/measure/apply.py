@@ -60,7 +60,7 @@ def tell(conversation: Conversation, engines: Iterable[str]) -> dict:
     made, made_worse = _outcome(lambda: _made(y, x))
     profiles = {"none": None, "calibrated": known, "crooked": crooked, "added": added}
     profiles |= {"applied": applied or known, "made": made}
-    worse = {"added": prove(known, NAMES, y, x).worse, "crooked": crooked_worse}
+    worse: dict[str, bool | None] = {"added": prove(known, NAMES, y, x).worse, "crooked": crooked_worse}
     worse |= {"applied": applied_worse, "made": made_worse}
     scores = {
         name: {engine: _score(conversation, profile, engine) for engine in engines}
