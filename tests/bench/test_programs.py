@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ import pytest
 import soundfile as sf
 
 from bench.measure import alignment, alone, apply, canceller, real_recordings, tune_paper_ss
+from edgefilter.diagnosis.criteria import Criteria
 from tests.bench.conftest import RATE, babble
 
 
@@ -95,6 +97,8 @@ def test_alignment_and_its_cost_measured_later(clips: Path, tmp_path: Path, monk
 
 def test_what_the_first_seconds_teach(live: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     options = ("--room", "lab", "--engines", "linear")
+    cut_short = partial(apply.diagnose, criteria=Criteria(most_cost=4))  # what a search finds is tested elsewhere
+    monkeypatch.setattr(apply, "diagnose", cut_short)
     monkeypatch.setattr(sys, "argv", ["program", str(live), "--output", str(tmp_path / "apply"), *options])
     assert not apply.main()
     found, page = json.loads((tmp_path / "apply.json").read_text()), (tmp_path / "apply.md").read_text()
