@@ -23,6 +23,8 @@ if TYPE_CHECKING:
     from edgefilter.diagnosis.compare import compare as compare
     from edgefilter.diagnosis.diagnose import add as add
     from edgefilter.diagnosis.diagnose import diagnose as diagnose
+    from edgefilter.diagnosis.proof import Proof as Proof
+    from edgefilter.diagnosis.proof import prove as prove
     from edgefilter.diagnosis.result import Diagnosis as Diagnosis
     from edgefilter.diagnosis.result import Finding as Finding
     from edgefilter.diagnosis.result import Interval as Interval
@@ -59,6 +61,7 @@ _HOMES = {
     "calibration.sweep": ("generate_sweep",),
     "diagnosis.compare": ("Comparison", "compare"),
     "diagnosis.diagnose": ("add", "diagnose"),
+    "diagnosis.proof": ("Proof", "prove"),
     "diagnosis.result": ("Diagnosis", "Finding", "Interval"),
     "echo.effect": ("Effect", "Parameter"),
     "echo.measurement": ("Measurement",),

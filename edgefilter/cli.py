@@ -148,11 +148,18 @@ def _add_calibrate(commands: argparse._SubParsersAction) -> None:
 def _add_diagnosis(commands: argparse._SubParsersAction) -> None:
     compare = commands.add_parser("compare", help="say how far the profile is from a recording of the robot, and where")
     diagnose = commands.add_parser("diagnose", help="say which physical effects the profile lacks")
-    add = commands.add_parser("add", help="fit an effect to a recording and write a profile that has it")
+    add = commands.add_parser("add", help="fit effects to a recording and write a profile that has them")
     remove = commands.add_parser("remove", help="write a profile without one of its effects")
-    for command in (add, remove):
+    add.add_argument("effect", nargs="+", metavar="EFFECT", help="names of effects, as 'diagnose' prints them")
+    remove.add_argument("effect", metavar="EFFECT", help="name of the effect, as 'profile show' prints it")
+    diagnose.add_argument(
+        "--apply",
+        metavar="P2.npz",
+        help="write a profile with all that was found; without --profile, one made from the recording",
+    )
+    for command in (add, diagnose):
         command.add_argument(
-            "effect", metavar="EFFECT", help="name of the effect, as 'diagnose' and 'profile show' print it"
+            "--force", action="store_true", help="write it even where the running filter is worse with it"
         )
     for command in (compare, diagnose, add, remove):
         needed = command in (add, remove)

@@ -9,7 +9,7 @@ import sys
 
 import soundfile
 
-from edgefilter import Profile, add, compare, diagnose
+from edgefilter import Profile, add, compare, diagnose, prove
 
 profile_path, mic_path, reference_path, output_path = sys.argv[1:]
 profile = Profile.load(profile_path)
@@ -21,6 +21,8 @@ found = diagnose(profile, recording, reference)
 print(found.verdict, found.evidence)
 for finding in found.ranking:
     print(f"{finding.effect}: {finding.evidence}")
-    profile, before, after = add(profile, finding.effect, recording, reference)
-    print(f"  {before.excess_db:.1f} dB before it was added, {after.excess_db:.1f} dB after")
+names = [finding.effect for finding in found.ranking]
+if names and not prove(profile, names, recording, reference).worse:
+    profile, before, after = add(profile, names, recording, reference)
+    print(f"  {before.excess_db:.1f} dB before they were added, {after.excess_db:.1f} dB after")
 profile.save(output_path)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -14,6 +14,7 @@ from edgefilter.diagnosis.findings import findings_of, share_of
 from edgefilter.diagnosis.leftover import left_in_words
 from edgefilter.diagnosis.noise_change import look_at_fan
 from edgefilter.diagnosis.prepare import Prepared, prepare
+from edgefilter.diagnosis.proof import listed, with_fitted
 from edgefilter.diagnosis.result import Diagnosis, Finding, Interval, Verdict
 from edgefilter.diagnosis.score import Judge
 from edgefilter.diagnosis.select import search
@@ -89,25 +90,30 @@ def diagnose(
 
 
 def add(
-    profile: Profile, name: str, recording: Samples, reference: Samples, *, sample_rate: int = SAMPLE_RATE
+    profile: Profile,
+    names: str | Sequence[str],
+    recording: Samples,
+    reference: Samples,
+    *,
+    sample_rate: int = SAMPLE_RATE,
 ) -> tuple[Profile, Comparison, Comparison]:
-    """Fit an effect to a recording and write it into a new profile.
+    """Fit one or several effects to a recording, beside each other, and write them into a new profile.
 
     Parameters
     ----------
     profile : Profile
         Stays as it is.
-    name : str
-        Of the effect, as a diagnosis prints it.
+    names : str or sequence of str
+        Of the effects, as a diagnosis prints them.
     recording, reference, sample_rate
         As of `diagnose`.
 
     Returns
     -------
     Profile
-        With the effect.
+        With the effects.
     Comparison, Comparison
-        Before and after.
+        Before and after, both of the straightened recording; its warnings say what was straightened.
 
     Raises
     ------
@@ -118,10 +124,14 @@ def add(
 
     Notes
     -----
+    Clocks that drift, jumps and a turned volume are followed by the running filter itself and would spoil the fit of
+    anything else, so they are taken out of the recording first, unless they are among the names; the profile does not
+    get them. Each effect is fitted with the others in place, in turn, until the error no longer falls.
+
     Fitted to all of the recording: that predicts other recordings of the robot better than the fit to half of it by
-    which `diagnose` judges. So the comparison after, of this recording, is of samples that the fit has used. An event
-    (a jump, a moment's move) is kept with the recording in which it happened: of any other the profile predicts what it
-    did before.
+    which `diagnose` judges. So the comparison after, of this recording, is of samples that the fit has used; `prove`
+    says what the effects are worth on others. An event (a jump, a moment's move) is kept with the recording in which it
+    happened: of any other the profile predicts what it did before.
 
     Examples
     --------
@@ -139,10 +149,16 @@ def add(
     (['playback_gain'], True)
     """
     prepared = prepare(profile, recording, reference, sample_rate=sample_rate)
-    before = describe(prepared, prepared.model)
-    values = dict(prepared.model.fit(name, replace(prepared.measurement, fit=prepared.usable)).effects)[name]
-    knowing = profile.with_echo(profile.echo.with_effect(name, values))
-    return knowing, before, compare(knowing, recording, reference, sample_rate=sample_rate)
+    knowing, model, straightened = with_fitted(profile, prepared, listed(names))
+    if not straightened:
+        after = compare(knowing, recording, reference, sample_rate=sample_rate)
+        return knowing, describe(prepared, prepared.model), after
+    values, straight = dict(model.effects), prepared.model
+    for name in straightened:
+        straight = straight.with_effect(name, values[name])
+    told = tuple(f"{name} is taken out first: {find(name).sentence(values[name])}" for name in straightened)
+    told_of = replace(prepared, warnings=(*told, *prepared.warnings))
+    return knowing, describe(told_of, straight), describe(told_of, model)
 
 
 def conclude(

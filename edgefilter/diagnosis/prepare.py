@@ -95,6 +95,8 @@ def prepare(profile: Profile, recording: Samples, reference: Samples, *, sample_
     predicted = model.predict(at_calibration)
     known = floored(model.expected_noise(profile.noise_psd)).astype(np.float32)
     offset = starting_offset(whiten(predicted, known), whiten(y, known))
+    if model.timed:  # a clock that drifts has drifted further, or less, by the time that the offset takes
+        offset += starting_offset(whiten(model.predict(delayed(x, start + offset)), known), whiten(y, known))
     pieces = utterance_lags(x, predicted, y, known, offset)
     begin, end = known_span(x, start + pieces[0][2], start + pieces[-1][2])
     shifted = (

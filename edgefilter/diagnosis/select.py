@@ -198,7 +198,7 @@ def _best(bench: Workbench, start: EchoModel, runs: list[EchoModel]) -> EchoMode
     The earlier and simpler one where others hardly explain more.
     """
     base = bench.score(start).level_db
-    valid = [_standing(bench, start, run) for run in runs]
+    valid = [standing(bench, start, run) for run in runs]
     best = start
     for run in sorted(valid, key=lambda run: sum(find(name).complexity for name in added(start, run))):
         most = base - bench.score(best).level_db
@@ -207,7 +207,7 @@ def _best(bench: Workbench, start: EchoModel, runs: list[EchoModel]) -> EchoMode
     return best
 
 
-def _standing(bench: Workbench, start: EchoModel, run: EchoModel) -> EchoModel:
+def standing(bench: Workbench, start: EchoModel, run: EchoModel) -> EchoModel:
     """The run without the effects that cannot be named beside its others, the latest first."""
     while fallen := [name for name in added(start, run) if not _stands(bench, run, name)]:
         run = run.without_effect(fallen[-1])

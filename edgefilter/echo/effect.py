@@ -58,6 +58,8 @@ class Effect:
     scales_fan: whether the fan gets the same gain as the voice. event: whether the values belong to one recording
     (moments, a gain's curve) rather than to the robot: they get a parameter RECORDING besides their own, and in other
     recordings the effect is left out. absorbed: whether a linear path fitted to a recording holds the effect already.
+    followed: whether the running filter follows it by itself, as its aligner does a drift, so that a fit of others takes
+    it out of the recording first (diagnosis/joint.py).
 
     What the diagnosis asks:
     title: as it reads inside a sentence ("a turned volume"); by default the name. complexity: of two effects that
@@ -78,6 +80,7 @@ class Effect:
     scales_fan: ClassVar[bool] = False
     event: ClassVar[bool] = False
     absorbed: ClassVar[bool] = False
+    followed: ClassVar[bool] = False
 
     title: ClassVar[str] = ""
     complexity: ClassVar[int] = 3

@@ -178,7 +178,7 @@ def _finding(finding: Finding, names: Mapping[str, object]) -> dict[str, object]
         "share": f"{100 * finding.share:.0f}",
         "evidence": sentence(finding.evidence),
         "parameters": [(name, interval_text(interval)) for name, interval in finding.parameters.items()],
-        "command": add_command(finding.effect, names).split(" "),
+        "command": add_command([finding.effect], names).split(" "),
     }
 
 

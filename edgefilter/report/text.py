@@ -69,14 +69,14 @@ def diagnosis_lines(found: Diagnosis, calibrated: bool = True) -> list[str]:
     return [*lines, f"where       it is with {profile}:", *comparison_lines(found.comparison)]
 
 
-def add_command(effect: str, names: Mapping[str, Any]) -> str:
-    """What to type to have that effect in a new profile; without a profile, to have one at all."""
+def add_command(effects: Sequence[str], names: Mapping[str, Any]) -> str:
+    """What to type to have those effects in a new profile; without a profile, to have one at all."""
     if names["profile"] is None:
         return "edgefilter calibrate --live --output robot.npz"
     files = " ".join(f"--{role} {shlex.quote(str(names[role]))}" for role in ("profile", "recording", "reference"))
     own = "".join(f" --effects {shlex.quote(str(file))}" for file in names.get("effects") or ())
-    output = Path(str(names["profile"])).with_suffix(f".{effect}.npz")
-    return f"edgefilter add {effect} {files}{own} --output {shlex.quote(str(output))}"
+    output = Path(str(names["profile"])).with_suffix(f".{'.'.join(effects)}.npz")
+    return f"edgefilter add {' '.join(effects)} {files}{own} --output {shlex.quote(str(output))}"
 
 
 def in_order(ranking: Sequence[Finding]) -> list[Finding]:

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import json
 import sys
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 import soundfile as sf
 
-from bench.measure import alignment, alone, canceller, real_recordings, tune_paper_ss
+from bench.measure import alignment, alone, apply, canceller, real_recordings, tune_paper_ss
+from edgefilter.diagnosis.criteria import Criteria
 from tests.bench.conftest import RATE, babble
 
 
@@ -91,3 +93,18 @@ def test_alignment_and_its_cost_measured_later(clips: Path, tmp_path: Path, monk
     again, _ = run(monkeypatch, alignment, tmp_path / "alignment", *folders, "--only-cost", "--seed", 7)
     assert again["stamp"] == found["stamp"] and again["lags"] == found["lags"]
     assert "--only-cost" in again["cost"]["stamp"]["command"]
+
+
+def test_what_the_first_seconds_teach(live: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    options = ("--room", "lab", "--engines", "linear")
+    cut_short = partial(apply.diagnose, criteria=Criteria(most_cost=4))  # what a search finds is tested elsewhere
+    monkeypatch.setattr(apply, "diagnose", cut_short)
+    monkeypatch.setattr(sys, "argv", ["program", str(live), "--output", str(tmp_path / "apply"), *options])
+    assert not apply.main()
+    found, page = json.loads((tmp_path / "apply.json").read_text()), (tmp_path / "apply.md").read_text()
+    check_stamp(found, page, ["CONVERSATIONS"])
+    (row,) = found["conversations"]
+    assert row["conversation"] == "lab_00" and set(row["si_sdr"]) == set(apply.PROFILES)
+    proofs = found["summary"]["live, lab"]["proofs"]
+    assert proofs["added"]["proofs"] == 1 and proofs["added"]["refused"] == row["worse"]["added"]
+    assert "| profile | linear |" in page and page.count("| `diagnose --apply` |") == 2

@@ -67,8 +67,8 @@ def test_add_lowers_the_error_and_remove_restores_the_profile(scene, tmp_path, c
     assert "playback_gain added" in out and "gain_db = -3.0" in out and str(better) in out
     figures = json.loads((tmp_path / "add.json").read_text())
     assert figures["excess_after_db"] < 0.5 < figures["excess_before_db"] - 3
-    assert figures["at_run_time"] == "" and "NOTE" not in out
-    assert figures["parameters"]["gain_db"] == {
+    assert figures["effects"]["playback_gain"]["at_run_time"] == "" and "NOTE" not in out
+    assert figures["effects"]["playback_gain"]["parameters"]["gain_db"] == {
         "value": pytest.approx(-3.0, abs=0.02),
         "unit": "dB",
     }  # 0.02 dB: -53 dB of the voice

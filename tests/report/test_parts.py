@@ -162,7 +162,7 @@ def test_four_effects_give_five_comparisons_in_the_page():
 def test_the_command_to_add_is_one_that_a_shell_reads():
     names = {"profile": "my robot.npz", "recording": "m.wav", "reference": "r.wav", "effects": ["own.py"]}
     assert (
-        add_command("tilt", names)
+        add_command(["tilt"], names)
         == "edgefilter add tilt --profile 'my robot.npz' --recording m.wav --reference r.wav --effects own.py --output"
         " 'my robot.tilt.npz'"
     )

@@ -36,6 +36,7 @@ class ClockDrift(Effect):
         " there"
     )
     title: ClassVar[str] = "clock drift"
+    followed: ClassVar[bool] = True
     complexity: ClassVar[int] = 1
     parameters: ClassVar[tuple[Parameter, ...]] = (
         Parameter("ppm", "1e-6", 0.0, -1000.0, 1000.0),

@@ -47,6 +47,7 @@ class DelayJump(Effect):
     )
     title: ClassVar[str] = "a delay jump"
     event: ClassVar[bool] = True
+    followed: ClassVar[bool] = True
     complexity: ClassVar[int] = 1
     parameters: ClassVar[tuple[Parameter, ...]] = (
         Parameter("times_s", "s", 0.0, 0.0, 1e6),

@@ -22,6 +22,7 @@ class PlaybackGain(Effect):
     stage: ClassVar[Stage] = "source"
     title: ClassVar[str] = "a turned volume"
     absorbed: ClassVar[bool] = True
+    followed: ClassVar[bool] = True
     complexity: ClassVar[int] = 0
     memory: ClassVar[int | None] = 0
     parameters: ClassVar[tuple[Parameter, ...]] = (Parameter("gain_db", "dB", 0.0, -60.0, 60.0),)

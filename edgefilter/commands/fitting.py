@@ -1,0 +1,149 @@
+"""What `add` and `diagnose --apply` share: effects are proven in the running filter, fitted, written and told of."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from edgefilter.diagnosis.compare import Comparison
+from edgefilter.diagnosis.criteria import Criteria
+from edgefilter.diagnosis.diagnose import add
+from edgefilter.diagnosis.proof import Proof, prove
+from edgefilter.echo.effects.catalogue import find
+from edgefilter.echo.effects.catalogue import names as names_known
+from edgefilter.echo.running import reach
+from edgefilter.errors import EdgefilterError, SignalError
+from edgefilter.profile.data import Profile
+from edgefilter.report.words import UNITS, decibels, figure, joined
+from edgefilter.types import Samples
+
+LEAST_FALL_DB = 0.05
+"""By less the figures that are shown do not differ."""
+
+
+class Refused(EdgefilterError):
+    """What was fitted would make the running filter worse, so that nothing was written."""
+
+
+@dataclass(frozen=True, eq=False)
+class Fitted:
+    """A profile with effects, the comparisons before and after, and the proof; unproven: why there is none."""
+
+    names: tuple[str, ...]
+    dropped: tuple[str, ...]
+    profile: Profile
+    before: Comparison
+    after: Comparison
+    proof: Proof | None
+    unproven: str = ""
+
+    def to_dict(self) -> dict[str, Any]:
+        """Ready for JSON."""
+        values = dict(self.profile.echo.effects)
+        effects = {}
+        for name in self.names:
+            effect = find(name)
+            told = {p.name: {"value": np.asarray(values[name][p.name]).tolist(), "unit": p.unit} for p in effect.told}
+            effects[name] = {
+                "this_recording_only": effect.event,
+                "at_run_time": reach(effect, values[name]),
+                "parameters": told,
+            }
+        return {
+            "effects": effects,
+            "dropped": list(self.dropped),
+            "excess_before_db": self.before.excess_db,
+            "excess_after_db": self.after.excess_db,
+            "noise_floor_db": self.after.noise_floor_db,
+            "proof": self.proof.to_dict() if self.proof else None,
+        }
+
+    def lines(self) -> list[str]:
+        """For the terminal: the excess before and after, the values, the proof, what to beware of."""
+        values = dict(self.profile.echo.effects)
+        added = joined(self.names) or "nothing"
+        before_db, after_db = self.before.excess_db, self.after.excess_db
+        lines = [f"{added} added: {before_db:.1f} dB over the noise floor before, {after_db:.1f} dB after"]
+        for name in self.names:
+            lines += _values(name, values[name], len(self.names) > 1)
+        lines += [f"{'recording':<12}{text}" for text in self.before.warnings]
+        lines.append(f"{'proof':<12}{_told(self.proof) if self.proof else f'none: {self.unproven}'}")
+        lines += [f"{'dropped':<12}{name}: with it the running filter would be worse" for name in self.dropped]
+        lines += [
+            f"NOTE        {name} happened in this recording and is kept with it: of others the profile predicts what it"
+            " did before"
+            for name in self.names
+            if find(name).event
+        ]
+        lines += [f"NOTE        {name}: {note}" for name in self.names if (note := reach(find(name), values[name]))]
+        if self.names and after_db > before_db - LEAST_FALL_DB:
+            what = "this effect does" if len(self.names) == 1 else "these effects do"
+            lines.append(f"WARNING     the error did not fall: {what} not explain the recording")
+        return lines
+
+
+def fit(
+    profile: Profile | None,
+    start: Profile,
+    names: tuple[str, ...],
+    recording: Samples,
+    reference: Samples,
+    *,
+    force: bool,
+    drop: bool = False,
+) -> Fitted:
+    """The effects fitted to the recording on top of start, and proven against profile.
+
+    start: the profile, or one made from the recording where there is none. drop: whether an effect that makes the
+    filter worse is left out where the others help. Raises Refused where the filter would be worse, unless force.
+    """
+    proof, unproven = None, ""
+    dropped: tuple[str, ...] = ()
+    try:
+        proof = prove(profile, names, recording, reference) if names or profile is None else None
+        unproven = "" if proof else "there is nothing to prove"
+        while drop and not force and proof and proof.worse and proof.culprit:
+            dropped = (*dropped, proof.culprit)
+            names = tuple(name for name in names if name not in dropped)
+            proof = prove(profile, names, recording, reference)
+    except SignalError as error:
+        if not force:
+            raise
+        unproven = str(error)
+    if proof and proof.worse and not force:
+        raise Refused(_refusal(proof))
+    return Fitted(names, dropped, *add(start, names, recording, reference), proof, unproven)
+
+
+def long_paths() -> list[str]:
+    """Names of the effects that lengthen a path: a profile made from a recording has one of a quarter of a second."""
+    longest = Criteria().long_filter
+    return [name for name in names_known() if find(name).absorbed and find(name).complexity >= longest]
+
+
+def _values(name: str, values: Any, named: bool) -> list[str]:
+    lines = []
+    for p in find(name).told:
+        value = np.asarray(values[p.name])
+        shown = f"{value.size} values" if value.size > 6 else ", ".join(figure(v) for v in value.ravel())
+        lines.append(f"  {f'{name} ' if named else ''}{p.name} = {shown} {UNITS.get(p.unit, p.unit)}".rstrip())
+    return lines
+
+
+def _told(proof: Proof) -> str:
+    return (
+        f"running filter, {proof.seconds:.1f} s held out: ERLE {decibels(proof.erle_before_db)} dB before,"
+        f" {decibels(proof.erle_after_db)} dB after"
+    )
+
+
+def _refusal(proof: Proof) -> str:
+    what = joined(proof.effects) or "a profile made from this recording"
+    others = f"; without {proof.culprit} it is {dict(proof.without)[proof.culprit]:.1f} dB" if proof.culprit else ""
+    return (
+        f"{what} would make the running filter worse: ERLE {proof.erle_before_db:.1f} dB before,"
+        f" {proof.erle_after_db:.1f} dB after, on {proof.seconds:.1f} s of the robot that the fit has not"
+        f" seen{others}; nothing is written (--force writes it)"
+    )

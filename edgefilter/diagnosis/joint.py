@@ -1,0 +1,98 @@
+"""Effects fitted beside each other to a recording, and to a straight one: drift, jumps and volume taken out first."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+from edgefilter.diagnosis.criteria import Criteria
+from edgefilter.diagnosis.prepare import Prepared
+from edgefilter.diagnosis.select import refit, standing
+from edgefilter.diagnosis.trials import Workbench
+from edgefilter.echo.effects.catalogue import find, names
+from edgefilter.echo.measurement import Measurement
+from edgefilter.echo.model import EchoModel
+
+ROUNDS = 3
+"""A bound on the work; two rounds settle what a long filter and a loudspeaker's distortion have in common."""
+WORTH = 0.02
+"""Part of the squared error (0.1 dB) by which a round has to lower it to be followed by another."""
+
+
+def fit_jointly(measurement: Measurement, model: EchoModel, wanted: Sequence[str]) -> EchoModel:
+    """The model with the effects of those names, each fitted with the others in place, in turn, until the error no longer falls.
+
+    measurement: whatever its reference is not straightened for has to be in the model already, or wanted: a long filter
+    fitted to a recording whose clocks differ fits nothing.
+    """
+    best, least = model, float("inf")
+    for _ in range(ROUNDS if len(wanted) > 1 else 1):
+        for name in wanted:
+            model = model.fit(name, measurement)
+        error = measurement.error(measurement.heard(model)[0])
+        if error < least:
+            best, before, least = model, least, error
+            if error < (1.0 - WORTH) * before:
+                continue
+        break
+    return best
+
+
+def fit_straight(prepared: Prepared, wanted: Sequence[str]) -> tuple[EchoModel, tuple[str, ...]]:
+    """The prepared recording's model with those effects, fitted jointly, and with what the running filter follows by itself.
+
+    The names of the latter are the second answer: a drift or a turned volume of this recording, which would spoil the
+    fit of the others and is none of theirs. Looked for twice, since beside the wrong room it may be hidden.
+    """
+    bench, followed = Workbench(prepared, Criteria()), _followed(wanted)
+    model = _straightened(bench, _without(prepared.model, followed), followed)
+    fitted, order = _forward(bench, model, wanted)
+    model = _straightened(bench, _without(fitted, followed), followed)
+    found = tuple(name for name in followed if name in dict(model.effects))
+    everywhere = replace(prepared.measurement, fit=prepared.usable)
+    return fit_jointly(everywhere, model, [*found, *order]), found
+
+
+def _forward(bench: Workbench, model: EchoModel, wanted: Sequence[str]) -> tuple[EchoModel, list[str]]:
+    """The model with the wanted effects, and their order: always the simplest next of those that explain nearly most.
+
+    In another order an effect settles on what the one after it should have explained. Last come those of which a fit to
+    half of the recording finds nothing.
+    """
+    order: list[str] = []
+    while left := [name for name in wanted if name not in order]:
+        newest = bench.preferred(trial for name in left if (trial := bench.attempt(name, model.without_effect(name))))
+        if newest is None:
+            return model, [*order, *left]
+        model = newest.model
+        order.append(newest.name)
+    return model, order
+
+
+def _followed(wanted: Sequence[str]) -> list[str]:
+    """Names of the effects that the running filter follows, less those that are wanted and those that a wanted one holds.
+
+    A flexible effect on the path has the volume in it: beside it a gain is anything.
+    """
+    holds_gain = any(find(name).stage == "path" and find(name).flexible for name in wanted)
+    return [
+        name
+        for name in names()
+        if find(name).followed and name not in wanted and not (find(name).absorbed and holds_gain)
+    ]
+
+
+def _without(model: EchoModel, dropped: Sequence[str]) -> EchoModel:
+    return replace(model, effects=tuple(entry for entry in model.effects if entry[0] not in dropped))
+
+
+def _straightened(bench: Workbench, start: EchoModel, followed: Sequence[str]) -> EchoModel:
+    """The model with those of the followed effects that held-out samples show: forward, each refitted, backward."""
+    model = start
+    while True:
+        absent = [name for name in followed if name not in dict(model.effects)]
+        trials = [trial for name in absent if (trial := bench.attempt(name, model)) is not None]
+        newest = bench.preferred(trial for trial in trials if bench.admissible(trial, model))
+        if newest is None:
+            return standing(bench, start, model)
+        model = refit(bench, start, newest.model)

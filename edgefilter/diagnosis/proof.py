@@ -1,0 +1,191 @@
+"""Whether what a recording teaches helps the running filter: fitted to the first part of it, heard on the rest."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edgefilter.calibration.from_recording import self_calibrate
+from edgefilter.diagnosis.joint import fit_straight
+from edgefilter.diagnosis.prepare import Prepared, prepare
+from edgefilter.dsp.frames import block_power, decibels
+from edgefilter.echo.model import EchoModel
+from edgefilter.errors import SignalError
+from edgefilter.filter.ego_filter import enhance
+from edgefilter.profile.data import Profile
+from edgefilter.types import SAMPLE_RATE, Samples
+
+FIRST = 0.6
+"""Part of the robot's voice that the proof fits to: the rest is as short as judges a filter, since a fit to less than
+all is worse than the one that is written."""
+NEAR = 0.1
+"""Of the recording, how far either way the cut may move to fall into a pause."""
+LEAST_S = 0.5
+"""Seconds of the robot alone that each part must hold."""
+WORSE_DB = 0.2
+"""By less ERLE than this two runs of the filter differ for no reason."""
+AHEAD = SAMPLE_RATE // 10
+"""Samples by which the filter hears the reference ahead of the microphone, as on a robot."""
+
+
+@dataclass(frozen=True)
+class Proof:
+    """ERLE in dB of the running filter, engine linear, over seconds that the fit has not seen, without and with what was fitted.
+
+    seconds: of the robot alone that were judged, from start_s to the recording's end. without: of several effects, the
+    ERLE with all but that one, where they make the filter worse; empty otherwise.
+    """
+
+    effects: tuple[str, ...]
+    start_s: float
+    seconds: float
+    erle_before_db: float
+    erle_after_db: float
+    without: tuple[tuple[str, float], ...] = ()
+
+    @property
+    def worse(self) -> bool:
+        """Whether the filter is better off without."""
+        return self.erle_after_db < self.erle_before_db - WORSE_DB
+
+    @property
+    def culprit(self) -> str | None:
+        """The effect without which the others do least harm; None where there is but one, or no harm."""
+        return max(self.without, key=lambda entry: entry[1])[0] if self.without else None
+
+    def to_dict(self) -> dict[str, object]:
+        """Ready for JSON."""
+        found = {key: round(v, 3) if isinstance(v, float) else v for key, v in asdict(self).items()}
+        return {**found, "without": {name: round(db, 3) for name, db in self.without}, "worse": self.worse}
+
+
+class HeldOut:
+    """A recording cut in two at a pause: a part to fit to, and the robot alone of the rest, heard by a filter that has just begun.
+
+    profile: by which recording (n,) and reference (m,), both at 16 kHz, are aligned. Raises SignalError where
+    either part holds less than LEAST_S of the robot.
+    """
+
+    def __init__(self, profile: Profile, recording: Samples, reference: Samples) -> None:
+        self._prepared = prepare(profile, recording, reference)
+        robot = self._prepared.usable & self._prepared.active
+        self.cut = _cut(self._prepared.prediction, robot)
+        self._judged = robot[self.cut :]
+        self.seconds = float(np.count_nonzero(self._judged)) / SAMPLE_RATE
+        shortest = min(self.seconds, float(np.count_nonzero(robot[: self.cut])) / SAMPLE_RATE)
+        if shortest < LEAST_S:
+            raise SignalError(
+                f"too little of the robot alone to hold seconds out and prove a fit on them: {shortest:.1f} s, expected"
+                f" {LEAST_S:g} s in each part of the recording; give a longer one, or --force"
+            )
+
+    def before(self, prepared: Prepared) -> Prepared:
+        """The prepared recording with nothing to fit to, or to judge by, from the cut on."""
+        first = np.arange(prepared.usable.size) < self.cut
+        fit = replace(prepared.measurement, fit=prepared.fit & first)
+        return replace(prepared, measurement=fit, usable=prepared.usable & first)
+
+    def erle_db(self, profile: Profile | None) -> float:
+        """ERLE of the running filter with that profile over the held-out seconds of the robot alone, dB."""
+        measurement = self._prepared.measurement
+        heard = measurement.recording[self.cut :]
+        said = np.pad(measurement.reference, (0, AHEAD))[self.cut + AHEAD :]
+        left = enhance(heard, said, profile, "linear")
+        powers = (float(np.sum(np.square(x[self._judged], dtype=np.float64))) for x in (heard, left))
+        return float(np.subtract(*(decibels(power) for power in powers)))
+
+
+def prove(
+    profile: Profile | None,
+    names: str | Sequence[str],
+    recording: Samples,
+    reference: Samples,
+) -> Proof:
+    """Say whether the running filter is better with effects than without them, on seconds that their fit has not seen.
+
+    Parameters
+    ----------
+    profile : Profile or None
+        What is known of the robot. None: the filter without a profile is held against one with a profile made from the
+        recording and the effects.
+    names : str or sequence of str
+        Of the effects; of none only where there is no profile.
+    recording, reference
+        As of `diagnose`, at 16 kHz.
+
+    Returns
+    -------
+    Proof
+        ERLE before and after.
+
+    Raises
+    ------
+    UsageError
+        For an unknown effect.
+    SignalError
+        Where the recording does not contain the reference, or too little of it to hold seconds out.
+
+    Notes
+    -----
+    The effects are fitted, as `add` does it, to the first three fifths of the robot's voice. A filter that begins with
+    the rest, engine "linear", then runs over it with the profile before and after. Where somebody else talks is left
+    out.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from edgefilter import calibrate, generate_sweep
+    >>> rng = np.random.default_rng(0)
+    >>> def fan(n):
+    ...     return 1e-3 * rng.standard_normal(n).astype(np.float32)
+    >>> sweep = generate_sweep()
+    >>> profile = calibrate(sweep, 0.5 * np.roll(sweep, 300) + fan(sweep.size), fan(64_000))
+    >>> said = (0.2 * rng.standard_normal(80_000) * np.repeat(rng.uniform(size=25) > 0.3, 3200)).astype(np.float32)
+    >>> heard = 0.5 * np.roll(said, 300) + 0.2 * np.roll(said, 900) + fan(said.size)
+    >>> proof = prove(profile, "late_reverb", heard, said)
+    >>> proof.worse, proof.erle_after_db > proof.erle_before_db + 3
+    (False, True)
+    """
+    names = listed(names)
+    known = profile or self_calibrate(recording, reference)
+    held = HeldOut(known, recording, reference)
+    first = profile or self_calibrate(recording[: held.cut], reference)
+    early = held.before(prepare(first, recording, reference))
+
+    def erle_with(wanted: tuple[str, ...]) -> float:
+        return held.erle_db(with_fitted(first, early, wanted)[0])
+
+    proof = Proof(names, held.cut / SAMPLE_RATE, held.seconds, held.erle_db(profile), erle_with(names))
+    if not proof.worse or len(names) < 2:
+        return proof
+    others = ((name, erle_with(tuple(other for other in names if other != name))) for name in names)
+    return replace(proof, without=tuple(others))
+
+
+def listed(names: str | Sequence[str]) -> tuple[str, ...]:
+    """The names, each once, of one or several effects."""
+    return (names,) if isinstance(names, str) else tuple(dict.fromkeys(names))
+
+
+def with_fitted(
+    profile: Profile, prepared: Prepared, names: Sequence[str]
+) -> tuple[Profile, EchoModel, tuple[str, ...]]:
+    """The profile with those effects fitted; the fitted model and the names of what was straightened in it."""
+    model, straightened = fit_straight(prepared, names) if names else (prepared.model, ())
+    echo, values = profile.echo, dict(model.effects)
+    for name in names:
+        echo = echo.with_effect(name, values[name])
+    return profile.with_echo(echo), model, straightened
+
+
+def _cut(prediction: Samples, robot: NDArray[np.bool_]) -> int:
+    """The middle of the quietest fifth of a second near where FIRST of the robot's voice is over."""
+    spoken = np.cumsum(robot)
+    middle = int(np.searchsorted(spoken, FIRST * spoken[-1])) if spoken.size else 0
+    near, block = round(NEAR * robot.size), SAMPLE_RATE // 5
+    start = max(middle - near, 0)
+    part = prediction[start : middle + near]
+    return start + int(np.argmin(block_power(part, block))) * block + block // 2 if part.size >= block else middle

@@ -1,0 +1,137 @@
+"""`add` with several names and `diagnose --apply` as typed: proof, refusal, --force, the JSON, one line for what is wrong."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import soundfile
+
+from edgefilter.calibration.from_recording import SOURCE
+from edgefilter.cli import main
+from edgefilter.profile.data import Profile
+from tests.commands.test_diagnosis_commands import RATE, arguments, fails_in_one_line
+from tests.diagnosis.robot_scene import profile, record, voice
+from tests.diagnosis.test_apply import RESONANCE, office
+
+PROOF = {"effects", "start_s", "seconds", "erle_before_db", "erle_after_db", "without", "worse"}
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """robot.npz; mic.wav of a robot with a ring and a turned volume; back.wav of one that is carried out of the office."""
+    folder = tmp_path_factory.mktemp("apply")
+    x, robot = voice(9.0), profile()
+    robot.save(folder / "robot.npz")
+    rings = robot.echo.with_effect("chassis_resonance", RESONANCE).with_effect("playback_gain", {"gain_db": -3.0})
+    back = record(x, office())
+    back[86_400:] = record(x)[86_400:]
+    sounds = {"ref": x, "mic": record(x, rings), "back": back, "short": record(x)[: RATE * 7 // 5]}
+    for name, samples in sounds.items():
+        soundfile.write(folder / f"{name}.wav", samples, RATE, "FLOAT")
+    return folder
+
+
+def test_two_effects_are_added_in_one_step_and_proven(scene: Path, tmp_path: Path, capsys) -> None:
+    better, figures = tmp_path / "better.npz", tmp_path / "add.json"
+    words = arguments(scene, "add chassis_resonance playback_gain", "--output", better, "--json", figures)
+    assert main(words) == 0
+    out = capsys.readouterr().out
+    assert "chassis_resonance and playback_gain added" in out and "playback_gain gain_db = -3.00 dB" in out
+    assert "s held out: ERLE " in out and f"written to {better}" in out
+    told = json.loads(figures.read_text())
+    assert told.keys() == {
+        "schema",
+        "effects",
+        "dropped",
+        "excess_before_db",
+        "excess_after_db",
+        "noise_floor_db",
+        "proof",
+        "output",
+    }
+    assert told["schema"] == 2 and told["effects"].keys() == {"chassis_resonance", "playback_gain"}
+    assert told["effects"]["playback_gain"]["parameters"]["gain_db"]["value"] == pytest.approx(-3.0, abs=0.03)
+    assert told["proof"].keys() == PROOF and not told["proof"]["worse"]
+    assert told["proof"]["erle_after_db"] > told["proof"]["erle_before_db"] + 3.0
+    assert [name for name, _ in Profile.load(better).echo.effects] == ["chassis_resonance", "playback_gain"]
+
+
+def test_what_makes_the_filter_worse_is_refused_in_one_line_without_a_file(scene: Path, tmp_path: Path, capsys) -> None:
+    out, figures = tmp_path / "worse.npz", tmp_path / "worse.json"
+    words = arguments(scene, "add late_reverb", "--output", out, "--json", figures, mic="back.wav")
+    expected = ["late_reverb would make the running filter worse: ERLE ", "nothing is written", "--force"]
+    fails_in_one_line(capsys, words, 1, expected)
+    assert not out.exists() and not figures.exists()
+    assert main([*words, "--force"]) == 0
+    assert "late_reverb added" in capsys.readouterr().out
+    assert json.loads(figures.read_text())["proof"]["worse"] is True
+    assert [name for name, _ in Profile.load(out).echo.effects] == ["late_reverb"]
+
+
+def test_of_two_the_one_that_hurts_is_named(scene: Path, tmp_path: Path, capsys) -> None:
+    words = arguments(scene, "add mic_clipping late_reverb", "--output", tmp_path / "x.npz", mic="back.wav")
+    fails_in_one_line(capsys, words, 1, ["mic_clipping and late_reverb would make", "without late_reverb it is "])
+
+
+def test_all_that_is_found_is_applied_in_one_step(scene: Path, tmp_path: Path, capsys) -> None:
+    better = tmp_path / "better.npz"
+    assert main(arguments(scene, "diagnose", "--apply", better, "--json", "-")) == 0
+    told = json.loads(capsys.readouterr().out)
+    found = {entry["effect"] for entry in told["ranking"]}
+    assert found == {"chassis_resonance", "playback_gain"} == told["applied"]["effects"].keys()
+    assert told["applied"]["output"] == str(better) and told["applied"]["proof"].keys() == PROOF
+    assert told["applied"]["excess_after_db"] < 0.5
+    assert main(arguments(scene, "diagnose", profile=better)) == 0
+    assert "verdict     explained" in capsys.readouterr().out
+
+
+def test_without_a_profile_one_is_made_and_proven_against_none(scene: Path, tmp_path: Path, capsys) -> None:
+    made = tmp_path / "made.npz"
+    files = ["--recording", str(scene / "mic.wav"), "--reference", str(scene / "ref.wav")]
+    assert main(["diagnose", *files, "--apply", str(made), "--json", str(tmp_path / "a.json")]) == 0
+    out = capsys.readouterr().out
+    assert f"written to {made}" in out and "next " not in out
+    proof = json.loads((tmp_path / "a.json").read_text())["applied"]["proof"]
+    assert proof["erle_after_db"] > proof["erle_before_db"] + 3.0
+    assert Profile.load(made).source == SOURCE
+    human = tmp_path / "human.wav"
+    run = ["run", "--input", files[1], "--reference", files[3], "--profile", str(made), "--output", str(human)]
+    assert main([*run, "--engine", "linear", "--quiet"]) == 0
+    before, after = (np.mean(soundfile.read(path)[0] ** 2) for path in (scene / "mic.wav", human))
+    assert after < 0.02 * before
+
+
+def test_nothing_found_leaves_the_profile_as_it_is(scene: Path, tmp_path: Path, capsys) -> None:
+    soundfile.write(scene / "same.wav", record(voice(9.0)), RATE, "FLOAT")
+    assert main(arguments(scene, "diagnose", "--apply", tmp_path / "same.npz", mic="same.wav")) == 0
+    out = capsys.readouterr().out
+    assert "nothing added" in out and "there is nothing to prove" in out
+    assert Profile.load(tmp_path / "same.npz").echo.effects == ()
+
+
+def test_a_diagnosis_that_is_refused_is_told_but_not_applied(scene: Path, tmp_path: Path, capsys) -> None:
+    """Too short a recording to hold seconds out; with --force it is applied unproven."""
+    out = tmp_path / "short.npz"
+    words = arguments(scene, "diagnose", "--apply", out, mic="short.wav")
+    fails_in_one_line(capsys, words, 1, ["too little of the robot alone to hold seconds out", "--force"])
+    assert not out.exists()
+    fails_in_one_line(
+        capsys, arguments(scene, "add playback_gain", "--output", out, mic="short.wav"), 1, ["too little of the robot"]
+    )
+    assert not out.exists()
+    assert main(arguments(scene, "add playback_gain", "--output", out, "--force", mic="short.wav")) == 0
+    assert "proof       none: too little of the robot" in capsys.readouterr().out and out.exists()
+
+
+def test_wrong_usage_is_one_line_and_exit_2(scene: Path, tmp_path: Path, capsys) -> None:
+    out = ["--output", tmp_path / "x.npz"]
+    fails_in_one_line(capsys, arguments(scene, "add playback_gain clok_drift", *out), 2, ["clok_drift", "clock_drift"])
+    fails_in_one_line(capsys, arguments(scene, "add", *out), 2, ["EFFECT"])
+    fails_in_one_line(capsys, arguments(scene, "diagnose", "--force"), 2, ["--force without --apply"])
+    same = arguments(scene, "diagnose", "--apply", scene / "robot.npz")
+    fails_in_one_line(capsys, same, 2, ["--apply", "robot.npz", "overwritten"])
+    fails_in_one_line(capsys, arguments(scene, "diagnose", "--apply", tmp_path / "no/x.npz"), 1, ["No such file"])
+    assert not (tmp_path / "x.npz").exists()

@@ -1,0 +1,175 @@
+"""Effects fitted beside each other to a straightened recording, and proven in the running filter."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from edgefilter.diagnosis.compare import compare
+from edgefilter.diagnosis.diagnose import add
+from edgefilter.diagnosis.joint import fit_jointly, fit_straight
+from edgefilter.diagnosis.prepare import prepare
+from edgefilter.diagnosis.proof import HeldOut, prove
+from edgefilter.echo.model import EchoModel
+from edgefilter.errors import SignalError, UsageError
+from tests.diagnosis.robot_scene import path, profile, record, voice
+
+DRIFT = {"ppm": 40.0, "offset": 0.0}
+RESONANCE = {"frequency_hz": 640.0, "q": 35.0, "gain_db": -2.0}
+
+
+def office() -> EchoModel:
+    """The robot in a room of 0.5 s, its reverberation 12 dB below the direct sound."""
+    rng, taps = np.random.default_rng(5), np.zeros(8000)
+    late = np.arange(8000 - 200)
+    taps[200:] = rng.standard_normal(late.size) * 10 ** (-3 * late / 8000)
+    return EchoModel(path()).with_effect("late_reverb", {"taps": taps * 0.25 / np.linalg.norm(taps)})
+
+
+@pytest.fixture(scope="module")
+def drifting() -> tuple[np.ndarray, np.ndarray]:
+    """Recording and reference of a robot in the office whose clocks differ by 40 ppm."""
+    x = voice(9.0)
+    return record(x, office().with_effect("clock_drift", DRIFT)), x
+
+
+def test_two_effects_are_fitted_beside_each_other() -> None:
+    x = voice(8.0)
+    robot = EchoModel(path()).with_effect("chassis_resonance", RESONANCE)
+    y = record(x, robot.with_effect("playback_gain", {"gain_db": -3.0}))
+    knowing, before, after = add(profile(), ["playback_gain", "chassis_resonance"], y, x)
+    values = dict(knowing.echo.effects)
+    assert values["playback_gain"]["gain_db"] == pytest.approx(-3.0, abs=0.03)
+    assert values["chassis_resonance"]["frequency_hz"] == pytest.approx(640.0, rel=0.005)
+    assert after.excess_db < 0.5 < 3.0 < before.excess_db
+    alone, _, _ = add(profile(), "playback_gain", y, x)
+    assert abs(dict(alone.echo.effects)["playback_gain"]["gain_db"] + 3.0) > 0.05  # fitted alone it takes the ring in
+
+
+def test_the_order_of_the_names_changes_nothing_that_is_heard() -> None:
+    x = voice(8.0)
+    y = record(
+        x, EchoModel(path()).with_effect("chassis_resonance", RESONANCE).with_effect("playback_gain", {"gain_db": -3.0})
+    )
+    names = ["playback_gain", "chassis_resonance"]
+    one, other = (add(profile(), order, y, x)[2].excess_db for order in (names, names[::-1]))
+    assert one == pytest.approx(other, abs=0.1)
+
+
+def test_reverberation_is_learnt_from_a_recording_whose_clocks_differ(drifting) -> None:
+    y, x = drifting
+    knowing, before, after = add(profile(), "late_reverb", y, x)
+    assert [name for name, _ in knowing.echo.effects] == ["late_reverb"]
+    assert any("clock_drift" in text and "40.0 samples in a million" in text for text in after.warnings)
+    assert after.excess_db < 1.5 < 10.0 < before.excess_db
+    straight, other = record(voice(9.0, seed=8), office(), seed=9), voice(9.0, seed=8)
+    assert compare(knowing, straight, other).excess_db < compare(profile(), straight, other).excess_db - 8.0
+
+
+def test_reverberation_learnt_across_a_drift_helps_the_running_filter(drifting) -> None:
+    y, x = drifting
+    proof = prove(profile(), "late_reverb", y, x)
+    assert proof.erle_before_db == HeldOut(profile(), y, x).erle_db(profile())
+    assert proof.erle_after_db > proof.erle_before_db + 3.0
+    assert not proof.worse and proof.seconds > 1.5
+
+
+def test_a_jump_is_taken_out_before_another_effect_is_fitted() -> None:
+    x = voice(9.0)
+    jumped = EchoModel(path()).with_effect("chassis_resonance", RESONANCE)
+    y = record(x, jumped.with_effect("delay_jump", {"times_s": 4.3, "samples": 37.0}))
+    knowing, _, after = add(profile(), "chassis_resonance", y, x)
+    assert [name for name, _ in knowing.echo.effects] == ["chassis_resonance"] and after.excess_db < 0.7
+    assert dict(knowing.echo.effects)["chassis_resonance"]["frequency_hz"] == pytest.approx(640.0, rel=0.01)
+
+
+def test_a_turned_volume_is_taken_out_but_beside_a_filter_that_holds_it() -> None:
+    x = voice(8.0)
+    turned = (
+        EchoModel(path()).with_effect("chassis_resonance", RESONANCE).with_effect("playback_gain", {"gain_db": -3.0})
+    )
+    prepared = prepare(profile(), record(x, turned), x)
+    model, straightened = fit_straight(prepared, ["chassis_resonance"])
+    assert straightened == ("playback_gain",)
+    assert dict(model.effects)["playback_gain"]["gain_db"] == pytest.approx(-3.0, abs=0.05)
+    assert fit_straight(prepared, ["late_reverb"])[1] == ()
+
+
+def test_nothing_is_taken_out_of_a_straight_recording() -> None:
+    x = voice(8.0)
+    prepared = prepare(profile(), record(x, EchoModel(path()).with_effect("chassis_resonance", RESONANCE)), x)
+    everywhere = replace(prepared.measurement, fit=prepared.usable)
+    model, straightened = fit_straight(prepared, ["chassis_resonance"])
+    assert straightened == ()
+    alone = prepared.model.fit("chassis_resonance", everywhere)
+    assert everywhere.error(model.predict(x)) <= everywhere.error(alone.predict(x)) * 1.001
+
+
+def test_rounds_lower_the_error_of_what_was_fitted_in_turn() -> None:
+    x = voice(6.0)
+    robot = (
+        EchoModel(path()).with_effect("chassis_resonance", RESONANCE).with_effect("playback_gain", {"gain_db": -3.0})
+    )
+    measurement = prepare(profile(), record(x, robot), x).measurement
+    names, in_turn = ["playback_gain", "chassis_resonance"], EchoModel(path())
+    for name in names:
+        in_turn = in_turn.fit(name, measurement)
+    jointly = fit_jointly(measurement, EchoModel(path()), names)
+    left = [measurement.error(measurement.heard(model)[0]) for model in (in_turn, jointly)]
+    assert left[1] < 0.97 * left[0]  # most of what is left is the fan
+
+
+@pytest.fixture(scope="module")
+def carried_back() -> tuple[np.ndarray, np.ndarray]:
+    """Three fifths of the recording in the office, its volume turned, the rest in the laboratory: what is learnt there is wrong here."""
+    x = voice(10.0)
+    y = record(x, office())
+    back = record(x)
+    y[96_000:] = back[96_000:]
+    return y, x
+
+
+def test_what_the_held_out_seconds_contradict_is_called_worse(carried_back) -> None:
+    y, x = carried_back
+    proof = prove(profile(), "late_reverb", y, x)
+    assert proof.worse and proof.erle_after_db < proof.erle_before_db - 1.0
+    assert proof.without == () and proof.culprit is None
+    assert 5.0 < proof.start_s < 7.0
+
+
+def test_of_several_effects_the_one_that_hurts_is_named(carried_back) -> None:
+    y, x = carried_back
+    proof = prove(profile(), ["late_reverb", "mic_clipping"], y, x)
+    assert proof.worse and proof.culprit == "late_reverb"
+    assert dict(proof.without)["late_reverb"] == pytest.approx(proof.erle_before_db, abs=0.3)
+    assert proof.to_dict()["without"].keys() == {"late_reverb", "mic_clipping"} and proof.to_dict()["worse"] is True
+
+
+def test_a_profile_made_from_the_recording_is_proven_against_a_filter_without_any(drifting) -> None:
+    y, x = drifting
+    proof = prove(None, "late_reverb", y, x)
+    cold = HeldOut(profile(), y, x).erle_db(None)
+    assert proof.erle_before_db == pytest.approx(cold, abs=1.5)  # the two profiles cut at another pause
+    assert proof.erle_after_db > proof.erle_before_db + 3.0
+
+
+def test_too_little_of_the_robot_cannot_be_held_out() -> None:
+    x = voice(1.4)
+    with pytest.raises(SignalError, match="too little of the robot alone to hold seconds out"):
+        prove(profile(), "playback_gain", record(x), x)
+
+
+def test_an_unknown_name_among_several_is_refused(drifting) -> None:
+    y, x = drifting
+    with pytest.raises(UsageError, match="unknown effect 'late_reverbs'"):
+        add(profile(), ["playback_gain", "late_reverbs"], y, x)
+
+
+def test_a_drift_in_the_profile_is_predicted_whatever_the_lag() -> None:
+    """A profile that holds a drift predicted a recording 0.8 s later with a lag that was off by a fraction of a sample."""
+    x = voice(9.0)
+    known = profile().with_echo(EchoModel(path()).with_effect("clock_drift", {"ppm": 80.0, "offset": 0.0}))
+    for lag in (0.0, 13_000.0):
+        assert compare(known, record(x, known.echo, lag), x).excess_db < 0.3, lag
