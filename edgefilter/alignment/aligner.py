@@ -55,18 +55,26 @@ class Aligner:
     def __init__(self, hop: int, profile: Profile | None = None, max_lag_s: float = 1.5) -> None:
         self.hop = hop
         self._max_lag = int((max_lag_s + 0.1) * SAMPLE_RATE)
-        self._response = None if profile is None else profile.echo.impulse_response
-        early = None if self._response is None else self._response[: PRE_ROLL + 320]
-        self._lags = LagSearch(self._max_lag, early, PRE_ROLL)
+        self._calibrated = None if profile is None else profile.echo.impulse_response
         kernel_table()
         self.reset()
 
+    def _listen_for(self, response: Samples | None) -> None:
+        """What an arrival looks like from now on: impulse response (taps,); None: any.
+
+        Where no utterance was found the robot may stand elsewhere than where it was calibrated.
+        """
+        self._response = response
+        early = None if response is None else response[: PRE_ROLL + 320]
+        self._lags = LagSearch(self._max_lag, early, PRE_ROLL)
+        self._meter = DelayMeter(response, PRE_ROLL)
+
     def reset(self) -> None:
         """Forget everything, as after construction."""
+        self._listen_for(self._calibrated)
         length = self._lags.span + SAMPLE_RATE
         self._mic, self._ref = Tape(length), Tape(length)
         self._onsets = OnsetDetector(self.hop)
-        self._meter = DelayMeter(self._response, PRE_ROLL)
         self._drift = DriftFilter()
         self._open: deque[Utterance] = deque(maxlen=32)
         self._announced = Announcements()
@@ -163,6 +171,8 @@ class Aligner:
         if self._ref.end > end + self._max_lag + SAMPLE_RATE // 4:
             self._resolve(found=False)
             self._missed = True
+            if not self._known and self._response is not None:
+                self._listen_for(None)
 
     def _resolve(self, found: bool = True) -> None:
         self._open.popleft()

@@ -31,8 +31,8 @@ FADE = 0.9995
 WORTH_S = 5.0
 """Seconds of audible robot from which on what was learned may be worth keeping."""
 PSD_FFT = 1200
-TWICE_S = 15.0
-"""Up to as many seconds teach more where they are heard twice."""
+SHORT_S, TIMES = 15.0, 3
+"""Up to as many seconds teach more where they are heard several times."""
 
 
 class PathLearner:
@@ -73,6 +73,8 @@ class PathLearner:
     def start(self, path: PathState, hop: int) -> None:
         """A stream begins with that path."""
         self._hop, self._begin = hop, path
+        known = path.canceller.weights.any()
+        self._response = Canceller.resumed(path.canceller, hop).impulse_response() if known else None
         self._silence = np.zeros(self.past, np.float32)
         self._tape = Tape(hop, MINUTE)
         self._running = self._resumed(path)
@@ -128,14 +130,20 @@ class PathLearner:
         return Lesson(winner.path.state(), kind, detail)
 
     def _candidates(self) -> list[Rival]:
-        """Paths that have heard the whole tape: with what it teaches of the loudspeaker, and without."""
+        """Paths that have heard the whole tape: from the beginning with what the tape teaches of the loudspeaker, and without.
+
+        From nothing with it, too: where the robot was calibrated it may not stand any more.
+        """
         self._counts["rounds"] += 1
+        fitted = self._fitted()
         rivals = [
-            Rival(self._fresh(self._fitted()), "loudspeaker and path"),
-            Rival(self._fresh(self._begin.effects), "path"),
+            Rival(self._fresh(fitted, self._response), "loudspeaker and path"),
+            Rival(self._fresh(self._begin.effects, self._response), "path"),
         ]
+        if self._response is not None:
+            rivals.append(Rival(self._fresh(fitted, None), "another path"))
         for rival in rivals:
-            for _ in range(2 if self._audible_s < TWICE_S else 1):
+            for _ in range(TIMES if self._audible_s < SHORT_S else 1):
                 self._tape.replay(rival.path)
         return rivals
 
@@ -156,12 +164,9 @@ class PathLearner:
                 effects = (*others, (effect.name, values))
         return effects
 
-    def _fresh(self, effects: Effects) -> EchoPath:
-        """The path of the beginning with those effects, before it has heard anything."""
-        begin = self._begin.canceller
-        calibrated = begin.weights.any()
-        response = Canceller.resumed(begin, self._hop).impulse_response() if calibrated else None
-        adaptation = replace(begin.adaptation, products=True)
+    def _fresh(self, effects: Effects, response: Samples | None) -> EchoPath:
+        """A path with those effects that starts from an impulse response, or from nothing, and has heard nothing."""
+        adaptation = replace(self._begin.canceller.adaptation, products=True)
         return EchoPath(Canceller(self._hop, TAPS[1], response, adaptation), effects)
 
     def _keep(self) -> None:

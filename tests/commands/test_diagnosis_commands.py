@@ -92,8 +92,8 @@ def test_add_says_so_where_the_error_does_not_fall(scene, tmp_path, capsys):
 def test_add_says_what_the_running_filter_makes_of_an_effect_where_that_is_nothing(scene, tmp_path, capsys):
     command = arguments(scene, "add clock_drift", "--output", tmp_path / "drift.npz", "--json")
     assert main([*command, str(tmp_path / "add.json")]) == 0
-    said = json.loads((tmp_path / "add.json").read_text())["at_run_time"]
-    assert "follows the clocks by itself" in said and f"NOTE        {said}" in capsys.readouterr().out
+    said = json.loads((tmp_path / "add.json").read_text())["effects"]["clock_drift"]["at_run_time"]
+    assert "follows the clocks by itself" in said and f"NOTE        clock_drift: {said}" in capsys.readouterr().out
 
 
 def test_diagnose_finds_what_is_missing_and_writes_the_documented_json(scene, capsys):
