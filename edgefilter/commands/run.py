@@ -22,7 +22,6 @@ from edgefilter.filter.budget_cache import forget
 from edgefilter.filter.ego_filter import EgoFilter
 from edgefilter.filter.learner import Learner
 from edgefilter.learning.background import LEAST_CORES, BackgroundLearner, cores
-from edgefilter.learning.path_learner import PathLearner
 from edgefilter.profile.data import Profile
 from edgefilter.session import RunReport, filter_blocks
 from edgefilter.types import SAMPLE_RATE, Event
@@ -106,6 +105,8 @@ def make_learner(args: argparse.Namespace, live: bool, profile: Profile | None) 
         return None
     remember = Path(args.learn) if args.learn else None
     if not live:
+        from edgefilter.learning.path_learner import PathLearner
+
         return PathLearner(profile, remember)
     if cores() < LEAST_CORES:
         say("one core only: loudspeaker and room are not learned while running")

@@ -12,8 +12,7 @@ from pathlib import Path
 
 from edgefilter.filter.echo_path import PathState
 from edgefilter.filter.learner import Heard, Lesson
-from edgefilter.learning.path_learner import PathLearner
-from edgefilter.learning.shared import SharedHops
+from edgefilter.learning.shared import PAST, SharedHops
 from edgefilter.profile.data import Profile
 
 LEAST_CORES = 2
@@ -42,7 +41,7 @@ class BackgroundLearner:
     >>> learner.close()
     """
 
-    past = PathLearner.past
+    past = PAST
 
     def __init__(self, profile: Profile | None = None, remember: Path | None = None) -> None:
         self._profile, self._remember = profile, remember

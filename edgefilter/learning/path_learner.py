@@ -9,7 +9,8 @@ import numpy as np
 from scipy import signal
 
 from edgefilter.dsp.psd import floored
-from edgefilter.echo.effects.catalogue import EFFECTS
+from edgefilter.echo.effect import complete, vanishes
+from edgefilter.echo.effects.catalogue import EFFECTS, find
 from edgefilter.echo.measurement import Measurement
 from edgefilter.echo.model import EchoModel
 from edgefilter.filter.canceller import Canceller
@@ -17,6 +18,7 @@ from edgefilter.filter.echo_path import TAPS, EchoPath, Effects, PathState, star
 from edgefilter.filter.learner import Heard, Lesson
 from edgefilter.learning.contest import Rival
 from edgefilter.learning.remember import learned_profile
+from edgefilter.learning.shared import PAST
 from edgefilter.learning.tape import Tape, emphasised
 from edgefilter.profile.data import Profile
 from edgefilter.types import SAMPLE_RATE, EventKind, Samples
@@ -31,6 +33,8 @@ FADE = 0.9995
 WORTH_S = 5.0
 """Seconds of audible robot from which on what was learned may be worth keeping."""
 PSD_FFT = 1200
+MOMENT, QUIET = 4800, 1e-4
+"""Samples over which the reference's power is taken, and how far below its highest sample's it teaches nothing."""
 SHORT_S, TIMES = 15.0, 3
 """Up to as many seconds teach more where they are heard several times."""
 
@@ -62,8 +66,7 @@ class PathLearner:
     0
     """
 
-    past = SAMPLE_RATE
-    """Samples of the aligned reference that it wants after a switch of the delay."""
+    past = PAST
 
     def __init__(self, profile: Profile | None = None, remember: Path | None = None) -> None:
         self._profile, self._remember = profile, remember
@@ -135,11 +138,10 @@ class PathLearner:
         From nothing with it, too: where the robot was calibrated it may not stand any more.
         """
         self._counts["rounds"] += 1
-        fitted = self._fitted()
-        rivals = [
-            Rival(self._fresh(fitted, self._response), "loudspeaker and path"),
-            Rival(self._fresh(self._begin.effects, self._response), "path"),
-        ]
+        known, fitted = self._begin.effects, self._fitted()
+        rivals = [Rival(self._fresh(known, self._response), "path")]
+        if any(find(name).learned for name, _ in fitted):
+            rivals.append(Rival(self._fresh(fitted, self._response), "loudspeaker and path"))
         if self._response is not None:
             rivals.append(Rival(self._fresh(fitted, None), "another path"))
         for rival in rivals:
@@ -148,20 +150,25 @@ class PathLearner:
         return rivals
 
     def _fitted(self) -> Effects:
-        """The effects in use, those that can be learned as they explain the tape."""
+        """The effects of the beginning, those that can be learned as they explain the tape."""
         mic, reference, innovation = self._tape.signals()
-        peak = float(np.square(reference).max())
-        loud = signal.oaconvolve(np.square(reference), np.full(4800, 1 / 4800))[: mic.size] > 1e-3 * peak / 10
+        power = np.square(reference)
+        loud = signal.oaconvolve(power, np.full(MOMENT, 1 / MOMENT))[: mic.size] > QUIET * float(power.max())
         use = self._tape.straight() & loud
-        noise = psd(innovation[use])
-        measurement = Measurement(reference, mic, noise, use)
         effects = self._begin.effects
+        if use.sum() < FIRST_S * SAMPLE_RATE / 2:
+            return effects
+        measurement = Measurement(reference, mic, psd(innovation[use]), use)
         path = self._running.canceller.impulse_response()
         for effect in EFFECTS:
             if effect.learned:
                 others = tuple(entry for entry in effects if entry[0] != effect.name)
-                values = effect.fit(measurement, EchoModel(path, tuple(e for e in others if e[0] in SOURCES)))
-                effects = (*others, (effect.name, values))
+                model = EchoModel(path, tuple(entry for entry in others if entry[0] in SOURCES))
+                try:
+                    values = complete(effect, effect.fit(measurement, model))
+                except (ArithmeticError, np.linalg.LinAlgError):  # what cannot be fitted is not learned
+                    continue
+                effects = others if vanishes(effect, values) else (*others, (effect.name, values))
         return effects
 
     def _fresh(self, effects: Effects, response: Samples | None) -> EchoPath:

@@ -14,9 +14,12 @@ from pathlib import Path
 import numpy as np
 
 from edgefilter.filter.learner import Heard, Lesson
+from edgefilter.types import SAMPLE_RATE
 
 HOPS = 1024
 """Hops that the ring holds, 16 s: longer than a fit takes beside a busy filter."""
+PAST = SAMPLE_RATE
+"""Samples of the aligned reference that a learner wants after a switch of the delay."""
 SWITCHES = 16
 """Of the latest hops in which the delay was switched, the ring holds the past under the new one."""
 LETTER = 1 << 21

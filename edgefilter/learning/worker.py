@@ -15,7 +15,7 @@ import threading
 import time
 
 from edgefilter.learning.path_learner import PathLearner
-from edgefilter.learning.shared import HOPS, SharedHops
+from edgefilter.learning.shared import HOPS, PAST, SharedHops
 from edgefilter.session import peak_memory_mb
 
 NICE = 10
@@ -31,7 +31,7 @@ def main() -> None:
         os.nice(NICE)
     told = sys.stdin.buffer
     path, hop, profile, remember = pickle.loads(told.read(struct.unpack("<q", told.read(8))[0]))
-    ring = SharedHops(hop, PathLearner.past, sys.argv[1])
+    ring = SharedHops(hop, PAST, sys.argv[1])
     ring.unlink()
     over = threading.Event()
 
