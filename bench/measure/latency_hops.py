@@ -147,7 +147,6 @@ def main() -> None:
             else edge(args.contender, args.taps, args.hop, learner)
         )
         took = measure(contender, args.seconds, args.paced)
-        learned = learner.stats() if learner else None
         if learner:
             learner.close()
     times = {stage: [round(ms, 5) for ms in values] for stage, values in contender.stages.items()}
@@ -157,7 +156,7 @@ def main() -> None:
                 "hop": contender.hop,
                 "took": [round(ms, 5) for ms in took],
                 "stages": times,
-                "learned": learned,
+                "learned": learner.stats() if learner else None,
                 "peak_memory_mb": peak_memory_mb(os.getpid()),
             }
         )

@@ -144,11 +144,11 @@ def markdown(found: dict, name: str) -> str:
     )
     lines += [
         "",
-        "Mean power left while the robot speaks, by stage, dB over the fan (with learning, then what it brings):",
+        "The median second in which the robot speaks, by stage, dB over the fan (and what learning changes):",
         "",
     ]
     lines += results_writer.table(
-        ["from minute", "change", *(f"{start}{way}" for start in STARTS for way in ("", ", learning"))],
+        ["minutes", "change", *(f"{start}{way}" for start in STARTS for way in ("", ", learning"))],
         stage_rows(found),
     )
     for start, both in found["runs"].items():
@@ -168,7 +168,7 @@ def stage_rows(found: dict) -> list[list[str]]:
         use = speaking & (second >= begin) & (second < end)
         cells = []
         for both in found["runs"].values():
-            alone, learning = (mean_db(both[way]["left_db"][: use.size][use]) for way in ("alone", "learning"))
+            alone, learning = (np.median(both[way]["left_db"][use]) for way in ("alone", "learning"))
             cells += [f"{alone:.1f}", f"{learning:.1f} ({learning - alone:+.1f})"]
-        rows.append([f"{begin / 60:.1f}", name, *cells])
+        rows.append([f"{begin / 60:.1f} to {end / 60:.1f}", name, *cells])
     return rows
