@@ -105,13 +105,14 @@ def draw(found: dict, output: Path) -> None:
             means = [mean_db(left[at : at + STEP_S][speaking[at : at + STEP_S]]) for at in blocks]
             label = "with learning" if learning else "without"
             axis.plot([(at + STEP_S / 2) / 60 for at in blocks], means, color=COLOURS[bool(learning)], label=label)
-        top = axis.get_ylim()[1]
+        across = axis.get_xaxis_transform()
         for kind, marker in (("learned", "v"), ("unlearned", "x")):
             times = [second / 60 for second, event, _ in both["learning"]["lessons"] if event == kind]
-            axis.plot(times, [top] * len(times), marker, color="#33658a", label=f"{kind}, {len(times)} times")
+            label = f"{kind}, {len(times)} times"
+            axis.plot(times, [0.96] * len(times), marker, color="#33658a", label=label, transform=across)
         for stage in found["stages"]:
             axis.axvline(stage["begin_s"] / 60, color="black", linewidth=0.6, linestyle=":")
-            axis.annotate(stage["name"], (stage["begin_s"] / 60, top), (2, 6), textcoords="offset points", fontsize=7)
+            axis.text(stage["begin_s"] / 60, 1.01, stage["name"], fontsize=7, transform=across)
         axis.set(xlabel="minutes", ylabel="left beside the human, dB over the fan")
         axis.set_title(f"{start}, engine linear, {STEP_S} s each while the robot speaks", pad=18)
         axis.grid(alpha=0.3)
@@ -122,12 +123,11 @@ def draw(found: dict, output: Path) -> None:
 def markdown(found: dict, name: str) -> str:
     """What was run, the answer, the stages, and the picture. name: of the picture, without suffix."""
     lines = [
-        f"{found['minutes']:.1f} minutes, {found['speech_minutes']:.1f} of them robot speech. Distinct speech:"
-        f" {found['distinct_minutes']:.1f} minutes of {len(found['voices'])} voices ({', '.join(found['voices'])}),"
-        " repeated in random order; no",
-        "other synthesizer. Engine `linear`. A human talks over about every third utterance. What is left: output less",
-        "the human, that is the robot's rest, the fan, and what the filter took from the human, above 120 Hz; dB over",
-        "the fan.",
+        f"{found['minutes']:.1f} minutes, {found['speech_minutes']:.1f} of them robot speech, of which"
+        f" {found['distinct_minutes']:.1f} are distinct: {len(found['voices'])} voices",
+        f"({', '.join(found['voices'])}), their sentences repeated in random order. Engine `linear`. A human talks over",
+        "about every third utterance. What is left: output less the human, that is the robot's rest, the fan, and what the",
+        "filter took from the human, above 120 Hz; dB over the fan.",
         "",
     ]
     lines += results_writer.table(
