@@ -54,7 +54,9 @@ def contenders() -> tuple[list[str], dict[str, str]]:
     return [*usable, *PEERS], missing
 
 
-def run_hops(contender: str, seconds: float, paced: bool, threads: int = 1, **more: object) -> dict:
+def run_hops(
+    contender: str, seconds: float, paced: bool, threads: int = 1, learning: bool = False, **more: object
+) -> dict:
     """One child's answer; more: taps, hop, model (the path of another network for crnn)."""
     command = [
         sys.executable,
@@ -68,6 +70,7 @@ def run_hops(contender: str, seconds: float, paced: bool, threads: int = 1, **mo
         str(CORES),
     ]
     command += ["--paced"] if paced else []
+    command += ["--learning"] if learning else []
     model = more.pop("model", None)
     for option, value in more.items():
         command += [f"--{option}", str(value)]

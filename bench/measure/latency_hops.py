@@ -27,7 +27,9 @@ from bench.measure import peers
 from edgefilter import engines
 from edgefilter.dsp.stft import StftConfig
 from edgefilter.filter.budget import held_to
+from edgefilter.filter.learner import Learner
 from edgefilter.filter.stream import Stream
+from edgefilter.learning.background import BackgroundLearner
 from edgefilter.profile.data import Profile
 from edgefilter.types import SAMPLE_RATE
 
@@ -46,15 +48,15 @@ class Contender:
     stages: dict[str, list[float]] = field(default_factory=lambda: defaultdict(list))
 
 
-def edge(name: str, taps: int | None, hop: int | None) -> Contender:
-    """An engine in the whole path, started from the bundled profile, with another tail or hop where asked."""
+def edge(name: str, taps: int | None, hop: int | None, learner: Learner | None = None) -> Contender:
+    """An engine in the whole path, started from the bundled profile, with another tail or hop or a learner where asked."""
     profile = Profile.load(DEMO / "profile.npz")
     if taps:
         response = profile.echo.impulse_response
         profile = profile.with_impulse_response(np.pad(response, (0, max(taps - response.size, 0)))[:taps])
     stft = StftConfig() if hop is None else StftConfig(n_fft=2 * hop, hop=hop, window_length=2 * hop)
     engine = engines.create(name, profile, stft)
-    stream = Stream(engine, profile)
+    stream = Stream(engine, profile, learner=learner)
     contender = Contender(engine.stft.hop, stream.process)
     front = stream.front
     parts = [("alignment", front.aligner, "step")]
@@ -134,13 +136,19 @@ def main() -> None:
     parser.add_argument("--cores", type=int, default=2)
     parser.add_argument("--taps", type=int)
     parser.add_argument("--hop", type=int)
+    parser.add_argument("--learning", action="store_true", help="with a learner in another process")
     args = parser.parse_args()
     with ExitStack() as stack:
         stack.enter_context(held_to(args.cores))
+        learner = BackgroundLearner() if args.learning else None
         contender = (
-            peer(args.contender, stack) if args.contender in PEERS else edge(args.contender, args.taps, args.hop)
+            peer(args.contender, stack)
+            if args.contender in PEERS
+            else edge(args.contender, args.taps, args.hop, learner)
         )
         took = measure(contender, args.seconds, args.paced)
+        if learner:
+            learner.close()
     times = {stage: [round(ms, 5) for ms in values] for stage, values in contender.stages.items()}
     print(
         json.dumps(
@@ -148,6 +156,7 @@ def main() -> None:
                 "hop": contender.hop,
                 "took": [round(ms, 5) for ms in took],
                 "stages": times,
+                "learned": learner.stats() if learner else None,
                 "peak_memory_mb": peak_memory_mb(os.getpid()),
             }
         )

@@ -114,15 +114,26 @@ class Room:
 
 
 def draw_room(rng: np.random.Generator, kind: str, robot_m: float, direction: Array, human_m: float) -> Room:
-    """Impulse responses at 16 kHz by image sources (Allen & Berkley 1979; pyroomacoustics), without filter delay.
+    """A room drawn by `draw_walls`, in which the robot stands somewhere (`stand`)."""
+    return stand(rng, draw_walls(rng, kind), robot_m, direction, human_m)
 
-    kind: "lab" (RT60 0.20-0.26 s) or "office" (0.50-0.75 s). robot_m, direction (3,): where the loudspeaker lies from
-    the microphone; it is a part of the robot, so the same in every room. The human's mouth is human_m away, a little
-    higher.
-    """
+
+def draw_walls(rng: np.random.Generator, kind: str) -> tuple[Array, float]:
+    """Size in m (3,) and RT60 in s of an empty room. kind: "lab" (0.20-0.26 s) or "office" (0.50-0.75 s)."""
     low, high, scale = {"lab": (0.20, 0.26, 1.0), "office": (0.50, 0.75, 0.9)}[kind]
     size = scale * np.array([rng.uniform(5.0, 7.0), rng.uniform(4.0, 5.5), rng.uniform(2.6, 3.2) / scale])
-    wanted = rng.uniform(low, high)
+    return size, rng.uniform(low, high)
+
+
+def stand(
+    rng: np.random.Generator, walls: tuple[Array, float], robot_m: float, direction: Array, human_m: float
+) -> Room:
+    """Impulse responses at 16 kHz by image sources (Allen & Berkley 1979; pyroomacoustics), without filter delay.
+
+    walls: from `draw_walls`. robot_m, direction (3,): where the loudspeaker lies from the microphone; it is a part of
+    the robot, so the same in every room. The human's mouth is human_m away, a little higher.
+    """
+    size, wanted = walls
     microphone = np.array([*rng.uniform(1.75, size[:2] - 1.75), rng.uniform(0.9, 1.2)])
     angle, height = rng.uniform(0, 2 * math.pi), rng.uniform(0.1, 0.5)
     reach = math.sqrt(human_m**2 - height**2)

@@ -1,0 +1,214 @@
+"""Long recordings of a simulated robot: a day in which room, volume, place, clocks and lag change, a human interrupting.
+
+The robot speaks clip after clip, in random order and over and over. Five changes divide a day into six stages of equal
+length: it is calibrated and begins in a laboratory, then is carried into an office, turned down, driven to another
+place in that office, gets a playback clock of its own with another lag, and is carried into another office. The human
+talks over about every third utterance. Loudspeaker, shell and fan stay the same.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import signal
+
+from bench.simulate.conversations import Clip, Robot, draw_robot, read_speech, with_distortion
+from bench.simulate.simulated_robot import (
+    RATE,
+    Array,
+    Room,
+    draw_fan,
+    draw_room,
+    draw_walls,
+    fan_noise,
+    stand,
+    sweep,
+    warp,
+)
+from edgefilter.types import Samples
+
+PAUSE_S = (0.4, 2.0)
+END_S = 3.0
+"""Silence at the end of a stage: the echo of the last utterance dies away in it."""
+HUMAN_DB, FAN_DB = -24.0, -31.5
+"""Power of human and fan, against the robot's where it speaks first (between lab and office of `conversations`)."""
+DISTORTION_DB = -24.0
+INTERRUPTED = 0.3
+VOLUME_DB, PPM = -5.0, -60.0
+LAGS_S = (0.12, 0.31)
+STAGES = 6
+
+
+@dataclass(frozen=True)
+class Stage:
+    """What stays the same for a while. name: in what it differs from the one before."""
+
+    name: str
+    room: Room
+    lag: int
+    volume_db: float = 0.0
+    ppm: float = 0.0
+
+
+@dataclass(frozen=True)
+class Day:
+    """A day's signals, (n,) float32 each, and its calibration.
+
+    mic = echo + clean + fan. stages: names. begins: sample of the microphone at which each of them begins. speech_s,
+    distinct_s: seconds of robot speech, and of those without repetitions.
+    """
+
+    ref: Samples
+    mic: Samples
+    clean: Samples
+    fan: Samples
+    calibration: tuple[Samples, Samples, Samples]
+    stages: tuple[str, ...]
+    begins: tuple[int, ...]
+    speech_s: float
+    distinct_s: float
+
+
+class Repertoire(Iterator[Array]):
+    """What the robot says: the clips in random order, over and over, each with a peak of 0.7."""
+
+    def __init__(self, rng: np.random.Generator, clips: list[Clip]) -> None:
+        self._rng, self._clips = rng, clips
+        self._order: list[int] = []
+        self._sizes: dict[int, int] = {}
+        self._said = 0
+
+    def __next__(self) -> Array:
+        if not self._order:
+            self._order = self._rng.permutation(len(self._clips)).tolist()
+        number = self._order.pop()
+        samples = read_speech(self._clips[number])
+        self._sizes[number] = samples.size
+        self._said += samples.size
+        return 0.7 * samples / np.abs(samples).max()
+
+    @property
+    def speech_s(self) -> float:
+        """Seconds said so far."""
+        return self._said / RATE
+
+    @property
+    def distinct_s(self) -> float:
+        """Seconds of the clips among them."""
+        return sum(self._sizes.values()) / RATE
+
+
+def speak(
+    rng: np.random.Generator, robot: Robot, repertoire: Iterator[Array], stage: Stage, speech_s: float
+) -> tuple[Array, Array, list[slice]]:
+    """Reference (n,), echo (n,) without gain, and where in the echo each utterance is, of so many seconds of speech."""
+    said: list[tuple[int, Array]] = []
+    at, missing = RATE // 2, speech_s * RATE
+    while missing > 0:
+        said.append((at, next(repertoire)))
+        missing -= said[-1][1].size
+        at += said[-1][1].size + int(rng.uniform(*PAUSE_S) * RATE)
+    ref, echo = np.zeros((2, at + stage.lag + int(END_S * RATE)))
+    tail = stage.room.robot.size + robot.bulk
+    volume = 10 ** (stage.volume_db / 20)
+    for start, samples in said:
+        ref[start : start + samples.size] = samples
+        heard = robot.record(np.pad(volume * samples, (0, tail)), stage.room.robot)
+        place = echo[start + stage.lag : start + stage.lag + heard.size]
+        place += heard[: place.size]
+    later = stage.lag + robot.bulk
+    return ref, warp(echo, stage.ppm), [slice(start + later, start + later + x.size) for start, x in said]
+
+
+def interrupt(rng: np.random.Generator, speech: list[Clip], room: Room, heard: list[slice], size: int) -> Array:
+    """(size,) a human of unit power at the microphone, who talks over some of the utterances."""
+    clean, free = np.zeros(size), 0
+    for utterance in heard:
+        begin = utterance.start + int(rng.uniform(0.3, 1.5) * RATE)
+        if rng.random() < INTERRUPTED and begin >= free:
+            voice = signal.oaconvolve(read_speech(speech[rng.integers(len(speech))]), room.human)[: size - begin]
+            clean[begin : begin + voice.size] = voice / math.sqrt(np.mean(voice**2))
+            free = begin + voice.size + RATE
+    return clean
+
+
+def draw_stages(rng: np.random.Generator, robot: Robot, stage_s: float) -> list[Stage]:
+    """The six stages of a day. stage_s: how long one of them lasts, about, for what the clocks lose in it."""
+    human_m = rng.uniform(1.0, 1.5)
+    about = robot.distance_m, robot.direction, human_m
+    walls = draw_walls(rng, "office")
+    laboratory, office, elsewhere = draw_room(rng, "lab", *about), stand(rng, walls, *about), stand(rng, walls, *about)
+    early, late = (round(lag * RATE) for lag in LAGS_S)
+    lost = round(-PPM * 1e-6 * stage_s * RATE)
+    return [
+        Stage("laboratory", laboratory, early),
+        Stage("office", office, early),
+        Stage(f"volume {VOLUME_DB:+.0f} dB", office, early, VOLUME_DB),
+        Stage("another place", elsewhere, early, VOLUME_DB),
+        Stage(f"clock {PPM:+.0f} ppm, lag {late - early:+d} samples", elsewhere, late, VOLUME_DB, PPM),
+        Stage("another office", draw_room(rng, "office", *about), late + lost, VOLUME_DB, PPM),
+    ]
+
+
+def make_day(seed: int, minutes: float, voices: list[Clip], speech: list[Clip]) -> Day:
+    """A day of so many minutes of robot speech."""
+    rng = np.random.default_rng(seed)
+    repertoire, robot = Repertoire(rng, voices), draw_robot(rng)
+    stages = draw_stages(rng, robot, 60 * minutes / STAGES)
+    robot, _ = with_distortion(robot, next(Repertoire(rng, voices)), stages[0].room.robot, DISTORTION_DB)
+    parts, begins, now, level = [], [], 0, 0.0
+    for stage in stages:
+        ref, echo, heard = speak(rng, robot, repertoire, stage, 60 * minutes / STAGES)
+        human = interrupt(rng, speech, stage.room, heard, ref.size)
+        level = level or loudness(echo, heard)
+        parts.append([x.astype(np.float32) for x in (ref, echo, human)])
+        begins.append(now)
+        now += ref.size
+    ref, echo, human = (np.concatenate(signals) for signals in zip(*parts, strict=True))
+    microphone = draw_microphone(rng, robot, stages[0].room, float(np.abs(echo).max()), level)
+    fan = np.concatenate([microphone.hears_fan(rng, part[0].size) for part in parts])
+    clean = np.float32(microphone.gain * level * 10 ** (HUMAN_DB / 20)) * human
+    mic = np.float32(microphone.gain) * echo + clean + fan
+    sweeps = calibration(rng, robot, stages[0].room, microphone)
+    names = tuple(stage.name for stage in stages)
+    return Day(ref, mic, clean, fan, sweeps, names, tuple(begins), repertoire.speech_s, repertoire.distinct_s)
+
+
+def loudness(echo: Array, heard: list[slice]) -> float:
+    """Root mean square of the utterances."""
+    return math.sqrt(np.mean(np.concatenate([echo[utterance] for utterance in heard]) ** 2))
+
+
+@dataclass(frozen=True)
+class Microphone:
+    """Its gain, and the fan that it hears: root mean square and spectrum."""
+
+    gain: float
+    fan: float
+    spectrum: Array
+
+    def hears_fan(self, rng: np.random.Generator, size: int) -> Samples:
+        """(size,) of the fan."""
+        return (self.fan * fan_noise(rng, self.spectrum, size)).astype(np.float32)
+
+
+def draw_microphone(rng: np.random.Generator, robot: Robot, room: Room, peak: float, level: float) -> Microphone:
+    """With a gain at which a sweep in that room has a peak of 0.3 of full scale, or the voice one of 0.8.
+
+    peak, level: largest sample and root mean square of the voice without gain.
+    """
+    gain = float(min(0.3 / np.abs(robot.record(sweep(), room.robot)).max(), 0.8 / peak))
+    return Microphone(gain, gain * level * 10 ** (FAN_DB / 20), draw_fan(rng))
+
+
+def calibration(
+    rng: np.random.Generator, robot: Robot, room: Room, microphone: Microphone
+) -> tuple[Samples, Samples, Samples]:
+    """A sweep, its recording in a room, and the fan alone."""
+    excitation = sweep()
+    echo = np.float32(microphone.gain) * robot.record(excitation, room.robot).astype(np.float32)
+    fan, alone = (microphone.hears_fan(rng, size) for size in (echo.size, 8 * RATE))
+    return excitation.astype(np.float32), echo + fan, alone
