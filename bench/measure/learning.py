@@ -10,7 +10,7 @@ second is louder with learning. curve: what is left over seconds of robot speech
 calibrated here, learning from nothing, and the day after with what was learned here or elsewhere. cost: milliseconds of
 a paced hop with a learner in another process and without, in turns, and what that process takes. The first two run
 recordings as files, with the learner in the same process, so that they take minutes (of one core: 0.6 for each minute
-of a day's speech, 0.8 for each room of the curve). --voices may name several folders, such as of other synthesizers.
+of a day's speech, 1 for each room of the curve). --voices may name several folders, such as of other synthesizers.
 """
 
 from __future__ import annotations

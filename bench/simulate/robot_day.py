@@ -148,7 +148,7 @@ def draw_stages(rng: np.random.Generator, robot: Robot, stage_s: float) -> list[
         Stage("office", office, early),
         Stage(f"volume {VOLUME_DB:+.0f} dB", office, early, VOLUME_DB),
         Stage("another place", elsewhere, early, VOLUME_DB),
-        Stage(f"clock {PPM:+.0f} ppm, lag {late - early:+d} samples", elsewhere, late, VOLUME_DB, PPM),
+        Stage(f"clock {PPM:+.0f} ppm, lag", elsewhere, late, VOLUME_DB, PPM),
         Stage("another office", draw_room(rng, "office", *about), late + lost, VOLUME_DB, PPM),
     ]
 
