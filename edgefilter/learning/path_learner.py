@@ -13,7 +13,7 @@ from edgefilter.echo.effect import complete, vanishes
 from edgefilter.echo.effects.catalogue import EFFECTS, find
 from edgefilter.echo.measurement import Measurement
 from edgefilter.echo.model import EchoModel
-from edgefilter.filter.canceller import Canceller
+from edgefilter.filter.canceller import COLD, Canceller
 from edgefilter.filter.echo_path import TAPS, EchoPath, Effects, PathState, starting_path
 from edgefilter.filter.learner import Heard, Lesson
 from edgefilter.learning.contest import Rival
@@ -21,7 +21,7 @@ from edgefilter.learning.remember import learned_profile
 from edgefilter.learning.shared import PAST
 from edgefilter.learning.tape import Tape, emphasised
 from edgefilter.profile.data import Profile
-from edgefilter.types import SAMPLE_RATE, EventKind, Samples
+from edgefilter.types import SAMPLE_RATE, Samples
 
 MINUTE = 60.0
 FIRST_S, FACTOR, EVERY_S = 2.0, 1.5, 20.0
@@ -32,11 +32,12 @@ FADE = 0.9995
 """... this factor a hop."""
 WORTH_S = 5.0
 """Seconds of audible robot from which on what was learned may be worth keeping."""
+BEFORE = "the path of before"
 PSD_FFT = 1200
 MOMENT, QUIET = 4800, 1e-4
 """Samples over which the reference's power is taken, and how far below its highest sample's it teaches nothing."""
 SHORT_S, TIMES = 15.0, 3
-"""Up to as many seconds teach more where they are heard several times."""
+"""So few seconds teach more where they are heard several times."""
 
 
 class PathLearner:
@@ -81,7 +82,9 @@ class PathLearner:
         self._silence = np.zeros(self.past, np.float32)
         self._tape = Tape(hop, MINUTE)
         self._running = self._resumed(path)
-        self._rivals: list[Rival] = []
+        self._rivals = [Rival(self._running, "no lesson at all", "unlearned", stays=True)]
+        if known:
+            self._rivals.append(Rival(self._fresh((), None, products=False), "a path from nothing", stays=True))
         self._audible_s, self._next_s, self._peak = 0.0, FIRST_S, 0.0
         self._counts = {"rounds": 0, "learned": 0, "unlearned": 0, "remembered": 0}
 
@@ -92,14 +95,15 @@ class PathLearner:
         audible = self._audible(heard)
         left = emphasised(heard.innovation)
         for rival in self._rivals:
-            rival.step(heard, left, audible)
+            if rival.path is not self._running:
+                rival.step(heard, left, audible)
         won = [rival for rival in self._rivals if rival.won]
         if won:
             return self._adopt(max(won, key=lambda rival: rival.gain_db))
         self._rivals = [rival for rival in self._rivals if not rival.over]
         if audible and self._audible_s >= self._next_s:
             self._next_s = min(self._next_s * FACTOR, self._next_s + EVERY_S)
-            self._rivals = [rival for rival in self._rivals if rival.before] + self._candidates()
+            self._rivals = [rival for rival in self._rivals if rival.stays] + self._candidates()
             self._keep()
         return None
 
@@ -125,28 +129,36 @@ class PathLearner:
         return audible
 
     def _adopt(self, winner: Rival) -> Lesson:
-        kind: EventKind = "unlearned" if winner.before else "learned"
-        self._counts[kind] += 1
+        self._counts[winner.kind] += 1
         detail = f"{winner.was}: {winner.gain_db:.1f} dB less is left of the robot"
-        self._rivals = [] if winner.before else [Rival(self._running, "the path of before", before=True)]
+        self._rivals = [rival for rival in self._rivals if rival.stays and rival.was != BEFORE]
+        for rival in self._rivals:
+            rival.forget()
+        if all(rival.path is not self._running for rival in self._rivals):
+            self._rivals.append(Rival(self._running, BEFORE, "unlearned", stays=True))
         self._running = winner.path
-        return Lesson(winner.path.state(), kind, detail)
+        return Lesson(winner.path.state(), winner.kind, detail)
 
     def _candidates(self) -> list[Rival]:
-        """Paths that have heard the whole tape: from the beginning with what the tape teaches of the loudspeaker, and without.
+        """Paths that have heard the tape: from the beginning with what it teaches of the loudspeaker, and without.
 
-        From nothing with it, too: where the robot was calibrated it may not stand any more.
+        And from nothing, with its newest seconds alone: the robot may stand elsewhere than at the beginning, or than a
+        minute ago.
         """
         self._counts["rounds"] += 1
         known, fitted = self._begin.effects, self._fitted()
+        short = self._audible_s < SHORT_S
         rivals = [Rival(self._fresh(known, self._response), "path")]
         if any(find(name).learned for name, _ in fitted):
             rivals.append(Rival(self._fresh(fitted, self._response), "loudspeaker and path"))
-        if self._response is not None:
-            rivals.append(Rival(self._fresh(fitted, None), "another path"))
         for rival in rivals:
-            for _ in range(TIMES if self._audible_s < SHORT_S else 1):
+            for _ in range(TIMES if short else 1):
                 self._tape.replay(rival.path)
+        if self._response is not None or not short:
+            elsewhere = self._fresh(fitted, None)
+            for _ in range(TIMES):
+                self._tape.replay(elsewhere, SHORT_S)
+            rivals.append(Rival(elsewhere, "another path"))
         return rivals
 
     def _fitted(self) -> Effects:
@@ -171,9 +183,12 @@ class PathLearner:
                 effects = others if vanishes(effect, values) else (*others, (effect.name, values))
         return effects
 
-    def _fresh(self, effects: Effects, response: Samples | None) -> EchoPath:
+    def _fresh(self, effects: Effects, response: Samples | None, products: bool = True) -> EchoPath:
         """A path with those effects that starts from an impulse response, or from nothing, and has heard nothing."""
-        adaptation = replace(self._begin.canceller.adaptation, products=True)
+        begin = self._begin.canceller.adaptation
+        if response is None:
+            begin = replace(COLD, posterior=begin.posterior)
+        adaptation = replace(begin, products=products)
         return EchoPath(Canceller(self._hop, TAPS[1], response, adaptation), effects)
 
     def _keep(self) -> None:

@@ -29,11 +29,12 @@ class Tape:
         if len(self._hops) > self._most + self._most // 4:
             del self._hops[: -self._most]
 
-    def replay(self, path: EchoPath) -> float:
-        """Let a path hear all of it, as the running filter did; the power, emphasised, that it left."""
+    def replay(self, path: EchoPath, newest_s: float | None = None) -> float:
+        """Let a path hear all of it, or its newest seconds, as the running filter did; the power, emphasised, that it left."""
+        first = 0 if newest_s is None else max(0, len(self._hops) - round(newest_s * SAMPLE_RATE / self._hop))
         return sum(
             emphasised(path.step(heard.mic, heard.reference, heard.located, heard.past).innovation)
-            for heard in self._hops
+            for heard in self._hops[first:]
         )
 
     def signals(self) -> tuple[Samples, Samples, Samples]:

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from edgefilter.learning.contest import LEAST, MOST, Rival
+from edgefilter.learning.contest import LATEST, LEAST, MOST, Rival
 
 
 def rival(gains):
@@ -23,3 +23,12 @@ def test_a_loss_never_wins_and_ends():
     lost = rival(np.full(MOST, -0.5))
     assert not lost.won
     assert lost.over
+
+
+def test_a_standing_rival_is_judged_by_its_latest_blocks_and_never_given_up():
+    standing = Rival(None, "a test", stays=True, gains_db=[-1.0] * MOST)
+    assert not standing.over
+    standing.gains_db = [0.4, 0.5] * (LATEST // 2)
+    assert standing.won
+    standing.forget()
+    assert not standing.won
