@@ -64,7 +64,7 @@ def load(path: Path) -> Trained:
         raise ModelError(
             f"{path} is no checkpoint of a network ({' '.join(str(error).split())[:120]}): give one that training wrote"
         ) from None
-    training = {key: value for key, value in found.items() if key not in ("network", "config", "kind", "figures")}
+    training = {key: value for key, value in found.items() if key not in ("network", "config", "kind", "figures", "resume")}
     return Trained(network.eval(), training, found.get("figures", {}))
 
 
