@@ -55,7 +55,9 @@ class Items:
         for path in tqdm(new, desc=f"read {self.folder}", unit="item", leave=False):
             with np.load(path) as file:
                 if POWERS[0] not in file:
-                    raise UsageError(f"{path} holds no expected powers: simulate it again with python -m export.dataset")
+                    raise UsageError(
+                        f"{path} holds no expected powers: simulate it again with python -m export.dataset"
+                    )
                 names = (*STORED, *POWERS, "scale", "reference_scale")
                 self._items[path.name] = {name: file[name] for name in names}
         self._items = {path.name: self._items[path.name] for path in paths}
@@ -138,7 +140,10 @@ class Batches:
         self.rng = np.random.default_rng([self.seed, step, self.rank])
         batch, seconds = self.shape.of(step)
         samples = self._whole_hops(seconds)
-        self._ready = step, self.spectra([self._crop(str(n), samples) for n in self.rng.choice(self.items.names, batch)])
+        self._ready = (
+            step,
+            self.spectra([self._crop(str(n), samples) for n in self.rng.choice(self.items.names, batch)]),
+        )
 
     def _whole_hops(self, seconds: float) -> int:
         return int(seconds * SAMPLE_RATE) // self.stft.hop * self.stft.hop

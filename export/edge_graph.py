@@ -39,7 +39,7 @@ class EdgeGraph(nn.Module):
         answered: Tensor,
         hidden: Tensor,
     ) -> tuple[Tensor, ...]:
-        """Spectra (1, bins, 2), powers (1, bins) and EdgeCrnn's state to the human's spectrum (1, bins, 2), the probability (1,) and the next state."""
+        """Spectra (1, bins, 2), powers (1, bins) and EdgeCrnn's state to what EdgeCrnn.step gives."""
         network = self.network
         spectra = torch.cat((error, mic, reference, echo))
         mic_now, ref_now = compressed(spectra[:, 1:].permute(0, 2, 1), -2).reshape(2, 6, -1).split(1)

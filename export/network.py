@@ -109,7 +109,7 @@ class Upward(nn.Module):
 
 
 class EdgeCrnn(nn.Module):
-    """(error, mic, reference, echo) spectra and (noise, residual) power spectra to the human's spectrum and the probability that somebody speaks.
+    """Spectra of error, mic, reference, echo, powers of noise and residual to the human's spectrum and the probability of speech.
 
     State: the previous frame's features of either branch (batch, 6, bands), the power of the prior's previous answer
     (batch, bins) and the GRU's (layers, batch, hidden).
@@ -153,7 +153,7 @@ class EdgeCrnn(nn.Module):
         residual: Tensor,
         state: tuple[Tensor, ...],
     ) -> tuple[Tensor, Tensor, tuple[Tensor, ...]]:
-        """Spectra (batch, frames, bins, 2) and powers (batch, frames, bins) to the human's (batch, frames, bins, 2), logits (batch, frames), and the next state."""
+        """Spectra (batch, frames, bins, 2) and powers (batch, frames, bins) to the human's spectra, logits (batch, frames), and the next state."""
         batch, frames = error.shape[:2]
         mic_x, mic_last = _with_previous(torch.cat((features(error), features(mic)), -1), state[0])
         ref_x, ref_last = _with_previous(torch.cat((features(reference), features(echo)), -1), state[1])
@@ -195,7 +195,7 @@ class EdgeCrnn(nn.Module):
         residual: Tensor,
         state: tuple[Tensor, ...],
     ) -> tuple[Tensor, Tensor, tuple[Tensor, ...]]:
-        """One frame: spectra (1, bins, 2) and powers (1, bins) to the human's (1, bins, 2), the probability (1,) that somebody speaks, and the next state."""
+        """One frame, spectra (1, bins, 2) and powers (1, bins): the human's spectrum, the probability (1,) of speech, the next state."""
         frame = (x.unsqueeze(1) for x in (error, mic, reference, echo, noise, residual))
         human, logit, state = self(*frame, state)
         return human.squeeze(1), torch.sigmoid(logit.squeeze(1)), state

@@ -57,10 +57,15 @@ def main() -> int:
     parser.add_argument("--batch", type=int, default=Shape.batch)
     parser.add_argument("--seconds", type=float, default=Shape.seconds, help="of a crop")
     parser.add_argument(
-        "--long-every", type=int, default=Shape.long_every, help="each so many batches a quarter of crops, 4 times as long"
+        "--long-every",
+        type=int,
+        default=Shape.long_every,
+        help="each so many batches a quarter of crops, 4 times as long",
     )
     parser.add_argument("--newest", type=int, help="items kept in memory (default: all)")
-    parser.add_argument("--rate", type=float, default=1.5e-3, help="learning rate; it stays, and falls over the last fifth")
+    parser.add_argument(
+        "--rate", type=float, default=1.5e-3, help="learning rate; it stays, and falls over the last fifth"
+    )
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--hop", type=int, default=256)
     parser.add_argument("--channels", type=int, nargs=4, default=EdgeConfig.channels)

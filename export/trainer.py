@@ -94,7 +94,9 @@ class Trainer:
         self.network = task.network().to(device)
         self.before: Mapping[str, object] = self._take(start) if start else {}
         self.average = {name: value.clone() for name, value in self.network.state_dict().items()}
-        self.optimiser = torch.optim.AdamW(self.network.parameters(), lr=plan.rate, weight_decay=1e-2, betas=(0.9, 0.98))
+        self.optimiser = torch.optim.AdamW(
+            self.network.parameters(), lr=plan.rate, weight_decay=1e-2, betas=(0.9, 0.98)
+        )
         self.step, self.best, self.since, self.seconds = 0, -math.inf, 0, 0.0
         self._resume(output / "last.pt", device)
 

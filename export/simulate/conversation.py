@@ -66,9 +66,7 @@ def simulate(recipe: Recipe, seed: int, index: int, material: Material) -> Conve
     robot_gain = level / max(active_rms(voice.echo), 1e-9) if voice.echo.any() else 0.0
     near = rng.random() < recipe.near_share
     human_rms = level * 10 ** (rng.uniform(*(recipe.near_db if near else recipe.human_gain_db)) / 20)
-    clean = script.human(
-        rng, recipe, material.humans, path.to_human(rng, material, room, recipe.wideness), samples
-    )
+    clean = script.human(rng, recipe, material.humans, path.to_human(rng, material, room, recipe.wideness), samples)
     clean *= human_rms / max(active_rms(clean), 1e-9)
     quiet = rng.random() < recipe.quiet_fan
     fan_rms = human_rms * 10 ** (-(rng.uniform(20, 45) if quiet else rng.uniform(*recipe.fan_db)) / 20)
@@ -114,9 +112,7 @@ def _robot(
     return Voice(echo, said.told, response, about | {"distortion_db": round(level_db, 1)})
 
 
-def _recorded(
-    microphone: Microphone, echo: Samples, clean: Samples, noise: Samples
-) -> tuple[Samples, Samples, float]:
+def _recorded(microphone: Microphone, echo: Samples, clean: Samples, noise: Samples) -> tuple[Samples, Samples, float]:
     """What the microphone makes of all three together, what it makes of the human, and the gain at which it was recorded."""
     mic, clean = microphone.filtered(echo + clean + noise), microphone.filtered(clean)
     gain = microphone.gain(mic.size)

@@ -132,7 +132,8 @@ class Heard:
 def listen(front: FrontEnd, mic: Samples, reference: Samples, clean: Samples, stft: StftConfig) -> Heard:
     """Run the front over a conversation, (n,) each, and put its frames together to sound again.
 
-    The synthesis is the inverse of the analysis, so that frames cut from that sound are the engine's own.
+    The synthesis is the inverse of the analysis, so that frames cut from that sound are the engine's own, but for bins
+    beside a low cut.
     """
     hop, hops = stft.hop, mic.size // stft.hop
     own, voices = Analyser(stft), [Synthesiser(stft) for _ in range(4)]

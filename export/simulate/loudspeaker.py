@@ -8,9 +8,9 @@ from collections.abc import Callable
 import numpy as np
 from scipy import signal
 
+from edgefilter.echo.effect import complete
 from edgefilter.echo.effects.catalogue import find
 from edgefilter.echo.effects.compression import Compression
-from edgefilter.echo.effect import complete
 from edgefilter.types import SAMPLE_RATE, Samples
 
 SECOND = 0.4

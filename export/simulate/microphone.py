@@ -16,7 +16,10 @@ HIGH_PASS, BAND_LIMIT, GAIN_CONTROL, CLIPPING = 0.4, 0.25, 0.2, 0.1
 
 @dataclass(frozen=True)
 class Microphone:
-    """sections: of its linear filter, second order. gain_db, gain_hz: knots of its gain control and how many a second; clip: part of the peak that it passes."""
+    """sections: of its linear filter, second order.
+
+    gain_db, gain_hz: knots of its gain control, how many a second. clip: part of the peak that it passes.
+    """
 
     sections: np.ndarray | None = None
     gain_db: np.ndarray | None = None
