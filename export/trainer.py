@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import torch
-from torch import Tensor, distributed, nn
+from torch import Tensor, nn
 from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
 
@@ -19,6 +19,7 @@ from edgefilter.types import SAMPLE_RATE
 from export.crops import Batches, Items, Shape
 from export.losses import si_sdr
 from export.onnx_export import load
+from export.processes import Processes
 from export.tasks import Task
 
 WARM_UP = 300
@@ -52,33 +53,6 @@ class Plan:
         return min(1 - 1 / min(AVERAGED, max(2.0, self.steps / 25)), (step + 1) / (step + 10))
 
 
-@dataclass(frozen=True)
-class Processes:
-    """Those that train together: each draws crops of its own, gradients are their mean. rank 0 writes."""
-
-    rank: int = 0
-    world: int = 1
-
-    @classmethod
-    def join(cls) -> Processes:
-        """As torchrun started them; one where it did not."""
-        if not distributed.is_torchelastic_launched():
-            return cls()
-        distributed.init_process_group("nccl" if torch.cuda.is_available() else "gloo")
-        return cls(distributed.get_rank(), distributed.get_world_size())
-
-    def share(self, network: nn.Module) -> None:
-        """Replace each gradient by its mean over all processes."""
-        if self.world == 1:
-            return
-        gradients = [p.grad if p.grad is not None else torch.zeros_like(p) for p in network.parameters()]
-        flat = torch.cat([gradient.reshape(-1) for gradient in gradients])
-        distributed.all_reduce(flat)
-        parts = (flat / self.world).split([gradient.numel() for gradient in gradients])
-        for parameter, part in zip(network.parameters(), parts):
-            parameter.grad = part.view_as(parameter).clone()
-
-
 class Trainer:
     """Trains one network into a folder: last.pt to go on from, best.pt by validation loss, log.jsonl.
 
@@ -105,19 +79,19 @@ class Trainer:
         batches = Batches(items, self.task.stft, self.shape, self.plan.seed, self.processes.rank)
         print(f"{self.task.describe(self.network)}; {len(items.names)} items, from step {self.step}", flush=True)
         steps = range(self.step, self.plan.steps)
-        with SummaryWriter(self.output) as board, tqdm(steps, initial=self.step, total=self.plan.steps) as progress:
+        board = SummaryWriter(self.output) if self.processes.rank == 0 else None
+        with tqdm(steps, initial=self.step, total=self.plan.steps, disable=board is None) as progress:
             began = time.perf_counter() - self.seconds
             for step in progress:
                 shown = self._one(step, batches.draw(step))
                 progress.set_postfix(loss=f"{shown['total']:.4f}", si_sdr=f"{-shown['si_sdr']:.1f}")
-                board.add_scalar("train/total", shown["total"], step)
                 self.step, self.seconds = step + 1, time.perf_counter() - began
                 if self.step % self.plan.every and self.step < self.plan.steps:
                     continue
-                if self.processes.rank == 0:
-                    self._judge(items, held_out, board)
+                if board:
+                    self._judge(items, held_out, board, shown["total"])
                 items.refresh()
-                if self.plan.patience and self.since >= self.plan.patience:
+                if self.processes.agree(0 < self.plan.patience <= self.since, self._device()):
                     print(f"stopped: {self.plan.patience} validations without a better score")
                     break
         return self.output / "best.pt"
@@ -141,7 +115,7 @@ class Trainer:
                 self.average[name].copy_(value)
         return {name: float(value.detach()) for name, value in terms.items()}
 
-    def _judge(self, items: Items, held_out: Items, board: SummaryWriter) -> None:
+    def _judge(self, items: Items, held_out: Items, board: SummaryWriter, loss: float) -> None:
         """Validate the averaged weights and write what training goes on from, and the weights where they are the best."""
         averaged = self.task.network().to(self._device())
         averaged.load_state_dict(self.average)
@@ -156,6 +130,7 @@ class Trainer:
         here = {"step": self.step, "best": self.best, "since": self.since, "seconds": self.seconds}
         here |= {"running": self.network.state_dict(), "optimiser": self.optimiser.state_dict()}
         _write(state | {"network": self.average, "resume": here}, self.output / "last.pt")
+        board.add_scalar("train/total", loss, self.step)
         for name, value in figures.items():
             board.add_scalar(f"validation/{name}", value, self.step)
         line = {"step": self.step, "seconds": round(self.seconds), "items": len(items.names)}
