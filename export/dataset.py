@@ -1,7 +1,7 @@
 """Simulated conversations with the running filter's front run over them, as arrays that training can crop.
 
     python -m export.dataset --humans DIR --robots DIR --output DIR [--recipe wide --noise DIR --responses DIR]
-        [--count 2000] [--seed 1] [--profile P.npz]
+        [--count 2000] [--seed 1] [--minutes M] [--profile P.npz]
 
 Writes DIR/NNNNN.npz per item: mic, reference, error, clean as an engine gets them ((n,) int16 with their scale; echo =
 mic - error), noise, residual (the front's expected power spectra, simulate/linear_stage.py) and about (JSON), and
@@ -12,7 +12,9 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import os
+import time
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, replace
@@ -97,8 +99,11 @@ def make_dataset(
     (output / "dataset.json").write_text(json.dumps(about, indent=1, default=str) + "\n", encoding="utf-8")
     paths = [(index, output / f"{index:05d}.npz") for index in range(count)]
     missing = [(recipe, seed, index, path, stft) for index, path in paths if not path.exists()]
-    with ProcessPoolExecutor(jobs, initializer=_start, initargs=(material,)) as pool:
+    pool = ProcessPoolExecutor(jobs, initializer=_start, initargs=(material,))
+    try:
         yield from pool.map(_make, missing)
+    finally:
+        pool.shutdown(cancel_futures=True)
 
 
 def main() -> None:
@@ -122,8 +127,10 @@ def main() -> None:
         "--hop", type=int, default=256, help="of the linear stage; the window is twice as long (default: %(default)s)"
     )
     parser.add_argument("--profile", type=Path, help="add the lasting effects of this profile to half of the items")
+    parser.add_argument("--minutes", type=float, default=math.inf, help="stop then, with what is there")
     parser.add_argument("--jobs", type=int, default=os.cpu_count())
     options = parser.parse_args()
+    began = time.monotonic()
     recipe = RECIPES[options.recipe]
     if options.profile:
         recipe = replace(recipe, effects=Profile.load(options.profile).echo.lasting().effects)
@@ -138,7 +145,9 @@ def main() -> None:
     work = make_dataset(recipe, options.seed, options.count, material, options.output, stft, options.jobs)
     have = len(list(options.output.glob("*.npz")))
     for _ in tqdm(work, total=options.count - have, unit="item", desc=str(options.output)):
-        pass
+        if time.monotonic() - began > 60 * options.minutes:
+            work.close()
+            break
 
 
 if __name__ == "__main__":

@@ -24,6 +24,11 @@ class Processes:
             distributed.init_process_group("nccl" if torch.cuda.is_available() else "gloo")
         return cls(distributed.get_rank(), distributed.get_world_size())
 
+    @property
+    def device(self) -> torch.device:
+        """Where this one computes: a GPU of its own where there is one."""
+        return torch.device("cuda", self.rank) if torch.cuda.is_available() else torch.device("cpu")
+
     def share(self, network: nn.Module) -> None:
         """Replace each gradient by its mean over all processes."""
         if self.world == 1:

@@ -22,7 +22,7 @@ import torch
 
 from edgefilter.errors import EdgefilterError
 from edgefilter.types import SAMPLE_RATE
-from export.crops import Items, Shape
+from export.crops import Shape
 from export.losses import LossWeights
 from export.network import EdgeConfig
 from export.tasks import TASKS
@@ -52,6 +52,7 @@ def main() -> int:
     parser.add_argument("--output", type=Path, required=True, metavar="DIR")
     parser.add_argument("--network", choices=tuple(TASKS), default="edge")
     parser.add_argument("--steps", type=int, default=6000)
+    parser.add_argument("--minutes", type=float, help="end by then; the rate falls over the last fifth of them")
     parser.add_argument("--every", type=int, default=500, help="steps between validations")
     parser.add_argument("--patience", type=int, default=0, help="validations without a better score to stop after")
     parser.add_argument("--batch", type=int, default=Shape.batch)
@@ -85,10 +86,10 @@ def main() -> int:
             smoke(options)
         torch.set_num_threads(options.threads)
         options.output.mkdir(parents=True, exist_ok=True)
-        plan = Plan(options.steps, options.rate, options.seed, options.every, options.patience)
+        plan = Plan(options.steps, options.rate, options.seed, options.every, options.patience, options.minutes)
         shape = Shape(options.batch, options.seconds, options.long_every)
         trainer = Trainer(TASKS[options.network](options), plan, shape, options.output, options.start)
-        trainer.run(Items(options.data, options.newest), Items(options.validation))
+        trainer.run(options.data, options.validation, options.newest)
     except (EdgefilterError, OSError) as error:
         print(f"train: {error}", file=sys.stderr)
         return 1

@@ -34,19 +34,28 @@ HELD_OUT_S = 8.0
 
 @dataclass(frozen=True)
 class Plan:
-    """How long and how fast. every: steps between validations; patience: validations without a better score before the end, 0 for never."""
+    """How long and how fast.
+
+    every: steps between validations. patience: validations without a better score before the end, 0 for never. minutes:
+    after which training ends if it has not before, None for whenever.
+    """
 
     steps: int
     rate: float
     seed: int
     every: int
-    patience: int
+    patience: int = 0
+    minutes: float | None = None
 
-    def rate_at(self, step: int) -> float:
+    def done_at(self, step: int, seconds: float = 0.0) -> float:
+        """Part of the training that is behind, by steps or by time, whichever is more."""
+        return max(step / self.steps, seconds / (60 * self.minutes) if self.minutes else 0.0)
+
+    def rate_at(self, step: int, seconds: float = 0.0) -> float:
         """Learning rate: a rise, long the same, a fall to zero."""
         rise = (step + 1) / min(WARM_UP, self.steps / 10)
-        fall = (self.steps - step) / (FALL * self.steps)
-        return self.rate * min(1.0, rise, fall) + 1e-6
+        fall = (1.0 - self.done_at(step, seconds)) / FALL
+        return self.rate * max(0.0, min(1.0, rise, fall)) + 1e-6
 
     def kept_at(self, step: int) -> float:
         """Weight of the past in the averaged weights."""
@@ -64,7 +73,7 @@ class Trainer:
         self.task, self.plan, self.shape, self.output = task, plan, shape, output
         torch.manual_seed(plan.seed)
         self.processes = Processes.join()
-        device = torch.device("cuda", self.processes.rank) if torch.cuda.is_available() else torch.device("cpu")
+        device = self.processes.device
         self.network = task.network().to(device)
         self.before: Mapping[str, object] = self._take(start) if start else {}
         self.average = {name: value.clone() for name, value in self.network.state_dict().items()}
@@ -74,8 +83,11 @@ class Trainer:
         self.step, self.best, self.since, self.seconds = 0, -math.inf, 0, 0.0
         self._resume(output / "last.pt", device)
 
-    def run(self, items: Items, held_out: Items) -> Path:
-        """Train until the plan is done; returns the best checkpoint."""
+    def run(self, data: Path, validation: Path, newest: int | None = None) -> Path:
+        """Train on items until the plan is done; returns the best checkpoint. newest: see Items."""
+        items, held_out = (
+            Items(folder, count, self._device()) for folder, count in ((data, newest), (validation, None))
+        )
         batches = Batches(items, self.task.stft, self.shape, self.plan.seed, self.processes.rank)
         print(f"{self.task.describe(self.network)}; {len(items.names)} items, from step {self.step}", flush=True)
         steps = range(self.step, self.plan.steps)
@@ -86,20 +98,20 @@ class Trainer:
                 shown = self._one(step, batches.draw(step))
                 progress.set_postfix(loss=f"{shown['total']:.4f}", si_sdr=f"{-shown['si_sdr']:.1f}")
                 self.step, self.seconds = step + 1, time.perf_counter() - began
-                if self.step % self.plan.every and self.step < self.plan.steps:
+                over = self.processes.agree(self.plan.done_at(self.step, self.seconds) >= 1.0, self._device())
+                if self.step % self.plan.every and not over:
                     continue
                 if board:
                     self._judge(items, held_out, board, shown["total"])
                 items.refresh()
-                if self.processes.agree(0 < self.plan.patience <= self.since, self._device()):
-                    print(f"stopped: {self.plan.patience} validations without a better score")
+                if over or self.processes.agree(0 < self.plan.patience <= self.since, self._device()):
                     break
         return self.output / "best.pt"
 
     def _one(self, step: int, batch: Mapping[str, Tensor]) -> dict[str, float]:
         """One step; returns the loss terms."""
         for group in self.optimiser.param_groups:
-            group["lr"] = self.plan.rate_at(step)
+            group["lr"] = self.plan.rate_at(step, self.seconds)
         terms, _ = self.task.loss(self.network, on(self._device(), batch))
         self.optimiser.zero_grad(set_to_none=True)
         terms["total"].backward()

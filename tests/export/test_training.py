@@ -54,7 +54,7 @@ def test_the_dataset_holds_what_the_linear_stage_left(data):
     items = Items(data)
     assert items.names == ["00000.npz", "00001.npz"]
     for name in items.names:
-        crop = items.crop(name, 3 * 16000, 16000)
+        crop = {signal: x[0].numpy() for signal, x in items.crops([(name, 3 * 16000)], 16000).items()}
         robot, left = crop["mic"] - crop["clean"], crop["error"] - crop["clean"]
         assert np.mean(left**2) < 0.2 * np.mean(robot**2)
     assert json.loads((data / "dataset.json").read_text())["seed"] == 4
@@ -82,11 +82,25 @@ def test_expected_powers_belong_to_the_frames_beside_them(data):
     """An item's noise is told in bytes: half a step of 0.5 dB, and as many frames as the crop holds."""
     items, stft = Items(data), StftConfig()
     name = items.names[0]
-    stored = items._items[name]["residual"]
-    found = items.powers(name, 10 * stft.hop, 8 * stft.hop, stft)["residual"]
-    assert found.shape == (7, stft.bins)
-    np.testing.assert_allclose(10 * np.log10(found[0]), -90 + 0.5 * stored[11].astype(float), atol=1e-3)
-    assert items.powers(name, 0, 8 * stft.hop, StftConfig(320, 160, 320)) == {}
+    stored = np.load(data / name)["residual"]
+    found = items.powers([(name, 10 * stft.hop)], 8 * stft.hop, stft)["residual"]
+    assert found.shape == (1, 7, stft.bins)
+    np.testing.assert_allclose(10 * np.log10(found[0, 0].numpy()), -90 + 0.5 * stored[11].astype(float), atol=1e-3)
+    assert items.powers([(name, 0)], 8 * stft.hop, StftConfig(320, 160, 320)) == {}
+
+
+def test_a_swapped_human_is_as_loud_as_the_one_who_was_there(data, monkeypatch):
+    def drawn(share):
+        monkeypatch.setattr("export.crops.SWAPPED", share)
+        return Batches(Items(data), StftConfig(), Shape(16, 1.0), seed=3).draw(0)
+
+    swapped, kept = drawn(1.0), drawn(0.0)
+    power = [batch["clean"].square().sum((1, 2, 3)) for batch in (swapped, kept)]
+    changed = [not torch.allclose(a, b) for a, b in zip(swapped["clean"], kept["clean"])]
+    assert sum(changed) > 4
+    assert torch.allclose(power[0], power[1], rtol=0.2)  # framing weighs the ends of a crop less
+    rest = [batch["mic"] - batch["clean"] for batch in (swapped, kept)]
+    assert torch.allclose(*rest, atol=1e-3)
 
 
 def test_a_silent_robot_leaves_the_human_in_the_microphone(data, monkeypatch):
@@ -268,6 +282,9 @@ def test_the_rate_rises_stays_and_falls():
     rates = [plan.rate_at(step) for step in range(1000)]
     assert rates[0] < 0.02 and max(rates) < 1.0001 and rates[-1] < 0.01
     assert all(rate > 0.999 for rate in rates[100:800]) and rates[899] == pytest.approx(0.505, abs=0.01)
+    timed = Plan(steps=10**6, rate=1.0, seed=1, every=100, minutes=10)
+    assert timed.rate_at(1000, 7 * 60) > 0.999 and timed.rate_at(1000, 9 * 60) == pytest.approx(0.5, abs=0.01)
+    assert timed.done_at(1000, 10 * 60) == 1.0
 
 
 def test_training_starts_from_given_weights_of_the_same_shape(tmp_path, monkeypatch, capsys):
