@@ -32,7 +32,8 @@ from export.simulate.linear_stage import front_end, listen
 from export.simulate.material import Material, read_noises, read_responses
 from export.simulate.recipe import RECIPES, Recipe
 
-ROOMS = {"lab": 80, "office": 120, "hall": 40}
+ROOMS = {"lab": 1 / 3, "office": 1 / 2, "hall": 1 / 6}
+"""Shares of the kinds of room."""
 
 
 def pack(conversation: Conversation, stft: StftConfig, rng: np.random.Generator) -> dict[str, np.ndarray]:
@@ -127,6 +128,7 @@ def main() -> None:
         "--hop", type=int, default=256, help="of the linear stage; the window is twice as long (default: %(default)s)"
     )
     parser.add_argument("--profile", type=Path, help="add the lasting effects of this profile to half of the items")
+    parser.add_argument("--rooms", type=int, default=240, help="simulated, half of them offices, a third laboratories")
     parser.add_argument("--minutes", type=float, default=math.inf, help="stop then, with what is there")
     parser.add_argument("--jobs", type=int, default=os.cpu_count())
     options = parser.parse_args()
@@ -138,7 +140,9 @@ def main() -> None:
     material = Material(
         read_corpus(*options.humans),
         read_corpus(*options.robots),
-        make_rooms(options.seed, ROOMS, options.jobs),
+        make_rooms(
+            options.seed, {kind: math.ceil(share * options.rooms) for kind, share in ROOMS.items()}, options.jobs
+        ),
         read_noises(*options.noise),
         read_responses(*options.responses),
     )

@@ -38,9 +38,10 @@ def data(tmp_path_factory):
         "1",
         "--recipe",
         "paper",
+        "--rooms",
+        "2",
     ]
     patch = pytest.MonkeyPatch()
-    patch.setattr(dataset, "ROOMS", {"lab": 1, "office": 1})
     patch.setattr("sys.argv", ["dataset", *arguments, "--output", str(folder / "items")])
     dataset.main()
     before = (folder / "items" / "00001.npz").stat().st_mtime_ns
