@@ -107,7 +107,8 @@ def make_dataset(
         pool.shutdown(cancel_futures=True)
 
 
-def main() -> None:
+def arguments() -> argparse.Namespace:
+    """What the command line says."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--humans", type=Path, nargs="+", required=True, metavar="DIR")
     parser.add_argument("--robots", type=Path, nargs="+", required=True, metavar="DIR")
@@ -131,7 +132,11 @@ def main() -> None:
     parser.add_argument("--rooms", type=int, default=240, help="simulated, half of them offices, a third laboratories")
     parser.add_argument("--minutes", type=float, default=math.inf, help="stop then, with what is there")
     parser.add_argument("--jobs", type=int, default=os.cpu_count())
-    options = parser.parse_args()
+    return parser.parse_args()
+
+
+def main() -> None:
+    options = arguments()
     began = time.monotonic()
     recipe = RECIPES[options.recipe]
     if options.profile:

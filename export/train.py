@@ -45,7 +45,8 @@ def smoke(options: argparse.Namespace) -> None:
     options.steps, options.every, options.batch, options.seconds = 4, 2, 2, 0.7
 
 
-def main() -> int:
+def arguments() -> argparse.Namespace:
+    """What the command line says."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--data", type=Path, required=True, metavar="DIR")
     parser.add_argument("--validation", type=Path, required=True, metavar="DIR")
@@ -80,7 +81,11 @@ def main() -> int:
     parser.add_argument(
         "--smoke", action="store_true", help="make a few seconds of data in --data and --validation and take four steps"
     )
-    options = parser.parse_args()
+    return parser.parse_args()
+
+
+def main() -> int:
+    options = arguments()
     try:
         if options.smoke:
             smoke(options)
