@@ -5,8 +5,8 @@ r"""Do simulated recordings look like real ones? What the linear stage leaves of
 DATA: items of export/dataset.py, of which those without a profile are taken, the human (who is known) subtracted. DIR:
 pairs NAME_lpb.wav and NAME_mic.wav (or .flac) in which nobody but the loudspeaker is heard; each is filtered anew in pieces as long
 as the items. Of each piece from START_S on, over the hops in which the robot is heard: ERLE, the residual's level by
-frequency under the microphone's, and how much louder than its usual level the residual's loud moments are. Writes
-OUTPUT.json, OUTPUT.md and OUTPUT.png.
+frequency under the microphone's, how much louder than its usual level the residual's loud moments are, and, where
+AECMOS is installed, its judgement of the echo. Writes OUTPUT.json, OUTPUT.md and OUTPUT.png.
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ from bench import results_writer
 from bench.measure import picture
 from bench.measure.levels import frame_power
 from bench.measure.real_recordings import read
+from bench.measure.real_scores import aecmos
 from edgefilter.dsp.stft import StftConfig
 from edgefilter.engines.linear import Linear
 from edgefilter.errors import EdgefilterError, UsageError
@@ -34,13 +35,13 @@ START_S, PIECE_S = 4.0, 12.0
 HEARD_DB = 25.0
 """A hop counts where the microphone is within so much of its loudest."""
 BANDS_HZ = np.geomspace(100, 7600, 20)
-PARTS = {"ERLE, dB": "erle_db", "residual's loud moments over its median, dB": "bursts_db"}
+PARTS = {"ERLE, dB": "erle_db", "residual's loud moments over its median, dB": "bursts_db", "AECMOS, echo": "echo_mos"}
 
 
-def examine(mic: Samples, left: Samples) -> dict[str, object] | None:
+def examine(mic: Samples, left: Samples, reference: Samples) -> dict[str, object] | None:
     """Figures of one piece (n,): microphone and what the linear stage left; None where the robot is hardly heard."""
     start, hop = round(START_S * SAMPLE_RATE), StftConfig().hop
-    mic, left = mic[start:], left[start:]
+    mic, left, reference = mic[start:], left[start:], reference[start:]
     before, after = frame_power(mic, hop), frame_power(left, hop)
     heard = before > 10 ** (-HEARD_DB / 10) * before.max(initial=0.0)
     if before.max(initial=0.0) < 1e-7 or heard.sum() < SAMPLE_RATE / hop:
@@ -49,7 +50,10 @@ def examine(mic: Samples, left: Samples) -> dict[str, object] | None:
     frequencies, spectra = signal.welch(np.stack((left, mic)), SAMPLE_RATE, nperseg=1024)
     bands = np.digitize(frequencies, BANDS_HZ)
     power = np.stack([spectra[:, bands == band].sum(axis=1) for band in range(1, BANDS_HZ.size)], axis=1)
+    mos = aecmos()
+    signals = {name: np.clip(x, -1, 1) for name, x in (("lpb", reference), ("mic", mic), ("enh", left))}
     return {
+        "echo_mos": mos(signals, "st")["echo_mos"] if mos else None,
         "erle_db": float(10 * np.log10(before[heard].sum() / after[heard].sum())),
         "bursts_db": float(np.percentile(ratio_db, 95) - np.median(ratio_db)),
         "spectrum_db": [float(x) for x in 10 * np.log10((power[0] + 1e-15) / (power[1] + 1e-15))],
@@ -65,10 +69,11 @@ def simulated(folder: Path) -> Iterator[dict[str, object]]:
         with np.load(path) as item:
             if json.loads(str(item["about"]))["warm"]:
                 continue
-            mic, error, clean = (
-                item["scale"] / 32767 * item[name].astype(np.float32) for name in ("mic", "error", "clean")
+            mic, error, clean, reference = (
+                item["reference_scale" if name == "reference" else "scale"] / 32767 * item[name].astype(np.float32)
+                for name in ("mic", "error", "clean", "reference")
             )
-            if item["reference"].any() and (found := examine(mic - clean, error - clean)):
+            if reference.any() and (found := examine(mic - clean, error - clean, reference)):
                 yield found
 
 
@@ -84,7 +89,7 @@ def real(folder: Path) -> Iterator[dict[str, object]]:
             stream = Stream(Linear())
             piece = slice(at, at + size)
             left = np.concatenate((stream.process(mic[piece], reference[piece]), stream.flush()))
-            if found := examine(mic[piece], left):
+            if found := examine(mic[piece], left, reference[piece]):
                 yield found
 
 
@@ -94,10 +99,20 @@ def overlap(ours: np.ndarray, theirs: np.ndarray) -> float:
     return float(np.mean((theirs >= low) & (theirs <= high)))
 
 
+def measured(sets: dict[str, list[dict]]) -> dict[str, str]:
+    """Those of PARTS that there are figures of."""
+    return {
+        label: key
+        for label, key in PARTS.items()
+        if all(row[key] is not None for rows in sets.values() for row in rows)
+    }
+
+
 def plot(sets: dict[str, list[dict]], output: Path) -> None:
     """A histogram of each figure, and the spectrum's median and 5 to 95 % range."""
-    figure, axes = picture.panels(1, 3, (14, 4))
-    for axis, (label, key) in zip(axes, PARTS.items()):
+    parts = measured(sets)
+    figure, axes = picture.panels(1, len(parts) + 1, (4.5 * len(parts) + 5, 4))
+    for axis, (label, key) in zip(axes, parts.items()):
         for name, rows in sets.items():
             axis.hist([row[key] for row in rows], bins=20, density=True, alpha=0.5, label=f"{name}, {len(rows)}")
         axis.set(xlabel=label, ylabel="density")
@@ -105,16 +120,16 @@ def plot(sets: dict[str, list[dict]], output: Path) -> None:
     centres = np.sqrt(BANDS_HZ[1:] * BANDS_HZ[:-1])
     for name, rows in sets.items():
         low, middle, high = np.percentile([row["spectrum_db"] for row in rows], [5, 50, 95], axis=0)
-        (line,) = axes[2].semilogx(centres, middle, label=name)
-        axes[2].fill_between(centres, low, high, alpha=0.2, color=line.get_color())
-    axes[2].set(xlabel="Hz", ylabel="residual under the microphone, dB")
-    axes[2].legend()
+        (line,) = axes[-1].semilogx(centres, middle, label=name)
+        axes[-1].fill_between(centres, low, high, alpha=0.2, color=line.get_color())
+    axes[-1].set(xlabel="Hz", ylabel="residual under the microphone, dB")
+    axes[-1].legend()
     picture.save(figure, output)
 
 
 def markdown(sets: dict[str, list[dict]], name: str) -> str:
     cells = []
-    for label, key in PARTS.items():
+    for label, key in measured(sets).items():
         values = {kind: np.array([row[key] for row in rows]) for kind, rows in sets.items()}
         ranges = ["{:.1f} / {:.1f} / {:.1f}".format(*np.percentile(each, [5, 50, 95])) for each in values.values()]
         cells.append([label, *ranges, f"{100 * overlap(values['simulated'], values['real']):.0f} %"])
