@@ -1,6 +1,6 @@
 r"""Do simulated recordings look like real ones? What the linear stage leaves of the robot without a profile, side by side.
 
-    python -m bench.measure.simulated --items DATA --real DIR --output bench/results/simulated
+    python -m bench.measure.simulated --items DATA --real DIR [--pattern 'NAME*'] --output bench/results/simulated
 
 DATA: items of export/dataset.py, of which those without a profile are taken, the human (who is known) subtracted. DIR:
 pairs NAME_lpb.wav and NAME_mic.wav (or .flac) in which nobody but the loudspeaker is heard; each is filtered anew in pieces as long
@@ -77,9 +77,10 @@ def simulated(folder: Path) -> Iterator[dict[str, object]]:
                 yield found
 
 
-def real(folder: Path) -> Iterator[dict[str, object]]:
-    """Figures of pieces of PIECE_S of the recordings, each filtered from nothing."""
-    pairs = [(path, path.with_name(path.name.replace("_lpb.", "_mic."))) for path in sorted(folder.glob("*_lpb.*"))]
+def real(folder: Path, patterns: list[str]) -> Iterator[dict[str, object]]:
+    """Figures of pieces of PIECE_S of the recordings of such names, each filtered from nothing."""
+    found = sorted({path for pattern in patterns for path in folder.glob(f"{pattern}_lpb.*")})
+    pairs = [(path, path.with_name(path.name.replace("_lpb.", "_mic."))) for path in found]
     if not pairs:
         raise UsageError(f"{folder} holds no NAME_lpb.wav (or .flac) with its NAME_mic.wav")
     size = round(PIECE_S * SAMPLE_RATE)
@@ -89,8 +90,8 @@ def real(folder: Path) -> Iterator[dict[str, object]]:
             stream = Stream(Linear())
             piece = slice(at, at + size)
             left = np.concatenate((stream.process(mic[piece], reference[piece]), stream.flush()))
-            if found := examine(mic[piece], left, reference[piece]):
-                yield found
+            if figures := examine(mic[piece], left, reference[piece]):
+                yield figures
 
 
 def overlap(ours: np.ndarray, theirs: np.ndarray) -> float:
@@ -145,11 +146,12 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--items", type=Path, required=True, metavar="DATA")
     parser.add_argument("--real", type=Path, required=True, metavar="DIR")
+    parser.add_argument("--pattern", nargs="+", default=["*"], help="of names in DIR, without _lpb and what follows")
     parser.add_argument("--output", type=Path, required=True, metavar="PATH")
     options = parser.parse_args()
     try:
         made_with = results_writer.stamp({"recordings": [options.real]})
-        sets = {"simulated": list(simulated(options.items)), "real": list(real(options.real))}
+        sets = {"simulated": list(simulated(options.items)), "real": list(real(options.real, options.pattern))}
     except (EdgefilterError, OSError) as error:
         print(f"simulated: {error}", file=sys.stderr)
         return 1
