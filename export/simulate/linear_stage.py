@@ -10,6 +10,7 @@ import numpy as np
 from edgefilter.dsp.stft import Analyser, StftConfig, Synthesiser
 from edgefilter.engines.linear import Linear
 from edgefilter.filter.canceller import COLD, WARM, Adaptation, Canceller, CancellerOutput
+from edgefilter.filter.echo_path import EchoPath
 from edgefilter.filter.front_end import FrontEnd, low_cut
 from edgefilter.filter.onset_gate import GATE
 from edgefilter.profile.data import Profile
@@ -95,12 +96,12 @@ class WeakCanceller(Canceller):
         self._past = np.zeros(taps.size - 1 + self.hop, np.float32)
 
     def step(self, mic: Samples, reference: Samples, located: bool = True) -> CancellerOutput:
-        echo, error, uncertainty = super().step(mic, reference, located)
+        echo, error, uncertainty, innovation = super().step(mic, reference, located)
         if self._never:
-            return CancellerOutput(np.zeros_like(echo), mic.copy(), uncertainty)
+            return CancellerOutput(np.zeros_like(echo), mic.copy(), uncertainty, innovation)
         self._past = np.concatenate((self._past[self.hop :], echo))
         part = np.convolve(self._past, self._missing, "valid").astype(np.float32)
-        return CancellerOutput(echo - part, error + part, uncertainty)
+        return CancellerOutput(echo - part, error + part, uncertainty, innovation)
 
 
 def front_end(stage: Stage, profile: Profile | None, stft: StftConfig, rng: np.random.Generator) -> FrontEnd:
@@ -108,8 +109,8 @@ def front_end(stage: Stage, profile: Profile | None, stft: StftConfig, rng: np.r
     front = FrontEnd(Linear(stft), profile)
     assert front.linear_stage is not None
     if stage != Stage():
-        canceller = WeakCanceller(front.linear_stage.canceller, profile, stage, rng)
-        front.linear_stage = replace(front.linear_stage, canceller=canceller)
+        path = front.linear_stage.path
+        front.linear_stage.path = EchoPath(WeakCanceller(path.canceller, profile, stage, rng), path.effects)
     return front
 
 
