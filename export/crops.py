@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -13,132 +14,206 @@ from tqdm import tqdm
 from edgefilter.dsp.stft import StftConfig
 from edgefilter.errors import UsageError
 from edgefilter.types import SAMPLE_RATE
+from export.simulate.linear_stage import from_bytes
 
-SIGNALS = ("error", "mic", "reference", "echo", "clean")
+POWERS = ("noise", "residual")
+STORED = ("mic", "error", "reference", "clean")
 TARGET_RMS = 0.1
 """At which the human is scaled for the loss."""
-ROBOT_SILENT = 0.06
+SWAPPED = 0.3
+"""Share of crops that get another conversation's human, at the level of the one that was there."""
+GAIN_DB, LEVEL_DB, TOLD_DB = (4.0, 4.0), (12.0, 18.0), (8.0, 8.0)
+"""By which a crop's human, all that is heard and the reference are made softer and louder, at most; the human by little,
+since canceller and expected powers were made with the one that was there."""
+ROBOT_SILENT = 0.04
 """Share of crops in which the robot says nothing and the fan is faint: the human has to come out untouched."""
+LOUD_REST = 0.1
+"""Part of the error's power that the human is taken to have at least when crops are brought to one level: beside a crop
+that holds only the end of a word and a loud robot, no other would count in the loss."""
+NOTHING = 1e-9
+"""Power per bin of a residual echo that is not there."""
 
 
 class Items:
-    """The dataset in memory; refresh() takes in what has been written since, so training can start before simulation ends."""
+    """The dataset in memory; refresh() takes in what has been written since, so training can start before simulation ends.
 
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
-        self._items: dict[str, dict[str, np.ndarray]] = {}
+    newest: how many are kept, None for all: older ones make room. device: whose memory; a GPU crops faster from its own.
+    """
+
+    def __init__(self, folder: Path, newest: int | None = None, device: torch.device = torch.device("cpu")) -> None:
+        self.folder, self.newest, self.device = folder, newest, device
+        self._items: dict[str, dict[str, Tensor]] = {}
+        self._levels = torch.from_numpy(from_bytes(np.arange(256))).to(device)
         self.refresh()
         if not self._items:
             raise UsageError(f"{folder} holds no simulated items: make them with python -m export.dataset")
 
     def refresh(self) -> int:
         """Load new items and return how many there are."""
-        new = [path for path in sorted(self.folder.glob("*.npz")) if path.name not in self._items]
+        paths = sorted(self.folder.glob("*.npz"))[-self.newest if self.newest else 0 :]
+        new = [path for path in paths if path.name not in self._items]
         for path in tqdm(new, desc=f"read {self.folder}", unit="item", leave=False):
             with np.load(path) as file:
-                self._items[path.name] = {
-                    name: file[name] for name in ("mic", "error", "reference", "clean", "scale", "reference_scale")
-                }
+                if POWERS[0] not in file:
+                    remedy = "simulate it again with python -m export.dataset"
+                    raise UsageError(f"{path} holds no expected powers: {remedy}")
+                names = (*STORED, *POWERS, "scale", "reference_scale")
+                self._items[path.name] = {name: torch.from_numpy(file[name]).to(self.device) for name in names}
+        self._items = {path.name: self._items[path.name] for path in paths}
         self.names = sorted(self._items)
         return len(self.names)
 
-    def crop(self, name: str, start: int, samples: int) -> dict[str, np.ndarray]:
-        """(samples,) float32 of each signal but the echo, at their true scale."""
-        item = self._items[name]
+    def crops(
+        self, places: list[tuple[str, int]], samples: int, signals: tuple[str, ...] = STORED
+    ) -> dict[str, Tensor]:
+        """(places, samples) float32 of each of these stored signals, at their true scale; places: item and first sample."""
+        found = {}
+        for signal in signals:
+            scale = "reference_scale" if signal == "reference" else "scale"
+            cut = torch.stack([self._items[name][signal][at : at + samples] for name, at in places])
+            found[signal] = cut * torch.stack([self._items[name][scale] for name, _ in places])[:, None] / 32767
+        return found
+
+    def powers(self, places: list[tuple[str, int]], samples: int, stft: StftConfig) -> dict[str, Tensor]:
+        """(places, frames, bins) float32 of both expected powers, for the frames that lie wholly in the crops.
+
+        places: as for crops(), whole hops from the item's start. Empty where an item was simulated for another
+        transform.
+        """
+        if any(self._items[name]["noise"].shape != (self.length(name) // stft.hop, stft.bins) for name, _ in places):
+            return {}
+        frames = samples // stft.hop - 1
+        firsts = [(name, at // stft.hop + 1) for name, at in places]
         return {
-            signal: (
-                (item["reference_scale" if signal == "reference" else "scale"] / 32767)
-                * item[signal][start : start + samples].astype(np.float32)
-            )
-            for signal in ("mic", "error", "reference", "clean")
+            power: self._levels[torch.stack([self._items[n][power][t : t + frames] for n, t in firsts]).long()]
+            for power in POWERS
         }
 
     def length(self, name: str) -> int:
         """Samples of that item."""
-        return self._items[name]["mic"].size
+        return self._items[name]["mic"].shape[0]
+
+
+@dataclass(frozen=True)
+class Shape:
+    """Batches of `batch` crops of `seconds`; every long_every-th (0: none) of a quarter as many, four times as long."""
+
+    batch: int = 16
+    seconds: float = 2.0
+    long_every: int = 4
+
+    def of(self, step: int) -> tuple[int, float]:
+        """Crops and seconds of that step's batch."""
+        if self.long_every and step % self.long_every == self.long_every - 1:
+            return max(1, self.batch // 4), 4 * self.seconds
+        return self.batch, self.seconds
 
 
 class Batches:
-    """Batches of crops with their augmentation, made on a thread ahead of training."""
+    """Batches of crops with their augmentation, made on a thread ahead of training.
 
-    def __init__(
-        self, items: Items, stft: StftConfig, batch: int, seconds: float, seed: int, augment: bool = True
-    ) -> None:
-        self.items, self.stft, self.batch, self.augment = items, stft, batch, augment
-        self.samples = int(seconds * SAMPLE_RATE) // stft.hop * stft.hop
-        self.rng = np.random.default_rng(seed)
-        self._window = torch.from_numpy(stft.analysis_window.copy())
-        self._next: dict[str, Tensor] | None = None
+    The batch of a step depends on seed, step and rank, and on the items that are there.
+    """
+
+    def __init__(self, items: Items, stft: StftConfig, shape: Shape, seed: int, rank: int = 0) -> None:
+        self.items, self.stft, self.shape, self.seed, self.rank = items, stft, shape, seed, rank
+        self._window = torch.from_numpy(stft.analysis_window.copy()).to(items.device)
+        self._ready: tuple[int, dict[str, Tensor]] | None = None
         self._thread: threading.Thread | None = None
 
-    def draw(self) -> dict[str, Tensor]:
-        """Spectra (batch, frames, bins, 2) by signal, "active" (batch, frames), "scale" (batch,) to TARGET_RMS."""
-        if self._thread is None:
-            self._start()
-        self._thread.join()
-        ready = self._next
-        self._start()
-        return ready
-
-    def _start(self) -> None:
-        self._thread = threading.Thread(target=self._prepare, daemon=True)
+    def draw(self, step: int) -> dict[str, Tensor]:
+        """Spectra (batch, frames, bins, 2) by signal, powers (batch, frames, bins), "active" (batch, frames), "scale" (batch,) to TARGET_RMS."""
+        if self._thread is not None:
+            self._thread.join()
+        if self._ready is None or self._ready[0] != step:
+            self._prepare(step)
+        assert self._ready is not None
+        batch = self._ready[1]
+        self._thread = threading.Thread(target=self._prepare, args=(step + 1,), daemon=True)
         self._thread.start()
-
-    def _prepare(self) -> None:
-        self._next = self.spectra([self._crop(str(name)) for name in self.rng.choice(self.items.names, self.batch)])
-
-    def _crop(self, name: str) -> dict[str, np.ndarray]:
-        rng = self.rng
-        crop = self.items.crop(name, int(rng.integers(self.items.length(name) - self.samples + 1)), self.samples)
-        if not self.augment:
-            return crop
-        if rng.random() < 0.4:
-            self._swap_human(crop)
-        if rng.random() < ROBOT_SILENT:
-            self._silence_robot(crop)
-        gain = 10 ** (rng.uniform(-6, 6) / 20) - 1
-        for signal in ("mic", "error"):
-            crop[signal] = crop[signal] + gain * crop["clean"]
-        crop["clean"] = (1 + gain) * crop["clean"]
-        level, told = 10 ** (rng.uniform(-12, 18) / 20), 10 ** (rng.uniform(-8, 8) / 20)
-        return {signal: (told if signal == "reference" else level) * samples for signal, samples in crop.items()}
-
-    def _swap_human(self, crop: dict[str, np.ndarray]) -> None:
-        """Put another human, from another conversation, in the place of the one that is there; now and then nobody."""
-        other = str(self.rng.choice(self.items.names))
-        clean = self.items.crop(
-            other, int(self.rng.integers(self.items.length(other) - self.samples + 1)), self.samples
-        )["clean"]
-        here, there = (float(np.sqrt(np.mean(x**2))) for x in (crop["clean"], clean))
-        if here == 0.0 or there == 0.0:
-            return
-        clean = (here / there) * clean
-        for signal in ("mic", "error"):
-            crop[signal] = crop[signal] - crop["clean"] + clean
-        crop["clean"] = clean
-
-    def _silence_robot(self, crop: dict[str, np.ndarray]) -> None:
-        """Only the human, and white noise 30 to 60 dB below the loudest sample."""
-        peak = float(np.abs(crop["clean"]).max()) or 0.01
-        noise = 10 ** (-self.rng.uniform(30, 60) / 20) * peak * self.rng.standard_normal(self.samples, np.float32)
-        crop["mic"] = crop["error"] = crop["clean"] + noise
-        crop["reference"] = np.zeros(self.samples, np.float32)
-
-    def spectra(self, crops: list[dict[str, np.ndarray]]) -> dict[str, Tensor]:
-        """Crops of equal length to a batch."""
-        for crop in crops:
-            crop["echo"] = crop["mic"] - crop["error"]
-        batch = {}
-        for signal in SIGNALS:
-            samples = torch.from_numpy(np.stack([crop[signal] for crop in crops]).astype(np.float32))
-            frames = samples.unfold(1, self.stft.window_length, self.stft.hop) * self._window
-            batch[signal] = torch.view_as_real(torch.fft.rfft(frames, self.stft.n_fft))
-        clean, error = batch["clean"], batch["error"]
-        power = clean.square().sum((2, 3))
-        loudest = power.amax(1, keepdim=True)
-        batch["active"] = ((power > 10**-3.5 * loudest) & (power > 1e-9)).float()
-        count = batch["active"].sum(1).clamp(min=1)
-        speech = (power * batch["active"]).sum(1) / count
-        level = torch.where(loudest.squeeze(1) > 1e-9, speech, error.square().sum((2, 3)).mean(1))
-        batch["scale"] = TARGET_RMS * (self.stft.n_fft * self.stft.noise_gain() / 2) ** 0.5 / (level + 1e-12).sqrt()
         return batch
+
+    def ends(self, names: list[str], seconds: float) -> dict[str, Tensor]:
+        """The last seconds of these items, as they are."""
+        samples = self._whole_hops(seconds)
+        places = [(name, self.items.length(name) // self.stft.hop * self.stft.hop - samples) for name in names]
+        return self.spectra(self._cut(places, samples))
+
+    def _prepare(self, step: int) -> None:
+        rng = np.random.default_rng([self.seed, step, self.rank])
+        batch, seconds = self.shape.of(step)
+        samples = self._whole_hops(seconds)
+        crops = self._cut(self._places(rng, batch, samples), samples)
+        others = self._places(rng, batch, samples)
+        swapped, silent = rng.random((2, batch)) < np.array([[SWAPPED], [ROBOT_SILENT]])
+        self._swap_humans(crops, others, swapped)
+        self._silence_robots(crops, rng, silent)
+        gain, level, told = (
+            self._each(10 ** (rng.uniform(-low, high, batch) / 20)) for low, high in (GAIN_DB, LEVEL_DB, TOLD_DB)
+        )
+        for signal in ("mic", "error", "clean"):
+            crops[signal] = level * (crops[signal] + (gain - 1) * crops["clean"])
+        crops["reference"] = told * crops["reference"]
+        for power in POWERS:
+            if power in crops:
+                crops[power] = level.square()[..., None] * crops[power]
+        self._ready = step, self.spectra(crops)
+
+    def _each(self, values: np.ndarray) -> Tensor:
+        """One number a crop, (batch, 1)."""
+        return torch.from_numpy(values.astype(np.float32)).to(self.items.device)[:, None]
+
+    def _whole_hops(self, seconds: float) -> int:
+        return int(seconds * SAMPLE_RATE) // self.stft.hop * self.stft.hop
+
+    def _places(self, rng: np.random.Generator, count: int, samples: int) -> list[tuple[str, int]]:
+        """Items and places in them at random, whole hops from the item's start."""
+        hop, names = self.stft.hop, [str(name) for name in rng.choice(self.items.names, count)]
+        return [(name, int(rng.integers((self.items.length(name) - samples) // hop + 1)) * hop) for name in names]
+
+    def _cut(self, places: list[tuple[str, int]], samples: int) -> dict[str, Tensor]:
+        return self.items.crops(places, samples) | self.items.powers(places, samples, self.stft)
+
+    def _swap_humans(self, crops: dict[str, Tensor], others: list[tuple[str, int]], swapped: np.ndarray) -> None:
+        """Put another human, from another conversation, in the place of one that is there, where there is somebody in both."""
+        chosen = [int(row) for row in np.flatnonzero(swapped)]
+        if not chosen:
+            return
+        clean = crops["clean"][chosen]
+        other = self.items.crops([others[row] for row in chosen], clean.shape[1], ("clean",))["clean"]
+        here, there = (x.square().mean(1, keepdim=True).sqrt() for x in (clean, other))
+        other = torch.where((here > 0) & (there > 0), here / there.clamp(min=1e-9) * other, clean)
+        for signal in ("mic", "error", "clean"):
+            crops[signal][chosen] += other - clean
+
+    def _silence_robots(self, crops: dict[str, Tensor], rng: np.random.Generator, silent: np.ndarray) -> None:
+        """Only the human, and white noise 30 to 60 dB below the loudest sample."""
+        for row in np.flatnonzero(silent):
+            clean = crops["clean"][row]
+            rms = 10 ** (-rng.uniform(30, 60) / 20) * (float(clean.abs().max()) or 0.01)
+            noise = torch.from_numpy(rng.standard_normal(clean.shape[0], np.float32)).to(clean.device)
+            crops["mic"][row] = crops["error"][row] = clean + rms * noise
+            crops["reference"][row] = 0.0
+            for power, level in (("noise", rms**2 * self.stft.noise_gain()), ("residual", NOTHING)):
+                if power in crops:
+                    crops[power][row] = level
+
+    def spectra(self, crops: dict[str, Tensor]) -> dict[str, Tensor]:
+        """Signals (batch, samples) and powers to a batch."""
+        batch = {power: crops[power] for power in POWERS if power in crops}
+        for signal, samples in (crops | {"echo": crops["mic"] - crops["error"]}).items():
+            if signal not in POWERS:
+                frames = samples.unfold(1, self.stft.window_length, self.stft.hop) * self._window
+                batch[signal] = torch.view_as_real(torch.fft.rfft(frames, self.stft.n_fft))
+        batch["active"], level = _activity(batch["clean"])
+        unit = (self.stft.n_fft * self.stft.noise_gain() / 2) ** 0.5
+        left = batch["error"].square().sum((2, 3)).mean(1)
+        batch["scale"] = TARGET_RMS * unit / (torch.maximum(level, LOUD_REST * left) + 1e-12).sqrt()
+        return batch
+
+
+def _activity(clean: Tensor) -> tuple[Tensor, Tensor]:
+    """Frames in which the human speaks, 0 or 1 (batch, frames), and the human's mean power in them (batch,)."""
+    power = clean.square().sum((2, 3))
+    active = ((power > 10**-3.5 * power.amax(1, keepdim=True)) & (power > 1e-9)).float()
+    return active, (power * active).sum(1) / active.sum(1).clamp(min=1)

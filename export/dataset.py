@@ -1,16 +1,20 @@
-"""Simulated conversations with the linear stage run over them, as arrays that training can crop.
+"""Simulated conversations with the running filter's front run over them, as arrays that training can crop.
 
-    python -m export.dataset --humans DIR --robots DIR --output DIR --count 2000 --seed 1 [--recipe edge|paper] [--profile P.npz]
+    python -m export.dataset --humans DIR --robots DIR --output DIR [--recipe wide --noise DIR --responses DIR]
+        [--count 2000] [--seed 1] [--minutes M] [--profile P.npz]
 
-Writes DIR/NNNNN.npz per item (mic, reference, error, clean: (n,) int16 with one scale, about: JSON) and
-DIR/dataset.json. reference is the aligned one; echo = mic - error. A second run goes on where the first stopped.
+Writes DIR/NNNNN.npz per item: mic, reference, error, clean as an engine gets them ((n,) int16 with their scale; echo =
+mic - error), noise, residual (the front's expected power spectra, simulate/linear_stage.py) and about (JSON), and
+DIR/dataset.json. A second run goes on where the first stopped.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import math
 import os
+import time
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, replace
@@ -20,54 +24,45 @@ import numpy as np
 from tqdm import tqdm
 
 from edgefilter.dsp.stft import StftConfig
-from edgefilter.engines.linear import Linear
-from edgefilter.filter.front_end import FrontEnd
 from edgefilter.profile.data import Profile
-from edgefilter.types import Samples
-from export.corpus import Corpus, read_corpus
+from export.corpus import read_corpus
 from export.rooms import Room, draw_room
-from export.simulate import RECIPES, Conversation, Recipe, simulate
+from export.simulate.conversation import Conversation, simulate
+from export.simulate.linear_stage import front_end, listen
+from export.simulate.material import Material, read_noises, read_responses
+from export.simulate.recipe import RECIPES, Recipe
 
-ROOMS = {"lab": 80, "office": 120}
-
-
-def linear_stage(conversation: Conversation, stft: StftConfig) -> tuple[Samples, Samples]:
-    """The aligned reference and the linear stage's error, (n,) each, n a multiple of the hop: the runtime's own front."""
-    front = FrontEnd(Linear(stft), conversation.profile)
-    hop, references, errors = stft.hop, [], []
-    for at in range(0, conversation.mic.size - hop + 1, hop):
-        reference, error = front.signals(conversation.mic[at : at + hop], conversation.reference[at : at + hop])
-        references.append(reference)
-        errors.append(error)
-    return np.concatenate(references), np.concatenate(errors)
+ROOMS = {"lab": 1 / 3, "office": 1 / 2, "hall": 1 / 6}
+"""Shares of the kinds of room."""
 
 
-def pack(conversation: Conversation, stft: StftConfig) -> dict[str, np.ndarray]:
-    """The item's arrays: int16 at a scale at which the loudest sample is full."""
-    reference, error = linear_stage(conversation, stft)
-    signals = {"mic": conversation.mic, "error": error, "clean": conversation.clean, "reference": reference}
-    signals = {name: samples[: error.size] for name, samples in signals.items()}
+def pack(conversation: Conversation, stft: StftConfig, rng: np.random.Generator) -> dict[str, np.ndarray]:
+    """The item's arrays: int16 at a scale at which the loudest sample is full. rng: for the linear stage's errors."""
+    front = front_end(conversation.stage, conversation.profile, stft, rng)
+    heard = listen(front, conversation.mic, conversation.reference, conversation.clean, stft)
+    signals = {"mic": heard.mic, "error": heard.error, "clean": heard.clean, "reference": heard.reference}
     peak = max(float(np.abs(signals[name]).max()) for name in ("mic", "error", "clean"))
-    scales = {
-        name: max(float(np.abs(reference).max()), 1e-6) if name == "reference" else max(peak, 1e-6) for name in signals
-    }
+    told = max(float(np.abs(heard.reference).max()), 1e-6)
+    scales = {name: told if name == "reference" else max(peak, 1e-6) for name in signals}
     packed = {name: np.round(32767 * samples / scales[name]).astype(np.int16) for name, samples in signals.items()}
-    return packed | {"scale": np.float32(scales["mic"]), "reference_scale": np.float32(scales["reference"])}
+    powers = {"noise": heard.noise, "residual": heard.residual}
+    return packed | powers | {"scale": np.float32(scales["mic"]), "reference_scale": np.float32(told)}
 
 
-_shared: dict[str, object] = {}
+_shared: list[Material] = []
 
 
-def _start(humans: Corpus, robots: Corpus, rooms: list[Room]) -> None:
-    _shared.update(humans=humans, robots=robots, rooms=rooms)
+def _start(material: Material) -> None:
+    _shared[:] = [material]
 
 
 def _make(job: tuple[Recipe, int, int, Path, StftConfig]) -> dict[str, object]:
     recipe, seed, index, path, stft = job
-    conversation = simulate(recipe, seed, index, **_shared)
+    conversation = simulate(recipe, seed, index, *_shared)
     part = path.with_suffix(".part")
+    arrays = pack(conversation, stft, np.random.default_rng([seed, index, 1]))
     with part.open("wb") as file:
-        np.savez(file, about=json.dumps(conversation.about), **pack(conversation, stft))
+        np.savez(file, about=json.dumps(conversation.about), **arrays)
     part.replace(path)
     return conversation.about
 
@@ -88,9 +83,7 @@ def make_dataset(
     recipe: Recipe,
     seed: int,
     count: int,
-    humans: Corpus,
-    robots: Corpus,
-    rooms: list[Room],
+    material: Material,
     output: Path,
     stft: StftConfig,
     jobs: int,
@@ -101,20 +94,33 @@ def make_dataset(
         "recipe": asdict(recipe),
         "seed": seed,
         "stft": asdict(stft),
-        "speakers": len(humans.speakers),
-        "voices": len(robots.speakers),
+        "speakers": len(material.humans.speakers),
+        "voices": len(material.robots.speakers),
     }
     (output / "dataset.json").write_text(json.dumps(about, indent=1, default=str) + "\n", encoding="utf-8")
     paths = [(index, output / f"{index:05d}.npz") for index in range(count)]
     missing = [(recipe, seed, index, path, stft) for index, path in paths if not path.exists()]
-    with ProcessPoolExecutor(jobs, initializer=_start, initargs=(humans, robots, rooms)) as pool:
+    pool = ProcessPoolExecutor(jobs, initializer=_start, initargs=(material,))
+    try:
         yield from pool.map(_make, missing)
+    finally:
+        pool.shutdown(cancel_futures=True)
 
 
-def main() -> None:
+def arguments() -> argparse.Namespace:
+    """What the command line says."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--humans", type=Path, nargs="+", required=True, metavar="DIR")
     parser.add_argument("--robots", type=Path, nargs="+", required=True, metavar="DIR")
+    parser.add_argument("--noise", type=Path, nargs="*", default=[], metavar="DIR", help="recorded noises")
+    parser.add_argument(
+        "--responses",
+        type=Path,
+        nargs="*",
+        default=[],
+        metavar="DIR",
+        help="measured impulse responses in folders room, loudspeaker, microphone",
+    )
     parser.add_argument("--output", type=Path, required=True, metavar="DIR")
     parser.add_argument("--count", type=int, default=2000)
     parser.add_argument("--seed", type=int, default=1)
@@ -123,18 +129,34 @@ def main() -> None:
         "--hop", type=int, default=256, help="of the linear stage; the window is twice as long (default: %(default)s)"
     )
     parser.add_argument("--profile", type=Path, help="add the lasting effects of this profile to half of the items")
+    parser.add_argument("--rooms", type=int, default=240, help="simulated, half of them offices, a third laboratories")
+    parser.add_argument("--minutes", type=float, default=math.inf, help="stop then, with what is there")
     parser.add_argument("--jobs", type=int, default=os.cpu_count())
-    options = parser.parse_args()
+    return parser.parse_args()
+
+
+def main() -> None:
+    options = arguments()
+    began = time.monotonic()
     recipe = RECIPES[options.recipe]
     if options.profile:
         recipe = replace(recipe, effects=Profile.load(options.profile).echo.lasting().effects)
     stft = StftConfig(2 * options.hop, options.hop, 2 * options.hop)
-    humans, robots = read_corpus(*options.humans), read_corpus(*options.robots)
-    rooms = make_rooms(options.seed, ROOMS, options.jobs)
-    work = make_dataset(recipe, options.seed, options.count, humans, robots, rooms, options.output, stft, options.jobs)
+    material = Material(
+        read_corpus(*options.humans),
+        read_corpus(*options.robots),
+        make_rooms(
+            options.seed, {kind: math.ceil(share * options.rooms) for kind, share in ROOMS.items()}, options.jobs
+        ),
+        read_noises(*options.noise),
+        read_responses(*options.responses),
+    )
+    work = make_dataset(recipe, options.seed, options.count, material, options.output, stft, options.jobs)
     have = len(list(options.output.glob("*.npz")))
     for _ in tqdm(work, total=options.count - have, unit="item", desc=str(options.output)):
-        pass
+        if time.monotonic() - began > 60 * options.minutes:
+            work.close()
+            break
 
 
 if __name__ == "__main__":

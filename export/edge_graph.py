@@ -10,7 +10,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from export.network import EdgeCrnn, compressed, masked
+from export import wiener
+from export.network import EdgeCrnn, compressed, corrected
 
 
 class EdgeGraph(nn.Module):
@@ -31,24 +32,30 @@ class EdgeGraph(nn.Module):
         mic: Tensor,
         reference: Tensor,
         echo: Tensor,
+        noise: Tensor,
+        residual: Tensor,
         mic_last: Tensor,
         ref_last: Tensor,
+        answered: Tensor,
         hidden: Tensor,
     ) -> tuple[Tensor, ...]:
-        """Spectra (1, bins, 2) and EdgeCrnn's state to the human's spectrum (1, bins, 2), the probability (1,) and the next state."""
+        """Spectra (1, bins, 2), powers (1, bins) and EdgeCrnn's state to what EdgeCrnn.step gives."""
         network = self.network
-        spectra = torch.cat((error, mic, reference, echo))[:, 1:].permute(0, 2, 1)
-        features = compressed(spectra)
-        mic_now, ref_now = features.reshape(2, 6, -1).split(1)
-        met, skips = network.encode(_beside(mic_now, mic_last), _beside(ref_now, ref_last))
+        spectra = torch.cat((error, mic, reference, echo))
+        mic_now, ref_now = compressed(spectra[:, 1:].permute(0, 2, 1), -2).reshape(2, 6, -1).split(1)
+        observed = (error * error).sum(-1)
+        ratio, answered = wiener.step(observed, noise + residual + wiener.SILENCE, answered)
+        expected = wiener.features(observed, noise, residual, ratio, 1)[:, :, 1:]
+        met, skips = network.encode(_beside(mic_now, mic_last, expected), _beside(ref_now, ref_last))
         heard = torch.relu(network.inward(met.reshape(1, 1, -1)))
         following = []
         for layer, state in zip(self.memory, hidden.split(1)):
             heard = layer(heard, state)
             following.append(heard)
-        human = masked(network.decode(heard, met, skips).squeeze(2), spectra[:1])
-        human = nn.functional.pad(human, (1, 0)).permute(0, 2, 1)
-        return human, torch.sigmoid(network.speech(heard)).reshape(1), mic_now, ref_now, torch.cat(following)
+        raw = nn.functional.pad(network.decode(heard, met, skips).squeeze(2), (1, 0)).permute(0, 2, 1)
+        human = corrected(wiener.gain(ratio), raw, error)
+        speech = torch.sigmoid(network.speech(heard)).reshape(1)
+        return human, speech, mic_now, ref_now, answered, torch.cat(following)
 
 
 class OperatorLayer(nn.Module):
@@ -86,6 +93,6 @@ class ProductLayer(nn.Module):
         return new + update * (state - new)
 
 
-def _beside(now: Tensor, last: Tensor) -> Tensor:
-    """Features (1, 6, bands) of this frame and the one before, (1, 12, 1, bands)."""
-    return torch.cat((now, last), 1).unsqueeze(2)
+def _beside(*features: Tensor) -> Tensor:
+    """Features (1, n, bands) of this frame and the one before to one (1, sum of n, 1, bands)."""
+    return torch.cat(features, 1).unsqueeze(2)

@@ -13,13 +13,17 @@ EPSILON = 1e-8
 
 @dataclass(frozen=True)
 class LossWeights:
-    """Weights of the terms of edge_loss."""
+    """Weights of the terms of edge_loss.
+
+    suppression: an amplitude too small costs 1 + suppression / magnitude times as much as one that is too large, since
+    words that were deleted do not come back, while a recogniser gets over some of the robot.
+    """
 
     complex: float = 0.3
     magnitude: float = 0.7
-    suppression: float = 1.0
-    si_sdr: float = 0.01
-    speech: float = 0.05
+    suppression: float = 6.0
+    si_sdr: float = 0.004
+    speech: float = 0.1
     compression: float = 0.3
 
 

@@ -1,8 +1,9 @@
-"""The edge CRNN: a causal network that masks the linear stage's error, one frame at a time.
+"""The edge CRNN: a causal network that corrects the Wiener mask of 'ss' on the linear stage's error, one frame at a time.
 
-Two encoders, one for what the microphone holds (error, microphone) and one for what the robot said (reference, echo
-estimate), meet in the middle, as the two branches of Li, Hindriks & Kunneman (2024), section 3.2, do; a GRU remembers,
-a decoder with skips gives a complex mask.
+Two encoders, one for what the microphone holds (error, microphone, and the error over what is expected of fan and
+residual echo) and one for what the robot said (reference, echo estimate), meet in the middle, as the two branches of Li,
+Hindriks & Kunneman (2024), section 3.2, do; a GRU remembers, a decoder with skips gives the correction. Before any
+training the answer is that of 'ss'.
 """
 
 from __future__ import annotations
@@ -11,14 +12,19 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
-from torch.nn.functional import leaky_relu
+from torch.nn.functional import layer_norm, leaky_relu
 
 from edgefilter.dsp.stft import StftConfig
+from export import wiener
 
 COMPRESSION = 0.3
 """Exponent of the magnitude features; the robot is 25 dB above the human, so levels have to be brought together."""
 FLOOR = 1e-6
 """Least magnitude of a bin, so that the compression has a finite slope."""
+LOGITS = 2.0
+"""Logits of the mask's gain by which one unit of the decoder's first output corrects the prior."""
+MOST_LOGITS = 8.0
+"""Bound on that, 35 dB: beyond, a mask is as good as open or shut."""
 
 
 @dataclass(frozen=True)
@@ -49,10 +55,26 @@ class EdgeConfig:
         return self.n_fft // 2
 
 
+class FrameNorm(nn.Module):
+    """Layer norm of (frames, channels, 1, frequencies) over all but the first, in whichever memory order they come."""
+
+    def __init__(self, channels: int, frequencies: int) -> None:
+        super().__init__()
+        self.weight = nn.Parameter(torch.ones(channels, 1, frequencies))
+        self.bias = nn.Parameter(torch.zeros(channels, 1, frequencies))
+
+    def forward(self, x: Tensor) -> Tensor:
+        if x.is_contiguous():
+            return layer_norm(x, self.weight.shape, self.weight, self.bias)
+        weight, bias = (p.permute(1, 2, 0).contiguous() for p in (self.weight, self.bias))
+        return layer_norm(x.permute(0, 2, 3, 1), weight.shape, weight, bias).permute(0, 3, 1, 2)
+
+
 class Stage(nn.Module):
     """Convolution along frequency, normalisation over the frame, leaky ReLU.
 
-    Tensors are (frames, channels, 1, frequencies).
+    Tensors are (frames, channels, 1, frequencies): channels innermost in training, where that is a quarter faster,
+    frequencies innermost in the exported graph.
     """
 
     def __init__(
@@ -60,9 +82,8 @@ class Stage(nn.Module):
     ) -> None:
         super().__init__()
         self.convolution = nn.Conv2d(inputs, outputs, (1, kernel), (1, stride), (0, kernel // 2), bias=norm != "batch")
-        shape = [outputs, 1, frequencies // stride]
         self.norm = {
-            "layer": lambda: nn.LayerNorm(shape),
+            "layer": lambda: FrameNorm(outputs, frequencies // stride),
             "batch": lambda: nn.BatchNorm2d(outputs),
             "none": nn.Identity,
         }[norm]()
@@ -81,17 +102,17 @@ class Upward(nn.Module):
     def forward(self, x: Tensor) -> Tensor:
         y = self.stage(x)
         n, channels, _, frequencies = y.shape
-        return (
-            y.reshape(n, 2, channels // 2, frequencies)
-            .permute(0, 2, 3, 1)
-            .reshape(n, channels // 2, 1, 2 * frequencies)
-        )
+        if y.is_contiguous():
+            pairs = y.reshape(n, 2, channels // 2, frequencies).permute(0, 2, 3, 1)
+            return pairs.reshape(n, channels // 2, 1, 2 * frequencies)
+        return y.permute(0, 2, 3, 1).reshape(n, 1, 2 * frequencies, channels // 2).permute(0, 3, 1, 2)
 
 
 class EdgeCrnn(nn.Module):
-    """(error, mic, reference, echo) spectra to the human's spectrum and the probability that somebody speaks.
+    """Spectra of error, mic, reference, echo, powers of noise and residual to the human's spectrum and the probability of speech.
 
-    State: the previous frame's features of either branch (batch, 6, bands) and the GRU's (layers, batch, hidden).
+    State: the previous frame's features of either branch (batch, 6, bands), the power of the prior's previous answer
+    (batch, bins) and the GRU's (layers, batch, hidden).
     """
 
     def __init__(self, config: EdgeConfig = EdgeConfig()) -> None:
@@ -99,7 +120,7 @@ class EdgeCrnn(nn.Module):
         self.config = config
         c1, c2, c3, c4 = config.channels
         f, norm = config.bands, config.norm
-        self.mic_1, self.mic_2 = Stage(12, c1, f, norm, 2), Stage(c1, c2, f // 2, norm, 2)
+        self.mic_1, self.mic_2 = Stage(15, c1, f, norm, 2), Stage(c1, c2, f // 2, norm, 2)
         self.ref_1, self.ref_2 = Stage(12, c1, f, norm, 2), Stage(c1, c2, f // 2, norm, 2)
         self.joint_1, self.joint_2 = Stage(2 * c2, c3, f // 4, norm, 2), Stage(c3, c4, f // 8, norm, 2)
         self.inward = nn.Linear(c4 * f // 16, config.hidden)
@@ -109,91 +130,118 @@ class EdgeCrnn(nn.Module):
         self.up_2, self.up_1 = Upward(3 * c2, c1, f // 4, norm), Upward(3 * c1, c1, f // 2, norm)
         self.mask = nn.Conv2d(c1, 2, (1, 3), padding=(0, 1))
         self.speech = nn.Linear(config.hidden, 1)
-        with torch.no_grad():
-            self.mask.bias.copy_(torch.tensor([0.5, 0.0]))
+        nn.init.zeros_(self.mask.weight)
+        nn.init.zeros_(self.mask.bias)
 
-    def initial_state(self, batch: int = 1) -> tuple[Tensor, Tensor, Tensor]:
+    def initial_state(self, batch: int = 1) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """All zeros: before the first frame there was silence."""
         zeros = self.inward.weight.new_zeros
         return (
             zeros(batch, 6, self.config.bands),
             zeros(batch, 6, self.config.bands),
+            zeros(batch, self.config.bands + 1),
             zeros(self.config.layers, batch, self.config.hidden),
         )
 
     def forward(
-        self, error: Tensor, mic: Tensor, reference: Tensor, echo: Tensor, state: tuple[Tensor, ...]
+        self,
+        error: Tensor,
+        mic: Tensor,
+        reference: Tensor,
+        echo: Tensor,
+        noise: Tensor,
+        residual: Tensor,
+        state: tuple[Tensor, ...],
     ) -> tuple[Tensor, Tensor, tuple[Tensor, ...]]:
-        """Spectra (batch, frames, bins, 2) to the human's (batch, frames, bins, 2), logits (batch, frames), and the next state."""
+        """Spectra (batch, frames, bins, 2) and powers (batch, frames, bins) to the human's spectra, logits (batch, frames), and the next state."""
         batch, frames = error.shape[:2]
-        mic_x, mic_last = self._with_previous(torch.cat((features(error), features(mic)), 2), state[0])
-        ref_x, ref_last = self._with_previous(torch.cat((features(reference), features(echo)), 2), state[1])
-        met, skips = self.encode(mic_x, ref_x)
-        remembered, hidden = self.memory(torch.relu(self.inward(met.reshape(batch, frames, -1))), state[2])
-        raw = self.decode(remembered, met, skips).reshape(batch, frames, 2, self.config.bands)
-        return apply_mask(raw.float(), error), self.speech(remembered).squeeze(-1), (mic_last, ref_last, hidden)
+        mic_x, mic_last = _with_previous(torch.cat((features(error), features(mic)), -1), state[0])
+        ref_x, ref_last = _with_previous(torch.cat((features(reference), features(echo)), -1), state[1])
+        with torch.no_grad():
+            observed = error.square().sum(-1)
+            ratio, answered = wiener.ratios(observed, noise + residual, state[2])
+            expected = wiener.features(observed, noise, residual, ratio)[..., 1:, :]
+        mic_x = torch.cat((mic_x, expected), -1)
+        met, skips = self.encode(_channels_last(mic_x), _channels_last(ref_x))
+        remembered, hidden = self.memory(torch.relu(self.inward(met.reshape(batch, frames, -1))), state[3])
+        raw = self.decode(remembered, met, skips).permute(0, 2, 3, 1).reshape(batch, frames, self.config.bands, 2)
+        human = corrected(wiener.gain(ratio), nn.functional.pad(raw.float(), (0, 0, 1, 0)), error)
+        return human, self.speech(remembered).squeeze(-1), (mic_last, ref_last, answered, hidden)
 
     def encode(self, mic: Tensor, reference: Tensor) -> tuple[Tensor, tuple[Tensor, ...]]:
-        """Features of either branch beside those of the frame before, (n, 12, 1, bands), to where both meet, and the skips to the decoder."""
+        """Features of either branch, (n, 15 and 12, 1, bands), to where both meet, and the skips to the decoder."""
         m1, r1 = self.mic_1(mic), self.ref_1(reference)
         m2, r2 = self.mic_2(m1), self.ref_2(r1)
         j1 = self.joint_1(torch.cat((m2, r2), 1))
         return self.joint_2(j1), (m1, r1, m2, r2, j1)
 
     def decode(self, remembered: Tensor, met: Tensor, skips: tuple[Tensor, ...]) -> Tensor:
-        """The GRU's output with what `encode` gave to the raw mask (n, 2, 1, bands)."""
+        """The GRU's output with what `encode` gave to the raw correction (n, 2, 1, bands)."""
         m1, r1, m2, r2, j1 = skips
         y = torch.relu(self.outward(remembered)).reshape(met.shape)
+        if not met.is_contiguous():
+            y = y.contiguous(memory_format=torch.channels_last)
         y = self.up_3(torch.cat((self.up_4(torch.cat((y, met), 1)), j1), 1))
         y = self.up_1(torch.cat((self.up_2(torch.cat((y, m2, r2), 1)), m1, r1), 1))
         return self.mask(y)
 
     def step(
-        self, error: Tensor, mic: Tensor, reference: Tensor, echo: Tensor, state: tuple[Tensor, ...]
+        self,
+        error: Tensor,
+        mic: Tensor,
+        reference: Tensor,
+        echo: Tensor,
+        noise: Tensor,
+        residual: Tensor,
+        state: tuple[Tensor, ...],
     ) -> tuple[Tensor, Tensor, tuple[Tensor, ...]]:
-        """One frame: spectra (1, bins, 2) to the human's (1, bins, 2), the probability (1,) that somebody speaks, and the next state."""
-        frame = (spectrum.unsqueeze(1) for spectrum in (error, mic, reference, echo))
+        """One frame, spectra (1, bins, 2) and powers (1, bins): the human's spectrum, the probability (1,) of speech, the next state."""
+        frame = (x.unsqueeze(1) for x in (error, mic, reference, echo, noise, residual))
         human, logit, state = self(*frame, state)
         return human.squeeze(1), torch.sigmoid(logit.squeeze(1)), state
 
-    def _with_previous(self, x: Tensor, previous: Tensor) -> tuple[Tensor, Tensor]:
-        """Features (batch, frames, 6, bands) beside those one frame earlier, (batch * frames, 12, 1, bands), and the last ones."""
-        earlier = torch.cat((previous.unsqueeze(1), x[:, :-1]), 1)
-        both = torch.cat((x, earlier), 2)
-        return both.reshape(-1, 12, 1, self.config.bands), x[:, -1]
+
+def _with_previous(x: Tensor, previous: Tensor) -> tuple[Tensor, Tensor]:
+    """Features (batch, frames, bands, 6) beside those one frame earlier, (..., 12), and the last ones (batch, 6, bands)."""
+    earlier = torch.cat((previous.transpose(1, 2).unsqueeze(1), x[:, :-1]), 1)
+    return torch.cat((x, earlier), -1), x[:, -1].transpose(1, 2)
+
+
+def _channels_last(x: Tensor) -> Tensor:
+    """(batch, frames, bands, features) as (batch * frames, features, 1, bands), the features innermost in memory."""
+    return x.reshape(-1, 1, *x.shape[2:]).permute(0, 3, 1, 2)
 
 
 def features(spectrum: Tensor) -> Tensor:
-    """(batch, frames, bins, 2) to real, imaginary part and magnitude, all compressed, (batch, frames, 3, bins - 1).
+    """(batch, frames, bins, 2) to real, imaginary part and magnitude, all compressed, (batch, frames, bins - 1, 3).
 
     0 Hz is left out.
     """
-    return compressed(spectrum[:, :, 1:].transpose(-1, -2))
+    return compressed(spectrum[:, :, 1:], -1)
 
 
-def compressed(parts: Tensor) -> Tensor:
-    """Real and imaginary parts (..., 2, bands) to these and the magnitude, (..., 3, bands), all times the magnitude to COMPRESSION - 1.
+def compressed(parts: Tensor, along: int) -> Tensor:
+    """Real and imaginary parts, along that dimension, to these and the magnitude, all times the magnitude to COMPRESSION - 1.
 
     A power is the exponential of a logarithm: onnxruntime vectorises both, and its power not.
     """
-    power = (parts * parts).sum(-2, keepdim=True) + FLOOR**2
-    return torch.cat((parts, power.sqrt()), -2) * torch.exp((COMPRESSION - 1) / 2 * torch.log(power))
+    power = (parts * parts).sum(along, keepdim=True) + FLOOR**2
+    return torch.cat((parts, power.sqrt()), along) * torch.exp((COMPRESSION - 1) / 2 * torch.log(power))
 
 
-def apply_mask(raw: Tensor, error: Tensor) -> Tensor:
-    """Error (..., bins, 2) times a complex mask of magnitude tanh |raw|.
+def corrected(prior: Tensor, raw: Tensor, error: Tensor) -> Tensor:
+    """Error (..., 2) times the prior's gain (...), of which raw (..., 2) corrects logit and phase; zeros change nothing."""
+    gain, turn = opened(prior, raw[..., 0]), raw[..., 1]
+    real = gain * torch.rsqrt(1 + turn * turn)
+    imaginary = turn * real
+    x, y = error.unbind(-1)
+    return torch.stack((real * x - imaginary * y, imaginary * x + real * y), -1)
 
-    Raw is (..., 2, bins - 1), 0 Hz is silenced.
-    """
-    return nn.functional.pad(masked(raw, error[..., 1:, :].transpose(-1, -2)), (1, 0)).transpose(-1, -2).contiguous()
 
-
-def masked(raw: Tensor, error: Tensor) -> Tensor:
-    """The same with real and imaginary parts as rows: raw, error and the result (..., 2, bins - 1)."""
-    size = torch.sqrt((raw * raw).sum(-2, keepdim=True) + 1e-8)
-    real, imaginary = (raw * (torch.tanh(size) / size)).split(1, -2)
-    x, y = error.split(1, -2)
-    return torch.cat((real * x - imaginary * y, real * y + imaginary * x), -2)
+def opened(prior: Tensor, raw: Tensor) -> Tensor:
+    """sigmoid(logit(prior) + LOGITS raw), the correction bounded to MOST_LOGITS."""
+    odds = torch.exp(MOST_LOGITS * torch.tanh(LOGITS / MOST_LOGITS * raw)) * prior
+    return odds / (1 - prior + odds)
 
 
 def count(network: EdgeCrnn) -> dict[str, float]:
@@ -211,8 +259,9 @@ def count(network: EdgeCrnn) -> dict[str, float]:
 
     hooks = [module.register_forward_hook(add) for module in network.modules()]
     spectrum = torch.zeros(1, 1, network.config.n_fft // 2 + 1, 2)
+    power = spectrum[..., 0]
     with torch.no_grad():
-        network(spectrum, spectrum, spectrum, spectrum, network.initial_state())
+        network(*4 * (spectrum,), power, power, network.initial_state())
     for hook in hooks:
         hook.remove()
     return {"parameters": sum(p.numel() for p in network.parameters()), "macs_per_frame": total}

@@ -25,7 +25,7 @@ import torch
 from torch import Tensor, nn
 
 from edgefilter.dsp.stft import StftConfig
-from edgefilter.engines.crnn import EDGE_TYPE, EDGE_VERSION, SPECTRA
+from edgefilter.engines.crnn import EDGE_TYPE, EDGE_VERSION, POWERS, SPECTRA
 from edgefilter.engines.paper_crnn import PAPER_TYPE, PAPER_VERSION
 from edgefilter.engines.paper_ss import PAPER_STFT
 from edgefilter.errors import EdgefilterError, ModelError
@@ -64,7 +64,9 @@ def load(path: Path) -> Trained:
         raise ModelError(
             f"{path} is no checkpoint of a network ({' '.join(str(error).split())[:120]}): give one that training wrote"
         ) from None
-    training = {key: value for key, value in found.items() if key not in ("network", "config", "kind", "figures")}
+    training = {
+        key: value for key, value in found.items() if key not in ("network", "config", "kind", "figures", "resume")
+    }
     return Trained(network.eval(), training, found.get("figures", {}))
 
 
@@ -98,13 +100,14 @@ def _write_edge(trained: Trained, path: Path, products: bool = False) -> None:
     config = network.config
     stft = StftConfig(config.n_fft, config.hop, config.n_fft, config.window)
     # one tensor object per input: the exporter would merge inputs that are the same object
-    inputs = [torch.randn(1, stft.bins, 2) for _ in SPECTRA] + [torch.randn_like(tensor) for tensor in state]
+    powers = [torch.rand(1, stft.bins) for _ in POWERS]
+    inputs = [*(torch.randn(1, stft.bins, 2) for _ in SPECTRA), *powers, *map(torch.randn_like, state)]
     names = [f"state_{i}" for i in range(len(state))]
     trace(
         EdgeGraph(network, products).eval(),
         inputs,
         path,
-        [*SPECTRA, *names],
+        [*SPECTRA, *POWERS, *names],
         ["spectrum", "speech_probability", *(f"next_{name}" for name in names)],
     )
     states = [[name, list(tensor.shape)] for name, tensor in zip(names, state)]

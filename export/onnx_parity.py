@@ -117,15 +117,15 @@ def _chained(network: nn.Module, path: Path, frames: int) -> Iterator[tuple[list
 
 
 def _frame(network: nn.Module, rng: np.random.Generator) -> list[Tensor]:
-    """Four spectra (1, bins, 2) whose levels go up and down over 60 dB, as speech does.
+    """Four spectra (1, bins, 2) whose levels go up and down over 60 dB, as speech does, and two powers (1, bins) likewise.
 
     Error is the difference of mic and echo.
     """
     bins = network.config.n_fft // 2 + 1
-    mic, reference, echo = (10.0 ** rng.uniform(-3, 0, (3, 1, 1, 1)) * rng.standard_normal((3, 1, bins, 2))).astype(
-        np.float32
-    )
-    return [torch.from_numpy(x) for x in (mic - echo, mic, reference, echo)]
+    mic, reference, echo = 10.0 ** rng.uniform(-3, 0, (3, 1, 1, 1)) * rng.standard_normal((3, 1, bins, 2))
+    noise, residual = 10.0 ** rng.uniform(-6, 0, (2, 1, 1)) * rng.standard_normal((2, 1, bins)) ** 2
+    inputs = (mic - echo, mic, reference, echo, noise, residual)
+    return [torch.from_numpy(x.astype(np.float32)) for x in inputs]
 
 
 @torch.no_grad()

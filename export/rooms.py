@@ -13,13 +13,17 @@ from edgefilter.types import SAMPLE_RATE, Samples
 HUMANS = 3
 """Positions of the human per room."""
 MAX_ORDER = 60
-RANGES = {"lab": ((5.0, 8.0), (4.0, 6.0), (0.15, 0.35)), "office": ((3.0, 5.5), (2.5, 4.5), (0.35, 0.8))}
-"""Length, width in m and RT60 in s of either kind of room."""
+RANGES = {
+    "lab": ((5.0, 8.0), (4.0, 6.0), (0.15, 0.35), (0.6, 1.9)),
+    "office": ((3.0, 5.5), (2.5, 4.5), (0.35, 0.8), (0.6, 1.9)),
+    "hall": ((5.0, 9.0), (3.0, 7.0), (0.5, 1.0), (0.3, 4.0)),
+}
+"""Length, width in m, RT60 in s and the human's distance in m of each kind of room."""
 
 
 @dataclass(frozen=True, eq=False)
 class Room:
-    """robot: (n,) from the loudspeaker to the microphone; humans: HUMANS responses (n,) from 0.7 to 2 m.
+    """robot: (n,) from the loudspeaker to the microphone; humans: HUMANS responses (n,) from as far as RANGES says.
 
     Float32, 16 kHz.
     """
@@ -32,7 +36,7 @@ class Room:
 
 def draw_room(rng: np.random.Generator, kind: str) -> Room:
     """A shoebox room of that kind (Allen & Berkley 1979, by pyroomacoustics), robot and humans somewhere in it."""
-    lengths, widths, decays = RANGES[kind]
+    lengths, widths, decays, distances = RANGES[kind]
     size = np.array([rng.uniform(*lengths), rng.uniform(*widths), rng.uniform(2.4, 3.2)])
     rt60_s = max(rng.uniform(*decays), 1.05 * _shortest_decay(size))
     absorption, order = pra.inverse_sabine(rt60_s, size)
@@ -45,7 +49,7 @@ def draw_room(rng: np.random.Generator, kind: str) -> Room:
     loudspeaker = rng.standard_normal(3)
     room.add_source(microphone + rng.uniform(0.06, 0.3) * loudspeaker / np.linalg.norm(loudspeaker))
     for _ in range(HUMANS):
-        room.add_source(_mouth(rng, microphone, size))
+        room.add_source(_mouth(rng, microphone, size, distances))
     room.compute_rir()
     skip = pra.constants.get("frac_delay_length") // 2
     robot, *humans = (np.asarray(response[skip:], np.float32) for response in room.rir[0])
@@ -58,10 +62,12 @@ def _shortest_decay(size: np.ndarray) -> float:
     return 24 * math.log(10) / 343.0 * float(np.prod(size)) / surface
 
 
-def _mouth(rng: np.random.Generator, microphone: np.ndarray, size: np.ndarray) -> np.ndarray:
-    """A point 0.7 to 2 m from the microphone, inside the room."""
+def _mouth(
+    rng: np.random.Generator, microphone: np.ndarray, size: np.ndarray, distances: tuple[float, float]
+) -> np.ndarray:
+    """A point at such a distance from the microphone, up to 0.7 m higher, inside the room."""
     while True:
-        angle, reach = rng.uniform(0, 2 * math.pi), rng.uniform(0.6, 1.9)
+        angle, reach = rng.uniform(0, 2 * math.pi), rng.uniform(*distances)
         mouth = microphone + np.array([reach * math.cos(angle), reach * math.sin(angle), rng.uniform(0.0, 0.7)])
         if ((mouth > 0.2) & (mouth < size - 0.2)).all():
             return mouth

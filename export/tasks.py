@@ -11,11 +11,12 @@ from torch import Tensor, nn
 
 from edgefilter.dsp.stft import StftConfig
 from edgefilter.engines.paper_ss import PAPER_STFT
+from edgefilter.errors import UsageError
 from export.losses import LossWeights, edge_loss, power_law_loss, si_sdr
 from export.network import EdgeConfig, EdgeCrnn, count
 from export.paper_network import PaperConfig, PaperCrnn, parameter_count
 
-INPUTS = ("error", "mic", "reference", "echo")
+INPUTS = ("error", "mic", "reference", "echo", "noise", "residual")
 
 
 class Task(Protocol):
@@ -50,7 +51,7 @@ class EdgeTask:
         self.stft, self.half = self._config.stft, not options.full_precision
 
     def network(self) -> EdgeCrnn:
-        return EdgeCrnn(self._config)
+        return EdgeCrnn(self._config).to(memory_format=torch.channels_last)
 
     def config(self) -> dict[str, object]:
         return asdict(self._config)
@@ -63,6 +64,8 @@ class EdgeTask:
         )
 
     def loss(self, network: nn.Module, batch: dict[str, Tensor]) -> tuple[dict[str, Tensor], Tensor]:
+        if "residual" not in batch:
+            raise UsageError(f"the data was simulated for another transform, expected --hop {self.stft.hop}")
         inputs = [batch[name] for name in INPUTS]
         with torch.autocast(inputs[0].device.type, torch.bfloat16, enabled=self.half and network.training):
             human, logit, _ = network(*inputs, network.initial_state(inputs[0].shape[0]))

@@ -44,10 +44,12 @@ _TITLES = {"mr": "mister", "mrs": "missus", "dr": "doctor", "st": "saint"}
 
 @dataclass(frozen=True, slots=True)
 class WordErrors:
-    """Errors (substitutions, deletions, insertions) against a text of `words` words."""
+    """Errors (substitutions, deletions, insertions) against a text of `words` words; how many of them were which."""
 
     errors: int
     words: int
+    deletions: int = 0
+    insertions: int = 0
 
     @property
     def rate(self) -> float:
@@ -66,9 +68,10 @@ def word_errors(text: str, recognised: str) -> WordErrors:
     if not text:
         raise UsageError("the text to compare with has no words, expected what the human says: check the transcript")
     if not recognised:
-        return WordErrors(len(text.split()), len(text.split()))
+        return WordErrors(len(text.split()), len(text.split()), deletions=len(text.split()))
     counts = jiwer.process_words(text, recognised)
-    return WordErrors(counts.substitutions + counts.deletions + counts.insertions, len(text.split()))
+    errors = counts.substitutions + counts.deletions + counts.insertions
+    return WordErrors(errors, len(text.split()), counts.deletions, counts.insertions)
 
 
 def normalise(text: str) -> str:

@@ -17,9 +17,12 @@ from edgefilter.engines.onnx_session import FixedPlaces, expect_slots, find_mode
 from edgefilter.engines.spectral_subtraction import SpectralSubtraction
 from edgefilter.types import Frame, Output, Samples, Spectrum
 
-EDGE_TYPE, EDGE_VERSION = "edgefilter-crnn", 1
+EDGE_TYPE, EDGE_VERSION, EDGE_BEFORE = "edgefilter-crnn", 2, 1
+"""Networks of version 2 take POWERS and correct the Wiener mask themselves; those of version 1 go without."""
 SPECTRA = ("error", "mic", "reference", "echo")
 """The graph's first inputs, each (1, bins, 2) float32, real and imaginary part."""
+POWERS = ("noise_psd", "residual_psd")
+"""Those that follow, each (1, bins) float32, as in Frame."""
 VARIABLE = "EDGEFILTER_CRNN"
 
 WIENER_SHARE = 0.5
@@ -45,7 +48,8 @@ class Crnn:
 
     def __init__(self, model: str | Path | None = None, wiener_share: float = WIENER_SHARE) -> None:
         path = find_model(model, VARIABLE, "crnn_int8.onnx", "make one with 'python -m export.onnx_export --int8'")
-        self.model = open_model(path, EDGE_TYPE, EDGE_VERSION)
+        self.model = open_model(path, EDGE_TYPE, EDGE_BEFORE, EDGE_VERSION)
+        self._powers = POWERS if self.model.version == EDGE_VERSION else ()
         self.stft = self.model.stft
         self.lookahead = 0
         self._wiener, self._share = SpectralSubtraction(self.stft), np.float32(wiener_share)
@@ -56,7 +60,8 @@ class Crnn:
             "speech_probability": (1,),
             **{f"next_{name}": shape for name, shape in states.items()},
         }
-        expect_slots(self.model, {**dict.fromkeys(SPECTRA, spectrum), **states}, outputs)
+        powers = dict.fromkeys(self._powers, (1, self.stft.bins))
+        expect_slots(self.model, {**dict.fromkeys(SPECTRA, spectrum), **powers, **states}, outputs)
         self._own = threading.local()
 
     def initial_state(self) -> CrnnState:
@@ -64,12 +69,8 @@ class Crnn:
 
     def step(self, frame: Frame, state: CrnnState) -> tuple[Output, CrnnState]:
         places = self._places()
-        places.error[:], places.mic[:], places.reference[:], places.echo[:] = (
-            frame.error,
-            frame.mic,
-            frame.reference,
-            frame.echo,
-        )
+        for name, inputs in places.inputs:
+            inputs[:] = getattr(frame, name)
         for place, tensor in zip(places.states, state[0]):
             place[...] = tensor
         places.slots.run()
@@ -83,26 +84,27 @@ class Crnn:
         if not hasattr(self._own, "places"):
             slots = FixedPlaces(self.model.session)
             names = [name for name, _ in self.model.states]
-            error, mic, reference, echo = (slots.inputs[name].view(np.complex64).reshape(-1) for name in SPECTRA)
+            spectra = [(name, slots.inputs[name].view(np.complex64).reshape(-1)) for name in SPECTRA]
+            powers = [(name, slots.inputs[name].reshape(-1)) for name in self._powers]
             states, next_states = (
                 [slots.inputs[name] for name in names],
                 [slots.outputs[f"next_{name}"] for name in names],
             )
             spectrum = slots.outputs["spectrum"].view(np.complex64).reshape(-1)
             probability = slots.outputs["speech_probability"]
-            self._own.places = Places(slots, error, mic, reference, echo, spectrum, probability, states, next_states)
+            self._own.places = Places(slots, [*spectra, *powers], spectrum, probability, states, next_states)
         return self._own.places
 
 
 @dataclass(frozen=True)
 class Places:
-    """Where one frame's inputs go and its outputs come, spectra (bins,) complex64."""
+    """Where one frame's inputs go and its outputs come.
+
+    inputs: (bins,) by the name of the Frame's field that goes there. spectrum: (bins,) complex64.
+    """
 
     slots: FixedPlaces
-    error: Spectrum
-    mic: Spectrum
-    reference: Spectrum
-    echo: Spectrum
+    inputs: list[tuple[str, Spectrum | Samples]]
     spectrum: Spectrum
     probability: Samples
     states: list[Samples]

@@ -26,9 +26,10 @@ FOLDERS = (Path(__file__).parents[1] / "models", Path(__file__).parents[2] / "mo
 
 @dataclass(frozen=True, eq=False)
 class Model:
-    """A model file that was found to fit. training and figures are what it says about itself."""
+    """A model file that was found to fit. version: of its inputs; training and figures are what it says about itself."""
 
     path: Path
+    version: int
     session: onnxruntime.InferenceSession
     stft: StftConfig
     training: Mapping[str, object]
@@ -100,12 +101,12 @@ def open_session(path: Path) -> onnxruntime.InferenceSession:
         ) from None
 
 
-def open_model(path: Path, kind: str, version: int) -> Model:
-    """Open a model and refuse it where its metadata is not that of a `kind` of this version at the package's sampling rate."""
+def open_model(path: Path, kind: str, *versions: int) -> Model:
+    """Open a model and refuse it where its metadata is not that of a `kind` of one of these versions at the package's sampling rate."""
     session = open_session(path)
     said = session.get_modelmeta().custom_metadata_map
     _expect(path, "type", said.get("type"), kind)
-    _expect(path, "version", said.get("version"), str(version))
+    _expect(path, "version", said.get("version"), *map(str, versions))
     _expect(path, "sample_rate", said.get("sample_rate"), str(SAMPLE_RATE))
     try:
         stft = StftConfig(int(said["n_fft"]), int(said["hop"]), int(said["window_length"]), said["window"])
@@ -117,7 +118,7 @@ def open_model(path: Path, kind: str, version: int) -> Model:
         raise ModelError(f"model {path} does not say its {error.args[0]}: export it again") from None
     except (ValueError, TypeError, StftError) as error:
         raise ModelError(f"model {path} has unusable metadata ({error}): export it again") from None
-    return Model(path, session, stft, training, figures, states)
+    return Model(path, int(said["version"]), session, stft, training, figures, states)
 
 
 def expect_slots(model: Model, inputs: Mapping[str, tuple], outputs: Mapping[str, tuple]) -> None:
@@ -145,9 +146,9 @@ def _may_be(found: Sequence[int | str | None], wanted: Sequence[int | str]) -> b
     )
 
 
-def _expect(path: Path, key: str, found: str | None, wanted: str) -> None:
-    if found != wanted:
+def _expect(path: Path, key: str, found: str | None, *wanted: str) -> None:
+    if found not in wanted:
         raise ModelError(
-            f"model {path} has {key} {found or 'unknown'}, expected {wanted}: take the model that belongs to this"
+            f"model {path} has {key} {found or 'unknown'}, expected {' or '.join(wanted)}: take the model that belongs to this"
             " engine and version"
         )

@@ -134,15 +134,6 @@ class FrontEnd:
         noise, residual = stage.residual.step(e, error, linear.uncertainty, added)
         return Frame(x, r, e, error, noise, residual), aligned
 
-    def signals(self, mic: Samples, ref: Samples) -> tuple[Samples, Samples]:
-        """One hop (hop,) of both channels to the aligned reference and the linear stage's error, (hop,) each, as training wants them.
-
-        The kind "full" alone has them.
-        """
-        assert self.linear_stage is not None
-        aligned = self.linear_stage.aligner.step(mic, ref)
-        return aligned.reference, self.linear_stage.step(mic, aligned).error
-
 
 def low_cut(stft: StftConfig) -> Samples:
     """(bins,) gain without phase: RUMBLE below RUMBLE_HZ, 1 above."""

@@ -163,8 +163,8 @@ def test_normalise(text: str, words: str) -> None:
 
 
 def test_word_errors_counts_and_cap() -> None:
-    assert recogniser.word_errors("one two three four", "one too three") == recogniser.WordErrors(2, 4)
-    assert recogniser.word_errors("Two words", "") == recogniser.WordErrors(2, 2)
+    assert recogniser.word_errors("one two three four", "one too three") == recogniser.WordErrors(2, 4, deletions=1)
+    assert recogniser.word_errors("Two words", "") == recogniser.WordErrors(2, 2, deletions=2)
     robot_heard = recogniser.word_errors("stop", "and then the robot went on")
     assert robot_heard.rate == 6.0 and robot_heard.capped == 1.0
     with pytest.raises(UsageError, match="no words"):

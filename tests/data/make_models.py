@@ -2,7 +2,8 @@
 
 python -m tests.data.make_models
 
-They are pure functions of the seed: the weights are random, nothing was trained on anything.
+They are pure functions of the seed: the weights are random, nothing was trained on anything. crnn_before.onnx is such a
+network of version 1, without the expected powers as inputs, from before there was a version 2.
 """
 
 from __future__ import annotations
@@ -20,9 +21,11 @@ TRAINING = {"data": "none: random weights", "seed": 0}
 
 
 def tiny_edge() -> EdgeCrnn:
-    """The edge network with as few channels as it takes."""
+    """The edge network with as few channels as it takes, and a correction that is not zero."""
     torch.manual_seed(0)
-    return EdgeCrnn(EdgeConfig(channels=(2, 2, 2, 2), hidden=6)).eval()
+    network = EdgeCrnn(EdgeConfig(channels=(2, 2, 2, 2), hidden=6)).eval()
+    torch.nn.init.normal_(network.mask.weight)
+    return network
 
 
 def tiny_paper() -> PaperCrnn:

@@ -1,4 +1,4 @@
-"""The comparison of trained networks, on a network of four steps."""
+"""The comparisons of trained networks, on a network of four steps."""
 
 import json
 
@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import soundfile as sf
 
-from bench.measure import networks
+from bench.measure import networks, words_validation
 from export import train
 
 
@@ -42,14 +42,17 @@ def conversation(tmp_path):
     return folder.parent
 
 
-def test_networks_are_compared(tmp_path, conversation, monkeypatch):
-    run = tmp_path / "tiny"
+@pytest.fixture
+def run(tmp_path, monkeypatch):
+    """A folder of export/train.py."""
     small = ["--channels", "2", "2", "2", "2", "--hidden", "4", "--smoke"]
-    monkeypatch.setattr(
-        "sys.argv",
-        ["train", "--data", str(tmp_path / "d"), "--validation", str(tmp_path / "v"), "--output", str(run), *small],
-    )
+    folders = ["--data", str(tmp_path / "d"), "--validation", str(tmp_path / "v"), "--output", str(tmp_path / "tiny")]
+    monkeypatch.setattr("sys.argv", ["train", *folders, *small])
     assert train.main() == 0
+    return tmp_path / "tiny"
+
+
+def test_networks_are_compared(tmp_path, run, conversation, monkeypatch):
     monkeypatch.setattr(networks, "Recogniser", Deaf)
     monkeypatch.setattr(networks, "HOPS", 3)
     monkeypatch.setattr(networks.Conversation, "profile", None)
@@ -71,6 +74,24 @@ def test_networks_are_compared(tmp_path, conversation, monkeypatch):
     assert all(row["errors"] == 1 and row["words"] == 2 and np.isfinite(row["si_sdr"]) for row in found["utterances"])
     assert found["runs"][0]["steps"] == 4 and found["runs"][0]["hot_ms"]["p50"] > 0
     assert "| tiny | 512/256" in out.with_suffix(".md").read_text() and out.with_suffix(".png").stat().st_size > 1000
+
+
+def test_checkpoints_are_judged_by_words_warm_and_cold_against_ss(tmp_path, run, conversation, monkeypatch):
+    monkeypatch.setattr(words_validation, "Recogniser", Deaf)
+    monkeypatch.setattr(words_validation.Conversation, "profile", None)
+    arguments = ["--checkpoints", run / "last.pt", "--conversations", conversation, "--cold", "--whisper", tmp_path]
+    arguments += ["--output", tmp_path / "results" / "words", "--cache", tmp_path / "cache"]
+    monkeypatch.setattr("sys.argv", ["words_validation", *map(str, arguments)])
+    assert words_validation.main() == 0
+    found = json.loads((tmp_path / "results" / "words.json").read_text())["utterances"]
+    names = ["linear", "ss", "tiny/last, step 4", "tiny/last, step 4, 0.5 ss", "tiny/last, step 4, 0.2 error"]
+    assert [row["system"] for row in found] == 2 * names
+    assert [row["kind"] for row in found] == 5 * ["conversations lab"] + 5 * ["conversations lab cold"]
+    assert all((row["errors"], row["deletions"], row["insertions"], row["words"]) == (1, 1, 0, 2) for row in found)
+    by_name = {row["system"]: row["si_sdr"] for row in found[:5]}
+    assert by_name["ss"] == pytest.approx(by_name[names[2]], abs=0.1)  # after four steps it is still nearly 'ss'
+    assert by_name["ss"] != by_name["linear"] != by_name[names[3]] and len(set(by_name.values())) == 5
+    assert "| tiny/last, step 4 | 50 | 50 | 0 | +0.0 [+0.0, +0.0] |" in (tmp_path / "results/words.md").read_text()
 
 
 def test_a_folder_without_a_network_is_one_line(tmp_path, conversation, monkeypatch, capsys):

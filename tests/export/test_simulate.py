@@ -4,12 +4,19 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import soundfile as sf
 
+from edgefilter.dsp.stft import StftConfig
 from edgefilter.errors import UsageError
-from export.corpus import read_corpus
+from export.corpus import Corpus, read_corpus
 from export.rooms import draw_room
-from export.simulate import PAPER, RECIPES, draw_colour, simulate
-from tests.export.speech import RATE, write_librispeech, write_table
+from export.simulate.conversation import simulate
+from export.simulate.linear_stage import Stage, WideSetting, from_bytes, front_end, listen
+from export.simulate.loudspeaker import KINDS, active_rms, distorted
+from export.simulate.material import RESPONSES, Material, read_noises, read_responses
+from export.simulate.path import draw_colour
+from export.simulate.recipe import PAPER, RECIPES, WIDE
+from tests.export.speech import RATE, babble, write_librispeech, write_table
 
 
 @pytest.fixture(scope="module")
@@ -17,19 +24,21 @@ def parts(tmp_path_factory):
     folder = tmp_path_factory.mktemp("speech")
     humans = read_corpus(write_librispeech(folder / "humans", ("11", "12", "13")))
     robots = read_corpus(write_table(folder / "robots", ("a", "b")))
-    return humans, robots, [draw_room(np.random.default_rng(kind == "lab"), kind) for kind in ("lab", "office")]
+    return Material(
+        humans, robots, [draw_room(np.random.default_rng(kind == "lab"), kind) for kind in ("lab", "office")]
+    )
 
 
 def test_an_item_depends_on_seed_and_index_alone(parts):
-    first, again = (simulate(RECIPES["edge"], 3, 5, *parts) for _ in range(2))
-    other = simulate(RECIPES["edge"], 3, 6, *parts)
+    first, again = (simulate(RECIPES["edge"], 3, 5, parts) for _ in range(2))
+    other = simulate(RECIPES["edge"], 3, 6, parts)
     assert np.array_equal(first.mic, again.mic) and first.about == again.about
     assert not np.array_equal(first.mic, other.mic)
 
 
 def test_the_papers_recipe_has_the_papers_segments(parts):
     for index in range(6):
-        item = simulate(PAPER, 1, index, *parts)
+        item = simulate(PAPER, 1, index, parts)
         assert item.mic.size == item.clean.size == item.reference.size == 5 * RATE
         onset = int(np.argmax(np.abs(item.clean) > 1e-4 * np.abs(item.clean).max()))
         assert 0.5 * RATE <= onset < 1.6 * RATE  # 0.5 to 1.5 s, and the way through the room
@@ -38,16 +47,109 @@ def test_the_papers_recipe_has_the_papers_segments(parts):
 
 
 def test_the_human_is_inside_the_microphone(parts):
-    item = simulate(replace(RECIPES["edge"], human=1.0, warm=1.0), 2, 0, *parts)
+    item = simulate(replace(RECIPES["edge"], human=1.0, warm=1.0), 2, 0, parts)
     assert item.profile is not None and np.any(item.clean)
-    silent = simulate(replace(RECIPES["edge"], human=0.0), 2, 0, *parts)
+    silent = simulate(replace(RECIPES["edge"], human=0.0), 2, 0, parts)
     assert not np.any(silent.clean)
+
+
+@pytest.mark.parametrize("kind", sorted(KINDS))
+def test_each_kind_of_distortion_is_as_loud_as_asked_and_none_of_it_is_the_voice_itself(kind):
+    rng = np.random.default_rng(4)
+    voice = babble(rng, 4.0)
+    added = distorted(rng, voice, (kind,), -25.0) - voice
+    assert 20 * np.log10(active_rms(added) / active_rms(voice)) == pytest.approx(-25.0, abs=0.1)
+    assert abs(np.dot(added, voice)) < 1e-2 * np.linalg.norm(added) * np.linalg.norm(voice)
+
+
+def test_the_wide_recipe_has_every_kind():
+    assert set(WIDE.kinds) == set(KINDS)
+
+
+def test_wide_items_hold_loud_humans_silent_robots_and_every_kind_of_start(parts):
+    items = [simulate(replace(WIDE, plain=0.0, seconds=3.0), 8, index, parts) for index in range(40)]
+    assert {item.about["profile"] for item in items} == {"none", "right", "level", "device", "path"}
+    loud = [item.about["human_over_robot_db"] > -8 for item in items]
+    assert 4 < sum(loud) < 24  # a third of 40, 4 standard deviations
+    assert any(not item.reference.any() for item in items) and any(not item.clean.any() for item in items)
+    assert max(np.abs(item.mic).max() for item in items) <= 1.0
+    assert any(item.stage.missing_db is not None for item in items)
+    assert len({item.stage.adaptation for item in items}) > 3
+
+
+def test_a_robot_that_says_nothing_leaves_the_human_and_the_fan(parts):
+    alone = replace(
+        WIDE, plain=0.0, robot=0.0, human=1.0, near_share=0.0, fan_db=(40.0, 40.0), wideness=0.0, seconds=4.0
+    )
+    item = simulate(alone, 6, 0, parts)
+    rest = item.mic - item.clean
+    assert 20 * np.log10(active_rms(item.clean) / active_rms(rest)) == pytest.approx(40.0, abs=1.0)
+
+
+def test_a_weakened_canceller_leaves_as_much_more_as_asked_and_a_lost_one_everything(parts):
+    item = simulate(replace(RECIPES["edge"], moving=0.0, warm=1.0, human=0.0, seconds=6.0), 3, 1, parts)
+    stft, left = StftConfig(), {}
+    for missing_db in (None, -6.0, np.inf):
+        front = front_end(Stage(missing_db=missing_db), item.profile, stft, np.random.default_rng(1))
+        heard = listen(front, item.mic, item.reference, item.clean, stft)
+        left[missing_db] = 10 * np.log10(np.mean(heard.error**2) / np.mean(heard.mic**2))
+    assert left[None] < -12
+    assert left[-6.0] == pytest.approx(-6.0, abs=1.5)  # the filter's energy is exact, its gain for a voice is not
+    assert left[np.inf] == pytest.approx(0.0, abs=1e-6)
+
+
+def test_frames_cut_from_the_stored_sound_are_the_engines_own(parts):
+    item = simulate(replace(RECIPES["edge"], warm=1.0, seconds=3.0), 2, 3, parts)
+    stft = StftConfig()
+    front = front_end(item.stage, item.profile, stft, np.random.default_rng(0))
+    frames = [front.step(item.mic[at : at + 256], item.reference[at : at + 256])[0] for at in range(0, 47872, 256)]
+    front = front_end(item.stage, item.profile, stft, np.random.default_rng(0))
+    heard = listen(front, item.mic, item.reference, item.clean, stft)
+    for t in (50, 120, 180):
+        found = stft.analyse(heard.error[(t - 1) * 256 : (t + 1) * 256])
+        np.testing.assert_allclose(found, frames[t].error, atol=1e-5 * np.abs(frames[t].error).max() + 1e-7)
+        told = from_bytes(heard.residual[t])
+        assert np.abs(10 * np.log10(told / np.maximum(frames[t].residual_psd, 1e-9))).max() < 0.26
+
+
+def test_settings_of_the_linear_stage_are_drawn_in_their_shares():
+    rng = np.random.default_rng(0)
+    stages = [WideSetting().draw(rng, warm=True) for _ in range(400)]
+    assert 0.4 < np.mean([stage.taps is None for stage in stages]) < 0.6  # own: 0.5, 4 standard deviations
+    assert 0.01 < np.mean([stage.missing_db == np.inf for stage in stages]) < 0.1
+    weakened = [s.missing_db for s in stages if s.missing_db is not None and np.isfinite(s.missing_db)]
+    assert min(weakened) > -25 and max(weakened) < -3 and 60 < len(weakened) < 140
+    assert all(1024 <= stage.taps <= 8192 for stage in stages if stage.taps)
+
+
+def test_recorded_noises_and_measured_responses_are_used(parts, tmp_path):
+    rng = np.random.default_rng(1)
+    for kind in ("room", "loudspeaker", "microphone"):
+        (tmp_path / "rir" / kind).mkdir(parents=True)
+        decay = rng.standard_normal(800) * np.exp(-np.arange(800) / 100)
+        sf.write(tmp_path / "rir" / kind / "a.flac", np.append(0.9, 0.2 * decay / np.abs(decay).max()), RATE)
+    (tmp_path / "noise").mkdir()
+    sf.write(tmp_path / "noise" / "hum.wav", 0.3 * np.sin(np.arange(RATE) * 2 * np.pi * 100 / RATE), RATE)
+    material = replace(parts, noises=read_noises(tmp_path / "noise"), responses=read_responses(tmp_path / "rir"))
+    assert {kind: len(each) for kind, each in material.responses.items()} == dict.fromkeys(RESPONSES, 1)
+    assert all(response[0] == 1.0 for (response,) in material.responses.values())
+    recipe = replace(WIDE, plain=0.0, seconds=2.0)
+    with_them, without = ([simulate(recipe, 5, index, each).mic for index in range(12)] for each in (material, parts))
+    assert sum(not np.array_equal(a, b) for a, b in zip(with_them, without)) > 3
+    with pytest.raises(UsageError, match="holds no impulse response"):
+        read_responses(tmp_path / "noise" / "nothing")
+
+
+def test_who_says_three_words_is_drawn_seldom():
+    corpus = Corpus({"few": (), "many": ()}, {"few": 2.0, "many": 60.0})
+    rng = np.random.default_rng(0)
+    assert 0 < sum(corpus.draw_speaker(rng) == "few" for _ in range(2000)) < 60  # 1 % of 2000
 
 
 def test_effects_of_a_profile_change_the_robot(parts):
     plain = replace(RECIPES["edge"], moving=0.0, effects_share=1.0)
     turned_down = replace(plain, effects=(("bandlimit", {"cutoff_hz": 1500.0, "order": 4.0}),))
-    items = [simulate(recipe, 4, 1, *parts) for recipe in (plain, turned_down)]
+    items = [simulate(recipe, 4, 1, parts) for recipe in (plain, turned_down)]
     high = [np.sum(np.abs(np.fft.rfft(item.mic - item.clean))[-item.mic.size // 8 :] ** 2) for item in items]
     assert high[1] < 0.5 * high[0]
     assert items[1].about["effects"] == ["bandlimit"]

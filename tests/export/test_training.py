@@ -8,11 +8,14 @@ import torch
 
 from edgefilter.dsp.metrics import si_sdr as si_sdr_of_samples
 from edgefilter.dsp.stft import StftConfig
-from export import dataset, train
-from export.crops import Batches, Items
+from edgefilter.engines.spectral_subtraction import SpectralSubtraction
+from edgefilter.types import Frame
+from export import checkpoint, dataset, train
+from export.crops import Batches, Items, Shape
 from export.losses import LossWeights, edge_loss, power_law_loss, si_sdr
-from export.network import EdgeConfig, EdgeCrnn, apply_mask, count
+from export.network import MOST_LOGITS, EdgeConfig, EdgeCrnn, corrected, count, opened
 from export.paper_network import PaperConfig
+from export.trainer import Plan
 from tests.export.speech import write_librispeech, write_table
 
 SMALL = EdgeConfig(64, 32, channels=(4, 4, 4, 4), hidden=8)
@@ -35,9 +38,10 @@ def data(tmp_path_factory):
         "1",
         "--recipe",
         "paper",
+        "--rooms",
+        "2",
     ]
     patch = pytest.MonkeyPatch()
-    patch.setattr(dataset, "ROOMS", {"lab": 1, "office": 1})
     patch.setattr("sys.argv", ["dataset", *arguments, "--output", str(folder / "items")])
     dataset.main()
     before = (folder / "items" / "00001.npz").stat().st_mtime_ns
@@ -51,35 +55,108 @@ def test_the_dataset_holds_what_the_linear_stage_left(data):
     items = Items(data)
     assert items.names == ["00000.npz", "00001.npz"]
     for name in items.names:
-        crop = items.crop(name, 3 * 16000, 16000)
+        crop = {signal: x[0].numpy() for signal, x in items.crops([(name, 3 * 16000)], 16000).items()}
         robot, left = crop["mic"] - crop["clean"], crop["error"] - crop["clean"]
         assert np.mean(left**2) < 0.2 * np.mean(robot**2)
     assert json.loads((data / "dataset.json").read_text())["seed"] == 4
 
 
 def test_batches_are_consistent_after_augmentation(data):
-    batch = Batches(Items(data), StftConfig(), 4, 1.0, seed=1).draw()
+    batch = Batches(Items(data), StftConfig(), Shape(4, 1.0), seed=1).draw(0)
     assert batch["error"].shape == batch["clean"].shape == (4, 61, 257, 2)
+    assert batch["noise"].shape == batch["residual"].shape == (4, 61, 257)
     assert torch.allclose(batch["mic"] - batch["error"], batch["echo"], atol=1e-4)
+
+
+def test_every_fourth_batch_is_of_few_long_crops_and_each_can_be_drawn_again(data):
+    batches = Batches(Items(data), StftConfig(), Shape(8, 0.512), seed=1)
+    found = [batches.draw(step) for step in range(5)]
+    assert [len(batch["mic"]) for batch in found] == [8, 8, 8, 2, 8]
+    assert found[3]["mic"].shape[1] == 4 * (found[0]["mic"].shape[1] + 1) - 1
+    again = Batches(Items(data), StftConfig(), Shape(8, 0.512), seed=1).draw(2)
+    assert all(torch.equal(again[name], tensor) for name, tensor in found[2].items())
+    other = Batches(Items(data), StftConfig(), Shape(8, 0.512), seed=1, rank=1).draw(2)
+    assert not torch.equal(other["mic"], again["mic"])
+
+
+def test_expected_powers_belong_to_the_frames_beside_them(data):
+    """An item's noise is told in bytes: half a step of 0.5 dB, and as many frames as the crop holds."""
+    items, stft = Items(data), StftConfig()
+    name = items.names[0]
+    stored = np.load(data / name)["residual"]
+    found = items.powers([(name, 10 * stft.hop)], 8 * stft.hop, stft)["residual"]
+    assert found.shape == (1, 7, stft.bins)
+    np.testing.assert_allclose(10 * np.log10(found[0, 0].numpy()), -90 + 0.5 * stored[11].astype(float), atol=1e-3)
+    assert items.powers([(name, 0)], 8 * stft.hop, StftConfig(320, 160, 320)) == {}
+
+
+def test_a_swapped_human_is_as_loud_as_the_one_who_was_there(data, monkeypatch):
+    def drawn(share):
+        monkeypatch.setattr("export.crops.SWAPPED", share)
+        return Batches(Items(data), StftConfig(), Shape(16, 1.0), seed=3).draw(0)
+
+    swapped, kept = drawn(1.0), drawn(0.0)
+    power = [batch["clean"].square().sum((1, 2, 3)) for batch in (swapped, kept)]
+    changed = [not torch.allclose(a, b) for a, b in zip(swapped["clean"], kept["clean"])]
+    assert sum(changed) > 4
+    assert torch.allclose(power[0], power[1], rtol=0.2)  # framing weighs the ends of a crop less
+    rest = [batch["mic"] - batch["clean"] for batch in (swapped, kept)]
+    assert torch.allclose(*rest, atol=1e-3)
 
 
 def test_a_silent_robot_leaves_the_human_in_the_microphone(data, monkeypatch):
     monkeypatch.setattr("export.crops.ROBOT_SILENT", 1.0)
-    batch = Batches(Items(data), StftConfig(), 4, 1.0, seed=1).draw()
+    batch = Batches(Items(data), StftConfig(), Shape(4, 1.0), seed=1).draw(0)
     assert not batch["reference"].any() and not batch["echo"].any()
     noise = (batch["mic"] - batch["clean"]).square().mean()
     assert 0 < noise < 1e-2 * batch["clean"].square().amax()
+    heard = (batch["mic"] - batch["clean"]).square().sum(-1).mean()
+    assert float(batch["noise"].mean() / heard) == pytest.approx(1.0, rel=0.1)  # 4 x 61 x 257 draws of an exponential
 
 
 def spectra(frames=9, seed=0):
+    """Four spectra and two powers, as the network takes them."""
     generator = torch.Generator().manual_seed(seed)
-    return [0.1 * torch.randn(1, frames, 33, 2, generator=generator) for _ in range(4)]
+    powers = [0.01 * torch.rand(1, frames, 33, generator=generator) for _ in range(2)]
+    return [0.1 * torch.randn(1, frames, 33, 2, generator=generator) for _ in range(4)] + powers
+
+
+def awake(config=SMALL):
+    """A network whose correction is not the zero that it begins with."""
+    torch.manual_seed(1)
+    network = EdgeCrnn(config).eval()
+    torch.nn.init.normal_(network.mask.weight)
+    return network
+
+
+def test_before_training_the_answer_is_that_of_ss():
+    stft, inputs = SMALL.stft, spectra(40)
+    engine, state = SpectralSubtraction(stft), SpectralSubtraction(stft).initial_state()
+    with torch.no_grad():
+        found, _, _ = EdgeCrnn(SMALL).eval()(*inputs, EdgeCrnn(SMALL).initial_state())
+    error, _, _, _, noise, residual = (x[0].numpy() for x in inputs)
+    gains = []
+    for t in range(40):
+        spectrum = (error[t] @ (1, 1j)).astype(np.complex64)
+        frame = Frame(spectrum, spectrum, spectrum, spectrum, noise[t], residual[t])
+        wanted, state = engine.step(frame, state)
+        gains.append(np.abs(wanted.spectrum / spectrum))
+        # 0.995 is the largest gain that a correction can start from
+        np.testing.assert_allclose(found[0, t].numpy() @ (1, 1j), wanted.spectrum, atol=6e-3 * np.abs(spectrum).max())
+    assert np.ptp(gains) > 0.5
+
+
+def test_training_and_graph_see_the_same_whatever_the_memory_order():
+    network, inputs = awake(), spectra()
+    with torch.no_grad():
+        plain = network(*inputs, network.initial_state())[0]
+        last = network.to(memory_format=torch.channels_last)(*inputs, network.initial_state())[0]
+    assert torch.allclose(plain, last, atol=1e-6)
 
 
 @pytest.mark.parametrize("norm", ["layer", "batch", "none"])
 def test_frame_by_frame_is_the_whole_clip(norm):
-    torch.manual_seed(1)
-    network = EdgeCrnn(EdgeConfig(64, 32, channels=(4, 4, 4, 4), hidden=8, norm=norm)).eval()
+    network = awake(EdgeConfig(64, 32, channels=(4, 4, 4, 4), hidden=8, norm=norm))
     inputs = spectra()
     with torch.no_grad():
         whole, logits, _ = network(*inputs, network.initial_state())
@@ -91,8 +168,7 @@ def test_frame_by_frame_is_the_whole_clip(norm):
 
 
 def test_the_future_does_not_change_the_past():
-    network = EdgeCrnn(SMALL).eval()
-    inputs = spectra()
+    network, inputs = awake(), spectra()
     with torch.no_grad():
         before, *_ = network(*inputs, network.initial_state())
         for x in inputs:
@@ -102,17 +178,22 @@ def test_the_future_does_not_change_the_past():
     assert not torch.allclose(before[:, 6:], after[:, 6:])
 
 
-def test_the_mask_never_amplifies():
+def test_the_correction_never_amplifies_and_is_bounded():
     error = spectra()[0]
-    human = apply_mask(100 * torch.randn(1, 9, 2, 32), error)
-    assert (human.norm(dim=-1) <= error.norm(dim=-1) + 1e-6).all()
-    assert (human[:, :, 0] == 0).all()
+    prior = torch.rand(1, 9, 33).clamp(0.18, 0.995)
+    human = corrected(prior, 100 * torch.randn(1, 9, 33, 2), error)
+    assert (human.norm(dim=-1) <= error.norm(dim=-1) * (1 + 1e-6)).all()
+    logits = torch.logit(opened(prior, torch.tensor(1e3)), 1e-9) - torch.logit(prior)
+    assert torch.allclose(logits, torch.tensor(MOST_LOGITS), atol=0.1)
+    unchanged = corrected(prior, torch.zeros(1, 9, 33, 2), error)
+    assert torch.allclose(unchanged, prior.unsqueeze(-1) * error, atol=1e-6)
 
 
 def counted_by_hand(config):
     """Parameters and multiply-accumulates a frame from the layers' sizes alone."""
     (a, b, c, d), f, hidden = config.channels, config.n_fft // 2, config.hidden
-    down = [(12, a, 5, f // 2), (a, b, 5, f // 4)] * 2 + [(2 * b, c, 5, f // 8), (c, d, 5, f // 16)]
+    down = [(15, a, 5, f // 2), (12, a, 5, f // 2)] + [(a, b, 5, f // 4)] * 2
+    down += [(2 * b, c, 5, f // 8), (c, d, 5, f // 16)]
     up = [(2 * d, 2 * c, 3, f // 16), (2 * c, 2 * b, 3, f // 8), (3 * b, 2 * a, 3, f // 4), (3 * a, 2 * a, 3, f // 2)]
     mask = (a, 2, 3, f)
     convolutions = [*down, *up, mask]
@@ -134,9 +215,9 @@ def test_counts_are_those_of_the_layers_sizes(config):
 
 
 def test_the_default_network_is_as_large_as_its_page_says():
-    """models/MODELS.md: 1.32 M parameters, 292 MMAC/s at 62.5 frames a second."""
+    """models/MODELS.md: 1.32 M parameters, 294 MMAC/s at 62.5 frames a second."""
     figures = count(EdgeCrnn())
-    assert round(figures["parameters"] / 1e6, 2) == 1.32 and round(figures["macs_per_frame"] * 62.5 / 1e6) == 292
+    assert round(figures["parameters"] / 1e6, 2) == 1.32 and round(figures["macs_per_frame"] * 62.5 / 1e6) == 294
 
 
 def test_the_loss_is_least_at_the_human_and_minds_suppression_more():
@@ -197,6 +278,16 @@ def test_training_runs_stops_and_goes_on(tmp_path, monkeypatch, capsys):
     assert list((tmp_path / "run").glob("events.*"))
 
 
+def test_the_rate_rises_stays_and_falls():
+    plan = Plan(steps=1000, rate=1.0, seed=1, every=100, patience=0)
+    rates = [plan.rate_at(step) for step in range(1000)]
+    assert rates[0] < 0.02 and max(rates) < 1.0001 and rates[-1] < 0.01
+    assert all(rate > 0.999 for rate in rates[100:800]) and rates[899] == pytest.approx(0.505, abs=0.01)
+    timed = Plan(steps=10**6, rate=1.0, seed=1, every=100, minutes=10)
+    assert timed.rate_at(1000, 7 * 60) > 0.999 and timed.rate_at(1000, 9 * 60) == pytest.approx(0.5, abs=0.01)
+    assert timed.done_at(1000, 10 * 60) == 1.0
+
+
 def test_training_starts_from_given_weights_of_the_same_shape(tmp_path, monkeypatch, capsys):
     def run(name, hidden, *more):
         folders = ["--data", str(tmp_path / "d"), "--validation", str(tmp_path / "v"), "--output", str(tmp_path / name)]
@@ -217,6 +308,28 @@ def test_training_starts_from_given_weights_of_the_same_shape(tmp_path, monkeypa
     assert all(torch.allclose(first[name], second[name], atol=1e-4) for name in first)
     assert run("third", "12", "--start", str(tmp_path / "first" / "best.pt")) == 1
     assert "hidden=12" in capsys.readouterr().err
+
+
+def test_small_weights_are_half_of_the_average_and_training_goes_on_from_them(tmp_path, monkeypatch, capsys):
+    def run(name, *more):
+        folders = ["--data", str(tmp_path / "d"), "--validation", str(tmp_path / "v"), "--output", str(tmp_path / name)]
+        small = ["--hop", "32", "--channels", "4", "4", "4", "4", "--hidden", "8", "--smoke"]
+        monkeypatch.setattr("sys.argv", ["train", *folders, *small, *more])
+        return train.main()
+
+    assert run("first") == 0
+    last, weights = tmp_path / "first" / "last.pt", tmp_path / "weights.pt"
+    monkeypatch.setattr("sys.argv", ["checkpoint", str(last), "--output", str(weights)])
+    assert checkpoint.main() == 0
+    full, half = (torch.load(path, weights_only=True) for path in (last, weights))
+    assert half["network"].keys() == full["network"].keys() and "resume" not in half and half["step"] == 4
+    for name, value in half["network"].items():
+        assert value.dtype == torch.float16 and torch.allclose(value.float(), full["network"][name], atol=2e-3)
+    assert weights.stat().st_size < 0.3 * last.stat().st_size
+    assert run("second", "--start", str(weights)) == 0
+    monkeypatch.setattr(checkpoint, "MOST_BYTES", 1000)
+    monkeypatch.setattr("sys.argv", ["checkpoint", str(last), "--output", str(weights)])
+    assert checkpoint.main() == 1 and "expected at most" in capsys.readouterr().err and not weights.exists()
 
 
 def test_the_papers_network_trains_too(tmp_path, monkeypatch):

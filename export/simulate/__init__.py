@@ -1,0 +1,1 @@
+"""Conversations with a robot, simulated from speech, rooms, noises and physical effects."""

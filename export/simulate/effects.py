@@ -1,0 +1,80 @@
+"""Effects of the catalogue with values at random, for the simulated robot."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from edgefilter.echo.measurement import Values
+from edgefilter.types import SAMPLE_RATE, Array
+
+PATH_CHANGE = 0.3
+"""Share of wide items in which the path changes on the way."""
+
+
+def draw_effects(
+    rng: np.random.Generator, share: float, wideness: float, seconds: float
+) -> tuple[tuple[str, Values], ...]:
+    """None, one or two effects that are nobody's defect in particular, and now and then a path that changes."""
+    names: list[str] = []
+    if rng.random() < share:
+        names += [str(name) for name in rng.choice(list(DRAWN), size=int(rng.integers(1, 3)), replace=False)]
+    drawn = tuple((name, DRAWN[name](rng, seconds)) for name in names)
+    if rng.random() < wideness * PATH_CHANGE:
+        drawn += (("path_change", _path_change(rng, seconds)),)
+    return drawn
+
+
+def _decay(rng: np.random.Generator, rt60_s: float, level_db: float, samples: int) -> Array:
+    """(samples,) of noise that decays by 60 dB in rt60_s, its energy level_db over a unit impulse."""
+    taps = rng.standard_normal(samples) * 10 ** (-3 * np.arange(samples) / (rt60_s * SAMPLE_RATE))
+    return 10 ** (level_db / 20) * taps / np.linalg.norm(taps)
+
+
+def _path_change(rng: np.random.Generator, seconds: float) -> Values:
+    taps = _decay(rng, rng.uniform(0.02, 0.3), rng.uniform(-20, 0), 2048)
+    return {"time_s": rng.uniform(0.2, 0.9) * seconds, "duration_s": rng.uniform(0.01, 1.0), "taps": taps}
+
+
+def _late_reverb(rng: np.random.Generator, seconds: float) -> Values:
+    rt60_s, level_db = rng.uniform(0.2, 1.0), rng.uniform(-20, -5)
+    return {"rt60_s": rt60_s, "level_db": level_db, "taps": _decay(rng, rt60_s, level_db, 6000)}
+
+
+def _chassis_resonance(rng: np.random.Generator, seconds: float) -> Values:
+    return {
+        "frequency_hz": 10 ** rng.uniform(2.0, 3.6),
+        "q": 10 ** rng.uniform(0.7, 2.0),
+        "gain_db": rng.uniform(-25, -3),
+        "phase_deg": rng.uniform(-180, 180),
+    }
+
+
+def _compression(rng: np.random.Generator, seconds: float) -> Values:
+    return {
+        "threshold_db": rng.uniform(-40, -15),
+        "ratio": rng.uniform(1.5, 8),
+        "attack_ms": rng.uniform(1, 50),
+        "release_ms": rng.uniform(50, 600),
+    }
+
+
+def _bandlimit(rng: np.random.Generator, seconds: float) -> Values:
+    return {"cutoff_hz": rng.uniform(3000, 7500), "order": float(rng.integers(2, 9))}
+
+
+def _delay_jump(rng: np.random.Generator, seconds: float) -> Values:
+    steps = int(rng.integers(1, 3))
+    return {"times_s": np.sort(rng.uniform(1.0, seconds, steps)), "samples": rng.uniform(-400, 400, steps)}
+
+
+DRAWN: dict[str, Callable[[np.random.Generator, float], Values]] = {
+    "late_reverb": _late_reverb,
+    "chassis_resonance": _chassis_resonance,
+    "compression": _compression,
+    "bandlimit": _bandlimit,
+    "delay_jump": _delay_jump,
+}
+"""Effects that act on the robot alone; distortion, rattle, volume and drift are drawn for themselves, and what acts on
+the whole microphone is in microphone.py."""

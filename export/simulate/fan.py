@@ -1,0 +1,77 @@
+"""What else the microphone hears: the robot's fan, steady or changing its speed, recorded noises, people in the background."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from scipy import signal
+
+from edgefilter.dsp.stft import StftConfig
+from edgefilter.profile.data import GRID_BINS, GRID_HZ
+from edgefilter.types import SAMPLE_RATE, Samples
+from export.simulate.loudspeaker import active_rms
+from export.simulate.material import Material
+
+CHANGING, RECORDED, BACKGROUND, TALKERS = 0.2, 0.3, 0.2, 0.4
+"""Shares of wide items whose fan changes its speed, whose fan is a recording, with something sounding in the background
+besides, and, of the last, those in which that is people."""
+
+
+def noise(
+    rng: np.random.Generator, material: Material, samples: int, rms: float, human_rms: float, wideness: float
+) -> tuple[Samples, Samples]:
+    """Noise (n,) with a fan of that RMS, and the fan's one-sided PSD (601,) on GRID_HZ as a calibration would find it."""
+    sound, psd = fan(rng, samples, rms)
+    changing, recorded, background, talkers = rng.random(4)
+    if recorded < wideness * RECORDED and material.noises:
+        sound = material.noise(rng, samples)
+        sound = rms / max(float(np.sqrt(np.mean(sound**2))), 1e-9) * sound
+        psd = _psd(sound)
+    if changing < wideness * CHANGING:
+        sound = sound * _speed(rng, samples)
+    if background < wideness * BACKGROUND:
+        added = _people(rng, material, samples) if talkers < TALKERS else material.noise(rng, samples)
+        if added is not None:
+            sound = sound + human_rms * 10 ** (-rng.uniform(5, 30) / 20) / max(active_rms(added), 1e-9) * added
+    return sound.astype(np.float32), psd
+
+
+def fan(rng: np.random.Generator, samples: int, rms: float) -> tuple[Samples, Samples]:
+    """Fan noise (n,) of that RMS and its PSD: falling, with bumps and a few blade lines."""
+    corner = 10 ** rng.uniform(math.log10(150), math.log10(4000))
+    level_db = -10 * rng.uniform(0.6, 1.6) * np.log10(1 + (GRID_HZ / corner) ** 2)
+    for centre in 10 ** rng.uniform(math.log10(60), math.log10(6000), size=5):
+        level_db += rng.uniform(-4, 7) * np.exp(-0.5 * (np.log2((GRID_HZ + 1) / centre) / rng.uniform(0.15, 0.5)) ** 2)
+    blade = rng.uniform(80, 400)
+    for line in range(1, int(rng.integers(1, 5))):
+        level_db += rng.uniform(0, 10) * np.exp(-0.5 * ((GRID_HZ - line * blade) / 12.0) ** 2)
+    amplitude = 10 ** (np.maximum(level_db, -45) / 20)
+    taps = signal.firwin2(1023, np.linspace(0, 1, GRID_BINS), amplitude)
+    white = rng.standard_normal(samples + taps.size - 1)
+    sound = signal.oaconvolve(white, taps, mode="valid")
+    scale = rms / math.sqrt(np.mean(sound**2))
+    response = np.abs(np.fft.rfft(taps, 2 * (GRID_BINS - 1)))[:GRID_BINS]
+    return (scale * sound).astype(np.float32), (2 / SAMPLE_RATE * (scale * response) ** 2).astype(np.float32)
+
+
+def _speed(rng: np.random.Generator, samples: int) -> Samples:
+    """Gain (n,) of a fan that is turned up or down by as much as 8 dB within 0.3 to 4 s."""
+    at, lasts = rng.uniform(0.1, 0.8) * samples, rng.uniform(0.3, 4.0) * SAMPLE_RATE
+    return 10 ** (rng.uniform(-8, 8) / 20 * np.clip((np.arange(samples) - at) / lasts, 0, 1))
+
+
+def _people(rng: np.random.Generator, material: Material, samples: int) -> Samples:
+    """Three to six humans at once (n,), too far away for a microphone to make out one."""
+    total = np.zeros(samples, np.float32)
+    for _ in range(int(rng.integers(3, 7))):
+        speech = material.humans.draw(rng, material.humans.draw_speaker(rng), min(6.0, samples / SAMPLE_RATE))
+        total += np.roll(np.resize(speech, samples), int(rng.integers(samples)))
+    tail = rng.standard_normal(4000) * np.exp(-np.arange(4000) / 900)
+    return signal.oaconvolve(total, tail)[:samples].astype(np.float32)
+
+
+def _psd(sound: Samples) -> Samples:
+    """(601,) one-sided PSD of a recording on GRID_HZ."""
+    density = signal.welch(sound, SAMPLE_RATE, nperseg=StftConfig().n_fft)
+    return np.interp(GRID_HZ, *density).astype(np.float32)

@@ -1,0 +1,165 @@
+"""The running filter's own front over a simulated conversation, in settings as wide as its errors are in reality."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Protocol
+
+import numpy as np
+
+from edgefilter.dsp.stft import Analyser, StftConfig, Synthesiser
+from edgefilter.engines.linear import Linear
+from edgefilter.filter.canceller import COLD, WARM, Adaptation, Canceller, CancellerOutput
+from edgefilter.filter.echo_path import EchoPath
+from edgefilter.filter.front_end import FrontEnd, low_cut
+from edgefilter.filter.onset_gate import GATE
+from edgefilter.profile.data import Profile
+from edgefilter.types import Samples
+
+LOUDNESS_STEP_DB, LEAST_DB = 0.5, -90.0
+"""Power spectra are kept as one byte a bin: steps of so many dB from there on, to +37.5 dB."""
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One linear stage. taps, adaptation: None for the running filter's own choice.
+
+    missing_db: what is missing of its echo estimate, over that estimate, None for nothing; infinite where the reference
+    was never found: the error is then the microphone. missing_taps: of the filter that makes it.
+    """
+
+    taps: int | None = None
+    adaptation: Adaptation | None = None
+    missing_db: float | None = None
+    missing_taps: int = 64
+
+
+class Setting(Protocol):
+    """Draws the linear stage of an item."""
+
+    def draw(self, rng: np.random.Generator, warm: bool) -> Stage: ...
+
+
+@dataclass(frozen=True)
+class BenchSetting:
+    """The running filter as it is."""
+
+    def draw(self, rng: np.random.Generator, warm: bool) -> Stage:
+        return Stage()
+
+
+@dataclass(frozen=True)
+class WideSetting:
+    """Shares of items whose linear stage is another one; a network that has seen one setting only follows its quirks.
+
+    own: as it is. products, posterior: of the others, each switched to the contrary. taps: (least, most), as powers of
+    two. weakened: echo estimates of which missing_db is missing, so that ERLE is 3 to 25 dB. lost: the reference was
+    never found.
+    """
+
+    own: float = 0.5
+    products: float = 0.4
+    posterior: float = 0.4
+    taps: tuple[int, int] = (1024, 8192)
+    weakened: float = 0.25
+    missing_db: tuple[float, float] = (-25.0, -3.0)
+    lost: float = 0.05
+
+    def draw(self, rng: np.random.Generator, warm: bool) -> Stage:
+        stage = Stage()
+        if rng.random() >= self.own:
+            usual = WARM if warm else COLD
+            adaptation = replace(
+                usual,
+                products=usual.products != (rng.random() < self.products),
+                posterior=usual.posterior != (rng.random() < self.posterior),
+            )
+            stage = Stage(int(2 ** rng.uniform(*np.log2(self.taps))), adaptation)
+        drawn, missing = rng.random(), rng.uniform(*self.missing_db)
+        if drawn < self.lost:
+            return replace(stage, missing_db=np.inf)
+        if drawn < self.lost + self.weakened:
+            return replace(stage, missing_db=missing, missing_taps=int(2 ** rng.uniform(0, 9)))
+        return stage
+
+
+class WeakCanceller(Canceller):
+    """A canceller whose echo estimate lacks a part, filtered at random: misalignment that it does not know of."""
+
+    def __init__(self, usual: Canceller, profile: Profile | None, stage: Stage, rng: np.random.Generator) -> None:
+        response = profile.echo.running_response() if profile else None
+        super().__init__(usual.hop, stage.taps or usual.taps, response, stage.adaptation or usual.adaptation)
+        self._never = stage.missing_db == np.inf
+        taps = rng.standard_normal(stage.missing_taps)
+        missing_db = -np.inf if stage.missing_db is None or self._never else stage.missing_db
+        self._missing = 10 ** (missing_db / 20) * taps / np.linalg.norm(taps)
+        self._past = np.zeros(taps.size - 1 + self.hop, np.float32)
+
+    def step(self, mic: Samples, reference: Samples, located: bool = True) -> CancellerOutput:
+        echo, error, uncertainty, innovation = super().step(mic, reference, located)
+        if self._never:
+            return CancellerOutput(np.zeros_like(echo), mic.copy(), uncertainty, innovation)
+        self._past = np.concatenate((self._past[self.hop :], echo))
+        part = np.convolve(self._past, self._missing, "valid").astype(np.float32)
+        return CancellerOutput(echo - part, error + part, uncertainty, innovation)
+
+
+def front_end(stage: Stage, profile: Profile | None, stft: StftConfig, rng: np.random.Generator) -> FrontEnd:
+    """The running filter's front with that linear stage."""
+    front = FrontEnd(Linear(stft), profile)
+    assert front.linear_stage is not None
+    if stage != Stage():
+        path = front.linear_stage.path
+        front.linear_stage.path = EchoPath(WeakCanceller(path.canceller, profile, stage, rng), path.effects)
+    return front
+
+
+@dataclass(frozen=True, eq=False)
+class Heard:
+    """What an engine gets, as sound: mic, reference, error, clean (n,) float32, n a multiple of the hop.
+
+    noise, residual: (n / hop, bins) uint8 by `to_bytes`; row t belongs to the frame whose last sample is (t + 1) hop.
+    clean has the gate's gain and the low cut of a front without a profile, which nothing after them can undo.
+    """
+
+    mic: Samples
+    reference: Samples
+    error: Samples
+    clean: Samples
+    noise: np.ndarray
+    residual: np.ndarray
+
+
+def listen(front: FrontEnd, mic: Samples, reference: Samples, clean: Samples, stft: StftConfig) -> Heard:
+    """Run the front over a conversation, (n,) each, and put its frames together to sound again.
+
+    The synthesis is the inverse of the analysis, so that frames cut from that sound are the engine's own, but for bins
+    beside a low cut.
+    """
+    hop, hops = stft.hop, mic.size // stft.hop
+    own, voices = Analyser(stft), [Synthesiser(stft) for _ in range(4)]
+    cut = low_cut(stft) if front.gate is None else np.ones(stft.bins, np.float32)
+    sound = np.zeros((4, (hops + 1) * hop), np.float32)
+    noise, residual = np.zeros((2, hops, stft.bins), np.uint8)
+    inputs = np.stack([np.append(x[: hops * hop], np.zeros(hop, np.float32)) for x in (mic, reference, clean)])
+    for t in range(hops + 1):
+        at = slice(t * hop, (t + 1) * hop)
+        frame, _ = front.step(inputs[0, at], inputs[1, at])
+        human = inputs[2, at] * np.float32(GATE if front.gate and front.gate.shut else 1.0)
+        spectra = frame.mic, frame.reference, frame.error, cut * own.push(human)[0]
+        for row, voice, spectrum in zip(sound, voices, spectra):
+            row[at] = voice.push(spectrum)
+        if t < hops:
+            noise[t], residual[t] = to_bytes(frame.noise_psd), to_bytes(frame.residual_psd)
+    return Heard(*sound[:, hop:], noise, residual)
+
+
+def to_bytes(power: Samples) -> np.ndarray:
+    """Power spectra as uint8, LOUDNESS_STEP_DB a step."""
+    level_db = 10 * np.log10(power + 1e-12)
+    return np.clip(np.rint((level_db - LEAST_DB) / LOUDNESS_STEP_DB), 0, 255).astype(np.uint8)
+
+
+def from_bytes(level: np.ndarray) -> Samples:
+    """The inverse of to_bytes, to half a step."""
+    return (10 ** ((LEAST_DB + LOUDNESS_STEP_DB * np.arange(256)) / 10)).astype(np.float32)[level]

@@ -1,0 +1,56 @@
+"""Who says what and when."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import signal
+
+from edgefilter.types import SAMPLE_RATE, Samples
+from export.corpus import Corpus
+from export.simulate.recipe import Recipe
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """The robot's: told to the player (n,), played by it (n,) with lag and volume, and the utterances' [start, end] in told."""
+
+    told: Samples
+    played: Samples
+    utterances: tuple[tuple[int, int], ...]
+
+
+def robot(rng: np.random.Generator, recipe: Recipe, voices: Corpus, samples: int, moving: bool) -> Part:
+    """Utterance after utterance, each 2 to 7 s; moving: with a lag and a volume of its own."""
+    voice = voices.draw_speaker(rng)
+    told, played = np.zeros((2, samples), np.float32)
+    utterances: list[tuple[int, int]] = []
+    lag = int(rng.uniform(0.0, 0.3) * SAMPLE_RATE)
+    at = int(rng.uniform(0.0, 0.6) * SAMPLE_RATE) if recipe.seconds > 5 else 0
+    volume = 1.0
+    while at < samples - SAMPLE_RATE // 2:
+        speech = voices.draw(rng, voice, rng.uniform(2.0, 7.0))[: samples - at]
+        told[at : at + speech.size] = speech
+        end = min(samples, at + lag + speech.size)
+        played[at + lag : end] += volume * speech[: max(0, end - at - lag)]
+        utterances.append((at, at + speech.size))
+        new_lag = int(rng.uniform(*recipe.lag_s) * SAMPLE_RATE) if moving else lag
+        at += speech.size + int(rng.uniform(0.3, 1.2) * SAMPLE_RATE) + max(0, lag - new_lag)
+        volume = 10 ** (rng.uniform(*recipe.volume_db) / 20) if moving else 1.0
+        lag = new_lag
+    return Part(told, played, tuple(utterances))
+
+
+def human(rng: np.random.Generator, recipe: Recipe, humans: Corpus, response: Samples, samples: int) -> Samples:
+    """The human at the microphone (n,): silent at first, then one or more utterances; now and then nobody speaks."""
+    clean = np.zeros(samples, np.float32)
+    if rng.random() >= recipe.human:
+        return clean
+    at = int(rng.uniform(*recipe.silence_s) * SAMPLE_RATE)
+    speaker = humans.draw_speaker(rng)
+    while at < samples - SAMPLE_RATE:
+        speech = humans.draw(rng, speaker, rng.uniform(1.5, 7.0))[: samples - at]
+        clean[at : at + speech.size] += speech
+        at += speech.size + int(rng.uniform(0.5, 3.0) * SAMPLE_RATE)
+    return signal.oaconvolve(clean, response)[:samples].astype(np.float32)
