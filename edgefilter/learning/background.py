@@ -54,7 +54,7 @@ class BackgroundLearner:
         self._ring = SharedHops(hop, self.past)
         command = [sys.executable, "-m", "edgefilter.learning.worker", self._ring.name]
         environment = {**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
-        self._process = subprocess.Popen(command, stdin=subprocess.PIPE, env=environment)
+        self._process = subprocess.Popen(command, stdin=subprocess.PIPE, env=environment, start_new_session=True)
         self._finalizer = weakref.finalize(self, _end, self._process, self._ring)
         send(self._process, (path, hop, self._profile, self._remember))
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import os
 import pickle
+import signal
 import struct
 import sys
 import threading
@@ -27,6 +28,8 @@ MARGIN = 64
 
 def main() -> None:
     """Run until the other side closes standard input."""
+    for number in (signal.SIGINT, signal.SIGTERM):  # meant for the filter, which then closes standard input
+        signal.signal(number, signal.SIG_IGN)
     if hasattr(os, "nice"):
         os.nice(NICE)
     told = sys.stdin.buffer

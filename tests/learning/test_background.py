@@ -1,5 +1,6 @@
 """Learning in another process: the same lessons, late, and a filter that does without them where it must."""
 
+import signal
 import time
 
 import numpy as np
@@ -41,6 +42,8 @@ def test_it_learns_what_the_learner_in_this_process_does(scene, tmp_path):
     out = feed(ego, learner, scene)
     kinds = [event.kind for event in ego.events()]
     assert "learned" in kinds
+    for number in (signal.SIGINT, signal.SIGTERM):  # Ctrl-C and a stopped service reach the whole group
+        learner._process.send_signal(number)
     stats = ego.stats()["learning"]
     assert stats["cpu_s"] > 0
     assert stats["memory_mb"] > 0

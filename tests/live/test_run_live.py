@@ -11,6 +11,9 @@ import numpy as np
 import pytest
 import soundfile
 
+from edgefilter import Profile
+from tests.learning.scenes import Scene
+
 ROOT = Path(__file__).parents[2]
 DEMO = ROOT / "edgefilter/demo_data"
 
@@ -47,7 +50,7 @@ def db(x):
 def test_live_run_takes_the_monitor_ends_by_ctrl_c_and_equals_the_file_path(server, conversation, tmp_path):
     command = edgefilter(
         "run", "--input", "mic", "--profile", DEMO / "profile.npz", "--output", tmp_path / "live.wav", "--engine", "ss",
-        "--save-input", tmp_path / "heard", "--json", tmp_path / "stats.json",
+        "--save-input", tmp_path / "heard", "--json", tmp_path / "stats.json", "--no-learn",
     )  # fmt: skip
     live = subprocess.Popen(command, env=server.environment, cwd=ROOT, stderr=subprocess.PIPE, text=True)
     heard = tmp_path / "heard/mic.wav"
@@ -72,7 +75,7 @@ def test_live_run_takes_the_monitor_ends_by_ctrl_c_and_equals_the_file_path(serv
     assert db(mic) > -60 and db(ref) > -60
     again = edgefilter(
         "run", "--input", heard, "--reference", tmp_path / "heard/reference.wav", "--profile", DEMO / "profile.npz",
-        "--output", tmp_path / "file.wav", "--engine", "ss",
+        "--output", tmp_path / "file.wav", "--engine", "ss", "--no-learn",
     )  # fmt: skip
     subprocess.run(again, cwd=ROOT, check=True, capture_output=True)
     assert (tmp_path / "file.wav").read_bytes() == (tmp_path / "live.wav").read_bytes()
@@ -82,6 +85,32 @@ def test_live_run_takes_the_monitor_ends_by_ctrl_c_and_equals_the_file_path(serv
     assert (
         db(out[speech]) < db(mic[speech]) - 15
     )  # 25 dB were seen; the players start the two channels at different times
+
+
+def test_live_the_loudspeaker_is_learned_by_another_process_and_remembered(server, tmp_path):
+    scene = Scene(seconds=9.0)
+    for sink, sound in (("robot", scene.reference), ("robot_mic", scene.mic)):
+        soundfile.write(tmp_path / f"{sink}.wav", sound, 16_000, "PCM_16")
+    file = tmp_path / "robot.npz"
+    command = edgefilter(
+        "run", "--input", "mic", "--output", tmp_path / "live.wav", "--engine", "linear", "--learn", file,
+        "--json", tmp_path / "stats.json", "--save-input", tmp_path / "heard",
+    )  # fmt: skip
+    live = subprocess.Popen(command, env=server.environment, cwd=ROOT, stderr=subprocess.PIPE, text=True)
+    heard = tmp_path / "heard/mic.wav"
+    for _ in range(300):
+        if heard.exists() and heard.stat().st_size > 10_000:
+            break
+        time.sleep(0.1)
+    for player in play(server, tmp_path):
+        assert player.wait(timeout=60) == 0
+    time.sleep(1.0)
+    live.send_signal(signal.SIGINT)
+    _, said = live.communicate(timeout=60)
+    assert live.returncode == 0 and "Traceback" not in said, said
+    learning = json.loads((tmp_path / "stats.json").read_text())["learning"]
+    assert learning["process"] == "running" and learning["heard_s"] > 4 and learning["rounds"] > 0
+    assert Profile.load(file).learned
 
 
 def run_for(server, seconds, tmp_path, *more):
