@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,6 +14,7 @@ from edgefilter.echo.effect import complete, vanishes
 from edgefilter.echo.effects.catalogue import EFFECTS, find
 from edgefilter.echo.measurement import Measurement
 from edgefilter.echo.model import EchoModel
+from edgefilter.errors import ProfileError
 from edgefilter.filter.canceller import COLD, Canceller
 from edgefilter.filter.echo_path import TAPS, EchoPath, Effects, PathState, starting_path
 from edgefilter.filter.learner import Heard, Lesson
@@ -104,7 +106,8 @@ class PathLearner:
         if audible and self._audible_s >= self._next_s:
             self._next_s = min(self._next_s * FACTOR, self._next_s + EVERY_S)
             self._rivals = [rival for rival in self._rivals if rival.stays] + self._candidates()
-            self._keep()
+            with suppress(ProfileError):  # it is tried again, and told of, at the end; the sound goes on
+                self._keep()
         return None
 
     def stats(self) -> dict[str, object]:

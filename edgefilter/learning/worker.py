@@ -15,6 +15,7 @@ import sys
 import threading
 import time
 
+from edgefilter.errors import EdgefilterError
 from edgefilter.learning.path_learner import PathLearner
 from edgefilter.learning.shared import HOPS, PAST, SharedHops
 from edgefilter.session import peak_memory_mb
@@ -33,7 +34,10 @@ def main() -> None:
     if hasattr(os, "nice"):
         os.nice(NICE)
     told = sys.stdin.buffer
-    path, hop, profile, remember = pickle.loads(told.read(struct.unpack("<q", told.read(8))[0]))
+    length = told.read(8)
+    if len(length) < 8:
+        return
+    path, hop, profile, remember = pickle.loads(told.read(struct.unpack("<q", length)[0]))
     ring = SharedHops(hop, PAST, sys.argv[1])
     ring.unlink()
     over = threading.Event()
@@ -58,7 +62,10 @@ def main() -> None:
         used = {"cpu_s": round(time.process_time(), 2), "memory_mb": peak_memory_mb()}
         ring.report({**learner.stats(), **used, "hops": at, "fell_behind": behind})
         over.wait(PAUSE_S)
-    learner.close()
+    try:
+        learner.close()
+    except EdgefilterError as error:
+        print(f"edgefilter: {error}", file=sys.stderr)
 
 
 if __name__ == "__main__":

@@ -112,11 +112,11 @@ def test_too_little_of_the_robot_is_not_remembered(tmp_path):
     assert not file.exists()
 
 
-def test_a_file_that_cannot_be_written_is_an_error_and_leaves_the_old_one(alone, tmp_path):
-    missing = tmp_path / "nowhere" / "robot.npz"
-    learner = PathLearner(remember=missing)
+def test_a_file_that_cannot_be_written_is_told_of_at_the_end_and_no_sample_is_lost(alone, tmp_path):
+    out, _, ego = run(alone, PathLearner(remember=tmp_path / "nowhere" / "robot.npz"))
+    assert out.size == alone.mic.size
     with pytest.raises(ProfileError, match="nowhere"):
-        run(alone, learner)[2].close()
+        ego.close()
 
 
 def test_a_profile_goes_on_from_what_is_in_use(alone):
