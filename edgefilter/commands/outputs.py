@@ -25,7 +25,7 @@ READ = (
     "noise_recording",
 )
 """Options that may name a file to read; a name that is no file, such as a device's, cannot be overwritten."""
-WRITTEN = ("output", "json", "report", "save_profile", "apply", "plot")
+WRITTEN = ("output", "json", "report", "save_profile", "learn", "apply", "plot")
 """Options that may name a file to write."""
 FOLDERS: dict[tuple[str, str], tuple[str, ...]] = {
     ("run", "save_input"): ("mic.wav", "reference.wav"),

@@ -95,6 +95,18 @@ def barge_in() -> dict:
     }
 
 
+def learned(kind: str, room: str) -> list[float]:
+    """SI-SDR in dB and capped word errors in % of `crnn`, without and with learning."""
+    found = result("learning_moderate")["summary"][kind][room]
+    return [found[row][key] for row in ("crnn", "crnn-learning") for key in ("si_sdr_mean", "wer_capped")]
+
+
+def learned_really() -> list[float]:
+    """The same on the real loudspeaker."""
+    found = result("learning_real")["summary"]
+    return [x for row in ("crnn", "crnn-learning") for x in (found[row]["si_sdr"], 100 * found[row]["wer_capped"])]
+
+
 def utterances() -> list[dict]:
     return [row for block in result("alignment")["lags"].values() for row in block["rows"]]
 
@@ -162,6 +174,18 @@ FIGURES: dict[str, tuple[tuple[str, ...], Callable[[], object]]] = {
         lambda: [
             x for kind in ("paper", "live") for room in ("lab", "office") for x in quality("shared", kind, room, "crnn")
         ],
+    ),
+    rf"learning takes `crnn` from {NUMBER} / {NUMBER} to {NUMBER} / {NUMBER} in the lab, "
+    rf"from {NUMBER} / {NUMBER} to {NUMBER} / {NUMBER} in the office, live from {NUMBER} / {NUMBER} to {NUMBER} / {NUMBER} "
+    rf"and from {NUMBER} / {NUMBER} to {NUMBER} / {NUMBER}; on the real": (
+        ("learning_moderate",),
+        lambda: [
+            x for kind in ("moderate_paper", "moderate_live") for room in ("lab", "office") for x in learned(kind, room)
+        ],
+    ),
+    rf"on the real loudspeaker from {NUMBER} / {NUMBER} to {NUMBER} / {NUMBER}": (
+        ("learning_real",),
+        lambda: learned_really(),
     ),
     rf"[Aa]ligned {NUMBER} ms \(median\) after its first sound": (("alignment",), lambda: [time_to_align()]),
     rf"p50 / p99: `ss` {NUMBER} / {NUMBER} ms, `crnn` {NUMBER} / {NUMBER} ms": (

@@ -21,7 +21,7 @@ from tests.diagnosis.robot_scene import profile
 
 NEITHER = {
     "help", "version", "debug", "command", "word", "engine", "budget_ms", "remeasure", "seconds", "quiet", "stepped_sine", "live",
-    "speaker", "level_db", "effect", "force",
+    "speaker", "level_db", "effect", "force", "no_learn",
 }  # fmt: skip
 
 
@@ -119,7 +119,7 @@ def every_pair():
         ("remove playback_gain", ["--profile", "robot.npz", "--effects", "own.py"], ("--json", "--output")),
         ("calibrate", sweep, ("--json", "--output")),
         ("profile show", ["robot.npz", "--effects", "own.py"], ("--json", "--plot")),
-        ("run", filtered, ("--json", "--output", "--save-profile")),
+        ("run", filtered, ("--json", "--output", "--save-profile", "--learn")),
     ):
         for output in outputs:
             for file in [word for word in given if "." in word]:

@@ -31,7 +31,7 @@ def test_what_a_run_learns_is_kept_and_the_next_begins_with_it(folder, capsys):
     file = folder / "robot.npz"
     code, first = run(folder, "--learn", str(file))
     assert code == 0
-    assert first["learning"]["remembered"] > 0
+    assert first["learning"]["learned"] > 0
     assert "learned" in {event["kind"] for event in first["events"]}
     assert "dB less is left of the robot" in capsys.readouterr().err
     assert Profile.load(file).learned
