@@ -14,8 +14,6 @@ from edgefilter.commands.display import describe_latency, write_json
 from edgefilter.dsp.metrics import si_sdr
 from edgefilter.engines import NEEDS_PROFILE
 from edgefilter.filter.ego_filter import EgoFilter, enhance
-from edgefilter.learning.path_learner import PathLearner
-from edgefilter.profile.data import Profile
 from edgefilter.session import filter_blocks
 from edgefilter.types import SAMPLE_RATE, Samples
 
@@ -25,8 +23,7 @@ DATA = Path(__file__).parents[1] / "demo_data"
 def main(args: argparse.Namespace) -> int:
     folder = Path(args.output)
     folder.mkdir(parents=True, exist_ok=True)
-    profile = Profile.load(DATA / "profile.npz")
-    ego = EgoFilter(profile, args.engine, learn=PathLearner(profile))
+    ego = EgoFilter(DATA / "profile.npz", args.engine)
     filtered = folder / "filtered.wav"
     with FileSource(DATA / "mic.flac", DATA / "reference.flac") as source, FileSink(filtered) as sink:
         report = filter_blocks(source, ego, sink)
@@ -52,11 +49,7 @@ def scores(filtered: Samples, engine: str) -> dict[str, float | None]:
     human, mic, ref = (_read(DATA / f"{name}.flac") for name in ("human", "mic", "reference"))
     speaking = np.flatnonzero(human)
     span = slice(speaking[0], speaking[-1] + 1)
-    cold = (
-        None
-        if engine in NEEDS_PROFILE
-        else si_sdr(enhance(mic, ref, None, engine, learn=PathLearner())[span], human[span])
-    )
+    cold = None if engine in NEEDS_PROFILE else si_sdr(enhance(mic, ref, None, engine)[span], human[span])
     return {
         "si_sdr_before_db": si_sdr(mic[span], human[span]),
         "si_sdr_after_db": si_sdr(filtered[span], human[span]),

@@ -197,8 +197,9 @@ def test_a_jump_stays_with_its_recording_through_the_files_and_add_says_so(tmp_p
         return capsys.readouterr().out
 
     out = run("add delay_jump", "mic.wav", "robot.npz", "--output", str(tmp_path / "knowing.npz"))
-    (note,) = [line for line in out.splitlines() if line.startswith("NOTE")]
-    assert "delay_jump happened in this recording" in note and "fingerprint" not in out
+    happened, at_run_time = [line for line in out.splitlines() if line.startswith("NOTE")]
+    assert "delay_jump happened in this recording" in happened and "fingerprint" not in out
+    assert "the running filter" in at_run_time
     assert Profile.load(tmp_path / "knowing.npz").echo.effects[0][1]["recording"] > 0
     told = {
         name: json.loads(run("compare", f"{name}.wav", "knowing.npz", "--json", "-"))["excess_db"]

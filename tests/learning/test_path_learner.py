@@ -54,12 +54,12 @@ def test_the_same_recording_teaches_the_same_whatever_the_blocks(alone):
 @pytest.mark.parametrize(
     "scene",
     [
-        Scene(volume=0.4),
-        Scene(moved=23),
-        Scene(lag=1700),
-        Scene(ppm=100.0),
-        Scene(human_db=-10.0),
-        Scene(human_db=0.0, repeats=True),
+        Scene(8.0, volume=0.4),
+        Scene(8.0, moved=23),
+        Scene(8.0, lag=1700),
+        Scene(8.0, ppm=100.0),
+        Scene(8.0, human_db=-10.0),
+        Scene(8.0, human_db=0.0, repeats=True),
     ],
     ids=["volume", "moved", "lag", "drift", "human", "repeating human"],
 )
