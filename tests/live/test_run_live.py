@@ -43,6 +43,22 @@ def play(server, folder):
     ]
 
 
+def run_until_played(server, command, folder, heard):
+    """Start a live run, play the folder's sounds once the first samples are on disk at heard, end it by Ctrl-C; what it said."""
+    live = subprocess.Popen(command, env=server.environment, cwd=ROOT, stderr=subprocess.PIPE, text=True)
+    for _ in range(300):
+        if heard.exists() and heard.stat().st_size > 10_000:
+            break
+        time.sleep(0.1)
+    for player in play(server, folder):
+        assert player.wait(timeout=60) == 0
+    time.sleep(1.5)
+    live.send_signal(signal.SIGINT)
+    _, said = live.communicate(timeout=60)
+    assert live.returncode == 0 and "Traceback" not in said, said
+    return said
+
+
 def db(x):
     return 10 * np.log10(np.mean(np.square(x, dtype=np.float64)) + 1e-12)
 
@@ -52,18 +68,8 @@ def test_live_run_takes_the_monitor_ends_by_ctrl_c_and_equals_the_file_path(serv
         "run", "--input", "mic", "--profile", DEMO / "profile.npz", "--output", tmp_path / "live.wav", "--engine", "ss",
         "--save-input", tmp_path / "heard", "--json", tmp_path / "stats.json", "--no-learn",
     )  # fmt: skip
-    live = subprocess.Popen(command, env=server.environment, cwd=ROOT, stderr=subprocess.PIPE, text=True)
     heard = tmp_path / "heard/mic.wav"
-    for _ in range(300):  # until the first samples are on disk
-        if heard.exists() and heard.stat().st_size > 10_000:
-            break
-        time.sleep(0.1)
-    for player in play(server, conversation):
-        assert player.wait(timeout=60) == 0
-    time.sleep(1.5)
-    live.send_signal(signal.SIGINT)
-    _, said = live.communicate(timeout=60)
-    assert live.returncode == 0 and "Traceback" not in said, said
+    said = run_until_played(server, command, conversation, heard)
     assert "robot.monitor" in said
 
     stats = json.loads((tmp_path / "stats.json").read_text())
@@ -96,18 +102,7 @@ def test_live_the_loudspeaker_is_learned_by_another_process_and_remembered(serve
         "run", "--input", "mic", "--output", tmp_path / "live.wav", "--engine", "linear", "--learn", file,
         "--json", tmp_path / "stats.json", "--save-input", tmp_path / "heard",
     )  # fmt: skip
-    live = subprocess.Popen(command, env=server.environment, cwd=ROOT, stderr=subprocess.PIPE, text=True)
-    heard = tmp_path / "heard/mic.wav"
-    for _ in range(300):
-        if heard.exists() and heard.stat().st_size > 10_000:
-            break
-        time.sleep(0.1)
-    for player in play(server, tmp_path):
-        assert player.wait(timeout=60) == 0
-    time.sleep(1.0)
-    live.send_signal(signal.SIGINT)
-    _, said = live.communicate(timeout=60)
-    assert live.returncode == 0 and "Traceback" not in said, said
+    run_until_played(server, command, tmp_path, tmp_path / "heard/mic.wav")
     learning = json.loads((tmp_path / "stats.json").read_text())["learning"]
     assert learning["process"] == "running" and learning["heard_s"] > 4 and learning["rounds"] > 0
     assert Profile.load(file).learned
