@@ -38,8 +38,9 @@ ROOMS = {"lab": 1 / 3, "office": 1 / 2, "hall": 1 / 6}
 
 def pack(conversation: Conversation, stft: StftConfig, rng: np.random.Generator) -> dict[str, np.ndarray]:
     """The item's arrays: int16 at a scale at which the loudest sample is full. rng: for the linear stage's errors."""
-    front = front_end(conversation.stage, conversation.profile, stft, rng)
-    heard = listen(front, conversation.mic, conversation.reference, conversation.clean, stft)
+    front = front_end(conversation.stage, conversation.profile, stft, rng, learns=conversation.before > 0)
+    signals = conversation.mic, conversation.reference, conversation.clean
+    heard = listen(front, *signals, stft, conversation.before)
     signals = {"mic": heard.mic, "error": heard.error, "clean": heard.clean, "reference": heard.reference}
     peak = max(float(np.abs(signals[name]).max()) for name in ("mic", "error", "clean"))
     told = max(float(np.abs(heard.reference).max()), 1e-6)

@@ -32,7 +32,8 @@ LOUDEST = 0.95
 class Conversation:
     """mic, clean, reference: (n,) float32; clean is the human at the microphone.
 
-    Profile: of a calibration elsewhere, or None. stage: the linear stage that is to run over it.
+    Profile: of a calibration elsewhere, or None. stage: the linear stage that is to run over it. before: samples at the
+    beginning that are only there to be learned from.
     """
 
     mic: Samples
@@ -40,6 +41,7 @@ class Conversation:
     reference: Samples
     profile: Profile | None
     stage: Stage = Stage()
+    before: int = 0
     about: dict[str, object] = field(default_factory=dict)
 
 
@@ -57,7 +59,10 @@ def simulate(recipe: Recipe, seed: int, index: int, material: Material) -> Conve
     """Item `index` of that seed."""
     rng = np.random.default_rng([seed, index])
     if rng.random() < recipe.plain:
-        recipe = replace(BENCHMARK, effects=recipe.effects, effects_share=recipe.effects_share)
+        kept = {name: getattr(recipe, name) for name in ("effects", "effects_share", "later")}
+        recipe = replace(BENCHMARK, **kept)
+    before = round(recipe.seconds * SAMPLE_RATE) if rng.random() < recipe.later else 0
+    recipe = replace(recipe, seconds=recipe.seconds + before / SAMPLE_RATE)
     room = material.room(rng, _room_kind(rng, recipe))
     colour = path.device(rng, material, recipe.wideness)
     samples = round(recipe.seconds * SAMPLE_RATE)
@@ -82,8 +87,9 @@ def simulate(recipe: Recipe, seed: int, index: int, material: Material) -> Conve
         "profile": known,
         "human_over_robot_db": round(20 * float(np.log10(human_rms / level)), 1),
         "quiet_fan": bool(quiet),
+        "learned": bool(before),
     }
-    return Conversation(mic, clean, voice.reference, profile, stage, about | voice.about)
+    return Conversation(mic, clean, voice.reference, profile, stage, before, about | voice.about)
 
 
 def _room_kind(rng: np.random.Generator, recipe: Recipe) -> str:

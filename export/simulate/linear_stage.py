@@ -13,6 +13,7 @@ from edgefilter.filter.canceller import COLD, WARM, Adaptation, Canceller, Cance
 from edgefilter.filter.echo_path import EchoPath
 from edgefilter.filter.front_end import FrontEnd, low_cut
 from edgefilter.filter.onset_gate import GATE
+from edgefilter.learning.path_learner import PathLearner
 from edgefilter.profile.data import Profile
 from edgefilter.types import Samples
 
@@ -104,11 +105,14 @@ class WeakCanceller(Canceller):
         return CancellerOutput(echo - part, error + part, uncertainty, innovation)
 
 
-def front_end(stage: Stage, profile: Profile | None, stft: StftConfig, rng: np.random.Generator) -> FrontEnd:
-    """The running filter's front with that linear stage."""
-    front = FrontEnd(Linear(stft), profile)
+def front_end(
+    stage: Stage, profile: Profile | None, stft: StftConfig, rng: np.random.Generator, learns: bool = False
+) -> FrontEnd:
+    """The running filter's front with that linear stage; learns: while it runs, where the stage is the filter's own."""
+    own = stage == Stage()
+    front = FrontEnd(Linear(stft), profile, PathLearner(profile) if learns and own else None)
     assert front.linear_stage is not None
-    if stage != Stage():
+    if not own:
         path = front.linear_stage.path
         front.linear_stage.path = EchoPath(WeakCanceller(path.canceller, profile, stage, rng), path.effects)
     return front
@@ -130,8 +134,10 @@ class Heard:
     residual: np.ndarray
 
 
-def listen(front: FrontEnd, mic: Samples, reference: Samples, clean: Samples, stft: StftConfig) -> Heard:
-    """Run the front over a conversation, (n,) each, and put its frames together to sound again.
+def listen(
+    front: FrontEnd, mic: Samples, reference: Samples, clean: Samples, stft: StftConfig, before: int = 0
+) -> Heard:
+    """Run the front over a conversation, (n,) each, and put its frames together to sound again, without what was before.
 
     The synthesis is the inverse of the analysis, so that frames cut from that sound are the engine's own, but for bins
     beside a low cut.
@@ -151,7 +157,10 @@ def listen(front: FrontEnd, mic: Samples, reference: Samples, clean: Samples, st
             row[at] = voice.push(spectrum)
         if t < hops:
             noise[t], residual[t] = to_bytes(frame.noise_psd), to_bytes(frame.residual_psd)
-    return Heard(*sound[:, hop:], noise, residual)
+        if front.linear_stage:
+            front.linear_stage.learn()
+    left = before // hop
+    return Heard(*sound[:, (1 + left) * hop :], noise[left:], residual[left:])
 
 
 def to_bytes(power: Samples) -> np.ndarray:

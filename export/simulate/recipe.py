@@ -24,6 +24,8 @@ class Recipe:
     clock and volume change. far_human: the far end is a person instead of a voice from text. plain: drawn by the
     recipe BENCHMARK instead.
 
+    later: the filter has run for as long as the item already, and has learned meanwhile as it does in use.
+
     Apart from that. seconds: of one item. lag_s, ppm, volume_db: of moving items. silence_s: before the human speaks.
     kinds: of distortion, see loudspeaker.KINDS. wideness: of microphone, noise and path, 0 for none of their defects
     and 1 for the shares in microphone.py, fan.py and path.py. effects: (name, values) of a profile's effects, in
@@ -56,6 +58,7 @@ class Recipe:
     effects: tuple[tuple[str, Values], ...] = ()
     effects_share: float = 0.5
     catalogue: float = 0.0
+    later: float = 0.0
     setting: Setting = BenchSetting()
     plain: float = 0.0
 
@@ -94,6 +97,7 @@ WIDE = Recipe(
     distortion_db=(-45.0, -10.0),  # real loudspeakers leave -16 to -24 dB after the best linear filter
     wideness=1.0,
     catalogue=0.3,
+    later=0.15,  # what a robot hears after its first seconds; each costs ten times the simulation
     setting=WideSetting(),
     plain=0.3,  # what the benchmark measures must stay in the training
 )

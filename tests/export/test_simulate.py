@@ -9,6 +9,7 @@ import soundfile as sf
 from edgefilter.dsp.stft import StftConfig
 from edgefilter.errors import UsageError
 from export.corpus import Corpus, read_corpus
+from export.dataset import pack
 from export.rooms import draw_room
 from export.simulate.conversation import simulate
 from export.simulate.linear_stage import Stage, WideSetting, from_bytes, front_end, listen
@@ -67,10 +68,10 @@ def test_the_wide_recipe_has_every_kind():
 
 
 def test_wide_items_hold_loud_humans_silent_robots_and_every_kind_of_start(parts):
-    items = [simulate(replace(WIDE, plain=0.0, seconds=3.0), 8, index, parts) for index in range(40)]
+    items = [simulate(replace(WIDE, plain=0.0, seconds=3.0), 8, index, parts) for index in range(60)]
     assert {item.about["profile"] for item in items} == {"none", "right", "level", "device", "path"}
     loud = [item.about["human_over_robot_db"] > -8 for item in items]
-    assert 4 < sum(loud) < 24  # a third of 40, 4 standard deviations
+    assert 6 < sum(loud) < 35  # a third of 60, 4 standard deviations
     assert any(not item.reference.any() for item in items) and any(not item.clean.any() for item in items)
     assert max(np.abs(item.mic).max() for item in items) <= 1.0
     assert any(item.stage.missing_db is not None for item in items)
@@ -78,12 +79,31 @@ def test_wide_items_hold_loud_humans_silent_robots_and_every_kind_of_start(parts
 
 
 def test_a_robot_that_says_nothing_leaves_the_human_and_the_fan(parts):
-    alone = replace(
-        WIDE, plain=0.0, robot=0.0, human=1.0, near_share=0.0, fan_db=(40.0, 40.0), wideness=0.0, seconds=4.0
-    )
+    alone = replace(WIDE, plain=0.0, robot=0.0, human=1.0, near_share=0.0, fan_db=(40.0, 40.0), wideness=0.0)
+    alone = replace(alone, seconds=4.0, silence_s=(0.0, 1.0), later=0.0)
     item = simulate(alone, 6, 0, parts)
     rest = item.mic - item.clean
     assert 20 * np.log10(active_rms(item.clean) / active_rms(rest)) == pytest.approx(40.0, abs=1.0)
+
+
+def test_an_item_of_a_filter_that_ran_before_holds_what_came_after(parts):
+    stft, said = StftConfig(), {}
+    for later in (0.0, 1.0):
+        item = simulate(replace(RECIPES["edge"], later=later, seconds=2.0, human=0.0), 3, 2, parts)
+        assert (item.before, item.mic.size) == (later * 2 * RATE, (1 + later) * 2 * RATE)
+        said[later] = pack(item, stft, np.random.default_rng(0))
+        assert said[later]["mic"].shape == (2 * RATE,) and said[later]["noise"].shape[0] == 2 * RATE // 256
+
+
+def test_a_front_that_learns_leaves_less_of_a_loudspeaker_that_distorts(parts):
+    recipe = replace(RECIPES["edge"], moving=0.0, warm=0.0, human=0.0, seconds=9.0, distortion_db=(-14.0, -14.0))
+    item, stft, left = simulate(recipe, 3, 1, parts), StftConfig(), {}
+    for learns in (False, True):
+        front = front_end(Stage(), None, stft, np.random.default_rng(0), learns)
+        heard = listen(front, item.mic, item.reference, item.clean, stft, before=6 * RATE)
+        left[learns] = 10 * np.log10(np.mean(heard.error**2))
+    print(left)
+    assert left[True] < left[False] - 0.5
 
 
 def test_a_weakened_canceller_leaves_as_much_more_as_asked_and_a_lost_one_everything(parts):
