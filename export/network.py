@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.nn.functional import layer_norm, leaky_relu
@@ -33,7 +34,8 @@ class EdgeConfig:
 
     Hidden, layers: of the GRU.
 
-    norm: "layer" over each frame, "batch", or "none".
+    norm: "layer" over each frame, "batch", or "none". erb: bands that encoder and decoder work on, as wide as the ear's
+    (a multiple of 16; a network of 64 takes a third of the time), 0 for every frequency.
     """
 
     n_fft: int = 512
@@ -43,6 +45,7 @@ class EdgeConfig:
     hidden: int = 256
     layers: int = 2
     norm: str = "layer"
+    erb: int = 0
 
     @property
     def stft(self) -> StftConfig:
@@ -119,7 +122,11 @@ class EdgeCrnn(nn.Module):
         super().__init__()
         self.config = config
         c1, c2, c3, c4 = config.channels
-        f, norm = config.bands, config.norm
+        f, norm = config.erb or config.bands, config.norm
+        if config.erb:
+            spread = erb_bands(config.stft, config.erb)
+            self.register_buffer("pooling", (spread / spread.sum(1, keepdim=True)).T.contiguous(), persistent=False)
+            self.register_buffer("spreading", spread, persistent=False)
         self.mic_1, self.mic_2 = Stage(15, c1, f, norm, 2), Stage(c1, c2, f // 2, norm, 2)
         self.ref_1, self.ref_2 = Stage(12, c1, f, norm, 2), Stage(c1, c2, f // 2, norm, 2)
         self.joint_1, self.joint_2 = Stage(2 * c2, c3, f // 4, norm, 2), Stage(c3, c4, f // 8, norm, 2)
@@ -170,6 +177,8 @@ class EdgeCrnn(nn.Module):
 
     def encode(self, mic: Tensor, reference: Tensor) -> tuple[Tensor, tuple[Tensor, ...]]:
         """Features of either branch, (n, 15 and 12, 1, bands), to where both meet, and the skips to the decoder."""
+        if self.config.erb:
+            mic, reference = (_on_bands(x, self.pooling) for x in (mic, reference))
         m1, r1 = self.mic_1(mic), self.ref_1(reference)
         m2, r2 = self.mic_2(m1), self.ref_2(r1)
         j1 = self.joint_1(torch.cat((m2, r2), 1))
@@ -183,7 +192,7 @@ class EdgeCrnn(nn.Module):
             y = y.contiguous(memory_format=torch.channels_last)
         y = self.up_3(torch.cat((self.up_4(torch.cat((y, met), 1)), j1), 1))
         y = self.up_1(torch.cat((self.up_2(torch.cat((y, m2, r2), 1)), m1, r1), 1))
-        return self.mask(y)
+        return _on_bands(self.mask(y), self.spreading) if self.config.erb else self.mask(y)
 
     def step(
         self,
@@ -199,6 +208,29 @@ class EdgeCrnn(nn.Module):
         frame = (x.unsqueeze(1) for x in (error, mic, reference, echo, noise, residual))
         human, logit, state = self(*frame, state)
         return human.squeeze(1), torch.sigmoid(logit.squeeze(1)), state
+
+
+def erb_bands(stft: StftConfig, count: int) -> Tensor:
+    """(count, bins - 1) weights that spread bands over the frequencies above 0 Hz, linearly between their centres.
+
+    Centres are evenly spaced on the ERB-rate scale of Glasberg & Moore (1990), eq. (4), but at least a bin apart.
+    """
+    frequencies = stft.frequencies[1:]
+    rate = 21.4 * np.log10(1 + 0.00437 * np.linspace(frequencies[0], frequencies[-1], 4096))
+    wanted = np.interp(np.linspace(rate[0], rate[-1], count), rate, np.linspace(0, frequencies.size - 1, 4096))
+    centres = np.rint(wanted).astype(int)
+    for band in range(1, count):
+        centres[band] = max(centres[band], centres[band - 1] + 1)
+    bins = np.arange(frequencies.size)
+    spread = np.stack([np.interp(bins, centres, np.eye(count)[band]) for band in range(count)])
+    return torch.from_numpy(spread.astype(np.float32))
+
+
+def _on_bands(x: Tensor, weights: Tensor) -> Tensor:
+    """(n, channels, 1, frequencies) times weights (frequencies, others), in the memory order in which x is."""
+    if x.is_contiguous():
+        return x @ weights
+    return (weights.T @ x.permute(0, 2, 3, 1)).permute(0, 3, 1, 2)
 
 
 def _with_previous(x: Tensor, previous: Tensor) -> tuple[Tensor, Tensor]:

@@ -15,6 +15,7 @@ from edgefilter.errors import UsageError
 from export.losses import LossWeights, edge_loss, power_law_loss, si_sdr
 from export.network import EdgeConfig, EdgeCrnn, count
 from export.paper_network import PaperConfig, PaperCrnn, parameter_count
+from export.recogniser_loss import RecogniserLoss
 
 INPUTS = ("error", "mic", "reference", "echo", "noise", "residual")
 
@@ -44,11 +45,12 @@ class EdgeTask:
     kind: ClassVar[str] = "edge"
 
     def __init__(self, options: argparse.Namespace) -> None:
-        self._config = EdgeConfig(
-            2 * options.hop, options.hop, channels=tuple(options.channels), hidden=options.hidden, norm=options.norm
-        )
+        shape = {name: getattr(options, name) for name in ("hidden", "norm", "erb")}
+        self._config = EdgeConfig(2 * options.hop, options.hop, channels=tuple(options.channels), **shape)
         self.weights = LossWeights(suppression=options.suppression, si_sdr=options.si_sdr)
         self.stft, self.half = self._config.stft, not options.full_precision
+        self.recogniser = RecogniserLoss(options.recogniser, self.stft) if options.recogniser else None
+        self.recogniser_weight = options.recogniser_weight
 
     def network(self) -> EdgeCrnn:
         return EdgeCrnn(self._config).to(memory_format=torch.channels_last)
@@ -70,8 +72,12 @@ class EdgeTask:
         with torch.autocast(inputs[0].device.type, torch.bfloat16, enabled=self.half and network.training):
             human, logit, _ = network(*inputs, network.initial_state(inputs[0].shape[0]))
         scale = batch["scale"][:, None, None, None]
-        human = scale * human.float()
-        return edge_loss(human, logit.float(), scale * batch["clean"], batch["active"], self.weights), human
+        human, clean = scale * human.float(), scale * batch["clean"]
+        terms = edge_loss(human, logit.float(), clean, batch["active"], self.weights)
+        if self.recogniser and network.training:
+            terms["recogniser"] = self.recogniser(human, clean)
+            terms["total"] = terms["total"] + self.recogniser_weight * terms["recogniser"]
+        return terms, human
 
 
 class PaperTask:

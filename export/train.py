@@ -73,6 +73,11 @@ def arguments() -> argparse.Namespace:
     parser.add_argument("--channels", type=int, nargs=4, default=EdgeConfig.channels)
     parser.add_argument("--hidden", type=int, default=EdgeConfig.hidden)
     parser.add_argument("--norm", choices=("layer", "batch", "none"), default="layer")
+    parser.add_argument(
+        "--erb", type=int, default=0, help="bands as wide as the ear's, 64 say, in place of all frequencies"
+    )
+    parser.add_argument("--recogniser", type=Path, metavar="WHISPER", help="folder whose encoder judges the answer too")
+    parser.add_argument("--recogniser-weight", type=float, default=0.1)
     parser.add_argument("--suppression", type=float, default=LossWeights.suppression)
     parser.add_argument("--si-sdr", type=float, default=LossWeights.si_sdr)
     parser.add_argument("--start", type=Path, metavar="CHECKPOINT", help="weights to begin with")

@@ -104,11 +104,12 @@ def test_the_engine_computes_what_torch_computes(exported):
         np.testing.assert_allclose(found, mine.numpy(), atol=1e-4)
 
 
-@pytest.mark.parametrize("norm", ["layer", "batch", "none"])
+@pytest.mark.parametrize(("norm", "erb"), [("layer", 0), ("batch", 0), ("none", 0), ("layer", 32)])
 @pytest.mark.parametrize("products", [False, True])
-def test_the_rewritten_graph_answers_like_the_network_whatever_its_shape(norm, products):
+def test_the_rewritten_graph_answers_like_the_network_whatever_its_shape(norm, erb, products):
     torch.manual_seed(4)
-    network = EdgeCrnn(EdgeConfig(n_fft=512, hop=256, channels=(3, 4, 5, 6), hidden=7, layers=3, norm=norm)).eval()
+    shape = {"channels": (3, 4, 5, 6), "hidden": 7, "layers": 3, "norm": norm, "erb": erb}
+    network = EdgeCrnn(EdgeConfig(n_fft=512, hop=256, **shape)).eval()
     torch.nn.init.normal_(network.mask.weight)
     state = [torch.rand_like(tensor) for tensor in network.initial_state()]
     spectra = [10.0 ** torch.empty(1, 257, 1).uniform_(-6, 0) * torch.randn(1, 257, 2) for _ in range(4)]

@@ -13,7 +13,7 @@ from edgefilter.types import Frame
 from export import checkpoint, dataset, train
 from export.crops import Batches, Items, Shape
 from export.losses import LossWeights, edge_loss, power_law_loss, si_sdr
-from export.network import MOST_LOGITS, EdgeConfig, EdgeCrnn, corrected, count, opened
+from export.network import MOST_LOGITS, EdgeConfig, EdgeCrnn, corrected, count, erb_bands, opened
 from export.paper_network import PaperConfig
 from export.trainer import Plan
 from tests.export.speech import write_librispeech, write_table
@@ -146,17 +146,26 @@ def test_before_training_the_answer_is_that_of_ss():
     assert np.ptp(gains) > 0.5
 
 
-def test_training_and_graph_see_the_same_whatever_the_memory_order():
-    network, inputs = awake(), spectra()
+def test_bands_are_as_wide_as_the_ears_and_lose_no_frequency():
+    spread = erb_bands(EdgeConfig().stft, 64)
+    assert spread.shape == (64, 256) and (spread >= 0).all()
+    assert torch.allclose(spread.sum(0), torch.ones(256))  # a mask of ones on the bands is one everywhere
+    widths = (spread > 0).sum(1)
+    assert widths[0] <= 2 and 20 < widths[-2] < 32  # a triangle of two steps of half an ERB, which is 865 Hz there
+
+
+@pytest.mark.parametrize("erb", [0, 16])
+def test_training_and_graph_see_the_same_whatever_the_memory_order(erb):
+    network, inputs = awake(EdgeConfig(64, 32, channels=(4, 4, 4, 4), hidden=8, erb=erb)), spectra()
     with torch.no_grad():
         plain = network(*inputs, network.initial_state())[0]
         last = network.to(memory_format=torch.channels_last)(*inputs, network.initial_state())[0]
     assert torch.allclose(plain, last, atol=1e-6)
 
 
-@pytest.mark.parametrize("norm", ["layer", "batch", "none"])
-def test_frame_by_frame_is_the_whole_clip(norm):
-    network = awake(EdgeConfig(64, 32, channels=(4, 4, 4, 4), hidden=8, norm=norm))
+@pytest.mark.parametrize(("norm", "erb"), [("layer", 0), ("batch", 0), ("none", 0), ("layer", 16)])
+def test_frame_by_frame_is_the_whole_clip(norm, erb):
+    network = awake(EdgeConfig(64, 32, channels=(4, 4, 4, 4), hidden=8, norm=norm, erb=erb))
     inputs = spectra()
     with torch.no_grad():
         whole, logits, _ = network(*inputs, network.initial_state())
