@@ -1,19 +1,21 @@
 r"""Which checkpoint keeps the words: networks against 'ss' on validation conversations, by what a recogniser makes of them.
 
     python -m bench.measure.words_validation --checkpoints RUN/last.pt [...] --conversations DIR [DIR ...] --cold \
-        --whisper WHISPER --output bench/results/words_validation
+        --real RECORDINGS --humans HUMAN/val --whisper WHISPER --output bench/results/words_validation
 
 Loss and SI-SDR did not predict word errors, so networks are chosen by these. Every network is heard alone, and mixed
-with the Wiener mask of 'ss' and with the linear stage's error (--wiener, --error: shares of the answer). --cold: each
-conversation once more without its profile. Give validation conversations, never test ones. Differences are paired: each
-utterance against its own answer by 'ss'. Real loudspeakers: `bench.measure.real` with EDGEFILTER_CRNN.
+with the Wiener mask of 'ss' and with the linear stage's error (--wiener, --error: shares of the answer), beside the
+package's own `crnn`. --cold: each conversation once more without its profile. --real: humans of --humans laid on the
+tuning half of the recordings of real loudspeakers (bench.measure.real), without a profile. --learning: the filter learns
+while it runs. Give validation conversations, never test ones. Differences are paired: each utterance against its own
+answer by 'ss'. All systems get the very same frames: what stands before the engine runs once.
 """
 
 from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -23,17 +25,23 @@ import torch
 from bench import results_writer
 from bench.measure.conversation import Conversation, every, find_conversations, progress
 from bench.measure.intervals import interval
+from bench.measure.real_streams import Cells, Laid, chosen, find_recordings, lay
 from bench.measure.recogniser import Recogniser, word_errors
+from edgefilter import PathLearner
 from edgefilter.dsp.metrics import si_sdr
-from edgefilter.dsp.stft import StftConfig
+from edgefilter.dsp.stft import StftConfig, Synthesiser
 from edgefilter.engines import create
 from edgefilter.engines.base import Engine, EngineState, FrontEndKind
 from edgefilter.engines.crnn import Crnn
-from edgefilter.errors import EdgefilterError
+from edgefilter.errors import EdgefilterError, UsageError
 from edgefilter.filter.stream import Stream
-from edgefilter.types import Frame, Output
+from edgefilter.profile.data import Profile
+from edgefilter.types import Frame, Output, Samples
 from export import onnx_export
 
+REAL = Cells(sers=(-10.0, -20.0), befores=(0.0, 10.0))
+"""Of humans laid on real loudspeakers."""
+ECHO_ONLY = "device1_*"
 BASE = "ss"
 
 
@@ -63,12 +71,82 @@ class WithError:
         return Output(spectrum.astype(np.complex64), output.speech_probability), state
 
 
+@dataclass(frozen=True)
+class Case:
+    """One utterance to be understood: mic, ref (n,); clean (m,) is the human in span. kind: whose table it stands in."""
+
+    kind: str
+    name: str
+    mic: Samples
+    ref: Samples
+    clean: Samples
+    span: slice
+    text: str
+    profile: Profile | None = None
+
+
+def cases(name: str, conversation: Conversation, cold: bool) -> Iterator[Case]:
+    """A conversation with its profile, and with `cold` once more without."""
+    mic, ref, clean = (conversation.read(each) for each in ("mic", "ref", "clean"))
+    kind, text, span = f"{name} {conversation.meta['room']}", conversation.meta["text"], conversation.span
+    yield Case(kind, conversation.folder.name, mic, ref, clean[span], span, text, conversation.profile)
+    if cold:
+        yield Case(f"{kind} cold", conversation.folder.name, mic, ref, clean[span], span, text)
+
+
+def laid_case(laid: Laid) -> Case:
+    """A human on a real loudspeaker."""
+    signals = laid.signals()
+    if signals.human is None:
+        raise UsageError(f"{laid.name} holds no human")
+    name = f"{laid.name}, {laid.ser:g} dB after {laid.before:g} s"
+    return Case(
+        "real loudspeaker", name, signals.mic, signals.ref, signals.human[signals.span], signals.span, laid.text
+    )
+
+
+@dataclass(frozen=True)
+class Listener:
+    """An engine that keeps the frames it is given."""
+
+    stft: StftConfig
+    frames: list[Frame]
+    name: str = "listener"
+    front: FrontEndKind = "full"
+    lookahead: int = 0
+
+    def initial_state(self) -> EngineState:
+        return ()
+
+    def step(self, frame: Frame, state: EngineState) -> tuple[Output, EngineState]:
+        self.frames.append(Frame(*(part.copy() for part in frame)))
+        return Output(frame.error), state
+
+
+def frames(case: Case, stft: StftConfig, learning: bool) -> list[Frame]:
+    """What every engine of that transform is given."""
+    listener = Listener(stft, [])
+    stream = Stream(listener, case.profile, learner=PathLearner(case.profile) if learning else None)
+    stream.process(case.mic, case.ref)
+    stream.flush()
+    return listener.frames
+
+
+def answer(engine: Engine, heard: list[Frame], samples: int) -> Samples:
+    """(samples,) that a stream with this engine gives out."""
+    state, voice, hops = engine.initial_state(), Synthesiser(engine.stft), []
+    for frame in heard:
+        output, state = engine.step(frame, state)
+        hops.append(voice.push(output.spectrum))
+    return np.concatenate(hops)[engine.stft.window_length - engine.stft.hop :][:samples]
+
+
 Make = Callable[[], Engine]
 
 
 def systems(checkpoints: list[Path], wiener: list[float], error: list[float], folder: Path) -> dict[str, Make]:
-    """What is compared, by name: linear, ss, and each checkpoint's averaged weights alone and mixed."""
-    found: dict[str, Make] = {"linear": lambda: create("linear"), BASE: lambda: create("ss")}
+    """What is compared, by name: linear, ss, crnn as it ships, and each checkpoint's averaged weights alone and mixed."""
+    found: dict[str, Make] = {name: lambda name=name: create(name) for name in ("linear", BASE, "crnn")}
     folder.mkdir(parents=True, exist_ok=True)
     for path in checkpoints:
         trained = onnx_export.load(path)
@@ -83,23 +161,26 @@ def systems(checkpoints: list[Path], wiener: list[float], error: list[float], fo
     return found
 
 
-def judge(name: str, make: Make, kind: str, conversation: Conversation, recogniser: Recogniser) -> dict:
-    """One utterance: SI-SDR and word errors. kind: "... cold" without the profile."""
-    stream = Stream(make(), None if kind.endswith("cold") else conversation.profile)
-    out = np.concatenate((stream.process(conversation.read("mic"), conversation.read("ref")), stream.flush()))
-    out = out[conversation.span]
-    errors = word_errors(conversation.meta["text"], recogniser.transcribe(out))
-    return {
-        "system": name,
-        "kind": kind,
-        "conversation": conversation.folder.name,
-        "si_sdr": si_sdr(out, conversation.read("clean")[conversation.span]),
-        "words": errors.words,
-        "errors": errors.errors,
-        "deletions": errors.deletions,
-        "insertions": errors.insertions,
-        "capped": errors.capped,
-    }
+def judge(case: Case, making: dict[str, Make], learning: bool, recogniser: Recogniser) -> Iterator[dict]:
+    """SI-SDR and word errors of every system."""
+    heard: dict[StftConfig, list[Frame]] = {}
+    for name, make in making.items():
+        engine = make()
+        if engine.stft not in heard:
+            heard[engine.stft] = frames(case, engine.stft, learning)
+        out = answer(engine, heard[engine.stft], case.mic.size)[case.span]
+        errors = word_errors(case.text, recogniser.transcribe(out))
+        yield {
+            "system": name,
+            "kind": case.kind,
+            "conversation": case.name,
+            "si_sdr": si_sdr(out, case.clean),
+            "words": errors.words,
+            "errors": errors.errors,
+            "deletions": errors.deletions,
+            "insertions": errors.insertions,
+            "capped": errors.capped,
+        }
 
 
 def compared(rows: list[dict], kind: str, system: str) -> dict[str, float]:
@@ -131,8 +212,9 @@ def markdown(rows: list[dict]) -> str:
             less = "{:+.1f} [{:+.1f}, {:+.1f}]".format(*(100 * found[key] for key in ("less", "less_low", "less_high")))
             cells.append([system, *percent, less, f"{found['si_sdr']:.1f}"])
         count = len({row["conversation"] for row in rows if row["kind"] == kind})
+        words = sum(row["words"] for row in rows if (row["kind"], row["system"]) == (kind, BASE))
         head = ["system", "capped WER, %", "deleted", "inserted", "WER less that of ss, points", "SI-SDR, dB"]
-        lines += [f"{kind}, {count} utterances:", "", *results_writer.table(head, cells), ""]
+        lines += [f"{kind}, {count} utterances of {words} words:", "", *results_writer.table(head, cells), ""]
     return "\n".join(lines)
 
 
@@ -142,6 +224,10 @@ def main() -> int:
     parser.add_argument("--conversations", type=Path, nargs="+", required=True, metavar="DIR")
     parser.add_argument("--every", type=int, default=1, metavar="N", help="take every N-th conversation of each folder")
     parser.add_argument("--cold", action="store_true", help="each once more without its profile")
+    parser.add_argument("--real", type=Path, metavar="DIR", help="recordings of real loudspeakers")
+    parser.add_argument("--humans", type=Path, metavar="DIR", help="speech that is laid on them")
+    parser.add_argument("--real-cases", type=int, default=8, help="humans that are laid on them, each four times")
+    parser.add_argument("--learning", action="store_true", help="the filter learns while it runs")
     parser.add_argument("--wiener", type=float, nargs="*", default=[0.5], help="shares of 'ss' in the answer")
     parser.add_argument("--error", type=float, nargs="*", default=[0.2], help="shares of the linear stage's error")
     parser.add_argument("--whisper", type=Path, required=True, metavar="DIR")
@@ -150,19 +236,27 @@ def main() -> int:
     options = parser.parse_args()
     torch.set_num_threads(1)
     try:
+        if options.real and not options.humans:
+            raise UsageError("--real lays humans on recordings: give --humans with a transcripts.tsv")
         recogniser = Recogniser(options.whisper, options.cache / "transcripts.jsonl")
         models = {
             "WHISPER": options.whisper,
             **{f"{path.parent.name}/{path.name}": path for path in options.checkpoints},
         }
-        made_with = results_writer.stamp({"conversations": options.conversations}, models=models)
+        real = {"real": [options.real]} if options.real else {}
+        made_with = results_writer.stamp({"conversations": options.conversations, **real}, models=models)
         making = systems(options.checkpoints, options.wiener, options.error, options.cache / "checkpoints")
         found = every(find_conversations(options.conversations), options.every)
+        laid: list[Laid] = []
+        if options.real:
+            recordings = chosen(find_recordings(options.real, ECHO_ONLY), "tune", ECHO_ONLY)
+            recordings = [recording for recording in recordings if recording.kind == "echo-only"]
+            laid = lay(recordings, options.humans, None, REAL, options.real_cases, seed=1)
         rows = []
-        for name, conversation in progress(found, name="conversations"):
-            room = f"{name} {conversation.meta['room']}"
-            for kind in (room, f"{room} cold") if options.cold else (room,):
-                rows += [judge(system, make, kind, conversation, recogniser) for system, make in making.items()]
+        for item in progress([*found, *laid], name="conversations"):
+            each = [laid_case(item)] if isinstance(item, Laid) else cases(*item, options.cold)
+            for case in each:
+                rows += judge(case, making, options.learning, recogniser)
     except (EdgefilterError, OSError) as error:
         print(f"words_validation: {error}", file=sys.stderr)
         return 1

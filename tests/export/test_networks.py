@@ -7,6 +7,8 @@ import pytest
 import soundfile as sf
 
 from bench.measure import networks, words_validation
+from edgefilter.engines import create
+from edgefilter.filter.stream import Stream
 from export import train
 
 
@@ -84,14 +86,23 @@ def test_checkpoints_are_judged_by_words_warm_and_cold_against_ss(tmp_path, run,
     monkeypatch.setattr("sys.argv", ["words_validation", *map(str, arguments)])
     assert words_validation.main() == 0
     found = json.loads((tmp_path / "results" / "words.json").read_text())["utterances"]
-    names = ["linear", "ss", "tiny/last, step 4", "tiny/last, step 4, 0.5 ss", "tiny/last, step 4, 0.2 error"]
+    names = ["linear", "ss", "crnn", "tiny/last, step 4", "tiny/last, step 4, 0.5 ss", "tiny/last, step 4, 0.2 error"]
     assert [row["system"] for row in found] == 2 * names
-    assert [row["kind"] for row in found] == 5 * ["conversations lab"] + 5 * ["conversations lab cold"]
+    assert [row["kind"] for row in found] == 6 * ["conversations lab"] + 6 * ["conversations lab cold"]
     assert all((row["errors"], row["deletions"], row["insertions"], row["words"]) == (1, 1, 0, 2) for row in found)
-    by_name = {row["system"]: row["si_sdr"] for row in found[:5]}
-    assert by_name["ss"] == pytest.approx(by_name[names[2]], abs=0.1)  # after four steps it is still nearly 'ss'
-    assert by_name["ss"] != by_name["linear"] != by_name[names[3]] and len(set(by_name.values())) == 5
+    by_name = {row["system"]: row["si_sdr"] for row in found[:6]}
+    assert by_name["ss"] == pytest.approx(by_name[names[3]], abs=0.1)  # after four steps it is still nearly 'ss'
+    assert by_name["ss"] != by_name["linear"] != by_name[names[4]] and len(set(by_name.values())) == 6
     assert "| tiny/last, step 4 | 50 | 50 | 0 | +0.0 [+0.0, +0.0] |" in (tmp_path / "results/words.md").read_text()
+
+
+def test_an_engine_answers_kept_frames_as_a_stream_does():
+    mic, ref = 0.1 * np.random.default_rng(0).standard_normal((2, 20000)).astype(np.float32)
+    case = words_validation.Case("kind", "name", mic, ref, mic, slice(None), "one")
+    engine = create("ss")
+    kept = words_validation.answer(engine, words_validation.frames(case, engine.stft, learning=False), mic.size)
+    stream = Stream(engine)
+    assert np.array_equal(kept, np.concatenate((stream.process(mic, ref), stream.flush())))
 
 
 def test_a_folder_without_a_network_is_one_line(tmp_path, conversation, monkeypatch, capsys):
