@@ -1,7 +1,7 @@
 """Simulated conversations with the running filter's front run over them, as arrays that training can crop.
 
     python -m export.dataset --humans DIR --robots DIR --output DIR [--recipe wide --noise DIR --responses DIR]
-        [--count 2000] [--seed 1] [--minutes M] [--profile P.npz]
+        [--count 2000] [--seed 1] [--minutes M] [--profile P.npz] [--scheduler ADDRESS]
 
 Writes DIR/NNNNN.npz per item: mic, reference, error, clean as an engine gets them ((n,) int16 with their scale; echo =
 mic - error), noise, residual (the front's expected power spectra, simulate/linear_stage.py) and about (JSON), and
@@ -14,6 +14,7 @@ import argparse
 import json
 import math
 import os
+import sys
 import time
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
@@ -24,6 +25,7 @@ import numpy as np
 from tqdm import tqdm
 
 from edgefilter.dsp.stft import StftConfig
+from edgefilter.errors import EdgefilterError
 from edgefilter.profile.data import Profile
 from export.corpus import read_corpus
 from export.rooms import Room, draw_room
@@ -31,6 +33,7 @@ from export.simulate.conversation import Conversation, simulate
 from export.simulate.linear_stage import front_end, listen
 from export.simulate.material import Material, read_noises, read_responses
 from export.simulate.recipe import RECIPES, Recipe
+from export.spread import spread
 
 ROOMS = {"lab": 1 / 3, "office": 1 / 2, "hall": 1 / 6}
 """Shares of the kinds of room."""
@@ -50,16 +53,9 @@ def pack(conversation: Conversation, stft: StftConfig, rng: np.random.Generator)
     return packed | powers | {"scale": np.float32(scales["mic"]), "reference_scale": np.float32(told)}
 
 
-_shared: list[Material] = []
-
-
-def _start(material: Material) -> None:
-    _shared[:] = [material]
-
-
-def _make(job: tuple[Recipe, int, int, Path, StftConfig]) -> dict[str, object]:
+def _make(material: Material, job: tuple[Recipe, int, int, Path, StftConfig]) -> dict[str, object]:
     recipe, seed, index, path, stft = job
-    conversation = simulate(recipe, seed, index, *_shared)
+    conversation = simulate(recipe, seed, index, material)
     part = path.with_suffix(".part")
     arrays = pack(conversation, stft, np.random.default_rng([seed, index, 1]))
     with part.open("wb") as file:
@@ -88,8 +84,9 @@ def make_dataset(
     output: Path,
     stft: StftConfig,
     jobs: int,
+    scheduler: str | None = None,
 ) -> Iterator[dict[str, object]]:
-    """Write the items that are not there yet; yields what each is about."""
+    """Write the items that are not there yet; yields what each is about. jobs, scheduler: see spread."""
     output.mkdir(parents=True, exist_ok=True)
     about = {
         "recipe": asdict(recipe),
@@ -99,13 +96,9 @@ def make_dataset(
         "voices": len(material.robots.speakers),
     }
     (output / "dataset.json").write_text(json.dumps(about, indent=1, default=str) + "\n", encoding="utf-8")
-    paths = [(index, output / f"{index:05d}.npz") for index in range(count)]
+    paths = [(index, output.resolve() / f"{index:05d}.npz") for index in range(count)]
     missing = [(recipe, seed, index, path, stft) for index, path in paths if not path.exists()]
-    pool = ProcessPoolExecutor(jobs, initializer=_start, initargs=(material,))
-    try:
-        yield from pool.map(_make, missing)
-    finally:
-        pool.shutdown(cancel_futures=True)
+    yield from spread(_make, material, missing, jobs, scheduler)
 
 
 def arguments() -> argparse.Namespace:
@@ -133,11 +126,26 @@ def arguments() -> argparse.Namespace:
     parser.add_argument("--rooms", type=int, default=240, help="simulated, half of them offices, a third laboratories")
     parser.add_argument("--minutes", type=float, default=math.inf, help="stop then, with what is there")
     parser.add_argument("--jobs", type=int, default=os.cpu_count())
+    parser.add_argument(
+        "--scheduler",
+        metavar="ADDRESS",
+        help="of a Dask cluster that makes the items instead; its machines see the same folders",
+    )
     return parser.parse_args()
 
 
-def main() -> None:
+def main() -> int:
     options = arguments()
+    try:
+        simulate_all(options)
+    except (EdgefilterError, OSError) as error:
+        print(f"dataset: {error}", file=sys.stderr)
+        return 1
+    return 0
+
+
+def simulate_all(options: argparse.Namespace) -> None:
+    """Read the material, make what is missing, show how far it is."""
     began = time.monotonic()
     recipe = RECIPES[options.recipe]
     if options.profile:
@@ -152,7 +160,9 @@ def main() -> None:
         read_noises(*options.noise),
         read_responses(*options.responses),
     )
-    work = make_dataset(recipe, options.seed, options.count, material, options.output, stft, options.jobs)
+    work = make_dataset(
+        recipe, options.seed, options.count, material, options.output, stft, options.jobs, options.scheduler
+    )
     have = len(list(options.output.glob("*.npz")))
     for _ in tqdm(work, total=options.count - have, unit="item", desc=str(options.output)):
         if time.monotonic() - began > 60 * options.minutes:
@@ -161,4 +171,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())
