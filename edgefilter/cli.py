@@ -9,9 +9,11 @@ import sys
 from typing import Any, NoReturn
 
 from edgefilter import __version__
+from edgefilter.commands.arguments import effects_option, level
 from edgefilter.commands.outputs import check_outputs
+from edgefilter.commands.run_options import add_run
 from edgefilter.echo.user_effects import load_effect
-from edgefilter.engines import ENGINES, HAVE_MODEL
+from edgefilter.engines import ENGINES
 from edgefilter.errors import EdgefilterError, UsageError
 
 
@@ -34,7 +36,7 @@ def build_parser() -> Parser:
     parser.add_argument("--debug", action="store_true", help="show a traceback when something fails")
     commands = parser.add_subparsers(dest="command", metavar="COMMAND")
     _add_demo(commands)
-    _add_run(commands)
+    add_run(commands)
     _add_calibrate(commands)
     _add_diagnosis(commands)
     _add_devices(commands)
@@ -54,61 +56,6 @@ def _add_demo(commands: argparse._SubParsersAction) -> None:
         "--engine", default="auto", metavar="ENGINE", help=f"auto, {', '.join(ENGINES)} (default: %(default)s)"
     )
     demo.add_argument("--json", metavar="FILE", help="write the figures as JSON ('-': standard output)")
-
-
-def _add_run(commands: argparse._SubParsersAction) -> None:
-    run = commands.add_parser(
-        "run",
-        help="filter a recording, a pipe or the microphone",
-        description=(
-            "Filter a recording, a pipe or the microphone.\n\n  edgefilter run --input mic.wav --reference tts.wav"
-            " --profile robot.npz --output human.wav\n  edgefilter run --input mic --profile robot.npz --output"
-            " human.wav      (live; Ctrl-C ends it)\n  ... | edgefilter run --input - --output - | ...                 "
-            "       (s16le 16 kHz: stereo in, mono out)"
-        ),
-    )
-    run.add_argument(
-        "--input",
-        required=True,
-        metavar="mic|FILE|DEVICE|-",
-        help="microphone device (number or part of its name), recording, or raw PCM",
-    )
-    run.add_argument(
-        "--reference",
-        metavar="FILE|DEVICE",
-        help="what the robot says; live it defaults to the monitor of the default output",
-    )
-    run.add_argument("--profile", metavar="P.npz", help="calibrated robot, made by 'edgefilter calibrate'")
-    run.add_argument(
-        "--engine", default="auto", metavar="ENGINE", help=f"auto, {', '.join(ENGINES)} (default: %(default)s)"
-    )
-    run.add_argument("--model", metavar="FILE.onnx", help=f"network for {' or '.join(HAVE_MODEL)} in place of its own")
-    run.add_argument(
-        "--budget-ms",
-        type=_positive,
-        metavar="B",
-        help="compute per hop (p99) that auto may use, and that a live run keeps to (live default: 8)",
-    )
-    run.add_argument("--remeasure", action="store_true", help="forget how fast the engines were on this machine")
-    run.add_argument(
-        "--output", required=True, metavar="FILE|DEVICE|-", help="WAV or FLAC file, output device, or raw PCM"
-    )
-    run.add_argument("--json", metavar="FILE", help="write what happened as JSON")
-    run.add_argument("--save-input", metavar="DIR", help="also write what was heard: DIR/mic.wav and DIR/reference.wav")
-    run.add_argument(
-        "--save-profile", metavar="P2.npz", help="write the profile with the echo path as it was adapted in this run"
-    )
-    learning = run.add_mutually_exclusive_group()
-    learning.add_argument(
-        "--learn",
-        metavar="P.npz",
-        help="begin with what was learned in earlier runs, where the file exists (else with --profile), go on learning,"
-        " and keep it there",
-    )
-    learning.add_argument("--no-learn", action="store_true", help="do not learn loudspeaker and room while running")
-    run.add_argument("--seconds", type=_positive, metavar="S", help="stop after S seconds")
-    _effects_option(run)
-    run.add_argument("--quiet", action="store_true", help="no progress bar, no level meter")
 
 
 def _add_calibrate(commands: argparse._SubParsersAction) -> None:
@@ -139,7 +86,7 @@ def _add_calibrate(commands: argparse._SubParsersAction) -> None:
         "--input", default="mic", metavar="DEVICE", help="input device for --live (default: %(default)s)"
     )
     peak = "peak of the played sweep, dB of full scale (default: %(default)s)"
-    calibrate.add_argument("--level-db", type=_level, default=-12.0, metavar="DB", help=peak)
+    calibrate.add_argument("--level-db", type=level, default=-12.0, metavar="DB", help=peak)
     calibrate.add_argument("--save-input", metavar="DIR", help="with --live: also keep the recordings")
     calibrate.add_argument("--output", required=True, metavar="P.npz", help="profile to write")
     calibrate.add_argument("--json", metavar="FILE", help="write the result as JSON ('-': standard output)")
@@ -185,17 +132,7 @@ def _add_diagnosis(commands: argparse._SubParsersAction) -> None:
         else:
             command.add_argument("--report", metavar="R.html", help="write a page with pictures and sound, in one file")
         command.add_argument("--json", metavar="FILE", help="write the result as JSON ('-': standard output)")
-        _effects_option(command)
-
-
-def _effects_option(command: argparse.ArgumentParser) -> None:
-    command.add_argument(
-        "--effects",
-        action="append",
-        default=[],
-        metavar="FILE.py",
-        help="an effect of your own (see docs/own_effect.md); repeatable",
-    )
+        effects_option(command)
 
 
 def _add_devices(commands: argparse._SubParsersAction) -> None:
@@ -210,26 +147,7 @@ def _add_profile(commands: argparse._SubParsersAction) -> None:
     show.add_argument("profile", metavar="P.npz")
     show.add_argument("--plot", metavar="FILE.png", help="draw it")
     show.add_argument("--json", metavar="FILE", help="write it as JSON ('-': standard output)")
-    _effects_option(show)
-
-
-def _positive(text: str) -> float:
-    return _number(text, 0.0, 1e6, "a number above 0")
-
-
-def _level(text: str) -> float:
-    """Of a peak: at most full scale, and above what 16 bit can hold."""
-    return _number(text, -90.0, 0.0, "a level from -90 to 0 dB of full scale", closed=True)
-
-
-def _number(text: str, low: float, high: float, expected: str, closed: bool = False) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = float("nan")
-    if not (low <= value <= high if closed else low < value < high):
-        raise argparse.ArgumentTypeError(f"'{text}' is not {expected}")
-    return value
+    effects_option(show)
 
 
 def main(argv: list[str] | None = None) -> int:

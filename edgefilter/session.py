@@ -95,12 +95,14 @@ def filter_blocks(
     show: Callable[[Progress], None] = lambda progress: None,
     stopped: Callable[[], bool] = lambda: False,
     tell: Callable[[Event], None] = lambda event: None,
+    troubles: Callable[[int, bool], list[Event]] = lambda sample, last: [],
 ) -> RunReport:
     """Run ego over every block of source until it ends or stopped() says so; always flush into sink what was received.
 
     A source or sink that fails on the way (a device that vanished, a truncated file, a full disk) ends the run: what
     was received is filtered and flushed as far as the sink still takes it, and the error stands in report.failure. show
-    gets the levels after each block, tell what happened in the filter.
+    gets the levels after each block, tell what happened in the filter and, as troubles says by which sample, at both
+    ends.
     """
     report, progress = RunReport(), Progress()
     began = time.perf_counter()
@@ -109,6 +111,11 @@ def filter_blocks(
         sink.write(out)
         report.samples_out += out.size
         progress.out_db = level_db(out) if out.size else progress.out_db
+
+    def hear(last: bool) -> None:
+        for event in [*ego.events(), *troubles(report.samples_in, last)]:
+            report.events.append(event)
+            tell(event)
 
     def take(block: Block) -> None:
         if recorder is not None:
@@ -119,9 +126,7 @@ def filter_blocks(
         report.samples_in += block.mic.size
         report.lost += block.lost
         push(out)
-        for event in ego.events():
-            report.events.append(event)
-            tell(event)
+        hear(last=False)
         progress.samples, progress.lost = report.samples_in, report.lost
         progress.mic_db, progress.ref_db = level_db(block.mic), level_db(block.ref)
         show(progress)
@@ -138,6 +143,7 @@ def filter_blocks(
         push(ego.flush())
     except EdgefilterError as error:  # a sink that failed before says so again; its first word is the reason
         report.failure = report.failure or error
+    hear(last=True)
     report.wall_s = time.perf_counter() - began
     report.filter = dict(ego.stats())
     return report

@@ -68,6 +68,9 @@ EventKind: TypeAlias = Literal[
     "stepped_up",
     "learned",
     "unlearned",
+    "lost",
+    "overrun",
+    "underrun",
 ]
 
 
@@ -81,6 +84,8 @@ class Event:
         What happened. "realigned": the reference was found elsewhere in the microphone. "speech_started",
         "speech_stopped": of the human, from engines that judge it. "overloaded", "stepped_down", "stepped_up": what too
         little or enough time led to. "learned", "unlearned": a better echo path was taken over, or given back.
+        "lost", "overrun", "underrun": samples that the sound devices of `edgefilter run` lost, callbacks that came too
+        late; not from an `EgoFilter` itself.
     sample : int
         By which sample of the microphone, in whole hops.
     detail : str

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, replace
 from typing import Any
 
@@ -13,6 +13,8 @@ from edgefilter.audio import pulse
 from edgefilter.audio.lookup import Device, match, monitor
 from edgefilter.audio.pairing import Pairing
 from edgefilter.audio.port import POLL_S, START_S, InputPort, OutputPort
+from edgefilter.audio.reader import Reader
+from edgefilter.audio.speech import SpokenReference
 from edgefilter.errors import DeviceError, UsageError
 from edgefilter.types import SAMPLE_RATE, Block, Samples
 
@@ -93,6 +95,13 @@ def _pulse_input(source: str) -> Device | None:
     return None
 
 
+def speaker(output: str | int | Device | None, speech: Reader) -> SpokenReference:
+    """Speech for an output device, to be the reference of a LiveSource."""
+    spoken = SpokenReference(_sounddevice(), find(output, "output"), speech.chunks())
+    spoken.notes += speech.notes
+    return spoken
+
+
 class LiveSource:
     """Microphone and reference devices as blocks on the microphone's sample counter, until stop() or `seconds`.
 
@@ -104,16 +113,24 @@ class LiveSource:
     live = True
 
     def __init__(
-        self, mic: str | int | Device | None, reference: str | int | Device | None = None, seconds: float | None = None
+        self,
+        mic: str | int | Device | None,
+        reference: str | int | Device | SpokenReference | None = None,
+        seconds: float | None = None,
     ) -> None:
         self._mic = InputPort(_sounddevice(), find(mic, "input"))
-        self._reference = None if reference is None else InputPort(_sounddevice(), find(reference, "input"))
+        self._reference: InputPort | SpokenReference | None = None
+        if isinstance(reference, SpokenReference):
+            self._reference = reference
+        elif reference is not None:
+            self._reference = InputPort(_sounddevice(), find(reference, "input"))
         self._pairing = Pairing()
         self._stopped = False
         self.total = None if seconds is None else round(seconds * SAMPLE_RATE)
         self.notes = [f"microphone: {self._mic.device}", *self._mic.notes]
         if self._reference is not None:
-            self.notes += [f"reference: {self._reference.device}", *self._reference.notes]
+            how = "what is played on " if isinstance(reference, SpokenReference) else ""
+            self.notes += [f"reference: {how}{self._reference.device}", *self._reference.notes]
 
     def __enter__(self) -> LiveSource:
         try:
@@ -132,7 +149,7 @@ class LiveSource:
             words = ", ".join(f"{count} {name.replace('_', ' ')}" for name, count in troubles.items())
             self.notes.append(f"live input was not complete: {words}")
 
-    def _ports(self) -> list[InputPort]:
+    def _ports(self) -> Sequence[InputPort | SpokenReference]:
         """The reference first, so that it is there when the microphone starts."""
         return [self._mic] if self._reference is None else [self._reference, self._mic]
 

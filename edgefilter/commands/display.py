@@ -17,9 +17,28 @@ from edgefilter.audio.protocols import Source
 from edgefilter.errors import AudioFileError, UsageError
 from edgefilter.filter.ego_filter import EgoFilter
 from edgefilter.session import Progress
-from edgefilter.types import SAMPLE_RATE
+from edgefilter.types import SAMPLE_RATE, Event
 
 METER_PERIOD_S = 0.1
+
+
+def say(text: str) -> None:
+    """One line for the person who runs it, on standard error: standard output may be sound."""
+    print(text, file=sys.stderr)
+
+
+def say_event(event: Event, live: bool) -> None:
+    """Tell of a change of engine or path when it happens, below the level meter where that is shown.
+
+    Live, also of the human's speech.
+    """
+    if event.kind in ("stepped_down", "stepped_up", "overloaded", "learned", "unlearned") or (
+        live and event.kind.startswith("speech")
+    ):
+        say(
+            f"{chr(10) if sys.stderr.isatty() else ''}{event.sample / SAMPLE_RATE:.1f} s:"
+            f" {event.kind.replace('_', ' ')} {event.detail}"
+        )
 
 
 def describe_latency(ego: EgoFilter) -> str:

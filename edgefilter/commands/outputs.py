@@ -16,6 +16,7 @@ from edgefilter.errors import EdgefilterError, UsageError
 READ = (
     "input",
     "reference",
+    "play",
     "profile",
     "model",
     "recording",

@@ -10,6 +10,8 @@ from edgefilter.errors import UsageError
 from edgefilter.filter.excess import Excess
 from edgefilter.types import SAMPLE_RATE, EventKind, Frame
 
+INTERRUPTIONS: frozenset[EventKind] = frozenset({"speech_started"})
+"""The events at which a robot should stop."""
 ODDS_RANGE = (-2.0, 8.0)
 """Bounds on the network's log-odds of one hop, so that none outweighs a tenth of a second."""
 ODDS_MEMORY_S, EXCESS_MEMORY_S = 0.0133, 0.0449

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -44,6 +45,10 @@ class EgoFilter:
     learn : BackgroundLearner or PathLearner, optional
         Learns loudspeaker and room while the filter runs, in another process or, for recordings, in this one; engines
         without a linear stage do not need it. One learner serves one filter.
+    on_barge_in : callable, optional
+        Gets the `Event` of speech that has begun, inside `process` and in the very hop, from engines that judge speech
+        (those whose `speech_probability` is not None). It should stop or duck the robot and return at once, since the
+        sound waits for it; what it raises leaves `process`.
 
     Attributes
     ----------
@@ -84,6 +89,7 @@ class EgoFilter:
         model: str | Path | None = None,
         barge_in: BargeInSettings | None = None,
         learn: Learner | None = None,
+        on_barge_in: Callable[[Event], object] | None = None,
     ) -> None:
         if engine == "auto" and model is not None:
             raise UsageError(
@@ -94,7 +100,8 @@ class EgoFilter:
             strongest(self.profile) if engine == "auto" else (engines.create(engine, self.profile, model=model), reason)
         )
         ladder = None if budget_ms is None or best.lookahead is None else Ladder(climbable(best, self.profile))
-        self._stream = Stream(ladder or best, self.profile, Stepping(best.stft.hop, ladder, budget_ms), barge_in, learn)
+        stepping = Stepping(best.stft.hop, ladder, budget_ms)
+        self._stream = Stream(ladder or best, self.profile, stepping, barge_in, learn, on_barge_in)
 
     @property
     def engine_name(self) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Callable
 
 import numpy as np
 
@@ -10,7 +11,7 @@ from edgefilter.dsp.ring import Ring
 from edgefilter.dsp.stft import Synthesiser
 from edgefilter.engines.base import ClipEngine, Engine
 from edgefilter.errors import SignalError
-from edgefilter.filter.barge_in import BargeIn, BargeInSettings, HumanJudge
+from edgefilter.filter.barge_in import INTERRUPTIONS, BargeIn, BargeInSettings, HumanJudge
 from edgefilter.filter.front_end import FrontEnd
 from edgefilter.filter.learner import Learner
 from edgefilter.filter.stepping import Stepping
@@ -25,9 +26,9 @@ class Stream:
     all inputs. Sample n is out once n + latency samples have come in. After flush as many samples are out as went in.
     With an engine that waits for the end (waits_for_end) process returns nothing and flush everything. stepping: told
     the compute time of every hop; what it answers becomes an event. barge_in: when speech counts as begun and ended,
-    None for the defaults. learner: of better echo paths, for engines
-    with a linear stage. speech_probability: of the last hop, weighed with what robot and room leave; None before the
-    first hop and where the engine does not judge it.
+    None for the defaults. learner: of better echo paths, for engines with a linear stage. on_barge_in: called in the
+    hop in which speech has begun. speech_probability: of the last hop, weighed with what robot and room leave; None
+    before the first hop and where the engine does not judge it.
     """
 
     def __init__(
@@ -37,12 +38,14 @@ class Stream:
         stepping: Stepping | None = None,
         barge_in: BargeInSettings | None = None,
         learner: Learner | None = None,
+        on_barge_in: Callable[[Event], object] | None = None,
     ) -> None:
         self.engine = engine
         self.profile = profile
         self.stepping = stepping
         self.learner = learner
         self._barge_in_settings = barge_in or BargeInSettings()
+        self._on_barge_in = on_barge_in
         self.reset()
 
     @property
@@ -168,6 +171,8 @@ class Stream:
             self.speech_probability = self._judge.step(frame, probability, suspect)
         if talk := self._barge_in.note(self.speech_probability):
             self.events.append(Event(talk, self._stepped, f"probability {self.speech_probability or 0.0:.2f}"))
+            if self._on_barge_in and talk in INTERRUPTIONS:
+                self._on_barge_in(self.events[-1])
 
     def _collect(self, frame: Frame, engine: ClipEngine) -> None:
         self._clip.append(frame)

@@ -6,7 +6,7 @@ import soundfile
 
 from edgefilter import EgoFilter
 from edgefilter.commands.demo import DATA
-from edgefilter.commands.run import say_event
+from edgefilter.commands.display import say_event
 from edgefilter.dsp.stft import StftConfig
 from edgefilter.errors import UsageError
 from edgefilter.filter.barge_in import BargeIn, BargeInSettings, HumanJudge
@@ -154,13 +154,15 @@ def test_an_engine_without_a_network_gives_no_probability_and_no_events():
     assert not [event for event in ego.events() if event.kind.startswith("speech")]
 
 
-def test_the_settings_reach_the_stream():
+def test_the_settings_reach_the_stream_and_who_gives_a_callback_is_called_when_the_human_begins():
     mic, ref = (soundfile.read(DATA / f"{name}.flac", dtype="float32")[0] for name in ("mic", "reference"))
     found = []
     for settings in (BargeInSettings(min_speech_s=0.2), BargeInSettings()):
-        ego = EgoFilter(DATA / "profile.npz", engine="crnn", barge_in=settings)
+        called: list[Event] = []
+        ego = EgoFilter(DATA / "profile.npz", engine="crnn", barge_in=settings, on_barge_in=called.append)
         ego.process(mic, ref)
-        found.append(next(event.sample for event in ego.events() if event.kind == "speech_started"))
+        assert called and called == [event for event in ego.events() if event.kind == "speech_started"]
+        found.append(called[0].sample)
     assert found[0] >= found[1] + 0.15 * SAMPLE_RATE
 
 

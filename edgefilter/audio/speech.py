@@ -1,0 +1,86 @@
+"""The robot's speech, played here: the samples that the loudspeaker gets are the reference."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import soxr
+
+from edgefilter.audio.lookup import Device
+from edgefilter.audio.pairing import Inlet
+from edgefilter.audio.port import BUFFER_S, Port
+from edgefilter.dsp.ring import Ring
+from edgefilter.types import SAMPLE_RATE, Samples
+
+AHEAD_S = 1.0
+"""Speech that waits for the device, against a reader that is late."""
+PIECE = SAMPLE_RATE // 10
+FADE_S = 0.02
+"""How long a change of the gain by one takes: short for an ear, too long for a click."""
+
+
+class SpokenReference(Port):
+    """Plays speech, and is read like an input that hears exactly what is played, gain changes included.
+
+    speech: arrays (n,) at 16 kHz, played from the first `take` on; before it, and after it has ended, there is silence.
+    The sound leaves the loudspeaker later than it is read here, by the device's latency.
+    """
+
+    def __init__(self, sounddevice: Any, device: Device, speech: Iterator[Samples]) -> None:
+        super().__init__(sounddevice, device, "output")
+        self.inlet = Inlet(round(BUFFER_S * self.rate))
+        self._ahead = round(AHEAD_S * self.rate)
+        self._ring = Ring(2 * self._ahead)
+        self._pieces = self._converted(speech)
+        self._back = self._resampler(self.rate, SAMPLE_RATE)
+        self._gain = self._wanted = 1.0
+        self._step = 1.0 / (FADE_S * self.rate)
+
+    def fade(self, gain: float) -> None:
+        """Go on with this gain; with 0 the rest of the speech is passed over in silence."""
+        self._wanted = gain
+
+    def open(self) -> None:
+        """Start the stream, silent at first."""
+
+        def callback(outdata: np.ndarray, _frames: int, _time: Any, status: Any) -> None:
+            played = self._next(len(outdata))
+            outdata[:] = played[:, None]
+            self.inlet.receive(played, bool(status.output_underflow))
+
+        self.start(callback)
+
+    def take(self) -> Samples:
+        """What was played since the last call, (n,) at 16 kHz; sees to it that there is more to play."""
+        while len(self._ring) < self._ahead and (piece := next(self._pieces, None)) is not None:
+            self._ring.write(piece)
+        played = self.inlet.take()
+        return played if self._back is None else self._back.resample_chunk(played)
+
+    def _next(self, count: int) -> Samples:
+        """The next count samples for the device; called by the audio thread."""
+        played = np.zeros(count, np.float32)
+        speech = self._ring.read(count)
+        played[: speech.size] = speech
+        if self._gain != 1.0 or self._wanted != 1.0:
+            reach = self._step * np.arange(1, count + 1)
+            gains = self._gain + np.clip(self._wanted - self._gain, -reach, reach)
+            self._gain = float(gains[-1])
+            played *= gains.astype(np.float32)
+        return played
+
+    def _converted(self, speech: Iterator[Samples]) -> Iterator[Samples]:
+        """The speech in pieces at the device's rate."""
+        resampler = self._resampler(SAMPLE_RATE, self.rate)
+        for chunk in speech:
+            for at in range(0, chunk.size, PIECE):
+                piece = chunk[at : at + PIECE]
+                yield piece if resampler is None else resampler.resample_chunk(piece)
+        if resampler is not None:
+            yield resampler.resample_chunk(np.zeros(0, np.float32), last=True)
+
+    @staticmethod
+    def _resampler(given: int, wanted: int) -> soxr.ResampleStream | None:
+        return None if given == wanted else soxr.ResampleStream(given, wanted, 1, dtype="float32")

@@ -1,0 +1,51 @@
+"""What source and sink have lost, as events: counters that have risen since they were last looked at."""
+
+from __future__ import annotations
+
+from edgefilter.audio.protocols import Sink, Source
+from edgefilter.types import SAMPLE_RATE, Event, EventKind
+
+KINDS: dict[EventKind, tuple[str, ...]] = {
+    "lost": ("_lost", "_filled", "_dropped", "_inserted", "missing", "dropped"),
+    "overrun": ("_overruns",),
+    "underrun": ("underruns",),
+}
+"""Endings of the counters' names, by the kind of event that each leads to."""
+PERIOD = SAMPLE_RATE
+"""Samples between two looks: a machine that cannot keep up loses something in every block."""
+
+
+class Troubles:
+    """Looks at the counters of both ends; call it with the number of samples so far.
+
+    >>> class Ends:
+    ...     def stats(self):
+    ...         return {"microphone_lost": 160, "underruns": 0}
+    >>> troubles = Troubles(Ends(), Ends())
+    >>> [event.detail for event in troubles(16000, False)], troubles(16001, True)
+    (['160 microphone lost, 160 microphone lost'], [])
+    """
+
+    def __init__(self, source: Source, sink: Sink) -> None:
+        self._ends: tuple[Source | Sink, ...] = (source, sink)
+        self._before: list[dict[str, int]] = [{}, {}]
+        self._next = 0
+
+    def __call__(self, sample: int, last: bool) -> list[Event]:
+        """What was lost since the last look, at most one event of a kind; last: look even if that was just now."""
+        if sample < self._next and not last:
+            return []
+        self._next = sample + PERIOD
+        risen = []
+        for number, end in enumerate(self._ends):
+            now, before = dict(end.stats()), self._before[number]
+            risen += [(name, count - before.get(name, 0)) for name, count in now.items()]
+            self._before[number] = now
+        happened = []
+        for kind, endings in KINDS.items():
+            words = [
+                f"{count} {name.replace('_', ' ')}" for name, count in risen if count > 0 and name.endswith(endings)
+            ]
+            if words:
+                happened.append(Event(kind, sample, ", ".join(words)))
+        return happened

@@ -1,0 +1,110 @@
+"""A human who interrupts: the user's command is run beside the sound, and what cannot work is said."""
+
+import time
+
+import numpy as np
+import pytest
+
+from edgefilter import EgoFilter
+from edgefilter.cli import main
+from edgefilter.commands import barge_in
+from edgefilter.commands.barge_in import Availability, BargeInCommand, Lowering
+from edgefilter.session import Progress
+from edgefilter.types import Event
+
+STARTED, STOPPED = (Event(f"speech_{word}", 24000, "probability 0.98") for word in ("started", "stopped"))
+
+
+def test_the_command_is_run_once_for_each_interruption_and_told_what_happened(tmp_path):
+    said, file = [], tmp_path / "told"
+    command = f'echo "$EDGEFILTER_EVENT $EDGEFILTER_TIME $EDGEFILTER_DETAIL" >> {file}; cat >> {file}'
+    with BargeInCommand(command, said.append) as reaction:
+        for event in (STARTED, STOPPED, Event("realigned", 0, ""), STARTED):
+            reaction.hear(event)
+    assert file.read_text() == "speech_started 1.500 probability 0.98\n" * 2 and not said
+
+
+def test_the_sound_does_not_wait_for_the_command_and_what_it_prints_is_no_sound(capfd):
+    began = time.monotonic()
+    with BargeInCommand("sleep 0.3; echo heard", lambda text: None) as reaction:
+        reaction.hear(STARTED)
+        assert time.monotonic() - began < 0.2
+    out, err = capfd.readouterr()
+    assert (out, err) == ("", "heard\n")
+
+
+@pytest.mark.parametrize(("command", "code"), [("exit 3", "ended with 3"), ("/no/such/program 2>/dev/null", "127")])
+def test_a_command_that_fails_is_one_line(command, code):
+    said = []
+    with BargeInCommand(command, said.append) as reaction:
+        reaction.hear(STARTED)
+    assert len(said) == 1 and code in said[0] and command in said[0]
+
+
+def test_a_command_that_does_not_end_is_killed_with_its_children_and_not_multiplied(tmp_path, monkeypatch):
+    monkeypatch.setattr(barge_in, "PATIENCE_S", 0.3)
+    monkeypatch.setattr(barge_in, "MOST_AT_ONCE", 2)
+    said, alive = [], tmp_path / "alive"
+    with BargeInCommand(f"(sleep 1; touch {alive}) & wait", said.append) as reaction:
+        for _ in range(3):
+            reaction.hear(STARTED)
+        time.sleep(0.2)
+    killed = [text for text in said if "killed" in text]
+    assert len(killed) == 2 and len([text for text in said if "not run, 2 earlier ones" in text]) == 1
+    time.sleep(1.0)
+    assert not alive.exists()
+
+
+@pytest.mark.parametrize(("how", "gains"), [("stop", [0.0, 0.0]), ("duck", [10**-0.5, 10**-0.5, 1.0])])
+def test_the_robot_is_stopped_for_good_or_lowered_while_the_human_speaks(how, gains):
+    class Speech:
+        def __init__(self):
+            self.gains = []
+
+        def fade(self, gain):
+            self.gains.append(gain)
+
+    speech = Speech()
+    lowering = Lowering(speech, how)
+    for event in (STARTED, Event("learned", 0, ""), STARTED, STOPPED):
+        lowering.hear(event)
+    assert speech.gains == pytest.approx(gains)
+
+
+def test_an_engine_that_judges_no_speech_is_said_once_and_one_that_does_is_not():
+    for engine, expected in (("bypass", 1), ("crnn", 0)):
+        said = []
+        ego = EgoFilter(engine=engine)
+        availability = Availability(ego, said.append)
+        for samples in (100, 1000, 2000):
+            block = np.zeros(samples - ego.stats()["samples"], np.float32)
+            ego.process(block, block)
+            availability.show(Progress(samples=samples))
+        assert len(said) == expected and all("engine bypass does not judge speech" in text for text in said)
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        (["--input", "mic", "--on-barge-in", " "], "' ' is not a command"),
+        (["--input", "mic", "--barge-in", "stop"], "--barge-in concerns the speech that --play plays"),
+        (["--input", "mic", "--barge-in", "shout", "--play", "x.wav"], "'shout'"),
+        (["--input", "mic", "--speaker", "x"], "--speaker concerns"),
+        (["--input", "-", "--play", "x.wav"], "found --input -"),
+        (["--input", "mic", "--reference", "monitor", "--play", "x.wav"], "found --reference monitor"),
+        (["--input", "mic", "--play", ""], "names no file"),
+    ],
+)
+def test_what_cannot_be_meant_is_one_line(words, expected, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert main(["run", *words, "--output", "out.wav"]) == 2
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == 1 and expected in lines[0] and not list(tmp_path.iterdir())
+
+
+def test_speech_that_is_no_sound_is_one_line(tmp_path, capsys):
+    (tmp_path / "speech.wav").write_text("hello")
+    words = ["run", "--input", "mic", "--play", str(tmp_path / "speech.wav"), "--output", str(tmp_path / "out.wav")]
+    assert main(words) == 1
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == 1 and "is not audio" in lines[0]
