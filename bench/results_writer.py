@@ -214,7 +214,7 @@ def command(data: Mapping[str, Sequence[Path]], models: Mapping[str, Path]) -> s
     known = {path.resolve(): f"{what}/{path.resolve().name}" for what, paths in data.items() for path in paths}
     known |= {path.resolve(): name for name, path in models.items()}
     spec = getattr(sys.modules["__main__"], "__spec__", None)
-    program = spec.name if spec and spec.name.startswith("bench.") else Path(sys.argv[0]).stem
+    program = spec.name.removesuffix(".__main__") if spec and spec.name.startswith("bench.") else Path(sys.argv[0]).stem
     return " ".join(["python", "-m", program, *(_without_folders(argument, known) for argument in sys.argv[1:])])
 
 

@@ -1,25 +1,37 @@
-"""A file that an audio encoder writes into and that stays a whole file when the disk fills up."""
+"""A file that an audio encoder writes into and that is a whole file at any time: on a full disk, and where the program is killed."""
 
 from __future__ import annotations
 
+import errno
 import io
 import os
+import stat
 from pathlib import Path
+
+try:
+    import fcntl
+except ModuleNotFoundError:  # Windows, which does not let two programs write one file anyway
+    fcntl = None  # type: ignore[assignment]
 
 _FLAC_FRAME = b"\xff\xf8"  # sync code of a frame of fixed size, RFC 9639, 9.1
 _HEADER = 256  # bytes in which both formats' headers lie
+_MOST = 0xFFFFFFFF  # a WAV of more bytes says so much, and readers go on to the end of the file
 
 
 class Disk(io.RawIOBase):
-    """A file in the making that stays whole on a full disk.
+    """A file in the making, one program's alone, that stays whole on a full disk and where the program is killed.
 
     The encoders' libraries turn a failed write into an unnamed error and then leave a torn last frame behind. Here a
     write that does not fit is undone and remembered in `error`, and from then on only the header may still be changed.
+    Raises BlockingIOError, and leaves the file alone, where another program is writing it.
     """
 
     def __init__(self, path: Path) -> None:
         super().__init__()
-        self._file: io.FileIO = open(path, "w+b", buffering=0)  # noqa: SIM115 (closed by close)
+        self._file: io.FileIO = open(path, "r+b", buffering=0, opener=_make_or_open)  # noqa: SIM115 (closed by close)
+        if stat.S_ISREG(os.fstat(self._file.fileno()).st_mode):
+            _take_alone(self._file)
+            self._file.truncate(0)
         self._end: int | None = None
         self._flac_frames = 0
         self.error: OSError | None = None
@@ -53,10 +65,19 @@ class Disk(io.RawIOBase):
     def tell(self) -> int:
         return self._file.tell()
 
-    def finish(self) -> None:
-        """Close the file after its encoder; if the disk was full, make its header agree with what is there."""
+    def update_header(self) -> None:
+        """Make the header agree with what is there by now: an encoder does so at the end, which a killed program does not see."""
+        at = self._file.tell()
         try:
-            if self.error:
+            self._repair_header()
+        except OSError as error:
+            self.error = self.error or error
+        self._file.seek(at)
+
+    def finish(self) -> None:
+        """Close the file after its encoder; if the disk was full, or the sizes are too large for a header, it is put right."""
+        try:
+            if self.error or self._file.seek(0, os.SEEK_END) > _MOST:
                 self._repair_header()
             self._file.close()
         except OSError as error:
@@ -76,7 +97,7 @@ class Disk(io.RawIOBase):
         end = self._file.seek(0, os.SEEK_END)
         for at in (4, start.index(b"data") + 4):
             self._file.seek(at)
-            self._file.write((end - at - 4).to_bytes(4, "little"))
+            self._file.write(min(end - at - 4, _MOST).to_bytes(4, "little"))
 
     def _repair_flac(self, start: bytes) -> None:
         """Put the number of samples that reached the disk into STREAMINFO (RFC 9639, 8.2).
@@ -89,3 +110,21 @@ class Disk(io.RawIOBase):
         fields = int.from_bytes(start[18:26], "big") >> 36 << 36 | total
         self._file.seek(18)
         self._file.write(fields.to_bytes(8, "big") + bytes(16))
+
+
+def _make_or_open(path: str, flags: int) -> int:
+    """The file as it is: emptied only once it is known that nobody else writes it."""
+    return os.open(path, flags | os.O_CREAT, 0o666)
+
+
+def _take_alone(file: io.FileIO) -> None:
+    if fcntl is None:
+        return
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        file.close()
+        raise
+    except OSError as error:
+        if error.errno not in (errno.ENOLCK, errno.ENOTSUP, errno.EINVAL):  # file systems without locks
+            raise

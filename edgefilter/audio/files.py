@@ -122,9 +122,10 @@ class _Taker:
 class FileSink:
     """A mono 16 kHz file, WAV or FLAC by suffix, 16-bit PCM (or 32-bit float for WAV).
 
-    Valid up to the last sample however the context is left. `clipped` counts samples beyond full scale.
-    Raises UsageError for another suffix, AudioFileError where the file cannot be written or the disk is full; then what
-    fitted remains, as a valid file.
+    Valid up to the last sample however the context is left, and where the program is killed: a WAV up to the last
+    write, a FLAC up to the last of its frames of a quarter of a second. `clipped` counts samples beyond full scale.
+    Raises UsageError for another suffix, AudioFileError where the file cannot be written, another program is writing
+    it, or the disk is full; then what fitted remains, as a valid file.
 
     >>> import tempfile, numpy as np
     >>> with tempfile.TemporaryDirectory() as folder:
@@ -146,6 +147,11 @@ class FileSink:
         self._float32 = float32
         try:
             self._disk = Disk(self.path)
+        except BlockingIOError:
+            raise AudioFileError(
+                f"output {self.path} is being written by another program (a second edgefilter?): end that one or name"
+                " another file"
+            ) from None
         except OSError as error:
             raise AudioFileError(
                 f"output {self.path} cannot be written: {error.strerror}; name a file in a writable directory"
@@ -176,6 +182,8 @@ class FileSink:
         if self._file is None:
             raise AudioFileError(f"output {self.path} is closed already")
         self._file.write(data)
+        if not self._disk.error:
+            self._disk.update_header()
         if self._disk.error:
             self.close(quiet=True)
             raise self._full(self._disk.error)

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import json
+import math
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from edgefilter.dsp.stft import StftConfig
+from edgefilter.engines.onnx_file import check_shipped, read_model
 from edgefilter.errors import ModelError, StftError
 from edgefilter.types import SAMPLE_RATE
 
@@ -22,6 +24,8 @@ except Exception as error:  # a broken installation raises what its binary part 
 
 FOLDERS = (Path(__file__).parents[1] / "models", Path(__file__).parents[2] / "models")
 """Where models lie: inside the installed package, or at the top of a checkout."""
+MOST_STATE, MOST_FFT = 1 << 22, 1 << 14
+"""Values in one state tensor at most, 16 MiB; the longest transform, a second."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,6 +79,7 @@ def find_model(given: str | Path | None, variable: str, name: str, remedy: str) 
         return path
     for folder in FOLDERS:
         if (folder / name).is_file():
+            check_shipped(folder / name)
             return folder / name
     raise ModelError(f"there is no {name} in {FOLDERS[0]}: {remedy}, or name one with --model or {variable}")
 
@@ -83,8 +88,9 @@ def open_session(path: Path) -> onnxruntime.InferenceSession:
     """A session on one core: frames are too small to share, and a second thread that spins costs a whole core.
 
     Denormal numbers count as zero in the thread that makes the session. Raises ModelError where the file is no ONNX
-    model.
+    model, or one that leads out of its file (onnx_file.py).
     """
+    content = read_model(path)
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = options.inter_op_num_threads = 1
     options.execution_mode = onnxruntime.ExecutionMode.ORT_SEQUENTIAL
@@ -94,11 +100,14 @@ def open_session(path: Path) -> onnxruntime.InferenceSession:
     options.add_session_config_entry("session.inter_op.allow_spinning", "0")
     options.add_session_config_entry("session.set_denormal_as_zero", "1")
     try:
-        return onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
+        # a fallback would print, and try the same again
+        session = onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"], enable_fallback=0)
+        for slot in (*session.get_inputs(), *session.get_outputs()):
+            _ = slot.name, slot.shape  # text that is none fails here rather than later
+        _ = session.get_modelmeta().custom_metadata_map
+        return session
     except Exception as error:  # onnxruntime's exceptions share no base of their own
-        raise ModelError(
-            f"model {path} cannot be loaded ({' '.join(str(error).split())[:160]}): export it again"
-        ) from None
+        raise ModelError(f"model {path} cannot be loaded ({plain(str(error))}): export it again") from None
 
 
 def open_model(path: Path, kind: str, *versions: int) -> Model:
@@ -109,15 +118,21 @@ def open_model(path: Path, kind: str, *versions: int) -> Model:
     _expect(path, "version", said.get("version"), *map(str, versions))
     _expect(path, "sample_rate", said.get("sample_rate"), str(SAMPLE_RATE))
     try:
-        stft = StftConfig(int(said["n_fft"]), int(said["hop"]), int(said["window_length"]), said["window"])
+        sizes = [int(said[name]) for name in ("n_fft", "hop", "window_length")]
+        if max(sizes) > MOST_FFT:
+            raise ValueError(f"sizes of the STFT {sizes}, expected at most {MOST_FFT}")
+        stft = StftConfig(*sizes, said["window"])
         states = tuple(
             (str(name), tuple(int(size) for size in shape)) for name, shape in json.loads(said.get("states", "[]"))
         )
+        for name, shape in states:
+            if min(shape, default=0) < 1 or math.prod(shape) > MOST_STATE:
+                raise ValueError(f"state {name[:40]} of shape {str(shape)[:80]}")
         training, figures = json.loads(said["training"]), json.loads(said["figures"])
     except KeyError as error:
         raise ModelError(f"model {path} does not say its {error.args[0]}: export it again") from None
-    except (ValueError, TypeError, StftError) as error:
-        raise ModelError(f"model {path} has unusable metadata ({error}): export it again") from None
+    except (ValueError, TypeError, StftError, RecursionError, OverflowError) as error:
+        raise ModelError(f"model {path} has unusable metadata ({plain(str(error))}): export it again") from None
     return Model(path, int(said["version"]), session, stft, training, figures, states)
 
 
@@ -134,9 +149,25 @@ def expect_slots(model: Model, inputs: Mapping[str, tuple], outputs: Mapping[str
         fits = found.keys() == wanted.keys() and all(_may_be(shape, wanted[name]) for name, shape in found.items())
         if not fits:
             said, expected = (
-                ", ".join(f"{name} {list(shape)}" for name, shape in sorted(each.items())) for each in (found, wanted)
+                plain(", ".join(f"{name} {list(shape)}" for name, shape in sorted(each.items())), 400)
+                for each in (found, wanted)
             )
             raise ModelError(f"model {model.path} has {word} {said}, its metadata wants {expected}: export it again")
+
+
+def expect_answer(path: Path, answer: Callable[[], Iterable[np.ndarray]]) -> None:
+    """Refuse a model that fails on a first frame, or answers it with what is no finite number."""
+    try:
+        found = answer()
+    except Exception as error:  # onnxruntime's own, or numpy's of shapes that cannot be
+        raise ModelError(f"model {path} cannot be run ({plain(str(error))}): export it again") from None
+    if not all(np.isfinite(part).all() for part in found):
+        raise ModelError(f"model {path} answers with values that are not finite: train it again")
+
+
+def plain(text: str, most: int = 160) -> str:
+    """What a file or a library says, fit for one line."""
+    return " ".join(text.split())[:most]
 
 
 def _may_be(found: Sequence[int | str | None], wanted: Sequence[int | str]) -> bool:
@@ -149,6 +180,6 @@ def _may_be(found: Sequence[int | str | None], wanted: Sequence[int | str]) -> b
 def _expect(path: Path, key: str, found: str | None, *wanted: str) -> None:
     if found not in wanted:
         raise ModelError(
-            f"model {path} has {key} {found or 'unknown'}, expected {' or '.join(wanted)}: take the model that belongs to this"
+            f"model {path} has {key} {plain(found or 'unknown', 40)}, expected {' or '.join(wanted)}: take the model that belongs to this"
             " engine and version"
         )

@@ -9,7 +9,7 @@ from typing import ClassVar
 import numpy as np
 
 from edgefilter.engines.base import FrontEndKind
-from edgefilter.engines.onnx_session import expect_slots, find_model, open_model
+from edgefilter.engines.onnx_session import expect_answer, expect_slots, find_model, open_model
 from edgefilter.engines.paper_ss import PAPER_STFT
 from edgefilter.errors import ModelError
 from edgefilter.types import SAMPLE_RATE, Frame, Spectrum
@@ -45,6 +45,9 @@ class PaperCrnn:
             )
         clip = (1, "any", PAPER_STFT.bins)
         expect_slots(self.model, {"mic_magnitude": clip, "reference_magnitude": clip}, {"mask": clip})
+        frame = np.ones(PAPER_STFT.bins, np.complex64)
+        power = np.ones(PAPER_STFT.bins, np.float32)
+        expect_answer(self.model.path, lambda: self.answer([Frame(frame, frame, frame, frame, power, power)] * 2))
 
     def answer(self, frames: Sequence[Frame]) -> list[Spectrum]:
         """The human's spectrum for each frame of the clip."""

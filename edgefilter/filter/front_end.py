@@ -8,6 +8,7 @@ from edgefilter.alignment.aligner import Aligner
 from edgefilter.alignment.delay_line import UNLOCATED, Aligned
 from edgefilter.alignment.paper import PaperAligner
 from edgefilter.dsp.stft import Analyser, StftConfig
+from edgefilter.echo.source_chain import SourceChain
 from edgefilter.engines.base import ClipEngine, Engine
 from edgefilter.filter.canceller import Canceller, CancellerOutput
 from edgefilter.filter.echo_path import EchoPath, starting_path
@@ -87,7 +88,7 @@ class FrontEnd:
 
     def __init__(self, engine: Engine | ClipEngine, profile: Profile | None, learner: Learner | None = None) -> None:
         stft = engine.stft
-        self.hop = stft.hop
+        self.hop, self._stft = stft.hop, stft
         self.aligner: Aligner | PaperAligner | None = None
         self.gate: OnsetGate | None = None
         self.linear_stage: LinearStage | None = None
@@ -99,8 +100,7 @@ class FrontEnd:
                 self.gate = OnsetGate(stft.hop, float(np.sum(np.square(profile.echo.running_response()))))
             path = starting_path(profile, stft.hop)
             self.linear_stage = LinearStage(aligner, path, Residual(stft, profile), learner)
-            colours = path.source.colours
-            self._unpredictable = Unpredictable(stft, colours) if colours else None
+            self._source: SourceChain | None = None
         self._analyser = Analyser(stft, channels=4 if self.linear_stage else 2)
         self._low_cut = None if profile or not self.linear_stage else low_cut(stft)
         self._nothing = np.zeros(stft.bins, np.float32)
@@ -130,9 +130,15 @@ class FrontEnd:
         if self._low_cut is not None:
             spectra *= self._low_cut
         x, r, e, error = spectra
-        added = self._unpredictable.step(stage.path.source.expected) if self._unpredictable else None
-        noise, residual = stage.residual.step(e, error, linear.uncertainty, added)
+        noise, residual = stage.residual.step(e, error, linear.uncertainty, self._added(stage.path.source))
         return Frame(x, r, e, error, noise, residual), aligned
+
+    def _added(self, source: SourceChain) -> Samples | None:
+        """What the effects of the path in use bring that no waveform predicts; a lesson can have brought another path."""
+        if source is not self._source:
+            self._source = source
+            self._unpredictable = Unpredictable(self._stft, source.colours) if source.colours else None
+        return self._unpredictable.step(source.expected) if self._unpredictable else None
 
 
 def low_cut(stft: StftConfig) -> Samples:

@@ -8,9 +8,7 @@ import json
 import math
 import os
 import secrets
-import struct
 import zipfile
-import zlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -128,8 +126,10 @@ def _members(content: bytes) -> dict[str, np.ndarray]:
                 with archive.open(info) as member:
                     arrays[info.filename.removesuffix(".npy")] = _array(member.read(info.file_size + 1), info.filename)
             return arrays
-    except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError, struct.error) as error:
-        raise _Damaged(f"truncated or damaged ({error})") from None
+    except _Damaged:
+        raise
+    except Exception as error:  # zipfile lets through what its arithmetic raises: ValueError, struct.error, zlib.error
+        raise _Damaged(f"truncated or damaged ({' '.join(str(error).split())[:80]})") from None
 
 
 def _array(content: bytes, name: str) -> np.ndarray:
