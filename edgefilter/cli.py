@@ -137,7 +137,11 @@ def _add_diagnosis(commands: argparse._SubParsersAction) -> None:
 
 def _add_devices(commands: argparse._SubParsersAction) -> None:
     devices = commands.add_parser("devices", help="list sound devices and the reference that live use would take")
-    devices.add_argument("--json", metavar="FILE", help="write the list as JSON ('-': standard output)")
+    word = devices.add_mutually_exclusive_group()
+    word.add_argument("--json", metavar="FILE", help="write the list as JSON ('-': standard output)")
+    word.add_argument("--setup", action="store_true", help="print what makes a virtual speaker and microphone")
+    word.add_argument("--load", action="store_true", help="make them, until the sound server ends")
+    word.add_argument("--unload", action="store_true", help="remove them")
 
 
 def _add_profile(commands: argparse._SubParsersAction) -> None:

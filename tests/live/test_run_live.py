@@ -171,6 +171,7 @@ def test_an_unknown_device_is_one_line_that_names_the_known_ones(server, tmp_pat
 def test_devices_lists_them_and_the_reference(server):
     result = subprocess.run(edgefilter("devices"), env=server.environment, cwd=ROOT, capture_output=True, text=True)
     assert result.returncode == 0, result.stderr
+    assert "sound server, output  robot_mic" in result.stdout
     assert "robot_mic_monitor" in result.stdout and "reference would come from: robot.monitor" in result.stdout
 
 
