@@ -20,7 +20,7 @@ def test_the_played_speech_is_the_reference_and_ends_when_the_human_speaks(serve
         edgefilter(
             "run", "--input", "mic", "--play", tmp_path / "robot.wav", "--barge-in", "stop", "--engine", "crnn",
             "--no-learn", "--on-barge-in", f"echo $EDGEFILTER_TIME > {tmp_path}/noticed", "--seconds", 6,
-            "--save-input", tmp_path / "heard", "--output", tmp_path / "out.wav", "--json", tmp_path / "stats.json",
+            "--record", tmp_path / "heard", "--output", tmp_path / "out.wav",
         ),
         env=server.environment, cwd=ROOT, stderr=subprocess.PIPE, text=True,
     )  # fmt: skip
@@ -37,9 +37,9 @@ def test_the_played_speech_is_the_reference_and_ends_when_the_human_speaks(serve
     from_loudspeaker = np.fromfile(tmp_path / "heard.raw", "<i2")
     assert live.returncode == 0 and "what is played on" in said, said
 
-    events = json.loads((tmp_path / "stats.json").read_text())["events"]
-    noticed = next(event["seconds"] for event in events if event["kind"] == "speech_started")
-    assert float((tmp_path / "noticed").read_text().split()[0]) == round(noticed, 3)
+    events = [json.loads(line) for line in (tmp_path / "heard/events.jsonl").read_text().splitlines()]
+    noticed = next(event["time"] for event in events if event["kind"] == "speech_started")
+    assert float((tmp_path / "noticed").read_text().split()[0]) == noticed
     reference = np.rint(32768 * soundfile.read(tmp_path / "heard/reference.wav", dtype="float32")[0]).astype(int)
     ended = int(np.flatnonzero(reference)[-1])
     assert 0.0 < ended / 16_000 - noticed < 0.4  # the device's buffer, and the blocks between the two threads

@@ -66,7 +66,7 @@ def db(x):
 def test_live_run_takes_the_monitor_ends_by_ctrl_c_and_equals_the_file_path(server, conversation, tmp_path):
     command = edgefilter(
         "run", "--input", "mic", "--profile", DEMO / "profile.npz", "--output", tmp_path / "live.wav", "--engine", "ss",
-        "--save-input", tmp_path / "heard", "--json", tmp_path / "stats.json", "--no-learn",
+        "--record", tmp_path / "heard", "--json", tmp_path / "stats.json", "--no-learn",
     )  # fmt: skip
     heard = tmp_path / "heard/mic.wav"
     said = run_until_played(server, command, conversation, heard)
@@ -100,7 +100,7 @@ def test_live_the_loudspeaker_is_learned_by_another_process_and_remembered(serve
     file = tmp_path / "robot.npz"
     command = edgefilter(
         "run", "--input", "mic", "--output", tmp_path / "live.wav", "--engine", "linear", "--learn", file,
-        "--json", tmp_path / "stats.json", "--save-input", tmp_path / "heard",
+        "--json", tmp_path / "stats.json", "--record", tmp_path / "heard",
     )  # fmt: skip
     run_until_played(server, command, tmp_path, tmp_path / "heard/mic.wav")
     learning = json.loads((tmp_path / "stats.json").read_text())["learning"]

@@ -52,7 +52,7 @@ def test_others_listen_to_the_virtual_microphone_and_the_robot_plays_into_the_vi
     live = subprocess.Popen(
         edgefilter(
             "run", "--input", "mic", "--output", "edgefilter_human", "--engine", "bypass", "--seconds", 5,
-            "--save-input", tmp_path / "heard",
+            "--record", tmp_path / "heard",
         ),
         cwd=ROOT, stderr=subprocess.PIPE, text=True,
     )  # fmt: skip
