@@ -95,6 +95,11 @@ def _on_server(name: str, kind: str) -> Device | None:
     return None
 
 
+def input_port(name: str | int | Device | None) -> InputPort:
+    """An input that can be opened, found by what people type."""
+    return InputPort(_sounddevice(), find(name, "input"))
+
+
 def speaker(output: str | int | Device | None, speech: Reader) -> SpokenReference:
     """Speech for an output device, to be the reference of a LiveSource."""
     spoken = SpokenReference(_sounddevice(), find(output, "output"), speech.chunks())

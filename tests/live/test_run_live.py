@@ -190,3 +190,15 @@ def test_live_calibration_measures_the_virtual_room(server, tmp_path):
     assert figures["delay_samples"] > 0
     middle = [band["snr_db"] for band in figures["bands"] if 200 < band["low_hz"] < 5000]
     assert min(middle) > 30  # there is no fan: 16-bit rounding is all the noise
+
+
+def test_the_doctor_finds_the_virtual_machine_fit(server):
+    result = subprocess.run(
+        edgefilter("doctor", "--json", "-"), env=server.environment, cwd=ROOT, capture_output=True, text=True
+    )
+    found = json.loads(result.stdout)
+    checks = {check["name"]: check for check in found["checks"]}
+    assert result.returncode == 0 and found["fit"], result.stdout + result.stderr
+    assert "as shipped" in checks["model"]["found"] and "robot.monitor" in checks["reference"]["found"]
+    assert {"microphone", "mic clock", "ref clock", "sound server"} <= set(checks)
+    assert checks["level"]["state"] == "warning" and "unmute" in checks["level"]["do"]  # nobody plays anything
