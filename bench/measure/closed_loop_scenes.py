@@ -34,11 +34,11 @@ COUGH_DB = 3.0
 
 
 class Talk(NamedTuple):
-    """What one run of the filter gave: samples, events of speech, the probability after each hop."""
+    """What one run of the filter gave: samples, events of speech, the probability after each hop, None where nobody judges."""
 
     out: Samples
     events: list[Event]
-    probability: list[float]
+    probability: list[float | None]
     hop: int
 
 
@@ -48,7 +48,7 @@ def listen(mic: Samples, ref: Samples, profile: Profile | None, engine: str) -> 
     mic, ref = mic.astype(np.float32), ref.astype(np.float32)
     for at in range(0, mic.size, ego.hop):
         done.append(ego.process(mic[at : at + ego.hop], ref[at : at + ego.hop]))
-        probability.append(ego.speech_probability or 0.0)
+        probability.append(ego.speech_probability)
     events = [event for event in ego.events() if event.kind.startswith("speech")]
     return Talk(np.concatenate((*done, ego.flush())), events, probability, ego.hop)
 

@@ -99,7 +99,7 @@ def summarise(rows: list[dict]) -> dict:
                 "human": len(scores["human"]),
                 "robot_told": sum(s >= HALF for s in scores["robot"]),
                 "human_taken": sum(s >= HALF for s in scores["human"]),
-                "area": float(np.trapezoid(y, x)),
+                "area": float(np.sum(np.diff(x) * (y[1:] + y[:-1])) / 2),
                 "curve": curve,
             }
     return found

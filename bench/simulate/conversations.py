@@ -12,8 +12,9 @@ end of the human in mic, t_main: onset of the second utterance in ref, lag), snr
 nl_db (distortion relative to the linear loudspeaker, best gain removed), delay (of the direct sound in sweep_mic),
 seed, said (the robot's sentences, each with its first and last sample in ref). True delay of the reference in mic:
 lag + delay - ppm 1e-6 t. Kinds: `paper`, one lag of 50-300 ms; `live`, lag before t_main and lag2 after (0-1.2 s each),
-volume turned by up to 3 dB between them (volume_db), clocks 10-300 ppm apart (either sign). Even conversations take place in the laboratory (RT60 0.20-0.26 s), odd ones in an office
-(0.50-0.75 s). Item i of a seed is the same whatever --count is.
+volume turned by up to 3 dB between them (volume_db), clocks 10-300 ppm apart (either sign). Even conversations take
+place in the laboratory (RT60 0.20-0.26 s), odd ones in an office (0.50-0.75 s). Item i of a seed is the same whatever
+--count is.
 
 How it compares with a set of ten `paper` conversations simulated by other hands (lab / office means: theirs; then 60 of
 these with --distortion strong):
