@@ -34,7 +34,7 @@ LEAVES = {
 }
 LAYERS = (
     {"errors", "types"},
-    {"dsp"},
+    {"dsp", "selfecho"},
     {"echo"},
     {"profile"},
     {"alignment", "engines"},

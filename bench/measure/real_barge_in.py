@@ -46,7 +46,7 @@ def starts(events: Sequence[Event]) -> int:
     return sum(event.kind == "speech_started" for event in events)
 
 
-def replay(probability: Sequence[float], hop: int, threshold: float) -> list[Event]:
+def replay(probability: Sequence[float | None], hop: int, threshold: float) -> list[Event]:
     """The events that the package would give at another threshold, one value a hop of so many samples."""
     usual = BargeInSettings()
     rule = BargeIn(hop / SAMPLE_RATE, replace(usual, threshold=threshold, release=min(usual.release, threshold)))

@@ -10,10 +10,11 @@ sweep_ref, sweep_mic, fan_only (always recorded in a laboratory), ref, mic, clea
 inside mic), all FLAC, 16 kHz, 16 bit, and meta.json: room, rt60, voice, speaker, text, positions in samples (start and
 end of the human in mic, t_main: onset of the second utterance in ref, lag), snr_fan and sisdr_mix over [start, end],
 nl_db (distortion relative to the linear loudspeaker, best gain removed), delay (of the direct sound in sweep_mic),
-seed. True delay of the reference in mic: lag + delay - ppm 1e-6 t. Kinds: `paper`, one lag of 50-300 ms; `live`, lag
-before t_main and lag2 after (0-1.2 s each), volume turned by up to 3 dB between them (volume_db), clocks 10-300 ppm
-apart (either sign). Even conversations take place in the laboratory (RT60 0.20-0.26 s), odd ones in an office
-(0.50-0.75 s). Item i of a seed is the same whatever --count is.
+seed, said (the robot's sentences, each with its first and last sample in ref). True delay of the reference in mic:
+lag + delay - ppm 1e-6 t. Kinds: `paper`, one lag of 50-300 ms; `live`, lag before t_main and lag2 after (0-1.2 s each),
+volume turned by up to 3 dB between them (volume_db), clocks 10-300 ppm apart (either sign). Even conversations take
+place in the laboratory (RT60 0.20-0.26 s), odd ones in an office (0.50-0.75 s). Item i of a seed is the same whatever
+--count is.
 
 How it compares with a set of ten `paper` conversations simulated by other hands (lab / office means: theirs; then 60 of
 these with --distortion strong):
@@ -33,7 +34,7 @@ import csv
 import json
 import math
 import sys
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -44,14 +45,14 @@ from tqdm import tqdm
 from bench.simulate.simulated_robot import (
     RATE,
     Array,
-    Loudspeaker,
-    draw_body,
+    Robot,
     draw_fan,
-    draw_loudspeaker,
+    draw_robot,
     draw_room,
     fan_noise,
     sweep,
     warp,
+    with_distortion,
 )
 from edgefilter.dsp.metrics import si_sdr
 
@@ -62,12 +63,9 @@ DISTORTION_DB = {
     "moderate": {"lab": (-26.0, -21.0), "office": (-27.0, -21.0)},
     "strong": {"lab": (-21.0, -17.0), "office": (-17.5, -13.5)},
 }
-"""Range of the loudspeaker's distortion at the microphone.
-
-moderate: the nl_db that the set described above states. strong: so much that the best linear filter of 300 ms leaves
-about as much of the robot as in that set, although in an office a part of what it leaves there is reverberation behind
-the 300 ms.
-"""
+"""Range of the loudspeaker's distortion at the microphone. moderate: the nl_db that the set described above states.
+strong: so much that the best linear filter of 300 ms leaves about as much of the robot as in that set, although in an
+office a part of what it leaves there is reverberation behind the 300 ms."""
 
 
 @dataclass(frozen=True)
@@ -79,21 +77,31 @@ class Clip:
     text: str
 
 
+Sentence = tuple[str, int, int]
+"""What the robot says, and its first and last sample."""
+
+
 @dataclass(frozen=True)
-class Robot:
-    """What does not change between rooms: loudspeaker, shell, geometry, converter delay, gain."""
+class Scene:
+    """A conversation that can be recorded again, should the robot say less of what it was to say.
 
-    loudspeaker: Loudspeaker
-    shell: Array
-    distance_m: float
-    direction: Array
-    bulk: int
+    signals: by name, as written. response, gain: from the loudspeaker to the microphone's samples. fan: (n,) in mic.
+    """
 
-    def record(self, x: Array, response: Array, linear: bool = False) -> Array:
-        """Microphone samples (n,) of the played samples x (n,) for a room's impulse response, without fan or human."""
-        path = signal.oaconvolve(response, self.shell)
-        heard = signal.oaconvolve(self.loudspeaker.play(x, linear), path)[: x.size - self.bulk]
-        return np.concatenate([np.zeros(self.bulk), heard])
+    signals: dict[str, Array]
+    meta: dict
+    robot: Robot
+    response: Array
+    gain: float
+    fan: Array
+
+    def echo(self, ref: Array) -> Array:
+        """(n,) of the robot at the microphone, for the reference (n,)."""
+        return self.gain * self.robot.record(played(ref, self.meta), self.response)
+
+    def mic(self, ref: Array) -> Array:
+        """(n,) of the microphone, for the reference (n,): human and fan are the same whatever the robot says."""
+        return self.echo(ref) + self.signals["clean"] + self.fan
 
 
 def read_clips(folder: Path, seconds: tuple[float, float]) -> list[Clip]:
@@ -111,6 +119,14 @@ def read_clips(folder: Path, seconds: tuple[float, float]) -> list[Clip]:
     return clips
 
 
+def read_voices(folders: list[Path]) -> dict[str, list[Clip]]:
+    """The robot's sentences by voice."""
+    voices: dict[str, list[Clip]] = {}
+    for clip in (clip for folder in folders for clip in read_clips(folder, (1.0, 15.0))):
+        voices.setdefault(clip.speaker, []).append(clip)
+    return voices
+
+
 def read_speech(clip: Clip) -> Array:
     samples, rate = sf.read(clip.path)
     if rate != RATE or samples.ndim != 1:
@@ -119,32 +135,17 @@ def read_speech(clip: Clip) -> Array:
     return samples[loud[0] : loud[-1] + 1]
 
 
-def read_utterance(rng: np.random.Generator, clips: list[Clip], at_least: float) -> Array:
-    """Sentences of one voice in random order until they last at_least seconds, 0.1-0.4 s apart."""
+def read_utterance(rng: np.random.Generator, clips: list[Clip], at_least: float) -> tuple[Array, list[Sentence]]:
+    """Sentences of one voice in random order until they last at_least seconds, 0.1-0.4 s apart, and where they are."""
     parts: list[Array] = []
+    said: list[Sentence] = []
     for i in rng.permutation(len(clips)):
+        at = sum(part.size for part in parts)
         parts += [read_speech(clips[i]), np.zeros(int(rng.uniform(0.1, 0.4) * RATE))]
-        if sum(part.size for part in parts[:-1]) >= at_least * RATE:
+        said.append((clips[i].text, at, at + parts[-2].size))
+        if at + parts[-2].size >= at_least * RATE:
             break
-    return np.concatenate(parts[:-1])
-
-
-def draw_robot(rng: np.random.Generator) -> Robot:
-    direction = np.array([*rng.uniform(-1, 1, size=2), rng.uniform(-0.8, -0.1)])
-    direction /= np.linalg.norm(direction)
-    return Robot(draw_loudspeaker(rng), draw_body(rng), rng.uniform(0.1, 0.3), direction, int(rng.integers(250, 635)))
-
-
-def with_distortion(robot: Robot, played: Array, response: Array, nl_db: float) -> tuple[Robot, float]:
-    """The robot with its drive turned until the voice is distorted by nl_db (bisection), and the figure reached."""
-    straight = robot.record(played, response, linear=True)
-    low, high = math.log(0.01), math.log(100.0)
-    for _ in range(9):
-        middle = 0.5 * (low + high)
-        robot = replace(robot, loudspeaker=replace(robot.loudspeaker, drive=math.exp(middle)))
-        found = -si_sdr(robot.record(played, response), straight)
-        low, high = (middle, high) if found < nl_db else (low, middle)
-    return robot, found
+    return np.concatenate(parts[:-1]), said
 
 
 def draw_lags(rng: np.random.Generator, kind: str, pause: int) -> tuple[int, int, float, float]:
@@ -162,10 +163,10 @@ def draw_lags(rng: np.random.Generator, kind: str, pause: int) -> tuple[int, int
             return first, second, ppm, rng.uniform(-3, 3)
 
 
-def make_conversation(
+def make_scene(
     seed: int, index: int, kind: str, speech: list[Clip], voices: dict[str, list[Clip]], distortion: str = "moderate"
-) -> tuple[dict[str, Array], dict]:
-    """Signals by name (n,) float64 and the contents of meta.json, for item index of this seed."""
+) -> Scene:
+    """Item index of this seed: signals (n,) float64 and the contents of meta.json."""
     rng = np.random.default_rng([seed, index])
     human_clip = speech[np.random.default_rng(seed).permutation(len(speech))[index % len(speech)]]
     voice = str(rng.choice(sorted(voices)))
@@ -174,54 +175,49 @@ def make_conversation(
     laboratory = draw_room(rng, "lab", robot.distance_m, robot.direction, human_m)
     room = draw_room(rng, "office", robot.distance_m, robot.direction, human_m) if room_name == "office" else laboratory
     human = read_speech(human_clip)
-    script, ref, played = make_script(rng, kind, voices[voice], human.size)
-    robot, nl_db = with_distortion(robot, played, room.robot, rng.uniform(*DISTORTION_DB[distortion][room_name]))
+    script, ref = make_script(rng, kind, voices[voice], human.size)
+    voice_heard = played(ref, script)
+    robot, nl_db = with_distortion(robot, voice_heard, room.robot, rng.uniform(*DISTORTION_DB[distortion][room_name]))
 
-    start = script["onset"] + robot.bulk
+    start = script.pop("onset") + robot.bulk
     voiced = signal.oaconvolve(human, room.human)[: ref.size - start]
     clean = np.concatenate([np.zeros(start), voiced, np.zeros(ref.size - start - voiced.size)])
     end = min(start + human.size + RATE // 10, ref.size)
-    signals, scores = record_all(
-        rng, UNFILTERED_DB[room_name], robot, (laboratory.robot, room.robot), played, clean, slice(start, end)
+    signals, scores, gain = record_all(
+        rng, UNFILTERED_DB[room_name], robot, (laboratory.robot, room.robot), voice_heard, clean, slice(start, end)
     )
     impulse = np.eye(1, 4096)[0]
     delay = int(np.argmax(np.abs(robot.record(impulse, laboratory.robot, linear=True))))
-    del script["onset"]
-    meta = {
-        "room": room_name,
-        "rt60": room.rt60_s,
-        "voice": voice,
-        "speaker": human_clip.speaker,
-        "text": human_clip.text,
-    }
-    meta |= {
-        "start": start,
-        "end": end,
-        **script,
-        **scores,
-        "nl_db": nl_db,
-        "live": kind == "live",
-        "delay": delay,
-        "seed": [seed, index],
-    }
-    return {"ref": ref, **signals}, meta
+    meta = {"room": room_name, "rt60": room.rt60_s, "voice": voice, "speaker": human_clip.speaker}
+    meta |= {"text": human_clip.text, "start": start, "end": end, **script, **scores, "nl_db": nl_db}
+    meta |= {"live": kind == "live", "delay": delay, "seed": [seed, index]}
+    fan = signals.pop("fan")
+    return Scene({"ref": ref, **signals}, meta, robot, room.robot, gain, fan)
 
 
-def make_script(rng: np.random.Generator, kind: str, voice: list[Clip], human_size: int) -> tuple[dict, Array, Array]:
-    """Meta entries (and the human's `onset` before converter delay), ref (n,), and what the converter plays (n,)."""
+def make_script(rng: np.random.Generator, kind: str, voice: list[Clip], human_size: int) -> tuple[dict, Array]:
+    """Meta entries (and the human's `onset` before converter delay) and ref (n,)."""
     wait, pause, lead = (int(s * RATE) for s in (rng.uniform(0.5, 1.6), rng.uniform(0.5, 1.1), 0.45))
-    first = read_utterance(rng, voice, 4.0)
-    second = read_utterance(rng, voice, (wait + human_size) / RATE + rng.uniform(0.3, 1.0))
+    first, said = read_utterance(rng, voice, 4.0)
+    second, said_then = read_utterance(rng, voice, (wait + human_size) / RATE + rng.uniform(0.3, 1.0))
     first, second = (0.7 * speech / max(np.abs(first).max(), np.abs(second).max()) for speech in (first, second))
     lag, lag2, ppm, volume_db = draw_lags(rng, kind, pause)
     t_main = lead + first.size + pause
-    ref, played = np.zeros((2, t_main + second.size + max(lag, lag2) + RATE // 2))
+    ref = np.zeros(t_main + second.size + max(lag, lag2) + RATE // 2)
     ref[lead : lead + first.size], ref[t_main : t_main + second.size] = first, second
-    played[lead + lag : lead + lag + first.size] = first
-    played[t_main + lag2 : t_main + lag2 + second.size] = 10 ** (volume_db / 20) * second
     script = {"lag": lag, "t_main": t_main, "onset": t_main + lag2 + wait}
     script |= {"lag2": lag2, "ppm": ppm, "volume_db": volume_db} if kind == "live" else {}
-    return script, ref, warp(played, ppm)
+    placed = ((lead, said), (t_main, said_then))
+    return script | {"said": [(text, at + i, at + j) for at, of in placed for text, i, j in of]}, ref
+
+
+def played(ref: Array, script: dict) -> Array:
+    """What the converter plays (n,) of ref (n,): each utterance after its lag, on its own clock, as loud as it was turned."""
+    out, at = np.zeros(ref.size), script["t_main"]
+    lag, lag2 = script["lag"], script.get("lag2", script["lag"])
+    out[lag : lag + at] = ref[:at][: ref.size - lag]
+    out[at + lag2 :] += 10 ** (script.get("volume_db", 0.0) / 20) * ref[at : ref.size - lag2]
+    return warp(out, script.get("ppm", 0.0))
 
 
 def record_all(
@@ -232,8 +228,8 @@ def record_all(
     played: Array,
     clean: Array,
     span: slice,
-) -> tuple[dict[str, Array], dict[str, float]]:
-    """Calibration in the first path's room, conversation in the second's, with all levels set, and their figures.
+) -> tuple[dict[str, Array], dict[str, float], float]:
+    """Calibration in the first path's room, conversation in the second's, with all levels set; their figures; the gain.
 
     The gain makes the sweep peak at 0.22-0.42 of full scale; the human is scaled to the unfiltered SI-SDR, the fan to
     4.5-10.5 dB below the human.
@@ -241,8 +237,9 @@ def record_all(
     excitation = sweep()
     sweep_echo = robot.record(excitation, paths[0])
     gain = rng.uniform(0.22, 0.42) / np.abs(sweep_echo).max()
-    echo = gain * robot.record(played, paths[1])
-    echo *= min(1.0, 0.9 / np.abs(echo).max())
+    echo = robot.record(played, paths[1])
+    echo_gain = gain * min(1.0, 0.9 / np.abs(gain * echo).max())
+    echo *= echo_gain
     mean, deviation = unfiltered_db
     target_db = mean + deviation * np.clip(rng.standard_normal(), -2, 2)
     clean = clean * math.sqrt(np.mean(echo[span] ** 2) / np.mean(clean[span] ** 2)) * 10 ** (target_db / 20)
@@ -256,8 +253,9 @@ def record_all(
         "fan_only": fan[1],
         "mic": mic,
         "clean": clean,
+        "fan": fan[2],
     }
-    return signals, {"snr_fan": snr_fan, "sisdr_mix": si_sdr(mic[span], clean[span])}
+    return signals, {"snr_fan": snr_fan, "sisdr_mix": si_sdr(mic[span], clean[span])}, echo_gain
 
 
 def main() -> None:
@@ -276,16 +274,14 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=1)
     options = parser.parse_args()
     speech = read_clips(options.speech, (3.0, 12.0))
-    voices: dict[str, list[Clip]] = {}
-    for clip in (clip for folder in options.voices for clip in read_clips(folder, (1.0, 15.0))):
-        voices.setdefault(clip.speaker, []).append(clip)
+    voices = read_voices(options.voices)
     for index in tqdm(range(options.count), unit="conversation", desc=str(options.output)):
-        signals, meta = make_conversation(options.seed, index, options.kind, speech, voices, options.distortion)
-        folder = options.output / f"{meta['room']}_{index:02d}"
+        scene = make_scene(options.seed, index, options.kind, speech, voices, options.distortion)
+        folder = options.output / f"{scene.meta['room']}_{index:02d}"
         folder.mkdir(parents=True, exist_ok=True)
-        for name, samples in signals.items():
+        for name, samples in scene.signals.items():
             sf.write(folder / f"{name}.flac", samples, RATE, subtype="PCM_16")
-        (folder / "meta.json").write_text(json.dumps(meta, indent=1) + "\n", encoding="utf-8")
+        (folder / "meta.json").write_text(json.dumps(scene.meta, indent=1) + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":

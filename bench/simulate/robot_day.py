@@ -15,18 +15,21 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import signal
 
-from bench.simulate.conversations import Clip, Robot, draw_robot, read_speech, with_distortion
+from bench.simulate.conversations import Clip, read_speech
 from bench.simulate.simulated_robot import (
     RATE,
     Array,
+    Robot,
     Room,
     draw_fan,
+    draw_robot,
     draw_room,
     draw_walls,
     fan_noise,
     stand,
     sweep,
     warp,
+    with_distortion,
 )
 from edgefilter.types import Samples
 

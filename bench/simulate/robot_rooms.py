@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bench.simulate.conversations import Clip, draw_robot, with_distortion
+from bench.simulate.conversations import Clip
 from bench.simulate.robot_day import (
     DISTORTION_DB,
     Repertoire,
@@ -16,7 +16,7 @@ from bench.simulate.robot_day import (
     loudness,
     speak,
 )
-from bench.simulate.simulated_robot import RATE, draw_room
+from bench.simulate.simulated_robot import RATE, draw_robot, draw_room, with_distortion
 from edgefilter.types import Samples
 
 LAG_S = (0.05, 0.3)

@@ -6,12 +6,14 @@ Shares no code with the filter's own echo model.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pyroomacoustics as pra
 from numpy.typing import NDArray
 from scipy import signal
+
+from edgefilter.dsp.metrics import si_sdr
 
 RATE = 16000
 OVERSAMPLING = 4
@@ -215,3 +217,38 @@ def sweep(peak: float = 0.35) -> Array:
     x[:320] *= fade
     x[-320:] *= fade[::-1]
     return np.concatenate([np.zeros(RATE // 2), x, np.zeros(RATE)])
+
+
+@dataclass(frozen=True)
+class Robot:
+    """What does not change between rooms: loudspeaker, shell, geometry, converter delay, gain."""
+
+    loudspeaker: Loudspeaker
+    shell: Array
+    distance_m: float
+    direction: Array
+    bulk: int
+
+    def record(self, x: Array, response: Array, linear: bool = False) -> Array:
+        """Microphone samples (n,) of the played samples x (n,) for a room's impulse response, without fan or human."""
+        path = signal.oaconvolve(response, self.shell)
+        heard = signal.oaconvolve(self.loudspeaker.play(x, linear), path)[: x.size - self.bulk]
+        return np.concatenate([np.zeros(self.bulk), heard])
+
+
+def draw_robot(rng: np.random.Generator) -> Robot:
+    direction = np.array([*rng.uniform(-1, 1, size=2), rng.uniform(-0.8, -0.1)])
+    direction /= np.linalg.norm(direction)
+    return Robot(draw_loudspeaker(rng), draw_body(rng), rng.uniform(0.1, 0.3), direction, int(rng.integers(250, 635)))
+
+
+def with_distortion(robot: Robot, played: Array, response: Array, nl_db: float) -> tuple[Robot, float]:
+    """The robot with its drive turned until the voice is distorted by nl_db (bisection), and the figure reached."""
+    straight = robot.record(played, response, linear=True)
+    low, high = math.log(0.01), math.log(100.0)
+    for _ in range(9):
+        middle = 0.5 * (low + high)
+        robot = replace(robot, loudspeaker=replace(robot.loudspeaker, drive=math.exp(middle)))
+        found = -si_sdr(robot.record(played, response), straight)
+        low, high = (middle, high) if found < nl_db else (low, middle)
+    return robot, found

@@ -10,9 +10,9 @@ import pytest
 
 from bench.measure import latency, learning, learning_cost, learning_curve
 from bench.simulate import robot_day
-from bench.simulate.conversations import draw_robot, read_clips
+from bench.simulate.conversations import read_clips
 from bench.simulate.robot_rooms import Recording
-from bench.simulate.simulated_robot import Room, draw_walls, stand
+from bench.simulate.simulated_robot import Room, draw_robot, draw_walls, stand
 from tests.bench.conftest import RATE, babble
 from tests.bench.test_programs import check_stamp
 from tests.bench.test_programs import run as run_program
