@@ -129,7 +129,7 @@ class LiveSource:
             self._reference = reference
         elif reference is not None:
             self._reference = InputPort(_sounddevice(), find(reference, "input"))
-        self._pairing = Pairing()
+        self._pairing = Pairing(late_is_lost=not isinstance(reference, SpokenReference))
         self._stopped = False
         self.total = None if seconds is None else round(seconds * SAMPLE_RATE)
         self.notes = [f"microphone: {self._mic.device}", *self._mic.notes]
