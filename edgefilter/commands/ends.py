@@ -53,11 +53,11 @@ def make_source(name: str, reference: str | SpokenReference | None, output: str)
             f"live, the reference is a device, found the file {reference}: leave --reference out or name a monitor"
             " ('edgefilter devices'); to play the file, --play"
         )
-    if reference is None:
-        own = virtual.speaker_monitor() if output == virtual.HUMAN else None
-        played_on = "default" if output in ("-", virtual.HUMAN) or looks_like_file(output) else output
-        reference = own or monitor_of(played_on)
-    return LiveSource(name, reference, patience_s=math.inf)
+    if reference is not None:
+        return LiveSource(name, reference, patience_s=math.inf)
+    own = virtual.speaker_monitor() if output == virtual.HUMAN else None
+    played_on = "default" if output in ("-", virtual.HUMAN) or looks_like_file(output) else output
+    return LiveSource(name, own or monitor_of(played_on), patience_s=math.inf)
 
 
 def make_sink(name: str, latency: int, wait: bool) -> Sink:

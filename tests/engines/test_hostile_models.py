@@ -75,6 +75,10 @@ def transform_beyond_all_memory(model):
     next(entry for entry in model.metadata_props if entry.key == "n_fft").value = str(2**40)
 
 
+def hop_beyond_all_memory(model):
+    next(entry for entry in model.metadata_props if entry.key == "hop").value = str(2**40)
+
+
 def text_of_many_lines(model):
     next(entry for entry in model.metadata_props if entry.key == "type").value = "a\n" * 10_000
 
@@ -90,6 +94,7 @@ def text_of_many_lines(model):
         (weights_that_are_no_numbers, "answers with values that are not finite"),
         (state_beyond_all_memory, "unusable metadata .*state_0"),
         (transform_beyond_all_memory, "unusable metadata .*expected at most"),
+        (hop_beyond_all_memory, "unusable metadata .*expected at most"),
         (text_of_many_lines, "has type a a a"),
     ],
 )
