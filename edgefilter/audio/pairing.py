@@ -87,10 +87,15 @@ class Pairing:
         self._watched = 0
         self.filled = self.dropped = self.inserted = 0
 
-    def push(self, mic: Samples, ref: Samples) -> Block | None:
-        """Take what arrived, (n,) and (m,), and return the block that is complete, if any."""
+    def push(self, mic: Samples, ref: Samples, silence: int = 0) -> Block | None:
+        """Take what arrived, (n,) and (m,), and return the block that is complete, if any.
+
+        silence: so many of ref, the first ones, stand in for a device that is away and are counted by whoever put them
+        there.
+        """
         late = min(self._debt, ref.size)
         self._debt -= late
+        self.filled -= min(late, silence)
         self._mic = np.concatenate((self._mic, mic))
         self._ref = np.concatenate((self._ref, ref[late:]))
         lost = self.filled + self.dropped + self.inserted

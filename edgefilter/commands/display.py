@@ -23,6 +23,10 @@ from edgefilter.types import SAMPLE_RATE, Event, Stats
 STATUS_PERIOD_S = 0.2
 
 
+TOLD = ("stepped_down", "stepped_up", "overloaded", "learned", "unlearned", "device_gone", "device_back")
+"""Kinds of events that every run tells of."""
+
+
 def say(text: str) -> None:
     """One line for the person who runs it, on standard error: standard output may be sound."""
     print(text, file=sys.stderr)
@@ -34,13 +38,11 @@ def interject(text: str) -> None:
 
 
 def say_event(event: Event, live: bool) -> None:
-    """Tell of a change of engine or path when it happens.
+    """Tell of a change of engine or path, or a device that went or came, when it happens.
 
     Live, also of the human's speech.
     """
-    if event.kind in ("stepped_down", "stepped_up", "overloaded", "learned", "unlearned") or (
-        live and event.kind.startswith("speech")
-    ):
+    if event.kind in TOLD or (live and event.kind.startswith("speech")):
         interject(f"{event.sample / SAMPLE_RATE:.1f} s: {event.kind.replace('_', ' ')} {event.detail}")
 
 
