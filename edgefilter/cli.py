@@ -40,6 +40,7 @@ def build_parser() -> Parser:
     _add_calibrate(commands)
     _add_diagnosis(commands)
     _add_devices(commands)
+    _add_doctor(commands)
     _add_profile(commands)
     return parser
 
@@ -137,7 +138,18 @@ def _add_diagnosis(commands: argparse._SubParsersAction) -> None:
 
 def _add_devices(commands: argparse._SubParsersAction) -> None:
     devices = commands.add_parser("devices", help="list sound devices and the reference that live use would take")
-    devices.add_argument("--json", metavar="FILE", help="write the list as JSON ('-': standard output)")
+    word = devices.add_mutually_exclusive_group()
+    word.add_argument("--json", metavar="FILE", help="write the list as JSON ('-': standard output)")
+    word.add_argument("--setup", action="store_true", help="print what makes a virtual speaker and microphone")
+    word.add_argument("--load", action="store_true", help="make them, until the sound server ends")
+    word.add_argument("--unload", action="store_true", help="remove them")
+
+
+def _add_doctor(commands: argparse._SubParsersAction) -> None:
+    doctor = commands.add_parser("doctor", help="check whether this machine is fit for a live run, and say what to do")
+    doctor.add_argument("--input", default="mic", metavar="DEVICE", help="microphone (default: %(default)s)")
+    doctor.add_argument("--reference", metavar="DEVICE", help="input that hears the loudspeaker (default: as of run)")
+    doctor.add_argument("--json", metavar="FILE", help="write the findings as JSON ('-': standard output)")
 
 
 def _add_profile(commands: argparse._SubParsersAction) -> None:

@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from edgefilter.audio.files import Recorder
 from edgefilter.audio.protocols import Sink
+from edgefilter.audio.recorder import Recorder
 from edgefilter.dsp.frames import decibels
 from edgefilter.errors import EdgefilterError
 from edgefilter.filter.ego_filter import EgoFilter
@@ -23,19 +23,43 @@ try:
 except ModuleNotFoundError:  # Windows has no such module
     resource = None  # type: ignore[assignment]
 
+AUDIBLE_DB = -50.0
+"""Level of the reference from which on the robot counts as speaking."""
 MOST_EVENTS = 1000
 """Events that a report keeps, the latest ones."""
 
 
 @dataclass
 class Progress:
-    """What a display may show after each block."""
+    """What a display may show after each block.
+
+    residual_db: the output's level under the microphone's while the robot speaks and nobody is noticed, of the last
+    second or so; None before. load: compute time per time of the sound, likewise.
+    """
 
     samples: int = 0
     lost: int = 0
     mic_db: float = -120.0
     ref_db: float = -120.0
     out_db: float = -120.0
+    residual_db: float | None = None
+    load: float = 0.0
+    _left: float = 0.0
+    _heard: float = 0.0
+
+    def note(self, block: Block, out: Samples, human: bool, process_s: float) -> None:
+        """Take the levels of a block, and what the filter made of it in process_s seconds; human: whether one speaks."""
+        count = max(block.mic.size, 1)
+        self.samples += block.mic.size
+        self.lost += block.lost
+        self.mic_db, self.ref_db = level_db(block.mic), level_db(block.ref)
+        self.out_db = level_db(out) if out.size else self.out_db
+        memory = float(np.exp(-count / SAMPLE_RATE))
+        self.load += (1.0 - memory) * (process_s * SAMPLE_RATE / count - self.load)
+        if self.ref_db > AUDIBLE_DB and not human and out.size:
+            self._left += (1.0 - memory) * (10 ** (self.out_db / 10) - self._left)
+            self._heard += (1.0 - memory) * (10 ** (self.mic_db / 10) - self._heard)
+            self.residual_db = 10 * float(np.log10(self._left / self._heard))
 
 
 @dataclass
@@ -110,7 +134,8 @@ def filter_blocks(
     def push(out: Samples) -> None:
         sink.write(out)
         report.samples_out += out.size
-        progress.out_db = level_db(out) if out.size else progress.out_db
+        if recorder is not None:
+            recorder.write_output(out)
 
     def hear(last: bool) -> None:
         for event in [*ego.events(), *troubles(report.samples_in, last)]:
@@ -122,13 +147,13 @@ def filter_blocks(
             recorder.write(block)
         start = time.perf_counter()
         out = ego.process(block.mic, block.ref)
-        report.process_s += time.perf_counter() - start
+        process_s = time.perf_counter() - start
+        report.process_s += process_s
         report.samples_in += block.mic.size
         report.lost += block.lost
         push(out)
         hear(last=False)
-        progress.samples, progress.lost = report.samples_in, report.lost
-        progress.mic_db, progress.ref_db = level_db(block.mic), level_db(block.ref)
+        progress.note(block, out, ego.human_speaks, process_s)
         show(progress)
 
     try:

@@ -71,7 +71,7 @@ def find(name: str | int | Device | None, kind: str) -> Device:
     try:
         return match(_devices(), name, kind, default)
     except UsageError:
-        if kind == "input" and name in pulse.sources() and (device := _pulse_input(str(name))):
+        if name in pulse.names(kind) and (device := _on_server(str(name), kind)):
             return device
         raise
 
@@ -80,19 +80,24 @@ def monitor_of(output: str | int | Device | None = None) -> Device:
     """The input that hears what output plays (default: the default output); UsageError where there is none."""
     device = find(output, "output")
     if device.name in pulse.STAND_INS and (source := pulse.default_monitor()):
-        found = _pulse_input(source)
+        found = _on_server(source, "input")
         if found:
             return found
     return monitor(_devices(), device)
 
 
-def _pulse_input(source: str) -> Device | None:
-    """The sound server's source as a device, None where PortAudio has no way to the server."""
-    for name in pulse.STAND_INS:
+def _on_server(name: str, kind: str) -> Device | None:
+    """The sound server's input or output of this name as a device, None where PortAudio has no way to the server."""
+    for stand_in in pulse.STAND_INS:
         for device in _devices():
-            if device.name == name and device.inputs:
-                return replace(device, name=source, pulse_source=source)
+            if device.name == stand_in and device.channels(kind):
+                return replace(device, name=name, pulse_name=name)
     return None
+
+
+def input_port(name: str | int | Device | None) -> InputPort:
+    """An input that can be opened, found by what people type."""
+    return InputPort(_sounddevice(), find(name, "input"))
 
 
 def speaker(output: str | int | Device | None, speech: Reader) -> SpokenReference:

@@ -1,4 +1,4 @@
-"""Files as source and sink: a recording with its reference in, a WAV or FLAC out, and the recorder of live input."""
+"""Files as source and sink: a recording with its reference in, a WAV or FLAC out."""
 
 from __future__ import annotations
 
@@ -212,35 +212,3 @@ class FileSink:
         return AudioFileError(
             f"output {self.path} cannot be written on: {error.strerror}{kept}; free some space or write elsewhere"
         )
-
-
-class Recorder:
-    """Keeps the input of a run: DIR/mic.wav and DIR/reference.wav, 32-bit float, exactly the samples of the blocks."""
-
-    def __init__(self, directory: str | Path) -> None:
-        self.directory = Path(directory)
-        try:
-            self.directory.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise AudioFileError(
-                f"directory {self.directory} for the input cannot be made: {error.strerror}; name another"
-            ) from None
-        self._mic = FileSink(self.directory / "mic.wav", float32=True)
-        try:
-            self._reference = FileSink(self.directory / "reference.wav", float32=True)
-        except AudioFileError:
-            self._mic.close(quiet=True)
-            raise
-
-    def __enter__(self) -> Recorder:
-        return self
-
-    def __exit__(self, *exc: object) -> None:
-        try:
-            self._mic.__exit__(*exc)
-        finally:
-            self._reference.__exit__(*exc)
-
-    def write(self, block: Block) -> None:
-        self._mic.write(block.mic)
-        self._reference.write(block.ref)

@@ -15,7 +15,7 @@ _DEFAULT_WORDS = ("default", "mic", "speaker")
 class Device:
     """A sound device as the audio system lists it: number, name, channels each way, its own rate in Hz, its audio system.
 
-    pulse_source: where the device only stands for the sound server, the server's input that is meant.
+    pulse_name: where the device only stands for the sound server, the server's input or output that is meant.
     """
 
     index: int
@@ -24,7 +24,7 @@ class Device:
     outputs: int
     rate: float
     system: str = ""
-    pulse_source: str = ""
+    pulse_name: str = ""
 
     def __str__(self) -> str:
         return self.name

@@ -17,7 +17,7 @@ import soxr
 
 from edgefilter.audio.lookup import Device
 from edgefilter.audio.pairing import Inlet, Outlet
-from edgefilter.audio.pulse import OPENING, reading_from
+from edgefilter.audio.pulse import OPENING, leading_to
 from edgefilter.errors import DeviceError
 from edgefilter.types import SAMPLE_RATE, Samples
 
@@ -91,7 +91,7 @@ class Port:
         make = self._sd.InputStream if self.kind == "input" else self._sd.OutputStream
         settings = {"device": self.device.index, "channels": self.channels, "samplerate": self.rate}
         try:
-            with _quiet(), reading_from(self.device.pulse_source):
+            with _quiet(), leading_to(self.device.pulse_name, self.kind):
                 self._stream = make(**settings, dtype="float32", latency=STREAM_LATENCY_S, callback=callback)
                 self._stream.start()
         except self._sd.PortAudioError as error:

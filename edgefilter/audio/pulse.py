@@ -14,38 +14,45 @@ OPENING = threading.RLock()
 """Held while a stream is opened: what that changes is the whole process's, and two at once would undo each other's."""
 
 
-def sources() -> list[str]:
-    """Names of all inputs of the running server, monitors included; empty where there is none."""
-    return [line.split("\t")[1] for line in _pactl("list", "short", "sources").splitlines() if line.count("\t") >= 1]
+def names(kind: str) -> list[str]:
+    """Names of all inputs (kind 'input', monitors included) or outputs of the running server; empty where there is none."""
+    lines = _pactl("list", "short", "sources" if kind == "input" else "sinks").splitlines()
+    return [line.split("\t")[1] for line in lines if line.count("\t") >= 1]
+
+
+def default_name(kind: str) -> str:
+    """The server's default input or output; '' where there is no server."""
+    return _pactl("get-default-source" if kind == "input" else "get-default-sink").strip()
 
 
 def default_monitor() -> str | None:
     """Name of the monitor of the default output, None where there is no server or no such monitor."""
-    name = _pactl("get-default-sink").strip() + ".monitor"
-    return name if name in sources() else None
+    name = default_name("output") + ".monitor"
+    return name if name in names("input") else None
 
 
 @contextmanager
-def reading_from(source: str) -> Iterator[None]:
-    """While a stream is opened: let the stand-in lead to this source; '' changes nothing.
+def leading_to(name: str, kind: str) -> Iterator[None]:
+    """While a stream is opened: let the stand-in lead to this input or output; '' changes nothing.
 
     PortAudio opens the devices of its list and takes no name of the server's. The environment is all that libpulse
-    reads beside that, once, when the stream connects (pulseaudio(1), PULSE_SOURCE); so the variable is set for that
-    moment, for one stream at a time.
+    reads beside that, once, when the stream connects (pulseaudio(1), PULSE_SOURCE and PULSE_SINK); so the variable is
+    set for that moment, for one stream at a time.
     """
-    if not source:
+    if not name:
         yield
         return
+    variable = "PULSE_SOURCE" if kind == "input" else "PULSE_SINK"
     with OPENING:
-        before = os.environ.get("PULSE_SOURCE")
-        os.environ["PULSE_SOURCE"] = source
+        before = os.environ.get(variable)
+        os.environ[variable] = name
         try:
             yield
         finally:
             if before is None:
-                os.environ.pop("PULSE_SOURCE", None)
+                os.environ.pop(variable, None)
             else:
-                os.environ["PULSE_SOURCE"] = before
+                os.environ[variable] = before
 
 
 def _pactl(*words: str) -> str:

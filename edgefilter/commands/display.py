@@ -1,12 +1,13 @@
-"""What a person sees while a run goes on: a progress bar for recordings, a level meter for live audio."""
+"""What a person sees while a run goes on: a progress bar for recordings, a status line for live audio."""
 
 from __future__ import annotations
 
 import importlib
 import json
+import shutil
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from types import ModuleType
@@ -17,9 +18,9 @@ from edgefilter.audio.protocols import Source
 from edgefilter.errors import AudioFileError, UsageError
 from edgefilter.filter.ego_filter import EgoFilter
 from edgefilter.session import Progress
-from edgefilter.types import SAMPLE_RATE, Event
+from edgefilter.types import SAMPLE_RATE, Event, Stats
 
-METER_PERIOD_S = 0.1
+STATUS_PERIOD_S = 0.2
 
 
 def say(text: str) -> None:
@@ -27,18 +28,20 @@ def say(text: str) -> None:
     print(text, file=sys.stderr)
 
 
+def interject(text: str) -> None:
+    """A line while a run goes, below the status line where that is shown."""
+    say(f"{chr(10) if sys.stderr.isatty() else ''}{text}")
+
+
 def say_event(event: Event, live: bool) -> None:
-    """Tell of a change of engine or path when it happens, below the level meter where that is shown.
+    """Tell of a change of engine or path when it happens.
 
     Live, also of the human's speech.
     """
     if event.kind in ("stepped_down", "stepped_up", "overloaded", "learned", "unlearned") or (
         live and event.kind.startswith("speech")
     ):
-        say(
-            f"{chr(10) if sys.stderr.isatty() else ''}{event.sample / SAMPLE_RATE:.1f} s:"
-            f" {event.kind.replace('_', ' ')} {event.detail}"
-        )
+        interject(f"{event.sample / SAMPLE_RATE:.1f} s: {event.kind.replace('_', ' ')} {event.detail}")
 
 
 def describe_latency(ego: EgoFilter) -> str:
@@ -51,12 +54,12 @@ def describe_latency(ego: EgoFilter) -> str:
 
 
 @contextmanager
-def display(source: Source, quiet: bool) -> Iterator[Callable[[Progress], None]]:
+def display(source: Source, ego: EgoFilter, quiet: bool) -> Iterator[Callable[[Progress], None]]:
     """Give a function to call after each block."""
     if quiet:
         yield lambda progress: None
     elif source.live:
-        yield from _meter()
+        yield from _status(source, ego)
     else:
         yield from _bar(source.total)
 
@@ -69,28 +72,49 @@ def _bar(total: int | None) -> Iterator[Callable[[Progress], None]]:
         yield lambda progress: bar.update(progress.samples / SAMPLE_RATE - bar.n)
 
 
-def _meter() -> Iterator[Callable[[Progress], None]]:
+def _status(source: Source, ego: EgoFilter) -> Iterator[Callable[[Progress], None]]:
     shown = 0.0
     terminal = sys.stderr.isatty()
 
     def show(progress: Progress) -> None:
         nonlocal shown
         now = time.monotonic()
-        if now - shown >= METER_PERIOD_S and terminal:
+        if now - shown >= STATUS_PERIOD_S and terminal:
             shown = now
-            print("\r" + meter_line(progress), end="", file=sys.stderr, flush=True)
+            width = shutil.get_terminal_size().columns
+            line = status_line(progress, ego.stats(), source.stats(), width - 1)
+            print("\r" + line, end="", file=sys.stderr, flush=True)
 
     yield show
     if terminal:
         print(file=sys.stderr)
 
 
-def meter_line(progress: Progress) -> str:
-    """One line: elapsed time, the three levels as bars and dB, what was lost."""
+def status_line(progress: Progress, stats: Stats, source: Mapping[str, int], width: int) -> str:
+    """How it goes, in one line of this width, the most urgent first; without the bars of the levels where they do not fit."""
     minutes, seconds = divmod(progress.samples / SAMPLE_RATE, 60)
-    levels = [("mic", progress.mic_db), ("robot", progress.ref_db), ("out", progress.out_db)]
-    bars = "  ".join(f"{name} {_bar_of(level)} {level:4.0f} dB" for name, level in levels)
-    return f"{minutes:02.0f}:{seconds:04.1f}  {bars}  lost {progress.lost} "
+    levels = {"mic": progress.mic_db, "robot": progress.ref_db, "out": progress.out_db}
+    plain = " ".join(f"{name} {level:.0f}" for name, level in levels.items()) + " dB"
+    bars = "  ".join(f"{name} {_bar_of(level)} {level:4.0f} dB" for name, level in levels.items())
+    late = stats["deadline"]["missed_deadlines"] if stats["deadline"] else 0
+    overruns = sum(count for name, count in source.items() if name.endswith("overruns"))
+    words = [
+        f"{stats['engine']} {100 * progress.load:.0f} %",
+        f"late {late}",
+        f"overruns {overruns}",
+        f"lost {progress.lost}",
+    ]
+    if progress.residual_db is not None:
+        words.append(f"residual {progress.residual_db:.0f} dB")
+    if alignment := stats["alignment"]:
+        delay = alignment.get("delay_samples")
+        words.append("lag -" if delay is None else f"lag {1000 * delay / SAMPLE_RATE:.1f} ms")
+        words.append(f"drift {alignment.get('ppm', 0.0):+.0f} ppm")
+    if stats["learning"]:
+        words.append(f"learned {stats['learning'].get('learned', 0)}")
+    clock = f"{minutes:02.0f}:{seconds:04.1f}"
+    line = "  ".join((clock, bars, *words))
+    return (line if len(line) <= width else "  ".join((clock, plain, *words)))[:width].ljust(width)
 
 
 def _bar_of(level_db: float, width: int = 10) -> str:

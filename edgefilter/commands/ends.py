@@ -6,6 +6,7 @@ import argparse
 from collections.abc import Iterator
 from pathlib import Path
 
+from edgefilter.audio import virtual
 from edgefilter.audio.files import FileSink, open_source
 from edgefilter.audio.protocols import Sink, Source
 from edgefilter.audio.raw import PcmSink
@@ -38,10 +39,11 @@ def make_speech(args: argparse.Namespace) -> SpokenReference | None:
 def make_source(name: str, reference: str | SpokenReference | None, output: str) -> Source:
     """A file or pipe where name is one, else the live devices.
 
-    The reference defaults to the monitor of the output device.
+    The reference defaults to the monitor of the output device, for the virtual microphone to that of its speaker.
     """
     if isinstance(reference, str | None) and (name == "-" or looks_like_file(name)):
         return open_source(name, reference)
+    virtual.refuse_own(name)
     from edgefilter.audio.device import LiveSource, monitor_of
 
     if isinstance(reference, str) and looks_like_file(reference):
@@ -49,7 +51,11 @@ def make_source(name: str, reference: str | SpokenReference | None, output: str)
             f"live, the reference is a device, found the file {reference}: leave --reference out or name a monitor"
             " ('edgefilter devices'); to play the file, --play"
         )
-    return LiveSource(name, reference or monitor_of("default" if output == "-" or looks_like_file(output) else output))
+    if reference is None:
+        own = virtual.speaker_monitor() if output == virtual.HUMAN else None
+        played_on = "default" if output in ("-", virtual.HUMAN) or looks_like_file(output) else output
+        return LiveSource(name, own or monitor_of(played_on))
+    return LiveSource(name, reference)
 
 
 def make_sink(name: str, latency: int, wait: bool) -> Sink:

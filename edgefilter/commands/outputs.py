@@ -26,14 +26,16 @@ READ = (
     "noise_recording",
 )
 """Options that may name a file to read; a name that is no file, such as a device's, cannot be overwritten."""
-WRITTEN = ("output", "json", "report", "save_profile", "learn", "apply", "plot")
+WRITTEN = ("output", "json", "report", "save_profile", "learn", "apply", "plot", "log_json")
 """Options that may name a file to write."""
 FOLDERS: dict[tuple[str, str], tuple[str, ...]] = {
-    ("run", "save_input"): ("mic.wav", "reference.wav"),
+    ("run", "record"): ("mic.wav", "reference.wav", "output.wav", "events.jsonl", "run.json", "profile.npz"),
     ("calibrate", "save_input"): ("sweep_reference.wav", "sweep_recording.wav", "noise_recording.wav"),
     ("demo", "output"): ("filtered.wav", "microphone.wav", "human.wav", "before_after.png"),
 }
 """By command and option: the files that are written into the folder which the option names."""
+IN_FOLDERS = ("save_input", "record")
+"""Options that name nothing but a folder."""
 PACKAGE = Path(__file__).parents[1]
 
 
@@ -72,7 +74,7 @@ def check_outputs(args: argparse.Namespace) -> None:
     Raises UsageError for that, and for '-' where standard output cannot be meant; EdgefilterError where a result could
     not be written in the end.
     """
-    for option in (*READ, *WRITTEN, "save_input"):
+    for option in (*READ, *WRITTEN, *IN_FOLDERS):
         given = getattr(args, option, None)
         for path in given if isinstance(given, list) else [given]:
             if path is not None and (not path or "\0" in path):
@@ -101,6 +103,8 @@ def check_outputs(args: argparse.Namespace) -> None:
     for command, option in FOLDERS:
         if command == args.command and getattr(args, option) is not None:
             _check_folder(f"--{option.replace('_', '-')}", getattr(args, option))
+    if getattr(args, "record", None) is not None:
+        _check_no_record(args.record)
 
 
 def _read(args: argparse.Namespace) -> Iterator[Place]:
@@ -119,7 +123,7 @@ def _read(args: argparse.Namespace) -> Iterator[Place]:
 
 
 def _written(args: argparse.Namespace) -> Iterator[Place]:
-    for option in (*WRITTEN, "save_input"):
+    for option in (*WRITTEN, *IN_FOLDERS):
         path = getattr(args, option, None)
         if path is None:
             continue
@@ -128,7 +132,7 @@ def _written(args: argparse.Namespace) -> Iterator[Place]:
             yield Place(role, os.path.join(path, name))
         if (args.command, option) not in FOLDERS:
             sound = (args.command, option) == ("run", "output")
-            to_stdout = path == "-" and (sound or option == "json")
+            to_stdout = path == "-" and (sound or option in ("json", "log_json"))
             yield Place(role, path, 1 if to_stdout else None, at_end=not sound and not to_stdout)
 
 
@@ -167,3 +171,10 @@ def _check_folder(role: str, path: str) -> None:
         raise EdgefilterError(f"{role} {path} cannot be made: {above} is no folder; name another")
     if not os.access(above, os.W_OK):
         raise EdgefilterError(f"{role} {path} cannot be made or written: {os.strerror(errno.EACCES)}; name another")
+
+
+def _check_no_record(path: str) -> None:
+    """Raise UsageError where a record lies already: what failed once may not come again."""
+    found = [name for name in FOLDERS["run", "record"] if os.path.lexists(os.path.join(path, name))]
+    if found:
+        raise UsageError(f"--record {path} holds {', '.join(found)} already: name a new folder")

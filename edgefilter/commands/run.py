@@ -5,25 +5,21 @@ from __future__ import annotations
 import argparse
 import gc
 import signal
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import partial
-from typing import TypeVar
 
-from edgefilter.audio.files import Recorder
 from edgefilter.audio.protocols import Sink, Source
 from edgefilter.audio.troubles import Troubles
 from edgefilter.commands.assembly import check_request, make_filter
-from edgefilter.commands.barge_in import Availability, BargeInCommand, Lowering
-from edgefilter.commands.display import describe_latency, display, say, say_event, write_json
+from edgefilter.commands.display import describe_latency, say, write_json
 from edgefilter.commands.ends import limited, make_sink, make_source, make_speech
+from edgefilter.commands.watch import Watch
 from edgefilter.errors import EdgefilterError
 from edgefilter.filter.budget import Choice
 from edgefilter.filter.ego_filter import EgoFilter
-from edgefilter.session import Progress, RunReport, filter_blocks
-from edgefilter.types import SAMPLE_RATE, Event
-
-T = TypeVar("T")
+from edgefilter.session import RunReport, filter_blocks
+from edgefilter.types import SAMPLE_RATE
 
 
 def main(args: argparse.Namespace) -> int:
@@ -33,55 +29,36 @@ def main(args: argparse.Namespace) -> int:
     check_request(args, ego, source.live)
     sink = make_sink(args.output, ego.latency, wait=not source.live)
     limit = None if args.seconds is None else round(args.seconds * SAMPLE_RATE)
-    for note in source.notes:
+    notes = [*source.notes, f"engine {ego.engine_name} ({ego.engine_reason}), {describe_latency(ego)}"]
+    for note in notes:
         say(note)
-    say(f"engine {ego.engine_name} ({ego.engine_reason}), {describe_latency(ego)}")
     told = len(source.notes)
-    hearing: list[Callable[[Event], None]] = [partial(say_event, live=source.live)]
-    showing: list[Callable[[Progress], None]] = []
-    if args.barge_in and speech:
-        hearing.append(Lowering(speech, args.barge_in).hear)
-    if args.barge_in or args.on_barge_in:
-        showing.append(Availability(ego, say).show)
-    with ExitStack() as stack:
-        stopped = stack.enter_context(stop_on_signal(source))
-        if args.on_barge_in:
-            hearing.append(stack.enter_context(BargeInCommand(args.on_barge_in, say)).hear)
-        stack.enter_context(source)
-        stack.enter_context(sink)
-        recorder = stack.enter_context(Recorder(args.save_input)) if args.save_input else None
-        showing.append(stack.enter_context(display(source, args.quiet)))
-        stack.enter_context(garbage_of_this_run_only())
+    watch = Watch(args, ego, source, speech, notes)
+    with stop_on_signal(source) as stopped, source, sink, watch, garbage_of_this_run_only():
         report = filter_blocks(
             limited(source, limit),
             ego,
             sink,
-            recorder,
-            partial(each, showing),
+            watch.record,
+            watch.show,
             lambda: bool(stopped) or sink.finished,
-            partial(each, hearing),
+            watch.hear,
             Troubles(source, sink),
         )
         report.interrupted |= bool(stopped)
-    return finish(args, ego, choice, source, sink, report, told)
-
-
-def each(functions: Sequence[Callable[[T], None]], what: T) -> None:
-    """Call all of them."""
-    for function in functions:
-        function(what)
+    return finish(args, ego, choice, (source, sink, watch), report, told)
 
 
 def finish(
     args: argparse.Namespace,
     ego: EgoFilter,
     choice: Choice | None,
-    source: Source,
-    sink: Sink,
+    ends: tuple[Source, Sink, Watch],
     report: RunReport,
     told: int,
 ) -> int:
     """Say and write what happened; return the exit code."""
+    source, sink, watch = ends
     for note in [*source.notes[told:], *sink.notes]:
         say(note)
     figures = report.to_dict() | {"choice": choice.to_dict() if choice else None}
@@ -90,6 +67,7 @@ def finish(
     endings = (
         (partial(write_json, figures), args.json),
         (partial(save_profile, ego), args.save_profile),
+        (lambda _: watch.finish(figures), True),
         (lambda _: ego.close(), True),
     )
     for write, path in endings:

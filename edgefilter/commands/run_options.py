@@ -47,7 +47,10 @@ def add_run(commands: argparse._SubParsersAction) -> None:
         "--output", required=True, metavar="FILE|DEVICE|-", help="WAV or FLAC file, output device, or raw PCM"
     )
     run.add_argument("--json", metavar="FILE", help="write what happened as JSON")
-    run.add_argument("--save-input", metavar="DIR", help="also write what was heard: DIR/mic.wav and DIR/reference.wav")
+    run.add_argument(
+        "--record", metavar="FOLDER", help="keep microphone, reference, output, events and profile in a new folder"
+    )
+    run.add_argument("--log-json", metavar="FILE|-", help="write each event as a line of JSON when it happens")
     run.add_argument(
         "--save-profile", metavar="P2.npz", help="write the profile with the echo path as it was adapted in this run"
     )
@@ -62,7 +65,7 @@ def add_run(commands: argparse._SubParsersAction) -> None:
     learning.add_argument("--no-learn", action="store_true", help="do not learn loudspeaker and room while running")
     run.add_argument("--seconds", type=positive, metavar="S", help="stop after S seconds")
     effects_option(run)
-    run.add_argument("--quiet", action="store_true", help="no progress bar, no level meter")
+    run.add_argument("--quiet", action="store_true", help="no progress bar, no status line")
 
 
 def _add_acting(run: argparse.ArgumentParser) -> None:

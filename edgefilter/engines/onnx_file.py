@@ -49,10 +49,15 @@ def read_model(path: Path) -> bytes:
         raise ModelError(f"model {path} cannot be loaded (it {refused}): export it again") from None
 
 
+def digest(path: Path) -> str:
+    """sha256 of a file."""
+    return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
 def check_shipped(path: Path) -> None:
     """Raise ModelError where a file that came with the package is not, bit by bit, the one that the package was tested with."""
     expected = SHIPPED.get(path.name)
-    if expected and hashlib.sha256(path.read_bytes()).hexdigest() != expected:
+    if expected and digest(path) != expected:
         raise ModelError(
             f"model {path} is not the one that belongs to this edgefilter (its sha256 is another): reinstall edgefilter,"
             " or name a model of your own with --model"

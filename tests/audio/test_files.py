@@ -11,7 +11,9 @@ import numpy as np
 import pytest
 import soundfile
 
-from edgefilter.audio.files import FileSink, FileSource, Recorder, open_source
+from edgefilter.audio import recorder as recorder_module
+from edgefilter.audio.files import FileSink, FileSource, open_source
+from edgefilter.audio.recorder import Recorder
 from edgefilter.errors import AudioFileError, UsageError
 from edgefilter.types import Block
 
@@ -210,11 +212,23 @@ def test_recorder_keeps_the_exact_blocks(tmp_path):
     with Recorder(tmp_path / "deep" / "input") as recorder:
         for at in (0, 500):
             recorder.write(Block(mic[at : at + 500], ref[at : at + 500], at))
+            recorder.write_output(2 * mic[at : at + 500])
     source = FileSource(tmp_path / "deep/input/mic.wav", tmp_path / "deep/input/reference.wav")
     got_mic, got_ref = read(source)
     np.testing.assert_array_equal(got_mic, mic)
     np.testing.assert_array_equal(got_ref, ref)
-    assert source.notes == []
+    np.testing.assert_array_equal(read(FileSource(tmp_path / "deep/input/output.wav"))[0], 2 * mic)
+    assert source.notes == [] and recorder.failure is None
+
+
+def test_a_recording_longer_than_a_wav_file_can_be_ends_and_what_is_there_stays_valid(tmp_path, monkeypatch):
+    monkeypatch.setattr(recorder_module, "MOST", 1000)
+    with Recorder(tmp_path) as recorder:
+        for at in range(0, 2000, 400):
+            recorder.write(Block(noise(400), noise(400), at))
+            recorder.write_output(noise(400))
+    assert "mic.wav holds" in str(recorder.failure) and "ends here" in str(recorder.failure)
+    assert {soundfile.info(tmp_path / f"{name}.wav").frames for name in ("mic", "reference", "output")} == {800}
 
 
 def test_stop_ends_the_iteration(tmp_path):

@@ -7,7 +7,7 @@ import threading
 
 import pytest
 
-from edgefilter.audio.pulse import reading_from
+from edgefilter.audio.pulse import leading_to
 
 
 @pytest.mark.parametrize("before", [None, "the_users_own"])
@@ -19,7 +19,7 @@ def test_two_streams_opened_at_once_read_each_its_own_source_and_leave_the_envir
 
     def open_stream(source):
         start.wait(5)
-        with reading_from(source):
+        with leading_to(source, "input"):
             inside.wait(0.2)  # where the other were let in meanwhile, it would now have set its own
             seen[source] = os.environ["PULSE_SOURCE"]
 
@@ -32,9 +32,16 @@ def test_two_streams_opened_at_once_read_each_its_own_source_and_leave_the_envir
     assert os.environ.get("PULSE_SOURCE") == before
 
 
+def test_an_output_has_a_variable_of_its_own(monkeypatch):
+    monkeypatch.delenv("PULSE_SINK", raising=False)
+    with leading_to("edgefilter_human", "output"):
+        assert os.environ["PULSE_SINK"] == "edgefilter_human" and "PULSE_SOURCE" not in os.environ
+    assert "PULSE_SINK" not in os.environ
+
+
 def test_a_device_that_needs_no_source_leaves_the_environment_alone(monkeypatch):
     monkeypatch.setenv("PULSE_SOURCE", "the_users_own")
-    with reading_from(""):
+    with leading_to("", "input"):
         assert os.environ["PULSE_SOURCE"] == "the_users_own"
 
 

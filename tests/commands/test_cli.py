@@ -93,8 +93,8 @@ def test_other_rates_and_channels_are_converted_and_said_so(speech):
         )
 
 
-def test_save_input_run_again_gives_the_identical_output(speech):
-    assert run(speech, "--reference", speech / "ref.wav", "--save-input", speech / "heard", engine="ss").returncode == 0
+def test_a_recorded_run_again_gives_the_identical_output(speech):
+    assert run(speech, "--reference", speech / "ref.wav", "--record", speech / "heard", engine="ss").returncode == 0
     again = edgefilter(
         "run",
         "--input",

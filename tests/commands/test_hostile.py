@@ -39,7 +39,7 @@ RUN = ("run", "--input", "mic.wav", "--engine", "bypass", "--output", "out.wav")
 
 
 @pytest.mark.parametrize(
-    "option", ["--json", "--profile", "--reference", "--model", "--save-input", "--save-profile", "--effects"]
+    "option", ["--json", "--profile", "--reference", "--model", "--record", "--save-profile", "--effects"]
 )
 def test_an_empty_name_as_an_unset_shell_variable_gives_is_not_taken_for_no_option(folder, option):
     one_line(program(folder, *RUN, option, ""), 2, option, "names no file")
@@ -82,7 +82,7 @@ def test_samples_far_beyond_full_scale_are_refused_with_their_value(folder, comm
 def test_a_folder_that_cannot_be_made_leaves_the_output_of_an_earlier_run_alone(folder, where, why):
     (folder / "out.wav").write_bytes(b"of an earlier run")
     (folder / "other").write_text("a file")
-    one_line(program(folder, *RUN, "--save-input", where.replace("mic.wav", "other")), 1, "--save-input", why)
+    one_line(program(folder, *RUN, "--record", where.replace("mic.wav", "other")), 1, "--record", why)
     one_line(program(folder, "demo", "--output", where), 1, "--output", why)
     assert (folder / "out.wav").read_bytes() == b"of an earlier run"
 

@@ -21,13 +21,13 @@ from tests.diagnosis.robot_scene import profile
 
 NEITHER = {
     "help", "version", "debug", "command", "word", "engine", "budget_ms", "remeasure", "seconds", "quiet", "stepped_sine", "live",
-    "speaker", "level_db", "effect", "force", "no_learn", "on_barge_in", "barge_in",
+    "speaker", "level_db", "effect", "force", "no_learn", "on_barge_in", "barge_in", "setup", "load", "unload",
 }  # fmt: skip
 
 
 @pytest.fixture
 def heard(tmp_path, monkeypatch):
-    """A folder like one that --save-input made, a profile and a user's effect in it.
+    """A folder like one that --record made, a profile and a user's effect in it.
 
     The working directory is beside it.
     """
@@ -65,20 +65,20 @@ def run(heard, *more):
     return ["run", "--input", heard / "mic.wav", "--reference", heard / "reference.wav", "--engine", "bypass", *more]
 
 
-def test_save_input_over_the_recording_that_is_being_filtered_does_not_destroy_it(heard, capsys):
+def test_record_over_the_recording_that_is_being_filtered_does_not_destroy_it(heard, capsys):
     refused(
         heard,
         capsys,
-        run(heard, "--output", "out.wav", "--save-input", heard),
-        "--save-input",
+        run(heard, "--output", "out.wav", "--record", heard),
+        "--record",
         "mic.wav",
         "overwritten",
     )
     refused(
         heard,
         capsys,
-        run(heard, "--output", "out.wav", "--save-input", "../heard"),
-        "--save-input",
+        run(heard, "--output", "out.wav", "--record", "../heard"),
+        "--record",
         "mic.wav",
         "overwritten",
     )
@@ -157,7 +157,7 @@ def test_a_model_that_the_environment_names_is_not_written_over(heard, capsys, m
     ("words", "parts"),
     [
         (["run", "--input", "mic.wav", "--output", "o.wav", "--json", "./o.wav"], ("--json", "--output")),
-        (["run", "--input", "mic.wav", "--output", "new/mic.wav", "--save-input", "new"], ("--save-input", "--output")),
+        (["run", "--input", "mic.wav", "--output", "new/mic.wav", "--record", "new"], ("--record", "--output")),
         (["run", "--input", "mic.wav", "--output", "o.wav", "--json", "O.WAV"], ("--json", "--output")),
         (
             [

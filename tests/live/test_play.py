@@ -12,15 +12,15 @@ from tests.live.test_run_live import DEMO, ROOT, edgefilter
 
 def test_the_played_speech_is_the_reference_and_ends_when_the_human_speaks(server, tmp_path):
     robot = np.tile(soundfile.read(DEMO / "reference.flac", dtype="int16")[0][:48_000], 3)
-    human, _ = soundfile.read(DEMO / "human.flac", dtype="int16")
-    begins = int(np.argmax(np.abs(human) > 1000))
     soundfile.write(tmp_path / "robot.wav", robot, 16_000, "PCM_16")
-    soundfile.write(tmp_path / "human.wav", human[begins - 4000 : begins + 40_000], 16_000, "PCM_16")
+    human = 10 * soundfile.read(DEMO / "human.flac", dtype="float32")[0]
+    begins = int(np.argmax(np.abs(human) > 0.1))
+    soundfile.write(tmp_path / "human.wav", human[begins - 4000 : begins + 24_000], 16_000, "PCM_16")
     live = subprocess.Popen(
         edgefilter(
             "run", "--input", "mic", "--play", tmp_path / "robot.wav", "--barge-in", "stop", "--engine", "crnn",
             "--no-learn", "--on-barge-in", f"echo $EDGEFILTER_TIME > {tmp_path}/noticed", "--seconds", 6,
-            "--save-input", tmp_path / "heard", "--output", tmp_path / "out.wav", "--json", tmp_path / "stats.json",
+            "--record", tmp_path / "heard", "--output", tmp_path / "out.wav",
         ),
         env=server.environment, cwd=ROOT, stderr=subprocess.PIPE, text=True,
     )  # fmt: skip
@@ -28,18 +28,18 @@ def test_the_played_speech_is_the_reference_and_ends_when_the_human_speaks(serve
     while live.poll() is None and not (heard.exists() and heard.stat().st_size > 2 * 64_000):
         time.sleep(0.05)
     loudspeaker = subprocess.Popen(
-        ["parec", "-d", "robot.monitor", "--rate=16000", "--channels=1", "--format=s16le", "--raw"],
-        env=server.environment, stdout=subprocess.PIPE,
+        ["parec", "-d", "robot.monitor", "--rate=16000", "--channels=1", "--format=s16le", "--latency-msec=50", "--raw", tmp_path / "heard.raw"],
+        env=server.environment,
     )  # fmt: skip
     subprocess.run(["paplay", "-d", "robot_mic", tmp_path / "human.wav"], env=server.environment, check=True)
     _, said = live.communicate(timeout=60)
-    loudspeaker.terminate()
-    from_loudspeaker = np.frombuffer(loudspeaker.communicate()[0], "<i2")
+    loudspeaker.terminate(), loudspeaker.wait()
+    from_loudspeaker = np.fromfile(tmp_path / "heard.raw", "<i2")
     assert live.returncode == 0 and "what is played on" in said, said
 
-    events = json.loads((tmp_path / "stats.json").read_text())["events"]
-    noticed = next(event["seconds"] for event in events if event["kind"] == "speech_started")
-    assert float((tmp_path / "noticed").read_text().split()[0]) == round(noticed, 3)
+    events = [json.loads(line) for line in (tmp_path / "heard/events.jsonl").read_text().splitlines()]
+    noticed = next(event["time"] for event in events if event["kind"] == "speech_started")
+    assert float((tmp_path / "noticed").read_text().split()[0]) == noticed
     reference = np.rint(32768 * soundfile.read(tmp_path / "heard/reference.wav", dtype="float32")[0]).astype(int)
     ended = int(np.flatnonzero(reference)[-1])
     assert 0.0 < ended / 16_000 - noticed < 0.4  # the device's buffer, and the blocks between the two threads

@@ -66,7 +66,7 @@ def db(x):
 def test_live_run_takes_the_monitor_ends_by_ctrl_c_and_equals_the_file_path(server, conversation, tmp_path):
     command = edgefilter(
         "run", "--input", "mic", "--profile", DEMO / "profile.npz", "--output", tmp_path / "live.wav", "--engine", "ss",
-        "--save-input", tmp_path / "heard", "--json", tmp_path / "stats.json", "--no-learn",
+        "--record", tmp_path / "heard", "--json", tmp_path / "stats.json", "--no-learn",
     )  # fmt: skip
     heard = tmp_path / "heard/mic.wav"
     said = run_until_played(server, command, conversation, heard)
@@ -100,7 +100,7 @@ def test_live_the_loudspeaker_is_learned_by_another_process_and_remembered(serve
     file = tmp_path / "robot.npz"
     command = edgefilter(
         "run", "--input", "mic", "--output", tmp_path / "live.wav", "--engine", "linear", "--learn", file,
-        "--json", tmp_path / "stats.json", "--save-input", tmp_path / "heard",
+        "--json", tmp_path / "stats.json", "--record", tmp_path / "heard",
     )  # fmt: skip
     run_until_played(server, command, tmp_path, tmp_path / "heard/mic.wav")
     learning = json.loads((tmp_path / "stats.json").read_text())["learning"]
@@ -171,6 +171,7 @@ def test_an_unknown_device_is_one_line_that_names_the_known_ones(server, tmp_pat
 def test_devices_lists_them_and_the_reference(server):
     result = subprocess.run(edgefilter("devices"), env=server.environment, cwd=ROOT, capture_output=True, text=True)
     assert result.returncode == 0, result.stderr
+    assert "sound server, output  robot_mic" in result.stdout
     assert "robot_mic_monitor" in result.stdout and "reference would come from: robot.monitor" in result.stdout
 
 
@@ -189,3 +190,15 @@ def test_live_calibration_measures_the_virtual_room(server, tmp_path):
     assert figures["delay_samples"] > 0
     middle = [band["snr_db"] for band in figures["bands"] if 200 < band["low_hz"] < 5000]
     assert min(middle) > 30  # there is no fan: 16-bit rounding is all the noise
+
+
+def test_the_doctor_finds_the_virtual_machine_fit(server):
+    result = subprocess.run(
+        edgefilter("doctor", "--json", "-"), env=server.environment, cwd=ROOT, capture_output=True, text=True
+    )
+    found = json.loads(result.stdout)
+    checks = {check["name"]: check for check in found["checks"]}
+    assert result.returncode == 0 and found["fit"], result.stdout + result.stderr
+    assert "as shipped" in checks["model"]["found"] and "robot.monitor" in checks["reference"]["found"]
+    assert {"microphone", "mic clock", "ref clock", "sound server"} <= set(checks)
+    assert checks["level"]["state"] == "warning" and "unmute" in checks["level"]["do"]  # nobody plays anything

@@ -1,0 +1,166 @@
+"""`edgefilter doctor`: whether this machine is fit for a live run, and what to do where it is not."""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+
+from edgefilter.audio import pulse, virtual
+from edgefilter.commands.display import write_json
+from edgefilter.engines import create
+from edgefilter.engines.onnx_file import SHIPPED, digest
+from edgefilter.errors import EdgefilterError
+from edgefilter.filter.budget import DEFAULT_MS
+from edgefilter.filter.ego_filter import EgoFilter
+from edgefilter.learning.background import LEAST_CORES, cores
+
+if TYPE_CHECKING:
+    from edgefilter.audio.port import InputPort
+    from edgefilter.audio.trial import Trial
+
+PACE = 0.005
+"""By how much a device's clock may be out; what the filter follows is far less, but a few seconds tell no more."""
+TOO_SOFT_DB, CLIPPED_DB = -75.0, -0.1
+HOPS = 60
+"""Hops of noise over which the strongest engine is timed."""
+
+
+@dataclass(frozen=True)
+class Check:
+    """One finding. do: what helps, empty where nothing is needed."""
+
+    name: str
+    state: Literal["ok", "warning", "failed"]
+    found: str
+    do: str = ""
+
+
+def main(args: argparse.Namespace) -> int:
+    checks = []
+    for check in examine(args.input, args.reference):
+        checks.append(check)
+        if args.json != "-":
+            print(f"{check.state:8} {check.name:13} {check.found}" + (f": {check.do}" if check.do else ""))
+    failed = [check.name for check in checks if check.state == "failed"]
+    if args.json:
+        write_json({"schema": 1, "fit": not failed, "checks": [asdict(check) for check in checks]}, args.json)
+    if args.json != "-":
+        print(f"not fit for a live run: {', '.join(failed)} failed" if failed else "fit for a live run")
+    return 1 if failed else 0
+
+
+def examine(microphone: str, reference: str | None) -> Iterator[Check]:
+    """All checks, each as soon as it is done."""
+    yield from _machine()
+    yield from _guarded("model", _model)
+    yield from _guarded("engine", _engine)
+    yield from _guarded("sound server", _server)
+    ports: dict[str, InputPort] = {}
+    yield from _guarded("microphone", lambda: _open(ports, "microphone", microphone))
+    yield from _guarded("reference", lambda: _open(ports, "reference", reference))
+    if ports:
+        yield from _guarded("sound", lambda: _sound(ports))
+
+
+def _guarded(name: str, look: Callable[[], Iterator[Check]]) -> Iterator[Check]:
+    """The checks of one subject; an error of ours is one that failed, and says itself what to do."""
+    try:
+        yield from look()
+    except EdgefilterError as error:
+        yield Check(name, "failed", " ".join(str(error).split()))
+
+
+def _machine() -> Iterator[Check]:
+    found = cores()
+    few = "loudspeaker and room are not learned while running; allow another core"
+    yield Check("cores", "ok", str(found)) if found >= LEAST_CORES else Check("cores", "warning", str(found), few)
+
+
+def _model() -> Iterator[Check]:
+    model = getattr(create("crnn"), "model", None)
+    if model is None:
+        return
+    found = f"{model.path}, sha256 {digest(model.path)[:12]}"
+    if model.path.name in SHIPPED and digest(model.path) == SHIPPED[model.path.name]:
+        yield Check("model", "ok", f"{found}, as shipped")
+    else:
+        yield Check(
+            "model", "warning", f"{found}, not one of the package's", "unset EDGEFILTER_CRNN unless it is meant"
+        )
+
+
+def _engine() -> Iterator[Check]:
+    ego = EgoFilter()
+    noise = 0.1 * np.random.default_rng(0).standard_normal(HOPS * ego.hop).astype(np.float32)
+    took = []
+    for at in range(0, noise.size, ego.hop):
+        began = time.perf_counter()
+        ego.process(noise[at : at + ego.hop], noise[at : at + ego.hop])
+        took.append(1000 * (time.perf_counter() - began))
+    typical = float(np.median(took[HOPS // 3 :]))
+    found = f"{ego.engine_name}, {typical:.1f} ms of computing a hop back to back (a hop lasts {ego.hop / 16:.0f} ms)"
+    if typical <= DEFAULT_MS:
+        yield Check("engine", "ok", found)
+    else:
+        yield Check("engine", "warning", found, "'run --engine auto' will take a cheaper one; end other programs")
+
+
+def _server() -> Iterator[Check]:
+    outputs = pulse.names("output")
+    if not outputs:
+        help_with = "start PulseAudio or PipeWire, or name an input that hears the loudspeaker with --reference"
+        yield Check("sound server", "warning", "none answers", help_with)
+        return
+    yield Check("sound server", "ok", f"{len(outputs)} outputs, default {pulse.default_name('output') or 'none'}")
+    made = virtual.SPEAKER in outputs and virtual.HUMAN in outputs
+    how = "there" if made else "not made ('edgefilter devices --load' makes it)"
+    yield Check("virtual mic", "ok", how)
+
+
+def _open(ports: dict[str, InputPort], role: str, name: str | None) -> Iterator[Check]:
+    """Find the input and see at which rate it can be opened."""
+    if role == "microphone":
+        virtual.refuse_own(str(name))
+    from edgefilter.audio.device import input_port, monitor_of
+
+    device = name if name is not None else virtual.speaker_monitor() or monitor_of("default")
+    port = input_port(device)
+    ports[role] = port
+    yield Check(role, "ok", ", ".join([f"{port.device}, {port.rate} Hz", *port.notes]))
+
+
+def _sound(ports: dict[str, InputPort]) -> Iterator[Check]:
+    from edgefilter.audio.trial import listen
+
+    for (role, _), trial in zip(ports.items(), listen(list(ports.values()))):
+        yield _clock(role, trial)
+        if role == "microphone":
+            yield _level(trial)
+        if trial.overruns:
+            yield Check(f"{role} load", "warning", f"{trial.overruns} overruns in 3 s", "end other programs")
+
+
+def _clock(role: str, trial: Trial) -> Check:
+    name = f"{role[:3]} clock"
+    found = f"{100 * (trial.pace - 1):+.2f} % of {trial.rate} Hz (to some 0.1 %)"
+    if abs(trial.pace - 1) <= PACE:
+        return Check(name, "ok", found)
+    return Check(
+        name, "failed", found, f"the {role} loses samples or runs at another rate: end other programs, try another"
+    )
+
+
+def _level(trial: Trial) -> Check:
+    found = f"{trial.level_db:.0f} dB of full scale, peak {trial.peak_db:.0f} dB"
+    if trial.peak_db <= -120.0:
+        return Check("level", "warning", "every sample is zero", "unmute the microphone, or name another with --input")
+    if trial.level_db < TOO_SOFT_DB:
+        return Check("level", "warning", found, "raise the microphone's gain")
+    if trial.peak_db > CLIPPED_DB:
+        return Check("level", "warning", found, "lower the microphone's gain: it is clipped")
+    return Check("level", "ok", found)
