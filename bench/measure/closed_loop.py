@@ -12,7 +12,8 @@ gets the human's span of what each of them leaves.
 
 Backchannels: the same scenes, with a short word or a cough in the place of the interruption. False stops: the robot
 alone for --minutes of its speech, in new rooms all the time, half of them with loudspeakers of strong distortion and
-half without a calibration, and the recordings of one real loudspeaker (--real). Writes OUTPUT.json, .md and .png.
+half without a calibration, and the recordings of one real loudspeaker (--real). Writes OUTPUT.json, .md and .png. Rows
+are kept in --cache as they are made: a run that was cut off, or is asked for more minutes, goes on where it stopped.
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ from bench.measure import closed_loop_report as report
 from bench.measure.closed_loop_alone import monologues, real_minutes
 from bench.measure.closed_loop_scenes import measure
 from bench.measure.conversation import progress
+from bench.measure.kept_rows import KeptRows
 from bench.measure.recogniser import Recogniser
 from bench.simulate.conversations import make_scene, read_clips, read_voices
 from edgefilter.engines import HAVE_LINEAR_STAGE
@@ -45,13 +47,19 @@ def main() -> int:
             {"WHISPER": options.whisper},
         )
         recogniser = Recogniser(options.whisper, options.cache / "transcripts.jsonl") if options.whisper else None
+        kept = KeptRows(options.cache / "closed_loop.jsonl", made_with, options.seed, options.engine)
         speech, voices = read_clips(options.speech, (3.0, 12.0)), read_voices(options.voices)
         rows = []
         for index in progress(range(options.count), "conversation"):
             kind = KINDS[index // 2 % 2]
-            scene = make_scene(options.seed, index, kind, speech, voices)
-            rows.append({"index": index, "kind": kind, **measure(scene, options.engine, recogniser)})
-        alone = monologues(options.alone_voices, options.minutes, options.seed, options.engine)
+            row = kept.get(
+                f"conversation {index}",
+                lambda i=index, k=kind: measure(
+                    make_scene(options.seed, i, k, speech, voices), options.engine, recogniser
+                ),
+            )
+            rows.append({"index": index, "kind": kind, **row})
+        alone = monologues(options.alone_voices, options.minutes, options.seed, options.engine, kept)
         alone += real_minutes(options.real, options.engine) if options.real else []
     except (EdgefilterError, OSError) as error:
         print(f"closed_loop: {error}", file=sys.stderr)

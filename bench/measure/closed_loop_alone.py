@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import math
-from itertools import cycle
+from collections import Counter
+from itertools import cycle, islice
 from pathlib import Path
 
 import numpy as np
 
 from bench.measure.closed_loop_scenes import Talk, listen
 from bench.measure.conversation import progress
+from bench.measure.kept_rows import KeptRows
 from bench.measure.real_barge_in import THRESHOLDS, replay, starts
 from bench.measure.real_streams import ECHO_ONLY, chosen, find_recordings
 from bench.simulate.conversations import read_voices
-from bench.simulate.robot_alone import make_monologue
+from bench.simulate.robot_alone import Monologue, make_monologue
 from edgefilter.calibration.calibrate import calibrate
 from edgefilter.types import SAMPLE_RATE
 
@@ -23,22 +25,32 @@ AUDIBLE = 1e-3
 """A second of a real recording counts as speech where the reference is within 30 dB of its loudest second."""
 
 
-def monologues(folders: list[Path], minutes: float, seed: int, engine: str) -> list[dict]:
+def monologues(folders: list[Path], minutes: float, seed: int, engine: str, kept: KeptRows) -> list[dict]:
     """A row for each robot, until they have spoken for so many minutes; each voice goes on where it stopped."""
     voices = read_voices(folders) if folders else {}
     order = np.random.default_rng(seed)
-    clips = {name: cycle([found[i] for i in order.permutation(len(found))]) for name, found in voices.items()}
-    names, rows = sorted(clips), []
+    clips = {name: [found[i] for i in order.permutation(len(found))] for name, found in voices.items()}
+    names, rows, taken = sorted(clips), [], Counter[str]()
     length = min(MONOLOGUE_S, 60 * minutes)
     count = math.ceil(60 * minutes / length) if names and minutes > 0 else 0
     for index in progress(range(count), "monologue"):
         voice = names[index % len(names)]
-        made = make_monologue(seed, index, voice, clips[voice], length)
-        talk = listen(made.mic, made.ref, calibrate(*made.calibration) if made.start == "calibrated" else None, engine)
-        said = [[f"{clip.path.parent.name}/{clip.path.stem}", s] for clip, s in zip(made.clips, made.seconds)]
-        of = {"room": made.room, "distortion": made.distortion, "start": made.start, "voice": voice}
-        rows.append({"source": "simulated", **of, "said": said, **stops(talk, sum(made.seconds))})
+        own = islice(cycle(clips[voice]), taken[voice], None)
+        row = kept.get(
+            f"monologue {index} of {length} s",
+            lambda i=index, v=voice, c=own: monologue(make_monologue(seed, i, v, c, length), engine),
+        )
+        taken[voice] += len(row["said"])
+        rows.append(row)
     return rows
+
+
+def monologue(made: Monologue, engine: str) -> dict:
+    """What the filter notices of one robot alone."""
+    talk = listen(made.mic, made.ref, calibrate(*made.calibration) if made.start == "calibrated" else None, engine)
+    said = [[f"{clip.path.parent.name}/{clip.path.stem}", s] for clip, s in zip(made.clips, made.seconds, strict=True)]
+    of = {"room": made.room, "distortion": made.distortion, "start": made.start, "voice": made.voice}
+    return {"source": "simulated", **of, "said": said, **stops(talk, sum(made.seconds))}
 
 
 def real_minutes(folder: Path, engine: str) -> list[dict]:

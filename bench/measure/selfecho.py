@@ -8,7 +8,8 @@ less the human, over the robot's second utterance. The human: over the span of t
 as every system leaves it; for `microphone` the human is taken alone, since unfiltered the robot drowns the human. A
 passage in which Whisper hears nothing has no score. The robot's words have their times, from its own clock; the
 probability of speech is the engine's, its mean over the passage. "repeating": the human's text is added to what the
-robot has said, as if every human repeated the robot. Writes OUTPUT.json, .md and .png.
+robot has said, as if every human repeated the robot. Rows are kept in --cache as they are made. Writes OUTPUT.json, .md
+and .png.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ from bench import results_writer
 from bench.measure import picture
 from bench.measure.closed_loop_scenes import listen
 from bench.measure.conversation import progress
+from bench.measure.kept_rows import KeptRows
 from bench.measure.recogniser import Recogniser
 from bench.simulate.conversations import Scene, make_scene, read_clips, read_voices
 from edgefilter.calibration.calibrate import calibrate
@@ -159,11 +161,18 @@ def main() -> int:
         data, networks = {"HUMAN": [options.speech], "ROBOT": options.voices}, set(options.systems) - {MICROPHONE}
         made_with = results_writer.stamp(data, sorted(networks), {"WHISPER": options.whisper})
         recogniser = Recogniser(options.whisper, options.cache / "transcripts.jsonl")
+        kept = KeptRows(options.cache / "selfecho.jsonl", made_with, options.seed, options.systems)
         speech, voices = read_clips(options.speech, (3.0, 12.0)), read_voices(options.voices)
         rows = []
         for index in progress(range(options.count), "conversation"):
-            scene = make_scene(options.seed, index, KINDS[index // 2 % 2], speech, voices)
-            rows += [{"index": index, **row} for row in measure(scene, options.systems, recogniser)]
+            kind = KINDS[index // 2 % 2]
+            found = kept.get(
+                f"conversation {index}",
+                lambda i=index, k=kind: {
+                    "rows": measure(make_scene(options.seed, i, k, speech, voices), options.systems, recogniser)
+                },
+            )
+            rows += [{"index": index, **row} for row in found["rows"]]
     except (EdgefilterError, OSError) as error:
         print(f"selfecho: {error}", file=sys.stderr)
         return 1

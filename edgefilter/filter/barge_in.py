@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Literal, TypeAlias, get_args
 
 from edgefilter.dsp.stft import StftConfig
 from edgefilter.errors import UsageError
 from edgefilter.filter.excess import Excess
 from edgefilter.types import SAMPLE_RATE, EventKind, Frame
 
+Judge: TypeAlias = Literal["engine", "network"]
 INTERRUPTIONS: frozenset[EventKind] = frozenset({"speech_started"})
 """The events at which a robot should stop."""
 ODDS_RANGE = (-2.0, 8.0)
@@ -43,14 +45,16 @@ class BargeInSettings:
     that soft syllables do not end a sentence. min_speech_s: how long the threshold is held before speech has begun; the
     probability is smoothed already, so that 0 will do, and every 0.1 s comes on top of the delay. min_silence_s: how
     long the silence lasts before speech has ended; 0.5 s bridges the pauses within a sentence, 0.2 s tells a recogniser
-    sooner.
-    Raises UsageError for probabilities outside 0 to 1, a release above the threshold, or negative times.
+    sooner. judge: "engine", or "network" to let crnn's network judge beside an engine that judges no speech (`ss`,
+    `linear`), at what crnn costs.
+    Raises UsageError for probabilities outside 0 to 1, a release above the threshold, negative times, or another judge.
     """
 
     threshold: float = 0.97
     release: float = 0.4
     min_speech_s: float = 0.0
     min_silence_s: float = 0.5
+    judge: Judge = "engine"
 
     def __post_init__(self) -> None:
         if not 0.0 < self.release <= self.threshold < 1.0:
@@ -59,6 +63,8 @@ class BargeInSettings:
         if not (self.min_speech_s >= 0.0 and self.min_silence_s >= 0.0):
             found = f"min_speech_s {self.min_speech_s} and min_silence_s {self.min_silence_s}"
             raise UsageError(f"barge-in got {found}, expected seconds, 0 or more")
+        if self.judge not in get_args(Judge):
+            raise UsageError(f"barge-in got judge '{self.judge}', expected one of {', '.join(get_args(Judge))}")
 
 
 class HumanJudge:

@@ -11,6 +11,7 @@ import numpy as np
 
 from edgefilter import engines
 from edgefilter.engines.base import ClipEngine, Engine
+from edgefilter.engines.judged import with_network_as_judge
 from edgefilter.engines.ladder import CANDIDATES, Ladder, climbable
 from edgefilter.errors import EdgefilterError, SignalError, UsageError
 from edgefilter.filter.barge_in import BargeInSettings
@@ -99,6 +100,8 @@ class EgoFilter:
         best, self.engine_reason = (
             strongest(self.profile) if engine == "auto" else (engines.create(engine, self.profile, model=model), reason)
         )
+        if barge_in and barge_in.judge == "network":
+            best = with_network_as_judge(best)
         ladder = None if budget_ms is None or best.lookahead is None else Ladder(climbable(best, self.profile))
         stepping = Stepping(best.stft.hop, ladder, budget_ms)
         self._stream = Stream(ladder or best, self.profile, stepping, barge_in, learn, on_barge_in)
@@ -132,8 +135,9 @@ class EgoFilter:
     def speech_probability(self) -> float | None:
         """Probability that the human speaks now, 0 to 1: the network's, weighed with what robot and room are expected to leave.
 
-        None before the first hop and with engines that do not judge it (all but crnn): what stands above the robot's
-        rest is not yet a human, so they give no events of speech either. 0 where an utterance of the robot has begun
+        None before the first hop and with engines that do not judge it (all but crnn, unless the settings of barge-in
+        have judge="network"): what stands above the robot's rest is not yet a human, so they give no events of speech
+        either. 0 where an utterance of the robot has begun
         and is not found yet.
         """
         return self._stream.speech_probability

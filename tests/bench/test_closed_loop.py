@@ -113,6 +113,9 @@ def test_the_program_runs_to_its_tables_and_its_picture(
     assert 3.0 <= alone["speech_s"] < 7.0 and found["summary"]["false_stops"]["all"]["stops"] == alone["stops"]
     assert "| closed loop: stopped by the event | 0 [0, 0] |" in page
     assert (tmp_path / "closed.png").stat().st_size > 5000
+    asked.clear()
+    assert closed_loop.main() == 0  # again: every row is known
+    assert not asked and json.loads((tmp_path / "closed.json").read_text())["summary"] == found["summary"]
 
 
 def test_no_stop_in_half_an_hour_says_at_most_seven_an_hour() -> None:

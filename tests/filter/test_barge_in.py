@@ -44,6 +44,7 @@ def test_an_engine_that_stops_judging_ends_the_speech():
         ({"release": 0.0}, "release 0.0"),
         ({"threshold": float("nan")}, "threshold nan"),
         ({"min_silence_s": -1.0}, "min_silence_s -1.0, expected seconds"),
+        ({"judge": "me"}, "judge 'me', expected one of engine, network"),
     ],
 )
 def test_settings_that_mean_nothing_are_one_line(settings, message):
@@ -152,6 +153,29 @@ def test_an_engine_without_a_network_gives_no_probability_and_no_events():
     ego.process(mic, ref)
     assert ego.speech_probability is None and not ego.human_speaks
     assert not [event for event in ego.events() if event.kind.startswith("speech")]
+
+
+def test_the_network_can_judge_beside_an_engine_that_does_not_and_changes_nothing_of_its_sound():
+    mic, ref = (
+        soundfile.read(DATA / f"{name}.flac", dtype="float32")[0][:SAMPLE_RATE] for name in ("mic", "reference")
+    )
+    network = BargeInSettings(judge="network")
+    found = {}
+    for name, engine, settings in (("ss", "ss", None), ("judged", "ss", network), ("crnn", "crnn", network)):
+        ego = EgoFilter(DATA / "profile.npz", engine=engine, barge_in=settings)
+        out = [ego.process(mic[at : at + 256], ref[at : at + 256]) for at in range(0, mic.size, 256)]
+        found[name] = np.concatenate(out), ego.speech_probability, ego
+    assert np.array_equal(found["judged"][0], found["ss"][0])
+    assert found["judged"][1] == found["crnn"][1] and found["ss"][1] is None
+    stats = found["judged"][2].stats()
+    assert stats["engine"] == "ss" and stats["model"] == found["crnn"][2].stats()["model"]
+
+
+def test_engines_that_take_other_frames_cannot_judge_for_one_another():
+    with pytest.raises(
+        UsageError, match="engine crnn cannot judge speech for bypass: its front is full, expected none"
+    ):
+        EgoFilter(engine="bypass", barge_in=BargeInSettings(judge="network"))
 
 
 def test_the_settings_reach_the_stream_and_who_gives_a_callback_is_called_when_the_human_begins():
