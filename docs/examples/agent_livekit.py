@@ -3,8 +3,8 @@
     python agent_livekit.py [WHISPER]
 
 Needs `pip install edgefilter[livekit]`, and faster-whisper where a model (a folder, or a name such as base) is given for
-the words. No server: the session is a real one, its microphone a real audio stream, but of a local track, into which the
-simulated room of room.py plays, in real time. In a room of a server the processor goes where the session is started:
+the words. There is no server: the session is a real one, its microphone and its loudspeaker are those of the simulated
+room of room.py. In a room of a server the processor goes where the session is started:
 
     audio = room_io.AudioInputOptions(noise_cancellation=ears, sample_rate=16000)
     await session.start(agent, room=ctx.room, room_options=room_io.RoomOptions(audio_input=audio))
@@ -35,17 +35,22 @@ def frame_of(samples):
 
 
 class Microphone(io.AudioInput):
-    """A track as the session's microphone, as a room of a server gives it, filtered; keeps what it gave."""
+    """The room's microphone; lets time pass, as fast as the session listens, and keeps what it gave."""
 
-    def __init__(self, track, ears):
+    def __init__(self, room, ears, loudspeaker):
         super().__init__(label="microphone")
-        self.stream = rtc.AudioStream.from_track(
-            track=track, sample_rate=RATE, num_channels=1, frame_size_ms=50, noise_cancellation=ears
-        )
-        self.heard = []
+        self.room, self.ears, self.loudspeaker = room, ears, loudspeaker
+        self.heard, self.over = [], asyncio.Event()
 
     async def __anext__(self):
-        frame = (await self.stream.__anext__()).frame
+        await asyncio.sleep(0.003)
+        if self.room.now >= END_S * RATE:
+            self.over.set()
+            raise StopAsyncIteration
+        if self.room.now == HUMAN_AT_S * RATE:
+            self.room.speak()
+        self.loudspeaker.step()
+        frame = self.ears._process(frame_of(self.room.hear(BLOCK)))  # as rtc.AudioStream does with noise_cancellation
         self.heard.append(from_pcm16(frame.data.cast("B")))
         return frame
 
@@ -90,7 +95,7 @@ async def speech():
         yield frame_of(ROBOT[at : at + 4 * BLOCK])
 
 
-async def converse(ego, words=Words(None), room=None, human_at_s=HUMAN_AT_S, end_s=END_S):
+async def converse(ego, words=Words(None), room=None):
     """What happened, [(seconds, what)], the room and the processor."""
     room, log, began = room or Room(), [], 0
     session = AgentSession(vad=None, turn_handling={"turn_detection": "manual"})
@@ -102,26 +107,20 @@ async def converse(ego, words=Words(None), room=None, human_at_s=HUMAN_AT_S, end
         nonlocal began
         if event.kind == "speech_started":
             tell("the human speaks")
-            began = max(0, len(microphone.heard) - 10)  # half a second before
+            began = max(0, len(microphone.heard) - 25)  # half a second before
             session.interrupt()
         elif event.kind == "speech_stopped":
             tell(f"the human said: {words(np.concatenate(microphone.heard[began:]))}")
 
     ears = EgoProcessor(ego, on_event)
-    source = rtc.AudioSource(RATE, 1, queue_size_ms=100)
-    microphone = Microphone(rtc.LocalAudioTrack.create_audio_track("microphone", source), ears)
     loudspeaker = Loudspeaker(room)
+    microphone = Microphone(room, ears, loudspeaker)
     session.input.audio = microphone
     session.output.audio = ears.tap(loudspeaker)
     await session.start(Agent(instructions="Talk."))
     said = session.say("At last.", audio=speech())
     said.add_done_callback(lambda handle: tell("the robot was interrupted" if handle.interrupted else "the robot ended"))
-    while room.now < end_s * RATE:
-        if room.now == human_at_s * RATE:
-            room.speak()
-        loudspeaker.step()
-        await source.capture_frame(frame_of(room.hear(BLOCK)))
-    await microphone.stream.aclose()
+    await microphone.over.wait()
     await session.aclose()
     return log, room, ears
 
