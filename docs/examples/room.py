@@ -44,7 +44,7 @@ class Room:
         self.buffer = np.zeros(0, np.float32)
         self.device = round(device_s * RATE)
         self.played = []
-        self._tail = np.zeros(round(lag_s * RATE) + self.response.size + 4 * RATE, np.float32)
+        self._tail = np.zeros(0, np.float32)  # what will be heard of what was played
         self._lag = round(lag_s * RATE)
         self.human_from = None
 
@@ -70,9 +70,11 @@ class Room:
         out[: self.buffer.size] = self.buffer[:count]
         self.buffer = self.buffer[count:]
         self.played.append(out)
-        self._tail[self._lag : self._lag + count + self.response.size - 1] += fftconvolve(out, self.response)
+        echo = np.concatenate((np.zeros(self._lag, np.float32), fftconvolve(out, self.response)))
+        echo[: self._tail.size] += self._tail  # never longer: as many samples have gone from it as come now
+        self._tail = echo
         mic = self._tail[:count] + self.fan[(self.now + np.arange(count)) % self.fan.size] + self.human(count)
-        self._tail = np.concatenate((self._tail[count:], np.zeros(count, np.float32)))
+        self._tail = self._tail[count:]
         self.now += count
         return mic.astype(np.float32)
 
