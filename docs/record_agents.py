@@ -1,7 +1,7 @@
 """Runs the examples of agents and writes what they print into docs/agents_recorded.md.
 
-Run from the root of the repository: python -m docs.record_agents WHISPER. Needs the extras pipecat, livekit and wyoming,
-faster-whisper, and WHISPER, a model for it (a folder, or a name such as base).
+Run from the root of the repository: python -m docs.record_agents WHISPER. Needs the extras pipecat, livekit and
+wyoming, faster-whisper, and WHISPER, a model for it (a folder, or a name such as base).
 """
 
 from __future__ import annotations
@@ -20,11 +20,13 @@ HEAD = """# What the examples print
 Written by `python -m docs.record_agents WHISPER`, with Whisper-base (faster-whisper {whisper}). In the three
 conversations a simulated robot says 5.7 s into the [simulated room](examples/room.py), all of it handed over at once; a
 recorded human, at the microphone 23 dB below it and 8 dB above its fan, says over it what Whisper writes of the human
-alone as "Please leave your message after the tone, when done hang up, or press the pound key". One conversation each: they show that it works, not how well.
+alone as "Please leave your message after the tone, when done hang up, or press the pound key". One conversation each:
+they show that it works, not how well.
 """
 
 
 def main() -> None:
+    """Run each example and write the page."""
     model = sys.argv[1]
     parts = [HEAD.format(whisper=version("faster-whisper"))]
     for name, package in AGENTS.items():

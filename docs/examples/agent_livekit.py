@@ -2,8 +2,7 @@
 
     python agent_livekit.py [WHISPER]
 
-Needs `pip install edgefilter[livekit]`, and faster-whisper where a model (a folder, or a name such as base) is given for
-the words. There is no server: the session is a real one, its microphone and its loudspeaker are those of the simulated
+Needs `pip install edgefilter[livekit]`, and for the words faster-whisper with a model (a folder, or a name such as base). There is no server: the session is a real one, its microphone and its loudspeaker are those of the simulated
 room of room.py. In a room of a server the processor goes where the session is started:
 
     audio = room_io.AudioInputOptions(noise_cancellation=ears, sample_rate=16000)
@@ -119,7 +118,9 @@ async def converse(ego, words=Words(None), room=None):
     session.output.audio = ears.tap(loudspeaker)
     await session.start(Agent(instructions="Talk."))
     said = session.say("At last.", audio=speech())
-    said.add_done_callback(lambda handle: tell("the robot was interrupted" if handle.interrupted else "the robot ended"))
+    said.add_done_callback(
+        lambda handle: tell("the robot was interrupted" if handle.interrupted else "the robot ended")
+    )
     await microphone.over.wait()
     await session.aclose()
     return log, room, ears

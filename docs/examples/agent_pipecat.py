@@ -2,10 +2,9 @@
 
     python agent_pipecat.py [WHISPER]
 
-Needs `pip install edgefilter[pipecat]`, and faster-whisper where a model (a folder, or a name such as base) is given for
-the words. The transport is the simulated room of room.py; with devices it is a line, and the rest stays:
+Needs `pip install edgefilter[pipecat]`, and for the words faster-whisper with a model (a folder, or a name such as base). The transport is the simulated room of room.py; with devices it is a line, and the rest stays:
 
-    transport = LocalAudioTransport(LocalAudioTransportParams(audio_in_enabled=True, audio_out_enabled=True, **ears.params))
+    params = LocalAudioTransportParams(audio_in_enabled=True, audio_out_enabled=True, **ears.params)
 """
 
 import asyncio

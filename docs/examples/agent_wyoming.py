@@ -1,13 +1,12 @@
-"""A Home Assistant satellite that can be interrupted: it talks, a human talks over it, it falls silent and understands.
+r"""A Wyoming satellite that can be interrupted: it talks, a human talks over it, it falls silent and understands.
 
     python agent_wyoming.py [WHISPER]
 
-Needs `pip install edgefilter[wyoming]`, and faster-whisper where a model (a folder, or a name such as base) is given for
-the words. Everything goes through TCP: the simulated room of room.py is a microphone and a loudspeaker service, as
+Needs `pip install edgefilter[wyoming]`, and for the words faster-whisper with a model (a folder, or a name such as base). Everything goes through TCP: the simulated room of room.py is a microphone and a loudspeaker service, as
 wyoming-mic-external and wyoming-snd-external are; edgefilter's service stands before them; and this program is the
 satellite, which speaks and listens through it. On a robot:
 
-    python -m edgefilter.integrations.wyoming --microphone 'arecord -q -r 16000 -c 1 -f S16_LE -t raw' \\
+    python -m edgefilter.integrations.wyoming --microphone 'arecord -q -r 16000 -c 1 -f S16_LE -t raw' \
         --loudspeaker 'aplay -q -r 22050 -c 1 -f S16_LE -t raw' --profile robot.npz --stop-for-speech
     wyoming-satellite --mic-uri tcp://127.0.0.1:10600 --snd-uri tcp://127.0.0.1:10601 ...
 """

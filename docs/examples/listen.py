@@ -3,8 +3,8 @@
     python listen.py mic.wav reference.wav [robot.npz] [WHISPER]
     ... | python listen.py - - [robot.npz] [WHISPER]
 
-Reads a recording with what the robot said, or from a pipe 16-bit stereo at 16 kHz (microphone, reference); with `mic` as
-the first word, the default microphone and the monitor of the default output. Each thing that the human says is cut out
+Reads a recording with what the robot said, or from a pipe 16-bit stereo at 16 kHz (microphone, reference); with `mic`
+as the first word, the default microphone and the monitor of the default output (`mic -`). Each thing that the human says is cut out
 by the filter's events and handed to Whisper (faster-whisper; WHISPER is a folder or a name such as base); without, its
 time is printed.
 """
@@ -23,7 +23,11 @@ mic, reference, *more = sys.argv[1:]
 profile = next((word for word in more if word.endswith(".npz")), None)
 words = Words(next((word for word in more if word != profile), None))
 ego = EgoFilter(profile=profile)
-heard, first, began = np.zeros(0, np.float32), 0, None  # what was filtered; the sample it starts with; who speaks, since when
+heard, first, began = (
+    np.zeros(0, np.float32),
+    0,
+    None,
+)  # what was filtered; the sample it starts with; who speaks, since when
 
 
 def listen(human):

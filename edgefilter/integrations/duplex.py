@@ -1,9 +1,9 @@
 """The two directions of a voice agent's sound, as they come, brought to the microphone's sample counter and filtered.
 
-An agent has no sample counter that both directions share: it hands speech over in bursts, faster than it is played, late,
-or drops half of it when it is interrupted. Here the microphone is the clock. What was handed to the loudspeaker waits
-in a queue, and every sample of the microphone takes one from it, as the loudspeaker does; what is dropped before its
-turn was never played and is no reference. How much later it is heard, the filter's aligner finds.
+An agent has no sample counter that both directions share: it hands speech over in bursts, faster than it is played,
+late, or drops half of it when it is interrupted. Here the microphone is the clock. What was handed to the loudspeaker
+waits in a queue, and every sample of the microphone takes one from it, as the loudspeaker does; what is dropped before
+its turn was never played and is no reference. How much later it is heard, the filter's aligner finds.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ ABSENT_S = 1.0
 
 
 class DuplexStats(TypedDict):
-    """Seconds of sound: played in all, waiting, dropped unplayed, played unheard, refused; and how often speech ran out.
+    """Seconds of sound: played, waiting, dropped unplayed, played unheard, refused; and how often speech ran out.
 
     gaps counts the ends of speech and the underruns within it alike: the agent does not say which it was.
     """
@@ -44,7 +44,7 @@ class DuplexStats(TypedDict):
 
 
 class Resampler:
-    """One stream from one rate to another, piece by piece; what it holds back is at most 40 ms, nothing at equal rates."""
+    """One stream from one rate to another, piece by piece; it holds some 40 ms back, at equal rates nothing."""
 
     def __init__(self, source: int, target: int) -> None:
         self.rates = (source, target)
@@ -65,7 +65,7 @@ class Duplex:
     Parameters
     ----------
     ego : EgoFilter, optional
-        The filter; unless given, one without a profile that steps down to cheaper engines where the machine is too slow.
+        The filter; unless given, one without a profile, with cheaper engines to step down to on a slow machine.
     patience_s : float
         How long the microphone waits for speech that is late while the robot talks. For agents that hand over speech no
         earlier than it is played, whose frames therefore jitter around their turn; 0 where they are ahead.

@@ -75,13 +75,11 @@ class EgoProcessor(rtc.FrameProcessor[rtc.AudioFrame]):
 
 
 class _Tap(io.AudioOutput):
-    """Hands everything on to the next output and tells the duplex of it; frames may come faster than they are played."""
+    """Hands everything on to the next output and tells the duplex; frames may come faster than they are played."""
 
     def __init__(self, duplex: Duplex, output: io.AudioOutput) -> None:
         able = io.AudioOutputCapabilities(pause=True)
-        super().__init__(
-            label="edgefilter", capabilities=able, next_in_chain=output, sample_rate=output.sample_rate
-        )
+        super().__init__(label="edgefilter", capabilities=able, next_in_chain=output, sample_rate=output.sample_rate)
         self._duplex = duplex
 
     @property

@@ -1,4 +1,4 @@
-"""Wyoming: microphone and loudspeaker of a Home Assistant satellite, with the robot's own voice out of the microphone.
+r"""Wyoming: microphone and loudspeaker of a Home Assistant satellite, with the robot's own voice out of the microphone.
 
     python -m edgefilter.integrations.wyoming --microphone 'arecord -q -r 16000 -c 1 -f S16_LE -t raw' \
         --loudspeaker 'aplay -q -r 22050 -c 1 -f S16_LE -t raw' --profile robot.npz
@@ -104,7 +104,7 @@ class EgoService:
             await asyncio.to_thread(self.duplex.close)
 
     async def say(self, chunk: AudioChunk) -> None:
-        """Hand a piece of speech to the loudspeaker as its turn comes, at the real pace where no microphone tells the time."""
+        """Hand a piece of speech to the loudspeaker as its turn comes; without a microphone at the real pace."""
         until = time.monotonic() + chunk.seconds
         while self.duplex.queued_s > AHEAD_S and time.monotonic() < until:
             await asyncio.sleep(0.005)
@@ -247,7 +247,9 @@ class _Speaker(AsyncEventHandler):
 
 def main(words: list[str] | None = None) -> int:
     """Parse the command line and serve; one line and exit code 1 where that fails."""
-    parser = argparse.ArgumentParser(prog="python -m edgefilter.integrations.wyoming", description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(
+        prog="python -m edgefilter.integrations.wyoming", description=__doc__.splitlines()[0]
+    )
     parser.add_argument("--microphone", required=True, help="command that writes raw 16-bit samples, or a URI")
     parser.add_argument("--loudspeaker", required=True, help="command that reads raw 16-bit samples, or a URI")
     parser.add_argument("--mic-rate", type=int, default=16_000, help="of the command")

@@ -44,7 +44,7 @@ def ego(room_of):
 
 @pytest.fixture
 def check_conversation(room_of):
-    """What each agent's example must show: the human is noticed, the robot stops, and the reference is what was played."""
+    """What each example must show: the human is noticed, the robot stops, the reference is what was played."""
 
     def check(log, room, stats, references, human_at_s):
         told = {what.split(":")[0]: seconds for seconds, what in log}

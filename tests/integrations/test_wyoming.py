@@ -92,8 +92,9 @@ def test_commands_are_microphone_and_loudspeaker_and_who_hangs_up_interrupts(end
         await asyncio.gather(serving, return_exceptions=True)
 
     asyncio.run(asyncio.wait_for(talk(), 60))
-    np.testing.assert_array_equal(np.frombuffer((tmp_path / "played").read_bytes(), "<i2")[:10_000] / 32768,
-                                  from_pcm16(as_pcm16(NOISE))[:10_000])
+    np.testing.assert_array_equal(
+        np.frombuffer((tmp_path / "played").read_bytes(), "<i2")[:10_000] / 32768, from_pcm16(as_pcm16(NOISE))[:10_000]
+    )
 
 
 def test_a_loudspeaker_that_is_not_there_silences_nothing_else(caplog):
