@@ -2,7 +2,8 @@ r"""A Wyoming satellite that can be interrupted: it talks, a human talks over it
 
     python agent_wyoming.py [WHISPER]
 
-Needs `pip install edgefilter[wyoming]`, and for the words faster-whisper with a model (a folder, or a name such as base). Everything goes through TCP: the simulated room of room.py is a microphone and a loudspeaker service, as
+Needs `pip install edgefilter[wyoming]`, and for the words faster-whisper with a model (a folder, or a name such as
+base). Everything goes through TCP: the simulated room of room.py is a microphone and a loudspeaker service, as
 wyoming-mic-external and wyoming-snd-external are; edgefilter's service stands before them; and this program is the
 satellite, which speaks and listens through it. On a robot:
 
@@ -51,7 +52,7 @@ class RoomMicrophone(AsyncEventHandler):
             heard = as_pcm16(self.room.hear(BLOCK))
             await self.write_event(AudioChunk(RATE, 2, 1, heard).event())
             with suppress(TimeoutError, asyncio.TimeoutError):  # time passes even if nobody listens
-                await asyncio.wait_for(self.listened.get(), 0.5)
+                await asyncio.wait_for(self.listened.get(), 2.0)
 
 
 class RoomLoudspeaker(AsyncEventHandler):

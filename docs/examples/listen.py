@@ -4,9 +4,9 @@
     ... | python listen.py - - [robot.npz] [WHISPER]
 
 Reads a recording with what the robot said, or from a pipe 16-bit stereo at 16 kHz (microphone, reference); with `mic`
-as the first word, the default microphone and the monitor of the default output (`mic -`). Each thing that the human says is cut out
-by the filter's events and handed to Whisper (faster-whisper; WHISPER is a folder or a name such as base); without, its
-time is printed.
+as the first word, the default microphone and the monitor of the default output (`mic -`). Each thing that the human
+says is cut out by the filter's events and handed to Whisper (faster-whisper; WHISPER is a folder or a name such as
+base); without, its time is printed.
 """
 
 import sys

@@ -2,7 +2,8 @@
 
     python words.py said.wav [WHISPER]
 
-WHISPER is a model for faster-whisper, a folder or a name such as base; without one, all that is said is how long it was.
+WHISPER is a model for faster-whisper, a folder or a name such as base; without one, all that is said is how long it
+was.
 """
 
 import sys
