@@ -1,6 +1,7 @@
 #!/bin/sh
 # Installs what the tests need from the system: virtual sound devices, PortAudio, a browser, SpeexDSP.
 packages="pulseaudio pulseaudio-utils libasound2-plugins libportaudio2 chromium libspeexdsp1"
+command -v cc >/dev/null || packages="$packages tcc libc6-dev"  # for the example in C
 missing=""
 for package in $packages; do
     dpkg -s "$package" >/dev/null 2>&1 || missing="$missing $package"

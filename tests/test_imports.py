@@ -29,6 +29,9 @@ LEAVES = {
     "onnxruntime": {"engines/onnx_session.py"},
     "matplotlib": {"report/plots.py"},
     "jinja2": {"report/html.py"},
+    "pipecat": {"integrations/pipecat.py"},
+    "livekit": {"integrations/livekit.py"},
+    "wyoming": {"integrations/wyoming.py", "integrations/wyoming_sound.py"},
     "torch": set(),
     "export": set(),
 }
@@ -41,7 +44,7 @@ LAYERS = (
     {"filter", "audio"},
     {"calibration"},
     {"diagnosis"},
-    {"session", "report"},
+    {"session", "report", "integrations"},
     {"learning"},
     {"commands"},
     {"cli"},

@@ -1,6 +1,8 @@
 """Every program in docs/examples, run as its first lines say, on recordings that the repository has."""
 
+import importlib.util
 import re
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -16,6 +18,8 @@ CALIBRATION = ROOT / "tests/data/demo_calibration"
 REVERBERANT = ROOT / "tests/data/hidden/dev/11"
 """A simulated robot that was carried into a reverberant room after its calibration."""
 RATE = 16000
+ELSEWHERE = {"agent_pipecat.py", "agent_livekit.py", "agent_wyoming.py"}
+"""Whose conversation tests/integrations runs."""
 
 
 def run(name, *words, stdin=None):
@@ -25,6 +29,14 @@ def run(name, *words, stdin=None):
     )
     assert done.returncode == 0, done.stderr.decode()
     return done.stdout, done.stderr.decode()
+
+
+def imported(name):
+    """The example as a module, where it can run only in part."""
+    spec = importlib.util.spec_from_file_location(name.removesuffix(".py"), EXAMPLES / name)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
 
 
 def read(path):
@@ -46,8 +58,8 @@ def filtered(tmp_path_factory):
 
 def test_each_example_is_run_here_or_where_it_is_said():
     text = Path(__file__).read_text()
-    names = {path.name for path in EXAMPLES.glob("*.py")}
-    assert len(names) >= 5 and set(re.findall(r'run\(\s*"(\w+\.py)"', text)) == names
+    names = {path.name for path in EXAMPLES.glob("*.py")} - ELSEWHERE
+    assert len(names) >= 5 and set(re.findall(r'(?:run|imported)\(\s*"(\w+\.py)"', text)) == names
 
 
 def test_a_file_is_filtered(filtered):
@@ -95,3 +107,56 @@ def test_a_calibration_gives_a_profile_with_which_the_missing_effect_is_found_an
         float(lines[0].split()[0]) > 10 > 3 > float(lines[3].split()[-3])
     )  # dB before and after; 15.7 and 0.0 were seen
     assert (tmp_path / "better.npz").exists()
+
+
+@pytest.fixture(scope="module")
+def stereo():
+    """The bundled conversation, 16-bit, microphone and reference."""
+    return np.stack([soundfile.read(DEMO / f"{name}.flac", dtype="int16")[0] for name in ("mic", "reference")], axis=1)
+
+
+def test_what_the_human_says_is_cut_out_from_a_recording_and_behind_a_pipe(stereo, tmp_path):
+    cut = stereo[6 * RATE :]
+    for name, channel in (("mic.wav", 0), ("reference.wav", 1)):
+        soundfile.write(tmp_path / name, cut[:, channel], RATE)
+    said, _ = run("listen.py", tmp_path / "mic.wav", tmp_path / "reference.wav", DEMO / "profile.npz")
+    piped, _ = run("listen.py", "-", "-", DEMO / "profile.npz", stdin=cut.astype("<i2").tobytes())
+    assert said == piped
+    began, ended = re.fullmatch(r"(\S+) to (\S+) s: \(.* s\)\n", said.decode()).groups()
+    assert 2.2 < float(began) < 3.2 and 7.0 < float(ended) < 10.0  # half a second before the human, who begins at 3.0 s
+
+
+def test_a_program_in_c_gets_as_many_samples_as_it_gave(stereo, tmp_path):
+    compiler = shutil.which("cc") or shutil.which("tcc")
+    subprocess.run([compiler, "-Wall", "-o", tmp_path / "pipe", EXAMPLES / "pipe.c"], check=True)
+    words = f"'{sys.executable}' -m edgefilter.cli run --input - --output - --quiet --no-learn --engine linear"
+    given = stereo[: 6 * RATE]
+    done = subprocess.run(
+        [tmp_path / "pipe", words], input=given.astype("<i2").tobytes(), capture_output=True, cwd=ROOT, timeout=300
+    )
+    assert done.returncode == 0, done.stderr.decode()
+    human = np.frombuffer(done.stdout, "<i2") / 32768
+    assert human.size == len(given)
+    assert db(human[4 * RATE : 5 * RATE]) < db(given[4 * RATE : 5 * RATE, 0] / 32768) - 8  # uncalibrated, after 4 s
+    failed = subprocess.run([tmp_path / "pipe", "exit 3"], input=b"", capture_output=True)
+    assert failed.returncode == 3
+
+
+def test_the_simulated_room_holds_the_robot_and_then_the_human(tmp_path):
+    said, _ = run("room.py", tmp_path / "heard.wav")
+    assert b"9.0 s heard" in said
+    heard = read(tmp_path / "heard.wav")
+    assert db(heard[RATE : 2 * RATE]) > db(heard[7 * RATE : 8 * RATE]) + 15 > db(heard[: RATE // 10]) + 15
+    said, _ = run("words.py", tmp_path / "heard.wav")
+    assert said == b"(9.0 s)\n"
+
+
+def test_the_part_of_the_ros_node_that_needs_no_ros_filters(stereo):
+    node = imported("ros2_node.py")
+    duplex = node.Duplex(node.EgoFilter(DEMO / "profile.npz", "linear"))
+    out = b""
+    duplex.play(stereo[: 4 * RATE, 1].astype(np.float32) / 32768, RATE)
+    for at in range(0, 4 * RATE, 512):
+        out += node.filtered(duplex, stereo[at : at + 512, 0].astype("<i2").tobytes())
+    human = np.frombuffer(out, "<i2") / 32768
+    assert db(human[2 * RATE : 3 * RATE]) < db(stereo[2 * RATE : 3 * RATE, 0] / 32768) - 15

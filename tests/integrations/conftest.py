@@ -1,0 +1,72 @@
+"""The examples' simulated room, imported as they import it, and a filter whose reference can be looked at."""
+
+import importlib
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from edgefilter import EgoFilter
+from edgefilter.integrations import duplex
+
+EXAMPLES = Path(__file__).parents[2] / "docs/examples"
+
+
+class Watched(EgoFilter):
+    """Keeps the reference that it got, and when speech began."""
+
+    def __init__(self, *args, **kwargs):
+        super().__init__(*args, **kwargs)
+        self.references, self.began = [], []
+
+    def process(self, mic_block, ref_block):
+        self.references.append(ref_block)
+        return super().process(mic_block, ref_block)
+
+
+@pytest.fixture(scope="session")
+def example():
+    """Imports a program of docs/examples as a module."""
+    if str(EXAMPLES) not in sys.path:
+        sys.path.append(str(EXAMPLES))
+    return importlib.import_module
+
+
+@pytest.fixture(scope="session")
+def room_of(example):
+    return example("room")
+
+    def events(self):
+        happened = super().events()
+        self.began += [event.sample / 16_000 for event in happened if event.kind == "speech_started"]
+        return happened
+
+
+@pytest.fixture
+def ego(room_of, monkeypatch):
+    """The room's time is not the machine's: a slow machine is no microphone that was off."""
+    monkeypatch.setattr(duplex, "ABSENT_S", 1e9)
+    return Watched(room_of.PROFILE)
+
+
+@pytest.fixture
+def check_conversation(room_of):
+    """What each example must show: the human is noticed, the robot stops, the reference is what was played."""
+
+    def check(room, ego, human_at_s):
+        assert human_at_s < ego.began[0] < human_at_s + 0.5, ego.began  # 0.2 s were seen
+        played, said = (sounding(parts) for parts in (room.played, ego.references))
+        assert human_at_s * 16_000 * 0.8 < played.size < 0.95 * sounding([room_of.ROBOT]).size, "cut off in mid-word"
+        both = min(played.size, said.size)
+        np.testing.assert_array_equal(played[:both], said[:both])
+        assert abs(played.size - said.size) < 0.5 * 16_000  # what the loudspeaker's buffer holds, and a frame
+
+    return check
+
+
+def sounding(parts):
+    """All samples that are not zero: a machine that is too slow makes pauses, in the one or in the other."""
+    samples = np.concatenate(parts)
+    samples = np.rint(samples * 32768)
+    return samples[samples != 0]

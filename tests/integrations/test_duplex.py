@@ -1,0 +1,233 @@
+"""What an agent's clock does to its speech, and what of it becomes the filter's reference."""
+
+import threading
+
+import numpy as np
+import pytest
+import soxr
+
+from edgefilter import EgoFilter, SignalError, UsageError
+from edgefilter.integrations import duplex as module
+from edgefilter.integrations.duplex import Duplex, as_pcm16, from_pcm16
+
+RATE = 16000
+VOICE = 0.1 * np.random.default_rng(0).standard_normal(2 * RATE).astype(np.float32)
+
+
+class Witness:
+    """In the filter's place: gives the microphone back and keeps the reference that it got."""
+
+    waits_for_end = False
+    engine_name = "witness"
+
+    def __init__(self):
+        self.references = [np.zeros(0, np.float32)]
+
+    @property
+    def reference(self):
+        return np.concatenate(self.references)
+
+    def process(self, mic, reference):
+        assert mic.size == reference.size
+        self.references.append(reference)
+        return mic
+
+    def events(self):
+        return []
+
+
+class Clock:
+    now = 0.0
+
+    def __call__(self):
+        return self.now
+
+
+@pytest.fixture
+def witness():
+    return Witness()
+
+
+def listen(duplex, seconds, rate=RATE, frame=320):
+    """Let seconds pass at the microphone; how much of them came out."""
+    total = round(seconds * rate)
+    return sum(duplex.hear(np.zeros(min(frame, total - at), np.float32), rate).size for at in range(0, total, frame))
+
+
+@pytest.mark.parametrize("frames", [(160, 160), (320, 640), (1, 977), (65536, 3)], ids=str)
+def test_speech_that_is_handed_over_at_once_is_the_reference_at_the_pace_of_the_microphone(witness, frames):
+    duplex = Duplex(witness)
+    duplex.play(VOICE, RATE)
+    for count in frames * 2:
+        duplex.hear(np.zeros(count, np.float32), RATE)
+    heard = 2 * sum(frames)
+    np.testing.assert_array_equal(witness.reference[: VOICE.size], VOICE[:heard])
+    assert not witness.reference[VOICE.size :].any() and witness.reference.size == heard
+
+
+def test_speech_cut_off_in_mid_word_was_not_played_and_the_next_begins_at_once(witness):
+    duplex = Duplex(witness)
+    duplex.play(VOICE, RATE)
+    listen(duplex, 0.5)
+    duplex.interrupt()
+    listen(duplex, 0.25)
+    duplex.play(VOICE[::-1], RATE)
+    listen(duplex, 0.25)
+    expected = np.concatenate((VOICE[: RATE // 2], np.zeros(RATE // 4), VOICE[::-1][: RATE // 4]))
+    np.testing.assert_array_equal(witness.reference, expected.astype(np.float32))
+    assert duplex.stats()["dropped_s"] == 1.5
+
+
+def test_speech_that_ran_out_leaves_a_gap_as_long_as_the_loudspeaker_was_silent(witness):
+    duplex = Duplex(witness)
+    duplex.play(VOICE[:3200], RATE)
+    listen(duplex, 0.3)
+    duplex.play(VOICE[3200:6400], RATE)
+    listen(duplex, 0.3)
+    np.testing.assert_array_equal(witness.reference[:3200], VOICE[:3200])
+    assert not witness.reference[3200:4800].any() and duplex.stats()["gaps"] == 2
+    np.testing.assert_array_equal(witness.reference[4800:8000], VOICE[3200:6400])
+
+
+def test_a_frame_that_is_late_is_waited_for_and_leaves_no_gap(witness):
+    duplex = Duplex(witness, patience_s=0.1)
+    duplex.play(VOICE[:1280], RATE)
+    assert listen(duplex, 0.16) == 1280, "0.08 s were there, as many wait"
+    duplex.play(VOICE[1280:3840], RATE)
+    assert listen(duplex, 0.02) == 1280 + 320
+    np.testing.assert_array_equal(witness.reference, VOICE[:2880])
+
+
+def test_the_microphone_waits_no_longer_than_its_patience_and_loses_nothing(witness):
+    duplex = Duplex(witness, patience_s=0.1)
+    duplex.play(VOICE[:1280], RATE)
+    assert listen(duplex, 0.18) == 1280 and listen(duplex, 0.02) == 1920, "0.12 s are more than 0.1 s"
+    assert listen(duplex, 1.0) == RATE, "after the gap nobody waits"
+    np.testing.assert_array_equal(witness.reference[:1280], VOICE[:1280])
+
+
+def test_an_utterance_that_was_ended_is_not_waited_for(witness):
+    duplex = Duplex(witness, patience_s=0.1)
+    duplex.play(VOICE[:1280], RATE)
+    duplex.end()
+    assert listen(duplex, 0.2) == 3200
+
+
+@pytest.mark.parametrize("said, heard", [(24000, 16000), (22050, 48000), (8000, 44100), (48000, 8000)])
+def test_rates_of_speech_and_microphone_may_be_any(witness, said, heard):
+    duplex = Duplex(witness)
+    voice = soxr.resample(soxr.resample(VOICE, RATE, 6000), 6000, said)  # nothing that 8 kHz could not carry
+    for at in range(0, voice.size, 441):
+        duplex.play(voice[at : at + 441], said)
+    duplex.end()
+    out = listen(duplex, 2.5, heard, frame=heard // 100)
+    assert 2.5 * heard >= out > 2.2 * heard, "what the resamplers hold back, 0.23 s for the two of 8 kHz"
+    expected = soxr.resample(voice, said, RATE)
+    error = witness.reference[: expected.size][800:-800] - expected[800:-800]
+    assert np.mean(error**2) < 1e-4 * np.mean(expected**2), "40 dB: two resamplers, of which one ran in pieces"
+
+
+def test_what_was_played_while_the_microphone_was_off_is_not_heard_later(witness):
+    clock = Clock()
+    duplex = Duplex(witness, clock=clock)
+    duplex.play(np.tile(VOICE, 5), RATE)
+    for _ in range(50):
+        clock.now += 0.02
+        listen(duplex, 0.02)
+    clock.now += 5.02  # muted for 5 s
+    listen(duplex, 0.02)
+    assert duplex.stats()["unheard_s"] == pytest.approx(5.0, abs=0.01)
+    np.testing.assert_array_equal(witness.reference[-320:], np.tile(VOICE, 5)[6 * RATE : 6 * RATE + 320])
+
+
+def test_a_microphone_that_comes_in_bursts_loses_no_reference(witness):
+    clock = Clock()
+    duplex = Duplex(witness, clock=clock)
+    duplex.play(VOICE, RATE)
+    for _ in range(2):
+        clock.now += 0.8  # the event loop stood still
+        listen(duplex, 0.8)
+    np.testing.assert_array_equal(witness.reference, VOICE[: 8 * RATE // 5])
+
+
+def test_a_paused_loudspeaker_goes_on_where_it_stopped_but_for_what_it_threw_away(witness):
+    duplex = Duplex(witness)
+    duplex.play(VOICE, RATE)
+    listen(duplex, 0.5)
+    duplex.pause()
+    listen(duplex, 0.5)
+    duplex.resume(skipped_s=0.2)
+    listen(duplex, 0.5)
+    assert not witness.reference[RATE // 2 : RATE].any()
+    np.testing.assert_array_equal(witness.reference[RATE:], VOICE[11200:19200])
+
+
+def test_the_queue_is_bounded_and_says_what_it_refused(witness, monkeypatch):
+    monkeypatch.setattr(module, "MOST_QUEUED_S", 1.5)
+    duplex = Duplex(witness)
+    for _ in range(3):
+        duplex.play(VOICE, RATE)
+    assert duplex.queued_s == 1.5 and duplex.stats()["refused_s"] == 4.5
+
+
+def test_switched_off_it_passes_the_microphone_and_forgets_what_was_said(witness):
+    duplex = Duplex(witness)
+    duplex.play(VOICE, RATE)
+    duplex.enabled = False
+    duplex.play(VOICE, RATE)
+    assert duplex.queued_s == 0 and duplex.hear(VOICE, 44100) is VOICE
+    duplex.enabled = True
+    listen(duplex, 0.1)
+    assert not witness.reference.any()
+
+
+def test_speech_may_come_from_another_thread(witness):
+    duplex = Duplex(witness)
+
+    def talk():
+        for at in range(0, VOICE.size, 64):
+            duplex.play(VOICE[at : at + 64], RATE)
+
+    thread = threading.Thread(target=talk)
+    thread.start()
+    while thread.is_alive():
+        duplex.hear(np.zeros(32, np.float32), RATE)
+    listen(duplex, 2.0)
+    np.testing.assert_array_equal(witness.reference[witness.reference != 0], VOICE[VOICE != 0])
+
+
+def test_an_engine_that_answers_at_the_end_is_refused(witness):
+    witness.waits_for_end = True
+    with pytest.raises(UsageError, match="witness needs the whole recording"):
+        Duplex(witness)
+
+
+def test_bytes_become_one_channel_and_back():
+    stereo = np.array([[16384, 0], [-32768, -32768]], "<i2")
+    np.testing.assert_array_equal(from_pcm16(stereo.tobytes(), 2), np.float32([0.25, -1.0]))
+    assert as_pcm16(np.float32([0.5, 2.0]), 2) == np.array([16384, 16384, 32767, 32767], "<i2").tobytes()
+    with pytest.raises(SignalError, match="found 3 bytes, expected whole 16-bit samples of 1"):
+        from_pcm16(b"abc")
+
+
+def test_the_robot_is_removed_though_its_speech_comes_in_bursts_is_cut_off_and_begins_again(room_of):
+    """At other rates than the filter's; the loudspeaker drops what it holds when the speech is cut off."""
+    room = room_of.Room()
+    events = []
+    duplex = Duplex(EgoFilter(room_of.PROFILE, "crnn"), on_event=events.append)
+    heard, filtered = [], []
+    for step in range(300):
+        if step in (0, 150):
+            duplex.play(soxr.resample(room_of.ROBOT, RATE, 24000), 24000)
+            room.play(room_of.ROBOT)
+        if step == 100:
+            duplex.interrupt()
+            room.silence()
+        heard.append(room.hear(320))
+        filtered.append(duplex.hear(heard[-1], RATE))
+    mic, out = np.concatenate(heard), np.concatenate(filtered)
+    for start, end in ((0.5, 2.2), (3.5, 5.9)):
+        part = slice(round(start * RATE), round(end * RATE))
+        assert 10 * np.log10(np.mean(out[part] ** 2) / np.mean(mic[part] ** 2)) < -25  # 44 dB were seen
+    assert np.abs(out).max() < 1.12 * np.abs(mic).max()  # 1 dB
+    assert not [event for event in events if event.kind == "speech_started"], "nobody spoke"

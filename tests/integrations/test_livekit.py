@@ -1,0 +1,119 @@
+"""Against the real LiveKit Agents: its session, its outputs, its audio streams; no server."""
+
+import asyncio
+
+import numpy as np
+import pytest
+from livekit import rtc
+from livekit.agents.voice import io, room_io
+
+from edgefilter import EgoFilter
+from edgefilter.integrations.duplex import as_pcm16, from_pcm16
+from edgefilter.integrations.livekit import EgoProcessor
+
+NOISE = 0.1 * np.random.default_rng(0).standard_normal(48_000).astype(np.float32)
+
+
+class Sink(io.AudioOutput):
+    """The end of an output's chain, which writes down what it was asked for."""
+
+    def __init__(self):
+        super().__init__(label="sink", capabilities=io.AudioOutputCapabilities(pause=True), sample_rate=24_000)
+        self.asked = []
+
+    async def capture_frame(self, frame):
+        await super().capture_frame(frame)
+        self.asked.append(frame.samples_per_channel)
+
+    def flush(self):
+        super().flush()
+        self.asked.append("flush")
+
+    def clear_buffer(self):
+        self.asked.append("clear")
+
+    def pause(self):
+        self.asked.append("pause")
+
+    def resume(self):
+        self.asked.append("resume")
+
+
+@pytest.fixture
+def ears():
+    return EgoProcessor(EgoFilter(engine="linear"))
+
+
+def frame_of(samples, rate=24_000, channels=1):
+    return rtc.AudioFrame(as_pcm16(samples, channels), rate, channels, samples.size)
+
+
+def test_a_robot_that_talks_is_interrupted_and_its_reference_is_what_it_played(example, ego, check_conversation):
+    log, room, _ = asyncio.run(asyncio.wait_for(example("agent_livekit").converse(ego), 120))
+    check_conversation(room, ego, 3.0)
+    kinds = [what.split(":")[0] for _, what in log]
+    assert kinds == ["the human speaks", "the robot was interrupted", "the human said"]
+
+
+def test_an_audio_stream_sends_its_frames_through_it(ears):
+    """A real one, of a local track; it runs on a clock of its own, so that only what comes out is looked at."""
+
+    async def listen():
+        source = rtc.AudioSource(24_000, 1)
+        track = rtc.LocalAudioTrack.create_audio_track("microphone", source)
+        stream = rtc.AudioStream.from_track(
+            track=track, sample_rate=24_000, num_channels=1, frame_size_ms=50, noise_cancellation=ears
+        )
+        feeding = asyncio.create_task(source.capture_frame(frame_of(NOISE[:12_000])))
+        frames = [(await stream.__anext__()).frame for _ in range(8)]
+        feeding.cancel()
+        await stream.aclose()
+        return frames
+
+    frames = asyncio.run(asyncio.wait_for(listen(), 60))
+    assert {frame.samples_per_channel for frame in frames} == {1200}
+    assert 8 * 800 * 0.8 < ears.duplex.ego.stats()["samples"] <= 8 * 800 + 800
+
+
+def test_the_room_s_options_take_it_for_noise_cancellation(ears):
+    assert room_io.AudioInputOptions(noise_cancellation=ears).noise_cancellation is ears
+    assert isinstance(ears, rtc.FrameProcessor) and ears.enabled
+
+
+@pytest.mark.parametrize("rate, channels, ms", [(24_000, 1, 50), (48_000, 2, 10), (16_000, 1, 20), (44_100, 1, 10)])
+def test_frames_come_out_as_long_as_they_went_in_and_late_by_less_than_a_fifth_of_a_second(ears, rate, channels, ms):
+    count, out = rate * ms // 1000, []
+    for at in range(0, NOISE.size - count, count):
+        frame = ears._process(frame_of(NOISE[at : at + count], rate, channels))
+        assert (frame.samples_per_channel, frame.sample_rate, frame.num_channels) == (count, rate, channels)
+        out.append(from_pcm16(frame.data.cast("B"), channels))
+    out = np.concatenate(out)
+    started = np.flatnonzero(np.abs(out) > 0.02)[0] / rate
+    assert 0.02 < started < 0.2
+    assert np.mean(out[-rate // 2 :] ** 2) == pytest.approx(0.01, rel=0.7), "the microphone, as no robot speaks"
+
+
+def test_the_tap_hands_everything_on_and_notes_what_is_played_paused_and_dropped(ears):
+    sink = Sink()
+
+    async def talk():
+        tap = ears.tap(sink)
+        await tap.capture_frame(frame_of(NOISE[:24_000]))
+        tap.flush()
+        assert ears.duplex.queued_s == pytest.approx(1.0, abs=1e-3)
+        tap.pause()
+        ears._process(frame_of(NOISE[:2400]))
+        assert ears.duplex.stats()["played_s"] == 0
+        tap.resume()
+        tap.clear_buffer()
+        assert tap.sample_rate == 24_000 and tap.can_pause
+
+    asyncio.run(talk())
+    assert sink.asked == [24_000, "flush", "pause", "resume", "clear"]
+    assert ears.duplex.queued_s == 0 and ears.duplex.stats()["dropped_s"] == pytest.approx(1.0, abs=1e-3)
+
+
+def test_switched_off_it_forgets_what_was_said(ears):
+    ears.duplex.play(NOISE, 24_000)
+    ears.enabled = False
+    assert ears.duplex.queued_s == 0 and not ears.enabled
