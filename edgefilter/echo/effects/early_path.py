@@ -44,7 +44,7 @@ class EarlyPath(Effect):
 
     def fit(self, measurement: Measurement, model: VoiceModel) -> Values:
         """As late_reverb's; neutral where nothing of it holds on other samples."""
-        taps, _ = fit_path(measurement, model)
+        taps, _ = measurement.once(fit_path, model)
         if not taps.any():
             return neutral(self)
         grown = np.cumsum(taps**2)

@@ -45,6 +45,7 @@ class LateReverb(Effect):
     stage: ClassVar[Stage] = "path"
     title: ClassVar[str] = "late reverberation"
     absorbed: ClassVar[bool] = True
+    lengthens: ClassVar[bool] = True
     complexity: ClassVar[int] = 4
     flexible: ClassVar[bool] = True
     parameters: ClassVar[tuple[Parameter, ...]] = (
@@ -66,7 +67,7 @@ class LateReverb(Effect):
         Then once more with taps expected to decay as the room that was found does: some seconds of speech do not teach
         ten thousand.
         """
-        taps, rt60 = fit_path(measurement, model)
+        taps, rt60 = measurement.once(fit_path, model)
         if not taps.any():
             return neutral(self)
         late = float(np.sum(taps[LEAD + SAMPLE_RATE // 100 :] ** 2))
