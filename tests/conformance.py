@@ -377,6 +377,8 @@ EFFECT_CASES: dict[str, dict[str, object]] = {
     "bandlimit": {"cutoff_hz": 2500.0, "order": 6.0},
     "chassis_resonance": {"frequency_hz": 820.0, "q": 40.0, "gain_db": 0.0, "phase_deg": 30.0},
     "late_reverb": {"taps": 0.04 * _decaying(6000, 1200.0, 11)},
+    "early_path": {"taps": 0.1 * _decaying(400, 60.0, 13)},
+    "equaliser": {"gain_db": 6.0 * np.sin(np.arange(27) / 4.0)},
     "path_change": {"time_s": 6.3, "duration_s": 0.01, "taps": 0.05 * _decaying(600, 120.0, 12)},
     "fan_noise": {"spectrum_db": np.linspace(9.0, 3.0, 601)},
     "rattle": {

@@ -2,11 +2,12 @@
 
     python -m bench.measure.hidden_effects DIR [DIR ...] [--limit N] [--jobs 2] [--json] [--output PATH]
 
-A folder holds cases as bench.simulate.hidden_cases writes them: sweep_ref, sweep_mic, fan_only, ref, mic (FLAC),
-truth.json (effects, raw, strength). Instead of truth.json files it may hold one seals.json: per case a salt and the
-sha256 of salt + ":" + case + ":" + label. Then the diagnosis's own answer is hashed, and nothing else: a hit is the
-exact label (effects sorted and joined by "+", none, unknown). Prints and writes Markdown and JSON: counts with 95 %
-Wilson intervals, excess before and after, the confusion matrix, each miss.
+A folder holds cases as bench.simulate.hidden_cases and bench.simulate.wild write them: sweep_ref, sweep_mic, fan_only,
+ref, mic (FLAC), truth.json (effects, raw, strength, and `also`: other names that are right). Instead of truth.json files
+it may hold one seals.json: per case a salt and the sha256 of salt + ":" + case + ":" + label. Then the diagnosis's own
+answer is hashed, and nothing else: a hit is the exact label (effects sorted and joined by "+", none, unknown). Prints
+and writes Markdown and JSON: counts with 95 % Wilson intervals, excess before and after, the confusion matrix, each
+miss.
 """
 
 from __future__ import annotations
@@ -79,7 +80,13 @@ def judge(case: Path, truth: dict | None) -> Outcome:
         said["evidence"] = f"{type(error).__name__}: {error}"
     seconds = time.process_time() - started
     return Outcome(
-        case.name, tuple(sorted(known["effects"])), tuple(known["raw"]), known["strength"], **said, seconds=seconds
+        case.name,
+        tuple(sorted(known["effects"])),
+        tuple(known["raw"]),
+        known["strength"],
+        **said,
+        seconds=seconds,
+        also=tuple(known.get("also", ())),
     )
 
 

@@ -21,7 +21,7 @@ class Outcome:
     truth: effects, ("none",), ("unknown",), or empty where it is sealed. raw: what it is in detail. verdict: of the
     diagnosis, or "error". named: effects of its ranking, in order. before_db, after_db: excess before and after each of
     them. remaining_db: at the end. sealed_hit: whether the label's hash is that of the answer; None where nothing is
-    sealed.
+    sealed. also: other names that are right of what is hidden.
     """
 
     case: str
@@ -38,6 +38,7 @@ class Outcome:
     evidence: str
     seconds: float
     sealed_hit: bool | None = None
+    also: tuple[str, ...] = ()
 
     @property
     def group(self) -> str:
@@ -68,7 +69,8 @@ class Outcome:
             return bool(self.sealed_hit)
         if self.group in ("controls", "outside"):
             return self.label == self.truth[0]
-        return self.first == self.truth[0] if self.group == "singles" else set(self.truth) <= set(self.named)
+        right = (self.truth[0], *self.also)
+        return self.first in right if self.group == "singles" else set(self.truth) <= set(self.named)
 
 
 def counted(flags: Iterable[bool]) -> dict:
@@ -94,8 +96,8 @@ def summarise(outcomes: Sequence[Outcome]) -> dict:
     for strength in STRENGTHS:
         of = [o for o in singles if o.strength == strength]
         counts[f"top-1, {strength}"] = counted(o.hit for o in of)
-        counts[f"top-2, {strength}"] = counted(o.truth[0] in o.named[:2] for o in of)
-    counts["singles: that effect and no other"] = counted(o.label == o.truth[0] for o in singles)
+        counts[f"top-2, {strength}"] = counted(bool({o.truth[0], *o.also} & set(o.named[:2])) for o in of)
+    counts["singles: that effect and no other"] = counted(o.label in (o.truth[0], *o.also) for o in singles)
     counts["false alarms on controls"] = counted(not o.hit for o in controls)
     counts["pairs: both named"] = counted(o.hit for o in pairs)
     counts["pairs: at least one named"] = counted(bool(set(o.truth) & set(o.named)) for o in pairs)
@@ -221,7 +223,8 @@ def _miss_lines(misses: Sequence[Outcome]) -> list[str]:
         hidden = (
             "sealed"
             if not o.truth
-            else "+".join(o.truth) + ("" if set(o.raw) == set(o.truth) or not o.raw else f" ({'+'.join(o.raw)})")
+            else " or ".join(("+".join(o.truth), *o.also))
+            + ("" if set(o.raw) == set(o.truth) or not o.raw else f" ({'+'.join(o.raw)})")
         )
         said = o.verdict + (": " + ", ".join(o.named) if o.named else "")
         lines.append(

@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 
 from edgefilter.diagnosis.compare import Comparison
-from edgefilter.diagnosis.criteria import Criteria
 from edgefilter.diagnosis.diagnose import add
 from edgefilter.diagnosis.proof import Proof, prove
 from edgefilter.echo.effects.catalogue import find
@@ -119,8 +118,7 @@ def fit(
 
 def long_paths() -> list[str]:
     """Names of the effects that lengthen a path: a profile made from a recording has one of a quarter of a second."""
-    longest = Criteria().long_filter
-    return [name for name in names_known() if find(name).absorbed and find(name).complexity >= longest]
+    return [name for name in names_known() if find(name).lengthens]
 
 
 def _values(name: str, values: Any, named: bool) -> list[str]:

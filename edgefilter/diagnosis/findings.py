@@ -28,7 +28,9 @@ def share_of(before_db: float, after_db: float) -> float:
 
 
 def findings_of(found: Found, progress: Callable[[str], None] | None) -> tuple[tuple[Finding, ...], list[str]]:
-    """Strongest first; each with the excess before and after it in the order in which they were added.
+    """The one that is missed most first; each with the excess before and after it in the order of the steps.
+
+    A change of the fan comes first only where it is more than all the rest.
 
     And what is not known of them.
     """
@@ -53,7 +55,9 @@ def findings_of(found: Found, progress: Callable[[str], None] | None) -> tuple[t
             )
         )
         before = after
-    return tuple(sorted(findings, key=lambda finding: -finding.share)), doubts
+    voice, noise = ([f for f in findings if (find(f.effect).stage == "noise") is fan] for fan in (False, True))
+    first = noise and sum(f.share for f in noise) > sum(f.share for f in voice)
+    return tuple((*noise, *voice) if first else (*voice, *noise)), doubts
 
 
 def _intervals(prepared: Prepared, model: EchoModel, step: Trial) -> tuple[Mapping[str, Interval], list[str]]:

@@ -8,7 +8,8 @@ where the best one does not lead to an explanation.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
+from itertools import pairwise
 
 from edgefilter.diagnosis.criteria import Criteria
 from edgefilter.diagnosis.noise_change import changed_fan
@@ -221,13 +222,40 @@ def _stands(bench: Workbench, model: EchoModel, name: str) -> bool:
 
 
 def _in_steps(bench: Workbench, start: EchoModel, model: EchoModel) -> tuple[Trial, ...]:
-    """The effects that a model has beyond the start, each with what it explains beside those before it, the largest first."""
-    left, steps = added(start, model), []
-    values, model = dict(model.effects), start
+    """The effects that a model has beyond the start, each with what it explains beside those before it.
+
+    First comes the one that is missed most; where the excess does not fall from step to step so, the largest.
+    """
+    found = added(start, model)
+    missed = sorted(found, key=lambda name: -_left_without(bench, start, model, name))
+    steps = _steps(bench, start, model, missed)
+    excess = [bench.score(start).excess_db, *(step.score.excess_db for step in steps)]
+    if all(after <= before for before, after in pairwise(excess)):
+        return steps
+    left, order, with_them, values = list(found), [], start, dict(model.effects)
     while left:
-        tries = {name: model.with_effect(name, values[name]) for name in left}
-        name = min(tries, key=lambda name: bench.score(tries[name]).level_db)
-        steps.append(bench.beside(name, model, tries[name]))
-        model = tries[name]
-        left.remove(name)
+        tries = {name: with_them.with_effect(name, values[name]) for name in left}
+        order.append(min(tries, key=lambda name: bench.score(tries[name]).level_db))
+        with_them = tries[order[-1]]
+        left.remove(order[-1])
+    return _steps(bench, start, model, order)
+
+
+def _left_without(bench: Workbench, start: EchoModel, model: EchoModel, name: str) -> float:
+    """Level in dB that a model leaves without that effect, the others fitted anew: what these could swallow is not its own."""
+    others = model.without_effect(name)
+    kept = added(start, others)
+    if len(kept) != 1:
+        return bench.score(refit(bench, start, others)).level_db
+    alone = bench.attempt(kept[0], start)
+    return min(bench.score(others).level_db, alone.score.level_db if alone else float("inf"))
+
+
+def _steps(bench: Workbench, start: EchoModel, model: EchoModel, order: Sequence[str]) -> tuple[Trial, ...]:
+    """The effects of a model beyond the start in that order."""
+    steps, values = [], dict(model.effects)
+    for name in order:
+        grown = start.with_effect(name, values[name])
+        steps.append(bench.beside(name, start, grown))
+        start = grown
     return tuple(steps)

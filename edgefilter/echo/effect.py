@@ -58,6 +58,7 @@ class Effect:
     scales_fan: whether the fan gets the same gain as the voice. event: whether the values belong to one recording
     (moments, a gain's curve) rather than to the robot: they get a parameter RECORDING besides their own, and in other
     recordings the effect is left out. absorbed: whether a linear path fitted to a recording holds the effect already.
+    lengthens: whether it is what makes a path longer than a recording teaches it at first.
     followed: whether the running filter follows it by itself, as its aligner does a drift, so that a fit of others takes
     it out of the recording first (diagnosis/joint.py).
 
@@ -80,6 +81,7 @@ class Effect:
     scales_fan: ClassVar[bool] = False
     event: ClassVar[bool] = False
     absorbed: ClassVar[bool] = False
+    lengthens: ClassVar[bool] = False
     followed: ClassVar[bool] = False
 
     title: ClassVar[str] = ""

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Protocol, TypeAlias
+from typing import Any, Protocol, TypeAlias, TypeVar
 
 import numpy as np
 import scipy
@@ -17,6 +17,7 @@ from edgefilter.types import SAMPLE_RATE, Array, Samples
 
 Values: TypeAlias = Mapping[str, "float | Array"]
 """The parameters of one effect by name."""
+Result = TypeVar("Result")
 REMEMBERED = 6
 """Models whose predictions a measurement keeps."""
 
@@ -58,6 +59,7 @@ class Measurement:
     noise_psd: Samples | None = None
     fit: NDArray[np.bool_] | None = None
     _heard: dict[VoiceModel, tuple[Samples, Samples]] = field(default_factory=dict, init=False, repr=False)
+    _done: dict[tuple[object, VoiceModel], Any] = field(default_factory=dict, init=False, repr=False)
 
     @property
     def weights(self) -> Samples:
@@ -95,6 +97,13 @@ class Measurement:
                 del self._heard[next(iter(self._heard))]
         self._heard[model] = known
         return known
+
+    def once(self, work: Callable[[Measurement, VoiceModel], Result], model: VoiceModel) -> Result:
+        """What work makes of this measurement and a model, remembered: for a fit that several effects share."""
+        key = work, model
+        if key not in self._done:
+            self._done[key] = work(self, model)
+        return self._done[key]
 
     def error(self, predicted: Samples) -> float:
         """Weighted sum of squares of the whitened recording minus predicted (n,): what a fit makes small."""

@@ -15,6 +15,8 @@ from edgefilter.echo.effects.chassis_resonance import ChassisResonance
 from edgefilter.echo.effects.clock_drift import ClockDrift
 from edgefilter.echo.effects.compression import Compression
 from edgefilter.echo.effects.delay_jump import DelayJump
+from edgefilter.echo.effects.early_path import EarlyPath
+from edgefilter.echo.effects.equaliser import Equaliser
 from edgefilter.echo.effects.fan_noise import FanNoise
 from edgefilter.echo.effects.late_reverb import LateReverb
 from edgefilter.echo.effects.mic_agc import MicAgc
@@ -34,7 +36,9 @@ EFFECTS: tuple[Effect, ...] = (
     SpeakerNonlinearity(),
     Rattle(),
     Bandlimit(),
+    Equaliser(),
     ChassisResonance(),
+    EarlyPath(),
     LateReverb(),
     PathChange(),
     ClockDrift(),

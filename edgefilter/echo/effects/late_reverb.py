@@ -45,6 +45,7 @@ class LateReverb(Effect):
     stage: ClassVar[Stage] = "path"
     title: ClassVar[str] = "late reverberation"
     absorbed: ClassVar[bool] = True
+    lengthens: ClassVar[bool] = True
     complexity: ClassVar[int] = 4
     flexible: ClassVar[bool] = True
     parameters: ClassVar[tuple[Parameter, ...]] = (
@@ -66,20 +67,9 @@ class LateReverb(Effect):
         Then once more with taps expected to decay as the room that was found does: some seconds of speech do not teach
         ten thousand.
         """
-        x = measurement.heard(model)[1]
-        residual = measurement.white_recording - x
-        length = min(TAPS, measurement.recording.size // 4)
-        taps = fit_supported(x, residual, measurement.weights, length, LEAD, prior=np.full(length, EXPECTED), steps=40)
+        taps, rt60 = measurement.once(fit_path, model)
         if not taps.any():
             return neutral(self)
-        response = scipy.signal.oaconvolve(model.impulse_response.astype(np.float64), taps)[LEAD:]
-        response[: model.impulse_response.size] += model.impulse_response
-        direct = int(np.argmax(np.abs(model.impulse_response)))
-        rt60 = reverberation_time(response[direct : taps.size - LEAD])
-        if rt60 > 0.0:
-            taps = fit_filter(
-                x, residual, measurement.weights, length, LEAD, prior=decaying(taps, SLOWER * rt60), steps=60
-            )
         late = float(np.sum(taps[LEAD + SAMPLE_RATE // 100 :] ** 2))
         return {
             "rt60_s": rt60,
@@ -100,14 +90,43 @@ class LateReverb(Effect):
         A loudspeaker of another colour or a path that moved are stationary, too, and a filter this long takes up
         either.
         """
-        taps = np.atleast_1d(np.asarray(evidence.values["taps"], float))
-        direct = int(np.argmax(np.abs(evidence.model.impulse_response)))
-        before = evidence.model.impulse_response[direct:].astype(np.float64)
-        added = scipy.signal.oaconvolve(evidence.model.impulse_response.astype(np.float64), taps)[LEAD + direct :]
-        after = added.copy()
-        after[: before.size] += before[: added.size]
-        late = float(np.sum(added[EARLY:] ** 2)) >= LATE_SHARE * float(np.sum(added**2))
-        return late and decay(after) > LONGER * decay(before)
+        return rings_longer(evidence)
+
+
+def fit_path(measurement: Measurement, model: VoiceModel) -> tuple[Array, float]:
+    """(k,) taps at lags -LEAD to k - LEAD behind the calibrated path, zeros where none hold on other samples; RT60 of the new path in s."""
+    x = measurement.heard(model)[1]
+    residual = measurement.white_recording - x
+    length = min(TAPS, measurement.recording.size // 4)
+    taps = fit_supported(x, residual, measurement.weights, length, LEAD, prior=np.full(length, EXPECTED), steps=40)
+    if not taps.any():
+        return taps, 0.0
+    response = scipy.signal.oaconvolve(model.impulse_response.astype(np.float64), taps)[LEAD:]
+    response[: model.impulse_response.size] += model.impulse_response
+    direct = int(np.argmax(np.abs(model.impulse_response)))
+    rt60 = reverberation_time(response[direct : taps.size - LEAD])
+    rt60 = rt60 or reverberation_time(model.impulse_response[direct:].astype(np.float64))
+    if rt60 > 0.0:
+        prior = decaying(taps, SLOWER * rt60)
+        taps = fit_filter(x, residual, measurement.weights, length, LEAD, prior=prior, steps=60)
+    return taps, rt60
+
+
+def rings_longer(evidence: Evidence) -> bool:
+    """Whether taps make the room longer: a good part of what they add, a gain apart, comes later than early reflections do.
+
+    And the whole decays more slowly.
+    """
+    taps = np.atleast_1d(np.asarray(evidence.values["taps"], float))
+    direct = int(np.argmax(np.abs(evidence.model.impulse_response)))
+    before = evidence.model.impulse_response[direct:].astype(np.float64)
+    added = scipy.signal.oaconvolve(evidence.model.impulse_response.astype(np.float64), taps)[LEAD + direct :]
+    after = added.copy()
+    after[: before.size] += before[: added.size]
+    known = np.pad(before, (0, max(added.size - before.size, 0)))[: added.size]
+    added -= float(added @ known) / float(known @ known) * known
+    late = float(np.sum(added[EARLY:] ** 2)) >= LATE_SHARE * float(np.sum(added**2))
+    return late and decay(after) > LONGER * decay(before)
 
 
 def block_energy(taps: Array) -> tuple[Array, float]:

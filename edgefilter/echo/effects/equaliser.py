@@ -1,0 +1,153 @@
+"""The voice has another colour: an equaliser in the player, or another loudspeaker."""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import fft
+
+from edgefilter.echo.effect import Effect, Parameter, Stage
+from edgefilter.echo.evidence import Evidence
+from edgefilter.echo.measurement import Measurement, Values, VoiceModel
+from edgefilter.echo.wiener import Spectra, convolve_from, fit_filter, spectra
+from edgefilter.types import SAMPLE_RATE, Array, Samples
+
+KNOTS_HZ = np.geomspace(80.0, 7600.0, 27)
+"""A quarter of an octave apart: what is narrower rings, and is a resonance."""
+FFT = 4096
+DELAYS = np.arange(-8.0, 8.01, 0.1)
+"""Samples: the lag at which a recording is found is that of its loudest frequencies."""
+TAPS, LEAD, EXPECTED = 48, 16, 1e-4
+"""Of the filter that takes up what a smooth gain of least phase is not: 3 ms, and a hundredth for each tap."""
+STEPS, DAMPING, BEND = 12, 1e-3, 3e-3
+"""Of the fit: how often it is made linear anew, how strongly it is held, and how strongly the gain is kept smooth, both
+re the energy of a knot."""
+MOST_DB = 40.0
+LEAST_DB = 0.4
+"""Standard deviation over frequency by which a gain differs from day to day at most."""
+HEARD = 1e-3
+"""Part of the loudest knot's energy from which on a knot is heard."""
+
+
+class Equaliser(Effect):
+    """y = h * x, |H| smooth over frequency: gain_db at KNOTS_HZ, linear in between in dB over the logarithm of frequency.
+
+    Its phase is the least that the gain allows (Oppenheim & Schafer 2010, eq. 12.35), as analogue filters, their
+    digital likenesses and loudspeakers have it, but for a delay in samples. taps: (k,) lags -LEAD to k - LEAD, by which
+    the real filter differs from that one. range_db only reports: from the least to the largest gain that is heard.
+    """
+
+    name: ClassVar[str] = "equaliser"
+    stage: ClassVar[Stage] = "path"
+    title: ClassVar[str] = "an equaliser or another loudspeaker"
+    absorbed: ClassVar[bool] = True
+    complexity: ClassVar[int] = 2
+    flexible: ClassVar[bool] = True
+    parameters: ClassVar[tuple[Parameter, ...]] = (
+        Parameter("gain_db", "dB", 0.0, -MOST_DB, MOST_DB),
+        Parameter("delay", "samples", 0.0, -100.0, 100.0),
+        Parameter("taps", "1", 0.0, -10.0, 10.0),
+        Parameter("range_db", "dB", 0.0, 0.0, 2 * MOST_DB),
+    )
+
+    def apply(self, x: Samples, values: Values, sample_rate: int) -> Samples:
+        """X in its other colour."""
+        gain_db, delay = np.asarray(values["gain_db"], float), float(values["delay"])
+        y = x.copy()
+        if gain_db.any() or delay:
+            knots = np.broadcast_to(gain_db, KNOTS_HZ.shape) * (np.log(10.0) / 20.0)
+            hz = np.arange(FFT // 2 + 1) * sample_rate / FFT
+            response = np.exp(_basis(FFT // 2 + 1, sample_rate) @ knots - 2j * np.pi * hz / sample_rate * delay)
+            y = convolve_from(x, fft.fftshift(fft.irfft(response, FFT)), FFT // 2)
+        taps = np.atleast_1d(np.asarray(values["taps"], float))
+        return y + convolve_from(x, taps, LEAD) if taps.any() else y
+
+    def fit(self, measurement: Measurement, model: VoiceModel) -> Values:
+        """Gauss-Newton in the gains of all knots and the delay, in the whitened cross-spectrum; then taps."""
+        x = measurement.heard(model)[1]
+        found = spectra(measurement, x, SAMPLE_RATE / FFT)
+        knots, delay = _smooth_gain(found)
+        gain_db = np.clip(knots * (20.0 / np.log(10.0)), -MOST_DB, MOST_DB)
+        values = {"gain_db": gain_db, "delay": delay, "taps": 0.0}
+        left = measurement.white_recording - self.apply(x, values, SAMPLE_RATE)
+        taps = fit_filter(x, left, measurement.weights, TAPS, LEAD, prior=np.full(TAPS, EXPECTED), steps=20)
+        heard = gain_db[_heard(found)]
+        return {**values, "taps": np.clip(taps, -10.0, 10.0), "range_db": float(np.ptp(heard)) if heard.size else 0.0}
+
+    def sentence(self, values: Values) -> str:
+        """Where it is loudest and where softest."""
+        gain_db = np.broadcast_to(np.asarray(values["gain_db"], float), KNOTS_HZ.shape)
+        high, low = int(np.argmax(gain_db)), int(np.argmin(gain_db))
+        return (
+            f"the voice has another colour, smooth over frequency and the same at all levels: {gain_db[high]:+.1f} dB"
+            f" around {KNOTS_HZ[high]:.0f} Hz, {gain_db[low]:+.1f} dB around {KNOTS_HZ[low]:.0f} Hz"
+        )
+
+    def plausible(self, evidence: Evidence) -> bool:
+        """Whether the smooth gain, without the taps, does most of it, and is more than a turned volume."""
+        gain_db = np.asarray(evidence.values["gain_db"], float)
+        if gain_db.size < 2 or float(np.std(gain_db)) < LEAST_DB:
+            return False
+        plain = self.apply(evidence.before.prediction, {**evidence.values, "taps": 0.0}, SAMPLE_RATE)
+        fall = evidence.before.level_db - evidence.after.level_db
+        return evidence.before.level_db - evidence.grid.level_db(plain) > 0.6 * fall
+
+
+@cache
+def _basis(bins: int, sample_rate: int) -> NDArray[np.complex128]:
+    """(bins, knots) complex logarithm of the response to a knot of 1 neper: the gain, and the least phase that goes with it."""
+    hz = np.maximum(np.arange(bins) * sample_rate / (2 * (bins - 1)), 1.0)
+    at = np.log(hz / KNOTS_HZ[0]) / np.log(KNOTS_HZ[1] / KNOTS_HZ[0])
+    at = np.clip(at, 0.0, KNOTS_HZ.size - 1.0)
+    gain = np.maximum(1.0 - np.abs(at[:, None] - np.arange(KNOTS_HZ.size)), 0.0)
+    cepstrum = fft.irfft(gain, axis=0)
+    cepstrum[1 : bins - 1] *= 2.0
+    cepstrum[bins:] = 0.0
+    return fft.rfft(cepstrum, axis=0)
+
+
+def _smooth_gain(found: Spectra) -> tuple[Array, float]:
+    """Nepers at the knots (k,) and delay of the response that explains most of the cross-spectrum."""
+    turns = np.exp(-2j * np.pi * np.outer(found.hz, DELAYS) / SAMPLE_RATE)
+    delay = float(DELAYS[int(np.argmax((found.cross @ turns.conj()).real))])
+    whole = _basis(FFT // 2 + 1, SAMPLE_RATE)
+    at = np.clip(np.rint(found.hz * FFT / SAMPLE_RATE).astype(int), 0, FFT // 2)
+    basis = np.concatenate((whole[at], -2j * np.pi * found.hz[:, None] / SAMPLE_RATE), axis=1)
+    energy = np.maximum(found.predicted, 1e-12)
+    size = float(np.max(energy @ np.abs(basis[:, :-1]) ** 2))
+    bent = np.diff(np.eye(KNOTS_HZ.size), 2, axis=0)
+    penalty = np.zeros((basis.shape[1],) * 2)
+    penalty[:-1, :-1] = BEND * size * (bent.T @ bent)
+
+    def cost(a: Array) -> float:
+        response = np.exp(basis @ a)
+        own = float(np.sum(np.abs(response) ** 2 * energy - 2.0 * (response.conj() * found.cross).real))
+        return own + float(a @ penalty @ a)
+
+    a = np.append(np.zeros(KNOTS_HZ.size), delay)
+    now, damping = cost(a), DAMPING
+    for _ in range(STEPS):
+        response = np.exp(basis @ a)
+        slope = response[:, None] * basis
+        normal = (slope.conj().T @ (energy[:, None] * slope)).real + penalty
+        right = (slope.conj().T @ (found.cross - energy * response)).real - penalty @ a
+        step = np.linalg.solve(normal + damping * np.diag(normal.diagonal() + 1e-9 * size), right)
+        there = a + np.clip(step, -1.0, 1.0)
+        then = cost(there)
+        if then < now:
+            settled, a, now, damping = now - then < 1e-5 * abs(now), there, then, 0.3 * damping
+            if settled:
+                break
+        else:
+            damping = 10.0 * max(damping, 1e-4)
+    return a[:-1], float(np.clip(a[-1], -100.0, 100.0))
+
+
+def _heard(found: Spectra) -> NDArray[np.bool_]:
+    """(knots,) bool: where the voice has energy enough to tell a gain."""
+    at = np.clip(np.rint(found.hz * FFT / SAMPLE_RATE).astype(int), 0, FFT // 2)
+    energy = found.predicted @ _basis(FFT // 2 + 1, SAMPLE_RATE).real[at]
+    return np.asarray(energy > HEARD * energy.max())

@@ -1,0 +1,72 @@
+"""The wild set: which programs, in which half, and that their sound comes back at its place."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from bench.measure.hidden_scores import Outcome
+from bench.simulate import wild, wild_tools
+from bench.simulate.hidden_acoustics import Place
+from bench.simulate.wild_programs import Program
+from edgefilter.echo.effects import catalogue
+
+SUITES = {half: {program.name.split()[0].rstrip(",") for program in programs} for half, programs in wild.HALVES.items()}
+YET_WITHOUT_A_NAME = {"limiter", "multiband_compression", "noise_suppression", "codec"}
+"""Right names that the catalogue does not have: the table counts such a case as a miss."""
+
+
+def test_the_halves_are_of_other_programs() -> None:
+    assert sum(map(len, wild.HALVES.values())) >= 25
+    assert min(map(len, wild.HALVES.values())) >= 25
+    assert not SUITES["tuning"] & SUITES["reporting"]
+
+
+@pytest.mark.parametrize("half", sorted(wild.HALVES))
+def test_every_right_name_is_one_that_the_diagnosis_may_say(half: str) -> None:
+    right = {name for program in wild.HALVES[half] for name in program.right}
+    assert right <= set(catalogue.names()) | YET_WITHOUT_A_NAME | {"unknown"}
+    assert len(right) >= 12
+
+
+@pytest.mark.parametrize("half", sorted(wild.HALVES))
+def test_programs_come_in_turn_with_a_control_for_every_ten(half: str) -> None:
+    programs = wild.HALVES[half]
+    drawn = [wild.program_of(half, index) for index in range(2 * len(programs))]
+    assert [program for program in drawn if program is not wild.CONTROL][: len(programs)] == list(programs)
+    assert [index for index, program in enumerate(drawn) if program is wild.CONTROL] == list(range(9, len(drawn), 10))
+
+
+@pytest.mark.parametrize("lag", [0, 37, 480, -20])
+def test_a_program_that_is_late_is_put_back(lag: int) -> None:
+    x = np.random.default_rng(0).standard_normal(4000)
+    late = np.concatenate([np.zeros(lag), x]) if lag >= 0 else x[-lag:]
+    y = wild_tools.Command("late", lambda _: late)(x)
+    assert y.size == x.size
+    np.testing.assert_array_equal(y[100:-100], x[100:-100])
+
+
+def test_a_program_that_is_not_there_says_which_packages_are_needed(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PATH", "")
+    with pytest.raises(SystemExit, match=r"sox was not found; .*wild_tools\.py says which packages"):
+        wild_tools.sox("gain", -3)(np.zeros(100))
+
+
+@pytest.mark.parametrize(("name", "least", "most"), [("microphone moved", 0.01, 0.06), ("robot moved", 0.0, 1.2)])
+def test_who_moves_stays_in_the_room(name: str, least: float, most: float) -> None:
+    place = Place(np.array([4.0, 3.0, 2.6]), 0.4, 1, np.array([1.0, 1.0, 1.0]), np.array([1.2, 1.0, 0.9]))
+    other, words = wild.moved(np.random.default_rng(1), place, Program(name, "room", ("early_path",), None))
+    assert least <= np.linalg.norm(other.microphone - place.microphone) <= most + 1e-9
+    assert ((other.microphone > 0) & (other.microphone < place.size)).all()
+    assert words.startswith(name.split()[0])
+    assert np.allclose(other.loudspeaker, place.loudspeaker) == (name == "microphone moved")
+
+
+@pytest.mark.parametrize(("said", "hit"), [("limiter", True), ("compression", True), ("late_reverb", False)])
+def test_other_right_names_count(said: str, hit: bool) -> None:
+    empty: tuple[float, ...] = ()
+    outcome = Outcome(
+        *("case", ("limiter",), ("program",), "clear", "missing", (said,), empty, empty, empty, 9.0, 1.0, "", 1.0),
+        also=("compression",),
+    )
+    assert outcome.hit is hit

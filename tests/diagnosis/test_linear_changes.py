@@ -1,0 +1,80 @@
+"""Stationary linear changes are told apart: a colour, a path that is another from the start, and a room that sounds longer."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy import signal
+
+from edgefilter.diagnosis.diagnose import diagnose
+from edgefilter.dsp.fractional_delay import delayed
+from edgefilter.echo.effects.catalogue import find
+from edgefilter.echo.measurement import Values
+from edgefilter.echo.model import EchoModel
+from edgefilter.types import PRE_ROLL
+from tests.diagnosis.robot_scene import DELAY, FAN, path, profile, voice
+
+RATE = 16000
+SHELF_HZ = 2500.0
+
+
+def through(h: np.ndarray, x: np.ndarray) -> np.ndarray:
+    """What the microphone hears through that path, with the fan."""
+    clean = EchoModel(h.astype(np.float32)).predict(delayed(x, DELAY - PRE_ROLL))
+    return (clean + FAN * np.random.default_rng(3).standard_normal(x.size)).astype(np.float32)
+
+
+def shelf(gain_db: float) -> tuple[np.ndarray, np.ndarray]:
+    """Of first order: 0 dB at low frequencies, gain_db in the treble."""
+    turn = 2 * np.pi * SHELF_HZ
+    return signal.bilinear([10 ** (gain_db / 20), turn], [1.0, turn], RATE)
+
+
+def three_reflections() -> np.ndarray:
+    """Within 6 ms, as of a table that the robot was put on."""
+    taps = np.zeros(97)
+    taps[[0, 18, 41, 96]] = 1.0, 0.3, -0.25, 0.2
+    return np.convolve(path(), taps)[:6400]
+
+
+def elsewhere() -> np.ndarray:
+    """Another place in the same room: all reflections are others, and die away as they did."""
+    h = path(seed=5)
+    h[PRE_ROLL + 23] += 0.1
+    return h
+
+
+def longer_room() -> np.ndarray:
+    rng, h = np.random.default_rng(4), np.pad(path(), (0, 6000))
+    t = np.arange(10_000)
+    h[PRE_ROLL + 160 :][: t.size] += 0.012 * rng.standard_normal(t.size) * 10 ** (-3 * t / (0.5 * RATE))
+    return h
+
+
+def assert_gain_of_the_shelf(values: Values) -> None:
+    """The gain is read over frequency."""
+    impulse = np.eye(1, 4096, 1024, dtype=np.float32)[0]
+    response = np.abs(np.fft.rfft(find("equaliser").apply(impulse, values, RATE)))
+    hz, wanted = signal.freqz(*shelf(-4.0), response.size, fs=RATE)
+    heard = (hz > 200) & (hz < 6000)
+    error_db = 20 * np.log10(response[heard] / np.abs(wanted[heard]))
+    assert np.abs(error_db).max() < 0.5  # ten seconds of a voice that is 20 dB down at 6 kHz
+
+
+@pytest.mark.parametrize(
+    ("h", "named"),
+    [
+        (three_reflections(), "early_path"),
+        (elsewhere(), "early_path"),
+        (signal.lfilter(*shelf(-4.0), path()), "equaliser"),
+        (longer_room(), "late_reverb"),
+    ],
+    ids=["three reflections within 6 ms", "elsewhere in the room", "treble shelf of -4 dB", "a room of 0.5 s"],
+)
+def test_a_stationary_change_is_named_as_what_it_is(h: np.ndarray, named: str) -> None:
+    x = voice(10.0)
+    found = diagnose(profile(), through(h, x), x)
+    assert (found.verdict, [finding.effect for finding in found.ranking]) == ("missing", [named])
+    assert found.remaining_db < 1.0  # the product's promise for linear effects
+    if named == "equaliser":
+        assert_gain_of_the_shelf(found.ranking[0].values)
