@@ -71,6 +71,8 @@ EventKind: TypeAlias = Literal[
     "lost",
     "overrun",
     "underrun",
+    "device_gone",
+    "device_back",
 ]
 
 
@@ -85,7 +87,8 @@ class Event:
         "speech_stopped": of the human, from engines that judge it. "overloaded", "stepped_down", "stepped_up": what too
         little or enough time led to. "learned", "unlearned": a better echo path was taken over, or given back.
         "lost", "overrun", "underrun": samples that the sound devices of `edgefilter run` lost, callbacks that came too
-        late; not from an `EgoFilter` itself.
+        late, "device_gone", "device_back": one that stopped, for which silence stands in, and runs again; not from an
+        `EgoFilter` itself.
     sample : int
         By which sample of the microphone, in whole hops.
     detail : str

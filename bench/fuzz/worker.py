@@ -17,7 +17,7 @@ from bench.fuzz.targets import TARGETS, Target, working_in
 from edgefilter.errors import EdgefilterError
 
 PATIENCE_S = 10
-"""Seconds after which an input hangs."""
+"""Seconds of the processor after which an input hangs; a busy machine takes longer by the clock."""
 MEMORY = 4 << 30
 """Bytes of address space that the process has, libraries included."""
 LONGEST = 1200
@@ -79,7 +79,7 @@ def work(args: argparse.Namespace) -> int:
     """Inputs until there are no more, or the time is over."""
     resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-    signal.signal(signal.SIGALRM, _hang)
+    signal.signal(signal.SIGPROF, _hang)
     counts, choice = Counts(args.worker), drawn(args.only)
     began, used = time.monotonic(), time.process_time()
     with working_in(args.worker), tqdm(total=args.inputs, disable=None, mininterval=10.0) as bar:
@@ -106,7 +106,7 @@ def work(args: argparse.Namespace) -> int:
 
 def attempt(target: Target, path: Path, rng: random.Random) -> str:
     """What came of one input: "taken", "refused", or what is wrong."""
-    signal.alarm(PATIENCE_S)
+    signal.setitimer(signal.ITIMER_PROF, PATIENCE_S)
     try:
         target.attempt(path, rng)
         return "taken"
@@ -122,7 +122,7 @@ def attempt(target: Target, path: Path, rng: random.Random) -> str:
         where = f"{Path(trace.tb_frame.f_code.co_filename).name}:{trace.tb_lineno}" if trace else ""
         return f"{type(error).__name__}: {' '.join(str(error).split())[:200]} ({where})"
     finally:
-        signal.alarm(0)
+        signal.setitimer(signal.ITIMER_PROF, 0)
 
 
 def _hang(number: int, frame: object) -> None:

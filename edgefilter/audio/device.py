@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,7 @@ from edgefilter.audio.pairing import Pairing
 from edgefilter.audio.port import POLL_S, START_S, InputPort, OutputPort
 from edgefilter.audio.reader import Reader
 from edgefilter.audio.speech import SpokenReference
+from edgefilter.audio.steady import SteadyInput
 from edgefilter.errors import DeviceError, UsageError
 from edgefilter.types import SAMPLE_RATE, Block, Samples
 
@@ -110,9 +112,10 @@ def speaker(output: str | int | Device | None, speech: Reader) -> SpokenReferenc
 class LiveSource:
     """Microphone and reference devices as blocks on the microphone's sample counter, until stop() or `seconds`.
 
-    Raises DeviceError, after everything received has been delivered, when a device stops. reference None: silence.
-    lost: samples left out, filled or moved so far, see stats(): overruns are callbacks that the driver marked, each of
-    which may hide an unknown number of samples.
+    patience_s: how long a device may be away; silence stands in meanwhile, by the clock, and it is opened again as soon
+    as that can be done. Raises DeviceError, after everything received has been delivered, when a device is away for
+    longer. reference None: silence. lost: samples left out, filled or moved so far, see stats(): overruns are callbacks
+    that the driver marked, each of which may hide an unknown number of samples.
     """
 
     live = True
@@ -122,39 +125,36 @@ class LiveSource:
         mic: str | int | Device | None,
         reference: str | int | Device | SpokenReference | None = None,
         seconds: float | None = None,
+        patience_s: float = 0.0,
     ) -> None:
-        self._mic = InputPort(_sounddevice(), find(mic, "input"))
-        self._reference: InputPort | SpokenReference | None = None
-        if isinstance(reference, SpokenReference):
-            self._reference = reference
-        elif reference is not None:
-            self._reference = InputPort(_sounddevice(), find(reference, "input"))
-        self._pairing = Pairing()
+        self._mic = SteadyInput(_opener(mic), patience_s)
+        self._reference = None if reference is None else SteadyInput(_opener(reference), patience_s)
+        self._pairing = Pairing(late_is_lost=not isinstance(reference, SpokenReference))
         self._stopped = False
         self.total = None if seconds is None else round(seconds * SAMPLE_RATE)
-        self.notes = [f"microphone: {self._mic.device}", *self._mic.notes]
+        self.notes = [f"microphone: {self._mic.port.device}", *self._mic.port.notes]
         if self._reference is not None:
             how = "what is played on " if isinstance(reference, SpokenReference) else ""
-            self.notes += [f"reference: {how}{self._reference.device}", *self._reference.notes]
+            self.notes += [f"reference: {how}{self._reference.port.device}", *self._reference.port.notes]
 
     def __enter__(self) -> LiveSource:
         try:
-            for port in self._ports():
-                port.open()
+            for each in self._inputs():
+                each.open()
         except DeviceError:
             self.__exit__()
             raise
         return self
 
     def __exit__(self, *exc: object) -> None:
-        for port in self._ports():
-            port.close()
+        for each in self._inputs():
+            each.close()
         troubles = {name: count for name, count in self.stats().items() if count and name != "lost"}
         if troubles:
             words = ", ".join(f"{count} {name.replace('_', ' ')}" for name, count in troubles.items())
             self.notes.append(f"live input was not complete: {words}")
 
-    def _ports(self) -> Sequence[InputPort | SpokenReference]:
+    def _inputs(self) -> list[SteadyInput]:
         """The reference first, so that it is there when the microphone starts."""
         return [self._mic] if self._reference is None else [self._reference, self._mic]
 
@@ -166,25 +166,26 @@ class LiveSource:
         return self.stats()["lost"]
 
     def stats(self) -> dict[str, int]:
-        """Samples at 16 kHz by what befell them, and callbacks marked as overrun."""
+        """Samples at 16 kHz by what befell them; callbacks marked as overrun; how often a device went away and came back."""
         counts = {f"reference_{name}": getattr(self._pairing, name) for name in ("filled", "dropped", "inserted")}
-        for name, port in (("microphone", self._mic), ("reference", self._reference)):
-            counts[f"{name}_lost"] = 0 if port is None else round(port.inlet.lost * SAMPLE_RATE / port.rate)
-        lost = sum(counts.values())
-        for name, port in (("microphone", self._mic), ("reference", self._reference)):
-            counts[f"{name}_overruns"] = 0 if port is None else port.inlet.flags
-        return {"lost": lost, **counts}
+        both = (("microphone", self._mic), ("reference", self._reference))
+        for name, each in both:
+            counts[f"{name}_lost"], counts[f"{name}_away"] = (each.lost, each.filled) if each else (0, 0)
+        found = {"lost": sum(counts.values()), **counts}
+        for name, each in both:
+            times = (each.overruns, each.gone, each.back) if each else (0, 0, 0)
+            found |= dict(zip((f"{name}_overruns", f"{name}_gone", f"{name}_back"), times))
+        return found
 
     def __iter__(self) -> Iterator[Block]:
         given = reported = 0
         failure = None
         self._synchronise()
         while not self._stopped and failure is None:
-            mic = self._mic.take()
-            block = self._pairing.push(mic, np.zeros_like(mic) if self._reference is None else self._reference.take())
+            block = self._take()
             try:
-                for port in self._ports():
-                    port.check_alive(port.inlet.received)
+                for each in self._inputs():
+                    each.check()
             except DeviceError as error:
                 failure, rest = error, self._pairing.flush()
                 block = block if rest is None else rest if block is None else _join(block, rest)
@@ -200,19 +201,34 @@ class LiveSource:
         if failure is not None:
             raise failure
 
+    def _take(self) -> Block | None:
+        """What came of both devices, as far as it can be paired."""
+        mic = self._mic.take()
+        if self._reference is None:
+            return self._pairing.push(mic, np.zeros_like(mic))
+        before = self._reference.filled
+        ref = self._reference.take()
+        return self._pairing.push(mic, ref, self._reference.filled - before)
+
     def _synchronise(self) -> None:
         """Wait until both devices run steadily, and begin with what arrives then.
 
         The reference is emptied last: one that is too new only adds delay, one that is too old would come before its
         echo.
         """
-        while not self._stopped and not all(port.inlet.received >= SETTLE_S * port.rate for port in self._ports()):
-            for port in self._ports():
-                port.check_alive(port.inlet.received, START_S)
+        while not self._stopped and not all(each.settled >= SETTLE_S for each in self._inputs()):
+            for each in self._inputs():
+                each.port.check_alive(each.port.inlet.received, START_S)
             time.sleep(POLL_S)
-        self._mic.take()
-        if self._reference is not None:
-            self._reference.take()
+        for each in reversed(self._inputs()):
+            each.begin()
+
+
+def _opener(device: str | int | Device | SpokenReference | None) -> Callable[[], InputPort | SpokenReference]:
+    """What makes an input of a device, each time anew; what is spoken goes on where it was."""
+    if isinstance(device, SpokenReference):
+        return lambda: device
+    return partial(InputPort, _sounddevice(), find(device, "input"))
 
 
 def _join(first: Block, second: Block) -> Block:

@@ -73,9 +73,12 @@ class Pairing:
     late for those places is discarded, so that a stall does not shift the reference. If the counters differ by more
     than TOLERANCE throughout WINDOW, the clocks differ or a driver lost samples: the reference is cut (`dropped`) or
     extended with silence (`inserted`) to meet the counter again. Depends on the samples alone, not on the time of day.
+    late_is_lost: False where the reference is what is played here: after a stall it is not late but played later, so
+    that nothing of it is discarded.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, late_is_lost: bool = True) -> None:
+        self._late_is_lost = late_is_lost
         self._mic = np.zeros(0, np.float32)
         self._ref = np.zeros(0, np.float32)
         self._debt = 0
@@ -84,10 +87,15 @@ class Pairing:
         self._watched = 0
         self.filled = self.dropped = self.inserted = 0
 
-    def push(self, mic: Samples, ref: Samples) -> Block | None:
-        """Take what arrived, (n,) and (m,), and return the block that is complete, if any."""
+    def push(self, mic: Samples, ref: Samples, silence: int = 0) -> Block | None:
+        """Take what arrived, (n,) and (m,), and return the block that is complete, if any.
+
+        silence: so many of ref, the first ones, stand in for a device that is away and are counted by whoever put them
+        there.
+        """
         late = min(self._debt, ref.size)
         self._debt -= late
+        self.filled -= min(late, silence)
         self._mic = np.concatenate((self._mic, mic))
         self._ref = np.concatenate((self._ref, ref[late:]))
         lost = self.filled + self.dropped + self.inserted
@@ -95,7 +103,7 @@ class Pairing:
         missing = self._mic.size - self._ref.size - MAX_WAIT
         if missing > 0:
             self._ref = np.concatenate((self._ref, np.zeros(missing, np.float32)))
-            self._debt += missing
+            self._debt += missing * self._late_is_lost
             self.filled += missing
         return self._emit(min(self._mic.size, self._ref.size), self.filled + self.dropped + self.inserted - lost)
 

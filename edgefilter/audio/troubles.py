@@ -6,9 +6,11 @@ from edgefilter.audio.protocols import Sink, Source
 from edgefilter.types import SAMPLE_RATE, Event, EventKind
 
 KINDS: dict[EventKind, tuple[str, ...]] = {
-    "lost": ("_lost", "_filled", "_dropped", "_inserted", "missing", "dropped"),
+    "lost": ("_lost", "_filled", "_dropped", "_inserted", "_away", "missing", "dropped"),
     "overrun": ("_overruns",),
     "underrun": ("underruns",),
+    "device_gone": ("_gone",),
+    "device_back": ("_back",),
 }
 """Endings of the counters' names, by the kind of event that each leads to."""
 PERIOD = SAMPLE_RATE
@@ -43,9 +45,15 @@ class Troubles:
             self._before[number] = now
         happened = []
         for kind, endings in KINDS.items():
-            words = [
-                f"{count} {name.replace('_', ' ')}" for name, count in risen if count > 0 and name.endswith(endings)
-            ]
+            words = [_words(name, count) for name, count in risen if count > 0 and name.endswith(endings)]
             if words:
                 happened.append(Event(kind, sample, ", ".join(words)))
         return happened
+
+
+def _words(name: str, count: int) -> str:
+    """A counter that has risen, in words."""
+    what, _, end = name.rpartition("_")
+    if end == "gone":
+        return f"{what}: silence stands in until it is back"
+    return what if end == "back" else f"{count} {name.replace('_', ' ')}"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib
 import json
-import shutil
+import os
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -23,6 +23,10 @@ from edgefilter.types import SAMPLE_RATE, Event, Stats
 STATUS_PERIOD_S = 0.2
 
 
+TOLD = ("stepped_down", "stepped_up", "overloaded", "learned", "unlearned", "device_gone", "device_back")
+"""Kinds of events that every run tells of."""
+
+
 def say(text: str) -> None:
     """One line for the person who runs it, on standard error: standard output may be sound."""
     print(text, file=sys.stderr)
@@ -34,13 +38,11 @@ def interject(text: str) -> None:
 
 
 def say_event(event: Event, live: bool) -> None:
-    """Tell of a change of engine or path when it happens.
+    """Tell of a change of engine or path, or a device that went or came, when it happens.
 
     Live, also of the human's speech.
     """
-    if event.kind in ("stepped_down", "stepped_up", "overloaded", "learned", "unlearned") or (
-        live and event.kind.startswith("speech")
-    ):
+    if event.kind in TOLD or (live and event.kind.startswith("speech")):
         interject(f"{event.sample / SAMPLE_RATE:.1f} s: {event.kind.replace('_', ' ')} {event.detail}")
 
 
@@ -81,8 +83,7 @@ def _status(source: Source, ego: EgoFilter) -> Iterator[Callable[[Progress], Non
         now = time.monotonic()
         if now - shown >= STATUS_PERIOD_S and terminal:
             shown = now
-            width = shutil.get_terminal_size().columns
-            line = status_line(progress, ego.stats(), source.stats(), width - 1)
+            line = status_line(progress, ego.stats(), source.stats(), _width() - 1)
             print("\r" + line, end="", file=sys.stderr, flush=True)
 
     yield show
@@ -90,20 +91,24 @@ def _status(source: Source, ego: EgoFilter) -> Iterator[Callable[[Progress], Non
         print(file=sys.stderr)
 
 
+def _width() -> int:
+    """Columns of the terminal behind standard error."""
+    try:
+        return os.get_terminal_size(sys.stderr.fileno()).columns
+    except OSError:
+        return 80
+
+
 def status_line(progress: Progress, stats: Stats, source: Mapping[str, int], width: int) -> str:
-    """How it goes, in one line of this width, the most urgent first; without the bars of the levels where they do not fit."""
+    """How it goes, in one line of this width: what does not fit at its end is left out, the bars of the levels before it."""
     minutes, seconds = divmod(progress.samples / SAMPLE_RATE, 60)
     levels = {"mic": progress.mic_db, "robot": progress.ref_db, "out": progress.out_db}
     plain = " ".join(f"{name} {level:.0f}" for name, level in levels.items()) + " dB"
     bars = "  ".join(f"{name} {_bar_of(level)} {level:4.0f} dB" for name, level in levels.items())
     late = stats["deadline"]["missed_deadlines"] if stats["deadline"] else 0
     overruns = sum(count for name, count in source.items() if name.endswith("overruns"))
-    words = [
-        f"{stats['engine']} {100 * progress.load:.0f} %",
-        f"late {late}",
-        f"overruns {overruns}",
-        f"lost {progress.lost}",
-    ]
+    words = [f"{stats['engine']} {100 * progress.load:.0f} %", f"late {late}"]
+    words += [f"lost {progress.lost}", f"overruns {overruns}"]
     if progress.residual_db is not None:
         words.append(f"residual {progress.residual_db:.0f} dB")
     if alignment := stats["alignment"]:

@@ -113,7 +113,7 @@ def _engine() -> Iterator[Check]:
 def _server() -> Iterator[Check]:
     outputs = pulse.names("output")
     if not outputs:
-        help_with = "start PulseAudio or PipeWire, or name an input that hears the loudspeaker with --reference"
+        help_with = "start PulseAudio or PipeWire (and install pulseaudio-utils), or give an input that hears the loudspeaker as --reference"
         yield Check("sound server", "warning", "none answers", help_with)
         return
     yield Check("sound server", "ok", f"{len(outputs)} outputs, default {pulse.default_name('output') or 'none'}")

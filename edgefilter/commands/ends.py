@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -12,6 +13,7 @@ from edgefilter.audio.protocols import Sink, Source
 from edgefilter.audio.raw import PcmSink
 from edgefilter.audio.reader import Reader
 from edgefilter.audio.speech import SpokenReference
+from edgefilter.audio.steady_sink import SteadySink
 from edgefilter.errors import UsageError
 
 FILE_ENDINGS = (".wav", ".flac", ".ogg", ".mp3", ".aiff", ".aif", ".w64", ".opus", ".txt", ".raw", ".pcm")
@@ -51,11 +53,11 @@ def make_source(name: str, reference: str | SpokenReference | None, output: str)
             f"live, the reference is a device, found the file {reference}: leave --reference out or name a monitor"
             " ('edgefilter devices'); to play the file, --play"
         )
-    if reference is None:
-        own = virtual.speaker_monitor() if output == virtual.HUMAN else None
-        played_on = "default" if output in ("-", virtual.HUMAN) or looks_like_file(output) else output
-        return LiveSource(name, own or monitor_of(played_on))
-    return LiveSource(name, reference)
+    if reference is not None:
+        return LiveSource(name, reference, patience_s=math.inf)
+    own = virtual.speaker_monitor() if output == virtual.HUMAN else None
+    played_on = "default" if output in ("-", virtual.HUMAN) or looks_like_file(output) else output
+    return LiveSource(name, own or monitor_of(played_on), patience_s=math.inf)
 
 
 def make_sink(name: str, latency: int, wait: bool) -> Sink:
@@ -69,7 +71,9 @@ def make_sink(name: str, latency: int, wait: bool) -> Sink:
         return FileSink(name)
     from edgefilter.audio.device import LiveSink
 
-    return LiveSink(name, latency, wait=wait)
+    if wait:
+        return LiveSink(name, latency, wait=True)
+    return SteadySink(lambda: LiveSink(name, latency, wait=False))
 
 
 def looks_like_file(name: str) -> bool:

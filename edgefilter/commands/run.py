@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import gc
 import signal
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import partial
@@ -20,6 +21,9 @@ from edgefilter.filter.budget import Choice
 from edgefilter.filter.ego_filter import EgoFilter
 from edgefilter.session import RunReport, filter_blocks
 from edgefilter.types import SAMPLE_RATE
+
+TWICE_S = 0.5
+"""Seconds from which on a second signal is one of its own."""
 
 
 def main(args: argparse.Namespace) -> int:
@@ -111,10 +115,19 @@ def garbage_of_this_run_only() -> Iterator[None]:
 
 @contextmanager
 def stop_on_signal(source: Source) -> Iterator[list[int]]:
-    """SIGINT and SIGTERM end the source, and with it the run, in good order; the list then holds the signal."""
+    """SIGINT and SIGTERM end the source, and with it the run, in good order; the list then holds the signal.
+
+    A later one ends it at once: nobody may be reading the pipe that the first waits for. (Not one that comes with the
+    first: timeout(1) signals a program and its group.)
+    """
     caught: list[int] = []
+    first_at = 0.0
 
     def handle(number: int, _frame: object) -> None:
+        nonlocal first_at
+        if caught and time.monotonic() - first_at > TWICE_S:
+            raise KeyboardInterrupt
+        first_at = first_at or time.monotonic()
         caught.append(number)
         source.stop()
 

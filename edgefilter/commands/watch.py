@@ -20,7 +20,7 @@ from edgefilter.types import Event
 
 
 class Watch:
-    """Tells all of them of each block and each event; a context manager around the run.
+    """Tells all of them of each block and each event, those who act first; a context manager around the run.
 
     notes: what the user was told before it. record: where the sound is to be kept, if anywhere.
     """
@@ -35,7 +35,7 @@ class Watch:
     ) -> None:
         self._args, self._ego, self._source, self._speech, self._notes = args, ego, source, speech, notes
         self._stack = ExitStack()
-        self._hearing: list[Callable[[Event], None]] = [partial(say_event, live=source.live)]
+        self._hearing: list[Callable[[Event], None]] = []
         self._showing: list[Callable[[Progress], None]] = []
         self._logs: list[EventLog] = []
         self.record: Record | None = None
@@ -58,8 +58,15 @@ class Watch:
             self._showing.append(stack.enter_context(display(self._source, self._ego, args.quiet)))
             self._stack = stack.pop_all()
         for log in self._logs:
-            log.write("started", 0, engine=self._ego.engine_name, latency=self._ego.latency, notes=self._notes)
+            log.write(
+                "started",
+                0,
+                engine=self._ego.engine_name,
+                latency_ms=self._ego.stats()["latency_ms"],
+                notes=self._notes,
+            )
             self._hearing.append(log.hear)
+        self._hearing.append(partial(say_event, live=self._source.live))
         return self
 
     def __exit__(self, *exc: object) -> None:

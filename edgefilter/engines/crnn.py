@@ -72,11 +72,10 @@ class Crnn:
 
     def _first_answer(self) -> list[Spectrum | Samples]:
         """What the network makes of a frame of noise."""
-        spectra = (
-            np.random.default_rng(0).standard_normal((4, self.stft.bins, 2), np.float32).view(np.complex64)[..., 0]
-        )
+        noise = np.random.default_rng(0).standard_normal((4, self.stft.bins, 2), np.float32)
+        mic, reference, echo, error = noise.view(np.complex64)[..., 0]
         power = np.ones(self.stft.bins, np.float32)
-        places = self._run(Frame(*spectra, noise_psd=power, residual_psd=power), self.initial_state()[0])
+        places = self._run(Frame(mic, reference, echo, error, power, power), self.initial_state()[0])
         return [places.spectrum, places.probability, *places.next_states]
 
     def initial_state(self) -> CrnnState:

@@ -118,10 +118,10 @@ def open_model(path: Path, kind: str, *versions: int) -> Model:
     _expect(path, "version", said.get("version"), *map(str, versions))
     _expect(path, "sample_rate", said.get("sample_rate"), str(SAMPLE_RATE))
     try:
-        sizes = [int(said[name]) for name in ("n_fft", "hop", "window_length")]
-        if max(sizes) > MOST_FFT:
-            raise ValueError(f"sizes of the STFT {sizes}, expected at most {MOST_FFT}")
-        stft = StftConfig(*sizes, said["window"])
+        n_fft, hop, window_length = (int(said[name]) for name in ("n_fft", "hop", "window_length"))
+        if max(n_fft, hop) > MOST_FFT:
+            raise ValueError(f"n_fft is {n_fft} and hop {hop}, expected at most {MOST_FFT}")
+        stft = StftConfig(n_fft, hop, window_length, said["window"])
         states = tuple(
             (str(name), tuple(int(size) for size in shape)) for name, shape in json.loads(said.get("states", "[]"))
         )

@@ -36,6 +36,9 @@ FAN_START = 1e-9
 """Fan power per bin before anything was heard and without a profile."""
 FAN_RISE, FAN_FALL = 1.004, 0.97
 """How fast the fan's estimate follows per hop where there is no profile: up slowly, so that speech does not lift it."""
+FAN_LEAST = 1e-14
+"""Its lower bound, 15 dB below the rounding of 24-bit samples: an estimate that a muted microphone has taken to zero
+could never rise again."""
 
 
 class Residual:
@@ -78,6 +81,7 @@ class Residual:
             self._smooth *= 0.8
             self._smooth += 0.2 * fourier.power(error)
             self._noise = np.minimum(np.maximum(self._smooth, FAN_FALL * self._noise), FAN_RISE * self._noise)
+            np.maximum(self._noise, FAN_LEAST, out=self._noise)
             self._noise_power = float(np.add.reduce(self._noise))
         self._below[:], self._above[:] = self._echo[0], self._echo[-1]
         brought = np.correlate(self._extended, self._spread, "valid")
@@ -86,7 +90,7 @@ class Residual:
         if added is not None:
             unknown += added
         loud = float(np.add.reduce(brought))
-        if loud >= AUDIBLE * self._noise_power:
+        if loud > AUDIBLE * self._noise_power:
             self._track(float(np.vdot(error, error).real) - self._noise_power - float(np.add.reduce(unknown)), loud)
         brought *= self._leakage
         brought += unknown

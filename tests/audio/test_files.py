@@ -12,6 +12,7 @@ import pytest
 import soundfile
 
 from edgefilter.audio import recorder as recorder_module
+from edgefilter.audio.disk import Disk
 from edgefilter.audio.files import FileSink, FileSource, open_source
 from edgefilter.audio.recorder import Recorder
 from edgefilter.errors import AudioFileError, UsageError
@@ -245,3 +246,44 @@ def test_stop_ends_the_iteration(tmp_path):
 def test_stdin_with_a_second_reference_is_refused():
     with pytest.raises(UsageError, match="already holds the reference"):
         open_source("-", "r.wav")
+
+
+WRITING = (
+    "import os, sys, numpy as np\nfrom edgefilter.audio.files import FileSink\nx = np.load(sys.argv[2])\n"
+    "sink = FileSink(sys.argv[1], float32='float' in sys.argv[1])\n"
+    "for i in range(0, x.size, 256): sink.write(x[i:i + 256])\nos.kill(os.getpid(), 9)\n"
+)
+
+
+@pytest.mark.parametrize(("name", "missing"), [("x.wav", 0), ("float.wav", 0), ("x.flac", 4800)])
+def test_a_killed_program_leaves_a_whole_file(tmp_path, name, missing):
+    sound = noise(100_000)
+    np.save(tmp_path / "x.npy", sound)
+    command = [sys.executable, "-c", WRITING, str(tmp_path / name), str(tmp_path / "x.npy")]
+    assert subprocess.run(command, cwd=ROOT).returncode == -signal.SIGKILL
+    kept, _ = read(FileSource(tmp_path / name))
+    assert kept.size >= sound.size - missing
+    np.testing.assert_array_equal(kept, sound[: kept.size])
+
+
+def test_a_file_that_is_being_written_is_left_alone(tmp_path):
+    path = tmp_path / "x.wav"
+    with FileSink(path) as first:
+        first.write(noise(1000))
+        with pytest.raises(AudioFileError, match="being written by another program .*name another file"):
+            FileSink(path)
+        first.write(noise(1000))
+    assert FileSource(path).total == 2000
+    with FileSink(path) as again:  # afterwards it is free
+        again.write(noise(10))
+    assert FileSource(path).total == 10
+
+
+def test_a_wav_of_more_than_its_sizes_can_say_is_marked_as_going_on_to_the_end(tmp_path):
+    disk = Disk(tmp_path / "x.wav")
+    disk.write(b"RIFF\0\0\0\0WAVEfmt " + bytes(20) + b"data\0\0\0\0")
+    disk._file.truncate(5 * 2**30)  # takes no room
+    disk.finish()
+    with open(tmp_path / "x.wav", "rb") as file:
+        start = file.read(44)
+    assert start[4:8] == start[40:44] == b"\xff" * 4

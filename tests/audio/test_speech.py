@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from edgefilter.audio.lookup import Device
+from edgefilter.audio.pairing import TOLERANCE, Pairing
 from edgefilter.audio.speech import FADE_S, SpokenReference
 
 SPEECH = 0.5 * np.random.default_rng(3).standard_normal(48_000).astype(np.float32).clip(-1, 1)
@@ -103,3 +104,21 @@ def test_a_device_of_another_rate_plays_all_of_it_and_is_read_at_16_khz():
     lag = int(np.argmax(lags))
     error = heard[lag : lag + 40_000] - SPEECH[:40_000]
     assert lag < 200 and np.mean(error**2) < 0.1 * np.mean(SPEECH**2)  # twice that
+
+
+@pytest.mark.parametrize("stall_s", [0.1, 0.6])
+def test_speech_that_a_stalled_device_plays_later_is_in_the_reference_later_and_whole(stall_s):
+    """The counter of what is played stands still meanwhile; what comes after it was not late, it was played then."""
+    pairing = Pairing(late_is_lost=False)
+    spoken, blocks = np.arange(1, 16_000 * 8 + 1, dtype=np.float32), []
+    played, stalled = 0, range(16_000 * 2, 16_000 * 2 + round(16_000 * stall_s))
+    for at in range(0, 16_000 * 9, 160):
+        mic = np.zeros(160, np.float32)
+        step = 0 if at in stalled else 160
+        blocks.append(pairing.push(mic, spoken[played : played + step]))
+        played += step
+    reference = np.concatenate([block.ref for block in blocks if block])
+    kept = reference[reference > 0]
+    np.testing.assert_array_equal(kept, spoken[: kept.size])
+    late = np.flatnonzero(reference == 16_000 * 7)[0] - (16_000 * 7 - 1)
+    assert abs(late - 16_000 * stall_s) <= TOLERANCE

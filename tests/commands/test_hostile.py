@@ -1,7 +1,12 @@
 """What users type and pipe by mistake: one line, the right exit code, nothing half done."""
 
+import contextlib
+import fcntl
 import subprocess
 import sys
+import termios
+import threading
+import time
 
 import numpy as np
 import pytest
@@ -186,3 +191,54 @@ def test_the_effects_that_became_part_of_the_adapted_path_are_said(tmp_path):
         done.returncode == 0
         and "the adapted path is in new.npz; bandlimit is part of it now and no longer listed" in done.stderr
     ), done.stderr
+
+
+def feed(pipe, data):
+    with contextlib.suppress(OSError):
+        pipe.write(data)
+        pipe.flush()
+
+
+def wait_until_full(pipe):
+    """Until a pipe that nobody reads takes no more."""
+    before, end = -1, time.monotonic() + 60
+    while time.monotonic() < end:
+        held = int.from_bytes(fcntl.ioctl(pipe, termios.FIONREAD, bytes(4)), sys.byteorder)
+        if held == before > 0:
+            return
+        before = held
+        time.sleep(0.5)
+    raise AssertionError("nothing came out")
+
+
+def test_a_second_signal_ends_a_run_whose_reader_does_not_read(folder):
+    child = subprocess.Popen(
+        [
+            sys.executable,
+            "-m",
+            "edgefilter.cli",
+            "run",
+            "--input",
+            "-",
+            "--output",
+            "-",
+            "--engine",
+            "bypass",
+            "--quiet",
+        ],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+    )
+    try:
+        # half as much comes out: more than the pipe behind it holds, so that it waits once this is swallowed
+        threading.Thread(target=feed, args=(child.stdin, bytes(1 << 20)), daemon=True).start()
+        wait_until_full(child.stdout)
+        child.terminate()
+        time.sleep(1.0)
+        assert child.poll() is None, "it waits for its reader"
+        child.terminate()
+        assert child.wait(20) == 130 and b"interrupted" in child.stderr.read()
+    finally:
+        child.kill()
+        child.wait()

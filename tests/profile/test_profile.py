@@ -216,6 +216,16 @@ def test_every_flipped_byte_is_refused_or_harmless(saved):
             assert profile.delay == make().delay
 
 
+def test_a_piece_cut_out_or_doubled_is_one_line(saved):
+    """Found by bench.fuzz: zipfile sought before the file's beginning, or quoted a page of its bytes."""
+    content = saved.read_bytes()
+    for at in (30, 200, 1500, len(content) // 2):
+        for size in (1, 4, 64, 1000):
+            for damaged in (content[:at] + content[at + size :], content[: at + size] + content[at:]):
+                saved.write_bytes(damaged)
+                refused(saved, "truncated or damaged|no .npy array|claims shape|holds")
+
+
 def test_no_such_file_folder_and_other_types(tmp_path):
     refused(tmp_path / "absent.npz", "no such file")
     refused(tmp_path, "is a folder")

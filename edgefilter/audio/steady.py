@@ -1,0 +1,150 @@
+"""An input that goes on: silence while its device is away, the device again when it is back, and a count of all that is missing."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+
+import numpy as np
+
+from edgefilter.audio.port import START_S, VANISHED_S, InputPort
+from edgefilter.audio.speech import SpokenReference
+from edgefilter.errors import DeviceError
+from edgefilter.types import SAMPLE_RATE, Samples
+
+RETRY_S = 1.0
+"""Between two attempts to open a device that is away."""
+WATCH_S = 2.0
+"""How long a device must have been behind the clock throughout, before sound counts as lost rather than late."""
+LEAST_S = 0.1
+"""So much must be missing then; clocks that differ by 300 ppm drift apart by a hundredth of it."""
+
+
+def clock() -> float:
+    """Seconds that also pass while the machine sleeps, where the system has such a clock."""
+    return time.clock_gettime(time.CLOCK_BOOTTIME) if hasattr(time, "CLOCK_BOOTTIME") else time.monotonic()
+
+
+class SampleClock:
+    """What a device should have delivered by the clock and did not: sound that a driver, or a sleeping machine, lost without a word.
+
+    missed: seconds so far. Compares, from one stretch of WATCH_S to the next, by how much the device was behind the
+    clock at least: late sound catches up within a stretch, lost sound does not, and drifting clocks change it slowly.
+    """
+
+    def __init__(self) -> None:
+        self.missed = 0.0
+        self._base: float | None = None
+        self._least = np.inf
+        self._until: float | None = None
+
+    def note(self, delivered_s: float, now: float) -> None:
+        """Take note of the seconds of sound that came so far."""
+        if self._until is None:
+            self._until = now + WATCH_S
+        if now >= self._until:
+            self._judge()
+            self._least, self._until = np.inf, now + WATCH_S
+        self._least = min(self._least, now - delivered_s)
+
+    def _judge(self) -> None:
+        before, self._base = self._base, self._least
+        if before is not None and self._least - before > LEAST_S:
+            self.missed += self._least - before
+
+
+class SteadyInput:
+    """An input port that outlives its device.
+
+    make: makes the port, of a device that may be away (DeviceError). patience_s: how long it may be; with 0 its loss is
+    an error at once. While it is away, `take` gives silence by the clock. filled: samples of that so far. lost: samples
+    that came too late to be kept, or never. overruns: callbacks that the driver marked. gone, back: how often.
+    """
+
+    def __init__(self, make: Callable[[], InputPort | SpokenReference], patience_s: float = 0.0) -> None:
+        self._make, self._patience_s = make, patience_s
+        self.port = make()
+        self.filled = self.gone = self.back = 0
+        self._earlier_lost = self._earlier_overruns = 0
+        self._open, self._clock = False, SampleClock()
+        self._failure: DeviceError | None = None
+        self._heard_at = self._gone_at = self._tried_at = 0.0
+
+    def open(self) -> None:
+        """Open the device; raises DeviceError."""
+        self.port.open()
+        self._open, self._heard_at = True, clock()
+
+    def close(self) -> None:
+        """End the stream."""
+        self.port.close()
+        self._open = False
+
+    @property
+    def settled(self) -> float:
+        """Seconds of sound that have come since the device was opened."""
+        return self.port.inlet.received / self.port.rate
+
+    @property
+    def lost(self) -> int:
+        """Samples at 16 kHz."""
+        seconds = self._clock.missed + self.port.inlet.lost / self.port.rate
+        return self._earlier_lost + round(seconds * SAMPLE_RATE)
+
+    @property
+    def overruns(self) -> int:
+        """Of all streams so far."""
+        return self._earlier_overruns + self.port.inlet.flags
+
+    def begin(self) -> None:
+        """Forget what came so far: the first block begins now."""
+        self.port.take()
+
+    def take(self) -> Samples:
+        """What came since the last call (n,), or silence for as long as nothing can come."""
+        now = clock()
+        samples = self.port.take() if self._open else np.zeros(0, np.float32)
+        if self._failure is None:
+            self._heard_at = now if samples.size else self._heard_at
+            self._clock.note(self.settled, now)
+            return samples
+        silence = np.zeros(max(round((now - self._heard_at) * SAMPLE_RATE) - samples.size, 0), np.float32)
+        self.filled += silence.size
+        if not samples.size:
+            self._heard_at += silence.size / SAMPLE_RATE
+            return silence
+        self.back += 1
+        self._failure, self._heard_at = None, now
+        return np.concatenate((silence, samples))
+
+    def check(self) -> None:
+        """See whether the device is there, and try to get it back where it is not; raises DeviceError when patience is over."""
+        try:
+            if self._open:
+                self.port.check_alive(self.port.inlet.received, START_S if self._failure else VANISHED_S)
+        except DeviceError as error:
+            if self._patience_s <= 0.0:
+                raise
+            self.close()
+            if self._failure is None:
+                self._failure, self._gone_at = error, self._heard_at
+                self.gone += 1
+        now = clock()
+        if self._failure and not self._open and now - self._tried_at >= RETRY_S:
+            if now - self._gone_at >= self._patience_s:
+                raise self._failure
+            self._tried_at = now
+            self._reopen()
+
+    def _reopen(self) -> None:
+        port = None
+        try:
+            port = self._make()
+            port.open()
+        except DeviceError:
+            if port:
+                port.close()
+            return
+        if port is not self.port:
+            self._earlier_lost, self._earlier_overruns = self.lost, self.overruns
+        self.port, self._clock, self._open = port, SampleClock(), True

@@ -1,0 +1,215 @@
+"""What befalls sound devices while a run goes on, on virtual ones: it goes on, says so, and counts what is missing."""
+
+import numpy as np
+import pytest
+
+from edgefilter.audio import device, port, steady
+from edgefilter.audio.device import LiveSink, LiveSource
+from edgefilter.audio.files import FileSink, FileSource
+from edgefilter.audio.pairing import TOLERANCE
+from edgefilter.audio.steady import LEAST_S, WATCH_S, SampleClock
+from edgefilter.audio.steady_sink import SteadySink
+from edgefilter.audio.troubles import Troubles
+from edgefilter.errors import DeviceError
+from edgefilter.filter.ego_filter import EgoFilter
+from edgefilter.session import filter_blocks
+from tests.audio.virtual_portaudio import CALLBACK_S, VirtualDevice, VirtualPortAudio
+
+FOREVER = float("inf")
+STEP = round(CALLBACK_S * 16000)
+
+
+@pytest.fixture
+def plug(monkeypatch):
+    """A function that puts virtual devices in place of all others."""
+
+    def plug(*devices):
+        system = VirtualPortAudio(*devices)
+        monkeypatch.setattr(device, "_sounddevice", lambda: system)
+        for module in (device, port, steady):
+            monkeypatch.setattr(module, "time", system)
+        monkeypatch.setattr(device, "POLL_S", CALLBACK_S / 2)
+        return system
+
+    return plug
+
+
+@pytest.fixture
+def both(plug):
+    mic, ref = VirtualDevice("mic", "input"), VirtualDevice("ref", "input")
+    return plug(mic, ref), mic, ref
+
+
+def run(source, path, sink=None):
+    """A whole run into a file, or a device, as `edgefilter run` has it; report, events by kind, and the file's samples."""
+    ego, told = EgoFilter(engine="bypass"), {}
+    with source, sink or FileSink(path) as out:
+        report = filter_blocks(
+            source,
+            ego,
+            out,
+            tell=lambda event: told.setdefault(event.kind, []).append(event),
+            troubles=Troubles(source, out),
+        )
+    heard = None if sink else np.concatenate([block.mic for block in FileSource(path)])
+    return report, told, heard
+
+
+def test_a_microphone_that_is_unplugged_comes_back_and_the_file_keeps_its_time(both, tmp_path):
+    system, mic, _ = both
+    system.at(4.0, lambda: setattr(mic, "plugged", False))
+    system.at(11.0, lambda: setattr(mic, "plugged", True))
+    source = LiveSource("mic", "ref", seconds=20, patience_s=FOREVER)
+    began = system.now
+    report, told, heard = run(source, tmp_path / "x.wav")
+    assert report.failure is None and heard.size == report.samples_in == report.samples_out == 20 * 16000
+    assert system.now - began == pytest.approx(20, abs=0.6)  # settling, and what a callback and the pairing hold back
+    stats = source.stats()
+    silent = int(np.count_nonzero(heard == 0.0))
+    assert stats["microphone_away"] == pytest.approx(silent, abs=STEP) and 7 * 16000 <= silent <= 8.2 * 16000
+    assert report.lost == stats["lost"] == stats["microphone_away"]
+    assert [len(told[kind]) for kind in ("device_gone", "device_back")] == [1, 1]
+    assert told["device_gone"][0].detail == "microphone: silence stands in until it is back"
+    assert (stats["microphone_gone"], stats["microphone_back"]) == (1, 1)
+    edges = np.flatnonzero(np.diff((heard == 0.0).astype(int))) / 16000
+    assert edges == pytest.approx([4.0 - 0.2, edges[1]], abs=0.1) and 10.8 <= edges[1] <= 12.0
+
+
+def test_a_reference_that_stops_is_silence_until_it_runs_again_and_fits_then(both, tmp_path):
+    system, _, ref = both
+    system.at(4.0, lambda: setattr(ref, "plugged", False))
+    system.at(9.0, lambda: setattr(ref, "plugged", True))
+    with LiveSource("mic", "ref", seconds=14, patience_s=FOREVER) as source:
+        blocks = list(source)
+    heard = np.concatenate([block.ref for block in blocks])
+    assert heard.size == 14 * 16000 and np.all(np.concatenate([block.mic for block in blocks]) == 0.25)
+    silent, stats = int(np.count_nonzero(heard == 0.0)), source.stats()
+    assert stats["lost"] == sum(block.lost for block in blocks) == pytest.approx(silent, abs=STEP)
+    assert 5 * 16000 <= silent <= 6.3 * 16000 and not np.any(heard[-2 * 16000 :] == 0.0)
+    assert (stats["reference_gone"], stats["reference_back"]) == (1, 1)
+
+
+def test_a_reference_that_stutters_stays_in_step_and_every_gap_is_counted(both):
+    system, _, ref = both
+    for second in range(1, 21, 4):
+        system.at(second, lambda: setattr(ref, "swallows", 0.1))
+    with LiveSource("mic", "ref", seconds=26) as source:
+        blocks = list(source)
+    stats = source.stats()
+    silent = sum(int(np.count_nonzero(block.ref == 0.0)) for block in blocks)
+    assert stats["reference_inserted"] + stats["reference_filled"] == silent
+    assert silent == pytest.approx(0.5 * 16000, abs=TOLERANCE)  # so much was swallowed
+    assert stats["reference_gone"] == 0 and sum(block.mic.size for block in blocks) == 26 * 16000
+
+
+def test_sound_that_a_driver_loses_without_a_word_is_counted(both):
+    system, mic, ref = both
+    system.at(6.0, lambda: [setattr(each, "swallows", 0.5) for each in (mic, ref)])
+    with LiveSource("mic", "ref", seconds=14) as source:
+        list(source)
+    stats = source.stats()
+    for name in ("microphone_lost", "reference_lost"):
+        assert stats[name] == pytest.approx(0.5 * 16000, abs=2 * STEP)
+
+
+def test_after_a_suspend_the_run_goes_on_and_says_how_long_nothing_was_heard(both, tmp_path):
+    system, _, _ = both
+    system.at(6.0, lambda: system.pass_by(3600.0))
+    source = LiveSource("mic", "ref", seconds=14, patience_s=FOREVER)
+    report, told, heard = run(source, tmp_path / "x.wav")
+    assert report.failure is None and heard.size == 14 * 16000
+    stats = source.stats()
+    assert stats["microphone_lost"] == pytest.approx(3600 * 16000, rel=1e-3) and stats["microphone_gone"] == 0
+    assert any("microphone lost" in event.detail for event in told["lost"])
+
+
+def test_a_filter_that_is_too_slow_loses_what_the_rings_cannot_hold_and_counts_it(both):
+    system, _, _ = both
+    slow = {10: 3.5}
+    with LiveSource("mic", "ref", seconds=14) as source:
+        blocks = []
+        for block in source:
+            blocks.append(block)
+            for _ in range(round(slow.pop(len(blocks), 0.0) / CALLBACK_S)):
+                system.sleep(CALLBACK_S)  # the filter computes; the devices go on
+    stats = source.stats()
+    assert stats["microphone_lost"] == pytest.approx(1.5 * 16000, abs=2 * STEP)  # 3.5 s less the 2 s that a ring holds
+    mic = np.concatenate([block.mic for block in blocks])
+    assert np.count_nonzero(mic == 0.0) == stats["microphone_lost"]  # in their place is silence
+    assert sum(block.lost for block in blocks) == stats["lost"]
+
+
+@pytest.mark.parametrize("ppm", [300.0, -300.0])
+def test_devices_whose_clocks_differ_by_300_ppm_stay_together(plug, ppm):
+    mic, ref = VirtualDevice("mic", "input"), VirtualDevice("ref", "input", ppm=ppm)
+    plug(mic, ref)
+    with LiveSource("mic", "ref", seconds=100) as source:
+        size = sum(block.mic.size for block in source)
+    stats = source.stats()
+    moved = stats["reference_dropped" if ppm > 0 else "reference_inserted"]
+    assert size == 100 * 16000 and stats["lost"] == moved
+    assert moved > 0 and abs(100 * 16000 * 300e-6 - moved) <= TOLERANCE + STEP
+
+
+def test_a_device_of_another_rate_and_number_of_channels_is_converted_and_said(plug, tmp_path):
+    plug(
+        VirtualDevice("mic", "input", 44100.0, takes=(44100, 2)),
+        VirtualDevice("ref", "input", 48000.0, takes=(48000, 1)),
+        VirtualDevice("speaker", "output", 48000.0, takes=(48000, 2)),
+    )
+    source, sink = LiveSource("mic", "ref", seconds=4), LiveSink("speaker", latency=512, wait=False)
+    report, _, _ = run(source, None, sink)
+    assert report.failure is None and report.samples_out == 4 * 16000 and not source.stats()["lost"]
+    said = " ".join((*source.notes, *sink.notes))
+    for words in ("opened at 44100 Hz", "2 channels averaged", "opened at 48000 Hz", "2 channels get the same"):
+        assert words in said
+
+
+def test_a_device_that_can_be_opened_in_no_way_is_one_line(plug):
+    plug(VirtualDevice("mic", "input", 44100.0, takes=(192000, 7)))
+    with pytest.raises(DeviceError, match="'mic' cannot be opened at 16000 Hz or 44100 Hz: Invalid sample rate"):
+        LiveSource("mic")
+
+
+def test_an_output_device_that_is_unplugged_comes_back_and_what_was_not_played_is_counted(plug):
+    mic, speaker = VirtualDevice("mic", "input"), VirtualDevice("speaker", "output")
+    system = plug(mic, speaker)
+    system.at(4.0, lambda: setattr(speaker, "plugged", False))
+    system.at(12.0, lambda: setattr(speaker, "plugged", True))
+    source = LiveSource("mic", seconds=20, patience_s=FOREVER)
+    sink = SteadySink(lambda: LiveSink("speaker", latency=512, wait=False))
+    report, told, _ = run(source, None, sink)
+    stats = sink.stats()
+    assert report.failure is None and (stats["output_gone"], stats["output_back"]) == (1, 1)
+    assert [len(told[kind]) for kind in ("device_gone", "device_back")] == [1, 1]
+    played = sum(int(np.count_nonzero(part)) for part in speaker.played)
+    # every sample was played, dropped for a full queue, or found no device; what the device held when it went is unknown
+    assert played + stats["dropped"] + stats["output_away"] == pytest.approx(20 * 16000, abs=0.5 * 16000)
+    assert played == pytest.approx(12 * 16000, abs=1.5 * 16000)
+
+
+def test_a_device_that_was_never_there_is_an_error_and_not_waited_for(plug, tmp_path):
+    plug(VirtualDevice("mic", "input"), VirtualDevice("speaker", "output", plugged=False))
+    with pytest.raises(DeviceError, match="output device 'speaker' cannot be opened"):
+        SteadySink(lambda: LiveSink("speaker"))
+
+
+def test_patience_that_is_over_ends_the_run_with_what_was_heard(both, tmp_path):
+    system, mic, _ = both
+    system.at(4.0, lambda: setattr(mic, "plugged", False))
+    report, _, heard = run(LiveSource("mic", "ref", patience_s=5.0), tmp_path / "x.wav")
+    assert isinstance(report.failure, DeviceError) and "'mic' stopped" in str(report.failure)
+    assert heard.size == report.samples_in and np.count_nonzero(heard) == pytest.approx(3.8 * 16000, abs=0.1 * 16000)
+
+
+def test_late_sound_is_not_lost_and_drift_is_no_loss():
+    watch, delivered = SampleClock(), 0.0
+    for tick in range(19_900):
+        now = tick * 0.01
+        if not (tick // 100) % 7 == 3:  # a second's pause now and then, after which all of it comes
+            delivered = now * (1 - 300e-6)
+        watch.note(delivered, now)
+    assert watch.missed == 0.0
+    for tick in range(19_900, 21_000):
+        watch.note(delivered + tick * 0.01 - now, tick * 0.01 + 3 * LEAST_S)
+    assert watch.missed == pytest.approx(3 * LEAST_S, abs=WATCH_S * 400e-6)

@@ -1,0 +1,139 @@
+"""A PortAudio of virtual devices on a virtual clock: what the sound system does to a run, in no time and the same each time."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from types import SimpleNamespace
+
+import numpy as np
+
+CALLBACK_S = 0.02
+
+
+class PortAudioError(Exception):
+    pass
+
+
+@dataclass
+class VirtualDevice:
+    """One device. takes: (rate, channels) that it can be opened with, None for any. plugged: whether it is there.
+
+    ppm: by how much its clock is fast. swallows: seconds of sound that its driver loses without a word.
+    """
+
+    name: str
+    kind: str
+    rate: float = 16000.0
+    takes: tuple[int, int] | None = None
+    plugged: bool = True
+    ppm: float = 0.0
+    swallows: float = 0.0
+    played: list = field(default_factory=list)
+
+
+class Stream:
+    latency = 0.0
+
+    def __init__(self, system: VirtualPortAudio, device: VirtualDevice, rate: int, channels: int, callback) -> None:
+        if not device.plugged:
+            raise PortAudioError("Device unavailable", -9985)
+        self.system, self.device, self.rate, self.channels, self.callback = system, device, rate, channels, callback
+        self.running, self.due, self.count = False, system.now, 0
+
+    def start(self) -> None:
+        self.running = True
+        self.system.streams.append(self)
+
+    def abort(self) -> None:
+        self.running = False
+
+    def close(self) -> None:
+        self.running = False
+
+    def advance(self, now: float) -> None:
+        """The callbacks that are due by now."""
+        while self.running and self.due + CALLBACK_S <= now:
+            self.due += CALLBACK_S
+            if not self.device.plugged:
+                continue
+            if self.device.swallows > 0.0:
+                self.device.swallows -= CALLBACK_S
+                continue
+            size = round((self.count + 1) * CALLBACK_S * self.rate * (1 + 1e-6 * self.device.ppm)) - round(
+                self.count * CALLBACK_S * self.rate * (1 + 1e-6 * self.device.ppm)
+            )
+            self.count += 1
+            status = SimpleNamespace(input_overflow=False, output_underflow=False)
+            if self.device.kind == "input":
+                self.callback(np.full((size, self.channels), 0.25, np.float32), size, None, status)
+            else:
+                out = np.zeros((size, self.channels), np.float32)
+                self.callback(out, size, None, status)
+                self.device.played.append(out[:, 0])
+
+
+class VirtualPortAudio:
+    """What edgefilter uses of the module sounddevice, and of the module time."""
+
+    CLOCK_BOOTTIME = 7
+    PortAudioError = PortAudioError
+
+    def __init__(self, *devices: VirtualDevice) -> None:
+        self.devices, self.streams, self.now = devices, [], 1000.0
+        self.plan: list[tuple[float, object]] = []
+        self.default = SimpleNamespace(
+            device=[next((i for i, d in enumerate(devices) if d.kind == kind), -1) for kind in ("input", "output")]
+        )
+
+    def at(self, seconds: float, action) -> None:
+        """Call action once so many seconds from now have passed."""
+        self.plan.append((self.now + seconds, action))
+
+    def monotonic(self) -> float:
+        return self.now
+
+    def clock_gettime(self, clock: int) -> float:
+        return self.now
+
+    def sleep(self, seconds: float) -> None:
+        self.now += seconds
+        for entry in [entry for entry in self.plan if entry[0] <= self.now]:
+            self.plan.remove(entry)
+            entry[1]()
+        for stream in self.streams:
+            stream.advance(self.now)
+
+    def pass_by(self, seconds: float) -> None:
+        """Time in which nothing runs, the drivers neither."""
+        self.now += seconds
+        for stream in self.streams:
+            stream.due += seconds
+
+    def query_hostapis(self) -> list[dict]:
+        return [{"name": "virtual"}]
+
+    def query_devices(self) -> list[dict]:
+        return [
+            {
+                "name": device.name,
+                "hostapi": 0,
+                "max_input_channels": 2 * (device.kind == "input"),
+                "max_output_channels": 2 * (device.kind == "output"),
+                "default_samplerate": device.rate,
+            }
+            for device in self.devices
+        ]
+
+    def _check(self, device: int, channels: int, dtype: str, samplerate: int) -> None:
+        found = self.devices[device]
+        if not found.plugged:
+            raise PortAudioError("Device unavailable", -9985)
+        if found.takes not in (None, (samplerate, channels)):
+            raise PortAudioError("Invalid sample rate", -9997)
+
+    check_input_settings = check_output_settings = _check
+
+    def _stream(self, device: int, channels: int, samplerate: int, dtype: str, latency: float, callback) -> Stream:
+        return Stream(self, self.devices[device], samplerate, channels, callback)
+
+    InputStream = OutputStream = _stream

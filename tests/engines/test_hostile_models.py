@@ -1,0 +1,196 @@
+"""A model file is numbers and standard operators: nothing in it runs code, reads other files, or gives NaN."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+from pathlib import Path
+
+import hypothesis.strategies as st
+import numpy as np
+import onnx
+import pytest
+from hypothesis import given, settings
+from onnx import TensorProto, helper
+
+from edgefilter.engines import onnx_file, onnx_session
+from edgefilter.engines.crnn import LOUDEST, Crnn
+from edgefilter.errors import ModelError
+from edgefilter.types import Frame
+
+ROOT = Path(__file__).parents[2]
+EDGE = ROOT / "tests" / "data" / "crnn.onnx"
+
+
+def refused(path, words, capfd):
+    with pytest.raises(ModelError, match=words) as caught:
+        Crnn(path)
+    assert "\n" not in str(caught.value) and len(str(caught.value)) < 1200
+    assert capfd.readouterr() == ("", "")  # '--output -' sends sound there
+
+
+def outside(tensor, location):
+    tensor.ClearField("raw_data")
+    tensor.data_location = TensorProto.EXTERNAL
+    for key, value in (("location", location), ("offset", "0"), ("length", "4")):
+        entry = tensor.external_data.add()
+        entry.key, entry.value = key, value
+
+
+def weights_elsewhere(model):
+    outside(model.graph.initializer[0], "/etc/hostname")
+
+
+def constant_elsewhere(model):
+    outside(next(node for node in model.graph.node if node.op_type == "Constant").attribute[0].t, "../secret")
+
+
+def operator_of_a_library(model):
+    model.graph.node[0].domain = "com.example.run_my_code"
+
+
+def a_loop(model):
+    body = helper.make_graph([], "body", [], [])
+    model.graph.node.append(helper.make_node("Loop", ["", ""], ["x"], body=body))
+
+
+def own_function(model):
+    model.functions.append(helper.make_function("here", "f", [], [], [], []))
+
+
+def weights_that_are_no_numbers(model):
+    weights = next(each for each in model.graph.initializer if len(each.dims) == 4)
+    values = onnx.numpy_helper.to_array(weights).copy()
+    values.flat[0] = np.nan
+    weights.CopyFrom(onnx.numpy_helper.from_array(values, weights.name))
+
+
+def state_beyond_all_memory(model):
+    entry = next(entry for entry in model.metadata_props if entry.key == "states")
+    entry.value = json.dumps([["state_0", [1, 2**40]]])
+
+
+def transform_beyond_all_memory(model):
+    next(entry for entry in model.metadata_props if entry.key == "n_fft").value = str(2**40)
+
+
+def hop_beyond_all_memory(model):
+    next(entry for entry in model.metadata_props if entry.key == "hop").value = str(2**40)
+
+
+def text_of_many_lines(model):
+    next(entry for entry in model.metadata_props if entry.key == "type").value = "a\n" * 10_000
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (weights_elsewhere, "takes its weights from other files"),
+        (constant_elsewhere, "takes its weights from other files"),
+        (operator_of_a_library, "operators of the library 'com.example.run_my_code'"),
+        (a_loop, "a loop or a branch"),
+        (own_function, "functions of its own"),
+        (weights_that_are_no_numbers, "answers with values that are not finite"),
+        (state_beyond_all_memory, "unusable metadata .*state_0"),
+        (transform_beyond_all_memory, "unusable metadata .*expected at most"),
+        (hop_beyond_all_memory, "unusable metadata .*expected at most"),
+        (text_of_many_lines, "has type a a a"),
+    ],
+)
+def test_a_model_that_leads_out_of_its_file_or_gives_no_numbers_is_refused(tmp_path, capfd, change, words):
+    model = onnx.load(EDGE)
+    change(model)
+    (tmp_path / "m.onnx").write_bytes(model.SerializeToString())
+    refused(tmp_path / "m.onnx", words, capfd)
+
+
+def test_text_in_the_graph_that_is_no_text_is_refused_without_a_word_on_standard_output(tmp_path, capfd):
+    """Found by bench.fuzz: onnxruntime printed that it tries again."""
+    content = EDGE.read_bytes().replace(b"speech_probability", b"speech_probabilit\xff")
+    (tmp_path / "m.onnx").write_bytes(content)
+    refused(tmp_path / "m.onnx", "cannot be loaded", capfd)
+
+
+def test_a_model_beyond_all_sizes_is_not_read(tmp_path, capfd):
+    with open(tmp_path / "m.onnx", "wb") as file:
+        file.truncate(2 * onnx_file.MOST_BYTES)
+    refused(tmp_path / "m.onnx", "expected at most", capfd)
+
+
+@settings(max_examples=150, deadline=None, derandomize=True, database=None)
+@given(data=st.binary(max_size=200))
+def test_any_bytes_are_judged_without_onnxruntime_and_in_one_line(data, tmp_path_factory):
+    path = tmp_path_factory.getbasetemp() / "any.onnx"
+    path.write_bytes(data)
+    try:
+        assert onnx_file.read_model(path) == data
+    except ModelError as error:
+        assert "\n" not in str(error)
+
+
+@settings(max_examples=10, deadline=None, derandomize=True, database=None)
+@given(key=st.sampled_from(("n_fft", "hop", "states", "window", "training", "version")), value=st.text(max_size=30))
+def test_whatever_a_model_says_of_itself_it_is_taken_or_refused_in_one_line(key, value, tmp_path_factory):
+    model = onnx.load(EDGE)
+    next(entry for entry in model.metadata_props if entry.key == key).value = value
+    path = tmp_path_factory.getbasetemp() / "said.onnx"
+    path.write_bytes(model.SerializeToString())
+    try:
+        Crnn(path)
+    except ModelError as error:
+        assert "\n" not in str(error)
+
+
+def frame(engine, scale=1.0):
+    rng = np.random.default_rng(3)
+    spectra = scale * rng.standard_normal((4, engine.stft.bins, 2), np.float32).view(np.complex64)[..., 0]
+    power = np.ones(engine.stft.bins, np.float32)
+    return Frame(*spectra, noise_psd=power, residual_psd=power)
+
+
+def answering(monkeypatch, engine, spectrum, probability=0.5):
+    run = engine._run
+
+    def disturbed(frame, state):
+        places = run(frame, state)
+        places.spectrum[:] = spectrum
+        places.probability[:] = probability
+        return places
+
+    monkeypatch.setattr(engine, "_run", disturbed)
+
+
+def test_a_network_that_falls_into_nan_is_passed_over_and_begins_anew(monkeypatch):
+    engine = Crnn(EDGE)
+    answering(monkeypatch, engine, np.nan, np.nan)
+    output, (state, _) = engine.step(frame(engine), engine.initial_state())
+    assert np.isfinite(output.spectrum).all() and output.spectrum.any() and output.speech_probability == 0.0
+    assert not any(tensor.any() for tensor in state)
+
+
+def test_a_network_that_answers_too_loudly_is_turned_down(monkeypatch):
+    engine = Crnn(EDGE, wiener_share=0.0)
+    answering(monkeypatch, engine, 1e6)
+    heard = frame(engine)
+    output, _ = engine.step(heard, engine.initial_state())
+    power, most = (float(np.vdot(x, x).real) for x in (output.spectrum, heard.mic))
+    assert power == pytest.approx(LOUDEST * most, rel=1e-3)
+
+
+def test_the_shipped_models_are_the_pinned_ones_and_the_page_says_so():
+    page = (ROOT / "models" / "MODELS.md").read_text(encoding="utf-8")
+    shipped = {path.name: path for path in (ROOT / "models").glob("*.onnx")}
+    assert set(onnx_file.SHIPPED) == set(shipped)
+    for name, path in shipped.items():
+        found = hashlib.sha256(path.read_bytes()).hexdigest()
+        assert onnx_file.SHIPPED[name] == found and re.search(rf"`{name}` +`{found}`", page), name
+
+
+def test_a_package_whose_model_was_damaged_says_so_instead_of_filtering_with_it(tmp_path, monkeypatch, capfd):
+    own = ROOT / "models" / "crnn_int8.onnx"
+    content = bytearray(own.read_bytes())
+    content[len(content) // 2] ^= 1  # one bit of a weight: nothing else would notice
+    (tmp_path / own.name).write_bytes(content)
+    monkeypatch.setattr(onnx_session, "FOLDERS", (tmp_path,))
+    refused(None, "not the one that belongs to this edgefilter.*reinstall", capfd)

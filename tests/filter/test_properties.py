@@ -1,0 +1,150 @@
+"""Whatever sound comes, in whatever blocks: hypothesis looks for what breaks the filter's promises."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import hypothesis.strategies as st
+import numpy as np
+import pytest
+from hypothesis import given, settings
+
+import edgefilter
+from edgefilter import EgoFilter, Profile
+from edgefilter.dsp.stft import StftConfig
+from edgefilter.errors import SignalError
+from edgefilter.filter.residual_echo import Residual
+from edgefilter.types import SAMPLE_RATE
+from tests.filter.test_hostile_inputs import loudest_over_mic_db
+
+DEMO = Path(edgefilter.__file__).parent / "demo_data"
+TINY = Path(__file__).parents[1] / "data" / "crnn.onnx"
+FILTERS = {
+    "bypass": partial(EgoFilter, engine="bypass"),
+    "linear": partial(EgoFilter, engine="linear"),
+    "ss": partial(EgoFilter, engine="ss"),
+    "crnn": partial(EgoFilter, engine="crnn", model=TINY),
+}
+LENGTH = 24_000
+KINDS = {
+    "silence": lambda n, rng: np.zeros(n),
+    "denormals": lambda n, rng: np.full(n, 1e-42),
+    "direct current": lambda n, rng: np.full(n, rng.choice((-1.0, 1.0, 0.5))),
+    "full-scale square": lambda n, rng: np.sign(np.sin(np.arange(n) * rng.uniform(0.001, 3.0))),
+    "noise over full scale": lambda n, rng: 4.0 * rng.standard_normal(n),
+    "faint noise": lambda n, rng: 1e-5 * rng.standard_normal(n),
+    "tone": lambda n, rng: 0.3 * np.sin(np.arange(n) * rng.uniform(0.01, 3.0)),
+    "clicks": lambda n, rng: np.where(rng.random(n) < 0.001, 1.0, 0.0),
+}
+EXAMPLES = settings(max_examples=6, deadline=None, derandomize=True, database=None)
+
+stretches = st.lists(
+    st.tuples(st.sampled_from(sorted(KINDS)), st.integers(1, 20_000), st.integers(0, 99)), min_size=1, max_size=4
+)
+block_sizes = st.lists(st.integers(1, 65_536), min_size=1, max_size=5)
+
+
+def channel(plan: list[tuple[str, int, int]]) -> np.ndarray:
+    """The stretches one after the other, over and over, (LENGTH,) float32."""
+    parts = [KINDS[kind](n, np.random.default_rng(seed)).astype(np.float32) for kind, n, seed in plan]
+    return np.resize(np.concatenate(parts), LENGTH)
+
+
+def filtered(ego: EgoFilter, mic: np.ndarray, ref: np.ndarray, sizes: list[int]) -> np.ndarray:
+    out, at, turn = [], 0, 0
+    while at < mic.size:
+        end = at + sizes[turn % len(sizes)]
+        out.append(ego.process(mic[at:end], ref[at:end]))
+        at, turn = end, turn + 1
+    return np.concatenate((*out, ego.flush()))
+
+
+@pytest.mark.parametrize("name", FILTERS)
+def test_output_is_finite_as_long_as_the_input_never_louder_and_the_same_in_any_blocks(name):
+    ego = FILTERS[name]()
+
+    @EXAMPLES
+    @given(mic_plan=stretches, ref_plan=stretches, sizes=block_sizes, heard=st.integers(0, 3000))
+    def check(mic_plan, ref_plan, sizes, heard):
+        ref = channel(ref_plan)
+        mic = channel(mic_plan)
+        if heard:  # the reference is in the microphone, so late
+            mic = mic + np.concatenate((np.zeros(heard, np.float32), 0.5 * ref[: LENGTH - heard]))
+        ego.reset()
+        out = filtered(ego, mic, ref, sizes)
+        assert out.shape == mic.shape and out.dtype == np.float32 and np.isfinite(out).all()
+        assert loudest_over_mic_db(mic, out) < 1.0
+        ego.reset()
+        assert np.array_equal(filtered(ego, mic, ref, [65_536]), out)
+
+    check()
+
+
+@pytest.mark.parametrize("name", ["linear", "crnn"])
+def test_a_block_that_is_refused_leaves_no_trace(name):
+    rng = np.random.default_rng(0)
+    mic, ref = (0.1 * rng.standard_normal((2, 12_000))).astype(np.float32)
+    undisturbed, ego = filtered(FILTERS[name](), mic, ref, [700]), FILTERS[name]()
+
+    @EXAMPLES
+    @given(
+        bad=st.sampled_from((np.nan, np.inf, -np.inf)),
+        place=st.integers(0, 699),
+        sides=st.sampled_from(("mic", "ref", "shape", "dtype", "length")),
+        when=st.integers(0, 12_000 // 700),
+    )
+    def check(bad, place, sides, when):
+        ego.reset()
+        out = []
+        for at in range(0, mic.size, 700):
+            block, reference = mic[at : at + 700], ref[at : at + 700]
+            if at // 700 == when:
+                spoilt = block.copy()
+                spoilt[min(place, block.size - 1)] = bad
+                wrong = {
+                    "mic": (spoilt, reference),
+                    "ref": (block, spoilt),
+                    "shape": (block[:, None], reference),
+                    "dtype": ((32767 * block).astype(np.int16), reference),
+                    "length": (block, reference[1:]),
+                }[sides]
+                with pytest.raises(SignalError) as caught:
+                    ego.process(*wrong)
+                assert "\n" not in str(caught.value)
+            out.append(ego.process(block, reference))
+        assert np.array_equal(np.concatenate((*out, ego.flush())), undisturbed)
+
+    check()
+
+
+def test_a_minute_of_digital_silence_does_not_end_the_run():
+    """Found here: a division by zero after 45 s of it, where there is no profile and denormal numbers count as zero."""
+    ego, nothing = FILTERS["crnn"](), np.zeros(65_536, np.float32)
+    for _ in range(60 * SAMPLE_RATE // nothing.size):
+        assert not ego.process(nothing, nothing).any()
+    rng = np.random.default_rng(1)
+    human = (0.1 * rng.standard_normal(2 * SAMPLE_RATE)).astype(np.float32)
+    out = np.concatenate((ego.process(human, np.zeros_like(human)), ego.flush()))[-human.size :]
+    assert np.mean(out[SAMPLE_RATE:] ** 2) > 0.5 * np.mean(human[SAMPLE_RATE:] ** 2)
+
+
+def test_after_a_minute_of_a_muted_microphone_the_fan_is_found_again():
+    """Found beside it: the estimate had become zero, and what only rises by factors stayed there for the rest of the run."""
+    stft = StftConfig()
+    residual, nothing = Residual(stft), np.zeros(stft.bins, np.complex64)
+    for _ in range(60 * SAMPLE_RATE // stft.hop):
+        residual.step(nothing, nothing, nothing.real)
+    rng = np.random.default_rng(2)
+    fan = 1e-3 * rng.standard_normal((5000, stft.bins, 2), np.float32).view(np.complex64)[..., 0]
+    for error in fan:
+        noise, _ = residual.step(nothing, error, nothing.real)
+    assert np.median(noise) > 0.1 * 2e-6  # a slow minimum of what is there, whose power is 2e-6
+
+
+def test_a_profile_without_any_fan_can_hear_silence():
+    profile = Profile.load(DEMO / "profile.npz")
+    ego = EgoFilter(replace(profile, noise_psd=np.zeros_like(profile.noise_psd)), "ss")
+    nothing = np.zeros(8_000, np.float32)
+    assert not ego.process(nothing, nothing).any()
