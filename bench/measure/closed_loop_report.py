@@ -123,7 +123,8 @@ def markdown(content: dict, image: str) -> str:
     columns = ["threshold", "calibrated: in time, %", "false stops an hour", "cold: in time, %", "false stops an hour"]
     pairs = zip(found["curve"]["calibrated"], found["curve"]["cold"], strict=True)
     cells = [
-        [a["threshold"]] + [x for p in (a, b) for x in (f"{100 * p['in_time']:.0f}", f"{p['stops_per_hour']:.1f}")]
+        [a["threshold"]]
+        + [x for p in (a, b) for x in (f"{100 * p['in_time']:.0f}", f"{p['stops_per_hour']:.1f}" if p["hours"] else "")]
         for a, b in pairs
     ]
     return "\n".join([*lines, *table(columns, cells)]) + "\n"
