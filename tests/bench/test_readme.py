@@ -16,7 +16,8 @@ COMMANDS = re.findall(r"python -m (bench\.[\w.]+)([^`\n]*)", PAGE)
 @pytest.mark.parametrize("module", sorted({module for module, _ in COMMANDS}))
 def test_a_command_is_a_program_with_these_options(module: str) -> None:
     assert importlib.util.find_spec(module) is not None
-    source = (ROOT / Path(*module.split("."))).with_suffix(".py").read_text(encoding="utf-8")
+    place = ROOT / Path(*module.split("."))
+    source = (place / "__main__.py" if place.is_dir() else place.with_suffix(".py")).read_text(encoding="utf-8")
     assert '__name__ == "__main__"' in source
     for _, options in (command for command in COMMANDS if command[0] == module):
         for option in re.findall(r"(?<=\s)--[a-z][a-z-]*", options):

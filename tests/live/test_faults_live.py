@@ -35,7 +35,7 @@ class Run:
         """The exit code after that signal, or after its own end."""
         if number:
             self.process.send_signal(number)
-        code = self.process.wait(30)
+        code = self.process.wait(120)  # a loaded machine starts Python slowly
         self._reader.join()
         assert not self.says("Traceback"), self.said
         return code
