@@ -52,7 +52,7 @@ def test_the_played_speech_is_the_reference_and_ends_when_the_human_speaks(serve
     assert float((tmp_path / "noticed").read_text().split()[0]) == noticed
     reference = np.rint(32768 * soundfile.read(tmp_path / "heard/reference.wav", dtype="float32")[0]).astype("<i2")
     first, ended = (int(at) for at in np.flatnonzero(reference)[[0, -1]])
-    assert 0.0 < ended / 16_000 - noticed < 2.0  # some 0.1 s, and by how much a busy machine is behind
+    assert -0.5 < ended / 16_000 - noticed < 2.0  # some 0.1 s; a busy machine is behind, or has a gap just there
     assert ended < reference.size - 8000 and ended - first < robot.size - 16_000  # else it would go on to the end
     assert share(reference[first + 8000 : ended - 400], robot) > 0.3
     assert share(from_loudspeaker, reference) > 0.3
