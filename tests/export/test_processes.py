@@ -15,7 +15,16 @@ from export.trainer import Plan, Trainer
 
 ROOT = Path(__file__).parents[2]
 OPTIONS = argparse.Namespace(
-    hop=32, channels=(4, 4, 4, 4), hidden=8, norm="layer", suppression=6.0, si_sdr=0.004, full_precision=True
+    hop=32,
+    channels=(4, 4, 4, 4),
+    hidden=8,
+    norm="layer",
+    erb=0,
+    suppression=6.0,
+    si_sdr=0.004,
+    recogniser=None,
+    recogniser_weight=0.0,
+    full_precision=True,
 )
 WORDS = "--hop 32 --channels 4 4 4 4 --hidden 8 --full-precision --steps 3 --every 3 --batch 2 --seconds 0.5".split()
 
