@@ -96,14 +96,27 @@ def run(options: argparse.Namespace) -> str:
     failures = [worst.show(results, index) for index in progress(worst.worst(results, options.worst), "worst clip")]
     options.output.mkdir(parents=True, exist_ok=True)
     write_page(options.output / "evaluation.html", page.page(results, content, failures, made_with))
-    rows = [
-        {"set": clip.set, "room": clip.room, "clip": clip.name, "speaker": clip.speaker, **row}
-        for clip, row in zip(clips, results.rows, strict=True)
-    ]
     told = [{key: value for key, value in failure.items() if key != "pieces"} for failure in failures]
     text = table.markdown(results, content)
-    everything = {**content, "worst": told, "clips": rows}
+    everything = {**content, "worst": told, "clips": clip_rows(results)}
     return results_writer.write(options.output / "evaluation", made_with, TITLE, text, everything)
+
+
+def clip_rows(results: Results) -> list[dict]:
+    """What the JSON file holds of each clip; what was heard of it stays in the cache, being long."""
+    found = []
+    for clip, row in zip(results.clips, results.rows, strict=True):
+        told = {"set": clip.set, "room": clip.room, "clip": clip.name, "speaker": clip.speaker, "facts": row["facts"]}
+        for system in results.systems:
+            one = dict(row[system.name])
+            if "words" in one:
+                one["words"] = {
+                    name: {key: count for key, count in words.items() if key != "heard"}
+                    for name, words in one["words"].items()
+                }
+            told[system.name] = one
+        found.append(told)
+    return found
 
 
 def main(arguments: list[str] | None = None) -> int:

@@ -5,8 +5,9 @@ from __future__ import annotations
 import csv
 import hashlib
 import os
+import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -95,7 +96,8 @@ class Heard:
 
     def __init__(self, clip: Clip) -> None:
         self.clip, self.source = clip, clip.open()
-        self._kept: dict[str, Samples] = {}
+        self.lent_s = 0.0
+        self._kept: dict[str, tuple[Samples, float]] = {}
 
     @property
     def mic(self) -> Samples:
@@ -110,10 +112,14 @@ class Heard:
         return self.clip.text is not None
 
     def once(self, name: str, make: Callable[[], Samples]) -> Samples:
-        """What make gives, from the second time on without asking it."""
-        if name not in self._kept:
-            self._kept[name] = make()
-        return self._kept[name]
+        """What make gives, from the second time on without asking it; lent_s grows by what that would have taken."""
+        if name in self._kept:
+            self.lent_s += self._kept[name][1]
+        else:
+            began = time.perf_counter()
+            made = make()
+            self._kept[name] = made, time.perf_counter() - began
+        return self._kept[name][0]
 
     def fan(self) -> Samples:
         """The robot's fan as calibrated, as long as the clip; raises NotHere where it was not recorded."""
@@ -144,8 +150,9 @@ def find_clips(folders: Sequence[Path], laying: Laying = Laying(), every: int = 
         for below in [folder, *(path for path in sorted(folder.rglob("*")) if path.is_dir())]:
             found = [*_conversations(below), *_recordings(below, laying)]
             if found:
-                name = below.resolve().name if below.resolve().name not in sets else str(below)
-                sets[name] = [_named(clip, name) for clip in found]
+                name, parent = below.resolve().name, below.resolve().parent.name
+                name = name if name not in sets else f"{parent}/{name}"
+                sets.setdefault(name, []).extend(replace(clip, set=name) for clip in found)
     clips = [clip for found in sets.values() for clip in found[::every]]
     if not clips:
         raise UsageError(
@@ -153,10 +160,6 @@ def find_clips(folders: Sequence[Path], laying: Laying = Laying(), every: int = 
             " some with bench.simulate.conversations) or recordings of a real device"
         )
     return clips
-
-
-def _named(clip: Clip, name: str) -> Clip:
-    return Clip(name, *(getattr(clip, field) for field in list(Clip.__dataclass_fields__)[1:]))
 
 
 def _conversations(folder: Path) -> Iterator[Clip]:

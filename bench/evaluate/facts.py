@@ -17,6 +17,8 @@ PITCH_FRAME = SAMPLE_RATE // 25
 """40 ms: two periods of the deepest voice."""
 VOICED = 0.6
 """A frame is voiced where the autocorrelation, corrected for the window, reaches so much of the power."""
+OCTAVE = 0.03
+"""What a peak is taken to be lower by for each octave of lag: a periodic sound has one at every multiple of its period."""
 TALKS_DB = 30.0
 """The robot talks in frames within so much of its loudest."""
 
@@ -87,7 +89,7 @@ def pitch_hz(samples: Samples) -> float | None:
     frames = (frames - frames.mean(axis=1, keepdims=True))[loud > 0.1 * loud.max()] * window
     low, high = (round(SAMPLE_RATE / hz) for hz in reversed(PITCH_HZ))
     lags = _autocorrelation(frames)[:, low:high] / _autocorrelation(window[None])[:, low:high]
-    best = np.argmax(lags, axis=1)
+    best = np.argmax(lags - OCTAVE * np.log2(np.arange(low, high)), axis=1)
     voiced = lags[np.arange(best.size), best] > VOICED
     return float(np.median(SAMPLE_RATE / (low + best[voiced]))) if voiced.any() else None
 

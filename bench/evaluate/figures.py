@@ -88,12 +88,18 @@ class Group:
             self._weights[key] = cluster_weights([clip.speaker for clip in clips], [clip.place for clip in clips])
         return self._weights[key]
 
+    def _interval(
+        self, members: Sequence[int], above: np.ndarray, below: np.ndarray | None = None
+    ) -> tuple[float | None, float | None]:
+        """See `ratio_interval`; of one clip nobody can say."""
+        return (None, None) if len(members) < 2 else ratio_interval(self.weights(members), above, below)
+
     def mean(self, system: str, metric: str) -> dict | None:
         """mean, low, high, median, std and count of a figure; None where no clip has it."""
         members, values = self.column(system, metric)
         if not members:
             return None
-        low, high = ratio_interval(self.weights(members), values)
+        low, high = self._interval(members, values)
         spread = float(np.std(values, ddof=1)) if values.size > 1 else None
         found = {"mean": float(values.mean()), "low": low, "high": high, "median": float(np.median(values))}
         return found | {"std": spread, "count": values.size}
@@ -104,7 +110,7 @@ class Group:
         _, words = self.column(system, f"words@{recogniser}")
         if not members:
             return None
-        low, high = ratio_interval(self.weights(members), 100 * counts, words)
+        low, high = self._interval(members, 100 * counts, words)
         return {"mean": float(100 * counts.sum() / words.sum()), "low": low, "high": high, "words": int(words.sum())}
 
     def difference(self, system: str, other: str, metric: str) -> dict | None:
@@ -115,7 +121,7 @@ class Group:
         if not both:
             return None
         members, values = [index for index, _ in both], np.array([value for _, value in both])
-        low, high = ratio_interval(self.weights(members), values)
+        low, high = self._interval(members, values)
         return {"other": other, "difference": float(values.mean()), "low": low, "high": high, "count": values.size}
 
     def best(self, metric: str, besides: str = "") -> str | None:

@@ -16,6 +16,7 @@ from bench.evaluate.systems import System, catalogue
 from bench.measure.real_scores import TALK_TYPES, aecmos
 from bench.measure.recogniser import Recogniser, word_errors
 from edgefilter.dsp.metrics import erle, si_sdr
+from edgefilter.errors import EdgefilterError
 from edgefilter.types import SAMPLE_RATE, Samples
 
 ALONE_S = 5.0
@@ -61,12 +62,15 @@ def score(system: System, heard: Heard, setup: Setup) -> dict:
     """
     try:
         _ = heard.source.profile, heard.mic  # made and read here, so that their time is not the system's
-        began = time.perf_counter()
+        heard.lent_s, began = 0.0, time.perf_counter()
         out = system.run(heard)
-        seconds = time.perf_counter() - began
+        seconds = time.perf_counter() - began + heard.lent_s
     except NotHere as error:
         system.missing()
         return {"absent": str(error)}
+    except EdgefilterError as error:
+        system.missing()
+        return {"problem": str(error)}
     mic = heard.mic
     row: dict = {"duration": mic.size / SAMPLE_RATE} | ({} if system.learns else {"seconds": seconds})
     if out.size != mic.size:
@@ -122,7 +126,12 @@ def estoi(human: Samples, out: Samples) -> float | None:
         from pystoi import stoi
     except ImportError:
         return None
-    return float(stoi(human.astype(np.float64), out.astype(np.float64), SAMPLE_RATE, extended=True))
+    before = np.random.get_state()
+    np.random.seed(0)  # it adds a noise of its own, from the global generator
+    try:
+        return float(stoi(human.astype(np.float64), out.astype(np.float64), SAMPLE_RATE, extended=True))
+    finally:
+        np.random.set_state(before)
 
 
 @lru_cache(maxsize=1)

@@ -14,7 +14,7 @@ from bench.evaluate.facts import QUANTITIES
 from bench.evaluate.figures import Results
 from bench.evaluate.slices import metric_of
 from bench.evaluate.systems import TRUE_LAG, System
-from bench.evaluate.table import heading, number
+from bench.evaluate.table import counted, heading, interval, latency, number
 from bench.evaluate.worst import looked_at
 
 
@@ -66,7 +66,8 @@ def page(results: Results, content: Mapping[str, Any], worst: Sequence[Mapping],
         "dirty": made_with["dirty"],
         "facts": _facts(results, content["absent"]),
         "groups": groups,
-        "columns": [{"title": column.title, "bars": column.bars} for column in chosen] + [{"title": "Latency, ms", "bars": False}],
+        "columns": [{"title": column.title, "bars": column.bars} for column in chosen]
+        + [{"title": "Latency, ms", "bars": False}],
         "conclusions": content["conclusions"],
         "measure": "Capped word error rate, %" if metric_of(results) == "capped" else "SI-SDR, dB",
         "slices": [_slice(results, one) for one in content["slices"]],
@@ -91,8 +92,9 @@ def headline(results: Results) -> str:
     titles = {system.name: system.title for system in results.systems}
     counts = sorted({name: best.count(name) for name in best}.items(), key=lambda item: -item[1])
     what = "the fewest word errors" if metric == "capped" else "the highest SI-SDR"
-    first, *others = [f"{titles[name]} in {count}" for name, count in counts]
-    return f"Of {len(best)} tables, {what}: {', '.join([first, *others])}"
+    (first, count), *others = counts
+    rest = "".join(f"; {titles[name]} in {number_of}" for name, number_of in others)
+    return f"{titles[first]} has {what} in {count} of {len(best)} tables{rest}"
 
 
 def _facts(results: Results, absent: Mapping) -> list[tuple[str, str, str]]:
@@ -112,8 +114,7 @@ def _group(results: Results, group: Any, found: Mapping, chosen: Sequence[Column
     picked = [_column(systems, found["rows"], column) for column in chosen]
     rows, kind = [], ""
     for at, system in enumerate(systems):
-        late = "at the end" if system.latency_ms is None and system.kind != "bound" else number(system.latency_ms, 0)
-        cells = [*(cells[at] for cells in picked), {"text": late, "bars": False, "best": False}]
+        cells = [*(cells[at] for cells in picked), {"text": latency(system), "bars": False, "best": False}]
         rows.append({"title": system.title, "knows": system.knows, "kind": system.kind, "cells": cells})
         rows[-1]["first"] = system.kind != kind
         kind = system.kind
@@ -132,8 +133,7 @@ def _best(results: Results, group: Any) -> str:
     if found is None:
         return f"Best: {titles[name]}."
     unit = "points of capped WER" if metric == "capped" else "dB"
-    interval = f"{found['difference']:+.1f} [{found['low']:+.1f}, {found['high']:+.1f}] {unit}"
-    return f"Best: {titles[name]}; against the next, {titles[other]}, {interval}."
+    return f"Best: {titles[name]}; less the next, {titles[other]}: {interval(found, 1, 'difference')} {unit}."
 
 
 def _column(systems: Sequence[System], rows: Mapping, column: Column) -> list[dict]:
@@ -145,7 +145,7 @@ def _column(systems: Sequence[System], rows: Mapping, column: Column) -> list[di
         for value, system in zip(values, systems)
         if value is not None and system.kind != "bound" and system.knows != TRUE_LAG
     ]
-    best = (max(can_have) if column.better > 0 else min(can_have)) if can_have else None
+    best = (max(can_have) if column.better > 0 else min(can_have)) if len(set(can_have)) > 1 else None
     scale = _scale([one for one in found if isinstance(one, Mapping)], column) if column.bars else (0.0, 1.0)
     cells = []
     for one, value, system in zip(found, values, systems):
@@ -158,11 +158,17 @@ def _column(systems: Sequence[System], rows: Mapping, column: Column) -> list[di
             "best": robot and value is not None and value == best,
         }
         if column.bars and isinstance(one, Mapping):
-            low, at, high = (100 * (one[key] - scale[0]) / (scale[1] - scale[0]) for key in ("low", "mean", "high"))
+            low, at, high = (100 * (value - scale[0]) / (scale[1] - scale[0]) for value in _ends(one))
             cell |= {"at": round(at, 2), "low": round(low, 2), "width": round(high - low, 2)}
-            cell["text"] = f"{shown} [{one['low']:.{column.digits}f}, {one['high']:.{column.digits}f}]"
+            cell["text"] = interval(one, column.digits)
         cells.append(cell)
     return cells
+
+
+def _ends(one: Mapping) -> tuple[float, float, float]:
+    """Low, mean and high; the mean thrice where there is no interval."""
+    mean = one["mean"]
+    return (mean, mean, mean) if one["low"] is None else (one["low"], mean, one["high"])
 
 
 def _at(row: Any, path: Sequence[str]) -> Any:
@@ -174,7 +180,7 @@ def _at(row: Any, path: Sequence[str]) -> Any:
 def _scale(found: Sequence[Mapping], column: Column) -> tuple[float, float]:
     if column.path[-1] == "capped" or not found:
         return 0.0, WER_TOP
-    low, high = min(one["low"] for one in found), max(one["high"] for one in found)
+    low, high = min(_ends(one)[0] for one in found), max(_ends(one)[2] for one in found)
     return low - 1.0, high + 1.0
 
 
@@ -189,12 +195,15 @@ def _slice(results: Results, one: Mapping) -> dict:
         if not found:
             return None
         share = 100 * (found["mean"] - low) / (high - low)
-        shown = {key: f"{found[key]:.{digits}f}" for key in ("mean", "low", "high")}
-        return shown | {"bad": round(share if metric_of(results) == "capped" else 100 - share)}
+        ends = "" if found["low"] is None else f"{found['low']:.{digits}f} to {found['high']:.{digits}f}"
+        return {"mean": f"{found['mean']:.{digits}f}", "ends": ends} | {
+            "bad": round(share if metric_of(results) == "capped" else 100 - share)
+        }
 
     names = list(one["rows"][0]["systems"])
     lines = [(titles[name], [cell(part["systems"][name]) for part in one["rows"]]) for name in names]
-    return {**one, "lines": lines}
+    heads = [{"slice": part["slice"], "clips": counted(part["clips"], "clip")} for part in one["rows"]]
+    return {**one, "rows": heads, "lines": lines}
 
 
 def _worst(clip: Mapping) -> dict:

@@ -117,7 +117,7 @@ def _batch_norm(results: Results) -> dict:
     title = "Batch normalisation does not help"
     normed = f"crnn:{BATCH_NORM}"
     found = whole(results).difference(normed, "crnn", metric_of(results)) if _ran(results, normed) else None
-    if not found:
+    if not found or found["count"] < FEW:
         return _conclusion(title, [], "", f"give --network {BATCH_NORM}=FILE.onnx, a network trained with it")
     worse = 1 if metric_of(results) == "capped" else -1
     high = max(worse * found["low"], worse * found["high"])
@@ -127,18 +127,24 @@ def _batch_norm(results: Results) -> dict:
 
 
 def correlation(results: Results, key: str, system: str) -> tuple[float, float, float] | None:
-    """Spearman's rank correlation of a quantity with the figure of a system, and its interval; None with FEW clips."""
-    every = whole(results)
-    members, values = every.column(system, metric_of(results))
-    known = [(index, value, results.rows[index]["facts"].get(key)) for index, value in zip(members, values)]
-    known = [row for row in known if row[2] is not None]
-    if len(known) < FEW:
+    """Spearman's rank correlation of a quantity with the figure of a system, and its interval; None with FEW clips.
+
+    Ranks are within a set and room, so that what differs between rooms is not taken for the quantity.
+    """
+    x, y, members = [], [], []
+    for group in results.groups:
+        known = group.part([at for at in group.members if key in results.rows[at]["facts"]])
+        inside, values = known.column(system, metric_of(results))
+        if len(inside) > 1:
+            quantity = np.array([float(results.rows[at]["facts"][key]) for at in inside])
+            x.append(_ranks(quantity) / len(inside))
+            y.append(_ranks(values) / len(inside))
+            members += inside
+    if len(members) < FEW:
         return None
-    x, y = (_ranks(np.array([float(row[at]) for row in known])) for at in (2, 1))
-    weights = every.weights([row[0] for row in known])
-    draws = _correlation(weights, x, y)
-    low, high = np.nanpercentile(draws, [2.5, 97.5])
-    return float(_correlation(np.ones((1, x.size)), x, y)[0]), float(low), float(high)
+    ranks = np.concatenate(x), np.concatenate(y)
+    low, high = np.nanpercentile(_correlation(whole(results).weights(members), *ranks), [2.5, 97.5])
+    return float(_correlation(np.ones((1, len(members))), *ranks)[0]), float(low), float(high)
 
 
 def _correlation(weights: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:

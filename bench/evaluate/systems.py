@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 
 import numpy as np
@@ -16,11 +16,12 @@ from bench.evaluate.clips import Heard, NotHere
 from bench.measure import peers, quality
 from edgefilter.dsp.stft import Analyser, StftConfig, Synthesiser
 from edgefilter.engines import create
+from edgefilter.engines.paper_ss import PAPER_STFT, L
 from edgefilter.errors import EdgefilterError, UsageError
 from edgefilter.types import SAMPLE_RATE, Samples
 
 CALIBRATED, LEARNING, NEITHER = "calibration", "learning only", "neither"
-WHERE_THERE_IS = "calibration where there is one"
+WHERE_THERE_IS = "calibration if any"
 TRUE_LAG = "the true lag"
 NONE = ""
 BATCH_NORM = "batch-norm"
@@ -102,10 +103,14 @@ def _base(name: str, title: str, kind: str, **rest: object) -> System:
 
 def _own() -> list[System]:
     rows = []
-    endings = {CALIBRATED: "", LEARNING: "-uncalibrated-learning", NEITHER: "-uncalibrated"}
-    for knows, ending in endings.items():
+    ways = {
+        CALIBRATED: ("", "calibrated"),
+        LEARNING: ("-uncalibrated-learning", "learning only"),
+        NEITHER: ("-uncalibrated", "uncalibrated"),
+    }
+    for knows, (ending, words) in ways.items():
         for engine in ("linear", "ss", "crnn"):
-            row = _base(engine + ending, f"{engine}, {knows}", "own", knows=knows, latency_ms=_latency_ms(engine))
+            row = _base(engine + ending, f"{engine}, {words}", "own", knows=knows, latency_ms=_latency_ms(engine))
             rows.append(_calibrated(row) if knows == CALIBRATED else row)
     return rows
 
@@ -121,6 +126,7 @@ def _calibrated(row: System) -> System:
     return System(**{**row.__dict__, "run": run})
 
 
+@cache
 def _latency_ms(engine: str) -> float | None:
     try:
         found = edgefilter.EgoFilter(engine=engine).latency
@@ -153,7 +159,8 @@ def _paper() -> list[System]:
         voice = heard.clip.voice()
         return denoisers.voicefilter_lite(heard.mic, voice)
 
-    paper_ss = _calibrated(_base("paper-ss", "SS before post-filtering", "paper", knows=CALIBRATED))
+    late = 1000 * (PAPER_STFT.window_length + L * PAPER_STFT.hop) / SAMPLE_RATE
+    paper_ss = _calibrated(_base("paper-ss", "SS before post-filtering", "paper", knows=CALIBRATED, latency_ms=late))
     repaired = "SS after post-filtering (VoiceFixer)"
 
     def post(heard: Heard) -> Samples:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from bench.evaluate.figures import Group, Results
+from bench.evaluate.systems import System
 from bench.results_writer import table
 
 NOTES = (
@@ -23,7 +24,15 @@ def interval(found: Mapping | None, digits: int, key: str = "mean") -> str:
     """A mean with its interval; empty without."""
     if not found:
         return ""
+    if found["low"] is None:
+        return f"{found[key]:.{digits}f}"
     return f"{found[key]:.{digits}f} [{found['low']:.{digits}f}, {found['high']:.{digits}f}]"
+
+
+def latency(system: System) -> str:
+    """In ms; nothing for a bound."""
+    late = "" if system.kind == "bound" else "end"
+    return late if system.latency_ms is None else f"{system.latency_ms:.0f}"
 
 
 def number(value: float | None, digits: int) -> str:
@@ -62,7 +71,7 @@ def markdown(results: Results, found: Mapping) -> str:
 
 def _slice(results: Results, one: Mapping) -> list[str]:
     titles = {system.name: system.title for system in results.systems}
-    heads = [f"{part['slice']} ({part['clips']} clips)" for part in one["rows"]]
+    heads = [f"{part['slice']} ({counted(part['clips'], 'clip')})" for part in one["rows"]]
     digits = 0 if results.recognisers else 1
     rows = [
         [titles[name], *(interval(part["systems"][name], digits) for part in one["rows"])]
@@ -71,8 +80,13 @@ def _slice(results: Results, one: Mapping) -> list[str]:
     return table([f"{one['title']}{', ' + one['unit'] if one['unit'] else ''}", *heads], rows)
 
 
+def counted(count: int, what: str) -> str:
+    """How many, in words: "1 clip", "2 clips"."""
+    return f"{count} {what}" + ("s" if count != 1 else "")
+
+
 def heading(group: Group, found: Mapping, recogniser: str) -> str:
-    return f"{group.name}: {found['clips']} clips of {found['speakers']} speakers" + (
+    return f"{group.name}: {counted(found['clips'], 'clip')} of {counted(found['speakers'], 'speaker')}" + (
         f", {recogniser}" if recogniser else ""
     )
 
@@ -104,7 +118,7 @@ def _cells(results: Results, name: str, row: Mapping, recogniser: str) -> list[s
     cells += [interval(ratio, 1), *(number(ratio[key], 1) for key in ("median", "std"))] if ratio else [""] * 3
     means = [(row[key] or {}).get("mean") for key in ("estoi", "erle_db", "echo_mos", "human_mos")]
     cells += [number(value, digits) for value, digits in zip(means, (2, 1, 1, 1), strict=True)]
-    cells += [number(row["seconds_for_5s"], 2), "end" if system.latency_ms is None else f"{system.latency_ms:.0f}"]
+    cells += [number(row["seconds_for_5s"], 2), latency(system)]
     return [*cells, _against(row["against"])]
 
 

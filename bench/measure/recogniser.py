@@ -120,11 +120,11 @@ def find_model(name: str) -> Path:
     """
     if Path(name).is_dir():
         return Path(name)
-    from faster_whisper.utils import download_model
-
     try:
+        from faster_whisper.utils import download_model
+
         return Path(download_model(name, local_files_only=True))
-    except (ValueError, OSError) as error:
+    except (ImportError, ValueError, OSError) as error:
         raise UsageError(
             f"{name} is no folder, and no model of faster-whisper that was downloaded before: give a folder with"
             " model.bin and config.json"

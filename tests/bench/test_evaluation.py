@@ -71,7 +71,7 @@ def test_a_cluster_and_processes_give_the_same_figures_and_a_run_that_was_cut_of
     assert lab["rows"]["clean"]["si_sdr"] is None and row["erle_db"]["mean"] > 3 and 0 < row["seconds_for_5s"]
     assert "which the paper used" in first["absent"]["VoiceFilter (the paper's baseline)"]
     page = (tmp_path / "a" / "evaluation.md").read_text()
-    assert page.startswith("# Evaluation\n") and "| linear, neither | neither |" in page
+    assert page.startswith("# Evaluation\n") and "| linear, uncalibrated | neither |" in page
     assert "<title>edgefilter evaluation</title>" in (tmp_path / "a" / "evaluation.html").read_text()
 
 
@@ -134,6 +134,8 @@ def test_figures_of_a_row() -> None:
     assert found["wer"]["low"] < found["wer"]["mean"] < found["wer"]["high"]
     assert row["seconds_for_5s"] == pytest.approx(0.05) and row["clips"] == 12
     assert office.figures(made.systems[-1])["si_sdr"] is None
+    alone = lab.part(lab.members[:1]).mean("crnn", "wer")
+    assert (alone["low"], alone["high"], alone["count"]) == (None, None, 1)  # of one clip nobody can say
 
 
 def test_clusters_are_drawn_and_not_utterances() -> None:
