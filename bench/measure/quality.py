@@ -21,7 +21,6 @@ from __future__ import annotations
 import argparse
 import ast
 import hashlib
-import json
 import sys
 import time
 from collections.abc import Callable
@@ -34,6 +33,7 @@ from bench import results_writer
 from bench.measure import peers, scores, taught
 from bench.measure.conversation import Conversation, every, find_conversations, progress
 from bench.measure.recogniser import Recogniser, word_errors
+from bench.measure.score_cache import ScoreCache, key_of
 from edgefilter.dsp.metrics import si_sdr
 from edgefilter.engines import HAVE_MODEL
 from edgefilter.errors import EdgefilterError
@@ -140,43 +140,20 @@ def score(conversation: Conversation, engine: str, recogniser: Recogniser | None
     return result
 
 
-class Scores:
-    """Scores by recording, engine and code in a JSON-lines file, appended to at once."""
-
-    def __init__(self, path: Path, identity: str) -> None:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        self._path, self._identity = path, identity
-        lines = path.read_text(encoding="utf-8").splitlines() if path.exists() else []
-        self._known = {}
-        for line in lines:
-            if line.endswith("}"):
-                entry = json.loads(line)
-                self._known[entry["key"]] = entry["score"]
-
-    def get(self, conversation: Conversation, engine: str, version: str, make: Callable[[], dict]) -> dict:
-        parts = (conversation.fingerprint, engine, version, self._identity)
-        key = hashlib.sha256("\n".join(parts).encode()).hexdigest()
-        if key not in self._known:
-            self._known[key] = make()
-            with self._path.open("a", encoding="utf-8") as lines:
-                lines.write(json.dumps({"key": key, "score": self._known[key]}) + "\n")
-        return self._known[key]
-
-
 def run(
     sets: dict[str, list[Conversation]], engines: list[str], recogniser: Recogniser | None, cache: Path
 ) -> list[dict]:
     """Every score with its set, conversation and engine."""
-    kept = Scores(
-        cache, Path(__file__).with_name("recogniser.py").read_text(encoding="utf-8") if recogniser else "no recogniser"
-    )
+    kept = ScoreCache(cache)
+    hearing = Path(__file__).with_name("recogniser.py").read_text(encoding="utf-8") if recogniser else "no recogniser"
     versions = {engine: code_version(engine.removesuffix(TRUE_LAG)) for engine in engines}
     jobs = [(name, conversation, engine) for name, conversation in every(sets) for engine in engines]
     rows = []
     for name, conversation, engine in progress(jobs):
-        made = kept.get(
-            conversation, engine, versions[engine], lambda c=conversation, e=engine: score(c, e, recogniser)
-        )
+        key = key_of((conversation.fingerprint, engine, versions[engine], hearing))
+        if (made := kept.get(key)) is None:
+            made = score(conversation, engine, recogniser)
+            kept.keep(key, made)
         rows.append({"set": name, "conversation": conversation.folder.name, "engine": engine, **made})
     return rows
 

@@ -19,8 +19,6 @@ seed gives the same figures.
 from __future__ import annotations
 
 import argparse
-import hashlib
-import json
 import multiprocessing
 import sys
 from collections.abc import Iterator
@@ -34,6 +32,7 @@ from bench.measure import real_report
 from bench.measure.real_scores import Recognition, aecmos, score
 from bench.measure.real_streams import ECHO_ONLY, Cells, Laid, Recording, chosen, find_recordings, lay
 from bench.measure.real_systems import DEFAULT, UNOBTAINABLE, code_version
+from bench.measure.score_cache import ScoreCache, key_of
 from edgefilter.errors import EdgefilterError, UsageError
 
 PARTS = ("pairs", "laid", "alone")
@@ -44,20 +43,14 @@ class Scores:
     """Rows by system, code, stream and recogniser in a JSON-lines file, appended to at once; without a path none."""
 
     def __init__(self, path: Path | None) -> None:
-        self._path = path
-        lines = path.read_text(encoding="utf-8").splitlines() if path and path.exists() else []
-        self._known = {
-            entry["key"]: entry["row"] for entry in (json.loads(line) for line in lines if line.endswith("}}"))
-        }
+        self._cache = ScoreCache(path)
 
     def get(self, task: Task) -> dict | None:
-        return self._known.get(self._key(task)) if self._path else None
+        return self._cache.get(self._key(task))
 
     def keep(self, task: Task, row: dict) -> None:
-        if self._path and "absent" not in row:
-            self._path.parent.mkdir(parents=True, exist_ok=True)
-            with self._path.open("a", encoding="utf-8") as lines:
-                lines.write(json.dumps({"key": self._key(task), "row": row}) + "\n")
+        if "absent" not in row:
+            self._cache.keep(self._key(task), row)
 
     def _key(self, task: Task) -> str:
         system, stream, recognition = task
@@ -68,7 +61,7 @@ class Scores:
             repr(stream),
             repr(recognition),
         ]
-        return hashlib.sha256("\n".join(code).encode()).hexdigest()
+        return key_of(code)
 
 
 @cache

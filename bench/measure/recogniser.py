@@ -113,6 +113,24 @@ def _spell(n: int) -> str:
     raise AssertionError(n)
 
 
+def find_model(name: str) -> Path:
+    """The folder of that path, or of a model of faster-whisper that was downloaded before ("tiny.en"); fetches nothing.
+
+    Raises UsageError where there is neither.
+    """
+    if Path(name).is_dir():
+        return Path(name)
+    try:
+        from faster_whisper.utils import download_model
+
+        return Path(download_model(name, local_files_only=True))
+    except (ImportError, ValueError, OSError) as error:
+        raise UsageError(
+            f"{name} is no folder, and no model of faster-whisper that was downloaded before: give a folder with"
+            " model.bin and config.json"
+        ) from error
+
+
 class Recogniser:
     """Transcribes with the model in a folder; loads it only for audio that the cache does not know.
 

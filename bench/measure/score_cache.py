@@ -1,0 +1,36 @@
+"""Scores that were computed once: a JSON-lines file that a run which is cut off leaves whole but for its last line."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterable
+from pathlib import Path
+
+
+def key_of(parts: Iterable[str]) -> str:
+    """One key for everything that a score depends on."""
+    return hashlib.sha256("\n".join(parts).encode()).hexdigest()
+
+
+class ScoreCache:
+    """Scores by key, appended to the file at once; without a path nothing is kept."""
+
+    def __init__(self, path: Path | None) -> None:
+        self._path = path
+        self._known: dict[str, dict] = {}
+        if path and path.exists():
+            for line in path.read_text(encoding="utf-8").splitlines():
+                if line.endswith("}}"):
+                    entry = json.loads(line)
+                    self._known |= {entry["key"]: entry["score"]} if "score" in entry else {}
+
+    def get(self, key: str) -> dict | None:
+        return self._known.get(key)
+
+    def keep(self, key: str, score: dict) -> None:
+        if self._path:
+            self._known[key] = score
+            self._path.parent.mkdir(parents=True, exist_ok=True)
+            with self._path.open("a", encoding="utf-8") as lines:
+                lines.write(json.dumps({"key": key, "score": score}) + "\n")
