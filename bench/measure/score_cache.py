@@ -1,10 +1,11 @@
-"""Scores that were computed once: a JSON-lines file that a run which is cut off leaves whole but for its last line."""
+"""Scores that were computed once: a JSON-lines file, of which a line that was cut short harms no other."""
 
 from __future__ import annotations
 
 import hashlib
 import json
 from collections.abc import Iterable
+from contextlib import suppress
 from pathlib import Path
 
 
@@ -19,11 +20,12 @@ class ScoreCache:
     def __init__(self, path: Path | None) -> None:
         self._path = path
         self._known: dict[str, dict] = {}
+        self._cut = bool(path and path.exists() and not path.read_bytes().endswith(b"\n"))
         if path and path.exists():
             for line in path.read_text(encoding="utf-8").splitlines():
-                if line.endswith("}}"):
+                with suppress(ValueError, KeyError, TypeError):  # cut short, or of an earlier version
                     entry = json.loads(line)
-                    self._known |= {entry["key"]: entry["score"]} if "score" in entry else {}
+                    self._known[entry["key"]] = entry["score"]
 
     def get(self, key: str) -> dict | None:
         return self._known.get(key)
@@ -33,4 +35,5 @@ class ScoreCache:
             self._known[key] = score
             self._path.parent.mkdir(parents=True, exist_ok=True)
             with self._path.open("a", encoding="utf-8") as lines:
-                lines.write(json.dumps({"key": key, "score": score}) + "\n")
+                lines.write("\n" * self._cut + json.dumps({"key": key, "score": score}) + "\n")
+            self._cut = False
