@@ -183,12 +183,12 @@ def judge(case: Case, making: dict[str, Make], learning: bool, recogniser: Recog
         }
 
 
-def compared(rows: list[dict], kind: str, system: str) -> dict[str, float]:
-    """Figures of one system on one kind, and its capped WER less that of 'ss' on the same utterances with a 95 % interval."""
-    ours = [row for row in rows if (row["kind"], row["system"]) == (kind, system)]
-    base = {row["conversation"]: row for row in rows if (row["kind"], row["system"]) == (kind, BASE)}
+def compared(rows: list[dict], system: str) -> dict[str, float]:
+    """Figures of one system, and its capped WER less that of 'ss' on the same utterances with a 95 % interval."""
+    ours = [row for row in rows if row["system"] == system]
+    base = {(row["kind"], row["conversation"]): row for row in rows if row["system"] == BASE}
     words = sum(row["words"] for row in ours)
-    less = [row["capped"] - base[row["conversation"]]["capped"] for row in ours]
+    less = [row["capped"] - base[row["kind"], row["conversation"]]["capped"] for row in ours]
     low, high = interval(lambda x: x.mean(axis=-1), less)
     return {
         "capped": float(np.mean([row["capped"] for row in ours])),
@@ -202,19 +202,20 @@ def compared(rows: list[dict], kind: str, system: str) -> dict[str, float]:
 
 
 def markdown(rows: list[dict]) -> str:
-    """A table per kind."""
+    """A table per kind, and one of all."""
+    kinds = {kind: [row for row in rows if row["kind"] == kind] for kind in dict.fromkeys(row["kind"] for row in rows)}
     lines = []
-    for kind in dict.fromkeys(row["kind"] for row in rows):
+    for kind, of_kind in (kinds | {"all": rows} if len(kinds) > 1 else kinds).items():
         cells = []
-        for system in dict.fromkeys(row["system"] for row in rows):
-            found = compared(rows, kind, system)
+        for system in dict.fromkeys(row["system"] for row in of_kind):
+            found = compared(of_kind, system)
             percent = [f"{100 * found[key]:.0f}" for key in ("capped", "deletions", "insertions")]
             less = "{:+.1f} [{:+.1f}, {:+.1f}]".format(*(100 * found[key] for key in ("less", "less_low", "less_high")))
             cells.append([system, *percent, less, f"{found['si_sdr']:.1f}"])
-        count = len({row["conversation"] for row in rows if row["kind"] == kind})
-        words = sum(row["words"] for row in rows if (row["kind"], row["system"]) == (kind, BASE))
+        base = [row for row in of_kind if row["system"] == BASE]
         head = ["system", "capped WER, %", "deleted", "inserted", "WER less that of ss, points", "SI-SDR, dB"]
-        lines += [f"{kind}, {count} utterances of {words} words:", "", *results_writer.table(head, cells), ""]
+        said = f"{kind}, {len(base)} utterances of {sum(row['words'] for row in base)} words:"
+        lines += [said, "", *results_writer.table(head, cells), ""]
     return "\n".join(lines)
 
 
