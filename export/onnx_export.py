@@ -12,11 +12,13 @@ from __future__ import annotations
 
 import argparse
 import json
+import logging
 import os
 import sys
 import tempfile
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -191,13 +193,8 @@ def _write_int8(trained: Trained, path: Path) -> str:
     with it. Those get seven bits, an int8 product of eight overflows on processors without VNNI; convolutions stay
     fp32.
     """
-    import logging
-
     from onnxruntime.quantization import QuantType, quantize_dynamic
 
-    logging.getLogger().setLevel(
-        logging.ERROR
-    )  # it recommends a pre-processing that changes nothing for a traced graph
     network, small = trained.network, path.with_name(f"{path.stem}_int8.onnx")
     with tempfile.TemporaryDirectory(dir=path.parent) as folder:
         source, unproven = path, Path(folder, small.name)
@@ -206,11 +203,24 @@ def _write_int8(trained: Trained, path: Path) -> str:
             source = Path(folder, "products.onnx")
             _write_edge(trained, source, products=True)
             kinds = {"op_types_to_quantize": ["MatMul"], "per_channel": True, "reduce_range": True}
-        quantize_dynamic(str(source), str(unproven), weight_type=QuantType.QInt8, **kinds)
+        with _without_advice():
+            quantize_dynamic(str(source), str(unproven), weight_type=QuantType.QInt8, **kinds)
         apart = onnx_parity.int8(network, unproven)
         before, after = onnx_parity.seconds(network, path), onnx_parity.seconds(network, unproven)
         os.replace(unproven, small)
     return f"{small}: {small.stat().st_size / 1e6:.2f} MB, {apart}, {after / before:.2f} of the fp32 file's time"
+
+
+@contextmanager
+def _without_advice() -> Iterator[None]:
+    """The quantiser recommends a pre-processing that changes nothing for a traced graph, by the root logger."""
+    root = logging.getLogger()
+    before = root.level
+    root.setLevel(logging.ERROR)
+    try:
+        yield
+    finally:
+        root.setLevel(before)
 
 
 def main(argv: list[str] | None = None) -> int:
