@@ -15,7 +15,17 @@ import numpy as np
 import soundfile
 
 from bench.measure.conversation import Conversation
-from bench.measure.real_streams import ECHO_ONLY, Cells, Laid, Recording, Signals, find_recordings, lay, looped
+from bench.measure.real_streams import (
+    ECHO_ONLY,
+    ROBOT_ALONE,
+    Cells,
+    Laid,
+    Recording,
+    Signals,
+    find_recordings,
+    lay,
+    looped,
+)
 from edgefilter.errors import UsageError
 from edgefilter.profile.data import Profile
 from edgefilter.types import Samples
@@ -131,7 +141,7 @@ class Laying:
     """How humans of a folder of speech are laid on recordings of a real loudspeaker alone."""
 
     speech: Path | None = None
-    echo_only: str = "device1_*"
+    echo_only: str = ROBOT_ALONE
     cells: Cells = Cells(befores=(5.0,))
     cases: int = 8
     seed: int = 0

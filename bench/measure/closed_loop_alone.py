@@ -13,7 +13,7 @@ from bench.measure.closed_loop_scenes import Talk, listen
 from bench.measure.conversation import progress
 from bench.measure.kept_rows import KeptRows
 from bench.measure.real_barge_in import THRESHOLDS, replay, starts
-from bench.measure.real_streams import ECHO_ONLY, chosen, find_recordings
+from bench.measure.real_streams import ECHO_ONLY, ROBOT_ALONE, chosen, find_recordings
 from bench.simulate.conversations import read_voices
 from bench.simulate.robot_alone import Monologue, make_monologue
 from edgefilter.calibration.calibrate import calibrate
@@ -55,7 +55,7 @@ def monologue(made: Monologue, engine: str) -> dict:
 
 def real_minutes(folder: Path, engine: str) -> list[dict]:
     """A row for each recording of the reporting half without a human."""
-    found = [r for r in chosen(find_recordings(folder, "device1_*"), "report", "*") if r.kind == ECHO_ONLY]
+    found = [r for r in chosen(find_recordings(folder, ROBOT_ALONE), "report", "*") if r.kind == ECHO_ONLY]
     rows = []
     for recording in progress(found):
         mic, ref, _, _ = recording.signals()

@@ -21,7 +21,7 @@ from scipy.sparse.linalg import LinearOperator, lsmr
 
 from bench import results_writer
 from bench.measure.conversation import Conversation, every, find_conversations
-from bench.measure.real_streams import ECHO_ONLY, Cells, chosen, find_recordings, lay
+from bench.measure.real_streams import ECHO_ONLY, ROBOT_ALONE, Cells, chosen, find_recordings, lay
 from edgefilter import enhance
 from edgefilter.errors import EdgefilterError
 from edgefilter.types import SAMPLE_RATE, Samples
@@ -118,7 +118,7 @@ def main() -> int:
     parser.add_argument("--speech", type=Path, required=True, metavar="HUMAN")
     parser.add_argument("--conversations", type=Path, nargs="*", default=[], metavar="PAPER")
     parser.add_argument("--every", type=int, default=1, metavar="N", help="every Nth conversation")
-    parser.add_argument("--echo-only", default="device1_*", help="recordings of the robot alone (default: %(default)s)")
+    parser.add_argument("--echo-only", default=ROBOT_ALONE, help="recordings of the robot alone (default: %(default)s)")
     parser.add_argument("--split", default="report", choices=("tune", "report", "all"))
     parser.add_argument("--cases", type=int, default=6)
     parser.add_argument("--seed", type=int, default=0)

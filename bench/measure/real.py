@@ -30,7 +30,7 @@ from tqdm import tqdm
 from bench import results_writer
 from bench.measure import real_report
 from bench.measure.real_scores import Recognition, aecmos, score
-from bench.measure.real_streams import ECHO_ONLY, Cells, Laid, Recording, chosen, find_recordings, lay
+from bench.measure.real_streams import ECHO_ONLY, ROBOT_ALONE, Cells, Laid, Recording, chosen, find_recordings, lay
 from bench.measure.real_systems import DEFAULT, UNOBTAINABLE, code_version
 from bench.measure.score_cache import ScoreCache, key_of
 from edgefilter.errors import EdgefilterError, UsageError
@@ -143,7 +143,7 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
     )
     parser.add_argument(
         "--echo-only",
-        default="device1_*",
+        default=ROBOT_ALONE,
         metavar="PATTERN",
         help="names of the recordings without a human (default: %(default)s)",
     )

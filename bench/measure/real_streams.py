@@ -19,6 +19,8 @@ LENGTHS_S = 1.0
 """Seconds by which a loopback may differ from its microphone: recorders of real devices stop one after the other."""
 KINDS = ("doubletalk", "farend", "nearend")
 ECHO_ONLY = "echo-only"
+ROBOT_ALONE = "device1_*"
+"""Names of the public recordings that hold the robot alone."""
 UTTERANCE_S = (3.0, 10.0)
 """Length of the humans' utterances: some words, and over before the recording is."""
 TAIL_S = 0.5

@@ -25,7 +25,7 @@ import torch
 from bench import results_writer
 from bench.measure.conversation import Conversation, every, find_conversations, progress
 from bench.measure.intervals import interval
-from bench.measure.real_streams import Cells, Laid, chosen, find_recordings, lay
+from bench.measure.real_streams import ECHO_ONLY, ROBOT_ALONE, Cells, Laid, chosen, find_recordings, lay
 from bench.measure.recogniser import Recogniser, word_errors
 from edgefilter import PathLearner
 from edgefilter.dsp.metrics import si_sdr
@@ -41,7 +41,6 @@ from export import onnx_export
 
 REAL = Cells(sers=(-10.0, -20.0), befores=(0.0, 10.0))
 """Of humans laid on real loudspeakers."""
-ECHO_ONLY = "device1_*"
 BASE = "ss"
 
 
@@ -250,8 +249,8 @@ def main() -> int:
         found = every(find_conversations(options.conversations), options.every)
         laid: list[Laid] = []
         if options.real:
-            recordings = chosen(find_recordings(options.real, ECHO_ONLY), "tune", ECHO_ONLY)
-            recordings = [recording for recording in recordings if recording.kind == "echo-only"]
+            recordings = chosen(find_recordings(options.real, ROBOT_ALONE), "tune", "*")
+            recordings = [recording for recording in recordings if recording.kind == ECHO_ONLY]
             laid = lay(recordings, options.humans, None, REAL, options.real_cases, seed=1)
         rows = []
         for item in progress([*found, *laid], name="conversations"):
