@@ -227,10 +227,12 @@ def erb_bands(stft: StftConfig, count: int) -> Tensor:
 
 
 def _on_bands(x: Tensor, weights: Tensor) -> Tensor:
-    """(n, channels, 1, frequencies) times weights (frequencies, others), in the memory order in which x is."""
-    if x.is_contiguous():
-        return x @ weights
-    return (weights.T @ x.permute(0, 2, 3, 1)).permute(0, 3, 1, 2)
+    """(n, channels, 1, frequencies) times weights (frequencies, others), in the memory order in which x is.
+
+    As one product: with the weights on the left, a copy of them is made for each of the n.
+    """
+    y = x.contiguous() @ weights
+    return y if x.is_contiguous() else y.contiguous(memory_format=torch.channels_last)
 
 
 def _with_previous(x: Tensor, previous: Tensor) -> tuple[Tensor, Tensor]:
