@@ -17,10 +17,16 @@ SINKS = ("robot", "robot_mic")
 
 @dataclass
 class Server:
-    """environment: for the processes that are to use it."""
+    """environment: for the processes that are to use it. devices: its lines of ALSA's configuration."""
 
     process: subprocess.Popen
     environment: dict
+    devices: str
+
+    def add(self, other: Server) -> None:
+        """Let those who use this server see the other's devices too."""
+        with open(self.environment["ALSA_CONFIG_PATH"], "a") as configuration:
+            configuration.write(other.devices)
 
     def stop(self) -> None:
         self.process.kill()
@@ -30,7 +36,7 @@ class Server:
 def start_server(folder: Path, sinks: Sequence[str] = SINKS) -> Server:
     """Start a server whose files all lie in folder and wait until its sinks are there.
 
-    The first two are the default output and microphone.
+    The first is the default output, the last the default microphone.
     """
     socket = f"unix:{folder}/socket"
     environment = {
@@ -49,14 +55,14 @@ def start_server(folder: Path, sinks: Sequence[str] = SINKS) -> Server:
     environment |= {"PULSE_SERVER": socket, "ALSA_CONFIG_PATH": str(folder / "asound.conf"), "OMP_NUM_THREADS": "1"}
     names = {**{name: name for name in sinks}, **{f"{name}_monitor": f"{name}.monitor" for name in sinks}}
     entries = [f'pcm.{pcm} {{ type pulse\n server "{socket}"\n device "{device}" }}\n' for pcm, device in names.items()]
-    entries += [f'pcm.{pcm} {{ type pulse\n server "{socket}" }}\n' for pcm in ("!default", "pulse")]
-    (folder / "asound.conf").write_text("</usr/share/alsa/alsa.conf>\n" + "".join(entries))
+    usual = [f'pcm.{pcm} {{ type pulse\n server "{socket}" }}\n' for pcm in ("!default", "pulse")]
+    (folder / "asound.conf").write_text("</usr/share/alsa/alsa.conf>\n" + "".join(entries + usual))
     for _ in range(300):
         listed = subprocess.run(["pactl", "list", "short", "sinks"], env=environment, capture_output=True, text=True)
         if all(f"\t{name}\t" in listed.stdout for name in sinks):
             subprocess.run(["pactl", "set-default-sink", sinks[0]], env=environment, check=True)
-            subprocess.run(["pactl", "set-default-source", f"{sinks[1]}.monitor"], env=environment, check=True)
-            return Server(process, environment)
+            subprocess.run(["pactl", "set-default-source", f"{sinks[-1]}.monitor"], env=environment, check=True)
+            return Server(process, environment, "".join(entries))
         if process.poll() is not None:
             break
         time.sleep(0.1)

@@ -60,8 +60,8 @@ class Stage:
 class Day:
     """A day's signals, (n,) float32 each, and its calibration.
 
-    mic = echo + clean + fan. stages: names. begins: sample of the microphone at which each of them begins. speech_s,
-    distinct_s: seconds of robot speech, and of those without repetitions.
+    mic = echo + clean + fan. stages: names. begins: sample of the microphone at which each of them begins. told: what
+    the human says, and where in clean. speech_s, distinct_s: seconds of robot speech, and of those without repetitions.
     """
 
     ref: Samples
@@ -71,6 +71,7 @@ class Day:
     calibration: tuple[Samples, Samples, Samples]
     stages: tuple[str, ...]
     begins: tuple[int, ...]
+    told: tuple[tuple[str, slice], ...]
     speech_s: float
     distinct_s: float
 
@@ -126,16 +127,20 @@ def speak(
     return ref, warp(echo, stage.ppm), [slice(start + later, start + later + x.size) for start, x in said]
 
 
-def interrupt(rng: np.random.Generator, speech: list[Clip], room: Room, heard: list[slice], size: int) -> Array:
-    """(size,) a human of unit power at the microphone, who talks over some of the utterances."""
-    clean, free = np.zeros(size), 0
+def interrupt(
+    rng: np.random.Generator, speech: list[Clip], room: Room, heard: list[slice], size: int
+) -> tuple[Array, list[tuple[str, slice]]]:
+    """(size,) a human of unit power at the microphone, who talks over some of the utterances; what is said, and where."""
+    clean, told, free = np.zeros(size), [], 0
     for utterance in heard:
         begin = utterance.start + int(rng.uniform(0.3, 1.5) * RATE)
         if rng.random() < INTERRUPTED and begin >= free:
-            voice = signal.oaconvolve(read_speech(speech[rng.integers(len(speech))]), room.human)[: size - begin]
+            clip = speech[rng.integers(len(speech))]
+            voice = signal.oaconvolve(read_speech(clip), room.human)[: size - begin]
             clean[begin : begin + voice.size] = voice / math.sqrt(np.mean(voice**2))
+            told.append((clip.text, slice(begin, begin + voice.size)))
             free = begin + voice.size + RATE
-    return clean
+    return clean, told
 
 
 def draw_stages(rng: np.random.Generator, robot: Robot, stage_s: float) -> list[Stage]:
@@ -162,10 +167,11 @@ def make_day(seed: int, minutes: float, voices: list[Clip], speech: list[Clip]) 
     repertoire, robot = Repertoire(rng, voices), draw_robot(rng)
     stages = draw_stages(rng, robot, 60 * minutes / STAGES)
     robot, _ = with_distortion(robot, next(Repertoire(rng, voices)), stages[0].room.robot, DISTORTION_DB)
-    parts, begins, now, level = [], [], 0, 0.0
+    parts, begins, told, now, level = [], [], [], 0, 0.0
     for stage in stages:
         ref, echo, heard = speak(rng, robot, repertoire, stage, 60 * minutes / STAGES)
-        human = interrupt(rng, speech, stage.room, heard, ref.size)
+        human, said = interrupt(rng, speech, stage.room, heard, ref.size)
+        told += [(text, slice(now + place.start, now + place.stop)) for text, place in said]
         level = level or loudness(echo, heard)
         parts.append([x.astype(np.float32) for x in (ref, echo, human)])
         begins.append(now)
@@ -177,7 +183,8 @@ def make_day(seed: int, minutes: float, voices: list[Clip], speech: list[Clip]) 
     mic = np.float32(microphone.gain) * echo + clean + fan
     sweeps = calibration(rng, robot, stages[0].room, microphone)
     names = tuple(stage.name for stage in stages)
-    return Day(ref, mic, clean, fan, sweeps, names, tuple(begins), repertoire.speech_s, repertoire.distinct_s)
+    said = repertoire.speech_s, repertoire.distinct_s
+    return Day(ref, mic, clean, fan, sweeps, names, tuple(begins), tuple(told), *said)
 
 
 def loudness(echo: Array, heard: list[slice]) -> float:
