@@ -1,0 +1,203 @@
+r"""Is the probability of speech one? The centre and slope that make it so, and what is noticed at which price.
+
+    python -m bench.measure.barge_in_fit RECORDINGS --speech HUMAN/val --conversations VALIDATION/paper VALIDATION/live \
+        --every 3 --output PATH                        (EDGEFILTER_CRNN=FILE.onnx for a network other than the package's)
+
+Robots alone and humans laid on them (RECORDINGS, the tuning half, without a profile), and simulated conversations with
+theirs. Of each hop: the averaged log-odds that `edgefilter/filter/barge_in.py` weighs, and whether the human sounds.
+A logistic of both is fitted (Platt 1999), a human in one hop of four; the page says which CENTRE and SLOPE it has, how
+far the probability is from the share of humans before and after, and for each threshold false starts an hour against
+humans noticed.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from scipy.optimize import minimize
+from scipy.special import expit, logit
+
+from bench import results_writer
+from bench.measure.conversation import every, find_conversations, progress
+from bench.measure.levels import frame_power
+from bench.measure.real_barge_in import FIRST_DB, IN_TIME_S, THRESHOLDS, first_sound, in_time, noticed, replay, starts
+from bench.measure.real_streams import ECHO_ONLY, ROBOT_ALONE, Cells, chosen, find_recordings, lay
+from edgefilter import EgoFilter
+from edgefilter.errors import EdgefilterError
+from edgefilter.filter.barge_in import CENTRE, CENTRE_CALIBRATED, SLOPE
+from edgefilter.profile.data import Profile
+from edgefilter.types import SAMPLE_RATE, Samples
+
+ENGINE = "crnn"
+HUMAN_SHARE = 0.25
+"""Share of hops with a human that the probability is to be right for."""
+EDGES = (0.0, 0.02, 0.1, 0.3, 0.5, 0.7, 0.9, 0.98, 1.0)
+"""Of the probability, between the rows of the reliability table."""
+SERS_DB = (0.0, -10.0, -20.0, -26.0)
+AT_DB = -20.0
+"""The laid humans of which the page says how many were noticed."""
+SURE = 1e-9
+
+
+class Listened(NamedTuple):
+    """odds: averaged log-odds after each hop of so many samples; human: whether one sounds in it; ser: of a laid human, dB."""
+
+    kind: str
+    odds: np.ndarray
+    human: np.ndarray
+    hop: int
+    onset: int | None = None
+    ser: float | None = None
+
+
+def listened(kind: str, mic: Samples, ref: Samples, human: Samples | None, profile: Profile | None) -> Listened:
+    """What the network made of a recording, hop by hop."""
+    ego, found = EgoFilter(profile, ENGINE), []
+    hop = ego.hop
+    centre = CENTRE if profile is None else CENTRE_CALIBRATED
+    for at in range(0, mic.size - hop + 1, hop):
+        ego.process(mic[at : at + hop], ref[at : at + hop])
+        found.append(ego.speech_probability or 0.0)
+    odds = logit(np.clip(found, SURE, 1 - SURE)) / SLOPE + centre
+    if human is None:
+        return Listened(kind, odds, np.zeros(odds.size, bool), hop)
+    power = frame_power(human[: odds.size * hop], hop)
+    sounds = power > 10 ** (-FIRST_DB / 10) * power.max()
+    return Listened(kind, odds, sounds, hop, first_sound(human))
+
+
+def streams(options: argparse.Namespace) -> Iterator[Listened]:
+    """Everything that there is to listen to; robots alone with no human, and the others."""
+    recordings = chosen(find_recordings(options.recordings, ROBOT_ALONE), "tune", "*")
+    alone = [recording for recording in recordings if recording.kind == ECHO_ONLY]
+    laid = lay(alone, options.speech, None, Cells(SERS_DB, (5.0,)), options.cases, options.seed)
+    for recording in progress(alone, "alone"):
+        signals = recording.signals()
+        yield listened("real", signals.mic, signals.ref, None, None)
+    for stream in progress(laid, "laid"):
+        signals = stream.signals()
+        human = np.zeros_like(signals.mic)
+        human[signals.span] = signals.human[signals.span]
+        yield listened("real", signals.mic, signals.ref, human, None)._replace(ser=stream.ser)
+    sets = find_conversations(options.conversations) if options.conversations else {}
+    for _, conversation in progress(every(sets, options.every), "conversation"):
+        mic, ref, clean = (conversation.read(name) for name in ("mic", "ref", "clean"))
+        yield listened("simulated", mic, ref, clean, conversation.profile)
+
+
+def fitted(chosen_ones: list[Listened]) -> tuple[float, float]:
+    """Centre and slope of the logistic, by maximum likelihood, a human in HUMAN_SHARE of the hops."""
+    odds = np.concatenate([one.odds for one in chosen_ones])
+    human = np.concatenate([one.human for one in chosen_ones])
+    weight = np.where(human, HUMAN_SHARE / max(human.mean(), SURE), (1 - HUMAN_SHARE) / max(1 - human.mean(), SURE))
+
+    def cost(x: np.ndarray) -> float:
+        z = np.exp(x[1]) * (odds - x[0])
+        return float(np.mean(weight * (np.logaddexp(0.0, z) - human * z)))
+
+    centre, log_slope = minimize(cost, np.array([CENTRE, np.log(SLOPE)]), method="Nelder-Mead").x
+    return float(centre), float(np.exp(log_slope))
+
+
+def reliability(chosen_ones: list[Listened], centre: float, slope: float) -> dict:
+    """Share of hops with a human by the probability's value, and the mean distance of both (Guo et al. 2017, eq. (3))."""
+    odds = np.concatenate([one.odds for one in chosen_ones])
+    human = np.concatenate([one.human for one in chosen_ones])
+    weight = np.where(human, HUMAN_SHARE / human.mean(), (1 - HUMAN_SHARE) / (1 - human.mean()))
+    said = expit(slope * (odds - centre))
+    rows, far = [], 0.0
+    for low, high in zip(EDGES, EDGES[1:], strict=False):
+        here = (said >= low) & (said <= high if high == 1.0 else said < high)
+        if here.any():
+            mean, share = (float(np.average(x[here], weights=weight[here])) for x in (said, human))
+            rows.append({"low": low, "high": high, "hops": int(here.sum()), "said": mean, "share": share})
+            far += abs(mean - share) * weight[here].sum() / weight.sum()
+    return {"rows": rows, "distance": far}
+
+
+def curve(chosen_ones: list[Listened], centre: float, slope: float) -> list[dict]:
+    """For each threshold: false starts an hour on robots alone, and laid or conversing humans noticed in time."""
+    alone = [one for one in chosen_ones if one.onset is None]
+    heard = [one for one in chosen_ones if one.onset is not None and one.ser in (None, AT_DB)]
+    hours = sum(one.odds.size * one.hop for one in alone) / SAMPLE_RATE / 3600
+    points = []
+    for threshold in THRESHOLDS:
+        events = [replay(expit(slope * (one.odds - centre)).tolist(), one.hop, threshold) for one in (*alone, *heard)]
+        false = sum(starts(found) for found in events[: len(alone)])
+        soon = [in_time(noticed(found, one.onset)) for found, one in zip(events[len(alone) :], heard, strict=True)]
+        points.append(
+            {"threshold": threshold, "an_hour": false / hours if hours else None, "noticed": float(np.mean(soon))}
+        )
+    return points
+
+
+def markdown(kinds: dict) -> str:
+    """For each kind its fit, its reliability before and after, and its curve."""
+    lines = [f"Of {ENGINE}'s network; a human in one hop of {1 / HUMAN_SHARE:.0f}.", ""]
+    fits = [
+        [
+            name,
+            *(f"{of[x]:.2f}" for x in ("centre", "slope")),
+            *(f"{of[x]['distance']:.3f}" for x in ("before", "after")),
+        ]
+        for name, of in kinds.items()
+    ]
+    lines += results_writer.table(["", "centre", "slope", "distance as it is", "distance fitted"], fits)
+    for name, of in kinds.items():
+        lines += ["", f"{name}, the probability and the share of hops with a human, as it is and fitted:", ""]
+        lines += results_writer.table(["", "probability", "hops", "mean", "share"], _rows(of))
+        lines += ["", f"{name}, fitted:", ""]
+        cells = []
+        for point in of["curve"]:
+            false = "" if point["an_hour"] is None else f"{point['an_hour']:.0f}"
+            cells.append([point["threshold"], false, f"{100 * point['noticed']:.0f}"])
+        lines += results_writer.table(["threshold", "false starts an hour", f"noticed in {IN_TIME_S} s, %"], cells)
+    return "\n".join([*lines, ""])
+
+
+def _rows(of: dict) -> list[list]:
+    """Of the reliability table."""
+    rows = []
+    for name, when in (("before", "as it is"), ("after", "fitted")):
+        for row in of[name]["rows"]:
+            bounds = f"{row['low']:g} to {row['high']:g}"
+            rows.append([when, bounds, row["hops"], f"{row['said']:.2f}", f"{row['share']:.2f}"])
+    return rows
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("recordings", type=Path, metavar="RECORDINGS")
+    parser.add_argument("--speech", type=Path, required=True, metavar="DIR", help="humans to lay on them")
+    parser.add_argument("--conversations", type=Path, nargs="*", default=[], metavar="DIR")
+    parser.add_argument("--every", type=int, default=1, metavar="N", help="N-th conversation only")
+    parser.add_argument("--cases", type=int, default=12, help="humans laid at each level")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--output", type=Path, required=True, metavar="PATH")
+    options = parser.parse_args()
+    data = {"RECORDINGS": [options.recordings], "HUMAN": [options.speech], "conversations": options.conversations}
+    try:
+        made_with = results_writer.stamp(data, [ENGINE])
+        found = list(streams(options))
+    except (EdgefilterError, OSError) as error:
+        print(f"barge_in_fit: {error}", file=sys.stderr)
+        return 1
+    kinds = {}
+    for kind in dict.fromkeys(one.kind for one in found):
+        own = [one for one in found if one.kind == kind]
+        usual = CENTRE if kind == "real" else CENTRE_CALIBRATED
+        centre, slope = fitted(own)
+        before, after = reliability(own, usual, SLOPE), reliability(own, centre, slope)
+        shown = curve(own, centre, slope)
+        kinds[kind] = {"centre": centre, "slope": slope, "before": before, "after": after, "curve": shown}
+    print(results_writer.write(options.output, made_with, "Probability of speech", markdown(kinds), {"kinds": kinds}))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,43 @@
+"""The fit of the barge-in probability on odds whose truth is known."""
+
+import numpy as np
+import pytest
+from scipy.special import expit
+
+from bench.measure.barge_in_fit import HUMAN_SHARE, Listened, curve, fitted, markdown, reliability
+
+
+@pytest.fixture(scope="module")
+def known():
+    """Hops whose log-odds say the truth by a logistic of centre 1.5 and slope 0.8 where a quarter of them are human."""
+    rng = np.random.default_rng(3)
+    odds = rng.uniform(-6, 8, 60_000)
+    truth = rng.random(odds.size) < expit(0.8 * (odds - 1.5))
+    drop = truth & (rng.random(odds.size) > HUMAN_SHARE * (~truth).sum() / ((1 - HUMAN_SHARE) * truth.sum()))
+    odds, truth = odds[~drop], truth[~drop]
+    return Listened("real", odds, truth, 256, onset=0, ser=-20.0)
+
+
+def test_the_fit_is_right_about_odds_whatever_the_share_of_humans(known):
+    usual = fitted([known])
+    rare = known.human & (np.arange(known.human.size) % 4 > 0)
+    fewer = fitted([known._replace(odds=known.odds[~rare], human=known.human[~rare])])
+    assert usual == pytest.approx(fewer, abs=0.12)
+    assert reliability([known], *usual)["distance"] < 0.02
+    assert reliability([known], usual[0] - 2.0, usual[1])["distance"] > 0.1
+
+
+def test_the_curve_counts_false_starts_an_hour_and_who_is_noticed(known):
+    hour = np.full(3600 * 16_000 // 256, -9.0)
+    for at in (10_000, 100_000):
+        hour[at : at + 40] = 2.0  # logit 1.2 by the fit below: 0.77
+    alone = Listened("real", hour, np.zeros(hour.size, bool), 256)
+    odds = np.where(np.arange(400) >= 105, 9.0, -9.0)  # 5 hops behind the onset
+    human = Listened("real", odds, odds > 0, 256, onset=100 * 256, ser=-20.0)
+    late = human._replace(odds=np.roll(odds, 60))
+    louder = late._replace(ser=0.0)  # not among those that the page tells of
+    points = {point["threshold"]: point for point in curve([alone, human, late, louder], 1.0, 1.2)}
+    assert points[0.7]["an_hour"] == pytest.approx(2.0, rel=0.01) and points[0.9]["an_hour"] == 0
+    assert points[0.97]["noticed"] == 0.5
+    found = {"centre": 1.0, "slope": 1.2, "before": reliability([human], 3, 1), "after": reliability([human], 1, 1)}
+    assert "| 0.7 | 2 | 50 |" in markdown({"real": {**found, "curve": list(points.values())}})
