@@ -55,9 +55,10 @@ def test_two_processes_step_along_the_mean_of_their_gradients(tmp_path):
         for parameter, first, second in zip(alone.network.parameters(), *gradients, strict=True):
             parameter.grad = (first + second) / 2
         torch.nn.utils.clip_grad_norm_(alone.network.parameters(), 1.0)
-        for group in alone.optimiser.param_groups:
-            group["lr"] = plan.rate_at(step)
-        alone.optimiser.step()
+        for optimiser in alone.optimisers:
+            for group in optimiser.param_groups:
+                group["lr"] = plan.rate_at(step)
+            optimiser.step()
     for name, wanted in alone.network.state_dict().items():
         # Adam divides by the gradient's size: rounding of a gradient near zero shows in full
         assert torch.allclose(found["running"][name], wanted, atol=2e-5), name

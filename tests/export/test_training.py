@@ -15,7 +15,7 @@ from export.crops import Batches, Items, Shape
 from export.losses import LossWeights, edge_loss, power_law_loss, si_sdr
 from export.network import MOST_LOGITS, EdgeConfig, EdgeCrnn, corrected, count, erb_bands, opened
 from export.paper_network import PaperConfig
-from export.trainer import Plan
+from export.trainer import Plan, optimisers
 from tests.export.speech import write_librispeech, write_table
 
 SMALL = EdgeConfig(64, 32, channels=(4, 4, 4, 4), hidden=8)
@@ -359,3 +359,12 @@ def test_the_papers_network_trains_too(tmp_path, monkeypatch):
     train.main()
     saved = torch.load(tmp_path / "run" / "best.pt", weights_only=True)
     assert saved["kind"] == "paper" and saved["config"]["lstm"] == 4
+
+
+def test_every_weight_has_one_optimiser_and_every_matrix_the_one_for_matrices():
+    network = EdgeCrnn(SMALL)
+    muon, adam = optimisers(network, 1e-3)
+    held = [{id(weight) for group in one.param_groups for weight in group["params"]} for one in (muon, adam)]
+    assert held[0] | held[1] == {id(weight) for weight in network.parameters()} and not held[0] & held[1]
+    assert {id(network.inward.weight), id(network.memory.weight_hh_l0)} <= held[0]
+    assert {id(network.mask.weight), id(network.speech.weight), id(network.inward.bias)} <= held[1]
