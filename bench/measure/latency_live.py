@@ -127,7 +127,7 @@ def distance_ms(recording: np.ndarray) -> float:
 
 def pass_through(mic: str, reference: str, output: str) -> None:
     """What the devices themselves need: blocks from the source straight into the sink."""
-    from edgefilter.audio.device import LiveSink, LiveSource
+    from edgefilter.audio.live import LiveSink, LiveSource
 
     with LiveSource(mic, reference) as source, LiveSink(output, wait=False) as sink:
         for block in source:

@@ -57,7 +57,7 @@ def _read(path: str, role: str) -> Samples:
 
 
 def _record(args: argparse.Namespace) -> tuple[Samples, Samples, Samples]:
-    from edgefilter.audio.device import play_and_record
+    from edgefilter.audio.play_and_record import play_and_record
 
     amplitude = 10 ** (args.level_db / 20)
     sweep = generate_stepped_sine(amplitude) if args.stepped_sine else generate_sweep(amplitude=amplitude)

@@ -46,7 +46,8 @@ def make_source(name: str, reference: str | SpokenReference | None, output: str)
     if isinstance(reference, str | None) and (name == "-" or looks_like_file(name)):
         return open_source(name, reference)
     virtual.refuse_own(name)
-    from edgefilter.audio.device import LiveSource, monitor_of
+    from edgefilter.audio.device import monitor_of
+    from edgefilter.audio.live import LiveSource
 
     if isinstance(reference, str) and looks_like_file(reference):
         raise UsageError(
@@ -69,7 +70,7 @@ def make_sink(name: str, latency: int, wait: bool) -> Sink:
         return PcmSink()
     if looks_like_file(name):
         return FileSink(name)
-    from edgefilter.audio.device import LiveSink
+    from edgefilter.audio.live import LiveSink
 
     if wait:
         return LiveSink(name, latency, wait=True)

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from edgefilter.audio import device, port, steady
-from edgefilter.audio.device import LiveSink, LiveSource
+from edgefilter.audio import device, live, port, steady
 from edgefilter.audio.files import FileSink, FileSource
+from edgefilter.audio.live import LiveSink, LiveSource
 from edgefilter.audio.pairing import TOLERANCE
 from edgefilter.audio.steady import LEAST_S, WATCH_S, SampleClock
 from edgefilter.audio.steady_sink import SteadySink
@@ -26,9 +26,9 @@ def plug(monkeypatch):
     def plug(*devices):
         system = VirtualPortAudio(*devices)
         monkeypatch.setattr(device, "_sounddevice", lambda: system)
-        for module in (device, port, steady):
+        for module in (live, port, steady):
             monkeypatch.setattr(module, "time", system)
-        monkeypatch.setattr(device, "POLL_S", CALLBACK_S / 2)
+        monkeypatch.setattr(live, "POLL_S", CALLBACK_S / 2)
         return system
 
     return plug

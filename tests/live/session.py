@@ -14,7 +14,9 @@ from pathlib import Path
 import numpy as np
 import soundfile
 
-from edgefilter.audio.device import LiveSink, LiveSource, list_devices, monitor_of, play_and_record
+from edgefilter.audio.device import list_devices, monitor_of
+from edgefilter.audio.live import LiveSink, LiveSource
+from edgefilter.audio.play_and_record import play_and_record
 from edgefilter.errors import EdgefilterError
 
 folder = Path(sys.argv[2])

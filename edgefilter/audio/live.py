@@ -1,0 +1,227 @@
+"""Live audio: two devices as a source of blocks, one as a sink."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from functools import partial
+
+import numpy as np
+
+from edgefilter.audio.device import find, input_port, output_port
+from edgefilter.audio.lookup import Device
+from edgefilter.audio.pairing import Pairing
+from edgefilter.audio.port import POLL_S, START_S, InputPort
+from edgefilter.audio.speech import SpokenReference
+from edgefilter.audio.steady import SteadyInput
+from edgefilter.errors import DeviceError
+from edgefilter.types import SAMPLE_RATE, Block, Samples
+
+MARGIN_S = 0.04
+"""Silence ahead of a live output, on top of the declared latency, against the jitter of both devices' callbacks."""
+SETTLE_S = 0.2
+"""A stream may stall right after its start; so much of each input is discarded before the first block."""
+_SLACK_S = 0.3
+
+
+class LiveSource:
+    """Microphone and reference devices as blocks on the microphone's sample counter, until stop() or `seconds`.
+
+    patience_s: how long a device may be away; silence stands in meanwhile, by the clock, and it is opened again as soon
+    as that can be done. Raises DeviceError, after everything received has been delivered, when a device is away for
+    longer. reference None: silence. lost: samples left out, filled or moved so far, see stats(): overruns are callbacks
+    that the driver marked, each of which may hide an unknown number of samples.
+    """
+
+    live = True
+
+    def __init__(
+        self,
+        mic: str | int | Device | None,
+        reference: str | int | Device | SpokenReference | None = None,
+        seconds: float | None = None,
+        patience_s: float = 0.0,
+    ) -> None:
+        self._mic = SteadyInput(_opener(mic), patience_s)
+        self._reference = None if reference is None else SteadyInput(_opener(reference), patience_s)
+        self._pairing = Pairing(late_is_lost=not isinstance(reference, SpokenReference))
+        self._stopped = False
+        self.total = None if seconds is None else round(seconds * SAMPLE_RATE)
+        self.notes = [f"microphone: {self._mic.port.device}", *self._mic.port.notes]
+        if self._reference is not None:
+            how = "what is played on " if isinstance(reference, SpokenReference) else ""
+            self.notes += [f"reference: {how}{self._reference.port.device}", *self._reference.port.notes]
+
+    def __enter__(self) -> LiveSource:
+        try:
+            for each in self._inputs():
+                each.open()
+        except DeviceError:
+            self.__exit__()
+            raise
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        for each in self._inputs():
+            each.close()
+        troubles = {name: count for name, count in self.stats().items() if count and name != "lost"}
+        if troubles:
+            words = ", ".join(f"{count} {name.replace('_', ' ')}" for name, count in troubles.items())
+            self.notes.append(f"live input was not complete: {words}")
+
+    def _inputs(self) -> list[SteadyInput]:
+        """The reference first, so that it is there when the microphone starts."""
+        return [self._mic] if self._reference is None else [self._reference, self._mic]
+
+    def stop(self) -> None:
+        self._stopped = True
+
+    @property
+    def lost(self) -> int:
+        return self.stats()["lost"]
+
+    def stats(self) -> dict[str, int]:
+        """Samples at 16 kHz by what befell them; callbacks marked as overrun; how often a device went away and came back."""
+        counts = {f"reference_{name}": getattr(self._pairing, name) for name in ("filled", "dropped", "inserted")}
+        both = (("microphone", self._mic), ("reference", self._reference))
+        for name, each in both:
+            counts[f"{name}_lost"], counts[f"{name}_away"] = (each.lost, each.filled) if each else (0, 0)
+        found = {"lost": sum(counts.values()), **counts}
+        for name, each in both:
+            times = (each.overruns, each.gone, each.back) if each else (0, 0, 0)
+            found |= dict(zip((f"{name}_overruns", f"{name}_gone", f"{name}_back"), times))
+        return found
+
+    def __iter__(self) -> Iterator[Block]:
+        given = reported = 0
+        failure = None
+        self._synchronise()
+        while not self._stopped and failure is None:
+            block = self._take()
+            try:
+                for each in self._inputs():
+                    each.check()
+            except DeviceError as error:
+                failure, rest = error, self._pairing.flush()
+                block = block if rest is None else rest if block is None else _join(block, rest)
+            if block is None:
+                time.sleep(POLL_S)
+                continue
+            left = block.mic.size if self.total is None else min(block.mic.size, self.total - given)
+            lost, reported = self.lost - reported, self.lost
+            yield Block(block.mic[:left], block.ref[:left], block.start, lost)
+            given += left
+            if given == self.total:
+                return
+        if failure is not None:
+            raise failure
+
+    def _take(self) -> Block | None:
+        """What came of both devices, as far as it can be paired."""
+        mic = self._mic.take()
+        if self._reference is None:
+            return self._pairing.push(mic, np.zeros_like(mic))
+        before = self._reference.filled
+        ref = self._reference.take()
+        return self._pairing.push(mic, ref, self._reference.filled - before)
+
+    def _synchronise(self) -> None:
+        """Wait until both devices run steadily, and begin with what arrives then.
+
+        The reference is emptied last: one that is too new only adds delay, one that is too old would come before its
+        echo.
+        """
+        while not self._stopped and not all(each.settled >= SETTLE_S for each in self._inputs()):
+            for each in self._inputs():
+                each.port.check_alive(each.port.inlet.received, START_S)
+            time.sleep(POLL_S)
+        for each in reversed(self._inputs()):
+            each.begin()
+
+
+def _opener(device: str | int | Device | SpokenReference | None) -> Callable[[], InputPort | SpokenReference]:
+    """What makes an input of a device, each time anew; what is spoken goes on where it was."""
+    if isinstance(device, SpokenReference):
+        return lambda: device
+    return partial(input_port, find(device, "input"))
+
+
+def _join(first: Block, second: Block) -> Block:
+    return Block(
+        np.concatenate((first.mic, second.mic)),
+        np.concatenate((first.ref, second.ref)),
+        first.start,
+        first.lost + second.lost,
+    )
+
+
+class LiveSink:
+    """A loudspeaker or virtual device that first plays `latency` samples of silence, so that sound lags the input evenly.
+
+    MARGIN_S more silence comes before it as a reserve against jitter. wait: hold the writer up when enough is queued
+    (right for a file as source); otherwise, with a live source, what is too much is dropped and counted. An underrun
+    plays silence, is counted, and ends when the reserve is there again. Raises DeviceError when the device stops.
+    """
+
+    def __init__(self, device: str | int | Device | None, latency: int = 0, wait: bool = True) -> None:
+        self._port = output_port(device, latency, MARGIN_S)
+        self._lead = round(latency * self._port.rate / SAMPLE_RATE) + self._port.margin
+        self._most = self._lead + round(_SLACK_S * self._port.rate)
+        self._wait, self._open = wait, False
+        self.notes = [f"output: {self._port.device}", *self._port.notes]
+        self.finished = False
+        self.written = self.dropped = self.clipped = 0
+
+    def __enter__(self) -> LiveSink:
+        self._port.outlet.ring.write(np.zeros(self._lead, np.float32))
+        return self
+
+    def write(self, samples: Samples) -> None:
+        """Queue samples (n,); the device starts with the first ones."""
+        loud = int(np.count_nonzero(np.abs(samples) > 1.0))
+        self.clipped += loud
+        self._queue(self._port.convert(np.clip(samples, -1.0, 1.0) if loud else samples))
+        self.written += samples.size
+        if not self._open and samples.size:
+            self._port.open()
+            self._open = True
+        if self._open:
+            self._port.check_alive(self._port.outlet.calls, START_S)
+
+    def _queue(self, data: Samples) -> None:
+        ring = self._port.outlet.ring
+        piece = self._port.rate // 10
+        for at in range(0, data.size, piece):
+            if self._wait and self._open:
+                self._port.wait_until(self._most)
+            elif len(ring) > self._most:
+                self.dropped += data.size - at
+                return
+            ring.write(data[at : at + piece])
+
+    def stats(self) -> dict[str, int]:
+        """Samples written (16 kHz), clipped; dropped and missing (at the device's rate).
+
+        Underruns: callbacks that found too little.
+        """
+        outlet = self._port.outlet
+        figures = {
+            "written": self.written,
+            "clipped": self.clipped,
+            "underruns": max(outlet.underruns, self._port.flags),
+        }
+        return figures | {"missing": outlet.missing, "dropped": self.dropped + outlet.ring.lost}
+
+    def __exit__(self, *exc: object) -> None:
+        try:
+            if exc[0] is None and self._open:
+                self._port.outlet.draining.set()
+                self._queue(self._port.convert(np.zeros(0, np.float32), last=True))
+                self._port.wait_until(0)
+        finally:
+            self._port.close(drain=exc[0] is None)
+            troubles = {name: count for name, count in self.stats().items() if count and name != "written"}
+            if troubles:
+                self.notes.append(
+                    "live output was not complete: " + ", ".join(f"{count} {name}" for name, count in troubles.items())
+                )
