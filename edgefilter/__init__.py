@@ -45,7 +45,7 @@ if TYPE_CHECKING:
     from edgefilter.errors import UsageError as UsageError
     from edgefilter.filter.barge_in import BargeInSettings as BargeInSettings
     from edgefilter.filter.ego_filter import EgoFilter as EgoFilter
-    from edgefilter.filter.ego_filter import enhance as enhance
+    from edgefilter.filter.enhance import enhance as enhance
     from edgefilter.learning.background import BackgroundLearner as BackgroundLearner
     from edgefilter.learning.path_learner import PathLearner as PathLearner
     from edgefilter.profile.data import Profile as Profile
@@ -80,7 +80,8 @@ _HOMES = {
         "UsageError",
     ),
     "filter.barge_in": ("BargeInSettings",),
-    "filter.ego_filter": ("EgoFilter", "enhance"),
+    "filter.ego_filter": ("EgoFilter",),
+    "filter.enhance": ("enhance",),
     "learning.background": ("BackgroundLearner",),
     "learning.path_learner": ("PathLearner",),
     "profile.data": ("Profile",),

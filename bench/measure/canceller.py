@@ -23,7 +23,7 @@ from bench.measure import picture
 from bench.measure.conversation import Conversation, every, find_conversations, progress
 from edgefilter.dsp.metrics import erle, si_sdr
 from edgefilter.errors import EdgefilterError
-from edgefilter.filter.ego_filter import enhance
+from edgefilter.filter.enhance import enhance
 from edgefilter.types import SAMPLE_RATE
 
 ACTIVE = 1e-6

@@ -13,7 +13,8 @@ from edgefilter.audio.files import FileSink, FileSource
 from edgefilter.commands.display import describe_latency, write_json
 from edgefilter.dsp.metrics import si_sdr
 from edgefilter.engines import NEEDS_PROFILE
-from edgefilter.filter.ego_filter import EgoFilter, enhance
+from edgefilter.filter.ego_filter import EgoFilter
+from edgefilter.filter.enhance import enhance
 from edgefilter.session import filter_blocks
 from edgefilter.types import SAMPLE_RATE, Samples
 

@@ -1,4 +1,4 @@
-"""What users of the library hold: EgoFilter for blocks as they come, enhance for whole recordings."""
+"""What users of the library hold: EgoFilter, for blocks as they come."""
 
 from __future__ import annotations
 
@@ -6,8 +6,6 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
-
-import numpy as np
 
 from edgefilter import engines
 from edgefilter.engines.base import ClipEngine, Engine
@@ -293,45 +291,3 @@ def strongest(profile: Profile | None) -> tuple[Engine | ClipEngine, str]:
         except EdgefilterError as error:
             missing += f"; {name} cannot be used: {error}"
     raise UsageError(f"no engine can be made{missing}")
-
-
-def enhance(
-    mic: Samples,
-    ref: Samples,
-    profile: Profile | str | Path | None = None,
-    engine: str = "auto",
-    model: str | Path | None = None,
-    learn: Learner | None = None,
-) -> Samples:
-    """Filter a whole recording with its reference, by the same stream as live.
-
-    Parameters
-    ----------
-    mic, ref : ndarray of float, shape (n,)
-        What the microphone heard and what the robot said, full scale +-1, 16 kHz, on the same sample counter.
-    profile, engine, model, learn
-        As of `EgoFilter`.
-
-    Returns
-    -------
-    ndarray of float32, shape (n,)
-        The human, aligned with the input.
-
-    Raises
-    ------
-    SignalError
-        For another shape or dtype, unequal lengths, or samples that are not finite.
-    UsageError, ProfileError, ModelError
-        As of `EgoFilter`.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> robot = 0.1 * np.random.default_rng(0).standard_normal(48_000)
-    >>> heard = np.convolve(robot, [0.0] * 500 + [0.5, 0.2])[:48_000]
-    >>> left = enhance(heard, robot, engine="linear")[-16_000:]
-    >>> bool(np.mean(left**2) < 0.01 * np.mean(heard[-16_000:] ** 2))
-    True
-    """
-    ego = EgoFilter(profile, engine, model=model, learn=learn)
-    return np.concatenate((ego.process(mic, ref), ego.flush()))

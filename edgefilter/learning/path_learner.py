@@ -15,7 +15,8 @@ from edgefilter.echo.effects.catalogue import EFFECTS, find
 from edgefilter.echo.measurement import Measurement
 from edgefilter.echo.model import EchoModel
 from edgefilter.errors import ProfileError
-from edgefilter.filter.canceller import COLD, Canceller
+from edgefilter.filter.adaptation import COLD
+from edgefilter.filter.canceller import Canceller
 from edgefilter.filter.echo_path import TAPS, EchoPath, Effects, PathState, starting_path
 from edgefilter.filter.learner import Heard, Lesson
 from edgefilter.learning.contest import Rival

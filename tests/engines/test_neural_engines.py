@@ -16,7 +16,8 @@ from edgefilter.engines import create, onnx_file, onnx_session
 from edgefilter.engines.crnn import Crnn
 from edgefilter.engines.paper_crnn import PaperCrnn
 from edgefilter.errors import ModelError, SignalError, UsageError
-from edgefilter.filter.ego_filter import EgoFilter, enhance
+from edgefilter.filter.ego_filter import EgoFilter
+from edgefilter.filter.enhance import enhance
 from edgefilter.filter.stream import Stream
 from edgefilter.types import Frame
 from tests import conformance
