@@ -372,6 +372,15 @@ EFFECT_CASES: dict[str, dict[str, object]] = {
     "clock_drift": {"ppm": -80.0, "offset": 3.5},
     "delay_jump": {"times_s": np.array([3.3, 8.1]), "samples": np.array([37.4, -61.0])},
     "compression": {"threshold_db": -20.0, "ratio": 4.0, "attack_ms": 8.0, "release_ms": 200.0, "makeup_db": 3.0},
+    "limiter": {"ceiling_db": -16.0, "release_ms": 150.0, "makeup_db": 2.0},
+    "multiband_compression": {
+        "crossover_hz": np.array([350.0, 2000.0]),
+        "threshold_db": np.array([-30.0, -33.0, -40.0]),
+        "ratio": np.array([3.0, 2.0, 4.0]),
+        "attack_ms": 8.0,
+        "release_ms": 150.0,
+        "makeup_db": np.array([6.0, 3.0, 5.0]),
+    },
     "mic_agc": {"gain_db": 3.0 * np.sin(np.arange(4 * SECONDS) / 5.0)},
     "mic_clipping": {"level": 0.15},
     "bandlimit": {"cutoff_hz": 2500.0, "order": 6.0},
@@ -392,6 +401,8 @@ EFFECT_CASES: dict[str, dict[str, object]] = {
 
 
 RUN_CASES: dict[str, dict[str, object]] = {
+    # other crossovers shift the lag at which the aligner finds a robot that it does not know
+    "multiband_compression": {"crossover_hz": np.array([100.0, 6500.0])},
     "mic_agc": {"gain_db": 4.0 * np.sin(np.arange(4 * SECONDS) / 2.0), "range_db": 8.0, "time_constant_s": 0.5},
     "path_change": {"time_s": 0.0},
     "rattle": {"power": 1e-3, "decay_ms": 4.0},

@@ -46,6 +46,11 @@ class Criteria:
     """Of the level that one long filter explains, what a simple effect must explain to be taken for half of it."""
     nearly: float = 0.85
     """Share of the level that is explained where no other start is tried."""
+    little_db: float = 2.0
+    """Over the silences, and with no more than little_share of the power over the fan, neither: the model of the right
+    effect leaves as much, and another start costs seconds."""
+    little_share: float = 0.1
+    """See little_db."""
     better: float = 0.05
     """Of the level explained, what another start must explain more to be preferred: less is chance, and it is the less
     simple."""

@@ -47,7 +47,11 @@ def _runs(bench: Workbench, start: EchoModel) -> Iterator[EchoModel]:
     for first in _starts(bench, start):
         run = _stepwise(bench, start, first)
         yield run
-        if bench.explained(run) or bench.left(run) <= (1.0 - criteria.nearly) * bench.left(start):
+        if (
+            bench.explained(run)
+            or bench.left(run) <= (1.0 - criteria.nearly) * bench.left(start)
+            or bench.little(run, start)
+        ):
             for simple in _half_of_a_filter(bench, start, run):
                 yield _stepwise(bench, start, simple, criteria.long_filter - 1)
             return

@@ -90,6 +90,11 @@ class Workbench:
         """Whether a model leaves so little while the robot is heard that nothing further can be told in it."""
         return self.heard(model) <= self.criteria.heard_db or self.score(model).active_db <= self.criteria.fan_db
 
+    def little(self, model: EchoModel, start: EchoModel) -> bool:
+        """Whether a model leaves so little of what start leaves that the right effects may be in it."""
+        share = _over_fan(self.score(model).active_db) / max(_over_fan(self.score(start).active_db), 1e-12)
+        return self.heard(model) <= self.criteria.little_db and share <= self.criteria.little_share
+
     def left(self, model: EchoModel) -> float:
         """Level in dB over that of the silences."""
         score = self.score(model)

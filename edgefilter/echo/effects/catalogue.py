@@ -19,8 +19,10 @@ from edgefilter.echo.effects.early_path import EarlyPath
 from edgefilter.echo.effects.equaliser import Equaliser
 from edgefilter.echo.effects.fan_noise import FanNoise
 from edgefilter.echo.effects.late_reverb import LateReverb
+from edgefilter.echo.effects.limiter import Limiter
 from edgefilter.echo.effects.mic_agc import MicAgc
 from edgefilter.echo.effects.mic_clipping import MicClipping
+from edgefilter.echo.effects.multiband_compression import MultibandCompression
 from edgefilter.echo.effects.path_change import PathChange
 from edgefilter.echo.effects.playback_gain import PlaybackGain
 from edgefilter.echo.effects.rattle import Rattle
@@ -32,6 +34,8 @@ from edgefilter.types import Array
 EFFECTS: tuple[Effect, ...] = (
     PlaybackGain(),
     Compression(),
+    MultibandCompression(),
+    Limiter(),
     DelayJump(),
     SpeakerNonlinearity(),
     Rattle(),

@@ -67,6 +67,7 @@ def fit_laws(
     linear: Samples,
     hear: Callable[[Samples], Samples],
     before: Laws | None = None,
+    excerpt: slice | None = None,
 ) -> Laws | None:
     """The laws that explain a recording best, None where none holds on samples that it was not fitted to.
 
@@ -85,12 +86,17 @@ def fit_laws(
     before
         Laws from whose resonance and knee the search sets out, for the parts that bend in them; None: from the usual
         ones, for both.
+    excerpt
+        The samples on which resonance, excursion and knee are chosen; None: all.
     """
     search = _Search(x, hear, _Halves(linear, target, weights))
     if search.base <= 0.0 or search.peak <= 0.0:
         return None
-    bend = search.amplifier(before)
-    move = search.driver(before)
+    if excerpt is None:
+        bend, move = search.amplifier(before), search.driver(before)
+    else:
+        part = _Search(x[excerpt], hear, _Halves(linear[excerpt], target[excerpt], weights[excerpt]))
+        bend, move = search.as_in(part.amplifier(before)), search.as_in(part.driver(before))
     parts = [min(move, bend, key=_by_left)]
     left, together = parts[0].left, search.halves.left(np.concatenate((move.columns, bend.columns), axis=1))
     if together < (1.0 - FURTHER) * left:
@@ -139,6 +145,13 @@ class _Search:
             best = min(best, *map(make, beside), key=_by_left)
             best = min(best, make(best.setting, 0.5 * EXCURSION), key=_by_left)
         return best
+
+    def as_in(self, part: _Part) -> _Part:
+        """A part as another search has set it."""
+        terms = (
+            driver_terms(self._x, part.setting, part.scale) if part.setting else amplifier_terms(self._x, part.scale)
+        )
+        return self._part(part.setting, part.scale, terms)
 
     def _best(self, make: Callable[[float], _Part], settings: Sequence[float]) -> _Part:
         """The first setting, or the best of all where that one is promising."""

@@ -8,14 +8,17 @@ import numpy as np
 
 from edgefilter.dsp.membrane import MOTION_TAPS
 from edgefilter.echo.effect import Effect, Parameter, Stage, first, neutral
+from edgefilter.echo.effects.gain_fit import loudest
 from edgefilter.echo.effects.loudspeaker_fit import REACH_HZ, Laws, fit_laws
 from edgefilter.echo.effects.loudspeaker_laws import amplifier_terms, driver_terms
 from edgefilter.echo.measurement import Measurement, Values, VoiceModel
-from edgefilter.types import Array, Samples
+from edgefilter.types import SAMPLE_RATE, Array, Samples
 
 BOUND = 4.0
 """Of each weight: at the end of its excursion a law is off by no more than this, whatever is played."""
 SILENT_DB = -120.0
+EXCERPT = 10 * SAMPLE_RATE
+"""On the loudest stretch of that many samples it is chosen where the laws bend; how much they do, on all."""
 DRIVER, AMPLIFIER = ("force_factor", "stiffness", "damping"), ("even", "odd")
 
 
@@ -32,6 +35,7 @@ class SpeakerNonlinearity(Effect):
     name: ClassVar[str] = "speaker_nonlinearity"
     stage: ClassVar[Stage] = "source"
     title: ClassVar[str] = "loudspeaker nonlinearity"
+    cost: ClassVar[int] = 4
     flexible: ClassVar[bool] = True
     learned: ClassVar[bool] = True
     memory: ClassVar[int | None] = MOTION_TAPS
@@ -62,6 +66,9 @@ class SpeakerNonlinearity(Effect):
             measurement.weights,
             linear,
             lambda sound: measurement.whiten(model.predict(sound)),
+            excerpt=None
+            if model.timed or measurement.reference.size < 1.5 * EXCERPT
+            else loudest(measurement.reference, EXCERPT),
         )
         return neutral(self) if found is None else as_values(found)
 

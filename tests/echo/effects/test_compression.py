@@ -5,7 +5,7 @@ import pytest
 
 from edgefilter.echo.effect import complete, neutral
 from edgefilter.echo.effects import catalogue
-from edgefilter.echo.effects.compression import _falling_peak
+from edgefilter.echo.effects.compression import falling_peak
 from tests.conformance import held_out_power, robot_alone
 
 COMPRESS = catalogue.find("compression")
@@ -42,14 +42,14 @@ def test_release_is_the_time_to_1_over_e_of_the_reduction_in_db():
     )  # 300 ms are 4800 samples; the attack of 1 ms delays the start
 
 
-def test_falling_peak_is_the_slow_recursion():
+def testfalling_peak_is_the_slow_recursion():
     x = np.abs(np.random.default_rng(0).standard_normal(500)) * (np.random.default_rng(1).uniform(size=500) > 0.8)
     slow, y = [], 1.7
     for value in x:
         y = max(value, y * np.exp(-1 / 37.0))
         slow.append(y)
-    np.testing.assert_allclose(_falling_peak(x, 37.0, before=1.7), slow, atol=1e-9)
-    assert _falling_peak(x[:1], 37.0, before=0.0)[0] == pytest.approx(x[0], abs=1e-9)
+    np.testing.assert_allclose(falling_peak(x, 37.0, before=1.7), slow, atol=1e-9)
+    assert falling_peak(x[:1], 37.0, before=0.0)[0] == pytest.approx(x[0], abs=1e-9)
 
 
 def test_fit_finds_threshold_ratio_and_times():

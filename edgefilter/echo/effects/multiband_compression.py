@@ -1,0 +1,194 @@
+"""A player that turns down what is loud in each of three bands by itself."""
+
+from __future__ import annotations
+
+from itertools import product
+from typing import ClassVar
+
+import numpy as np
+import scipy
+from numpy.typing import NDArray
+
+from edgefilter.echo.effect import Effect, Parameter, Runner, Stage, complete, neutral
+from edgefilter.echo.effects.compression import Compressor
+from edgefilter.echo.effects.gain_fit import GainFit, Reach
+from edgefilter.echo.evidence import Evidence
+from edgefilter.echo.measurement import Measurement, Values, VoiceModel
+from edgefilter.echo.wiener import Spectra, spectra
+from edgefilter.types import SAMPLE_RATE, Array, Samples
+
+BANDS = 3
+LOW_HZ, HIGH_HZ = np.geomspace(90.0, 900.0, 14), np.geomspace(1000.0, 6000.0, 12)
+"""Crossovers that are tried, so close that no band's phase is off by more than some 20 degrees."""
+DELAYS = np.arange(-24.0, 24.1, 0.5)
+"""Samples: the lag at which such a recording is found is that of its loudest band."""
+THRESHOLDS_DB, SLOPE = (-6.0, -15.0), 0.5
+"""Starting points, relative to the loudest 20 ms of the reference in each band, and dB per dB."""
+RELEASE_MS = 150.0
+STEEPEST = 0.98
+RESOLUTION_HZ = 20.0
+LEAST_RATIO = 1.15
+"""Of at least two bands: a band that alone is compressed is another effect's."""
+WORTH = 0.05
+"""Of what the bands leave that are each only turned, so much less has to be left by bands that follow their level."""
+_EACH = np.ones(BANDS)
+REACH = Reach(
+    nudge=np.concatenate(([0.03, 0.03], 0.5 * _EACH, 0.03 * _EACH, [0.15, 0.15])),
+    longest=np.concatenate(([0.15, 0.15], 4.0 * _EACH, 0.3 * _EACH, [1.0, 1.0])),
+    lowest=np.concatenate((np.log([60.0, 900.0]), -80.0 * _EACH, 0.0 * _EACH, np.log([0.3, 5.0]))),
+    highest=np.concatenate((np.log([900.0, 7000.0]), 0.0 * _EACH, STEEPEST * _EACH, np.log([200.0, 5000.0]))),
+)
+"""Of crossovers as natural logarithms of Hz, thresholds in dB, slopes in dB per dB, attack and release of ms."""
+
+
+class MultibandCompression(Effect):
+    """The sum of three compressors, each on one band.
+
+    The bands are cut by crossovers of fourth order whose outputs are in phase (Linkwitz 1976), so that their sum has the
+    reference's spectrum but not its phase: that, too, is the effect's. threshold_db, ratio, makeup_db: (3,) from low to
+    high, of compressors as of `compression`; attack_ms and release_ms are those of all.
+    """
+
+    name: ClassVar[str] = "multiband_compression"
+    stage: ClassVar[Stage] = "source"
+    title: ClassVar[str] = "multi-band compression"
+    cost: ClassVar[int] = 4
+    flexible: ClassVar[bool] = True
+    parameters: ClassVar[tuple[Parameter, ...]] = (
+        Parameter("crossover_hz", "Hz", 1000.0, 20.0, 7500.0),
+        Parameter("threshold_db", "dB re full scale", -20.0, -80.0, 0.0),
+        Parameter("ratio", "dB/dB", 1.0, 1.0, 50.0),
+        Parameter("attack_ms", "ms", 10.0, 0.1, 1000.0),
+        Parameter("release_ms", "ms", 200.0, 1.0, 5000.0),
+        Parameter("makeup_db", "dB", 0.0, -40.0, 40.0),
+    )
+
+    def apply(self, x: Samples, values: Values, sample_rate: int) -> Samples:
+        """X (n,), each of its bands turned by its own level; where none is, x itself."""
+        return BandCompressor(values, sample_rate)(x)
+
+    def run(self, values: Values, sample_rate: int) -> Runner:
+        """The compressors, which carry their levels and their filters on."""
+        return BandCompressor(values, sample_rate)
+
+    def fit(self, measurement: Measurement, model: VoiceModel) -> Values:
+        """Gauss-Newton in all of them from the best of a coarse grid; neutral where the bands' gains do not follow their levels."""
+
+        def parts(x: Samples, unknowns: Array) -> list[Samples]:
+            return BandCompressor(complete(self, _values(unknowns)), SAMPLE_RATE).bands(x)
+
+        crossovers = find_crossovers(spectra(measurement, measurement.heard(model)[1], RESOLUTION_HZ))
+        if crossovers is None:
+            return neutral(self)
+        fit = GainFit(measurement, model, parts, REACH)
+        still = fit.cost(_start(fit.loud_db, crossovers, 0.0, 0.0))
+        found = fit.best([_start(fit.loud_db, crossovers, db, SLOPE) for db in THRESHOLDS_DB])
+        if found is None or found[1] > (1.0 - WORTH) * still:
+            return neutral(self)
+        makeup = 20.0 * np.log10(np.maximum(fit.gains(found[0]), 1e-2))
+        return {**_values(found[0]), "makeup_db": np.clip(makeup, -40.0, 40.0)}
+
+    def sentence(self, values: Values) -> str:
+        """The ratio of each band."""
+        low, high = np.broadcast_to(np.asarray(values["crossover_hz"], float), (2,))
+        ratios = ", ".join(f"{ratio:.1f}" for ratio in np.broadcast_to(np.asarray(values["ratio"], float), (BANDS,)))
+        return (
+            f"bands below {low:.0f} Hz, up to {high:.0f} Hz and above are each turned down when they have been loud, by"
+            f" {ratios} to 1"
+        )
+
+    def plausible(self, evidence: Evidence) -> bool:
+        """Two bands or more follow their level."""
+        ratio = np.broadcast_to(np.asarray(evidence.values["ratio"], float), (BANDS,))
+        return int(np.count_nonzero(ratio >= LEAST_RATIO)) >= 2
+
+
+class BandCompressor:
+    """One multi-band compressor on a stream: values as of MultibandCompression."""
+
+    def __init__(self, values: Values, sample_rate: int) -> None:
+        names = ("threshold_db", "ratio", "makeup_db")
+        each = [np.broadcast_to(np.asarray(values[name], float), (BANDS,)) for name in names]
+        shared = {"attack_ms": values["attack_ms"], "release_ms": values["release_ms"], "knee_db": 6.0}
+        self._compressors = [
+            Compressor({**dict(zip(names, numbers, strict=True)), **shared}, sample_rate)
+            for numbers in zip(*each, strict=True)
+        ]
+        self._crossovers = [
+            _Crossover(hz, sample_rate) for hz in np.broadcast_to(np.asarray(values["crossover_hz"], float), (2,))
+        ]
+        self._idle = bool(np.all(each[1] == 1.0) and np.all(each[2] == 0.0))
+
+    def __call__(self, x: Samples, heard: Samples | None = None) -> Samples:
+        """X (n,), which follows what came before, each band times its gain."""
+        return x.copy() if self._idle or not x.size else np.sum(self.bands(x), axis=0, dtype=np.float32)
+
+    def bands(self, x: Samples) -> list[Samples]:
+        """Three signals (n,), from low to high."""
+        low, rest = self._crossovers[0](x)
+        return [turn(band) for turn, band in zip(self._compressors, (low, *self._crossovers[1](rest)), strict=True)]
+
+
+class _Crossover:
+    """What lies below and above a frequency, on a stream: Butterworth filters of second order, twice each."""
+
+    def __init__(self, hz: float, sample_rate: int) -> None:
+        kinds = (scipy.signal.butter(2, hz, kind, fs=sample_rate, output="sos") for kind in ("low", "high"))
+        self._filters = [np.tile(sos, (2, 1)) for sos in kinds]
+        self._memory = [np.zeros((2, 2)), np.zeros((2, 2))]
+
+    def __call__(self, x: Samples) -> tuple[Samples, Samples]:
+        outputs = []
+        for side, sos in enumerate(self._filters):
+            y, self._memory[side] = scipy.signal.sosfilt(sos, x, zi=self._memory[side])
+            outputs.append(y.astype(np.float32))
+        return outputs[0], outputs[1]
+
+
+def find_crossovers(found: Spectra) -> tuple[float, float] | None:
+    """The two frequencies in Hz at whose crossovers' phases three turned bands explain most.
+
+    None where the bands explain as much without these phases: then nothing was cut into bands.
+    """
+    turned = found.cross[:, None] * np.exp(2j * np.pi * np.outer(found.hz, DELAYS) / SAMPLE_RATE)
+
+    def explained(bands: NDArray[np.complex128]) -> float:
+        matrix = (bands.conj().T @ (found.predicted[:, None] * bands)).real
+        right = (bands.conj().T @ turned).real
+        gains = np.linalg.solve(matrix + (1e-9 * np.trace(matrix) + 1e-12) * np.eye(BANDS), right)
+        return float(np.max(np.where((gains > 0.0).all(axis=0), np.sum(gains * right, axis=0), -np.inf)))
+
+    below, above = ({hz: _halves(found.hz, hz) for hz in side} for side in (LOW_HZ, HIGH_HZ))
+    best, most, without = None, -np.inf, -np.inf
+    for low, high in product(LOW_HZ, HIGH_HZ):
+        (bass, rest), (middle, treble) = below[low], above[high]
+        bands = np.stack((bass, rest * middle, rest * treble), axis=1)
+        with_phase, plain = explained(bands), explained(np.abs(bands).astype(complex))
+        without = max(without, plain)
+        if with_phase > most:
+            best, most = (float(low), float(high)), with_phase
+    return best if most > without and np.isfinite(most) else None
+
+
+def _halves(hz: Array, crossover_hz: float) -> tuple[NDArray[np.complex128], NDArray[np.complex128]]:
+    """(m,), (m,) responses below and above a crossover."""
+    kinds = (scipy.signal.butter(2, crossover_hz, kind, fs=SAMPLE_RATE) for kind in ("low", "high"))
+    low, high = (scipy.signal.freqz(b, a, hz, fs=SAMPLE_RATE)[1] ** 2 for b, a in kinds)
+    return low, high
+
+
+def _start(loud_db: float, crossovers_hz: tuple[float, float], below_db: float, slope: float) -> Array:
+    """Unknowns: the bands of speech are some 0, 5 and 15 dB under the whole."""
+    thresholds = loud_db + below_db - np.array([0.0, 5.0, 15.0])
+    return np.concatenate((np.log(crossovers_hz), thresholds, slope * _EACH, np.log([8.0, RELEASE_MS])))
+
+
+def _values(unknowns: Array) -> dict[str, float | Array]:
+    attack, release = np.exp(unknowns[-2:])
+    return {
+        "crossover_hz": np.exp(unknowns[:2]),
+        "threshold_db": unknowns[2:5].copy(),
+        "ratio": 1.0 / (1.0 - unknowns[5:8]),
+        "attack_ms": float(np.clip(attack, 0.1, 1000.0)),
+        "release_ms": float(np.clip(release, 1.0, 5000.0)),
+    }
