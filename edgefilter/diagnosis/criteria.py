@@ -48,7 +48,7 @@ class Criteria:
     """Share of the level that is explained where no other start is tried."""
     little_db: float = 2.0
     """Over the silences, and with no more than little_share of the power over the fan, neither: the model of the right
-    effect leaves as much, and another start costs seconds."""
+    effect leaves as much, and another start costs seconds. Nor is a last resort tried then."""
     little_share: float = 0.1
     """See little_db."""
     better: float = 0.05

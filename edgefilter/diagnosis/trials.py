@@ -161,7 +161,7 @@ class Workbench:
         ]
         resorts = [name for name in absent if find(name).last_resort]
         enough = self.criteria.last_resort_share * left
-        if not resorts or left < self.criteria.last_resort_db:
+        if not resorts or left < self.criteria.last_resort_db or self.little(model, self.prepared.model):
             return found
         if any((t.gain_db > enough or self.halves(t, model)) and self.admissible(t, model) for t in found):
             return found
