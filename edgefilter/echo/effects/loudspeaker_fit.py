@@ -96,7 +96,10 @@ def fit_laws(
         bend, move = search.amplifier(before), search.driver(before)
     else:
         part = _Search(x[excerpt], hear, _Halves(linear[excerpt], target[excerpt], weights[excerpt]))
-        bend, move = search.as_in(part.amplifier(before)), search.as_in(part.driver(before))
+        bend, move = part.amplifier(before), part.driver(before)
+        if not (part.promising(bend) or part.promising(move)):
+            return None
+        bend, move = search.as_in(bend), search.as_in(move)
     parts = [min(move, bend, key=_by_left)]
     left, together = parts[0].left, search.halves.left(np.concatenate((move.columns, bend.columns), axis=1))
     if together < (1.0 - FURTHER) * left:
@@ -140,7 +143,7 @@ class _Search:
             return self._part(hz, excursion, driver_terms(self._x, hz, excursion))
 
         best = self._best(make, RESONANCES_HZ if before is None else [before.resonance_hz])
-        if self._promising(best):
+        if self.promising(best):
             beside = [float(np.clip(best.setting * step, *REACH_HZ)) for step in (1.0 / BESIDE, BESIDE)]
             best = min(best, *map(make, beside), key=_by_left)
             best = min(best, make(best.setting, 0.5 * EXCURSION), key=_by_left)
@@ -156,9 +159,10 @@ class _Search:
     def _best(self, make: Callable[[float], _Part], settings: Sequence[float]) -> _Part:
         """The first setting, or the best of all where that one is promising."""
         first = make(settings[0])
-        return min((first, *map(make, settings[1:])), key=_by_left) if self._promising(first) else first
+        return min((first, *map(make, settings[1:])), key=_by_left) if self.promising(first) else first
 
-    def _promising(self, part: _Part) -> bool:
+    def promising(self, part: _Part) -> bool:
+        """Whether it lowers what the linear voice leaves enough for a closer look."""
         return part.left < (1.0 - PROMISING) * self.base
 
     def _part(self, setting: float, scale: float, terms: Samples) -> _Part:
