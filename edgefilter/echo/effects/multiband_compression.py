@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from itertools import product
 from typing import ClassVar
 
@@ -20,9 +21,9 @@ from edgefilter.types import SAMPLE_RATE, Array, Samples
 BANDS = 3
 LOW_HZ, HIGH_HZ = np.geomspace(90.0, 900.0, 14), np.geomspace(1000.0, 6000.0, 12)
 """Crossovers that are tried, so close that no band's phase is off by more than some 20 degrees."""
-DELAYS = np.arange(-24.0, 24.1, 0.5)
+DELAYS = np.arange(-24.0, 25.0)
 """Samples: the lag at which such a recording is found is that of its loudest band."""
-THRESHOLDS_DB, SLOPE = (-6.0, -15.0), 0.5
+THRESHOLDS_DB, SLOPE = (-6.0, -15.0, -25.0), 0.5
 """Starting points, relative to the loudest 20 ms of the reference in each band, and dB per dB."""
 RELEASE_MS = 150.0
 STEEPEST = 0.98
@@ -46,7 +47,8 @@ class MultibandCompression(Effect):
 
     The bands are cut by crossovers of fourth order whose outputs are in phase (Linkwitz 1976), so that their sum has the
     reference's spectrum but not its phase: that, too, is the effect's. threshold_db, ratio, makeup_db: (3,) from low to
-    high, of compressors as of `compression`; attack_ms and release_ms are those of all.
+    high, of compressors as of `compression`; attack_ms and release_ms are those of all. delay: of the whole, in whole
+    samples, re the lag at which a recording is found, which is that of its loudest band.
     """
 
     name: ClassVar[str] = "multiband_compression"
@@ -61,32 +63,34 @@ class MultibandCompression(Effect):
         Parameter("attack_ms", "ms", 10.0, 0.1, 1000.0),
         Parameter("release_ms", "ms", 200.0, 1.0, 5000.0),
         Parameter("makeup_db", "dB", 0.0, -40.0, 40.0),
+        Parameter("delay", "samples", 0.0, -100.0, 100.0),
     )
 
     def apply(self, x: Samples, values: Values, sample_rate: int) -> Samples:
         """X (n,), each of its bands turned by its own level; where none is, x itself."""
-        return BandCompressor(values, sample_rate)(x)
+        return BandCompressor(values, sample_rate)(_moved(x, float(values["delay"])))
 
     def run(self, values: Values, sample_rate: int) -> Runner:
-        """The compressors, which carry their levels and their filters on."""
+        """The compressors, which carry their levels and their filters on; where the voice is, the aligner says."""
         return BandCompressor(values, sample_rate)
 
     def fit(self, measurement: Measurement, model: VoiceModel) -> Values:
         """Gauss-Newton in all of them from the best of a coarse grid; neutral where the bands' gains do not follow their levels."""
+        crossed = find_crossovers(spectra(measurement, measurement.heard(model)[1], RESOLUTION_HZ))
+        if crossed is None:
+            return neutral(self)
+        *crossovers, delay = crossed
 
         def parts(x: Samples, unknowns: Array) -> list[Samples]:
-            return BandCompressor(complete(self, _values(unknowns)), SAMPLE_RATE).bands(x)
+            return BandCompressor(complete(self, _values(unknowns)), SAMPLE_RATE).bands(_moved(x, delay))
 
-        crossovers = find_crossovers(spectra(measurement, measurement.heard(model)[1], RESOLUTION_HZ))
-        if crossovers is None:
-            return neutral(self)
         fit = GainFit(measurement, model, parts, REACH)
         still = fit.cost(_start(fit.loud_db, crossovers, 0.0, 0.0))
         found = fit.best([_start(fit.loud_db, crossovers, db, SLOPE) for db in THRESHOLDS_DB])
         if found is None or found[1] > (1.0 - WORTH) * still:
             return neutral(self)
         makeup = 20.0 * np.log10(np.maximum(fit.gains(found[0]), 1e-2))
-        return {**_values(found[0]), "makeup_db": np.clip(makeup, -40.0, 40.0)}
+        return {**_values(found[0]), "delay": delay, "makeup_db": np.clip(makeup, -40.0, 40.0)}
 
     def sentence(self, values: Values) -> str:
         """The ratio of each band."""
@@ -145,29 +149,36 @@ class _Crossover:
         return outputs[0], outputs[1]
 
 
-def find_crossovers(found: Spectra) -> tuple[float, float] | None:
-    """The two frequencies in Hz at whose crossovers' phases three turned bands explain most.
+def find_crossovers(found: Spectra) -> tuple[float, float, float] | None:
+    """The two frequencies in Hz at whose crossovers' phases three turned bands explain most, and their delay in samples.
 
     None where the bands explain as much without these phases: then nothing was cut into bands.
     """
     turned = found.cross[:, None] * np.exp(2j * np.pi * np.outer(found.hz, DELAYS) / SAMPLE_RATE)
 
-    def explained(bands: NDArray[np.complex128]) -> float:
+    def explained(bands: NDArray[np.complex128]) -> tuple[float, float]:
         matrix = (bands.conj().T @ (found.predicted[:, None] * bands)).real
         right = (bands.conj().T @ turned).real
         gains = np.linalg.solve(matrix + (1e-9 * np.trace(matrix) + 1e-12) * np.eye(BANDS), right)
-        return float(np.max(np.where((gains > 0.0).all(axis=0), np.sum(gains * right, axis=0), -np.inf)))
+        worth = np.where((gains > 0.0).all(axis=0), np.sum(gains * right, axis=0), -np.inf)
+        return float(np.max(worth)), float(DELAYS[int(np.argmax(worth))])
 
     below, above = ({hz: _halves(found.hz, hz) for hz in side} for side in (LOW_HZ, HIGH_HZ))
     best, most, without = None, -np.inf, -np.inf
     for low, high in product(LOW_HZ, HIGH_HZ):
         (bass, rest), (middle, treble) = below[low], above[high]
         bands = np.stack((bass, rest * middle, rest * treble), axis=1)
-        with_phase, plain = explained(bands), explained(np.abs(bands).astype(complex))
-        without = max(without, plain)
+        without = max(without, explained(np.abs(bands).astype(complex))[0])
+        with_phase, delay = explained(bands)
         if with_phase > most:
-            best, most = (float(low), float(high)), with_phase
+            best, most = (float(low), float(high), delay), with_phase
     return best if most > without and np.isfinite(most) else None
+
+
+def _moved(x: Samples, delay: float) -> Samples:
+    """X (n,) by that many whole samples later."""
+    samples = round(delay)
+    return np.pad(x, (max(samples, 0), max(-samples, 0)))[max(-samples, 0) :][: x.size]
 
 
 def _halves(hz: Array, crossover_hz: float) -> tuple[NDArray[np.complex128], NDArray[np.complex128]]:
@@ -177,7 +188,7 @@ def _halves(hz: Array, crossover_hz: float) -> tuple[NDArray[np.complex128], NDA
     return low, high
 
 
-def _start(loud_db: float, crossovers_hz: tuple[float, float], below_db: float, slope: float) -> Array:
+def _start(loud_db: float, crossovers_hz: Sequence[float], below_db: float, slope: float) -> Array:
     """Unknowns: the bands of speech are some 0, 5 and 15 dB under the whole."""
     thresholds = loud_db + below_db - np.array([0.0, 5.0, 15.0])
     return np.concatenate((np.log(crossovers_hz), thresholds, slope * _EACH, np.log([8.0, RELEASE_MS])))
