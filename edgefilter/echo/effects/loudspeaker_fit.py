@@ -38,6 +38,7 @@ class Laws:
 
     resonance_hz, excursion: of driver_terms, driver: their weights (6,). knee, amplifier (4,): of amplifier_terms.
     level_db: of what they add at the microphone, re the linear voice and but for what is in proportion to it.
+    gain_db: of the linear voice beside them.
     held_out: the share by which they lower what the linear voice leaves on samples that were not fitted to.
     """
 
@@ -47,6 +48,7 @@ class Laws:
     knee: float
     amplifier: Array
     level_db: float
+    gain_db: float
     held_out: float
 
 
@@ -106,10 +108,10 @@ def fit_laws(
         parts, left = [move, bend], together
     if left > (1.0 - LEAST) * search.base:
         return None
-    found, level_db = search.halves.whole(np.concatenate([part.columns for part in parts], axis=1))
+    found, level_db, gain_db = search.halves.whole(np.concatenate([part.columns for part in parts], axis=1))
     driving = found[:DRIVER_TERMS] if move in parts else np.zeros(DRIVER_TERMS)
     bending = found[-AMPLIFIER_TERMS:] if bend in parts else np.zeros(AMPLIFIER_TERMS)
-    return Laws(move.setting, move.scale, driving, bend.scale, bending, level_db, 1.0 - left / search.base)
+    return Laws(move.setting, move.scale, driving, bend.scale, bending, level_db, gain_db, 1.0 - left / search.base)
 
 
 class _Search:
@@ -204,8 +206,8 @@ class _Halves:
         first, second = self._normal(columns)
         return _left(first, _solved(second)) + _left(second, _solved(first))
 
-    def whole(self, columns: Samples) -> tuple[Array, float]:
-        """Weights (k,) of columns (used, k) re the linear voice's gain, fitted to all, and the level of what they add, dB."""
+    def whole(self, columns: Samples) -> tuple[Array, float, float]:
+        """Weights (k,) of columns (used, k) re the linear voice's gain, fitted to all, the level of what they add, and that gain, dB."""
         first, second = self._normal(columns)
         found = _solved(first + second)
         voice = self._linear[:, NUISANCE_LEAD]
@@ -214,7 +216,7 @@ class _Halves:
         added = columns @ weights.astype(np.float32)
         added -= level_ratio(added, voice) * voice
         level = float(np.dot(added, added)) / (float(np.dot(voice, voice)) + 1e-30)
-        return weights, 10.0 * float(np.log10(level + 1e-12))
+        return weights, 10.0 * float(np.log10(level + 1e-12)), 20.0 * float(np.log10(max(abs(gain), 1e-3)))
 
     def _normal(self, columns: Samples) -> tuple[Array, Array]:
         """Of each half the weighted products of linear voice, columns and target with each other."""

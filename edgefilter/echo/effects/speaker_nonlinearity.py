@@ -17,19 +17,22 @@ from edgefilter.types import SAMPLE_RATE, Array, Samples
 BOUND = 4.0
 """Of each weight: at the end of its excursion a law is off by no more than this, whatever is played."""
 SILENT_DB = -120.0
+ORDINARY_DB = 0.4
+"""A gain of less differs from day to day."""
 EXCERPT = 10 * SAMPLE_RATE
 """On the loudest stretch of that many samples it is chosen where the laws bend; how much they do, on all."""
 DRIVER, AMPLIFIER = ("force_factor", "stiffness", "damping"), ("even", "odd")
 
 
 class SpeakerNonlinearity(Effect):
-    """y = x + what a moving coil and an amplifier add whose laws bend, ahead of the linear path.
+    """y = g (x + what a moving coil and an amplifier add whose laws bend), ahead of the linear path.
 
     force_factor, stiffness, damping: (2,) a, b of the relative change a s + b s^2 of each with the displacement, s
     within -1 and 1 (driver_terms); what they add drives the linear membrane like x itself, and the path behind holds
     that membrane. even, odd: (2,) weights of s x, s^3 x and of s^2 x, s^4 x with s the bent drive (amplifier_terms).
     resonance_hz: of the membrane. excursion, knee: displacement and drive, full scale, at which s has reached 0.7.
-    What is added never grows faster than x. Valid while it is well below x.
+    gain_db: 20 log10 g, of an amplifier that is overdriven; the volume before it is `playback_gain`'s. What is added never
+    grows faster than x. Valid while it is well below x.
     """
 
     name: ClassVar[str] = "speaker_nonlinearity"
@@ -45,6 +48,7 @@ class SpeakerNonlinearity(Effect):
         Parameter("excursion", "full scale", 1.0, 1e-4, 100.0),
         Parameter("knee", "full scale", 1.0, 1e-4, 100.0),
         Parameter("level_db", "dB re the linear voice at the microphone", SILENT_DB, SILENT_DB, 20.0),
+        Parameter("gain_db", "dB", 0.0, -60.0, 60.0),
     )
 
     def apply(self, x: Samples, values: Values, sample_rate: int) -> Samples:
@@ -55,7 +59,8 @@ class SpeakerNonlinearity(Effect):
             out += driving @ driver_terms(x, first(values, "resonance_hz"), first(values, "excursion"), sample_rate)
         if bending.any():
             out += bending @ amplifier_terms(x, first(values, "knee"))
-        return out
+        gain_db = first(values, "gain_db")
+        return out * np.float32(10.0 ** (gain_db / 20.0)) if gain_db else out
 
     def fit(self, measurement: Measurement, model: VoiceModel) -> Values:
         """Least squares in the whitened domain; neutral where no law holds on samples that it was not fitted to."""
@@ -70,7 +75,10 @@ class SpeakerNonlinearity(Effect):
             if model.timed or measurement.reference.size < 1.5 * EXCERPT
             else loudest(measurement.reference, EXCERPT),
         )
-        return neutral(self) if found is None else as_values(found)
+        if found is None:
+            return neutral(self)
+        louder = abs(found.gain_db) >= ORDINARY_DB
+        return {**as_values(found), "gain_db": float(np.clip(found.gain_db, -60.0, 60.0)) if louder else 0.0}
 
     def sentence(self, values: Values) -> str:
         """How strong the distortion is."""
