@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from itertools import product
 from typing import ClassVar
 
@@ -21,6 +20,8 @@ from edgefilter.types import SAMPLE_RATE, Array, Samples
 BANDS = 3
 LOW_HZ, HIGH_HZ = np.geomspace(90.0, 900.0, 14), np.geomspace(1000.0, 6000.0, 12)
 """Crossovers that are tried, so close that no band's phase is off by more than some 20 degrees."""
+FINER = np.array([0.91, 0.95, 1.0, 1.05, 1.1])
+"""Times the best of these, which are tried next."""
 DELAYS = np.arange(-24.0, 25.0)
 """Samples: the lag at which such a recording is found is that of its loudest band."""
 THRESHOLDS_DB, SLOPE = (-6.0, -15.0, -25.0), 0.5
@@ -28,18 +29,19 @@ THRESHOLDS_DB, SLOPE = (-6.0, -15.0, -25.0), 0.5
 RELEASE_MS = 150.0
 STEEPEST = 0.98
 RESOLUTION_HZ = 20.0
+MOST_DB = 40.0
 LEAST_RATIO = 1.15
 """Of at least two bands: a band that alone is compressed is another effect's."""
 WORTH = 0.05
 """Of what the bands leave that are each only turned, so much less has to be left by bands that follow their level."""
 _EACH = np.ones(BANDS)
 REACH = Reach(
-    nudge=np.concatenate(([0.03, 0.03], 0.5 * _EACH, 0.03 * _EACH, [0.15, 0.15])),
-    longest=np.concatenate(([0.15, 0.15], 4.0 * _EACH, 0.3 * _EACH, [1.0, 1.0])),
-    lowest=np.concatenate((np.log([60.0, 900.0]), -80.0 * _EACH, 0.0 * _EACH, np.log([0.3, 5.0]))),
-    highest=np.concatenate((np.log([900.0, 7000.0]), 0.0 * _EACH, STEEPEST * _EACH, np.log([200.0, 5000.0]))),
+    nudge=np.concatenate((0.5 * _EACH, 0.03 * _EACH, [0.15, 0.15])),
+    longest=np.concatenate((4.0 * _EACH, 0.3 * _EACH, [1.0, 1.0])),
+    lowest=np.concatenate((-80.0 * _EACH, 0.0 * _EACH, np.log([0.3, 5.0]))),
+    highest=np.concatenate((0.0 * _EACH, STEEPEST * _EACH, np.log([200.0, 5000.0]))),
 )
-"""Of crossovers as natural logarithms of Hz, thresholds in dB, slopes in dB per dB, attack and release of ms."""
+"""Of thresholds in dB, slopes in dB per dB, attack and release as natural logarithms of ms."""
 
 
 class MultibandCompression(Effect):
@@ -62,7 +64,7 @@ class MultibandCompression(Effect):
         Parameter("ratio", "dB/dB", 1.0, 1.0, 50.0),
         Parameter("attack_ms", "ms", 10.0, 0.1, 1000.0),
         Parameter("release_ms", "ms", 200.0, 1.0, 5000.0),
-        Parameter("makeup_db", "dB", 0.0, -40.0, 40.0),
+        Parameter("makeup_db", "dB", 0.0, -MOST_DB, MOST_DB),
         Parameter("delay", "samples", 0.0, -100.0, 100.0),
     )
 
@@ -75,22 +77,27 @@ class MultibandCompression(Effect):
         return BandCompressor(values, sample_rate)
 
     def fit(self, measurement: Measurement, model: VoiceModel) -> Values:
-        """Gauss-Newton in all of them from the best of a coarse grid; neutral where the bands' gains do not follow their levels."""
+        """The crossovers from the spectra, then Gauss-Newton in the rest from the best of three starts.
+
+        Neutral where the bands' gains do not follow their levels.
+        """
         crossed = find_crossovers(spectra(measurement, measurement.heard(model)[1], RESOLUTION_HZ))
         if crossed is None:
             return neutral(self)
-        *crossovers, delay = crossed
+        low, high, delay = crossed
+        filters = {"crossover_hz": np.array([low, high])}
 
         def parts(x: Samples, unknowns: Array) -> list[Samples]:
-            return BandCompressor(complete(self, _values(unknowns)), SAMPLE_RATE).bands(_moved(x, delay))
+            values = complete(self, {**filters, **_values(unknowns)})
+            return BandCompressor(values, SAMPLE_RATE).bands(_moved(x, delay))
 
         fit = GainFit(measurement, model, parts, REACH)
-        still = fit.cost(_start(fit.loud_db, crossovers, 0.0, 0.0))
-        found = fit.best([_start(fit.loud_db, crossovers, db, SLOPE) for db in THRESHOLDS_DB])
+        still = fit.cost(_start(fit.loud_db, 0.0, 0.0))
+        found = fit.best([_start(fit.loud_db, db, SLOPE) for db in THRESHOLDS_DB])
         if found is None or found[1] > (1.0 - WORTH) * still:
             return neutral(self)
-        makeup = 20.0 * np.log10(np.maximum(fit.gains(found[0]), 1e-2))
-        return {**_values(found[0]), "delay": delay, "makeup_db": np.clip(makeup, -40.0, 40.0)}
+        makeup_db = np.clip(20.0 * np.log10(np.maximum(fit.gains(found[0]), 1e-2)), -MOST_DB, MOST_DB)
+        return {**filters, **_values(found[0]), "delay": delay, "makeup_db": makeup_db}
 
     def sentence(self, values: Values) -> str:
         """The ratio of each band."""
@@ -102,9 +109,11 @@ class MultibandCompression(Effect):
         )
 
     def plausible(self, evidence: Evidence) -> bool:
-        """Two bands or more follow their level."""
-        ratio = np.broadcast_to(np.asarray(evidence.values["ratio"], float), (BANDS,))
-        return int(np.count_nonzero(ratio >= LEAST_RATIO)) >= 2
+        """Two bands or more follow their level, and each is heard: a band that the fit mutes is none."""
+        ratio, makeup_db = (
+            np.broadcast_to(np.asarray(evidence.values[name], float), (BANDS,)) for name in ("ratio", "makeup_db")
+        )
+        return int(np.count_nonzero(ratio >= LEAST_RATIO)) >= 2 and float(makeup_db.min()) > -MOST_DB
 
 
 class BandCompressor:
@@ -163,16 +172,20 @@ def find_crossovers(found: Spectra) -> tuple[float, float, float] | None:
         worth = np.where((gains > 0.0).all(axis=0), np.sum(gains * right, axis=0), -np.inf)
         return float(np.max(worth)), float(DELAYS[int(np.argmax(worth))])
 
-    below, above = ({hz: _halves(found.hz, hz) for hz in side} for side in (LOW_HZ, HIGH_HZ))
-    best, most, without = None, -np.inf, -np.inf
-    for low, high in product(LOW_HZ, HIGH_HZ):
-        (bass, rest), (middle, treble) = below[low], above[high]
-        bands = np.stack((bass, rest * middle, rest * treble), axis=1)
-        without = max(without, explained(np.abs(bands).astype(complex))[0])
-        with_phase, delay = explained(bands)
-        if with_phase > most:
-            best, most = (float(low), float(high), delay), with_phase
-    return best if most > without and np.isfinite(most) else None
+    best, most, without = (0.0, 0.0, 0.0), -np.inf, -np.inf
+    for finer in (False, True):
+        lows, highs = (best[0] * FINER, best[1] * FINER) if finer else (LOW_HZ, HIGH_HZ)
+        below, above = ({hz: _halves(found.hz, hz) for hz in side} for side in (lows, highs))
+        for low, high in product(lows, highs):
+            (bass, rest), (middle, treble) = below[low], above[high]
+            bands = np.stack((bass, rest * middle, rest * treble), axis=1)
+            without = max(without, explained(np.abs(bands).astype(complex))[0])
+            with_phase, delay = explained(bands)
+            if with_phase > most:
+                best, most = (float(low), float(high), delay), with_phase
+        if not most > without:
+            return None
+    return best
 
 
 def _moved(x: Samples, delay: float) -> Samples:
@@ -188,18 +201,17 @@ def _halves(hz: Array, crossover_hz: float) -> tuple[NDArray[np.complex128], NDA
     return low, high
 
 
-def _start(loud_db: float, crossovers_hz: Sequence[float], below_db: float, slope: float) -> Array:
+def _start(loud_db: float, below_db: float, slope: float) -> Array:
     """Unknowns: the bands of speech are some 0, 5 and 15 dB under the whole."""
     thresholds = loud_db + below_db - np.array([0.0, 5.0, 15.0])
-    return np.concatenate((np.log(crossovers_hz), thresholds, slope * _EACH, np.log([8.0, RELEASE_MS])))
+    return np.concatenate((thresholds, slope * _EACH, np.log([8.0, RELEASE_MS])))
 
 
 def _values(unknowns: Array) -> dict[str, float | Array]:
     attack, release = np.exp(unknowns[-2:])
     return {
-        "crossover_hz": np.exp(unknowns[:2]),
-        "threshold_db": unknowns[2:5].copy(),
-        "ratio": 1.0 / (1.0 - unknowns[5:8]),
+        "threshold_db": unknowns[:3].copy(),
+        "ratio": 1.0 / (1.0 - unknowns[3:6]),
         "attack_ms": float(np.clip(attack, 0.1, 1000.0)),
         "release_ms": float(np.clip(release, 1.0, 5000.0)),
     }
