@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 from scipy import fft
 
 from edgefilter.calibration.calibrate import calibrate, fan_psd
-from edgefilter.calibration.checks import clipped_samples
+from edgefilter.calibration.checks import check_lengths, clipped_samples
 from edgefilter.calibration.multisine import BLOCK, PERIOD, PERIODS, MultisineLaw, multisine_law, realisations
-from edgefilter.calibration.sweep import LATEST_DIRECT, deconvolve, find_direct
+from edgefilter.calibration.sweep import LATEST_DIRECT, deconvolve, find_direct, sweep_law
 from edgefilter.dsp.fourier import power
 from edgefilter.dsp.fractional_delay import interpolate
 from edgefilter.dsp.frames import decibels
@@ -88,12 +88,14 @@ def calibrate_multisine(
     True
     """
     try:
-        reference, recording = as_samples(sweep_reference, "x"), as_samples(sweep_recording, "the sweep recording")
+        reference = as_samples(sweep_reference, "the sweep reference")
+        recording = as_samples(sweep_recording, "the sweep recording")
         noise = as_samples(noise_recording, "the noise recording")
     except SignalError as error:
         raise CalibrationError(str(error)) from None
     law = multisine_law(reference)
     sweep = reference[: law.first]
+    check_lengths(sweep_law(sweep), recording, noise)
     near = deconvolve(sweep, recording[: law.first + LATEST_DIRECT], fan_psd(noise), GRID_HZ, PERIOD)
     heard = recording[: law.first + max(find_direct(near.response), 0)]
     profile = calibrate(sweep, heard, noise, created=created, source=source)
@@ -139,7 +141,7 @@ def _measured(part: Samples, blocks: tuple[int, int]) -> Spectra:
 
 
 def _drift_ppm(profile: Profile, played: Spectra, part: Samples) -> float:
-    """By how many ppm the recording's clock is ahead: a line through the lags of the multisines behind the sweep's path."""
+    """By how many ppm the recording's clock is the faster: a line through the lags of the multisines behind the sweep's path."""
     path = fft.rfft(profile.echo.impulse_response[:PERIOD].astype(np.float64), PERIOD)
     heard = _measured(part, played.shape[:2]).mean(axis=2)
     cross = (heard * np.conj(played * path)).reshape(-1, path.size)
@@ -199,17 +201,22 @@ class _Lines:
         total = _density(self.played, every)
         densities = (total, linear, noise, _density(self.even, 2 * self.measured_even), odd)
         level = decibels(np.array([total_power(psd) for psd in total]))
-        # of the sum over every other line of |line|^2 - its expectation, a mean over realisations
-        chance = np.sqrt(np.sum(noise**2, axis=1) * GRID_HZ[1] * LINE_HZ / 2 / len(realisations().periods)) / (
-            PERIODS - 1
-        )
-        least = decibels(CERTAIN * chance / np.array([max(total_power(psd), 1e-30) for psd in linear]), 1e-10)
+        least = decibels(CERTAIN * _chance(noise) / np.array([max(total_power(psd), 1e-30) for psd in linear]), 1e-10)
         return LinearApproximation(level, *(psd.astype(np.float32) for psd in densities), least)
 
 
 def _density(total: Array, count: Array) -> Array:
     """(levels, 601) full scale^2/Hz on GRID_HZ from sums of |line|^2 (levels, lines) over so many lines each."""
     return 2.0 / PERIOD**2 / LINE_HZ * _smooth(total) / np.maximum(_smooth(count.astype(float)), 1e-12)
+
+
+def _chance(noise: Array) -> Array:
+    """(levels,) standard deviation of a distortion's power where there is noise of those densities (levels, 601) alone.
+
+    Of the sum over every other line of |line|^2 less its expectation, each the mean over all realisations.
+    """
+    lines = np.sum(noise**2, axis=1) * GRID_HZ[1] * LINE_HZ / 2
+    return np.sqrt(lines / len(realisations().periods)) / (PERIODS - 1)
 
 
 def _smooth(lines: Array) -> Array:
@@ -238,7 +245,7 @@ def _doubts(profile: Profile, found: LinearApproximation, part: Samples, ppm: fl
         )
     if abs(ppm) > DOUBTFUL_PPM:
         texts.append(
-            f"the clocks of player and recorder are {ppm:.0f} ppm apart: taken out of the multisines, but the sweep's"
+            f"the clocks of player and recorder are {abs(ppm):.0f} ppm apart: taken out of the multisines, but the sweep's"
             " path is smeared, in all bands; play and record with one device"
         )
     return texts

@@ -82,14 +82,15 @@ def _draw_levels(part: SubFigure, known: LinearApproximation) -> None:
     axes = part.subplots(1, left.size, sharey=True, squeeze=False)[0]
     for i, axis in enumerate(axes):
         for name, colour, style in curves:
-            density = decibels(np.maximum(getattr(known, name)[i, 1:], 0.0), 1e-20)
+            density = getattr(known, name)[i, 1:]
+            density = np.where(density > 0.0, decibels(density, 1e-20), np.nan)  # chance takes the noise off to below 0
             label = name if name in ("linear", "noise") else f"{name} distortion"
             axis.semilogx(GRID_HZ[1:], density, color=colour, linestyle=style, linewidth=1.0, label=label)
         axis.set_xlim(50, 8000)
         axis.set_ylim(top - 85, top + 5)
         title = f"Played at {known.level_db[i]:.1f} dB of full scale:\na linear path leaves {left[i]:.1f} dB"
         _label(axis, title, "Hz", "dB of full scale² / Hz, at the microphone" if i == 0 else "")
-    axes[-1].legend(loc="upper right", fontsize=8)
+    axes[0].legend(loc="upper right", fontsize=8)
 
 
 def _draw_spectra(axis: Axes, profile: Profile) -> None:
