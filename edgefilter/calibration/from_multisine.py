@@ -198,11 +198,12 @@ class _Lines:
         counted = (self.played > 0).astype(float)
         added = (2 * odd + noise / (PERIODS - 1)) * _smooth(counted) / len(realisations().periods)
         linear = _density(self.linear, every) - added
-        total = _density(self.played, every)
-        densities = (total, linear, noise, _density(self.even, 2 * self.measured_even), odd)
+        total, even = _density(self.played, every), _density(self.even, 2 * self.measured_even)
         level = decibels(np.array([total_power(psd) for psd in total]))
         least = decibels(CERTAIN * _chance(noise) / np.array([max(total_power(psd), 1e-30) for psd in linear]), 1e-10)
-        return LinearApproximation(level, *(psd.astype(np.float32) for psd in densities), least)
+        densities = {"played": total, "linear": linear, "noise": noise, "even": even, "odd": odd}
+        stored = {name: psd.astype(np.float32) for name, psd in densities.items()}
+        return LinearApproximation(level_db=level, **stored, least_db=least)
 
 
 def _density(total: Array, count: Array) -> Array:

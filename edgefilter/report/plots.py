@@ -32,9 +32,9 @@ def plot_profile(profile: Profile, path: str | Path) -> None:
     if known is None:
         axes = figure.subplots(2, 2)
     else:
-        above, below = figure.subfigures(2, 1, height_ratios=(8, 3.5))
-        axes = above.subplots(2, 2)
-        _draw_levels(below, known)
+        grid = figure.add_gridspec(2, 1, height_ratios=(8, 3.5))
+        axes = figure.add_subfigure(grid[0]).subplots(2, 2)
+        _draw_levels(figure.add_subfigure(grid[1]), known)
     taps = profile.echo.impulse_response.astype(np.float64)
     ms = (np.arange(taps.size) - PRE_ROLL) / SAMPLE_RATE * 1000
     first = ms < 40
