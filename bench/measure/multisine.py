@@ -92,10 +92,10 @@ def measure(seed: int, index: int, voices: dict[str, list[Clip]]) -> Row:
     )
 
 
-def heard(scene: Scene, played: Array) -> Array:
+def heard(scene: Scene, played: Array, linear: bool = False) -> Array:
     """(n,) what the robot's microphone hears of a sound on the day of the calibration, without the fan."""
     path = signal.oaconvolve(scene.place.response(), scene.shell)
-    pressure = scene.usual.loudspeaker.play(played)
+    pressure = scene.usual.loudspeaker.play(played, linear)
     return scene.gain * fractional_delay(signal.oaconvolve(pressure, path)[: played.size], scene.delay)
 
 
@@ -108,18 +108,21 @@ def calibrated(rng: np.random.Generator, scene: Scene) -> Profile:
 
 
 def truth(scene: Scene, level_db: float) -> tuple[float, Array]:
-    """Distortion over the linear part, dB, and the linear gain (601,): of noise, coherence with what is heard (Bendat & Piersol)."""
+    """Distortion over the linear part, dB, and the linear gain (601,), of Gaussian noise at that level.
+
+    By the coherence of what is heard with what a linear loudspeaker would bring there (Bendat & Piersol 2010, sec. 6.1):
+    between these two there is no room, which would outlast a frame.
+    """
     n = SECONDS * RATE
     hz = np.fft.rfftfreq(n, 1 / RATE)
     shape = 10 ** (np.polynomial.Polynomial(SPEECH_DB)(np.log10(np.maximum(hz, 1.0))) / 20)
     shape[(hz < BAND_HZ[0]) | (hz > BAND_HZ[1])] = 0.0
     noise = np.fft.irfft(shape * np.fft.rfft(np.random.default_rng(1).standard_normal(n)), n)
     noise *= 10 ** (level_db / 20) / noise.std()
-    sound = np.roll(heard(scene, noise), -round(scene.delay))
-    (_, own), (_, whole), (at, cross) = (
-        signal.csd(a, b, RATE, nperseg=FRAME) for a, b in ((noise, noise), (sound, sound), (noise, sound))
-    )
-    explained = np.abs(cross) ** 2 / np.maximum(own.real, 1e-30)
+    straight, sound = heard(scene, noise, linear=True), heard(scene, noise)
+    pairs = ((noise, noise), (straight, straight), (sound, sound), (straight, sound))
+    (at, own), (_, linear), (_, whole), (_, cross) = (signal.csd(a, b, RATE, nperseg=FRAME) for a, b in pairs)
+    explained = np.abs(cross) ** 2 / np.maximum(linear.real, 1e-30)
     left = float(10 * np.log10(np.sum(whole.real - explained) / np.sum(explained)))
     width = np.maximum(GRID_HZ * (2 ** (1 / 12) - 1), 30.0)
     inside = np.abs(at[:, None] - GRID_HZ) <= width
