@@ -17,7 +17,9 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from edgefilter.calibration.calibrate import calibrate as calibrate
+    from edgefilter.calibration.from_multisine import calibrate_multisine as calibrate_multisine
     from edgefilter.calibration.from_recording import self_calibrate as self_calibrate
+    from edgefilter.calibration.multisine import generate_multisine as generate_multisine
     from edgefilter.calibration.sweep import generate_sweep as generate_sweep
     from edgefilter.diagnosis.compare import Comparison as Comparison
     from edgefilter.diagnosis.compare import compare as compare
@@ -48,6 +50,7 @@ if TYPE_CHECKING:
     from edgefilter.filter.enhance import enhance as enhance
     from edgefilter.learning.background import BackgroundLearner as BackgroundLearner
     from edgefilter.learning.path_learner import PathLearner as PathLearner
+    from edgefilter.profile.approximation import LinearApproximation as LinearApproximation
     from edgefilter.profile.data import Profile as Profile
     from edgefilter.types import SAMPLE_RATE as SAMPLE_RATE
     from edgefilter.types import Event as Event
@@ -57,7 +60,9 @@ __version__ = "0.1.0"
 
 _HOMES = {
     "calibration.calibrate": ("calibrate",),
+    "calibration.from_multisine": ("calibrate_multisine",),
     "calibration.from_recording": ("self_calibrate",),
+    "calibration.multisine": ("generate_multisine",),
     "calibration.sweep": ("generate_sweep",),
     "diagnosis.compare": ("Comparison", "compare"),
     "diagnosis.diagnose": ("add", "diagnose"),
@@ -84,6 +89,7 @@ _HOMES = {
     "filter.enhance": ("enhance",),
     "learning.background": ("BackgroundLearner",),
     "learning.path_learner": ("PathLearner",),
+    "profile.approximation": ("LinearApproximation",),
     "profile.data": ("Profile",),
     "types": ("SAMPLE_RATE", "Event", "Stats"),
 }

@@ -66,7 +66,8 @@ def _add_calibrate(commands: argparse._SubParsersAction) -> None:
         description=(
             "Measure the robot's voice and fan at its microphone.\n\n  edgefilter calibrate --sweep-reference S.wav"
             " --sweep-recording R.wav --noise-recording FAN.wav --output P.npz\n  edgefilter calibrate --live --output"
-            " P.npz                             (plays a sweep and records it)"
+            " P.npz                             (plays a sweep and records it)\n  edgefilter calibrate --multisine --excitation"
+            " S.wav                       (writes what is to be played)"
         ),
     )
     calibrate.add_argument("--sweep-reference", metavar="S.wav", help="the sweep as it was sent to the loudspeaker")
@@ -74,7 +75,13 @@ def _add_calibrate(commands: argparse._SubParsersAction) -> None:
     calibrate.add_argument(
         "--noise-recording", metavar="FAN.wav", help="the robot silent, its fan running, a few seconds"
     )
-    calibrate.add_argument(
+    sound = calibrate.add_mutually_exclusive_group()
+    sound.add_argument(
+        "--multisine",
+        action="store_true",
+        help="behind the sweep come multisines at three levels: measure the robot's distortion too",
+    )
+    sound.add_argument(
         "--stepped-sine",
         action="store_true",
         help="the recordings hold the paper's stepped sine (0-8001 Hz, 13 Hz steps)",
@@ -89,7 +96,9 @@ def _add_calibrate(commands: argparse._SubParsersAction) -> None:
     peak = "peak of the played sweep, dB of full scale (default: %(default)s)"
     calibrate.add_argument("--level-db", type=level, default=-12.0, metavar="DB", help=peak)
     calibrate.add_argument("--save-input", metavar="DIR", help="with --live: also keep the recordings")
-    calibrate.add_argument("--output", required=True, metavar="P.npz", help="profile to write")
+    result = calibrate.add_mutually_exclusive_group(required=True)
+    result.add_argument("--output", metavar="P.npz", help="profile to write")
+    result.add_argument("--excitation", metavar="S.wav", help="write the sound to be played, and nothing else")
     calibrate.add_argument("--json", metavar="FILE", help="write the result as JSON ('-': standard output)")
 
 

@@ -121,11 +121,16 @@ def _gate(n: int, start: int, fade: int) -> Array:
     return np.clip((np.arange(n) - start) / max(fade, 1), 0.0, 1.0)
 
 
-def draw_scene(rng: np.random.Generator, reference: Array, robot_over_fan_db: float) -> Scene:
+def draw_scene(
+    rng: np.random.Generator,
+    reference: Array,
+    robot_over_fan_db: float,
+    faint_db: tuple[float, float] = FAINT_DB,
+) -> Scene:
     """A robot, its calibration, and another day with the ordinary tolerances.
 
     robot_over_fan_db: of the whole recording. Tolerances: offset -60..60 samples, fan +-0.4 dB, gain +-0.1 dB, the
-    microphone moved by 0.1-0.9 mm, distortion of FAINT_DB over the fan. All recordings together are scaled later, see
+    microphone moved by 0.1-0.9 mm, distortion of faint_db over the fan. All recordings together are scaled later, see
     `hidden_cases.write_case`.
     """
     place, shell, amplitude = draw_place(rng, rng.uniform(0.18, 0.32)), draw_shell(rng), draw_hiss(rng)
@@ -146,7 +151,7 @@ def draw_scene(rng: np.random.Generator, reference: Array, robot_over_fan_db: fl
     peak = np.abs(signal.oaconvolve(excitation, whole)).max()
     gain = rng.uniform(0.25, 0.5) / peak
     fan_power = gain**2 * power(echo) * 10 ** (-robot_over_fan_db / 10)
-    wanted = fan_power / gain**2 * 10 ** (rng.uniform(*FAINT_DB) / 10)
+    wanted = fan_power / gain**2 * 10 ** (rng.uniform(*faint_db) / 10)
     loudspeaker, distortion = with_distortion(straight, reference, paths[0], wanted)
     tolerances["distortion_over_fan_db"] = decibels(distortion * gain**2 / fan_power)
     swept = gain * fractional_delay(signal.oaconvolve(loudspeaker.play(excitation), paths[0])[: excitation.size], delay)

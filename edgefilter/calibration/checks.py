@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import signal
 
 from edgefilter.calibration.stepped_sine import SteppedLaw
@@ -77,6 +78,20 @@ def collect_warnings(
 
 def clipping(law: Law, recording: Samples, direct: int) -> str | None:
     """Samples at full scale, or flat tops below it, and the frequencies that the sweep had there."""
+    clipped = clipped_samples(recording)
+    if clipped.size < 8:
+        return None
+    level = float(np.max(np.abs(recording)))
+    hz = law.frequency(clipped - direct)
+    low, high = np.clip(np.percentile(hz, [2, 98]), law.low_hz, law.high_hz)
+    return (
+        f"clipped: {clipped.size} samples at {level:.2f} of full scale, {low:.0f}-{high:.0f} Hz; "
+        "lower the playback volume or the microphone gain and calibrate again"
+    )
+
+
+def clipped_samples(recording: Samples) -> NDArray[np.intp]:
+    """Indices of samples (n,) at full scale or on a flat top below it."""
     size = np.abs(recording)
     level = float(size.max())
     top = size >= 0.999 if level >= 0.999 else size > 0.995 * level
@@ -85,15 +100,7 @@ def clipping(law: Law, recording: Samples, direct: int) -> str | None:
     run = still[:-2] & still[1:-1] & still[2:] & top[:-3]
     for k in range(4):
         flat[k : size.size - 3 + k] |= run
-    clipped = np.flatnonzero(flat | (size >= 0.9999))
-    if clipped.size < 8:
-        return None
-    hz = law.frequency(clipped - direct)
-    low, high = np.clip(np.percentile(hz, [2, 98]), law.low_hz, law.high_hz)
-    return (
-        f"clipped: {clipped.size} samples at {level:.2f} of full scale, {low:.0f}-{high:.0f} Hz; "
-        "lower the playback volume or the microphone gain and calibrate again"
-    )
+    return np.flatnonzero(flat | (size >= 0.9999))
 
 
 def short_recording(law: Law, recording: Samples, direct: int) -> str | None:

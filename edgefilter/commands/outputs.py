@@ -26,7 +26,7 @@ READ = (
     "noise_recording",
 )
 """Options that may name a file to read; a name that is no file, such as a device's, cannot be overwritten."""
-WRITTEN = ("output", "json", "report", "save_profile", "learn", "apply", "plot", "log_json")
+WRITTEN = ("output", "excitation", "json", "report", "save_profile", "learn", "apply", "plot", "log_json")
 """Options that may name a file to write."""
 FOLDERS: dict[tuple[str, str], tuple[str, ...]] = {
     ("run", "record"): ("mic.wav", "reference.wav", "output.wav", "events.jsonl", "run.json", "profile.npz"),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 
 from edgefilter.commands.display import report_part, write_json
+from edgefilter.profile.approximation import LinearApproximation
 from edgefilter.profile.data import Profile
 from edgefilter.profile.text import describe
 
@@ -35,7 +36,23 @@ def summary(profile: Profile) -> dict[str, object]:
             for (low, high), snr in zip(profile.band_hz, profile.band_snr_db)
         ],
         "distortion_db": {str(order): float(level) for order, level in enumerate(profile.distortion_db, start=2)},
+        "levels": [] if profile.approximation is None else levels(profile.approximation),
         "warnings": list(profile.warnings),
         "created": profile.created,
         "source": profile.source,
     }
+
+
+def levels(approximation: LinearApproximation) -> list[dict[str, float]]:
+    """Of each level of the multisines: dB of full scale, and what a linear path leaves, dB over the linear part."""
+    named = {
+        "left_db": approximation.over_linear_db("noise", "even", "odd"),
+        "noise_db": approximation.over_linear_db("noise"),
+        "even_db": approximation.over_linear_db("even"),
+        "odd_db": approximation.over_linear_db("odd"),
+        "least_db": approximation.least_db,
+    }
+    return [
+        {"played_db": float(level), **{name: float(figures[i]) for name, figures in named.items()}}
+        for i, level in enumerate(approximation.level_db)
+    ]

@@ -9,7 +9,7 @@ import numpy as np
 import soxr
 from numpy.typing import NDArray
 from scipy import fft
-from scipy.ndimage import maximum_filter1d
+from scipy.ndimage import maximum_filter1d, uniform_filter1d
 
 from edgefilter.diagnosis.offset import find_offset, starting_offset
 from edgefilter.dsp.fourier import power
@@ -21,7 +21,7 @@ from edgefilter.echo.model import EchoModel
 from edgefilter.echo.recording import fitted_blocks, paired
 from edgefilter.errors import SignalError
 from edgefilter.profile.data import Profile
-from edgefilter.types import PRE_ROLL, SAMPLE_RATE, Samples, as_samples
+from edgefilter.types import PRE_ROLL, SAMPLE_RATE, Array, Samples, as_samples
 
 SILENCE_DB = -15.0
 """The robot is silent where its predicted voice, whitened, is this far under the fan."""
@@ -30,6 +30,10 @@ FAN_TOLERANCE_DB = 1.0
 TALK_DB = 8.0
 """Over the fan: more than a reverberation tail in a pause, less than a soft voice at two metres."""
 GAP_S, EDGE_S = 1.0, 0.2
+MOMENT = 512
+"""Samples over which the voice's power says how much the loudspeaker distorts."""
+ORDINARY = 2.0
+"""Times the calibrated distortion: that of speech was up to 3.4 dB off what multisines of its spectrum had shown."""
 CUT, CUT_DB, TAIL_S = 32, -30.0, 0.3
 """A reference begins or ends in the middle of a word where that many samples at its end are no further below its
 loudest 20 ms; what was said before still sounds for TAIL_S."""
@@ -46,7 +50,8 @@ class Prepared:
     events of other recordings. prediction: of that model.
     usable: samples where nobody else talks. active: where the robot is heard. offset: samples of lag against the
     calibration.
-    human: (start_s, end_s) of other talkers.
+    human: (start_s, end_s) of other talkers. ordinary: the robot's own distortion, as calibrated, in the form of
+    EchoModel.unpredictable.
     """
 
     measurement: Measurement
@@ -57,6 +62,7 @@ class Prepared:
     offset: float
     human: tuple[tuple[float, float], ...] = ()
     warnings: tuple[str, ...] = ()
+    ordinary: tuple[tuple[Samples, Array], ...] = ()
 
     @property
     def held_out(self) -> NDArray[np.bool_]:
@@ -125,7 +131,20 @@ def prepare(profile: Profile, recording: Samples, reference: Samples, *, sample_
     if len(pieces) > 1:
         lags = ", ".join(f"{lag:.1f} from {first / SAMPLE_RATE:.1f} s" for first, _, lag in pieces)
         warnings += (f"the utterances lag by different numbers of samples: {lags}; aligned one by one",)
-    return Prepared(Measurement(x, y, psd, fit & usable), model, predicted, usable, active, offset, human, warnings)
+    measurement, ordinary = Measurement(x, y, psd, fit & usable), ordinary_distortion(profile, predicted)
+    return Prepared(measurement, model, predicted, usable, active, offset, human, warnings, ordinary)
+
+
+def ordinary_distortion(profile: Profile, predicted: Samples) -> tuple[tuple[Samples, Array], ...]:
+    """Expected square (n,) and density (601,) of what the calibrated loudspeaker adds to a predicted voice (n,).
+
+    Nothing where the calibration does not know it, or where the profile predicts its waveform.
+    """
+    known = profile.approximation
+    if known is None or "speaker_nonlinearity" in dict(profile.echo.effects):
+        return ()
+    power = uniform_filter1d(np.square(predicted, dtype=np.float64), MOMENT, mode="constant")
+    return (((ORDINARY * known.expected(power)).astype(np.float32), known.colour),)
 
 
 def known_span(x: Samples, first_lag: float, last_lag: float) -> tuple[int, int]:

@@ -87,17 +87,19 @@ class Judge:
     ) -> Score:
         """The score of a prediction (n,), with the ordinary tolerances taken up first.
 
-        unpredictable: as EchoModel.unpredictable gives it, noise that is expected on top of the fan. gain: (n,) of the
+        unpredictable: as EchoModel.unpredictable gives it, noise that is expected on top of the fan, as the robot's
+        ordinary distortion is. gain: (n,) of the
         microphone, which
         the fan passed as well: it is taken out of the residual before that is held against the fan. The cells keep it:
         as a likelihood their level has to be that of the recording as it is.
         """
         corrected = self.correct(prediction)
         residual = self.prepared.measurement.recording - corrected
-        cells = self.cells(residual) / self._expected_cells(unpredictable)
+        expected = (*unpredictable, *self.prepared.ordinary)
+        cells = self.cells(residual) / self._expected_cells(expected)
         weights = np.broadcast_to(self.freedom, cells.shape)
         plain = whiten(residual if gain is None else residual / gain, self.psd).astype(np.float64) ** 2
-        white = self._over_expected(plain, unpredictable) if unpredictable else plain
+        white = self._over_expected(plain, expected) if expected else plain
         held, active = self.prepared.held_out, self.prepared.active
         return Score(
             level_db=float(np.average(10 * np.log10(np.maximum(cells, 1e-3)), weights=weights)) if cells.size else 0.0,

@@ -15,7 +15,8 @@ if TYPE_CHECKING:
     from edgefilter.profile.data import Profile
 
 LEAKAGE = 0.005
-"""Part of the echo's power that no linear path explains, -23 dB: a loudspeaker's distortion, at first."""
+"""Part of the echo's power that no linear path explains, -23 dB: a loudspeaker's distortion, at first, where the profile
+does not know it."""
 LEAST, MOST = 0.0024, 0.1
 """Bounds on it once it is tracked."""
 LEAKAGE_MEMORY, LEAKAGE_RISE, LEAKAGE_FALL = 0.97, 1.005, 0.9
@@ -46,7 +47,7 @@ class Residual:
 
     With a profile the fan is the calibrated one; without, it is the slowly rising minimum of the smoothed error. Of the
     echo a part stays, how much is tracked: the least ratio of error to echo while the robot speaks, for a human can
-    only add to it.
+    only add to it. It begins with the loudspeaker's distortion where the profile knows it from multisines.
     """
 
     def __init__(self, stft: StftConfig, profile: Profile | None = None) -> None:
@@ -55,6 +56,8 @@ class Residual:
         self._spread = np.full(width, SPREAD / width, np.float32)
         self._fan = profile.noise_bins(stft) if profile is not None else None
         self._misalignment = np.float32(MISALIGNMENT_COLD if profile is None else MISALIGNMENT_WARM)
+        known = profile.approximation if profile is not None else None
+        self._first = LEAKAGE if known is None else min(max(known.share, LEAST), MOST)
         self.reset()
 
     def reset(self) -> None:
@@ -65,7 +68,7 @@ class Residual:
         before = self._spread.size // 2  # beyond its ends the echo counts as what it is there
         self._extended = np.zeros(self._bins + self._spread.size - 1, np.float32)
         self._below, self._echo, self._above = np.split(self._extended, (before, before + self._bins))
-        self._leakage, self._left, self._brought = LEAKAGE, 0.0, 0.0
+        self._leakage, self._left, self._brought = self._first, 0.0, 0.0
 
     def step(
         self, echo: Spectrum, error: Spectrum, uncertainty: Samples, added: Samples | None = None

@@ -14,6 +14,7 @@ from edgefilter.echo.effects.catalogue import find
 from edgefilter.echo.effects.catalogue import names as known_effects
 from edgefilter.echo.model import EchoModel
 from edgefilter.errors import ProfileError
+from edgefilter.profile.approximation import LinearApproximation
 from edgefilter.profile.file import REMEDY, read_fields, write_fields
 from edgefilter.types import PRE_ROLL, SAMPLE_RATE, Array, Samples
 
@@ -60,6 +61,8 @@ class Profile:
         Why and in which bands the calibration is not to be trusted.
     created, source : str
         ISO date, and what it was made from.
+    approximation : LinearApproximation, optional
+        What a linear path leaves of the robot at several levels, where it was calibrated with multisines.
 
     Raises
     ------
@@ -87,6 +90,7 @@ class Profile:
     warnings: tuple[str, ...] = ()
     created: str = ""
     source: str = ""
+    approximation: LinearApproximation | None = None
 
     def __post_init__(self) -> None:
         _check_arrays(self)
@@ -118,6 +122,8 @@ class Profile:
         """
         arrays = {name: np.asarray(getattr(self, name)) for name in _ARRAYS}
         arrays["impulse_response"] = np.asarray(self.echo.impulse_response)
+        if self.approximation is not None:
+            arrays |= self.approximation.arrays()
         header = {
             "pre_roll": PRE_ROLL,
             "delay": float(self.delay),
@@ -149,6 +155,7 @@ class Profile:
         """
         arrays, header, effects = read_fields(Path(path))
         try:
+            approximation = LinearApproximation.taken_from(arrays)
             expected = (
                 {*_ARRAYS, "impulse_response"},
                 {"pre_roll", "delay", "sample_rate", "warnings", "created", "source"},
@@ -166,7 +173,7 @@ class Profile:
                 raise ProfileError(f"warnings is a JSON {type(warnings).__name__}, expected a list of texts; {REMEDY}")
             fields: dict[str, Any] = {**arrays, **header}  # what type each has is checked on construction
             echo = EchoModel(fields.pop("impulse_response"), effects)
-            profile = cls(echo=echo, warnings=tuple(warnings), **fields)
+            profile = cls(echo=echo, warnings=tuple(warnings), approximation=approximation, **fields)
             _check_effects(profile.echo)
             return profile
         except ProfileError as error:

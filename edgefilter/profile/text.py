@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from edgefilter.echo.effects.catalogue import find
+from edgefilter.profile.approximation import LinearApproximation
 from edgefilter.profile.data import DISTORTION_ORDERS, Profile
 from edgefilter.types import PRE_ROLL, SAMPLE_RATE, Array, Samples
 
@@ -29,6 +30,7 @@ def describe(profile: Profile) -> str:
         f"decay       {_decay(path)}",
         f"fan         {fan:.1f} dB of full scale",
         f"distortion  orders {distortion}",
+        *(_left_lines(profile.approximation) if profile.approximation else ()),
         "signal-to-noise ratio of the sweep, by third octave",
         *(_band_line(edges, float(snr)) for edges, snr in zip(profile.band_hz, profile.band_snr_db, strict=True)),
     ]
@@ -43,6 +45,27 @@ def describe(profile: Profile) -> str:
     if not profile.warnings:
         lines.append("trust       nothing doubtful found")
     return "\n".join(lines)
+
+
+def _left_lines(known: LinearApproximation) -> list[str]:
+    """What a linear path leaves at each volume, the loudest first, then the same in a sentence."""
+    left = known.over_linear_db("noise", "even", "odd")
+    parts = {name: known.over_linear_db(name) for name in ("even", "odd", "noise")}
+    lines = ["left of the robot's voice by the best linear path: distortion of even and odd order, and noise"]
+    for i in reversed(range(left.size)):
+        told = [
+            f"{name} {'below ' if name != 'noise' and db[i] < known.least_db[i] else ''}"
+            f"{max(db[i], known.least_db[i]) if name != 'noise' else db[i]:.0f}"
+            for name, db in parts.items()
+        ]
+        lines.append(f"  played at {known.level_db[i]:5.1f} dB of full scale {left[i]:6.1f} dB  ({', '.join(told)})")
+    softer = [
+        f"{known.level_db[-1] - known.level_db[i]:.0f} dB softer {left[i]:.0f}" for i in reversed(range(left.size - 1))
+    ]
+    lines.append(
+        f"volume      at this volume the path leaves {left[-1]:.0f} dB{'; ' if softer else ''}{', '.join(softer)}"
+    )
+    return lines
 
 
 def _band_line(edges: Array, snr: float) -> str:

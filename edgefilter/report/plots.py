@@ -8,12 +8,13 @@ from pathlib import Path
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
+from matplotlib.figure import Figure, SubFigure
 
 from edgefilter.dsp.fourier import power
 from edgefilter.dsp.frames import decibels, frames
 from edgefilter.dsp.psd import hann
 from edgefilter.errors import EdgefilterError
+from edgefilter.profile.approximation import LinearApproximation
 from edgefilter.profile.data import DISTORTION_ORDERS, GRID_HZ, Profile
 from edgefilter.types import PRE_ROLL, SAMPLE_RATE, Samples
 
@@ -21,9 +22,19 @@ INK, ACCENT, SOFT = "#222222", "#b5442c", "#5b7c99"
 
 
 def plot_profile(profile: Profile, path: str | Path) -> None:
-    """Draw impulse response, decay, both readings of the response with the fan, and the bands, to a PNG, SVG or PDF."""
-    figure = _figure(11, 8)
-    axes = figure.subplots(2, 2)
+    """Draw impulse response, decay, both readings of the response with the fan, and the bands, to a PNG, SVG or PDF.
+
+    Below them, where the profile knows it, what the best linear path makes of the voice at each level, and what it
+    leaves.
+    """
+    known = profile.approximation
+    figure = _figure(11, 8 if known is None else 11.5)
+    if known is None:
+        axes = figure.subplots(2, 2)
+    else:
+        grid = figure.add_gridspec(2, 1, height_ratios=(8, 3.5))
+        axes = figure.add_subfigure(grid[0]).subplots(2, 2)
+        _draw_levels(figure.add_subfigure(grid[1]), known)
     taps = profile.echo.impulse_response.astype(np.float64)
     ms = (np.arange(taps.size) - PRE_ROLL) / SAMPLE_RATE * 1000
     first = ms < 40
@@ -61,6 +72,25 @@ def plot_before_after(signals: Mapping[str, Samples], path: str | Path) -> None:
         axis.set_ylabel("kHz")
     axes[-1].set_xlabel("s")
     _save(figure, path)
+
+
+def _draw_levels(part: SubFigure, known: LinearApproximation) -> None:
+    """Densities at the microphone, one picture a level, the softest first."""
+    curves = (("linear", INK, "-"), ("even", ACCENT, "-"), ("odd", ACCENT, ":"), ("noise", SOFT, "-"))
+    left = known.over_linear_db("noise", "even", "odd")
+    top = float(decibels(known.linear.max(), 1e-20))
+    axes = part.subplots(1, left.size, sharey=True, squeeze=False)[0]
+    for i, axis in enumerate(axes):
+        for name, colour, style in curves:
+            density = getattr(known, name)[i, 1:]
+            density = np.where(density > 0.0, decibels(density, 1e-20), np.nan)  # chance takes the noise off to below 0
+            label = name if name in ("linear", "noise") else f"{name} distortion"
+            axis.semilogx(GRID_HZ[1:], density, color=colour, linestyle=style, linewidth=1.0, label=label)
+        axis.set_xlim(50, 8000)
+        axis.set_ylim(top - 85, top + 5)
+        title = f"Played at {known.level_db[i]:.1f} dB of full scale:\na linear path leaves {left[i]:.1f} dB"
+        _label(axis, title, "Hz", "dB of full scale² / Hz, at the microphone" if i == 0 else "")
+    axes[0].legend(loc="upper right", fontsize=8)
 
 
 def _draw_spectra(axis: Axes, profile: Profile) -> None:

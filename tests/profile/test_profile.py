@@ -13,6 +13,7 @@ import pytest
 from edgefilter.dsp.stft import StftConfig
 from edgefilter.echo.model import EchoModel
 from edgefilter.errors import ProfileError
+from edgefilter.profile.approximation import LinearApproximation
 from edgefilter.profile.data import GRID_BINS, GRID_HZ, Profile
 from edgefilter.profile.file import read_fields, write_fields
 from edgefilter.types import PRE_ROLL
@@ -396,3 +397,36 @@ def test_unwritable_targets(tmp_path):
         make().save(tmp_path)
     with pytest.raises(ProfileError, match="not a file that can be replaced"):
         make().save("/dev/null")
+
+
+def known_levels():
+    density = np.full((2, GRID_BINS), 1e-9, np.float32)
+    return LinearApproximation(np.array([-26.0, -20.0]), *[density] * 3, -density / 9, density, np.array([-40.0, -46]))
+
+
+def test_what_a_linear_path_leaves_is_kept_and_a_part_of_it_is_refused(tmp_path):
+    path = tmp_path / "p.npz"
+    make(approximation=known_levels()).save(path)
+    kept = Profile.load(path).approximation.arrays()
+    for name, array in known_levels().arrays().items():
+        assert kept[name].dtype == array.dtype and kept[name].tobytes() == array.tobytes(), name
+    rewrite(path, approximation_odd=None)
+    refused(path, "array fields missing: approximation_odd; give a profile")
+    make().save(path)
+    assert Profile.load(path).approximation is None
+
+
+@pytest.mark.parametrize(
+    ("name", "array", "match"),
+    [
+        ("level_db", np.array([-20.0, -26.0]), r"expected rising levels"),
+        ("level_db", np.zeros(0), r"expected 1 to 8 float64"),
+        ("noise", np.zeros((2, 600), np.float32), r"approximation_noise is float32 of shape \(2, 600\)"),
+        ("even", np.full((2, GRID_BINS), np.nan, np.float32), "approximation_even is nan to nan"),
+        ("least_db", np.array([-40.0]), "approximation_least_db is .* expected 2 float64"),
+    ],
+)
+def test_a_damaged_part_of_what_a_linear_path_leaves_is_one_line(tmp_path, name, array, match):
+    make(approximation=known_levels()).save(tmp_path / "p.npz")
+    rewrite(tmp_path / "p.npz", **{f"approximation_{name}": array})
+    refused(tmp_path / "p.npz", match)

@@ -1,13 +1,16 @@
 """Pictures: drawn, with what was in the data, and one line where they cannot be written."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from PIL import Image
 
 from edgefilter.echo.model import EchoModel
 from edgefilter.errors import EdgefilterError
+from edgefilter.profile.approximation import LinearApproximation
 from edgefilter.profile.data import Profile
-from edgefilter.report.plots import plot_before_after, plot_profile
+from edgefilter.report.plots import ACCENT, INK, SOFT, plot_before_after, plot_profile
 from edgefilter.types import PRE_ROLL
 
 
@@ -40,6 +43,20 @@ def test_profile_picture_shows_the_profile(tmp_path):
     a, b, c = (pixels(tmp_path / f"{name}.png") for name in "abc")
     assert a.shape == (880, 1210) and a.std() > 10
     assert np.array_equal(a, b) and not np.array_equal(a, c)
+
+
+def test_what_a_linear_path_leaves_is_drawn_in_three_colours(tmp_path):
+    density = np.full((2, 601), 1e-9, np.float32)
+    levels = np.array([-26.0, -20.0])
+    parts = {name: share * density for name, share in {"noise": 1e-3, "even": 1e-2, "odd": 1e-4}.items()}
+    known = LinearApproximation(levels, density, density, **parts, least_db=levels)
+    plot_profile(replace(profile(), approximation=known), tmp_path / "a.svg")
+    drawn = (tmp_path / "a.svg").read_text()
+    plot_profile(profile(), tmp_path / "b.svg")
+    assert "a linear path leaves -19.5 dB" in drawn and "even distortion" in drawn
+    assert "a linear path" not in (tmp_path / "b.svg").read_text()
+    below = drawn[drawn.index("Played at") :]
+    assert all(below.count(f"stroke: {colour}") >= 2 for colour in (INK, ACCENT, SOFT))
 
 
 def test_warnings_are_on_the_picture(tmp_path):
