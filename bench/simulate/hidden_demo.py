@@ -31,7 +31,7 @@ RECORDED = ("sweep_ref", "sweep_mic", "fan_only")
 
 @dataclass(frozen=True)
 class Hidden:
-    """One case: what is hidden, in the order of the chain, how strongly, in whose voice."""
+    """One case: what is hidden, one after the other, how strongly, in whose voice."""
 
     name: str
     effects: tuple[str, ...]
@@ -42,7 +42,7 @@ class Hidden:
 
 CASES = (
     Hidden("one", ("late_reverb",), "clear", "am_puck", 1),
-    Hidden("two", ("speaker_nonlinearity", "late_reverb"), "clear", "bf_lily", 2),
+    Hidden("two", ("fan_noise", "late_reverb"), "moderate", "bf_lily", 2),
 )
 
 

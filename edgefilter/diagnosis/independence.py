@@ -23,12 +23,14 @@ CHANCE = 0.01
 AUTO_MS = 25
 """Longest lag of the autocorrelation: three periods of a deep voice."""
 CROSS_MS = (-25, 100)
-"""Lags of the cross-correlation behind the direct sound: what comes later is left by a room that late_reverb tells."""
-ZONES_MS = ((CROSS_MS[0], -1.0), (-1.0, 1.0), (1.0, CROSS_MS[1]))
-"""Before the direct sound, at it (an error of its level or of less than a sample of its lag reaches so far), behind."""
+"""Lags of the cross-correlation behind the direct sound: what comes later is a room, told by the excess by lag."""
+ZONES_MS = ((CROSS_MS[0], -1.0), (-1.0, 3.0), (3.0, CROSS_MS[1]))
+"""Before the direct sound, at it, behind it. An error of less than a sample of its lag reaches 1 ms before it; behind it
+the voice's own colour, which the whitened reference lacks and the residual has, rings for some ms, and hides what comes
+as early."""
 MEANINGS = (
     "feedback or mis-alignment",
-    "the direct sound's level or lag is another",
+    "another level, lag or first echo",
     "a path that the model has not got",
 )
 """Of a dependence in each."""
@@ -134,7 +136,7 @@ def independence(
     -----
     The residual goes through the causal filter that makes the calibrated fan white, the reference through its own
     linear prediction, and the cross-correlation is divided by what correlation the reference has left over the lags
-    shown: a path is seen at its own lags, not smeared by the vowels' pitch over negative ones. Of two independent
+    shown: what comes before the direct sound is not smeared over by the vowels' pitch. Of two independent
     series of which one is white, a correlation has the variance 1/N (Bartlett 1955; Box & Jenkins 1976, 11.1.3). Speech
     is not stationary, so the products of the squares stand in its place (White 1980). The fan is not quite that of the
     calibration: the residual's autocorrelation is held against that of the robot's silences, whose variance adds.
