@@ -130,7 +130,7 @@ def independence(
     """Test a residual (n,) against the aligned reference (n,); psd (601,): of the fan.
 
     heard, silent: (n,) bool, where the robot talks alone, and where nobody does. None for less than a second of the
-    robot.
+    robot, and where nothing is left.
 
     Notes
     -----
@@ -145,7 +145,10 @@ def independence(
         return None
     white = scipy.signal.oaconvolve(residual, whitener(psd))[: residual.size].astype(np.float32)
     spoken = white * heard
-    auto = _autocorrelation(spoken, white * silent if np.count_nonzero(silent) >= LEAST else None)
+    if not spoken.any():
+        return None
+    quiet = white * silent
+    auto = _autocorrelation(spoken, quiet if np.count_nonzero(silent) >= LEAST and quiet.any() else None)
     cross, share = _cross_correlation(spoken, reference)
     zones = []
     for (low, high), meaning in zip(ZONES_MS, MEANINGS, strict=True):
@@ -190,8 +193,7 @@ def _own(x: Samples, lags: int) -> tuple[Array, Array]:
     """Autocorrelation of x at 1 to `lags` samples, and its variance were x independent from sample to sample."""
     square = x * x
     energy = float(np.sum(square, dtype=np.float64))
-    variance = np.maximum(lagged_sums(square, square, 1, lags + 1), 1.0) / energy**2
-    return lagged_sums(x, x, 1, lags + 1) / energy, variance
+    return lagged_sums(x, x, 1, lags + 1) / energy, _positive(lagged_sums(square, square, 1, lags + 1)) / energy**2
 
 
 def _cross_correlation(spoken: Samples, reference: Samples) -> tuple[Correlogram, Array]:
@@ -201,8 +203,7 @@ def _cross_correlation(spoken: Samples, reference: Samples) -> tuple[Correlogram
     energy = float(np.sum(said * said, dtype=np.float64))
     norm = np.sqrt(energy * float(np.sum(spoken * spoken, dtype=np.float64)))
     plain = lagged_sums(spoken, said, low, high) / norm
-    variance = np.maximum(lagged_sums(spoken * spoken, said * said, low, high), 0.0) / norm**2
-    variance = np.maximum(variance, 1e-3 * float(np.mean(variance)))
+    variance = _positive(lagged_sums(spoken * spoken, said * said, low, high)) / norm**2
     own = lagged_sums(said, said, 0, high - low) / energy
     own[0] += RIDGE
     middle = np.eye(1, high - low, (high - low) // 2)[0]
@@ -210,6 +211,11 @@ def _cross_correlation(spoken: Samples, reference: Samples) -> tuple[Correlogram
     bounds = BOUND * np.sqrt(variance * wider[(high - low) // 2])
     lags_ms = (np.arange(low, high) - PRE_ROLL) / PER_MS
     return Correlogram(lags_ms, values, np.zeros(high - low), bounds), plain * values - variance
+
+
+def _positive(sums: Array) -> Array:
+    """Sums of squares, held above what rounding makes of those that are nearly zero."""
+    return np.maximum(sums, 1e-3 * float(np.mean(np.abs(sums))))
 
 
 def _predicted_away(reference: Samples) -> Samples:
