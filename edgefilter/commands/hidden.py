@@ -18,7 +18,7 @@ from edgefilter.commands.fitting import fit
 from edgefilter.diagnosis.diagnose import Diagnosis, diagnose
 from edgefilter.dsp.metrics import si_sdr
 from edgefilter.errors import UsageError
-from edgefilter.filter.ego_filter import enhance
+from edgefilter.filter.enhance import enhance
 from edgefilter.profile.data import Profile
 from edgefilter.report.text import in_order
 from edgefilter.report.words import decibels, headline
