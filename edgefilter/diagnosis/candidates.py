@@ -20,12 +20,13 @@ def candidates(found: Found, named: Collection[str]) -> tuple[Candidate, ...]:
 
     The information criterion is that of a residual that is Gaussian with a variance of its own in each cell (Whittle
     1953; Schwarz 1978): ln(N) for each number of the fit, less N times the fall of the mean log power, N the samples
-    held out. As these are held out the gain is not flattered; the penalty comes on top.
+    held out. As these are held out the gain is not flattered; the penalty comes on top. An effect that was
+    tried beside others only is ranked by its gain there.
     """
     judge = Judge(found.prepared)
     held = float(judge.starts.size * HOP * FRAMES_PER_CELL) * judge.freedom.sum() / (HOP - 1)
     tried = {entry.name: entry for entry in found.tried}
-    seen = {step.name: Tried(step.name, step, step) for step in found.steps}
+    seen = {step.name: Tried(step.name, None if place else step, step) for place, step in enumerate(found.steps)}
     rows = [_row(entry, found, named, held) for entry in {**seen, **tried}.values()]
     ranked = sorted((row for row in rows if row.delta_bic is not None), key=lambda row: row.delta_bic or 0.0)
     rest = sorted((row for row in rows if row.delta_bic is None), key=lambda row: row.effect)
@@ -52,12 +53,13 @@ def size_of(name: str, values: Values) -> float:
 def _row(entry: Tried, found: Found, named: Collection[str], held: float) -> Candidate:
     verdict, why = _fate(entry, found, named)
     beside = next((step for step in found.steps if step.name == entry.name), entry.beside)
-    row = Candidate(entry.name, verdict, why, beside_db=beside.gain_db if beside else None)
-    if entry.alone is None:
+    row = Candidate(entry.name, verdict, why, *(trial.gain_db if trial else None for trial in (entry.alone, beside)))
+    trial = entry.alone or beside
+    if trial is None:
         return row
-    numbers = size_of(entry.name, entry.alone.values)
-    bic = numbers * float(np.log(max(held, 2.0))) - held * np.log(10.0) / 10.0 * entry.alone.gain_db
-    return replace(row, gain_db=entry.alone.gain_db, numbers=numbers, delta_bic=float(bic))
+    numbers = size_of(entry.name, trial.values)
+    bic = numbers * float(np.log(max(held, 2.0))) - held * np.log(10.0) / 10.0 * trial.gain_db
+    return replace(row, numbers=numbers, delta_bic=float(bic))
 
 
 def _fate(entry: Tried, found: Found, named: Collection[str]) -> tuple[Fate, str]:
