@@ -53,7 +53,8 @@ def size_of(name: str, values: Values) -> float:
 def _row(entry: Tried, found: Found, named: Collection[str], held: float) -> Candidate:
     verdict, why = _fate(entry, found, named)
     beside = next((step for step in found.steps if step.name == entry.name), entry.beside)
-    row = Candidate(entry.name, verdict, why, *(trial.gain_db if trial else None for trial in (entry.alone, beside)))
+    alone_db, beside_db = (trial.gain_db if trial else None for trial in (entry.alone, beside))
+    row = Candidate(entry.name, verdict, why, alone_db, beside_db)
     trial = entry.alone or beside
     if trial is None:
         return row
