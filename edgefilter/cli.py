@@ -54,6 +54,9 @@ def _add_demo(commands: argparse._SubParsersAction) -> None:
         help="folder for the WAV files and the picture (default: %(default)s)",
     )
     demo.add_argument(
+        "--hidden", action="store_true", help="instead: robots to which something happened, diagnosed and mended"
+    )
+    demo.add_argument(
         "--engine", default="auto", metavar="ENGINE", help=f"auto, {', '.join(ENGINES)} (default: %(default)s)"
     )
     demo.add_argument("--json", metavar="FILE", help="write the figures as JSON ('-': standard output)")

@@ -20,6 +20,11 @@ NOT_CODE = {
     "edgefilter/py.typed",
     "edgefilter/demo_data/LICENSE.md",
     "edgefilter/demo_data/human.flac",
+    *(
+        f"edgefilter/demo_data/hidden/{case}/{name}"
+        for case in ("one", "two")
+        for name in ("mic.flac", "profile.npz", "reference.flac", "truth.json")
+    ),
     "edgefilter/demo_data/mic.flac",
     "edgefilter/demo_data/profile.npz",
     "edgefilter/demo_data/reference.flac",

@@ -10,6 +10,7 @@ import numpy as np
 import soundfile
 
 from edgefilter.audio.files import FileSink, FileSource
+from edgefilter.commands import hidden
 from edgefilter.commands.display import describe_latency, write_json
 from edgefilter.dsp.metrics import si_sdr
 from edgefilter.engines import NEEDS_PROFILE
@@ -22,6 +23,8 @@ DATA = Path(__file__).parents[1] / "demo_data"
 
 
 def main(args: argparse.Namespace) -> int:
+    if args.hidden:
+        return hidden.main(args)
     folder = Path(args.output)
     folder.mkdir(parents=True, exist_ok=True)
     ego = EgoFilter(DATA / "profile.npz", args.engine)

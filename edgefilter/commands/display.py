@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 import json
 import os
+import re
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -137,8 +138,9 @@ def report_part(name: str) -> ModuleType:
 
 
 def write_json(data: object, path: str) -> None:
-    """Write data as JSON to a file, or to standard output for '-'."""
+    """Write data as JSON to a file, or to standard output for '-'; a list of nothing but numbers and words in one line."""
     text = json.dumps(data, indent=1, allow_nan=False, default=float)
+    text = re.sub(r"\[\n\s+[^][{}]*?\n\s*\]", lambda found: re.sub(r"\n\s*", " ", found[0]), text)
     if path == "-":
         print(text)
         return

@@ -28,10 +28,18 @@ READ = (
 """Options that may name a file to read; a name that is no file, such as a device's, cannot be overwritten."""
 WRITTEN = ("output", "excitation", "json", "report", "save_profile", "learn", "apply", "plot", "log_json")
 """Options that may name a file to write."""
+HIDDEN_FILES = (
+    *("robot.npz", "mic.wav", "tts.wav", "talk.wav", "talk_tts.wav", "better.npz"),
+    *("human_before.wav", "human_after.wav", "report.html", "before_after.png"),
+)
+"""What `demo --hidden` writes of each of its robots."""
 FOLDERS: dict[tuple[str, str], tuple[str, ...]] = {
     ("run", "record"): ("mic.wav", "reference.wav", "output.wav", "events.jsonl", "run.json", "profile.npz"),
     ("calibrate", "save_input"): ("sweep_reference.wav", "sweep_recording.wav", "noise_recording.wav"),
-    ("demo", "output"): ("filtered.wav", "microphone.wav", "human.wav", "before_after.png"),
+    ("demo", "output"): (
+        *("filtered.wav", "microphone.wav", "human.wav", "before_after.png"),
+        *(f"{case}/{name}" for case in ("one", "two") for name in HIDDEN_FILES),
+    ),
 }
 """By command and option: the files that are written into the folder which the option names."""
 IN_FOLDERS = ("save_input", "record")
@@ -117,7 +125,7 @@ def _read(args: argparse.Namespace) -> Iterator[Place]:
     for variable, path in os.environ.items():
         if variable.startswith("EDGEFILTER_"):
             yield Place(variable, path)
-    for pattern in ("demo_data/*", "models/*", "../models/*"):
+    for pattern in ("demo_data/*", "demo_data/hidden/*/*", "models/*", "../models/*"):
         for file in PACKAGE.glob(pattern):
             yield Place("edgefilter's own", str(file))
 

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field, fields
 
 import numpy as np
 from numpy.typing import NDArray
 
+from edgefilter.diagnosis.independence import Independence, independence
 from edgefilter.diagnosis.prepare import Prepared, prepare
 from edgefilter.diagnosis.score import Judge
 from edgefilter.dsp.frames import block_power, blocks, decibels, frames
 from edgefilter.dsp.psd import frequencies, periodograms, total_power
+from edgefilter.echo.effects.catalogue import chain
 from edgefilter.echo.evidence import Score
 from edgefilter.echo.measurement import whiten
 from edgefilter.echo.model import EchoModel
@@ -38,7 +40,8 @@ class Comparison:
     silence_excess_db: while the robot is silent; nan where it never is. human: (start_s, end_s) where somebody talks,
     left out.
     offset_samples: lag of the recording against the calibration, constant. recording, prediction, residual: (n,),
-    aligned.
+    aligned. independence: whether the residual is white and independent of the reference; None for less than a second
+    of the robot.
     """
 
     excess_db: float
@@ -54,11 +57,15 @@ class Comparison:
     recording: Samples = field(repr=False)
     prediction: Samples = field(repr=False)
     residual: Samples = field(repr=False)
+    independence: Independence | None = field(default=None, repr=False)
 
     def to_dict(self) -> dict[str, object]:
         """All but the signals, ready for JSON; what is not a number becomes None."""
-        signals = ("recording", "prediction", "residual")
-        return {key: _plain(value) for key, value in asdict(self).items() if key not in signals}
+        left_out = ("recording", "prediction", "residual", "independence")
+        told = {
+            key: _plain(getattr(self, key)) for key in (entry.name for entry in fields(self)) if key not in left_out
+        }
+        return {**told, "independence": self.independence.to_dict() if self.independence else None}
 
 
 def _plain(value: object) -> object:
@@ -155,7 +162,16 @@ def describe(prepared: Prepared, model: EchoModel, score: Score | None = None) -
         recording=measurement.recording,
         prediction=prediction,
         residual=residual,
+        independence=independence(flat, _as_played(measurement.reference, model), psd, use & prepared.active, silent),
     )
+
+
+def _as_played(reference: Samples, model: EchoModel) -> Samples:
+    """The reference (n,) as a model sends it into the path, its clock that of the recording."""
+    for effect, values in chain(model.effects):
+        if effect.stage in ("source", "time"):
+            reference = effect.apply(reference, values, SAMPLE_RATE)
+    return reference
 
 
 def _by_band(residual: Samples, psd: Samples, use: NDArray[np.bool_]) -> tuple[tuple[float, float, float], ...]:

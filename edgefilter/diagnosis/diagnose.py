@@ -7,12 +7,15 @@ from dataclasses import replace
 
 import numpy as np
 
+from edgefilter.diagnosis.advice import advice
 from edgefilter.diagnosis.band_edge import cut_by_power
+from edgefilter.diagnosis.candidates import candidates
 from edgefilter.diagnosis.compare import Comparison, compare, describe
 from edgefilter.diagnosis.criteria import Criteria
 from edgefilter.diagnosis.findings import findings_of, share_of
 from edgefilter.diagnosis.leftover import left_in_words
 from edgefilter.diagnosis.noise_change import look_at_fan
+from edgefilter.diagnosis.precision import precision
 from edgefilter.diagnosis.prepare import Prepared, prepare
 from edgefilter.diagnosis.proof import listed, with_fitted
 from edgefilter.diagnosis.result import Diagnosis, Finding, Interval, Verdict
@@ -167,6 +170,7 @@ def conclude(
     """The diagnosis that a search leads to; the fan is looked at behind what the search has taken out of the voice."""
     comparison = describe(prepared, found.start, found.base)
     found, left = look_at_fan(found, criteria)
+    searched = found
     unpredictable = any(find(step.name).leaves_noise for step in found.steps)
     believed = bool(found.steps) and (
         found.final.excess_db < criteria.explained_db or _enough(prepared, found, criteria)
@@ -180,6 +184,7 @@ def conclude(
         found = sure or replace(found, steps=(), final=found.base, model=found.start)
     remaining = found.final.excess_db
     findings, doubts = findings_of(found, progress)
+    tried = candidates(searched, [finding.effect for finding in findings])
     return Diagnosis(
         verdict=verdict,
         comparison=replace(comparison, warnings=(*comparison.warnings, *found.notes, *doubts)),
@@ -190,6 +195,10 @@ def conclude(
             max(remaining, found.final.irreducible_db, 0.0) if unpredictable and verdict == "missing" else 0.0
         ),
         model=found.model,
+        tried=tried,
+        independence=(describe(found.prepared, found.model, found.final) if findings else comparison).independence,
+        precision=precision(found, findings),
+        advice=advice(tried),
     )
 
 

@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from typing import Literal, TypeAlias
 
 from edgefilter.diagnosis.compare import Comparison
+from edgefilter.diagnosis.independence import Independence
 from edgefilter.echo.measurement import Values
 from edgefilter.echo.model import EchoModel
 from edgefilter.types import Samples
 
 Verdict: TypeAlias = Literal["missing", "explained", "unexplained"]
+Fate: TypeAlias = Literal["named", "explained by another", "below its bar", "failed its proof", "not fitted"]
+"""What became of an effect that was tried."""
+Source: TypeAlias = Literal["jacobian", "thirds", "at its bound", "none"]
+"""Of a standard error: the prediction's derivatives, fits to a third of the recording each, or why there is none."""
 SCHEMA = 1
 
 
@@ -54,8 +59,71 @@ class Finding:
 
 
 @dataclass(frozen=True, eq=False)
+class Candidate:
+    """An effect that was tried, whatever came of it.
+
+    gain_db: by which it lowers the held-out level beside nothing else; beside_db: beside the others that were found;
+    None where it was not fitted there. numbers: how many of its own carry its fit. delta_bic: the change of the Bayesian
+    information criterion on the samples held out; the lower, the better. rank: by that, from 1. why: in words.
+    """
+
+    effect: str
+    verdict: Fate
+    why: str
+    gain_db: float | None = None
+    beside_db: float | None = None
+    numbers: float | None = None
+    delta_bic: float | None = None
+    rank: int | None = None
+
+    def to_dict(self) -> dict[str, object]:
+        """Ready for JSON."""
+        return {key: round(v, 4) if isinstance(v, float) else v for key, v in asdict(self).items()}
+
+
+@dataclass(frozen=True)
+class Known:
+    """One number of a finding with its standard error; source: where that is from, or why there is none.
+
+    index: which of several numbers that one parameter holds.
+    """
+
+    effect: str
+    parameter: str
+    index: int
+    value: float
+    unit: str
+    error: float | None
+    source: Source
+
+    @property
+    def label(self) -> str:
+        """As effect.parameter, with the index where it is not the first."""
+        return f"{self.effect}.{self.parameter}" + (f"[{self.index}]" if self.index else "")
+
+
+@dataclass(frozen=True)
+class Precision:
+    """How well the found numbers are known, and what of it they share: (label, label, correlation), the closest first."""
+
+    numbers: tuple[Known, ...] = ()
+    correlations: tuple[tuple[str, str, float], ...] = ()
+
+    def to_dict(self) -> dict[str, object]:
+        """Ready for JSON."""
+        return {
+            "numbers": [asdict(known) for known in self.numbers],
+            "correlations": [[first, second, round(r, 4)] for first, second, r in self.correlations],
+        }
+
+
+@dataclass(frozen=True, eq=False)
 class Diagnosis:
-    """The verdict on a recording: which effects are missing (ranking, strongest first), what is left, what cannot be predicted."""
+    """The verdict on a recording: which effects are missing (ranking, strongest first), what is left, what cannot be predicted.
+
+    tried: all effects that were tried. independence: of what is left with all that was found. precision: of the found
+    numbers. advice: what to record to tell candidates apart that explain nearly the same.
+    """
 
     verdict: Verdict
     comparison: Comparison
@@ -64,6 +132,10 @@ class Diagnosis:
     remaining_db: float
     irreducible_db: float
     model: EchoModel
+    tried: tuple[Candidate, ...] = ()
+    independence: Independence | None = None
+    precision: Precision = Precision()
+    advice: tuple[str, ...] = ()
 
     def to_dict(self) -> dict[str, object]:
         """The JSON that `diagnose --json` writes, schema 1."""
@@ -92,4 +164,11 @@ class Diagnosis:
             "human": compared["human"],
             "offset_samples": compared["offset_samples"],
             "warnings": compared["warnings"],
+            "tried": [candidate.to_dict() for candidate in self.tried],
+            "independence": {
+                "of_profile": compared["independence"],
+                "of_findings": self.independence.to_dict() if self.independence else None,
+            },
+            "precision": self.precision.to_dict(),
+            "advice": list(self.advice),
         }

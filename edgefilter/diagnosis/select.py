@@ -35,7 +35,8 @@ def search(
     steps = _in_steps(bench, model, best)
     full = len(added(model, best)) >= criteria.most_effects and not bench.explained(best)
     notes = (*bench.notes, FULL.format(criteria.most_effects)) if full else bench.notes
-    return Found(prepared, start, best, base, bench.score(best), ((step, *steps) if fan is not None else steps), notes)
+    steps = steps if fan is None else (step, *steps)
+    return Found(prepared, start, best, base, bench.score(best), steps, notes, bench.tried(model, best))
 
 
 def _runs(bench: Workbench, start: EchoModel) -> Iterator[EchoModel]:

@@ -34,10 +34,25 @@ class Trial:
 
 
 @dataclass(frozen=True, eq=False)
+class Tried:
+    """What came of one effect in a search: beside the start alone, and beside what the search has found; None where it was not fitted.
+
+    short: why it could not be named beside the start, empty where it could. failed: why its fit failed.
+    """
+
+    name: str
+    alone: Trial | None
+    beside: Trial | None
+    short: str = ""
+    failed: str = ""
+
+
+@dataclass(frozen=True, eq=False)
 class Found:
     """The outcome of a search from a start model.
 
-    Steps: the accepted effects in their order. notes: what the reader must know of the search.
+    Steps: the accepted effects in their order. notes: what the reader must know of the search. tried: every effect that
+    was fitted.
 
     prepared: what final was scored on; its fan is another than at the calibration where a changed fan is the first of
     the steps.
@@ -50,6 +65,7 @@ class Found:
     final: Score
     steps: tuple[Trial, ...]
     notes: tuple[str, ...] = ()
+    tried: tuple[Tried, ...] = ()
 
 
 class Workbench:
@@ -169,10 +185,28 @@ class Workbench:
 
     def admissible(self, trial: Trial, model: EchoModel) -> bool:
         """Whether a trial on a model explains enough to be named, and its values look like that effect."""
+        return not self.short_of(trial, model)
+
+    def short_of(self, trial: Trial, model: EchoModel) -> str:
+        """The bar that a trial on a model does not reach, in words; empty where it is admissible."""
         effect = find(trial.name)
-        if trial.gain_db < effect.least_gain_db or trial.size_db < effect.least_size_db:
-            return False
-        return effect.plausible(Evidence(trial.values, model, self.judge, self.score(model), trial.score))
+        if trial.gain_db < effect.least_gain_db:
+            return f"its gain is below {effect.least_gain_db:g} dB"
+        if trial.size_db < effect.least_size_db:
+            return f"what it changes is below {effect.least_size_db:g} dB over the fan"
+        evidence = Evidence(trial.values, model, self.judge, self.score(model), trial.score)
+        return "" if effect.plausible(evidence) else "its values do not look like it"
+
+    def tried(self, start: EchoModel, model: EchoModel) -> tuple[Tried, ...]:
+        """All effects that were fitted, beside the start or elsewhere, with what came of them; nothing is fitted anew."""
+        names_tried = {name: None for _, name in self._trials}
+        found = []
+        for name in names_tried:
+            alone = self._trials.get((signature(start), name))
+            others = frozenset(other for other, _ in model.effects if other != name)
+            short = self.short_of(alone, start) if alone else ""
+            found.append(Tried(name, alone, self._alike.get((others, name)), short, self._failed.get(name, "")))
+        return tuple(found)
 
     def preferred(self, trials: Iterable[Trial]) -> Trial | None:
         """Of admissible trials the simplest of those that explain nearly as much as the best.

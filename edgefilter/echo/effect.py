@@ -15,6 +15,9 @@ from edgefilter.types import Array, Samples
 Stage: TypeAlias = Literal["source", "path", "time", "microphone", "noise"]
 STAGES: tuple[Stage, ...] = ("source", "path", "time", "microphone", "noise")
 """In the order in which sound meets them."""
+Experiment: TypeAlias = Literal["levels", "tone", "tail", "sweep", "place", "minute"]
+"""Another recording in which an effect shows itself: at two volumes, of a steady tone, of silence after a word, of a
+sweep, at another place, of a minute."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,7 +72,8 @@ class Effect:
     not named. cost: of a fit, in quarters of a second. last_resort: whether it is tried only where no other explains
     much. flexible: whether it has so many numbers that it takes up what a simpler effect beside it does. learned:
     whether it is fitted anew to what the running filter hears. leaves_noise: whether it leaves noise in the residual
-    that no waveform predicts; noise_words: what is said of that where a residual is described.
+    that no waveform predicts; noise_words: what is said of that where a residual is described. shown_by: recordings in
+    which it differs from effects without them (diagnosis/advice.py).
     """
 
     name: ClassVar[str]
@@ -94,6 +98,7 @@ class Effect:
     learned: ClassVar[bool] = False
     leaves_noise: ClassVar[bool] = False
     noise_words: ClassVar[str] = ""
+    shown_by: ClassVar[tuple[Experiment, ...]] = ()
 
     def apply(self, x: Samples, values: Values, sample_rate: int) -> Samples:
         """The signal (n,) after the effect; x is not written to.

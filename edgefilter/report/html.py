@@ -13,9 +13,11 @@ import jinja2
 
 from edgefilter.diagnosis.compare import Comparison
 from edgefilter.diagnosis.diagnose import Diagnosis, Finding
+from edgefilter.diagnosis.result import Precision
 from edgefilter.errors import EdgefilterError
 from edgefilter.profile.data import Profile
 from edgefilter.report.media import MAX_SOUND_S, colour_scale, colours, sound, spectrogram_png
+from edgefilter.report.statistics import candidate_rows, correlograms, precision_rows
 from edgefilter.report.text import add_command, in_order
 from edgefilter.report.variants import MAX_FREE, Choice, compare_variants
 from edgefilter.report.words import decibels, headline, interval_text, sentence, title
@@ -34,7 +36,9 @@ def comparison_page(found: Comparison, names: Mapping[str, Any]) -> str:
     """
     profile = "The profile" if names["profile"] else "A stationary linear path made from the recording itself"
     excess = f"{profile} leaves {decibels(found.excess_db)} dB over the noise floor unexplained."
-    return _page({(): found}, (), {"kind": "comparison", "headline": excess, "findings": [], "left": ""}, names)
+    return _page(
+        {(): found}, (), {"kind": "comparison", "headline": excess, "findings": [], "left": "", **_statistics()}, names
+    )
 
 
 def diagnosis_page(
@@ -51,6 +55,7 @@ def diagnosis_page(
         "headline": headline(found.verdict, [finding.effect for finding in found.ranking], bool(names["profile"])),
         "findings": [_finding(finding, names) for finding in found.ranking],
         "left": sentence(found.evidence) if found.evidence else "",
+        **_statistics(found),
     }
     return _page(variants, steps, text, names, found.irreducible_db)
 
@@ -133,6 +138,7 @@ def _data(
                 "lags": _rounded(
                     (low, high, share * _error(found) / max(_error(before), 1e-6)) for low, high, share in found.lags
                 ),
+                "correlations": correlograms(found.independence),
                 "prediction": {
                     "picture": keep(spectrogram_png(found.prediction, scale)),
                     "sound": keep(sound(found.prediction, gain)),
@@ -155,6 +161,15 @@ def _error(found: Comparison) -> float:
 
 def _rounded(rows: Iterable[tuple[float, float, float]]) -> list[list[float]]:
     return [[round(float(x), 3) for x in row] for row in rows]
+
+
+def _statistics(found: Diagnosis | None = None) -> dict[str, object]:
+    """The tables of what was tried and of what is known; a comparison has none."""
+    return {
+        "tried": candidate_rows(found.tried if found else ()),
+        "known": precision_rows(found.precision if found else Precision()),
+        "advice": [sentence(line) for line in found.advice] if found else [],
+    }
 
 
 def _facts(before: Comparison, after: Comparison | None, irreducible_db: float | None) -> list[tuple[str, str, str]]:

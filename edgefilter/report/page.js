@@ -165,6 +165,34 @@ function load(audio, source) {
 const louder = document.getElementById("louder");
 const setVolume = () => (document.querySelector("#residual audio").volume = louder.checked ? 1 : 1 / data.louder);
 
+/* Correlations of what is left with their bounds; hundredths along the lags and from -1 to 1 of the largest upwards. */
+function drawCorrelogram(id, what) {
+  const figure = document.getElementById(id);
+  const frame = figure.querySelector(".frame");
+  frame.replaceChildren();
+  figure.querySelector(".says").replaceChildren(...(what?.says ?? []).map((text) => Object.assign(document.createElement("li"), { textContent: text })));
+  if (!what) return void put(frame, "plot", {}, "too short to say");
+  const { values, expected, bounds } = what;
+  const top = 1.1 * Math.max(...values.map(Math.abs), ...bounds.map((b, i) => b + Math.abs(expected[i])));
+  const x = (i) => ((100 * i) / (values.length - 1)).toFixed(2);
+  const y = (v) => (50 - (50 * v) / top).toFixed(2);
+  const line = (row) => row.map((v, i) => `${x(i)},${y(v)}`);
+  const edge = (sign) => line(bounds.map((b, i) => expected[i] + sign * b));
+  const plot = put(frame, "plot");
+  const drawn = [["polygon", "band", [...edge(1), ...edge(-1).reverse()]], ["polyline", "trace", line(values)]];
+  const marks = drawn.map(([kind, look, points]) => `<${kind} class="${look}" points="${points.join(" ")}"/>`);
+  plot.innerHTML = `<svg viewBox="0 0 100 100" preserveAspectRatio="none" aria-hidden="true">${marks.join("")}</svg>`;
+  const last = what.from_ms + what.step_ms * (values.length - 1);
+  const place = (ms) => (100 * (ms - what.from_ms)) / (last - what.from_ms);
+  if (what.from_ms < 0) put(plot, "zero", { left: place(0) });
+  const round4 = (v) => +(v / 1e4).toPrecision(2);
+  [-1, 0, 1].forEach((part) => put(frame, "tick", { bottom: 50 + 50 * (part / 1.1) }, `${round4((part * top) / 1.1)}`.replace("-", "−")));
+  const every = last > 50 ? 25 : 5;
+  ticks(frame, Array.from({ length: Math.floor(last / every) - Math.ceil(what.from_ms / every) + 1 }, (_, i) => (i + Math.ceil(what.from_ms / every)) * every), place, "ms");
+  plot.setAttribute("role", "img");
+  plot.setAttribute("aria-label", what.says.join("; "));
+}
+
 /* Numbers for those who read tables. */
 function drawTables(now) {
   const parent = document.getElementById("tables");
@@ -193,6 +221,8 @@ function draw() {
   drawSpectrogram("recording", data.recording, "recording");
   drawSpectrogram("prediction", now.prediction, "prediction");
   drawSpectrogram("residual", now.residual, `what is left, ${db(now.excess_db)} over the noise floor`);
+  drawCorrelogram("auto", now.correlations?.auto);
+  drawCorrelogram("cross", now.correlations?.cross);
   drawTables(now);
 }
 

@@ -12,6 +12,7 @@ import numpy as np
 
 from edgefilter.diagnosis.compare import Comparison
 from edgefilter.diagnosis.diagnose import Diagnosis, Finding
+from edgefilter.report.statistics import advice_lines, candidate_lines, independence_lines, precision_lines
 from edgefilter.report.words import decibels, headline, interval_text, sentence, title
 
 BAR_WIDTH = 30
@@ -20,7 +21,7 @@ MAX_TIMES = 12
 
 
 def comparison_lines(found: Comparison) -> list[str]:
-    """The excess, then where it is: by frequency, time, level and lag, and while the robot is silent."""
+    """The excess, then where it is: by frequency, time, level and lag, while the robot is silent, and whether it is noise."""
     lines = [
         f"excess      {decibels(found.excess_db)} dB over the noise floor of {decibels(found.noise_floor_db)} dBFS",
         f"lag         {found.offset_samples:+.2f} samples against the calibration, taken out",
@@ -40,11 +41,11 @@ def comparison_lines(found: Comparison) -> list[str]:
     lines += [
         f"  {low:5g} to {high:4g} ms  {100 * share:5.0f} %   {_bar(share)}".rstrip() for low, high, share in found.lags
     ]
-    return lines
+    return lines + independence_lines(found.independence)
 
 
 def diagnosis_lines(found: Diagnosis, calibrated: bool = True) -> list[str]:
-    """The verdict in a sentence, the error budget step by step, each finding with its evidence, then where the excess was.
+    """The verdict in a sentence, the error budget step by step, each finding with its evidence, statistics, where the excess was.
 
     calibrated: False where the profile was made from the recording itself.
     """
@@ -66,6 +67,10 @@ def diagnosis_lines(found: Diagnosis, calibrated: bool = True) -> list[str]:
         lines += _finding(rank, finding)
     if found.evidence:
         lines.append(f"left        {sentence(found.evidence)}")
+    lines += precision_lines(found.precision)
+    if found.ranking:
+        lines += independence_lines(found.independence, "with all that was found")
+    lines += [*candidate_lines(found.tried), *advice_lines(found.advice)]
     return [*lines, f"where       it is with {profile}:", *comparison_lines(found.comparison)]
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from edgefilter.echo.effect import Effect, Parameter, Stage
+from edgefilter.echo.effect import Effect, Experiment, Parameter, Stage
 from edgefilter.echo.evidence import Evidence
 from edgefilter.echo.measurement import Measurement, Values, VoiceModel
 from edgefilter.echo.wiener import Spectra, spectra
@@ -31,6 +31,7 @@ class ChassisResonance(Effect):
     name: ClassVar[str] = "chassis_resonance"
     stage: ClassVar[Stage] = "path"
     title: ClassVar[str] = "a chassis resonance"
+    shown_by: ClassVar[tuple[Experiment, ...]] = ("sweep", "tail")
     absorbed: ClassVar[bool] = True
     complexity: ClassVar[int] = 1
     parameters: ClassVar[tuple[Parameter, ...]] = (

@@ -8,7 +8,7 @@ import numpy as np
 import scipy
 
 from edgefilter.dsp.fractional_delay import interpolate
-from edgefilter.echo.effect import Effect, Parameter, Stage, first
+from edgefilter.echo.effect import Effect, Experiment, Parameter, Stage, first
 from edgefilter.echo.evidence import Evidence
 from edgefilter.echo.lag_track import track_lag
 from edgefilter.echo.measurement import Measurement, Values, VoiceModel
@@ -36,6 +36,7 @@ class ClockDrift(Effect):
         " there"
     )
     title: ClassVar[str] = "clock drift"
+    shown_by: ClassVar[tuple[Experiment, ...]] = ("minute",)
     followed: ClassVar[bool] = True
     complexity: ClassVar[int] = 1
     parameters: ClassVar[tuple[Parameter, ...]] = (

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
-from edgefilter.echo.effect import Effect, Parameter, Stage
+from edgefilter.echo.effect import Effect, Experiment, Parameter, Stage
 from edgefilter.echo.evidence import Evidence
 from edgefilter.echo.measurement import Measurement, Values, VoiceModel
 from edgefilter.echo.wiener import Spectra, convolve_from, fit_filter, spectra
@@ -43,6 +43,7 @@ class Equaliser(Effect):
     name: ClassVar[str] = "equaliser"
     stage: ClassVar[Stage] = "path"
     title: ClassVar[str] = "an equaliser or another loudspeaker"
+    shown_by: ClassVar[tuple[Experiment, ...]] = ("sweep",)
     absorbed: ClassVar[bool] = True
     complexity: ClassVar[int] = 2
     flexible: ClassVar[bool] = True

@@ -7,7 +7,7 @@ from typing import ClassVar
 import numpy as np
 
 from edgefilter.dsp.frames import block_power
-from edgefilter.echo.effect import Effect, Parameter, Stage, first, neutral
+from edgefilter.echo.effect import Effect, Experiment, Parameter, Stage, first, neutral
 from edgefilter.echo.evidence import Evidence
 from edgefilter.echo.measurement import Measurement, Values, VoiceModel
 from edgefilter.echo.wiener import convolve_from, fit_supported
@@ -36,6 +36,7 @@ class PathChange(Effect):
     stage: ClassVar[Stage] = "path"
     run_note: ClassVar[str] = "the running filter begins with the path as it was after the change"
     title: ClassVar[str] = "a changed path"
+    shown_by: ClassVar[tuple[Experiment, ...]] = ("sweep", "place")
     event: ClassVar[bool] = True
     complexity: ClassVar[int] = 4
     flexible: ClassVar[bool] = True

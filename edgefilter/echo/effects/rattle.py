@@ -10,7 +10,7 @@ import numpy as np
 import scipy
 
 from edgefilter.dsp.psd import floored
-from edgefilter.echo.effect import Effect, Parameter, Stage, complete, first, neutral, number_or_taps
+from edgefilter.echo.effect import Effect, Experiment, Parameter, Stage, complete, first, neutral, number_or_taps
 from edgefilter.echo.effects.knock_power import (
     BAND_HZ,
     BANDS,
@@ -62,6 +62,7 @@ class Rattle(Effect):
     name: ClassVar[str] = "rattle"
     stage: ClassVar[Stage] = "source"
     title: ClassVar[str] = "a rattle"
+    shown_by: ClassVar[tuple[Experiment, ...]] = ("levels", "tone")
     cost: ClassVar[int] = 8
     last_resort: ClassVar[bool] = True
     leaves_noise: ClassVar[bool] = True

@@ -1,0 +1,60 @@
+"""What would have to be recorded to tell two effects apart that explain a recording about as well."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import combinations
+
+from edgefilter.diagnosis.result import Candidate
+from edgefilter.echo.effect import Effect, Experiment
+from edgefilter.echo.effects.catalogue import find
+
+MARGIN = 0.15
+"""Of the larger gain, by which two candidates may differ and lie close: as Criteria.nested, by which the simpler of two
+is named."""
+RULES: tuple[tuple[Experiment, str], ...] = (
+    ("levels", "play the same sentences at two volumes, 6 dB apart: only {shows} grows or shrinks by another amount"),
+    ("minute", "record a minute and more: only {shows} goes on growing"),
+    ("tail", "record two seconds of silence after the last word: only {shows} goes on sounding"),
+    ("place", "record once more a metre away: only {shows} is another there"),
+    ("sweep", "calibrate again, by a sweep: only {shows} differs from one frequency to the next"),
+    ("tone", "play a steady tone of 300 Hz: only {shows} adds harmonics"),
+)
+"""For what the effects say of themselves (Effect.shown_by), the surest first."""
+
+
+def advice(tried: Sequence[Candidate]) -> tuple[str, ...]:
+    """A line for each named effect and each other candidate whose gain, alone, is within MARGIN of its own.
+
+    A flexible effect takes up what a simple one does and says nothing against it, so such a pair is no question; nor is
+    one that does not reach its bar.
+    """
+    rivals = [c for c in tried if c.gain_db is not None and c.verdict in ("named", "explained by another")]
+    lines = []
+    for first, second in combinations(rivals, 2):
+        if "named" not in (first.verdict, second.verdict) or first.verdict == second.verdict:
+            continue
+        gains = first.gain_db or 0.0, second.gain_db or 0.0
+        if min(gains) >= (1.0 - MARGIN) * max(gains) and find(first.effect).flexible == find(second.effect).flexible:
+            told = f"{first.effect} ({gains[0]:.2f} dB) or {second.effect} ({gains[1]:.2f} dB)"
+            lines.append(f"{told}: {_difference(find(first.effect), find(second.effect))}")
+    return tuple(lines)
+
+
+def _difference(first: Effect, second: Effect) -> str:
+    """The experiment in which just one of two effects shows itself."""
+    for shown, other in ((first, second), (second, first)):
+        if shown.scales_fan and not other.scales_fan:
+            return f"record ten seconds of silence before the robot talks: only {shown.name} changes the fan as well"
+        if shown.event and not other.event:
+            return f"record the same sentences again: only {shown.name} does not come again"
+    for kind, rule in RULES:
+        shows = [effect.name for effect in (first, second) if kind in effect.shown_by]
+        if len(shows) == 1:
+            return rule.format(shows=shows[0])
+    for shown, other in ((first, second), (second, first)):
+        if shown.stage == "microphone" and other.stage != "microphone":
+            return f"let a telephone play beside the robot, as loud as it: only {shown.name} happens to that as well"
+        if shown.leaves_noise and not other.leaves_noise:
+            return f"play one sentence three times: only {shown.name} is another each time"
+    return "nothing else shows them apart than a longer recording"

@@ -1,0 +1,126 @@
+"""How well the numbers of the found effects are known together: standard errors and correlations, as a fit report prints them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import combinations
+
+import numpy as np
+
+from edgefilter.diagnosis.findings import THIRDS_T
+from edgefilter.diagnosis.result import Finding, Known, Precision, Source
+from edgefilter.diagnosis.trials import Found
+from edgefilter.echo.effect import Parameter
+from edgefilter.echo.effects.catalogue import find
+from edgefilter.echo.recording import BLOCK
+from edgefilter.errors import UsageError
+from edgefilter.types import Array
+
+STEP = 0.1
+"""Of the interval's half width, by which a number is moved to see what the prediction makes of it."""
+LEAST_STEP = 1e-4
+"""Of the number itself: less is lost in float32."""
+SMALL = 1e-6
+"""Of the fan's power: a number that changes less than that is read off a filter and moves nothing by itself."""
+TOLD = 0.1
+"""Correlation from which on it is told."""
+MOST = 16
+"""Numbers whose derivatives are taken: each costs a prediction."""
+
+
+def precision(found: Found, findings: Sequence[Finding]) -> Precision:
+    """Standard errors and correlations of all numbers of the findings, from the derivatives of the model's prediction.
+
+    Sandwich estimate (White 1980; Liang & Zeger 1986) on the samples that were fitted to, blocks of half a second
+    standing for what is independent: speech and fan are neither white nor stationary. Filters of many taps, and the
+    numbers that are read off them, stay as they are; these have the scatter of fits to a third of the recording each.
+    """
+    entries = [entry for finding in findings for entry in _numbers(finding)]
+    moved = [_derivative(found, *entry) for entry in entries[:MOST]]
+    chosen = [i for i, column in enumerate(moved) if column is not None]
+    columns = [column for column in moved if column is not None]
+    covariance = _covariance(found, np.stack(columns)) if columns else None
+    if covariance is None:
+        chosen = []
+    errors = {} if covariance is None else dict(zip(chosen, np.sqrt(np.diag(covariance)), strict=True))
+    numbers = tuple(_known(entry, errors.get(i)) for i, entry in enumerate(entries))
+    shared = []
+    for (a, i), (b, j) in combinations(enumerate(chosen), 2):
+        r = 0.0 if covariance is None else float(covariance[a, b] / (errors[i] * errors[j]))
+        if abs(r) >= TOLD:
+            shared.append((numbers[i].label, numbers[j].label, r))
+    return Precision(numbers, tuple(sorted(shared, key=lambda entry: -abs(entry[2]))))
+
+
+def _numbers(finding: Finding) -> list[tuple[Finding, Parameter, int]]:
+    """Each number of a finding that has an interval."""
+    return [
+        (finding, parameter, index)
+        for parameter in find(finding.effect).told
+        if parameter.name in finding.parameters
+        for index in range(np.size(finding.parameters[parameter.name].value))
+    ]
+
+
+def _half_width(finding: Finding, parameter: Parameter, index: int) -> float | None:
+    """Of the interval; None where the fits to thirds have not given one."""
+    interval = finding.parameters[parameter.name]
+    low, high = (float(np.ravel(bound)[index]) for bound in (interval.low, interval.high))
+    return None if (low, high) == (parameter.low, parameter.high) else 0.5 * (high - low)
+
+
+def _derivative(found: Found, finding: Finding, parameter: Parameter, index: int) -> Array | None:
+    """(n,) the whitened prediction's derivative by a number; None at a bound, and where it does not move the prediction."""
+    value = np.array(finding.values[parameter.name], float)
+    at = float(value.ravel()[index])
+    if at in (parameter.low, parameter.high):
+        return None
+    step = max(STEP * (_half_width(finding, parameter, index) or 0.0), LEAST_STEP * abs(at), 1e-9)
+    step = step if at + step <= parameter.high else -step
+    value.reshape(-1)[index] = at + step
+    measurement = found.prepared.measurement
+    values = {**finding.values, parameter.name: value if value.ndim else float(value)}
+    try:
+        changed = found.model.with_effect(finding.effect, values).predict(measurement.reference)
+    except (UsageError, ArithmeticError):
+        return None
+    change = measurement.whiten(changed - measurement.heard(found.model)[0]) * measurement.weights
+    if float(np.mean(np.square(change, dtype=np.float64))) < SMALL * (step / max(abs(at), abs(step))) ** 2:
+        return None
+    return np.asarray(change / step, np.float64)
+
+
+def _covariance(found: Found, derivatives: Array) -> Array | None:
+    """(k, k) of numbers with those derivatives (k, n); None where they cannot be told apart at all."""
+    measurement = found.prepared.measurement
+    residual = (measurement.white_recording - measurement.heard(found.model)[1]) * measurement.weights
+    scale = np.sqrt(np.sum(derivatives**2, axis=1))
+    unit = derivatives / scale[:, None]
+    curvature = unit @ unit.T
+    if np.linalg.cond(curvature) > 1e10:
+        return None
+    edges = np.arange(0, residual.size, BLOCK)
+    scores = np.add.reduceat(unit * residual, edges, axis=1)
+    scores = scores[:, np.add.reduceat(measurement.weights, edges) > 0.0]
+    count = scores.shape[1]
+    if count <= derivatives.shape[0] + 1:
+        return None
+    bread = np.linalg.inv(curvature)
+    scatter = np.cov(scores) * count if scores.shape[0] > 1 else np.var(scores, ddof=1).reshape(1, 1) * count
+    covariance = bread @ scatter @ bread * count / (count - derivatives.shape[0])
+    return covariance / scale[:, None] / scale
+
+
+def _known(entry: tuple[Finding, Parameter, int], error: float | None) -> Known:
+    finding, parameter, index = entry
+    value = float(np.ravel(finding.parameters[parameter.name].value)[index])
+    source: Source = "jacobian"
+    if value in (parameter.low, parameter.high):
+        error, source = None, "at its bound"
+    elif error is None:
+        half = _half_width(*entry)
+        error = half / (THIRDS_T * np.sqrt(3.0)) if half else None
+        source = "thirds" if half else "none"
+    return Known(
+        finding.effect, parameter.name, index, value, parameter.unit, None if error is None else float(error), source
+    )

@@ -1,0 +1,132 @@
+"""All that was tried, how well the numbers are known, and what would have to be recorded next."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from edgefilter.commands.display import write_json
+from edgefilter.diagnosis.advice import advice
+from edgefilter.diagnosis.candidates import size_of
+from edgefilter.diagnosis.criteria import Criteria
+from edgefilter.diagnosis.diagnose import conclude
+from edgefilter.diagnosis.prepare import prepare
+from edgefilter.diagnosis.result import Candidate, Known, Precision
+from edgefilter.diagnosis.select import search
+from edgefilter.echo.effects.catalogue import find
+from edgefilter.echo.measurement import Measurement
+from edgefilter.report.statistics import candidate_lines, error_text, independence_lines, precision_lines
+from edgefilter.report.text import diagnosis_lines
+from tests.diagnosis.robot_scene import profile, record, voice
+
+GAIN_DB = -2.0
+
+
+@pytest.fixture(scope="module")
+def diagnosed():
+    """A robot whose volume was turned down, and the diagnosis of it."""
+    x, robot = voice(6.0), profile()
+    prepared = prepare(robot, record(x, robot.echo.with_effect("playback_gain", {"gain_db": GAIN_DB})), x)
+    return x, prepared, conclude(prepared, search(prepared, prepared.model, Criteria()), Criteria())
+
+
+def test_every_effect_that_was_fitted_is_in_the_table_with_its_fate(diagnosed):
+    tried = diagnosed[2].tried
+    by_name = {row.effect: row for row in tried}
+    assert by_name["playback_gain"].verdict == "named" and by_name["playback_gain"].gain_db > 3
+    assert len(tried) > 8 and len(by_name) == len(tried)
+    assert by_name["clock_drift"].verdict == "below its bar" and by_name["clock_drift"].why
+    ranked = [row for row in tried if row.rank is not None]
+    assert [row.rank for row in ranked] == list(range(1, len(ranked) + 1))
+    assert [row.delta_bic for row in ranked] == sorted(row.delta_bic for row in ranked)
+    assert by_name["playback_gain"].numbers == 1.0 and by_name["playback_gain"].delta_bic < -10_000
+    text = "\n".join(candidate_lines(tried))
+    assert all(row.effect in text for row in tried)
+
+
+def test_a_filter_counts_as_many_numbers_as_hold_its_energy():
+    alone, even, fading = np.zeros(800), np.ones(800), 0.9 ** np.arange(800)
+    alone[3] = 0.5
+    sizes = [size_of("early_path", {"taps": taps}) for taps in (alone, even, fading)]
+    assert sizes[:2] == pytest.approx([1.0, 800.0]) and 5 < sizes[2] < 30  # energy falls by e in 4.7 taps
+
+
+def test_the_standard_error_is_the_scatter_of_fits_to_other_noise(diagnosed):
+    """0.5 to 2: the scatter of 12 fits is itself known to a fifth, the error from a dozen blocks to about the same."""
+    x, prepared, found = diagnosed
+    (known,) = found.precision.numbers
+    assert known.label == "playback_gain.gain_db" and known.source == "jacobian"
+    robot, effect = profile(), find("playback_gain")
+    turned = robot.echo.with_effect("playback_gain", {"gain_db": GAIN_DB})
+    clean = turned.predict(prepared.measurement.reference)
+    rng = np.random.default_rng(1)
+    fits = []
+    for _ in range(12):
+        noisy = clean + (1e-3 * rng.standard_normal(x.size)).astype(np.float32)
+        other = Measurement(prepared.measurement.reference, noisy, prepared.noise_psd, prepared.fit)
+        fits.append(effect.fit(other, robot.echo)["gain_db"])
+    assert 0.5 < known.error / np.std(fits, ddof=1) < 2.0
+
+
+def test_the_text_says_all_of_it(diagnosed):
+    found = diagnosed[2]
+    text = "\n".join(diagnosis_lines(found))
+    assert "playback_gain.gain_db  -2.00 +/- 0.0" in text
+    assert "independence with all that was found" in text and "independence of what is left" in text
+    assert "Delta BIC  verdict" in text
+    left, profile_alone = (independence_lines(test)[3] for test in (found.independence, found.comparison.independence))
+    assert "another level, lag" in profile_alone and "another level, lag" not in left
+
+
+def test_numbers_say_where_their_error_is_from():
+    rows = [
+        Known("a", "q", 0, 12.0, "1", 0.3, "jacobian"),
+        Known("a", "s", 1, 2.0, "s", 0.1, "thirds"),
+        Known("a", "hardness", 0, 100.0, "", None, "at its bound"),
+    ]
+    assert [error_text(row) for row in rows] == [
+        "12.0 +/- 0.300 (2.5 %)",
+        "2.00 +/- 0.100 s (5 %), from fits to thirds of the recording",
+        "100, at its bound",
+    ]
+    lines = precision_lines(Precision(tuple(rows), (("a.q", "a.s[1]", -0.83),)))
+    assert lines[-1] == "  a.q, a.s[1]  -0.83"
+
+
+def candidate(effect: str, gain_db: float, verdict: str) -> Candidate:
+    return Candidate(effect, verdict, "", gain_db)
+
+
+@pytest.mark.parametrize(
+    ("named", "other", "gain_db", "words"),
+    [
+        ("compression", "mic_agc", 4.8, "only mic_agc changes the fan"),
+        ("playback_gain", "clock_drift", 4.9, "only clock_drift goes on growing"),
+        ("late_reverb", "early_path", 5.0, "only late_reverb goes on sounding"),
+        ("chassis_resonance", "rattle", 4.5, "two volumes, 6 dB apart: only rattle"),
+        ("speaker_nonlinearity", "compression", 5.2, "only speaker_nonlinearity adds harmonics"),
+    ],
+)
+def test_two_that_explain_the_same_get_the_recording_that_tells_them_apart(named, other, gain_db, words):
+    (line,) = advice([candidate(named, 5.0, "named"), candidate(other, gain_db, "explained by another")])
+    assert words in line and named in line and other in line
+
+
+def test_no_advice_where_there_is_no_question():
+    first = candidate("playback_gain", 5.0, "named")
+    for other in (
+        candidate("clock_drift", 4.0, "explained by another"),  # not close: 15 % is the margin
+        candidate("clock_drift", 4.9, "below its bar"),
+        candidate("clock_drift", 4.9, "named"),
+        candidate("equaliser", 5.1, "explained by another"),  # flexible: it takes up what a gain does
+    ):
+        assert advice([first, other]) == ()
+
+
+def test_a_list_of_numbers_is_one_line_of_json(tmp_path):
+    data = {"rows": [[1.5, 2, None], ["a]\n[b", "c"]], "objects": [{"x": [1, 2]}], "empty": []}
+    write_json(data, tmp_path / "x.json")
+    text = (tmp_path / "x.json").read_text()
+    assert json.loads(text) == data and "[ 1.5, 2, null ]" in text and '"x": [ 1, 2 ]' in text
