@@ -16,6 +16,7 @@ from edgefilter.dsp.fourier import power
 from edgefilter.dsp.fractional_delay import delayed
 from edgefilter.dsp.frames import all_block_power, blocks, decibels
 from edgefilter.dsp.psd import floored, hann
+from edgefilter.echo.effects.catalogue import find
 from edgefilter.echo.measurement import Measurement, whiten
 from edgefilter.echo.model import EchoModel
 from edgefilter.echo.recording import fitted_blocks, paired
@@ -138,10 +139,11 @@ def prepare(profile: Profile, recording: Samples, reference: Samples, *, sample_
 def ordinary_distortion(profile: Profile, predicted: Samples) -> tuple[tuple[Samples, Array], ...]:
     """Expected square (n,) and density (601,) of what the calibrated loudspeaker adds to a predicted voice (n,).
 
-    Nothing where the calibration does not know it, or where the profile predicts its waveform.
+    Nothing where the calibration does not know it, or where the profile predicts its waveform, with numbers that the
+    filter learns.
     """
     known = profile.approximation
-    if known is None or "speaker_nonlinearity" in dict(profile.echo.effects):
+    if known is None or any(find(name).learned for name, _ in profile.echo.effects):
         return ()
     power = uniform_filter1d(np.square(predicted, dtype=np.float64), MOMENT, mode="constant")
     return (((ORDINARY * known.expected(power)).astype(np.float32), known.colour),)
