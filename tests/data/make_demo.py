@@ -153,7 +153,7 @@ nonlinearity), with simulated fan noise, by `tests/data/make_demo.py` in the sou
 | human.flac | the human alone at the microphone: a prompt in a simulated room | CC BY-SA 3.0 |
 | mic.flac | robot, human and fan at the microphone | CC BY-SA 3.0 |
 | hidden/CASE/reference.flac | what a robot says, rendered with Kokoro-82M | CC0 1.0 |
-| hidden/CASE/mic.flac, truth.json | that robot after something happened, simulated by `bench/simulate/hidden_demo.py`; what it was | CC0 1.0 |
+| hidden/CASE/mic.flac, truth.json | that robot after something happened, simulated by `bench/simulate/demo_robots.py`; what it was | CC0 1.0 |
 | hidden/CASE/profile.npz | its calibration, from before | CC0 1.0 |
 
 The human is the prompt `vm-intro` of the Asterisk core sounds (Debian package asterisk-core-sounds-en-g722), copyright 2003-2010

@@ -19,6 +19,7 @@ BOUND = 4.0
 SILENT_DB = -120.0
 ORDINARY_DB = 0.4
 """A gain of less differs from day to day."""
+MOST_GAIN_DB = 60.0
 EXCERPT = 10 * SAMPLE_RATE
 """On the loudest stretch of that many samples it is chosen where the laws bend; how much they do, on all."""
 DRIVER, AMPLIFIER = ("force_factor", "stiffness", "damping"), ("even", "odd")
@@ -49,7 +50,7 @@ class SpeakerNonlinearity(Effect):
         Parameter("excursion", "full scale", 1.0, 1e-4, 100.0),
         Parameter("knee", "full scale", 1.0, 1e-4, 100.0),
         Parameter("level_db", "dB re the linear voice at the microphone", SILENT_DB, SILENT_DB, 20.0),
-        Parameter("gain_db", "dB", 0.0, -60.0, 60.0),
+        Parameter("gain_db", "dB", 0.0, 0.0, MOST_GAIN_DB),
     )
 
     def apply(self, x: Samples, values: Values, sample_rate: int) -> Samples:
@@ -78,8 +79,8 @@ class SpeakerNonlinearity(Effect):
         )
         if found is None:
             return neutral(self)
-        louder = abs(found.gain_db) >= ORDINARY_DB
-        return {**as_values(found), "gain_db": float(np.clip(found.gain_db, -60.0, 60.0)) if louder else 0.0}
+        louder = found.gain_db >= ORDINARY_DB  # a voice that is softer was turned down, whatever else happened to it
+        return {**as_values(found), "gain_db": min(found.gain_db, MOST_GAIN_DB) if louder else 0.0}
 
     def sentence(self, values: Values) -> str:
         """How strong the distortion is."""

@@ -1,6 +1,6 @@
 """Make the recordings of `edgefilter demo --hidden`: two simulated robots, one with one hidden effect and one with two.
 
-    python -m bench.simulate.hidden_demo --voices robot/val --output edgefilter/demo_data/hidden
+    python -m bench.simulate.demo_robots --voices robot/val --output edgefilter/demo_data/hidden
 
 --voices: a folder with a transcripts.tsv (path, speaker, seconds, text) of synthetic voices. A case is a folder: mic and
 reference (FLAC, 16 kHz, 16 bit), profile.npz, the calibration before the effect, and truth.json: what is hidden, with
