@@ -23,11 +23,11 @@ from scipy.optimize import minimize
 from scipy.special import expit, logit
 
 from bench import results_writer
+from bench.measure.closed_loop_scenes import listen
 from bench.measure.conversation import every, find_conversations, progress
 from bench.measure.levels import frame_power
 from bench.measure.real_barge_in import FIRST_DB, IN_TIME_S, THRESHOLDS, first_sound, in_time, noticed, replay, starts
 from bench.measure.real_streams import ECHO_ONLY, ROBOT_ALONE, Cells, chosen, find_recordings, lay
-from edgefilter import EgoFilter
 from edgefilter.errors import EdgefilterError
 from edgefilter.filter.barge_in import CENTRE, CENTRE_CALIBRATED, SLOPE
 from edgefilter.profile.data import Profile
@@ -57,13 +57,10 @@ class Listened(NamedTuple):
 
 def listened(kind: str, mic: Samples, ref: Samples, human: Samples | None, profile: Profile | None) -> Listened:
     """What the network made of a recording, hop by hop."""
-    ego, found = EgoFilter(profile, ENGINE), []
-    hop = ego.hop
-    centre = CENTRE if profile is None else CENTRE_CALIBRATED
-    for at in range(0, mic.size - hop + 1, hop):
-        ego.process(mic[at : at + hop], ref[at : at + hop])
-        found.append(ego.speech_probability or 0.0)
-    odds = logit(np.clip(found, SURE, 1 - SURE)) / SLOPE + centre
+    talk = listen(mic, ref, profile, ENGINE)
+    hop, centre = talk.hop, CENTRE if profile is None else CENTRE_CALIBRATED
+    said = [probability or 0.0 for probability in talk.probability[: mic.size // hop]]
+    odds = logit(np.clip(said, SURE, 1 - SURE)) / SLOPE + centre
     if human is None:
         return Listened(kind, odds, np.zeros(odds.size, bool), hop)
     power = frame_power(human[: odds.size * hop], hop)
@@ -90,11 +87,16 @@ def streams(options: argparse.Namespace) -> Iterator[Listened]:
         yield listened("simulated", mic, ref, clean, conversation.profile)
 
 
+def pooled(chosen_ones: list[Listened]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Odds and truth of all hops (n,), and their weights, by which humans are HUMAN_SHARE of them."""
+    odds, human = (np.concatenate([getattr(one, name) for one in chosen_ones]) for name in ("odds", "human"))
+    share = float(np.clip(human.mean(), SURE, 1 - SURE))
+    return odds, human, np.where(human, HUMAN_SHARE / share, (1 - HUMAN_SHARE) / (1 - share))
+
+
 def fitted(chosen_ones: list[Listened]) -> tuple[float, float]:
     """Centre and slope of the logistic, by maximum likelihood, a human in HUMAN_SHARE of the hops."""
-    odds = np.concatenate([one.odds for one in chosen_ones])
-    human = np.concatenate([one.human for one in chosen_ones])
-    weight = np.where(human, HUMAN_SHARE / max(human.mean(), SURE), (1 - HUMAN_SHARE) / max(1 - human.mean(), SURE))
+    odds, human, weight = pooled(chosen_ones)
 
     def cost(x: np.ndarray) -> float:
         z = np.exp(x[1]) * (odds - x[0])
@@ -106,9 +108,7 @@ def fitted(chosen_ones: list[Listened]) -> tuple[float, float]:
 
 def reliability(chosen_ones: list[Listened], centre: float, slope: float) -> dict:
     """Share of hops with a human by the probability's value, and the mean distance of both (Guo et al. 2017, eq. (3))."""
-    odds = np.concatenate([one.odds for one in chosen_ones])
-    human = np.concatenate([one.human for one in chosen_ones])
-    weight = np.where(human, HUMAN_SHARE / human.mean(), (1 - HUMAN_SHARE) / (1 - human.mean()))
+    odds, human, weight = pooled(chosen_ones)
     said = expit(slope * (odds - centre))
     rows, far = [], 0.0
     for low, high in zip(EDGES, EDGES[1:], strict=False):

@@ -35,6 +35,7 @@ from bench.measure.recogniser import Recogniser, word_errors
 from bench.simulate.conversations import read_clips
 from bench.simulate.robot_day import Day, make_day
 from edgefilter.calibration.calibrate import calibrate
+from edgefilter.errors import EdgefilterError
 from edgefilter.types import SAMPLE_RATE, Samples
 
 CLIP_S = (1.0, 15.0)
@@ -216,8 +217,12 @@ def main() -> int:
     parser.add_argument("--output", type=Path, help="without suffix; .json, .md and .png are written")
     args = parser.parse_args()
     data = {"ROBOT": args.voices, "HUMAN": [args.speech]}
-    made_with = results_writer.stamp(data, [args.engine], {"WHISPER": args.whisper})
-    found = measure(args)
+    try:
+        made_with = results_writer.stamp(data, [args.engine], {"WHISPER": args.whisper})
+        found = measure(args)
+    except (EdgefilterError, OSError) as error:
+        print(f"live_trial: {error}", file=sys.stderr)
+        return 1
     if args.output:
         live_trial_report.draw(found, args.output)
     page = live_trial_report.markdown(found, args.output.name if args.output else "live_trial")

@@ -23,7 +23,7 @@ def title(found: dict) -> str:
 def markdown(found: dict, name: str) -> str:
     """The page below its title; name: of the picture beside it, without suffix."""
     stats, source = found["stats"], found["stats"]["source"]
-    deadline = stats["filter"]["deadline"] if "filter" in stats else stats["deadline"]
+    deadline = stats["deadline"]
     lines = [
         f"Load average before {found['load_average_before']:.1f}. A simulated robot, played in real time into the",
         "loudspeaker and the microphone of a sound server of its own; everything else is as on a robot.",

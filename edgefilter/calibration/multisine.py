@@ -7,9 +7,9 @@ from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import fft, signal
+from scipy import fft
 
-from edgefilter.calibration.sweep import generate_sweep
+from edgefilter.calibration.sweep import generate_sweep, place_of
 from edgefilter.errors import CalibrationError
 from edgefilter.types import SAMPLE_RATE, Array, Samples
 
@@ -114,13 +114,10 @@ class MultisineLaw:
 def multisine_law(reference: Samples) -> MultisineLaw:
     """Recognise the sound of generate_multisine() at any level and place; raise CalibrationError where there is none."""
     pattern = generate_multisine(1.0, 0.0, 0.0).astype(np.float64)
-    energy = float(np.sum(reference.astype(np.float64) ** 2))
-    if reference.size >= pattern.size and energy > 0:
-        match = signal.correlate(reference.astype(np.float64), pattern, "valid", "fft")
-        start = int(np.argmax(np.abs(match)))
-        if abs(match[start]) > 0.9 * np.sqrt(energy * np.sum(pattern**2)):
-            return MultisineLaw(start, start + pattern.size - len(LEVELS_DB) * REALISATIONS * BLOCK)
-    seconds = f"{reference.size / SAMPLE_RATE:.1f} s long" if energy > 0 else "silent"
+    start = place_of(pattern, reference)
+    if start is not None:
+        return MultisineLaw(start, start + pattern.size - len(LEVELS_DB) * REALISATIONS * BLOCK)
+    seconds = f"{reference.size / SAMPLE_RATE:.1f} s long" if reference.any() else "silent"
     raise CalibrationError(
         f"the sweep reference ({seconds}) is not the sweep with multisines of {pattern.size / SAMPLE_RATE:.1f} s:"
         " play the one that 'calibrate --multisine --excitation FILE' writes, or leave --multisine out"

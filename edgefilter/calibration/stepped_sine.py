@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy import signal
 
+from edgefilter.calibration.sweep import place_of
 from edgefilter.dsp.fourier import power
 from edgefilter.dsp.frames import frames
 from edgefilter.dsp.psd import hann
@@ -63,12 +63,9 @@ def stepped_law(reference: Samples) -> SteppedLaw:
     Raise CalibrationError where there is none.
     """
     pattern = generate_stepped_sine(1.0, 0.0, 0.0).astype(np.float64)
-    energy = float(np.sum(reference.astype(np.float64) ** 2))
-    if reference.size >= pattern.size and energy > 0:
-        match = signal.correlate(reference.astype(np.float64), pattern, "valid", "fft")
-        start = int(np.argmax(np.abs(match)))
-        if abs(match[start]) > 0.9 * np.sqrt(energy * np.sum(pattern**2)):
-            return SteppedLaw(start)
+    start = place_of(pattern, reference)
+    if start is not None:
+        return SteppedLaw(start)
     raise CalibrationError(
         "the sweep reference is not the stepped sine of 0-8001 Hz in steps of 13 Hz, 0.1 s each: "
         "play the one that edgefilter generates, or leave the stepped-sine option out for an exponential sweep"

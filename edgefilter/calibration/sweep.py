@@ -202,3 +202,13 @@ def harmonic_distortion(result: Deconvolution, direct: int, law: SweepLaw, order
         fundamental = np.interp(frequencies[inside] / order, frequencies, linear)
         levels.append(10 * np.log10(max(excess[inside].sum() / max(fundamental.sum(), 1e-30), 1e-10)))
     return np.array(levels)
+
+
+def place_of(pattern: Array, reference: Samples) -> int | None:
+    """First sample of pattern (m,) in reference (n,), at any level; None where it is not there."""
+    energy = float(np.sum(reference.astype(np.float64) ** 2))
+    if reference.size < pattern.size or not energy > 0:
+        return None
+    match = signal.correlate(reference.astype(np.float64), pattern, "valid", "fft")
+    start = int(np.argmax(np.abs(match)))
+    return start if abs(match[start]) > 0.9 * np.sqrt(energy * np.sum(pattern**2)) else None

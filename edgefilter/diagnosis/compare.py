@@ -138,8 +138,8 @@ def describe(prepared: Prepared, model: EchoModel, score: Score | None = None) -
     flat = residual / model.microphone_gain(residual.size)
     white = whiten(flat, psd)
     use = prepared.usable
-    power = np.where(use, white.astype(np.float64) ** 2, np.nan)
     silent = use & ~prepared.active
+    power = np.where(use, white.astype(np.float64) ** 2, np.nan)
     return Comparison(
         excess_db=score.excess_db,
         noise_floor_db=float(decibels(total_power(psd))),
@@ -162,8 +162,16 @@ def describe(prepared: Prepared, model: EchoModel, score: Score | None = None) -
         recording=measurement.recording,
         prediction=prediction,
         residual=residual,
-        independence=independence(flat, _as_played(measurement.reference, model), psd, use & prepared.active, silent),
+        independence=independence_of(prepared, model, score),
     )
+
+
+def independence_of(prepared: Prepared, model: EchoModel, score: Score) -> Independence | None:
+    """Whether what a model leaves is noise, see `independence`; score: the judge's of that model."""
+    measurement, use, active = prepared.measurement, prepared.usable, prepared.active
+    flat = (measurement.recording - score.prediction) / model.microphone_gain(measurement.recording.size)
+    said = _as_played(measurement.reference, model)
+    return independence(flat, said, prepared.noise_psd, use & active, use & ~active)
 
 
 def _as_played(reference: Samples, model: EchoModel) -> Samples:

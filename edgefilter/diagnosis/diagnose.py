@@ -10,7 +10,7 @@ import numpy as np
 from edgefilter.diagnosis.advice import advice
 from edgefilter.diagnosis.band_edge import cut_by_power
 from edgefilter.diagnosis.candidates import candidates
-from edgefilter.diagnosis.compare import Comparison, compare, describe
+from edgefilter.diagnosis.compare import Comparison, compare, describe, independence_of
 from edgefilter.diagnosis.criteria import Criteria
 from edgefilter.diagnosis.findings import findings_of, share_of
 from edgefilter.diagnosis.leftover import left_in_words
@@ -196,7 +196,7 @@ def conclude(
         ),
         model=found.model,
         tried=tried,
-        independence=(describe(found.prepared, found.model, found.final) if findings else comparison).independence,
+        independence=independence_of(found.prepared, found.model, found.final) if findings else comparison.independence,
         precision=precision(found, findings),
         advice=advice(tried),
     )

@@ -12,6 +12,7 @@ import scipy
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
+from edgefilter.dsp.least_phase import log_response
 from edgefilter.dsp.psd import floored
 from edgefilter.types import PRE_ROLL, SAMPLE_RATE, Array, Samples
 
@@ -163,10 +164,7 @@ def whitener(psd: Samples) -> Samples:
     n = 4096
     bins = np.linspace(0, psd.size - 1, n // 2 + 1)
     level = np.interp(bins, np.arange(psd.size), np.log(floored(psd) * SAMPLE_RATE / 2))
-    cepstrum = np.fft.irfft(-0.5 * level)
-    cepstrum[1 : n // 2] *= 2.0
-    cepstrum[n // 2 + 1 :] = 0.0
-    return np.fft.irfft(np.exp(np.fft.rfft(cepstrum)))[:1200].astype(np.float32)
+    return scipy.fft.irfft(np.exp(log_response(-0.5 * level)))[:1200].astype(np.float32)
 
 
 def lagged_sums(a: Samples, b: Samples, low: int, high: int) -> Array:

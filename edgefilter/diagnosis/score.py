@@ -88,10 +88,9 @@ class Judge:
         """The score of a prediction (n,), with the ordinary tolerances taken up first.
 
         unpredictable: as EchoModel.unpredictable gives it, noise that is expected on top of the fan, as the robot's
-        ordinary distortion is. gain: (n,) of the
-        microphone, which
-        the fan passed as well: it is taken out of the residual before that is held against the fan. The cells keep it:
-        as a likelihood their level has to be that of the recording as it is.
+        ordinary distortion is. gain: (n,) of the microphone, which the fan passed as well: it is taken out of the
+        residual before that is held against the fan. The cells keep it: as a likelihood their level has to be that of
+        the recording as it is.
         """
         corrected = self.correct(prediction)
         residual = self.prepared.measurement.recording - corrected

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
+from edgefilter.dsp.least_phase import log_response
 from edgefilter.echo.effect import Effect, Experiment, Parameter, Stage
 from edgefilter.echo.evidence import Evidence
 from edgefilter.echo.measurement import Measurement, Values, VoiceModel
@@ -103,11 +104,7 @@ def _basis(bins: int, sample_rate: int) -> NDArray[np.complex128]:
     hz = np.maximum(np.arange(bins) * sample_rate / (2 * (bins - 1)), 1.0)
     at = np.log(hz / KNOTS_HZ[0]) / np.log(KNOTS_HZ[1] / KNOTS_HZ[0])
     at = np.clip(at, 0.0, KNOTS_HZ.size - 1.0)
-    gain = np.maximum(1.0 - np.abs(at[:, None] - np.arange(KNOTS_HZ.size)), 0.0)
-    cepstrum = fft.irfft(gain, axis=0)
-    cepstrum[1 : bins - 1] *= 2.0
-    cepstrum[bins:] = 0.0
-    return fft.rfft(cepstrum, axis=0)
+    return log_response(np.maximum(1.0 - np.abs(at[:, None] - np.arange(KNOTS_HZ.size)), 0.0))
 
 
 def _smooth_gain(found: Spectra) -> tuple[Array, float]:
