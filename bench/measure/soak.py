@@ -57,8 +57,14 @@ class Slice:
 
 
 def memory_mb(pid: int | str = "self") -> float:
-    """Resident memory of a process now, MB (Linux)."""
-    return int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * 4096 / 2**20
+    """Resident memory of a process now and of those that it started, the learner for one, MB (Linux); 0 when it ended."""
+    process = Path(f"/proc/{pid}")
+    try:
+        own = int((process / "statm").read_text().split()[1]) * 4096 / 2**20
+        children = [int(child) for task in process.glob("task/*/children") for child in task.read_text().split()]
+    except (FileNotFoundError, ProcessLookupError):
+        return 0.0
+    return own + sum(map(memory_mb, children))
 
 
 def blocks(total: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:

@@ -14,10 +14,10 @@ from edgefilter.types import SAMPLE_RATE, Samples
 
 RETRY_S = 1.0
 """Between two attempts to open a device that is away."""
-WATCH_S = 2.0
+WATCH_S = 4.0
 """How long a device must have been behind the clock throughout, before sound counts as lost rather than late."""
-LEAST_S = 0.1
-"""So much must be missing then; clocks that differ by 300 ppm drift apart by a hundredth of it."""
+LEAST_S = 0.02
+"""So much must be missing then; clocks that differ by 300 ppm drift apart by a twentieth of it."""
 
 
 def clock() -> float:
@@ -30,6 +30,7 @@ class SampleClock:
 
     missed: seconds so far. Compares, from one stretch of WATCH_S to the next, by how much the device was behind the
     clock at least: late sound catches up within a stretch, lost sound does not, and drifting clocks change it slowly.
+    What comes after all, from a machine that was too busy for longer, is taken off again.
     """
 
     def __init__(self) -> None:
@@ -49,8 +50,8 @@ class SampleClock:
 
     def _judge(self) -> None:
         before, self._base = self._base, self._least
-        if before is not None and self._least - before > LEAST_S:
-            self.missed += self._least - before
+        if before is not None and abs(self._least - before) > LEAST_S:
+            self.missed = max(0.0, self.missed + self._least - before)
 
 
 class SteadyInput:

@@ -213,3 +213,6 @@ def test_late_sound_is_not_lost_and_drift_is_no_loss():
     for tick in range(19_900, 21_000):
         watch.note(delivered + tick * 0.01 - now, tick * 0.01 + 3 * LEAST_S)
     assert watch.missed == pytest.approx(3 * LEAST_S, abs=WATCH_S * 400e-6)
+    for tick in range(21_000, 22_100):
+        watch.note(delivered + tick * 0.01 - now, tick * 0.01)
+    assert watch.missed == pytest.approx(0.0, abs=WATCH_S * 400e-6)  # it came after all
