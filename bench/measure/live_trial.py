@@ -42,6 +42,8 @@ CLIP_S = (1.0, 15.0)
 UNPLUGGED_AT, UNPLUGGED_S = 0.42, 6.0
 """When the microphone goes, as a part of the whole, and for how long."""
 HOG_AT, HOG_UNTIL, HOGS_PER_CORE = 0.6, 0.7, 2
+CLOSELY_MS = 20
+"""How far a sink may run ahead."""
 AFTER_S = 3.0
 """Sound that is played before the filter is given up on."""
 FOUND_WITHIN_S = 10.0
@@ -58,28 +60,37 @@ class Mishap:
 
 
 class Device:
-    """A sink that plays a recording as its clock goes on, on a sound server of its own, which can go and come back."""
+    """A sink that plays a recording as its clock goes on, on a sound server of its own, which can go and come back.
+
+    Somebody listens to it all the time: a sink to which nobody listens closely runs up to 2 s ahead, and a microphone
+    would hear what the loudspeaker has not played yet.
+    """
 
     def __init__(self, sink: str, samples: Samples) -> None:
         self._sink, self._samples = sink, samples
         self._folder = Path(tempfile.mkdtemp(prefix="pulse"))
-        self._player: subprocess.Popen | None = None
-        self.server = virtual_sound.start_server(self._folder, (sink,))
+        self._clients: list[subprocess.Popen] = []
+        self.plug_in()
 
     def play(self, begin_s: float = 0.0) -> None:
         """From there on."""
         path = self._folder / f"{begin_s:.0f}.wav"
         soundfile.write(path, self._samples[round(begin_s * SAMPLE_RATE) :], SAMPLE_RATE, "PCM_16")
-        self._player = subprocess.Popen(["paplay", "-d", self._sink, str(path)], env=self.server.environment)
+        self._clients.append(
+            subprocess.Popen(
+                ["paplay", "-d", self._sink, str(path)], env=self.server.environment, stderr=subprocess.DEVNULL
+            )
+        )
 
     def unplug(self) -> None:
         """The device is gone, and what was played into it."""
         self.server.stop()
-        if self._player:
-            self._player.wait()
+        while self._clients:
+            self._clients.pop().wait()
 
     def plug_in(self) -> None:
         self.server = virtual_sound.start_server(self._folder, (self._sink,))
+        self._clients.append(virtual_sound.listen(self.server, self._sink, CLOSELY_MS))
 
     def __enter__(self) -> Device:
         return self

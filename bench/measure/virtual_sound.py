@@ -70,6 +70,21 @@ def start_server(folder: Path, sinks: Sequence[str] = SINKS) -> Server:
     raise RuntimeError("pulseaudio did not start:\n" + (folder / "log").read_text())
 
 
+def listen(server: Server, sink: str, latency_ms: int) -> subprocess.Popen:
+    """A program that hears all of a sink, as soon as that, and forgets it; it ends with the server."""
+    command = ["parec", "-d", f"{sink}.monitor", f"--latency-msec={latency_ms}", "--raw"]
+    listener = subprocess.Popen(command, env=server.environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    for _ in range(100):
+        listed = subprocess.run(
+            ["pactl", "list", "short", "source-outputs"], env=server.environment, capture_output=True, text=True
+        )
+        if listed.stdout.strip():
+            return listener
+        time.sleep(0.05)
+    listener.kill()
+    raise RuntimeError(f"nothing can be heard of {sink}")
+
+
 @contextmanager
 def server(sinks: Sequence[str] = SINKS) -> Iterator[Server]:
     """A server of one's own for a while. Its folder is short: socket paths hold 107 bytes."""
