@@ -4,8 +4,8 @@ r"""Which checkpoint keeps the words: networks against 'ss' on validation conver
         --real RECORDINGS --humans HUMAN/val --whisper WHISPER --output bench/results/words_validation
 
 Loss and SI-SDR did not predict word errors, so networks are chosen by these. Every network is heard alone, and mixed
-with the Wiener mask of 'ss' and with the linear stage's error (--wiener, --error: shares of the answer), beside the
-package's own `crnn`. --cold: each conversation once more without its profile. --real: humans of --humans laid on the
+with the Wiener mask of 'ss', with the linear stage's error, and with both (--wiener, --error: shares of the answer),
+beside the package's own `ss` and `crnn`, which are mixed with the error as well. --cold: each conversation once more without its profile. --real: humans of --humans laid on the
 tuning half of the recordings of real loudspeakers (bench.measure.real), without a profile. --learning: the filter learns
 while it runs. Give validation conversations, never test ones. Differences are paired: each utterance against its own
 answer by 'ss'. All systems get the very same frames: what stands before the engine runs once.
@@ -144,20 +144,26 @@ Make = Callable[[], Engine]
 
 
 def systems(checkpoints: list[Path], wiener: list[float], error: list[float], folder: Path) -> dict[str, Make]:
-    """What is compared, by name: linear, ss, crnn as it ships, and each checkpoint's averaged weights alone and mixed."""
-    found: dict[str, Make] = {name: lambda name=name: create(name) for name in ("linear", BASE, "crnn")}
+    """What is compared, by name: linear, ss and crnn as they ship, each checkpoint's averaged weights, alone and mixed."""
+    found: dict[str, Make] = {"linear": lambda: create("linear")}
+    for name in (BASE, "crnn"):
+        found |= with_shares(name, lambda name=name: create(name), error)
     folder.mkdir(parents=True, exist_ok=True)
     for path in checkpoints:
         trained = onnx_export.load(path)
         name = f"{path.parent.name}/{path.stem}, step {trained.training.get('step', '?')}"
         model = folder / f"{path.parent.name}_{path.stem}.onnx"
         onnx_export.export(trained, model)
-        found[name] = lambda model=model: Crnn(model, 0.0)
-        for share in wiener:
-            found[f"{name}, {share:g} ss"] = lambda model=model, share=share: Crnn(model, share)
-        for share in error:
-            found[f"{name}, {share:g} error"] = lambda model=model, share=share: WithError(Crnn(model, 0.0), share)
+        for share in (0.0, *wiener):
+            mixed = f"{name}, {share:g} ss" if share else name
+            found |= with_shares(mixed, lambda model=model, share=share: Crnn(model, share), error)
     return found
+
+
+def with_shares(name: str, make: Make, shares: list[float]) -> dict[str, Make]:
+    """An engine as it is, and with each share of the error."""
+    mixed = {f"{name}, {share:g} error": lambda share=share: WithError(make(), share) for share in shares}
+    return {name: make, **mixed}
 
 
 def judge(case: Case, making: dict[str, Make], learning: bool, recogniser: Recogniser) -> Iterator[dict]:
