@@ -46,9 +46,13 @@ def listen(human):
 
 
 with make_source(mic, None if "-" in (mic, reference) or mic == "mic" else reference, "-") as source:
-    for block in source:
-        for at in range(0, block.mic.size, 320):  # 20 ms, as they come live
-            listen(ego.process(block.mic[at : at + 320], block.ref[at : at + 320]))
+    print(*source.notes, sep="\n", file=sys.stderr, flush=True)  # which devices
+    try:
+        for block in source:
+            for at in range(0, block.mic.size, 320):  # 20 ms, as they come live
+                listen(ego.process(block.mic[at : at + 320], block.ref[at : at + 320]))
+    except KeyboardInterrupt:  # how a live run ends
+        pass
 listen(ego.flush())
 if began is not None:  # the recording ended in mid-sentence
     print(f"{began / SAMPLE_RATE:.2f} s to the end: {words(heard[began - first :])}")

@@ -1,6 +1,7 @@
 """`edgefilter run --input mic` as on a laptop: default microphone, reference from the default output's monitor, Ctrl-C."""
 
 import json
+import re
 import signal
 import subprocess
 import sys
@@ -202,3 +203,22 @@ def test_the_doctor_finds_the_virtual_machine_fit(server):
     assert "as shipped" in checks["model"]["found"] and "robot.monitor" in checks["reference"]["found"]
     assert {"microphone", "mic clock", "ref clock", "sound server"} <= set(checks)
     assert checks["level"]["state"] == "warning" and "unmute" in checks["level"]["do"]  # nobody plays anything
+
+
+def test_the_example_that_listens_hears_the_default_microphone_and_the_monitor(server, tmp_path):
+    cut = [soundfile.read(DEMO / f"{name}.flac", dtype="int16")[0][6 * 16000 :] for name in ("reference", "mic")]
+    for sink, samples in zip(("robot", "robot_mic"), cut):
+        soundfile.write(tmp_path / f"{sink}.wav", samples, 16000, "PCM_16")
+    live = subprocess.Popen(
+        [sys.executable, ROOT / "docs/examples/listen.py", "mic", "-", DEMO / "profile.npz"],
+        env={**server.environment, "PYTHONPATH": str(ROOT)}, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    told = [live.stderr.readline() for _ in range(2)]
+    assert told[1].strip() == "reference: robot.monitor", told
+    for player in play(server, tmp_path):
+        assert player.wait(timeout=60) == 0
+    time.sleep(1.5)
+    live.send_signal(signal.SIGINT)
+    said, troubles = live.communicate(timeout=60)
+    assert live.returncode == 0 and "Traceback" not in troubles, troubles
+    assert re.search(r"^\S+ (to|s to) \S+.*: \(\S+ s\)$", said, re.MULTILINE), said  # somebody spoke
