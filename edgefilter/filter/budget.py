@@ -30,6 +30,9 @@ WARM_UP, PACED = 32, 300
 """Hops that are not counted, and hops at the real pace; as many again back to back."""
 WARM_UP_S, PACED_S, AT_ONCE_S = 0.2, 5.2, 0.4
 """Longest time for each kind of hops, seconds."""
+PASSING = 0.5
+"""Share of the budget within which the median of an engine whose p99 is beyond it may be another program's fault: it is
+measured a second time. Where it was not, the filter steps down while it runs."""
 AGAIN = " (measured before; --remeasure does it again)"
 SCENE = Path(__file__).parents[1] / "demo_data"
 
@@ -87,7 +90,7 @@ def choose(
     """The first of candidates, best first, whose p99 compute per hop at the real pace is within budget_ms.
 
     Figures of an earlier call on this machine, with these versions, models, cores and this length of path, are used
-    again; what is missing is measured, in less than 6 s an engine. say: told what is going on. Raises UsageError where
+    again; what is missing is measured, in less than 6 s an engine, twice where a passing load may have slowed it. say: told what is going on. Raises UsageError where
     no candidate can be made.
     """
     cores = min(CORES, len(_allowed()))
@@ -105,6 +108,9 @@ def choose(
         if name not in known or known[name].model != _model(engine):
             say(f"measuring engine {name} at the real pace on {cores} cores, about 5 s ...")
             known[name] = measure(engine, profile)
+            if not fits(known[name], budget_ms) and known[name].paced_p50_ms <= PASSING * budget_ms:
+                say(f"measuring engine {name} once more: something else may have taken the cores")
+                known[name] = min(known[name], measure(engine, profile), key=lambda each: each.paced_p99_ms)
             fresh += 1
         found.append(known[name])
         if fits(known[name], budget_ms):

@@ -46,7 +46,7 @@ def measured(monkeypatch):
         asked.append(engine.name)
         p99 = speeds[engine.name]
         return Figures(
-            engine.name, budget._model(engine), 16.0, 300, p99 < 16.0, p99 / 3, p99 / 2, p99, 2 * p99, p99 / 4, p99 / 3
+            engine.name, budget._model(engine), 16.0, 300, p99 < 16.0, 0.6 * p99, 0.8 * p99, p99, 2 * p99, p99 / 4, p99 / 3
         )
 
     monkeypatch.setattr(budget, "measure", pretend)
@@ -68,6 +68,19 @@ def test_the_best_engine_that_fits_is_taken_and_no_further_one_is_measured(measu
     for beaten in asked[:-1]:
         assert f"{beaten} needs {measured[0][beaten]:.1f} ms" in choice.reason
     json.dumps(choice.to_dict())
+
+
+def test_a_passing_load_does_not_cost_the_best_engine(monkeypatch):
+    slow, asked = [30.0, 5.0, 2.0], []
+
+    def pretend(engine, profile):
+        asked.append(engine.name)
+        p99 = slow.pop(0)
+        return Figures(engine.name, "", 16.0, 300, True, 1.5, 1.8, p99, 2 * p99, 1.0, 1.2)
+
+    monkeypatch.setattr(budget, "measure", pretend)
+    choice = choose(8.0, candidates=LADDER)
+    assert (choice.engine, choice.figures[-1].paced_p99_ms, asked) == ("ss", 5.0, ["ss", "ss"])
 
 
 def test_nothing_fits_takes_the_cheapest_and_says_what_would_help(measured):
