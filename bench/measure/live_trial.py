@@ -4,10 +4,10 @@ r"""Minutes live over virtual devices while everything happens that happens to a
         --output bench/results/live_trial                                               (needs PulseAudio)
 
 A day of `bench.simulate.robot_day` (a robot that is carried from room to room, turned down, and gets a clock and a lag of
-its own) is played into the loudspeaker and the microphone of a private sound server, and `edgefilter run --input mic`
+its own) is what two virtual devices hear, loopback and microphone, each on a private sound server, and `edgefilter run`
 listens to them with a calibration of its first room. Meanwhile the microphone is pulled out and put back, and other
-programs take every core. The figures: the event log, samples by what befell them, hops that came late, and word errors of
-each interruption, by what was going on.
+programs take every core. The figures: the event log, samples by what befell them, hops that came late, and word errors
+of each interruption, by what was going on.
 """
 
 from __future__ import annotations
@@ -19,9 +19,10 @@ import shutil
 import subprocess
 import sys
 import tempfile
+import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -42,8 +43,8 @@ CLIP_S = (1.0, 15.0)
 UNPLUGGED_AT, UNPLUGGED_S = 0.42, 6.0
 """When the microphone goes, as a part of the whole, and for how long."""
 HOG_AT, HOG_UNTIL, HOGS_PER_CORE = 0.6, 0.7, 2
-CLOSELY_MS = 20
-"""How far a sink may run ahead."""
+PIECE_S = 0.01
+"""Of sound, that is handed to a device at once."""
 AFTER_S = 3.0
 """Sound that is played before the filter is given up on."""
 FOUND_WITHIN_S = 10.0
@@ -60,37 +61,50 @@ class Mishap:
 
 
 class Device:
-    """A sink that plays a recording as its clock goes on, on a sound server of its own, which can go and come back.
+    """A microphone that hears a recording as the clock goes on, on a sound server of its own, which can go and come back.
 
-    Somebody listens to it all the time: a sink to which nobody listens closely runs up to 2 s ahead, and a microphone
-    would hear what the loudspeaker has not played yet.
+    Silence until it is told when the recording begins. A writer that comes too late makes up for it: a busy machine
+    delays what is heard and loses none of it, as with a sound card.
     """
 
-    def __init__(self, sink: str, samples: Samples) -> None:
-        self._sink, self._samples = sink, samples
+    def __init__(self, name: str, samples: Samples) -> None:
+        self._name = name
+        self._samples = np.round(32767 * samples).astype("<i2")
         self._folder = Path(tempfile.mkdtemp(prefix="pulse"))
-        self._clients: list[subprocess.Popen] = []
+        self._begins: int | None = None
         self.plug_in()
 
-    def play(self, begin_s: float = 0.0) -> None:
-        """From there on."""
-        path = self._folder / f"{begin_s:.0f}.wav"
-        soundfile.write(path, self._samples[round(begin_s * SAMPLE_RATE) :], SAMPLE_RATE, "PCM_16")
-        self._clients.append(
-            subprocess.Popen(
-                ["paplay", "-d", self._sink, str(path)], env=self.server.environment, stderr=subprocess.DEVNULL
-            )
-        )
-
-    def unplug(self) -> None:
-        """The device is gone, and what was played into it."""
-        self.server.stop()
-        while self._clients:
-            self._clients.pop().wait()
+    def play(self, at_s: float) -> None:
+        """From that moment of time.monotonic() on."""
+        self._begins = round(at_s * SAMPLE_RATE)
 
     def plug_in(self) -> None:
-        self.server = virtual_sound.start_server(self._folder, (self._sink,))
-        self._clients.append(virtual_sound.listen(self.server, self._sink, CLOSELY_MS))
+        self.server = virtual_sound.start_server(self._folder, (), (self._name,))
+        self._writer = threading.Thread(target=self._write, daemon=True)
+        self._writer.start()
+
+    def unplug(self) -> None:
+        """The device is gone, and what it would have heard."""
+        self.server.stop()
+        self._writer.join()
+
+    def _write(self) -> None:
+        with suppress(BrokenPipeError), open(self._folder / self._name, "wb", buffering=0) as pipe:
+            done = round(time.monotonic() * SAMPLE_RATE)
+            while True:
+                now = round(time.monotonic() * SAMPLE_RATE)
+                pipe.write(self._heard(done, now).tobytes())
+                done = now
+                time.sleep(PIECE_S)
+
+    def _heard(self, first: int, last: int) -> np.ndarray:
+        """What is heard between two samples of the clock, silence where the recording has nothing."""
+        heard = np.zeros(last - first, "<i2")
+        if self._begins is not None:
+            before = max(self._begins - first, 0)
+            piece = self._samples[max(first - self._begins, 0) : max(last - self._begins, 0)]
+            heard[before : before + piece.size] = piece
+        return heard
 
     def __enter__(self) -> Device:
         return self
@@ -102,8 +116,9 @@ class Device:
 
 @contextmanager
 def hogs(count: int) -> Iterator[None]:
-    """So many programs that only compute."""
-    busy = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(count)]
+    """So many programs that only compute, of another session: Linux shares the cores out by sessions first."""
+    command = [sys.executable, "-c", "while True: pass"]
+    busy = [subprocess.Popen(command, start_new_session=True) for _ in range(count)]
     try:
         yield
     finally:
@@ -116,19 +131,21 @@ def live(day: Day, engine: str, folder: Path) -> list[Mishap]:
     """Play the day to `edgefilter run`, which records into FOLDER/kept, and do to it what is to be done."""
     calibrate(*day.calibration).save(folder / "profile.npz")
     seconds = day.mic.size / SAMPLE_RATE
-    command = [sys.executable, "-m", "edgefilter.cli", "run", "--input", "robot_mic_monitor", "--engine", engine]
+    command = [sys.executable, "-m", "edgefilter.cli", "run", "--input", "robot_mic", "--reference", "loopback"]
+    command += ["--engine", engine]
     command += ["--profile", str(folder / "profile.npz"), "--record", str(folder / "kept"), "--quiet"]
     command += ["--output", str(folder / "out.wav"), "--json", str(folder / "stats.json")]
     command += ["--seconds", f"{seconds + AFTER_S:.0f}"]
-    with Device("robot", day.ref) as loudspeaker, Device("robot_mic", day.mic) as microphone:
-        loudspeaker.server.add(microphone.server)
-        run = subprocess.Popen(command, env=loudspeaker.server.environment, stderr=subprocess.PIPE, text=True)
+    with Device("loopback", day.ref) as loopback, Device("robot_mic", day.mic) as microphone:
+        loopback.server.add(microphone.server)
+        run = subprocess.Popen(command, env=loopback.server.environment, stderr=subprocess.PIPE, text=True)
         try:
             while not (folder / "kept/mic.wav").exists() and run.poll() is None:
                 time.sleep(0.05)
-            loudspeaker.play()
-            microphone.play()
-            happened = mishaps(microphone, seconds)
+            began = time.monotonic()
+            for device in (loopback, microphone):
+                device.play(began)
+            happened = mishaps(microphone, began, seconds)
             said = run.communicate()[1]
             if run.returncode:
                 raise SystemExit(f"{' '.join(command)} failed: {said}")
@@ -137,9 +154,8 @@ def live(day: Day, engine: str, folder: Path) -> list[Mishap]:
             run.kill()
 
 
-def mishaps(microphone: Device, seconds: float) -> list[Mishap]:
+def mishaps(microphone: Device, began: float, seconds: float) -> list[Mishap]:
     """The microphone away for a while, then every core busy for a while."""
-    began = time.monotonic()
 
     def wait(until_s: float) -> float:
         time.sleep(max(0.0, began + until_s - time.monotonic()))
@@ -149,7 +165,7 @@ def mishaps(microphone: Device, seconds: float) -> list[Mishap]:
     microphone.unplug()
     wait(gone + UNPLUGGED_S)
     microphone.plug_in()
-    microphone.play(back := time.monotonic() - began)
+    back = time.monotonic() - began
     busy = wait(HOG_AT * seconds)
     with hogs(HOGS_PER_CORE * (os.cpu_count() or 1)):
         free = wait(HOG_UNTIL * seconds)

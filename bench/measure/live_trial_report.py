@@ -25,8 +25,8 @@ def markdown(found: dict, name: str) -> str:
     stats, source = found["stats"], found["stats"]["source"]
     deadline = stats["deadline"]
     lines = [
-        f"Load average before {found['load_average_before']:.1f}. A simulated robot, played in real time into the",
-        "loudspeaker and the microphone of a sound server of its own; everything else is as on a robot.",
+        f"Load average before {found['load_average_before']:.1f}. A simulated robot, heard in real time by",
+        "loopback and microphone of sound servers of their own; everything else is as on a robot.",
         "",
         "What was done to it:",
         "",

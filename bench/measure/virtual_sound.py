@@ -1,4 +1,4 @@
-"""A private PulseAudio server with null sinks, seen by PortAudio through ALSA by their and their monitors' names."""
+"""A private PulseAudio server with null sinks or piped sources, seen by PortAudio through ALSA by their and their monitors' names."""
 
 from __future__ import annotations
 
@@ -33,10 +33,12 @@ class Server:
         self.process.wait()
 
 
-def start_server(folder: Path, sinks: Sequence[str] = SINKS) -> Server:
-    """Start a server whose files all lie in folder and wait until its sinks are there.
+def start_server(folder: Path, sinks: Sequence[str] = SINKS, sources: Sequence[str] = ()) -> Server:
+    """Start a server whose files all lie in folder and wait until its devices are there.
 
-    The first is the default output, the last the default microphone.
+    The first sink is the default output, the last one's monitor the default microphone. sources: microphones that hear
+    what is written into folder/NAME, 16-bit at 16 kHz, when it is written; a sink has a clock of its own, which stands
+    still and jumps where programs come and go.
     """
     socket = f"unix:{folder}/socket"
     environment = {
@@ -48,41 +50,30 @@ def start_server(folder: Path, sinks: Sequence[str] = SINKS) -> Server:
     arguments = ["-n", "--daemonize=no", "--use-pid-file=no", "--exit-idle-time=-1", "--disable-shm=yes"]
     modules = [f"module-native-protocol-unix socket={folder}/socket auth-anonymous=1"]
     modules += [f"module-null-sink sink_name={name} rate=16000 format=s16le channels=1" for name in sinks]
+    for name in sources:
+        (folder / name).unlink(missing_ok=True)
+        modules += [f"module-pipe-source source_name={name} file={folder / name} rate=16000 format=s16le channels=1"]
     for module in modules:
         arguments += ["-L", module]
     with open(folder / "log", "w") as log:
         process = subprocess.Popen(["pulseaudio", *arguments], env=environment, stdout=log, stderr=log)
     environment |= {"PULSE_SERVER": socket, "ALSA_CONFIG_PATH": str(folder / "asound.conf"), "OMP_NUM_THREADS": "1"}
-    names = {**{name: name for name in sinks}, **{f"{name}_monitor": f"{name}.monitor" for name in sinks}}
+    names = {**{name: name for name in (*sinks, *sources)}, **{f"{name}_monitor": f"{name}.monitor" for name in sinks}}
     entries = [f'pcm.{pcm} {{ type pulse\n server "{socket}"\n device "{device}" }}\n' for pcm, device in names.items()]
     usual = [f'pcm.{pcm} {{ type pulse\n server "{socket}" }}\n' for pcm in ("!default", "pulse")]
     (folder / "asound.conf").write_text("</usr/share/alsa/alsa.conf>\n" + "".join(entries + usual))
     for _ in range(300):
-        listed = subprocess.run(["pactl", "list", "short", "sinks"], env=environment, capture_output=True, text=True)
-        if all(f"\t{name}\t" in listed.stdout for name in sinks):
-            subprocess.run(["pactl", "set-default-sink", sinks[0]], env=environment, check=True)
-            subprocess.run(["pactl", "set-default-source", f"{sinks[-1]}.monitor"], env=environment, check=True)
+        listed = subprocess.run(["pactl", "list", "short"], env=environment, capture_output=True, text=True)
+        if all(f"\t{name}\t" in listed.stdout for name in (*sinks, *sources)):
+            if sinks:
+                subprocess.run(["pactl", "set-default-sink", sinks[0]], env=environment, check=True)
+                subprocess.run(["pactl", "set-default-source", f"{sinks[-1]}.monitor"], env=environment, check=True)
             return Server(process, environment, "".join(entries))
         if process.poll() is not None:
             break
         time.sleep(0.1)
     process.kill()
     raise RuntimeError("pulseaudio did not start:\n" + (folder / "log").read_text())
-
-
-def listen(server: Server, sink: str, latency_ms: int) -> subprocess.Popen:
-    """A program that hears all of a sink, as soon as that, and forgets it; it ends with the server."""
-    command = ["parec", "-d", f"{sink}.monitor", f"--latency-msec={latency_ms}", "--raw"]
-    listener = subprocess.Popen(command, env=server.environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-    for _ in range(100):
-        listed = subprocess.run(
-            ["pactl", "list", "short", "source-outputs"], env=server.environment, capture_output=True, text=True
-        )
-        if listed.stdout.strip():
-            return listener
-        time.sleep(0.05)
-    listener.kill()
-    raise RuntimeError(f"nothing can be heard of {sink}")
 
 
 @contextmanager

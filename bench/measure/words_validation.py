@@ -5,10 +5,11 @@ r"""Which checkpoint keeps the words: networks against 'ss' on validation conver
 
 Loss and SI-SDR did not predict word errors, so networks are chosen by these. Every network is heard alone, and mixed
 with the Wiener mask of 'ss', with the linear stage's error, and with both (--wiener, --error: shares of the answer),
-beside the package's own `ss` and `crnn`, which are mixed with the error as well. --cold: each conversation once more without its profile. --real: humans of --humans laid on the
-tuning half of the recordings of real loudspeakers (bench.measure.real), without a profile. --learning: the filter learns
-while it runs. Give validation conversations, never test ones. Differences are paired: each utterance against its own
-answer by 'ss'. All systems get the very same frames: what stands before the engine runs once.
+beside the package's own `ss` and `crnn`, which are mixed with the error as well. --cold: each conversation once more
+without its profile. --real: humans of --humans laid on the tuning half of the recordings of real loudspeakers
+(bench.measure.real), without a profile. --learning: the filter learns while it runs. Give validation conversations,
+never test ones. Differences are paired: each utterance against its own answer by 'ss'. All systems get the very same
+frames: what stands before the engine runs once.
 """
 
 from __future__ import annotations

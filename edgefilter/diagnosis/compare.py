@@ -6,6 +6,7 @@ from dataclasses import dataclass, field, fields
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import fft
 
 from edgefilter.diagnosis.independence import Independence, independence
 from edgefilter.diagnosis.prepare import Prepared, prepare
@@ -219,9 +220,10 @@ def _by_level(prediction: Samples, white: Samples, power: Array) -> tuple[tuple[
 
 def _by_lag(white: Samples, reference: Samples) -> tuple[tuple[float, float, float], ...]:
     """Share of the squared cross-correlation of residual and reference in each range of lags, both spectra flattened."""
-    n = 2 * white.size
-    a, b = np.fft.rfft(white, n), np.fft.rfft(reference, n)
-    cross = np.fft.irfft(a * np.conj(b) / (np.abs(b) ** 2 + 1e-2 * np.mean(np.abs(b) ** 2)), n)
+    n = fft.next_fast_len(2 * white.size, real=True)
+    a, b = fft.rfft(white, n), fft.rfft(reference, n)
+    power = np.abs(b) ** 2
+    cross = fft.irfft(a * np.conj(b) / (power + 1e-2 * np.mean(power)), n)
     edges = [round(ms * SAMPLE_RATE / 1000) for ms in LAG_EDGES_MS]
     parts = np.array(
         [
