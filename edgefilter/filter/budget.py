@@ -90,8 +90,8 @@ def choose(
     """The first of candidates, best first, whose p99 compute per hop at the real pace is within budget_ms.
 
     Figures of an earlier call on this machine, with these versions, models, cores and this length of path, are used
-    again; what is missing is measured, in less than 6 s an engine, twice where a passing load may have slowed it. say: told what is going on. Raises UsageError where
-    no candidate can be made.
+    again; what is missing is measured, in less than 6 s an engine, twice where a passing load may have slowed it. say:
+    told what is going on. Raises UsageError where no candidate can be made.
     """
     cores = min(CORES, len(_allowed()))
     about = budget_cache.describe({"held_to": cores, "taps": _taps(profile), "effects": _effects(profile)})

@@ -1,9 +1,12 @@
 """The live trial's bookkeeping: where a sentence lies in what was recorded, and what the page says of it."""
 
+import subprocess
+import time
+
 import numpy as np
 
 from bench.measure import live_trial_report
-from bench.measure.live_trial import located
+from bench.measure.live_trial import Device, located
 from bench.simulate.robot_day import interrupt
 
 
@@ -14,6 +17,21 @@ def test_a_sentence_is_found_where_the_recording_was_moved_and_filled():
     for moved in (-30_000, 0, 91_234):
         assert located(sentence, np.roll(mic, moved), 200_000) == 200_000 + moved
     assert located(mic[:32_000], mic, 0) == 0
+
+
+def test_a_device_hears_by_the_clock_whether_it_was_away_or_not():
+    samples = (0.1 * np.random.default_rng(1).standard_normal(20 * 16_000)).astype(np.float32)
+    command = ["timeout", "1.2", "parec", "-d", "robot_mic", "--rate=16000", "--channels=1", "--format=s16le", "--raw"]
+    with Device("robot_mic", samples) as device:
+        device.play(began := time.monotonic())
+        ends = []
+        for away in (False, True):
+            if away:
+                device.unplug(), device.plug_in()
+            heard = subprocess.run([*command, "--latency-msec=20"], env=device.server.environment, capture_output=True)
+            last = np.frombuffer(heard.stdout[-16_000:], "<i2")
+            ends.append(located(last / np.float32(32767), samples, 0) / 16_000 + 0.5 - (time.monotonic() - began))
+    assert abs(ends[0]) < 0.5 and abs(ends[1] - ends[0]) < 0.3, ends
 
 
 def test_the_day_says_what_its_human_says_and_where(tmp_path, monkeypatch):

@@ -46,7 +46,17 @@ def measured(monkeypatch):
         asked.append(engine.name)
         p99 = speeds[engine.name]
         return Figures(
-            engine.name, budget._model(engine), 16.0, 300, p99 < 16.0, 0.6 * p99, 0.8 * p99, p99, 2 * p99, p99 / 4, p99 / 3
+            engine.name,
+            budget._model(engine),
+            16.0,
+            300,
+            p99 < 16.0,
+            0.6 * p99,
+            0.8 * p99,
+            p99,
+            2 * p99,
+            p99 / 4,
+            p99 / 3,
         )
 
     monkeypatch.setattr(budget, "measure", pretend)
