@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from edgefilter.diagnosis.diagnose import diagnose as diagnose
     from edgefilter.diagnosis.proof import Proof as Proof
     from edgefilter.diagnosis.proof import prove as prove
+    from edgefilter.diagnosis.proven import diagnose_proven as diagnose_proven
     from edgefilter.diagnosis.result import Diagnosis as Diagnosis
     from edgefilter.diagnosis.result import Finding as Finding
     from edgefilter.diagnosis.result import Interval as Interval
@@ -67,6 +68,7 @@ _HOMES = {
     "diagnosis.compare": ("Comparison", "compare"),
     "diagnosis.diagnose": ("add", "diagnose"),
     "diagnosis.proof": ("Proof", "prove"),
+    "diagnosis.proven": ("diagnose_proven",),
     "diagnosis.result": ("Diagnosis", "Finding", "Interval"),
     "echo.effect": ("Effect", "Parameter"),
     "echo.measurement": ("Measurement",),

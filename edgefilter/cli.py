@@ -117,6 +117,11 @@ def _add_diagnosis(commands: argparse._SubParsersAction) -> None:
         metavar="P2.npz",
         help="write a profile with all that was found; without --profile, one made from the recording",
     )
+    diagnose.add_argument(
+        "--prove",
+        action="store_true",
+        help="do not name what makes the running filter worse on seconds that no fit has seen; takes a little longer",
+    )
     for command in (add, diagnose):
         command.add_argument(
             "--force", action="store_true", help="write it even where the running filter is worse with it"

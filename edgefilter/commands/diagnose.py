@@ -14,6 +14,7 @@ from edgefilter.commands.display import report_part, write_json
 from edgefilter.commands.fitting import Fitted, Refused, fit, long_paths
 from edgefilter.commands.material import load
 from edgefilter.diagnosis.diagnose import Diagnosis, diagnose
+from edgefilter.diagnosis.proven import diagnose_proven
 from edgefilter.errors import EdgefilterError, SignalError, UsageError
 from edgefilter.profile.data import Profile
 from edgefilter.report.text import add_command, diagnosis_lines, in_order
@@ -23,10 +24,14 @@ from edgefilter.types import Samples
 def main(args: argparse.Namespace) -> int:
     if args.force and not args.apply:
         raise UsageError("found --force without --apply, which is what it is for: give both or leave it out")
+    if args.prove and args.profile is None:
+        raise UsageError(
+            "found --prove without --profile: one made from the recording has heard the seconds of the proof"
+        )
     html = report_part("html") if args.report else None
     profile, recording, reference = load(args)
     with _bar() as progress:
-        found = diagnose(profile, recording, reference, progress=progress)
+        found = (diagnose_proven if args.prove else diagnose)(profile, recording, reference, progress=progress)
     if args.profile is None:
         found = replace(
             found, comparison=replace(found.comparison, warnings=(*profile.warnings, *found.comparison.warnings))

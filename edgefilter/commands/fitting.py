@@ -15,7 +15,8 @@ from edgefilter.echo.effects.catalogue import names as names_known
 from edgefilter.echo.running import reach
 from edgefilter.errors import EdgefilterError, SignalError
 from edgefilter.profile.data import Profile
-from edgefilter.report.words import UNITS, decibels, figure, joined
+from edgefilter.report.statistics import proof_line
+from edgefilter.report.words import UNITS, figure, joined
 from edgefilter.types import Samples
 
 LEAST_FALL_DB = 0.05
@@ -68,7 +69,7 @@ class Fitted:
         for name in self.names:
             lines += _values(name, values[name], len(self.names) > 1)
         lines += [f"{'recording':<12}{text}" for text in self.before.warnings]
-        lines.append(f"{'proof':<12}{_told(self.proof) if self.proof else f'none: {self.unproven}'}")
+        lines.append(proof_line(self.proof, self.unproven))
         lines += [f"{'dropped':<12}{name}: with it the running filter would be worse" for name in self.dropped]
         lines += [
             f"NOTE        {name} happened in this recording and is kept with it: of others the profile predicts what it"
@@ -128,13 +129,6 @@ def _values(name: str, values: Any, named: bool) -> list[str]:
         shown = f"{value.size} values" if value.size > 6 else ", ".join(figure(v) for v in value.ravel())
         lines.append(f"  {f'{name} ' if named else ''}{p.name} = {shown} {UNITS.get(p.unit, p.unit)}".rstrip())
     return lines
-
-
-def _told(proof: Proof) -> str:
-    return (
-        f"running filter, {proof.seconds:.1f} s held out: ERLE {decibels(proof.erle_before_db)} dB before,"
-        f" {decibels(proof.erle_after_db)} dB after"
-    )
 
 
 def _refusal(proof: Proof) -> str:

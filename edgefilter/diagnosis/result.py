@@ -4,13 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
-from typing import Literal, TypeAlias
+from typing import TYPE_CHECKING, Literal, TypeAlias
 
 from edgefilter.diagnosis.compare import Comparison
 from edgefilter.diagnosis.independence import Independence
 from edgefilter.echo.measurement import Values
 from edgefilter.echo.model import EchoModel
 from edgefilter.types import Samples
+
+if TYPE_CHECKING:
+    from edgefilter.diagnosis.proof import Proof
 
 Verdict: TypeAlias = Literal["missing", "explained", "unexplained"]
 Fate: TypeAlias = Literal["named", "explained by another", "below its bar", "failed its proof", "not fitted"]
@@ -122,7 +125,8 @@ class Diagnosis:
     """The verdict on a recording: which effects are missing (ranking, strongest first), what is left, what cannot be predicted.
 
     tried: all effects that were tried. independence: of what is left with all that was found. precision: of the found
-    numbers. advice: what to record to tell candidates apart that explain nearly the same.
+    numbers. advice: what to record to tell candidates apart that explain nearly the same. proof: of what was found, in
+    the running filter, where it was asked for; unproven: why there is none.
     """
 
     verdict: Verdict
@@ -136,6 +140,8 @@ class Diagnosis:
     independence: Independence | None = None
     precision: Precision = Precision()
     advice: tuple[str, ...] = ()
+    proof: Proof | None = None
+    unproven: str = ""
 
     def to_dict(self) -> dict[str, object]:
         """The JSON that `diagnose --json` writes, schema 1."""
@@ -171,4 +177,6 @@ class Diagnosis:
             },
             "precision": self.precision.to_dict(),
             "advice": list(self.advice),
+            "proof": self.proof.to_dict() if self.proof else None,
+            "unproven": self.unproven,
         }

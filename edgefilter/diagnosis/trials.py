@@ -219,11 +219,12 @@ class Workbench:
         return min(enough, key=lambda trial: (find(trial.name).complexity, -trial.gain_db), default=None)
 
     def absent(self, model: EchoModel, most: int) -> list[str]:
-        """Names of the effects on the voice that a model has not and whose complexity is at most `most`."""
+        """Names of the effects on the voice that a model has not, that are not disproved and whose complexity is at most `most`."""
+        out = {*dict(model.effects), *self.criteria.disproved}
         return [
             name
             for name in names()
-            if find(name).stage != "noise" and name not in dict(model.effects) and find(name).complexity <= most
+            if find(name).stage != "noise" and name not in out and find(name).complexity <= most
         ]
 
 

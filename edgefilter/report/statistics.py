@@ -7,8 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from edgefilter.diagnosis.independence import Correlogram, Independence
+from edgefilter.diagnosis.proof import Proof
 from edgefilter.diagnosis.result import Candidate, Known, Precision
-from edgefilter.report.words import UNITS, figure
+from edgefilter.report.words import UNITS, decibels, figure
 
 SCALE = 1e4
 """Correlations stand in the page as whole numbers of 1e-4."""
@@ -125,3 +126,13 @@ def _cells(row: Candidate) -> tuple[str, ...]:
     rank = "-" if row.rank is None else str(row.rank)
     gains = (shown(row.gain_db, 2), shown(row.beside_db, 2))
     return (rank, row.effect, *gains, shown(row.numbers, 0), shown(row.delta_bic, 0), verdict)
+
+
+def proof_line(proof: Proof | None, unproven: str) -> str:
+    """What the running filter made of what was found, or why it was not asked."""
+    if proof is None:
+        return f"proof       none: {unproven}"
+    return (
+        f"proof       running filter, {proof.seconds:.1f} s held out: ERLE {decibels(proof.erle_before_db)} dB before,"
+        f" {decibels(proof.erle_after_db)} dB after"
+    )

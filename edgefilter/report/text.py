@@ -12,7 +12,7 @@ import numpy as np
 
 from edgefilter.diagnosis.compare import Comparison
 from edgefilter.diagnosis.diagnose import Diagnosis, Finding
-from edgefilter.report.statistics import advice_lines, candidate_lines, independence_lines, precision_lines
+from edgefilter.report.statistics import advice_lines, candidate_lines, independence_lines, precision_lines, proof_line
 from edgefilter.report.words import decibels, headline, interval_text, sentence, title
 
 BAR_WIDTH = 30
@@ -67,6 +67,8 @@ def diagnosis_lines(found: Diagnosis, calibrated: bool = True) -> list[str]:
         lines += _finding(rank, finding)
     if found.evidence:
         lines.append(f"left        {sentence(found.evidence)}")
+    if found.proof or found.unproven:
+        lines.append(proof_line(found.proof, found.unproven))
     lines += precision_lines(found.precision)
     if found.ranking:
         lines += independence_lines(found.independence, "with all that was found")

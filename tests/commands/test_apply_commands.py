@@ -88,6 +88,17 @@ def test_all_that_is_found_is_applied_in_one_step(scene: Path, tmp_path: Path, c
     assert "verdict     explained" in capsys.readouterr().out
 
 
+def test_what_is_named_can_be_proven_first(scene: Path, tmp_path: Path, capsys) -> None:
+    kept = tmp_path / "proven.json"
+    assert main(arguments(scene, "diagnose", "--prove", "--json", kept)) == 0
+    told = json.loads(kept.read_text())
+    assert {entry["effect"] for entry in told["ranking"]} == {"chassis_resonance", "playback_gain"}
+    assert told["proof"].keys() == PROOF and not told["proof"]["worse"]
+    assert "proof       running filter, " in capsys.readouterr().out
+    words = ["diagnose", "--prove", "--recording", str(scene / "mic.wav"), "--reference", str(scene / "ref.wav")]
+    fails_in_one_line(capsys, words, 2, ["--prove without --profile"])
+
+
 def test_without_a_profile_one_is_made_and_proven_against_none(scene: Path, tmp_path: Path, capsys) -> None:
     made = tmp_path / "made.npz"
     files = ["--recording", str(scene / "mic.wav"), "--reference", str(scene / "ref.wav")]

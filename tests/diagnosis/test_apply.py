@@ -7,11 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from edgefilter.diagnosis import proven
 from edgefilter.diagnosis.compare import compare
 from edgefilter.diagnosis.diagnose import add
 from edgefilter.diagnosis.joint import fit_jointly, fit_straight
 from edgefilter.diagnosis.prepare import prepare
-from edgefilter.diagnosis.proof import HeldOut, prove
+from edgefilter.diagnosis.proof import HeldOut, Proof, prove
+from edgefilter.diagnosis.proven import diagnose_proven
 from edgefilter.echo.model import EchoModel
 from edgefilter.errors import SignalError, UsageError
 from tests.diagnosis.robot_scene import path, profile, record, voice
@@ -145,6 +147,24 @@ def test_of_several_effects_the_one_that_hurts_is_named(carried_back) -> None:
     assert proof.worse and proof.culprit == "late_reverb"
     assert dict(proof.without)["late_reverb"] == pytest.approx(proof.erle_before_db, abs=0.3)
     assert proof.to_dict()["without"].keys() == {"late_reverb", "mic_clipping"} and proof.to_dict()["worse"] is True
+
+
+def test_a_name_that_fails_its_proof_is_not_given(monkeypatch) -> None:
+    x = voice(6.0)
+    y = record(x, EchoModel(path()).with_effect("playback_gain", {"gain_db": -3.0}))
+    found = diagnose_proven(profile(), y, x)
+    assert [finding.effect for finding in found.ranking] == ["playback_gain"]
+    assert found.proof is not None and not found.proof.worse
+
+    def contradict(known, names, recording, reference):
+        worse = 4.0 if "playback_gain" in names else 0.0
+        return Proof(names, 3.6, 1.5, 12.0, 12.0 - worse, tuple((name, 12.0) for name in names if len(names) > 1))
+
+    monkeypatch.setattr(proven, "prove", contradict)
+    found = diagnose_proven(profile(), y, x)
+    assert "playback_gain" not in [finding.effect for finding in found.ranking]
+    (row,) = (row for row in found.tried if row.effect == "playback_gain")
+    assert row.verdict == "failed its proof" and "ERLE 12.0 dB without, 8.0 dB with" in row.why
 
 
 def test_a_profile_made_from_the_recording_is_proven_against_a_filter_without_any(drifting) -> None:
