@@ -98,6 +98,8 @@ def fit_laws(
         bend, move = search.amplifier(before), search.driver(before)
     else:
         part = _Search(x[excerpt], hear, _Halves(linear[excerpt], target[excerpt], weights[excerpt]))
+        if part.base <= 0.0 or part.peak <= 0.0:
+            return None
         bend, move = part.amplifier(before), part.driver(before)
         if not (part.promising(bend) or part.promising(move)):
             return None

@@ -7,6 +7,7 @@ from scipy import integrate
 from edgefilter.dsp.membrane import MOTION_Q, motion
 from edgefilter.echo.effect import complete, vanishes
 from edgefilter.echo.effects import catalogue
+from edgefilter.echo.effects.loudspeaker_fit import fit_laws
 from edgefilter.echo.effects.path_and_loudspeaker import fit_path_and_loudspeaker
 from edgefilter.echo.measurement import Measurement
 from edgefilter.echo.model import EchoModel
@@ -42,6 +43,15 @@ def test_membrane_moves_below_its_resonance_and_is_fastest_at_it():
     np.testing.assert_allclose(levels(250.0), MOTION_Q, rtol=0.01)  # both are Q at the resonance, from the equation
     assert levels(20.0)[0] == pytest.approx(1.0, abs=0.02) and levels(20.0)[1] < 0.1
     assert (levels(4000.0) < 0.1).all()
+
+
+def test_a_silent_excerpt_holds_no_law():
+    rng = np.random.default_rng(2)
+    x = (0.1 * rng.standard_normal(64_000)).astype(np.float32)
+    x[32_000:] = 0.0
+    target = x + 1e-2 * rng.standard_normal(x.size).astype(np.float32)
+    with np.errstate(all="raise"):
+        assert fit_laws(x, target, np.ones_like(x), x, np.copy, excerpt=slice(32_000, 64_000)) is None
 
 
 def test_terms_are_those_of_the_equation_of_motion():
