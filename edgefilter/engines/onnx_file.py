@@ -100,8 +100,8 @@ def _check_node(data: memoryview) -> None:
         elif field == ATTRIBUTE:
             _check_attribute(_message(value))
     if domain not in STANDARD and (domain, operator) not in OWN_OPERATORS:
-        name = domain[:40].decode("ascii", "backslashreplace")
-        raise _Refused(f"asks for operators of the library '{name}', expected standard ones")
+        name = domain[:40].decode("latin-1")
+        raise _Refused(f"asks for operators of the library {name!a}, expected standard ones")
 
 
 def _check_attribute(data: memoryview) -> None:

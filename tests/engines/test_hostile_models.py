@@ -50,6 +50,11 @@ def operator_of_a_library(model):
     model.graph.node[0].domain = "com.example.run_my_code"
 
 
+def library_of_many_lines(model):
+    """Found by bench.fuzz."""
+    model.graph.node[0].domain = "\n\x0bhidden\x18"
+
+
 def a_loop(model):
     body = helper.make_graph([], "body", [], [])
     model.graph.node.append(helper.make_node("Loop", ["", ""], ["x"], body=body))
@@ -89,6 +94,7 @@ def text_of_many_lines(model):
         (weights_elsewhere, "takes its weights from other files"),
         (constant_elsewhere, "takes its weights from other files"),
         (operator_of_a_library, "operators of the library 'com.example.run_my_code'"),
+        (library_of_many_lines, r"operators of the library '\\n\\x0bhidden\\x18'"),
         (a_loop, "a loop or a branch"),
         (own_function, "functions of its own"),
         (weights_that_are_no_numbers, "answers with values that are not finite"),
