@@ -8,6 +8,7 @@ import json
 import math
 import os
 import secrets
+import warnings
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
@@ -139,7 +140,9 @@ def _array(content: bytes, name: str) -> np.ndarray:
         version = np.lib.format.read_magic(file)
         if version != (1, 0):
             raise _Damaged(f"member {name!r} is in .npy format {version}, expected (1, 0)")
-        shape, fortran, dtype = np.lib.format.read_array_header_1_0(file)
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")  # of headers that numpy mends, which nobody wrote here
+            shape, fortran, dtype = np.lib.format.read_array_header_1_0(file)
     except Exception as error:  # numpy lets through what Python's own parser raises: TokenError, RecursionError
         raise _Damaged(f"member {name!r} is no .npy array ({' '.join(str(error).split())[:80]})") from None
     if dtype.hasobject or dtype.kind not in "fiub":

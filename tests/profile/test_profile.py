@@ -252,6 +252,14 @@ def test_pickled_objects_are_never_loaded(saved, tmp_path):
     assert not (tmp_path / "executed").exists()
 
 
+def test_an_array_that_numpy_would_mend_is_refused_without_a_warning(saved, recwarn):
+    """Found by bench.fuzz: Python 2's (601L,) was read with a warning on standard error."""
+    name, content = next(entry for entry in members(saved).items() if b"(601,), }" in entry[1])
+    rewrite(saved, **{name.removesuffix(".npy"): content.replace(b"(601,), }", b"(601L,),}")})
+    refused(saved, "is no .npy array")
+    assert not recwarn.list
+
+
 def test_decompression_bomb_is_refused_without_unpacking(saved):
     with (
         zipfile.ZipFile(saved, "a", zipfile.ZIP_DEFLATED) as archive,
