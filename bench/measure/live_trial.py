@@ -218,6 +218,8 @@ def measure(args: argparse.Namespace) -> dict:
         load = os.getloadavg()[0]
         happened = live(day, args.engine, folder)
         stats = json.loads((folder / "stats.json").read_text())
+        if stats.get("model"):
+            stats["model"]["file"] = Path(stats["model"]["file"]).name
         stages = [
             {"name": stage, "begin_s": at / SAMPLE_RATE} for stage, at in zip(day.stages, day.begins, strict=True)
         ]
