@@ -65,7 +65,8 @@ def error_text(known: Known) -> str:
     if known.error is None:
         why = "at its bound" if known.source == "at its bound" else "no standard error: too few fits to tell"
         return f"{figure(known.value)} {unit}".rstrip() + f", {why}"
-    part = f" ({100 * known.error / abs(known.value):.2g} %)" if known.value else ""
+    share = known.error / abs(known.value) if known.value else 0.0
+    part = f" ({100 * share:.2g} %)" if 0.0 < share < 1.0 else " (unknown: more than itself)" if share else ""
     by = ", from fits to thirds of the recording" if known.source == "thirds" else ""
     return f"{figure(known.value)} +/- {figure(known.error)} {unit}".rstrip() + part + by
 

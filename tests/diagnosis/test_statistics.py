@@ -85,11 +85,13 @@ def test_numbers_say_where_their_error_is_from():
         Known("a", "q", 0, 12.0, "1", 0.3, "jacobian"),
         Known("a", "s", 1, 2.0, "s", 0.1, "thirds"),
         Known("a", "hardness", 0, 100.0, "", None, "at its bound"),
+        Known("a", "damping", 0, 0.001, "", 0.01, "jacobian"),
     ]
     assert [error_text(row) for row in rows] == [
         "12.0 +/- 0.300 (2.5 %)",
         "2.00 +/- 0.100 s (5 %), from fits to thirds of the recording",
         "100, at its bound",
+        "0.00100 +/- 0.0100 (unknown: more than itself)",
     ]
     lines = precision_lines(Precision(tuple(rows), (("a.q", "a.s[1]", -0.83),)))
     assert lines[-1] == "  a.q, a.s[1]  -0.83"
