@@ -71,6 +71,8 @@ def _fate(entry: Tried, found: Found, named: Collection[str]) -> tuple[Fate, str
         return "failed its proof", "all that was found together explains too little"
     if entry.failed:
         return "not fitted", entry.failed
+    if entry.spared:
+        return "not fitted", "a simpler effect leaves nothing to explain"
     if entry.alone is None and entry.beside is None:
         return "below its bar", "its fit finds nothing"
     if entry.short:

@@ -19,6 +19,9 @@ class Criteria:
     nested: float = 0.85
     """A simpler effect that explains this share of what the best one does is preferred: the richer model fits its noise
     as well."""
+    settled: float = 0.1
+    """Where a simple effect leaves no more than this share of the level, and nothing that can be told, no richer one can
+    be preferred to it (`nested`), and none is tried."""
     long_filter: int = 4
     """Complexity of long filters: half a minute does not teach all their taps, so what they leave of the samples fitted
     to says little."""

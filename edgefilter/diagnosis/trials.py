@@ -37,7 +37,8 @@ class Trial:
 class Tried:
     """What came of one effect in a search: beside the start alone, and beside what the search has found; None where it was not fitted.
 
-    short: why it could not be named beside the start, empty where it could. failed: why its fit failed.
+    short: why it could not be named beside the start, empty where it could. failed: why its fit failed. spared: whether
+    it was not even fitted, since a simpler effect leaves nothing to explain.
     """
 
     name: str
@@ -45,6 +46,7 @@ class Tried:
     beside: Trial | None
     short: str = ""
     failed: str = ""
+    spared: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,6 +82,7 @@ class Workbench:
         self._alike: dict[tuple[frozenset[str], str], Trial | None] = {}
         self._cost = 0
         self._failed: dict[str, str] = {}
+        self._spared: set[str] = set()
         self._refused = False
 
     @property
@@ -172,9 +175,7 @@ class Workbench:
         The last resorts only where none of the others explains much of what is left.
         """
         left, absent = self.left(model), self.absent(model, most)
-        found = [
-            trial for name in absent if not find(name).last_resort and (trial := self.attempt(name, model)) is not None
-        ]
+        found = self._attempt_in_turn([name for name in absent if not find(name).last_resort], model)
         resorts = [name for name in absent if find(name).last_resort]
         enough = self.criteria.last_resort_share * left
         if not resorts or left < self.criteria.last_resort_db or self.little(model, self.prepared.model):
@@ -182,6 +183,22 @@ class Workbench:
         if any((t.gain_db > enough or self.halves(t, model)) and self.admissible(t, model) for t in found):
             return found
         return found + [trial for name in resorts if (trial := self.attempt(name, model)) is not None]
+
+    def _attempt_in_turn(self, names: list[str], model: EchoModel) -> list[Trial]:
+        """The simple ones first; the richer ones where none of those explains so much that no other could be preferred to it."""
+        found: list[Trial] = []
+        for complexity in sorted({find(name).complexity for name in names}):
+            level = [name for name in names if find(name).complexity == complexity]
+            if any(self._settles(trial, model) for trial in found):
+                self._spared.update(level)
+            else:
+                found += [trial for name in level if (trial := self.attempt(name, model)) is not None]
+        return found
+
+    def _settles(self, trial: Trial, model: EchoModel) -> bool:
+        """Whether a trial on a model can be named and leaves next to nothing."""
+        little = self.left(trial.model) <= self.criteria.settled * self.left(model)
+        return little and self.explained(trial.model) and self.admissible(trial, model)
 
     def admissible(self, trial: Trial, model: EchoModel) -> bool:
         """Whether a trial on a model explains enough to be named, and its values look like that effect."""
@@ -198,7 +215,7 @@ class Workbench:
         return "" if effect.plausible(evidence) else "its values do not look like it"
 
     def tried(self, start: EchoModel, model: EchoModel) -> tuple[Tried, ...]:
-        """All effects that were fitted, beside the start or elsewhere, with what came of them; nothing is fitted anew."""
+        """All effects that were fitted, beside the start or elsewhere, with what came of them, and those that were spared; nothing is fitted anew."""
         names_tried = {name: None for _, name in self._trials}
         found = []
         for name in names_tried:
@@ -206,7 +223,8 @@ class Workbench:
             others = frozenset(other for other, _ in model.effects if other != name)
             short = self.short_of(alone, start) if alone else ""
             found.append(Tried(name, alone, self._alike.get((others, name)), short, self._failed.get(name, "")))
-        return tuple(found)
+        spared = [name for name in names() if name in self._spared and name not in names_tried]
+        return (*found, *(Tried(name, None, None, spared=True) for name in spared))
 
     def preferred(self, trials: Iterable[Trial]) -> Trial | None:
         """Of admissible trials the simplest of those that explain nearly as much as the best.

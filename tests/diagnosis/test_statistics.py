@@ -22,14 +22,16 @@ from edgefilter.report.text import diagnosis_lines
 from tests.diagnosis.robot_scene import profile, record, voice
 
 GAIN_DB = -2.0
+THOROUGH = Criteria(settled=-1.0)
+"""Every effect is fitted, whatever a simpler one explains."""
 
 
 @pytest.fixture(scope="module")
 def diagnosed():
-    """A robot whose volume was turned down, and the diagnosis of it."""
+    """A robot whose volume was turned down, and the thorough diagnosis of it."""
     x, robot = voice(6.0), profile()
     prepared = prepare(robot, record(x, robot.echo.with_effect("playback_gain", {"gain_db": GAIN_DB})), x)
-    return x, prepared, conclude(prepared, search(prepared, prepared.model, Criteria()), Criteria())
+    return x, prepared, conclude(prepared, search(prepared, prepared.model, THOROUGH), THOROUGH)
 
 
 def test_every_effect_that_was_fitted_is_in_the_table_with_its_fate(diagnosed):
@@ -44,6 +46,17 @@ def test_every_effect_that_was_fitted_is_in_the_table_with_its_fate(diagnosed):
     assert by_name["playback_gain"].numbers == 1.0 and by_name["playback_gain"].delta_bic < -10_000
     text = "\n".join(candidate_lines(tried))
     assert all(row.effect in text for row in tried)
+
+
+def test_what_a_simpler_effect_leaves_nothing_to_is_spared_and_said(diagnosed):
+    _, prepared, thorough = diagnosed
+    quick = conclude(prepared, search(prepared, prepared.model, Criteria()), Criteria())
+    ((found, known),) = zip(quick.ranking, thorough.ranking, strict=True)
+    assert found.effect == known.effect == "playback_gain" and found.values == known.values
+    assert quick.remaining_db == thorough.remaining_db
+    fates = {row.effect: (row.verdict, row.why) for row in quick.tried}
+    assert fates["late_reverb"] == fates["compression"] == ("not fitted", "a simpler effect leaves nothing to explain")
+    assert len(fates) == len(quick.tried) == len(thorough.tried)
 
 
 def test_a_filter_counts_as_many_numbers_as_hold_its_energy():
