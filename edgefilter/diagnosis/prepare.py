@@ -19,7 +19,7 @@ from edgefilter.dsp.psd import floored, hann
 from edgefilter.echo.effects.catalogue import find
 from edgefilter.echo.measurement import Measurement, whiten
 from edgefilter.echo.model import EchoModel
-from edgefilter.echo.recording import fitted_blocks, paired
+from edgefilter.echo.recording import MAX_OFFSET, fitted_blocks, paired
 from edgefilter.errors import SignalError
 from edgefilter.profile.data import Profile
 from edgefilter.types import PRE_ROLL, SAMPLE_RATE, Array, Samples, as_samples
@@ -176,7 +176,7 @@ def utterance_lags(
     predicted: for x without an offset. A player starts each utterance anew, so its lag may be another after a pause of
     PAUSE_S; a difference of less than LAG_STEP is no new start but left for the effects to explain.
     """
-    block = SAMPLE_RATE // 50
+    block, reach = SAMPLE_RATE // 50, int(MAX_OFFSET * SAMPLE_RATE)
     level = all_block_power(x, block)
     loud = np.flatnonzero(level > 10**-4.5 * level.max(initial=0.0))
     gaps = np.flatnonzero(np.diff(loud) > 50 * PAUSE_S)
@@ -186,9 +186,10 @@ def utterance_lags(
     for begin, end in zip(begins, [*begins[1:], x.size], strict=True):
         lag = pieces[-1][2] if pieces else offset
         if len(begins) > 1 and end - begin > SAMPLE_RATE // 2:
-            inside = (np.arange(x.size) >= begin) & (np.arange(x.size) < end)
+            near = slice(max(begin - reach, 0), end + reach)
+            inside = (np.arange(x.size)[near] >= begin) & (np.arange(x.size)[near] < end)
             try:
-                own = find_offset(white * inside, sought)
+                own = find_offset(white[near] * inside, sought[near])
             except SignalError:
                 own = lag
             lag = own if abs(own - lag) > LAG_STEP else lag

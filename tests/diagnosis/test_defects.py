@@ -152,7 +152,9 @@ def test_a_search_that_is_cut_short_says_so() -> None:
     x = voice(6.0)
     found = diagnose(
         profile(),
-        record(x, EchoModel(path()).with_effect("playback_gain", {"gain_db": -3.0})),
+        record(
+            x, EchoModel(path()).with_effect("late_reverb", {"taps": np.r_[np.zeros(900), 0.3, np.zeros(300), 0.2]})
+        ),
         x,
         criteria=Criteria(most_cost=3),
     )
