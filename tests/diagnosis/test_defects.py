@@ -97,7 +97,7 @@ def test_the_words_name_a_band_of_the_judge() -> None:
 class Fragile(Effect):
     """A delay of one sample, mixed in; its fit fails as asked."""
 
-    name, stage, title = "fragile", "path", "a fragile thing"
+    name, stage, title, complexity = "fragile", "path", "a fragile thing", 0
     parameters = (Parameter("amount", "1", 0.0, -1.0, 1.0),)
     failures: list[Exception] = []
 
