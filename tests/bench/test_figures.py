@@ -69,7 +69,7 @@ def paced(contender: str) -> tuple[float, float]:
     return tuple(hop(contender, True)["quantiles"][percent] for percent in ("50", "99"))
 
 
-def hidden(count: str, folder: str = "hidden_3001") -> tuple[int, int]:
+def hidden(count: str, folder: str = "hidden_4001") -> tuple[int, int]:
     found = result("hidden_effects")["summary"][folder]["counts"][count]
     return found["hits"], found["n"]
 
@@ -157,7 +157,7 @@ def ahead(kind: str, ser: float | None) -> float:
 
 
 def seconds() -> tuple[float, float]:
-    found = result("hidden_effects")["summary"]["hidden_3001"]["seconds"]
+    found = result("hidden_effects")["summary"]["hidden_4001"]["seconds"]
     return found["p50"], found["max"]
 
 
