@@ -22,7 +22,6 @@ UNSTAMPED = (
     "alignment",
     "canceller",
     "diagnosis_story",
-    "hidden_effects",
     "networks",
     "networks_effect",
     "quality_generated",
