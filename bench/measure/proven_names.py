@@ -29,7 +29,7 @@ from edgefilter.calibration.calibrate import calibrate
 from edgefilter.calibration.from_recording import self_calibrate
 from edgefilter.diagnosis.diagnose import diagnose
 from edgefilter.diagnosis.prepare import prepare
-from edgefilter.diagnosis.proof import WORSE_DB, HeldOut, prove
+from edgefilter.diagnosis.proof import WORSE_DB, HeldOut, lasts, prove
 from edgefilter.dsp.frames import blocks, decibels, frames
 from edgefilter.dsp.psd import floored, periodograms
 from edgefilter.echo.effects.catalogue import find
@@ -75,7 +75,7 @@ def examine(name: str, profile: Profile | None, y: Samples, x: Samples) -> Row:
         found = diagnose(start, y[:cut], x[:cut])
         named = tuple(finding.effect for finding in in_order(found.ranking))
         noise = noise_off_db(start, found.model, y, x, cut) if any(find(e).stage == "noise" for e in named) else None
-        kept = tuple(effect for effect in named if not (find(effect).event or find(effect).stage == "noise"))
+        kept = tuple(effect for effect in named if lasts(effect))
         if not kept and profile is not None:
             return Row(name, named, noise_db=noise)
         proof = prove(profile, kept, y, x)

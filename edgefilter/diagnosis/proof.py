@@ -12,6 +12,7 @@ from edgefilter.calibration.from_recording import self_calibrate
 from edgefilter.diagnosis.joint import fit_straight
 from edgefilter.diagnosis.prepare import Prepared, prepare
 from edgefilter.dsp.frames import block_power, decibels
+from edgefilter.echo.effects.catalogue import find
 from edgefilter.echo.model import EchoModel
 from edgefilter.errors import SignalError
 from edgefilter.filter.enhance import enhance
@@ -168,6 +169,11 @@ def prove(
 def listed(names: str | Sequence[str]) -> tuple[str, ...]:
     """The names, each once, of one or several effects."""
     return (names,) if isinstance(names, str) else tuple(dict.fromkeys(names))
+
+
+def lasts(name: str) -> bool:
+    """Whether an effect holds for other seconds and changes the voice: what a proof by ERLE can speak of."""
+    return not find(name).event and find(name).stage != "noise"
 
 
 def with_fitted(

@@ -7,9 +7,8 @@ from dataclasses import replace
 
 from edgefilter.diagnosis.criteria import Criteria
 from edgefilter.diagnosis.diagnose import diagnose
-from edgefilter.diagnosis.proof import Proof, prove
+from edgefilter.diagnosis.proof import Proof, lasts, prove
 from edgefilter.diagnosis.result import Candidate, Diagnosis
-from edgefilter.echo.effects.catalogue import find
 from edgefilter.errors import SignalError
 from edgefilter.profile.data import Profile
 from edgefilter.types import Samples
@@ -67,16 +66,11 @@ def diagnose_proven(
     ('playback_gain', False)
     """
     disproved: dict[str, Proof] = {}
+    known = criteria or Criteria()
     while True:
-        left_out = (criteria or Criteria()).disproved + tuple(disproved)
-        found = diagnose(
-            profile,
-            recording,
-            reference,
-            progress=progress,
-            criteria=replace(criteria or Criteria(), disproved=left_out),
-        )
-        names = tuple(finding.effect for finding in found.ranking if _lasts(finding.effect))
+        left = replace(known, disproved=(*known.disproved, *disproved))
+        found = diagnose(profile, recording, reference, progress=progress, criteria=left)
+        names = tuple(finding.effect for finding in found.ranking if lasts(finding.effect))
         if not names:
             return _told(found, disproved, unproven="nothing lasting was found")
         if progress:
@@ -88,11 +82,6 @@ def diagnose_proven(
         if not proof.worse:
             return _told(found, disproved, proof)
         disproved[proof.culprit or names[0]] = proof
-
-
-def _lasts(name: str) -> bool:
-    """Whether an effect holds for other seconds and changes the voice."""
-    return not find(name).event and find(name).stage != "noise"
 
 
 def _told(found: Diagnosis, disproved: dict[str, Proof], proof: Proof | None = None, unproven: str = "") -> Diagnosis:

@@ -51,13 +51,18 @@ def run_until_played(server, command, folder, heard):
         if heard.exists() and heard.stat().st_size > 10_000:
             break
         time.sleep(0.1)
+    return play_and_end(live, server, folder)[1]
+
+
+def play_and_end(live, server, folder):
+    """Play the folder's sounds to a live run and end it by Ctrl-C; what it wrote to standard output and error."""
     for player in play(server, folder):
         assert player.wait(timeout=60) == 0
     time.sleep(1.5)
     live.send_signal(signal.SIGINT)
-    _, said = live.communicate(timeout=60)
+    written, said = live.communicate(timeout=60)
     assert live.returncode == 0 and "Traceback" not in said, said
-    return said
+    return written, said
 
 
 def db(x):
@@ -215,10 +220,5 @@ def test_the_example_that_listens_hears_the_default_microphone_and_the_monitor(s
     )  # fmt: skip
     told = [live.stderr.readline() for _ in range(2)]
     assert told[1].strip() == "reference: robot.monitor", told
-    for player in play(server, tmp_path):
-        assert player.wait(timeout=60) == 0
-    time.sleep(1.5)
-    live.send_signal(signal.SIGINT)
-    said, troubles = live.communicate(timeout=60)
-    assert live.returncode == 0 and "Traceback" not in troubles, troubles
+    said, _ = play_and_end(live, server, tmp_path)
     assert re.search(r"^\S+ (to|s to) \S+.*: \(\S+ s\)$", said, re.MULTILINE), said  # somebody spoke
