@@ -39,7 +39,8 @@ BLOCK = 320
 """Samples a block, 20 ms: no multiple of any hop."""
 GROWTH_MB = 3.0
 """Most growth of memory from the warm-up to the end; an array that grew by one frame a hop would add 115 MB an hour."""
-SETTLING_S = 15.0
+SETTLING_S, LEARNING_S = 15.0, 60.0
+"""Least warm-up of the process itself, and of the learner beside it, whose first lessons are as long as what was heard."""
 SLOWER = 1.3
 """Most growth of a block's processor time over that of a bypassed block, second half over first. A shared machine
 changes its speed by more than that, and the bypass with it."""
@@ -47,24 +48,32 @@ changes its speed by more than that, and the bypass with it."""
 
 @dataclass
 class Slice:
-    """Audio so far (s), resident memory (MB), processor time per block and that of a bypassed block (ms)."""
+    """Audio so far (s), resident memory of the process and of its learner (MB), processor time per block and that of a
+    bypassed block (ms)."""
 
     seconds: float
     memory_mb: float
+    learner_mb: float | None = None
     p50_ms: float | None = None
     p99_ms: float | None = None
     bypass_ms: float | None = None
 
 
 def memory_mb(pid: int | str = "self") -> float:
-    """Resident memory of a process now and of those that it started, the learner for one, MB (Linux); 0 when it ended."""
-    process = Path(f"/proc/{pid}")
+    """Resident memory of a process now, MB (Linux); 0 where it has ended."""
     try:
-        own = int((process / "statm").read_text().split()[1]) * 4096 / 2**20
-        children = [int(child) for task in process.glob("task/*/children") for child in task.read_text().split()]
+        return int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * 4096 / 2**20
     except (FileNotFoundError, ProcessLookupError):
         return 0.0
-    return own + sum(map(memory_mb, children))
+
+
+def children_mb(pid: int) -> float:
+    """The same of all processes that it started, and that these started: of a running filter, the learner's."""
+    try:
+        children = [int(child) for task in Path(f"/proc/{pid}/task").glob("*/children") for child in task.read_text().split()]
+    except (FileNotFoundError, ProcessLookupError):
+        return 0.0
+    return sum(memory_mb(child) + children_mb(child) for child in children)
 
 
 def blocks(total: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:
@@ -95,7 +104,7 @@ def from_file(minutes: float, engine: str, slices: int) -> dict:
         out, done = out + finished.size, done + mic.size
         if done * slices // total > len(parts):
             parts.append(
-                Slice(done / SAMPLE_RATE, memory_mb(), *percentiles(took, 50, 99).values(), float(np.median(bypassed)))
+                Slice(done / SAMPLE_RATE, memory_mb(), None, *percentiles(took, 50, 99).values(), float(np.median(bypassed)))
             )
             took.clear()
             bypassed.clear()
@@ -146,7 +155,7 @@ def live(minutes: float, engine: str, slices: int) -> dict:
             time.sleep(min(1.0, seconds / slices / 2))
             elapsed = time.monotonic() - began
             if elapsed * slices / seconds > len(parts) + 1 and run.poll() is None:
-                parts.append(Slice(elapsed, memory_mb(run.pid)))
+                parts.append(Slice(elapsed, memory_mb(run.pid), children_mb(run.pid)))
         for player in players:
             player.kill()
             player.wait()
@@ -179,12 +188,12 @@ def judge(result: dict) -> list[str]:
         troubles.append(f"{result['samples_in']} samples in, {result['samples_out']} out")
     if result["lost"]:
         troubles.append(f"{result['lost']} samples lost")
-    after = max(0.1 * result["slices"][-1]["seconds"], SETTLING_S)
-    settled = [part for part in result["slices"] if part["seconds"] >= after]
-    growth = settled[-1]["memory_mb"] - settled[0]["memory_mb"]
-    result["memory_growth_mb"] = growth
-    if growth > GROWTH_MB:
-        troubles.append(f"memory grew by {growth:.1f} MB")
+    settled = _settled(result["slices"], SETTLING_S)
+    learning = _settled(result["slices"], LEARNING_S) if result["kind"] == "live" else []
+    for whose, name, parts in (("memory", "memory_mb", settled), ("the learner's memory", "learner_mb", learning)):
+        growth = result[f"{name.removesuffix('_mb')}_growth_mb"] = parts[-1][name] - parts[0][name] if parts else None
+        if growth is not None and growth > GROWTH_MB:
+            troubles.append(f"{whose} grew by {growth:.1f} MB")
     if result["kind"] == "file":
         half = len(settled) // 2
         first, second = (_over_bypass(parts) for parts in (settled[:half], settled[half:]))
@@ -195,6 +204,12 @@ def judge(result: dict) -> list[str]:
                 f"{second:.1f} times in the second"
             )
     return troubles
+
+
+def _settled(parts: list[dict], least_s: float) -> list[dict]:
+    """The slices behind the warm-up."""
+    after = max(0.1 * parts[-1]["seconds"], least_s)
+    return [part for part in parts if part["seconds"] >= after]
 
 
 def _over_bypass(parts: list[dict]) -> float:
@@ -211,6 +226,8 @@ def markdown(result: dict, name: str) -> str:
     lines = [f"Load average at the end {result['load_average']:.1f}.", ""]
     lines += [f"{result['samples_in']} samples in, {result['samples_out']} out, {result['lost']} lost;"]
     lines += [f"memory grew by {result['memory_growth_mb']:+.2f} MB after the warm-up;"]
+    if result["learner_growth_mb"] is not None:
+        lines += [f"the learner's by {result['learner_growth_mb']:+.2f} MB after its own;"]
     if result["kind"] == "file":
         lines += [
             f"against a bypassed one, a block took {result['slower']:.2f} times as long in the second half as in "
@@ -230,8 +247,10 @@ def markdown(result: dict, name: str) -> str:
     cells = []
     for part in result["slices"]:
         times = ["" if part[key] is None else f"{part[key]:.3f}" for key in ("p50_ms", "p99_ms", "bypass_ms")]
-        cells.append([f"{part['seconds'] / 60:.1f}", f"{part['memory_mb']:.1f}", *times])
-    lines += results_writer.table(["minute", "memory MB", "p50", "p99", "bypassed, ms per 20 ms block"], cells)
+        learner = "" if part["learner_mb"] is None else f"{part['learner_mb']:.1f}"
+        cells.append([f"{part['seconds'] / 60:.1f}", f"{part['memory_mb']:.1f}", learner, *times])
+    head = ["minute", "memory MB", "learner's MB", "p50", "p99", "bypassed, ms per 20 ms block"]
+    lines += results_writer.table(head, cells)
     return "\n".join([*lines, "", f"![memory and time]({name}.png)", ""])
 
 
@@ -243,15 +262,15 @@ def title(result: dict) -> str:
 
 
 def draw(result: dict, output: Path) -> None:
-    """Memory over the run, and beside it, where blocks were timed, their median over a bypassed one's."""
-    timed = result["kind"] == "file"
-    figure, axes = picture.panels(1, 1 + timed, (5 + 5 * timed, 3.5))
-    minutes = [part["seconds"] / 60 for part in result["slices"]]
-    curves = [("resident memory, MB", [part["memory_mb"] for part in result["slices"]])]
-    if timed:
-        curves.append(
-            ("median block over a bypassed one", [part["p50_ms"] / part["bypass_ms"] for part in result["slices"]])
-        )
+    """Memory over the run, and beside it the learner's, or where blocks were timed their median over a bypassed one's."""
+    parts = result["slices"]
+    figure, axes = picture.panels(1, 2, (10, 3.5))
+    minutes = [part["seconds"] / 60 for part in parts]
+    if result["kind"] == "file":
+        beside = "median block over a bypassed one", [part["p50_ms"] / part["bypass_ms"] for part in parts]
+    else:
+        beside = "the learner's memory, MB", [part["learner_mb"] for part in parts]
+    curves = [("resident memory, MB", [part["memory_mb"] for part in parts]), beside]
     for axis, (name, values) in zip(axes, curves, strict=True):
         axis.plot(minutes, values, "o-")
         axis.set(title=name, xlabel="minutes", ylim=(0, 1.2 * max(values)))

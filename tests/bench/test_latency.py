@@ -171,5 +171,11 @@ def test_a_leak_lost_samples_and_slowing_down_are_found() -> None:
         bimodal["slices"][number]["p50_ms"] = 1.6 if number % 2 == number // 10 else 1.0
     assert "memory grew by 17.0 MB" in soak.judge(leaking)[0]
     assert "in the second" in soak.judge(slowing)[0]
+    live = result(kind="live")
+    for number, part in enumerate(live["slices"]):
+        part["learner_mb"] = 60.0 + 40.0 * (number > 0)  # it comes when it is called
+    assert soak.judge(live) == [] and live["learner_growth_mb"] == 0.0
+    live["slices"][-1]["learner_mb"] += 4.0
+    assert soak.judge(live) == ["the learner's memory grew by 4.0 MB"]
     assert soak.judge(bimodal) == []  # the robot spoke in five slices of one half and in four of the other
     assert soak.judge(throttled) == []  # the machine became slower, not the filter
