@@ -48,8 +48,7 @@ changes its speed by more than that, and the bypass with it."""
 
 @dataclass
 class Slice:
-    """Audio so far (s), resident memory of the process and of its learner (MB), processor time per block and that of a
-    bypassed block (ms)."""
+    """Audio so far (s), resident memory, also the learner's (MB), processor time of a block and of a bypassed one (ms)."""
 
     seconds: float
     memory_mb: float
@@ -70,7 +69,9 @@ def memory_mb(pid: int | str = "self") -> float:
 def children_mb(pid: int) -> float:
     """The same of all processes that it started, and that these started: of a running filter, the learner's."""
     try:
-        children = [int(child) for task in Path(f"/proc/{pid}/task").glob("*/children") for child in task.read_text().split()]
+        children = [
+            int(child) for task in Path(f"/proc/{pid}/task").glob("*/children") for child in task.read_text().split()
+        ]
     except (FileNotFoundError, ProcessLookupError):
         return 0.0
     return sum(memory_mb(child) + children_mb(child) for child in children)
@@ -104,7 +105,13 @@ def from_file(minutes: float, engine: str, slices: int) -> dict:
         out, done = out + finished.size, done + mic.size
         if done * slices // total > len(parts):
             parts.append(
-                Slice(done / SAMPLE_RATE, memory_mb(), None, *percentiles(took, 50, 99).values(), float(np.median(bypassed)))
+                Slice(
+                    done / SAMPLE_RATE,
+                    memory_mb(),
+                    None,
+                    *percentiles(took, 50, 99).values(),
+                    float(np.median(bypassed)),
+                )
             )
             took.clear()
             bypassed.clear()

@@ -29,10 +29,9 @@ from edgefilter.types import SAMPLE_RATE
 ESPEAK = ("en-gb+m3", "en-us+f3", "en-gb-scotland+m1", "en-gb-x-rp+f2", "en-us+m7", "en-029+f4", "en-gb-x-gbcwmd+m5")
 FLITE = ("kal16", "awb", "rms", "slt")
 VARIANTS = (
-    *("m1", "m2", "m4", "m6", "m8", "f1", "f5", "klatt", "klatt2", "klatt4", "klatt6", "croak", "whisper", "adam"),
-    *("Andy", "Annie", "belinda", "boris", "ed", "Gene", "grandma", "iven3", "john", "Lee", "linda", "Mario", "michael"),
-    *("paul", "quincy", "robosoft", "robosoft4", "robosoft7", "shelby", "steph2", "Storm", "travis", "UniRobot", "zac"),
-)
+    "m1 m2 m4 m6 m8 f1 f5 klatt klatt2 klatt4 klatt6 croak whisper adam Andy Annie belinda boris ed Gene grandma iven3 john "
+    "Lee linda Mario michael paul quincy robosoft robosoft4 robosoft7 shelby steph2 Storm travis UniRobot zac"
+).split()
 ACCENTS = ("en-us", "en-gb", "en-gb-x-gbclan", "en-us-nyc")
 """One after the other for VARIANTS; the pace goes round too."""
 PACE = (135, 165, 195)

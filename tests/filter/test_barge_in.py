@@ -122,6 +122,33 @@ def test_one_sure_hop_does_not_interrupt_a_robot_that_nobody_calibrated():
     assert heard[False][2] > threshold
 
 
+def test_a_robot_that_sounds_like_somebody_for_moments_learns_to_doubt_them():
+    room, judge = Room(), HumanJudge(STFT)
+    threshold = BargeInSettings().threshold
+
+    def bursts(seconds: float) -> int:
+        """Hops at which a robot that the network takes for somebody, 0.1 s of every second, would be stopped."""
+        hops = range(round(seconds / 0.016))
+        said = [judge.step(room.frame(robot=1.0), 0.9985 if hop % 60 < 6 else UNSURE) for hop in hops]
+        return sum(probability > threshold for probability in said)
+
+    assert bursts(4.0) > 10
+    bursts(10.0)
+    assert bursts(10.0) == 0
+    assert max(judge.step(room.frame(robot=1.0), 0.9999) for _ in range(12)) > threshold  # somebody does speak
+
+
+def test_who_interrupts_again_and_again_is_noticed_each_time_as_soon():
+    room, judge = Room(), HumanJudge(STFT)
+    delays = []
+    for _ in range(12):
+        for _ in range(125):
+            judge.step(room.frame(robot=1.0), UNSURE)
+        said = [judge.step(room.frame(robot=1.0), 0.9985) for _ in range(60)]
+        delays.append(next(hop for hop, probability in enumerate(said) if probability > BargeInSettings().threshold))
+    assert max(delays) < 6
+
+
 def test_an_utterance_that_is_not_found_yet_holds_the_probability_down_and_teaches_nothing():
     room, judge, same = Room(), HumanJudge(STFT), HumanJudge(STFT)
     for _ in range(100):
