@@ -52,7 +52,7 @@ class RoomMicrophone(AsyncEventHandler):
             heard = as_pcm16(self.room.hear(BLOCK))
             await self.write_event(AudioChunk(RATE, 2, 1, heard).event())
             with suppress(TimeoutError, asyncio.TimeoutError):  # time passes even if nobody listens
-                await asyncio.wait_for(self.listened.get(), 2.0)
+                await asyncio.wait_for(self.listened.get(), 0.5)  # less than a microphone that is off
 
 
 class RoomLoudspeaker(AsyncEventHandler):
