@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import scipy
 from numpy.typing import NDArray
 from scipy import fft
 
+from edgefilter.dsp.convolution import convolve
 from edgefilter.echo.measurement import Measurement
 from edgefilter.echo.recording import BLOCK
 from edgefilter.types import SAMPLE_RATE, Array, Samples
@@ -19,8 +19,8 @@ SETTLED = 1e-6
 
 def convolve_from(x: Samples, taps: Array, lead: int) -> Samples:
     """sum_k taps[k] x(n - k + lead), (n,) float32."""
-    y = scipy.signal.oaconvolve(x, taps.astype(np.float32))
-    return np.pad(y, (0, max(lead + x.size - y.size, 0)))[lead : lead + x.size].astype(np.float32)
+    y = convolve(x, taps.astype(np.float32))
+    return np.pad(y, (0, max(lead + x.size - y.size, 0)))[lead : lead + x.size].astype(np.float32, copy=False)
 
 
 def fit_filter(

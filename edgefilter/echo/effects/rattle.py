@@ -9,6 +9,7 @@ from typing import ClassVar
 import numpy as np
 import scipy
 
+from edgefilter.dsp.convolution import convolve
 from edgefilter.dsp.psd import floored
 from edgefilter.echo.effect import Effect, Experiment, Parameter, Stage, complete, first, neutral, number_or_taps
 from edgefilter.echo.effects.knock_power import (
@@ -206,7 +207,7 @@ def _matched(sound: Array, rest: Samples, measurement: Measurement, model: Voice
     knock = np.zeros(length, np.float32)
     knock[at : at + sound.size] = sound
     heard = measurement.whiten(model.predict(knock))
-    return scipy.signal.oaconvolve(rest, heard[::-1])[length - 1 - at :][: rest.size].astype(np.float32)
+    return convolve(rest, heard[::-1])[length - 1 - at :][: rest.size].astype(np.float32)
 
 
 def _coarse(x: Samples) -> list[Trigger]:
