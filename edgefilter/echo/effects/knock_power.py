@@ -69,9 +69,9 @@ def find_trigger(
         moved = resonated(x, resonance, Q)
         for share in SHARES:
             threshold = quantile_of_peaks(moved, share)
-            trains = find_knocks(moved, threshold)
+            outward, inward = (_hits(*knocks, late, len(power)) for knocks in knocks_at(moved, threshold))
             for side in SIDES:
-                source = _roughly_ringing(one_side(trains, side), late, len(power))
+                source = _roughly_ringing(one_side((outward, inward), side))
                 sources = [one[use], source[use]]
                 likelihood = _likelihood(seen, sources, _colours(seen, sources, ROUNDS))
                 if likelihood > best[0]:
@@ -115,14 +115,21 @@ def find_knocks(moved: Samples, threshold: float) -> tuple[Samples, Samples]:
     The height is the speed over threshold, per millisecond.
     """
     outward, inward = np.zeros_like(moved), np.zeros_like(moved)
-    for train, way in ((outward, moved), (inward, -moved)):
-        beyond = way > threshold
-        at = 1 + np.flatnonzero(beyond[1:] & ~beyond[:-1])
-        train[at] = (way[at] - way[at - 1]) * np.float32(SAMPLE_RATE / 1000 / threshold)
+    for train, (at, height) in zip((outward, inward), knocks_at(moved, threshold), strict=True):
+        train[at] = height
     return outward, inward
 
 
-def one_side(trains: tuple[Samples, Samples], side: float) -> Samples:
+def knocks_at(moved: Samples, threshold: float) -> list[tuple[NDArray[np.integer], Samples]]:
+    """Samples (k,) and heights (k,) of these knocks, outward and inward: they are few."""
+    found = []
+    for beyond in (moved > threshold, moved < -threshold):
+        at = 1 + np.flatnonzero(beyond[1:] > beyond[:-1])
+        found.append((at, np.abs(moved[at] - moved[at - 1]) * np.float32(SAMPLE_RATE / 1000 / threshold)))
+    return found
+
+
+def one_side(trains: tuple[Array, Array], side: float) -> Array:
     """(n,) of the trains outward and inward what belongs to a side: 1, -1, or 0 for both."""
     outward, inward = trains
     return outward if side > 0.0 else inward if side < 0.0 else outward + inward
@@ -156,13 +163,17 @@ def band_power(x: Samples) -> Samples:
     return bins.reshape(len(bins), BANDS, -1).mean(axis=2).astype(np.float32)
 
 
-def _roughly_ringing(knocks: Samples, late: int, frames: int) -> Samples:
-    """(frames, 1) the squared heights of knocks (n,) in each hop, decaying, with a mean of 1."""
-    at = np.flatnonzero(knocks)
-    hops = np.bincount(np.minimum((at + late) // HOP, frames), knocks[at].astype(np.float64) ** 2, frames + 1)
+def _hits(at: NDArray[np.integer], height: Samples, late: int, frames: int) -> Array:
+    """(frames + 1,) the squared heights (k,) of knocks at samples (k,) in each hop, `late` samples later."""
+    hops = np.minimum((at + late) // HOP, frames)
+    return np.asarray(np.bincount(hops, height.astype(np.float64) ** 2, frames + 1), float)
+
+
+def _roughly_ringing(hops: Array) -> Samples:
+    """(frames, 1) squared heights in each hop (frames + 1,), decaying, with a mean of 1."""
     keep = np.exp(-HOP / (DECAY_MS * 1e-3 * SAMPLE_RATE))
     rung = scipy.signal.lfilter([1.0], [1.0, -keep], hops)
-    both = rung[:frames] + rung[1:]
+    both = rung[:-1] + rung[1:]
     return (both / (both.mean() + 1e-30)).astype(np.float32)[:, None]
 
 

@@ -8,6 +8,7 @@ from typing import ClassVar
 
 import numpy as np
 import scipy
+from numpy.typing import NDArray
 
 from edgefilter.dsp.convolution import convolve
 from edgefilter.dsp.psd import floored
@@ -22,6 +23,7 @@ from edgefilter.echo.effects.knock_power import (
     colour_of_knocks,
     find_knocks,
     find_trigger,
+    knocks_at,
     one_side,
     quantile_of_peaks,
     resonated,
@@ -231,14 +233,14 @@ def _best_agreement(x: Samples, hits: list[Samples], choices: list[Trigger]) -> 
         key = choice.resonance_hz, choice.q
         if key not in moved:
             moved = {key: resonated(x, *key)}
-        agreement = _agreement(find_knocks(moved[key], choice.threshold), hits)
+        agreement = _agreement(knocks_at(moved[key], choice.threshold), hits)
         best = max(best, (agreement, choice), key=lambda pair: pair[0])
     return best[1]
 
 
-def _agreement(knocks: tuple[Samples, Samples], hits: list[Samples]) -> float:
+def _agreement(knocks: list[tuple[NDArray[np.integer], Samples]], hits: list[Samples]) -> float:
     """How much of the residual's energy knocks of these heights explain, in units of one knock's energy, overlaps neglected."""
-    heard = [(k, hit) for k, hit in zip(knocks, hits, strict=True) if hit.any()]
+    heard = [(height, hit[at]) for (at, height), hit in zip(knocks, hits, strict=True) if hit.any()]
     along, energy = sum(float(np.dot(k, hit)) for k, hit in heard), sum(float(np.dot(k, k)) for k, _ in heard)
     return along * abs(along) / energy if energy > 0.0 else 0.0
 
