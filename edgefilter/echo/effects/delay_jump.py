@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from functools import cache, partial
 from typing import ClassVar
 
 import numpy as np
@@ -18,6 +16,8 @@ from edgefilter.types import SAMPLE_RATE, Array, Samples
 
 BLOCK, REACH = 4000, 2400
 MOST_JUMPS = 8
+FADE = 512
+"""Samples around a stretch between jumps that are shifted with it, and over which what lies further off fades away."""
 LEAST_JUMP = 0.3
 """Samples; less is no jump, but a block's lag that is not known better."""
 OUTLIER = 25.0
@@ -60,7 +60,18 @@ class DelayJump(Effect):
 
     def apply(self, x: Samples, values: Values, sample_rate: int) -> Samples:
         """X (n,) read with the delay of each moment; outside of x there is silence."""
-        return _stepped(x, values, sample_rate, partial(delayed, x))
+        times, steps = (np.atleast_1d(np.asarray(values[name], float)) for name in ("times_s", "samples"))
+        order = np.argsort(times, kind="stable")
+        at = np.clip(np.round(times[order] * sample_rate), 0, x.size).astype(int)
+        delays = float(values["offset"]) + np.concatenate(([0.0], np.cumsum(steps[order])))
+        out = x.copy()
+        for start, stop, delay in zip([0, *at], [*at, x.size], delays, strict=True):
+            if delay != 0.0 and stop > start:
+                out[start:stop] = _later(x, delay, start, stop)
+        if float(values["gap_gain"]) != 1.0:
+            for start, step in zip(at, steps[order], strict=True):
+                out[start : start + int(max(step, 0.0))] *= np.float32(values["gap_gain"])
+        return out
 
     def fit(self, measurement: Measurement, model: VoiceModel) -> Values:
         """Steps through the lags of all blocks; none where a straight line, a drift, describes the lags as well.
@@ -83,10 +94,6 @@ class DelayJump(Effect):
     ) -> Values:
         """The values with each jump at the moment in the reference, and the gap filled in the way, that predicts best around it."""
 
-        @cache
-        def later(begin: int, end: int, delay: float) -> Samples:
-            return delayed(measurement.reference[begin:end], delay)
-
         def left(moments: Array, gap_gain: float, around: int) -> float:
             part = slice(max(around - HISTORY, 0), around + AFTERMATH)
             start = part.start / SAMPLE_RATE
@@ -94,8 +101,7 @@ class DelayJump(Effect):
             before = offset + float(samples[~late].sum())
             times, steps = (moments[late] - start, samples[late]) if late.any() else (0.0, 0.0)
             local = complete(self, {"times_s": times, "samples": steps, "offset": before, "gap_gain": gap_gain})
-            x, shift = measurement.reference[part], partial(later, part.start, part.stop)
-            predicted = model.predict(_stepped(x, local, SAMPLE_RATE, shift))
+            predicted = model.predict(self.apply(measurement.reference[part], local, SAMPLE_RATE))
             rest = measurement.whiten(measurement.recording[part] - predicted)
             return float(np.sum(rest[around - SETTLED - part.start :].astype(np.float64) ** 2))
 
@@ -127,19 +133,21 @@ class DelayJump(Effect):
         return bool(np.any(np.abs(np.atleast_1d(np.asarray(evidence.values["samples"], float))) >= LEAST_JUMP))
 
 
-def _stepped(x: Samples, values: Values, sample_rate: int, later: Callable[[float], Samples]) -> Samples:
-    """DelayJump.apply, of x (n,) and what it is when it comes that many samples later."""
-    times, steps = (np.atleast_1d(np.asarray(values[name], float)) for name in ("times_s", "samples"))
-    order = np.argsort(times, kind="stable")
-    at = np.clip(np.round(times[order] * sample_rate), 0, x.size).astype(int)
-    delays = float(values["offset"]) + np.concatenate(([0.0], np.cumsum(steps[order])))
-    out = x.copy()
-    for start, stop, delay in zip([0, *at], [*at, x.size], delays.tolist(), strict=True):
-        if delay != 0.0 and stop > start:
-            out[start:stop] = later(delay)[start:stop]
-    if float(values["gap_gain"]) != 1.0:
-        for start, step in zip(at, steps[order], strict=True):
-            out[start : start + int(max(step, 0.0))] *= np.float32(values["gap_gain"])
+def _later(x: Samples, delay: float, start: int, stop: int) -> Samples:
+    """(stop - start,) delayed(x, delay)[start:stop] of x (n,), from that stretch and what is near it."""
+    whole = round(delay)
+    first, last = (int(np.clip(at - whole, 0, x.size)) for at in (start - FADE, stop + FADE))
+    near, fade = x[first:last].copy(), np.linspace(0.0, 1.0, FADE, dtype=np.float32)
+    if first > 0 and near.size >= FADE:
+        near[:FADE] *= fade
+    if last < x.size and near.size >= FADE:
+        near[-FADE:] *= fade[::-1]
+    if near.size and delay != whole:
+        near = delayed(near, delay - whole)
+    out = np.zeros(stop - start, np.float32)
+    lag = first + whole - start
+    part = near[max(-lag, 0) : out.size - lag] if lag < out.size else near[:0]
+    out[max(lag, 0) : max(lag, 0) + part.size] = part
     return out
 
 
