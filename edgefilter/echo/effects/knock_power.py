@@ -67,8 +67,7 @@ def find_trigger(
     best: tuple[float, Trigger | None, Samples] = (-np.inf, None, one)
     for resonance in RESONANCES_HZ:
         moved = resonated(x, resonance, Q)
-        for share in SHARES:
-            threshold = quantile_of_peaks(moved, share)
+        for threshold in quantiles_of_peaks(moved):
             outward, inward = (_hits(*knocks, late, len(power)) for knocks in knocks_at(moved, threshold))
             for side in SIDES:
                 source = _roughly_ringing(one_side((outward, inward), side))
@@ -135,15 +134,15 @@ def one_side(trains: tuple[Array, Array], side: float) -> Array:
     return outward if side > 0.0 else inward if side < 0.0 else outward + inward
 
 
-def quantile_of_peaks(moved: Samples, share: float) -> float:
-    """The value that this share of the peaks of |moved| (n,) stays below.
+def quantiles_of_peaks(moved: Samples) -> list[float]:
+    """The values that each of SHARES of the peaks of |moved| (n,) stays below.
 
     Peaks under 5 % of the largest do not count.
     """
     size = np.abs(moved)
     peaks = size[1:-1][(size[1:-1] > size[:-2]) & (size[1:-1] >= size[2:])]
     peaks = peaks[peaks > 0.05 * peaks.max()] if peaks.size else peaks
-    return float(np.clip(np.quantile(peaks, share), 1e-5, 100.0)) if peaks.size else 100.0
+    return np.clip(np.quantile(peaks, SHARES), 1e-5, 100.0).tolist() if peaks.size else [100.0] * len(SHARES)
 
 
 def ringing_of(knocks: Samples, decay_ms: float, late: int, sample_rate: int = SAMPLE_RATE) -> Samples:
@@ -186,9 +185,14 @@ def _colours(power: Samples, sources: Sequence[Samples], rounds: int) -> list[Sa
     for _ in range(rounds):
         inverse = 1.0 / _expected(sources, colours)
         surprise = power * inverse * inverse
-        changes = [(np.sum(s * surprise, axis=0) + 1e-12) / (np.sum(s * inverse, axis=0) + 1e-9) for s in sources]
+        changes = [(_over_time(s, surprise) + 1e-12) / (_over_time(s, inverse) + 1e-9) for s in sources]
         colours = [colour * np.sqrt(change) for colour, change in zip(colours, changes, strict=True)]
     return colours
+
+
+def _over_time(source: Samples, power: Samples) -> Samples:
+    """(BANDS,) the sum of source (t, 1 or BANDS) times power (t, BANDS)."""
+    return (source.T @ power)[0] if source.shape[1] == 1 else np.sum(source * power, axis=0)
 
 
 def _expected(sources: Sequence[Samples], colours: Sequence[Samples]) -> Samples:
