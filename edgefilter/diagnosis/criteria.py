@@ -38,6 +38,8 @@ class Criteria:
     one's model errs."""
     most_effects: int = 3
     """A bound on the work: what the search is checked on holds two at once, and a third to be taken back."""
+    voice_db: float = -6.0
+    """Over the fan: where a model predicts less of a voice, no effect on it shows."""
     starts: int = 2
     """Further effects to begin with where the best one has not led to an explanation: of two at once the louder may
     hide the other."""

@@ -87,7 +87,7 @@ def _half_of_a_filter(bench: Workbench, start: EchoModel, run: EchoModel) -> lis
 def _stepwise(bench: Workbench, start: EchoModel, first: Trial, most: int = 9) -> EchoModel:
     """The model with first and all of complexity up to `most` that can be named beside it."""
     model = split(bench, start, first.model)
-    while len(added(start, model)) < bench.criteria.most_effects and not bench.explained(model):
+    while len(added(start, model)) < bench.criteria.most_effects and not bench.explained(model) and bench.voiced(model):
         newest = forward(bench, model, most)
         if newest is None:
             break
