@@ -159,7 +159,7 @@ class Judge:
         return uniform_filter1d(power, HOP) / uniform_filter1d(expected, HOP)
 
     def correct(self, prediction: Samples, white: Samples) -> Samples:
-        """Prediction (n,), white when whitened, through the short filter that brings it closest to the recording, no further from 1 than TOLERANCE."""
+        """Prediction (n,), and whitened, through the short filter that brings it closest to the recording, no further from 1 than TOLERANCE."""
         measurement = self.prepared.measurement
         target = measurement.white_recording - white
         weights, _ = normal_equations([white], target, TOLERANCE_TAPS, TOLERANCE_LEAD, self._rows).solve(1e-5)

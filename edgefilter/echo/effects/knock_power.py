@@ -121,7 +121,7 @@ def find_knocks(moved: Samples, threshold: float) -> tuple[Samples, Samples]:
 
 def knocks_at(moved: Samples, threshold: float) -> list[tuple[NDArray[np.integer], Samples]]:
     """Samples (k,) and heights (k,) of these knocks, outward and inward: they are few."""
-    found = []
+    found: list[tuple[NDArray[np.integer], Samples]] = []
     for beyond in (moved > threshold, moved < -threshold):
         at = 1 + np.flatnonzero(beyond[1:] > beyond[:-1])
         found.append((at, np.abs(moved[at] - moved[at - 1]) * np.float32(SAMPLE_RATE / 1000 / threshold)))
