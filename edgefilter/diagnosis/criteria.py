@@ -80,10 +80,6 @@ class Criteria:
     confirmed_db: float = 0.05
     """As the least that any effect must explain."""
 
-    # What is known beforehand
-    disproved: tuple[str, ...] = ()
-    """Effects that are not tried, since the running filter was worse with them."""
-
     # Where a search ends
     silent_db: float = 0.2
     """Where the residual is no more than this above that of the robot's silences, nothing of the voice is in it, and

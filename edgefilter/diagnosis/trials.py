@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass
 from typing import TypeAlias
 
@@ -73,8 +73,14 @@ class Found:
 class Workbench:
     """Tries effects on models of one prepared recording and remembers what came of it."""
 
-    def __init__(self, prepared: Prepared, criteria: Criteria, progress: Callable[[str], None] | None = None) -> None:
-        self.prepared, self.criteria = prepared, criteria
+    def __init__(
+        self,
+        prepared: Prepared,
+        criteria: Criteria,
+        progress: Callable[[str], None] | None = None,
+        without: Collection[str] = (),
+    ) -> None:
+        self.prepared, self.criteria, self._without = prepared, criteria, without
         self.judge = Judge(prepared)
         self._progress = progress
         self._scores: dict[Signature, Score] = {}
@@ -245,8 +251,8 @@ class Workbench:
         return min(enough, key=lambda trial: (find(trial.name).complexity, -trial.gain_db), default=None)
 
     def absent(self, model: EchoModel, most: int) -> list[str]:
-        """Names of the effects on the voice that a model has not, that are not disproved and whose complexity is at most `most`."""
-        out = {*dict(model.effects), *self.criteria.disproved}
+        """Names of the effects on the voice that a model has not, that may be tried and whose complexity is at most `most`."""
+        out = {*dict(model.effects), *self._without}
         return [
             name
             for name in names()
