@@ -29,7 +29,7 @@ from edgefilter.calibration.calibrate import calibrate
 from edgefilter.calibration.from_recording import self_calibrate
 from edgefilter.diagnosis.diagnose import diagnose
 from edgefilter.diagnosis.prepare import prepare
-from edgefilter.diagnosis.proof import WORSE_DB, HeldOut, lasts, prove
+from edgefilter.diagnosis.proof import WORSE_DB, HeldOut, lasts, proofs_until_kept
 from edgefilter.dsp.frames import blocks, decibels, frames
 from edgefilter.dsp.psd import floored, periodograms
 from edgefilter.echo.effects.catalogue import find
@@ -78,15 +78,10 @@ def examine(name: str, profile: Profile | None, y: Samples, x: Samples) -> Row:
         kept = tuple(effect for effect in named if lasts(effect))
         if not kept and profile is not None:
             return Row(name, named, noise_db=noise)
-        proof = prove(profile, kept, y, x)
-        first = proof.erle_before_db, proof.erle_after_db
-        while proof.worse and proof.culprit:
-            kept = tuple(effect for effect in kept if effect != proof.culprit)
-            proof = prove(profile, kept, y, x)
-        if proof.worse:
-            kept, after_db = (), proof.erle_before_db
-        else:
-            after_db = proof.erle_after_db
+        proofs = proofs_until_kept(profile, kept, y, x)
+        first, proof = (proofs[0].erle_before_db, proofs[0].erle_after_db), proofs[-1]
+        kept = () if proof.worse else proof.effects
+        after_db = proof.erle_before_db if proof.worse else proof.erle_after_db
     except EdgefilterError as error:
         return Row(name, declined=str(error))
     return Row(name, named, kept, first, (proof.erle_before_db, after_db), noise)

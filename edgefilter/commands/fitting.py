@@ -9,7 +9,7 @@ import numpy as np
 
 from edgefilter.diagnosis.compare import Comparison
 from edgefilter.diagnosis.diagnose import add
-from edgefilter.diagnosis.proof import Proof, prove
+from edgefilter.diagnosis.proof import Proof, proofs_until_kept, prove
 from edgefilter.echo.effects.catalogue import find
 from edgefilter.echo.effects.catalogue import names as names_known
 from edgefilter.echo.running import reach
@@ -99,19 +99,20 @@ def fit(
     start: the profile, or one made from the recording where there is none. drop: whether an effect that makes the
     filter worse is left out where the others help. Raises Refused where the filter would be worse, unless force.
     """
-    proof, unproven = None, ""
-    dropped: tuple[str, ...] = ()
+    proofs: tuple[Proof, ...] = ()
+    unproven = "there is nothing to prove"
     try:
-        proof = prove(profile, names, recording, reference) if names or profile is None else None
-        unproven = "" if proof else "there is nothing to prove"
-        while drop and not force and proof and proof.worse and proof.culprit:
-            dropped = (*dropped, proof.culprit)
-            names = tuple(name for name in names if name not in dropped)
-            proof = prove(profile, names, recording, reference)
+        if drop and not force and (names or profile is None):
+            proofs = proofs_until_kept(profile, names, recording, reference)
+        elif names or profile is None:
+            proofs = (prove(profile, names, recording, reference),)
     except SignalError as error:
         if not force:
             raise
         unproven = str(error)
+    proof, unproven = (proofs[-1], "") if proofs else (None, unproven)
+    dropped = tuple(earlier.culprit for earlier in proofs[:-1] if earlier.culprit)
+    names = tuple(name for name in names if name not in dropped)
     if proof and proof.worse and not force:
         raise Refused(_refusal(proof))
     return Fitted(names, dropped, *add(start, names, recording, reference), proof, unproven)

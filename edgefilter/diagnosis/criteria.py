@@ -38,6 +38,8 @@ class Criteria:
     one's model errs."""
     most_effects: int = 3
     """A bound on the work: what the search is checked on holds two at once, and a third to be taken back."""
+    voice_db: float = -6.0
+    """Over the fan: where a model predicts less of a voice, no effect on it shows."""
     starts: int = 2
     """Further effects to begin with where the best one has not led to an explanation: of two at once the louder may
     hide the other."""
@@ -77,10 +79,6 @@ class Criteria:
     confirmed_db."""
     confirmed_db: float = 0.05
     """As the least that any effect must explain."""
-
-    # What is known beforehand
-    disproved: tuple[str, ...] = ()
-    """Effects that are not tried, since the running filter was worse with them."""
 
     # Where a search ends
     silent_db: float = 0.2

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -37,6 +37,7 @@ def diagnose(
     sample_rate: int = SAMPLE_RATE,
     progress: Callable[[str], None] | None = None,
     criteria: Criteria | None = None,
+    without: Collection[str] = (),
 ) -> Diagnosis:
     """Find out which physical effects a profile lacks, from a recording of the robot alone.
 
@@ -54,6 +55,8 @@ def diagnose(
         Called with a short text before each trial.
     criteria : Criteria, optional
         When an effect is named.
+    without : collection of str, optional
+        Names of effects that are not tried.
 
     Returns
     -------
@@ -89,7 +92,7 @@ def diagnose(
     """
     prepared = prepare(profile, recording, reference, sample_rate=sample_rate)
     criteria = criteria or Criteria()
-    return conclude(prepared, search(prepared, prepared.model, criteria, progress), criteria, progress)
+    return conclude(prepared, search(prepared, prepared.model, criteria, progress, without), criteria, progress)
 
 
 def add(

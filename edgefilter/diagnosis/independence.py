@@ -12,6 +12,7 @@ import scipy
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
+from edgefilter.dsp.convolution import convolve
 from edgefilter.dsp.least_phase import log_response
 from edgefilter.dsp.psd import floored
 from edgefilter.types import PRE_ROLL, SAMPLE_RATE, Array, Samples
@@ -144,7 +145,7 @@ def independence(
     """
     if np.count_nonzero(heard) < LEAST:
         return None
-    white = scipy.signal.oaconvolve(residual, whitener(psd))[: residual.size].astype(np.float32)
+    white = convolve(residual, whitener(psd))[: residual.size].astype(np.float32)
     spoken = white * heard
     if not spoken.any():
         return None

@@ -166,6 +166,17 @@ def prove(
     return replace(proof, without=tuple(others))
 
 
+def proofs_until_kept(
+    profile: Profile | None, names: str | Sequence[str], recording: Samples, reference: Samples
+) -> tuple[Proof, ...]:
+    """`prove` of all names, then each time without the one that does most harm, as long as there is one: the last names what is kept."""
+    proofs = [prove(profile, names, recording, reference)]
+    while proofs[-1].worse and (culprit := proofs[-1].culprit):
+        kept = tuple(name for name in proofs[-1].effects if name != culprit)
+        proofs.append(prove(profile, kept, recording, reference))
+    return tuple(proofs)
+
+
 def listed(names: str | Sequence[str]) -> tuple[str, ...]:
     """The names, each once, of one or several effects."""
     return (names,) if isinstance(names, str) else tuple(dict.fromkeys(names))

@@ -66,10 +66,8 @@ def diagnose_proven(
     ('playback_gain', False)
     """
     disproved: dict[str, Proof] = {}
-    known = criteria or Criteria()
     while True:
-        left = replace(known, disproved=(*known.disproved, *disproved))
-        found = diagnose(profile, recording, reference, progress=progress, criteria=left)
+        found = diagnose(profile, recording, reference, progress=progress, criteria=criteria, without=disproved)
         names = tuple(finding.effect for finding in found.ranking if lasts(finding.effect))
         if not names:
             return _told(found, disproved, unproven="nothing lasting was found")

@@ -6,14 +6,16 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import fft
 from scipy.ndimage import uniform_filter1d
 
 from edgefilter.diagnosis.prepare import Prepared
-from edgefilter.dsp.frames import decibels
+from edgefilter.dsp import fourier
+from edgefilter.dsp.frames import decibels, frames
 from edgefilter.dsp.psd import frequencies, hann, total_power, variance_at
 from edgefilter.echo.evidence import Score
 from edgefilter.echo.least_squares import normal_equations
-from edgefilter.echo.measurement import Measurement, whiten
+from edgefilter.echo.measurement import Measurement
 from edgefilter.echo.model import EchoModel
 from edgefilter.echo.wiener import convolve_from
 from edgefilter.types import Array, Samples
@@ -67,45 +69,49 @@ class Judge:
 
     def level_db(self, prediction: Samples) -> float:
         """Score.level_db of a prediction (n,)."""
-        return self.judge(prediction).level_db
+        return self.judge(prediction, self.measurement.whiten(prediction)).level_db
 
     def cells(self, residual: Samples) -> Array:
         """(times, bands) power of the residual (n,) over the fan's, in the held-out cells."""
-        index = self.starts[:, None, None] + np.arange(FRAMES_PER_CELL)[:, None] * HOP + np.arange(FRAME)
-        power = np.abs(np.fft.rfft(residual[index] * self._window)) ** 2
-        ratio = power.mean(axis=1) / self._expected
+        at = self.starts[:, None] + np.arange(FRAMES_PER_CELL) * HOP
+        read = frames(residual, FRAME, 1)[at] * self._window
+        ratio = fourier.power(fft.rfft(read, axis=-1)).mean(axis=1) / self._expected
         return np.add.reduceat(ratio[:, : self._edges[-1]], self._edges[:-1], axis=1) / self.freedom
 
     def of(self, model: EchoModel) -> Score:
         """The score of a model: on what it predicts, with what it says that no waveform predicts counted as fan."""
         measurement = self.prepared.measurement
         gain = model.microphone_gain(measurement.recording.size)
-        return self.judge(measurement.heard(model)[0], model.unpredictable(measurement.reference), gain)
+        return self.judge(*measurement.heard(model), model.unpredictable(measurement.reference), gain)
 
     def judge(
-        self, prediction: Samples, unpredictable: Sequence[tuple[Samples, Array]] = (), gain: Samples | None = None
+        self,
+        prediction: Samples,
+        white: Samples,
+        unpredictable: Sequence[tuple[Samples, Array]] = (),
+        gain: Samples | None = None,
     ) -> Score:
-        """The score of a prediction (n,), with the ordinary tolerances taken up first.
+        """The score of a prediction (n,), also given whitened, with the ordinary tolerances taken up first.
 
         unpredictable: as EchoModel.unpredictable gives it, noise that is expected on top of the fan, as the robot's
         ordinary distortion is. gain: (n,) of the microphone, which the fan passed as well: it is taken out of the
         residual before that is held against the fan. The cells keep it: as a likelihood their level has to be that of
         the recording as it is.
         """
-        corrected = self.correct(prediction)
+        corrected = self.correct(prediction, white)
         residual = self.prepared.measurement.recording - corrected
         expected = (*unpredictable, *self.prepared.ordinary)
         cells = self.cells(residual) / self._expected_cells(expected)
         weights = np.broadcast_to(self.freedom, cells.shape)
-        plain = whiten(residual if gain is None else residual / gain, self.psd).astype(np.float64) ** 2
-        white = self._over_expected(plain, expected) if expected else plain
+        plain = self.measurement.whiten(residual if gain is None else residual / gain).astype(np.float64) ** 2
+        power = self._over_expected(plain, expected) if expected else plain
         held, active = self.prepared.held_out, self.prepared.active
         return Score(
             level_db=float(np.average(10 * np.log10(np.maximum(cells, 1e-3)), weights=weights)) if cells.size else 0.0,
-            excess_db=_db(white[held]),
-            active_db=_db(white[held & active]),
-            silent_db=_db(white[held & ~active]),
-            fitted_db=_db(white[self.prepared.fit & active]),
+            excess_db=_db(power[held]),
+            active_db=_db(power[held & active]),
+            silent_db=_db(power[held & ~active]),
+            fitted_db=_db(power[self.prepared.fit & active]),
             irreducible_db=_db(plain[held]) if unpredictable else 0.0,
             cells=cells,
             prediction=corrected,
@@ -122,7 +128,7 @@ class Judge:
         """Power of a change of the prediction (n,) over the fan in dB: as it is or whitened, whichever is more."""
         plain, white = (
             float(np.mean(change.astype(float) ** 2)) / self._fan,
-            float(np.mean(whiten(change, self.psd).astype(float) ** 2)),
+            float(np.mean(self.measurement.whiten(change).astype(float) ** 2)),
         )
         return float(10 * np.log10(max(plain, white, 1e-12)))
 
@@ -152,12 +158,11 @@ class Judge:
             expected += variance * float(np.mean(colour / self.psd))
         return uniform_filter1d(power, HOP) / uniform_filter1d(expected, HOP)
 
-    def correct(self, prediction: Samples) -> Samples:
-        """Prediction (n,) through the short filter that brings it closest to the recording, no further from 1 than TOLERANCE."""
+    def correct(self, prediction: Samples, white: Samples) -> Samples:
+        """Prediction (n,), and whitened, through the short filter that brings it closest to the recording, no further from 1 than TOLERANCE."""
         measurement = self.prepared.measurement
-        x = whiten(prediction, self.psd)
-        target = measurement.white_recording - x
-        weights, _ = normal_equations([x], target, TOLERANCE_TAPS, TOLERANCE_LEAD, self._rows).solve(1e-5)
+        target = measurement.white_recording - white
+        weights, _ = normal_equations([white], target, TOLERANCE_TAPS, TOLERANCE_LEAD, self._rows).solve(1e-5)
         response = np.fft.rfft(weights[0], 256)
         bounded = np.fft.irfft(response * np.minimum(1.0, TOLERANCE / np.maximum(np.abs(response), 1e-12)), 256)
         return prediction + convolve_from(prediction, np.roll(bounded, 96), 96 + TOLERANCE_LEAD)

@@ -8,7 +8,7 @@ where the best one does not lead to an explanation.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from itertools import pairwise
 
 from edgefilter.diagnosis.criteria import Criteria
@@ -22,15 +22,19 @@ FULL = "the search ended at {} effects with some error left: something further m
 
 
 def search(
-    prepared: Prepared, model: EchoModel, criteria: Criteria, progress: Callable[[str], None] | None = None
+    prepared: Prepared,
+    model: EchoModel,
+    criteria: Criteria,
+    progress: Callable[[str], None] | None = None,
+    without: Collection[str] = (),
 ) -> Found:
-    """Add effects to model as long as held-out samples say that they are there."""
-    bench, start = Workbench(prepared, criteria, progress), model
+    """Add effects, others than those named in without, to model as long as held-out samples say that they are there."""
+    bench, start = Workbench(prepared, criteria, progress, without), model
     base = bench.score(model)
     fan = changed_fan(prepared, model, base, criteria)
     if fan is not None:
         prepared, step = fan
-        bench, model = Workbench(prepared, criteria, progress), step.model
+        bench, model = Workbench(prepared, criteria, progress, without), step.model
     best = _best(bench, model, list(_runs(bench, model)))
     steps = _in_steps(bench, model, best)
     full = len(added(model, best)) >= criteria.most_effects and not bench.explained(best)
@@ -87,7 +91,7 @@ def _half_of_a_filter(bench: Workbench, start: EchoModel, run: EchoModel) -> lis
 def _stepwise(bench: Workbench, start: EchoModel, first: Trial, most: int = 9) -> EchoModel:
     """The model with first and all of complexity up to `most` that can be named beside it."""
     model = split(bench, start, first.model)
-    while len(added(start, model)) < bench.criteria.most_effects and not bench.explained(model):
+    while len(added(start, model)) < bench.criteria.most_effects and not bench.explained(model) and bench.voiced(model):
         newest = forward(bench, model, most)
         if newest is None:
             break

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass
 from typing import TypeAlias
 
@@ -73,8 +73,14 @@ class Found:
 class Workbench:
     """Tries effects on models of one prepared recording and remembers what came of it."""
 
-    def __init__(self, prepared: Prepared, criteria: Criteria, progress: Callable[[str], None] | None = None) -> None:
-        self.prepared, self.criteria = prepared, criteria
+    def __init__(
+        self,
+        prepared: Prepared,
+        criteria: Criteria,
+        progress: Callable[[str], None] | None = None,
+        without: Collection[str] = (),
+    ) -> None:
+        self.prepared, self.criteria, self._without = prepared, criteria, without
         self.judge = Judge(prepared)
         self._progress = progress
         self._scores: dict[Signature, Score] = {}
@@ -83,6 +89,7 @@ class Workbench:
         self._cost = 0
         self._failed: dict[str, str] = {}
         self._spared: set[str] = set()
+        self._in_vain: dict[str, float] = {}
         self._refused = False
 
     @property
@@ -108,6 +115,10 @@ class Workbench:
     def explained(self, model: EchoModel) -> bool:
         """Whether a model leaves so little while the robot is heard that nothing further can be told in it."""
         return self.heard(model) <= self.criteria.heard_db or self.score(model).active_db <= self.criteria.fan_db
+
+    def voiced(self, model: EchoModel) -> bool:
+        """Whether a model predicts so much of a voice that effects on it can be told."""
+        return self.judge.size_db(self.score(model).prediction) > self.criteria.voice_db
 
     def little(self, model: EchoModel, start: EchoModel) -> bool:
         """Whether a model leaves so little of what start leaves that the right effects may be in it."""
@@ -172,17 +183,20 @@ class Workbench:
     def attempt_all(self, model: EchoModel, most: int = 9) -> list[Trial]:
         """Each effect that the model has not and whose complexity is at most `most`.
 
-        The last resorts only where none of the others explains much of what is left.
+        The last resorts only where none of the others explains much of what is left, and not where they found nothing in
+        less.
         """
         left, absent = self.left(model), self.absent(model, most)
         found = self._attempt_in_turn([name for name in absent if not find(name).last_resort], model)
-        resorts = [name for name in absent if find(name).last_resort]
+        resorts = [name for name in absent if find(name).last_resort and left < self._in_vain.get(name, np.inf)]
         enough = self.criteria.last_resort_share * left
         if not resorts or left < self.criteria.last_resort_db or self.little(model, self.prepared.model):
             return found
         if any((t.gain_db > enough or self.halves(t, model)) and self.admissible(t, model) for t in found):
             return found
-        return found + [trial for name in resorts if (trial := self.attempt(name, model)) is not None]
+        tried = {name: self.attempt(name, model) for name in resorts}
+        self._in_vain |= {name: left for name, trial in tried.items() if trial is None}
+        return found + [trial for trial in tried.values() if trial is not None]
 
     def _attempt_in_turn(self, names: list[str], model: EchoModel) -> list[Trial]:
         """The simple ones first; the richer ones where none of those explains so much that no other could be preferred to it."""
@@ -237,8 +251,8 @@ class Workbench:
         return min(enough, key=lambda trial: (find(trial.name).complexity, -trial.gain_db), default=None)
 
     def absent(self, model: EchoModel, most: int) -> list[str]:
-        """Names of the effects on the voice that a model has not, that are not disproved and whose complexity is at most `most`."""
-        out = {*dict(model.effects), *self.criteria.disproved}
+        """Names of the effects on the voice that a model has not, that may be tried and whose complexity is at most `most`."""
+        out = {*dict(model.effects), *self._without}
         return [
             name
             for name in names()

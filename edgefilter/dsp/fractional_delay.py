@@ -7,6 +7,7 @@ from functools import lru_cache
 import numpy as np
 from scipy import fft
 
+from edgefilter.dsp.lag import turn
 from edgefilter.types import Array, Samples
 
 HALF_WIDTH = 24
@@ -14,7 +15,8 @@ HALF_WIDTH = 24
 -90 dB at 6.8 kHz, -55 dB at 7 kHz and -35 dB at 7.2 kHz, at the worst fraction."""
 PHASES = 256
 """Delays per sample at which the filters are tabulated; linear interpolation between them errs by less than -100 dB."""
-CHUNK = 8192
+CHUNK = 2048
+"""Samples that are read at once: their filters stay in the cache."""
 MARGIN = 256
 """Samples of silence between the end of a signal and its beginning, which the spectrum joins."""
 
@@ -53,8 +55,13 @@ def interpolate(x: Samples, positions: Array) -> Samples:
         base = np.floor(p).astype(np.int64)
         phase = (base + 2 - p) * PHASES  # the sample base + 1, delayed by base + 1 - p
         step = phase.astype(np.int64)
-        weights = table[step] + (phase - step).astype(np.float32)[:, None] * slope[step]
-        out[at : at + CHUNK] = np.einsum("ij,ij->i", windows[base + HALF_WIDTH + 1], weights)
+        weights = slope[step]
+        weights *= (phase - step).astype(np.float32)[:, None]
+        weights += table[step]
+        begin = int(base[0]) + HALF_WIDTH + 1
+        in_turn = bool((np.diff(base) == 1).all())  # nearly always, and then a view spares a copy of each window
+        read = windows[begin : begin + p.size] if in_turn else windows[base + HALF_WIDTH + 1]
+        out[at : at + CHUNK] = np.einsum("ij,ij->i", read, weights)
     return out
 
 
@@ -67,5 +74,6 @@ def delayed(x: Array, samples: float) -> Samples:
     if abs(samples) >= x.size:
         return np.zeros(x.size, np.float32)
     n = fft.next_fast_len(x.size + int(abs(samples)) + MARGIN, real=True)
-    ramp = np.exp(-2j * np.pi * np.arange(n // 2 + 1) / n * samples)
-    return fft.irfft(fft.rfft(x.astype(np.float64), n) * ramp, n)[: x.size].astype(np.float32)
+    spectrum = fft.rfft(x.astype(np.float64), n)
+    spectrum *= turn(np.arange(n // 2 + 1) * (-2.0 * np.pi / n), samples)
+    return fft.irfft(spectrum, n, overwrite_x=True)[: x.size].astype(np.float32)

@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import scipy
 from numpy.lib.stride_tricks import sliding_window_view
 
+from edgefilter.dsp.convolution import convolve
 from edgefilter.types import Array, Samples
 
 NUISANCE_TAPS, NUISANCE_LEAD = 16, 8
@@ -76,9 +76,7 @@ def normal_equations(
 def short_filter(x: Samples, taps: Samples) -> Samples:
     """The full convolution of x (n,) and taps (t,), (n + t - 1,): by the way that is faster for a hop, or for a recording."""
     return (
-        scipy.signal.oaconvolve(x, taps).astype(np.float32)
-        if x.size > CHUNK and taps.size > 4
-        else np.convolve(x, taps)
+        convolve(x, taps).astype(np.float32, copy=False) if x.size > CHUNK and taps.size > 4 else np.convolve(x, taps)
     )
 
 

@@ -9,9 +9,9 @@ from functools import cached_property
 from typing import Any, Protocol, TypeAlias, TypeVar
 
 import numpy as np
-import scipy
 from numpy.typing import NDArray
 
+from edgefilter.dsp.convolution import convolve
 from edgefilter.dsp.psd import floored
 from edgefilter.types import SAMPLE_RATE, Array, Samples
 
@@ -71,13 +71,18 @@ class Measurement:
 
         X itself where the fan is unknown.
         """
-        return x if self.noise_psd is None else whiten(x, self.noise_psd)
+        return x if self._whitening is None else _centred(x, self._whitening)
 
     @cached_property
     def fingerprint(self) -> float:
         """A whole number of 52 bits that tells this recording from others, from its samples at 16 bit."""
         digest = hashlib.sha256(np.round(self.recording * 32768.0).astype(np.int32).tobytes()).digest()
         return float(int.from_bytes(digest[:8], "big") >> 12)
+
+    @cached_property
+    def _whitening(self) -> Samples | None:
+        """(taps,) of the whitening filter."""
+        return None if self.noise_psd is None else whitening_taps(self.noise_psd)
 
     @cached_property
     def white_recording(self) -> Samples:
@@ -113,11 +118,19 @@ class Measurement:
 
 def whiten(x: Samples, noise_psd: Samples) -> Samples:
     """X (n,) filtered by 1 / sqrt(noise_psd), floored, zero-phase, so that noise of that one-sided PSD gets variance 1."""
+    return _centred(x, whitening_taps(noise_psd))
+
+
+def whitening_taps(noise_psd: Samples) -> Samples:
+    """(1199,) the filter of `whiten`, its middle at the 600th, for a PSD (601,)."""
     taps = np.fft.fftshift(np.fft.irfft(1.0 / np.sqrt(floored(noise_psd) * SAMPLE_RATE / 2)))[1:]
     taps *= np.hanning(taps.size + 2)[1:-1] ** 0.25
-    return scipy.signal.oaconvolve(x, taps.astype(np.float32), mode="full")[taps.size // 2 :][: x.size].astype(
-        np.float32
-    )
+    return taps.astype(np.float32)
+
+
+def _centred(x: Samples, taps: Samples) -> Samples:
+    """X (n,) through a filter whose middle tap is its moment 0."""
+    return convolve(x, taps)[taps.size // 2 :][: x.size].astype(np.float32, copy=False)
 
 
 def level_ratio(recording: Samples, predicted: Samples) -> float:

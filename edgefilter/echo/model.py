@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-import scipy
 
+from edgefilter.dsp.convolution import convolve
 from edgefilter.echo.effect import RECORDING, complete, fitted
 from edgefilter.echo.effects.catalogue import chain, find
 from edgefilter.echo.measurement import Measurement, Values
@@ -148,7 +148,7 @@ class EchoModel:
         for effect, values in applied:
             if effect.stage == "source":
                 x = effect.apply(x, values, SAMPLE_RATE)
-        x = scipy.signal.oaconvolve(x, self.impulse_response)[: reference.size].astype(np.float32)
+        x = convolve(x, self.impulse_response)[: reference.size].astype(np.float32, copy=False)
         for effect, values in applied:
             if effect.stage != "source":
                 x = effect.apply(x, values, SAMPLE_RATE)

@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import scipy
 from numpy.typing import NDArray
 from scipy import fft
 
+from edgefilter.dsp.convolution import convolve
 from edgefilter.echo.measurement import Measurement
 from edgefilter.echo.recording import BLOCK
 from edgefilter.types import SAMPLE_RATE, Array, Samples
@@ -19,8 +19,8 @@ SETTLED = 1e-6
 
 def convolve_from(x: Samples, taps: Array, lead: int) -> Samples:
     """sum_k taps[k] x(n - k + lead), (n,) float32."""
-    y = scipy.signal.oaconvolve(x, taps.astype(np.float32))
-    return np.pad(y, (0, max(lead + x.size - y.size, 0)))[lead : lead + x.size].astype(np.float32)
+    y = convolve(x, taps.astype(np.float32))
+    return np.pad(y, (0, max(lead + x.size - y.size, 0)))[lead : lead + x.size].astype(np.float32, copy=False)
 
 
 def fit_filter(
@@ -95,6 +95,8 @@ class _Blocks:
         before = np.concatenate((np.zeros(taps - 1 - lead, np.float32), self._x, np.zeros(after, np.float32)))
         pieces = before[self._used[:, None] * self._new + np.arange(self._size)]
         self._source = fft.rfft(pieces, axis=1)
+        self._turned_back = self._source.conj()
+        self._moved = np.zeros((self._used.size, self._size), np.float32)
 
     def correlation(self) -> Array:
         """(taps,) autocorrelation of x at lags from 0 on."""
@@ -105,22 +107,21 @@ class _Blocks:
         """(taps,) sum w(n) target(n) x(n - k + lead)."""
         whole = np.zeros((int(self._used[-1]) + 1) * self._new if self._used.size else 0, np.float32)
         whole[: target.size] = target[: whole.size]
-        return self._correlated(whole.reshape(-1, self._new)[self._used] * self._weights)
+        return self._correlated(whole.reshape(-1, self._new)[self._used])
 
     def normal(self, c: Array) -> Array:
         """(taps,) adjoint of x filtered by c (taps,)."""
         spectrum = fft.rfft(c.astype(np.float32), self._size)
-        filtered = fft.irfft(self._source * spectrum, self._size, axis=1)[
+        filtered = fft.irfft(self._source * spectrum, self._size, axis=1, overwrite_x=True)[
             :, self._taps - 1 : self._taps - 1 + self._new
         ]
-        return self._correlated(filtered * self._weights)
+        return self._correlated(filtered)
 
     def _correlated(self, signals: Samples) -> Array:
-        moved = np.zeros((signals.shape[0], self._size), np.float32)
-        moved[:, self._taps - 1 : self._taps - 1 + self._new] = signals
-        return fft.irfft(np.einsum("bf,bf->f", fft.rfft(moved, axis=1), self._source.conj()), self._size)[
-            : self._taps
-        ].astype(np.float64)
+        """(taps,) the sum over all blocks of signals (blocks, new) times their weights, correlated with x."""
+        np.multiply(signals, self._weights, out=self._moved[:, self._taps - 1 : self._taps - 1 + self._new])
+        both = np.einsum("bf,bf->f", fft.rfft(self._moved, axis=1), self._turned_back)
+        return fft.irfft(both, self._size)[: self._taps].astype(np.float64)
 
 
 def _windowed(correlation: Array, taps: int, size: int) -> Array:

@@ -9,9 +9,9 @@ from bench.measure import virtual_sound
 
 @pytest.fixture
 def new_server():
-    """A function that starts a server of its own; all are ended afterwards."""
+    """A function that starts a server of its own, with other sinks where they are given; all are ended afterwards."""
     with ExitStack() as stack:
-        yield lambda: stack.enter_context(virtual_sound.server())
+        yield lambda *sinks: stack.enter_context(virtual_sound.server(sinks or virtual_sound.SINKS))
 
 
 @pytest.fixture

@@ -8,6 +8,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
+from edgefilter.dsp.lag import turn
 from edgefilter.echo.effect import Effect, Experiment, Parameter, Stage
 from edgefilter.echo.evidence import Evidence
 from edgefilter.echo.measurement import Measurement, Values, VoiceModel
@@ -16,6 +17,8 @@ from edgefilter.types import SAMPLE_RATE, Array, Samples
 
 LOWEST_HZ, HIGHEST_HZ = 60.0, 7000.0
 QUALITIES = (4.0, 8.0, 16.0, 32.0, 64.0, 128.0)
+BROAD_HZ = 40.0
+"""Bandwidth of a mode from which on a spectrum of 1 Hz shows all of it."""
 MODES, NEXT, CLEAR_Q = 2, 0.05, 8.0
 """Modes that are looked for, the part of what the first explains that a further one must, and the least Q of that:
 broader ones are no modes."""
@@ -63,7 +66,8 @@ class ChassisResonance(Effect):
         modes: list[tuple[float, float]] = []
         columns, gains, explained = np.zeros((white.size, 0), np.float32), np.zeros(0), 0.0
         for _ in range(MODES):
-            mode = _refine(_without(fine, modes, gains), *_search(_without(coarse, modes, gains)))
+            frequency, q = _search(_without(coarse, modes, gains))
+            mode = _refine(_without(coarse if frequency / q > BROAD_HZ else fine, modes, gains), frequency, q)
             if modes and mode[1] < CLEAR_Q:
                 break
             ring = _ring(predicted, *mode, SAMPLE_RATE)
@@ -118,7 +122,7 @@ def _ring(x: Samples, frequency: float, q: float, sample_rate: int) -> NDArray[n
 def _shape(hz: Array, frequency: Array, q: float) -> NDArray[np.complex128]:
     """(modes, m) response of the mode at positive frequencies (its image at negative ones is left out)."""
     pole = np.asarray(_pole(frequency, q, SAMPLE_RATE))
-    return (1.0 - np.abs(pole))[:, None] / (1.0 - pole[:, None] * np.exp(-2j * np.pi * hz[None, :] / SAMPLE_RATE))
+    return (1.0 - np.abs(pole))[:, None] / (1.0 - pole[:, None] * turn(hz, -2.0 * np.pi / SAMPLE_RATE))
 
 
 def _explained(found: Spectra, hz_slice: slice, frequency: Array, q: float) -> Array:

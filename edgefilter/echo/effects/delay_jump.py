@@ -16,6 +16,8 @@ from edgefilter.types import SAMPLE_RATE, Array, Samples
 
 BLOCK, REACH = 4000, 2400
 MOST_JUMPS = 8
+FADE = 512
+"""Samples around a stretch between jumps that are shifted with it, and over which what lies further off fades away."""
 LEAST_JUMP = 0.3
 """Samples; less is no jump, but a block's lag that is not known better."""
 OUTLIER = 25.0
@@ -65,7 +67,7 @@ class DelayJump(Effect):
         out = x.copy()
         for start, stop, delay in zip([0, *at], [*at, x.size], delays, strict=True):
             if delay != 0.0 and stop > start:
-                out[start:stop] = delayed(x, delay)[start:stop]
+                out[start:stop] = _later(x, delay, start, stop)
         if float(values["gap_gain"]) != 1.0:
             for start, step in zip(at, steps[order], strict=True):
                 out[start : start + int(max(step, 0.0))] *= np.float32(values["gap_gain"])
@@ -129,6 +131,24 @@ class DelayJump(Effect):
     def plausible(self, evidence: Evidence) -> bool:
         """At least one step that is a step."""
         return bool(np.any(np.abs(np.atleast_1d(np.asarray(evidence.values["samples"], float))) >= LEAST_JUMP))
+
+
+def _later(x: Samples, delay: float, start: int, stop: int) -> Samples:
+    """(stop - start,) delayed(x, delay)[start:stop] of x (n,), from that stretch and what is near it."""
+    whole = round(delay)
+    first, last = (int(np.clip(at - whole, 0, x.size)) for at in (start - FADE, stop + FADE))
+    near, fade = x[first:last].copy(), np.linspace(0.0, 1.0, FADE, dtype=np.float32)
+    if first > 0 and near.size >= FADE:
+        near[:FADE] *= fade
+    if last < x.size and near.size >= FADE:
+        near[-FADE:] *= fade[::-1]
+    if near.size and delay != whole:
+        near = delayed(near, delay - whole)
+    out = np.zeros(stop - start, np.float32)
+    lag = first + whole - start
+    part = near[max(-lag, 0) : out.size - lag] if lag < out.size else near[:0]
+    out[max(lag, 0) : max(lag, 0) + part.size] = part
+    return out
 
 
 def find_steps(lag: Array, sigma: Array) -> tuple[Array, Array]:

@@ -67,11 +67,10 @@ def find_trigger(
     best: tuple[float, Trigger | None, Samples] = (-np.inf, None, one)
     for resonance in RESONANCES_HZ:
         moved = resonated(x, resonance, Q)
-        for share in SHARES:
-            threshold = quantile_of_peaks(moved, share)
-            trains = find_knocks(moved, threshold)
+        for threshold in quantiles_of_peaks(moved):
+            outward, inward = (_hits(*knocks, late, len(power)) for knocks in knocks_at(moved, threshold))
             for side in SIDES:
-                source = _roughly_ringing(one_side(trains, side), late, len(power))
+                source = _roughly_ringing(one_side((outward, inward), side))
                 sources = [one[use], source[use]]
                 likelihood = _likelihood(seen, sources, _colours(seen, sources, ROUNDS))
                 if likelihood > best[0]:
@@ -115,28 +114,35 @@ def find_knocks(moved: Samples, threshold: float) -> tuple[Samples, Samples]:
     The height is the speed over threshold, per millisecond.
     """
     outward, inward = np.zeros_like(moved), np.zeros_like(moved)
-    for train, way in ((outward, moved), (inward, -moved)):
-        beyond = way > threshold
-        at = 1 + np.flatnonzero(beyond[1:] & ~beyond[:-1])
-        train[at] = (way[at] - way[at - 1]) * np.float32(SAMPLE_RATE / 1000 / threshold)
+    for train, (at, height) in zip((outward, inward), knocks_at(moved, threshold), strict=True):
+        train[at] = height
     return outward, inward
 
 
-def one_side(trains: tuple[Samples, Samples], side: float) -> Samples:
+def knocks_at(moved: Samples, threshold: float) -> list[tuple[NDArray[np.integer], Samples]]:
+    """Samples (k,) and heights (k,) of these knocks, outward and inward: they are few."""
+    found: list[tuple[NDArray[np.integer], Samples]] = []
+    for beyond in (moved > threshold, moved < -threshold):
+        at = 1 + np.flatnonzero(beyond[1:] > beyond[:-1])
+        found.append((at, np.abs(moved[at] - moved[at - 1]) * np.float32(SAMPLE_RATE / 1000 / threshold)))
+    return found
+
+
+def one_side(trains: tuple[Array, Array], side: float) -> Array:
     """(n,) of the trains outward and inward what belongs to a side: 1, -1, or 0 for both."""
     outward, inward = trains
     return outward if side > 0.0 else inward if side < 0.0 else outward + inward
 
 
-def quantile_of_peaks(moved: Samples, share: float) -> float:
-    """The value that this share of the peaks of |moved| (n,) stays below.
+def quantiles_of_peaks(moved: Samples) -> list[float]:
+    """The values that each of SHARES of the peaks of |moved| (n,) stays below.
 
     Peaks under 5 % of the largest do not count.
     """
     size = np.abs(moved)
     peaks = size[1:-1][(size[1:-1] > size[:-2]) & (size[1:-1] >= size[2:])]
     peaks = peaks[peaks > 0.05 * peaks.max()] if peaks.size else peaks
-    return float(np.clip(np.quantile(peaks, share), 1e-5, 100.0)) if peaks.size else 100.0
+    return np.clip(np.quantile(peaks, SHARES), 1e-5, 100.0).tolist() if peaks.size else [100.0] * len(SHARES)
 
 
 def ringing_of(knocks: Samples, decay_ms: float, late: int, sample_rate: int = SAMPLE_RATE) -> Samples:
@@ -156,13 +162,17 @@ def band_power(x: Samples) -> Samples:
     return bins.reshape(len(bins), BANDS, -1).mean(axis=2).astype(np.float32)
 
 
-def _roughly_ringing(knocks: Samples, late: int, frames: int) -> Samples:
-    """(frames, 1) the squared heights of knocks (n,) in each hop, decaying, with a mean of 1."""
-    at = np.flatnonzero(knocks)
-    hops = np.bincount(np.minimum((at + late) // HOP, frames), knocks[at].astype(np.float64) ** 2, frames + 1)
+def _hits(at: NDArray[np.integer], height: Samples, late: int, frames: int) -> Array:
+    """(frames + 1,) the squared heights (k,) of knocks at samples (k,) in each hop, `late` samples later."""
+    hops = np.minimum((at + late) // HOP, frames)
+    return np.asarray(np.bincount(hops, height.astype(np.float64) ** 2, frames + 1), float)
+
+
+def _roughly_ringing(hops: Array) -> Samples:
+    """(frames, 1) squared heights in each hop (frames + 1,), decaying, with a mean of 1."""
     keep = np.exp(-HOP / (DECAY_MS * 1e-3 * SAMPLE_RATE))
     rung = scipy.signal.lfilter([1.0], [1.0, -keep], hops)
-    both = rung[:frames] + rung[1:]
+    both = rung[:-1] + rung[1:]
     return (both / (both.mean() + 1e-30)).astype(np.float32)[:, None]
 
 
@@ -175,9 +185,14 @@ def _colours(power: Samples, sources: Sequence[Samples], rounds: int) -> list[Sa
     for _ in range(rounds):
         inverse = 1.0 / _expected(sources, colours)
         surprise = power * inverse * inverse
-        changes = [(np.sum(s * surprise, axis=0) + 1e-12) / (np.sum(s * inverse, axis=0) + 1e-9) for s in sources]
+        changes = [(_over_time(s, surprise) + 1e-12) / (_over_time(s, inverse) + 1e-9) for s in sources]
         colours = [colour * np.sqrt(change) for colour, change in zip(colours, changes, strict=True)]
     return colours
+
+
+def _over_time(source: Samples, power: Samples) -> Samples:
+    """(BANDS,) the sum of source (t, 1 or BANDS) times power (t, BANDS)."""
+    return (source.T @ power)[0] if source.shape[1] == 1 else np.sum(source * power, axis=0)
 
 
 def _expected(sources: Sequence[Samples], colours: Sequence[Samples]) -> Samples:

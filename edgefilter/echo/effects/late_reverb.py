@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import ClassVar
 
 import numpy as np
-import scipy
 
+from edgefilter.dsp.convolution import convolve
 from edgefilter.dsp.frames import blocks
 from edgefilter.echo.effect import Effect, Experiment, Parameter, Stage, first, neutral
 from edgefilter.echo.evidence import Evidence
@@ -102,7 +102,7 @@ def fit_path(measurement: Measurement, model: VoiceModel) -> tuple[Array, float]
     taps = fit_supported(x, residual, measurement.weights, length, LEAD, prior=np.full(length, EXPECTED), steps=40)
     if not taps.any():
         return taps, 0.0
-    response = scipy.signal.oaconvolve(model.impulse_response.astype(np.float64), taps)[LEAD:]
+    response = convolve(model.impulse_response.astype(np.float64), taps)[LEAD:]
     response[: model.impulse_response.size] += model.impulse_response
     direct = int(np.argmax(np.abs(model.impulse_response)))
     rt60 = reverberation_time(response[direct : taps.size - LEAD])
@@ -121,7 +121,7 @@ def rings_longer(evidence: Evidence) -> bool:
     taps = np.atleast_1d(np.asarray(evidence.values["taps"], float))
     direct = int(np.argmax(np.abs(evidence.model.impulse_response)))
     before = evidence.model.impulse_response[direct:].astype(np.float64)
-    added = scipy.signal.oaconvolve(evidence.model.impulse_response.astype(np.float64), taps)[LEAD + direct :]
+    added = convolve(evidence.model.impulse_response.astype(np.float64), taps)[LEAD + direct :]
     after = added.copy()
     after[: before.size] += before[: added.size]
     known = np.pad(before, (0, max(added.size - before.size, 0)))[: added.size]

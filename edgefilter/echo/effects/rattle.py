@@ -8,7 +8,9 @@ from typing import ClassVar
 
 import numpy as np
 import scipy
+from numpy.typing import NDArray
 
+from edgefilter.dsp.convolution import convolve
 from edgefilter.dsp.psd import floored
 from edgefilter.echo.effect import Effect, Experiment, Parameter, Stage, complete, first, neutral, number_or_taps
 from edgefilter.echo.effects.knock_power import (
@@ -16,13 +18,13 @@ from edgefilter.echo.effects.knock_power import (
     BANDS,
     DECAYS_MS,
     RESONANCES_HZ,
-    SHARES,
     Trigger,
     colour_of_knocks,
     find_knocks,
     find_trigger,
+    knocks_at,
     one_side,
-    quantile_of_peaks,
+    quantiles_of_peaks,
     resonated,
     ringing_of,
 )
@@ -131,11 +133,15 @@ class Rattle(Effect):
 
         at, (gain, sounds) = trigger, explain(trigger)
         for again in range(REFINED):
-            hits = [_matched(sound, rest, measurement, model) * allowed for sound in sounds]
+            hits = [
+                _matched(sound, rest, measurement, model) * allowed if sound.any() else allowed[:0] for sound in sounds
+            ]
             other = _best_agreement(x, hits, _fine(at) if again else _coarse(x))
             gain_then, sounds_then = explain(other)
             if gain_then > gain:
                 at, gain, sounds = other, gain_then, sounds_then
+            elif again:
+                break
         halves = np.arange(x.size) // HALF % 2 == 0
         worth = WORTH * sounds.size * float(np.dot(rest, rest)) / max(float(measurement.weights.sum()), 1.0)
         if not told and gain <= _explained([predicted * measurement.weights], rest, 2 * TAPS)[0]:
@@ -206,13 +212,13 @@ def _matched(sound: Array, rest: Samples, measurement: Measurement, model: Voice
     knock = np.zeros(length, np.float32)
     knock[at : at + sound.size] = sound
     heard = measurement.whiten(model.predict(knock))
-    return scipy.signal.oaconvolve(rest, heard[::-1])[length - 1 - at :][: rest.size].astype(np.float32)
+    return convolve(rest, heard[::-1])[length - 1 - at :][: rest.size].astype(np.float32)
 
 
 def _coarse(x: Samples) -> list[Trigger]:
     """All over the range, either side knocking."""
     moved = [(hz, q, resonated(x, hz, q)) for hz, q in product(RESONANCES_HZ, (0.7, 1.0, 1.6))]
-    return [Trigger(hz, q, quantile_of_peaks(d, share), 0.0) for hz, q, d in moved for share in SHARES]
+    return [Trigger(hz, q, threshold, 0.0) for hz, q, d in moved for threshold in quantiles_of_peaks(d)]
 
 
 def _fine(at: Trigger) -> list[Trigger]:
@@ -230,14 +236,14 @@ def _best_agreement(x: Samples, hits: list[Samples], choices: list[Trigger]) -> 
         key = choice.resonance_hz, choice.q
         if key not in moved:
             moved = {key: resonated(x, *key)}
-        agreement = _agreement(find_knocks(moved[key], choice.threshold), hits)
+        agreement = _agreement(knocks_at(moved[key], choice.threshold), hits)
         best = max(best, (agreement, choice), key=lambda pair: pair[0])
     return best[1]
 
 
-def _agreement(knocks: tuple[Samples, Samples], hits: list[Samples]) -> float:
+def _agreement(knocks: list[tuple[NDArray[np.integer], Samples]], hits: list[Samples]) -> float:
     """How much of the residual's energy knocks of these heights explain, in units of one knock's energy, overlaps neglected."""
-    heard = [(k, hit) for k, hit in zip(knocks, hits, strict=True) if hit.any()]
+    heard = [(height, hit[at]) for (at, height), hit in zip(knocks, hits, strict=True) if hit.size]
     along, energy = sum(float(np.dot(k, hit)) for k, hit in heard), sum(float(np.dot(k, k)) for k, _ in heard)
     return along * abs(along) / energy if energy > 0.0 else 0.0
 

@@ -21,7 +21,8 @@ ORDINARY_DB = 0.4
 """A gain of less differs from day to day."""
 MOST_GAIN_DB = 60.0
 EXCERPT = 10 * SAMPLE_RATE
-"""On the loudest stretch of that many samples it is chosen where the laws bend; how much they do, on all."""
+"""On the loudest stretch of that many samples, or the first where the model knows what time it is, it is chosen where the
+laws bend; how much they do, on all."""
 DRIVER, AMPLIFIER = ("force_factor", "stiffness", "damping"), ("even", "odd")
 
 
@@ -66,16 +67,15 @@ class SpeakerNonlinearity(Effect):
 
     def fit(self, measurement: Measurement, model: VoiceModel) -> Values:
         """Least squares in the whitened domain; neutral where no law holds on samples that it was not fitted to."""
-        linear = measurement.heard(model)[1]
+        linear, x = measurement.heard(model)[1], measurement.reference
+        part = slice(0, EXCERPT) if model.timed else loudest(x, EXCERPT)
         found = fit_laws(
-            measurement.reference,
+            x,
             measurement.white_recording,
             measurement.weights,
             linear,
             lambda sound: measurement.whiten(model.predict(sound)),
-            excerpt=None
-            if model.timed or measurement.reference.size < 1.5 * EXCERPT
-            else loudest(measurement.reference, EXCERPT),
+            excerpt=part if x.size >= 1.5 * EXCERPT else None,
         )
         if found is None:
             return neutral(self)
