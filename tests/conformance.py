@@ -229,9 +229,14 @@ def robot_alone(
     truth = model.with_effect(name, values) if name else model
     drive = x - np.float32(0.005) * x**3
     noise = changed_fan(name, values or {}, x.size)
-    psd = signal.welch(fan(8 * SAMPLE_RATE, seed=3), SAMPLE_RATE, nperseg=1200, detrend=False)[1].astype(np.float32)
+    psd = _fan_psd()
     recording = truth.predict(drive) * np.float32(10 ** (gain_db / 20)) + noise
     return Measurement(x, recording, psd, np.arange(x.size) // 8000 % 2 == 0), model
+
+
+def _fan_psd() -> np.ndarray:
+    """(601,) of the fan, from another recording of it."""
+    return signal.welch(fan(8 * SAMPLE_RATE, seed=3), SAMPLE_RATE, nperseg=1200, detrend=False)[1].astype(np.float32)
 
 
 def changed_fan(name: str | None, values: Mapping[str, object], n: int) -> np.ndarray:
@@ -348,7 +353,7 @@ def running_robot(name: str, values: Mapping[str, object]) -> tuple[np.ndarray, 
     rng = np.random.default_rng(7)
     noise = sum(np.sqrt(square) * rng.standard_normal(ref.size) for square, _ in model.unpredictable(late))
     mic = (model.predict(late) + changed_fan(name, values, ref.size) + noise).astype(np.float32)
-    psd = signal.welch(fan(8 * SAMPLE_RATE, seed=3), SAMPLE_RATE, nperseg=1200, detrend=False)[1].astype(np.float32)
+    psd = _fan_psd()
     bands = np.array([[900.0, 1100.0]])
     profile = Profile(robot_model(), 900.0, np.ones(601, np.float32), psd, bands, np.array([40.0]), np.full(4, -50.0))
     return mic, ref, profile
@@ -383,6 +388,11 @@ EFFECT_CASES: dict[str, dict[str, object]] = {
     },
     "mic_agc": {"gain_db": 3.0 * np.sin(np.arange(4 * SECONDS) / 5.0)},
     "mic_clipping": {"level": 0.15},
+    "noise_suppression": {
+        "gain_db": np.linspace(-30.0, -9.0, 8),
+        "fan_db": 10.0 * np.log10(_fan_psd()),
+        "softer_db": -20.0,
+    },
     "bandlimit": {"cutoff_hz": 2500.0, "order": 6.0},
     "chassis_resonance": {"frequency_hz": 820.0, "q": 40.0, "gain_db": 0.0, "phase_deg": 30.0},
     "late_reverb": {"taps": 0.04 * _decaying(6000, 1200.0, 11)},

@@ -14,7 +14,7 @@ from edgefilter.diagnosis.compare import Comparison, compare, describe, independ
 from edgefilter.diagnosis.criteria import Criteria
 from edgefilter.diagnosis.findings import findings_of, share_of
 from edgefilter.diagnosis.leftover import left_in_words
-from edgefilter.diagnosis.noise_change import look_at_fan
+from edgefilter.diagnosis.noise_change import look_at_fan, without_doubtful
 from edgefilter.diagnosis.precision import precision
 from edgefilter.diagnosis.prepare import Prepared, prepare
 from edgefilter.diagnosis.proof import listed, with_fitted
@@ -184,7 +184,7 @@ def conclude(
     )
     if not believed and (quiet or not _partly(prepared, found, criteria)):
         sure = None if quiet else cut_by_power(found, criteria)
-        found = sure or replace(found, steps=(), final=found.base, model=found.start)
+        found = sure or without_doubtful(found)
     remaining = found.final.excess_db
     findings, doubts = findings_of(found, progress)
     tried = candidates(searched, [finding.effect for finding in findings])

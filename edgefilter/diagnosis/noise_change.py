@@ -1,7 +1,8 @@
-"""Whether the fan itself is another than at the calibration: before the search, and once the robot's voice is taken out."""
+"""Whether the fan itself is another than at the calibration, or held down: before the search, and once the robot's voice is taken out."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -11,9 +12,9 @@ from edgefilter.diagnosis.leftover import Leftover, inspect
 from edgefilter.diagnosis.prepare import Prepared
 from edgefilter.diagnosis.score import Judge
 from edgefilter.diagnosis.trials import Found, Trial
-from edgefilter.echo.effect import complete
+from edgefilter.echo.effect import complete, fitted, vanishes
 from edgefilter.echo.effects.catalogue import find, names
-from edgefilter.echo.evidence import Score
+from edgefilter.echo.evidence import Evidence, Score
 from edgefilter.echo.measurement import Measurement, Values
 from edgefilter.echo.model import EchoModel
 
@@ -27,8 +28,11 @@ def changed_fan(prepared: Prepared, model: EchoModel, base: Score, criteria: Cri
     None where it is the calibrated one.
 
     Only where there are silences and the change has a colour of its own: before the voice is explained, a gain cannot
-    be told from it.
+    be told from it. Where the fan is held down only while the robot is silent, the calibrated one stays.
     """
+    held_down = next(_held_down(prepared, model, criteria), None)
+    if held_down is not None:
+        return prepared, held_down
     residual = (prepared.measurement.recording - base.prediction) / model.microphone_gain(base.prediction.size)
     left = inspect(prepared, residual)
     if not np.isfinite(left.quiet_mean_db) or left.mains_hz:
@@ -56,12 +60,13 @@ def look_at_fan(found: Found, criteria: Criteria) -> tuple[Found, Leftover]:
 
     A microphone gain in the model is taken out of the residual first: the fan passed through it.
     """
+    found = _judged_anew(found, criteria)
     prepared = found.prepared
     measurement, model = prepared.measurement, found.model
     gain = model.microphone_gain(measurement.recording.size)
     residual = (measurement.recording - found.final.prediction) / gain
     left = inspect(prepared, residual)
-    if any(find(name).stage == "noise" for name, _ in model.effects):
+    if any(find(name).stage == "noise" or find(name).shows_in_silence for name, _ in model.effects):
         return found, left
     heard = bool(np.isfinite(left.quiet_mean_db))
     for name in _of_the_fan(model):
@@ -84,6 +89,48 @@ def look_at_fan(found: Found, criteria: Criteria) -> tuple[Found, Leftover]:
         step = Trial(name, values, changed, after, found.final.level_db - after.level_db, change)
         return replace(found, prepared=now, model=changed, final=after, steps=(*found.steps, step)), behind
     return found, left
+
+
+def _held_down(prepared: Prepared, model: EchoModel, criteria: Criteria) -> Iterator[Trial]:
+    """The effects that show in the robot's silences as well and that a model lacks, each as a step from it."""
+    judge = Judge(prepared)
+    absent = {name for name in names() if find(name).shows_in_silence} - {*dict(model.effects), *criteria.disproved}
+    for name in sorted(absent):
+        values = fitted(find(name), prepared.measurement, model)
+        if vanishes(find(name), values):
+            continue
+        changed, before = model.with_effect(name, values), judge.of(model)
+        after = judge.of(changed)
+        if find(name).plausible(Evidence(values, model, judge, before, after)):
+            size = judge.size_db(after.prediction - before.prediction)
+            yield Trial(name, values, changed, after, before.level_db - after.level_db, size)
+
+
+def _judged_anew(found: Found, criteria: Criteria) -> Found:
+    """The search's outcome with what shows in the silences fitted and judged beside all that was found, and only so kept."""
+    kept = tuple(step for step in found.steps if not find(step.name).shows_in_silence)
+    model = found.model
+    for name in {step.name for step in found.steps} - {step.name for step in kept}:
+        model = model.without_effect(name)
+    held_down = next(_held_down(found.prepared, model, criteria), None)
+    if held_down is None and kept == found.steps:
+        return found
+    return _in_steps(found, (*(() if held_down is None else (held_down,)), *kept))
+
+
+def without_doubtful(found: Found) -> Found:
+    """The outcome of a search that explains too little, with nothing but what silences and voice both show."""
+    return _in_steps(found, tuple(step for step in found.steps if find(step.name).shows_in_silence))
+
+
+def _in_steps(found: Found, steps: Iterable[Trial]) -> Found:
+    """The outcome with those effects alone, each scored beside those before it."""
+    judge, model, score, scored = Judge(found.prepared), found.start, found.base, []
+    for step in steps:
+        model, before = model.with_effect(step.name, step.values), score
+        score = judge.of(model)
+        scored.append(replace(step, model=model, score=score, gain_db=before.level_db - score.level_db))
+    return replace(found, model=model, final=score, steps=tuple(scored))
 
 
 def _of_the_fan(model: EchoModel) -> list[str]:

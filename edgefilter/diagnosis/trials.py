@@ -256,7 +256,10 @@ class Workbench:
         return [
             name
             for name in names()
-            if find(name).stage != "noise" and name not in out and find(name).complexity <= most
+            if find(name).stage != "noise"
+            and not find(name).shows_in_silence
+            and name not in out
+            and find(name).complexity <= most
         ]
 
 

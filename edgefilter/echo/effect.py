@@ -73,7 +73,9 @@ class Effect:
     much. flexible: whether it has so many numbers that it takes up what a simpler effect beside it does. learned:
     whether it is fitted anew to what the running filter hears. leaves_noise: whether it leaves noise in the residual
     that no waveform predicts; noise_words: what is said of that where a residual is described. shown_by: recordings in
-    which it differs from effects without them (diagnosis/advice.py).
+    which it differs from effects without them (diagnosis/advice.py). shows_in_silence: whether the robot's silences tell
+    it together with the voice, so that it is looked for before the search and behind it (diagnosis/noise_change.py), not
+    in it.
     """
 
     name: ClassVar[str]
@@ -99,6 +101,7 @@ class Effect:
     leaves_noise: ClassVar[bool] = False
     noise_words: ClassVar[str] = ""
     shown_by: ClassVar[tuple[Experiment, ...]] = ()
+    shows_in_silence: ClassVar[bool] = False
 
     def apply(self, x: Samples, values: Values, sample_rate: int) -> Samples:
         """The signal (n,) after the effect; x is not written to.

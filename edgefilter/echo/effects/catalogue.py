@@ -23,6 +23,7 @@ from edgefilter.echo.effects.limiter import Limiter
 from edgefilter.echo.effects.mic_agc import MicAgc
 from edgefilter.echo.effects.mic_clipping import MicClipping
 from edgefilter.echo.effects.multiband_compression import MultibandCompression
+from edgefilter.echo.effects.noise_suppression import NoiseSuppression
 from edgefilter.echo.effects.path_change import PathChange
 from edgefilter.echo.effects.playback_gain import PlaybackGain
 from edgefilter.echo.effects.rattle import Rattle
@@ -48,6 +49,7 @@ EFFECTS: tuple[Effect, ...] = (
     ClockDrift(),
     MicAgc(),
     MicClipping(),
+    NoiseSuppression(),
     FanNoise(),
 )
 """From the player's volume to the microphone's converter, then the noise."""

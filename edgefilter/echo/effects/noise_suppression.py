@@ -1,0 +1,210 @@
+"""The device behind the microphone suppresses noise: fan and voice are let through as far as the voice stands out of the fan."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import uniform_filter1d
+from scipy.signal import lfilter
+
+from edgefilter.dsp.frames import decibels, frames
+from edgefilter.dsp.psd import ROUNDING_PSD, floored, frequencies, hann, variance_at
+from edgefilter.echo.effect import Effect, Parameter, Runner, Stage, first, neutral
+from edgefilter.echo.evidence import Evidence
+from edgefilter.echo.measurement import Measurement, Values, VoiceModel
+from edgefilter.types import Array, Samples
+
+SIZE, HOP = 512, 256
+WINDOW = np.sqrt(hann(SIZE))
+"""Analysis and synthesis: their product, half-overlapping, adds up to 1."""
+FORGETTING, NEIGHBOURS = 0.5, 3
+"""Of the local ratio, from one frame to the next, and the bins over which it is averaged: what explains most of the
+suppressors tried."""
+KNOTS_DB = np.arange(-10.0, 26.0, 5.0)
+"""Local ratio of voice to fan; from OPEN_DB on everything is let through."""
+OPEN_DB = 30.0
+SILENT_DB = -10.0
+"""Of the voice re the fan, over all frequencies."""
+LOUD_DB, WEAK_DB = 15.0, (-9.0, 3.0)
+"""Where a suppressor lets nearly all through, and where it shows most: further down the fan drowns the voice."""
+TRUST = 0.3
+"""Standard deviation of a gain around that of the next knot, the last one's around 1, that is expected before anything was heard."""
+EDGES = np.unique(np.round(np.geomspace(4, SIZE // 2 - 10, 17)).astype(int))
+"""Bins of the bands whose loud cells say what the path is off by."""
+FEWEST_LOUD, FEWEST_QUIET = 30, 16
+"""Cells of a band, and frames of silence, that say something."""
+LEAST_SOFTER_DB = 2.0
+"""By which the silences are under the calibrated fan at least: from day to day it is half a dB."""
+LEAST_HELD_DB = 1.0
+"""By which the weak cells of the voice are held down at least,"""
+SURE = 6.0
+"""and in standard deviations."""
+DEEPER_DB = 3.0
+"""By which weak cells may be held down further than the silences are, which no suppressor does: its gain there is the least."""
+MISSED_DB = -3.0
+"""Of the loud cells of the voice, which a suppressor lets through, three in four are predicted but for less: where they are
+not, a drift, a codec or what else is in the recording may take the weak cells away as well."""
+
+
+class NoiseSuppression(Effect):
+    """Y(f, t) = g(r) X(f, t), r the local ratio |X|^2 / N of the predicted voice to the calibrated fan, in frames of 32 ms.
+
+    Every suppressor of the family of Wiener's filter (Lim & Oppenheim 1979, Ephraim & Malah 1984, and the spectral
+    gates) is a gain that rises with the local ratio, and differs in how steeply; so that is fitted: gain_db (8,) at ratios
+    of -10 to 25 dB, 0 dB from 30 dB on. fan_db: (601,) dB re full scale^2/Hz, the calibrated
+    fan on which the ratio is formed, or one number. softer_db only reports: level of the robot's silences re that fan.
+    """
+
+    name: ClassVar[str] = "noise_suppression"
+    stage: ClassVar[Stage] = "microphone"
+    run_note: ClassVar[str] = (
+        "what it takes of the voice lies near the fan, and where it opens it lets the calibrated fan through: adding it"
+        " changes nothing in the running filter"
+    )
+    title: ClassVar[str] = "noise suppression"
+    complexity: ClassVar[int] = 2
+    shows_in_silence: ClassVar[bool] = True
+    parameters: ClassVar[tuple[Parameter, ...]] = (
+        Parameter("gain_db", "dB", 0.0, -60.0, 12.0),
+        Parameter("fan_db", "dB re full scale^2/Hz", -200.0, -200.0, 0.0),
+        Parameter("softer_db", "dB", 0.0, -120.0, 60.0),
+    )
+
+    def apply(self, x: Samples, values: Values, sample_rate: int) -> Samples:
+        """X (n,) with the gain of each cell."""
+        gain_db = np.broadcast_to(np.asarray(values["gain_db"], float), KNOTS_DB.shape)
+        if not gain_db.any() or not x.size:
+            return x.copy()
+        density = 10.0 ** (np.atleast_1d(np.asarray(values["fan_db"], float)) / 10.0)
+        fan = variance_at(frequencies(SIZE // 2 + 1), np.resize(density, 601).astype(np.float32))
+        spectra = _spectra(np.pad(x, (HOP, SIZE)))
+        spectra *= np.interp(decibels(_ratio(spectra, fan)), [*KNOTS_DB, OPEN_DB], [*10.0 ** (gain_db / 20.0), 1.0])
+        pieces = np.fft.irfft(spectra, SIZE) * WINDOW
+        whole = np.zeros((pieces.shape[0] + 1, HOP))
+        whole[:-1] += pieces[:, :HOP]
+        whole[1:] += pieces[:, HOP:]
+        return whole.reshape(-1)[HOP : HOP + x.size].astype(np.float32)
+
+    def run(self, values: Values, sample_rate: int) -> Runner:
+        """The voice as it is: a gain by frequency takes as long as a frame, which the running filter does not wait."""
+        return _as_it_is
+
+    def fit(self, measurement: Measurement, model: VoiceModel) -> Values:
+        """Least squares over the cells, the fan's variance 1 in each: the gains at the knots times what the loud cells of the band have."""
+        if measurement.noise_psd is None:
+            return neutral(self)
+        voice = measurement.heard(model)[0]
+        cells = Cells(measurement, voice, measurement.weights > 0.0)
+        step = (np.eye(KNOTS_DB.size) - np.eye(KNOTS_DB.size, k=1)) / TRUST
+        left, right = step.T @ step, np.zeros(KNOTS_DB.size)
+        right[-1] = TRUST**-2
+        place = np.clip((cells.ratio_db - KNOTS_DB[0]) / (KNOTS_DB[1] - KNOTS_DB[0]), 0.0, KNOTS_DB.size)
+        hats = [np.maximum(0.0, 1.0 - np.abs(place - k)) for k in range(KNOTS_DB.size + 1)]
+        for i in range(KNOTS_DB.size):
+            right[i] += np.sum(hats[i] * (cells.cross - hats[-1] * cells.power))
+            for j in range(i, min(i + 2, KNOTS_DB.size)):
+                left[i, j] += np.sum(hats[i] * hats[j] * cells.power)
+                left[j, i] = left[i, j]
+        gains = np.clip(np.linalg.solve(left, right), 1e-3, 3.9)
+        return {
+            "gain_db": 20.0 * np.log10(gains),
+            "fan_db": np.clip(10.0 * np.log10(np.maximum(floored(measurement.noise_psd), ROUNDING_PSD)), -199.0, 0.0),
+            "softer_db": float(np.clip(cells.quiet_db, -120.0, 60.0)),
+        }
+
+    def sentence(self, values: Values) -> str:
+        """What the silences and the voice show."""
+        gains = np.broadcast_to(np.asarray(values["gain_db"], float), KNOTS_DB.shape)
+        at = {int(db): float(gains[int(np.argmin(np.abs(KNOTS_DB - db)))]) for db in (-5.0, 5.0, 15.0)}
+        return (
+            f"while the robot is silent the fan is {-first(values, 'softer_db'):.0f} dB softer than calibrated, and of the"
+            f" voice less is let through the less it stands out of the fan: {at[-5]:.0f} dB at -5 dB over it, {at[5]:.0f}"
+            f" dB at 5 dB, {at[15]:.0f} dB at 15 dB, all of it where it is loud"
+        )
+
+    def plausible(self, evidence: Evidence) -> bool:
+        """Whether the silences are softer than the fan, and weak cells of the voice more so than loud ones, on held-out samples.
+
+        A slower fan leaves the voice as it is, and a gain that was turned moves all of it.
+        """
+        measurement = evidence.grid.measurement
+        if measurement.noise_psd is None or measurement.fit is None:
+            return False
+        held = evidence.grid.usable & ~measurement.fit
+        cells = Cells(measurement, evidence.before.prediction, held)
+        if not cells.quiet_db <= -LEAST_SOFTER_DB or cells.missed_db > MISSED_DB:
+            return False
+        gain, error = cells.weak_gain()
+        deepest = 10.0 ** ((cells.quiet_db - DEEPER_DB) / 20.0)
+        return deepest < gain + error and gain < 10.0 ** (-LEAST_HELD_DB / 20.0) and 1.0 - gain > SURE * error
+
+
+class Cells:
+    """A recording and its predicted voice in cells of time and frequency, over the fan, whose expected power in each is 1.
+
+    Of those that lie wholly in the samples `among` (n,) bool. ratio_db: of voice to fan. power: of the voice as loud cells
+    of its band have it. cross: of that and the recording, real part; all (cells,). quiet_db: level of the recording while
+    the robot is silent, of all samples, 0 where that is too seldom. missed_db: what three in four loud cells differ by less
+    than from what is predicted, re that.
+    """
+
+    def __init__(self, measurement: Measurement, voice: Samples, among: NDArray[np.bool_]) -> None:
+        assert measurement.noise_psd is not None
+        fan = variance_at(frequencies(SIZE // 2 + 1), floored(measurement.noise_psd))
+        whole = frames(among, SIZE, HOP).all(axis=1)
+        x, y = (_spectra(signal) for signal in (voice, measurement.recording))
+        local_db = decibels(_ratio(x, fan)[whole])
+        x, y = (spectra / np.sqrt(HOP * fan) for spectra in (x, y))
+        self.quiet_db = _quiet_db(x, y)
+        x, y = x[whole], y[whole]
+        ratio_db, power, cross, missed = [], [], [], []
+        for low, high in zip(EDGES[:-1], EDGES[1:], strict=True):
+            own, both = np.abs(x[:, low:high]) ** 2, (np.conj(x[:, low:high]) * y[:, low:high]).real
+            level = local_db[:, low:high]
+            loud = level > LOUD_DB
+            scale = float(both[loud].sum() / own[loud].sum()) if loud.sum() >= FEWEST_LOUD else 0.0
+            if scale > 0.0:
+                ratio_db.append(level.ravel())
+                power.append(scale**2 * own.ravel())
+                cross.append(scale * both.ravel())
+                strange = np.abs(y[:, low:high] - scale * x[:, low:high])[loud] ** 2
+                missed.append(strange / (scale**2 * own[loud]))
+        self.missed_db = float(decibels(np.quantile(np.concatenate(missed), 0.75))) if missed else np.inf
+        self.ratio_db, self.power, self.cross = (
+            np.concatenate(parts) if parts else np.zeros(0) for parts in (ratio_db, power, cross)
+        )
+
+    def weak_gain(self) -> tuple[float, float]:
+        """Gain of the weak cells re the loud ones of their band, and its standard error: half the fan is in phase with the voice."""
+        weak = (self.ratio_db > WEAK_DB[0]) & (self.ratio_db < WEAK_DB[1])
+        power = float(self.power[weak].sum())
+        if power <= 0.0:
+            return 1.0, 1.0
+        return float(self.cross[weak].sum()) / power, float(np.sqrt(0.5 / power))
+
+
+def _as_it_is(x: Samples, heard: Samples | None = None) -> Samples:
+    """X (n,) itself."""
+    return x
+
+
+def _quiet_db(x: NDArray[np.complex128], y: NDArray[np.complex128]) -> float:
+    """Level of the recording y where the voice x is SILENT_DB re the fan: of a median, so that somebody who talks now and then is not heard."""
+    inner = slice(EDGES[0], EDGES[-1])
+    silent = decibels(np.mean(np.abs(x[:, inner]) ** 2, axis=1)) < SILENT_DB
+    if np.count_nonzero(silent) < FEWEST_QUIET:
+        return 0.0
+    return float(decibels(np.median(np.abs(y[silent, inner]) ** 2) / np.log(2.0)))
+
+
+def _ratio(spectra: NDArray[np.complex128], fan: Array) -> Array:
+    """(frames, bins) the local ratio; fan: (bins,) density per sample."""
+    near = uniform_filter1d(np.abs(spectra) ** 2, NEIGHBOURS, axis=1, mode="nearest")
+    return lfilter([1.0 - FORGETTING], [1.0, -FORGETTING], near, axis=0) / (HOP * fan)
+
+
+def _spectra(x: Samples) -> NDArray[np.complex128]:
+    """(frames, SIZE / 2 + 1) complex."""
+    return np.fft.rfft(frames(x, SIZE, HOP) * WINDOW)
