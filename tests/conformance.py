@@ -376,6 +376,7 @@ EFFECT_CASES: dict[str, dict[str, object]] = {
     },
     "clock_drift": {"ppm": -80.0, "offset": 3.5},
     "delay_jump": {"times_s": np.array([3.3, 8.1]), "samples": np.array([37.4, -61.0])},
+    "packet_loss": {"times_s": np.array([1.14, 1.16, 3.7, 5.2, 6.86, 8.9, 10.1]), "length_ms": 20.0, "fill": 0.5},
     "compression": {"threshold_db": -20.0, "ratio": 4.0, "attack_ms": 8.0, "release_ms": 200.0, "makeup_db": 3.0},
     "limiter": {"ceiling_db": -16.0, "release_ms": 150.0, "makeup_db": 2.0},
     "multiband_compression": {

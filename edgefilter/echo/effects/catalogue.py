@@ -24,6 +24,7 @@ from edgefilter.echo.effects.mic_agc import MicAgc
 from edgefilter.echo.effects.mic_clipping import MicClipping
 from edgefilter.echo.effects.multiband_compression import MultibandCompression
 from edgefilter.echo.effects.noise_suppression import NoiseSuppression
+from edgefilter.echo.effects.packet_loss import PacketLoss
 from edgefilter.echo.effects.path_change import PathChange
 from edgefilter.echo.effects.playback_gain import PlaybackGain
 from edgefilter.echo.effects.rattle import Rattle
@@ -38,6 +39,7 @@ EFFECTS: tuple[Effect, ...] = (
     MultibandCompression(),
     Limiter(),
     DelayJump(),
+    PacketLoss(),
     SpeakerNonlinearity(),
     Rattle(),
     Bandlimit(),

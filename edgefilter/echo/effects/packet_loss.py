@@ -1,0 +1,222 @@
+"""The reference is streamed to the loudspeaker in packets, and some were lost."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+import scipy
+from numpy.typing import NDArray
+
+from edgefilter.dsp.frames import block_power
+from edgefilter.dsp.psd import total_power
+from edgefilter.echo.effect import Effect, Parameter, Stage, first, neutral
+from edgefilter.echo.evidence import Evidence
+from edgefilter.echo.measurement import Measurement, Values, VoiceModel, whiten
+from edgefilter.types import PRE_ROLL, SAMPLE_RATE, Array, Samples
+
+NONE_S = 1e6
+STEP = 40
+"""Samples (2.5 ms) of the finest grid on which frames are looked for."""
+LENGTHS = (4, 8, 12, 16, 24)
+"""Steps of a frame: 10, 20, 30, 40, 60 ms, those of RTP's audio formats (RFC 3551, 6716)."""
+TAPS, SPREAD = 640, 600
+"""Samples of the path behind the direct sound by which a frame is told, and of the whitening filter either way."""
+BLOCK = 160
+LOUD, MISSING, PREDICTED = 30.0, 0.5, 0.1
+"""Of the voice over the fan where a block says something; what is left of a block that is missing, of the voice there; and
+what is left at most of half of the blocks where the voice is predicted at all."""
+CLEAR, SURE = 100.0, 25.0
+"""Energy of a frame over the variance of the residual where it says something, and by which it must fall without the frame."""
+KEPT = 0.7
+"""Gain from which on a frame was played."""
+NEARLY = 0.97
+"""Of what the best grid explains, what one of longer frames must: two short frames are one of twice their length."""
+FEWEST, ALONE, OFF_GRID = 4, 0.6, 0.9
+"""Times that frames must be lost; share of them that lies between frames that were played; and what a grid half a frame off may
+explain at most of what the found one does. What a codec takes away, or a compressor, keeps to no grid."""
+DROPPED = 0.3
+"""Of the fan's variance that must be there where a frame is missing: what the microphone itself lost has none."""
+FILLS: tuple[float, ...] = tuple(np.linspace(0.0, 1.0, 11).tolist())
+FADES_MS: tuple[float, ...] = (0.0, 1.0, 2.0, 4.0)
+FINE = (np.arange(-32, 33, 8), np.arange(-6, 7, 2), np.array([-1, 0, 1]))
+
+
+class PacketLoss(Effect):
+    """x = fill * x(t - length) in the frames that begin at times_s[i] and last length_ms: silence (0) to the last one repeated (1).
+
+    The clock goes on, other than with delay_jump. A frame that follows a lost one and is lost itself repeats what was put
+    into that, so that it fades. fade_ms: of the line by which one passes into the other, at both ends inside of the frame.
+    """
+
+    name: ClassVar[str] = "packet_loss"
+    stage: ClassVar[Stage] = "source"
+    run_note: ClassVar[str] = (
+        "these packets were lost in this recording, and no others will be the same: adding it changes nothing in the"
+        " running filter"
+    )
+    title: ClassVar[str] = "lost packets"
+    event: ClassVar[bool] = True
+    complexity: ClassVar[int] = 2
+    parameters: ClassVar[tuple[Parameter, ...]] = (
+        Parameter("times_s", "s", NONE_S, 0.0, NONE_S),
+        Parameter("length_ms", "ms", 20.0, 1.0, 200.0),
+        Parameter("fill", "", 0.0, 0.0, 1.0),
+        Parameter("fade_ms", "ms", 0.0, 0.0, 5.0),
+        Parameter("lost", "packets", 0.0, 0.0, 1e6),
+    )
+
+    def apply(self, x: Samples, values: Values, sample_rate: int) -> Samples:
+        """X (n,) without those frames."""
+        out = x.copy()
+        length, fade = (round(float(values[name]) * 1e-3 * sample_rate) for name in ("length_ms", "fade_ms"))
+        edge = np.clip((np.arange(length) + 0.5) / max(fade, 1e-9), 0.0, 1.0)
+        lost = np.minimum(edge, edge[::-1]).astype(np.float32)
+        for time in np.sort(np.atleast_1d(np.asarray(values["times_s"], float))):
+            at = round(time * sample_rate)
+            part = out[at : at + length] if at < x.size else out[:0]
+            before = np.zeros(part.size, np.float32)
+            if at >= length:
+                before = np.float32(values["fill"]) * out[at - length : at - length + part.size]
+            part += lost[: part.size] * (before - part)
+        return out
+
+    def fit(self, measurement: Measurement, model: VoiceModel) -> Values:
+        """The grid of frames, and those of them, without which the error falls most, of all samples: a frame is lost once.
+
+        Then the grid's moment to a sample, and how much of the last frame was put into the gap.
+        """
+        steps = _steps(measurement, model)
+        grid = None if steps is None else _best_grid(steps)
+        if grid is None:
+            return neutral(self)
+        times = (grid.first + np.flatnonzero(grid.lost) * grid.length) * STEP / SAMPLE_RATE
+        found = {"length_ms": 1e3 * grid.length * STEP / SAMPLE_RATE, "fill": 0.0, "fade_ms": 0.0}
+
+        def best(name: str, tried: Sequence[float | Array]) -> Any:
+            """Of the values tried that of the least error."""
+
+            def error(value: float | Array) -> float:
+                played = self.apply(measurement.reference, {**found, "times_s": times, name: value}, SAMPLE_RATE)
+                left = measurement.white_recording - measurement.whiten(model.predict(played))
+                return float(np.sum(left**2, dtype=np.float64))
+
+            return min(tried, key=error)
+
+        for moves in FINE:
+            times = best("times_s", [np.maximum(times + move / SAMPLE_RATE, 0.0) for move in moves])
+        for name, tried in (("fill", FILLS), ("fade_ms", FADES_MS), ("fill", FILLS)):
+            found[name] = float(best(name, tried))
+        return {**found, "times_s": np.clip(times, 0.0, NONE_S), "lost": float(times.size)}
+
+    def sentence(self, values: Values) -> str:
+        """How many, of which length, and the first of them."""
+        times = np.sort(np.atleast_1d(np.asarray(values["times_s"], float)))
+        listed = ", ".join(f"{time:.2f}" for time in times[:4]) + (" s" if times.size <= 4 else " s, ...")
+        fill = first(values, "fill")
+        gap = "nothing" if fill < 0.1 else f"the one before, times {fill:.1f},"
+        return (
+            f"{times.size} frames of {first(values, 'length_ms'):.0f} ms, all on one grid, are missing from the voice, and"
+            f" {gap} was played instead: at {listed}"
+        )
+
+    def plausible(self, evidence: Evidence) -> bool:
+        """Frames are missing from the voice, and the fan is there in the meantime: what the microphone lost, it lost of both."""
+        values, measurement = evidence.values, evidence.grid.measurement
+        if measurement.noise_psd is None or not evidence.values["lost"]:
+            return False
+        quarter = round(float(values["length_ms"]) * 1e-3 * SAMPLE_RATE / 4)
+        starts = np.round(np.atleast_1d(np.asarray(values["times_s"], float)) * SAMPLE_RATE).astype(int) + PRE_ROLL
+        middles = [measurement.recording[at + quarter : at + 3 * quarter] for at in starts]
+        power = [float(np.mean(np.square(part, dtype=np.float64))) for part in middles if part.size]
+        return bool(power) and float(np.median(power)) > DROPPED * total_power(measurement.noise_psd)
+
+
+@dataclass(frozen=True, eq=False)
+class Steps:
+    """Least squares for the change of the voice's gain in each step of STEP samples of the reference.
+
+    normal: (lags, steps) diagonals of the normal equations. right: (steps,) their right side. noise: variance of the
+    residual, whitened, at most moments.
+    """
+
+    normal: Array
+    right: Array
+    noise: float
+
+
+@dataclass(frozen=True, eq=False)
+class Grid:
+    """Frames of `length` steps from step `first` on, and which of them were lost (frames,) bool."""
+
+    length: int
+    first: int
+    lost: NDArray[np.bool_]
+
+
+def _steps(measurement: Measurement, model: VoiceModel) -> Steps | None:
+    """The equations; None where the voice is not predicted, or no block of it is missing."""
+    psd, heard = measurement.noise_psd, measurement.heard(model)[1]
+    if psd is None or heard.size < 8 * TAPS:
+        return None
+    left = measurement.white_recording - heard
+    voice, rest = block_power(heard, BLOCK), block_power(left, BLOCK)
+    loud = voice > LOUD
+    share = rest[loud] / voice[loud]
+    if np.count_nonzero(share > MISSING) < FEWEST or np.median(share) > PREDICTED:
+        return None
+    path = whiten(np.pad(model.impulse_response, (PRE_ROLL, SPREAD)), psd)[: TAPS + PRE_ROLL]
+    count, size = heard.size // STEP, STEP + path.size - 1
+    pieces = measurement.reference[: count * STEP].reshape(count, STEP)
+    driven = scipy.signal.fftconvolve(pieces, path[None], axes=1).astype(np.float32)
+    around = np.lib.stride_tricks.sliding_window_view(np.pad(left, (PRE_ROLL, size)), size)[::STEP][:count]
+    lags = -(-size // STEP)
+    normal = np.zeros((lags, count))
+    for lag in range(lags):
+        own, later = driven[: count - lag, lag * STEP :], driven[lag:, : size - lag * STEP]
+        normal[lag, : count - lag] = np.einsum("ij,ij->i", own, later)
+    noise = max(1.0, float(np.median(rest[loud])))
+    return Steps(normal, np.einsum("ij,ij->i", driven, around), noise)
+
+
+def _best_grid(steps: Steps) -> Grid | None:
+    """The grid whose lost frames explain most; None where they look like no packets."""
+    tried = {(length, first): _without(steps, length, first) for length in LENGTHS for first in range(length)}
+    most = max(worth for worth, *_ in tried.values())
+    length, first = max(key for key, (worth, *_) in tried.items() if worth >= NEARLY * most)
+    worth, gain, sure, clear = tried[length, first]
+    lost = sure & clear
+    beside = max(tried[length, (first + shift) % length][0] for shift in range(length // 4, length - length // 4 + 1))
+    if np.count_nonzero(lost & ~np.roll(lost, 1)) < FEWEST or beside > OFF_GRID * worth:
+        return None
+    played = clear & (gain > KEPT)
+    alone = sum(_next(played, lost, at, -1) and _next(played, lost, at, 1) for at in np.flatnonzero(lost).tolist())
+    return Grid(length, first, sure) if alone >= ALONE * np.count_nonzero(lost) else None
+
+
+def _without(steps: Steps, length: int, first: int) -> tuple[float, Array, NDArray[np.bool_], NDArray[np.bool_]]:
+    """What the lost frames of a grid explain, less the cost of saying which they are.
+
+    And (frames,) each: gain, whether lost for sure, whether loud enough to be clear.
+    """
+    count = (steps.right.size - first) // length
+    part = slice(first, first + count * length)
+    right = steps.right[part].reshape(count, length).sum(axis=1)
+    energy = steps.normal[0, part].reshape(count, length).sum(axis=1)
+    for lag in range(1, min(length, steps.normal.shape[0])):
+        energy += 2.0 * steps.normal[lag, part].reshape(count, length)[:, : length - lag].sum(axis=1)
+    fall = (-2.0 * right - energy) / steps.noise
+    clear = energy > CLEAR * steps.noise
+    sure = fall > SURE
+    cost = 2.0 * np.log(max(count, 2)) * np.count_nonzero(sure)
+    return float(fall[sure].sum() - cost), 1.0 + right / np.maximum(energy, 1e-9), sure, clear
+
+
+def _next(played: NDArray[np.bool_], lost: NDArray[np.bool_], at: int, way: int) -> bool:
+    """Whether the next frame that is not lost, that way, was played."""
+    at += way
+    while 0 <= at < lost.size and lost[at]:
+        at += way
+    return bool(0 <= at < lost.size and played[at])
