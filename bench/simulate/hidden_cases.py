@@ -27,7 +27,7 @@ from tqdm import tqdm
 from bench.simulate.conversations import Clip, read_clips, read_speech
 from bench.simulate.hidden_acoustics import decibels, power
 from bench.simulate.hidden_catalogue import CATALOGUE, ENR_DB, RANGES
-from bench.simulate.hidden_outside import OUTSIDE
+from bench.simulate.hidden_outside import NAMED, OUTSIDE
 from bench.simulate.hidden_robot import Chain, Scene, draw_scene
 from bench.simulate.simulated_robot import RATE, Array
 
@@ -130,7 +130,7 @@ def make_case(
         chain, parameters[effect], found[effect] = hide(rng, scene, chain, effect, force)
     signals = scale(scene.signals | {"mic": scene.record(chain)}, parameters)
     truth = {
-        "effects": ["unknown"] if kind == "outside" else sorted(effects) or ["none"],
+        "effects": ["unknown"] if kind == "outside" and effects[0] not in NAMED else sorted(effects) or ["none"],
         "raw": effects or ["none"],
         "strength": strength,
     }

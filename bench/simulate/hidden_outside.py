@@ -1,4 +1,4 @@
-"""What no effect of the catalogue explains: mains hum, a talker, music, doors, codecs, flutter, lost packets.
+"""What no effect of the 13 that are simulated explains: mains hum, a talker, music, doors, codecs, flutter, lost packets.
 
 Functions as in hidden_catalogue, plus `people`: human speech (k,) at 16 kHz to draw a talker from. Strength: power of
 what cannot be explained at the microphone over the fan (of a codec: of what is not coherent with its input).
@@ -210,3 +210,5 @@ OUTSIDE: dict[str, Disturbance] = {
     "door_slams": door_slams,
     "music": music,
 }
+NAMED = ("packet_loss",)
+"""Of these, what the diagnosis has a name for."""

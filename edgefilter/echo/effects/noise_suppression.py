@@ -37,13 +37,13 @@ FEWEST_LOUD, FEWEST_QUIET = 30, 16
 """Cells of a band, and frames of silence, that say something."""
 LEAST_SOFTER_DB = 2.0
 """By which the silences are under the calibrated fan at least: from day to day it is half a dB."""
-LEAST_HELD_DB = 1.0
-"""By which the weak cells of the voice are held down at least,"""
+LEAST_HELD_DB = 2.5
+"""By which the weak cells of the voice are held down at least (a good codec that leaves some of them out takes 1.6 dB),"""
 SURE = 6.0
 """and in standard deviations."""
 DEEPER_DB = 3.0
 """By which weak cells may be held down further than the silences are, which no suppressor does: its gain there is the least."""
-MISSED_DB = -3.0
+MISSED_DB = -4.5
 """Of the loud cells of the voice, which a suppressor lets through, three in four are predicted but for less: where they are
 not, a drift, a codec or what else is in the recording may take the weak cells away as well."""
 
@@ -53,8 +53,8 @@ class NoiseSuppression(Effect):
 
     Every suppressor of the family of Wiener's filter (Lim & Oppenheim 1979, Ephraim & Malah 1984, and the spectral
     gates) is a gain that rises with the local ratio, and differs in how steeply; so that is fitted: gain_db (8,) at ratios
-    of -10 to 25 dB, 0 dB from 30 dB on. fan_db: (601,) dB re full scale^2/Hz, the calibrated
-    fan on which the ratio is formed, or one number. softer_db only reports: level of the robot's silences re that fan.
+    of -10 to 25 dB, 0 dB from 30 dB on. fan_db: (601,) dB re full scale^2/Hz, the calibrated fan on which the ratio is
+    formed, or one number. softer_db only reports: level of the robot's silences re that fan.
     """
 
     name: ClassVar[str] = "noise_suppression"
