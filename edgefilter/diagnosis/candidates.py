@@ -10,7 +10,7 @@ import numpy as np
 from edgefilter.diagnosis.result import Candidate, Fate
 from edgefilter.diagnosis.score import FRAMES_PER_CELL, HOP, Judge
 from edgefilter.diagnosis.trials import Found, Trial, Tried
-from edgefilter.echo.effect import RECORDING, neutral
+from edgefilter.echo.effect import neutral
 from edgefilter.echo.effects.catalogue import find
 from edgefilter.echo.measurement import Values
 
@@ -39,11 +39,11 @@ def size_of(name: str, values: Values) -> float:
     The latter is the exponential of the entropy of how the energy is spread: a tail that dies away is not as many
     numbers as it has taps, because what the fit holds it to is that it dies away.
     """
-    plain = neutral(find(name))
+    plain, given = neutral(find(name)), {p.name for p in find(name).parameters if p.given}
     count = 0.0
     for key, value in values.items():
         change = np.ravel(np.asarray(value, float) - plain[key]) ** 2
-        if key == RECORDING.name or not change.any():
+        if key in given or not change.any():
             continue
         part = change[change > 0.0] / change.sum()
         count += float(np.exp(-np.sum(part * np.log(part)))) if part.size > 1 else 1.0

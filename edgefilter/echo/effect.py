@@ -22,16 +22,20 @@ sweep, at another place, of a minute."""
 
 @dataclass(frozen=True, slots=True)
 class Parameter:
-    """One number of an effect, or an array of such numbers: unit, the value at which the effect vanishes, the values that are possible."""
+    """One number of an effect, or an array of such numbers: unit, the value at which the effect vanishes, the values that are possible.
+
+    given: whether it is taken over from elsewhere, such as the calibrated fan, rather than fitted.
+    """
 
     name: str
     unit: str
     neutral: float
     low: float
     high: float
+    given: bool = False
 
 
-RECORDING = Parameter("recording", "fingerprint", 0.0, 0.0, 2.0**52)
+RECORDING = Parameter("recording", "fingerprint", 0.0, 0.0, 2.0**52, given=True)
 """Every event's last parameter: the recording in which it happened (Measurement.fingerprint); 0 for whichever is looked
 at."""
 
@@ -175,7 +179,7 @@ class Effect:
     @property
     def told(self) -> tuple[Parameter, ...]:
         """The parameters that say something to people."""
-        return tuple(p for p in self.parameters if p is not RECORDING)
+        return tuple(p for p in self.parameters if not p.given)
 
     @property
     def adds_noise(self) -> bool:

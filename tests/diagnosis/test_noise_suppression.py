@@ -97,3 +97,14 @@ def test_what_the_running_filter_contradicts_is_not_looked_for() -> None:
     assert changed_fan(prepared, prepared.model, base, Criteria())[1].name == "noise_suppression"
     disproved = Criteria(disproved=("noise_suppression",))
     assert changed_fan(prepared, prepared.model, base, disproved) is None
+
+
+def test_it_stays_named_beside_what_nothing_explains() -> None:
+    x = voice(SECONDS)
+    trembling = 0.7 + 0.3 * np.sin(2 * np.pi * 7.0 * np.arange(x.size) / 16000)
+    quick = Criteria(most_effects=1, starts=0)
+    found = diagnose(profile(), suppressed(record((trembling * x).astype(np.float32)), -12.0), x, criteria=quick)
+    assert found.verdict == "unexplained" and [f.effect for f in found.ranking][:1] == ["noise_suppression"]
+    row = next(row for row in found.tried if row.effect == "noise_suppression")
+    # eight gains and the level of the silences: the calibrated fan is taken over, not fitted
+    assert row.verdict == "named" and row.numbers is not None and row.numbers < 12.0

@@ -68,7 +68,7 @@ class NoiseSuppression(Effect):
     shows_in_silence: ClassVar[bool] = True
     parameters: ClassVar[tuple[Parameter, ...]] = (
         Parameter("gain_db", "dB", 0.0, -60.0, 12.0),
-        Parameter("fan_db", "dB re full scale^2/Hz", -200.0, -200.0, 0.0),
+        Parameter("fan_db", "dB re full scale^2/Hz", -200.0, -200.0, 0.0, given=True),
         Parameter("softer_db", "dB", 0.0, -120.0, 60.0),
     )
 
