@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import ClassVar
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter1d
-from scipy.signal import lfilter
 
 from edgefilter.dsp.frames import decibels, frames
 from edgefilter.dsp.psd import ROUNDING_PSD, floored, frequencies, hann, variance_at
@@ -202,7 +202,7 @@ def _quiet_db(x: NDArray[np.complex128], y: NDArray[np.complex128]) -> float:
 def _ratio(spectra: NDArray[np.complex128], fan: Array) -> Array:
     """(frames, bins) the local ratio; fan: (bins,) density per sample."""
     near = uniform_filter1d(np.abs(spectra) ** 2, NEIGHBOURS, axis=1, mode="nearest")
-    return lfilter([1.0 - FORGETTING], [1.0, -FORGETTING], near, axis=0) / (HOP * fan)
+    return scipy.signal.lfilter([1.0 - FORGETTING], [1.0, -FORGETTING], near, axis=0) / (HOP * fan)
 
 
 def _spectra(x: Samples) -> NDArray[np.complex128]:
