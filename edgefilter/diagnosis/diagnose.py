@@ -92,7 +92,9 @@ def diagnose(
     """
     prepared = prepare(profile, recording, reference, sample_rate=sample_rate)
     criteria = criteria or Criteria()
-    return conclude(prepared, search(prepared, prepared.model, criteria, progress, without), criteria, progress)
+    return conclude(
+        prepared, search(prepared, prepared.model, criteria, progress, without), criteria, progress, without
+    )
 
 
 def add(
@@ -168,11 +170,15 @@ def add(
 
 
 def conclude(
-    prepared: Prepared, found: Found, criteria: Criteria, progress: Callable[[str], None] | None = None
+    prepared: Prepared,
+    found: Found,
+    criteria: Criteria,
+    progress: Callable[[str], None] | None = None,
+    without: Collection[str] = (),
 ) -> Diagnosis:
-    """The diagnosis that a search leads to; the fan is looked at behind what the search has taken out of the voice."""
+    """The diagnosis that a search, without those effects, leads to; the fan is looked at behind what that has taken out of the voice."""
     comparison = describe(prepared, found.start, found.base)
-    found, left = look_at_fan(found, criteria)
+    found, left = look_at_fan(found, criteria, without)
     searched = found
     unpredictable = any(find(step.name).leaves_noise for step in found.steps)
     believed = bool(found.steps) and (

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -22,15 +22,17 @@ BAND = 20
 """Bins of 13.3 Hz over which the change is averaged before that is judged."""
 
 
-def changed_fan(prepared: Prepared, model: EchoModel, base: Score, criteria: Criteria) -> tuple[Prepared, Trial] | None:
+def changed_fan(
+    prepared: Prepared, model: EchoModel, base: Score, criteria: Criteria, without: Collection[str] = ()
+) -> tuple[Prepared, Trial] | None:
     """The recording prepared with the fan as the robot's silences have it, and what changed it as a step.
 
     None where it is the calibrated one.
 
     Only where there are silences and the change has a colour of its own: before the voice is explained, a gain cannot
-    be told from it. Where the fan is held down only while the robot is silent, the calibrated one stays.
+    be told from it. Where the fan is held down only while the robot is silent, the calibrated one stays; not so by an effect named in without.
     """
-    held_down = next(_held_down(prepared, model, criteria), None)
+    held_down = next(_held_down(prepared, model, without), None)
     if held_down is not None:
         return prepared, held_down
     residual = (prepared.measurement.recording - base.prediction) / model.microphone_gain(base.prediction.size)
@@ -55,12 +57,13 @@ def changed_fan(prepared: Prepared, model: EchoModel, base: Score, criteria: Cri
     return None
 
 
-def look_at_fan(found: Found, criteria: Criteria) -> tuple[Found, Leftover]:
+def look_at_fan(found: Found, criteria: Criteria, without: Collection[str] = ()) -> tuple[Found, Leftover]:
     """The search's outcome with the final residual judged against the fan as it is now, and with what changed the fan where it is another.
 
-    A microphone gain in the model is taken out of the residual first: the fan passed through it.
+    A microphone gain in the model is taken out of the residual first: the fan passed through it. without: names of effects
+    that are not to be looked for beside the voice.
     """
-    found = _judged_anew(found, criteria)
+    found = _judged_anew(found, without)
     prepared = found.prepared
     measurement, model = prepared.measurement, found.model
     gain = model.microphone_gain(measurement.recording.size)
@@ -91,10 +94,10 @@ def look_at_fan(found: Found, criteria: Criteria) -> tuple[Found, Leftover]:
     return found, left
 
 
-def _held_down(prepared: Prepared, model: EchoModel, criteria: Criteria) -> Iterator[Trial]:
+def _held_down(prepared: Prepared, model: EchoModel, without: Collection[str]) -> Iterator[Trial]:
     """The effects that show in the robot's silences as well and that a model lacks, each as a step from it."""
     judge = Judge(prepared)
-    absent = {name for name in names() if find(name).shows_in_silence} - {*dict(model.effects), *criteria.disproved}
+    absent = {name for name in names() if find(name).shows_in_silence} - {*dict(model.effects), *without}
     for name in sorted(absent):
         values = fitted(find(name), prepared.measurement, model)
         if vanishes(find(name), values):
@@ -106,13 +109,13 @@ def _held_down(prepared: Prepared, model: EchoModel, criteria: Criteria) -> Iter
             yield Trial(name, values, changed, after, before.level_db - after.level_db, size)
 
 
-def _judged_anew(found: Found, criteria: Criteria) -> Found:
+def _judged_anew(found: Found, without: Collection[str]) -> Found:
     """The search's outcome with what shows in the silences fitted and judged beside all that was found, and only so kept."""
     kept = tuple(step for step in found.steps if not find(step.name).shows_in_silence)
     model = found.model
     for name in {step.name for step in found.steps} - {step.name for step in kept}:
         model = model.without_effect(name)
-    held_down = next(_held_down(found.prepared, model, criteria), None)
+    held_down = next(_held_down(found.prepared, model, without), None)
     if held_down is None and kept == found.steps:
         return found
     return _in_steps(found, (*(() if held_down is None else (held_down,)), *kept))

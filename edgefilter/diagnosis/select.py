@@ -31,7 +31,7 @@ def search(
     """Add effects, others than those named in without, to model as long as held-out samples say that they are there."""
     bench, start = Workbench(prepared, criteria, progress, without), model
     base = bench.score(model)
-    fan = changed_fan(prepared, model, base, criteria)
+    fan = changed_fan(prepared, model, base, criteria, without)
     if fan is not None:
         prepared, step = fan
         bench, model = Workbench(prepared, criteria, progress, without), step.model

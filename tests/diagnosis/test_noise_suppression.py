@@ -95,8 +95,7 @@ def test_what_the_running_filter_contradicts_is_not_looked_for() -> None:
     prepared = prepare(profile(), suppressed(record(x), -12.0), x)
     base = Judge(prepared).of(prepared.model)
     assert changed_fan(prepared, prepared.model, base, Criteria())[1].name == "noise_suppression"
-    disproved = Criteria(disproved=("noise_suppression",))
-    assert changed_fan(prepared, prepared.model, base, disproved) is None
+    assert changed_fan(prepared, prepared.model, base, Criteria(), without=("noise_suppression",)) is None
 
 
 def test_it_stays_named_beside_what_nothing_explains() -> None:
