@@ -20,16 +20,23 @@ def test_the_direct_sound_comes_pre_roll_behind_its_reference(lag):
     np.testing.assert_allclose(reference[inside], np.roll(x, lag - PRE_ROLL)[inside], atol=1e-6)
 
 
-def test_the_driver_is_found_where_there_is_one_and_products_are_not_enough():
+def test_the_driver_is_found_where_there_is_one_and_products_explode():
     x = robot_speech()
     played = x + np.array([0.5, -0.3, 0.0, 0.2, 0.5, -0.2], np.float32) @ driver_terms(x, 250.0, 0.2)
-    recording = Recording("one", "a", x, robot_model().predict(played) + np.float32(0.1) * fan(x.size), 128_000)
-    taught = x[: recording.split], recording.microphone[: recording.split]
-    alone = erle_db(recording, path_alone(*taught), None)
-    found = {name: fit_model(MODELS[name], *taught) for name in ("d x, d^2 x", "driver")}
-    gain = {name: erle_db(recording, *fit) - alone for name, fit in found.items()}
+    gains = []
+    for draw in range(
+        6
+    ):  # a ten-millionth of the sound moves where a fit ends, and so what one draw gains, by up to 1 dB
+        heard = robot_model().predict(played) + np.float32(0.1) * fan(x.size)
+        heard *= 1.0 + 1e-7 * np.random.default_rng(draw).standard_normal(x.size)
+        recording = Recording("one", "a", x, heard.astype(np.float32), 128_000)
+        taught = x[: recording.split], recording.microphone[: recording.split]
+        alone = erle_db(recording, path_alone(*taught), None)
+        found = {name: fit_model(MODELS[name], *taught) for name in ("d x, d^2 x", "driver")}
+        gains.append([erle_db(recording, *found[name]) - alone for name in ("d x, d^2 x", "driver")])
+    products, driver = np.mean(gains, axis=0)
     # a regular voice leaves more error in the path than real ones, which hides most of either gain
-    assert gain["driver"] > 2.5 and gain["driver"] > gain["d x, d^2 x"] + 1.0
+    assert min(gain for _, gain in gains) > 2.0 and driver > 2.8 and driver > products
     rise = {name: rise_db(x, play) for name, (_, play) in found.items()}
     # d x of a reference 20 dB louder is 20 dB more beside it, d^2 x 40; a bent law ends
     assert rise["d x, d^2 x"] > 15.0 and rise["driver"] < 12.0
