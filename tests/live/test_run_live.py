@@ -244,6 +244,7 @@ def test_the_example_that_listens_hears_the_default_microphone_and_the_monitor(s
     live = subprocess.Popen(
         [sys.executable, ROOT / "docs/examples/listen.py", "mic", "-", DEMO / "profile.npz"],
         env={**server.environment, "PYTHONPATH": str(ROOT)}, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # a shell has its background jobs ignore it
     )  # fmt: skip
     told = [live.stderr.readline() for _ in range(2)]
     assert told[1].strip() == "reference: robot.monitor", told
