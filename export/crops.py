@@ -129,7 +129,7 @@ class Batches:
             self._prepare(step)
         assert self._ready is not None
         batch = self._ready[1]
-        self._thread = threading.Thread(target=self._prepare, args=(step + 1,), daemon=True)
+        self._thread = threading.Thread(target=self._prepare, args=(step + 1,))  # torch aborts where a daemon is cut off
         self._thread.start()
         return batch
 
