@@ -129,7 +129,8 @@ class Batches:
             self._prepare(step)
         assert self._ready is not None
         batch = self._ready[1]
-        self._thread = threading.Thread(target=self._prepare, args=(step + 1,))  # torch aborts where a daemon is cut off
+        # no daemon: torch aborts where one is cut off
+        self._thread = threading.Thread(target=self._prepare, args=(step + 1,))
         self._thread.start()
         return batch
 
