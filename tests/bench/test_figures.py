@@ -68,7 +68,7 @@ def paced(contender: str) -> tuple[float, float]:
     return tuple(hop(contender, True)["quantiles"][percent] for percent in ("50", "99"))
 
 
-def hidden(count: str, folder: str = "hidden_4001") -> tuple[int, int]:
+def hidden(count: str, folder: str = "hidden_4002") -> tuple[int, int]:
     found = result("hidden_effects")["summary"][folder]["counts"][count]
     return found["hits"], found["n"]
 
@@ -156,7 +156,7 @@ def ahead(kind: str, ser: float | None) -> float:
 
 
 def seconds() -> tuple[float, float]:
-    found = result("hidden_effects")["summary"]["hidden_4001"]["seconds"]
+    found = result("hidden_effects")["summary"]["hidden_4002"]["seconds"]
     return found["p50"], found["max"]
 
 
