@@ -102,10 +102,12 @@ def fit(
     proofs: tuple[Proof, ...] = ()
     unproven = "there is nothing to prove"
     try:
-        if drop and not force and (names or profile is None):
-            proofs = proofs_until_kept(profile, names, recording, reference)
-        elif names or profile is None:
-            proofs = (prove(profile, names, recording, reference),)
+        if names or profile is None:
+            proofs = (
+                proofs_until_kept(profile, names, recording, reference)
+                if drop and not force
+                else (prove(profile, names, recording, reference),)
+            )
     except SignalError as error:
         if not force:
             raise

@@ -139,8 +139,8 @@ def describe(prepared: Prepared, model: EchoModel, score: Score | None = None) -
     flat = residual / model.microphone_gain(residual.size)
     white = whiten(flat, psd)
     use = prepared.usable
-    power = np.where(use, white.astype(np.float64) ** 2, np.nan)
     silent = use & ~prepared.active
+    power = np.where(use, white.astype(np.float64) ** 2, np.nan)
     return Comparison(
         excess_db=score.excess_db,
         noise_floor_db=float(decibels(total_power(psd))),

@@ -97,14 +97,13 @@ class HumanJudge:
         """
         above = self._excess.step(frame.echo, frame.error, learn=not suspect)
         self._above += self._follow_excess * (min(above, MOST_EXCESS) - self._above)
-        robot = self._excess.echo_share >= ROBOT_SHARE
         if suspect:
             self._odds = 0.0
             self._bursts.step(self._odds, robot=False)
             return 0.0
         odds = math.log(max(probability, 1e-9) / max(1.0 - probability, 1e-9))
         self._odds += self._follow_odds * (min(max(odds, ODDS_RANGE[0]), ODDS_RANGE[1]) - self._odds)
-        doubt = self._bursts.step(self._odds, robot)
+        doubt = self._bursts.step(self._odds, robot=self._excess.echo_share >= ROBOT_SHARE)
         centre = self._centre + doubt * (CENTRE_DOUBTED - self._centre)
         room = ROOM_ODDS + ROOM_SLOPE * (self._above - ROOM_EXCESS) + ECHO_SLOPE * self._excess.echo_share
         return 1.0 / (1.0 + math.exp(-min(SLOPE * (self._odds - centre), room)))
