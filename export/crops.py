@@ -123,16 +123,19 @@ class Batches:
 
     def draw(self, step: int) -> dict[str, Tensor]:
         """Spectra (batch, frames, bins, 2) by signal, powers (batch, frames, bins), "active" (batch, frames), "scale" (batch,) to TARGET_RMS."""
-        if self._thread is not None:
-            self._thread.join()
+        self.close()
         if self._ready is None or self._ready[0] != step:
             self._prepare(step)
         assert self._ready is not None
         batch = self._ready[1]
-        # no daemon: torch aborts where one is cut off
         self._thread = threading.Thread(target=self._prepare, args=(step + 1,))
         self._thread.start()
         return batch
+
+    def close(self) -> None:
+        """Wait for the batch that is being made."""
+        if self._thread is not None:
+            self._thread.join()
 
     def ends(self, names: list[str], seconds: float) -> dict[str, Tensor]:
         """The last seconds of these items, as they are."""

@@ -46,3 +46,9 @@ class Processes:
         told = torch.tensor(float(decided), device=device)
         distributed.broadcast(told, 0)
         return bool(told)
+
+    def leave(self) -> None:
+        """Wait for the others and part: torch aborts where its threads outlive the interpreter."""
+        if self.world > 1:
+            distributed.barrier()
+            distributed.destroy_process_group()
