@@ -175,7 +175,11 @@ def test_a_leak_lost_samples_and_slowing_down_are_found() -> None:
     for number, part in enumerate(live["slices"]):
         part["learner_mb"] = 60.0 + 40.0 * (number > 0)  # it comes when it is called
     assert soak.judge(live) == [] and live["learner_growth_mb"] == 0.0
-    live["slices"][-1]["learner_mb"] += 4.0
-    assert soak.judge(live) == ["the learner's memory grew by 4.0 MB"]
+    for part in live["slices"][3::2]:
+        part["learner_mb"] += 150.0  # within a round
+    assert soak.judge(live) == []
+    for part in live["slices"][15:]:
+        part["learner_mb"] += 60.0
+    assert soak.judge(live) == ["the learner's memory grew by 60.0 MB"]
     assert soak.judge(bimodal) == []  # the robot spoke in five slices of one half and in four of the other
     assert soak.judge(throttled) == []  # the machine became slower, not the filter
