@@ -245,7 +245,9 @@ def markdown(result: dict, name: str) -> str:
     lines += [f"{result['samples_in']} samples in, {result['samples_out']} out, {result['lost']} lost;"]
     lines += [f"memory grew by {result['memory_growth_mb']:+.2f} MB after the warm-up;"]
     if result["learner_growth_mb"] is not None:
-        lines += [f"the learner's most by {result['learner_growth_mb']:+.1f} MB from the first half to the second, after its own;"]
+        lines += [
+            f"the learner's most by {result['learner_growth_mb']:+.1f} MB from the first half to the second, after its own;"
+        ]
     if result["kind"] == "file":
         lines += [
             f"against a bypassed one, a block took {result['slower']:.2f} times as long in the second half as in "
