@@ -22,8 +22,8 @@ from tqdm import tqdm
 from bench import results_writer
 from bench.measure.intervals import interval
 from bench.simulate.conversations import Clip, read_clips
+from bench.simulate.effect_conversations import EFFECTS as SIMULATED
 from bench.simulate.effect_conversations import EffectConversation, make
-from bench.simulate.hidden_catalogue import CATALOGUE
 from bench.simulate.simulated_robot import RATE
 from edgefilter import Profile, calibrate, enhance
 from edgefilter.diagnosis.diagnose import add
@@ -136,8 +136,9 @@ def conversations(
     for clip in read_clips(voices, (1.0, 15.0)):
         clips.setdefault(clip.speaker, []).append(clip)
     people = read_clips(speech, (3.0, 6.0))
-    numbers = [i for i in range(count * len(CATALOGUE)) if list(CATALOGUE)[i % len(CATALOGUE)] in effects]
-    return (make(seed, i, clips, people) for i in tqdm(numbers, unit="case", disable=not sys.stderr.isatty()))
+    wanted = [(effect, turn) for turn in range(count) for effect in SIMULATED if effect in effects]
+    shown = tqdm(wanted, unit="case", disable=not sys.stderr.isatty())
+    return (make(seed, effect, turn, clips, people) for effect, turn in shown)
 
 
 def main() -> int:
@@ -146,7 +147,7 @@ def main() -> int:
     parser.add_argument("--speech", type=Path, required=True, metavar="DIR", help="the humans")
     parser.add_argument("--count", type=int, default=10, help="conversations of each effect (default: %(default)s)")
     parser.add_argument("--seed", type=int, default=41)
-    parser.add_argument("--effects", default=",".join(CATALOGUE), help="which of them (default: all)")
+    parser.add_argument("--effects", default=",".join(SIMULATED), help="which of them (default: all)")
     parser.add_argument("--engines", default=",".join(ENGINES))
     parser.add_argument("--output", type=Path, metavar="PATH", help="also write PATH.md and PATH.json")
     parser.add_argument("--page", type=Path, metavar="FILE", help="also write the page of the documentation")

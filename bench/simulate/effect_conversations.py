@@ -1,4 +1,4 @@
-"""A robot that has one effect of the catalogue, alone at first, and a human who interrupts it late in the recording.
+"""A robot that has one effect that the diagnosis names, alone at first, and a human who interrupts it late in the recording.
 
 The robots, their calibration and the effects are those of hidden_cases, simulated by code of its own; the human is at
 the microphone before anything that the microphone does.
@@ -15,10 +15,11 @@ from bench.simulate.conversations import Clip, read_speech
 from bench.simulate.hidden_acoustics import power
 from bench.simulate.hidden_cases import ROBOT_OVER_FAN_DB, hide, read_reference
 from bench.simulate.hidden_catalogue import CATALOGUE
-from bench.simulate.hidden_outside import in_room
+from bench.simulate.hidden_outside import NAMED, OUTSIDE, in_room
 from bench.simulate.hidden_robot import draw_scene
 from bench.simulate.simulated_robot import RATE, Array
 
+EFFECTS = (*CATALOGUE, *NAMED)
 STRENGTHS = ("clear", "moderate")
 HUMAN_OVER_FAN_DB = (4.5, 10.5)
 """As in conversations: the robot is some 20 dB above the human."""
@@ -44,14 +45,17 @@ class EffectConversation:
     human: slice
 
 
-def make(seed: int, index: int, voices: dict[str, list[Clip]], speech: list[Clip]) -> EffectConversation:
-    """Item index of a seed: effect index mod 13 of CATALOGUE, its strength in turn."""
-    rng = np.random.default_rng([seed, index])
-    effect = list(CATALOGUE)[index % len(CATALOGUE)]
-    strength = STRENGTHS[index // len(CATALOGUE) % len(STRENGTHS)]
+def make(seed: int, effect: str, turn: int, voices: dict[str, list[Clip]], speech: list[Clip]) -> EffectConversation:
+    """The effect's conversation number `turn` of a seed, clear and moderate in turns; effect: one of EFFECTS."""
+    place, strength = EFFECTS.index(effect), STRENGTHS[turn % len(STRENGTHS)]
+    beyond = [place] if place >= len(CATALOGUE) else []
+    rng = np.random.default_rng([seed, turn if beyond else turn * len(CATALOGUE) + place, *beyond])
     voice = str(rng.choice(sorted(voices)))
     scene = draw_scene(rng, read_reference(rng, voices[voice]), rng.uniform(*ROBOT_OVER_FAN_DB[strength]))
-    chain, _, _ = hide(rng, scene, scene.usual, effect, strength)
+    if effect in CATALOGUE:
+        chain, _, _ = hide(rng, scene, scene.usual, effect, strength)
+    else:
+        chain, _ = OUTSIDE[effect](rng, scene, scene.usual, strength, lambda rng: np.zeros(0))
     ref = scene.reference
     early = find_pause(ref, ref.size - int(LATE_S * RATE))
     start = early + int(ALONE_S * RATE)

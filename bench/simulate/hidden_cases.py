@@ -134,6 +134,8 @@ def make_case(
         "raw": effects or ["none"],
         "strength": strength,
     }
+    if parameters.get("codec", {}).get("cuts_band"):
+        truth["also"] = ["bandlimit"]
     truth |= {"params": parameters, "effect_to_noise_db": found}
     truth |= {"robot_over_fan_db": decibels(power(scene.echo(scene.usual)) / scene.fan_power)}
     return signals, truth | {"tolerances": scene.tolerances, "voice": voice, "seed": [seed, index]}

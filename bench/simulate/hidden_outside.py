@@ -33,6 +33,10 @@ CODECS = {
 """Encoder of ffmpeg, its rate in Hz, options, formats out and in, bit rates in kbit/s from bad to good."""
 
 
+CUT_HZ = 6500.0
+"""Where a codec passes little above it, a band limit is as right a name."""
+
+
 def _with_sound(scene: Scene, chain: Chain, sound: Array, strength: str) -> Chain:
     """Sound (n,) of any level, added at the microphone at the wanted one."""
     sound = sound * 10 ** ((ENR_DB[strength] - scene.over_fan_db(sound)) / 20)
@@ -166,7 +170,7 @@ def codec(rng: np.random.Generator, scene: Scene, chain: Chain, strength: str, _
         if noise_db < ENR_DB[strength]:
             break
     _, parameters, played = min(tries, key=lambda entry: entry[0])
-    return replace(chain, played=played), parameters
+    return replace(chain, played=played), parameters | {"cuts_band": cuts_band(chain.played, played)}
 
 
 def through_codec(x: Array, name: str, kbps: int) -> Array:
@@ -191,6 +195,13 @@ def through_codec(x: Array, name: str, kbps: int) -> Array:
     return np.pad(y, (0, max(x.size - y.size, 0)))[: x.size]
 
 
+def cuts_band(x: Array, y: Array) -> bool:
+    """Whether of the power of x (n,) above CUT_HZ less than a quarter is in y (n,)."""
+    hz, before = signal.welch(x, fs=RATE, nperseg=1024)
+    after = signal.welch(y, fs=RATE, nperseg=1024)[1]
+    return bool(after[hz > CUT_HZ].sum() < 0.25 * before[hz > CUT_HZ].sum())
+
+
 def incoherent_db(x: Array, y: Array) -> float:
     """Share of y's power (n,), in dB, that no linear filter of x (n,) explains.
 
@@ -210,5 +221,5 @@ OUTSIDE: dict[str, Disturbance] = {
     "door_slams": door_slams,
     "music": music,
 }
-NAMED = ("packet_loss",)
+NAMED = ("packet_loss", "codec")
 """Of these, what the diagnosis has a name for."""

@@ -104,6 +104,8 @@ class Criteria:
     """Share of the excess power that findings must explain to be named beside what none explains."""
     part_level: float = 0.3
     """And share of its level: power alone may be that of one loud passage."""
+    noise_left: float = 0.4
+    """Of the excess in dB, what noise that follows the voice may leave: how it follows is known to a decibel or two."""
     much_db: float = 3.0
     """Over the silences: what the model of an effect that is really there does not leave."""
     nearly_all: float = 0.99

@@ -13,6 +13,7 @@ from edgefilter.diagnosis.candidates import candidates
 from edgefilter.diagnosis.compare import Comparison, compare, describe, independence_of
 from edgefilter.diagnosis.criteria import Criteria
 from edgefilter.diagnosis.findings import findings_of, share_of
+from edgefilter.diagnosis.follows_voice import noise_of_the_voice
 from edgefilter.diagnosis.leftover import left_in_words
 from edgefilter.diagnosis.noise_change import look_at_fan, without_doubtful
 from edgefilter.diagnosis.precision import precision
@@ -180,7 +181,6 @@ def conclude(
     comparison = describe(prepared, found.start, found.base)
     found, left = look_at_fan(found, criteria, without)
     searched = found
-    unpredictable = any(find(step.name).leaves_noise for step in found.steps)
     believed = bool(found.steps) and (
         found.final.excess_db < criteria.explained_db or _enough(prepared, found, criteria)
     )
@@ -188,9 +188,14 @@ def conclude(
     verdict: Verdict = (
         "missing" if believed and not _much_left(found, criteria) else "explained" if quiet else "unexplained"
     )
-    if not believed and (quiet or not _partly(prepared, found, criteria)):
+    noise = noise_of_the_voice(found, criteria, without) if verdict == "unexplained" else None
+    if noise is not None:
+        found = searched = noise
+        verdict = "missing"
+    elif not believed and (quiet or not _partly(prepared, found, criteria)):
         sure = None if quiet else cut_by_power(found, criteria)
         found = sure or without_doubtful(found)
+    unpredictable = any(find(step.name).leaves_noise for step in found.steps)
     remaining = found.final.excess_db
     findings, doubts = findings_of(found, progress)
     tried = candidates(searched, [finding.effect for finding in findings])

@@ -258,6 +258,7 @@ class Workbench:
             for name in names()
             if find(name).stage != "noise"
             and not find(name).shows_in_silence
+            and not find(name).in_what_is_left
             and name not in out
             and find(name).complexity <= most
         ]

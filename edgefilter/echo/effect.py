@@ -79,7 +79,8 @@ class Effect:
     that no waveform predicts; noise_words: what is said of that where a residual is described. shown_by: recordings in
     which it differs from effects without them (diagnosis/advice.py). shows_in_silence: whether the robot's silences tell
     it together with the voice, so that it is looked for before the search and behind it (diagnosis/noise_change.py), not
-    in it.
+    in it. in_what_is_left: whether it is told only by what all others leave, so that it is looked for where a search has not
+    explained the recording (diagnosis/follows_voice.py).
     """
 
     name: ClassVar[str]
@@ -106,6 +107,7 @@ class Effect:
     noise_words: ClassVar[str] = ""
     shown_by: ClassVar[tuple[Experiment, ...]] = ()
     shows_in_silence: ClassVar[bool] = False
+    in_what_is_left: ClassVar[bool] = False
 
     def apply(self, x: Samples, values: Values, sample_rate: int) -> Samples:
         """The signal (n,) after the effect; x is not written to.

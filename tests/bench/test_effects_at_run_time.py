@@ -34,7 +34,7 @@ def voices(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_the_human_comes_late_and_before_the_microphone(voices: Path) -> None:
     clips = read_clips(voices, (1.0, 15.0))
-    scene = effect_conversations.make(5, list(CATALOGUE).index("mic_clipping"), {"s0": clips}, clips)
+    scene = effect_conversations.make(5, "mic_clipping", 0, {"s0": clips}, clips)
     assert scene.effect == "mic_clipping" and scene.mic.shape == scene.ref.shape == scene.clean.shape
     assert np.abs(scene.clean[: scene.human.start]).max() < 1e-9  # rounding of a transform
     assert scene.early + 4 * RATE < scene.human.start

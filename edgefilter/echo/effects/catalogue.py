@@ -13,6 +13,7 @@ from edgefilter.echo.effect import STAGES, Effect, complete
 from edgefilter.echo.effects.bandlimit import Bandlimit
 from edgefilter.echo.effects.chassis_resonance import ChassisResonance
 from edgefilter.echo.effects.clock_drift import ClockDrift
+from edgefilter.echo.effects.codec import Codec
 from edgefilter.echo.effects.compression import Compression
 from edgefilter.echo.effects.delay_jump import DelayJump
 from edgefilter.echo.effects.early_path import EarlyPath
@@ -40,6 +41,7 @@ EFFECTS: tuple[Effect, ...] = (
     Limiter(),
     DelayJump(),
     PacketLoss(),
+    Codec(),
     SpeakerNonlinearity(),
     Rattle(),
     Bandlimit(),

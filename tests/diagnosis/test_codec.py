@@ -1,0 +1,86 @@
+"""Noise that follows the voice as a codec's does is named so; what moves, distorts or sounds by itself is not."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy import signal
+
+from edgefilter.diagnosis.diagnose import diagnose
+from edgefilter.diagnosis.prepare import prepare
+from edgefilter.diagnosis.score import Judge
+from edgefilter.echo.effects.catalogue import find
+from edgefilter.echo.effects.codec import signs_of
+from edgefilter.echo.evidence import Evidence
+from tests.diagnosis.robot_scene import profile, record, voice
+from tests.diagnosis.test_packet_loss import coded, lossy
+
+SECONDS = 12.0
+
+
+def evidence(recording: np.ndarray, x: np.ndarray) -> Evidence:
+    """The codec fitted to a recording beside nothing else."""
+    prepared = prepare(profile(), recording, x)
+    judge, codec = Judge(prepared), find("codec")
+    values = codec.fit(prepared.measurement, prepared.model)
+    return Evidence(
+        values,
+        prepared.model,
+        judge,
+        judge.of(prepared.model),
+        judge.of(prepared.model.with_effect("codec", values)),
+    )
+
+
+def trembling(x: np.ndarray) -> np.ndarray:
+    place = np.arange(x.size) + 1.5 * np.sin(2 * np.pi * 5 * np.arange(x.size) / 16000)
+    return np.interp(place, np.arange(x.size), x).astype(np.float32)
+
+
+def talked_into(x: np.ndarray) -> np.ndarray:
+    return record(x) + 0.3 * np.roll(record(voice(SECONDS)[::-1]), 40_000)
+
+
+@pytest.mark.parametrize("step_db", [-8.0, -14.0])
+def test_a_codec_is_named_with_how_loud_its_noise_is(step_db: float) -> None:
+    x = voice(SECONDS)
+    found = diagnose(profile(), record(coded(x, step_db)), x)
+    assert [finding.effect for finding in found.ranking] == ["codec"] and found.verdict == "missing"
+    finding = found.ranking[0]
+    assert finding.excess_after_db < 0.5 * finding.excess_before_db and found.irreducible_db > 2.0
+    assert finding.parameters["below_voice_db"].value == pytest.approx(-step_db, abs=3.0)
+    assert "follows it in every band" in finding.evidence and "codec" in [row.effect for row in found.tried]
+
+
+def test_where_the_codec_cuts_the_band_both_are_named() -> None:
+    x = voice(SECONDS)
+    low = signal.sosfilt(signal.cheby2(10, 50, 4000, fs=16000, output="sos"), coded(x, -8.0)).astype(np.float32)
+    assert {finding.effect for finding in diagnose(profile(), record(low), x).ranking} == {"bandlimit", "codec"}
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        record,
+        lambda x: record((x * (1 + 0.4 * np.sin(2 * np.pi * 5 * np.arange(x.size) / 16000))).astype(np.float32)),
+        lambda x: record(trembling(x)),
+        lambda x: record((x + 2.0 * x * np.abs(x)).astype(np.float32)),
+        lambda x: record(np.clip(x, -0.1, 0.1).astype(np.float32)),
+        lambda x: record(lossy(x, 320, 0.0)),
+        talked_into,
+        lambda x: record(x) + np.float32(0.01) * np.random.default_rng(1).standard_normal(x.size).astype(np.float32),
+    ],
+    ids=["nothing", "tremolo", "flutter", "distortion", "clipping", "lost packets", "talker", "fan"],
+)
+def test_what_is_left_of_something_else_is_no_codec(change) -> None:
+    x = voice(SECONDS)
+    found = evidence(change(x), x)
+    assert not find("codec").plausible(found), signs_of(found)
+
+
+def test_the_score_counts_the_noise_as_expected() -> None:
+    x = voice(SECONDS)
+    found = evidence(record(coded(x, -8.0)), x)
+    assert find("codec").plausible(found), signs_of(found)
+    assert found.after.excess_db < 0.4 * found.before.excess_db and found.after.silent_db < 0.5
+    assert found.after.irreducible_db > 2.0
