@@ -45,6 +45,8 @@ distortions from 0.25 on and all that moves from 0.4 on."""
 HARMONIC, PEAKED = 0.4, 1.33
 """Correlation of the residual's fine structure over frequency with the voice's, and its spread re that of noise, at most: a
 loudspeaker's distortion has the voice's harmonics, and a talker his own."""
+AROUND, OF_NOISE = 17, 1.1
+"""Bins of 16 Hz over which that is smoothed, and the standard deviation of the log of a periodogram of noise around it."""
 FEWEST = 2000
 """Cells of the fine structure that say something."""
 
@@ -210,21 +212,13 @@ def _coherent(voice: Samples, left: Samples, heard: NDArray[np.bool_]) -> float:
 
 def _fine(voice: Samples, left: Samples, heard: NDArray[np.bool_]) -> tuple[float, float, int]:
     """Signs.harmonic, peaked and cells."""
-    logs, over = [], None
-    for x in (voice, left):
-        power = power_of(_spectra(x, *LONG))[:, : LONG[0] * 3 // 16]
-        log = np.log(power + 1e-6)
-        logs.append(log - uniform_filter(log, (1, 17)))
-        over = uniform_filter(power, (1, 17))
-    use = _whole(heard, *LONG)[:, None] & (over > 2.0 * HEARD)
-    harmonic = _correlation(*(log * use for log in logs))
+    powers = [power_of(_spectra(x, *LONG))[:, : LONG[0] * 3 // 16] for x in (voice, left)]
+    logs = [np.log(power + 1e-6) for power in powers]
+    fine = [log - uniform_filter1d(log, AROUND, axis=1) for log in logs]
+    use = _whole(heard, *LONG)[:, None] & (uniform_filter1d(powers[1], AROUND, axis=1) > 2.0 * HEARD)
     count = int(np.count_nonzero(use))
-    peaked = float(np.sqrt(np.sum(np.square(logs[1] * use)) / max(count, 1))) / OF_NOISE
-    return harmonic, peaked, count
-
-
-OF_NOISE = 1.1
-"""Standard deviation of the log of a periodogram of noise around its mean over the bins beside it."""
+    peaked = float(np.sqrt(np.sum(np.square(fine[1] * use)) / max(count, 1))) / OF_NOISE
+    return _correlation(*(x * use for x in fine)), peaked, count
 
 
 def _correlation(a: Array, b: Array) -> float:
