@@ -144,7 +144,8 @@ def main() -> int:
         print(f"hidden_effects: {error}", file=sys.stderr)
         return 1
     summaries = {name: hidden_scores.summarise(outcomes) for name, outcomes in results.items()}
-    page = "\n".join(hidden_scores.markdown(name, results[name], summaries[name]) for name in results)
+    sections = (hidden_scores.markdown(name, results[name], summaries[name]) for name in results)
+    page = hidden_scores.glance(summaries) + "\n".join(sections)
     content = {
         "summary": summaries,
         "cases": {name: [asdict(outcome) for outcome in found] for name, found in results.items()},

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,6 +10,14 @@ import numpy as np
 from bench.measure.intervals import wilson
 
 STRENGTHS = ("clear", "moderate", "near")
+AT_A_GLANCE = {
+    "one effect: named first": "top-1",
+    "that one and no other": "singles: that effect and no other",
+    "two: both named": "pairs: both named",
+    "nothing: false alarms": "false alarms on controls",
+    "outside the catalogue: unexplained": "outside: unexplained",
+    "sealed: the exact label": "sealed: exact label",
+}
 EXPLAINED_LIMIT_DB = 1.0
 """Excess above which a case from outside the catalogue must never be called explained."""
 
@@ -92,7 +100,7 @@ def summarise(outcomes: Sequence[Outcome]) -> dict:
         name: [o for o in outcomes if o.group == name] for name in ("singles", "controls", "pairs", "outside", "sealed")
     }
     singles, controls, pairs, outside = (groups[name] for name in ("singles", "controls", "pairs", "outside"))
-    counts = {}
+    counts = {"top-1": counted(o.hit for o in singles)}
     for strength in STRENGTHS:
         of = [o for o in singles if o.strength == strength]
         counts[f"top-1, {strength}"] = counted(o.hit for o in of)
@@ -150,6 +158,25 @@ def confusion(outcomes: Sequence[Outcome]) -> dict[str, dict[str, int]]:
             row = matrix.setdefault(o.truth[0], {})
             row[o.first] = row.get(o.first, 0) + 1
     return {name: matrix[name] for name in sorted(matrix)}
+
+
+def glance(summaries: Mapping[str, dict]) -> str:
+    """All folders in one table, for two and more: the figures that matter most, each with its interval."""
+    if len(summaries) < 2:
+        return ""
+    rows = {
+        what: [_counted_cell(s["counts"].get(key)) for s in summaries.values()] for what, key in AT_A_GLANCE.items()
+    }
+    for what, key in (("seconds per case, median", "p50"), ("longest", "max")):
+        rows[what] = [f"{s['seconds'][key]:.1f}" for s in summaries.values()]
+    lines = [f"| | {' | '.join(summaries)} |", "| --- " * (len(summaries) + 1) + "|"]
+    return "\n".join(
+        [*lines, *(f"| {' | '.join([what, *cells])} |" for what, cells in rows.items() if any(cells)), "", ""]
+    )
+
+
+def _counted_cell(count: dict | None) -> str:
+    return f"{count['hits']} of {count['n']} [{count['low']:.0f}, {count['high']:.0f}] %" if count else ""
 
 
 def markdown(name: str, outcomes: Sequence[Outcome], summary: dict) -> str:

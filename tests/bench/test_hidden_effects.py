@@ -79,6 +79,7 @@ def test_summary_counts_by_strength_and_group() -> None:
     summary = hidden_scores.summarise(cases)
     counts = {name: (count["hits"], count["n"]) for name, count in summary["counts"].items()}
     assert counts == {
+        "top-1": (1, 3),
         "top-1, clear": (1, 2),
         "top-2, clear": (2, 2),
         "top-1, near": (0, 1),
@@ -95,6 +96,10 @@ def test_summary_counts_by_strength_and_group() -> None:
         "none": 1,
         "rattle": 1,
     }
+    assert not hidden_scores.glance({"made": summary})
+    table = hidden_scores.glance({"made": summary, "again": hidden_scores.summarise(cases[-1:])})
+    assert "| | made | again |" in table and "| two: both named | 1 of 1 [21, 100] % | 1 of 1 [21, 100] % |" in table
+    assert "| nothing: false alarms | 1 of 2 [9, 91] % |  |" in table and "sealed" not in table
     text = hidden_scores.markdown("made", cases, summary)
     assert (
         "| top-1, clear | 1 of 2 | 50 |" in text
