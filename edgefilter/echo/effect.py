@@ -80,7 +80,8 @@ class Effect:
     which it differs from effects without them (diagnosis/advice.py). shows_in_silence: whether the robot's silences tell
     it together with the voice, so that it is looked for before the search and behind it (diagnosis/noise_change.py), not
     in it. in_what_is_left: whether it is told only by what all others leave, so that it is looked for where a search has not
-    explained the recording (diagnosis/follows_voice.py).
+    explained the recording (diagnosis/follows_voice.py); the running filter, which follows what any path leaves, asks for
+    no variance() of it.
     """
 
     name: ClassVar[str]

@@ -26,14 +26,15 @@ class SourceChain:
 
     def __init__(self, effects: Sequence[tuple[str, Values]] = ()) -> None:
         applied = chain(effects)
+        noisy = {effect.name for effect, _ in applied if effect.adds_noise and not effect.in_what_is_left}
         self._makers = [
             (
-                partial(ExpectedSquare, effect, values, effect.memory or 0) if effect.adds_noise else None,
+                partial(ExpectedSquare, effect, values, effect.memory or 0) if effect.name in noisy else None,
                 stream_form(effect, values) if effect.stage == "source" else None,
             )
             for effect, values in applied
         ]
-        self.colours: list[Array] = [effect.colour(values) for effect, values in applied if effect.adds_noise]
+        self.colours: list[Array] = [effect.colour(values) for effect, values in applied if effect.name in noisy]
         self.expected: list[Samples] = []
         self._links = self._new_links()
         self.memory = LONG_MEMORY if any(run and not isinstance(run, Windowed) for _, run in self._links) else 0

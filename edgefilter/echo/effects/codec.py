@@ -42,9 +42,10 @@ FOLLOWS = 0.4
 COHERENT = 0.24
 """Of the residual's power around a cell, what one gain of the voice explains at most: chance is 0.05, codecs are up to 0.22,
 distortions from 0.25 on and all that moves from 0.4 on."""
-HARMONIC, PEAKED = 0.4, 1.33
+HARMONIC, PEAKED = 0.4, 1.26
 """Correlation of the residual's fine structure over frequency with the voice's, and its spread re that of noise, at most: a
-loudspeaker's distortion has the voice's harmonics, and a talker his own."""
+loudspeaker's distortion has the voice's harmonics (of 72 pieces of a real one the least are 0.32 and 1.32), a talker his
+own; nine codecs in ten are below 0.36 and 1.22."""
 AROUND, OF_NOISE = 17, 1.1
 """Bins of 16 Hz over which that is smoothed, and the standard deviation of the log of a periodogram of noise around it."""
 FEWEST = 2000
@@ -64,13 +65,15 @@ class Codec(Effect):
 
     name: ClassVar[str] = "codec"
     stage: ClassVar[Stage] = "source"
+    run_note: ClassVar[str] = (
+        "the running filter follows by itself what noise the voice brings along: adding it changes nothing there"
+    )
     title: ClassVar[str] = "a codec"
     shown_by: ClassVar[tuple[Experiment, ...]] = ("levels", "tone")
     complexity: ClassVar[int] = 3
     cost: ClassVar[int] = 4
     leaves_noise: ClassVar[bool] = True
     in_what_is_left: ClassVar[bool] = True
-    memory: ClassVar[int | None] = 4096
     parameters: ClassVar[tuple[Parameter, ...]] = (
         Parameter("power", "full scale^2", 0.0, 0.0, 1e3),
         Parameter("emphasis_db", "dB", 0.0, NONE_DB, 0.0),
