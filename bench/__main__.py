@@ -46,7 +46,7 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
         action="append",
         default=[],
         metavar="NAME|FOLDER",
-        help="recogniser, may be given several times; the first decides (default: none, and no word errors)",
+        help="recogniser, or pocketsphinx; may be given several times; the first decides (default: none, no word errors)",
     )
     parser.add_argument("--speech", type=Path, metavar="DIR", help="humans to lay on real recordings")
     parser.add_argument(
@@ -80,8 +80,7 @@ def stamp(options: argparse.Namespace, recognisers: dict[str, Path]) -> dict:
 
 def run(options: argparse.Namespace) -> str:
     """The page in Markdown, after all files are written."""
-    folders = [find_model(model) for model in options.asr_model]
-    recognisers = {folder.name: folder for folder in folders}
+    recognisers = dict(find_model(model) for model in options.asr_model)
     cells = Cells(options.ser, options.before)
     laying = Laying(options.speech, options.echo_only, cells, options.cases, options.seed)
     clips = find_clips(options.folders, laying, options.every)

@@ -22,7 +22,7 @@ from bench.results_writer import digest
 from export.spread import spread
 
 FACTS = "facts"
-JUDGES = ("speechmos", "pystoi", "jiwer", "faster-whisper", "ctranslate2")
+JUDGES = ("speechmos", "pystoi", "jiwer", "faster-whisper", "ctranslate2", "pocketsphinx")
 """Packages whose versions change scores."""
 
 

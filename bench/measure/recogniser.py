@@ -1,7 +1,9 @@
-"""Word errors by Whisper-base (faster-whisper, int8, one thread), from a folder on this machine; nothing is fetched.
+"""Word errors by a recogniser on this machine; nothing is fetched.
 
-The folder holds a CTranslate2 conversion: model.bin, config.json, tokenizer.json, vocabulary.json. Transcripts are kept
-in a JSON-lines file under the audio's hash, so that no audio is recognised twice.
+Whisper-base (faster-whisper, int8, one thread): a folder with a CTranslate2 conversion, model.bin, config.json,
+tokenizer.json, vocabulary.json. PocketSphinx: the American English that its package brings along, Gaussian mixtures and
+trigrams, which err otherwise than a network does. Transcripts are kept in a JSON-lines file under the audio's hash, so
+that no audio is recognised twice.
 """
 
 from __future__ import annotations
@@ -10,6 +12,8 @@ import hashlib
 import json
 import re
 from dataclasses import dataclass
+from functools import partial
+from importlib import metadata
 from pathlib import Path
 
 import jiwer
@@ -25,6 +29,7 @@ SETTINGS = {
     "condition_on_previous_text": False,
     "without_timestamps": True,
 }
+SPHINX = "pocketsphinx"
 PEAK = 0.5
 """Every input is scaled to this peak, so that the recogniser does not judge levels."""
 _TEENS = "ten eleven twelve thirteen fourteen fifteen sixteen seventeen eighteen nineteen"
@@ -113,46 +118,52 @@ def _spell(n: int) -> str:
     raise AssertionError(n)
 
 
-def find_model(name: str) -> Path:
-    """The folder of that path, or of a model of faster-whisper that was downloaded before ("tiny.en"); fetches nothing.
+def find_model(name: str) -> tuple[str, Path]:
+    """Name and folder of the model at that path, of "pocketsphinx", or of a model of faster-whisper that was downloaded before ("tiny.en").
 
-    Raises UsageError where there is neither.
+    Fetches nothing. Raises UsageError where there is none.
     """
     if Path(name).is_dir():
-        return Path(name)
+        return Path(name).name, Path(name)
+    if name == SPHINX:
+        return name, _sphinx_model()
     try:
         from faster_whisper.utils import download_model
 
-        return Path(download_model(name, local_files_only=True))
+        return name, Path(download_model(name, local_files_only=True))
     except (ImportError, ValueError, OSError) as error:
         raise UsageError(
-            f"{name} is no folder, and no model of faster-whisper that was downloaded before: give a folder with"
-            " model.bin and config.json"
+            f"{name} is no folder, not {SPHINX}, and no model of faster-whisper that was downloaded before: give a"
+            " folder with model.bin and config.json"
         ) from error
+
+
+def _sphinx_model() -> Path:
+    try:
+        from pocketsphinx import get_model_path
+    except ImportError as error:
+        raise UsageError(f"{SPHINX} is not installed: pip install {SPHINX}") from error
+    return Path(get_model_path())
 
 
 class Recogniser:
     """Transcribes with the model in a folder; loads it only for audio that the cache does not know.
 
-    folder: the CTranslate2 model. cache: a JSON-lines file of {"key", "text"}, made where missing, appended to at once.
-    Raises UsageError where the folder holds no model.
+    folder: of a CTranslate2 model, or PocketSphinx's. cache: a JSON-lines file of {"key", "text"}, made where missing,
+    appended to at once. Raises UsageError where the folder holds no model.
     """
 
     def __init__(self, folder: Path, cache: Path) -> None:
-        config = folder / "config.json"
-        if not (folder / "model.bin").is_file() or not config.is_file():
-            raise UsageError(
-                f"{folder} holds no model.bin and config.json; expected a CTranslate2 conversion of Whisper-base"
-            )
-        identity = f"{(folder / 'model.bin').stat().st_size} {config.read_text()} {SETTINGS} {PEAK}"
-        self._identity = hashlib.sha256(identity.encode()).hexdigest()
-        self._folder, self._cache, self._model = folder, cache, None
+        loads = _Sphinx if (folder / _Sphinx.ACOUSTIC / "mdef").is_file() else _Whisper
+        self._identity = hashlib.sha256(loads.identity(folder).encode()).hexdigest()
+        self._load, self._cache = partial(loads, folder), cache
+        self._model: _Sphinx | _Whisper | None = None
         cache.parent.mkdir(parents=True, exist_ok=True)
         lines = cache.read_text(encoding="utf-8").splitlines() if cache.exists() else []
         self._known = {entry["key"]: entry["text"] for entry in map(_entry, lines) if entry}
 
     def transcribe(self, samples: Samples) -> str:
-        """What Whisper hears in samples (n,), 16 kHz; silence gives an empty text."""
+        """What the recogniser hears in samples (n,), 16 kHz; silence gives an empty text."""
         samples = as_samples(samples, "samples")
         peak = float(np.abs(samples).max(initial=0.0))
         if peak == 0.0:
@@ -167,13 +178,57 @@ class Recogniser:
 
     def _recognise(self, samples: Samples) -> str:
         if self._model is None:
-            from faster_whisper import WhisperModel
+            self._model = self._load()
+        return self._model.recognise(samples)
 
-            self._model = WhisperModel(
-                str(self._folder), device="cpu", compute_type="int8", cpu_threads=1, local_files_only=True
+
+class _Whisper:
+    def __init__(self, folder: Path) -> None:
+        from faster_whisper import WhisperModel
+
+        self._model = WhisperModel(str(folder), device="cpu", compute_type="int8", cpu_threads=1, local_files_only=True)
+
+    @staticmethod
+    def identity(folder: Path) -> str:
+        """What the transcripts depend on."""
+        config = folder / "config.json"
+        if not (folder / "model.bin").is_file() or not config.is_file():
+            raise UsageError(
+                f"{folder} holds no model.bin and config.json; expected a CTranslate2 conversion of Whisper-base"
             )
+        return f"{(folder / 'model.bin').stat().st_size} {config.read_text()} {SETTINGS} {PEAK}"
+
+    def recognise(self, samples: Samples) -> str:
         segments, _ = self._model.transcribe(samples, **SETTINGS)
         return " ".join(segment.text.strip() for segment in segments)
+
+
+class _Sphinx:
+    ACOUSTIC = Path("en-us") / "en-us"
+
+    def __init__(self, folder: Path) -> None:
+        from pocketsphinx import Decoder
+
+        language = folder / self.ACOUSTIC.parent
+        self._decoder = Decoder(
+            hmm=str(folder / self.ACOUSTIC),
+            lm=str(language / "en-us.lm.bin"),
+            dict=str(language / "cmudict-en-us.dict"),
+            cmn="batch",  # of each utterance by itself, so that their order changes nothing
+            loglevel="FATAL",
+        )
+
+    @staticmethod
+    def identity(folder: Path) -> str:
+        """What the transcripts depend on."""
+        return f"{SPHINX} {metadata.version(SPHINX)} {PEAK}"
+
+    def recognise(self, samples: Samples) -> str:
+        self._decoder.start_utt()
+        self._decoder.process_raw((samples * 32767).astype(np.int16).tobytes(), full_utt=True)
+        self._decoder.end_utt()
+        found = self._decoder.hyp()
+        return found.hypstr if found else ""
 
 
 def _entry(line: str) -> dict | None:

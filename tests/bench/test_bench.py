@@ -15,6 +15,7 @@ import pytest
 import soundfile as sf
 from scipy import signal
 
+import edgefilter
 from bench.measure import barge_in, conversation, intervals, levels, peers, quality, recogniser, scores
 from bench.simulate import conversations
 from bench.simulate import simulated_robot as robot
@@ -194,6 +195,21 @@ def test_transcripts_are_kept_by_audio_and_survive_a_cut_line(tmp_path: Path, mo
     assert one.transcribe(np.zeros(100, np.float32)) == ""
     cache.write_text(cache.read_text() + '{"key": "half')
     assert recogniser.Recogniser(tmp_path, cache).transcribe(other) == "heard 2" and len(heard) == 2
+
+
+def test_a_real_recogniser_hears_the_human_where_the_robot_was(tmp_path: Path) -> None:
+    """PocketSphinx on the bundled conversation: most words of the human alone, more of them filtered than unfiltered."""
+    demo = Path(edgefilter.__file__).parent / "demo_data"
+    mic, reference, human = (
+        sf.read(demo / f"{name}.flac", dtype="float32")[0] for name in ("mic", "reference", "human")
+    )
+    filtered = edgefilter.enhance(mic, reference, edgefilter.Profile.load(demo / "profile.npz"), "ss")
+    name, folder = recogniser.find_model("pocketsphinx")
+    hears = recogniser.Recogniser(folder, tmp_path / "cache.jsonl")
+    text = "please leave your message after the tone when done hang up or press the pound key"
+    alone, with_robot, behind = (recogniser.word_errors(text, hears.transcribe(x)) for x in (human, mic, filtered))
+    assert name == "pocketsphinx" and alone.rate < 0.6
+    assert alone.errors < behind.errors < with_robot.errors
 
 
 def test_summary_adds_up() -> None:

@@ -82,7 +82,7 @@ def test_what_is_no_recording_is_said_in_one_line(tmp_path: Path, capsys: pytest
     assert "no */meta.json and no *_lpb and *_mic files" in capsys.readouterr().err
     with pytest.raises(UsageError, match="unknown system 'crm': choose some of unfiltered, "):
         systems.chosen(["crm"])
-    with pytest.raises(UsageError, match="nobody is no folder, and no model of faster-whisper"):
+    with pytest.raises(UsageError, match="nobody is no folder, not pocketsphinx, and no model"):
         find_model("nobody")
 
 
