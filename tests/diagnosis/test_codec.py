@@ -10,7 +10,7 @@ from edgefilter.diagnosis.diagnose import diagnose
 from edgefilter.diagnosis.prepare import prepare
 from edgefilter.diagnosis.score import Judge
 from edgefilter.echo.effects.catalogue import find
-from edgefilter.echo.effects.codec import signs_of
+from edgefilter.echo.effects.codec_signs import signs_of
 from edgefilter.echo.evidence import Evidence
 from tests.diagnosis.robot_scene import profile, record, voice
 from tests.diagnosis.test_packet_loss import coded, lossy

@@ -1,7 +1,4 @@
-"""When a residual is loud: at the moments of knocks, or wherever the voice is.
-
-And how loud a knock is at each frequency.
-"""
+"""When a residual is loud: at the moments of knocks, or wherever the voice is. And how loud it is then at each frequency."""
 
 from __future__ import annotations
 
@@ -15,12 +12,14 @@ from numpy.typing import NDArray
 
 from edgefilter.dsp.fourier import power
 from edgefilter.dsp.frames import frames
-from edgefilter.dsp.psd import hann
+from edgefilter.dsp.psd import floored, hann
 from edgefilter.types import SAMPLE_RATE, Array, Samples
 
 FRAME, HOP, BANDS = 128, 64, 16
 """Frames of 8 ms every 4 ms, in bands of 500 Hz: short enough for single knocks."""
 BAND_HZ = SAMPLE_RATE / 2 / BANDS
+GRID_HZ = np.linspace(0.0, SAMPLE_RATE / 2, 601)
+_BAND = np.minimum(GRID_HZ / BAND_HZ, BANDS - 1).astype(int)
 RESONANCES_HZ, Q = (120.0, 160.0, 210.0, 280.0, 370.0), 1.0
 SHARES = (0.3, 0.45, 0.6, 0.7, 0.8, 0.88, 0.94)
 """Thresholds to try, as the share of the displacement's peaks that stay below."""
@@ -94,6 +93,21 @@ def colour_of_knocks(residual: Samples, ringing: Samples, fit: NDArray[np.bool_]
     sources = [np.ones_like(source)[use], (source / scale)[use].astype(np.float32)]
     colours = _colours(power[use], sources, 4 * ROUNDS)
     return _likelihood(power[use], sources, colours), colours[1] / scale
+
+
+def fan_in_bands(noise_psd: Samples | None) -> Array:
+    """(BANDS,) power of the fan in each band, by which a whitened power is multiplied: of its density the harmonic mean.
+
+    noise_psd: (601,); None for a fan of variance 1, white.
+    """
+    fan = np.full(GRID_HZ.size, 2.0 / SAMPLE_RATE) if noise_psd is None else floored(noise_psd)
+    return np.bincount(_BAND) / np.bincount(_BAND, 1.0 / fan) * BAND_HZ
+
+
+def density_of(power: float | Array) -> Array:
+    """(601,) spectral density per Hz, of integral 1, of noise with that power in each band, one number or (BANDS,)."""
+    each = np.broadcast_to(np.asarray(power, float), (BANDS,)) + 1e-30
+    return (each / each.sum() / BAND_HZ)[_BAND]
 
 
 def resonated(x: Samples, resonance_hz: float, q: float, sample_rate: int = SAMPLE_RATE) -> Samples:

@@ -11,15 +11,14 @@ import scipy
 from numpy.typing import NDArray
 
 from edgefilter.dsp.convolution import convolve
-from edgefilter.dsp.psd import floored
 from edgefilter.echo.effect import Effect, Experiment, Parameter, Stage, complete, first, neutral, number_or_taps
 from edgefilter.echo.effects.knock_power import (
-    BAND_HZ,
-    BANDS,
     DECAYS_MS,
     RESONANCES_HZ,
     Trigger,
     colour_of_knocks,
+    density_of,
+    fan_in_bands,
     find_knocks,
     find_trigger,
     knocks_at,
@@ -47,7 +46,6 @@ WORTH = 2.5
 REFINED = 3
 MISSING_DB = -0.3
 """Under the fan: where the residual is so little of what a model expects, some of what it expects is not there."""
-GRID_HZ = np.linspace(0.0, SAMPLE_RATE / 2, 601)
 
 
 class Rattle(Effect):
@@ -100,8 +98,7 @@ class Rattle(Effect):
 
     def colour(self, values: Values) -> Array:
         """(601,) the spectral density of that, 0 to 8 kHz, per Hz: its integral is 1."""
-        power = np.broadcast_to(np.asarray(values["power"], float), (BANDS,)) + 1e-30
-        return (power / power.sum() / BAND_HZ)[np.minimum(GRID_HZ / BAND_HZ, BANDS - 1).astype(int)]
+        return density_of(values["power"])
 
     def fit(self, measurement: Measurement, model: VoiceModel) -> Values:
         """What sets the knocks off is found by when the residual is loud.
@@ -168,15 +165,9 @@ class Rattle(Effect):
             decay: colour_of_knocks(left, ringing_of(knocks, decay, DIRECT), measurement.fit) for decay in DECAYS_MS
         }
         decay = max(fits, key=lambda decay: fits[decay][0])
-        fan = (
-            np.full(GRID_HZ.size, 2.0 / SAMPLE_RATE)
-            if measurement.noise_psd is None
-            else floored(measurement.noise_psd)
-        )
-        bands = np.minimum(GRID_HZ / BAND_HZ, BANDS - 1).astype(int)
-        density = fits[decay][1] * np.bincount(bands) / np.bincount(bands, 1.0 / fan)
+        power = fits[decay][1] * fan_in_bands(measurement.noise_psd)
         rate = np.count_nonzero(knocks) * SAMPLE_RATE / max(x.size, 1)
-        return {"power": np.clip(density * BAND_HZ, 0.0, 1.0), "decay_ms": decay, "rate_hz": rate}
+        return {"power": np.clip(power, 0.0, 1.0), "decay_ms": decay, "rate_hz": rate}
 
     def sentence(self, values: Values) -> str:
         """How often, and at which moments of the membrane's movement."""
