@@ -38,11 +38,21 @@ def summarise(rows: list[dict], alone: list[dict]) -> dict:
         f"{of}, {start}": (of, start) for of in ("moderate", "strong", "real") for start in ("calibrated", "cold")
     }
     parts = {name: [r for r in alone if (r["distortion"], r["start"]) == of] for name, of in groups.items()}
+    parts |= {
+        f"of these {name}": [r for r in alone if synthesiser(r) == name] for name in sorted(map(synthesiser, alone))
+    }
     parts["all"] = alone
     found["false_stops"] = {name: false_stops(part) for name, part in parts.items() if part}
     simulated = [row for row in alone if row["source"] == "simulated"]
     found["curve"] = {start: curve([r[start] for r in rows], simulated, start) for start in ("calibrated", "cold")}
     return found
+
+
+def synthesiser(row: dict) -> str:
+    """What made the robot's voice: the name before the first hyphen, of Kokoro's voices there is none."""
+    return (
+        row["voice"].partition("-")[0] if "-" in row["voice"] else "neural" if row["source"] == "simulated" else "real"
+    )
 
 
 def noticing(judged: Sequence[dict]) -> dict:

@@ -119,6 +119,10 @@ def test_the_program_runs_to_its_tables_and_its_picture(
 
 
 def test_no_stop_in_half_an_hour_says_at_most_seven_an_hour() -> None:
+    assert [
+        closed_loop_report.synthesiser({"voice": voice, "source": source})
+        for voice, source in (("espeak-en-gb+m3", "simulated"), ("af_bella", "simulated"), ("recorded", "real"))
+    ] == ["espeak", "neural", "real"]
     row = {"speech_s": 1800.0, "stops": 0, "said": [["a", 900.0], ["a", 900.0]], "voice": "v"}
     found = closed_loop_report.false_stops([row])
     assert found["per_hour"] == 0.0 and found["interval"][0] == 0.0
