@@ -97,6 +97,7 @@ def from_file(minutes: float, engine: str, slices: int) -> dict:
     """So many minutes of audio through the whole path as fast as it goes."""
     ego, yardstick = EgoFilter(DEMO / "profile.npz", engine), EgoFilter(engine="bypass")
     total, done, out, took, bypassed, parts = round(60 * minutes * SAMPLE_RATE), 0, 0, [], [], []
+    not_finite = 0
     for number, (mic, ref) in enumerate(blocks(total)):
         start = time.thread_time()
         finished = ego.process(mic, ref)
@@ -107,6 +108,7 @@ def from_file(minutes: float, engine: str, slices: int) -> dict:
             bypassed.append(1000 * (time.thread_time() - start))
         ego.events()
         out, done = out + finished.size, done + mic.size
+        not_finite += finished.size - int(np.count_nonzero(np.isfinite(finished)))
         if done * slices // total > len(parts):
             parts.append(
                 Slice(
@@ -126,6 +128,7 @@ def from_file(minutes: float, engine: str, slices: int) -> dict:
         "samples_in": done,
         "samples_out": out,
         "lost": 0,
+        "not_finite": not_finite,
         "slices": [asdict(part) for part in parts],
     }
 
@@ -200,6 +203,8 @@ def judge(result: dict) -> list[str]:
         troubles.append(f"{result['samples_in']} samples in, {result['samples_out']} out")
     if result["lost"]:
         troubles.append(f"{result['lost']} samples lost")
+    if result.get("not_finite"):
+        troubles.append(f"{result['not_finite']} samples are no numbers")
     settled = _settled(result["slices"], SETTLING_S)
     result["memory_growth_mb"] = settled[-1]["memory_mb"] - settled[0]["memory_mb"]
     if result["memory_growth_mb"] > GROWTH_MB:

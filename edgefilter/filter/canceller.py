@@ -35,6 +35,9 @@ AGED_ROWS = 4
 """Partitions whose process noise is worked out anew in a hop, in turn: a path's power changes slowly."""
 SILENCE = 1e-10
 """Mean reference power, full scale^2, below which the path is neither adapted nor allowed to age."""
+LOUDEST = 1e12
+"""Mean square of a predicted echo, full scale 1, at which the filter has diverged and begins anew: the bundled conversation
+over and over took it there after some seven hours."""
 
 
 class CancellerOutput(NamedTuple):
@@ -114,24 +117,29 @@ class Canceller:
         return (max(self.partitions, PRODUCT_PARTITIONS) + 2) * self.hop
 
     def reset(self) -> None:
-        """Back to the start: the calibrated path, or none."""
+        """Back to the start: the calibrated path, or none, and nothing heard."""
+        rows, bins = self.partitions + PRODUCT_PARTITIONS * (self._channels - 1), self.hop + 1
+        self._recent = np.zeros((self._channels, 2 * self.hop), np.float32)
+        self._all_spectra, self._all_powers = (
+            np.zeros((2 * rows, bins), np.complex64),
+            np.zeros((2 * rows, bins), np.float32),
+        )
+        self._moving = np.zeros(DISPLACEMENT_TAPS - 1, np.float32)
+        self._begin(rows)
+        self._slide(to=rows)
+
+    def _begin(self, rows: int) -> None:
+        """The path at the start, whatever was heard of the reference."""
         hop, bins = self.hop, self.hop + 1
-        products = PRODUCT_PARTITIONS * (self._channels - 1)
-        shape = (self.partitions + products, bins)
+        products = rows - self.partitions
+        shape = (rows, bins)
         self._weights = np.zeros(shape, np.complex64)
-        self._blocks = np.zeros((shape[0], 2 * hop), np.float32)
+        self._blocks = np.zeros((rows, 2 * hop), np.float32)
         self._blocks[: self.partitions, :hop] = self._initial.reshape(self.partitions, hop)
         fourier.rfft(self._blocks, out=self._weights)
         product_variance = np.broadcast_to(PRODUCT_VARIANCE * self._path_power(), (products, bins))
         self._covariance = np.concatenate((self._prior(), product_variance)).astype(np.float32)
         self._ageing, self._aged = (1.0 - self.adaptation.transition**2) * fourier.power(self._weights), 0
-        self._recent = np.zeros((self._channels, 2 * hop), np.float32)
-        self._all_spectra, self._all_powers = (
-            np.zeros((2 * shape[0], bins), np.complex64),
-            np.zeros((2 * shape[0], bins), np.float32),
-        )
-        self._slide(to=shape[0])
-        self._moving = np.zeros(DISPLACEMENT_TAPS - 1, np.float32)
         self._noise = np.zeros(bins, np.float32)
         self._work = np.zeros(shape, np.complex64)
         self._expected = np.zeros(shape, np.float32)
@@ -146,9 +154,12 @@ class Canceller:
         located: whether the reference is known to lie where the microphone hears it; the path is adapted only then.
         """
         self._push(reference)
+        path_echo = echo = self._predict()
+        if not path_echo.dot(path_echo) < LOUDEST * self.hop:  # nor where it is no number
+            self._begin(len(self._covariance))
+            path_echo = echo = self._predict()
         np.multiply(self._covariance, self._powers, out=self._expected)
         misalignment = np.add.reduce(self._expected, axis=0)
-        path_echo = echo = self._predict()
         if self.behind:
             echo = self.behind(echo, mic)
         turned = self.volume.follow(mic, echo)

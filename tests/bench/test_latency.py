@@ -162,6 +162,7 @@ def test_a_leak_lost_samples_and_slowing_down_are_found() -> None:
     assert soak.judge(result()) == []
     assert soak.judge(result(samples_out=99)) == ["100 samples in, 99 out"]
     assert soak.judge(result(lost=3)) == ["3 samples lost"]
+    assert soak.judge(result(not_finite=2)) == ["2 samples are no numbers"]
     leaking, slowing, throttled, bimodal = result(), result(), result(), result()
     for number in range(20):
         for key in ("p50_ms", "bypass_ms"):

@@ -60,6 +60,17 @@ def test_unknown_path_is_learnt() -> None:
     assert db(error[-16000:]) < db(mic[-16000:]) - 20
 
 
+@pytest.mark.parametrize("poison", [1e20, np.inf, np.nan])
+def test_a_filter_that_has_diverged_begins_anew(poison: float) -> None:
+    h, x = path(), speechlike(4.0)
+    mic = signal.oaconvolve(x, h)[: x.size].astype(np.float32)
+    canceller = Canceller(HOP, 3200, h)
+    run(canceller, mic[:16000], x[:16000])
+    canceller._weights[3] = poison
+    error = run(canceller, mic[16000:], x[16000:])
+    assert np.isfinite(error).all() and db(error[8000:]) < db(mic[24000:]) - 30
+
+
 def test_error_and_echo_add_up_to_the_microphone_exactly() -> None:
     x, mic = speechlike(0.5), speechlike(0.5, seed=5)
     canceller = Canceller(HOP, 1600, path(taps=1600))
