@@ -105,6 +105,8 @@ class Trainer:
                 if over or self.processes.agree(0 < self.plan.patience <= self.since, self._device()):
                     break
         batches.close()
+        if board:
+            board.close()
         self.processes.leave()
         return self.output / "best.pt"
 

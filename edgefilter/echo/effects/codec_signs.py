@@ -23,11 +23,16 @@ SHORT, LONG = (512, 128), (1024, 256)
 PLACES = ((7, 15), (13, 7), (3, 41))
 """Frames of 8 ms and bins of 31 Hz around a cell within which a change of the voice is one complex gain: a path that moves, a
 gain that changes, a clock that trembles."""
+SHIFTS, SHIFTED = range(3, 17), (1, 41)
+"""Bins by which a sound that is modulated comes back beside itself, either way, and the place around a cell for that."""
 HEARD = 2.0
 """Times the fan that the residual around a cell must have to say something."""
 FOLLOWS = 0.4
 """Correlation, over time in bands, of the residual's level with the voice's: what sounds by itself has none, knocks less than
 0.35."""
+CLEAR, STANDS_OUT, BROAD = 30.0, 1.25, 0.4
+"""Times the fan that the voice must be in a band for its noise to be expected there, that the residual must be to be there,
+and the part of such bands in which it is: what happens in a narrow band alone is no codec's."""
 COHERENT = 0.24
 """Of the residual's power around a cell, what one gain of the voice explains at most: chance is 0.05, codecs are up to 0.22,
 distortions from 0.25 on and all that moves from 0.4 on."""
@@ -43,9 +48,10 @@ FEWEST = 2000
 
 @dataclass(frozen=True)
 class Signs:
-    """Of a whitened residual beside the voice that a model predicts: see FOLLOWS, COHERENT, HARMONIC, PEAKED; cells: how many fine ones."""
+    """Of a whitened residual beside the voice that a model predicts: see FOLLOWS, BROAD, COHERENT, HARMONIC, PEAKED; cells: how many fine ones."""
 
     follows: float
+    broad: float
     coherent: float
     harmonic: float
     peaked: float
@@ -54,7 +60,7 @@ class Signs:
     @property
     def of_a_codec(self) -> bool:
         """Whether all of them are."""
-        alike = self.follows > FOLLOWS and self.coherent < COHERENT
+        alike = self.follows > FOLLOWS and self.broad > BROAD and self.coherent < COHERENT
         return alike and self.harmonic < HARMONIC and self.peaked < PEAKED and self.cells >= FEWEST
 
 
@@ -67,7 +73,8 @@ def signs_of(evidence: Evidence) -> Signs:
     fine = convolve_from(voice, taps, LEAD)
     voice, left = voice + fine, left - fine
     heard = evidence.grid.usable & (uniform_filter1d(voice * voice, LONG[0]) > HEARD)
-    return Signs(_follows(voice, left, heard), _coherent(voice, left, heard), *_fine(voice, left, heard))
+    follows, broad = _follows(voice, left, heard)
+    return Signs(follows, broad, _coherent(voice, left, heard), *_fine(voice, left, heard))
 
 
 def _spectra(x: Samples, size: int, hop: int) -> NDArray[np.complex64]:
@@ -82,35 +89,52 @@ def _whole(heard: NDArray[np.bool_], size: int, hop: int) -> NDArray[np.bool_]:
     return frames(heard.astype(np.float32), size, hop).mean(axis=1) > 0.9
 
 
-def _follows(voice: Samples, left: Samples, heard: NDArray[np.bool_]) -> float:
-    """Correlation of the two levels in dB within bands over time, where both are over the fan."""
+def _follows(voice: Samples, left: Samples, heard: NDArray[np.bool_]) -> tuple[float, float]:
+    """Correlation of the two levels in dB within bands over time, where both are over the fan; and Signs.broad."""
     (size, hop), edges = SHORT, np.unique(np.geomspace(1, SHORT[0] // 2 - 12, 16).astype(int))
     over, loud = (
         np.add.reduceat(uniform_filter(power_of(_spectra(x, size, hop)), (5, 1)), edges[:-1], axis=1)[:, :-1]
         / np.diff(edges)[:-1]
         for x in (left, voice)
     )
-    use = _whole(heard, size, hop)[:, None] & (over > HEARD) & (loud > HEARD)
+    whole = _whole(heard, size, hop)
+    use = whole[:, None] & (over > HEARD) & (loud > HEARD)
     count = np.maximum(use.sum(axis=0), 1)
     swings = []
     for level in (decibels(np.maximum(over - 1.0, 0.1)), decibels(np.maximum(loud, 0.1))):
         swings.append(use * (level - (use * level).sum(axis=0) / count))
-    return _correlation(*swings)
+    return _correlation(*swings), _breadth(over[whole], loud[whole])
+
+
+def _breadth(over: Array, loud: Array) -> float:
+    """Part of the bands in which the voice (frames, bands) is well over the fan where the residual (frames, bands) stands out of it."""
+    clear = loud.mean(axis=0) > CLEAR
+    return float(np.mean(over.mean(axis=0)[clear] > STANDS_OUT)) if clear.any() else 0.0
 
 
 def _coherent(voice: Samples, left: Samples, heard: NDArray[np.bool_]) -> float:
-    """The most that one gain of the voice around each cell explains of the residual's power, over PLACES."""
+    """The most that one gain of the voice around each cell explains of the residual's power: over PLACES, or shifted by one of SHIFTS."""
     said, rest = (_spectra(x, *SHORT) for x in (voice, left))
-    use = _whole(heard, *SHORT)[:, None]
-    cross, power, over = said.conj() * rest, power_of(said), power_of(rest)
-    most = 0.0
-    for place in PLACES:
-        along = uniform_filter(cross.real, place) ** 2 + uniform_filter(cross.imag, place) ** 2
-        around = uniform_filter(over, place)
-        cells = use & (around > HEARD)
-        explained = along / (uniform_filter(power, place) + np.float32(1e-9))
-        most = max(most, float(explained[cells].sum()) / max(float(around[cells].sum()), 1e-9))
+    use = _whole(heard, *SHORT)
+    most = max(_explained(said, rest, use, place) for place in PLACES)
+    said, rest, use = said[::4], rest[::4], use[::4]
+    for by in SHIFTS:
+        for low, high in ((said, rest), (rest, said)):
+            pair = low[:, :-by], high[:, by:]
+            most = max(most, _explained(*(pair if low is said else pair[::-1]), use, SHIFTED))
     return most
+
+
+def _explained(
+    said: NDArray[np.complex64], rest: NDArray[np.complex64], use: NDArray[np.bool_], place: tuple[int, int]
+) -> float:
+    """Of the power of rest (frames, bins) in those frames, what one gain of said around each cell explains."""
+    cross, power, over = said.conj() * rest, power_of(said), power_of(rest)
+    along = uniform_filter(cross.real, place) ** 2 + uniform_filter(cross.imag, place) ** 2
+    around = uniform_filter(over, place)
+    cells = use[:, None] & (around > HEARD)
+    explained = along / (uniform_filter(power, place) + np.float32(1e-9))
+    return float(explained[cells].sum()) / max(float(around[cells].sum()), 1e-9)
 
 
 def _fine(voice: Samples, left: Samples, heard: NDArray[np.bool_]) -> tuple[float, float, int]:
