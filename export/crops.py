@@ -123,7 +123,8 @@ class Batches:
 
     def draw(self, step: int) -> dict[str, Tensor]:
         """Spectra (batch, frames, bins, 2) by signal, powers (batch, frames, bins), "active" (batch, frames), "scale" (batch,) to TARGET_RMS."""
-        self.close()
+        if self._thread is not None:
+            self._thread.join()
         if self._ready is None or self._ready[0] != step:
             self._prepare(step)
         assert self._ready is not None
@@ -131,11 +132,6 @@ class Batches:
         self._thread = threading.Thread(target=self._prepare, args=(step + 1,))
         self._thread.start()
         return batch
-
-    def close(self) -> None:
-        """Wait for the batch that is being made."""
-        if self._thread is not None:
-            self._thread.join()
 
     def ends(self, names: list[str], seconds: float) -> dict[str, Tensor]:
         """The last seconds of these items, as they are."""

@@ -14,7 +14,6 @@ that of each.
 from __future__ import annotations
 
 import argparse
-import os
 import sys
 from pathlib import Path
 
@@ -101,10 +100,7 @@ def main() -> int:
         shape = Shape(options.batch, options.seconds, options.long_every)
         trainer = Trainer(TASKS[options.network](options), plan, shape, options.output, options.start)
         trainer.run(options.data, options.validation, options.newest)
-        if trainer.processes.world > 1:
-            sys.stdout.flush()
-            sys.stderr.flush()
-            os._exit(0)  # all is written; torch's threads abort an interpreter that they outlive, now and then
+        trainer.processes.leave()
     except (EdgefilterError, OSError) as error:
         print(f"train: {error}", file=sys.stderr)
         return 1

@@ -104,10 +104,8 @@ class Trainer:
                 items.refresh()
                 if over or self.processes.agree(0 < self.plan.patience <= self.since, self._device()):
                     break
-        batches.close()
         if board:
             board.close()
-        self.processes.leave()
         return self.output / "best.pt"
 
     def _one(self, step: int, batch: Mapping[str, Tensor]) -> dict[str, float]:

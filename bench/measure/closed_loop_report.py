@@ -38,9 +38,8 @@ def summarise(rows: list[dict], alone: list[dict]) -> dict:
         f"{of}, {start}": (of, start) for of in ("moderate", "strong", "real") for start in ("calibrated", "cold")
     }
     parts = {name: [r for r in alone if (r["distortion"], r["start"]) == of] for name, of in groups.items()}
-    parts |= {
-        f"of these {name}": [r for r in alone if synthesiser(r) == name] for name in sorted(map(synthesiser, alone))
-    }
+    made_by = sorted({synthesiser(row) for row in alone})
+    parts |= {f"of these {name}": [row for row in alone if synthesiser(row) == name] for name in made_by}
     parts["all"] = alone
     found["false_stops"] = {name: false_stops(part) for name, part in parts.items() if part}
     simulated = [row for row in alone if row["source"] == "simulated"]
@@ -50,9 +49,10 @@ def summarise(rows: list[dict], alone: list[dict]) -> dict:
 
 def synthesiser(row: dict) -> str:
     """What made the robot's voice: the name before the first hyphen, of Kokoro's voices there is none."""
-    return (
-        row["voice"].partition("-")[0] if "-" in row["voice"] else "neural" if row["source"] == "simulated" else "real"
-    )
+    if row["source"] == "real":
+        return "real"
+    maker, hyphen, _ = row["voice"].partition("-")
+    return maker if hyphen else "neural"
 
 
 def noticing(judged: Sequence[dict]) -> dict:

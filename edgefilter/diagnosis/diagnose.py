@@ -188,13 +188,13 @@ def conclude(
     verdict: Verdict = (
         "missing" if believed and not _much_left(found, criteria) else "explained" if quiet else "unexplained"
     )
-    noise = noise_of_the_voice(found, criteria, without) if verdict == "unexplained" else None
+    cut = cut_by_power(found, criteria) if verdict == "unexplained" else None
+    noise = noise_of_the_voice(found, cut, criteria, without) if verdict == "unexplained" else None
     if noise is not None:
         found = searched = noise
         verdict = "missing"
     elif not believed and (quiet or not _partly(prepared, found, criteria)):
-        sure = None if quiet else cut_by_power(found, criteria)
-        found = sure or without_doubtful(found)
+        found = cut or without_doubtful(found)
     unpredictable = any(find(step.name).leaves_noise for step in found.steps)
     remaining = found.final.excess_db
     findings, doubts = findings_of(found, progress)

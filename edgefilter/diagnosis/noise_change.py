@@ -11,10 +11,10 @@ from edgefilter.diagnosis.criteria import Criteria
 from edgefilter.diagnosis.leftover import Leftover, inspect
 from edgefilter.diagnosis.prepare import Prepared
 from edgefilter.diagnosis.score import Judge
-from edgefilter.diagnosis.trials import Found, Trial
-from edgefilter.echo.effect import complete, fitted, vanishes
+from edgefilter.diagnosis.trials import Found, Trial, beside
+from edgefilter.echo.effect import complete
 from edgefilter.echo.effects.catalogue import find, names
-from edgefilter.echo.evidence import Evidence, Score
+from edgefilter.echo.evidence import Score
 from edgefilter.echo.measurement import Measurement, Values
 from edgefilter.echo.model import EchoModel
 
@@ -69,7 +69,7 @@ def look_at_fan(found: Found, criteria: Criteria, without: Collection[str] = ())
     gain = model.microphone_gain(measurement.recording.size)
     residual = (measurement.recording - found.final.prediction) / gain
     left = inspect(prepared, residual)
-    if any(find(name).stage == "noise" or find(name).shows_in_silence for name, _ in model.effects):
+    if any(find(name).is_of_the_fan for name, _ in model.effects):
         return found, left
     heard = bool(np.isfinite(left.quiet_mean_db))
     for name in _of_the_fan(model):
@@ -97,16 +97,9 @@ def look_at_fan(found: Found, criteria: Criteria, without: Collection[str] = ())
 def _held_down(prepared: Prepared, model: EchoModel, without: Collection[str]) -> Iterator[Trial]:
     """The effects that show in the robot's silences as well and that a model lacks, each as a step from it."""
     judge = Judge(prepared)
-    absent = {name for name in names() if find(name).shows_in_silence} - {*dict(model.effects), *without}
-    for name in sorted(absent):
-        values = fitted(find(name), prepared.measurement, model)
-        if vanishes(find(name), values):
-            continue
-        changed, before = model.with_effect(name, values), judge.of(model)
-        after = judge.of(changed)
-        if find(name).plausible(Evidence(values, model, judge, before, after)):
-            size = judge.size_db(after.prediction - before.prediction)
-            yield Trial(name, values, changed, after, before.level_db - after.level_db, size)
+    for name in sorted(name for name in names() if find(name).shows_in_silence and name not in without):
+        if step := beside(judge, name, model):
+            yield step
 
 
 def _judged_anew(found: Found, without: Collection[str]) -> Found:

@@ -163,9 +163,7 @@ class Workbench:
     def beside(self, name: str, others: EchoModel, model: EchoModel) -> Trial:
         """What the effect of that name explains that model has and others has not."""
         before, after = self.score(others), self.score(model)
-        size = self.judge.size_db(after.prediction - before.prediction)
-        if find(name).adds_noise:
-            size = max(size, self.judge.noise_size_db(model))
+        size = size_of_change(self.judge, name, model, before, after)
         return Trial(name, dict(model.effects)[name], model, after, before.level_db - after.level_db, size)
 
     def halves(self, trial: Trial, model: EchoModel) -> bool:
@@ -262,6 +260,29 @@ class Workbench:
             and name not in out
             and find(name).complexity <= most
         ]
+
+
+def beside(judge: Judge, name: str, model: EchoModel, before: Score | None = None) -> Trial | None:
+    """An effect outside the search, fitted beside what a model has; before: that model's score, where it is known.
+
+    None where it is there, its fit finds nothing, or its values do not look like it.
+    """
+    effect = find(name)
+    values = None if name in dict(model.effects) else fitted(effect, judge.measurement, model)
+    if values is None or vanishes(effect, values):
+        return None
+    changed, before = model.with_effect(name, values), before or judge.of(model)
+    after = judge.of(changed)
+    if not effect.plausible(Evidence(values, model, judge, before, after)):
+        return None
+    size = size_of_change(judge, name, changed, before, after)
+    return Trial(name, values, changed, after, before.level_db - after.level_db, size)
+
+
+def size_of_change(judge: Judge, name: str, model: EchoModel, before: Score, after: Score) -> float:
+    """Power over the fan, in dB, of what an effect that model has changes in the prediction, or of the noise that it adds."""
+    size = judge.size_db(after.prediction - before.prediction)
+    return max(size, judge.noise_size_db(model)) if find(name).adds_noise else size
 
 
 def added(start: EchoModel, model: EchoModel) -> list[str]:

@@ -190,6 +190,16 @@ class Effect:
         return type(self).variance is not Effect.variance
 
     @property
+    def noise_is_asked(self) -> bool:
+        """Whether the running filter asks for variance()."""
+        return self.adds_noise and not self.in_what_is_left
+
+    @property
+    def is_of_the_fan(self) -> bool:
+        """Whether the robot's silences tell it."""
+        return self.stage == "noise" or self.shows_in_silence
+
+    @property
     def timed(self) -> bool:
         """Whether what it does depends on when the recording began."""
         return self.event or self.stage == "time"

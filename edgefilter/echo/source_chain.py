@@ -26,15 +26,14 @@ class SourceChain:
 
     def __init__(self, effects: Sequence[tuple[str, Values]] = ()) -> None:
         applied = chain(effects)
-        noisy = {effect.name for effect, _ in applied if effect.adds_noise and not effect.in_what_is_left}
         self._makers = [
             (
-                partial(ExpectedSquare, effect, values, effect.memory or 0) if effect.name in noisy else None,
+                partial(ExpectedSquare, effect, values, effect.memory or 0) if effect.noise_is_asked else None,
                 stream_form(effect, values) if effect.stage == "source" else None,
             )
             for effect, values in applied
         ]
-        self.colours: list[Array] = [effect.colour(values) for effect, values in applied if effect.name in noisy]
+        self.colours: list[Array] = [effect.colour(values) for effect, values in applied if effect.noise_is_asked]
         self.expected: list[Samples] = []
         self._links = self._new_links()
         self.memory = LONG_MEMORY if any(run and not isinstance(run, Windowed) for _, run in self._links) else 0

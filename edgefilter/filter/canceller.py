@@ -107,6 +107,7 @@ class Canceller:
             known = min(self.taps, impulse_response.size)
             self._initial[:known] = impulse_response[:known]
         self._channels = 3 if self.adaptation.products else 1
+        self._rows = self.partitions + PRODUCT_PARTITIONS * (self._channels - 1)
         self._first = [0, self.partitions, self.partitions + PRODUCT_PARTITIONS][: self._channels]
         self._lowpass_reversed = (displacement_taps() / DISPLACEMENT_SCALE).astype(np.float32)[::-1].copy()
         self.reset()
@@ -118,26 +119,25 @@ class Canceller:
 
     def reset(self) -> None:
         """Back to the start: the calibrated path, or none, and nothing heard."""
-        rows, bins = self.partitions + PRODUCT_PARTITIONS * (self._channels - 1), self.hop + 1
+        rows, bins = self._rows, self.hop + 1
         self._recent = np.zeros((self._channels, 2 * self.hop), np.float32)
         self._all_spectra, self._all_powers = (
             np.zeros((2 * rows, bins), np.complex64),
             np.zeros((2 * rows, bins), np.float32),
         )
         self._moving = np.zeros(DISPLACEMENT_TAPS - 1, np.float32)
-        self._begin(rows)
+        self._begin()
         self._slide(to=rows)
 
-    def _begin(self, rows: int) -> None:
+    def _begin(self) -> None:
         """The path at the start, whatever was heard of the reference."""
-        hop, bins = self.hop, self.hop + 1
-        products = rows - self.partitions
+        hop, rows, bins = self.hop, self._rows, self.hop + 1
         shape = (rows, bins)
         self._weights = np.zeros(shape, np.complex64)
         self._blocks = np.zeros((rows, 2 * hop), np.float32)
         self._blocks[: self.partitions, :hop] = self._initial.reshape(self.partitions, hop)
         fourier.rfft(self._blocks, out=self._weights)
-        product_variance = np.broadcast_to(PRODUCT_VARIANCE * self._path_power(), (products, bins))
+        product_variance = np.broadcast_to(PRODUCT_VARIANCE * self._path_power(), (rows - self.partitions, bins))
         self._covariance = np.concatenate((self._prior(), product_variance)).astype(np.float32)
         self._ageing, self._aged = (1.0 - self.adaptation.transition**2) * fourier.power(self._weights), 0
         self._noise = np.zeros(bins, np.float32)
@@ -156,7 +156,7 @@ class Canceller:
         self._push(reference)
         path_echo = echo = self._predict()
         if not path_echo.dot(path_echo) < LOUDEST * self.hop:  # nor where it is no number
-            self._begin(len(self._covariance))
+            self._begin()
             path_echo = echo = self._predict()
         np.multiply(self._covariance, self._powers, out=self._expected)
         misalignment = np.add.reduce(self._expected, axis=0)
@@ -200,7 +200,7 @@ class Canceller:
             first = np.multiply(moved, reference, out=self._recent[1, self.hop :])
             np.multiply(moved, first, out=self._recent[2, self.hop :])
         fresh = fourier.rfft(self._recent)
-        rows = len(self._covariance)
+        rows = self._rows
         if self._at == 0:
             self._all_spectra[rows:], self._all_powers[rows:] = self._spectra, self._powers
             self._slide(to=rows)
@@ -210,7 +210,7 @@ class Canceller:
 
     def _slide(self, to: int) -> None:
         """Look at the rows from `to` on: one place on, all of the past is one place further down without being copied."""
-        self._at, rows = to, slice(to, to + len(self._covariance))
+        self._at, rows = to, slice(to, to + self._rows)
         self._spectra, self._powers = self._all_spectra[rows], self._all_powers[rows]
 
     def _displacement(self, reference: Samples) -> Samples:

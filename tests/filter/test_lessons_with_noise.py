@@ -14,7 +14,7 @@ from edgefilter.filter.echo_path import EchoPath, PathState
 from edgefilter.filter.learner import Heard, Lesson
 
 DEMO = Path(edgefilter.__file__).parent / "demo_data"
-NOISY = next(effect for effect in EFFECTS if effect.adds_noise and not effect.in_what_is_left)
+NOISY = next(effect for effect in EFFECTS if effect.noise_is_asked)
 WITH = ((NOISY.name, {p.name: (p.neutral + p.high) / 2 for p in NOISY.told}),)
 
 

@@ -73,8 +73,9 @@ def signs_of(evidence: Evidence) -> Signs:
     fine = convolve_from(voice, taps, LEAD)
     voice, left = voice + fine, left - fine
     heard = evidence.grid.usable & (uniform_filter1d(voice * voice, LONG[0]) > HEARD)
-    follows, broad = _follows(voice, left, heard)
-    return Signs(follows, broad, _coherent(voice, left, heard), *_fine(voice, left, heard))
+    said, rest, use = _spectra(voice, *SHORT), _spectra(left, *SHORT), _whole(heard, *SHORT)
+    follows, broad = _follows(said, rest, use)
+    return Signs(follows, broad, _coherent(said, rest, use), *_fine(voice, left, heard))
 
 
 def _spectra(x: Samples, size: int, hop: int) -> NDArray[np.complex64]:
@@ -89,15 +90,13 @@ def _whole(heard: NDArray[np.bool_], size: int, hop: int) -> NDArray[np.bool_]:
     return frames(heard.astype(np.float32), size, hop).mean(axis=1) > 0.9
 
 
-def _follows(voice: Samples, left: Samples, heard: NDArray[np.bool_]) -> tuple[float, float]:
-    """Correlation of the two levels in dB within bands over time, where both are over the fan; and Signs.broad."""
-    (size, hop), edges = SHORT, np.unique(np.geomspace(1, SHORT[0] // 2 - 12, 16).astype(int))
+def _follows(said: NDArray[np.complex64], rest: NDArray[np.complex64], whole: NDArray[np.bool_]) -> tuple[float, float]:
+    """Correlation of the levels of both (frames, bins) in dB, within bands over time, where both are over the fan; and Signs.broad."""
+    edges = np.unique(np.geomspace(1, SHORT[0] // 2 - 12, 16).astype(int))
     over, loud = (
-        np.add.reduceat(uniform_filter(power_of(_spectra(x, size, hop)), (5, 1)), edges[:-1], axis=1)[:, :-1]
-        / np.diff(edges)[:-1]
-        for x in (left, voice)
+        np.add.reduceat(uniform_filter(power_of(spectra), (5, 1)), edges[:-1], axis=1)[:, :-1] / np.diff(edges)[:-1]
+        for spectra in (rest, said)
     )
-    whole = _whole(heard, size, hop)
     use = whole[:, None] & (over > HEARD) & (loud > HEARD)
     count = np.maximum(use.sum(axis=0), 1)
     swings = []
@@ -112,16 +111,13 @@ def _breadth(over: Array, loud: Array) -> float:
     return float(np.mean(over.mean(axis=0)[clear] > STANDS_OUT)) if clear.any() else 0.0
 
 
-def _coherent(voice: Samples, left: Samples, heard: NDArray[np.bool_]) -> float:
+def _coherent(said: NDArray[np.complex64], rest: NDArray[np.complex64], use: NDArray[np.bool_]) -> float:
     """The most that one gain of the voice around each cell explains of the residual's power: over PLACES, or shifted by one of SHIFTS."""
-    said, rest = (_spectra(x, *SHORT) for x in (voice, left))
-    use = _whole(heard, *SHORT)
     most = max(_explained(said, rest, use, place) for place in PLACES)
     said, rest, use = said[::4], rest[::4], use[::4]
     for by in SHIFTS:
-        for low, high in ((said, rest), (rest, said)):
-            pair = low[:, :-by], high[:, by:]
-            most = max(most, _explained(*(pair if low is said else pair[::-1]), use, SHIFTED))
+        for pair in ((said[:, :-by], rest[:, by:]), (said[:, by:], rest[:, :-by])):
+            most = max(most, _explained(*pair, use, SHIFTED))
     return most
 
 
