@@ -132,12 +132,16 @@ class AlignmentStats(AlignmentCounts, total=False):
 
 
 class LinearStageStats(TypedDict):
-    """What the canceller did: hops, those in which it adapted, its length in hops, the playback gain that it follows."""
+    """What the canceller did: hops, those in which it adapted, its length in hops, the playback gain that it follows.
+
+    diverged: how often it began anew because what it predicted was beyond all reason.
+    """
 
     hops: int
     active_hops: int
     partitions: int
     gain_db: float
+    diverged: int
 
 
 class DeadlineStats(TypedDict):

@@ -3,12 +3,14 @@
 Memory, time per hop and samples must not drift.
 
     OMP_NUM_THREADS=1 python -m bench.measure.soak --minutes 60 --output bench/results/soak
+    OMP_NUM_THREADS=1 python -m bench.measure.soak --minutes 600 --one-way --engine ss --output bench/results/soak_one_way
     OMP_NUM_THREADS=1 python -m bench.measure.soak --live 10 --output bench/results/soak_live    (needs PulseAudio)
 
 Exit code 1 where something drifted. The sound is the bundled conversation over and over, the reference with a clock
-that is PPM fast, so that the alignment has work to do for ever. Memory and processor time per block are read once in
-every slice, the learner's memory each second, of which the slice has the most; the first tenth of the run, 15 s at
-least, is warm-up.
+that is PPM fast for TURN_S and as much slow for the next, so that the alignment has work to do for ever; --one-way: fast
+all the time, so that after some seven hours the lag is beyond all that are looked for. Memory and processor time per
+block are read once in every slice, the learner's memory each second, of which the slice has the most; the first tenth
+of the run, 15 s at least, is warm-up.
 """
 
 from __future__ import annotations
@@ -36,6 +38,8 @@ from edgefilter.types import SAMPLE_RATE
 
 DEMO = Path(edgefilter.__file__).parent / "demo_data"
 PPM = 50.0
+TURN_S = 3600.0
+"""After so long the clock that was fast is slow: the buffers of a real machine let no lag grow for ever."""
 BLOCK = 320
 """Samples a block, 20 ms: no multiple of any hop."""
 GROWTH_MB = 3.0
@@ -81,24 +85,31 @@ def children_mb(pid: int) -> float:
     return sum(memory_mb(child) + children_mb(child) for child in children)
 
 
-def blocks(total: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+def ahead(heard: np.ndarray, one_way: bool) -> np.ndarray:
+    """Samples that the reference's clock has gained when so many were heard."""
+    turn = round(TURN_S * SAMPLE_RATE)
+    return PPM * 1e-6 * (heard if one_way else turn - np.abs(heard % (2 * turn) - turn))
+
+
+def blocks(total: int, one_way: bool = False) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     """Total samples of the conversation in a loop, the reference on its own clock."""
     mic, ref = (soundfile.read(DEMO / f"{name}.flac", dtype="float32")[0] for name in ("mic", "reference"))
     for at in range(0, total, BLOCK):
         count = min(BLOCK, total - at)
-        place = np.arange(at, at + count) * (1.0 + PPM * 1e-6)
+        heard = np.arange(at, at + count)
+        place = heard + ahead(heard, one_way)
         whole = place.astype(np.int64)
         part = (place - whole).astype(np.float32)
         reference = (1 - part) * ref[whole % ref.size] + part * ref[(whole + 1) % ref.size]
-        yield mic[np.arange(at, at + count) % mic.size], reference
+        yield mic[heard % mic.size], reference
 
 
-def from_file(minutes: float, engine: str, slices: int) -> dict:
+def from_file(minutes: float, engine: str, slices: int, one_way: bool = False) -> dict:
     """So many minutes of audio through the whole path as fast as it goes."""
     ego, yardstick = EgoFilter(DEMO / "profile.npz", engine), EgoFilter(engine="bypass")
     total, done, out, took, bypassed, parts = round(60 * minutes * SAMPLE_RATE), 0, 0, [], [], []
     not_finite = 0
-    for number, (mic, ref) in enumerate(blocks(total)):
+    for number, (mic, ref) in enumerate(blocks(total, one_way)):
         start = time.thread_time()
         finished = ego.process(mic, ref)
         took.append(1000 * (time.thread_time() - start))
@@ -122,13 +133,16 @@ def from_file(minutes: float, engine: str, slices: int) -> dict:
             took.clear()
             bypassed.clear()
     out += ego.flush().size
+    linear = ego.stats()["linear_stage"]
     return {
         "kind": "file",
         "engine": ego.engine_name,
+        "one_way": one_way,
         "samples_in": done,
         "samples_out": out,
         "lost": 0,
         "not_finite": not_finite,
+        "diverged": linear["diverged"] if linear else 0,
         "slices": [asdict(part) for part in parts],
     }
 
@@ -205,6 +219,8 @@ def judge(result: dict) -> list[str]:
         troubles.append(f"{result['lost']} samples lost")
     if result.get("not_finite"):
         troubles.append(f"{result['not_finite']} samples are no numbers")
+    if result.get("diverged"):
+        troubles.append(f"the canceller diverged {result['diverged']} times")
     settled = _settled(result["slices"], SETTLING_S)
     result["memory_growth_mb"] = settled[-1]["memory_mb"] - settled[0]["memory_mb"]
     if result["memory_growth_mb"] > GROWTH_MB:
@@ -283,7 +299,8 @@ def title(result: dict) -> str:
     """How long, of what, how."""
     minutes = result["samples_in"] / SAMPLE_RATE / 60
     pace = "live" if result["kind"] == "live" else "faster than real time"
-    return f"Soak: {minutes:.0f} minutes of `{result['engine']}`, {pace}"
+    beyond = ", a lag that grows all the time" if result.get("one_way") else ""
+    return f"Soak: {minutes:.0f} minutes of `{result['engine']}`, {pace}{beyond}"
 
 
 def draw(result: dict, output: Path) -> None:
@@ -308,13 +325,16 @@ def main() -> int:
         "--minutes", type=float, default=60.0, help="of audio, faster than real time (default: %(default)s)"
     )
     parser.add_argument("--live", type=float, metavar="MINUTES", help="run live on a virtual device instead")
+    parser.add_argument("--one-way", action="store_true", help="the reference's clock is fast all the time")
     parser.add_argument("--engine", default="auto")
     parser.add_argument("--slices", type=int, default=20)
     parser.add_argument("--output", type=Path, help="without suffix; .json, .md and .png are written")
     args = parser.parse_args()
     made_with = results_writer.stamp({"DEMO": [DEMO]}, [args.engine])
     result = (
-        live(args.live, args.engine, args.slices) if args.live else from_file(args.minutes, args.engine, args.slices)
+        live(args.live, args.engine, args.slices)
+        if args.live
+        else from_file(args.minutes, args.engine, args.slices, args.one_way)
     )
     result["load_average"] = os.getloadavg()[0]
     result["troubles"] = judge(result)

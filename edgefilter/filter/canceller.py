@@ -30,14 +30,14 @@ PRODUCT_VARIANCE = 2e-3
 VOLUME_REOPENS = 0.02
 """Variance of a path whose volume was turned, relative to its power: the factor is not known exactly."""
 REOPEN = 0.3
-"""Variance, relative to its power, of a path that is found to be another one."""
+"""Variance, relative to its power, of a path that is found to be another one. Of the path itself as much is kept as is
+heard: kept whole, a variance that grows with it let it grow without end."""
 AGED_ROWS = 4
 """Partitions whose process noise is worked out anew in a hop, in turn: a path's power changes slowly."""
 SILENCE = 1e-10
 """Mean reference power, full scale^2, below which the path is neither adapted nor allowed to age."""
 LOUDEST = 1e12
-"""Mean square of a predicted echo, full scale 1, at which the filter has diverged and begins anew: the bundled conversation
-over and over took it there after some seven hours."""
+"""Mean square of a predicted echo, full scale 1, at which the filter has diverged and begins anew."""
 
 
 class CancellerOutput(NamedTuple):
@@ -126,6 +126,7 @@ class Canceller:
             np.zeros((2 * rows, bins), np.float32),
         )
         self._moving = np.zeros(DISPLACEMENT_TAPS - 1, np.float32)
+        self._diverged = 0
         self._begin()
         self._slide(to=rows)
 
@@ -157,6 +158,7 @@ class Canceller:
         path_echo = echo = self._predict()
         if not path_echo.dot(path_echo) < LOUDEST * self.hop:  # nor where it is no number
             self._begin()
+            self._diverged += 1
             path_echo = echo = self._predict()
         np.multiply(self._covariance, self._powers, out=self._expected)
         misalignment = np.add.reduce(self._expected, axis=0)
@@ -180,6 +182,7 @@ class Canceller:
             self._active += 1
             if self._limiter.changed:
                 np.maximum(self._covariance, REOPEN * fourier.power(self._weights), out=self._covariance)
+                self._weights *= self._limiter.heard
             self._adapt(error_spectrum, 1.0 / (0.5 * misalignment + self._noise + 1e-12))
             if self.adaptation.posterior and not excessive:
                 echo = echo + (self._predict() - path_echo) if self.behind else self._predict()
@@ -315,4 +318,5 @@ class Canceller:
             "active_hops": self._active,
             "partitions": self.partitions,
             "gain_db": 20.0 * float(np.log10(self.volume.gain)),
+            "diverged": self._diverged,
         }

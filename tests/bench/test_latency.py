@@ -152,6 +152,12 @@ def test_one_minute_of_audio_does_not_drift(tmp_path: Path, monkeypatch: pytest.
     assert "nothing drifted" in page and "(soak.png)" in page and (tmp_path / "soak.png").stat().st_size > 5_000
 
 
+def test_the_lag_of_the_long_run_comes_back_unless_it_shall_grow() -> None:
+    hours = 3600 * 16000 * np.arange(4)
+    np.testing.assert_allclose(soak.ahead(hours, one_way=False), [0, 2880, 0, 2880])  # 50 ppm of an hour's samples
+    np.testing.assert_allclose(soak.ahead(hours, one_way=True), [0, 2880, 5760, 8640])
+
+
 def test_a_leak_lost_samples_and_slowing_down_are_found() -> None:
     def result(**changes: object) -> dict:
         slices = [
@@ -163,6 +169,7 @@ def test_a_leak_lost_samples_and_slowing_down_are_found() -> None:
     assert soak.judge(result(samples_out=99)) == ["100 samples in, 99 out"]
     assert soak.judge(result(lost=3)) == ["3 samples lost"]
     assert soak.judge(result(not_finite=2)) == ["2 samples are no numbers"]
+    assert soak.judge(result(diverged=1)) == ["the canceller diverged 1 times"]
     leaking, slowing, throttled, bimodal = result(), result(), result(), result()
     for number in range(20):
         for key in ("p50_ms", "bypass_ms"):

@@ -69,6 +69,17 @@ def test_a_filter_that_has_diverged_begins_anew(poison: float) -> None:
     canceller._weights[3] = poison
     error = run(canceller, mic[16000:], x[16000:])
     assert np.isfinite(error).all() and db(error[8000:]) < db(mic[24000:]) - 30
+    assert canceller.stats()["diverged"] == 1
+
+
+def test_of_a_path_that_has_become_another_one_as_much_is_kept_as_is_heard(monkeypatch: pytest.MonkeyPatch) -> None:
+    x, h = speechlike(2.0), path()
+    canceller = Canceller(HOP, 3200, h)
+    monkeypatch.setattr(canceller, "_adapt", lambda *_: None)  # what adaptation repairs is not the question
+    before, variance = np.abs(canceller._weights).max(), canceller._covariance.max()
+    run(canceller, 0.1 * speechlike(2.0, seed=5), x)  # nothing of an echo that is far louder than the microphone
+    assert np.abs(canceller._weights).max() < 0.01 * before
+    assert variance < canceller._covariance.max() < before**2  # once reopened, it does not grow with every doubt
 
 
 def test_error_and_echo_add_up_to_the_microphone_exactly() -> None:
