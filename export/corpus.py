@@ -37,12 +37,15 @@ class Corpus:
         weights = np.array([min(1.0, self.seconds.get(name, ENOUGH_S) / ENOUGH_S) ** 2 for name in names])
         return str(rng.choice(names, p=weights / weights.sum()))
 
-    def draw(self, rng: np.random.Generator, speaker: str, seconds: float) -> Samples:
-        """Utterances (n,) of that speaker, 0.1 to 0.5 s apart, cut at `seconds`; peak 0.5."""
+    def draw(self, rng: np.random.Generator, speaker: str, seconds: float, said: list[Path] | None = None) -> Samples:
+        """Utterances (n,) of that speaker, 0.1 to 0.5 s apart, cut at `seconds`; peak 0.5. said: gets their paths."""
         parts: list[Samples] = []
         wanted, have = round(seconds * SAMPLE_RATE), 0
         while have < wanted:
-            part = read_speech(self.speakers[speaker][int(rng.integers(len(self.speakers[speaker])))])
+            path = self.speakers[speaker][int(rng.integers(len(self.speakers[speaker])))]
+            part = read_speech(path)
+            if said is not None:
+                said.append(path)
             pause = np.zeros(int(rng.uniform(0.1, 0.5) * SAMPLE_RATE), np.float32)
             parts += [part, pause]
             have += part.size + pause.size

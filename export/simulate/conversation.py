@@ -71,8 +71,8 @@ def simulate(recipe: Recipe, seed: int, index: int, material: Material) -> Conve
     robot_gain = level / max(active_rms(voice.echo), 1e-9) if voice.echo.any() else 0.0
     near = rng.random() < recipe.near_share
     human_rms = level * 10 ** (rng.uniform(*(recipe.near_db if near else recipe.human_gain_db)) / 20)
-    clean = script.human(rng, recipe, material.humans, path.to_human(rng, material, room, recipe.wideness), samples)
-    clean *= human_rms / max(active_rms(clean), 1e-9)
+    human = script.human(rng, recipe, material.humans, path.to_human(rng, material, room, recipe.wideness), samples)
+    clean = human.clean * (human_rms / max(active_rms(human.clean), 1e-9))
     quiet = rng.random() < recipe.quiet_fan
     fan_rms = human_rms * 10 ** (-(rng.uniform(20, 45) if quiet else rng.uniform(*recipe.fan_db)) / 20)
     noise, psd = fan.noise(rng, material, samples, fan_rms, human_rms, recipe.wideness)
@@ -89,7 +89,7 @@ def simulate(recipe: Recipe, seed: int, index: int, material: Material) -> Conve
         "quiet_fan": bool(quiet),
         "learned": bool(before),
     }
-    return Conversation(mic, clean, voice.reference, profile, stage, before, about | voice.about)
+    return Conversation(mic, clean, voice.reference, profile, stage, before, about | human.about | voice.about)
 
 
 def _room_kind(rng: np.random.Generator, recipe: Recipe) -> str:

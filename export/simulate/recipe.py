@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from edgefilter.echo.measurement import Values
 from export.simulate.linear_stage import BenchSetting, Setting, WideSetting
@@ -102,4 +102,6 @@ WIDE = Recipe(
     plain=0.3,  # what the benchmark measures must stay in the training
 )
 """As wide as reality is known to be: ranges by experiment on real recordings and from the catalogue of effects."""
-RECIPES = {"edge": BENCHMARK, "paper": PAPER, "wide": WIDE}
+MICROPHONE = replace(WIDE, later=0.0)
+"""WIDE for networks that get the microphone alone: what the filter has learned before cannot matter to them."""
+RECIPES = {"edge": BENCHMARK, "paper": PAPER, "wide": WIDE, "microphone": MICROPHONE}

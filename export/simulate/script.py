@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from scipy import signal
@@ -42,15 +43,30 @@ def robot(rng: np.random.Generator, recipe: Recipe, voices: Corpus, samples: int
     return Part(told, played, tuple(utterances))
 
 
-def human(rng: np.random.Generator, recipe: Recipe, humans: Corpus, response: Samples, samples: int) -> Samples:
-    """The human at the microphone (n,): silent at first, then one or more utterances; now and then nobody speaks."""
+@dataclass(frozen=True, eq=False)
+class Human:
+    """The human at the microphone (n,), who it is and the names of the recordings; no speaker where nobody speaks."""
+
+    clean: Samples
+    speaker: str | None = None
+    recordings: tuple[str, ...] = ()
+
+    @property
+    def about(self) -> dict[str, object]:
+        return {"speaker": self.speaker, "recordings": self.recordings}
+
+
+def human(rng: np.random.Generator, recipe: Recipe, humans: Corpus, response: Samples, samples: int) -> Human:
+    """Silent at first, then one or more utterances; now and then nobody speaks."""
     clean = np.zeros(samples, np.float32)
     if rng.random() >= recipe.human:
-        return clean
+        return Human(clean)
+    said: list[Path] = []
     at = int(rng.uniform(*recipe.silence_s) * SAMPLE_RATE)
     speaker = humans.draw_speaker(rng)
     while at < samples - SAMPLE_RATE:
-        speech = humans.draw(rng, speaker, rng.uniform(1.5, 7.0))[: samples - at]
+        speech = humans.draw(rng, speaker, rng.uniform(1.5, 7.0), said)[: samples - at]
         clean[at : at + speech.size] += speech
         at += speech.size + int(rng.uniform(0.5, 3.0) * SAMPLE_RATE)
-    return signal.oaconvolve(clean, response)[:samples].astype(np.float32)
+    heard = signal.oaconvolve(clean, response)[:samples].astype(np.float32)
+    return Human(heard, speaker, tuple(sorted({path.name for path in said})))
