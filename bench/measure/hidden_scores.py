@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from bench import results_writer
 from bench.measure.intervals import wilson
 
 STRENGTHS = ("clear", "moderate", "near")
@@ -169,10 +170,8 @@ def glance(summaries: Mapping[str, dict]) -> str:
     }
     for what, key in (("seconds per case, median", "p50"), ("longest", "max")):
         rows[what] = [f"{s['seconds'][key]:.1f}" for s in summaries.values()]
-    lines = [f"| | {' | '.join(summaries)} |", "| --- " * (len(summaries) + 1) + "|"]
-    return "\n".join(
-        [*lines, *(f"| {' | '.join([what, *cells])} |" for what, cells in rows.items() if any(cells)), "", ""]
-    )
+    told = [[what, *cells] for what, cells in rows.items() if any(cells)]
+    return "\n".join([*results_writer.table(["", *summaries], told), "", ""])
 
 
 def _counted_cell(count: dict | None) -> str:

@@ -79,7 +79,7 @@ def code_version(name: str) -> str:
         package = Path(edgefilter.__file__).parent
         wanted = taught.row(name)
         models = (
-            [*package.rglob("*.onnx"), *package.parent.glob("models/*.onnx")] if wanted.engine in HAVE_MODEL else []
+            [*package.rglob("*.onnx"), *package.parent.glob("models/crnn*.onnx")] if wanted.engine in HAVE_MODEL else []
         )
         entered = {
             package / "filter" / "ego_filter.py",

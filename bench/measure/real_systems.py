@@ -85,7 +85,7 @@ def code_version(system: str) -> str:
         package = Path(edgefilter.__file__).parent
         files = [
             *sorted(package.rglob("*.py")),
-            *sorted(package.parent.glob("models/*.onnx")),
+            *sorted(package.parent.glob("models/crnn*.onnx")),
             *sorted(package.rglob("*.onnx")),
         ]
     return hashlib.sha256(b"".join(path.read_bytes() for path in files)).hexdigest()

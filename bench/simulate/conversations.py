@@ -13,8 +13,9 @@ nl_db (distortion relative to the linear loudspeaker, best gain removed), delay 
 seed, said (the robot's sentences, each with its first and last sample in ref). True delay of the reference in mic:
 lag + delay - ppm 1e-6 t. Kinds: `paper`, one lag of 50-300 ms; `live`, lag before t_main and lag2 after (0-1.2 s each),
 volume turned by up to 3 dB between them (volume_db), clocks 10-300 ppm apart (either sign). Even conversations take
-place in the laboratory (RT60 0.20-0.26 s), odd ones in an office (0.50-0.75 s). Item i of a seed is the same whatever
---count is.
+place in the laboratory (RT60 0.20-0.26 s), odd ones in an office (0.50-0.75 s). --published: rooms and levels as the
+source paper has them, 1800 in the laboratory to 6200 in the office, the human's level spread by 3.28 and 4.29 dB; its 17
+voices are those of ROBOT/train. Item i of a seed is the same whatever --count is.
 
 How it compares with a set of ten `paper` conversations simulated by other hands (lab / office means: theirs; then 60 of
 these with --distortion strong):
@@ -57,7 +58,11 @@ from bench.simulate.simulated_robot import (
 from edgefilter.dsp.metrics import si_sdr
 
 UNFILTERED_DB = {"lab": (-22.0, 1.0), "office": (-26.2, 0.9)}
-"""Mean and standard deviation of the unfiltered SI-SDR (Li, Hindriks & Kunneman 2024, Table 2: -22.0 and -26.3 dB)."""
+"""Mean and standard deviation of the unfiltered SI-SDR: the human's level varies little between two conversations."""
+PUBLISHED_DB = {"lab": (-22.0, 3.28), "office": (-26.3, 4.29)}
+"""The same as published (Li, Hindriks & Kunneman 2024, Table 2)."""
+PUBLISHED_LAB, PUBLISHED_ALL = 1800, 1800 + 6200
+"""Segments of the laboratory, and all (section 4)."""
 
 DISTORTION_DB = {
     "moderate": {"lab": (-26.0, -21.0), "office": (-27.0, -21.0)},
@@ -164,13 +169,19 @@ def draw_lags(rng: np.random.Generator, kind: str, pause: int) -> tuple[int, int
 
 
 def make_scene(
-    seed: int, index: int, kind: str, speech: list[Clip], voices: dict[str, list[Clip]], distortion: str = "moderate"
+    seed: int,
+    index: int,
+    kind: str,
+    speech: list[Clip],
+    voices: dict[str, list[Clip]],
+    distortion: str = "moderate",
+    published: bool = False,
 ) -> Scene:
     """Item index of this seed: signals (n,) float64 and the contents of meta.json."""
     rng = np.random.default_rng([seed, index])
     human_clip = speech[np.random.default_rng(seed).permutation(len(speech))[index % len(speech)]]
     voice = str(rng.choice(sorted(voices)))
-    room_name = "office" if index % 2 else "lab"
+    room_name = room_of(index, published)
     robot, human_m = draw_robot(rng), rng.uniform(1.0, 1.5)
     laboratory = draw_room(rng, "lab", robot.distance_m, robot.direction, human_m)
     room = draw_room(rng, "office", robot.distance_m, robot.direction, human_m) if room_name == "office" else laboratory
@@ -184,7 +195,13 @@ def make_scene(
     clean = np.concatenate([np.zeros(start), voiced, np.zeros(ref.size - start - voiced.size)])
     end = min(start + human.size + RATE // 10, ref.size)
     signals, scores, gain = record_all(
-        rng, UNFILTERED_DB[room_name], robot, (laboratory.robot, room.robot), voice_heard, clean, slice(start, end)
+        rng,
+        (PUBLISHED_DB if published else UNFILTERED_DB)[room_name],
+        robot,
+        (laboratory.robot, room.robot),
+        voice_heard,
+        clean,
+        slice(start, end),
     )
     impulse = np.eye(1, 4096)[0]
     delay = int(np.argmax(np.abs(robot.record(impulse, laboratory.robot, linear=True))))
@@ -193,6 +210,12 @@ def make_scene(
     meta |= {"live": kind == "live", "delay": delay, "seed": [seed, index]}
     fan = signals.pop("fan")
     return Scene({"ref": ref, **signals}, meta, robot, room.robot, gain, fan)
+
+
+def room_of(index: int, published: bool) -> str:
+    """Where item index takes place: in turn, or the laboratory's share spread evenly."""
+    in_lab = index * PUBLISHED_LAB % PUBLISHED_ALL < PUBLISHED_LAB if published else index % 2 == 0
+    return "lab" if in_lab else "office"
 
 
 def make_script(rng: np.random.Generator, kind: str, voice: list[Clip], human_size: int) -> tuple[dict, Array]:
@@ -270,13 +293,14 @@ def main() -> None:
         default="moderate",
         help="of the loudspeaker (default: %(default)s)",
     )
+    parser.add_argument("--published", action="store_true", help="rooms and levels as the source paper has them")
     parser.add_argument("--count", type=int, default=24)
     parser.add_argument("--seed", type=int, default=1)
     options = parser.parse_args()
     speech = read_clips(options.speech, (3.0, 12.0))
     voices = read_voices(options.voices)
     for index in tqdm(range(options.count), unit="conversation", desc=str(options.output)):
-        scene = make_scene(options.seed, index, options.kind, speech, voices, options.distortion)
+        scene = make_scene(options.seed, index, options.kind, speech, voices, options.distortion, options.published)
         folder = options.output / f"{scene.meta['room']}_{index:02d}"
         folder.mkdir(parents=True, exist_ok=True)
         for name, samples in scene.signals.items():

@@ -82,6 +82,20 @@ def test_an_item_does_not_depend_on_how_many_are_made(clips: Path, live: Path, t
         np.testing.assert_array_equal(read(tmp_path / "again" / "lab_00", name), read(live / "lab_00", name))
 
 
+def test_rooms_and_levels_as_published(clips: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    rooms = [conversations.room_of(i, published=True) for i in range(80)]
+    assert rooms.count("lab") == 18 and "lab" in rooms[:1] and "lab" in rooms[70:]  # 1800 of 8000, spread over all
+    assert conversations.PUBLISHED_DB == {"lab": (-22.0, 3.28), "office": (-26.3, 4.29)}  # the paper's Table 2
+    monkeypatch.setattr(conversations, "PUBLISHED_DB", {"office": (-20.0, 0.0)})
+    monkeypatch.setattr(conversations, "UNFILTERED_DB", {"office": (-26.0, 0.0)})
+    speech, voices = conversations.read_clips(clips, (3.0, 12.0)), conversations.read_voices([clips])
+    loud, soft = (
+        conversations.make_scene(7, 1, "paper", speech, voices, published=published).signals["clean"]
+        for published in (True, False)
+    )
+    np.testing.assert_allclose(loud, 10 ** (6 / 20) * soft, atol=1e-9)
+
+
 def test_folder_without_transcripts_is_refused(tmp_path: Path) -> None:
     with pytest.raises(SystemExit, match="transcripts.tsv is missing"):
         conversations.read_clips(tmp_path, (3.0, 12.0))

@@ -98,7 +98,7 @@ def test_summary_counts_by_strength_and_group() -> None:
     }
     assert not hidden_scores.glance({"made": summary})
     table = hidden_scores.glance({"made": summary, "again": hidden_scores.summarise(cases[-1:])})
-    assert "| | made | again |" in table and "| two: both named | 1 of 1 [21, 100] % | 1 of 1 [21, 100] % |" in table
+    assert "|  | made | again |" in table and "| two: both named | 1 of 1 [21, 100] % | 1 of 1 [21, 100] % |" in table
     assert "| nothing: false alarms | 1 of 2 [9, 91] % |  |" in table and "sealed" not in table
     text = hidden_scores.markdown("made", cases, summary)
     assert (

@@ -26,7 +26,7 @@ CLIPPED = """[...document.querySelectorAll('body *')].filter((e) => e.checkVisib
   const cut = getComputedStyle(e).overflowX !== 'visible' && e.scrollWidth > e.clientWidth + 1;
   return outside || cut ? [e.tagName + '.' + e.className + ' ' + e.textContent.slice(0, 40)] : []; })"""
 CONTRAST = """(() => {
-  const parts = (c) => c.match(/[\\d.]+/g).map(Number);
+  const parts = (c) => c.match(/[\\d.]+/g).map((v, i) => c.startsWith('color(') && i < 3 ? 255 * v : Number(v));
   const ground = (e) => { for (; e; e = e.parentElement) { const c = parts(getComputedStyle(e).backgroundColor); if (c[3] !== 0) return c; } };
   const light = (c) => c.slice(0, 3).map((v) => v / 255).map((v) => v <= 0.04045 ? v / 12.92 : ((v + 0.055) / 1.055) ** 2.4)
     .reduce((sum, v, i) => sum + v * [0.2126, 0.7152, 0.0722][i], 0);
