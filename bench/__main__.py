@@ -14,6 +14,7 @@ from __future__ import annotations
 import argparse
 import os
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 from bench import results_writer
@@ -21,6 +22,7 @@ from bench.evaluate import page, slices, systems, table, worst
 from bench.evaluate.clips import Laying, find_clips
 from bench.evaluate.figures import Results
 from bench.evaluate.judge import Setup
+from bench.evaluate.systems import System
 from bench.evaluate.work import evaluate
 from bench.measure.conversation import progress
 from bench.measure.real import names, numbers
@@ -73,9 +75,9 @@ def named_file(text: str) -> tuple[str, Path]:
     return name, Path(path)
 
 
-def stamp(options: argparse.Namespace, recognisers: dict[str, Path]) -> dict:
+def stamp(options: argparse.Namespace, recognisers: dict[str, Path], here: Sequence[System]) -> dict:
     data = {"recordings": options.folders} | ({"HUMAN": [options.speech]} if options.speech else {})
-    return results_writer.stamp(data, ENGINES, recognisers | dict(options.network))
+    return results_writer.stamp(data, ENGINES, recognisers | {row.name: row.model for row in here if row.model})
 
 
 def run(options: argparse.Namespace) -> str:
@@ -86,7 +88,7 @@ def run(options: argparse.Namespace) -> str:
     clips = find_clips(options.folders, laying, options.every)
     networks = dict(options.network)
     here, absent = systems.present(systems.chosen(options.systems, networks))
-    made_with = stamp(options, recognisers)
+    made_with = stamp(options, recognisers, here)
     setup = Setup(options.cache, recognisers, networks)
     results = Results(clips, here, evaluate(clips, here, setup, options.jobs, options.scheduler), list(recognisers))
     groups = table.content(results)

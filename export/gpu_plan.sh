@@ -18,7 +18,7 @@ PYTHON=${PYTHON:-python3} PART_BYTES=15000000
 export OMP_NUM_THREADS=1
 
 many=(--count 20000 --minutes "$SIMULATE_MINUTES") few=(--count 96)
-large=(--channels 24 40 64 64 --hidden 512 --batch 64) edge=(--batch 64) paper=(--norm layer --batch 16 --seconds 4)
+large=(--channels 24 40 64 64 --hidden 512 --batch 64) edge=(--batch 64) paper=(--batch 16 --seconds 4 --long-every 0)
 if [ -n "${QUICK:-}" ]; then
     many=(--count 3 --rooms 3) few=(--count 2 --rooms 3) CORES=1 MINUTES=0.1
     large=(--channels 4 4 4 4 --hidden 8 --batch 2 --steps 4 --every 4) edge=("${large[@]}")

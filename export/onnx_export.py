@@ -4,7 +4,8 @@ python -m export.onnx_export CHECKPOINT --output models/crnn.onnx [--int8] [--fi
 
 A checkpoint is what torch.save made of a dict: network (a state_dict), config (the fields of its configuration),
 figures (what it reached on validation data) and kind ("edge", also where it is missing, or "paper"); all else in it
-says how it was trained, and goes into the file's metadata like the figures. The file is written only once the ONNX
+says how it was trained, and goes into the file's metadata like the figures; of the paper's network, which there is in
+several widths, its sizes go there as well. The file is written only once the ONNX
 checker, the parity test and the size limit have passed; otherwise ModelError says which failed.
 """
 
@@ -19,7 +20,7 @@ import tempfile
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 import onnx
@@ -35,7 +36,7 @@ from edgefilter.types import SAMPLE_RATE
 from export import onnx_parity
 from export.edge_graph import EdgeGraph
 from export.network import EdgeConfig, EdgeCrnn
-from export.paper_network import PaperConfig, PaperCrnn
+from export.paper_network import PaperConfig, PaperCrnn, parameter_count
 
 OPSET = 17
 MAX_EDGE_BYTES = 12_000_000
@@ -126,7 +127,8 @@ def _write_paper(trained: Trained, path: Path) -> None:
     inputs = [torch.rand(1, 50, network.config.bins) for _ in range(2)]
     names = ["mic_magnitude", "reference_magnitude"]
     trace(network, inputs, path, names, ["mask"], {name: {1: "frames"} for name in (*names, "mask")})
-    describe(path, PAPER_TYPE, PAPER_VERSION, PAPER_STFT, trained)
+    sizes = asdict(network.config) | {"parameters": parameter_count(network)}
+    describe(path, PAPER_TYPE, PAPER_VERSION, PAPER_STFT, trained, network=json.dumps(sizes))
 
 
 def trace(

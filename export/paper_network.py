@@ -5,6 +5,7 @@ python -m export.paper_network      prints its parameter and operation counts
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -21,7 +22,11 @@ DILATIONS = (1, 1, 1, 2, 4, 8, 16, 1)
 
 @dataclass(frozen=True)
 class PaperConfig:
-    """Sizes of the paper's Table 1; smaller ones are for tests. filters holds the filters of each convolution."""
+    """Sizes of the paper's Table 1, or of a narrower network of the same shape.
+
+    bins: frequencies of the input and of the mask. filters: of each of the eight convolutions of a branch. lstm: units in
+    each direction. hidden: units of the first dense layer. batch_norm: batch normalisation behind each convolution.
+    """
 
     bins: int = PAPER_STFT.bins
     filters: tuple[int, ...] = (64, 64, 64, 64, 64, 64, 64, 8)
@@ -43,12 +48,17 @@ class PaperCrnn(nn.Module):
     def __init__(self, config: PaperConfig = PaperConfig()) -> None:
         super().__init__()
         self.config = config
-        self.mixture = _branch(config)
-        self.reference = _branch(config)
+        self.mixture = convolutions(config.filters, config.batch_norm)
+        self.reference = convolutions(config.filters, config.batch_norm)
         self.blstm = nn.LSTM(2 * config.filters[-1] * config.bins, config.lstm, batch_first=True, bidirectional=True)
         self.dense = nn.Sequential(
             nn.Linear(2 * config.lstm, config.hidden), nn.ReLU(), nn.Linear(config.hidden, config.bins), nn.Sigmoid()
         )
+
+    @property
+    def last(self) -> nn.Linear:
+        """The layer whose sigmoid is the mask."""
+        return self.dense[2]
 
     def forward(self, mic_magnitude: Tensor, reference_magnitude: Tensor) -> Tensor:
         """Mask (batch, frames, bins) in 0-1 for the mixture's magnitude, from both magnitudes (batch, frames, bins)."""
@@ -58,20 +68,20 @@ class PaperCrnn(nn.Module):
         return self.dense(torch.relu(recurrent))
 
 
-def _branch(config: PaperConfig) -> nn.Sequential:
-    """The eight convolutions of one input, (batch, 1, frames, bins) to (batch, last filters, frames, bins)."""
+def convolutions(filters: Sequence[int], batch_norm: bool) -> nn.Sequential:
+    """The eight convolutions of one input, (batch, 1, frames, bins) to (batch, last of filters, frames, bins)."""
     layers: list[nn.Module] = []
     channels = 1
-    for filters, kernel, dilation in zip(config.filters, KERNELS, DILATIONS, strict=True):
+    for width, kernel, dilation in zip(filters, KERNELS, DILATIONS, strict=True):
         same = (dilation * (kernel[0] // 2), kernel[1] // 2)
-        convolution = nn.Conv2d(channels, filters, kernel, padding=same, dilation=(dilation, 1))
+        convolution = nn.Conv2d(channels, width, kernel, padding=same, dilation=(dilation, 1))
         nn.init.kaiming_normal_(convolution.weight, nonlinearity="relu")
         nn.init.zeros_(convolution.bias)
         layers.append(convolution)
-        if config.batch_norm:
-            layers.append(nn.BatchNorm2d(filters))
+        if batch_norm:
+            layers.append(nn.BatchNorm2d(width))
         layers.append(nn.ReLU())
-        channels = filters
+        channels = width
     return nn.Sequential(*layers)
 
 

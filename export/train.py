@@ -1,8 +1,11 @@
 """Train the edge network, or the paper's, on simulated conversations.
 
     python -m export.train --data DIR --validation DIR --output RUN [--network edge|paper] [--steps 6000] [--seed 1]
-        [--start WEIGHTS.pt] [--smoke]
+        [--filters 64 8 --lstm 400 --hidden 600] [--start WEIGHTS.pt] [--smoke]
     torchrun --nproc-per-node 2 -m export.train ...                             the same on several processes
+
+The paper's network has its own sizes unless --filters, --lstm and --hidden make it narrower. What goes on, by a second
+call or by --start, keeps the sizes that it has.
 
 --start takes the weights of a trained network of the same shape, to go on with other data: with --data made by
 export/dataset.py --profile, an effect that was found in the field is learned. Every --every steps RUN/last.pt is
@@ -15,17 +18,20 @@ from __future__ import annotations
 
 import argparse
 import sys
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
 import torch
 
-from edgefilter.errors import EdgefilterError
+from edgefilter.errors import EdgefilterError, UsageError
 from edgefilter.types import SAMPLE_RATE
 from export.crops import Shape
 from export.losses import LossWeights
 from export.network import EdgeConfig
-from export.tasks import TASKS
+from export.onnx_export import load
+from export.paper_network import PaperCrnn
+from export.tasks import TASKS, EdgeTask, PaperTask
 from export.trainer import Plan, Trainer
 
 
@@ -70,12 +76,20 @@ def arguments() -> argparse.Namespace:
     )
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--hop", type=int, default=256)
-    parser.add_argument("--channels", type=int, nargs=4, default=EdgeConfig.channels)
-    parser.add_argument("--hidden", type=int, default=EdgeConfig.hidden)
-    parser.add_argument("--norm", choices=("layer", "batch", "none"), default="layer")
+    parser.add_argument("--channels", type=int, nargs=4, help=f"of the edge network (default: {EdgeConfig.channels})")
     parser.add_argument(
-        "--erb", type=int, default=0, help="bands as wide as the ear's, 64 say, in place of all frequencies"
+        "--filters",
+        type=int,
+        nargs="+",
+        metavar="N",
+        help="of the paper's network: of its first seven convolutions and of the last (default: 64 8; of one number an eighth)",
     )
+    parser.add_argument("--lstm", type=int, help="units in each direction of the paper's network (default: 400)")
+    parser.add_argument("--hidden", type=int, help=f"units (default: {EdgeConfig.hidden}; of the paper's network 600)")
+    parser.add_argument(
+        "--norm", choices=("layer", "batch", "none"), help="(default: layer; of the paper's network none)"
+    )
+    parser.add_argument("--erb", type=int, help="bands as wide as the ear's, 64 say, in place of all frequencies")
     parser.add_argument("--recogniser", type=Path, metavar="WHISPER", help="folder whose encoder judges the answer too")
     parser.add_argument("--recogniser-weight", type=float, default=0.1)
     parser.add_argument("--suppression", type=float, default=LossWeights.suppression)
@@ -89,6 +103,21 @@ def arguments() -> argparse.Namespace:
     return parser.parse_args()
 
 
+def sizes_before(kind: str, *checkpoints: Path | None) -> dict[str, object]:
+    """Configuration of the network in the first of these files that is there, empty without any.
+
+    Raises UsageError where that is a network of another kind, and ModelError where it is no checkpoint.
+    """
+    for path in checkpoints:
+        if path and path.exists():
+            network = load(path).network
+            found = PaperTask.kind if isinstance(network, PaperCrnn) else EdgeTask.kind
+            if found != kind:
+                raise UsageError(f"{path} holds a network of kind {found}, expected {kind}: give --network {found}")
+            return asdict(network.config)
+    return {}
+
+
 def main() -> int:
     options = arguments()
     try:
@@ -98,7 +127,9 @@ def main() -> int:
         options.output.mkdir(parents=True, exist_ok=True)
         plan = Plan(options.steps, options.rate, options.seed, options.every, options.patience, options.minutes)
         shape = Shape(options.batch, options.seconds, options.long_every)
-        trainer = Trainer(TASKS[options.network](options), plan, shape, options.output, options.start)
+        before = sizes_before(options.network, options.output / "last.pt", options.start)
+        task = TASKS[options.network](options, before)
+        trainer = Trainer(task, plan, shape, options.output, options.start)
         trainer.run(options.data, options.validation, options.newest)
         trainer.processes.leave()
     except (EdgefilterError, OSError) as error:

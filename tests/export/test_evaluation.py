@@ -20,12 +20,15 @@ from bench.measure.intervals import cluster_weights, ratio_interval
 from bench.measure.real_streams import Cells
 from bench.measure.recogniser import find_model
 from bench.measure.score_cache import ScoreCache
+from edgefilter import enhance
 from edgefilter.dsp.metrics import si_sdr
+from edgefilter.engines import create
 from edgefilter.errors import UsageError
 from tests.bench.conftest import RATE, babble
 from tests.bench.evaluated import results
 
-ROWS = "unfiltered,linear-uncalibrated,clean,fan-kept,ideal-mask,voicefilter"
+DATA = Path(__file__).parents[1] / "data"
+ROWS = "unfiltered,linear-uncalibrated,clean,fan-kept,ideal-mask,dtln-aec"
 
 
 def run(output: Path, *arguments: object) -> dict:
@@ -71,7 +74,7 @@ def test_a_cluster_and_processes_give_the_same_figures_and_a_run_that_was_cut_of
     assert row["si_sdr"]["mean"] > lab["rows"]["unfiltered"]["si_sdr"]["mean"]
     assert lab["rows"]["ideal-mask"]["si_sdr"]["mean"] > row["si_sdr"]["mean"] + 3
     assert lab["rows"]["clean"]["si_sdr"] is None and row["erle_db"]["mean"] > 3 and 0 < row["seconds_for_5s"]
-    assert "which the paper used" in first["absent"]["VoiceFilter (the paper's baseline)"]
+    assert first["absent"]["DTLN-aec"].startswith("no package carries its weights")
     page = (tmp_path / "a" / "evaluation.md").read_text()
     assert page.startswith("# Evaluation\n") and "| linear, uncalibrated | neither |" in page
     assert "<title>edgefilter evaluation</title>" in (tmp_path / "a" / "evaluation.html").read_text()
@@ -199,6 +202,45 @@ def test_networks_of_others_are_run_aligned_and_one_that_is_missing_is_named(mon
     here, absent = systems.present(systems.chosen(["gtcrn", "clean"]))
     assert [row.name for row in here] == ["clean"]
     assert absent == {"linear, then GTCRN": "needs the package nobody-has-this: pip install --no-deps nobody-has-this"}
+
+
+def test_the_narrower_network_of_the_paper_filters_what_has_a_calibration_or_says_why_not(
+    live: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (row,) = systems.chosen(["paper-crnn-narrow"])
+    assert row.knows == systems.CALIBRATED and systems.present([row]) == ([row], {})
+    clip = find_clips([live.parent])[0]
+    heard = Heard(clip)
+    out = row.run(heard)
+    assert out.shape == heard.mic.shape and out.dtype == np.float32
+    wanted = enhance(heard.mic, heard.source.read("ref"), None, "paper-crnn", model=systems.NARROW_CRNN)
+    np.testing.assert_array_equal(out, wanted)
+    monkeypatch.setattr(type(heard.source), "profile", None)
+    with pytest.raises(NotHere, match="no calibration of this device"):
+        row.run(heard)
+
+    other = tmp_path / "models" / "paper_crnn_narrow.onnx"
+    before = row.code()
+    monkeypatch.setattr(systems, "NARROW_CRNN", other)
+    why = (
+        "no paper_crnn_narrow.onnx in models/: train one with python -m export.train --network paper --filters 16 2"
+        " --lstm 80 --hidden 150"
+    )
+    assert systems.present([row]) == ([], {row.title: why})
+    other.parent.mkdir()
+    other.write_bytes((DATA / "paper_crnn.onnx").read_bytes())
+    assert systems.present([row]) == ([row], {}) and row.code() != before
+    other.write_bytes((DATA / "crnn.onnx").read_bytes())
+    assert "type edgefilter-crnn, expected edgefilter-paper-crnn" in systems.present([row])[1][row.title]
+
+
+def test_the_narrower_network_is_as_wide_as_its_row_and_its_command_say() -> None:
+    (row,) = systems.chosen(["paper-crnn-narrow"])
+    said = create("paper-crnn", model=systems.NARROW_CRNN).model.session.get_modelmeta().custom_metadata_map
+    sizes = json.loads(said["network"])
+    assert f"({sizes['parameters'] / 1e6:.1f} of 34 M parameters)" in row.title
+    assert (sizes["filters"], sizes["lstm"], sizes["hidden"]) == ([16] * 7 + [2], 80, 150)
+    assert systems.NARROW_CRNN.stat().st_size < 8e6  # the repository keeps it without special storage
 
 
 VOICEFIXER = """

@@ -10,6 +10,7 @@ import onnx
 import pytest
 import torch
 
+from edgefilter import enhance
 from edgefilter.engines.crnn import Crnn
 from edgefilter.engines.onnx_session import open_session
 from edgefilter.engines.paper_crnn import PaperCrnn as PaperEngine
@@ -242,6 +243,28 @@ def test_the_papers_network_is_exported_for_clips_of_any_length_and_with_an_int8
             with torch.no_grad():
                 wanted = network(torch.from_numpy(mic), torch.from_numpy(reference)).numpy()
             assert np.max(np.abs(found - wanted)) < bound
+
+
+def test_a_narrower_network_says_its_sizes_and_the_engine_runs_it(tmp_path, monkeypatch, capsys):
+    torch.manual_seed(3)
+    config = PaperConfig(filters=(3,) * 7 + (2,), lstm=4, hidden=5)
+    state = {"kind": "paper", "config": asdict(config), "network": PaperCrnn(config).state_dict(), "step": 7}
+    torch.save(state, tmp_path / "best.pt")
+    path = tmp_path / "narrow.onnx"
+    assert main([str(tmp_path / "best.pt"), "--output", str(path)]) == 0
+    capsys.readouterr()
+    sizes = {"bins": 601, "filters": [3] * 7 + [2], "lstm": 4, "hidden": 5, "batch_norm": False}
+    count = sum(value.numel() for value in state["network"].values())
+    mic, reference = np.random.default_rng(0).standard_normal((2, 3200)).astype(np.float32)
+    given = enhance(mic, reference, engine="paper-crnn", model=path)
+    model = PaperEngine(path).model
+    said = model.session.get_modelmeta().custom_metadata_map["network"]
+    assert model.training == {"step": 7} and json.loads(said) == sizes | {"parameters": count}
+    monkeypatch.setenv("EDGEFILTER_PAPER_CRNN", str(path))
+    assert PaperEngine().model.path == path
+    named = enhance(mic, reference, engine="paper-crnn")
+    np.testing.assert_array_equal(given, named)
+    assert given.shape == mic.shape and 0 < np.sum(given**2) < np.sum(mic**2)
 
 
 def test_the_test_models_are_what_their_script_makes(tmp_path):

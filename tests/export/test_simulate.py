@@ -54,6 +54,19 @@ def test_the_human_is_inside_the_microphone(parts):
     assert not np.any(silent.clean)
 
 
+def test_an_item_says_who_speaks_and_in_which_recordings(parts):
+    for index in range(3):
+        about = simulate(replace(RECIPES["microphone"], human=1.0, plain=0.0), 2, index, parts).about
+        known = {path.name for path in parts.humans.speakers[about["speaker"]]}
+        assert about["recordings"] and set(about["recordings"]) <= known
+    silent = simulate(replace(RECIPES["microphone"], human=0.0, plain=0.0), 2, 0, parts).about
+    assert silent["speaker"] is None and silent["recordings"] == ()
+
+
+def test_the_microphones_recipe_is_the_wide_one_without_the_filters_past():
+    assert replace(RECIPES["microphone"], later=WIDE.later) == WIDE and RECIPES["microphone"].later == 0
+
+
 @pytest.mark.parametrize("kind", sorted(KINDS))
 def test_each_kind_of_distortion_is_as_loud_as_asked_and_none_of_it_is_the_voice_itself(kind):
     rng = np.random.default_rng(4)

@@ -1,6 +1,7 @@
 """Dataset, network, losses and the training loop on seconds of sound."""
 
 import json
+from dataclasses import asdict
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from export.crops import Batches, Items, Shape
 from export.losses import LossWeights, edge_loss, power_law_loss, si_sdr
 from export.network import MOST_LOGITS, EdgeConfig, EdgeCrnn, corrected, count, erb_bands, opened
 from export.paper_network import PaperConfig
+from export.tasks import FIRST_MASK, PaperTask, filters_of
 from export.trainer import Plan, optimisers
 from tests.export.speech import write_librispeech, write_table
 
@@ -341,24 +343,83 @@ def test_small_weights_are_half_of_the_average_and_training_goes_on_from_them(tm
     assert checkpoint.main() == 1 and "expected at most" in capsys.readouterr().err and not weights.exists()
 
 
-def test_the_papers_network_trains_too(tmp_path, monkeypatch):
-    narrow = PaperConfig(filters=(2, 2, 2, 2, 2, 2, 2, 2), lstm=4, hidden=8)
-    monkeypatch.setattr("export.tasks.PaperConfig", lambda batch_norm: narrow)
-    arguments = [
-        "--data",
-        str(tmp_path / "d"),
-        "--validation",
-        str(tmp_path / "v"),
-        "--output",
-        str(tmp_path / "run"),
-        "--network",
-        "paper",
-        "--smoke",
-    ]
-    monkeypatch.setattr("sys.argv", ["train", *arguments])
-    train.main()
+NARROW = ("--network", "paper", "--filters", "3", "2", "--lstm", "4", "--hidden", "5")
+
+
+@pytest.fixture
+def trained(tmp_path, monkeypatch):
+    """Four steps of train.py into tmp_path / name; its exit code."""
+
+    def run(name, *more):
+        folders = ["--data", str(tmp_path / "d"), "--validation", str(tmp_path / "v"), "--output", str(tmp_path / name)]
+        monkeypatch.setattr("sys.argv", ["train", *folders, "--smoke", *more])
+        return train.main()
+
+    return run
+
+
+def test_the_papers_network_trains_in_the_width_that_was_asked_for(trained, tmp_path):
+    assert trained("run", *NARROW) == 0
     saved = torch.load(tmp_path / "run" / "best.pt", weights_only=True)
-    assert saved["kind"] == "paper" and saved["config"]["lstm"] == 4
+    config = {"bins": 601, "filters": (3,) * 7 + (2,), "lstm": 4, "hidden": 5, "batch_norm": False}
+    assert saved["kind"] == "paper" and saved["config"] == config
+    assert saved["network"]["blstm.weight_hh_l0"].shape == (4 * 4, 4)
+    assert all(torch.isfinite(value).all() for value in saved["network"].values())
+
+
+def test_without_a_width_the_papers_network_is_that_of_table_1(monkeypatch):
+    monkeypatch.setattr("sys.argv", "train --data d --validation v --output r --network paper".split())
+    assert PaperTask(train.arguments()).config() == asdict(PaperConfig())
+    assert filters_of([16]) == (16,) * 7 + (2,) and filters_of([4]) == (4,) * 7 + (1,)
+
+
+def test_before_training_the_papers_network_lets_through_as_much_as_there_is_of_the_human(monkeypatch):
+    monkeypatch.setattr("sys.argv", ["train", "--data", "d", "--validation", "v", "--output", "r", *NARROW])
+    torch.manual_seed(0)
+    with torch.no_grad():
+        mask = PaperTask(train.arguments()).network()(*torch.rand(2, 1, 20, 601))
+    assert float(mask.log().mean().exp()) == pytest.approx(FIRST_MASK, rel=0.5)  # random weights turn it a little
+    assert 20 * np.log10(FIRST_MASK) == pytest.approx(-25)
+
+
+def test_a_training_of_the_papers_network_goes_on_in_its_own_width(trained, tmp_path, capsys):
+    assert trained("run", *NARROW, "--norm", "batch") == 0
+    assert trained("run", "--network", "paper") == 0
+    assert "from step 4" in capsys.readouterr().out
+    assert trained("more", "--network", "paper", "--start", str(tmp_path / "run" / "best.pt")) == 0
+    configs = [torch.load(tmp_path / name / "last.pt", weights_only=True)["config"] for name in ("run", "more")]
+    assert configs[0] == configs[1] and configs[0]["lstm"] == 4 and configs[0]["batch_norm"]
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ("--filters 4", "--filters is of --network paper, and this is --network edge: leave it out"),
+        ("--lstm 4", "--lstm is of --network paper"),
+        ("--network paper --channels 4 4 4 4", "--channels is of --network edge, and this is --network paper"),
+        ("--network paper --erb 16", "--erb is of --network edge"),
+        ("--network paper --norm layer", "--norm is layer, expected batch or none for --network paper"),
+        ("--network paper --filters 4 4 4", "--filters has 3 numbers, expected one, or two"),
+        ("--network paper --filters 4 0", "--filters has 0, expected 1 or more"),
+        ("--network paper --lstm 0", "--lstm is 0, expected 1 or more"),
+        ("--network paper --hidden -3", "--hidden is -3, expected 1 or more"),
+    ],
+)
+def test_sizes_that_a_network_cannot_have_are_refused_in_one_line(trained, capsys, options, said):
+    assert trained("run", *options.split()) == 1
+    lines = capsys.readouterr().err.splitlines()
+    assert lines[-1].startswith(f"train: {said}") and "Traceback" not in "".join(lines)
+
+
+def test_a_folder_of_another_training_is_left_alone(trained, tmp_path, capsys):
+    assert trained("run", *NARROW) == 0
+    before = (tmp_path / "run" / "last.pt").read_bytes()
+    assert trained("run", *NARROW, "--lstm", "6") == 1
+    said = capsys.readouterr().err.splitlines()[-1]
+    assert "lstm=4" in said and "lstm=6" in said and "or another --output" in said
+    assert trained("run", "--hop", "32") == 1
+    assert "holds a network of kind paper, expected edge: give --network paper" in capsys.readouterr().err
+    assert (tmp_path / "run" / "last.pt").read_bytes() == before
 
 
 def test_every_weight_has_one_optimiser_and_every_matrix_the_one_for_matrices():
