@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 from bench.evaluate.figures import Group, Results
 from bench.evaluate.systems import System
@@ -55,7 +55,7 @@ def content(results: Results) -> list[dict]:
 
 def markdown(results: Results, found: Mapping) -> str:
     """A table for each group and recogniser, the slices, the conclusions, and what could not be had. found: the JSON's content."""
-    lines = [*NOTES, ""]
+    lines = ["## At a glance", "", *_glance(results, found["groups"]), "", *NOTES, ""]
     for group, figures in zip(results.groups, found["groups"], strict=True):
         for recogniser in results.recognisers or ("",):
             lines += [f"## {heading(group, figures, recogniser)}", "", *_table(results, figures, recogniser), ""]
@@ -67,6 +67,28 @@ def markdown(results: Results, found: Mapping) -> str:
     lines += ["## Rows that cannot be had here", ""]
     lines += [f"- {title}: {why}" for title, why in found["absent"].items()] or ["None."]
     return "\n".join(lines)
+
+
+def _glance(results: Results, groups: Sequence[Mapping]) -> list[str]:
+    """Systems down, groups across, one figure each: capped WER of the first recogniser, SI-SDR without one."""
+    recogniser = next(iter(results.recognisers), "")
+    found = {group["set"] + ", " + group["room"]: group for group in groups}
+    found = {
+        name: group for name, group in found.items() if any(_chief(row, recogniser) for row in group["rows"].values())
+    }
+    digits = 0 if recogniser else 1
+    rows = [
+        [system.title, system.knows]
+        + [interval(_chief(group["rows"][system.name], recogniser), digits) for group in found.values()]
+        for system in results.systems
+    ]
+    heads = [f"{name} ({group['clips']})" for name, group in found.items()]
+    said = f"Capped WER, %, {recogniser}" if recogniser else "SI-SDR, dB"
+    return [f"{said}; of each set and room, with its number of clips.", "", *table(["system", "knows", *heads], rows)]
+
+
+def _chief(row: Mapping, recogniser: str) -> Mapping | None:
+    return (row["words"].get(recogniser) or {}).get("capped") if recogniser else row["si_sdr"]
 
 
 def _slice(results: Results, one: Mapping) -> list[str]:

@@ -123,6 +123,22 @@ def test_a_peer_that_is_better_is_shown_as_better() -> None:
         assert group["rows"]["crnn"]["against"]["capped"]["low"] > 0  # ours is worse, and surely so
 
 
+def test_a_glance_has_a_figure_of_each_row_and_group_first() -> None:
+    made = results()
+    content = {"groups": table.content(made), "conclusions": [], "slices": [], "absent": {}}
+    lines = table.markdown(made, content).splitlines()
+    assert lines[0] == "## At a glance" and lines[2].startswith("Capped WER, %, whisper;")
+    heads, _, *rows = [
+        [cell.strip() for cell in line.strip("|").split("|")] for line in lines[4 : 6 + len(made.systems)]
+    ]
+    assert heads == ["system", "knows", *(f"{group.name} ({len(group.members)})" for group in made.groups)]
+    for system, cells in zip(made.systems, rows, strict=True):
+        means = [group["rows"][system.name]["words"]["whisper"]["capped"]["mean"] for group in content["groups"]]
+        assert cells[:2] == [system.title, system.knows] and [cell.split()[0] for cell in cells[2:]] == [
+            f"{m:.0f}" for m in means
+        ]
+
+
 def test_figures_of_a_row() -> None:
     made = results()
     lab, office = made.groups
