@@ -231,7 +231,7 @@ def test_the_narrower_network_of_the_paper_filters_what_has_a_calibration_or_say
     assert out.shape == heard.mic.shape and out.dtype == np.float32
     wanted = enhance(heard.mic, heard.source.read("ref"), None, "paper-crnn", model=systems.NARROW_CRNN)
     np.testing.assert_array_equal(out, wanted)
-    monkeypatch.setattr(type(heard.source), "profile", None)
+    monkeypatch.setitem(vars(heard.source), "profile", None)
     with pytest.raises(NotHere, match="no calibration of this device"):
         row.run(heard)
 
