@@ -32,7 +32,6 @@ from edgefilter.engines import ENGINES
 from edgefilter.errors import EdgefilterError
 from edgefilter.report.html import write_page
 
-CHECKOUT = Path(__file__).parents[1]
 TITLE = "Evaluation"
 
 
@@ -89,7 +88,7 @@ def run(options: argparse.Namespace) -> str:
     clips = find_clips(options.folders, laying, options.every)
     networks = dict(options.network)
     here, absent = systems.present(systems.chosen(options.systems, networks))
-    absent = {title: why.replace(f"{CHECKOUT}/", "") for title, why in absent.items()}
+    absent = {title: why.replace(f"{results_writer.ROOT}/", "") for title, why in absent.items()}
     made_with = stamp(options, recognisers, here)
     setup = Setup(options.cache, recognisers, networks)
     results = Results(clips, here, evaluate(clips, here, setup, options.jobs, options.scheduler), list(recognisers))

@@ -22,6 +22,7 @@ import torch
 from bench.evaluate.d_vector import d_vector
 from edgefilter.errors import EdgefilterError
 from export.corpus import read_corpus
+from export.paper_network import parameter_count
 from export.trainer import Plan
 from export.voicefilter_mixtures import Mixtures, Voices, read_items
 from export.voicefilter_network import VoiceFilterConfig
@@ -71,8 +72,10 @@ def train(options: argparse.Namespace) -> list[str]:
     held_out = mixtures(
         options.validation, options.validation_speech, config, 0, options.output / f"validation_{CACHE}"
     )
-    parameters = sum(parameter.numel() for parameter in trainer.network.parameters())
-    print(f"{parameters} parameters; {len(data.items)} items, {len(data.told)} with a human who is told", flush=True)
+    print(
+        f"{parameter_count(trainer.network)} parameters; {len(data.items)} items, {len(data.told)} with a human who is told",
+        flush=True,
+    )
     trainer.run(data, held_out, options.batch, options.seconds)
     best = rounded(load(options.output / "best.pt"))
     best = replace(best, figures=validate(best.network, held_out))

@@ -72,17 +72,18 @@ def markdown(results: Results, found: Mapping) -> str:
 def _glance(results: Results, groups: Sequence[Mapping]) -> list[str]:
     """Systems down, groups across, one figure each: capped WER of the first recogniser, SI-SDR without one."""
     recogniser = next(iter(results.recognisers), "")
-    found = {group["set"] + ", " + group["room"]: group for group in groups}
     found = {
-        name: group for name, group in found.items() if any(_chief(row, recogniser) for row in group["rows"].values())
+        group.name: figures
+        for group, figures in zip(results.groups, groups, strict=True)
+        if any(_chief(row, recogniser) for row in figures["rows"].values())
     }
     digits = 0 if recogniser else 1
     rows = [
         [system.title, system.knows]
-        + [interval(_chief(group["rows"][system.name], recogniser), digits) for group in found.values()]
+        + [interval(_chief(figures["rows"][system.name], recogniser), digits) for figures in found.values()]
         for system in results.systems
     ]
-    heads = [f"{name} ({group['clips']})" for name, group in found.items()]
+    heads = [f"{name} ({figures['clips']})" for name, figures in found.items()]
     said = f"Capped WER, %, {recogniser}" if recogniser else "SI-SDR, dB"
     return [f"{said}; of each set and room, with its number of clips.", "", *table(["system", "knows", *heads], rows)]
 

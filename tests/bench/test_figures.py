@@ -15,6 +15,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from bench.evaluate.table import interval
+
 ROOT = Path(__file__).parents[2]
 RESULTS = ROOT / "bench" / "results"
 FILES = sorted(path.stem for path in RESULTS.glob("*.json"))
@@ -345,11 +347,8 @@ def evaluated(column: tuple[str, str], system: str) -> str:
     """SI-SDR in dB and capped word errors in %, with their interval; no SI-SDR of the clean human, nothing where none was."""
     (group,) = (one for one in result("evaluation")["groups"] if (one["set"], one["room"]) == column)
     row = group["rows"][system]
-    words = (row["words"]["whisper"] or {}).get("capped")
-    if not words:
-        return ""
-    ratio = f"{row['si_sdr']['mean']:.1f} / " if row["si_sdr"] else ""
-    return f"{ratio}{words['mean']:.0f} [{words['low']:.0f}, {words['high']:.0f}]"
+    words = interval((row["words"]["whisper"] or {}).get("capped"), 0)
+    return f"{row['si_sdr']['mean']:.1f} / {words}" if words and row["si_sdr"] else words
 
 
 def test_the_table_of_the_readme_is_of_the_results() -> None:
