@@ -17,7 +17,7 @@ from edgefilter.types import SAMPLE_RATE
 from export.simulate.linear_stage import from_bytes
 
 POWERS = ("noise", "residual")
-STORED = ("mic", "error", "reference", "clean")
+STORED = ("mic", "error", "reference", "clean", "fan")
 TARGET_RMS = 0.1
 """At which the human is scaled for the loss."""
 SWAPPED = 0.3
@@ -54,10 +54,10 @@ class Items:
         new = [path for path in paths if path.name not in self._items]
         for path in tqdm(new, desc=f"read {self.folder}", unit="item", leave=False):
             with np.load(path) as file:
-                if POWERS[0] not in file:
-                    remedy = "simulate it again with python -m export.dataset"
-                    raise UsageError(f"{path} holds no expected powers: {remedy}")
                 names = (*STORED, *POWERS, "scale", "reference_scale")
+                if missing := [name for name in names if name not in file]:
+                    remedy = "simulate it again with python -m export.dataset"
+                    raise UsageError(f"{path} holds no {' and no '.join(missing)}: {remedy}")
                 self._items[path.name] = {name: torch.from_numpy(file[name]).to(self.device) for name in names}
         self._items = {path.name: self._items[path.name] for path in paths}
         self.names = sorted(self._items)
@@ -151,8 +151,10 @@ class Batches:
         gain, level, told = (
             self._each(10 ** (rng.uniform(-low, high, batch) / 20)) for low, high in (GAIN_DB, LEVEL_DB, TOLD_DB)
         )
+        louder = (gain - 1) * crops["clean"]
         for signal in ("mic", "error", "clean"):
-            crops[signal] = level * (crops[signal] + (gain - 1) * crops["clean"])
+            crops[signal] = level * (crops[signal] + louder)
+        crops["fan"] = level * crops["fan"]
         crops["reference"] = told * crops["reference"]
         for power in POWERS:
             if power in crops:
@@ -192,6 +194,7 @@ class Batches:
             clean = crops["clean"][row]
             rms = 10 ** (-rng.uniform(30, 60) / 20) * (float(clean.abs().max()) or 0.01)
             noise = torch.from_numpy(rng.standard_normal(clean.shape[0], np.float32)).to(clean.device)
+            crops["fan"][row] = rms * noise
             crops["mic"][row] = crops["error"][row] = clean + rms * noise
             crops["reference"][row] = 0.0
             for power, level in (("noise", rms**2 * self.stft.noise_gain()), ("residual", NOTHING)):

@@ -3,8 +3,8 @@
     python -m export.dataset --humans DIR --robots DIR --output DIR [--recipe wide --noise DIR --responses DIR]
         [--count 2000] [--seed 1] [--minutes M] [--profile P.npz] [--scheduler ADDRESS]
 
-Writes DIR/NNNNN.npz per item: mic, reference, error, clean as an engine gets them ((n,) int16 with their scale; echo =
-mic - error), noise, residual (the front's expected power spectra, simulate/linear_stage.py) and about (JSON), and
+Writes DIR/NNNNN.npz per item: mic, reference, error, and of it clean and fan, as an engine gets them ((n,) int16 with
+their scale; echo = mic - error), noise, residual (the front's expected power spectra, simulate/linear_stage.py) and about (JSON), and
 DIR/dataset.json. A second run goes on where the first stopped.
 """
 
@@ -42,10 +42,10 @@ ROOMS = {"lab": 1 / 3, "office": 1 / 2, "hall": 1 / 6}
 def pack(conversation: Conversation, stft: StftConfig, rng: np.random.Generator) -> dict[str, np.ndarray]:
     """The item's arrays: int16 at a scale at which the loudest sample is full. rng: for the linear stage's errors."""
     front = front_end(conversation.stage, conversation.profile, stft, rng, learns=conversation.before > 0)
-    signals = conversation.mic, conversation.reference, conversation.clean
+    signals = conversation.mic, conversation.reference, conversation.clean, conversation.fan
     heard = listen(front, *signals, stft, conversation.before)
-    signals = {"mic": heard.mic, "error": heard.error, "clean": heard.clean, "reference": heard.reference}
-    peak = max(float(np.abs(signals[name]).max()) for name in ("mic", "error", "clean"))
+    signals = {name: getattr(heard, name) for name in ("mic", "error", "clean", "fan", "reference")}
+    peak = max(float(np.abs(samples).max()) for name, samples in signals.items() if name != "reference")
     told = max(float(np.abs(heard.reference).max()), 1e-6)
     scales = {name: told if name == "reference" else max(peak, 1e-6) for name in signals}
     packed = {name: np.round(32767 * samples / scales[name]).astype(np.int16) for name, samples in signals.items()}

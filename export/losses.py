@@ -43,19 +43,22 @@ def power_law_loss(mask: Tensor, mixture: Tensor, clean: Tensor, exponent: float
     return ((mask * mixture + EPSILON) ** exponent - (clean + EPSILON) ** exponent).square().mean()
 
 
-def edge_loss(human: Tensor, logit: Tensor, clean: Tensor, active: Tensor, weights: LossWeights) -> dict[str, Tensor]:
+def edge_loss(
+    human: Tensor, logit: Tensor, clean: Tensor, wanted: Tensor, active: Tensor, weights: LossWeights
+) -> dict[str, Tensor]:
     """Terms and their weighted "total".
 
-    human, clean: (batch, frames, bins, 2), scaled so that speech is near 1. logit, active: (batch, frames). suppression
-    counts once more where the estimate is below the human: words that are gone do not come back (Braun & Tashev 2020
+    human, clean, wanted: (batch, frames, bins, 2), scaled so that speech is near 1; wanted is the human with as much of
+    the fan as the estimate should keep. logit, active: (batch, frames). suppression
+    counts once more where the estimate is below what is wanted: words that are gone do not come back (Braun & Tashev 2020
     compress likewise; the asymmetry follows Wang et al. 2020, "VoiceFilter-Lite", eq. (2)).
     """
     magnitude, phased = compressed(human, weights.compression)
-    wanted, wanted_phased = compressed(clean, weights.compression)
-    missing = torch.relu(wanted - magnitude)
+    target, target_phased = compressed(wanted, weights.compression)
+    missing = torch.relu(target - magnitude)
     terms = {
-        "complex": (phased - wanted_phased).square().sum(-1).mean(),
-        "magnitude": (magnitude - wanted).square().mean(),
+        "complex": (phased - target_phased).square().sum(-1).mean(),
+        "magnitude": (magnitude - target).square().mean(),
         "suppression": missing.square().mean(),
         "si_sdr": -si_sdr(human, clean),
         "speech": binary_cross_entropy_with_logits(logit, active),

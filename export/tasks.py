@@ -68,7 +68,7 @@ class EdgeTask:
         self.weights = LossWeights(suppression=options.suppression, si_sdr=options.si_sdr)
         self.stft, self.half = self._config.stft, not options.full_precision
         self.recogniser = RecogniserLoss(options.recogniser, self.stft) if options.recogniser else None
-        self.recogniser_weight = options.recogniser_weight
+        self.recogniser_weight, self.fan_kept = options.recogniser_weight, options.fan_kept
 
     def network(self) -> EdgeCrnn:
         return EdgeCrnn(self._config).to(memory_format=torch.channels_last)
@@ -90,8 +90,9 @@ class EdgeTask:
         with torch.autocast(inputs[0].device.type, torch.bfloat16, enabled=self.half and network.training):
             human, logit, _ = network(*inputs, network.initial_state(inputs[0].shape[0]))
         scale = batch["scale"][:, None, None, None]
-        human, clean = scale * human.float(), scale * batch["clean"]
-        terms = edge_loss(human, logit.float(), clean, batch["active"], self.weights)
+        human, clean, fan = scale * human.float(), scale * batch["clean"], scale * batch["fan"]
+        wanted = clean + self.fan_kept * fan
+        terms = edge_loss(human, logit.float(), clean, wanted, batch["active"], self.weights)
         if self.recogniser and network.training:
             terms["recogniser"] = self.recogniser(human, clean)
             terms["total"] = terms["total"] + self.recogniser_weight * terms["recogniser"]

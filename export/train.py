@@ -43,6 +43,7 @@ def smoke(options: argparse.Namespace) -> None:
         for index in range(2):
             human, robot = (rng.standard_normal(3 * SAMPLE_RATE).cumsum() % 7 - 3 for _ in range(2))
             signals = {"mic": human + 9 * robot, "error": human + robot, "reference": 9 * robot, "clean": human}
+            signals["fan"] = 0 * human
             packed = {name: np.round(1000 * samples).astype(np.int16) for name, samples in signals.items()}
             shape = human.size // options.hop, options.hop + 1
             powers = {name: np.full(shape, level, np.uint8) for name, level in (("noise", 60), ("residual", 90))}
@@ -92,6 +93,9 @@ def arguments() -> argparse.Namespace:
     parser.add_argument("--erb", type=int, help="bands as wide as the ear's, 64 say, in place of all frequencies")
     parser.add_argument("--recogniser", type=Path, metavar="WHISPER", help="folder whose encoder judges the answer too")
     parser.add_argument("--recogniser-weight", type=float, default=0.1)
+    parser.add_argument(
+        "--fan-kept", type=float, default=0.0, metavar="SHARE", help="of the fan's amplitude that the answer should keep"
+    )
     parser.add_argument("--suppression", type=float, default=LossWeights.suppression)
     parser.add_argument("--si-sdr", type=float, default=LossWeights.si_sdr)
     parser.add_argument("--start", type=Path, metavar="CHECKPOINT", help="weights to begin with")

@@ -30,7 +30,7 @@ LOUDEST = 0.95
 
 @dataclass(frozen=True, eq=False)
 class Conversation:
-    """mic, clean, reference: (n,) float32; clean is the human at the microphone.
+    """mic, clean, fan, reference: (n,) float32; clean is the human at the microphone, fan all that is neither human nor robot.
 
     Profile: of a calibration elsewhere, or None. stage: the linear stage that is to run over it. before: samples at the
     beginning that are only there to be learned from.
@@ -38,6 +38,7 @@ class Conversation:
 
     mic: Samples
     clean: Samples
+    fan: Samples
     reference: Samples
     profile: Profile | None
     stage: Stage = Stage()
@@ -77,7 +78,7 @@ def simulate(recipe: Recipe, seed: int, index: int, material: Material) -> Conve
     fan_rms = human_rms * 10 ** (-(rng.uniform(20, 45) if quiet else rng.uniform(*recipe.fan_db)) / 20)
     noise, psd = fan.noise(rng, material, samples, fan_rms, human_rms, recipe.wideness)
     microphone = Microphone.draw(rng, recipe.wideness, recipe.seconds)
-    mic, clean, gain = _recorded(microphone, robot_gain * voice.echo, clean, noise)
+    mic, clean, heard_fan, gain = _recorded(microphone, robot_gain * voice.echo, clean, noise)
     profile, known = _profile(rng, recipe, material, (room, colour), microphone, gain, (robot_gain, voice.path), psd)
     stage = recipe.setting.draw(rng, profile is not None)
     about = {
@@ -89,7 +90,7 @@ def simulate(recipe: Recipe, seed: int, index: int, material: Material) -> Conve
         "quiet_fan": bool(quiet),
         "learned": bool(before),
     }
-    return Conversation(mic, clean, voice.reference, profile, stage, before, about | human.about | voice.about)
+    return Conversation(mic, clean, heard_fan, voice.reference, profile, stage, before, about | human.about | voice.about)
 
 
 def _room_kind(rng: np.random.Generator, recipe: Recipe) -> str:
@@ -118,15 +119,16 @@ def _robot(
     return Voice(echo, said.told, response, about | {"distortion_db": round(level_db, 1)})
 
 
-def _recorded(microphone: Microphone, echo: Samples, clean: Samples, noise: Samples) -> tuple[Samples, Samples, float]:
-    """What the microphone makes of all three together, what it makes of the human, and the gain at which it was recorded."""
-    mic, clean = microphone.filtered(echo + clean + noise), microphone.filtered(clean)
-    gain = microphone.gain(mic.size)
-    mic, clean = gain * mic, gain * clean
+def _recorded(
+    microphone: Microphone, echo: Samples, clean: Samples, noise: Samples
+) -> tuple[Samples, Samples, Samples, float]:
+    """What the microphone makes of all three together, of the human, of the noise, and the gain at which it was recorded."""
+    gain = microphone.gain(echo.size)
+    mic, clean, noise = (gain * microphone.filtered(x) for x in (echo + clean + noise, clean, noise))
     peak = float(np.abs(mic).max(initial=1e-9))
     level = min(1.0, LOUDEST / peak)
     limit = microphone.clip * peak * level
-    return np.clip(level * mic, -limit, limit), level * clean, level
+    return np.clip(level * mic, -limit, limit), level * clean, level * noise, level
 
 
 def _profile(

@@ -121,22 +121,29 @@ def front_end(
 
 @dataclass(frozen=True, eq=False)
 class Heard:
-    """What an engine gets, as sound: mic, reference, error, clean (n,) float32, n a multiple of the hop.
+    """What an engine gets, as sound: mic, reference, error, clean, fan (n,) float32, n a multiple of the hop.
 
     noise, residual: (n / hop, bins) uint8 by `to_bytes`; row t belongs to the frame whose last sample is (t + 1) hop.
-    clean has the gate's gain and the low cut of a front without a profile, which nothing after them can undo.
+    clean and fan have the gate's gain and the low cut of a front without a profile, which nothing after them can undo.
     """
 
     mic: Samples
     reference: Samples
     error: Samples
     clean: Samples
+    fan: Samples
     noise: np.ndarray
     residual: np.ndarray
 
 
 def listen(
-    front: FrontEnd, mic: Samples, reference: Samples, clean: Samples, stft: StftConfig, before: int = 0
+    front: FrontEnd,
+    mic: Samples,
+    reference: Samples,
+    clean: Samples,
+    fan: Samples,
+    stft: StftConfig,
+    before: int = 0,
 ) -> Heard:
     """Run the front over a conversation, (n,) each, and put its frames together to sound again, without what was before.
 
@@ -144,16 +151,16 @@ def listen(
     beside a low cut.
     """
     hop, hops = stft.hop, mic.size // stft.hop
-    own, voices = Analyser(stft), [Synthesiser(stft) for _ in range(4)]
+    own, voices = Analyser(stft, 2), [Synthesiser(stft) for _ in range(5)]
     cut = low_cut(stft) if front.gate is None else np.ones(stft.bins, np.float32)
-    sound = np.zeros((4, (hops + 1) * hop), np.float32)
+    sound = np.zeros((5, (hops + 1) * hop), np.float32)
     noise, residual = np.zeros((2, hops, stft.bins), np.uint8)
-    inputs = np.stack([np.append(x[: hops * hop], np.zeros(hop, np.float32)) for x in (mic, reference, clean)])
+    inputs = np.stack([np.append(x[: hops * hop], np.zeros(hop, np.float32)) for x in (mic, reference, clean, fan)])
     for t in range(hops + 1):
         at = slice(t * hop, (t + 1) * hop)
         frame, _ = front.step(inputs[0, at], inputs[1, at])
-        human = inputs[2, at] * np.float32(GATE if front.gate and front.gate.shut else 1.0)
-        spectra = frame.mic, frame.reference, frame.error, cut * own.push(human)[0]
+        parts = inputs[2:, at] * np.float32(GATE if front.gate and front.gate.shut else 1.0)
+        spectra = frame.mic, frame.reference, frame.error, *(cut * own.push(*parts))
         for row, voice, spectrum in zip(sound, voices, spectra):
             row[at] = voice.push(spectrum)
         if t < hops:

@@ -113,7 +113,7 @@ def test_a_front_that_learns_leaves_less_of_a_loudspeaker_that_distorts(parts):
     item, stft, left = simulate(recipe, 3, 1, parts), StftConfig(), {}
     for learns in (False, True):
         front = front_end(Stage(), None, stft, np.random.default_rng(0), learns)
-        heard = listen(front, item.mic, item.reference, item.clean, stft, before=6 * RATE)
+        heard = listen(front, item.mic, item.reference, item.clean, item.fan, stft, before=6 * RATE)
         left[learns] = 10 * np.log10(np.mean(heard.error**2))
     print(left)
     assert left[True] < left[False] - 0.5
@@ -124,7 +124,7 @@ def test_a_weakened_canceller_leaves_as_much_more_as_asked_and_a_lost_one_everyt
     stft, left = StftConfig(), {}
     for missing_db in (None, -6.0, np.inf):
         front = front_end(Stage(missing_db=missing_db), item.profile, stft, np.random.default_rng(1))
-        heard = listen(front, item.mic, item.reference, item.clean, stft)
+        heard = listen(front, item.mic, item.reference, item.clean, item.fan, stft)
         left[missing_db] = 10 * np.log10(np.mean(heard.error**2) / np.mean(heard.mic**2))
     assert left[None] < -12
     assert left[-6.0] == pytest.approx(-6.0, abs=1.5)  # the filter's energy is exact, its gain for a voice is not
@@ -137,7 +137,7 @@ def test_frames_cut_from_the_stored_sound_are_the_engines_own(parts):
     front = front_end(item.stage, item.profile, stft, np.random.default_rng(0))
     frames = [front.step(item.mic[at : at + 256], item.reference[at : at + 256])[0] for at in range(0, 47872, 256)]
     front = front_end(item.stage, item.profile, stft, np.random.default_rng(0))
-    heard = listen(front, item.mic, item.reference, item.clean, stft)
+    heard = listen(front, item.mic, item.reference, item.clean, item.fan, stft)
     for t in (50, 120, 180):
         found = stft.analyse(heard.error[(t - 1) * 256 : (t + 1) * 256])
         np.testing.assert_allclose(found, frames[t].error, atol=1e-5 * np.abs(frames[t].error).max() + 1e-7)
