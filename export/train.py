@@ -94,7 +94,11 @@ def arguments() -> argparse.Namespace:
     parser.add_argument("--recogniser", type=Path, metavar="WHISPER", help="folder whose encoder judges the answer too")
     parser.add_argument("--recogniser-weight", type=float, default=0.1)
     parser.add_argument(
-        "--fan-kept", type=float, default=0.0, metavar="SHARE", help="of the fan's amplitude that the answer should keep"
+        "--fan-kept",
+        type=float,
+        default=0.0,
+        metavar="SHARE",
+        help="of the fan's amplitude that the answer should keep",
     )
     parser.add_argument("--suppression", type=float, default=LossWeights.suppression)
     parser.add_argument("--si-sdr", type=float, default=LossWeights.si_sdr)

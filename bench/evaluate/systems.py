@@ -27,7 +27,10 @@ VOICE = "the human's voice"
 NONE = ""
 BATCH_NORM = "batch-norm"
 """The name under which --network takes a network with batch normalisation, for the third of the paper's conclusions."""
+NARROW_BATCH_NORM = "paper-crnn-narrow-batch-norm"
+"""The twin of paper-crnn-narrow that was trained with batch normalisation."""
 NARROW_CRNN = Path(__file__).parents[2] / "models" / "paper_crnn_narrow.onnx"
+NARROW_CRNN_NORMED = NARROW_CRNN.with_name("paper_crnn_narrow_batch_norm.onnx")
 """The checkout's own; the package does not bring it."""
 
 
@@ -176,7 +179,8 @@ def _paper() -> list[System]:
         paper_ss,
         System("paper-ss-voicefixer", repaired, "paper", post, CALIBRATED, None, voicefixer.find, voicefixer.version),
         System(**{**crnn.__dict__, "missing": lambda: create("paper-crnn"), "code": _paper_crnn}),
-        _calibrated(_narrow_crnn()),
+        _calibrated(_narrow_crnn("paper-crnn-narrow", NARROW_CRNN)),
+        _calibrated(_narrow_crnn(NARROW_BATCH_NORM, NARROW_CRNN_NORMED, ", with batch normalisation", " --norm batch")),
     ]
 
 
@@ -197,30 +201,24 @@ def _paper_crnn(model: Path | None = None) -> str:
     return quality.code_version("paper-crnn") + hashlib.sha256(Path(path).read_bytes()).hexdigest()
 
 
-def _narrow_crnn() -> System:
-    """The paper's network with fewer filters and units, of this project's training: at full width that takes days."""
+def _narrow_crnn(name: str, model: Path, differs: str = "", trained: str = "") -> System:
+    """The paper's network with fewer filters and units, of this project's training: at full width that takes days.
+
+    differs: for the title. trained: further options of its training.
+    """
 
     def run(heard: Heard) -> Samples:
         source = heard.source
-        return edgefilter.enhance(heard.mic, source.read("ref"), source.profile, "paper-crnn", model=NARROW_CRNN)
+        return edgefilter.enhance(heard.mic, source.read("ref"), source.profile, "paper-crnn", model=model)
 
     def missing() -> object:
-        if not NARROW_CRNN.is_file():
-            remedy = "train one with python -m export.train --network paper --filters 16 2 --lstm 80 --hidden 150"
-            raise NotHere(f"no {NARROW_CRNN.name} in {NARROW_CRNN.parent.name}/: {remedy}")
-        return create("paper-crnn", model=NARROW_CRNN)
+        if not model.is_file():
+            command = f"python -m export.train --network paper --filters 16 2 --lstm 80 --hidden 150{trained}"
+            raise NotHere(f"no {model.name} in {model.parent.name}/: train one with {command}")
+        return create("paper-crnn", model=model)
 
-    title = "CRNN of the paper's shape, narrower (1.8 of 34 M parameters)"
-    return System(
-        "paper-crnn-narrow",
-        title,
-        "paper",
-        run,
-        CALIBRATED,
-        missing=missing,
-        code=lambda: _paper_crnn(NARROW_CRNN),
-        model=NARROW_CRNN,
-    )
+    title = f"CRNN of the paper's shape, narrower (1.8 of 34 M parameters){differs}"
+    return System(name, title, "paper", run, CALIBRATED, missing=missing, code=lambda: _paper_crnn(model), model=model)
 
 
 def _peers() -> list[System]:

@@ -90,7 +90,9 @@ def simulate(recipe: Recipe, seed: int, index: int, material: Material) -> Conve
         "quiet_fan": bool(quiet),
         "learned": bool(before),
     }
-    return Conversation(mic, clean, heard_fan, voice.reference, profile, stage, before, about | human.about | voice.about)
+    return Conversation(
+        mic, clean, heard_fan, voice.reference, profile, stage, before, about | human.about | voice.about
+    )
 
 
 def _room_kind(rng: np.random.Generator, recipe: Recipe) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -182,7 +183,21 @@ def test_slices_hold_every_clip_once_and_the_conclusions_follow_the_figures() ->
     assert slices.correlation(made, "level_db", "paper-ss")[2] < 0 < slices.correlation(made, "level_db", "crnn")[2]
     assert volume["verdict"] == "partly seen here" and "level and paper-ss: -0." in volume["figures"]
     assert reverberation["verdict"] == "seen here as well" and "capped WER: paper-ss +" in reverberation["figures"]
-    assert norm["verdict"].startswith("not tested: give --network batch-norm=")
+    assert norm["verdict"].startswith("not tested: needs paper-crnn-narrow-batch-norm, or --network batch-norm=")
+
+
+@pytest.mark.parametrize(("decibels", "verdict"), [(-4.0, "seen here as well"), (4.0, "partly seen here")])
+def test_batch_normalisation_is_judged_in_words_and_in_decibels(decibels: float, verdict: str) -> None:
+    made = results()
+    twins = [replace(made.systems[0], name=name) for name in ("paper-crnn-narrow", systems.NARROW_BATCH_NORM)]
+    made = replace(made, systems=(*made.systems, *twins))
+    for row in made.rows:  # as many words, and so many dB more
+        row[twins[0].name] = row["crnn"]
+        row[twins[1].name] = row["crnn"] | {"si_sdr": row["crnn"]["si_sdr"] + decibels}
+    found = slices.conclusions(made)[2]
+    told = "With it less without: paper-crnn-narrow +0.0 [+0.0, +0.0] points of capped WER; paper-crnn-narrow"
+    assert found["verdict"] == verdict
+    assert found["figures"].startswith(f"{told} {decibels:+.1f} [{decibels:+.1f}, {decibels:+.1f}] dB of SI-SDR")
 
 
 def test_the_worst_clips_come_first() -> None:
@@ -235,9 +250,8 @@ def test_the_narrower_network_of_the_paper_filters_what_has_a_calibration_or_say
     with pytest.raises(NotHere, match="no calibration of this device"):
         row.run(heard)
 
-    other = tmp_path / "models" / "paper_crnn_narrow.onnx"
-    before = row.code()
-    monkeypatch.setattr(systems, "NARROW_CRNN", other)
+    other, before = tmp_path / "models" / "paper_crnn_narrow.onnx", row.code()
+    row = systems._narrow_crnn("paper-crnn-narrow", other)
     why = (
         "no paper_crnn_narrow.onnx in models/: train one with python -m export.train --network paper --filters 16 2"
         " --lstm 80 --hidden 150"

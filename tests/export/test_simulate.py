@@ -95,8 +95,18 @@ def test_a_robot_that_says_nothing_leaves_the_human_and_the_fan(parts):
     alone = replace(WIDE, plain=0.0, robot=0.0, human=1.0, near_share=0.0, fan_db=(40.0, 40.0), wideness=0.0)
     alone = replace(alone, seconds=4.0, silence_s=(0.0, 1.0), later=0.0)
     item = simulate(alone, 6, 0, parts)
-    rest = item.mic - item.clean
-    assert 20 * np.log10(active_rms(item.clean) / active_rms(rest)) == pytest.approx(40.0, abs=1.0)
+    assert 20 * np.log10(active_rms(item.clean) / active_rms(item.fan)) == pytest.approx(40.0, abs=1.0)
+    np.testing.assert_allclose(item.mic, item.clean + item.fan, atol=1e-6)
+    stft = StftConfig()
+    heard = listen(
+        front_end(item.stage, item.profile, stft, np.random.default_rng(0)),
+        item.mic,
+        item.reference,
+        item.clean,
+        item.fan,
+        stft,
+    )
+    np.testing.assert_allclose(heard.error, heard.clean + heard.fan, atol=1e-5)
 
 
 def test_an_item_of_a_filter_that_ran_before_holds_what_came_after(parts):

@@ -16,7 +16,7 @@ from export.crops import Batches, Items, Shape
 from export.losses import LossWeights, edge_loss, power_law_loss, si_sdr
 from export.network import MOST_LOGITS, EdgeConfig, EdgeCrnn, corrected, count, erb_bands, opened
 from export.paper_network import PaperConfig
-from export.tasks import FIRST_MASK, PaperTask, filters_of
+from export.tasks import FIRST_MASK, EdgeTask, PaperTask, filters_of
 from export.trainer import Plan, optimisers
 from tests.export.speech import write_librispeech, write_table
 
@@ -236,7 +236,7 @@ def test_the_loss_is_least_at_the_human_and_minds_suppression_more():
     silent, active = torch.zeros(1, 40), torch.ones(1, 40)
 
     def total(human):
-        return float(edge_loss(human, silent, clean, active, LossWeights(si_sdr=0.0))["total"])
+        return float(edge_loss(human, silent, clean, clean, active, LossWeights(si_sdr=0.0))["total"])
 
     assert total(clean) < total(0.7 * clean)
     quieter, louder = (
@@ -244,6 +244,27 @@ def test_the_loss_is_least_at_the_human_and_minds_suppression_more():
         total(clean * (2 - 0.25**0.3) ** (1 / 0.3)),
     )  # equal steps of the compressed magnitude
     assert quieter > 1.2 * louder
+
+
+def test_a_share_of_the_fan_is_wanted_where_it_was_asked_for(data, monkeypatch):
+    """The loss of an answer with as much of the fan as asked is that of the human where nothing was asked."""
+    batch = Batches(Items(data), StftConfig(), Shape(2, 1.0), seed=1).draw(0)
+
+    def loss(kept, answered):
+        given = ["train", "--data", "d", "--validation", "v", "--output", "r", "--fan-kept", str(kept)]
+        monkeypatch.setattr("sys.argv", given)
+        task, answer = EdgeTask(train.arguments()), batch["clean"] + answered * batch["fan"]
+        monkeypatch.setattr(EdgeCrnn, "forward", lambda self, *_: (answer, torch.zeros(answer.shape[:2]), ()))
+        return float(task.loss(task.network(), batch)[0]["magnitude"])
+
+    assert loss(0.0, 0.0) == pytest.approx(0.0, abs=1e-9) == loss(0.2, 0.2)
+    assert loss(0.2, 0.0) > 1e-3 < loss(0.0, 0.2)
+
+
+@pytest.mark.parametrize("share", ["-0.1", "1.5"])
+def test_a_share_of_the_fan_is_a_share(trained, capsys, share):
+    assert trained("run", "--fan-kept", share) == 1
+    assert f"--fan-kept is {float(share):g}, expected 0 to 1" in capsys.readouterr().err
 
 
 def test_si_sdr_of_spectra_is_that_of_samples():
