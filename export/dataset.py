@@ -122,7 +122,7 @@ def arguments() -> argparse.Namespace:
     parser.add_argument(
         "--hop", type=int, default=256, help="of the linear stage; the window is twice as long (default: %(default)s)"
     )
-    parser.add_argument("--profile", type=Path, help="add the lasting effects of this profile to half of the items")
+    parser.add_argument("--profile", type=Path, help="its effects are added to half of the items")
     parser.add_argument("--rooms", type=int, default=240, help="simulated, half of them offices, a third laboratories")
     parser.add_argument("--minutes", type=float, default=math.inf, help="stop then, with what is there")
     parser.add_argument("--jobs", type=int, default=os.cpu_count())
@@ -149,7 +149,7 @@ def simulate_all(options: argparse.Namespace) -> None:
     began = time.monotonic()
     recipe = RECIPES[options.recipe]
     if options.profile:
-        recipe = replace(recipe, effects=Profile.load(options.profile).echo.lasting().effects)
+        recipe = replace(recipe, effects=Profile.load(options.profile).echo.effects)
     stft = StftConfig(2 * options.hop, options.hop, 2 * options.hop)
     material = Material(
         read_corpus(*options.humans),

@@ -64,6 +64,8 @@ PUBLISHED_DB = {"lab": (-22.0, 3.28), "office": (-26.3, 4.29)}
 PUBLISHED_LAB, PUBLISHED_ALL = 1800, 1800 + 6200
 """Segments of the laboratory, and all (section 4)."""
 
+PACKET = RATE // 50
+"""Samples of a packet of the robot's voice on its way to the loudspeaker, where some are lost: 20 ms."""
 DISTORTION_DB = {
     "moderate": {"lab": (-26.0, -21.0), "office": (-27.0, -21.0)},
     "strong": {"lab": (-21.0, -17.0), "office": (-17.5, -13.5)},
@@ -176,8 +178,12 @@ def make_scene(
     voices: dict[str, list[Clip]],
     distortion: str = "moderate",
     published: bool = False,
+    lost: float = 0.0,
 ) -> Scene:
-    """Item index of this seed: signals (n,) float64 and the contents of meta.json."""
+    """Item index of this seed: signals (n,) float64 and the contents of meta.json.
+
+    lost: share of the robot's packets that never reach its loudspeaker.
+    """
     rng = np.random.default_rng([seed, index])
     human_clip = speech[np.random.default_rng(seed).permutation(len(speech))[index % len(speech)]]
     voice = str(rng.choice(sorted(voices)))
@@ -187,6 +193,7 @@ def make_scene(
     room = draw_room(rng, "office", robot.distance_m, robot.direction, human_m) if room_name == "office" else laboratory
     human = read_speech(human_clip)
     script, ref = make_script(rng, kind, voices[voice], human.size)
+    script |= {"lost": draw_lost(np.random.default_rng([seed, index, 1]), ref, lost)} if lost else {}
     voice_heard = played(ref, script)
     robot, nl_db = with_distortion(robot, voice_heard, room.robot, rng.uniform(*DISTORTION_DB[distortion][room_name]))
 
@@ -234,9 +241,21 @@ def make_script(rng: np.random.Generator, kind: str, voice: list[Clip], human_si
     return script | {"said": [(text, at + i, at + j) for at, of in placed for text, i, j in of]}, ref
 
 
+def draw_lost(rng: np.random.Generator, ref: Array, share: float) -> list[int]:
+    """First samples of that share of the packets of ref (n,) that say something, each lost or not for itself."""
+    firsts = np.arange(0, ref.size - PACKET, PACKET)
+    loud = np.add.reduceat(ref**2, firsts) > 1e-3 * np.mean(ref**2) * PACKET
+    return firsts[loud & (rng.random(firsts.size) < share)].tolist()
+
+
 def played(ref: Array, script: dict) -> Array:
-    """What the converter plays (n,) of ref (n,): each utterance after its lag, on its own clock, as loud as it was turned."""
-    out, at = np.zeros(ref.size), script["t_main"]
+    """What the converter plays (n,) of ref (n,) without the packets that were lost.
+
+    Each utterance after its lag, on its own clock, as loud as it was turned.
+    """
+    out, at, ref = np.zeros(ref.size), script["t_main"], ref.copy()
+    for first in script.get("lost", ()):
+        ref[first : first + PACKET] = 0.0
     lag, lag2 = script["lag"], script.get("lag2", script["lag"])
     out[lag : lag + at] = ref[:at][: ref.size - lag]
     out[at + lag2 :] += 10 ** (script.get("volume_db", 0.0) / 20) * ref[at : ref.size - lag2]
@@ -294,13 +313,29 @@ def main() -> None:
         help="of the loudspeaker (default: %(default)s)",
     )
     parser.add_argument("--published", action="store_true", help="rooms and levels as the source paper has them")
+    parser.add_argument(
+        "--lost-packets",
+        type=float,
+        default=0.0,
+        metavar="SHARE",
+        help="of the robot's voice, streamed in packets of 20 ms, silent where one is lost (default: %(default)g)",
+    )
     parser.add_argument("--count", type=int, default=24)
     parser.add_argument("--seed", type=int, default=1)
     options = parser.parse_args()
     speech = read_clips(options.speech, (3.0, 12.0))
     voices = read_voices(options.voices)
     for index in tqdm(range(options.count), unit="conversation", desc=str(options.output)):
-        scene = make_scene(options.seed, index, options.kind, speech, voices, options.distortion, options.published)
+        scene = make_scene(
+            options.seed,
+            index,
+            options.kind,
+            speech,
+            voices,
+            options.distortion,
+            options.published,
+            options.lost_packets,
+        )
         folder = options.output / f"{scene.meta['room']}_{index:02d}"
         folder.mkdir(parents=True, exist_ok=True)
         for name, samples in scene.signals.items():

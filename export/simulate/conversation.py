@@ -17,7 +17,7 @@ from edgefilter.profile.data import Profile
 from edgefilter.types import PRE_ROLL, SAMPLE_RATE, Samples
 from export.rooms import Room
 from export.simulate import fan, path, script
-from export.simulate.effects import draw_effects
+from export.simulate.effects import draw_effects, elsewhere
 from export.simulate.linear_stage import Stage
 from export.simulate.loudspeaker import active_rms, distorted
 from export.simulate.material import Material
@@ -107,7 +107,7 @@ def _robot(
     moving, silent, person = rng.random(3) < (recipe.moving, 1.0 - recipe.robot, recipe.far_human)
     response = path.path(path.in_room(rng, material, room, recipe.wideness), colour)
     said = script.robot(rng, recipe, material.humans if person else material.robots, samples, moving)
-    effects = recipe.effects if rng.random() < recipe.effects_share else ()
+    effects = elsewhere(rng, recipe.effects, recipe.seconds) if rng.random() < recipe.effects_share else ()
     effects += draw_effects(rng, recipe.catalogue, recipe.wideness, recipe.seconds)
     level_db, ppm = rng.uniform(*recipe.distortion_db), rng.uniform(*recipe.ppm)
     about = {"moving": bool(moving), "utterances": said.utterances, "effects": [name for name, _ in effects]}

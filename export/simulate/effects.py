@@ -6,16 +6,41 @@ from collections.abc import Callable
 
 import numpy as np
 
+from edgefilter.echo.effects.catalogue import find
+from edgefilter.echo.effects.packet_loss import PacketLoss
 from edgefilter.echo.measurement import Values
 from edgefilter.types import SAMPLE_RATE, Array
 
 PATH_CHANGE = 0.3
 """Share of wide items in which the path changes on the way."""
+LOST_MORE = 2.0
+"""Times as many packets are lost at most as in the recording in which that was found, and so many times fewer at least."""
+Found = tuple[tuple[str, Values], ...]
+"""Effects by name, with their values."""
 
 
-def draw_effects(
-    rng: np.random.Generator, share: float, wideness: float, seconds: float
-) -> tuple[tuple[str, Values], ...]:
+def elsewhere(rng: np.random.Generator, found: Found, seconds: float) -> Found:
+    """Effects that were found in one recording, as they are in another of so many seconds.
+
+    What lasts is the same. Other packets are lost, about as often; the other events were that recording's alone.
+    """
+    drawn = [
+        (name, _other_packets(rng, values, seconds) if name == PacketLoss.name else values)
+        for name, values in found
+        if name == PacketLoss.name or not find(name).event
+    ]
+    return tuple(drawn)
+
+
+def _other_packets(rng: np.random.Generator, values: Values, seconds: float) -> Values:
+    length_s, times = float(values["length_ms"]) / 1000, np.atleast_1d(np.asarray(values["times_s"], float))
+    share = times.size * length_s / (times.max() + length_s) * LOST_MORE ** rng.uniform(-1, 1)
+    firsts = np.arange(rng.uniform(0, length_s), seconds, length_s)
+    lost = firsts[rng.random(firsts.size) < share]
+    return {**values, "times_s": lost, "lost": float(lost.size)}
+
+
+def draw_effects(rng: np.random.Generator, share: float, wideness: float, seconds: float) -> Found:
     """None, one or two effects that are nobody's defect in particular, and now and then a path that changes."""
     names: list[str] = []
     if rng.random() < share:

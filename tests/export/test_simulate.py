@@ -12,6 +12,7 @@ from export.corpus import Corpus, read_corpus
 from export.dataset import pack
 from export.rooms import draw_room
 from export.simulate.conversation import simulate
+from export.simulate.effects import elsewhere
 from export.simulate.linear_stage import Stage, WideSetting, from_bytes, front_end, listen
 from export.simulate.loudspeaker import KINDS, active_rms, distorted
 from export.simulate.material import RESPONSES, Material, read_noises, read_responses
@@ -196,6 +197,21 @@ def test_effects_of_a_profile_change_the_robot(parts):
     high = [np.sum(np.abs(np.fft.rfft(item.mic - item.clean))[-item.mic.size // 8 :] ** 2) for item in items]
     assert high[1] < 0.5 * high[0]
     assert items[1].about["effects"] == ["bandlimit"]
+
+
+def test_packets_are_lost_elsewhere_as_often_as_where_they_were_found_and_other_events_are_not():
+    times = np.arange(5) * 0.8  # of 20 ms: 100 ms in 3.22 s
+    lost = {"times_s": times, "length_ms": 20.0, "fill": 0.5, "fade_ms": 1.0, "lost": 5.0}
+    band = {"cutoff_hz": 3000.0, "order": 4.0}
+    found = (("packet_loss", lost), ("path_change", {"time_s": 1.0}), ("bandlimit", band))
+    drawn = [elsewhere(np.random.default_rng(seed), found, 12.0) for seed in range(200)]
+    assert all([name for name, _ in each] == ["packet_loss", "bandlimit"] for each in drawn)
+    assert all(each[1][1] == band and each[0][1]["fill"] == 0.5 for each in drawn)
+    first, second = (each[0][1] for each in drawn[:2])
+    assert not np.array_equal(first["times_s"], second["times_s"]) and first["lost"] == first["times_s"].size
+    shares = [each[0][1]["lost"] * 0.02 / 12.0 for each in drawn]
+    # the mean of 2^u, u evenly in -1 to 1, is 1.5 / (2 ln 2) = 1.08
+    assert np.mean(shares) == pytest.approx(1.08 * 0.1 / 3.22, rel=0.15)
 
 
 def test_rooms_decay_as_long_as_asked():
