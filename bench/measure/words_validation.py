@@ -9,12 +9,14 @@ beside the package's own `ss` and `crnn`, which are mixed with the error as well
 without its profile. --real: humans of --humans laid on the tuning half of the recordings of real loudspeakers
 (bench.measure.real), without a profile. --learning: the filter learns while it runs. Give validation conversations,
 never test ones. Differences are paired: each utterance against its own answer by 'ss'. All systems get the very same
-frames: what stands before the engine runs once.
+frames: what stands before the engine runs once. --known: earlier results by the same code; what they hold is not run
+again.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -167,10 +169,40 @@ def with_shares(name: str, make: Make, shares: list[float]) -> dict[str, Make]:
     return {name: make, **mixed}
 
 
-def judge(case: Case, making: dict[str, Make], learning: bool, recogniser: Recogniser) -> Iterator[dict]:
+Row = tuple[str, str, str]
+"""Of a result: kind, conversation, system."""
+
+
+def read_known(paths: list[Path], made_with: dict) -> dict[Row, dict]:
+    """Rows of earlier results.
+
+    Raises UsageError where one was made by other code, on other data of the same name, or with other models.
+    """
+    known: dict[Row, dict] = {}
+    for path in paths:
+        found = json.loads(path.read_text(encoding="utf-8"))
+        theirs, ours = ({"code": stamp["code"], **hashes(stamp)} for stamp in (found["stamp"], made_with))
+        if other := [name for name in theirs.keys() & ours.keys() if theirs[name] != ours[name]]:
+            raise UsageError(f"{path} was made with another {', another '.join(sorted(other))}: measure it again")
+        known |= {(row["kind"], row["conversation"], row["system"]): row for row in found["utterances"]}
+    return known
+
+
+def hashes(stamp: dict) -> dict[str, str]:
+    """Of the data and models of a stamp, by name."""
+    data = {entry["folder"]: entry["sha256"] for entry in stamp["data"]}
+    return data | {name: model["sha256"] for name, model in stamp["models"].items()}
+
+
+def judge(
+    case: Case, making: dict[str, Make], learning: bool, recogniser: Recogniser, known: dict[Row, dict]
+) -> Iterator[dict]:
     """SI-SDR and word errors of every system."""
     heard: dict[StftConfig, list[Frame]] = {}
     for name, make in making.items():
+        if row := known.get((case.kind, case.name, name)):
+            yield row
+            continue
         engine = make()
         if engine.stft not in heard:
             heard[engine.stft] = frames(case, engine.stft, learning)
@@ -237,6 +269,7 @@ def main() -> int:
     parser.add_argument("--learning", action="store_true", help="the filter learns while it runs")
     parser.add_argument("--wiener", type=float, nargs="*", default=[0.5], help="shares of 'ss' in the answer")
     parser.add_argument("--error", type=float, nargs="*", default=[0.2], help="shares of the linear stage's error")
+    parser.add_argument("--known", type=Path, nargs="*", default=[], metavar="FILE.json", help="earlier results")
     parser.add_argument("--whisper", type=Path, required=True, metavar="DIR")
     parser.add_argument("--output", type=Path, required=True, metavar="PATH")
     parser.add_argument("--cache", type=Path, default=Path.home() / ".cache" / "edgefilter-bench", metavar="DIR")
@@ -252,6 +285,7 @@ def main() -> int:
         }
         real = {"real": [options.real]} if options.real else {}
         made_with = results_writer.stamp({"conversations": options.conversations, **real}, models=models)
+        known = read_known(options.known, made_with)
         making = systems(options.checkpoints, options.wiener, options.error, options.cache / "checkpoints")
         found = every(find_conversations(options.conversations), options.every)
         laid: list[Laid] = []
@@ -263,7 +297,7 @@ def main() -> int:
         for item in progress([*found, *laid], name="conversations"):
             each = [laid_case(item)] if isinstance(item, Laid) else cases(*item, options.cold)
             for case in each:
-                rows += judge(case, making, options.learning, recogniser)
+                rows += judge(case, making, options.learning, recogniser, known)
     except (EdgefilterError, OSError) as error:
         print(f"words_validation: {error}", file=sys.stderr)
         return 1

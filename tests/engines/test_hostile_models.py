@@ -187,7 +187,11 @@ def test_a_network_that_answers_too_loudly_is_turned_down(monkeypatch):
 def test_the_shipped_models_are_the_pinned_ones_and_the_page_says_so():
     page = (ROOT / "models" / "MODELS.md").read_text(encoding="utf-8")
     there = {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in (ROOT / "models").glob("*.onnx")}
-    rows = {"voicefilter.onnx", "paper_crnn_narrow.onnx", "paper_crnn_narrow_batch_norm.onnx"}  # those are the benchmark's
+    rows = {
+        "voicefilter.onnx",
+        "paper_crnn_narrow.onnx",
+        "paper_crnn_narrow_batch_norm.onnx",
+    }  # those are the benchmark's
     engines = {name: found for name, found in there.items() if name not in rows}
     assert onnx_file.SHIPPED == engines
     for name, found in there.items():
