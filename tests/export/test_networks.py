@@ -97,6 +97,34 @@ def test_checkpoints_are_judged_by_words_warm_and_cold_against_ss(tmp_path, run,
     assert "| tiny/last, step 4 | 50 | 50 | 0 | +0.0 [+0.0, +0.0] |" in (tmp_path / "results/words.md").read_text()
 
 
+def test_what_an_earlier_result_holds_is_not_run_again_unless_it_is_of_other_data(
+    tmp_path, run, conversation, monkeypatch, capsys
+):
+    monkeypatch.setattr(words_validation, "Recogniser", Deaf)
+    monkeypatch.setattr(words_validation.Conversation, "profile", None)
+    shared = ["--conversations", conversation, "--whisper", tmp_path / "w", "--wiener", "--error"]
+    (tmp_path / "w").mkdir()
+    (tmp_path / "w" / "model.bin").write_bytes(b"whisper")
+
+    def words(name, *more):
+        given = [*shared, "--cache", tmp_path / "cache", "--output", tmp_path / name, *more]
+        monkeypatch.setattr("sys.argv", ["words_validation", *map(str, given)])
+        return words_validation.main()
+
+    def rows(name):
+        return json.loads((tmp_path / f"{name}.json").read_text())["utterances"]
+
+    assert words("first") == 0
+    ran = []
+    monkeypatch.setattr(words_validation, "answer", lambda *_: ran.append(1) or np.zeros(48000, np.float32))
+    assert words("second", "--checkpoints", run / "last.pt", "--known", tmp_path / "first.json") == 0
+    assert len(ran) == 1 and rows("second")[:3] == rows("first") and len(rows("second")) == 4
+    (conversation / "more.txt").write_text("other data", encoding="utf-8")
+    assert words("third", "--known", tmp_path / "first.json") == 1
+    assert "first.json was made with another conversations: measure it again" in capsys.readouterr().err
+    (conversation / "more.txt").unlink()
+
+
 def test_an_engine_answers_kept_frames_as_a_stream_does():
     mic, ref = 0.1 * np.random.default_rng(0).standard_normal((2, 20000)).astype(np.float32)
     case = words_validation.Case("kind", "name", mic, ref, mic, slice(None), "one")
