@@ -176,15 +176,20 @@ Row = tuple[str, str, str]
 def read_known(paths: list[Path], made_with: dict) -> dict[Row, dict]:
     """Rows of earlier results.
 
-    Raises UsageError where one was made by other code, on other data of the same name, or with other models.
+    Raises UsageError where one is no such result, or was made by other code, on other data of the same name, or with
+    other models.
     """
     known: dict[Row, dict] = {}
     for path in paths:
-        found = json.loads(path.read_text(encoding="utf-8"))
-        theirs, ours = ({"code": stamp["code"], **hashes(stamp)} for stamp in (found["stamp"], made_with))
+        try:
+            found = json.loads(path.read_text(encoding="utf-8"))
+            theirs, rows = {"code": found["stamp"]["code"], **hashes(found["stamp"])}, found["utterances"]
+        except (ValueError, TypeError, KeyError):
+            raise UsageError(f"{path} is no result of words_validation: give the JSON file of one") from None
+        ours = {"code": made_with["code"], **hashes(made_with)}
         if other := [name for name in theirs.keys() & ours.keys() if theirs[name] != ours[name]]:
             raise UsageError(f"{path} was made with another {', another '.join(sorted(other))}: measure it again")
-        known |= {(row["kind"], row["conversation"], row["system"]): row for row in found["utterances"]}
+        known |= {(row["kind"], row["conversation"], row["system"]): row for row in rows}
     return known
 
 

@@ -323,6 +323,8 @@ def main() -> None:
     parser.add_argument("--count", type=int, default=24)
     parser.add_argument("--seed", type=int, default=1)
     options = parser.parse_args()
+    if not 0.0 <= options.lost_packets <= 1.0:
+        sys.exit(f"--lost-packets is {options.lost_packets:g}; expected 0 to 1")
     speech = read_clips(options.speech, (3.0, 12.0))
     voices = read_voices(options.voices)
     for index in tqdm(range(options.count), unit="conversation", desc=str(options.output)):

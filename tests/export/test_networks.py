@@ -122,7 +122,9 @@ def test_what_an_earlier_result_holds_is_not_run_again_unless_it_is_of_other_dat
     (conversation / "more.txt").write_text("other data", encoding="utf-8")
     assert words("third", "--known", tmp_path / "first.json") == 1
     assert "first.json was made with another conversations: measure it again" in capsys.readouterr().err
-    (conversation / "more.txt").unlink()
+    (tmp_path / "first.json").write_text('{"stamp": 1}', encoding="utf-8")
+    assert words("third", "--known", tmp_path / "first.json") == 1
+    assert "first.json is no result of words_validation" in capsys.readouterr().err
 
 
 def test_an_engine_answers_kept_frames_as_a_stream_does():
