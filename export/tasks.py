@@ -92,8 +92,8 @@ class EdgeTask:
         with torch.autocast(inputs[0].device.type, torch.bfloat16, enabled=self.half and network.training):
             human, logit, _ = network(*inputs, network.initial_state(inputs[0].shape[0]))
         scale = batch["scale"][:, None, None, None]
-        human, clean, fan = scale * human.float(), scale * batch["clean"], scale * batch["fan"]
-        wanted = clean + self.fan_kept * fan
+        human, clean = scale * human.float(), scale * batch["clean"]
+        wanted = clean + self.fan_kept * scale * batch["fan"] if self.fan_kept else clean
         terms = edge_loss(human, logit.float(), clean, wanted, batch["active"], self.weights)
         if self.recogniser and network.training:
             terms["recogniser"] = self.recogniser(human, clean)

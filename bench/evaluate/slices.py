@@ -103,25 +103,28 @@ def _reverberation(results: Results) -> dict:
     if not network or not _ran(results, "paper-ss") or min(len(group.members) for group in rooms.values()) < FEW // 2:
         return _conclusion(title, [], "")
     signs, told = [], []
-    for metric in dict.fromkeys((metric_of(results), "si_sdr")):
+    for metric, worse, unit in _measures(results):
         draws = {
             (name, room): _draws(results, rooms[room], name, metric) for name in ("paper-ss", network) for room in rooms
         }
         rises = {name: draws[name, "office"] - draws[name, "lab"] for name in ("paper-ss", network)}
-        worse = 1 if metric == "capped" else -1
         signs.append(_sign(*np.nanpercentile(worse * (rises["paper-ss"] - rises[network]), [2.5, 97.5])))
-        unit = "points of capped WER" if metric == "capped" else "dB of SI-SDR"
         each = [f"{name} {_middle(rise)} from {np.nanmedian(draws[name, 'lab']):.1f}" for name, rise in rises.items()]
         told.append(f"{unit}: {', '.join(each)}")
     return _conclusion(title, signs, f"From the laboratory to the office, {'; '.join(told)}.")
+
+
+def _measures(results: Results) -> list[tuple[str, int, str]]:
+    """By what a conclusion is judged: words where there is a recogniser, and dB; 1 where more is worse, else -1; the unit."""
+    words = [("capped", 1, "points of capped WER")] if results.recognisers else []
+    return [*words, ("si_sdr", -1, "dB of SI-SDR")]
 
 
 def _batch_norm(results: Results) -> dict:
     """In words, and in dB, which end at no 100 %; contradicted only where it does help."""
     title = "Batch normalisation does not help"
     signs, told = [], []
-    for metric in dict.fromkeys((metric_of(results), "si_sdr")):
-        worse, unit = (1, "points of capped WER") if metric == "capped" else (-1, "dB of SI-SDR")
+    for metric, worse, unit in _measures(results):
         for normed, without in NORMED.items():
             ran = _ran(results, normed) and _ran(results, without)
             found = whole(results).difference(normed, without, metric) if ran else None

@@ -180,13 +180,13 @@ def read_known(paths: list[Path], made_with: dict) -> dict[Row, dict]:
     other models.
     """
     known: dict[Row, dict] = {}
+    ours = hashes(made_with)
     for path in paths:
         try:
             found = json.loads(path.read_text(encoding="utf-8"))
-            theirs, rows = {"code": found["stamp"]["code"], **hashes(found["stamp"])}, found["utterances"]
+            theirs, rows = hashes(found["stamp"]), found["utterances"]
         except (ValueError, TypeError, KeyError):
             raise UsageError(f"{path} is no result of words_validation: give the JSON file of one") from None
-        ours = {"code": made_with["code"], **hashes(made_with)}
         if other := [name for name in theirs.keys() & ours.keys() if theirs[name] != ours[name]]:
             raise UsageError(f"{path} was made with another {', another '.join(sorted(other))}: measure it again")
         known |= {(row["kind"], row["conversation"], row["system"]): row for row in rows}
@@ -194,9 +194,9 @@ def read_known(paths: list[Path], made_with: dict) -> dict[Row, dict]:
 
 
 def hashes(stamp: dict) -> dict[str, str]:
-    """Of the data and models of a stamp, by name."""
+    """Of the code, data and models of a stamp, by name."""
     data = {entry["folder"]: entry["sha256"] for entry in stamp["data"]}
-    return data | {name: model["sha256"] for name, model in stamp["models"].items()}
+    return {"code": stamp["code"]} | data | {name: model["sha256"] for name, model in stamp["models"].items()}
 
 
 def judge(

@@ -6,9 +6,9 @@ from collections.abc import Callable
 
 import numpy as np
 
-from edgefilter.echo.effects.catalogue import find
 from edgefilter.echo.effects.packet_loss import PacketLoss
 from edgefilter.echo.measurement import Values
+from edgefilter.echo.model import EchoModel
 from edgefilter.types import SAMPLE_RATE, Array
 
 PATH_CHANGE = 0.3
@@ -24,12 +24,8 @@ def elsewhere(rng: np.random.Generator, found: Found, seconds: float) -> Found:
 
     What lasts is the same. Other packets are lost, about as often; the other events were that recording's alone.
     """
-    drawn = [
-        (name, _other_packets(rng, values, seconds) if name == PacketLoss.name else values)
-        for name, values in found
-        if name == PacketLoss.name or not find(name).event
-    ]
-    return tuple(drawn)
+    packets = [(name, _other_packets(rng, values, seconds)) for name, values in found if name == PacketLoss.name]
+    return (*packets, *EchoModel(np.ones(1, np.float32), found).lasting().effects)
 
 
 def _other_packets(rng: np.random.Generator, values: Values, seconds: float) -> Values:
