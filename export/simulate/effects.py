@@ -31,9 +31,13 @@ def elsewhere(rng: np.random.Generator, found: Found, seconds: float) -> Found:
 def _other_packets(rng: np.random.Generator, values: Values, seconds: float) -> Values:
     length_s, times = float(values["length_ms"]) / 1000, np.atleast_1d(np.asarray(values["times_s"], float))
     share = times.size * length_s / (times.max() + length_s) * LOST_MORE ** rng.uniform(-1, 1)
+    return {**values, **_lost(rng, share, length_s, seconds)}
+
+
+def _lost(rng: np.random.Generator, share: float, length_s: float, seconds: float) -> Values:
     firsts = np.arange(rng.uniform(0, length_s), seconds, length_s)
     lost = firsts[rng.random(firsts.size) < share]
-    return {**values, "times_s": lost, "lost": float(lost.size)}
+    return {"times_s": lost, "lost": float(lost.size)}
 
 
 def draw_effects(rng: np.random.Generator, share: float, wideness: float, seconds: float) -> Found:
@@ -90,12 +94,20 @@ def _delay_jump(rng: np.random.Generator, seconds: float) -> Values:
     return {"times_s": np.sort(rng.uniform(1.0, seconds, steps)), "samples": rng.uniform(-400, 400, steps)}
 
 
+def _packet_loss(rng: np.random.Generator, seconds: float) -> Values:
+    length_ms, share = float(rng.choice((10, 20, 30, 40, 60))), 10 ** rng.uniform(-2.5, -1.0)
+    fill, fade_ms = float(rng.choice((0.0, rng.uniform(), 1.0))), float(rng.choice((0.0, rng.uniform(0, 4))))
+    lost = _lost(rng, share, length_ms / 1000, seconds)
+    return {**lost, "length_ms": length_ms, "fill": fill, "fade_ms": fade_ms}
+
+
 DRAWN: dict[str, Callable[[np.random.Generator, float], Values]] = {
     "late_reverb": _late_reverb,
     "chassis_resonance": _chassis_resonance,
     "compression": _compression,
     "bandlimit": _bandlimit,
     "delay_jump": _delay_jump,
+    "packet_loss": _packet_loss,
 }
 """Effects that act on the robot alone; distortion, rattle, volume and drift are drawn for themselves, and what acts on
 the whole microphone is in microphone.py."""

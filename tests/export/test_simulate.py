@@ -7,12 +7,13 @@ import pytest
 import soundfile as sf
 
 from edgefilter.dsp.stft import StftConfig
+from edgefilter.echo.model import EchoModel
 from edgefilter.errors import UsageError
 from export.corpus import Corpus, read_corpus
 from export.dataset import pack
 from export.rooms import draw_room
 from export.simulate.conversation import simulate
-from export.simulate.effects import elsewhere
+from export.simulate.effects import draw_effects, elsewhere
 from export.simulate.linear_stage import Stage, WideSetting, from_bytes, front_end, listen
 from export.simulate.loudspeaker import KINDS, active_rms, distorted
 from export.simulate.material import RESPONSES, Material, read_noises, read_responses
@@ -212,6 +213,18 @@ def test_packets_are_lost_elsewhere_as_often_as_where_they_were_found_and_other_
     shares = [each[0][1]["lost"] * 0.02 / 12.0 for each in drawn]
     # the mean of 2^u, u evenly in -1 to 1, is 1.5 / (2 ln 2) = 1.08
     assert np.mean(shares) == pytest.approx(1.08 * 0.1 / 3.22, rel=0.15)
+
+
+def test_drawn_effects_can_be_predicted_and_packets_are_lost_in_their_shares():
+    shares = []
+    for seed in range(40):
+        drawn = draw_effects(np.random.default_rng(seed), 1.0, 1.0, 12.0)
+        echo = EchoModel(np.eye(1, 32, dtype=np.float32)[0], drawn).predict(np.ones(RATE, np.float32))
+        assert np.isfinite(echo).all(), drawn
+        shares += [v["lost"] * v["length_ms"] / 12000 for name, v in drawn if name == "packet_loss"]
+    assert len(shares) >= 5
+    assert max(shares) < 0.2
+    assert np.median(shares) > 0.003
 
 
 def test_rooms_decay_as_long_as_asked():
