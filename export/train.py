@@ -7,7 +7,8 @@
 The paper's network has its own sizes unless --filters, --lstm and --hidden make it narrower. What goes on, by a second
 call or by --start, keeps the sizes that it has.
 
---start takes the weights of a trained network of the same shape, to go on with other data: with --data made by
+--start takes the weights of a trained network of the same sizes (one of --erb bands may have had another --hop), to go
+on with other data: with --data made by
 export/dataset.py --profile, an effect that was found in the field is learned. Every --every steps RUN/last.pt is
 written (a second call goes on from there; more --steps prolong it), RUN/best.pt where the averaged weights have the best
 validation loss so far; TensorBoard reads RUN, and RUN/log.jsonl has the same figures. With several processes --batch is

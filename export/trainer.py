@@ -65,8 +65,8 @@ class Plan:
 class Trainer:
     """Trains one network into a folder: last.pt to go on from, best.pt by validation loss, log.jsonl.
 
-    start: a checkpoint of a network of the same shape, whose weights are the first. Raises UsageError where its shape, or
-    that of the training in the folder, is another one.
+    start: a checkpoint of a network whose weights are the first; they have to fit, and those of a network of bands fit
+    every transform. Raises UsageError where they do not, and where the training in the folder is of another network.
     """
 
     def __init__(self, task: Task, plan: Plan, shape: Shape, output: Path, start: Path | None = None) -> None:
@@ -160,10 +160,11 @@ class Trainer:
     def _take(self, start: Path) -> Mapping[str, object]:
         """Weights of a trained network; returns what it says of its training."""
         loaded = load(start)
-        found, wanted = loaded.network.config, self.network.config
-        if found != wanted:
-            raise UsageError(f"{start} holds a network of {found}, expected {wanted}: {self.task.remedy}")
-        self.network.load_state_dict(loaded.network.state_dict())
+        try:
+            self.network.load_state_dict(loaded.network.state_dict())
+        except RuntimeError as error:
+            found, wanted = loaded.network.config, self.network.config
+            raise UsageError(f"{start} holds a network of {found}, expected {wanted}: {self.task.remedy}") from error
         return loaded.training
 
     def _resume(self, last: Path, device: torch.device) -> None:

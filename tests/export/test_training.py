@@ -321,11 +321,11 @@ def test_the_rate_rises_stays_and_falls():
 
 
 def test_training_starts_from_given_weights_of_the_same_shape(tmp_path, monkeypatch, capsys):
-    def run(name, hidden, *more):
+    def run(name, hidden, *more, hop="32"):
         folders = ["--data", str(tmp_path / "d"), "--validation", str(tmp_path / "v"), "--output", str(tmp_path / name)]
         monkeypatch.setattr(
             "sys.argv",
-            ["train", *folders, "--hop", "32", "--channels", "4", "4", "4", "4", "--hidden", hidden, "--smoke", *more],
+            ["train", *folders, "--hop", hop, "--channels", "4", "4", "4", "4", "--hidden", hidden, "--smoke", *more],
         )
         return train.main()
 
@@ -340,6 +340,14 @@ def test_training_starts_from_given_weights_of_the_same_shape(tmp_path, monkeypa
     assert all(torch.allclose(first[name], second[name], atol=1e-4) for name in first)
     assert run("third", "12", "--start", str(tmp_path / "first" / "best.pt")) == 1
     assert "hidden=12" in capsys.readouterr().err
+    start = ("--start", str(tmp_path / "bands" / "best.pt"), "--rate", "0")
+    assert run("bands", "8", "--erb", "16") == 0
+    assert run("other transform", "8", "--erb", "16", *start, hop="20") == 0
+    first, second = (torch.load(tmp_path / n / "best.pt", weights_only=False) for n in ("bands", "other transform"))
+    assert (first["config"]["n_fft"], second["config"]["n_fft"]) == (64, 40)
+    assert all(torch.allclose(first["network"][name], second["network"][name], atol=1e-4) for name in first["network"])
+    assert run("other bands", "8", "--erb", "32", *start) == 1
+    assert "erb=16" in capsys.readouterr().err
 
 
 def test_small_weights_are_half_of_the_average_and_training_goes_on_from_them(tmp_path, monkeypatch, capsys):
