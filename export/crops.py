@@ -4,20 +4,15 @@ from __future__ import annotations
 
 import threading
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import torch
 from torch import Tensor
-from tqdm import tqdm
 
 from edgefilter.dsp.stft import StftConfig
-from edgefilter.errors import UsageError
 from edgefilter.types import SAMPLE_RATE
-from export.simulate.linear_stage import from_bytes
+from export.items import POWERS, Items
 
-POWERS = ("noise", "residual")
-STORED = ("mic", "error", "reference", "clean", "fan")
 TARGET_RMS = 0.1
 """At which the human is scaled for the loss."""
 SWAPPED = 0.3
@@ -32,66 +27,6 @@ LOUD_REST = 0.1
 that holds only the end of a word and a loud robot, no other would count in the loss."""
 NOTHING = 1e-9
 """Power per bin of a residual echo that is not there."""
-
-
-class Items:
-    """The dataset in memory; refresh() takes in what has been written since, so training can start before simulation ends.
-
-    newest: how many are kept, None for all: older ones make room. device: whose memory; a GPU crops faster from its own.
-    """
-
-    def __init__(self, folder: Path, newest: int | None = None, device: torch.device = torch.device("cpu")) -> None:
-        self.folder, self.newest, self.device = folder, newest, device
-        self._items: dict[str, dict[str, Tensor]] = {}
-        self._levels = torch.from_numpy(from_bytes(np.arange(256))).to(device)
-        self.refresh()
-        if not self._items:
-            raise UsageError(f"{folder} holds no simulated items: make them with python -m export.dataset")
-
-    def refresh(self) -> int:
-        """Load new items and return how many there are."""
-        paths = sorted(self.folder.glob("*.npz"))[-self.newest if self.newest else 0 :]
-        new = [path for path in paths if path.name not in self._items]
-        for path in tqdm(new, desc=f"read {self.folder}", unit="item", leave=False):
-            with np.load(path) as file:
-                names = (*STORED, *POWERS, "scale", "reference_scale")
-                if missing := [name for name in names if name not in file]:
-                    remedy = "simulate it again with python -m export.dataset"
-                    raise UsageError(f"{path} holds no {' and no '.join(missing)}: {remedy}")
-                self._items[path.name] = {name: torch.from_numpy(file[name]).to(self.device) for name in names}
-        self._items = {path.name: self._items[path.name] for path in paths}
-        self.names = sorted(self._items)
-        return len(self.names)
-
-    def crops(
-        self, places: list[tuple[str, int]], samples: int, signals: tuple[str, ...] = STORED
-    ) -> dict[str, Tensor]:
-        """(places, samples) float32 of each of these stored signals, at their true scale; places: item and first sample."""
-        found = {}
-        for signal in signals:
-            scale = "reference_scale" if signal == "reference" else "scale"
-            cut = torch.stack([self._items[name][signal][at : at + samples] for name, at in places])
-            found[signal] = cut * torch.stack([self._items[name][scale] for name, _ in places])[:, None] / 32767
-        return found
-
-    def powers(self, places: list[tuple[str, int]], samples: int, stft: StftConfig) -> dict[str, Tensor]:
-        """(places, frames, bins) float32 of both expected powers, for the frames that lie wholly in the crops.
-
-        places: as for crops(), whole hops from the item's start. Empty where an item was simulated for another
-        transform.
-        """
-        if any(self._items[name]["noise"].shape != (self.length(name) // stft.hop, stft.bins) for name, _ in places):
-            return {}
-        frames = samples // stft.hop - 1
-        firsts = [(name, at // stft.hop + 1) for name, at in places]
-        return {
-            power: self._levels[torch.stack([self._items[n][power][t : t + frames] for n, t in firsts]).long()]
-            for power in POWERS
-        }
-
-    def length(self, name: str) -> int:
-        """Samples of that item."""
-        return self._items[name]["mic"].shape[0]
 
 
 @dataclass(frozen=True)

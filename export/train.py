@@ -72,7 +72,7 @@ def arguments() -> argparse.Namespace:
         default=Shape.long_every,
         help="each so many batches a quarter of crops, 4 times as long",
     )
-    parser.add_argument("--newest", type=int, help="items kept in memory (default: all)")
+    parser.add_argument("--newest", type=int, help="use the last so many items alone (default: all)")
     parser.add_argument(
         "--rate", type=float, default=1.5e-3, help="learning rate; it stays, and falls over the last fifth"
     )

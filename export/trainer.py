@@ -16,7 +16,8 @@ from tqdm import tqdm
 
 from edgefilter.errors import UsageError
 from edgefilter.types import SAMPLE_RATE
-from export.crops import Batches, Items, Shape
+from export.crops import Batches, Shape
+from export.items import Items
 from export.losses import si_sdr
 from export.onnx_export import load
 from export.processes import Processes

@@ -9,7 +9,8 @@ from pathlib import Path
 import torch
 
 from export import train
-from export.crops import Batches, Items, Shape
+from export.crops import Batches, Shape
+from export.items import Items
 from export.tasks import EdgeTask
 from export.trainer import Plan, Trainer
 

@@ -10,9 +10,11 @@ import torch
 from edgefilter.dsp.metrics import si_sdr as si_sdr_of_samples
 from edgefilter.dsp.stft import StftConfig
 from edgefilter.engines.spectral_subtraction import SpectralSubtraction
+from edgefilter.errors import UsageError
 from edgefilter.types import Frame
 from export import checkpoint, dataset, train
-from export.crops import Batches, Items, Shape
+from export.crops import Batches, Shape
+from export.items import Items, mapped
 from export.losses import LossWeights, edge_loss, power_law_loss, si_sdr
 from export.network import MOST_LOGITS, EdgeConfig, EdgeCrnn, corrected, count, erb_bands, opened
 from export.paper_network import PaperConfig
@@ -68,6 +70,25 @@ def test_batches_are_consistent_after_augmentation(data):
     assert batch["error"].shape == batch["clean"].shape == (4, 61, 257, 2)
     assert batch["noise"].shape == batch["residual"].shape == (4, 61, 257)
     assert torch.allclose(batch["mic"] - batch["error"], batch["echo"], atol=1e-4)
+
+
+def test_items_are_mapped_as_they_were_written_and_broken_ones_named(data, tmp_path):
+    path = sorted(data.glob("*.npz"))[0]
+    with np.load(path) as file:
+        found = mapped(path)
+        assert found.keys() == set(file.files)
+        for name in file.files:
+            assert found[name].dtype == file[name].dtype
+            np.testing.assert_array_equal(found[name], file[name])
+    broken = tmp_path / "broken.npz"
+    whole = path.read_bytes()
+    for content in (b"", b"no archive", whole[: len(whole) // 2]):
+        broken.write_bytes(content)
+        with pytest.raises(UsageError, match="not a whole simulated item"):
+            mapped(broken)
+    np.savez_compressed(broken, mic=np.zeros(9))
+    with pytest.raises(UsageError, match="mic.npy is compressed"):
+        mapped(broken)
 
 
 def test_every_fourth_batch_is_of_few_long_crops_and_each_can_be_drawn_again(data):
