@@ -12,6 +12,7 @@ from torch import Tensor
 from edgefilter.dsp.stft import StftConfig
 from edgefilter.types import SAMPLE_RATE
 from export.items import POWERS, Items
+from export.network import erb_rate
 
 TARGET_RMS = 0.1
 """At which the human is scaled for the loss."""
@@ -22,6 +23,9 @@ GAIN_DB, LEVEL_DB, TOLD_DB = (4.0, 4.0), (12.0, 18.0), (8.0, 8.0)
 since canceller and expected powers were made with the one that was there."""
 ROBOT_SILENT = 0.04
 """Share of crops in which the robot says nothing and the fan is faint: the human has to come out untouched."""
+COLOURED, COLOUR_DB, WAVES = 0.5, 4.0, 4
+"""Share of crops in which microphone, human and reference each get another frequency response, and of how many waves along
+the ear's scale, each up to so deep, that is: other devices and voices than the ones that were simulated."""
 LOUD_REST = 0.1
 """Part of the error's power that the human is taken to have at least when crops are brought to one level: beside a crop
 that holds only the end of a word and a loud robot, no other would count in the loss."""
@@ -72,7 +76,7 @@ class Batches:
         """The last seconds of these items, as they are."""
         samples = self._whole_hops(seconds)
         places = [(name, self.items.length(name) // self.stft.hop * self.stft.hop - samples) for name in names]
-        return self.spectra(self._cut(places, samples))
+        return _weighed(self._spectra(self._cut(places, samples)), self.stft)
 
     def _prepare(self, step: int) -> None:
         rng = np.random.default_rng([self.seed, step, self.rank])
@@ -94,7 +98,9 @@ class Batches:
         for power in POWERS:
             if power in crops:
                 crops[power] = level.square()[..., None] * crops[power]
-        self._ready = step, self.spectra(crops)
+        spectra = self._spectra(crops)
+        self._colour(spectra, rng)
+        self._ready = step, _weighed(spectra, self.stft)
 
     def _each(self, values: np.ndarray) -> Tensor:
         """One number a crop, (batch, 1)."""
@@ -136,18 +142,51 @@ class Batches:
                 if power in crops:
                     crops[power][row] = level
 
-    def spectra(self, crops: dict[str, Tensor]) -> dict[str, Tensor]:
-        """Signals (batch, samples) and powers to a batch."""
+    def _spectra(self, crops: dict[str, Tensor]) -> dict[str, Tensor]:
+        """Signals (batch, samples) to spectra, with the echo's; powers as they are."""
         batch = {power: crops[power] for power in POWERS if power in crops}
         for signal, samples in (crops | {"echo": crops["mic"] - crops["error"]}).items():
             if signal not in POWERS:
                 frames = samples.unfold(1, self.stft.window_length, self.stft.hop) * self._window
                 batch[signal] = torch.view_as_real(torch.fft.rfft(frames, self.stft.n_fft))
-        batch["active"], level = _activity(batch["clean"])
-        unit = (self.stft.n_fft * self.stft.noise_gain() / 2) ** 0.5
-        left = batch["error"].square().sum((2, 3)).mean(1)
-        batch["scale"] = TARGET_RMS * unit / (torch.maximum(level, LOUD_REST * left) + 1e-12).sqrt()
         return batch
+
+    def _colour(self, batch: dict[str, Tensor], rng: np.random.Generator) -> None:
+        """Other frequency responses of microphone, human and reference in some of the crops; what is expected follows."""
+        count = batch["mic"].shape[0]
+        some = rng.random((count, 1)) < COLOURED
+        heard, human, told = (
+            torch.from_numpy(np.where(some, colours(rng, count, self.stft), 1).astype(np.float32))
+            .to(self.items.device)
+            .reshape(count, 1, -1, 1)
+            for _ in range(3)
+        )
+        other = (human - 1) * batch["clean"]
+        for signal in ("mic", "error", "clean"):
+            batch[signal] = heard * (batch[signal] + other)
+        for signal in ("fan", "echo"):
+            batch[signal] = heard * batch[signal]
+        batch["reference"] = told * batch["reference"]
+        for power in POWERS:
+            if power in batch:
+                batch[power] = heard[..., 0].square() * batch[power]
+
+
+def colours(rng: np.random.Generator, count: int, stft: StftConfig) -> np.ndarray:
+    """(count, bins) gains of smooth frequency responses at random."""
+    place = erb_rate(stft.frequencies) / erb_rate(stft.frequencies[-1])
+    depth, phase = rng.uniform(0, COLOUR_DB, (count, WAVES)), rng.uniform(0, 2 * np.pi, (count, WAVES))
+    waves = np.cos(np.pi * np.arange(1, WAVES + 1)[:, None] * place + phase[..., None])
+    return 10 ** (np.einsum("cw,cwf->cf", depth, waves) / 20)
+
+
+def _weighed(batch: dict[str, Tensor], stft: StftConfig) -> dict[str, Tensor]:
+    """The batch with "active" and "scale"."""
+    active, level = _activity(batch["clean"])
+    unit = (stft.n_fft * stft.noise_gain() / 2) ** 0.5
+    left = batch["error"].square().sum((2, 3)).mean(1)
+    scale = TARGET_RMS * unit / (torch.maximum(level, LOUD_REST * left) + 1e-12).sqrt()
+    return batch | {"active": active, "scale": scale}
 
 
 def _activity(clean: Tensor) -> tuple[Tensor, Tensor]:

@@ -210,13 +210,18 @@ class EdgeCrnn(nn.Module):
         return human.squeeze(1), torch.sigmoid(logit.squeeze(1)), state
 
 
+def erb_rate(frequency_hz: np.ndarray) -> np.ndarray:
+    """Place along the ear's frequency scale, in equivalent rectangular bandwidths (Glasberg & Moore 1990, eq. (4))."""
+    return 21.4 * np.log10(1 + 0.00437 * frequency_hz)
+
+
 def erb_bands(stft: StftConfig, count: int) -> Tensor:
     """(count, bins - 1) weights that spread bands over the frequencies above 0 Hz, linearly between their centres.
 
-    Centres are evenly spaced on the ERB-rate scale of Glasberg & Moore (1990), eq. (4), but at least a bin apart.
+    Centres are evenly spaced on the ERB-rate scale, but at least a bin apart.
     """
     frequencies = stft.frequencies[1:]
-    rate = 21.4 * np.log10(1 + 0.00437 * np.linspace(frequencies[0], frequencies[-1], 4096))
+    rate = erb_rate(np.linspace(frequencies[0], frequencies[-1], 4096))
     wanted = np.interp(np.linspace(rate[0], rate[-1], count), rate, np.linspace(0, frequencies.size - 1, 4096))
     centres = np.rint(wanted).astype(int)
     for band in range(1, count):

@@ -113,9 +113,31 @@ def test_expected_powers_belong_to_the_frames_beside_them(data):
     assert items.powers([(name, 0)], 8 * stft.hop, StftConfig(320, 160, 320)) == {}
 
 
+def test_another_frequency_response_is_that_of_all_that_goes_through_it(data, monkeypatch):
+    def drawn(share):
+        monkeypatch.setattr("export.crops.COLOURED", share)
+        return Batches(Items(data), StftConfig(), Shape(4, 1.0), seed=3).draw(0)
+
+    def gain(name, *less):
+        first, second = (each[name] - sum(each[other] for other in less) for each in (coloured, plain))
+        return (first.square().sum((1, 3)) / second.square().sum((1, 3))).sqrt()[:, 1:]
+
+    coloured, plain = drawn(1.0), drawn(0.0)
+    heard = gain("echo")
+    assert torch.allclose(gain("error", "clean"), heard, rtol=1e-2)
+    for power in ("noise", "residual"):
+        ratio = (coloured[power] / plain[power])[:, :, 1:]
+        assert torch.allclose(ratio, heard.square()[:, None].expand_as(ratio), rtol=1e-2)
+    for found in (heard, gain("clean") / heard, gain("reference")):
+        db = 20 * torch.log10(found)
+        assert 2.0 < db.abs().max() < 16.0 and (db[:, 1:] - db[:, :-1]).abs().max() < 2.0
+    assert not torch.allclose(gain("clean"), heard, rtol=0.2) and not torch.allclose(gain("reference"), heard, rtol=0.2)
+
+
 def test_a_swapped_human_is_as_loud_as_the_one_who_was_there(data, monkeypatch):
     def drawn(share):
         monkeypatch.setattr("export.crops.SWAPPED", share)
+        monkeypatch.setattr("export.crops.COLOURED", 0.0)
         return Batches(Items(data), StftConfig(), Shape(16, 1.0), seed=3).draw(0)
 
     swapped, kept = drawn(1.0), drawn(0.0)
