@@ -25,7 +25,7 @@ from scipy.special import expit, logit
 from bench import results_writer
 from bench.measure.closed_loop_scenes import listen
 from bench.measure.conversation import every, find_conversations, progress
-from bench.measure.levels import frame_power
+from bench.measure.levels import FRAME, frame_power
 from bench.measure.real_barge_in import FIRST_DB, IN_TIME_S, THRESHOLDS, first_sound, in_time, noticed, replay, starts
 from bench.measure.real_streams import ECHO_ONLY, ROBOT_ALONE, Cells, chosen, find_recordings, lay
 from edgefilter.errors import EdgefilterError
@@ -41,11 +41,16 @@ EDGES = (0.0, 0.02, 0.1, 0.3, 0.5, 0.7, 0.9, 0.98, 1.0)
 SERS_DB = (0.0, -10.0, -20.0, -26.0)
 AT_DB = -20.0
 """The laid humans of which the page says how many were noticed."""
+AUDIBLE_DB = 20.0
+"""Below the loudest sound: who begins with less, a breath say, is 40 dB below the robot where the whole is 20."""
 SURE = 1e-9
 
 
 class Listened(NamedTuple):
-    """odds: averaged log-odds after each hop of so many samples; human: whether one sounds in it; ser: of a laid human, dB."""
+    """odds: averaged log-odds after each hop of so many samples; human: whether one sounds in it; ser: of a laid human, dB.
+
+    audible: whether the human comes within AUDIBLE_DB of the loudest sound in time to be noticed.
+    """
 
     kind: str
     odds: np.ndarray
@@ -53,6 +58,7 @@ class Listened(NamedTuple):
     hop: int
     onset: int | None = None
     ser: float | None = None
+    audible: bool = True
 
 
 def listened(kind: str, mic: Samples, ref: Samples, human: Samples | None, profile: Profile | None) -> Listened:
@@ -65,7 +71,15 @@ def listened(kind: str, mic: Samples, ref: Samples, human: Samples | None, profi
         return Listened(kind, odds, np.zeros(odds.size, bool), hop)
     power = frame_power(human[: odds.size * hop], hop)
     sounds = power > 10 ** (-FIRST_DB / 10) * power.max()
-    return Listened(kind, odds, sounds, hop, first_sound(human))
+    onset = first_sound(human)
+    return Listened(kind, odds, sounds, hop, onset, audible=audible(human, onset))
+
+
+def audible(human: Samples, onset: int) -> bool:
+    """Whether anything within AUDIBLE_DB of the human's loudest 20 ms sounds within IN_TIME_S of the onset."""
+    power = frame_power(human)
+    soon = power[onset // FRAME :][: round(IN_TIME_S * SAMPLE_RATE / FRAME)]
+    return bool(soon.max() > 10 ** (-AUDIBLE_DB / 10) * power.max())
 
 
 def streams(options: argparse.Namespace) -> Iterator[Listened]:
@@ -123,7 +137,7 @@ def reliability(chosen_ones: list[Listened], centre: float, slope: float) -> dic
 def curve(chosen_ones: list[Listened], centre: float, slope: float) -> list[dict]:
     """For each threshold: false starts an hour on robots alone, and laid or conversing humans noticed in time."""
     alone = [one for one in chosen_ones if one.onset is None]
-    heard = [one for one in chosen_ones if one.onset is not None and one.ser in (None, AT_DB)]
+    heard = told(chosen_ones)
     hours = sum(one.odds.size * one.hop for one in alone) / SAMPLE_RATE / 3600
     points = []
     for threshold in THRESHOLDS:
@@ -134,6 +148,11 @@ def curve(chosen_ones: list[Listened], centre: float, slope: float) -> list[dict
             {"threshold": threshold, "an_hour": false / hours if hours else None, "noticed": float(np.mean(soon))}
         )
     return points
+
+
+def told(chosen_ones: list[Listened]) -> list[Listened]:
+    """The humans of whom the curve says how many were noticed."""
+    return [one for one in chosen_ones if one.onset is not None and one.ser in (None, AT_DB)]
 
 
 def markdown(kinds: dict) -> str:
@@ -157,6 +176,8 @@ def markdown(kinds: dict) -> str:
             false = "" if point["an_hour"] is None else f"{point['an_hour']:.0f}"
             cells.append([point["threshold"], false, f"{100 * point['noticed']:.0f}"])
         lines += results_writer.table(["threshold", "false starts an hour", f"noticed in {IN_TIME_S} s, %"], cells)
+        first = f"in their first {IN_TIME_S} s they come within {AUDIBLE_DB:.0f} dB of their loudest sound"
+        lines += ["", f"Of {of['humans']} humans {of['audible']} can be noticed so soon: {first}."]
     return "\n".join([*lines, ""])
 
 
@@ -195,6 +216,8 @@ def main() -> int:
         before, after = reliability(own, usual, SLOPE), reliability(own, centre, slope)
         shown = curve(own, centre, slope)
         kinds[kind] = {"centre": centre, "slope": slope, "before": before, "after": after, "curve": shown}
+        humans = told(own)
+        kinds[kind] |= {"humans": len(humans), "audible": sum(one.audible for one in humans)}
     print(results_writer.write(options.output, made_with, "Probability of speech", markdown(kinds), {"kinds": kinds}))
     return 0
 

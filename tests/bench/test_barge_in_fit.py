@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.special import expit
 
-from bench.measure.barge_in_fit import HUMAN_SHARE, Listened, curve, fitted, markdown, reliability
+from bench.measure.barge_in_fit import HUMAN_SHARE, Listened, audible, curve, fitted, markdown, reliability
 
 
 @pytest.fixture(scope="module")
@@ -40,4 +40,13 @@ def test_the_curve_counts_false_starts_an_hour_and_who_is_noticed(known):
     assert points[0.7]["an_hour"] == pytest.approx(2.0, rel=0.01) and points[0.9]["an_hour"] == 0
     assert points[0.97]["noticed"] == 0.5
     found = {"centre": 1.0, "slope": 1.2, "before": reliability([human], 3, 1), "after": reliability([human], 1, 1)}
-    assert "| 0.7 | 2 | 50 |" in markdown({"real": {**found, "curve": list(points.values())}})
+    page = markdown({"real": {**found, "curve": list(points.values()), "humans": 2, "audible": 1}})
+    assert "| 0.7 | 2 | 50 |" in page and "Of 2 humans 1 can be noticed so soon" in page
+
+
+def test_who_begins_with_a_breath_cannot_be_noticed_in_time():
+    voice = np.random.default_rng(1).standard_normal(16_000)
+    assert audible(np.concatenate((np.zeros(8000), voice)), 8000)
+    for breath_s, seen in ((0.2, True), (0.4, False)):
+        human = np.concatenate((10 ** (-23 / 20) * voice[: int(breath_s * 16_000)], voice))
+        assert audible(human, 0) is seen
