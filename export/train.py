@@ -27,11 +27,13 @@ import torch
 
 from edgefilter.errors import EdgefilterError, UsageError
 from edgefilter.types import SAMPLE_RATE
-from export.crops import Shape
+from export.crops import Batches, Shape
+from export.items import Items
 from export.losses import LossWeights
 from export.network import EdgeConfig
 from export.onnx_export import load
 from export.paper_network import PaperCrnn
+from export.step_times import measure, table
 from export.tasks import TASKS, EdgeTask, PaperTask
 from export.trainer import Plan, Trainer
 
@@ -104,6 +106,7 @@ def arguments() -> argparse.Namespace:
     parser.add_argument("--suppression", type=float, default=LossWeights.suppression)
     parser.add_argument("--si-sdr", type=float, default=LossWeights.si_sdr)
     parser.add_argument("--start", type=Path, metavar="CHECKPOINT", help="weights to begin with")
+    parser.add_argument("--times", action="store_true", help="say where the time of a step goes, and train nothing")
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--full-precision", action="store_true", help="float32 instead of bfloat16 in the forward pass")
     parser.add_argument(
@@ -138,6 +141,9 @@ def main() -> int:
         shape = Shape(options.batch, options.seconds, options.long_every)
         before = sizes_before(options.network, options.output / "last.pt", options.start)
         task = TASKS[options.network](options, before)
+        if options.times:
+            print(table(measure(task, Batches(Items(options.data), task.stft, shape, options.seed))))
+            return 0
         trainer = Trainer(task, plan, shape, options.output, options.start)
         trainer.run(options.data, options.validation, options.newest)
         trainer.processes.leave()

@@ -18,6 +18,7 @@ from export.items import Items, mapped
 from export.losses import LossWeights, edge_loss, power_law_loss, si_sdr
 from export.network import MOST_LOGITS, EdgeConfig, EdgeCrnn, corrected, count, erb_bands, opened
 from export.paper_network import PaperConfig
+from export.step_times import ROWS
 from export.tasks import FIRST_MASK, EdgeTask, PaperTask, filters_of
 from export.trainer import Plan, optimisers
 from tests.export.speech import write_librispeech, write_table
@@ -501,3 +502,18 @@ def test_every_weight_has_one_optimiser_and_every_matrix_the_one_for_matrices():
     assert held[0] | held[1] == {id(weight) for weight in network.parameters()} and not held[0] & held[1]
     assert {id(network.inward.weight), id(network.memory.weight_hh_l0)} <= held[0]
     assert {id(network.mask.weight), id(network.speech.weight), id(network.inward.bias)} <= held[1]
+
+
+@pytest.mark.parametrize("network", ["edge", "paper"])
+def test_where_the_time_of_a_step_goes(data, network, monkeypatch, capsys, tmp_path):
+    own = {"edge": ("--channels", "4", "4", "4", "4"), "paper": ("--filters", "3", "2", "--lstm", "4")}[network]
+    folders = ("--data", str(data), "--validation", str(data), "--output", str(tmp_path))
+    short = ("--hidden", "8", "--batch", "2", "--seconds", "0.5", "--long-every", "0", "--times")
+    monkeypatch.setattr("sys.argv", ["train", *folders, "--network", network, *own, *short])
+    monkeypatch.setattr("export.step_times.TIMED", 2)
+    assert train.main() == 0
+    lines = [line.split(" ms")[0].rsplit(maxsplit=1) for line in capsys.readouterr().out.splitlines()]
+    found = {name: float(milliseconds) for name, milliseconds in lines}
+    assert sum(found[row] for row in ROWS) == pytest.approx(found["a step"], rel=0.02, abs=0.5)
+    assert found["convolutions"] > 0 and found["recurrent layers"] > 0 and found["optimiser"] > 0
+    assert not list(tmp_path.glob("*.pt"))
