@@ -78,14 +78,10 @@ def _mark(network: nn.Module) -> None:
 
 def by_row(events: Sequence[FunctionEvent]) -> Counter[str]:
     """Microseconds by row: an operation's own row, or that of the operation whose gradient it is."""
-    rows = {}
-    for event in events:
-        row = next((up.name for up in _upward(event) if up.name in ROWS), None)
-        if row and event.sequence_nr >= 0:
-            rows[event.sequence_nr] = row
+    own = [next((up.name for up in _upward(event) if up.name in ROWS), None) for event in events]
+    rows = {event.sequence_nr: row for event, row in zip(events, own, strict=True) if row and event.sequence_nr >= 0}
     found: Counter[str] = Counter()
-    for event in events:
-        row = next((up.name for up in _upward(event) if up.name in ROWS), None)
+    for event, row in zip(events, own, strict=True):
         if row is None:
             gradient = next((up for up in _upward(event) if up.name.startswith(BACKWARD)), None)
             row = rows.get(gradient.sequence_nr, LOSS) if gradient else LOSS

@@ -136,7 +136,6 @@ def main() -> int:
         if options.smoke:
             smoke(options)
         torch.set_num_threads(options.threads)
-        options.output.mkdir(parents=True, exist_ok=True)
         plan = Plan(options.steps, options.rate, options.seed, options.every, options.patience, options.minutes)
         shape = Shape(options.batch, options.seconds, options.long_every)
         before = sizes_before(options.network, options.output / "last.pt", options.start)
@@ -144,6 +143,7 @@ def main() -> int:
         if options.times:
             print(table(measure(task, Batches(Items(options.data), task.stft, shape, options.seed))))
             return 0
+        options.output.mkdir(parents=True, exist_ok=True)
         trainer = Trainer(task, plan, shape, options.output, options.start)
         trainer.run(options.data, options.validation, options.newest)
         trainer.processes.leave()

@@ -214,9 +214,8 @@ def main() -> int:
         usual = CENTRE if kind == "real" else CENTRE_CALIBRATED
         centre, slope = fitted(own)
         before, after = reliability(own, usual, SLOPE), reliability(own, centre, slope)
-        shown = curve(own, centre, slope)
+        shown, humans = curve(own, centre, slope), told(own)
         kinds[kind] = {"centre": centre, "slope": slope, "before": before, "after": after, "curve": shown}
-        humans = told(own)
         kinds[kind] |= {"humans": len(humans), "audible": sum(one.audible for one in humans)}
     print(results_writer.write(options.output, made_with, "Probability of speech", markdown(kinds), {"kinds": kinds}))
     return 0

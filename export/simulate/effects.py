@@ -35,6 +35,7 @@ def _other_packets(rng: np.random.Generator, values: Values, seconds: float) -> 
 
 
 def _lost(rng: np.random.Generator, share: float, length_s: float, seconds: float) -> Values:
+    """About that share of all packets of length_s, each by itself."""
     firsts = np.arange(rng.uniform(0, length_s), seconds, length_s)
     lost = firsts[rng.random(firsts.size) < share]
     return {"times_s": lost, "lost": float(lost.size)}

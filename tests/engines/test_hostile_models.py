@@ -187,12 +187,8 @@ def test_a_network_that_answers_too_loudly_is_turned_down(monkeypatch):
 def test_the_shipped_models_are_the_pinned_ones_and_the_page_says_so():
     page = (ROOT / "models" / "MODELS.md").read_text(encoding="utf-8")
     there = {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in (ROOT / "models").glob("*.onnx")}
-    rows = {
-        "voicefilter.onnx",
-        "paper_crnn_narrow.onnx",
-        "paper_crnn_narrow_batch_norm.onnx",
-    }  # those are the benchmark's
-    engines = {name: found for name, found in there.items() if name not in rows}
+    of_the_benchmark = {"voicefilter.onnx", "paper_crnn_narrow.onnx", "paper_crnn_narrow_batch_norm.onnx"}
+    engines = {name: found for name, found in there.items() if name not in of_the_benchmark}
     assert onnx_file.SHIPPED == engines
     for name, found in there.items():
         assert re.search(rf"`{name}` +`{found}`", page), name
