@@ -29,6 +29,8 @@ the ear's scale, each up to so deep, that is: other devices and voices than the 
 LOUD_REST = 0.1
 """Part of the error's power that the human is taken to have at least when crops are brought to one level: beside a crop
 that holds only the end of a word and a loud robot, no other would count in the loss."""
+ONSET, ONSET_S, QUIET_S = 4.0, 0.3, 0.5
+"""How much more the speech head answers for the first seconds of a human than for the rest, and after how many without one."""
 NOTHING = 1e-9
 """Power per bin of a residual echo that is not there."""
 
@@ -61,7 +63,7 @@ class Batches:
         self._thread: threading.Thread | None = None
 
     def draw(self, step: int) -> dict[str, Tensor]:
-        """Spectra (batch, frames, bins, 2) by signal, powers (batch, frames, bins), "active" (batch, frames), "scale" (batch,) to TARGET_RMS."""
+        """Spectra (batch, frames, bins, 2) by signal, powers (batch, frames, bins), "active", "heed" (batch, frames), "scale" (batch,) to TARGET_RMS."""
         if self._thread is not None:
             self._thread.join()
         if self._ready is None or self._ready[0] != step:
@@ -181,12 +183,12 @@ def colours(rng: np.random.Generator, count: int, stft: StftConfig) -> np.ndarra
 
 
 def _weighed(batch: dict[str, Tensor], stft: StftConfig) -> dict[str, Tensor]:
-    """The batch with "active" and "scale"."""
+    """The batch with "active", "heed" and "scale"."""
     active, level = _activity(batch["clean"])
     unit = (stft.n_fft * stft.noise_gain() / 2) ** 0.5
     left = batch["error"].square().sum((2, 3)).mean(1)
     scale = TARGET_RMS * unit / (torch.maximum(level, LOUD_REST * left) + 1e-12).sqrt()
-    return batch | {"active": active, "scale": scale}
+    return batch | {"active": active, "heed": _heed(active, stft.hop), "scale": scale}
 
 
 def _activity(clean: Tensor) -> tuple[Tensor, Tensor]:
@@ -194,3 +196,15 @@ def _activity(clean: Tensor) -> tuple[Tensor, Tensor]:
     power = clean.square().sum((2, 3))
     active = ((power > 10**-3.5 * power.amax(1, keepdim=True)) & (power > 1e-9)).float()
     return active, (power * active).sum(1) / active.sum(1).clamp(min=1)
+
+
+def _heed(active: Tensor, hop: int) -> Tensor:
+    """Weight of each frame (batch, frames) for the speech head: ONSET in a human's first ONSET_S after QUIET_S without, else 1."""
+    quiet, onset = (max(1, round(seconds * SAMPLE_RATE / hop)) for seconds in (QUIET_S, ONSET_S))
+    before = active.cumsum(1)
+    spoken = before - torch.nn.functional.pad(before, (quiet + 1, 0))[:, : active.shape[1]]
+    begins = (active > 0) & (spoken == 1)
+    begins[:, :quiet] = False
+    since = begins.float().cumsum(1)
+    lately = since - torch.nn.functional.pad(since, (onset, 0))[:, : active.shape[1]]
+    return torch.where(lately > 0, ONSET, 1.0)

@@ -94,7 +94,7 @@ class EdgeTask:
         scale = batch["scale"][:, None, None, None]
         human, clean = scale * human.float(), scale * batch["clean"]
         wanted = clean + self.fan_kept * scale * batch["fan"] if self.fan_kept else clean
-        terms = edge_loss(human, logit.float(), clean, wanted, batch["active"], self.weights)
+        terms = edge_loss(human, logit.float(), clean, wanted, batch["active"], self.weights, batch["heed"])
         if self.recogniser and network.training:
             terms["recogniser"] = self.recogniser(human, clean)
             terms["total"] = terms["total"] + self.recogniser_weight * terms["recogniser"]
