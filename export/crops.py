@@ -63,7 +63,10 @@ class Batches:
         self._thread: threading.Thread | None = None
 
     def draw(self, step: int) -> dict[str, Tensor]:
-        """Spectra (batch, frames, bins, 2) by signal, powers (batch, frames, bins), "active", "heed" (batch, frames), "scale" (batch,) to TARGET_RMS."""
+        """Spectra (batch, frames, bins, 2) by signal, powers (batch, frames, bins), "active", "heed" (batch, frames), "scale" (batch,).
+
+        scale: to TARGET_RMS.
+        """
         if self._thread is not None:
             self._thread.join()
         if self._ready is None or self._ready[0] != step:
@@ -188,7 +191,7 @@ def _weighed(batch: dict[str, Tensor], stft: StftConfig) -> dict[str, Tensor]:
     unit = (stft.n_fft * stft.noise_gain() / 2) ** 0.5
     left = batch["error"].square().sum((2, 3)).mean(1)
     scale = TARGET_RMS * unit / (torch.maximum(level, LOUD_REST * left) + 1e-12).sqrt()
-    return batch | {"active": active, "heed": _heed(active, stft.hop), "scale": scale}
+    return batch | {"active": active, "heed": heed(active, stft.hop), "scale": scale}
 
 
 def _activity(clean: Tensor) -> tuple[Tensor, Tensor]:
@@ -198,7 +201,7 @@ def _activity(clean: Tensor) -> tuple[Tensor, Tensor]:
     return active, (power * active).sum(1) / active.sum(1).clamp(min=1)
 
 
-def _heed(active: Tensor, hop: int) -> Tensor:
+def heed(active: Tensor, hop: int) -> Tensor:
     """Weight of each frame (batch, frames) for the speech head: ONSET in a human's first ONSET_S after QUIET_S without, else 1."""
     quiet, onset = (max(1, round(seconds * SAMPLE_RATE / hop)) for seconds in (QUIET_S, ONSET_S))
     before = active.cumsum(1)

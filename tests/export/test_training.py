@@ -13,7 +13,7 @@ from edgefilter.engines.spectral_subtraction import SpectralSubtraction
 from edgefilter.errors import UsageError
 from edgefilter.types import Frame
 from export import checkpoint, dataset, train
-from export.crops import Batches, Shape
+from export.crops import Batches, Shape, heed
 from export.items import Items, mapped
 from export.losses import LossWeights, edge_loss, power_law_loss, si_sdr
 from export.network import MOST_LOGITS, EdgeConfig, EdgeCrnn, corrected, count, erb_bands, opened
@@ -288,6 +288,26 @@ def test_the_loss_is_least_at_the_human_and_minds_suppression_more():
         total(clean * (2 - 0.25**0.3) ** (1 / 0.3)),
     )  # equal steps of the compressed magnitude
     assert quieter > 1.2 * louder
+
+
+def test_the_head_answers_more_for_a_humans_first_words():
+    """Three humans at 100 hops a second: one who was there before, one after a pause of 0.2 s, one after 2 s."""
+    active = torch.zeros(1, 700)
+    active[0, :100] = active[0, 120:200] = active[0, 400:402] = active[0, 405:500] = 1.0
+    more = heed(active, hop=160)[0] > 1.0
+    assert more.nonzero().flatten().tolist() == list(range(400, 430))
+
+
+def test_a_frame_that_counts_more_moves_the_loss_more():
+    clean, active = spectra(4, seed=3)[0], torch.tensor([[1.0, 0.0, 0.0, 0.0]])
+
+    def speech(wrong, weight):
+        logit = torch.where(torch.arange(4) == wrong, -5.0, 5.0) * (2 * active - 1)
+        return float(edge_loss(clean, logit, clean, clean, active, LossWeights(), weight)["speech"])
+
+    weight = torch.tensor([[4.0, 1.0, 1.0, 1.0]])
+    assert speech(0, None) == pytest.approx(speech(1, None)) == pytest.approx(speech(0, torch.ones(1, 4)))
+    assert speech(0, weight) == pytest.approx(4 * speech(1, weight), rel=0.02)
 
 
 def test_a_share_of_the_fan_is_wanted_where_it_was_asked_for(data, monkeypatch):
