@@ -54,11 +54,11 @@ def edge_loss(
 ) -> dict[str, Tensor]:
     """Terms and their weighted "total".
 
-        human, clean, wanted: (batch, frames, bins, 2), scaled so that speech is near 1; wanted is the human with as much of
-        the fan as the estimate should keep. logit, active, heed: (batch, frames); heed is what each frame of the head counts,
-    None for all the same. suppression counts once more where the estimate is
-        below what is wanted: words that are gone do not come back (Braun & Tashev 2020 compress likewise; the asymmetry
-        follows Wang et al. 2020, "VoiceFilter-Lite", eq. (2)).
+    human, clean, wanted: (batch, frames, bins, 2), scaled so that speech is near 1; wanted is the human with as much of
+    the fan as the estimate should keep. logit, active, heed: (batch, frames); heed is what each frame counts for the head,
+    None for all the same. suppression counts once more where the estimate is below what is wanted: words that are gone
+    do not come back (Braun & Tashev 2020 compress likewise; the asymmetry follows Wang et al. 2020, "VoiceFilter-Lite",
+    eq. (2)).
     """
     magnitude, phased = compressed(human, weights.compression)
     target, target_phased = compressed(wanted, weights.compression)
