@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import soundfile as sf
+from scipy import signal
 
 from edgefilter.errors import UsageError
 from edgefilter.types import SAMPLE_RATE, Samples
@@ -37,13 +38,21 @@ class Corpus:
         weights = np.array([min(1.0, self.seconds.get(name, ENOUGH_S) / ENOUGH_S) ** 2 for name in names])
         return str(rng.choice(names, p=weights / weights.sum()))
 
-    def draw(self, rng: np.random.Generator, speaker: str, seconds: float, said: list[Path] | None = None) -> Samples:
-        """Utterances (n,) of that speaker, 0.1 to 0.5 s apart, cut at `seconds`; peak 0.5. said: gets their paths."""
+    def draw(
+        self, rng: np.random.Generator, speaker: str, seconds: float, said: list[Path] | None = None, rate: int = 100
+    ) -> Samples:
+        """Utterances (n,) of that speaker, 0.1 to 0.5 s apart, cut at `seconds`; peak 0.5.
+
+        said: gets their paths. rate: at which they are played, percent; pitch and formants go with it, so that it is another
+        voice.
+        """
         parts: list[Samples] = []
         wanted, have = round(seconds * SAMPLE_RATE), 0
         while have < wanted:
             path = self.speakers[speaker][int(rng.integers(len(self.speakers[speaker])))]
             part = read_speech(path)
+            if rate != 100:
+                part = signal.resample_poly(part, 100, rate).astype(np.float32)
             if said is not None:
                 said.append(path)
             pause = np.zeros(int(rng.uniform(0.1, 0.5) * SAMPLE_RATE), np.float32)

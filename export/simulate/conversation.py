@@ -60,7 +60,7 @@ def simulate(recipe: Recipe, seed: int, index: int, material: Material) -> Conve
     """Item `index` of that seed."""
     rng = np.random.default_rng([seed, index])
     if rng.random() < recipe.plain:
-        kept = {name: getattr(recipe, name) for name in ("effects", "effects_share", "later")}
+        kept = {name: getattr(recipe, name) for name in ("effects", "effects_share", "later", "other_voices")}
         recipe = replace(BENCHMARK, **kept)
     before = round(recipe.seconds * SAMPLE_RATE) if rng.random() < recipe.later else 0
     recipe = replace(recipe, seconds=recipe.seconds + before / SAMPLE_RATE)

@@ -21,8 +21,8 @@ class Recipe:
 
     Shares of the items. office, hall: rooms, the rest is lab. warm: start from a calibrated profile; wrong: from one of
     another robot, room or fan (counted apart from warm). human: somebody speaks. robot: it speaks at all. moving: lag,
-    clock and volume change. far_human: the far end is a person instead of a voice from text. plain: drawn by the
-    recipe BENCHMARK instead.
+    clock and volume change. far_human: the far end is a person instead of a voice from text. other_voices: of robots and of
+    humans, whose voice is played faster or slower and so is another's. plain: drawn by the recipe BENCHMARK instead.
 
     later: the filter has run for as long as the item already, and has learned meanwhile as it does in use.
 
@@ -47,6 +47,7 @@ class Recipe:
     human: float = 0.92
     robot: float = 1.0
     far_human: float = 0.0
+    other_voices: float = 0.0
     moving: float = 0.4
     lag_s: Range = (0.0, 0.8)
     ppm: Range = (-150.0, 150.0)
@@ -104,4 +105,6 @@ WIDE = Recipe(
 """As wide as reality is known to be: ranges by experiment on real recordings and from the catalogue of effects."""
 MICROPHONE = replace(WIDE, later=0.0)
 """WIDE for networks that get the microphone alone: what the filter has learned before cannot matter to them."""
-RECIPES = {"edge": BENCHMARK, "paper": PAPER, "wide": WIDE, "microphone": MICROPHONE}
+VOICES = replace(MICROPHONE, other_voices=0.5)
+"""MICROPHONE with more voices than there are: of synthetic ones few are at hand, and robots have any."""
+RECIPES = {"edge": BENCHMARK, "paper": PAPER, "wide": WIDE, "microphone": MICROPHONE, "voices": VOICES}

@@ -12,6 +12,9 @@ from edgefilter.types import SAMPLE_RATE, Samples
 from export.corpus import Corpus
 from export.simulate.recipe import Recipe
 
+RATES = (82, 122)
+"""Percent of its own speed at which a voice is played to be another: from a low man's to a high woman's is about as much."""
+
 
 @dataclass(frozen=True, eq=False)
 class Part:
@@ -24,14 +27,14 @@ class Part:
 
 def robot(rng: np.random.Generator, recipe: Recipe, voices: Corpus, samples: int, moving: bool) -> Part:
     """Utterance after utterance, each 2 to 7 s; moving: with a lag and a volume of its own."""
-    voice = voices.draw_speaker(rng)
+    voice, played_at = voices.draw_speaker(rng), rate(rng, recipe)
     told, played = np.zeros((2, samples), np.float32)
     utterances: list[tuple[int, int]] = []
     lag = int(rng.uniform(0.0, 0.3) * SAMPLE_RATE)
     at = int(rng.uniform(0.0, 0.6) * SAMPLE_RATE) if recipe.seconds > 5 else 0
     volume = 1.0
     while at < samples - SAMPLE_RATE // 2:
-        speech = voices.draw(rng, voice, rng.uniform(2.0, 7.0))[: samples - at]
+        speech = voices.draw(rng, voice, rng.uniform(2.0, 7.0), rate=played_at)[: samples - at]
         told[at : at + speech.size] = speech
         end = min(samples, at + lag + speech.size)
         played[at + lag : end] += volume * speech[: max(0, end - at - lag)]
@@ -63,10 +66,16 @@ def human(rng: np.random.Generator, recipe: Recipe, humans: Corpus, response: Sa
         return Human(clean)
     said: list[Path] = []
     at = int(rng.uniform(*recipe.silence_s) * SAMPLE_RATE)
-    speaker = humans.draw_speaker(rng)
+    speaker, played_at = humans.draw_speaker(rng), rate(rng, recipe)
     while at < samples - SAMPLE_RATE:
-        speech = humans.draw(rng, speaker, rng.uniform(1.5, 7.0), said)[: samples - at]
+        speech = humans.draw(rng, speaker, rng.uniform(1.5, 7.0), said, played_at)[: samples - at]
         clean[at : at + speech.size] += speech
         at += speech.size + int(rng.uniform(0.5, 3.0) * SAMPLE_RATE)
     heard = signal.oaconvolve(clean, response)[:samples].astype(np.float32)
     return Human(heard, speaker, tuple(sorted({path.name for path in said})))
+
+
+def rate(rng: np.random.Generator, recipe: Recipe) -> int:
+    """Percent of its own speed at which this one's voice is played."""
+    other = recipe.other_voices and rng.random() < recipe.other_voices
+    return int(rng.integers(RATES[0], RATES[1] + 1)) if other else 100

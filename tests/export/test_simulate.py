@@ -12,13 +12,14 @@ from edgefilter.errors import UsageError
 from export.corpus import Corpus, read_corpus
 from export.dataset import pack
 from export.rooms import draw_room
+from export.simulate import script
 from export.simulate.conversation import simulate
 from export.simulate.effects import draw_effects, elsewhere
 from export.simulate.linear_stage import Stage, WideSetting, from_bytes, front_end, listen
 from export.simulate.loudspeaker import KINDS, active_rms, distorted
 from export.simulate.material import RESPONSES, Material, read_noises, read_responses
 from export.simulate.path import draw_colour
-from export.simulate.recipe import PAPER, RECIPES, WIDE
+from export.simulate.recipe import PAPER, RECIPES, VOICES, WIDE
 from tests.export.speech import RATE, babble, write_librispeech, write_table
 
 
@@ -183,6 +184,25 @@ def test_recorded_noises_and_measured_responses_are_used(parts, tmp_path):
     assert sum(not np.array_equal(a, b) for a, b in zip(with_them, without)) > 3
     with pytest.raises(UsageError, match="holds no impulse response"):
         read_responses(tmp_path / "noise" / "nothing")
+
+
+def test_a_voice_that_is_played_faster_is_higher_and_shorter(tmp_path):
+    tone = np.sin(2 * np.pi * 400 * np.arange(16000) / 16000).astype(np.float32)
+    sf.write(tmp_path / "one-1-0.flac", tone, 16000)
+    corpus = read_corpus(tmp_path)
+    for rate in (80, 100, 125):
+        speech = corpus.draw(np.random.default_rng(0), "one", 3.0, rate=rate)
+        assert np.argmax(np.abs(np.fft.rfft(speech[4000:8000]))) * 4 == pytest.approx(4 * rate, abs=4)
+        end = 16000 * 100 // rate
+        assert speech[end - 100 : end - 60].any() and not speech[end + 1 : end + 1600].any()
+
+
+def test_half_of_the_speakers_of_many_voices_are_given_another_voice():
+    rng = np.random.default_rng(0)
+    rates = np.array([script.rate(rng, VOICES) for _ in range(400)])
+    other = rates[rates != 100]
+    assert 0.4 < other.size / rates.size < 0.6 and (other.min(), other.max()) == script.RATES
+    assert {script.rate(rng, WIDE) for _ in range(20)} == {100}
 
 
 def test_who_says_three_words_is_drawn_seldom():
