@@ -12,7 +12,7 @@ from edgefilter.dsp.stft import StftConfig
 from edgefilter.types import SAMPLE_RATE
 from export.whisper_encoder import WhisperEncoder
 
-LISTENED_S = 8.0
+LISTENED_S = 16.0
 """Seconds of a batch that are listened to: the first layers cost more than the network."""
 ROOM_DB = -40.0
 """Level of the noise under both, over the human's: a recogniser never hears digital silence between words."""
@@ -21,12 +21,12 @@ ROOM_DB = -40.0
 class RecogniserLoss:
     """Mean squared distance of the layers' answers, each over the spread of the human's (Plantinga et al. 2020, "Phonetic feedback").
 
-    folder: Whisper in CTranslate2's format.
+    folder: Whisper in CTranslate2's format. half: bfloat16 in the layers, which are frozen and forgive it.
     """
 
-    def __init__(self, folder: Path, stft: StftConfig, layers: int = 2) -> None:
+    def __init__(self, folder: Path, stft: StftConfig, layers: int = 2, half: bool = False) -> None:
         self.encoder = WhisperEncoder(folder, layers).eval()
-        self.stft = stft
+        self.stft, self.half = stft, half
         self._window = torch.from_numpy(stft.synthesis_window.copy())
         self._noise = torch.Generator().manual_seed(0)
 
@@ -40,12 +40,18 @@ class RecogniserLoss:
         level = wanted.square().mean(1, keepdim=True).sqrt()
         room = torch.randn(wanted.shape, generator=self._noise).to(wanted) * level * 10 ** (ROOM_DB / 20)
         with torch.no_grad():
-            targets = self.encoder(self.encoder.log_mel(wanted + room))
-        answers = self.encoder(self.encoder.log_mel(heard + room))
+            targets = self._layers(wanted + room)
+        answers = self._layers(heard + room)
         apart = [
             (answer - target).square().mean() / target.var().clamp(min=1e-6) for answer, target in zip(answers, targets)
         ]
         return torch.stack(apart).mean()
+
+    def _layers(self, sound: Tensor) -> list[Tensor]:
+        """What each layer makes of sounds (batch, samples)."""
+        mel = self.encoder.log_mel(sound)
+        with torch.autocast(mel.device.type, torch.bfloat16, enabled=self.half):
+            return [answer.float() for answer in self.encoder(mel)]
 
     def sound(self, spectra: Tensor) -> Tensor:
         """(batch, frames, bins, 2) to (batch, (frames - 1) hop), overlapped and added, without the frame at either end that lacks a neighbour."""

@@ -67,7 +67,7 @@ class EdgeTask:
         self._config = EdgeConfig(2 * options.hop, options.hop, **shape)
         self.weights = LossWeights(suppression=options.suppression, si_sdr=options.si_sdr)
         self.stft, self.half = self._config.stft, not options.full_precision
-        self.recogniser = RecogniserLoss(options.recogniser, self.stft) if options.recogniser else None
+        self.recogniser = RecogniserLoss(options.recogniser, self.stft, half=self.half) if options.recogniser else None
         if not 0.0 <= options.fan_kept <= 1.0:
             raise UsageError(f"--fan-kept is {options.fan_kept:g}, expected 0 to 1")
         self.recogniser_weight, self.fan_kept = options.recogniser_weight, options.fan_kept

@@ -100,6 +100,18 @@ def test_the_loss_vanishes_at_the_human_grows_with_the_robot_and_teaches(folder)
     assert float(loss(heard, torch.zeros_like(clean))) == 0.0
 
 
+def test_half_precision_in_the_layers_leaves_the_loss_and_its_slope(folder):
+    rng, slopes = torch.Generator().manual_seed(0), {}
+    clean, robot = (torch.randn(2, 80, 257, 2, generator=rng) for _ in range(2))
+    for half in (False, True):
+        loss, heard = RecogniserLoss(folder, EdgeConfig().stft, half=half), (clean + robot).requires_grad_()
+        value = loss(heard, clean)
+        value.backward()
+        slopes[half] = float(value.detach()), heard.grad.flatten()
+    assert slopes[True][0] == pytest.approx(slopes[False][0], rel=0.02)
+    assert torch.cosine_similarity(slopes[True][1], slopes[False][1], dim=0) > 0.98
+
+
 def test_the_sound_of_spectra_is_what_they_were_cut_from(folder):
     loss = RecogniserLoss(folder, EdgeConfig().stft)
     stft, sound = loss.stft, np.random.default_rng(0).standard_normal(256 * 12).astype(np.float32)
