@@ -35,7 +35,7 @@ from bench.measure.conversation import Conversation, every, find_conversations, 
 from bench.measure.recogniser import Recogniser, word_errors
 from bench.measure.score_cache import ScoreCache, key_of
 from edgefilter.dsp.metrics import si_sdr
-from edgefilter.engines import HAVE_MODEL
+from edgefilter.engines import CATALOGUE
 from edgefilter.errors import EdgefilterError
 from edgefilter.types import SAMPLE_RATE, Samples
 
@@ -71,20 +71,20 @@ def processor(name: str) -> Processor:
 def code_version(name: str) -> str:
     """Hash of the code that makes a row: changed code is scored anew.
 
-    Of the package it is what filtering and calibrating import.
+    Of the package it is what filtering and calibrating import, and of the engines the row's own.
     """
     if name in NO_ENGINE:
         files = [Path(peers.__file__)]
     else:
         package = Path(edgefilter.__file__).parent
         wanted = taught.row(name)
-        models = (
-            [*package.rglob("*.onnx"), *package.parent.glob("models/crnn*.onnx")] if wanted.engine in HAVE_MODEL else []
-        )
+        module = CATALOGUE[wanted.engine].module
+        models = [*package.rglob(f"{module}*.onnx"), *package.parent.glob(f"models/{module}*.onnx")]
         entered = {
             package / "filter" / "ego_filter.py",
             package / "calibration" / "calibrate.py",
-            *package.glob("engines/*.py"),
+            package / "engines" / "__init__.py",
+            package / "engines" / f"{module}.py",
             *([package / "learning" / "path_learner.py"] if wanted.learning else []),
         }
         files = sorted(imported_by(entered, package)) + sorted(models)
@@ -94,13 +94,23 @@ def code_version(name: str) -> str:
 def imported_by(files: set[Path], package: Path) -> set[Path]:
     """These files of the package and all of it that they import, at whatever place in the code.
 
-    The package's own __init__ leads to every public name but loads none before it is asked for, so it counts for nothing.
+    The package's own __init__ leads to every public name but loads none before it is asked for, so it counts for
+    nothing; nor does what is imported for its types alone.
     """
     found, new = set(), set(files)
     while new:
         path = new.pop()
         found.add(path)
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        nodes = list(ast.walk(ast.parse(path.read_text(encoding="utf-8"))))
+        only_types = {
+            inner
+            for node in nodes
+            if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING"
+            for inner in node.body
+        }
+        for node in nodes:
+            if node in only_types:
+                continue
             if isinstance(node, ast.ImportFrom) and node.module and node.module.split(".")[0] == package.name:
                 place = package.parent.joinpath(*node.module.split("."))
                 asked = {
