@@ -1,6 +1,6 @@
 """Convert a trained network to the ONNX file that the runtime loads, and prove that both compute the same.
 
-python -m export.onnx_export CHECKPOINT --output models/crnn.onnx [--int8] [--figures FIGURES.json]
+python -m export.onnx_export CHECKPOINT --output models/crnn.onnx [--int8] [--platt SCALE BIAS] [--figures FIGURES.json]
 
 A checkpoint is what torch.save made of a dict: network (a state_dict), config (the fields of its configuration),
 figures (what it reached on validation data) and kind ("edge", also where it is missing, or "paper"); all else in it
@@ -12,15 +12,17 @@ checker, the parity test and the size limit have passed; otherwise ModelError sa
 from __future__ import annotations
 
 import argparse
+import copy
 import json
 import logging
+import math
 import os
 import sys
 import tempfile
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
 import onnx
@@ -71,6 +73,22 @@ def load(path: Path) -> Trained:
         key: value for key, value in found.items() if key not in ("network", "config", "kind", "figures", "resume")
     }
     return Trained(network.eval(), training, found.get("figures", {}))
+
+
+def scaled(trained: Trained, scale: float, bias: float) -> Trained:
+    """The network whose speech head's log-odds are scale times what they were, plus bias (Platt 1999).
+
+    Raises ModelError for a network without such a head, and for a scale that is not positive.
+    """
+    if not isinstance(trained.network, EdgeCrnn):
+        raise ModelError("the paper's network judges no speech: leave out --platt")
+    if not (0.0 < scale < math.inf and math.isfinite(bias)):
+        raise ModelError(f"--platt is {scale:g} {bias:g}, expected a scale above 0 and a bias")
+    network = copy.deepcopy(trained.network)
+    with torch.no_grad():
+        network.speech.weight.mul_(scale)
+        network.speech.bias.mul_(scale).add_(bias)
+    return replace(trained, network=network, training={**trained.training, "platt": [scale, bias]})
 
 
 def export(trained: Trained, path: Path, int8: bool = False) -> list[str]:
@@ -238,13 +256,20 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument(
         "--figures", type=Path, metavar="FILE.json", help="figures to write into the file, over those of the checkpoint"
     )
+    parser.add_argument(
+        "--platt",
+        type=float,
+        nargs=2,
+        metavar=("SCALE", "BIAS"),
+        help="of the speech head's log-odds, as bench.measure.barge_in_fit finds them",
+    )
     options = parser.parse_args(argv)
     try:
         trained = load(options.checkpoint)
         if options.figures:
-            trained = Trained(
-                trained.network, trained.training, {**trained.figures, **json.loads(options.figures.read_text())}
-            )
+            trained = replace(trained, figures={**trained.figures, **json.loads(options.figures.read_text())})
+        if options.platt:
+            trained = scaled(trained, *options.platt)
         print("\n".join(export(trained, options.output, options.int8)))
     except (EdgefilterError, OSError, ValueError) as error:
         print(f"export: {error}", file=sys.stderr)

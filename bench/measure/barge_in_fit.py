@@ -5,9 +5,9 @@ r"""Is the probability of speech one? The centre and slope that make it so, and 
 
 Robots alone and humans laid on them (RECORDINGS, the tuning half, without a profile), and simulated conversations with
 theirs. Of each hop: the averaged log-odds that `edgefilter/filter/barge_in.py` weighs, and whether the human sounds.
-A logistic of both is fitted (Platt 1999), a human in one hop of four; the page says which CENTRE and SLOPE it has, how
-far the probability is from the share of humans before and after, and for each threshold false starts an hour against
-humans noticed.
+A logistic of both is fitted (Platt 1999), a human in one hop of four; the page says which CENTRE and SLOPE it has, with
+which scale and bias `export.onnx_export --platt` makes a network that the filter's own fit, how far the probability is
+from the share of humans before and after, and for each threshold false starts an hour against humans noticed.
 """
 
 from __future__ import annotations
@@ -120,6 +120,11 @@ def fitted(chosen_ones: list[Listened]) -> tuple[float, float]:
     return float(centre), float(np.exp(log_slope))
 
 
+def platt(centre: float, slope: float, usual: float) -> dict[str, float]:
+    """Scale and bias of the network's log-odds with which centre usual and SLOPE say what these say of odds as they are."""
+    return {"scale": slope / SLOPE, "bias": usual - slope / SLOPE * centre}
+
+
 def reliability(chosen_ones: list[Listened], centre: float, slope: float) -> dict:
     """Share of hops with a human by the probability's value, and the mean distance of both (Guo et al. 2017, eq. (3))."""
     odds, human, weight = pooled(chosen_ones)
@@ -161,12 +166,14 @@ def markdown(kinds: dict) -> str:
     fits = [
         [
             name,
-            *(f"{of[x]:.2f}" for x in ("centre", "slope")),
+            *(f"{of[x]:.2f}" for x in ("centre", "slope", "scale", "bias")),
             *(f"{of[x]['distance']:.3f}" for x in ("before", "after")),
         ]
         for name, of in kinds.items()
     ]
-    lines += results_writer.table(["", "centre", "slope", "distance as it is", "distance fitted"], fits)
+    lines += results_writer.table(
+        ["", "centre", "slope", "scale", "bias", "distance as it is", "distance fitted"], fits
+    )
     for name, of in kinds.items():
         lines += ["", f"{name}, the probability and the share of hops with a human, as it is and fitted:", ""]
         lines += results_writer.table(["", "probability", "hops", "mean", "share"], _rows(of))
@@ -216,6 +223,7 @@ def main() -> int:
         before, after = reliability(own, usual, SLOPE), reliability(own, centre, slope)
         shown, humans = curve(own, centre, slope), told(own)
         kinds[kind] = {"centre": centre, "slope": slope, "before": before, "after": after, "curve": shown}
+        kinds[kind] |= platt(centre, slope, usual)
         kinds[kind] |= {"humans": len(humans), "audible": sum(one.audible for one in humans)}
     print(results_writer.write(options.output, made_with, "Probability of speech", markdown(kinds), {"kinds": kinds}))
     return 0

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from scipy.special import expit
 
-from bench.measure.barge_in_fit import HUMAN_SHARE, Listened, audible, curve, fitted, markdown, reliability
+from bench.measure.barge_in_fit import HUMAN_SHARE, Listened, audible, curve, fitted, markdown, platt, reliability
+from edgefilter.filter.barge_in import CENTRE, SLOPE
 
 
 @pytest.fixture(scope="module")
@@ -27,6 +28,12 @@ def test_the_fit_is_right_about_odds_whatever_the_share_of_humans(known):
     assert reliability([known], usual[0] - 2.0, usual[1])["distance"] > 0.1
 
 
+def test_a_network_scaled_so_fits_the_filters_own_centre_and_slope(known):
+    by = platt(*fitted([known]), CENTRE)
+    scaled = known._replace(odds=by["scale"] * known.odds + by["bias"])
+    assert fitted([scaled]) == pytest.approx((CENTRE, SLOPE), abs=0.01)
+
+
 def test_the_curve_counts_false_starts_an_hour_and_who_is_noticed(known):
     hour = np.full(3600 * 16_000 // 256, -9.0)
     for at in (10_000, 100_000):
@@ -39,8 +46,15 @@ def test_the_curve_counts_false_starts_an_hour_and_who_is_noticed(known):
     points = {point["threshold"]: point for point in curve([alone, human, late, louder], 1.0, 1.2)}
     assert points[0.7]["an_hour"] == pytest.approx(2.0, rel=0.01) and points[0.9]["an_hour"] == 0
     assert points[0.97]["noticed"] == 0.5
-    found = {"centre": 1.0, "slope": 1.2, "before": reliability([human], 3, 1), "after": reliability([human], 1, 1)}
+    found = {
+        "centre": 1.0,
+        "slope": 1.2,
+        **platt(1.0, 1.2, 3.25),
+        "before": reliability([human], 3, 1),
+        "after": reliability([human], 1, 1),
+    }
     page = markdown({"real": {**found, "curve": list(points.values()), "humans": 2, "audible": 1}})
+    assert "| real | 1.00 | 1.20 | 0.96 | 2.29 |" in page
     assert "| 0.7 | 2 | 50 |" in page and "Of 2 humans 1 can be noticed so soon" in page
 
 

@@ -9,6 +9,7 @@ import numpy as np
 import onnx
 import pytest
 import torch
+from scipy.special import logit
 
 from edgefilter import enhance
 from edgefilter.engines.crnn import Crnn
@@ -64,6 +65,24 @@ def test_the_runtime_takes_the_file_and_knows_its_stft_training_and_figures(expo
     assert [shape for _, shape in engine.model.states] == [
         tuple(tensor.shape) for tensor in exported[0].initial_state()
     ]
+
+
+def test_the_speech_head_is_scaled_as_asked_and_the_file_says_so(exported, tmp_path, capsys):
+    network, path = exported
+    words = [path.with_name("last.pt"), "--output", tmp_path / "crnn.onnx", "--platt", "0.5", "1.5"]
+    assert main([str(word) for word in words]) == 0
+    engines = Crnn(path), Crnn(tmp_path / "crnn.onnx")
+    assert engines[1].model.training["platt"] == [0.5, 1.5]
+    rng, bins = np.random.default_rng(2), engines[0].stft.bins
+    spectra = (rng.standard_normal((4, bins)) + 1j * rng.standard_normal((4, bins))).astype(np.complex64)
+    frame = Frame(*spectra, *rng.random((2, bins), np.float32))
+    (usual, _), (scaled, _) = (engine.step(frame, engine.initial_state()) for engine in engines)
+    np.testing.assert_array_equal(usual.spectrum, scaled.spectrum)
+    assert logit(scaled.speech_probability) == pytest.approx(0.5 * logit(usual.speech_probability) + 1.5, abs=1e-4)
+    capsys.readouterr()
+    for given, complaint in ((["0", "1"], "scale above 0"), (["1", "inf"], "and a bias")):
+        assert main([str(word) for word in [*words[:-2], *given]]) == 1
+        assert complaint in capsys.readouterr().err
 
 
 def test_nothing_but_the_model_is_left_behind(exported):
