@@ -5,9 +5,10 @@ r"""Is the probability of speech one? The centre and slope that make it so, and 
 
 Robots alone and humans laid on them (RECORDINGS, the tuning half, without a profile), and simulated conversations with
 theirs. Of each hop: the averaged log-odds that `edgefilter/filter/barge_in.py` weighs, and whether the human sounds.
-A logistic of both is fitted (Platt 1999), a human in one hop of four; the page says which CENTRE and SLOPE it has, with
-which scale and bias `export.onnx_export --platt` makes a network that the filter's own fit, how far the probability is
-from the share of humans before and after, and for each threshold false starts an hour against humans noticed.
+A logistic of both is fitted (Platt 1999), a human in one hop of four; the page says which CENTRE and SLOPE it has, how
+far the probability is from the share of humans before and after, and for each threshold false starts an hour against
+humans noticed. Where the fitted probability has --false-starts an hour the filter's usual threshold ought to be:
+`export.onnx_export --platt SCALE BIAS` with the scale and bias of the page makes a network of which that is so.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ from bench.measure.levels import FRAME, frame_power
 from bench.measure.real_barge_in import FIRST_DB, IN_TIME_S, THRESHOLDS, first_sound, in_time, noticed, replay, starts
 from bench.measure.real_streams import ECHO_ONLY, ROBOT_ALONE, Cells, chosen, find_recordings, lay
 from edgefilter.errors import EdgefilterError
-from edgefilter.filter.barge_in import CENTRE, CENTRE_CALIBRATED, SLOPE
+from edgefilter.filter.barge_in import CENTRE, CENTRE_CALIBRATED, SLOPE, BargeInSettings
 from edgefilter.profile.data import Profile
 from edgefilter.types import SAMPLE_RATE, Samples
 
@@ -44,6 +45,8 @@ AT_DB = -20.0
 AUDIBLE_DB = 20.0
 """Below the loudest sound: who begins with less, a breath say, is 40 dB below the robot where the whole is 20."""
 SURE = 1e-9
+FINE = tuple(round(0.5 + 0.01 * step, 2) for step in range(50))
+"""Thresholds among which the one for so many false starts is looked for."""
 
 
 class Listened(NamedTuple):
@@ -120,9 +123,25 @@ def fitted(chosen_ones: list[Listened]) -> tuple[float, float]:
     return float(centre), float(np.exp(log_slope))
 
 
-def platt(centre: float, slope: float, usual: float) -> dict[str, float]:
-    """Scale and bias of the network's log-odds with which centre usual and SLOPE say what these say of odds as they are."""
-    return {"scale": slope / SLOPE, "bias": usual - slope / SLOPE * centre}
+def sparing(chosen_ones: list[Listened], centre: float, slope: float, false_starts: float) -> float:
+    """The lowest threshold on the fitted probability at which robots alone have at most so many false starts an hour."""
+    alone = [one for one in chosen_ones if one.onset is None]
+    hours = sum(one.odds.size * one.hop for one in alone) / SAMPLE_RATE / 3600
+    said = [expit(slope * (one.odds - centre)).tolist() for one in alone]
+    for threshold in FINE:
+        if sum(starts(replay(one, alone[0].hop, threshold)) for one in said) <= false_starts * hours:
+            return threshold
+    return FINE[-1]
+
+
+def platt(centre: float, slope: float, threshold: float, usual: float) -> dict[str, float]:
+    """Scale and bias of the network's log-odds, by which the filter's threshold stands where this one does.
+
+    The slope becomes the filter's as well. usual: the filter's centre.
+    """
+    scale = slope / SLOPE
+    apart = float(logit(BargeInSettings().threshold) - logit(threshold)) / SLOPE
+    return {"scale": scale, "bias": usual + apart - scale * centre}
 
 
 def reliability(chosen_ones: list[Listened], centre: float, slope: float) -> dict:
@@ -166,13 +185,13 @@ def markdown(kinds: dict) -> str:
     fits = [
         [
             name,
-            *(f"{of[x]:.2f}" for x in ("centre", "slope", "scale", "bias")),
+            *(f"{of[x]:.2f}" for x in ("centre", "slope", "threshold", "scale", "bias")),
             *(f"{of[x]['distance']:.3f}" for x in ("before", "after")),
         ]
         for name, of in kinds.items()
     ]
     lines += results_writer.table(
-        ["", "centre", "slope", "scale", "bias", "distance as it is", "distance fitted"], fits
+        ["", "centre", "slope", "threshold", "scale", "bias", "distance as it is", "distance fitted"], fits
     )
     for name, of in kinds.items():
         lines += ["", f"{name}, the probability and the share of hops with a human, as it is and fitted:", ""]
@@ -206,6 +225,9 @@ def main() -> int:
     parser.add_argument("--every", type=int, default=1, metavar="N", help="N-th conversation only")
     parser.add_argument("--cases", type=int, default=12, help="humans laid at each level")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument(
+        "--false-starts", type=float, default=15.0, metavar="N", help="an hour that may be (default: 15)"
+    )
     parser.add_argument("--output", type=Path, required=True, metavar="PATH")
     options = parser.parse_args()
     data = {"RECORDINGS": [options.recordings], "HUMAN": [options.speech], "conversations": options.conversations}
@@ -223,7 +245,8 @@ def main() -> int:
         before, after = reliability(own, usual, SLOPE), reliability(own, centre, slope)
         shown, humans = curve(own, centre, slope), told(own)
         kinds[kind] = {"centre": centre, "slope": slope, "before": before, "after": after, "curve": shown}
-        kinds[kind] |= platt(centre, slope, usual)
+        kinds[kind]["threshold"] = sparing(own, centre, slope, options.false_starts)
+        kinds[kind] |= platt(centre, slope, kinds[kind]["threshold"], usual)
         kinds[kind] |= {"humans": len(humans), "audible": sum(one.audible for one in humans)}
     print(results_writer.write(options.output, made_with, "Probability of speech", markdown(kinds), {"kinds": kinds}))
     return 0

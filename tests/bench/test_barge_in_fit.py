@@ -4,8 +4,18 @@ import numpy as np
 import pytest
 from scipy.special import expit
 
-from bench.measure.barge_in_fit import HUMAN_SHARE, Listened, audible, curve, fitted, markdown, platt, reliability
-from edgefilter.filter.barge_in import CENTRE, SLOPE
+from bench.measure.barge_in_fit import (
+    HUMAN_SHARE,
+    Listened,
+    audible,
+    curve,
+    fitted,
+    markdown,
+    platt,
+    reliability,
+    sparing,
+)
+from edgefilter.filter.barge_in import CENTRE, SLOPE, BargeInSettings
 
 
 @pytest.fixture(scope="module")
@@ -28,10 +38,19 @@ def test_the_fit_is_right_about_odds_whatever_the_share_of_humans(known):
     assert reliability([known], usual[0] - 2.0, usual[1])["distance"] > 0.1
 
 
-def test_a_network_scaled_so_fits_the_filters_own_centre_and_slope(known):
-    by = platt(*fitted([known]), CENTRE)
-    scaled = known._replace(odds=by["scale"] * known.odds + by["bias"])
-    assert fitted([scaled]) == pytest.approx((CENTRE, SLOPE), abs=0.01)
+def test_scale_and_bias_bring_the_threshold_of_so_many_false_starts_to_the_filters(known):
+    hour = np.full(3600 * 16_000 // 256, -9.0)
+    for at, odds in ((10_000, 2.0), (100_000, 3.0)):
+        hour[at : at + 40] = odds
+    alone = Listened("real", hour, np.zeros(hour.size, bool), 256)
+    one, none = (sparing([alone, known], 1.0, 1.2, false_starts) for false_starts in (1, 0))
+    assert expit(1.2 * (2.0 - 1.0)) < one < expit(1.2 * (2.0 - 1.0)) + 0.01
+    assert expit(1.2 * (3.0 - 1.0)) < none < expit(1.2 * (3.0 - 1.0)) + 0.01
+    by = platt(1.0, 1.2, one, CENTRE)
+    for odds, stops in ((2.0, False), (3.0, True)):
+        assert (expit(SLOPE * (by["scale"] * odds + by["bias"] - CENTRE)) > BargeInSettings().threshold) == stops
+    same = platt(CENTRE, SLOPE, BargeInSettings().threshold, CENTRE)
+    assert same == pytest.approx({"scale": 1.0, "bias": 0.0})
 
 
 def test_the_curve_counts_false_starts_an_hour_and_who_is_noticed(known):
@@ -49,12 +68,13 @@ def test_the_curve_counts_false_starts_an_hour_and_who_is_noticed(known):
     found = {
         "centre": 1.0,
         "slope": 1.2,
-        **platt(1.0, 1.2, 3.25),
+        "threshold": 0.97,
+        **platt(1.0, 1.2, 0.97, 3.25),
         "before": reliability([human], 3, 1),
         "after": reliability([human], 1, 1),
     }
     page = markdown({"real": {**found, "curve": list(points.values()), "humans": 2, "audible": 1}})
-    assert "| real | 1.00 | 1.20 | 0.96 | 2.29 |" in page
+    assert "| real | 1.00 | 1.20 | 0.97 | 0.96 | 2.29 |" in page
     assert "| 0.7 | 2 | 50 |" in page and "Of 2 humans 1 can be noticed so soon" in page
 
 
