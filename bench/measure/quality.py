@@ -36,7 +36,7 @@ from bench.measure.recogniser import Recogniser, word_errors
 from bench.measure.score_cache import ScoreCache, key_of
 from edgefilter.dsp.metrics import si_sdr
 from edgefilter.engines import CATALOGUE
-from edgefilter.errors import EdgefilterError
+from edgefilter.errors import EdgefilterError, UsageError
 from edgefilter.types import SAMPLE_RATE, Samples
 
 Processor = Callable[[Conversation, Samples], Samples]
@@ -71,13 +71,16 @@ def processor(name: str) -> Processor:
 def code_version(name: str) -> str:
     """Hash of the code that makes a row: changed code is scored anew.
 
-    Of the package it is what filtering and calibrating import, and of the engines the row's own.
+    Of the package it is what filtering and calibrating import, and of the engines the row's own. Raises UsageError for
+    an engine that there is not.
     """
     if name in NO_ENGINE:
         files = [Path(peers.__file__)]
     else:
         package = Path(edgefilter.__file__).parent
         wanted = taught.row(name)
+        if wanted.engine not in CATALOGUE:
+            raise UsageError(f"unknown engine '{wanted.engine}': choose one of {', '.join(CATALOGUE)}")
         module = CATALOGUE[wanted.engine].module
         models = [*package.rglob(f"{module}*.onnx"), *package.parent.glob(f"models/{module}*.onnx")]
         entered = {

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
-import edgefilter
-from bench.measure import peers, taught
+from bench.measure import peers, quality, taught
 from edgefilter import EgoFilter, Event
 from edgefilter.errors import EdgefilterError, UsageError
 from edgefilter.types import Samples
@@ -79,13 +77,5 @@ def engine(name: str, mic: Samples, ref: Samples) -> Heard:
 
 def code_version(system: str) -> str:
     """Hash of the code and the networks behind a system."""
-    if system == MICROPHONE or system in PEERS or system in UNOBTAINABLE:
-        files = [Path(peers.__file__)]
-    else:
-        package = Path(edgefilter.__file__).parent
-        files = [
-            *sorted(package.rglob("*.py")),
-            *sorted(package.parent.glob("models/crnn*.onnx")),
-            *sorted(package.rglob("*.onnx")),
-        ]
-    return hashlib.sha256(b"".join(path.read_bytes() for path in files)).hexdigest()
+    bare = system == MICROPHONE or system in UNOBTAINABLE
+    return quality.code_version("unfiltered" if bare else system)
