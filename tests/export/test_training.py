@@ -431,6 +431,18 @@ def test_small_weights_are_half_of_the_average_and_training_goes_on_from_them(tm
         assert value.dtype == torch.float16 and torch.allclose(value.float(), full["network"][name], atol=2e-3)
     assert weights.stat().st_size < 0.3 * last.stat().st_size
     assert run("second", "--start", str(weights)) == 0
+    second, mean = tmp_path / "second" / "last.pt", tmp_path / "mean.pt"
+    monkeypatch.setattr("sys.argv", ["checkpoint", str(second), "--output", str(mean), "--full", "--mean", str(last)])
+    assert checkpoint.main() == 0
+    later, both = (torch.load(path, weights_only=True) for path in (second, mean))
+    assert both["mean_of"] == [later["step"], 4] and both["stages"] == later["stages"]
+    for name, value in both["network"].items():
+        assert torch.allclose(value, (full["network"][name] + later["network"][name]) / 2, atol=1e-6)
+    torch.save({**full, "config": {**full["config"], "hidden": 9}}, tmp_path / "wide.pt")
+    monkeypatch.setattr(
+        "sys.argv", ["checkpoint", str(last), "--output", str(mean), "--mean", str(tmp_path / "wide.pt")]
+    )
+    assert checkpoint.main() == 1 and "wide.pt" in capsys.readouterr().err
     monkeypatch.setattr(checkpoint, "MOST_BYTES", 1000)
     monkeypatch.setattr("sys.argv", ["checkpoint", str(last), "--output", str(weights)])
     assert checkpoint.main() == 1 and "expected at most" in capsys.readouterr().err and not weights.exists()
