@@ -56,6 +56,7 @@ class Scores:
         system, stream, recognition = task
         files = sorted(Path(__file__).parent.glob("real*.py"))
         code = [
+            system,
             _version(system),
             *(path.read_text(encoding="utf-8") for path in files),
             repr(stream),

@@ -118,6 +118,9 @@ def test_kept_rows_are_taken_for_the_same_code_and_stream_only(recordings, speec
     real.Scores(tmp_path / "kept.jsonl").keep(task, {"si_sdr": 1.0, "name": "{}"})
     assert real.Scores(tmp_path / "kept.jsonl").get(task) == {"si_sdr": 1.0, "name": "{}"}
     assert real.Scores(tmp_path / "kept.jsonl").get(other) is None
+    microphone, peer = (("microphone", *task[1:]), ("aec3", *task[1:]))  # code of one file
+    real.Scores(tmp_path / "kept.jsonl").keep(microphone, {"si_sdr": 2.0})
+    assert real.Scores(tmp_path / "kept.jsonl").get(peer) is None
     monkeypatch.setattr(real, "_version", lambda system: "other code")
     assert real.Scores(tmp_path / "kept.jsonl").get(task) is None
 
