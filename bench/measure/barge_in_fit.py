@@ -124,8 +124,13 @@ def fitted(chosen_ones: list[Listened]) -> tuple[float, float]:
 
 
 def sparing(chosen_ones: list[Listened], centre: float, slope: float, false_starts: float) -> float:
-    """The lowest threshold on the fitted probability at which robots alone have at most so many false starts an hour."""
+    """The lowest threshold on the fitted probability at which robots alone have at most so many false starts an hour.
+
+    The filter's where none is alone.
+    """
     alone = [one for one in chosen_ones if one.onset is None]
+    if not alone:
+        return BargeInSettings().threshold
     hours = sum(one.odds.size * one.hop for one in alone) / SAMPLE_RATE / 3600
     said = [expit(slope * (one.odds - centre)).tolist() for one in alone]
     for threshold in FINE:

@@ -46,6 +46,7 @@ def test_scale_and_bias_bring_the_threshold_of_so_many_false_starts_to_the_filte
     one, none = (sparing([alone, known], 1.0, 1.2, false_starts) for false_starts in (1, 0))
     assert expit(1.2 * (2.0 - 1.0)) < one < expit(1.2 * (2.0 - 1.0)) + 0.01
     assert expit(1.2 * (3.0 - 1.0)) < none < expit(1.2 * (3.0 - 1.0)) + 0.01
+    assert sparing([known], 1.0, 1.2, 0) == BargeInSettings().threshold
     by = platt(1.0, 1.2, one, CENTRE)
     for odds, stops in ((2.0, False), (3.0, True)):
         assert (expit(SLOPE * (by["scale"] * odds + by["bias"] - CENTRE)) > BargeInSettings().threshold) == stops
