@@ -32,7 +32,7 @@ from bench.measure.real_streams import ECHO_ONLY, ROBOT_ALONE, Cells, chosen, fi
 from edgefilter.errors import EdgefilterError
 from edgefilter.filter.barge_in import CENTRE, CENTRE_CALIBRATED, SLOPE, BargeInSettings
 from edgefilter.profile.data import Profile
-from edgefilter.types import SAMPLE_RATE, Samples
+from edgefilter.types import SAMPLE_RATE, Event, Samples
 
 ENGINE = "crnn"
 HUMAN_SHARE = 0.25
@@ -128,15 +128,27 @@ def sparing(chosen_ones: list[Listened], centre: float, slope: float, false_star
 
     The filter's where none is alone.
     """
-    alone = [one for one in chosen_ones if one.onset is None]
+    alone = robots_alone(chosen_ones)
     if not alone:
         return BargeInSettings().threshold
+    few = (at for at in FINE if false_starts_an_hour(alone, centre, slope, at) <= false_starts)
+    return next(few, FINE[-1])
+
+
+def robots_alone(chosen_ones: list[Listened]) -> list[Listened]:
+    """Those in whom nobody speaks."""
+    return [one for one in chosen_ones if one.onset is None]
+
+
+def false_starts_an_hour(alone: list[Listened], centre: float, slope: float, threshold: float) -> float:
+    """At that threshold on the fitted probability."""
     hours = sum(one.odds.size * one.hop for one in alone) / SAMPLE_RATE / 3600
-    said = [expit(slope * (one.odds - centre)).tolist() for one in alone]
-    for threshold in FINE:
-        if sum(starts(replay(one, alone[0].hop, threshold)) for one in said) <= false_starts * hours:
-            return threshold
-    return FINE[-1]
+    return sum(starts(replayed(one, centre, slope, threshold)) for one in alone) / hours
+
+
+def replayed(one: Listened, centre: float, slope: float, threshold: float) -> list[Event]:
+    """What the filter would have said by the fitted probability."""
+    return replay(expit(slope * (one.odds - centre)).tolist(), one.hop, threshold)
 
 
 def platt(centre: float, slope: float, threshold: float, usual: float) -> dict[str, float]:
@@ -165,17 +177,12 @@ def reliability(chosen_ones: list[Listened], centre: float, slope: float) -> dic
 
 def curve(chosen_ones: list[Listened], centre: float, slope: float) -> list[dict]:
     """For each threshold: false starts an hour on robots alone, and laid or conversing humans noticed in time."""
-    alone = [one for one in chosen_ones if one.onset is None]
-    heard = told(chosen_ones)
-    hours = sum(one.odds.size * one.hop for one in alone) / SAMPLE_RATE / 3600
+    alone, heard = robots_alone(chosen_ones), told(chosen_ones)
     points = []
     for threshold in THRESHOLDS:
-        events = [replay(expit(slope * (one.odds - centre)).tolist(), one.hop, threshold) for one in (*alone, *heard)]
-        false = sum(starts(found) for found in events[: len(alone)])
-        soon = [in_time(noticed(found, one.onset)) for found, one in zip(events[len(alone) :], heard, strict=True)]
-        points.append(
-            {"threshold": threshold, "an_hour": false / hours if hours else None, "noticed": float(np.mean(soon))}
-        )
+        soon = [in_time(noticed(replayed(one, centre, slope, threshold), one.onset)) for one in heard]
+        false = false_starts_an_hour(alone, centre, slope, threshold) if alone else None
+        points.append({"threshold": threshold, "an_hour": false, "noticed": float(np.mean(soon))})
     return points
 
 

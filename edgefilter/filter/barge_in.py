@@ -30,7 +30,9 @@ CENTRE_CALIBRATED = 2.25
 """The same with a profile: the network was trained on what a calibrated path leaves, and is wrong less often."""
 CENTRE_DOUBTED = 5.2
 """The same of a robot that sounds like a human for a moment again and again (own_bursts.py): of synthesizers that the
-network never heard, one false start of eight is left, and most who interrupt are still noticed."""
+network never heard, one false start of eight is left, and most who interrupt are still noticed. Also of what is heard
+while an utterance of the robot has begun and its lag is not found: its first sound, soft still, comes without its
+reference, as a human does."""
 ROBOT_SHARE = 0.1
 """Share of what is expected from which on the robot is heard: with as much, the network decides alone."""
 ROOM_EXCESS, ROOM_ODDS = 0.4, 3.45
@@ -89,11 +91,11 @@ class HumanJudge:
         self._follow_excess = 1.0 - math.exp(-hop_s / EXCESS_MEMORY_S)
         self._odds = self._above = 0.0
 
-    def step(self, frame: Frame, probability: float, suspect: bool = False) -> float:
+    def step(self, frame: Frame, probability: float, suspect: bool = False, begun: bool = False) -> float:
         """Probability that a human speaks, 0 to 1, from the engine's.
 
-        suspect: whether the frame may hold an utterance of the robot that is not found yet; the answer is then 0, and
-        nothing is learned from the frame.
+        suspect: whether what sounds may well be an utterance of the robot that is not found yet; the answer is then 0,
+        and nothing is learned from the frame. begun: whether there is such an utterance, audible or not.
         """
         above = self._excess.step(frame.echo, frame.error, learn=not suspect)
         self._above += self._follow_excess * (min(above, MOST_EXCESS) - self._above)
@@ -104,6 +106,7 @@ class HumanJudge:
         odds = math.log(max(probability, 1e-9) / max(1.0 - probability, 1e-9))
         self._odds += self._follow_odds * (min(max(odds, ODDS_RANGE[0]), ODDS_RANGE[1]) - self._odds)
         doubt = self._bursts.step(self._odds, robot=self._excess.echo_share >= ROBOT_SHARE)
+        doubt = 1.0 if begun else doubt
         centre = self._centre + doubt * (CENTRE_DOUBTED - self._centre)
         room = ROOM_ODDS + ROOM_SLOPE * (self._above - ROOM_EXCESS) + ECHO_SLOPE * self._excess.echo_share
         return 1.0 / (1.0 + math.exp(-min(SLOPE * (self._odds - centre), room)))

@@ -161,14 +161,15 @@ class Stream:
             self._collect(frame, engine)
             return np.zeros(0, np.float32)
         output, self._state = engine.step(frame, self._state)
-        self._judge_speech(frame, output.speech_probability)
+        begun = aligned is not None and aligned.state == "begun"
+        self._judge_speech(frame, output.speech_probability, begun)
         return self._synthesiser.push(output.spectrum)
 
-    def _judge_speech(self, frame: Frame, probability: float | None) -> None:
+    def _judge_speech(self, frame: Frame, probability: float | None, begun: bool) -> None:
         self.speech_probability = probability
         if probability is not None:
             suspect = self.front.gate is not None and self.front.gate.suspect
-            self.speech_probability = self._judge.step(frame, probability, suspect)
+            self.speech_probability = self._judge.step(frame, probability, suspect, begun)
         if talk := self._barge_in.note(self.speech_probability):
             self.events.append(Event(talk, self._stepped, f"probability {self.speech_probability or 0.0:.2f}"))
             if self._on_barge_in and talk in INTERRUPTIONS:

@@ -164,6 +164,34 @@ def test_an_utterance_that_is_not_found_yet_holds_the_probability_down_and_teach
     assert np.all(judge._excess._log_gain < same._excess._log_gain)
 
 
+def test_while_an_utterance_is_looked_for_it_takes_a_surer_sign_and_a_sure_one_will_do():
+    threshold, odds = BargeInSettings().threshold, {}
+    for begun in (False, True):
+        for said in (0.997, 0.9999):
+            room, judge = Room(), HumanJudge(STFT, calibrated=True)
+            for _ in range(100):
+                judge.step(room.frame(), UNSURE)
+            odds[begun, said] = max(judge.step(room.frame(human=0.05), said, begun=begun) for _ in range(12))
+    assert odds[False, 0.997] > threshold > odds[True, 0.997] and odds[True, 0.9999] > threshold
+
+
+def test_an_utterance_is_looked_for_from_its_first_sample_until_its_lag_is_found(monkeypatch):
+    mic, ref = (soundfile.read(DATA / f"{name}.flac", dtype="float32")[0] for name in ("mic", "reference"))
+    usual, told = HumanJudge.step, []
+
+    def step(self, frame, probability, suspect=False, begun=False):
+        told.append(begun)
+        return usual(self, frame, probability, suspect, begun)
+
+    monkeypatch.setattr(HumanJudge, "step", step)
+    ego = EgoFilter(DATA / "profile.npz", engine="crnn")
+    ego.process(mic, ref)
+    first = int(np.flatnonzero(np.abs(ref) > 1e-3)[0]) // ego.hop
+    found = next(event.sample for event in ego.events() if event.kind == "realigned") // ego.hop
+    assert not any(told[: first - 1]) and all(told[first + 1 : found - 1]) and found - first > 3
+    assert not any(told[found : found + 60])
+
+
 @pytest.mark.parametrize("probability", [0.0, 1.0])
 def test_probabilities_stay_in_0_to_1_whatever_comes(probability):
     judge, silence = HumanJudge(STFT), np.zeros(STFT.bins, np.complex64)
