@@ -4,7 +4,7 @@ r"""Is the probability of speech one? The centre and slope that make it so, and 
         --every 3 --output PATH                        (EDGEFILTER_CRNN=FILE.onnx for a network other than the package's)
 
 Robots alone and humans laid on them (RECORDINGS, the tuning half, without a profile), and simulated conversations with
-theirs. Of each hop: the averaged log-odds that `edgefilter/filter/barge_in.py` weighs, and whether the human sounds.
+theirs, as they are and less the human. Of each hop: the averaged log-odds that `edgefilter/filter/barge_in.py` weighs, and whether the human sounds.
 A logistic of both is fitted (Platt 1999), a human in one hop of four; the page says which CENTRE and SLOPE it has, how
 far the probability is from the share of humans before and after, and for each threshold false starts an hour against
 humans noticed. Where the fitted probability has --false-starts an hour the filter's usual threshold ought to be:
@@ -101,6 +101,7 @@ def streams(options: argparse.Namespace) -> Iterator[Listened]:
     sets = find_conversations(options.conversations) if options.conversations else {}
     for _, conversation in progress(every(sets, options.every), "conversation"):
         mic, ref, clean = (conversation.read(name) for name in ("mic", "ref", "clean"))
+        yield listened("simulated", mic - clean, ref, None, conversation.profile)
         yield listened("simulated", mic, ref, clean, conversation.profile)
 
 
@@ -124,13 +125,8 @@ def fitted(chosen_ones: list[Listened]) -> tuple[float, float]:
 
 
 def sparing(chosen_ones: list[Listened], centre: float, slope: float, false_starts: float) -> float:
-    """The lowest threshold on the fitted probability at which robots alone have at most so many false starts an hour.
-
-    The filter's where none is alone.
-    """
+    """The lowest threshold on the fitted probability at which robots alone have at most so many false starts an hour."""
     alone = robots_alone(chosen_ones)
-    if not alone:
-        return BargeInSettings().threshold
     few = (at for at in FINE if false_starts_an_hour(alone, centre, slope, at) <= false_starts)
     return next(few, FINE[-1])
 
@@ -181,7 +177,7 @@ def curve(chosen_ones: list[Listened], centre: float, slope: float) -> list[dict
     points = []
     for threshold in THRESHOLDS:
         soon = [in_time(noticed(replayed(one, centre, slope, threshold), one.onset)) for one in heard]
-        false = false_starts_an_hour(alone, centre, slope, threshold) if alone else None
+        false = false_starts_an_hour(alone, centre, slope, threshold)
         points.append({"threshold": threshold, "an_hour": false, "noticed": float(np.mean(soon))})
     return points
 
@@ -208,12 +204,14 @@ def markdown(kinds: dict) -> str:
     for name, of in kinds.items():
         lines += ["", f"{name}, the probability and the share of hops with a human, as it is and fitted:", ""]
         lines += results_writer.table(["", "probability", "hops", "mean", "share"], _rows(of))
-        lines += ["", f"{name}, fitted:", ""]
-        cells = []
-        for point in of["curve"]:
-            false = "" if point["an_hour"] is None else f"{point['an_hour']:.0f}"
-            cells.append([point["threshold"], false, f"{100 * point['noticed']:.0f}"])
-        lines += results_writer.table(["threshold", "false starts an hour", f"noticed in {IN_TIME_S} s, %"], cells)
+        lines += ["", f"{name}, by the threshold of the probability, as it is and fitted:", ""]
+        found = zip(of["curve_before"], of["curve"], strict=True)
+        cells = [
+            [both[0]["threshold"], *(f"{x:.0f}" for each in both for x in (each["an_hour"], 100 * each["noticed"]))]
+            for both in found
+        ]
+        columns = ["false starts an hour", f"noticed in {IN_TIME_S} s, %"]
+        lines += results_writer.table(["threshold", *columns, *(f"fitted: {column}" for column in columns)], cells)
         first = f"in their first {IN_TIME_S} s they come within {AUDIBLE_DB:.0f} dB of their loudest sound"
         lines += ["", f"Of {of['humans']} humans {of['audible']} can be noticed so soon: {first}."]
     return "\n".join([*lines, ""])
@@ -255,10 +253,11 @@ def main() -> int:
         usual = CENTRE if kind == "real" else CENTRE_CALIBRATED
         centre, slope = fitted(own)
         before, after = reliability(own, usual, SLOPE), reliability(own, centre, slope)
-        shown, humans = curve(own, centre, slope), told(own)
-        kinds[kind] = {"centre": centre, "slope": slope, "before": before, "after": after, "curve": shown}
+        kinds[kind] = {"centre": centre, "slope": slope, "before": before, "after": after}
+        kinds[kind] |= {"curve_before": curve(own, usual, SLOPE), "curve": curve(own, centre, slope)}
         kinds[kind]["threshold"] = sparing(own, centre, slope, options.false_starts)
         kinds[kind] |= platt(centre, slope, kinds[kind]["threshold"], usual)
+        humans = told(own)
         kinds[kind] |= {"humans": len(humans), "audible": sum(one.audible for one in humans)}
     print(results_writer.write(options.output, made_with, "Probability of speech", markdown(kinds), {"kinds": kinds}))
     return 0

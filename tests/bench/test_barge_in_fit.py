@@ -46,7 +46,6 @@ def test_scale_and_bias_bring_the_threshold_of_so_many_false_starts_to_the_filte
     one, none = (sparing([alone, known], 1.0, 1.2, false_starts) for false_starts in (1, 0))
     assert expit(1.2 * (2.0 - 1.0)) < one < expit(1.2 * (2.0 - 1.0)) + 0.01
     assert expit(1.2 * (3.0 - 1.0)) < none < expit(1.2 * (3.0 - 1.0)) + 0.01
-    assert sparing([known], 1.0, 1.2, 0) == BargeInSettings().threshold
     by = platt(1.0, 1.2, one, CENTRE)
     for odds, stops in ((2.0, False), (3.0, True)):
         assert (expit(SLOPE * (by["scale"] * odds + by["bias"] - CENTRE)) > BargeInSettings().threshold) == stops
@@ -74,9 +73,11 @@ def test_the_curve_counts_false_starts_an_hour_and_who_is_noticed(known):
         "before": reliability([human], 3, 1),
         "after": reliability([human], 1, 1),
     }
-    page = markdown({"real": {**found, "curve": list(points.values()), "humans": 2, "audible": 1}})
+    as_it_is = curve([alone, human, late], 3.25, 1.25)
+    curves = {"curve_before": as_it_is, "curve": list(points.values())}
+    page = markdown({"real": {**found, **curves, "humans": 2, "audible": 1}})
     assert "| real | 1.00 | 1.20 | 0.97 | 0.96 | 2.29 |" in page
-    assert "| 0.7 | 2 | 50 |" in page and "Of 2 humans 1 can be noticed so soon" in page
+    assert "| 0.7 | 0 | 50 | 2 | 50 |" in page and "Of 2 humans 1 can be noticed so soon" in page
 
 
 def test_who_begins_with_a_breath_cannot_be_noticed_in_time():
