@@ -88,7 +88,7 @@ def test_the_demo_runs_from_it(installed, tmp_path):
     figures = json.loads((tmp_path / "demo.json").read_text())
     assert (
         figures["engine"] == "crnn" and figures["si_sdr_after_db"] > 9.0
-    )  # README: 9.5 dB; half a decibel for another processor
+    )  # README: 9.3 dB; a little for another processor
     assert (tmp_path / "demo/before_after.png").stat().st_size > 10_000
     where = run(installed / "python", "-c", "import edgefilter; print(edgefilter.__file__)", cwd=tmp_path).strip()
     assert Path(where).is_relative_to(installed.parent)

@@ -28,7 +28,7 @@ from bench.measure.intervals import percentiles
 from bench.measure.recogniser import Recogniser, word_errors
 from edgefilter.dsp.metrics import si_sdr
 from edgefilter.engines import create
-from edgefilter.engines.crnn import SPECTRA, WIENER_SHARE, Crnn
+from edgefilter.engines.crnn import SPECTRA, Crnn
 from edgefilter.engines.onnx_session import FixedPlaces
 from edgefilter.errors import EdgefilterError, UsageError
 from edgefilter.filter.stream import Stream
@@ -193,8 +193,6 @@ def main() -> int:
     parser.add_argument(
         "--every", type=int, default=1, metavar="N", help="take every N-th conversation of each folder (default: all)"
     )
-    shares = "of the Wiener mask in the answer (default: 0 and the engine's)"
-    parser.add_argument("--shares", type=float, nargs="+", default=[0.0, WIENER_SHARE], help=shares)
     parser.add_argument("--whisper", type=Path, required=True, metavar="DIR")
     parser.add_argument("--output", type=Path, required=True, metavar="PATH")
     parser.add_argument("--cache", type=Path, default=Path.home() / ".cache" / "edgefilter-bench", metavar="DIR")
@@ -217,9 +215,7 @@ def main() -> int:
             for row in judge(name, lambda name=name: create(name), conversations, recogniser)
         ]
         for run in runs:
-            for share in options.shares:
-                name = f"{run.folder.name}, {share:g} Wiener"
-                rows += judge(name, lambda run=run, share=share: Crnn(run.model, share), conversations, recogniser)
+            rows += judge(run.folder.name, lambda run=run: Crnn(run.model), conversations, recogniser)
     except (EdgefilterError, OSError) as error:
         print(f"networks: {error}", file=sys.stderr)
         return 1

@@ -36,6 +36,8 @@ from edgefilter.dsp.stft import StftConfig, Synthesiser
 from edgefilter.engines import create
 from edgefilter.engines.base import Engine, EngineState, FrontEndKind
 from edgefilter.engines.crnn import Crnn
+from edgefilter.engines.linear import Linear
+from edgefilter.engines.spectral_subtraction import SpectralSubtraction
 from edgefilter.errors import EdgefilterError, UsageError
 from edgefilter.filter.stream import Stream
 from edgefilter.profile.data import Profile
@@ -48,12 +50,13 @@ BASE = "ss"
 
 
 @dataclass(frozen=True)
-class WithError:
-    """An engine with a share of the linear stage's error in its answer, which brings words back that were deleted."""
+class Mixed:
+    """An engine with a share of another's answer in its own: what one deletes the other may have kept."""
 
     engine: Engine
+    other: Engine
     share: float
-    name: str = "with error"
+    name: str = "mixed"
     front: FrontEndKind = "full"
 
     @property
@@ -65,12 +68,14 @@ class WithError:
         return self.engine.lookahead
 
     def initial_state(self) -> EngineState:
-        return self.engine.initial_state()
+        return self.engine.initial_state(), self.other.initial_state()
 
     def step(self, frame: Frame, state: EngineState) -> tuple[Output, EngineState]:
-        output, state = self.engine.step(frame, state)
-        spectrum = (1 - self.share) * output.spectrum + self.share * frame.error
-        return Output(spectrum.astype(np.complex64), output.speech_probability), state
+        (ours, mine), (theirs, its) = (
+            engine.step(frame, each) for engine, each in zip((self.engine, self.other), state, strict=True)
+        )
+        spectrum = (1 - self.share) * ours.spectrum + self.share * theirs.spectrum
+        return Output(spectrum.astype(np.complex64), ours.speech_probability), (mine, its)
 
 
 @dataclass(frozen=True)
@@ -157,16 +162,25 @@ def systems(checkpoints: list[Path], wiener: list[float], error: list[float], fo
         name = f"{path.parent.name}/{path.stem}, step {trained.training.get('step', '?')}"
         model = folder / f"{path.parent.name}_{path.stem}.onnx"
         onnx_export.export(trained, model)
-        for share in (0.0, *wiener):
-            mixed = f"{name}, {share:g} ss" if share else name
-            found |= with_shares(mixed, lambda model=model, share=share: Crnn(model, share), error)
+        found |= with_shares(name, lambda model=model: Crnn(model), error)
+        for share in wiener:
+            found |= with_shares(
+                f"{name}, {share:g} {BASE}",
+                lambda model=model, share=share: mix(Crnn(model), SpectralSubtraction, share),
+                error,
+            )
     return found
 
 
 def with_shares(name: str, make: Make, shares: list[float]) -> dict[str, Make]:
     """An engine as it is, and with each share of the error."""
-    mixed = {f"{name}, {share:g} error": lambda share=share: WithError(make(), share) for share in shares}
+    mixed = {f"{name}, {share:g} error": lambda share=share: mix(make(), Linear, share) for share in shares}
     return {name: make, **mixed}
+
+
+def mix(engine: Engine, other: Callable[[StftConfig], Engine], share: float) -> Mixed:
+    """An engine with a share of another's answer, at its own transform."""
+    return Mixed(engine, other(engine.stft), share)
 
 
 Row = tuple[str, str, str]

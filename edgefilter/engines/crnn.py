@@ -1,7 +1,4 @@
-"""'crnn': a recurrent network and a Wiener mask, half and half, on the linear stage's error.
-
-The network says whether a human speaks.
-"""
+"""'crnn': a recurrent network that corrects the Wiener mask on the linear stage's error, and says whether a human speaks."""
 
 from __future__ import annotations
 
@@ -15,28 +12,21 @@ import numpy as np
 
 from edgefilter.engines.base import FrontEndKind
 from edgefilter.engines.onnx_session import FixedPlaces, expect_answer, expect_slots, find_model, open_model
-from edgefilter.engines.spectral_subtraction import SpectralSubtraction
 from edgefilter.types import Frame, Output, Samples, Spectrum
 
-EDGE_TYPE, EDGE_VERSION, EDGE_BEFORE = "edgefilter-crnn", 2, 1
-"""Networks of version 2 take POWERS and correct the Wiener mask themselves; those of version 1 go without."""
+EDGE_TYPE, EDGE_VERSION = "edgefilter-crnn", 2
 SPECTRA = ("error", "mic", "reference", "echo")
 """The graph's first inputs, each (1, bins, 2) float32, real and imaginary part."""
 POWERS = ("noise_psd", "residual_psd")
 """Those that follow, each (1, bins) float32, as in Frame."""
 VARIABLE = "EDGEFILTER_CRNN"
 
-WIENER_SHARE = 0.5
-"""Part of the answer that comes from the Wiener mask of 'ss'. The two err in different places, and what one deletes the
-other keeps: on validation conversations the mean had a higher SI-SDR than either, far fewer word errors than the
-network and about as many as 'ss'."""
-
 LOUDEST = 1.26
 """Most power of a frame of the network's answer, over the microphone's: 1 dB. The shipped network stays below; one that
 is not as it should be is turned down to it."""
 
-CrnnState: TypeAlias = tuple[tuple[Samples, ...], Samples]
-"""The network's state tensors, all zeros at the start, and the Wiener mask's state."""
+CrnnState: TypeAlias = tuple[Samples, ...]
+"""The network's state tensors, all zeros at the start."""
 
 
 class Crnn:
@@ -44,20 +34,18 @@ class Crnn:
 
     model: an ONNX file made by export/onnx_export.py; without one the file that the environment variable
     EDGEFILTER_CRNN names, else the package's own, whose recurrent layer has int8 weights: a hop finds them cold, and
-    reads a quarter of the bytes. The file says which STFT it was trained for. wiener_share: 0 is the network alone, 1
-    the Wiener mask. Raises ModelError for a file that is not such a model.
+    reads a quarter of the bytes. The file says which STFT it was trained for. Raises ModelError for a file that is not
+    such a model.
     """
 
     name: ClassVar[str] = "crnn"
     front: ClassVar[FrontEndKind] = "full"
 
-    def __init__(self, model: str | Path | None = None, wiener_share: float = WIENER_SHARE) -> None:
+    def __init__(self, model: str | Path | None = None) -> None:
         path = find_model(model, VARIABLE, "crnn_int8.onnx", "make one with 'python -m export.onnx_export --int8'")
-        self.model = open_model(path, EDGE_TYPE, EDGE_BEFORE, EDGE_VERSION)
-        self._powers = POWERS if self.model.version == EDGE_VERSION else ()
+        self.model = open_model(path, EDGE_TYPE, EDGE_VERSION)
         self.stft = self.model.stft
         self.lookahead = 0
-        self._wiener, self._share = SpectralSubtraction(self.stft), np.float32(wiener_share)
         states = dict(self.model.states)
         spectrum = (1, self.stft.bins, 2)
         outputs = {
@@ -65,7 +53,7 @@ class Crnn:
             "speech_probability": (1,),
             **{f"next_{name}": shape for name, shape in states.items()},
         }
-        powers = dict.fromkeys(self._powers, (1, self.stft.bins))
+        powers = dict.fromkeys(POWERS, (1, self.stft.bins))
         expect_slots(self.model, {**dict.fromkeys(SPECTRA, spectrum), **powers, **states}, outputs)
         self._own = threading.local()
         expect_answer(path, self._first_answer)
@@ -75,21 +63,19 @@ class Crnn:
         noise = np.random.default_rng(0).standard_normal((4, self.stft.bins, 2), np.float32)
         mic, reference, echo, error = noise.view(np.complex64)[..., 0]
         power = np.ones(self.stft.bins, np.float32)
-        places = self._run(Frame(mic, reference, echo, error, power, power), self.initial_state()[0])
+        places = self._run(Frame(mic, reference, echo, error, power, power), self.initial_state())
         return [places.spectrum, places.probability, *places.next_states]
 
     def initial_state(self) -> CrnnState:
-        return tuple(np.zeros(shape, np.float32) for _, shape in self.model.states), self._wiener.initial_state()
+        return tuple(np.zeros(shape, np.float32) for _, shape in self.model.states)
 
     def step(self, frame: Frame, state: CrnnState) -> tuple[Output, CrnnState]:
-        places = self._run(frame, state[0])
-        following = tuple(place.copy() for place in places.next_states)
-        masked, mask_state = self._wiener.step(frame, state[1])
+        places = self._run(frame, state)
         gain = _limited(_power(places.spectrum), LOUDEST * _power(frame.mic))
-        if gain is None:  # numbers have grown beyond all bounds: begin anew, and until then the mask alone
-            return Output(masked.spectrum, 0.0), (self.initial_state()[0], mask_state)
-        human = self._share * masked.spectrum + gain * (1 - self._share) * places.spectrum
-        return Output(human, min(max(float(places.probability[0]), 0.0), 1.0)), (following, mask_state)
+        if gain is None:  # numbers have grown beyond all bounds: begin anew, and until then the linear stage alone
+            return Output(frame.error, 0.0), self.initial_state()
+        following = tuple(place.copy() for place in places.next_states)
+        return Output(gain * places.spectrum, min(max(float(places.probability[0]), 0.0), 1.0)), following
 
     def _run(self, frame: Frame, state: tuple[Samples, ...]) -> Places:
         """The network on one frame; its answers stand in the places."""
@@ -107,7 +93,7 @@ class Crnn:
             slots = FixedPlaces(self.model.session)
             names = [name for name, _ in self.model.states]
             spectra = [(name, slots.inputs[name].view(np.complex64).reshape(-1)) for name in SPECTRA]
-            powers = [(name, slots.inputs[name].reshape(-1)) for name in self._powers]
+            powers = [(name, slots.inputs[name].reshape(-1)) for name in POWERS]
             states, next_states = (
                 [slots.inputs[name] for name in names],
                 [slots.outputs[f"next_{name}"] for name in names],

@@ -30,10 +30,9 @@ MOST_STATE, MOST_FFT = 1 << 22, 1 << 14
 
 @dataclass(frozen=True, eq=False)
 class Model:
-    """A model file that was found to fit. version: of its inputs; training and figures are what it says about itself."""
+    """A model file that was found to fit. training and figures are what it says about itself."""
 
     path: Path
-    version: int
     session: onnxruntime.InferenceSession
     stft: StftConfig
     training: Mapping[str, object]
@@ -110,12 +109,12 @@ def open_session(path: Path) -> onnxruntime.InferenceSession:
         raise ModelError(f"model {path} cannot be loaded ({plain(str(error))}): export it again") from None
 
 
-def open_model(path: Path, kind: str, *versions: int) -> Model:
-    """Open a model and refuse it where its metadata is not that of a `kind` of one of these versions at the package's sampling rate."""
+def open_model(path: Path, kind: str, version: int) -> Model:
+    """Open a model and refuse it where its metadata is not that of a `kind` of this version at the package's sampling rate."""
     session = open_session(path)
     said = session.get_modelmeta().custom_metadata_map
     _expect(path, "type", said.get("type"), kind)
-    _expect(path, "version", said.get("version"), *map(str, versions))
+    _expect(path, "version", said.get("version"), str(version))
     _expect(path, "sample_rate", said.get("sample_rate"), str(SAMPLE_RATE))
     try:
         n_fft, hop, window_length = (int(said[name]) for name in ("n_fft", "hop", "window_length"))
@@ -133,7 +132,7 @@ def open_model(path: Path, kind: str, *versions: int) -> Model:
         raise ModelError(f"model {path} does not say its {error.args[0]}: export it again") from None
     except (ValueError, TypeError, StftError, RecursionError, OverflowError) as error:
         raise ModelError(f"model {path} has unusable metadata ({plain(str(error))}): export it again") from None
-    return Model(path, int(said["version"]), session, stft, training, figures, states)
+    return Model(path, session, stft, training, figures, states)
 
 
 def expect_slots(model: Model, inputs: Mapping[str, tuple], outputs: Mapping[str, tuple]) -> None:
@@ -177,9 +176,9 @@ def _may_be(found: Sequence[int | str | None], wanted: Sequence[int | str]) -> b
     )
 
 
-def _expect(path: Path, key: str, found: str | None, *wanted: str) -> None:
-    if found not in wanted:
+def _expect(path: Path, key: str, found: str | None, wanted: str) -> None:
+    if found != wanted:
         raise ModelError(
-            f"model {path} has {key} {plain(found or 'unknown', 40)}, expected {' or '.join(wanted)}: take the model that belongs to this"
+            f"model {path} has {key} {plain(found or 'unknown', 40)}, expected {wanted}: take the model that belongs to this"
             " engine and version"
         )

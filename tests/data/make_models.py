@@ -2,8 +2,7 @@
 
 python -m tests.data.make_models
 
-They are pure functions of the seed: the weights are random, nothing was trained on anything. crnn_before.onnx is such a
-network of version 1, without the expected powers as inputs, from before there was a version 2.
+They are pure functions of the seed: the weights are random, nothing was trained on anything.
 """
 
 from __future__ import annotations

@@ -70,4 +70,4 @@ def test_networks_for_tests_say_that_nothing_was_trained(path: Path) -> None:
 
 
 def test_there_are_networks_for_tests() -> None:
-    assert len(FOR_TESTS) == 3
+    assert len(FOR_TESTS) == 2

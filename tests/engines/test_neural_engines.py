@@ -25,7 +25,7 @@ from tests import conformance
 DATA = Path(__file__).parents[1] / "data"
 ROOT = Path(__file__).parents[2]
 DEMO = ROOT / "edgefilter/demo_data"
-EDGE, PAPER, BEFORE = DATA / "crnn.onnx", DATA / "paper_crnn.onnx", DATA / "crnn_before.onnx"
+EDGE, PAPER = DATA / "crnn.onnx", DATA / "paper_crnn.onnx"
 
 
 def changed(folder: Path, metadata: dict[str, str | None], source: Path = EDGE) -> Path:
@@ -43,10 +43,9 @@ def spectrum(rng: np.random.Generator, bins: int) -> np.ndarray:
     return (rng.standard_normal(bins) + 1j * rng.standard_normal(bins)).astype(np.complex64)
 
 
-@pytest.mark.parametrize("path", [EDGE, BEFORE], ids=lambda path: path.stem)
-def test_crnn_answers_what_onnxruntime_answers_for_the_same_frames(path):
-    engine = Crnn(path, wiener_share=0.0)
-    session = onnx_session.open_session(path)
+def test_crnn_answers_what_onnxruntime_answers_for_the_same_frames():
+    engine = Crnn(EDGE)
+    session = onnx_session.open_session(EDGE)
     rng = np.random.default_rng(0)
     state, theirs = engine.initial_state(), [np.zeros(shape, np.float32) for _, shape in engine.model.states]
     for _ in range(5):
@@ -56,13 +55,13 @@ def test_crnn_answers_what_onnxruntime_answers_for_the_same_frames(path):
             Frame(mic=mic, reference=reference, echo=echo, error=error, noise_psd=noise, residual_psd=residual), state
         )
         pairs = [np.stack((x.real, x.imag), axis=-1)[None] for x in (error, mic, reference, echo)]
-        powers = [noise[None], residual[None]] if path == EDGE else []
+        powers = [noise[None], residual[None]]
         found, probability, *theirs = session.run(
             None, dict(zip([slot.name for slot in session.get_inputs()], pairs + powers + theirs, strict=True))
         )
         np.testing.assert_array_equal(output.spectrum, found[0, :, 0] + 1j * found[0, :, 1])
         assert output.speech_probability == probability[0] and 0 < probability[0] < 1
-    assert any(tensor.any() for tensor in state[0])
+    assert any(tensor.any() for tensor in state)
 
 
 def test_streams_in_several_threads_share_an_engine_without_mixing():
@@ -79,19 +78,6 @@ def test_streams_in_several_threads_share_an_engine_without_mixing():
     with ThreadPoolExecutor(4) as pool:
         for wanted, found in zip(alone, pool.map(run, sounds)):
             np.testing.assert_array_equal(found, wanted)
-
-
-def test_the_answer_is_half_the_networks_and_half_the_wiener_masks():
-    rng = np.random.default_rng(1)
-    bins = Crnn(EDGE).stft.bins
-    power = rng.random(bins).astype(np.float32)
-    frame = Frame(*(spectrum(rng, bins) for _ in range(4)), power, power)
-    network, wiener, both = (
-        engine.step(frame, engine.initial_state())[0].spectrum
-        for engine in (Crnn(EDGE, wiener_share=s) for s in (0.0, 1.0, 0.5))
-    )
-    assert not np.allclose(network, wiener, atol=1e-3)
-    np.testing.assert_allclose(both, (network + wiener) / 2, atol=1e-6)
 
 
 def test_the_stream_tells_the_probability_of_speech():
@@ -120,8 +106,7 @@ def test_one_thread_without_spinning_and_with_denormals_as_zero():
     [
         ({"type": "edgefilter-paper-crnn"}, "type edgefilter-paper-crnn, expected edgefilter-crnn"),
         ({"type": None}, "type unknown, expected edgefilter-crnn"),
-        ({"version": "3"}, "version 3, expected 1 or 2"),
-        ({"version": "1"}, "inputs .*noise_psd"),
+        ({"version": "1"}, "version 1, expected 2"),
         ({"sample_rate": "48000"}, "sample_rate 48000, expected 16000"),
         ({"hop": None}, "does not say its hop"),
         ({"training": None}, "does not say its training"),
@@ -188,7 +173,7 @@ def test_the_exact_network_filters_the_demo_as_the_int8_one_does():
     speaking = np.flatnonzero(human)
     span = slice(speaking[0], speaking[-1] + 1)
     for out in (exact, small):
-        assert si_sdr(out[span], human[span]) > 9.2  # 9.5 is promised; random weights give 3.7
+        assert si_sdr(out[span], human[span]) > 9.2  # 9.3 is promised; random weights give 3.7
     apart = 10 * np.log10(np.mean(exact**2) / np.mean((exact - small) ** 2))
     assert 40 < apart < 90  # 62 were seen; 41 to 56 are in models/MODELS.md. More would be one file twice
 

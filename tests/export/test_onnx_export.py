@@ -58,7 +58,7 @@ def exported(tmp_path_factory) -> tuple[EdgeCrnn, Path]:
 
 
 def test_the_runtime_takes_the_file_and_knows_its_stft_training_and_figures(exported):
-    engine = Crnn(exported[1], wiener_share=0.0)
+    engine = Crnn(exported[1])
     assert engine.stft == EDGE.stft
     assert engine.model.training == {"data": "none", "seed": 1}
     assert engine.model.figures == {"si_sdr_db": 1.5, "wer": 0.3}
@@ -106,7 +106,7 @@ def test_the_graph_is_opset_17_and_its_gru_is_torchs(exported):
 
 def test_the_engine_computes_what_torch_computes(exported):
     network, path = exported
-    engine = Crnn(path, wiener_share=0.0)
+    engine = Crnn(path)
     rng = np.random.default_rng(3)
     ours, theirs = network.initial_state(), engine.initial_state()
     for _ in range(20):
@@ -120,7 +120,7 @@ def test_the_engine_computes_what_torch_computes(exported):
         # 1e-4: the bound of the export, on values of about 1
         np.testing.assert_allclose(output.spectrum, torch.view_as_complex(spectrum)[0].numpy(), atol=1e-4)
         assert output.speech_probability == pytest.approx(float(probability[0]), abs=1e-4)
-    for mine, found in zip(ours, theirs[0], strict=True):
+    for mine, found in zip(ours, theirs, strict=True):
         np.testing.assert_allclose(found, mine.numpy(), atol=1e-4)
 
 
@@ -145,7 +145,7 @@ def test_the_int8_variant_is_taken_by_the_engine_and_answers_nearly_the_same(exp
     small = exported[1].with_name("crnn_int8.onnx")
     operators = {node.op_type for node in onnx.load(small).graph.node}
     assert "MatMulInteger" in operators and "GRU" not in operators and "MatMul" not in operators
-    engines = Crnn(exported[1], wiener_share=0.0), Crnn(small, wiener_share=0.0)
+    engines = Crnn(exported[1]), Crnn(small)
     assert engines[1].model.describe() == {**engines[0].model.describe(), "file": str(small)}
     rng = np.random.default_rng(5)
     nothing = np.zeros(engines[0].stft.bins, np.float32)
