@@ -66,6 +66,13 @@ def test_commands_are_microphone_and_loudspeaker_and_who_hangs_up_interrupts(end
                 await asyncio.sleep(0.05)
         raise AssertionError("the service does not start")
 
+    async def until(happens):
+        for _ in range(200):
+            if happens():
+                return
+            await asyncio.sleep(0.05)
+        raise AssertionError("it does not happen")
+
     async def talk():
         serving = asyncio.create_task(service.run(mic_uri, snd_uri))
         listener, speaker = await client_of(mic_uri), await client_of(snd_uri)
@@ -81,12 +88,10 @@ def test_commands_are_microphone_and_loudspeaker_and_who_hangs_up_interrupts(end
         played = service.duplex.stats()["played_s"]
         for _ in range(20):
             await speaker.write_event(AudioChunk(RATE, 2, 1, as_pcm16(NOISE)).event())
-        await asyncio.sleep(0.3)
-        assert service.duplex.stats()["played_s"] > played
+        await until(lambda: service.duplex.stats()["played_s"] > played)
         await speaker.disconnect()
-        await asyncio.sleep(0.3)
-        assert service.duplex.queued_s == 0 and service.duplex.stats()["dropped_s"] > 0
-        assert not service.speakers
+        await until(lambda: service.duplex.queued_s == 0 and service.duplex.stats()["dropped_s"] > 0)
+        await until(lambda: not service.speakers)
         await listener.disconnect()
         serving.cancel()
         await asyncio.gather(serving, return_exceptions=True)
