@@ -25,6 +25,10 @@ LOUDEST = 1.26
 """Most power of a frame of the network's answer, over the microphone's: 1 dB. The shipped network stays below; one that
 is not as it should be is turned down to it."""
 
+SURE = 100.0
+"""Times what is expected of fan and robot, 20 dB: what stands above it in a bin is somebody's, whatever the network makes of
+it. Beside a silent robot whose fan is known, the network takes some of a loud human for that fan."""
+
 CrnnState: TypeAlias = tuple[Samples, ...]
 """The network's state tensors, all zeros at the start."""
 
@@ -75,7 +79,8 @@ class Crnn:
         if gain is None:  # numbers have grown beyond all bounds: begin anew, and until then the linear stage alone
             return Output(frame.error, 0.0), self.initial_state()
         following = tuple(place.copy() for place in places.next_states)
-        return Output(gain * places.spectrum, min(max(float(places.probability[0]), 0.0), 1.0)), following
+        human = _with_what_is_sure(gain * places.spectrum, frame)
+        return Output(human, min(max(float(places.probability[0]), 0.0), 1.0)), following
 
     def _run(self, frame: Frame, state: tuple[Samples, ...]) -> Places:
         """The network on one frame; its answers stand in the places."""
@@ -102,6 +107,17 @@ class Crnn:
             probability = slots.outputs["speech_probability"]
             self._own.places = Places(slots, [*spectra, *powers], spectrum, probability, states, next_states)
         return self._own.places
+
+
+def _with_what_is_sure(human: Spectrum, frame: Frame) -> Spectrum:
+    """The answer, in no bin below the error less SURE times what is expected there (spectral subtraction, Boll 1979)."""
+    error = frame.error
+    power = error.real**2 + error.imag**2
+    least = power - np.float32(SURE) * (frame.noise_psd + frame.residual_psd)
+    short = least > human.real**2 + human.imag**2
+    if short.any():
+        human[short] = np.sqrt(least[short] / power[short]) * error[short]
+    return human
 
 
 def _power(spectrum: Spectrum) -> float:

@@ -15,7 +15,7 @@ from hypothesis import given, settings
 from onnx import TensorProto, helper
 
 from edgefilter.engines import onnx_file, onnx_session
-from edgefilter.engines.crnn import LOUDEST, Crnn
+from edgefilter.engines.crnn import LOUDEST, SURE, Crnn
 from edgefilter.errors import ModelError
 from edgefilter.types import Frame
 
@@ -174,6 +174,18 @@ def test_a_network_that_falls_into_nan_is_passed_over_and_begins_anew(monkeypatc
     output, state = engine.step(heard, engine.initial_state())
     assert np.array_equal(output.spectrum, heard.error) and output.speech_probability == 0.0
     assert not any(tensor.any() for tensor in state)
+
+
+def test_what_stands_far_above_all_that_is_expected_comes_through_whatever_the_network_says(monkeypatch):
+    engine = Crnn(EDGE)
+    answering(monkeypatch, engine, 0.0)
+    heard, ones = frame(engine), np.ones(engine.stft.bins, np.float32)
+    power, far = np.abs(heard.error) ** 2, np.arange(ones.size) % 2 == 0
+    expected = (power / np.where(far, 400.0, 50.0)).astype(np.float32)
+    heard = heard._replace(noise_psd=expected, residual_psd=0 * ones)
+    output, _ = engine.step(heard, engine.initial_state())
+    assert not output.spectrum[~far].any()
+    np.testing.assert_allclose(output.spectrum[far], np.sqrt(1 - SURE / 400) * heard.error[far], rtol=1e-4)
 
 
 def test_a_network_that_answers_too_loudly_is_turned_down(monkeypatch):
