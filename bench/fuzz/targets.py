@@ -206,7 +206,7 @@ def attempt_audio(path: Path, rng: random.Random) -> None:
 
 @lru_cache
 def networks() -> list[bytes]:
-    return [(NETWORKS / name).read_bytes() for name in ("crnn.onnx", "crnn_before.onnx", "paper_crnn.onnx")]
+    return [(NETWORKS / name).read_bytes() for name in ("crnn.onnx", "paper_crnn.onnx")]
 
 
 def attempt_model(path: Path, rng: random.Random) -> None:

@@ -22,8 +22,8 @@ POWERS = ("noise_psd", "residual_psd")
 VARIABLE = "EDGEFILTER_CRNN"
 
 LOUDEST = 1.26
-"""Most power of a frame of the network's answer, over the microphone's: 1 dB. The shipped network stays below; one that
-is not as it should be is turned down to it."""
+"""Most power of a frame of the answer, over the microphone's: 1 dB. The shipped network stays below; one that is not as it
+should be is turned down to it."""
 
 SURE = 100.0
 """Times what is expected of fan and robot, 20 dB: what stands above it in a bin is somebody's, whatever the network makes of
@@ -75,12 +75,12 @@ class Crnn:
 
     def step(self, frame: Frame, state: CrnnState) -> tuple[Output, CrnnState]:
         places = self._run(frame, state)
-        gain = _limited(_power(places.spectrum), LOUDEST * _power(frame.mic))
+        human = _with_what_is_sure(places.spectrum, frame)
+        gain = _limited(_power(human), LOUDEST * _power(frame.mic))
         if gain is None:  # numbers have grown beyond all bounds: begin anew, and until then the linear stage alone
             return Output(frame.error, 0.0), self.initial_state()
         following = tuple(place.copy() for place in places.next_states)
-        human = _with_what_is_sure(gain * places.spectrum, frame)
-        return Output(human, min(max(float(places.probability[0]), 0.0), 1.0)), following
+        return Output(gain * human, min(max(float(places.probability[0]), 0.0), 1.0)), following
 
     def _run(self, frame: Frame, state: tuple[Samples, ...]) -> Places:
         """The network on one frame; its answers stand in the places."""
@@ -111,12 +111,12 @@ class Crnn:
 
 def _with_what_is_sure(human: Spectrum, frame: Frame) -> Spectrum:
     """The answer, in no bin below the error less SURE times what is expected there (spectral subtraction, Boll 1979)."""
-    error = frame.error
+    human, error = human.copy(), frame.error
     power = error.real**2 + error.imag**2
     least = power - np.float32(SURE) * (frame.noise_psd + frame.residual_psd)
-    short = least > human.real**2 + human.imag**2
-    if short.any():
-        human[short] = np.sqrt(least[short] / power[short]) * error[short]
+    with np.errstate(over="ignore"):  # of a network that has grown beyond all bounds
+        short = least > human.real**2 + human.imag**2
+    human[short] = np.sqrt(least[short] / power[short]) * error[short]
     return human
 
 

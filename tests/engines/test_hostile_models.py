@@ -197,6 +197,17 @@ def test_a_network_that_answers_too_loudly_is_turned_down(monkeypatch):
     assert power == pytest.approx(LOUDEST * most, rel=1e-3)
 
 
+def test_what_is_sure_is_no_louder_than_the_microphone_either(monkeypatch):
+    engine = Crnn(EDGE)
+    answering(monkeypatch, engine, 0.0)
+    heard = frame(engine)
+    nothing = 0 * heard.noise_psd
+    heard = heard._replace(mic=0.1 * heard.error, noise_psd=nothing, residual_psd=nothing)
+    output, _ = engine.step(heard, engine.initial_state())
+    power = [np.vdot(spectrum, spectrum).real for spectrum in (output.spectrum, heard.mic)]
+    assert power[0] == pytest.approx(LOUDEST * power[1], rel=1e-3)
+
+
 def test_the_shipped_models_are_the_pinned_ones_and_the_page_says_so():
     page = (ROOT / "models" / "MODELS.md").read_text(encoding="utf-8")
     there = {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in (ROOT / "models").glob("*.onnx")}

@@ -107,6 +107,7 @@ def test_one_thread_without_spinning_and_with_denormals_as_zero():
         ({"type": "edgefilter-paper-crnn"}, "type edgefilter-paper-crnn, expected edgefilter-crnn"),
         ({"type": None}, "type unknown, expected edgefilter-crnn"),
         ({"version": "1"}, "version 1, expected 2"),
+        ({"version": "3"}, "version 3, expected 2"),
         ({"sample_rate": "48000"}, "sample_rate 48000, expected 16000"),
         ({"hop": None}, "does not say its hop"),
         ({"training": None}, "does not say its training"),
