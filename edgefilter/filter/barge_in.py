@@ -23,9 +23,10 @@ not."""
 MOST_EXCESS = 2.0
 """Bound on the excess of one hop: a click is no more than a syllable."""
 CENTRE, SLOPE = 3.25, 1.25
-"""Averaged log-odds of the network at which a human is as likely as not, and the slope of the logistic around it:
-fitted on robots alone and humans laid on them 0 to 26 dB below, on one real loudspeaker without a profile, a human in
-one hop of four."""
+"""Averaged log-odds of the network at which a human is as likely as not, and the slope of the logistic around it: by
+hand between those that fit robots alone and humans laid on them 0 to 26 dB below, on one real loudspeaker without a
+profile (3.9 and 0.85) and on simulated ones (2.4 and 1.1; bench/results/barge_in_fit.md), steeper, so that few hops
+lie near the threshold."""
 CENTRE_CALIBRATED = 2.25
 """The same with a profile: the network was trained on what a calibrated path leaves, and is wrong less often."""
 CENTRE_DOUBTED = 5.2
