@@ -47,6 +47,8 @@ from export import onnx_export
 REAL = Cells(sers=(-10.0, -20.0), befores=(0.0, 10.0))
 """Of humans laid on real loudspeakers."""
 BASE = "ss"
+COLD, LAID = " cold", "real loudspeaker"
+"""How the kind of a conversation without its profile ends, and the kind of humans laid on real loudspeakers."""
 
 
 @dataclass(frozen=True)
@@ -98,7 +100,7 @@ def cases(name: str, conversation: Conversation, cold: bool) -> Iterator[Case]:
     kind, text, span = f"{name} {conversation.meta['room']}", conversation.meta["text"], conversation.span
     yield Case(kind, conversation.folder.name, mic, ref, clean[span], span, text, conversation.profile)
     if cold:
-        yield Case(f"{kind} cold", conversation.folder.name, mic, ref, clean[span], span, text)
+        yield Case(f"{kind}{COLD}", conversation.folder.name, mic, ref, clean[span], span, text)
 
 
 def laid_case(laid: Laid) -> Case:
@@ -107,9 +109,7 @@ def laid_case(laid: Laid) -> Case:
     if signals.human is None:
         raise UsageError(f"{laid.name} holds no human")
     name = f"{laid.name}, {laid.ser:g} dB after {laid.before:g} s"
-    return Case(
-        "real loudspeaker", name, signals.mic, signals.ref, signals.human[signals.span], signals.span, laid.text
-    )
+    return Case(LAID, name, signals.mic, signals.ref, signals.human[signals.span], signals.span, laid.text)
 
 
 @dataclass(frozen=True)
@@ -148,25 +148,29 @@ def answer(engine: Engine, heard: list[Frame], samples: int) -> Samples:
     return np.concatenate(hops)[engine.stft.window_length - engine.stft.hop :][:samples]
 
 
-Make = Callable[[], Engine]
+Make = Callable[[Profile | None], Engine]
+"""Of the profile that the filter runs with."""
 
 
 def systems(checkpoints: list[Path], wiener: list[float], error: list[float], folder: Path) -> dict[str, Make]:
-    """What is compared, by name: linear, ss and crnn as they ship, each checkpoint's averaged weights, alone and mixed."""
-    found: dict[str, Make] = {"linear": lambda: create("linear")}
+    """What is compared, by name: linear, ss and crnn as they ship, each checkpoint's averaged weights, alone and mixed.
+
+    crnn has the share of ss that ships; a checkpoint is alone with and without a calibration, or mixed with both.
+    """
+    found: dict[str, Make] = {"linear": lambda profile: create("linear", profile)}
     for name in (BASE, "crnn"):
-        found |= with_shares(name, lambda name=name: create(name), error)
+        found |= with_shares(name, lambda profile, name=name: create(name, profile), error)
     folder.mkdir(parents=True, exist_ok=True)
     for path in checkpoints:
         trained = onnx_export.load(path)
         name = f"{path.parent.name}/{path.stem}, step {trained.training.get('step', '?')}"
         model = folder / f"{path.parent.name}_{path.stem}.onnx"
         onnx_export.export(trained, model)
-        found |= with_shares(name, lambda model=model: Crnn(model), error)
+        found |= with_shares(name, lambda _, model=model: Crnn(model), error)
         for share in wiener:
             found |= with_shares(
                 f"{name}, {share:g} {BASE}",
-                lambda model=model, share=share: mix(Crnn(model), SpectralSubtraction, share),
+                lambda _, model=model, share=share: mix(Crnn(model), SpectralSubtraction, share),
                 error,
             )
     return found
@@ -174,7 +178,9 @@ def systems(checkpoints: list[Path], wiener: list[float], error: list[float], fo
 
 def with_shares(name: str, make: Make, shares: list[float]) -> dict[str, Make]:
     """An engine as it is, and with each share of the error."""
-    mixed = {f"{name}, {share:g} error": lambda share=share: mix(make(), Linear, share) for share in shares}
+    mixed = {
+        f"{name}, {share:g} error": lambda profile, share=share: mix(make(profile), Linear, share) for share in shares
+    }
     return {name: make, **mixed}
 
 
@@ -222,7 +228,7 @@ def judge(
         if row := known.get((case.kind, case.name, name)):
             yield row
             continue
-        engine = make()
+        engine = make(case.profile)
         if engine.stft not in heard:
             heard[engine.stft] = frames(case, engine.stft, learning)
         out = answer(engine, heard[engine.stft], case.mic.size)[case.span]
@@ -259,10 +265,16 @@ def compared(rows: list[dict], system: str) -> dict[str, float]:
 
 
 def markdown(rows: list[dict]) -> str:
-    """A table per kind, and one of all."""
+    """A table per kind, one of the conversations with their profile, one of those without, and one of all."""
     kinds = {kind: [row for row in rows if row["kind"] == kind] for kind in dict.fromkeys(row["kind"] for row in rows)}
+    cold = [kind for kind in kinds if kind.endswith(COLD)]
+    warm = [kind for kind in kinds if kind not in (*cold, LAID)]
+    groups = {"with a calibration": warm, "without": cold, "all": list(kinds)}
+    together = {
+        name: [row for kind in group for row in kinds[kind]] for name, group in groups.items() if len(group) > 1
+    }
     lines = []
-    for kind, of_kind in (kinds | {"all": rows} if len(kinds) > 1 else kinds).items():
+    for kind, of_kind in (kinds | together).items():
         cells = []
         for system in dict.fromkeys(row["system"] for row in of_kind):
             found = compared(of_kind, system)

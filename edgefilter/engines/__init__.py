@@ -20,31 +20,31 @@ class Entry:
     """One engine of the catalogue.
 
     module: its file in this folder, loaded when the engine is asked for and not before: one of them loads onnxruntime.
-    factory: what makes it there, a class or a function of one argument. takes: that argument, the STFT to work with,
-    the path of a network in place of its own, or the robot's profile. automatic: whether "auto" may choose it.
-    linear_stage: whether an echo path is adapted before it, that is whether its front is "full".
+    factory: what makes it there, a class or a function. takes: its arguments, the STFT to work with, the path of a
+    network in place of its own, the robot's profile. automatic: whether "auto" may choose it. linear_stage: whether an
+    echo path is adapted before it, that is whether its front is "full".
     """
 
     module: str
     factory: str
-    takes: Literal["stft", "model", "profile"]
+    takes: tuple[Literal["stft", "model", "profile"], ...]
     automatic: bool = False
     linear_stage: bool = False
 
 
 CATALOGUE = {
-    "crnn": Entry("crnn", "Crnn", "model", automatic=True, linear_stage=True),
-    "ss": Entry("spectral_subtraction", "SpectralSubtraction", "stft", automatic=True, linear_stage=True),
-    "linear": Entry("linear", "Linear", "stft", automatic=True, linear_stage=True),
-    "bypass": Entry("bypass", "Bypass", "stft"),
-    "paper-ss": Entry("paper_ss", "paper_ss", "profile"),
-    "paper-ss-causal": Entry("paper_ss", "paper_ss_causal", "profile"),
-    "paper-crnn": Entry("paper_crnn", "PaperCrnn", "model"),
+    "crnn": Entry("crnn", "Crnn", ("model", "profile"), automatic=True, linear_stage=True),
+    "ss": Entry("spectral_subtraction", "SpectralSubtraction", ("stft",), automatic=True, linear_stage=True),
+    "linear": Entry("linear", "Linear", ("stft",), automatic=True, linear_stage=True),
+    "bypass": Entry("bypass", "Bypass", ("stft",)),
+    "paper-ss": Entry("paper_ss", "paper_ss", ("profile",)),
+    "paper-ss-causal": Entry("paper_ss", "paper_ss_causal", ("profile",)),
+    "paper-crnn": Entry("paper_crnn", "PaperCrnn", ("model",)),
 }
 """Best first: that is the order in which "auto" tries them."""
 ENGINES = tuple(CATALOGUE)
-NEEDS_PROFILE = tuple(name for name, entry in CATALOGUE.items() if entry.takes == "profile")
-HAVE_MODEL = tuple(name for name, entry in CATALOGUE.items() if entry.takes == "model")
+NEEDS_PROFILE = tuple(name for name, entry in CATALOGUE.items() if entry.takes == ("profile",))
+HAVE_MODEL = tuple(name for name, entry in CATALOGUE.items() if "model" in entry.takes)
 HAVE_LINEAR_STAGE = tuple(name for name, entry in CATALOGUE.items() if entry.linear_stage)
 
 
@@ -58,7 +58,7 @@ def create(
     name : str
         One of `ENGINES`.
     profile : Profile, optional
-        The calibrated robot; the engines of `NEEDS_PROFILE` do not work without.
+        The calibrated robot; the engines of `NEEDS_PROFILE` do not work without, and `crnn` answers otherwise with one.
     stft : StftConfig, optional
         For the engines that work with any; the others have their own.
     model : str or Path, optional
@@ -84,15 +84,16 @@ def create(
     if name not in CATALOGUE:
         raise UsageError(f"unknown engine '{name}': choose one of auto, {', '.join(ENGINES)}")
     entry = CATALOGUE[name]
-    if model is not None and entry.takes != "model":
+    if model is not None and name not in HAVE_MODEL:
         raise UsageError(
             f"engine {name} has no network, found the model {model}: leave it out or take one of"
             f" {', '.join(HAVE_MODEL)}"
         )
-    if profile is None and entry.takes == "profile":
+    if profile is None and name in NEEDS_PROFILE:
         raise UsageError(
             f"engine {name} needs the robot's calibrated response: give --profile P.npz (made by 'edgefilter"
             " calibrate')"
         )
     factory = getattr(importlib.import_module(f"edgefilter.engines.{entry.module}"), entry.factory)
-    return factory({"stft": stft, "model": model, "profile": profile}[entry.takes])
+    given = {"stft": stft, "model": model, "profile": profile}
+    return factory(*(given[argument] for argument in entry.takes))

@@ -6,13 +6,17 @@ import math
 import threading
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar, TypeAlias
+from typing import TYPE_CHECKING, ClassVar, TypeAlias
 
 import numpy as np
 
 from edgefilter.engines.base import FrontEndKind
 from edgefilter.engines.onnx_session import FixedPlaces, expect_answer, expect_slots, find_model, open_model
+from edgefilter.engines.spectral_subtraction import SpectralSubtraction
 from edgefilter.types import Frame, Output, Samples, Spectrum
+
+if TYPE_CHECKING:
+    from edgefilter.profile.data import Profile
 
 EDGE_TYPE, EDGE_VERSION = "edgefilter-crnn", 2
 SPECTRA = ("error", "mic", "reference", "echo")
@@ -29,8 +33,13 @@ SURE = 100.0
 """Times what is expected of fan and robot, 20 dB: what stands above it in a bin is somebody's, whatever the network makes of
 it. Beside a silent robot whose fan is known, the network takes some of a loud human for that fan."""
 
-CrnnState: TypeAlias = tuple[Samples, ...]
-"""The network's state tensors, all zeros at the start."""
+SHARE_OF_SS = np.float32(0.5)
+"""How much of the answer is that of `ss` where the robot is calibrated: it errs elsewhere than the network, and both
+together err less than either (models/MODELS.md). Without a calibration, or with a path that the filter has learned, it
+saves no word and costs a real loudspeaker's humans up to 2 dB."""
+
+CrnnState: TypeAlias = tuple[tuple[Samples, ...], Samples]
+"""The network's state tensors, all zeros at the start, and the state of `ss`."""
 
 
 class Crnn:
@@ -38,18 +47,19 @@ class Crnn:
 
     model: an ONNX file made by export/onnx_export.py; without one the file that the environment variable
     EDGEFILTER_CRNN names, else the package's own, whose recurrent layer has int8 weights: a hop finds them cold, and
-    reads a quarter of the bytes. The file says which STFT it was trained for. Raises ModelError for a file that is not
-    such a model.
+    reads a quarter of the bytes. The file says which STFT it was trained for. profile: the robot; calibrated, not
+    learned, it gives `ss` a share of the answer. Raises ModelError for a file that is not such a model.
     """
 
     name: ClassVar[str] = "crnn"
     front: ClassVar[FrontEndKind] = "full"
 
-    def __init__(self, model: str | Path | None = None) -> None:
+    def __init__(self, model: str | Path | None = None, profile: Profile | None = None) -> None:
         path = find_model(model, VARIABLE, "crnn_int8.onnx", "make one with 'python -m export.onnx_export --int8'")
         self.model = open_model(path, EDGE_TYPE, EDGE_VERSION)
         self.stft = self.model.stft
         self.lookahead = 0
+        self._ss, self._ss_helps = SpectralSubtraction(self.stft), profile is not None and not profile.learned
         states = dict(self.model.states)
         spectrum = (1, self.stft.bins, 2)
         outputs = {
@@ -67,20 +77,26 @@ class Crnn:
         noise = np.random.default_rng(0).standard_normal((4, self.stft.bins, 2), np.float32)
         mic, reference, echo, error = noise.view(np.complex64)[..., 0]
         power = np.ones(self.stft.bins, np.float32)
-        places = self._run(Frame(mic, reference, echo, error, power, power), self.initial_state())
+        places = self._run(Frame(mic, reference, echo, error, power, power), self.initial_state()[0])
         return [places.spectrum, places.probability, *places.next_states]
 
     def initial_state(self) -> CrnnState:
-        return tuple(np.zeros(shape, np.float32) for _, shape in self.model.states)
+        tensors = tuple(np.zeros(shape, np.float32) for _, shape in self.model.states)
+        return tensors, self._ss.initial_state()
 
     def step(self, frame: Frame, state: CrnnState) -> tuple[Output, CrnnState]:
-        places = self._run(frame, state)
-        human = _with_what_is_sure(places.spectrum, frame)
+        tensors, mask = state
+        places = self._run(frame, tensors)
+        human = places.spectrum
+        if self._ss_helps:
+            masked, mask = self._ss.step(frame, mask)
+            human = (1 - SHARE_OF_SS) * human + SHARE_OF_SS * masked.spectrum
+        human = _with_what_is_sure(human, frame)
         gain = _limited(_power(human), LOUDEST * _power(frame.mic))
         if gain is None:  # numbers have grown beyond all bounds: begin anew, and until then the linear stage alone
             return Output(frame.error, 0.0), self.initial_state()
         following = tuple(place.copy() for place in places.next_states)
-        return Output(gain * human, min(max(float(places.probability[0]), 0.0), 1.0)), following
+        return Output(gain * human, min(max(float(places.probability[0]), 0.0), 1.0)), (following, mask)
 
     def _run(self, frame: Frame, state: tuple[Samples, ...]) -> Places:
         """The network on one frame; its answers stand in the places."""

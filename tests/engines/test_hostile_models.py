@@ -173,7 +173,7 @@ def test_a_network_that_falls_into_nan_is_passed_over_and_begins_anew(monkeypatc
     heard = frame(engine)
     output, state = engine.step(heard, engine.initial_state())
     assert np.array_equal(output.spectrum, heard.error) and output.speech_probability == 0.0
-    assert not any(tensor.any() for tensor in state)
+    assert not any(tensor.any() for tensor in state[0])
 
 
 def test_what_stands_far_above_all_that_is_expected_comes_through_whatever_the_network_says(monkeypatch):

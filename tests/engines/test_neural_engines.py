@@ -4,6 +4,7 @@ import hashlib
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +20,7 @@ from edgefilter.errors import ModelError, SignalError, UsageError
 from edgefilter.filter.ego_filter import EgoFilter
 from edgefilter.filter.enhance import enhance
 from edgefilter.filter.stream import Stream
+from edgefilter.profile.data import LEARNED, Profile
 from edgefilter.types import Frame
 from tests import conformance
 
@@ -61,7 +63,30 @@ def test_crnn_answers_what_onnxruntime_answers_for_the_same_frames():
         )
         np.testing.assert_array_equal(output.spectrum, found[0, :, 0] + 1j * found[0, :, 1])
         assert output.speech_probability == probability[0] and 0 < probability[0] < 1
-    assert any(tensor.any() for tensor in state)
+    assert any(tensor.any() for tensor in state[0])
+
+
+def test_of_a_calibrated_robot_half_of_the_answer_is_that_of_ss():
+    profile = Profile.load(DEMO / "profile.npz")
+    engines = create("crnn", profile, model=EDGE), create("crnn", model=EDGE), create("ss")
+    states = [engine.initial_state() for engine in engines]
+    rng = np.random.default_rng(1)
+    for _ in range(5):
+        spectra = [spectrum(rng, 257) for _ in range(4)]
+        powers = rng.uniform(0.5, 2.0, (2, 257)).astype(np.float32)  # nothing stands 20 dB above it
+        answers, states = zip(*(e.step(Frame(*spectra, *powers), s) for e, s in zip(engines, states, strict=True)))
+        both, network, mask = (answer.spectrum for answer in answers)
+        np.testing.assert_allclose(both, (network + mask) / 2, atol=1e-6)
+        assert answers[0].speech_probability == answers[1].speech_probability
+
+
+def test_of_a_robot_whose_path_was_learned_the_network_answers_alone():
+    learned = replace(Profile.load(DEMO / "profile.npz"), source=LEARNED)
+    engines = create("crnn", learned, model=EDGE), create("crnn", model=EDGE)
+    rng = np.random.default_rng(1)
+    heard = Frame(*(spectrum(rng, 257) for _ in range(4)), *np.ones((2, 257), np.float32))
+    answers = [engine.step(heard, engine.initial_state())[0].spectrum for engine in engines]
+    np.testing.assert_array_equal(*answers)
 
 
 def test_streams_in_several_threads_share_an_engine_without_mixing():
