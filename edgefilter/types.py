@@ -41,7 +41,8 @@ class Frame(NamedTuple):
 
     mic, reference, echo, error: (bins,) complex64. reference is delayed to where the robot's voice arrives at the
     microphone, echo is the linear stage's estimate of it, error = mic - echo. noise_psd, residual_psd: (bins,) float32,
-    expected |spectrum|^2 of the fan and of what is left of the echo in error.
+    expected |spectrum|^2 of the fan and of what is left of the echo in error. idle: whether nothing of the robot can be
+    audible.
     """
 
     mic: Spectrum
@@ -50,6 +51,7 @@ class Frame(NamedTuple):
     error: Spectrum
     noise_psd: Samples
     residual_psd: Samples
+    idle: bool = False
 
 
 class Output(NamedTuple):

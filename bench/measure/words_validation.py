@@ -126,7 +126,7 @@ class Listener:
         return ()
 
     def step(self, frame: Frame, state: EngineState) -> tuple[Output, EngineState]:
-        self.frames.append(Frame(*(part.copy() for part in frame)))
+        self.frames.append(Frame(*(part.copy() for part in frame[:-1]), frame.idle))
         return Output(frame.error), state
 
 

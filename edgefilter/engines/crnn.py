@@ -30,13 +30,15 @@ LOUDEST = 1.26
 should be is turned down to it."""
 
 SURE = 100.0
-"""Times what is expected of fan and robot, 20 dB: what stands above it in a bin is somebody's, whatever the network makes of
-it. Beside a silent robot whose fan is known, the network takes some of a loud human for that fan."""
+"""Times what is expected of fan and robot, 20 dB: what stands above it in a bin while the robot is silent is somebody's,
+whatever the network makes of it, which takes some of a loud human for the fan. While the robot speaks, much of what nobody
+expects is the robot."""
 
-SHARE_OF_SS = np.float32(0.5)
+SHARE_OF_SS = np.float32(0.4)
 """How much of the answer is that of `ss` where the robot is calibrated: it errs elsewhere than the network, and both
-together err less than either (models/MODELS.md). Without a calibration, or with a path that the filter has learned, it
-saves no word and costs a real loudspeaker's humans up to 2 dB."""
+together err less than either; half would be as good, and leave more of a robot alone (models/MODELS.md). Without a
+calibration, or with a path that the filter has learned, it saves no word and costs a real loudspeaker's humans up to
+2 dB."""
 
 CrnnState: TypeAlias = tuple[tuple[Samples, ...], Samples]
 """The network's state tensors, all zeros at the start, and the state of `ss`."""
@@ -91,7 +93,8 @@ class Crnn:
         if self._ss_helps:
             masked, mask = self._ss.step(frame, mask)
             human = (1 - SHARE_OF_SS) * human + SHARE_OF_SS * masked.spectrum
-        human = _with_what_is_sure(human, frame)
+        if frame.idle:
+            human = _with_what_is_sure(human, frame)
         gain = _limited(_power(human), LOUDEST * _power(frame.mic))
         if gain is None:  # numbers have grown beyond all bounds: begin anew, and until then the linear stage alone
             return Output(frame.error, 0.0), self.initial_state()

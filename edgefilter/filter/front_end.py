@@ -131,7 +131,7 @@ class FrontEnd:
             spectra *= self._low_cut
         x, r, e, error = spectra
         noise, residual = stage.residual.step(e, error, linear.uncertainty, self._added(stage.path.source))
-        return Frame(x, r, e, error, noise, residual), aligned
+        return Frame(x, r, e, error, noise, residual, aligned.state == "idle"), aligned
 
     def _added(self, source: SourceChain) -> Samples | None:
         """What the effects of the path in use bring that no waveform predicts; a lesson can have brought another path."""

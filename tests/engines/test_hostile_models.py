@@ -152,7 +152,7 @@ def frame(engine, scale=1.0):
     rng = np.random.default_rng(3)
     spectra = scale * rng.standard_normal((4, engine.stft.bins, 2), np.float32).view(np.complex64)[..., 0]
     power = np.ones(engine.stft.bins, np.float32)
-    return Frame(*spectra, noise_psd=power, residual_psd=power)
+    return Frame(*spectra, noise_psd=power, residual_psd=power, idle=True)
 
 
 def answering(monkeypatch, engine, spectrum, probability=0.5):
@@ -183,6 +183,8 @@ def test_what_stands_far_above_all_that_is_expected_comes_through_whatever_the_n
     power, far = np.abs(heard.error) ** 2, np.arange(ones.size) % 2 == 0
     expected = (power / np.where(far, 400.0, 50.0)).astype(np.float32)
     heard = heard._replace(noise_psd=expected, residual_psd=0 * ones)
+    output, _ = engine.step(heard._replace(idle=False), engine.initial_state())
+    assert not output.spectrum.any()  # the robot speaks: it may all be the robot's
     output, _ = engine.step(heard, engine.initial_state())
     assert not output.spectrum[~far].any()
     np.testing.assert_allclose(output.spectrum[far], np.sqrt(1 - SURE / 400) * heard.error[far], rtol=1e-4)

@@ -14,7 +14,7 @@ import soundfile
 
 from edgefilter.dsp.metrics import si_sdr
 from edgefilter.engines import create, onnx_file, onnx_session
-from edgefilter.engines.crnn import Crnn
+from edgefilter.engines.crnn import SHARE_OF_SS, Crnn
 from edgefilter.engines.paper_crnn import PaperCrnn
 from edgefilter.errors import ModelError, SignalError, UsageError
 from edgefilter.filter.ego_filter import EgoFilter
@@ -66,7 +66,7 @@ def test_crnn_answers_what_onnxruntime_answers_for_the_same_frames():
     assert any(tensor.any() for tensor in state[0])
 
 
-def test_of_a_calibrated_robot_half_of_the_answer_is_that_of_ss():
+def test_of_a_calibrated_robot_ss_has_its_share_of_the_answer():
     profile = Profile.load(DEMO / "profile.npz")
     engines = create("crnn", profile, model=EDGE), create("crnn", model=EDGE), create("ss")
     states = [engine.initial_state() for engine in engines]
@@ -76,7 +76,7 @@ def test_of_a_calibrated_robot_half_of_the_answer_is_that_of_ss():
         powers = rng.uniform(0.5, 2.0, (2, 257)).astype(np.float32)  # nothing stands 20 dB above it
         answers, states = zip(*(e.step(Frame(*spectra, *powers), s) for e, s in zip(engines, states, strict=True)))
         both, network, mask = (answer.spectrum for answer in answers)
-        np.testing.assert_allclose(both, (network + mask) / 2, atol=1e-6)
+        np.testing.assert_allclose(both, (1 - SHARE_OF_SS) * network + SHARE_OF_SS * mask, atol=1e-6)
         assert answers[0].speech_probability == answers[1].speech_probability
 
 
