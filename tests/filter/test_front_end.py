@@ -28,3 +28,14 @@ def test_all_spectra_of_a_frame_lose_the_same_rumble():
         frame, _ = front.step(hop, 0 * hop)
     assert np.array_equal(frame.mic, frame.error)
     assert np.abs(frame.mic[0]) < 0.1 * np.abs(frame.mic[3:]).max()
+
+
+def test_a_frame_says_whether_nothing_of_the_robot_can_be_heard():
+    """Silent for a second, speaking for two, silent for three."""
+    front, second = FrontEnd(Linear(), robot()), SAMPLE_RATE // 256
+    ref = np.zeros(6 * second * 256, np.float32)
+    ref[second * 256 : 3 * second * 256] = 0.1 * np.random.default_rng(0).standard_normal(2 * second * 256)
+    mic = 0.5 * np.roll(ref, 1600)
+    hops = zip(mic.reshape(-1, 256), ref.reshape(-1, 256), strict=True)
+    idle = np.array([front.step(*hop)[0].idle for hop in hops])
+    assert idle[:second].all() and not idle[second : 3 * second + 7].any() and idle[-second:].all()
