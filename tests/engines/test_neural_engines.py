@@ -73,7 +73,7 @@ def test_of_a_calibrated_robot_ss_has_its_share_of_the_answer():
     rng = np.random.default_rng(1)
     for _ in range(5):
         spectra = [spectrum(rng, 257) for _ in range(4)]
-        powers = rng.uniform(0.5, 2.0, (2, 257)).astype(np.float32)  # nothing stands 20 dB above it
+        powers = rng.uniform(0.5, 2.0, (2, 257)).astype(np.float32)
         answers, states = zip(*(e.step(Frame(*spectra, *powers), s) for e, s in zip(engines, states, strict=True)))
         both, network, mask = (answer.spectrum for answer in answers)
         np.testing.assert_allclose(both, (1 - SHARE_OF_SS) * network + SHARE_OF_SS * mask, atol=1e-6)
