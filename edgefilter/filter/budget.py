@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import os
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -187,8 +186,7 @@ def _scene(hop: int) -> Iterator[tuple[Samples, Samples]]:
 
 
 def _model(engine: Engine | ClipEngine) -> str:
-    file = getattr(getattr(engine, "model", None), "path", None)
-    return hashlib.sha256(file.read_bytes()).hexdigest() if file else ""
+    return getattr(getattr(engine, "model", None), "sha256", "")
 
 
 def _taps(profile: Profile | None) -> int | None:

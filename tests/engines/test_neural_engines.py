@@ -13,7 +13,7 @@ import pytest
 import soundfile
 
 from edgefilter.dsp.metrics import si_sdr
-from edgefilter.engines import create, onnx_file, onnx_session
+from edgefilter.engines import create, onnx_session
 from edgefilter.engines.crnn import SHARE_OF_SS, Crnn
 from edgefilter.engines.paper_crnn import PaperCrnn
 from edgefilter.errors import ModelError, SignalError, UsageError
@@ -168,7 +168,7 @@ def test_the_model_comes_from_the_option_then_the_variable_then_the_package(tmp_
     (tmp_path / "crnn_int8.onnx").write_bytes(EDGE.read_bytes())
     with pytest.raises(ModelError, match="crnn_int8.onnx is not the one that belongs to this edgefilter"):
         Crnn()
-    monkeypatch.setitem(onnx_file.SHIPPED, "crnn_int8.onnx", hashlib.sha256(EDGE.read_bytes()).hexdigest())
+    monkeypatch.setitem(onnx_session.SHIPPED, "crnn_int8.onnx", hashlib.sha256(EDGE.read_bytes()).hexdigest())
     assert Crnn().model.path == tmp_path / "crnn_int8.onnx"
     monkeypatch.setenv("EDGEFILTER_CRNN", str(EDGE))
     assert Crnn().model.path == EDGE
