@@ -21,7 +21,7 @@ import numpy as np
 
 from edgefilter import engines
 from edgefilter.errors import EdgefilterError, UsageError
-from edgefilter.filter.budget_cache import processor, versions
+from edgefilter.filter.budget import processor, versions
 
 SCHEMA = 2
 """Of every JSON file: 2 has a stamp, 1 had the machine alone."""
