@@ -12,8 +12,7 @@ from edgefilter.dsp import fourier
 from edgefilter.dsp.membrane import DISPLACEMENT_TAPS, displacement_taps
 from edgefilter.errors import SignalError
 from edgefilter.filter.adaptation import COLD, WARM, Adaptation
-from edgefilter.filter.echo_limiter import EchoLimiter
-from edgefilter.filter.volume import Volume
+from edgefilter.filter.volume import EchoLimiter, Volume
 from edgefilter.types import SAMPLE_RATE, LinearStageStats, Samples, Spectrum
 
 PRIOR_VARIANCE = 0.05

@@ -110,6 +110,17 @@ def test_of_a_path_that_has_become_another_one_as_much_is_kept_as_is_heard(monke
     assert variance < canceller._covariance.max() < before**2  # once reopened, it does not grow with every doubt
 
 
+def test_a_robot_that_was_calibrated_in_a_dead_room_learns_the_room_it_is_carried_to() -> None:
+    """A path that is zero behind the direct sound says nothing of the power of what will come there."""
+    room, x = path(), speechlike(6.0)
+    dead = room.copy()
+    dead[512:] = 0.0
+    mic = signal.oaconvolve(x, room)[: x.size].astype(np.float32)
+    error = run(Canceller(HOP, 3200, dead), mic, x)
+    # 58 dB were seen, and 13 where what lies behind 512 taps is never learned
+    assert db(error[-16000:]) < db(mic[-16000:]) - 40
+
+
 def test_error_and_echo_add_up_to_the_microphone_exactly() -> None:
     x, mic = speechlike(0.5), speechlike(0.5, seed=5)
     canceller = Canceller(HOP, 1600, path(taps=1600))
