@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Iterator
 from functools import partial
 
@@ -10,8 +9,8 @@ import numpy as np
 
 from edgefilter.audio.device import find, input_port, output_port
 from edgefilter.audio.lookup import Device
-from edgefilter.audio.pairing import Pairing
-from edgefilter.audio.port import POLL_S, START_S, InputPort
+from edgefilter.audio.pairing import MAX_WAIT, TOLERANCE, Pairing
+from edgefilter.audio.port import START_S, InputPort, pause
 from edgefilter.audio.speech import SpokenReference
 from edgefilter.audio.steady import SteadyInput
 from edgefilter.errors import DeviceError
@@ -19,9 +18,6 @@ from edgefilter.types import SAMPLE_RATE, Block, Samples
 
 MARGIN_S = 0.04
 """Silence ahead of a live output, on top of the declared latency, against the jitter of both devices' callbacks."""
-SETTLE_S = 0.2
-"""A stream may stall right after its start; so much of each input is discarded before the first block."""
-_SLACK_S = 0.3
 
 
 class LiveSource:
@@ -105,7 +101,7 @@ class LiveSource:
                 failure, rest = error, self._pairing.flush()
                 block = block if rest is None else rest if block is None else _join(block, rest)
             if block is None:
-                time.sleep(POLL_S)
+                pause()
                 continue
             left = block.mic.size if self.total is None else min(block.mic.size, self.total - given)
             lost, reported = self.lost - reported, self.lost
@@ -126,15 +122,15 @@ class LiveSource:
         return self._pairing.push(mic, ref, self._reference.filled - before)
 
     def _synchronise(self) -> None:
-        """Wait until both devices run steadily, and begin with what arrives then.
+        """Wait until both devices run steadily, and begin with what arrives then: a stream may stall right after its start.
 
         The reference is emptied last: one that is too new only adds delay, one that is too old would come before its
         echo.
         """
-        while not self._stopped and not all(each.settled >= SETTLE_S for each in self._inputs()):
+        while not self._stopped and not all(each.settled * SAMPLE_RATE >= MAX_WAIT for each in self._inputs()):
             for each in self._inputs():
                 each.port.check_alive(each.port.inlet.received, START_S)
-            time.sleep(POLL_S)
+            pause()
         for each in reversed(self._inputs()):
             each.begin()
 
@@ -159,14 +155,15 @@ class LiveSink:
     """A loudspeaker or virtual device that first plays `latency` samples of silence, so that sound lags the input evenly.
 
     MARGIN_S more silence comes before it as a reserve against jitter. wait: hold the writer up when enough is queued
-    (right for a file as source); otherwise, with a live source, what is too much is dropped and counted. An underrun
+    (right for a file as source); otherwise, with a live source, what is too much is dropped and counted: more than a
+    source holds back at most while it waits for the reference, and delivers at once. An underrun
     plays silence, is counted, and ends when the reserve is there again. Raises DeviceError when the device stops.
     """
 
     def __init__(self, device: str | int | Device | None, latency: int = 0, wait: bool = True) -> None:
         self._port = output_port(device, latency, MARGIN_S)
         self._lead = round(latency * self._port.rate / SAMPLE_RATE) + self._port.margin
-        self._most = self._lead + round(_SLACK_S * self._port.rate)
+        self._most = self._lead + round((MAX_WAIT + TOLERANCE) / SAMPLE_RATE * self._port.rate)
         self._wait, self._open = wait, False
         self.notes = [f"output: {self._port.device}", *self._port.notes]
         self.finished = False

@@ -1,36 +1,29 @@
-"""An input that goes on: silence while its device is away, the device again when it is back, and a count of all that is missing."""
+"""An input and an output that outlive their devices, use them again when they are back, and count what is missing."""
 
 from __future__ import annotations
 
-import time
+from collections import Counter
 from collections.abc import Callable
 
 import numpy as np
 
-from edgefilter.audio.port import START_S, VANISHED_S, InputPort
+from edgefilter.audio.pairing import TOLERANCE, WINDOW
+from edgefilter.audio.port import BUFFER_S, START_S, InputPort, clock
+from edgefilter.audio.protocols import Sink
 from edgefilter.audio.speech import SpokenReference
 from edgefilter.errors import DeviceError
 from edgefilter.types import SAMPLE_RATE, Samples
 
 RETRY_S = 1.0
 """Between two attempts to open a device that is away."""
-WATCH_S = 4.0
-"""How long a device must have been behind the clock throughout, before sound counts as lost rather than late."""
-LEAST_S = 0.02
-"""So much must be missing then; clocks that differ by 300 ppm drift apart by a twentieth of it."""
-
-
-def clock() -> float:
-    """Seconds that also pass while the machine sleeps, where the system has such a clock."""
-    return time.clock_gettime(time.CLOCK_BOOTTIME) if hasattr(time, "CLOCK_BOOTTIME") else time.monotonic()
 
 
 class SampleClock:
     """What a device should have delivered by the clock and did not: sound that a driver, or a sleeping machine, lost without a word.
 
-    missed: seconds so far. Compares, from one stretch of WATCH_S to the next, by how much the device was behind the
-    clock at least: late sound catches up within a stretch, lost sound does not, and drifting clocks change it slowly.
-    What comes after all, from a machine that was too busy for longer, is taken off again.
+    missed: seconds so far. Compares, from one WINDOW to the next, by how much the device was behind the clock at least:
+    late sound catches up within a window, lost sound does not, and clocks that differ by 300 ppm change it by far less
+    than the TOLERANCE. What comes after all, from a machine that was too busy for longer, is taken off again.
     """
 
     def __init__(self) -> None:
@@ -42,15 +35,15 @@ class SampleClock:
     def note(self, delivered_s: float, now: float) -> None:
         """Take note of the seconds of sound that came so far."""
         if self._until is None:
-            self._until = now + WATCH_S
+            self._until = now + WINDOW / SAMPLE_RATE
         if now >= self._until:
-            self._judge()
-            self._least, self._until = np.inf, now + WATCH_S
+            self._compare()
+            self._least, self._until = np.inf, now + WINDOW / SAMPLE_RATE
         self._least = min(self._least, now - delivered_s)
 
-    def _judge(self) -> None:
+    def _compare(self) -> None:
         before, self._base = self._base, self._least
-        if before is not None and abs(self._least - before) > LEAST_S:
+        if before is not None and abs(self._least - before) > TOLERANCE / SAMPLE_RATE:
             self.missed = max(0.0, self.missed + self._least - before)
 
 
@@ -122,7 +115,7 @@ class SteadyInput:
         """See whether the device is there, and try to get it back where it is not; raises DeviceError when patience is over."""
         try:
             if self._open:
-                self.port.check_alive(self.port.inlet.received, START_S if self._failure else VANISHED_S)
+                self.port.check_alive(self.port.inlet.received, START_S if self._failure else BUFFER_S)
         except DeviceError as error:
             if self._patience_s <= 0.0:
                 raise
@@ -149,3 +142,78 @@ class SteadyInput:
         if port is not self.port:
             self._earlier_lost, self._earlier_overruns = self.lost, self.overruns
         self.port, self._clock, self._open = port, SampleClock(), True
+
+
+class SteadySink:
+    """An output that outlives its device.
+
+    make: the sink of a device that may be away (DeviceError); it is made anew for each return. What comes while the
+    device is away is dropped and counted (output_away, samples at 16 kHz). A device that never worked is an error.
+    """
+
+    finished = False
+
+    def __init__(self, make: Callable[[], Sink]) -> None:
+        self._make = make
+        self._sink: Sink | None = make()
+        self.notes = self._sink.notes
+        self._worked = self._is_away = False
+        self._tried_at = 0.0
+        self._earlier: Counter[str] = Counter()
+        self._own = {"output_away": 0, "output_gone": 0, "output_back": 0}
+
+    def __enter__(self) -> SteadySink:
+        if self._sink:
+            self._sink.__enter__()
+        return self
+
+    def write(self, samples: Samples) -> None:
+        """Play samples (n,), or drop them while there is no device."""
+        if self._sink is None and clock() - self._tried_at >= RETRY_S:
+            self._sink = self._again()
+        if self._sink is None:
+            self._own["output_away"] += samples.size
+            return
+        try:
+            self._sink.write(samples)
+        except DeviceError as error:
+            if not self._worked:
+                raise
+            self._own["output_away"] += samples.size
+            self._own["output_gone"] += not self._is_away
+            self._is_away = True
+            self._retire(error)
+            return
+        self._own["output_back"] += self._is_away
+        self._worked, self._is_away = True, False
+
+    def _again(self) -> Sink | None:
+        self._tried_at = clock()
+        try:
+            sink = self._make()
+        except DeviceError:
+            return None
+        sink.__enter__()
+        return sink
+
+    def _retire(self, error: DeviceError) -> None:
+        """Let go of a sink whose device stopped; what it counted stays."""
+        if self._sink:
+            self._earlier.update(self._sink.stats())
+            self._sink.__exit__(type(error), error, None)
+        self._sink, self._tried_at = None, clock()
+
+    def stats(self) -> dict[str, int]:
+        """Those of all its sinks so far, and samples that found no device; how often the device went away and came back."""
+        now = self._sink.stats() if self._sink else {}
+        return {name: self._earlier[name] + now.get(name, 0) for name in {**self._earlier, **now}} | self._own
+
+    def __exit__(self, *exc: object) -> None:
+        if self._sink:
+            self._sink.__exit__(*exc)
+            self.notes = self._sink.notes
+        if self._own["output_gone"]:
+            self.notes = [
+                *self.notes,
+                f"the output device was away for {self._own['output_away'] / SAMPLE_RATE:.1f} s of sound",
+            ]

@@ -13,7 +13,7 @@ from edgefilter.audio.protocols import Sink, Source
 from edgefilter.audio.raw import PcmSink
 from edgefilter.audio.reader import Reader
 from edgefilter.audio.speech import SpokenReference
-from edgefilter.audio.steady_sink import SteadySink
+from edgefilter.audio.steady import SteadySink
 from edgefilter.errors import UsageError
 
 FILE_ENDINGS = (".wav", ".flac", ".ogg", ".mp3", ".aiff", ".aif", ".w64", ".opus", ".txt", ".raw", ".pcm")
