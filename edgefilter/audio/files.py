@@ -10,8 +10,8 @@ import numpy as np
 import soundfile
 
 from edgefilter.audio.disk import Disk
-from edgefilter.audio.protocols import Source
-from edgefilter.audio.raw import PcmSource, clip_note, to_pcm16
+from edgefilter.audio.protocols import Sink, Source
+from edgefilter.audio.raw import PcmSink, PcmSource, clip_note, to_pcm16
 from edgefilter.audio.reader import Reader
 from edgefilter.errors import AudioFileError, UsageError
 from edgefilter.types import SAMPLE_RATE, Block, Samples, as_samples
@@ -20,14 +20,22 @@ _FORMATS = {".wav": "WAV", ".flac": "FLAC"}
 
 
 def open_source(path: str | Path, reference: str | Path | None = None) -> Source:
-    """The source for a recording and its reference, or for '-', raw stereo (microphone, reference) on standard input."""
-    if str(path) != "-":
+    """The source for a recording and its reference; '-', standard input, and named pipes bring both as raw stereo."""
+    named = Path(path).is_fifo()
+    if str(path) != "-" and not named:
         return FileSource(path, reference)
     if reference is not None:
         raise UsageError(
-            f"'-' as input is stereo and already holds the reference, found a second one, {reference}: leave it out"
+            f"'{path}' as input is stereo and already holds the reference, found a second one, {reference}: leave it out"
         )
-    return PcmSource()
+    return PcmSource(open(path, "rb", buffering=0), f"input {path}") if named else PcmSource()  # noqa: SIM115
+
+
+def open_sink(path: str | Path) -> Sink:
+    """The sink for a file; '-', standard output, and named pipes get raw samples."""
+    if str(path) == "-":
+        return PcmSink()
+    return PcmSink(open(path, "wb", buffering=0), f"output {path}") if Path(path).is_fifo() else FileSink(path)  # noqa: SIM115
 
 
 class FileSource:
@@ -144,6 +152,8 @@ class FileSink:
         form = _FORMATS.get(self.path.suffix.lower())
         if form is None:
             raise UsageError(f"output {self.path} ends in '{self.path.suffix}', expected .wav or .flac: rename it")
+        if self.path.is_fifo():
+            raise AudioFileError(f"output {self.path} is a pipe, expected a file: only 'run' writes raw samples to a pipe")
         self._float32 = float32
         try:
             self._disk = Disk(self.path)

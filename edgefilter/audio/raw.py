@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import io
 import os
 import select
 import sys
@@ -16,8 +17,9 @@ from edgefilter.errors import AudioFileError, UsageError
 from edgefilter.types import SAMPLE_RATE, Block, Samples, as_samples
 
 FULL_SCALE = 32768.0
-_READ_BYTES = 1 << 16
-_PATIENCE_S = 0.1  # how soon stop() is noticed while the pipe is silent
+_PATIENCE_S = 0.1
+"""How soon stop() is noticed while a pipe is silent."""
+_HEADERS = (b"RIFF", b"fLaC", b"OggS")
 
 
 def to_pcm16(samples: Samples) -> tuple[NDArray[np.int16], int]:
@@ -38,13 +40,15 @@ def clip_note(clipped: int, written: int) -> str:
 class PcmSource:
     """Raw s16le stereo at 16 kHz, (microphone, reference), from standard input or any binary stream.
 
-    Blocks are as long as the pipe delivers them, so a live pipe is not held up.
+    Blocks are as long as the pipe delivers them, so a live pipe is not held up. name: of the stream, in messages.
+    Raises AudioFileError for a stream without sound, or with a file's header.
     """
 
     live = False
 
-    def __init__(self, stream: BinaryIO | None = None) -> None:
+    def __init__(self, stream: BinaryIO | None = None, name: str = "standard input") -> None:
         self._stream = sys.stdin.buffer if stream is None else stream
+        self._name = name
         if self._stream.isatty():
             raise UsageError(
                 "'-' reads raw s16le 16 kHz stereo (microphone, reference) from a pipe, found a terminal: pipe sound"
@@ -71,6 +75,11 @@ class PcmSource:
         start, rest = 0, b""
         for data in self._pieces():
             data = rest + data
+            if start == 0 and data.startswith(_HEADERS):
+                raise AudioFileError(
+                    f"{self._name} begins with the header of an audio file ({data[:4]!r}), expected raw s16le 16 kHz"
+                    " stereo (microphone, reference): name the file itself, or leave the header out"
+                )
             whole = len(data) // 4 * 4
             rest = data[whole:]
             stereo = np.frombuffer(data[:whole], "<i2").reshape(-1, 2).astype(np.float32) / np.float32(FULL_SCALE)
@@ -79,11 +88,11 @@ class PcmSource:
                 start += len(stereo)
         if rest:
             cut = f"its last {len(rest)} bytes were ignored (is it s16le stereo?)"
-            self.notes.append(f"standard input ended in the middle of a sample: {cut}")
+            self.notes.append(f"{self._name} ended in the middle of a sample: {cut}")
         if start == 0 and not self._stopped:
             raise AudioFileError(
-                "standard input held no sound, expected raw s16le 16 kHz stereo (microphone, reference): check the"
-                " program before the pipe"
+                f"{self._name} held no sound, expected raw s16le 16 kHz stereo (microphone, reference): check the program"
+                " before the pipe"
             )
         self.total = start
 
@@ -97,7 +106,8 @@ class PcmSource:
         while not self._stopped:
             if handle is not None and wait and not select.select([handle], [], [], _PATIENCE_S)[0]:
                 continue
-            data = self._stream.read(_READ_BYTES) if handle is None else os.read(handle, _READ_BYTES)
+            count = io.DEFAULT_BUFFER_SIZE
+            data = self._stream.read(count) if handle is None else os.read(handle, count)
             if not data:
                 return
             yield data
@@ -106,8 +116,9 @@ class PcmSource:
 class PcmSink:
     """Raw s16le mono at 16 kHz to standard output or any binary stream; a reader that goes away ends it quietly."""
 
-    def __init__(self, stream: BinaryIO | None = None) -> None:
+    def __init__(self, stream: BinaryIO | None = None, name: str = "standard output") -> None:
         self._stream = sys.stdout.buffer if stream is None else stream
+        self._name = name
         if self._stream.isatty():
             raise UsageError(
                 "'-' writes raw s16le 16 kHz mono, found a terminal: pipe it into a program or name a .wav or .flac"
@@ -136,7 +147,7 @@ class PcmSink:
             self._write_all(pcm.astype("<i2").tobytes())
         except OSError as error:
             if error.errno not in (errno.EPIPE, errno.ECONNRESET):
-                raise AudioFileError(f"standard output cannot be written: {error.strerror}") from None
+                raise AudioFileError(f"{self._name} cannot be written: {error.strerror}") from None
             self.finished = True
             self.notes.append(f"the program behind the pipe stopped reading after {self.written / SAMPLE_RATE:.2f} s")
             return

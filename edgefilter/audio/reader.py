@@ -67,6 +67,8 @@ class Reader:
     def _check_is_file(self) -> None:
         if self.path.is_dir():
             raise self._error("is a directory, expected an audio file: name a file in it")
+        if self.path.is_fifo():
+            raise self._error("is a pipe, expected a file, which is read twice: write it to a file first")
         try:
             with open(self.path, "rb") as file:
                 start = file.read(16)

@@ -1,11 +1,8 @@
 """What befalls sound devices while a run goes on, on virtual ones: it goes on, says so, and counts what is missing."""
 
-import sys
-
 import numpy as np
 import pytest
 
-from edgefilter.audio import port
 from edgefilter.audio.files import FileSink, FileSource
 from edgefilter.audio.live import LiveSink, LiveSource
 from edgefilter.audio.pairing import TOLERANCE, WINDOW
@@ -14,24 +11,10 @@ from edgefilter.audio.troubles import Troubles
 from edgefilter.errors import DeviceError
 from edgefilter.filter.ego_filter import EgoFilter
 from edgefilter.session import filter_blocks
-from tests.audio.virtual_portaudio import CALLBACK_S, VirtualDevice, VirtualPortAudio
+from tests.audio.virtual_portaudio import CALLBACK_S, VirtualDevice
 
 FOREVER = float("inf")
 STEP = round(CALLBACK_S * 16000)
-
-
-@pytest.fixture
-def plug(monkeypatch):
-    """A function that puts virtual devices, and their clock, in place of all others."""
-
-    def plug(*devices):
-        system = VirtualPortAudio(*devices)
-        monkeypatch.setitem(sys.modules, "sounddevice", system)
-        monkeypatch.setattr(port, "time", system)
-        monkeypatch.setattr(port, "POLL_S", CALLBACK_S / 2)
-        return system
-
-    return plug
 
 
 @pytest.fixture
