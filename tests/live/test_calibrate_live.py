@@ -66,7 +66,7 @@ def test_live_calibration_works_while_another_program_listens_to_the_monitor(ser
     )
     try:
         figures, said = figures_of(
-            calibrating(server, tmp_path, "--speaker", "loud", "--input", "loud.monitor"), tmp_path
+            calibrating(server, tmp_path, "--speaker", "lou", "--input", "loud mon"), tmp_path
         )
     finally:
         listener.kill()

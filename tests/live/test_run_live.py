@@ -171,7 +171,7 @@ def test_an_unknown_device_is_one_line_that_names_the_known_ones(server, tmp_pat
     )
     lines = [line for line in result.stderr.splitlines() if line.startswith("edgefilter:")]
     assert result.returncode == 2 and len(lines) == 1, result.stderr
-    assert "nosuchmic" in lines[0] and "robot_mic_monitor" in lines[0]
+    assert "nosuchmic" in lines[0] and "'robot_mic.monitor'" in lines[0] and "'pulse'" not in lines[0]
 
 
 def test_devices_lists_them_and_the_reference(server):
