@@ -11,6 +11,7 @@ from edgefilter.audio.device import find, input_port, output_port
 from edgefilter.audio.lookup import Device
 from edgefilter.audio.pairing import MAX_WAIT, TOLERANCE, Pairing
 from edgefilter.audio.port import START_S, InputPort, pause
+from edgefilter.audio.protocols import Sink, Source
 from edgefilter.audio.speech import SpokenReference
 from edgefilter.audio.steady import SteadyInput
 from edgefilter.errors import DeviceError
@@ -20,7 +21,7 @@ MARGIN_S = 0.04
 """Silence ahead of a live output, on top of the declared latency, against the jitter of both devices' callbacks."""
 
 
-class LiveSource:
+class LiveSource(Source):
     """Microphone and reference devices as blocks on the microphone's sample counter, until stop() or `seconds`.
 
     patience_s: how long a device may be away; silence stands in meanwhile, by the clock, and it is opened again as soon
@@ -41,7 +42,6 @@ class LiveSource:
         self._mic = SteadyInput(_opener(mic), patience_s)
         self._reference = None if reference is None else SteadyInput(_opener(reference), patience_s)
         self._pairing = Pairing(late_is_lost=not isinstance(reference, SpokenReference))
-        self._stopped = False
         self.total = None if seconds is None else round(seconds * SAMPLE_RATE)
         self.notes = [f"microphone: {self._mic.port.device}", *self._mic.port.notes]
         if self._reference is not None:
@@ -60,21 +60,12 @@ class LiveSource:
     def __exit__(self, *exc: object) -> None:
         for each in self._inputs():
             each.close()
-        troubles = {name: count for name, count in self.stats().items() if count and name != "lost"}
-        if troubles:
-            words = ", ".join(f"{count} {name.replace('_', ' ')}" for name, count in troubles.items())
-            self.notes.append(f"live input was not complete: {words}")
+        counts = {name: count for name, count in self.stats().items() if name != "lost"}
+        self.notes += _incomplete("input", counts)
 
     def _inputs(self) -> list[SteadyInput]:
         """The reference first, so that it is there when the microphone starts."""
         return [self._mic] if self._reference is None else [self._reference, self._mic]
-
-    def stop(self) -> None:
-        self._stopped = True
-
-    @property
-    def lost(self) -> int:
-        return self.stats()["lost"]
 
     def stats(self) -> dict[str, int]:
         """Samples at 16 kHz by what befell them; callbacks marked as overrun; how often a device went away and came back."""
@@ -142,6 +133,12 @@ def _opener(device: str | int | Device | SpokenReference | None) -> Callable[[],
     return partial(input_port, find(device, "input"))
 
 
+def _incomplete(what: str, counts: dict[str, int]) -> list[str]:
+    """A note about the counters that are not zero, none where all are."""
+    words = ", ".join(f"{count} {name.replace('_', ' ')}" for name, count in counts.items() if count)
+    return [f"live {what} was not complete: {words}"] if words else []
+
+
 def _join(first: Block, second: Block) -> Block:
     return Block(
         np.concatenate((first.mic, second.mic)),
@@ -151,7 +148,7 @@ def _join(first: Block, second: Block) -> Block:
     )
 
 
-class LiveSink:
+class LiveSink(Sink):
     """A loudspeaker or virtual device that first plays `latency` samples of silence, so that sound lags the input evenly.
 
     MARGIN_S more silence comes before it as a reserve against jitter. wait: hold the writer up when enough is queued
@@ -166,8 +163,7 @@ class LiveSink:
         self._most = self._lead + round((MAX_WAIT + TOLERANCE) / SAMPLE_RATE * self._port.rate)
         self._wait, self._open = wait, False
         self.notes = [f"output: {self._port.device}", *self._port.notes]
-        self.finished = False
-        self.written = self.dropped = self.clipped = 0
+        self.dropped = 0
 
     def __enter__(self) -> LiveSink:
         self._port.outlet.ring.write(np.zeros(self._lead, np.float32))
@@ -202,12 +198,8 @@ class LiveSink:
         Underruns: callbacks that found too little.
         """
         outlet = self._port.outlet
-        figures = {
-            "written": self.written,
-            "clipped": self.clipped,
-            "underruns": max(outlet.underruns, self._port.flags),
-        }
-        return figures | {"missing": outlet.missing, "dropped": self.dropped + outlet.ring.lost}
+        lost = {"missing": outlet.missing, "dropped": self.dropped + outlet.ring.lost}
+        return {**super().stats(), "underruns": max(outlet.underruns, self._port.flags), **lost}
 
     def __exit__(self, *exc: object) -> None:
         try:
@@ -217,8 +209,5 @@ class LiveSink:
                 self._port.wait_until(0)
         finally:
             self._port.close(drain=exc[0] is None)
-            troubles = {name: count for name, count in self.stats().items() if count and name != "written"}
-            if troubles:
-                self.notes.append(
-                    "live output was not complete: " + ", ".join(f"{count} {name}" for name, count in troubles.items())
-                )
+            counts = {name: count for name, count in self.stats().items() if name != "written"}
+            self.notes += _incomplete("output", counts)

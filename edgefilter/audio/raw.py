@@ -13,6 +13,7 @@ from typing import BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
+from edgefilter.audio.protocols import Sink, Source
 from edgefilter.errors import AudioFileError, UsageError
 from edgefilter.types import SAMPLE_RATE, Block, Samples, as_samples
 
@@ -37,14 +38,12 @@ def clip_note(clipped: int, written: int) -> str:
     return f"{clipped} of {written} output samples exceeded full scale and were clipped: lower the level of the input"
 
 
-class PcmSource:
+class PcmSource(Source):
     """Raw s16le stereo at 16 kHz, (microphone, reference), from standard input or any binary stream.
 
     Blocks are as long as the pipe delivers them, so a live pipe is not held up. name: of the stream, in messages.
     Raises AudioFileError for a stream without sound, or with a file's header.
     """
-
-    live = False
 
     def __init__(self, stream: BinaryIO | None = None, name: str = "standard input") -> None:
         self._stream = sys.stdin.buffer if stream is None else stream
@@ -54,22 +53,8 @@ class PcmSource:
                 "'-' reads raw s16le 16 kHz stereo (microphone, reference) from a pipe, found a terminal: pipe sound"
                 " into it"
             )
-        self.notes: list[str] = []
+        self.notes = []
         self.total: int | None = None
-        self.lost = 0
-        self._stopped = False
-
-    def __enter__(self) -> PcmSource:
-        return self
-
-    def __exit__(self, *exc: object) -> None:
-        pass
-
-    def stop(self) -> None:
-        self._stopped = True
-
-    def stats(self) -> dict[str, int]:
-        return {"lost": 0}
 
     def __iter__(self) -> Iterator[Block]:
         start, rest = 0, b""
@@ -113,7 +98,7 @@ class PcmSource:
             yield data
 
 
-class PcmSink:
+class PcmSink(Sink):
     """Raw s16le mono at 16 kHz to standard output or any binary stream; a reader that goes away ends it quietly."""
 
     def __init__(self, stream: BinaryIO | None = None, name: str = "standard output") -> None:
@@ -124,20 +109,11 @@ class PcmSink:
                 "'-' writes raw s16le 16 kHz mono, found a terminal: pipe it into a program or name a .wav or .flac"
                 " file"
             )
-        self.notes: list[str] = []
-        self.finished = False
-        self.written = 0
-        self.clipped = 0
-
-    def __enter__(self) -> PcmSink:
-        return self
+        self.notes = []
 
     def __exit__(self, *exc: object) -> None:
         if self.clipped:
             self.notes.append(clip_note(self.clipped, self.written))
-
-    def stats(self) -> dict[str, int]:
-        return {"written": self.written, "clipped": self.clipped}
 
     def write(self, samples: Samples) -> None:
         if self.finished:

@@ -16,10 +16,11 @@ from edgefilter.errors import AudioFileError
 from edgefilter.types import SAMPLE_RATE, Array, Samples
 
 _RATES = range(1000, 768001)
-_ENDLESS = 0x7FFFF000  # writers to a pipe put sizes from here up into the header because they cannot know better
+"""Hz that converters have; a header that says another is damaged."""
+_ENDLESS = 0x7FFFF000
+"""Writers to a pipe put sizes from here up into a WAV's header because they cannot know better."""
 _LOUDEST = 1e6
 """No recording is 120 dB over full scale; squares of more do not fit into float32 for long."""
-_VALUES = 1 << 16  # samples times channels that are in memory at a time
 
 
 class Reader:
@@ -117,8 +118,8 @@ class Reader:
             )
 
     def _blocks(self, file: soundfile.SoundFile) -> Iterator[Array]:
-        """Yield (n, channels) float32 until the end; a decoder that gives up is an error with its place."""
-        size = max(1, _VALUES // self.channels)
+        """Yield (n, channels) float32, SAMPLE_RATE values at a time; a decoder that gives up is an error with its place."""
+        size = max(1, SAMPLE_RATE // self.channels)
         done = 0
         while True:
             try:

@@ -144,14 +144,12 @@ class SteadyInput:
         self.port, self._clock, self._open = port, SampleClock(), True
 
 
-class SteadySink:
+class SteadySink(Sink):
     """An output that outlives its device.
 
     make: the sink of a device that may be away (DeviceError); it is made anew for each return. What comes while the
     device is away is dropped and counted (output_away, samples at 16 kHz). A device that never worked is an error.
     """
-
-    finished = False
 
     def __init__(self, make: Callable[[], Sink]) -> None:
         self._make = make

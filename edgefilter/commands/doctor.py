@@ -20,8 +20,8 @@ from edgefilter.filter.ego_filter import EgoFilter
 from edgefilter.learning.background import LEAST_CORES, cores
 
 if TYPE_CHECKING:
-    from edgefilter.audio.port import InputPort
     from edgefilter.audio.measure import Trial
+    from edgefilter.audio.port import InputPort
 
 PACE = 0.005
 """By how much a device's clock may be out; what the filter follows is far less, but a few seconds tell no more."""

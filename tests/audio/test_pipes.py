@@ -47,7 +47,10 @@ def test_a_wav_file_in_a_pipe_of_raw_samples_is_one_line(pipes):
     header = (pipes / "x.wav").read_bytes()
     threading.Thread(target=lambda: (pipes / "in.wav").write_bytes(header), daemon=True).start()
     done = run(pipes, "run", "--input", "in.wav", "--output", "human.wav", "--engine", "bypass", "--quiet")
-    assert done.returncode == 1 and "in.wav begins with the header of an audio file (b'RIFF'), expected raw s16le" in done.stderr
+    assert (
+        done.returncode == 1
+        and "in.wav begins with the header of an audio file (b'RIFF'), expected raw s16le" in done.stderr
+    )
     assert "Traceback" not in done.stderr
 
 

@@ -101,11 +101,12 @@ def test_a_device_that_is_not_clear_is_answered_with_names(wanted, kind, words):
         match(DEVICES, wanted, kind)
 
 
+PHONE = "usb-Acme_Speakerphone-00"
 SERVED = [
     Device(0, "pulse", 32, 32, 44100.0), Device(1, "default", 32, 32, 44100.0), Device(2, "HDA Intel", 2, 2, 48000.0),
-    *(Device(0, name, 32 * ("output" not in name or "monitor" in name), 32 * name.endswith("output.usb-Acme_Speakerphone-00"), 44100.0, pulse_name=name)
-      for name in ("alsa_input.usb-Acme_Speakerphone-00", "alsa_output.usb-Acme_Speakerphone-00", "alsa_output.usb-Acme_Speakerphone-00.monitor",
-                   "alsa_input.pci-0000", "alsa_output.pci-0000.monitor")),
+    *(Device(0, name, inputs, 32 - inputs, 44100.0, pulse_name=name)
+      for name, inputs in ((f"alsa_input.{PHONE}", 32), (f"alsa_output.{PHONE}", 0), (f"alsa_output.{PHONE}.monitor", 32),
+                           ("alsa_input.pci-0000", 32), ("alsa_output.pci-0000.monitor", 32))),
 ]  # fmt: skip
 
 

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from edgefilter.audio import measure, pulse
-from edgefilter.audio.pairing import Inlet
 from edgefilter.audio.measure import Trial, listen
+from edgefilter.audio.pairing import Inlet
 from edgefilter.cli import main
 from edgefilter.commands import doctor
 from edgefilter.commands.doctor import Check

@@ -65,9 +65,7 @@ def test_live_calibration_works_while_another_program_listens_to_the_monitor(ser
         ["parec", "-d", "loud.monitor", "--latency-msec=20", "--raw"], env=server.environment, stdout=subprocess.DEVNULL
     )
     try:
-        figures, said = figures_of(
-            calibrating(server, tmp_path, "--speaker", "lou", "--input", "loud mon"), tmp_path
-        )
+        figures, said = figures_of(calibrating(server, tmp_path, "--speaker", "lou", "--input", "loud mon"), tmp_path)
     finally:
         listener.kill()
         listener.wait()
