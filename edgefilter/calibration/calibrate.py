@@ -15,7 +15,7 @@ from edgefilter.errors import CalibrationError, SignalError
 from edgefilter.profile.data import DISTORTION_ORDERS, GRID_FFT, GRID_HZ, Profile
 from edgefilter.types import PRE_ROLL, SAMPLE_RATE, Array, Samples, as_samples
 
-MIN_TAPS, MAX_TAPS = 6400, 16000
+MIN_TAPS, MAX_TAPS = 6400, SAMPLE_RATE
 """400 ms and 1 s: what is kept of the impulse response at least and at most."""
 
 

@@ -16,6 +16,7 @@ from edgefilter.types import PRE_ROLL, SAMPLE_RATE, Array, Samples
 
 Law = SweepLaw | SteppedLaw
 LOW_SNR_DB = 10.0
+"""Below it a band's path is wrong by more than 3 dB at times."""
 SPEECH_HZ = (110.0, 7200.0)
 """Bands that a warning is about; a small loudspeaker radiates nothing below them, and that is no fault of the
 calibration."""

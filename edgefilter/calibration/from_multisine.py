@@ -11,7 +11,15 @@ from scipy import fft
 from edgefilter.calibration.calibrate import calibrate, fan_psd
 from edgefilter.calibration.checks import check_lengths, clipped_samples
 from edgefilter.calibration.multisine import BLOCK, PERIOD, PERIODS, MultisineLaw, multisine_law, realisations
-from edgefilter.calibration.sweep import LATEST_DIRECT, deconvolve, find_direct, sweep_law
+from edgefilter.calibration.sweep import (
+    DRIFT_REACH,
+    LATEST_DIRECT,
+    LOW_HZ,
+    deconvolve,
+    find_direct,
+    smoothed,
+    sweep_law,
+)
 from edgefilter.dsp.fourier import power
 from edgefilter.dsp.fractional_delay import interpolate
 from edgefilter.dsp.frames import decibels
@@ -23,14 +31,10 @@ from edgefilter.profile.data import GRID_HZ, Profile
 from edgefilter.types import PRE_ROLL, SAMPLE_RATE, Array, Samples, as_samples
 
 LINE_HZ = SAMPLE_RATE / PERIOD
-SMOOTHING, SMOOTHING_HZ = 2 ** (1 / 12) - 1, 30.0
-"""Half the width over which lines are averaged: a twelfth of an octave, and no less than that many Hz."""
-LOWEST_HZ = 20.0
-"""Below it a converter's offset is no distortion."""
-REACH = 400
-"""Samples by which a multisine may be heard earlier or later than the sweep said: clocks 900 ppm apart."""
-LEAST_PPM, DOUBTFUL_PPM = 0.5, 5.0
-"""Clocks that are less far apart are left alone; a sweep measures the path well where they are less than the latter."""
+SMOOTHING_HZ = 30.0
+"""Half the width over which lines are averaged at least: 30 lines, so that a density is good to 1 dB."""
+DOUBTFUL_PPM = 5.0
+"""Clocks that are further apart smear a sweep's path: by half a sample from its beginning to its end."""
 CERTAIN = 3.0
 """Standard deviations of the noise's own power from which on a distortion is told from it."""
 LEAST_SHARE = 0.1
@@ -116,9 +120,8 @@ def approximate(
     played = fft.rfft(reference[law.blocks()[..., None] + PERIOD + np.arange(PERIOD)].astype(np.float64))
     part = recording[law.first + delay : law.stop + delay]
     ppm = _drift_ppm(profile, played, part)
-    if abs(ppm) > LEAST_PPM:
-        at = np.arange(part.size) + law.first
-        part = interpolate(recording, delay + at + 1e-6 * ppm * (at - law.first / 2))
+    at = np.arange(part.size) + law.first
+    part = interpolate(recording, delay + at + 1e-6 * ppm * (at - law.first / 2))
     lines = _Lines.of(played, part)
     found = lines.approximation()
     share = total_power(found.linear[-1]) / max(_heard_power(part), 1e-30)
@@ -145,7 +148,7 @@ def _drift_ppm(profile: Profile, played: Spectra, part: Samples) -> float:
     path = fft.rfft(profile.echo.impulse_response[:PERIOD].astype(np.float64), PERIOD)
     heard = _measured(part, played.shape[:2]).mean(axis=2)
     cross = (heard * np.conj(played * path)).reshape(-1, path.size)
-    rough = [highest(correlation_near(spectrum, PERIOD, REACH))[0] for spectrum in cross]
+    rough = [highest(correlation_near(spectrum, PERIOD, DRIFT_REACH))[0] for spectrum in cross]
     lags = [top(spectrum, PERIOD, lag) for spectrum, lag in zip(cross, rough, strict=True)]
     loud = len(lags) // 3
     return 1e6 * float(np.polyfit(BLOCK * np.arange(len(lags))[loud:], lags[loud:], 1)[0])
@@ -168,7 +171,7 @@ class _Lines:
         """Of spectra played (levels, realisations, lines) and the recording of them, swung in and on their counter."""
         excited = realisations().excited
         odd_lines = np.arange(excited.shape[1]) % 2 == 1
-        audible = np.arange(excited.shape[1]) * LINE_HZ >= LOWEST_HZ
+        audible = np.arange(excited.shape[1]) * LINE_HZ >= LOW_HZ
         heard = _measured(part, played.shape[:2])
         mean = heard.mean(axis=2)
         noise = power(heard - mean[:, :, None]).sum(axis=2) / (PERIODS - 2)
@@ -222,11 +225,7 @@ def _chance(noise: Array) -> Array:
 
 def _smooth(lines: Array) -> Array:
     """(levels, 601) mean over the lines around each frequency of GRID_HZ."""
-    half = np.maximum(SMOOTHING * GRID_HZ, SMOOTHING_HZ) / LINE_HZ
-    total = np.pad(np.cumsum(lines, axis=1), ((0, 0), (1, 0)))
-    low = np.clip(np.floor(GRID_HZ / LINE_HZ - half), 0, None).astype(int)
-    high = np.minimum(np.ceil(GRID_HZ / LINE_HZ + half) + 1, lines.shape[1]).astype(int)
-    return (total[:, high] - total[:, low]) / (high - low)
+    return smoothed(lines, GRID_HZ, LINE_HZ, SMOOTHING_HZ)
 
 
 def _doubts(profile: Profile, found: LinearApproximation, part: Samples, ppm: float) -> list[str]:
