@@ -18,7 +18,7 @@ from edgefilter.errors import DeviceError
 from edgefilter.types import SAMPLE_RATE, Block, Samples
 
 MARGIN_S = 0.04
-"""Silence ahead of a live output, on top of the declared latency, against the jitter of both devices' callbacks."""
+"""Silence ahead of a live output, on top of the declared latency: two callbacks of 20 ms, which come with jitter."""
 
 
 class LiveSource(Source):
@@ -68,7 +68,7 @@ class LiveSource(Source):
         return [self._mic] if self._reference is None else [self._reference, self._mic]
 
     def stats(self) -> dict[str, int]:
-        """Samples at 16 kHz by what befell them; callbacks marked as overrun; how often a device went away and came back."""
+        """Samples at 16 kHz that were lost, filled or moved; callbacks marked as overrun; devices lost and found again."""
         counts = {f"reference_{name}": getattr(self._pairing, name) for name in ("filled", "dropped", "inserted")}
         both = (("microphone", self._mic), ("reference", self._reference))
         for name, each in both:

@@ -1,4 +1,4 @@
-"""The robot's speech, played here: the samples that the loudspeaker gets are the reference."""
+"""Speech that this program plays itself: the samples that the loudspeaker gets are the reference."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ FADE_S = 0.02
 
 
 class SpokenReference(Port):
-    """Plays speech, and is read like an input that hears exactly what is played, gain changes included.
+    """Plays speech, and is read like an input that delivers exactly what is played, gain changes included.
 
     speech: arrays (n,) at 16 kHz, played from the first `take` on; before it, and after it has ended, there is silence.
     The sound leaves the loudspeaker later than it is read here, by the device's latency.

@@ -1,4 +1,4 @@
-"""An input and an output that outlive their devices, use them again when they are back, and count what is missing."""
+"""An input and an output that go on without their devices, use them again when they are back, and count what is missing."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ RETRY_S = 1.0
 
 
 class SampleClock:
-    """What a device should have delivered by the clock and did not: sound that a driver, or a sleeping machine, lost without a word.
+    """Sound that a device should have delivered by the clock and did not, because a driver or a sleeping machine lost it.
 
     missed: seconds so far. Compares, from one WINDOW to the next, by how much the device was behind the clock at least:
     late sound catches up within a window, lost sound does not, and clocks that differ by 300 ppm change it by far less
@@ -48,11 +48,12 @@ class SampleClock:
 
 
 class SteadyInput:
-    """An input port that outlives its device.
+    """An input port that goes on without its device.
 
-    make: makes the port, of a device that may be away (DeviceError). patience_s: how long it may be; with 0 its loss is
-    an error at once. While it is away, `take` gives silence by the clock. filled: samples of that so far. lost: samples
-    that came too late to be kept, or never. overruns: callbacks that the driver marked. gone, back: how often.
+    make: makes the port; DeviceError where the device is away. patience_s: how long it may be away; with 0 its loss is
+    an error at once. While it is away, `take` gives silence by the clock. filled: samples of this silence so far. lost:
+    samples that did not fit into the ring or never came. overruns: callbacks that the driver marked. gone, back: how
+    often the device was lost and found again.
     """
 
     def __init__(self, make: Callable[[], InputPort | SpokenReference], patience_s: float = 0.0) -> None:
@@ -62,12 +63,12 @@ class SteadyInput:
         self._earlier_lost = self._earlier_overruns = 0
         self._open, self._clock = False, SampleClock()
         self._failure: DeviceError | None = None
-        self._heard_at = self._gone_at = self._tried_at = 0.0
+        self._received_at = self._gone_at = self._tried_at = 0.0
 
     def open(self) -> None:
         """Open the device; raises DeviceError."""
         self.port.open()
-        self._open, self._heard_at = True, clock()
+        self._open, self._received_at = True, clock()
 
     def close(self) -> None:
         """End the stream."""
@@ -99,16 +100,16 @@ class SteadyInput:
         now = clock()
         samples = self.port.take() if self._open else np.zeros(0, np.float32)
         if self._failure is None:
-            self._heard_at = now if samples.size else self._heard_at
+            self._received_at = now if samples.size else self._received_at
             self._clock.note(self.settled, now)
             return samples
-        silence = np.zeros(max(round((now - self._heard_at) * SAMPLE_RATE) - samples.size, 0), np.float32)
+        silence = np.zeros(max(round((now - self._received_at) * SAMPLE_RATE) - samples.size, 0), np.float32)
         self.filled += silence.size
         if not samples.size:
-            self._heard_at += silence.size / SAMPLE_RATE
+            self._received_at += silence.size / SAMPLE_RATE
             return silence
         self.back += 1
-        self._failure, self._heard_at = None, now
+        self._failure, self._received_at = None, now
         return np.concatenate((silence, samples))
 
     def check(self) -> None:
@@ -121,7 +122,7 @@ class SteadyInput:
                 raise
             self.close()
             if self._failure is None:
-                self._failure, self._gone_at = error, self._heard_at
+                self._failure, self._gone_at = error, self._received_at
                 self.gone += 1
         now = clock()
         if self._failure and not self._open and now - self._tried_at >= RETRY_S:
@@ -145,10 +146,10 @@ class SteadyInput:
 
 
 class SteadySink(Sink):
-    """An output that outlives its device.
+    """An output that goes on without its device.
 
-    make: the sink of a device that may be away (DeviceError); it is made anew for each return. What comes while the
-    device is away is dropped and counted (output_away, samples at 16 kHz). A device that never worked is an error.
+    make: makes the device's sink, again for each return; DeviceError where the device is away. What is written while it
+    is away is dropped and counted (output_away, samples at 16 kHz). A device that never worked is an error.
     """
 
     def __init__(self, make: Callable[[], Sink]) -> None:
@@ -202,7 +203,7 @@ class SteadySink(Sink):
         self._sink, self._tried_at = None, clock()
 
     def stats(self) -> dict[str, int]:
-        """Those of all its sinks so far, and samples that found no device; how often the device went away and came back."""
+        """The sums over all its sinks so far; samples that found no device; how often the device was lost and found again."""
         now = self._sink.stats() if self._sink else {}
         return {name: self._earlier[name] + now.get(name, 0) for name in {**self._earlier, **now}} | self._own
 

@@ -1,6 +1,6 @@
 """A speaker for the robot and a microphone for everybody else, on PulseAudio or PipeWire's stand-in for it.
 
-As module-echo-cancel has them: what is played into the speaker is heard on the default output and is the reference,
+As module-echo-cancel has them: what is played into the speaker goes to the default output and is the reference,
 what `edgefilter run` writes can be listened to as a microphone.
 """
 
@@ -71,7 +71,7 @@ def unload() -> list[str]:
 
 
 def speaker_monitor() -> str | None:
-    """What hears the virtual speaker alone, None where there is none."""
+    """The monitor of the virtual speaker, None where there is none."""
     name = f"{SPEAKER}.monitor"
     return name if name in pulse.names("input") else None
 

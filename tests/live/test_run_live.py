@@ -15,6 +15,8 @@ import soundfile
 from edgefilter import Profile
 from tests.learning.scenes import Scene
 
+pytestmark = pytest.mark.slow
+
 ROOT = Path(__file__).parents[2]
 DEMO = ROOT / "edgefilter/demo_data"
 
