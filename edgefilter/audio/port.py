@@ -31,7 +31,7 @@ nothing for as long has stopped."""
 START_S = 6.0
 """How long a device may take to its first samples: a virtual one can hold back its first 2 s."""
 STREAM_LATENCY_S = 0.05
-"""Buffer asked of the sound system for live use: three callbacks of 16 ms."""
+"""Buffer asked of the sound system for live use, three hops: it is part of the latency."""
 
 
 def clock() -> float:
