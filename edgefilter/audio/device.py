@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import asdict, replace
 from typing import Any
 
 from edgefilter.audio import pulse
-from edgefilter.audio.lookup import Device, match, monitor
-from edgefilter.audio.port import InputPort, OutputPort
+from edgefilter.audio.lookup import STAND_INS, Device, match, monitor
+from edgefilter.audio.port import STREAM_LATENCY_S, InputPort, OutputPort, silence_alsa
 from edgefilter.audio.reader import Reader
 from edgefilter.audio.speech import SpokenReference
-from edgefilter.errors import DeviceError, UsageError
+from edgefilter.errors import DeviceError
 
 
 def _sounddevice() -> Any:
@@ -23,10 +24,11 @@ def _sounddevice() -> Any:
         ) from None
     except OSError as error:
         raise DeviceError(f"live audio needs the PortAudio library ({error}): apt install libportaudio2") from None
+    silence_alsa()
     return sounddevice
 
 
-def _devices() -> list[Device]:
+def _of_portaudio() -> list[Device]:
     sd = _sounddevice()
     systems = [api["name"] for api in sd.query_hostapis()]
     return [
@@ -42,9 +44,23 @@ def _devices() -> list[Device]:
     ]
 
 
+def _of_server(found: list[Device]) -> Iterator[Device]:
+    """The sound server's inputs and outputs, each behind the device of PortAudio's that leads to the server."""
+    for kind in ("input", "output"):
+        ways = [device for name in STAND_INS for device in found if device.name == name and device.channels(kind)]
+        for name in pulse.names(kind) if ways else ():
+            inputs, outputs = (ways[0].inputs, 0) if kind == "input" else (0, ways[0].outputs)
+            yield replace(ways[0], name=name, pulse_name=name, inputs=inputs, outputs=outputs)
+
+
+def _devices() -> list[Device]:
+    found = _of_portaudio()
+    return [*found, *_of_server(found)]
+
+
 def list_devices() -> list[dict[str, Any]]:
-    """One dict a device: index, name, inputs, outputs (channels), rate (Hz, its own), system."""
-    return [asdict(device) for device in _devices()]
+    """PortAudio's devices, one dict each: index, name, inputs, outputs (channels), rate (Hz, its own), system."""
+    return [asdict(device) for device in _of_portaudio()]
 
 
 def find(name: str | int | Device | None, kind: str) -> Device:
@@ -52,42 +68,29 @@ def find(name: str | int | Device | None, kind: str) -> Device:
 
     kind: 'input' or 'output'. Raises UsageError for an unknown or ambiguous name, DeviceError without any device.
     """
-    default = _sounddevice().default.device[0 if kind == "input" else 1]
-    try:
-        return match(_devices(), name, kind, default)
-    except UsageError:
-        if name in pulse.names(kind) and (device := _on_server(str(name), kind)):
-            return device
-        raise
+    if isinstance(name, Device):
+        return name
+    return match(_devices(), name, kind, _sounddevice().default.device[0 if kind == "input" else 1])
 
 
 def monitor_of(output: str | int | Device | None = None) -> Device:
-    """The input that hears what output plays (default: the default output); UsageError where there is none."""
-    device = find(output, "output")
-    if device.name in pulse.STAND_INS and (source := pulse.default_monitor()):
-        found = _on_server(source, "input")
-        if found:
-            return found
-    return monitor(_devices(), device)
+    """The input that gets what output plays (default: the default output); UsageError where there is none."""
+    device, devices = find(output, "output"), _devices()
+    source = pulse.default_monitor() if device.name in STAND_INS else None
+    found = [each for each in devices if source and each.pulse_name == source]
+    return found[0] if found else monitor(devices, device)
 
 
-def _on_server(name: str, kind: str) -> Device | None:
-    """The sound server's input or output of this name as a device, None where PortAudio has no way to the server."""
-    for stand_in in pulse.STAND_INS:
-        for device in _devices():
-            if device.name == stand_in and device.channels(kind):
-                return replace(device, name=name, pulse_name=name)
-    return None
-
-
-def input_port(name: str | int | Device | None) -> InputPort:
+def input_port(name: str | int | Device | None, latency_s: float = STREAM_LATENCY_S) -> InputPort:
     """An input that can be opened, found by what people type."""
-    return InputPort(_sounddevice(), find(name, "input"))
+    return InputPort(_sounddevice(), find(name, "input"), latency_s)
 
 
-def output_port(name: str | int | Device | None, queued: int, margin_s: float = 0.0) -> OutputPort:
+def output_port(
+    name: str | int | Device | None, queued: int, margin_s: float = 0.0, latency_s: float = STREAM_LATENCY_S
+) -> OutputPort:
     """An output that can be opened, with room for so many samples at 16 kHz, found by what people type."""
-    return OutputPort(_sounddevice(), find(name, "output"), queued, margin_s)
+    return OutputPort(_sounddevice(), find(name, "output"), queued, margin_s, latency_s)
 
 
 def speaker(output: str | int | Device | None, speech: Reader) -> SpokenReference:

@@ -14,8 +14,8 @@ except ModuleNotFoundError:  # Windows, which does not let two programs write on
     fcntl = None  # type: ignore[assignment]
 
 _FLAC_FRAME = b"\xff\xf8"  # sync code of a frame of fixed size, RFC 9639, 9.1
-_HEADER = 256  # bytes in which both formats' headers lie
-_MOST = 0xFFFFFFFF  # a WAV of more bytes says so much, and readers go on to the end of the file
+_MOST = 0xFFFFFFFF
+"""Bytes that a WAV's size fields can say: a longer one says so much, and readers go on to the end of the file."""
 
 
 class Disk(io.RawIOBase):
@@ -86,7 +86,7 @@ class Disk(io.RawIOBase):
 
     def _repair_header(self) -> None:
         self._file.seek(0)
-        start = self._file.read(_HEADER)
+        start = self._file.read(io.DEFAULT_BUFFER_SIZE)  # both formats' headers lie within
         if start[:4] == b"fLaC" and len(start) >= 42:
             self._repair_flac(start)
         elif start[:4] == b"RIFF" and b"data" in start:

@@ -10,8 +10,8 @@ import numpy as np
 import soundfile
 
 from edgefilter.audio.disk import Disk
-from edgefilter.audio.protocols import Source
-from edgefilter.audio.raw import PcmSource, clip_note, to_pcm16
+from edgefilter.audio.protocols import Sink, Source
+from edgefilter.audio.raw import PcmSink, PcmSource, clip_note, to_pcm16
 from edgefilter.audio.reader import Reader
 from edgefilter.errors import AudioFileError, UsageError
 from edgefilter.types import SAMPLE_RATE, Block, Samples, as_samples
@@ -20,17 +20,25 @@ _FORMATS = {".wav": "WAV", ".flac": "FLAC"}
 
 
 def open_source(path: str | Path, reference: str | Path | None = None) -> Source:
-    """The source for a recording and its reference, or for '-', raw stereo (microphone, reference) on standard input."""
-    if str(path) != "-":
+    """The source for a recording and its reference; '-', standard input, and named pipes bring both as raw stereo."""
+    named = Path(path).is_fifo()
+    if str(path) != "-" and not named:
         return FileSource(path, reference)
     if reference is not None:
         raise UsageError(
-            f"'-' as input is stereo and already holds the reference, found a second one, {reference}: leave it out"
+            f"'{path}' as input is stereo and already holds the reference, found a second one, {reference}: leave it out"
         )
-    return PcmSource()
+    return PcmSource(open(path, "rb", buffering=0), f"input {path}") if named else PcmSource()  # noqa: SIM115
 
 
-class FileSource:
+def open_sink(path: str | Path) -> Sink:
+    """The sink for a file; '-', standard output, and named pipes get raw samples."""
+    if str(path) == "-":
+        return PcmSink()
+    return PcmSink(open(path, "wb", buffering=0), f"output {path}") if Path(path).is_fifo() else FileSink(path)  # noqa: SIM115
+
+
+class FileSource(Source):
     """A recording and, if there is one, the reference of what the robot said, as blocks of 16 kHz mono.
 
     The recording decides the length: a shorter reference is followed by silence, a longer one is cut, without one the
@@ -38,15 +46,11 @@ class FileSource:
     Raises AudioFileError for an unusable file (see Reader).
     """
 
-    live = False
-
     def __init__(self, mic_path: str | Path, reference_path: str | Path | None = None, block: int = 4096) -> None:
         self._mic = Reader(mic_path, "recording")
         self._reference = None if reference_path is None else Reader(reference_path, "reference")
         self._block = block
-        self._stopped = False
-        self.total: int | None = self._mic.total
-        self.lost = 0
+        self.total = self._mic.total
         self.notes = list(self._mic.notes)
         if self._mic.silent:
             self.notes.append(f"recording {mic_path} is silent: every sample is zero")
@@ -56,18 +60,6 @@ class FileSource:
             )
         else:
             self.notes += self._reference.notes + _length_notes(self._reference, self._mic.total)
-
-    def __enter__(self) -> FileSource:
-        return self
-
-    def __exit__(self, *exc: object) -> None:
-        pass
-
-    def stop(self) -> None:
-        self._stopped = True
-
-    def stats(self) -> dict[str, int]:
-        return {"lost": 0}
 
     def __iter__(self) -> Iterator[Block]:
         reference = _Taker(iter(()) if self._reference is None else self._reference.chunks())
@@ -119,7 +111,7 @@ class _Taker:
         return joined[:count]
 
 
-class FileSink:
+class FileSink(Sink):
     """A mono 16 kHz file, WAV or FLAC by suffix, 16-bit PCM (or 32-bit float for WAV).
 
     Valid up to the last sample however the context is left, and where the program is killed: a WAV up to the last
@@ -137,13 +129,14 @@ class FileSink:
 
     def __init__(self, path: str | Path, float32: bool = False) -> None:
         self.path = Path(path)
-        self.notes: list[str] = []
-        self.finished = False
-        self.written = 0
-        self.clipped = 0
+        self.notes = []
         form = _FORMATS.get(self.path.suffix.lower())
         if form is None:
             raise UsageError(f"output {self.path} ends in '{self.path.suffix}', expected .wav or .flac: rename it")
+        if self.path.is_fifo():
+            raise AudioFileError(
+                f"output {self.path} is a pipe, expected a file: only 'run' writes raw samples to a pipe"
+            )
         self._float32 = float32
         try:
             self._disk = Disk(self.path)
@@ -164,14 +157,8 @@ class FileSink:
             self._disk.finish()
             raise self._full(self._disk.error or OSError(errno.EIO, str(error))) from None
 
-    def __enter__(self) -> FileSink:
-        return self
-
     def __exit__(self, *exc: object) -> None:
         self.close(quiet=exc[0] is not None)
-
-    def stats(self) -> dict[str, int]:
-        return {"written": self.written, "clipped": self.clipped}
 
     def write(self, samples: Samples) -> None:
         if self._float32:
@@ -203,9 +190,8 @@ class FileSink:
             self._disk.finish()
         if self.clipped:
             self.notes.append(clip_note(self.clipped, self.written))
-        if self._disk.error:
-            if not quiet:
-                raise self._full(self._disk.error)
+        if self._disk.error and not quiet:
+            raise self._full(self._disk.error)
 
     def _full(self, error: OSError) -> AudioFileError:
         kept = f"; its first {self.written / SAMPLE_RATE:.1f} s or so are kept" if self.written else ""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Iterator
 from functools import partial
 
@@ -10,21 +9,19 @@ import numpy as np
 
 from edgefilter.audio.device import find, input_port, output_port
 from edgefilter.audio.lookup import Device
-from edgefilter.audio.pairing import Pairing
-from edgefilter.audio.port import POLL_S, START_S, InputPort
+from edgefilter.audio.pairing import MAX_WAIT, TOLERANCE, Pairing
+from edgefilter.audio.port import START_S, InputPort, pause
+from edgefilter.audio.protocols import Sink, Source
 from edgefilter.audio.speech import SpokenReference
 from edgefilter.audio.steady import SteadyInput
 from edgefilter.errors import DeviceError
 from edgefilter.types import SAMPLE_RATE, Block, Samples
 
 MARGIN_S = 0.04
-"""Silence ahead of a live output, on top of the declared latency, against the jitter of both devices' callbacks."""
-SETTLE_S = 0.2
-"""A stream may stall right after its start; so much of each input is discarded before the first block."""
-_SLACK_S = 0.3
+"""Silence ahead of a live output, on top of the declared latency: two callbacks of 20 ms, which come with jitter."""
 
 
-class LiveSource:
+class LiveSource(Source):
     """Microphone and reference devices as blocks on the microphone's sample counter, until stop() or `seconds`.
 
     patience_s: how long a device may be away; silence stands in meanwhile, by the clock, and it is opened again as soon
@@ -45,7 +42,6 @@ class LiveSource:
         self._mic = SteadyInput(_opener(mic), patience_s)
         self._reference = None if reference is None else SteadyInput(_opener(reference), patience_s)
         self._pairing = Pairing(late_is_lost=not isinstance(reference, SpokenReference))
-        self._stopped = False
         self.total = None if seconds is None else round(seconds * SAMPLE_RATE)
         self.notes = [f"microphone: {self._mic.port.device}", *self._mic.port.notes]
         if self._reference is not None:
@@ -64,24 +60,15 @@ class LiveSource:
     def __exit__(self, *exc: object) -> None:
         for each in self._inputs():
             each.close()
-        troubles = {name: count for name, count in self.stats().items() if count and name != "lost"}
-        if troubles:
-            words = ", ".join(f"{count} {name.replace('_', ' ')}" for name, count in troubles.items())
-            self.notes.append(f"live input was not complete: {words}")
+        counts = {name: count for name, count in self.stats().items() if name != "lost"}
+        self.notes += _incomplete("input", counts)
 
     def _inputs(self) -> list[SteadyInput]:
         """The reference first, so that it is there when the microphone starts."""
         return [self._mic] if self._reference is None else [self._reference, self._mic]
 
-    def stop(self) -> None:
-        self._stopped = True
-
-    @property
-    def lost(self) -> int:
-        return self.stats()["lost"]
-
     def stats(self) -> dict[str, int]:
-        """Samples at 16 kHz by what befell them; callbacks marked as overrun; how often a device went away and came back."""
+        """Samples at 16 kHz that were lost, filled or moved; callbacks marked as overrun; devices lost and found again."""
         counts = {f"reference_{name}": getattr(self._pairing, name) for name in ("filled", "dropped", "inserted")}
         both = (("microphone", self._mic), ("reference", self._reference))
         for name, each in both:
@@ -105,7 +92,7 @@ class LiveSource:
                 failure, rest = error, self._pairing.flush()
                 block = block if rest is None else rest if block is None else _join(block, rest)
             if block is None:
-                time.sleep(POLL_S)
+                pause()
                 continue
             left = block.mic.size if self.total is None else min(block.mic.size, self.total - given)
             lost, reported = self.lost - reported, self.lost
@@ -126,15 +113,15 @@ class LiveSource:
         return self._pairing.push(mic, ref, self._reference.filled - before)
 
     def _synchronise(self) -> None:
-        """Wait until both devices run steadily, and begin with what arrives then.
+        """Wait until both devices run steadily, and begin with what arrives then: a stream may stall right after its start.
 
         The reference is emptied last: one that is too new only adds delay, one that is too old would come before its
         echo.
         """
-        while not self._stopped and not all(each.settled >= SETTLE_S for each in self._inputs()):
+        while not self._stopped and not all(each.settled * SAMPLE_RATE >= MAX_WAIT for each in self._inputs()):
             for each in self._inputs():
                 each.port.check_alive(each.port.inlet.received, START_S)
-            time.sleep(POLL_S)
+            pause()
         for each in reversed(self._inputs()):
             each.begin()
 
@@ -146,6 +133,12 @@ def _opener(device: str | int | Device | SpokenReference | None) -> Callable[[],
     return partial(input_port, find(device, "input"))
 
 
+def _incomplete(what: str, counts: dict[str, int]) -> list[str]:
+    """A note about the counters that are not zero, none where all are."""
+    words = ", ".join(f"{count} {name.replace('_', ' ')}" for name, count in counts.items() if count)
+    return [f"live {what} was not complete: {words}"] if words else []
+
+
 def _join(first: Block, second: Block) -> Block:
     return Block(
         np.concatenate((first.mic, second.mic)),
@@ -155,22 +148,22 @@ def _join(first: Block, second: Block) -> Block:
     )
 
 
-class LiveSink:
+class LiveSink(Sink):
     """A loudspeaker or virtual device that first plays `latency` samples of silence, so that sound lags the input evenly.
 
     MARGIN_S more silence comes before it as a reserve against jitter. wait: hold the writer up when enough is queued
-    (right for a file as source); otherwise, with a live source, what is too much is dropped and counted. An underrun
+    (right for a file as source); otherwise, with a live source, what is too much is dropped and counted: more than a
+    source holds back at most while it waits for the reference, and delivers at once. An underrun
     plays silence, is counted, and ends when the reserve is there again. Raises DeviceError when the device stops.
     """
 
     def __init__(self, device: str | int | Device | None, latency: int = 0, wait: bool = True) -> None:
         self._port = output_port(device, latency, MARGIN_S)
         self._lead = round(latency * self._port.rate / SAMPLE_RATE) + self._port.margin
-        self._most = self._lead + round(_SLACK_S * self._port.rate)
+        self._most = self._lead + round((MAX_WAIT + TOLERANCE) / SAMPLE_RATE * self._port.rate)
         self._wait, self._open = wait, False
         self.notes = [f"output: {self._port.device}", *self._port.notes]
-        self.finished = False
-        self.written = self.dropped = self.clipped = 0
+        self.dropped = 0
 
     def __enter__(self) -> LiveSink:
         self._port.outlet.ring.write(np.zeros(self._lead, np.float32))
@@ -205,12 +198,8 @@ class LiveSink:
         Underruns: callbacks that found too little.
         """
         outlet = self._port.outlet
-        figures = {
-            "written": self.written,
-            "clipped": self.clipped,
-            "underruns": max(outlet.underruns, self._port.flags),
-        }
-        return figures | {"missing": outlet.missing, "dropped": self.dropped + outlet.ring.lost}
+        lost = {"missing": outlet.missing, "dropped": self.dropped + outlet.ring.lost}
+        return {**super().stats(), "underruns": max(outlet.underruns, self._port.flags), **lost}
 
     def __exit__(self, *exc: object) -> None:
         try:
@@ -220,8 +209,5 @@ class LiveSink:
                 self._port.wait_until(0)
         finally:
             self._port.close(drain=exc[0] is None)
-            troubles = {name: count for name, count in self.stats().items() if count and name != "written"}
-            if troubles:
-                self.notes.append(
-                    "live output was not complete: " + ", ".join(f"{count} {name}" for name, count in troubles.items())
-                )
+            counts = {name: count for name, count in self.stats().items() if name != "written"}
+            self.notes += _incomplete("output", counts)

@@ -1,4 +1,4 @@
-"""Finding a sound device by what people type, and the monitor that hears what an output plays."""
+"""Finding a sound device by what people type, and the monitor that gets what an output plays."""
 
 from __future__ import annotations
 
@@ -9,13 +9,15 @@ from dataclasses import dataclass
 from edgefilter.errors import DeviceError, UsageError
 
 _DEFAULT_WORDS = ("default", "mic", "speaker")
+STAND_INS = ("pulse", "default", "pipewire")
+"""PortAudio's devices that lead to the sound server, the most direct first."""
 
 
 @dataclass(frozen=True)
 class Device:
     """A sound device as the audio system lists it: number, name, channels each way, its own rate in Hz, its audio system.
 
-    pulse_name: where the device only stands for the sound server, the server's input or output that is meant.
+    pulse_name: the sound server's own name of it, where PortAudio only has a device that leads to the server.
     """
 
     index: int
@@ -34,14 +36,14 @@ class Device:
         return self.inputs if kind == "input" else self.outputs
 
 
-def match(devices: Sequence[Device], wanted: str | int | Device | None, kind: str, default: int = -1) -> Device:
+def match(devices: Sequence[Device], wanted: str | int | None, kind: str, default: int = -1) -> Device:
     """The device that wanted names: a number, a name, a part of a name, or None, 'default', 'mic' for the default one.
 
-    kind: 'input' or 'output'; default: index of the system's default, -1 for none.
-    Raises UsageError for an unknown or ambiguous name, DeviceError where there is no device of this kind at all.
+    A whole name goes before a part of one, and a part that only a monitor has in it is the last that is taken. Capitals,
+    dots, dashes and underlines do not matter in a part. kind: 'input' or 'output'; default: index of the system's
+    default, -1 for none. Raises UsageError for an unknown or ambiguous name, DeviceError where there is no device of
+    this kind at all.
     """
-    if isinstance(wanted, Device):
-        return wanted
     usable = [device for device in devices if device.channels(kind)]
     if not usable:
         raise DeviceError(
@@ -49,15 +51,16 @@ def match(devices: Sequence[Device], wanted: str | int | Device | None, kind: st
             " devices')"
         )
     text = "default" if wanted is None else str(wanted).strip()
+    own = [device for device in usable if not device.pulse_name]
     if text.isdigit():
-        found = [device for device in usable if device.index == int(text)]
+        found = [device for device in own if device.index == int(text)]
     else:
-        found = [device for device in usable if device.name.lower() == text.lower()]
-        if not found and text.lower() in _DEFAULT_WORDS:
-            found = [device for device in usable if device.index == default] or (usable if len(usable) == 1 else [])
+        ranks = {device: rank for device in usable if (rank := _rank(device, text)) is not None}
+        found = [device for device, rank in ranks.items() if rank == min(ranks.values())]
+        if text.lower() in _DEFAULT_WORDS and min(ranks.values(), default=2) > 1:
+            found = [device for device in own if device.index == default] or (own if len(own) == 1 else [])
             if not found:
                 raise UsageError(f"there is no default {kind} device; name one of {_names(usable)}")
-        found = found or [device for device in usable if text.lower() in device.name.lower()]
     if not found:
         raise UsageError(f"{kind} device '{text}' is unknown; expected one of {_names(usable)}")
     if len(found) > 1:
@@ -67,18 +70,30 @@ def match(devices: Sequence[Device], wanted: str | int | Device | None, kind: st
     return found[0]
 
 
+def _rank(device: Device, text: str) -> int | None:
+    """How well a device is named by text, 0 best: by its name, by a part of it; PortAudio's devices or the server's first."""
+    of_server = bool(device.pulse_name)
+    if device.name.lower() == text.lower():
+        return int(of_server)
+    plain, part = _plain(device.name), _plain(text)
+    if part not in plain:
+        return None
+    return 4 if "monitor" in plain.replace(part, "") else 3 - of_server
+
+
 def monitor(devices: Sequence[Device], output: Device) -> Device:
-    """The input that hears what output plays, by the names that PulseAudio, PipeWire and Windows give it.
+    """The input that gets what output plays, by the names that PulseAudio, PipeWire and Windows give it.
 
     Understood are 'Monitor of NAME', NAME followed by 'monitor' ('.', '_', '-' or a space between) and 'NAME
-    [Loopback]'. For an output that only stands for another ('default', 'pulse', 'pipewire'), the single monitor there
-    is. Raises UsageError, one line, where there is none or more than one.
+    [Loopback]'. For an output that only leads to the sound server, the single monitor there is. Raises UsageError, one
+    line, where there is none or more than one.
     """
     plain = _plain(output.name)
     names = {f"monitor of {plain}", f"{plain} monitor", f"{plain} loopback"}
     inputs = [device for device in devices if device.inputs]
     found = [device for device in inputs if _plain(device.name) in names]
-    if not found and plain in ("default", "pulse", "pipewire", "sysdefault"):
+    found = [device for device in found if bool(device.pulse_name) == bool(output.pulse_name)] or found
+    if not found and output.name in STAND_INS:
         found = [device for device in inputs if re.search(r"\b(monitor|loopback)\b", _plain(device.name))]
     if len(found) == 1:
         return found[0]
@@ -87,7 +102,7 @@ def monitor(devices: Sequence[Device], output: Device) -> Device:
             f"output '{output}' has more than one possible monitor, {_names(found)}: choose one with --reference"
         )
     raise UsageError(
-        f"output '{output}' has no monitor input that hears what the robot says: name an input with --reference, or"
+        f"output '{output}' has no monitor input that gets what the robot says: name an input with --reference, or"
         " define one for PulseAudio or PipeWire in ~/.asoundrc: pcm.robot_monitor { type pulse device SINK.monitor }"
     )
 
@@ -98,4 +113,7 @@ def _plain(name: str) -> str:
 
 
 def _names(devices: Sequence[Device]) -> str:
-    return ", ".join(f"{device.index} '{device.name}'" for device in devices)
+    """What can be typed for each: the sound server's names; PortAudio's numbers and names, without its ways to the server."""
+    named = [device for device in devices if device.pulse_name]
+    others = [device for device in devices if not (device.pulse_name or (named and device.name in STAND_INS))]
+    return ", ".join([*(f"'{device}'" for device in named), *(f"{device.index} '{device}'" for device in others)])

@@ -13,9 +13,9 @@ from edgefilter.types import SAMPLE_RATE, Block, Samples
 MAX_WAIT = SAMPLE_RATE // 4
 """Samples for which the microphone waits for a reference that is late, before silence stands in for it."""
 TOLERANCE = SAMPLE_RATE // 50
-"""Samples by which the two counters may differ for good; callbacks of 20 ms come in any phase."""
+"""Samples by which the two counters may differ for good: one callback of 20 ms, which come in any phase."""
 WINDOW = 2 * SAMPLE_RATE
-"""A difference counts as lasting when it was never smaller in this many samples."""
+"""Samples: a difference counts as lasting when it was never smaller for 2 s; a busy machine catches up sooner."""
 
 
 class Inlet:
@@ -90,8 +90,7 @@ class Pairing:
     def push(self, mic: Samples, ref: Samples, silence: int = 0) -> Block | None:
         """Take what arrived, (n,) and (m,), and return the block that is complete, if any.
 
-        silence: so many of ref, the first ones, stand in for a device that is away and are counted by whoever put them
-        there.
+        silence: so many of ref, the first ones, stand in for a device that is away; the caller counts them.
         """
         late = min(self._debt, ref.size)
         self._debt -= late

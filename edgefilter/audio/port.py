@@ -5,11 +5,13 @@ Callbacks only copy between PortAudio's buffer and a ring and count; everything 
 
 from __future__ import annotations
 
+import ctypes
 import os
 import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -22,20 +24,42 @@ from edgefilter.errors import DeviceError
 from edgefilter.types import SAMPLE_RATE, Samples
 
 POLL_S = 0.004
-VANISHED_S = 2.0
+"""Between two looks at a device: a quarter of a hop."""
+BUFFER_S = 2.0
+"""How much sound a ring holds while the filter is busy; beyond it samples are lost, and counted. A device that delivers
+nothing for as long has stopped."""
 START_S = 6.0
 """How long a device may take to its first samples: a virtual one can hold back its first 2 s."""
-BUFFER_S = 2.0
-"""How much sound a ring holds while the filter is busy; beyond it samples are lost, and counted."""
 STREAM_LATENCY_S = 0.05
+"""Buffer asked of the sound system for live use, three hops: it is part of the latency."""
+
+
+def clock() -> float:
+    """Seconds that also pass while the machine sleeps, where the system has such a clock."""
+    return time.clock_gettime(time.CLOCK_BOOTTIME) if hasattr(time, "CLOCK_BOOTTIME") else time.monotonic()
+
+
+def pause() -> None:
+    """Wait until it is worth looking at the devices again."""
+    time.sleep(POLL_S)
+
+
+@cache
+def silence_alsa() -> None:
+    """Keep ALSA from printing a line for each underrun, hundreds of them; the streams count and tell them.
+
+    Its error handler (snd_lib_error_set_handler) may be any function of C that takes no notice of its arguments.
+    """
+    try:
+        alsa = ctypes.CDLL("libasound.so.2")
+    except OSError:  # another audio system
+        return
+    alsa.snd_lib_error_set_handler(ctypes.CDLL(None).getpid)
 
 
 @contextmanager
-def _quiet() -> Iterator[None]:
-    """Keep what the C libraries print about every attempt out of the terminal.
-
-    Their refusal comes back as an error code.
-    """
+def quiet() -> Iterator[None]:
+    """Keep off the terminal what the C libraries print while a stream is opened or closed; errors come back as codes."""
     with OPENING:
         sys.stderr.flush()
         kept = os.dup(2)
@@ -50,12 +74,16 @@ def _quiet() -> Iterator[None]:
 
 
 class Port:
-    """One PortAudio stream and how its rate and channels are brought to 16 kHz mono."""
+    """One PortAudio stream and how its rate and channels are brought to 16 kHz mono.
 
-    def __init__(self, sounddevice: Any, device: Device, kind: str) -> None:
+    latency_s: the buffer asked of the sound system, seconds.
+    """
+
+    def __init__(self, sounddevice: Any, device: Device, kind: str, latency_s: float = STREAM_LATENCY_S) -> None:
         self._sd = sounddevice
         self.kind = kind
         self.device = device
+        self.latency_s = latency_s
         self.rate, self.channels = self._settings()
         self.notes: list[str] = []
         if self.rate != SAMPLE_RATE:
@@ -67,8 +95,8 @@ class Port:
             how = "averaged" if kind == "input" else "get the same"
             self.notes.append(f"{kind} device '{self.device}' has no mono: {self.channels} channels {how}")
         self._stream: Any = None
-        self._heard = 0
-        self._silent_s, self._asked = 0.0, time.monotonic()
+        self._progress = 0
+        self._still_s, self._asked = 0.0, clock()
 
     def _settings(self) -> tuple[int, int]:
         check = self._sd.check_input_settings if self.kind == "input" else self._sd.check_output_settings
@@ -77,7 +105,7 @@ class Port:
         for rate in (SAMPLE_RATE, round(self.device.rate)):
             for channels in sorted({1, 2, most}):
                 try:
-                    with _quiet():
+                    with quiet():
                         check(device=self.device.index, channels=channels, dtype="float32", samplerate=rate)
                     return rate, channels
                 except (self._sd.PortAudioError, ValueError) as error:
@@ -91,21 +119,24 @@ class Port:
         make = self._sd.InputStream if self.kind == "input" else self._sd.OutputStream
         settings = {"device": self.device.index, "channels": self.channels, "samplerate": self.rate}
         try:
-            with _quiet(), leading_to(self.device.pulse_name, self.kind):
-                self._stream = make(**settings, dtype="float32", latency=STREAM_LATENCY_S, callback=callback)
+            with quiet(), leading_to(self.device.pulse_name, self.kind):
+                self._stream = make(**settings, dtype="float32", latency=self.latency_s, callback=callback)
                 self._stream.start()
         except self._sd.PortAudioError as error:
             raise DeviceError(
                 f"{self.kind} device '{self.device}' cannot be started: {_words(error)}; is another program using it?"
             ) from None
 
-    def check_alive(self, progress: int, patience_s: float = VANISHED_S) -> None:
-        """Raise DeviceError once progress, samples or callbacks so far, has stood still for patience_s of the time that we were awake."""
-        now = time.monotonic()
+    def check_alive(self, progress: int, patience_s: float = BUFFER_S) -> None:
+        """Raise DeviceError once progress, samples or callbacks so far, has stood still for patience_s.
+
+        Only the time counts in which this program was awake: at most a tenth of a second from one call to the next.
+        """
+        now = clock()
         awake, self._asked = min(now - self._asked, 0.1), now
-        self._silent_s = 0.0 if progress != self._heard else self._silent_s + awake
-        self._heard = progress
-        if self._silent_s > patience_s:
+        self._still_s = 0.0 if progress != self._progress else self._still_s + awake
+        self._progress = progress
+        if self._still_s > patience_s:
             raise DeviceError(
                 f"{self.kind} device '{self.device}' stopped (no sound for {patience_s:.0f} s: unplugged, or the sound"
                 " server ended); what came until then is kept: reconnect it and start again"
@@ -118,7 +149,7 @@ class Port:
         try:
             if drain:  # sound servers drop what is in their buffers when a stream ends
                 time.sleep(self._stream.latency + 0.1)
-            with _quiet():
+            with quiet():
                 self._stream.abort()
                 self._stream.close()
         except self._sd.PortAudioError:  # a device that has vanished cannot be stopped; its loss was reported already
@@ -130,15 +161,18 @@ def _words(error: Exception) -> str:
     return str(error.args[0] if error.args else error).splitlines()[0]
 
 
+def resampler(given: int, wanted: int) -> soxr.ResampleStream | None:
+    """From one rate to another, None where they are the same."""
+    return None if given == wanted else soxr.ResampleStream(given, wanted, 1, dtype="float32")
+
+
 class InputPort(Port):
     """An input whose callback fills an Inlet, read as 16 kHz mono."""
 
-    def __init__(self, sounddevice: Any, device: Device) -> None:
-        super().__init__(sounddevice, device, "input")
+    def __init__(self, sounddevice: Any, device: Device, latency_s: float = STREAM_LATENCY_S) -> None:
+        super().__init__(sounddevice, device, "input", latency_s)
         self.inlet = Inlet(round(BUFFER_S * self.rate))
-        self._resampler = (
-            None if self.rate == SAMPLE_RATE else soxr.ResampleStream(self.rate, SAMPLE_RATE, 1, dtype="float32")
-        )
+        self._resampler = resampler(self.rate, SAMPLE_RATE)
 
     def open(self) -> None:
         inlet = self.inlet
@@ -156,14 +190,14 @@ class InputPort(Port):
 class OutputPort(Port):
     """An output whose callback empties an Outlet, fed with 16 kHz mono."""
 
-    def __init__(self, sounddevice: Any, device: Device, queued: int, margin_s: float = 0.0) -> None:
-        super().__init__(sounddevice, device, "output")
+    def __init__(
+        self, sounddevice: Any, device: Device, queued: int, margin_s: float = 0.0, latency_s: float = STREAM_LATENCY_S
+    ) -> None:
+        super().__init__(sounddevice, device, "output", latency_s)
         self.flags = 0
         self.margin = round(margin_s * self.rate)
         self.outlet = Outlet(round((BUFFER_S + queued / SAMPLE_RATE) * self.rate) + self.margin, self.margin)
-        self._resampler = (
-            None if self.rate == SAMPLE_RATE else soxr.ResampleStream(SAMPLE_RATE, self.rate, 1, dtype="float32")
-        )
+        self._resampler = resampler(SAMPLE_RATE, self.rate)
 
     def convert(self, samples: Samples, last: bool = False) -> Samples:
         """Samples (n,) at 16 kHz as samples at the device's rate."""
@@ -185,4 +219,4 @@ class OutputPort(Port):
         """Return when at most queued samples wait in the ring; raises DeviceError when the device stops."""
         while len(self.outlet.ring) > queued:
             self.check_alive(self.outlet.calls)
-            time.sleep(POLL_S)
+            pause()

@@ -8,21 +8,21 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-STAND_INS = ("pulse", "default", "pipewire")
-"""PortAudio devices that lead to the sound server, the most direct first."""
+from edgefilter.errors import DeviceError
+
 OPENING = threading.RLock()
 """Held while a stream is opened: what that changes is the whole process's, and two at once would undo each other's."""
 
 
 def names(kind: str) -> list[str]:
     """Names of all inputs (kind 'input', monitors included) or outputs of the running server; empty where there is none."""
-    lines = _pactl("list", "short", "sources" if kind == "input" else "sinks").splitlines()
-    return [line.split("\t")[1] for line in lines if line.count("\t") >= 1]
+    lines = _asked("list", "short", "sources" if kind == "input" else "sinks").splitlines()
+    return [line.split("\t")[1] for line in lines if "\t" in line]
 
 
 def default_name(kind: str) -> str:
     """The server's default input or output; '' where there is no server."""
-    return _pactl("get-default-source" if kind == "input" else "get-default-sink").strip()
+    return _asked("get-default-source" if kind == "input" else "get-default-sink").strip()
 
 
 def default_monitor() -> str | None:
@@ -55,8 +55,22 @@ def leading_to(name: str, kind: str) -> Iterator[None]:
                 os.environ[variable] = before
 
 
-def _pactl(*words: str) -> str:
+def pactl(*words: str) -> str:
+    """What pactl answers; raises DeviceError where it is missing, or the server is or refuses."""
     try:
-        return subprocess.run(["pactl", *words], capture_output=True, text=True, timeout=5).stdout
-    except (OSError, subprocess.TimeoutExpired):
+        done = subprocess.run(["pactl", *words], capture_output=True, text=True, timeout=10)
+    except FileNotFoundError:
+        raise DeviceError("pactl was not found: apt install pulseaudio-utils") from None
+    except (OSError, subprocess.TimeoutExpired) as error:
+        raise DeviceError(f"pactl cannot be run: {' '.join(str(error).split())}") from None
+    if done.returncode:
+        said = " ".join(done.stderr.split()) or f"exit code {done.returncode}"
+        raise DeviceError(f"the sound server did not take 'pactl {' '.join(words)}': {said}; is it running?")
+    return done.stdout
+
+
+def _asked(*words: str) -> str:
+    try:
+        return pactl(*words)
+    except DeviceError:
         return ""

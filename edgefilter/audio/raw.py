@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import io
 import os
 import select
 import sys
@@ -12,12 +13,14 @@ from typing import BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
+from edgefilter.audio.protocols import Sink, Source
 from edgefilter.errors import AudioFileError, UsageError
 from edgefilter.types import SAMPLE_RATE, Block, Samples, as_samples
 
 FULL_SCALE = 32768.0
-_READ_BYTES = 1 << 16
-_PATIENCE_S = 0.1  # how soon stop() is noticed while the pipe is silent
+_PATIENCE_S = 0.1
+"""How soon stop() is noticed while a pipe is silent."""
+_HEADERS = (b"RIFF", b"fLaC", b"OggS")
 
 
 def to_pcm16(samples: Samples) -> tuple[NDArray[np.int16], int]:
@@ -35,42 +38,33 @@ def clip_note(clipped: int, written: int) -> str:
     return f"{clipped} of {written} output samples exceeded full scale and were clipped: lower the level of the input"
 
 
-class PcmSource:
+class PcmSource(Source):
     """Raw s16le stereo at 16 kHz, (microphone, reference), from standard input or any binary stream.
 
-    Blocks are as long as the pipe delivers them, so a live pipe is not held up.
+    Blocks are as long as the pipe delivers them, so a live pipe is not held up. name: of the stream, in messages.
+    Raises AudioFileError for a stream without sound, or with a file's header.
     """
 
-    live = False
-
-    def __init__(self, stream: BinaryIO | None = None) -> None:
+    def __init__(self, stream: BinaryIO | None = None, name: str = "standard input") -> None:
         self._stream = sys.stdin.buffer if stream is None else stream
+        self._name = name
         if self._stream.isatty():
             raise UsageError(
                 "'-' reads raw s16le 16 kHz stereo (microphone, reference) from a pipe, found a terminal: pipe sound"
                 " into it"
             )
-        self.notes: list[str] = []
+        self.notes = []
         self.total: int | None = None
-        self.lost = 0
-        self._stopped = False
-
-    def __enter__(self) -> PcmSource:
-        return self
-
-    def __exit__(self, *exc: object) -> None:
-        pass
-
-    def stop(self) -> None:
-        self._stopped = True
-
-    def stats(self) -> dict[str, int]:
-        return {"lost": 0}
 
     def __iter__(self) -> Iterator[Block]:
         start, rest = 0, b""
         for data in self._pieces():
             data = rest + data
+            if start == 0 and data.startswith(_HEADERS):
+                raise AudioFileError(
+                    f"{self._name} begins with the header of an audio file ({data[:4]!r}), expected raw s16le 16 kHz"
+                    " stereo (microphone, reference): name the file itself, or leave the header out"
+                )
             whole = len(data) // 4 * 4
             rest = data[whole:]
             stereo = np.frombuffer(data[:whole], "<i2").reshape(-1, 2).astype(np.float32) / np.float32(FULL_SCALE)
@@ -79,11 +73,11 @@ class PcmSource:
                 start += len(stereo)
         if rest:
             cut = f"its last {len(rest)} bytes were ignored (is it s16le stereo?)"
-            self.notes.append(f"standard input ended in the middle of a sample: {cut}")
+            self.notes.append(f"{self._name} ended in the middle of a sample: {cut}")
         if start == 0 and not self._stopped:
             raise AudioFileError(
-                "standard input held no sound, expected raw s16le 16 kHz stereo (microphone, reference): check the"
-                " program before the pipe"
+                f"{self._name} held no sound, expected raw s16le 16 kHz stereo (microphone, reference): check the program"
+                " before the pipe"
             )
         self.total = start
 
@@ -97,36 +91,29 @@ class PcmSource:
         while not self._stopped:
             if handle is not None and wait and not select.select([handle], [], [], _PATIENCE_S)[0]:
                 continue
-            data = self._stream.read(_READ_BYTES) if handle is None else os.read(handle, _READ_BYTES)
+            count = io.DEFAULT_BUFFER_SIZE
+            data = self._stream.read(count) if handle is None else os.read(handle, count)
             if not data:
                 return
             yield data
 
 
-class PcmSink:
+class PcmSink(Sink):
     """Raw s16le mono at 16 kHz to standard output or any binary stream; a reader that goes away ends it quietly."""
 
-    def __init__(self, stream: BinaryIO | None = None) -> None:
+    def __init__(self, stream: BinaryIO | None = None, name: str = "standard output") -> None:
         self._stream = sys.stdout.buffer if stream is None else stream
+        self._name = name
         if self._stream.isatty():
             raise UsageError(
                 "'-' writes raw s16le 16 kHz mono, found a terminal: pipe it into a program or name a .wav or .flac"
                 " file"
             )
-        self.notes: list[str] = []
-        self.finished = False
-        self.written = 0
-        self.clipped = 0
-
-    def __enter__(self) -> PcmSink:
-        return self
+        self.notes = []
 
     def __exit__(self, *exc: object) -> None:
         if self.clipped:
             self.notes.append(clip_note(self.clipped, self.written))
-
-    def stats(self) -> dict[str, int]:
-        return {"written": self.written, "clipped": self.clipped}
 
     def write(self, samples: Samples) -> None:
         if self.finished:
@@ -136,7 +123,7 @@ class PcmSink:
             self._write_all(pcm.astype("<i2").tobytes())
         except OSError as error:
             if error.errno not in (errno.EPIPE, errno.ECONNRESET):
-                raise AudioFileError(f"standard output cannot be written: {error.strerror}") from None
+                raise AudioFileError(f"{self._name} cannot be written: {error.strerror}") from None
             self.finished = True
             self.notes.append(f"the program behind the pipe stopped reading after {self.written / SAMPLE_RATE:.2f} s")
             return

@@ -15,9 +15,10 @@ import soxr
 from edgefilter.errors import AudioFileError
 from edgefilter.types import LOUDEST, SAMPLE_RATE, Array, Samples
 
-_RATES = range(1000, 768001)
-_ENDLESS = 0x7FFFF000  # writers to a pipe put sizes from here up into the header because they cannot know better
-_VALUES = 1 << 16  # samples times channels that are in memory at a time
+RATES = range(1000, 768001)
+"""Hz that converters have; a header that says another is damaged."""
+_ENDLESS = 0x7FFFF000
+"""Writers to a pipe put sizes from here up into a WAV's header because they cannot know better."""
 
 
 class Reader:
@@ -65,6 +66,8 @@ class Reader:
     def _check_is_file(self) -> None:
         if self.path.is_dir():
             raise self._error("is a directory, expected an audio file: name a file in it")
+        if self.path.is_fifo():
+            raise self._error("is a pipe, expected a file, which is read twice: write it to a file first")
         try:
             with open(self.path, "rb") as file:
                 start = file.read(16)
@@ -92,9 +95,9 @@ class Reader:
             ) from None
 
     def _check_header(self, file: soundfile.SoundFile) -> None:
-        if self.rate not in _RATES:
+        if self.rate not in RATES:
             raise self._error(
-                f"says its rate is {self.rate} Hz, expected {_RATES.start} to {_RATES.stop - 1} Hz: its header is"
+                f"says its rate is {self.rate} Hz, expected {RATES.start} to {RATES.stop - 1} Hz: its header is"
                 " damaged"
             )
         promised = re.search(r"^data\s*: (\d+) \(should be (\d+)\)", file.extra_info, re.MULTILINE)
@@ -113,8 +116,8 @@ class Reader:
             )
 
     def _blocks(self, file: soundfile.SoundFile) -> Iterator[Array]:
-        """Yield (n, channels) float32 until the end; a decoder that gives up is an error with its place."""
-        size = max(1, _VALUES // self.channels)
+        """Yield (n, channels) float32, SAMPLE_RATE values at a time; a decoder that gives up is an error with its place."""
+        size = max(1, SAMPLE_RATE // self.channels)
         done = 0
         while True:
             try:

@@ -1,4 +1,4 @@
-"""The robot's speech, played here: the samples that the loudspeaker gets are the reference."""
+"""Speech that this program plays itself: the samples that the loudspeaker gets are the reference."""
 
 from __future__ import annotations
 
@@ -6,23 +6,19 @@ from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
-import soxr
 
 from edgefilter.audio.lookup import Device
 from edgefilter.audio.pairing import Inlet
-from edgefilter.audio.port import BUFFER_S, Port
+from edgefilter.audio.port import BUFFER_S, Port, resampler
 from edgefilter.dsp.ring import Ring
 from edgefilter.types import SAMPLE_RATE, Samples
 
-AHEAD_S = 1.0
-"""Speech that waits for the device, against a reader that is late."""
-PIECE = SAMPLE_RATE // 10
 FADE_S = 0.02
 """How long a change of the gain by one takes: short for an ear, too long for a click."""
 
 
 class SpokenReference(Port):
-    """Plays speech, and is read like an input that hears exactly what is played, gain changes included.
+    """Plays speech, and is read like an input that delivers exactly what is played, gain changes included.
 
     speech: arrays (n,) at 16 kHz, played from the first `take` on; before it, and after it has ended, there is silence.
     The sound leaves the loudspeaker later than it is read here, by the device's latency.
@@ -31,10 +27,9 @@ class SpokenReference(Port):
     def __init__(self, sounddevice: Any, device: Device, speech: Iterator[Samples]) -> None:
         super().__init__(sounddevice, device, "output")
         self.inlet = Inlet(round(BUFFER_S * self.rate))
-        self._ahead = round(AHEAD_S * self.rate)
-        self._ring = Ring(2 * self._ahead)
+        self._ring = Ring(round(BUFFER_S * self.rate))
         self._pieces = self._converted(speech)
-        self._back = self._resampler(self.rate, SAMPLE_RATE)
+        self._back = resampler(self.rate, SAMPLE_RATE)
         self._gain = self._wanted = 1.0
         self._step = 1.0 / (FADE_S * self.rate)
 
@@ -54,7 +49,7 @@ class SpokenReference(Port):
 
     def take(self) -> Samples:
         """What was played since the last call, (n,) at 16 kHz; sees to it that there is more to play."""
-        while len(self._ring) < self._ahead and (piece := next(self._pieces, None)) is not None:
+        while len(self._ring) < self._ring.capacity // 2 and (piece := next(self._pieces, None)) is not None:
             self._ring.write(piece)
         played = self.inlet.take()
         return played if self._back is None else self._back.resample_chunk(played)
@@ -72,15 +67,11 @@ class SpokenReference(Port):
         return played
 
     def _converted(self, speech: Iterator[Samples]) -> Iterator[Samples]:
-        """The speech in pieces at the device's rate."""
-        resampler = self._resampler(SAMPLE_RATE, self.rate)
+        """The speech at the device's rate, in pieces of a quarter of the ring, which is half full when one is added."""
+        there, size = resampler(SAMPLE_RATE, self.rate), round(BUFFER_S * SAMPLE_RATE) // 4
         for chunk in speech:
-            for at in range(0, chunk.size, PIECE):
-                piece = chunk[at : at + PIECE]
-                yield piece if resampler is None else resampler.resample_chunk(piece)
-        if resampler is not None:
-            yield resampler.resample_chunk(np.zeros(0, np.float32), last=True)
-
-    @staticmethod
-    def _resampler(given: int, wanted: int) -> soxr.ResampleStream | None:
-        return None if given == wanted else soxr.ResampleStream(given, wanted, 1, dtype="float32")
+            for at in range(0, chunk.size, size):
+                piece = chunk[at : at + size]
+                yield piece if there is None else there.resample_chunk(piece)
+        if there is not None:
+            yield there.resample_chunk(np.zeros(0, np.float32), last=True)

@@ -1,36 +1,29 @@
-"""An input that goes on: silence while its device is away, the device again when it is back, and a count of all that is missing."""
+"""An input and an output that go on without their devices, use them again when they are back, and count what is missing."""
 
 from __future__ import annotations
 
-import time
+from collections import Counter
 from collections.abc import Callable
 
 import numpy as np
 
-from edgefilter.audio.port import START_S, VANISHED_S, InputPort
+from edgefilter.audio.pairing import TOLERANCE, WINDOW
+from edgefilter.audio.port import BUFFER_S, START_S, InputPort, clock
+from edgefilter.audio.protocols import Sink
 from edgefilter.audio.speech import SpokenReference
 from edgefilter.errors import DeviceError
 from edgefilter.types import SAMPLE_RATE, Samples
 
 RETRY_S = 1.0
 """Between two attempts to open a device that is away."""
-WATCH_S = 4.0
-"""How long a device must have been behind the clock throughout, before sound counts as lost rather than late."""
-LEAST_S = 0.02
-"""So much must be missing then; clocks that differ by 300 ppm drift apart by a twentieth of it."""
-
-
-def clock() -> float:
-    """Seconds that also pass while the machine sleeps, where the system has such a clock."""
-    return time.clock_gettime(time.CLOCK_BOOTTIME) if hasattr(time, "CLOCK_BOOTTIME") else time.monotonic()
 
 
 class SampleClock:
-    """What a device should have delivered by the clock and did not: sound that a driver, or a sleeping machine, lost without a word.
+    """Sound that a device should have delivered by the clock and did not, because a driver or a sleeping machine lost it.
 
-    missed: seconds so far. Compares, from one stretch of WATCH_S to the next, by how much the device was behind the
-    clock at least: late sound catches up within a stretch, lost sound does not, and drifting clocks change it slowly.
-    What comes after all, from a machine that was too busy for longer, is taken off again.
+    missed: seconds so far. Compares, from one WINDOW to the next, by how much the device was behind the clock at least:
+    late sound catches up within a window, lost sound does not, and clocks that differ by 300 ppm change it by far less
+    than the TOLERANCE. What comes after all, from a machine that was too busy for longer, is taken off again.
     """
 
     def __init__(self) -> None:
@@ -42,24 +35,25 @@ class SampleClock:
     def note(self, delivered_s: float, now: float) -> None:
         """Take note of the seconds of sound that came so far."""
         if self._until is None:
-            self._until = now + WATCH_S
+            self._until = now + WINDOW / SAMPLE_RATE
         if now >= self._until:
-            self._judge()
-            self._least, self._until = np.inf, now + WATCH_S
+            self._compare()
+            self._least, self._until = np.inf, now + WINDOW / SAMPLE_RATE
         self._least = min(self._least, now - delivered_s)
 
-    def _judge(self) -> None:
+    def _compare(self) -> None:
         before, self._base = self._base, self._least
-        if before is not None and abs(self._least - before) > LEAST_S:
+        if before is not None and abs(self._least - before) > TOLERANCE / SAMPLE_RATE:
             self.missed = max(0.0, self.missed + self._least - before)
 
 
 class SteadyInput:
-    """An input port that outlives its device.
+    """An input port that goes on without its device.
 
-    make: makes the port, of a device that may be away (DeviceError). patience_s: how long it may be; with 0 its loss is
-    an error at once. While it is away, `take` gives silence by the clock. filled: samples of that so far. lost: samples
-    that came too late to be kept, or never. overruns: callbacks that the driver marked. gone, back: how often.
+    make: makes the port; DeviceError where the device is away. patience_s: how long it may be away; with 0 its loss is
+    an error at once. While it is away, `take` gives silence by the clock. filled: samples of this silence so far. lost:
+    samples that did not fit into the ring or never came. overruns: callbacks that the driver marked. gone, back: how
+    often the device was lost and found again.
     """
 
     def __init__(self, make: Callable[[], InputPort | SpokenReference], patience_s: float = 0.0) -> None:
@@ -69,12 +63,12 @@ class SteadyInput:
         self._earlier_lost = self._earlier_overruns = 0
         self._open, self._clock = False, SampleClock()
         self._failure: DeviceError | None = None
-        self._heard_at = self._gone_at = self._tried_at = 0.0
+        self._received_at = self._gone_at = self._tried_at = 0.0
 
     def open(self) -> None:
         """Open the device; raises DeviceError."""
         self.port.open()
-        self._open, self._heard_at = True, clock()
+        self._open, self._received_at = True, clock()
 
     def close(self) -> None:
         """End the stream."""
@@ -106,29 +100,29 @@ class SteadyInput:
         now = clock()
         samples = self.port.take() if self._open else np.zeros(0, np.float32)
         if self._failure is None:
-            self._heard_at = now if samples.size else self._heard_at
+            self._received_at = now if samples.size else self._received_at
             self._clock.note(self.settled, now)
             return samples
-        silence = np.zeros(max(round((now - self._heard_at) * SAMPLE_RATE) - samples.size, 0), np.float32)
+        silence = np.zeros(max(round((now - self._received_at) * SAMPLE_RATE) - samples.size, 0), np.float32)
         self.filled += silence.size
         if not samples.size:
-            self._heard_at += silence.size / SAMPLE_RATE
+            self._received_at += silence.size / SAMPLE_RATE
             return silence
         self.back += 1
-        self._failure, self._heard_at = None, now
+        self._failure, self._received_at = None, now
         return np.concatenate((silence, samples))
 
     def check(self) -> None:
         """See whether the device is there, and try to get it back where it is not; raises DeviceError when patience is over."""
         try:
             if self._open:
-                self.port.check_alive(self.port.inlet.received, START_S if self._failure else VANISHED_S)
+                self.port.check_alive(self.port.inlet.received, START_S if self._failure else BUFFER_S)
         except DeviceError as error:
             if self._patience_s <= 0.0:
                 raise
             self.close()
             if self._failure is None:
-                self._failure, self._gone_at = error, self._heard_at
+                self._failure, self._gone_at = error, self._received_at
                 self.gone += 1
         now = clock()
         if self._failure and not self._open and now - self._tried_at >= RETRY_S:
@@ -149,3 +143,76 @@ class SteadyInput:
         if port is not self.port:
             self._earlier_lost, self._earlier_overruns = self.lost, self.overruns
         self.port, self._clock, self._open = port, SampleClock(), True
+
+
+class SteadySink(Sink):
+    """An output that goes on without its device.
+
+    make: makes the device's sink, again for each return; DeviceError where the device is away. What is written while it
+    is away is dropped and counted (output_away, samples at 16 kHz). A device that never worked is an error.
+    """
+
+    def __init__(self, make: Callable[[], Sink]) -> None:
+        self._make = make
+        self._sink: Sink | None = make()
+        self.notes = self._sink.notes
+        self._worked = self._is_away = False
+        self._tried_at = 0.0
+        self._earlier: Counter[str] = Counter()
+        self._own = {"output_away": 0, "output_gone": 0, "output_back": 0}
+
+    def __enter__(self) -> SteadySink:
+        if self._sink:
+            self._sink.__enter__()
+        return self
+
+    def write(self, samples: Samples) -> None:
+        """Play samples (n,), or drop them while there is no device."""
+        if self._sink is None and clock() - self._tried_at >= RETRY_S:
+            self._sink = self._again()
+        if self._sink is None:
+            self._own["output_away"] += samples.size
+            return
+        try:
+            self._sink.write(samples)
+        except DeviceError as error:
+            if not self._worked:
+                raise
+            self._own["output_away"] += samples.size
+            self._own["output_gone"] += not self._is_away
+            self._is_away = True
+            self._retire(error)
+            return
+        self._own["output_back"] += self._is_away
+        self._worked, self._is_away = True, False
+
+    def _again(self) -> Sink | None:
+        self._tried_at = clock()
+        try:
+            sink = self._make()
+        except DeviceError:
+            return None
+        sink.__enter__()
+        return sink
+
+    def _retire(self, error: DeviceError) -> None:
+        """Let go of a sink whose device stopped; what it counted stays."""
+        if self._sink:
+            self._earlier.update(self._sink.stats())
+            self._sink.__exit__(type(error), error, None)
+        self._sink, self._tried_at = None, clock()
+
+    def stats(self) -> dict[str, int]:
+        """The sums over all its sinks so far; samples that found no device; how often the device was lost and found again."""
+        now = self._sink.stats() if self._sink else {}
+        return {name: self._earlier[name] + now.get(name, 0) for name in {**self._earlier, **now}} | self._own
+
+    def __exit__(self, *exc: object) -> None:
+        if self._sink:
+            self._sink.__exit__(*exc)
+            self.notes = self._sink.notes
+        if self._own["output_gone"]:
+            self.notes = [
+                *self.notes,
+                f"the output device was away for {self._own['output_away'] / SAMPLE_RATE:.1f} s of sound",
+            ]

@@ -1,4 +1,4 @@
-"""What source and sink have lost, as events: counters that have risen since they were last looked at."""
+"""Events for what source and sink have lost: each counter that has risen since the last look."""
 
 from __future__ import annotations
 
@@ -18,18 +18,18 @@ PERIOD = SAMPLE_RATE
 
 
 class Troubles:
-    """Looks at the counters of both ends; call it with the number of samples so far.
+    """Looks at the counters of source and sink; call it with the number of samples so far.
 
-    >>> class Ends:
+    >>> class Lossy:
     ...     def stats(self):
     ...         return {"microphone_lost": 160, "underruns": 0}
-    >>> troubles = Troubles(Ends(), Ends())
+    >>> troubles = Troubles(Lossy(), Lossy())
     >>> [event.detail for event in troubles(16000, False)], troubles(16001, True)
     (['160 microphone lost, 160 microphone lost'], [])
     """
 
     def __init__(self, source: Source, sink: Sink) -> None:
-        self._ends: tuple[Source | Sink, ...] = (source, sink)
+        self._counted: tuple[Source | Sink, ...] = (source, sink)
         self._before: list[dict[str, int]] = [{}, {}]
         self._next = 0
 
@@ -39,8 +39,8 @@ class Troubles:
             return []
         self._next = sample + PERIOD
         risen = []
-        for number, end in enumerate(self._ends):
-            now, before = dict(end.stats()), self._before[number]
+        for number, each in enumerate(self._counted):
+            now, before = dict(each.stats()), self._before[number]
             risen += [(name, count - before.get(name, 0)) for name, count in now.items()]
             self._before[number] = now
         happened = []

@@ -1,14 +1,13 @@
 """A speaker for the robot and a microphone for everybody else, on PulseAudio or PipeWire's stand-in for it.
 
-As module-echo-cancel has them: what is played into the speaker is heard on the default output and is the reference,
+As module-echo-cancel has them: what is played into the speaker goes to the default output and is the reference,
 what `edgefilter run` writes can be listened to as a microphone.
 """
 
 from __future__ import annotations
 
-import subprocess
-
 from edgefilter.audio import pulse
+from edgefilter.audio.lookup import STAND_INS
 from edgefilter.errors import DeviceError, UsageError
 
 SPEAKER, HUMAN, MICROPHONE = "edgefilter_speaker", "edgefilter_human", "edgefilter_mic"
@@ -46,59 +45,42 @@ def load() -> list[str]:
 
     Raises DeviceError where there is no server or it refuses one; none is left behind then.
     """
-    there = {*_names("sinks"), *_names("sources")}
+    there = {*pulse.names("output"), *pulse.names("input")}
     made: list[tuple[str, str]] = []
     for name, module in MODULES.items():
         if name not in there:
             try:
-                made.append((name, _pactl("load-module", *module.split()).strip()))
+                made.append((name, pulse.pactl("load-module", *module.split()).strip()))
             except DeviceError:
                 for _, number in reversed(made):
-                    _pactl("unload-module", number)
+                    pulse.pactl("unload-module", number)
                 raise
     return [name for name, _ in made]
 
 
 def unload() -> list[str]:
     """Remove the devices, however they were made, and return the names of those that were there; raises DeviceError."""
-    loaded = [line.split("\t") for line in _pactl("list", "short", "modules").splitlines()]
+    loaded = [line.split("\t") for line in pulse.pactl("list", "short", "modules").splitlines()]
     removed = []
     for name in reversed(MODULES):
         for number, _, arguments, *_ in (fields for fields in loaded if len(fields) > 2):
             if {f"sink_name={name}", f"source_name={name}"} & {*arguments.split()}:
-                _pactl("unload-module", number)
+                pulse.pactl("unload-module", number)
                 removed.append(name)
     return removed
 
 
 def speaker_monitor() -> str | None:
-    """What hears the virtual speaker alone, None where there is none."""
+    """The monitor of the virtual speaker, None where there is none."""
     name = f"{SPEAKER}.monitor"
     return name if name in pulse.names("input") else None
 
 
 def refuse_own(microphone: str) -> None:
     """Raise UsageError where the microphone is the filter's own output: it would hear itself, or nothing."""
-    meant = pulse.default_name("input") if microphone in ("mic", "default", *pulse.STAND_INS) else microphone
+    meant = pulse.default_name("input") if microphone in ("mic", "default", *STAND_INS) else microphone
     if meant in (MICROPHONE, f"{HUMAN}.monitor"):
         raise UsageError(
             f"microphone '{meant}' is edgefilter's own output: name the real one with --input ('edgefilter devices'), or"
             " make that the default again ('pactl set-default-source NAME')"
         )
-
-
-def _names(what: str) -> list[str]:
-    return [line.split("\t")[1] for line in _pactl("list", "short", what).splitlines() if "\t" in line]
-
-
-def _pactl(*words: str) -> str:
-    try:
-        done = subprocess.run(["pactl", *words], capture_output=True, text=True, timeout=10)
-    except FileNotFoundError:
-        raise DeviceError("pactl was not found: apt install pulseaudio-utils") from None
-    except (OSError, subprocess.TimeoutExpired) as error:
-        raise DeviceError(f"pactl cannot be run: {' '.join(str(error).split())}") from None
-    if done.returncode:
-        said = " ".join(done.stderr.split()) or f"exit code {done.returncode}"
-        raise DeviceError(f"the sound server did not take 'pactl {' '.join(words)}': {said}; is it running?")
-    return done.stdout

@@ -15,7 +15,7 @@ from edgefilter.errors import CalibrationError, SignalError
 from edgefilter.profile.data import DISTORTION_ORDERS, GRID_FFT, GRID_HZ, Profile
 from edgefilter.types import PRE_ROLL, SAMPLE_RATE, Array, Samples, as_samples
 
-MIN_TAPS, MAX_TAPS = 6400, 16000
+MIN_TAPS, MAX_TAPS = 6400, SAMPLE_RATE
 """400 ms and 1 s: what is kept of the impulse response at least and at most."""
 
 
@@ -70,12 +70,7 @@ def calibrate(
     >>> profile.delay, round(float(profile.response[100]), 2)
     (300.0, 0.5)
     """
-    named = {
-        "the sweep reference": sweep_reference,
-        "the sweep recording": sweep_recording,
-        "the noise recording": noise_recording,
-    }
-    reference, recording, noise = (_samples(x, name) for name, x in named.items())
+    reference, recording, noise = checked(sweep_reference, sweep_recording, noise_recording)
     law = stepped_law(reference) if stepped_sine else sweep_law(reference)
     check_lengths(law, recording, noise)
     noise_psd = fan_psd(noise)
@@ -104,9 +99,14 @@ def calibrate(
     )
 
 
-def _samples(x: object, name: str) -> Samples:
+def checked(reference: object, recording: object, noise: object) -> tuple[Samples, Samples, Samples]:
+    """The three recordings of a calibration as float32; raises CalibrationError for another type, shape or NaN."""
     try:
-        return as_samples(x, name)
+        return (
+            as_samples(reference, "the sweep reference"),
+            as_samples(recording, "the sweep recording"),
+            as_samples(noise, "the noise recording"),
+        )
     except SignalError as error:
         raise CalibrationError(str(error)) from None
 

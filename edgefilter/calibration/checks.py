@@ -1,4 +1,4 @@
-"""What makes a calibration untrustworthy, said in words that name the bands."""
+"""Errors and warnings of a calibration; each warning names the bands that it is about."""
 
 from __future__ import annotations
 
@@ -9,20 +9,21 @@ from scipy import signal
 from edgefilter.calibration.stepped_sine import SteppedLaw
 from edgefilter.calibration.sweep import EARLIEST_DIRECT, LATEST_DIRECT, Deconvolution, SweepLaw, deconvolve
 from edgefilter.dsp.fourier import power
-from edgefilter.dsp.frames import blocks
+from edgefilter.dsp.frames import block_power, blocks
 from edgefilter.dsp.psd import frequencies, hann
 from edgefilter.errors import CalibrationError
 from edgefilter.types import PRE_ROLL, SAMPLE_RATE, Array, Samples
 
 Law = SweepLaw | SteppedLaw
 LOW_SNR_DB = 10.0
+"""Below it a band's path is wrong by more than 3 dB at times."""
 SPEECH_HZ = (110.0, 7200.0)
 """Bands that a warning is about; a small loudspeaker radiates nothing below them, and that is no fault of the
 calibration."""
 
 
 def check_lengths(law: Law, recording: Samples, noise: Samples) -> None:
-    """Raise CalibrationError for recordings with too little in them to start."""
+    """Raise CalibrationError for recordings that are too short or silent."""
     if noise.size < SAMPLE_RATE // 2:
         raise CalibrationError(
             f"the noise recording is {noise.size / SAMPLE_RATE:.2f} s long, expected at least 0.5 s of the fan alone"
@@ -63,7 +64,7 @@ def collect_warnings(
     bands: Array,
     snr: Array,
 ) -> list[str]:
-    """All that is doubtful about a calibration, the gravest first; empty where nothing is."""
+    """All warnings about a calibration, the gravest first."""
     found = [
         clipping(law, recording, direct),
         short_recording(law, recording, direct),
@@ -155,16 +156,12 @@ def disturbed(
     shift = direct - early
     predicted = signal.oaconvolve(reference.astype(np.float64), result.cut(shift, early + 6400))
     first, last = max(shift, 0), min(shift + predicted.size, recording.size)
-    heard = np.zeros(recording.size)
-    heard[first:last] = predicted[first - shift : last - shift]
+    own = np.zeros(recording.size)
+    own[first:last] = predicted[first - shift : last - shift]
     block = SAMPLE_RATE // 4
-    count = recording.size // block
-
-    def power(x: Array) -> Array:
-        return np.mean(x[: count * block].reshape(count, block) ** 2, axis=1)
-
-    rest, own = power(recording - heard), power(heard)
-    limit = np.maximum(own / 6, max(10 * float(np.mean(noise.astype(np.float64) ** 2)), own.max() * 10**-2.5, 1e-9))
+    rest, explained = block_power(recording - own, block), block_power(own, block)
+    least = max(10 * float(np.mean(noise.astype(np.float64) ** 2)), explained.max() * 10**-2.5, 1e-9)
+    limit = np.maximum(explained / 6, least)
     bad = np.flatnonzero(rest > limit)
     if not bad.size:
         return None

@@ -8,46 +8,45 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
-from edgefilter.calibration.calibrate import calibrate, fan_psd
+from edgefilter.calibration.calibrate import calibrate, checked, fan_psd
 from edgefilter.calibration.checks import check_lengths, clipped_samples
 from edgefilter.calibration.multisine import BLOCK, PERIOD, PERIODS, MultisineLaw, multisine_law, realisations
-from edgefilter.calibration.sweep import LATEST_DIRECT, deconvolve, find_direct, sweep_law
+from edgefilter.calibration.sweep import (
+    DRIFT_REACH,
+    LATEST_DIRECT,
+    LOW_HZ,
+    deconvolve,
+    find_direct,
+    smoothed,
+    sweep_law,
+)
 from edgefilter.dsp.fourier import power
 from edgefilter.dsp.fractional_delay import interpolate
 from edgefilter.dsp.frames import decibels
 from edgefilter.dsp.lag import correlation_near, highest, top
-from edgefilter.dsp.psd import total_power
-from edgefilter.errors import CalibrationError, SignalError
+from edgefilter.dsp.psd import ROUNDING_PSD, total_power
+from edgefilter.errors import CalibrationError
 from edgefilter.profile.approximation import LinearApproximation
 from edgefilter.profile.data import GRID_HZ, Profile
-from edgefilter.types import PRE_ROLL, SAMPLE_RATE, Array, Samples, as_samples
+from edgefilter.types import PRE_ROLL, SAMPLE_RATE, Array, Samples
 
 LINE_HZ = SAMPLE_RATE / PERIOD
-SMOOTHING, SMOOTHING_HZ = 2 ** (1 / 12) - 1, 30.0
-"""Half the width over which lines are averaged: a twelfth of an octave, and no less than that many Hz."""
-LOWEST_HZ = 20.0
-"""Below it a converter's offset is no distortion."""
-REACH = 400
-"""Samples by which a multisine may be heard earlier or later than the sweep said: clocks 900 ppm apart."""
-LEAST_PPM, DOUBTFUL_PPM = 0.5, 5.0
-"""Clocks that are less far apart are left alone; a sweep measures the path well where they are less than the latter."""
+SMOOTHING_HZ = 30.0
+"""Half the width over which lines are averaged at least: 30 lines, so that a density is good to 1 dB."""
+DOUBTFUL_PPM = 5.0
+"""Clocks that are further apart smear a sweep's path: by half a sample from its beginning to its end."""
 CERTAIN = 3.0
 """Standard deviations of the noise's own power from which on a distortion is told from it."""
 LEAST_SHARE = 0.1
-"""Of the power heard while the loudest multisines sound, the least that has to be theirs."""
+"""The least share of the recorded power that the loudest multisines must explain; another sound explains none of it."""
 DISTURBED_DB = 3.0
-"""The noise beside the multisines is no more than this above the fan."""
+"""A warning is given where the noise while the multisines sound is further above the fan alone."""
 
 Spectra = NDArray[np.complex128]
 
 
 def calibrate_multisine(
-    sweep_reference: Samples,
-    sweep_recording: Samples,
-    noise_recording: Samples,
-    *,
-    created: str = "",
-    source: str = "",
+    sweep_reference: Samples, sweep_recording: Samples, noise_recording: Samples, *, created: str = "", source: str = ""
 ) -> Profile:
     """Measure the robot's own voice at its microphone, and what of it no linear path explains.
 
@@ -87,18 +86,13 @@ def calibrate_multisine(
     >>> bool(-30 < even < -20 and odd < -50)
     True
     """
-    try:
-        reference = as_samples(sweep_reference, "the sweep reference")
-        recording = as_samples(sweep_recording, "the sweep recording")
-        noise = as_samples(noise_recording, "the noise recording")
-    except SignalError as error:
-        raise CalibrationError(str(error)) from None
+    reference, recording, noise = checked(sweep_reference, sweep_recording, noise_recording)
     law = multisine_law(reference)
     sweep = reference[: law.first]
     check_lengths(sweep_law(sweep), recording, noise)
     near = deconvolve(sweep, recording[: law.first + LATEST_DIRECT], fan_psd(noise), GRID_HZ, PERIOD)
-    heard = recording[: law.first + max(find_direct(near.response), 0)]
-    profile = calibrate(sweep, heard, noise, created=created, source=source)
+    swept = recording[: law.first + max(find_direct(near.response), 0)]
+    profile = calibrate(sweep, swept, noise, created=created, source=source)
     approximation, warnings = approximate(profile, law, reference, recording)
     return replace(profile, approximation=approximation, warnings=(*profile.warnings, *warnings))
 
@@ -116,23 +110,18 @@ def approximate(
     played = fft.rfft(reference[law.blocks()[..., None] + PERIOD + np.arange(PERIOD)].astype(np.float64))
     part = recording[law.first + delay : law.stop + delay]
     ppm = _drift_ppm(profile, played, part)
-    if abs(ppm) > LEAST_PPM:
-        at = np.arange(part.size) + law.first
-        part = interpolate(recording, delay + at + 1e-6 * ppm * (at - law.first / 2))
+    at = np.arange(part.size) + law.first
+    part = interpolate(recording, delay + at + 1e-6 * ppm * (at - law.first / 2))
     lines = _Lines.of(played, part)
     found = lines.approximation()
-    share = total_power(found.linear[-1]) / max(_heard_power(part), 1e-30)
+    loudest = part[part.size * 2 // 3 :].astype(np.float64)
+    share = total_power(found.linear[-1]) / max(float(np.mean(loudest**2)), 1e-30)
     if not share > LEAST_SHARE:
         raise CalibrationError(
             f"the sweep recording holds the sweep but not the multisines behind it: they explain {100 * share:.0f} % of"
             f" what is heard there, expected at least {100 * LEAST_SHARE:.0f} %; is it the recording of this reference?"
         )
     return found, _doubts(profile, found, part, ppm)
-
-
-def _heard_power(part: Samples) -> float:
-    """Mean square of what is heard at the loudest level."""
-    return float(np.mean(part[part.size * 2 // 3 :].astype(np.float64) ** 2))
 
 
 def _measured(part: Samples, blocks: tuple[int, int]) -> Spectra:
@@ -145,7 +134,7 @@ def _drift_ppm(profile: Profile, played: Spectra, part: Samples) -> float:
     path = fft.rfft(profile.echo.impulse_response[:PERIOD].astype(np.float64), PERIOD)
     heard = _measured(part, played.shape[:2]).mean(axis=2)
     cross = (heard * np.conj(played * path)).reshape(-1, path.size)
-    rough = [highest(correlation_near(spectrum, PERIOD, REACH))[0] for spectrum in cross]
+    rough = [highest(correlation_near(spectrum, PERIOD, DRIFT_REACH))[0] for spectrum in cross]
     lags = [top(spectrum, PERIOD, lag) for spectrum, lag in zip(cross, rough, strict=True)]
     loud = len(lags) // 3
     return 1e6 * float(np.polyfit(BLOCK * np.arange(len(lags))[loud:], lags[loud:], 1)[0])
@@ -165,10 +154,10 @@ class _Lines:
 
     @classmethod
     def of(cls, played: Spectra, part: Samples) -> _Lines:
-        """Of spectra played (levels, realisations, lines) and the recording of them, swung in and on their counter."""
+        """Of the played spectra (levels, realisations, lines) and their recording, aligned with them."""
         excited = realisations().excited
         odd_lines = np.arange(excited.shape[1]) % 2 == 1
-        audible = np.arange(excited.shape[1]) * LINE_HZ >= LOWEST_HZ
+        audible = np.arange(excited.shape[1]) * LINE_HZ >= LOW_HZ
         heard = _measured(part, played.shape[:2])
         mean = heard.mean(axis=2)
         noise = power(heard - mean[:, :, None]).sum(axis=2) / (PERIODS - 2)
@@ -177,8 +166,8 @@ class _Lines:
         energy = power(x).sum(axis=1)
         best = (mean * x.conj()).sum(axis=1) / np.maximum(energy, 1e-30)
         known = np.maximum(excited.sum(axis=0) - 1, 0)
-        beside = np.where(excited, power(mean - best[:, None] * x), 0.0).sum(axis=1)
-        beside -= known * own.mean(axis=1)
+        unexplained = np.where(excited, power(mean - best[:, None] * x), 0.0).sum(axis=1)
+        unexplained -= known * own.mean(axis=1)
         silent = ~excited & audible
         between = ((power(mean) - own) * (silent & odd_lines)).sum(axis=1)
         return cls(
@@ -186,7 +175,7 @@ class _Lines:
             linear=power(best) * energy,
             noise=noise.sum(axis=1),
             even=((power(mean) - own) * (silent & ~odd_lines)).sum(axis=1),
-            odd=beside + between,
+            odd=unexplained + between,
             measured_even=np.broadcast_to((silent & ~odd_lines).sum(axis=0), energy.shape),
             measured_odd=np.broadcast_to(known + (silent & odd_lines).sum(axis=0), energy.shape),
         )
@@ -222,11 +211,7 @@ def _chance(noise: Array) -> Array:
 
 def _smooth(lines: Array) -> Array:
     """(levels, 601) mean over the lines around each frequency of GRID_HZ."""
-    half = np.maximum(SMOOTHING * GRID_HZ, SMOOTHING_HZ) / LINE_HZ
-    total = np.pad(np.cumsum(lines, axis=1), ((0, 0), (1, 0)))
-    low = np.clip(np.floor(GRID_HZ / LINE_HZ - half), 0, None).astype(int)
-    high = np.minimum(np.ceil(GRID_HZ / LINE_HZ + half) + 1, lines.shape[1]).astype(int)
-    return (total[:, high] - total[:, low]) / (high - low)
+    return smoothed(lines, GRID_HZ, LINE_HZ, SMOOTHING_HZ)
 
 
 def _doubts(profile: Profile, found: LinearApproximation, part: Samples, ppm: float) -> list[str]:
@@ -238,7 +223,8 @@ def _doubts(profile: Profile, found: LinearApproximation, part: Samples, ppm: fl
             f"clipped: {clipped.size} samples while the multisines sound, which looks like distortion of the loudspeaker,"
             " in all bands; lower the playback volume or the microphone gain and calibrate again"
         )
-    louder = decibels(np.array([total_power(psd) for psd in found.noise]) / max(total_power(profile.noise_psd), 1e-20))
+    alone = max(total_power(profile.noise_psd), ROUNDING_PSD * SAMPLE_RATE / 2)
+    louder = decibels(np.array([total_power(psd) for psd in found.noise]) / alone)
     if np.max(louder) > DISTURBED_DB:
         texts.append(
             f"something else than the multisines sounds beside them, {np.max(louder):.0f} dB above the fan, in all bands;"

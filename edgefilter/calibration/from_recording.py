@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 from scipy import fft, signal
 from scipy.ndimage import binary_closing, uniform_filter1d
 
+from edgefilter.calibration.sweep import DRIFT_REACH
 from edgefilter.dsp.fractional_delay import delayed, interpolate
 from edgefilter.dsp.frames import all_block_power, block_power, decibels, frames
 from edgefilter.dsp.lag import correlation_near, flat_cross, highest
@@ -28,8 +29,8 @@ where there is."""
 LEAST_DROP_DB, OTHERS_DB = 3.0, 6.0
 """What the path must take away of its best fifth of unseen blocks, and how far above the robot something is that is not
 the robot's."""
-WINDOW, UPSAMPLED = SAMPLE_RATE, 4
-MAX_PPM, PPM_STEP, DRIFT_REACH = 400.0, 2.0, 400
+UPSAMPLED = 4
+MAX_PPM, PPM_STEP = 400.0, 2.0
 DRIFT_GAIN = 1.1
 """By this factor the correlation along a sloping line must exceed that along a level one."""
 REACH = 512
@@ -137,7 +138,7 @@ def find_lag(recording: Samples, reference: Samples) -> int:
 
 
 def _drifting(x: Samples, ppm: float) -> Samples:
-    """X (n,) read at a clock that is ppm faster."""
+    """Samples x (n,), read at a clock that is ppm faster."""
     n = np.arange(x.size)
     return interpolate(x, n + 1e-6 * ppm * n) if ppm else x
 
@@ -148,20 +149,20 @@ def find_drift(recording: Samples, reference: Samples) -> tuple[float, int]:
     Of all lines of up to MAX_PPM the one on which the correlations of windows of a second, spectra flattened, add up to
     most; 0 ppm where it brings less than DRIFT_GAIN of what no drift does. Lags of up to DRIFT_REACH.
     """
-    size, part = 4 * WINDOW, slice(2 * WINDOW, 3 * WINDOW)
-    padded = np.pad(reference, (2 * WINDOW, 2 * WINDOW))
-    starts = np.arange(0, recording.size - WINDOW + 1, WINDOW // 2)
+    size, part = 4 * SAMPLE_RATE, slice(2 * SAMPLE_RATE, 3 * SAMPLE_RATE)
+    padded = np.pad(reference, (2 * SAMPLE_RATE, 2 * SAMPLE_RATE))
+    starts = np.arange(0, recording.size - SAMPLE_RATE + 1, SAMPLE_RATE // 2)
     near = np.arange(-DRIFT_REACH * UPSAMPLED, DRIFT_REACH * UPSAMPLED + 1)
     rows = np.zeros((starts.size, near.size))
     for row, start in zip(rows, starts, strict=True):
         heard = np.zeros(size)
-        heard[part] = recording[start : start + WINDOW]
+        heard[part] = recording[start : start + SAMPLE_RATE]
         cross = flat_cross(padded[start : start + size], heard, size)
         row[:] = np.take(
             fft.irfft(np.pad(cross, (0, (UPSAMPLED - 1) * size // 2)), UPSAMPLED * size), near, mode="wrap"
         )
     grid = np.arange(-MAX_PPM, MAX_PPM + PPM_STEP, PPM_STEP)
-    middles = starts + WINDOW / 2
+    middles = starts + SAMPLE_RATE / 2
     sums = []
     for ppm in grid:
         moves = np.round(-ppm * 1e-6 * middles * UPSAMPLED).astype(int)

@@ -12,14 +12,15 @@ from edgefilter.dsp.fourier import power
 from edgefilter.dsp.frames import frames
 from edgefilter.dsp.psd import hann
 from edgefilter.errors import CalibrationError
+from edgefilter.profile.data import GRID_FFT, GRID_HZ
 from edgefilter.types import SAMPLE_RATE, Array, Samples
 
 STEP_HZ = 13
 STEPS_HZ = np.arange(0, 8001, STEP_HZ, dtype=np.float64)
 STEP_SAMPLES = 1600
 """0.1 s a step, inferred (the paper does not say): one frame of 1200 samples after 400 for the room to settle."""
-FRAME, HOP = 1200, 160
-_WINDOW = hann(FRAME)
+HOP = 160
+_WINDOW = hann(GRID_FFT)
 
 
 def generate_stepped_sine(amplitude: float = 0.35, lead_s: float = 0.5, tail_s: float = 1.0) -> Samples:
@@ -84,29 +85,28 @@ def response_from_stepped_sine(
     104 Hz on, the fan's energy subtracted.
     """
     ends = law.start + STEP_SAMPLES * np.arange(1, STEPS_HZ.size + 1)
-    at = ends[:, None] + np.arange(-FRAME, 0)
+    at = ends[:, None] + np.arange(-GRID_FFT, 0)
     padded = np.pad(recording.astype(np.float64), (0, max(0, int(ends[-1]) + delay - recording.size)))[
         np.maximum(at + delay, 0)
     ]
-    grid = np.arange(FRAME // 2 + 1) * SAMPLE_RATE / FRAME
     fan, fan_power = mean_magnitude(noise), np.mean(power(_frames(noise)), axis=0)
     played = _tone_magnitude(reference[at].astype(np.float64), STEPS_HZ)
     heard = _tone_magnitude(padded, STEPS_HZ)
-    response = np.maximum(heard - np.interp(STEPS_HZ, grid, fan), 0.0) / np.maximum(played, 1e-9)
+    response = np.maximum(heard - np.interp(STEPS_HZ, GRID_HZ, fan), 0.0) / np.maximum(played, 1e-9)
     response[0] = 0.0
     levels = []
     for order in orders:
         use = (STEPS_HZ >= 104.0) & (STEPS_HZ * order < 7600.0)
         excess = _tone_magnitude(padded[use], order * STEPS_HZ[use]) ** 2 - np.interp(
-            order * STEPS_HZ[use], grid, fan_power
+            order * STEPS_HZ[use], GRID_HZ, fan_power
         )
         levels.append(10 * np.log10(max(excess.sum() / max(np.sum(heard[use] ** 2), 1e-30), 1e-10)))
-    return np.interp(grid, STEPS_HZ, response).astype(np.float32), np.array(levels)
+    return np.interp(GRID_HZ, STEPS_HZ, response).astype(np.float32), np.array(levels)
 
 
 def _tone_magnitude(pieces: Array, frequencies: Array) -> Array:
-    """|DFT| of each Hann-weighted piece (k, FRAME) at its own frequency (k,)."""
-    turn = np.exp(-2j * np.pi * frequencies[:, None] / SAMPLE_RATE * np.arange(FRAME))
+    """|DFT| of each Hann-weighted piece (k, GRID_FFT) at its own frequency (k,)."""
+    turn = np.exp(-2j * np.pi * frequencies[:, None] / SAMPLE_RATE * np.arange(GRID_FFT))
     return np.abs(np.sum(pieces * _WINDOW * turn, axis=1))
 
 
@@ -116,9 +116,7 @@ def mean_magnitude(samples: Samples) -> Array:
 
 
 def response_from_sweep(reference: Samples, recording: Samples, noise: Samples, delay: int) -> Samples:
-    """The paper's |H_m(f) H_s(f)| (601,) float32, eq.
-
-    (3)-(5), from any sweep: sum_t (|X_m(t,f)| - |N(f)|) / sum_t |A(t,f)|.
+    """The paper's |H_m(f) H_s(f)| (601,) float32, from any sweep: sum_t (|X_m(t,f)| - |N(f)|) / sum_t |A(t,f)|, eq. (3)-(5).
 
     Hann frames of 1200 samples, hop 160; for each bin, those frames t in which the reference, delayed by delay samples,
     is within 20 dB of its maximum in that bin. Negative sums are set to 0, and so are bins in which the sweep has no
@@ -137,5 +135,5 @@ def response_from_sweep(reference: Samples, recording: Samples, noise: Samples, 
 
 def _frames(samples: Samples) -> NDArray[np.complex128]:
     """(frames, 601) complex spectra."""
-    padded = np.pad(samples, (0, max(0, FRAME - samples.size)))
-    return np.fft.rfft(frames(padded, FRAME, HOP) * _WINDOW, axis=1)
+    padded = np.pad(samples, (0, max(0, GRID_FFT - samples.size)))
+    return np.fft.rfft(frames(padded, GRID_FFT, HOP) * _WINDOW, axis=1)

@@ -12,8 +12,13 @@ from edgefilter.errors import CalibrationError
 from edgefilter.types import SAMPLE_RATE, Array, Samples
 
 LOW_HZ, HIGH_HZ = 40.0, 7990.0
-LATEST_DIRECT = int(1.6 * SAMPLE_RATE)
-EARLIEST_DIRECT = -2000
+"""Of the generated sweep: from below what a robot's loudspeaker plays to the end of the band."""
+EARLIEST_DIRECT, LATEST_DIRECT = -2000, int(1.6 * SAMPLE_RATE)
+"""Samples by which the direct sound may come after it was played, on the recording's counter."""
+TWELFTH = 2 ** (1 / 12) - 1
+"""Half the width of a sixth of an octave around a frequency, over that frequency."""
+DRIFT_REACH = 400
+"""Samples by which clocks that are apart may move a lag within a recording: 400 ppm in a minute."""
 
 
 def generate_sweep(seconds: float = 6.0, amplitude: float = 0.35, lead_s: float = 0.5, tail_s: float = 1.0) -> Samples:
@@ -159,8 +164,8 @@ def deconvolve(reference: Samples, recording: Samples, noise_psd: Array, noise_h
     floor = np.full(energy.size, 1e-7 * energy.max())
     first = Deconvolution(fft.irfft(cross / (energy + floor), n), energy, floor, fan)
     direct = find_direct(first.response)
-    raw = _smooth(first.spectrum(first.cut(direct - 64, taps)), frequencies)
-    below = _smooth(first.noise(taps), frequencies)
+    raw = smoothed(first.spectrum(first.cut(direct - 64, taps)), frequencies, frequencies[1], 5.0)
+    below = smoothed(first.noise(taps), frequencies, frequencies[1], 5.0)
     path = np.maximum(raw - below, 1e-3 * below) + 1e-12 * raw.max()
     weight = floor * 1e-3 + taps * fan / path
     return Deconvolution(fft.irfft(cross / (energy + weight), n), energy, weight, fan)
@@ -172,15 +177,14 @@ def find_direct(response: Array) -> int:
     return int(lags[np.argmax(np.abs(response[lags]))])
 
 
-def _smooth(power: Array, frequencies: Array) -> Array:
-    """Mean of power over a sixth of an octave, at least 10 Hz."""
-    total = np.concatenate(([0.0], np.cumsum(power)))
-    step = frequencies[1]
-    half = np.maximum(frequencies * (2 ** (1 / 12) - 1), 5.0) / step
-    index = np.arange(power.size)
-    low = np.maximum(np.floor(index - half), 0).astype(int)
-    high = np.minimum(np.ceil(index + half) + 1, power.size).astype(int)
-    return (total[high] - total[low]) / (high - low)
+def smoothed(lines: Array, hz: Array, line_hz: float, least_hz: float) -> Array:
+    """(..., hz.size) mean of lines (..., n), line_hz apart, over a sixth of an octave around each hz, at least 2 least_hz."""
+    total = np.cumsum(lines, axis=-1)
+    total = np.concatenate((np.zeros_like(total[..., :1]), total), axis=-1)
+    half = np.maximum(TWELFTH * hz, least_hz) / line_hz
+    low = np.clip(np.floor(hz / line_hz - half), 0, None).astype(int)
+    high = np.minimum(np.ceil(hz / line_hz + half) + 1, lines.shape[-1]).astype(int)
+    return (total[..., high] - total[..., low]) / (high - low)
 
 
 def harmonic_distortion(result: Deconvolution, direct: int, law: SweepLaw, orders: tuple[int, ...]) -> Array:

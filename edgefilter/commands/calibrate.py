@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import argparse
 import datetime
-import sys
+import shutil
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -16,13 +19,18 @@ from edgefilter.calibration.from_multisine import calibrate_multisine
 from edgefilter.calibration.multisine import SWEEP_PART, generate_multisine
 from edgefilter.calibration.stepped_sine import generate_stepped_sine
 from edgefilter.calibration.sweep import generate_sweep
-from edgefilter.commands.display import write_json
+from edgefilter.commands.display import countdown, say, write_json
 from edgefilter.commands.profile import summary
-from edgefilter.errors import UsageError
+from edgefilter.errors import DeviceError, UsageError
 from edgefilter.profile.text import describe
 from edgefilter.types import SAMPLE_RATE, Samples
 
-FAN_SECONDS = 5
+NOISE_S = 5
+"""Of the noise alone: a power spectral density good to 1 dB in bands of 60 Hz."""
+BUFFERS_S = (0.2, 0.4, 0.6)
+"""Asked of the sound system, the later ones where the first lost sound. 0.2 s lost nothing beside a client of 20 ms on a
+PulseAudio null sink, where 0.05 s did four times of four; with two of 0.6 s the delay is still below the 1.6 s in which a
+calibration looks for the sweep."""
 RECORDINGS = ("sweep_reference", "sweep_recording", "noise_recording")
 
 
@@ -37,15 +45,20 @@ def main(args: argparse.Namespace) -> int:
     if not args.live and len(given) < len(RECORDINGS):
         missing = " ".join(f"--{name.replace('_', '-')} FILE" for name in RECORDINGS if name not in given)
         raise UsageError(f"calibration needs three recordings, missing: {missing} (or --live to make them now)")
-    sweep, recording, fan = _record(args) if args.live else (_read(getattr(args, name), name) for name in RECORDINGS)
-    source = (
-        f"live: {args.speaker} to {args.input}" if args.live else ", ".join(getattr(args, name) for name in RECORDINGS)
-    )
+    if args.live:
+        with _folder(args.save_input) as folder:
+            return _calibrate(args, f"live: {args.speaker} to {args.input}", *_record(args, folder))
+    names = [getattr(args, name) for name in RECORDINGS]
+    return _calibrate(args, ", ".join(names), *(_read(path, role) for path, role in zip(names, RECORDINGS)))
+
+
+def _calibrate(args: argparse.Namespace, source: str, sweep: Samples, recording: Samples, noise: Samples) -> int:
+    """Make the profile and say what is in it."""
     today = datetime.date.today().isoformat()
     if args.multisine:
-        profile = calibrate_multisine(sweep, recording, fan, created=today, source=source)
+        profile = calibrate_multisine(sweep, recording, noise, created=today, source=source)
     else:
-        profile = calibrate(sweep, recording, fan, stepped_sine=args.stepped_sine, created=today, source=source)
+        profile = calibrate(sweep, recording, noise, stepped_sine=args.stepped_sine, created=today, source=source)
     profile.save(args.output)
     if args.json:
         write_json(summary(profile), args.json)
@@ -83,22 +96,52 @@ def _read(path: str, role: str) -> Samples:
     reader = Reader(path, role.replace("_", " "))
     samples = np.concatenate([*reader.chunks(), np.zeros(0, np.float32)])
     for note in reader.notes:
-        print(note, file=sys.stderr)
+        say(note)
     return samples
 
 
-def _record(args: argparse.Namespace) -> tuple[Samples, Samples, Samples]:
-    from edgefilter.audio.play_and_record import play_and_record
+def _record(args: argparse.Namespace, folder: Path) -> tuple[Samples, Samples, Samples]:
+    """The sound that is played, what the microphone picks up of it, and the noise alone; each is in the folder at once."""
+    sound = _sound(args)
+    name = "a sweep and multisines" if args.multisine else "a stepped sine" if args.stepped_sine else "a sweep"
+    silence = np.zeros(NOISE_S * SAMPLE_RATE, np.float32)
+    _keep(folder, "sweep_reference", sound)
+    noise = _take(args, folder, "noise_recording", silence, f"now quiet: {NOISE_S} s of the robot's noise alone")
+    seconds = round(sound.size / SAMPLE_RATE)
+    return sound, _take(args, folder, "sweep_recording", sound, f"now playing: {seconds} s of {name}"), noise
 
-    sweep = _sound(args)
-    name = "a sweep and multisines" if args.multisine else "a sweep"
-    print(f"keep quiet: {FAN_SECONDS} s of the fan, then {name} of {sweep.size / SAMPLE_RATE:.0f} s", file=sys.stderr)
-    fan = play_and_record(args.speaker, args.input, np.zeros(FAN_SECONDS * SAMPLE_RATE, np.float32))
-    recording = play_and_record(args.speaker, args.input, sweep)
-    if args.save_input:
-        folder = Path(args.save_input)
-        folder.mkdir(parents=True, exist_ok=True)
-        for name, samples in zip(RECORDINGS, (sweep, recording, fan)):
-            with FileSink(folder / f"{name}.wav", float32=True) as sink:
-                sink.write(samples)
-    return sweep, recording, fan
+
+def _take(args: argparse.Namespace, folder: Path, name: str, sound: Samples, what: str) -> Samples:
+    """Play and record, again with larger buffers where something was lost: a calibration would measure the hole."""
+    from edgefilter.audio.measure import play_and_record
+
+    for latency_s in BUFFERS_S:
+        found = play_and_record(args.speaker, args.input, sound, latency_s=latency_s, tell=countdown(what))
+        _keep(folder, name, found.samples)
+        if not found.holes:
+            return found.samples
+        say(f"the recording has holes ({found.holes})")
+    raise DeviceError(
+        f"the recording has holes ({found.holes}), also with buffers of {latency_s:g} s: close other programs and measure"
+        " again"
+    )
+
+
+def _keep(folder: Path, name: str, samples: Samples) -> None:
+    with FileSink(folder / f"{name}.wav", float32=True) as sink:
+        sink.write(samples)
+
+
+@contextmanager
+def _folder(path: str | None) -> Iterator[Path]:
+    """Where recordings are kept: the folder that was asked for, or one that is left behind if the calibration fails."""
+    folder = Path(path or tempfile.mkdtemp(prefix="edgefilter-"))
+    folder.mkdir(parents=True, exist_ok=True)
+    try:
+        yield folder
+    except BaseException:
+        if any(folder.iterdir()):
+            say(f"what was recorded is kept in {folder}")
+        raise
+    if not path:
+        shutil.rmtree(folder)

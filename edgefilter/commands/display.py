@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import json
+import math
 import os
 import re
 import sys
@@ -31,6 +32,21 @@ TOLD = ("stepped_down", "stepped_up", "overloaded", "learned", "unlearned", "dev
 def say(text: str) -> None:
     """One line for the person who runs it, on standard error: standard output may be sound."""
     print(text, file=sys.stderr)
+
+
+def countdown(what: str) -> Callable[[float], None]:
+    """Say what is going on; on a terminal, the function that is returned shows the seconds that are left."""
+    if not sys.stderr.isatty():
+        say(what)
+        return lambda left_s: None
+    shown = -1
+
+    def show(left_s: float) -> None:
+        nonlocal shown
+        if shown != (shown := math.ceil(left_s)):
+            print(f"\r{what}, {shown} s left ", end="" if shown else "\n", file=sys.stderr, flush=True)
+
+    return show
 
 
 def interject(text: str) -> None:

@@ -19,8 +19,8 @@ from edgefilter.filter.ego_filter import EgoFilter
 from edgefilter.learning.background import LEAST_CORES, cores
 
 if TYPE_CHECKING:
+    from edgefilter.audio.measure import Trial
     from edgefilter.audio.port import InputPort
-    from edgefilter.audio.trial import Trial
 
 PACE = 0.005
 """By how much a device's clock may be out; what the filter follows is far less, but a few seconds tell no more."""
@@ -134,7 +134,7 @@ def _open(ports: dict[str, InputPort], role: str, name: str | None) -> Iterator[
 
 
 def _sound(ports: dict[str, InputPort]) -> Iterator[Check]:
-    from edgefilter.audio.trial import listen
+    from edgefilter.audio.measure import listen
 
     for (role, _), trial in zip(ports.items(), listen(list(ports.values()))):
         yield _clock(role, trial)

@@ -8,12 +8,11 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from edgefilter.audio import virtual
-from edgefilter.audio.files import FileSink, open_source
+from edgefilter.audio.files import open_sink, open_source
 from edgefilter.audio.protocols import Sink, Source
-from edgefilter.audio.raw import PcmSink
 from edgefilter.audio.reader import Reader
 from edgefilter.audio.speech import SpokenReference
-from edgefilter.audio.steady_sink import SteadySink
+from edgefilter.audio.steady import SteadySink
 from edgefilter.errors import UsageError
 
 FILE_ENDINGS = (".wav", ".flac", ".ogg", ".mp3", ".aiff", ".aif", ".w64", ".opus", ".txt", ".raw", ".pcm")
@@ -66,10 +65,8 @@ def make_sink(name: str, latency: int, wait: bool) -> Sink:
 
     wait: let a device that plays slower hold back the source, which a recording can bear and a microphone cannot.
     """
-    if name == "-":
-        return PcmSink()
-    if looks_like_file(name):
-        return FileSink(name)
+    if name == "-" or looks_like_file(name):
+        return open_sink(name)
     from edgefilter.audio.live import LiveSink
 
     if wait:

@@ -21,7 +21,7 @@ def blocks(x: NDArray, size: int) -> NDArray:
     return x[: count * size].reshape(count, size)
 
 
-def block_power(x: Samples, size: int) -> Array:
+def block_power(x: Array, size: int) -> Array:
     """(k,) float64, mean square of x (n,) in each whole block."""
     return np.square(blocks(x, size), dtype=np.float64).mean(axis=1)
 

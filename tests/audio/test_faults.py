@@ -3,35 +3,18 @@
 import numpy as np
 import pytest
 
-from edgefilter.audio import device, live, port, steady
 from edgefilter.audio.files import FileSink, FileSource
 from edgefilter.audio.live import LiveSink, LiveSource
-from edgefilter.audio.pairing import TOLERANCE
-from edgefilter.audio.steady import LEAST_S, WATCH_S, SampleClock
-from edgefilter.audio.steady_sink import SteadySink
+from edgefilter.audio.pairing import TOLERANCE, WINDOW
+from edgefilter.audio.steady import SampleClock, SteadySink
 from edgefilter.audio.troubles import Troubles
 from edgefilter.errors import DeviceError
 from edgefilter.filter.ego_filter import EgoFilter
 from edgefilter.session import filter_blocks
-from tests.audio.virtual_portaudio import CALLBACK_S, VirtualDevice, VirtualPortAudio
+from tests.audio.virtual_portaudio import CALLBACK_S, VirtualDevice
 
 FOREVER = float("inf")
 STEP = round(CALLBACK_S * 16000)
-
-
-@pytest.fixture
-def plug(monkeypatch):
-    """A function that puts virtual devices in place of all others."""
-
-    def plug(*devices):
-        system = VirtualPortAudio(*devices)
-        monkeypatch.setattr(device, "_sounddevice", lambda: system)
-        for module in (live, port, steady):
-            monkeypatch.setattr(module, "time", system)
-        monkeypatch.setattr(live, "POLL_S", CALLBACK_S / 2)
-        return system
-
-    return plug
 
 
 @pytest.fixture
@@ -211,8 +194,8 @@ def test_late_sound_is_not_lost_and_drift_is_no_loss():
         watch.note(delivered, now)
     assert watch.missed == 0.0
     for tick in range(19_900, 21_000):
-        watch.note(delivered + tick * 0.01 - now, tick * 0.01 + 3 * LEAST_S)
-    assert watch.missed == pytest.approx(3 * LEAST_S, abs=WATCH_S * 400e-6)
+        watch.note(delivered + tick * 0.01 - now, tick * 0.01 + 3 * TOLERANCE / 16000)
+    assert watch.missed == pytest.approx(3 * TOLERANCE / 16000, abs=WINDOW / 16000 * 400e-6)
     for tick in range(21_000, 22_100):
         watch.note(delivered + tick * 0.01 - now, tick * 0.01)
-    assert watch.missed == pytest.approx(0.0, abs=WATCH_S * 400e-6)  # it came after all
+    assert watch.missed == pytest.approx(0.0, abs=WINDOW / 16000 * 400e-6)  # it came after all

@@ -104,6 +104,8 @@ def broken(folder, kind):
         x = noise(40000)
         x[34567] = float(kind)
         soundfile.write(path, x, 16000, subtype="FLOAT")
+    elif kind == "scaled":
+        soundfile.write(path, 1e6 * noise(40000) / np.abs(noise(40000)).max() * 1.01, 16000, subtype="FLOAT")
     elif kind.startswith("cut"):
         soundfile.write(path, noise(40000), 16000, format="FLAC" if kind == "cut-flac" else "WAV")
         path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
@@ -122,6 +124,7 @@ def broken(folder, kind):
         ("text", "is not audio .*dear diary"),
         ("nan", r"holds nan at sample 34567"),
         ("inf", r"holds inf at sample 34567"),
+        ("scaled", r"holds -?1.01e\+06, expected samples of a full scale of 1: its scaling is wrong"),
         ("cut-wav", "truncated"),
         ("cut-flac", "truncated"),
         ("tiny", "holds 1 samples at 44100 Hz"),
@@ -188,9 +191,10 @@ def test_what_fitted_on_a_full_disk_stays_a_valid_file(tmp_path, suffix):
     """A limit on file size fails a write as a full disk does, in its middle, and needs no disk."""
     path = tmp_path / f"x{suffix}"
     code = (
-        "import sys, numpy as np\nfrom edgefilter.audio.files import FileSink\nfrom edgefilter.errors import"
+        "import os, sys, numpy as np\nfrom edgefilter.audio.files import FileSink\nfrom edgefilter.errors import"
         " AudioFileError\nx = np.load(sys.argv[2])\ntry:\n    with FileSink(sys.argv[1]) as sink:\n        for i in"
-        " range(0, x.size, 256): sink.write(x[i:i + 256])\nexcept AudioFileError as error: print(error)\n"
+        " range(0, x.size, 256): sink.write(x[i:i + 256]); fitted = os.path.getsize(sys.argv[1])\n"
+        "except AudioFileError as error: print(fitted, error)\n"
     )
     np.save(tmp_path / "x.npy", noise(160000))
 
@@ -203,6 +207,7 @@ def test_what_fitted_on_a_full_disk_stays_a_valid_file(tmp_path, suffix):
     assert "cannot be written on" in done.stdout and str(path) in done.stdout and done.stdout.count("\n") == 1, (
         done.stderr
     )
+    assert path.stat().st_size == int(done.stdout.split()[0])  # no part of the write that failed is left behind
     kept, _ = read(FileSource(path))
     assert kept.size > 45000  # nearly what 100001 bytes hold, less the write that failed
     np.testing.assert_array_equal(kept, noise(160000)[: kept.size])

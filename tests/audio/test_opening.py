@@ -48,14 +48,14 @@ def test_a_device_that_needs_no_source_leaves_the_environment_alone(monkeypatch)
 def test_two_streams_opened_at_once_do_not_silence_standard_error_for_good():
     code = (
         "import os, threading\n"
-        "from edgefilter.audio.port import _quiet\n"
+        "from edgefilter.audio.port import quiet\n"
         "first_in, second_in = threading.Event(), threading.Event()\n"
         "def first():\n"
-        "    with _quiet():\n"
+        "    with quiet():\n"
         "        first_in.set(); second_in.wait(0.3)\n"
         "def second():\n"
         "    first_in.wait(5)\n"
-        "    with _quiet():\n"
+        "    with quiet():\n"
         "        second_in.set(); one.join(0.3)\n"
         "one, two = threading.Thread(target=first), threading.Thread(target=second)\n"
         "one.start(); two.start(); one.join(); two.join()\n"

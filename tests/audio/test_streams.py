@@ -101,6 +101,40 @@ def test_a_device_that_is_not_clear_is_answered_with_names(wanted, kind, words):
         match(DEVICES, wanted, kind)
 
 
+PHONE = "usb-Acme_Speakerphone-00"
+SERVED = [
+    Device(0, "pulse", 32, 32, 44100.0), Device(1, "default", 32, 32, 44100.0), Device(2, "HDA Intel", 2, 2, 48000.0),
+    *(Device(0, name, inputs, 32 - inputs, 44100.0, pulse_name=name)
+      for name, inputs in ((f"alsa_input.{PHONE}", 32), (f"alsa_output.{PHONE}", 0), (f"alsa_output.{PHONE}.monitor", 32),
+                           ("alsa_input.pci-0000", 32), ("alsa_output.pci-0000.monitor", 32))),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    "wanted, kind, name",
+    [
+        ("speakerphone", "input", "alsa_input.usb-Acme_Speakerphone-00"),  # and not its monitor
+        ("acme speakerphone", "output", "alsa_output.usb-Acme_Speakerphone-00"),
+        ("Acme_Speakerphone-00.monitor", "input", "alsa_output.usb-Acme_Speakerphone-00.monitor"),
+        ("pci-0000", "input", "alsa_input.pci-0000"),
+        ("hda", "input", "HDA Intel"),
+        ("2", "input", "HDA Intel"),
+        ("mic", "input", "default"),
+    ],
+)
+def test_a_part_of_a_sound_servers_name_is_enough(wanted, kind, name):
+    assert match(SERVED, wanted, kind, default=1).name == name
+
+
+def test_an_unknown_device_is_answered_with_the_names_that_work_and_not_with_the_way_to_the_server():
+    with pytest.raises(UsageError, match="expected one of 'alsa_input.usb-Acme_Speakerphone-00'") as caught:
+        match(SERVED, "trumpet", "input")
+    assert "'pulse'" not in str(caught.value) and "'default'" not in str(caught.value)
+    assert "2 'HDA Intel'" in str(caught.value)
+    with pytest.raises(UsageError, match="ambiguous; it matches 'alsa_input.usb.*', 'alsa_input.pci"):
+        match(SERVED, "alsa_input", "input")
+
+
 def test_no_device_at_all_is_said():
     with pytest.raises(DeviceError, match="no sound device with an input"):
         match([], None, "input")

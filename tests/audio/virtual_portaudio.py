@@ -18,7 +18,8 @@ class PortAudioError(Exception):
 class VirtualDevice:
     """One device. takes: (rate, channels) that it can be opened with, None for any. plugged: whether it is there.
 
-    ppm: by how much its clock is fast. swallows: seconds of sound that its driver loses without a word.
+    ppm: by how much its clock is fast. swallows: seconds of sound that its driver loses without a word. needs_s: buffer
+    below which each callback is marked as late. hears: the output whose sound this input gets, a callback later.
     """
 
     name: str
@@ -28,17 +29,19 @@ class VirtualDevice:
     plugged: bool = True
     ppm: float = 0.0
     swallows: float = 0.0
+    needs_s: float = 0.0
+    hears: VirtualDevice | None = None
     played: list = field(default_factory=list)
 
 
 class Stream:
     latency = 0.0
 
-    def __init__(self, system: VirtualPortAudio, device: VirtualDevice, rate: int, channels: int, callback) -> None:
+    def __init__(self, system: VirtualPortAudio, device: VirtualDevice, rate, channels, latency, callback) -> None:
         if not device.plugged:
             raise PortAudioError("Device unavailable", -9985)
         self.system, self.device, self.rate, self.channels, self.callback = system, device, rate, channels, callback
-        self.running, self.due, self.count = False, system.now, 0
+        self.running, self.due, self.count, self.late = False, system.now, 0, latency < device.needs_s
 
     def start(self) -> None:
         self.running = True
@@ -63,9 +66,12 @@ class Stream:
                 self.count * CALLBACK_S * self.rate * (1 + 1e-6 * self.device.ppm)
             )
             self.count += 1
-            status = SimpleNamespace(input_overflow=False, output_underflow=False)
+            status = SimpleNamespace(input_overflow=self.late, output_underflow=self.late)
             if self.device.kind == "input":
-                self.callback(np.full((size, self.channels), 0.25, np.float32), size, None, status)
+                sound = np.full((size, self.channels), 0.25, np.float32)
+                if heard := self.device.hears:
+                    sound = heard.played.pop(0)[:, None] if heard.played else 0 * sound
+                self.callback(sound, size, None, status)
             else:
                 out = np.zeros((size, self.channels), np.float32)
                 self.callback(out, size, None, status)
@@ -134,6 +140,6 @@ class VirtualPortAudio:
     check_input_settings = check_output_settings = _check
 
     def _stream(self, device: int, channels: int, samplerate: int, dtype: str, latency: float, callback) -> Stream:
-        return Stream(self, self.devices[device], samplerate, channels, callback)
+        return Stream(self, self.devices[device], samplerate, channels, latency, callback)
 
     InputStream = OutputStream = _stream

@@ -65,6 +65,7 @@ def test_without_a_robot_it_is_one_line(said):
         self_calibrate(0.1 * record(said) + voice(10.0, seed=5), said)
 
 
+@pytest.mark.slow
 def test_what_is_stationary_is_not_claimed_and_what_moves_is(tmp_path, said, capsys):
     said = said[: 6 * RATE]
     changed = (

@@ -6,9 +6,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from edgefilter.audio import pulse, trial
+from edgefilter.audio import measure, pulse
+from edgefilter.audio.measure import Trial, listen
 from edgefilter.audio.pairing import Inlet
-from edgefilter.audio.trial import Trial, listen
 from edgefilter.cli import main
 from edgefilter.commands import doctor
 from edgefilter.commands.doctor import Check
@@ -93,7 +93,7 @@ def test_another_model_than_the_package_s_is_said(monkeypatch, tmp_path):
 def test_pace_and_level_are_measured(monkeypatch):
     """A port whose clock is 2 % fast, by a clock of the test's own."""
     now = [100.0]
-    monkeypatch.setattr(trial.time, "monotonic", lambda: now[0])
+    monkeypatch.setattr(measure, "clock", lambda: now[0])
 
     class Port:
         rate, opened, closed = 16_000, False, False
@@ -118,7 +118,7 @@ def test_pace_and_level_are_measured(monkeypatch):
     def sleep(seconds):
         now[0] += seconds
 
-    monkeypatch.setattr(trial.time, "sleep", sleep)
+    monkeypatch.setattr(measure, "pause", lambda: sleep(0.004))
     port = Port()
     (heard,) = listen([port], seconds=2.0)
     assert heard.pace == pytest.approx(1.02, abs=1e-3) and port.opened and port.closed

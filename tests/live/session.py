@@ -16,7 +16,7 @@ import soundfile
 
 from edgefilter.audio.device import list_devices, monitor_of
 from edgefilter.audio.live import LiveSink, LiveSource
-from edgefilter.audio.play_and_record import play_and_record
+from edgefilter.audio.measure import play_and_record
 from edgefilter.errors import EdgefilterError
 
 folder = Path(sys.argv[2])
@@ -78,7 +78,7 @@ def sink():
 
 def measure():
     sound, _ = soundfile.read(folder / "robot.wav", dtype="float32")
-    np.savez(folder / "received.npz", mic=play_and_record("robot", "robot_monitor", sound))
+    np.savez(folder / "received.npz", mic=play_and_record("robot", "robot_monitor", sound).samples)
     return {"size": sound.size}
 
 

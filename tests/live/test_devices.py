@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 import soundfile
 
+pytestmark = pytest.mark.slow
+
 SESSION = Path(__file__).with_name("session.py")
 ROOT = Path(__file__).parents[2]
 QUIET = 8000  # samples of silence first: a sound server swallows the first milliseconds of a stream

@@ -7,10 +7,13 @@ import threading
 import time
 from pathlib import Path
 
+import pytest
 import soundfile
 
 from bench.measure import virtual_sound
 from tests.live.test_run_live import ROOT, edgefilter
+
+pytestmark = pytest.mark.slow
 
 
 class Run:

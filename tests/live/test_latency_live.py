@@ -3,7 +3,11 @@
 import json
 import sys
 
+import pytest
+
 from bench.measure import latency_live, soak
+
+pytestmark = pytest.mark.slow
 
 
 def test_a_click_comes_back_no_sooner_than_the_window_allows():

@@ -5,9 +5,12 @@ import subprocess
 import time
 
 import numpy as np
+import pytest
 import soundfile
 
 from tests.live.test_run_live import DEMO, ROOT, edgefilter
+
+pytestmark = pytest.mark.slow
 
 
 def share(sound, whole):

@@ -4,10 +4,13 @@ import subprocess
 import time
 
 import numpy as np
+import pytest
 import soundfile
 
 from edgefilter.cli import main
 from tests.live.test_run_live import DEMO, ROOT, edgefilter
+
+pytestmark = pytest.mark.slow
 
 NAMES = ("edgefilter_speaker", "edgefilter_human", "edgefilter_mic")
 

@@ -1,0 +1,127 @@
+"""Measurements on devices: a sound played and recorded at the same time, and a few seconds of listening to some inputs."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from edgefilter.audio.device import input_port, output_port
+from edgefilter.audio.lookup import Device
+from edgefilter.audio.port import START_S, STREAM_LATENCY_S, InputPort, clock, pause
+from edgefilter.dsp.frames import decibels
+from edgefilter.types import SAMPLE_RATE, Samples
+
+
+@dataclass(frozen=True)
+class Recording:
+    """What a microphone picked up while a sound was played.
+
+    samples: (n,) float32 at 16 kHz. holes: what was lost on the way, in words; empty where nothing was.
+    """
+
+    samples: Samples
+    holes: str = ""
+
+
+def play_and_record(
+    output: str | int | Device | None,
+    microphone: str | int | Device | None,
+    samples: Samples,
+    tail_s: float = 1.0,
+    latency_s: float = STREAM_LATENCY_S,
+    tell: Callable[[float], None] = lambda left_s: None,
+) -> Recording:
+    """Play samples (n,) at 16 kHz and return what the microphone picks up from the moment playing starts, (n + tail,).
+
+    Both are on one sample counter up to a constant: the devices' buffers appear as additional delay, so that the sound
+    never seems to arrive before it is played. Silence goes first, since sound servers swallow a stream's start.
+    latency_s: the buffers asked of the sound system; the larger, the fewer holes. tell: called again and again with the
+    seconds that are left. Raises DeviceError where a device cannot be opened or stops.
+    """
+    mic = input_port(microphone, latency_s)
+    lead = np.zeros(round((latency_s + STREAM_LATENCY_S) * SAMPLE_RATE), np.float32)
+    played = np.concatenate((lead, samples.astype(np.float32)))
+    speaker = output_port(output, played.size, latency_s=latency_s)
+    speaker.outlet.ring.write(speaker.convert(played, last=True))
+    speaker.outlet.draining.set()  # nothing follows: silence after the last sample is no underrun
+    begun: list[int] = []
+
+    def mark() -> None:
+        if not begun:
+            begun.append(mic.inlet.received)
+
+    parts: list[Samples] = []
+    wanted = samples.size + round(tail_s * SAMPLE_RATE)
+    first, left = 0, wanted
+    try:
+        mic.open()
+        while not mic.inlet.calls:
+            mic.check_alive(mic.inlet.received, START_S)
+            pause()
+        speaker.open(mark)
+        while left > 0:
+            mic.check_alive(mic.inlet.received, START_S)
+            speaker.check_alive(speaker.outlet.calls, START_S)
+            parts.append(mic.take())
+            if begun:
+                first = round(begun[0] * SAMPLE_RATE / mic.rate + latency_s * SAMPLE_RATE)
+                left = first + wanted - sum(part.size for part in parts)
+            tell(max(left, 0) / SAMPLE_RATE)
+            pause()
+    finally:
+        mic.close()
+        speaker.close()
+    lost = {"samples lost": mic.inlet.lost, "overruns": mic.inlet.flags, "underruns": speaker.flags}
+    holes = ", ".join(f"{count} {what}" for what, count in lost.items() if count)
+    return Recording(np.concatenate(parts)[first : first + wanted], holes)
+
+
+@dataclass(frozen=True)
+class Trial:
+    """What one input delivered.
+
+    rate: Hz, at which it was opened. pace: samples per second of this machine's clock, by that rate; 1 is right, good to
+    some 0.1 %. level_db, peak_db: of full scale, -120 for digital silence. overruns: callbacks that were marked.
+    """
+
+    rate: int
+    pace: float
+    level_db: float
+    peak_db: float
+    overruns: int
+
+
+def listen(ports: Sequence[InputPort], seconds: float = 3.0) -> list[Trial]:
+    """Open the inputs, listen until each has run for so long, and close them.
+
+    Raises DeviceError where one cannot be opened or stops.
+    """
+    sound: list[list[np.ndarray]] = [[] for _ in ports]
+    steps: list[list[tuple[float, int]]] = [[] for _ in ports]
+    try:
+        for port in ports:
+            port.open()
+        while min((step[-1][0] - step[0][0] if step else 0.0) for step in steps) < seconds:
+            for port, parts, step in zip(ports, sound, steps):
+                now, received = clock(), port.inlet.received
+                port.check_alive(received, START_S)
+                if received > (step[-1][1] if step else 0):
+                    step.append((now, received))
+                parts.append(port.take())
+            pause()
+    finally:
+        for port in ports:
+            port.close()
+    return [_trial(port, np.concatenate(parts), step) for port, parts, step in zip(ports, sound, steps)]
+
+
+def _trial(port: InputPort, sound: np.ndarray, steps: Sequence[tuple[float, int]]) -> Trial:
+    """The pace is the slope of a line through the counter, without the first half second in which devices settle."""
+    times, received = np.array(steps).T
+    settled = times > times[0] + 0.5
+    slope = np.polyfit(times[settled] - times[0], received[settled], 1)[0]
+    level = float(decibels(float(np.mean(np.square(sound, dtype=np.float64)))))
+    peak = float(decibels(float(np.max(np.square(sound), initial=0.0))))
+    return Trial(port.rate, float(slope / port.rate), level, peak, port.inlet.flags)

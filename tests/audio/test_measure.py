@@ -1,0 +1,46 @@
+"""A sound played and recorded on virtual devices: what was lost is said, tried again, and what was recorded is kept."""
+
+import pytest
+import soundfile
+
+from edgefilter.cli import main
+from tests.audio.virtual_portaudio import VirtualDevice
+
+
+@pytest.fixture
+def calibrate(plug, tmp_path, monkeypatch, capsys):
+    """Calibrate with devices that lose nothing once buffers of so many seconds are asked for; exit code and what is said."""
+
+    def calibrate(needs_s, *arguments):
+        speaker = VirtualDevice("speaker", "output", needs_s=needs_s)
+        plug(VirtualDevice("mic", "input", hears=speaker), speaker)
+        code = main(["calibrate", "--live", "--output", str(tmp_path / "p.npz"), *map(str, arguments)])
+        return code, capsys.readouterr().err.splitlines()
+
+    monkeypatch.setenv("TMPDIR", str(tmp_path))
+    monkeypatch.setattr("tempfile.tempdir", None)
+    return calibrate
+
+
+def test_a_recording_with_holes_is_made_again_with_larger_buffers(calibrate, tmp_path):
+    code, said = calibrate(0.3)
+    assert code == 0 and (tmp_path / "p.npz").exists()
+    assert [line.split(" (")[0].split(":")[0] for line in said] == [
+        *("now quiet", "the recording has holes", "now quiet"),
+        *("now playing", "the recording has holes", "now playing"),
+    ]
+    assert [path.name for path in tmp_path.iterdir()] == ["p.npz"]  # nothing else is left behind
+
+
+def test_recordings_of_a_calibration_that_failed_are_kept_and_their_place_is_said(calibrate, tmp_path):
+    code, said = calibrate(10.0)
+    assert code == 1 and "also with buffers of 0.6 s: close other programs" in said[-1]
+    (folder,) = tmp_path.iterdir()
+    assert said[-2] == f"what was recorded is kept in {folder}"
+    assert {path.name for path in folder.iterdir()} == {"sweep_reference.wav", "noise_recording.wav"}
+    assert soundfile.info(folder / "noise_recording.wav").frames == 6 * 16000
+
+
+def test_recordings_go_where_the_user_wants_them(calibrate, tmp_path):
+    code, _ = calibrate(0.0, "--save-input", tmp_path / "kept")
+    assert code == 0 and len(list((tmp_path / "kept").glob("*.wav"))) == 3

@@ -1,0 +1,73 @@
+"""`edgefilter calibrate --live` on real streams: a virtual room is measured, also while another program listens."""
+
+import json
+import subprocess
+
+import numpy as np
+import pytest
+
+from edgefilter import Profile
+from tests.live.test_run_live import ROOT, edgefilter
+
+pytestmark = pytest.mark.slow
+
+
+def calibrating(server, folder, *arguments):
+    files = ("--output", folder / "p.npz", "--json", folder / "p.json")
+    return subprocess.Popen(
+        edgefilter("calibrate", "--live", *files, *arguments),
+        env=server.environment, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+    )  # fmt: skip
+
+
+def figures_of(calibration, folder):
+    told = calibration.communicate(timeout=180)
+    assert calibration.returncode == 0, told
+    return json.loads((folder / "p.json").read_text()), told[1].splitlines()
+
+
+def test_live_calibration_measures_the_virtual_room(server, tmp_path):
+    """The default output is looped into the microphone with a gain of one: the path is a delay."""
+    subprocess.run(
+        ["pactl", "load-module", "module-loopback", "source=robot.monitor", "sink=robot_mic", "latency_msec=30"],
+        env=server.environment, check=True, capture_output=True,
+    )  # fmt: skip
+    figures, said = figures_of(calibrating(server, tmp_path, "--save-input", tmp_path / "kept"), tmp_path)
+    assert figures["delay_samples"] > 0
+    middle = [band["snr_db"] for band in figures["bands"] if 200 < band["low_hz"] < 5000]
+    assert min(middle) > 30  # there is no fan: 16-bit rounding is all the noise
+    assert said[:2] == ["now quiet: 5 s of the robot's noise alone", "now playing: 8 s of a sweep"]
+    assert len(list((tmp_path / "kept").glob("*.wav"))) == 3
+
+
+def test_live_calibration_by_multisines_finds_no_distortion_where_there_is_none(server, tmp_path):
+    """On a sink that is heard itself: its clock is one."""
+    figures, said = figures_of(
+        calibrating(server, tmp_path, "--multisine", "--speaker", "robot", "--input", "robot_monitor"), tmp_path
+    )
+    assert any("a sweep and multisines" in line for line in said)
+    played, left, noise = ([level[f"{key}_db"] for level in figures["levels"]] for key in ("played", "left", "noise"))
+    assert np.diff(played) == pytest.approx(6, abs=0.1) and played[-1] == pytest.approx(-16.9, abs=0.5)
+    assert max(left) < -60 and max(noise) < -80  # -72 and -100 were seen
+    assert len(figures["warnings"]) == 1 and "the noise recording is silent" in figures["warnings"][0]
+    profile = Profile.load(tmp_path / "p.npz")
+    assert figures["delay_samples"] > 0 and profile.approximation is not None
+    assert max(figures["distortion_db"].values()) < -60  # -96 were seen
+
+
+def test_live_calibration_works_while_another_program_listens_to_the_monitor(server, tmp_path):
+    """A client that asks for 20 ms has the server ask every client in short steps; at 44.1 kHz buffers of 50 ms ran dry."""
+    subprocess.run(
+        ["pactl", "load-module", "module-null-sink", "sink_name=loud"],
+        env=server.environment, check=True, capture_output=True,
+    )  # fmt: skip
+    listener = subprocess.Popen(
+        ["parec", "-d", "loud.monitor", "--latency-msec=20", "--raw"], env=server.environment, stdout=subprocess.DEVNULL
+    )
+    try:
+        figures, said = figures_of(calibrating(server, tmp_path, "--speaker", "lou", "--input", "loud mon"), tmp_path)
+    finally:
+        listener.kill()
+        listener.wait()
+    assert figures["delay_samples"] > 0 and figures["distortion_db"]["2"] < -60
+    assert not [line for line in said if "ALSA" in line or "Expression" in line], said
