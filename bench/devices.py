@@ -91,7 +91,7 @@ def find_clips(options: argparse.Namespace) -> list[Clip]:
     clips: list[Clip] = []
     for device, own in list(found.items())[:: options.every][: options.limit]:
         alone = [one for one in own if one.kind == "farend"]
-        if len(alone) > 1:
+        if alone and alone[0].name.removeprefix(f"{device}_").isdigit():
             cells = Cells(options.levels, (min(options.before),))
             laid = recordings.lay(alone, options.speech, None, cells, options.cases, options.seed)
         else:
@@ -215,7 +215,7 @@ def as_recorded(rows: Sequence[dict], here: Sequence[System]) -> dict:
         for one in here:
             row = own.get(one.name, {})
             figures = [results.cell(row.get("echo_mos"), 2), results.cell(row.get("human_mos"), 2)]
-            texts.append(" / ".join(figures) + (f"; {row['si_sdr_mic']:.1f} dB" if "si_sdr_mic" in row else ""))
+            texts.append(" / ".join(figures) + (f"; {results.cell(row['si_sdr_mic'], 1)} dB" if row.get("si_sdr_mic") else ""))
         device = next(row["room"] for row in pairs if row["clip"] == clip)
         cells.append([device[:8] + clip.partition(device)[2], *texts])
     title = "As recorded: AECMOS echo / human; where the human is alone, SI-SDR against the microphone"

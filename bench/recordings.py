@@ -288,6 +288,8 @@ def lay_once(
     for case in range(cases):
         one = spoken[rng.integers(len(spoken))]
         human = soundfile.info(one.path).frames
+        if human / SAMPLE_RATE > length:
+            raise _too_short(recording, length + TAIL_S, human / SAMPLE_RATE + TAIL_S)
         latest = max(min(befores[1], length - human / SAMPLE_RATE), 0.0)
         at = round(rng.uniform(min(befores[0], latest), latest) * SAMPLE_RATE)
         laid.append(Laid(case, recording, at, one.path, one.text, float(rng.uniform(*sers)), at / SAMPLE_RATE))
@@ -299,14 +301,15 @@ def place(recording: Recording, human: int, before: float, rng: np.random.Genera
     power = np.cumsum(np.append(0.0, _echo(recording).mic.astype(np.float64) ** 2))
     low, high = round(before * SAMPLE_RATE), power.size - 1 - human - round(TAIL_S * SAMPLE_RATE)
     if high < low:
-        needed = before + human / SAMPLE_RATE + TAIL_S
-        raise UsageError(
-            f"{recording.name}: {(power.size - 1) / SAMPLE_RATE:.1f} s, expected {needed:.1f} s for this human"
-        )
+        raise _too_short(recording, (power.size - 1) / SAMPLE_RATE, before + human / SAMPLE_RATE + TAIL_S)
     draws = rng.integers(low, high + 1, size=TRIES)
     robot = (power[draws + human] - power[draws]) / human
     good = np.flatnonzero(robot > ROBOT_SILENT * power[-1] / (power.size - 1))
     return int(draws[good[0] if good.size else np.argmax(robot)])
+
+
+def _too_short(recording: Recording, found: float, needed: float) -> UsageError:
+    return UsageError(f"{recording.name}: {found:.1f} s, expected {needed:.1f} s for this human")
 
 
 class Utterance(NamedTuple):

@@ -131,7 +131,7 @@ def contenders(
     code = results.code_digest()
     found = {"linear": Contender(lambda profile: create("linear", profile), code)}
     for name in (BASE, "crnn"):
-        shipped = "".join(entry.read_bytes().hex()[:64] for entry in results.models_of([name]).values())
+        shipped = "".join(results.digest(path)["sha256"] for path in results.models_of([name]).values())
         found |= _with_error(name, lambda profile, name=name: create(name, profile), code + shipped, error)
     folder.mkdir(parents=True, exist_ok=True)
     for path in checkpoints:
@@ -236,7 +236,9 @@ def run(options: argparse.Namespace) -> str:
         raise UsageError("words need a recogniser: give --whisper")
     torch.set_num_threads(1)
     checkpoints = {f"{path.parent.name}/{path.name}": path for path in options.checkpoints}
-    data = {"conversations": options.conversations} | ({"real": [options.real]} if options.real else {})
+    data = {"conversations": options.conversations} | (
+        {"RECORDINGS": [options.real], "HUMAN": [options.speech]} if options.real else {}
+    )
     made_with = results.stamp(data, ["linear", BASE, "crnn"], {"WHISPER": options.whisper, **checkpoints})
     making = contenders(options.checkpoints, options.wiener, options.error, options.cache / "checkpoints")
     judges, kept = runner.judges(runner.Setup(options.cache, options.whisper)), Cache(options.cache, "rows")

@@ -8,11 +8,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from bench.measure.real_barge_in import first_sound
+from bench.measure.recogniser import Recogniser
 
 from bench.measure import closed_loop, closed_loop_report, closed_loop_scenes
 from bench.measure.closed_loop_scenes import Talk, early_errors, lasts, lowered, muted, silent_at, words
-from bench.measure.real_barge_in import first_sound
-from bench.measure.recogniser import Recogniser
 from bench.simulate.conversations import Scene, make_scene, read_clips, read_voices
 from edgefilter import Event
 from tests.bench.conftest import RATE

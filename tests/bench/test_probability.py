@@ -2,8 +2,6 @@
 
 import numpy as np
 import pytest
-from scipy.special import expit
-
 from bench.measure.barge_in_fit import (
     HUMAN_SHARE,
     Listened,
@@ -15,6 +13,8 @@ from bench.measure.barge_in_fit import (
     reliability,
     sparing,
 )
+from scipy.special import expit
+
 from edgefilter.filter.barge_in import CENTRE, SLOPE, BargeInSettings
 
 
