@@ -215,7 +215,9 @@ def as_recorded(rows: Sequence[dict], here: Sequence[System]) -> dict:
         for one in here:
             row = own.get(one.name, {})
             figures = [results.cell(row.get("echo_mos"), 2), results.cell(row.get("human_mos"), 2)]
-            texts.append(" / ".join(figures) + (f"; {results.cell(row['si_sdr_mic'], 1)} dB" if row.get("si_sdr_mic") else ""))
+            texts.append(
+                " / ".join(figures) + (f"; {results.cell(row['si_sdr_mic'], 1)} dB" if row.get("si_sdr_mic") else "")
+            )
         device = next(row["room"] for row in pairs if row["clip"] == clip)
         cells.append([device[:8] + clip.partition(device)[2], *texts])
     title = "As recorded: AECMOS echo / human; where the human is alone, SI-SDR against the microphone"

@@ -252,7 +252,7 @@ def slices(rows: Sequence[dict], here: Sequence[System]) -> list[dict]:
         known = [row for row in human if quantity.key in row["facts"]]
         values = {row["clip"]: row["facts"][quantity.key] for row in known}
         edges = np.unique(np.quantile(list(values.values()), np.linspace(0, 1, PARTS + 1))) if values else np.zeros(0)
-        if len(edges) < 3:
+        if len(edges) < 3 or len(values) < PARTS:
             continue
         parts = {}
         for low, high in zip(edges, edges[1:]):
@@ -284,7 +284,7 @@ def worst(rows: Sequence[dict], here: Sequence[System]) -> list[dict]:
 
 def worst_table(found: Sequence[dict], rows: Sequence[dict]) -> dict:
     title = f"The {len(found)} clips on which {found[0]['system']} does worst" if found else "Worst clips"
-    shown = ("unfiltered", found[0]["system"] if found else "", "clean")
+    shown = dict.fromkeys(("unfiltered", found[0]["system"] if found else "clean", "clean"))
     cells = []
     for row in found:
         of_clip = {one["system"]: one.get("transcript", "") for one in rows if one["clip"] == row["clip"]}

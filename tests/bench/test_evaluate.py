@@ -65,7 +65,10 @@ def test_processes_give_the_same_figures_and_a_run_that_was_cut_off_goes_on(live
     assert ratio["Unfiltered"] == pytest.approx(meta["sisdr_mix"], abs=0.05)  # 16-bit rounding of the clean human
     page = (tmp_path / "a.md").read_text()
     assert page.startswith("# A\n\n## Evaluation\n") and "| linear, uncalibrated | neither |" in page
-    assert first["stamp"]["judged"].keys() >= {"linear-uncalibrated"} and first["stamp"]["data"][0]["folder"] == "made"
+    assert (
+        first["stamp"]["judged"].keys() >= {"linear-uncalibrated"}
+        and first["stamp"]["data"][0]["folder"] == live.parent.name
+    )
 
 
 def test_a_page_to_listen_to(live: Path, tmp_path: Path) -> None:
