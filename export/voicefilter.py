@@ -19,7 +19,7 @@ from pathlib import Path
 
 import torch
 
-from bench.evaluate.d_vector import d_vector
+from bench.voicefilter import d_vector
 from edgefilter.errors import EdgefilterError
 from export.corpus import read_corpus
 from export.paper_network import parameter_count

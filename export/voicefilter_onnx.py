@@ -11,8 +11,8 @@ import torch
 from onnx import helper, numpy_helper
 from torch import nn
 
-from bench.evaluate.denoisers import open_session
-from bench.evaluate.voicefilter import TYPE, VERSION
+from bench.denoisers import open_session
+from bench.voicefilter import TYPE, VERSION
 from edgefilter.errors import ModelError
 from export.onnx_export import Trained, describe, trace
 
