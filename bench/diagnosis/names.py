@@ -228,19 +228,20 @@ def tables(found: Mapping[str, Sequence[Outcome]]) -> list[dict]:
     ]
     made = [results.table("names", "How often it is right", ["", *((name, 1) for name in found)], rows)]
     for name, of in found.items():
-        columns = [
-            "effect",
-            "named first",
-            ("excess before, dB", 1),
-            ("after", 1),
-            ("after, worst", 1),
-            ("share removed, %", 0),
-        ]
-        text = "Excess: held-out, whitened, over the fan; medians of the cases where the effect was named first."
-        made.append(results.table(f"{name}-effects", f"{name}: effects", columns, by_effect(of), text))
-        columns = ["case", "hidden", "strength", "said", ("excess, dB", 1), ("left, dB", 1), "evidence"]
-        misses = [_miss(one) for one in of if not one.hit]
-        made.append(results.table(f"{name}-misses", f"{name}: {len(misses)} misses", columns, misses))
+        if effects := by_effect(of):
+            columns = [
+                "effect",
+                "named first",
+                ("excess before, dB", 1),
+                ("after", 1),
+                ("after, worst", 1),
+                ("share removed, %", 0),
+            ]
+            text = "Excess: held-out, whitened, over the fan; medians of the cases where the effect was named first."
+            made.append(results.table(f"{name}-effects", f"{name}: effects", columns, effects, text))
+        if misses := [_miss(one) for one in of if not one.hit]:
+            columns = ["case", "hidden", "strength", "said", ("excess, dB", 1), ("left, dB", 1), "evidence"]
+            made.append(results.table(f"{name}-misses", f"{name}: {len(misses)} misses", columns, misses))
     return made
 
 

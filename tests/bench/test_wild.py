@@ -64,9 +64,5 @@ def test_who_moves_stays_in_the_room(name: str, least: float, most: float) -> No
 
 @pytest.mark.parametrize(("said", "hit"), [("limiter", True), ("compression", True), ("late_reverb", False)])
 def test_other_right_names_count(said: str, hit: bool) -> None:
-    empty: tuple[float, ...] = ()
-    outcome = Outcome(
-        *("case", ("limiter",), ("program",), "clear", "missing", (said,), empty, empty, empty, 9.0, 1.0, "", 1.0),
-        also=("compression",),
-    )
+    outcome = Outcome("case", ("limiter",), ("program",), "clear", "missing", (said,), also=("compression",))
     assert outcome.hit is hit
