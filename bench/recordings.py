@@ -454,7 +454,7 @@ def conversation_clips(folder: Path) -> Iterator[Clip]:
         others = [other for other in found if other is not one and other.meta["speaker"] == meta["speaker"]]
         others = [other for other in others if other.meta["text"] != meta["text"]]
         voices = tuple((other.folder / "clean.flac", other.span) for other in others[:1])
-        place_ = f"{folder} {one.name}"
+        place_ = f"{folder.resolve().parent.name}/{folder.name}/{one.name}"
         yield Clip("", meta["room"], one, str(meta["speaker"]), place_, meta["text"], voices)
 
 

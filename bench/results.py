@@ -266,8 +266,28 @@ def save(output: Path, whole: Mapping) -> None:
 
 
 def to_json(content: Mapping) -> str:
-    """JSON as the results folder holds it."""
-    return json.dumps(plain(content), indent=1, allow_nan=False) + "\n"
+    """JSON as the results folder holds it: what holds no further list or object stands in one line."""
+    text = json.dumps(plain(content), indent=1, allow_nan=False) + "\n"
+    return re.sub(r"[\[{][^\[\]{}]*[\]}]", lambda found: re.sub(r"\s*\n\s*", " ", found[0]), text)
+
+
+def columns(rows: Sequence[Mapping], digits: int = 5) -> dict:
+    """Many rows with the same keys as {"columns", "values"}, numbers rounded to so many digits; a row that lacks a key has None.
+
+    >>> columns([{"a": 1, "b": 0.123456}, {"a": 2}])
+    {'columns': ['a', 'b'], 'values': [[1, 0.12346], [2, None]]}
+    """
+    keys = list(dict.fromkeys(key for row in rows for key in row))
+
+    def short(value: Any) -> Any:
+        return float(f"{value:.{digits}g}") if isinstance(value, float) and math.isfinite(value) else value
+
+    return {"columns": keys, "values": [[short(row.get(key)) for key in keys] for row in rows]}
+
+
+def rows_of(found: Mapping) -> list[dict]:
+    """The rows that `columns` made."""
+    return [dict(zip(found["columns"], values, strict=True)) for values in found["values"]]
 
 
 def plain(value: Any) -> Any:

@@ -11,8 +11,10 @@ from pathlib import Path
 
 from tqdm import tqdm
 
+from bench import facts as facts_of
 from bench import metrics, recordings, results, systems
 from bench.cache import Cache
+from bench.facts import facts
 from bench.metrics import Judges
 from bench.recogniser import Recogniser
 from bench.recordings import Clip, NotHere
@@ -35,7 +37,7 @@ class Setup:
 def run(
     clips: Sequence[Clip], rows: Sequence[systems.System], setup: Setup, jobs: int = 1, scheduler: str | None = None
 ) -> list[dict]:
-    """A row of figures for each clip and system: set, room, clip, speaker, place, system, and what `metrics.score` gives.
+    """A row of figures for each clip and system: set, room, clip, speaker, place, text, facts, system, and what `metrics.score` gives.
 
     "absent" with the reason, or the "problem" that made an output unusable, in place of figures. What is done is kept at
     once: a row under its clip and code, a transcript or AECMOS under the sound itself. So a run that was cut off goes on
@@ -63,6 +65,7 @@ def _work(setup: Setup, task: tuple[Clip, tuple[str, ...]]) -> tuple[str, list[d
     (clip, names), (known, kept, judging) = task, _opened(setup.cache, setup.whisper, tuple(setup.networks.items()))
     asked = judging.recogniser.identity if judging.recogniser else "no recogniser"
     about = {"set": clip.set, "room": clip.room, "clip": clip.name, "speaker": clip.speaker, "place": clip.place}
+    about |= {"text": clip.text, "facts": kept.get(lambda: facts(clip), "facts", clip.fingerprint, _scoring())}
     rows = []
     for name in names:
         system = known[name]
@@ -102,4 +105,6 @@ def _code(system: systems.System) -> str:
 
 @lru_cache(maxsize=1)
 def _scoring() -> str:
-    return results.code_digest([Path(str(metrics.__file__))]) + " ".join(map(systems.version, SCORING))
+    return results.code_digest([Path(str(module.__file__)) for module in (metrics, facts_of)]) + " ".join(
+        map(systems.version, SCORING)
+    )
