@@ -2,7 +2,7 @@ r"""How often hidden effects are named, and whether what is named makes the runn
 
     python -m bench diagnosis names --cases DIR ... --output bench/results/diagnosis
     python -m bench diagnosis proof --cases DIR ... --real DIR ... --output bench/results/diagnosis
-    python -m bench diagnosis run-time --voices ROBOT/test --speech HUMAN/test --count 8 \
+    python -m bench diagnosis run-time --voices ROBOT/test --speech HUMAN/test --count 8 --seed 41 \
         --output bench/results/diagnosis --page docs/effects_at_run_time.md
 
 names, proof: --cases are folders of cases as bench.simulate.hidden_cases and bench.simulate.wild write them; proof needs

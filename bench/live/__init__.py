@@ -4,8 +4,8 @@ r"""Robots that talk, move and are interrupted: on virtual devices in real time,
     python -m bench live soak --minutes 60                    faster than real time; --one-way: the clocks go on drifting
     python -m bench live hour --minutes 60                    the same on virtual devices
     python -m bench live click                                from a click to the filtered click
-    python -m bench live barge-in --voices ROBOT/test --speech HUMAN/test --count 24 --whisper WHISPER \
-        --alone ROBOT/test SYNTHESIZERS --minutes 60 --real RECORDINGS
+    python -m bench live barge-in --voices ROBOT/test --speech HUMAN/test --count 24 --seed 17 \
+        --whisper WHISPER --alone ROBOT/test SYNTHESIZERS --minutes 60 --real RECORDINGS
     python -m bench live day --voices ROBOT/test --speech HUMAN/test --minutes 60
     python -m bench live rooms --voices ROBOT/test --count 16
 

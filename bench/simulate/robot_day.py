@@ -178,7 +178,9 @@ def make_day(seed: int, minutes: float, voices: list[Clip], speech: list[Clip]) 
     mic = np.float32(microphone.gain) * echo + clean + fan
     sweeps = calibration(rng, robot, stages[0].room, microphone)
     names = tuple(stage.name for stage in stages)
-    speech_s, distinct_s = (sum(seconds for _, seconds in of) for of in (repertoire.said, dict.fromkeys(repertoire.said)))
+    speech_s, distinct_s = (
+        sum(seconds for _, seconds in of) for of in (repertoire.said, dict.fromkeys(repertoire.said))
+    )
     return Day(ref, mic, clean, fan, sweeps, names, tuple(begins), tuple(told), speech_s, distinct_s)
 
 
