@@ -88,3 +88,21 @@ def server(sinks: Sequence[str] = SINKS) -> Iterator[Server]:
         if started:
             started.stop()
         shutil.rmtree(folder, ignore_errors=True)
+
+
+def memory_mb(pid: int | str = "self") -> float:
+    """Resident memory of a process now, MB (Linux); 0 where it has ended."""
+    try:
+        return int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * 4096 / 2**20
+    except (FileNotFoundError, ProcessLookupError):
+        return 0.0
+
+
+def children_mb(pid: int) -> float:
+    """The same of all processes that it started, and that these started: of a running filter, the learner's."""
+    try:
+        listed = [path.read_text().split() for path in Path(f"/proc/{pid}/task").glob("*/children")]
+    except (FileNotFoundError, ProcessLookupError):
+        return 0.0
+    children = [int(child) for some in listed for child in some]
+    return sum(memory_mb(child) + children_mb(child) for child in children)
