@@ -93,7 +93,7 @@ def find_clips(options: argparse.Namespace) -> list[Clip]:
         alone = [one for one in own if one.kind == "farend"]
         if alone and alone[0].name.removeprefix(f"{device}_").isdigit():
             cells = Cells(options.levels, (min(options.before),))
-            laid = recordings.lay(alone, options.speech, None, cells, options.cases, options.seed)
+            laid = recordings.lay(alone, options.speech, cells, options.cases, options.seed)
         else:
             laid = [human for one in alone for human in recordings.lay_once(
                 one, options.speech, options.humans, options.ser, options.before, options.seed)]  # fmt: skip

@@ -146,7 +146,7 @@ def _real(folder: Path, options: argparse.Namespace) -> Iterator[Clip]:
     kept = [one for one in laid_on if not one.tuned_on]
     if kept and options.speech:
         cells = Cells(options.ser, options.before)
-        laid = recordings.lay(kept, options.speech, None, cells, options.cases, options.seed)
+        laid = recordings.lay(kept, options.speech, cells, options.cases, options.seed)
         yield from recordings.laid_clips(laid, options.speech, "real loudspeaker")
 
 

@@ -277,17 +277,6 @@ def ratio_interval(
     return float(low), float(high)
 
 
-def interval(statistic: Callable[..., np.ndarray], *columns: Sequence[float]) -> tuple[float, float]:
-    """95 % percentile bootstrap interval (Efron & Tibshirani 1993, ch. 13) over utterances, with a fixed seed.
-
-    columns: (n,) each, resampled together; statistic maps (RESAMPLES, n) arrays to (RESAMPLES,).
-    """
-    arrays = [np.asarray(column, np.float64) for column in columns]
-    draws = np.random.default_rng(0).integers(0, arrays[0].size, size=(RESAMPLES, arrays[0].size))
-    low, high = np.percentile(statistic(*(array[draws] for array in arrays)), [2.5, 97.5])
-    return float(low), float(high)
-
-
 def wilson(hits: int, n: int) -> tuple[float, float]:
     """95 % interval of a proportion (Wilson 1927), as numbers from 0 to 1.
 

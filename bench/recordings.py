@@ -202,8 +202,7 @@ class Laid:
     """A human laid on a recording without one.
 
     at: sample of the recording at which the human begins. before: seconds of robot that are played first. ser: power of
-    the human over that of the microphone's recording while the human speaks, dB. noise, noise_at, noise_db: a fan's
-    file, its first sample, and its power against the mean power of the recording, dB.
+    the human over that of the microphone's recording while the human speaks, dB.
     """
 
     case: int
@@ -213,9 +212,6 @@ class Laid:
     text: str
     ser: float
     before: float
-    noise: Path | None = None
-    noise_at: int = 0
-    noise_db: float = 0.0
 
     @property
     def name(self) -> str:
@@ -229,9 +225,6 @@ class Laid:
         laid = np.zeros_like(mic)
         laid[span] = human * np.sqrt(np.mean(mic[span] ** 2) / np.mean(human**2)) * 10 ** (self.ser / 20)
         mic += laid
-        if self.noise:
-            fan = looped(read(self.noise), self.noise_at, mic.size)
-            mic += fan * np.sqrt(np.mean(echo.astype(np.float64) ** 2) / np.mean(fan**2)) * 10 ** (self.noise_db / 20)
         # a converter's range holds all of it: turned down together where it would not
         full = max(1.0, float(np.abs(mic).max()))
         return Signals((mic / full).astype(np.float32), ref[begin:end], (laid / full).astype(np.float32), span)
@@ -244,32 +237,23 @@ def _echo(recording: Recording) -> Signals:
 
 @dataclass(frozen=True)
 class Cells:
-    """Every case is laid on at every SER (dB), after every time of robot alone (s), without and with a fan."""
+    """Every case is laid on at every SER (dB), after every time of robot alone (s)."""
 
     sers: tuple[float, ...] = (0.0, -10.0, -20.0, -26.0)
     befores: tuple[float, ...] = (5.0,)
-    noise_db: float = -30.0
 
 
-def lay(
-    recordings: Sequence[Recording], speech: Path, noise: Path | None, cells: Cells, cases: int, seed: int
-) -> list[Laid]:
-    """Cases humans on the recordings in turn; case i of a seed has the same human, place and fan in all cells."""
-    utterances, fans = transcripts(speech), _fans(noise)
-    rng = np.random.default_rng(seed)
-    order = rng.permutation(len(utterances))
+def lay(recordings: Sequence[Recording], speech: Path, cells: Cells, cases: int, seed: int) -> list[Laid]:
+    """Cases humans on the recordings in turn; case i of a seed has the same human and place in all cells."""
+    spoken, rng = transcripts(speech), np.random.default_rng(seed)
+    order = rng.permutation(len(spoken))
     laid = []
     for case in range(cases):
-        recording, spoken = recordings[case % len(recordings)], utterances[order[case % order.size]]
-        at = place(recording, soundfile.info(spoken.path).frames, max(cells.befores), rng)
-        fan = fans[rng.integers(len(fans))] if fans else None
-        fan_at = int(rng.integers(1 << 20))
-        for noise_file in (None, fan) if fan else (None,):
-            for before in cells.befores:
-                laid += [
-                    Laid(case, recording, at, spoken.path, spoken.text, ser, before, noise_file, fan_at, cells.noise_db)
-                    for ser in cells.sers
-                ]
+        recording, one = recordings[case % len(recordings)], spoken[order[case % order.size]]
+        at = place(recording, soundfile.info(one.path).frames, max(cells.befores), rng)
+        laid += [
+            Laid(case, recording, at, one.path, one.text, ser, before) for before in cells.befores for ser in cells.sers
+        ]
     return laid
 
 
@@ -337,15 +321,6 @@ def transcripts(folder: Path) -> list[Utterance]:
         raise UsageError(
             f"{table} names no utterance of {low:.0f} to {high:.0f} s with a text, expected some: give another folder"
         )
-    return found
-
-
-def _fans(folder: Path | None) -> list[Path]:
-    if folder is None:
-        return []
-    found = sorted(path for path in folder.rglob("*") if path.suffix in AUDIO)
-    if not found:
-        raise UsageError(f"{folder} holds no noise ({', '.join(AUDIO)}), expected recordings of fans")
     return found
 
 

@@ -21,7 +21,7 @@ from bench import denoisers, peers, results, voicefilter
 from bench.recordings import Clip, NotHere, Signals
 from edgefilter import EgoFilter, Event, PathLearner, Profile
 from edgefilter.dsp.stft import StftConfig
-from edgefilter.engines import CATALOGUE, HAVE_MODEL, create
+from edgefilter.engines import HAVE_MODEL, create
 from edgefilter.errors import EdgefilterError, UsageError
 from edgefilter.filter.echo_path import PathState
 from edgefilter.filter.learner import Heard, Learner, Lesson
@@ -156,26 +156,29 @@ def run_engine(
     return Output(out, ego.events(), [value or 0.0 for value in probability], ego.hop)
 
 
-def _own(
-    engine: str, way: str, model: Path | None = None, name: str = "", title: str = "", kind: str = "own"
-) -> System:
+def _own(engine: str, way: str, model: Path | None = None, name: str = "", title: str = "", train: str = "") -> System:
+    """A row of an engine of the package. title: of a row of the source paper. train: what makes a model that is missing."""
     wanted = row(engine + way)
-    knows = ("calibration" if wanted.calibrated else "neither") if not wanted.learning else WAYS[way]
+    kind = "paper" if title else "own"
+    must = wanted.calibrated and (model is None or kind == "paper")
 
     def run(clip: Clip) -> Output:
         profile = clip.profile if wanted.calibrated else None
-        if wanted.calibrated and profile is None and kind == "own" and model is None:
+        if must and profile is None:
             raise NotHere("no calibration of this device")
         learner = _lessons(clip.fingerprint, profile) if wanted.learning else None
         return run_engine(wanted, clip.signals, profile, learner, model)
 
     def missing() -> object:
+        if model and not model.is_file():
+            raise NotHere(f"no {model.name} in {model.parent.name}/" + (f": train one with {train}" if train else ""))
         return create(engine, model=model) if engine in HAVE_MODEL else None
 
+    knows = WAYS[way] if wanted.learning else "calibration" if wanted.calibrated else "neither"
     title = title or (f"{engine} with network {name.partition(':')[2]}" if model else f"{engine}, {WAYS[way]}")
-    return System(
-        name or engine + way, title, kind, run, knows, _latency_ms(engine), missing, partial(_engine_code, engine, model), model
-    )  # fmt: skip
+    late = None if engine == "paper-crnn" else _latency_ms(engine)  # whole clips
+    code = partial(_engine_code, engine, model)
+    return System(name or engine + way, title, kind, run, knows, late, missing, code, model)
 
 
 def _engine_code(engine: str, model: Path | None = None) -> str:
@@ -242,39 +245,13 @@ def _lessons(recording: str, profile: Profile | None) -> _Kept:
 
 
 def _paper() -> list[System]:
-    rows = [_voicefilter(), _lite()]
-    late = {"paper-ss": "SS before post-filtering", "paper-crnn": "CRNN of the paper's shape"}
-    for name, title in late.items():
-        if name in CATALOGUE:
-            rows.append(_calibrated(_own(name, "", title=title, kind="paper")))
+    rows = [_voicefilter(), _lite(), _own("paper-ss", "", title="SS before post-filtering")]
+    rows.append(_own("paper-crnn", "", title="CRNN of the paper's shape"))
     for name, (differs, option) in NARROW.items():
-        path = MODELS / f"{name.replace('-', '_')}.onnx"
         title = f"CRNN of the paper's shape, narrower (1.8 of 34 M parameters){differs}"
-        found = _calibrated(_own("paper-crnn", "", path, name, title, "paper"))
-        rows.append(
-            _needs(found, path, f"python -m export.train --network paper --filters 16 2 --lstm 80 --hidden 150{option}")
-        )
+        train = f"python -m export.train --network paper --filters 16 2 --lstm 80 --hidden 150{option}"
+        rows.append(_own("paper-crnn", "", MODELS / f"{name.replace('-', '_')}.onnx", name, title, train))
     return rows
-
-
-def _calibrated(found: System) -> System:
-    """The row, for clips that have a calibration only."""
-
-    def run(clip: Clip) -> Output:
-        if clip.profile is None:
-            raise NotHere("no calibration of this device")
-        return found.run(clip)
-
-    return System(**{**found.__dict__, "run": run, "latency_ms": None if "crnn" in found.name else found.latency_ms})
-
-
-def _needs(found: System, path: Path, command: str) -> System:
-    def missing() -> object:
-        if not path.is_file():
-            raise NotHere(f"no {path.name} in {path.parent.name}/: train one with {command}")
-        return found.missing()
-
-    return System(**{**found.__dict__, "missing": missing})
 
 
 def _voicefilter() -> System:

@@ -92,7 +92,7 @@ def streams(options: argparse.Namespace) -> Iterator[Listened]:
     for recording in progress(options.alone, "alone"):
         yield listened("real", recording.signals(), None)
     if options.alone:
-        laid = recordings.lay(options.alone, options.speech, None, Cells(), options.cases, options.seed)
+        laid = recordings.lay(options.alone, options.speech, Cells(), options.cases, options.seed)
         for one in progress(laid, "laid"):
             yield listened("real", one.signals(), None)._replace(ser=one.ser)
     sets = recordings.find_conversations(options.conversations)

@@ -191,7 +191,7 @@ def cases(options: argparse.Namespace) -> list[Case]:
             found.append(Case(f"{name} {clip.room}", clip, clip.profile))
             found += [Case(f"{name} {clip.room}{COLD}", clip, None)] * options.cold
     if options.alone:
-        laid = recordings.lay(options.alone, options.speech, None, REAL, options.cases, options.seed)
+        laid = recordings.lay(options.alone, options.speech, REAL, options.cases, options.seed)
         clips = recordings.named(recordings.laid_clips(laid, options.speech, LAID), "real")[:: options.every][
             : options.limit
         ]

@@ -120,11 +120,3 @@ def speech(tmp_path: Path) -> Path:
         lines.append(f"{index}.wav\t{index}\t3.50\tone two three")
     (folder / "transcripts.tsv").write_text("\n".join(lines) + "\n")
     return folder
-
-
-@pytest.fixture
-def noise(tmp_path: Path) -> Path:
-    folder = tmp_path / "noise"
-    folder.mkdir()
-    sf.write(folder / "fan.wav", bursts(30, 1), RATE)
-    return folder

@@ -74,33 +74,6 @@ def test_an_item_does_not_depend_on_how_many_are_made(clips: Path, live: Path, t
         np.testing.assert_array_equal(read(tmp_path / "again" / "lab_00", name), read(live / "lab_00", name))
 
 
-def test_rooms_and_levels_as_published(clips: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    rooms = [conversations.room_of(i, published=True) for i in range(80)]
-    assert rooms.count("lab") == 18 and "lab" in rooms[:1] and "lab" in rooms[70:]  # 1800 of 8000, spread over all
-    assert conversations.PUBLISHED_DB == {"lab": (-22.0, 3.28), "office": (-26.3, 4.29)}  # the paper's Table 2
-    monkeypatch.setattr(conversations, "PUBLISHED_DB", {"office": (-20.0, 0.0)})
-    monkeypatch.setattr(conversations, "UNFILTERED_DB", {"office": (-26.0, 0.0)})
-    speech, voices = conversations.read_clips(clips, (3.0, 12.0)), conversations.read_voices([clips])
-    loud, soft = (
-        conversations.make_scene(7, 1, "paper", speech, voices, published=published).signals["clean"]
-        for published in (True, False)
-    )
-    np.testing.assert_allclose(loud, 10 ** (6 / 20) * soft, atol=1e-9)
-
-
-def test_lost_packets_are_silent_where_the_notes_say_and_nothing_else_changes(clips: Path) -> None:
-    speech, voices = conversations.read_clips(clips, (3.0, 12.0)), conversations.read_voices([clips])
-    whole, lossy = (conversations.make_scene(7, 0, "paper", speech, voices, lost=share) for share in (0.0, 0.1))
-    np.testing.assert_array_equal(whole.signals["ref"], lossy.signals["ref"])
-    ref, lost, lag = lossy.signals["ref"], lossy.meta["lost"], lossy.meta["lag"]
-    loud = np.add.reduceat(ref**2, np.arange(0, ref.size, 320)) > 1e-3 * np.mean(ref**2) * 320
-    assert len(lost) == pytest.approx(0.1 * loud.sum(), rel=0.6) and "lost" not in whole.meta
-    heard = conversations.played(ref, lossy.meta)
-    assert not any(heard[lag + first : lag + first + 320].any() for first in lost)
-    changed = np.flatnonzero(heard != conversations.played(ref, whole.meta)) - lag
-    assert set(changed // 320 * 320) == set(lost)
-
-
 def test_folder_without_transcripts_is_refused(tmp_path: Path) -> None:
     with pytest.raises(SystemExit, match="transcripts.tsv is missing"):
         conversations.read_clips(tmp_path, (3.0, 12.0))

@@ -9,7 +9,7 @@ import pytest
 
 from bench import metrics
 from bench.cache import Cache
-from bench.metrics import difference, excess_db, first_sound, in_time, interval, mean, noticed, pooled, replay
+from bench.metrics import difference, excess_db, first_sound, in_time, mean, noticed, pooled, replay
 from bench.recogniser import Recogniser, WordErrors, normalise, word_errors
 from bench.systems import Output
 from edgefilter.errors import UsageError
@@ -73,15 +73,6 @@ def test_a_line_that_is_appended_after_a_cut_one_is_known(tmp_path: Path) -> Non
     again = Cache(tmp_path)
     assert again.get(lambda: pytest.fail("made again"), "one", np.zeros(3)) == {"a": 0.5, "b": None}
     assert again.get(lambda: "other", "one", np.zeros(4)) == "other"
-
-
-def test_bootstrap_interval_has_the_width_of_the_standard_error() -> None:
-    x = np.random.default_rng(5).standard_normal(400)
-    low, high = interval(lambda sample: sample.mean(axis=1), x)
-    assert high - low == pytest.approx(
-        2 * 1.96 * x.std() / 20, rel=0.08
-    )  # 2000 draws give a quantile to a few per cent
-    assert interval(lambda sample: sample.mean(axis=1), x) == (low, high)
 
 
 def test_clusters_are_drawn_and_not_recordings() -> None:

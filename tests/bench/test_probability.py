@@ -2,19 +2,20 @@
 
 import numpy as np
 import pytest
-from bench.measure.barge_in_fit import (
+from scipy.special import expit
+
+from bench import results
+from bench.training.probability import (
     HUMAN_SHARE,
     Listened,
     audible,
     curve,
     fitted,
-    markdown,
     platt,
     reliability,
     sparing,
+    tables,
 )
-from scipy.special import expit
-
 from edgefilter.filter.barge_in import CENTRE, SLOPE, BargeInSettings
 
 
@@ -75,9 +76,10 @@ def test_the_curve_counts_false_starts_an_hour_and_who_is_noticed(known):
     }
     as_it_is = curve([alone, human, late], 3.25, 1.25)
     curves = {"curve_before": as_it_is, "curve": list(points.values())}
-    page = markdown({"real": {**found, **curves, "humans": 2, "audible": 1}})
-    assert "| real | 1.00 | 1.20 | 0.97 | 0.96 | 2.29 |" in page
-    assert "| 0.7 | 0 | 50 | 2 | 50 |" in page and "Of 2 humans 1 can be noticed so soon" in page
+    fits, _, by_threshold = tables({"real": {**found, **curves, "humans": 2, "audible": 1}})
+    assert [results.cell(x, 2) for x in fits["rows"][0][:6]] == ["real", "1.00", "1.20", "0.97", "0.96", "2.29"]
+    assert [results.cell(x, 0) for x in by_threshold["rows"][1][1:]] == ["0", "50", "2", "50"]
+    assert by_threshold["text"].startswith("Of 2 humans 1 can be noticed so soon")
 
 
 def test_who_begins_with_a_breath_cannot_be_noticed_in_time():
