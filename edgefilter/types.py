@@ -16,6 +16,8 @@ SAMPLE_RATE = 16000
 PRE_ROLL = 64
 """Samples (4 ms) of the impulse response before the direct sound: what equalisers and linear-phase filters of a
 loudspeaker ring ahead of it."""
+LOUDEST = 1e6
+"""Largest sample that is taken, 120 dB over full scale: no recording is louder, and powers stay within float32."""
 
 Array: TypeAlias = NDArray[np.floating]
 Samples: TypeAlias = NDArray[np.float32]
@@ -181,7 +183,10 @@ class Stats(TypedDict):
 
 
 def as_samples(x: object, name: str) -> Samples:
-    """Return x as a finite (n,) float32 array, contiguous, without writing into it; raise SignalError otherwise."""
+    """Return x as an (n,) float32 array, contiguous, without writing into it.
+
+    Raises SignalError for another shape or dtype, and for samples that are not finite or louder than LOUDEST.
+    """
     array = np.asarray(x)
     if array.dtype.kind != "f":
         raise SignalError(
@@ -190,9 +195,14 @@ def as_samples(x: object, name: str) -> Samples:
     if array.ndim != 1:
         raise SignalError(f"{name} has shape {array.shape}, expected one channel of shape (n,)")
     array = np.ascontiguousarray(array, np.float32)
-    if not math.isfinite(array.dot(array)) and not np.isfinite(array).all():
-        bad = int(np.argmin(np.isfinite(array)))
-        raise SignalError(
-            f"{name} holds {array[bad]} at sample {bad}, expected finite samples: repair or cut the recording"
-        )
+    with np.errstate(over="ignore", invalid="ignore"):
+        power = array.dot(array)
+    if not power < LOUDEST**2:  # what is below it as a whole is so in every sample, and this is cheap
+        good = np.abs(array) <= LOUDEST
+        if not good.all():
+            bad = int(np.argmin(good))
+            expected = "samples of a full scale of 1: its scaling is wrong"
+            if not math.isfinite(array[bad]):
+                expected = "finite samples: repair or cut the recording"
+            raise SignalError(f"{name} holds {array[bad]:g} at sample {bad}, expected {expected}")
     return array

@@ -7,7 +7,7 @@ import json
 import random
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 
@@ -22,8 +22,7 @@ from edgefilter.echo.effect import complete
 from edgefilter.echo.effects.catalogue import EFFECTS
 from edgefilter.engines.crnn import Crnn
 from edgefilter.engines.paper_crnn import PaperCrnn
-from edgefilter.filter import budget_cache
-from edgefilter.filter.budget import KINDS, Figures, fits
+from edgefilter.filter import budget
 from edgefilter.learning.path_learner import PathLearner
 from edgefilter.profile.data import LEARNED
 from edgefilter.types import SAMPLE_RATE, Frame
@@ -148,10 +147,9 @@ def attempt_learning(path: Path, rng: random.Random) -> None:
 
 
 def caches() -> list[bytes]:
-    figures = {"ss": Figures(**{name: kind() for name, kind in KINDS.items()})}
-    trouble = budget_cache.keep(ABOUT, {name: asdict(each) for name, each in figures.items()})
+    trouble = budget.keep(ABOUT, {"ss": budget.Figures("ss", "", 16.0, 300, True, 1.0, 2.0, 3.0, 4.0)})
     expect(trouble is None, str(trouble))
-    return [(budget_cache.folder() / budget_cache.FILE).read_bytes()]
+    return [budget.timings().read_bytes()]
 
 
 ABOUT = {"held_to": 1}
@@ -159,12 +157,12 @@ ABOUT = {"held_to": 1}
 
 def attempt_cache(path: Path, rng: random.Random) -> None:
     """The file is put where the cache is; whatever it holds, the program goes on."""
-    kept = budget_cache.folder() / budget_cache.FILE
+    kept = budget.timings()
     kept.parent.mkdir(parents=True, exist_ok=True)
     kept.write_bytes(path.read_bytes())
     told: list[str] = []
-    for figures in budget_cache.recall(ABOUT, KINDS, told.append).values():
-        fits(Figures(**figures), 8.0)
+    for figures in budget.recall(ABOUT, told.append).values():
+        budget.fits(figures, 8.0)
     expect(not any("\n" in line for line in told), "more than one line")
 
 

@@ -13,12 +13,10 @@ import soundfile
 import soxr
 
 from edgefilter.errors import AudioFileError
-from edgefilter.types import SAMPLE_RATE, Array, Samples
+from edgefilter.types import LOUDEST, SAMPLE_RATE, Array, Samples
 
 _RATES = range(1000, 768001)
 _ENDLESS = 0x7FFFF000  # writers to a pipe put sizes from here up into the header because they cannot know better
-_LOUDEST = 1e6
-"""No recording is 120 dB over full scale; squares of more do not fit into float32 for long."""
 _VALUES = 1 << 16  # samples times channels that are in memory at a time
 
 
@@ -141,7 +139,7 @@ class Reader:
                     f" of channel {channel + 1}" if self.channels > 1 else ""
                 )
                 raise self._error(f"holds {data[at, channel]} {where}, expected finite samples: repair or cut it")
-            if np.abs(data).max() > _LOUDEST:
+            if np.abs(data).max() > LOUDEST:
                 loudest = data.flat[np.abs(data).argmax()]
                 raise self._error(f"holds {loudest:g}, expected samples of a full scale of 1: its scaling is wrong")
             self.silent = self.silent and not data.any()

@@ -8,8 +8,7 @@ from pathlib import Path
 from edgefilter.commands.display import say
 from edgefilter.engines import HAVE_LINEAR_STAGE
 from edgefilter.errors import UsageError
-from edgefilter.filter.budget import DEFAULT_MS, Choice, choose
-from edgefilter.filter.budget_cache import forget
+from edgefilter.filter.budget import DEFAULT_MS, Choice, choose, forget
 from edgefilter.filter.ego_filter import EgoFilter
 from edgefilter.filter.learner import Learner
 from edgefilter.learning.background import LEAST_CORES, BackgroundLearner, cores

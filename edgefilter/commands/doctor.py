@@ -13,7 +13,6 @@ import numpy as np
 from edgefilter.audio import pulse, virtual
 from edgefilter.commands.display import write_json
 from edgefilter.engines import create
-from edgefilter.engines.onnx_file import SHIPPED, digest
 from edgefilter.errors import EdgefilterError
 from edgefilter.filter.budget import DEFAULT_MS
 from edgefilter.filter.ego_filter import EgoFilter
@@ -85,8 +84,8 @@ def _model() -> Iterator[Check]:
     model = getattr(create("crnn"), "model", None)
     if model is None:
         return
-    found = f"{model.path}, sha256 {digest(model.path)[:12]}"
-    if model.path.name in SHIPPED and digest(model.path) == SHIPPED[model.path.name]:
+    found = f"{model.path}, sha256 {model.sha256[:12]}"
+    if model.shipped:
         yield Check("model", "ok", f"{found}, as shipped")
     else:
         yield Check(

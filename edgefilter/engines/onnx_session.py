@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import math
 import os
@@ -12,7 +13,6 @@ from pathlib import Path
 import numpy as np
 
 from edgefilter.dsp.stft import StftConfig
-from edgefilter.engines.onnx_file import check_shipped, read_model
 from edgefilter.errors import ModelError, StftError
 from edgefilter.types import SAMPLE_RATE
 
@@ -24,8 +24,17 @@ except Exception as error:  # a broken installation raises what its binary part 
 
 FOLDERS = (Path(__file__).parents[1] / "models", Path(__file__).parents[2] / "models")
 """Where models lie: inside the installed package, or at the top of a checkout."""
-MOST_STATE, MOST_FFT = 1 << 22, 1 << 14
-"""Values in one state tensor at most, 16 MiB; the longest transform, a second."""
+SHIPPED = {
+    "crnn.onnx": "ab3b1c9ea0a1e5601f4942aa8ad161852121db9af3c2cad511e95df6a6ec571a",
+    "crnn_int8.onnx": "43b32629814fba62d568eb0162784cf4f8a1621643e64a69f109321e524c6872",
+}
+"""sha256 of the files in models/, as MODELS.md lists them."""
+MOST_BYTES, MOST_STATE, MOST_FFT = 512 * 2**20, 1 << 22, 1 << 14
+"""Bounds on what a file may ask for: its own size, the values in one state tensor (16 MiB), the longest transform (1 s)."""
+
+OTHER_FILES = b"location"
+"""The key (ExternalDataProto of onnx.proto) without which no tensor can name another file; onnxruntime before 1.24 opens
+any path there, and 1.32 those below the working directory."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,11 +42,17 @@ class Model:
     """A model file that was found to fit. training and figures are what it says about itself."""
 
     path: Path
+    sha256: str
     session: onnxruntime.InferenceSession
     stft: StftConfig
     training: Mapping[str, object]
     figures: Mapping[str, object]
     states: tuple[tuple[str, tuple[int, ...]], ...]
+
+    @property
+    def shipped(self) -> bool:
+        """Whether it is, bit by bit, one of the files that edgefilter was tested with."""
+        return self.sha256 in SHIPPED.values()
 
     def describe(self) -> dict[str, object]:
         """Ready for JSON."""
@@ -67,7 +82,7 @@ class FixedPlaces:
 def find_model(given: str | Path | None, variable: str, name: str, remedy: str) -> Path:
     """The model file to use: the given one, else the environment variable's, else the package's own.
 
-    Raises ModelError.
+    Raises ModelError where there is none, or where the package's own is not the one that edgefilter was tested with.
     """
     chosen = given or os.environ.get(variable)
     if chosen:
@@ -77,19 +92,23 @@ def find_model(given: str | Path | None, variable: str, name: str, remedy: str) 
             raise ModelError(f"model {path}{origin} is no file: {remedy}")
         return path
     for folder in FOLDERS:
-        if (folder / name).is_file():
-            check_shipped(folder / name)
-            return folder / name
+        path = folder / name
+        if path.is_file():
+            if name in SHIPPED and _sha256(_read(path)) != SHIPPED[name]:
+                raise ModelError(
+                    f"model {path} is not the one that belongs to this edgefilter (its sha256 is another): reinstall"
+                    " edgefilter, or name a model of your own with --model"
+                )
+            return path
     raise ModelError(f"there is no {name} in {FOLDERS[0]}: {remedy}, or name one with --model or {variable}")
 
 
-def open_session(path: Path) -> onnxruntime.InferenceSession:
+def open_session(path: Path, content: bytes | None = None) -> onnxruntime.InferenceSession:
     """A session on one core: frames are too small to share, and a second thread that spins costs a whole core.
 
-    Denormal numbers count as zero in the thread that makes the session. Raises ModelError where the file is no ONNX
-    model, or one that leads out of its file (onnx_file.py).
+    content: of the file, where it was read before. Denormal numbers count as zero in the thread that makes the session.
+    Raises ModelError for what is no ONNX model, asks for operators of other libraries, or has weights in other files.
     """
-    content = read_model(path)
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = options.inter_op_num_threads = 1
     options.execution_mode = onnxruntime.ExecutionMode.ORT_SEQUENTIAL
@@ -98,6 +117,9 @@ def open_session(path: Path) -> onnxruntime.InferenceSession:
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
     options.add_session_config_entry("session.inter_op.allow_spinning", "0")
     options.add_session_config_entry("session.set_denormal_as_zero", "1")
+    content = _read(path) if content is None else content
+    if OTHER_FILES in content:
+        raise ModelError(f"model {path} takes its weights from other files, expected them inside: export it again")
     try:
         # a fallback would print, and try the same again
         session = onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"], enable_fallback=0)
@@ -111,7 +133,8 @@ def open_session(path: Path) -> onnxruntime.InferenceSession:
 
 def open_model(path: Path, kind: str, version: int) -> Model:
     """Open a model and refuse it where its metadata is not that of a `kind` of this version at the package's sampling rate."""
-    session = open_session(path)
+    content = _read(path)
+    session = open_session(path, content)
     said = session.get_modelmeta().custom_metadata_map
     _expect(path, "type", said.get("type"), kind)
     _expect(path, "version", said.get("version"), str(version))
@@ -132,7 +155,7 @@ def open_model(path: Path, kind: str, version: int) -> Model:
         raise ModelError(f"model {path} does not say its {error.args[0]}: export it again") from None
     except (ValueError, TypeError, StftError, RecursionError, OverflowError) as error:
         raise ModelError(f"model {path} has unusable metadata ({plain(str(error))}): export it again") from None
-    return Model(path, session, stft, training, figures, states)
+    return Model(path, _sha256(content), session, stft, training, figures, states)
 
 
 def expect_slots(model: Model, inputs: Mapping[str, tuple], outputs: Mapping[str, tuple]) -> None:
@@ -167,6 +190,20 @@ def expect_answer(path: Path, answer: Callable[[], Iterable[np.ndarray]]) -> Non
 def plain(text: str, most: int = 160) -> str:
     """What a file or a library says, fit for one line."""
     return " ".join(text.split())[:most]
+
+
+def _read(path: Path) -> bytes:
+    """The bytes of a model file; raises ModelError where it cannot be read, or is larger than any model."""
+    try:
+        if (size := path.stat().st_size) > MOST_BYTES:
+            raise ModelError(f"model {path} is {size} bytes long, expected at most {MOST_BYTES}: export it again")
+        return path.read_bytes()
+    except OSError as error:
+        raise ModelError(f"model {path} cannot be read ({error.strerror}): check the path") from None
+
+
+def _sha256(content: bytes) -> str:
+    return hashlib.sha256(content).hexdigest()
 
 
 def _may_be(found: Sequence[int | str | None], wanted: Sequence[int | str]) -> bool:

@@ -1,24 +1,27 @@
-"""Which engine this machine can bear: the real path measured at the real pace on two cores, and the choice with its reason."""
+"""Which engine this machine can bear: the real path measured at the real pace on two cores, remembered, and the choice with its reason."""
 
 from __future__ import annotations
 
 import hashlib
+import json
 import os
+import platform
 import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import get_type_hints
 
 import numpy as np
+import platformdirs
 import soundfile
 
 from edgefilter import engines
 from edgefilter.engines.base import ClipEngine, Engine
 from edgefilter.engines.ladder import CANDIDATES
 from edgefilter.errors import EdgefilterError, UsageError
-from edgefilter.filter import budget_cache
 from edgefilter.filter.stream import Stream
 from edgefilter.profile.data import Profile
 from edgefilter.types import SAMPLE_RATE, Samples
@@ -27,14 +30,13 @@ DEFAULT_MS = 8.0
 """Compute per hop that is allowed unless the user says otherwise: half of a 16 ms hop."""
 CORES = 2
 WARM_UP, PACED = 32, 300
-"""Hops that are not counted, and hops at the real pace; as many again back to back."""
-WARM_UP_S, PACED_S, AT_ONCE_S = 0.2, 5.2, 0.4
-"""Longest time for each kind of hops, seconds."""
-PASSING = 0.5
-"""Share of the budget within which the median of an engine whose p99 is beyond it may be another program's fault: it is
-measured a second time. Where it was not, the filter steps down while it runs."""
+"""Hops that are not counted, and hops at the real pace."""
+LATE_S = 0.4
+"""An engine that has fallen so far behind the real pace is not measured any longer."""
 AGAIN = " (measured before; --remeasure does it again)"
 SCENE = Path(__file__).parents[1] / "demo_data"
+PACKAGES = ("edgefilter", "numpy", "scipy", "onnxruntime")
+"""Those whose versions a measurement depends on."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,11 +55,18 @@ class Figures:
     paced_p95_ms: float
     paced_p99_ms: float
     paced_max_ms: float
-    at_once_p50_ms: float
-    at_once_p99_ms: float
 
-
-KINDS = get_type_hints(Figures)
+    @classmethod
+    def of(cls, kept: object) -> Figures:
+        """From JSON; raises ValueError where it is not what `asdict` gives."""
+        kinds = get_type_hints(cls)
+        if not isinstance(kept, dict) or kept.keys() != kinds.keys():
+            raise ValueError(f"expected {', '.join(kinds)}")
+        for name, kind in kinds.items():
+            value = kept[name]
+            if type(value) is not kind or (kind in (int, float) and not 0 <= value < float("inf")):
+                raise ValueError(f"{name} is {str(value)[:40]!r}, expected type {kind.__name__}")
+        return cls(**kept)
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,12 +99,12 @@ def choose(
     """The first of candidates, best first, whose p99 compute per hop at the real pace is within budget_ms.
 
     Figures of an earlier call on this machine, with these versions, models, cores and this length of path, are used
-    again; what is missing is measured, in less than 6 s an engine, twice where a passing load may have slowed it. say:
-    told what is going on. Raises UsageError where no candidate can be made.
+    again; what is missing is measured, in less than 6 s an engine, and once more where it is too slow, for something else
+    may have taken the cores. say: told what is going on. Raises UsageError where no candidate can be made.
     """
     cores = min(CORES, len(_allowed()))
-    about = budget_cache.describe({"held_to": cores, "taps": _taps(profile), "effects": _effects(profile)})
-    known = {name: Figures(**kept) for name, kept in budget_cache.recall(about, KINDS, say).items()}
+    about = _about(cores, profile)
+    known = recall(about, say)
     found: list[Figures] = []
     skipped: dict[str, str] = {}
     fresh = 0
@@ -108,7 +117,7 @@ def choose(
         if name not in known or known[name].model != _model(engine):
             say(f"measuring engine {name} at the real pace on {cores} cores, about 5 s ...")
             known[name] = measure(engine, profile)
-            if not fits(known[name], budget_ms) and known[name].paced_p50_ms <= PASSING * budget_ms:
+            if not fits(known[name], budget_ms) and known[name].complete:
                 say(f"measuring engine {name} once more: something else may have taken the cores")
                 known[name] = min(known[name], measure(engine, profile), key=lambda each: each.paced_p99_ms)
             fresh += 1
@@ -117,7 +126,7 @@ def choose(
             break
     if not found:
         raise UsageError("no engine can be made: " + "; ".join(f"{name}: {why}" for name, why in skipped.items()))
-    if fresh and (trouble := budget_cache.keep(about, {name: asdict(figures) for name, figures in known.items()})):
+    if fresh and (trouble := keep(about, known)):
         say(f"the measurement cannot be kept for the next time ({trouble})")
     best = found[-1] if fits(found[-1], budget_ms) else min(found, key=lambda figures: figures.paced_p99_ms)
     reason = _reason(best, found, skipped, budget_ms, cores) + ("" if fresh else AGAIN)
@@ -130,29 +139,25 @@ def fits(figures: Figures, budget_ms: float) -> bool:
 
 
 def measure(engine: Engine | ClipEngine, profile: Profile | None = None, paced: int = PACED) -> Figures:
-    """Run the bundled conversation through the whole path, first paced at the real hop, then back to back, held to two cores."""
+    """Run the bundled conversation through the whole path at the real pace, held to two cores."""
     hop = engine.stft.hop
-    hops = _scene(hop)
-    stream = Stream(engine, profile)
+    hops, stream = _scene(hop), Stream(engine, profile)
     with held_to(CORES):
-        pace(stream, hops, WARM_UP, WARM_UP_S, period_s=0.0)
-        slow = pace(stream, hops, paced, PACED_S)
-        at_once = pace(stream, hops, paced, AT_ONCE_S, period_s=0.0)
-    times = (*np.percentile(slow, (50, 95, 99, 100)), *np.percentile(at_once, (50, 99)))
-    return Figures(
-        engine.name, _model(engine), 1000 * hop / SAMPLE_RATE, len(slow), len(slow) == paced, *map(float, times)
-    )
+        pace(stream, hops, WARM_UP, period_s=0.0)
+        took = pace(stream, hops, paced)
+    times = (float(each) for each in np.percentile(took, (50, 95, 99, 100)))
+    return Figures(engine.name, _model(engine), 1000 * hop / SAMPLE_RATE, len(took), len(took) == paced, *times)
 
 
 def pace(
-    stream: Stream, hops: Iterator[tuple[Samples, Samples]], count: int, limit_s: float, period_s: float | None = None
+    stream: Stream, hops: Iterator[tuple[Samples, Samples]], count: int, period_s: float | None = None
 ) -> list[float]:
-    """Ms that each of count hops took, one begun every period_s (None: the hop's own length), fewer where limit_s is over first."""
+    """Ms that each of count hops took, one begun every period_s (None: the hop's own length); fewer where it falls LATE_S behind."""
     period_s = stream.engine.stft.hop / SAMPLE_RATE if period_s is None else period_s
     took: list[float] = []
     began = time.perf_counter()
-    while len(took) < count and (not took or time.perf_counter() - began < limit_s):
-        time.sleep(max(0.0, began + len(took) * period_s - time.perf_counter()))
+    while len(took) < count and (early := began + len(took) * period_s - time.perf_counter()) > -LATE_S:
+        time.sleep(max(0.0, early))
         mic, ref = next(hops)
         start = time.perf_counter()
         stream.process(mic, ref)
@@ -187,16 +192,92 @@ def _scene(hop: int) -> Iterator[tuple[Samples, Samples]]:
 
 
 def _model(engine: Engine | ClipEngine) -> str:
-    file = getattr(getattr(engine, "model", None), "path", None)
-    return hashlib.sha256(file.read_bytes()).hexdigest() if file else ""
+    return getattr(getattr(engine, "model", None), "sha256", "")
 
 
-def _taps(profile: Profile | None) -> int | None:
-    return None if profile is None else int(profile.echo.impulse_response.size)
+def _about(cores: int, profile: Profile | None) -> dict[str, object]:
+    """What timings depend on: machine, versions, cores, and the path's length and effects."""
+    found: dict[str, object] = {"machine": platform.node(), "processor": processor(), "cores": os.cpu_count()}
+    if profile:
+        found |= {"taps": profile.echo.impulse_response.size, "effects": [name for name, _ in profile.echo.effects]}
+    return {**found, **versions(PACKAGES), "held_to": cores}
 
 
-def _effects(profile: Profile | None) -> list[str]:
-    return [] if profile is None else [name for name, _ in profile.echo.effects]
+def versions(packages: Iterable[str]) -> dict[str, str]:
+    """Of Python and of each package, "none" where it is not installed."""
+    found = {"python": platform.python_version()}
+    for package in packages:
+        try:
+            found[package] = version(package)
+        except PackageNotFoundError:
+            found[package] = "none"
+    return found
+
+
+def processor() -> str:
+    """Name of the processor as the system knows it."""
+    lines = []
+    with suppress(OSError):
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+    names = [line.split(":", 1)[1].strip() for line in lines if line.lower().startswith("model name")]
+    return names[0] if names else platform.processor()
+
+
+def timings() -> Path:
+    """The file in which measurements are kept, in the user's cache folder by the platform's rules."""
+    return platformdirs.user_cache_path("edgefilter", appauthor=False, opinion=False) / "timings.json"
+
+
+def recall(about: Mapping[str, object], say: Callable[[str], None] = lambda text: None) -> dict[str, Figures]:
+    """Engine -> figures as kept by `keep` for exactly this description; none where they are damaged, and say is told."""
+    try:
+        entry = _kept().get(_key(about), {})
+        if not isinstance(entry, dict):
+            raise ValueError("its entry for this machine holds no engines")
+        return {name: Figures.of(figures) for name, figures in entry.items()}
+    except (OSError, ValueError) as error:
+        say(f"the measurements kept in {timings()} are not used: {error}")
+        return {}
+
+
+def keep(about: Mapping[str, object], figures: Mapping[str, Figures]) -> str | None:
+    """Write figures, atomically; returns why that was impossible, None when it was done."""
+    everything: dict = {}
+    with suppress(OSError, ValueError):
+        everything = _kept()
+    everything[_key(about)] = {name: asdict(each) for name, each in figures.items()}
+    draft = timings().with_suffix(f".{os.getpid()}")
+    try:
+        draft.parent.mkdir(parents=True, exist_ok=True)
+        draft.write_text(json.dumps(everything, indent=1) + "\n", encoding="utf-8")
+        draft.replace(timings())
+    except OSError as error:
+        with suppress(OSError):
+            draft.unlink()
+        return f"{draft.parent}: {error.strerror}"
+    return None
+
+
+def forget() -> None:
+    """Remove all that was measured."""
+    timings().unlink(missing_ok=True)
+
+
+def _kept() -> dict:
+    """All that is kept, nothing where there is no file; raises OSError, or ValueError for what is no JSON object."""
+    try:
+        found = json.loads(timings().read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        return {}
+    except (ValueError, RecursionError):
+        raise ValueError("it is not JSON") from None
+    if not isinstance(found, dict):
+        raise ValueError(f"it holds a JSON {type(found).__name__}, expected an object")
+    return found
+
+
+def _key(about: Mapping[str, object]) -> str:
+    return hashlib.sha256(json.dumps(about, sort_keys=True).encode()).hexdigest()[:16]
 
 
 def _reason(best: Figures, found: Sequence[Figures], skipped: dict[str, str], budget_ms: float, cores: int) -> str:
@@ -204,8 +285,7 @@ def _reason(best: Figures, found: Sequence[Figures], skipped: dict[str, str], bu
     others = [f"{figures.engine} needs {_needs(figures)}" for figures in found if figures is not best]
     others += [f"{name} cannot be used ({why})" for name, why in skipped.items()]
     against = "".join(f"; {text}" for text in others)
-    typical = f"p50 {best.paced_p50_ms:.1f} ms, back to back {best.at_once_p50_ms:.1f} ms"
-    measured = f"p99 {_needs(best)} per {best.hop_ms:.0f} ms hop on {cores} cores ({typical})"
+    measured = f"p99 {_needs(best)} per {best.hop_ms:.0f} ms hop on {cores} cores (p50 {best.paced_p50_ms:.1f} ms)"
     if fits(best, budget_ms):
         return f"auto: best engine within {budget_ms:g} ms, {measured}{against}"
     wish = (

@@ -12,8 +12,7 @@ from edgefilter.dsp import fourier
 from edgefilter.dsp.membrane import DISPLACEMENT_TAPS, displacement_taps
 from edgefilter.errors import SignalError
 from edgefilter.filter.adaptation import COLD, WARM, Adaptation
-from edgefilter.filter.echo_limiter import EchoLimiter
-from edgefilter.filter.volume import Volume
+from edgefilter.filter.volume import EchoLimiter, Volume
 from edgefilter.types import SAMPLE_RATE, LinearStageStats, Samples, Spectrum
 
 PRIOR_VARIANCE = 0.05
@@ -98,9 +97,8 @@ class Canceller:
         self.behind = behind
         self.partitions = -(-taps // hop)
         self.taps = self.partitions * hop
-        self._warm = impulse_response is not None
-        self.adaptation = adaptation or (WARM if self._warm else COLD)
-        self._initial = np.zeros(self.taps, np.float32)
+        self.adaptation = adaptation or (COLD if impulse_response is None else WARM)
+        self._initial, self._initial_gain = np.zeros(self.taps, np.float32), 1.0
         if impulse_response is not None:
             if impulse_response.ndim != 1 or not np.isfinite(impulse_response).all():
                 raise SignalError("the canceller's impulse response is not a finite (n,) array: calibrate again")
@@ -111,6 +109,11 @@ class Canceller:
         self._first = [0, self.partitions, self.partitions + PRODUCT_PARTITIONS][: self._channels]
         self._lowpass_reversed = (displacement_taps() / DISPLACEMENT_SCALE).astype(np.float32)[::-1].copy()
         self.reset()
+
+    @property
+    def _warm(self) -> bool:
+        """Whether anything is known of the path at the start."""
+        return bool(self._initial.any())
 
     @property
     def history(self) -> int:
@@ -147,6 +150,7 @@ class Canceller:
         self._padded = np.zeros(2 * hop, np.float32)
         self._hops = self._active = 0
         self.volume = Volume(hop, self._warm)
+        self.volume.gain = self._initial_gain
         self._limiter = EchoLimiter(hop)
 
     def step(self, mic: Samples, reference: Samples, located: bool = True) -> CancellerOutput:
@@ -157,8 +161,9 @@ class Canceller:
         self._push(reference)
         path_echo = echo = self._predict()
         if not path_echo.dot(path_echo) < LOUDEST * self.hop:  # nor where it is no number
-            self._begin()
-            self._diverged += 1
+            diverged = self._diverged + 1
+            self.reset()  # of the reference's past, too: it may be what made it diverge
+            self._diverged = diverged
             path_echo = echo = self._predict()
         np.multiply(self._covariance, self._powers, out=self._expected)
         misalignment = np.add.reduce(self._expected, axis=0)
@@ -276,12 +281,16 @@ class Canceller:
 
     @classmethod
     def resumed(cls, state: CancellerState, hop: int) -> Canceller:
-        """A canceller that goes on from that state; its reference is to be rewritten before the next step."""
+        """A canceller that goes on from that state, and begins anew from its path where it diverges.
+
+        Its reference is to be rewritten before the next step.
+        """
         canceller = cls(hop, state.taps, adaptation=state.adaptation)
         canceller._weights[:], canceller._covariance[:] = state.weights, state.covariance
         canceller._noise[:] = state.noise
         canceller._ageing = (1.0 - state.adaptation.transition**2) * fourier.power(canceller._weights)
-        canceller._warm, canceller.volume = True, Volume(hop)
+        canceller._initial, canceller._initial_gain = canceller.impulse_response(), state.volume_gain
+        canceller.volume = Volume(hop)
         canceller.volume.gain = state.volume_gain
         return canceller
 

@@ -47,7 +47,8 @@ class EgoFilter:
     on_barge_in : callable, optional
         Gets the `Event` of speech that has begun, inside `process` and in the very hop, from engines that judge speech
         (those whose `speech_probability` is not None). It should stop or duck the robot and return at once, since the
-        sound waits for it; what it raises leaves `process`.
+        sound waits for it. What it raises leaves `process` when the block is filtered, and no sample is lost: the next
+        `process` or `flush` returns those of this block as well.
 
     Attributes
     ----------
@@ -77,6 +78,12 @@ class EgoFilter:
     >>> out = np.concatenate((ego.process(human, np.zeros_like(human)), ego.flush()))
     >>> bool(np.allclose(out, human, atol=1e-6))
     True
+
+    As a context manager it is closed at the end, and the learner with it:
+
+    >>> with EgoFilter(engine="linear") as ego:
+    ...     ego.process(human, np.zeros_like(human)).size
+    512
     """
 
     def __init__(
@@ -166,7 +173,7 @@ class EgoFilter:
         Raises
         ------
         SignalError
-            For another shape or dtype, unequal lengths, samples that are not finite, or after `flush`.
+            For another shape or dtype, unequal lengths, samples that are not finite or beyond 1e6, or after `flush`.
         """
         return self._stream.process(mic_block, ref_block)
 
@@ -181,7 +188,7 @@ class EgoFilter:
         Raises
         ------
         SignalError
-            For another shape or dtype, or samples that are not finite.
+            For another shape or dtype, or samples that are not finite or beyond 1e6.
 
         Notes
         -----
@@ -219,8 +226,14 @@ class EgoFilter:
         """Start anew, as after construction."""
         self._stream.reset()
 
+    def __enter__(self) -> EgoFilter:
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self.close()
+
     def close(self) -> None:
-        """End the learner, which then keeps what it is to remember.
+        """End the learner, which then keeps what it is to remember; `with` does it by itself.
 
         Raises
         ------

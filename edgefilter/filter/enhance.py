@@ -37,7 +37,7 @@ def enhance(
     Raises
     ------
     SignalError
-        For another shape or dtype, unequal lengths, or samples that are not finite.
+        For another shape or dtype, unequal lengths, or samples that are not finite or beyond 1e6.
     UsageError, ProfileError, ModelError
         As of `EgoFilter`.
 

@@ -17,9 +17,8 @@ it."""
 CALM = 0.01
 """Part of the hops over the budget up to which the machine has recovered: the budget is promised for 99 of 100."""
 PATIENCE_S, MOST_PATIENCE_S = 10.0, 160.0
-"""Calm seconds before a better engine is tried again; doubled each time that one had to be left within PROVEN_S, up to
-the most."""
-PROVEN_S = 30.0
+"""Calm seconds before a better engine is tried again; doubled, up to the most, each time that one had to be left before it
+had run as long again."""
 
 
 class Stepping:
@@ -103,7 +102,7 @@ class Stepping:
             first, self._told = not self._told, True
             return ("overloaded", f"{why} and there is no cheaper engine to step down to") if first else None
         if self._since_up is not None:
-            failed = self._since_up < self._hops(PROVEN_S)
+            failed = self._since_up < self._hops(self._patience_s)
             self._patience_s = min(2 * self._patience_s, MOST_PATIENCE_S) if failed else PATIENCE_S
         self._since_up = None
         return "stepped_down", f"{self._move(self.ladder, 1)}: {why}"

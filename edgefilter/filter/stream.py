@@ -27,7 +27,8 @@ class Stream:
     With an engine that waits for the end (waits_for_end) process returns nothing and flush everything. stepping: told
     the compute time of every hop; what it answers becomes an event. barge_in: when speech counts as begun and ended,
     None for the defaults. learner: of better echo paths, for engines with a linear stage. on_barge_in: called in the
-    hop in which speech has begun. speech_probability: of the last hop, weighed with what robot and room leave; None
+    hop in which speech has begun; what it raises is raised once the block is filtered, whose samples then come with the
+    next call. speech_probability: of the last hop, weighed with what robot and room leave; None
     before the first hop and where the engine does not judge it.
     """
 
@@ -82,6 +83,8 @@ class Stream:
         self._synthesiser = Synthesiser(stft)
         self._mic, self._ref = Ring(2 * stft.hop), Ring(2 * stft.hop)
         self._before_start = self.latency - stft.hop
+        self._raised: BaseException | None = None
+        self._kept = np.zeros(0, np.float32)
         self._flushed = False
 
     def process(self, mic: Samples, ref: Samples) -> Samples:
@@ -94,7 +97,7 @@ class Stream:
                 f"mic has {mic.size} samples and ref {ref.size}, expected as many of each: pad the shorter with zeros"
             )
         self.samples_in += mic.size
-        return self._run(mic, ref)
+        return self._deliver(self._run(mic, ref))
 
     def flush(self) -> Samples:
         """Return the samples that process still holds back; the stream can then only be reset."""
@@ -102,11 +105,21 @@ class Stream:
         self._flushed = True
         padding = np.zeros(self.latency + self.engine.stft.hop, np.float32)
         if not missing:
-            return np.zeros(0, np.float32)
+            return self._deliver(padding[:0])
         rest = self._run(padding, padding)
         if self.engine.lookahead is None:
             rest = self._finish([self._synthesiser.push(spectrum) for spectrum in self.engine.answer(self._clip)])
-        return rest[:missing]
+        return self._deliver(rest[:missing])
+
+    def _deliver(self, out: Samples) -> Samples:
+        """The finished samples out (n,), behind those that are kept; where on_barge_in has raised they are all kept."""
+        if self._kept.size:
+            out = np.concatenate((self._kept, out))
+        error, self._raised = self._raised, None
+        self._kept = out if error else out[:0]
+        if error:
+            raise error
+        return out
 
     def _run(self, mic: Samples, ref: Samples) -> Samples:
         hop = self.engine.stft.hop
@@ -173,7 +186,10 @@ class Stream:
         if talk := self._barge_in.note(self.speech_probability):
             self.events.append(Event(talk, self._stepped, f"probability {self.speech_probability or 0.0:.2f}"))
             if self._on_barge_in and talk in INTERRUPTIONS:
-                self._on_barge_in(self.events[-1])
+                try:
+                    self._on_barge_in(self.events[-1])
+                except BaseException as error:  # the rest of the block is filtered first
+                    self._raised = self._raised or error
 
     def _collect(self, frame: Frame, engine: ClipEngine) -> None:
         self._clip.append(frame)

@@ -12,9 +12,9 @@ import numpy as np
 import onnx
 import pytest
 from hypothesis import given, settings
-from onnx import TensorProto, helper
+from onnx import TensorProto
 
-from edgefilter.engines import onnx_file, onnx_session
+from edgefilter.engines import onnx_session
 from edgefilter.engines.crnn import LOUDEST, SURE, Crnn
 from edgefilter.errors import ModelError
 from edgefilter.types import Frame
@@ -30,16 +30,22 @@ def refused(path, words, capfd):
     assert capfd.readouterr() == ("", "")  # '--output -' sends sound there
 
 
-def outside(tensor, location):
+def outside(tensor, location, length=4):
     tensor.ClearField("raw_data")
     tensor.data_location = TensorProto.EXTERNAL
-    for key, value in (("location", location), ("offset", "0"), ("length", "4")):
+    for key, value in (("location", location), ("offset", "0"), ("length", str(length))):
         entry = tensor.external_data.add()
         entry.key, entry.value = key, value
 
 
 def weights_elsewhere(model):
     outside(model.graph.initializer[0], "/etc/hostname")
+
+
+def weights_beside_it(model):
+    """In the working directory, in the right number: onnxruntime would take them."""
+    weights = next(each for each in model.graph.initializer if each.name.endswith("norm.weight"))
+    outside(weights, "weights", 4 * weights.dims[0])
 
 
 def constant_elsewhere(model):
@@ -55,13 +61,9 @@ def library_of_many_lines(model):
     model.graph.node[0].domain = "\n\x0bhidden\x18"
 
 
-def a_loop(model):
-    body = helper.make_graph([], "body", [], [])
-    model.graph.node.append(helper.make_node("Loop", ["", ""], ["x"], body=body))
-
-
-def own_function(model):
-    model.functions.append(helper.make_function("here", "f", [], [], [], []))
+def weights_said_to_be_elsewhere(model):
+    outside(model.graph.initializer[0], "/etc/hostname")
+    del model.graph.initializer[0].external_data[:]
 
 
 def weights_that_are_no_numbers(model):
@@ -92,11 +94,11 @@ def text_of_many_lines(model):
     ("change", "words"),
     [
         (weights_elsewhere, "takes its weights from other files"),
+        (weights_beside_it, "takes its weights from other files"),
+        (weights_said_to_be_elsewhere, "cannot be loaded"),
         (constant_elsewhere, "takes its weights from other files"),
-        (operator_of_a_library, "operators of the library 'com.example.run_my_code'"),
-        (library_of_many_lines, r"operators of the library '\\n\\x0bhidden\\x18'"),
-        (a_loop, "a loop or a branch"),
-        (own_function, "functions of its own"),
+        (operator_of_a_library, "cannot be loaded .*com.example.run_my_code"),
+        (library_of_many_lines, "cannot be loaded .*hidden"),
         (weights_that_are_no_numbers, "answers with values that are not finite"),
         (state_beyond_all_memory, "unusable metadata .*state_0"),
         (transform_beyond_all_memory, "unusable metadata .*expected at most"),
@@ -104,7 +106,9 @@ def text_of_many_lines(model):
         (text_of_many_lines, "has type a a a"),
     ],
 )
-def test_a_model_that_leads_out_of_its_file_or_gives_no_numbers_is_refused(tmp_path, capfd, change, words):
+def test_a_model_that_leads_out_of_its_file_or_gives_no_numbers_is_refused(tmp_path, monkeypatch, capfd, change, words):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "weights").write_bytes(bytes(1 << 16))
     model = onnx.load(EDGE)
     change(model)
     (tmp_path / "m.onnx").write_bytes(model.SerializeToString())
@@ -120,19 +124,18 @@ def test_text_in_the_graph_that_is_no_text_is_refused_without_a_word_on_standard
 
 def test_a_model_beyond_all_sizes_is_not_read(tmp_path, capfd):
     with open(tmp_path / "m.onnx", "wb") as file:
-        file.truncate(2 * onnx_file.MOST_BYTES)
+        file.truncate(2 * onnx_session.MOST_BYTES)
     refused(tmp_path / "m.onnx", "expected at most", capfd)
 
 
 @settings(max_examples=150, deadline=None, derandomize=True, database=None)
 @given(data=st.binary(max_size=200))
-def test_any_bytes_are_judged_without_onnxruntime_and_in_one_line(data, tmp_path_factory):
+def test_any_bytes_are_refused_in_one_line(data, tmp_path_factory):
     path = tmp_path_factory.getbasetemp() / "any.onnx"
     path.write_bytes(data)
-    try:
-        assert onnx_file.read_model(path) == data
-    except ModelError as error:
-        assert "\n" not in str(error)
+    with pytest.raises(ModelError, match="model .*any.onnx") as caught:
+        Crnn(path)
+    assert "\n" not in str(caught.value)
 
 
 @settings(max_examples=10, deadline=None, derandomize=True, database=None)
@@ -215,7 +218,7 @@ def test_the_shipped_models_are_the_pinned_ones_and_the_page_says_so():
     there = {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in (ROOT / "models").glob("*.onnx")}
     outside = {"crnn_20ms_int8.onnx", "voicefilter.onnx", "paper_crnn_narrow.onnx", "paper_crnn_narrow_batch_norm.onnx"}
     engines = {name: found for name, found in there.items() if name not in outside}
-    assert onnx_file.SHIPPED == engines
+    assert onnx_session.SHIPPED == engines
     for name, found in there.items():
         assert re.search(rf"`{name}` +`{found}`", page), name
 

@@ -13,8 +13,8 @@ import pytest
 import soundfile
 
 from edgefilter.dsp.metrics import si_sdr
-from edgefilter.engines import create, onnx_file, onnx_session
-from edgefilter.engines.crnn import SHARE_OF_SS, Crnn
+from edgefilter.engines import create, onnx_session
+from edgefilter.engines.crnn import Crnn
 from edgefilter.engines.paper_crnn import PaperCrnn
 from edgefilter.errors import ModelError, SignalError, UsageError
 from edgefilter.filter.ego_filter import EgoFilter
@@ -76,7 +76,7 @@ def test_of_a_calibrated_robot_ss_has_its_share_of_the_answer():
         powers = rng.uniform(0.5, 2.0, (2, 257)).astype(np.float32)
         answers, states = zip(*(e.step(Frame(*spectra, *powers), s) for e, s in zip(engines, states, strict=True)))
         both, network, mask = (answer.spectrum for answer in answers)
-        np.testing.assert_allclose(both, (1 - SHARE_OF_SS) * network + SHARE_OF_SS * mask, atol=1e-6)
+        np.testing.assert_allclose(both, 0.6 * network + 0.4 * mask, atol=1e-6)  # models/MODELS.md, the shares of ss
         assert answers[0].speech_probability == answers[1].speech_probability
 
 
@@ -168,7 +168,7 @@ def test_the_model_comes_from_the_option_then_the_variable_then_the_package(tmp_
     (tmp_path / "crnn_int8.onnx").write_bytes(EDGE.read_bytes())
     with pytest.raises(ModelError, match="crnn_int8.onnx is not the one that belongs to this edgefilter"):
         Crnn()
-    monkeypatch.setitem(onnx_file.SHIPPED, "crnn_int8.onnx", hashlib.sha256(EDGE.read_bytes()).hexdigest())
+    monkeypatch.setitem(onnx_session.SHIPPED, "crnn_int8.onnx", hashlib.sha256(EDGE.read_bytes()).hexdigest())
     assert Crnn().model.path == tmp_path / "crnn_int8.onnx"
     monkeypatch.setenv("EDGEFILTER_CRNN", str(EDGE))
     assert Crnn().model.path == EDGE

@@ -1,5 +1,7 @@
 """The beginning and the end of the human's speech, from probabilities and in the bundled conversation."""
 
+from functools import partial
+
 import numpy as np
 import pytest
 import soundfile
@@ -243,6 +245,29 @@ def test_the_settings_reach_the_stream_and_who_gives_a_callback_is_called_when_t
         assert called and called == [event for event in ego.events() if event.kind == "speech_started"]
         found.append(called[0].sample)
     assert found[0] >= found[1] + 0.15 * SAMPLE_RATE
+
+
+@pytest.mark.parametrize("block", [255, 4000, 256_000])
+def test_a_callback_that_raises_costs_no_sample(block):
+    """256000 samples went in and 248320 came out."""
+    mic, ref = (soundfile.read(DATA / f"{name}.flac", dtype="float32")[0] for name in ("mic", "reference"))
+    settings = BargeInSettings(min_silence_s=0.1)  # speech begins several times
+    usual = EgoFilter(DATA / "profile.npz", engine="crnn", barge_in=settings)
+    wanted = np.concatenate((usual.process(mic, ref), usual.flush()))
+    started = [event.sample for event in usual.events() if event.kind == "speech_started"]
+
+    def fail(event: Event) -> None:
+        raise RuntimeError(event.sample)
+
+    ego, out, raised = EgoFilter(DATA / "profile.npz", engine="crnn", barge_in=settings, on_barge_in=fail), [], []
+    blocks = [(mic[at : at + block], ref[at : at + block]) for at in range(0, mic.size, block)]
+    for call in (*(partial(ego.process, *each) for each in blocks), ego.flush, ego.flush):
+        try:
+            out.append(call())
+        except RuntimeError as error:
+            raised.append(error.args[0])
+    assert np.array_equal(np.concatenate(out), wanted)
+    assert len(started) > 1 and raised == (started if block < 256_000 else started[:1])
 
 
 @pytest.mark.parametrize("alone", [True, False])

@@ -8,7 +8,6 @@ import os
 import subprocess
 import sys
 import time
-from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -21,8 +20,8 @@ from platformdirs.windows import Windows
 from edgefilter.engines.bypass import Bypass
 from edgefilter.engines.spectral_subtraction import SpectralSubtraction
 from edgefilter.errors import UsageError
-from edgefilter.filter import budget, budget_cache
-from edgefilter.filter.budget import Figures, choose, fits, held_to, measure, pace
+from edgefilter.filter import budget
+from edgefilter.filter.budget import Figures, choose, fits, held_to, measure, pace, timings
 from edgefilter.filter.stream import Stream
 from edgefilter.profile.data import Profile
 
@@ -33,7 +32,7 @@ DEMO = budget.SCENE
 def cache(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     monkeypatch.setenv("LOCALAPPDATA", str(tmp_path / "cache"))
-    return budget_cache.folder()
+    return timings().parent
 
 
 @pytest.fixture
@@ -55,8 +54,6 @@ def measured(monkeypatch):
             0.8 * p99,
             p99,
             2 * p99,
-            p99 / 4,
-            p99 / 3,
         )
 
     monkeypatch.setattr(budget, "measure", pretend)
@@ -72,7 +69,7 @@ LADDER = ("ss", "linear", "bypass")
 )
 def test_the_best_engine_that_fits_is_taken_and_no_further_one_is_measured(measured, budget_ms, engine, asked):
     choice = choose(budget_ms, candidates=LADDER)
-    assert (choice.engine, choice.fits, measured[1]) == (engine, True, asked)
+    assert (choice.engine, choice.fits, list(dict.fromkeys(measured[1]))) == (engine, True, asked)
     assert choice.to_dict()["figures"][-1]["paced_p99_ms"] <= budget_ms
     assert f"within {budget_ms:g} ms" in choice.reason and f"{choice.figures[-1].paced_p99_ms:.1f} ms" in choice.reason
     for beaten in asked[:-1]:
@@ -86,7 +83,7 @@ def test_a_passing_load_does_not_cost_the_best_engine(monkeypatch):
     def pretend(engine, profile):
         asked.append(engine.name)
         p99 = slow.pop(0)
-        return Figures(engine.name, "", 16.0, 300, True, 1.5, 1.8, p99, 2 * p99, 1.0, 1.2)
+        return Figures(engine.name, "", 16.0, 300, True, 1.5, 1.8, p99, 2 * p99)
 
     monkeypatch.setattr(budget, "measure", pretend)
     choice = choose(8.0, candidates=LADDER)
@@ -134,7 +131,7 @@ def test_figures_are_remembered_for_the_same_path_only(measured):
     choose(8.0, longer, LADDER)
     choose(8.0, None, LADDER)
     assert asked == ["ss", "linear", "ss", "ss"]
-    budget_cache.forget()
+    budget.forget()
     assert not choose(8.0, profile, LADDER).remembered and asked[-1] == "ss"
 
 
@@ -142,18 +139,16 @@ def test_another_machine_or_version_is_measured_again(measured, monkeypatch):
     choose(8.0, candidates=LADDER)
     for name, other in (("processor", lambda: "another processor"), ("version", lambda package: "99")):
         with monkeypatch.context() as changed:
-            changed.setattr(budget_cache, name, other)
+            changed.setattr(budget, name, other)
             assert not choose(8.0, candidates=LADDER).remembered, name
     assert choose(8.0, candidates=LADDER).remembered
 
 
-def test_another_model_file_is_measured_again(measured, monkeypatch, tmp_path):
+def test_another_model_file_is_measured_again(measured, monkeypatch):
     """The engine says which file it runs; its bytes count, not its name."""
-    file = tmp_path / "crnn.onnx"
-    file.write_bytes(b"weights")
-    monkeypatch.setattr(SpectralSubtraction, "model", SimpleNamespace(path=file), raising=False)
+    monkeypatch.setattr(SpectralSubtraction, "model", SimpleNamespace(sha256="1"), raising=False)
     assert not choose(8.0, candidates=LADDER).remembered and choose(8.0, candidates=LADDER).remembered
-    file.write_bytes(b"other weights")
+    monkeypatch.setattr(SpectralSubtraction, "model", SimpleNamespace(sha256="2"))
     assert not choose(8.0, candidates=LADDER).remembered and choose(8.0, candidates=LADDER).remembered
 
 
@@ -170,44 +165,42 @@ def test_another_model_file_is_measured_again(measured, monkeypatch, tmp_path):
 )
 def test_a_damaged_cache_is_measured_again(measured, cache, text, why):
     cache.mkdir(parents=True)
-    (cache / budget_cache.FILE).write_text(text)
+    timings().write_text(text)
     said = []
     assert choose(8.0, candidates=LADDER, say=said.append).engine == "ss" and choose(8.0, candidates=LADDER).remembered
     told = [line for line in said if "are not used" in line]
     assert len(told) == (why is not None)
-    assert all(why in line and str(cache / budget_cache.FILE) in line for line in told)
+    assert all(why in line and str(timings()) in line for line in told)
 
 
 def test_an_old_layout_in_the_cache_is_measured_again(measured, cache):
     choose(8.0, candidates=LADDER)
-    file = cache / budget_cache.FILE
+    file = timings()
     file.write_text(file.read_text().replace("paced_p99_ms", "p99"))
     said = []
     assert not choose(8.0, candidates=LADDER, say=said.append).remembered
-    assert any("are not used: ss: expected engine, model" in line for line in said)
+    assert any("are not used: expected engine, model" in line for line in said)
 
 
 @pytest.mark.parametrize(
     ("place", "value", "why"),
     [
         ((), 3, "holds no engines"),
-        (("engines",), ["ss"], "holds no engines"),
-        (("engines",), None, "holds no engines"),
-        (("engines", "ss"), "fast", "ss: expected engine"),
-        (("engines", "ss"), [1.0], "ss: expected engine"),
-        (("engines", "ss", "paced_p99_ms"), "fast", "ss: paced_p99_ms is 'fast', expected type float"),
-        (("engines", "ss", "paced_p99_ms"), None, "paced_p99_ms is 'None'"),
-        (("engines", "ss", "paced_p99_ms"), True, "paced_p99_ms is 'True'"),
-        (("engines", "ss", "paced_p99_ms"), float("nan"), "paced_p99_ms is 'nan'"),
-        (("engines", "ss", "paced_p99_ms"), -1.0, "paced_p99_ms is '-1.0'"),
-        (("engines", "ss", "hops"), 300.5, "hops is '300.5', expected type int"),
-        (("engines", "ss", "complete"), 1, "complete is '1', expected type bool"),
-        (("engines", "ss", "model"), {"a": 1}, "model is"),
+        (("ss",), "fast", "expected engine"),
+        (("ss",), [1.0], "expected engine"),
+        (("ss", "paced_p99_ms"), "fast", "paced_p99_ms is 'fast', expected type float"),
+        (("ss", "paced_p99_ms"), None, "paced_p99_ms is 'None'"),
+        (("ss", "paced_p99_ms"), True, "paced_p99_ms is 'True'"),
+        (("ss", "paced_p99_ms"), float("nan"), "paced_p99_ms is 'nan'"),
+        (("ss", "paced_p99_ms"), -1.0, "paced_p99_ms is '-1.0'"),
+        (("ss", "hops"), 300.5, "hops is '300.5', expected type int"),
+        (("ss", "complete"), 1, "complete is '1', expected type bool"),
+        (("ss", "model"), {"a": 1}, "model is"),
     ],
 )
 def test_a_cache_of_valid_json_with_wrong_types_inside_is_ignored_and_said(measured, cache, place, value, why):
     choose(8.0, candidates=LADDER)
-    file = cache / budget_cache.FILE
+    file = timings()
     content = json.loads(file.read_text())
     (entry,) = content
     at = content
@@ -235,16 +228,16 @@ def test_a_cache_that_cannot_be_written_is_said(measured, cache):
 def test_the_cache_lies_where_the_platform_wants_it(monkeypatch, tmp_path):
     monkeypatch.setattr(platformdirs, "PlatformDirs", Unix)
     monkeypatch.setenv("HOME", str(tmp_path))
-    assert budget_cache.folder() == tmp_path / "cache/edgefilter"
+    assert timings().parent == tmp_path / "cache/edgefilter"
     for ignored in ("", "relative/folder"):
         monkeypatch.setenv("XDG_CACHE_HOME", ignored)
-        assert budget_cache.folder() == tmp_path / ".cache/edgefilter"
+        assert timings().parent == tmp_path / ".cache/edgefilter"
     monkeypatch.delenv("XDG_CACHE_HOME")
     monkeypatch.setattr(platformdirs, "PlatformDirs", MacOS)
-    assert budget_cache.folder() == tmp_path / "Library/Caches/edgefilter"
+    assert timings().parent == tmp_path / "Library/Caches/edgefilter"
     monkeypatch.setattr(platformdirs, "PlatformDirs", Windows)
     monkeypatch.setattr("platformdirs.windows.get_win_folder", lambda name: str(tmp_path / name))
-    assert budget_cache.folder() == tmp_path / "CSIDL_LOCAL_APPDATA/edgefilter"
+    assert timings().parent == tmp_path / "CSIDL_LOCAL_APPDATA/edgefilter"
 
 
 def test_measuring_runs_the_whole_path_at_the_real_pace():
@@ -253,7 +246,6 @@ def test_measuring_runs_the_whole_path_at_the_real_pace():
     assert time.perf_counter() - began >= 39 * 0.016
     assert (figures.engine, figures.hop_ms, figures.hops, figures.complete) == ("ss", 16.0, 40, True)
     assert 0 < figures.paced_p50_ms <= figures.paced_p95_ms <= figures.paced_p99_ms <= figures.paced_max_ms
-    assert 0 < figures.at_once_p50_ms <= figures.at_once_p99_ms
 
 
 def test_pace_begins_a_hop_each_period_and_counts_only_the_work():
@@ -267,36 +259,21 @@ def test_pace_begins_a_hop_each_period_and_counts_only_the_work():
 
     hop = np.zeros(256, np.float32)
     before = time.perf_counter()
-    took = pace(Stub(Bypass()), iter([(hop, hop)] * 10), 10, 5.0)
+    took = pace(Stub(Bypass()), iter([(hop, hop)] * 10), 10)
     assert np.all(np.array(begun) - before >= np.arange(10) * 0.016 - 1e-4)  # never early; the resolution of sleep
     assert len(took) == 10 and min(took) >= 2.0
 
 
-def test_an_engine_far_too_slow_is_given_up_in_time():
+def test_measuring_an_engine_far_too_slow_ends_in_time_and_it_does_not_fit():
     class Slow(Bypass):
         def step(self, frame, state):
-            time.sleep(0.05)
+            time.sleep(0.1)
             return super().step(frame, state)
 
-    hop = np.zeros(256, np.float32)
-    took = pace(Stream(Slow()), iter([(hop, hop)] * 300), 300, 0.3)
-    assert 1 <= len(took) <= 6  # 50 ms each
-    assert not fits(replace(Figures("x", "", 16.0, 300, True, 1, 1, 1, 1, 1, 1), complete=False), 8.0)
-
-
-def test_measuring_an_engine_far_too_slow_ends_in_time_and_does_not_fit(monkeypatch):
-    class Slow(Bypass):
-        steps = 0
-
-        def step(self, frame, state):
-            Slow.steps += 1
-            time.sleep(0.03)
-            return super().step(frame, state)
-
-    for name, limit in (("WARM_UP_S", 0.1), ("PACED_S", 0.2), ("AT_ONCE_S", 0.1)):
-        monkeypatch.setattr(budget, name, limit)
+    began = time.perf_counter()
     figures = measure(Slow())
-    assert not figures.complete and Slow.steps <= 4 + 7 + 4 and figures.paced_p50_ms >= 30
+    assert time.perf_counter() - began < 3.0  # 300 hops are 4.8 s
+    assert not figures.complete and figures.hops < 10 and figures.paced_p50_ms >= 100
     assert not fits(figures, 1000.0)
 
 
@@ -333,4 +310,4 @@ def test_a_recording_gets_the_strongest_engine_unmeasured_unless_a_budget_is_giv
     said, stats = run(tmp_path, "--seconds", "1", "--budget-ms", "500")
     assert stats["choice"]["remembered"] and "measuring" not in said
     said, stats = run(tmp_path, "--seconds", "1", "--remeasure")
-    assert stats["choice"] is None and not list(budget_cache.folder().iterdir())
+    assert stats["choice"] is None and not list(timings().parent.iterdir())

@@ -36,7 +36,7 @@ def run(canceller: Canceller, mic: np.ndarray, reference: np.ndarray, located: b
         canceller.step(mic[i : i + hop], reference[i : i + hop], located).error
         for i in range(0, mic.size - hop + 1, hop)
     ]
-    return np.concatenate(steps)
+    return np.concatenate((mic[:0], *steps))
 
 
 def db(x: np.ndarray) -> float:
@@ -72,6 +72,34 @@ def test_a_filter_that_has_diverged_begins_anew(poison: float) -> None:
     assert canceller.stats()["diverged"] == 1
 
 
+@pytest.mark.parametrize("taught_s", [0.0, 3.0])
+def test_a_filter_that_was_resumed_recovers_after_a_divergence(taught_s: float) -> None:
+    """Its weights, their covariance and its ageing were zero for ever."""
+    h, x = path(), speechlike(8.0)
+    mic = signal.oaconvolve(x, h)[: x.size].astype(np.float32)
+    canceller, at = Canceller(HOP, 3200), int(taught_s * 16000) // HOP * HOP
+    run(canceller, mic[:at], x[:at])
+    canceller = Canceller.resumed(canceller.state(), HOP)
+    x[at + 8000] = 1e9
+    error = run(canceller, mic[at:], x[at:])
+    assert canceller.stats()["diverged"]
+    assert db(error[-16000:]) < db(mic[-16000:]) - 20
+
+
+def test_a_filter_that_was_resumed_knows_how_far_the_volume_was_turned() -> None:
+    """Otherwise a profile that is written later has the turned volume twice in what lies beyond the adapted taps."""
+    h, x = path(), speechlike(4.0)
+    mic = signal.oaconvolve(x, h)[: x.size].astype(np.float32)
+    mic[16_000:] *= np.float32(10 ** (6 / 20))
+    canceller = Canceller(HOP, 3200, h)
+    run(canceller, mic[:32_000], x[:32_000])
+    resumed = Canceller.resumed(canceller.state(), HOP)
+    assert resumed.stats()["gain_db"] == canceller.stats()["gain_db"] == pytest.approx(6.0, abs=0.4)
+    x[40_000] = 1e8
+    run(resumed, mic[32_000:], x[32_000:])
+    assert resumed.stats()["diverged"] and resumed.stats()["gain_db"] == canceller.stats()["gain_db"]
+
+
 def test_of_a_path_that_has_become_another_one_as_much_is_kept_as_is_heard(monkeypatch: pytest.MonkeyPatch) -> None:
     x, h = speechlike(2.0), path()
     canceller = Canceller(HOP, 3200, h)
@@ -80,6 +108,17 @@ def test_of_a_path_that_has_become_another_one_as_much_is_kept_as_is_heard(monke
     run(canceller, 0.1 * speechlike(2.0, seed=5), x)  # nothing of an echo that is far louder than the microphone
     assert np.abs(canceller._weights).max() < 0.01 * before
     assert variance < canceller._covariance.max() < before**2  # once reopened, it does not grow with every doubt
+
+
+def test_a_robot_that_was_calibrated_in_a_dead_room_learns_the_room_it_is_carried_to() -> None:
+    """A path that is zero behind the direct sound says nothing of the power of what will come there."""
+    room, x = path(), speechlike(6.0)
+    dead = room.copy()
+    dead[512:] = 0.0
+    mic = signal.oaconvolve(x, room)[: x.size].astype(np.float32)
+    error = run(Canceller(HOP, 3200, dead), mic, x)
+    # 58 dB were seen, and 13 where what lies behind 512 taps is never learned
+    assert db(error[-16000:]) < db(mic[-16000:]) - 40
 
 
 def test_error_and_echo_add_up_to_the_microphone_exactly() -> None:

@@ -18,7 +18,7 @@ from edgefilter.engines.linear import Linear
 from edgefilter.engines.paper_ss import PAPER_STFT
 from edgefilter.engines.spectral_subtraction import SpectralSubtraction
 from edgefilter.errors import UsageError
-from edgefilter.filter.stepping import MOST_PATIENCE_S, PATIENCE_S, PROVEN_S, Stepping
+from edgefilter.filter.stepping import MOST_PATIENCE_S, PATIENCE_S, Stepping
 from edgefilter.filter.stream import Stream
 from edgefilter.filter.timing import Histogram
 from edgefilter.types import SAMPLE_RATE, Output
@@ -234,7 +234,7 @@ def test_patience_is_short_again_after_an_engine_has_proved_itself():
     slow, stream = overloaded_stream(cost_s=0.030)
     feed(stream, 45.0)
     slow.cost_s = 0.001
-    feed(stream, 60.0 + PROVEN_S)
+    feed(stream, 90.0)
     assert stream.engine.wanted == 0
     slow.cost_s = 0.030
     feed(stream, 1.0)

@@ -1,5 +1,7 @@
 """EgoFilter as people embed it: what it refuses, what it tells."""
 
+import contextlib
+
 import numpy as np
 import pytest
 
@@ -15,6 +17,8 @@ from tests import conformance
         (np.zeros((2, 100), np.float32), np.zeros(100, np.float32), r"shape \(2, 100\).*one channel"),
         (np.full(3, np.nan, np.float32), np.zeros(3, np.float32), "nan at sample 0"),
         (np.zeros(3, np.float32), np.array([0, 0, np.inf], np.float32), "inf at sample 2"),
+        (np.full(3, 1e38, np.float32), np.zeros(3, np.float32), "mic holds 1e[+]38 at sample 0.*its scaling is wrong"),
+        (np.zeros(3, np.float32), np.array([0, -1e8, 0], np.float32), "ref holds -1e[+]08 at sample 1.*full scale"),
         (np.zeros(3, np.float32), np.zeros(4, np.float32), "3 samples and ref 4"),
     ],
 )
@@ -36,6 +40,39 @@ def test_after_flush_only_reset_helps():
         ego.process(*conformance.conversation(1000))
     ego.reset()
     assert ego.process(*conformance.conversation(1000)).size > 0
+
+
+def test_samples_as_loud_as_any_recording_are_taken():
+    loud = np.array([1e6, 0, -1e6], np.float32)
+    assert np.isfinite(enhance(loud, loud, engine="linear")).all()
+
+
+class Closing:
+    """A learner that learns nothing and counts how often it was closed."""
+
+    past, closed = 0, 0
+
+    def start(self, path, hop):
+        pass
+
+    def hear(self, heard):
+        return None
+
+    def stats(self):
+        return {}
+
+    def close(self):
+        self.closed += 1
+
+
+def test_as_a_context_manager_it_closes_the_learner_also_after_an_error():
+    for error in (None, KeyError):
+        learner = Closing()
+        with contextlib.suppress(KeyError), EgoFilter(engine="linear", learn=learner) as ego:
+            assert ego.process(*conformance.conversation(1000)).size > 0
+            if error:
+                raise error
+        assert learner.closed == 1
 
 
 def test_float64_input_is_taken_without_writing_into_it():

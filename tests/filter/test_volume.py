@@ -1,0 +1,102 @@
+"""The two that compare the predicted echo with the microphone: a volume that was turned, and an echo that is too loud."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from edgefilter.filter.volume import EchoLimiter, Volume
+
+HOP = 256
+
+
+def hops(seconds: float, seed: int) -> np.ndarray:
+    """(n, HOP) of noise, mean square 1."""
+    return np.random.default_rng(seed).standard_normal((round(seconds * 16000 / HOP), HOP)).astype(np.float32)
+
+
+def limited(mic: np.ndarray, echo: np.ndarray) -> tuple[np.ndarray, list[bool]]:
+    """What a limiter lets through of the echo hop by hop, and in which hops it said that the path has changed."""
+    limiter, out, changed = EchoLimiter(HOP), [], []
+    for m, e in zip(mic, echo, strict=True):
+        limiter.measure(m, e)
+        out.append(limiter.apply(e))
+        changed.append(limiter.changed)
+    return np.array(out), changed
+
+
+def test_an_echo_that_lowers_the_microphone_is_not_touched() -> None:
+    echo, human = hops(1.0, 0), hops(1.0, 1)
+    out, changed = limited(0.9 * echo + 0.3 * human, echo)
+    assert np.array_equal(out, echo) and not any(changed)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.25])
+def test_of_an_echo_that_is_too_loud_as_much_is_subtracted_as_is_heard(share: float) -> None:
+    echo = hops(1.0, 0)
+    mic = share * echo + 0.02 * hops(1.0, 1)
+    out, _ = limited(mic, echo)
+    np.testing.assert_allclose(out[2:], share * echo[2:], atol=0.03)  # the noise correlates by chance
+    assert np.mean((mic - out) ** 2) < 1.01 * np.mean(mic**2)
+
+
+def test_a_loudspeaker_that_is_cut_off_in_mid_hop_costs_one_part_of_it() -> None:
+    echo = hops(1.0, 0)
+    mic = echo + 0.01 * hops(1.0, 1)
+    mic[30, 128:] -= echo[30, 128:]
+    mic[31:] -= echo[31:]
+    out, _ = limited(mic, echo)
+    assert np.array_equal(out[:30], echo[:30]) and np.array_equal(out[30, :128], echo[30, :128])
+    assert not out[30, 192:].any() and not out[31:].any()
+    steps = np.abs(np.diff(out[30, 127:192] / echo[30, 127:192]))
+    assert steps.max() <= 1.01  # at once down
+
+
+def test_what_is_let_through_again_comes_back_without_a_step() -> None:
+    echo = np.ones((40, HOP), np.float32)
+    mic = echo.copy()
+    mic[10:20] = 0.0
+    out, _ = limited(mic, echo)
+    gain = out.reshape(-1)
+    assert gain[11 * HOP] == 0.0 and np.all(gain[30 * HOP :] == 1.0)
+    assert np.diff(gain).max() < 0.02  # 4 ms from nothing to all
+
+
+def test_an_echo_that_stays_too_loud_for_half_a_second_is_put_down_to_another_path() -> None:
+    echo, mic = hops(2.0, 0), 0.1 * hops(2.0, 1)
+    _, changed = limited(mic, echo)
+    first = changed.index(True)
+    assert 0.45 < first * HOP / 16000 < 0.55 and 2 <= sum(changed) <= 4
+
+
+def factor_after(mic: np.ndarray, echo: np.ndarray, known: bool = True) -> float:
+    volume = Volume(HOP, known)
+    for m, e in zip(mic, echo, strict=True):
+        volume.follow(m, np.float32(volume.gain) * e)
+    return volume.gain
+
+
+@pytest.mark.parametrize("factor", [0.3, 2.0, 30.0])
+def test_a_turned_volume_is_found_within_half_a_second_and_bounded(factor: float) -> None:
+    echo = hops(0.5, 0)
+    found = factor_after(factor * echo + 0.05 * hops(0.5, 1), echo)
+    assert found == pytest.approx(min(factor, 10.0), rel=0.05)
+
+
+def test_whatever_the_scale_the_same_volume_is_found() -> None:
+    echo, noise = hops(0.5, 0), hops(0.5, 1)
+    found = [factor_after(scale * (2.0 * echo + 0.1 * noise), scale * echo) for scale in (1e-6, 1.0, 1e4)]
+    assert found == pytest.approx([found[1]] * 3, rel=1e-3) and found[1] > 1.9
+
+
+@pytest.mark.parametrize("scale", [0.0, 0.02])
+def test_a_microphone_that_does_not_hear_the_echo_turns_no_volume(scale: float) -> None:
+    echo = hops(2.0, 0)
+    assert factor_after(scale * echo + hops(2.0, 1), echo) == 1.0
+
+
+def test_the_volume_of_a_path_that_is_unknown_yet_means_nothing() -> None:
+    echo = hops(0.5, 0)
+    assert factor_after(2.0 * echo, echo, known=False) == 1.0
+    learned = np.concatenate((echo, 2.0 * echo))
+    assert factor_after(learned, np.concatenate((echo, echo)), known=False) == pytest.approx(2.0, rel=0.01)
