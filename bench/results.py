@@ -26,7 +26,7 @@ import numpy as np
 
 from edgefilter import engines
 from edgefilter.errors import EdgefilterError, UsageError
-from edgefilter.filter.budget_cache import processor, versions
+from edgefilter.filter.budget import processor, versions
 
 SCHEMA = 3
 """Of every JSON file: 3 has parts with tables and plots, and digests of the behaviour that was measured."""
@@ -283,11 +283,6 @@ def columns(rows: Sequence[Mapping], digits: int = 5) -> dict:
         return float(f"{value:.{digits}g}") if isinstance(value, float) and math.isfinite(value) else value
 
     return {"columns": keys, "values": [[short(row.get(key)) for key in keys] for row in rows]}
-
-
-def rows_of(found: Mapping) -> list[dict]:
-    """The rows that `columns` made."""
-    return [dict(zip(found["columns"], values, strict=True)) for values in found["values"]]
 
 
 def plain(value: Any) -> Any:

@@ -40,7 +40,7 @@ ABSENT = {
 }
 """Rows that readers will look for, and why nobody can have them."""
 BATCH_NORM = "paper-crnn-narrow-batch-norm"
-MODELS = results.ROOT / "models"
+MODELS = voicefilter.MODEL.parent
 NARROW = {"paper-crnn-narrow": ("", ""), BATCH_NORM: (", with batch normalisation", " --norm batch")}
 """Title and option of training of the paper's network with fewer filters and units: at full width that takes days."""
 
@@ -250,7 +250,7 @@ def _paper() -> list[System]:
     for name, (differs, option) in NARROW.items():
         title = f"CRNN of the paper's shape, narrower (1.8 of 34 M parameters){differs}"
         train = f"python -m export.train --network paper --filters 16 2 --lstm 80 --hidden 150{option}"
-        rows.append(_own("paper-crnn", "", MODELS / f"{name.replace('-', '_')}.onnx", name, title, train))
+        rows.append(_own("paper-crnn", "", MODELS / f"{name.replace('-', '_')}_int8.onnx", name, title, train))
     return rows
 
 

@@ -15,7 +15,7 @@ import soxr
 from edgefilter.errors import AudioFileError
 from edgefilter.types import LOUDEST, SAMPLE_RATE, Array, Samples
 
-_RATES = range(1000, 768001)
+RATES = range(1000, 768001)
 _ENDLESS = 0x7FFFF000  # writers to a pipe put sizes from here up into the header because they cannot know better
 _VALUES = 1 << 16  # samples times channels that are in memory at a time
 
@@ -92,10 +92,9 @@ class Reader:
             ) from None
 
     def _check_header(self, file: soundfile.SoundFile) -> None:
-        if self.rate not in _RATES:
+        if self.rate not in RATES:
             raise self._error(
-                f"says its rate is {self.rate} Hz, expected {_RATES.start} to {_RATES.stop - 1} Hz: its header is"
-                " damaged"
+                f"says its rate is {self.rate} Hz, expected {RATES.start} to {RATES.stop - 1} Hz: its header is damaged"
             )
         promised = re.search(r"^data\s*: (\d+) \(should be (\d+)\)", file.extra_info, re.MULTILINE)
         if promised and int(promised[1]) >= _ENDLESS:

@@ -120,3 +120,8 @@ def speech(tmp_path: Path) -> Path:
         lines.append(f"{index}.wav\t{index}\t3.50\tone two three")
     (folder / "transcripts.tsv").write_text("\n".join(lines) + "\n")
     return folder
+
+
+def rows_of(found: dict) -> list[dict]:
+    """The rows that results.columns made."""
+    return [dict(zip(found["columns"], values, strict=True)) for values in found["values"]]

@@ -13,9 +13,11 @@ from bench import __main__ as program
 from bench import denoisers, devices, evaluate, results, systems
 from bench.facts import pitch_hz, talking_s
 from bench.recordings import NotHere, find_recordings, named, recorded_clip
+from edgefilter import PathLearner, enhance
 from edgefilter.dsp.metrics import si_sdr
+from edgefilter.engines import create
 from edgefilter.errors import UsageError
-from tests.bench.conftest import RATE, babble
+from tests.bench.conftest import RATE, babble, rows_of
 
 ROWS = "unfiltered,linear-uncalibrated,ideal-mask,clean,dtln-aec"
 RATES = {"unfiltered": 120, "paper-ss": 20, "crnn": 40, "aec3": 80, "clean": 0}
@@ -35,7 +37,7 @@ def table(part: dict, name: str) -> dict:
 
 def figures(part: dict) -> list[dict]:
     """All rows but for the time that they took, rounded, as workers have other threads."""
-    rows = results.rows_of(part["rows"])
+    rows = rows_of(part["rows"])
     return [
         {key: round(x, 2) if isinstance(x, float) else x for key, x in row.items() if key != "seconds"} for row in rows
     ]
@@ -296,8 +298,6 @@ def test_engines_that_tell_who_speaks_have_events_and_others_none(pairs: Path) -
 
 @pytest.mark.slow
 def test_learning_rows_share_what_was_learned_and_say_what_they_know(live: Path) -> None:
-    from edgefilter import PathLearner, enhance
-
     clip = evaluate.find_clips(options(live, live))[0]
     known = systems.catalogue()
     row = known["linear-learning"]
@@ -312,9 +312,20 @@ def test_the_papers_network_filters_what_has_a_calibration_or_says_why_not(
 ) -> None:
     (row,) = systems.chosen(["paper-crnn-narrow"])
     assert row.knows == "calibration" and row.latency_ms is None
-    if row.model.is_file():
-        assert systems.present([row]) == ([row], {})
+    assert systems.present([row]) == ([row], {})
+    sizes = json.loads(
+        create("paper-crnn", model=row.model).model.session.get_modelmeta().custom_metadata_map["network"]
+    )
+    assert f"({sizes['parameters'] / 1e6:.1f} of 34 M parameters)" in row.title
+    assert (sizes["filters"], sizes["lstm"], sizes["hidden"]) == ([16] * 7 + [2], 80, 150)  # as its command says
+    clip = evaluate.find_clips(options(live, live))[0]
+    np.testing.assert_array_equal(
+        row.run(clip).samples, enhance(clip.mic, clip.ref, clip.profile, "paper-crnn", model=row.model)
+    )
+    clip.source.__dict__["profile"] = None
+    with pytest.raises(NotHere, match="no calibration of this device"):
+        row.run(clip)
     monkeypatch.setattr(systems, "MODELS", tmp_path / "models")
     (row,) = systems.chosen(["paper-crnn-narrow"])
-    why = "no paper_crnn_narrow.onnx in models/: train one with python -m export.train --network paper"
+    why = "no paper_crnn_narrow_int8.onnx in models/: train one with python -m export.train --network paper"
     assert systems.present([row])[1][row.title].startswith(why)

@@ -14,6 +14,7 @@ import pytest
 from bench import results
 from edgefilter.engines import create
 from edgefilter.errors import UsageError
+from tests.bench.conftest import rows_of
 
 
 @pytest.fixture
@@ -165,7 +166,7 @@ def test_numbers_become_plain_and_what_is_not_finite_null() -> None:
     rows = [{"a": "[b\n{", "c": [1, {"d": 2}]}, {"a": "e", "f": 0.123456789}]
     text = results.to_json({"rows": results.columns(rows)})
     assert "[ 0.12346 ]" not in text and json.loads(text)["rows"]["values"][1] == ["e", None, 0.12346]
-    assert results.rows_of(results.columns(rows[:1])) == rows[:1]
+    assert rows_of(results.columns(rows[:1])) == rows[:1]
 
 
 def test_machine_tells_how_many_threads_were_allowed(monkeypatch: pytest.MonkeyPatch) -> None:

