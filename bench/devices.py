@@ -77,7 +77,7 @@ def run(options: argparse.Namespace) -> str:
     ):
         tables.append(by_device(key, title, [row for row in rows if row["set"] == part], here, digits, tuned_on))
     tables += [against_peers(rows, here, tuned_on), barge_in(rows, here, tuned_on), as_recorded(rows, here)]
-    tables.append(results.table("absent", "Rows that cannot be had here", ["system", "why"], list(absent.items())))
+    tables.append(results.absent(absent))
     return results.write(options.output, "devices", "Real devices", made_with, [one for one in tables if one["rows"]],
                          notes=NOTES, rows=results.columns(slim(rows)))  # fmt: skip
 

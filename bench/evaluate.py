@@ -101,7 +101,7 @@ def run(options: argparse.Namespace) -> str:
     setup = runner.Setup(options.cache, options.whisper, dict(options.network))
     rows = runner.run(clips, here, setup, options.jobs, options.scheduler)
     tables = [headline(rows), glance(rows, here), *groups(rows, here, options.against), *slices(rows, here)]
-    tables += [worst_table(worst(rows, here), rows), absent_table(absent)]
+    tables += [worst_table(worst(rows, here), rows), results.absent(absent)]
     notes = "\n\n".join([NOTES, "What the source paper (Li, Hindriks & Kunneman 2024) concluded:", conclusions(rows)])
     parts = {"clips": results.columns(about(clips, rows)), "rows": results.columns(slim(rows))}
     page = results.write(options.output, "evaluation", "Evaluation", made_with, tables, notes=notes, **parts)
@@ -263,10 +263,6 @@ def slices(rows: Sequence[dict], here: Sequence[System]) -> list[dict]:
         columns = [quantity.title, *((head, digits) for head in parts)]
         found.append(results.table(f"by-{quantity.key}", f"{said} by: {quantity.title}", columns, cells))
     return found
-
-
-def absent_table(absent: dict[str, str]) -> dict:
-    return results.table("absent", "Rows that cannot be had here", ["system", "why"], list(absent.items()))
 
 
 # ---------------------------------------------------------------- worst clips

@@ -34,8 +34,6 @@ QUANTITIES = (
     Quantity("pitch_hz", "Pitch of the human, Hz"),
     Quantity("rt60_s", "Reverberation time, s", 2),
     Quantity("fan_db", "Human over fan, dB", 1),
-    Quantity("lag_ms", "Lag of the reference, ms"),
-    Quantity("drift_ppm", "Difference of the clocks, ppm"),
     Quantity("distortion_db", "Distortion of the loudspeaker, dB", 1),
     Quantity("before_s", "Robot talked before, s", 1),
 )
@@ -54,8 +52,6 @@ def facts(clip: Clip) -> dict[str, float]:
     if isinstance(clip.source, Conversation):
         meta = clip.source.meta
         found |= {"rt60_s": meta["rt60"], "fan_db": meta["snr_fan"], "distortion_db": meta["nl_db"]}
-        found["lag_ms"] = 1000 * meta.get("lag2", meta["lag"]) / SAMPLE_RATE
-        found["drift_ppm"] = abs(meta.get("ppm", 0.0))
     return {key: float(value) for key, value in found.items()}
 
 

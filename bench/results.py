@@ -46,7 +46,6 @@ def stamp(
     data: Mapping[str, Sequence[Path]] | None = None,
     systems: Iterable[str] = (),
     models: Mapping[str, Path | None] | None = None,
-    judged: Mapping[str, str] | None = None,
 ) -> dict:
     """What a result is made with and from, ready for JSON; take it before measuring.
 
@@ -59,8 +58,6 @@ def stamp(
         Rows of bench/systems.py that are measured, or "diagnosis": `bench.stale` compares their digests with today's.
     models
         Files or folders by name: ``{"WHISPER": folder}``; None where none is used.
-    judged
-        Digests that were computed already, for a system that is in no catalogue.
 
     Returns
     -------
@@ -84,7 +81,7 @@ def stamp(
         "dirty": dirty,
         "data": [{"what": w, "folder": p.resolve().name, **digest(p)} for w, paths in data.items() for p in paths],
         "models": {name: digest(path) for name, path in files.items()},
-        "judged": stale.judged(systems) | dict(judged or {}),
+        "judged": stale.judged(systems),
         "machine": machine(),
         "date": datetime.now(timezone.utc).strftime("%Y-%m-%d %H:%M UTC"),
     }
@@ -198,6 +195,11 @@ def table(name: str, title: str, columns: Sequence, rows: Iterable[Sequence], te
     pairs = [column if isinstance(column, tuple) else (column, None) for column in columns]
     heads, digits = [pair[0] for pair in pairs], [pair[1] for pair in pairs]
     return {"name": name, "title": title, "text": text, "columns": heads, "digits": digits, "rows": list(rows)}
+
+
+def absent(reasons: Mapping[str, str]) -> dict:
+    """The table of systems that cannot run here."""
+    return table("absent", "Rows that cannot be had here", ["system", "why"], list(reasons.items()))
 
 
 def panel(title: str, x: str, y: str, lines: Mapping[str, tuple], marks: str = ".-", **axes: object) -> dict:

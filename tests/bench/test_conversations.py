@@ -68,6 +68,7 @@ def test_conversation_levels_and_spans(live: Path) -> None:
         assert np.abs(mic).max() < 1.0
 
 
+@pytest.mark.slow
 def test_an_item_does_not_depend_on_how_many_are_made(clips: Path, live: Path, tmp_path: Path) -> None:
     make(clips, tmp_path / "again", "live", 1)
     for name in ("mic", "ref", "sweep_mic", "fan_only"):

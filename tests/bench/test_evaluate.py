@@ -73,6 +73,7 @@ def test_processes_give_the_same_figures_and_a_run_that_was_cut_off_goes_on(live
     )
 
 
+@pytest.mark.slow
 def test_a_page_to_listen_to(live: Path, tmp_path: Path) -> None:
     run(
         tmp_path / "a",
@@ -307,6 +308,7 @@ def test_learning_rows_share_what_was_learned_and_say_what_they_know(live: Path)
     np.testing.assert_array_equal(row.run(clip).samples, alone)  # of lessons that are kept
 
 
+@pytest.mark.slow
 def test_the_papers_network_filters_what_has_a_calibration_or_says_why_not(
     live: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -39,6 +39,7 @@ def test_the_fit_is_right_about_odds_whatever_the_share_of_humans(known):
     assert reliability([known], usual[0] - 2.0, usual[1])["distance"] > 0.1
 
 
+@pytest.mark.slow
 def test_scale_and_bias_bring_the_threshold_of_so_many_false_starts_to_the_filters(known):
     hour = np.full(3600 * 16_000 // 256, -9.0)
     for at, odds in ((10_000, 2.0), (100_000, 3.0)):

@@ -62,6 +62,7 @@ def run(tmp_path, monkeypatch):
     return tmp_path / "tiny"
 
 
+@pytest.mark.slow
 def test_checkpoints_are_compared_by_words_with_a_profile_and_without_against_ss(tmp_path, run, conversation, whisper):
     arguments = ["--checkpoints", run / "last.pt", "--conversations", conversation, "--cold", "--whisper", whisper]
     arguments += ["--output", tmp_path / "results" / "training", "--cache", tmp_path / "cache"]
@@ -79,6 +80,7 @@ def test_checkpoints_are_compared_by_words_with_a_profile_and_without_against_ss
     assert "| tiny/last, step 4 | 50 | 50 | 0 | 0.0 |" in (tmp_path / "results" / "training.md").read_text()
 
 
+@pytest.mark.slow
 def test_what_is_known_is_not_run_again(tmp_path, run, conversation, whisper, monkeypatch):
     shared = ["training", "words", "--conversations", conversation, "--whisper", whisper, "--wiener", "--error"]
 
