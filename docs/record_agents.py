@@ -10,6 +10,8 @@ import subprocess
 import sys
 from importlib.metadata import version
 from pathlib import Path
+from subprocess import PIPE
+from tempfile import TemporaryDirectory
 
 EXAMPLES = Path(__file__).with_name("examples")
 DEMO = Path(__file__).parents[1] / "edgefilter/demo_data"
@@ -32,17 +34,22 @@ def main() -> None:
     for name, package in AGENTS.items():
         title = f"## [{name}](examples/{name}), {package} {version(package)}"
         parts.append(f"{title}\n\n```text\n{output(name, model)}```\n")
-    recording = [DEMO / f"{name}.flac" for name in ("mic", "reference")]
-    said = output("listen.py", *recording, DEMO / "profile.npz", model)
     title = "## [listen.py](examples/listen.py) on the bundled recording, on which the robot talks on"
+    with TemporaryDirectory() as folder:
+        log = Path(folder) / "events.jsonl"
+        options = ["--output", "-", "--quiet", "--no-learn", "--log-json", log]
+        for option, name in (("input", "mic.flac"), ("reference", "reference.flac"), ("profile", "profile.npz")):
+            options += [f"--{option}", DEMO / name]
+        human = subprocess.run([sys.executable, "-m", "edgefilter.cli", "run", *options], stdout=PIPE, check=True)
+        said = output("listen.py", log, model, stdin=human.stdout)
     parts.append(f"{title}\n\n```text\n{said}```\n")
     PAGE.write_text("\n".join(parts))
 
 
-def output(name: str, *words: object) -> str:
+def output(name: str, *words: object, stdin: bytes = b"") -> str:
     """What an example prints."""
-    command = [sys.executable, EXAMPLES / name, *words]
-    return subprocess.run([str(word) for word in command], capture_output=True, text=True, check=True).stdout
+    command = [sys.executable, EXAMPLES / name, *map(str, words)]
+    return subprocess.run(command, input=stdin, stdout=PIPE, check=True).stdout.decode()
 
 
 if __name__ == "__main__":

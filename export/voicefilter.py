@@ -19,9 +19,9 @@ from pathlib import Path
 
 import torch
 
-from bench.evaluate.d_vector import d_vector
 from edgefilter.errors import EdgefilterError
 from export.corpus import read_corpus
+from export.d_vector import d_vector
 from export.paper_network import parameter_count
 from export.trainer import Plan
 from export.voicefilter_mixtures import Mixtures, Voices, read_items

@@ -9,18 +9,17 @@ LONGEST = (
     "live",
     "diagnosis/test_hidden_recordings.py",
     "commands/test_apply_commands.py",
-    "bench/test_learning.py",
     "diagnosis/test_diagnose.py",
     "export/test_gpu_plan.py",
     "diagnosis/test_defects.py",
     "docs/test_examples.py",
-    "bench/test_programs.py",
     "test_wheel.py",
-    "export/test_evaluation.py",
     "commands/test_demo.py",
     "learning/test_path_learner.py",
     "diagnosis/test_linear_changes.py",
-    "bench/test_bench.py",
+    "bench/test_evaluate.py",
+    "bench/test_live.py",
+    "bench/test_conversations.py",
 )
 """From some twenty seconds up: begun last, one of them would be waited for by the other process alone."""
 

@@ -31,7 +31,7 @@ LEAVES = {
     "jinja2": {"report/html.py"},
     "pipecat": {"integrations/pipecat.py"},
     "livekit": {"integrations/livekit.py"},
-    "wyoming": {"integrations/wyoming.py", "integrations/wyoming_sound.py"},
+    "wyoming": {"integrations/wyoming.py"},
     "torch": set(),
     "export": set(),
 }

@@ -15,7 +15,7 @@ import numpy as np
 import soundfile
 
 import edgefilter
-from bench.fuzz.mutate import damaged, damaged_archive, damaged_json
+from bench.fuzz.damage import damaged, damaged_archive, damaged_json
 from edgefilter import EgoFilter, Profile
 from edgefilter.audio.files import FileSource
 from edgefilter.echo.effect import complete
@@ -171,18 +171,11 @@ def recordings() -> list[bytes]:
     """A fifth of a second as people have it: rates, channels, codecs."""
     mic, ref = (x[:3200] for x in sound())
     stereo = np.stack((mic, ref), 1)
-    forms = [
-        ("WAV", "PCM_16", mic, 16000),
-        ("WAV", "FLOAT", stereo, 48000),
-        ("WAV", "PCM_24", stereo, 44100),
-        ("WAV", "IMA_ADPCM", mic, 16000),
-    ]
-    forms += [
-        ("WAVEX", "PCM_32", stereo, 8000),
-        ("FLAC", "PCM_16", mic, 16000),
-        ("OGG", "VORBIS", mic, 16000),
-        ("AIFF", "PCM_16", mic, 22050),
-    ]
+    forms = (
+        *(("WAV", "PCM_16", mic, 16000), ("WAV", "FLOAT", stereo, 48000), ("WAV", "PCM_24", stereo, 44100)),
+        *(("WAV", "IMA_ADPCM", mic, 16000), ("WAVEX", "PCM_32", stereo, 8000), ("FLAC", "PCM_16", mic, 16000)),
+        *(("OGG", "VORBIS", mic, 16000), ("AIFF", "PCM_16", mic, 22050)),
+    )
     files = []
     for form, subtype, samples, rate in forms:
         file = io.BytesIO()

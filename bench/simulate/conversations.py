@@ -13,9 +13,8 @@ nl_db (distortion relative to the linear loudspeaker, best gain removed), delay 
 seed, said (the robot's sentences, each with its first and last sample in ref). True delay of the reference in mic:
 lag + delay - ppm 1e-6 t. Kinds: `paper`, one lag of 50-300 ms; `live`, lag before t_main and lag2 after (0-1.2 s each),
 volume turned by up to 3 dB between them (volume_db), clocks 10-300 ppm apart (either sign). Even conversations take
-place in the laboratory (RT60 0.20-0.26 s), odd ones in an office (0.50-0.75 s). --published: rooms and levels as the
-source paper has them, 1800 in the laboratory to 6200 in the office, the human's level spread by 3.28 and 4.29 dB; its 17
-voices are those of ROBOT/train. Item i of a seed is the same whatever --count is.
+place in the laboratory (RT60 0.20-0.26 s), odd ones in an office (0.50-0.75 s). Item i of a seed is the same whatever
+--count is.
 
 How it compares with a set of ten `paper` conversations simulated by other hands (lab / office means: theirs; then 60 of
 these with --distortion strong):
@@ -59,13 +58,6 @@ from edgefilter.dsp.metrics import si_sdr
 
 UNFILTERED_DB = {"lab": (-22.0, 1.0), "office": (-26.2, 0.9)}
 """Mean and standard deviation of the unfiltered SI-SDR: the human's level varies little between two conversations."""
-PUBLISHED_DB = {"lab": (-22.0, 3.28), "office": (-26.3, 4.29)}
-"""The same as published (Li, Hindriks & Kunneman 2024, Table 2)."""
-PUBLISHED_LAB, PUBLISHED_ALL = 1800, 1800 + 6200
-"""Segments of the laboratory, and all (section 4)."""
-
-PACKET = RATE // 50
-"""Samples of a packet of the robot's voice on its way to the loudspeaker, where some are lost: 20 ms."""
 DISTORTION_DB = {
     "moderate": {"lab": (-26.0, -21.0), "office": (-27.0, -21.0)},
     "strong": {"lab": (-21.0, -17.0), "office": (-17.5, -13.5)},
@@ -177,23 +169,17 @@ def make_scene(
     speech: list[Clip],
     voices: dict[str, list[Clip]],
     distortion: str = "moderate",
-    published: bool = False,
-    lost: float = 0.0,
 ) -> Scene:
-    """Item index of this seed: signals (n,) float64 and the contents of meta.json.
-
-    lost: share of the robot's packets that never reach its loudspeaker.
-    """
+    """Item index of this seed: signals (n,) float64 and the contents of meta.json."""
     rng = np.random.default_rng([seed, index])
     human_clip = speech[np.random.default_rng(seed).permutation(len(speech))[index % len(speech)]]
     voice = str(rng.choice(sorted(voices)))
-    room_name = room_of(index, published)
+    room_name = "lab" if index % 2 == 0 else "office"
     robot, human_m = draw_robot(rng), rng.uniform(1.0, 1.5)
     laboratory = draw_room(rng, "lab", robot.distance_m, robot.direction, human_m)
     room = draw_room(rng, "office", robot.distance_m, robot.direction, human_m) if room_name == "office" else laboratory
     human = read_speech(human_clip)
     script, ref = make_script(rng, kind, voices[voice], human.size)
-    script |= {"lost": draw_lost(np.random.default_rng([seed, index, 1]), ref, lost)} if lost else {}
     voice_heard = played(ref, script)
     robot, nl_db = with_distortion(robot, voice_heard, room.robot, rng.uniform(*DISTORTION_DB[distortion][room_name]))
 
@@ -203,7 +189,7 @@ def make_scene(
     end = min(start + human.size + RATE // 10, ref.size)
     signals, scores, gain = record_all(
         rng,
-        (PUBLISHED_DB if published else UNFILTERED_DB)[room_name],
+        UNFILTERED_DB[room_name],
         robot,
         (laboratory.robot, room.robot),
         voice_heard,
@@ -217,12 +203,6 @@ def make_scene(
     meta |= {"live": kind == "live", "delay": delay, "seed": [seed, index]}
     fan = signals.pop("fan")
     return Scene({"ref": ref, **signals}, meta, robot, room.robot, gain, fan)
-
-
-def room_of(index: int, published: bool) -> str:
-    """Where item index takes place: in turn, or the laboratory's share spread evenly."""
-    in_lab = index * PUBLISHED_LAB % PUBLISHED_ALL < PUBLISHED_LAB if published else index % 2 == 0
-    return "lab" if in_lab else "office"
 
 
 def make_script(rng: np.random.Generator, kind: str, voice: list[Clip], human_size: int) -> tuple[dict, Array]:
@@ -241,21 +221,9 @@ def make_script(rng: np.random.Generator, kind: str, voice: list[Clip], human_si
     return script | {"said": [(text, at + i, at + j) for at, of in placed for text, i, j in of]}, ref
 
 
-def draw_lost(rng: np.random.Generator, ref: Array, share: float) -> list[int]:
-    """First samples of that share of the packets of ref (n,) that say something, each lost or not for itself."""
-    firsts = np.arange(0, ref.size - PACKET, PACKET)
-    loud = np.add.reduceat(ref**2, firsts) > 1e-3 * np.mean(ref**2) * PACKET
-    return firsts[loud & (rng.random(firsts.size) < share)].tolist()
-
-
 def played(ref: Array, script: dict) -> Array:
-    """What the converter plays (n,) of ref (n,) without the packets that were lost.
-
-    Each utterance after its lag, on its own clock, as loud as it was turned.
-    """
-    out, at, ref = np.zeros(ref.size), script["t_main"], ref.copy()
-    for first in script.get("lost", ()):
-        ref[first : first + PACKET] = 0.0
+    """What the converter plays (n,) of ref (n,): each utterance after its lag, on its own clock, as loud as it was turned."""
+    out, at = np.zeros(ref.size), script["t_main"]
     lag, lag2 = script["lag"], script.get("lag2", script["lag"])
     out[lag : lag + at] = ref[:at][: ref.size - lag]
     out[at + lag2 :] += 10 ** (script.get("volume_db", 0.0) / 20) * ref[at : ref.size - lag2]
@@ -289,14 +257,8 @@ def record_all(
     level, spectrum = math.sqrt(np.mean(clean[span] ** 2)) * 10 ** (-snr_fan / 20), draw_fan(rng)
     fan = [level * fan_noise(rng, spectrum, n) for n in (excitation.size, 8 * RATE, clean.size)]
     mic = echo + clean + fan[2]
-    signals = {
-        "sweep_ref": excitation,
-        "sweep_mic": gain * sweep_echo + fan[0],
-        "fan_only": fan[1],
-        "mic": mic,
-        "clean": clean,
-        "fan": fan[2],
-    }
+    signals = {"sweep_ref": excitation, "sweep_mic": gain * sweep_echo + fan[0], "fan_only": fan[1]}
+    signals |= {"mic": mic, "clean": clean, "fan": fan[2]}
     return signals, {"snr_fan": snr_fan, "sisdr_mix": si_sdr(mic[span], clean[span])}, echo_gain
 
 
@@ -306,38 +268,14 @@ def main() -> None:
     parser.add_argument("--voices", type=Path, required=True, nargs="+", metavar="DIR", help="the robot's voices")
     parser.add_argument("--output", type=Path, required=True, metavar="DIR")
     parser.add_argument("--kind", choices=("paper", "live"), required=True)
-    parser.add_argument(
-        "--distortion",
-        choices=tuple(DISTORTION_DB),
-        default="moderate",
-        help="of the loudspeaker (default: %(default)s)",
-    )
-    parser.add_argument("--published", action="store_true", help="rooms and levels as the source paper has them")
-    parser.add_argument(
-        "--lost-packets",
-        type=float,
-        default=0.0,
-        metavar="SHARE",
-        help="of the robot's voice, streamed in packets of 20 ms, silent where one is lost (default: %(default)g)",
-    )
+    parser.add_argument("--distortion", choices=tuple(DISTORTION_DB), default="moderate", help="of the loudspeaker")
     parser.add_argument("--count", type=int, default=24)
     parser.add_argument("--seed", type=int, default=1)
     options = parser.parse_args()
-    if not 0.0 <= options.lost_packets <= 1.0:
-        sys.exit(f"--lost-packets is {options.lost_packets:g}; expected 0 to 1")
     speech = read_clips(options.speech, (3.0, 12.0))
     voices = read_voices(options.voices)
     for index in tqdm(range(options.count), unit="conversation", desc=str(options.output)):
-        scene = make_scene(
-            options.seed,
-            index,
-            options.kind,
-            speech,
-            voices,
-            options.distortion,
-            options.published,
-            options.lost_packets,
-        )
+        scene = make_scene(options.seed, index, options.kind, speech, voices, options.distortion)
         folder = options.output / f"{scene.meta['room']}_{index:02d}"
         folder.mkdir(parents=True, exist_ok=True)
         for name, samples in scene.signals.items():

@@ -4,16 +4,20 @@ r"""Build HUMAN, ROBOT and WHISPER, the folders that every benchmark and trainin
         test-other.tar.gz speechocean762.tar.gz
     python -m bench.simulate.corpora --output DATA --kokoro kokoro-v1.0.int8.onnx voices-v1.0.bin  (or --renderings DIR)
     python -m bench.simulate.corpora --output DATA --whisper whisper-base
+    python -m bench.simulate.corpora --output DATA --synthesizers
 
 Archives: LibriSpeech (openslr.org/12) and speechocean762 (openslr.org/101), as they were downloaded. DATA/human/train,
 val and test are each made when all archives of theirs were given; DATA/robot likewise has train, val and test, each
-with a transcripts.tsv (path, speaker, seconds, text). Which recordings and sentences: selection.tsv and
-robot_sentences.tsv beside this file. --whisper takes the folder of openai/whisper-base and converts it to DATA/whisper
-(needs ct2-transformers-converter). Nothing is fetched.
+with a transcripts.tsv (path, speaker, seconds, text). Which recordings and sentences: selection.tsv (set, archive,
+speaker, chapter, utterances such as "0-4,9") and robot_sentences.tsv (set, voice, number, text) beside this file, in
+the order of the transcripts: what is simulated from a folder draws by position. --whisper takes the folder of
+openai/whisper-base and converts it to DATA/whisper (needs ct2-transformers-converter). --synthesizers has Debian's
+espeak-ng and flite read the robot's sentences, three voices each, into DATA/synthesizers: voices that no network was
+trained on. Nothing is fetched.
 
-LibriSpeech's archives are held against the checksums published with them. All that was read and made is written down in
-DATA/checksums.tsv (what, files, bytes, sha256); --checksums FILE, somebody else's such file, is compared with it: exit
-code 1 and a line for each difference. Renderings and Whisper's conversion depend on versions of their packages,
+LibriSpeech's archives are compared with the checksums published with them. All that was read and made is written down
+in DATA/checksums.tsv (what, files, bytes, sha256); --checksums FILE, somebody else's such file, is compared with it:
+exit code 1 and a line for each difference. Renderings and Whisper's conversion depend on versions of their packages,
 recordings on nothing.
 """
 
@@ -21,66 +25,321 @@ from __future__ import annotations
 
 import argparse
 import csv
+import hashlib
+import io
 import shutil
 import subprocess
 import sys
-from collections.abc import Iterable, Mapping, Sequence
-from pathlib import Path
+import tarfile
+import tempfile
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import count
+from pathlib import Path, PurePosixPath
 
+import numpy as np
+import soundfile as sf
+import soxr
 from tqdm import tqdm
 
-from bench import results_writer
-from bench.simulate import archives, robot_voices
-from bench.simulate.selection import Utterance, read_selection, read_sentences
+from bench.results import digest
 from edgefilter.errors import EdgefilterError, UsageError
+from edgefilter.types import SAMPLE_RATE
 
+SELECTION = Path(__file__).with_name("selection.tsv")
+SENTENCES = Path(__file__).with_name("robot_sentences.tsv")
+SPEECHOCEAN = "speechocean762"
 CONVERTER = "ct2-transformers-converter"
 SETS = ("train", "val", "test")
+SUFFIXES = (".flac", ".wav", ".ogg")
+MD5 = {
+    "train-clean-100": "2a93770f6d5c6c964bc36631d331a522",
+    "test-clean": "32fa31d27d2e1cad72775fee3f4849a9",
+    "test-other": "fb5a50374b501bb3bac4815ee91d3135",
+}
+"""As published with LibriSpeech (md5sum.txt of OpenSLR 12). OpenSLR 101 publishes none for speechocean762."""
+ESPEAK = ("en-gb+m3", "en-us+f3", "en-gb-scotland+m1", "en-gb-x-rp+f2", "en-us+m7", "en-029+f4", "en-gb-x-gbcwmd+m5")
+FLITE = ("kal16", "awb", "rms", "slt")
+SYNTHESIZED = (*(f"espeak-{voice}" for voice in ESPEAK), *(f"flite-{voice}" for voice in FLITE))
+"""Voices that read the sentences in turn, each sentence READ times."""
+READ, WORDS_A_MINUTE = 3, 165
 Sums = dict[str, dict[str, object]]
 """files, bytes, sha256 by what was read or made."""
 
 
+@dataclass(frozen=True)
+class Utterance:
+    """One recording that is taken. archive: its name without .tar.gz. name: the corpus's own, without suffix."""
+
+    folder: str
+    archive: str
+    number: str
+    name: str
+
+    @property
+    def speaker(self) -> str:
+        """As the transcripts call the speaker; the two corpora number theirs independently."""
+        return f"so{self.number}" if self.archive == SPEECHOCEAN else self.number
+
+    @property
+    def path(self) -> str:
+        """Inside its set's folder."""
+        where = f"ls{self.number}" if self.folder == "train" and self.archive != SPEECHOCEAN else self.speaker
+        return f"{where}/{self.name}.flac"
+
+
+@dataclass(frozen=True)
+class Sentence:
+    """What one of the robot's voices reads."""
+
+    folder: str
+    voice: str
+    number: int
+    text: str
+
+    @property
+    def path(self) -> str:
+        """Inside its set's folder, without suffix."""
+        return f"{self.voice}/{self.number:03d}"
+
+
+Renderer = Callable[[Sentence], tuple[np.ndarray, int]]
+"""A sentence's samples (n,) and their rate."""
+
+
+def read_selection(path: Path = SELECTION) -> list[Utterance]:
+    """Every utterance of every set, in order."""
+    return [
+        Utterance(row["set"], row["archive"], row["speaker"], utterance_name(row, number))
+        for row in _rows(path)
+        for number in numbers(row["utterances"])
+    ]
+
+
+def read_sentences(path: Path = SENTENCES) -> list[Sentence]:
+    """Every sentence of every voice, in order."""
+    return [Sentence(row["set"], row["voice"], int(row["number"]), row["text"]) for row in _rows(path)]
+
+
+def utterance_name(row: dict[str, str], number: int) -> str:
+    """LibriSpeech: SPEAKER-CHAPTER-NNNN; speechocean762: the speaker in five digits, the utterance in four."""
+    if row["archive"] == SPEECHOCEAN:
+        return f"{int(row['speaker']):05d}{number:04d}"
+    return f"{row['speaker']}-{row['chapter']}-{number:04d}"
+
+
+def numbers(text: str) -> list[int]:
+    """Numbers from a list of numbers and ranges.
+
+    >>> numbers("0-2,9")
+    [0, 1, 2, 9]
+    """
+    parts = [part.split("-") for part in text.split(",")]
+    return [number for first, *last in parts for number in range(int(first), int(last[0] if last else first) + 1)]
+
+
+def _rows(path: Path) -> list[dict[str, str]]:
+    with path.open(encoding="utf-8", newline="") as lines:
+        return list(csv.DictReader(lines, delimiter="\t", quoting=csv.QUOTE_NONE))
+
+
+def archive_name(path: Path) -> str:
+    """What an archive is called without its suffixes.
+
+    >>> archive_name(Path("downloads/test-clean.tar.gz"))
+    'test-clean'
+    """
+    return path.name.split(".tar")[0]
+
+
+def check(path: Path) -> dict[str, object]:
+    """Bytes and sha256 of an archive; raises UsageError where its publisher's MD5 is known and another one."""
+    md5, sha256 = hashlib.md5(usedforsecurity=False), hashlib.sha256()
+    try:
+        with path.open("rb") as file:
+            while chunk := file.read(1 << 20):
+                md5.update(chunk)
+                sha256.update(chunk)
+    except OSError as error:
+        raise UsageError(f"{path}: {error.strerror}; expected a downloaded archive") from None
+    wanted = MD5.get(archive_name(path))
+    if wanted and md5.hexdigest() != wanted:
+        raise UsageError(f"{path} has the MD5 {md5.hexdigest()}, expected {wanted}: download it again")
+    return {"files": 1, "bytes": path.stat().st_size, "sha256": sha256.hexdigest()}
+
+
+def take(archive: Path, wanted: Mapping[str, Path]) -> dict[str, tuple[float, str]]:
+    """Write recordings of a tar archive where they are wanted, as FLAC, and return their seconds and texts.
+
+    LibriSpeech keeps texts in SPEAKER-CHAPTER.trans.txt, speechocean762 in files called `text`; both have a name and
+    the words in a line. The archive is read once, from its beginning to its end; no path inside it decides where
+    anything is written.
+
+    Parameters
+    ----------
+    archive
+        .tar, .tar.gz, ...
+    wanted
+        The file to write by the recording's name without suffix.
+
+    Raises
+    ------
+    UsageError
+        For what is no tar archive, for a recording that is not 16 kHz mono, and where one or its text is missing.
+    """
+    seconds: dict[str, float] = {}
+    texts: dict[str, str] = {}
+    try:
+        with tarfile.open(archive, "r|*") as members:
+            for member in members:
+                place = PurePosixPath(member.name)
+                if not member.isfile():
+                    continue
+                if place.stem in wanted and place.suffix.lower() in (".flac", ".wav"):
+                    content = members.extractfile(member).read()
+                    seconds[place.stem] = _write(content, wanted[place.stem], f"{archive}:{place}")
+                elif place.name.endswith(".trans.txt") or place.name == "text":
+                    lines = members.extractfile(member).read().decode("utf-8").splitlines()
+                    named = map(str.split, filter(None, lines))
+                    texts |= {name: " ".join(words) for name, *words in named if name in wanted}
+    except (tarfile.TarError, EOFError) as error:
+        raise UsageError(f"{archive} cannot be read as a tar archive ({error}): download it again") from None
+    for what, found in (("recordings", seconds), ("texts", texts)):
+        if missing := [name for name in wanted if name not in found]:
+            lacks = f"{archive} lacks {len(missing)} of {len(wanted)} {what}, {missing[0]} first"
+            raise UsageError(f"{lacks}: is it the right archive?")
+    return {name: (seconds[name], texts[name].lower()) for name in wanted}
+
+
+def _write(content: bytes, path: Path, name: str) -> float:
+    """Write FLAC; what is FLAC already stays bit for bit. Returns its length in seconds."""
+    about = sf.info(io.BytesIO(content))
+    if about.samplerate != SAMPLE_RATE or about.channels != 1:
+        found = f"{about.samplerate} Hz and {about.channels} channels"
+        raise UsageError(f"{name} has {found}, expected {SAMPLE_RATE} Hz mono")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if about.format == "FLAC":
+        path.write_bytes(content)
+    else:
+        sf.write(path, sf.read(io.BytesIO(content), dtype="int16")[0], SAMPLE_RATE, subtype="PCM_16")
+    return about.frames / SAMPLE_RATE
+
+
 def human(given: Sequence[Path], output: Path) -> tuple[Sums, list[str]]:
-    """Write DATA/human; returns checksums and a line for each set that was left out for want of an archive."""
+    """Write DATA/human; returns checksums and a line for each set that was left out because an archive is missing."""
     selected = read_selection()
-    by_name = {archives.archive_name(path): path for path in given}
+    by_name = {archive_name(path): path for path in given}
     if strange := set(by_name) - {utterance.archive for utterance in selected}:
         known = ", ".join(sorted({utterance.archive for utterance in selected}))
         raise UsageError(
             f"nothing is taken from {', '.join(sorted(strange))}, expected archives called {known}: keep their names"
         )
-    needed = {name: {u.archive for u in selected if u.folder == name} for name in SETS}
-    complete = [name for name in SETS if needed[name] <= set(by_name)]
-    left_out = [
-        f"human/{name} needs {', '.join(sorted(needed[name] - set(by_name)))} as well"
-        for name in SETS
-        if name not in complete
-    ]
+    lacking = {name: sorted({u.archive for u in selected if u.folder == name} - set(by_name)) for name in SETS}
+    complete = [name for name in SETS if not lacking[name]]
+    left_out = [f"human/{name} needs {', '.join(lacking[name])} as well" for name in SETS if lacking[name]]
     chosen = [utterance for utterance in selected if utterance.folder in complete]
     sums: Sums = {}
     found: dict[tuple[str, str], tuple[float, str]] = {}
     for name, path in by_name.items():
-        sums[path.name] = archives.check(path)
+        sums[path.name] = check(path)
         targets = {u.name: output / "human" / u.folder / u.path for u in chosen if u.archive == name}
-        found |= {(name, key): value for key, value in (archives.take(path, targets) if targets else {}).items()}
+        found |= {(name, key): value for key, value in (take(path, targets) if targets else {}).items()}
     for name in complete:
-        rows = [_row(u, *found[u.archive, u.name]) for u in chosen if u.folder == name]
+        rows = [(u.path, u.speaker, *found[u.archive, u.name]) for u in chosen if u.folder == name]
         sums[f"human/{name}"] = _transcribe(output / "human" / name, rows)
     return sums, left_out
 
 
-def robot(render: robot_voices.Renderer, output: Path) -> Sums:
+def kokoro(model: Path, voices: Path) -> Renderer:
+    """Renders with the package kokoro-onnx, British voices (b...) in British English.
+
+    model, voices: kokoro-v1.0.int8.onnx and voices-v1.0.bin of its release of model files. Raises UsageError without
+    the package.
+    """
+    try:
+        from kokoro_onnx import Kokoro
+    except ImportError as error:
+        remedy = "pip install kokoro-onnx, or give --renderings"
+        raise UsageError(f"rendering needs the package kokoro-onnx: {remedy}") from error
+    engine = Kokoro(str(model), str(voices))
+
+    def render(sentence: Sentence) -> tuple[np.ndarray, int]:
+        language = "en-gb" if sentence.voice.startswith("b") else "en-us"
+        return engine.create(sentence.text, voice=sentence.voice, speed=1.0, lang=language)
+
+    return render
+
+
+def renderings(folder: Path) -> Renderer:
+    """Takes FOLDER/VOICE/NNN.flac, .wav or .ogg, or FOLDER/SET/VOICE/...; raises UsageError for one that is missing."""
+
+    def read(sentence: Sentence) -> tuple[np.ndarray, int]:
+        roots = (folder, folder / sentence.folder)
+        places = (root / f"{sentence.path}{suffix}" for root in roots for suffix in SUFFIXES)
+        found = next((place for place in places if place.is_file()), None)
+        if found is None:
+            wanted = f"{sentence.path}.flac, .wav or .ogg, expected a rendering of '{sentence.text}'"
+            raise UsageError(f"{folder} holds no {wanted}")
+        samples, rate = sf.read(found, dtype="float32", always_2d=True)
+        return samples.mean(axis=1), rate
+
+    return read
+
+
+def read_aloud(sentence: Sentence) -> tuple[np.ndarray, int]:
+    """Renders with espeak-ng or flite. Raises UsageError where the synthesizer is missing or fails."""
+    program, _, voice = sentence.voice.partition("-")
+    with tempfile.TemporaryDirectory() as folder:
+        output = str(Path(folder) / "spoken.wav")
+        espeak = ["espeak-ng", "-v", voice, "-s", str(WORDS_A_MINUTE), "-w", output, sentence.text]
+        asked = espeak if program == "espeak" else ["flite", "-voice", voice, "-t", sentence.text, "-o", output]
+        try:
+            subprocess.run(asked, capture_output=True, check=True)
+            return sf.read(output)
+        except (OSError, subprocess.CalledProcessError, sf.LibsndfileError) as error:
+            raise UsageError(f"{asked[0]} does not speak ({error}): apt-get install espeak-ng flite") from error
+
+
+def robot(render: Renderer, output: Path) -> Sums:
     """Write DATA/robot."""
-    sums: Sums = {}
     sentences = read_sentences()
-    for name in SETS:
-        folder, rows = output / "robot" / name, []
-        own = [sentence for sentence in sentences if sentence.folder == name]
-        for sentence in tqdm(own, desc=f"robot/{name}", unit="sentence", disable=not sys.stderr.isatty()):
-            path, seconds = robot_voices.write(sentence, render, folder)
-            rows.append((path, sentence.voice, f"{seconds:.2f}", sentence.text))
-        sums[f"robot/{name}"] = _transcribe(folder, rows)
-    return sums
+    return {
+        f"robot/{name}": _render([s for s in sentences if s.folder == name], render, output / "robot" / name)
+        for name in SETS
+    }
+
+
+def synthesizers(output: Path) -> Sums:
+    """Write DATA/synthesizers: the sentences of all sets, each READ times, by SYNTHESIZED in turn."""
+    texts, turn = dict.fromkeys(sentence.text for sentence in read_sentences()), count()
+    voices = [
+        (number, text, SYNTHESIZED[next(turn) % len(SYNTHESIZED)])
+        for number, text in enumerate(texts)
+        for _ in range(READ)
+    ]
+    sentences = [Sentence("synthesizers", voice, number, text) for number, text, voice in voices]
+    return {"synthesizers": _render(sentences, read_aloud, output / "synthesizers")}
+
+
+def _render(sentences: Sequence[Sentence], render: Renderer, folder: Path) -> dict[str, object]:
+    """Write sentences as 16 kHz FLAC below the folder, and their transcripts."""
+    rows = []
+    for sentence in tqdm(sentences, desc=folder.name, unit="sentence", disable=not sys.stderr.isatty()):
+        samples, rate = render(sentence)
+        samples = np.asarray(samples, np.float32)
+        if rate != SAMPLE_RATE:
+            samples = soxr.resample(samples, rate, SAMPLE_RATE)
+        path = f"{sentence.path}.flac"
+        (folder / path).parent.mkdir(parents=True, exist_ok=True)
+        sf.write(folder / path, np.clip(samples, -1.0, 1.0), SAMPLE_RATE, subtype="PCM_16")
+        rows.append((path, sentence.voice, samples.size / SAMPLE_RATE, sentence.text))
+    return _transcribe(folder, rows)
+
+
+def _transcribe(folder: Path, rows: Iterable[tuple[str, str, float, str]]) -> dict[str, object]:
+    lines = [f"{path}\t{speaker}\t{seconds:.2f}\t{text}\n" for path, speaker, seconds, text in rows]
+    (folder / "transcripts.tsv").write_text("".join(lines), encoding="utf-8")
+    return digest(folder)
 
 
 def whisper(source: Path, output: Path) -> Sums:
@@ -97,13 +356,12 @@ def whisper(source: Path, output: Path) -> Sums:
     done = subprocess.run([program, "--model", str(source), *options], capture_output=True, text=True)
     if done.returncode or not (target / "model.bin").is_file():
         raise UsageError(f"{CONVERTER} failed: {' '.join(done.stderr.split())[-300:] or 'no model.bin was written'}")
-    return {source.name: results_writer.digest(source), "whisper": results_writer.digest(target)}
+    return {source.name: digest(source), "whisper": digest(target)}
 
 
-def compare(sums: Mapping[str, Mapping[str, object]], wanted: Path) -> list[str]:
+def compare(sums: Sums, wanted: Path) -> list[str]:
     """A line for each entry of both that differs."""
-    with wanted.open(encoding="utf-8", newline="") as lines:
-        others = {row["what"]: row["sha256"] for row in csv.DictReader(lines, delimiter="\t")}
+    others = {row["what"]: row["sha256"] for row in _rows(wanted)}
     pairs = ((what, entry["sha256"], others.get(what, entry["sha256"])) for what, entry in sums.items())
     return [f"{what} has the sha256 {own}, {wanted.name} says {other}" for what, own, other in pairs if own != other]
 
@@ -111,19 +369,9 @@ def compare(sums: Mapping[str, Mapping[str, object]], wanted: Path) -> list[str]
 def keep(sums: Sums, path: Path) -> None:
     """Write checksums, those of earlier calls included."""
     if path.is_file():
-        with path.open(encoding="utf-8", newline="") as lines:
-            sums = {row.pop("what"): row for row in csv.DictReader(lines, delimiter="\t")} | sums
+        sums = {row.pop("what"): row for row in _rows(path)} | sums
     rows = [f"{what}\t{entry['files']}\t{entry['bytes']}\t{entry['sha256']}" for what, entry in sorted(sums.items())]
     path.write_text("\n".join(["what\tfiles\tbytes\tsha256", *rows]) + "\n", encoding="utf-8")
-
-
-def _row(utterance: Utterance, seconds: float, text: str) -> tuple[str, str, str, str]:
-    return utterance.path, utterance.speaker, f"{seconds:.2f}", text
-
-
-def _transcribe(folder: Path, rows: Iterable[Sequence[str]]) -> dict[str, object]:
-    (folder / "transcripts.tsv").write_text("".join("\t".join(row) + "\n" for row in rows), encoding="utf-8")
-    return results_writer.digest(folder)
 
 
 def build(options: argparse.Namespace) -> int:
@@ -133,44 +381,41 @@ def build(options: argparse.Namespace) -> int:
     if options.archives:
         made, left_out = human(options.archives, options.output)
         sums |= made
-        print(*left_out, sep="\n", file=sys.stderr, end="\n" if left_out else "")
-    if options.kokoro or options.renderings:
-        render = (
-            robot_voices.renderings(options.renderings) if options.renderings else robot_voices.kokoro(*options.kokoro)
-        )
-        sums |= {path.name: results_writer.digest(path) for path in options.kokoro or ()} | robot(
-            render, options.output
-        )
+        for line in left_out:
+            print(line, file=sys.stderr)
+    if options.kokoro:
+        sums |= {path.name: digest(path) for path in options.kokoro} | robot(kokoro(*options.kokoro), options.output)
+    if options.renderings:
+        sums |= robot(renderings(options.renderings), options.output)
+    if options.synthesizers:
+        sums |= synthesizers(options.output)
     if options.whisper:
         sums |= whisper(options.whisper, options.output)
     keep(sums, options.output / "checksums.tsv")
     for what, entry in sums.items():
         print(f"{what}: {entry['files']} files, {entry['bytes']} bytes, sha256 {entry['sha256']}")
     differences = compare(sums, options.checksums) if options.checksums else []
-    print(*differences, sep="\n", file=sys.stderr, end="\n" if differences else "")
+    for line in differences:
+        print(line, file=sys.stderr)
     return 1 if differences else 0
 
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--output", type=Path, required=True, metavar="DATA")
-    parser.add_argument(
-        "--archives",
-        type=Path,
-        nargs="+",
-        metavar="ARCHIVE",
-        help="of LibriSpeech and speechocean762, names as published",
-    )
+    add = parser.add_argument
+    add("--output", type=Path, required=True, metavar="DATA")
+    add("--archives", type=Path, nargs="+", metavar="ARCHIVE", help="of LibriSpeech and speechocean762, as published")
     voices = parser.add_mutually_exclusive_group()
     voices.add_argument("--kokoro", type=Path, nargs=2, metavar=("MODEL", "VOICES"), help="render the robot's voices")
     voices.add_argument(
         "--renderings", type=Path, metavar="DIR", help="take them from DIR/VOICE/NNN.wav, .flac or .ogg"
     )
-    parser.add_argument("--whisper", type=Path, metavar="DIR", help="a download of openai/whisper-base")
-    parser.add_argument("--checksums", type=Path, metavar="FILE", help="compare with this checksums.tsv")
+    add("--synthesizers", action="store_true", help="have espeak-ng and flite read the robot's sentences")
+    add("--whisper", type=Path, metavar="DIR", help="a download of openai/whisper-base")
+    add("--checksums", type=Path, metavar="FILE", help="compare with this checksums.tsv")
     options = parser.parse_args()
-    if not (options.archives or options.kokoro or options.renderings or options.whisper):
-        parser.error("nothing to build from: give --archives, --kokoro, --renderings or --whisper")
+    if not (options.archives or options.kokoro or options.renderings or options.synthesizers or options.whisper):
+        parser.error("nothing to build from: give --archives, --kokoro, --renderings, --synthesizers or --whisper")
     try:
         return build(options)
     except (EdgefilterError, OSError) as error:

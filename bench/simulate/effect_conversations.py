@@ -12,11 +12,9 @@ import numpy as np
 from scipy import signal
 
 from bench.simulate.conversations import Clip, read_speech
-from bench.simulate.hidden_acoustics import power
 from bench.simulate.hidden_cases import ROBOT_OVER_FAN_DB, hide, read_reference
-from bench.simulate.hidden_catalogue import CATALOGUE
-from bench.simulate.hidden_outside import NAMED, OUTSIDE, in_room
-from bench.simulate.hidden_robot import draw_scene
+from bench.simulate.hidden_effects import CATALOGUE, NAMED, OUTSIDE, in_room
+from bench.simulate.hidden_robot import draw_scene, power
 from bench.simulate.simulated_robot import RATE, Array
 
 EFFECTS = (*CATALOGUE, *NAMED)

@@ -24,11 +24,9 @@ import numpy as np
 import soundfile as sf
 from tqdm import tqdm
 
-from bench.simulate.conversations import Clip, read_clips, read_speech
-from bench.simulate.hidden_acoustics import decibels, power
-from bench.simulate.hidden_catalogue import CATALOGUE, ENR_DB, RANGES
-from bench.simulate.hidden_outside import NAMED, OUTSIDE
-from bench.simulate.hidden_robot import Chain, Scene, draw_scene
+from bench.simulate.conversations import Clip, read_clips, read_speech, read_voices
+from bench.simulate.hidden_effects import CATALOGUE, ENR_DB, NAMED, OUTSIDE, RANGES
+from bench.simulate.hidden_robot import Chain, Scene, decibels, draw_scene, power
 from bench.simulate.simulated_robot import RATE, Array
 
 SETS = ("singles", "controls", "pairs", "outside")
@@ -38,21 +36,13 @@ ALONG_THE_CHAIN = (
 )
 """The order in which two effects are applied."""
 APART = {
-    frozenset(pair)
+    frozenset(pair.split())
     for pair in (
-        ("playback_gain", "compression"),
-        ("playback_gain", "mic_agc"),
-        ("compression", "mic_agc"),
-        ("compression", "speaker_nonlinearity"),
-        ("mic_clipping", "speaker_nonlinearity"),
-        ("mic_clipping", "compression"),
-        ("mic_clipping", "mic_agc"),
-        ("rattle", "speaker_nonlinearity"),
-        ("rattle", "mic_clipping"),
-        ("late_reverb", "path_change"),
-        ("clock_drift", "delay_jump"),
-        ("fan_noise", "mic_agc"),
-    )
+        "playback_gain compression, playback_gain mic_agc, compression mic_agc, compression speaker_nonlinearity, "
+        "mic_clipping speaker_nonlinearity, mic_clipping compression, mic_clipping mic_agc, "
+        "rattle speaker_nonlinearity, rattle mic_clipping, late_reverb path_change, clock_drift delay_jump, "
+        "fan_noise mic_agc"
+    ).split(", ")
 }
 """Pairs that are not made: each could pass for the other or hides it."""
 ROBOT_OVER_FAN_DB = {
@@ -179,9 +169,7 @@ def main() -> None:
     parser.add_argument("--count", type=int, default=39, help="cases of each set (default: %(default)s)")
     parser.add_argument("--seed", type=int, default=1)
     options = parser.parse_args()
-    voices: dict[str, list[Clip]] = {}
-    for clip in (clip for folder in options.voices for clip in read_clips(folder, (1.0, 15.0))):
-        voices.setdefault(clip.speaker, []).append(clip)
+    voices = read_voices(options.voices)
     kinds = SETS if options.set == "all" else (options.set,)
     if "outside" in kinds and not options.speech:
         parser.error("the set `outside` needs --speech, a folder of human speech")

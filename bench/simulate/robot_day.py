@@ -1,21 +1,23 @@
-"""Long recordings of a simulated robot: a day in which room, volume, place, clocks and lag change, a human interrupting.
+"""Long recordings of a simulated robot: a day of changes, one robot in two rooms, and a robot that speaks to nobody.
 
-The robot speaks clip after clip, in random order and over and over. Five changes divide a day into six stages of equal
+A day: the robot speaks clip after clip, in random order and over and over. Five changes divide a day into six stages of equal
 length: it is calibrated and begins in a laboratory, then is carried into an office, turned down, driven to another
 place in that office, gets a playback clock of its own with another lag, and is carried into another office. The human
-talks over about every third utterance. Loudspeaker, shell and fan stay the same.
+talks over about every third utterance. Loudspeaker, shell and fan stay the same. Two rooms: the robot alone, yesterday
+in both and today in one, with a calibration in both. Alone: ever new robots in new rooms, which nobody interrupts.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from itertools import chain
 
 import numpy as np
 from scipy import signal
 
-from bench.simulate.conversations import Clip, read_speech
+from bench.simulate.conversations import DISTORTION_DB, Clip, read_speech
 from bench.simulate.simulated_robot import (
     RATE,
     Array,
@@ -38,7 +40,7 @@ END_S = 3.0
 """Silence at the end of a stage: the echo of the last utterance dies away in it."""
 HUMAN_DB, FAN_DB = -24.0, -31.5
 """Power of human and fan, against the robot's where it speaks first (between lab and office of `conversations`)."""
-DISTORTION_DB = -24.0
+USUAL_DISTORTION_DB = -24.0
 INTERRUPTED = 0.3
 VOLUME_DB, PPM = -5.0, -60.0
 LAGS_S = (0.12, 0.31)
@@ -77,32 +79,23 @@ class Day:
 
 
 class Repertoire(Iterator[Array]):
-    """What the robot says: the clips in random order, over and over, each with a peak of 0.7."""
+    """What the robot says: clips one after the other, each with a peak of 0.7; said: those so far, with their seconds."""
 
-    def __init__(self, rng: np.random.Generator, clips: list[Clip]) -> None:
-        self._rng, self._clips = rng, clips
-        self._order: list[int] = []
-        self._sizes: dict[int, int] = {}
-        self._said = 0
+    def __init__(self, clips: Iterable[Clip]) -> None:
+        self._clips = iter(clips)
+        self.said: list[tuple[Clip, float]] = []
 
     def __next__(self) -> Array:
-        if not self._order:
-            self._order = self._rng.permutation(len(self._clips)).tolist()
-        number = self._order.pop()
-        samples = read_speech(self._clips[number])
-        self._sizes[number] = samples.size
-        self._said += samples.size
+        clip = next(self._clips)
+        samples = read_speech(clip)
+        self.said.append((clip, samples.size / RATE))
         return 0.7 * samples / np.abs(samples).max()
 
-    @property
-    def speech_s(self) -> float:
-        """Seconds said so far."""
-        return self._said / RATE
 
-    @property
-    def distinct_s(self) -> float:
-        """Seconds of the clips among them."""
-        return sum(self._sizes.values()) / RATE
+def shuffled(rng: np.random.Generator, clips: list[Clip]) -> Iterator[Clip]:
+    """The clips in random order, over and over."""
+    while True:
+        yield from (clips[number] for number in rng.permutation(len(clips)).tolist()[::-1])
 
 
 def speak(
@@ -164,9 +157,11 @@ def draw_stages(rng: np.random.Generator, robot: Robot, stage_s: float) -> list[
 def make_day(seed: int, minutes: float, voices: list[Clip], speech: list[Clip]) -> Day:
     """A day of so many minutes of robot speech."""
     rng = np.random.default_rng(seed)
-    repertoire, robot = Repertoire(rng, voices), draw_robot(rng)
+    repertoire, robot = Repertoire(shuffled(rng, voices)), draw_robot(rng)
     stages = draw_stages(rng, robot, 60 * minutes / STAGES)
-    robot, _ = with_distortion(robot, next(Repertoire(rng, voices)), stages[0].room.robot, DISTORTION_DB)
+    robot, _ = with_distortion(
+        robot, next(Repertoire(shuffled(rng, voices))), stages[0].room.robot, USUAL_DISTORTION_DB
+    )
     parts, begins, told, now, level = [], [], [], 0, 0.0
     for stage in stages:
         ref, echo, heard = speak(rng, robot, repertoire, stage, 60 * minutes / STAGES)
@@ -183,8 +178,10 @@ def make_day(seed: int, minutes: float, voices: list[Clip], speech: list[Clip]) 
     mic = np.float32(microphone.gain) * echo + clean + fan
     sweeps = calibration(rng, robot, stages[0].room, microphone)
     names = tuple(stage.name for stage in stages)
-    said = repertoire.speech_s, repertoire.distinct_s
-    return Day(ref, mic, clean, fan, sweeps, names, tuple(begins), tuple(told), *said)
+    speech_s, distinct_s = (
+        sum(seconds for _, seconds in of) for of in (repertoire.said, dict.fromkeys(repertoire.said))
+    )
+    return Day(ref, mic, clean, fan, sweeps, names, tuple(begins), tuple(told), speech_s, distinct_s)
 
 
 def loudness(echo: Array, heard: list[slice]) -> float:
@@ -222,3 +219,102 @@ def calibration(
     echo = np.float32(microphone.gain) * robot.record(excitation, room.robot).astype(np.float32)
     fan, alone = (microphone.hears_fan(rng, size) for size in (echo.size, 8 * RATE))
     return excitation.astype(np.float32), echo + fan, alone
+
+
+ROOM_LAG_S = (0.05, 0.3)
+ROOMS = ("lab", "office")
+
+
+@dataclass(frozen=True)
+class Recording:
+    """Reference, echo and fan, (n,) float32 each."""
+
+    ref: Samples
+    echo: Samples
+    fan: Samples
+
+    @property
+    def mic(self) -> Samples:
+        """What the microphone hears."""
+        return self.echo + self.fan
+
+
+@dataclass(frozen=True)
+class TwoRooms:
+    """today, yesterday and calibration take place in this room (of that kind), the others in the other one."""
+
+    kind: str
+    today: Recording
+    yesterday: Recording
+    yesterday_elsewhere: Recording
+    calibration: tuple[Samples, Samples, Samples]
+    calibration_elsewhere: tuple[Samples, Samples, Samples]
+
+
+def make_rooms(seed: int, index: int, clips: list[Clip], today_s: float, yesterday_s: float) -> TwoRooms:
+    """Robot number index: today in the laboratory where index is even, else in the office.
+
+    today_s, yesterday_s: seconds of robot speech; no clip is heard in two of the recordings before all were heard.
+    """
+    rng = np.random.default_rng([seed, index])
+    kind, other = (ROOMS[(index + i) % 2] for i in (0, 1))
+    robot, human_m = draw_robot(rng), rng.uniform(1.0, 1.5)
+    here, elsewhere = (draw_room(rng, of, robot.distance_m, robot.direction, human_m) for of in (kind, other))
+    repertoire = Repertoire(shuffled(rng, clips))
+    robot, _ = with_distortion(robot, next(repertoire), here.robot, USUAL_DISTORTION_DB)
+    spoken = []
+    for room, seconds in ((here, today_s), (here, yesterday_s), (elsewhere, yesterday_s)):
+        stage = Stage(kind, room, round(rng.uniform(*ROOM_LAG_S) * RATE))
+        spoken.append(speak(rng, robot, repertoire, stage, seconds))
+    level = loudness(spoken[0][1], spoken[0][2])
+    microphone = draw_microphone(rng, robot, here, max(float(np.abs(echo).max()) for _, echo, _ in spoken), level)
+    recordings = [
+        Recording(np.float32(ref), np.float32(microphone.gain * echo), microphone.hears_fan(rng, ref.size))
+        for ref, echo, _ in spoken
+    ]
+    return TwoRooms(kind, *recordings, *(calibration(rng, robot, room, microphone) for room in (here, elsewhere)))
+
+
+STARTS, ALONE_LAG_S, ALONE_PPM = ("calibrated", "cold"), (0.02, 1.0), (10.0, 300.0)
+TRIAL_S = 6.0
+"""Of the robot's voice, to which its distortion is set."""
+
+
+@dataclass(frozen=True)
+class Monologue:
+    """One robot in one room, from the filter's first moment on.
+
+    ref, mic: (n,) float32. start: whether the filter has the calibration (sweep, its recording, the fan). said: clips
+    in order, and how many seconds each.
+    """
+
+    ref: Samples
+    mic: Samples
+    calibration: tuple[Samples, Samples, Samples]
+    room: str
+    distortion: str
+    start: str
+    voice: str
+    said: list[tuple[Clip, float]]
+
+
+def make_monologue(seed: int, index: int, voice: str, clips: Iterator[Clip], speech_s: float) -> Monologue:
+    """Number index of this seed, in which the voice says the next of its clips: rooms, distortions, starts in turn.
+
+    The lag is constant; in every other block of eight the clocks differ.
+    """
+    rng = np.random.default_rng([seed, index])
+    kind, distortion, start = ROOMS[index % 2], tuple(DISTORTION_DB)[index // 2 % 2], STARTS[index // 4 % 2]
+    robot = draw_robot(rng)
+    room = draw_room(rng, kind, robot.distance_m, robot.direction, rng.uniform(1.0, 1.5))
+    first = next(clips)
+    trial = read_speech(first)[: round(TRIAL_S * RATE)]
+    robot, _ = with_distortion(robot, trial, room.robot, rng.uniform(*DISTORTION_DB[distortion][kind]))
+    ppm = rng.choice([-1.0, 1.0]) * math.exp(rng.uniform(*np.log(ALONE_PPM))) if index // 8 % 2 else 0.0
+    stage = Stage(kind, room, round(rng.uniform(*ALONE_LAG_S) * RATE), rng.uniform(-3, 3), ppm)
+    said = Repertoire(chain([first], clips))
+    ref, echo, heard = speak(rng, robot, said, stage, speech_s)
+    microphone = draw_microphone(rng, robot, room, float(np.abs(echo).max()), loudness(echo, heard))
+    mic = (microphone.gain * echo).astype(np.float32) + microphone.hears_fan(rng, ref.size)
+    sweeps = calibration(rng, robot, room, microphone)
+    return Monologue(ref.astype(np.float32), mic, sweeps, kind, distortion, start, voice, said.said)

@@ -5,36 +5,373 @@
 A case is a folder HALF_NUMBER as bench.simulate.hidden_cases writes them; truth.json besides says what other names are
 right (also), which program it was and its setting. Case i has program i mod their number, then comes a control for
 every ten; the setting is drawn again, at most six times, while it changes less than LEAST_DB over the fan. Robot, room
-and ordinary tolerances are those of hidden_robot. `--half reporting` is for figures, never for tuning: other suites.
+and ordinary tolerances are those of hidden_robot. `--half reporting` is for figures, never for tuning: the two share no
+suite of programs, so that a suite's way to do things is not learned.
+
+Debian: sox ffmpeg swh-plugins tap-plugins cmt caps invada-studio-plugins-ladspa zam-plugins vlevel lame opus-tools speex
+libgsm-tools. PyPI: pedalboard noisereduce webrtc-noise-gain.
 """
 
 from __future__ import annotations
 
 import argparse
-from dataclasses import replace
+import importlib
+import os
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
+import soundfile as sf
+from scipy import signal
 from tqdm import tqdm
 
-from bench.simulate.conversations import Clip, read_clips
-from bench.simulate.hidden_acoustics import Place, decibels, direction, power
+from bench.simulate.conversations import Clip, read_voices
 from bench.simulate.hidden_cases import read_reference, scale, write_case
-from bench.simulate.hidden_robot import Chain, Scene, draw_scene
+from bench.simulate.hidden_effects import Rng, log_uniform, put_back
+from bench.simulate.hidden_robot import Chain, Place, Scene, decibels, direction, draw_scene, power
 from bench.simulate.simulated_robot import RATE, Array
-from bench.simulate.wild_programs import Program
-from bench.simulate.wild_reporting import REPORTING
-from bench.simulate.wild_tools import put_back
-from bench.simulate.wild_tuning import TUNING
 
-HALVES = {"tuning": TUNING, "reporting": REPORTING}
-CONTROL = Program("none", "source", ("none",), None)
 EVERY = 10
 ROBOT_OVER_FAN_DB = (20.0, 30.0)
 LEAST_DB, CLEAR_DB = 2.0, 8.5
 TRIES = 6
 TAIL_S = 1.0
 """By which a program may lengthen the room's response."""
+LADSPA = "/usr/lib/ladspa"
+RAW = ("-f", "f32le", "-ac", "1", "-ar", str(RATE))
+
+
+@dataclass(frozen=True)
+class Command:
+    """One setting of a program: the words that its manual knows it by, and what it makes of samples (n,) at 16 kHz."""
+
+    words: str
+    run: Callable[[Array], Array]
+
+    def __call__(self, x: Array) -> Array:
+        """(n,) x through the program, put back in time by whole samples."""
+        return put_back(self.run(x), x)
+
+
+@dataclass(frozen=True)
+class Program:
+    """One effect of one program: where it stands, the names that are right, and a setting drawn at random.
+
+    right: the first is what the manual says that the effect does, others that are right as well stand behind it. draw:
+    None for a simulator of rooms, which is given the room itself.
+    """
+
+    name: str
+    place: Literal["source", "room", "microphone"]
+    right: tuple[str, ...]
+    draw: Callable[[Rng], Command] | None
+
+
+def sox(*effect: object) -> Command:
+    """SoX with an effect and its arguments."""
+    words = [str(word) for word in effect]
+    raw = ["-t", "f32", "-r", str(RATE), "-c", "1", "-"]
+    return Command("sox " + " ".join(words), lambda x: _piped(["sox", "-V1", "-R", *raw, *raw, *words], x))
+
+
+def ffmpeg(filters: str) -> Command:
+    """The audio filters of ffmpeg."""
+    return Command(f"ffmpeg -af {filters}", lambda x: _filtered(x, filters))
+
+
+def ladspa(file: str, label: str, *controls: float, channels: int = 1, rate: int = RATE) -> Command:
+    """One channel through a LADSPA plugin with that many inputs, its controls in their order; ffmpeg is the host.
+
+    rate: at which it runs, for a plugin that works at the rates of studios only.
+    """
+    values = "|".join(f"c{i}={value:g}" for i, value in enumerate(controls))
+    spread = "pan=stereo|c0=c0|c1=c0," if channels == 2 else ""
+    filters = f"aresample={rate},{spread}ladspa=f={file}:p={label}:c={values},pan=mono|c0=c0"
+    return Command(f"{file} {label} {values}", lambda x: _filtered(x, filters))
+
+
+def ladspa_by_rate(file: str, label: str, *controls: float) -> Command:
+    """The same for a plugin whose controls have bounds in parts of the sampling rate, which ffmpeg does not know: SoX hosts it."""
+    return sox("ladspa", f"{LADSPA}/{file}.so", label, *(f"{value:g}" for value in controls))
+
+
+def coded(encode: str, decode: str, rate: int = RATE) -> Command:
+    """A codec's own two programs, as shell words with {wav} (16 bit), {packed} and {out} (a WAV file)."""
+
+    def run(x: Array) -> Array:
+        with tempfile.TemporaryDirectory() as folder:
+            paths = {name: Path(folder, f"{name}.wav") for name in ("wav", "packed", "out")}
+            sf.write(paths["wav"], signal.resample_poly(x, rate, RATE), rate, subtype="PCM_16")
+            for line in (encode, decode):
+                subprocess.run(line.format(**paths), shell=True, check=True, capture_output=True)
+            y, decoded = sf.read(paths["out"], dtype="float64")
+        return signal.resample_poly(y if y.ndim == 1 else y[:, 0], RATE, decoded)
+
+    return Command(f"{encode} ; {decode}", run)
+
+
+def pedalboard(name: str, **settings: float) -> Command:
+    """One of pedalboard's effects."""
+
+    def run(x: Array) -> Array:
+        plugin = getattr(importlib.import_module("pedalboard"), name)(**settings)
+        return np.asarray(plugin(x.astype(np.float32), RATE), float)
+
+    return Command(f"pedalboard.{name}({_listed(settings)})", run)
+
+
+def noisereduce(**settings: float) -> Command:
+    """The spectral gate of noisereduce."""
+
+    def run(x: Array) -> Array:
+        return np.asarray(importlib.import_module("noisereduce").reduce_noise(y=x, sr=RATE, **settings), float)
+
+    return Command(f"noisereduce.reduce_noise({_listed(settings)})", run)
+
+
+def webrtc(auto_gain: int, noise_suppression: int) -> Command:
+    """webrtc-noise-gain: target level -dBFS of its gain control, 0 to 4 for its noise suppression."""
+
+    def run(x: Array) -> Array:
+        device = importlib.import_module("webrtc_noise_gain").AudioProcessor(auto_gain, noise_suppression)
+        pcm = np.round(32767 * np.clip(np.pad(x, (0, -x.size % 160)), -1, 1)).astype(np.int16).reshape(-1, 160)
+        out = b"".join(device.Process10ms(frame.tobytes()).audio for frame in pcm)
+        return np.frombuffer(out, np.int16)[: x.size] / 32768.0
+
+    return Command(f"webrtc_noise_gain.AudioProcessor({auto_gain}, {noise_suppression})", run)
+
+
+def _listed(settings: dict[str, float]) -> str:
+    return ", ".join(f"{key}={value:.4g}" for key, value in settings.items())
+
+
+def _filtered(x: Array, filters: str) -> Array:
+    return _piped(["ffmpeg", "-v", "error", "-threads", "1", *RAW, "-i", "-", "-af", filters, *RAW, "-"], x)
+
+
+def _piped(command: list[str], x: Array) -> Array:
+    """(m,) what a program makes of 32-bit floats on its standard input; ends the program with its own words."""
+    raw, environment = x.astype(np.float32).tobytes(), os.environ | {"LADSPA_PATH": LADSPA}
+    try:
+        done = subprocess.run(command, input=raw, capture_output=True, env=environment)
+    except FileNotFoundError:
+        sys.exit(f"{command[0]} was not found; bench/simulate/wild.py says which packages are needed")
+    if done.returncode:
+        sys.exit(f"{' '.join(command)} failed: {done.stderr.decode(errors='replace').strip()[-300:]}")
+    return np.frombuffer(done.stdout, np.float32).astype(np.float64)
+
+
+def either(rng: Rng, low: float, high: float) -> float:
+    """A number of that size, of either sign."""
+    return float(rng.choice([-1.0, 1.0]) * rng.uniform(low, high))
+
+
+def volume(rng: Rng) -> float:
+    """dB: much softer, or a little louder, as the headroom is."""
+    return float(rng.choice([rng.uniform(-8.0, -1.5), rng.uniform(1.5, 2.5)]))
+
+
+def gains(rng: Rng, count: int, most: float = 9.0) -> list[float]:
+    """(count,) dB of neighbouring bands, none alike."""
+    return [float(round(value, 1)) for value in rng.uniform(-most, most, count)]
+
+
+def echoes_ms(rng: Rng, count: int) -> list[float]:
+    return sorted(float(round(value, 2)) for value in rng.uniform(1.0, 9.0, count))
+
+
+def _parametric(r: Rng) -> Command:
+    bands = [(either(r, 3, 9), f * r.uniform(0.7, 1.4), r.uniform(0.8, 2.5)) for f in (350.0, 1200.0, 3500.0)]
+    low, high = (either(r, 0, 5), r.uniform(150, 300), 0.5), (either(r, 2, 6), r.uniform(3500, 6000), 0.5)
+    return ladspa_by_rate("triple_para_1204", "triplePara", *(value for band in (low, *bands, high) for value in band))
+
+
+def _sox_echo(r: Rng) -> Command:
+    pairs = [word for ms in echoes_ms(r, int(r.integers(1, 4))) for word in (ms, round(float(r.uniform(0.15, 0.4)), 2))]
+    return sox("echo", 1.0, 1.0, *pairs)
+
+
+def _sox_compand(r: Rng) -> Command:
+    knee, ratio = r.uniform(-36, -24), r.uniform(2.5, 6)
+    times = f"{r.uniform(0.003, 0.02):.3f},{r.uniform(0.1, 0.5):.2f}"
+    return sox("compand", times, f"6:-90,-90,{knee:.1f},{knee:.1f},0,{knee * (1 - 1 / ratio):.1f}", "0", "-30")
+
+
+def _sox_multiband(r: Rng) -> Command:
+    def band() -> str:
+        knee, ratio = r.uniform(-45, -30), r.uniform(2.0, 6.0)
+        times = f"{r.uniform(0.003, 0.01):.3f},{r.uniform(0.08, 0.3):.2f}"
+        return f"{times} 6:-90,-90,{knee:.1f},{knee:.1f},0,{knee * (1 - 1 / ratio):.1f} 0 -30"
+
+    return sox("mcompand", band(), f"{r.uniform(300, 700):.0f}", band(), f"{r.uniform(1500, 3000):.0f}", band())
+
+
+def _tap_eq(r: Rng) -> Command:
+    return ladspa("tap_eq", "tap_equalizer", 0, *gains(r, 5), 0, 0, 100, 200, 450, 1000, 2200, 4500, 12000, 15000)
+
+
+def _firequalizer(r: Rng) -> Command:
+    bands = zip((60, 250, 600, 1400, 3000, 7500), [0.0, *gains(r, 5)], strict=True)
+    return ffmpeg("firequalizer=gain_entry='" + ";".join(f"entry({hz},{db})" for hz, db in bands) + "'")
+
+
+def _aecho(r: Rng) -> Command:
+    delays = echoes_ms(r, int(r.integers(1, 4)))
+    decays = [f"{r.uniform(0.15, 0.4):.2f}" for _ in delays]
+    return ffmpeg(f"aecho=1:1:{'|'.join(map(str, delays))}:{'|'.join(decays)}")
+
+
+def _limiter(r: Rng) -> Command:
+    limit, attack, release = r.uniform(0.12, 0.35), r.uniform(2, 8), log_uniform(r, 30, 400)
+    return ffmpeg(f"alimiter=limit={limit:.3f}:attack={attack:.1f}:release={release:.0f}:level=0")
+
+
+def _acompressor(r: Rng) -> Command:
+    level, ratio, attack, release = (
+        r.uniform(-34, -22),
+        r.uniform(2.5, 8),
+        log_uniform(r, 2, 30),
+        log_uniform(r, 60, 500),
+    )
+    return ffmpeg(f"acompressor=threshold={level:.0f}dB:ratio={ratio:.1f}:attack={attack:.1f}:release={release:.0f}")
+
+
+def _mcompand(r: Rng) -> Command:
+    curve, last = "6 -47/-40\\,-34/-34\\,-17/-33", "6 -47/-40\\,-34/-34\\,-15/-33 7900"
+    return ffmpeg(
+        f"mcompand=0.005\\,0.1 {curve} 300 | 0.003\\,0.05 {curve} 1400 | 0.000625\\,{r.uniform(0.01, 0.05):.4f} {last}"
+    )
+
+
+def _compressor(r: Rng) -> Command:
+    level, ratio, attack, release = (
+        r.uniform(-34, -24),
+        r.uniform(2.5, 8),
+        log_uniform(r, 1, 20),
+        log_uniform(r, 60, 500),
+    )
+    return pedalboard("Compressor", threshold_db=level, ratio=ratio, attack_ms=attack, release_ms=release)
+
+
+# fmt: off
+TUNING: tuple[Program, ...] = (
+    Program("sox bass, treble", "source", ("equaliser",),
+            lambda r: sox("bass", f"{either(r, 3, 9):.1f}", "treble", f"{either(r, 3, 9):.1f}")),
+    Program("swh triplePara", "source", ("equaliser",), _parametric),
+    Program("swh dj_eq", "source", ("equaliser",), lambda r: ladspa("dj_eq_1901", "dj_eq_mono", *gains(r, 3, 6.0), rate=48000)),
+    Program("sox echo", "room", ("early_path",), _sox_echo),
+    Program("pyroomacoustics, microphone moved", "room", ("early_path",), None),
+    Program("pyroomacoustics, robot moved", "room", ("early_path",), None),
+    Program("swh gverb", "room", ("late_reverb",),
+            lambda r: ladspa("gverb_1216", "gverb", r.uniform(8, 25), r.uniform(0.5, 1.2), 0.3, 0.8, 0, -70, r.uniform(-24, -16))),
+    Program("sox reverb", "room", ("late_reverb",),
+            lambda r: sox("reverb", f"{r.uniform(50, 90):.0f}", "50", f"{r.uniform(50, 100):.0f}", "100", "0", "-6")),
+    Program("swh valve", "source", ("speaker_nonlinearity",), lambda r: ladspa("valve_1209", "valve", r.uniform(0.3, 0.9), r.uniform(0.1, 0.9))),
+    Program("swh foverdrive", "source", ("speaker_nonlinearity",), lambda r: ladspa("foverdrive_1196", "foverdrive", r.uniform(1.5, 3))),
+    Program("sox overdrive", "source", ("speaker_nonlinearity", "playback_gain"),  # its gain raises the level as well
+            lambda r: sox("overdrive", f"{r.uniform(3, 12):.1f}", f"{r.uniform(5, 30):.0f}")),
+    Program("swh fastLookaheadLimiter", "source", ("limiter", "compression"),  # a limiter is a compressor of infinite ratio
+            lambda r: ladspa("fast_lookahead_limiter_1913", "fastLookaheadLimiter",
+                             0, r.uniform(-18, -8), log_uniform(r, 0.03, 0.6), channels=2)),
+    Program("swh hardLimiter", "source", ("speaker_nonlinearity", "limiter"),  # it clips, which an amplifier's limiter does as well
+            lambda r: ladspa("hard_limiter_1413", "hardLimiter", r.uniform(-16, -8), 1, 0)),
+    Program("swh hardLimiter behind the microphone", "microphone", ("mic_clipping",),
+            lambda r: ladspa("hard_limiter_1413", "hardLimiter", r.uniform(-22, -16), 1, 0)),
+    Program("swh sc4m", "source", ("compression",),
+            lambda r: ladspa("sc4m_1916", "sc4m", r.uniform(0, 0.5), log_uniform(r, 2, 30), log_uniform(r, 60, 500),
+                             r.uniform(-30, -20), r.uniform(2.5, 10), r.uniform(1, 8), r.uniform(0, 6))),
+    Program("sox compand", "source", ("compression",), _sox_compand),
+    Program("sox mcompand", "source", ("multiband_compression",), _sox_multiband),
+    Program("webrtc noise suppression", "microphone", ("noise_suppression",), lambda r: webrtc(0, int(r.integers(1, 5)))),
+    Program("webrtc gain control", "microphone", ("mic_agc",), lambda r: webrtc(int(r.integers(5, 20)), 0)),
+    Program("speex", "source", ("codec",),
+            lambda r: coded(f"speexenc --wideband --quality {r.integers(3, 9)} {{wav}} {{packed}}", "speexdec {packed} {out}")),
+    Program("speex, packets lost", "source", ("codec",),
+            lambda r: coded("speexenc --wideband --quality 8 {wav} {packed}",
+                            f"speexdec --packet-loss {r.integers(3, 15)} {{packed}} {{out}}")),
+    Program("swh buttlow", "source", ("bandlimit", "equaliser"),  # of second order: 12 dB an octave
+            lambda r: ladspa_by_rate("butterworth_1902", "buttlow_iir", r.uniform(1800, 4500), r.uniform(0.6, 1.41))),
+    Program("sox sinc", "source", ("bandlimit",), lambda r: sox("sinc", f"-{r.uniform(2500, 5500):.0f}")),
+    Program("sox speed", "source", ("clock_drift",), lambda r: sox("speed", f"{1 + either(r, 3e-5, 3e-4):.6f}")),
+    Program("sox gain", "source", ("playback_gain",), lambda r: sox("gain", f"{volume(r):.1f}")),
+    Program("sox equalizer, narrow", "source", ("chassis_resonance", "equaliser"),  # one peak, which is an equaliser's band as well
+            lambda r: sox("equalizer", f"{log_uniform(r, 250, 4000):.0f}", f"{r.uniform(8, 30):.1f}q", f"{r.uniform(6, 15):.1f}")),
+    Program("sox tremolo", "source", ("unknown",), lambda r: sox("tremolo", f"{r.uniform(3, 9):.1f}", f"{r.uniform(40, 80):.0f}")),
+    Program("sox flanger", "source", ("unknown",),
+            lambda r: sox("flanger", 0, f"{r.uniform(1, 4):.1f}", 0, 70, f"{r.uniform(0.5, 2):.1f}")),
+)
+"""SoX, swh-plugins, pyroomacoustics, Speex, WebRTC."""
+
+REPORTING: tuple[Program, ...] = (
+    Program("tap equalizer", "source", ("equaliser",), _tap_eq),
+    Program("caps Eq10", "source", ("equaliser",), lambda r: ladspa("caps", "Eq10", 0, 0, 0, *gains(r, 6), 0)),
+    Program("caps CabinetIII", "source", ("equaliser",),
+            lambda r: ladspa("caps", "CabinetIII", int(r.integers(0, 17)), 0, r.uniform(-3, 3))),
+    Program("pedalboard HighShelfFilter", "source", ("equaliser",),
+            lambda r: pedalboard("HighShelfFilter", cutoff_frequency_hz=r.uniform(900, 3500), gain_db=either(r, 3, 9))),
+    Program("ffmpeg firequalizer", "source", ("equaliser",), _firequalizer),
+    Program("ffmpeg aecho", "room", ("early_path",), _aecho),
+    Program("cmt delay_0.01s", "room", ("early_path",),
+            lambda r: ladspa("cmt", "delay_0.01s", r.uniform(0.0015, 0.009), r.uniform(0.15, 0.4))),
+    Program("tap reverb", "room", ("late_reverb",),
+            lambda r: ladspa("tap_reverb", "tap_reverb", r.uniform(700, 2000), 0, r.uniform(-22, -12),
+                             1, 1, 1, 0, int(r.integers(0, 43)), channels=2)),
+    Program("caps Plate", "room", ("late_reverb",),
+            lambda r: ladspa("caps", "Plate", 0.7, r.uniform(0.3, 0.7), 0.4, r.uniform(0.1, 0.3))),
+    Program("cmt freeverb3", "room", ("late_reverb",),
+            lambda r: ladspa("cmt", "freeverb3", 0, r.uniform(0.3, 0.7), 0.3, r.uniform(0.1, 0.3), 0.7, 0.5, channels=2)),
+    Program("tap sigmoid", "source", ("speaker_nonlinearity", "playback_gain"),  # its pre-gain raises the level
+            lambda r: ladspa("tap_sigmoid", "tap_sigmoid", r.uniform(2, 10), r.uniform(-6, 0))),
+    Program("tap tubewarmth", "source", ("speaker_nonlinearity",),
+            lambda r: ladspa("tap_tubewarmth", "tap_tubewarmth", r.uniform(2, 9), r.uniform(0, 10))),
+    Program("invada tube", "source", ("speaker_nonlinearity",),
+            lambda r: ladspa("inv_tube", "invada_mono_tube_module_0_1", r.uniform(3, 15), r.uniform(-0.4, 0.4), 0, 75)),
+    Program("ffmpeg asoftclip", "source", ("speaker_nonlinearity",),
+            lambda r: ffmpeg(f"asoftclip=type={r.choice(['tanh', 'atan', 'cubic', 'exp', 'alg'])}")),
+    Program("ffmpeg alimiter", "source", ("limiter", "compression"), _limiter),
+    Program("tap limiter", "source", ("limiter", "compression"), lambda r: ladspa("tap_limiter", "tap_limiter", r.uniform(-18, -8), 0)),
+    Program("pedalboard Limiter", "source", ("limiter", "compression"),
+            lambda r: pedalboard("Limiter", threshold_db=r.uniform(-24, -14), release_ms=log_uniform(r, 40, 400))),
+    Program("ffmpeg acompressor", "source", ("compression",), _acompressor),
+    Program("invada compressor", "source", ("compression",),
+            lambda r: ladspa("inv_compressor", "invada_mono_compressor_module_0_1", r.uniform(0, 0.6), log_uniform(r, 1, 20),
+                             log_uniform(r, 60, 500), r.uniform(-34, -24), r.uniform(2.5, 8), 0, 0)),
+    Program("pedalboard Compressor", "source", ("compression",), _compressor),
+    Program("ffmpeg mcompand", "source", ("multiband_compression",), _mcompand),
+    Program("ffmpeg afftdn", "microphone", ("noise_suppression",), lambda r: ffmpeg(f"afftdn=nr={r.uniform(8, 25):.0f}:nf=-50:tn=1")),
+    Program("noisereduce", "microphone", ("noise_suppression",),
+            lambda r: noisereduce(stationary=True, prop_decrease=r.uniform(0.6, 1.0))),
+    Program("ffmpeg dynaudnorm", "microphone", ("mic_agc",), lambda r: ffmpeg(f"dynaudnorm=f={r.integers(200, 800)}:g=5:m=6")),
+    Program("vlevel", "microphone", ("mic_agc",),
+            lambda r: ladspa("vlevel-ladspa", "vlevel_mono", r.uniform(0.3, 1.5), r.uniform(0.3, 0.7), 1, r.uniform(3, 8), 0)),
+    Program("toast", "source", ("codec", "bandlimit"),  # narrow band, too
+            lambda r: coded("sox {wav} -t gsm {packed}", "sox -t gsm -r 8000 {packed} {out}", 8000)),
+    Program("lame", "source", ("codec",),
+            lambda r: coded(f"lame -m m -b {r.choice([8, 16, 24, 32])} {{wav}} {{packed}}", "lame --decode {packed} {out}")),
+    Program("opus, packets lost", "source", ("codec",),
+            lambda r: coded("opusenc --bitrate 32 {wav} {packed}",
+                            f"opusdec --rate 16000 --packet-loss {r.integers(3, 15)} {{packed}} {{out}}")),
+    Program("pedalboard Clipping", "microphone", ("mic_clipping",), lambda r: pedalboard("Clipping", threshold_db=r.uniform(-22, -16))),
+    Program("pedalboard LadderFilter", "source", ("bandlimit", "equaliser"),  # 24 dB an octave, and a colour below
+            lambda r: pedalboard("LadderFilter", cutoff_hz=r.uniform(2000, 4500), resonance=0.0, drive=1.0)),
+    Program("ffmpeg asetrate", "source", ("clock_drift",),
+            lambda r: ffmpeg(f"aresample=160000,asetrate={160000 + round(either(r, 6, 45))},aresample=16000")),
+    Program("ffmpeg volume", "source", ("playback_gain",), lambda r: ffmpeg(f"volume={volume(r):.1f}dB")),
+    Program("ffmpeg tremolo", "source", ("unknown",),
+            lambda r: ffmpeg(f"tremolo=f={r.uniform(3, 9):.1f}:d={r.uniform(0.4, 0.8):.2f}")),
+    Program("pedalboard Chorus", "source", ("unknown",),
+            lambda r: pedalboard("Chorus", rate_hz=r.uniform(0.5, 3), depth=r.uniform(0.1, 0.3), mix=r.uniform(0.3, 0.5))),
+)
+"""ffmpeg, tap, caps, cmt, invada, vlevel, LAME, Opus, GSM, pedalboard, noisereduce."""
+# fmt: on
+
+HALVES = {"tuning": TUNING, "reporting": REPORTING}
+CONTROL = Program("none", "source", ("none",), None)
 
 
 def program_of(half: str, index: int) -> Program:
@@ -45,7 +382,7 @@ def program_of(half: str, index: int) -> Program:
     return programs[(index - index // EVERY) % len(programs)]
 
 
-def moved(rng: np.random.Generator, place: Place, program: Program) -> tuple[Place, str]:
+def moved(rng: Rng, place: Place, program: Program) -> tuple[Place, str]:
     """The microphone some centimetres, or the robot some tenths of a metre, away in the same room."""
     if "robot" in program.name:
         step = rng.uniform(0.3, 1.2) * direction(rng) * np.array([1.0, 1.0, 0.1])
@@ -54,7 +391,7 @@ def moved(rng: np.random.Generator, place: Place, program: Program) -> tuple[Pla
     return place.microphone_moved(step), f"microphone moved by {100 * np.linalg.norm(step):.1f} cm"
 
 
-def through(rng: np.random.Generator, scene: Scene, program: Program) -> tuple[Chain, str]:
+def through(rng: Rng, scene: Scene, program: Program) -> tuple[Chain, str]:
     """The usual chain with a setting of the program in its place, and the words for that setting."""
     chain = scene.usual
     if program is CONTROL:
@@ -81,8 +418,8 @@ def make_case(seed: int, index: int, half: str, voices: dict[str, list[Clip]]) -
     usual = scene.record(scene.usual)
     for _ in range(TRIES):
         chain, words = through(rng, scene, program)
-        heard = scene.record(chain)
-        change_db = scene.over_fan_db(put_back(heard, usual) - usual)
+        mic = scene.record(chain)
+        change_db = scene.over_fan_db(put_back(mic, usual) - usual)
         if program is CONTROL or change_db >= LEAST_DB:
             break
     right = program.right
@@ -90,7 +427,7 @@ def make_case(seed: int, index: int, half: str, voices: dict[str, list[Clip]]) -
     truth = {"effects": [right[0]], "also": list(right[1:]), "raw": [program.name], "strength": strength}
     truth |= {"setting": words, "effect_to_noise_db": change_db, "tolerances": scene.tolerances}
     truth |= {"robot_over_fan_db": decibels(power(scene.echo(scene.usual)) / scene.fan_power)}
-    return scale(scene.signals | {"mic": heard}, {}), truth | {"voice": voice, "seed": [seed, index]}
+    return scale(scene.signals | {"mic": mic}, {}), truth | {"voice": voice, "seed": [seed, index]}
 
 
 def main() -> None:
@@ -101,13 +438,9 @@ def main() -> None:
     parser.add_argument("--count", type=int, default=40, help="cases (default: %(default)s)")
     parser.add_argument("--seed", type=int, default=1)
     options = parser.parse_args()
-    voices: dict[str, list[Clip]] = {}
-    for clip in (clip for folder in options.voices for clip in read_clips(folder, (1.0, 15.0))):
-        voices.setdefault(clip.speaker, []).append(clip)
-    for index in tqdm(range(options.count), unit="case", desc=options.half):
-        write_case(
-            options.output / f"{options.half}_{index:03d}", *make_case(options.seed, index, options.half, voices)
-        )
+    half, voices = options.half, read_voices(options.voices)
+    for index in tqdm(range(options.count), unit="case", desc=half):
+        write_case(options.output / f"{half}_{index:03d}", *make_case(options.seed, index, half, voices))
 
 
 if __name__ == "__main__":

@@ -2,8 +2,8 @@
 
     python agent_livekit.py [WHISPER]
 
-Needs `pip install edgefilter[livekit]`, and for the words faster-whisper with a model (a folder, or a name such as
-base). There is no server: the session is a real one, its microphone and its loudspeaker are those of the simulated room
+Needs `pip install '.[livekit]'` in a checkout, and for the words faster-whisper with a model (a folder, or a name such
+as base). There is no server: the session is a real one, its microphone and its loudspeaker are those of the simulated room
 of room.py. In a room of a server the processor goes where the session is started:
 
     audio = room_io.AudioInputOptions(noise_cancellation=ears, sample_rate=16000)

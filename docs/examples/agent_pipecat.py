@@ -2,8 +2,8 @@
 
     python agent_pipecat.py [WHISPER]
 
-Needs `pip install edgefilter[pipecat]`, and for the words faster-whisper with a model (a folder, or a name such as
-base). The transport is the simulated room of room.py; with devices it is a line, and the rest stays:
+Needs `pip install '.[pipecat]'` in a checkout, and for the words faster-whisper with a model (a folder, or a name such
+as base). The transport is the simulated room of room.py; with devices it is a line, and the rest stays:
 
     params = LocalAudioTransportParams(audio_in_enabled=True, audio_out_enabled=True, **ears.params)
 """

@@ -2,8 +2,8 @@ r"""A Wyoming satellite that can be interrupted: it talks, a human talks over it
 
     python agent_wyoming.py [WHISPER]
 
-Needs `pip install edgefilter[wyoming]`, and for the words faster-whisper with a model (a folder, or a name such as
-base). Everything goes through TCP: the simulated room of room.py is a microphone and a loudspeaker service, as
+Needs `pip install '.[wyoming]'` in a checkout, and for the words faster-whisper with a model (a folder, or a name such
+as base). Everything goes through TCP: the simulated room of room.py is a microphone and a loudspeaker service, as
 wyoming-mic-external and wyoming-snd-external are; edgefilter's service stands before them; and this program is the
 satellite, which speaks and listens through it. On a robot:
 

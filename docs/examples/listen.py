@@ -1,58 +1,49 @@
-"""Microphone, filter, where speech begins and ends, recogniser: all in one file.
+"""What the human says, in words: behind `edgefilter run`, which filters and tells where speech begins and ends.
 
-    python listen.py mic.wav reference.wav [robot.npz] [WHISPER]
-    ... | python listen.py - - [robot.npz] [WHISPER]
+    edgefilter run --input mic --output - --quiet --log-json events.jsonl | python listen.py events.jsonl [WHISPER]
 
-Reads a recording with what the robot said, or from a pipe 16-bit stereo at 16 kHz (microphone, reference); with `mic`
-as the first word, the default microphone and the monitor of the default output (`mic -`). Each thing that the human
-says is cut out by the filter's events and handed to Whisper (faster-whisper; WHISPER is a folder or a name such as
-base); without, its time is printed.
+`--input mic.wav --reference tts.wav` does the same with a recording. `edgefilter run` writes the human as 16-bit samples,
+and each event as a line of JSON. Each passage between speech_started and
+speech_stopped is handed to Whisper (faster-whisper; WHISPER is a folder or a name such as base); without, its time is
+printed.
 """
 
+import json
+import signal
 import sys
+from collections import deque
 
 import numpy as np
 from words import Words
 
-from edgefilter import SAMPLE_RATE, EgoFilter
-from edgefilter.commands.ends import make_source  # the command line's own; not of the public API
+RATE = 16_000
+BEFORE = RATE // 2  # samples kept from before the event: a word's first sounds come before the filter is sure
 
-BEFORE = SAMPLE_RATE // 2  # of what came before the event: the first sounds of a word are heard before they are sure
-
-mic, reference, *more = sys.argv[1:]
-profile = next((word for word in more if word.endswith(".npz")), None)
-words = Words(next((word for word in more if word != profile), None))
-ego = EgoFilter(profile=profile)
-heard, first, began = (
-    np.zeros(0, np.float32),
-    0,
-    None,
-)  # what was filtered; the sample it starts with; who speaks, since when
+signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C ends edgefilter run, and with it the pipe
+words = Words(*sys.argv[2:])
+human, first, began = np.zeros(0, np.float32), 0, None  # samples; the number of the first; where speech began
 
 
-def listen(human):
-    """Take the next filtered samples; print what was said where somebody has just stopped speaking."""
-    global heard, first, began
-    heard = np.concatenate((heard, human))
-    for event in ego.events():
-        if event.kind == "speech_started":
-            began = max(first, event.sample - BEFORE)
-        elif event.kind == "speech_stopped" and began is not None:
-            said = heard[began - first : event.sample - first]
-            print(f"{began / SAMPLE_RATE:.2f} to {event.sample / SAMPLE_RATE:.2f} s: {words(said)}", flush=True)
-            began = None
-    if began is None and heard.size > BEFORE:
-        first, heard = first + heard.size - BEFORE, heard[-BEFORE:]
+def finish(end):
+    said = words(human[began - first : end - first])
+    print(f"{began / RATE:.2f} to {end / RATE:.2f} s: {said}", flush=True)
 
 
-with make_source(mic, None if "-" in (mic, reference) or mic == "mic" else reference, "-") as source:
-    print(*source.notes, sep="\n", file=sys.stderr, flush=True)  # which devices
-    try:
-        for block in source:
-            for at in range(0, block.mic.size, 320):  # 20 ms, as they come live
-                listen(ego.process(block.mic[at : at + 320], block.ref[at : at + 320]))
-    except KeyboardInterrupt:  # how a live run ends
-        pass
-listen(ego.flush())
-if began is not None:  # the recording ended in mid-sentence
-    print(f"{began / SAMPLE_RATE:.2f} s to the end: {words(heard[began - first :])}")
+data, events = sys.stdin.buffer.read1(), deque()
+with open(sys.argv[1]) as log:  # there since the first samples
+    while data:
+        data += sys.stdin.buffer.read(len(data) % 2)
+        human = np.concatenate((human, np.frombuffer(data, "<i2").astype(np.float32) / 32768))
+        events.extend(json.loads(line) for line in log)
+        while events and (at := round(events[0]["time"] * RATE)) <= first + human.size:
+            kind = events.popleft()["kind"]
+            if kind == "speech_started":
+                began = max(first, at - BEFORE)
+            elif kind == "speech_stopped" and began is not None:
+                finish(at)
+                began = None
+        if began is None and human.size > 2 * BEFORE:
+            first, human = first + human.size - 2 * BEFORE, human[-2 * BEFORE :]
+        data = sys.stdin.buffer.read1()
+if began is not None:  # it ended in mid-sentence
+    finish(first + human.size)

@@ -11,7 +11,6 @@ is better off with the devices themselves (`edgefilter run`).
 
 import numpy as np
 
-from edgefilter import EgoFilter
 from edgefilter.integrations.duplex import Duplex, as_pcm16, from_pcm16
 
 RATE = 16_000
@@ -35,9 +34,7 @@ def main():
             super().__init__("edgefilter")
             self.human = self.create_publisher(AudioData, "human", 10)
             self.events = self.create_publisher(String, "speech_events", 10)
-            self.duplex = Duplex(
-                EgoFilter(budget_ms=8), on_event=lambda event: self.events.publish(String(data=event.kind))
-            )
+            self.duplex = Duplex(on_event=lambda event: self.events.publish(String(data=event.kind)))
             self.create_subscription(AudioData, "speech", self.on_speech, 50)
             self.create_subscription(Empty, "speech_stopped", lambda _: self.duplex.interrupt(), 10)
             self.create_subscription(AudioData, "audio", self.on_audio, 50)

@@ -51,3 +51,8 @@ def with_network_as_judge(engine: Engine | ClipEngine) -> Engine | ClipEngine:
     if engine.name == JUDGE:
         return engine
     return cast(Engine, Judged(cast(Engine, engine), cast(Engine, engines.create(JUDGE))))
+
+
+def judges_speech(engine: Engine | ClipEngine) -> bool:
+    """Whether the engine says how probable it is that a human speaks."""
+    return engine.name == JUDGE or isinstance(engine, Judged)

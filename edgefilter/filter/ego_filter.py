@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from edgefilter import engines
 from edgefilter.engines.base import ClipEngine, Engine
-from edgefilter.engines.judged import with_network_as_judge
+from edgefilter.engines.judged import judges_speech, with_network_as_judge
 from edgefilter.engines.ladder import CANDIDATES, Ladder, climbable
 from edgefilter.errors import EdgefilterError, SignalError, UsageError
 from edgefilter.filter.barge_in import BargeInSettings
@@ -34,7 +34,8 @@ class EgoFilter:
         One of `edgefilter.ENGINES`, or "auto" for the strongest that can be made here.
     budget_ms : float, optional
         Compute per hop to keep to. Where more is needed for long, cheaper engines take over (see Stepping), each time
-        with an event. Without a budget the engine stays, and missed deadlines are only counted.
+        with an event. Without a budget the engine stays, and missed deadlines are only counted; so it does where the
+        settings of barge-in have judge="network", since no engine is cheaper than the network.
     reason : str
         Why an engine that was named was chosen, for `stats`.
     model : str or Path, optional
@@ -105,9 +106,11 @@ class EgoFilter:
         best, self.engine_reason = (
             strongest(self.profile) if engine == "auto" else (engines.create(engine, self.profile, model=model), reason)
         )
-        if barge_in and barge_in.judge == "network":
+        network_judges = barge_in is not None and barge_in.judge == "network"
+        if network_judges:
             best = with_network_as_judge(best)
-        ladder = None if budget_ms is None or best.lookahead is None else Ladder(climbable(best, self.profile))
+        budget = None if network_judges else budget_ms
+        ladder = None if budget is None or best.lookahead is None else Ladder(climbable(best, self.profile))
         stepping = Stepping(best.stft.hop, ladder, budget_ms)
         self._stream = Stream(ladder or best, self.profile, stepping, barge_in, learn, on_barge_in)
 
@@ -120,6 +123,11 @@ class EgoFilter:
     def _engine(self) -> Engine | ClipEngine:
         engine = self._stream.engine
         return engine.rungs[engine.wanted] if isinstance(engine, Ladder) else engine
+
+    @property
+    def _engines(self) -> Sequence[Engine | ClipEngine]:
+        engine = self._stream.engine
+        return engine.rungs if isinstance(engine, Ladder) else (engine,)
 
     @property
     def latency(self) -> int:
@@ -154,6 +162,11 @@ class EgoFilter:
         Always False where the engine does not judge it.
         """
         return self._stream.human_speaks
+
+    @property
+    def judges_speech(self) -> bool:
+        """Whether the engine, and each cheaper one that may take over, judges speech."""
+        return all(judges_speech(engine) for engine in self._engines)
 
     def process(self, mic_block: Samples, ref_block: Samples) -> Samples:
         """Take the next block of both channels and return the samples that are finished.
@@ -256,7 +269,7 @@ class EgoFilter:
         return {
             "engine": self.engine_name,
             "engine_reason": self.engine_reason,
-            "engines": [engine.name for engine in getattr(self._stream.engine, "rungs", [self._stream.engine])],
+            "engines": [engine.name for engine in self._engines],
             "model": model.describe() if model else None,
             "latency_ms": None if self.waits_for_end else 1000 * self.latency / SAMPLE_RATE,
             "samples": self._stream.samples_in,

@@ -1,57 +1,46 @@
-"""The two directions of a voice agent's sound, as they come, brought to the microphone's sample counter and filtered.
+"""A filter between a voice agent and its sound: pairs the microphone with what was played meanwhile, and filters.
 
-An agent has no sample counter that both directions share: it hands speech over in bursts, faster than it is played,
-late, or drops half of it when it is interrupted. Here the microphone is the clock. What was handed to the loudspeaker
-waits in a queue, and every sample of the microphone takes one from it, as the loudspeaker does; what is dropped before
-its turn was never played and is no reference. How much later it is heard, the filter's aligner finds.
+An agent's two directions share no sample counter. It hands speech over in bursts, faster than it is played, or late,
+and drops the rest when it is interrupted. Here the microphone is the clock: speech waits in a queue, and each sample of
+the microphone takes one from it, as the loudspeaker does. Speech that is dropped from the queue was never played and
+is no reference. The filter's aligner finds how much later the reference is heard.
 """
 
 from __future__ import annotations
 
+import logging
 import threading
 import time
 from collections import deque
 from collections.abc import Callable
-from typing import TypedDict
 
 import numpy as np
 import soxr
 
 from edgefilter.audio.raw import FULL_SCALE, to_pcm16
 from edgefilter.errors import SignalError, UsageError
-from edgefilter.filter.budget import DEFAULT_MS
+from edgefilter.filter.barge_in import BargeInSettings
 from edgefilter.filter.ego_filter import EgoFilter
 from edgefilter.types import SAMPLE_RATE, Event, Samples
 
 MOST_QUEUED_S = 600.0
-"""Speech that may wait to be played; what comes on top is counted and not believed: 40 MB is all that it may take."""
+"""Speech that may wait to be played, 38 MB of float32: longer than any answer. The rest is refused and counted."""
 ABSENT_S = 1.0
-"""A microphone that delivers nothing for so long was off, not late; what was played meanwhile nobody heard."""
-
-
-class DuplexStats(TypedDict):
-    """Seconds of sound: played, waiting, dropped unplayed, played unheard, refused; and how often speech ran out.
-
-    gaps counts the ends of speech and the underruns within it alike: the agent does not say which it was.
-    """
-
-    played_s: float
-    queued_s: float
-    dropped_s: float
-    unheard_s: float
-    refused_s: float
-    gaps: int
+"""A microphone that delivers nothing for so long was off: event loops stand still for tenths of a second, not more."""
+PATIENCE_S = 0.12
+"""How long the microphone waits for late speech: three times the 40 ms that a Pipecat transport hands over at once."""
+_LOGGER = logging.getLogger(__name__)
 
 
 class Resampler:
-    """One stream from one rate to another, piece by piece; it holds some 40 ms back, at equal rates nothing."""
+    """One stream from one rate to another, piece by piece; it holds about 40 ms back, at equal rates nothing."""
 
     def __init__(self, source: int, target: int) -> None:
         self.rates = (source, target)
         self._stream = None if source == target else soxr.ResampleStream(source, target, 1, dtype="float32")
 
     def push(self, samples: Samples, last: bool = False) -> Samples:
-        """Take the next samples (n,) and return what is finished; with last everything, and nothing may follow."""
+        """Take the next samples (n,) and return the finished ones; after `last` nothing may follow."""
         if self._stream is None or not (samples.size or last):
             return samples
         return self._stream.resample_chunk(samples, last=last)
@@ -65,19 +54,31 @@ class Duplex:
     Parameters
     ----------
     ego : EgoFilter, optional
-        The filter; unless given, one without a profile, with cheaper engines to step down to on a slow machine.
+        The filter; by default one without a profile, which always judges speech.
     patience_s : float
-        How long the microphone waits for speech that is late while the robot talks. For agents that hand over speech no
-        earlier than it is played, whose frames therefore jitter around their turn; 0 where they are ahead.
+        How long the microphone waits for late speech while the robot talks. Agents that hand over speech just in time
+        hand it over with jitter, and a gap in the reference that the loudspeaker did not make costs an alignment. 0 for
+        agents that hand over early.
     on_event : callable, optional
         Called with each `Event` of the filter, in the thread of `hear`. Without it they are kept for `ego.events()`.
     clock : callable
         Seconds, monotonic.
 
+    Attributes
+    ----------
+    enabled : bool
+        False passes the microphone on as it is. The filter goes on beside it, so that its events stay true and it knows
+        the room when it is switched on again.
+
     Raises
     ------
     UsageError
         For an engine that answers only at the end of a recording.
+
+    Notes
+    -----
+    An engine that judges no speech gives no events of speech. A warning is logged where such an engine is at work, so
+    also where a filter with a budget steps down to one.
 
     Examples
     --------
@@ -91,11 +92,11 @@ class Duplex:
     def __init__(
         self,
         ego: EgoFilter | None = None,
-        patience_s: float = 0.0,
+        patience_s: float = PATIENCE_S,
         on_event: Callable[[Event], None] | None = None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        self.ego = EgoFilter(budget_ms=DEFAULT_MS) if ego is None else ego
+        self.ego = EgoFilter(barge_in=BargeInSettings(judge="network")) if ego is None else ego
         if self.ego.waits_for_end:
             raise UsageError(
                 f"engine {self.ego.engine_name} needs the whole recording before it answers: an agent needs another"
@@ -105,21 +106,18 @@ class Duplex:
         self._clock = clock
         self._queue_lock, self._hear_lock = threading.Lock(), threading.Lock()
         self._queue: deque[Samples] = deque()
-        self._queued = self._played = self._dropped = self._unheard = self._refused = self._gaps = 0
+        self._queued = self._gaps = 0
+        self._samples = dict.fromkeys(("played", "dropped", "unheard", "refused"), 0)
         self._from_agent = Resampler(SAMPLE_RATE, SAMPLE_RATE)
         self._from_mic, self._to_agent = (Resampler(SAMPLE_RATE, SAMPLE_RATE) for _ in range(2))
         self._mic = np.zeros(0, np.float32)
-        self._talking = self._paused = False
-        self._enabled = True
+        self.enabled = True
+        self._talking = self._paused = self._deaf = False
         self._talking_since = self._heard_at = clock()
 
-    # what the agent says: any thread
-
     def play(self, samples: Samples, rate: int) -> None:
-        """Say what is handed to the loudspeaker now, to be played after what was handed over before: (n,) at rate."""
+        """Take speech that is handed to the loudspeaker, (n,) at rate, to be played after all that was before it."""
         with self._queue_lock:
-            if not self._enabled:
-                return
             if not self._talking:
                 self._talking, self._talking_since = True, self._clock()
             if self._from_agent.rates[0] != rate:
@@ -127,40 +125,40 @@ class Duplex:
                 self._from_agent = Resampler(rate, SAMPLE_RATE)
             self._append(self._from_agent.push(samples))
 
+    def play_pcm16(self, pcm: bytes | memoryview, rate: int, channels: int = 1) -> None:
+        """As `play`, for 16-bit samples, interleaved."""
+        self.play(from_pcm16(pcm, channels), rate)
+
     def end(self) -> None:
-        """Say that the utterance is complete: the microphone need not wait for more of it."""
+        """Take the utterance for complete: the microphone does not wait for more of it."""
         with self._queue_lock:
             self._finish()
             self._talking = False
 
     def interrupt(self) -> None:
-        """Say that what has not been played yet never will be: the robot fell silent in mid-word."""
+        """Drop the speech that has not been played: the robot fell silent in mid-word."""
         with self._queue_lock:
             self._from_agent = Resampler(*self._from_agent.rates)
-            self._dropped += self._skip(self._queued)
+            self._take(self._queued, "dropped")
             self._talking = False
 
     def pause(self) -> None:
-        """Say that the loudspeaker stands still and goes on where it stopped."""
+        """Hold the speech that waits: the loudspeaker stands still."""
         self._paused = True
 
     def resume(self, skipped_s: float = 0.0) -> None:
-        """Say that the loudspeaker goes on; skipped_s: of the speech that waits, what it leaves out."""
+        """Go on after a pause; skipped_s: how much of the speech that waits the loudspeaker leaves out."""
         with self._queue_lock:
-            self._dropped += self._skip(round(skipped_s * SAMPLE_RATE))
+            self._take(round(skipped_s * SAMPLE_RATE), "dropped")
             self._paused = False
 
-    # what the microphone hears: one thread at a time
-
     def hear(self, samples: Samples, rate: int) -> Samples:
-        """Take the microphone's next samples (n,) at rate and return what is finished of the human, at the same rate.
+        """Take the microphone's next samples (n,) at rate and return finished samples of the human, at the same rate.
 
-        None, some or more than came in; in all as many, later by the filter's latency and, at another rate than 16 kHz,
-        by the resamplers' 40 ms each way.
+        One call may return none or more than came in. All together are as many as came in, later by the filter's
+        latency and, at another rate than 16 kHz, by the resamplers' 40 ms each way.
         """
         with self._hear_lock:
-            if not self._enabled:
-                return samples
             if self._from_mic.rates[0] != rate:
                 self._from_mic, self._to_agent = Resampler(rate, SAMPLE_RATE), Resampler(SAMPLE_RATE, rate)
             self._mic = np.concatenate((self._mic, self._from_mic.push(samples)))
@@ -168,46 +166,52 @@ class Duplex:
                 self._forget_unheard(samples.size / rate)
                 reference = self._reference()
             mic, self._mic = self._mic[: reference.size], self._mic[reference.size :]
-            human = self._to_agent.push(self.ego.process(mic, reference))
+            human = self.ego.process(mic, reference)
+            if human.size:
+                self._warn_if_deaf()
+            human = self._to_agent.push(human)
             events = self.ego.events() if self._on_event else []
         for event in events:
             if self._on_event:
                 self._on_event(event)
-        return human
+        return human if self.enabled else samples
 
-    @property
-    def enabled(self) -> bool:
-        """Whether the microphone is filtered; while it is not, it passes as it is and what is played is not noted."""
-        return self._enabled
-
-    @enabled.setter
-    def enabled(self, value: bool) -> None:
-        self._enabled = value
-        if not value:
-            self.interrupt()
+    def hear_pcm16(self, pcm: bytes | memoryview, rate: int, channels: int = 1) -> bytes:
+        """As `hear`, for 16-bit samples, interleaved; each channel of the answer is the human."""
+        return as_pcm16(self.hear(from_pcm16(pcm, channels), rate), channels)
 
     @property
     def queued_s(self) -> float:
         """Seconds of speech that wait to be played."""
         return self._queued / SAMPLE_RATE
 
-    def stats(self) -> DuplexStats:
-        """What came of what the agent handed over; the filter's own are `ego.stats()`."""
-        return {
-            "played_s": self._played / SAMPLE_RATE,
-            "queued_s": self._queued / SAMPLE_RATE,
-            "dropped_s": self._dropped / SAMPLE_RATE,
-            "unheard_s": self._unheard / SAMPLE_RATE,
-            "refused_s": self._refused / SAMPLE_RATE,
-            "gaps": self._gaps,
-        }
+    def stats(self) -> dict[str, float]:
+        """Seconds of speech: played_s, queued_s, dropped_s, unheard_s (the microphone was off), refused_s; and gaps.
+
+        gaps counts how often speech ran out, at its end or within it: an agent that does not call `end` does not say
+        which. The filter's figures are in `ego.stats()`.
+        """
+        seconds = {f"{what}_s": count / SAMPLE_RATE for what, count in self._samples.items()}
+        return {**seconds, "queued_s": self.queued_s, "gaps": self._gaps}
 
     def close(self) -> None:
         """End the filter's learner, if it has one."""
         self.ego.close()
 
+    def _warn_if_deaf(self) -> None:
+        """Log once, each time it begins, that the engine at work judges no speech, and once that one does again."""
+        deaf, self._deaf = self._deaf, self.ego.speech_probability is None
+        if self._deaf and not deaf:
+            _LOGGER.warning(
+                "engine %s judges no speech: the human is not noticed. EgoFilter(barge_in=BargeInSettings(judge="
+                "'network')) always has one that does",
+                self.ego.engine_name,
+            )
+        elif deaf and not self._deaf:
+            _LOGGER.warning("engine %s judges speech: the human is noticed again", self.ego.engine_name)
+
     def _reference(self) -> Samples:
-        """What was played while the waiting microphone samples were heard; shorter where they wait on."""
+        """What was played while the waiting samples of the microphone were recorded; shorter where they wait on."""
         count = self._mic.size
         if self._paused:
             return np.zeros(count, np.float32)
@@ -218,34 +222,34 @@ class Duplex:
                 self._finish()
                 self._talking = False
                 self._gaps += 1
-        taken = self._take(count)
-        self._played += taken.size
+        taken = self._take(count, "played")
         return taken if taken.size == count else np.concatenate((taken, np.zeros(count - taken.size, np.float32)))
 
     def _forget_unheard(self, heard_s: float) -> None:
         """Skip what was played while the microphone was off.
 
-        A microphone that was late instead delivers at once what it missed, and the reference is then early, which the
-        aligner can find; one that came late it could not.
+        A microphone that was only late now delivers what it missed. The reference is then early, which the aligner
+        finds; it could not find one that is late.
         """
         now, since = self._clock(), max(self._heard_at, self._talking_since)
         self._heard_at = now
         if not self._paused and now - since - heard_s > ABSENT_S:
-            self._unheard += self._skip(round((now - since - heard_s) * SAMPLE_RATE))
+            self._take(round((now - since - heard_s) * SAMPLE_RATE), "unheard")
 
     def _append(self, samples: Samples) -> None:
         fits = samples[: max(0, round(MOST_QUEUED_S * SAMPLE_RATE) - self._queued)]
-        self._refused += samples.size - fits.size
+        self._samples["refused"] += samples.size - fits.size
         if fits.size:
             self._queue.append(fits)
             self._queued += fits.size
 
     def _finish(self) -> None:
-        """Put what the resampler holds back into the queue; what is played next begins anew."""
+        """Queue what the resampler holds back; speech that follows begins a new stream."""
         self._append(self._from_agent.push(np.zeros(0, np.float32), last=True))
         self._from_agent = Resampler(*self._from_agent.rates)
 
-    def _take(self, count: int) -> Samples:
+    def _take(self, count: int, what: str) -> Samples:
+        """Take up to count samples from the queue and count them as what became of them."""
         parts = []
         while count and self._queue:
             part = self._queue.popleft()
@@ -255,10 +259,8 @@ class Duplex:
             parts.append(part)
             count -= part.size
             self._queued -= part.size
+            self._samples[what] += part.size
         return np.concatenate(parts) if parts else np.zeros(0, np.float32)
-
-    def _skip(self, count: int) -> int:
-        return self._take(count).size
 
 
 def from_pcm16(pcm: bytes | memoryview, channels: int = 1) -> Samples:

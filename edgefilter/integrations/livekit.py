@@ -1,35 +1,33 @@
 """LiveKit Agents: a frame processor for the room's microphone, and a tap on what the agent says.
 
-    ears = EgoProcessor(EgoFilter("robot.npz", budget_ms=8))
+    ears = EgoProcessor(EgoFilter("robot.npz"))
     audio = room_io.AudioInputOptions(noise_cancellation=ears, sample_rate=16000)
     await session.start(agent, room=ctx.room, room_options=room_io.RoomOptions(audio_input=audio))
     session.output.audio = ears.tap(session.output.audio)
 
-Needs `pip install edgefilter[livekit]`.
+Needs `pip install '.[livekit]'` in a checkout.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 
-import numpy as np
 from livekit import rtc
 from livekit.agents.voice import io
 
 from edgefilter.filter.ego_filter import EgoFilter
-from edgefilter.integrations.duplex import Duplex, as_pcm16, from_pcm16
+from edgefilter.integrations.duplex import Duplex
 from edgefilter.types import Event
 
 ROOM_HOLDS_S = 0.2
-"""What a room's output has in its source and throws away when it is paused (room_io: queue_size_ms). Where a sink keeps
-it, the reference is early by so much, which the aligner finds."""
+"""Speech that a room's output holds ahead and throws away when it is paused (room_io: queue_size_ms). Behind a sink that
+keeps it the reference is early by so much, which the aligner finds."""
 
 
 class EgoProcessor(rtc.FrameProcessor[rtc.AudioFrame]):
-    """The robot's own voice out of a LiveKit room's microphone, for `AudioInputOptions(noise_cancellation=...)`.
+    """Removes the robot's voice from a LiveKit room's microphone, for `AudioInputOptions(noise_cancellation=...)`.
 
-    Frames come out as long as they went in. Until the filter's first samples are out, and where it later has too few
-    for a frame, silence stands in front of them.
+    Frames come out as long as they went in: while the filter has too few samples for a frame, silence is put in front.
 
     Parameters
     ----------
@@ -41,15 +39,15 @@ class EgoProcessor(rtc.FrameProcessor[rtc.AudioFrame]):
     Attributes
     ----------
     duplex : Duplex
-        What processor and tap share: `duplex.stats()`, `duplex.ego`.
+        Shared by the processor and its tap: `duplex.stats()`, `duplex.ego`.
     """
 
     def __init__(self, ego: EgoFilter | None = None, on_event: Callable[[Event], None] | None = None) -> None:
-        self.duplex = Duplex(ego, on_event=on_event)
-        self._ready = np.zeros(0, np.float32)
+        self.duplex = Duplex(ego, patience_s=0.0, on_event=on_event)  # the room holds speech ahead: none is late
+        self._ready = b""
 
     def tap(self, output: io.AudioOutput) -> io.AudioOutput:
-        """What the session says through output, noted on its way: to become `session.output.audio`."""
+        """Return an output, for `session.output.audio`, that hands speech on to this one and takes it as reference."""
         return _Tap(self.duplex, output)
 
     @property
@@ -62,20 +60,17 @@ class EgoProcessor(rtc.FrameProcessor[rtc.AudioFrame]):
         self.duplex.enabled = value
 
     def _process(self, frame: rtc.AudioFrame) -> rtc.AudioFrame:
-        count = frame.samples_per_channel
-        human = self.duplex.hear(from_pcm16(frame.data.cast("B"), frame.num_channels), frame.sample_rate)
-        missing = np.zeros(max(0, count - self._ready.size - human.size), np.float32)
-        ready = np.concatenate((missing, self._ready, human))
-        self._ready = ready[count:]
-        pcm = as_pcm16(ready[:count], frame.num_channels)
-        return rtc.AudioFrame(pcm, frame.sample_rate, frame.num_channels, count, userdata=frame.userdata)
+        pcm, form = frame.data.cast("B"), (frame.sample_rate, frame.num_channels)
+        ready = (self._ready + self.duplex.hear_pcm16(pcm, *form)).rjust(pcm.nbytes, b"\0")
+        self._ready = ready[pcm.nbytes :]
+        return rtc.AudioFrame(ready[: pcm.nbytes], *form, frame.samples_per_channel, userdata=frame.userdata)
 
     def _close(self) -> None:
         self.duplex.close()
 
 
 class _Tap(io.AudioOutput):
-    """Hands everything on to the next output and tells the duplex; frames may come faster than they are played."""
+    """Hands everything on to the next output and tells the duplex."""
 
     def __init__(self, duplex: Duplex, output: io.AudioOutput) -> None:
         able = io.AudioOutputCapabilities(pause=True)
@@ -88,10 +83,10 @@ class _Tap(io.AudioOutput):
         return self.next_in_chain
 
     async def capture_frame(self, frame: rtc.AudioFrame) -> None:
-        """Hand on first: the room takes nothing before somebody listens."""
+        """Hand on first: a room waits here until somebody listens."""
         await super().capture_frame(frame)
         await self._next.capture_frame(frame)
-        self._duplex.play(from_pcm16(frame.data.cast("B"), frame.num_channels), frame.sample_rate)
+        self._duplex.play_pcm16(frame.data.cast("B"), frame.sample_rate, frame.num_channels)
 
     def flush(self) -> None:
         super().flush()

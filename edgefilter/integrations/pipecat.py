@@ -1,52 +1,50 @@
-"""Pipecat: one filter at both ends of a transport, and its judgement of who speaks.
+"""Pipecat: one filter for a transport's microphone and loudspeaker, and its voice activity detection.
 
-    ears = EgoFilters(EgoFilter("robot.npz", budget_ms=8))
+    ears = EgoFilters(EgoFilter("robot.npz"))
     params = LocalAudioTransportParams(audio_in_enabled=True, audio_out_enabled=True, **ears.params)
 
-Needs `pip install edgefilter[pipecat]`.
+Needs `pip install '.[pipecat]'` in a checkout.
 """
 
 from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable
+from typing import Any
 
 from pipecat.audio.filters.base_audio_filter import BaseAudioFilter
 from pipecat.audio.vad.vad_analyzer import VADAnalyzer, VADParams
 from pipecat.frames.frames import FilterControlFrame, FilterEnableFrame
 
+from edgefilter.errors import UsageError
 from edgefilter.filter.ego_filter import EgoFilter
-from edgefilter.integrations.duplex import Duplex, as_pcm16, from_pcm16
+from edgefilter.integrations.duplex import Duplex
 from edgefilter.types import SAMPLE_RATE, Event
-
-PATIENCE_S = 0.12
-"""A transport hands over 40 ms when it has room for them, and a resampler holds 40 ms back: speech that is later than
-both together did not come in time for the loudspeaker either."""
-JUDGED = 256
-"""Samples at 16 kHz between two looks at whether the human speaks: a hop of the filter."""
 
 
 class EgoFilters:
-    """The robot's own voice out of a Pipecat transport's microphone.
+    """Removes the robot's voice from a Pipecat transport's microphone.
 
-    Pipecat asks a filter at each end by the same method, so this object has two faces, `params`, over one filter: the
-    one at the loudspeaker hears exactly what is written to it and changes nothing, the one at the microphone filters.
+    Two Pipecat filters share one EgoFilter: the one of the loudspeaker takes what is written to it as the reference and
+    changes nothing, the one of the microphone filters.
 
     Parameters
     ----------
     ego : EgoFilter, optional
         As of `edgefilter.integrations.duplex.Duplex`.
     in_channels, out_channels : int
-        The transport's `audio_in_channels` and `audio_out_channels`.
+        Channels of the transport's microphone and loudspeaker. Pipecat tells a filter neither, so `params` tells the
+        transport: one that is given another number as well is refused by Python.
     on_event : callable, optional
         Called with each `edgefilter.Event`, in a thread of the event loop's executor.
 
     Attributes
     ----------
     params : dict
-        `audio_in_filter` and `audio_out_filter`, for `TransportParams`.
+        For `TransportParams(**params)`: `audio_in_filter`, `audio_in_channels`, `audio_out_filter`,
+        `audio_out_channels`.
     duplex : Duplex
-        What both faces share: `duplex.stats()`, `duplex.ego`.
+        Shared by both filters: `duplex.stats()`, `duplex.ego`.
     """
 
     def __init__(
@@ -56,22 +54,37 @@ class EgoFilters:
         out_channels: int = 1,
         on_event: Callable[[Event], None] | None = None,
     ) -> None:
-        self.duplex = Duplex(ego, PATIENCE_S, on_event)
-        self.params: dict[str, BaseAudioFilter] = {
+        self.duplex = Duplex(ego, on_event=on_event)
+        self.params: dict[str, Any] = {
             "audio_in_filter": _Microphone(self.duplex, in_channels),
+            "audio_in_channels": in_channels,
             "audio_out_filter": _Loudspeaker(self.duplex, out_channels),
+            "audio_out_channels": out_channels,
         }
 
     def vad(self, params: VADParams | None = None) -> VADAnalyzer:
-        """The filter's own judgement of who speaks, as the `vad_analyzer` of Pipecat's user turns.
+        """Return the filter's own voice activity detection, as the `vad_analyzer` of Pipecat's user turns.
 
-        With an engine that judges it (`crnn`) in place of Silero, which takes what is left of the robot for somebody.
+        It replaces Silero, which takes what is left of the robot's voice for a human.
+
+        Raises
+        ------
+        UsageError
+            Where the filter's engine, or a cheaper one that may take over, judges no speech: the human would not be
+            noticed.
         """
-        return _HumanVAD(self.duplex.ego, params)
+        ego = self.duplex.ego
+        if not ego.judges_speech:
+            raise UsageError(
+                f"vad() got a filter whose engines ({', '.join(ego.stats()['engines'])}) do not all judge speech, so"
+                " that the human would not be noticed: leave out budget_ms, or give EgoFilter"
+                " barge_in=BargeInSettings(judge='network')"
+            )
+        return _HumanVAD(ego, params)
 
 
-class _Face(BaseAudioFilter):
-    """What both ends have in common: a rate, and that a FilterEnableFrame at either of them concerns both."""
+class _Filter(BaseAudioFilter):
+    """The common part of both filters: the rate; a FilterEnableFrame for either of them concerns both."""
 
     def __init__(self, duplex: Duplex, channels: int) -> None:
         self._duplex = duplex
@@ -89,31 +102,30 @@ class _Face(BaseAudioFilter):
             self._duplex.enabled = frame.enable
 
 
-class _Microphone(_Face):
+class _Microphone(_Filter):
     async def filter(self, audio: bytes) -> bytes:
-        """Filter in a thread: a hop takes some milliseconds, which the event loop has not got."""
-        human = await asyncio.to_thread(self._duplex.hear, from_pcm16(audio, self._channels), self._rate)
-        return as_pcm16(human, self._channels)
+        """Filter in a thread: a hop takes some milliseconds, too many for the event loop."""
+        return await asyncio.to_thread(self._duplex.hear_pcm16, audio, self._rate, self._channels)
 
     async def stop(self) -> None:
         await asyncio.to_thread(self._duplex.close)
 
 
-class _Loudspeaker(_Face):
+class _Loudspeaker(_Filter):
     async def filter(self, audio: bytes) -> bytes:
-        self._duplex.play(from_pcm16(audio, self._channels), self._rate)
+        self._duplex.play_pcm16(audio, self._rate, self._channels)
         return audio
 
 
 class _HumanVAD(VADAnalyzer):
-    """Whether the filter says that the human speaks; how sure is sure enough, its BargeInSettings say."""
+    """Confidence 1 while the filter's human_speaks holds, else 0: the thresholds are those of its BargeInSettings."""
 
     def __init__(self, ego: EgoFilter, params: VADParams | None) -> None:
         super().__init__(params=params or VADParams(confidence=0.5, start_secs=0.0, min_volume=0.0))
         self._ego = ego
 
     def num_frames_required(self) -> int:
-        return JUDGED * self.sample_rate // SAMPLE_RATE
+        return self._ego.hop * self.sample_rate // SAMPLE_RATE
 
     def voice_confidence(self, buffer: bytes) -> float:
         return float(self._ego.human_speaks)

@@ -1,74 +1,83 @@
-r"""Wyoming: microphone and loudspeaker of a Home Assistant satellite, with the robot's own voice out of the microphone.
+r"""Wyoming: microphone and loudspeaker of a Home Assistant satellite, with the robot's voice removed from the microphone.
 
     python -m edgefilter.integrations.wyoming --microphone 'arecord -q -r 16000 -c 1 -f S16_LE -t raw' \
         --loudspeaker 'aplay -q -r 22050 -c 1 -f S16_LE -t raw' --profile robot.npz
     wyoming-satellite --mic-uri tcp://127.0.0.1:10600 --snd-uri tcp://127.0.0.1:10601 ...
 
-Needs `pip install edgefilter[wyoming]`.
+Needs `pip install '.[wyoming]'` in a checkout.
 """
 
 from __future__ import annotations
 
 import argparse
 import asyncio
+import contextlib
 import logging
+import shlex
+import signal
 import sys
 import time
+from collections.abc import AsyncIterator, Coroutine
 from functools import partial
+from typing import Any, cast
 
+import numpy as np
 from wyoming.audio import AudioChunk, AudioChunkConverter, AudioFormat, AudioStart, AudioStop
+from wyoming.client import AsyncClient
 from wyoming.event import Event as Message
 from wyoming.info import Attribution, Describe, Info, MicProgram, SndProgram
+from wyoming.mic import MicProcessAsyncClient
 from wyoming.server import AsyncEventHandler, AsyncServer
 from wyoming.snd import Played
 from wyoming.vad import VoiceStarted, VoiceStopped
 
 from edgefilter import __version__
-from edgefilter.errors import EdgefilterError
-from edgefilter.filter.budget import DEFAULT_MS
+from edgefilter.audio.reader import RATES
+from edgefilter.errors import EdgefilterError, SignalError
+from edgefilter.filter.barge_in import BargeInSettings
 from edgefilter.filter.ego_filter import EgoFilter
-from edgefilter.integrations.duplex import Duplex, as_pcm16, from_pcm16
-from edgefilter.integrations.wyoming_sound import Player, open_microphone
-from edgefilter.types import Event
+from edgefilter.integrations.duplex import ABSENT_S, MOST_QUEUED_S, Duplex, as_pcm16, from_pcm16
+from edgefilter.types import SAMPLE_RATE, Event
 
-RECONNECT_S = 3.0
-MOST_WAITING = 64
-"""Messages that a listener may be behind, 4 s of 64 ms; of one that is slower the oldest are left out."""
-MOST_SAID = 10_000
-"""Messages of one who speaks that wait for their turn, about ten minutes; then its connection is read no further."""
+MOST_WAITING = 256
+"""Messages that a listener may be behind, 4 s of hops; of a slower listener the oldest are left out."""
+MOST_BYTES = round(MOST_QUEUED_S * SAMPLE_RATE) * np.int16().itemsize
+"""Size of a message, and of all that a client has said and waits to be played: the queue's ten minutes, 19 MB."""
 AHEAD_S = 0.5
-"""Speech that is handed to the loudspeaker before its turn: what is further ahead is still here when it is dropped."""
+"""Speech that the loudspeaker gets before its turn: the size of aplay's buffer. Speech further ahead is still here when
+it is dropped."""
 MIC_URI, SND_URI = "tcp://127.0.0.1:10600", "tcp://127.0.0.1:10601"
-ABOUT = {
-    "attribution": Attribution("edgefilter", "https://pypi.org/project/edgefilter"),
+ABOUT: dict[str, Any] = {
+    "attribution": Attribution("edgefilter", url=""),
     "installed": True,
-    "description": "The robot's own voice out of its microphone",
+    "description": "A microphone without the robot's own voice",
     "version": __version__,
 }
 _LOGGER = logging.getLogger(__name__)
 
 
 class EgoService:
-    """Two Wyoming services over one filter: a microphone that many may listen to, and a loudspeaker.
+    """Two Wyoming services over one filter: a microphone for many listeners, and a loudspeaker.
 
     Parameters
     ----------
     microphone, loudspeaker : str
-        Where sound comes from and goes to: a command that writes or reads raw 16-bit samples, or the URI of another
+        Source and destination of the sound: a command that writes or reads raw 16-bit samples, or the URI of another
         Wyoming service (`tcp://...`, `unix://...`).
     ego : EgoFilter, optional
         As of `edgefilter.integrations.duplex.Duplex`.
     mic_format, snd_format : AudioFormat
-        What the commands write and read.
+        What the commands write and read, of width 2.
     stop_for_speech : bool
-        Whether what is being played ends when the human begins to speak. The protocol has no word for it, so that a
-        satellite cannot do it.
+        Whether the loudspeaker is silenced when the human begins to speak. A satellite cannot do it: the protocol has
+        no message for it.
 
     Notes
     -----
-    The microphone is filtered whether somebody listens or not, so that the room is known when somebody does. Listeners
-    also get `voice-started` and `voice-stopped` of the human. Who disconnects from the loudspeaker before its
-    `audio-stop` interrupts: what is not played yet is dropped.
+    The microphone is filtered whether somebody listens or not, so that the filter knows the room when somebody does.
+    Listeners also get `voice-started` and `voice-stopped` of the human. A client that disconnects from the loudspeaker
+    before its `audio-stop` interrupts: speech that is not played yet is dropped. A client that sends a message that
+    cannot be read is disconnected, with a line in the log.
     """
 
     def __init__(
@@ -80,13 +89,12 @@ class EgoService:
         snd_format: AudioFormat = AudioFormat(22_050, 2, 1),
         stop_for_speech: bool = False,
     ) -> None:
-        self._heard: list[Event] = []
-        self.duplex = Duplex(ego, on_event=self._heard.append)
+        self._events: list[Event] = []
+        self.duplex = Duplex(ego, on_event=self._events.append)
         self.mic_format = mic_format
         self.player = Player(loudspeaker, snd_format)
         self._microphone = microphone
         self._stop_for_speech = stop_for_speech
-        self._to_mono16 = AudioChunkConverter(width=2, channels=1)
         self.listeners: set[_Listener] = set()
         self.speakers: set[_Speaker] = set()
 
@@ -94,9 +102,9 @@ class EgoService:
         """Serve both until cancelled."""
         servers = [AsyncServer.from_uri(uri) for uri in (mic_uri, snd_uri)]
         try:
-            await asyncio.gather(
-                servers[0].run(partial(_Listener, self)), servers[1].run(partial(_Speaker, self)), self._listen()
-            )
+            for server, handler in zip(servers, (_Listener, _Speaker)):
+                await server.start(partial(handler, self))  # its run() would take SIGTERM for itself alone
+            await self._listen()
         finally:
             await self.player.stop()
             for server in servers:
@@ -108,8 +116,7 @@ class EgoService:
         until = time.monotonic() + chunk.seconds
         while self.duplex.queued_s > AHEAD_S and time.monotonic() < until:
             await asyncio.sleep(0.005)
-        mono = self._to_mono16.convert(chunk)
-        self.duplex.play(from_pcm16(mono.audio), mono.rate)
+        self.duplex.play_pcm16(chunk.audio, chunk.rate, chunk.channels)
         try:
             await self.player.write(chunk)
         except OSError as error:
@@ -117,13 +124,13 @@ class EgoService:
             await self.interrupt()
 
     async def finish(self) -> None:
-        """The utterance is complete; returns when it has been played."""
+        """End the utterance; returns when it has been played."""
         self.duplex.end()
         await self.player.end()
         await asyncio.sleep(self.duplex.queued_s)
 
     async def interrupt(self) -> None:
-        """End what is being played, and drop what was not played yet, here and with all who speak."""
+        """Silence the loudspeaker, and drop the speech of all speakers that was not played yet."""
         for speaker in self.speakers:
             speaker.drop()
         self.duplex.interrupt()
@@ -131,42 +138,73 @@ class EgoService:
 
     async def _listen(self) -> None:
         """Read the microphone for ever; one that ends or fails is opened again."""
+        samples = self.duplex.ego.hop * self.mic_format.rate // SAMPLE_RATE
         while True:
             try:
-                async with open_microphone(self._microphone, self.mic_format) as client:
+                async with _microphone_client(self._microphone, self.mic_format, samples) as client:
                     while (message := await client.read_event()) is not None:
                         if AudioChunk.is_type(message.type):
-                            await self._hear(self._to_mono16.convert(AudioChunk.from_event(message)))
+                            await self._hear(_chunk_of(message))
                 why = "ended"
-            except (OSError, EOFError, ValueError) as error:
-                why = f"cannot be read ({error})"
-            _LOGGER.warning("microphone %s %s: again in %.0f s", self._microphone, why, RECONNECT_S)
-            await asyncio.sleep(RECONNECT_S)
+            except Exception as error:  # another service's messages must not end this one
+                why = f"cannot be read ({type(error).__name__}: {error})"
+            _LOGGER.warning("microphone %s %s: again in %.0f s", self._microphone, why, ABSENT_S)
+            await asyncio.sleep(ABSENT_S)
 
     async def _hear(self, chunk: AudioChunk) -> None:
-        human = await asyncio.to_thread(self.duplex.hear, from_pcm16(chunk.audio), chunk.rate)
+        human = await asyncio.to_thread(self.duplex.hear, from_pcm16(chunk.audio, chunk.channels), chunk.rate)
         if human.size:
             self._tell(AudioChunk(chunk.rate, 2, 1, as_pcm16(human), chunk.timestamp).event())
-        while self._heard:
-            kind = self._heard.pop(0).kind
-            if kind == "speech_started":
+        while self._events:
+            event = self._events.pop(0)
+            if event.kind == "speech_started":
                 self._tell(VoiceStarted(chunk.timestamp).event())
                 if self._stop_for_speech:
                     await self.interrupt()
-            elif kind == "speech_stopped":
+            elif event.kind == "speech_stopped":
                 self._tell(VoiceStopped(chunk.timestamp).event())
+            elif event.kind == "overloaded":
+                _LOGGER.warning("the machine is too slow: %s", event.detail)
 
     def _tell(self, message: Message) -> None:
         for listener in self.listeners:
             listener.send(message)
 
 
-class _Listener(AsyncEventHandler):
-    """One who listens to the microphone."""
+class _BoundedReader:
+    """A stream's reader that refuses messages of more than MOST_BYTES before it reads them."""
+
+    def __init__(self, reader: asyncio.StreamReader) -> None:
+        self._reader, self.readline, self.feed_eof = reader, reader.readline, reader.feed_eof
+
+    async def readexactly(self, count: int) -> bytes:
+        if count > MOST_BYTES:
+            raise SignalError(f"found a message of {count} bytes, expected at most {MOST_BYTES}")
+        return await self._reader.readexactly(count)
+
+
+class _Client(AsyncEventHandler):
+    """A client that is disconnected, and no other, where a message cannot be read."""
 
     def __init__(self, service: EgoService, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        super().__init__(reader, writer)
+        super().__init__(cast(asyncio.StreamReader, _BoundedReader(reader)), writer)
         self._service = service
+
+    async def run(self) -> None:
+        try:
+            await super().run()
+        except (ConnectionError, EOFError):
+            pass  # it has gone
+        except Exception as error:
+            peer = self.writer.get_extra_info("peername")
+            _LOGGER.warning("client %s: %s: %s; its connection is closed", peer, type(error).__name__, error)
+
+
+class _Listener(_Client):
+    """A client of the microphone."""
+
+    def __init__(self, service: EgoService, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        super().__init__(service, reader, writer)
         self._waiting: asyncio.Queue[Message] = asyncio.Queue(MOST_WAITING)
         self._task = asyncio.create_task(self._write())
         service.listeners.add(self)
@@ -182,52 +220,63 @@ class _Listener(AsyncEventHandler):
         return True
 
     async def _write(self) -> None:
-        try:
+        with contextlib.suppress(ConnectionError):  # it has gone; run() notices as well and disconnects
             while True:
                 await self.write_event(await self._waiting.get())
-        except ConnectionError:
-            pass  # it has gone; run() notices as well and disconnects
 
     async def disconnect(self) -> None:
         self._service.listeners.discard(self)
         self._task.cancel()
 
 
-class _Speaker(AsyncEventHandler):
-    """One who speaks through the loudspeaker; what it says waits here, so that its end is noticed in time."""
+class _Speaker(_Client):
+    """A client of the loudspeaker; its speech waits here, so that its hanging up is noticed in time."""
 
     def __init__(self, service: EgoService, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        super().__init__(reader, writer)
-        self._service = service
-        self._said: asyncio.Queue[Message | None] = asyncio.Queue(MOST_SAID)
+        super().__init__(service, reader, writer)
+        self._said: asyncio.Queue[AudioChunk | AudioStop | None] = asyncio.Queue()
+        self._waiting_bytes = 0
         self._speaking = self._ignored = False
         self._task = asyncio.create_task(self._speak())
         service.speakers.add(self)
 
     def drop(self) -> None:
-        """Forget what waits, and what else comes of this utterance; its end is still answered."""
+        """Forget the speech that waits, and the rest of this utterance; its end is still answered."""
         self._ignored = self._speaking
         waiting = [self._said.get_nowait() for _ in range(self._said.qsize())]
+        self._waiting_bytes = 0
         for message in waiting:
-            if message is None or AudioStop.is_type(message.type):
+            if not isinstance(message, AudioChunk):
                 self._said.put_nowait(message)
 
     async def handle_event(self, event: Message) -> bool:
         if AudioStart.is_type(event.type):
             self._ignored = False
-        elif AudioStop.is_type(event.type) or (AudioChunk.is_type(event.type) and not self._ignored):
-            self._speaking = not AudioStop.is_type(event.type)
-            await self._said.put(event)
+        elif AudioStop.is_type(event.type):
+            self._speaking = False
+            self._said.put_nowait(AudioStop())
+        elif AudioChunk.is_type(event.type):
+            await self._take(_chunk_of(event))
         elif Describe.is_type(event.type):
             form = self._service.player.form
             await self.write_event(Info(snd=[SndProgram(name="edgefilter", snd_format=form, **ABOUT)]).event())
         return True
 
+    async def _take(self, chunk: AudioChunk) -> None:
+        """Let speech wait for its turn; while too much waits, the connection is read no further."""
+        while self._waiting_bytes > MOST_BYTES:
+            await asyncio.sleep(AHEAD_S)
+        if not self._ignored:
+            self._speaking = True
+            self._waiting_bytes += len(chunk.audio)
+            self._said.put_nowait(chunk)
+
     async def _speak(self) -> None:
         try:
             while (message := await self._said.get()) is not None:
-                if AudioChunk.is_type(message.type):
-                    await self._service.say(AudioChunk.from_event(message))
+                if isinstance(message, AudioChunk):
+                    self._waiting_bytes -= len(message.audio)
+                    await self._service.say(message)
                 else:
                     self._ignored = False
                     await self._service.finish()
@@ -242,7 +291,89 @@ class _Speaker(AsyncEventHandler):
             self._task.cancel()
             await self._service.interrupt()
         else:
-            await self._said.put(None)
+            self._said.put_nowait(None)
+
+
+class Player:
+    """A loudspeaker, a command or the service at a URI, that can be silenced; it opens again with the next sound."""
+
+    def __init__(self, where: str, form: AudioFormat) -> None:
+        self.where, self.form = where, form
+        self._convert = AudioChunkConverter(form.rate)
+        self._client: AsyncClient | None = None
+        self._process: asyncio.subprocess.Process | None = None
+
+    async def write(self, chunk: AudioChunk) -> None:
+        """Play a 16-bit chunk after what was written before; raises OSError where there is nothing to play it."""
+        if "://" in self.where:
+            await self._write_to_service(chunk)
+            return
+        if self._process is None or self._process.returncode is not None:
+            words = shlex.split(self.where)
+            self._process = await asyncio.create_subprocess_exec(*words, stdin=asyncio.subprocess.PIPE)
+        assert self._process.stdin is not None
+        if chunk.channels != self.form.channels:
+            pcm = as_pcm16(from_pcm16(chunk.audio, chunk.channels), self.form.channels)
+            chunk = AudioChunk(chunk.rate, 2, self.form.channels, pcm)
+        self._process.stdin.write(self._convert.convert(chunk).audio)
+        await self._process.stdin.drain()
+
+    async def _write_to_service(self, chunk: AudioChunk) -> None:
+        if self._client is None:
+            client = AsyncClient.from_uri(self.where)
+            await client.connect()
+            self._client = client
+            await client.write_event(AudioStart(chunk.rate, chunk.width, chunk.channels).event())
+        await self._client.write_event(chunk.event())
+
+    async def end(self) -> None:
+        """End the utterance: what was written is still played."""
+        if self._client is not None:
+            await self._client.write_event(AudioStop().event())
+            await self._disconnect()
+
+    async def stop(self) -> None:
+        """Be silent now: what was written and is not played yet is dropped, as far as it is still here."""
+        process, self._process = self._process, None
+        if process is not None and process.returncode is None:
+            process.kill()
+            await process.wait()
+        await self._disconnect()
+
+    async def _disconnect(self) -> None:
+        client, self._client = self._client, None
+        if client is not None:
+            await client.disconnect()
+
+
+@contextlib.asynccontextmanager
+async def _microphone_client(where: str, form: AudioFormat, samples: int) -> AsyncIterator[AsyncClient]:
+    """A client of a command, which is read by so many samples at once, or of the service at a URI."""
+    if "://" not in where:
+        program, *words = shlex.split(where)
+        async with MicProcessAsyncClient(form.rate, 2, form.channels, samples, program, words) as command:
+            yield command
+        return
+    async with AsyncClient.from_uri(where) as client:
+        client._reader = _BoundedReader(client._reader)
+        yield client
+
+
+def _chunk_of(message: Message) -> AudioChunk:
+    """The sound in a message, at 16 bits; raises SignalError where the message does not say what it is or is cut."""
+    rate, width, channels = (message.data.get(key) for key in ("rate", "width", "channels"))
+    size = len(message.payload or b"")
+    if (
+        rate not in RATES
+        or width not in (1, 2, 3, 4)
+        or channels not in range(1, size + 2)
+        or size % (width * channels)
+    ):
+        raise SignalError(
+            f"found a chunk of {size} bytes with rate {rate}, width {width} and channels {channels}, expected whole"
+            f" samples with a rate of {RATES.start} to {RATES.stop - 1} Hz and a width of 1 to 4 bytes"
+        )
+    return AudioChunkConverter(width=2).convert(AudioChunk.from_event(message))
 
 
 def main(words: list[str] | None = None) -> int:
@@ -252,12 +383,11 @@ def main(words: list[str] | None = None) -> int:
     )
     parser.add_argument("--microphone", required=True, help="command that writes raw 16-bit samples, or a URI")
     parser.add_argument("--loudspeaker", required=True, help="command that reads raw 16-bit samples, or a URI")
-    parser.add_argument("--mic-rate", type=int, default=16_000, help="of the command")
-    parser.add_argument("--mic-channels", type=int, default=1, help="of the command")
-    parser.add_argument("--snd-rate", type=int, default=22_050, help="of the command")
-    parser.add_argument("--snd-channels", type=int, default=1, help="of the command")
+    for end, rate in (("mic", 16_000), ("snd", 22_050)):
+        parser.add_argument(f"--{end}-rate", type=int, default=rate, help="of the command")
+        parser.add_argument(f"--{end}-channels", type=int, default=1, help="of the command")
     parser.add_argument("--profile", help="the calibrated robot")
-    parser.add_argument("--engine", default="auto")
+    parser.add_argument("--engine", default="auto", help="one beside which the network can judge speech")
     parser.add_argument("--mic-uri", default=MIC_URI, help="where satellites find the microphone")
     parser.add_argument("--snd-uri", default=SND_URI, help="where satellites find the loudspeaker")
     parser.add_argument("--stop-for-speech", action="store_true", help="fall silent when the human begins to speak")
@@ -266,18 +396,27 @@ def main(words: list[str] | None = None) -> int:
         service = EgoService(
             args.microphone,
             args.loudspeaker,
-            EgoFilter(args.profile, args.engine, DEFAULT_MS),
+            EgoFilter(args.profile, args.engine, barge_in=BargeInSettings(judge="network")),
             AudioFormat(args.mic_rate, 2, args.mic_channels),
             AudioFormat(args.snd_rate, 2, args.snd_channels),
             args.stop_for_speech,
         )
-        asyncio.run(service.run(args.mic_uri, args.snd_uri))
+        asyncio.run(_until_sigterm(service.run(args.mic_uri, args.snd_uri)))
     except KeyboardInterrupt:
-        return 130
+        return 128 + signal.SIGINT
+    except asyncio.CancelledError:
+        return 128 + signal.SIGTERM
     except (EdgefilterError, OSError, ValueError) as error:
         print(f"edgefilter: {error}", file=sys.stderr)
         return 1
     return 0
+
+
+async def _until_sigterm(serving: Coroutine[None, None, None]) -> None:
+    task = asyncio.current_task()
+    assert task is not None
+    asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, task.cancel)
+    await serving
 
 
 if __name__ == "__main__":

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from scipy import signal
 
-from bench.simulate.alignment_scene import HEAD, RATE, fan, hear, known_path, room, run, speech_like, utterances
 from edgefilter.alignment.aligner import Aligner
 from edgefilter.alignment.delay_line import Tape, read_delayed, read_line
 from edgefilter.alignment.delay_tracker import DelayMeasurement
@@ -15,6 +14,7 @@ from edgefilter.alignment.lag_search import CERTAIN_EARLY, Candidate, LagSearch
 from edgefilter.alignment.paper import PaperAligner, paper_lag
 from edgefilter.errors import SignalError
 from edgefilter.types import PRE_ROLL
+from tests.alignment.scene import HEAD, RATE, fan, hear, known_path, room, run, speech_like, utterances
 
 WITHIN = 0.3 * RATE  # the requirement: an utterance's lag is found within 300 ms of its onset at the microphone
 CLOSE = 16  # the requirement: +-1 ms

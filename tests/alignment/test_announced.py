@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from bench.simulate.alignment_scene import HEAD, RATE, fan, hear, room, run, speech_like, utterances
 from edgefilter.alignment.aligner import Aligner
 from edgefilter.alignment.announced import AHEAD, PATIENCE, Announcements
 from edgefilter.filter.ego_filter import EgoFilter
+from tests.alignment.scene import HEAD, RATE, fan, hear, room, run, speech_like, utterances
 
 
 def erle_db(mic, out, span):

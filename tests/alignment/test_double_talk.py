@@ -3,7 +3,10 @@
 import numpy as np
 import pytest
 
-from bench.simulate.alignment_scene import (
+from edgefilter.alignment.aligner import Aligner
+from edgefilter.alignment.delay_tracker import STRIDE, DelayMeasurement
+from edgefilter.alignment.drift_filter import DriftFilter
+from tests.alignment.scene import (
     RATE,
     double_talk,
     fan,
@@ -14,9 +17,6 @@ from bench.simulate.alignment_scene import (
     speech_like,
     utterances,
 )
-from edgefilter.alignment.aligner import Aligner
-from edgefilter.alignment.delay_tracker import STRIDE, DelayMeasurement
-from edgefilter.alignment.drift_filter import DriftFilter
 
 CLOSE = 16  # the requirement: +-1 ms
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,7 @@ import pytest
 import soundfile as sf
 from scipy import signal
 
+from bench.recordings import Clip, Signals
 from bench.simulate import conversations
 
 RATE = 16000
@@ -61,3 +63,65 @@ def live(clips: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     output = tmp_path_factory.mktemp("made") / "live"
     make(clips, output, "live", 2)
     return output
+
+
+def bursts(seed: int, seconds: int) -> np.ndarray:
+    """Noise that comes and goes, as a voice does."""
+    rng = np.random.default_rng(seed)
+    envelope = np.repeat(rng.uniform(0.2, 1.0, 4 * seconds), RATE // 4)
+    return (0.05 * envelope * rng.standard_normal(seconds * RATE)).astype(np.float32)
+
+
+def write_pair(folder: Path, name: str, ref: np.ndarray, mic: np.ndarray) -> None:
+    sf.write(folder / f"{name}_lpb.wav", ref, RATE)
+    sf.write(folder / f"{name}_mic.wav", mic, RATE)
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A source of a clip."""
+
+    made: Signals
+    name: str = "scene"
+
+    def signals(self) -> Signals:
+        return self.made
+
+
+def clip_of(seconds: float, text: str | None = None) -> Clip:
+    """A robot, and in the second half a human 20 dB below it."""
+    robot, human = babble(seconds, 1), 0.1 * babble(seconds, 2)
+    start = human.size // 2
+    human[:start] = 0
+    return Clip("set", "lab", Scene(Signals(robot + human, robot, human, slice(start, human.size))), "s", "p", text)
+
+
+@pytest.fixture
+def pairs(tmp_path: Path) -> Path:
+    """Two recordings of one robot alone, one of each other kind; loopbacks a little shorter, as in reality."""
+    folder = tmp_path / "recordings"
+    folder.mkdir()
+    names = ("device1_00", "device1_01", "x_doubletalk", "x_farend_singletalk", "x_nearend_singletalk")
+    for index, name in enumerate(names):
+        ref = bursts(index, 7)
+        echo = 0.5 * np.roll(ref, 300)
+        human = bursts(10 + index, 7) if index in (2, 4) else 0.0
+        write_pair(folder, name, ref[:-100] if index != 4 else 0 * ref[:-100], human + (0 if index == 4 else echo))
+    return folder
+
+
+@pytest.fixture
+def speech(tmp_path: Path) -> Path:
+    folder = tmp_path / "speech"
+    folder.mkdir()
+    lines = []
+    for index in range(2):
+        sf.write(folder / f"{index}.wav", np.concatenate((np.zeros(RATE // 2), bursts(20 + index, 3))), RATE)
+        lines.append(f"{index}.wav\t{index}\t3.50\tone two three")
+    (folder / "transcripts.tsv").write_text("\n".join(lines) + "\n")
+    return folder
+
+
+def rows_of(found: dict) -> list[dict]:
+    """The rows that results.columns made."""
+    return [dict(zip(found["columns"], values, strict=True)) for values in found["values"]]

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 import soundfile as sf
 
-from bench.simulate import archives, corpora, robot_voices, selection
+from bench.simulate import corpora
 from bench.simulate.conversations import read_clips
 
 RATE = 16000
@@ -77,15 +77,15 @@ def given(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[Path]:
     folder.mkdir()
     for name, text in (("SELECTION", SELECTION), ("SENTENCES", SENTENCES)):
         (tmp_path / name).write_text(text, encoding="utf-8")
-    monkeypatch.setattr(selection.read_selection, "__defaults__", (tmp_path / "SELECTION",))
-    monkeypatch.setattr(selection.read_sentences, "__defaults__", (tmp_path / "SENTENCES",))
+    monkeypatch.setattr(corpora.read_selection, "__defaults__", (tmp_path / "SELECTION",))
+    monkeypatch.setattr(corpora.read_sentences, "__defaults__", (tmp_path / "SENTENCES",))
     made = [
         librispeech(folder, "train-clean-100", "103", "1240", 2),
         librispeech(folder, "test-clean", "1089", "134", 10),
     ]
     made += [librispeech(folder, "test-other", "367", "13", 3), speechocean(folder)]
     for path in made[:3]:
-        monkeypatch.setitem(archives.MD5, archives.archive_name(path), hashlib.md5(path.read_bytes()).hexdigest())
+        monkeypatch.setitem(corpora.MD5, corpora.archive_name(path), hashlib.md5(path.read_bytes()).hexdigest())
     return made
 
 
@@ -143,8 +143,8 @@ def test_checksums_are_written_compared_and_added_to(
 
 
 def test_published_checksums_are_those_of_librispeech() -> None:
-    assert set(archives.MD5) == {u.archive for u in selection.read_selection()} - {selection.SPEECHOCEAN}
-    assert all(len(md5) == 32 for md5 in archives.MD5.values())
+    assert set(corpora.MD5) == {u.archive for u in corpora.read_selection()} - {corpora.SPEECHOCEAN}
+    assert all(len(md5) == 32 for md5 in corpora.MD5.values())
 
 
 @pytest.mark.parametrize(
@@ -186,7 +186,7 @@ def test_an_archive_that_is_not_what_it_should_be_is_one_line(
     else:
         path.unlink()
     if damage not in ("other bytes", "gone", "other name"):
-        monkeypatch.setitem(archives.MD5, "test-clean", hashlib.md5(path.read_bytes()).hexdigest())
+        monkeypatch.setitem(corpora.MD5, "test-clean", hashlib.md5(path.read_bytes()).hexdigest())
     assert run(monkeypatch, "--output", tmp_path / "data", "--archives", path) == 1
     error = capsys.readouterr().err
     assert error.startswith("corpora: ") and error.count("\n") == 1
@@ -199,7 +199,7 @@ def test_no_path_inside_an_archive_decides_where_anything_is_written(tmp_path: P
         {"../../a-1-0000.flac": encoded(sound(0), "FLAC"), "a-1.trans.txt": b"a-1-0000 HI\n"},
     )
     target = tmp_path / "in" / "deep" / "here.flac"
-    assert archives.take(path, {"a-1-0000": target}) == {"a-1-0000": (0.5, "hi")}
+    assert corpora.take(path, {"a-1-0000": target}) == {"a-1-0000": (0.5, "hi")}
     assert [file for file in tmp_path.rglob("*.flac")] == [target]
 
 
@@ -237,9 +237,9 @@ def test_voices_are_rendered_in_their_own_english(monkeypatch: pytest.MonkeyPatc
 
     monkeypatch.setitem(sys.modules, "kokoro_onnx", type(sys)("kokoro_onnx"))
     sys.modules["kokoro_onnx"].Kokoro = Kokoro
-    render = robot_voices.kokoro(tmp_path / "m.onnx", tmp_path / "v.bin")
+    render = corpora.kokoro(tmp_path / "m.onnx", tmp_path / "v.bin")
     for voice, code in (("af_one", 1), ("bm_two", 2)):
-        samples, rate = render(selection.Sentence("test", voice, 0, "four"))
+        samples, rate = render(corpora.Sentence("test", voice, 0, "four"))
         assert samples.tolist() == [4, 1, code] and rate == 24000
 
 
@@ -275,7 +275,7 @@ def test_whisper_is_converted_by_the_published_converter(
 
 
 def test_the_shipped_selection_keeps_test_speakers_and_voices_apart() -> None:
-    chosen, read = selection.read_selection(), selection.read_sentences()
+    chosen, read = corpora.read_selection(), corpora.read_sentences()
     for items, who in ((chosen, "speaker"), (read, "voice")):
         sets = {name: {getattr(item, who) for item in items if item.folder == name} for name in corpora.SETS}
         assert not (sets["train"] & sets["test"] or sets["val"] & sets["test"] or sets["train"] & sets["val"])

@@ -1,35 +1,51 @@
-"""bench/README.md leads from each result to a command that exists, with options that it has."""
+"""bench/README.md leads to commands that exist, with options that they have, and names every result."""
 
 from __future__ import annotations
 
+import argparse
+import importlib
 import importlib.util
 import re
 from pathlib import Path
 
 import pytest
 
+from bench import __main__ as program
+from bench import results
+
 ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "bench" / "README.md").read_text(encoding="utf-8")
-COMMANDS = re.findall(r"python -m (bench\.[\w.]+)([^`\n]*)", PAGE)
+MODULES = re.findall(r"python -m (bench\.[\w.]+)([^`\n]*)", PAGE)
+SCENARIOS = re.findall(r"python -m bench (\w+)([^`\n]*)", PAGE)
 
 
-@pytest.mark.parametrize("module", sorted({module for module, _ in COMMANDS}))
-def test_a_command_is_a_program_with_these_options(module: str) -> None:
-    assert importlib.util.find_spec(module) is not None
-    place = ROOT / Path(*module.split("."))
-    source = (place / "__main__.py" if place.is_dir() else place.with_suffix(".py")).read_text(encoding="utf-8")
-    assert '__name__ == "__main__"' in source
-    for _, options in (command for command in COMMANDS if command[0] == module):
-        for option in re.findall(r"(?<=\s)--[a-z][a-z-]*", options):
-            assert f'"{option}"' in source, option
+def options(text: str) -> list[str]:
+    return re.findall(r"(?<=\s)--[a-z][a-z-]*", text)
 
 
-def test_every_result_has_a_row_and_every_page_named_is_there() -> None:
-    named = set(re.findall(r"\]\(results/(\w+)\.(?:md|json)\)", PAGE))
-    assert named == {path.stem for path in (ROOT / "bench" / "results").glob("*.json")}
+@pytest.mark.parametrize("module", sorted({module for module, _ in MODULES}))
+def test_a_generator_has_the_options_of_its_commands(module: str) -> None:
+    found = importlib.util.find_spec(module)
+    assert found is not None and found.origin
+    source = Path(found.origin).read_text(encoding="utf-8")
+    for _, text in (command for command in MODULES if command[0] == module):
+        assert [option for option in options(text) if f'"{option}"' not in source] == []
+
+
+@pytest.mark.parametrize("name", sorted({name for name, _ in SCENARIOS if name != "SCENARIO"}))
+def test_a_scenario_has_the_options_of_its_commands(name: str) -> None:
+    parser = argparse.ArgumentParser()
+    program.common(parser)
+    importlib.import_module(f"bench.{name}").add_arguments(parser)
+    known = {option for action in parser._actions for option in action.option_strings}
+    for _, text in (command for command in SCENARIOS if command[0] == name):
+        assert set(options(text)) <= known
+
+
+def test_every_scenario_and_result_is_named_and_every_link_leads_somewhere() -> None:
+    named = set(re.findall(r"`results/(\w+)\.md`", PAGE))
+    made = {path.stem for path in results.RESULTS.glob("*.json") if results.read(path)["parts"]}
+    assert made <= named and len(named) == 8
+    assert set(program.SCENARIOS) == {name for name, _ in SCENARIOS} - {"SCENARIO"}
     for target in re.findall(r"\]\(([^)#:]+)\)", PAGE):
         assert (ROOT / "bench" / target).exists(), target
-
-
-def test_there_are_commands_to_check() -> None:
-    assert len(COMMANDS) >= 20

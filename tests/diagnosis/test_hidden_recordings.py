@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import soundfile as sf
 
-from bench.measure import hidden_effects
+from bench.diagnosis import names
 from edgefilter.calibration.calibrate import calibrate
 from edgefilter.diagnosis.compare import compare
 from edgefilter.diagnosis.diagnose import add, diagnose
@@ -28,11 +28,11 @@ excess before is another one: by up to 0.9 dB."""
 
 
 def read(case: Path) -> dict[str, np.ndarray]:
-    return {name: sf.read(case / f"{name}.flac", dtype="float32")[0] for name in hidden_effects.SIGNALS}
+    return {name: sf.read(case / f"{name}.flac", dtype="float32")[0] for name in names.SIGNALS}
 
 
 def calibrated(signals: dict[str, np.ndarray]) -> Profile:
-    return calibrate(*(signals[name] for name in hidden_effects.SIGNALS[:3]))
+    return calibrate(*(signals[name] for name in names.SIGNALS[:3]))
 
 
 def pause(reference: np.ndarray) -> int:
@@ -93,15 +93,12 @@ def test_the_hidden_effect_is_named_and_its_adding_keeps_the_promise(name: str, 
 
 
 @pytest.fixture(scope="module")
-def sealed() -> dict[str, hidden_effects.Outcome]:
+def sealed() -> dict[str, names.Outcome]:
     seals = json.loads((DATA / "sealed" / "seals.json").read_text())
-    return {
-        name: hidden_effects.check_seal(hidden_effects.judge(DATA / "sealed" / name, None), seals[name])
-        for name in SEALED
-    }
+    return {name: names.check_seal(names.diagnosed(DATA / "sealed" / name, None), seals[name]) for name in SEALED}
 
 
-def test_seals_are_met_as_often_as_they_were(sealed: dict[str, hidden_effects.Outcome]) -> None:
+def test_seals_are_met_as_often_as_they_were(sealed: dict[str, names.Outcome]) -> None:
     for name, outcome in sealed.items():
         hit = "hit" if outcome.sealed_hit else "miss"
         print(
@@ -110,7 +107,7 @@ def test_seals_are_met_as_often_as_they_were(sealed: dict[str, hidden_effects.Ou
     assert sum(bool(outcome.sealed_hit) for outcome in sealed.values()) >= SEALED_HITS
 
 
-def test_what_is_added_to_a_sealed_case_keeps_the_promise(sealed: dict[str, hidden_effects.Outcome]) -> None:
+def test_what_is_added_to_a_sealed_case_keeps_the_promise(sealed: dict[str, names.Outcome]) -> None:
     """Hit or miss: the strongest effect that is named lowers the error by what was promised of it."""
     named = {name: outcome for name, outcome in sealed.items() if outcome.named}
     assert len(named) >= SEALED_HITS

@@ -11,6 +11,8 @@ import numpy as np
 import pytest
 import soundfile
 
+from edgefilter import EgoFilter
+
 ROOT = Path(__file__).parents[2]
 EXAMPLES = ROOT / "docs/examples"
 DEMO = ROOT / "edgefilter/demo_data"
@@ -115,13 +117,25 @@ def stereo():
     return np.stack([soundfile.read(DEMO / f"{name}.flac", dtype="int16")[0] for name in ("mic", "reference")], axis=1)
 
 
-def test_what_the_human_says_is_cut_out_from_a_recording_and_behind_a_pipe(stereo, tmp_path):
-    cut = stereo[6 * RATE :]
-    for name, channel in (("mic.wav", 0), ("reference.wav", 1)):
-        soundfile.write(tmp_path / name, cut[:, channel], RATE)
-    said, _ = run("listen.py", tmp_path / "mic.wav", tmp_path / "reference.wav", DEMO / "profile.npz")
-    piped, _ = run("listen.py", "-", "-", DEMO / "profile.npz", stdin=cut.astype("<i2").tobytes())
-    assert said == piped
+def test_what_the_human_says_is_cut_out_behind_the_command_line(stereo, tmp_path):
+    log = tmp_path / "events.jsonl"
+    command = [
+        "run",
+        "--input",
+        "-",
+        "--profile",
+        DEMO / "profile.npz",
+        "--output",
+        "-",
+        "--engine",
+        "crnn",
+        "--no-learn",
+    ]
+    human = subprocess.run(
+        [sys.executable, "-m", "edgefilter.cli", *map(str, command), "--quiet", "--log-json", log],
+        input=stereo[6 * RATE :].astype("<i2").tobytes(), stdout=subprocess.PIPE, cwd=ROOT, check=True,
+    )  # fmt: skip
+    said, _ = run("listen.py", log, stdin=human.stdout)
     began, ended = re.fullmatch(r"(\S+) to (\S+) s: \(.* s\)\n", said.decode()).groups()
     assert 2.2 < float(began) < 3.2 and 7.0 < float(ended) < 10.0  # half a second before the human, who begins at 3.0 s
 
@@ -153,7 +167,7 @@ def test_the_simulated_room_holds_the_robot_and_then_the_human(tmp_path):
 
 def test_the_part_of_the_ros_node_that_needs_no_ros_filters(stereo):
     node = imported("ros2_node.py")
-    duplex = node.Duplex(node.EgoFilter(DEMO / "profile.npz", "linear"))
+    duplex = node.Duplex(EgoFilter(DEMO / "profile.npz", "linear"))
     out = b""
     duplex.play(stereo[: 4 * RATE, 1].astype(np.float32) / 32768, RATE)
     for at in range(0, 4 * RATE, 512):

@@ -215,10 +215,9 @@ def test_what_is_sure_is_no_louder_than_the_microphone_either(monkeypatch):
 
 def test_the_shipped_models_are_the_pinned_ones_and_the_page_says_so():
     page = (ROOT / "models" / "MODELS.md").read_text(encoding="utf-8")
-    there = {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in (ROOT / "models").glob("*.onnx")}
-    outside = {"crnn_20ms_int8.onnx", "voicefilter.onnx", "paper_crnn_narrow.onnx", "paper_crnn_narrow_batch_norm.onnx"}
-    engines = {name: found for name, found in there.items() if name not in outside}
-    assert onnx_session.SHIPPED == engines
+    files = [path for folder in ("models", "bench/models") for path in (ROOT / folder).glob("*.[op]*")]
+    there = {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
+    assert onnx_session.SHIPPED == {name: there[name] for name in ("crnn.onnx", "crnn_int8.onnx")}
     for name, found in there.items():
         assert re.search(rf"`{name}` +`{found}`", page), name
 

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import json
+import re
+from itertools import takewhile
 from pathlib import Path
 
 import onnxruntime
 import pytest
 
 ROOT = Path(__file__).parents[2]
-SHIPPED = sorted((ROOT / "models").glob("*.onnx"))
+SHIPPED = sorted((*(ROOT / "models").glob("*.onnx"), *(ROOT / "bench/models").glob("*.onnx")))
 FOR_TESTS = sorted((ROOT / "tests" / "data").glob("*.onnx"))
 
 
@@ -23,16 +25,14 @@ def page() -> dict[str, dict[str, str]]:
     """The rows of the page's first table by file, cells by column."""
     lines = (ROOT / "models" / "MODELS.md").read_text(encoding="utf-8").splitlines()
     start = next(i for i, line in enumerate(lines) if line.startswith("| file |"))
-    head, *rows = (
-        [cell.strip() for cell in line.strip("|").split("|")] for line in lines[start:] if line.startswith("|")
-    )
-    rows = rows[1 : next(i for i, row in enumerate(rows) if len(row) != len(head))]
+    table = takewhile(lambda line: line.startswith("|"), lines[start:])
+    head, _, *rows = ([cell.strip() for cell in line.strip("|").split("|")] for line in table)
     return {row[0].split(",")[0]: dict(zip(head, row, strict=True)) for row in rows}
 
 
 def test_every_file_has_a_row_and_every_row_a_file() -> None:
-    assert len(SHIPPED) >= 2
-    assert sorted(page()) == [path.name for path in SHIPPED]
+    assert len(SHIPPED) >= 6
+    assert sorted(page()) == sorted(path.name for path in SHIPPED)
 
 
 @pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.name)
@@ -43,6 +43,16 @@ def test_steps_seed_items_and_size_are_those_of_the_file(path: Path) -> None:
     assert row["seed"] == ", ".join(map(str, seeds))
     assert row["items"] == str(said["items"])
     assert row["file"] == f"{path.name}, {path.stat().st_size / 1e6:.1f} MB"
+
+
+@pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.name)
+def test_the_validation_figures_are_those_of_the_file(path: Path) -> None:
+    cell, said = page()[path.name]["validation SI-SDR, dB"], json.loads(metadata(path)["figures"])
+    if cell.startswith("as "):
+        cell = page()[cell.removeprefix("as ")]["validation SI-SDR, dB"]
+    known = [said["si_sdr_db"], said.get("si_sdr_error_db", said.get("si_sdr_mic_db"))]
+    found = re.findall(r"-?\d+\.\d", cell)
+    assert found == [f"{value:.1f}" for value in known[: len(found)]] and found
 
 
 @pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.name)

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from scipy.signal import fftconvolve
 
-from bench.simulate.alignment_scene import speech_like
 from edgefilter import Profile, engines, enhance
 from edgefilter.echo.model import EchoModel
 from edgefilter.types import PRE_ROLL, SAMPLE_RATE
+from tests.alignment.scene import speech_like
 
 SECONDS = 8
 SIZE = SECONDS * SAMPLE_RATE

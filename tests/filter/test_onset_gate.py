@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 import soundfile
 
-from bench.simulate.alignment_scene import RATE, fan, hear, known_path, room, run, utterances
 from edgefilter import enhance
 from edgefilter.alignment.aligner import Aligner
 from edgefilter.alignment.delay_line import Aligned
 from edgefilter.commands.demo import DATA
 from edgefilter.filter.onset_gate import GATE, LONGEST, RAMP, SETTLE, OnsetGate
+from tests.alignment.scene import RATE, fan, hear, known_path, room, run, utterances
 
 HOP = 256
 

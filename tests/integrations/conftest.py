@@ -1,4 +1,4 @@
-"""The examples' simulated room, imported as they import it, and a filter whose reference can be looked at."""
+"""The simulated room of the examples, and a filter whose reference can be looked at."""
 
 import importlib
 import sys
@@ -15,7 +15,7 @@ EXAMPLES = Path(__file__).parents[2] / "docs/examples"
 
 
 class Watched(EgoFilter):
-    """Keeps the reference that it got, and when speech began."""
+    """Keeps the reference that it got, and the time at which speech began."""
 
     def __init__(self, *args, **kwargs):
         super().__init__(*args, **kwargs)

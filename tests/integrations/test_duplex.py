@@ -19,6 +19,7 @@ class Witness:
 
     waits_for_end = False
     engine_name = "witness"
+    speech_probability: float | None = 0.0
 
     def __init__(self):
         self.references = [np.zeros(0, np.float32)]
@@ -79,7 +80,7 @@ def test_speech_cut_off_in_mid_word_was_not_played_and_the_next_begins_at_once(w
 
 
 def test_speech_that_ran_out_leaves_a_gap_as_long_as_the_loudspeaker_was_silent(witness):
-    duplex = Duplex(witness)
+    duplex = Duplex(witness, patience_s=0)
     duplex.play(VOICE[:3200], RATE)
     listen(duplex, 0.3)
     duplex.play(VOICE[3200:6400], RATE)
@@ -96,6 +97,17 @@ def test_a_frame_that_is_late_is_waited_for_and_leaves_no_gap(witness):
     duplex.play(VOICE[1280:3840], RATE)
     assert listen(duplex, 0.02) == 1280 + 320
     np.testing.assert_array_equal(witness.reference, VOICE[:2880])
+
+
+def test_one_frame_that_is_20_ms_late_makes_no_gap_unless_asked_for(witness):
+    """A gap that the loudspeaker did not make moves the reference by 20 ms: 17 dB less until it is aligned again."""
+    for count, patience in ((320, {}), (0, {"patience_s": 0.0})):
+        duplex = Duplex(witness, **patience)
+        duplex.play(VOICE[:3200], RATE)
+        listen(duplex, 0.22)
+        duplex.play(VOICE[3200:6400], RATE)
+        listen(duplex, 0.1)
+        np.testing.assert_array_equal(witness.reference[-320:], VOICE[4800 + count - 320 : 4800 + count])
 
 
 def test_the_microphone_waits_no_longer_than_its_patience_and_loses_nothing(witness):
@@ -162,6 +174,20 @@ def test_a_paused_loudspeaker_goes_on_where_it_stopped_but_for_what_it_threw_awa
     np.testing.assert_array_equal(witness.reference[RATE:], VOICE[11200:19200])
 
 
+def test_a_loudspeaker_that_is_paused_while_the_microphone_is_off_plays_nothing_meanwhile(witness):
+    clock = Clock()
+    duplex = Duplex(witness, clock=clock)
+    duplex.play(VOICE, RATE)
+    listen(duplex, 0.5)
+    duplex.pause()
+    clock.now += 5.0
+    listen(duplex, 0.1)
+    duplex.resume()
+    listen(duplex, 0.5)
+    assert duplex.stats()["unheard_s"] == 0
+    np.testing.assert_array_equal(witness.reference[-RATE // 2 :], VOICE[RATE // 2 : RATE])
+
+
 def test_the_queue_is_bounded_and_says_what_it_refused(witness, monkeypatch):
     monkeypatch.setattr(module, "MOST_QUEUED_S", 1.5)
     duplex = Duplex(witness)
@@ -170,15 +196,35 @@ def test_the_queue_is_bounded_and_says_what_it_refused(witness, monkeypatch):
     assert duplex.queued_s == 1.5 and duplex.stats()["refused_s"] == 4.5
 
 
-def test_switched_off_it_passes_the_microphone_and_forgets_what_was_said(witness):
+def test_switched_off_it_passes_the_microphone_and_the_filter_still_knows_what_is_played(witness):
     duplex = Duplex(witness)
     duplex.play(VOICE, RATE)
     duplex.enabled = False
-    duplex.play(VOICE, RATE)
-    assert duplex.queued_s == 0 and duplex.hear(VOICE, 44100) is VOICE
+    assert duplex.hear(VOICE[:RATE], RATE) is not None and (duplex.hear(VOICE[:320], RATE) == VOICE[:320]).all()
     duplex.enabled = True
     listen(duplex, 0.1)
-    assert not witness.reference.any()
+    np.testing.assert_array_equal(witness.reference[-1600:], VOICE[RATE + 320 : RATE + 1920])
+
+
+def test_an_engine_that_judges_no_speech_is_told_of_once_and_so_is_its_end(witness, caplog):
+    duplex = Duplex(witness)
+    for probability in (0.1, None, None, 0.2):
+        witness.speech_probability = probability
+        listen(duplex, 0.1)
+    told = [record.getMessage() for record in caplog.records]
+    assert len(told) == 2 and "witness judges no speech: the human is not noticed" in told[0]
+    assert "noticed again" in told[1]
+
+
+def test_a_filter_that_steps_down_to_an_engine_that_judges_no_speech_says_so(caplog):
+    ego = EgoFilter(budget_ms=1e-6)
+    assert not ego.judges_speech
+    listen(Duplex(ego), 1.0)
+    assert "judges no speech: the human is not noticed" in caplog.text
+
+
+def test_the_filter_that_it_makes_itself_judges_speech():
+    assert Duplex().ego.judges_speech
 
 
 def test_speech_may_come_from_another_thread(witness):

@@ -113,7 +113,23 @@ def test_the_tap_hands_everything_on_and_notes_what_is_played_paused_and_dropped
     assert ears.duplex.queued_s == 0 and ears.duplex.stats()["dropped_s"] == pytest.approx(1.0, abs=1e-3)
 
 
-def test_switched_off_it_forgets_what_was_said(ears):
-    ears.duplex.play(NOISE, 24_000)
+def test_after_a_pause_the_speech_that_the_room_had_thrown_away_is_no_reference(ears):
+    """The room's output holds 0.2 s (livekit.agents.voice.room_io.ParticipantAudioOutput) and clears it when paused."""
+
+    async def talk():
+        tap = ears.tap(Sink())
+        await tap.capture_frame(frame_of(NOISE))
+        tap.flush()
+        tap.pause()
+        tap.resume()
+
+    asyncio.run(talk())
+    assert ears.duplex.stats()["dropped_s"] == pytest.approx(0.2) and ears.duplex.queued_s == pytest.approx(
+        1.8, abs=1e-3
+    )
+
+
+def test_switched_off_it_gives_the_microphone_as_it_is(ears):
     ears.enabled = False
-    assert ears.duplex.queued_s == 0 and not ears.enabled
+    assert not ears.enabled
+    np.testing.assert_array_equal(ears._process(frame_of(NOISE[:1200])).data, frame_of(NOISE[:1200]).data)

@@ -7,7 +7,7 @@ import pytest
 from pipecat.frames.frames import FilterEnableFrame
 from pipecat.transports.base_transport import TransportParams
 
-from edgefilter import EgoFilter
+from edgefilter import BargeInSettings, EgoFilter, UsageError
 from edgefilter.integrations.duplex import as_pcm16, from_pcm16
 from edgefilter.integrations.pipecat import EgoFilters
 
@@ -29,6 +29,15 @@ def test_a_robot_that_talks_is_interrupted_and_its_reference_is_what_it_played(e
 def test_both_faces_are_filters_of_a_transport(filters):
     params = TransportParams(audio_in_enabled=True, audio_out_enabled=True, **filters.params)
     assert params.audio_in_filter is not params.audio_out_filter
+
+
+@pytest.mark.parametrize("end", ["in", "out"])
+def test_a_stereo_transport_that_the_filters_were_not_told_of_is_refused(end):
+    """Its samples would be taken for mono at half the pace, and the robot would stay in the microphone."""
+    with pytest.raises(TypeError, match=f"audio_{end}_channels"):
+        TransportParams(**{f"audio_{end}_channels": 2}, **EgoFilters(EgoFilter(engine="linear")).params)
+    told = TransportParams(**EgoFilters(EgoFilter(engine="linear"), in_channels=2, out_channels=2).params)
+    assert (told.audio_in_channels, told.audio_out_channels) == (2, 2)
 
 
 def test_the_loudspeaker_s_sound_is_left_alone_and_noted_at_its_rate(filters):
@@ -58,10 +67,47 @@ def test_it_can_be_switched_off_while_it_runs(filters):
     np.testing.assert_array_equal(from_pcm16(asyncio.run(hear()), 2), from_pcm16(as_pcm16(NOISE)))
 
 
-def test_the_voice_activity_is_the_filter_s_own_judgement(filters, monkeypatch):
-    vad = filters.vad()
+async def confidences(room_of, filters, switched_off_s):
+    """The VAD's confidence every 20 ms: robot from 0 to 2.5 s, human from 1 s to 3.5 s, then nobody but the fan."""
+    vad, (microphone, loudspeaker) = filters.vad(), (filters.params[f"audio_{end}_filter"] for end in ("in", "out"))
+    room, found = room_of.Room(), []
+    await loudspeaker.filter(as_pcm16(room_of.ROBOT[:40_000]))
+    filters.duplex.end()
+    room.play(room_of.ROBOT[:40_000])
+    for step in range(250):
+        if step == 50:
+            room.speak()
+        if step == 175:
+            room.human_from = None
+        if step == round(50 * switched_off_s):
+            await microphone.process_frame(FilterEnableFrame(enable=False))
+        await microphone.filter(as_pcm16(room.hear(320)))
+        found.append(vad.voice_confidence(b""))
+    return np.array(found)
+
+
+@pytest.mark.parametrize("switched_off_s", [6.0, 2.0, 0.2], ids=["never", "while the human speaks", "before"])
+def test_the_voice_activity_is_the_human_s_also_while_the_filter_is_switched_off(room_of, switched_off_s):
+    filters = EgoFilters(EgoFilter(room_of.PROFILE, "crnn"))
+    found = asyncio.run(confidences(room_of, filters, switched_off_s))
+    assert not found[:50].any() and found[90:160].all(), "0.2 s to notice were seen"
+    assert not found[220:].any(), "0.5 s of pause end it"
+
+
+def test_the_voice_activity_is_asked_for_once_a_hop(room_of):
+    vad = EgoFilters(EgoFilter(engine="crnn")).vad()
     vad.set_sample_rate(24_000)
-    assert vad.num_frames_required() == 384, "one hop of the filter"
-    assert vad.voice_confidence(b"") == 0.0
-    monkeypatch.setattr(EgoFilter, "human_speaks", True)
-    assert vad.voice_confidence(b"") == 1.0
+    assert vad.num_frames_required() == 384
+
+
+@pytest.mark.parametrize("settings", [{"engine": "ss"}, {"budget_ms": 8}], ids=["ss", "may step down to ss"])
+def test_a_voice_activity_that_would_not_notice_the_human_is_refused(settings):
+    with pytest.raises(UsageError, match="ss.* do not all judge speech.*judge='network'"):
+        EgoFilters(EgoFilter(**settings)).vad()
+
+
+@pytest.mark.parametrize("settings", [{"engine": "ss"}, {"budget_ms": 1e-6}], ids=["ss", "no hop within the budget"])
+def test_with_the_network_as_judge_the_human_is_noticed_whatever_the_engine_and_the_budget(room_of, settings):
+    ego = EgoFilter(room_of.PROFILE, **settings, barge_in=BargeInSettings(judge="network"))
+    found = asyncio.run(confidences(room_of, EgoFilters(ego), 6.0))
+    assert found[90:160].all() and not found[220:].any()

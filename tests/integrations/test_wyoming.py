@@ -1,25 +1,34 @@
 """Against the real Wyoming: its servers and clients over TCP, as a satellite uses them."""
 
 import asyncio
+import contextlib
+import json
+import signal
 import socket
+import subprocess
 import sys
+import time
+from functools import partial
+from pathlib import Path
 
 import numpy as np
 import pytest
 from wyoming.audio import AudioChunk, AudioFormat, AudioStart, AudioStop
 from wyoming.client import AsyncClient
+from wyoming.event import Event as Message
 from wyoming.info import Describe, Info
+from wyoming.server import AsyncEventHandler, AsyncServer
 from wyoming.snd import Played
 
 from edgefilter import EgoFilter
 from edgefilter.integrations.duplex import as_pcm16, from_pcm16
-from edgefilter.integrations.wyoming import EgoService, main
-from edgefilter.integrations.wyoming_sound import Player
+from edgefilter.integrations.wyoming import EgoService, Player, main
 
 RATE = 16_000
 NOISE = 0.1 * np.random.default_rng(0).standard_normal(RATE).astype(np.float32)
 NOBODY = "tcp://127.0.0.1:9"
 """Where no service is: the port of the discard protocol, which nobody runs."""
+MONO = AudioFormat(RATE, 2, 1)
 
 
 def free_port(count=1):
@@ -27,6 +36,10 @@ def free_port(count=1):
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return min(probe.getsockname()[1], 65_000 - count)
+
+
+def noise(samples=NOISE):
+    return AudioChunk(RATE, 2, 1, as_pcm16(samples)).event()
 
 
 @pytest.fixture
@@ -42,6 +55,55 @@ def endless_noise(tmp_path):
     return f'{sys.executable} -c "{code}"'
 
 
+@pytest.fixture
+def player(tmp_path):
+    """A command that is a loudspeaker: keeps the first 20000 bytes that it gets."""
+    return f"{sys.executable} -c \"import sys; open('{tmp_path}/played', 'wb').write(sys.stdin.buffer.read(20000))\""
+
+
+async def until(happens):
+    for _ in range(200):
+        if happens():
+            return
+        await asyncio.sleep(0.05)
+    raise AssertionError("it does not happen")
+
+
+async def client_of(uri):
+    for _ in range(200):
+        try:
+            client = AsyncClient.from_uri(uri)
+            await client.connect()
+            return client
+        except OSError:
+            await asyncio.sleep(0.05)
+    raise AssertionError("the service does not start")
+
+
+@contextlib.asynccontextmanager
+async def running(microphone, loudspeaker):
+    """A service at work, a function that connects a client to its microphone or loudspeaker, and their ports."""
+    service = EgoService(microphone, loudspeaker, EgoFilter(engine="linear"), AudioFormat(RATE, 2, 2), MONO)
+    ports = {end: free_port() for end in ("microphone", "loudspeaker")}
+    uris = {end: f"tcp://127.0.0.1:{port}" for end, port in ports.items()}
+    serving = asyncio.create_task(service.run(*uris.values()))
+    try:
+        yield service, lambda end: client_of(uris[end]), ports
+    finally:
+        serving.cancel()
+        await asyncio.gather(serving, return_exceptions=True)
+
+
+def logged(caplog):
+    """Warnings and errors, but for those of the filter: its engine judges no speech, the machine may be too slow."""
+    told = [record.getMessage() for record in caplog.records if record.levelname in ("WARNING", "ERROR")]
+    return [line for line in told if "judges no speech" not in line and "too slow" not in line]
+
+
+def within_a_minute(talk):
+    asyncio.run(asyncio.wait_for(talk(), 60))
+
+
 def test_a_satellite_is_interrupted_and_its_reference_is_what_was_played(example, ego, check_conversation):
     converse = example("agent_wyoming").converse
     log, room, _ = asyncio.run(asyncio.wait_for(converse(ego, port=free_port(4)), 120))
@@ -49,57 +111,176 @@ def test_a_satellite_is_interrupted_and_its_reference_is_what_was_played(example
     assert [what.split(":")[0] for _, what in log] == ["the human speaks", "the robot is silent", "the human said"]
 
 
-def test_commands_are_microphone_and_loudspeaker_and_who_hangs_up_interrupts(endless_noise, tmp_path):
+def test_commands_are_microphone_and_loudspeaker_and_who_hangs_up_interrupts(endless_noise, player, tmp_path):
     """One satellite says all it has and waits until it was played; another disconnects in mid-word."""
-    player = f"{sys.executable} -c \"import sys; open('{tmp_path}/played', 'wb').write(sys.stdin.buffer.read(20000))\""
-    mic_uri, snd_uri = (f"tcp://127.0.0.1:{free_port()}" for _ in range(2))
-    ego, form = EgoFilter(engine="linear"), AudioFormat(RATE, 2, 1)
-    service = EgoService(endless_noise, player, ego, AudioFormat(RATE, 2, 2), form)
-
-    async def client_of(uri):
-        for _ in range(200):
-            try:
-                client = AsyncClient.from_uri(uri)
-                await client.connect()
-                return client
-            except OSError:
-                await asyncio.sleep(0.05)
-        raise AssertionError("the service does not start")
-
-    async def until(happens):
-        for _ in range(200):
-            if happens():
-                return
-            await asyncio.sleep(0.05)
-        raise AssertionError("it does not happen")
 
     async def talk():
-        serving = asyncio.create_task(service.run(mic_uri, snd_uri))
-        listener, speaker = await client_of(mic_uri), await client_of(snd_uri)
-        chunk = AudioChunk.from_event(await listener.read_event())
-        assert (chunk.rate, chunk.width, chunk.channels) == (RATE, 2, 1) and from_pcm16(chunk.audio).any()
-        await speaker.write_event(Describe().event())
-        assert Info.from_event(await speaker.read_event()).snd[0].snd_format == form
-        await speaker.write_event(AudioStart(RATE, 2, 1).event())
-        await speaker.write_event(AudioChunk(RATE, 2, 1, as_pcm16(NOISE)).event())
-        await speaker.write_event(AudioStop().event())
-        assert Played.is_type((await speaker.read_event()).type)
-        await asyncio.sleep(0.1)
-        played = service.duplex.stats()["played_s"]
-        for _ in range(20):
-            await speaker.write_event(AudioChunk(RATE, 2, 1, as_pcm16(NOISE)).event())
-        await until(lambda: service.duplex.stats()["played_s"] > played)
-        await speaker.disconnect()
-        await until(lambda: service.duplex.queued_s == 0 and service.duplex.stats()["dropped_s"] > 0)
-        await until(lambda: not service.speakers)
-        await listener.disconnect()
-        serving.cancel()
-        await asyncio.gather(serving, return_exceptions=True)
+        async with running(endless_noise, player) as (service, connect, ports):
+            listener, speaker = await connect("microphone"), await connect("loudspeaker")
+            chunk = AudioChunk.from_event(await listener.read_event())
+            assert (chunk.rate, chunk.width, chunk.channels) == (RATE, 2, 1) and from_pcm16(chunk.audio).any()
+            await speaker.write_event(Describe().event())
+            assert Info.from_event(await speaker.read_event()).snd[0].snd_format == MONO
+            await speaker.write_event(AudioStart(RATE, 2, 1).event())
+            await speaker.write_event(noise())
+            await speaker.write_event(AudioStop().event())
+            assert Played.is_type((await speaker.read_event()).type)
+            await asyncio.sleep(0.1)
+            played = service.duplex.stats()["played_s"]
+            for _ in range(20):
+                await speaker.write_event(noise())
+            await until(lambda: service.duplex.stats()["played_s"] > played)
+            await speaker.disconnect()
+            await until(lambda: service.duplex.queued_s == 0 and service.duplex.stats()["dropped_s"] > 0)
+            await until(lambda: not service.speakers)
+            await listener.disconnect()
 
-    asyncio.run(asyncio.wait_for(talk(), 60))
+    within_a_minute(talk)
     np.testing.assert_array_equal(
         np.frombuffer((tmp_path / "played").read_bytes(), "<i2")[:10_000] / 32768, from_pcm16(as_pcm16(NOISE))[:10_000]
     )
+
+
+def test_the_rest_of_an_utterance_that_was_interrupted_is_not_played_and_its_end_is_answered(endless_noise, player):
+    async def talk():
+        async with running(endless_noise, player) as (service, connect, ports):
+            speaker = await connect("loudspeaker")
+            await speaker.write_event(noise())
+            await until(lambda: service.duplex.stats()["played_s"] > 0.1)
+            await service.interrupt()
+            handed_over = sum(service.duplex.stats()[f"{what}_s"] for what in ("played", "dropped"))
+            await speaker.write_event(noise())
+            await speaker.write_event(AudioStop().event())
+            assert Played.is_type((await speaker.read_event()).type)
+            assert service.duplex.queued_s == 0
+            assert sum(service.duplex.stats()[f"{what}_s"] for what in ("played", "dropped")) == handed_over
+            played = service.duplex.stats()["played_s"]
+            await speaker.write_event(noise())  # the next utterance, though nothing says that it begins
+            await until(lambda: service.duplex.stats()["played_s"] > played)
+            await speaker.disconnect()
+
+    within_a_minute(talk)
+
+
+BROKEN = {
+    "cut in mid-sample": Message("audio-chunk", {"rate": RATE, "width": 2, "channels": 1}, b"abc"),
+    "no width": Message("audio-chunk", {"rate": RATE, "channels": 1}, b"abcd"),
+    "no channels at all": Message("audio-chunk", {"rate": RATE, "width": 2, "channels": 0}, b"abcd"),
+    "a rate in words": Message("audio-chunk", {"rate": "fast", "width": 2, "channels": 1}, b"abcd"),
+    "a rate that no sound has": Message("audio-chunk", {"rate": 1, "width": 2, "channels": 1}, b"abcd"),
+}
+
+
+@pytest.mark.parametrize("broken", BROKEN.values(), ids=BROKEN)
+def test_who_sends_a_broken_chunk_is_disconnected_in_one_line_and_others_go_on(broken, endless_noise, player, caplog):
+    async def talk():
+        async with running(endless_noise, player) as (service, connect, ports):
+            one, other, listener = (
+                await connect("loudspeaker"),
+                await connect("loudspeaker"),
+                await connect("microphone"),
+            )
+            await one.write_event(broken)
+            assert await one.read_event() is None, "the connection is closed"
+            await other.write_event(noise(NOISE[:1600]))
+            await other.write_event(AudioStop().event())
+            assert Played.is_type((await other.read_event()).type)
+            assert AudioChunk.is_type((await listener.read_event()).type)
+            await until(lambda: len(service.speakers) == 1)
+
+    within_a_minute(talk)
+    told = logged(caplog)
+    assert len(told) == 1 and "expected" in told[0] and "connection is closed" in told[0], told
+
+
+@pytest.mark.parametrize("end", ["microphone", "loudspeaker"])
+@pytest.mark.parametrize("what", ["payload_length", "data_length"])
+def test_a_message_that_claims_900_mb_is_refused_before_it_is_read(end, what, endless_noise, player, caplog):
+    async def talk():
+        async with running(endless_noise, player) as (service, connect, ports):
+            await (await connect(end)).disconnect()  # the service has started
+            reader, writer = await asyncio.open_connection("127.0.0.1", ports[end])
+            writer.write(json.dumps({"type": "audio-chunk", what: 900_000_000}).encode() + b"\n" + bytes(100_000))
+            with contextlib.suppress(ConnectionError):
+                while await asyncio.wait_for(reader.read(65536), 5):  # what the microphone has said meanwhile
+                    pass
+            listener = await connect("microphone")
+            assert AudioChunk.is_type((await listener.read_event()).type), "others go on"
+
+    within_a_minute(talk)
+    told = logged(caplog)
+    assert len(told) == 1 and "900000000 bytes" in told[0] and "connection is closed" in told[0], told
+
+
+def test_a_client_that_speaks_another_language_is_disconnected(endless_noise, player, caplog):
+    async def talk():
+        async with running(endless_noise, player) as (service, connect, ports):
+            await (await connect("loudspeaker")).disconnect()
+            for line in (b"GET / HTTP/1.1\n", b"[]\n", b"{}\n", b'{"type": "audio-chunk", "data_length": "a"}\n'):
+                reader, writer = await asyncio.open_connection("127.0.0.1", ports["loudspeaker"])
+                writer.write(line)
+                assert await asyncio.wait_for(reader.read(), 5) == b""
+            await until(lambda: not service.speakers)
+
+    within_a_minute(talk)
+    assert not [record for record in caplog.records if record.exc_info], "no traceback"
+
+
+class BrokenMicrophone(AsyncEventHandler):
+    """Sends one sound of four bytes that are no two samples, then, when it is opened again, noise."""
+
+    opened = 0
+
+    def __init__(self, broken, reader, writer):
+        super().__init__(reader, writer)
+        BrokenMicrophone.opened += 1
+        first = broken if BrokenMicrophone.opened == 1 else noise()
+        self.task = asyncio.create_task(self.write_event(first))
+
+    async def handle_event(self, event):
+        return True
+
+
+@pytest.mark.parametrize("broken", BROKEN.values(), ids=BROKEN)
+def test_a_microphone_that_sends_a_broken_chunk_is_opened_again(broken, player, caplog):
+    async def talk():
+        port = free_port()
+        BrokenMicrophone.opened = 0
+        microphone = AsyncServer.from_uri(f"tcp://127.0.0.1:{port}")
+        await microphone.start(partial(BrokenMicrophone, broken))
+        async with running(f"tcp://127.0.0.1:{port}", player) as (_, connect, _ports):
+            listener = await connect("microphone")
+            assert AudioChunk.is_type((await listener.read_event()).type)
+        await microphone.stop()
+
+    within_a_minute(talk)
+    assert "cannot be read" in caplog.text and "expected" in caplog.text
+
+
+def test_one_sigterm_ends_it_with_its_commands(endless_noise, player):
+    ports = free_port(2)
+    mic_uri, snd_uri = (f"tcp://127.0.0.1:{ports + i}" for i in range(2))
+    words = ["--microphone", endless_noise, "--mic-channels", "2", "--loudspeaker", player, "--engine", "linear"]
+    words += ["--mic-uri", mic_uri, "--snd-uri", snd_uri]
+    service = subprocess.Popen(
+        [sys.executable, "-m", "edgefilter.integrations.wyoming", *words], stderr=subprocess.PIPE, text=True
+    )
+    try:
+
+        async def hear():
+            for uri in (mic_uri, snd_uri):
+                client = await client_of(uri)
+                if uri == mic_uri:
+                    assert AudioChunk.is_type((await client.read_event()).type)
+
+        within_a_minute(hear)
+        commands = Path(f"/proc/{service.pid}/task/{service.pid}/children").read_text().split()
+        assert commands, "the microphone's command runs"
+        service.send_signal(signal.SIGTERM)
+        assert service.wait(10) == 143 and service.stderr.read() == ""
+        assert not [command for command in commands if Path(f"/proc/{command}").exists()]
+    finally:
+        service.kill()
 
 
 def test_a_loudspeaker_that_is_not_there_silences_nothing_else(caplog):
@@ -108,17 +289,32 @@ def test_a_loudspeaker_that_is_not_there_silences_nothing_else(caplog):
     assert "cannot be reached" in caplog.text and service.duplex.queued_s == 0
 
 
-def test_a_loudspeaker_that_is_stopped_drops_what_it_has_and_can_be_used_again(tmp_path):
-    player = Player(f"{sys.executable} -c 'import time; time.sleep(60)'", AudioFormat(RATE, 2, 1))
+def test_stereo_speech_on_a_mono_loudspeaker_is_the_mean_of_its_channels_and_not_clipped(player, tmp_path):
+    loud = np.full(10_000, 0.8, np.float32)
 
     async def talk():
-        for _ in range(2):
-            await player.write(AudioChunk(RATE, 2, 1, as_pcm16(NOISE[:100])))
-            process = player._process
-            await player.stop()
-            assert process.returncode == -9
+        mono = Player(player, MONO)
+        await mono.write(AudioChunk(RATE, 2, 2, as_pcm16(loud, 2)))
+        await until(lambda: (tmp_path / "played").exists() and (tmp_path / "played").stat().st_size == 20_000)
+        await mono.stop()
 
-    asyncio.run(asyncio.wait_for(talk(), 30))
+    within_a_minute(talk)
+    np.testing.assert_array_equal(from_pcm16((tmp_path / "played").read_bytes()), from_pcm16(as_pcm16(loud)))
+
+
+def test_a_loudspeaker_that_is_stopped_drops_what_it_has_and_can_be_used_again(tmp_path):
+    started = tmp_path / "started"
+    player = Player(f"{sys.executable} -c \"import time; open('{started}', 'a').write('x'); time.sleep(60)\"", MONO)
+
+    async def talk():
+        for starts in ("x", "xx"):
+            await player.write(AudioChunk(RATE, 2, 1, as_pcm16(NOISE[:100])))
+            await until(lambda starts=starts: started.exists() and started.read_text() == starts)
+            began = time.monotonic()
+            await player.stop()
+            assert time.monotonic() - began < 5
+
+    within_a_minute(talk)
 
 
 def test_what_cannot_be_served_is_one_line(capsys, tmp_path):

@@ -4,7 +4,7 @@ from contextlib import ExitStack
 
 import pytest
 
-from bench.measure import virtual_sound
+from bench.live import virtual_sound
 
 
 @pytest.fixture

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 import soundfile
 
-from bench.measure import virtual_sound
+from bench.live import virtual_sound
 from tests.live.test_run_live import ROOT, edgefilter
 
 pytestmark = pytest.mark.slow

@@ -195,16 +195,30 @@ def test_the_doctor_finds_the_virtual_machine_fit(server):
     assert checks["level"]["state"] == "warning" and "unmute" in checks["level"]["do"]  # nobody plays anything
 
 
-def test_the_example_that_listens_hears_the_default_microphone_and_the_monitor(server, tmp_path):
+def test_the_example_that_listens_says_when_somebody_spoke_while_it_runs(server, tmp_path):
     cut = [soundfile.read(DEMO / f"{name}.flac", dtype="int16")[0][6 * 16000 :] for name in ("reference", "mic")]
     for sink, samples in zip(("robot", "robot_mic"), cut):
         soundfile.write(tmp_path / f"{sink}.wav", samples, 16000, "PCM_16")
-    live = subprocess.Popen(
-        [sys.executable, ROOT / "docs/examples/listen.py", "mic", "-", DEMO / "profile.npz"],
-        env={**server.environment, "PYTHONPATH": str(ROOT)}, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+    log = tmp_path / "events.jsonl"
+    command = edgefilter("run", "--input", "mic", "--profile", DEMO / "profile.npz", "--output", "-", "--engine", "crnn",
+                         "--no-learn", "--quiet", "--log-json", log)  # fmt: skip
+    with subprocess.Popen(
+        command, env=server.environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, cwd=ROOT,
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # a shell has its background jobs ignore it
-    )  # fmt: skip
-    told = [live.stderr.readline() for _ in range(2)]
-    assert told[1].strip() == "reference: robot.monitor", told
-    said, _ = play_and_end(live, server, tmp_path)
+    ) as live:  # fmt: skip
+        listener = subprocess.Popen(
+            [sys.executable, ROOT / "docs/examples/listen.py", log],
+            stdin=live.stdout,
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+        until = time.monotonic() + 60
+        while not log.exists() or not log.read_text():
+            assert time.monotonic() < until, live.stderr.read()
+            time.sleep(0.1)
+        for player in play(server, tmp_path):
+            assert player.wait(timeout=60) == 0
+        time.sleep(1.5)
+        live.send_signal(signal.SIGINT)
+        said = listener.communicate(timeout=60)[0]
     assert re.search(r"^\S+ (to|s to) \S+.*: \(\S+ s\)$", said, re.MULTILINE), said  # somebody spoke

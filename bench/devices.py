@@ -1,0 +1,224 @@
+r"""Every real device in one table, a row a device: nothing is known beforehand, nothing is calibrated.
+
+    OMP_NUM_THREADS=1 python -m bench devices RECORDINGS --speech HUMAN --whisper WHISPER --output PATH
+
+RECORDINGS holds pairs NAME_lpb (what the loudspeaker was sent) and NAME_mic, 16 kHz mono. Where the robot talks alone,
+humans of --speech are laid on: on a device's only recording at a level and after a time drawn from --ser and --before;
+on a device of many recordings (DEVICE_00, ...) at each of --levels, on the half that is kept to report on. The same
+recordings whole tell how far the robot alone is lowered, and every speech_started in them is false. Pairs in which both
+talk, or the human alone, are judged as recorded, by AECMOS. Devices that match --tuned-on were looked at while the
+filter was made: they stand in tables of their own.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from dataclasses import replace
+from fnmatch import fnmatch
+from pathlib import Path
+
+import numpy as np
+
+from bench import recordings, results, runner, systems
+from bench.evaluate import names, numbers, slim
+from bench.metrics import difference, mean
+from bench.recordings import Cells, Clip, Recording
+from bench.systems import System
+
+DEFAULT = ("unfiltered", *(f"{engine}-uncalibrated{way}" for way in ("", "-learning") for engine in systems.OWN),
+           *systems.PEERS, "clean")  # fmt: skip
+TUNED_ON = "F_i0k*,1N-e5*,yw9vi*,0B-YT*,0sjDo*"
+"""The devices of the shared recordings that are there to tune on."""
+SOON_S = 0.5
+"""A human who interrupts is to be noticed by then."""
+AHEAD_DB = 1.0
+"""The best peer counts as ahead on a device by more than this."""
+NOTES = """SI-SDR and word errors (at most 100 % an utterance) over the human who was laid on; the robot alone: by how much
+its recordings are lowered as a whole; false starts: every `speech_started` in them. Means are of devices, each with the same
+weight, and so are their 95 % intervals; differences are paired by device. 'Kept apart' devices were not looked at while the
+filter was made; the others stand apart. Peers get microphone and reference as the engines do."""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("recordings", type=Path, metavar="RECORDINGS")
+    parser.add_argument("--speech", type=Path, required=True, metavar="DIR", help="humans, with a transcripts.tsv")
+    parser.add_argument("--systems", type=names, default=list(DEFAULT), metavar="A,B,...", help="default: %(default)s")
+    parser.add_argument(
+        "--tuned-on", type=names, default=names(TUNED_ON), metavar="PATTERN,...", help="default: %(default)s"
+    )
+    parser.add_argument("--humans", type=int, default=2, metavar="N", help="on each device of one recording")
+    parser.add_argument("--ser", type=numbers, default=(-14.0, -6.0), metavar="LOW,HIGH", help="human against echo, dB")
+    parser.add_argument("--before", type=numbers, default=(5.0, 12.0), metavar="LOW,HIGH", help="robot alone before, s")
+    parser.add_argument(
+        "--levels", type=numbers, default=Cells.sers, metavar="DB,...", help="on a device of many recordings"
+    )
+    parser.add_argument("--cases", type=int, default=8, metavar="N", help="humans at each of the levels")
+
+
+def run(options: argparse.Namespace) -> str:
+    here, absent = systems.present(systems.chosen(options.systems))
+    clips = find_clips(options)
+    data = {"RECORDINGS": [options.recordings], "HUMAN": [options.speech]}
+    made_with = results.stamp(data, [one.name for one in here], {"WHISPER": options.whisper})
+    setup = runner.Setup(options.cache, options.whisper)
+    rows = runner.run(clips, here, setup, options.jobs, options.scheduler)
+    tuned_on = {clip.room for clip in clips if any(fnmatch(clip.room, one) for one in options.tuned_on)}
+    kept = [row for row in rows if row["room"] not in tuned_on]
+    tuned = [row for row in rows if row["room"] in tuned_on]
+    tables = [
+        overview("headline", "Devices kept apart", kept, here),
+        overview("tuned-on", "Devices tuned on", tuned, here),
+    ]
+    for key, digits, title, part in (
+        ("si_sdr", 1, "SI-SDR of the human laid on, dB", "laid"),
+        ("capped", 0, "Words wrong, %", "laid"),
+        ("erle_db", 1, "The robot alone, lowered by dB", "alone"),
+    ):
+        tables.append(by_device(key, title, [row for row in rows if row["set"] == part], here, digits, tuned_on))
+    tables += [against_peers(rows, here, tuned_on), barge_in(rows, here, tuned_on), as_recorded(rows, here)]
+    tables.append(results.absent(absent))
+    return results.write(options.output, "devices", "Real devices", made_with, [one for one in tables if one["rows"]],
+                         notes=NOTES, rows=results.columns(slim(rows)))  # fmt: skip
+
+
+def find_clips(options: argparse.Namespace) -> list[Clip]:
+    """Humans laid on, robots alone, and pairs as recorded; a clip's room is its device."""
+    found: dict[str, list[Recording]] = {}
+    for one in recordings.find_recordings(options.recordings):
+        if not one.tuned_on:
+            found.setdefault(one.device, []).append(one)
+    clips: list[Clip] = []
+    for device, own in list(found.items())[:: options.every][: options.limit]:
+        alone = [one for one in own if one.kind == "farend"]
+        if alone and alone[0].name.removeprefix(f"{device}_").isdigit():
+            cells = Cells(options.levels, (min(options.before),))
+            laid = recordings.lay(alone, options.speech, cells, options.cases, options.seed)
+        else:
+            laid = [human for one in alone for human in recordings.lay_once(
+                one, options.speech, options.humans, options.ser, options.before, options.seed)]  # fmt: skip
+        sets = {"laid": recordings.laid_clips(laid, options.speech, device)}
+        sets["alone"] = (recordings.recorded_clip(one) for one in alone)
+        sets["pairs"] = (recordings.recorded_clip(one) for one in own if one.kind != "farend")
+        clips += [replace(clip, set=part, room=device) for part, some in sets.items() for clip in some]
+    return clips
+
+
+def of(rows: Sequence[dict], system: str, part: str = "") -> list[dict]:
+    return [row for row in rows if row["system"] == system and part in ("", row["set"])]
+
+
+def per_device(rows: Sequence[dict], key: str) -> list[dict]:
+    """A row for each device that has the figure: its mean, and the device as the cluster of an interval."""
+    devices = dict.fromkeys(row["room"] for row in rows)
+    means = {device: mean([row for row in rows if row["room"] == device], key) for device in devices}
+    return [{"clip": d, "speaker": d, "place": d, key: found["mean"]} for d, found in means.items() if found]
+
+
+def overview(name: str, title: str, rows: Sequence[dict], here: Sequence[System]) -> dict:
+    """A row a system: means over devices, the worst device, and paired differences from `crnn` without learning."""
+    devices = len({row["room"] for row in rows})
+    columns = ["system", ("SI-SDR, dB", 1), ("worst device", 1), ("words wrong, %", 0), ("robot alone, dB", 1),
+               ("worst device", 1), "false starts", f"noticed in {SOON_S} s", ("dB less crnn", 1), ("words less crnn", 0)]  # fmt: skip
+    cells = []
+    for one in here:
+        laid, alone = (of(rows, one.name, part) for part in ("laid", "alone"))
+        ratio, lowered = per_device(laid, "si_sdr"), per_device(alone, "erle_db")
+        base = of(rows, "crnn-uncalibrated", "laid") if one.name != "crnn-uncalibrated" else []
+        less = [difference(per_device(laid, key), per_device(base, key), key) for key in ("si_sdr", "capped")]
+        cells.append([one.title, mean(ratio, "si_sdr"), min((row["si_sdr"] for row in ratio), default=None),
+                      mean(per_device(laid, "capped"), "capped"), mean(lowered, "erle_db"),
+                      min((row["erle_db"] for row in lowered), default=None), starts(alone), soon(laid), *less])  # fmt: skip
+    return results.table(name, f"{title}: {devices}", columns, cells if devices else [])
+
+
+def starts(alone: Sequence[dict]) -> str | None:
+    """False starts, and in how many minutes."""
+    told = [row for row in alone if row.get("false_starts") is not None]
+    minutes = sum(row["duration"] for row in told) / 60
+    return f"{sum(row['false_starts'] for row in told)} in {minutes:.1f} min" if told else None
+
+
+def soon(laid: Sequence[dict]) -> str | None:
+    """How many of the humans are noticed within SOON_S of their first sound."""
+    told = [row for row in laid if "early" in row]
+    count = sum(row["delay_s"] is not None and row["delay_s"] <= SOON_S for row in told)
+    return f"{count} of {len(told)}" if told else None
+
+
+def marked(device: str, tuned_on: set[str]) -> str:
+    return f"{device[:8]} (tuned on)" if device in tuned_on else device[:8]
+
+
+def by_device(
+    key: str, title: str, rows: Sequence[dict], here: Sequence[System], digits: int, tuned_on: set[str]
+) -> dict:
+    """A row a device, the mean of its humans in each system's column; below, the mean of all devices and the worst."""
+    shown = [one for one in here if per_device(of(rows, one.name), key)]
+    found = {one.name: {row["clip"]: row[key] for row in per_device(of(rows, one.name), key)} for one in shown}
+    devices = dict.fromkeys(row["room"] for row in rows)
+    cells = [[marked(d, tuned_on), *(found[one.name].get(d) for one in shown)] for d in devices]
+    if cells and shown:
+        worse = max if key == "capped" else min
+        cells.append(["mean", *(float(np.mean(list(found[one.name].values()))) for one in shown)])
+        cells.append(["worst", *(worse(found[one.name].values()) for one in shown)])
+    return results.table(key, title, ["device", *((one.title, digits) for one in shown)], cells if shown else [])
+
+
+def against_peers(rows: Sequence[dict], here: Sequence[System], tuned_on: set[str]) -> dict:
+    """On each device `crnn` less the best peer there, paired by human."""
+    laid = [row for row in rows if row["set"] == "laid"]
+    peers = [one for one in here if one.kind == "peer"]
+    cells, ahead = [], 0
+    for device in dict.fromkeys(row["room"] for row in laid):
+        own = [row for row in laid if row["room"] == device]
+        means = {one: found["mean"] for one in peers if (found := mean(of(own, one.name), "si_sdr"))}
+        mine = of(own, "crnn-uncalibrated")
+        if not means or not mine:
+            continue
+        best = max(means, key=lambda one: means[one])
+        less = [difference(mine, of(own, best.name), key) for key in ("si_sdr", "capped")]
+        ahead += less[0] is not None and less[0]["mean"] < -AHEAD_DB
+        cells.append([marked(device, tuned_on), best.title, means[best], *less])
+    columns = ["device", "best peer", ("its SI-SDR, dB", 1), ("crnn less it, dB", 1), ("words less its, points", 0)]
+    text = f"The best peer is ahead of `crnn`, uncalibrated, by more than {AHEAD_DB:.0f} dB on {ahead} of {len(cells)} devices."
+    return results.table("peers", "Against the best peer of each device", columns, cells, text)
+
+
+def barge_in(rows: Sequence[dict], here: Sequence[System], tuned_on: set[str]) -> dict:
+    """A row for each device and system that tells who speaks."""
+    cells = []
+    for device in dict.fromkeys(row["room"] for row in rows):
+        for one in here:
+            own = of([row for row in rows if row["room"] == device], one.name)
+            laid, alone = of(own, one.name, "laid"), of(own, one.name, "alone")
+            if starts(alone) is None:
+                continue
+            told = [row for row in laid if "early" in row]
+            delays = [np.inf if row["delay_s"] is None else 1000 * row["delay_s"] for row in told]
+            median = float(np.quantile(delays, 0.5, method="higher")) if delays else np.inf
+            early = sum(row["early"] for row in told)
+            cells.append([marked(device, tuned_on), one.title, starts(alone), soon(laid),
+                          median if np.isfinite(median) else "never", early])  # fmt: skip
+    columns = ["device", "system", "false starts", f"noticed in {SOON_S} s", ("median, ms", 0), "already on"]
+    return results.table("barge-in", "Barge-in", columns, cells)
+
+
+def as_recorded(rows: Sequence[dict], here: Sequence[System]) -> dict:
+    """Pairs, and robots alone of one recording: AECMOS for echo and human; SI-SDR against the microphone for a human alone."""
+    pairs = [row for row in rows if row["set"] in ("pairs", "alone") and row.get("echo_mos") is not None]
+    here = [one for one in here if one.attainable]
+    cells = []
+    for clip in dict.fromkeys(row["clip"] for row in pairs):
+        own = {row["system"]: row for row in pairs if row["clip"] == clip}
+        texts = []
+        for one in here:
+            row = own.get(one.name, {})
+            figures = [results.cell(row.get("echo_mos"), 2), results.cell(row.get("human_mos"), 2)]
+            texts.append(
+                " / ".join(figures) + (f"; {results.cell(row['si_sdr_mic'], 1)} dB" if row.get("si_sdr_mic") else "")
+            )
+        device = next(row["room"] for row in pairs if row["clip"] == clip)
+        cells.append([device[:8] + clip.partition(device)[2], *texts])
+    title = "As recorded: AECMOS echo / human; where the human is alone, SI-SDR against the microphone"
+    return results.table("as-recorded", title, ["recording", *(one.title for one in here)], cells)

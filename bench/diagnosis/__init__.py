@@ -1,0 +1,44 @@
+r"""How often hidden effects are named, and whether what is named makes the running filter better on unseen seconds.
+
+    python -m bench diagnosis names --cases DIR ... --output bench/results/diagnosis
+    python -m bench diagnosis proof --cases DIR ... --real DIR ... --output bench/results/diagnosis
+    python -m bench diagnosis run-time --voices ROBOT/test --speech HUMAN/test --count 8 --seed 41 \
+        --output bench/results/diagnosis --page docs/effects_at_run_time.md
+
+names, proof: --cases are folders of cases as bench.simulate.hidden_cases and bench.simulate.wild write them; proof needs
+no labels, so that real recordings do as well. run-time simulates its own. What each part does stands at the head of its
+file in bench/diagnosis/. All parts write to the one file of --output.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from bench.diagnosis import names, proof, run_time
+from bench.simulate.effect_conversations import EFFECTS
+from edgefilter.errors import UsageError
+
+PARTS = {"names": names.run, "proof": proof.run, "run-time": run_time.run}
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument
+    add("part", choices=tuple(PARTS))
+    add("--cases", type=Path, nargs="+", default=[], metavar="DIR", help="names, proof: folders of cases")
+    add("--real", type=Path, nargs="+", default=[], metavar="DIR", help="proof: pairs NAME_lpb and NAME_mic")
+    add("--voices", type=Path, metavar="DIR", help="run-time: the robot's voices")
+    add("--speech", type=Path, metavar="DIR", help="run-time: the humans")
+    add("--count", type=int, default=8, help="run-time: conversations of each effect (default: %(default)s)")
+    add("--effects", default=",".join(EFFECTS), metavar="A,B,...", help="run-time: which of them (default: all)")
+    add("--engines", default=",".join(run_time.ENGINES), metavar="A,B,...", help="run-time (default: %(default)s)")
+    add("--page", type=Path, metavar="FILE", help="run-time: also write the page of the documentation")
+
+
+def run(options: argparse.Namespace) -> str:
+    """Run one part."""
+    if options.part == "run-time" and not (options.voices and options.speech):
+        raise UsageError("the part 'run-time' needs --voices and --speech, folders with a transcripts.tsv")
+    if options.part != "run-time" and not (options.cases or (options.part == "proof" and options.real)):
+        raise UsageError(f"the part '{options.part}' needs --cases, folders of bench.simulate.hidden_cases")
+    return PARTS[options.part](options)

@@ -1,0 +1,319 @@
+"""Milliseconds of a hop: each engine in the whole path, alone and beside a learner, against SpeexDSP and WebRTC AEC3.
+
+    python -m bench latency --output bench/results/latency            (12 minutes, on a machine left alone)
+    python -m bench latency --seconds 1 --rounds 1                    (a minute, coarse)
+
+Every measurement is a process of its own, held to CORES cores, with one thread. Contenders take turns, in reversed order
+every other round, so that a change of the machine's speed meets all of them. Paced: a hop begins when a device would
+deliver it, the processor idles in between. Beside a learner: another process learns from the same hops. The sound is the
+bundled conversation (simulated robot), over and over; the first WARM_UP_S are left out.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import time
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from bench import peers, results
+from bench.metrics import percentiles
+from bench.recordings import progress, read
+from bench.stale import DEMO
+from edgefilter import Profile, engines
+from edgefilter.engines.ladder import CANDIDATES
+from edgefilter.errors import EdgefilterError, UsageError
+from edgefilter.filter.budget import held_to
+from edgefilter.filter.learner import Learner
+from edgefilter.filter.stream import Stream
+from edgefilter.learning.background import BackgroundLearner
+from edgefilter.types import SAMPLE_RATE
+
+CORES = 2
+WARM_UP_S = 0.5
+YARDSTICK = "speexdsp"
+"""The contender whose paced hop the others are compared with; it has no gain from a second thread."""
+PEERS = (YARDSTICK, "speexdsp-suppressed", "aec3")
+LEARNING = "-learning"
+LEARNERS = ("linear", "crnn")
+"""Engines that are also timed beside a learner: the one that leaves it most of the processor, and the one that leaves it least."""
+SLOWEST = 5
+PERCENTILES = ("p50", "p95", "p99", "max")
+
+
+# ---------------------------------------------------------------- one contender, in a process of its own
+
+
+@dataclass
+class Contender:
+    """What is timed: a function of one hop of both channels, and the times of its stages."""
+
+    hop: int
+    step: Callable[[np.ndarray, np.ndarray], object]
+    dtype: type = np.float32
+    stages: dict[str, list[float]] = field(default_factory=lambda: defaultdict(list))
+
+
+def engine(name: str, learner: Learner | None = None) -> Contender:
+    """An engine in the whole path, started from the bundled profile."""
+    profile = Profile.load(DEMO / "profile.npz")
+    made = engines.create(name, profile)
+    stream = Stream(made, profile, learner=learner)
+    contender = Contender(made.stft.hop, stream.process)
+    front = stream.front
+    parts = [("alignment", front.aligner, "step"), ("analysis", front._analyser, "push"), ("engine", made, "step")]
+    if stage := front.linear_stage:
+        parts += [("canceller", stage.canceller, "step"), ("residual", stage.residual, "step")]
+    parts.append(("overlap-add", stream._synthesiser, "push"))
+    for stage_name, owner, method in parts:
+        if owner is not None:
+            setattr(owner, method, _timed(getattr(owner, method), contender.stages[stage_name]))
+    return contender
+
+
+def peer(name: str, stack: ExitStack) -> Contender:
+    """A public canceller at its own frame length, called as its own samples say."""
+    if name == "aec3":
+        return Contender(peers.AEC3_FRAME, peers.aec3_frames())
+    step = stack.enter_context(peers.speexdsp_frames(suppress=name == "speexdsp-suppressed"))
+    out = np.zeros(peers.FRAME, np.int16)
+    return Contender(peers.FRAME, lambda near, far: step(near, far, out), np.int16)
+
+
+def _timed(inner: Callable, times: list[float]) -> Callable:
+    def timed(*arguments: object) -> object:
+        start = time.perf_counter()
+        result = inner(*arguments)
+        times.append(1000 * (time.perf_counter() - start))
+        return result
+
+    return timed
+
+
+def sound(hop: int, dtype: type) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """The bundled conversation, hop by hop, over and over."""
+    scale = 32767 if dtype is np.int16 else 1
+    mic, ref = ((scale * read(DEMO / f"{name}.flac")).astype(dtype) for name in ("mic", "reference"))
+    while True:
+        for at in range(0, mic.size - hop + 1, hop):
+            yield np.ascontiguousarray(mic[at : at + hop]), np.ascontiguousarray(ref[at : at + hop])
+
+
+def measure(contender: Contender, seconds: float, paced: bool) -> list[float]:
+    """Milliseconds of each hop of so many seconds of audio, after the warm-up."""
+    hops = sound(contender.hop, contender.dtype)
+    period = contender.hop / SAMPLE_RATE if paced else 0.0
+    for _ in range(round(WARM_UP_S * SAMPLE_RATE / contender.hop)):
+        contender.step(*next(hops))
+    for times in contender.stages.values():
+        times.clear()
+    took: list[float] = []
+    began = time.perf_counter()
+    for number in range(round(seconds * SAMPLE_RATE / contender.hop)):
+        hop = next(hops)
+        time.sleep(max(0.0, began + number * period - time.perf_counter()))
+        start = time.perf_counter()
+        contender.step(*hop)
+        took.append(1000 * (time.perf_counter() - start))
+    return took
+
+
+def peak_memory_mb() -> float:
+    """Largest resident memory of this process so far, MB (Linux; getrusage would count the parent's at the fork)."""
+    lines = Path("/proc/self/status").read_text().splitlines()
+    return next(float(line.split()[1]) for line in lines if line.startswith("VmHWM")) / 1024
+
+
+def child(name: str, seconds: float, paced: bool) -> dict:
+    """What `run_hops` returns, measured in this process."""
+    base = name.removesuffix(LEARNING)
+    with ExitStack() as stack:
+        stack.enter_context(held_to(CORES))
+        learner = BackgroundLearner() if base != name else None
+        contender = peer(name, stack) if name in PEERS else engine(base, learner)
+        took = measure(contender, seconds, paced)
+        if learner:
+            learner.close()
+    found = {"hop": contender.hop, "took": took, "stages": dict(contender.stages), "peak_memory_mb": peak_memory_mb()}
+    return found | {"learned": learner.stats() if learner else None}
+
+
+def run_hops(name: str, seconds: float, paced: bool) -> dict:
+    """hop, took (ms of each hop), stages (the same of each stage), peak_memory_mb, learned (of the other process)."""
+    command = [sys.executable, "-m", "bench.latency", name, str(seconds), str(int(paced))]
+    environment = {**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
+    done = subprocess.run(command, capture_output=True, text=True, env=environment, cwd=results.ROOT)
+    if done.returncode:
+        raise UsageError(f"{name} could not be timed: {done.stderr.strip().splitlines()[-1]}")
+    return json.loads(done.stdout)
+
+
+# ---------------------------------------------------------------- all of them
+
+
+def contenders() -> tuple[list[str], dict[str, str]]:
+    """Whatever can run here, and why the rest cannot."""
+    usable, missing = ["bypass"], {}
+    for name in reversed(CANDIDATES):
+        try:
+            engines.create(name)
+            usable += [name, *([name + LEARNING] if name in LEARNERS else [])]
+        except EdgefilterError as error:
+            missing[name] = str(error)
+    return [*usable, *PEERS], missing
+
+
+def summary(runs: Sequence[Mapping]) -> dict:
+    """Several runs of one contender as one row: ms a hop, hops that took longer than they last, part of real time."""
+    hop, took = runs[0]["hop"], np.concatenate([run["took"] for run in runs])
+    period = 1000 * hop / SAMPLE_RATE
+    stages = {name: float(np.mean(np.concatenate([run["stages"][name] for run in runs]))) for name in runs[0]["stages"]}
+    return {
+        "hop_ms": period,
+        "hops": took.size,
+        **percentiles(took, 50, 95, 99, 100),
+        "mean": float(took.mean()),
+        "missed": int(np.sum(took > period)),
+        "real_time_factor": float(took.mean()) / period,
+        "stages": stages,
+        "slowest": sorted((row for run in runs for row in slowest(run)), key=lambda row: -row["ms"])[:SLOWEST],
+        "peak_memory_mb": max(run["peak_memory_mb"] for run in runs),
+        "learned": [run["learned"] for run in runs if run["learned"]],
+    }
+
+
+def slowest(run: Mapping) -> list[dict]:
+    """The slowest hops: second in the sound, ms, and the stage that took most of it."""
+    first = round(WARM_UP_S * SAMPLE_RATE / run["hop"])
+    stages = {name: times for name, times in run["stages"].items() if len(times) == len(run["took"])}
+    rows = []
+    for at in np.argsort(run["took"])[::-1][:SLOWEST]:
+        stage = max(stages, key=lambda name: stages[name][at]) if stages else ""
+        rows.append({"second": (first + int(at)) * run["hop"] / SAMPLE_RATE, "ms": run["took"][at], "stage": stage})
+    return rows
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--contenders", metavar="A,B,...", help="default: all that can run here")
+    parser.add_argument("--seconds", type=float, default=12.0, help="of audio in each round (default: %(default)s)")
+    parser.add_argument("--rounds", type=int, default=2, help="default: %(default)s")
+
+
+def run(options: argparse.Namespace) -> str:
+    """Measure all, paced and back to back, and write the tables."""
+    names, missing = contenders()
+    names = options.contenders.split(",") if options.contenders else names
+    load = os.getloadavg()[0]
+    made_with = results.stamp({"DEMO": [DEMO]}, [name for name in names if name not in PEERS])
+    turns = [(name, paced) for paced in (False, True) for name in names]
+    runs: dict[tuple[str, bool], list[dict]] = defaultdict(list)
+    for number in progress(range(options.rounds), "round"):
+        for name, paced in turns if number % 2 == 0 else turns[::-1]:
+            runs[name, paced].append(run_hops(name, options.seconds, paced))
+    rows = [{"contender": name, "paced": paced, **summary(runs[name, paced])} for name, paced in turns]
+    conditions = f"{options.rounds} rounds of {options.seconds:g} s each, {CORES} of {os.cpu_count()} cores, one thread"
+    notes = [
+        f"{conditions}, load average before {load:.2f}. Milliseconds a hop; missed: hops that took longer than they last."
+    ]
+    notes += [f"{name} is not in the table: {why}" for name, why in missing.items()]
+    plots = [results.plot("hops", [_panel(runs, names, paced) for paced in (True, False)])]
+    return results.write(
+        options.output,
+        "latency",
+        "Latency and cost per hop",
+        made_with,
+        tables(rows),
+        plots,
+        "\n\n".join(notes),
+        rows=rows,
+    )
+
+
+def tables(rows: Sequence[Mapping]) -> list[dict]:
+    """Times, ratios to the yardstick, what a hop is made of, the slowest hops, and what a learner takes."""
+    paced = {row["contender"]: row for row in rows if row["paced"]}
+    yardstick = paced.get(YARDSTICK)
+    cells = [
+        [
+            row["contender"],
+            "paced" if row["paced"] else "back to back",
+            row["hop_ms"],
+            *(row[key] for key in PERCENTILES),
+            row["missed"],
+            row["real_time_factor"],
+            *(row[key] / yardstick[key] if yardstick and row["paced"] else None for key in ("p50", "p99")),
+        ]
+        for row in rows
+    ]
+    columns = ["", "pace", ("hop, ms", 0), *((key, 3) for key in PERCENTILES), "missed", ("real-time factor", 4)]
+    columns += [(f"p50 over {YARDSTICK}'s", 2), ("p99", 2)]
+    stages = list(dict.fromkeys(name for row in paced.values() for name in row["stages"]))
+    parts = [
+        [name, *(row["stages"].get(s) for s in stages), row["mean"]] for name, row in paced.items() if row["stages"]
+    ]
+    slow = [
+        [name, ", ".join(f"{hop['second']:.2f} s {hop['ms']:.1f} {hop['stage']}".strip() for hop in row["slowest"])]
+        for name, row in paced.items()
+    ]
+    made = [
+        results.table("latency", "Milliseconds a hop", columns, cells),
+        results.table(
+            "stages", "What a paced hop is made of, mean ms", ["", *((s, 3) for s in stages), ("whole", 3)], parts
+        ),
+        results.table(
+            "slowest", "The slowest paced hops", ["", "second of the sound, ms, the stage that took most"], slow
+        ),
+    ]
+    if beside := [_learner(name, row, paced) for name, row in paced.items() if row["learned"]]:
+        columns = [
+            "",
+            ("p99 over that without", 2),
+            ("CPU, s a minute", 1),
+            ("memory, MB", 0),
+            ("fits a run", 1),
+            "fell behind",
+        ]
+        made.append(
+            results.table(
+                "learner", "A learner beside it, and what its process takes (its start included)", columns, beside
+            )
+        )
+    return made
+
+
+def _learner(name: str, row: Mapping, paced: Mapping[str, Mapping]) -> list:
+    """A row of the learner's table."""
+    alone, learned = paced.get(name.removesuffix(LEARNING)), row["learned"]
+    minutes = row["hops"] * row["hop_ms"] / 60_000
+    return [
+        name,
+        row["p99"] / alone["p99"] if alone else None,
+        sum(one["cpu_s"] for one in learned) / minutes,
+        max(one["memory_mb"] for one in learned),
+        float(np.mean([one["rounds"] for one in learned])),
+        sum(one["fell_behind"] for one in learned),
+    ]
+
+
+def _panel(runs: Mapping[tuple[str, bool], Sequence[Mapping]], names: Sequence[str], paced: bool) -> dict:
+    """How many hops are slower than so many ms."""
+    slower = np.array([100, 50, 20, 10, 5, 2, 1, 0.5, 0.2])
+    lines = {
+        name: (slower, np.percentile(np.concatenate([run["took"] for run in runs[name, paced]]), 100 - slower))
+        for name in names
+    }
+    title = "paced" if paced else "back to back"
+    return results.panel(title, "hops slower than this, %", "ms a hop", lines, xscale="log", yscale="log")
+
+
+if __name__ == "__main__":
+    print(json.dumps(child(sys.argv[1], float(sys.argv[2]), sys.argv[3] == "1")))

@@ -1,0 +1,66 @@
+r"""Robots that talk, move and are interrupted: on virtual devices in real time, and over minutes and hours of recordings.
+
+    python -m bench live trial --voices ROBOT/test --speech HUMAN/test --whisper WHISPER --output bench/results/live
+    python -m bench live soak --minutes 60                    faster than real time; --one-way: the clocks go on drifting
+    python -m bench live hour --minutes 60                    the same on virtual devices
+    python -m bench live click                                from a click to the filtered click
+    python -m bench live barge-in --voices ROBOT/test --speech HUMAN/test --count 24 --seed 17 \
+        --whisper WHISPER --alone ROBOT/test SYNTHESIZERS --minutes 60 --real RECORDINGS
+    python -m bench live day --voices ROBOT/test --speech HUMAN/test --minutes 60
+    python -m bench live rooms --voices ROBOT/test --count 16
+
+trial, hour and click need PulseAudio, whose private servers make no sound. What each part does stands at the head of its
+file in bench/live/. All parts write to the one file of --output.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from bench.live import barge_in, click, day, rooms, soak, trial
+from edgefilter.errors import UsageError
+
+PARTS = {
+    "trial": trial.run,
+    "soak": soak.run,
+    "hour": soak.run,
+    "click": click.run,
+    "barge-in": barge_in.run,
+    "day": day.run,
+    "rooms": rooms.run,
+}
+NEEDED = {
+    "trial": ("voices", "speech"),
+    "barge-in": ("voices", "speech"),
+    "day": ("voices", "speech"),
+    "rooms": ("voices",),
+}
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument
+    add("part", choices=tuple(PARTS))
+    add("--voices", type=Path, nargs="+", metavar="DIR", help="folders of the robot's sentences")
+    add("--speech", type=Path, metavar="DIR", help="folder of human speech")
+    add("--minutes", type=float, default=10.0, help="of the run, or of robot speech (default: %(default)s)")
+    add("--count", type=int, default=16, help="conversations, rooms or clicks (default: %(default)s)")
+    add("--engine", help="default: auto; of barge-in crnn, of day and rooms linear")
+    add("--one-way", action="store_true", help="soak: the reference's clock is fast all the time")
+    add(
+        "--alone",
+        type=Path,
+        nargs="*",
+        default=[],
+        metavar="DIR",
+        help="barge-in: voices of robots that nobody interrupts",
+    )
+    add("--real", type=Path, metavar="DIR", help="barge-in: recordings of a real loudspeaker alone")
+
+
+def run(options: argparse.Namespace) -> str:
+    """Run one part."""
+    for name in NEEDED.get(options.part, ()):
+        if getattr(options, name) is None:
+            raise UsageError(f"the part '{options.part}' needs --{name}, a folder with a transcripts.tsv")
+    return PARTS[options.part](options)

@@ -1,0 +1,222 @@
+"""The long run: memory, time per hop and samples must not drift.
+
+soak: so many minutes of audio faster than real time; hour: the same live on virtual devices, with the learner. The sound
+is the bundled conversation over and over. In a soak the reference has a clock that is PPM fast for TURN_S and as much
+slow for the next, so that the alignment has work to do for ever; --one-way: fast all the time, so that after some seven
+hours the lag is beyond all that are looked for. Memory and processor time per block are read once in each of SLICES, the
+learner's memory each second, of which the slice has the most; the first tenth of the run, 15 s at least, is warm-up.
+Exit code 1 where something drifted.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+import soundfile
+
+from bench import results
+from bench.live import virtual_sound
+from bench.live.virtual_sound import children_mb, memory_mb
+from bench.metrics import percentiles
+from bench.recordings import read
+from bench.stale import DEMO
+from edgefilter import EgoFilter
+from edgefilter.errors import UsageError
+from edgefilter.types import SAMPLE_RATE
+
+SLICES = 20
+PPM = 50.0
+TURN_S = 3600.0
+"""After so long the clock that was fast is slow: the buffers of a real machine let no lag grow for ever."""
+BLOCK = 320
+"""Samples a block, 20 ms: no multiple of any hop."""
+GROWTH_MB = 3.0
+"""Most growth of memory from the warm-up to the end; an array that grew by one frame a hop would add 115 MB an hour."""
+LEARNER_GROWTH_MB = 50.0
+"""The same of the learner, its most in the later half over its most in the earlier one. A round's arrays come and go, so
+that it swings by 150 MB; 37 minutes that rose to 420 MB by the 13th were 210 to 220 MB whenever the heap was trimmed."""
+SETTLING_S, LEARNING_S = 15.0, 60.0
+"""Least warm-up of the process itself, and of the learner, whose first fits are as long as what was recorded by then."""
+SLOWER = 1.3
+"""Most growth of a block's processor time over that of a bypassed block, second half over first. A shared machine
+changes its speed by more than that, and the bypass with it."""
+
+
+def run(options: argparse.Namespace) -> str:
+    """Run, write, and raise UsageError with what drifted."""
+    engine = options.engine or "auto"
+    made_with = results.stamp({"DEMO": [DEMO]}, [engine])
+    found = (
+        live(options.minutes, engine) if options.part == "hour" else from_file(options.minutes, engine, options.one_way)
+    )
+    found["load_average"] = os.getloadavg()[0]
+    troubles, slices = drifts(found), found["slices"]
+    minutes = found["samples_in"] / SAMPLE_RATE / 60
+    beyond = ", a lag that grows all the time" if options.one_way else ""
+    title = f"{minutes:.0f} minutes of `{found['engine']}`, {'live' if options.part == 'hour' else 'faster than real time'}{beyond}"
+    facts = [(key.replace("_", " "), value) for key, value in found.items() if isinstance(value, int | float | str)]
+    if "deadline" in found:
+        deadline = found["deadline"]
+        facts += [
+            ("hops late", f"{deadline['missed_deadlines']} of {deadline['hops']}"),
+            ("steps between engines", deadline["steps"]),
+        ]
+        facts += [("ms a hop, p50 / p99", f"{deadline['compute']['p50_ms']:.1f} / {deadline['compute']['p99_ms']:.1f}")]
+    keys = [key for key in slices[0] if key != "seconds"]
+    columns = [("minute", 1), *((key.replace("_", " "), 3 if key.endswith("_ms") else 1) for key in keys)]
+    rows = [[one["seconds"] / 60, *(one[key] for key in keys)] for one in slices]
+    curves = [
+        results.panel(
+            key.replace("_", " "), "minutes", "", {key: ([row[0] for row in rows], [one[key] for one in slices])}, "o-"
+        )
+        for key in keys
+    ]
+    page = results.write(
+        options.output,
+        options.part + ("_one_way" if options.one_way else ""),
+        title,
+        made_with,
+        [results.table(options.part, f"Verdict: {'; '.join(troubles) or 'nothing drifted'}", ["", ""], facts),
+         results.table(f"{options.part}-slices", "By time", columns, rows)],
+        [results.plot(options.part, curves)],
+        **found,
+    )  # fmt: skip
+    if troubles:
+        raise UsageError("; ".join(troubles))
+    return page
+
+
+def ahead(at: np.ndarray, one_way: bool) -> np.ndarray:
+    """Samples that the reference's clock has gained at these samples."""
+    turn = round(TURN_S * SAMPLE_RATE)
+    return PPM * 1e-6 * (at if one_way else turn - np.abs(at % (2 * turn) - turn))
+
+
+def blocks(total: int, one_way: bool = False) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Total samples of the conversation in a loop, the reference on its own clock."""
+    mic, ref = (read(DEMO / f"{name}.flac") for name in ("mic", "reference"))
+    for start in range(0, total, BLOCK):
+        at = np.arange(start, min(start + BLOCK, total))
+        place = at + ahead(at, one_way)
+        whole = place.astype(np.int64)
+        part = (place - whole).astype(np.float32)
+        yield mic[at % mic.size], (1 - part) * ref[whole % ref.size] + part * ref[(whole + 1) % ref.size]
+
+
+def from_file(minutes: float, engine: str, one_way: bool = False) -> dict:
+    """So many minutes of audio through the whole path as fast as it goes."""
+    ego, yardstick = EgoFilter(DEMO / "profile.npz", engine), EgoFilter(engine="bypass")
+    total, done, out, not_finite = round(60 * minutes * SAMPLE_RATE), 0, 0, 0
+    took, bypassed, slices = [], [], []
+    for number, (mic, ref) in enumerate(blocks(total, one_way)):
+        start = time.thread_time()
+        finished = ego.process(mic, ref)
+        took.append(1000 * (time.thread_time() - start))
+        if number % 10 == 0:
+            start = time.thread_time()
+            yardstick.process(mic, ref)
+            bypassed.append(1000 * (time.thread_time() - start))
+        ego.events()
+        out, done = out + finished.size, done + mic.size
+        not_finite += finished.size - int(np.count_nonzero(np.isfinite(finished)))
+        if done * SLICES // total > len(slices):
+            times = percentiles(took, 50, 99)
+            slices.append({"seconds": done / SAMPLE_RATE, "memory_mb": memory_mb(), "p50_ms": times["p50"],
+                           "p99_ms": times["p99"], "bypass_ms": float(np.median(bypassed))})  # fmt: skip
+            took.clear()
+            bypassed.clear()
+    out += ego.flush().size
+    diverged = (ego.stats()["linear_stage"] or {}).get("diverged", 0)
+    counts = {"samples_in": done, "samples_out": out, "lost": 0, "not_finite": not_finite, "diverged": diverged}
+    return {"engine": ego.engine_name, **counts, "slices": slices}
+
+
+def live(minutes: float, engine: str) -> dict:
+    """So many minutes of `edgefilter run` between virtual devices, which players feed with the conversation."""
+    seconds = 60 * minutes
+    with virtual_sound.server() as server, tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        players = [_play(server, sink, DEMO / f"{sound}.flac", seconds, folder)
+                   for sink, sound in (("robot", "reference"), ("robot_mic", "mic"))]  # fmt: skip
+        command = [sys.executable, "-m", "edgefilter.cli", "run", "--input", "mic", "--engine", engine, "--quiet"]
+        command += ["--profile", DEMO / "profile.npz", "--output", folder / "out.wav", "--json", folder / "stats.json"]
+        command += ["--seconds", seconds]
+        process = subprocess.Popen(list(map(str, command)), env=server.environment, stderr=subprocess.PIPE, text=True)
+        began, slices, most = time.monotonic(), [], 0.0
+        while process.poll() is None:
+            time.sleep(min(1.0, seconds / SLICES / 2))
+            elapsed, most = time.monotonic() - began, max(most, children_mb(process.pid))
+            if elapsed * SLICES / seconds > len(slices) + 1 and process.poll() is None:
+                slices.append({"seconds": elapsed, "memory_mb": memory_mb(process.pid), "learner_mb": most})
+                most = 0.0
+        for player in players:
+            player.kill()
+            player.wait()
+        if process.returncode:
+            raise UsageError(f"edgefilter run failed: {process.stderr.read()}")
+        stats = json.loads((folder / "stats.json").read_text())
+    found = {key: stats[key] for key in ("engine", "samples_in", "samples_out", "source", "deadline")}
+    return {**found, "lost": stats["samples_lost"], "slices": slices}
+
+
+def _play(server: virtual_sound.Server, sink: str, sound: Path, seconds: float, folder: Path) -> subprocess.Popen:
+    samples, path = soundfile.read(sound, dtype="int16")[0], folder / f"{sink}.wav"
+    with soundfile.SoundFile(path, "w", SAMPLE_RATE, 1, "PCM_16") as file:
+        for _ in range(int((seconds + 30) * SAMPLE_RATE / samples.size) + 1):
+            file.write(samples)
+    return subprocess.Popen(["paplay", "-d", sink, str(path)], env=server.environment)
+
+
+def drifts(found: dict) -> list[str]:
+    """What drifted, in words; empty where nothing did. Growth is noted in what was found."""
+    troubles = []
+    if found["samples_in"] != found["samples_out"]:
+        troubles.append(f"{found['samples_in']} samples in, {found['samples_out']} out")
+    for key, what in (("lost", "samples lost"), ("not_finite", "samples are no numbers"), ("diverged", "divergences")):
+        if found.get(key):
+            troubles.append(f"{found[key]} {what}")
+    settled = _settled(found["slices"], SETTLING_S)
+    found["memory_growth_mb"] = settled[-1]["memory_mb"] - settled[0]["memory_mb"]
+    if found["memory_growth_mb"] > GROWTH_MB:
+        troubles.append(f"memory grew by {found['memory_growth_mb']:.1f} MB")
+    if "learner_mb" in settled[0] and (learning := _settled(found["slices"], LEARNING_S))[1:]:
+        first, second = (max(one["learner_mb"] for one in half) for half in _halves(learning))
+        found["learner_growth_mb"] = second - first
+        if second - first > LEARNER_GROWTH_MB:
+            troubles.append(f"the learner's memory grew by {second - first:.1f} MB")
+    if "bypass_ms" in settled[0]:
+        first, second = (_over_bypass(half) for half in _halves(settled))
+        found["slower"] = second / first
+        if second > SLOWER * first:
+            troubles.append(
+                f"a block took {first:.1f} times as long as a bypassed one, in the second half {second:.1f} times"
+            )
+    return troubles
+
+
+def _settled(slices: Sequence[Mapping], least_s: float) -> Sequence[Mapping]:
+    """The slices behind the warm-up."""
+    after = max(0.1 * slices[-1]["seconds"], least_s)
+    return [one for one in slices if one["seconds"] >= after]
+
+
+def _halves(slices: Sequence[Mapping]) -> tuple[Sequence[Mapping], Sequence[Mapping]]:
+    return slices[: len(slices) // 2], slices[len(slices) // 2 :]
+
+
+def _over_bypass(slices: Sequence[Mapping]) -> float:
+    """A block's time over a bypassed one's.
+
+    The mean, since a slice in which the robot is mostly silent costs two thirds of another; of the bypassed block,
+    which costs the same whatever is heard, the median.
+    """
+    return float(np.mean([one["p50_ms"] for one in slices]) / np.median([one["bypass_ms"] for one in slices]))

@@ -1,0 +1,301 @@
+"""What is measured of an output, and what is said of many: means with intervals, paired differences, barge-in."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from bench.cache import Cache
+from bench.recogniser import Recogniser, word_errors
+from edgefilter.dsp.metrics import erle, si_sdr
+from edgefilter.filter.barge_in import BargeIn, BargeInSettings
+from edgefilter.types import SAMPLE_RATE, Event, Samples
+
+if TYPE_CHECKING:
+    from bench.recordings import Clip
+    from bench.systems import Output
+
+FRAME = SAMPLE_RATE // 50
+"""20 ms: of levels over time."""
+FLOOR = 1e-10
+"""-100 dB of full scale, added to powers: below it no difference can be noticed, and digital silence has no ratio."""
+ALONE_S = 5.0
+"""Robot alone just before the human, over which it is measured how far the robot is lowered: while both talk nobody can
+tell what of a nonlinear filter's output is echo."""
+MOS_S = 20.0
+"""AECMOS gets at most so much, up to the human's end: it was trained on clips of about 10 s."""
+TALK_TYPES = {"doubletalk": "dt", "farend": "st", "nearend": "nst"}
+"""AECMOS's names for who talks."""
+
+
+# ---------------------------------------------------------------- one output
+
+
+@dataclass(frozen=True)
+class Judges:
+    """What costs seconds, kept under the sound that is judged: the recogniser's words, AECMOS, ESTOI."""
+
+    cache: Cache
+    recogniser: Recogniser | None = None
+
+    def words(self, text: str, out: Samples) -> dict | None:
+        """errors, words, deletions, insertions, capped (%) and the transcript; None without a recogniser."""
+        if self.recogniser is None:
+            return None
+        said = self.recogniser.transcribe(out)
+        found = word_errors(text, said)
+        counts = {key: getattr(found, key) for key in ("errors", "words", "deletions", "insertions")}
+        return counts | {"wer": 100 * found.rate, "capped": 100 * found.capped, "transcript": said}
+
+    def mos(self, mic: Samples, ref: Samples, out: Samples, talk: str) -> dict[str, float]:
+        """echo_mos and human_mos, 1 to 5 (Purin et al. 2022, "AECMOS"); empty where speechmos is not installed."""
+        judge = _aecmos()
+        if judge is None:
+            return {}
+        signals = {name: np.clip(x, -1, 1) for name, x in (("lpb", ref), ("mic", mic), ("enh", out))}
+
+        def made() -> dict[str, float]:
+            said = judge(signals, TALK_TYPES[talk])
+            return {"echo_mos": float(said["echo_mos"]), "human_mos": float(said["deg_mos"])}
+
+        return self.cache.get(made, "aecmos", talk, *signals.values())
+
+    def estoi(self, human: Samples, out: Samples) -> float | None:
+        """Extended short-time objective intelligibility (Jensen & Taal 2016); None where pystoi is not installed."""
+        try:
+            from pystoi import stoi
+        except ImportError:
+            return None
+
+        def made() -> float:
+            before = np.random.get_state()
+            np.random.seed(0)  # it adds a noise of its own, from the global generator
+            try:
+                return float(stoi(human.astype(np.float64), out.astype(np.float64), SAMPLE_RATE, extended=True))
+            finally:
+                np.random.set_state(before)
+
+        return self.cache.get(made, "estoi", human, out)
+
+
+@lru_cache(maxsize=1)
+def _aecmos() -> Callable | None:
+    try:
+        from speechmos.aecmos import AECMOS
+    except ImportError:
+        return None
+    return AECMOS("aecmos_16kHz")
+
+
+def score(clip: Clip, output: Output, judges: Judges) -> dict:
+    """All figures of one system on one clip; "problem" in place of what an unusable output makes impossible.
+
+    si_sdr, estoi and the words are over the span in which the human speaks; erle_db over the ALONE_S before it, or over
+    the whole of a recording in which nobody speaks; excess_db is the most by which a second is louder than the
+    microphone; delay_s and early, or false_starts, for systems that tell events.
+    """
+    out, mic, ref = output.samples, clip.mic, clip.ref
+    row: dict = {"duration": mic.size / SAMPLE_RATE}
+    if out.size != mic.size:
+        return row | {"problem": f"{out.size} samples for {mic.size}"}
+    if not np.isfinite(out).all():
+        return row | {"problem": "samples that are not finite"}
+    row["excess_db"] = excess_db(out, mic)
+    if clip.human is None:
+        row |= judges.mos(mic[-round(MOS_S * SAMPLE_RATE) :], ref[-round(MOS_S * SAMPLE_RATE) :],
+                          out[-round(MOS_S * SAMPLE_RATE) :], clip.talk)  # fmt: skip
+        if clip.talk == "farend":
+            row["erle_db"] = lowered_db(mic, out)
+            row |= {} if output.events is None else {"false_starts": starts(output.events)}
+        if clip.talk == "nearend":
+            row["si_sdr_mic"] = si_sdr(out, mic)
+        return row
+    span, before = clip.span, slice(max(clip.span.start - round(ALONE_S * SAMPLE_RATE), 0), clip.span.start)
+    listened = slice(max(span.stop - round(MOS_S * SAMPLE_RATE), 0), span.stop)
+    if not out[span].any():
+        return row | {"problem": "silence where the human speaks"}
+    row |= judges.mos(mic[listened], ref[listened], out[listened], clip.talk)
+    row["erle_db"] = lowered_db(mic[before], out[before]) if before.start < before.stop else None
+    human = clip.human[span]
+    if not np.array_equal(out[span], human):  # the human alone has no distance from itself
+        row |= {"si_sdr": si_sdr(out[span], human), "estoi": judges.estoi(human, out[span])}
+    if clip.text:
+        row |= judges.words(clip.text, out[span]) or {}
+    return row if output.events is None else row | noticed(output.events, first_sound(clip.human))
+
+
+def lowered_db(mic: Samples, out: Samples) -> float | None:
+    """ERLE, dB; None where one of both is silent."""
+    return erle(mic, out) if mic.any() and out.any() else None
+
+
+def frame_power(x: Samples, frame: int = FRAME) -> np.ndarray:
+    """Mean square of each whole frame of x (n,), (n // frame,) float64."""
+    return np.mean(x[: x.size // frame * frame].reshape(-1, frame).astype(np.float64) ** 2, axis=1)
+
+
+def excess_db(out: Samples, mic: Samples) -> float:
+    """The most by which out is louder than mic, both (n,), over any second at steps of 0.1 s, dB."""
+
+    def windows(x: Samples) -> np.ndarray:
+        window, step = min(SAMPLE_RATE, x.size), SAMPLE_RATE // 10
+        sums = np.cumsum(np.append(0.0, x.astype(np.float64) ** 2))
+        at = np.arange(0, x.size - window + 1, step)
+        return (sums[at + window] - sums[at]) / window
+
+    return float(np.max(10 * np.log10((windows(out) + FLOOR) / (windows(mic) + FLOOR))))
+
+
+# ---------------------------------------------------------------- barge-in
+
+IN_TIME_S = 0.3
+"""Somebody who interrupts is to be noticed by then."""
+FIRST_DB = 25.0
+"""A human's first sound is the first frame within so much of the loudest."""
+THRESHOLDS = (0.5, 0.7, 0.8, 0.9, 0.94, 0.96, 0.97, 0.98, 0.985, 0.99, 0.995)
+"""Of the probability, from which speech counts as begun: the points of the curve."""
+
+
+def first_sound(human: Samples) -> int:
+    """First sample of the first 20 ms within FIRST_DB of the human's loudest."""
+    power = frame_power(human)
+    return int(np.flatnonzero(power > 10 ** (-FIRST_DB / 10) * power.max())[0]) * FRAME
+
+
+def noticed(events: Sequence[Event], onset: int) -> dict:
+    """delay_s from the onset to the first speech_started after it, None if there is none.
+
+    early: speech was on already, so nothing is noticed.
+    """
+    talk = [event for event in events if event.kind.startswith("speech")]
+    before = [event.kind for event in talk if event.sample < onset]
+    after = [event.sample for event in talk if event.sample >= onset and event.kind == "speech_started"]
+    early = bool(before) and before[-1] == "speech_started"
+    return {"delay_s": None if early or not after else (after[0] - onset) / SAMPLE_RATE, "early": early}
+
+
+def in_time(found: Mapping) -> bool:
+    """Whether what `noticed` found is soon enough."""
+    return found["delay_s"] is not None and found["delay_s"] <= IN_TIME_S
+
+
+def starts(events: Sequence[Event]) -> int:
+    return sum(event.kind == "speech_started" for event in events)
+
+
+def replay(probability: Sequence[float | None], hop: int, threshold: float) -> list[Event]:
+    """The events that the package would give at another threshold, one value a hop of so many samples."""
+    usual = BargeInSettings()
+    rule = BargeIn(hop / SAMPLE_RATE, replace(usual, threshold=threshold, release=min(usual.release, threshold)))
+    found = ((index * hop, rule.note(value)) for index, value in enumerate(probability, start=1))
+    return [Event(kind, sample, "replayed") for sample, kind in found if kind]
+
+
+# ---------------------------------------------------------------- many outputs
+
+RESAMPLES = 2000
+
+
+def values(rows: Iterable[Mapping], key: str) -> tuple[list[Mapping], np.ndarray]:
+    """The rows that have this figure, and the figures."""
+    kept = [row for row in rows if row.get(key) is not None]
+    return kept, np.array([row[key] for row in kept], np.float64)
+
+
+def mean(rows: Iterable[Mapping], key: str) -> dict | None:
+    """mean, low, high (95 %), median, std and count of a figure; None where no row has it.
+
+    The interval is drawn over speakers and places (keys of a row, where it has them), not over recordings.
+    """
+    kept, found = values(rows, key)
+    if not kept:
+        return None
+    low, high = _bounds(kept, found)
+    spread = float(np.std(found, ddof=1)) if found.size > 1 else None
+    middle = {"mean": float(found.mean()), "low": low, "high": high, "median": float(np.median(found))}
+    return middle | {"std": spread, "count": found.size}
+
+
+def pooled(rows: Iterable[Mapping], above: str, below: str) -> dict | None:
+    """Sum of one figure over the sum of another, %, with its interval."""
+    kept, top = values(rows, above)
+    if not kept:
+        return None
+    bottom = np.array([row[below] for row in kept], np.float64)
+    low, high = _bounds(kept, 100 * top, bottom)
+    return {"mean": float(100 * top.sum() / bottom.sum()), "low": low, "high": high, "count": int(bottom.sum())}
+
+
+def difference(rows: Iterable[Mapping], others: Iterable[Mapping], key: str, same: str = "clip") -> dict | None:
+    """By how much a figure is above that of other rows on the same clips, with its paired interval."""
+    (kept, mine), (theirs, known) = values(rows, key), values(others, key)
+    of = {row[same]: value for row, value in zip(theirs, known, strict=True)}
+    both = [(row, value - of[row[same]]) for row, value in zip(kept, mine, strict=True) if row[same] in of]
+    return mean([{**row, key: value} for row, value in both], key)
+
+
+def _bounds(
+    rows: Sequence[Mapping], above: np.ndarray, below: np.ndarray | None = None
+) -> tuple[float | None, float | None]:
+    """Of one row nobody can say."""
+    if len(rows) < 2:
+        return None, None
+    clusters = tuple(tuple(row.get(key, index) for index, row in enumerate(rows)) for key in ("speaker", "place"))
+    return ratio_interval(cluster_weights(*clusters), above, below)
+
+
+@lru_cache(maxsize=64)
+def cluster_weights(*factors: tuple[Hashable, ...]) -> np.ndarray:
+    """How often each of n recordings is drawn, (RESAMPLES, n), where speakers, rooms and the like are drawn and not they.
+
+    factors: for each recording the cluster that it belongs to. Each factor's clusters are drawn with replacement, on
+    their own; a recording counts as often as the product says (the pigeonhole bootstrap, Owen 2007, a little too wide
+    rather than too narrow). A factor of one cluster says nothing and stays as it is. With a fixed seed.
+    """
+    rng = np.random.default_rng(0)
+    weights = np.ones((RESAMPLES, len(factors[0])))
+    for factor in dict.fromkeys(factors):  # recordings that are clusters of their own in both ways are drawn once
+        names = {name: index for index, name in enumerate(dict.fromkeys(factor))}
+        drawn = rng.multinomial(len(names), np.full(len(names), 1 / len(names)), size=RESAMPLES)
+        weights *= drawn[:, [names[name] for name in factor]]
+    return weights
+
+
+def ratio_interval(
+    weights: np.ndarray, above: Sequence[float], below: Sequence[float] | None = None
+) -> tuple[float, float]:
+    """95 % percentile interval of sum(above) / sum(below), (n,) each, over draws of `cluster_weights`; a mean without below."""
+    below_array = np.ones(len(above)) if below is None else np.asarray(below, np.float64)
+    sums = weights @ below_array
+    ratios = (weights @ np.asarray(above, np.float64))[sums > 0] / sums[sums > 0]
+    low, high = np.percentile(ratios, [2.5, 97.5])
+    return float(low), float(high)
+
+
+def wilson(hits: int, n: int) -> tuple[float, float]:
+    """95 % interval of a proportion (Wilson 1927), as numbers from 0 to 1.
+
+    >>> [round(bound, 3) for bound in wilson(0, 100)]
+    [0.0, 0.037]
+    """
+    if n == 0:
+        return 0.0, 1.0
+    z, p = 1.959964, hits / n
+    centre, half = p + z * z / (2 * n), z * math.sqrt(p * (1 - p) / n + z * z / (4 * n * n))
+    return max(0.0, (centre - half) / (1 + z * z / n)), min(1.0, (centre + half) / (1 + z * z / n))
+
+
+def percentiles(samples: Sequence[float], *percents: float) -> dict[str, float]:
+    """p50, p95, ... of the samples; 100 is called max.
+
+    >>> percentiles([1.0, 2.0, 3.0], 50, 100)
+    {'p50': 2.0, 'max': 3.0}
+    """
+    found = np.percentile(samples, percents)
+    names = ("max" if percent == 100 else f"p{percent:g}" for percent in percents)
+    return dict(zip(names, map(float, found), strict=True))

@@ -1,0 +1,247 @@
+"""Do the tests notice a change in the code? Mutants by cosmic-ray, a sample of them, and the tests beside each module.
+
+    OMP_NUM_THREADS=1 python -m bench mutate --count 200 --output bench/results/mutate      (hours; --jobs 2)
+
+A mutant is a module of edgefilter/FOLDER with one operator, number, condition, decorator or the like replaced. Places are
+drawn at random, each as often as any other, then one of cosmic-ray's replacements there; annotations, which do nothing
+while a program runs, are left out. A mutant is killed where a test of tests/FOLDER fails, or takes longer than three
+times what all of them take; files of tests that name the module come first, slow tests last. Everything happens in
+copies of the checkout. The same seed draws the same mutants as long as the code is the same: `--again` tries those alone
+that survived in OUTPUT.json, after tests were added. Needs cosmic-ray: pip install cosmic-ray.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import importlib
+import os
+import queue
+import random
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from bench import results
+from bench.metrics import wilson
+from bench.recordings import progress
+from edgefilter.errors import UsageError
+
+FOLDERS = ("alignment", "filter", "engines", "learning", "diagnosis", "integrations")
+LEFT_OUT = ("results", "__pycache__", "*.egg-info", ".*")
+PATIENCE, LEAST_S = 3.0, 60.0
+"""A mutant is killed by the clock after so many times what the tests take without one, but not before LEAST_S."""
+PASSED, FAILED, NONE_CHOSEN = 0, 1, 5
+"""Exit codes of pytest."""
+
+
+@dataclass(frozen=True)
+class Mutant:
+    """A replacement in a module: which of an operator's occurrences, and the line before and after it."""
+
+    folder: str
+    module: str
+    operator: str
+    occurrence: int
+    line: int
+    before: str
+    after: str
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--modules", default=",".join(FOLDERS), metavar="A,B,...", help="folders (default: %(default)s)"
+    )
+    parser.add_argument("--count", type=int, default=200, help="mutants (default: %(default)s)")
+    parser.add_argument("--again", action="store_true", help="only those that survived in OUTPUT.json")
+
+
+def run(options: argparse.Namespace) -> str:
+    """Draw mutants, run the tests on each, and count."""
+    folders = options.modules.split(",")
+    for folder in folders:
+        for place in (results.ROOT / "edgefilter" / folder, results.ROOT / "tests" / folder):
+            if not place.is_dir():
+                raise UsageError(f"there is no {place}, expected folders of edgefilter/ that tests/ has as well")
+    made_with = results.stamp()
+    drawn = sample(folders, options.count, options.seed)
+    outcomes = _survived(options.output, drawn) if options.again else {}
+    missing = [mutant for mutant in drawn if outcomes.get(mutant, "survived") == "survived"]
+    with copies(options.jobs) as free, ThreadPoolExecutor(options.jobs) as pool:
+        limits = dict(zip(folders, pool.map(lambda folder: baseline_s(free, folder), folders), strict=True))
+        tried = pool.map(lambda mutant: attempt(free, mutant, limits[mutant.folder]), missing)
+        outcomes |= dict(zip(missing, progress_of(tried, len(missing)), strict=True))
+    rows = [{**asdict(mutant), "outcome": outcomes[mutant]} for mutant in drawn]
+    survivors = [row for row in rows if row["outcome"] == "survived"]
+    tables = [
+        results.table("mutation", "By folder", ["folder", "mutants", "killed", "survived", "survived, % [95 %]"],
+                      [_counts(name, rows) for name in (*folders, "all")]),
+        results.table("survivors", "What no test noticed", ["where", "before", "after"],
+                      [[f"{row['module']}:{row['line']}", f"`{row['before']}`", f"`{row['after']}`"] for row in survivors]),
+    ]  # fmt: skip
+    return results.write(options.output, "mutate", "Mutations of the code", made_with, tables, mutants=rows)
+
+
+def _counts(name: str, rows: Sequence[Mapping]) -> list:
+    own = [row for row in rows if name in ("all", row["folder"])]
+    survived = sum(row["outcome"] == "survived" for row in own)
+    low, high = wilson(survived, len(own))
+    share = {"mean": 100 * survived / max(len(own), 1), "low": 100 * low, "high": 100 * high}
+    return [name, len(own), len(own) - survived, survived, {key: round(value) for key, value in share.items()}]
+
+
+def _survived(output: Path | None, drawn: Sequence[Mutant]) -> dict[Mutant, str]:
+    """Outcomes of an earlier run over the same mutants."""
+    path = output and output.with_name(f"{output.name}.json")
+    part = results.read(path)["parts"].get("mutate") if path and path.exists() else None
+    known = {Mutant(**row): outcome for row in part["mutants"] if (outcome := row.pop("outcome"))} if part else {}
+    if list(known) != list(drawn):
+        raise UsageError(
+            f"{path} is not of these {len(drawn)} mutants: run without --again, or with its --count and --seed"
+        )
+    return known
+
+
+# ---------------------------------------------------------------- mutants
+
+
+def sample(folders: Sequence[str], count: int, seed: int) -> list[Mutant]:
+    """So many different places of the folders' modules, each with a replacement drawn at random."""
+    cosmic = _cosmic_ray()
+    found: dict[tuple, list[tuple[str, int]]] = {}
+    for folder in folders:
+        for path in sorted((results.ROOT / "edgefilter" / folder).rglob("*.py")):
+            for place, replacements in places(cosmic, path.read_text(encoding="utf-8")).items():
+                found[(folder, path, *place)] = replacements
+    rng = random.Random(seed)
+    mutants = []
+    for folder, path, line, column in rng.sample(list(found), min(count, len(found))):
+        operator, occurrence = rng.choice(found[folder, path, line, column])
+        source = path.read_text(encoding="utf-8")
+        lines, changed = source.splitlines(), mutated(source, operator, occurrence).splitlines()
+        after = next((b for a, b in zip(lines, changed) if a != b), "")
+        module = path.relative_to(results.ROOT).as_posix()
+        mutants.append(Mutant(folder, module, operator, occurrence, line, lines[line - 1].strip(), after.strip()))
+    return mutants
+
+
+def places(cosmic: object, source: str) -> dict[tuple[int, int], list[tuple[str, int]]]:
+    """Every (line, column) of the source that can be mutated, with the operators and occurrences there."""
+    nodes, skipped = list(cosmic.ast.ast_nodes(cosmic.ast.get_ast(source))), list(annotations(source))
+    found: dict[tuple[int, int], list[tuple[str, int]]] = {}
+    for name in cosmic.plugins.operator_names():
+        operator = cosmic.plugins.get_operator(name)
+        if operator.arguments():  # those that replace one named variable
+            continue
+        positions = (start for node in nodes for start, _ in operator().mutation_positions(node))
+        for occurrence, at in enumerate(positions):
+            if not any(first <= at < last for first, last in skipped):
+                found.setdefault(at, []).append((name, occurrence))
+    return dict(sorted(found.items()))
+
+
+def annotations(source: str) -> Iterator[tuple[tuple[int, int], tuple[int, int]]]:
+    """Where annotations begin and end."""
+    for node in ast.walk(ast.parse(source)):
+        for part in (getattr(node, "annotation", None), getattr(node, "returns", None)):
+            if part is not None:
+                yield (part.lineno, part.col_offset), (part.end_lineno, part.end_col_offset)
+
+
+def mutated(source: str, operator: str, occurrence: int) -> str:
+    cosmic = _cosmic_ray()
+    return cosmic.mutating.mutate_code(source, cosmic.plugins.get_operator(operator)(), occurrence)
+
+
+def _cosmic_ray() -> object:
+    try:
+        # parso first: cosmic-ray's plugins otherwise find it half imported
+        for name in ("parso.python.tree", "cosmic_ray.ast", "cosmic_ray.mutating", "cosmic_ray.plugins"):
+            importlib.import_module(name)
+    except ImportError as error:
+        raise UsageError(f"mutants need cosmic-ray ({error}): pip install cosmic-ray") from None
+    return importlib.import_module("cosmic_ray")
+
+
+# ---------------------------------------------------------------- tests
+
+
+@contextmanager
+def copies(count: int) -> Iterator[queue.Queue[Path]]:
+    """Copies of the checkout, to be taken and given back."""
+    free: queue.Queue[Path] = queue.Queue()
+    with tempfile.TemporaryDirectory() as folder:
+        for number in range(count):
+            copy = Path(folder) / str(number)
+            shutil.copytree(results.ROOT, copy, ignore=shutil.ignore_patterns(*LEFT_OUT), symlinks=True)
+            free.put(copy)
+        yield free
+
+
+def baseline_s(free: queue.Queue[Path], folder: str) -> float:
+    """Seconds that the folder's tests may take. Raises UsageError where they fail without any mutant."""
+    copy = free.get()
+    began = time.monotonic()
+    try:
+        code = tests(copy, folder, "", None)
+    finally:
+        free.put(copy)
+    if code != PASSED:
+        raise UsageError(f"tests/{folder} fails without a mutant: mend that first")
+    return max(LEAST_S, PATIENCE * (time.monotonic() - began))
+
+
+def attempt(free: queue.Queue[Path], mutant: Mutant, limit_s: float) -> str:
+    """killed, timeout or survived."""
+    copy = free.get()
+    path = copy / mutant.module
+    source = path.read_text(encoding="utf-8")
+    try:
+        path.write_text(mutated(source, mutant.operator, mutant.occurrence), encoding="utf-8")
+        code = tests(copy, mutant.folder, path.stem, limit_s)
+    except subprocess.TimeoutExpired:
+        return "timeout"
+    finally:
+        path.write_text(source, encoding="utf-8")
+        free.put(copy)
+    return "survived" if code == PASSED else "killed"
+
+
+def tests(copy: Path, folder: str, module: str, limit_s: float | None) -> int:
+    """The exit code of the first tests of tests/FOLDER that fail, or of all: those that name the module first, slow ones last."""
+    files = sorted((copy / "tests" / folder).rglob("test_*.py"))
+    files.sort(key=lambda path: not module or module not in path.stem + path.read_text(encoding="utf-8"))
+    began, code = time.monotonic(), PASSED
+    environment = os.environ | {"PYTHONPATH": str(copy), "PYTHONDONTWRITEBYTECODE": "1"}
+    for which in ("not slow", "slow"):
+        command = [sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", "-m", which, *map(str, files)]
+        left = None if limit_s is None else max(limit_s - (time.monotonic() - began), 1.0)
+        process = subprocess.Popen(
+            command,
+            cwd=copy,
+            env=environment,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+            start_new_session=True,
+        )
+        try:
+            code = process.wait(left)
+        except subprocess.TimeoutExpired:
+            os.killpg(process.pid, 9)  # with whatever the tests have started
+            process.wait()
+            raise
+        if code not in (PASSED, NONE_CHOSEN):
+            return code
+    return PASSED
+
+
+def progress_of(items: Iterator[str], total: int) -> list[str]:
+    """All items, with a bar where somebody is looking."""
+    return [next(items) for _ in progress(range(total), "mutant")]

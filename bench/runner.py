@@ -1,0 +1,110 @@
+"""Clips through systems: what is known is taken from the cache, the rest is spread over cores or a cluster."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import lru_cache
+from pathlib import Path
+
+from tqdm import tqdm
+
+from bench import facts as facts_of
+from bench import metrics, recordings, results, systems
+from bench.cache import Cache
+from bench.facts import facts
+from bench.metrics import Judges
+from bench.recogniser import Recogniser
+from bench.recordings import Clip, NotHere
+from edgefilter.errors import EdgefilterError
+from export.spread import spread
+
+SCORING = ("speechmos", "pystoi", "jiwer", "faster-whisper", "ctranslate2")
+"""Packages whose versions change scores."""
+
+
+@dataclass(frozen=True)
+class Setup:
+    """What every worker is told once: where scores are kept, the recogniser's folder, further networks by name."""
+
+    cache: Path | None
+    whisper: Path | None = None
+    networks: Mapping[str, Path] = field(default_factory=dict)
+
+
+def run(
+    clips: Sequence[Clip], rows: Sequence[systems.System], setup: Setup, jobs: int = 1, scheduler: str | None = None
+) -> list[dict]:
+    """A row of figures for each clip and system: set, room, clip, speaker, place, text, facts, system, and what `metrics.score` gives.
+
+    "absent" with the reason, or the "problem" that made an output unusable, in place of figures. What is done is kept at
+    once: a row under its clip and code, a transcript or AECMOS under the sound itself. So a run that was cut off goes on
+    where it stopped, and a change of code that leaves the sound equal costs the filters' time only.
+    """
+    tasks = [(clip, tuple(one.name for one in rows)) for clip in clips]
+    done: dict[str, list[dict]] = {}
+    if jobs == 1 and not scheduler:
+        made = (_work(setup, task) for task in tasks)
+    else:
+        made = spread(_work, setup, tasks, jobs, scheduler)
+    for name, found in tqdm(made, total=len(tasks), unit="clip", disable=not sys.stderr.isatty()):
+        done[name] = found
+    return [row for clip in clips for row in done[clip.name]]
+
+
+def judges(setup: Setup) -> Judges:
+    """The recogniser and the other judges, with their caches."""
+    kept = Cache(setup.cache, "by_sound")
+    return Judges(kept, Recogniser(setup.whisper, kept) if setup.whisper else None)
+
+
+def _work(setup: Setup, task: tuple[Clip, tuple[str, ...]]) -> tuple[str, list[dict]]:
+    """All rows of one clip."""
+    (clip, names), (known, kept, judging) = task, _opened(setup.cache, setup.whisper, tuple(setup.networks.items()))
+    asked = judging.recogniser.identity if judging.recogniser else "no recogniser"
+    about = {"set": clip.set, "room": clip.room, "clip": clip.name, "speaker": clip.speaker, "place": clip.place}
+    about |= {"text": clip.text, "facts": kept.get(lambda: facts(clip), "facts", clip.fingerprint, _scoring())}
+    rows = []
+    for name in names:
+        system = known[name]
+        key = (clip.fingerprint, clip.talk, str(clip.text), str(clip.voices), name, _code(system), _scoring(), asked)
+        rows.append({**about, "system": name, **kept.get(lambda system=system: one(clip, system, judging), *key)})
+    return clip.name, rows
+
+
+def one(clip: Clip, system: systems.System, judging: Judges) -> dict:
+    """All figures of one output. Raises NotHere where it is the machine that lacks something: nothing is kept of that."""
+    try:
+        _ = clip.profile, clip.mic  # made and read here, so that their time is not the system's
+        clip.lent_s, began = 0.0, time.perf_counter()
+        output = system.run(clip)
+        seconds = time.perf_counter() - began + clip.lent_s
+    except NotHere as error:
+        system.missing()
+        return {"absent": str(error)}
+    except EdgefilterError as error:
+        system.missing()
+        return {"problem": str(error)}
+    timed = {} if system.learns else {"seconds": seconds}  # a robot learns in another process
+    return timed | metrics.score(clip, output, judging)
+
+
+@lru_cache(maxsize=1)
+def _opened(
+    cache: Path | None, whisper: Path | None, networks: tuple[tuple[str, Path], ...]
+) -> tuple[dict[str, systems.System], Cache, Judges]:
+    return systems.catalogue(dict(networks)), Cache(cache, "rows"), judges(Setup(cache, whisper))
+
+
+@lru_cache(maxsize=64)
+def _code(system: systems.System) -> str:
+    return system.code() + results.code_digest([Path(str(systems.__file__)), Path(str(recordings.__file__))])
+
+
+@lru_cache(maxsize=1)
+def _scoring() -> str:
+    return results.code_digest([Path(str(module.__file__)) for module in (metrics, facts_of)]) + " ".join(
+        map(systems.version, SCORING)
+    )

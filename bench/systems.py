@@ -1,0 +1,351 @@
+"""The one catalogue of systems: what each does with a clip, what it knows, and why one cannot be had here.
+
+A row's name says how an engine runs: `crnn` with the clip's calibration, `crnn-learning` learns while it runs as well,
+`crnn-uncalibrated` and `crnn-uncalibrated-learning` know nothing beforehand. `-true-lag` behind a peer's name: its
+reference is delayed by the true lag, which no robot knows.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache, partial
+from importlib import metadata
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from bench import denoisers, peers, results, voicefilter
+from bench.recordings import Clip, NotHere, Signals
+from edgefilter import EgoFilter, Event, PathLearner, Profile
+from edgefilter.dsp.stft import StftConfig
+from edgefilter.engines import HAVE_MODEL, create
+from edgefilter.errors import EdgefilterError, UsageError
+from edgefilter.filter.echo_path import PathState
+from edgefilter.filter.learner import Heard, Learner, Lesson
+from edgefilter.types import SAMPLE_RATE, Samples
+
+OWN = ("linear", "ss", "crnn")
+WAYS = {"": "calibrated", "-learning": "calibrated and learning", "-uncalibrated-learning": "learning only",
+        "-uncalibrated": "uncalibrated"}  # fmt: skip
+TRUE_LAG = "-true-lag"
+PEERS = {"speexdsp": "SpeexDSP", "speexdsp-suppressed": "SpeexDSP with its suppressor", "aec3": "WebRTC AEC3"}
+DENOISERS = {"dtln": "DTLN", "rnnoise": "RNNoise", "gtcrn": "GTCRN", "deepfilternet3": "DeepFilterNet3"}
+ABSENT = {
+    "paper-ss-voicefixer": ("SS after post-filtering (VoiceFixer)", "no package carries VoiceFixer's weights"),
+    "dtln-aec": ("DTLN-aec", "no package carries its weights; DTLN against noise is below"),
+    "nkf-aec": ("NKF-AEC", "no package carries its weights"),
+}
+"""Rows that readers will look for, and why nobody can have them."""
+BATCH_NORM = "paper-crnn-narrow-batch-norm"
+MODELS = voicefilter.MODEL.parent
+NARROW = {"paper-crnn-narrow": ("", ""), BATCH_NORM: (", with batch normalisation", " --norm batch")}
+"""Title and option of training of the paper's network with fewer filters and units: at full width that takes days."""
+
+
+class Output(NamedTuple):
+    """What a system made of a clip: samples (n,), aligned with it.
+
+    events, and the human's probability after each hop of so many samples; None where it does not tell who speaks.
+    """
+
+    samples: Samples
+    events: list[Event] | None = None
+    probability: list[float] | None = None
+    hop: int = 0
+
+
+@dataclass(frozen=True)
+class System:
+    """A row.
+
+    kind: unfiltered, paper, own, peer, denoiser or bound. knows: what it had besides microphone and reference.
+    latency_ms: from its windows, None where it answers only at the end. missing: raises NotHere where it cannot run
+    here. code: files and versions on which its output depends, beside the package. model: a network that no engine
+    brings.
+    """
+
+    name: str
+    title: str
+    kind: str
+    run: Callable[[Clip], Output]
+    knows: str = ""
+    latency_ms: float | None = None
+    missing: Callable[[], object] = lambda: None
+    code: Callable[[], str] = lambda: ""
+    model: Path | None = None
+
+    @property
+    def learns(self) -> bool:
+        return self.name.endswith("-learning")
+
+    @property
+    def attainable(self) -> bool:
+        """Whether a robot can have it."""
+        return self.kind != "bound" and not self.name.endswith(TRUE_LAG)
+
+
+class Row(NamedTuple):
+    """What a row's name says: "crnn-uncalibrated-learning" is engine crnn without a profile, learning."""
+
+    engine: str
+    calibrated: bool
+    learning: bool
+
+
+def row(name: str) -> Row:
+    base = name.removesuffix("-learning")
+    engine = base.removesuffix("-uncalibrated")
+    return Row(engine, engine == base, base != name)
+
+
+def catalogue(networks: Mapping[str, Path] | None = None) -> dict[str, System]:
+    """All rows by name, in the order of the tables. networks: further networks for the engine crnn, by name."""
+    rows = [System("unfiltered", "Unfiltered", "unfiltered", lambda clip: Output(clip.mic), latency_ms=0.0)]
+    rows += [*_paper(), *(_own(engine, way) for way in WAYS for engine in OWN), *_peers()]
+    rows += [_own("crnn", "", path, f"crnn:{name}") for name, path in (networks or {}).items()]
+    rows += [*_denoisers(), *_bounds()]
+    rows += [System(name, title, "peer", lambda clip: Output(clip.mic), missing=partial(_refuse, why))
+             for name, (title, why) in ABSENT.items()]  # fmt: skip
+    return {one.name: one for one in rows}
+
+
+def chosen(names: Sequence[str], networks: Mapping[str, Path] | None = None) -> list[System]:
+    """The rows of these names, all without any. Raises UsageError for a name that no row has."""
+    rows = catalogue(networks)
+    for name in names:
+        if name not in rows:
+            raise UsageError(f"unknown system '{name}': choose some of {', '.join(rows)}")
+    return [one for one in rows.values() if not names or one.name in names]
+
+
+def present(rows: Iterable[System]) -> tuple[list[System], dict[str, str]]:
+    """The rows that can run here, and of the others name and reason."""
+    here, reasons = [], {}
+    for one in rows:
+        try:
+            one.missing()
+        except EdgefilterError as error:
+            reasons[one.title] = str(error).replace(f"{results.ROOT}/", "")
+        else:
+            here.append(one)
+    return here, reasons
+
+
+def _refuse(why: str) -> object:
+    raise NotHere(why)
+
+
+# ---------------------------------------------------------------- the package's engines
+
+
+def run_engine(
+    wanted: Row, signals: Signals, profile: Profile | None, learner: Learner | None = None, model: Path | None = None
+) -> Output:
+    """An engine over mic and ref, hop by hop as live, so that its events and the probability after each hop are known."""
+    ego = EgoFilter(profile, wanted.engine, model=model, learn=learner)
+    parts, probability = [], []
+    for at in range(0, signals.mic.size, ego.hop):
+        parts.append(ego.process(signals.mic[at : at + ego.hop], signals.ref[at : at + ego.hop]))
+        probability.append(ego.speech_probability)
+    out = np.concatenate((*parts, ego.flush()))
+    if ego.speech_probability is None:
+        return Output(out)
+    return Output(out, ego.events(), [value or 0.0 for value in probability], ego.hop)
+
+
+def _own(engine: str, way: str, model: Path | None = None, name: str = "", title: str = "", train: str = "") -> System:
+    """A row of an engine of the package. title: of a row of the source paper. train: what makes a model that is missing."""
+    wanted = row(engine + way)
+    kind = "paper" if title else "own"
+    must = wanted.calibrated and (model is None or kind == "paper")
+
+    def run(clip: Clip) -> Output:
+        profile = clip.profile if wanted.calibrated else None
+        if must and profile is None:
+            raise NotHere("no calibration of this device")
+        learner = _lessons(clip.fingerprint, profile) if wanted.learning else None
+        return run_engine(wanted, clip.signals, profile, learner, model)
+
+    def missing() -> object:
+        if model and not model.is_file():
+            raise NotHere(f"no {model.name} in {model.parent.name}/" + (f": train one with {train}" if train else ""))
+        return create(engine, model=model) if engine in HAVE_MODEL else None
+
+    knows = WAYS[way] if wanted.learning else "calibration" if wanted.calibrated else "neither"
+    title = title or (f"{engine} with network {name.partition(':')[2]}" if model else f"{engine}, {WAYS[way]}")
+    late = None if engine == "paper-crnn" else _latency_ms(engine)  # whole clips
+    code = partial(_engine_code, engine, model)
+    return System(name or engine + way, title, kind, run, knows, late, missing, code, model)
+
+
+def _engine_code(engine: str, model: Path | None = None) -> str:
+    """Digest of the package and of the engine's network."""
+    path = create(engine, model=model).model.path if engine in HAVE_MODEL else None
+    return results.code_digest() + (hashlib.sha256(Path(path).read_bytes()).hexdigest() if path else "")
+
+
+@cache
+def _latency_ms(engine: str) -> float | None:
+    try:
+        return 1000 * EgoFilter(engine=engine).latency / SAMPLE_RATE
+    except EdgefilterError:
+        return None
+
+
+class _Kept:
+    """A learner that learns a recording once, and then says again what it said; one stream only, from its first hop.
+
+    What is learned does not depend on the engine, so the engines of a recording share the work.
+    """
+
+    def __init__(self, profile: Profile | None) -> None:
+        self._learner: Learner | None = PathLearner(profile)
+        self._lessons: dict[int, Lesson] = {}
+        self._at = 0
+
+    @property
+    def past(self) -> int:
+        return PathLearner.past
+
+    def start(self, path: PathState, hop: int) -> None:
+        if self._at:
+            self._learner, self._at = None, 0
+        if self._learner:
+            self._learner.start(path, hop)
+
+    def hear(self, heard: Heard) -> Lesson | None:
+        self._at += 1
+        if self._learner and (lesson := self._learner.hear(heard)):
+            self._lessons[self._at] = lesson
+        return self._lessons.get(self._at)
+
+    def stats(self) -> dict[str, object]:
+        return {}
+
+    def close(self) -> None: ...
+
+
+_latest: dict[tuple[str, bool], _Kept] = {}
+
+
+def _lessons(recording: str, profile: Profile | None) -> _Kept:
+    """The learner that has taken this recording before, or a new one; at most four are kept."""
+    key = (recording, profile is not None)
+    if key not in _latest:
+        while len(_latest) >= 4:
+            _latest.pop(next(iter(_latest)))
+        _latest[key] = _Kept(profile)
+    return _latest[key]
+
+
+# ---------------------------------------------------------------- the source paper, peers, denoisers, bounds
+
+
+def _paper() -> list[System]:
+    rows = [_voicefilter(), _lite(), _own("paper-ss", "", title="SS before post-filtering")]
+    rows.append(_own("paper-crnn", "", title="CRNN of the paper's shape"))
+    for name, (differs, option) in NARROW.items():
+        title = f"CRNN of the paper's shape, narrower (1.8 of 34 M parameters){differs}"
+        train = f"python -m export.train --network paper --filters 16 2 --lstm 80 --hidden 150{option}"
+        rows.append(_own("paper-crnn", "", MODELS / f"{name.replace('-', '_')}_int8.onnx", name, title, train))
+    return rows
+
+
+def _voicefilter() -> System:
+    def run(clip: Clip) -> Output:
+        return Output(voicefilter.keep(clip.mic, clip.voice()))
+
+    title = "VoiceFilter, small, told the human's voice"
+    model = voicefilter.MODEL if voicefilter.MODEL.is_file() else None
+    code = partial(_files, voicefilter, "voicefilter-lite", model)
+    return System(
+        "voicefilter", title, "paper", run, "the human's voice", missing=voicefilter.find, code=code, model=model
+    )
+
+
+def _lite() -> System:
+    def run(clip: Clip) -> Output:
+        return Output(denoisers.voicefilter_lite(clip.mic, clip.voice()))
+
+    return _bundled("voicefilter-lite", "VoiceFilter-Lite, told the human's voice", "paper", run, "the human's voice")
+
+
+def _bundled(
+    name: str, title: str, kind: str, run: Callable[[Clip], Output], knows: str, before_ms: float = 0.0
+) -> System:
+    late = denoisers.LATENCIES_MS[name] + before_ms
+    code = partial(_files, denoisers, name)
+    return System(name, title, kind, run, knows, late, partial(denoisers.bundled, name), code)
+
+
+def _files(module: object, package: str = "", model: Path | None = None) -> str:
+    """Digest of a module's own code, of a package's version and of a network."""
+    paths = [Path(str(module.__file__)), *([model] if model else [])]  # type: ignore[attr-defined]
+    return results.code_digest(paths) + (denoisers.version(package) if package else "")
+
+
+def _peers() -> list[System]:
+    late = {
+        "speexdsp": peers.FRAME,
+        "speexdsp-suppressed": 2 * peers.FRAME,
+        "aec3": peers.AEC3_FRAME + peers.AEC3_DELAY,
+    }
+    found = []
+    for name, title in PEERS.items():
+        process = getattr(peers, name.replace("-", "_"))
+        probe = partial(process, *np.zeros((2, SAMPLE_RATE // 10), np.float32))
+        for ending, told in (("", ""), (TRUE_LAG, ", told the true lag")):
+
+            def run(clip: Clip, process: Callable = process, lagged: bool = bool(ending)) -> Output:
+                return Output(process(clip.mic, clip.delayed_reference() if lagged else clip.ref))
+
+            knows, ms = ("the true lag" if ending else "neither"), 1000 * late[name] / SAMPLE_RATE
+            found.append(System(name + ending, title + told, "peer", run, knows, ms, probe, partial(_files, peers)))
+    return found
+
+
+def linear(clip: Clip) -> Samples:
+    """What our linear stage leaves, (n,), with a calibration where there is one; computed once for a clip."""
+    wanted = Row("linear", clip.profile is not None, False)
+    return clip.once("linear", lambda: run_engine(wanted, clip.signals, clip.profile).samples)
+
+
+def _denoisers() -> list[System]:
+    found = []
+    for name, title in DENOISERS.items():
+
+        def run(clip: Clip, network: Callable[[Samples], Samples] = getattr(denoisers, name)) -> Output:
+            return Output(network(linear(clip)))
+
+        late = _latency_ms("linear") or 0.0
+        one = _bundled(name, f"linear, then {title}", "denoiser", run, "calibration if any", late)
+        code = partial(lambda code: _engine_code("linear") + code(), one.code)
+        found.append(System(**{**one.__dict__, "code": code}))
+    return found
+
+
+def _bounds() -> list[System]:
+    mask = partial(_engine_code, "linear")
+    return [
+        System("clean", "The human alone", "bound", lambda clip: Output(clip.known_human())),
+        System("fan-kept", "Echo gone, fan kept", "bound", lambda clip: Output(clip.known_human() + clip.fan())),
+        System("ideal-mask", "Ideal mask on what linear leaves", "bound", ideal_mask, "calibration if any", code=mask),
+    ]
+
+
+def ideal_mask(clip: Clip) -> Output:
+    """What the linear stage leaves, each bin at the human's magnitude where that is less."""
+    config = StftConfig()
+    error, human = (voicefilter.analysed(config, x) for x in (linear(clip), clip.known_human()))
+    gain = np.minimum(np.abs(human) / np.maximum(np.abs(error), 1e-9), 1.0)
+    return Output(voicefilter.synthesised(config, gain * error, clip.mic.size))
+
+
+def version(package: str) -> str:
+    try:
+        return f"{package} {metadata.version(package)}"
+    except metadata.PackageNotFoundError:
+        return f"{package} not installed"

@@ -1,0 +1,251 @@
+"""Which checkpoint keeps the words: networks against 'ss' on validation conversations, by what a recogniser makes of them.
+
+Loss and SI-SDR did not predict word errors, so networks are chosen by these. Every network answers alone, and mixed
+with the Wiener mask of 'ss', with the linear stage's error, and with both (--wiener, --error: shares of the answer),
+beside the package's own `linear`, `ss` and `crnn`. Differences are paired: each utterance against its own answer by
+'ss'. All systems get the very same frames: the front end (alignment, echo cancellation, noise estimate) runs once.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+
+from bench import recordings, results, runner
+from bench.cache import Cache
+from bench.metrics import Judges, difference, mean, pooled
+from bench.recordings import Cells, Clip, progress
+from edgefilter import PathLearner
+from edgefilter.dsp.metrics import si_sdr
+from edgefilter.dsp.stft import StftConfig, Synthesiser
+from edgefilter.engines import create
+from edgefilter.engines.base import Engine, EngineState, FrontEndKind
+from edgefilter.engines.crnn import Crnn
+from edgefilter.engines.linear import Linear
+from edgefilter.engines.spectral_subtraction import SpectralSubtraction
+from edgefilter.errors import UsageError
+from edgefilter.filter.stream import Stream
+from edgefilter.profile.data import Profile
+from edgefilter.types import Frame, Output, Samples
+from export import onnx_export
+
+REAL = Cells(sers=(-10.0, -20.0), befores=(0.0, 10.0))
+"""Of humans laid on real loudspeakers."""
+BASE = "ss"
+COLD, LAID = " cold", "real loudspeaker"
+"""How the kind of a conversation without its profile ends, and the kind of humans laid on real loudspeakers."""
+Make = Callable[[Profile | None], Engine]
+"""Of the profile that the filter runs with."""
+
+
+class Case(NamedTuple):
+    """A clip, with its profile or without. kind: whose table it stands in."""
+
+    kind: str
+    clip: Clip
+    profile: Profile | None
+
+
+class Contender(NamedTuple):
+    """make: the engine; identity: of the code and the network on which its answer depends."""
+
+    make: Make
+    identity: str
+
+
+@dataclass(frozen=True)
+class Mixed:
+    """An engine with a share of another's answer in its own: what one deletes the other may have kept."""
+
+    engine: Engine
+    other: Engine
+    share: float
+    name: str = "mixed"
+    front: FrontEndKind = "full"
+
+    @property
+    def stft(self) -> StftConfig:
+        return self.engine.stft
+
+    @property
+    def lookahead(self) -> int:
+        return self.engine.lookahead
+
+    def initial_state(self) -> EngineState:
+        return self.engine.initial_state(), self.other.initial_state()
+
+    def step(self, frame: Frame, state: EngineState) -> tuple[Output, EngineState]:
+        (ours, mine), (theirs, its) = (
+            engine.step(frame, each) for engine, each in zip((self.engine, self.other), state, strict=True)
+        )
+        spectrum = (1 - self.share) * ours.spectrum + self.share * theirs.spectrum
+        return Output(spectrum.astype(np.complex64), ours.speech_probability), (mine, its)
+
+
+@dataclass(frozen=True)
+class Listener:
+    """An engine that keeps the frames it is given."""
+
+    stft: StftConfig
+    frames: list[Frame]
+    name: str = "listener"
+    front: FrontEndKind = "full"
+    lookahead: int = 0
+
+    def initial_state(self) -> EngineState:
+        return ()
+
+    def step(self, frame: Frame, state: EngineState) -> tuple[Output, EngineState]:
+        self.frames.append(Frame(*(part.copy() for part in frame[:-1]), frame.idle))
+        return Output(frame.error), state
+
+
+def frames(case: Case, stft: StftConfig, learning: bool) -> list[Frame]:
+    """What every engine of that transform is given."""
+    listener = Listener(stft, [])
+    stream = Stream(listener, case.profile, learner=PathLearner(case.profile) if learning else None)
+    stream.process(case.clip.mic, case.clip.ref)
+    stream.flush()
+    return listener.frames
+
+
+def answer(engine: Engine, given: list[Frame], samples: int) -> Samples:
+    """(samples,) that a stream with this engine gives out."""
+    state, voice, hops = engine.initial_state(), Synthesiser(engine.stft), []
+    for frame in given:
+        output, state = engine.step(frame, state)
+        hops.append(voice.push(output.spectrum))
+    return np.concatenate(hops)[engine.stft.window_length - engine.stft.hop :][:samples]
+
+
+def contenders(
+    checkpoints: Sequence[Path], wiener: Sequence[float], error: Sequence[float], folder: Path
+) -> dict[str, Contender]:
+    """What is compared, by name: linear, ss and crnn as they ship, each checkpoint's averaged weights, alone and mixed."""
+    code = results.code_digest()
+    found = {"linear": Contender(lambda profile: create("linear", profile), code)}
+    for name in (BASE, "crnn"):
+        shipped = "".join(results.digest(path)["sha256"] for path in results.models_of([name]).values())
+        found |= _with_error(name, lambda profile, name=name: create(name, profile), code + shipped, error)
+    folder.mkdir(parents=True, exist_ok=True)
+    for path in checkpoints:
+        trained = onnx_export.load(path)
+        name = f"{path.parent.name}/{path.stem}, step {trained.training.get('step', '?')}"
+        model = folder / f"{path.parent.name}_{path.stem}.onnx"
+        onnx_export.export(trained, model)
+        identity = code + results.digest(path)["sha256"]
+        found |= _with_error(name, lambda _, model=model: Crnn(model), identity, error)
+        for share in wiener:
+
+            def mixed(_: Profile | None, model: Path = model, share: float = share) -> Engine:
+                return mix(Crnn(model), SpectralSubtraction, share)
+
+            found |= _with_error(f"{name}, {share:g} {BASE}", mixed, identity, error)
+    return found
+
+
+def _with_error(name: str, make: Make, identity: str, shares: Sequence[float]) -> dict[str, Contender]:
+    """An engine as it is, and with each share of the linear stage's error."""
+    mixed = {
+        f"{name}, {share:g} error": Contender(lambda profile, s=share: mix(make(profile), Linear, s), identity)
+        for share in shares
+    }
+    return {name: Contender(make, identity), **mixed}
+
+
+def mix(engine: Engine, other: Callable[[StftConfig], Engine], share: float) -> Mixed:
+    """An engine with a share of another's answer, at its own transform."""
+    return Mixed(engine, other(engine.stft), share)
+
+
+def compare(case: Case, making: dict[str, Contender], learning: bool, judges: Judges, kept: Cache) -> Iterator[dict]:
+    """SI-SDR and word errors of every contender."""
+    given: dict[StftConfig, list[Frame]] = {}
+    clip, asked = case.clip, judges.recogniser.identity if judges.recogniser else ""
+
+    def made(contender: Contender) -> dict:
+        engine = contender.make(case.profile)
+        if engine.stft not in given:
+            given[engine.stft] = frames(case, engine.stft, learning)
+        out = answer(engine, given[engine.stft], clip.mic.size)[clip.span]
+        return {"si_sdr": si_sdr(out, clip.known_human()[clip.span])} | (judges.words(clip.text or "", out) or {})
+
+    about = {"kind": case.kind, "clip": f"{case.kind} {clip.name}", "speaker": clip.speaker, "place": clip.place}
+    for name, contender in making.items():
+        key = ("words", clip.fingerprint, case.profile is None, learning, name, contender.identity, asked)
+        yield {**about, "system": name, **kept.get(lambda contender=contender: made(contender), *key)}
+
+
+def cases(options: argparse.Namespace) -> list[Case]:
+    found = []
+    for name, conversations in recordings.find_conversations(options.conversations).items():
+        folder = conversations[0].folder.parent
+        clips = recordings.named(recordings.conversation_clips(folder), name)[:: options.every][: options.limit]
+        for clip in clips:
+            found.append(Case(f"{name} {clip.room}", clip, clip.profile))
+            found += [Case(f"{name} {clip.room}{COLD}", clip, None)] * options.cold
+    if options.alone:
+        laid = recordings.lay(options.alone, options.speech, REAL, options.cases, options.seed)
+        clips = recordings.named(recordings.laid_clips(laid, options.speech, LAID), "real")[:: options.every][
+            : options.limit
+        ]
+        found += [Case(LAID, clip, None) for clip in clips]
+    return found
+
+
+def tables(rows: Sequence[dict]) -> list[dict]:
+    """A table per kind, one of the conversations with their profile, one of those without, and one of all."""
+    kinds = {kind: [row for row in rows if row["kind"] == kind] for kind in dict.fromkeys(row["kind"] for row in rows)}
+    cold = [kind for kind in kinds if kind.endswith(COLD)]
+    warm = [kind for kind in kinds if kind not in (*cold, LAID)]
+    groups = {"with a calibration": warm, "without": cold, "all": list(kinds)}
+    together = {
+        name: [row for kind in group for row in kinds[kind]] for name, group in groups.items() if len(group) > 1
+    }
+    columns = [
+        "system",
+        ("WER, %", 0),
+        ("left out", 0),
+        ("put in", 0),
+        ("WER less that of ss, points", 1),
+        ("SI-SDR, dB", 1),
+    ]
+    found = []
+    for kind, own in (kinds | together).items():
+        cells = []
+        for system in dict.fromkeys(row["system"] for row in own):
+            mine, base = ([row for row in own if row["system"] == name] for name in (system, BASE))
+            kinds_of = [pooled(mine, key, "words") for key in ("deletions", "insertions")]
+            less = difference(mine, base, "capped") if system != BASE else None
+            cells.append(
+                [system, mean(mine, "capped"), *(one and one["mean"] for one in kinds_of), less, mean(mine, "si_sdr")]
+            )
+        title = f"{kind}: {len({row['clip'] for row in own})} utterances"
+        found.append(results.table(f"words-{kind}".replace(" ", "-"), title, columns, cells))
+    return found
+
+
+def run(options: argparse.Namespace) -> str:
+    if not options.whisper:
+        raise UsageError("words need a recogniser: give --whisper")
+    torch.set_num_threads(1)
+    checkpoints = {f"{path.parent.name}/{path.name}": path for path in options.checkpoints}
+    data = {"conversations": options.conversations} | (
+        {"RECORDINGS": [options.real], "HUMAN": [options.speech]} if options.real else {}
+    )
+    made_with = results.stamp(data, ["linear", BASE, "crnn"], {"WHISPER": options.whisper, **checkpoints})
+    making = contenders(options.checkpoints, options.wiener, options.error, options.cache / "checkpoints")
+    judges, kept = runner.judges(runner.Setup(options.cache, options.whisper)), Cache(options.cache, "rows")
+    rows: list[dict] = []
+    for case in progress(cases(options), "utterance"):
+        rows += compare(case, making, options.learning, judges, kept)
+    notes = "Word errors at most 100 % an utterance; intervals over speakers and rooms."
+    slim = [{key: value for key, value in row.items() if key not in ("transcript", "place", "speaker")} for row in rows]
+    return results.write(options.output, "words", "Words on validation", made_with, tables(rows), notes=notes,
+                         rows=results.columns(slim))  # fmt: skip

@@ -1,0 +1,362 @@
+"""Live parts on the least that they take: what is recorded anew, bookkeeping, verdicts, and each part from end to end."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from bench import __main__ as bench
+from bench.live import barge_in, click, day, rooms, soak, trial
+from bench.live.barge_in import Talk, early_errors, lasts, lowered, muted, silent_at, words
+from bench.metrics import first_sound
+from bench.recogniser import Recogniser
+from bench.simulate import robot_day
+from bench.simulate.conversations import Scene, make_scene, read_clips, read_voices
+from bench.simulate.robot_day import Recording
+from bench.simulate.simulated_robot import Room, draw_robot, draw_walls, stand
+from edgefilter import Event
+from tests.bench.conftest import RATE, babble
+
+
+def run(output: Path, part: str, *arguments: object) -> tuple[dict, str]:
+    """A part of the JSON file, and the page."""
+    assert bench.main(["live", part, "--output", str(output), *map(str, arguments)]) == 0
+    parts = json.loads(output.with_suffix(".json").read_text())["parts"]
+    return parts[part.replace("-", "_")], output.with_suffix(".md").read_text()
+
+
+def test_a_part_says_which_folder_it_needs(clips: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert bench.main(["live", "day", "--voices", str(clips)]) == 1
+    assert capsys.readouterr().err == "bench live: the part 'day' needs --speech, a folder with a transcripts.tsv\n"
+
+
+# ---------------------------------------------------------------- long recordings
+
+
+def test_clips_repeat_only_after_all_were_said(clips: Path) -> None:
+    repertoire = robot_day.Repertoire(robot_day.shuffled(np.random.default_rng(0), read_clips(clips, (1.0, 15.0))))
+    said = [next(repertoire) for _ in range(9)]
+    assert len({x.tobytes() for x in said[:6]}) == 6
+    assert [seconds for _, seconds in repertoire.said] == [x.size / RATE for x in said]
+    assert len(set(repertoire.said)) == 6
+
+
+def test_an_utterance_is_in_the_echo_after_the_lag_at_its_volume_and_by_its_clock() -> None:
+    robot = draw_robot(np.random.default_rng(3))
+    response = np.eye(1, 100)[0]
+
+    def echo(**how: float) -> np.ndarray:
+        stage = robot_day.Stage("", Room(0.2, response, response), **{"lag": 800, **how})
+        voice = iter([babble(3.0, 1).astype(float)])
+        return robot_day.speak(np.random.default_rng(0), robot, voice, stage, 1.0)[1]
+
+    plain = echo()
+    assert not plain[: RATE // 2 + 800 + robot.bulk - 40].any() and plain.any()
+    assert np.allclose(echo(lag=1000)[200:], plain)
+    assert np.std(echo(volume_db=-20.0)) == pytest.approx(0.1 * np.std(plain), rel=0.05)  # the driver is not linear
+    span = slice(40_000, 48_000)
+    late = np.argmax(np.correlate(echo(ppm=-1000.0)[span], plain[span], "full")) - 7999
+    assert late == pytest.approx(44, abs=4)  # 1000 ppm of 40000 to 48000 samples
+
+
+def test_a_robot_driven_elsewhere_stays_in_its_room() -> None:
+    rng, direction = np.random.default_rng(1), np.array([0.6, 0.0, -0.8])
+    walls = draw_walls(rng, "lab")
+    here, there = (stand(rng, walls, 0.2, direction, 1.2) for _ in range(2))
+    assert here.rt60_s == pytest.approx(there.rt60_s, rel=0.15) and not np.allclose(here.robot[:800], there.robot[:800])
+    assert np.argmax(np.abs(here.robot)) == np.argmax(np.abs(there.robot))  # its loudspeaker went along
+
+
+def test_the_day_says_what_its_human_says_and_where(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    clips = [robot_day.Clip(tmp_path, "a", "one two"), robot_day.Clip(tmp_path, "b", "three")]
+    monkeypatch.setattr(robot_day, "read_speech", lambda clip: np.full(16_000, 0.1 if clip.speaker == "a" else 0.2))
+    room = Room(0.2, np.zeros(1), np.array([0.0, 1.0, 0.5]))
+    utterances = [slice(at, at + 60_000) for at in range(0, 2_700_000, 90_000)]
+    clean, told = robot_day.interrupt(np.random.default_rng(0), clips, room, utterances, 2_700_000)
+    assert {text for text, _ in told} == {"one two", "three"} and 1 < len(told) < len(utterances)
+    silent = np.ones(clean.size, bool)
+    for _, place in told:
+        assert abs(np.mean(clean[place] ** 2) - 1) < 0.01
+        silent[place] = False
+    assert not clean[silent].any()
+
+
+@pytest.mark.slow
+def test_a_day(clips: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(robot_day, "END_S", 1.0)
+    found, page = run(tmp_path / "live", "day", "--voices", clips, "--speech", clips, "--minutes", 0.1)
+    assert found["speech_minutes"] == pytest.approx(found["distinct_minutes"])  # six clips, six stages
+    assert len(found["begins_s"]) == 6 and found["begins_s"][0] == 0 and found["begins_s"] == sorted(found["begins_s"])
+    left = {way: np.array(one["left_db"]) for way, one in found["runs"].items()}
+    assert list(left) == list(day.WAYS) and {one.size for one in left.values()} == {len(found["speaking"])}
+    more = left["calibrated, learning"] - left["calibrated"]
+    assert f"| calibrated | {more.max():.2f} | {np.argmax(more)} | {np.sum(more > 0.5)} of {more.size} |" in page
+    assert abs(np.median(left["uncalibrated"][~np.array(found["speaking"])])) < 3  # the fan alone
+    assert (
+        left["calibrated"][:3].max() < -robot_day.FAN_DB - 8
+    )  # the robot is 31.5 dB over the fan, and mostly cancelled
+    assert (tmp_path / "live_day.png").stat().st_size > 10_000
+
+
+@pytest.mark.slow
+def test_rooms(clips: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(rooms, "YESTERDAY_S", 5.0)
+    monkeypatch.setattr(rooms, "TODAY_S", 6.0)
+    found, page = run(tmp_path / "live", "rooms", "--voices", clips, "--count", 1)
+    (room,) = found["rooms"]
+    curves = room["curves"]
+    assert room["room"] == "lab" and list(curves) == list(rooms.SYSTEMS)
+    assert curves["learning from nothing"][-1] < curves["cold"][-1] - 2
+    assert curves["next day, same room"][0] < curves["cold"][0] - 3
+    assert f"| cold | {np.mean(curves['cold'][1:3]):.1f} |" in page and "1 rooms, lab" in page
+
+
+def test_what_is_left_is_measured_against_the_echo_without_the_fan() -> None:
+    echo, fan = babble(4.0, 1), 0.01 * babble(4.0, 2)
+    recording = Recording(echo, echo, fan)
+    assert rooms.left(recording, recording.mic) == pytest.approx(0.0, abs=0.01)
+    assert rooms.left(recording, fan + 0.1 * echo) == pytest.approx(-20.0, abs=0.01)
+
+
+# ---------------------------------------------------------------- the long run
+
+
+@pytest.mark.slow
+def test_one_minute_of_audio_does_not_drift(tmp_path: Path) -> None:
+    found, page = run(tmp_path / "live", "soak", "--minutes", 1, "--engine", "ss")
+    assert found["samples_in"] == found["samples_out"] == 60 * 16000 and len(found["slices"]) == soak.SLICES
+    assert "nothing drifted" in page and (tmp_path / "live_soak.png").stat().st_size > 5_000
+
+
+def test_the_lag_of_the_long_run_comes_back_unless_it_shall_grow() -> None:
+    hours = 3600 * 16000 * np.arange(4)
+    np.testing.assert_allclose(soak.ahead(hours, one_way=False), [0, 2880, 0, 2880])  # 50 ppm of an hour's samples
+    np.testing.assert_allclose(soak.ahead(hours, one_way=True), [0, 2880, 5760, 8640])
+
+
+def test_a_leak_lost_samples_and_slowing_down_are_found() -> None:
+    def result(learner: bool = False, **changes: object) -> dict:
+        kinds = {"learner_mb": 60.0} if learner else {"p50_ms": 1.0, "p99_ms": 2.0, "bypass_ms": 0.1}
+        slices = [{"seconds": 60 * i, "memory_mb": 60.0, **kinds} for i in range(20)]
+        return {"samples_in": 100, "samples_out": 100, "lost": 0, "slices": slices, **changes}
+
+    assert soak.drifts(result()) == []
+    assert soak.drifts(result(samples_out=99)) == ["100 samples in, 99 out"]
+    assert soak.drifts(result(lost=3)) == ["3 samples lost"]
+    assert soak.drifts(result(not_finite=2)) == ["2 samples are no numbers"]
+    assert soak.drifts(result(diverged=1)) == ["1 divergences"]
+    leaking, slowing, throttled, bimodal = (result() for _ in range(4))
+    for number in range(20):
+        for key in ("p50_ms", "bypass_ms"):
+            throttled["slices"][number][key] *= 1 + 0.1 * number
+        leaking["slices"][number]["memory_mb"] += number
+        slowing["slices"][number]["p50_ms"] += 0.1 * number
+        bimodal["slices"][number]["p50_ms"] = 1.6 if number % 2 == number // 10 else 1.0
+    assert soak.drifts(leaking) == ["memory grew by 17.0 MB"]
+    assert "in the second half" in soak.drifts(slowing)[0]
+    assert soak.drifts(bimodal) == []  # the robot spoke in five slices of one half and in four of the other
+    assert soak.drifts(throttled) == []  # the machine became slower, not the filter
+    live = result(learner=True)
+    live["slices"][0]["learner_mb"] = 0.0  # it comes when it is called
+    assert soak.drifts(live) == [] and live["learner_growth_mb"] == 0.0
+    for one in live["slices"][3::2]:
+        one["learner_mb"] += 150.0  # within a round
+    assert soak.drifts(live) == []
+    for one in live["slices"][15:]:
+        one["learner_mb"] += 60.0
+    assert soak.drifts(live) == ["the learner's memory grew by 60.0 MB"]
+
+
+# ---------------------------------------------------------------- clicks and devices
+
+
+def test_the_distance_between_two_clicks_is_exact() -> None:
+    rng = np.random.default_rng(0)
+    recording = rng.normal(0, 20, 48_000)
+    for at, gain in ((10_000, 1.0), (12_345, 0.5), (14_690, 0.25)):
+        recording[at : at + click.CLICK] += gain * click.click()
+    assert click.distance_ms(recording) == 1000 * 2345 / 16000
+    assert np.isnan(click.distance_ms(recording[:11_000]))
+
+
+@pytest.mark.slow
+def test_start_of_the_program_is_timed_to_its_first_samples() -> None:
+    seconds, memory_mb = click.start("ss")
+    assert 0.05 < seconds and 20 < memory_mb < 200
+
+
+def test_a_sentence_is_found_where_the_recording_was_moved_and_filled() -> None:
+    rng = np.random.default_rng(5)
+    mic = np.convolve(rng.standard_normal(400_000), np.ones(8) / 8, "same").astype(np.float32)
+    sentence = mic[200_000:240_000] + 0.3 * rng.standard_normal(40_000).astype(np.float32)
+    for moved in (-30_000, 0, 91_234):
+        assert trial.located(sentence, np.roll(mic, moved), 200_000) == 200_000 + moved
+    assert trial.located(mic[:32_000], mic, 0) == 0
+
+
+@pytest.mark.slow
+def test_a_device_gives_its_sound_by_the_clock_whether_it_was_away_or_not() -> None:
+    samples = (0.1 * np.random.default_rng(1).standard_normal(20 * 16_000)).astype(np.float32)
+    command = ["timeout", "1.2", "parec", "-d", "robot_mic", "--rate=16000", "--channels=1", "--format=s16le", "--raw"]
+    with trial.Device("robot_mic", samples) as device:
+        device.play(began := time.monotonic())
+        ends = []
+        for away in (False, True):
+            if away:
+                device.unplug(), device.plug_in()
+            given = subprocess.run([*command, "--latency-msec=20"], env=device.server.environment, capture_output=True)
+            last = np.frombuffer(given.stdout[-16_000:], "<i2")
+            ends.append(trial.located(last / np.float32(32767), samples, 0) / 16_000 + 0.5 - (time.monotonic() - began))
+    assert abs(ends[0]) < 0.5 and abs(ends[1] - ends[0]) < 0.3, ends
+
+
+def test_the_trial_has_a_row_for_each_mishap_and_weighs_sentences_by_their_words() -> None:
+    sentence = {"begin_s": 61.0, "during": "office", "noticed_s": 0.2, "text": "yes", "recognised": "no"}
+    wrong = {"human alone": 0.0, "microphone": 1.0, "output": 1.0}
+    other = {"during": "cores busy", "noticed_s": None, "words": 3, "wrong": {**wrong, "output": 0.0}}
+    deadline = {"missed_deadlines": 1, "hops": 9, "steps": 0, "compute": {"p50_ms": 1.0, "p99_ms": 2.0}}
+    found = {
+        "doings": [(60.0, "cores busy, 10 s")],
+        "events": [{"time": 1.0, "kind": "started"}, *({"time": 2.0, "kind": "jump"} for _ in range(13)),
+                   {"time": 2.0, "kind": "speech_started"}],
+        "sentences": [{**sentence, "wrong": wrong, "words": 1}, {**sentence, **other}],
+        "stats": {"samples_in": 5, "samples_out": 5, "engine": "ss", "source": {"lost": 0, "microphone_gone": 1},
+                  "deadline": deadline},
+    }  # fmt: skip
+    rows = {table["name"]: table["rows"] for table in trial.tables(found)}
+    assert rows["trial"] == [
+        ["office", 1, "1 of 1", 0.0, 100.0, 100.0],
+        ["cores busy", 1, "0 of 1", 0.0, 100.0, 0.0],
+        ["all", 2, "1 of 2", 0.0, 100.0, 25.0],
+    ]
+    assert ["microphone gone", 1] in rows["trial-counts"] and rows["trial-done"] == [["1:00.0", "cores busy, 10 s"]]
+    assert rows["trial-events"] == [["0:01.0", "started", ""], ["13 times", "jump", ""]]
+
+
+# ---------------------------------------------------------------- barge-in in closed loop
+
+
+@pytest.fixture(scope="module")
+def scene(clips: Path) -> Scene:
+    return make_scene(3, 0, "live", read_clips(clips, (3.0, 12.0)), read_voices([clips]))
+
+
+@pytest.fixture(scope="module")
+def echo(scene: Scene) -> np.ndarray:
+    return scene.echo(scene.signals["ref"])
+
+
+def test_a_scene_recorded_again_is_the_same_up_to_the_stop_and_without_the_robot_behind_it(
+    scene: Scene, echo: np.ndarray
+) -> None:
+    ref, meta = scene.signals["ref"], scene.meta
+    np.testing.assert_allclose(echo + scene.signals["clean"] + scene.fan, scene.signals["mic"], atol=1e-12)
+    at = meta["t_main"] + RATE
+    stopped = scene.echo(lowered(ref, at, 0.0))
+    reached = round(at + meta["lag2"] + meta["delay"] - abs(meta["ppm"]) * 1e-6 * ref.size)
+    before = slice(0, reached - RATE // 50)  # the clocks' resampling and the loudspeaker's filters look ahead
+    np.testing.assert_allclose(stopped[before], echo[before], atol=1e-6)
+    behind = slice(reached + RATE // 2, None)  # the laboratory calms down by 60 dB in 0.26 s
+    assert np.abs(echo[behind]).max() > 0.05 and np.abs(stopped[behind]).max() < 1e-4
+
+
+def test_a_ducked_robot_is_quieter_by_so_much(scene: Scene) -> None:
+    ref = scene.signals["ref"]
+    ducked = lowered(ref, RATE, 10 ** (-10 / 20))
+    assert np.array_equal(ducked[:RATE], ref[:RATE])
+    np.testing.assert_allclose(ducked[RATE + RATE // 10 :], 10**-0.5 * ref[RATE + RATE // 10 :])
+
+
+def test_the_oracle_is_silent_when_the_human_begins(scene: Scene, echo: np.ndarray) -> None:
+    onset = first_sound(scene.signals["clean"].astype(np.float32))
+    left = scene.echo(lowered(scene.signals["ref"], silent_at(scene, onset), 0.0))
+    assert np.abs(left[onset - RATE // 2 : onset - RATE // 20]).max() > 0.02
+    assert np.abs(left[onset + RATE // 4 :]).max() < 0.01 * np.abs(echo[onset:]).max()
+
+
+def test_a_muted_microphone_is_silent_while_the_robot_speaks(scene: Scene, echo: np.ndarray) -> None:
+    found = muted(scene)
+    assert not found[np.abs(echo) > 0.1 * np.abs(echo).max()].any() and found[-RATE // 10 :].any()
+
+
+def test_errors_are_counted_in_the_first_words_alone() -> None:
+    spoken = "please stop talking and listen to me".split()
+    assert early_errors(spoken, spoken, 3) == 0
+    assert early_errors(spoken, [], 3) == 3
+    assert early_errors(spoken, "talking and listen to me".split(), 3) == 2
+    assert early_errors(spoken, "please stop talking and listening too".split(), 3) == 0
+    assert early_errors(spoken, "well well please stop talking and listen to me".split(), 3) == 2
+    found = words("please stop talking and listen to me", "talking and listen to me", 0.4)
+    assert (found["whole"], found["first"]) == (pytest.approx(100 * 2 / 7), 100.0)
+
+
+def test_speech_lasts_until_a_pause_of_a_fifth_of_a_second() -> None:
+    def talk(*parts: tuple[float, float]) -> Talk:
+        hops = [[probability] * round(seconds * RATE / 256) for seconds, probability in parts]
+        return Talk(np.zeros(0, np.float32), [], sum(hops, []), 256)
+
+    assert lasts(talk((2.0, 0.1)), RATE) is None
+    assert lasts(talk((1.0, 0.1), (0.2, 1.0), (1.0, 0.1)), RATE) == [True, False, False, False]
+    assert lasts(talk((1.0, 0.1), (2.0, 1.0)), RATE) == [True] * 4
+    assert lasts(talk((1.0, 0.1), (0.2, 1.0), (0.1, 0.1), (0.6, 1.0), (1.0, 0.1)), RATE) == [True, True, True, True]
+
+
+@pytest.mark.slow
+def test_interruptions_and_false_stops_from_end_to_end(
+    scene: Scene, clips: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked = []
+
+    def listen(mic: np.ndarray, ref: np.ndarray, profile: object, engine: str) -> Talk:
+        """A filter that notices the human after 0.1 s if the robot is as loud as ever, and passes the microphone."""
+        asked.append(ref)
+        onset = first_sound(scene.signals["clean"].astype(np.float32)) + RATE // 10
+        probability = [float(at > onset) for at in range(256, mic.size, 256)]
+        return Talk(mic.astype(np.float32), [Event("speech_started", onset, "sure")], probability, 256)
+
+    class Listener(Recogniser):
+        """Understands whatever is not silent."""
+
+        identity = "listener"
+
+        def __init__(self, *of: object) -> None: ...
+
+        def transcribe(self, samples: np.ndarray) -> str:
+            return "some words here" if np.abs(samples).max() > 0 else ""
+
+    monkeypatch.setattr(barge_in, "Recogniser", Listener)
+    monkeypatch.setattr(barge_in, "make_scene", lambda *of: scene)
+    monkeypatch.setattr(barge_in, "listen", listen)
+    options = ["--voices", clips, "--speech", clips, "--count", 1, "--alone", clips, "--minutes", 0.05]
+    options += ["--whisper", clips, "--cache", tmp_path]
+    found, page = run(tmp_path / "live", "barge-in", *options)
+    (interruption,), (alone,) = found["conversations"], found["alone"]
+    assert set(interruption["words"]) == set(barge_in.POLICIES)
+    assert interruption["calibrated"]["delay_s"] == 0.1 and "| calibrated | 1 | 100 [21, 100] | 0.10 | 0.10 |" in page
+    stopped, ducked, silent = asked[-4:-1]
+    stop = first_sound(scene.signals["clean"].astype(np.float32)) + round(0.17 * RATE)
+    assert not stopped[stop:].any() and np.abs(ducked[stop:]).max() > 0.1 and not silent[stop:].any()
+    assert 3.0 <= alone["speech_s"] < 7.0 and alone["stops"] == 1
+    assert "| closed loop: stopped by the event | 0 | 0 |" in page
+    assert (tmp_path / "live_barge_in.png").stat().st_size > 5000
+    asked.clear()
+    again, _ = run(tmp_path / "live", "barge-in", *options)  # every row is known
+    assert not asked and again["tables"] == found["tables"]
+
+
+def test_no_stop_in_half_an_hour_says_at_most_seven_an_hour() -> None:
+    assert [barge_in.synthesiser(voice) for voice in ("espeak-en-gb+m3", "af_bella", "real-recorded")] == [
+        "espeak",
+        "neural",
+        "real",
+    ]
+    row = {"speech_s": 1800.0, "stops": 0, "said": [["a", 900.0], ["a", 900.0]], "voice": "v"}
+    robots, minutes, distinct, voices, count, rate = barge_in.false_stops([row])
+    assert (robots, minutes, distinct, voices, count) == (1, 30.0, 15.0, 1, 0)
+    assert rate["mean"] == rate["low"] == 0.0
+    assert rate["high"] == pytest.approx(3.689 / 0.5, abs=0.01)  # the exact bound of a count of 0, Garwood 1936

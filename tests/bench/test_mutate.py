@@ -1,0 +1,101 @@
+"""Mutants: drawn where code runs, the same for a seed; killed by a test that fails, surviving where none does."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+
+from bench import __main__ as bench
+from bench import mutate, results
+from edgefilter.errors import UsageError
+
+CODE = '''"""A module."""
+
+
+def twice(x: int | None) -> int:
+    return 2 * x
+
+
+def never_tested(x: int) -> int:
+    return x - 1
+'''
+TEST = """from edgefilter.alignment.twice import twice
+
+
+def test_twice():
+    assert twice(3) == 6
+"""
+
+
+@pytest.fixture
+def checkout(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A checkout with one module of two functions, one of them tested."""
+    root = tmp_path / "checkout"
+    for folder in ("edgefilter/alignment", "tests/alignment", "docs/results"):
+        (root / folder).mkdir(parents=True)
+    for place in ("edgefilter/__init__.py", "edgefilter/alignment/__init__.py", "docs/results/large.json"):
+        (root / place).write_text("")
+    (root / "edgefilter/alignment/twice.py").write_text(CODE)
+    (root / "tests/alignment/test_twice.py").write_text(TEST)
+    (root / "tests/pytest.ini").write_text("[pytest]\nmarkers = slow\n")
+    monkeypatch.setattr(results, "ROOT", root)
+    monkeypatch.setattr(results, "stamp", lambda *of: {"command": "c", "commit": "0", "dirty": False, "data": [],
+                                                       "models": {}, "judged": {}, "machine": {}, "date": ""})  # fmt: skip
+    return root
+
+
+def test_annotations_are_no_places(checkout: Path) -> None:
+    found = mutate.sample(["alignment"], 100, 1)
+    assert sorted((mutant.line, mutant.before) for mutant in found) == [
+        (5, "return 2 * x"), (5, "return 2 * x"), (9, "return x - 1"), (9, "return x - 1")
+    ]  # fmt: skip
+    assert all(mutant.after != mutant.before for mutant in found)
+    assert (
+        mutate.sample(["alignment"], 2, 7) == mutate.sample(["alignment"], 2, 7) != mutate.sample(["alignment"], 2, 8)
+    )
+
+
+@pytest.mark.slow
+def test_what_a_test_notices_is_killed_and_what_none_does_survives(
+    checkout: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    output = tmp_path / "mutate"
+    command = ["mutate", "--modules", "alignment", "--count", "4", "--jobs", "2", "--output", str(output)]
+    assert bench.main(command) == 0
+    part = json.loads(output.with_suffix(".json").read_text())["parts"]["mutate"]
+    assert {(row["line"], row["outcome"]) for row in part["mutants"]} == {(5, "killed"), (9, "survived")}
+    page = output.with_suffix(".md").read_text()
+    assert "| alignment | 4 | 2 | 2 | 50 [15, 85] |" in page and "| edgefilter/alignment/twice.py:9 |" in page
+    assert (checkout / "edgefilter/alignment/twice.py").read_text() == CODE  # only copies are changed
+    (checkout / "tests/alignment/test_never.py").write_text(
+        "from edgefilter.alignment.twice import never_tested\n\n\ndef test_it():\n    assert never_tested(5) == 4\n"
+    )
+    assert bench.main([*command, "--again"]) == 0
+    part = json.loads(output.with_suffix(".json").read_text())["parts"]["mutate"]
+    assert {row["outcome"] for row in part["mutants"]} == {"killed"}
+    assert bench.main([*command, "--again", "--seed", "5", "--count", "3"]) == 1
+    assert "is not of these 3 mutants" in capsys.readouterr().err
+
+
+def test_a_mutant_that_never_ends_is_killed_by_the_clock(checkout: Path) -> None:
+    (checkout / "tests/alignment/test_twice.py").write_text("import time\n\n\ndef test_it():\n    time.sleep(60)\n")
+    (mutant,) = mutate.sample(["alignment"], 1, 1)
+    with mutate.copies(1) as free:
+        assert mutate.attempt(free, mutant, 2.0) == "timeout"
+        copy = free.get_nowait()
+        assert (copy / mutant.module).read_text() == CODE and not (copy / "docs/results").exists()
+
+
+def test_tests_that_fail_anyway_and_folders_without_tests_are_one_line(
+    checkout: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shutil.rmtree(checkout / "tests/alignment")
+    assert bench.main(["mutate", "--modules", "alignment"]) == 1
+    assert "expected folders of edgefilter/ that tests/ has as well" in capsys.readouterr().err
+    (checkout / "tests/alignment").mkdir()
+    (checkout / "tests/alignment/test_twice.py").write_text(TEST.replace("6", "7"))
+    with mutate.copies(1) as free, pytest.raises(UsageError, match="tests/alignment fails without a mutant"):
+        mutate.baseline_s(free, "alignment")

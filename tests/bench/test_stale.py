@@ -1,0 +1,45 @@
+"""A result of another behaviour than today's is named; a pure move of code leaves it as it is."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from bench import __main__ as program
+from bench import results, stale, systems
+from bench.systems import Output
+
+
+def test_a_result_is_stale_where_a_system_gives_another_sound(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    gain = [1.0]
+    known = systems.catalogue()
+    row = replace(known["unfiltered"], name="half", run=lambda clip: Output(np.float32(gain[0]) * clip.mic))
+    monkeypatch.setattr(systems, "catalogue", lambda *_: {"half": row, "unfiltered": known["unfiltered"]})
+    stale.digest_of.cache_clear()
+    results.write(tmp_path / "devices", "devices", "D", results.stamp(systems=["half", "unfiltered", "nobody"]))
+    assert set(results.read(tmp_path / "devices.json")["parts"]["devices"]["stamp"]["judged"]) == {"half", "unfiltered"}
+    file = str(tmp_path / "devices.json")
+    assert program.main(["stale", file]) == 0
+    gain[0] = 1.0 + 1e-9  # rounding that no 16-bit sample shows
+    stale.digest_of.cache_clear()
+    assert program.main(["stale", file]) == 0
+    gain[0] = 0.5
+    stale.digest_of.cache_clear()
+    assert program.main(["stale", file]) == 1
+    assert "devices.json, devices: half behave differently now" in capsys.readouterr().err
+    old = tmp_path / "old.json"
+    old.write_text(json.dumps({"schema": 2, "rows": []}))
+    assert stale.stale(old) == ["old.json: of an earlier form"]
+    stale.digest_of.cache_clear()
+
+
+def test_the_demonstrations_can_be_heard_by_every_engine() -> None:
+    assert [clip.human is not None for clip in stale.demos()] == [True, False]
+    linear, again = stale.digest_of("linear"), stale.judged(["linear", "dtln-aec"])
+    assert linear and again == {"linear": linear} and stale.digest_of("linear-uncalibrated") != linear

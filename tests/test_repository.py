@@ -1,0 +1,20 @@
+"""What the repository may hold: no file that its history would carry for ever."""
+
+import subprocess
+from pathlib import Path
+
+ROOT = Path(__file__).parents[1]
+MOST_MB = 4.5
+"""The largest file, models/crnn.onnx, has 4.2 MB."""
+
+
+def test_no_file_of_the_repository_is_larger_than_four_and_a_half_megabytes():
+    """In a checkout the tracked files and those about to be added; in an unpacked archive every file."""
+    command = ["git", "-C", ROOT, "ls-files", "-z", "--cached", "--others", "--exclude-standard"]
+    listed = (
+        subprocess.run(command, capture_output=True, text=True).stdout.split("\0") if (ROOT / ".git").exists() else []
+    )
+    files = [ROOT / name for name in listed if name] or list((ROOT / "models").rglob("*"))
+    large = {str(path.relative_to(ROOT)): path.stat().st_size for path in files if path.is_file()}
+    assert "models/crnn.onnx" in large, "no files were found"
+    assert not {name: size for name, size in large.items() if size > MOST_MB * 1e6}
