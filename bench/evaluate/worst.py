@@ -15,8 +15,7 @@ from edgefilter.calibration.from_recording import self_calibrate
 from edgefilter.diagnosis.diagnose import diagnose
 from edgefilter.errors import EdgefilterError
 from edgefilter.report.media import colour_scale, sound, spectrogram_png
-from edgefilter.report.text import in_order
-from edgefilter.report.words import headline
+from edgefilter.report.text import headline, in_order
 from edgefilter.types import SAMPLE_RATE, Samples
 
 COUNT = 10

@@ -24,8 +24,7 @@ from edgefilter import EgoFilter
 from edgefilter.calibration.from_recording import self_calibrate
 from edgefilter.diagnosis.diagnose import diagnose
 from edgefilter.errors import EdgefilterError
-from edgefilter.report.text import in_order
-from edgefilter.report.words import headline
+from edgefilter.report.text import headline, in_order
 from edgefilter.types import SAMPLE_RATE, Samples
 
 START_S = 2.0

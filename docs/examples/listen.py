@@ -15,7 +15,7 @@ import numpy as np
 from words import Words
 
 from edgefilter import SAMPLE_RATE, EgoFilter
-from edgefilter.commands.ends import make_source  # the command line's own; not of the public API
+from edgefilter.commands.run import make_source  # the command line's own; not of the public API
 
 BEFORE = SAMPLE_RATE // 2  # of what came before the event: the first sounds of a word are heard before they are sure
 

@@ -146,3 +146,12 @@ def test_wrong_usage_is_one_line_and_exit_2(scene: Path, tmp_path: Path, capsys)
     fails_in_one_line(capsys, same, 2, ["--apply", "robot.npz", "overwritten"])
     fails_in_one_line(capsys, arguments(scene, "diagnose", "--apply", tmp_path / "no/x.npz"), 1, ["No such file"])
     assert not (tmp_path / "x.npz").exists()
+
+
+def test_what_an_added_effect_holds_is_shown_as_json_also_where_it_is_many_numbers(tmp_path: Path, capsys) -> None:
+    robot = profile()
+    gains = {"gain_db": np.linspace(0.0, 3.0, 240), "knots_hz": 40.0}
+    robot.with_echo(robot.echo.with_effect("mic_agc", gains)).save(tmp_path / "agc.npz")
+    assert main(["profile", "show", str(tmp_path / "agc.npz"), "--json", "-"]) == 0
+    (shown,) = json.loads(capsys.readouterr().out)["effects"]
+    assert shown["parameters"]["gain_db"] == pytest.approx(gains["gain_db"]) and shown["parameters"]["knots_hz"] == 40.0

@@ -8,7 +8,7 @@ import pytest
 import soundfile
 
 from edgefilter.cli import main
-from edgefilter.commands import hidden
+from edgefilter.commands import demo as command
 from edgefilter.commands.outputs import HIDDEN_FILES
 from edgefilter.filter.ego_filter import EgoFilter
 
@@ -65,12 +65,12 @@ def test_it_says_what_is_calibrated_and_what_not(demo):
     assert (
         3.0 < cold < 9.2
     )  # learnt from six seconds of robot: better than random weights, worse than with the calibration
-    assert "with the robot's calibration" in text and f"{cold:.1f} dB uncalibrated" in text
+    assert "with the robot's calibration" in text and f"{cold:.1f} dB without it" in text
 
 
 def test_hidden_tells_the_story_from_a_robot_that_changed_to_a_filter_that_is_mended(tmp_path, monkeypatch, capsys):
     """The case of one effect; that of two goes the same way and takes as long."""
-    monkeypatch.setattr(hidden, "CASES", ("one",))
+    monkeypatch.setattr(command, "CASES", ("one",))
     words = ["demo", "--hidden", "--engine", "linear", "--output", tmp_path / "out", "--json", tmp_path / "out.json"]
     assert main([str(word) for word in words]) == 0
     told, figures = capsys.readouterr().out, json.loads((tmp_path / "out.json").read_text())["one"]
@@ -82,5 +82,9 @@ def test_hidden_tells_the_story_from_a_robot_that_changed_to_a_filter_that_is_me
     assert after > before + 4 > figures["si_sdr_microphone_db"] + 14  # -18.6, then -4.9, then 3.2
     made = {path.name for path in (tmp_path / "out/one").iterdir()}
     assert made == set(HIDDEN_FILES)
-    for part in ("edgefilter diagnose --profile", f"{after:.1f} dB with better.npz", "hidden was: late_reverb"):
+    for part in (
+        "edgefilter diagnose --profile",
+        f"{after:.1f} dB with better.npz",
+        "what had been changed: late_reverb",
+    ):
         assert part in told
