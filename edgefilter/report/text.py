@@ -21,8 +21,6 @@ UNITS = {"1": "", "1e-6": "ppm"}
 """Units of parameters that read better otherwise."""
 BAR_WIDTH = 30
 """Columns of the longest bar; lines stay within 80."""
-MAX_TIMES = 12
-"""Rows that the excess by time takes at most; longer recordings are summed up in longer steps."""
 WEIGHT = 0.01
 """Share of the residual from which a dependence gets its reason: half a minute of sound shows smaller ones, which nobody would mend."""
 HEADS = ("rank", "effect", "alone, dB", "added, dB", "numbers", "Delta BIC", "verdict")
@@ -109,7 +107,7 @@ def comparison_lines(found: Comparison) -> list[str]:
         lines.append(f"human       somebody talks at {spans}; left out of every figure")
     lines += [f"WARNING     {text}" for text in found.warnings]
     lines += _table("by frequency", "Hz", found.bands)
-    lines += _table("by time", "s", coarser(found.times, MAX_TIMES))
+    lines += _table("by time", "s", coarser(found.times, len(found.bands)))
     lines += _table("by level of the robot's voice", "dBFS", found.levels)
     lines += ["by lag of the correlation with the reference"]
     lines += [

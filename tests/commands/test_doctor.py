@@ -123,3 +123,16 @@ def test_pace_and_level_are_measured(monkeypatch):
     (heard,) = listen([port], seconds=2.0)
     assert heard.pace == pytest.approx(1.02, abs=1e-3) and port.opened and port.closed
     assert heard.level_db == pytest.approx(-20.0, abs=0.1) and heard.overruns == 0
+
+
+def test_devices_are_listed_where_no_output_exists(monkeypatch, capsys):
+    """A reference needs an output; the list does not."""
+    from edgefilter.audio import device
+
+    microphone = {"index": 0, "inputs": 1, "outputs": 0, "rate": 48_000.0, "name": "USB microphone"}
+    monkeypatch.setattr(device, "list_devices", lambda: [microphone])
+    monkeypatch.setattr(device, "monitor_of", raises(DeviceError("no sound device with an output was found")))
+    monkeypatch.setattr(pulse, "names", lambda kind: [])
+    assert main(["devices"]) == 0
+    listed = capsys.readouterr().out.splitlines()
+    assert "USB microphone" in listed[0] and listed[-1].endswith("none (no sound device with an output was found)")
