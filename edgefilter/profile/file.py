@@ -70,7 +70,7 @@ def _replace(path: Path, members: Mapping[str, np.ndarray]) -> None:
     try:
         # not tempfile: its files are the owner's alone, and the umask that others have can only be read by changing it
         with open(temporary, "xb") as file:
-            np.savez_compressed(file, allow_pickle=False, **members)
+            np.savez_compressed(file, **members)  # numbers alone: nothing is pickled (numpy before 2.1 knows no allow_pickle)
             file.flush()
             os.fsync(file.fileno())
         os.replace(temporary, path)
