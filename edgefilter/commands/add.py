@@ -14,8 +14,8 @@ def main(args: argparse.Namespace) -> int:
     names = tuple(dict.fromkeys(args.effect))
     for name in names:
         find(name)
-    with progress("fit and proof"):
-        profile, recording, reference = load(args)
+    profile, recording, reference = load(args)
+    with progress("fit, and proof in the running filter"):
         fitted = fit(profile, profile, names, recording, reference, force=args.force)
     fitted.profile.save(args.output)
     lines = [*fitted.lines(), f"written to {args.output}"]

@@ -13,8 +13,8 @@ from edgefilter.report.text import comparison_lines
 
 def main(args: argparse.Namespace) -> int:
     html = report_part("html") if args.report else None
+    profile, recording, reference = load(args)
     with progress("comparison"):
-        profile, recording, reference = load(args)
         found = compare(profile, recording, reference)
     if args.profile is None:
         found = replace(found, warnings=(*profile.warnings, *found.warnings))

@@ -25,8 +25,8 @@ def main(args: argparse.Namespace) -> int:
             "found --prove without --profile: a profile made from the recording has used the seconds of the proof"
         )
     html = report_part("html") if args.report else None
+    profile, recording, reference = load(args)
     with progress("diagnosis") as step:
-        profile, recording, reference = load(args)
         found = (diagnose_proven if args.prove else diagnose)(profile, recording, reference, progress=step)
         if args.profile is None:
             warnings = (*profile.warnings, *found.comparison.warnings)

@@ -34,6 +34,7 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_two_effects_are_added_in_one_step_and_proven(scene: Path, tmp_path: Path, capsys) -> None:
     better, figures = tmp_path / "better.npz", tmp_path / "add.json"
     words = arguments(scene, "add chassis_resonance playback_gain", "--output", better, "--json", figures)
@@ -59,6 +60,7 @@ def test_two_effects_are_added_in_one_step_and_proven(scene: Path, tmp_path: Pat
     assert [name for name, _ in Profile.load(better).echo.effects] == ["chassis_resonance", "playback_gain"]
 
 
+@pytest.mark.slow
 def test_what_makes_the_filter_worse_is_refused_in_one_line_without_a_file(scene: Path, tmp_path: Path, capsys) -> None:
     out, figures = tmp_path / "worse.npz", tmp_path / "worse.json"
     words = arguments(scene, "add late_reverb", "--output", out, "--json", figures, mic="back.wav")
@@ -71,11 +73,13 @@ def test_what_makes_the_filter_worse_is_refused_in_one_line_without_a_file(scene
     assert [name for name, _ in Profile.load(out).echo.effects] == ["late_reverb"]
 
 
+@pytest.mark.slow
 def test_of_two_the_one_that_hurts_is_named(scene: Path, tmp_path: Path, capsys) -> None:
     words = arguments(scene, "add mic_clipping late_reverb", "--output", tmp_path / "x.npz", mic="back.wav")
     fails_in_one_line(capsys, words, 1, ["mic_clipping and late_reverb would make", "without late_reverb it is "])
 
 
+@pytest.mark.slow
 def test_all_that_is_found_is_applied_in_one_step(scene: Path, tmp_path: Path, capsys) -> None:
     better = tmp_path / "better.npz"
     assert main(arguments(scene, "diagnose", "--apply", better, "--json", "-")) == 0
@@ -88,6 +92,7 @@ def test_all_that_is_found_is_applied_in_one_step(scene: Path, tmp_path: Path, c
     assert "verdict     explained" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_what_is_named_can_be_proven_first(scene: Path, tmp_path: Path, capsys) -> None:
     kept = tmp_path / "proven.json"
     assert main(arguments(scene, "diagnose", "--prove", "--json", kept)) == 0
@@ -99,6 +104,7 @@ def test_what_is_named_can_be_proven_first(scene: Path, tmp_path: Path, capsys) 
     fails_in_one_line(capsys, words, 2, ["--prove without --profile"])
 
 
+@pytest.mark.slow
 def test_without_a_profile_one_is_made_and_proven_against_none(scene: Path, tmp_path: Path, capsys) -> None:
     made = tmp_path / "made.npz"
     files = ["--recording", str(scene / "mic.wav"), "--reference", str(scene / "ref.wav")]

@@ -25,6 +25,7 @@ def demo(tmp_path_factory):
     return folder, result.stdout
 
 
+@pytest.mark.slow
 def test_it_filters_the_bundled_recording_and_the_human_stands_out(demo):
     folder, _ = demo
     figures = json.loads((folder / "demo.json").read_text())
@@ -41,6 +42,7 @@ def test_it_filters_the_bundled_recording_and_the_human_stands_out(demo):
     )  # 9.3 is promised, int8 sums differ between processors; random weights give 3.7
 
 
+@pytest.mark.slow
 def test_it_draws_before_and_after(demo):
     from matplotlib import image
 
@@ -49,6 +51,7 @@ def test_it_draws_before_and_after(demo):
     assert picture[..., :3].std() > 0.1  # not an empty canvas
 
 
+@pytest.mark.slow
 def test_it_says_the_figures_and_that_they_are_simulated(demo):
     text = demo[1]
     assert (
@@ -59,6 +62,7 @@ def test_it_says_the_figures_and_that_they_are_simulated(demo):
     )
 
 
+@pytest.mark.slow
 def test_it_says_what_is_calibrated_and_what_not(demo):
     folder, text = demo
     cold = json.loads((folder / "demo.json").read_text())["si_sdr_after_uncalibrated_db"]
@@ -68,6 +72,7 @@ def test_it_says_what_is_calibrated_and_what_not(demo):
     assert "with the robot's calibration" in text and f"{cold:.1f} dB without it" in text
 
 
+@pytest.mark.slow
 def test_hidden_tells_the_story_from_a_robot_that_changed_to_a_filter_that_is_mended(tmp_path, monkeypatch, capsys):
     """The case of one effect; that of two goes the same way and takes as long."""
     monkeypatch.setattr(command, "CASES", ("one",))

@@ -37,6 +37,7 @@ def without(package, folder, *words):
 FILES = ["--profile", "robot.npz", "--recording", "mic.wav", "--reference", "ref.wav"]
 
 
+@pytest.mark.slow
 def test_compare_and_diagnose_work_without_jinja2(scene):
     for command in ("compare", "diagnose"):
         done = without("jinja2", scene, command, *FILES)
