@@ -75,7 +75,9 @@ def plot_before_after(signals: Mapping[str, Samples], path: str | Path) -> None:
         axis.set_title(name, loc="left", fontsize=10)
         axis.set_ylabel("frequency, kHz")
     axes[-1].set_xlabel("time, s")
-    figure.colorbar(picture, ax=list(axes), label="colour: level, dB relative to the loudest sound", aspect=40, pad=0.01)
+    figure.colorbar(
+        picture, ax=list(axes), label="colour: level, dB relative to the loudest sound", aspect=40, pad=0.01
+    )
     _save(figure, path)
 
 
