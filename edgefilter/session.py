@@ -24,17 +24,17 @@ except ModuleNotFoundError:  # Windows has no such module
     resource = None  # type: ignore[assignment]
 
 AUDIBLE_DB = -50.0
-"""Level of the reference from which on the robot counts as speaking."""
+"""Level of the reference, dB of full scale, above which the robot counts as talking: of the residual that is shown."""
 MOST_EVENTS = 1000
-"""Events that a report keeps, the latest ones."""
+"""Events that a report keeps, the latest ones: a run may last for weeks."""
 
 
 @dataclass
 class Progress:
-    """What a display may show after each block.
+    """What a display may show after each block: samples so far, and levels of the block in dB of full scale.
 
-    residual_db: the output's level under the microphone's while the robot speaks and nobody is noticed, of the last
-    second or so; None before. load: compute time per time of the sound, likewise.
+    residual_db: level of the output against the microphone's while the robot talks and no human is noticed, over about
+    the last second; None before. load: computing time per duration of the sound, over the same time.
     """
 
     samples: int = 0
@@ -44,11 +44,11 @@ class Progress:
     out_db: float = -120.0
     residual_db: float | None = None
     load: float = 0.0
-    _left: float = 0.0
-    _heard: float = 0.0
+    _out_power: float = 0.0
+    _mic_power: float = 0.0
 
     def note(self, block: Block, out: Samples, human: bool, process_s: float) -> None:
-        """Take the levels of a block, and what the filter made of it in process_s seconds; human: whether one speaks."""
+        """Take a block and what the filter made of it in process_s seconds; human: whether a human speaks."""
         count = max(block.mic.size, 1)
         self.samples += block.mic.size
         self.lost += block.lost
@@ -57,9 +57,9 @@ class Progress:
         memory = float(np.exp(-count / SAMPLE_RATE))
         self.load += (1.0 - memory) * (process_s * SAMPLE_RATE / count - self.load)
         if self.ref_db > AUDIBLE_DB and not human and out.size:
-            self._left += (1.0 - memory) * (10 ** (self.out_db / 10) - self._left)
-            self._heard += (1.0 - memory) * (10 ** (self.mic_db / 10) - self._heard)
-            self.residual_db = 10 * float(np.log10(self._left / self._heard))
+            self._out_power += (1.0 - memory) * (10 ** (self.out_db / 10) - self._out_power)
+            self._mic_power += (1.0 - memory) * (10 ** (self.mic_db / 10) - self._mic_power)
+            self.residual_db = 10 * float(np.log10(self._out_power / self._mic_power))
 
 
 @dataclass
@@ -124,9 +124,10 @@ def filter_blocks(
     """Run ego over every block of source until it ends or stopped() says so; always flush into sink what was received.
 
     A source or sink that fails on the way (a device that vanished, a truncated file, a full disk) ends the run: what
-    was received is filtered and flushed as far as the sink still takes it, and the error stands in report.failure. show
-    gets the levels after each block, tell what happened in the filter and, as troubles says by which sample, at both
-    ends.
+    was received is filtered and flushed as far as the sink still takes it, and the error stands in report.failure.
+
+    show : called with the levels after each block.
+    tell : called with each event of the filter, and with what troubles(sample, last) reports of source and sink.
     """
     report, progress = RunReport(), Progress()
     began = time.perf_counter()
@@ -137,7 +138,7 @@ def filter_blocks(
         if recorder is not None:
             recorder.write_output(out)
 
-    def hear(last: bool) -> None:
+    def tell_events(last: bool) -> None:
         for event in [*ego.events(), *troubles(report.samples_in, last)]:
             report.events.append(event)
             tell(event)
@@ -152,7 +153,7 @@ def filter_blocks(
         report.samples_in += block.mic.size
         report.lost += block.lost
         push(out)
-        hear(last=False)
+        tell_events(last=False)
         progress.note(block, out, ego.human_speaks, process_s)
         show(progress)
 
@@ -168,7 +169,7 @@ def filter_blocks(
         push(ego.flush())
     except EdgefilterError as error:  # a sink that failed before says so again; its first word is the reason
         report.failure = report.failure or error
-    hear(last=True)
+    tell_events(last=True)
     report.wall_s = time.perf_counter() - began
     report.filter = dict(ego.stats())
     return report

@@ -12,6 +12,7 @@ import soundfile
 from edgefilter import session
 
 
+@pytest.mark.slow
 def test_every_command_starts_where_there_is_no_resource_module(tmp_path):
     """As on Windows."""
     soundfile.write(tmp_path / "mic.wav", np.full(4000, 0.1), 16000)

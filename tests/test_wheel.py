@@ -5,11 +5,13 @@ Needs a package index.
 
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
 import venv
 import zipfile
+from importlib import metadata
 from pathlib import Path
 
 import pytest
@@ -105,3 +107,17 @@ def test_every_public_name_can_be_had_from_it(installed, tmp_path):
 def test_edgefilter_alone_shows_what_there_is(installed, tmp_path):
     help_ = run(installed / "edgefilter", cwd=tmp_path)
     assert help_ == run(installed / "edgefilter", "--help", cwd=tmp_path) and "calibrate" in help_
+
+
+def test_each_core_dependency_is_bound_below_and_below_its_next_major_version_and_the_bounds_hold_here():
+    stated = re.search(r"^dependencies = \[(.*?)^\]", (ROOT / "pyproject.toml").read_text(), re.S | re.M)[1]
+    found = re.findall(r'"([a-z]+)>=([\d.]+),<(\d+)"', stated)
+    assert len(found) == len(re.findall('"', stated)) // 2 >= 7
+    for name, least, below in found:
+        here = tuple(int(part) for part in metadata.version(name).split(".")[:3])
+        assert tuple(int(part) for part in least.split(".")) <= here and here[0] < int(below), name
+
+
+def test_the_notice_names_every_network_of_the_repository_and_no_other():
+    named = set(re.findall(r"models/(\w+\.(?:onnx|pt))", (ROOT / "NOTICE").read_text()))
+    assert named == {path.name for path in (ROOT / "models").iterdir() if path.suffix in (".onnx", ".pt")}

@@ -4,13 +4,10 @@ from __future__ import annotations
 
 import argparse
 
-from edgefilter.commands import fitting
-from edgefilter.commands.display import write_json
-from edgefilter.commands.material import load
+from edgefilter.commands.display import print_result, progress
+from edgefilter.commands.fitting import fit
+from edgefilter.commands.recordings import load
 from edgefilter.echo.effects.catalogue import find
-
-SCHEMA = 2
-"""Of the JSON: 1 knew of one effect only."""
 
 
 def main(args: argparse.Namespace) -> int:
@@ -18,10 +15,9 @@ def main(args: argparse.Namespace) -> int:
     for name in names:
         find(name)
     profile, recording, reference = load(args)
-    fitted = fitting.fit(profile, profile, names, recording, reference, force=args.force)
+    with progress("fit, and proof in the running filter"):
+        fitted = fit(profile, profile, names, recording, reference, force=args.force)
     fitted.profile.save(args.output)
-    if args.json:
-        write_json({"schema": SCHEMA, **fitted.to_dict(), "output": args.output}, args.json)
-    if args.json != "-":
-        print("\n".join([*fitted.lines(), f"written to {args.output}"]))
+    lines = [*fitted.lines(), f"written to {args.output}"]
+    print_result(args, lines, {"schema": 2, **fitted.to_dict(), "output": args.output})
     return 0

@@ -5,8 +5,8 @@ from __future__ import annotations
 import argparse
 from dataclasses import replace
 
-from edgefilter.commands.display import report_part, write_json
-from edgefilter.commands.material import load
+from edgefilter.commands.display import print_result, progress, report_part
+from edgefilter.commands.recordings import load
 from edgefilter.diagnosis.compare import compare
 from edgefilter.report.text import comparison_lines
 
@@ -14,15 +14,12 @@ from edgefilter.report.text import comparison_lines
 def main(args: argparse.Namespace) -> int:
     html = report_part("html") if args.report else None
     profile, recording, reference = load(args)
-    found = compare(profile, recording, reference)
+    with progress("comparison"):
+        found = compare(profile, recording, reference)
     if args.profile is None:
         found = replace(found, warnings=(*profile.warnings, *found.warnings))
-    if args.json:
-        write_json({"schema": 1, **found.to_dict()}, args.json)
-    if args.json != "-":
-        print("\n".join(comparison_lines(found)))
+    print_result(args, comparison_lines(found), {"schema": 1, **found.to_dict()})
     if html:
         html.write_page(args.report, html.comparison_page(found, vars(args)))
-        if args.json != "-":
-            print(f"report      {args.report}")
+        print_result(args, [f"report      {args.report}"])
     return 0

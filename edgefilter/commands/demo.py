@@ -1,94 +1,236 @@
-"""`edgefilter demo`: the bundled (simulated) conversation, filtered, drawn and measured."""
+"""`edgefilter demo`: a bundled (simulated) conversation, filtered; or robots that have changed, diagnosed and mended."""
 
 from __future__ import annotations
 
 import argparse
-import sys
+import json
+from dataclasses import dataclass
 from pathlib import Path
+from types import ModuleType
+from typing import Any
 
 import numpy as np
 import soundfile
 
 from edgefilter.audio.files import FileSink, FileSource
-from edgefilter.commands import hidden
-from edgefilter.commands.display import describe_latency, write_json
+from edgefilter.commands.display import describe_latency, print_result, progress, report_part, say
+from edgefilter.commands.fitting import fit
+from edgefilter.diagnosis.compare import compare
+from edgefilter.diagnosis.diagnose import Diagnosis, diagnose
 from edgefilter.dsp.metrics import si_sdr
 from edgefilter.engines import NEEDS_PROFILE
+from edgefilter.errors import UsageError
 from edgefilter.filter.ego_filter import EgoFilter
 from edgefilter.filter.enhance import enhance
+from edgefilter.profile.data import Profile
+from edgefilter.report.text import decibels, headline, in_order
 from edgefilter.session import filter_blocks
 from edgefilter.types import SAMPLE_RATE, Samples
 
-DATA = Path(__file__).parents[1] / "demo_data"
+DATA = Path(__file__).parent.parent / "demo_data"
+CASES = ("one", "two")
+"""Folders of demo_data/hidden: a robot to which one thing has happened, and one to which two have."""
+HUMAN_DB, HUMAN_AT_S = -20.0, 1.0
+"""Level of the human over the robot in the same seconds, and when the human begins to interrupt it."""
 
 
 def main(args: argparse.Namespace) -> int:
     if args.hidden:
-        return hidden.main(args)
-    folder = Path(args.output)
-    folder.mkdir(parents=True, exist_ok=True)
-    ego = EgoFilter(DATA / "profile.npz", args.engine)
-    filtered = folder / "filtered.wav"
-    with FileSource(DATA / "mic.flac", DATA / "reference.flac") as source, FileSink(filtered) as sink:
-        report = filter_blocks(source, ego, sink)
-    if report.failure:
-        raise report.failure
-    figures = report.to_dict() | scores(_read(filtered), args.engine)
-    files = [filtered, *_copy_input(folder), *_draw(folder, filtered)]
-    if args.json:
-        write_json(figures, args.json)
-    if args.json != "-":
-        print(
-            f"a simulated robot talks, a human interrupts; filtered with engine {ego.engine_name}"
-            f" ({report.process_s / (report.samples_in / SAMPLE_RATE):.3f} of real time,"
-            f" {describe_latency(ego)})\nSI-SDR of the human: {figures['si_sdr_before_db']:.1f} dB before,"
-            f" {figures['si_sdr_after_db']:.1f} dB after with the robot's calibration{_without(figures)}\nfiles:"
-            f" {', '.join(str(file) for file in files)}"
-        )
+        figures = {name: _mend(name, Path(args.output) / name, args) for name in CASES}
+        print_result(args, [], {"schema": 1, **figures})
+    else:
+        _filter(args)
     return 0
 
 
+def _filter(args: argparse.Namespace) -> None:
+    """Filter the bundled conversation, measure it, draw it, and print what came of it."""
+    folder = Path(args.output)
+    folder.mkdir(parents=True, exist_ok=True)
+    filtered = folder / "filtered.wav"
+    with progress("demo: filtering the bundled conversation") as step:
+        ego = EgoFilter(DATA / "profile.npz", args.engine)
+        with FileSource(DATA / "mic.flac", DATA / "reference.flac") as source, FileSink(filtered) as sink:
+            report = filter_blocks(source, ego, sink)
+        if report.failure:
+            raise report.failure
+        step("again without the robot's calibration")
+        sounds = {"microphone": _read(DATA / "mic.flac"), "filtered": _read(filtered)}
+        sounds["human"] = _read(DATA / "human.flac")
+        figures = report.to_dict() | scores(sounds["filtered"], args.engine)
+        step("drawing")
+        for name in ("microphone", "human"):
+            _write(folder / f"{name}.wav", sounds[name])
+        drawn = _draw(folder, sounds)
+    files = [filtered, folder / "microphone.wav", folder / "human.wav", *drawn]
+    cold = figures["si_sdr_after_uncalibrated_db"]
+    without = "" if cold is None else f", {cold:.1f} dB without it"
+    lines = [
+        f"a simulated robot talks, a human interrupts; filtered with engine {ego.engine_name}"
+        f" ({report.process_s / (report.samples_in / SAMPLE_RATE):.3f} of real time, {describe_latency(ego)})",
+        f"SI-SDR of the human: {figures['si_sdr_before_db']:.1f} dB before, {figures['si_sdr_after_db']:.1f} dB after"
+        f" with the robot's calibration{without}",
+        f"files: {', '.join(str(file) for file in files)}",
+    ]
+    print_result(args, lines, figures)
+
+
 def scores(filtered: Samples, engine: str) -> dict[str, float | None]:
-    """SI-SDR over the stretch in which the human speaks: before, after, and after without the calibration where the engine can do so."""
+    """SI-SDR where the human speaks: before, after, and after without the calibration if the engine works without one."""
     human, mic, ref = (_read(DATA / f"{name}.flac") for name in ("human", "mic", "reference"))
-    speaking = np.flatnonzero(human)
-    span = slice(speaking[0], speaking[-1] + 1)
-    cold = None if engine in NEEDS_PROFILE else si_sdr(enhance(mic, ref, None, engine)[span], human[span])
+    cold = None if engine in NEEDS_PROFILE else enhance(mic, ref, None, engine)
     return {
-        "si_sdr_before_db": si_sdr(mic[span], human[span]),
-        "si_sdr_after_db": si_sdr(filtered[span], human[span]),
-        "si_sdr_after_uncalibrated_db": cold,
+        "si_sdr_before_db": _si_sdr(mic, human),
+        "si_sdr_after_db": _si_sdr(filtered, human),
+        "si_sdr_after_uncalibrated_db": None if cold is None else _si_sdr(cold, human),
     }
 
 
-def _without(figures: dict) -> str:
-    cold = figures["si_sdr_after_uncalibrated_db"]
-    return "" if cold is None else f", {cold:.1f} dB uncalibrated"
+@dataclass(frozen=True, eq=False)
+class Case:
+    """A bundled robot: its profile from before something happened to it, and recordings (n,) from after.
+
+    mic, reference: the robot alone. talk, talk_reference: the robot interrupted by a human. human: the human alone.
+    """
+
+    profile: Profile
+    mic: Samples
+    reference: Samples
+    talk: Samples
+    talk_reference: Samples
+    human: Samples
+    truth: dict[str, Any]
+
+
+def load(name: str) -> Case:
+    """The bundled robot of that name; the demo's human is mixed into the last seconds of its recording."""
+    folder = DATA / "hidden" / name
+    truth = json.loads((folder / "truth.json").read_text(encoding="utf-8"))
+    mic, reference = (_read(folder / f"{file}.flac") for file in ("mic", "reference"))
+    at, begin = round(truth["talk_s"] * SAMPLE_RATE), round(HUMAN_AT_S * SAMPLE_RATE)
+    robot = mic[at:]
+    voice = _read(DATA / "human.flac")
+    voice = voice[_speaking(voice)][: robot.size - begin]
+    level = np.sqrt(np.mean(robot[begin : begin + voice.size] ** 2) / np.mean(voice**2)) * 10 ** (HUMAN_DB / 20)
+    human = np.zeros_like(robot)
+    human[begin : begin + voice.size] = np.float32(level) * voice
+    profile = Profile.load(folder / "profile.npz")
+    return Case(profile, mic[:at], reference[:at], robot + human, reference[at:], human, truth)
+
+
+def _mend(name: str, folder: Path, args: argparse.Namespace) -> dict[str, Any]:
+    """One robot from its recordings to the mended filter: written and drawn, and told with the commands that do it."""
+    case = load(name)
+    folder.mkdir(parents=True, exist_ok=True)
+    case.profile.save(folder / "robot.npz")
+    given = {"mic": case.mic, "tts": case.reference, "talk": case.talk, "talk_tts": case.talk_reference}
+    for file, samples in given.items():
+        _write(folder / f"{file}.wav", samples)
+    files = f"--profile {folder}/robot.npz --recording {folder}/mic.wav --reference {folder}/tts.wav"
+    made = f"--apply {folder}/better.npz --report {folder}/report.html"
+    print_result(args, [f"robot {name}: something about it has changed since its calibration (simulated)"])
+    print_result(args, [f"$ edgefilter compare {files}"])
+    with progress(f"robot {name}: comparison"):
+        excess_db = compare(case.profile, case.mic, case.reference).excess_db
+    print_result(args, [f"  its own voice is {decibels(excess_db)} dB over the noise floor after the prediction"])
+    print_result(args, [f"$ edgefilter diagnose {files} {made}"])
+    with progress(f"robot {name}: diagnosis") as step:
+        found = diagnose(case.profile, case.mic, case.reference, progress=step)
+        step("fit of what was found, and proof in the running filter")
+        names = tuple(finding.effect for finding in in_order(found.ranking))
+        applied = fit(case.profile, case.profile, names, case.mic, case.reference, force=False, drop=True)
+        applied.profile.save(folder / "better.npz")
+    told = [line for number, line in enumerate(applied.lines()) if number == 0 or line.startswith("proof")]
+    print_result(
+        args, [f"  {line}" for line in (headline(found.verdict, [each.effect for each in found.ranking]), *told)]
+    )
+    run = f"edgefilter run --input {folder}/talk.wav --reference {folder}/talk_tts.wav --profile {folder}"
+    print_result(args, [f"$ {run}/better.npz --output {folder}/human_after.wav"])
+    filtered = {}
+    with progress(f"robot {name}: conversation") as step:
+        for kept, profile, which in (("before", case.profile, "old"), ("after", applied.profile, "mended")):
+            step(f"filtering with the {which} profile")
+            filtered[kept] = enhance(case.talk, case.talk_reference, profile, args.engine)
+            _write(folder / f"human_{kept}.wav", filtered[kept])
+        step("drawing the page and the picture")
+        drawn = _draw_mended(folder, case, found, filtered)
+    sdr = {"microphone": case.talk, **filtered}
+    figures = {
+        "hidden": case.truth["effects"],
+        "named": [finding.effect for finding in found.ranking],
+        "excess_before_db": excess_db,
+        "excess_after_db": found.remaining_db,
+        **{f"si_sdr_{kept}_db": _si_sdr(samples, case.human) for kept, samples in sdr.items()},
+        "applied": applied.to_dict(),
+    }
+    written = ["robot.npz", *(f"{file}.wav" for file in given), "better.npz", "human_before.wav", "human_after.wav"]
+    lines = [
+        "  SI-SDR of the human who interrupts it: {si_sdr_microphone_db:.1f} dB at the microphone, {si_sdr_before_db:.1f}"
+        " dB with the profile as it was, {si_sdr_after_db:.1f} dB with better.npz".format(**figures),
+        f"what had been changed: {', '.join(case.truth['effects'])}",
+        f"files in {folder}: {', '.join([*written, *drawn])}",
+        "",
+    ]
+    print_result(args, lines)
+    return figures
+
+
+def _draw(folder: Path, sounds: dict[str, Samples]) -> list[Path]:
+    plots = _drawer("plots")
+    if plots is None:
+        return []
+    names = {
+        "microphone": "microphone: the robot talks, its fan runs, a human interrupts",
+        "filtered": "filtered: what edgefilter leaves of it",
+        "human": "the human alone, for comparison",
+    }
+    plots.plot_before_after({names[name]: samples for name, samples in sounds.items()}, folder / "before_after.png")
+    return [folder / "before_after.png"]
+
+
+def _draw_mended(folder: Path, case: Case, found: Diagnosis, filtered: dict[str, Samples]) -> list[str]:
+    """The page of the diagnosis, and the conversation before and after."""
+    html, plots = _drawer("html"), _drawer("plots")
+    if html is None or plots is None:
+        return []
+    names = {"profile": "robot.npz", "recording": "mic.wav", "reference": "tts.wav", "effects": []}
+    page = html.diagnosis_page(case.profile, found, case.mic, case.reference, names)
+    html.write_page(folder / "report.html", page)
+    sounds = {
+        "microphone: the robot talks, and a human interrupts it": case.talk,
+        "filtered with the profile as it was": filtered["before"],
+        "filtered with what the diagnosis added": filtered["after"],
+        "the human alone, for comparison": case.human,
+    }
+    plots.plot_before_after(sounds, folder / "before_after.png")
+    return ["report.html", "before_after.png"]
+
+
+def _drawer(name: str) -> ModuleType | None:
+    """A part of the report, or None, which is said, where what it needs is not installed: the figures come all the same."""
+    try:
+        return report_part(name)
+    except UsageError as error:
+        say(f"not drawn: {error}")
+        return None
+
+
+def _speaking(human: Samples) -> slice:
+    """From the first to the last sample that is not zero."""
+    spoken = np.flatnonzero(human)
+    return slice(spoken[0], spoken[-1] + 1)
+
+
+def _si_sdr(samples: Samples, human: Samples) -> float:
+    """SI-SDR, dB, over the time in which the human speaks."""
+    span = _speaking(human)
+    return si_sdr(samples[span], human[span])
 
 
 def _read(path: Path) -> Samples:
     return soundfile.read(path, dtype="float32")[0]
 
 
-def _copy_input(folder: Path) -> list[Path]:
-    before, human = folder / "microphone.wav", folder / "human.wav"
-    for source, target in ((DATA / "mic.flac", before), (DATA / "human.flac", human)):
-        with FileSink(target) as sink:
-            sink.write(_read(source))
-    return [before, human]
-
-
-def _draw(folder: Path, filtered: Path) -> list[Path]:
-    try:
-        from edgefilter.report.plots import plot_before_after
-    except ModuleNotFoundError as error:
-        print(f"no picture: {error.name} is not installed (pip install 'edgefilter[report]')", file=sys.stderr)
-        return []
-    picture = folder / "before_after.png"
-    signals = {
-        "microphone": _read(DATA / "mic.flac"),
-        "filtered": _read(filtered),
-        "the human alone": _read(DATA / "human.flac"),
-    }
-    plot_before_after(signals, picture)
-    return [picture]
+def _write(path: Path, samples: Samples) -> None:
+    with FileSink(path) as sink:
+        sink.write(samples)

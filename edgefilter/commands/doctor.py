@@ -11,22 +11,24 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from edgefilter.audio import pulse, virtual
-from edgefilter.commands.display import write_json
+from edgefilter.commands.display import print_result
 from edgefilter.engines import create
 from edgefilter.errors import EdgefilterError
 from edgefilter.filter.budget import DEFAULT_MS
 from edgefilter.filter.ego_filter import EgoFilter
 from edgefilter.learning.background import LEAST_CORES, cores
+from edgefilter.types import SAMPLE_RATE
 
 if TYPE_CHECKING:
     from edgefilter.audio.measure import Trial
     from edgefilter.audio.port import InputPort
 
 PACE = 0.005
-"""By how much a device's clock may be out; what the filter follows is far less, but a few seconds tell no more."""
-TOO_SOFT_DB, CLIPPED_DB = -75.0, -0.1
-HOPS = 60
-"""Hops of noise over which the strongest engine is timed."""
+"""Error of a device's clock that passes: 3 s of listening tell no less, though the filter follows only far smaller ones."""
+TOO_SOFT_DB = -75.0
+"""Level, dB of full scale, under which the gain is too low: the noise of 16 bit, -101 dB, is 26 dB below."""
+CLIPPED_DB = -0.1
+"""Peak, dB of full scale, over which a microphone counts as clipped: conversion to 16 kHz may lower a clipped peak a little."""
 
 
 @dataclass(frozen=True)
@@ -43,13 +45,10 @@ def main(args: argparse.Namespace) -> int:
     checks = []
     for check in examine(args.input, args.reference):
         checks.append(check)
-        if args.json != "-":
-            print(f"{check.state:8} {check.name:13} {check.found}" + (f": {check.do}" if check.do else ""))
+        print_result(args, [f"{check.state:8} {check.name:13} {check.found}" + (f": {check.do}" if check.do else "")])
     failed = [check.name for check in checks if check.state == "failed"]
-    if args.json:
-        write_json({"schema": 1, "fit": not failed, "checks": [asdict(check) for check in checks]}, args.json)
-    if args.json != "-":
-        print(f"not fit for a live run: {', '.join(failed)} failed" if failed else "fit for a live run")
+    verdict = f"not fit for a live run: {', '.join(failed)} failed" if failed else "fit for a live run"
+    print_result(args, [verdict], {"schema": 1, "fit": not failed, "checks": [asdict(check) for check in checks]})
     return 1 if failed else 0
 
 
@@ -67,7 +66,7 @@ def examine(microphone: str, reference: str | None) -> Iterator[Check]:
 
 
 def _guarded(name: str, look: Callable[[], Iterator[Check]]) -> Iterator[Check]:
-    """The checks of one subject; an error of ours is one that failed, and says itself what to do."""
+    """The checks of one subject; an EdgefilterError is a check that failed, and says itself what to do."""
     try:
         yield from look()
     except EdgefilterError as error:
@@ -76,7 +75,7 @@ def _guarded(name: str, look: Callable[[], Iterator[Check]]) -> Iterator[Check]:
 
 def _machine() -> Iterator[Check]:
     found = cores()
-    few = "loudspeaker and room are not learned while running; allow another core"
+    few = "loudspeaker and room are not learned during a run; allow another core"
     yield Check("cores", "ok", str(found)) if found >= LEAST_CORES else Check("cores", "warning", str(found), few)
 
 
@@ -89,20 +88,23 @@ def _model() -> Iterator[Check]:
         yield Check("model", "ok", f"{found}, as shipped")
     else:
         yield Check(
-            "model", "warning", f"{found}, not one of the package's", "unset EDGEFILTER_CRNN unless it is meant"
+            "model",
+            "warning",
+            f"{found}, not the one of this package",
+            "unset EDGEFILTER_CRNN unless you set it on purpose",
         )
 
 
 def _engine() -> Iterator[Check]:
     ego = EgoFilter()
-    noise = 0.1 * np.random.default_rng(0).standard_normal(HOPS * ego.hop).astype(np.float32)
+    noise = 0.1 * np.random.default_rng(0).standard_normal(SAMPLE_RATE).astype(np.float32)
     took = []
     for at in range(0, noise.size, ego.hop):
         began = time.perf_counter()
         ego.process(noise[at : at + ego.hop], noise[at : at + ego.hop])
         took.append(1000 * (time.perf_counter() - began))
-    typical = float(np.median(took[HOPS // 3 :]))
-    found = f"{ego.engine_name}, {typical:.1f} ms of computing a hop back to back (a hop lasts {ego.hop / 16:.0f} ms)"
+    typical = float(np.median(took))
+    found = f"{ego.engine_name}, {typical:.1f} ms of computing for a hop of {1000 * ego.hop / SAMPLE_RATE:.0f} ms"
     if typical <= DEFAULT_MS:
         yield Check("engine", "ok", found)
     else:
@@ -112,7 +114,7 @@ def _engine() -> Iterator[Check]:
 def _server() -> Iterator[Check]:
     outputs = pulse.names("output")
     if not outputs:
-        help_with = "start PulseAudio or PipeWire (and install pulseaudio-utils), or give an input that hears the loudspeaker as --reference"
+        help_with = "start PulseAudio or PipeWire (and install pulseaudio-utils), or name an input that records the loudspeaker with --reference"
         yield Check("sound server", "warning", "none answers", help_with)
         return
     yield Check("sound server", "ok", f"{len(outputs)} outputs, default {pulse.default_name('output') or 'none'}")

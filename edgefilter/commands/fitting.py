@@ -15,8 +15,7 @@ from edgefilter.echo.effects.catalogue import names as names_known
 from edgefilter.echo.running import reach
 from edgefilter.errors import EdgefilterError, SignalError
 from edgefilter.profile.data import Profile
-from edgefilter.report.statistics import proof_line
-from edgefilter.report.words import UNITS, figure, joined
+from edgefilter.report.text import UNITS, figure, joined, proof_line
 from edgefilter.types import Samples
 
 LEAST_FALL_DB = 0.05

@@ -1,4 +1,4 @@
-"""What each command reads and writes, and the check that nothing is both, written twice, or impossible to write."""
+"""The check, before any work, that no file is both read and written, or written twice, and that each can be written."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ FOLDERS: dict[tuple[str, str], tuple[str, ...]] = {
 """By command and option: the files that are written into the folder which the option names."""
 IN_FOLDERS = ("save_input", "record")
 """Options that name nothing but a folder."""
-PACKAGE = Path(__file__).parents[1]
+PACKAGE = Path(__file__).parent.parent
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import argparse
 
-from edgefilter.commands.display import report_part, write_json
+import numpy as np
+
+from edgefilter.commands.display import print_result, report_part
 from edgefilter.profile.approximation import LinearApproximation
 from edgefilter.profile.data import Profile
 from edgefilter.profile.text import describe
@@ -13,14 +15,10 @@ from edgefilter.profile.text import describe
 def main(args: argparse.Namespace) -> int:
     plots = report_part("plots") if args.plot else None
     profile = Profile.load(args.profile)
-    if args.json:
-        write_json(summary(profile), args.json)
-    if args.json != "-":
-        print(describe(profile))
+    print_result(args, [describe(profile)], summary(profile))
     if plots:
         plots.plot_profile(profile, args.plot)
-        if args.json != "-":
-            print(f"drawn to {args.plot}")
+        print_result(args, [f"drawn to {args.plot}"])
     return 0
 
 
@@ -30,7 +28,10 @@ def summary(profile: Profile) -> dict[str, object]:
         "schema": 1,
         "taps": int(profile.echo.impulse_response.size),
         "delay_samples": profile.delay,
-        "effects": [{"effect": name, "parameters": dict(values)} for name, values in profile.echo.effects],
+        "effects": [
+            {"effect": name, "parameters": {key: np.asarray(value).tolist() for key, value in values.items()}}
+            for name, values in profile.echo.effects
+        ],
         "bands": [
             {"low_hz": float(low), "high_hz": float(high), "snr_db": float(snr)}
             for (low, high), snr in zip(profile.band_hz, profile.band_snr_db)
@@ -44,7 +45,7 @@ def summary(profile: Profile) -> dict[str, object]:
 
 
 def levels(approximation: LinearApproximation) -> list[dict[str, float]]:
-    """Of each level of the multisines: dB of full scale, and what a linear path leaves, dB over the linear part."""
+    """For each level of the multisines: dB of full scale, and what a linear path leaves, dB over the linear part."""
     named = {
         "left_db": approximation.over_linear_db("noise", "even", "odd"),
         "noise_db": approximation.over_linear_db("noise"),

@@ -4,26 +4,36 @@ from __future__ import annotations
 
 import argparse
 import gc
+import math
 import signal
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import partial
+from pathlib import Path
 
+from edgefilter.audio import virtual
+from edgefilter.audio.files import open_sink, open_source
 from edgefilter.audio.protocols import Sink, Source
+from edgefilter.audio.reader import Reader
+from edgefilter.audio.speech import SpokenReference
+from edgefilter.audio.steady import SteadySink
 from edgefilter.audio.troubles import Troubles
-from edgefilter.commands.assembly import check_request, make_filter
 from edgefilter.commands.display import describe_latency, say, write_json
-from edgefilter.commands.ends import limited, make_sink, make_source, make_speech
-from edgefilter.commands.watch import Watch
-from edgefilter.errors import EdgefilterError
-from edgefilter.filter.budget import Choice
+from edgefilter.commands.observers import Observers
+from edgefilter.engines import HAVE_LINEAR_STAGE
+from edgefilter.errors import EdgefilterError, UsageError
+from edgefilter.filter.budget import DEFAULT_MS, Choice, choose, forget
 from edgefilter.filter.ego_filter import EgoFilter
+from edgefilter.filter.learner import Learner
+from edgefilter.learning.background import LEAST_CORES, BackgroundLearner, cores
+from edgefilter.profile.data import Profile
 from edgefilter.session import RunReport, filter_blocks
-from edgefilter.types import SAMPLE_RATE
+from edgefilter.types import SAMPLE_RATE, Block
 
+FILE_ENDINGS = (".wav", ".flac", ".ogg", ".mp3", ".aiff", ".aif", ".w64", ".opus", ".txt", ".raw", ".pcm")
 TWICE_S = 0.5
-"""Seconds from which on a second signal is one of its own."""
+"""Seconds after which a second signal counts: timeout(1) signals a program and its group, which is one request."""
 
 
 def main(args: argparse.Namespace) -> int:
@@ -37,60 +47,177 @@ def main(args: argparse.Namespace) -> int:
     for note in notes:
         say(note)
     told = len(source.notes)
-    watch = Watch(args, ego, source, speech, notes)
-    with stop_on_signal(source) as stopped, source, sink, watch, garbage_of_this_run_only():
+    observers = Observers(args, ego, source, speech, notes)
+    with stop_on_signal(source) as stopped, source, sink, observers, garbage_of_this_run_only():
         report = filter_blocks(
             limited(source, limit),
             ego,
             sink,
-            watch.record,
-            watch.show,
+            observers.record,
+            observers.show,
             lambda: bool(stopped) or sink.finished,
-            watch.hear,
+            observers.hear,
             Troubles(source, sink),
         )
         report.interrupted |= bool(stopped)
-    return finish(args, ego, choice, (source, sink, watch), report, told)
-
-
-def finish(
-    args: argparse.Namespace,
-    ego: EgoFilter,
-    choice: Choice | None,
-    ends: tuple[Source, Sink, Watch],
-    report: RunReport,
-    told: int,
-) -> int:
-    """Say and write what happened; return the exit code."""
-    source, sink, watch = ends
     for note in [*source.notes[told:], *sink.notes]:
         say(note)
     figures = report.to_dict() | {"choice": choice.to_dict() if choice else None}
     figures |= {"source": source.stats(), "sink": sink.stats(), "notes": [*source.notes, *sink.notes]}
+    _write_results(args, ego, observers, report, figures)
+    missed = f", {report.filter['deadline']['missed_deadlines']} deadlines missed" if source.live else ""
+    _say_end(args, report, missed)
+    return 130 if report.interrupted and not source.live else 0
+
+
+def make_speech(args: argparse.Namespace) -> SpokenReference | None:
+    """The speech that the run itself plays, None where no --play asks for it."""
+    live = args.input != "-" and not looks_like_file(args.input)
+    if args.play is None:
+        if args.speaker is not None or args.barge_in:
+            option = "--barge-in" if args.barge_in else "--speaker"
+            raise UsageError(f"{option} concerns the speech that --play plays, found none: give --play FILE")
+        return None
+    if not live or args.reference is not None:
+        found = f"--reference {args.reference}" if live else f"--input {args.input}"
+        raise UsageError(
+            f"--play plays the robot's speech to a live microphone and is the reference itself, found {found}: give"
+            " --input mic and no --reference"
+        )
+    from edgefilter.audio.device import speaker
+
+    return speaker(args.speaker, Reader(args.play, "speech"))
+
+
+def make_source(name: str, reference: str | SpokenReference | None, output: str) -> Source:
+    """A file or pipe where name is one, else the live devices.
+
+    The reference defaults to the monitor of the output device, for the virtual microphone to that of its speaker.
+    """
+    if isinstance(reference, str | None) and (name == "-" or looks_like_file(name)):
+        return open_source(name, reference)
+    virtual.refuse_own(name)
+    from edgefilter.audio.device import monitor_of
+    from edgefilter.audio.live import LiveSource
+
+    if isinstance(reference, str) and looks_like_file(reference):
+        raise UsageError(
+            f"live, the reference is a device, found the file {reference}: leave --reference out or name a monitor"
+            " ('edgefilter devices'); to play the file, --play"
+        )
+    if reference is not None:
+        return LiveSource(name, reference, patience_s=math.inf)
+    own = virtual.speaker_monitor() if output == virtual.HUMAN else None
+    played_on = "default" if output in ("-", virtual.HUMAN) or looks_like_file(output) else output
+    return LiveSource(name, own or monitor_of(played_on), patience_s=math.inf)
+
+
+def make_sink(name: str, latency: int, wait: bool) -> Sink:
+    """A file or pipe where name is one, else an output device, which gets the latency as silence first.
+
+    wait: let a device that plays slower hold back the source, which a recording can bear and a microphone cannot.
+    """
+    if name == "-" or looks_like_file(name):
+        return open_sink(name)
+    from edgefilter.audio.live import LiveSink
+
+    if wait:
+        return LiveSink(name, latency, wait=True)
+    return SteadySink(lambda: LiveSink(name, latency, wait=False))
+
+
+def looks_like_file(name: str) -> bool:
+    """Whether people who type this mean a file: it exists, has an audio ending, or has a folder in it."""
+    return Path(name).exists() or name.lower().endswith(FILE_ENDINGS) or "/" in name
+
+
+def limited(source: Source, limit: int | None) -> Iterator[Block]:
+    """The blocks of source up to limit samples; the last one is cut."""
+    left = limit
+    for block in source:
+        if left is not None and block.mic.size >= left:
+            source.stop()
+            yield Block(block.mic[:left], block.ref[:left], block.start, block.lost)
+            return
+        left = None if left is None else left - block.mic.size
+        yield block
+
+
+def make_filter(args: argparse.Namespace, live: bool) -> tuple[EgoFilter, Choice | None]:
+    """The filter with the engine that was asked for, or with the one that the measurement chose.
+
+    Live, or where a budget is given, "auto" is measured; a recording has no deadline and gets the strongest engine at
+    once. Live, an engine that was chosen or that has a budget may be replaced by cheaper ones while it runs.
+    """
+    if args.remeasure:
+        forget()
+    choice, engine, reason, budget_ms = None, args.engine, "asked for", args.budget_ms
+    learned_before = args.learn and Path(args.learn).exists()
+    file = args.learn if learned_before else args.profile
+    profile = Profile.load(file) if file else None
+    if engine == "auto" and not args.model and (live or budget_ms):
+        choice = choose(budget_ms or DEFAULT_MS, profile, say=say)
+        engine, reason, budget_ms = choice.engine, choice.reason, choice.budget_ms
+    learner = make_learner(args, live, profile)
+    ego = EgoFilter(profile, engine, budget_ms if live else None, reason, args.model, learn=learner)
+    if profile is None and ego.engine_name in HAVE_LINEAR_STAGE:
+        say(
+            "no profile: the robot is not calibrated, loudspeaker and room are learned from its first seconds"
+            " ('edgefilter calibrate' measures them beforehand)"
+        )
+    return ego, choice
+
+
+def make_learner(args: argparse.Namespace, live: bool, profile: Profile | None) -> Learner | None:
+    """A learner in another process for a live run, in this one for a recording; none where it would take the filter's core."""
+    if args.no_learn:
+        return None
+    remember = Path(args.learn) if args.learn else None
+    if not live:
+        from edgefilter.learning.path_learner import PathLearner
+
+        return PathLearner(profile, remember)
+    if cores() < LEAST_CORES:
+        say("one core only: loudspeaker and room are not learned while running")
+        return None
+    return BackgroundLearner(profile, remember)
+
+
+def check_request(args: argparse.Namespace, ego: EgoFilter, live: bool) -> None:
+    """Raise UsageError for what was asked of a filter that cannot do it."""
+    names = ", ".join(HAVE_LINEAR_STAGE)
+    if ego.waits_for_end and live:
+        raise UsageError(
+            f"engine {ego.engine_name} needs the whole recording before it answers: give --input FILE or take another"
+            " engine"
+        )
+    if args.save_profile and not ego.can_adapt:
+        needed = f"give --profile and an engine with a linear stage ({names})"
+        raise UsageError(f"--save-profile writes back an adapted path: {needed}")
+    if args.learn and ego.stats()["linear_stage"] is None:
+        raise UsageError(
+            f"--learn keeps what a linear stage has learned, which {ego.engine_name} lacks: take one of {names}"
+        )
+
+
+def _write_results(
+    args: argparse.Namespace, ego: EgoFilter, observers: Observers, report: RunReport, figures: dict[str, object]
+) -> None:
+    """Write all that was asked for; raises the first reason why the run failed or something could not be written."""
     failure = report.failure
-    endings = (
-        (partial(write_json, figures), args.json),
-        (partial(save_profile, ego), args.save_profile),
-        (lambda _: watch.finish(figures), True),
-        (lambda _: ego.close(), True),
-    )
-    for write, path in endings:
+    for write, wanted in (
+        (lambda: write_json(figures, args.json), args.json),
+        (lambda: save_profile(ego, args.save_profile), args.save_profile),
+        (partial(observers.finish, figures), True),
+        (ego.close, True),
+    ):
         try:
-            if path:
-                write(path)
+            if wanted:
+                write()
         except EdgefilterError as error:  # what else there is to write is still written
             failure = failure or error
     if failure:
         raise failure
-    seconds = report.samples_in / SAMPLE_RATE
-    factor = f", {report.process_s / seconds:.3f} of real time" if seconds else ""
-    how = "stopped after" if report.interrupted else "filtered"
-    missed = f", {report.filter['deadline']['missed_deadlines']} deadlines missed" if source.live else ""
-    say(
-        f"{how} {seconds:.1f} s in {report.wall_s:.1f} s{factor}; {report.samples_out} samples to {args.output},"
-        f" {report.lost} lost{missed}"
-    )
-    return 130 if report.interrupted and not source.live else 0
 
 
 def save_profile(ego: EgoFilter, path: str) -> None:
@@ -101,6 +228,16 @@ def save_profile(ego: EgoFilter, path: str) -> None:
     before = ego.profile.echo.effects if ego.profile else ()
     held = ", ".join(name for name, _ in before if name not in left)
     say(f"the adapted path is in {path}" + (f"; {held} is part of it now and no longer listed" if held else ""))
+
+
+def _say_end(args: argparse.Namespace, report: RunReport, missed: str) -> None:
+    seconds = report.samples_in / SAMPLE_RATE
+    factor = f", {report.process_s / seconds:.3f} of real time" if seconds else ""
+    how = "stopped after" if report.interrupted else "filtered"
+    say(
+        f"{how} {seconds:.1f} s in {report.wall_s:.1f} s{factor}; {report.samples_out} samples to {args.output},"
+        f" {report.lost} lost{missed}"
+    )
 
 
 @contextmanager
@@ -117,8 +254,7 @@ def garbage_of_this_run_only() -> Iterator[None]:
 def stop_on_signal(source: Source) -> Iterator[list[int]]:
     """SIGINT and SIGTERM end the source, and with it the run, in good order; the list then holds the signal.
 
-    A later one ends it at once: nobody may be reading the pipe that the first waits for. (Not one that comes with the
-    first: timeout(1) signals a program and its group.)
+    A later one ends the run at once: nobody may be reading the pipe that the first waits for.
     """
     caught: list[int] = []
     first_at = 0.0

@@ -61,7 +61,7 @@ def _plain(value: np.ndarray, name: str) -> np.ndarray:
     return value
 
 
-def _replace(path: Path, members: Mapping[str, np.ndarray]) -> None:
+def _replace(path: Path, members: Mapping[str, Any]) -> None:
     """Write to a temporary file beside path, force it to the disk, then rename it over path."""
     path = path.resolve()
     if path.exists() and not path.is_file():
@@ -70,7 +70,9 @@ def _replace(path: Path, members: Mapping[str, np.ndarray]) -> None:
     try:
         # not tempfile: its files are the owner's alone, and the umask that others have can only be read by changing it
         with open(temporary, "xb") as file:
-            np.savez_compressed(file, allow_pickle=False, **members)
+            np.savez_compressed(
+                file, **members
+            )  # numbers alone: nothing is pickled (numpy before 2.1 knows no allow_pickle)
             file.flush()
             os.fsync(file.fileno())
         os.replace(temporary, path)

@@ -6,33 +6,50 @@ import datetime
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from importlib import resources
+from itertools import product
 from pathlib import Path
 from typing import Any
 
 import jinja2
 
-from edgefilter.diagnosis.compare import Comparison
+from edgefilter.diagnosis.compare import Comparison, describe
 from edgefilter.diagnosis.diagnose import Diagnosis, Finding
+from edgefilter.diagnosis.prepare import Prepared, prepare
 from edgefilter.diagnosis.result import Precision
+from edgefilter.echo.effect import complete
+from edgefilter.echo.effects.catalogue import find
+from edgefilter.echo.model import EchoModel
 from edgefilter.errors import EdgefilterError
 from edgefilter.profile.data import Profile
 from edgefilter.report.media import MAX_SOUND_S, colour_scale, colours, sound, spectrogram_png
-from edgefilter.report.statistics import candidate_rows, correlograms, precision_rows
-from edgefilter.report.text import add_command, in_order
-from edgefilter.report.variants import MAX_FREE, Choice, compare_variants
-from edgefilter.report.words import decibels, headline, interval_text, sentence, title
+from edgefilter.report.text import (
+    add_command,
+    candidate_rows,
+    correlograms,
+    decibels,
+    headline,
+    in_order,
+    interval_text,
+    precision_rows,
+    sentence,
+    title,
+)
 from edgefilter.types import SAMPLE_RATE, Samples
 
 ROLES = ("profile", "recording", "reference")
 LOUDER = 10.0
 """How much louder than the recording the residual is stored; the page turns it down to its true level, or not (20
 dB)."""
+MAX_FREE = 3
+"""Up to so many effects every subset is computed; of more only those that leave out the last ones."""
+
+Choice = tuple[bool, ...]
 
 
 def comparison_page(found: Comparison, names: Mapping[str, Any]) -> str:
     """The page of a comparison.
 
-    Names: profile (None: the recording itself was taken for it), recording, reference, what the files are called.
+    names: profile (None: the recording itself was taken for it), recording, reference, what the files are called.
     """
     profile = "The profile" if names["profile"] else "A stationary linear path made from the recording itself"
     excess = f"{profile} leaves {decibels(found.excess_db)} dB over the noise floor unexplained."
@@ -46,7 +63,7 @@ def diagnosis_page(
 ) -> str:
     """The page of a diagnosis, with a switch for each found effect.
 
-    Recording (n,), reference (m,): what was diagnosed.
+    recording (n,), reference (m,): what was diagnosed.
     """
     steps = in_order(found.ranking)
     variants = compare_variants(profile, found.model, steps, recording, reference)
@@ -213,3 +230,42 @@ def _notes(found: Comparison) -> list[str]:
 
 def _asset(name: str) -> str:
     return resources.files("edgefilter.report").joinpath(name).read_text(encoding="utf-8")
+
+
+def choices(count: int) -> list[Choice]:
+    """Which of count effects are on, for each comparison that a report holds.
+
+    The one with none comes first, with all last.
+    """
+    if count <= MAX_FREE:
+        return list(product((False, True), repeat=count))
+    return [tuple(i < on for i in range(count)) for on in range(count + 1)]
+
+
+def compare_variants(
+    profile: Profile, model: EchoModel, findings: Sequence[Finding], recording: Samples, reference: Samples
+) -> dict[Choice, Comparison]:
+    """For each choice of findings, recording (n,) against model, which has them all, without those that are off.
+
+    The excess of each is the diagnosis's; where it is, is shown for all samples.
+    """
+    prepared = prepare(profile, recording, reference)
+    found = {}
+    for choice in choices(len(findings)):
+        chosen, partial = [], model
+        for finding, on in zip(findings, choice, strict=True):
+            if on:
+                chosen.append(finding)
+            else:
+                partial = partial.without_effect(finding.effect)
+        found[choice] = describe(_with_noise(prepared, chosen), partial)
+    return found
+
+
+def _with_noise(prepared: Prepared, findings: Sequence[Finding]) -> Prepared:
+    """The same recording, the noise to be expected being that with the chosen effects on the fan."""
+    psd = prepared.noise_psd
+    for finding in findings:
+        effect = find(finding.effect)
+        psd = effect.noise_psd(complete(effect, finding.values), psd)
+    return prepared.behind(psd)

@@ -13,14 +13,13 @@ import soundfile
 from edgefilter.dsp.fourier import power
 from edgefilter.dsp.frames import decibels, frames
 from edgefilter.dsp.psd import hann
+from edgefilter.dsp.stft import StftConfig
 from edgefilter.types import SAMPLE_RATE, Samples
 
-WINDOW, MAX_COLUMNS = 480, 800
-"""Samples of a spectrogram's frame, and how many columns a picture has at most."""
+MAX_COLUMNS = 800
+"""Columns that a spectrogram has at most."""
 LEVELS = 64
 """How many colours there are."""
-OPUS_COMPRESSION = 0.8
-"""Of libsndfile's range 0 (best) to 1 (smallest): about 55 kbit/s at 16 kHz mono."""
 MAX_SOUND_S = 60
 """How much of a recording a page carries as sound."""
 _ANCHORS = np.array(
@@ -41,22 +40,22 @@ _ANCHORS = np.array(
 
 
 def spectrogram_db(samples: Samples) -> np.ndarray:
-    """Level (columns, WINDOW // 2 + 1) in dB of full scale per bin, Hann frames, mean power where frames share a column."""
-    hop = WINDOW // 2
-    padded = np.pad(samples, (0, max(0, WINDOW - samples.size)))
-    window = hann(WINDOW).astype(np.float32)
-    count = 1 + (padded.size - WINDOW) // hop
+    """Level (columns, 257) in dB of full scale per bin, Hann frames of 32 ms, mean power where frames share a column."""
+    size, hop = StftConfig().window_length, StftConfig().hop
+    padded = np.pad(samples, (0, max(0, size - samples.size)))
+    window = hann(size).astype(np.float32)
+    count = 1 + (padded.size - size) // hop
     columns = min(count, MAX_COLUMNS)
     edges = np.linspace(0, count, columns + 1).astype(int)
-    level = np.empty((columns, WINDOW // 2 + 1))
-    pieces = frames(padded, WINDOW, hop)
+    level = np.empty((columns, size // 2 + 1))
+    pieces = frames(padded, size, hop)
     for column, (first, last) in enumerate(zip(edges[:-1], edges[1:], strict=True)):
         level[column] = np.mean(power(np.fft.rfft(pieces[first:last] * window, axis=1)), axis=0)
     return decibels(level / (window.sum() / 2) ** 2, 1e-20)
 
 
 def colour_scale(samples: Samples) -> tuple[float, float]:
-    """DB of full scale per bin that get the darkest and the brightest colour: from the quiet of a recording (n,) to nearly its loudest."""
+    """Levels, dB of full scale per bin, that get the darkest and the brightest colour: from the quiet of a recording (n,) to nearly its loudest."""
     quiet, loud = np.percentile(spectrogram_db(samples), (20, 99.7))
     top = 5.0 * float(np.ceil(max(loud, -140.0) / 5.0))
     return min(5.0 * float(np.floor(quiet / 5.0)), top - 40.0), top
@@ -80,10 +79,10 @@ def colours() -> np.ndarray:
 
 
 def sound(samples: Samples, gain: float = 1.0) -> str:
-    """The first MAX_SOUND_S of samples (n,) times gain, as an Opus data address."""
+    """The first MAX_SOUND_S of samples (n,) times gain, as an Opus data address, about 30 kbit/s."""
     buffer = io.BytesIO()
     loud = np.clip(samples[: MAX_SOUND_S * SAMPLE_RATE] * np.float32(gain), -1.0, 1.0)
-    soundfile.write(buffer, loud, SAMPLE_RATE, format="OGG", subtype="OPUS", compression_level=OPUS_COMPRESSION)
+    soundfile.write(buffer, loud, SAMPLE_RATE, format="OGG", subtype="OPUS")
     return _address("audio/ogg", buffer.getvalue())
 
 

@@ -185,8 +185,8 @@ function drawCorrelogram(id, what) {
   const last = what.from_ms + what.step_ms * (values.length - 1);
   const place = (ms) => (100 * (ms - what.from_ms)) / (last - what.from_ms);
   if (what.from_ms < 0) put(plot, "zero", { left: place(0) });
-  const round4 = (v) => +(v / 1e4).toPrecision(2);
-  [-1, 0, 1].forEach((part) => put(frame, "tick", { bottom: 50 + 50 * (part / 1.1) }, `${round4((part * top) / 1.1)}`.replace("-", "−")));
+  const short = (v) => +v.toPrecision(2);
+  [-1, 0, 1].forEach((part) => put(frame, "tick", { bottom: 50 + 50 * (part / 1.1) }, `${short((part * top) / 1.1)}`.replace("-", "−")));
   const every = last > 50 ? 25 : 5;
   ticks(frame, Array.from({ length: Math.floor(last / every) - Math.ceil(what.from_ms / every) + 1 }, (_, i) => (i + Math.ceil(what.from_ms / every)) * every), place, "ms");
   plot.setAttribute("role", "img");

@@ -10,12 +10,11 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure, SubFigure
 
-from edgefilter.dsp.fourier import power
-from edgefilter.dsp.frames import decibels, frames
-from edgefilter.dsp.psd import hann
+from edgefilter.dsp.frames import decibels
 from edgefilter.errors import EdgefilterError
 from edgefilter.profile.approximation import LinearApproximation
 from edgefilter.profile.data import DISTORTION_ORDERS, GRID_HZ, Profile
+from edgefilter.report.media import spectrogram_db
 from edgefilter.types import PRE_ROLL, SAMPLE_RATE, Samples
 
 INK, ACCENT, SOFT = "#222222", "#b5442c", "#5b7c99"
@@ -42,9 +41,13 @@ def plot_profile(profile: Profile, path: str | Path) -> None:
     _label(axes[0, 0], "Impulse response, first 40 ms", "ms after the direct sound", "amplitude")
     left = np.cumsum(taps[::-1] ** 2)[::-1]
     axes[0, 1].plot(
-        ms, decibels(taps**2 / max(float(np.max(taps**2)), 1e-30), 1e-20), color=SOFT, linewidth=0.3, label="|h|"
+        ms,
+        decibels(taps**2 / max(float(np.max(taps**2)), 1e-30), 1e-20),
+        color=SOFT,
+        linewidth=0.3,
+        label="impulse response, squared",
     )
-    axes[0, 1].plot(ms, decibels(left / max(left[0], 1e-30), 1e-20), color=ACCENT, label="energy still to come")
+    axes[0, 1].plot(ms, decibels(left / max(left[0], 1e-30), 1e-20), color=ACCENT, label="energy that is still to come")
     axes[0, 1].set_ylim(-90, 3)
     axes[0, 1].legend(loc="upper right")
     _label(axes[0, 1], "Decay", "ms after the direct sound", "dB")
@@ -60,17 +63,21 @@ def plot_profile(profile: Profile, path: str | Path) -> None:
 
 
 def plot_before_after(signals: Mapping[str, Samples], path: str | Path) -> None:
-    """Draw the spectrograms of named recordings (n,), 16 kHz, one below the other on the same scale, to a PNG, SVG or PDF."""
+    """Draw the spectrograms of named recordings (n,), 16 kHz, one below the other with one legend, to a PNG, SVG or PDF."""
     figure = _figure(11, 2.4 * len(signals))
     axes = figure.subplots(len(signals), 1, sharex=True, squeeze=False)[:, 0]
-    peak = max(float(np.max(_spectrogram(samples), initial=1e-12)) for samples in signals.values())
-    for axis, (name, samples) in zip(axes, signals.items(), strict=True):
-        picture = decibels(_spectrogram(samples) / peak, 1e-20)
+    levels = [spectrogram_db(samples) for samples in signals.values()]
+    loudest = max(float(level.max()) for level in levels)
+    for axis, level, (name, samples) in zip(axes, levels, signals.items(), strict=True):
         extent = (0, samples.size / SAMPLE_RATE, 0, SAMPLE_RATE / 2000)
-        axis.imshow(picture.T, origin="lower", aspect="auto", extent=extent, vmin=-85, vmax=-35, cmap="magma")
+        look = {"vmin": -85, "vmax": -35, "cmap": "magma"}
+        picture = axis.imshow((level - loudest).T, origin="lower", aspect="auto", extent=extent, **look)
         axis.set_title(name, loc="left", fontsize=10)
-        axis.set_ylabel("kHz")
-    axes[-1].set_xlabel("s")
+        axis.set_ylabel("frequency, kHz")
+    axes[-1].set_xlabel("time, s")
+    figure.colorbar(
+        picture, ax=list(axes), label="colour: level, dB relative to the loudest sound", aspect=40, pad=0.01
+    )
     _save(figure, path)
 
 
@@ -105,7 +112,7 @@ def _draw_spectra(axis: Axes, profile: Profile) -> None:
         decibels(profile.response[1:] ** 2, 1e-20),
         color=INK,
         linewidth=1.2,
-        label="|Hm Hs|, eq. (5) of the paper",
+        label="smoothed: |Hm Hs|, eq. (5) of Li et al. 2024",
     )
     fan = axis.twinx()
     fan.semilogx(GRID_HZ[1:], decibels(profile.noise_psd[1:], 1e-20), color=ACCENT, linewidth=1.0)
@@ -127,7 +134,7 @@ def _draw_bands(axis: Axes, profile: Profile) -> None:
     )
     _label(
         axis,
-        f"Signal-to-noise ratio of the sweep by third octave\nharmonic distortion by order, dB: {orders}",
+        f"Signal-to-noise ratio of the sweep by third octave; red: below 10 dB, too noisy\nharmonic distortion by order, dB: {orders}",
         "Hz",
         "dB",
     )
@@ -138,12 +145,6 @@ def _label(axis: Axes, title: str, x: str, y: str) -> None:
     axis.set_xlabel(x)
     axis.set_ylabel(y)
     axis.grid(alpha=0.25)
-
-
-def _spectrogram(samples: Samples) -> np.ndarray:
-    """Power (frames, 257) of Hann frames of 512 samples, hop 128."""
-    padded = np.pad(samples, (0, max(0, 512 - samples.size)))
-    return power(np.fft.rfft(frames(padded, 512, 128) * hann(512).astype(np.float32), axis=1))
 
 
 def _figure(width: float, height: float) -> Figure:

@@ -1,30 +1,102 @@
-"""A comparison and a diagnosis as lines for the terminal: figures with small bars."""
+"""A comparison and a diagnosis in words: sentences, figures and lines for the terminal, rows for the page."""
 
 from __future__ import annotations
 
 import math
 import shlex
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from edgefilter.diagnosis.compare import Comparison
-from edgefilter.diagnosis.diagnose import Diagnosis, Finding
-from edgefilter.report.statistics import advice_lines, candidate_lines, independence_lines, precision_lines, proof_line
-from edgefilter.report.words import decibels, headline, interval_text, sentence, title
+from edgefilter.diagnosis.diagnose import Diagnosis, Finding, Interval
+from edgefilter.diagnosis.independence import Correlogram, Independence
+from edgefilter.diagnosis.proof import Proof
+from edgefilter.diagnosis.result import Candidate, Known, Precision
+from edgefilter.echo.effects.catalogue import find, names
 
+UNITS = {"1": "", "1e-6": "ppm"}
+"""Units of parameters that read better otherwise."""
 BAR_WIDTH = 30
-MAX_TIMES = 12
-"""Rows that the excess by time takes at most; longer recordings are summed up in longer steps."""
+"""Columns of the longest bar; lines stay within 80."""
+WEIGHT = 0.01
+"""Share of the residual from which a dependence gets its reason: half a minute of sound shows smaller ones, which nobody would mend."""
+HEADS = ("rank", "effect", "alone, dB", "added, dB", "numbers", "Delta BIC", "verdict")
+
+
+def spoken(effect: str) -> str:
+    """The effect inside a sentence; one without a title, or whose file is not loaded, by its name without underscores."""
+    return (find(effect).title if effect in names() else "") or effect.replace("_", " ")
+
+
+def title(effect: str) -> str:
+    """The effect as a heading, without its article."""
+    words = spoken(effect).removeprefix("a ")
+    return words[:1].upper() + words[1:]
+
+
+def joined(words: Iterable[str]) -> str:
+    """Join words as in "a, b and c"."""
+    *first, last = list(words) or [""]
+    return f"{', '.join(first)} and {last}" if first else last
+
+
+def sentence(words: str) -> str:
+    """The words with a capital and a full stop, where they have none."""
+    words = words.strip()
+    return words and words[:1].upper() + words[1:] + ("" if words.endswith((".", "!", "?")) else ".")
+
+
+def headline(verdict: str, effects: Iterable[str], calibrated: bool = True) -> str:
+    """One sentence for the verdict of a diagnosis.
+
+    calibrated: whether there was a profile that could lack something.
+    """
+    found = joined(spoken(effect) for effect in effects)
+    if verdict == "missing" and not calibrated:
+        return f"Found in the recording, besides what is stationary and linear: {found}."
+    if verdict == "explained" and not calibrated:
+        return (
+            "A stationary linear path explains this recording; what it is made of cannot be told without a calibration."
+        )
+    if verdict == "missing":
+        return f"Missing from the profile: {found}."
+    if verdict == "explained":
+        return "The profile explains this recording."
+    return "Something is in this recording that no known effect explains" + (f", besides {found}." if found else ".")
+
+
+def decibels(value: float) -> str:
+    """One decimal, and no minus before a zero."""
+    return f"{0.0 if abs(value) < 0.05 else value:.1f}"
+
+
+def figure(value: float) -> str:
+    """A number with three significant digits; without an exponent where people would not write one."""
+    value = float(value)
+    if value == 0 or not 1e-4 <= abs(value) < 1e7:
+        return f"{value:.3g}"
+    return f"{value:.{max(0, 2 - math.floor(math.log10(abs(value))))}f}"
+
+
+def interval_text(interval: Interval) -> str:
+    """Say "0.61 s (0.56 to 0.66)"; several values one after the other, each with its own range."""
+    values, lows, highs = (np.atleast_1d(x) for x in (interval.value, interval.low, interval.high))
+    unit = UNITS.get(interval.unit, interval.unit)
+    shown = [
+        f"{figure(v)} {unit}".rstrip() + (f" ({figure(low)} to {figure(high)})" if low < high else "")
+        for v, low, high in zip(values, lows, highs)
+    ]
+    return ", ".join(shown) or "none"
 
 
 def comparison_lines(found: Comparison) -> list[str]:
-    """The excess, then where it is: by frequency, time, level and lag, while the robot is silent, and whether it is noise."""
+    """The excess, while the robot talks and while it is silent, then by frequency, time, level and lag, and whether it is noise."""
     lines = [
-        f"excess      {decibels(found.excess_db)} dB over the noise floor of {decibels(found.noise_floor_db)} dBFS",
-        f"lag         {found.offset_samples:+.2f} samples against the calibration, taken out",
+        f"excess      {decibels(found.excess_db)} dB, what is not predicted, over the noise floor of {decibels(found.noise_floor_db)} dBFS",
+        f"lag         {found.offset_samples:+.2f} samples against the calibration, compensated",
     ]
     if math.isfinite(found.silence_excess_db):
         lines.append(
@@ -35,7 +107,7 @@ def comparison_lines(found: Comparison) -> list[str]:
         lines.append(f"human       somebody talks at {spans}; left out of every figure")
     lines += [f"WARNING     {text}" for text in found.warnings]
     lines += _table("by frequency", "Hz", found.bands)
-    lines += _table("by time", "s", coarser(found.times, MAX_TIMES))
+    lines += _table("by time", "s", coarser(found.times, len(found.bands)))
     lines += _table("by level of the robot's voice", "dBFS", found.levels)
     lines += ["by lag of the correlation with the reference"]
     lines += [
@@ -61,7 +133,7 @@ def diagnosis_lines(found: Diagnosis, calibrated: bool = True) -> list[str]:
     ]
     lines += [f"  {name:<27} {decibels(db):>6}  {_bar(db / top)}".rstrip() for name, db in steps]
     lines.append(
-        f"  {'of it irreducible':<27} {decibels(found.irreducible_db):>6}  {_bar(found.irreducible_db / top)}".rstrip()
+        f"  {'irreducible part of it':<27} {decibels(found.irreducible_db):>6}  {_bar(found.irreducible_db / top)}".rstrip()
     )
     for rank, finding in enumerate(found.ranking, start=1):
         lines += _finding(rank, finding)
@@ -72,8 +144,8 @@ def diagnosis_lines(found: Diagnosis, calibrated: bool = True) -> list[str]:
     lines += precision_lines(found.precision)
     if found.ranking:
         lines += independence_lines(found.independence, "with all that was found")
-    lines += [*candidate_lines(found.tried), *advice_lines(found.advice)]
-    return [*lines, f"where       it is with {profile}:", *comparison_lines(found.comparison)]
+    lines += [*candidate_lines(found.tried), *(f"advice      {line}" for line in found.advice)]
+    return [*lines, f"where       the excess is with {profile}:", *comparison_lines(found.comparison)]
 
 
 def add_command(effects: Sequence[str], names: Mapping[str, Any]) -> str:
@@ -122,3 +194,119 @@ def _table(heading: str, unit: str, rows: Sequence[tuple[float, float, float]]) 
 
 def _bar(part: float) -> str:
     return "#" * round(BAR_WIDTH * min(max(part, 0.0), 1.0))
+
+
+def independence_lines(found: Independence | None, what: str = "of what is left") -> list[str]:
+    """How many correlations are beyond their bounds, and what that says; at most 80 columns."""
+    if found is None:
+        return []
+    head = f"correlations {what}: lags beyond 99 % bounds (of noise: 1 %)"
+    return [head] + [f"  {name:<17} {100 * part.outside:5.1f} %  {says}" for name, part, says in _verdicts(found)]
+
+
+def candidate_lines(tried: Sequence[Candidate]) -> list[str]:
+    """The table of all effects that were tried."""
+    if not tried:
+        return ["tried       nothing: no more of the robot's voice is left than of its silences"]
+    widths = (4, 20, 9, 10, 7, 9)
+    table = [HEADS, *(_cells(row) for row in tried)]
+    cells = (
+        [text.ljust(w) if column == 1 else text.rjust(w) for column, (text, w) in enumerate(zip(row, widths))]
+        for row in table
+    )
+    return ["tried       by Delta BIC; gain on held-out samples"] + [
+        f"  {' '.join(row)}  {whole[-1]}" for row, whole in zip(cells, table, strict=True)
+    ]
+
+
+def precision_lines(found: Precision) -> list[str]:
+    """Each number with its standard error, then what they share."""
+    if not found.numbers:
+        return []
+    width = max(len(known.label) for known in found.numbers)
+    lines = ["known       number +/- standard error"]
+    lines += [f"  {known.label:<{width}}  {error_text(known)}" for known in found.numbers]
+    if found.correlations:
+        lines.append("correlations of these")
+        lines += [f"  {first}, {second}  {r:+.2f}" for first, second, r in found.correlations]
+    return lines
+
+
+def error_text(known: Known) -> str:
+    """Say "-3.00 +/- 0.004 dB (0.1 %)", and where the error is from unless from the prediction's derivatives."""
+    unit = UNITS.get(known.unit, known.unit)
+    if known.error is None:
+        why = "at its bound" if known.source == "at its bound" else "no standard error: too few fits to tell"
+        return f"{figure(known.value)} {unit}".rstrip() + f", {why}"
+    share = known.error / abs(known.value) if known.value else 0.0
+    part = f" ({100 * share:.2g} %)" if 0.0 < share < 1.0 else " (unknown: more than itself)" if share else ""
+    by = ", from fits to thirds of the recording" if known.source == "thirds" else ""
+    return f"{figure(known.value)} +/- {figure(known.error)} {unit}".rstrip() + part + by
+
+
+def candidate_rows(tried: Sequence[Candidate]) -> dict[str, object]:
+    """The table for the page; named: whether a row is to stand out."""
+    return {
+        "heads": HEADS,
+        "rows": [{"cells": _cells(row), "named": row.verdict == "named"} for row in tried],
+    }
+
+
+def precision_rows(found: Precision) -> dict[str, object]:
+    """Numbers and correlations for the page."""
+    return {
+        "numbers": [(known.label, error_text(known)) for known in found.numbers],
+        "correlations": [(first, second, f"{r:+.2f}".replace("-", "−")) for first, second, r in found.correlations],
+    }
+
+
+def correlograms(found: Independence | None) -> dict[str, object] | None:
+    """What the page draws of a residual's correlations, and says below."""
+    if found is None:
+        return None
+    said = {name: f"{100 * part.outside:.1f} % of lags outside: {says}" for name, part, says in _verdicts(found)}
+    auto, *zones = (f"{name}, {text}" for name, text in said.items())
+    return {
+        "auto": {**_drawn(found.autocorrelation), "says": [auto]},
+        "cross": {**_drawn(found.cross_correlation), "says": zones},
+    }
+
+
+def _verdicts(found: Independence) -> list[tuple[str, Correlogram, str]]:
+    """Name, correlogram and what it says: of the autocorrelation, then of each range of lags behind the direct sound."""
+    auto = found.autocorrelation
+    at = auto.lags_ms[auto.largest]
+    rows = [("autocorrelation", auto, f"not white, largest at {at:.1f} ms" if auto.dependent else "white")]
+    for zone in found.zones:
+        heavy, light = f"{100 * zone.share:.0f} % of it: {zone.meaning}", "dependent, but less than 1 % of it"
+        says = (heavy if zone.share >= WEIGHT else light) if zone.part.dependent else "independent"
+        rows.append((f"{zone.low_ms:g} to {zone.high_ms:g} ms", zone.part, says))
+    return rows
+
+
+def _drawn(part: Correlogram) -> dict[str, object]:
+    step = float(part.lags_ms[1] - part.lags_ms[0])
+    arrays = {
+        name: np.round(getattr(part, name).astype(float), 4).tolist() for name in ("values", "expected", "bounds")
+    }
+    return {"from_ms": float(part.lags_ms[0]), "step_ms": step, **arrays}
+
+
+def _cells(row: Candidate) -> tuple[str, ...]:
+    def shown(value: float | None, digits: int) -> str:
+        return "-" if value is None else f"{round(value, digits) + 0.0:.{digits}f}"
+
+    verdict = row.verdict + (f": {row.why}" if row.why else "")
+    rank = "-" if row.rank is None else str(row.rank)
+    gains = (shown(row.gain_db, 2), shown(row.beside_db, 2))
+    return (rank, row.effect, *gains, shown(row.numbers, 0), shown(row.delta_bic, 0), verdict)
+
+
+def proof_line(proof: Proof | None, unproven: str) -> str:
+    """What the running filter made of what was found, or why it was not asked."""
+    if proof is None:
+        return f"proof       none: {unproven}"
+    return (
+        f"proof       running filter, {proof.seconds:.1f} s held out: ERLE {decibels(proof.erle_before_db)} dB before,"
+        f" {decibels(proof.erle_after_db)} dB after"
+    )

@@ -34,6 +34,7 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_two_effects_are_added_in_one_step_and_proven(scene: Path, tmp_path: Path, capsys) -> None:
     better, figures = tmp_path / "better.npz", tmp_path / "add.json"
     words = arguments(scene, "add chassis_resonance playback_gain", "--output", better, "--json", figures)
@@ -59,6 +60,7 @@ def test_two_effects_are_added_in_one_step_and_proven(scene: Path, tmp_path: Pat
     assert [name for name, _ in Profile.load(better).echo.effects] == ["chassis_resonance", "playback_gain"]
 
 
+@pytest.mark.slow
 def test_what_makes_the_filter_worse_is_refused_in_one_line_without_a_file(scene: Path, tmp_path: Path, capsys) -> None:
     out, figures = tmp_path / "worse.npz", tmp_path / "worse.json"
     words = arguments(scene, "add late_reverb", "--output", out, "--json", figures, mic="back.wav")
@@ -71,11 +73,13 @@ def test_what_makes_the_filter_worse_is_refused_in_one_line_without_a_file(scene
     assert [name for name, _ in Profile.load(out).echo.effects] == ["late_reverb"]
 
 
+@pytest.mark.slow
 def test_of_two_the_one_that_hurts_is_named(scene: Path, tmp_path: Path, capsys) -> None:
     words = arguments(scene, "add mic_clipping late_reverb", "--output", tmp_path / "x.npz", mic="back.wav")
     fails_in_one_line(capsys, words, 1, ["mic_clipping and late_reverb would make", "without late_reverb it is "])
 
 
+@pytest.mark.slow
 def test_all_that_is_found_is_applied_in_one_step(scene: Path, tmp_path: Path, capsys) -> None:
     better = tmp_path / "better.npz"
     assert main(arguments(scene, "diagnose", "--apply", better, "--json", "-")) == 0
@@ -88,6 +92,7 @@ def test_all_that_is_found_is_applied_in_one_step(scene: Path, tmp_path: Path, c
     assert "verdict     explained" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_what_is_named_can_be_proven_first(scene: Path, tmp_path: Path, capsys) -> None:
     kept = tmp_path / "proven.json"
     assert main(arguments(scene, "diagnose", "--prove", "--json", kept)) == 0
@@ -99,6 +104,7 @@ def test_what_is_named_can_be_proven_first(scene: Path, tmp_path: Path, capsys) 
     fails_in_one_line(capsys, words, 2, ["--prove without --profile"])
 
 
+@pytest.mark.slow
 def test_without_a_profile_one_is_made_and_proven_against_none(scene: Path, tmp_path: Path, capsys) -> None:
     made = tmp_path / "made.npz"
     files = ["--recording", str(scene / "mic.wav"), "--reference", str(scene / "ref.wav")]
@@ -146,3 +152,12 @@ def test_wrong_usage_is_one_line_and_exit_2(scene: Path, tmp_path: Path, capsys)
     fails_in_one_line(capsys, same, 2, ["--apply", "robot.npz", "overwritten"])
     fails_in_one_line(capsys, arguments(scene, "diagnose", "--apply", tmp_path / "no/x.npz"), 1, ["No such file"])
     assert not (tmp_path / "x.npz").exists()
+
+
+def test_what_an_added_effect_holds_is_shown_as_json_also_where_it_is_many_numbers(tmp_path: Path, capsys) -> None:
+    robot = profile()
+    gains = {"gain_db": np.linspace(0.0, 3.0, 240), "knots_hz": 40.0}
+    robot.with_echo(robot.echo.with_effect("mic_agc", gains)).save(tmp_path / "agc.npz")
+    assert main(["profile", "show", str(tmp_path / "agc.npz"), "--json", "-"]) == 0
+    (shown,) = json.loads(capsys.readouterr().out)["effects"]
+    assert shown["parameters"]["gain_db"] == pytest.approx(gains["gain_db"]) and shown["parameters"]["knots_hz"] == 40.0

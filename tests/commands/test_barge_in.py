@@ -1,9 +1,14 @@
 """A human who interrupts: the user's command is run beside the sound, and what cannot work is said."""
 
+import os
+import subprocess
+import sys
+import threading
 import time
 
 import numpy as np
 import pytest
+import soundfile
 
 from edgefilter import EgoFilter
 from edgefilter.cli import main
@@ -71,7 +76,7 @@ def test_the_robot_is_stopped_for_good_or_lowered_while_the_human_speaks(how, ga
     assert speech.gains == pytest.approx(gains)
 
 
-def test_an_engine_that_judges_no_speech_is_said_once_and_one_that_does_is_not():
+def test_an_engine_that_tells_no_speech_is_said_once_and_one_that_does_is_not():
     for engine, expected in (("bypass", 1), ("crnn", 0)):
         said = []
         ego = EgoFilter(engine=engine)
@@ -80,7 +85,9 @@ def test_an_engine_that_judges_no_speech_is_said_once_and_one_that_does_is_not()
             block = np.zeros(samples - ego.stats()["samples"], np.float32)
             ego.process(block, block)
             availability.show(Progress(samples=samples))
-        assert len(said) == expected and all("engine bypass does not judge speech" in text for text in said)
+        assert len(said) == expected and all(
+            "engine bypass does not tell whether somebody speaks" in text for text in said
+        )
 
 
 @pytest.mark.parametrize(
@@ -108,3 +115,30 @@ def test_speech_that_is_no_sound_is_one_line(tmp_path, capsys):
     assert main(words) == 1
     lines = capsys.readouterr().err.splitlines()
     assert len(lines) == 1 and "is not audio" in lines[0]
+
+
+def test_a_machine_that_starts_no_more_threads_is_one_line_and_the_sound_goes_on(monkeypatch):
+    def refuse(thread):
+        raise RuntimeError("can't start new thread")
+
+    said = []
+    with BargeInCommand("true", said.append) as reaction:
+        monkeypatch.setattr(threading.Thread, "start", refuse)
+        reaction.hear(STARTED)
+        monkeypatch.undo()
+    assert said == ["--on-barge-in: cannot be run (can't start new thread): true"]
+
+
+def test_a_terminal_that_goes_away_does_not_cost_the_run_a_sample(tmp_path):
+    """Nobody reads standard error any more, and an event is to be told there."""
+    rng = np.random.default_rng(1)
+    robot = 0.2 * rng.standard_normal(6 * 16_000)
+    heard = np.concatenate((np.roll(robot, 700)[: 3 * 16_000], np.roll(robot, 1500)[3 * 16_000 :]))
+    soundfile.write(tmp_path / "mic.wav", heard, 16_000, "FLOAT")
+    soundfile.write(tmp_path / "ref.wav", robot, 16_000, "FLOAT")
+    read, write = os.pipe()
+    os.close(read)
+    words = ["--input", "mic.wav", "--reference", "ref.wav", "--engine", "linear", "--output", "out.wav"]
+    done = subprocess.run([sys.executable, "-m", "edgefilter.cli", "run", *words], cwd=tmp_path, stderr=write)
+    os.close(write)
+    assert done.returncode == 0 and soundfile.info(tmp_path / "out.wav").frames == 6 * 16_000

@@ -61,6 +61,7 @@ def test_run_writes_as_many_samples_as_it_read_and_says_what_it_did(speech):
     assert "filtered 2.0 s" in result.stderr
 
 
+@pytest.mark.slow
 def test_a_pipe_gives_the_same_samples_as_a_file(speech):
     mic, ref = (soundfile.read(speech / name, dtype="int16")[0] for name in ("mic.wav", "ref.wav"))
     for name, x in (("mic16.wav", mic), ("ref16.wav", ref)):
@@ -82,6 +83,7 @@ def test_a_pipe_gives_the_same_samples_as_a_file(speech):
         assert np.array_equal(np.frombuffer(piped.stdout, "<i2"), soundfile.read(speech / "out.wav", dtype="int16")[0])
 
 
+@pytest.mark.slow
 def test_other_rates_and_channels_are_converted_and_said_so(speech):
     rng = np.random.default_rng(1)
     for rate, channels in ((8000, 1), (44100, 2), (48000, 1)):
@@ -93,6 +95,7 @@ def test_other_rates_and_channels_are_converted_and_said_so(speech):
         )
 
 
+@pytest.mark.slow
 def test_a_recorded_run_again_gives_the_identical_output(speech):
     assert run(speech, "--reference", speech / "ref.wav", "--record", speech / "heard", engine="ss").returncode == 0
     again = edgefilter(
@@ -142,6 +145,7 @@ def test_a_recording_of_one_sample_gives_one_sample(speech):
     assert soundfile.info(speech / "out.wav").frames == 1
 
 
+@pytest.mark.slow
 def test_a_short_reference_is_padded_and_a_silent_one_is_said(speech):
     soundfile.write(speech / "short.wav", np.full(100, 0.1), RATE)
     soundfile.write(speech / "silent.wav", np.zeros(2 * RATE), RATE)
@@ -152,6 +156,7 @@ def test_a_short_reference_is_padded_and_a_silent_one_is_said(speech):
     assert silent.returncode == 0 and "silent" in silent.stderr
 
 
+@pytest.mark.slow
 def test_an_output_that_cannot_be_written_is_one_line(speech):
     one_line(run(speech, output="no/such/folder/out.wav"), 1, "out.wav")
     one_line(run(speech, output="out.xyz/out"), 2, ".wav")
@@ -209,6 +214,7 @@ def test_a_damaged_profile_is_one_line(speech):
     one_line(run(speech, "--profile", speech / "p.npz"), 1, "p.npz")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_an_interrupted_run_leaves_a_valid_file_with_what_was_received(tmp_path, number):
     process = subprocess.Popen(

@@ -60,6 +60,7 @@ def test_compare_says_how_much_is_unexplained_and_where(scene, capsys):
     assert found["schema"] == 1 and found["excess_db"] > 3 and f"{found['excess_db']:.1f} dB" in out
 
 
+@pytest.mark.slow
 def test_add_lowers_the_error_and_remove_restores_the_profile(scene, tmp_path, capsys):
     better = tmp_path / "better.npz"
     assert main(arguments(scene, "add playback_gain", "--output", better, "--json", tmp_path / "add.json")) == 0
@@ -80,6 +81,7 @@ def test_add_lowers_the_error_and_remove_restores_the_profile(scene, tmp_path, c
     assert restored.echo.effects == () and np.array_equal(before.echo.impulse_response, restored.echo.impulse_response)
 
 
+@pytest.mark.slow
 def test_add_says_so_where_the_error_does_not_fall(scene, tmp_path, capsys):
     assert main(arguments(scene, "add playback_gain", "--output", tmp_path / "once.npz")) == 0
     assert (
@@ -89,6 +91,7 @@ def test_add_says_so_where_the_error_does_not_fall(scene, tmp_path, capsys):
     assert "the error did not fall" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_add_says_what_the_running_filter_makes_of_an_effect_where_that_is_nothing(scene, tmp_path, capsys):
     command = arguments(scene, "add clock_drift", "--output", tmp_path / "drift.npz", "--json")
     assert main([*command, str(tmp_path / "add.json")]) == 0
@@ -121,6 +124,7 @@ def test_diagnose_finds_what_is_missing_and_writes_the_documented_json(scene, ca
     assert "next        edgefilter add playback_gain --profile " in out
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("command", ["compare", "diagnose"])
 def test_the_report_is_one_file_that_loads_nothing(scene, tmp_path, command, capsys):
     assert main(arguments(scene, command, "--report", tmp_path / "r.html")) == 0
@@ -214,6 +218,7 @@ def test_wrong_usage_is_one_line_and_exit_2(scene, tmp_path, capsys):
     )
 
 
+@pytest.mark.slow
 def test_an_effect_of_ones_own_goes_through_every_command(tmp_path, capsys, own_registry):  # noqa: F811
     x, robot = voice(8.0), profile()
     own = ["--effects", documented_file(tmp_path)]

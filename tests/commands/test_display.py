@@ -1,13 +1,18 @@
 """What a person sees during a run."""
 
+import re
+import subprocess
 import sys
+import time
 
 import numpy as np
 import pytest
+import soundfile
 
 from edgefilter.commands import display
 from edgefilter.session import Progress
 from edgefilter.types import Block
+from tests.diagnosis.robot_scene import profile, record, voice
 
 STATS = {
     "engine": "crnn",
@@ -70,10 +75,9 @@ def test_the_status_line_is_drawn_on_a_terminal_and_nowhere_else(monkeypatch, ca
     assert capsys.readouterr().err == ""
 
 
-@pytest.mark.parametrize("total", [None, 160_000])
-def test_a_recording_gets_a_bar_that_counts_seconds(monkeypatch, total):
-    counted = []
-    monkeypatch.setattr(display.tqdm, "update", lambda bar, n: counted.append(n))
+@pytest.mark.parametrize(("total", "told"), [(None, "2 s"), (160_000, "2 of 10 s")])
+def test_a_recording_gets_progress_that_counts_seconds(monkeypatch, capsys, total, told):
+    monkeypatch.setattr(display, "LINE_PERIOD_S", 0.05)
 
     class Recording:
         live = False
@@ -81,7 +85,25 @@ def test_a_recording_gets_a_bar_that_counts_seconds(monkeypatch, total):
     Recording.total = total
     with display.display(Recording(), Ego(), quiet=False) as show:
         show(Progress(samples=32_000))
-    assert sum(counted) == pytest.approx(2.0)  # seconds; exact but for floats
+        time.sleep(0.5)
+    assert capsys.readouterr().err.splitlines()[-1].endswith(f"filtering: {told}")
+
+
+def test_a_short_recording_is_filtered_without_a_word_of_progress(capsys):
+    class Recording:
+        live, total = False, 160_000
+
+    with display.display(Recording(), Ego(), quiet=False) as show:
+        show(Progress(samples=32_000))
+    assert capsys.readouterr().err == ""
+
+
+def test_the_legend_explains_each_part_of_the_status_line():
+    progress = Progress(residual_db=-24.6)
+    line = display.status_line(progress, STATS, {"microphone_overruns": 1}, 220)
+    parts = {word for word in re.findall(r"[a-z]+", line) if word not in ("ms", "ppm", "d", "db")}
+    explained = "\n".join(row[:20] for row in display.STATUS_LEGEND.splitlines())
+    assert len(parts) == 11 and all(part in explained for part in parts), parts
 
 
 def test_json_goes_to_a_file_or_to_standard_output(tmp_path, capsys):
@@ -89,3 +111,39 @@ def test_json_goes_to_a_file_or_to_standard_output(tmp_path, capsys):
     assert (tmp_path / "x.json").read_text().split() == ["{", '"a":', "1", "}"]
     display.write_json({"b": 2}, "-")
     assert '"b": 2' in capsys.readouterr().out
+
+
+def test_a_long_command_says_what_it_does_before_it_has_done_it_where_there_is_no_terminal(tmp_path):
+    """A pipe gets a line at once, then one now and then; standard output has nothing of it."""
+    x = voice(6.0)
+    soundfile.write(tmp_path / "ref.wav", x, 16000, "FLOAT")
+    soundfile.write(tmp_path / "mic.wav", record(x), 16000, "FLOAT")
+    profile().save(tmp_path / "robot.npz")
+    files = ["--profile", "robot.npz", "--recording", "mic.wav", "--reference", "ref.wav"]
+    child = subprocess.Popen(
+        [sys.executable, "-m", "edgefilter.cli", "diagnose", *files],
+        cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    try:
+        assert "diagnosis" in child.stderr.readline()
+        assert child.poll() is None, "said when all was over"
+    finally:
+        child.kill()
+        out, _ = child.communicate()
+    assert out == ""
+
+
+def test_piped_output_is_there_line_by_line_and_not_when_the_program_ends():
+    """What is printed stays where the process then dies without a word."""
+    code = "import os; from edgefilter.cli import main; main(['devices', '--setup']); print('last'); os._exit(0)"
+    done = subprocess.run([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
+    assert done.stdout.endswith("last\n")
+
+
+def test_progress_goes_on_being_said_while_one_step_lasts(capsys, monkeypatch):
+    monkeypatch.setattr(display, "LINE_PERIOD_S", 0.05)
+    with display.progress("diagnosis") as step:
+        step("trying late_reverb")
+        time.sleep(0.5)
+    said = capsys.readouterr().err.splitlines()
+    assert said[0].endswith("diagnosis") and len(said) > 3 and said[-1].endswith("diagnosis: trying late_reverb")

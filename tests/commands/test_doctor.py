@@ -1,7 +1,8 @@
 """`edgefilter doctor` on machines that lack something: each finding says what to do, and the exit code tells."""
 
 import json
-from types import SimpleNamespace
+from itertools import islice
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -83,11 +84,12 @@ def test_clock_and_level_are_judged(pace, level, peak, states, words):
     assert words in " ".join(check.found + check.do for check in found)
 
 
-def test_another_model_than_the_package_s_is_said(monkeypatch, tmp_path):
-    (own := tmp_path / "crnn_int8.onnx").write_bytes(b"mine")
-    monkeypatch.setattr(doctor, "create", lambda name: SimpleNamespace(model=SimpleNamespace(path=own)))
-    (found,) = doctor._model()
-    assert found.state == "warning" and str(own) in found.found and "EDGEFILTER_CRNN" in found.do
+def test_another_model_than_the_package_s_is_said(monkeypatch):
+    own = Path(__file__).parents[2] / "models/crnn_20ms_int8.onnx"
+    monkeypatch.setenv("EDGEFILTER_CRNN", str(own))
+    _, found = islice(doctor.examine("mic", None), 2)
+    assert (found.name, found.state) == ("model", "warning")
+    assert str(own) in found.found and "EDGEFILTER_CRNN" in found.do
 
 
 def test_pace_and_level_are_measured(monkeypatch):
@@ -123,3 +125,16 @@ def test_pace_and_level_are_measured(monkeypatch):
     (heard,) = listen([port], seconds=2.0)
     assert heard.pace == pytest.approx(1.02, abs=1e-3) and port.opened and port.closed
     assert heard.level_db == pytest.approx(-20.0, abs=0.1) and heard.overruns == 0
+
+
+def test_devices_are_listed_where_no_output_exists(monkeypatch, capsys):
+    """A reference needs an output; the list does not."""
+    from edgefilter.audio import device
+
+    microphone = {"index": 0, "inputs": 1, "outputs": 0, "rate": 48_000.0, "name": "USB microphone"}
+    monkeypatch.setattr(device, "list_devices", lambda: [microphone])
+    monkeypatch.setattr(device, "monitor_of", raises(DeviceError("no sound device with an output was found")))
+    monkeypatch.setattr(pulse, "names", lambda kind: [])
+    assert main(["devices"]) == 0
+    listed = capsys.readouterr().out.splitlines()
+    assert "USB microphone" in listed[0] and listed[-1].endswith("none (no sound device with an output was found)")

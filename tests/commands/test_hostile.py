@@ -211,6 +211,7 @@ def wait_until_full(pipe):
     raise AssertionError("nothing came out")
 
 
+@pytest.mark.slow
 def test_a_second_signal_ends_a_run_whose_reader_does_not_read(folder):
     child = subprocess.Popen(
         [

@@ -11,7 +11,7 @@ import soundfile
 
 from edgefilter import EgoFilter, Profile, enhance
 from edgefilter.cli import main
-from edgefilter.commands.event_log import EventLog
+from edgefilter.commands.observers import EventLog
 from edgefilter.errors import AudioFileError
 from edgefilter.types import Event
 from tests.diagnosis.robot_scene import profile

@@ -27,6 +27,7 @@ def run(folder, *more):
     return code, json.loads((folder / "run.json").read_text()) if code == 0 else None
 
 
+@pytest.mark.slow
 def test_what_a_run_learns_is_kept_and_the_next_begins_with_it(folder, capsys):
     file = folder / "robot.npz"
     code, first = run(folder, "--learn", str(file))

@@ -24,7 +24,7 @@ from edgefilter.echo.effects import catalogue
 from edgefilter.echo.effects.catalogue import find
 from edgefilter.echo.model import EchoModel
 from edgefilter.profile.data import Profile
-from edgefilter.report.variants import compare_variants
+from edgefilter.report.html import compare_variants
 from edgefilter.types import PRE_ROLL
 from tests.diagnosis.robot_scene import DELAY, FAN, path, profile, record, voice
 

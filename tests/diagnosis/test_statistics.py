@@ -17,8 +17,7 @@ from edgefilter.diagnosis.result import Candidate, Known, Precision
 from edgefilter.diagnosis.select import search
 from edgefilter.echo.effects.catalogue import find
 from edgefilter.echo.measurement import Measurement
-from edgefilter.report.statistics import candidate_lines, error_text, independence_lines, precision_lines
-from edgefilter.report.text import diagnosis_lines
+from edgefilter.report.text import candidate_lines, diagnosis_lines, error_text, independence_lines, precision_lines
 from tests.diagnosis.robot_scene import profile, record, voice
 
 GAIN_DB = -2.0
@@ -87,7 +86,7 @@ def test_the_text_says_all_of_it(diagnosed):
     found = diagnosed[2]
     text = "\n".join(diagnosis_lines(found))
     assert "playback_gain.gain_db  -2.00 +/- 0.0" in text
-    assert "independence with all that was found" in text and "independence of what is left" in text
+    assert "correlations with all that was found" in text and "correlations of what is left" in text
     assert "Delta BIC  verdict" in text
     left, profile_alone = (independence_lines(test)[3] for test in (found.independence, found.comparison.independence))
     assert "another level, lag" in profile_alone and "another level, lag" not in left

@@ -13,11 +13,10 @@ from PIL import Image
 from edgefilter.diagnosis.compare import compare
 from edgefilter.diagnosis.diagnose import Diagnosis, Finding, Interval
 from edgefilter.echo.effects.catalogue import EFFECTS
-from edgefilter.report import words
-from edgefilter.report.html import add_command, diagnosis_page
+from edgefilter.report import text
+from edgefilter.report.html import choices, compare_variants, diagnosis_page
 from edgefilter.report.media import LEVELS, MAX_COLUMNS, colour_scale, colours, sound, spectrogram_db, spectrogram_png
-from edgefilter.report.text import coarser, diagnosis_lines
-from edgefilter.report.variants import choices, compare_variants
+from edgefilter.report.text import add_command, coarser, diagnosis_lines
 from tests.diagnosis.robot_scene import profile, record, voice
 
 RATE = 16000
@@ -33,7 +32,7 @@ def finding(name: str, values: dict, before: float = 9.0, after: float = 1.0) ->
 
 
 @pytest.mark.parametrize(
-    ("interval", "text"),
+    ("interval", "said"),
     [
         (Interval(0.614, 0.561, 0.66, "s"), "0.614 s (0.561 to 0.660)"),
         (Interval(80.04, 79.0, 81.2, "1e-6"), "80.0 ppm (79.0 to 81.2)"),
@@ -43,23 +42,23 @@ def finding(name: str, values: dict, before: float = 9.0, after: float = 1.0) ->
         (Interval(2e-9, 1e-9, 3e-9, "1"), "2e-09 (1e-09 to 3e-09)"),
     ],
 )
-def test_parameters_read_as_people_write_them(interval, text):
-    assert words.interval_text(interval) == text
+def test_parameters_read_as_people_write_them(interval, said):
+    assert text.interval_text(interval) == said
 
 
 def test_sentences_for_the_three_verdicts():
     assert (
-        words.headline("missing", ["late_reverb", "clock_drift"])
+        text.headline("missing", ["late_reverb", "clock_drift"])
         == "Missing from the profile: late reverberation and clock drift."
     )
-    assert words.headline("explained", []) == "The profile explains this recording."
-    assert "no known effect explains." in words.headline("unexplained", [])
-    assert words.headline("unexplained", ["my_own"]).endswith("besides my own.")
-    assert words.decibels(-0.04) == "0.0"
+    assert text.headline("explained", []) == "The profile explains this recording."
+    assert "no known effect explains." in text.headline("unexplained", [])
+    assert text.headline("unexplained", ["my_own"]).endswith("besides my own.")
+    assert text.decibels(-0.04) == "0.0"
 
 
 def test_every_built_in_effect_has_a_name_for_people():
-    assert all(effect.title and words.spoken(effect.name) == effect.title for effect in EFFECTS)
+    assert all(effect.title and text.spoken(effect.name) == effect.title for effect in EFFECTS)
 
 
 def test_the_terminal_says_verdict_budget_parameters_and_what_is_left():
@@ -67,7 +66,7 @@ def test_the_terminal_says_verdict_budget_parameters_and_what_is_left():
     found = compare(profile(), record(x), x)
     two = (finding("late_reverb", {"rt60_s": 0.61}), finding("my_own", {"depth": 2.0}, 1.0, 0.3))
     lines = diagnosis_lines(Diagnosis("missing", found, two, "A hum at 50 Hz.", 0.3, 0.1, profile().echo))
-    text = "\n".join(lines)
+    told = "\n".join(lines)
     assert lines[0] == "verdict     missing: Missing from the profile: late reverberation and my own."
     for part in (
         "with late_reverb",
@@ -76,7 +75,7 @@ def test_the_terminal_says_verdict_budget_parameters_and_what_is_left():
         "Evidence for my_own.",
         "left        A hum at 50 Hz.",
     ):
-        assert part in text, part
+        assert part in told, part
     bars = [len(line) - len(line.rstrip("#")) for line in lines if line.startswith("  with ")]
     assert bars[0] > bars[1] > 0
 
@@ -99,8 +98,8 @@ def test_a_tone_is_at_its_place_and_level_in_the_spectrogram():
     )  # a bin's centre is hit: only the window's samples differ
     image = Image.open(content(spectrogram_png(x, (-72.0, 0.0))))
     index = np.asarray(image)
-    assert index.shape == (241, level.shape[0]) and image.palette.getdata()[1][:3] == colours()[0].tobytes()
-    row = 240 - round(2000 / (8000 / 240))
+    assert index.shape == (257, level.shape[0]) and image.palette.getdata()[1][:3] == colours()[0].tobytes()
+    row = 256 - round(2000 / (8000 / 256))
     assert index[row, -10] == round((1 + 20 * np.log10(0.5) / 72) * (LEVELS - 1)) == index.max()
     assert not index[:, : level.shape[0] // 2 - 2].any()
 
@@ -144,6 +143,7 @@ def test_subsets_are_compared_on_one_alignment():
     assert found[(True,)].offset_samples == found[(False,)].offset_samples
 
 
+@pytest.mark.slow
 def test_four_effects_give_five_comparisons_in_the_page():
     x, robot = voice(3.0), profile()
     y = record(x)

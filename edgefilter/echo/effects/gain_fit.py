@@ -77,7 +77,7 @@ class GainFit:
         measurement = self._measurement
         parts = [measurement.whiten(self._model.predict(part)) for part in self._make(measurement.reference, unknowns)]
         rows = np.stack(parts, axis=1) * measurement.weights[:, None]
-        normal, right = np.float64(rows.T @ rows), np.float64(rows.T @ measurement.white_recording)
+        normal, right = (rows.T @ rows).astype(float), (rows.T @ measurement.white_recording).astype(float)
         return np.linalg.solve(normal + 1e-6 * np.trace(normal) * np.eye(right.size) + 1e-30, right)
 
     def _heard(self, sound: Samples) -> Samples:
@@ -125,7 +125,7 @@ class GainFit:
 
 def _solved(rows: Samples, target: Samples, ridge: Array) -> Samples:
     """(k,) least-squares weights of rows (m, k); ridge (k,) is relative to each one's own energy."""
-    normal, right = np.float64(rows.T @ rows), np.float64(rows.T @ target)
+    normal, right = (rows.T @ rows).astype(float), (rows.T @ target).astype(float)
     scale = np.sqrt(normal.diagonal()) + 1e-30
     return np.float32(np.linalg.solve(normal / scale[:, None] / scale + np.diag(ridge), right / scale) / scale)
 

@@ -224,7 +224,7 @@ class _Halves:
         """Of each half the weighted products of linear voice, columns and target with each other."""
         rows = np.concatenate((self._linear, columns, self._target), axis=1)
         first, second = rows[: self._split], rows[self._split :]
-        return np.float64(first.T @ first), np.float64(second.T @ second)
+        return (first.T @ first).astype(float), (second.T @ second).astype(float)
 
 
 def _solved(normal: Array) -> Array:
