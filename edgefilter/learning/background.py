@@ -133,8 +133,9 @@ class _Worker:
     """The learner's process and the pipes to it, for which nobody ever waits but at the end. unsent: messages, or the rest of one."""
 
     def __init__(self) -> None:
-        # the very path of this process: -m would look into the working directory first
-        code = f"import sys; sys.path[:] = {sys.path!r}; from edgefilter.learning.worker import main; main()"
+        # what this process imports from but the working directory, where anybody's numpy.py may lie; -m would look there
+        path = [*filter(None, sys.path), str(Path(__file__).parents[2])]
+        code = f"import sys; sys.path[:] = {path!r}; from edgefilter.learning.worker import main; main()"
         environment = {
             **os.environ,
             "OMP_NUM_THREADS": "1",

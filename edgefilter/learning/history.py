@@ -38,8 +38,8 @@ class HopHistory:
             del self._hops[:-most]
 
     def since(self, count: int) -> Sequence[tuple[FilteredHop, bool]]:
-        """What is kept of the hops that came after the first `count`, each with whether the robot was audible."""
-        return self._hops[max(0, len(self._hops) - (self.count - count)) :]
+        """The hops after the first `count` of all, at most RECENT_S of them; each with whether the robot was audible."""
+        return self._hops[max(0, len(self._hops) - min(self.count - count, self._hops_of(RECENT_S))) :]
 
     def recent(self) -> HopHistory:
         """Its newest RECENT_S."""
