@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import fft, signal
+from scipy import fft
 from scipy.ndimage import binary_closing, uniform_filter1d
 
 from edgefilter.calibration.sweep import DRIFT_REACH
@@ -244,7 +244,7 @@ def decay_prior(seconds: float, peak: float) -> Array:
 def bands_over_fan(predicted: Samples) -> tuple[np.ndarray, np.ndarray]:
     """Third-octave bands (B, 2) Hz and the mean power of the whitened prediction in each over the fan's, dB."""
     bands = third_octave_bands()
-    density = signal.welch(predicted, SAMPLE_RATE, nperseg=GRID_FFT, detrend=False)[1] * SAMPLE_RATE / 2
+    density = periodograms(predicted, GRID_FFT).mean(axis=0) * SAMPLE_RATE / 2
     means = [density[(GRID_HZ >= low - 7) & (GRID_HZ < high + 7)].mean() for low, high in bands]
     return bands, 10 * np.log10(np.clip(np.array(means, np.float64), 1e-2, 1e12))
 

@@ -16,7 +16,7 @@ from edgefilter.engines import create
 from edgefilter.errors import EdgefilterError
 from edgefilter.filter.budget import DEFAULT_MS
 from edgefilter.filter.ego_filter import EgoFilter
-from edgefilter.learning.background import LEAST_CORES, cores
+from edgefilter.learning.background import cores
 from edgefilter.types import SAMPLE_RATE
 
 if TYPE_CHECKING:
@@ -75,8 +75,8 @@ def _guarded(name: str, look: Callable[[], Iterator[Check]]) -> Iterator[Check]:
 
 def _machine() -> Iterator[Check]:
     found = cores()
-    few = "loudspeaker and room are not learned during a run; allow another core"
-    yield Check("cores", "ok", str(found)) if found >= LEAST_CORES else Check("cores", "warning", str(found), few)
+    few = "loudspeaker and room are not learned while running; allow another core"
+    yield Check("cores", "ok", str(found)) if found > 1 else Check("cores", "warning", str(found), few)
 
 
 def _model() -> Iterator[Check]:

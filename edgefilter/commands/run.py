@@ -26,7 +26,7 @@ from edgefilter.errors import EdgefilterError, UsageError
 from edgefilter.filter.budget import DEFAULT_MS, Choice, choose, forget
 from edgefilter.filter.ego_filter import EgoFilter
 from edgefilter.filter.learner import Learner
-from edgefilter.learning.background import LEAST_CORES, BackgroundLearner, cores
+from edgefilter.learning.background import BackgroundLearner, cores
 from edgefilter.profile.data import Profile
 from edgefilter.session import RunReport, filter_blocks
 from edgefilter.types import SAMPLE_RATE, Block
@@ -177,7 +177,7 @@ def make_learner(args: argparse.Namespace, live: bool, profile: Profile | None) 
         from edgefilter.learning.path_learner import PathLearner
 
         return PathLearner(profile, remember)
-    if cores() < LEAST_CORES:
+    if cores() == 1:
         say("one core only: loudspeaker and room are not learned while running")
         return None
     return BackgroundLearner(profile, remember)

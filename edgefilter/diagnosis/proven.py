@@ -1,4 +1,4 @@
-"""A diagnosis held against the running filter: a name with which it is worse on seconds that no fit has seen is not given."""
+"""A diagnosis of the first part of a recording, proven on the rest: a name with which the running filter is worse there is not given."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import replace
 
 from edgefilter.diagnosis.criteria import Criteria
 from edgefilter.diagnosis.diagnose import diagnose
-from edgefilter.diagnosis.proof import Proof, lasts, prove
+from edgefilter.diagnosis.proof import HeldOut, Proof, lasts, prove
 from edgefilter.diagnosis.result import Candidate, Diagnosis
 from edgefilter.errors import SignalError
 from edgefilter.profile.data import Profile
@@ -22,7 +22,7 @@ def diagnose_proven(
     progress: Callable[[str], None] | None = None,
     criteria: Criteria | None = None,
 ) -> Diagnosis:
-    """`diagnose`, and without the effects that the running filter contradicts.
+    """`diagnose` of the first part of a recording, without the effects that the running filter contradicts on the rest.
 
     Parameters
     ----------
@@ -45,9 +45,11 @@ def diagnose_proven(
 
     Notes
     -----
-    What was found is fitted to three fifths of the robot's voice and heard by the running filter on the rest (`prove`).
-    Where that is worse, the diagnosis is made anew without the effect that does most harm, until it is not: another one
-    may take its place. Not proven are events, which do not come again, and changes of the fan.
+    The first three fifths of the robot's voice are diagnosed, so that names, as values, come from seconds on which they
+    are not proven. The running filter then takes the rest (`prove`). Where it is worse with what was found, the
+    diagnosis is made anew without the effect that does most harm, until it is not: another one may take its place. Not
+    proven are events, which do not come again, and changes of the stationary noise. Where a recording is too short to
+    be cut, all of it is diagnosed and nothing proven.
 
     Examples
     --------
@@ -66,17 +68,22 @@ def diagnose_proven(
     ('playback_gain', False)
     """
     disproved: dict[str, Proof] = {}
+    try:
+        stop, too_short = HeldOut(profile, recording, reference).cut, ""
+    except SignalError as error:
+        stop, too_short = recording.size, str(error)
     while True:
-        found = diagnose(profile, recording, reference, progress=progress, criteria=criteria, without=disproved)
+        found = diagnose(
+            profile, recording[:stop], reference[:stop], progress=progress, criteria=criteria, without=disproved
+        )
         names = tuple(finding.effect for finding in found.ranking if lasts(finding.effect))
         if not names:
             return _told(found, disproved, unproven="nothing lasting was found")
+        if too_short:
+            return _told(found, disproved, unproven=too_short)
         if progress:
             progress("the running filter without and with what was found")
-        try:
-            proof = prove(profile, names, recording, reference)
-        except SignalError as error:
-            return _told(found, disproved, unproven=str(error))
+        proof = prove(profile, names, recording, reference)
         if not proof.worse:
             return _told(found, disproved, proof)
         disproved[proof.culprit or names[0]] = proof

@@ -70,6 +70,11 @@ def load_effect(path: str | Path) -> str:
     return effect.name
 
 
+def loaded_files() -> tuple[Path, ...]:
+    """The files of all effects of the user's own that are known, for another process to load."""
+    return tuple(_loaded)
+
+
 def _guarded(path: Path, mine: type[Effect]) -> type[Effect]:
     """A subclass of the user's class: what its hooks raise becomes one line that names the file and the line in it, what they give is checked."""
     own = [name for name in HOOKS if getattr(mine, name) is not getattr(Effect, name)]

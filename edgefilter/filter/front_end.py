@@ -12,7 +12,7 @@ from edgefilter.echo.source_chain import SourceChain
 from edgefilter.engines.base import ClipEngine, Engine
 from edgefilter.filter.canceller import Canceller, CancellerOutput
 from edgefilter.filter.echo_path import EchoPath, starting_path
-from edgefilter.filter.learner import Heard, Learner, Lesson
+from edgefilter.filter.learner import FilteredHop, Learner, Lesson
 from edgefilter.filter.onset_gate import GATE, OnsetGate
 from edgefilter.filter.residual_echo import Residual, Unpredictable
 from edgefilter.profile.data import Profile
@@ -31,7 +31,7 @@ class LinearStage:
 
     lesson: Lesson | None = None
     _next: Lesson | None = None
-    _heard: Heard | None = None
+    _latest: FilteredHop | None = None
 
     def __init__(self, aligner: Aligner, path: EchoPath, residual: Residual, learner: Learner | None = None) -> None:
         self.aligner = aligner
@@ -57,13 +57,13 @@ class LinearStage:
             output = self._adopt(self.lesson, mic, aligned.reference, located, output)
         if self._learner:
             idle = aligned.state == "idle"
-            self._heard = Heard(mic, aligned.reference, output.innovation, located, idle, past, aligned.delay)
+            self._latest = FilteredHop(mic, aligned.reference, output.innovation, located, idle, past, aligned.delay)
         return output
 
     def learn(self) -> None:
         """Tell the learner of the latest hop."""
-        if self._learner and self._heard:
-            self._next = self._learner.hear(self._heard)
+        if self._learner and self._latest:
+            self._next = self._learner.observe(self._latest)
 
     def _adopt(
         self, lesson: Lesson, mic: Samples, reference: Samples, located: bool, before: CancellerOutput

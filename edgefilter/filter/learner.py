@@ -8,7 +8,7 @@ from edgefilter.filter.echo_path import PathState
 from edgefilter.types import EventKind, Samples
 
 
-class Heard(NamedTuple):
+class FilteredHop(NamedTuple):
     """One hop of the running filter.
 
     mic, reference, innovation: (hop,) float32, the microphone, the aligned reference, and the microphone less the echo
@@ -27,9 +27,9 @@ class Heard(NamedTuple):
 
 
 class Lesson(NamedTuple):
-    """A path that has proved better than the one in use, to be taken over.
+    """A path that predicts better than the one in use, to be taken over.
 
-    kind: "learned", or "unlearned" where the one before is to come back. detail: in words, with figures.
+    kind: "learned", or "unlearned" where an earlier path comes back. detail: in words, with figures.
     """
 
     path: PathState
@@ -38,18 +38,18 @@ class Lesson(NamedTuple):
 
 
 class Learner(Protocol):
-    """Listens to the hops of one stream and now and then knows a better path."""
+    """Follows the hops of one stream and now and then knows a better path."""
 
     @property
     def past(self) -> int:
-        """Samples of the aligned reference that Heard.past is to hold."""
+        """Samples of the aligned reference that FilteredHop.past is to hold."""
         ...
 
     def start(self, path: PathState, hop: int) -> None:
         """A stream begins with that path, in steps of hop samples."""
         ...
 
-    def hear(self, heard: Heard) -> Lesson | None:
+    def observe(self, hop: FilteredHop) -> Lesson | None:
         """Take one hop; the lesson is adopted with the next one."""
         ...
 

@@ -1,4 +1,4 @@
-"""Learning in another process: the running filter leaves its hops in shared memory and finds lessons there."""
+"""Learning in another process: the running filter sends its hops there and takes the lessons that come back."""
 
 from __future__ import annotations
 
@@ -8,16 +8,41 @@ import struct
 import subprocess
 import sys
 import weakref
+from collections import deque
+from contextlib import suppress
 from pathlib import Path
+from typing import NamedTuple
 
+from edgefilter.echo.user_effects import loaded_files
 from edgefilter.filter.echo_path import PathState
-from edgefilter.filter.learner import Heard, Lesson
-from edgefilter.learning.shared import PAST, SharedHops
+from edgefilter.filter.learner import FilteredHop, Lesson
+from edgefilter.learning.history import PAST, RECENT_S
 from edgefilter.profile.data import Profile
+from edgefilter.types import SAMPLE_RATE
 
-LEAST_CORES = 2
 GOODBYE_S = 20.0
-"""How long a learner's process may take to end."""
+"""How long a learner's process may take to end, s: a fit and the writing of a file, on a slow machine."""
+LENGTH = struct.Struct("<q")
+"""Before each message of the learner's process: its bytes."""
+
+
+class Beginning(NamedTuple):
+    """To the learner's process: a stream begins. What comes back of it bears its number. effect_files: of the user's own effects."""
+
+    stream: int
+    path: PathState
+    hop: int
+    profile: Profile | None
+    remember: Path | None
+    effect_files: tuple[Path, ...]
+
+
+class News(NamedTuple):
+    """From the learner's process: what it says of itself, and a lesson where there is one."""
+
+    stream: int
+    stats: dict[str, object]
+    lesson: Lesson | None
 
 
 class BackgroundLearner:
@@ -30,8 +55,9 @@ class BackgroundLearner:
 
     Notes
     -----
-    A hop costs the running filter a copy of three arrays into shared memory. Where the process falls behind by 16 s, or
-    ends, the filter goes on without lessons, and `stats` says so.
+    A hop costs the running filter a copy of three arrays into a pipe; it never waits for the other process. Where that
+    process falls behind by 15 s, it begins anew; where it ends, or cannot be started, the filter goes on without
+    lessons. `stats` tells of both.
 
     Examples
     --------
@@ -45,55 +71,133 @@ class BackgroundLearner:
 
     def __init__(self, profile: Profile | None = None, remember: Path | None = None) -> None:
         self._profile, self._remember = profile, remember
-        self._ring: SharedHops | None = None
-        self._process: subprocess.Popen[bytes] | None = None
+        self._worker: _Worker | None = None
+        self._lesson: Lesson | None = None
+        self._stats: dict[str, object] = {}
+        self._stream = 0
+
+    @property
+    def pid(self) -> int | None:
+        """Of the other process; None where there is none."""
+        return self._worker.process.pid if self._worker else None
 
     def start(self, path: PathState, hop: int) -> None:
         """A stream begins: what was learned of one before is forgotten."""
         self.close()
-        self._ring = SharedHops(hop, self.past)
-        command = [sys.executable, "-m", "edgefilter.learning.worker", self._ring.name]
-        environment = {**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
-        self._process = subprocess.Popen(command, stdin=subprocess.PIPE, env=environment, start_new_session=True)
-        self._finalizer = weakref.finalize(self, _end, self._process, self._ring)
-        send(self._process, (path, hop, self._profile, self._remember))
+        self._path, self._hop, self._stream, self._stats = path, hop, 0, {}
+        with suppress(OSError):  # no memory for another process, or no interpreter: the filter goes on without
+            self._worker = _Worker()
+            self._finalizer = weakref.finalize(self, self._worker.end)
+            self._begin()
 
-    def hear(self, heard: Heard) -> Lesson | None:
-        """Leave the hop for the other process, and look whether a lesson has come."""
-        if self._ring is None:
+    def observe(self, hop: FilteredHop) -> Lesson | None:
+        """Send the hop to the other process, and look whether a lesson has come."""
+        if self._worker is None:
             return None
-        self._ring.write(heard)
-        return self._ring.take()
+        if len(self._worker.unsent) > RECENT_S * SAMPLE_RATE / self._hop:
+            self._worker.forget()
+            self._stream += 1
+            self._begin()
+        self._worker.send(hop)
+        self._take(self._worker.exchange())
+        lesson, self._lesson = self._lesson, None
+        return lesson
 
     def stats(self) -> dict[str, object]:
         """What the other process has told of itself, and whether it lives."""
-        running = self._process is not None and self._process.poll() is None
-        return {**(self._ring.figures() if self._ring else {}), "process": "running" if running else "ended"}
+        if self._worker:
+            self._take(self._worker.exchange())
+        running = self._worker is not None and self._worker.process.poll() is None
+        return {**self._stats, "fell_behind": self._stream, "process": "running" if running else "ended"}
 
     def close(self) -> None:
         """End the other process; it writes down what it is to remember first."""
-        if self._ring is not None:
-            self._finalizer()
-            self._process = None
+        if self._worker:
+            self._finalizer.detach()
+            self._take(self._worker.end())
+            self._worker = self._lesson = None
+
+    def _begin(self) -> None:
+        assert self._worker is not None
+        beginning = Beginning(self._stream, self._path, self._hop, self._profile, self._remember, loaded_files())
+        self._worker.send(beginning)
+
+    def _take(self, all_news: list[News]) -> None:
+        for news in all_news:
+            if news.stream == self._stream:
+                self._stats, self._lesson = news.stats, news.lesson or self._lesson
+                self._path = news.lesson.path if news.lesson else self._path
 
 
-def send(process: subprocess.Popen[bytes], message: object) -> None:
-    """Write a message to the process, its length first."""
-    data = pickle.dumps(message, protocol=5)
-    assert process.stdin is not None
-    process.stdin.write(struct.pack("<q", len(data)) + data)
-    process.stdin.flush()
+class _Worker:
+    """The learner's process and the pipes to it, for which nobody ever waits but at the end. unsent: messages, or the rest of one."""
 
+    def __init__(self) -> None:
+        # what this process imports from but the working directory, where anybody's numpy.py may lie; -m would look there
+        path = [*filter(None, sys.path), str(Path(__file__).parents[2])]
+        code = f"import sys; sys.path[:] = {path!r}; from edgefilter.learning.worker import main; main()"
+        environment = {
+            **os.environ,
+            "OMP_NUM_THREADS": "1",
+            "OPENBLAS_NUM_THREADS": "1",
+            "MALLOC_MMAP_THRESHOLD_": "262144",  # glibc: what a fit took goes back to the system after it
+        }
+        self.process = subprocess.Popen(
+            [sys.executable, "-c", code],
+            bufsize=0,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            env=environment,
+            start_new_session=True,
+        )
+        assert self.process.stdin is not None and self.process.stdout is not None
+        self._to, self._from = self.process.stdin, self.process.stdout
+        for pipe in (self._to, self._from):
+            os.set_blocking(pipe.fileno(), False)
+        self.unsent: deque[memoryview] = deque()
+        self._received = bytearray()
 
-def _end(process: subprocess.Popen[bytes], ring: SharedHops) -> None:
-    if process.stdin is not None:
-        process.stdin.close()
-    try:
-        process.wait(GOODBYE_S)
-    except subprocess.TimeoutExpired:
-        process.kill()
-        process.wait()
-    ring.unlink()
+    def send(self, message: Beginning | FilteredHop) -> None:
+        """Queue a message for the next exchange."""
+        self.unsent.append(memoryview(pickle.dumps(message, protocol=5)))
+
+    def forget(self) -> None:
+        """Drop all that is queued but the first message, of which a part may be written already."""
+        while len(self.unsent) > 1:
+            self.unsent.pop()
+
+    def exchange(self) -> list[News]:
+        """Write as much of the queue as the pipe takes; return the messages that have come, each as a whole."""
+        try:
+            while self.unsent and (written := self._to.write(self.unsent[0])):
+                self.unsent[0] = self.unsent[0][written:]
+                if not self.unsent[0]:
+                    self.unsent.popleft()
+            while data := self._from.read(1 << 16):
+                self._received += data
+        except OSError:  # the process has ended
+            self.unsent.clear()
+        return self._whole()
+
+    def end(self) -> list[News]:
+        """Close the pipe, which ends the process, and return its last messages."""
+        try:
+            self._received += self.process.communicate(b"".join(self.unsent), GOODBYE_S)[0]
+        except subprocess.TimeoutExpired:
+            self.process.kill()
+            self.process.communicate()
+        self.unsent.clear()
+        return self._whole()
+
+    def _whole(self) -> list[News]:
+        found = []
+        while len(self._received) >= LENGTH.size:
+            stop = LENGTH.size + LENGTH.unpack_from(self._received)[0]
+            if len(self._received) < stop:
+                break
+            found.append(pickle.loads(self._received[LENGTH.size : stop]))
+            del self._received[:stop]
+        return found
 
 
 def cores() -> int:

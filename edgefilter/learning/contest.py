@@ -1,4 +1,4 @@
-"""Which of two paths predicts better what neither has heard yet."""
+"""Which of two paths predicts unseen hops better."""
 
 from __future__ import annotations
 
@@ -8,25 +8,25 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from edgefilter.filter.echo_path import EchoPath
-from edgefilter.filter.learner import Heard
-from edgefilter.learning.tape import emphasised
+from edgefilter.filter.learner import FilteredHop
+from edgefilter.learning.history import emphasised
 from edgefilter.types import EventKind
 
 BLOCK = 6
 """Audible hops, 96 ms, whose errors are compared as one."""
 LEAST, MOST = 8, 60
-"""Blocks after which a verdict is possible, and after which a rival that has not won is given up."""
-LATEST = 16
-"""Blocks, 1.5 s, by which one is judged that is never given up: what was right a minute ago does not count."""
+"""Blocks after which a rival can win, and after which one that has not won is given up."""
+LATEST = 2 * LEAST
+"""Blocks, 1.5 s, by which a standing rival is compared: what was right a minute ago does not count."""
 GAIN_DB, CERTAIN = 0.15, 2.5
 """Mean fall of the error, and how many of its standard errors that must be."""
 
 
 @dataclass
 class Rival:
-    """A path that runs beside the one in use and wants its place.
+    """A path that is compared, hop by hop, with the one in use.
 
-    was: what to call it. kind: of the event where it wins. stays: whether it is a standing one, judged by its latest
+    was: what to call it. kind: of the event where it wins. stays: whether it is a standing one, compared by its latest
     blocks and never given up. gains_db: (blocks,) by how much less it left.
     """
 
@@ -39,9 +39,9 @@ class Rival:
     _its: float = 1e-12
     _running: float = 1e-12
 
-    def step(self, heard: Heard, running: float, audible: bool) -> None:
-        """Let it hear a hop too. running: power, emphasised, of what the path in use left of it."""
-        left = emphasised(self.path.step(heard.mic, heard.reference, heard.located, heard.past).innovation)
+    def step(self, hop: FilteredHop, running: float, audible: bool) -> None:
+        """Step it through a hop, too. running: power, emphasised, of what the path in use left of the hop."""
+        left = emphasised(self.path.step(hop.mic, hop.reference, hop.located, hop.past).innovation)
         if not audible:
             return
         self._its, self._running, self._count = self._its + left, self._running + running, self._count + 1
@@ -51,8 +51,8 @@ class Rival:
             if self.stays:
                 del self.gains_db[:-LATEST]
 
-    def forget(self) -> None:
-        """The path in use is another one: what was compared so far says nothing any more."""
+    def restart(self) -> None:
+        """Another path is in use now: the comparisons so far say nothing any more."""
         self.gains_db.clear()
         self._its, self._running, self._count = 1e-12, 1e-12, 0
 

@@ -1,30 +1,21 @@
-"""The learner's process: hops from shared memory through a PathLearner, its lessons back.
-
-    python -m edgefilter.learning.worker FILE
-
-FILE is the shared memory; what to begin with comes on standard input, whose end is the end.
-"""
+"""The learner's process: hops from standard input through a PathLearner, lessons to standard output (see background.py)."""
 
 from __future__ import annotations
 
 import os
 import pickle
 import signal
-import struct
 import sys
-import threading
 import time
 
-from edgefilter.errors import EdgefilterError
+from edgefilter.echo.user_effects import load_effect
+from edgefilter.learning.background import LENGTH, Beginning, News
 from edgefilter.learning.path_learner import PathLearner
-from edgefilter.learning.shared import HOPS, PAST, SharedHops
 from edgefilter.session import peak_memory_mb
 
 NICE = 10
-PAUSE_S = 0.02
-"""Between two looks at the ring, about a hop."""
-MARGIN = 64
-"""Hops before the ring's end at which the learner has fallen behind."""
+REPORT_HOPS = 16
+"""Hops, a quarter of a second, after which it tells of itself."""
 
 
 def main() -> None:
@@ -33,40 +24,38 @@ def main() -> None:
         signal.signal(number, signal.SIG_IGN)
     if hasattr(os, "nice"):
         os.nice(NICE)
-    told = sys.stdin.buffer
-    length = told.read(8)
-    if len(length) < 8:
-        return
-    path, hop, profile, remember = pickle.loads(told.read(struct.unpack("<q", length)[0]))
-    ring = SharedHops(hop, PAST, sys.argv[1])
-    ring.unlink()
-    over = threading.Event()
-
-    def wait_for_the_end() -> None:
-        told.read()
-        over.set()
-
-    threading.Thread(target=wait_for_the_end, daemon=True).start()
-    learner = PathLearner(profile, remember)
-    learner.start(path, hop)
-    at, behind = 0, 0
-    while not (over.is_set() and at >= ring.written):
-        if ring.written - at > HOPS - MARGIN:
-            at, behind = ring.written, behind + 1
-            learner.start(path, hop)
-        while at < ring.written:
-            lesson = learner.hear(ring.read(at))
-            at += 1
-            if lesson:
-                ring.post(lesson)
-        used = {"cpu_s": round(time.process_time(), 2), "memory_mb": peak_memory_mb()}
-        ring.report({**learner.stats(), **used, "hops": at, "fell_behind": behind})
-        over.wait(PAUSE_S)
+    answers = os.fdopen(os.dup(1), "wb")
+    os.dup2(2, 1)  # what a user's effect prints is no message
     try:
-        learner.close()
-    except EdgefilterError as error:
-        print(f"edgefilter: {error}", file=sys.stderr)
+        learn(answers)
+    except Exception as error:
+        sys.exit(f"edgefilter: learning has ended: {type(error).__name__}: {' '.join(str(error).split())}")
 
 
-if __name__ == "__main__":
-    main()
+def learn(answers) -> None:
+    """Take each message as it comes; at the end keep what is to be remembered."""
+    learner, stream, hops = PathLearner(), 0, 0
+
+    def tell(lesson=None) -> None:
+        used = {"cpu_s": round(time.process_time(), 2), "memory_mb": peak_memory_mb(), "hops": hops}
+        data = pickle.dumps(News(stream, {**learner.stats(), **used}, lesson), protocol=5)
+        answers.write(LENGTH.pack(len(data)) + data)
+        answers.flush()
+
+    while True:
+        try:
+            message = pickle.load(sys.stdin.buffer)
+        except (EOFError, pickle.UnpicklingError):  # the end, or the middle of a message where the filter was killed
+            break
+        if isinstance(message, Beginning):
+            for file in message.effect_files:
+                load_effect(file)
+            learner, stream, hops = PathLearner(message.profile, message.remember), message.stream, 0
+            learner.start(message.path, message.hop)
+            continue
+        lesson = learner.observe(message)
+        hops += 1
+        if lesson or hops % REPORT_HOPS == 0:
+            tell(lesson)
+    learner.close()
+    tell()

@@ -9,7 +9,7 @@ import pytest
 
 from edgefilter.diagnosis import proven
 from edgefilter.diagnosis.compare import compare
-from edgefilter.diagnosis.diagnose import add
+from edgefilter.diagnosis.diagnose import add, diagnose
 from edgefilter.diagnosis.joint import fit_jointly, fit_straight
 from edgefilter.diagnosis.prepare import prepare
 from edgefilter.diagnosis.proof import HeldOut, Proof, prove
@@ -147,6 +147,18 @@ def test_of_several_effects_the_one_that_hurts_is_named(carried_back) -> None:
     assert proof.worse and proof.culprit == "late_reverb"
     assert dict(proof.without)["late_reverb"] == pytest.approx(proof.erle_before_db, abs=0.3)
     assert proof.to_dict()["without"].keys() == {"late_reverb", "mic_clipping"} and proof.to_dict()["worse"] is True
+
+
+@pytest.mark.slow
+def test_the_seconds_of_the_proof_choose_no_name() -> None:
+    """The volume is turned down behind the cut alone: names that were chosen on those seconds would pass their proof."""
+    x = voice(10.0)
+    y = record(x)
+    y[100_000:] = record(x, EchoModel(path()).with_effect("playback_gain", {"gain_db": -6.0}))[100_000:]
+    assert diagnose(profile(), y, x).ranking
+    found = diagnose_proven(profile(), y, x)
+    assert found.ranking == () and found.comparison.recording.size <= 100_000
+    assert found.unproven == "nothing lasting was found"
 
 
 def test_a_name_that_fails_its_proof_is_not_given(monkeypatch) -> None:

@@ -11,7 +11,7 @@ import edgefilter
 from edgefilter import EgoFilter, Profile
 from edgefilter.echo.effects.catalogue import EFFECTS
 from edgefilter.filter.echo_path import EchoPath, PathState
-from edgefilter.filter.learner import Heard, Lesson
+from edgefilter.filter.learner import FilteredHop, Lesson
 
 DEMO = Path(edgefilter.__file__).parent / "demo_data"
 NOISY = next(effect for effect in EFFECTS if effect.noise_is_asked)
@@ -29,7 +29,7 @@ class Teacher:
     def start(self, path: PathState, hop: int) -> None:
         self.path = path
 
-    def hear(self, heard: Heard) -> Lesson | None:
+    def observe(self, hop: FilteredHop) -> Lesson | None:
         self.hops += 1
         return (
             Lesson(PathState(self.effects, self.path.canceller), "learned", "another path") if self.hops == 30 else None

@@ -76,3 +76,9 @@ class Scene:
             self.human *= 10 ** (self.human_db / 20) * np.std(echo) / np.std(self.human)
         fan = 1e-4 * np.random.default_rng(3).standard_normal(n)
         self.mic = (echo + self.human + fan).astype(np.float32)
+
+    def part(self, start_s: float, stop_s: float) -> Scene:
+        """The scene between two moments."""
+        span = slice(int(start_s * SAMPLE_RATE), int(stop_s * SAMPLE_RATE))
+        self.reference, self.mic, self.human = self.reference[span], self.mic[span], self.human[span]
+        return self

@@ -1,23 +1,41 @@
 """Learning in another process: the same lessons, late, and a filter that does without them where it must."""
 
+import gc
+import os
 import signal
+import sys
 import time
 
 import numpy as np
 import pytest
 
-from edgefilter import BackgroundLearner, EgoFilter, PathLearner, Profile
-from tests.learning.scenes import Scene
+from edgefilter import BackgroundLearner, EgoFilter, PathLearner, Profile, load_effect
+from edgefilter.echo.model import EchoModel
+from edgefilter.learning import background
+from tests.learning.scenes import Scene, room
 
 HOP = 256
+OWN = """
+import numpy as np
+from edgefilter.echo.effect import Parameter
+class Gain:
+    name, stage = "own_gain_of_the_learning_test", "source"
+    parameters = (Parameter("factor", "1", 1.0, 0.1, 10.0),)
+    def apply(self, x, values, sample_rate):
+        print("not a message")
+        return x * np.float32(values["factor"])
+    def fit(self, measurement, model):
+        return {"factor": 1.0}
+"""
 
 
 def caught_up(learner, hops):
+    """Wait until the other process has taken all hops but those that it has not told of yet."""
     deadline = time.monotonic() + 60
-    while learner.stats().get("hops", 0) < hops:
+    while learner.stats().get("hops", 0) <= hops - 16:
         assert time.monotonic() < deadline, learner.stats()
         assert learner.stats()["process"] == "running"
-        time.sleep(0.02)
+        time.sleep(0.01)
 
 
 def feed(ego, learner, scene, every=100):
@@ -30,44 +48,148 @@ def feed(ego, learner, scene, every=100):
     return np.concatenate(out)
 
 
+def kinds(ego):
+    return [event.kind for event in ego.events()]
+
+
+def plain(scene):
+    ego = EgoFilter(engine="linear")
+    return np.concatenate((ego.process(scene.mic, scene.reference), ego.flush()))
+
+
 @pytest.fixture(scope="module")
 def scene():
     return Scene(seconds=10.0)
 
 
+@pytest.fixture(scope="module")
+def short():
+    return Scene(seconds=2.0)
+
+
+@pytest.mark.slow
 def test_it_learns_what_the_learner_in_this_process_does(scene, tmp_path):
     file = tmp_path / "robot.npz"
     learner = BackgroundLearner(remember=file)
     ego = EgoFilter(engine="linear", learn=learner)
     out = feed(ego, learner, scene)
-    kinds = [event.kind for event in ego.events()]
-    assert "learned" in kinds
+    assert "learned" in kinds(ego)
     for number in (signal.SIGINT, signal.SIGTERM):  # Ctrl-C and a stopped service reach the whole group
-        learner._process.send_signal(number)
+        os.kill(learner.pid, number)
     stats = ego.stats()["learning"]
     assert stats["cpu_s"] > 0
     assert stats["memory_mb"] > 0
-    alone = EgoFilter(engine="linear")
-    plain = alone.process(scene.mic, scene.reference)
     last = slice(out.size - 16_000, out.size)
-    assert np.mean(out[last] ** 2) < 0.8 * np.mean(plain[last] ** 2)
+    assert np.mean(out[last] ** 2) < 0.8 * np.mean(plain(scene)[last] ** 2)
     ego.close()
-    assert learner.stats()["process"] == "ended"
+    after = learner.stats()
+    assert after["process"] == "ended" and after["remembered"] > 0 and after["hops"] == scene.mic.size // HOP
     assert Profile.load(file).learned
 
 
-def test_the_filter_goes_on_where_the_learner_has_died(scene):
+@pytest.mark.slow
+def test_a_filter_that_is_used_again_learns_again():
+    scene = Scene(seconds=5.0)
     learner = BackgroundLearner()
     ego = EgoFilter(engine="linear", learn=learner)
-    learner._process.kill()
-    learner._process.wait()
-    out = np.concatenate((ego.process(scene.mic, scene.reference), ego.flush()))
-    plain = EgoFilter(engine="linear")
-    np.testing.assert_allclose(
-        out, np.concatenate((plain.process(scene.mic, scene.reference), plain.flush())), atol=1e-5
-    )
+    for end in (ego.flush, ego.close):
+        feed(ego, learner, scene)
+        assert "learned" in kinds(ego)
+        end()
+        ego.reset()
+    ego.close()
+
+
+@pytest.mark.parametrize("path", [[], [""]], ids=["as it is", "with the working directory"])
+def test_what_lies_in_the_working_directory_is_not_run(short, tmp_path, monkeypatch, path):
+    for name in ("numpy", "scipy", "edgefilter", "pickle"):
+        (tmp_path / f"{name}.py").write_text(f"open({str(tmp_path / 'was run')!r}, 'w')")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [*path, *sys.path])
+    learner = BackgroundLearner()
+    feed(EgoFilter(engine="linear", learn=learner), learner, short)
+    learner.close()
+    assert not (tmp_path / "was run").exists()
+    assert learner.stats()["hops"] == short.mic.size // HOP
+
+
+@pytest.mark.parametrize("program", ["/bin/false", "/nowhere/python"], ids=["dies at once", "is not there"])
+def test_the_filter_goes_on_where_the_process_cannot_be_started(short, monkeypatch, program):
+    monkeypatch.setattr(sys, "executable", program)
+    learner = BackgroundLearner()
+    ego = EgoFilter(engine="linear", learn=learner)
+    time.sleep(0.1)
+    out = np.concatenate((ego.process(short.mic, short.reference), ego.flush()))
+    np.testing.assert_allclose(out, plain(short), atol=1e-5)
     assert ego.stats()["learning"]["process"] == "ended"
     ego.close()
+
+
+def test_the_filter_goes_on_where_the_learner_has_died(short):
+    learner = BackgroundLearner()
+    ego = EgoFilter(engine="linear", learn=learner)
+    os.kill(learner.pid, signal.SIGKILL)
+    time.sleep(0.1)
+    out = np.concatenate((ego.process(short.mic, short.reference), ego.flush()))
+    np.testing.assert_allclose(out, plain(short), atol=1e-5)
+    assert ego.stats()["learning"]["process"] == "ended"
+    ego.close()
+
+
+def test_effects_of_the_users_own_are_known_there_and_may_print(short, tmp_path):
+    (tmp_path / "own.py").write_text(OWN)
+    name = load_effect(tmp_path / "own.py")
+    silence, flat = np.full(601, 1e-9, np.float32), np.ones(601, np.float32)
+    echo = EchoModel(np.pad(room(2), (64, 0)), ((name, {"factor": 0.5}),))
+    profile = Profile(echo, 1200.0, flat, silence, np.array([[900.0, 1100.0]]), np.array([40.0]), np.full(4, -50.0))
+    learner = BackgroundLearner(profile)
+    ego = EgoFilter(profile, "linear", learn=learner)
+    feed(ego, learner, short)
+    ego.close()
+    assert learner.stats()["hops"] == short.mic.size // HOP
+
+
+@pytest.mark.slow
+def test_a_process_that_falls_behind_begins_anew_and_learns(scene):
+    learner = BackgroundLearner()
+    ego = EgoFilter(engine="linear", learn=learner)
+    os.kill(learner.pid, signal.SIGSTOP)
+    silence = np.zeros(20 * 16_000, np.float32)
+    began = time.monotonic()
+    ego.process(silence, silence)
+    assert time.monotonic() - began < 10  # nobody waits for a process that stands still
+    os.kill(learner.pid, signal.SIGCONT)
+    caught_up(learner, 300)  # 20 s less the 15 s after which it begins anew
+    assert learner.stats()["fell_behind"] == 1
+    told = learner.stats()["hops"]
+    assert told < 400
+    for at in range(0, scene.mic.size - HOP + 1, HOP):
+        ego.process(scene.mic[at : at + HOP], scene.reference[at : at + HOP])
+        if at % (100 * HOP) == 0:
+            caught_up(learner, told + at // HOP)
+    assert "learned" in kinds(ego)
+    ego.close()
+
+
+def test_a_process_that_does_not_end_is_killed(monkeypatch):
+    monkeypatch.setattr(background, "GOODBYE_S", 0.5)
+    learner = BackgroundLearner()
+    ego = EgoFilter(engine="linear", learn=learner)
+    pid = learner.pid
+    os.kill(pid, signal.SIGSTOP)
+    ego.close()
+    with pytest.raises(ProcessLookupError):
+        os.kill(pid, 0)
+
+
+def test_the_process_ends_with_the_last_one_who_holds_its_learner():
+    learner = BackgroundLearner()
+    ego = EgoFilter(engine="linear", learn=learner)
+    pid = learner.pid
+    del ego, learner
+    gc.collect()
+    with pytest.raises(ProcessLookupError):
+        os.kill(pid, 0)
 
 
 def test_a_learner_that_was_never_started_closes_in_silence():

@@ -30,5 +30,5 @@ def test_a_standing_rival_is_judged_by_its_latest_blocks_and_never_given_up():
     assert not standing.over
     standing.gains_db = [0.4, 0.5] * (LATEST // 2)
     assert standing.won
-    standing.forget()
+    standing.restart()
     assert not standing.won

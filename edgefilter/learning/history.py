@@ -1,0 +1,88 @@
+"""The last minute of hops: the microphone with the reference as the aligner delivered it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edgefilter.filter.echo_path import TAPS, EchoPath
+from edgefilter.filter.learner import FilteredHop
+from edgefilter.types import SAMPLE_RATE, Samples
+
+MINUTE = 60.0
+"""Seconds that are kept."""
+RECENT_S = 15.0
+"""The newest of them, s: enough to fit a loudspeaker and a room to, and all of it from where the robot stands now."""
+PAST = SAMPLE_RATE
+"""Samples of the aligned reference, longer than any path, that a learner wants after a switch of the delay."""
+PRE_EMPHASIS = 0.95
+"""First-order pre-emphasis: fan and rumble below the voice weigh less."""
+
+
+class HopHistory:
+    """Keeps a minute of hops of `hop` samples, and whether the robot was audible in each. count: of all hops so far."""
+
+    def __init__(self, hop: int) -> None:
+        self._hop = hop
+        self.count = 0
+        self._hops: list[tuple[FilteredHop, bool]] = []
+
+    def append(self, hop: FilteredHop, audible: bool) -> None:
+        """Take one hop; now and then the oldest ones are dropped."""
+        self._hops.append((hop._replace(mic=hop.mic.copy()), audible))
+        self.count += 1
+        most = self._hops_of(MINUTE)
+        if len(self._hops) > most + most // 4:
+            del self._hops[:-most]
+
+    def since(self, count: int) -> Sequence[tuple[FilteredHop, bool]]:
+        """The hops after the first `count` of all, at most RECENT_S of them; each with whether the robot was audible."""
+        return self._hops[max(0, len(self._hops) - min(self.count - count, self._hops_of(RECENT_S))) :]
+
+    def recent(self) -> HopHistory:
+        """Its newest RECENT_S."""
+        newest = HopHistory(self._hop)
+        newest._hops = self._hops[-self._hops_of(RECENT_S) :]
+        return newest
+
+    def replay(self, path: EchoPath) -> None:
+        """Step a path through all of it, as the running filter was stepped."""
+        for hop, _ in self._hops:
+            path.step(hop.mic, hop.reference, hop.located, hop.past)
+
+    def signals(self) -> tuple[Samples, Samples, Samples]:
+        """Microphone, reference and innovation, (n,) each."""
+        mic, reference, innovation = (
+            np.concatenate(rows) for rows in zip(*(hop[:3] for hop, _ in self._hops), strict=True)
+        )
+        return mic, reference, innovation
+
+    def usable(self) -> NDArray[np.bool_]:
+        """(n,) bool, where the robot may be audible and the reference lies as the microphone hears it.
+
+        For the length of a path after a switch of the delay, some of the echo was sent under the delay of before.
+        """
+        usable = np.array([hop.located and not hop.idle for hop, _ in self._hops])
+        for at in np.flatnonzero([hop.past is not None for hop, _ in self._hops]):
+            usable[at : at + TAPS[1] // self._hop] = False
+        return np.repeat(usable, self._hop)
+
+    def silent(self) -> NDArray[np.bool_]:
+        """(n,) bool, where nothing of the robot can be audible."""
+        return np.repeat(np.array([hop.idle for hop, _ in self._hops]), self._hop)
+
+    @property
+    def delay(self) -> float:
+        """Samples, the latest that is known; 0 where none is."""
+        return next((hop.delay for hop, _ in reversed(self._hops) if hop.delay == hop.delay), 0.0)
+
+    def _hops_of(self, seconds: float) -> int:
+        return max(1, round(seconds * SAMPLE_RATE / self._hop))
+
+
+def emphasised(x: Samples) -> float:
+    """Power of x (n,) with pre-emphasis, summed."""
+    bright = x[1:] - PRE_EMPHASIS * x[:-1]
+    return float(bright.dot(bright))
