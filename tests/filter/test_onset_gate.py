@@ -9,9 +9,11 @@ from edgefilter import enhance
 from edgefilter.alignment.aligner import Aligner
 from edgefilter.alignment.delay_line import Aligned
 from edgefilter.commands.demo import DATA
-from edgefilter.filter.onset_gate import GATE, LONGEST, RAMP, SETTLE, OnsetGate
+from edgefilter.filter.onset_gate import GATE, LONGEST, SETTLE, OnsetGate
 
 HOP = 256
+RAMP = 64
+"""4 ms."""
 
 
 def spoken(rng: np.random.Generator, seconds: list[float], pauses: list[float]) -> tuple[np.ndarray, list[int]]:
