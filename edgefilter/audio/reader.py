@@ -97,8 +97,7 @@ class Reader:
     def _check_header(self, file: soundfile.SoundFile) -> None:
         if self.rate not in RATES:
             raise self._error(
-                f"says its rate is {self.rate} Hz, expected {RATES.start} to {RATES.stop - 1} Hz: its header is"
-                " damaged"
+                f"says its rate is {self.rate} Hz, expected {RATES.start} to {RATES.stop - 1} Hz: its header is damaged"
             )
         promised = re.search(r"^data\s*: (\d+) \(should be (\d+)\)", file.extra_info, re.MULTILINE)
         if promised and int(promised[1]) >= _ENDLESS:

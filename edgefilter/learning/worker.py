@@ -7,8 +7,10 @@ import pickle
 import signal
 import sys
 import time
+from typing import BinaryIO
 
 from edgefilter.echo.user_effects import load_effect
+from edgefilter.filter.learner import Lesson
 from edgefilter.learning.background import LENGTH, Beginning, News
 from edgefilter.learning.path_learner import PathLearner
 from edgefilter.session import peak_memory_mb
@@ -32,11 +34,11 @@ def main() -> None:
         sys.exit(f"edgefilter: learning has ended: {type(error).__name__}: {' '.join(str(error).split())}")
 
 
-def learn(answers) -> None:
+def learn(answers: BinaryIO) -> None:
     """Take each message as it comes; at the end keep what is to be remembered."""
     learner, stream, hops = PathLearner(), 0, 0
 
-    def tell(lesson=None) -> None:
+    def tell(lesson: Lesson | None = None) -> None:
         used = {"cpu_s": round(time.process_time(), 2), "memory_mb": peak_memory_mb(), "hops": hops}
         data = pickle.dumps(News(stream, {**learner.stats(), **used}, lesson), protocol=5)
         answers.write(LENGTH.pack(len(data)) + data)
