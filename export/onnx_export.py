@@ -261,7 +261,7 @@ def main(argv: list[str] | None = None) -> int:
         type=float,
         nargs=2,
         metavar=("SCALE", "BIAS"),
-        help="of the speech head's log-odds, as bench.measure.barge_in_fit finds them",
+        help="of the speech head's log-odds, as `python -m bench training probability` finds them",
     )
     options = parser.parse_args(argv)
     try:

@@ -3,7 +3,7 @@ r"""How often hidden effects are named, and whether what is named makes the runn
     python -m bench diagnosis names --cases DIR ... --output bench/results/diagnosis
     python -m bench diagnosis proof --cases DIR ... --real DIR ... --output bench/results/diagnosis
     python -m bench diagnosis run-time --voices ROBOT/test --speech HUMAN/test --count 8 --seed 41 \
-        --output bench/results/diagnosis --page docs/effects_at_run_time.md
+        --output bench/results/diagnosis
 
 names, proof: --cases are folders of cases as bench.simulate.hidden_cases and bench.simulate.wild write them; proof needs
 no labels, so that real recordings do as well. run-time simulates its own. What each part does stands at the head of its
@@ -32,7 +32,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--count", type=int, default=8, help="run-time: conversations of each effect (default: %(default)s)")
     add("--effects", default=",".join(EFFECTS), metavar="A,B,...", help="run-time: which of them (default: all)")
     add("--engines", default=",".join(run_time.ENGINES), metavar="A,B,...", help="run-time (default: %(default)s)")
-    add("--page", type=Path, metavar="FILE", help="run-time: also write the page of the documentation")
 
 
 def run(options: argparse.Namespace) -> str:

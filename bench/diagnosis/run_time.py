@@ -87,7 +87,7 @@ def tables(rows: Sequence[Mapping], engines: Sequence[str]) -> list[dict]:
 
 
 def run(options: argparse.Namespace) -> str:
-    """All effects, --count conversations each; also the page of the documentation."""
+    """All effects, --count conversations each."""
     effects, engines = options.effects.split(","), options.engines.split(",")
     for name in effects:
         find(name)
@@ -99,8 +99,4 @@ def run(options: argparse.Namespace) -> str:
     for effect, turn in progress(turns, "conversation"):
         rows += measure(make(options.seed, effect, turn, voices, people), engines)
     made = tables(rows, engines)
-    if options.page:
-        parts = [f"{one['title']}:\n\n{results.markdown_table(one)}" for one in made]
-        text = "\n\n".join([f"# {TITLE}", INTRODUCTION, *parts, f"Made by `{made_with['command']}`."])
-        options.page.write_text(text + "\n", encoding="utf-8")
-    return results.write(options.output, "run_time", TITLE, made_with, made, rows=rows)
+    return results.write(options.output, "run_time", TITLE, made_with, made, notes=INTRODUCTION, rows=rows)

@@ -52,7 +52,7 @@ class PaperSpectralSubtraction:
     The paper leaves open, and this implementation takes: hop 160 and a 400-sample Hann analysis window, zero-padded to
     the 1200 points that the paper's 601 bins imply (VoiceFilter's sizes); a Hann smoothing window without its zero end
     points, normalised to sum 1; digital silence before and after the recording, for which eq. (6) gives SM = 1; and
-    alpha chosen for the lowest word errors on 24 simulated validation conversations (bench/measure/tune_paper_ss.py):
+    alpha chosen for the lowest word errors on 24 simulated validation conversations:
     4. beta scales the output alone, which neither SI-SDR nor a recogniser with a normalised level notices; it is 1, the
     most that is never louder than the microphone.
 
