@@ -16,13 +16,9 @@ from numpy.typing import NDArray
 from edgefilter.errors import UsageError
 
 LEAST = 9
-"""Score from which a passage counts as found again: so many letters and blanks in a row, errors made up for. "and the"
-has 9 with the blanks around it. Of sentences that have nothing to do with each other a fiftieth is found so, at most a
-third; texts that are shorter than that have to be found whole."""
-ERROR = 1
-"""What a wrong, missing or additional letter takes from a passage's score; each right one gives 1."""
-HALF = 0.5
-"""Part of a word's letters that has to be found for the word to count."""
+"""Score from which a passage counts as found: so many letters and blanks in a row, each wrong, missing or additional one
+made up for by a right one more. "and the" has 9 with the blanks around it. Of sentences that have nothing to do with each
+other a fiftieth is found so, at most a third; texts that are shorter than that have to be found whole."""
 REACH_S = 2.0
 """Seconds by which the times of what was said and heard may differ: lag of the playback, the recogniser's own times."""
 SURE = 0.02
@@ -126,12 +122,12 @@ def recent(said: str | Iterable[str | Said], heard: tuple[float, float] | None =
 
 
 def explained(words: list[str], robot: str) -> float:
-    """Part of the words, weighed by their letters, at least HALF of whose letters lie in a passage of the robot's text."""
+    """Part of the words, weighed by their letters, at least half of whose letters lie in a passage of the robot's text."""
     heard = f" {' '.join(words)} "
     found = passages(heard, f" {robot} ", min(LEAST, len(heard)))
     letters, at = 0, 1
     for word in words:
-        if np.count_nonzero(found[at : at + len(word)]) >= HALF * len(word):
+        if 2 * np.count_nonzero(found[at : at + len(word)]) >= len(word):
             letters += len(word)
         at += len(word) + 1
     return letters / sum(map(len, words))
@@ -161,11 +157,11 @@ def passages(heard: str, robot: str, least: int) -> NDArray[np.bool_]:
 
 def best_until(equal: NDArray[np.bool_]) -> NDArray[np.int64]:
     """(n + 1, m + 1) score of the best alignment of letters that ends behind the first i and j; equal: (n, m)."""
-    steps = ERROR * np.arange(equal.shape[1] + 1)
+    steps = np.arange(equal.shape[1] + 1)
     best = np.zeros((equal.shape[0] + 1, equal.shape[1] + 1), np.int64)
     for row, same in enumerate(equal):
         above, here = best[row], best[row + 1]
-        np.maximum(above[1:] - ERROR, above[:-1] + np.where(same, 1, -ERROR), out=here[1:])
+        np.maximum(above[1:] - 1, above[:-1] + np.where(same, 1, -1), out=here[1:])
         np.maximum(here, 0, out=here)
         # letters that the robot alone has: the best place to the left, less what the way from there costs
         here[:] = np.maximum.accumulate(here + steps) - steps
@@ -177,10 +173,10 @@ def traced(best: NDArray[np.int64], equal: NDArray[np.bool_], row: int, column: 
     same = []
     while best[row, column] > 0:
         paired = equal[row - 1, column - 1]
-        if best[row, column] == best[row - 1, column - 1] + (1 if paired else -ERROR):
+        if best[row, column] == best[row - 1, column - 1] + (1 if paired else -1):
             row, column = row - 1, column - 1
             same += [row] if paired else []
-        elif best[row, column] == best[row - 1, column] - ERROR:
+        elif best[row, column] == best[row - 1, column] - 1:
             row -= 1
         else:
             column -= 1

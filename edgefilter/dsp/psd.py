@@ -9,6 +9,9 @@ from edgefilter.dsp.fourier import power
 from edgefilter.dsp.frames import frames
 from edgefilter.types import SAMPLE_RATE, Array, Samples
 
+GRID_FFT = 1200
+"""FFT length of the frequency grid of profiles and of most densities, the paper's 601 bins."""
+GRID_BINS = GRID_FFT // 2 + 1
 ROUNDING_PSD = 1e-14
 """PSD of rounding to 16 bit: (2^-15)^2 / 12 / 8 kHz, rounded down."""
 NOTCH = 1e-7

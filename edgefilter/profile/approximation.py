@@ -8,19 +8,15 @@ from typing import Any
 import numpy as np
 
 from edgefilter.dsp.frames import decibels
-from edgefilter.dsp.psd import total_power
+from edgefilter.dsp.psd import GRID_BINS, total_power
 from edgefilter.errors import ProfileError
 from edgefilter.profile.file import REMEDY
 from edgefilter.types import Array, Samples
 
-BINS = 601
-"""Of the profile's frequency grid."""
 PREFIX = "approximation_"
 """Before the names of its arrays in a profile's file."""
-MAX_LEVELS = 8
 STEEPEST = 2.0
 """dB by which a distortion grows over the voice for each dB of the voice: that of a cubic law; a square one has 1."""
-
 CLEARLY_DB = 3.0
 """Over the least that is told from the noise: what leads from one level to the next."""
 
@@ -61,8 +57,8 @@ class LinearApproximation:
 
     def __post_init__(self) -> None:
         levels = np.asarray(self.level_db)
-        if levels.dtype != np.float64 or levels.ndim != 1 or not 1 <= levels.size <= MAX_LEVELS:
-            _fail("level_db", f"{levels.dtype} of shape {levels.shape}", f"1 to {MAX_LEVELS} float64")
+        if levels.dtype != np.float64 or levels.ndim != 1 or not levels.size:
+            _fail("level_db", f"{levels.dtype} of shape {levels.shape}", "float64 of one level or more")
         if not (np.all(np.abs(levels) <= 300.0) and np.all(np.diff(levels) > 0.0)):
             _fail("level_db", levels.tolist(), "rising levels of -300 to 300 dB")
         least = np.asarray(self.least_db)
@@ -70,8 +66,8 @@ class LinearApproximation:
             _fail("least_db", f"{least.dtype} {least.tolist()}", f"{levels.size} float64 of -300 to 300 dB")
         for name in ("played", "linear", "noise", "even", "odd"):
             density = np.asarray(getattr(self, name))
-            if density.shape != (levels.size, BINS) or density.dtype != np.float32:
-                _fail(name, f"{density.dtype} of shape {density.shape}", f"float32 of shape ({levels.size}, {BINS})")
+            if density.shape != (levels.size, GRID_BINS) or density.dtype != np.float32:
+                _fail(name, f"{density.dtype} of shape {density.shape}", f"float32 of shape ({levels.size}, {GRID_BINS})")
             if not np.all(np.abs(density) <= 1e6):
                 _fail(name, f"{density.min():g} to {density.max():g}", "-1e6 to 1e6 everywhere")
 

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from edgefilter.dsp.psd import GRID_BINS, GRID_FFT
 from edgefilter.dsp.stft import StftConfig
 from edgefilter.echo.effect import complete
 from edgefilter.echo.effects.catalogue import find
@@ -18,14 +19,11 @@ from edgefilter.profile.approximation import LinearApproximation
 from edgefilter.profile.file import REMEDY, read_fields, write_fields
 from edgefilter.types import PRE_ROLL, SAMPLE_RATE, Array, Samples
 
-GRID_FFT = 1200
-"""FFT length of the profile's frequency grid, the paper's 601 bins."""
-GRID_BINS = GRID_FFT // 2 + 1
 GRID_HZ = np.arange(GRID_BINS) * SAMPLE_RATE / GRID_FFT
 """(601,) Hz, 0 to 8000 in steps of 13.33."""
 DISTORTION_ORDERS = (2, 3, 4, 5)
 MAX_TAPS = 4 * SAMPLE_RATE
-MAX_DELAY = 4 * SAMPLE_RATE
+"""Samples, 4 s: longer than the reverberation of any room that a robot talks in, and than the lag of any player."""
 LEARNED = "what the running filter learned"
 """Source of a profile that no calibration made."""
 PROBE = 1600
@@ -263,9 +261,9 @@ def _check_numbers(profile: Profile) -> None:
     if (
         isinstance(profile.delay, bool)
         or not isinstance(profile.delay, int | float | np.number)
-        or not abs(profile.delay) <= MAX_DELAY
+        or not abs(profile.delay) <= MAX_TAPS
     ):
-        _fail("delay", repr(profile.delay), f"-{MAX_DELAY} to {MAX_DELAY} samples")
+        _fail("delay", repr(profile.delay), f"-{MAX_TAPS} to {MAX_TAPS} samples")
     for name in ("created", "source"):
         if not isinstance(getattr(profile, name), str):
             _fail(name, type(getattr(profile, name)).__name__, "a text")
