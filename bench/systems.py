@@ -24,7 +24,7 @@ from edgefilter.dsp.stft import StftConfig
 from edgefilter.engines import HAVE_MODEL, create
 from edgefilter.errors import EdgefilterError, UsageError
 from edgefilter.filter.echo_path import PathState
-from edgefilter.filter.learner import Heard, Learner, Lesson
+from edgefilter.filter.learner import FilteredHop, Learner, Lesson
 from edgefilter.types import SAMPLE_RATE, Samples
 
 OWN = ("linear", "ss", "crnn")
@@ -216,9 +216,9 @@ class _Kept:
         if self._learner:
             self._learner.start(path, hop)
 
-    def hear(self, heard: Heard) -> Lesson | None:
+    def observe(self, hop: FilteredHop) -> Lesson | None:
         self._at += 1
-        if self._learner and (lesson := self._learner.hear(heard)):
+        if self._learner and (lesson := self._learner.observe(hop)):
             self._lessons[self._at] = lesson
         return self._lessons.get(self._at)
 

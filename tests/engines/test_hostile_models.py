@@ -140,6 +140,7 @@ def test_any_bytes_are_refused_in_one_line(data, tmp_path_factory):
 
 @settings(max_examples=10, deadline=None, derandomize=True, database=None)
 @given(key=st.sampled_from(("n_fft", "hop", "states", "window", "training", "version")), value=st.text(max_size=30))
+@pytest.mark.slow
 def test_whatever_a_model_says_of_itself_it_is_taken_or_refused_in_one_line(key, value, tmp_path_factory):
     model = onnx.load(EDGE)
     next(entry for entry in model.metadata_props if entry.key == key).value = value

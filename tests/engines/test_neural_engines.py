@@ -189,6 +189,7 @@ def test_the_packages_int8_file_is_of_the_same_training_as_the_exact_one():
     )
 
 
+@pytest.mark.slow
 def test_the_exact_network_filters_the_demo_as_the_int8_one_does():
     """Both files are run: each brings the human out, and what int8 weights change is far under the answer."""
     mic, ref, human = (
@@ -252,6 +253,7 @@ def test_paper_crnn_refuses_a_recording_that_is_too_long_before_it_fills_the_mem
     assert enhance(mic, ref, engine="paper-crnn", model=PAPER).shape == mic.shape
 
 
+@pytest.mark.slow
 def test_the_command_line_takes_a_model_and_reports_it(tmp_path):
     mic, ref = conformance.conversation()
     soundfile.write(tmp_path / "mic.wav", mic, 16000, "FLOAT")

@@ -297,6 +297,7 @@ def run(folder, *more):
     return result.stderr, json.loads((folder / "j").read_text())
 
 
+@pytest.mark.slow
 def test_a_recording_gets_the_strongest_engine_unmeasured_unless_a_budget_is_given(tmp_path):
     said, stats = run(tmp_path, "--seconds", "1")
     assert stats["choice"] is None and "strongest engine, not measured" in said

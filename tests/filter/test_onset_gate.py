@@ -97,6 +97,7 @@ def test_the_gate_shuts_at_once_and_opens_without_a_step():
     assert opening[-1] == 1.0 and np.abs(np.diff(opening)).max() <= 1.01 / RAMP
 
 
+@pytest.mark.slow
 def test_the_robots_onset_in_the_demo_stays_below_the_human():
     """At 8 s its second utterance begins with another lag.
 

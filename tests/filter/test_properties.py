@@ -119,6 +119,7 @@ def test_a_block_that_is_refused_leaves_no_trace(name):
     check()
 
 
+@pytest.mark.slow
 def test_a_minute_of_digital_silence_does_not_end_the_run():
     """Found here: a division by zero after 45 s of it, where there is no profile and denormal numbers count as zero."""
     ego, nothing = FILTERS["crnn"](), np.zeros(65_536, np.float32)

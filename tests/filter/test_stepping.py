@@ -219,6 +219,7 @@ def test_a_single_stall_or_rare_late_hops_change_nothing():
     assert not stream.events and stream.stepping.stats()["missed_deadlines"] > 0
 
 
+@pytest.mark.slow
 def test_failed_attempts_to_step_up_become_rarer():
     _, stream = overloaded_stream(cost_s=0.030)
     happened = feed(stream, 600.0)
@@ -264,6 +265,7 @@ def busy_cores():
         process.wait()
 
 
+@pytest.mark.slow
 def test_under_real_load_on_all_cores_a_slow_engine_is_left_and_no_sample_is_lost(busy_cores):
     """The slow engine sleeps longer than a hop, so that it is too slow on any machine; the real clock."""
     mic, ref = conformance.conversation(48_000)
