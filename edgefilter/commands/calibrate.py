@@ -13,14 +13,14 @@ from pathlib import Path
 import numpy as np
 
 from edgefilter.audio.files import FileSink
-from edgefilter.audio.reader import Reader
 from edgefilter.calibration.calibrate import calibrate
 from edgefilter.calibration.from_multisine import calibrate_multisine
 from edgefilter.calibration.multisine import SWEEP_PART, generate_multisine
 from edgefilter.calibration.stepped_sine import generate_stepped_sine
 from edgefilter.calibration.sweep import generate_sweep
-from edgefilter.commands.display import countdown, say, write_json
+from edgefilter.commands.display import countdown, print_result, say
 from edgefilter.commands.profile import summary
+from edgefilter.commands.recordings import read
 from edgefilter.errors import DeviceError, UsageError
 from edgefilter.profile.text import describe
 from edgefilter.types import SAMPLE_RATE, Samples
@@ -49,7 +49,9 @@ def main(args: argparse.Namespace) -> int:
         with _folder(args.save_input) as folder:
             return _calibrate(args, f"live: {args.speaker} to {args.input}", *_record(args, folder))
     names = [getattr(args, name) for name in RECORDINGS]
-    return _calibrate(args, ", ".join(names), *(_read(path, role) for path, role in zip(names, RECORDINGS)))
+    return _calibrate(
+        args, ", ".join(names), *(read(path, role.replace("_", " ")) for path, role in zip(names, RECORDINGS))
+    )
 
 
 def _calibrate(args: argparse.Namespace, source: str, sweep: Samples, recording: Samples, noise: Samples) -> int:
@@ -60,11 +62,7 @@ def _calibrate(args: argparse.Namespace, source: str, sweep: Samples, recording:
     else:
         profile = calibrate(sweep, recording, noise, stepped_sine=args.stepped_sine, created=today, source=source)
     profile.save(args.output)
-    if args.json:
-        write_json(summary(profile), args.json)
-    if args.json != "-":
-        print(describe(profile))
-        print(f"written to {args.output}")
+    print_result(args, [describe(profile), f"written to {args.output}"], summary(profile))
     return 0
 
 
@@ -90,14 +88,6 @@ def _sound(args: argparse.Namespace) -> Samples:
             " its loudest multisines peak so much higher than its sweep"
         )
     return generate_multisine(amplitude / SWEEP_PART)
-
-
-def _read(path: str, role: str) -> Samples:
-    reader = Reader(path, role.replace("_", " "))
-    samples = np.concatenate([*reader.chunks(), np.zeros(0, np.float32)])
-    for note in reader.notes:
-        say(note)
-    return samples
 
 
 def _record(args: argparse.Namespace, folder: Path) -> tuple[Samples, Samples, Samples]:

@@ -63,7 +63,9 @@ def countdown(what: str) -> Callable[[float], None]:
     def show(left_s: float) -> None:
         nonlocal shown
         if shown != (shown := math.ceil(left_s)):
-            print(f"\r{what}, {shown} s left ", end="" if shown else "\n", file=sys.stderr, flush=True)
+            _overwrite(f"{what}, {shown} s left")
+            if not shown:
+                say("")
 
     return show
 
