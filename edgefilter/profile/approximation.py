@@ -67,7 +67,9 @@ class LinearApproximation:
         for name in ("played", "linear", "noise", "even", "odd"):
             density = np.asarray(getattr(self, name))
             if density.shape != (levels.size, GRID_BINS) or density.dtype != np.float32:
-                _fail(name, f"{density.dtype} of shape {density.shape}", f"float32 of shape ({levels.size}, {GRID_BINS})")
+                _fail(
+                    name, f"{density.dtype} of shape {density.shape}", f"float32 of shape ({levels.size}, {GRID_BINS})"
+                )
             if not np.all(np.abs(density) <= 1e6):
                 _fail(name, f"{density.min():g} to {density.max():g}", "-1e6 to 1e6 everywhere")
 
