@@ -19,7 +19,6 @@ from bench.metrics import Judges
 from bench.recogniser import Recogniser
 from bench.recordings import Clip, NotHere
 from edgefilter.errors import EdgefilterError
-from export.spread import spread
 
 SCORING = ("speechmos", "pystoi", "jiwer", "faster-whisper", "ctranslate2")
 """Packages whose versions change scores."""
@@ -48,6 +47,8 @@ def run(
     if jobs == 1 and not scheduler:
         made = (_work(setup, task) for task in tasks)
     else:
+        from export.spread import spread  # the training side is not installed everywhere
+
         made = spread(_work, setup, tasks, jobs, scheduler)
     for name, found in tqdm(made, total=len(tasks), unit="clip", disable=not sys.stderr.isatty()):
         done[name] = found

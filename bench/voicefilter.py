@@ -17,7 +17,6 @@ from bench.recordings import NotHere
 from edgefilter.dsp.stft import Analyser, StftConfig, Synthesiser
 from edgefilter.errors import UsageError
 from edgefilter.types import Array, Samples
-from export import d_vector
 
 TYPE, VERSION = "edgefilter-voicefilter", 1
 """What the file's metadata has to say."""
@@ -29,12 +28,16 @@ def find(model: Path | None = None) -> Path:
     model = model or MODEL
     if not model.is_file():
         raise NotHere(f"no {model.name} in {model.parent.name}/: train one with python -m export.voicefilter")
+    from export import d_vector  # the training side is not installed everywhere
+
     d_vector.find()
     return model
 
 
 def keep(samples: Samples, voice: Samples, model: Path | None = None) -> Samples:
     """What samples (n,) hold of the speaker of voice (m,), (n,)."""
+    from export import d_vector
+
     session, stft = _open(find(model))
     frames = analysed(stft, samples)
     try:
