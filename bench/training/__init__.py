@@ -13,18 +13,19 @@ that is to tune on.
 from __future__ import annotations
 
 import argparse
+import importlib
 from pathlib import Path
 
 from bench.recordings import Recording, find_recordings
-from bench.training import probability, words
 from edgefilter.errors import UsageError
 
-PARTS = {"words": words.run, "probability": probability.run}
+PARTS = ("words", "probability")
+"""Modules of this folder; the first needs torch, so that each is imported where it runs."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
-    add("part", choices=tuple(PARTS))
+    add("part", choices=PARTS)
     add("--conversations", type=Path, nargs="*", default=[], metavar="DIR", help="of bench.simulate.conversations")
     add("--real", type=Path, metavar="DIR", help="recordings of real devices, the robot alone")
     add("--speech", type=Path, metavar="DIR", help="humans that are laid on them")
@@ -43,7 +44,7 @@ def run(options: argparse.Namespace) -> str:
     if options.real and not options.speech:
         raise UsageError("--real lays humans on recordings: give --speech with a transcripts.tsv")
     options.alone = tuning_half(options.real) if options.real else []
-    return PARTS[options.part](options)
+    return importlib.import_module(f"bench.training.{options.part}").run(options)
 
 
 def tuning_half(folder: Path) -> list[Recording]:
