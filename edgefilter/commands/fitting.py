@@ -18,9 +18,6 @@ from edgefilter.profile.data import Profile
 from edgefilter.report.text import UNITS, figure, joined, proof_line
 from edgefilter.types import Samples
 
-LEAST_FALL_DB = 0.05
-"""By less the figures that are shown do not differ."""
-
 
 class Refused(EdgefilterError):
     """What was fitted would make the running filter worse, so that nothing was written."""
@@ -77,7 +74,7 @@ class Fitted:
             if find(name).event
         ]
         lines += [f"NOTE        {name}: {note}" for name in self.names if (note := reach(find(name), values[name]))]
-        if self.names and after_db > before_db - LEAST_FALL_DB:
+        if self.names and round(after_db, 1) >= round(before_db, 1):  # as they are shown
             what = "this effect does" if len(self.names) == 1 else "these effects do"
             lines.append(f"WARNING     the error did not fall: {what} not explain the recording")
         return lines

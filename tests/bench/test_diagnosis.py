@@ -235,12 +235,11 @@ def test_the_human_comes_late_and_before_the_microphone(voices: Path) -> None:
 @pytest.mark.slow
 def test_a_fan_that_is_known_makes_it_better_and_the_page_says_so(voices: Path, tmp_path: Path) -> None:
     arguments = ["--voices", voices, "--speech", voices, "--count", 1, "--effects", "fan_noise", "--seed", 41]
-    arguments += ["--engines", "ss", "--output", tmp_path / "found", "--page", tmp_path / "page.md"]
+    arguments += ["--engines", "ss", "--output", tmp_path / "found"]
     assert bench.main(["diagnosis", "run-time", *map(str, arguments)]) == 0
     (row,) = json.loads((tmp_path / "found.json").read_text())["parts"]["run_time"]["rows"]
     assert row["erle_more"] > 1  # as much fan more is masked, up to the mask's floor
-    (told,) = [line for line in (tmp_path / "page.md").read_text().splitlines() if line.startswith("| fan_noise |")]
-    assert told in (tmp_path / "found.md").read_text()
+    assert "| fan_noise |" in (tmp_path / "found.md").read_text()
 
 
 @pytest.mark.parametrize(("sign", "said"), [(-1, "worse"), (1, "better"), (0, "better")])

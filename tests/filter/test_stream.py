@@ -55,7 +55,7 @@ class Closing:
     def start(self, path, hop):
         pass
 
-    def hear(self, heard):
+    def observe(self, hop):
         return None
 
     def stats(self):

@@ -180,7 +180,7 @@ def test_devices_lists_them_and_the_reference(server):
     result = subprocess.run(edgefilter("devices"), env=server.environment, cwd=ROOT, capture_output=True, text=True)
     assert result.returncode == 0, result.stderr
     assert "sound server, output  robot_mic" in result.stdout
-    assert "robot_mic_monitor" in result.stdout and "reference would come from: robot.monitor" in result.stdout
+    assert "robot_mic_monitor" in result.stdout and "take its reference from: robot.monitor" in result.stdout
 
 
 def test_the_doctor_finds_the_virtual_machine_fit(server):
