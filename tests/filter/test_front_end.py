@@ -39,19 +39,3 @@ def test_a_frame_says_whether_nothing_of_the_robot_can_be_heard():
     hops = zip(mic.reshape(-1, 256), ref.reshape(-1, 256), strict=True)
     idle = np.array([front.step(*hop)[0].idle for hop in hops])
     assert idle[:second].all() and not idle[second : 3 * second + 7].any() and idle[-second:].all()
-
-
-def test_the_noise_is_found_again_after_a_microphone_was_muted():
-    """An estimate that only grows by a factor could never rise from zero."""
-    front, rng = FrontEnd(Linear(), None), np.random.default_rng(0)
-    silence = np.zeros(256, np.float32)
-
-    def expected(hops: int, level: float) -> float:
-        for _ in range(hops):
-            frame, _ = front.step((level * rng.standard_normal(256)).astype(np.float32), silence)
-        return float(frame.noise_psd.mean())
-
-    before = expected(600, 1e-4)
-    muted = expected(4000, 0.0)
-    assert muted > 0.1 * before
-    assert expected(600, 1e-4) > 0.5 * before
