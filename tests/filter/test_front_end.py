@@ -5,6 +5,7 @@ import numpy as np
 from edgefilter import enhance
 from edgefilter.engines.linear import Linear
 from edgefilter.filter.front_end import RUMBLE, FrontEnd
+from edgefilter.filter.residual_echo import Residual
 from edgefilter.types import SAMPLE_RATE
 from tests.engines.test_engines import robot
 
@@ -39,3 +40,19 @@ def test_a_frame_says_whether_nothing_of_the_robot_can_be_heard():
     hops = zip(mic.reshape(-1, 256), ref.reshape(-1, 256), strict=True)
     idle = np.array([front.step(*hop)[0].idle for hop in hops])
     assert idle[:second].all() and not idle[second : 3 * second + 7].any() and idle[-second:].all()
+
+
+def test_the_noise_is_found_again_after_a_microphone_was_muted():
+    """An estimate that only grows by a factor could never rise from zero."""
+    stft, rng = Linear().stft, np.random.default_rng(0)
+    residual, silence = Residual(stft), np.zeros(stft.bins, np.float32)
+
+    def expected(hops: int, level: float) -> float:
+        for _ in range(hops):
+            error = level * (rng.standard_normal(stft.bins) + 1j * rng.standard_normal(stft.bins)).astype(np.complex64)
+            noise, _ = residual.step(silence.astype(np.complex64), error, silence)
+        return float(noise.mean())
+
+    before = expected(2000, 1e-4)
+    assert expected(4000, 0.0) < 1e-4 * before
+    assert expected(6000, 1e-4) > 0.5 * before
