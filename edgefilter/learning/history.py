@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from edgefilter.filter.echo_path import TAPS, EchoPath
 from edgefilter.filter.learner import FilteredHop
+from edgefilter.filter.volume import pre_emphasised
 from edgefilter.types import SAMPLE_RATE, Samples
 
 MINUTE = 60.0
@@ -17,8 +18,6 @@ RECENT_S = 15.0
 """The newest of them, s: enough to fit a loudspeaker and a room to, and all of it from where the robot stands now."""
 PAST = SAMPLE_RATE
 """Samples of the aligned reference, longer than any path, that a learner wants after a switch of the delay."""
-PRE_EMPHASIS = 0.95
-"""First-order pre-emphasis: fan and rumble below the voice weigh less."""
 
 
 class HopHistory:
@@ -84,5 +83,5 @@ class HopHistory:
 
 def emphasised(x: Samples) -> float:
     """Power of x (n,) with pre-emphasis, summed."""
-    bright = x[1:] - PRE_EMPHASIS * x[:-1]
+    bright = pre_emphasised(x)
     return float(bright.dot(bright))
