@@ -107,7 +107,7 @@ def peak_filter(frequency_hz: float, q: float, gain_db: float) -> Array:
 class Room:
     """A shoebox room with a robot's microphone, its loudspeaker and a human.
 
-    rt60_s is what the impulse response shows.
+    rt60_s is what the impulse response shows. robot, human: responses (n,), of an array (microphones, n).
     """
 
     rt60_s: float
@@ -128,12 +128,18 @@ def draw_walls(rng: np.random.Generator, kind: str) -> tuple[Array, float]:
 
 
 def stand(
-    rng: np.random.Generator, walls: tuple[Array, float], robot_m: float, direction: Array, human_m: float
+    rng: np.random.Generator,
+    walls: tuple[Array, float],
+    robot_m: float,
+    direction: Array,
+    human_m: float,
+    array: Array | None = None,
 ) -> Room:
     """Impulse responses at 16 kHz by image sources (Allen & Berkley 1979; pyroomacoustics), without filter delay.
 
     walls: from `draw_walls`. robot_m, direction (3,): where the loudspeaker lies from the microphone; it is a part of
-    the robot, so the same in every room. The human's mouth is human_m away, a little higher.
+    the robot, so the same in every room. The human's mouth is human_m away, a little higher. array: (m, 3), where the
+    microphones of an array lie from the microphone; None for the microphone alone.
     """
     size, wanted = walls
     microphone = np.array([*rng.uniform(1.75, size[:2] - 1.75), rng.uniform(0.9, 1.2)])
@@ -146,19 +152,29 @@ def stand(
     ):  # Sabine's formula misses the decay of an absorbing room by a quarter: ask again for what came out short
         robot, human = _image_sources(size, asked, microphone, (microphone + robot_m * direction, mouth))
         found = float(pra.experimental.measure_rt60(human, fs=RATE, decay_db=30))
-        asked = min(asked * wanted / found, 1.5)
+        asked, last = min(asked * wanted / found, 1.5), asked
+    if array is not None:
+        robot, human = _image_sources(size, last, microphone + array, (microphone + robot_m * direction, mouth))
     return Room(found, robot, human)
 
 
 def _image_sources(size: Array, rt60_s: float, microphone: Array, sources: tuple[Array, ...]) -> list[Array]:
+    """Of each source the response (n,) at a microphone (3,), or (m, n) at microphones (m, 3)."""
     absorption, order = pra.inverse_sabine(rt60_s, size)
     room = pra.ShoeBox(size, fs=RATE, materials=pra.Material(absorption), max_order=min(order, 60))
-    room.add_microphone(microphone)
+    for one in np.atleast_2d(microphone):
+        room.add_microphone(one)
     for source in sources:
         room.add_source(source)
     room.compute_rir()
     skip = pra.constants.get("frac_delay_length") // 2
-    return [np.asarray(response[skip:], np.float64) for response in room.rir[0]]
+    found = []
+    for heard in zip(*room.rir):
+        responses = np.zeros((len(heard), max(one.size for one in heard) - skip))
+        for row, one in zip(responses, heard):
+            row[: one.size - skip] = one[skip:]
+        found.append(responses if microphone.ndim > 1 else responses[0])
+    return found
 
 
 def draw_body(rng: np.random.Generator) -> Array:
@@ -230,10 +246,14 @@ class Robot:
     bulk: int
 
     def record(self, x: Array, response: Array, linear: bool = False) -> Array:
-        """Microphone samples (n,) of the played samples x (n,) for a room's impulse response, without fan or human."""
-        path = signal.oaconvolve(response, self.shell)
-        heard = signal.oaconvolve(self.loudspeaker.play(x, linear), path)[: x.size - self.bulk]
-        return np.concatenate([np.zeros(self.bulk), heard])
+        """Microphone samples (n,) of the played samples x (n,) for a room's impulse response, without fan or human.
+
+        Of an array (m, n), for responses (m, taps) and a shell (m, 32).
+        """
+        path = signal.oaconvolve(response, self.shell, axes=-1)
+        sound = self.loudspeaker.play(x, linear)
+        heard = signal.oaconvolve(sound if path.ndim == 1 else sound[None], path, axes=-1)[..., : x.size - self.bulk]
+        return np.concatenate([np.zeros((*path.shape[:-1], self.bulk)), heard], axis=-1)
 
 
 def draw_robot(rng: np.random.Generator) -> Robot:
