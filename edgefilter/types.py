@@ -16,6 +16,7 @@ SAMPLE_RATE = 16000
 PRE_ROLL = 64
 """Samples (4 ms) of the impulse response before the direct sound: what equalisers and linear-phase filters of a
 loudspeaker ring ahead of it."""
+MOST_MICROPHONES = 8
 LOUDEST = 1e6
 """Largest sample that is taken, 120 dB over full scale: no recording is louder, and powers stay within float32."""
 
@@ -28,7 +29,8 @@ Spectrum: TypeAlias = NDArray[np.complex64]
 class Block:
     """Samples of both channels that belong to the same stretch of the sample counter.
 
-    mic, ref: (n,) float32, full scale +-1, any n >= 0. start: counter of the first sample.
+    mic: (n,) float32, full scale +-1, any n >= 0; of an array (microphones, n). ref: (n,). start: counter of the first
+    sample.
     lost: samples that the source could not deliver since the previous block (their place is filled, never silently).
     """
 
@@ -206,3 +208,20 @@ def as_samples(x: object, name: str) -> Samples:
                 expected = "finite samples: repair or cut the recording"
             raise SignalError(f"{name} holds {array[bad]:g} at sample {bad}, expected {expected}")
     return array
+
+
+def as_microphones(x: object, name: str) -> Samples:
+    """Return x (n,) or (n, channels) as (n,) float32 where it has one channel, else as (channels, n), contiguous.
+
+    Raises SignalError for more than MOST_MICROPHONES channels, and as as_samples does.
+    """
+    array = np.asarray(x)
+    if array.ndim != 2:
+        return as_samples(array, name)
+    if not 1 <= array.shape[1] <= MOST_MICROPHONES:
+        raise SignalError(
+            f"{name} has shape {array.shape}, expected (n,) or (n, channels) with 1 to {MOST_MICROPHONES} channels"
+        )
+    if array.shape[1] == 1:
+        return as_samples(array[:, 0], name)
+    return np.stack([as_samples(channel, f"{name}, channel {at},") for at, channel in enumerate(array.T)])

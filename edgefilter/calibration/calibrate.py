@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy import signal
 
+from edgefilter.calibration.array import cross_density, doubts, refuse_silent
 from edgefilter.calibration.checks import check_found, check_lengths, collect_warnings
 from edgefilter.calibration.stepped_sine import SteppedLaw, response_from_stepped_sine, response_from_sweep, stepped_law
 from edgefilter.calibration.sweep import Deconvolution, deconvolve, find_direct, harmonic_distortion, sweep_law
@@ -12,8 +13,9 @@ from edgefilter.dsp.frames import all_block_power
 from edgefilter.dsp.psd import third_octave_bands
 from edgefilter.echo.model import EchoModel
 from edgefilter.errors import CalibrationError, SignalError
+from edgefilter.profile.array import ArrayCalibration
 from edgefilter.profile.data import DISTORTION_ORDERS, GRID_FFT, GRID_HZ, Profile
-from edgefilter.types import PRE_ROLL, SAMPLE_RATE, Array, Samples, as_samples
+from edgefilter.types import PRE_ROLL, SAMPLE_RATE, Array, Samples, as_microphones, as_samples
 
 MIN_TAPS, MAX_TAPS = 6400, SAMPLE_RATE
 """400 ms and 1 s: what is kept of the impulse response at least and at most."""
@@ -35,10 +37,11 @@ def calibrate(
     sweep_reference : ndarray of float, shape (n,)
         An exponential sweep as it was played, with silence around it (`generate_sweep`). All three at 16 kHz, full
         scale +-1.
-    sweep_recording : ndarray of float, shape (m,)
-        What the microphone heard, on the same sample counter to within -2000 samples and 1.6 s.
-    noise_recording : ndarray of float, shape (k,)
-        The fan alone, some seconds.
+    sweep_recording : ndarray of float, shape (m,) or (m, channels)
+        What the microphone heard, on the same sample counter to within -2000 samples and 1.6 s; or two to eight
+        microphones that share a clock.
+    noise_recording : ndarray of float, shape (k,) or (k, channels)
+        The fan alone, some seconds, in the same microphones.
     stepped_sine : bool
         Reference and recording are those of the paper's `generate_stepped_sine` instead.
     created, source : str
@@ -70,7 +73,8 @@ def calibrate(
     >>> profile.delay, round(float(profile.response[100]), 2)
     (300.0, 0.5)
     """
-    reference, recording, noise = checked(sweep_reference, sweep_recording, noise_recording)
+    reference, recordings, noises = checked(sweep_reference, sweep_recording, noise_recording)
+    recording, noise = first(recordings), first(noises)
     law = stepped_law(reference) if stepped_sine else sweep_law(reference)
     check_lengths(law, recording, noise)
     noise_psd = fan_psd(noise)
@@ -85,6 +89,17 @@ def calibrate(
     else:
         response = response_from_sweep(reference, recording, noise, direct)
         distortion = harmonic_distortion(result, direct, law, DISTORTION_ORDERS)
+    warnings = collect_warnings(law, reference, recording, noise, result, path, direct, bands, snr)
+    array = None
+    if recordings.ndim > 1:
+        refuse_silent(recordings)
+        results = [deconvolve(reference, *of, GRID_HZ, MIN_TAPS) for of in zip(recordings[1:], map(fan_psd, noises[1:]))]
+        responses = np.zeros((len(results), MAX_TAPS), np.float32)
+        for row, other in zip(responses, results):
+            further = impulse_response(other, direct)
+            row[: further.size] = further
+        array = ArrayCalibration(responses[:, : max(path.size, MIN_TAPS)], cross_density(noises))
+        warnings += doubts(noises, [result, *results], direct)
     return Profile(
         echo=EchoModel(path),
         delay=float(direct),
@@ -93,22 +108,38 @@ def calibrate(
         band_hz=bands,
         band_snr_db=snr,
         distortion_db=distortion,
-        warnings=tuple(collect_warnings(law, reference, recording, noise, result, path, direct, bands, snr)),
+        warnings=tuple(warnings),
         created=created,
         source=source,
+        array=array,
     )
 
 
 def checked(reference: object, recording: object, noise: object) -> tuple[Samples, Samples, Samples]:
-    """The three recordings of a calibration as float32; raises CalibrationError for another type, shape or NaN."""
+    """The three recordings of a calibration as float32, of an array the latter two (microphones, n).
+
+    Raises CalibrationError for another type, shape or NaN, and for other microphones in the noise than in the sweep.
+    """
     try:
-        return (
+        found = (
             as_samples(reference, "the sweep reference"),
-            as_samples(recording, "the sweep recording"),
-            as_samples(noise, "the noise recording"),
+            as_microphones(recording, "the sweep recording"),
+            as_microphones(noise, "the noise recording"),
         )
     except SignalError as error:
         raise CalibrationError(str(error)) from None
+    counts = [1 if one.ndim == 1 else len(one) for one in found[1:]]
+    if counts[0] != counts[1]:
+        raise CalibrationError(
+            f"the sweep recording has {counts[0]} channels and the noise recording {counts[1]}, expected the same"
+            " microphones in both"
+        )
+    return found
+
+
+def first(recordings: Samples) -> Samples:
+    """(n,) of the first microphone, of recordings (n,) or (microphones, n)."""
+    return recordings if recordings.ndim == 1 else recordings[0]
 
 
 def fan_psd(noise: Samples) -> Samples:

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
-from edgefilter.calibration.calibrate import calibrate, checked, fan_psd
+from edgefilter.calibration.calibrate import calibrate, checked, fan_psd, first
 from edgefilter.calibration.checks import check_lengths, clipped_samples
 from edgefilter.calibration.multisine import BLOCK, PERIOD, PERIODS, MultisineLaw, multisine_law, realisations
 from edgefilter.calibration.sweep import (
@@ -86,13 +86,14 @@ def calibrate_multisine(
     >>> bool(-30 < even < -20 and odd < -50)
     True
     """
-    reference, recording, noise = checked(sweep_reference, sweep_recording, noise_recording)
+    reference, recordings, noises = checked(sweep_reference, sweep_recording, noise_recording)
+    recording, noise = first(recordings), first(noises)
     law = multisine_law(reference)
     sweep = reference[: law.first]
     check_lengths(sweep_law(sweep), recording, noise)
     near = deconvolve(sweep, recording[: law.first + LATEST_DIRECT], fan_psd(noise), GRID_HZ, PERIOD)
-    swept = recording[: law.first + max(find_direct(near.response), 0)]
-    profile = calibrate(sweep, swept, noise, created=created, source=source)
+    swept = recordings[..., : law.first + max(find_direct(near.response), 0)]
+    profile = calibrate(sweep, swept.T, noises.T, created=created, source=source)
     approximation, warnings = approximate(profile, law, reference, recording)
     return replace(profile, approximation=approximation, warnings=(*profile.warnings, *warnings))
 

@@ -10,14 +10,17 @@ from edgefilter.types import Samples
 class Ring:
     """First in, first out, fixed capacity, float32.
 
+    channels: samples are then (channels, n) in place of (n,), and counted once.
+
     Writing never blocks: what does not fit is not stored and is added to `lost`, so an audio callback can write and
     return. One thread may write while another reads; each side moves only its own counter.
     """
 
-    def __init__(self, capacity: int) -> None:
+    def __init__(self, capacity: int, channels: int | None = None) -> None:
         if capacity <= 0:
             raise ValueError(f"ring capacity is {capacity}, expected at least one sample")
-        self._data = np.zeros(capacity, np.float32)
+        self._data = np.zeros(capacity if channels is None else (channels, capacity), np.float32)
+        self._size = capacity
         self._written = 0
         self._read = 0
         self.lost = 0
@@ -29,24 +32,25 @@ class Ring:
     @property
     def capacity(self) -> int:
         """Samples that it holds at most."""
-        return self._data.size
+        return self._size
 
     def write(self, samples: Samples) -> int:
         """Store as many of samples (n,) as fit and return how many; the rest is counted in `lost`."""
-        count = min(samples.size, self._data.size - len(self))
-        at = self._written % self._data.size
-        first = min(count, self._data.size - at)
-        self._data[at : at + first] = samples[:first]
-        self._data[: count - first] = samples[first:count]
-        self.lost += samples.size - count
+        given = samples.shape[-1]
+        count = min(given, self._size - len(self))
+        at = self._written % self._size
+        first = min(count, self._size - at)
+        self._data[..., at : at + first] = samples[..., :first]
+        self._data[..., : count - first] = samples[..., first:count]
+        self.lost += given - count
         self._written += count
         return count
 
     def read(self, count: int) -> Samples:
         """Return and remove up to count samples, the oldest first, as a new array."""
         count = min(count, len(self))
-        at = self._read % self._data.size
-        first = min(count, self._data.size - at)
-        out = np.concatenate((self._data[at : at + first], self._data[: count - first]))
+        at = self._read % self._size
+        first = min(count, self._size - at)
+        out = np.concatenate((self._data[..., at : at + first], self._data[..., : count - first]), axis=-1)
         self._read += count
         return out

@@ -44,7 +44,8 @@ class CancellerOutput(NamedTuple):
 
     echo, error: (hop,) float32 with error = mic - echo exactly. uncertainty: (hop + 1,) float32, what the filter itself
     expects of |error spectrum|^2 from its misalignment, for a rectangular frame of hop samples, on frequencies 0 to
-    Nyquist. innovation: (hop,), the error of the prediction that knew nothing of this hop of the microphone.
+    Nyquist. innovation: (hop,), the error of the prediction that knew nothing of this hop of the microphone. Of an array
+    each has a leading axis of microphones.
     """
 
     echo: Samples
@@ -57,7 +58,7 @@ class CancellerOutput(NamedTuple):
 class CancellerState:
     """What a canceller knows of the path: weights (rows, bins), their covariance and the noise (bins,) that it measured.
 
-    volume_gain: by how much the volume was turned since the path was measured.
+    Of an array each has a leading axis of microphones. volume_gain: by how much the volume was turned since the path was measured.
     """
 
     taps: int
@@ -79,8 +80,10 @@ class Canceller:
     "Loudspeaker nonlinearities"). Their paths are PRODUCT_PARTITIONS long and start at zero. adaptation: WARM where
     impulse_response is given, COLD where not, unless said otherwise. impulse_response (n,) float32 starts the filter;
     longer than taps it is cut, without it the start is cold. behind(echo, mic) (hop,): what the microphone makes of the
-    echo that the path brings, None for nothing. Raises SignalError where hop or taps are not positive or
-    the impulse response is not finite.
+    echo that the path brings, None for nothing. microphones: of an array, None for a single one: signals are then
+    (microphones, hop), the impulse response (microphones, n), and all that is said of a path holds of each; the volume,
+    and whether the echo is there at all, is told in the first microphone for all of them. Raises SignalError where hop or
+    taps are not positive or the impulse response is not finite.
     """
 
     def __init__(
@@ -90,6 +93,7 @@ class Canceller:
         impulse_response: Samples | None = None,
         adaptation: Adaptation | None = None,
         behind: Callable[[Samples, Samples], Samples] | None = None,
+        microphones: int | None = None,
     ) -> None:
         if hop < 1 or taps < 1:
             raise SignalError(f"canceller got hop={hop} and taps={taps}, expected both to be at least 1 sample")
@@ -98,12 +102,14 @@ class Canceller:
         self.partitions = -(-taps // hop)
         self.taps = self.partitions * hop
         self.adaptation = adaptation or (COLD if impulse_response is None else WARM)
-        self._initial, self._initial_gain = np.zeros(self.taps, np.float32), 1.0
+        self.microphones = microphones
+        self._lead = () if microphones is None else (microphones,)
+        self._initial, self._initial_gain = np.zeros((*self._lead, self.taps), np.float32), 1.0
         if impulse_response is not None:
-            if impulse_response.ndim != 1 or not np.isfinite(impulse_response).all():
+            if impulse_response.shape[:-1] != self._lead or not np.isfinite(impulse_response).all():
                 raise SignalError("the canceller's impulse response is not a finite (n,) array: calibrate again")
-            known = min(self.taps, impulse_response.size)
-            self._initial[:known] = impulse_response[:known]
+            known = min(self.taps, impulse_response.shape[-1])
+            self._initial[..., :known] = impulse_response[..., :known]
         self._channels = 3 if self.adaptation.products else 1
         self._rows = self.partitions + PRODUCT_PARTITIONS * (self._channels - 1)
         self._first = [0, self.partitions, self.partitions + PRODUCT_PARTITIONS][: self._channels]
@@ -136,47 +142,48 @@ class Canceller:
     def _begin(self) -> None:
         """The path at the start, whatever was heard of the reference."""
         hop, rows, bins = self.hop, self._rows, self.hop + 1
-        shape = (rows, bins)
+        lead, shape = self._lead, (*self._lead, rows, bins)
         self._weights = np.zeros(shape, np.complex64)
-        self._blocks = np.zeros((rows, 2 * hop), np.float32)
-        self._blocks[: self.partitions, :hop] = self._initial.reshape(self.partitions, hop)
+        self._blocks = np.zeros((*lead, rows, 2 * hop), np.float32)
+        self._blocks[..., : self.partitions, :hop] = self._initial.reshape(*lead, self.partitions, hop)
         fourier.rfft(self._blocks, out=self._weights)
-        product_variance = np.broadcast_to(PRODUCT_VARIANCE * self._path_power(), (rows - self.partitions, bins))
-        self._covariance = np.concatenate((self._prior(), product_variance)).astype(np.float32)
+        of_products = (*lead, rows - self.partitions, bins)
+        product_variance = np.broadcast_to(PRODUCT_VARIANCE * self._path_power()[..., None, :], of_products)
+        self._covariance = np.concatenate((self._prior(), product_variance), axis=-2).astype(np.float32)
         self._ageing, self._aged = (1.0 - self.adaptation.transition**2) * fourier.power(self._weights), 0
-        self._noise = np.zeros(bins, np.float32)
+        self._noise = np.zeros((*lead, bins), np.float32)
         self._work = np.zeros(shape, np.complex64)
         self._expected = np.zeros(shape, np.float32)
-        self._padded = np.zeros(2 * hop, np.float32)
+        self._padded = np.zeros((*lead, 2 * hop), np.float32)
         self._hops = self._active = 0
         self.volume = Volume(hop, self._warm)
         self.volume.gain = self._initial_gain
         self._limiter = EchoLimiter(hop)
 
     def step(self, mic: Samples, reference: Samples, located: bool = True) -> CancellerOutput:
-        """Cancel one hop: mic, reference (hop,) float32, neither written to.
+        """Cancel one hop: mic (hop,), of an array (microphones, hop), reference (hop,) float32, neither written to.
 
         located: whether the reference is known to lie where the microphone hears it; the path is adapted only then.
         """
         self._push(reference)
         path_echo = echo = self._predict()
-        if not path_echo.dot(path_echo) < LOUDEST * self.hop:  # nor where it is no number
+        if not np.vdot(path_echo, path_echo) < LOUDEST * self.hop:  # nor where it is no number
             diverged = self._diverged + 1
             self.reset()  # of the reference's past, too: it may be what made it diverge
             self._diverged = diverged
             path_echo = echo = self._predict()
         np.multiply(self._covariance, self._powers, out=self._expected)
-        misalignment = np.add.reduce(self._expected, axis=0)
+        misalignment = np.add.reduce(self._expected, axis=-2)
         if self.behind:
             echo = self.behind(echo, mic)
-        turned = self.volume.follow(mic, echo)
+        turned = self.volume.follow(self._first_of(mic), self._first_of(echo))
         if turned != 1.0:
             self._weights *= np.float32(turned)
             self._covariance *= np.float32(turned**2)
             self._covariance += VOLUME_REOPENS * fourier.power(self._weights)
             echo = echo * np.float32(turned)
-        excessive = self._limiter.measure(mic, echo)
-        self._padded[self.hop :] = innovation = mic - echo
+        excessive = self._limiter.measure(self._first_of(mic), self._first_of(echo))
+        self._padded[..., self.hop :] = innovation = mic - echo
         error_spectrum = fourier.rfft(self._padded)
         memory = self.adaptation.noise_memory
         self._noise *= memory
@@ -197,7 +204,11 @@ class Canceller:
     def _predict(self) -> Samples:
         """(hop,) echo of the newest hop by the weights as they are."""
         np.multiply(self._weights, self._spectra, out=self._work)
-        return fourier.irfft(np.add.reduce(self._work, axis=0), 2 * self.hop)[self.hop :]
+        return fourier.irfft(np.add.reduce(self._work, axis=-2), 2 * self.hop)[..., self.hop :]
+
+    def _first_of(self, x: Samples) -> Samples:
+        """(hop,) of the first microphone, of x (hop,) or (microphones, hop)."""
+        return x if self.microphones is None else x[0]
 
     def _push(self, reference: Samples) -> None:
         """Take the reference's next hop into the spectra and powers (partitions, bins), the newest first in each channel."""
@@ -232,25 +243,25 @@ class Canceller:
         work, blocks, expected = self._work, self._blocks, self._expected
         np.conjugate(self._spectra, out=work)
         work *= self._covariance
-        work *= error_spectrum * divisor
+        work *= (error_spectrum * divisor)[..., None, :]
         fourier.irfft(work, 2 * self.hop, out=blocks)
-        blocks[:, self.hop :] = 0.0  # each partition keeps to hop taps (Shynk 1992)
+        blocks[..., self.hop :] = 0.0  # each partition keeps to hop taps (Shynk 1992)
         self._weights += fourier.rfft(blocks, out=work)
         kept = self.adaptation.transition**2
-        expected *= (-self.adaptation.certainty * kept) * divisor
+        expected *= (-self.adaptation.certainty * kept) * divisor[..., None, :]
         expected += kept
         self._covariance *= expected
         aged = slice(self._aged, self._aged + AGED_ROWS)
-        self._ageing[aged] = (1.0 - kept) * fourier.power(self._weights[aged])
-        self._aged = aged.stop if aged.stop < len(self._weights) else 0
+        self._ageing[..., aged, :] = (1.0 - kept) * fourier.power(self._weights[..., aged, :])
+        self._aged = aged.stop if aged.stop < self._rows else 0
         self._covariance += self._ageing
 
     def _path_power(self) -> np.ndarray:
         """(bins,) |H|^2 of the path at the start, summed over partitions; 1 where nothing is known."""
         return (
-            fourier.power(self._weights[: self.partitions]).sum(axis=0)
+            fourier.power(self._weights[..., : self.partitions, :]).sum(axis=-2)
             if self._warm
-            else np.ones(self.hop + 1, np.float32)
+            else np.ones((*self._lead, self.hop + 1), np.float32)
         )
 
     def _prior(self) -> np.ndarray:
@@ -258,15 +269,16 @@ class Canceller:
         seconds = np.arange(self.partitions) * self.hop / SAMPLE_RATE
         decay = 10.0 ** (-6.0 * seconds / DECAY_RT60_S)[:, None] * np.ones(self.hop + 1)
         if not self._warm:
-            return (decay / decay.sum(axis=0)).astype(np.float32)
+            return np.broadcast_to(decay / decay.sum(axis=0), (*self._lead, *decay.shape)).astype(np.float32)
         return (
-            PRIOR_VARIANCE * fourier.power(self._weights[: self.partitions])
-            + LATE_VARIANCE * decay * self._path_power()
+            PRIOR_VARIANCE * fourier.power(self._weights[..., : self.partitions, :])
+            + LATE_VARIANCE * decay * self._path_power()[..., None, :]
         ).astype(np.float32)
 
     def impulse_response(self) -> Samples:
-        """The adapted path (taps,) float32, to be written back into a profile."""
-        return fourier.irfft(self._weights[: self.partitions], 2 * self.hop)[:, : self.hop].reshape(-1)
+        """The adapted path (taps,) float32, of an array (microphones, taps), to be written back into a profile."""
+        blocks = fourier.irfft(self._weights[..., : self.partitions, :], 2 * self.hop)[..., : self.hop]
+        return blocks.reshape(*self._lead, -1)
 
     def state(self) -> CancellerState:
         """Copies of what it knows of the path, without the reference that is under way."""
@@ -285,7 +297,8 @@ class Canceller:
 
         Its reference is to be rewritten before the next step.
         """
-        canceller = cls(hop, state.taps, adaptation=state.adaptation)
+        microphones = len(state.weights) if state.weights.ndim > 2 else None
+        canceller = cls(hop, state.taps, adaptation=state.adaptation, microphones=microphones)
         canceller._weights[:], canceller._covariance[:] = state.weights, state.covariance
         canceller._noise[:] = state.noise
         canceller._ageing = (1.0 - state.adaptation.transition**2) * fourier.power(canceller._weights)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -39,7 +40,7 @@ class EchoPath:
         self.effects = effects
         self.source = SourceChain(effects)
         self.canceller = canceller
-        canceller.behind = VoiceChain(effects) or None
+        canceller.behind = _behind(effects, canceller.microphones)
 
     @property
     def history(self) -> int:
@@ -47,11 +48,11 @@ class EchoPath:
         return max(self.canceller.history, self.source.memory)
 
     def step(self, mic: Samples, reference: Samples, located: bool, past: Samples | None = None) -> CancellerOutput:
-        """One hop (hop,) of the microphone and of the aligned reference.
+        """One hop (hop,) of the microphone, of an array (microphones, hop), and of the aligned reference (hop,).
 
         past: (n,) the aligned reference up to and with this hop where its delay was switched in it, else None.
         """
-        before = None if past is None else self.source.restart(past[: -mic.size])
+        before = None if past is None else self.source.restart(past[: -reference.size])
         driven = self.source(reference)
         if before is not None:
             self.canceller.rewrite_reference(np.concatenate((before, driven)))
@@ -70,10 +71,21 @@ class EchoPath:
         return path
 
 
-def starting_path(profile: Profile | None, hop: int) -> EchoPath:
-    """What a filter with that profile, or with none, begins with."""
+def starting_path(profile: Profile | None, hop: int, microphones: int | None = None) -> EchoPath:
+    """What a filter with that profile, or with none, begins with; microphones: of an array, None for a single one."""
     if profile is None:
-        return EchoPath(Canceller(hop))
-    response = profile.echo.running_response()
+        return EchoPath(Canceller(hop, microphones=microphones))
+    response = profile.running_responses() if microphones else profile.echo.running_response()
     adaptation = LEARNED if profile.learned else WARM
-    return EchoPath(Canceller(hop, int(np.clip(response.size, *TAPS)), response, adaptation), profile.echo.effects)
+    taps = int(np.clip(response.shape[-1], *TAPS))
+    return EchoPath(Canceller(hop, taps, response, adaptation, microphones=microphones), profile.echo.effects)
+
+
+def _behind(effects: Effects, microphones: int | None) -> Callable[[Samples, Samples], Samples] | None:
+    """What the microphone, or each one of an array, does behind the path; None where it does nothing."""
+    if microphones is None:
+        return VoiceChain(effects) or None
+    chains = [VoiceChain(effects) for _ in range(microphones)]
+    if not chains[0]:
+        return None
+    return lambda echo, mic: np.stack([chain(*own) for chain, *own in zip(chains, echo, mic)])

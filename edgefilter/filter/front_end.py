@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from edgefilter.alignment.aligner import Aligner
 from edgefilter.alignment.delay_line import UNLOCATED, Aligned
 from edgefilter.alignment.paper import PaperAligner
+from edgefilter.dsp import fourier
 from edgefilter.dsp.stft import Analyser, StftConfig
 from edgefilter.echo.source_chain import SourceChain
 from edgefilter.engines.base import ClipEngine, Engine
@@ -15,8 +18,9 @@ from edgefilter.filter.echo_path import EchoPath, starting_path
 from edgefilter.filter.learner import FilteredHop, Learner, Lesson
 from edgefilter.filter.onset_gate import GATE, OnsetGate
 from edgefilter.filter.residual_echo import Residual, Unpredictable
+from edgefilter.filter.spatial import SpatialFilter
 from edgefilter.profile.data import Profile
-from edgefilter.types import Frame, Samples
+from edgefilter.types import Frame, Output, Samples, Spectrum
 
 RUMBLE_HZ, RUMBLE = 90.0, 0.05
 """Below this frequency a microphone whose path nobody measured hears rooms, not people; it is lowered by 26 dB."""
@@ -48,7 +52,7 @@ class LinearStage:
         return self.path.canceller
 
     def step(self, mic: Samples, aligned: Aligned) -> CancellerOutput:
-        """One hop (hop,) of the microphone, with what the aligner found in it."""
+        """One hop (hop,) of the microphone, of an array (microphones, hop), with what the aligner found in it."""
         located = aligned.state not in UNLOCATED
         past = self._past() if aligned.realigned else None
         output = self.path.step(mic, aligned.reference, located, past)
@@ -69,7 +73,7 @@ class LinearStage:
         self, lesson: Lesson, mic: Samples, reference: Samples, located: bool, before: CancellerOutput
     ) -> CancellerOutput:
         """Fade from what the path of before made of this hop to what the learned one makes of it."""
-        self.path = EchoPath.resumed(lesson.path, self._past(), mic.size)
+        self.path = EchoPath.resumed(lesson.path, self._past(), reference.size)
         after = self.path.step(mic, reference, located)
         echo = before.echo + self._fade * (after.echo - before.echo)
         return CancellerOutput(echo, mic - echo, after.uncertainty, after.innovation)
@@ -83,25 +87,41 @@ class FrontEnd:
     """Finds the reference in the microphone and subtracts what is linear of it.
 
     kind "none" passes the microphone, "paper" only delays the reference per utterance, "full" tracks and cancels.
-    aligner: None for "none". linear_stage: None but for "full". gate: None but for "full" with a profile.
+    aligner: None for "none". linear_stage: None but for "full". gate: None but for "full" with a profile. spatial: None
+    but for "full" with an array. microphones: of an array, None for a single one; the kinds without a linear stage hear
+    its first. aligner: one that has heard nothing yet, but may have been told of utterances; None for a new one.
     """
 
-    def __init__(self, engine: Engine | ClipEngine, profile: Profile | None, learner: Learner | None = None) -> None:
+    def __init__(
+        self,
+        engine: Engine | ClipEngine,
+        profile: Profile | None,
+        learner: Learner | None = None,
+        microphones: int | None = None,
+        aligner: Aligner | PaperAligner | None = None,
+    ) -> None:
         stft = engine.stft
         self.hop, self._stft = stft.hop, stft
-        self.aligner: Aligner | PaperAligner | None = None
+        self.microphones = microphones
+        self.aligner = aligner
+        self.spatial: SpatialFilter | None = None
         self.gate: OnsetGate | None = None
         self.linear_stage: LinearStage | None = None
         if engine.front == "paper":
-            self.aligner = PaperAligner(stft.hop)
+            self.aligner = aligner or PaperAligner(stft.hop)
         elif engine.front == "full":
-            self.aligner = aligner = Aligner(stft.hop, profile)
+            tracking = aligner if isinstance(aligner, Aligner) else Aligner(stft.hop, profile)
+            self.aligner = tracking
             if profile:
                 self.gate = OnsetGate(stft.hop, float(np.sum(np.square(profile.echo.running_response()))))
-            path = starting_path(profile, stft.hop)
-            self.linear_stage = LinearStage(aligner, path, Residual(stft, profile), learner)
+            path = starting_path(profile, stft.hop, microphones)
+            self.linear_stage = LinearStage(tracking, path, Residual(stft, profile), learner)
             self._source: SourceChain | None = None
-        self._analyser = Analyser(stft, channels=4 if self.linear_stage else 2)
+            if microphones:
+                noise = profile.array.noise_covariance(stft) if profile and profile.array else None
+                self.spatial = SpatialFilter(stft, microphones, noise)
+        channels = 2 if self.linear_stage is None else 4 if microphones is None else 1 + 2 * microphones
+        self._analyser = Analyser(stft, channels)
         self._low_cut = None if profile or not self.linear_stage else low_cut(stft)
         self._nothing = np.zeros(stft.bins, np.float32)
         self._fan = profile.noise_bins(stft) if profile else self._nothing
@@ -113,25 +133,66 @@ class FrontEnd:
         return self.linear_stage.lesson if self.linear_stage else None
 
     def step(self, mic: Samples, ref: Samples) -> tuple[Frame, Aligned | None]:
-        """One hop (hop,) of both channels to one frame, with what the aligner found."""
+        """One hop (hop,) of microphone and reference to one frame, with what the aligner found.
+
+        mic: of an array (microphones, hop).
+        """
         stage = self.linear_stage
+        heard, mic = mic, mic if self.microphones is None else mic[0]
         if stage is None:
             found = self.aligner.step(mic, ref) if self.aligner else None
             x, r = self._analyser.push(mic, found.reference if found else ref)
             return Frame(x, r, self._silence, x, self._fan, self._nothing), found
         aligned = stage.aligner.step(mic, ref)
-        linear = stage.step(mic, aligned)
-        signals = np.stack((mic, aligned.reference, linear.echo, linear.error))
-        if self.gate and (gain := self.gate.step(mic, ref, aligned)) is not None:
-            signals[[0, 2, 3]] *= gain
+        linear = stage.step(heard, aligned)
+        gain = self.gate.step(mic, ref, aligned) if self.gate else None
+        added = self._added(stage.path.source)
+        if self.spatial:
+            r, (x, e, error) = self._combined(self.spatial, heard, aligned.reference, linear.echo, gain)
+            uncertainty, fan = self.spatial.independent(linear.uncertainty), self.spatial.fan_psd()
+            noise, residual = stage.residual.step(e, error, uncertainty, added, fan)
+        else:
+            x, r, e, error = self._spectra(gain, (0, 2, 3), mic, aligned.reference, linear.echo, linear.error)
+            noise, residual = stage.residual.step(e, error, linear.uncertainty, added)
+        return Frame(x, r, e, error, noise, residual, aligned.state == "idle"), aligned
+
+    def _spectra(self, gain: Samples | None, heard: Sequence[int], *signals: Samples) -> Spectrum:
+        """(k, bins) of k signals (hop,); gain: the gate's, None for 1, on those that the microphone has heard."""
+        stacked = np.stack(signals)
+        if gain is not None and self.gate:
+            stacked[list(heard)] *= gain
             if self.gate.shuts:
                 self._analyser.scale_past(GATE)
-        spectra = self._analyser.push(*signals)
+        spectra = self._analyser.push(*stacked)
         if self._low_cut is not None:
             spectra *= self._low_cut
-        x, r, e, error = spectra
-        noise, residual = stage.residual.step(e, error, linear.uncertainty, self._added(stage.path.source))
-        return Frame(x, r, e, error, noise, residual, aligned.state == "idle"), aligned
+        return spectra
+
+    def _combined(
+        self, spatial: SpatialFilter, mic: Samples, reference: Samples, echo: Samples, gain: Samples | None
+    ) -> tuple[Spectrum, Spectrum]:
+        """Spectra (bins,) of the reference, and (3, bins) of microphones, echo and error through the spatial filter."""
+        count = len(mic)
+        spectra = self._spectra(gain, range(1, 1 + 2 * count), reference, *mic, *echo)
+        self.errors = spectra[1 : 1 + count] - spectra[1 + count :]
+        x, error = spatial.step(np.stack((spectra[1 : 1 + count], self.errors)))
+        return spectra[0], np.stack((x, x - error, error))
+
+    def hear(self, frame: Frame, output: Output, probability: float | None, speaking: bool) -> None:
+        """Tell the spatial filter of an array what the engine made of the latest frame, and whether a human speaks.
+
+        probability: None from an engine that does not judge it; the share of what exceeds fan and residual echo then
+        stands for it, and for the mask.
+        """
+        if self.spatial is None:
+            return
+        power = fourier.power(frame.error) + np.float32(1e-20)
+        if probability is None:
+            gain = np.maximum(1.0 - (frame.noise_psd + frame.residual_psd) / power, 0.0)
+            probability = float(np.mean(gain))
+        else:
+            gain = np.minimum(np.sqrt(fourier.power(output.spectrum) / power), 1.0)
+        self.spatial.learn(self.errors, gain, probability, speaking, frame.idle)
 
     def _added(self, source: SourceChain) -> Samples | None:
         """What the effects of the path in use bring that no waveform predicts; a lesson can have brought another path."""

@@ -71,13 +71,21 @@ class Residual:
         self._leakage, self._left, self._brought = self._first, 0.0, 0.0
 
     def step(
-        self, echo: Spectrum, error: Spectrum, uncertainty: Samples, added: Samples | None = None
+        self,
+        echo: Spectrum,
+        error: Spectrum,
+        uncertainty: Samples,
+        added: Samples | None = None,
+        fan: Samples | None = None,
     ) -> tuple[Samples, Samples]:
         """Expected |fan|^2 and |residual echo|^2 in error, both (bins,) float32.
 
         echo, error: (bins,) of the frame. uncertainty: (bins,), CancellerOutput.uncertainty of the frame's last hop.
-        added: (bins,), what of the robot no waveform predicts.
+        added: (bins,), what of the robot no waveform predicts. fan: (bins,), the calibrated fan as it is from this frame
+        on, where what hears it has changed.
         """
+        if fan is not None:
+            self._fan, self._noise, self._noise_power = fan, fan, float(np.add.reduce(fan))
         self._echo *= TAIL_DECAY
         np.maximum(fourier.power(echo), self._echo, out=self._echo)
         if self._fan is None:

@@ -16,7 +16,7 @@ from edgefilter.filter.front_end import FrontEnd
 from edgefilter.filter.learner import Learner
 from edgefilter.filter.stepping import Stepping
 from edgefilter.profile.data import Profile
-from edgefilter.types import SAMPLE_RATE, Event, Frame, Samples, as_samples
+from edgefilter.types import SAMPLE_RATE, Event, Frame, Samples, as_microphones, as_samples
 
 
 class Stream:
@@ -73,6 +73,7 @@ class Stream:
         if self.stepping:
             self.stepping.reset()
         self.front = FrontEnd(self.engine, self.profile, self.learner)
+        self._microphones: int | None = None
         self.events: deque[Event] = deque(maxlen=1000)
         self.speech_probability: float | None = None
         self._judge = HumanJudge(stft, calibrated=self.profile is not None)
@@ -88,15 +89,15 @@ class Stream:
         self._flushed = False
 
     def process(self, mic: Samples, ref: Samples) -> Samples:
-        """Take mic (n,) and ref (n,) and return what is finished, 0 to n + latency samples."""
-        mic, ref = as_samples(mic, "mic"), as_samples(ref, "ref")
+        """Take mic (n,), of an array (n, channels), and ref (n,); return what is finished, 0 to n + latency samples."""
+        mic, ref = as_microphones(mic, "mic"), as_samples(ref, "ref")
         if self._flushed:
             raise SignalError("the stream has been flushed, its end is written: call reset() before the next recording")
-        if mic.size != ref.size:
-            raise SignalError(
-                f"mic has {mic.size} samples and ref {ref.size}, expected as many of each: pad the shorter with zeros"
-            )
-        self.samples_in += mic.size
+        if mic.shape[-1] != ref.size:
+            found = f"mic has {mic.shape[-1]} samples and ref {ref.size}"
+            raise SignalError(f"{found}, expected as many of each: pad the shorter with zeros")
+        self._expect(None if mic.ndim == 1 else len(mic))
+        self.samples_in += ref.size
         return self._deliver(self._run(mic, ref))
 
     def flush(self) -> Samples:
@@ -106,10 +107,31 @@ class Stream:
         padding = np.zeros(self.latency + self.engine.stft.hop, np.float32)
         if not missing:
             return self._deliver(padding[:0])
-        rest = self._run(padding, padding)
+        lead = () if self._microphones is None else (self._microphones,)
+        rest = self._run(np.zeros((*lead, padding.size), np.float32), padding)
         if self.engine.lookahead is None:
             rest = self._finish([self._synthesiser.push(spectrum) for spectrum in self.engine.answer(self._clip)])
         return self._deliver(rest[:missing])
+
+    def _expect(self, microphones: int | None) -> None:
+        """Be ready for that many microphones, None for a single one; raises SignalError where they have become others.
+
+        And where the profile was calibrated with another number of them.
+        """
+        if self.samples_in == 0:
+            known = 1 if self.profile is None else self.profile.microphones
+            if self.profile and known != (microphones or 1):
+                raise SignalError(
+                    f"mic has {microphones or 1} channels and the profile {known}, expected as many: choose the channels"
+                    " that were calibrated, or calibrate again with these"
+                )
+            if microphones != self._microphones:
+                self.front = FrontEnd(self.engine, self.profile, self.learner, microphones, self.front.aligner)
+                self._mic = Ring(2 * self.engine.stft.hop, microphones)
+                self._microphones = microphones
+        if microphones != self._microphones:
+            found = f"mic has {microphones or 1} channels after {self._microphones or 1}"
+            raise SignalError(f"{found}, expected as many to the end: call reset() before another recording")
 
     def _deliver(self, out: Samples) -> Samples:
         """The finished samples out (n,), behind those that are kept; where on_barge_in has raised they are all kept."""
@@ -124,11 +146,11 @@ class Stream:
     def _run(self, mic: Samples, ref: Samples) -> Samples:
         hop = self.engine.stft.hop
         done: list[Samples] = []
-        for at in range(0, mic.size, hop):
-            if mic.size - at >= hop and not len(self._mic):
-                done.append(self._watched_step(mic[at : at + hop], ref[at : at + hop]))
+        for at in range(0, ref.size, hop):
+            if ref.size - at >= hop and not len(self._mic):
+                done.append(self._watched_step(mic[..., at : at + hop], ref[at : at + hop]))
                 continue
-            self._mic.write(mic[at : at + hop])
+            self._mic.write(mic[..., at : at + hop])
             self._ref.write(ref[at : at + hop])
             if len(self._mic) >= hop:
                 done.append(self._watched_step(self._mic.read(hop), self._ref.read(hop)))
@@ -161,7 +183,7 @@ class Stream:
         return out
 
     def _step(self, mic: Samples, ref: Samples) -> Samples:
-        self._stepped += mic.size
+        self._stepped += ref.size
         frame, aligned = self.front.step(mic, ref)
         if aligned and aligned.realigned:
             self.events.append(
@@ -176,6 +198,7 @@ class Stream:
         output, self._state = engine.step(frame, self._state)
         begun = aligned is not None and aligned.state == "begun"
         self._judge_speech(frame, output.speech_probability, begun)
+        self.front.hear(frame, output, self.speech_probability, self.human_speaks)
         return self._synthesiser.push(output.spectrum)
 
     def _judge_speech(self, frame: Frame, probability: float | None, begun: bool) -> None:

@@ -16,6 +16,7 @@ from edgefilter.echo.effects.catalogue import names as known_effects
 from edgefilter.echo.model import EchoModel
 from edgefilter.errors import ProfileError
 from edgefilter.profile.approximation import LinearApproximation
+from edgefilter.profile.array import ArrayCalibration
 from edgefilter.profile.file import REMEDY, read_fields, write_fields
 from edgefilter.types import PRE_ROLL, SAMPLE_RATE, Array, Samples
 
@@ -61,6 +62,8 @@ class Profile:
         ISO date, and what it was made from.
     approximation : LinearApproximation, optional
         What a linear path leaves of the robot at several levels, where it was calibrated with multisines.
+    array : ArrayCalibration, optional
+        The further microphones, where it was calibrated with several; all else is of the first one.
 
     Raises
     ------
@@ -89,6 +92,7 @@ class Profile:
     created: str = ""
     source: str = ""
     approximation: LinearApproximation | None = None
+    array: ArrayCalibration | None = None
 
     def __post_init__(self) -> None:
         _check_arrays(self)
@@ -122,6 +126,8 @@ class Profile:
         arrays["impulse_response"] = np.asarray(self.echo.impulse_response)
         if self.approximation is not None:
             arrays |= self.approximation.arrays()
+        if self.array is not None:
+            arrays |= self.array.arrays()
         header = {
             "pre_roll": PRE_ROLL,
             "delay": float(self.delay),
@@ -153,7 +159,7 @@ class Profile:
         """
         arrays, header, effects = read_fields(Path(path))
         try:
-            approximation = LinearApproximation.taken_from(arrays)
+            approximation, array = LinearApproximation.taken_from(arrays), ArrayCalibration.taken_from(arrays)
             expected = (
                 {*_ARRAYS, "impulse_response"},
                 {"pre_roll", "delay", "sample_rate", "warnings", "created", "source"},
@@ -171,7 +177,7 @@ class Profile:
                 raise ProfileError(f"warnings is a JSON {type(warnings).__name__}, expected a list of texts; {REMEDY}")
             fields: dict[str, Any] = {**arrays, **header}  # what type each has is checked on construction
             echo = EchoModel(fields.pop("impulse_response"), effects)
-            profile = cls(echo=echo, warnings=tuple(warnings), approximation=approximation, **fields)
+            profile = cls(echo=echo, warnings=tuple(warnings), approximation=approximation, array=array, **fields)
             _check_effects(profile.echo)
             return profile
         except ProfileError as error:
@@ -181,6 +187,19 @@ class Profile:
     def learned(self) -> bool:
         """Whether the running filter wrote it: its path is known as well as speech can teach it, not as a sweep can."""
         return self.source == LEARNED
+
+    @property
+    def microphones(self) -> int:
+        """How many it was calibrated with."""
+        return 1 if self.array is None else 1 + len(self.array.responses)
+
+    def running_responses(self) -> Samples:
+        """(microphones, taps) float32, the paths as the running filter begins with them, the effects that are filters in them."""
+        further = () if self.array is None else self.array.responses
+        models = [self.echo, *(replace(self.echo, impulse_response=response) for response in further)]
+        found = [model.running_response() for model in models]
+        taps = max(one.size for one in found)
+        return np.stack([np.pad(one, (0, taps - one.size)) for one in found])
 
     def with_impulse_response(self, impulse_response: Samples) -> Profile:
         """The same robot with another path (taps,) float32, for example the one that the running filter has adapted."""

@@ -14,7 +14,7 @@ from tests import conformance
     ("mic", "ref", "message"),
     [
         (np.zeros(100, np.int16), np.zeros(100, np.float32), "dtype int16.*divide"),
-        (np.zeros((2, 100), np.float32), np.zeros(100, np.float32), r"shape \(2, 100\).*one channel"),
+        (np.zeros((2, 100), np.float32), np.zeros(100, np.float32), r"shape \(2, 100\).*1 to 8 channels"),
         (np.full(3, np.nan, np.float32), np.zeros(3, np.float32), "nan at sample 0"),
         (np.zeros(3, np.float32), np.array([0, 0, np.inf], np.float32), "inf at sample 2"),
         (np.full(3, 1e38, np.float32), np.zeros(3, np.float32), "mic holds 1e[+]38 at sample 0.*its scaling is wrong"),

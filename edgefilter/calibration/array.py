@@ -1,0 +1,57 @@
+"""Calibration of an array: the echo paths of its further microphones, and the fan between all of them."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy import signal
+
+from edgefilter.calibration.sweep import Deconvolution, find_direct
+from edgefilter.dsp.psd import GRID_FFT
+from edgefilter.errors import CalibrationError
+from edgefilter.types import SAMPLE_RATE, Samples
+
+APART_DB = 10.0
+"""Difference of the fan's level to the median microphone's that equal microphones never have: on a real robot with four,
+the three of its array agree within 1 dB and the fourth, of another kind, is 12 to 18 dB louder."""
+FARTHEST = 32
+"""Samples between the direct sound in two microphones of one robot: .7 m."""
+EQUAL = 1e-3
+"""Part of a microphone's power that two channels with the same sound may differ by: -30 dB, rounding and a converter."""
+
+
+def cross_density(noises: Samples) -> Samples:
+    """(601, microphones, microphones, 2) float32 of noises (microphones, n), as ArrayCalibration.noise."""
+    x = noises.astype(np.float64)
+    found = signal.csd(x[None], x[:, None], SAMPLE_RATE, nperseg=GRID_FFT, detrend=False)[1].transpose(2, 0, 1)
+    return np.stack((found.real, found.imag), axis=-1).astype(np.float32)
+
+
+def refuse_silent(recordings: Samples) -> None:
+    """Raise CalibrationError for microphones (microphones, n) that are silent."""
+    for at, one in enumerate(recordings):
+        if not one.any():
+            raise CalibrationError(
+                f"channel {at} of the sweep recording is silent, every sample 0: choose the microphones with --mic-channels"
+            )
+
+
+def doubts(noises: Samples, results: list[Deconvolution], direct: int) -> list[str]:
+    """What is doubtful about microphones beside one another: noises (microphones, n), and what was deconvolved of each."""
+    found = []
+    power = np.mean(np.square(noises, dtype=np.float64), axis=1)
+    level = 10 * np.log10(power + 1e-20)
+    for at, apart in enumerate(level - np.median(level)):
+        if abs(apart) > APART_DB:
+            how = "louder" if apart > 0 else "softer"
+            found.append(f"channel {at}: the fan is {abs(apart):.0f} dB {how} there than elsewhere; another gain or kind?")
+    for at, result in enumerate(results):
+        lag = find_direct(result.response) - direct
+        if abs(lag) > FARTHEST:
+            found.append(f"channel {at}: hears the robot {lag} samples after channel 0; another converter, or processed?")
+    found += [
+        f"channel {j}: the same sound as channel {i}; leave one of them out"
+        for j in range(len(noises))
+        for i in range(j)
+        if np.mean(np.square(noises[i] - noises[j], dtype=np.float64)) < EQUAL * max(power[i], 1e-20)
+    ]
+    return found

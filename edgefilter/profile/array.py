@@ -1,0 +1,83 @@
+"""What a calibration measured of the further microphones of an array, and of the noise between all of them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+
+from edgefilter.dsp.psd import GRID_BINS, GRID_FFT
+from edgefilter.dsp.stft import StftConfig
+from edgefilter.errors import ProfileError
+from edgefilter.profile.file import REMEDY
+from edgefilter.types import MOST_MICROPHONES, SAMPLE_RATE, Array, Samples
+
+PREFIX = "array_"
+"""Before the names of its arrays in a profile's file."""
+
+
+@dataclass(frozen=True, eq=False)
+class ArrayCalibration:
+    """Echo paths of the further microphones, and the noise of all as cross-spectral densities.
+
+    Parameters
+    ----------
+    responses : ndarray of float32, shape (microphones - 1, taps)
+        Of each further microphone the impulse response, on the clock of the first microphone's: all begin PRE_ROLL
+        samples before the direct sound in the first one.
+    noise : ndarray of float32, shape (601, microphones, microphones, 2)
+        One-sided cross-spectral density of the fan, real and imaginary part, full scale^2/Hz, at 0 to 8000 Hz in steps of
+        13.33; [k, i, j] is the mean of X_i conj(X_j).
+
+    Raises
+    ------
+    ProfileError
+        Where an array has another shape or type, is not finite or out of range.
+    """
+
+    responses: Samples
+    noise: Samples
+
+    def __post_init__(self) -> None:
+        responses, noise = np.asarray(self.responses), np.asarray(self.noise)
+        if responses.dtype != np.float32 or responses.ndim != 2 or not 1 <= len(responses) < MOST_MICROPHONES:
+            _fail("responses", responses, f"float32 of shape (1 to {MOST_MICROPHONES - 1}, taps)")
+        if not np.all(np.abs(responses) <= 1e3):
+            raise ProfileError(f"{PREFIX}responses is not within -1000 to 1000 everywhere; {REMEDY}")
+        count = len(responses) + 1
+        if noise.dtype != np.float32 or noise.shape != (GRID_BINS, count, count, 2):
+            _fail("noise", noise, f"float32 of shape ({GRID_BINS}, {count}, {count}, 2)")
+        if not np.all(np.abs(noise) <= 1.0):
+            raise ProfileError(f"{PREFIX}noise is not within -1 to 1 everywhere; {REMEDY}")
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """Its arrays by their names in a profile's file."""
+        return {PREFIX + field.name: np.asarray(getattr(self, field.name)) for field in fields(self)}
+
+    @classmethod
+    def taken_from(cls, arrays: dict[str, Any]) -> ArrayCalibration | None:
+        """Of the arrays of a profile's file those that are its own, which are taken out; None where there are none.
+
+        Raises ProfileError where some are there and others are not.
+        """
+        names = [field.name for field in fields(cls)]
+        found = {name: arrays.pop(PREFIX + name) for name in names if PREFIX + name in arrays}
+        if found and len(found) < len(names):
+            missing = ", ".join(PREFIX + name for name in names if name not in found)
+            raise ProfileError(f"array fields missing: {missing}; {REMEDY}")
+        return cls(**found) if found else None
+
+    def noise_covariance(self, stft: StftConfig) -> Array:
+        """Expected X_i conj(X_j) of the fan in one frame of stft, (microphones, microphones, bins) complex64."""
+        density = self.noise[..., 0] + 1j * self.noise[..., 1]
+        at = stft.frequencies * GRID_FFT / SAMPLE_RATE
+        low = np.minimum(at.astype(int), GRID_BINS - 2)
+        share = (at - low)[:, None, None]
+        found = (1.0 - share) * density[low] + share * density[low + 1]
+        scale = 0.5 * SAMPLE_RATE * stft.noise_gain()
+        return np.ascontiguousarray(found.transpose(1, 2, 0) * scale, np.complex64)
+
+
+def _fail(name: str, found: np.ndarray, expected: str) -> None:
+    raise ProfileError(f"{PREFIX}{name} is {found.dtype} of shape {found.shape}, expected {expected}; {REMEDY}")
