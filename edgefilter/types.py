@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal, NamedTuple, TypeAlias, TypedDict
 
 import numpy as np
@@ -82,6 +82,17 @@ EventKind: TypeAlias = Literal[
 ]
 
 
+class Turn(NamedTuple):
+    """What the human said from when they were noticed, and half a second before, until they had finished, 30 s at most.
+
+    start: the first sample, of the microphone. samples: (n,) float32; of an array filtered once more with what is known
+    at the end, with one microphone what was streamed.
+    """
+
+    start: int
+    samples: Samples
+
+
 @dataclass(frozen=True, slots=True)
 class Event:
     """Something that a user of the stream may want to know.
@@ -99,11 +110,14 @@ class Event:
         By which sample of the microphone, in whole hops.
     detail : str
         The same in words, with figures.
+    turn : Turn, optional
+        Of "speech_stopped": what the human said, for a recogniser that takes a turn as a whole.
     """
 
     kind: EventKind
     sample: int
     detail: str
+    turn: Turn | None = field(default=None, compare=False, repr=False)
 
 
 AlignmentState: TypeAlias = Literal["idle", "announced", "begun", "unfound", "lost", "locked"]
@@ -163,12 +177,21 @@ class DeadlineStats(TypedDict):
     compute: dict[str, float]
 
 
+class ArrayStats(TypedDict):
+    """Of an array: how many microphones, the one that the answer sounds like, and why others are left out, by number."""
+
+    microphones: int
+    reference: int
+    left_out: dict[str, str]
+
+
 class Stats(TypedDict):
     """What EgoFilter.stats() returns, ready for JSON.
 
     engine, engine_reason: the one at work, and why it was chosen. engines: those that can take turns. model: what a
     network's file says of itself, None without one. latency_ms: algorithmic, None for an engine that needs the whole
-    recording. samples: taken in so far. alignment, linear_stage: None for engines that go without. learning: what the
+    recording. samples: taken in so far. alignment, linear_stage: None for engines that go without. array: None with one
+    microphone. learning: what the
     learner did, None without one.
     """
 
@@ -180,6 +203,7 @@ class Stats(TypedDict):
     samples: int
     alignment: AlignmentStats | None
     linear_stage: LinearStageStats | None
+    array: ArrayStats | None
     learning: dict[str, object] | None
     deadline: DeadlineStats | None
 

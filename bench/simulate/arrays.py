@@ -71,7 +71,9 @@ def measured_covariances(folder: Path) -> tuple[Array, Array]:
         for file in own:
             samples, rate = sf.read(file)
             if rate != RATE or samples.ndim != 2 or samples.shape[1] < 4:
-                sys.exit(f"{file} has {rate} Hz and shape {samples.shape}, expected {RATE} Hz and an array in channels 1-3")
+                sys.exit(
+                    f"{file} has {rate} Hz and shape {samples.shape}, expected {RATE} Hz and an array in channels 1-3"
+                )
             x = samples.T[1:4] / samples[:, 1:4].std()
             found = found + signal.csd(x[None], x[:, None], fs=RATE, nperseg=SIZE)[1].transpose(2, 0, 1)
         halves.append(found / len(own))
@@ -82,7 +84,9 @@ def with_microphones(covariance: Array, count: int, rng_phase: float) -> Array:
     """Covariances (bins, count, count) of one to four microphones from those of three."""
     if count <= 3:
         return covariance[:, :count, :count]
-    root = np.linalg.cholesky(covariance + 1e-6 * np.trace(covariance, axis1=1, axis2=2)[:, None, None].real * np.eye(3))
+    root = np.linalg.cholesky(
+        covariance + 1e-6 * np.trace(covariance, axis1=1, axis2=2)[:, None, None].real * np.eye(3)
+    )
     turn = np.exp(1j * rng_phase * np.arange(len(covariance)) / len(covariance))
     mixed = root[:, 2, [2, 0, 1]] * turn[:, None]
     out = np.zeros((len(covariance), 4, 4), complex)
@@ -209,7 +213,9 @@ def make(
         voiced = signal.oaconvolve(human[None], response, axes=-1)[:, : ref.size - start]
         clean[:, start : start + voiced.shape[1]] += voiced
         spans.append((start, min(start + human.size + RATE // 10, ref.size)))
-    signals, scores = _record(rng, room_name, robot, (laboratory, room), sound, clean, spans, covariances, places, gains)
+    signals, scores = _record(
+        rng, room_name, robot, (laboratory, room), sound, clean, spans, covariances, places, gains
+    )
     meta = {"room": room_name, "rt60": room.rt60_s, "voice": voice, "speaker": speaker, "text": said[0].text}
     meta |= {"start": spans[0][0], "end": spans[0][1], "t_main": script["parts"][1]["at"], "kind": kind}
     meta |= {"turns": [{"start": a, "end": b, "text": clip.text, "moved": moving and i > 0}
@@ -283,7 +289,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--speech", type=Path, required=True, metavar="DIR", help="human speech")
     parser.add_argument("--voices", type=Path, required=True, nargs="+", metavar="DIR", help="the robot's voices")
-    parser.add_argument("--noise", type=Path, metavar="DIR", help="an array's own noise; without it the fan is of parts")
+    parser.add_argument(
+        "--noise", type=Path, metavar="DIR", help="an array's own noise; without it the fan is of parts"
+    )
     parser.add_argument("--output", type=Path, required=True, metavar="DIR")
     parser.add_argument("--kind", choices=("paper", "live"), required=True)
     parser.add_argument("--room", choices=("lab", "office", "both"), default="both", help="both: in turn")

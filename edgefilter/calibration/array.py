@@ -43,11 +43,15 @@ def doubts(noises: Samples, results: list[Deconvolution], direct: int) -> list[s
     for at, apart in enumerate(level - np.median(level)):
         if abs(apart) > APART_DB:
             how = "louder" if apart > 0 else "softer"
-            found.append(f"channel {at}: the fan is {abs(apart):.0f} dB {how} there than elsewhere; another gain or kind?")
+            found.append(
+                f"channel {at}: the fan is {abs(apart):.0f} dB {how} there than elsewhere; another gain or kind?"
+            )
     for at, result in enumerate(results):
         lag = find_direct(result.response) - direct
         if abs(lag) > FARTHEST:
-            found.append(f"channel {at}: hears the robot {lag} samples after channel 0; another converter, or processed?")
+            found.append(
+                f"channel {at}: hears the robot {lag} samples after channel 0; another converter, or processed?"
+            )
     found += [
         f"channel {j}: the same sound as channel {i}; leave one of them out"
         for j in range(len(noises))

@@ -93,7 +93,9 @@ def calibrate(
     array = None
     if recordings.ndim > 1:
         refuse_silent(recordings)
-        results = [deconvolve(reference, *of, GRID_HZ, MIN_TAPS) for of in zip(recordings[1:], map(fan_psd, noises[1:]))]
+        results = [
+            deconvolve(reference, *of, GRID_HZ, MIN_TAPS) for of in zip(recordings[1:], map(fan_psd, noises[1:]))
+        ]
         responses = np.zeros((len(results), MAX_TAPS), np.float32)
         for row, other in zip(responses, results):
             further = impulse_response(other, direct)

@@ -82,7 +82,7 @@ class Canceller:
     longer than taps it is cut, without it the start is cold. behind(echo, mic) (hop,): what the microphone makes of the
     echo that the path brings, None for nothing. microphones: of an array, None for a single one: signals are then
     (microphones, hop), the impulse response (microphones, n), and all that is said of a path holds of each; the volume,
-    and whether the echo is there at all, is told in the first microphone for all of them. Raises SignalError where hop or
+    and whether the echo is there at all, is told in one microphone, `first`, for all of them. Raises SignalError where hop or
     taps are not positive or the impulse response is not finite.
     """
 
@@ -102,7 +102,7 @@ class Canceller:
         self.partitions = -(-taps // hop)
         self.taps = self.partitions * hop
         self.adaptation = adaptation or (COLD if impulse_response is None else WARM)
-        self.microphones = microphones
+        self.microphones, self.first = microphones, 0
         self._lead = () if microphones is None else (microphones,)
         self._initial, self._initial_gain = np.zeros((*self._lead, self.taps), np.float32), 1.0
         if impulse_response is not None:
@@ -207,8 +207,8 @@ class Canceller:
         return fourier.irfft(np.add.reduce(self._work, axis=-2), 2 * self.hop)[..., self.hop :]
 
     def _first_of(self, x: Samples) -> Samples:
-        """(hop,) of the first microphone, of x (hop,) or (microphones, hop)."""
-        return x if self.microphones is None else x[0]
+        """(hop,) of the microphone that tells for all, of x (hop,) or (microphones, hop)."""
+        return x if self.microphones is None else x[self.first]
 
     def _push(self, reference: Samples) -> None:
         """Take the reference's next hop into the spectra and powers (partitions, bins), the newest first in each channel."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -14,10 +13,11 @@ from edgefilter.engines.ladder import CANDIDATES, Ladder, climbable
 from edgefilter.errors import EdgefilterError, SignalError, UsageError
 from edgefilter.filter.barge_in import BargeInSettings
 from edgefilter.filter.learner import Learner
+from edgefilter.filter.microphones import Microphones
 from edgefilter.filter.stepping import Stepping
 from edgefilter.filter.stream import Stream
-from edgefilter.profile.data import MAX_TAPS, Profile
-from edgefilter.types import SAMPLE_RATE, Event, Samples, Stats, as_samples
+from edgefilter.profile.data import Profile
+from edgefilter.types import SAMPLE_RATE, ArrayStats, Event, Samples, Stats, as_samples
 
 if TYPE_CHECKING:
     from edgefilter.engines.onnx_session import Model
@@ -275,6 +275,7 @@ class EgoFilter:
             "samples": self._stream.samples_in,
             "alignment": front.aligner.stats() if front.aligner else None,
             "linear_stage": front.linear_stage.canceller.stats() if front.linear_stage else None,
+            "array": _array_stats(front.microphones),
             "learning": self._stream.learner.stats() if self._stream.learner and front.linear_stage else None,
             "deadline": self._stream.stepping.stats() if self._stream.stepping else None,
         }
@@ -303,9 +304,17 @@ class EgoFilter:
             names = ", ".join(engines.HAVE_LINEAR_STAGE)
             raise SignalError(f"nothing to write back: give a profile and an engine with a linear stage ({names})")
         canceller = stage.canceller
-        model = replace(profile.echo, effects=stage.path.effects)
-        echo = model.with_running_response(canceller.impulse_response(), canceller.volume.gain)
-        return profile.with_echo(replace(echo, impulse_response=echo.impulse_response[:MAX_TAPS]))
+        return profile.with_running_responses(canceller.impulse_response(), canceller.volume.gain, stage.path.effects)
+
+
+def _array_stats(microphones: Microphones | None) -> ArrayStats | None:
+    if microphones is None:
+        return None
+    return {
+        "microphones": microphones.count,
+        "reference": microphones.first,
+        "left_out": {str(at): why for at, why in sorted(microphones.left_out.items())},
+    }
 
 
 def strongest(profile: Profile | None) -> tuple[Engine | ClipEngine, str]:

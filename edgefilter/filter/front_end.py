@@ -16,6 +16,7 @@ from edgefilter.engines.base import ClipEngine, Engine
 from edgefilter.filter.canceller import Canceller, CancellerOutput
 from edgefilter.filter.echo_path import EchoPath, starting_path
 from edgefilter.filter.learner import FilteredHop, Learner, Lesson
+from edgefilter.filter.microphones import Microphones
 from edgefilter.filter.onset_gate import GATE, OnsetGate
 from edgefilter.filter.residual_echo import Residual, Unpredictable
 from edgefilter.filter.spatial import SpatialFilter
@@ -87,9 +88,9 @@ class FrontEnd:
     """Finds the reference in the microphone and subtracts what is linear of it.
 
     kind "none" passes the microphone, "paper" only delays the reference per utterance, "full" tracks and cancels.
-    aligner: None for "none". linear_stage: None but for "full". gate: None but for "full" with a profile. spatial: None
-    but for "full" with an array. microphones: of an array, None for a single one; the kinds without a linear stage hear
-    its first. aligner: one that has heard nothing yet, but may have been told of utterances; None for a new one.
+    aligner: None for "none". linear_stage: None but for "full". gate: None but for "full" with a profile. microphones: of
+    an array, and None for a single one; the kinds without a linear stage hear its first. spatial: None but for "full" with
+    an array. errors: (microphones, bins) of the latest frame of an array.
     """
 
     def __init__(
@@ -102,9 +103,10 @@ class FrontEnd:
     ) -> None:
         stft = engine.stft
         self.hop, self._stft = stft.hop, stft
-        self.microphones = microphones
+        self.microphones = None if microphones is None else Microphones(microphones, stft.hop)
         self.aligner = aligner
         self.spatial: SpatialFilter | None = None
+        self.errors: Spectrum | None = None
         self.gate: OnsetGate | None = None
         self.linear_stage: LinearStage | None = None
         if engine.front == "paper":
@@ -138,7 +140,7 @@ class FrontEnd:
         mic: of an array (microphones, hop).
         """
         stage = self.linear_stage
-        heard, mic = mic, mic if self.microphones is None else mic[0]
+        heard, mic = mic, mic if self.microphones is None else mic[self.microphones.first]
         if stage is None:
             found = self.aligner.step(mic, ref) if self.aligner else None
             x, r = self._analyser.push(mic, found.reference if found else ref)
@@ -147,7 +149,10 @@ class FrontEnd:
         linear = stage.step(heard, aligned)
         gain = self.gate.step(mic, ref, aligned) if self.gate else None
         added = self._added(stage.path.source)
-        if self.spatial:
+        if self.spatial and self.microphones:
+            if self.microphones.step(heard, linear.error):
+                self.spatial.use(self.microphones.used)
+                stage.canceller.first = self.microphones.first
             r, (x, e, error) = self._combined(self.spatial, heard, aligned.reference, linear.echo, gain)
             uncertainty, fan = self.spatial.independent(linear.uncertainty), self.spatial.fan_psd()
             noise, residual = stage.residual.step(e, error, uncertainty, added, fan)
@@ -184,7 +189,7 @@ class FrontEnd:
         probability: None from an engine that does not judge it; the share of what exceeds fan and residual echo then
         stands for it, and for the mask.
         """
-        if self.spatial is None:
+        if self.spatial is None or self.errors is None:
             return
         power = fourier.power(frame.error) + np.float32(1e-20)
         if probability is None:

@@ -26,6 +26,10 @@ SPACING_M = 0.05
 SPEED_OF_SOUND = 343.0
 LIKELY, UNLIKELY = 0.5, 0.3
 """Probability of speech above which a hop tells of the human, and below which of the noise."""
+ITERATIONS = 8
+"""Of the power method where it has to come to its end at once; hop by hop one is enough, since it goes on where it was."""
+LEFT_OUT = 1e4
+"""Noise over the mean that a microphone that is left out is taken to have."""
 TINY = 1e-30
 
 
@@ -61,10 +65,17 @@ class SpatialFilter:
         start = 1e-9 * np.repeat(self._ones, stft.bins, axis=2) if noise is None else noise
         self._fan = start.astype(np.complex64)
         self._robot, self._robot_known = self._fan.copy(), False
-        self._human = np.zeros_like(self._fan)
+        self._human, self._turn = np.zeros_like(self._fan), np.zeros_like(self._fan)
+        self._against = self._fan
         self._speaking = False
+        self._without, self._reference = np.zeros((microphones, 1, 1), np.float32), 0
         self._direction = np.full((microphones, stft.bins), 1.0 + 0.0j, np.complex64)
-        self.weights = self._best(self._fan)
+        self.weights = self._best(self._human, self._fan, ITERATIONS)
+
+    def use(self, used: np.ndarray) -> None:
+        """Leave out the microphones where used (microphones,) is False; the first that is used is the one to sound like."""
+        self._without = np.where(used, np.float32(0.0), np.float32(LEFT_OUT))[:, None, None]
+        self._reference = int(np.argmax(used))
 
     def step(self, spectra: Spectrum) -> Spectrum:
         """(k, bins) of spectra (k, microphones, bins): all through the same weights."""
@@ -85,30 +96,40 @@ class SpatialFilter:
         speaking: whether a turn of the human is under way. idle: whether nothing of the robot can be audible.
         """
         outer = error[:, None] * error.conj()
-        noise = self._fan if idle else self._robot
+        self._against = noise = self._fan if idle else self._robot
         heard = speaking or probability > LIKELY
         if heard:
             if not self._speaking:
                 self._human *= np.float32(CARRIED)
+                self._turn[:] = 0.0
             self._human *= self._human_keep
             if probability > LIKELY:
-                self._human += np.square(gain) * outer
+                outer *= np.square(gain)
+                self._human += outer
+                self._turn += outer
         elif probability < UNLIKELY:
             noise += self._noise_step * (outer - noise)
         self._speaking = heard
-        self.weights = self._best(noise)
+        self.weights = self._best(self._human, noise)
 
-    def _best(self, noise: Spectrum) -> Spectrum:
-        """Weights against the noise of that covariance; one step of the power method, which goes on where it was."""
+    def finished(self) -> Spectrum:
+        """Weights (microphones, bins) for the latest turn of the human as a whole: all of it weighs the same."""
+        return self._best(self._turn, self._against, ITERATIONS)
+
+    def _best(self, gathered: Spectrum, noise: Spectrum, iterations: int = 1) -> Spectrum:
+        """Weights for a human and against noise of these covariances; the power method goes on where it was."""
+        at = self._reference
         level = np.einsum("ccf->f", noise).real / len(noise) + np.float32(TINY)
-        human = self._human / level + self._prior
-        loaded = noise / level + np.float32(LOADING) * self._ones
-        found = solve(loaded, np.einsum("cdf,df->cf", human, self._direction))
-        found /= np.sqrt(np.einsum("cf,cf->f", found, found.conj()).real)
+        human = gathered / level + self._prior
+        loaded = noise / level + (np.float32(LOADING) + self._without) * self._ones
+        found = self._direction
+        for _ in range(iterations):
+            found = solve(loaded, np.einsum("cdf,df->cf", human, found))
+            found /= np.sqrt(np.einsum("cf,cf->f", found, found.conj()).real)
         self._direction = found
-        cross = np.einsum("df,df->f", human[0], found)
+        cross = np.einsum("df,df->f", human[at], found)
         power = _form(found, human)
-        return found * (np.sqrt(human[0, 0].real / power) * cross.conj() / (np.abs(cross) + np.float32(TINY)))
+        return found * (np.sqrt(human[at, at].real / power) * cross.conj() / (np.abs(cross) + np.float32(TINY)))
 
 
 def diffuse_coherence(stft: StftConfig, microphones: int) -> Samples:
@@ -122,7 +143,7 @@ def diffuse_coherence(stft: StftConfig, microphones: int) -> Samples:
 
 
 def solve(matrix: Spectrum, right: Spectrum) -> Spectrum:
-    """x (n, bins) of matrix x = right, in each bin; matrix: (n, n, bins), Hermitian, positive definite.
+    """The x (n, bins) of matrix x = right, in each bin; matrix: (n, n, bins), Hermitian, positive definite.
 
     A Cholesky factorisation without roots, matrix = L D L^H, in all bins at once: for a few microphones this takes a tenth
     of what a call for each bin does.

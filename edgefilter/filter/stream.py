@@ -15,8 +15,9 @@ from edgefilter.filter.barge_in import INTERRUPTIONS, BargeIn, BargeInSettings, 
 from edgefilter.filter.front_end import FrontEnd
 from edgefilter.filter.learner import Learner
 from edgefilter.filter.stepping import Stepping
+from edgefilter.filter.turns import Turns
 from edgefilter.profile.data import Profile
-from edgefilter.types import SAMPLE_RATE, Event, Frame, Samples, as_microphones, as_samples
+from edgefilter.types import SAMPLE_RATE, Event, EventKind, Frame, Samples, Turn, as_microphones, as_samples
 
 
 class Stream:
@@ -78,6 +79,7 @@ class Stream:
         self.speech_probability: float | None = None
         self._judge = HumanJudge(stft, calibrated=self.profile is not None)
         self._barge_in = BargeIn(stft.hop / SAMPLE_RATE, self._barge_in_settings)
+        self._turns = Turns(stft, self.front.spatial)
         self.samples_in = self.samples_out = self._stepped = 0
         self._state = None if self.engine.lookahead is None else self.engine.initial_state()
         self._clip: list[Frame] = []
@@ -127,6 +129,7 @@ class Stream:
                 )
             if microphones != self._microphones:
                 self.front = FrontEnd(self.engine, self.profile, self.learner, microphones, self.front.aligner)
+                self._turns = Turns(self.engine.stft, self.front.spatial)
                 self._mic = Ring(2 * self.engine.stft.hop, microphones)
                 self._microphones = microphones
         if microphones != self._microphones:
@@ -197,6 +200,8 @@ class Stream:
             return np.zeros(0, np.float32)
         output, self._state = engine.step(frame, self._state)
         begun = aligned is not None and aligned.state == "begun"
+        if output.speech_probability is not None:
+            self._turns.step(output.spectrum, frame.error, self.front.errors)
         self._judge_speech(frame, output.speech_probability, begun)
         self.front.hear(frame, output, self.speech_probability, self.human_speaks)
         return self._synthesiser.push(output.spectrum)
@@ -207,12 +212,20 @@ class Stream:
             suspect = self.front.gate is not None and self.front.gate.suspect
             self.speech_probability = self._judge.step(frame, probability, suspect, begun)
         if talk := self._barge_in.note(self.speech_probability):
-            self.events.append(Event(talk, self._stepped, f"probability {self.speech_probability or 0.0:.2f}"))
+            self._tell_of_speech(talk, f"probability {self.speech_probability or 0.0:.2f}")
             if self._on_barge_in and talk in INTERRUPTIONS:
                 try:
                     self._on_barge_in(self.events[-1])
                 except BaseException as error:  # the rest of the block is filtered first
                     self._raised = self._raised or error
+
+    def _tell_of_speech(self, talk: EventKind, detail: str) -> None:
+        if talk == "speech_started":
+            self._turns.start()
+            self.events.append(Event(talk, self._stepped, detail))
+        else:
+            start, samples = self._turns.finish()
+            self.events.append(Event(talk, self._stepped, detail, Turn(start, samples)))
 
     def _collect(self, frame: Frame, engine: ClipEngine) -> None:
         self._clip.append(frame)

@@ -187,8 +187,8 @@ class EchoLimiter:
 
 
 def pre_emphasised(x: Samples) -> Samples:
-    """(n - 1,) of x (n,)."""
-    return x[1:] - PRE_EMPHASIS * x[:-1]
+    """(..., n - 1) of x (..., n)."""
+    return x[..., 1:] - PRE_EMPHASIS * x[..., :-1]
 
 
 def _coherent(found: Moments) -> bool:

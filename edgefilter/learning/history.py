@@ -52,11 +52,19 @@ class HopHistory:
             path.step(hop.mic, hop.reference, hop.located, hop.past)
 
     def signals(self) -> tuple[Samples, Samples, Samples]:
-        """Microphone, reference and innovation, (n,) each."""
+        """Microphone, reference and innovation, (n,) each; of an array the first microphone."""
         mic, reference, innovation = (
-            np.concatenate(rows) for rows in zip(*(hop[:3] for hop, _ in self._hops), strict=True)
+            np.concatenate([row if row.ndim == 1 else row[0] for row in rows])
+            for rows in zip(*(hop[:3] for hop, _ in self._hops), strict=True)
         )
         return mic, reference, innovation
+
+    def noise(self) -> Samples:
+        """(microphones, n) of an array where nothing of the robot can be audible, everything where that is under a second."""
+        silent = [hop.mic for hop, _ in self._hops if hop.idle]
+        return np.concatenate(
+            silent if len(silent) > self._hops_of(1.0) else [hop.mic for hop, _ in self._hops], axis=-1
+        )
 
     def usable(self) -> NDArray[np.bool_]:
         """(n,) bool, where the robot may be audible and the reference lies as the microphone hears it.
@@ -82,6 +90,6 @@ class HopHistory:
 
 
 def emphasised(x: Samples) -> float:
-    """Power of x (n,) with pre-emphasis, summed."""
+    """Power of x (n,), or of all microphones (microphones, n), with pre-emphasis, summed."""
     bright = pre_emphasised(x)
-    return float(bright.dot(bright))
+    return float(np.vdot(bright, bright))

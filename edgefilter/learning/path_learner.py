@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 from scipy import fft
 
+from edgefilter.calibration.array import cross_density
 from edgefilter.calibration.from_recording import bands_over_fan, fan_in_silences
 from edgefilter.dsp.psd import floored, periodograms
 from edgefilter.echo.effect import complete, vanishes
@@ -23,7 +24,8 @@ from edgefilter.filter.echo_path import TAPS, EchoPath, Effects, PathState, star
 from edgefilter.filter.learner import FilteredHop, Lesson
 from edgefilter.learning.contest import Rival
 from edgefilter.learning.history import MINUTE, PAST, RECENT_S, HopHistory, emphasised
-from edgefilter.profile.data import DISTORTION_ORDERS, GRID_FFT, LEARNED, MAX_TAPS, Profile
+from edgefilter.profile.array import ArrayCalibration
+from edgefilter.profile.data import DISTORTION_ORDERS, GRID_FFT, LEARNED, Profile
 from edgefilter.types import SAMPLE_RATE, Samples
 
 FIRST_S, FACTOR = 2.0, 1.5
@@ -173,7 +175,7 @@ class PathLearner:
             return effects
         noise_psd = floored(periodograms(innovation[use], GRID_FFT).mean(axis=0)).astype(np.float32)
         measurement = Measurement(reference, mic, noise_psd, use)
-        path = self._running.canceller.impulse_response()
+        path = _first(self._running.canceller.impulse_response())
         for effect in EFFECTS:
             if effect.learned:
                 others = tuple(entry for entry in effects if entry[0] != effect.name)
@@ -191,7 +193,8 @@ class PathLearner:
         if response is None:
             begin = replace(COLD, posterior=begin.posterior)
         adaptation = replace(begin, products=products)
-        return EchoPath(Canceller(self._hop, TAPS[1], response, adaptation), effects)
+        microphones = self._running.canceller.microphones
+        return EchoPath(Canceller(self._hop, TAPS[1], response, adaptation, microphones=microphones), effects)
 
     def _keep(self) -> None:
         """Write what had been learned by the latest fit, where the hops since show that it is better to begin with."""
@@ -199,8 +202,9 @@ class PathLearner:
             return
         state, count = self._snapshot
         learned = learned_profile(self._profile, self._resumed(state), self._history)
-        before = starting_path(self._profile, self._hop)
-        rival = Rival(starting_path(learned, self._hop), "what was learned")
+        microphones = self._running.canceller.microphones
+        before = starting_path(self._profile, self._hop, microphones)
+        rival = Rival(starting_path(learned, self._hop, microphones), "what was learned")
         for hop, audible in self._history.since(count):
             left = emphasised(before.step(hop.mic, hop.reference, hop.located, hop.past).innovation)
             rival.step(hop, left, audible)
@@ -223,9 +227,12 @@ def learned_profile(base: Profile | None, path: EchoPath, history: HopHistory) -
     noise_psd = floored(fan_in_silences(mic, history.silent())[0]).astype(np.float32)
     today = datetime.datetime.now(datetime.timezone.utc).date().isoformat()
     if base is not None:
-        echo = replace(base.echo, effects=path.effects).with_running_response(response, canceller.volume.gain)
-        echo = replace(echo, impulse_response=echo.impulse_response[:MAX_TAPS])
-        return replace(base, echo=echo, noise_psd=noise_psd, created=today, source=LEARNED)
+        adapted = base.with_running_responses(response, canceller.volume.gain, path.effects)
+        return replace(adapted, noise_psd=noise_psd, created=today, source=LEARNED)
+    array = None
+    if canceller.microphones is not None:
+        array = ArrayCalibration(response[1:], cross_density(history.noise()))
+        response = response[0]
     echo = EchoModel(response, path.effects)
     bands, snr = bands_over_fan(whiten(echo.predict(reference), noise_psd))
     return Profile(
@@ -238,4 +245,10 @@ def learned_profile(base: Profile | None, path: EchoPath, history: HopHistory) -
         distortion_db=np.zeros(len(DISTORTION_ORDERS)),
         created=today,
         source=LEARNED,
+        array=array,
     )
+
+
+def _first(response: Samples) -> Samples:
+    """(taps,) of the first microphone, of a response (taps,) or (microphones, taps)."""
+    return response if response.ndim == 1 else response[0]

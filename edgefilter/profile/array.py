@@ -11,7 +11,7 @@ from edgefilter.dsp.psd import GRID_BINS, GRID_FFT
 from edgefilter.dsp.stft import StftConfig
 from edgefilter.errors import ProfileError
 from edgefilter.profile.file import REMEDY
-from edgefilter.types import MOST_MICROPHONES, SAMPLE_RATE, Array, Samples
+from edgefilter.types import MOST_MICROPHONES, SAMPLE_RATE, Samples, Spectrum
 
 PREFIX = "array_"
 """Before the names of its arrays in a profile's file."""
@@ -68,7 +68,7 @@ class ArrayCalibration:
             raise ProfileError(f"array fields missing: {missing}; {REMEDY}")
         return cls(**found) if found else None
 
-    def noise_covariance(self, stft: StftConfig) -> Array:
+    def noise_covariance(self, stft: StftConfig) -> Spectrum:
         """Expected X_i conj(X_j) of the fan in one frame of stft, (microphones, microphones, bins) complex64."""
         density = self.noise[..., 0] + 1j * self.noise[..., 1]
         at = stft.frequencies * GRID_FFT / SAMPLE_RATE

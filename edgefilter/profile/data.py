@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -17,7 +18,7 @@ from edgefilter.echo.model import EchoModel
 from edgefilter.errors import ProfileError
 from edgefilter.profile.approximation import LinearApproximation
 from edgefilter.profile.array import ArrayCalibration
-from edgefilter.profile.file import REMEDY, read_fields, write_fields
+from edgefilter.profile.file import REMEDY, Effects, read_fields, write_fields
 from edgefilter.types import PRE_ROLL, SAMPLE_RATE, Array, Samples
 
 GRID_HZ = np.arange(GRID_BINS) * SAMPLE_RATE / GRID_FFT
@@ -195,11 +196,24 @@ class Profile:
 
     def running_responses(self) -> Samples:
         """(microphones, taps) float32, the paths as the running filter begins with them, the effects that are filters in them."""
+        return _stacked([model.running_response() for model in self._models()])
+
+    def with_running_responses(self, responses: Samples, gain: float, effects: Effects) -> Profile:
+        """The same robot with the paths (taps,), of an array (microphones, taps), to which the running filter adapted them.
+
+        gain: by which the volume was turned. effects: those of the path in use. What of a path is longer than the
+        filter's is the profile's own.
+        """
+        models = [replace(model, effects=effects) for model in self._models()]
+        echoes = [model.with_running_response(row, gain) for model, row in zip(models, np.atleast_2d(responses))]
+        paths = [echo.impulse_response[:MAX_TAPS] for echo in echoes]
+        array = self.array and replace(self.array, responses=_stacked(paths[1:]))
+        return replace(self, echo=replace(echoes[0], impulse_response=paths[0]), array=array)
+
+    def _models(self) -> list[EchoModel]:
+        """The model of each microphone."""
         further = () if self.array is None else self.array.responses
-        models = [self.echo, *(replace(self.echo, impulse_response=response) for response in further)]
-        found = [model.running_response() for model in models]
-        taps = max(one.size for one in found)
-        return np.stack([np.pad(one, (0, taps - one.size)) for one in found])
+        return [self.echo, *(replace(self.echo, impulse_response=response) for response in further)]
 
     def with_impulse_response(self, impulse_response: Samples) -> Profile:
         """The same robot with another path (taps,) float32, for example the one that the running filter has adapted."""
@@ -220,6 +234,12 @@ class Profile:
         The stored values where n_fft is 1200.
         """
         return np.interp(stft.frequencies, GRID_HZ, self.response).astype(np.float32)
+
+
+def _stacked(paths: Sequence[Samples]) -> Samples:
+    """(paths, taps), the shorter ones with zeros at their ends."""
+    taps = max(path.size for path in paths)
+    return np.stack([np.pad(path, (0, taps - path.size)) for path in paths])
 
 
 def _fail(name: str, found: object, expected: str) -> None:

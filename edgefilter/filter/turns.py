@@ -1,0 +1,89 @@
+"""The finished turn of the human: filtered once more when it is over, with what is known at its end."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from edgefilter.dsp import fourier
+from edgefilter.dsp.stft import StftConfig
+from edgefilter.filter.spatial import SpatialFilter
+from edgefilter.types import SAMPLE_RATE, Samples, Spectrum
+
+LONGEST_S = 30.0
+"""Of a turn that is kept; what a recogniser takes at once. Of a longer one the latest part."""
+BEFORE_S = 0.5
+"""Of sound before the human was noticed: they had begun to speak, and a recogniser wants some silence first."""
+LARGEST = 2.0
+"""Most that an answer is taken to be over its error in a bin: engines add no sound, but an error can vanish."""
+
+
+class Turns:
+    """Keeps the latest frames of one stream; step once a frame.
+
+    stft: of the frames. spatial: of an array; with one microphone a second look finds nothing new, and the turn is what
+    was streamed. What is kept are the errors (microphones, bins) and the engine's answer over the error, so that another
+    spatial filter costs no second run of the engine.
+    """
+
+    def __init__(self, stft: StftConfig, spatial: SpatialFilter | None) -> None:
+        self._stft, self._spatial = stft, spatial
+        self._before = round(BEFORE_S * SAMPLE_RATE / stft.hop)
+        self._room = round(LONGEST_S * SAMPLE_RATE / stft.hop)
+        microphones = 1 if spatial is None else len(spatial.weights)
+        self._errors = np.zeros((0, microphones, stft.bins), np.complex64)
+        self._gains = np.zeros((0, stft.bins), np.complex64)
+        self._count = self._begin = 0
+
+    def step(self, answer: Spectrum, error: Spectrum, errors: Spectrum | None) -> None:
+        """Keep a frame: the engine's answer and the error (bins,) that it was given, and the errors (microphones, bins)."""
+        at = self._count % self._room
+        if at >= len(self._gains):
+            self._grow()
+        if errors is None:
+            self._errors[at, 0], self._gains[at] = answer, 1.0
+        else:
+            self._errors[at] = errors
+            gain = np.divide(answer, error, out=np.zeros_like(answer), where=error != 0.0)
+            size = np.abs(gain)
+            self._gains[at] = gain * (np.minimum(size, LARGEST) / np.maximum(size, np.float32(1e-9)))
+        self._count += 1
+
+    def start(self) -> None:
+        """A turn has begun with the latest frame."""
+        self._begin = max(self._count - 1 - self._before, 0)
+
+    def finish(self) -> tuple[int, Samples]:
+        """The turn up to the latest frame: its first sample, and its samples (n,) float32, a whole number of hops."""
+        first = max(self._begin, self._count - self._room)
+        rows = np.arange(first, self._count) % self._room
+        errors, gains = self._errors[rows], self._gains[rows]
+        if self._spatial is None:
+            spectra = errors[:, 0]
+        else:
+            spectra = sum(weight.conj() * errors[:, at] for at, weight in enumerate(self._spatial.finished()))
+            spectra *= gains
+        hop, window = self._stft.hop, self._stft.window_length
+        late = window - hop
+        # frame t ends with sample (t + 1) hop, and has window samples; the first and the last late samples lack a frame
+        return max((first + 1) * hop - window, 0) + late, overlap_add(spectra, self._stft)[late : -late or None]
+
+    def _grow(self) -> None:
+        """Room for twice as many frames, and for a second at first: most streams never need all of it."""
+        rows = min(max(2 * len(self._gains), SAMPLE_RATE // self._stft.hop), self._room)
+        for name in ("_errors", "_gains"):
+            before = getattr(self, name)
+            after = np.zeros((rows, *before.shape[1:]), np.complex64)
+            after[: len(before)] = before
+            setattr(self, name, after)
+
+
+def overlap_add(spectra: Spectrum, stft: StftConfig) -> Samples:
+    """((frames - 1) hop + window_length,) float32 of the frames spectra (frames, bins)."""
+    pieces = -(-stft.window_length // stft.hop)
+    frames = fourier.irfft(np.ascontiguousarray(spectra, np.complex64), stft.n_fft)[:, : stft.window_length]
+    windowed = np.zeros((len(frames), pieces * stft.hop), np.float32)
+    windowed[:, : stft.window_length] = frames * stft.synthesis_window
+    out = np.zeros((len(frames) + pieces - 1, stft.hop), np.float32)
+    for piece in range(pieces):
+        out[piece : piece + len(frames)] += windowed[:, piece * stft.hop : (piece + 1) * stft.hop]
+    return out.reshape(-1)[: (len(frames) - 1) * stft.hop + stft.window_length]

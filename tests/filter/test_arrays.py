@@ -1,0 +1,268 @@
+"""Several microphones through the whole path: what they share with one, what they are refused for, and what a turn is."""
+
+from __future__ import annotations
+
+import functools
+
+import numpy as np
+import pytest
+
+from edgefilter import EgoFilter, PathLearner, calibrate, enhance, generate_sweep
+from edgefilter.dsp.stft import StftConfig
+from edgefilter.engines.spectral_subtraction import SpectralSubtraction
+from edgefilter.errors import CalibrationError, SignalError
+from edgefilter.filter.canceller import Canceller
+from edgefilter.filter.stream import Stream
+from edgefilter.filter.turns import overlap_add
+from edgefilter.profile.data import Profile
+from edgefilter.types import Frame, Output
+from tests.conformance import conversation
+
+RATE = 16000
+PATHS = [0.3 * np.eye(1, 900, 300 + at)[0] + 0.1 * np.eye(1, 900, 500 - 3 * at)[0] for at in range(4)]
+
+
+def noise(n: int, seed: int) -> np.ndarray:
+    return np.random.default_rng(seed).standard_normal(n)
+
+
+def fan(n: int, microphones: int, seed: int) -> np.ndarray:
+    """(n, microphones): one source with a delay a microphone, and a little of each microphone's own."""
+    source = noise(n + 10, seed)
+    return np.stack([source[at : at + n] + 0.1 * noise(n, seed + 10 + at) for at in range(microphones)], axis=1)
+
+
+@functools.cache
+def calibration(microphones: int) -> Profile:
+    sweep = generate_sweep()
+    heard = np.stack([np.convolve(sweep, path)[: sweep.size] for path in PATHS[:microphones]], axis=1)
+    heard = heard + 1e-3 * fan(sweep.size, microphones, 3)
+    return calibrate(sweep, heard.astype(np.float32), (1e-3 * fan(64000, microphones, 4)).astype(np.float32))
+
+
+@functools.cache
+def talk(microphones: int = 3, seconds: float = 6.0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Microphones (n, m), reference (n,), and the human in the first microphone (n,), who talks from 3 to 5 s."""
+    n = round(seconds * RATE)
+    syllables = np.repeat(np.abs(noise(n // 1600 + 1, 6)), 1600)[:n]
+    ref = 0.1 * noise(n, 5) * syllables
+    human = np.zeros(n)
+    human[3 * RATE : 5 * RATE] = 0.02 * noise(2 * RATE, 7) * np.repeat(np.abs(noise(20, 12)), 1600)
+    mic = np.stack(
+        [np.convolve(ref, path)[:n] + np.roll(human, -2 * at) for at, path in enumerate(PATHS[:microphones])], 1
+    )
+    mic = mic + 2e-3 * fan(n, microphones, 8)
+    return mic.astype(np.float32), ref.astype(np.float32), human.astype(np.float32)
+
+
+class Told(SpectralSubtraction):
+    """`ss` that is told when the human speaks."""
+
+    name = "told"
+
+    def __init__(self, begin: int, end: int) -> None:
+        super().__init__()
+        self._span, self._hop = (begin // self.stft.hop, end // self.stft.hop), 0
+
+    def step(self, frame: Frame, state: np.ndarray) -> tuple[Output, np.ndarray]:
+        output, state = super().step(frame, state)
+        self._hop += 1
+        return Output(output.spectrum, 0.999 if self._span[0] <= self._hop < self._span[1] else 0.001), state
+
+
+@pytest.mark.parametrize("warm", [False, True])
+def test_the_canceller_does_in_each_microphone_what_it_does_in_one(warm: bool) -> None:
+    mic, ref, _ = talk()
+    paths = np.array(PATHS[:3], np.float32) if warm else None
+    alone = [Canceller(taps=1024, impulse_response=None if paths is None else paths[at]) for at in range(3)]
+    together = Canceller(taps=1024, impulse_response=paths, microphones=3)
+    for at in range(0, 40000 - 256, 256):
+        hop = np.ascontiguousarray(mic[at : at + 256].T)
+        found = together.step(hop, ref[at : at + 256])
+        first = alone[0].step(hop[0], ref[at : at + 256])
+        assert np.array_equal(found.error[0], first.error) and np.array_equal(found.echo[0], first.echo)
+        assert np.array_equal(found.uncertainty[0], first.uncertainty)
+    assert np.array_equal(together.impulse_response()[0], alone[0].impulse_response())
+    late = found.error[:, :]
+    assert np.all(np.sum(late**2, axis=1) < 0.1 * np.sum(hop**2, axis=1))
+
+
+def test_one_channel_as_a_column_is_the_signal_itself() -> None:
+    mic, ref = conversation(20000)
+    assert np.array_equal(enhance(mic[:, None], ref, engine="ss"), enhance(mic, ref, engine="ss"))
+
+
+def test_any_partition_of_an_array_gives_the_same_bits() -> None:
+    mic, ref, _ = talk()
+    profile, whole = calibration(3), []
+    for sizes in ([mic.shape[0]], [1, 255, 256, 300, 4096, 7]):
+        ego, out, at = EgoFilter(profile, "ss"), [], 0
+        while at < len(ref):
+            for size in sizes:
+                out.append(ego.process(mic[at : at + size], ref[at : at + size]))
+                at += size
+        whole.append(np.concatenate((*out, ego.flush())))
+    assert whole[0].shape == ref.shape and np.array_equal(*whole)
+
+
+def test_three_microphones_leave_less_than_one() -> None:
+    mic, ref, human = talk()
+    span = slice(round(3.2 * RATE), round(4.8 * RATE))
+
+    def snr(heard: np.ndarray, microphones: int) -> float:
+        stream = Stream(Told(3 * RATE, 5 * RATE), calibration(microphones))
+        out = np.concatenate((stream.process(heard, ref), stream.flush()))[span]
+        gain = out.dot(human[span]) / human[span].dot(human[span])
+        return 10 * np.log10(gain**2 * np.sum(human[span] ** 2) / np.sum((out - gain * human[span]) ** 2))
+
+    assert snr(mic, 3) > snr(mic[:, 0], 1) + 3.0
+
+
+def test_engines_without_a_linear_stage_hear_the_first_microphone() -> None:
+    mic, ref, _ = talk()
+    assert np.array_equal(enhance(mic, ref, engine="bypass"), enhance(mic[:, 0], ref, engine="bypass"))
+
+
+def test_other_microphones_than_were_calibrated_are_one_line() -> None:
+    mic, ref, _ = talk()
+    with pytest.raises(SignalError, match="mic has 2 channels and the profile 3, expected as many: choose"):
+        EgoFilter(calibration(3), "ss").process(mic[:, :2], ref)
+    with pytest.raises(SignalError, match="mic has 1 channels and the profile 3"):
+        EgoFilter(calibration(3), "ss").process(mic[:, 0], ref)
+    ego = EgoFilter(engine="ss")
+    ego.process(mic[:1000], ref[:1000])
+    with pytest.raises(SignalError, match="mic has 2 channels after 3, expected as many to the end"):
+        ego.process(mic[1000:2000, :2], ref[1000:2000])
+    with pytest.raises(SignalError, match=r"shape \(10, 9\), expected .* 1 to 8 channels"):
+        ego.process(np.zeros((10, 9), np.float32), ref[:10])
+    bad = mic[1000:2000].copy()
+    bad[5, 2] = np.nan
+    with pytest.raises(SignalError, match="mic, channel 2, holds nan at sample 5"):
+        ego.process(bad, ref[1000:2000])
+
+
+def test_what_was_announced_before_the_first_block_is_still_waited_for() -> None:
+    mic, ref, _ = talk()
+    ego = EgoFilter(engine="ss")
+    ego.announce(ref)
+    ego.process(mic[:2000], np.zeros(2000, np.float32))
+    assert ego.stats()["alignment"]["announced"] == 1
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        (lambda x: 0.0 * x, "silent"),
+        (lambda x: 10.0 * x, "20 dB louder"),
+        (lambda x: 0.05 * x, "26 dB softer"),
+        (lambda x: np.sqrt(np.mean(x**2)) * noise(x.size, 9), "hears the robot otherwise"),
+    ],
+)
+def test_a_microphone_that_is_no_part_of_the_array_is_left_out(change, reason) -> None:
+    mic, ref, _ = talk()
+    mic = mic.copy()
+    mic[:, 1] = change(mic[:, 1])
+    ego = EgoFilter(calibration(3), "ss")
+    ego.process(mic, ref)
+    stats = ego.stats()["array"]
+    assert stats["microphones"] == 3 and list(stats["left_out"]) == ["1"] and reason in stats["left_out"]["1"]
+
+
+def test_equal_channels_count_as_one_and_another_takes_the_place_of_the_first() -> None:
+    mic, ref, _ = talk()
+    twice, silent = mic.copy(), mic.copy()
+    twice[:, 2], silent[:, 0] = mic[:, 0], 0.0
+    for heard, expected in ((twice, (0, {"2": "the same as channel 0"})), (silent, (1, {"0": "silent"}))):
+        ego = EgoFilter(calibration(3), "ss")
+        out = np.concatenate((ego.process(heard, ref), ego.flush()))
+        stats = ego.stats()["array"]
+        assert (stats["reference"], stats["left_out"]) == expected
+        assert np.mean(out[2 * RATE : 3 * RATE] ** 2) < 0.05 * np.mean(mic[2 * RATE : 3 * RATE, 0] ** 2)
+    assert EgoFilter(engine="ss").stats()["array"] is None
+
+
+def test_a_turn_of_one_microphone_is_what_was_streamed() -> None:
+    mic, ref, _ = talk()
+    stream = Stream(Told(3 * RATE, 5 * RATE), calibration(1))
+    out = np.concatenate((stream.process(mic[:, 0], ref), stream.flush()))
+    (turn,) = [event.turn for event in stream.events if event.turn]
+    assert np.array_equal(turn.samples, out[turn.start : turn.start + turn.samples.size])
+    assert turn.start <= 2.7 * RATE and turn.start + turn.samples.size >= 5 * RATE
+
+
+def test_a_turn_of_an_array_lies_where_it_was_streamed() -> None:
+    mic, ref, _ = talk()
+    stream = Stream(Told(3 * RATE, 5 * RATE), calibration(3))
+    out = np.concatenate((stream.process(mic, ref), stream.flush()))
+    (turn,) = [event.turn for event in stream.events if event.turn]
+    streamed = out[turn.start : turn.start + turn.samples.size]
+    span = slice(round(3.2 * RATE) - turn.start, round(4.8 * RATE) - turn.start)
+    alike = turn.samples[span].dot(streamed[span])
+    assert alike > 0.95 * np.linalg.norm(turn.samples[span]) * np.linalg.norm(streamed[span])
+    assert not np.array_equal(turn.samples, streamed)
+
+
+def test_of_a_turn_longer_than_30_s_the_latest_part_is_kept() -> None:
+    mic, ref = np.tile(conversation(4 * RATE), 9)
+    stream = Stream(Told(RATE, 35 * RATE), None)
+    out = np.concatenate((stream.process(mic, ref), stream.flush()))
+    (turn,) = [event.turn for event in stream.events if event.turn]
+    assert 29.9 * RATE < turn.samples.size <= 30 * RATE
+    assert np.array_equal(turn.samples, out[turn.start : turn.start + turn.samples.size])
+
+
+def test_frames_add_up_to_the_signal() -> None:
+    stft, x = StftConfig(), noise(512 + 9 * 256, 11).astype(np.float32)
+    frames = np.stack([stft.analyse(x[at : at + 512]) for at in range(0, x.size - 511, 256)])
+    np.testing.assert_allclose(overlap_add(frames, stft)[256:-256], x[256:-256], atol=1e-5)
+
+
+def test_a_profile_keeps_all_microphones(tmp_path) -> None:
+    profile = calibration(3)
+    profile.save(tmp_path / "robot.npz")
+    again = Profile.load(tmp_path / "robot.npz")
+    assert again.microphones == 3 and calibration(1).microphones == 1
+    assert np.array_equal(again.array.responses, profile.array.responses)
+    assert np.array_equal(again.array.noise, profile.array.noise)
+    # the second microphone hears the direct sound a sample later
+    peaks = [int(np.argmax(np.abs(path))) for path in profile.running_responses()]
+    assert np.diff(peaks).tolist() == [1, 1]
+
+
+def test_the_calibrated_covariance_is_that_of_the_fan() -> None:
+    stft = StftConfig()
+    covariance = calibration(3).array.noise_covariance(stft)
+    x = 1e-3 * fan(64000, 3, 4)
+    frames = np.stack([stft.analyse(x[at : at + 512].T) for at in range(0, 63000, 256)])
+    measured = np.einsum("tif,tjf->ijf", frames, frames.conj()) / len(frames)
+    inside = slice(4, 250)
+    level = measured[0, 0, inside].real.mean()
+    assert np.abs((covariance - measured)[..., inside]).mean() < 0.15 * level
+    assert np.allclose(covariance[0, 0].real, calibration(3).noise_bins(stft), rtol=1e-4)
+
+
+def test_a_calibration_says_what_is_doubtful_about_a_channel() -> None:
+    sweep = generate_sweep()
+    heard = np.stack([np.convolve(sweep, path)[: sweep.size] for path in PATHS[:3]], 1) + 1e-3 * fan(sweep.size, 3, 3)
+    quiet = 1e-3 * fan(64000, 3, 4)
+    heard[:, 2], quiet[:, 2] = heard[:, 0], quiet[:, 0]
+    heard[:, 1] *= 5.0
+    quiet[:, 1] *= 5.0
+    said = "; ".join(calibrate(sweep, heard.astype(np.float32), quiet.astype(np.float32)).warnings)
+    assert "channel 1: the fan is 14 dB louder" in said and "channel 2: the same sound as channel 0" in said
+    heard[:, 1] = 0.0
+    with pytest.raises(CalibrationError, match="channel 1 of the sweep recording is silent"):
+        calibrate(sweep, heard.astype(np.float32), quiet.astype(np.float32))
+    with pytest.raises(CalibrationError, match="has 3 channels and the noise recording 2"):
+        calibrate(sweep, heard.astype(np.float32), quiet[:, :2].astype(np.float32))
+
+
+def test_an_array_learns_and_its_profile_is_adapted_in_all_microphones() -> None:
+    mic, ref, _ = talk()
+    profile = calibration(3)
+    ego = EgoFilter(profile, "linear", learn=PathLearner(profile))
+    ego.process(0.5 * mic, ref)
+    adapted = ego.adapted_profile()
+    assert adapted.microphones == 3
+    before, after = (np.linalg.norm(one.running_responses()[:, :1000], axis=1) for one in (profile, adapted))
+    np.testing.assert_allclose(after / before, 0.5, atol=0.1)

@@ -1,0 +1,177 @@
+"""The spatial filter against a slow one that solves each bin by itself, and against what it must not do to a human."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from edgefilter.dsp.stft import StftConfig
+from edgefilter.filter.spatial import (
+    CARRIED,
+    HUMAN_MEMORY_S,
+    LOADING,
+    NOISE_MEMORY_S,
+    PRIOR,
+    SpatialFilter,
+    diffuse_coherence,
+    solve,
+)
+
+STFT = StftConfig()
+HOP_S = STFT.hop / 16000
+PLACES = 0.04 * np.array([[1.0, 0.0, 0.0], [-0.5, 0.866, 0.0], [-0.5, -0.866, 0.0]])
+
+
+def complex_noise(rng: np.random.Generator, *shape: int) -> np.ndarray:
+    return (rng.standard_normal(shape) + 1j * rng.standard_normal(shape)).astype(np.complex64)
+
+
+def plane_wave(direction: np.ndarray) -> np.ndarray:
+    """(3, bins) transfer functions of microphones at PLACES, relative to the first."""
+    delays = -(PLACES @ direction) / 343.0
+    return np.exp(-2j * np.pi * STFT.frequencies * (delays - delays[0])[:, None]).astype(np.complex64)
+
+
+def point_source(place: np.ndarray) -> np.ndarray:
+    distance = np.linalg.norm(PLACES - place, axis=1)[:, None]
+    return (np.exp(-2j * np.pi * STFT.frequencies * distance / 343.0) / distance).astype(np.complex64)
+
+
+def directions(rng: np.random.Generator, count: int) -> np.ndarray:
+    drawn = rng.standard_normal((count, 3))
+    return drawn / np.linalg.norm(drawn, axis=1, keepdims=True)
+
+
+def fan_below() -> np.ndarray:
+    """(3, 3, bins) of a source 10 cm below the microphones and a tenth of diffuse noise."""
+    near = point_source(np.array([0.02, 0.01, -0.1]))
+    near = near / np.abs(near[:1])
+    diffuse = diffuse_coherence(STFT, 3)
+    return (0.9 * near[:, None] * near.conj() + 0.1 * diffuse).astype(np.complex64)
+
+
+@pytest.mark.parametrize("n", [1, 2, 3, 8])
+def test_all_bins_are_solved_as_each_would_be(n: int) -> None:
+    rng = np.random.default_rng(n)
+    root, right = complex_noise(rng, n, n, 40).astype(np.complex128), complex_noise(rng, n, 40).astype(np.complex128)
+    matrix = np.einsum("ikf,jkf->ijf", root, root.conj()) + 0.1 * np.eye(n)[:, :, None]
+    expected = np.stack([np.linalg.solve(matrix[:, :, f], right[:, f]) for f in range(40)], axis=1)
+    np.testing.assert_allclose(solve(matrix, right), expected, rtol=1e-8)
+
+
+def slow(frames: list, noise: np.ndarray) -> np.ndarray:
+    """Weights after these (error, gain, probability, speaking, idle), each bin by itself, by generalised eigenvectors."""
+    fan, robot, human = noise.astype(complex), noise.astype(complex), np.zeros(noise.shape, complex)
+    before = False
+    for error, gain, probability, speaking, idle in frames:
+        outer = np.einsum("if,jf->ijf", error, error.conj())
+        against = fan if idle else robot
+        heard = speaking or probability > 0.5
+        if heard:
+            human = human * (1.0 if before else CARRIED) * (1.0 - HOP_S / HUMAN_MEMORY_S)
+            human = human + (gain**2 * outer if probability > 0.5 else 0.0)
+        elif probability < 0.3:
+            against += HOP_S / NOISE_MEMORY_S * (outer - against)
+        before = heard
+    weights = np.zeros(noise.shape[1:], complex)
+    prior = PRIOR * diffuse_coherence(STFT, len(noise))
+    for f in range(noise.shape[2]):
+        level = np.trace(against[:, :, f]).real / len(noise)
+        wanted = human[:, :, f] / level + prior[:, :, f]
+        loaded = against[:, :, f] / level + LOADING * np.eye(len(noise))
+        inverse = np.linalg.inv(np.linalg.cholesky(loaded))
+        vector = inverse.conj().T @ np.linalg.eigh(inverse @ wanted @ inverse.conj().T)[1][:, -1]
+        heard_first = (wanted @ vector)[0]
+        scale = np.sqrt(wanted[0, 0].real / (vector.conj() @ wanted @ vector).real)
+        weights[:, f] = vector * scale * heard_first.conj() / abs(heard_first)
+    return weights
+
+
+def test_streaming_weights_are_those_of_the_slow_filter() -> None:
+    rng = np.random.default_rng(1)
+    human, noise = plane_wave(np.array([0.6, 0.64, 0.48])), fan_below()
+    root = np.linalg.cholesky(noise.transpose(2, 0, 1) + 1e-6 * np.eye(3)).transpose(1, 2, 0)
+    spatial, frames = SpatialFilter(STFT, 3, noise), []
+    for hop in range(150):
+        speaks = hop >= 60
+        fan = 0.7 * np.einsum("ijf,jf->if", root, complex_noise(rng, 3, STFT.bins))
+        error = fan + (4.0 * human * complex_noise(rng, STFT.bins) if speaks else 0.0)
+        gain = rng.uniform(0.2, 1.0, STFT.bins).astype(np.float32)
+        frames.append((error.astype(np.complex64), gain, 0.9 if speaks else 0.1, speaks, hop % 50 < 10))
+        spatial.learn(*frames[-1])
+    for _ in range(20):  # nothing new, so that the power method comes to its end
+        frames.append((0 * error, gain, 0.4, True, False))
+        spatial.learn(*frames[-1])
+    expected = slow(frames, noise)
+    assert np.abs(spatial.weights - expected).max() < 0.02 * np.abs(expected).max()
+
+
+def test_a_human_keeps_level_and_phase_and_the_fan_is_lowered() -> None:
+    rng = np.random.default_rng(2)
+    human, noise = plane_wave(np.array([0.8, 0.0, 0.6])), fan_below()
+    spatial = SpatialFilter(STFT, 3, noise)
+    for _ in range(100):
+        spatial.learn(3.0 * human * complex_noise(rng, STFT.bins), np.ones(STFT.bins, np.float32), 0.9, True, True)
+    heard = spatial.step(human[None])[0][8:]
+    assert np.abs(20 * np.log10(np.abs(heard))).max() < 0.5 and np.abs(np.angle(heard)).max() < 0.2
+    before, after = noise[0, 0].real[8:], spatial.fan_psd()[8:]
+    assert 10 * np.log10(before.sum() / after.sum()) > 6.0
+
+
+def test_a_human_of_whom_nothing_is_known_loses_at_most_1_db() -> None:
+    rng = np.random.default_rng(3)
+    spatial = SpatialFilter(STFT, 3, fan_below())
+    for _ in range(20):
+        spatial.learn(complex_noise(rng, 3, STFT.bins) * 0, np.zeros(STFT.bins, np.float32), 0.4, False, True)
+    powers = [np.abs(spatial.step(plane_wave(one)[None])[0][3:250]) ** 2 for one in directions(rng, 300)]
+    assert 10 * np.log10(np.mean(powers)) > -1.0
+    lost = -10 * np.log10(np.mean(powers, axis=1))
+    assert np.median(lost) < 1.0
+
+
+def test_the_noise_is_held_while_a_human_speaks() -> None:
+    rng = np.random.default_rng(4)
+    one = SpatialFilter(STFT, 3, fan_below())
+    loud = 10 * complex_noise(rng, 3, STFT.bins)
+    nothing = np.zeros(STFT.bins, np.float32)
+    for _ in range(20):
+        one.learn(loud, nothing, 0.4, False, False)
+    before = one.weights
+    for _ in range(50):
+        one.learn(loud, nothing, 0.2, True, False)
+    still = one.weights
+    for _ in range(50):
+        one.learn(loud, nothing, 0.2, False, False)
+    assert np.abs(one.weights - still).max() > 10 * np.abs(still - before).max()
+
+
+def test_another_direction_is_followed_within_a_turn() -> None:
+    rng = np.random.default_rng(5)
+    noise = fan_below()
+    spatial, ones = SpatialFilter(STFT, 3, noise), np.ones(STFT.bins, np.float32)
+    for place in ([1.0, 0.0, 0.0], [-1.0, 0.0, 0.0]):
+        human = plane_wave(np.array(place))
+        spatial.learn(np.zeros((3, STFT.bins), np.complex64), ones, 0.1, False, True)  # a turn ends
+        for _ in range(32):  # half a second
+            spatial.learn(3.0 * human * complex_noise(rng, STFT.bins), ones, 0.9, True, True)
+        assert np.abs(20 * np.log10(np.abs(spatial.step(human[None])[0][8:]))).mean() < 1.0
+
+
+def test_a_microphone_that_is_left_out_is_not_heard() -> None:
+    rng = np.random.default_rng(6)
+    spatial = SpatialFilter(STFT, 3, fan_below())
+    spatial.use(np.array([False, True, True]))
+    for _ in range(10):
+        spatial.learn(complex_noise(rng, 3, STFT.bins), np.ones(STFT.bins, np.float32), 0.9, True, True)
+    assert np.abs(spatial.weights[0]).max() < 1e-2 * np.abs(spatial.weights[1:]).max()
+
+
+def test_a_turn_as_a_whole_weighs_all_of_it_the_same() -> None:
+    rng = np.random.default_rng(7)
+    spatial = SpatialFilter(STFT, 3, fan_below())
+    human, ones = plane_wave(np.array([0.0, 0.8, 0.6])), np.ones(STFT.bins, np.float32)
+    for _ in range(60):
+        spatial.learn(3.0 * human * complex_noise(rng, STFT.bins), ones, 0.9, True, True)
+    found = spatial.finished()
+    heard = np.einsum("cf,cf->f", found.conj(), human)[8:]
+    assert np.abs(20 * np.log10(np.abs(heard))).max() < 0.5
