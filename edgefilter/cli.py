@@ -16,11 +16,19 @@ from edgefilter.commands.outputs import check_outputs
 from edgefilter.echo.user_effects import load_effect
 from edgefilter.engines import ENGINES, HAVE_MODEL
 from edgefilter.errors import EdgefilterError, UsageError
+from edgefilter.types import MOST_MICROPHONES
 
 ENGINE = {
     "default": "auto",
     "metavar": "ENGINE",
     "help": f"auto, {', '.join(ENGINES)} (default: %(default)s); docs/cli.md says what each does",
+}
+MOST_CHANNELS = 64
+"""Of a device or a file: interfaces of studios have so many."""
+MIC_CHANNELS = {
+    "type": lambda text: channels(text),
+    "metavar": "N,N,...",
+    "help": "channels that are microphones, one to eight, from 0 (docs/arrays.md); otherwise the mean of all is taken",
 }
 EFFECTS = {
     "action": "append",
@@ -80,6 +88,9 @@ def _run(commands: argparse._SubParsersAction) -> None:
     option("--input", required=True, metavar="mic|FILE|DEVICE|-", help=told)
     told = "what the robot says; live, unless given, what the output device plays (its monitor)"
     option("--reference", metavar="FILE|DEVICE", help=told)
+    option("--mic-channels", **MIC_CHANNELS)
+    told = "channel of --input, from 0, that holds what the robot says; goes with --mic-channels"
+    option("--reference-channel", type=channel, metavar="N", help=told)
     option("--profile", metavar="P.npz", help="calibrated robot, made by 'edgefilter calibrate'")
     option("--engine", **ENGINE)
     option("--model", metavar="FILE.onnx", help=f"network for {' or '.join(HAVE_MODEL)} in place of its own")
@@ -91,6 +102,7 @@ def _run(commands: argparse._SubParsersAction) -> None:
     _json(option)
     told = "keep microphone, reference, output, events and profile in a new folder"
     option("--record", metavar="FOLDER", help=told)
+    option("--turns", metavar="FOLDER", help="write each finished turn of the human to a WAV file there")
     option("--log-json", metavar="FILE|-", help="write each event as a line of JSON when it happens")
     told = "write the profile with the echo path as it was adapted in this run"
     option("--save-profile", metavar="P2.npz", help=told)
@@ -129,6 +141,7 @@ def _calibrate(commands: argparse._SubParsersAction) -> None:
     option("--sweep-recording", metavar="R.wav", help="the sweep as the microphone recorded it")
     told = "some seconds of the fan while the robot is silent"
     option("--noise-recording", metavar="FAN.wav", help=told)
+    option("--mic-channels", **MIC_CHANNELS)
     sound = calibrate.add_mutually_exclusive_group()
     told = "multisines at three levels follow the sweep: measure the robot's distortion too"
     sound.add_argument("--multisine", action="store_true", help=told)
@@ -253,6 +266,21 @@ def positive(text: str) -> float:
 def level(text: str) -> float:
     """Level of a peak: at most full scale, and above what 16 bit can hold."""
     return number(text, -90.0, 0.0, "a level from -90 to 0 dB of full scale", closed=True)
+
+
+def channel(text: str) -> int:
+    """The number of a channel, counted from 0."""
+    if not text.strip().isdecimal() or int(text) >= MOST_CHANNELS:
+        raise argparse.ArgumentTypeError(f"'{text}' is not the number of a channel, 0 to {MOST_CHANNELS - 1}")
+    return int(text)
+
+
+def channels(text: str) -> list[int]:
+    """Numbers of channels, one to eight of them, none twice."""
+    found = [channel(part) for part in text.split(",")]
+    if len(set(found)) < len(found) or len(found) > MOST_MICROPHONES:
+        raise argparse.ArgumentTypeError(f"'{text}' does not name one to {MOST_MICROPHONES} different channels")
+    return found
 
 
 def number(text: str, low: float, high: float, expected: str, closed: bool = False) -> float:

@@ -49,8 +49,8 @@ class Progress:
 
     def note(self, block: Block, out: Samples, human: bool, process_s: float) -> None:
         """Take a block and what the filter made of it in process_s seconds; human: whether a human speaks."""
-        count = max(block.mic.size, 1)
-        self.samples += block.mic.size
+        count = max(block.ref.size, 1)
+        self.samples += block.ref.size
         self.lost += block.lost
         self.mic_db, self.ref_db = level_db(block.mic), level_db(block.ref)
         self.out_db = level_db(out) if out.size else self.out_db
@@ -150,7 +150,7 @@ def filter_blocks(
         out = ego.process(block.mic, block.ref)
         process_s = time.perf_counter() - start
         report.process_s += process_s
-        report.samples_in += block.mic.size
+        report.samples_in += block.ref.size
         report.lost += block.lost
         push(out)
         tell_events(last=False)

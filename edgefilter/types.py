@@ -29,7 +29,7 @@ Spectrum: TypeAlias = NDArray[np.complex64]
 class Block:
     """Samples of both channels that belong to the same stretch of the sample counter.
 
-    mic: (n,) float32, full scale +-1, any n >= 0; of an array (microphones, n). ref: (n,). start: counter of the first
+    mic: (n,) float32, full scale +-1, any n >= 0; of an array (n, channels). ref: (n,). start: counter of the first
     sample.
     lost: samples that the source could not deliver since the previous block (their place is filled, never silently).
     """

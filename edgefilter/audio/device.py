@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, replace
 from typing import Any
 
@@ -81,9 +81,11 @@ def monitor_of(output: str | int | Device | None = None) -> Device:
     return found[0] if found else monitor(devices, device)
 
 
-def input_port(name: str | int | Device | None, latency_s: float = STREAM_LATENCY_S) -> InputPort:
-    """An input that can be opened, found by what people type."""
-    return InputPort(_sounddevice(), find(name, "input"), latency_s)
+def input_port(
+    name: str | int | Device | None, latency_s: float = STREAM_LATENCY_S, channels: Sequence[int] | None = None
+) -> InputPort:
+    """An input that can be opened, found by what people type; channels: numbers, from 0, of those that are wanted."""
+    return InputPort(_sounddevice(), find(name, "input"), latency_s, channels)
 
 
 def output_port(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import errno
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -14,16 +14,28 @@ from edgefilter.audio.protocols import Sink, Source
 from edgefilter.audio.raw import PcmSink, PcmSource, clip_note, to_pcm16
 from edgefilter.audio.reader import Reader
 from edgefilter.errors import AudioFileError, UsageError
-from edgefilter.types import SAMPLE_RATE, Block, Samples, as_samples
+from edgefilter.types import SAMPLE_RATE, Block, Samples, as_microphones
 
 _FORMATS = {".wav": "WAV", ".flac": "FLAC"}
 
 
-def open_source(path: str | Path, reference: str | Path | None = None) -> Source:
-    """The source for a recording and its reference; '-', standard input, and named pipes bring both as raw stereo."""
+def open_source(
+    path: str | Path,
+    reference: str | Path | None = None,
+    channels: Sequence[int] | None = None,
+    reference_channel: int | None = None,
+) -> Source:
+    """The source for a recording and its reference; '-', standard input, and named pipes bring both as raw stereo.
+
+    channels, reference_channel: as of FileSource.
+    """
     named = Path(path).is_fifo()
     if str(path) != "-" and not named:
-        return FileSource(path, reference)
+        return FileSource(path, reference, channels=channels, reference_channel=reference_channel)
+    if channels is not None or reference_channel is not None:
+        raise UsageError(
+            f"'{path}' as input is stereo, microphone and reference, found channels asked for: give a file or a device"
+        )
     if reference is not None:
         raise UsageError(
             f"'{path}' as input is stereo and already holds the reference, found a second one, {reference}: leave it out"
@@ -42,13 +54,25 @@ class FileSource(Source):
     """A recording and, if there is one, the reference of what the robot said, as blocks of 16 kHz mono.
 
     The recording decides the length: a shorter reference is followed by silence, a longer one is cut, without one the
-    reference is silence. `notes` says each conversion and is complete after construction.
+    reference is silence. `notes` says each conversion and is complete after construction. channels: numbers, from 0, of
+    the recording's channels that are microphones, in place of the mean of all. reference_channel: the one that is the
+    reference.
     Raises AudioFileError for an unusable file (see Reader).
     """
 
-    def __init__(self, mic_path: str | Path, reference_path: str | Path | None = None, block: int = 4096) -> None:
-        self._mic = Reader(mic_path, "recording")
+    def __init__(
+        self,
+        mic_path: str | Path,
+        reference_path: str | Path | None = None,
+        block: int = 4096,
+        channels: Sequence[int] | None = None,
+        reference_channel: int | None = None,
+    ) -> None:
+        self._mic = Reader(mic_path, "recording", channels)
         self._reference = None if reference_path is None else Reader(reference_path, "reference")
+        if reference_channel is not None:
+            self._reference = Reader(mic_path, "reference in", [reference_channel])
+        self.microphones = 1 if channels is None else len(channels)
         self._block = block
         self.total = self._mic.total
         self.notes = list(self._mic.notes)
@@ -63,7 +87,7 @@ class FileSource(Source):
 
     def __iter__(self) -> Iterator[Block]:
         reference = _Taker(iter(()) if self._reference is None else self._reference.chunks())
-        mic = _Taker(self._mic.chunks())
+        mic = _Taker(self._mic.chunks(), self.microphones)
         for start in range(0, self._mic.total, self._block):
             if self._stopped:
                 return
@@ -93,26 +117,26 @@ def _length_notes(reference: Reader, total: int) -> list[str]:
 class _Taker:
     """Chunks of any length in, exactly the asked number of samples out, silence after the last."""
 
-    def __init__(self, chunks: Iterator[Samples]) -> None:
+    def __init__(self, chunks: Iterator[Samples], channels: int = 1) -> None:
         self._chunks = chunks
-        self._rest = np.zeros(0, np.float32)
+        self._rest = np.zeros(0 if channels == 1 else (0, channels), np.float32)
 
     def take(self, count: int) -> Samples:
         parts = [self._rest]
-        have = self._rest.size
+        have = len(self._rest)
         while have < count:
             chunk = next(self._chunks, None)
             if chunk is None:
-                chunk = np.zeros(count - have, np.float32)
+                chunk = np.zeros((count - have, *self._rest.shape[1:]), np.float32)
             parts.append(chunk)
-            have += chunk.size
+            have += len(chunk)
         joined = np.concatenate(parts)
         self._rest = joined[count:]
         return joined[:count]
 
 
 class FileSink(Sink):
-    """A mono 16 kHz file, WAV or FLAC by suffix, 16-bit PCM (or 32-bit float for WAV).
+    """A 16 kHz file, WAV or FLAC by suffix, 16-bit PCM (or 32-bit float for WAV), mono unless channels are more.
 
     Valid up to the last sample however the context is left, and where the program is killed: a WAV up to the last
     write, a FLAC up to the last of its frames of a quarter of a second. `clipped` counts samples beyond full scale.
@@ -127,7 +151,7 @@ class FileSink(Sink):
     160
     """
 
-    def __init__(self, path: str | Path, float32: bool = False) -> None:
+    def __init__(self, path: str | Path, float32: bool = False, channels: int = 1) -> None:
         self.path = Path(path)
         self.notes = []
         form = _FORMATS.get(self.path.suffix.lower())
@@ -151,7 +175,7 @@ class FileSink(Sink):
             ) from None
         try:
             self._file: soundfile.SoundFile | None = soundfile.SoundFile(
-                self._disk, "w", SAMPLE_RATE, 1, "FLOAT" if float32 else "PCM_16", format=form
+                self._disk, "w", SAMPLE_RATE, channels, "FLOAT" if float32 else "PCM_16", format=form
             )
         except soundfile.LibsndfileError as error:
             self._disk.finish()
@@ -162,7 +186,7 @@ class FileSink(Sink):
 
     def write(self, samples: Samples) -> None:
         if self._float32:
-            data: np.ndarray = as_samples(samples, "output")
+            data: np.ndarray = as_microphones(samples, "output").T
         else:
             data, clipped = to_pcm16(samples)
             self.clipped += clipped
@@ -174,7 +198,7 @@ class FileSink(Sink):
         if self._disk.error:
             self.close(quiet=True)
             raise self._full(self._disk.error)
-        self.written += data.size
+        self.written += len(data)
 
     def close(self, quiet: bool = False) -> None:
         """Finish the file; a second call does nothing.

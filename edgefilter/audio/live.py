@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 
 import numpy as np
@@ -26,7 +26,9 @@ class LiveSource(Source):
 
     patience_s: how long a device may be away; silence stands in meanwhile, by the clock, and it is opened again as soon
     as that can be done. Raises DeviceError, after everything received has been delivered, when a device is away for
-    longer. reference None: silence. lost: samples left out, filled or moved so far, see stats(): overruns are callbacks
+    longer. reference None: silence. channels: numbers, from 0, of the microphone device's channels that are microphones, in
+    place of their mean. reference_channel: the one of them that is the reference, with which no second device is opened
+    and no second clock has to be followed; it needs channels. lost: samples left out, filled or moved so far, see stats(): overruns are callbacks
     that the driver marked, each of which may hide an unknown number of samples.
     """
 
@@ -38,8 +40,13 @@ class LiveSource(Source):
         reference: str | int | Device | SpokenReference | None = None,
         seconds: float | None = None,
         patience_s: float = 0.0,
+        channels: Sequence[int] | None = None,
+        reference_channel: int | None = None,
     ) -> None:
-        self._mic = SteadyInput(_opener(mic), patience_s)
+        self._both = reference_channel is not None
+        taken = None if channels is None else [*channels, *([reference_channel] if self._both else ())]
+        self.microphones = 1 if channels is None else len(channels)
+        self._mic = SteadyInput(_opener(mic, taken), patience_s)
         self._reference = None if reference is None else SteadyInput(_opener(reference), patience_s)
         self._pairing = Pairing(late_is_lost=not isinstance(reference, SpokenReference))
         self.total = None if seconds is None else round(seconds * SAMPLE_RATE)
@@ -94,7 +101,7 @@ class LiveSource(Source):
             if block is None:
                 pause()
                 continue
-            left = block.mic.size if self.total is None else min(block.mic.size, self.total - given)
+            left = block.ref.size if self.total is None else min(block.ref.size, self.total - given)
             lost, reported = self.lost - reported, self.lost
             yield Block(block.mic[:left], block.ref[:left], block.start, lost)
             given += left
@@ -106,8 +113,11 @@ class LiveSource(Source):
     def _take(self) -> Block | None:
         """What came of both devices, as far as it can be paired."""
         mic = self._mic.take()
+        if self._both:
+            heard = mic[:, :-1] if self.microphones > 1 else mic[:, 0]
+            return self._pairing.push(heard, mic[:, -1])
         if self._reference is None:
-            return self._pairing.push(mic, np.zeros_like(mic))
+            return self._pairing.push(mic, np.zeros(len(mic), np.float32))
         before = self._reference.filled
         ref = self._reference.take()
         return self._pairing.push(mic, ref, self._reference.filled - before)
@@ -126,11 +136,13 @@ class LiveSource(Source):
             each.begin()
 
 
-def _opener(device: str | int | Device | SpokenReference | None) -> Callable[[], InputPort | SpokenReference]:
+def _opener(
+    device: str | int | Device | SpokenReference | None, channels: Sequence[int] | None = None
+) -> Callable[[], InputPort | SpokenReference]:
     """What makes an input of a device, each time anew; what is spoken goes on where it was."""
     if isinstance(device, SpokenReference):
         return lambda: device
-    return partial(input_port, find(device, "input"))
+    return partial(input_port, find(device, "input"), channels=channels)
 
 
 def _incomplete(what: str, counts: dict[str, int]) -> list[str]:

@@ -18,7 +18,7 @@ from edgefilter.types import SAMPLE_RATE, Samples
 class Recording:
     """What a microphone picked up while a sound was played.
 
-    samples: (n,) float32 at 16 kHz. holes: what was lost on the way, in words; empty where nothing was.
+    samples: (n,), or (n, channels) of several, float32 at 16 kHz. holes: what was lost on the way, in words; empty where nothing was.
     """
 
     samples: Samples
@@ -32,15 +32,17 @@ def play_and_record(
     tail_s: float = 1.0,
     latency_s: float = STREAM_LATENCY_S,
     tell: Callable[[float], None] = lambda left_s: None,
+    channels: Sequence[int] | None = None,
 ) -> Recording:
     """Play samples (n,) at 16 kHz and return what the microphone picks up from the moment playing starts, (n + tail,).
 
     Both are on one sample counter up to a constant: the devices' buffers appear as additional delay, so that the sound
     never seems to arrive before it is played. Silence goes first, since sound servers swallow a stream's start.
     latency_s: the buffers asked of the sound system; the larger, the fewer holes. tell: called again and again with the
-    seconds that are left. Raises DeviceError where a device cannot be opened or stops.
+    seconds that are left. channels: numbers, from 0, of the microphone's channels that are wanted in place of their mean.
+    Raises DeviceError where a device cannot be opened or stops.
     """
-    mic = input_port(microphone, latency_s)
+    mic = input_port(microphone, latency_s, channels)
     lead = np.zeros(round((latency_s + STREAM_LATENCY_S) * SAMPLE_RATE), np.float32)
     played = np.concatenate((lead, samples.astype(np.float32)))
     speaker = output_port(output, played.size, latency_s=latency_s)
@@ -67,7 +69,7 @@ def play_and_record(
             parts.append(mic.take())
             if begun:
                 first = round(begun[0] * SAMPLE_RATE / mic.rate + latency_s * SAMPLE_RATE)
-                left = first + wanted - sum(part.size for part in parts)
+                left = first + wanted - sum(len(part) for part in parts)
             tell(max(left, 0) / SAMPLE_RATE)
             pause()
     finally:

@@ -22,11 +22,13 @@ class Inlet:
     """A ring that an audio callback fills, with the places where it had to leave samples out.
 
     The callback calls `receive`; the reader calls `take`, which puts silence where samples are missing, so that
-    the sample counter stays true. lost: samples that did not fit. flags: callbacks that the driver marked as overrun.
+    the sample counter stays true. channels: samples are then (n, channels) in place of (n,). lost: samples that did not
+    fit. flags: callbacks that the driver marked as overrun.
     """
 
-    def __init__(self, capacity: int) -> None:
-        self._ring = Ring(capacity)
+    def __init__(self, capacity: int, channels: int | None = None) -> None:
+        self._ring = Ring(capacity, channels)
+        self._shape = () if channels is None else (channels,)
         self._gaps: deque[tuple[int, int]] = deque()
         self._stored = 0
         self._read = 0
@@ -46,8 +48,8 @@ class Inlet:
         """Called by the audio thread with (n,) samples."""
         count = self._ring.write(samples)
         self._stored += count
-        if count < samples.size:
-            self._gaps.append((self._stored, samples.size - count))
+        if count < len(samples):
+            self._gaps.append((self._stored, len(samples) - count))
         self.flags += flagged
         self.calls += 1
 
@@ -57,7 +59,7 @@ class Inlet:
         parts = []
         while self._gaps and self._gaps[0][0] <= upto:
             at, missing = self._gaps.popleft()
-            parts += [self._ring.read(at - self._read), np.zeros(missing, np.float32)]
+            parts += [self._ring.read(at - self._read), np.zeros((missing, *self._shape), np.float32)]
             self._read = at
         parts.append(self._ring.read(upto - self._read))
         self._read = upto
@@ -79,7 +81,7 @@ class Pairing:
 
     def __init__(self, late_is_lost: bool = True) -> None:
         self._late_is_lost = late_is_lost
-        self._mic = np.zeros(0, np.float32)
+        self._mic: Samples | None = None
         self._ref = np.zeros(0, np.float32)
         self._debt = 0
         self._next = 0
@@ -88,33 +90,34 @@ class Pairing:
         self.filled = self.dropped = self.inserted = 0
 
     def push(self, mic: Samples, ref: Samples, silence: int = 0) -> Block | None:
-        """Take what arrived, (n,) and (m,), and return the block that is complete, if any.
+        """Take what arrived, (n,), or (n, channels) of an array, and (m,), and return the block that is complete, if any.
 
         silence: so many of ref, the first ones, stand in for a device that is away; the caller counts them.
         """
         late = min(self._debt, ref.size)
         self._debt -= late
         self.filled -= min(late, silence)
-        self._mic = np.concatenate((self._mic, mic))
+        self._mic = mic if self._mic is None else np.concatenate((self._mic, mic))
         self._ref = np.concatenate((self._ref, ref[late:]))
         lost = self.filled + self.dropped + self.inserted
-        self._watch(mic.size)
-        missing = self._mic.size - self._ref.size - MAX_WAIT
+        self._watch(len(mic))
+        missing = len(self._mic) - self._ref.size - MAX_WAIT
         if missing > 0:
             self._ref = np.concatenate((self._ref, np.zeros(missing, np.float32)))
             self._debt += missing * self._late_is_lost
             self.filled += missing
-        return self._emit(min(self._mic.size, self._ref.size), self.filled + self.dropped + self.inserted - lost)
+        return self._emit(min(len(self._mic), self._ref.size), self.filled + self.dropped + self.inserted - lost)
 
     def flush(self) -> Block | None:
         """The microphone samples still waiting; silence stands in for their reference."""
-        missing = max(0, self._mic.size - self._ref.size)
+        waiting = 0 if self._mic is None else len(self._mic)
+        missing = max(0, waiting - self._ref.size)
         self.filled += missing
         self._ref = np.concatenate((self._ref, np.zeros(missing, np.float32)))
-        return self._emit(self._mic.size, missing)
+        return self._emit(waiting, missing)
 
     def _emit(self, count: int, lost: int) -> Block | None:
-        if count == 0:
+        if count == 0 or self._mic is None:
             return None
         block = Block(self._mic[:count], self._ref[:count], self._next, lost)
         self._mic, self._ref = self._mic[count:], self._ref[count:]
@@ -123,7 +126,7 @@ class Pairing:
 
     def _watch(self, arrived: int) -> None:
         """Follow the smallest difference of the counters (reference ahead: positive), and act on one that lasts."""
-        skew = self._ref.size - self._mic.size - self._debt
+        skew = self._ref.size - (0 if self._mic is None else len(self._mic)) - self._debt
         before = self._smallest
         if before is None or abs(skew) < abs(before) or (skew > 0) != (before > 0):
             self._smallest = skew if before is None or (skew > 0) == (before > 0) else 0

@@ -9,7 +9,7 @@ import ctypes
 import os
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import cache
 from typing import Any
@@ -20,7 +20,7 @@ import soxr
 from edgefilter.audio.lookup import Device
 from edgefilter.audio.pairing import Inlet, Outlet
 from edgefilter.audio.pulse import OPENING, leading_to
-from edgefilter.errors import DeviceError
+from edgefilter.errors import DeviceError, UsageError
 from edgefilter.types import SAMPLE_RATE, Samples
 
 POLL_S = 0.004
@@ -76,11 +76,20 @@ def quiet() -> Iterator[None]:
 class Port:
     """One PortAudio stream and how its rate and channels are brought to 16 kHz mono.
 
-    latency_s: the buffer asked of the sound system, seconds.
+    latency_s: the buffer asked of the sound system, seconds. wanted: numbers of an input's channels, from 0, to be
+    delivered in that order in place of their mean.
     """
 
-    def __init__(self, sounddevice: Any, device: Device, kind: str, latency_s: float = STREAM_LATENCY_S) -> None:
+    def __init__(
+        self,
+        sounddevice: Any,
+        device: Device,
+        kind: str,
+        latency_s: float = STREAM_LATENCY_S,
+        wanted: Sequence[int] | None = None,
+    ) -> None:
         self._sd = sounddevice
+        self.wanted = None if wanted is None else list(wanted)
         self.kind = kind
         self.device = device
         self.latency_s = latency_s
@@ -91,7 +100,11 @@ class Port:
                 f"{kind} device '{self.device}' does not run at {SAMPLE_RATE} Hz: opened at {self.rate} Hz and"
                 " resampled"
             )
-        if self.channels > 1:
+        if self.wanted is not None:
+            self.notes.append(
+                f"{kind} device '{self.device}': channels {', '.join(map(str, self.wanted))} of {self.channels}"
+            )
+        elif self.channels > 1:
             how = "averaged" if kind == "input" else "get the same"
             self.notes.append(f"{kind} device '{self.device}' has no mono: {self.channels} channels {how}")
         self._stream: Any = None
@@ -101,9 +114,16 @@ class Port:
     def _settings(self) -> tuple[int, int]:
         check = self._sd.check_input_settings if self.kind == "input" else self._sd.check_output_settings
         most = max(2, self.device.channels(self.kind))
+        least = 1 if self.wanted is None else max(self.wanted) + 1
+        if least > self.device.channels(self.kind):
+            raise UsageError(
+                f"{self.kind} device '{self.device}' has {self.device.channels(self.kind)} channels, found channel"
+                f" {least - 1} asked for, counted from 0: choose others ('edgefilter devices')"
+            )
+        counts = sorted({1, 2, most}) if self.wanted is None else sorted({least, most})
         refusal = ""
         for rate in (SAMPLE_RATE, round(self.device.rate)):
-            for channels in sorted({1, 2, most}):
+            for channels in counts:
                 try:
                     with quiet():
                         check(device=self.device.index, channels=channels, dtype="float32", samplerate=rate)
@@ -161,24 +181,36 @@ def _words(error: Exception) -> str:
     return str(error.args[0] if error.args else error).splitlines()[0]
 
 
-def resampler(given: int, wanted: int) -> soxr.ResampleStream | None:
+def resampler(given: int, wanted: int, channels: int = 1) -> soxr.ResampleStream | None:
     """From one rate to another, None where they are the same."""
-    return None if given == wanted else soxr.ResampleStream(given, wanted, 1, dtype="float32")
+    return None if given == wanted else soxr.ResampleStream(given, wanted, channels, dtype="float32")
 
 
 class InputPort(Port):
-    """An input whose callback fills an Inlet, read as 16 kHz mono."""
+    """An input whose callback fills an Inlet, read as 16 kHz mono, or as the channels that are wanted."""
 
-    def __init__(self, sounddevice: Any, device: Device, latency_s: float = STREAM_LATENCY_S) -> None:
-        super().__init__(sounddevice, device, "input", latency_s)
-        self.inlet = Inlet(round(BUFFER_S * self.rate))
-        self._resampler = resampler(self.rate, SAMPLE_RATE)
+    def __init__(
+        self,
+        sounddevice: Any,
+        device: Device,
+        latency_s: float = STREAM_LATENCY_S,
+        wanted: Sequence[int] | None = None,
+    ) -> None:
+        super().__init__(sounddevice, device, "input", latency_s, wanted)
+        several = None if wanted is None or len(wanted) == 1 else len(wanted)
+        self.inlet = Inlet(round(BUFFER_S * self.rate), several)
+        self._resampler = resampler(self.rate, SAMPLE_RATE, several or 1)
 
     def open(self) -> None:
-        inlet = self.inlet
+        inlet, wanted = self.inlet, self.wanted
+        taken = None if wanted is None else wanted[0] if len(wanted) == 1 else wanted
 
         def callback(indata: np.ndarray, _frames: int, _time: Any, status: Any) -> None:
-            inlet.receive(indata[:, 0] if indata.shape[1] == 1 else indata.mean(axis=1), bool(status.input_overflow))
+            if taken is not None:
+                samples = indata[:, taken]
+            else:
+                samples = indata[:, 0] if indata.shape[1] == 1 else indata.mean(axis=1)
+            inlet.receive(samples, bool(status.input_overflow))
 
         self.start(callback)
 

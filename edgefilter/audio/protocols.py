@@ -15,12 +15,13 @@ class Source(Protocol):
 
     notes: what was done to the sound on its way in (converted, padded, dropped), one sentence each, for the user to
     read; complete when the iteration has ended. total: samples per channel at 16 kHz, None if unknown beforehand.
-    live: blocks arrive in real time.
+    live: blocks arrive in real time. microphones: channels of a block's mic, which is (n,) where it is one.
     """
 
     notes: list[str]
     total: int | None
     live: bool = False
+    microphones: int = 1
     _stopped: bool = False
 
     def __enter__(self: Itself) -> Itself:

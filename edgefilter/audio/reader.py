@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import re
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -24,20 +24,23 @@ _ENDLESS = 0x7FFFF000
 class Reader:
     """A WAV, FLAC or Ogg file of any rate and channel count, delivered at 16 kHz with its channels averaged.
 
-    role: how messages name the file ("recording"). The file is read once at opening, so that a damaged one is refused
-    before anything is made from it. total: round(n * 16000 / rate) samples. silent: every sample is zero.
+    wanted: numbers of channels, from 0, to be delivered in that order in place of their mean. role: how messages name the
+    file ("recording"). The file is read once at opening, so that a damaged one is refused before anything is made from
+    it. total: round(n * 16000 / rate) samples. silent: every sample is zero.
     Raises AudioFileError for a file that is missing, empty, truncated, not audio, or holds what no recording does.
     """
 
-    def __init__(self, path: str | Path, role: str = "recording") -> None:
+    def __init__(self, path: str | Path, role: str = "recording", wanted: Sequence[int] | None = None) -> None:
         self.path = Path(path)
         self.role = role
+        self.wanted = None if wanted is None else list(wanted)
         self.notes: list[str] = []
         self.silent = True
         self._check_is_file()
         with self._open() as file:
             self.rate, self.channels = file.samplerate, file.channels
             self._check_header(file)
+            self._check_channels()
             length = self._scan(file)
         self.total = (2 * length * SAMPLE_RATE + self.rate) // (2 * self.rate)
         if self.total == 0:
@@ -47,18 +50,27 @@ class Reader:
         self._note_conversion()
 
     def chunks(self) -> Iterator[Samples]:
-        """Yield float32 arrays of any length, `total` samples in all."""
-        resampler = soxr.ResampleStream(self.rate, SAMPLE_RATE, 1, dtype="float32", quality="VHQ")
+        """Yield float32 arrays (n,), or (n, channels) of several that are wanted, of any length, `total` samples in all."""
+        several = self.wanted is not None and len(self.wanted) > 1
+        count = len(self.wanted) if several and self.wanted else 1
+        resampler = soxr.ResampleStream(self.rate, SAMPLE_RATE, count, dtype="float32", quality="VHQ")
         given = 0
         with self._open() as file:
             for data in self._blocks(file):
-                mono = data[:, 0] if self.channels == 1 else data.mean(axis=1, dtype=np.float32)
+                taken = self._taken(data)
                 if self.rate != SAMPLE_RATE:
-                    mono = resampler.resample_chunk(np.ascontiguousarray(mono))
-                given += mono.size
-                yield mono
+                    taken = resampler.resample_chunk(np.ascontiguousarray(taken))
+                given += len(taken)
+                yield taken
         if self.rate != SAMPLE_RATE:
-            yield resampler.resample_chunk(np.zeros(0, np.float32), last=True)[: self.total - given]
+            rest = np.zeros((0, count) if several else 0, np.float32)
+            yield resampler.resample_chunk(rest, last=True)[: self.total - given]
+
+    def _taken(self, data: Array) -> Samples:
+        """What is delivered of data (n, channels)."""
+        if self.wanted is None:
+            return data[:, 0] if self.channels == 1 else data.mean(axis=1, dtype=np.float32)
+        return data[:, self.wanted[0]] if len(self.wanted) == 1 else data[:, self.wanted]
 
     def _error(self, what: str) -> AudioFileError:
         return AudioFileError(f"{self.role} {self.path} {what}")
@@ -114,6 +126,16 @@ class Reader:
                 "is truncated: the Ogg stream stops before its end mark; copy it again, or re-save what is there"
             )
 
+    def _check_channels(self) -> None:
+        for channel in self.wanted or ():
+            if channel >= self.channels:
+                has = (
+                    f"has {self.channels} channels, 0 to {self.channels - 1}"
+                    if self.channels > 1
+                    else "has channel 0 alone"
+                )
+                raise self._error(f"{has}, found channel {channel} asked for: choose others with --mic-channels")
+
     def _blocks(self, file: soundfile.SoundFile) -> Iterator[Array]:
         """Yield (n, channels) float32, SAMPLE_RATE values at a time; a decoder that gives up is an error with its place."""
         size = max(1, SAMPLE_RATE // self.channels)
@@ -144,7 +166,7 @@ class Reader:
             if np.abs(data).max() > LOUDEST:
                 loudest = data.flat[np.abs(data).argmax()]
                 raise self._error(f"holds {loudest:g}, expected samples of a full scale of 1: its scaling is wrong")
-            self.silent = self.silent and not data.any()
+            self.silent = self.silent and not self._taken(data).any()
             length += len(data)
         if length == 0:
             raise self._error("is empty (a header and 0 samples), expected sound: record it again")
@@ -159,8 +181,14 @@ class Reader:
         if self.rate != SAMPLE_RATE:
             above = f" (it has nothing above {self.rate / 2000:g} kHz)" if self.rate < SAMPLE_RATE else ""
             done.append(f"{self.rate} Hz resampled to {SAMPLE_RATE} Hz{above}")
-        if self.channels > 1:
-            done.append(f"{self.channels} channels averaged to one")
+        if self.wanted is not None:
+            done.append(
+                f"channel{'s' if len(self.wanted) > 1 else ''} {', '.join(map(str, self.wanted))} of {self.channels}"
+            )
+        elif self.channels > 1:
+            done.append(
+                f"{self.channels} channels averaged to one (microphones of an array: name them with --mic-channels)"
+            )
         if done:
             self.notes.append(f"{self.role} {self.path}: {', '.join(done)}")
 

@@ -16,11 +16,13 @@ MOST = (2**32 - 2**16) // 4
 class Recorder:
     """FOLDER/mic.wav, reference.wav and output.wav, 32-bit float: exactly the samples of the blocks, and the filter's.
 
+    microphones: channels of mic.wav.
+
     A disk that is full ends the recording and not the run: what was written stays valid, and the error stands in
     `failure`. Raises AudioFileError where the folder or a file cannot be made.
     """
 
-    def __init__(self, folder: str | Path) -> None:
+    def __init__(self, folder: str | Path, microphones: int = 1) -> None:
         self.folder = Path(folder)
         self.failure: AudioFileError | None = None
         try:
@@ -31,8 +33,8 @@ class Recorder:
             ) from None
         self._files: list[FileSink] = []
         try:
-            for name in NAMES:
-                self._files.append(FileSink(self.folder / name, float32=True))
+            for name, channels in zip(NAMES, (microphones, 1, 1)):
+                self._files.append(FileSink(self.folder / name, float32=True, channels=channels))
         except AudioFileError:
             self._close()
             raise
@@ -61,7 +63,7 @@ class Recorder:
             return
         file = self._files[number]
         try:
-            if file.written + samples.size > MOST:
+            if file.written * samples[:1].size + samples.size > MOST:
                 hours = MOST / SAMPLE_RATE / 3600
                 raise AudioFileError(
                     f"{file.path} holds {hours:.1f} hours, all that a WAV file can: the recording ends here"

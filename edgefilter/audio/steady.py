@@ -63,6 +63,7 @@ class SteadyInput:
         self._earlier_lost = self._earlier_overruns = 0
         self._open, self._clock = False, SampleClock()
         self._failure: DeviceError | None = None
+        self._latest = np.zeros(0, np.float32)
         self._received_at = self._gone_at = self._tried_at = 0.0
 
     def open(self) -> None:
@@ -96,17 +97,19 @@ class SteadyInput:
         self.port.take()
 
     def take(self) -> Samples:
-        """What came since the last call (n,), or silence for as long as nothing can come."""
+        """What came since the last call (n,) or (n, channels), or silence for as long as nothing can come."""
         now = clock()
-        samples = self.port.take() if self._open else np.zeros(0, np.float32)
+        samples = self.port.take() if self._open else self._latest[:0]
+        self._latest = samples
         if self._failure is None:
-            self._received_at = now if samples.size else self._received_at
+            self._received_at = now if len(samples) else self._received_at
             self._clock.note(self.settled, now)
             return samples
-        silence = np.zeros(max(round((now - self._received_at) * SAMPLE_RATE) - samples.size, 0), np.float32)
-        self.filled += silence.size
-        if not samples.size:
-            self._received_at += silence.size / SAMPLE_RATE
+        missing = max(round((now - self._received_at) * SAMPLE_RATE) - len(samples), 0)
+        silence = np.zeros((missing, *samples.shape[1:]), np.float32)
+        self.filled += missing
+        if not len(samples):
+            self._received_at += missing / SAMPLE_RATE
             return silence
         self.back += 1
         self._failure, self._received_at = None, now

@@ -49,9 +49,11 @@ def main(args: argparse.Namespace) -> int:
         with _folder(args.save_input) as folder:
             return _calibrate(args, f"live: {args.speaker} to {args.input}", *_record(args, folder))
     names = [getattr(args, name) for name in RECORDINGS]
-    return _calibrate(
-        args, ", ".join(names), *(read(path, role.replace("_", " ")) for path, role in zip(names, RECORDINGS))
+    wanted = (None, args.mic_channels, args.mic_channels)
+    recordings = (
+        read(path, role.replace("_", " "), channels) for path, role, channels in zip(names, RECORDINGS, wanted)
     )
+    return _calibrate(args, ", ".join(names), *recordings)
 
 
 def _calibrate(args: argparse.Namespace, source: str, sweep: Samples, recording: Samples, noise: Samples) -> int:
@@ -106,7 +108,9 @@ def _take(args: argparse.Namespace, folder: Path, name: str, sound: Samples, wha
     from edgefilter.audio.measure import play_and_record
 
     for latency_s in BUFFERS_S:
-        found = play_and_record(args.speaker, args.input, sound, latency_s=latency_s, tell=countdown(what))
+        found = play_and_record(
+            args.speaker, args.input, sound, latency_s=latency_s, tell=countdown(what), channels=args.mic_channels
+        )
         _keep(folder, name, found.samples)
         if not found.holes:
             return found.samples
@@ -118,7 +122,8 @@ def _take(args: argparse.Namespace, folder: Path, name: str, sound: Samples, wha
 
 
 def _keep(folder: Path, name: str, samples: Samples) -> None:
-    with FileSink(folder / f"{name}.wav", float32=True) as sink:
+    channels = 1 if samples.ndim == 1 else samples.shape[1]
+    with FileSink(folder / f"{name}.wav", float32=True, channels=channels) as sink:
         sink.write(samples)
 
 

@@ -13,6 +13,7 @@ from functools import partial
 from pathlib import Path
 from typing import TextIO
 
+from edgefilter.audio.files import FileSink
 from edgefilter.audio.protocols import Source
 from edgefilter.audio.recorder import Recorder
 from edgefilter.audio.speech import SpokenReference
@@ -78,8 +79,8 @@ class Record(Recorder):
     The sound, events.jsonl, run.json with the figures, and profile.npz if the run had a profile to begin with.
     """
 
-    def __init__(self, folder: str | Path, profile: Profile | None) -> None:
-        super().__init__(folder)
+    def __init__(self, folder: str | Path, profile: Profile | None, microphones: int = 1) -> None:
+        super().__init__(folder, microphones)
         self.log = EventLog(self.folder / "events.jsonl")
         if profile is not None:
             profile.save(self.folder / "profile.npz")
@@ -89,6 +90,37 @@ class Record(Recorder):
         write_json(figures, str(self.folder / "run.json"))
         if self.failure:
             raise self.failure
+
+
+class TurnWriter:
+    """Writes each finished turn of the human to a WAV file of its own: FOLDER/turn_0001.wav, turn_0002.wav, ...
+
+    A file that cannot be written ends the writing and not the run; why stands in `failure`. Raises AudioFileError where
+    the folder cannot be made.
+    """
+
+    def __init__(self, folder: str | Path) -> None:
+        self.failure: AudioFileError | None = None
+        self.written = 0
+        self._folder = Path(folder)
+        try:
+            self._folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise AudioFileError(
+                f"folder {folder} for the turns cannot be made: {error.strerror}; name another"
+            ) from None
+
+    def hear(self, event: Event) -> None:
+        """Write the turn that an event brings, if it brings one."""
+        if event.turn is None or self.failure:
+            return
+        try:
+            with FileSink(self._folder / f"turn_{self.written + 1:04d}.wav") as sink:
+                sink.write(event.turn.samples)
+        except AudioFileError as error:
+            self.failure = error
+        else:
+            self.written += 1
 
 
 class Observers:
@@ -111,6 +143,7 @@ class Observers:
         self._of_blocks: list[Callable[[Progress], None]] = []
         self._logs: list[EventLog] = []
         self.record: Record | None = None
+        self._turns: TurnWriter | None = None
 
     def __enter__(self) -> Observers:
         args = self._args
@@ -122,9 +155,12 @@ class Observers:
             if args.barge_in or args.on_barge_in:
                 self._of_blocks.append(Availability(self._ego, interject).show)
             if args.record:
-                self.record = Record(args.record, self._ego.profile)
+                self.record = Record(args.record, self._ego.profile, self._source.microphones)
                 stack.enter_context(self.record)
                 self._logs.append(self.record.log)
+            if args.turns:
+                self._turns = TurnWriter(args.turns)
+                self._of_events.append(self._turns.hear)
             if args.log_json:
                 self._logs.append(EventLog(args.log_json))
             self._of_blocks.append(stack.enter_context(display(self._source, self._ego, args.quiet)))
@@ -156,6 +192,8 @@ class Observers:
             log.write("ended", int(str(figures["samples_in"])), **{name: figures[name] for name in ENDED})
             log.close()
             failure = failure or log.failure
+        if self._turns:
+            failure = failure or self._turns.failure
         if self.record:
             self.record.finish(figures)
         if failure:

@@ -35,6 +35,7 @@ HIDDEN_FILES = (
 """What `demo --hidden` writes of each of its robots."""
 FOLDERS: dict[tuple[str, str], tuple[str, ...]] = {
     ("run", "record"): ("mic.wav", "reference.wav", "output.wav", "events.jsonl", "run.json", "profile.npz"),
+    ("run", "turns"): ("turn_0001.wav",),
     ("calibrate", "save_input"): ("sweep_reference.wav", "sweep_recording.wav", "noise_recording.wav"),
     ("demo", "output"): (
         *("filtered.wav", "microphone.wav", "human.wav", "before_after.png"),
@@ -42,7 +43,7 @@ FOLDERS: dict[tuple[str, str], tuple[str, ...]] = {
     ),
 }
 """By command and option: the files that are written into the folder which the option names."""
-IN_FOLDERS = ("save_input", "record")
+IN_FOLDERS = ("save_input", "record", "turns")
 """Options that name nothing but a folder."""
 PACKAGE = Path(__file__).parent.parent
 

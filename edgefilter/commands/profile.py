@@ -26,6 +26,7 @@ def summary(profile: Profile) -> dict[str, object]:
     """The figures of a profile, ready for JSON."""
     return {
         "schema": 1,
+        "microphones": profile.microphones,
         "taps": int(profile.echo.impulse_response.size),
         "delay_samples": profile.delay,
         "effects": [

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -14,15 +15,17 @@ from edgefilter.profile.data import Profile
 from edgefilter.types import Samples
 
 
-def read(path: str, role: str) -> Samples:
+def read(path: str, role: str, channels: Sequence[int] | None = None) -> Samples:
     """A whole recording (n,), 16 kHz mono, which messages call by its role; conversions are said on standard error.
+
+    channels: numbers, from 0, of those that are wanted in place of the mean; (n, channels) of several.
 
     Raises AudioFileError for a file that is unusable.
     """
-    reader = Reader(path, role)
+    reader = Reader(path, role, channels)
     for note in reader.notes:
         say(note)
-    return np.concatenate([*reader.chunks(), np.zeros(0, np.float32)])
+    return np.concatenate(list(reader.chunks()))
 
 
 def load(args: argparse.Namespace) -> tuple[Profile, Samples, Samples]:

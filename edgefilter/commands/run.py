@@ -22,7 +22,7 @@ from edgefilter.audio.troubles import Troubles
 from edgefilter.commands.display import describe_latency, say, write_json
 from edgefilter.commands.observers import Observers
 from edgefilter.engines import HAVE_LINEAR_STAGE
-from edgefilter.errors import EdgefilterError, UsageError
+from edgefilter.errors import EdgefilterError, SignalError, UsageError
 from edgefilter.filter.budget import DEFAULT_MS, Choice, choose, forget
 from edgefilter.filter.ego_filter import EgoFilter
 from edgefilter.filter.learner import Learner
@@ -38,9 +38,9 @@ TWICE_S = 0.5
 
 def main(args: argparse.Namespace) -> int:
     speech = make_speech(args)
-    source = make_source(args.input, speech or args.reference, args.output)
+    source = make_source(args.input, speech or args.reference, args.output, channels_of(args), args.reference_channel)
     ego, choice = make_filter(args, source.live)
-    check_request(args, ego, source.live)
+    check_request(args, ego, source)
     sink = make_sink(args.output, ego.latency, wait=not source.live)
     limit = None if args.seconds is None else round(args.seconds * SAMPLE_RATE)
     notes = [*source.notes, f"engine {ego.engine_name} ({ego.engine_reason}), {describe_latency(ego)}"]
@@ -89,13 +89,33 @@ def make_speech(args: argparse.Namespace) -> SpokenReference | None:
     return speaker(args.speaker, Reader(args.play, "speech"))
 
 
-def make_source(name: str, reference: str | SpokenReference | None, output: str) -> Source:
+def channels_of(args: argparse.Namespace) -> list[int] | None:
+    """The microphones that --mic-channels names; raises UsageError for a reference channel without or among them."""
+    if args.reference_channel is None:
+        return args.mic_channels
+    if args.mic_channels is None or args.reference_channel in args.mic_channels:
+        found = "none" if args.mic_channels is None else f"channel {args.reference_channel} among them"
+        raise UsageError(f"--reference-channel goes with --mic-channels that name the others, found {found}")
+    if args.reference is not None or args.play is not None:
+        other = "--play" if args.play is not None else "--reference"
+        raise UsageError(f"--reference-channel is the reference, found {other} too: leave one of them out")
+    return args.mic_channels
+
+
+def make_source(
+    name: str,
+    reference: str | SpokenReference | None,
+    output: str,
+    channels: list[int] | None = None,
+    reference_channel: int | None = None,
+) -> Source:
     """A file or pipe where name is one, else the live devices.
 
     The reference defaults to the monitor of the output device, for the virtual microphone to that of its speaker.
+    channels, reference_channel: as of FileSource and LiveSource.
     """
     if isinstance(reference, str | None) and (name == "-" or looks_like_file(name)):
-        return open_source(name, reference)
+        return open_source(name, reference, channels, reference_channel)
     virtual.refuse_own(name)
     from edgefilter.audio.device import monitor_of
     from edgefilter.audio.live import LiveSource
@@ -105,11 +125,11 @@ def make_source(name: str, reference: str | SpokenReference | None, output: str)
             f"live, the reference is a device, found the file {reference}: leave --reference out or name a monitor"
             " ('edgefilter devices'); to play the file, --play"
         )
-    if reference is not None:
-        return LiveSource(name, reference, patience_s=math.inf)
+    if reference is not None or reference_channel is not None:
+        return LiveSource(name, reference, patience_s=math.inf, channels=channels, reference_channel=reference_channel)
     own = virtual.speaker_monitor() if output == virtual.HUMAN else None
     played_on = "default" if output in ("-", virtual.HUMAN) or looks_like_file(output) else output
-    return LiveSource(name, own or monitor_of(played_on), patience_s=math.inf)
+    return LiveSource(name, own or monitor_of(played_on), patience_s=math.inf, channels=channels)
 
 
 def make_sink(name: str, latency: int, wait: bool) -> Sink:
@@ -135,11 +155,11 @@ def limited(source: Source, limit: int | None) -> Iterator[Block]:
     """The blocks of source up to limit samples; the last one is cut."""
     left = limit
     for block in source:
-        if left is not None and block.mic.size >= left:
+        if left is not None and block.ref.size >= left:
             source.stop()
             yield Block(block.mic[:left], block.ref[:left], block.start, block.lost)
             return
-        left = None if left is None else left - block.mic.size
+        left = None if left is None else left - block.ref.size
         yield block
 
 
@@ -183,10 +203,17 @@ def make_learner(args: argparse.Namespace, live: bool, profile: Profile | None) 
     return BackgroundLearner(profile, remember)
 
 
-def check_request(args: argparse.Namespace, ego: EgoFilter, live: bool) -> None:
-    """Raise UsageError for what was asked of a filter that cannot do it."""
+def check_request(args: argparse.Namespace, ego: EgoFilter, source: Source) -> None:
+    """Raise UsageError for what was asked of a filter that cannot do it, SignalError for a profile of other microphones."""
     names = ", ".join(HAVE_LINEAR_STAGE)
-    if ego.waits_for_end and live:
+    if ego.profile and ego.profile.microphones != source.microphones:
+        raise SignalError(
+            f"the profile holds {ego.profile.microphones} microphones, found {source.microphones}: name those that were"
+            " calibrated with --mic-channels, or calibrate again with these"
+        )
+    if args.turns and not ego.judges_speech:
+        raise UsageError(f"--turns needs an engine that judges speech, found {ego.engine_name}: take crnn")
+    if ego.waits_for_end and source.live:
         raise UsageError(
             f"engine {ego.engine_name} needs the whole recording before it answers: give --input FILE or take another"
             " engine"

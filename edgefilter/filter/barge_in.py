@@ -130,6 +130,12 @@ class BargeIn:
         self._sure = self._silent = 0
         self.speaking = False
 
+    def end(self) -> bool:
+        """The recording is over; whether somebody was speaking."""
+        was, self.speaking = self.speaking, False
+        self._sure = self._silent = 0
+        return was
+
     def note(self, probability: float | None) -> EventKind | None:
         """Take the probability of a hop, None where the engine does not judge it.
 

@@ -28,7 +28,7 @@ class Microphones:
 
     >>> rng = np.random.default_rng(0)
     >>> watched = Microphones(3, 256)
-    >>> for _ in range(63):
+    >>> for _ in range(62):
     ...     heard = rng.standard_normal((3, 256)).astype(np.float32)
     ...     heard[1] = 0.0
     ...     changed = watched.step(heard, heard)

@@ -113,6 +113,8 @@ class Stream:
         rest = self._run(np.zeros((*lead, padding.size), np.float32), padding)
         if self.engine.lookahead is None:
             rest = self._finish([self._synthesiser.push(spectrum) for spectrum in self.engine.answer(self._clip)])
+        if self._barge_in.end():
+            self._tell_of_speech("speech_stopped", "the recording has ended")
         return self._deliver(rest[:missing])
 
     def _expect(self, microphones: int | None) -> None:
@@ -153,10 +155,10 @@ class Stream:
             if ref.size - at >= hop and not len(self._mic):
                 done.append(self._watched_step(mic[..., at : at + hop], ref[at : at + hop]))
                 continue
-            self._mic.write(mic[..., at : at + hop])
+            self._mic.write(mic[..., at : at + hop].T)
             self._ref.write(ref[at : at + hop])
             if len(self._mic) >= hop:
-                done.append(self._watched_step(self._mic.read(hop), self._ref.read(hop)))
+                done.append(self._watched_step(np.ascontiguousarray(self._mic.read(hop).T), self._ref.read(hop)))
         return self._finish(done)
 
     def _finish(self, done: list[Samples]) -> Samples:

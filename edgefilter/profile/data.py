@@ -195,14 +195,31 @@ class Profile:
         return 1 if self.array is None else 1 + len(self.array.responses)
 
     def running_responses(self) -> Samples:
-        """(microphones, taps) float32, the paths as the running filter begins with them, the effects that are filters in them."""
+        """The paths as the running filter begins with them, the effects that are filters in them.
+
+        Returns
+        -------
+        ndarray of float32, shape (microphones, taps)
+            A row a microphone, the first one's first.
+        """
         return _stacked([model.running_response() for model in self._models()])
 
     def with_running_responses(self, responses: Samples, gain: float, effects: Effects) -> Profile:
-        """The same robot with the paths (taps,), of an array (microphones, taps), to which the running filter adapted them.
+        """The same robot with the paths to which the running filter has adapted them.
 
-        gain: by which the volume was turned. effects: those of the path in use. What of a path is longer than the
-        filter's is the profile's own.
+        Parameters
+        ----------
+        responses : ndarray of float32, shape (taps,) or (microphones, taps)
+            What of a path is longer than the filter's is the profile's own.
+        gain : float
+            By which the volume was turned.
+        effects : tuple of (name, values)
+            Of the path in use.
+
+        Returns
+        -------
+        Profile
+            A new one.
         """
         models = [replace(model, effects=effects) for model in self._models()]
         echoes = [model.with_running_response(row, gain) for model, row in zip(models, np.atleast_2d(responses))]

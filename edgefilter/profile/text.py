@@ -28,6 +28,7 @@ def describe(profile: Profile) -> str:
             f" {profile.delay:.0f} samples ({1000 * profile.delay / SAMPLE_RATE:.1f} ms), gain {_gain_db(path):.1f} dB"
         ),
         f"decay       {_decay(path)}",
+        *([f"microphones {profile.microphones}; what is said here is of the first"] if profile.array else ()),
         f"fan         {fan:.1f} dB of full scale",
         f"distortion  orders {distortion}",
         *(_left_lines(profile.approximation) if profile.approximation else ()),

@@ -292,3 +292,39 @@ def test_a_wav_of_more_than_its_sizes_can_say_is_marked_as_going_on_to_the_end(t
     with open(tmp_path / "x.wav", "rb") as file:
         start = file.read(44)
     assert start[4:8] == start[40:44] == b"\xff" * 4
+
+
+def test_channels_that_are_wanted_come_in_their_order(tmp_path):
+    four = np.random.default_rng(0).uniform(-0.5, 0.5, (5000, 4)).astype(np.float32)
+    soundfile.write(tmp_path / "four.wav", four, 16000, "FLOAT")
+    source = FileSource(tmp_path / "four.wav", channels=[2, 0], reference_channel=3, block=700)
+    blocks = list(source)
+    assert source.microphones == 2 and source.notes[0].endswith("channels 2, 0 of 4")
+    assert np.array_equal(np.concatenate([block.mic for block in blocks]), four[:, [2, 0]])
+    assert np.array_equal(np.concatenate([block.ref for block in blocks]), four[:, 3])
+    alone = np.concatenate([block.mic for block in FileSource(tmp_path / "four.wav", channels=[1])])
+    assert np.array_equal(alone, four[:, 1])
+
+
+def test_channels_are_resampled_together(tmp_path):
+    t = np.arange(48000) / 48000
+    sound = 0.3 * np.stack((np.sin(2 * np.pi * 440 * t), np.cos(2 * np.pi * 440 * t)), axis=1)
+    soundfile.write(tmp_path / "two.wav", sound, 48000, "FLOAT")
+    heard = np.concatenate([block.mic for block in FileSource(tmp_path / "two.wav", channels=[0, 1])])
+    assert heard.shape == (16000, 2)
+    assert np.allclose(heard[100:-100] ** 2 @ np.ones(2), 0.09, atol=1e-3)
+
+
+def test_a_channel_that_is_not_there_is_one_line(tmp_path):
+    soundfile.write(tmp_path / "two.wav", np.zeros((100, 2)), 16000)
+    with pytest.raises(AudioFileError, match="has 2 channels, 0 to 1, found channel 2 asked for"):
+        FileSource(tmp_path / "two.wav", channels=[0, 2])
+    with pytest.raises(UsageError, match="stereo, microphone and reference, found channels asked for"):
+        open_source("-", channels=[0])
+
+
+def test_several_channels_are_written_and_read_again(tmp_path):
+    three = np.random.default_rng(1).uniform(-0.5, 0.5, (300, 3)).astype(np.float32)
+    with FileSink(tmp_path / "three.wav", float32=True, channels=3) as sink:
+        sink.write(three)
+    assert sink.written == 300 and np.array_equal(soundfile.read(tmp_path / "three.wav", dtype="float32")[0], three)
