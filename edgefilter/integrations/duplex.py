@@ -33,11 +33,14 @@ _LOGGER = logging.getLogger(__name__)
 
 
 class Resampler:
-    """One stream from one rate to another, piece by piece; it holds about 40 ms back, at equal rates nothing."""
+    """One stream from one rate to another, piece by piece; it holds about 40 ms back, at equal rates nothing.
 
-    def __init__(self, source: int, target: int) -> None:
-        self.rates = (source, target)
-        self._stream = None if source == target else soxr.ResampleStream(source, target, 1, dtype="float32")
+    channels: samples are then (n, channels), where they are more than one.
+    """
+
+    def __init__(self, source: int, target: int, channels: int = 1) -> None:
+        self.rates, self.channels = (source, target), channels
+        self._stream = None if source == target else soxr.ResampleStream(source, target, channels, dtype="float32")
 
     def push(self, samples: Samples, last: bool = False) -> Samples:
         """Take the next samples (n,) and return the finished ones; after `last` nothing may follow."""
@@ -153,17 +156,20 @@ class Duplex:
             self._paused = False
 
     def hear(self, samples: Samples, rate: int) -> Samples:
-        """Take the microphone's next samples (n,) at rate and return finished samples of the human, at the same rate.
+        """Take the microphone's next samples at rate and return finished samples of the human (m,), at the same rate.
 
-        One call may return none or more than came in. All together are as many as came in, later by the filter's
-        latency and, at another rate than 16 kHz, by the resamplers' 40 ms each way.
+        samples: (n,), of an array (n, channels), as many channels in each call. One call may return none or more than came
+        in. All together are as many as came in, later by the filter's latency and, at another rate than 16 kHz, by the
+        resamplers' 40 ms each way.
         """
         with self._hear_lock:
-            if self._from_mic.rates[0] != rate:
-                self._from_mic, self._to_agent = Resampler(rate, SAMPLE_RATE), Resampler(SAMPLE_RATE, rate)
-            self._mic = np.concatenate((self._mic, self._from_mic.push(samples)))
+            channels = 1 if samples.ndim == 1 else samples.shape[1]
+            if self._from_mic.rates[0] != rate or self._from_mic.channels != channels:
+                self._from_mic, self._to_agent = Resampler(rate, SAMPLE_RATE, channels), Resampler(SAMPLE_RATE, rate)
+            pushed = self._from_mic.push(samples)
+            self._mic = np.concatenate((self._mic, pushed)) if len(self._mic) else pushed
             with self._queue_lock:
-                self._forget_unheard(samples.size / rate)
+                self._forget_unheard(len(samples) / rate)
                 reference = self._reference()
             mic, self._mic = self._mic[: reference.size], self._mic[reference.size :]
             human = self.ego.process(mic, reference)
@@ -174,7 +180,9 @@ class Duplex:
         for event in events:
             if self._on_event:
                 self._on_event(event)
-        return human if self.enabled else samples
+        if self.enabled:
+            return human
+        return samples if samples.ndim == 1 else samples[:, 0]
 
     def hear_pcm16(self, pcm: bytes | memoryview, rate: int, channels: int = 1) -> bytes:
         """As `hear`, for 16-bit samples, interleaved; each channel of the answer is the human."""
@@ -212,7 +220,7 @@ class Duplex:
 
     def _reference(self) -> Samples:
         """What was played while the waiting samples of the microphone were recorded; shorter where they wait on."""
-        count = self._mic.size
+        count = len(self._mic)
         if self._paused:
             return np.zeros(count, np.float32)
         if self._talking and count > self._queued:

@@ -8,7 +8,7 @@ from edgefilter.audio.live import LiveSink, LiveSource
 from edgefilter.audio.pairing import TOLERANCE, WINDOW
 from edgefilter.audio.steady import SampleClock, SteadySink
 from edgefilter.audio.troubles import Troubles
-from edgefilter.errors import DeviceError
+from edgefilter.errors import DeviceError, UsageError
 from edgefilter.filter.ego_filter import EgoFilter
 from edgefilter.session import filter_blocks
 from tests.audio.virtual_portaudio import CALLBACK_S, VirtualDevice
@@ -199,3 +199,34 @@ def test_late_sound_is_not_lost_and_drift_is_no_loss():
     for tick in range(21_000, 22_100):
         watch.note(delivered + tick * 0.01 - now, tick * 0.01)
     assert watch.missed == pytest.approx(0.0, abs=WINDOW / 16000 * 400e-6)  # it came after all
+
+
+def test_the_channels_of_a_device_that_are_named_are_taken_and_one_of_them_is_the_reference(plug):
+    plug(VirtualDevice("array", "input", rate=48000.0, takes=(48000, 6), channels=6))
+    source = LiveSource("array", seconds=1, channels=[1, 2, 4], reference_channel=5)
+    with source:
+        blocks = list(source)
+    mic, ref = (np.concatenate([getattr(block, name) for block in blocks]) for name in ("mic", "ref"))
+    assert source.microphones == 3 and mic.shape == (16000, 3) and ref.shape == (16000,)
+    assert mic[8000:] == pytest.approx(np.tile([0.2, 0.3, 0.5], (8000, 1)), abs=1e-3)
+    assert ref[8000:] == pytest.approx(0.6, abs=1e-3) and source.lost == 0
+    assert any("channels 1, 2, 4, 5 of 6" in note for note in source.notes)
+
+
+def test_an_array_that_is_unplugged_comes_back_with_all_its_microphones(plug):
+    array, ref = VirtualDevice("array", "input", channels=4), VirtualDevice("ref", "input")
+    system = plug(array, ref)
+    system.at(3.0, lambda: setattr(array, "plugged", False))
+    system.at(8.0, lambda: setattr(array, "plugged", True))
+    source = LiveSource("array", "ref", seconds=15, patience_s=FOREVER, channels=[0, 3])
+    with source:
+        mic = np.concatenate([block.mic for block in source])
+    assert mic.shape == (15 * 16000, 2) and mic[-1] == pytest.approx([0.1, 0.4])
+    silent = np.count_nonzero(mic[:, 0] == 0.0)
+    assert silent > 4 * 16000 and source.stats()["microphone_away"] == pytest.approx(silent, abs=STEP)
+
+
+def test_a_channel_that_a_device_lacks_is_one_line(plug):
+    plug(VirtualDevice("array", "input", channels=4))
+    with pytest.raises(UsageError, match="input device 'array' has 4 channels, found channel 4 asked for"):
+        LiveSource("array", channels=[1, 4])

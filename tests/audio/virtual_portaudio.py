@@ -19,7 +19,8 @@ class VirtualDevice:
     """One device. takes: (rate, channels) that it can be opened with, None for any. plugged: whether it is there.
 
     ppm: by how much its clock is fast. swallows: seconds of sound that its driver loses without a word. needs_s: buffer
-    below which each callback is marked as late. hears: the output whose sound this input gets, a callback later.
+    below which each callback is marked as late. channels: how many it has; of more than two the k-th, from 0, sounds as
+    loud as k + 1 tenths. hears: the output whose sound this input gets, a callback later.
     """
 
     name: str
@@ -30,6 +31,7 @@ class VirtualDevice:
     ppm: float = 0.0
     swallows: float = 0.0
     needs_s: float = 0.0
+    channels: int = 2
     hears: VirtualDevice | None = None
     played: list = field(default_factory=list)
 
@@ -69,6 +71,8 @@ class Stream:
             status = SimpleNamespace(input_overflow=self.late, output_underflow=self.late)
             if self.device.kind == "input":
                 sound = np.full((size, self.channels), 0.25, np.float32)
+                if self.device.channels > 2:
+                    sound = np.tile(0.1 * np.arange(1, self.channels + 1, dtype=np.float32), (size, 1))
                 if heard := self.device.hears:
                     sound = heard.played.pop(0)[:, None] if heard.played else 0 * sound
                 self.callback(sound, size, None, status)
@@ -123,7 +127,7 @@ class VirtualPortAudio:
             {
                 "name": device.name,
                 "hostapi": 0,
-                "max_input_channels": 2 * (device.kind == "input"),
+                "max_input_channels": device.channels * (device.kind == "input"),
                 "max_output_channels": 2 * (device.kind == "output"),
                 "default_samplerate": device.rate,
             }

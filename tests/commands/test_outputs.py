@@ -19,7 +19,7 @@ from edgefilter.cli import build_parser, main
 from edgefilter.commands.outputs import FOLDERS, READ, WRITTEN
 from tests.diagnosis.robot_scene import profile
 
-NEITHER = {"mic_channels", "reference_channel", 
+NEITHER = {"mic_channels", "reference_channel",
     "help", "version", "debug", "command", "word", "engine", "budget_ms", "remeasure", "seconds", "quiet", "stepped_sine", "live",
     "speaker", "level_db", "effect", "force", "prove", "no_learn", "on_barge_in", "barge_in", "setup", "load", "unload",
     "hidden", "multisine",

@@ -277,3 +277,15 @@ def test_the_robot_is_removed_though_its_speech_comes_in_bursts_is_cut_off_and_b
         assert 10 * np.log10(np.mean(out[part] ** 2) / np.mean(mic[part] ** 2)) < -25  # 44 dB were seen
     assert np.abs(out).max() < 1.12 * np.abs(mic).max()  # 1 dB
     assert not [event for event in events if event.kind == "speech_started"], "nobody spoke"
+
+
+@pytest.mark.parametrize("rate", [RATE, 48000])
+def test_an_array_goes_through_to_the_filter_and_one_channel_comes_back(rate):
+    frame = np.zeros((rate // 50, 3), np.float32)
+    frame[:, 1] = 0.1
+    duplex = Duplex(EgoFilter(engine="linear"))
+    heard = [duplex.hear(frame, rate) for _ in range(50)]
+    assert all(part.ndim == 1 for part in heard) and duplex.ego.stats()["array"]["microphones"] == 3
+    assert sum(part.size for part in heard) == pytest.approx(rate, abs=0.13 * rate)
+    duplex.enabled = False
+    assert np.array_equal(duplex.hear(frame, rate), frame[:, 0])
