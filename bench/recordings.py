@@ -63,21 +63,52 @@ class Signals(NamedTuple):
 
 @dataclass(frozen=True)
 class Conversation:
-    """A folder of bench/simulate/conversations.py; signals are read when asked for."""
+    """A folder of bench/simulate/conversations.py or arrays.py; signals are read when asked for.
+
+    turn: which of the human's, where there are several.
+    """
 
     folder: Path
+    turn: int = 0
 
     @property
     def name(self) -> str:
-        return self.folder.name
+        return self.folder.name if len(self.turns) == 1 else f"{self.folder.name}, turn {self.turn + 1}"
+
+    @property
+    def turns(self) -> list[dict]:
+        """The human's: start, end and text of each."""
+        return self.meta.get("turns", [self.meta])
+
+    @property
+    def text(self) -> str:
+        return self.turns[self.turn]["text"]
+
+    @cached_property
+    def microphones(self) -> int:
+        return soundfile.info(self.folder / "mic.flac").channels
 
     @cached_property
     def meta(self) -> dict:
         return json.loads((self.folder / "meta.json").read_text(encoding="utf-8"))
 
     def read(self, name: str) -> Samples:
-        """mic, ref, clean, sweep_ref, sweep_mic or fan_only, (n,)."""
-        return read(self.folder / f"{name}.flac")
+        """mic, ref, clean, sweep_ref, sweep_mic or fan_only, (n,); of an array the first microphone."""
+        return self.read_all(name)[:, 0].copy()
+
+    def read_all(self, name: str) -> Samples:
+        """The same with all microphones, (n, microphones)."""
+        samples, rate = soundfile.read(self.folder / f"{name}.flac", dtype="float32", always_2d=True)
+        if rate != SAMPLE_RATE:
+            raise UsageError(f"{self.folder / name}.flac: {rate} Hz, expected {SAMPLE_RATE} Hz: convert it first")
+        return samples
+
+    def array(self, microphones: int) -> tuple[Signals, Profile]:
+        """Signals and calibration of the first so many microphones; raises NotHere where there are fewer."""
+        if self.microphones < microphones:
+            raise NotHere(f"{self.microphones} microphones, expected {microphones}")
+        mic, sweep, fan = (self.read_all(name)[:, :microphones] for name in ("mic", "sweep_mic", "fan_only"))
+        return Signals(mic, self.read("ref")), calibrate(self.read("sweep_ref"), sweep, fan)
 
     @cached_property
     def fingerprint(self) -> str:
@@ -90,7 +121,8 @@ class Conversation:
 
     @property
     def span(self) -> slice:
-        return slice(self.meta["start"], self.meta["end"])
+        turn = self.turns[self.turn]
+        return slice(turn["start"], turn["end"])
 
     def signals(self) -> Signals:
         return Signals(self.read("mic"), self.read("ref"), self.read("clean"), self.span)
@@ -100,7 +132,11 @@ class Conversation:
         ref, at, meta = self.read("ref"), self.meta["t_main"], self.meta
         delay = direct_delay(self.read("sweep_ref"), self.read("sweep_mic")) - MARGIN
         out = np.zeros_like(ref)
-        for samples, start, lag in ((ref[:at], 0, meta["lag"]), (ref[at:], at, meta.get("lag2", meta["lag"]))):
+        if parts := meta.get("parts"):
+            placed = [(ref[part["at"] : part["at"] + part["size"]], part["at"], part["lag"]) for part in parts]
+        else:
+            placed = [(ref[:at], 0, meta["lag"]), (ref[at:], at, meta.get("lag2", meta["lag"]))]
+        for samples, start, lag in placed:
             begin = max(start + lag + delay, 0)
             kept = samples[: max(ref.size - begin, 0)]
             out[begin : begin + kept.size] += kept
@@ -388,6 +424,12 @@ class Clip:
         human = b"" if self.human is None else self.human.tobytes()
         return hashlib.sha256(self.mic.tobytes() + self.ref.tobytes() + human).hexdigest()
 
+    def array(self, microphones: int) -> tuple[Signals, Profile]:
+        """See Conversation.array; raises NotHere for a recording of one microphone."""
+        if not isinstance(self.source, Conversation):
+            raise NotHere(f"1 microphone, expected {microphones}")
+        return self.source.array(microphones)
+
     def known_human(self) -> Samples:
         """(n,); raises NotHere where only the mixture was recorded."""
         if self.human is None:
@@ -425,15 +467,17 @@ class Clip:
 
 
 def conversation_clips(folder: Path) -> Iterator[Clip]:
-    """The conversations of a folder; every one is in a room of its own."""
+    """The conversations of a folder, a clip for each turn of the human; every conversation is in a room of its own."""
     found = [Conversation(path.parent) for path in sorted(folder.glob("*/meta.json"))]
+    found = [replace(one, turn=turn) for one in found for turn in range(len(one.turns))]
     for one in found:
         meta = one.meta
         others = [other for other in found if other is not one and other.meta["speaker"] == meta["speaker"]]
-        others = [other for other in others if other.meta["text"] != meta["text"]]
+        others = [other for other in others if other.text != one.text]
         voices = tuple((other.folder / "clean.flac", other.span) for other in others[:1])
-        place_ = f"{folder.resolve().parent.name}/{folder.name}/{one.name}"
-        yield Clip("", meta["room"], one, str(meta["speaker"]), place_, meta["text"], voices)
+        place_ = f"{folder.resolve().parent.name}/{folder.name}/{one.folder.name}"
+        room = meta["room"] if len(one.turns) == 1 else f"{meta['room']}, {'first' if one.turn == 0 else 'later'} turn"
+        yield Clip("", room, one, str(meta["speaker"]), place_, one.text, voices)
 
 
 def recorded_clip(recording: Recording) -> Clip:

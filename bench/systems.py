@@ -19,7 +19,7 @@ import numpy as np
 
 from bench import denoisers, peers, results, voicefilter
 from bench.recordings import Clip, NotHere, Signals
-from edgefilter import EgoFilter, Event, PathLearner, Profile
+from edgefilter import EgoFilter, Event, PathLearner, Profile, calibrate
 from edgefilter.dsp.stft import StftConfig
 from edgefilter.engines import HAVE_MODEL, create
 from edgefilter.errors import EdgefilterError, UsageError
@@ -30,6 +30,8 @@ from edgefilter.types import SAMPLE_RATE, Samples
 OWN = ("linear", "ss", "crnn")
 WAYS = {"": "calibrated", "-learning": "calibrated and learning", "-uncalibrated-learning": "learning only",
         "-uncalibrated": "uncalibrated"}  # fmt: skip
+ARRAYS = (2, 3, 4)
+"""Numbers of microphones, of conversations that have so many."""
 TRUE_LAG = "-true-lag"
 PEERS = {"speexdsp": "SpeexDSP", "speexdsp-suppressed": "SpeexDSP with its suppressor", "aec3": "WebRTC AEC3"}
 DENOISERS = {"dtln": "DTLN", "rnnoise": "RNNoise", "gtcrn": "GTCRN", "deepfilternet3": "DeepFilterNet3"}
@@ -104,7 +106,7 @@ def row(name: str) -> Row:
 def catalogue(networks: Mapping[str, Path] | None = None) -> dict[str, System]:
     """All rows by name, in the order of the tables. networks: further networks for the engine crnn, by name."""
     rows = [System("unfiltered", "Unfiltered", "unfiltered", lambda clip: Output(clip.mic), latency_ms=0.0)]
-    rows += [*_paper(), *(_own(engine, way) for way in WAYS for engine in OWN), *_peers()]
+    rows += [*_paper(), *(_own(engine, way) for way in WAYS for engine in OWN), *_arrays(), *_peers()]
     rows += [_own("crnn", "", path, f"crnn:{name}") for name, path in (networks or {}).items()]
     rows += [*_denoisers(), *_bounds()]
     rows += [System(name, title, "peer", lambda clip: Output(clip.mic), missing=partial(_refuse, why))
@@ -147,7 +149,7 @@ def run_engine(
     """An engine over mic and ref, hop by hop as live, so that its events and the probability after each hop are known."""
     ego = EgoFilter(profile, wanted.engine, model=model, learn=learner)
     parts, probability = [], []
-    for at in range(0, signals.mic.size, ego.hop):
+    for at in range(0, signals.ref.size, ego.hop):
         parts.append(ego.process(signals.mic[at : at + ego.hop], signals.ref[at : at + ego.hop]))
         probability.append(ego.speech_probability)
     out = np.concatenate((*parts, ego.flush()))
@@ -179,6 +181,44 @@ def _own(engine: str, way: str, model: Path | None = None, name: str = "", title
     late = None if engine == "paper-crnn" else _latency_ms(engine)  # whole clips
     code = partial(_engine_code, engine, model)
     return System(name or engine + way, title, kind, run, knows, late, missing, code, model)
+
+
+def _arrays() -> list[System]:
+    """Rows of `crnn` with several microphones: streamed, the finished turns, and what is made of them as one."""
+    found = []
+    for count in ARRAYS:
+        for way in ("", "-learning"):
+            told, code = f"{count} microphones, {WAYS[way]}", partial(_engine_code, "crnn")
+            knows, late = WAYS[way] if way else "calibration", _latency_ms("crnn")
+            streamed, finished = (partial(_of_array, count, bool(way), turns) for turns in (False, True))
+            found.append(System(f"crnn-{count}{way}", f"crnn, {told}", "own", streamed, knows, late, code=code))
+            title = f"crnn, {told}, finished turns"
+            found.append(System(f"crnn-{count}-turns{way}", title, "own", finished, knows, None, code=code))
+        title = f"crnn on the mean of {count} microphones, calibrated"
+        mean = partial(_of_mean, count)
+        found.append(System(f"crnn-mean-of-{count}", title, "own", mean, "calibration", _latency_ms("crnn"), code=code))
+    return found
+
+
+def _of_array(count: int, learning: bool, turns: bool, clip: Clip) -> Output:
+    """What `crnn` makes of the first count microphones; turns: with the finished turns in place of what was streamed."""
+    signals, profile = clip.array(count)
+    found = run_engine(Row("crnn", True, learning), signals, profile, PathLearner(profile) if learning else None)
+    if turns:
+        samples = found.samples.copy()
+        for turn in (event.turn for event in found.events or () if event.turn):
+            samples[turn.start : turn.start + turn.samples.size] = turn.samples
+        found = found._replace(samples=samples)
+    return found
+
+
+def _of_mean(count: int, clip: Clip) -> Output:
+    """What `crnn` makes of the mean of the microphones, calibrated with that mean: an array as a single channel."""
+    clip.array(count)
+    sweep, fan, mic = (clip.source.read_all(name)[:, :count].mean(axis=1) for name in ("sweep_mic", "fan_only", "mic"))
+    return run_engine(
+        Row("crnn", True, False), Signals(mic, clip.ref), calibrate(clip.source.read("sweep_ref"), sweep, fan)
+    )
 
 
 def _engine_code(engine: str, model: Path | None = None) -> str:

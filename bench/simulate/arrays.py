@@ -80,14 +80,14 @@ def measured_covariances(folder: Path) -> tuple[Array, Array]:
     return halves[0], halves[1]
 
 
-def with_microphones(covariance: Array, count: int, rng_phase: float) -> Array:
-    """Covariances (bins, count, count) of one to four microphones from those of three."""
+def with_microphones(covariance: Array, count: int, phase: float) -> Array:
+    """Covariances (bins, count, count) of one to four microphones from those of three; phase: of the fourth at 8 kHz."""
     if count <= 3:
         return covariance[:, :count, :count]
     root = np.linalg.cholesky(
         covariance + 1e-6 * np.trace(covariance, axis1=1, axis2=2)[:, None, None].real * np.eye(3)
     )
-    turn = np.exp(1j * rng_phase * np.arange(len(covariance)) / len(covariance))
+    turn = np.exp(1j * phase * np.arange(len(covariance)) / len(covariance))
     mixed = root[:, 2, [2, 0, 1]] * turn[:, None]
     out = np.zeros((len(covariance), 4, 4), complex)
     out[:, :3, :3], out[:, 3, :3] = root, 0.7 * mixed
@@ -198,10 +198,9 @@ def make(
     robot = replace(robot, shell=np.stack([draw_body(rng) for _ in range(microphones)]))
     gains = 10 ** (np.concatenate(([0.0], rng.uniform(-1, 1, microphones - 1))) / 20)
     laboratory = stand(rng, draw_walls(rng, "lab"), robot.distance_m, robot.direction, human_m, places)
-    walls = draw_walls(rng, room_name)
-    state = rng.bit_generator.state
-    room = stand(rng, walls, robot.distance_m, robot.direction, human_m, places)
-    heard = [room.human] + [_elsewhere(rng, state, walls, robot, places) if moving else room.human for _ in humans[1:]]
+    moves = turns - 1 if moving else 0
+    room = stand(rng, draw_walls(rng, room_name), robot.distance_m, robot.direction, human_m, places, moves)
+    heard = [room.human, *(room.elsewhere or [room.human] * (turns - 1))]
     script, ref = make_script(rng, kind, voices[voice], humans)
     sound = played(ref, script)
     one = replace(robot, shell=robot.shell[0])
@@ -222,27 +221,6 @@ def make(
                        for i, ((a, b), clip) in enumerate(zip(spans, said))]}  # fmt: skip
     meta |= {**script, **scores, "nl_db": nl_db, "places": places.tolist(), "seed": [seed, index]}
     return {"ref": ref, **signals}, meta
-
-
-def _elsewhere(rng: np.random.Generator, state: dict, walls: tuple, robot: Robot, places: Array) -> Array:
-    """Responses of a human who stands elsewhere around the same robot in the same room."""
-    again = np.random.default_rng()
-    again.bit_generator.state = state
-    size = walls[0]
-    again.uniform(1.75, size[:2] - 1.75)  # the robot's place is drawn first, and is the same
-
-    class Turned:
-        """Draws as the first time for where the robot stands, then anew."""
-
-        def __init__(self) -> None:
-            self.first, self.calls = np.random.default_rng(), 0
-            self.first.bit_generator.state = state
-
-        def uniform(self, *args: object) -> object:
-            self.calls += 1
-            return self.first.uniform(*args) if self.calls <= 2 else rng.uniform(*args)
-
-    return stand(Turned(), walls, robot.distance_m, robot.direction, rng.uniform(1.0, 1.5), places).human  # type: ignore[arg-type]
 
 
 def _record(
@@ -285,6 +263,14 @@ def _record(
     return {"sweep_ref": excitation, **signals}, scores
 
 
+def write(folder: Path, signals: dict[str, Array], meta: dict) -> None:
+    """The signals as FLAC and meta.json into a folder."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, samples in signals.items():
+        sf.write(folder / f"{name}.flac", samples, RATE, subtype="PCM_16")
+    (folder / "meta.json").write_text(json.dumps(meta, indent=1) + "\n", encoding="utf-8")
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--speech", type=Path, required=True, metavar="DIR", help="human speech")
@@ -309,11 +295,7 @@ def main() -> None:
             options.seed, index, options.kind, room, speech, voices, covariances, options.microphones, options.turns,
             options.moving,
         )  # fmt: skip
-        folder = options.output / f"{room}_{index:02d}"
-        folder.mkdir(parents=True, exist_ok=True)
-        for name, samples in signals.items():
-            sf.write(folder / f"{name}.flac", samples, RATE, subtype="PCM_16")
-        (folder / "meta.json").write_text(json.dumps(meta, indent=1) + "\n", encoding="utf-8")
+        write(options.output / f"{room}_{index:02d}", signals, meta)
 
 
 if __name__ == "__main__":

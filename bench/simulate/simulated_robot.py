@@ -107,12 +107,14 @@ def peak_filter(frequency_hz: float, q: float, gain_db: float) -> Array:
 class Room:
     """A shoebox room with a robot's microphone, its loudspeaker and a human.
 
-    rt60_s is what the impulse response shows. robot, human: responses (n,), of an array (microphones, n).
+    rt60_s is what the impulse response shows. robot, human: responses (n,), of an array (microphones, n). elsewhere: the
+    human's from further places.
     """
 
     rt60_s: float
     robot: Array
     human: Array
+    elsewhere: tuple[Array, ...] = ()
 
 
 def draw_room(rng: np.random.Generator, kind: str, robot_m: float, direction: Array, human_m: float) -> Room:
@@ -134,18 +136,24 @@ def stand(
     direction: Array,
     human_m: float,
     array: Array | None = None,
+    moves: int = 0,
 ) -> Room:
     """Impulse responses at 16 kHz by image sources (Allen & Berkley 1979; pyroomacoustics), without filter delay.
 
     walls: from `draw_walls`. robot_m, direction (3,): where the loudspeaker lies from the microphone; it is a part of
     the robot, so the same in every room. The human's mouth is human_m away, a little higher. array: (m, 3), where the
-    microphones of an array lie from the microphone; None for the microphone alone.
+    microphones of an array lie from the microphone; None for the microphone alone. moves: further places of an array's
+    human, as far away.
     """
     size, wanted = walls
     microphone = np.array([*rng.uniform(1.75, size[:2] - 1.75), rng.uniform(0.9, 1.2)])
-    angle, height = rng.uniform(0, 2 * math.pi), rng.uniform(0.1, 0.5)
-    reach = math.sqrt(human_m**2 - height**2)
-    mouth = microphone + np.array([reach * math.cos(angle), reach * math.sin(angle), height])
+
+    def mouth_somewhere() -> Array:
+        angle, height = rng.uniform(0, 2 * math.pi), rng.uniform(0.1, 0.5)
+        reach = math.sqrt(human_m**2 - height**2)
+        return microphone + np.array([reach * math.cos(angle), reach * math.sin(angle), height])
+
+    mouth = mouth_somewhere()
     asked = wanted
     for _ in range(
         3
@@ -154,7 +162,9 @@ def stand(
         found = float(pra.experimental.measure_rt60(human, fs=RATE, decay_db=30))
         asked, last = min(asked * wanted / found, 1.5), asked
     if array is not None:
-        robot, human = _image_sources(size, last, microphone + array, (microphone + robot_m * direction, mouth))
+        sources = (microphone + robot_m * direction, mouth, *(mouth_somewhere() for _ in range(moves)))
+        robot, human, *elsewhere = _image_sources(size, last, microphone + array, sources)
+        return Room(found, robot, human, tuple(elsewhere))
     return Room(found, robot, human)
 
 
