@@ -50,6 +50,8 @@ class EgoFilter:
         (those whose `speech_probability` is not None). It should stop or duck the robot and return at once, since the
         sound waits for it. What it raises leaves `process` when the block is filtered, and no sample is lost: the next
         `process` or `flush` returns those of this block as well.
+    keep_channels : bool
+        Keep what the linear stage leaves of each microphone, for `robot_removed`.
 
     Attributes
     ----------
@@ -69,7 +71,8 @@ class EgoFilter:
     -----
     The path, hop by hop: alignment of the reference, a partitioned-block frequency-domain Kalman filter (Enzner & Vary
     2006) that subtracts the echo, the engine's mask on what is left, overlap-add (docs/architecture.md). Samples are
-    float, full scale +-1, at 16 kHz, one channel. Any partition into blocks gives the same output to the last bit.
+    float, full scale +-1, at 16 kHz; of two to eight microphones the path makes one channel (docs/arrays.md). Any partition
+    into blocks gives the same output to the last bit.
 
     Examples
     --------
@@ -97,6 +100,7 @@ class EgoFilter:
         barge_in: BargeInSettings | None = None,
         learn: Learner | None = None,
         on_barge_in: Callable[[Event], object] | None = None,
+        keep_channels: bool = False,
     ) -> None:
         if engine == "auto" and model is not None:
             raise UsageError(
@@ -112,7 +116,7 @@ class EgoFilter:
         budget = None if network_judges else budget_ms
         ladder = None if budget is None or best.lookahead is None else Ladder(climbable(best, self.profile))
         stepping = Stepping(best.stft.hop, ladder, budget_ms)
-        self._stream = Stream(ladder or best, self.profile, stepping, barge_in, learn, on_barge_in)
+        self._stream = Stream(ladder or best, self.profile, stepping, barge_in, learn, on_barge_in, keep_channels)
 
     @property
     def engine_name(self) -> str:
@@ -173,9 +177,11 @@ class EgoFilter:
 
         Parameters
         ----------
-        mic_block, ref_block : ndarray of float, shape (n,)
-            What the microphone heard and what the robot said meanwhile, any n, on the same sample counter. Never
+        mic_block : ndarray of float, shape (n,) or (n, channels)
+            What the microphone heard, or two to eight microphones on one clock, as many in each block; any n. Never
             written to.
+        ref_block : ndarray of float, shape (n,)
+            What the robot said meanwhile, on the same sample counter. Never written to.
 
         Returns
         -------
@@ -186,9 +192,21 @@ class EgoFilter:
         Raises
         ------
         SignalError
-            For another shape or dtype, unequal lengths, samples that are not finite or beyond 1e6, or after `flush`.
+            For another shape or dtype, unequal lengths, samples that are not finite or beyond 1e6, other microphones
+            than before or than the profile's, or after `flush`.
         """
         return self._stream.process(mic_block, ref_block)
+
+    def robot_removed(self) -> Samples:
+        """Each microphone with the robot's voice subtracted, for whoever wants to know where the human is.
+
+        Returns
+        -------
+        ndarray of float32, shape (n, microphones)
+            What came since the last call, whole hops, 30 s at most; sample i of all of them belongs to sample i of the
+            input. Fan and room are in it. Nothing without `keep_channels`, or from an engine without a linear stage.
+        """
+        return self._stream.robot_removed()
 
     def announce(self, utterance: Samples) -> None:
         """Say what the robot will play next; it may start at any time, or never, and several queue up.

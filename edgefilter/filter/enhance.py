@@ -24,8 +24,10 @@ def enhance(
 
     Parameters
     ----------
-    mic, ref : ndarray of float, shape (n,)
-        What the microphone heard and what the robot said, full scale +-1, 16 kHz, on the same sample counter.
+    mic : ndarray of float, shape (n,) or (n, channels)
+        What the microphone heard, or two to eight microphones on one clock; full scale +-1, 16 kHz.
+    ref : ndarray of float, shape (n,)
+        What the robot said, on the same sample counter.
     profile, engine, model, learn
         As of `EgoFilter`.
 

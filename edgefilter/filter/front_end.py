@@ -90,7 +90,7 @@ class FrontEnd:
     kind "none" passes the microphone, "paper" only delays the reference per utterance, "full" tracks and cancels.
     aligner: None for "none". linear_stage: None but for "full". gate: None but for "full" with a profile. microphones: of
     an array, and None for a single one; the kinds without a linear stage hear its first. spatial: None but for "full" with
-    an array. errors: (microphones, bins) of the latest frame of an array.
+    an array. errors: (microphones, bins) of the latest frame of an array. linear: what the linear stage made of the latest hop.
     """
 
     def __init__(
@@ -107,6 +107,7 @@ class FrontEnd:
         self.aligner = aligner
         self.spatial: SpatialFilter | None = None
         self.errors: Spectrum | None = None
+        self.linear: CancellerOutput | None = None
         self.gate: OnsetGate | None = None
         self.linear_stage: LinearStage | None = None
         if engine.front == "paper":
@@ -146,7 +147,7 @@ class FrontEnd:
             x, r = self._analyser.push(mic, found.reference if found else ref)
             return Frame(x, r, self._silence, x, self._fan, self._nothing), found
         aligned = stage.aligner.step(mic, ref)
-        linear = stage.step(heard, aligned)
+        self.linear = linear = stage.step(heard, aligned)
         gain = self.gate.step(mic, ref, aligned) if self.gate else None
         added = self._added(stage.path.source)
         if self.spatial and self.microphones:

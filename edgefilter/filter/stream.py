@@ -15,7 +15,7 @@ from edgefilter.filter.barge_in import INTERRUPTIONS, BargeIn, BargeInSettings, 
 from edgefilter.filter.front_end import FrontEnd
 from edgefilter.filter.learner import Learner
 from edgefilter.filter.stepping import Stepping
-from edgefilter.filter.turns import Turns
+from edgefilter.filter.turns import LONGEST_S, Turns
 from edgefilter.profile.data import Profile
 from edgefilter.types import SAMPLE_RATE, Event, EventKind, Frame, Samples, Turn, as_microphones, as_samples
 
@@ -29,7 +29,7 @@ class Stream:
     the compute time of every hop; what it answers becomes an event. barge_in: when speech counts as begun and ended,
     None for the defaults. learner: of better echo paths, for engines with a linear stage. on_barge_in: called in the
     hop in which speech has begun; what it raises is raised once the block is filtered, whose samples then come with the
-    next call. speech_probability: of the last hop, weighed with what robot and room leave; None
+    next call. keep_channels: for robot_removed. speech_probability: of the last hop, weighed with what robot and room leave; None
     before the first hop and where the engine does not judge it.
     """
 
@@ -41,7 +41,9 @@ class Stream:
         barge_in: BargeInSettings | None = None,
         learner: Learner | None = None,
         on_barge_in: Callable[[Event], object] | None = None,
+        keep_channels: bool = False,
     ) -> None:
+        self._keep_channels = keep_channels
         self.engine = engine
         self.profile = profile
         self.stepping = stepping
@@ -80,6 +82,7 @@ class Stream:
         self._judge = HumanJudge(stft, calibrated=self.profile is not None)
         self._barge_in = BargeIn(stft.hop / SAMPLE_RATE, self._barge_in_settings)
         self._turns = Turns(stft, self.front.spatial)
+        self._removed: deque[Samples] = deque(maxlen=round(LONGEST_S * SAMPLE_RATE / stft.hop))
         self.samples_in = self.samples_out = self._stepped = 0
         self._state = None if self.engine.lookahead is None else self.engine.initial_state()
         self._clip: list[Frame] = []
@@ -101,6 +104,12 @@ class Stream:
         self._expect(None if mic.ndim == 1 else len(mic))
         self.samples_in += ref.size
         return self._deliver(self._run(mic, ref))
+
+    def robot_removed(self) -> Samples:
+        """(n, microphones) of what the linear stage left of each since the last call, 30 s at most."""
+        removed = list(self._removed)
+        self._removed.clear()
+        return np.concatenate(removed) if removed else np.zeros((0, self._microphones or 1), np.float32)
 
     def flush(self) -> Samples:
         """Return the samples that process still holds back; the stream can then only be reset."""
@@ -190,6 +199,8 @@ class Stream:
     def _step(self, mic: Samples, ref: Samples) -> Samples:
         self._stepped += ref.size
         frame, aligned = self.front.step(mic, ref)
+        if self._keep_channels and self.front.linear:
+            self._removed.append(np.atleast_2d(self.front.linear.error).T)
         if aligned and aligned.realigned:
             self.events.append(
                 Event("realigned", self._stepped, f"reference arrives after {aligned.delay:.1f} samples")

@@ -266,3 +266,25 @@ def test_an_array_learns_and_its_profile_is_adapted_in_all_microphones() -> None
     assert adapted.microphones == 3
     before, after = (np.linalg.norm(one.running_responses()[:, :1000], axis=1) for one in (profile, adapted))
     np.testing.assert_allclose(after / before, 0.5, atol=0.1)
+
+
+@pytest.mark.parametrize("microphones", [1, 3])
+def test_each_microphone_is_given_with_the_robot_removed_where_asked(microphones: int) -> None:
+    mic, ref, _ = talk()
+    heard = mic[:, :microphones] if microphones > 1 else mic[:, 0]
+    ego = EgoFilter(calibration(microphones), "linear", keep_channels=True)
+    parts = []
+    for at in range(0, ref.size, 5000):
+        ego.process(heard[at : at + 5000], ref[at : at + 5000])
+        parts.append(ego.robot_removed())
+    removed = np.concatenate(parts)
+    assert removed.shape == (ref.size // 256 * 256, microphones) and ego.robot_removed().shape == (0, microphones)
+    second = slice(RATE, 2 * RATE)
+    before = np.mean(np.reshape(heard, (ref.size, -1))[second] ** 2, axis=0)
+    assert np.all(np.mean(removed[second] ** 2, axis=0) < 0.02 * before)
+    human = slice(round(3.2 * RATE), round(4.8 * RATE))  # in its place: what is left there is the human
+    alike = [np.corrcoef(one, np.roll(talk()[2], -2 * at)[human])[0, 1] for at, one in enumerate(removed[human].T)]
+    assert min(alike) > 0.9
+    quiet = EgoFilter(calibration(microphones), "linear")
+    quiet.process(heard, ref)
+    assert quiet.robot_removed().size == 0
