@@ -211,6 +211,7 @@ def _doctor(commands: argparse._SubParsersAction) -> None:
     told = "check whether this machine is fit for a live run, and say what to do"
     option = commands.add_parser("doctor", help=told).add_argument
     option("--input", default="mic", metavar="DEVICE", help="microphone (default: %(default)s)")
+    option("--mic-channels", **MIC_CHANNELS)
     told = "input that records what the loudspeaker plays (default: the one that 'run' takes)"
     option("--reference", metavar="DEVICE", help=told)
     _json(option)

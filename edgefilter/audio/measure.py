@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy import signal
 
 from edgefilter.audio.device import input_port, output_port
 from edgefilter.audio.lookup import Device
@@ -81,11 +82,27 @@ def play_and_record(
 
 
 @dataclass(frozen=True)
+class Channel:
+    """What one microphone of an array delivered.
+
+    number: of the device's channel. level_db, floor_db, peak_db: of full scale; the floor is the level that it has nine
+    tenths of the time at least. coherence: with the array's first microphone, mean over 200 Hz to 4 kHz, 0 to 1.
+    """
+
+    number: int
+    level_db: float
+    floor_db: float
+    peak_db: float
+    coherence: float
+
+
+@dataclass(frozen=True)
 class Trial:
     """What one input delivered.
 
     rate: Hz, at which it was opened. pace: samples per second of this machine's clock, by that rate; 1 is right, good to
     some 0.1 %. level_db, peak_db: of full scale, -120 for digital silence. overruns: callbacks that were marked.
+    channels: of an array, each of its microphones.
     """
 
     rate: int
@@ -93,6 +110,7 @@ class Trial:
     level_db: float
     peak_db: float
     overruns: int
+    channels: tuple[Channel, ...] = ()
 
 
 def listen(ports: Sequence[InputPort], seconds: float = 3.0) -> list[Trial]:
@@ -126,4 +144,23 @@ def _trial(port: InputPort, sound: np.ndarray, steps: Sequence[tuple[float, int]
     slope = np.polyfit(times[settled] - times[0], received[settled], 1)[0]
     level = float(decibels(float(np.mean(np.square(sound, dtype=np.float64)))))
     peak = float(decibels(float(np.max(np.square(sound), initial=0.0))))
-    return Trial(port.rate, float(slope / port.rate), level, peak, port.inlet.flags)
+    each = channels(sound, port.wanted) if port.wanted and sound.ndim > 1 else ()
+    return Trial(port.rate, float(slope / port.rate), level, peak, port.inlet.flags, each)
+
+
+def channels(sound: np.ndarray, numbers: Sequence[int]) -> tuple[Channel, ...]:
+    """What each microphone delivered, of sound (n, microphones); numbers: of the device's channels."""
+    hop = SAMPLE_RATE // 50
+    power = np.square(sound[: len(sound) // hop * hop], dtype=np.float64).reshape(-1, hop, len(numbers)).mean(axis=1)
+    hz, alike = signal.coherence(sound[:, :1], sound, SAMPLE_RATE, nperseg=512, axis=0)
+    inside = (hz >= 200.0) & (hz <= 4000.0)
+    return tuple(
+        Channel(
+            number,
+            float(decibels(float(power[:, at].mean()))),
+            float(decibels(float(np.percentile(power[:, at], 10)))),
+            float(decibels(float(np.max(np.square(sound[:, at]), initial=0.0)))),
+            float(np.sqrt(np.nan_to_num(alike[inside, at])).mean()),
+        )
+        for at, number in enumerate(numbers)
+    )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Literal
 
@@ -20,7 +20,7 @@ from edgefilter.learning.background import cores
 from edgefilter.types import SAMPLE_RATE
 
 if TYPE_CHECKING:
-    from edgefilter.audio.measure import Trial
+    from edgefilter.audio.measure import Channel, Trial
     from edgefilter.audio.port import InputPort
 
 PACE = 0.005
@@ -29,6 +29,11 @@ TOO_SOFT_DB = -75.0
 """Level, dB of full scale, under which the gain is too low: the noise of 16 bit, -101 dB, is 26 dB below."""
 CLIPPED_DB = -0.1
 """Peak, dB of full scale, over which a microphone counts as clipped: conversion to 16 kHz may lower a clipped peak a little."""
+APART_DB = 12.0
+"""From the median microphone, as in filter/microphones.py: equal microphones agree within 1 to 2 dB."""
+SAME, UNLIKE = 0.999, 0.2
+"""Coherence of a copy, and that below which a channel is no microphone of the array: the array of a real robot has .7 to
+.99 up to 4 kHz in its own noise, a microphone of another kind beside it .1."""
 
 
 @dataclass(frozen=True)
@@ -43,7 +48,7 @@ class Check:
 
 def main(args: argparse.Namespace) -> int:
     checks = []
-    for check in examine(args.input, args.reference):
+    for check in examine(args.input, args.reference, args.mic_channels):
         checks.append(check)
         print_result(args, [f"{check.state:8} {check.name:13} {check.found}" + (f": {check.do}" if check.do else "")])
     failed = [check.name for check in checks if check.state == "failed"]
@@ -52,14 +57,14 @@ def main(args: argparse.Namespace) -> int:
     return 1 if failed else 0
 
 
-def examine(microphone: str, reference: str | None) -> Iterator[Check]:
-    """All checks, each as soon as it is done."""
+def examine(microphone: str, reference: str | None, channels: Sequence[int] | None = None) -> Iterator[Check]:
+    """All checks, each as soon as it is done; channels: of the microphone's device, where it is an array."""
     yield from _machine()
     yield from _guarded("model", _model)
     yield from _guarded("engine", _engine)
     yield from _guarded("sound server", _server)
     ports: dict[str, InputPort] = {}
-    yield from _guarded("microphone", lambda: _open(ports, "microphone", microphone))
+    yield from _guarded("microphone", lambda: _open(ports, "microphone", microphone, channels))
     yield from _guarded("reference", lambda: _open(ports, "reference", reference))
     if ports:
         yield from _guarded("sound", lambda: _sound(ports))
@@ -123,14 +128,16 @@ def _server() -> Iterator[Check]:
     yield Check("virtual mic", "ok", how)
 
 
-def _open(ports: dict[str, InputPort], role: str, name: str | None) -> Iterator[Check]:
+def _open(
+    ports: dict[str, InputPort], role: str, name: str | None, channels: Sequence[int] | None = None
+) -> Iterator[Check]:
     """Find the input and see at which rate it can be opened."""
     if role == "microphone":
         virtual.refuse_own(str(name))
     from edgefilter.audio.device import input_port, monitor_of
 
     device = name if name is not None else virtual.speaker_monitor() or monitor_of("default")
-    port = input_port(device)
+    port = input_port(device, channels=channels)
     ports[role] = port
     yield Check(role, "ok", ", ".join([f"{port.device}, {port.rate} Hz", *port.notes]))
 
@@ -142,8 +149,28 @@ def _sound(ports: dict[str, InputPort]) -> Iterator[Check]:
         yield _clock(role, trial)
         if role == "microphone":
             yield _level(trial)
+            yield from array_checks(trial.channels)
         if trial.overruns:
             yield Check(f"{role} load", "warning", f"{trial.overruns} overruns in 3 s", "end other programs")
+
+
+def array_checks(channels: Sequence[Channel]) -> Iterator[Check]:
+    """A check for each microphone of an array, beside the others."""
+    level = float(np.median([one.level_db for one in channels])) if channels else 0.0
+    for at, one in enumerate(channels):
+        found = f"{one.level_db:.0f} dB, floor {one.floor_db:.0f} dB, peak {one.peak_db:.0f} dB"
+        found += f", coherence {one.coherence:.2f} with channel {channels[0].number}" if at else ""
+        why = ""
+        if one.peak_db <= -120.0:
+            why = "it is silent"
+        elif abs(one.level_db - level) > APART_DB:
+            why = "it is of another kind, or has another gain"
+        elif at and one.coherence > SAME:
+            why = f"it is a copy of channel {channels[0].number}"
+        elif at and one.coherence < UNLIKE:
+            why = f"it has nothing in common with channel {channels[0].number}: processed, or what is played?"
+        do = f"leave it out of --mic-channels: {why}" if why else ""
+        yield Check(f"channel {one.number}", "warning" if why else "ok", found, do)
 
 
 def _clock(role: str, trial: Trial) -> Check:

@@ -28,7 +28,7 @@ from edgefilter.errors import DeviceError, ModelError
     ],
 )
 def test_what_failed_decides_and_what_to_do_is_said(checks, code, last, monkeypatch, capsys, tmp_path):
-    monkeypatch.setattr(doctor, "examine", lambda microphone, reference: iter(checks))
+    monkeypatch.setattr(doctor, "examine", lambda *_: iter(checks))
     assert main(["doctor", "--json", str(tmp_path / "d.json")]) == code
     said = capsys.readouterr().out.splitlines()
     assert len(said) == 3 and said[-1] == last and said[1].startswith(checks[1].state)
@@ -98,7 +98,7 @@ def test_pace_and_level_are_measured(monkeypatch):
     monkeypatch.setattr(measure, "clock", lambda: now[0])
 
     class Port:
-        rate, opened, closed = 16_000, False, False
+        rate, opened, closed, wanted = 16_000, False, False, None
 
         def __init__(self):
             self.inlet, self.total = Inlet(64_000), 0.0

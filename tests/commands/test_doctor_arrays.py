@@ -1,0 +1,48 @@
+"""What the doctor says of the channels of an array."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from edgefilter.audio.measure import channels
+from edgefilter.commands.doctor import array_checks
+
+
+@pytest.fixture
+def sound() -> np.ndarray:
+    """(n, 3) of one noise that arrives a sample later in each, and each one's own."""
+    rng = np.random.default_rng(0)
+    one = rng.standard_normal(48003)
+    return np.stack([0.01 * (one[3 - at : 48003 - at] + 0.3 * rng.standard_normal(48000)) for at in range(3)], axis=1)
+
+
+def test_an_array_is_listed_with_levels_floor_and_coherence(sound: np.ndarray) -> None:
+    sound[:4000] *= 10.0
+    found = channels(sound, [1, 2, 4])
+    assert [one.number for one in found] == [1, 2, 4] and found[0].coherence == pytest.approx(1.0)
+    assert found[1].floor_db == pytest.approx(-39.6, abs=0.5) and found[1].level_db > found[1].floor_db + 5
+    assert 0.8 < found[1].coherence < 0.98
+    checks = list(array_checks(found))
+    assert [check.state for check in checks] == ["ok"] * 3 and checks[2].name == "channel 4"
+    assert "coherence 0.9" in checks[1].found and "with channel 1" in checks[1].found
+
+
+@pytest.mark.parametrize(
+    ("change", "why"),
+    [
+        (lambda x: 0.0 * x[:, 1], "it is silent"),
+        (lambda x: 10.0 * x[:, 1], "another kind"),
+        (lambda x: x[:, 0], "a copy of channel 1"),
+        (lambda x: 0.01 * np.random.default_rng(9).standard_normal(len(x)), "nothing in common with channel 1"),
+    ],
+)
+def test_a_channel_that_is_no_microphone_of_the_array_is_to_be_left_out(sound: np.ndarray, change, why: str) -> None:
+    sound[:, 1] = change(sound)
+    states = list(array_checks(channels(sound, [1, 2, 4])))
+    assert [check.state for check in states] == ["ok", "warning", "ok"]
+    assert states[1].do.startswith("leave it out of --mic-channels") and why in states[1].do
+
+
+def test_one_microphone_has_no_list() -> None:
+    assert list(array_checks(())) == []
