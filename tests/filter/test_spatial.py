@@ -175,3 +175,23 @@ def test_a_turn_as_a_whole_weighs_all_of_it_the_same() -> None:
     found = spatial.finished()
     heard = np.einsum("cf,cf->f", found.conj(), human)[8:]
     assert np.abs(20 * np.log10(np.abs(heard))).max() < 0.5
+
+
+def test_a_human_who_is_suddenly_elsewhere_loses_little_and_is_found_within_half_a_second() -> None:
+    noise = fan_below()
+    root = np.linalg.cholesky(noise.transpose(2, 0, 1) + 1e-6 * np.eye(3)).transpose(1, 2, 0)
+    lost = []
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        spatial = SpatialFilter(STFT, 3, noise)
+        for place, hops in zip(directions(rng, 2), (188, 31)):
+            human = plane_wave(place)
+            for hop in range(hops):
+                level = 2.0 * rng.gamma(0.5, 1.0, STFT.bins)
+                fan = 0.7 * np.einsum("ijf,jf->if", root, complex_noise(rng, 3, STFT.bins))
+                error = (human * level * complex_noise(rng, STFT.bins) + fan).astype(np.complex64)
+                spatial.learn(error, (level / (level + 1.0)).astype(np.float32), 0.9, True, True)
+                if hops == 31 and hop in (0, 30):
+                    lost.append(-10 * np.log10(np.mean(np.abs(spatial.step(human[None])[0][6:250]) ** 2)))
+    at_once, later = np.mean(np.reshape(lost, (4, 2)), axis=0)
+    assert at_once < 2.0 and later < 1.0
