@@ -26,6 +26,7 @@ def words_wrong(rows: list[dict], system: str, turn: str) -> float:
 
 
 def draw() -> None:
+    """Write the picture."""
     found = results.read(results.RESULTS / "arrays.json")["parts"]["evaluation"]["rows"]
     rows = [dict(zip(found["columns"], values, strict=True)) for values in found["values"]]
     figure, panes = plt.subplots(1, 2, figsize=(8.4, 3.4), sharey=True, layout="constrained")
