@@ -24,6 +24,8 @@ less, and 1 dB less of the human."""
 SPACING_M = 0.05
 """Distance of the microphones by which that field is reckoned: 3 and 8 cm differ by .2 dB in arrays of 4 to 8 cm."""
 SPEED_OF_SOUND = 343.0
+KNOWN_HOPS = 75
+"""Of the fan alone, 1.2 s, after which it counts as known without a calibration."""
 LIKELY, UNLIKELY = 0.5, 0.3
 """Probability of speech above which a hop tells of the human, and below which of the noise."""
 ITERATIONS = 8
@@ -61,7 +63,7 @@ class SpatialFilter:
         self._human_keep = np.float32(1.0 - hop_s / HUMAN_MEMORY_S)
         self._ones = np.eye(microphones, dtype=np.float32)[:, :, None]
         self._prior = np.float32(PRIOR) * diffuse_coherence(stft, microphones)
-        self._calibrated = noise
+        self._known_hops = 0 if noise is None else KNOWN_HOPS
         start = 1e-9 * np.repeat(self._ones, stft.bins, axis=2) if noise is None else noise
         self._fan = start.astype(np.complex64)
         self._robot, self._robot_known = self._fan.copy(), False
@@ -82,8 +84,8 @@ class SpatialFilter:
         return np.einsum("cf,kcf->kf", self.weights.conj(), spectra)
 
     def fan_psd(self) -> Samples | None:
-        """(bins,) expected |spectrum|^2 of the calibrated fan in what step makes; None where it is not calibrated."""
-        return None if self._calibrated is None else _form(self.weights, self._calibrated)
+        """(bins,) expected |spectrum|^2 of the fan in what step makes; None where it was neither calibrated nor heard alone."""
+        return None if self._known_hops < KNOWN_HOPS else _form(self.weights, self._fan)
 
     def independent(self, powers: Samples) -> Samples:
         """(bins,) of what is independent from microphone to microphone, powers (microphones, bins), in what step makes."""
@@ -109,6 +111,7 @@ class SpatialFilter:
                 self._turn += outer
         elif probability < UNLIKELY:
             noise += self._noise_step * (outer - noise)
+            self._known_hops += idle
         self._speaking = heard
         self.weights = self._best(self._human, noise)
 
