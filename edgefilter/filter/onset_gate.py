@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from edgefilter.alignment.delay_line import UNLOCATED, Aligned
+from edgefilter.alignment.utterances import Sustained
 from edgefilter.types import SAMPLE_RATE, Samples
 
 GATE = 0.003
@@ -42,6 +43,7 @@ class OnsetGate:
         self._hop = hop
         self._gain = gain
         self._decay = FORGET**hop
+        self._sustained = Sustained()
         self._loudest = USUAL * hop
         self._shut = self._settling = 0
         self._closed = np.full(hop, GATE, np.float32)
@@ -71,8 +73,9 @@ class OnsetGate:
             float(ref.dot(ref)),
             float(aligned.reference.dot(aligned.reference)),
         )
+        sustained = self._sustained.step(played)
         if played > 1e-3 * self._loudest:
-            self._loudest = max(played, self._decay * self._loudest)
+            self._loudest = max(sustained, self._decay * self._loudest)
         before = self.shut
         if aligned.state not in UNLOCATED:
             self._shut = 0

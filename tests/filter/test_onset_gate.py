@@ -50,6 +50,22 @@ def test_the_robot_is_lowered_until_its_lag_is_found(lags):
     assert np.array_equal(out[~begun, RAMP:], mic[~begun, RAMP:])
 
 
+def test_one_loud_sample_of_the_reference_does_not_keep_the_gate_open_for_ever():
+    rng = np.random.default_rng(1)
+    h = room(rng, 0.3)
+    ref, onsets = spoken(rng, [2.0, 2.0], [1.5, 1.0])
+    mic = hear(ref, [(0, 3000), (onsets[1] - 100, 9000)], h)[0] + fan(rng, ref.size, 0.001)
+    clicked = ref.copy()
+    clicked[onsets[0] + RATE] = 1e6
+    mic, out, _ = gated(mic, ref, h)
+    _, after_click, found = gated(mic.reshape(-1), clicked, h)
+    lowered = np.all(out == np.float32(GATE) * mic, axis=1)
+    second = np.arange(len(found)) * HOP > onsets[1]
+    begun = np.array([aligned.state == "begun" for aligned in found])
+    assert np.count_nonzero(lowered & second & begun) > 2
+    assert np.array_equal(after_click[lowered & begun], out[lowered & begun])
+
+
 @pytest.mark.parametrize("level", [0.0, 0.1])
 def test_a_human_20_db_below_the_robot_beside_a_muted_loudspeaker_is_untouched(level):
     rng = np.random.default_rng(2)
