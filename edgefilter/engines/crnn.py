@@ -30,9 +30,8 @@ LOUDEST = 1.26
 should be is turned down to it."""
 
 SURE = 100.0
-"""Times what is expected of fan and robot, 20 dB: what stands above it in a bin while the robot is silent is somebody's,
-whatever the network makes of it, which takes some of a loud human for the fan. While the robot speaks, much of what nobody
-expects is the robot."""
+"""Error power over the expected powers of noise and residual echo, 20 dB, from which on a bin is the human's while the robot
+is silent, whatever the network says: it takes parts of a loud human for noise. While the robot speaks this is not so sure."""
 
 SHARE_OF_SS = np.float32(0.4)
 """How much of the answer is that of `ss` where the robot is calibrated: it errs elsewhere than the network, and both
@@ -129,7 +128,7 @@ class Crnn:
 
 
 def _with_what_is_sure(human: Spectrum, frame: Frame) -> Spectrum:
-    """The answer, in no bin below the error less SURE times what is expected there (spectral subtraction, Boll 1979)."""
+    """The answer, in no bin below the error less SURE times the expected powers (spectral subtraction, Boll 1979)."""
     human, error = human.copy(), frame.error
     power = error.real**2 + error.imag**2
     least = power - np.float32(SURE) * (frame.noise_psd + frame.residual_psd)

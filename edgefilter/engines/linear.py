@@ -1,4 +1,4 @@
-"""The engine that trusts the linear stage alone: what the canceller could not predict is the answer."""
+"""The engine that is the linear stage alone: the answer is what the canceller could not predict."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What stands before the engine: alignment, linear stage and what is known of the rest, one hop at a time."""
+"""The front end: alignment, echo cancellation, and estimates of noise and residual echo, one hop at a time."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ from edgefilter.profile.data import Profile
 from edgefilter.types import Frame, Samples
 
 RUMBLE_HZ, RUMBLE = 90.0, 0.05
-"""Below this frequency a microphone whose path nobody measured hears rooms, not people; it is lowered by 26 dB."""
+"""Below this frequency a microphone without a calibration picks up the room, not people; it is lowered by 26 dB."""
 
 
 class LinearStage:
-    """What the kind "full" alone has: the tracked delay, the echo path, and what it leaves.
+    """Tracked delay, echo path and residual echo: what only front ends of the kind "full" have.
 
-    learner: told of every hop; what it answers is adopted with the next one. lesson: the one that was adopted in the
-    latest hop.
+    learner: told of every hop; the lesson that it answers is adopted with the next one. lesson: the one that was adopted
+    in the latest hop.
     """
 
     lesson: Lesson | None = None
@@ -68,7 +68,7 @@ class LinearStage:
     def _adopt(
         self, lesson: Lesson, mic: Samples, reference: Samples, located: bool, before: CancellerOutput
     ) -> CancellerOutput:
-        """Fade from what the path of before made of this hop to what the learned one makes of it."""
+        """Fade from this hop's output of the old path (before) to that of the learned path."""
         self.path = EchoPath.resumed(lesson.path, self._past(), mic.size)
         after = self.path.step(mic, reference, located)
         echo = before.echo + self._fade * (after.echo - before.echo)
@@ -80,9 +80,10 @@ class LinearStage:
 
 
 class FrontEnd:
-    """Finds the reference in the microphone and subtracts what is linear of it.
+    """Finds the reference in the microphone and subtracts its linear echo.
 
-    kind "none" passes the microphone, "paper" only delays the reference per utterance, "full" tracks and cancels.
+    What it does depends on the engine's `front`: "none" passes the microphone, "paper" only delays the reference, once per
+    utterance, "full" tracks the delay and cancels the echo.
     aligner: None for "none". linear_stage: None but for "full". gate: None but for "full" with a profile.
     """
 
@@ -109,7 +110,7 @@ class FrontEnd:
 
     @property
     def lesson(self) -> Lesson | None:
-        """What was learned and taken over in the latest hop."""
+        """The lesson that was adopted in the latest hop."""
         return self.linear_stage.lesson if self.linear_stage else None
 
     def step(self, mic: Samples, ref: Samples) -> tuple[Frame, Aligned | None]:
@@ -134,7 +135,7 @@ class FrontEnd:
         return Frame(x, r, e, error, noise, residual, aligned.state == "idle"), aligned
 
     def _added(self, source: SourceChain) -> Samples | None:
-        """What the effects of the path in use bring that no waveform predicts; a lesson can have brought another path."""
+        """(bins,) expected power of the effects that no waveform predicts, for the path in use; a lesson can change it."""
         if source is not self._source:
             self._source = source
             self._unpredictable = Unpredictable(self._stft, source.colours) if source.colours else None

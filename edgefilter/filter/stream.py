@@ -1,4 +1,4 @@
-"""The straight data path: blocks in, alignment, linear stage, engine, overlap-add, finished samples out."""
+"""The whole data path: blocks in, alignment, linear stage, engine, overlap-add, finished samples out."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class Stream:
     the compute time of every hop; what it answers becomes an event. barge_in: when speech counts as begun and ended,
     None for the defaults. learner: of better echo paths, for engines with a linear stage. on_barge_in: called in the
     hop in which speech has begun; what it raises is raised once the block is filtered, whose samples then come with the
-    next call. speech_probability: of the last hop, weighed with what robot and room leave; None
+    next call. speech_probability: of the last hop, smoothed; None
     before the first hop and where the engine does not judge it.
     """
 
@@ -75,7 +75,7 @@ class Stream:
         self.front = FrontEnd(self.engine, self.profile, self.learner)
         self.events: deque[Event] = deque(maxlen=1000)
         self.speech_probability: float | None = None
-        self._judge = HumanJudge(stft, calibrated=self.profile is not None)
+        self._judge = HumanJudge(stft.hop / SAMPLE_RATE, calibrated=self.profile is not None)
         self._barge_in = BargeIn(stft.hop / SAMPLE_RATE, self._barge_in_settings)
         self.samples_in = self.samples_out = self._stepped = 0
         self._state = None if self.engine.lookahead is None else self.engine.initial_state()
@@ -145,7 +145,7 @@ class Stream:
         return out[early:]
 
     def _watched_step(self, mic: Samples, ref: Samples) -> Samples:
-        """One hop; the time that it takes is watched, the learner's is not, which lives in another process where time counts."""
+        """One hop; its compute time is watched, but not the learner's, which is another process in a live run."""
         out = self._timed_step(mic, ref) if self.stepping else self._step(mic, ref)
         if self.learner and self.front.linear_stage:
             self.front.linear_stage.learn()
@@ -175,14 +175,14 @@ class Stream:
             return np.zeros(0, np.float32)
         output, self._state = engine.step(frame, self._state)
         begun = aligned is not None and aligned.state == "begun"
-        self._judge_speech(frame, output.speech_probability, begun)
+        self._judge_speech(output.speech_probability, begun)
         return self._synthesiser.push(output.spectrum)
 
-    def _judge_speech(self, frame: Frame, probability: float | None, begun: bool) -> None:
+    def _judge_speech(self, probability: float | None, begun: bool) -> None:
         self.speech_probability = probability
         if probability is not None:
             suspect = self.front.gate is not None and self.front.gate.suspect
-            self.speech_probability = self._judge.step(frame, probability, suspect, begun)
+            self.speech_probability = self._judge.step(probability, suspect, begun)
         if talk := self._barge_in.note(self.speech_probability):
             self.events.append(Event(talk, self._stepped, f"probability {self.speech_probability or 0.0:.2f}"))
             if self._on_barge_in and talk in INTERRUPTIONS:

@@ -1,4 +1,4 @@
-"""How long hops took, kept in constant memory."""
+"""A histogram of compute times, in constant memory."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class Histogram:
         self.max_ms = max(self.max_ms, ms)
 
     def percentile(self, percent: float) -> float:
-        """Ms under which percent of the times lie; 0 without any."""
+        """The time in ms under which so many percent of the times lie; 0 without any."""
         below = 0
         for at, count in sorted(self._bins.items()):
             below += count

@@ -8,10 +8,12 @@ from edgefilter import enhance
 from edgefilter.alignment.aligner import Aligner
 from edgefilter.alignment.delay_line import Aligned
 from edgefilter.commands.demo import DATA
-from edgefilter.filter.onset_gate import GATE, LONGEST, RAMP, SETTLE, OnsetGate
+from edgefilter.filter.onset_gate import GATE, LONGEST, SETTLE, OnsetGate
 from tests.alignment.scene import RATE, fan, hear, known_path, room, run, utterances
 
 HOP = 256
+RAMP = 64
+"""4 ms."""
 
 
 def spoken(rng: np.random.Generator, seconds: list[float], pauses: list[float]) -> tuple[np.ndarray, list[int]]:
