@@ -5,8 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike
-from scipy import fft, signal
+from scipy import fft
 
 from edgefilter.errors import CalibrationError
 from edgefilter.types import SAMPLE_RATE, Array, Samples
@@ -94,7 +95,7 @@ def sweep_law(reference: Samples) -> SweepLaw:
         raise CalibrationError(
             f"the sweep reference sounds for {(stop - start) / SAMPLE_RATE:.2f} s, expected at least 0.5 s of sweep"
         )
-    phase = np.unwrap(np.angle(signal.hilbert(reference[start:stop])))
+    phase = np.unwrap(np.angle(scipy.signal.hilbert(reference[start:stop])))
     step = (stop - start) // 400
     middle = np.arange(step * 20, stop - start - step * 20, step)
     rate_hz = (phase[middle + step // 2] - phase[middle - step // 2]) / (step // 2 * 2) * SAMPLE_RATE / (2 * np.pi)
@@ -213,6 +214,6 @@ def place_of(pattern: Array, reference: Samples) -> int | None:
     energy = float(np.sum(reference.astype(np.float64) ** 2))
     if reference.size < pattern.size or not energy > 0:
         return None
-    match = signal.correlate(reference.astype(np.float64), pattern, "valid", "fft")
+    match = scipy.signal.correlate(reference.astype(np.float64), pattern, "valid", "fft")
     start = int(np.argmax(np.abs(match)))
     return start if abs(match[start]) > 0.9 * np.sqrt(energy * np.sum(pattern**2)) else None
