@@ -113,6 +113,12 @@ def test_the_gate_shuts_at_once_and_opens_without_a_step():
     assert opening[-1] == 1.0 and np.abs(np.diff(opening)).max() <= 1.01 / RAMP
 
 
+def test_the_gate_is_shut_from_the_first_sample_on():
+    gate, loud = OnsetGate(1, 1.0), np.ones(1, np.float32)
+    gain = gate.step(loud, loud, Aligned(0 * loud, float("nan"), 0.0, 0.0, "begun", False))
+    assert gate.shut and gain is not None and gain[0] == np.float32(GATE)
+
+
 @pytest.mark.slow
 def test_the_robots_onset_in_the_demo_stays_below_the_human():
     """At 8 s its second utterance begins with another lag.
