@@ -129,11 +129,8 @@ def _calibrate(commands: argparse._SubParsersAction) -> None:
     option("--sweep-recording", metavar="R.wav", help="the sweep as the microphone recorded it")
     told = "some seconds of the fan while the robot is silent"
     option("--noise-recording", metavar="FAN.wav", help=told)
-    sound = calibrate.add_mutually_exclusive_group()
     told = "multisines at three levels follow the sweep: measure the robot's distortion too"
-    sound.add_argument("--multisine", action="store_true", help=told)
-    told = "the recordings hold the stepped sine of Li et al. 2024 (0-8001 Hz in steps of 13 Hz)"
-    sound.add_argument("--stepped-sine", action="store_true", help=told)
+    option("--multisine", action="store_true", help=told)
     option("--live", action="store_true", help="play the sweep on --speaker and record it on --input")
     told = "device for --live (default: %(default)s)"
     option("--speaker", default="default", metavar="DEVICE", help=f"output {told}")
