@@ -43,7 +43,7 @@ class Frame(NamedTuple):
 
     mic, reference, echo, error: (bins,) complex64. reference is delayed to where the robot's voice arrives at the
     microphone, echo is the linear stage's estimate of it, error = mic - echo. noise_psd, residual_psd: (bins,) float32,
-    expected |spectrum|^2 of the fan and of what is left of the echo in error. idle: whether nothing of the robot can be
+    expected |spectrum|^2 of the noise and of the residual echo in error. idle: whether nothing of the robot can be
     audible.
     """
 

@@ -10,7 +10,7 @@ from edgefilter.types import Frame, Output
 
 
 class Linear:
-    """Returns the linear stage's error: nothing is masked, so the human is not distorted and the fan stays."""
+    """Returns the linear stage's error: nothing is masked, so the human is not distorted and noise stays."""
 
     name: ClassVar[str] = "linear"
     front: ClassVar[FrontEndKind] = "full"

@@ -105,7 +105,7 @@ class FrontEnd:
         self._analyser = Analyser(stft, channels=4 if self.linear_stage else 2)
         self._low_cut = None if profile or not self.linear_stage else low_cut(stft)
         self._nothing = np.zeros(stft.bins, np.float32)
-        self._fan = profile.noise_bins(stft) if profile else self._nothing
+        self._noise = profile.noise_bins(stft) if profile else self._nothing
         self._silence = np.zeros(stft.bins, np.complex64)
 
     @property
@@ -119,7 +119,7 @@ class FrontEnd:
         if stage is None:
             found = self.aligner.step(mic, ref) if self.aligner else None
             x, r = self._analyser.push(mic, found.reference if found else ref)
-            return Frame(x, r, self._silence, x, self._fan, self._nothing), found
+            return Frame(x, r, self._silence, x, self._noise, self._nothing), found
         aligned = stage.aligner.step(mic, ref)
         linear = stage.step(mic, aligned)
         signals = np.stack((mic, aligned.reference, linear.echo, linear.error))
