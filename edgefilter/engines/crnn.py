@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, ClassVar, TypeAlias
 
 import numpy as np
 
+from edgefilter.dsp import fourier
 from edgefilter.engines.base import FrontEndKind
 from edgefilter.engines.onnx_session import FixedPlaces, expect_answer, expect_slots, find_model, open_model
 from edgefilter.engines.spectral_subtraction import SpectralSubtraction
@@ -98,7 +99,7 @@ class Crnn:
         if gain is None:  # numbers have grown beyond all bounds: begin anew, and until then the linear stage alone
             return Output(frame.error, 0.0), self.initial_state()
         following = tuple(place.copy() for place in places.next_states)
-        return Output(gain * human, min(max(float(places.probability[0]), 0.0), 1.0)), (following, mask)
+        return Output(gain * human, min(max(places.probability.item(), 0.0), 1.0)), (following, mask)
 
     def _run(self, frame: Frame, state: tuple[Samples, ...]) -> Places:
         """The network on one frame; its answers stand in the places."""
@@ -130,10 +131,10 @@ class Crnn:
 def _with_what_is_sure(human: Spectrum, frame: Frame) -> Spectrum:
     """The answer, in no bin below the error less SURE times the expected powers (spectral subtraction, Boll 1979)."""
     human, error = human.copy(), frame.error
-    power = error.real**2 + error.imag**2
+    power = fourier.power(error)
     least = power - np.float32(SURE) * (frame.noise_psd + frame.residual_psd)
     with np.errstate(over="ignore"):  # of a network that has grown beyond all bounds
-        short = least > human.real**2 + human.imag**2
+        short = least > fourier.power(human)
     human[short] = np.sqrt(least[short] / power[short]) * error[short]
     return human
 

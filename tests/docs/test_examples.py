@@ -95,6 +95,7 @@ def test_an_announced_utterance_is_found_and_removed(tmp_path):
     assert db(read(tmp_path / "human.wav")[speaking]) < db(mic[speaking]) - 25  # as above
 
 
+@pytest.mark.slow
 def test_a_calibration_gives_a_profile_with_which_the_missing_effect_is_found_and_added(tmp_path):
     names = ("sweep_ref", "sweep_mic", "fan_only")
     said, _ = run("calibrate.py", *(REVERBERANT / f"{name}.flac" for name in names), tmp_path / "robot.npz")
