@@ -104,7 +104,7 @@ class Event:
     detail: str
 
 
-AlignmentState: TypeAlias = Literal["idle", "announced", "begun", "unfound", "lost", "locked"]
+AlignmentState: TypeAlias = Literal["idle", "announced", "begun", "unfound", "coarse", "lost", "locked"]
 """What is known of the utterance that may be heard now (edgefilter.alignment.delay_line.Aligned)."""
 
 
