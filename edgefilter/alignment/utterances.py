@@ -10,8 +10,8 @@ from edgefilter.types import SAMPLE_RATE, Samples
 PAUSE = SAMPLE_RATE // 5
 """Samples of silence after which the lag may be another one: shorter than any pause between two playbacks, longer than
 a plosive."""
-FLOOR = 1e-8
-"""Mean square under which a reference is silent whatever came before (-80 dB of full scale)."""
+FLOOR = 2.0**-46
+"""Mean square of a 24-bit converter's last bit, -138 dB of full scale: a reference that has less is silent."""
 RANGE = 10**-4.5
 """A hop this far (45 dB) under the loudest of the last seconds is silence."""
 SUSTAINED = 3

@@ -6,6 +6,7 @@ from typing import ClassVar
 
 import numpy as np
 
+from edgefilter.dsp import fourier
 from edgefilter.dsp.stft import StftConfig
 from edgefilter.engines.base import FrontEndKind
 from edgefilter.types import Frame, Output, Samples
@@ -34,7 +35,7 @@ class SpectralSubtraction:
         return np.zeros(self.stft.bins, np.float32)
 
     def step(self, frame: Frame, state: Samples) -> tuple[Output, Samples]:
-        unwanted = frame.noise_psd + frame.residual_psd + 1e-12
+        unwanted = frame.noise_psd + frame.residual_psd + fourier.TINY
         observed = frame.error.real**2 + frame.error.imag**2
         wanted = MEMORY * state + (1.0 - MEMORY) * np.maximum(observed - unwanted, 0.0)
         gain = np.maximum(wanted / (wanted + unwanted), FLOOR)

@@ -40,7 +40,7 @@ class OnsetGate:
         self._gain = gain
         self._decay = 0.1 ** (hop / (FORGET_S * SAMPLE_RATE))
         self._sustained = Sustained()
-        self._loudest = USUAL * hop
+        self._loudest, self._least = 0.0, USUAL * hop
         self._shut = self._settling = 0
         self._closed = np.full(hop, GATE, np.float32)
         self._opening = np.ones(hop, np.float32)
@@ -76,6 +76,7 @@ class OnsetGate:
         if aligned.state not in UNLOCATED:
             self._shut = 0
             if aligned.state == "locked" and explained > 0.1 * self._loudest:
+                self._least = 0.0  # how loud this voice is, is known from now on
                 self._gain += LEARNING * (min(heard / explained, 2 * self._gain) - self._gain)
         elif self._shut or self._alone(heard, explained):
             self._shut += self._hop
@@ -86,4 +87,6 @@ class OnsetGate:
 
     def _alone(self, heard: float, explained: float) -> bool:
         """Whether a hop of this power can only be the robot, and not at the present delay."""
-        return heard > LOUD * self._gain * self._loudest and heard > EXPLAINED * self._gain * explained
+        return (
+            heard > LOUD * self._gain * max(self._loudest, self._least) and heard > EXPLAINED * self._gain * explained
+        )

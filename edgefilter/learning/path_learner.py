@@ -127,7 +127,7 @@ class PathLearner:
     def _audible(self, hop: FilteredHop) -> bool:
         power = float(hop.reference.dot(hop.reference))
         self._peak = max(self._sustained.step(power), FADE * self._peak)
-        audible = hop.located and power > AUDIBLE * self._peak and power > 1e-8
+        audible = hop.located and power > AUDIBLE * self._peak
         self._audible_s += audible * self._hop / SAMPLE_RATE
         return audible
 
