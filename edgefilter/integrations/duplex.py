@@ -15,9 +15,9 @@ from collections import deque
 from collections.abc import Callable
 
 import numpy as np
-import soxr
 
 from edgefilter.audio.raw import FULL_SCALE, to_pcm16
+from edgefilter.dsp.resample import Resampler
 from edgefilter.errors import SignalError, UsageError
 from edgefilter.filter.barge_in import BargeInSettings
 from edgefilter.filter.ego_filter import EgoFilter
@@ -30,20 +30,6 @@ ABSENT_S = 1.0
 PATIENCE_S = 0.12
 """How long the microphone waits for late speech: three times the 40 ms that a Pipecat transport hands over at once."""
 _LOGGER = logging.getLogger(__name__)
-
-
-class Resampler:
-    """One stream from one rate to another, piece by piece; it holds about 40 ms back, at equal rates nothing."""
-
-    def __init__(self, source: int, target: int) -> None:
-        self.rates = (source, target)
-        self._stream = None if source == target else soxr.ResampleStream(source, target, 1, dtype="float32")
-
-    def push(self, samples: Samples, last: bool = False) -> Samples:
-        """Take the next samples (n,) and return the finished ones; after `last` nothing may follow."""
-        if self._stream is None or not (samples.size or last):
-            return samples
-        return self._stream.resample_chunk(samples, last=last)
 
 
 class Duplex:
@@ -156,7 +142,7 @@ class Duplex:
         """Take the microphone's next samples (n,) at rate and return finished samples of the human, at the same rate.
 
         One call may return none or more than came in. All together are as many as came in, later by the filter's
-        latency and, at another rate than 16 kHz, by the resamplers' 40 ms each way.
+        latency and, at another rate than 16 kHz, by the resamplers' 3.5 ms each way.
         """
         with self._hear_lock:
             if self._from_mic.rates[0] != rate:
