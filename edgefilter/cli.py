@@ -200,6 +200,9 @@ def _doctor(commands: argparse._SubParsersAction) -> None:
     option("--input", default="mic", metavar="DEVICE", help="microphone (default: %(default)s)")
     told = "input that records what the loudspeaker plays (default: the one that 'run' takes)"
     option("--reference", metavar="DEVICE", help=told)
+    told = "output that plays chirps, 5 s with a peak of -18 dB of full scale: where the robot plays (default: %(default)s)"
+    option("--speaker", default="default", metavar="DEVICE", help=told)
+    option("--no-chirp", action="store_true", help="play nothing")
     _json(option)
 
 

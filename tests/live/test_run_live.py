@@ -183,16 +183,48 @@ def test_devices_lists_them_and_the_reference(server):
     assert "robot_mic_monitor" in result.stdout and "take its reference from: robot.monitor" in result.stdout
 
 
-def test_the_doctor_finds_the_virtual_machine_fit(server):
-    result = subprocess.run(
-        edgefilter("doctor", "--json", "-"), env=server.environment, cwd=ROOT, capture_output=True, text=True
-    )
+def doctor(server, *words):
+    """What the doctor found, by the name of the check, and its exit code."""
+    command = edgefilter("doctor", "--json", "-", *words)
+    result = subprocess.run(command, env=server.environment, cwd=ROOT, capture_output=True, text=True)
     found = json.loads(result.stdout)
-    checks = {check["name"]: check for check in found["checks"]}
-    assert result.returncode == 0 and found["fit"], result.stdout + result.stderr
+    assert found["fit"] == (result.returncode == 0), result.stderr
+    return {check["name"]: check for check in found["checks"]}, result
+
+
+def test_the_doctor_finds_the_virtual_machine_fit(server):
+    checks, result = doctor(server)
+    assert result.returncode == 0, result.stdout + result.stderr
     assert "as shipped" in checks["model"]["found"] and "robot.monitor" in checks["reference"]["found"]
     assert {"microphone", "mic clock", "ref clock", "sound server"} <= set(checks)
     assert checks["level"]["state"] == "warning" and "unmute" in checks["level"]["do"]  # nobody plays anything
+    assert "peak -18 dB of full scale (--no-chirp" in result.stderr
+    assert "the microphone does not hear them" in checks["set-up"]["found"]
+    quiet, result = doctor(server, "--no-chirp")
+    assert "set-up" not in quiet and "chirps" not in result.stderr
+
+
+@pytest.fixture
+def loopback(server):
+    """The microphone hears what the output plays."""
+    words = ("source=robot.monitor", "sink=robot_mic", "latency_msec=60", "adjust_time=0")
+    subprocess.run(["pactl", "load-module", "module-loopback", *words], env=server.environment, check=True)
+    return server
+
+
+def test_the_doctor_hears_the_robot_by_the_way_that_run_takes(loopback):
+    checks, _ = doctor(loopback)
+    told = re.match(r"the microphone hears the robot after (\d+) ms, \d+ dB above the noise", checks["set-up"]["found"])
+    assert checks["set-up"]["state"] != "failed" and 0 < int(told[1]) < 500, checks["set-up"]
+
+
+def test_the_doctor_says_that_the_microphone_is_the_monitor_and_that_the_reference_is_the_wrong_one(loopback):
+    copied, result = doctor(loopback, "--input", "robot.monitor")
+    assert result.returncode == 1 and "copy of the reference" in copied["set-up"]["found"]
+    words = "module-null-sink sink_name=other rate=16000 channels=1".split()
+    subprocess.run(["pactl", "load-module", *words], env=loopback.environment, check=True)
+    silent, result = doctor(loopback, "--reference", "other.monitor")
+    assert result.returncode == 1 and "'other.monitor' is silent while something is played" in silent["set-up"]["found"]
 
 
 def test_the_example_that_listens_says_when_somebody_spoke_while_it_runs(server, tmp_path):
