@@ -1,6 +1,6 @@
 #!/bin/sh
-# Installs what the tests need from the system: virtual sound devices, PortAudio, a browser, SpeexDSP.
-packages="pulseaudio pulseaudio-utils libasound2-plugins libportaudio2 chromium libspeexdsp1"
+# Installs what the tests need from the system: virtual sound devices, PortAudio, a browser, SpeexDSP, systemd's own checks.
+packages="pulseaudio pulseaudio-utils libasound2-plugins libportaudio2 chromium libspeexdsp1 systemd"
 command -v cc >/dev/null || packages="$packages tcc libc6-dev"  # for the example in C
 missing=""
 for package in $packages; do

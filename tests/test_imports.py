@@ -32,6 +32,8 @@ LEAVES = {
     "pipecat": {"integrations/pipecat.py"},
     "livekit": {"integrations/livekit.py"},
     "wyoming": {"integrations/wyoming.py"},
+    "websockets": {"integrations/serve.py"},
+    "av": {"integrations/opus.py"},
     "torch": set(),
     "export": set(),
 }
