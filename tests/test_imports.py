@@ -34,6 +34,8 @@ LEAVES = {
     "wyoming": {"integrations/wyoming.py"},
     "websockets": {"integrations/serve.py"},
     "av": {"integrations/opus.py"},
+    "sic_framework": {"integrations/sic.py"},
+    "redis": {"integrations/sic.py"},
     "torch": set(),
     "export": set(),
 }

@@ -25,6 +25,8 @@ ORDER = "UDudDUdu"
 filter, and would explain one sweep, does not explain the other."""
 LEAD = round(0.5 * SAMPLE_RATE)
 """Samples of silence before the first chirp, in which the room's noise is measured."""
+QUIET = round(0.1 * SAMPLE_RATE)
+"""Samples of it, the quietest of which count: a stream may begin with a noise of its own."""
 RESPONSE = round(0.25 * SAMPLE_RATE)
 """Samples of the echo path that are fitted."""
 STRETCHED_PPM = 5.0
@@ -103,7 +105,8 @@ def _judge(mic: Samples, ref: Samples) -> Heard:
     offsets, ppm = _drift(heard, references, starts, size)
     omega = 2 * np.pi * np.arange(heard.shape[1]) / size
     heard = heard * np.exp(1j * omega * offsets[:, None])
-    noise = np.mean(np.square(mic[max(at_mic, 0) : max(at_mic + LEAD - FADE, 1)], dtype=np.float64))
+    before = mic[max(at_mic, 0) : max(at_mic, 0) + (LEAD - FADE) // QUIET * QUIET].reshape(-1, QUIET)
+    noise = np.min(np.mean(np.square(before, dtype=np.float64), axis=1))
     band = slice(round(LOWEST_HZ * size / SAMPLE_RATE), round(HIGHEST_HZ * size / SAMPLE_RATE))
     loud = np.array([kind.isupper() for kind in ORDER])
     energy = np.sum(power(heard[:, band]), axis=1) - noise * SLOT * size / 2 * (HIGHEST_HZ - LOWEST_HZ) / (

@@ -162,6 +162,12 @@ def _set_up(ports: dict[str, InputPort], speaker: str) -> Iterator[Check]:
     from edgefilter.audio.live import LiveSource
     from edgefilter.audio.measure import play_through
 
+    if ports["microphone"].device == ports["reference"].device:
+        name = ports["microphone"].device
+        yield Check(
+            "set-up", "failed", f"microphone and reference are both '{name}'", "name the real microphone with --input"
+        )
+        return
     output = virtual.SPEAKER if speaker == "default" and virtual.speaker_monitor() else speaker
     sound = chirps()
     say(

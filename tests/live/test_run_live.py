@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import soundfile
+import soxr
 
 from edgefilter import Profile
 from tests.learning.scenes import Scene
@@ -114,6 +115,26 @@ def test_live_the_loudspeaker_is_learned_by_another_process_and_remembered(serve
     learning = json.loads((tmp_path / "stats.json").read_text())["learning"]
     assert learning["process"] == "running" and learning["heard_s"] > 4 and learning["rounds"] > 0
     assert Profile.load(file).learned
+
+
+def test_live_the_clocks_of_microphone_and_reference_may_differ(server, tmp_path):
+    """The microphone's sound is played faster by 300 ppm than the reference's, as a clock that is slower hears it."""
+    scene = Scene(seconds=12.0)
+    for sink, sound in (("robot", scene.reference), ("robot_mic", soxr.resample(scene.mic, 1e6 + 300, 1e6))):
+        soundfile.write(tmp_path / f"{sink}.wav", sound, 16_000, "PCM_16")
+    command = edgefilter(
+        "run", "--input", "mic", "--output", tmp_path / "live.wav", "--engine", "linear", "--no-learn",
+        "--json", tmp_path / "stats.json", "--record", tmp_path / "heard",
+    )  # fmt: skip
+    run_until_played(server, command, tmp_path, tmp_path / "heard/mic.wav")
+    found = json.loads((tmp_path / "stats.json").read_text())["alignment"]
+    assert 150 < abs(found["ppm"]) < 450, found
+    mic, out = (
+        soundfile.read(path, dtype="float32")[0] for path in (tmp_path / "heard/mic.wav", tmp_path / "live.wav")
+    )
+    first = int(np.argmax(np.abs(mic) > 0.02))
+    late = slice(first + 7 * 16_000, first + 11 * 16_000)
+    assert db(out[late]) < db(mic[late]) - 8
 
 
 def run_for(server, seconds, tmp_path, *more):
@@ -220,7 +241,7 @@ def test_the_doctor_hears_the_robot_by_the_way_that_run_takes(loopback):
 
 def test_the_doctor_says_that_the_microphone_is_the_monitor_and_that_the_reference_is_the_wrong_one(loopback):
     copied, result = doctor(loopback, "--input", "robot.monitor")
-    assert result.returncode == 1 and "copy of the reference" in copied["set-up"]["found"]
+    assert result.returncode == 1 and "microphone and reference are both 'robot.monitor'" in copied["set-up"]["found"]
     words = "module-null-sink sink_name=other rate=16000 channels=1".split()
     subprocess.run(["pactl", "load-module", *words], env=loopback.environment, check=True)
     silent, result = doctor(loopback, "--reference", "other.monitor")
