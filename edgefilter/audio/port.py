@@ -15,11 +15,11 @@ from functools import cache
 from typing import Any
 
 import numpy as np
-import soxr
 
 from edgefilter.audio.lookup import Device
 from edgefilter.audio.pairing import Inlet, Outlet
 from edgefilter.audio.pulse import OPENING, leading_to
+from edgefilter.dsp.resample import Resampler
 from edgefilter.errors import DeviceError
 from edgefilter.types import SAMPLE_RATE, Samples
 
@@ -161,18 +161,13 @@ def _words(error: Exception) -> str:
     return str(error.args[0] if error.args else error).splitlines()[0]
 
 
-def resampler(given: int, wanted: int) -> soxr.ResampleStream | None:
-    """From one rate to another, None where they are the same."""
-    return None if given == wanted else soxr.ResampleStream(given, wanted, 1, dtype="float32")
-
-
 class InputPort(Port):
     """An input whose callback fills an Inlet, read as 16 kHz mono."""
 
     def __init__(self, sounddevice: Any, device: Device, latency_s: float = STREAM_LATENCY_S) -> None:
         super().__init__(sounddevice, device, "input", latency_s)
         self.inlet = Inlet(round(BUFFER_S * self.rate))
-        self._resampler = resampler(self.rate, SAMPLE_RATE)
+        self._resampler = Resampler(self.rate, SAMPLE_RATE)
 
     def open(self) -> None:
         inlet = self.inlet
@@ -183,8 +178,7 @@ class InputPort(Port):
         self.start(callback)
 
     def take(self) -> Samples:
-        samples = self.inlet.take()
-        return samples if self._resampler is None else self._resampler.resample_chunk(samples)
+        return self._resampler.push(self.inlet.take())
 
 
 class OutputPort(Port):
@@ -197,11 +191,11 @@ class OutputPort(Port):
         self.flags = 0
         self.margin = round(margin_s * self.rate)
         self.outlet = Outlet(round((BUFFER_S + queued / SAMPLE_RATE) * self.rate) + self.margin, self.margin)
-        self._resampler = resampler(SAMPLE_RATE, self.rate)
+        self._resampler = Resampler(SAMPLE_RATE, self.rate)
 
     def convert(self, samples: Samples, last: bool = False) -> Samples:
         """Samples (n,) at 16 kHz as samples at the device's rate."""
-        return samples if self._resampler is None else self._resampler.resample_chunk(samples, last=last)
+        return self._resampler.push(samples, last)
 
     def open(self, before: Callable[[], None] = lambda: None) -> None:
         """Start the stream; before is called in each callback, ahead of the delivery, by the audio thread."""

@@ -100,21 +100,26 @@ class BargeIn:
         self.settings = settings = settings or BargeInSettings()
         self._least = max(1, round(settings.min_speech_s / hop_s))
         self._pause = max(1, round(settings.min_silence_s / hop_s))
-        self._sure = self._silent = 0
-        self.speaking = False
+        self._sure = self._silent = self._waited = 0
+        self._begun = self.speaking = False
 
-    def note(self, probability: float | None) -> EventKind | None:
+    def note(self, probability: float | None, wait: int = 0) -> EventKind | None:
         """Take the probability of a hop, None where the engine does not judge it.
+
+        wait: hops for which speech that has begun is not told yet; if it has ended by then it never is.
 
         Returns 'speech_started' or 'speech_stopped' or None.
         """
         probability = probability or 0.0
         self._sure = self._sure + 1 if probability >= self.settings.threshold else 0
         self._silent = self._silent + 1 if probability < self.settings.release else 0
-        if not self.speaking and self._sure >= self._least:
+        if not self._begun and self._sure >= self._least:
+            self._begun, self._waited = True, 0
+        if self._silent >= self._pause:
+            told, self._begun, self.speaking = self.speaking, False, False
+            return "speech_stopped" if told else None
+        self._waited += 1
+        if self._begun and not self.speaking and self._waited > wait:
             self.speaking = True
             return "speech_started"
-        if self.speaking and self._silent >= self._pause:
-            self.speaking = False
-            return "speech_stopped"
         return None

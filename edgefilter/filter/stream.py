@@ -14,6 +14,7 @@ from edgefilter.errors import SignalError
 from edgefilter.filter.barge_in import INTERRUPTIONS, BargeIn, BargeInSettings, HumanJudge
 from edgefilter.filter.front_end import FrontEnd
 from edgefilter.filter.learner import Learner
+from edgefilter.filter.reference_watch import ReferenceWatch
 from edgefilter.filter.stepping import Stepping
 from edgefilter.profile.data import Profile
 from edgefilter.types import SAMPLE_RATE, Event, Frame, Samples, as_samples
@@ -73,6 +74,7 @@ class Stream:
         if self.stepping:
             self.stepping.reset()
         self.front = FrontEnd(self.engine, self.profile, self.learner)
+        self._watch = ReferenceWatch(stft.hop) if self.front.linear_stage else None
         self.events: deque[Event] = deque(maxlen=1000)
         self.speech_probability: float | None = None
         self._judge = HumanJudge(stft.hop / SAMPLE_RATE, calibrated=self.profile is not None)
@@ -167,6 +169,9 @@ class Stream:
             self.events.append(
                 Event("realigned", self._stepped, f"reference arrives after {aligned.delay:.1f} samples")
             )
+        if self._watch and aligned:
+            said = self._watch.step(mic, ref, aligned)
+            self.events.extend(Event(kind, self._stepped, detail) for kind, detail in said)
         if lesson := self.front.lesson:
             self.events.append(Event(lesson.kind, self._stepped, lesson.detail))
         engine = self.engine
@@ -180,10 +185,13 @@ class Stream:
 
     def _judge_speech(self, probability: float | None, begun: bool) -> None:
         self.speech_probability = probability
+        wait = 0
         if probability is not None:
             suspect = self.front.gate is not None and self.front.gate.suspect
+            if self._watch:
+                suspect, wait = suspect or self._watch.suspect, self._watch.wait // self.engine.stft.hop
             self.speech_probability = self._judge.step(probability, suspect, begun)
-        if talk := self._barge_in.note(self.speech_probability):
+        if talk := self._barge_in.note(self.speech_probability, wait):
             self.events.append(Event(talk, self._stepped, f"probability {self.speech_probability or 0.0:.2f}"))
             if self._on_barge_in and talk in INTERRUPTIONS:
                 try:

@@ -23,6 +23,10 @@ NEITHER = {
     "help", "version", "debug", "command", "word", "engine", "budget_ms", "remeasure", "seconds", "quiet", "live",
     "speaker", "level_db", "effect", "force", "prove", "no_learn", "on_barge_in", "barge_in", "setup", "load", "unload",
     "hidden", "multisine",
+    "no_chirp",
+    "host",
+    "port",
+    "streams",
 }  # fmt: skip
 
 

@@ -20,7 +20,7 @@ CALIBRATION = ROOT / "tests/data/demo_calibration"
 REVERBERANT = ROOT / "tests/data/hidden/dev/11"
 """A simulated robot that was carried into a reverberant room after its calibration."""
 RATE = 16000
-ELSEWHERE = {"agent_pipecat.py", "agent_livekit.py", "agent_wyoming.py"}
+ELSEWHERE = {"agent_pipecat.py", "agent_livekit.py", "agent_wyoming.py", "satellite.py"}
 """Whose conversation tests/integrations runs."""
 
 
