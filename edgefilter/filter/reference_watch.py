@@ -90,14 +90,14 @@ class ReferenceWatch:
 
     def _look(self, aligned: Aligned) -> list[tuple[EventKind, str]]:
         """One step of a search, where one is due, and what it leads to."""
-        if aligned.state == "locked" and self.verdict == "unknown":
+        if aligned.state in ("locked", "coarse") and self.verdict == "unknown":
             self.verdict = "fits"
         if not self._onsets.active:
             return []
         self._to_search -= self._hop
         now, stage, self._stage = self._ref.end, self._stage, 0
         if stage == 0:
-            found_by_aligner = aligned.state in ("locked", "lost") and self.verdict == "fits"
+            found_by_aligner = aligned.state in ("locked", "coarse", "lost") and self.verdict == "fits"
             if self._to_search > 0 or found_by_aligner:
                 return []
             self._to_search, self._stage = SEARCH_STRIDE, 1
