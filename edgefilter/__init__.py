@@ -49,6 +49,7 @@ if TYPE_CHECKING:
     from edgefilter.filter.barge_in import BargeInSettings as BargeInSettings
     from edgefilter.filter.ego_filter import EgoFilter as EgoFilter
     from edgefilter.filter.enhance import enhance as enhance
+    from edgefilter.integrations.echo_canceller import EchoCanceller as EchoCanceller
     from edgefilter.learning.background import BackgroundLearner as BackgroundLearner
     from edgefilter.learning.path_learner import PathLearner as PathLearner
     from edgefilter.profile.approximation import LinearApproximation as LinearApproximation
@@ -89,6 +90,7 @@ _HOMES = {
     "filter.barge_in": ("BargeInSettings",),
     "filter.ego_filter": ("EgoFilter",),
     "filter.enhance": ("enhance",),
+    "integrations.echo_canceller": ("EchoCanceller",),
     "learning.background": ("BackgroundLearner",),
     "learning.path_learner": ("PathLearner",),
     "profile.approximation": ("LinearApproximation",),

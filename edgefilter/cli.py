@@ -56,7 +56,19 @@ def build_parser() -> Parser:
     parser.add_argument("--version", action="version", version=f"edgefilter {__version__}")
     parser.add_argument("--debug", action="store_true", help="show a traceback when something fails")
     commands = parser.add_subparsers(dest="command", metavar="COMMAND")
-    for add_command in (_demo, _run, _calibrate, _compare, _diagnose, _add, _remove, _devices, _doctor, _profile):
+    for add_command in (
+        _demo,
+        _run,
+        _calibrate,
+        _compare,
+        _diagnose,
+        _add,
+        _remove,
+        _devices,
+        _doctor,
+        _serve,
+        _profile,
+    ):
         add_command(commands)
     return parser
 
@@ -142,11 +154,8 @@ def _calibrate(commands: argparse._SubParsersAction) -> None:
     told = "some seconds of the fan while the robot is silent"
     option("--noise-recording", metavar="FAN.wav", help=told)
     option("--mic-channels", **MIC_CHANNELS)
-    sound = calibrate.add_mutually_exclusive_group()
     told = "multisines at three levels follow the sweep: measure the robot's distortion too"
-    sound.add_argument("--multisine", action="store_true", help=told)
-    told = "the recordings hold the stepped sine of Li et al. 2024 (0-8001 Hz in steps of 13 Hz)"
-    sound.add_argument("--stepped-sine", action="store_true", help=told)
+    option("--multisine", action="store_true", help=told)
     option("--live", action="store_true", help="play the sweep on --speaker and record it on --input")
     told = "device for --live (default: %(default)s)"
     option("--speaker", default="default", metavar="DEVICE", help=f"output {told}")
@@ -214,7 +223,33 @@ def _doctor(commands: argparse._SubParsersAction) -> None:
     option("--mic-channels", **MIC_CHANNELS)
     told = "input that records what the loudspeaker plays (default: the one that 'run' takes)"
     option("--reference", metavar="DEVICE", help=told)
+    told = "output that plays chirps, 5 s with a peak of -18 dB of full scale: where the robot plays (default: %(default)s)"
+    option("--speaker", default="default", metavar="DEVICE", help=told)
+    option("--no-chirp", action="store_true", help="play nothing")
     _json(option)
+
+
+def _serve(commands: argparse._SubParsersAction) -> None:
+    told = "filter for devices whose microphone is elsewhere, over WebSocket (docs/serve.md)"
+    option = commands.add_parser("serve", help=told).add_argument
+    told = "address to serve (default: %(default)s, which only this machine reaches); any other needs --token"
+    option("--host", default="127.0.0.1", metavar="ADDRESS", help=told)
+    option(
+        "--port",
+        type=whole(0, 65535, "a port, 0 to 65535"),
+        default=10620,
+        metavar="N",
+        help="0: any that is free (default: %(default)s)",
+    )
+    option("--token", metavar="FILE", help="file with the secret that a client has to send")
+    option("--profile", metavar="P.npz", help="calibrated robot, of all clients")
+    option("--engine", **ENGINE)
+    option(
+        "--streams",
+        type=whole(1, 10_000, "a number of streams, 1 or more"),
+        metavar="N",
+        help="clients at a time (default: 4 a core)",
+    )
 
 
 def _profile(commands: argparse._SubParsersAction) -> None:
@@ -262,6 +297,17 @@ def command(text: str) -> str:
 def positive(text: str) -> float:
     """A number above 0."""
     return number(text, 0.0, 1e6, "a number above 0")
+
+
+def whole(least: int, most: int, expected: str) -> Callable[[str], int]:
+    """A function that reads a whole number from least to most, else raises an error that says what was expected."""
+
+    def read(text: str) -> int:
+        if not text.isdecimal() or not least <= int(text) <= most:
+            raise argparse.ArgumentTypeError(f"'{text}' is not {expected}")
+        return int(text)
+
+    return read
 
 
 def level(text: str) -> float:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 import time
 from collections import deque
 from collections.abc import Callable, Iterable
@@ -16,12 +15,8 @@ from edgefilter.audio.recorder import Recorder
 from edgefilter.dsp.frames import decibels
 from edgefilter.errors import EdgefilterError
 from edgefilter.filter.ego_filter import EgoFilter
+from edgefilter.filter.timing import peak_memory_mb
 from edgefilter.types import SAMPLE_RATE, Block, Event, Samples
-
-try:
-    import resource
-except ModuleNotFoundError:  # Windows has no such module
-    resource = None  # type: ignore[assignment]
 
 AUDIBLE_DB = -50.0
 """Level of the reference, dB of full scale, above which the robot counts as talking: of the residual that is shown."""
@@ -94,16 +89,6 @@ class RunReport:
             "events": [{"kind": e.kind, "seconds": e.sample / SAMPLE_RATE, "detail": e.detail} for e in self.events],
             **self.filter,
         }
-
-
-def peak_memory_mb() -> float | None:
-    """The most memory that this process has had, in MiB; None on Windows, whose Python does not tell.
-
-    getrusage counts in kibibytes on Linux and in bytes on macOS (getrusage(2) of each).
-    """
-    if resource is None:
-        return None
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (2**20 if sys.platform == "darwin" else 2**10)
 
 
 def level_db(x: Samples) -> float:

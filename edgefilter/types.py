@@ -45,7 +45,7 @@ class Frame(NamedTuple):
 
     mic, reference, echo, error: (bins,) complex64. reference is delayed to where the robot's voice arrives at the
     microphone, echo is the linear stage's estimate of it, error = mic - echo. noise_psd, residual_psd: (bins,) float32,
-    expected |spectrum|^2 of the fan and of what is left of the echo in error. idle: whether nothing of the robot can be
+    expected |spectrum|^2 of the noise and of the residual echo in error. idle: whether nothing of the robot can be
     audible.
     """
 
@@ -74,12 +74,19 @@ EventKind: TypeAlias = Literal[
     "stepped_up",
     "learned",
     "unlearned",
+    "reference_missing",
+    "reference_late",
+    "robot_unfound",
+    "rate_mismatch",
     "lost",
     "overrun",
     "underrun",
     "device_gone",
     "device_back",
 ]
+
+SET_UP_WRONG: tuple[EventKind, ...] = ("reference_missing", "reference_late", "robot_unfound", "rate_mismatch")
+"""Kinds that say that something was connected wrongly, once each time it begins."""
 
 
 class Turn(NamedTuple):
@@ -103,6 +110,9 @@ class Event:
         What happened. "realigned": the reference was found elsewhere in the microphone. "speech_started",
         "speech_stopped": of the human, from engines that judge it. "overloaded", "stepped_down", "stepped_up": what too
         little or enough time led to. "learned", "unlearned": a better echo path was taken over, or given back.
+        "reference_missing", "reference_late", "robot_unfound": the reference was silent from the start, comes after its
+        echo, or carries sound that is not found in the microphone, though that is louder then. "rate_mismatch": a
+        plugin's or a service's sound comes at another pace than its rate and channels say.
         "lost", "overrun", "underrun": samples that the sound devices of `edgefilter run` lost, callbacks that came too
         late, "device_gone", "device_back": one that stopped, for which silence stands in, and runs again; not from an
         `EgoFilter` itself.
@@ -120,7 +130,7 @@ class Event:
     turn: Turn | None = field(default=None, compare=False, repr=False)
 
 
-AlignmentState: TypeAlias = Literal["idle", "announced", "begun", "unfound", "lost", "locked"]
+AlignmentState: TypeAlias = Literal["idle", "announced", "begun", "unfound", "coarse", "lost", "locked"]
 """What is known of the utterance that may be heard now (edgefilter.alignment.delay_line.Aligned)."""
 
 

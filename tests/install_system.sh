@@ -1,6 +1,8 @@
 #!/bin/sh
-# Installs what the tests need from the system: virtual sound devices, PortAudio, a browser, SpeexDSP.
-packages="pulseaudio pulseaudio-utils libasound2-plugins libportaudio2 chromium libspeexdsp1"
+# Installs what the tests need from the system: virtual sound devices, PortAudio, a browser, SpeexDSP, systemd's own checks, a Redis server,
+# and what PyAudio is built with, which the Social Interaction Cloud asks for.
+packages="pulseaudio pulseaudio-utils libasound2-plugins libportaudio2 chromium libspeexdsp1 systemd"
+packages="$packages pipewire pipewire-pulse wireplumber dbus redis-server portaudio19-dev"
 command -v cc >/dev/null || packages="$packages tcc libc6-dev"  # for the example in C
 missing=""
 for package in $packages; do

@@ -32,6 +32,10 @@ LEAVES = {
     "pipecat": {"integrations/pipecat.py"},
     "livekit": {"integrations/livekit.py"},
     "wyoming": {"integrations/wyoming.py"},
+    "websockets": {"integrations/serve.py"},
+    "av": {"integrations/opus.py"},
+    "sic_framework": {"integrations/sic.py"},
+    "redis": {"integrations/sic.py"},
     "torch": set(),
     "export": set(),
 }

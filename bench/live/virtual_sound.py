@@ -1,4 +1,4 @@
-"""A private PulseAudio server with null sinks or piped sources, seen by PortAudio through ALSA by their and their monitors' names."""
+"""A private PulseAudio or PipeWire with null sinks or piped sources, seen by PortAudio through ALSA by their and their monitors' names."""
 
 from __future__ import annotations
 
@@ -9,19 +9,22 @@ import tempfile
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 SINKS = ("robot", "robot_mic")
+SYSTEMS = ("pulseaudio", "pipewire")
 
 
 @dataclass
 class Server:
-    """environment: for the processes that are to use it. devices: its lines of ALSA's configuration."""
+    """A running server, with all that it consists of, the environment that leads to it, and its lines of ALSA's configuration."""
 
     process: subprocess.Popen
     environment: dict
     devices: str
+    system: str = "pulseaudio"
+    others: list[subprocess.Popen] = field(default_factory=list)
 
     def add(self, other: Server) -> None:
         """Let those who use this server see the other's devices too."""
@@ -29,35 +32,38 @@ class Server:
             configuration.write(other.devices)
 
     def stop(self) -> None:
-        self.process.kill()
-        self.process.wait()
+        for process in (self.process, *self.others):
+            process.kill()
+            process.wait()
 
 
-def start_server(folder: Path, sinks: Sequence[str] = SINKS, sources: Sequence[str] = ()) -> Server:
+def start_server(
+    folder: Path, sinks: Sequence[str] = SINKS, sources: Sequence[str] = (), system: str = "pulseaudio"
+) -> Server:
     """Start a server whose files all lie in folder and wait until its devices are there.
 
     The first sink is the default output, the last one's monitor the default microphone. sources: microphones that hear
     what is written into folder/NAME, 16-bit at 16 kHz, when it is written; a sink has a clock of its own, which stands
     still and jumps where programs come and go.
     """
-    socket = f"unix:{folder}/socket"
+    pulse = system == "pulseaudio"
+    socket = f"unix:{folder}/{'socket' if pulse else 'pulse/native'}"
     environment = {
         **os.environ,
         "HOME": str(folder),
         "XDG_RUNTIME_DIR": str(folder),
-        "PULSE_RUNTIME_PATH": str(folder / "run"),
+        "PULSE_RUNTIME_PATH": str(folder / "pulse"),
+        "DBUS_SESSION_BUS_ADDRESS": f"unix:path={folder}/bus",
     }
-    arguments = ["-n", "--daemonize=no", "--use-pid-file=no", "--exit-idle-time=-1", "--disable-shm=yes"]
-    modules = [f"module-native-protocol-unix socket={folder}/socket auth-anonymous=1"]
-    modules += [f"module-null-sink sink_name={name} rate=16000 format=s16le channels=1" for name in sinks]
+    modules = [f"module-null-sink sink_name={name} rate=16000 format=s16le channels=1" for name in sinks]
     for name in sources:
         (folder / name).unlink(missing_ok=True)
         modules += [f"module-pipe-source source_name={name} file={folder / name} rate=16000 format=s16le channels=1"]
-    for module in modules:
-        arguments += ["-L", module]
-    with open(folder / "log", "w") as log:
-        process = subprocess.Popen(["pulseaudio", *arguments], env=environment, stdout=log, stderr=log)
+    start = _start_pulseaudio if pulse else _start_pipewire
+    process, *others = start(folder, environment, modules)
     environment |= {"PULSE_SERVER": socket, "ALSA_CONFIG_PATH": str(folder / "asound.conf"), "OMP_NUM_THREADS": "1"}
+    if not pulse:
+        _load(modules, environment, process)
     names = {**{name: name for name in (*sinks, *sources)}, **{f"{name}_monitor": f"{name}.monitor" for name in sinks}}
     entries = [f'pcm.{pcm} {{ type pulse\n server "{socket}"\n device "{device}" }}\n' for pcm, device in names.items()]
     usual = [f'pcm.{pcm} {{ type pulse\n server "{socket}" }}\n' for pcm in ("!default", "pulse")]
@@ -68,21 +74,57 @@ def start_server(folder: Path, sinks: Sequence[str] = SINKS, sources: Sequence[s
             if sinks:
                 subprocess.run(["pactl", "set-default-sink", sinks[0]], env=environment, check=True)
                 subprocess.run(["pactl", "set-default-source", f"{sinks[-1]}.monitor"], env=environment, check=True)
-            return Server(process, environment, "".join(entries))
+            return Server(process, environment, "".join(entries), system, others)
         if process.poll() is not None:
             break
         time.sleep(0.1)
-    process.kill()
-    raise RuntimeError("pulseaudio did not start:\n" + (folder / "log").read_text())
+    Server(process, environment, "", system, others).stop()
+    raise RuntimeError(f"{system} did not start:\n" + (folder / "log").read_text())
+
+
+def _start_pulseaudio(folder: Path, environment: dict, modules: Sequence[str]) -> list[subprocess.Popen]:
+    arguments = ["-n", "--daemonize=no", "--use-pid-file=no", "--exit-idle-time=-1", "--disable-shm=yes"]
+    for module in (f"module-native-protocol-unix socket={folder}/socket auth-anonymous=1", *modules):
+        arguments += ["-L", module]
+    with open(folder / "log", "w") as log:
+        return [subprocess.Popen(["pulseaudio", *arguments], env=environment, stdout=log, stderr=log)]
+
+
+def _start_pipewire(folder: Path, environment: dict, modules: Sequence[str]) -> list[subprocess.Popen]:
+    """PipeWire, its session manager, what speaks PulseAudio's protocol, and the bus that they meet on."""
+    (folder / "bus").unlink(missing_ok=True)
+    programs = (["dbus-daemon", "--session", "--nofork", f"--address=unix:path={folder}/bus"], *(
+        [name] for name in ("pipewire", "wireplumber", "pipewire-pulse")
+    ))  # fmt: skip
+    started = []
+    with open(folder / "log", "w") as log:
+        for program, socket in zip(programs, ("bus", "pipewire-0", "", "")):
+            started.append(subprocess.Popen(program, env=environment, stdout=log, stderr=log))
+            for _ in range(100):
+                if not socket or (folder / socket).exists():
+                    break
+                time.sleep(0.05)
+    bus, pipewire, *others = started
+    return [pipewire, *others, bus]
+
+
+def _load(modules: Sequence[str], environment: dict, process: subprocess.Popen) -> None:
+    """Load the modules, again until the session manager takes them."""
+    for module in modules:
+        for _ in range(100):
+            words = ["pactl", "load-module", *module.split()]
+            if process.poll() is not None or not subprocess.run(words, env=environment, capture_output=True).returncode:
+                break
+            time.sleep(0.1)
 
 
 @contextmanager
-def server(sinks: Sequence[str] = SINKS) -> Iterator[Server]:
+def server(sinks: Sequence[str] = SINKS, system: str = "pulseaudio") -> Iterator[Server]:
     """A server of one's own for a while. Its folder is short: socket paths hold 107 bytes."""
     folder = Path(tempfile.mkdtemp(prefix="pulse"))
     started = None
     try:
-        started = start_server(folder, sinks)
+        started = start_server(folder, sinks, system=system)
         yield started
     finally:
         if started:

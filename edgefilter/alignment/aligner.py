@@ -7,6 +7,7 @@ from collections import deque
 import numpy as np
 
 from edgefilter.alignment.announced import AHEAD, Announcements, Playback
+from edgefilter.alignment.coarse_lag import CoarseLag
 from edgefilter.alignment.delay_line import HALF_WIDTH, Aligned, Tape, kernel_table, read_delayed, read_line
 from edgefilter.alignment.delay_tracker import REACH, STRIDE, DelayMeasurement, DelayMeter
 from edgefilter.alignment.drift_filter import DriftFilter
@@ -28,6 +29,8 @@ from edgefilter.types import PRE_ROLL, SAMPLE_RATE, AlignmentCounts, AlignmentSt
 
 SEARCH_STRIDE = 768
 """Samples between two searches of the whole range."""
+COARSE_MARGIN = 400
+"""Samples, 25 ms, by which the reference is read earlier than at a coarse lag, so that a canceller holds all that arrives."""
 LOST_BLOCKS, NEARBY, NEARBY_SEARCHES = 3, 4096, 10
 """Measurements in speech without a credible peak after which all lags are searched again: at first as if the present
 delay had ceased NEARBY samples ago, which finds jumps of up to 200 ms, then as if the utterance had begun half a second
@@ -84,6 +87,9 @@ class Aligner:
         self._witness, self._segments = JumpWitness(), 0
         self._to_search, self._to_measure, self._stage = SEARCH_STRIDE, STRIDE // 2, 0
         self._gain: float | None = None
+        self._by_bands = None if self._calibrated is not None else CoarseLag(self.hop, self._max_lag)
+        self._coarse: int | None = None
+        self._margin = PRE_ROLL
         self._known = self._refuted = self._trusted = self._measured = self._missed = False
         self._confidence, self._lost = 0.0, 0
         self._counts: AlignmentCounts = {
@@ -122,12 +128,24 @@ class Aligner:
         self._measured = False
         if self._known:
             self._drift.advance(self.hop)
+        elif self._by_bands:
+            self._coarse = self._look_coarsely(mic, ref, self._by_bands)
         switched = self._measure() if self._known else False
         switched = self._search() or switched
         return self._deliver(mic, before, switched)
 
+    def _look_coarsely(self, mic: Samples, ref: Samples, by_bands: CoarseLag) -> int | None:
+        """Where the reference is to be read as long as nothing sharper is known: its delay in samples."""
+        by_bands.step(mic, ref)
+        found = by_bands.find()
+        if found is None or (self._coarse is not None and abs(found - COARSE_MARGIN - self._coarse) <= self.hop):
+            return self._coarse
+        return max(found - COARSE_MARGIN, 0)
+
     def history(self, count: int) -> Samples:
         """The last count aligned samples (count,) float32, the present hop included, as if the present delay had always held."""
+        if not self._known and self._coarse is not None:
+            return self._ref.read(self._ref.end - self._coarse - count, self._ref.end - self._coarse)
         if not self._known or self._refuted:
             return np.zeros(count, np.float32)
         return read_line(self._ref, self._ref.end, count, self._read_at, self._drift.slope, chunk=512)
@@ -151,6 +169,8 @@ class Aligner:
         """What `Aligned` says of each."""
         if self._expected is not None:
             return "announced"
+        if not self._known and self._coarse is not None:
+            return "coarse" if self._audible() else "idle"
         begun = [utterance.start for utterance in self._open if not utterance.lost]
         if begun and (self._known or self._audible()):
             return "begun" if self._ref.end <= begun[-1] + self._max_lag + SAMPLE_RATE // 4 else "unfound"
@@ -248,6 +268,8 @@ class Aligner:
         return self._switch(float(AHEAD), 3.0)
 
     def _switch(self, delay: float, deviation: float) -> bool:
+        if not self._known and self._coarse is not None:  # the canceller has learned what arrives behind that lag
+            self._margin = max(round(delay) - self._coarse, PRE_ROLL)
         self._drift.restart(delay, deviation)
         return self._switched()
 
@@ -329,8 +351,8 @@ class Aligner:
 
     def _deliver(self, mic: Samples, before: float, switched: bool) -> Aligned:
         if not self._known:
-            return Aligned(np.zeros(self.hop, np.float32), float("nan"), 0.0, 0.0, self._state(), False)
-        self._read_at = max(self._drift.delay - PRE_ROLL, 0.0)
+            return self._deliver_coarsely(before)
+        self._read_at = max(self._drift.delay - self._margin, 0.0)
         end = self._ref.end
         start = self._read_at - self._drift.slope * self.hop if switched or before != before else before
         if self._read_at < HALF_WIDTH:
@@ -339,15 +361,25 @@ class Aligner:
             start, switched = self._read_at - self._drift.slope * self.hop, True
         reference = read_delayed(self._ref, end, self.hop, start, self._read_at)
         if self._open and not self._refuted and end - self._drift.delay > self._open[0].start:
-            self._refuted = self._cannot_be(mic, reference)
+            self._refuted = self._cannot_be(mic)
         if self._refuted:
             reference = np.zeros(self.hop, np.float32)
         ppm = -1e6 * self._drift.slope
         return Aligned(reference, self._drift.delay, ppm, self._confidence, self._state(), switched)
 
-    def _cannot_be(self, mic: Samples, reference: Samples) -> bool:
+    def _deliver_coarsely(self, before: float) -> Aligned:
+        """The reference at the coarse lag, early enough for all that may arrive; nothing where there is none."""
+        if self._coarse is None:
+            return Aligned(np.zeros(self.hop, np.float32), float("nan"), 0.0, 0.0, self._state(), False)
+        self._read_at = float(self._coarse)
+        reference = self._ref.read(self._ref.end - self._coarse - self.hop, self._ref.end - self._coarse)
+        delay = self._read_at + COARSE_MARGIN
+        return Aligned(reference, delay, 0.0, 0.0, self._state(), self._read_at != before)
+
+    def _cannot_be(self, mic: Samples) -> bool:
         """Whether the microphone holds 10 dB less than the reference at the old delay would bring there."""
         if self._gain is None:
             return False
-        expected = self._gain * float(np.dot(reference[: self.hop - PRE_ROLL], reference[: self.hop - PRE_ROLL]))
-        return float(np.dot(mic, mic)) < 0.1 * expected
+        stop = self._ref.end - round(self._drift.delay)
+        brought = self._ref.read(stop - self.hop, stop)
+        return float(np.dot(mic, mic)) < 0.1 * self._gain * float(np.dot(brought, brought))

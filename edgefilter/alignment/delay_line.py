@@ -25,7 +25,8 @@ class Aligned(NamedTuple):
     reference can be audible. "announced": an utterance that was announced is waited for; it may begin at any time or
     never. "begun": an utterance of the robot has begun and is not found yet; delay is the one of the utterance before,
     or nan. "unfound": it should have been heard by now, whatever its lag, and was not found: the lag is uncertain,
-    delay as in "begun". "lost": it was found, but the last looks did not see it, beside a loud human or after a jump;
+    delay as in "begun". "coarse": no sharp arrival was found yet, the delay is known to within 25 ms; the reference
+    is early by as much. "lost": it was found, but the last looks did not see it, beside a loud human or after a jump;
     delay is carried on, with its drift. "locked": it was found and its delay is followed.
     """
 

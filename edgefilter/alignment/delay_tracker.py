@@ -9,6 +9,7 @@ import numpy as np
 from scipy.ndimage import uniform_filter1d
 
 from edgefilter.alignment.delay_line import Tape
+from edgefilter.alignment.utterances import FLOOR
 from edgefilter.dsp import fourier
 from edgefilter.dsp.fourier import power
 from edgefilter.dsp.lag import climb, turn
@@ -78,7 +79,6 @@ class DelayMeter:
             early[:count] = response[:count]
             self._prior = fourier.rfft(np.roll(early, -pre_roll)).astype(np.complex64)
             self._prior_blocks = 16.0
-        self._known_scale = response is not None
         self._blocks = 0.0  # 0 until the first measurement
         self._cross = np.zeros_like(self._prior)
         self._power: Array = np.zeros_like(self._omega)
@@ -101,7 +101,7 @@ class DelayMeter:
         self._reference(ref, start, slope, wide)
         np.multiply(wide[REACH:-REACH], self._window, out=inner[REACH:-REACH])
         energy, drive = float(x.dot(x)), float(inner.dot(inner))
-        if not (drive > 1e-9 and energy > 1e-12):
+        if not (drive > FLOOR and energy > 0.0):
             return None
         m, a, w = fourier.rfft(self._framed)
         m *= turn(self._omega, centre - whole)
@@ -138,13 +138,13 @@ class DelayMeter:
         explained = 1.0 - float(self._band.dot(left / (power_m + 1e-20))) / self._band_size
         return DelayMeasurement(
             offset=offset,
-            variance=4.0 / (information + 1e-9) + 1e-4,
+            variance=4.0 / (information + 1e-30) + 1e-4,
             strength=strength,
             ratio=ratio,
             dominance=peak / max(near, 1e-20),
             explained=min(max(explained, 0.0), 1.0),
             gain=energy / drive,
-            gain_there=energy / (float(there.dot(there)) + 1e-12),
+            gain_there=energy / (float(there.dot(there)) + 1e-30),
         )
 
     def _reference(self, ref: Tape, start: int, slope: float, out: Samples) -> Samples:
@@ -180,7 +180,7 @@ class DelayMeter:
 
     def _start(self, power_m: Samples, power_a: Samples) -> None:
         smooth = uniform_filter1d(power_a, 65, mode="nearest")
-        scale = 1.0 if self._known_scale else 0.7 * float(np.sqrt(power_m.sum() / power_a.sum()))
+        scale = 0.7 * float(np.sqrt(power_m.sum() / power(self._prior).dot(power_a)))
         self._blocks = self._prior_blocks
         self._power = self._blocks * smooth
         self._total = np.add.reduce(self._power)

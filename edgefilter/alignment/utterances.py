@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from dataclasses import dataclass
 
 from edgefilter.types import SAMPLE_RATE, Samples
@@ -9,10 +10,12 @@ from edgefilter.types import SAMPLE_RATE, Samples
 PAUSE = SAMPLE_RATE // 5
 """Samples of silence after which the lag may be another one: shorter than any pause between two playbacks, longer than
 a plosive."""
-FLOOR = 1e-8
-"""Mean square under which a reference is silent whatever came before (-80 dB of full scale)."""
+FLOOR = 2.0**-46
+"""Mean square of a 24-bit converter's last bit, -138 dB of full scale: a reference that has less is silent."""
 RANGE = 10**-4.5
 """A hop this far (45 dB) under the loudest of the last seconds is silence."""
+SUSTAINED = 3
+"""Hops that a level must last to be the voice's: 48 ms, a short vowel. A click falls into two at most."""
 NEVER = -(10**9)
 """A position long before the first sample."""
 
@@ -33,6 +36,18 @@ class Utterance:
     lost: bool = False
 
 
+class Sustained:
+    """How loud a voice is that may hold clicks: the level that it holds for a short vowel."""
+
+    def __init__(self) -> None:
+        self._powers = deque([0.0] * SUSTAINED, maxlen=SUSTAINED)
+
+    def step(self, power: float) -> float:
+        """Take the power of the next hop; the least of the last SUSTAINED."""
+        self._powers.append(power)
+        return min(self._powers)
+
+
 class OnsetDetector:
     """Cuts the reference into utterances, hop by hop.
 
@@ -41,6 +56,7 @@ class OnsetDetector:
 
     def __init__(self, hop: int) -> None:
         self._hop = hop
+        self._sustained = Sustained()
         self._peak = 0.0
         self._decay = 0.1 ** (hop / (10.0 * SAMPLE_RATE))
         self.now = 0
@@ -54,7 +70,7 @@ class OnsetDetector:
         """
         self.now += self._hop
         power = float(ref.dot(ref)) / self._hop
-        self._peak = max(power, self._peak * self._decay)
+        self._peak = max(self._sustained.step(power), self._peak * self._decay)
         self.active = power > max(FLOOR, RANGE * self._peak)
         if not self.active:
             return None

@@ -11,8 +11,9 @@ from scipy import signal
 from edgefilter.audio.device import input_port, output_port
 from edgefilter.audio.lookup import Device
 from edgefilter.audio.port import START_S, STREAM_LATENCY_S, InputPort, clock, pause
+from edgefilter.audio.protocols import Source
 from edgefilter.dsp.frames import decibels
-from edgefilter.types import SAMPLE_RATE, Samples
+from edgefilter.types import SAMPLE_RATE, Block, Samples
 
 
 @dataclass(frozen=True)
@@ -79,6 +80,34 @@ def play_and_record(
     lost = {"samples lost": mic.inlet.lost, "overruns": mic.inlet.flags, "underruns": speaker.flags}
     holes = ", ".join(f"{count} {what}" for what, count in lost.items() if count)
     return Recording(np.concatenate(parts)[first : first + wanted], holes)
+
+
+def play_through(
+    output: str | int | Device | None, source: Source, samples: Samples, tail_s: float = 2.0
+) -> tuple[Samples, Samples, int]:
+    """Play samples (n,) at 16 kHz while a live source runs, until tail_s after them.
+
+    Returns its microphone and reference (m,), and the samples that were lost. Raises DeviceError where a device cannot be opened or stops.
+    """
+    speaker = output_port(output, samples.size)
+    speaker.outlet.ring.write(speaker.convert(samples.astype(np.float32), last=True))
+    speaker.outlet.draining.set()
+    wanted = samples.size + round(tail_s * SAMPLE_RATE)
+    blocks: list[Block] = []
+    try:
+        with source:
+            for block in source:
+                if not blocks:
+                    speaker.open()
+                blocks.append(block)
+                speaker.check_alive(speaker.outlet.calls, START_S)
+                wanted -= block.ref.size
+                if wanted <= 0:
+                    break
+    finally:
+        speaker.close()
+    mic, ref = (np.concatenate([getattr(block, name) for block in blocks]) for name in ("mic", "ref"))
+    return mic, ref, sum(block.lost for block in blocks)
 
 
 @dataclass(frozen=True)

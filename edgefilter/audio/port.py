@@ -15,11 +15,11 @@ from functools import cache
 from typing import Any
 
 import numpy as np
-import soxr
 
 from edgefilter.audio.lookup import Device
 from edgefilter.audio.pairing import Inlet, Outlet
 from edgefilter.audio.pulse import OPENING, leading_to
+from edgefilter.dsp.resample import Resampler
 from edgefilter.errors import DeviceError, UsageError
 from edgefilter.types import SAMPLE_RATE, Samples
 
@@ -181,11 +181,6 @@ def _words(error: Exception) -> str:
     return str(error.args[0] if error.args else error).splitlines()[0]
 
 
-def resampler(given: int, wanted: int, channels: int = 1) -> soxr.ResampleStream | None:
-    """From one rate to another, None where they are the same."""
-    return None if given == wanted else soxr.ResampleStream(given, wanted, channels, dtype="float32")
-
-
 class InputPort(Port):
     """An input whose callback fills an Inlet, read as 16 kHz mono, or as the channels that are wanted."""
 
@@ -199,7 +194,7 @@ class InputPort(Port):
         super().__init__(sounddevice, device, "input", latency_s, wanted)
         several = None if wanted is None or len(wanted) == 1 else len(wanted)
         self.inlet = Inlet(round(BUFFER_S * self.rate), several)
-        self._resampler = resampler(self.rate, SAMPLE_RATE, several or 1)
+        self._resampler = Resampler(self.rate, SAMPLE_RATE, several or 1)
 
     def open(self) -> None:
         inlet, wanted = self.inlet, self.wanted
@@ -215,8 +210,7 @@ class InputPort(Port):
         self.start(callback)
 
     def take(self) -> Samples:
-        samples = self.inlet.take()
-        return samples if self._resampler is None else self._resampler.resample_chunk(samples)
+        return self._resampler.push(self.inlet.take())
 
 
 class OutputPort(Port):
@@ -229,11 +223,11 @@ class OutputPort(Port):
         self.flags = 0
         self.margin = round(margin_s * self.rate)
         self.outlet = Outlet(round((BUFFER_S + queued / SAMPLE_RATE) * self.rate) + self.margin, self.margin)
-        self._resampler = resampler(SAMPLE_RATE, self.rate)
+        self._resampler = Resampler(SAMPLE_RATE, self.rate)
 
     def convert(self, samples: Samples, last: bool = False) -> Samples:
         """Samples (n,) at 16 kHz as samples at the device's rate."""
-        return samples if self._resampler is None else self._resampler.resample_chunk(samples, last=last)
+        return self._resampler.push(samples, last)
 
     def open(self, before: Callable[[], None] = lambda: None) -> None:
         """Start the stream; before is called in each callback, ahead of the delivery, by the audio thread."""

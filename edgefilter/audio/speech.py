@@ -9,7 +9,8 @@ import numpy as np
 
 from edgefilter.audio.lookup import Device
 from edgefilter.audio.pairing import Inlet
-from edgefilter.audio.port import BUFFER_S, Port, resampler
+from edgefilter.audio.port import BUFFER_S, Port
+from edgefilter.dsp.resample import Resampler
 from edgefilter.dsp.ring import Ring
 from edgefilter.types import SAMPLE_RATE, Samples
 
@@ -29,7 +30,7 @@ class SpokenReference(Port):
         self.inlet = Inlet(round(BUFFER_S * self.rate))
         self._ring = Ring(round(BUFFER_S * self.rate))
         self._pieces = self._converted(speech)
-        self._back = resampler(self.rate, SAMPLE_RATE)
+        self._back = Resampler(self.rate, SAMPLE_RATE)
         self._gain = self._wanted = 1.0
         self._step = 1.0 / (FADE_S * self.rate)
 
@@ -51,8 +52,7 @@ class SpokenReference(Port):
         """What was played since the last call, (n,) at 16 kHz; sees to it that there is more to play."""
         while len(self._ring) < self._ring.capacity // 2 and (piece := next(self._pieces, None)) is not None:
             self._ring.write(piece)
-        played = self.inlet.take()
-        return played if self._back is None else self._back.resample_chunk(played)
+        return self._back.push(self.inlet.take())
 
     def _next(self, count: int) -> Samples:
         """The next count samples for the device; called by the audio thread."""
@@ -68,10 +68,8 @@ class SpokenReference(Port):
 
     def _converted(self, speech: Iterator[Samples]) -> Iterator[Samples]:
         """The speech at the device's rate, in pieces of a quarter of the ring, which is half full when one is added."""
-        there, size = resampler(SAMPLE_RATE, self.rate), round(BUFFER_S * SAMPLE_RATE) // 4
+        there, size = Resampler(SAMPLE_RATE, self.rate), round(BUFFER_S * SAMPLE_RATE) // 4
         for chunk in speech:
             for at in range(0, chunk.size, size):
-                piece = chunk[at : at + size]
-                yield piece if there is None else there.resample_chunk(piece)
-        if there is not None:
-            yield there.resample_chunk(np.zeros(0, np.float32), last=True)
+                yield there.push(chunk[at : at + size])
+        yield there.push(np.zeros(0, np.float32), last=True)

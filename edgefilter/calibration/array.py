@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy import signal
+from scipy import fft
 
 from edgefilter.calibration.sweep import Deconvolution, find_direct
-from edgefilter.dsp.psd import GRID_FFT
+from edgefilter.dsp.frames import frames
+from edgefilter.dsp.psd import GRID_FFT, hann
 from edgefilter.errors import CalibrationError
 from edgefilter.types import SAMPLE_RATE, Samples
 
@@ -21,8 +22,10 @@ EQUAL = 1e-3
 
 def cross_density(noises: Samples) -> Samples:
     """(601, microphones, microphones, 2) float32 of noises (microphones, n), as ArrayCalibration.noise."""
-    x = noises.astype(np.float64)
-    found = signal.csd(x[None], x[:, None], SAMPLE_RATE, nperseg=GRID_FFT, detrend=False)[1].transpose(2, 0, 1)
+    window = hann(GRID_FFT)
+    spectra = fft.rfft([frames(one, GRID_FFT, GRID_FFT // 2) * window for one in noises.astype(np.float64)])
+    found = np.einsum("itk,jtk->kij", spectra, spectra.conj()) / (spectra.shape[1] * SAMPLE_RATE * np.sum(window**2))
+    found[1:-1] *= 2.0
     return np.stack((found.real, found.imag), axis=-1).astype(np.float32)
 
 

@@ -7,8 +7,14 @@ from scipy import signal
 
 from edgefilter.calibration.array import cross_density, doubts, refuse_silent
 from edgefilter.calibration.checks import check_found, check_lengths, collect_warnings
-from edgefilter.calibration.stepped_sine import SteppedLaw, response_from_stepped_sine, response_from_sweep, stepped_law
-from edgefilter.calibration.sweep import Deconvolution, deconvolve, find_direct, harmonic_distortion, sweep_law
+from edgefilter.calibration.sweep import (
+    Deconvolution,
+    deconvolve,
+    find_direct,
+    harmonic_distortion,
+    response_from_sweep,
+    sweep_law,
+)
 from edgefilter.dsp.frames import all_block_power
 from edgefilter.dsp.psd import third_octave_bands
 from edgefilter.echo.model import EchoModel
@@ -26,7 +32,6 @@ def calibrate(
     sweep_recording: Samples,
     noise_recording: Samples,
     *,
-    stepped_sine: bool = False,
     created: str = "",
     source: str = "",
 ) -> Profile:
@@ -42,8 +47,6 @@ def calibrate(
         microphones that share a clock.
     noise_recording : ndarray of float, shape (k,) or (k, channels)
         The fan alone, some seconds, in the same microphones.
-    stepped_sine : bool
-        Reference and recording are those of the paper's `generate_stepped_sine` instead.
     created, source : str
         Texts for the profile: when, and from what.
 
@@ -75,7 +78,7 @@ def calibrate(
     """
     reference, recordings, noises = checked(sweep_reference, sweep_recording, noise_recording)
     recording, noise = first(recordings), first(noises)
-    law = stepped_law(reference) if stepped_sine else sweep_law(reference)
+    law = sweep_law(reference)
     check_lengths(law, recording, noise)
     noise_psd = fan_psd(noise)
     result = deconvolve(reference, recording, noise_psd, GRID_HZ, MIN_TAPS)
@@ -84,11 +87,6 @@ def calibrate(
     path = impulse_response(result, direct)
     bands = third_octave_bands()
     snr = band_snr_db(result, path, bands)
-    if isinstance(law, SteppedLaw):
-        response, distortion = response_from_stepped_sine(law, reference, recording, noise, direct, DISTORTION_ORDERS)
-    else:
-        response = response_from_sweep(reference, recording, noise, direct)
-        distortion = harmonic_distortion(result, direct, law, DISTORTION_ORDERS)
     warnings = collect_warnings(law, reference, recording, noise, result, path, direct, bands, snr)
     array = None
     if recordings.ndim > 1:
@@ -105,11 +103,11 @@ def calibrate(
     return Profile(
         echo=EchoModel(path),
         delay=float(direct),
-        response=response,
+        response=response_from_sweep(reference, recording, noise, direct),
         noise_psd=noise_psd,
         band_hz=bands,
         band_snr_db=snr,
-        distortion_db=distortion,
+        distortion_db=harmonic_distortion(result, direct, law, DISTORTION_ORDERS),
         warnings=tuple(warnings),
         created=created,
         source=source,

@@ -6,7 +6,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import signal
 
-from edgefilter.calibration.stepped_sine import SteppedLaw
 from edgefilter.calibration.sweep import EARLIEST_DIRECT, LATEST_DIRECT, Deconvolution, SweepLaw, deconvolve
 from edgefilter.dsp.fourier import power
 from edgefilter.dsp.frames import block_power, blocks
@@ -14,7 +13,6 @@ from edgefilter.dsp.psd import frequencies, hann
 from edgefilter.errors import CalibrationError
 from edgefilter.types import PRE_ROLL, SAMPLE_RATE, Array, Samples
 
-Law = SweepLaw | SteppedLaw
 LOW_SNR_DB = 10.0
 """Below it a band's path is wrong by more than 3 dB at times."""
 SPEECH_HZ = (110.0, 7200.0)
@@ -22,7 +20,7 @@ SPEECH_HZ = (110.0, 7200.0)
 calibration."""
 
 
-def check_lengths(law: Law, recording: Samples, noise: Samples) -> None:
+def check_lengths(law: SweepLaw, recording: Samples, noise: Samples) -> None:
     """Raise CalibrationError for recordings that are too short or silent."""
     if noise.size < SAMPLE_RATE // 2:
         raise CalibrationError(
@@ -54,7 +52,7 @@ def check_found(result: Deconvolution, direct: int) -> None:
 
 
 def collect_warnings(
-    law: Law,
+    law: SweepLaw,
     reference: Samples,
     recording: Samples,
     noise: Samples,
@@ -77,7 +75,7 @@ def collect_warnings(
     return [text for text in found if text]
 
 
-def clipping(law: Law, recording: Samples, direct: int) -> str | None:
+def clipping(law: SweepLaw, recording: Samples, direct: int) -> str | None:
     """Samples at full scale, or flat tops below it, and the frequencies that the sweep had there."""
     clipped = clipped_samples(recording)
     if clipped.size < 8:
@@ -104,7 +102,7 @@ def clipped_samples(recording: Samples) -> NDArray[np.intp]:
     return np.flatnonzero(flat | (size >= 0.9999))
 
 
-def short_recording(law: Law, recording: Samples, direct: int) -> str | None:
+def short_recording(law: SweepLaw, recording: Samples, direct: int) -> str | None:
     """A recording that ends before the sweep has passed and rung out."""
     missing = law.stop + direct + SAMPLE_RATE // 5 - recording.size
     if missing <= 0:
@@ -143,15 +141,13 @@ def quiet(recording: Samples) -> str | None:
 
 
 def disturbed(
-    law: Law, reference: Samples, recording: Samples, noise: Samples, result: Deconvolution, direct: int
+    law: SweepLaw, reference: Samples, recording: Samples, noise: Samples, result: Deconvolution, direct: int
 ) -> str | None:
     """Something else in a sweep's recording: quarter seconds in which neither the path nor its harmonics explain the sound.
 
     What remains has to exceed the fan by 10 dB, a sixth of the explained power there, and the loudest quarter second
     less 25 dB.
     """
-    if not isinstance(law, SweepLaw):
-        return None
     early = int(law.lead(5.5))
     shift = direct - early
     predicted = signal.oaconvolve(reference.astype(np.float64), result.cut(shift, early + 6400))

@@ -5,16 +5,22 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike
-from scipy import fft, signal
+import scipy
+from numpy.typing import ArrayLike, NDArray
+from scipy import fft
 
+from edgefilter.dsp.frames import frames
+from edgefilter.dsp.psd import hann
 from edgefilter.errors import CalibrationError
+from edgefilter.profile.data import GRID_FFT
 from edgefilter.types import SAMPLE_RATE, Array, Samples
 
 LOW_HZ, HIGH_HZ = 40.0, 7990.0
 """Of the generated sweep: from below what a robot's loudspeaker plays to the end of the band."""
 EARLIEST_DIRECT, LATEST_DIRECT = -2000, int(1.6 * SAMPLE_RATE)
 """Samples by which the direct sound may come after it was played, on the recording's counter."""
+HOP = 160
+"""Samples between the frames of the paper's spectrograms."""
 TWELFTH = 2 ** (1 / 12) - 1
 """Half the width of a sixth of an octave around a frequency, over that frequency."""
 DRIFT_REACH = 400
@@ -94,7 +100,7 @@ def sweep_law(reference: Samples) -> SweepLaw:
         raise CalibrationError(
             f"the sweep reference sounds for {(stop - start) / SAMPLE_RATE:.2f} s, expected at least 0.5 s of sweep"
         )
-    phase = np.unwrap(np.angle(signal.hilbert(reference[start:stop])))
+    phase = np.unwrap(np.angle(scipy.signal.hilbert(reference[start:stop])))
     step = (stop - start) // 400
     middle = np.arange(step * 20, stop - start - step * 20, step)
     rate_hz = (phase[middle + step // 2] - phase[middle - step // 2]) / (step // 2 * 2) * SAMPLE_RATE / (2 * np.pi)
@@ -110,10 +116,7 @@ def sweep_law(reference: Samples) -> SweepLaw:
 
 
 def _not_a_sweep(why: str) -> str:
-    return (
-        f"the sweep reference is not an exponential sweep: {why}; play the one that edgefilter generates, "
-        "and give a stepped sine as the stepped recording, not as the sweep"
-    )
+    return f"the sweep reference is not an exponential sweep: {why}; play the one that edgefilter generates"
 
 
 @dataclass(frozen=True, eq=False)
@@ -208,11 +211,36 @@ def harmonic_distortion(result: Deconvolution, direct: int, law: SweepLaw, order
     return np.array(levels)
 
 
+def response_from_sweep(reference: Samples, recording: Samples, noise: Samples, delay: int) -> Samples:
+    """The paper's |H_m(f) H_s(f)| (601,) float32, from any sweep: sum_t (|X_m(t,f)| - |N(f)|) / sum_t |A(t,f)|, eq. (3)-(5).
+
+    Hann frames of 1200 samples, hop 160; |N(f)| is the fan's mean magnitude in them. For each bin, those frames t in
+    which the reference, delayed by delay samples, is within 20 dB of its maximum in that bin. Negative sums are set to 0,
+    and so are bins in which the sweep has no energy (60 dB below its strongest bin). Reverberation that outlasts the frame
+    is not part of this reading.
+    """
+    played = np.abs(_frames(np.pad(reference, (max(delay, 0), 0))[max(-delay, 0) :]))
+    heard = np.abs(_frames(recording))
+    count = min(len(played), len(heard))
+    played, heard = played[:count], heard[:count]
+    strongest = played.max(axis=0)
+    use = played > 0.1 * strongest
+    excess = np.sum(use * (heard - np.abs(_frames(noise)).mean(axis=0)), axis=0)
+    response = np.maximum(excess, 0.0) / np.maximum(np.sum(use * played, axis=0), 1e-9)
+    return np.where(strongest > 1e-3 * strongest.max(), response, 0.0).astype(np.float32)
+
+
+def _frames(samples: Samples) -> NDArray[np.complex128]:
+    """(frames, 601) complex spectra."""
+    padded = np.pad(samples, (0, max(0, GRID_FFT - samples.size)))
+    return np.fft.rfft(frames(padded, GRID_FFT, HOP) * hann(GRID_FFT), axis=1)
+
+
 def place_of(pattern: Array, reference: Samples) -> int | None:
     """First sample of pattern (m,) in reference (n,), at any level; None where it is not there."""
     energy = float(np.sum(reference.astype(np.float64) ** 2))
     if reference.size < pattern.size or not energy > 0:
         return None
-    match = signal.correlate(reference.astype(np.float64), pattern, "valid", "fft")
+    match = scipy.signal.correlate(reference.astype(np.float64), pattern, "valid", "fft")
     start = int(np.argmax(np.abs(match)))
     return start if abs(match[start]) > 0.9 * np.sqrt(energy * np.sum(pattern**2)) else None

@@ -16,7 +16,6 @@ from edgefilter.audio.files import FileSink
 from edgefilter.calibration.calibrate import calibrate
 from edgefilter.calibration.from_multisine import calibrate_multisine
 from edgefilter.calibration.multisine import SWEEP_PART, generate_multisine
-from edgefilter.calibration.stepped_sine import generate_stepped_sine
 from edgefilter.calibration.sweep import generate_sweep
 from edgefilter.commands.display import countdown, print_result, say
 from edgefilter.commands.profile import summary
@@ -62,7 +61,7 @@ def _calibrate(args: argparse.Namespace, source: str, sweep: Samples, recording:
     if args.multisine:
         profile = calibrate_multisine(sweep, recording, noise, created=today, source=source)
     else:
-        profile = calibrate(sweep, recording, noise, stepped_sine=args.stepped_sine, created=today, source=source)
+        profile = calibrate(sweep, recording, noise, created=today, source=source)
     profile.save(args.output)
     print_result(args, [describe(profile), f"written to {args.output}"], summary(profile))
     return 0
@@ -83,7 +82,7 @@ def _sound(args: argparse.Namespace) -> Samples:
     """What is played, the sweep at the level that was asked for."""
     amplitude = 10 ** (args.level_db / 20)
     if not args.multisine:
-        return generate_stepped_sine(amplitude) if args.stepped_sine else generate_sweep(amplitude=amplitude)
+        return generate_sweep(amplitude=amplitude)
     if amplitude > SWEEP_PART:
         raise UsageError(
             f"--level-db is {args.level_db:g}, expected at most {20 * np.log10(SWEEP_PART):.0f} with --multisine:"
@@ -95,7 +94,7 @@ def _sound(args: argparse.Namespace) -> Samples:
 def _record(args: argparse.Namespace, folder: Path) -> tuple[Samples, Samples, Samples]:
     """The sound that is played, what the microphone picks up of it, and the noise alone; each is in the folder at once."""
     sound = _sound(args)
-    name = "a sweep and multisines" if args.multisine else "a stepped sine" if args.stepped_sine else "a sweep"
+    name = "a sweep and multisines" if args.multisine else "a sweep"
     silence = np.zeros(NOISE_S * SAMPLE_RATE, np.float32)
     _keep(folder, "sweep_reference", sound)
     noise = _take(args, folder, "noise_recording", silence, f"now quiet: {NOISE_S} s of the robot's noise alone")

@@ -18,7 +18,7 @@ from types import ModuleType
 from typing import TYPE_CHECKING
 
 from edgefilter.errors import AudioFileError, UsageError
-from edgefilter.types import SAMPLE_RATE, Event, Stats
+from edgefilter.types import SAMPLE_RATE, SET_UP_WRONG, Event, Stats
 
 if TYPE_CHECKING:
     from edgefilter.audio.protocols import Source
@@ -29,7 +29,10 @@ STATUS_PERIOD_S = 0.2
 """Time between two updates of a line on a terminal: as often as figures can be read."""
 LINE_PERIOD_S = 5.0
 """Time between two lines of progress where standard error is a file or a pipe."""
-TOLD = ("stepped_down", "stepped_up", "overloaded", "learned", "unlearned", "device_gone", "device_back")
+TOLD = (
+    *("stepped_down", "stepped_up", "overloaded", "learned", "unlearned", "device_gone", "device_back"),
+    *SET_UP_WRONG,
+)
 """Kinds of events that are shown in every run; those of the human's speech only in a live one."""
 STATUS_LEGEND = """\
 The status line of a live run:

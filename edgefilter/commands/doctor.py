@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from edgefilter.audio import pulse, virtual
-from edgefilter.commands.display import print_result
+from edgefilter.calibration.chirps import LEVEL_DB, SOFTER_DB, Heard, chirps, judge
+from edgefilter.commands.display import print_result, say
 from edgefilter.engines import create
 from edgefilter.errors import EdgefilterError
 from edgefilter.filter.budget import DEFAULT_MS
@@ -35,6 +36,14 @@ SAME, UNLIKE = 0.999, 0.2
 """Coherence of a copy, and that below which a channel is no microphone of the array: the array of a real robot has .7 to
 .99 up to 4 kHz in its own noise, a microphone of another kind beside it .1."""
 
+MOST_LAG_S = 1.5
+"""Lag that the filter searches."""
+LINEAR_DB = 15.0
+"""Echo over what a linear filter leaves from which on the set-up is good: small loudspeakers at moderate volume have 20
+to 27 dB."""
+CHANGED_DB = 1.5
+"""Difference of two gains, dB, that neither noise nor a small loudspeaker explains: they differ by some tenths."""
+
 
 @dataclass(frozen=True)
 class Check:
@@ -48,7 +57,7 @@ class Check:
 
 def main(args: argparse.Namespace) -> int:
     checks = []
-    for check in examine(args.input, args.reference, args.mic_channels):
+    for check in examine(args.input, args.reference, None if args.no_chirp else args.speaker, args.mic_channels):
         checks.append(check)
         print_result(args, [f"{check.state:8} {check.name:13} {check.found}" + (f": {check.do}" if check.do else "")])
     failed = [check.name for check in checks if check.state == "failed"]
@@ -57,8 +66,13 @@ def main(args: argparse.Namespace) -> int:
     return 1 if failed else 0
 
 
-def examine(microphone: str, reference: str | None, channels: Sequence[int] | None = None) -> Iterator[Check]:
-    """All checks, each as soon as it is done; channels: of the microphone's device, where it is an array."""
+def examine(
+    microphone: str, reference: str | None, speaker: str | None, channels: Sequence[int] | None = None
+) -> Iterator[Check]:
+    """All checks, each as soon as it is done. speaker: what plays the chirps; None for none of them.
+
+    channels: of the microphone's device, where it is an array.
+    """
     yield from _machine()
     yield from _guarded("model", _model)
     yield from _guarded("engine", _engine)
@@ -68,6 +82,8 @@ def examine(microphone: str, reference: str | None, channels: Sequence[int] | No
     yield from _guarded("reference", lambda: _open(ports, "reference", reference))
     if ports:
         yield from _guarded("sound", lambda: _sound(ports))
+    if speaker is not None and len(ports) == 2:
+        yield from _guarded("set-up", lambda: _set_up(ports, speaker))
 
 
 def _guarded(name: str, look: Callable[[], Iterator[Check]]) -> Iterator[Check]:
@@ -171,6 +187,98 @@ def array_checks(channels: Sequence[Channel]) -> Iterator[Check]:
             why = f"it has nothing in common with channel {channels[0].number}: processed, or what is played?"
         do = f"leave it out of --mic-channels: {why}" if why else ""
         yield Check(f"channel {one.number}", "warning" if why else "ok", found, do)
+
+
+def _set_up(ports: dict[str, InputPort], speaker: str) -> Iterator[Check]:
+    """Play chirps and hear them as a run would."""
+    from edgefilter.audio.live import LiveSource
+    from edgefilter.audio.measure import play_through
+
+    if ports["microphone"].device == ports["reference"].device:
+        name = ports["microphone"].device
+        yield Check(
+            "set-up", "failed", f"microphone and reference are both '{name}'", "name the real microphone with --input"
+        )
+        return
+    output = virtual.SPEAKER if speaker == "default" and virtual.speaker_monitor() else speaker
+    sound = chirps()
+    say(
+        f"chirps for {sound.size / SAMPLE_RATE:.0f} s on output '{output}', peak {LEVEL_DB:.0f} dB of full scale"
+        " (--no-chirp: without)"
+    )
+    source = LiveSource(ports["microphone"].device, ports["reference"].device)
+    mic, ref, lost = play_through(output, source, sound)
+    yield from judge_set_up(judge(mic, ref), output, str(ports["reference"].device))
+    if lost:
+        yield Check("set-up load", "warning", f"{lost} samples lost while the chirps were heard", "end other programs")
+
+
+def judge_set_up(heard: Heard, output: str, reference: str) -> Iterator[Check]:
+    """What the chirps have shown: whether the reference is right, then what the microphone makes of the robot."""
+    if not heard.in_reference:
+        found = f"reference '{reference}' is silent while something is played on output '{output}'"
+        yield Check(
+            "set-up", "failed", found, f"take the monitor of '{output}' (--reference), or play elsewhere (--speaker)"
+        )
+        return
+    if not heard.in_microphone:
+        found = f"the reference has the chirps, the microphone does not hear them (its peak: {heard.peak_db:.0f} dB)"
+        yield Check("set-up", "warning", found, "unmute loudspeaker and microphone, turn them up, or name others")
+        return
+    assert heard.lag_s is not None and heard.above_noise_db is not None and heard.ppm is not None
+    assert heard.linear_db is not None and heard.softer_db is not None
+    if heard.same:
+        found = "the microphone is a copy of the reference, not a microphone"
+        yield Check("set-up", "failed", found, "name the real one with --input ('edgefilter devices')")
+        return
+    late_ms = -1000 * heard.lag_s
+    if late_ms > 1.0:
+        found = f"the reference comes {late_ms:.0f} ms after the microphone has heard it"
+        yield Check("set-up", "failed", found, "take a reference with less buffering, such as the output's own monitor")
+        return
+    if heard.lag_s > MOST_LAG_S:
+        found = (
+            f"the microphone hears the robot after {heard.lag_s:.2f} s, more than the {MOST_LAG_S} s that are searched"
+        )
+        yield Check("set-up", "failed", found, "use a loudspeaker or a microphone with less delay")
+        return
+    good = heard.linear_db >= LINEAR_DB or heard.linear_db > heard.above_noise_db - 6.0
+    found = (
+        f"the microphone hears the robot after {1000 * heard.lag_s:.0f} ms, {heard.above_noise_db:.0f} dB above the noise,"
+        f" clocks {abs(heard.ppm):.0f} ppm apart; linear echo {heard.linear_db:.0f} dB"
+    )
+    if good:
+        yield Check("set-up", "ok", f"{found}: good")
+    else:
+        yield Check(
+            "set-up",
+            "warning",
+            found,
+            "turn the loudspeaker down, and end other programs: distortion and unsteady clocks are not predicted",
+        )
+    yield from _processed(heard)
+
+
+def _processed(heard: Heard) -> Iterator[Check]:
+    """What changes the sound on its way: a converter at its end, gain control, noise suppression."""
+    assert heard.softer_db is not None
+    if heard.peak_db > CLIPPED_DB:
+        yield Check(
+            "set-up", "warning", "the chirps are clipped at the microphone", "lower its gain or the loudspeaker"
+        )
+    elif heard.softer_db > CHANGED_DB:
+        found = f"chirps {SOFTER_DB:.0f} dB softer come {heard.softer_db:.1f} dB louder than they should"
+        yield Check(
+            "set-up",
+            "warning",
+            found,
+            "switch gain control off in device or sound server, or turn down the loudspeaker",
+        )
+    elif heard.softer_db < -CHANGED_DB:
+        found = f"chirps {SOFTER_DB:.0f} dB softer come {-heard.softer_db:.1f} dB softer than they should"
+        yield Check(
+            "set-up", "warning", found, "switch noise suppression and echo cancelling off in device or sound server"
+        )
 
 
 def _clock(role: str, trial: Trial) -> Check:

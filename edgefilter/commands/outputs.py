@@ -24,6 +24,7 @@ READ = (
     "sweep_reference",
     "sweep_recording",
     "noise_recording",
+    "token",
 )
 """Options that may name a file to read; a name that is no file, such as a device's, cannot be overwritten."""
 WRITTEN = ("output", "excitation", "json", "report", "save_profile", "learn", "apply", "plot", "log_json")

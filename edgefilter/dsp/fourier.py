@@ -19,6 +19,8 @@ try:
 except (ImportError, AttributeError, TypeError):
     _kernel = None
 
+TINY = np.float32(1e-30)
+"""Power to add to a divisor that may be zero, far below that of any sound."""
 _SINGLE, _COMPLEX = np.dtype(np.float32), np.dtype(np.complex64)
 
 

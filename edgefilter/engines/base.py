@@ -1,4 +1,4 @@
-"""The protocol that every engine follows: spectra in, the human's spectrum out, state passed and not hidden."""
+"""The protocol of every engine: spectra in, the human's spectrum out, state passed in and out."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The engine that changes nothing: it proves the stream and is the unfiltered row of every table."""
+"""The engine that changes nothing: it tests the stream, and is the unfiltered row of every table."""
 
 from __future__ import annotations
 

@@ -6,10 +6,11 @@ import math
 import threading
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, ClassVar, TypeAlias
+from typing import TYPE_CHECKING, ClassVar, NamedTuple, TypeAlias
 
 import numpy as np
 
+from edgefilter.dsp import fourier
 from edgefilter.engines.base import FrontEndKind
 from edgefilter.engines.onnx_session import FixedPlaces, expect_answer, expect_slots, find_model, open_model
 from edgefilter.engines.spectral_subtraction import SpectralSubtraction
@@ -30,9 +31,8 @@ LOUDEST = 1.26
 should be is turned down to it."""
 
 SURE = 100.0
-"""Times what is expected of fan and robot, 20 dB: what stands above it in a bin while the robot is silent is somebody's,
-whatever the network makes of it, which takes some of a loud human for the fan. While the robot speaks, much of what nobody
-expects is the robot."""
+"""Error power over the expected powers of noise and residual echo, 20 dB, from which on a bin is the human's while the robot
+is silent, whatever the network says: it takes parts of a loud human for noise. While the robot speaks this is not so sure."""
 
 SHARE_OF_SS = np.float32(0.4)
 """How much of the answer is that of `ss` where the robot is calibrated: it errs elsewhere than the network, and both
@@ -40,8 +40,32 @@ together err less than either; half would be as good, and leave more of a robot 
 calibration, or with a path that the filter has learned, it saves no word and costs a real loudspeaker's humans up to
 2 dB."""
 
-CrnnState: TypeAlias = tuple[tuple[Samples, ...], Samples]
-"""The network's state tensors, all zeros at the start, and the state of `ss`."""
+LOUD = 1.3e3, 6.3e3
+"""Power of the loudest frame of microphone and reference, 31 and 38 dB, in the recordings that the network was trained on
+(medians): the loudest so far is brought there."""
+FADE = 0.1 ** (0.016 / 60.0)
+"""Fall of the loudest power from frame to frame, 10 dB in a minute."""
+LASTING = 3
+"""Frames that must be as loud, so that no click counts."""
+
+
+class Levels(NamedTuple):
+    """How loud a stream's microphone and reference have been, as powers of frames.
+
+    loudest: (2,). latest: (LASTING, 2).
+    """
+
+    loudest: Samples
+    latest: Samples
+
+    def after(self, frame: Frame) -> Levels:
+        """These, and one more frame."""
+        latest = np.vstack((self.latest[1:], (_power(frame.mic), _power(frame.reference))))
+        return Levels(np.maximum(latest.min(axis=0), FADE * self.loudest), latest)
+
+
+CrnnState: TypeAlias = tuple[tuple[Samples, ...], Samples, Levels]
+"""The network's state tensors, all zeros at the start, the state of `ss`, and the levels."""
 
 
 class Crnn:
@@ -84,12 +108,14 @@ class Crnn:
 
     def initial_state(self) -> CrnnState:
         tensors = tuple(np.zeros(shape, np.float32) for _, shape in self.model.states)
-        return tensors, self._ss.initial_state()
+        return tensors, self._ss.initial_state(), Levels(*(np.zeros(shape, np.float32) for shape in (2, (LASTING, 2))))
 
     def step(self, frame: Frame, state: CrnnState) -> tuple[Output, CrnnState]:
-        tensors, mask = state
-        places = self._run(frame, tensors)
-        human = places.spectrum
+        tensors, mask, levels = state
+        levels = levels.after(frame)
+        levelled, scale = at_training_level(frame, levels.loudest)
+        places = self._run(levelled, tensors)
+        human: Spectrum = places.spectrum * np.float32(1.0 / scale)
         if self._ss_helps:
             masked, mask = self._ss.step(frame, mask)
             human = (1 - SHARE_OF_SS) * human + SHARE_OF_SS * masked.spectrum
@@ -99,7 +125,7 @@ class Crnn:
         if gain is None:  # numbers have grown beyond all bounds: begin anew, and until then the linear stage alone
             return Output(frame.error, 0.0), self.initial_state()
         following = tuple(place.copy() for place in places.next_states)
-        return Output(gain * human, min(max(float(places.probability[0]), 0.0), 1.0)), (following, mask)
+        return Output(gain * human, min(max(places.probability.item(), 0.0), 1.0)), (following, mask, levels)
 
     def _run(self, frame: Frame, state: tuple[Samples, ...]) -> Places:
         """The network on one frame; its answers stand in the places."""
@@ -128,13 +154,25 @@ class Crnn:
         return self._own.places
 
 
+def at_training_level(frame: Frame, loudest: Samples) -> tuple[Frame, np.float32]:
+    """The frame with microphone and reference as loud as in training, and the factor on the microphone.
+
+    loudest: (2,) power of the loudest frames of each so far; a channel that was silent stays as it is.
+    """
+    mic, reference = (
+        np.float32(math.sqrt(usual / most) if most else 1.0) for usual, most in zip(LOUD, loudest, strict=True)
+    )
+    spectra = mic * frame.mic, reference * frame.reference, mic * frame.echo, mic * frame.error
+    return Frame(*spectra, mic**2 * frame.noise_psd, mic**2 * frame.residual_psd, frame.idle), mic
+
+
 def _with_what_is_sure(human: Spectrum, frame: Frame) -> Spectrum:
-    """The answer, in no bin below the error less SURE times what is expected there (spectral subtraction, Boll 1979)."""
+    """The answer, in no bin below the error less SURE times the expected powers (spectral subtraction, Boll 1979)."""
     human, error = human.copy(), frame.error
-    power = error.real**2 + error.imag**2
+    power = fourier.power(error)
     least = power - np.float32(SURE) * (frame.noise_psd + frame.residual_psd)
     with np.errstate(over="ignore"):  # of a network that has grown beyond all bounds
-        short = least > human.real**2 + human.imag**2
+        short = least > fourier.power(human)
     human[short] = np.sqrt(least[short] / power[short]) * error[short]
     return human
 

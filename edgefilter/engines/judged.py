@@ -1,4 +1,4 @@
-"""One engine's answer with another one's judgement of whether a human speaks: barge-in for engines that have none."""
+"""An engine's spectrum with the network's probability of speech: barge-in for engines that give none."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from edgefilter.errors import UsageError
 from edgefilter.types import Frame, Output
 
 JUDGE = "crnn"
-"""The engine whose network judges speech for others."""
+"""The engine whose network says for others whether a human speaks."""
 
 
 class Judged:

@@ -1,4 +1,4 @@
-"""Several engines as one: the best first, and a crossfade instead of a click when another one takes over."""
+"""Several engines as one, with a crossfade when another one takes over."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ engine with a memory starts empty and has to settle while it is still quiet)."""
 
 @dataclass(frozen=True, slots=True)
 class Voice:
-    """One engine at work: which, its state, and its answers that wait because another engine looks further ahead."""
+    """One engine at work: its index, its state, and its answers that wait where another engine looks further ahead."""
 
     rung: int
     state: EngineState
@@ -34,7 +34,7 @@ class Voice:
 
 @dataclass(frozen=True, slots=True)
 class LadderState:
-    """Who is heard, who is coming in (if anybody), how many frames that one still needs to fill up, and its weight, 0 to 1."""
+    """The engine whose output is heard, the one that fades in (if any), the frames until it can, and its weight, 0 to 1."""
 
     heard: Voice
     coming: Voice | None = None

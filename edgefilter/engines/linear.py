@@ -1,4 +1,4 @@
-"""The engine that trusts the linear stage alone: what the canceller could not predict is the answer."""
+"""The engine that is the linear stage alone: the answer is what the canceller could not predict."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from edgefilter.types import Frame, Output
 
 
 class Linear:
-    """Returns the linear stage's error: nothing is masked, so the human is not distorted and the fan stays."""
+    """Returns the linear stage's error: nothing is masked, so the human is not distorted and noise stays."""
 
     name: ClassVar[str] = "linear"
     front: ClassVar[FrontEndKind] = "full"

@@ -1,4 +1,4 @@
-"""'ss': a gentle Wiener mask on the linear stage's error, from the power spectra of what is known to be left in it."""
+"""'ss': a gentle Wiener mask on the linear stage's error, from the expected powers of noise and residual echo."""
 
 from __future__ import annotations
 
@@ -6,22 +6,22 @@ from typing import ClassVar
 
 import numpy as np
 
+from edgefilter.dsp import fourier
 from edgefilter.dsp.stft import StftConfig
 from edgefilter.engines.base import FrontEndKind
 from edgefilter.types import Frame, Output, Samples
 
 FLOOR = 0.18
-"""Least gain, -15 dB: it keeps the fan natural and loses no words."""
+"""Least gain, -15 dB: it keeps the noise natural and loses no words."""
 MEMORY = 0.8
 """Decision-directed smoothing of the a-priori signal-to-noise ratio; the usual 0.98 smears onsets and costs words."""
 
 
 class SpectralSubtraction:
-    """Wiener gain xi / (1 + xi) with the decision-directed a-priori ratio xi of Ephraim & Malah (1984), eq.
+    """Wiener gain xi / (1 + xi) with the decision-directed a-priori signal-to-noise ratio xi of Ephraim & Malah (1984).
 
-    (51); xi = wanted / unwanted.
-
-    The state is the power of the previous answer (bins,).
+    Eq. (51) there; xi is the human's power over that of noise and residual echo. The state is the power of the previous
+    answer (bins,).
     """
 
     name: ClassVar[str] = "ss"
@@ -35,7 +35,7 @@ class SpectralSubtraction:
         return np.zeros(self.stft.bins, np.float32)
 
     def step(self, frame: Frame, state: Samples) -> tuple[Output, Samples]:
-        unwanted = frame.noise_psd + frame.residual_psd + 1e-12
+        unwanted = frame.noise_psd + frame.residual_psd + fourier.TINY
         observed = frame.error.real**2 + frame.error.imag**2
         wanted = MEMORY * state + (1.0 - MEMORY) * np.maximum(observed - unwanted, 0.0)
         gain = np.maximum(wanted / (wanted + unwanted), FLOOR)

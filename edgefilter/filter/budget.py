@@ -1,4 +1,4 @@
-"""Which engine this machine can bear: the real path measured at the real pace on two cores, remembered, and the choice with its reason."""
+"""Which engine is fast enough on this machine: measured at the real pace on two cores, remembered, chosen with a reason."""
 
 from __future__ import annotations
 
@@ -152,7 +152,10 @@ def measure(engine: Engine | ClipEngine, profile: Profile | None = None, paced: 
 def pace(
     stream: Stream, hops: Iterator[tuple[Samples, Samples]], count: int, period_s: float | None = None
 ) -> list[float]:
-    """Ms that each of count hops took, one begun every period_s (None: the hop's own length); fewer where it falls LATE_S behind."""
+    """Compute time in ms of each of count hops, one begun every period_s (None: the hop's own length).
+
+    Fewer where it falls LATE_S behind.
+    """
     period_s = stream.engine.stft.hop / SAMPLE_RATE if period_s is None else period_s
     took: list[float] = []
     began = time.perf_counter()

@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from edgefilter.alignment.utterances import FLOOR, Sustained
 from edgefilter.dsp import fourier
 from edgefilter.dsp.membrane import DISPLACEMENT_TAPS, displacement_taps
 from edgefilter.errors import SignalError
@@ -17,12 +18,20 @@ from edgefilter.types import SAMPLE_RATE, LinearStageStats, Samples, Spectrum
 
 PRIOR_VARIANCE = 0.05
 """Variance of a calibrated path relative to its own power: the robot moved and the room is another."""
+UNKNOWN_VARIANCE = 0.1
+"""Variance of an unknown path, summed over its partitions, relative to the power of microphone over reference in each bin
+when it is first adapted: on 63 simulated and real recordings without a profile .1 and .3 leave the same within 0.2 dB, .03
+learns too slowly by up to 10 dB, 1 and more forgets within hops."""
+UNKNOWN_HOPS = 32
+"""Hops of robot, half a second, for which an unknown path stays as uncertain as what is heard makes it: what the first
+hop says, before the echo has arrived or while the voice only begins, may be wrong by any factor."""
 DECAY_RT60_S = 1.0
 """Decay of the covariance prior behind the direct sound, seconds for 60 dB."""
 LATE_VARIANCE = 0.04
 """Power of the unknown room's decay at the direct sound, relative to the calibrated path."""
-DISPLACEMENT_SCALE = 0.1
-"""Displacement, in the reference's full scale, at which the products have the size of the reference."""
+DISPLACEMENT_SCALE = 0.7
+"""Displacement, relative to the rms that the reference has held at its loudest so far, at which the products have the size of the
+reference."""
 PRODUCT_PARTITIONS = 2
 PRODUCT_VARIANCE = 2e-3
 """Variance of the paths of the nonlinear products relative to the linear path."""
@@ -33,8 +42,6 @@ REOPEN = 0.3
 heard: kept whole, a variance that grows with it let it grow without end."""
 AGED_ROWS = 4
 """Partitions whose process noise is worked out anew in a hop, in turn: a path's power changes slowly."""
-SILENCE = 1e-10
-"""Mean reference power, full scale^2, below which the path is neither adapted nor allowed to age."""
 LOUDEST = 1e12
 """Mean square of a predicted echo, full scale 1, at which the filter has diverged and begins anew."""
 
@@ -58,7 +65,8 @@ class CancellerOutput(NamedTuple):
 class CancellerState:
     """What a canceller knows of the path: weights (rows, bins), their covariance and the noise (bins,) that it measured.
 
-    Of an array each has a leading axis of microphones. volume_gain: by how much the volume was turned since the path was measured.
+    Of an array each has a leading axis of microphones. volume_gain: by how much the volume was turned since the path was
+    measured. loudest: mean square that the reference has held at its loudest, by which the nonlinear products are scaled.
     """
 
     taps: int
@@ -67,6 +75,7 @@ class CancellerState:
     covariance: Samples
     noise: Samples
     volume_gain: float
+    loudest: float
 
 
 class Canceller:
@@ -135,6 +144,7 @@ class Canceller:
             np.zeros((2 * rows, bins), np.float32),
         )
         self._moving = np.zeros(DISPLACEMENT_TAPS - 1, np.float32)
+        self._loudest, self._sustained = FLOOR, Sustained()
         self._diverged = 0
         self._begin()
         self._slide(to=rows)
@@ -147,16 +157,19 @@ class Canceller:
         self._blocks = np.zeros((*lead, rows, 2 * hop), np.float32)
         self._blocks[..., : self.partitions, :hop] = self._initial.reshape(*lead, self.partitions, hop)
         fourier.rfft(self._blocks, out=self._weights)
-        of_products = (*lead, rows - self.partitions, bins)
-        product_variance = np.broadcast_to(PRODUCT_VARIANCE * self._path_power()[..., None, :], of_products)
-        self._covariance = np.concatenate((self._prior(), product_variance), axis=-2).astype(np.float32)
+        self._covariance = np.zeros(shape, np.float32)
+        self._product_variance = np.zeros((*lead, bins), np.float32)
+        self._unknown = 0 if self._warm else UNKNOWN_HOPS
+        if self._warm:
+            known = np.float32(PRIOR_VARIANCE) * fourier.power(self._weights[..., : self.partitions, :])
+            self._expect(self._path_power(), np.float32(LATE_VARIANCE) * self._decay(), known)
         self._ageing, self._aged = (1.0 - self.adaptation.transition**2) * fourier.power(self._weights), 0
         self._noise = np.zeros((*lead, bins), np.float32)
         self._work = np.zeros(shape, np.complex64)
         self._expected = np.zeros(shape, np.float32)
         self._padded = np.zeros((*lead, 2 * hop), np.float32)
         self._hops = self._active = 0
-        self.volume = Volume(hop, self._warm)
+        self.volume = Volume(hop, self._warm, scaled=False)
         self.volume.gain = self._initial_gain
         self._limiter = EchoLimiter(hop)
 
@@ -172,16 +185,16 @@ class Canceller:
             self.reset()  # of the reference's past, too: it may be what made it diverge
             self._diverged = diverged
             path_echo = echo = self._predict()
-        np.multiply(self._covariance, self._powers, out=self._expected)
-        misalignment = np.add.reduce(self._expected, axis=-2)
         if self.behind:
             echo = self.behind(echo, mic)
-        turned = self.volume.follow(self._first_of(mic), self._first_of(echo))
+        turned = self.volume.follow(self._first_of(mic), self._first_of(echo)) if located else 1.0
         if turned != 1.0:
             self._weights *= np.float32(turned)
-            self._covariance *= np.float32(turned**2)
+            for variance in (self._covariance, self._ageing, self._product_variance):
+                variance *= np.float32(turned**2)
             self._covariance += VOLUME_REOPENS * fourier.power(self._weights)
             echo = echo * np.float32(turned)
+            self._limiter.turn(turned)
         excessive = self._limiter.measure(self._first_of(mic), self._first_of(echo))
         self._padded[..., self.hop :] = innovation = mic - echo
         error_spectrum = fourier.rfft(self._padded)
@@ -189,17 +202,22 @@ class Canceller:
         self._noise *= memory
         self._noise += (1.0 - memory) * fourier.power(error_spectrum)
         self._hops += 1
-        heard = located and reference.dot(reference) > SILENCE * self.hop
+        heard = located and reference.dot(reference) > FLOOR * self.hop
+        if heard and self._unknown:
+            self._unknown -= 1
+            self._expect_what_is_heard()
+        np.multiply(self._covariance, self._powers, out=self._expected)
+        misalignment = 0.5 * np.add.reduce(self._expected, axis=-2)
         if heard and not self.volume.suspected:
             self._active += 1
             if self._limiter.changed:
                 np.maximum(self._covariance, REOPEN * fourier.power(self._weights), out=self._covariance)
                 self._weights *= self._limiter.heard
-            self._adapt(error_spectrum, 1.0 / (0.5 * misalignment + self._noise + 1e-12))
+            self._adapt(error_spectrum, 1.0 / (misalignment + self._noise + fourier.TINY))
             if self.adaptation.posterior and not excessive:
                 echo = echo + (self._predict() - path_echo) if self.behind else self._predict()
         echo = self._limiter.apply(echo)
-        return CancellerOutput(echo, mic - echo, 0.5 * misalignment, innovation)
+        return CancellerOutput(echo, mic - echo, misalignment, innovation)
 
     def _predict(self) -> Samples:
         """(hop,) echo of the newest hop by the weights as they are."""
@@ -215,6 +233,7 @@ class Canceller:
         self._recent[:, : self.hop] = self._recent[:, self.hop :]
         self._recent[0, self.hop :] = reference
         if self._channels > 1:
+            self._scale_products(self._sustained.step(float(reference.dot(reference)) / self.hop))
             moved = self._displacement(reference)
             first = np.multiply(moved, reference, out=self._recent[1, self.hop :])
             np.multiply(moved, first, out=self._recent[2, self.hop :])
@@ -227,6 +246,21 @@ class Canceller:
         for row, spectrum, power in zip(self._first, fresh, fourier.power(fresh)):
             self._spectra[row], self._powers[row] = spectrum, power
 
+    def _scale_products(self, loudness: float) -> None:
+        """Bring the products to the size of a reference that holds this mean square, if it never was as loud."""
+        if loudness <= self._loudest:
+            return
+        smaller, self._loudest = np.float32((self._loudest / loudness) ** 0.5), loudness
+        self._moving *= smaller
+        for order, first in enumerate(self._first[1:], 1):
+            rows, scale = slice(first, first + PRODUCT_PARTITIONS), smaller**order
+            self._recent[order] *= scale
+            self._spectra[rows] *= scale
+            self._powers[rows] *= scale**2
+            self._weights[..., rows, :] /= scale
+            variance = self._covariance[..., rows, :]
+            np.minimum(variance / scale**2, self._product_variance[..., None, :], out=variance)
+
     def _slide(self, to: int) -> None:
         """Look at the rows from `to` on: one place on, all of the past is one place further down without being copied."""
         self._at, rows = to, slice(to, to + self._rows)
@@ -234,7 +268,7 @@ class Canceller:
 
     def _displacement(self, reference: Samples) -> Samples:
         """(n,) of the membrane while it plays the next n samples of the reference; carries its state on."""
-        moving = np.concatenate((self._moving, reference))
+        moving = np.concatenate((self._moving, reference * np.float32(self._loudest**-0.5)))
         self._moving = moving[reference.size :]
         return np.correlate(moving, self._lowpass_reversed, "valid")
 
@@ -256,24 +290,29 @@ class Canceller:
         self._aged = aged.stop if aged.stop < self._rows else 0
         self._covariance += self._ageing
 
-    def _path_power(self) -> np.ndarray:
-        """(bins,) |H|^2 of the path at the start, summed over partitions; 1 where nothing is known."""
-        return (
-            fourier.power(self._weights[..., : self.partitions, :]).sum(axis=-2)
-            if self._warm
-            else np.ones((*self._lead, self.hop + 1), np.float32)
-        )
+    def _expect(self, path_power: Samples, decay: Samples, known: Samples | float = 0.0) -> None:
+        """Let the covariance be that of a path of this power (bins,) at least: decay (partitions, 1) of it, and known."""
+        rows = self._covariance[..., : self.partitions, :], self._covariance[..., self.partitions :, :]
+        self._product_variance = np.maximum(self._product_variance, PRODUCT_VARIANCE * path_power)
+        expected = known + decay * path_power[..., None, :], self._product_variance[..., None, :]
+        for row, variance in zip(rows, expected, strict=True):
+            np.maximum(row, variance, out=row)
 
-    def _prior(self) -> np.ndarray:
-        """(partitions, bins) covariance before anything was heard."""
-        seconds = np.arange(self.partitions) * self.hop / SAMPLE_RATE
-        decay = 10.0 ** (-6.0 * seconds / DECAY_RT60_S)[:, None] * np.ones(self.hop + 1)
-        if not self._warm:
-            return np.broadcast_to(decay / decay.sum(axis=0), (*self._lead, *decay.shape)).astype(np.float32)
-        return (
-            PRIOR_VARIANCE * fourier.power(self._weights[..., : self.partitions, :])
-            + LATE_VARIANCE * decay * self._path_power()[..., None, :]
-        ).astype(np.float32)
+    def _path_power(self) -> Samples:
+        """(bins,) |H|^2 of the path as it is, summed over partitions."""
+        return fourier.power(self._weights[..., : self.partitions, :]).sum(axis=-2)
+
+    def _expect_what_is_heard(self) -> None:
+        """Set the covariance of an unknown path by the powers of microphone and reference, whose scales nobody knows."""
+        decay = self._decay()
+        played = np.add.reduce(self._powers[: self.partitions], axis=0) / self.partitions
+        heard = 2.0 * self._noise  # half of each block is the microphone, and nothing was subtracted from it yet
+        self._expect(heard / (played + fourier.TINY), UNKNOWN_VARIANCE / decay.sum() * decay)
+
+    def _decay(self) -> Samples:
+        """(partitions, 1) power of a room's response, from 1 on."""
+        seconds = np.arange(self.partitions, dtype=np.float32) * self.hop / SAMPLE_RATE
+        return np.power(np.float32(10.0), -6.0 * seconds / DECAY_RT60_S, dtype=np.float32)[:, None]
 
     def impulse_response(self) -> Samples:
         """The adapted path (taps,) float32, of an array (microphones, taps), to be written back into a profile."""
@@ -289,6 +328,7 @@ class Canceller:
             self._covariance.copy(),
             self._noise.copy(),
             self.volume.gain,
+            self._loudest,
         )
 
     @classmethod
@@ -300,8 +340,10 @@ class Canceller:
         microphones = len(state.weights) if state.weights.ndim > 2 else None
         canceller = cls(hop, state.taps, adaptation=state.adaptation, microphones=microphones)
         canceller._weights[:], canceller._covariance[:] = state.weights, state.covariance
-        canceller._noise[:] = state.noise
+        canceller._noise[:], canceller._loudest = state.noise, state.loudest
         canceller._ageing = (1.0 - state.adaptation.transition**2) * fourier.power(canceller._weights)
+        canceller._unknown = 0 if canceller._covariance.any() else UNKNOWN_HOPS
+        canceller._product_variance = PRODUCT_VARIANCE * canceller._path_power()
         canceller._initial, canceller._initial_gain = canceller.impulse_response(), state.volume_gain
         canceller.volume = Volume(hop)
         canceller.volume.gain = state.volume_gain

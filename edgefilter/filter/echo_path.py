@@ -1,4 +1,4 @@
-"""The way from the reference to the microphone as it is believed to be: the source's effects and the adaptive filter behind them."""
+"""The echo path as the filter models it: the effects ahead of the loudspeaker, and the adaptive filter behind them."""
 
 from __future__ import annotations
 

@@ -150,7 +150,7 @@ class EgoFilter:
 
     @property
     def speech_probability(self) -> float | None:
-        """Probability that the human speaks now, 0 to 1: the network's, weighed with what robot and room are expected to leave.
+        """Probability that the human speaks now, 0 to 1: the network's, smoothed over a hop or two.
 
         None before the first hop and with engines that do not judge it (all but crnn, unless the settings of barge-in
         have judge="network"): what stands above the robot's rest is not yet a human, so they give no events of speech

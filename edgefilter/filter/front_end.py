@@ -1,4 +1,4 @@
-"""What stands before the engine: alignment, linear stage and what is known of the rest, one hop at a time."""
+"""The front end: alignment, echo cancellation, and estimates of noise and residual echo, one hop at a time."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ from edgefilter.profile.data import Profile
 from edgefilter.types import Frame, Output, Samples, Spectrum
 
 RUMBLE_HZ, RUMBLE = 90.0, 0.05
-"""Below this frequency a microphone whose path nobody measured hears rooms, not people; it is lowered by 26 dB."""
+"""Below this frequency a microphone without a calibration picks up the room, not people; it is lowered by 26 dB."""
 
 
 class LinearStage:
-    """What the kind "full" alone has: the tracked delay, the echo path, and what it leaves.
+    """Tracked delay, echo path and residual echo: what only front ends of the kind "full" have.
 
-    learner: told of every hop; what it answers is adopted with the next one. lesson: the one that was adopted in the
-    latest hop.
+    learner: told of every hop; the lesson that it answers is adopted with the next one. lesson: the one that was adopted
+    in the latest hop.
     """
 
     lesson: Lesson | None = None
@@ -73,7 +73,7 @@ class LinearStage:
     def _adopt(
         self, lesson: Lesson, mic: Samples, reference: Samples, located: bool, before: CancellerOutput
     ) -> CancellerOutput:
-        """Fade from what the path of before made of this hop to what the learned one makes of it."""
+        """Fade from this hop's output of the old path (before) to that of the learned path."""
         self.path = EchoPath.resumed(lesson.path, self._past(), reference.size)
         after = self.path.step(mic, reference, located)
         echo = before.echo + self._fade * (after.echo - before.echo)
@@ -85,12 +85,14 @@ class LinearStage:
 
 
 class FrontEnd:
-    """Finds the reference in the microphone and subtracts what is linear of it.
+    """Finds the reference in the microphone and subtracts its linear echo.
 
-    kind "none" passes the microphone, "paper" only delays the reference per utterance, "full" tracks and cancels.
+    What it does depends on the engine's `front`: "none" passes the microphone, "paper" only delays the reference, once per
+    utterance, "full" tracks the delay and cancels the echo.
     aligner: None for "none". linear_stage: None but for "full". gate: None but for "full" with a profile. microphones: of
     an array, and None for a single one; the kinds without a linear stage hear its first. spatial: None but for "full" with
-    an array. errors: (microphones, bins) of the latest frame of an array. linear: what the linear stage made of the latest hop.
+    an array. errors: (microphones, bins) of the latest frame of an array. linear: what the linear stage made of the latest
+    hop.
     """
 
     def __init__(
@@ -127,12 +129,12 @@ class FrontEnd:
         self._analyser = Analyser(stft, channels)
         self._low_cut = None if profile or not self.linear_stage else low_cut(stft)
         self._nothing = np.zeros(stft.bins, np.float32)
-        self._fan = profile.noise_bins(stft) if profile else self._nothing
+        self._noise = profile.noise_bins(stft) if profile else self._nothing
         self._silence = np.zeros(stft.bins, np.complex64)
 
     @property
     def lesson(self) -> Lesson | None:
-        """What was learned and taken over in the latest hop."""
+        """The lesson that was adopted in the latest hop."""
         return self.linear_stage.lesson if self.linear_stage else None
 
     def step(self, mic: Samples, ref: Samples) -> tuple[Frame, Aligned | None]:
@@ -141,11 +143,11 @@ class FrontEnd:
         mic: of an array (microphones, hop).
         """
         stage = self.linear_stage
-        heard, mic = mic, mic if self.microphones is None else mic[self.microphones.first]
+        heard, mic = mic, self.first_of(mic)
         if stage is None:
             found = self.aligner.step(mic, ref) if self.aligner else None
             x, r = self._analyser.push(mic, found.reference if found else ref)
-            return Frame(x, r, self._silence, x, self._fan, self._nothing), found
+            return Frame(x, r, self._silence, x, self._noise, self._nothing), found
         aligned = stage.aligner.step(mic, ref)
         self.linear = linear = stage.step(heard, aligned)
         gain = self.gate.step(mic, ref, aligned) if self.gate else None
@@ -161,6 +163,10 @@ class FrontEnd:
             x, r, e, error = self._spectra(gain, (0, 2, 3), mic, aligned.reference, linear.echo, linear.error)
             noise, residual = stage.residual.step(e, error, linear.uncertainty, added)
         return Frame(x, r, e, error, noise, residual, aligned.state == "idle"), aligned
+
+    def first_of(self, mic: Samples) -> Samples:
+        """(hop,) of the microphone that the answer sounds like, of mic (hop,) or (microphones, hop)."""
+        return mic if self.microphones is None else mic[self.microphones.first]
 
     def _spectra(self, gain: Samples | None, heard: Sequence[int], *signals: Samples) -> Spectrum:
         """(k, bins) of k signals (hop,); gain: the gate's, None for 1, on those that the microphone has heard."""
@@ -201,7 +207,7 @@ class FrontEnd:
         self.spatial.learn(self.errors, gain, probability, speaking, frame.idle)
 
     def _added(self, source: SourceChain) -> Samples | None:
-        """What the effects of the path in use bring that no waveform predicts; a lesson can have brought another path."""
+        """(bins,) expected power of the effects that no waveform predicts, for the path in use; a lesson can change it."""
         if source is not self._source:
             self._source = source
             self._unpredictable = Unpredictable(self._stft, source.colours) if source.colours else None

@@ -1,4 +1,4 @@
-"""What the running filter knows of learning: what it tells a learner of every hop, and what may come back."""
+"""Between the running filter and a learner: what is told of every hop, and the lesson that may come back."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How much of the robot and of its fan is left in the linear stage's error, as power spectra that a mask can use."""
+"""Power spectra of the residual echo and of the stationary noise in the linear stage's error, for a mask."""
 
 from __future__ import annotations
 
@@ -23,38 +23,70 @@ LEAKAGE_MEMORY, LEAKAGE_RISE, LEAKAGE_FALL = 0.97, 1.005, 0.9
 """The part is observed over half a second of the robot's speech; it falls at once and rises by 1.4 dB a second, so that
 a human's sentence hardly lifts it."""
 MARGIN = 3.0
-"""The mask wants to know the loud moments, which distort most; what is tracked is nearer to the quiet ones."""
+"""Leakage over what is tracked: a mask needs that of loud moments, which distort most, and quiet ones are tracked."""
 AUDIBLE = 60.0
-"""Power of the echo over the fan's from which on its leakage can be told."""
+"""Power of the echo over the noise's from which on its leakage can be told."""
 SPREAD, SPREAD_HZ = 0.1, 2000.0
 """Distortion falls on other frequencies too: this part of the echo's mean over SPREAD_HZ counts as well."""
 TAIL_DECAY = 0.6
 """Fall of the residual echo per hop, room for what lies beyond the canceller's tail and between its frames."""
 MISALIGNMENT_WARM, MISALIGNMENT_COLD = 0.5, 2.0
-"""Weight of the canceller's own expectation of its misalignment: it counts a calibrated path as unknown longer than it
-is, and a path that it learnt from nothing as better known than it is."""
-FAN_START = 1e-9
-"""Fan power per bin before anything was heard and without a profile."""
-FAN_RISE, FAN_FALL = 1.004, 0.97
-"""How fast the fan's estimate follows per hop where there is no profile: up slowly, so that speech does not lift it."""
-FAN_LEAST = 1e-14
-"""Its lower bound, 15 dB below the rounding of 24-bit samples: an estimate that a muted microphone has taken to zero
-could never rise again."""
+"""Weight of the canceller's own estimate of its misalignment: too large for a calibrated path, too small for one that was
+learned from nothing."""
+NOISE_LEAST = 1e-9
+"""Lower bound of the estimated noise, relative to the loudest power of a bin heard so far, mean over the bins: of what a muted
+microphone has taken to zero no ratio could be told."""
+
+
+class NoiseTracker:
+    """Power of the stationary noise in each bin, whatever speaks beside it.
+
+    Every frame counts with the probability that it holds nothing else: Gerkmann & Hendriks (2012), "Unbiased MMSE-based
+    noise power estimation with low complexity and low tracking delay", eq. (18), (22) and (23), with their values.
+    bins: of a spectrum.
+    """
+
+    PRESENT = np.float32(10.0**1.5)
+    """Power of speech over the noise where there is any, 15 dB."""
+    MEMORY, STUCK_MEMORY, STUCK = np.float32(0.8), np.float32(0.9), np.float32(0.99)
+    FIRST = 5
+    """Frames whose mean is the first estimate."""
+
+    def __init__(self, bins: int) -> None:
+        self.power = np.zeros(bins, np.float32)
+        self._present = np.zeros(bins, np.float32)
+        self._count, self._loudest = 0, 0.0
+
+    def step(self, observed: Samples) -> Samples:
+        """The noise's power (bins,) after a frame of the power observed (bins,)."""
+        self._loudest = max(self._loudest, float(np.add.reduce(observed)) / observed.size)
+        self._count += 1
+        if self._count <= self.FIRST:
+            self.power += (observed - self.power) / np.float32(self._count)
+        else:
+            likelihood = np.minimum(observed / self.power, 100.0) * (self.PRESENT / (1.0 + self.PRESENT))
+            present = 1.0 / (1.0 + (1.0 + self.PRESENT) * np.exp(-likelihood))
+            self._present += (1.0 - self.STUCK_MEMORY) * (present - self._present)
+            present = np.where(self._present > self.STUCK, np.minimum(present, self.STUCK), present)
+            self.power += (1.0 - self.MEMORY) * (1.0 - present) * (observed - self.power)
+        np.maximum(self.power, np.float32(NOISE_LEAST * self._loudest + fourier.TINY), out=self.power)
+        return self.power
 
 
 class Residual:
-    """Tracks the fan and the residual echo of one stream; step() once per frame.
+    """Tracks the stationary noise and the residual echo of one stream; step() once per frame.
 
-    With a profile the fan is the calibrated one; without, it is the slowly rising minimum of the smoothed error. Of the
-    echo a part stays, how much is tracked: the least ratio of error to echo while the robot speaks, for a human can
-    only add to it. It begins with the loudspeaker's distortion where the profile knows it from multisines.
+    The noise is what NoiseTracker finds in the error; with a profile, the calibrated shape at that level. The
+    leakage is the part of the echo that stays. It follows the least ratio of error to echo while the robot speaks, for a
+    human can only add to it, and begins with the loudspeaker's distortion where the profile knows it from multisines.
     """
 
     def __init__(self, stft: StftConfig, profile: Profile | None = None) -> None:
         self._bins = stft.bins
         width = max(1, round(SPREAD_HZ / stft.frequencies[1]))
         self._spread = np.full(width, SPREAD / width, np.float32)
-        self._fan = profile.noise_bins(stft) if profile is not None else None
+        fan = profile.noise_bins(stft) if profile is not None else None
+        self._calibrated = fan if fan is not None and fan.all() else None
         self._misalignment = np.float32(MISALIGNMENT_COLD if profile is None else MISALIGNMENT_WARM)
         known = profile.approximation if profile is not None else None
         self._first = LEAKAGE if known is None else min(max(known.share, LEAST), MOST)
@@ -62,9 +94,7 @@ class Residual:
 
     def reset(self) -> None:
         """As before the first frame."""
-        self._noise = np.full(self._bins, FAN_START, np.float32) if self._fan is None else self._fan.copy()
-        self._noise_power = float(np.add.reduce(self._noise))
-        self._smooth = np.zeros(self._bins, np.float32)
+        self._tracked = NoiseTracker(self._bins)
         before = self._spread.size // 2  # beyond its ends the echo counts as what it is there
         self._extended = np.zeros(self._bins + self._spread.size - 1, np.float32)
         self._below, self._echo, self._above = np.split(self._extended, (before, before + self._bins))
@@ -78,22 +108,19 @@ class Residual:
         added: Samples | None = None,
         fan: Samples | None = None,
     ) -> tuple[Samples, Samples]:
-        """Expected |fan|^2 and |residual echo|^2 in error, both (bins,) float32.
+        """Expected |noise|^2 and |residual echo|^2 in error, both (bins,) float32.
 
         echo, error: (bins,) of the frame. uncertainty: (bins,), CancellerOutput.uncertainty of the frame's last hop.
-        added: (bins,), what of the robot no waveform predicts. fan: (bins,), the calibrated fan as it is from this frame
-        on, where what hears it has changed.
+        added: (bins,), what of the robot no waveform predicts. fan: (bins,), the noise, where somebody knows it better.
         """
-        if fan is not None:
-            self._fan, self._noise, self._noise_power = fan, fan, float(np.add.reduce(fan))
         self._echo *= TAIL_DECAY
         np.maximum(fourier.power(echo), self._echo, out=self._echo)
-        if self._fan is None:
-            self._smooth *= 0.8
-            self._smooth += 0.2 * fourier.power(error)
-            self._noise = np.minimum(np.maximum(self._smooth, FAN_FALL * self._noise), FAN_RISE * self._noise)
-            np.maximum(self._noise, FAN_LEAST, out=self._noise)
-            self._noise_power = float(np.add.reduce(self._noise))
+        noise = self._tracked.step(fourier.power(error))
+        if fan is not None:
+            noise = fan
+        elif self._calibrated is not None:
+            noise = self._calibrated * np.float32(np.median(noise / self._calibrated))
+        noise_power = float(np.add.reduce(noise))
         self._below[:], self._above[:] = self._echo[0], self._echo[-1]
         brought = np.correlate(self._extended, self._spread, "valid")
         brought += self._echo
@@ -101,14 +128,14 @@ class Residual:
         if added is not None:
             unknown += added
         loud = float(np.add.reduce(brought))
-        if loud > AUDIBLE * self._noise_power:
-            self._track(float(np.vdot(error, error).real) - self._noise_power - float(np.add.reduce(unknown)), loud)
+        if loud > AUDIBLE * noise_power:
+            self._track(float(np.vdot(error, error).real) - noise_power - float(np.add.reduce(unknown)), loud)
         brought *= self._leakage
         brought += unknown
-        return self._noise, brought
+        return noise, brought
 
     def _track(self, left: float, brought: float) -> None:
-        """Follow the least part of the echo that stays, from the power left beyond fan and unknown and the power of a loud echo."""
+        """Follow the leakage. left: error power beyond noise and unknown echo; brought: power of the echo."""
         self._left += (1.0 - LEAKAGE_MEMORY) * (left - self._left)
         self._brought += (1.0 - LEAKAGE_MEMORY) * (brought - self._brought)
         change = MARGIN * max(self._left, 0.0) / self._brought / self._leakage
@@ -117,7 +144,7 @@ class Residual:
 
 
 class Unpredictable:
-    """What effects that no waveform predicts bring into each frame: expected |spectrum|^2, from their expected squares.
+    """Expected |spectrum|^2 of effects that no waveform predicts, from their expected squares.
 
     colours: (601,) spectral density of each per Hz, integral 1, 0 to 8 kHz.
     """

@@ -1,4 +1,4 @@
-"""The kept promise: counts the hops that came too late, and moves down and up a ladder of engines as the machine can bear."""
+"""Compute time of the running filter: counts late hops, and changes to a cheaper or a better engine."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The straight data path: blocks in, alignment, linear stage, engine, overlap-add, finished samples out."""
+"""The whole data path: blocks in, alignment, linear stage, engine, overlap-add, finished samples out."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from edgefilter.errors import SignalError
 from edgefilter.filter.barge_in import INTERRUPTIONS, BargeIn, BargeInSettings, HumanJudge
 from edgefilter.filter.front_end import FrontEnd
 from edgefilter.filter.learner import Learner
+from edgefilter.filter.reference_watch import ReferenceWatch
 from edgefilter.filter.stepping import Stepping
 from edgefilter.filter.turns import LONGEST_S, Turns
 from edgefilter.profile.data import Profile
@@ -29,7 +30,7 @@ class Stream:
     the compute time of every hop; what it answers becomes an event. barge_in: when speech counts as begun and ended,
     None for the defaults. learner: of better echo paths, for engines with a linear stage. on_barge_in: called in the
     hop in which speech has begun; what it raises is raised once the block is filtered, whose samples then come with the
-    next call. keep_channels: for robot_removed. speech_probability: of the last hop, weighed with what robot and room leave; None
+    next call. keep_channels: for robot_removed. speech_probability: of the last hop, smoothed; None
     before the first hop and where the engine does not judge it.
     """
 
@@ -77,9 +78,10 @@ class Stream:
             self.stepping.reset()
         self.front = FrontEnd(self.engine, self.profile, self.learner)
         self._microphones: int | None = None
+        self._watch = ReferenceWatch(stft.hop) if self.front.linear_stage else None
         self.events: deque[Event] = deque(maxlen=1000)
         self.speech_probability: float | None = None
-        self._judge = HumanJudge(stft, calibrated=self.profile is not None)
+        self._judge = HumanJudge(stft.hop / SAMPLE_RATE, calibrated=self.profile is not None)
         self._barge_in = BargeIn(stft.hop / SAMPLE_RATE, self._barge_in_settings)
         self._turns = Turns(stft, self.front.spatial)
         self._removed: deque[Samples] = deque(maxlen=round(LONGEST_S * SAMPLE_RATE / stft.hop))
@@ -181,7 +183,7 @@ class Stream:
         return out[early:]
 
     def _watched_step(self, mic: Samples, ref: Samples) -> Samples:
-        """One hop; the time that it takes is watched, the learner's is not, which lives in another process where time counts."""
+        """One hop; its compute time is watched, but not the learner's, which is another process in a live run."""
         out = self._timed_step(mic, ref) if self.stepping else self._step(mic, ref)
         if self.learner and self.front.linear_stage:
             self.front.linear_stage.learn()
@@ -205,6 +207,9 @@ class Stream:
             self.events.append(
                 Event("realigned", self._stepped, f"reference arrives after {aligned.delay:.1f} samples")
             )
+        if self._watch and aligned:
+            said = self._watch.step(self.front.first_of(mic), ref, aligned)
+            self.events.extend(Event(kind, self._stepped, detail) for kind, detail in said)
         if lesson := self.front.lesson:
             self.events.append(Event(lesson.kind, self._stepped, lesson.detail))
         engine = self.engine
@@ -215,16 +220,19 @@ class Stream:
         begun = aligned is not None and aligned.state == "begun"
         if output.speech_probability is not None:
             self._turns.step(output.spectrum, frame.error, self.front.errors)
-        self._judge_speech(frame, output.speech_probability, begun)
+        self._judge_speech(output.speech_probability, begun)
         self.front.hear(frame, output, self.speech_probability, self.human_speaks)
         return self._synthesiser.push(output.spectrum)
 
-    def _judge_speech(self, frame: Frame, probability: float | None, begun: bool) -> None:
+    def _judge_speech(self, probability: float | None, begun: bool) -> None:
         self.speech_probability = probability
+        wait = 0
         if probability is not None:
             suspect = self.front.gate is not None and self.front.gate.suspect
-            self.speech_probability = self._judge.step(frame, probability, suspect, begun)
-        if talk := self._barge_in.note(self.speech_probability):
+            if self._watch:
+                suspect, wait = suspect or self._watch.suspect, self._watch.wait // self.engine.stft.hop
+            self.speech_probability = self._judge.step(probability, suspect, begun)
+        if talk := self._barge_in.note(self.speech_probability, wait):
             self._tell_of_speech(talk, f"probability {self.speech_probability or 0.0:.2f}")
             if self._on_barge_in and talk in INTERRUPTIONS:
                 try:

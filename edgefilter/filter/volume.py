@@ -56,6 +56,14 @@ class Moments(NamedTuple):
         """These, followed by those of the next hop."""
         return Moments(*(MEMORY * before + (1.0 - MEMORY) * new for before, new in zip(self, now)))
 
+    def plus(self, now: Moments) -> Moments:
+        """The sums of both."""
+        return Moments(*(before + new for before, new in zip(self, now)))
+
+    def scaled(self, factor: float) -> Moments:
+        """Those of an echo that is factor times this one."""
+        return Moments(self.mic, self.cross * factor, self.echo * factor**2)
+
     def left(self, factor: float = 1.0) -> float:
         """Power of mic - factor * echo."""
         return self.mic - 2.0 * self.cross * factor + self.echo * factor * factor
@@ -67,18 +75,19 @@ NOTHING = Moments(0.0, 0.0, 0.0)
 class Volume:
     """Follows the volume of the robot's voice: one factor on the whole echo path, believed only on evidence.
 
-    hop: samples per step. known: whether the path is, or has yet to be learnt. gain: product of all factors so far.
-    suspected: a factor is being tried, the path is better left as it is until then.
+    hop: samples per step. known: whether the path is, or has yet to be learnt. scaled: whether it has the scale of this
+    microphone and this reference; where not, that is found first, hop by hop. gain: product of all factors so far.
+    suspected: a factor is being looked for or tried, the path is better left as it is until then.
     """
 
-    def __init__(self, hop: int, known: bool = True) -> None:
+    def __init__(self, hop: int, known: bool = True, scaled: bool = True) -> None:
         self._forget = 0.1 ** (hop / (FORGET_S * SAMPLE_RATE))
         self._patience = round(PATIENCE_S * SAMPLE_RATE / hop)
-        self._known = known
+        self._known, self._scaled = known, scaled or not known
         self._peak = 0.0
         self._smoothed = self._since = NOTHING
-        self.suspected, self._factor, self._count, self._age, self._rest = False, 1.0, 0, 0, 0
-        self.gain = 1.0
+        self.suspected, self._factor, self._count, self._age, self._rest = not self._scaled, 1.0, 0, 0, 0
+        self.gain = self._first = 1.0
 
     def follow(self, mic: Samples, echo: Samples) -> float:
         """The factor by which the echo path is to be scaled now, 1 where nothing says so. mic, echo: (hop,)."""
@@ -88,6 +97,8 @@ class Volume:
         audible = now.echo > AUDIBLE * self._peak
         if not self._known:
             self._known = audible and self._smoothed.mic > MOST * self._smoothed.left()
+        elif not self._scaled:
+            return self._scale(now) if audible and now.mic else 1.0
         elif self.suspected:
             return self._confirm(now, audible)
         elif self._rest:
@@ -95,6 +106,21 @@ class Volume:
         elif self._suspicious(self._smoothed):
             self.suspected, self._since = True, NOTHING
         return 1.0
+
+    def _scale(self, now: Moments) -> float:
+        """Bring the echo to the scale of what is heard: never louder, and from as many hops on as prove a factor by that."""
+        self._since = since = self._since.plus(now)
+        self._count += 1
+        if since.echo > EXCESS * since.mic:
+            return self._turn(math.sqrt(since.mic / since.echo))
+        agree = self._count >= WITNESSES and _coherent(since)
+        if not agree and self._count < self._patience:
+            return 1.0
+        factor = since.cross / since.echo
+        factor = self._turn(factor) if agree and since.left() > EXCESS * since.left(factor) else 1.0
+        self._scaled, self._first = True, self.gain
+        self._drop()
+        return factor
 
     def _suspicious(self, found: Moments) -> bool:
         """Whether one factor on the echo explains much of the error."""
@@ -107,7 +133,7 @@ class Volume:
         """Test the suspected factor by what it leaves of the hops after those that it was found in."""
         self._age += 1
         if audible:
-            self._since = Moments(*(before + new for before, new in zip(self._since, now)))
+            self._since = self._since.plus(now)
             self._count += 1
         if self._count < WITNESSES:
             if self._age > self._patience:
@@ -118,13 +144,17 @@ class Volume:
         self._rest = self._patience
         if since.left() <= EXCESS * since.left(suspected) or not _coherent(since):
             return 1.0
-        factor = self._bounded(since.cross / since.echo)
+        return self._turn(self._bounded(since.cross / since.echo))
+
+    def _turn(self, factor: float) -> float:
         self._peak *= factor**2
         self.gain *= factor
+        self._since, self._count = NOTHING, 0
         return factor
 
     def _bounded(self, factor: float) -> float:
-        return min(max(factor, 1.0 / (MOST * self.gain)), MOST / self.gain)
+        turned = self.gain / self._first
+        return min(max(factor, 1.0 / (MOST * turned)), MOST / turned)
 
     def _drop(self) -> None:
         self.suspected, self._count, self._age, self._smoothed = False, 0, 0, NOTHING
@@ -168,6 +198,10 @@ class EchoLimiter:
             self._weights[1:][gross] = np.minimum(self._weights[1:][gross], _weight(cross[gross] / expected[gross]))
         self._limited = bool(self._weights.min() < 1.0)
         return self._limited
+
+    def turn(self, factor: float) -> None:
+        """The echo is factor times what it was."""
+        self._smoothed = self._smoothed.scaled(factor)
 
     def _wait(self, excessive: bool) -> None:
         """Tell that the path has changed once the echo was too loud for long enough."""

@@ -15,13 +15,13 @@ from collections import deque
 from collections.abc import Callable
 
 import numpy as np
-import soxr
 
 from edgefilter.audio.raw import FULL_SCALE, to_pcm16
+from edgefilter.dsp.resample import Resampler
 from edgefilter.errors import SignalError, UsageError
 from edgefilter.filter.barge_in import BargeInSettings
 from edgefilter.filter.ego_filter import EgoFilter
-from edgefilter.types import SAMPLE_RATE, Event, Samples
+from edgefilter.types import SAMPLE_RATE, SET_UP_WRONG, Event, Samples
 
 MOST_QUEUED_S = 600.0
 """Speech that may wait to be played, 38 MB of float32: longer than any answer. The rest is refused and counted."""
@@ -29,24 +29,12 @@ ABSENT_S = 1.0
 """A microphone that delivers nothing for so long was off: event loops stand still for tenths of a second, not more."""
 PATIENCE_S = 0.12
 """How long the microphone waits for late speech: three times the 40 ms that a Pipecat transport hands over at once."""
+PACE_S, PACE_NEAR = 5.0, 0.01
+"""Seconds over which samples are counted, and by how much two counts may differ from one another and from a factor of
+CONFUSED: some callbacks of 20 ms."""
+CONFUSED = (1 / 6, 1 / 3, 1 / 2, 2 / 3, 44.1 / 48, 48 / 44.1, 3 / 2, 2.0, 44.1 / 16, 3.0, 4.0, 6.0)
+"""Factors between the rates of sound cards, telephones and speech, and between one, two and four channels."""
 _LOGGER = logging.getLogger(__name__)
-
-
-class Resampler:
-    """One stream from one rate to another, piece by piece; it holds about 40 ms back, at equal rates nothing.
-
-    channels: samples are then (n, channels), where they are more than one.
-    """
-
-    def __init__(self, source: int, target: int, channels: int = 1) -> None:
-        self.rates, self.channels = (source, target), channels
-        self._stream = None if source == target else soxr.ResampleStream(source, target, channels, dtype="float32")
-
-    def push(self, samples: Samples, last: bool = False) -> Samples:
-        """Take the next samples (n,) and return the finished ones; after `last` nothing may follow."""
-        if self._stream is None or not (samples.size or last):
-            return samples
-        return self._stream.resample_chunk(samples, last=last)
 
 
 class Duplex:
@@ -63,7 +51,7 @@ class Duplex:
         hand it over with jitter, and a gap in the reference that the loudspeaker did not make costs an alignment. 0 for
         agents that hand over early.
     on_event : callable, optional
-        Called with each `Event` of the filter, in the thread of `hear`. Without it they are kept for `ego.events()`.
+        Called with each `Event`, in the thread of `hear`. Without it the latest thousand are kept for `events()`.
     clock : callable
         Seconds, monotonic.
 
@@ -81,7 +69,7 @@ class Duplex:
     Notes
     -----
     An engine that judges no speech gives no events of speech. A warning is logged where such an engine is at work, so
-    also where a filter with a budget steps down to one.
+    also where a filter with a budget steps down to one, and for each event of a kind in `types.SET_UP_WRONG`.
 
     Examples
     --------
@@ -109,11 +97,13 @@ class Duplex:
         self._clock = clock
         self._queue_lock, self._hear_lock = threading.Lock(), threading.Lock()
         self._queue: deque[Samples] = deque()
-        self._queued = self._gaps = 0
+        self._queued = self._gaps = self._heard = 0
         self._samples = dict.fromkeys(("played", "dropped", "unheard", "refused"), 0)
         self._from_agent = Resampler(SAMPLE_RATE, SAMPLE_RATE)
         self._from_mic, self._to_agent = (Resampler(SAMPLE_RATE, SAMPLE_RATE) for _ in range(2))
         self._mic = np.zeros(0, np.float32)
+        self._pace = Pace(clock)
+        self._kept: deque[Event] = deque(maxlen=1000)
         self.enabled = True
         self._talking = self._paused = self._deaf = False
         self._talking_since = self._heard_at = clock()
@@ -160,7 +150,7 @@ class Duplex:
 
         samples: (n,), of an array (n, channels), as many channels in each call. One call may return none or more than came
         in. All together are as many as came in, later by the filter's latency and, at another rate than 16 kHz, by the
-        resamplers' 40 ms each way.
+        resamplers' 3.5 ms each way.
         """
         with self._hear_lock:
             channels = 1 if samples.ndim == 1 else samples.shape[1]
@@ -176,13 +166,21 @@ class Duplex:
             if human.size:
                 self._warn_if_deaf()
             human = self._to_agent.push(human)
-            events = self.ego.events() if self._on_event else []
+            events = self.ego.events()
+            if wrong := self._pace.note(len(samples), rate):
+                events.append(Event("rate_mismatch", self._heard, wrong))
+            self._heard += len(mic)
         for event in events:
-            if self._on_event:
-                self._on_event(event)
+            if event.kind in SET_UP_WRONG:
+                _LOGGER.warning("%s: %s", event.kind.replace("_", " "), event.detail)
+            (self._on_event or self._kept.append)(event)
         if self.enabled:
             return human
         return samples if samples.ndim == 1 else samples[:, 0]
+
+    def events(self) -> list[Event]:
+        """What happened since the last call, oldest first, where no on_event takes it."""
+        return [self._kept.popleft() for _ in range(len(self._kept))]
 
     def hear_pcm16(self, pcm: bytes | memoryview, rate: int, channels: int = 1) -> bytes:
         """As `hear`, for 16-bit samples, interleaved; each channel of the answer is the human."""
@@ -269,6 +267,44 @@ class Duplex:
             self._queued -= part.size
             self._samples[what] += part.size
         return np.concatenate(parts) if parts else np.zeros(0, np.float32)
+
+
+class Pace:
+    """Whether sound comes as fast as its rate says: one that is told wrongly makes another voice of it.
+
+    Wrong rates and channels are off by a few known factors; a machine that is busy, or a file, is off by any.
+
+    >>> now = iter(range(100))
+    >>> pace = Pace(lambda: float(next(now)))
+    >>> [said for said in (pace.note(32000, 16000) for _ in range(20)) if said]
+    ['it brings 32000 samples a second and is said to have 16000: give the rate or the channels that it has']
+    """
+
+    def __init__(self, clock: Callable[[], float]) -> None:
+        self._clock = clock
+        self._began: float | None = None
+        self._came, self._before, self._said = 0, 0.0, 0.0
+
+    def note(self, samples: int, rate: int) -> str:
+        """Take note of samples that have come; what is wrong, once, else nothing."""
+        now = self._clock()
+        if self._began is None:
+            self._began = now  # the first samples were recorded before
+            return ""
+        self._came += samples
+        if now - self._began < PACE_S:
+            return ""
+        found, before = self._came / (now - self._began), self._before
+        self._began, self._came, self._before = now, 0, found
+        wrong = abs(found / before - 1) < PACE_NEAR if before else False
+        factor = next((each for each in CONFUSED if abs(found / rate / each - 1) < PACE_NEAR), 1.0)
+        if not wrong or factor in (1.0, self._said):
+            return ""
+        self._said = factor
+        return (
+            f"it brings {factor * rate:.0f} samples a second and is said to have {rate}: give the rate or the channels"
+            " that it has"
+        )
 
 
 def from_pcm16(pcm: bytes | memoryview, channels: int = 1) -> Samples:

@@ -58,8 +58,8 @@ class Rival:
 
     @property
     def gain_db(self) -> float:
-        """Mean of the gains."""
-        return float(np.mean(self.gains_db)) if self.gains_db else 0.0
+        """Mean of the gains, of which there must be one."""
+        return float(np.mean(self.gains_db))
 
     @property
     def won(self) -> bool:

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 from scipy import fft
 
+from edgefilter.alignment.utterances import Sustained
 from edgefilter.calibration.array import cross_density
 from edgefilter.calibration.from_recording import bands_over_fan, fan_in_silences
 from edgefilter.dsp.psd import floored, periodograms
@@ -86,7 +87,7 @@ class PathLearner:
         self._rivals = [Rival(self._running, "no lesson at all", "unlearned", stays=True)]
         if known:
             self._rivals.append(Rival(self._fresh((), None, products=False), "a path from nothing", stays=True))
-        self._audible_s, self._next_s, self._peak = 0.0, FIRST_S, 0.0
+        self._audible_s, self._next_s, self._peak, self._sustained = 0.0, FIRST_S, 0.0, Sustained()
         self._snapshot = None
         self._counts = dict.fromkeys(self._counts, 0)
 
@@ -127,8 +128,8 @@ class PathLearner:
 
     def _audible(self, hop: FilteredHop) -> bool:
         power = float(hop.reference.dot(hop.reference))
-        self._peak = max(power, FADE * self._peak)
-        audible = hop.located and power > AUDIBLE * self._peak and power > 1e-8
+        self._peak = max(self._sustained.step(power), FADE * self._peak)
+        audible = hop.located and power > AUDIBLE * self._peak
         self._audible_s += audible * self._hop / SAMPLE_RATE
         return audible
 

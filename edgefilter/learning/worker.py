@@ -11,9 +11,9 @@ from typing import BinaryIO
 
 from edgefilter.echo.user_effects import load_effect
 from edgefilter.filter.learner import Lesson
+from edgefilter.filter.timing import peak_memory_mb
 from edgefilter.learning.background import LENGTH, Beginning, News
 from edgefilter.learning.path_learner import PathLearner
-from edgefilter.session import peak_memory_mb
 
 NICE = 10
 REPORT_HOPS = 16

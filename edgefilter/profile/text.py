@@ -9,6 +9,8 @@ from edgefilter.profile.approximation import LinearApproximation
 from edgefilter.profile.data import DISTORTION_ORDERS, Profile
 from edgefilter.types import PRE_ROLL, SAMPLE_RATE, Array, Samples
 
+SHOWN = 4
+"""Values of an effect's array that are shown."""
 HIDDEN_DB = -99.0
 """Distortion at or below this was not above the fan."""
 
@@ -37,15 +39,20 @@ def describe(profile: Profile) -> str:
     ]
     for name, values in profile.echo.effects:
         told = [(p.name, values[p.name]) for p in find(name).told if p.name in values]
-        figures = ", ".join(
-            f"{key} = array {value.shape}" if isinstance(value, np.ndarray) else f"{key} = {value}"
-            for key, value in told
-        )
+        figures = ", ".join(f"{key} = {_figures(value)}" for key, value in told)
         lines.append(f"effect      {name}{', in one recording' if find(name).event else ''}: {figures}")
     lines.extend(f"WARNING     {text}" for text in profile.warnings)
     if not profile.warnings:
         lines.append("trust       nothing doubtful found")
     return "\n".join(lines)
+
+
+def _figures(value: float | Array) -> str:
+    """Three significant digits, which --json has whole; of a long array its length."""
+    rounded = [f"{float(f'{number:.3g}'):g}" for number in np.ravel(value)[:SHOWN]]
+    if np.size(value) > SHOWN:
+        return f"{np.size(value)} values"
+    return rounded[0] if np.ndim(value) == 0 else f"({', '.join(rounded)})"
 
 
 def _left_lines(known: LinearApproximation) -> list[str]:

@@ -50,6 +50,19 @@ def test_every_utterance_gets_its_own_lag_in_an_office_beside_a_human_as_loud(ho
         assert time_to_align(hops, truth, onset + lag + HEAD, hop) <= WITHIN
 
 
+@pytest.mark.parametrize("click", [1e2, 1e4, 1e6])
+def test_utterances_after_one_loud_sample_of_the_reference_are_found(click):
+    rng = np.random.default_rng(3)
+    h = room(rng, 0.3)
+    ref, onsets = utterances(rng, [2.0, 2.0, 2.0], [1.5, 1.5, 1.5])
+    mic, truth = hear(ref, [(0, 3000), (onsets[1] - 100, 9000), (onsets[2] - 100, 5000)], h)
+    ref[onsets[0] + RATE : onsets[0] + RATE + 2] = click
+    hops = run(Aligner(256, known_path(h)), mic + fan(rng, ref.size), ref)
+    for utterance in (onsets[1], onsets[2]):
+        at = (utterance + 3 * RATE // 2) // 256
+        assert abs(hops[at].delay - truth[at * 256]) < 2 and hops[at].state == "locked"
+
+
 @pytest.mark.parametrize("ppm", [300.0, -300.0])
 def test_drift_is_tracked_without_jitter(ppm):
     rng = np.random.default_rng(5)

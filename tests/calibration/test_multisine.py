@@ -124,6 +124,7 @@ def left_of_noise_db(speaker, level_db, seconds=20):
     return 10 * np.log10(np.sum(pyy.real - explained) / np.sum(explained))
 
 
+@pytest.mark.slow
 def test_the_distortion_of_the_bench_loudspeaker_is_that_which_noise_shows(speaker, recorded):
     """Without a room, whose colour would weigh the distortion."""
     sound = heard_through(np.array([0.15]), speaker.play(PLAYED.astype(np.float64)))
@@ -134,6 +135,7 @@ def test_the_distortion_of_the_bench_loudspeaker_is_that_which_noise_shows(speak
         assert abs(found.over_linear_db("even", "odd")[at] - truth) < 2
 
 
+@pytest.mark.slow
 def test_clocks_that_drift_are_straightened_and_said(even):
     recording = warp(heard_through(room(), bent(PLAYED, 0.5, 0.0)).astype(np.float64), 60.0).astype(np.float32)
     profile = calibrate_multisine(PLAYED, recording, QUIET)
@@ -258,7 +260,6 @@ def test_the_command_writes_the_sound_and_makes_a_profile_of_its_recording(recor
     [
         (["--excitation", "s.wav", "--live"], "leave --live out"),
         (["--excitation", "s.wav", "--output", "p.npz"], "not allowed with"),
-        (["--multisine", "--stepped-sine", "--live", "--output", "p.npz"], "not allowed with"),
         (["--multisine", "--excitation", "s.wav", "--level-db", "-3"], "expected at most -6"),
         (["--multisine", "--live"], "--output --excitation is required"),
     ],

@@ -53,7 +53,7 @@ def test_what_is_missing_is_found_and_the_rest_still_checked(monkeypatch):
     monkeypatch.setattr(pulse, "names", lambda kind: [])
     monkeypatch.setattr(pulse, "default_name", lambda kind: "")
     monkeypatch.setattr(device, "_sounddevice", raises(DeviceError("live audio needs the PortAudio library")))
-    found = {check.name: check for check in doctor.examine("mic", None)}
+    found = {check.name: check for check in doctor.examine("mic", None, None)}
     assert {name for name, check in found.items() if check.state == "failed"} == {"model", "microphone", "reference"}
     assert {name for name, check in found.items() if check.state == "warning"} == {"cores", "sound server"}
     assert "reinstall" in found["model"].found and "PortAudio" in found["microphone"].found
@@ -87,7 +87,7 @@ def test_clock_and_level_are_judged(pace, level, peak, states, words):
 def test_another_model_than_the_package_s_is_said(monkeypatch):
     own = Path(__file__).parents[2] / "models/crnn_20ms_int8.onnx"
     monkeypatch.setenv("EDGEFILTER_CRNN", str(own))
-    _, found = islice(doctor.examine("mic", None), 2)
+    _, found = islice(doctor.examine("mic", None, None), 2)
     assert (found.name, found.state) == ("model", "warning")
     assert str(own) in found.found and "EDGEFILTER_CRNN" in found.do
 

@@ -19,10 +19,15 @@ from edgefilter.cli import build_parser, main
 from edgefilter.commands.outputs import FOLDERS, READ, WRITTEN
 from tests.diagnosis.robot_scene import profile
 
-NEITHER = {"mic_channels", "reference_channel",
-    "help", "version", "debug", "command", "word", "engine", "budget_ms", "remeasure", "seconds", "quiet", "stepped_sine", "live",
+NEITHER = {
+    "mic_channels", "reference_channel",
+    "help", "version", "debug", "command", "word", "engine", "budget_ms", "remeasure", "seconds", "quiet", "live",
     "speaker", "level_db", "effect", "force", "prove", "no_learn", "on_barge_in", "barge_in", "setup", "load", "unload",
     "hidden", "multisine",
+    "no_chirp",
+    "host",
+    "port",
+    "streams",
 }  # fmt: skip
 
 

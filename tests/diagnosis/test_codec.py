@@ -41,6 +41,7 @@ def talked_into(x: np.ndarray) -> np.ndarray:
     return record(x) + 0.3 * np.roll(record(voice(SECONDS)[::-1]), 40_000)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("step_db", [-8.0, -14.0])
 def test_a_codec_is_named_with_how_loud_its_noise_is(step_db: float) -> None:
     x = voice(SECONDS)
@@ -52,6 +53,7 @@ def test_a_codec_is_named_with_how_loud_its_noise_is(step_db: float) -> None:
     assert "follows it in every band" in finding.evidence and "codec" in [row.effect for row in found.tried]
 
 
+@pytest.mark.slow
 def test_where_the_codec_cuts_the_band_both_are_named() -> None:
     x = voice(SECONDS)
     low = signal.sosfilt(signal.cheby2(10, 50, 4000, fs=16000, output="sos"), coded(x, -8.0)).astype(np.float32)

@@ -81,6 +81,7 @@ def test_a_fan_of_digital_zeros_gives_figures_and_no_infinities() -> None:
     assert [finding.effect for finding in said.ranking if finding.effect == "fan_noise"] == []
 
 
+@pytest.mark.slow
 def test_the_words_name_a_band_of_the_judge() -> None:
     x = voice(10.0)
     clean = EchoModel(path()).predict(delayed(x, DELAY - PRE_ROLL))
@@ -177,6 +178,7 @@ def test_a_jump_is_not_replayed_in_another_recording() -> None:
     assert diagnose(knowing, later, other).verdict == "explained"
 
 
+@pytest.mark.slow
 def test_a_jump_stays_with_its_recording_through_the_files_and_add_says_so(tmp_path, capsys) -> None:
     import soundfile as sf
 
@@ -225,6 +227,7 @@ def coloured(x: np.ndarray) -> np.ndarray:
     return signal.lfilter(taps, [1.0], x)
 
 
+@pytest.mark.slow
 def test_another_colour_of_the_loudspeaker_is_not_called_late_reverberation() -> None:
     x = voice(12.0)
     clean = coloured(EchoModel(path()).predict(delayed(x, DELAY - PRE_ROLL)))

@@ -77,6 +77,7 @@ def test_one_hidden_effect_is_named_alone_and_leaves_nothing(effect: str, change
         )
 
 
+@pytest.mark.slow
 def test_two_effects_at_once_are_both_found() -> None:
     x = voice(SECONDS)
     clipped = np.clip(echo(x) + 0.6 * signal.lfilter(*signal.iirpeak(1200.0, 30.0, fs=16000), echo(x)), -0.06, 0.06)
@@ -85,6 +86,7 @@ def test_two_effects_at_once_are_both_found() -> None:
     assert found.remaining_db < 1.0
 
 
+@pytest.mark.slow
 def test_a_search_that_ends_at_its_most_effects_says_so() -> None:
     x = voice(SECONDS)
     clipped = np.clip(echo(x) + 0.6 * signal.lfilter(*signal.iirpeak(1200.0, 30.0, fs=16000), echo(x)), -0.06, 0.06)
@@ -130,6 +132,7 @@ def test_what_no_effect_makes_is_unexplained() -> None:
     assert "follows the robot's voice" in found.evidence
 
 
+@pytest.mark.slow
 def test_a_band_limit_shows_in_the_power_where_a_codecs_noise_hides_it() -> None:
     x, low = voice(SECONDS), signal.butter(12, 4000.0, fs=16000, output="sos")
     passed = signal.sosfiltfilt(low, echo(x))

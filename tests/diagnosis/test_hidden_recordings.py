@@ -15,6 +15,7 @@ from edgefilter.diagnosis.compare import compare
 from edgefilter.diagnosis.diagnose import add, diagnose
 from edgefilter.profile.data import Profile
 
+pytestmark = pytest.mark.slow
 DATA = Path(__file__).parents[1] / "data" / "hidden"
 RATE = 16000
 SEALED = ("00", "01", "02")

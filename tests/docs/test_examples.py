@@ -20,7 +20,7 @@ CALIBRATION = ROOT / "tests/data/demo_calibration"
 REVERBERANT = ROOT / "tests/data/hidden/dev/11"
 """A simulated robot that was carried into a reverberant room after its calibration."""
 RATE = 16000
-ELSEWHERE = {"agent_pipecat.py", "agent_livekit.py", "agent_wyoming.py"}
+ELSEWHERE = {"agent_pipecat.py", "agent_livekit.py", "agent_wyoming.py", "satellite.py"}
 """Whose conversation tests/integrations runs."""
 
 
@@ -95,6 +95,7 @@ def test_an_announced_utterance_is_found_and_removed(tmp_path):
     assert db(read(tmp_path / "human.wav")[speaking]) < db(mic[speaking]) - 25  # as above
 
 
+@pytest.mark.slow
 def test_a_calibration_gives_a_profile_with_which_the_missing_effect_is_found_and_added(tmp_path):
     names = ("sweep_ref", "sweep_mic", "fan_only")
     said, _ = run("calibrate.py", *(REVERBERANT / f"{name}.flac" for name in names), tmp_path / "robot.npz")

@@ -14,7 +14,7 @@ import soundfile
 
 from edgefilter.dsp.metrics import si_sdr
 from edgefilter.engines import create, onnx_session
-from edgefilter.engines.crnn import Crnn
+from edgefilter.engines.crnn import Crnn, at_training_level
 from edgefilter.engines.paper_crnn import PaperCrnn
 from edgefilter.errors import ModelError, SignalError, UsageError
 from edgefilter.filter.ego_filter import EgoFilter
@@ -53,15 +53,16 @@ def test_crnn_answers_what_onnxruntime_answers_for_the_same_frames():
     for _ in range(5):
         error, mic, reference, echo = (spectrum(rng, engine.stft.bins) for _ in range(4))
         noise, residual = rng.random((2, engine.stft.bins)).astype(np.float32)
-        output, state = engine.step(
-            Frame(mic=mic, reference=reference, echo=echo, error=error, noise_psd=noise, residual_psd=residual), state
-        )
-        pairs = [np.stack((x.real, x.imag), axis=-1)[None] for x in (error, mic, reference, echo)]
-        powers = [noise[None], residual[None]]
+        heard = Frame(mic=mic, reference=reference, echo=echo, error=error, noise_psd=noise, residual_psd=residual)
+        output, state = engine.step(heard, state)
+        levelled, scale = at_training_level(heard, state[2].loudest)
+        spectra = levelled.error, levelled.mic, levelled.reference, levelled.echo
+        pairs = [np.stack((x.real, x.imag), axis=-1)[None] for x in spectra]
+        powers = [levelled.noise_psd[None], levelled.residual_psd[None]]
         found, probability, *theirs = session.run(
             None, dict(zip([slot.name for slot in session.get_inputs()], pairs + powers + theirs, strict=True))
         )
-        np.testing.assert_array_equal(output.spectrum, found[0, :, 0] + 1j * found[0, :, 1])
+        np.testing.assert_array_equal(output.spectrum, np.float32(1 / scale) * (found[0, :, 0] + 1j * found[0, :, 1]))
         assert output.speech_probability == probability[0] and 0 < probability[0] < 1
     assert any(tensor.any() for tensor in state[0])
 

@@ -74,10 +74,13 @@ def test_the_part_of_the_echo_that_stays_is_tracked_and_a_human_hardly_lifts_it(
     residual, rng = Residual(STFT, robot()), np.random.default_rng(5)
 
     def expected(seconds, human):
-        frames = range(int(seconds * 16000 / STFT.hop))
-        return np.mean(
-            [residual.step(noise(rng, 1.0), noise(rng, part) + noise(rng, human), NOTHING)[1] for _ in frames][-60:]
-        )
+        found = []
+        for frame in range(int(seconds * 16000 / STFT.hop)):
+            speaks = frame % 20 >= 5  # what never pauses would be noise
+            echo, error = speaks * noise(rng, 1.0), speaks * noise(rng, part) + noise(rng, human) + noise(rng, 1e-6)
+            residual_psd = residual.step(echo, error, NOTHING)[1]
+            found += [residual_psd] * speaks
+        return np.mean(found[-60:])
 
     alone = expected(20, 0.0)
     assert part < alone < 8 * part  # MARGIN, and the echo's maximum over frames, which is above its mean
@@ -85,10 +88,15 @@ def test_the_part_of_the_echo_that_stays_is_tracked_and_a_human_hardly_lifts_it(
     assert expected(8, 0.0) < 1.2 * alone  # a memory of half a second forgets what was 250 times as much in 3 s
 
 
-def test_the_fan_of_the_profile_is_taken_as_it_is():
-    profile = robot()
-    fan, _ = Residual(STFT, profile).step(SILENCE, SILENCE, NOTHING)
-    np.testing.assert_array_equal(fan, profile.noise_bins(STFT))
+@pytest.mark.parametrize("level", [1e-4, 1.0, 1e4])
+def test_the_noise_of_the_profile_keeps_its_shape_at_whatever_level_the_microphone_is(level):
+    profile, rng = robot(), np.random.default_rng(7)
+    calibrated, residual = profile.noise_bins(STFT), Residual(STFT, profile)
+    for _ in range(100):
+        found, _ = residual.step(SILENCE, np.sqrt(level * calibrated).astype(np.float32) * noise(rng, 1.0), NOTHING)
+    ratio = found / calibrated
+    assert ratio.max() == pytest.approx(ratio.min(), rel=1e-5)  # float32
+    assert ratio.mean() == pytest.approx(level, rel=0.3)  # 100 frames, of which each counts a fifth at most
 
 
 def test_without_a_profile_the_fan_is_learnt_and_speech_does_not_lift_it():
@@ -97,6 +105,6 @@ def test_without_a_profile_the_fan_is_learnt_and_speech_does_not_lift_it():
         fan, _ = residual.step(SILENCE, noise(rng, 1e-3), NOTHING)
     learnt = np.median(fan)
     assert 0.3e-3 < learnt < 1.5e-3  # a minimum-like follower lies somewhat below the mean
-    for _ in range(60):  # one second of speech 20 dB above
-        fan, _ = residual.step(SILENCE, noise(rng, 1e-1), NOTHING)
+    for frame in range(60):  # one second of speech 20 dB above, in syllables
+        fan, _ = residual.step(SILENCE, noise(rng, 1e-1 if frame % 15 < 10 else 1e-3), NOTHING)
     assert np.median(fan) < 2 * learnt

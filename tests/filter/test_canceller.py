@@ -100,9 +100,21 @@ def test_a_filter_that_was_resumed_knows_how_far_the_volume_was_turned() -> None
     assert resumed.stats()["diverged"] and resumed.stats()["gain_db"] == canceller.stats()["gain_db"]
 
 
+def test_the_hops_are_counted_and_those_with_a_robot_to_adapt_to() -> None:
+    canceller, x = Canceller(HOP, 3200, path()), speechlike(1.0)
+    mic = signal.oaconvolve(x, path())[: x.size].astype(np.float32)
+    run(canceller, mic, x)
+    run(canceller, mic, np.zeros_like(x))
+    stats, hops = canceller.stats(), x.size // HOP
+    assert stats["hops"] == 2 * hops and 0.9 * hops < stats["active_hops"] <= hops
+    canceller.reset()
+    assert canceller.stats()["hops"] == canceller.stats()["active_hops"] == 0
+
+
 def test_of_a_path_that_has_become_another_one_as_much_is_kept_as_is_heard(monkeypatch: pytest.MonkeyPatch) -> None:
     x, h = speechlike(2.0), path()
     canceller = Canceller(HOP, 3200, h)
+    run(canceller, signal.oaconvolve(x, h)[: x.size].astype(np.float32), x)  # until its scale is known
     monkeypatch.setattr(canceller, "_adapt", lambda *_: None)  # what adaptation repairs is not the question
     before, variance = np.abs(canceller._weights).max(), canceller._covariance.max()
     run(canceller, 0.1 * speechlike(2.0, seed=5), x)  # nothing of an echo that is far louder than the microphone

@@ -153,3 +153,17 @@ def test_the_profile_of_these_scenes_is_true():
     ref, echo, _, fan, _ = scene()
     out = enhance(echo + fan, ref, profile(), "linear")
     assert 10 * np.log10(np.mean(echo[-SAMPLE_RATE:] ** 2) / np.mean(out[-SAMPLE_RATE:] ** 2)) > 20
+
+
+@pytest.mark.parametrize("click", [1e2, 1e6])
+def test_one_loud_sample_of_the_reference_costs_the_rest_next_to_nothing(click):
+    """It lies in the first of two utterances, the second of which has another lag and is judged."""
+    ref, _, _, fan, path = scene()
+    pause = slice(7 * SAMPLE_RATE // 2, 9 * SAMPLE_RATE // 2)
+    ref[pause] = 0.0
+    echo = np.concatenate((heard(ref, path, 900)[: pause.stop], heard(ref, path, 6000)[pause.stop :]))
+    clicked = ref.copy()
+    clicked[2 * SAMPLE_RATE] = click
+    left = [enhance(echo + fan, played, profile(), "linear")[-2 * SAMPLE_RATE :] for played in (ref, clicked)]
+    power = [float(np.mean(x**2)) for x in left]
+    assert power[1] < 1.4 * power[0]  # 1.5 dB: of the path a part is learnt again

@@ -8,10 +8,12 @@ from edgefilter import enhance
 from edgefilter.alignment.aligner import Aligner
 from edgefilter.alignment.delay_line import Aligned
 from edgefilter.commands.demo import DATA
-from edgefilter.filter.onset_gate import GATE, LONGEST, RAMP, SETTLE, OnsetGate
+from edgefilter.filter.onset_gate import GATE, LONGEST, SETTLE, OnsetGate
 from tests.alignment.scene import RATE, fan, hear, known_path, room, run, utterances
 
 HOP = 256
+RAMP = 64
+"""4 ms."""
 
 
 def spoken(rng: np.random.Generator, seconds: list[float], pauses: list[float]) -> tuple[np.ndarray, list[int]]:
@@ -48,6 +50,22 @@ def test_the_robot_is_lowered_until_its_lag_is_found(lags):
         assert np.any(burst & part)
         assert np.mean(out[burst & part] ** 2) < 0.1 * np.mean(mic[burst & part] ** 2)
     assert np.array_equal(out[~begun, RAMP:], mic[~begun, RAMP:])
+
+
+def test_one_loud_sample_of_the_reference_does_not_keep_the_gate_open_for_ever():
+    rng = np.random.default_rng(1)
+    h = room(rng, 0.3)
+    ref, onsets = spoken(rng, [2.0, 2.0], [1.5, 1.0])
+    mic = hear(ref, [(0, 3000), (onsets[1] - 100, 9000)], h)[0] + fan(rng, ref.size, 0.001)
+    clicked = ref.copy()
+    clicked[onsets[0] + RATE] = 1e6
+    mic, out, _ = gated(mic, ref, h)
+    _, after_click, found = gated(mic.reshape(-1), clicked, h)
+    lowered = np.all(out == np.float32(GATE) * mic, axis=1)
+    second = np.arange(len(found)) * HOP > onsets[1]
+    begun = np.array([aligned.state == "begun" for aligned in found])
+    assert np.count_nonzero(lowered & second & begun) > 2
+    assert np.array_equal(after_click[lowered & begun], out[lowered & begun])
 
 
 @pytest.mark.parametrize("level", [0.0, 0.1])
@@ -93,6 +111,12 @@ def test_the_gate_shuts_at_once_and_opens_without_a_step():
     assert np.all(gains[1] == np.float32(GATE)) and np.all(gains[2] == np.float32(GATE))
     opening = np.concatenate((gains[2][-1:], gains[3]))
     assert opening[-1] == 1.0 and np.abs(np.diff(opening)).max() <= 1.01 / RAMP
+
+
+def test_the_gate_is_shut_from_the_first_sample_on():
+    gate, loud = OnsetGate(1, 1.0), np.ones(1, np.float32)
+    gain = gate.step(loud, loud, Aligned(0 * loud, float("nan"), 0.0, 0.0, "begun", False))
+    assert gate.shut and gain is not None and gain[0] == np.float32(GATE)
 
 
 @pytest.mark.slow

@@ -25,17 +25,14 @@ def reference():
     return (0.05 * noise * (1 + np.sin(np.arange(noise.size) / 900))).astype(np.float32)
 
 
-@pytest.mark.parametrize(
-    ("effect", "values"),
-    [("speaker_nonlinearity", {"even": 1.0, "odd": 1.0, "knee": 0.2}), ("playback_gain", {"gain_db": -9.0})],
-)
-def test_an_effect_in_the_profile_lowers_the_residual_of_a_robot_that_has_it(reference, effect, values):
+def test_an_effect_in_the_profile_lowers_the_residual_of_a_robot_that_has_it(reference):
     plain = robot()
-    knowing = Profile(**{**plain.__dict__, "echo": plain.echo.with_effect(effect, values)})
+    values = {"even": 1.0, "odd": 1.0, "knee": 0.2}
+    knowing = Profile(**{**plain.__dict__, "echo": plain.echo.with_effect("speaker_nonlinearity", values)})
     mic = echo_of(knowing, reference) + 1e-4 * np.random.default_rng(6).standard_normal(reference.size).astype(
         np.float32
     )
-    aligned = slice(2_000, 24_000)  # a quarter second later a volume alone is followed
+    aligned = slice(2_000, 24_000)
     without, with_it = (db(enhance(mic, reference, profile, "linear")[aligned]) for profile in (plain, knowing))
     assert (
         with_it < without - 3

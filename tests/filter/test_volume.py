@@ -83,6 +83,15 @@ def test_a_turned_volume_is_found_within_half_a_second_and_bounded(factor: float
     assert found == pytest.approx(min(factor, 10.0), rel=0.05)
 
 
+def test_a_volume_that_was_turned_down_is_heard_again_where_soft_speech_tells_that_it_is_up() -> None:
+    """How loud an audible echo is moves with the volume: a soft passage is one, 14 dB below the loudest."""
+    echo = np.concatenate((hops(0.5, 0), 0.2 * hops(0.5, 1)))
+    half = len(echo) // 2
+    volume = np.where(np.arange(len(echo)) < half, 0.1, 1.0).astype(np.float32)[:, None]
+    assert factor_after(volume[:half] * echo[:half], echo[:half]) == pytest.approx(0.1, rel=0.05)
+    assert factor_after(volume * echo, echo) == pytest.approx(1.0, rel=0.05)
+
+
 def test_whatever_the_scale_the_same_volume_is_found() -> None:
     echo, noise = hops(0.5, 0), hops(0.5, 1)
     found = [factor_after(scale * (2.0 * echo + 0.1 * noise), scale * echo) for scale in (1e-6, 1.0, 1e4)]

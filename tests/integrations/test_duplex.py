@@ -223,6 +223,34 @@ def test_a_filter_that_steps_down_to_an_engine_that_judges_no_speech_says_so(cap
     assert "judges no speech: the human is not noticed" in caplog.text
 
 
+@pytest.mark.parametrize(
+    ("factor", "words"),
+    [(3.0, "brings 48000 samples a second and is said to have 16000"), (2.0, "32000"), (1.0, ""), (1.7, ""), (0.5, "8000")],
+    ids=["48 kHz as 16", "stereo as mono", "right", "a file", "8 kHz as 16"],
+)  # fmt: skip
+def test_a_rate_or_channels_that_are_not_the_microphone_s_are_said_once(witness, caplog, factor, words):
+    clock = Clock()
+    duplex = Duplex(witness, clock=clock)
+    for _ in range(1500):
+        clock.now += 0.02
+        duplex.hear(np.zeros(round(320 * factor), np.float32), RATE)
+    wrong = [event for event in duplex.events() if event.kind == "rate_mismatch"]
+    assert len(wrong) == bool(words) and duplex.events() == []
+    assert all(words in event.detail for event in wrong) and caplog.text.count("rate mismatch") == bool(words)
+
+
+def test_an_agent_whose_reference_is_late_does_not_interrupt_itself_and_the_log_says_why(room_of, caplog):
+    room, events = room_of.Room(), []
+    duplex = Duplex(EgoFilter(room_of.PROFILE, "crnn"), on_event=events.append)
+    room.play(room_of.ROBOT)
+    for step in range(250):
+        if step == 20:  # 0.4 s after the loudspeaker
+            duplex.play(room_of.ROBOT, RATE)
+        duplex.hear(room.hear(320), RATE)
+    assert [event.kind for event in events if event.kind != "realigned"] == ["reference_late"]
+    assert "reference late: the reference comes" in caplog.text
+
+
 def test_the_filter_that_it_makes_itself_judges_speech():
     assert Duplex().ego.judges_speech
 

@@ -3,6 +3,7 @@
 import gc
 import os
 import signal
+import subprocess
 import sys
 import time
 
@@ -190,6 +191,20 @@ def test_the_process_ends_with_the_last_one_who_holds_its_learner():
     gc.collect()
     with pytest.raises(ProcessLookupError):
         os.kill(pid, 0)
+
+
+def test_the_process_imports_nothing_that_it_does_not_need():
+    """Each of these takes 5 to 50 MB and up to a second of a small machine, and none is used to learn."""
+    code = "import sys; import edgefilter.learning.worker; print(*sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    loaded = set(done.stdout.split())
+    assert "edgefilter.learning.path_learner" in loaded
+    needless = {"soundfile", "soxr", "sounddevice", "onnxruntime", "matplotlib", "jinja2"}
+    needless |= {f"scipy.{name}" for name in ("signal", "stats", "optimize", "interpolate", "sparse")}
+    needless |= {
+        f"edgefilter.{name}" for name in ("audio", "alignment.aligner", "engines", "session", "report", "diagnosis")
+    }
+    assert not needless & loaded
 
 
 def test_a_learner_that_was_never_started_closes_in_silence():

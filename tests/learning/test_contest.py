@@ -13,6 +13,10 @@ def test_a_clear_and_steady_gain_wins():
     assert rival([0.5, 0.6] * LEAST).won
 
 
+def test_nothing_is_said_of_a_rival_without_a_comparison():
+    assert not rival([]).won and not rival([]).over
+
+
 def test_few_blocks_small_gains_and_scattered_ones_do_not():
     assert not rival([1.0] * (LEAST - 1)).won
     assert not rival([0.1, 0.12] * LEAST).won

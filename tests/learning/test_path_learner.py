@@ -46,6 +46,22 @@ def test_a_distorting_loudspeaker_is_learned_from_its_first_seconds(alone):
     assert ego.stats()["learning"]["learned"] == kinds.count("learned")
 
 
+def test_the_first_lesson_knows_the_loudspeaker(alone):
+    """After two seconds of the robot, some of which the search for its lag has cost."""
+    ego = EgoFilter(engine="linear", learn=PathLearner())
+    ego.process(alone.mic[: 4 * SAMPLE_RATE], alone.reference[: 4 * SAMPLE_RATE])
+    lessons = [event.detail for event in ego.events() if event.kind == "learned"]
+    assert lessons and lessons[0].startswith("loudspeaker and path: ")
+
+
+def test_one_loud_sample_of_the_reference_does_not_end_the_learning(alone):
+    reference = alone.reference.copy()
+    reference[SAMPLE_RATE] = 1e6
+    ego = EgoFilter(engine="linear", learn=PathLearner())
+    ego.process(alone.mic[: 6 * SAMPLE_RATE], reference[: 6 * SAMPLE_RATE])
+    assert ego.stats()["learning"]["heard_s"] > 2.0
+
+
 @pytest.mark.slow
 def test_the_same_recording_teaches_the_same_whatever_the_blocks(alone):
     once, _, _ = run(alone, PathLearner(), block=4096)

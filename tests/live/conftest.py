@@ -1,4 +1,5 @@
-"""Servers of virtual sound devices: two null sinks, seen by PortAudio by the names robot, robot_mic and their monitors."""
+"""Servers of virtual sound devices, PulseAudio and PipeWire: two null sinks, seen by PortAudio by the names robot, robot_mic
+and their monitors."""
 
 from contextlib import ExitStack
 
@@ -7,11 +8,11 @@ import pytest
 from bench.live import virtual_sound
 
 
-@pytest.fixture
-def new_server():
+@pytest.fixture(params=virtual_sound.SYSTEMS)
+def new_server(request):
     """A function that starts a server of its own, with other sinks where they are given; all are ended afterwards."""
     with ExitStack() as stack:
-        yield lambda *sinks: stack.enter_context(virtual_sound.server(sinks or virtual_sound.SINKS))
+        yield lambda *sinks: stack.enter_context(virtual_sound.server(sinks or virtual_sound.SINKS, request.param))
 
 
 @pytest.fixture

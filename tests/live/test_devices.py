@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import soundfile
+import soxr
 
 pytestmark = pytest.mark.slow
 
@@ -22,7 +23,8 @@ def sounds(tmp_path):
     random = np.random.default_rng(7)
     made = {}
     for name in ("robot", "robot_mic"):
-        pcm = np.concatenate((np.zeros(QUIET), random.integers(-9000, 9000, 24000))).astype(np.int16)
+        noise = soxr.resample(random.uniform(-9000, 9000, 9000), 6000, 16000)  # with room for an interpolation
+        pcm = np.concatenate((np.zeros(QUIET), noise)).astype(np.int16)
         soundfile.write(tmp_path / f"{name}.wav", pcm, 16000, subtype="PCM_16")
         made[name] = pcm / np.float32(32768)
     return made
@@ -47,10 +49,17 @@ def offset_of(sound, heard):
     return int(np.argmax(np.correlate(heard, probe, "valid"))) - QUIET
 
 
-def assert_contained(sound, heard):
-    """Exact: 16-bit samples at the devices' own rate pass through every stage unchanged."""
+def assert_contained(sound, heard, server):
+    """Exact with PulseAudio: 16-bit samples at the devices' own rate pass through every stage unchanged.
+
+    PipeWire's graph runs at 48 kHz: the same samples, interpolated at a place of its own between them.
+    """
     at = offset_of(sound, heard)
-    np.testing.assert_array_equal(heard[at + QUIET : at + sound.size], sound[QUIET:])
+    got, sent = heard[at + QUIET : at + sound.size], sound[QUIET:]
+    if server.system == "pulseaudio":
+        np.testing.assert_array_equal(got, sent)
+    else:
+        assert np.corrcoef(got, sent)[0, 1] > 0.9  # half a sample of 3 kHz noise off: 0.94
 
 
 def test_both_channels_arrive_sample_for_sample_and_nothing_is_lost(server, tmp_path, sounds):
@@ -58,15 +67,15 @@ def test_both_channels_arrive_sample_for_sample_and_nothing_is_lost(server, tmp_
     heard = np.load(tmp_path / "received.npz")
     assert heard["mic"].size == heard["ref"].size == 6 * 16000
     assert result["gapless"] and not any(result["stats"].values()), result
-    assert_contained(sounds["robot_mic"], heard["mic"])
-    assert_contained(sounds["robot"], heard["ref"])
+    assert_contained(sounds["robot_mic"], heard["mic"], server)
+    assert_contained(sounds["robot"], heard["ref"], server)
     assert "reference: robot_monitor" in result["notes"]
 
 
 def test_sink_plays_everything_after_the_latency(server, tmp_path, sounds):
     result = run("sink", server, tmp_path)
     assert result["sink"] == {"written": sounds["robot"].size, "clipped": 0, "underruns": 0, "missing": 0, "dropped": 0}
-    assert_contained(sounds["robot"], np.load(tmp_path / "received.npz")["mic"])
+    assert_contained(sounds["robot"], np.load(tmp_path / "received.npz")["mic"], server)
 
 
 def test_play_and_record_hears_the_whole_sound_and_never_before_it_is_played(server, tmp_path, sounds):
@@ -74,7 +83,7 @@ def test_play_and_record_hears_the_whole_sound_and_never_before_it_is_played(ser
     heard = np.load(tmp_path / "received.npz")["mic"]
     assert heard.size == sounds["robot"].size + 16000
     assert 0 <= offset_of(sounds["robot"], heard) < 16000  # the tail holds a second of delay
-    assert_contained(sounds["robot"], heard)
+    assert_contained(sounds["robot"], heard, server)
 
 
 def test_a_server_that_dies_is_one_error_after_what_was_received(server, tmp_path):

@@ -67,7 +67,7 @@ def test_a_run_outlives_the_sound_server_and_a_second_run_and_ends_whole_by_a_si
 
     server.stop()
     wait_for(lambda: first.says("device gone microphone"))
-    again = virtual_sound.start_server(Path(server.environment["HOME"]))
+    again = virtual_sound.start_server(Path(server.environment["HOME"]), system=server.system)
     try:
         wait_for(lambda: first.says("device back microphone"))
         grown = first.size()

@@ -9,6 +9,7 @@ import pytest
 import soundfile
 
 from tests.live.test_run_live import DEMO, ROOT, edgefilter
+from tests.live.test_virtual_microphone import arrived
 
 pytestmark = pytest.mark.slow
 
@@ -29,11 +30,14 @@ def test_the_played_speech_is_the_reference_and_ends_when_the_human_speaks(serve
     soundfile.write(tmp_path / "robot.wav", robot, 16_000, "PCM_16")
     human = 10 * soundfile.read(DEMO / "human.flac", dtype="float32")[0]
     begins = int(np.argmax(np.abs(human) > 0.1))
+    noise = 1e-4 * np.random.default_rng(0).standard_normal(12 * 16_000)  # a microphone's own
+    soundfile.write(tmp_path / "noise.wav", noise, 16_000, "PCM_16")
     soundfile.write(tmp_path / "human.wav", human[begins - 4000 : begins + 24_000], 16_000, "PCM_16")
     loudspeaker = subprocess.Popen(
         ["parec", "-d", "robot.monitor", "--rate=16000", "--channels=1", "--format=s16le", "--latency-msec=50", "--raw", tmp_path / "heard.raw"],
         env=server.environment,
     )  # fmt: skip
+    room = subprocess.Popen(["paplay", "-d", "robot_mic", tmp_path / "noise.wav"], env=server.environment)
     live = subprocess.Popen(
         edgefilter(
             "run", "--input", "mic", "--play", tmp_path / "robot.wav", "--barge-in", "stop", "--engine", "crnn",
@@ -47,7 +51,8 @@ def test_the_played_speech_is_the_reference_and_ends_when_the_human_speaks(serve
         time.sleep(0.05)
     subprocess.run(["paplay", "-d", "robot_mic", tmp_path / "human.wav"], env=server.environment, check=True)
     _, said = live.communicate(timeout=60)
-    loudspeaker.terminate(), loudspeaker.wait()
+    for process in (loudspeaker, room):
+        process.terminate(), process.wait()
     from_loudspeaker = np.fromfile(tmp_path / "heard.raw", "<i2")
     assert live.returncode == 0 and "what is played on" in said, said
 
@@ -59,4 +64,7 @@ def test_the_played_speech_is_the_reference_and_ends_when_the_human_speaks(serve
     assert -0.05 < ended / 16_000 - noticed < 2.0  # what is noticed was played before; a busy machine is behind
     assert ended < reference.size - 8000 and ended - first < robot.size - 16_000  # else it would go on to the end
     assert share(reference[first + 8000 : ended - 400], robot) > 0.3
-    assert share(from_loudspeaker, reference) > 0.3
+    if server.system == "pulseaudio":
+        assert share(from_loudspeaker, reference) > 0.3
+    else:  # whose graph runs at 48 kHz: no sample stays what it is
+        assert arrived(from_loudspeaker.astype(np.float32), reference[first:ended].astype(np.float32)) > 0.95

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import soundfile
+import soxr
 
 from edgefilter import Profile
 from tests.learning.scenes import Scene
@@ -116,6 +117,26 @@ def test_live_the_loudspeaker_is_learned_by_another_process_and_remembered(serve
     assert Profile.load(file).learned
 
 
+def test_live_the_clocks_of_microphone_and_reference_may_differ(server, tmp_path):
+    """The microphone's sound is played faster by 300 ppm than the reference's, as a clock that is slower hears it."""
+    scene = Scene(seconds=12.0)
+    for sink, sound in (("robot", scene.reference), ("robot_mic", soxr.resample(scene.mic, 1e6 + 300, 1e6))):
+        soundfile.write(tmp_path / f"{sink}.wav", sound, 16_000, "PCM_16")
+    command = edgefilter(
+        "run", "--input", "mic", "--output", tmp_path / "live.wav", "--engine", "linear", "--no-learn",
+        "--json", tmp_path / "stats.json", "--record", tmp_path / "heard",
+    )  # fmt: skip
+    run_until_played(server, command, tmp_path, tmp_path / "heard/mic.wav")
+    found = json.loads((tmp_path / "stats.json").read_text())["alignment"]
+    assert 150 < abs(found["ppm"]) < 450, found
+    mic, out = (
+        soundfile.read(path, dtype="float32")[0] for path in (tmp_path / "heard/mic.wav", tmp_path / "live.wav")
+    )
+    first = int(np.argmax(np.abs(mic) > 0.02))
+    late = slice(first + 7 * 16_000, first + 11 * 16_000)
+    assert db(out[late]) < db(mic[late]) - 8
+
+
 def run_for(server, seconds, tmp_path, *more):
     """A live run of so many seconds without a profile, its words and its figures."""
     command = edgefilter(
@@ -183,16 +204,48 @@ def test_devices_lists_them_and_the_reference(server):
     assert "robot_mic_monitor" in result.stdout and "take its reference from: robot.monitor" in result.stdout
 
 
-def test_the_doctor_finds_the_virtual_machine_fit(server):
-    result = subprocess.run(
-        edgefilter("doctor", "--json", "-"), env=server.environment, cwd=ROOT, capture_output=True, text=True
-    )
+def doctor(server, *words):
+    """What the doctor found, by the name of the check, and its exit code."""
+    command = edgefilter("doctor", "--json", "-", *words)
+    result = subprocess.run(command, env=server.environment, cwd=ROOT, capture_output=True, text=True)
     found = json.loads(result.stdout)
-    checks = {check["name"]: check for check in found["checks"]}
-    assert result.returncode == 0 and found["fit"], result.stdout + result.stderr
+    assert found["fit"] == (result.returncode == 0), result.stderr
+    return {check["name"]: check for check in found["checks"]}, result
+
+
+def test_the_doctor_finds_the_virtual_machine_fit(server):
+    checks, result = doctor(server)
+    assert result.returncode == 0, result.stdout + result.stderr
     assert "as shipped" in checks["model"]["found"] and "robot.monitor" in checks["reference"]["found"]
     assert {"microphone", "mic clock", "ref clock", "sound server"} <= set(checks)
     assert checks["level"]["state"] == "warning" and "unmute" in checks["level"]["do"]  # nobody plays anything
+    assert "peak -18 dB of full scale (--no-chirp" in result.stderr
+    assert "the microphone does not hear them" in checks["set-up"]["found"]
+    quiet, result = doctor(server, "--no-chirp")
+    assert "set-up" not in quiet and "chirps" not in result.stderr
+
+
+@pytest.fixture
+def loopback(server):
+    """The microphone hears what the output plays."""
+    words = ("source=robot.monitor", "sink=robot_mic", "latency_msec=60", "adjust_time=0")
+    subprocess.run(["pactl", "load-module", "module-loopback", *words], env=server.environment, check=True)
+    return server
+
+
+def test_the_doctor_hears_the_robot_by_the_way_that_run_takes(loopback):
+    checks, _ = doctor(loopback)
+    told = re.match(r"the microphone hears the robot after (\d+) ms, \d+ dB above the noise", checks["set-up"]["found"])
+    assert checks["set-up"]["state"] != "failed" and 0 < int(told[1]) < 500, checks["set-up"]
+
+
+def test_the_doctor_says_that_the_microphone_is_the_monitor_and_that_the_reference_is_the_wrong_one(loopback):
+    copied, result = doctor(loopback, "--input", "robot.monitor")
+    assert result.returncode == 1 and "microphone and reference are both 'robot.monitor'" in copied["set-up"]["found"]
+    words = "module-null-sink sink_name=other rate=16000 channels=1".split()
+    subprocess.run(["pactl", "load-module", *words], env=loopback.environment, check=True)
+    silent, result = doctor(loopback, "--reference", "other.monitor")
+    assert result.returncode == 1 and "'other.monitor' is silent while something is played" in silent["set-up"]["found"]
 
 
 def test_the_example_that_listens_says_when_somebody_spoke_while_it_runs(server, tmp_path):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,7 +10,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from edgefilter.dsp.membrane import motion
 from edgefilter.echo.effects.loudspeaker_laws import AMPLIFIER_TERMS, DRIVER_TERMS, amplifier_terms, driver_terms
-from edgefilter.echo.least_squares import NUISANCE_LEAD, NUISANCE_TAPS
+from edgefilter.echo.least_squares import CHUNK, NUISANCE_LEAD, NUISANCE_TAPS
 from edgefilter.echo.measurement import level_ratio
 from edgefilter.echo.recording import BLOCK
 from edgefilter.types import Array, Samples
@@ -170,7 +170,7 @@ class _Search:
         return part.left < (1.0 - PROMISING) * self.base
 
     def _part(self, setting: float, scale: float, terms: Samples) -> _Part:
-        columns = self.halves.columns([self._hear(term) for term in terms])
+        columns = self.halves.columns(map(self._hear, terms), len(terms))
         return _Part(setting, scale, columns, self.halves.left(columns))
 
 
@@ -196,12 +196,15 @@ class _Halves:
         self._split = int(np.count_nonzero(first))
         self._root = np.sqrt(weights[self.used, None].astype(np.float32))
         lags = np.pad(linear, (NUISANCE_TAPS - 1 - NUISANCE_LEAD, NUISANCE_LEAD))
-        self._linear = sliding_window_view(lags, NUISANCE_TAPS)[:, ::-1][self.used] * self._root
+        self._linear = sliding_window_view(lags, NUISANCE_TAPS)[:, ::-1]
         self._target = target[self.used, None] * self._root
 
-    def columns(self, signals: Sequence[Samples]) -> Samples:
-        """(used, k) signals (n,) at the samples that count, the first half's in front, weighted."""
-        return np.stack([signal[self.used] for signal in signals], axis=1) * self._root
+    def columns(self, signals: Iterable[Samples], count: int) -> Samples:
+        """(used, count) signals (n,) at the samples that count, the first half's in front, weighted."""
+        out = np.empty((self.used.size, count), np.float32)
+        for column, signal in zip(out.T, signals, strict=True):
+            np.multiply(signal[self.used], self._root[:, 0], out=column)
+        return out
 
     def left(self, columns: Samples) -> float:
         """What the linear voice and columns (used, k), fitted to one half, leave on the other: the sum of both ways."""
@@ -212,19 +215,33 @@ class _Halves:
         """Weights (k,) of columns (used, k) re the linear voice's gain, fitted to all, the level of what they add, and that gain, dB."""
         first, second = self._normal(columns)
         found = _solved(first + second)
-        voice = self._linear[:, NUISANCE_LEAD]
-        gain = level_ratio(self._linear @ found[:NUISANCE_TAPS].astype(np.float32), voice) or 1.0
+        voice, filtered = self._voice(np.eye(NUISANCE_TAPS)[NUISANCE_LEAD]), self._voice(found[:NUISANCE_TAPS])
+        gain = level_ratio(filtered, voice) or 1.0
         weights = found[NUISANCE_TAPS:] / gain
         added = columns @ weights.astype(np.float32)
         added -= level_ratio(added, voice) * voice
         level = float(np.dot(added, added)) / (float(np.dot(voice, voice)) + 1e-30)
         return weights, 10.0 * float(np.log10(level + 1e-12)), 20.0 * float(np.log10(max(abs(gain), 1e-3)))
 
+    def _voice(self, taps: Array) -> Samples:
+        """(used,) of the linear voice through taps (NUISANCE_TAPS,), weighted."""
+        return (self._linear @ taps.astype(np.float32))[self.used] * self._root[:, 0]
+
     def _normal(self, columns: Samples) -> tuple[Array, Array]:
         """Of each half the weighted products of linear voice, columns and target with each other."""
-        rows = np.concatenate((self._linear, columns, self._target), axis=1)
-        first, second = rows[: self._split], rows[self._split :]
-        return (first.T @ first).astype(float), (second.T @ second).astype(float)
+        first, second = slice(0, self._split), slice(self._split, self.used.size)
+        return self._products(columns, first), self._products(columns, second)
+
+    def _products(self, columns: Samples, half: slice) -> Array:
+        """A piece at a time, so that memory stays bounded."""
+        size = NUISANCE_TAPS + columns.shape[1] + 1
+        total = np.zeros((size, size))
+        for at in range(half.start, half.stop, CHUNK):
+            piece = slice(at, min(at + CHUNK, half.stop))
+            linear = self._linear[self.used[piece]] * self._root[piece]
+            rows = np.concatenate((linear, columns[piece], self._target[piece]), axis=1)
+            total += rows.T @ rows
+        return total
 
 
 def _solved(normal: Array) -> Array:

@@ -1,0 +1,90 @@
+"""A lag to within a hop from band energies alone: it needs no sharp arrival, only a loudspeaker that follows what it is sent."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from edgefilter.dsp import fourier
+from edgefilter.types import SAMPLE_RATE, Samples
+
+BANDS, LOWEST_HZ = 40, 150.0
+"""Bands, equally wide in mel from LOWEST_HZ up to 8 kHz."""
+RANGE = 1e-5
+"""A band's power is told down to so much of the loudest band's so far, -50 dB."""
+MEMORY_S = 3.0
+"""Time constant of the correlation, and of the means that are removed."""
+ENOUGH_S, CERTAIN = 1.0, 0.6
+"""Seconds of both that must have been heard, and correlation times its ratio to the best elsewhere from which on it is believed.
+After 1.5 s of ten unknown devices' recordings the least was 0.78, and beside speech of somebody else while the reference
+played unheard the most 0.46."""
+SAME = 3
+"""Lags on each side, in hops, that are the same arrival."""
+
+
+class CoarseLag:
+    """Correlates the shapes of the spectra of microphone and reference at every lag, hop by hop.
+
+    A shape is the log energies of BANDS bands, less their means over time and over the bands. No phase and no level are
+    in it, so that neither a diffuse path nor a microphone that was processed hides the lag. hop: samples per step, and
+    resolution. max_lag: samples.
+
+    >>> rng = np.random.default_rng(0)
+    >>> voice = rng.standard_normal(64000).astype(np.float32) * (1 + np.sin(np.arange(64000) / 700))
+    >>> heard, lag = np.convolve(np.roll(voice, 4000), rng.standard_normal(400), "same"), CoarseLag(256, 16000)
+    >>> for at in range(0, 48000, 256):
+    ...     lag.step(heard[at : at + 256], voice[at : at + 256])
+    >>> abs(lag.find() - 4000) < 512
+    True
+    """
+
+    def __init__(self, hop: int, max_lag: int) -> None:
+        self._hop = hop
+        self._window = np.hanning(2 * hop + 1)[: 2 * hop].astype(np.float32)
+        mel = np.linspace(_mel(LOWEST_HZ), _mel(SAMPLE_RATE / 2), BANDS + 1)
+        edges = 700.0 * (10.0 ** (mel / 2595.0) - 1.0) * 2 * hop / SAMPLE_RATE
+        self._edges = np.unique(np.round(edges).astype(int))[:-1]
+        self._sound = np.zeros((2, 2 * hop), np.float32)
+        self._forget = math.exp(-hop / (MEMORY_S * SAMPLE_RATE))
+        lags = max_lag // hop + 1
+        self._loudest = np.zeros((2, 1), np.float32)
+        self._means = np.zeros((2, self._edges.size), np.float32)
+        self._past = np.zeros((lags, self._edges.size), np.float32)
+        self._cross, self._power = np.zeros(lags), np.zeros(lags)
+        self._heard = 0.0
+        self._frames = 0
+
+    def step(self, mic: Samples, ref: Samples) -> None:
+        """Take in a hop (hop,) of both."""
+        hop = self._hop
+        self._sound[:, :hop] = self._sound[:, hop:]
+        self._sound[0, hop:], self._sound[1, hop:] = mic, ref
+        power = np.add.reduceat(fourier.power(fourier.rfft(self._sound * self._window)), self._edges, axis=1)
+        self._loudest = np.maximum(self._loudest, power.max(axis=1, keepdims=True))
+        if not self._loudest.all():
+            return
+        self._frames += 1
+        levels = np.log(power + RANGE * self._loudest)
+        self._means += max(1.0 - self._forget, 1.0 / self._frames) * (levels - self._means)
+        shapes = levels - self._means
+        shapes -= shapes.mean(axis=1, keepdims=True)
+        heard, played = shapes
+        self._past[1:] = self._past[:-1]
+        self._past[0] = played
+        self._cross = self._forget * self._cross + self._past @ heard
+        self._power = self._forget * self._power + np.square(self._past).sum(axis=1)
+        self._heard = self._forget * self._heard + float(heard @ heard)
+
+    def find(self) -> int | None:
+        """The lag in samples, None where none is beyond doubt."""
+        if self._frames * self._hop < ENOUGH_S * SAMPLE_RATE:
+            return None
+        score = self._cross / np.sqrt(self._power * self._heard + np.finfo(np.float64).tiny)
+        at = int(score.argmax())
+        elsewhere = max(score[: max(at - SAME, 0)].max(initial=0.0), score[at + SAME + 1 :].max(initial=0.0))
+        return at * self._hop if score[at] ** 2 > CERTAIN * elsewhere else None
+
+
+def _mel(hz: float) -> float:
+    return 2595.0 * math.log10(1.0 + hz / 700.0)

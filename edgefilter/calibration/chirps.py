@@ -1,0 +1,170 @@
+"""Chirps that tell whether microphone and reference are set up rightly: what was recorded of them, judged."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import soxr
+from scipy import fft
+
+from edgefilter.dsp.fourier import power
+from edgefilter.dsp.frames import decibels
+from edgefilter.dsp.lag import flat_cross
+from edgefilter.types import SAMPLE_RATE, Samples
+
+LEVEL_DB = -18.0
+"""Peak of the louder chirps, dB of full scale: as loud as speech of the robot's, which peaks some dB above."""
+SOFTER_DB = 10.0
+"""By how much every other pair is softer: what changes the level by itself makes less, or more, of it."""
+LOWEST_HZ, HIGHEST_HZ = 150.0, 7000.0
+SLOT, CHIRP, FADE = round(0.6 * SAMPLE_RATE), round(0.3 * SAMPLE_RATE), round(0.01 * SAMPLE_RATE)
+"""Samples from one chirp to the next, of a chirp, and of its rise and fall: the rest of a slot is for the room's echo."""
+ORDER = "UDudDUdu"
+"""Up and down, louder (capital) and softer; the first half is fitted and the second judges, so that what is no linear
+filter, and would explain one sweep, does not explain the other."""
+LEAD = round(0.5 * SAMPLE_RATE)
+"""Samples of silence before the first chirp, in which the room's noise is measured."""
+QUIET = round(0.1 * SAMPLE_RATE)
+"""Samples of it, the quietest of which count: a stream may begin with a noise of its own."""
+RESPONSE = round(0.25 * SAMPLE_RATE)
+"""Samples of the echo path that are fitted."""
+STRETCHED_PPM = 5.0
+"""Difference of two clocks from which on a chirp is stretched enough, by a fortieth of a sample, to cost 30 dB of 7 kHz:
+the microphone is straightened then."""
+CERTAIN = 12.0
+"""Height of a correlation with the chirps over its root mean square from which they are there: noise has 5."""
+
+
+def chirps() -> Samples:
+    """The sound to be played, (n,) float32 at 16 kHz, 5.3 s with the silence before."""
+    time = np.arange(CHIRP) / SAMPLE_RATE
+    phase = 2 * np.pi * (LOWEST_HZ * time + (HIGHEST_HZ - LOWEST_HZ) / (2 * time[-1]) * time**2)
+    edge = 0.5 - 0.5 * np.cos(np.pi * (np.arange(FADE) + 0.5) / FADE)
+    up = np.sin(phase)
+    up[:FADE] *= edge
+    up[-FADE:] *= edge[::-1]
+    sound = np.zeros(LEAD + SLOT * len(ORDER), np.float32)
+    for number, kind in enumerate(ORDER):
+        level_db = LEVEL_DB - (0.0 if kind.isupper() else SOFTER_DB)
+        at = LEAD + number * SLOT
+        sound[at : at + CHIRP] = 10 ** (level_db / 20) * (up if kind in "Uu" else up[::-1])
+    return sound
+
+
+@dataclass(frozen=True)
+class Heard:
+    """What a microphone and a reference brought of the chirps.
+
+    in_reference, in_microphone: whether they are there at all; what follows is None where one of them lacks them.
+    lag_s: seconds by which the microphone hears them after the reference has them. above_noise_db: of the louder ones at
+    the microphone. ppm: by how much the microphone's clock is faster. linear_db: power of the echo over what a linear
+    filter, fitted to other chirps, leaves of it. softer_db: gain for the softer chirps over that for the louder ones, dB.
+    same: whether the microphone is a copy of the reference. peak_db: of the microphone, dB of full scale.
+    """
+
+    in_reference: bool
+    in_microphone: bool
+    peak_db: float
+    lag_s: float | None = None
+    above_noise_db: float | None = None
+    ppm: float | None = None
+    linear_db: float | None = None
+    softer_db: float | None = None
+    same: bool = False
+
+
+def judge(mic: Samples, ref: Samples) -> Heard:
+    """Look for the chirps in both channels (n,), which share a sample counter.
+
+    >>> sound = np.pad(chirps(), (4000, 12000))
+    >>> heard = judge(0.1 * np.roll(sound, 800), sound)
+    >>> round(1000 * heard.lag_s), round(heard.ppm), heard.linear_db > 40, round(heard.softer_db)
+    (50, 0, True, 0)
+    """
+    heard = _judge(mic, ref)
+    if heard.ppm is not None and abs(heard.ppm) > STRETCHED_PPM:
+        straight = _judge(soxr.resample(mic, 1e6 + heard.ppm, 1e6), ref)
+        if straight.ppm is not None:
+            return replace(straight, ppm=heard.ppm + straight.ppm)
+    return heard
+
+
+def _judge(mic: Samples, ref: Samples) -> Heard:
+    sound = chirps()
+    peak_db = float(decibels(float(np.max(np.square(mic), initial=0.0))))
+    (at_ref, in_ref), (at_mic, in_mic) = _find(ref, sound), _find(mic, sound)
+    if not (in_ref and in_mic):
+        return Heard(in_ref, in_mic, peak_db)
+    starts = [at_ref + LEAD + number * SLOT for number in range(len(ORDER))]
+    lag = at_mic - at_ref
+    size = fft.next_fast_len(2 * SLOT, real=True)
+    margin = FADE
+    references = np.stack([_spectrum(ref, start - margin, size) for start in starts])
+    heard = np.stack([_spectrum(mic, start + lag - margin, size) for start in starts])
+    offsets, ppm = _drift(heard, references, starts, size)
+    omega = 2 * np.pi * np.arange(heard.shape[1]) / size
+    heard = heard * np.exp(1j * omega * offsets[:, None])
+    before = mic[max(at_mic, 0) : max(at_mic, 0) + (LEAD - FADE) // QUIET * QUIET].reshape(-1, QUIET)
+    noise = np.min(np.mean(np.square(before, dtype=np.float64), axis=1))
+    band = slice(round(LOWEST_HZ * size / SAMPLE_RATE), round(HIGHEST_HZ * size / SAMPLE_RATE))
+    loud = np.array([kind.isupper() for kind in ORDER])
+    energy = np.sum(power(heard[:, band]), axis=1) - noise * SLOT * size / 2 * (HIGHEST_HZ - LOWEST_HZ) / (
+        SAMPLE_RATE / 2
+    )
+    given = np.sum(power(references[:, band]), axis=1)
+    gain_db = [float(decibels(max(float(np.sum(energy[of]) / np.sum(given[of])), 1e-12))) for of in (loud, ~loud)]
+    over = np.mean(
+        [
+            np.mean(np.square(mic[start + lag : start + lag + CHIRP], dtype=np.float64))
+            for start in np.array(starts)[loud]
+        ]
+    )
+    left_db, same = _left(heard, references, band, size)
+    return Heard(
+        in_ref, in_mic, peak_db, lag / SAMPLE_RATE, float(decibels(float(over / max(noise, 1e-12)))), ppm, left_db,
+        gain_db[1] - gain_db[0], same and abs(lag) <= FADE and abs(ppm) < 1.0,
+    )  # fmt: skip
+
+
+def _find(heard: Samples, sound: Samples) -> tuple[int, bool]:
+    """Where the sound begins in what was heard, in samples, and whether it is there."""
+    if not heard.any():
+        return 0, False
+    size = fft.next_fast_len(heard.size + sound.size, real=True)
+    correlation = np.abs(fft.irfft(flat_cross(sound, heard, size), size))
+    at = int(np.argmax(correlation))
+    return at if at < heard.size else at - size, bool(correlation[at] > CERTAIN * np.sqrt(np.mean(correlation**2)))
+
+
+def _spectrum(x: Samples, start: int, size: int) -> np.ndarray:
+    """Of a slot from start on; zeros where there is nothing."""
+    part = np.zeros(size)
+    first, last = max(start, 0), max(min(start + SLOT, x.size), max(start, 0))
+    part[first - start : last - start] = x[first:last]
+    return fft.rfft(part)
+
+
+def _drift(heard: np.ndarray, references: np.ndarray, starts: list[int], size: int) -> tuple[np.ndarray, float]:
+    """By how many samples each slot is late, on a line through all of them, and the clock's difference, ppm."""
+    lags = []
+    for y, r in zip(heard, references):
+        near = np.roll(fft.irfft(y * np.conj(r), size), 16)[:33]  # +- 1 ms: 300 ppm of 5 s are 24 samples
+        at = min(max(int(np.argmax(np.abs(near))), 1), 31)
+        low, middle, high = np.abs(near[at - 1 : at + 2])
+        lags.append(at - 16 + 0.5 * (low - high) / min(low - 2 * middle + high, -1e-20))
+    slope, offset = np.polyfit(np.array(starts) - starts[0], lags, 1)
+    return offset + slope * (np.array(starts) - starts[0]), float(1e6 * slope)
+
+
+def _left(heard: np.ndarray, references: np.ndarray, band: slice, size: int) -> tuple[float, bool]:
+    """Echo over what the filter of the first half leaves of the second, dB; whether that filter only copies."""
+    half = len(heard) // 2
+    total = np.sum(power(references[:half]), axis=0)
+    response = fft.irfft(np.sum(heard[:half] * np.conj(references[:half]), axis=0) / (total + 1e-6 * total.max()), size)
+    response[RESPONSE:-FADE] = 0.0
+    left = heard[half:, band] - fft.rfft(response)[band] * references[half:, band]
+    linear_db = float(decibels(np.sum(power(heard[half:, band])) / max(np.sum(power(left)), 1e-12)))
+    largest = np.argmax(np.abs(response))
+    there = np.sum(np.roll(response, 16 - largest)[:33] ** 2)  # an impulse of this band, 1 ms to each side
+    return linear_db, bool(linear_db > 50.0 and there > 0.98 * np.sum(response**2))

@@ -1,0 +1,82 @@
+"""`edgefilter serve`: the filter for devices whose microphone is elsewhere, over WebSocket."""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import ipaddress
+import signal
+from pathlib import Path
+
+from edgefilter.commands.display import say
+from edgefilter.errors import EdgefilterError, UsageError
+from edgefilter.filter.barge_in import BargeInSettings
+from edgefilter.filter.ego_filter import EgoFilter
+from edgefilter.learning.background import BackgroundLearner, cores
+from edgefilter.profile.data import Profile
+
+STREAMS_PER_CORE = 4
+"""Clients at a time unless --streams says otherwise: half of what a core bore when it was measured (docs/serve.md)."""
+
+
+def main(args: argparse.Namespace) -> int:
+    try:
+        from edgefilter.integrations.serve import Service
+    except ModuleNotFoundError as error:
+        raise UsageError(f"serve needs {error.name}, which is not installed: pip install '.[serve]'") from None
+    token = None if args.token is None else read_token(args.token)
+    if token is None and not is_own(args.host):
+        raise UsageError(
+            f"--host {args.host} lets other machines listen, found no --token: give a file that holds a secret, or leave"
+            " --host out"
+        )
+    profile = Profile.load(args.profile) if args.profile else None
+    streams = args.streams or STREAMS_PER_CORE * cores()
+
+    def make_filter(learns: bool) -> EgoFilter:
+        learner = BackgroundLearner(profile) if learns else None
+        return EgoFilter(profile, args.engine, barge_in=BargeInSettings(judge="network"), learn=learner)
+
+    make_filter(False)  # what cannot be made is said now, and what is slow to load is loaded
+
+    def ready(port: int) -> None:
+        whose = "any machine with the token" if token else "this machine"
+        say(f"serving ws://{args.host}:{port} to {whose}, {streams} streams at most; Ctrl-C ends it")
+
+    async def run() -> None:
+        service = Service(make_filter, streams, cores() - 1, token)
+        loop = asyncio.get_running_loop()
+        for number in (signal.SIGINT, signal.SIGTERM):
+            loop.add_signal_handler(number, service.stop)
+        await service.run(args.host, args.port, ready)
+
+    try:
+        asyncio.run(run())
+    except OSError as error:
+        raise EdgefilterError(
+            f"{args.host}:{args.port} cannot be served: {error.strerror or error}; choose another --host or --port"
+        ) from None
+    return 0
+
+
+def read_token(path: str) -> str:
+    """The secret in a file; raises UsageError where there is none."""
+    try:
+        token = Path(path).read_text().strip()
+    except (OSError, UnicodeDecodeError) as error:
+        raise UsageError(
+            f"--token {path} cannot be read: {getattr(error, 'strerror', None) or 'it is no text'}"
+        ) from None
+    if len(token) < 16 or not token.isascii() or not token.isprintable():
+        raise UsageError(
+            f"--token {path} holds {len(token)} characters, expected 16 or more of ASCII: openssl rand -hex 24"
+        )
+    return token
+
+
+def is_own(host: str) -> bool:
+    """Whether only this machine reaches it."""
+    try:
+        return host == "localhost" or ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False

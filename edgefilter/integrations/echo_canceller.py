@@ -1,0 +1,236 @@
+"""EchoCanceller: the filter in the shape of the echo cancellers that programs call now, 10 ms of microphone and reference at a time."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import math
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edgefilter.audio.raw import FULL_SCALE, to_pcm16
+from edgefilter.dsp.resample import Resampler
+from edgefilter.errors import SignalError, UsageError
+from edgefilter.filter.ego_filter import EgoFilter
+from edgefilter.profile.data import Profile
+from edgefilter.types import SAMPLE_RATE, Event, Samples
+
+LOWEST_RATE, HIGHEST_RATE = 8000, 48000
+"""Hz that a canceller may run at: what telephones and sound cards have."""
+MOST_CHANNELS = 8
+"""Microphones of one canceller; each has a filter of its own, and the time that this takes."""
+Sound = TypeVar("Sound", bytes, bytearray, NDArray[np.int16], NDArray[np.floating])
+_LOGGER = logging.getLogger(__name__)
+
+
+class EchoCanceller:
+    """An echo canceller as programs call it now: `process(mic, ref)` gives as many samples as came in, of the same type.
+
+    Parameters
+    ----------
+    sample_rate : int
+        Of microphone and reference, 8000 to 48000 Hz.
+    channels : int
+        Microphones, 1 to 8. Each is filtered by itself, which takes its own time.
+    profile : Profile, str or Path, optional
+        As of `EgoFilter`.
+    engine : str
+        As of `EgoFilter`.
+
+    Attributes
+    ----------
+    delay : int
+        Samples, at `sample_rate`, by which the answer is late: sample i comes out as sample i + delay. Silence comes first.
+
+    Raises
+    ------
+    UsageError
+        For a rate or a number of channels out of range, and an engine that answers only at the end of a recording.
+
+    Notes
+    -----
+    The filter works at 16 kHz. At other rates the delay grows by 7 ms, and above 16 kHz nothing over 8 kHz survives,
+    which a warning in the log says once. One object belongs to one thread at a time.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> with EchoCanceller(16000, engine="linear") as canceller:
+    ...     out = canceller.process(np.zeros(160, np.int16), np.zeros(160, np.int16))
+    ...     out.dtype.name, out.size, canceller.delay
+    ('int16', 160, 512)
+    """
+
+    def __init__(
+        self,
+        sample_rate: int = SAMPLE_RATE,
+        channels: int = 1,
+        profile: Profile | str | Path | None = None,
+        engine: str = "auto",
+    ) -> None:
+        if not LOWEST_RATE <= sample_rate <= HIGHEST_RATE:
+            raise UsageError(
+                f"sample_rate is {sample_rate}, expected {LOWEST_RATE} to {HIGHEST_RATE} Hz: convert the sound before"
+            )
+        if not 1 <= channels <= MOST_CHANNELS:
+            raise UsageError(f"channels is {channels}, expected 1 to {MOST_CHANNELS}: leave some microphones out")
+        self.sample_rate, self.channels = sample_rate, channels
+        self._filters = [EgoFilter(profile, engine) for _ in range(channels)]
+        first = self._filters[0]
+        if first.waits_for_end:
+            raise UsageError(
+                f"engine {first.engine_name} needs the whole recording before it answers: take another engine"
+            )
+        self._worker: ThreadPoolExecutor | None = None
+        if sample_rate > SAMPLE_RATE:
+            _LOGGER.warning("at %d Hz nothing above %d Hz survives", sample_rate, SAMPLE_RATE // 2)
+        self.reset()
+
+    @classmethod
+    def create(
+        cls, frame_size: int, filter_length: int, sample_rate: int = SAMPLE_RATE, mics: int = 1, speakers: int = 1
+    ) -> EchoCanceller:
+        """Make one as speexdsp's Python class is made.
+
+        Parameters
+        ----------
+        frame_size, filter_length, speakers : int
+            Not needed: frames may have any length, the length of the echo path is the filter's own, and the
+            reference's channels are counted in each call.
+        sample_rate, mics : int
+            As `sample_rate` and `channels` of the class.
+
+        Returns
+        -------
+        EchoCanceller
+        """
+        return cls(sample_rate, mics)
+
+    def reset(self) -> None:
+        """Forget everything; the next sample is the first."""
+        rate = self.sample_rate
+        for each in self._filters:
+            each.reset()
+        self._to_filter = [Resampler(rate, SAMPLE_RATE) for _ in range(self.channels + 1)]
+        self._from_filter = [Resampler(SAMPLE_RATE, rate) for _ in range(self.channels)]
+        self.delay = self._filters[0].latency
+        if rate != SAMPLE_RATE:
+            # what both resamplers and the filter hold back, and a sample for each of the three that counts whole ones
+            held_s = self._to_filter[0].delay_s + self.delay / SAMPLE_RATE + self._from_filter[0].delay_s
+            self.delay = math.ceil(held_s * rate + 2 * max(rate / SAMPLE_RATE, 1.0))
+        self._ready: Samples = np.zeros((self.channels, self.delay), np.float32)
+
+    @property
+    def delay_ms(self) -> float:
+        """The delay in milliseconds."""
+        return 1000 * self.delay / self.sample_rate
+
+    @property
+    def speaking(self) -> bool:
+        """Whether the human is speaking, by the first microphone; always False where the engine does not judge it."""
+        return self._filters[0].human_speaks
+
+    def events(self) -> list[Event]:
+        """What happened at the first microphone since the last call, as of `EgoFilter`; its samples are those at 16 kHz."""
+        return self._filters[0].events()
+
+    def process(self, mic: Sound, ref: Sound) -> Sound:
+        """Take the next samples of both and return as many of the human.
+
+        Parameters
+        ----------
+        mic : ndarray of int16 or float, bytes or bytearray
+            (n,), with several microphones (n, channels) or interleaved; float: full scale +-1. Bytes: 16-bit samples,
+            interleaved. Never written to.
+        ref : the same
+            What the loudspeaker plays meanwhile, n samples; of several channels, (n, channels) or interleaved, the mean.
+
+        Returns
+        -------
+        the type of mic
+            As long as mic and in its shape, late by `delay`; integers beyond full scale are clipped.
+
+        Raises
+        ------
+        SignalError
+            For another type or shape, another length of ref, or samples that are not finite.
+        """
+        given, form = _samples(mic, "mic")
+        heard = _as_channels(given, self.channels, "mic")
+        played, _ = _samples(ref, "ref")
+        count = len(heard)
+        if played.size % max(count, 1) or played.size < count:
+            raise SignalError(
+                f"ref has {played.size} samples, expected the {count} of the microphone, or a multiple for several"
+                " channels: pad the shorter with zeros"
+            )
+        if not count:
+            return mic
+        said = self._to_filter[-1].push(played.reshape(count, -1).mean(axis=1, dtype=np.float32))
+        new = []
+        for number, ego in enumerate(self._filters):
+            human = ego.process(self._to_filter[number].push(np.ascontiguousarray(heard[:, number])), said)
+            new.append(self._from_filter[number].push(human))
+        ready = np.concatenate((self._ready, np.stack(new)), axis=1)
+        self._ready = ready[:, count:]
+        return _like(ready[:, :count].T.reshape(form), mic)
+
+    async def process_async(self, mic: Sound, ref: Sound) -> Sound:
+        """As `process`, in a thread of its own, so that the event loop goes on; calls are served in their order."""
+        if self._worker is None:
+            self._worker = ThreadPoolExecutor(1, "echo-canceller")
+        return await asyncio.get_running_loop().run_in_executor(self._worker, self.process, mic, ref)
+
+    def close(self) -> None:
+        """End the thread of `process_async`; `with` and `async with` do it by themselves."""
+        if self._worker is not None:
+            self._worker.shutdown()
+            self._worker = None
+
+    def __enter__(self) -> EchoCanceller:
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self.close()
+
+    async def __aenter__(self) -> EchoCanceller:
+        return self
+
+    async def __aexit__(self, *exc: object) -> None:
+        self.close()
+
+
+def _samples(sound: object, name: str) -> tuple[Samples, tuple[int, ...]]:
+    """What was given as float32 of full scale +-1, in any shape, and the shape."""
+    if isinstance(sound, bytes | bytearray | memoryview):
+        if len(sound) % 2:
+            raise SignalError(f"{name} has {len(sound)} bytes, expected whole 16-bit samples")
+        sound = np.frombuffer(sound, "<i2")
+    array = np.asarray(sound)
+    if array.dtype == np.int16:
+        return array.astype(np.float32) / np.float32(FULL_SCALE), array.shape
+    if array.dtype.kind == "f":
+        return array.astype(np.float32), array.shape
+    raise SignalError(f"{name} has dtype {array.dtype}, expected int16 or float in +-1")
+
+
+def _as_channels(samples: Samples, channels: int, name: str) -> Samples:
+    """Samples as (n, channels)."""
+    fits = samples.ndim == 1 and samples.size % channels == 0
+    if not fits and samples.shape[1:] != (channels,):
+        raise SignalError(
+            f"{name} has shape {samples.shape}, expected (n, {channels}) or {channels} channels interleaved"
+        )
+    return samples.reshape(-1, channels)
+
+
+def _like(samples: Samples, given: Sound) -> Sound:
+    """Samples in the type of what was given."""
+    if isinstance(given, np.ndarray):
+        whole = given.dtype.kind != "f"
+        return (to_pcm16(samples.reshape(-1))[0].reshape(samples.shape) if whole else samples).astype(given.dtype)
+    return type(given)(to_pcm16(samples.reshape(-1))[0].astype("<i2").tobytes())

@@ -1,0 +1,61 @@
+"""Opus packets to samples and back, by libopus within PyAV. Needs `pip install '.[opus]'` in a checkout."""
+
+from __future__ import annotations
+
+import av
+import av.error
+import numpy as np
+
+from edgefilter.errors import SignalError
+from edgefilter.types import SAMPLE_RATE, Samples
+
+RATE = 48_000
+"""Hz of what a decoder gives, whatever was encoded: the clock of Opus (RFC 6716, section 2)."""
+FRAME_MS = 20
+"""Length of a packet that is made here."""
+
+
+class Decoder:
+    """One mono stream of packets, decoded in their order."""
+
+    def __init__(self) -> None:
+        self._codec = av.CodecContext.create("libopus", "r")
+        self._codec.sample_rate, self._codec.layout = RATE, "mono"
+
+    def decode(self, packet: bytes) -> Samples:
+        """The samples (n,) of a packet at 48 kHz; raises SignalError for bytes that are none."""
+        try:
+            frames = self._codec.decode(av.Packet(packet)) if packet else []
+        except (av.error.FFmpegError, ValueError) as error:
+            raise SignalError(f"found {len(packet)} bytes that are no Opus packet ({type(error).__name__})") from None
+        parts = [frame.to_ndarray().reshape(-1, len(frame.layout.channels)) for frame in frames]
+        if not parts:
+            return np.zeros(0, np.float32)
+        return np.concatenate(parts)[:, 0].astype(np.float32) / np.float32(32768)
+
+
+class Encoder:
+    """One mono stream at `rate` as packets of 20 ms. bitrate: bits a second."""
+
+    def __init__(self, bitrate: int = 24_000, rate: int = SAMPLE_RATE) -> None:
+        self._codec = av.CodecContext.create("libopus", "w")
+        self._codec.sample_rate, self._codec.layout, self._codec.format = rate, "mono", "flt"
+        self._codec.bit_rate = bitrate
+        self._codec.options = {"application": "voip", "frame_duration": str(FRAME_MS)}
+        self._size = rate * FRAME_MS // 1000
+        self._rate = rate
+        self._waiting = np.zeros(0, np.float32)
+
+    def push(self, samples: Samples, last: bool = False) -> list[bytes]:
+        """Take samples (n,) and return the packets that are complete; after `last`, filled up with silence, nothing follows."""
+        waiting = np.concatenate((self._waiting, samples))
+        if last:
+            waiting = np.pad(waiting, (0, -waiting.size % self._size))
+        whole = waiting.size // self._size * self._size
+        self._waiting = waiting[whole:]
+        packets: list[bytes] = []
+        for at in range(0, whole, self._size):
+            frame = av.AudioFrame.from_ndarray(waiting[None, at : at + self._size], format="flt", layout="mono")
+            frame.sample_rate = self._rate
+            packets += [bytes(packet) for packet in self._codec.encode(frame)]
+        return packets

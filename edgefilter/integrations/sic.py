@@ -1,0 +1,160 @@
+"""Social Interaction Cloud: a component that takes a robot's microphone and what it says, and gives the human and barge-in.
+
+    python -m edgefilter.integrations.sic --profile robot.npz        # beside the robot's own component manager
+
+    human = Human(input_source=pepper.mic)
+    human.register_callback(on_human)                   # AudioMessage, and SpeechMessage when the human begins or ends
+    human.request(AudioRequest(wave, rate), block=False)                  # what is sent to the loudspeaker, too
+
+Needs `pip install '.[sic]'` in a checkout, and the framework's Redis server.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import sys
+
+import redis
+from sic_framework import SICComponentManager
+from sic_framework.core.component_python2 import SICComponent
+from sic_framework.core.connector import SICConnector
+from sic_framework.core.message_python2 import AudioMessage, AudioRequest, SICConfMessage, SICMessage, SICRequest
+from sic_framework.core.utils import is_sic_instance
+
+from edgefilter.errors import EdgefilterError
+from edgefilter.filter.barge_in import BargeInSettings
+from edgefilter.filter.ego_filter import EgoFilter
+from edgefilter.integrations.duplex import Duplex
+from edgefilter.types import SAMPLE_RATE, Event
+
+SPEECH = {"speech_started": True, "speech_stopped": False}
+_default = {"profile": None, "engine": "auto"}
+
+
+class HumanConf(SICConfMessage):
+    """What `Human(conf=...)` may say.
+
+    Parameters
+    ----------
+    profile : str, optional
+        File of the calibrated robot, where the component runs; unless given, what its command line says.
+    engine : str, optional
+        As of `EgoFilter`; likewise.
+    """
+
+    def __init__(self, profile: str | None = None, engine: str | None = None) -> None:
+        self.profile, self.engine = profile, engine
+
+
+class SpeechMessage(SICMessage):
+    """The human began or stopped speaking, or something was connected wrongly.
+
+    kind, detail: of the `edgefilter.Event`. seconds: of the microphone. is_speaking: whether the human speaks now; None for
+    events of other kinds.
+    """
+
+    def __init__(self, event: Event) -> None:
+        super().__init__()
+        self.kind, self.detail = event.kind, event.detail
+        self.seconds = event.sample / SAMPLE_RATE
+        self.is_speaking = SPEECH.get(event.kind)
+
+
+class SilencedRequest(SICRequest):
+    """Tell the component that the robot fell silent in mid-word: what was not played yet is no reference."""
+
+
+class HumanComponent(SICComponent):
+    """Takes AudioMessage of the microphone, AudioRequest of what is said, and sends AudioMessage and SpeechMessage."""
+
+    COMPONENT_STARTUP_TIMEOUT = 10
+
+    def __init__(self, *words: object, **more: object) -> None:
+        super().__init__(*words, **more)
+        profile = self.params.profile or _default["profile"]
+        engine = self.params.engine or _default["engine"] or "auto"
+        ego = EgoFilter(profile, engine, barge_in=BargeInSettings(judge="network"))
+        self._duplex = Duplex(ego, on_event=self._tell)
+
+    @staticmethod
+    def get_conf() -> HumanConf:
+        """Return what is meant without a configuration."""
+        return HumanConf()
+
+    @staticmethod
+    def get_inputs() -> list[type]:
+        """Return the types of message that are taken."""
+        return [AudioMessage]
+
+    @staticmethod
+    def get_output() -> type:
+        """Return the type of the sound that is sent."""
+        return AudioMessage
+
+    def start(self) -> None:
+        """Serve until the manager says that it is over."""
+        super().start()
+        self._signal_to_stop.wait()
+        self._stopped.set()
+
+    def on_message(self, message: AudioMessage) -> None:
+        """Filter what the microphone heard, and send what is finished."""
+        human = self._duplex.hear_pcm16(bytes(message.waveform), message.sample_rate)
+        if human:
+            answer = AudioMessage(human, sample_rate=message.sample_rate)
+            answer._timestamp = message._timestamp
+            self.output_message(answer)
+
+    def on_request(self, request: SICRequest) -> SICMessage:
+        """Take what is said as the reference, or its end."""
+        if is_sic_instance(request, AudioRequest):
+            self._duplex.play_pcm16(bytes(request.waveform), request.sample_rate)
+        elif is_sic_instance(request, SilencedRequest):
+            self._duplex.interrupt()
+        else:
+            raise NotImplementedError(f"found {type(request).__name__}, expected AudioRequest or SilencedRequest")
+        return SICMessage()
+
+    def _tell(self, event: Event) -> None:
+        message = SpeechMessage(event)
+        message._timestamp = self._get_timestamp()
+        self.output_message(message)
+
+    def _cleanup(self) -> None:
+        self._duplex.close()
+
+
+class Human(SICConnector):
+    """The component for a program: `Human(input_source=microphone)`."""
+
+    component_class = HumanComponent
+    component_group = "Edgefilter"
+
+
+def main(words: list[str] | None = None) -> int:
+    """Serve the component where it is asked for; one line and exit code 1 where that fails."""
+    parser = argparse.ArgumentParser(prog="python -m edgefilter.integrations.sic", description=__doc__.splitlines()[0])
+    parser.add_argument("--profile", help="the calibrated robot")
+    parser.add_argument("--engine", default="auto", help="one beside which the network can judge speech")
+    args = parser.parse_args(words)
+    try:
+        EgoFilter(
+            args.profile, args.engine, barge_in=BargeInSettings(judge="network")
+        )  # what cannot be made is said now
+        _default.update(profile=args.profile, engine=args.engine)
+        manager = SICComponentManager([HumanComponent], component_group=Human.component_group, auto_serve=False)
+    except redis.exceptions.RedisError as error:
+        print(f"edgefilter: the Redis server of DB_IP, DB_PORT and DB_PASS cannot be reached: {error}", file=sys.stderr)
+        return 1
+    except (EdgefilterError, OSError) as error:
+        print(f"edgefilter: {error}", file=sys.stderr)
+        return 1
+    print(f"serving HumanComponent at {manager.ip}", file=sys.stderr)
+    manager.serve()
+    return 0
+
+
+if __name__ == "__main__":
+    # messages are known by the module that they are of, which is not __main__
+    sys.exit(importlib.import_module("edgefilter.integrations.sic").main())

@@ -1,0 +1,213 @@
+"""What a device says to `edgefilter serve`: its first message, and two labelled streams put on one sample counter."""
+
+from __future__ import annotations
+
+import json
+import struct
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+
+from edgefilter.errors import SignalError
+from edgefilter.types import Samples
+
+HEADER = struct.Struct("<BxHQ")
+"""Before the sound of a message of one of two streams: its label, an unused byte, the number of the message in its stream
+(from 65535 on to 0), and the counter of its first sample; little-endian."""
+MICROPHONE, REFERENCE = 0, 1
+"""Labels."""
+RATES = range(8000, 48001)
+"""Hz that a device may have."""
+MOST_LATE_MS = 2000
+"""By how much the reference may come later than the microphone."""
+JITTER_S = 0.06
+"""For how long a message that is missing is waited for: three of 20 ms."""
+MOST_GAP_S = 10.0
+"""Longest gap that is filled with silence; a counter that jumps further is another stream."""
+
+
+@dataclass(frozen=True)
+class Form:
+    """How a device sends: the first message.
+
+    rate: Hz, of the samples and of the counters. streams: "stereo", microphone and reference interleaved, or "two",
+    each message of one stream, with a HEADER. codec: "pcm", 16 bit, or "opus", mono, at a rate of 48000 and in two streams.
+    late_ms: how long the microphone waits for a reference that comes later. learn: whether to learn the room. bitrate:
+    bits a second of the answer in Opus.
+    """
+
+    rate: int = 16000
+    streams: Literal["stereo", "two"] = "stereo"
+    codec: Literal["pcm", "opus"] = "pcm"
+    late_ms: int = 0
+    learn: bool = False
+    bitrate: int = 24000
+
+    @classmethod
+    def of(cls, text: str | bytes) -> Form:
+        """Read the first message; raises SignalError, one line, for what it may not hold.
+
+        >>> Form.of('{"rate": 48000}').rate
+        48000
+        """
+        given = message_of(text)
+        bounds: dict[str, Any] = {
+            "rate": RATES,
+            "streams": ("stereo", "two"),
+            "codec": ("pcm", "opus"),
+            "late_ms": range(MOST_LATE_MS + 1),
+            "learn": (False, True),
+            "bitrate": range(6000, 128001),
+        }
+        for name, value in given.items():
+            allowed = bounds.get(name)
+            if allowed is None:
+                raise SignalError(f"the first message has '{name}', expected {', '.join(bounds)}")
+            if isinstance(value, float) or value not in allowed or isinstance(value, bool) != (name == "learn"):
+                expected = (
+                    f"{allowed[0]} to {allowed[-1]}" if isinstance(allowed, range) else " or ".join(map(str, allowed))
+                )
+                raise SignalError(f"the first message has {name} {value!r}, expected {expected}")
+        form = cls(**given)
+        if form.codec == "opus" and (form.streams != "two" or form.rate != 48000):
+            raise SignalError(
+                "codec opus needs two streams and a rate of 48000: one packet of both would mix them, and its clock is"
+                " always 48 kHz"
+            )
+        return form
+
+
+def message_of(text: str | bytes) -> dict[str, Any]:
+    """A message in JSON; raises SignalError for what is none."""
+    try:
+        found = json.loads(text)
+    except (ValueError, RecursionError):
+        found = None
+    if isinstance(text, bytes) or not isinstance(found, dict):
+        raise SignalError(f"found {text[:40]!r}, expected a text message with an object in JSON")
+    return found
+
+
+class _Order:
+    """Messages of one stream in the order of their numbers; one that is missing is given up after a while.
+
+    give: called with the counter of its first sample, its sound, and how many messages were lost before it. newest: the
+    highest counter so far.
+    """
+
+    def __init__(self, give: Callable[[int, bytes, int], None], jitter: int) -> None:
+        self._give, self._jitter = give, jitter
+        self._next: int | None = None
+        self._waiting: dict[int, tuple[int, bytes]] = {}
+        self.newest = 0
+
+    def push(self, number: int, at: int, sound: bytes) -> None:
+        """Take a message."""
+        if self._next is None:
+            self._next = number
+        ahead = (number - self._next + 32768) % 65536 - 32768
+        if ahead < 0 or number in self._waiting:
+            return  # given up, or sent twice
+        self.newest = max(self.newest, at)
+        self._waiting[number] = (at, sound)
+        self._drain(0)
+        if self._waiting and self.newest - min(start for start, _ in self._waiting.values()) > self._jitter:
+            first = min(self._waiting, key=lambda each: (each - (self._next or 0)) % 65536)
+            lost, self._next = (first - self._next) % 65536, first
+            self._drain(lost)
+
+    def _drain(self, lost: int) -> None:
+        while self._next in self._waiting:
+            at, sound = self._waiting.pop(self._next)
+            self._next = (self._next + 1) % 65536
+            self._give(at, sound, lost)
+            lost = 0
+
+
+class TwoStreams:
+    """Microphone and reference with counters of one clock, put together; every sample of the microphone comes out.
+
+    decoders: for each label, what makes samples of a message's sound. The microphone waits for its reference, up to
+    late samples of its own. lost: samples for which silence stands in, of the microphone and of messages of the reference
+    that never came. late: samples of the reference that came too late, and were left out; lateness: by how many samples
+    more than allowed the latest of them was.
+    """
+
+    def __init__(self, decoders: tuple[Callable[[bytes], Samples], ...], rate: int, late: int) -> None:
+        self._decoders, self._rate, self._wait = decoders, rate, late
+        gives = (self._take_mic, self._take_ref)
+        self._orders = [_Order(give, round(JITTER_S * rate)) for give in gives]
+        self._at: int | None = None
+        self._mic, self._ref = np.zeros(0, np.float32), np.zeros(0, np.float32)
+        self._early: list[tuple[int, Samples]] = []
+        self._ref_end = 0
+        self.lost = self.late = self.lateness = 0
+
+    def push(self, message: bytes) -> None:
+        """Take a message with its header; raises SignalError for one that is none."""
+        if len(message) < HEADER.size:
+            raise SignalError(f"found a message of {len(message)} bytes, expected a header of {HEADER.size} and sound")
+        label, number, at = HEADER.unpack_from(message)
+        if label not in (MICROPHONE, REFERENCE):
+            raise SignalError(f"found label {label}, expected {MICROPHONE} (microphone) or {REFERENCE} (reference)")
+        self._orders[label].push(number, at, message[HEADER.size :])
+
+    def take(self, last: bool = False) -> tuple[Samples, Samples]:
+        """What is complete of both, (n,) each; last: all."""
+        if self._at is None:
+            return self._mic, self._ref
+        known = max(self._ref_end, self._orders[MICROPHONE].newest - self._wait) - self._at
+        count = self._mic.size if last else min(max(known, 0), self._mic.size)
+        mic, self._mic = self._mic[:count], self._mic[count:]
+        ref = self._ref[:count]
+        self._ref = self._ref[count:]
+        self._at += count
+        return mic, np.concatenate((ref, np.zeros(count - ref.size, np.float32)))
+
+    def _take_mic(self, at: int, sound: bytes, lost: int) -> None:
+        samples = self._decoders[MICROPHONE](sound)
+        if self._at is None:
+            self._at = at
+            early, self._early = self._early, []
+            for start, part in early:
+                self._place(start, part)
+        end = self._at + self._mic.size
+        gap = at - end
+        self._check_gap(gap)
+        if gap > 0:
+            self.lost += gap
+            self._mic = np.concatenate((self._mic, np.zeros(gap, np.float32)))
+        self._mic = np.concatenate((self._mic, samples[max(-gap, 0) :]))
+
+    def _take_ref(self, at: int, sound: bytes, lost: int) -> None:
+        samples = self._decoders[REFERENCE](sound)
+        self.lost += max(at - self._ref_end, 0) if lost else 0
+        self._ref_end = max(self._ref_end, at + samples.size)
+        if self._at is None:
+            self._early.append((at, samples))
+            del self._early[:-64]
+        else:
+            self._place(at, samples)
+
+    def _place(self, at: int, samples: Samples) -> None:
+        """Put samples of the reference where they belong; what belongs to samples that are gone is too late."""
+        assert self._at is not None
+        late = min(max(self._at - at, 0), samples.size)
+        if late and samples[:late].any():
+            self.late += late
+            self.lateness = self._at - at
+        at, samples = at + late, samples[late:]
+        start = at - self._at
+        self._check_gap(start - self._ref.size)
+        if start > self._ref.size:
+            self._ref = np.concatenate((self._ref, np.zeros(start - self._ref.size, np.float32)))
+        known = min(max(self._ref.size - start, 0), samples.size)
+        self._ref = np.concatenate((self._ref, samples[known:]))
+
+    def _check_gap(self, gap: int) -> None:
+        if abs(gap) > MOST_GAP_S * self._rate:
+            raise SignalError(
+                f"a counter jumps by {gap / self._rate:.1f} s, expected {MOST_GAP_S:.0f} s at most: begin a new connection"
+            )

@@ -1,0 +1,94 @@
+"""A lag that band energies tell where no sharp arrival does, and what the linear stage makes of it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import soundfile
+
+import edgefilter
+from edgefilter.alignment.aligner import Aligner
+from edgefilter.alignment.coarse_lag import CoarseLag
+from edgefilter.engines.linear import Linear
+from edgefilter.filter.canceller import Canceller
+from edgefilter.filter.front_end import FrontEnd
+from tests.conformance import robot_speech
+
+HOP = 256
+DEMO = Path(edgefilter.__file__).parent / "demo_data"
+
+
+def hops(x: np.ndarray) -> np.ndarray:
+    return x[: x.size // HOP * HOP].reshape(-1, HOP)
+
+
+def diffuse(width: float, seed: int) -> np.ndarray:
+    """A path without an arrival: noise under a bell of that width in samples."""
+    t = np.arange(8 * width)
+    h = np.random.default_rng(seed).standard_normal(t.size) * np.exp(-0.5 * ((t - 3 * width) / width) ** 2)
+    return h / np.sqrt(np.sum(h**2))
+
+
+def heard(x: np.ndarray, path: np.ndarray, lag: int, noise_db: float, seed: int) -> np.ndarray:
+    echo = np.concatenate((np.zeros(lag), np.convolve(x, path)))[: x.size]
+    noise = np.random.default_rng(seed).standard_normal(x.size) * echo.std() * 10 ** (noise_db / 20)
+    return (echo + noise).astype(np.float32)
+
+
+@pytest.mark.parametrize("lag", [700, 9_000, 23_000])
+@pytest.mark.parametrize("factor", [1e-4, 1.0, 1e4])
+def test_the_lag_of_a_diffuse_path_is_found_to_within_its_spread_at_any_level(lag, factor):
+    x, coarse = robot_speech(6.0), CoarseLag(HOP, 25_600)
+    for pair in zip(hops(factor * heard(x, diffuse(100, 1), lag, -20, 2)), hops(x), strict=True):
+        coarse.step(*pair)
+    found = coarse.find()
+    assert found is not None and lag - HOP < found < lag + 600 + HOP  # the bell ends there
+
+
+def test_of_a_reference_that_is_played_unheard_no_lag_is_believed():
+    """Beside another's speech: the same voice backwards."""
+    voice, _ = soundfile.read(DEMO / "reference.flac", dtype="float32")
+    coarse = CoarseLag(HOP, 25_600)
+    for pair in zip(hops(voice[::-1]), hops(voice), strict=True):
+        coarse.step(*pair)
+        assert coarse.find() is None
+
+
+def test_silence_on_either_side_says_nothing():
+    coarse, x = CoarseLag(HOP, 8_000), robot_speech(2.0)
+    for hop in hops(x):
+        coarse.step(0 * hop, hop)
+    for hop in hops(x):
+        coarse.step(hop, 0 * hop)
+    assert coarse.find() is None
+
+
+@pytest.mark.parametrize(("width", "lag", "noise_db"), [(120, 2_900, -30), (200, 3_600, -30), (120, 20_000, -20)])
+def test_the_linear_stage_follows_a_path_without_an_arrival(width, lag, noise_db):
+    """Nothing was subtracted for ever where the cross-correlation had no peak; in dB it removes as much as with the true lag."""
+    x = robot_speech(8.0)
+    mic = heard(x, diffuse(width, width), lag, noise_db, 3)
+    front, knowing = FrontEnd(Linear(), None), Canceller(HOP)
+    late = np.concatenate((np.zeros(lag, np.float32), x))[: x.size]
+    left: tuple[list, list] = ([], [])
+    for m, r, true in zip(hops(mic), hops(x), hops(late), strict=True):
+        aligned = front.aligner.step(m, r)
+        left[0].append(front.linear_stage.step(m, aligned).error)
+        left[1].append(knowing.step(m, true).error)
+    third = slice(lag + 2 * 16_000, lag + 4 * 16_000)
+    lowered = [-10 * np.log10(np.mean(np.concatenate(e)[third] ** 2) / np.mean(mic[third] ** 2)) for e in left]
+    assert lowered[0] > 0.8 * lowered[1] > 5.0
+
+
+def test_the_state_says_that_the_lag_is_coarse_and_a_sharp_arrival_ends_it():
+    x = robot_speech(8.0)
+    mic = heard(x, diffuse(200, 5), 3_600, -30, 3)
+    aligner = Aligner(HOP)
+    states = [aligner.step(*pair).state for pair in zip(hops(mic), hops(x), strict=True)]
+    assert "coarse" in states
+    sharp, aligner = np.roll(x, 3_000), Aligner(HOP)
+    sharp[:3_000] = 0.0
+    states = [aligner.step(*pair).state for pair in zip(hops(sharp), hops(x), strict=True)]
+    assert states[-1] == "locked"

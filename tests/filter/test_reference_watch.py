@@ -1,0 +1,107 @@
+"""A reference that is late, missing, or another sound: it is said, and no robot is taken for somebody because of it."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import soundfile
+
+import edgefilter
+from edgefilter import EgoFilter
+from edgefilter.filter.barge_in import BargeIn
+from edgefilter.types import SET_UP_WRONG
+
+DEMO = Path(edgefilter.__file__).parent / "demo_data"
+RATE = 16_000
+LAG = 2288
+"""Samples after which the microphone of the bundled conversation hears the reference's first utterance."""
+
+
+@pytest.fixture(scope="module")
+def robot():
+    """The bundled robot alone: microphone and reference, 9 s."""
+    return [soundfile.read(DEMO / f"{name}.flac", dtype="float32")[0][: 9 * RATE] for name in ("mic", "reference")]
+
+
+def later(x, samples):
+    return np.concatenate((np.zeros(samples, np.float32), x))[: x.size]
+
+
+def events(ego, mic, ref, block=256):
+    for at in range(0, mic.size, block):
+        ego.process(mic[at : at + block], ref[at : at + block])
+    return ego.events()
+
+
+@pytest.mark.parametrize("profile", [None, DEMO / "profile.npz"], ids=["no profile", "profile"])
+@pytest.mark.parametrize("late_ms", [60, 157, 300])
+def test_a_robot_whose_reference_is_late_is_not_taken_for_somebody_and_the_lateness_is_said(robot, profile, late_ms):
+    mic, ref = robot
+    found = events(EgoFilter(profile, "crnn"), mic, later(ref, LAG + 16 * late_ms))
+    assert "speech_started" not in {event.kind for event in found}
+    (late,) = (event for event in found if event.kind == "reference_late")
+    assert f"comes {late_ms} ms after" in late.detail or f"comes {late_ms - 1} ms after" in late.detail
+    assert late.sample < 1.5 * RATE  # half a second after the reference has begun, the latest of which does at 0.9 s
+
+
+def test_a_reference_in_time_is_said_nothing_of_and_the_human_is_noticed_as_before():
+    mic, ref = (soundfile.read(DEMO / f"{name}.flac", dtype="float32")[0] for name in ("mic", "reference"))
+    found = events(EgoFilter(DEMO / "profile.npz", "crnn"), mic, ref)
+    assert not {event.kind for event in found} & set(SET_UP_WRONG)
+    (began,) = (event for event in found if event.kind == "speech_started")
+    assert 9.1 < began.sample / RATE < 9.6
+
+
+def test_a_late_reference_that_is_mended_is_forgotten(robot):
+    mic, ref = robot
+    ego = EgoFilter(DEMO / "profile.npz", "crnn")
+    assert "reference_late" in {event.kind for event in events(ego, mic, later(ref, LAG + 4800))}
+    talking = soundfile.read(DEMO / "mic.flac", dtype="float32")[0]
+    reference = soundfile.read(DEMO / "reference.flac", dtype="float32")[0]
+    found = events(ego, talking, reference)
+    began = [event.sample / RATE - 9 for event in found if event.kind == "speech_started"]
+    assert len(began) == 1 and 9.1 < began[0] < 9.8, "the human is noticed beside the robot"
+
+
+def test_somebody_who_speaks_before_the_robot_ever_did_is_noticed_half_a_second_later():
+    """Until the reference was seen to come in time, what begins while it is silent may be the robot."""
+    human = soundfile.read(DEMO / "human.flac", dtype="float32")[0][9 * RATE : 13 * RATE]
+    rng = np.random.default_rng(0)
+    mic = np.concatenate((np.zeros(RATE), 10 * human)).astype(np.float32)
+    mic += (1e-3 * rng.standard_normal(mic.size)).astype(np.float32)
+    found = [event for event in events(EgoFilter(engine="crnn"), mic, 0 * mic) if event.kind == "speech_started"]
+    assert len(found) == 1 and 1.5 * RATE < found[0].sample < 2.5 * RATE
+
+
+def test_another_sound_than_the_loudspeaker_s_is_said(robot):
+    mic, ref = robot
+    quiet = (1e-4 * np.random.default_rng(2).standard_normal(2 * RATE)).astype(np.float32)
+    other = np.concatenate((0 * quiet, ref[::-1], ref[::-1]))
+    heard = np.concatenate((quiet, mic, mic))
+    ego = EgoFilter(engine="linear")
+    wrong = [event for event in events(ego, heard, other) if event.kind in SET_UP_WRONG]
+    assert [event.kind for event in wrong] == ["robot_unfound"] and "dB louder" in wrong[0].detail
+
+
+def test_a_robot_that_plays_unheard_is_no_mistake(robot):
+    _, ref = robot
+    rng = np.random.default_rng(2)
+    mic = (1e-3 * rng.standard_normal(2 * RATE + 2 * ref.size)).astype(np.float32)
+    other = np.concatenate((np.zeros(2 * RATE, np.float32), ref, ref))
+    assert not [event for event in events(EgoFilter(engine="linear"), mic, other) if event.kind in SET_UP_WRONG]
+
+
+@pytest.mark.parametrize(("level", "said"), [(0.1, 1), (1e-5, 0)], ids=["sound", "silence"])
+def test_a_reference_that_never_comes_is_said_once_where_something_is_heard(level, said):
+    mic = (level * np.random.default_rng(3).standard_normal(100 * RATE)).astype(np.float32)
+    found = events(EgoFilter(engine="linear"), mic, 0 * mic, block=RATE)
+    wrong = [event for event in found if event.kind in SET_UP_WRONG]
+    assert [event.kind for event in wrong] == ["reference_missing"] * said
+
+
+def test_speech_that_waits_is_told_once_it_may_be_and_never_if_it_has_ended():
+    talk = BargeIn(0.1)
+    assert [talk.note(0.99, wait=3) for _ in range(5)] == [None, None, None, "speech_started", None]
+    assert [talk.note(0.0, wait=3) for _ in range(6)].count("speech_stopped") == 1
+    assert [talk.note(p, wait=30) for p in (0.99, *[0.0] * 6, 0.5)] == [None] * 8 and not talk.speaking
+    assert talk.note(0.99, wait=0) == "speech_started"

@@ -1,0 +1,96 @@
+"""A program of the Social Interaction Cloud: a room's microphone as a component, the human's ears, and a robot that talks.
+
+Usage: sic_program.py FOLDER. Writes what the human's component has sent, as JSON and samples.
+"""
+
+import json
+import sys
+import threading
+import time
+from pathlib import Path
+
+import numpy as np
+
+ROOT = Path(__file__).parents[2]
+sys.path.append(str(ROOT / "docs/examples"))
+
+import room as simulated  # noqa: E402
+from sic_framework import SICComponentManager, SICConfMessage  # noqa: E402
+from sic_framework.core.connector import SICConnector  # noqa: E402
+from sic_framework.core.message_python2 import AudioMessage, AudioRequest  # noqa: E402
+from sic_framework.core.sensor_python2 import SICSensor  # noqa: E402
+from sic_framework.core.sic_application import SICApplication  # noqa: E402
+
+from edgefilter.integrations.sic import Human, SpeechMessage  # noqa: E402
+
+FRAME = 1600  # 0.1 s
+FRAMES = 60
+ROOM = simulated.Room()
+BEGIN = threading.Event()
+
+
+class RoomMicrophoneSensor(SICSensor):
+    def execute(self):
+        BEGIN.wait(1.0)
+        if not BEGIN.is_set() or self.sent >= FRAMES:
+            time.sleep(0.05)
+            return None
+        time.sleep(max(0.0, self.begun + self.sent * 0.1 - time.monotonic()) if self.sent else 0.0)
+        self.begun = self.begun or time.monotonic()
+        if self.sent == 30:
+            ROOM.speak()
+        self.sent += 1
+        heard = np.rint(ROOM.hear(FRAME) * 32767).astype("<i2")
+        return AudioMessage(heard.tobytes(), sample_rate=16000)
+
+    begun, sent = 0.0, 0
+
+    @staticmethod
+    def get_conf():
+        return SICConfMessage()
+
+    @staticmethod
+    def get_inputs():
+        return []
+
+    @staticmethod
+    def get_output():
+        return AudioMessage
+
+
+class RoomMicrophone(SICConnector):
+    component_class = RoomMicrophoneSensor
+    component_group = "Room"
+
+
+def main():
+    app = SICApplication()
+    threading.Thread(
+        target=lambda: SICComponentManager([RoomMicrophoneSensor], component_group="Room"), daemon=True
+    ).start()
+    time.sleep(1.0)
+    sound, told = [], []
+
+    def take(message):
+        if isinstance(message, SpeechMessage):
+            told.append([message.kind, message.seconds, message.is_speaking])
+        else:
+            sound.append(np.frombuffer(message.waveform, "<i2"))
+
+    microphone = RoomMicrophone()
+    human = Human(input_source=microphone)
+    human.register_callback(take)
+    said = np.rint(simulated.ROBOT * 32767).astype("<i2").tobytes()
+    human.request(AudioRequest(said, 16000))
+    ROOM.play(simulated.ROBOT)
+    BEGIN.set()
+    end = time.monotonic() + 30
+    while sum(map(len, sound)) < (FRAMES - 2) * FRAME and time.monotonic() < end:
+        time.sleep(0.1)
+    folder = Path(sys.argv[1])
+    np.save(folder / "human.npy", np.concatenate(sound) if sound else np.zeros(0))
+    (folder / "told.json").write_text(json.dumps(told))
+    app.shutdown()
+
+
+main()

@@ -1,0 +1,457 @@
+"""`edgefilter serve` with a real WebSocket client: what comes out, and clients that are slow, wrong, late or gone."""
+
+import asyncio
+import json
+import signal
+import subprocess
+import sys
+from contextlib import asynccontextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+import soundfile
+import soxr
+from websockets.asyncio.client import connect
+from websockets.exceptions import ConnectionClosed, InvalidStatus
+
+import edgefilter
+from edgefilter import EgoFilter
+from edgefilter.cli import main
+from edgefilter.dsp.metrics import si_sdr
+from edgefilter.integrations import serve as module
+from edgefilter.integrations.opus import Decoder, Encoder
+from edgefilter.integrations.serve import Service
+from edgefilter.integrations.wire import HEADER, MICROPHONE, REFERENCE
+
+ROOT = Path(__file__).parents[2]
+DEMO = Path(edgefilter.__file__).parent / "demo_data"
+RATE = 16_000
+BOTH = slice(9 * RATE, 15 * RATE)
+"""Where human and robot talk at once in the bundled conversation."""
+
+
+@pytest.fixture(scope="module")
+def conversation():
+    """Microphone, reference and the human alone, 16 s."""
+    return [soundfile.read(DEMO / f"{name}.flac", dtype="float32")[0] for name in ("mic", "reference", "human")]
+
+
+def pcm(x):
+    return np.rint(np.clip(x, -1, 32767 / 32768) * 32768).astype("<i2").tobytes()
+
+
+def as_float(data):
+    return np.frombuffer(data, "<i2").astype(np.float32) / 32768
+
+
+@asynccontextmanager
+async def serving(engine="crnn", profile=DEMO / "profile.npz", streams=4, token=None):
+    """The address of a service, which is ended afterwards."""
+    service = Service(lambda learns: EgoFilter(profile, engine), streams, token=token)
+    found = asyncio.get_running_loop().create_future()
+    task = asyncio.create_task(service.run("127.0.0.1", 0, found.set_result))
+    try:
+        yield f"ws://127.0.0.1:{await found}"
+    finally:
+        service.stop()
+        await asyncio.wait_for(task, 20)
+
+
+async def converse(address, hello, messages, pause_s=0.0):
+    """Send all messages, then the end; the sound that came back and what was told."""
+    async with connect(address, compression=None, max_size=None) as server:
+        await server.send(json.dumps(hello))
+
+        async def speak():
+            for message in messages:
+                await server.send(message)
+                if pause_s:
+                    await asyncio.sleep(pause_s)
+            await server.send(json.dumps({"kind": "end"}))
+
+        speaking = asyncio.create_task(speak())
+        sound, told = [], []
+        try:
+            async for answer in server:
+                sound.append(answer) if isinstance(answer, bytes) else told.append(json.loads(answer))
+        except ConnectionClosed:
+            pass
+        speaking.cancel()
+        return sound, told
+
+
+def run(coroutine):
+    return asyncio.run(asyncio.wait_for(coroutine, 120))
+
+
+async def heard(hello, messages, **words):
+    async with serving(**words) as address:
+        return await converse(address, hello, messages)
+
+
+def stereo_messages(mic, ref, size=320):
+    both = np.stack([mic, ref], axis=1)
+    return [pcm(both[at : at + size]) for at in range(0, len(both), size)]
+
+
+def labelled(mic, ref, size=320, ref_after=0, keep=lambda label, number: True):
+    """Messages of two streams as a device sends them; the reference's come ref_after messages later than the microphone's."""
+    packets = [[], []]
+    for label, x in ((MICROPHONE, mic), (REFERENCE, ref)):
+        for number in range(x.size // size):
+            at = number * size
+            packets[label].append(HEADER.pack(label, number % 65536, at) + pcm(x[at : at + size]))
+    out = []
+    for number in range(len(packets[0]) + ref_after):
+        if number < len(packets[0]) and keep(MICROPHONE, number):
+            out.append(packets[0][number])
+        if 0 <= number - ref_after < len(packets[1]) and keep(REFERENCE, number - ref_after):
+            out.append(packets[1][number - ref_after])
+    return out
+
+
+def kinds(told):
+    return [each["kind"] for each in told]
+
+
+def test_a_stereo_stream_is_filtered_as_a_file_is_and_the_human_is_told(conversation):
+    mic, ref, human = conversation
+    sound, told = run(heard({"rate": RATE}, stereo_messages(mic, ref)))
+    out = as_float(b"".join(sound))
+    ego = EgoFilter(DEMO / "profile.npz", "crnn")
+    expected = np.concatenate((ego.process(as_float(pcm(mic)), as_float(pcm(ref))), ego.flush()))
+    np.testing.assert_allclose(out, expected, atol=1 / 32768)
+    assert si_sdr(mic[BOTH], human[BOTH]) < -20 and si_sdr(out[BOTH], human[BOTH]) > 6  # 9.4 dB were seen
+    assert kinds(told)[0] == "ready" and kinds(told)[-1] == "ended" and told[-1]["samples"] == mic.size
+    (began,) = (each["time"] for each in told if each["kind"] == "speech_started")
+    assert 9.1 < began < 9.6 and told[0]["delay_ms"] == 32.0
+
+
+@pytest.mark.parametrize("rate", [8000, 44100, 48000])
+def test_other_rates_give_as_many_samples_as_came_and_8_ms_more_of_delay(conversation, rate):
+    mic, ref = (soxr.resample(x[: 4 * RATE], RATE, rate) for x in conversation[:2])
+    sound, told = run(heard({"rate": rate}, stereo_messages(mic, ref, rate // 50), engine="linear"))
+    out = as_float(b"".join(sound))
+    assert abs(out.size - mic.size) <= 3 and told[0]["delay_ms"] <= 40
+    late = slice(rate * 2, rate * 3)
+    assert 10 * np.log10(np.mean(out[late] ** 2) / np.mean(mic[late] ** 2)) < -15
+
+
+@pytest.mark.parametrize("late", [0, 5, 100], ids=["in time", "0.1 s late", "2 s late"])
+def test_two_streams_are_put_together_however_late_the_reference_comes(conversation, late):
+    mic, ref = (x[: 8 * RATE] for x in conversation[:2])
+    hello = {"rate": RATE, "streams": "two", "late_ms": 2000}
+    sound, told = run(heard(hello, labelled(mic, ref, ref_after=late)))
+    straight, _ = run(heard({"rate": RATE}, stereo_messages(mic, ref)))
+    np.testing.assert_array_equal(as_float(b"".join(sound)), as_float(b"".join(straight))[: mic.size // 320 * 320])
+    assert told[-1]["lost"] == told[-1]["late"] == 0 and "speech_started" not in kinds(told)
+
+
+def test_a_reference_later_than_said_is_told_with_what_to_say(conversation):
+    mic, ref = (x[: 4 * RATE] for x in conversation[:2])
+    _, told = run(heard({"streams": "two", "late_ms": 100}, labelled(mic, ref, ref_after=20), engine="linear"))
+    wrong = [each["detail"] for each in told if each["kind"] == "reference_late"]
+    assert len(wrong) == 1 and "later than the 100 ms" in wrong[0] and "late_ms" in wrong[0] and told[-1]["late"] > 0
+
+
+def test_messages_that_are_lost_doubled_or_out_of_order_leave_the_rest_in_its_place(conversation):
+    mic, ref = (x[: 8 * RATE] for x in conversation[:2])
+    gone = {60, 61, 150}
+    messages = labelled(mic, ref, keep=lambda label, number: label == REFERENCE or number not in gone)
+    messages[40], messages[44] = messages[44], messages[40]
+    messages.insert(50, messages[30])
+    sound, told = run(heard({"streams": "two", "late_ms": 200}, messages))
+    assert told[-1]["lost"] == 3 * 320 and "lost" in kinds(told)
+    holed = mic.copy()
+    for number in gone:
+        holed[number * 320 : number * 320 + 320] = 0
+    whole = mic.size // 320 * 320
+    straight, _ = run(heard({}, stereo_messages(holed[:whole], ref[:whole])))
+    np.testing.assert_array_equal(as_float(b"".join(sound)), as_float(b"".join(straight)))
+
+
+def test_a_reference_that_is_only_sent_while_the_robot_talks_is_silence_meanwhile(conversation):
+    mic, ref = (x[: 8 * RATE] for x in conversation[:2])
+    ref = np.where(np.repeat(np.abs(ref).reshape(-1, 320).max(axis=1) > 0, 320), ref, 0)
+    silent = {number for number in range(ref.size // 320) if not ref[number * 320 : number * 320 + 320].any()}
+    count, messages = 0, []
+    for number in range(ref.size // 320):
+        at = number * 320
+        messages.append(HEADER.pack(MICROPHONE, number, at) + pcm(mic[at : at + 320]))
+        if number not in silent:
+            messages.append(HEADER.pack(REFERENCE, count, at) + pcm(ref[at : at + 320]))
+            count += 1
+    assert len(silent) > 20
+    sound, told = run(heard({"streams": "two", "late_ms": 60}, messages))
+    straight, _ = run(heard({}, stereo_messages(mic, ref)))
+    np.testing.assert_array_equal(as_float(b"".join(sound)), as_float(b"".join(straight)))
+    assert told[-1]["lost"] == 0
+
+
+def test_an_announced_utterance_needs_no_reference(conversation):
+    mic, ref = conversation[0][: 7 * RATE], conversation[1]
+    said = pcm(ref[round(0.42 * RATE) : round(6.1 * RATE)])
+    messages = [json.dumps({"kind": "announce"}), said, *stereo_messages(mic, 0 * mic)]
+    sound, _ = run(heard({}, messages))
+    out = as_float(b"".join(sound))
+    alone = slice(2 * RATE, 5 * RATE)
+    assert 10 * np.log10(np.mean(out[alone] ** 2) / np.mean(mic[alone] ** 2)) < -20
+
+
+def test_opus_at_32_kbit_leaves_enough_of_the_echo_to_notice_the_human_at_once(conversation):
+    """Microphone, reference and the answer go through the codec; docs/serve.md has the figures, and those of less."""
+    mic, ref, human = conversation
+    encoders = [Encoder(32_000), Encoder(32_000)]
+    messages = [
+        HEADER.pack(label, number, number * 960) + encoders[label].push(x[number * 320 : number * 320 + 320])[0]
+        for number in range(mic.size // 320)
+        for label, x in ((MICROPHONE, mic), (REFERENCE, ref))
+    ]
+    hello = {"rate": 48000, "streams": "two", "codec": "opus", "late_ms": 60}
+    sound, told = run(heard(hello, messages))
+    decoder = Decoder()
+    out = soxr.resample(np.concatenate([decoder.decode(packet) for packet in sound]), 48000, RATE)
+    (began,) = (each["time"] for each in told if each["kind"] == "speech_started")
+    assert 9.1 < began < 9.8
+    span = slice(BOTH.start, min(BOTH.stop, out.size) - 800)
+    found = max(si_sdr(out[span.start + late : span.stop + late], human[span]) for late in range(0, 800, 2))
+    assert found > si_sdr(mic[BOTH], human[BOTH]) + 15
+
+
+@pytest.mark.parametrize(
+    ("hello", "words"),
+    [
+        ("no", "found 'no', expected a text message with an object in JSON"),
+        ("[1]", "expected a text message"),
+        (b"\0" * 8, "expected a text message"),
+        ('{"rate": 96000}', "rate 96000, expected 8000 to 48000"),
+        ('{"rate": 16000.5}', "rate 16000.5"),
+        ('{"rate": true}', "rate True"),
+        ('{"codec": "mp3"}', "codec 'mp3', expected pcm or opus"),
+        ('{"volume": 3}', "'volume', expected rate, streams"),
+        ('{"codec": "opus"}', "codec opus needs two streams"),
+        ('{"late_ms": 5000}', "late_ms 5000, expected 0 to 2000"),
+    ],
+)
+def test_a_first_message_that_is_wrong_is_answered_in_one_line(hello, words):
+    async def talk():
+        async with serving("linear") as address, connect(address) as server:
+            await server.send(hello)
+            told = json.loads(await server.recv())
+            with pytest.raises(ConnectionClosed):
+                await server.recv()
+            return told, server.close_code
+
+    told, code = run(talk())
+    assert told["kind"] == "error" and words in told["detail"] and code == 1008
+
+
+@pytest.mark.parametrize(
+    ("form", "message", "words"),
+    [
+        ({}, b"abc", "found 3 bytes, expected whole 16-bit samples of microphone and reference"),
+        ({}, json.dumps({"kind": "dance"}), "kind 'dance', expected 'announce' or 'end'"),
+        ({"streams": "two"}, b"abc", "expected a header of 12"),
+        ({"streams": "two"}, HEADER.pack(7, 0, 0), "label 7"),
+        ({"streams": "two", "codec": "opus", "rate": 48000}, HEADER.pack(0, 0, 0) + b"\xff" * 9, "no Opus packet"),
+    ],
+)
+def test_a_message_that_cannot_be_read_ends_its_connection_and_no_other(form, message, words):
+    async def talk():
+        async with serving("linear") as address, connect(address) as good:
+            await good.send("{}")
+            await good.recv()
+            _, told = await converse(address, form, [message])
+            await good.send(pcm(np.zeros((1024, 2))))
+            return told, await good.recv()
+
+    told, answer = run(talk())
+    assert told[-1]["kind"] == "error" and words in told[-1]["detail"]
+    assert len(answer) > 0
+
+
+def test_a_counter_that_jumps_by_hours_ends_the_connection_and_fills_no_memory():
+    messages = [HEADER.pack(MICROPHONE, number, at) + pcm(np.zeros(320)) for number, at in ((0, 0), (1, 1 << 40))]
+    _, told = run(heard({"streams": "two"}, messages, engine="linear"))
+    assert told[-1]["kind"] == "error" and "a counter jumps by" in told[-1]["detail"]
+
+
+def test_more_clients_than_streams_are_sent_away_with_a_word():
+    async def talk():
+        async with serving("linear", streams=1) as address, connect(address) as first:
+            await first.send("{}")
+            await first.recv()
+            async with connect(address) as second:
+                with pytest.raises(ConnectionClosed):
+                    await second.recv()
+                code = second.close_code
+            await first.close()
+            while True:  # the place is free again once the server has noticed
+                async with connect(address) as third:
+                    await third.send("{}")
+                    try:
+                        return code, json.loads(await third.recv())["kind"]
+                    except ConnectionClosed:
+                        await asyncio.sleep(0.05)
+
+    assert run(talk()) == (1013, "ready")
+
+
+def test_without_the_token_nobody_is_let_in_and_no_web_page_is():
+    async def knock(address, **words):
+        try:
+            async with connect(address, **words) as server:
+                await server.send("{}")
+                return json.loads(await server.recv())["kind"]
+        except InvalidStatus as error:
+            return error.response.status_code
+
+    async def talk():
+        secret = "0123456789abcdef"
+        async with serving("linear", token=secret) as address:
+            yield_ = [await knock(address), await knock(address, additional_headers={"Authorization": "Bearer x"})]
+            return [*yield_, await knock(address, additional_headers={"Authorization": f"Bearer {secret}"})]
+
+    async def page():
+        async with serving("linear") as address:
+            return await knock(address, origin="http://example.org")
+
+    assert run(talk()) == [401, 401, "ready"] and run(page()) == 403
+
+
+def test_a_message_that_is_too_large_is_not_read(monkeypatch):
+    monkeypatch.setattr(module, "MOST_BYTES", 10_000)
+
+    async def talk():
+        async with serving("linear") as address, connect(address, max_size=None) as server:
+            await server.send("{}")
+            await server.recv()
+            with pytest.raises(ConnectionClosed):
+                await server.send(b"\0" * (module.MOST_BYTES + 4))
+                while True:
+                    await server.recv()
+            return server.close_code
+
+    assert run(talk()) == 1009
+
+
+def test_a_client_that_does_not_read_is_let_go_and_others_go_on(monkeypatch, caplog):
+    monkeypatch.setattr(module, "PATIENCE_S", 0.5)
+
+    async def talk():
+        async with serving("bypass", profile=None) as address:
+            slow = await connect(address, max_queue=1, write_limit=1 << 16)
+            await slow.send(json.dumps({"rate": 48000}))
+            block = pcm(np.zeros((48000, 2)))
+            with pytest.raises((ConnectionClosed, TimeoutError)):
+                for _ in range(2000):
+                    await asyncio.wait_for(slow.send(block), 20)
+            _, told = await converse(address, {}, stereo_messages(np.zeros(3200), np.zeros(3200)))
+            slow.transport.abort()
+            return told
+
+    assert kinds(run(talk()))[-1] == "ended" and "reads too slowly" in caplog.text
+
+
+def test_a_client_that_vanishes_leaves_its_place_and_comes_back():
+    async def talk():
+        async with serving("linear", streams=1) as address:
+            for _ in range(3):
+                server = await connect(address)
+                await server.send("{}")
+                try:
+                    await server.recv()
+                except ConnectionClosed:  # the server has not noticed yet
+                    await asyncio.sleep(0.2)
+                    continue
+                await server.send(pcm(np.zeros((320, 2))))
+                server.transport.abort()
+                await asyncio.sleep(0.2)
+            _, told = await converse(address, {}, stereo_messages(np.zeros(3200), np.zeros(3200)))
+            return kinds(told)[-1]
+
+    assert run(talk()) == "ended"
+
+
+def test_a_client_that_says_nothing_is_let_go(monkeypatch):
+    monkeypatch.setattr(module, "PATIENCE_S", 0.2)
+
+    async def talk():
+        async with serving("linear") as address, connect(address) as server:
+            return json.loads(await server.recv())["detail"]
+
+    assert "nothing was heard" in run(talk())
+
+
+@pytest.fixture
+def service(tmp_path):
+    """The command as it is typed, and its address."""
+    words = ["serve", "--port", "0", "--profile", str(DEMO / "profile.npz")]
+    process = subprocess.Popen([sys.executable, "-m", "edgefilter.cli", *words], stderr=subprocess.PIPE, text=True)
+    line = process.stderr.readline()
+    assert line.startswith("serving ws://127.0.0.1:"), line
+    yield process, line.split()[1]
+    process.kill()
+    process.communicate()
+
+
+def test_the_satellite_of_the_page_hears_the_human(service, conversation):
+    _, address = service
+    mic, ref, human = conversation
+    done = subprocess.run(
+        [sys.executable, ROOT / "docs/examples/satellite.py", address],
+        input=pcm(np.stack([mic, ref], axis=1)), capture_output=True, timeout=100,
+    )  # fmt: skip
+    out = as_float(done.stdout)
+    told = [json.loads(line) for line in done.stderr.decode().splitlines()]
+    assert out.size == mic.size and si_sdr(out[BOTH], human[BOTH]) > 6
+    assert "speech_started" in kinds(told) and told[-1]["kind"] == "ended"
+
+
+def test_sigterm_ends_every_stream_with_its_rest_and_the_service_once(service):
+    process, address = service
+
+    async def talk():
+        async with connect(address) as server:
+            await server.send("{}")
+            await server.recv()
+            await server.send(pcm(np.full((1024, 2), 0.01)))
+            got, told = len(await server.recv()) // 2, []
+            process.send_signal(signal.SIGTERM)
+            try:
+                async for answer in server:
+                    got += len(answer) // 2 if isinstance(answer, bytes) else 0
+                    told += [] if isinstance(answer, bytes) else [json.loads(answer)]
+            except ConnectionClosed:
+                pass
+            return got, told, server.close_code
+
+    got, told, code = run(talk())
+    assert (got, kinds(told)[-1], code) == (1024, "ended", 1001)
+    assert process.wait(timeout=20) == 0 and process.stderr.read() == ""
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--host", "0.0.0.0"], "--host 0.0.0.0 lets other machines listen, found no --token"),
+        (["--host", "robot.local"], "found no --token"),
+        (["--token", "{folder}/none"], "cannot be read"),
+        (["--token", "{folder}/short"], "holds 3 characters, expected 16 or more"),
+        (["--port", "70000"], "'70000' is not a port, 0 to 65535"),
+        (["--streams", "0"], "'0' is not a number of streams"),
+    ],
+)
+def test_what_cannot_be_served_is_one_line_and_exit_code_2(words, said, tmp_path, capsys):
+    (tmp_path / "short").write_text("abc")
+    assert main(["serve", *(word.format(folder=tmp_path) for word in words)]) == 2
+    told = capsys.readouterr().err.splitlines()
+    assert len(told) == 1 and said in told[0]
+
+
+def test_a_port_that_is_taken_is_one_line(service, capsys):
+    _, address = service
+    assert main(["serve", "--port", address.rpartition(":")[2], "--engine", "linear"]) == 1
+    told = capsys.readouterr().err.splitlines()
+    assert len(told) == 1 and "cannot be served" in told[0]
