@@ -73,3 +73,12 @@ def test_a_rate_that_nobody_has_needs_no_more_memory_than_others():
 def test_a_low_rate_loses_no_larger_part_of_its_band():
     out = through(1000, 16_000, tone(400, 1000, 2.0), (10,))
     assert db(out - tone(400, 16_000, 2.0)[: out.size]) < -60
+
+
+def test_several_channels_are_as_each_alone():
+    two = np.random.default_rng(3).standard_normal((4800, 2)).astype(np.float32)
+    together, alone = Resampler(48000, 16000, channels=2), Resampler(48000, 16000)
+    found = np.concatenate([together.push(two[:1000]), together.push(two[1000:], last=True)])
+    assert np.array_equal(
+        found[:, 1], np.concatenate([alone.push(two[:1000, 1]), alone.push(two[1000:, 1], last=True)])
+    )
