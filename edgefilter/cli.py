@@ -67,6 +67,7 @@ def build_parser() -> Parser:
         _devices,
         _doctor,
         _serve,
+        _ros2,
         _profile,
     ):
         add_command(commands)
@@ -249,6 +250,48 @@ def _serve(commands: argparse._SubParsersAction) -> None:
         type=whole(1, 10_000, "a number of streams, 1 or more"),
         metavar="N",
         help="clients at a time (default: 4 a core)",
+    )
+
+
+def _ros2(commands: argparse._SubParsersAction) -> None:
+    ros2 = commands.add_parser("ros2", help="filter as a node of ROS 2, /edgefilter, or extract its recordings")
+    option = ros2.add_argument
+    sound = "16-bit samples in audio_common_msgs/AudioData"
+    option("--mic", default="/audio", metavar="TOPIC", help=f"microphone, {sound} (default: %(default)s)")
+    told = "what is said, or what the output plays, the same (default: %(default)s)"
+    option("--reference", default="/speech", metavar="TOPIC", help=told)
+    told = "std_msgs/Empty when the robot was silenced in mid-word (default: %(default)s)"
+    option("--silenced", default="/speech_stopped", metavar="TOPIC", help=told)
+    option("--human", default="/human", metavar="TOPIC", help="topic for the human (default: %(default)s)")
+    option("--profile", metavar="P.npz", help="calibrated robot")
+    option("--engine", **ENGINE)
+    told = "of DDS (default: ROS_DOMAIN_ID, or 0)"
+    option("--domain", type=whole(0, 232, "a domain, 0 to 232"), metavar="N", help=told)
+    _form(option)
+    words = ros2.add_subparsers(dest="word", metavar="extract")
+    option = words.add_parser("extract", help="write two topics of a recording as WAV files").add_argument
+    option("recording", metavar="ROBOT.mcap")
+    option("--mic", required=True, metavar="TOPIC", help="microphone")
+    option("--reference", required=True, metavar="TOPIC", help="what the robot said")
+    option("--output", required=True, metavar="DIR", help="folder for mic.wav and reference.wav")
+    _form(option)
+    _json(option)
+
+
+def _form(option: Callable[..., object]) -> None:
+    option(
+        "--rate",
+        type=whole(8000, 48000, "a rate, 8000 to 48000 Hz"),
+        default=16000,
+        metavar="HZ",
+        help="of the samples (default: %(default)s)",
+    )
+    option(
+        "--channels",
+        type=whole(1, 8, "1 to 8 channels"),
+        default=1,
+        metavar="N",
+        help="interleaved (default: %(default)s)",
     )
 
 

@@ -36,6 +36,8 @@ LEAVES = {
     "av": {"integrations/opus.py"},
     "sic_framework": {"integrations/sic.py"},
     "redis": {"integrations/sic.py"},
+    "cyclonedds": {"integrations/ros2.py"},
+    "rosbags": {"integrations/bags.py"},
     "torch": set(),
     "export": set(),
 }

@@ -38,6 +38,7 @@ FOLDERS: dict[tuple[str, str], tuple[str, ...]] = {
     ("run", "record"): ("mic.wav", "reference.wav", "output.wav", "events.jsonl", "run.json", "profile.npz"),
     ("run", "turns"): ("turn_0001.wav",),
     ("calibrate", "save_input"): ("sweep_reference.wav", "sweep_recording.wav", "noise_recording.wav"),
+    ("ros2", "output"): ("mic.wav", "reference.wav"),
     ("demo", "output"): (
         *("filtered.wav", "microphone.wav", "human.wav", "before_after.png"),
         *(f"{case}/{name}" for case in ("one", "two") for name in HIDDEN_FILES),
@@ -111,7 +112,7 @@ def check_outputs(args: argparse.Namespace) -> None:
         if output.at_end:
             _check_writable(output)
     for command, option in FOLDERS:
-        if command == args.command and getattr(args, option) is not None:
+        if command == args.command and getattr(args, option, None) is not None:
             _check_folder(f"--{option.replace('_', '-')}", getattr(args, option))
     if getattr(args, "record", None) is not None:
         _check_no_record(args.record)

@@ -1,6 +1,5 @@
 """Every program in docs/examples, run as its first lines say, on recordings that the repository has."""
 
-import importlib.util
 import re
 import shutil
 import subprocess
@@ -10,8 +9,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import soundfile
-
-from edgefilter import EgoFilter
 
 ROOT = Path(__file__).parents[2]
 EXAMPLES = ROOT / "docs/examples"
@@ -31,14 +28,6 @@ def run(name, *words, stdin=None):
     )
     assert done.returncode == 0, done.stderr.decode()
     return done.stdout, done.stderr.decode()
-
-
-def imported(name):
-    """The example as a module, where it can run only in part."""
-    spec = importlib.util.spec_from_file_location(name.removesuffix(".py"), EXAMPLES / name)
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
 
 
 def read(path):
@@ -61,7 +50,7 @@ def filtered(tmp_path_factory):
 def test_each_example_is_run_here_or_where_it_is_said():
     text = Path(__file__).read_text()
     names = {path.name for path in EXAMPLES.glob("*.py")} - ELSEWHERE
-    assert len(names) >= 5 and set(re.findall(r'(?:run|imported)\(\s*"(\w+\.py)"', text)) == names
+    assert len(names) >= 5 and set(re.findall(r'run\(\s*"(\w+\.py)"', text)) == names
 
 
 def test_a_file_is_filtered(filtered):
@@ -164,14 +153,3 @@ def test_the_simulated_room_holds_the_robot_and_then_the_human(tmp_path):
     assert db(heard[RATE : 2 * RATE]) > db(heard[7 * RATE : 8 * RATE]) + 15 > db(heard[: RATE // 10]) + 15
     said, _ = run("words.py", tmp_path / "heard.wav")
     assert said == b"(9.0 s)\n"
-
-
-def test_the_part_of_the_ros_node_that_needs_no_ros_filters(stereo):
-    node = imported("ros2_node.py")
-    duplex = node.Duplex(EgoFilter(DEMO / "profile.npz", "linear"))
-    out = b""
-    duplex.play(stereo[: 4 * RATE, 1].astype(np.float32) / 32768, RATE)
-    for at in range(0, 4 * RATE, 512):
-        out += node.filtered(duplex, stereo[at : at + 512, 0].astype("<i2").tobytes())
-    human = np.frombuffer(out, "<i2") / 32768
-    assert db(human[2 * RATE : 3 * RATE]) < db(stereo[2 * RATE : 3 * RATE, 0] / 32768) - 15

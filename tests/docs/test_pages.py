@@ -18,8 +18,9 @@ CLI, API, ARCHITECTURE = ((DOCS / f"{name}.md").read_text() for name in ("cli", 
 def commands(parser, name="edgefilter"):
     """Every command with options of its own, and these."""
     inner = [action for action in parser._actions if isinstance(action, argparse._SubParsersAction)]
-    if not inner:
-        yield name, {option for action in parser._actions for option in action.option_strings} - {"-h", "--help"}
+    own = {option for action in parser._actions for option in action.option_strings} - {"-h", "--help"}
+    if not inner or (own and name != "edgefilter"):
+        yield name, own
     for action in inner:
         for word, command in action.choices.items():
             yield from commands(command, f"{name} {word}")

@@ -1,0 +1,47 @@
+"""`edgefilter ros2`: the filter as a node of ROS 2; `edgefilter ros2 extract`: its recordings as WAV files."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import signal
+from pathlib import Path
+
+from edgefilter.commands.display import print_result, say
+from edgefilter.errors import UsageError
+from edgefilter.filter.barge_in import BargeInSettings
+from edgefilter.filter.ego_filter import EgoFilter
+
+
+def main(args: argparse.Namespace) -> int:
+    try:
+        return _extract(args) if args.word == "extract" else _node(args)
+    except ModuleNotFoundError as error:
+        raise UsageError(f"ros2 needs {error.name}, which is not installed: pip install '.[ros2]'") from None
+
+
+def _extract(args: argparse.Namespace) -> int:
+    from edgefilter.integrations.bags import extract
+
+    topics = {"mic": args.mic, "reference": args.reference}
+    folder = Path(args.output)
+    seconds = extract(Path(args.recording), topics, folder, args.rate, args.channels)
+    lines = [f"{folder / name}.wav: {length:.1f} s of {topics[name]}" for name, length in seconds.items()]
+    print_result(args, lines, {"schema": 1, "seconds": seconds})
+    return 0
+
+
+def _node(args: argparse.Namespace) -> int:
+    from edgefilter.integrations.ros2 import Node, Topics
+
+    named = os.environ.get("ROS_DOMAIN_ID") or "0"
+    if args.domain is None and not named.isdecimal():
+        raise UsageError(f"ROS_DOMAIN_ID is '{named}', expected a number: set it, or give --domain")
+    domain = int(named) if args.domain is None else args.domain
+    ego = EgoFilter(args.profile, args.engine, barge_in=BargeInSettings(judge="network"))
+    node = Node(ego, Topics(args.mic, args.reference, args.silenced, args.human, args.rate, args.channels), domain)
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: node.stop())
+    say(f"node /edgefilter, domain {domain}: {args.mic} and {args.reference} in, {args.human} out; Ctrl-C ends it")
+    node.run(say)
+    return 0
