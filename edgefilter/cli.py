@@ -54,6 +54,7 @@ def build_parser() -> Parser:
         _calibrate,
         _compare,
         _diagnose,
+        _passport,
         _add,
         _remove,
         _devices,
@@ -173,6 +174,22 @@ def _diagnose(commands: argparse._SubParsersAction) -> None:
     option("--prove", action="store_true", help=told)
     _force(option)
     _recording(option, profile_needed=False)
+    _report(option)
+
+
+def _passport(commands: argparse._SubParsersAction) -> None:
+    told = "say what one recording of an unknown device tells, and what to expect of the filter there"
+    option = commands.add_parser("passport", help=told).add_argument
+    told = "the robot alone, as the microphone recorded it, 10 s or more; the first 60 s are taken"
+    option("--recording", required=True, metavar="MIC", help=told)
+    told = "what the robot said, as it was sent to the loudspeaker"
+    option("--reference", required=True, metavar="REF", help=told)
+    told = "which engine is tried; repeatable (default: all of them)"
+    option("--engine", action="append", choices=("linear", "ss", "crnn"), help=told)
+    told = "level of the human whose SI-SDR is predicted, against the robot's (default: %(default)s)"
+    option("--human-db", type=human_level, default=-10.0, metavar="DB", help=told)
+    option("--no-diagnosis", action="store_true", help="do not look for physical effects, which takes longest")
+    _json(option)
     _report(option)
 
 
@@ -299,6 +316,11 @@ def whole(least: int, most: int, expected: str) -> Callable[[str], int]:
 def level(text: str) -> float:
     """Level of a peak: at most full scale, and above what 16 bit can hold."""
     return number(text, -90.0, 0.0, "a level from -90 to 0 dB of full scale", closed=True)
+
+
+def human_level(text: str) -> float:
+    """Level of a human against the robot."""
+    return number(text, -40.0, 20.0, "a level from -40 to 20 dB", closed=True)
 
 
 def number(text: str, low: float, high: float, expected: str, closed: bool = False) -> float:
