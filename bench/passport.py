@@ -21,6 +21,7 @@ from bench.recordings import Recording
 from edgefilter.commands.demo import DATA, speaking
 from edgefilter.diagnosis.passport import ENGINES, LEAST_S, MOST_S, expected
 from edgefilter.dsp.metrics import si_sdr
+from edgefilter.errors import UsageError
 from edgefilter.filter.enhance import enhance
 from edgefilter.types import SAMPLE_RATE
 
@@ -41,6 +42,10 @@ def run(options: argparse.Namespace) -> str:
     data = {"RECORDINGS": [options.recordings], "HUMAN": [options.speech]}
     made_with = results.stamp(data, [f"{engine}-uncalibrated" for engine in options.engines])
     found = list(cases(options))
+    if not found:
+        raise UsageError(
+            f"{options.recordings} holds no recording of a robot alone of {LEAST_S:.0f} s or more, expected some"
+        )
     devices = list(dict.fromkeys(row["device"] for row in found))
     cells, errors = [], []
     for device in devices:

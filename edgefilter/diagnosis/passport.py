@@ -88,7 +88,8 @@ class Passport:
     lag_ms, lag_spread_ms: median of the windows with a sharp arrival and the span of their middle eight tenths; sharp: the
     share of windows that have one; without any the lag is coarse, to a hop of 16 ms. drift_ppm: parts of a million by
     which the reference's clock is faster (the lag shrinks), None where no arrival is sharp. change_db: what is neither
-    linear in the reference nor noise, against what is linear. gated, clipped: shares of time and of samples.
+    linear in the reference nor noise, against what is linear. pauses: whether the robot is silent for long enough to know the
+    noise; if not, the quietest moments stand for it, and it is at most that. gated, clipped: shares of time and of samples.
     """
 
     seconds: float
@@ -101,6 +102,7 @@ class Passport:
     gated: float
     human_db: float
     found: bool
+    pauses: bool = False
     lag_ms: float | None = None
     lag_spread_ms: float | None = None
     sharp: float = 0.0
@@ -174,7 +176,7 @@ def measure(
         if ppm:
             near = interpolate(near, np.arange(near.size) * (1.0 + 1e-6 * ppm))
     progress("coherence")
-    fan, _ = fan_in_silences(mic, silences(near))
+    fan, pauses_s = fan_in_silences(mic, silences(near))
     spectra = _Spectra(mic, near, fan)
     outputs, told = {}, {}
     for engine in engines:
@@ -188,6 +190,7 @@ def measure(
     return Passport(
         **known,
         noise_db=float(decibels(total_power(fan))),
+        pauses=pauses_s > 0.0,
         found=True,
         lag_ms=(lag + (float(np.median(lags)) if lags.size else 0.0)) / SAMPLE_RATE * 1000,
         lag_spread_ms=spread,

@@ -107,7 +107,7 @@ def passport_page(found: Passport, diagnosis: str, names: Mapping[str, Any]) -> 
         "date": datetime.date.today().isoformat(),
         **{key: told[key] for key in ("headline", "cause", "changes")},
         "engines": passport.engine_lines(found),
-        "uncertainty": passport.uncertainty(),
+        "uncertainty": passport.uncertainty(found),
         "facts": passport.rows(found),
         "enough": passport.enough(),
         "series": series,

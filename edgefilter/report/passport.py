@@ -18,7 +18,7 @@ UNLEARNED_DB = 6.0
 
 CAUSES = {
     "nothing": "nothing stands in the way of a linear filter",
-    "noise": "the robot is little above the noise, and no linear filter removes noise",
+    "noise": "the noise is what a linear filter leaves",
     "gate": "the microphone falls silent while the robot talks: it is processed (a gate, noise suppression)",
     "clipping": "the microphone is overdriven: its loudest samples are cut off",
     "change": "the loudspeaker distorts, or the microphone is processed (gain control, noise suppression): its levels follow the"
@@ -62,6 +62,10 @@ def advice(found: Passport) -> list[str]:
             " `edgefilter doctor` finds wrong connections."
         ]
     told = [FIRST[found.cause]] if found.cause in FIRST else []
+    if not found.pauses:
+        told.append(
+            "let the robot pause for some seconds while it is recorded: the noise is not known, and may be less"
+        )
     if found.mic_peak_db < QUIET_DB:
         told.append(f"turn the microphone's gain up: its peaks reach only {found.mic_peak_db:.0f} dBFS")
     if found.lag_spread_ms is not None and found.lag_spread_ms > UNSTABLE_MS:
@@ -84,7 +88,7 @@ def rows(found: Passport) -> list[tuple[str, str, str]]:
         (
             "noise",
             f"{found.noise_db:.0f} dBFS" if found.noise_db > -119.0 else "none",
-            "where the robot is most silent",
+            "in the robot's pauses" if found.pauses else "at most: in the quietest moments",
         ),
     ]
     if not found.found:
@@ -110,15 +114,13 @@ def lines(found: Passport, diagnosis: str) -> list[str]:
     if found.found:
         told += [f"{'':<12}{sentence(CAUSES[found.cause])}", ""]
         names = list(found.engines)
-        told.append(
-            f"{'band, Hz':<12}" + "".join(f"{head:>10}" for head in ("linear", "over noise", "follows", *names))
-        )
+        told.append(f"{'band, Hz':<12}" + "".join(f"{head:>10}" for head in ("linear", "noise", "follows", *names)))
         told += [
             f"{f'{band.low:.0f}-{band.high:.0f}':<12}{band.removable_db:>10.1f}{band.over_noise_db:>10.1f}{band.follows:>10.2f}"
             + "".join(f"{band.removed_db[name]:>10.1f}" for name in names)
             for band in found.bands
         ]
-        told += ["", *(f"{name:<12}{what}" for name, what in engine_lines(found)), f"{'':<12}{uncertainty()}"]
+        told += ["", *(f"{name:<12}{what}" for name, what in engine_lines(found)), f"{'':<12}{uncertainty(found)}"]
         told += ["", f"{'diagnosis':<12}{diagnosis}"]
     return [*told, "change first:", *(f"  {at}. {line}" for at, line in enumerate(advice(found), start=1))]
 
@@ -136,9 +138,12 @@ def engine_lines(found: Passport) -> list[tuple[str, str]]:
     ]
 
 
-def uncertainty() -> str:
-    """Of the prediction, in a sentence."""
-    return f"Another human's SI-SDR differed by {MEDIAN_ERROR_DB:.1f} dB at the median and {WORST_ERROR_DB:.1f} dB at worst."
+def uncertainty(found: Passport) -> str:
+    """Of the prediction, in a sentence or two."""
+    told = f"Another human's SI-SDR differed by {MEDIAN_ERROR_DB:.1f} dB at the median and {WORST_ERROR_DB:.1f} dB at worst."
+    if found.cause in ("gate", "change"):
+        told += " What processes the microphone has not heard this human: expect less where it acts on speech."
+    return told
 
 
 def _against(human_db: float) -> str:

@@ -19,8 +19,9 @@ SECONDS = 12.0
 
 @pytest.fixture(scope="module")
 def clean():
-    """Reference and microphone of a robot in a small room, with the fan 40 dB below it."""
+    """Reference and microphone of a robot in a small room that pauses in the middle; its fan is at -60 dBFS."""
     said = voice(SECONDS)
+    said[6 * RATE : 7 * RATE] = 0.0
     return said, record(said)
 
 
@@ -72,7 +73,7 @@ def test_what_is_removable_is_what_distortion_and_noise_leave(passport, clean):
     assert noisy["removable_db"] == pytest.approx(6.2, abs=0.7) and noisy["over_noise_db"] == pytest.approx(
         6.2, abs=0.7
     )
-    assert noisy["cause"] == "noise" and "quieter" in noisy["said"]["changes"][0] and "noise" in out
+    assert noisy["cause"] == "noise" and "quieter" in noisy["said"]["changes"][0] and "in the robot's pauses" in out
     distorted = heard + 0.4 * np.sqrt(np.mean(heard**2) / np.mean(heard**4)) * heard**2
     _, changed, _, _ = passport(distorted.astype(np.float32), said)
     assert changed["change_db"] == pytest.approx(20 * np.log10(0.4), abs=1.5) and changed["cause"] == "change"
@@ -103,6 +104,13 @@ def test_a_reference_that_is_not_in_the_recording_is_a_finding(passport, clean):
     code, figures, out, page = passport(record(voice(SECONDS, seed=9)), said)
     assert code == 0 and figures["found"] is False and figures["engines"] == {} and figures["lag_ms"] is None
     assert "The reference is not found in the recording." in out and "is not found" in page and "<svg" not in page
+
+
+def test_a_robot_that_never_pauses_is_asked_for_a_pause(passport):
+    said = (0.05 * np.random.default_rng(2).standard_normal(round(SECONDS * RATE))).astype(np.float32)
+    _, figures, out, _ = passport(record(said), said)
+    assert not figures["pauses"] and "at most" in out
+    assert any("pause" in change for change in figures["said"]["changes"])
 
 
 def test_the_level_of_the_human_is_the_one_asked_for(passport, clean):
