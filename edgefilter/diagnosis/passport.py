@@ -39,14 +39,14 @@ SIZE = 8192
 GATED = 1e-9
 """Mean square, -90 dBFS, which no microphone with a converter of 16 bit stays under in 20 ms, unless it was shut."""
 GATED_SHARE = 0.02
-"""Share of such moments from which on the microphone is taken for gated: 0.19 on the one device of seven (AEC challenge)
+"""Share of such moments from which on the microphone is taken for gated: 0.20 on the one device of six (AEC challenge)
 that is, 0 on the others."""
 FULL, CLIPPED_SHARE = 0.999, 1e-4
 """Of full scale: what reaches it may be cut off; and the share of samples from which on it was. One or two are a file that
-was made as loud as it can be, as two of the same seven."""
+was made as loud as it can be, as two of the same six."""
 FOLLOWS = 0.5
 """Correlation of band levels from which on the microphone holds the robot, however changed: 0.36 where noise covers it, 0.57
-where it is gated, 0.65 and more elsewhere, on the same seven."""
+where it is gated, 0.65 and more elsewhere, on the same six."""
 
 Cause = Literal["nothing", "noise", "gate", "clipping", "other", "change"]
 """What bounds a linear filter: nothing up to ENOUGH_DB, the noise, a microphone that shuts, one that is overdriven, a sound

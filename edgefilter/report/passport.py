@@ -5,8 +5,8 @@ from __future__ import annotations
 from edgefilter.diagnosis.passport import ENOUGH_DB, Passport
 from edgefilter.report.text import sentence
 
-MEDIAN_ERROR_DB, WORST_ERROR_DB = 1.0, 5.0
-"""Of the predicted SI-SDR, against what other humans had on the same device; `python -m bench passport`, seven devices."""
+ERROR_DB: tuple[float, float] | None = None
+"""Of the predicted SI-SDR, median and worst over devices, as `python -m bench passport` measures it; None: not measured yet."""
 DRIFTS_PPM = 50.0
 """Clocks further apart than this share no crystal: those of one sound card agree to 1 ppm, two cheap ones to 100."""
 UNSTABLE_MS = 2.0
@@ -50,7 +50,7 @@ def expectation(found: Passport) -> dict[str, object]:
         "headline": headline(found),
         "cause": sentence(CAUSES[found.cause]) if found.found else "",
         "changes": advice(found),
-        "uncertainty_db": {"median": MEDIAN_ERROR_DB, "worst": WORST_ERROR_DB},
+        "uncertainty_db": {"median": ERROR_DB[0], "worst": ERROR_DB[1]} if ERROR_DB else None,
     }
 
 
@@ -140,7 +140,9 @@ def engine_lines(found: Passport) -> list[tuple[str, str]]:
 
 def uncertainty(found: Passport) -> str:
     """Of the prediction, in a sentence or two."""
-    told = f"Another human's SI-SDR differed by {MEDIAN_ERROR_DB:.1f} dB at the median and {WORST_ERROR_DB:.1f} dB at worst."
+    told = "How far other humans are from this has not been measured: it was tried with one voice."
+    if ERROR_DB:
+        told = f"Other humans' SI-SDR differed from it by {ERROR_DB[0]:.1f} dB at the median of devices, {ERROR_DB[1]:.1f} dB at worst."
     if found.cause in ("gate", "change"):
         told += " What processes the microphone has not heard this human: expect less where it acts on speech."
     return told
