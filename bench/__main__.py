@@ -2,6 +2,7 @@
 
 evaluate   every system on conversations and on real recordings: words, SI-SDR, and where it fails
 devices    every real device in one table, a row a device
+passport   how far a passport's prediction is from what humans have on real devices
 latency    milliseconds of a hop, alone and beside a learner; CPU over a long time
 live       trials on virtual devices: conversations, barge-in, learning over a day, an hour without a break
 diagnosis  how often hidden effects are named, and what naming them brings

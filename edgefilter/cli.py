@@ -62,6 +62,7 @@ def build_parser() -> Parser:
         _calibrate,
         _compare,
         _diagnose,
+        _passport,
         _add,
         _remove,
         _devices,
@@ -187,6 +188,22 @@ def _diagnose(commands: argparse._SubParsersAction) -> None:
     option("--prove", action="store_true", help=told)
     _force(option)
     _recording(option, profile_needed=False)
+    _report(option)
+
+
+def _passport(commands: argparse._SubParsersAction) -> None:
+    told = "say what one recording of an unknown device tells, and what to expect of the filter there"
+    option = commands.add_parser("passport", help=told).add_argument
+    told = "the robot alone, as the microphone recorded it, 10 s or more; the first 60 s are taken"
+    option("--recording", required=True, metavar="MIC", help=told)
+    told = "what the robot said, as it was sent to the loudspeaker"
+    option("--reference", required=True, metavar="REF", help=told)
+    told = "which engine is tried; repeatable (default: all of them)"
+    option("--engine", action="append", choices=("linear", "ss", "crnn"), help=told)
+    told = "level of the human whose SI-SDR is predicted, against the robot's (default: %(default)s)"
+    option("--human-db", type=human_level, default=-10.0, metavar="DB", help=told)
+    option("--no-diagnosis", action="store_true", help="do not look for physical effects, which takes longest")
+    _json(option)
     _report(option)
 
 
@@ -371,6 +388,11 @@ def channels(text: str) -> list[int]:
     if len(set(found)) < len(found) or len(found) > MOST_MICROPHONES:
         raise argparse.ArgumentTypeError(f"'{text}' does not name one to {MOST_MICROPHONES} different channels")
     return found
+
+
+def human_level(text: str) -> float:
+    """Level of a human against the robot."""
+    return number(text, -40.0, 20.0, "a level from -40 to 20 dB", closed=True)
 
 
 def number(text: str, low: float, high: float, expected: str, closed: bool = False) -> float:

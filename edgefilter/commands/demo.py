@@ -110,7 +110,7 @@ def load(name: str) -> Case:
     at, begin = round(truth["talk_s"] * SAMPLE_RATE), round(HUMAN_AT_S * SAMPLE_RATE)
     robot = mic[at:]
     voice = _read(DATA / "human.flac")
-    voice = voice[_speaking(voice)][: robot.size - begin]
+    voice = voice[speaking(voice)][: robot.size - begin]
     level = np.sqrt(np.mean(robot[begin : begin + voice.size] ** 2) / np.mean(voice**2)) * 10 ** (HUMAN_DB / 20)
     human = np.zeros_like(robot)
     human[begin : begin + voice.size] = np.float32(level) * voice
@@ -215,7 +215,7 @@ def _drawer(name: str) -> ModuleType | None:
         return None
 
 
-def _speaking(human: Samples) -> slice:
+def speaking(human: Samples) -> slice:
     """From the first to the last sample that is not zero."""
     spoken = np.flatnonzero(human)
     return slice(spoken[0], spoken[-1] + 1)
@@ -223,7 +223,7 @@ def _speaking(human: Samples) -> slice:
 
 def _si_sdr(samples: Samples, human: Samples) -> float:
     """SI-SDR, dB, over the time in which the human speaks."""
-    span = _speaking(human)
+    span = speaking(human)
     return si_sdr(samples[span], human[span])
 
 

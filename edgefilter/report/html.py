@@ -14,6 +14,7 @@ import jinja2
 
 from edgefilter.diagnosis.compare import Comparison, describe
 from edgefilter.diagnosis.diagnose import Diagnosis, Finding
+from edgefilter.diagnosis.passport import Passport
 from edgefilter.diagnosis.prepare import Prepared, prepare
 from edgefilter.diagnosis.result import Precision
 from edgefilter.echo.effect import complete
@@ -21,6 +22,7 @@ from edgefilter.echo.effects.catalogue import find
 from edgefilter.echo.model import EchoModel
 from edgefilter.errors import EdgefilterError
 from edgefilter.profile.data import Profile
+from edgefilter.report import passport
 from edgefilter.report.media import MAX_SOUND_S, colour_scale, colours, sound, spectrogram_png
 from edgefilter.report.text import (
     add_command,
@@ -77,6 +79,48 @@ def diagnosis_page(
     return _page(variants, steps, text, names, found.irreducible_db)
 
 
+def passport_page(found: Passport, diagnosis: str, names: Mapping[str, Any]) -> str:
+    """The page of a device's passport, of which no part needs a script.
+
+    diagnosis: what it names, in a sentence. names: recording, reference, what the files are called.
+    """
+    series = ["linear, by coherence", *found.engines]
+    heights = [[band.removable_db, *band.removed_db.values()] for band in found.bands]
+    top = 10.0 * math.ceil(max([20.0, *(db for group in heights for db in group)]) / 10.0)
+    wide = 676 / max(len(found.bands), 1)
+    bars = [
+        (kind, round(40 + wide * (at + 0.1 + 0.8 * kind / len(series)), 1), round(200 - 190 * db / top, 1),
+         round(0.8 * wide / len(series) - 1, 1), round(190 * db / top, 1))
+        for at, group in enumerate(heights) for kind, db in enumerate(max(one, 0.0) for one in group)
+    ]  # fmt: skip
+    labels = [f"{band.low:.0f}-{band.high:.0f} Hz" for band in found.bands]
+    figures = [
+        [f"{band.mic_db:.0f}", f"{band.over_noise_db:.1f}", f"{band.follows:.2f}", f"{band.removable_db:.1f}",
+         *(f"{db:.1f}" for db in band.removed_db.values())]
+        for band in found.bands
+    ]  # fmt: skip
+    told = passport.expectation(found)
+    fields = {
+        "style": _asset("page.css"),
+        **{role: Path(str(names[role])).name for role in ("recording", "reference")},
+        "seconds": f"{found.seconds:.1f}",
+        "date": datetime.date.today().isoformat(),
+        **{key: told[key] for key in ("headline", "cause", "changes")},
+        "engines": passport.engine_lines(found),
+        "uncertainty": passport.uncertainty(found),
+        "facts": passport.rows(found),
+        "enough": passport.enough(),
+        "series": series,
+        "grid": [(200 - 190 * db / top, f"{db:.0f} dB") for db in (0.0, top / 2, top)],
+        "bars": bars,
+        "ticks": [(round(40 + wide * (at + 0.5), 1), label) for at, label in enumerate(labels)],
+        "heads": ["band", "level, dBFS", "over noise, dB", "follows", *(f"{name}, dB" for name in series)],
+        "bands": [[label, *row] for label, row in zip(labels, figures, strict=True)],
+        "diagnosis": diagnosis,
+    }
+    return _template("passport.html").render(fields)
+
+
 def write_page(path: str | Path, page: str) -> None:
     """Write the page; raises EdgefilterError where it cannot be written."""
     try:
@@ -116,11 +160,11 @@ def _page(
     return _template().render(fields)
 
 
-def _template() -> jinja2.Template:
-    """page.html; what is put into it is text, escaped unless the page calls it safe, and all of it has to be there."""
+def _template(name: str = "page.html") -> jinja2.Template:
+    """A page; what is put into it is text, escaped unless the page calls it safe, and all of it has to be there."""
     page = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined, keep_trailing_newline=True)
     page.policies["json.dumps_kwargs"] = {"allow_nan": False, "separators": (",", ":")}
-    return page.from_string(_asset("page.html"))
+    return page.from_string(_asset(name))
 
 
 def _data(

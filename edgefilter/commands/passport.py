@@ -1,0 +1,49 @@
+"""`edgefilter passport`: what one recording of an unknown device tells, and what to expect of the filter there."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable
+
+from edgefilter.calibration.from_recording import self_calibrate
+from edgefilter.commands.demo import DATA, speaking
+from edgefilter.commands.display import print_result, progress, report_part
+from edgefilter.commands.recordings import read
+from edgefilter.diagnosis.diagnose import Diagnosis, diagnose
+from edgefilter.diagnosis.passport import ENGINES, MOST_S, measure
+from edgefilter.errors import SignalError
+from edgefilter.report.passport import expectation, lines
+from edgefilter.report.text import headline
+from edgefilter.types import SAMPLE_RATE, Samples
+
+
+def main(args: argparse.Namespace) -> int:
+    html = report_part("html") if args.report else None
+    most = round(MOST_S * SAMPLE_RATE)
+    recording, reference = read(args.recording, "recording")[:most], read(args.reference, "reference")[:most]
+    voice = read(str(DATA / "human.flac"), "human")
+    with progress("passport") as step:
+        engines = args.engine or list(ENGINES)
+        found = measure(recording, reference, voice[speaking(voice)], args.human_db, engines, step)
+        named, verdict = (None, "not asked for") if args.no_diagnosis or not found.found else _diagnosed(
+            recording, reference, step
+        )  # fmt: skip
+    figures = found.to_dict() | {
+        "diagnosis": named.to_dict() if named else None,
+        "said": {**expectation(found), "diagnosis": verdict},
+    }
+    print_result(args, lines(found, verdict), figures)
+    if html:
+        html.write_page(args.report, html.passport_page(found, verdict, vars(args)))
+        print_result(args, [f"report      {args.report}"])
+    return 0
+
+
+def _diagnosed(recording: Samples, reference: Samples, step: Callable[[str], None]) -> tuple[Diagnosis | None, str]:
+    """What the diagnosis names, without a profile, and in a sentence; or why it names nothing."""
+    step("diagnosis")
+    try:
+        found = diagnose(self_calibrate(recording, reference), recording, reference, progress=step)
+    except SignalError as error:
+        return None, f"not possible: {error}"
+    return found, headline(found.verdict, [finding.effect for finding in found.ranking], calibrated=False)

@@ -1,0 +1,377 @@
+"""What one recording of an unknown device tells: how its robot reaches the microphone, and what to expect of the filter."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, field
+from typing import Any, Literal
+
+import numpy as np
+from scipy import fft
+
+from edgefilter.alignment.coarse_lag import CoarseLag
+from edgefilter.calibration.from_recording import fan_in_silences, find_drift, find_lag, silences
+from edgefilter.dsp.fourier import power
+from edgefilter.dsp.fractional_delay import delayed, interpolate
+from edgefilter.dsp.frames import all_block_power, block_power, decibels, frames
+from edgefilter.dsp.lag import correlation_near, flat_cross, highest
+from edgefilter.dsp.metrics import si_sdr
+from edgefilter.dsp.psd import frequencies, hann, third_octave_bands, total_power
+from edgefilter.echo.recording import paired
+from edgefilter.errors import SignalError
+from edgefilter.filter.ego_filter import EgoFilter
+from edgefilter.types import SAMPLE_RATE, Array, Samples
+
+ENGINES = ("linear", "ss", "crnn")
+"""Those that follow any device without knowing it."""
+LEAST_S, MOST_S = 10.0, 60.0
+"""What a recording has to last, and how much of it is looked at."""
+SETTLED_S = 5.0
+"""The filter has this long with the robot alone before it is judged, and before the human speaks."""
+PAUSE_S = 2.0
+"""Between two turns of the human."""
+WINDOW_S, STRETCH = 2.0, 1024
+"""Windows in which the lag is looked for, that many samples around what the whole says."""
+SHARP = 8.0
+"""Times the root mean square of the window's correlation from which on an arrival is sharp, as of `find_lag`."""
+SIZE = 8192
+"""Samples of the frames whose coherence counts: half a second holds most of a room's response."""
+GATED = 1e-9
+"""Mean square, -90 dBFS, which no microphone with a converter of 16 bit stays under in 20 ms, unless it was shut."""
+GATED_SHARE = 0.02
+"""Share of such moments from which on the microphone is taken for gated: 0.20 on the one device of six (AEC challenge)
+that is, 0 on the others."""
+FULL, CLIPPED_SHARE = 0.999, 1e-4
+"""Of full scale: what reaches it may be cut off; and the share of samples from which on it was. One or two are a file that
+was made as loud as it can be, as two of the same six."""
+FOLLOWS = 0.5
+"""Correlation of band levels from which on the microphone holds the robot, however changed: 0.36 where noise covers it, 0.57
+where it is gated, 0.65 and more elsewhere, on the same six."""
+
+Cause = Literal["nothing", "noise", "gate", "clipping", "other", "change"]
+"""What bounds a linear filter: nothing up to ENOUGH_DB, the noise, a microphone that shuts, one that is overdriven, a sound
+that does not follow the reference, or distortion or processing, which one recording cannot tell apart."""
+ENOUGH_DB = 15.0
+"""A linear filter that can remove so much brings a human 10 dB below the robot 5 dB above what is left of it."""
+
+
+@dataclass(frozen=True)
+class Band:
+    """An octave (Hz): how much linear filtering can remove, robot over noise, how well the levels follow the reference's.
+
+    removable_db: from the magnitude-squared coherence, 10 lg 1 / (1 - C). removed_db: what each engine takes off the robot.
+    """
+
+    low: float
+    high: float
+    mic_db: float
+    removable_db: float
+    over_noise_db: float
+    follows: float
+    removed_db: dict[str, float]
+
+
+@dataclass(frozen=True)
+class Expected:
+    """What an engine does: robot alone lowered, false starts of speech, SI-SDR of a human laid on, without and with it."""
+
+    removed_db: float
+    false_starts: int | None
+    si_sdr_before_db: float
+    si_sdr_db: float
+
+
+@dataclass(frozen=True)
+class Passport:
+    """All that one recording tells; levels in dB of full scale. found: whether the reference is in it; if not, the rest is empty.
+
+    lag_ms, lag_spread_ms: median of the windows with a sharp arrival and the span of their middle eight tenths; sharp: the
+    share of windows that have one; without any the lag is coarse, to a hop of 16 ms. drift_ppm: parts of a million by
+    which the reference's clock is faster (the lag shrinks), None where no arrival is sharp. change_db: what is neither
+    linear in the reference nor noise, against what is linear. pauses: whether the robot is silent for long enough to know the
+    noise; if not, the quietest moments stand for it, and it is at most that. gated, clipped: shares of time and of samples.
+    """
+
+    seconds: float
+    mic_db: float
+    mic_peak_db: float
+    ref_db: float
+    ref_peak_db: float
+    noise_db: float
+    clipped: float
+    gated: float
+    human_db: float
+    found: bool
+    pauses: bool = False
+    lag_ms: float | None = None
+    lag_spread_ms: float | None = None
+    sharp: float = 0.0
+    drift_ppm: float | None = None
+    removable_db: float = 0.0
+    over_noise_db: float = 0.0
+    change_db: float = 0.0
+    follows: float = 0.0
+    cause: Cause = "nothing"
+    bands: tuple[Band, ...] = ()
+    engines: dict[str, Expected] = field(default_factory=dict)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Ready for JSON, schema 1."""
+        return {"schema": 1, **_rounded(asdict(self))}
+
+
+def measure(
+    mic: Samples,
+    ref: Samples,
+    voice: Samples,
+    human_db: float = -10.0,
+    engines: Sequence[str] = ENGINES,
+    progress: Callable[[str], None] = lambda step: None,
+) -> Passport:
+    """The passport of a device from its robot alone.
+
+    Parameters
+    ----------
+    mic, ref : ndarray of float, shape (n,), (m,)
+        What the microphone heard and what the robot said, 16 kHz, full scale +-1; the first MOST_S are taken.
+    voice : ndarray of float, shape (v,)
+        A human without pauses at the ends, laid on at human_db of the microphone's power in the same seconds.
+    engines : sequence of str
+        Which are tried, without a profile and without learning.
+
+    Raises
+    ------
+    SignalError
+        Where there are fewer than LEAST_S, or the reference or the microphone is silent.
+
+    Notes
+    -----
+    Coherence: Carter, Knapp & Nuttall 1973, over half-overlapping Hann frames, less its bias. What it calls linear bounds
+    any filter of that length; a longer echo counts as changed. Levels follow: correlation of log energies, frame by frame.
+
+    Examples
+    --------
+    >>> rng = np.random.default_rng(0)
+    >>> said = rng.standard_normal(192_000).astype(np.float32) * (0.05 + 0.05 * np.sin(np.arange(192_000) / 900))
+    >>> heard = 0.5 * np.roll(said, 800) + 1e-4 * rng.standard_normal(192_000)
+    >>> found = measure(heard.astype(np.float32), said.astype(np.float32), said[:32_000], engines=["linear"])
+    >>> found.found, round(found.lag_ms), found.removable_db > 20
+    (True, 50, True)
+    """
+    most = round(MOST_S * SAMPLE_RATE)
+    mic, ref = paired(mic[:most], ref[:most])
+    _check(mic, ref)
+    known = _levels(mic, ref) | {"human_db": human_db}
+    progress("lag and drift")
+    lag = _lag(mic, ref)
+    if lag is None:
+        quietest = np.sort(block_power(mic, SAMPLE_RATE // 10))
+        noise_db = float(decibels(quietest[: max(quietest.size // 20, 1)].mean()))
+        return Passport(**known, noise_db=noise_db, found=False)
+    near, ppm = delayed(ref, lag), None
+    lags = _lags(mic, near)
+    if lags.size:
+        ppm, behind = find_drift(mic, near)
+        near = delayed(ref, lag + behind)
+        if ppm:
+            near = interpolate(near, np.arange(near.size) * (1.0 + 1e-6 * ppm))
+    progress("coherence")
+    fan, pauses_s = fan_in_silences(mic, silences(near))
+    spectra = _Spectra(mic, near, fan)
+    outputs, told = {}, {}
+    for engine in engines:
+        progress(f"{engine} on the robot alone")
+        outputs[engine], starts = _filtered(mic, ref, engine)
+        progress(f"{engine} with a human")
+        told[engine] = Expected(_removed(mic, outputs[engine]), starts, *expected(mic, ref, voice, human_db, engine))
+    removable, over_noise, follows = (spectra.over(0.0, SAMPLE_RATE / 2)[i] for i in (0, 1, 2))
+    windows = int(mic.size / (WINDOW_S * SAMPLE_RATE))
+    spread = None if not lags.size else float(np.quantile(lags, 0.9) - np.quantile(lags, 0.1)) / SAMPLE_RATE * 1000
+    return Passport(
+        **known,
+        noise_db=float(decibels(total_power(fan))),
+        pauses=pauses_s > 0.0,
+        found=True,
+        lag_ms=(lag + (float(np.median(lags)) if lags.size else 0.0)) / SAMPLE_RATE * 1000,
+        lag_spread_ms=spread,
+        sharp=lags.size / windows,
+        drift_ppm=ppm,
+        removable_db=removable,
+        over_noise_db=over_noise,
+        change_db=spectra.change_db(),
+        follows=follows,
+        cause=_cause(removable, over_noise, follows, known["gated"], known["clipped"]),
+        bands=tuple(_bands(mic, spectra, outputs)),
+        engines=told,
+    )
+
+
+def expected(mic: Samples, ref: Samples, voice: Samples, human_db: float, engine: str) -> tuple[float, float]:
+    """SI-SDR (dB) of a human who is laid on the robot alone, before and behind the engine: the mean of all turns.
+
+    mic, ref: (n,). The voice (v,) speaks from SETTLED_S on, again and again until the end, human_db over the microphone's
+    power in the same seconds.
+    """
+    human, spans = np.zeros(mic.size), []
+    begin, pause = round(SETTLED_S * SAMPLE_RATE), round(PAUSE_S * SAMPLE_RATE)
+    while begin + min(voice.size, pause) <= mic.size:
+        span = slice(begin, min(begin + voice.size, mic.size))
+        turn = voice[: span.stop - begin].astype(np.float64)
+        echo = float(np.mean(np.square(mic[span], dtype=np.float64)))
+        human[span] = turn * np.sqrt(echo / np.mean(turn**2)) * 10 ** (human_db / 20)
+        if echo > 0.0:
+            spans.append(span)
+        begin += voice.size + pause
+    full = max(1.0, float(np.abs(mic + human).max()))
+    mixed, human = ((mic + human) / full).astype(np.float32), human / full
+    output, _ = _filtered(mixed, ref, engine)
+    before, after = (float(np.mean([si_sdr(x[span], human[span]) for span in spans])) for x in (mixed, output))
+    return before, after
+
+
+def _check(mic: Samples, ref: Samples) -> None:
+    seconds = mic.size / SAMPLE_RATE
+    if seconds < LEAST_S:
+        raise SignalError(
+            f"the recording is {seconds:.1f} s long, expected {LEAST_S:.0f} to {MOST_S:.0f} s of the robot alone: record more"
+        )
+    for samples, name in ((mic, "recording"), (ref, "reference")):
+        if not samples.any():
+            raise SignalError(
+                f"the {name} is silent in the first {seconds:.0f} s, expected the robot's voice: check what was recorded"
+            )
+
+
+def _levels(mic: Samples, ref: Samples) -> dict[str, Any]:
+    told: dict[str, Any] = {"seconds": mic.size / SAMPLE_RATE}
+    for name, x in (("mic", mic), ("ref", ref)):
+        told[f"{name}_db"] = float(decibels(np.mean(np.square(x, dtype=np.float64))))
+        told[f"{name}_peak_db"] = float(decibels(float(np.abs(x).max()) ** 2))
+    told["clipped"] = float(np.mean(np.abs(mic) >= FULL))
+    shut = block_power(mic, SAMPLE_RATE // 50) < GATED
+    played = all_block_power(ref, SAMPLE_RATE // 50)[: shut.size] > 0.0
+    told["gated"] = float(np.mean(shut & played))
+    return told
+
+
+def _lag(mic: Samples, ref: Samples) -> int | None:
+    """Samples: that of the sharpest arrival, without one the coarse lag, None where there is neither."""
+    try:
+        return find_lag(mic, ref)
+    except SignalError:
+        coarse, hop = CoarseLag(256, 2 * SAMPLE_RATE), 256
+        for at in range(0, mic.size - hop + 1, hop):
+            coarse.step(mic[at : at + hop], ref[at : at + hop])
+        return coarse.find()
+
+
+def _lags(mic: Samples, near: Samples) -> Array:
+    """(w,) samples by which the microphone lags behind the aligned reference, in those windows whose arrival is sharp."""
+    size, found = round(WINDOW_S * SAMPLE_RATE), []
+    for at in range(0, mic.size - size + 1, size):
+        part = slice(at, at + size)
+        if mic[part].any() and near[part].any():
+            cross = flat_cross(near[part], mic[part], 2 * size)
+            lag, height = highest(np.abs(correlation_near(cross, 2 * size, STRETCH)))
+            if height > SHARP:
+                found.append(lag)
+    return np.array(found, float)
+
+
+class _Spectra:
+    """Powers by bin of microphone, of what of it is incoherent with the aligned reference, and of the noise; levels frame by frame."""
+
+    def __init__(self, mic: Samples, near: Samples, fan: Samples) -> None:
+        window = hann(SIZE)
+        x, y = (fft.rfft(frames(s, SIZE, SIZE // 2) * window, axis=1) for s in (near, mic))
+        played, heard = power(x), power(y)
+        self.hz = frequencies(SIZE // 2 + 1)
+        self.mic = heard.mean(axis=0)
+        coherent = np.abs((x.conj() * y).mean(axis=0)) ** 2 / np.maximum(played.mean(axis=0), 1e-30)
+        # a filter fitted to few frames explains some of anything: as much as the frames that count are few
+        count = np.square(played.sum(axis=0)) / np.maximum(np.square(played).sum(axis=0), 1e-30)
+        self.rest = np.clip((self.mic - coherent) / (1.0 - 1.0 / np.maximum(count, 1.5)), 0.0, self.mic)
+        self.noise = np.interp(self.hz, frequencies(fan.size), fan) * SAMPLE_RATE / 2 * np.sum(window**2)
+        short = hann(512)
+        self._short = [power(fft.rfft(frames(s, 512, 256) * short, axis=1)) for s in (near, mic)]
+
+    def over(self, low: float, high: float) -> tuple[float, float, float]:
+        """Removable dB, microphone over noise in dB and correlation of the levels, from low to high Hz."""
+        at = (self.hz >= low) & (self.hz < high)
+        mic, rest, noise = (float(s[at].sum()) for s in (self.mic, self.rest, self.noise))
+        ratios = [float(decibels(mic / max(part, 1e-6 * mic, 1e-20))) for part in (rest, noise)]
+        return ratios[0], ratios[1], self._follows(low, high)
+
+    def _follows(self, low: float, high: float) -> float:
+        """Correlation of log energies down to 50 dB under the loudest; over all of the spectrum, the median of its bands."""
+        if high - low > 5000.0:
+            return float(np.median([self._follows(*band) for band in octaves()]))
+        hz = frequencies(257)
+        at = (hz >= low) & (hz < high)
+        energies = [s[:, at].sum(axis=1) for s in self._short]
+        levels = [np.log(e + 1e-5 * e.max() + 1e-20) for e in energies]
+        return float(np.corrcoef(*levels)[0, 1]) if all(float(np.ptp(one)) > 0.0 for one in levels) else 0.0
+
+    def change_db(self) -> float:
+        """What is neither linear in the reference nor noise, against what is linear."""
+        linear = float((self.mic - self.rest).sum())
+        return float(decibels(np.maximum(self.rest - self.noise, 0.0).sum() / max(linear, 1e-20), 1e-6))
+
+
+def octaves() -> list[tuple[float, float]]:
+    """Octave bands, Hz: the third-octaves of IEC 61260-1 from 88 Hz on, three by three, up to 8 kHz."""
+    bands = third_octave_bands()
+    return [(float(bands[i, 0]), float(bands[min(i + 2, len(bands) - 1), 1])) for i in range(3, len(bands), 3)]
+
+
+def _filtered(mic: Samples, ref: Samples, engine: str) -> tuple[Samples, int | None]:
+    """(n,) the output without a profile, and how often speech of a human has started in it; None where that is not judged."""
+    with EgoFilter(engine=engine) as ego:
+        output = np.concatenate((ego.process(mic, ref), ego.flush()))
+        starts = sum(event.kind == "speech_started" for event in ego.events())
+        return output, starts if ego.judges_speech else None
+
+
+def _removed(mic: Samples, output: Samples) -> float:
+    """By how much the level falls once the filter has settled, dB."""
+    before, after = (
+        float(np.mean(np.square(x[round(SETTLED_S * SAMPLE_RATE) :], dtype=np.float64))) for x in (mic, output)
+    )
+    return float(decibels(before) - decibels(after))
+
+
+def _bands(mic: Samples, spectra: _Spectra, outputs: dict[str, Samples]) -> list[Band]:
+    from_here = slice(round(SETTLED_S * SAMPLE_RATE), None)
+    density = {
+        name: power(fft.rfft(frames(x[from_here], SIZE, SIZE // 2) * hann(SIZE), axis=1)).mean(axis=0)
+        for name, x in {"": mic, **outputs}.items()
+    }
+    told = []
+    for low, high in octaves():
+        at = (spectra.hz >= low) & (spectra.hz < high)
+        level = {name: float(decibels(d[at].sum(), 1e-20)) for name, d in density.items()}
+        mic_db = float(decibels(spectra.mic[at].sum() * 2 / SIZE / np.sum(hann(SIZE) ** 2)))
+        removed = {name: level[""] - db for name, db in level.items() if name}
+        told.append(Band(low, high, mic_db, *spectra.over(low, high), removed))
+    return told
+
+
+def _cause(removable_db: float, over_noise_db: float, follows: float, gated: float, clipped: float) -> Cause:
+    """A microphone that shuts before all else, since its noise cannot be seen; noise where it alone explains what is not linear."""
+    if removable_db >= ENOUGH_DB:
+        return "nothing"
+    if gated >= GATED_SHARE:
+        return "gate"
+    if removable_db > over_noise_db - 3.0:
+        return "noise"
+    if clipped >= CLIPPED_SHARE:
+        return "clipping"
+    return "change" if follows >= FOLLOWS else "other"
+
+
+def _rounded(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _rounded(one) for key, one in value.items()}
+    if isinstance(value, list | tuple):
+        return [_rounded(one) for one in value]
+    return round(value, 4) if isinstance(value, float) else value

@@ -1,0 +1,159 @@
+"""A device's passport in words: lines for the terminal, rows and sentences for the page and JSON."""
+
+from __future__ import annotations
+
+from edgefilter.diagnosis.passport import ENOUGH_DB, Passport
+from edgefilter.report.text import sentence
+
+ERROR_DB: tuple[float, float] | None = None
+"""Of the predicted SI-SDR, median and worst over devices, as `python -m bench passport` measures it; None: not measured yet."""
+DRIFTS_PPM = 50.0
+"""Clocks further apart than this share no crystal: those of one sound card agree to 1 ppm, two cheap ones to 100."""
+UNSTABLE_MS = 2.0
+"""A lag that moves more than this within a recording is no room's: buffers run empty or are filled up."""
+QUIET_DB = -50.0
+"""A microphone whose peaks stay under this uses 7 of its 16 bits."""
+UNLEARNED_DB = 6.0
+"""Where a fixed filter can remove so much more than the running one did, calibrating or learning pays."""
+
+CAUSES = {
+    "nothing": "nothing stands in the way of a linear filter",
+    "noise": "the noise is what a linear filter leaves",
+    "gate": "the microphone falls silent while the robot talks: it is processed (a gate, noise suppression)",
+    "clipping": "the microphone is overdriven: its loudest samples are cut off",
+    "change": "the loudspeaker distorts, or the microphone is processed (gain control, noise suppression): its levels follow the"
+    " reference, its waveform does not",
+    "other": "something else sounds that does not follow the reference: somebody talks, or there is another source",
+}
+FIRST = {
+    "noise": "make the room or the fan quieter, or bring loudspeaker or human nearer to the microphone",
+    "gate": "switch off the microphone's noise suppression, gain control and echo cancellation, then record again",
+    "clipping": "turn the microphone's gain down by 6 to 12 dB, then record again",
+    "change": "switch off the microphone's processing; if there is none, turn the loudspeaker down by 6 dB, and record again",
+    "other": "record the robot alone, without people, radio or a second loudspeaker",
+}
+
+
+def headline(found: Passport) -> str:
+    """The most important in a sentence."""
+    if not found.found:
+        return "The reference is not found in the recording."
+    if not found.engines:
+        return "The reference is found."
+    best = max(found.engines, key=lambda name: found.engines[name].si_sdr_db)
+    return f"Expect an SI-SDR of {found.engines[best].si_sdr_db:.0f} dB with {best}, for a human {_against(found.human_db)}."
+
+
+def expectation(found: Passport) -> dict[str, object]:
+    """What was found, how uncertain the prediction is, and what to change first, for JSON."""
+    return {
+        "headline": headline(found),
+        "cause": sentence(CAUSES[found.cause]) if found.found else "",
+        "changes": advice(found),
+        "uncertainty_db": {"median": ERROR_DB[0], "worst": ERROR_DB[1]} if ERROR_DB else None,
+    }
+
+
+def advice(found: Passport) -> list[str]:
+    """What to change, the most important first."""
+    if not found.found:
+        return [
+            "Check that the recording holds the robot, and that the reference is what was played, not earlier than 2 s before;"
+            " `edgefilter doctor` finds wrong connections."
+        ]
+    told = [FIRST[found.cause]] if found.cause in FIRST else []
+    if not found.pauses:
+        told.append(
+            "let the robot pause for some seconds while it is recorded: the noise is not known, and may be less"
+        )
+    if found.mic_peak_db < QUIET_DB:
+        told.append(f"turn the microphone's gain up: its peaks reach only {found.mic_peak_db:.0f} dBFS")
+    if found.lag_spread_ms is not None and found.lag_spread_ms > UNSTABLE_MS:
+        told.append("use larger buffers, or one program for playing and recording: the lag jumps")
+    if found.lag_spread_ms is None:
+        told.append("take the reference as late as possible before the loudspeaker: no arrival is sharp")
+    if abs(found.drift_ppm or 0.0) > DRIFTS_PPM:
+        told.append("use one sound card for loudspeaker and microphone, if you can: the clocks drift apart")
+    linear = found.engines.get("linear")
+    if linear and found.removable_db - linear.removed_db > UNLEARNED_DB:
+        told.append("calibrate, or let it learn (`run --learn`): more can be removed than the filter did in this time")
+    return [sentence(one) for one in told or ["nothing needs to be changed"]]
+
+
+def rows(found: Passport) -> list[tuple[str, str, str]]:
+    """Name, value and what it means, of everything that is one number."""
+    told = [
+        ("microphone", f"{found.mic_db:.0f} dBFS", f"peak {found.mic_peak_db:.0f} dBFS"),
+        ("reference", f"{found.ref_db:.0f} dBFS", f"peak {found.ref_peak_db:.0f} dBFS"),
+        (
+            "noise",
+            f"{found.noise_db:.0f} dBFS" if found.noise_db > -119.0 else "none",
+            "in the robot's pauses" if found.pauses else "at most: in the quietest moments",
+        ),
+    ]
+    if not found.found:
+        return told
+    spread = "no arrival is sharp" if found.lag_spread_ms is None else f"moves by {found.lag_spread_ms:.1f} ms"
+    drift = "-" if found.drift_ppm is None else f"{found.drift_ppm:+.0f} ppm"
+    told += [
+        ("lag", f"{found.lag_ms:.0f} ms", f"{spread}; sharp in {100 * found.sharp:.0f} % of the windows"),
+        ("drift", drift, "positive: the lag shrinks"),
+        ("linear", f"{found.removable_db:.1f} dB", "what a fixed linear filter can take off, by coherence"),
+        ("over noise", f"{found.over_noise_db:.1f} dB", "microphone over its noise"),
+        ("changed", f"{found.change_db:.0f} dB", "neither linear nor noise, against what is linear"),
+        ("follows", f"{found.follows:.2f}", "correlation of band levels with the reference's"),
+        ("gated", f"{100 * found.gated:.0f} %", "of the time the microphone is digitally silent while the robot plays"),
+    ]
+    return told
+
+
+def lines(found: Passport, diagnosis: str) -> list[str]:
+    """For the terminal."""
+    told = [headline(found), ""]
+    told += [f"{name:<12}{value:<10}{what}" for name, value, what in rows(found)]
+    if found.found:
+        told += [f"{'':<12}{sentence(CAUSES[found.cause])}", ""]
+        names = list(found.engines)
+        told.append(f"{'band, Hz':<12}" + "".join(f"{head:>10}" for head in ("linear", "noise", "follows", *names)))
+        told += [
+            f"{f'{band.low:.0f}-{band.high:.0f}':<12}{band.removable_db:>10.1f}{band.over_noise_db:>10.1f}{band.follows:>10.2f}"
+            + "".join(f"{band.removed_db[name]:>10.1f}" for name in names)
+            for band in found.bands
+        ]
+        told += ["", *(f"{name:<12}{what}" for name, what in engine_lines(found)), f"{'':<12}{uncertainty(found)}"]
+        told += ["", f"{'diagnosis':<12}{diagnosis}"]
+    return [*told, "change first:", *(f"  {at}. {line}" for at, line in enumerate(advice(found), start=1))]
+
+
+def engine_lines(found: Passport) -> list[tuple[str, str]]:
+    """What is expected of each engine."""
+    return [
+        (
+            name,
+            f"robot alone lowered by {one.removed_db:.1f} dB"
+            + ("" if one.false_starts is None else f", {one.false_starts} false starts of speech")
+            + f"; a human {_against(found.human_db)}: SI-SDR {one.si_sdr_before_db:.1f} -> {one.si_sdr_db:.1f} dB",
+        )
+        for name, one in found.engines.items()
+    ]
+
+
+def uncertainty(found: Passport) -> str:
+    """Of the prediction, in a sentence or two."""
+    told = "How far other humans are from this has not been measured: it was tried with one voice."
+    if ERROR_DB:
+        told = f"Other humans' SI-SDR differed from it by {ERROR_DB[0]:.1f} dB at the median of devices, {ERROR_DB[1]:.1f} dB at worst."
+    if found.cause in ("gate", "change"):
+        told += " What processes the microphone has not heard this human: expect less where it acts on speech."
+    return told
+
+
+def _against(human_db: float) -> str:
+    if human_db == 0.0:
+        return "as loud as the robot"
+    return f"{abs(human_db):g} dB {'below' if human_db < 0.0 else 'above'} the robot"
+
+
+def enough() -> str:
+    """What the bars of the page are measured against."""
+    return f"{ENOUGH_DB:.0f} dB are enough for a human 10 dB below the robot."
