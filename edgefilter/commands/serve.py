@@ -16,7 +16,8 @@ from edgefilter.learning.background import BackgroundLearner, cores
 from edgefilter.profile.data import Profile
 
 STREAMS_PER_CORE = 4
-"""Clients at a time unless --streams says otherwise: half of what a core bore when it was measured (docs/serve.md)."""
+"""Clients at a time unless --streams says otherwise: a third of what a core bears by computing time, 0.08 s a second of
+`crnn` (docs/serve.md), since those whose hops come at once wait for one another."""
 
 
 def main(args: argparse.Namespace) -> int:
