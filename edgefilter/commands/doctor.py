@@ -83,7 +83,7 @@ def examine(
     if ports:
         yield from _guarded("sound", lambda: _sound(ports))
     if speaker is not None and len(ports) == 2:
-        yield from _guarded("set-up", lambda: _set_up(ports, speaker))
+        yield from _guarded("set-up", lambda: _set_up(ports, speaker, channels))
 
 
 def _guarded(name: str, look: Callable[[], Iterator[Check]]) -> Iterator[Check]:
@@ -189,8 +189,8 @@ def array_checks(channels: Sequence[Channel]) -> Iterator[Check]:
         yield Check(f"channel {one.number}", "warning" if why else "ok", found, do)
 
 
-def _set_up(ports: dict[str, InputPort], speaker: str) -> Iterator[Check]:
-    """Play chirps and hear them as a run would."""
+def _set_up(ports: dict[str, InputPort], speaker: str, channels: Sequence[int] | None) -> Iterator[Check]:
+    """Play chirps and hear them as a run would, of an array in the first microphone."""
     from edgefilter.audio.live import LiveSource
     from edgefilter.audio.measure import play_through
 
@@ -206,7 +206,8 @@ def _set_up(ports: dict[str, InputPort], speaker: str) -> Iterator[Check]:
         f"chirps for {sound.size / SAMPLE_RATE:.0f} s on output '{output}', peak {LEVEL_DB:.0f} dB of full scale"
         " (--no-chirp: without)"
     )
-    source = LiveSource(ports["microphone"].device, ports["reference"].device)
+    first = channels[:1] if channels else None
+    source = LiveSource(ports["microphone"].device, ports["reference"].device, channels=first)
     mic, ref, lost = play_through(output, source, sound)
     yield from judge_set_up(judge(mic, ref), output, str(ports["reference"].device))
     if lost:

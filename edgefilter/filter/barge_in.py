@@ -103,6 +103,11 @@ class BargeIn:
         self._sure = self._silent = self._waited = 0
         self._begun = self.speaking = False
 
+    @property
+    def waited(self) -> int:
+        """Hops since speech began, in the hop in which that is told."""
+        return self._waited - 1
+
     def end(self) -> bool:
         """The recording is over; whether somebody was speaking."""
         was, self.speaking, self._begun = self.speaking, False, False

@@ -91,7 +91,7 @@ class Canceller:
     longer than taps it is cut, without it the start is cold. behind(echo, mic) (hop,): what the microphone makes of the
     echo that the path brings, None for nothing. microphones: of an array, None for a single one: signals are then
     (microphones, hop), the impulse response (microphones, n), and all that is said of a path holds of each; the volume,
-    and whether the echo is there at all, is told in one microphone, `first`, for all of them. Raises SignalError where hop or
+    and whether the echo is there at all, is told in one microphone (tell_by) for all of them. Raises SignalError where hop or
     taps are not positive or the impulse response is not finite.
     """
 
@@ -111,7 +111,7 @@ class Canceller:
         self.partitions = -(-taps // hop)
         self.taps = self.partitions * hop
         self.adaptation = adaptation or (COLD if impulse_response is None else WARM)
-        self.microphones, self.first = microphones, 0
+        self.microphones, self._teller = microphones, 0
         self._lead = () if microphones is None else (microphones,)
         self._initial, self._initial_gain = np.zeros((*self._lead, self.taps), np.float32), 1.0
         if impulse_response is not None:
@@ -219,6 +219,15 @@ class Canceller:
         echo = self._limiter.apply(echo)
         return CancellerOutput(echo, mic - echo, misalignment, innovation)
 
+    def tell_by(self, microphone: int) -> None:
+        """Tell the volume, and whether the echo is there, in that microphone of an array from now on.
+
+        The path begins anew where it was told in another: a broken one has scaled or silenced the others, too.
+        """
+        if microphone != self._teller:
+            self._teller = microphone
+            self._begin()
+
     def _predict(self) -> Samples:
         """(hop,) echo of the newest hop by the weights as they are."""
         np.multiply(self._weights, self._spectra, out=self._work)
@@ -226,7 +235,7 @@ class Canceller:
 
     def _first_of(self, x: Samples) -> Samples:
         """(hop,) of the microphone that tells for all, of x (hop,) or (microphones, hop)."""
-        return x if self.microphones is None else x[self.first]
+        return x if self.microphones is None else x[self._teller]
 
     def _push(self, reference: Samples) -> None:
         """Take the reference's next hop into the spectra and powers (partitions, bins), the newest first in each channel."""

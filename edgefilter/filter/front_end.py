@@ -149,13 +149,14 @@ class FrontEnd:
             x, r = self._analyser.push(mic, found.reference if found else ref)
             return Frame(x, r, self._silence, x, self._noise, self._nothing), found
         aligned = stage.aligner.step(mic, ref)
+        if self.microphones:
+            stage.canceller.tell_by(self.microphones.first)
         self.linear = linear = stage.step(heard, aligned)
         gain = self.gate.step(mic, ref, aligned) if self.gate else None
         added = self._added(stage.path.source)
         if self.spatial and self.microphones:
             if self.microphones.step(heard, linear.error):
                 self.spatial.use(self.microphones.used)
-                stage.canceller.first = self.microphones.first
             r, (x, e, error) = self._combined(self.spatial, heard, aligned.reference, linear.echo, gain)
             uncertainty, fan = self.spatial.independent(linear.uncertainty), self.spatial.fan_psd()
             noise, residual = stage.residual.step(e, error, uncertainty, added, fan)

@@ -242,7 +242,7 @@ class Stream:
 
     def _tell_of_speech(self, talk: EventKind, detail: str) -> None:
         if talk == "speech_started":
-            self._turns.start()
+            self._turns.start(self._barge_in.waited)
             self.events.append(Event(talk, self._stepped, detail))
         else:
             start, samples = self._turns.finish()

@@ -48,9 +48,9 @@ class Turns:
             self._gains[at] = gain * (np.minimum(size, LARGEST) / np.maximum(size, np.float32(1e-9)))
         self._count += 1
 
-    def start(self) -> None:
-        """A turn has begun with the latest frame."""
-        self._begin = max(self._count - 1 - self._before, 0)
+    def start(self, waited: int = 0) -> None:
+        """A turn has begun so many frames before the latest."""
+        self._begin = max(self._count - 1 - waited - self._before, 0)
 
     def finish(self) -> tuple[int, Samples]:
         """The turn up to the latest frame: its first sample, and its samples (n,) float32, a whole number of hops."""

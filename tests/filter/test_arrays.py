@@ -11,9 +11,10 @@ from edgefilter import EgoFilter, PathLearner, calibrate, enhance, generate_swee
 from edgefilter.dsp.stft import StftConfig
 from edgefilter.engines.spectral_subtraction import SpectralSubtraction
 from edgefilter.errors import CalibrationError, SignalError
+from edgefilter.filter.barge_in import BargeIn
 from edgefilter.filter.canceller import Canceller
 from edgefilter.filter.stream import Stream
-from edgefilter.filter.turns import overlap_add
+from edgefilter.filter.turns import Turns, overlap_add
 from edgefilter.profile.data import Profile
 from edgefilter.types import Frame, Output
 from tests.conformance import conversation
@@ -179,6 +180,35 @@ def test_equal_channels_count_as_one_and_another_takes_the_place_of_the_first() 
         assert (stats["reference"], stats["left_out"]) == expected
         assert np.mean(out[2 * RATE : 3 * RATE] ** 2) < 0.05 * np.mean(mic[2 * RATE : 3 * RATE, 0] ** 2)
     assert EgoFilter(engine="ss").stats()["array"] is None
+
+
+@pytest.mark.parametrize("factor", [1e-4, 0.05, 10.0])
+def test_a_first_microphone_that_is_left_out_has_set_the_volume_of_no_other(factor: float) -> None:
+    mic, ref, _ = talk()
+    mic = mic.copy()
+    mic[:, 0] *= factor
+    ego = EgoFilter(calibration(3), "linear", keep_channels=True)
+    ego.process(mic[: 2 * RATE], ref[: 2 * RATE])
+    assert list(ego.stats()["array"]["left_out"]) == ["0"]
+    assert abs(ego.stats()["linear_stage"]["gain_db"]) < 1.0
+    span = slice(round(1.1 * RATE), round(1.9 * RATE))
+    left = np.mean(ego.robot_removed()[span, 1:] ** 2, axis=0)
+    assert np.all(left < 0.05 * np.mean(mic[span, 1:] ** 2, axis=0))
+
+
+def test_a_turn_that_is_told_late_begins_no_later() -> None:
+    at_once, late, told = Turns(StftConfig(), None), Turns(StftConfig(), None), BargeIn(0.016)
+    frames = np.stack([StftConfig().analyse(noise(512, seed).astype(np.float32)) for seed in range(60)])
+    for at, frame in enumerate(frames):
+        for turns in (at_once, late):
+            turns.step(frame, frame, None)
+        if at == 40:
+            at_once.start()
+        if told.note(0.99 if at >= 40 else 0.0, wait=10) == "speech_started":
+            assert at == 50
+            late.start(told.waited)
+    assert at_once.finish()[0] == late.finish()[0] > 0
+    assert np.array_equal(at_once.finish()[1], late.finish()[1])
 
 
 def test_a_turn_of_one_microphone_is_what_was_streamed() -> None:
