@@ -15,10 +15,13 @@ RANGE = 1e-5
 """A band's power is told down to so much of the loudest band's so far, -50 dB."""
 MEMORY_S = 3.0
 """Time constant of the correlation, and of the means that are removed."""
+CHANCE = 0.1
+"""Correlation that the best of a hundred wrong lags has at least: a smaller one says nothing more for the right lag."""
 ENOUGH_S, CERTAIN = 1.0, 0.6
 """Seconds of both that must have been heard, and correlation times its ratio to the best elsewhere from which on it is believed.
-After 1.5 s of ten unknown devices' recordings the least was 0.78, and beside speech of somebody else while the reference
-played unheard the most 0.46."""
+After 1.5 s of robot six of six unknown devices have 0.78 and more. Beside other speech, while the reference plays unheard,
+20 of 80 pairs of 10 s go beyond it once: a canceller that looks in vain takes nothing away.
+"""
 SAME = 3
 """Lags on each side, in hops, that are the same arrival."""
 
@@ -82,7 +85,7 @@ class CoarseLag:
             return None
         score = self._cross / np.sqrt(self._power * self._heard + np.finfo(np.float64).tiny)
         at = int(score.argmax())
-        elsewhere = max(score[: max(at - SAME, 0)].max(initial=0.0), score[at + SAME + 1 :].max(initial=0.0))
+        elsewhere = max(score[: max(at - SAME, 0)].max(initial=CHANCE), score[at + SAME + 1 :].max(initial=CHANCE))
         return at * self._hop if score[at] ** 2 > CERTAIN * elsewhere else None
 
 

@@ -32,6 +32,10 @@ LATE_VARIANCE = 0.04
 DISPLACEMENT_SCALE = 0.7
 """Displacement, relative to the rms that the reference has held at its loudest so far, at which the products have the size of the
 reference."""
+FURTHEST = 10.0
+"""Largest displacement, of that size: a voice stays below 5, and what begins or clicks before its level is known goes far beyond."""
+ANOTHER_VOICE = 0.01
+"""Ratio of levels, -40 dB, below which what the products have learned was learned of noise before the voice, and is forgotten."""
 PRODUCT_PARTITIONS = 2
 PRODUCT_VARIANCE = 2e-3
 """Variance of the paths of the nonlinear products relative to the linear path."""
@@ -266,9 +270,12 @@ class Canceller:
             self._recent[order] *= scale
             self._spectra[rows] *= scale
             self._powers[rows] *= scale**2
-            self._weights[..., rows, :] /= scale
-            variance = self._covariance[..., rows, :]
-            np.minimum(variance / scale**2, self._product_variance[..., None, :], out=variance)
+            weights, variance = self._weights[..., rows, :], self._covariance[..., rows, :]
+            if smaller < ANOTHER_VOICE:
+                weights[:], variance[:] = 0.0, self._product_variance[..., None, :]
+            else:
+                weights /= scale
+                np.minimum(variance / scale**2, self._product_variance[..., None, :], out=variance)
 
     def _slide(self, to: int) -> None:
         """Look at the rows from `to` on: one place on, all of the past is one place further down without being copied."""
@@ -279,7 +286,7 @@ class Canceller:
         """(n,) of the membrane while it plays the next n samples of the reference; carries its state on."""
         moving = np.concatenate((self._moving, reference * np.float32(self._loudest**-0.5)))
         self._moving = moving[reference.size :]
-        return np.correlate(moving, self._lowpass_reversed, "valid")
+        return np.clip(np.correlate(moving, self._lowpass_reversed, "valid"), -FURTHEST, FURTHEST)
 
     def _adapt(self, error_spectrum: np.ndarray, divisor: np.ndarray) -> None:
         """Kalman correction of weights and covariance, Enzner & Vary (2006), eq. (30)-(34)."""

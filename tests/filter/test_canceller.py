@@ -133,6 +133,19 @@ def test_a_robot_that_was_calibrated_in_a_dead_room_learns_the_room_it_is_carrie
     assert db(error[-16000:]) < db(mic[-16000:]) - 40
 
 
+def test_the_first_loud_hop_after_a_faint_noise_does_not_open_the_nonlinear_products() -> None:
+    """Their size was told by a converter's noise: what they were expected to bring was beyond all numbers."""
+    x, h = speechlike(2.0), path()
+    x[:16_000] = 1e-7 * np.random.default_rng(8).standard_normal(16_000)
+    mic = signal.oaconvolve(x, h)[: x.size].astype(np.float32)
+    canceller = Canceller(HOP, 3200, h)
+    most = 0.0
+    for at in range(0, x.size // HOP * HOP, HOP):
+        most = max(most, float(canceller.step(mic[at : at + HOP], x[at : at + HOP]).uncertainty.mean()))
+    # ten times the microphone for two hops; it was beyond 1e9
+    assert most < 30 * np.mean(np.abs(np.fft.rfft(mic[: x.size // HOP * HOP].reshape(-1, HOP))) ** 2, axis=1).max()
+
+
 def test_error_and_echo_add_up_to_the_microphone_exactly() -> None:
     x, mic = speechlike(0.5), speechlike(0.5, seed=5)
     canceller = Canceller(HOP, 1600, path(taps=1600))
