@@ -65,7 +65,7 @@ def test_silence_on_either_side_says_nothing():
     assert coarse.find() is None
 
 
-@pytest.mark.parametrize(("width", "lag", "noise_db"), [(120, 2_900, -30), (200, 3_600, -30), (120, 20_000, -20)])
+@pytest.mark.parametrize(("width", "lag", "noise_db"), [(120, 2_900, -30), (200, 3_600, -30), (120, 12_000, -20)])
 def test_the_linear_stage_follows_a_path_without_an_arrival(width, lag, noise_db):
     """Nothing was subtracted for ever where the cross-correlation had no peak; in dB it removes as much as with the true lag."""
     x = robot_speech(8.0)
