@@ -77,6 +77,7 @@ EventKind: TypeAlias = Literal[
     "reference_missing",
     "reference_late",
     "robot_unfound",
+    "echo_unpredicted",
     "rate_mismatch",
     "lost",
     "overrun",
@@ -85,7 +86,13 @@ EventKind: TypeAlias = Literal[
     "device_back",
 ]
 
-SET_UP_WRONG: tuple[EventKind, ...] = ("reference_missing", "reference_late", "robot_unfound", "rate_mismatch")
+SET_UP_WRONG: tuple[EventKind, ...] = (
+    "reference_missing",
+    "reference_late",
+    "robot_unfound",
+    "echo_unpredicted",
+    "rate_mismatch",
+)
 """Kinds that say that something was connected wrongly, once each time it begins."""
 
 
@@ -111,7 +118,8 @@ class Event:
         "speech_stopped": of the human, from engines that judge it. "overloaded", "stepped_down", "stepped_up": what too
         little or enough time led to. "learned", "unlearned": a better echo path was taken over, or given back.
         "reference_missing", "reference_late", "robot_unfound": the reference was silent from the start, comes after its
-        echo, or carries sound that is not found in the microphone, though that is louder then. "rate_mismatch": a
+        echo, or carries sound that is not found in the microphone, though that is louder then. "echo_unpredicted": the echo is found, and hardly
+        any of it can be subtracted. "rate_mismatch": a
         plugin's or a service's sound comes at another pace than its rate and channels say.
         "lost", "overrun", "underrun": samples that the sound devices of `edgefilter run` lost, callbacks that came too
         late, "device_gone", "device_back": one that stopped, for which silence stands in, and runs again; not from an
@@ -164,7 +172,8 @@ class AlignmentStats(AlignmentCounts, total=False):
 class LinearStageStats(TypedDict):
     """What the canceller did: hops, those in which it adapted, its length in hops, the playback gain that it follows.
 
-    diverged: how often it began anew because what it predicted was beyond all reason.
+    diverged: how often it began anew because what it predicted was beyond all reason. removed_db: how far the subtraction
+    has lowered the robot over its last ten seconds, None before three of them.
     """
 
     hops: int
@@ -172,6 +181,7 @@ class LinearStageStats(TypedDict):
     partitions: int
     gain_db: float
     diverged: int
+    removed_db: float | None
 
 
 class DeadlineStats(TypedDict):

@@ -399,4 +399,5 @@ class Canceller:
             "partitions": self.partitions,
             "gain_db": 20.0 * float(np.log10(self.volume.gain)),
             "diverged": self._diverged,
+            "removed_db": self.volume.removed_db,
         }

@@ -208,7 +208,9 @@ class Stream:
                 Event("realigned", self._stepped, f"reference arrives after {aligned.delay:.1f} samples")
             )
         if self._watch and aligned:
-            said = self._watch.step(self.front.first_of(mic), ref, aligned)
+            stage = self.front.linear_stage
+            removed_db = stage.canceller.volume.removed_db if stage else None
+            said = self._watch.step(self.front.first_of(mic), ref, aligned, removed_db)
             self.events.extend(Event(kind, self._stepped, detail) for kind, detail in said)
         if lesson := self.front.lesson:
             self.events.append(Event(lesson.kind, self._stepped, lesson.detail))

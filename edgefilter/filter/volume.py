@@ -23,6 +23,8 @@ NOTICED = 1e-3
 """Error power over the microphone's, -30 dB, from which on a volume is suspected; 0.3 dB of volume leave that."""
 AUDIBLE, FORGET_S = 0.01, 10.0
 """The robot is audible where the echo is within 20 dB of its recent peak, which fades by 10 dB in FORGET_S seconds."""
+ENOUGH_S, LEAST_LEFT = 3.0, 1e-9
+"""Seconds of audible robot from which on it is said how much is removed, and the least that is left of it, -90 dB."""
 MOST = 10.0
 """Largest factor, 20 dB, by which the volume is followed from where it was at first, up or down; and the factor by which
 an echo path that began unknown must have lowered the microphone's power before its volume means anything."""
@@ -85,9 +87,17 @@ class Volume:
         self._patience = round(PATIENCE_S * SAMPLE_RATE / hop)
         self._known, self._scaled = known, scaled or not known
         self._peak = 0.0
-        self._smoothed = self._since = NOTHING
+        self._smoothed = self._since = self._lasting = NOTHING
+        self._enough, self._audible = round(ENOUGH_S * SAMPLE_RATE / hop), 0
         self.suspected, self._factor, self._count, self._age, self._rest = not self._scaled, 1.0, 0, 0, 0
         self.gain = self._first = 1.0
+
+    @property
+    def removed_db(self) -> float | None:
+        """How far the subtraction has lowered the microphone over the last FORGET_S of robot; None before ENOUGH_S of it."""
+        if self._audible < self._enough or not self._lasting.mic:
+            return None
+        return -10.0 * math.log10(max(self._lasting.left() / self._lasting.mic, LEAST_LEFT))
 
     def follow(self, mic: Samples, echo: Samples) -> float:
         """The factor by which the echo path is to be scaled now, 1 where nothing says so. mic, echo: (hop,)."""
@@ -95,6 +105,9 @@ class Volume:
         self._peak = max(now.echo, self._forget * self._peak)
         self._smoothed = self._smoothed.smoothed(now)
         audible = now.echo > AUDIBLE * self._peak
+        if audible:
+            self._lasting = Moments(*(self._forget * before for before in self._lasting)).plus(now)
+            self._audible += 1
         if not self._known:
             self._known = audible and self._smoothed.mic > MOST * self._smoothed.left()
         elif not self._scaled:

@@ -105,3 +105,18 @@ def test_speech_that_waits_is_told_once_it_may_be_and_never_if_it_has_ended():
     assert [talk.note(0.0, wait=3) for _ in range(6)].count("speech_stopped") == 1
     assert [talk.note(p, wait=30) for p in (0.99, *[0.0] * 6, 0.5)] == [None] * 8 and not talk.speaking
     assert talk.note(0.99, wait=0) == "speech_started"
+
+
+def test_a_microphone_that_is_processed_is_said_and_a_good_one_is_not(robot):
+    """A gate that opens by itself and noise as loud as the robot leave nothing to predict."""
+    mic, ref = robot
+    ego = EgoFilter(engine="linear")
+    assert not [event for event in events(ego, mic, ref) if event.kind in SET_UP_WRONG]
+    assert ego.stats()["linear_stage"]["removed_db"] > 10.0
+    rng = np.random.default_rng(4)
+    scrambled = np.abs(mic) * rng.choice((-1.0, 1.0), mic.size).astype(np.float32)  # the envelope is all that is left
+    ego = EgoFilter(engine="linear")
+    processed = 0.5 * mic + 0.7 * scrambled
+    wrong = [event for event in events(ego, processed, ref) if event.kind in SET_UP_WRONG]
+    assert [event.kind for event in wrong] == ["echo_unpredicted"] and "switch off" in wrong[0].detail
+    assert ego.stats()["linear_stage"]["removed_db"] < 4.0
