@@ -14,7 +14,7 @@ import soundfile
 
 from edgefilter.dsp.metrics import si_sdr
 from edgefilter.engines import create, onnx_session
-from edgefilter.engines.crnn import Crnn, at_training_level
+from edgefilter.engines.crnn import TRACKED_NOISE, Crnn, at_training_level
 from edgefilter.engines.paper_crnn import PaperCrnn
 from edgefilter.errors import ModelError, SignalError, UsageError
 from edgefilter.filter.ego_filter import EgoFilter
@@ -55,7 +55,7 @@ def test_crnn_answers_what_onnxruntime_answers_for_the_same_frames():
         noise, residual = rng.random((2, engine.stft.bins)).astype(np.float32)
         heard = Frame(mic=mic, reference=reference, echo=echo, error=error, noise_psd=noise, residual_psd=residual)
         output, state = engine.step(heard, state)
-        levelled, scale = at_training_level(heard, state[2].loudest)
+        levelled, scale = at_training_level(heard._replace(noise_psd=TRACKED_NOISE * noise), state[2].loudest)
         spectra = levelled.error, levelled.mic, levelled.reference, levelled.echo
         pairs = [np.stack((x.real, x.imag), axis=-1)[None] for x in spectra]
         powers = [levelled.noise_psd[None], levelled.residual_psd[None]]
@@ -75,6 +75,7 @@ def test_of_a_calibrated_robot_ss_has_its_share_of_the_answer():
     for _ in range(5):
         spectra = [spectrum(rng, 257) for _ in range(4)]
         powers = rng.uniform(0.5, 2.0, (2, 257)).astype(np.float32)
+        powers[0] = 0.0  # the network is told of noise as it is where it is calibrated alone
         answers, states = zip(*(e.step(Frame(*spectra, *powers), s) for e, s in zip(engines, states, strict=True)))
         both, network, mask = (answer.spectrum for answer in answers)
         np.testing.assert_allclose(both, 0.6 * network + 0.4 * mask, atol=1e-6)  # models/MODELS.md, the shares of ss
@@ -85,7 +86,7 @@ def test_of_a_robot_whose_path_was_learned_the_network_answers_alone():
     learned = replace(Profile.load(DEMO / "profile.npz"), source=LEARNED)
     engines = create("crnn", learned, model=EDGE), create("crnn", model=EDGE)
     rng = np.random.default_rng(1)
-    heard = Frame(*(spectrum(rng, 257) for _ in range(4)), *np.ones((2, 257), np.float32))
+    heard = Frame(*(spectrum(rng, 257) for _ in range(4)), np.zeros(257, np.float32), np.ones(257, np.float32))
     answers = [engine.step(heard, engine.initial_state())[0].spectrum for engine in engines]
     np.testing.assert_array_equal(*answers)
 
