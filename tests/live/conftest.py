@@ -1,6 +1,7 @@
 """Servers of virtual sound devices, PulseAudio and PipeWire: two null sinks, seen by PortAudio by the names robot, robot_mic
 and their monitors."""
 
+import os
 from contextlib import ExitStack
 
 import pytest
@@ -8,7 +9,17 @@ import pytest
 from bench.live import virtual_sound
 
 
-@pytest.fixture(params=virtual_sound.SYSTEMS)
+ON_BOTH = ("test_devices", "test_virtual_microphone", "test_play")
+"""Modules whose tests run on both systems always; the others, of minutes, on PipeWire where EDGEFILTER_LIVE=all is set."""
+
+
+def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
+    if "new_server" in metafunc.fixturenames:
+        both = metafunc.module.__name__.endswith(ON_BOTH) or os.environ.get("EDGEFILTER_LIVE") == "all"
+        metafunc.parametrize("new_server", virtual_sound.SYSTEMS[: 1 + both], indirect=True)
+
+
+@pytest.fixture
 def new_server(request):
     """A function that starts a server of its own, with other sinks where they are given; all are ended afterwards."""
     with ExitStack() as stack:
