@@ -8,7 +8,6 @@ import pytest
 
 from bench.live import virtual_sound
 
-
 ON_BOTH = ("test_devices", "test_virtual_microphone", "test_play")
 """Modules whose tests run on both systems always; the others, of minutes, on PipeWire where EDGEFILTER_LIVE=all is set."""
 
