@@ -349,7 +349,11 @@ def effect_check_runs_on_a_stream_as_on_a_recording(name: str) -> None:
 
 
 def effect_check_lowers_what_the_running_filter_leaves_or_says_why_not(name: str) -> None:
-    """Of a robot that has the effect `ss` leaves less at first, by 3 dB, where the profile knows it; or nothing changes and it is said."""
+    """Of a robot that has the effect `ss` leaves less at first, by 3 dB, where the profile knows it; or nothing changes and it is said.
+
+    A volume the filter finds by itself with the first words, and the level of a noise: there the profile must not harm, and
+    brings the noise's spectrum.
+    """
     effect, values = (
         catalogue.find(name),
         complete(catalogue.find(name), {**effect_case(name), **RUN_CASES.get(name, {})}),
@@ -361,7 +365,8 @@ def effect_check_lowers_what_the_running_filter_leaves_or_says_why_not(name: str
         assert "changes nothing" in reach(effect, values)
         return
     fall = 10 * np.log10(np.mean(without.astype(np.float64) ** 2) / np.mean(with_it.astype(np.float64) ** 2))
-    assert fall > 3.0, f"{fall:.2f} dB"
+    least = -0.5 if effect.followed else 1.0 if effect.stage == "noise" else 3.0
+    assert fall > least, f"{fall:.2f} dB"
 
 
 def running_robot(name: str, values: Mapping[str, object]) -> tuple[np.ndarray, np.ndarray, Profile]:

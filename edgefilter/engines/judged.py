@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from typing import cast
+from typing import TYPE_CHECKING, cast
 
 from edgefilter import engines
 from edgefilter.engines.base import ClipEngine, Engine, EngineState, FrontEndKind
 from edgefilter.errors import UsageError
 from edgefilter.types import Frame, Output
+
+if TYPE_CHECKING:
+    from edgefilter.profile.data import Profile
 
 JUDGE = "crnn"
 """The engine whose network says for others whether a human speaks."""
@@ -43,14 +46,14 @@ class Judged:
         return Output(output.spectrum, judged.speech_probability), (own, other)
 
 
-def with_network_as_judge(engine: Engine | ClipEngine) -> Engine | ClipEngine:
+def with_network_as_judge(engine: Engine | ClipEngine, profile: Profile | None = None) -> Engine | ClipEngine:
     """The engine with the judgement of crnn's network; crnn as it is.
 
-    Raises UsageError for an engine that has no linear stage, ModelError where the network cannot be loaded.
+    profile: the robot. Raises UsageError for an engine that has no linear stage, ModelError where the network cannot be loaded.
     """
     if engine.name == JUDGE:
         return engine
-    return cast(Engine, Judged(cast(Engine, engine), cast(Engine, engines.create(JUDGE))))
+    return cast(Engine, Judged(cast(Engine, engine), cast(Engine, engines.create(JUDGE, profile))))
 
 
 def judges_speech(engine: Engine | ClipEngine) -> bool:

@@ -34,8 +34,6 @@ DISPLACEMENT_SCALE = 0.7
 reference."""
 FURTHEST = 10.0
 """Largest displacement, of that size: a voice stays below 5, and what begins or clicks before its level is known goes far beyond."""
-ANOTHER_VOICE = 0.01
-"""Ratio of levels, -40 dB, below which what the products have learned was learned of noise before the voice, and is forgotten."""
 PRODUCT_PARTITIONS = 2
 PRODUCT_VARIANCE = 2e-3
 """Variance of the paths of the nonlinear products relative to the linear path."""
@@ -162,7 +160,6 @@ class Canceller:
         self._blocks[..., : self.partitions, :hop] = self._initial.reshape(*lead, self.partitions, hop)
         fourier.rfft(self._blocks, out=self._weights)
         self._covariance = np.zeros(shape, np.float32)
-        self._product_variance = np.zeros((*lead, bins), np.float32)
         self._unknown = 0 if self._warm else UNKNOWN_HOPS
         if self._warm:
             known = np.float32(PRIOR_VARIANCE) * fourier.power(self._weights[..., : self.partitions, :])
@@ -194,7 +191,7 @@ class Canceller:
         turned = self.volume.follow(self._first_of(mic), self._first_of(echo)) if located else 1.0
         if turned != 1.0:
             self._weights *= np.float32(turned)
-            for variance in (self._covariance, self._ageing, self._product_variance):
+            for variance in (self._covariance, self._ageing):
                 variance *= np.float32(turned**2)
             self._covariance += VOLUME_REOPENS * fourier.power(self._weights)
             echo = echo * np.float32(turned)
@@ -260,7 +257,10 @@ class Canceller:
             self._spectra[row], self._powers[row] = spectrum, power
 
     def _scale_products(self, loudness: float) -> None:
-        """Bring the products to the size of a reference that holds this mean square, if it never was as loud."""
+        """Bring the products to the size of a reference that holds this mean square, if it never was as loud.
+
+        What was learned of their paths stays as it is: softer speech says little of what a louder one will distort.
+        """
         if loudness <= self._loudest:
             return
         smaller, self._loudest = np.float32((self._loudest / loudness) ** 0.5), loudness
@@ -270,12 +270,6 @@ class Canceller:
             self._recent[order] *= scale
             self._spectra[rows] *= scale
             self._powers[rows] *= scale**2
-            weights, variance = self._weights[..., rows, :], self._covariance[..., rows, :]
-            if smaller < ANOTHER_VOICE:
-                weights[:], variance[:] = 0.0, self._product_variance[..., None, :]
-            else:
-                weights /= scale
-                np.minimum(variance / scale**2, self._product_variance[..., None, :], out=variance)
 
     def _slide(self, to: int) -> None:
         """Look at the rows from `to` on: one place on, all of the past is one place further down without being copied."""
@@ -309,8 +303,7 @@ class Canceller:
     def _expect(self, path_power: Samples, decay: Samples, known: Samples | float = 0.0) -> None:
         """Let the covariance be that of a path of this power (bins,) at least: decay (partitions, 1) of it, and known."""
         rows = self._covariance[..., : self.partitions, :], self._covariance[..., self.partitions :, :]
-        self._product_variance = np.maximum(self._product_variance, PRODUCT_VARIANCE * path_power)
-        expected = known + decay * path_power[..., None, :], self._product_variance[..., None, :]
+        expected = known + decay * path_power[..., None, :], PRODUCT_VARIANCE * path_power[..., None, :]
         for row, variance in zip(rows, expected, strict=True):
             np.maximum(row, variance, out=row)
 
@@ -359,7 +352,6 @@ class Canceller:
         canceller._noise[:], canceller._loudest = state.noise, state.loudest
         canceller._ageing = (1.0 - state.adaptation.transition**2) * fourier.power(canceller._weights)
         canceller._unknown = 0 if canceller._covariance.any() else UNKNOWN_HOPS
-        canceller._product_variance = PRODUCT_VARIANCE * canceller._path_power()
         canceller._initial, canceller._initial_gain = canceller.impulse_response(), state.volume_gain
         canceller.volume = Volume(hop)
         canceller.volume.gain = state.volume_gain

@@ -112,7 +112,7 @@ class EgoFilter:
         )
         network_judges = barge_in is not None and barge_in.judge == "network"
         if network_judges:
-            best = with_network_as_judge(best)
+            best = with_network_as_judge(best, self.profile)
         budget = None if network_judges else budget_ms
         ladder = None if budget is None or best.lookahead is None else Ladder(climbable(best, self.profile))
         stepping = Stepping(best.stft.hop, ladder, budget_ms)

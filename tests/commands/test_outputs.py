@@ -25,6 +25,8 @@ NEITHER = {
     "speaker", "level_db", "effect", "force", "prove", "no_learn", "on_barge_in", "barge_in", "setup", "load", "unload",
     "hidden", "multisine",
     "no_chirp",
+    "no_diagnosis",
+    "human_db",
     "mic",
     "silenced",
     "human",

@@ -12,7 +12,7 @@ import torch
 from scipy.special import logit
 
 from edgefilter import enhance
-from edgefilter.engines.crnn import Crnn
+from edgefilter.engines.crnn import FADE, LASTING, LOUD, TRACKED_NOISE, Crnn, Levels
 from edgefilter.engines.onnx_session import open_session
 from edgefilter.engines.paper_crnn import PaperCrnn as PaperEngine
 from edgefilter.errors import ModelError
@@ -104,6 +104,11 @@ def test_the_graph_is_opset_17_and_its_gru_is_torchs(exported):
     assert exported[0].memory.bias_hh_l0.abs().min() > 0
 
 
+def as_loud_as_in_training() -> Levels:
+    """Levels after which the engine scales the next frame by 1."""
+    return Levels(np.array(LOUD, np.float32) / np.float32(FADE), np.zeros((LASTING, 2), np.float32))
+
+
 def test_the_engine_computes_what_torch_computes(exported):
     network, path = exported
     engine = Crnn(path)
@@ -116,7 +121,9 @@ def test_the_engine_computes_what_torch_computes(exported):
         powers = [torch.from_numpy(x)[None] for x in (noise, residual)]
         with torch.no_grad():
             spectrum, probability, ours = network.step(*pairs, *powers, ours)
-        output, theirs = engine.step(Frame(mic, reference, echo, error, noise, residual), theirs)
+        heard = Frame(mic, reference, echo, error, noise / TRACKED_NOISE, residual)
+        theirs = theirs[:2] + (as_loud_as_in_training(),)
+        output, theirs = engine.step(heard, theirs)
         # 1e-4: the bound of the export, on values of about 1
         np.testing.assert_allclose(output.spectrum, torch.view_as_complex(spectrum)[0].numpy(), atol=1e-4)
         assert output.speech_probability == pytest.approx(float(probability[0]), abs=1e-4)
