@@ -121,13 +121,16 @@ class Volume:
         return 1.0
 
     def _scale(self, now: Moments) -> float:
-        """Bring the echo to the scale of what is heard: never louder, and from as many hops on as prove a factor by that."""
+        """Bring the echo to the scale of what is heard: never louder, and from as many hops on as prove a factor by that.
+
+        Where twice as many do not agree the path is another one, and its scale is left to the adaptation.
+        """
         self._since = since = self._since.plus(now)
         self._count += 1
         if since.echo > EXCESS * since.mic:
             return self._turn(math.sqrt(since.mic / since.echo))
         agree = self._count >= WITNESSES and _coherent(since)
-        if not agree and self._count < self._patience:
+        if not agree and self._count < 2 * WITNESSES:
             return 1.0
         factor = since.cross / since.echo
         factor = self._turn(factor) if agree and since.left() > EXCESS * since.left(factor) else 1.0
