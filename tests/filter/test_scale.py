@@ -76,6 +76,6 @@ def test_the_scale_of_a_calibrated_path_is_found_with_the_first_words(factor):
 
 def test_a_path_that_explains_nothing_is_adapted_after_a_moment_all_the_same():
     volume, echo, other = Volume(256, scaled=False), robot_speech(2.0), robot_speech(2.0, seed=9)
-    for hop, heard in zip(echo[:8_192].reshape(-1, 256), other[:8_192].reshape(-1, 256), strict=True):
+    for hop, heard in zip(echo[:16_128].reshape(-1, 256), other[:16_128].reshape(-1, 256), strict=True):
         volume.follow(heard, hop)
     assert not volume.suspected
