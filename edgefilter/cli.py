@@ -162,6 +162,8 @@ def _diagnose(commands: argparse._SubParsersAction) -> None:
     option("--apply", metavar="P2.npz", help=told)
     told = "leave out what makes the running filter worse on seconds that no fit has used; takes a little longer"
     option("--prove", action="store_true", help=told)
+    told = "write the law that explains most, of a curve, a gain by level or by time, as an effect of your own"
+    option("--write-effect", metavar="MINE.py", help=told)
     _force(option)
     _recording(option, profile_needed=False)
     _report(option)

@@ -402,6 +402,14 @@ EFFECT_CASES: dict[str, dict[str, object]] = {
         "below_voice_db": 10.0,
     },
     "compression": {"threshold_db": -20.0, "ratio": 4.0, "attack_ms": 8.0, "release_ms": 200.0, "makeup_db": 3.0},
+    "dynamics": {
+        "level_db": np.arange(-60.0, 1.0, 10.0),
+        "gain_db": np.array([6.0, 6.0, 5.0, 2.0, -2.0, -8.0, -14.0]),
+        "attack_ms": 8.0,
+        "release_ms": 150.0,
+    },
+    "static_curve": {"input": np.linspace(-0.8, 0.8, 9), "output": 0.3 * np.tanh(3.0 * np.linspace(-0.8, 0.8, 9))},
+    "modulation": {"rate_hz": 6.3, "mean_db": -2.0, "cosine": np.array([0.3, 0.1]), "sine": np.array([-0.2, 0.0])},
     "limiter": {"ceiling_db": -16.0, "release_ms": 150.0, "makeup_db": 2.0},
     "multiband_compression": {
         "crossover_hz": np.array([350.0, 2000.0]),

@@ -26,11 +26,14 @@ from bench.recordings import progress, read
 from bench.stale import DIAGNOSIS
 from edgefilter.calibration.calibrate import calibrate
 from edgefilter.diagnosis.diagnose import diagnose
+from edgefilter.echo.effects.catalogue import find
 from edgefilter.errors import UsageError
 from edgefilter.types import Samples
 
 SIGNALS = ("sweep_ref", "sweep_mic", "fan_only", "ref", "mic")
 STRENGTHS = ("clear", "moderate", "near")
+LEFT_LIMIT_DB = 3.0
+"""Excess above which what was named does not explain the recording."""
 EXPLAINED_LIMIT_DB = 1.0
 """Excess above which a case from outside the catalogue must never be called explained."""
 
@@ -86,12 +89,19 @@ class Outcome:
         return (self.truth[0], *self.also)
 
     @property
+    def family_hit(self) -> bool:
+        """Whether the first effect named is of the family of one that is right, its law listed or free."""
+        return bool(self.named) and find(self.named[0]).family in {find(name).family for name in self.right}
+
+    @property
     def hit(self) -> bool:
-        """Singles: named first. Pairs: both named. Controls: explained. Outside: unexplained. Sealed: the exact label."""
+        """Singles: named first. Pairs: both named. Controls: explained. Outside: unexplained, or free laws. Sealed: the label."""
         if self.group == "sealed":
             return bool(self.sealed_hit)
-        if self.group in ("controls", "outside"):
-            return self.label == self.truth[0]
+        if self.group == "outside":
+            return self.label == "unknown" or bool(self.named) and all(find(name).free_law for name in self.named)
+        if self.group == "controls":
+            return self.label == "none"
         return self.first in self.right if self.group == "singles" else set(self.truth) <= set(self.named)
 
 
@@ -167,7 +177,11 @@ def counts(found: Sequence[Outcome]) -> dict[str, dict]:
     singles, controls, pairs, outside, sealed = (
         [one for one in found if one.group == group] for group in ("singles", "controls", "pairs", "outside", "sealed")
     )
-    flags: dict[str, Iterable[bool]] = {"one effect: named first": [one.hit for one in singles]}
+    flags: dict[str, Iterable[bool]] = {
+        "one effect: its family first": [one.family_hit for one in singles],
+        "one effect: named first": [one.hit for one in singles],
+    }
+    flags["more than 3 dB left"] = [one.remaining_db > LEFT_LIMIT_DB for one in singles]
     for strength in STRENGTHS:
         of = [one for one in singles if one.strength == strength]
         flags[f"named first, {strength}"] = [one.hit for one in of]
@@ -177,7 +191,7 @@ def counts(found: Sequence[Outcome]) -> dict[str, dict]:
     flags["two effects: both named"] = [one.hit for one in pairs]
     flags["at least one named"] = [bool(set(one.truth) & set(one.named)) for one in pairs]
     flags["both and no other"] = [set(one.truth) == set(one.named) for one in pairs]
-    flags["outside the catalogue: unexplained"] = [one.hit for one in outside]
+    flags["outside the catalogue: unexplained, or a free law"] = [one.hit for one in outside]
     flags["explained above 1 dB of excess"] = [
         one.verdict == "explained" and one.excess_db > EXPLAINED_LIMIT_DB for one in outside
     ]
@@ -223,6 +237,7 @@ def tables(found: Mapping[str, Sequence[Outcome]]) -> list[dict]:
     ]
     times = [np.array([one.seconds for one in of]) for of in found.values()]
     rows += [
+        ["dB left of one effect, median", *(_left(of) for of in found.values())],
         ["seconds a case, median", *(float(np.median(of)) for of in times)],
         ["longest", *(float(of.max()) for of in times)],
     ]
@@ -243,6 +258,11 @@ def tables(found: Mapping[str, Sequence[Outcome]]) -> list[dict]:
             columns = ["case", "hidden", "strength", "said", ("excess, dB", 1), ("left, dB", 1), "evidence"]
             made.append(results.table(f"{name}-misses", f"{name}: {len(misses)} misses", columns, misses))
     return made
+
+
+def _left(found: Sequence[Outcome]) -> float | None:
+    left = [one.remaining_db for one in found if one.group == "singles" and np.isfinite(one.remaining_db)]
+    return float(np.median(left)) if left else None
 
 
 def by_effect(found: Sequence[Outcome]) -> list[list]:

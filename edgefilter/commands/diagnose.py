@@ -5,12 +5,14 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 
 from edgefilter.commands.display import print_result, progress, report_part
 from edgefilter.commands.fitting import Fitted, Refused, fit, long_paths
 from edgefilter.commands.recordings import load
 from edgefilter.diagnosis.diagnose import Diagnosis, diagnose
 from edgefilter.diagnosis.proven import diagnose_proven
+from edgefilter.diagnosis.write_effect import write_effect
 from edgefilter.errors import EdgefilterError, SignalError, UsageError
 from edgefilter.profile.data import Profile
 from edgefilter.report.text import add_command, diagnosis_lines, in_order
@@ -34,10 +36,18 @@ def main(args: argparse.Namespace) -> int:
         applied, refused = _apply(profile, found, recording, reference, args, step) if args.apply else (None, None)
     more = {"applied": {**applied.to_dict(), "output": args.apply}} if applied else {}
     told = [*applied.lines(), f"written to {args.apply}"] if applied else _next_step(found, args)
+    if args.apply and not applied and not refused:
+        told = [f"nothing was found that a profile can hold: {args.apply} is not written"]
     print_result(args, [*diagnosis_lines(found, args.profile is not None), *told], {**found.to_dict(), **more})
+    if args.write_effect:
+        with progress("effect of your own"):
+            law = write_effect(args.write_effect, profile, found, recording, reference)
+        print_result(args, [f"own effect  {args.write_effect}: {law}", f"next        {_own_command(args)}"])
     if html:
         with progress("page of the diagnosis"):
-            html.write_page(args.report, html.diagnosis_page(profile, found, recording, reference, vars(args)))
+            outcome = (applied.after, applied.proof) if applied else ()
+            page = html.diagnosis_page(profile, found, recording, reference, vars(args), *outcome)
+            html.write_page(args.report, page)
         print_result(args, [f"report      {args.report}"])
     if refused:
         raise refused
@@ -51,8 +61,10 @@ def _apply(
     reference: Samples,
     args: argparse.Namespace,
     step: Callable[[str], None],
-) -> tuple[Fitted, None] | tuple[None, EdgefilterError]:
+) -> tuple[Fitted | None, EdgefilterError | None]:
     """The profile with all that was found, written; or why it was not: the diagnosis is printed all the same.
+
+    Neither where nothing was found: a profile that has not changed is not written.
 
     A profile made from the recording gets the whole length of the room's response, from all of the recording.
     """
@@ -61,12 +73,19 @@ def _apply(
     start = None if args.profile is None else profile
     if start is None:
         names += long_paths()
+    if not names:
+        return None, None
     try:
-        applied = fit(start, profile, tuple(names), recording, reference, force=args.force, drop=True)
+        applied = fit(start, profile, tuple(names), recording, reference, force=args.force, found=found)
     except (Refused, SignalError) as error:
         return None, error
     applied.profile.save(args.apply)
     return applied, None
+
+
+def _own_command(args: argparse.Namespace) -> str:
+    own = {**vars(args), "effects": [*(args.effects or ()), args.write_effect]}
+    return add_command([Path(args.write_effect).stem], own)
 
 
 def _next_step(found: Diagnosis, args: argparse.Namespace) -> list[str]:

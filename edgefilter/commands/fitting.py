@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from edgefilter.diagnosis.compare import Comparison
-from edgefilter.diagnosis.diagnose import add
+from edgefilter.diagnosis.compare import Comparison, compare
+from edgefilter.diagnosis.diagnose import PROMISE_DB, Diagnosis, add, settle
 from edgefilter.diagnosis.proof import Proof, proofs_until_kept, prove
 from edgefilter.echo.effects.catalogue import find
 from edgefilter.echo.effects.catalogue import names as names_known
@@ -25,7 +25,11 @@ class Refused(EdgefilterError):
 
 @dataclass(frozen=True, eq=False)
 class Fitted:
-    """A profile with effects, the comparisons before and after, and the proof; unproven: why there is none."""
+    """A profile with effects, the comparisons before and after, and the proof; unproven: why there is none.
+
+    promised_db: what the diagnosis that named them has shown to be left, where there was one. compared_db: before and after
+    as `compare` has it, where something was taken out of the recording first that the filter follows and no profile gets.
+    """
 
     names: tuple[str, ...]
     dropped: tuple[str, ...]
@@ -34,6 +38,8 @@ class Fitted:
     after: Comparison
     proof: Proof | None
     unproven: str = ""
+    promised_db: float | None = None
+    compared_db: tuple[float, float] | None = None
 
     def to_dict(self) -> dict[str, Any]:
         """Ready for JSON."""
@@ -52,6 +58,8 @@ class Fitted:
             "dropped": list(self.dropped),
             "excess_before_db": self.before.excess_db,
             "excess_after_db": self.after.excess_db,
+            "compared_db": list(self.compared_db) if self.compared_db else None,
+            "promised_db": self.promised_db,
             "noise_floor_db": self.after.noise_floor_db,
             "proof": self.proof.to_dict() if self.proof else None,
         }
@@ -65,6 +73,9 @@ class Fitted:
         for name in self.names:
             lines += _values(name, values[name], len(self.names) > 1)
         lines += [f"{'recording':<12}{text}" for text in self.before.warnings]
+        if self.compared_db:
+            was, now = self.compared_db
+            lines.append(f"{'compare':<12}with that left in: {was:.1f} dB before, {now:.1f} dB after")
         lines.append(proof_line(self.proof, self.unproven))
         lines += [f"{'dropped':<12}{name}: with it the running filter would be worse" for name in self.dropped]
         lines += [
@@ -74,6 +85,11 @@ class Fitted:
             if find(name).event
         ]
         lines += [f"NOTE        {name}: {note}" for name in self.names if (note := reach(find(name), values[name]))]
+        if self.promised_db is not None and after_db > self.promised_db + PROMISE_DB:
+            why = f"without {joined(self.dropped)}" if self.dropped else "a fit to all of the recording ends elsewhere"
+            lines.append(
+                f"NOTE        the diagnosis left {self.promised_db:.1f} dB, what is written {after_db:.1f} dB: {why}"
+            )
         if self.names and round(after_db, 1) >= round(before_db, 1):  # as they are shown
             what = "this effect does" if len(self.names) == 1 else "these effects do"
             lines.append(f"WARNING     the error did not fall: {what} not explain the recording")
@@ -88,12 +104,13 @@ def fit(
     reference: Samples,
     *,
     force: bool,
-    drop: bool = False,
+    found: Diagnosis | None = None,
 ) -> Fitted:
     """The effects fitted to the recording on top of start, and proven against profile.
 
-    start: the profile, or one made from the recording where there is none. drop: whether an effect that makes the
-    filter worse is left out where the others help. Raises Refused where the filter would be worse, unless force.
+    start: the profile, or one made from the recording where there is none. found: the diagnosis that names come from; then an
+    effect that makes the filter worse is left out where the others help, and its comparison is the one before. Raises Refused where the
+    filter would be worse, unless force.
     """
     proofs: tuple[Proof, ...] = ()
     unproven = "there is nothing to prove"
@@ -101,7 +118,7 @@ def fit(
         if names or profile is None:
             proofs = (
                 proofs_until_kept(profile, names, recording, reference)
-                if drop and not force
+                if found and not force
                 else (prove(profile, names, recording, reference),)
             )
     except SignalError as error:
@@ -113,7 +130,15 @@ def fit(
     names = tuple(name for name in names if name not in dropped)
     if proof and proof.worse and not force:
         raise Refused(_refusal(proof))
-    return Fitted(names, dropped, *add(start, names, recording, reference), proof, unproven)
+    if found and profile:
+        knowing, after = settle(profile, found, names, recording, reference)
+        return Fitted(names, dropped, knowing, found.comparison, after, proof, unproven, found.remaining_db)
+    knowing, before, after = add(start, names, recording, reference)
+    compared = tuple(compare(each, recording, reference).excess_db for each in (start, knowing))
+    straight = np.allclose(compared, (before.excess_db, after.excess_db), atol=0.05)
+    return Fitted(
+        names, dropped, knowing, before, after, proof, unproven, None, None if straight else (compared[0], compared[1])
+    )
 
 
 def long_paths() -> list[str]:

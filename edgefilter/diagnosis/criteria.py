@@ -17,11 +17,15 @@ class Criteria:
 
     # Forward: which effect is the next
     nested: float = 0.85
-    """A simpler effect that explains this share of what the best one does is preferred: the richer model fits its noise
-    as well."""
-    settled: float = 0.1
-    """Where a simple effect leaves no more than this share of the level, and nothing that can be told, no richer one can
-    be preferred to it (`nested`), and none is tried."""
+    """A simpler effect of the same family that explains this share of what the family's best one does is preferred: the
+    richer model fits its noise as well."""
+    same_db: float = 0.05
+    """Two families that explain the same but for so much, or for same_share of it, are as good: the simpler is named. Where
+    a simple effect leaves no more, no richer one is tried. Chosen on programs of SoX and swh: volume against compression."""
+    same_share: float = 0.04
+    """See same_db."""
+    thorough: bool = False
+    """Whether richer effects are tried also where a simple one leaves nothing."""
     long_filter: int = 4
     """Complexity of long filters: half a minute does not teach all their taps, so what they leave of the samples fitted
     to says little."""

@@ -10,10 +10,11 @@ import numpy as np
 from edgefilter.diagnosis.advice import advice
 from edgefilter.diagnosis.band_edge import cut_by_power
 from edgefilter.diagnosis.candidates import candidates
-from edgefilter.diagnosis.compare import Comparison, compare, describe, independence_of
+from edgefilter.diagnosis.compare import Comparison, compare, describe
 from edgefilter.diagnosis.criteria import Criteria
 from edgefilter.diagnosis.findings import findings_of, share_of
 from edgefilter.diagnosis.follows_voice import noise_of_the_voice
+from edgefilter.diagnosis.joint import fit_jointly
 from edgefilter.diagnosis.leftover import left_in_words
 from edgefilter.diagnosis.noise_change import look_at_fan, without_doubtful
 from edgefilter.diagnosis.precision import precision
@@ -27,6 +28,8 @@ from edgefilter.echo.effects.catalogue import find
 from edgefilter.profile.data import Profile
 from edgefilter.types import SAMPLE_RATE, Samples
 
+PROMISE_DB = 0.5
+"""What is written may leave so much more than the diagnosis has shown before it is asked why."""
 __all__ = ["Diagnosis", "Finding", "Interval", "add", "diagnose"]
 
 
@@ -170,6 +173,32 @@ def add(
     return knowing, describe(told_of, straight), describe(told_of, model)
 
 
+def settle(
+    profile: Profile, found: Diagnosis, names: Sequence[str], recording: Samples, reference: Samples
+) -> tuple[Profile, Comparison]:
+    """The profile with those findings of a diagnosis, fitted once more to all of the recording, and its comparison.
+
+    recording, reference: what was diagnosed, at 16 kHz. Where the fit to all ends elsewhere, so that more than PROMISE_DB over
+    what the diagnosis has shown is left, the diagnosis's own values are written.
+    """
+    prepared = prepare(profile, recording, reference)
+    known, kept = dict(found.model.effects), set(names)
+    start = prepared.model
+    for name in (name for name in known if name in kept):
+        start = start.with_effect(name, known[name])
+    everywhere = replace(prepared.measurement, fit=prepared.usable)
+    choices = []
+    for model in (fit_jointly(everywhere, start, names), start):
+        values, echo = dict(model.effects), profile.echo
+        for name in names:
+            echo = echo.with_effect(name, values[name])
+        knowing = profile.with_echo(echo)
+        choices.append((knowing, compare(knowing, recording, reference)))
+        if choices[-1][1].excess_db <= found.remaining_db + PROMISE_DB:
+            break
+    return min(choices, key=lambda choice: choice[1].excess_db)
+
+
 def conclude(
     prepared: Prepared,
     found: Found,
@@ -196,21 +225,22 @@ def conclude(
     elif not believed and (quiet or not _partly(prepared, found, criteria)):
         found = cut or without_doubtful(found)
     unpredictable = any(find(step.name).leaves_noise for step in found.steps)
-    remaining = found.final.excess_db
+    after = describe(found.prepared, found.model, found.final) if found.steps else comparison
+    remaining = after.excess_db
     findings, doubts = findings_of(found, progress)
     tried = candidates(searched, [finding.effect for finding in findings])
     return Diagnosis(
         verdict=verdict,
         comparison=replace(comparison, warnings=(*comparison.warnings, *found.notes, *doubts)),
+        after=after,
         ranking=findings,
         evidence=left_in_words(found, left, remaining, criteria.explained_db),
-        remaining_db=remaining,
         irreducible_db=(
             max(remaining, found.final.irreducible_db, 0.0) if unpredictable and verdict == "missing" else 0.0
         ),
         model=found.model,
         tried=tried,
-        independence=independence_of(found.prepared, found.model, found.final) if findings else comparison.independence,
+        independence=after.independence,
         precision=precision(found, findings),
         advice=advice(tried),
     )

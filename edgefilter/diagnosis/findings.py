@@ -10,7 +10,7 @@ import numpy as np
 from edgefilter.diagnosis.prepare import Prepared
 from edgefilter.diagnosis.result import Finding, Interval
 from edgefilter.diagnosis.trials import Found, Trial
-from edgefilter.echo.effect import complete
+from edgefilter.echo.effect import Parameter, complete
 from edgefilter.echo.effects.catalogue import find
 from edgefilter.echo.model import EchoModel
 from edgefilter.echo.recording import BLOCK
@@ -89,7 +89,7 @@ def _intervals(prepared: Prepared, model: EchoModel, step: Trial) -> tuple[Mappi
             spread = np.full_like(value, parameter.low), np.full_like(value, parameter.high)
         else:
             spread = _spread(value, [np.asarray(fit[parameter.name], float) for fit in fits])
-        found[parameter.name] = _interval(value, *spread, parameter.unit)
+        found[parameter.name] = _interval(value, *spread, parameter)
     return found, failed
 
 
@@ -107,8 +107,14 @@ def _spread(value: np.ndarray, fits: list[np.ndarray]) -> tuple[np.ndarray, np.n
     return value - spread, value + spread
 
 
-def _interval(value: np.ndarray, low: np.ndarray, high: np.ndarray, unit: str) -> Interval:
+def _interval(value: np.ndarray, low: np.ndarray, high: np.ndarray, parameter: Parameter) -> Interval:
+    """The interval, within the possible values; nan where it spans half of them."""
+    low, high = (
+        np.clip(end, np.minimum(parameter.low, value), np.maximum(parameter.high, value)) for end in (low, high)
+    )
+    anything = high - low >= 0.5 * (parameter.high - parameter.low)
+    low, high = (np.where(anything, np.nan, end) for end in (low, high))
     if value.ndim == 0:
-        return Interval(float(value), float(low), float(high), unit)
+        return Interval(float(value), float(low), float(high), parameter.unit)
     middle, least, most = (tuple(map(float, part)) for part in (value, low, high))
-    return Interval(middle, least, most, unit)
+    return Interval(middle, least, most, parameter.unit)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from typing import TYPE_CHECKING, Literal, TypeAlias
@@ -23,11 +24,15 @@ Source: TypeAlias = Literal["jacobian", "thirds", "at its bound", "none"]
 SCHEMA = 1
 
 
+def _known(number: float) -> float | None:
+    return number if math.isfinite(number) else None
+
+
 @dataclass(frozen=True)
 class Interval:
     """A fitted parameter with the range that 90 % of resampled recordings give.
 
-    A tuple where there are several (times of jumps).
+    A tuple where there are several (times of jumps). nan for both ends where that range says nothing: half of all possible values.
     """
 
     value: float | tuple[float, ...]
@@ -38,7 +43,8 @@ class Interval:
     def to_dict(self) -> dict[str, object]:
         """Ready for JSON."""
         numbers = {
-            key: list(v) if isinstance(v := getattr(self, key), tuple) else v for key in ("value", "low", "high")
+            key: [_known(each) for each in v] if isinstance(v := getattr(self, key), tuple) else _known(v)
+            for key in ("value", "low", "high")
         }
         return {**numbers, "unit": self.unit}
 
@@ -124,16 +130,17 @@ class Precision:
 class Diagnosis:
     """The verdict on a recording: which effects are missing (ranking, strongest first), what is left, what cannot be predicted.
 
-    tried: all effects that were tried. independence: of what is left with all that was found. precision: of the found
-    numbers. advice: what to record to tell candidates apart that explain nearly the same. proof: of what was found, in
-    the running filter, where it was asked for; unproven: why there is none.
+    comparison, after: with the profile as it is, and with all that was found, by the same judge. tried: all effects that
+    were tried. independence: of what is left with all that was found. precision: of the found numbers. advice: what to
+    record to tell candidates apart that explain nearly the same. proof: of what was found, in the running filter, where it
+    was asked for; unproven: why there is none.
     """
 
     verdict: Verdict
     comparison: Comparison
     ranking: tuple[Finding, ...]
+    after: Comparison
     evidence: str
-    remaining_db: float
     irreducible_db: float
     model: EchoModel
     tried: tuple[Candidate, ...] = ()
@@ -142,6 +149,11 @@ class Diagnosis:
     advice: tuple[str, ...] = ()
     proof: Proof | None = None
     unproven: str = ""
+
+    @property
+    def remaining_db(self) -> float:
+        """Excess that all findings leave."""
+        return self.after.excess_db
 
     def to_dict(self) -> dict[str, object]:
         """The JSON that `diagnose --json` writes, schema 1."""

@@ -197,10 +197,11 @@ class Workbench:
         return found + [trial for trial in tried.values() if trial is not None]
 
     def _attempt_in_turn(self, names: list[str], model: EchoModel) -> list[Trial]:
-        """The simple ones first; the richer ones where none of those explains so much that no other could be preferred to it."""
+        """The simple ones first, free laws last; each where none before explains so much that no other could be preferred to it."""
         found: list[Trial] = []
-        for complexity in sorted({find(name).complexity for name in names}):
-            level = [name for name in names if find(name).complexity == complexity]
+        ranks = {name: (find(name).free_law, find(name).complexity) for name in names}
+        for rank in sorted(set(ranks.values())):
+            level = [name for name in names if ranks[name] == rank]
             if any(self._settles(trial, model) for trial in found):
                 self._spared.update(level)
             else:
@@ -209,8 +210,8 @@ class Workbench:
 
     def _settles(self, trial: Trial, model: EchoModel) -> bool:
         """Whether a trial on a model can be named and leaves next to nothing."""
-        little = self.left(trial.model) <= self.criteria.settled * self.left(model)
-        return little and self.explained(trial.model) and self.admissible(trial, model)
+        little = self.left(trial.model) <= self.margin(self.left(model))
+        return not self.criteria.thorough and little and self.explained(trial.model) and self.admissible(trial, model)
 
     def admissible(self, trial: Trial, model: EchoModel) -> bool:
         """Whether a trial on a model explains enough to be named, and its values look like that effect."""
@@ -232,21 +233,36 @@ class Workbench:
         found = []
         for name in names_tried:
             alone = self._trials.get((signature(start), name))
-            others = frozenset(other for other, _ in model.effects if other != name)
+            others = self._trials.get((signature(model.without_effect(name)), name))
             short = self.short_of(alone, start) if alone else ""
-            found.append(Tried(name, alone, self._alike.get((others, name)), short, self._failed.get(name, "")))
+            found.append(Tried(name, alone, others, short, self._failed.get(name, "")))
         spared = [name for name in names() if name in self._spared and name not in names_tried]
         return (*found, *(Tried(name, None, None, spared=True) for name in spared))
 
     def preferred(self, trials: Iterable[Trial]) -> Trial | None:
-        """Of admissible trials the simplest of those that explain nearly as much as the best.
+        """Of admissible trials the family that explains most, then its simplest member that explains nearly as much as its best.
 
-        None where none lowers the level.
+        Of two families that explain the same, but for what noise and tolerances make, that of the simpler member. None where no
+        trial lowers the level.
         """
-        trials = list(trials)
-        most = max((trial.gain_db for trial in trials), default=0.0)
-        enough = [trial for trial in trials if most > 0.0 and trial.gain_db >= self.criteria.nested * most]
-        return min(enough, key=lambda trial: (find(trial.name).complexity, -trial.gain_db), default=None)
+        members: dict[str, list[Trial]] = {}
+        for trial in trials:
+            members.setdefault(find(trial.name).family or trial.name, []).append(trial)
+        best = {family: max(trial.gain_db for trial in of) for family, of in members.items()}
+        most = max(best.values(), default=0.0)
+        enough = [
+            trial
+            for family, of in members.items()
+            for trial in of
+            if most > 0.0
+            and best[family] >= most - self.margin(most)
+            and trial.gain_db >= self.criteria.nested * best[family]
+        ]
+        return min(enough, key=_by_simplicity, default=None)
+
+    def margin(self, gain_db: float) -> float:
+        """By how much less than that a model may explain and still be as good: the simpler one is named."""
+        return max(self.criteria.same_db, self.criteria.same_share * gain_db)
 
     def absent(self, model: EchoModel, most: int) -> list[str]:
         """Names of the effects on the voice that a model has not, that may be tried and whose complexity is at most `most`."""
@@ -260,6 +276,12 @@ class Workbench:
             and name not in out
             and find(name).complexity <= most
         ]
+
+
+def _by_simplicity(trial: Trial) -> tuple[bool, int, float]:
+    """Those whose law is not free first, then the simpler effect, of two alike the one that explains more."""
+    effect = find(trial.name)
+    return effect.free_law, effect.complexity, -trial.gain_db
 
 
 def beside(judge: Judge, name: str, model: EchoModel, before: Score | None = None) -> Trial | None:

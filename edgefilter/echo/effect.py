@@ -24,7 +24,7 @@ sweep, at another place, of a minute."""
 class Parameter:
     """One number of an effect, or an array of such numbers: unit, the value at which the effect vanishes, the values that are possible.
 
-    given: whether it is taken over from elsewhere, such as the calibrated fan, rather than fitted.
+    given: whether it is taken over from elsewhere, such as the calibrated fan, or chosen from a few, rather than fitted.
     """
 
     name: str
@@ -70,6 +70,7 @@ class Effect:
     it out of the recording first (diagnosis/joint.py).
 
     What the diagnosis asks:
+    family: of effects that are one kind of change, by other laws.
     title: as it reads inside a sentence ("a turned volume"); by default the name. complexity: of two effects that
     explain about as much the lower one is named; from 4 on it is a long filter, which half a minute does not teach.
     least_gain_db: fall of the held-out level, and least_size_db: power over the fan of what changes, below which it is
@@ -96,6 +97,7 @@ class Effect:
     lengthens: ClassVar[bool] = False
     followed: ClassVar[bool] = False
 
+    family: ClassVar[str] = ""
     title: ClassVar[str] = ""
     complexity: ClassVar[int] = 3
     least_gain_db: ClassVar[float] = 0.05
@@ -151,6 +153,13 @@ class Effect:
         """What in a recording speaks for the effect, with its figures; empty: nothing but that the residual falls."""
         return ""
 
+    def code(self, values: Values) -> str:
+        """Lines of Python that define law(x, sample_rate), numpy as np: what the effect makes of samples x (n,), (n,) float64.
+
+        Empty for an effect whose law is listed; what gives some is the member of its family whose law is free.
+        """
+        return ""
+
     def plausible(self, evidence: Evidence) -> bool:
         """Whether the values, and what they explain, look like this effect rather than another."""
         return True
@@ -188,6 +197,11 @@ class Effect:
     def adds_noise(self) -> bool:
         """Whether variance() is more than nothing."""
         return type(self).variance is not Effect.variance
+
+    @property
+    def free_law(self) -> bool:
+        """Whether its law is free."""
+        return type(self).code is not Effect.code
 
     @property
     def noise_is_asked(self) -> bool:
@@ -242,6 +256,11 @@ def fitted(effect: Effect, measurement: Measurement, model: VoiceModel) -> dict[
 def vanishes(effect: Effect, values: Values) -> bool:
     """Whether all values are the neutral ones."""
     return all(np.array_equal(values[name], value) for name, value in neutral(effect).items())
+
+
+def as_array(numbers: Array, digits: int) -> str:
+    """Python for an array (k,) rounded to so many digits behind the point."""
+    return f"np.array({np.round(np.ravel(numbers), digits).tolist()})"
 
 
 def first(values: Values, name: str) -> float:

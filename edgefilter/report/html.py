@@ -15,6 +15,7 @@ import jinja2
 from edgefilter.diagnosis.compare import Comparison, describe
 from edgefilter.diagnosis.diagnose import Diagnosis, Finding
 from edgefilter.diagnosis.prepare import Prepared, prepare
+from edgefilter.diagnosis.proof import Proof
 from edgefilter.diagnosis.result import Precision
 from edgefilter.echo.effect import complete
 from edgefilter.echo.effects.catalogue import find
@@ -54,27 +55,42 @@ def comparison_page(found: Comparison, names: Mapping[str, Any]) -> str:
     profile = "The profile" if names["profile"] else "A stationary linear path made from the recording itself"
     excess = f"{profile} leaves {decibels(found.excess_db)} dB over the noise floor unexplained."
     return _page(
-        {(): found}, (), {"kind": "comparison", "headline": excess, "findings": [], "left": "", **_statistics()}, names
+        {(): found},
+        (),
+        {"kind": "comparison", "headline": excess, "findings": [], "left": "", "command": [], **_statistics()},
+        names,
     )
 
 
 def diagnosis_page(
-    profile: Profile, found: Diagnosis, recording: Samples, reference: Samples, names: Mapping[str, Any]
+    profile: Profile,
+    found: Diagnosis,
+    recording: Samples,
+    reference: Samples,
+    names: Mapping[str, Any],
+    written: Comparison | None = None,
+    proof: Proof | None = None,
 ) -> str:
     """The page of a diagnosis, with a switch for each found effect.
 
-    recording (n,), reference (m,): what was diagnosed.
+    recording (n,), reference (m,): what was diagnosed. written: the comparison with the profile that was written of it; proof:
+    of that in the running filter.
     """
     steps = in_order(found.ranking)
     variants = compare_variants(profile, found.model, steps, recording, reference)
+    variants |= {
+        (False,) * len(steps): found.comparison,
+        (True,) * len(steps): found.after if steps else found.comparison,
+    }
     text = {
         "kind": "diagnosis",
         "headline": headline(found.verdict, [finding.effect for finding in found.ranking], bool(names["profile"])),
-        "findings": [_finding(finding, names) for finding in found.ranking],
+        "findings": [_finding(finding) for finding in found.ranking],
         "left": sentence(found.evidence) if found.evidence else "",
+        "command": _command(found, names, written is not None),
         **_statistics(found),
     }
-    return _page(variants, steps, text, names, found.irreducible_db)
+    return _page(variants, steps, text, names, found.irreducible_db, _outcome(written, proof or found.proof))
 
 
 def write_page(path: str | Path, page: str) -> None:
@@ -93,13 +109,14 @@ def _page(
     text: Mapping[str, object],
     names: Mapping[str, Any],
     irreducible_db: float | None = None,
+    outcome: Sequence[tuple[str, str, str]] = (),
 ) -> str:
     before, after = variants[(False,) * len(steps)], variants[(True,) * len(steps)]
     scale = colour_scale(before.recording)
     fields = {
         **text,
         **{role: Path(str(names[role] or "none: the recording itself")).name for role in ROLES},
-        "facts": _facts(before, after if steps else None, irreducible_db),
+        "facts": [*_facts(before, after if steps else None, irreducible_db), *outcome],
         "switches": [title(finding.effect) for finding in steps],
         "notes": _notes(before),
         "seconds": f"{before.recording.size / SAMPLE_RATE:.1f}",
@@ -200,8 +217,27 @@ def _facts(before: Comparison, after: Comparison | None, irreducible_db: float |
     return facts
 
 
-def _finding(finding: Finding, names: Mapping[str, object]) -> dict[str, object]:
-    """What the page says of one effect; the command as words, between which its line may break."""
+def _command(found: Diagnosis, names: Mapping[str, Any], done: bool) -> list[str]:
+    """What to type to have all that was found in a new profile, as words between which its line may break; none where it is done."""
+    effects = [finding.effect for finding in in_order(found.ranking)]
+    return add_command(effects, names).split(" ") if effects and not done else []
+
+
+def _outcome(written: Comparison | None, proof: Proof | None) -> list[tuple[str, str, str]]:
+    """What the profile that was written leaves, and what the running filter makes of it."""
+    facts = []
+    if written is not None:
+        facts.append(("Written", f"{decibels(written.excess_db)} dB", "over the noise floor, with the new profile"))
+    if proof is not None:
+        erle = f"{decibels(proof.erle_before_db)} to {decibels(proof.erle_after_db)} dB"
+        facts.append(
+            ("Running filter", erle, f"of echo taken away on {proof.seconds:.1f} s that the fit has not heard")
+        )
+    return facts
+
+
+def _finding(finding: Finding) -> dict[str, object]:
+    """What the page says of one effect."""
     return {
         "title": title(finding.effect),
         "effect": finding.effect,
@@ -210,7 +246,6 @@ def _finding(finding: Finding, names: Mapping[str, object]) -> dict[str, object]
         "share": f"{100 * finding.share:.0f}",
         "evidence": sentence(finding.evidence),
         "parameters": [(name, interval_text(interval)) for name, interval in finding.parameters.items()],
-        "command": add_command([finding.effect], names).split(" "),
     }
 
 

@@ -85,8 +85,10 @@ def interval_text(interval: Interval) -> str:
     """Say "0.61 s (0.56 to 0.66)"; several values one after the other, each with its own range."""
     values, lows, highs = (np.atleast_1d(x) for x in (interval.value, interval.low, interval.high))
     unit = UNITS.get(interval.unit, interval.unit)
+    unknown = " (the recording does not say how exact)"
     shown = [
-        f"{figure(v)} {unit}".rstrip() + (f" ({figure(low)} to {figure(high)})" if low < high else "")
+        f"{figure(v)} {unit}".rstrip()
+        + (unknown if math.isnan(low) else f" ({figure(low)} to {figure(high)})" if low < high else "")
         for v, low, high in zip(values, lows, highs)
     ]
     return ", ".join(shown) or "none"

@@ -50,6 +50,7 @@ def outcome(
         (outcome("none", "unexplained"), False, "unknown"),
         (outcome("unknown", "unexplained", "bandlimit"), True, "unknown"),
         (outcome("unknown", "missing", "bandlimit"), False, "bandlimit"),
+        (outcome("unknown", "missing", "modulation"), True, "modulation"),
         (outcome("bandlimit+rattle", "missing", "rattle", "bandlimit"), True, "bandlimit+rattle"),
         (outcome("bandlimit+rattle", "missing", "rattle"), False, "rattle"),
         (outcome("", "missing", "rattle", sealed_hit=True), True, "rattle"),
@@ -74,17 +75,19 @@ def test_cases_are_counted_by_strength_and_kind() -> None:
         outcome("bandlimit+rattle", "missing", "rattle", "bandlimit", "mic_agc"),
     ]
     assert {name: (count["hits"], count["n"]) for name, count in names.counts(cases).items()} == {
+        "one effect: its family first": (1, 3),
         "one effect: named first": (1, 3),
         "named first, clear": (1, 2),
         "among the first two, clear": (2, 2),
         "named first, near": (0, 1),
         "among the first two, near": (0, 1),
+        "more than 3 dB left": (0, 3),
         "that effect and no other": (1, 3),
         "nothing: false alarms": (1, 2),
         "two effects: both named": (1, 1),
         "at least one named": (1, 1),
         "both and no other": (0, 1),
-        "outside the catalogue: unexplained": (1, 3),
+        "outside the catalogue: unexplained, or a free law": (1, 3),
         "explained above 1 dB of excess": (1, 3),
     }
     counts, effects, misses = names.tables({"made": cases, "again": cases[-1:]})[:3]
@@ -95,6 +98,13 @@ def test_cases_are_counted_by_strength_and_kind() -> None:
     assert (
         len(misses["rows"]) == 5 and ["c", "none", "clear", "missing: rattle", 5.0, 0.2, "some words"] in misses["rows"]
     )
+
+
+def test_a_free_law_of_the_right_family_is_a_hit_of_the_family_alone() -> None:
+    case = outcome("compression", "missing", "dynamics")
+    assert case.family_hit and not case.hit
+    assert not outcome("compression", "missing", "static_curve").family_hit
+    assert not outcome("compression", "unexplained").family_hit
 
 
 @pytest.mark.parametrize(("label", "hit"), [("bandlimit+rattle", True), ("rattle", False)])

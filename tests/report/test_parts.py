@@ -10,8 +10,9 @@ import pytest
 import soundfile
 from PIL import Image
 
-from edgefilter.diagnosis.compare import compare
+from edgefilter.diagnosis.compare import compare, describe
 from edgefilter.diagnosis.diagnose import Diagnosis, Finding, Interval
+from edgefilter.diagnosis.prepare import prepare
 from edgefilter.echo.effects.catalogue import EFFECTS
 from edgefilter.report import text
 from edgefilter.report.html import choices, compare_variants, diagnosis_page
@@ -38,6 +39,7 @@ def finding(name: str, values: dict, before: float = 9.0, after: float = 1.0) ->
         (Interval(80.04, 79.0, 81.2, "1e-6"), "80.0 ppm (79.0 to 81.2)"),
         (Interval((7.5, 12.0), (7.4, 11.9), (7.6, 12.1), "s"), "7.50 s (7.40 to 7.60), 12.0 s (11.9 to 12.1)"),
         (Interval(4.0, 4.0, 4.0, "1"), "4.00"),
+        (Interval(-12.2, float("nan"), float("nan"), "dB"), "-12.2 dB (the recording does not say how exact)"),
         (Interval(-31250.0, -31250.0, -31250.0, "samples"), "-31250 samples"),
         (Interval(2e-9, 1e-9, 3e-9, "1"), "2e-09 (1e-09 to 3e-09)"),
     ],
@@ -65,7 +67,7 @@ def test_the_terminal_says_verdict_budget_parameters_and_what_is_left():
     x = voice(4.0)
     found = compare(profile(), record(x), x)
     two = (finding("late_reverb", {"rt60_s": 0.61}), finding("my_own", {"depth": 2.0}, 1.0, 0.3))
-    lines = diagnosis_lines(Diagnosis("missing", found, two, "A hum at 50 Hz.", 0.3, 0.1, profile().echo))
+    lines = diagnosis_lines(Diagnosis("missing", found, two, found, "A hum at 50 Hz.", 0.1, profile().echo))
     told = "\n".join(lines)
     assert lines[0] == "verdict     missing: Missing from the profile: late reverberation and my own."
     for part in (
@@ -151,7 +153,8 @@ def test_four_effects_give_five_comparisons_in_the_page():
     model = robot.echo
     for one in four:
         model = model.with_effect(one.effect, one.values)
-    found = Diagnosis("missing", compare(robot, y, x), tuple(four), "", 0.1, 0.0, model)
+    before, after = (describe(prepare(robot, y, x), echo) for echo in (robot.echo, model))
+    found = Diagnosis("missing", before, tuple(four), after, "", 0.0, model)
     page = diagnosis_page(robot, found, y, x, {"profile": "p", "recording": "m", "reference": "r"})
     assert page.count('"excess_db"') == 5 and "switched with them" in page
     assert page.count("data:image/png") == 3, (

@@ -36,6 +36,7 @@ class Bandlimit(Effect):
 
     name: ClassVar[str] = "bandlimit"
     stage: ClassVar[Stage] = "path"
+    family: ClassVar[str] = "linear path"
     title: ClassVar[str] = "a band limit"
     shown_by: ClassVar[tuple[Experiment, ...]] = ("sweep",)
     absorbed: ClassVar[bool] = True

@@ -16,6 +16,7 @@ from edgefilter.echo.effects.clock_drift import ClockDrift
 from edgefilter.echo.effects.codec import Codec
 from edgefilter.echo.effects.compression import Compression
 from edgefilter.echo.effects.delay_jump import DelayJump
+from edgefilter.echo.effects.dynamics import Dynamics
 from edgefilter.echo.effects.early_path import EarlyPath
 from edgefilter.echo.effects.equaliser import Equaliser
 from edgefilter.echo.effects.fan_noise import FanNoise
@@ -23,6 +24,7 @@ from edgefilter.echo.effects.late_reverb import LateReverb
 from edgefilter.echo.effects.limiter import Limiter
 from edgefilter.echo.effects.mic_agc import MicAgc
 from edgefilter.echo.effects.mic_clipping import MicClipping
+from edgefilter.echo.effects.modulation import Modulation
 from edgefilter.echo.effects.multiband_compression import MultibandCompression
 from edgefilter.echo.effects.noise_suppression import NoiseSuppression
 from edgefilter.echo.effects.packet_loss import PacketLoss
@@ -30,6 +32,7 @@ from edgefilter.echo.effects.path_change import PathChange
 from edgefilter.echo.effects.playback_gain import PlaybackGain
 from edgefilter.echo.effects.rattle import Rattle
 from edgefilter.echo.effects.speaker_nonlinearity import SpeakerNonlinearity
+from edgefilter.echo.effects.static_curve import StaticCurve
 from edgefilter.echo.measurement import Values
 from edgefilter.errors import UsageError
 from edgefilter.types import Array
@@ -39,10 +42,12 @@ EFFECTS: tuple[Effect, ...] = (
     Compression(),
     MultibandCompression(),
     Limiter(),
+    Dynamics(),
     DelayJump(),
     PacketLoss(),
     Codec(),
     SpeakerNonlinearity(),
+    StaticCurve(),
     Rattle(),
     Bandlimit(),
     Equaliser(),
@@ -50,6 +55,7 @@ EFFECTS: tuple[Effect, ...] = (
     EarlyPath(),
     LateReverb(),
     PathChange(),
+    Modulation(),
     ClockDrift(),
     MicAgc(),
     MicClipping(),

@@ -33,6 +33,7 @@ class ChassisResonance(Effect):
 
     name: ClassVar[str] = "chassis_resonance"
     stage: ClassVar[Stage] = "path"
+    family: ClassVar[str] = "linear path"
     title: ClassVar[str] = "a chassis resonance"
     shown_by: ClassVar[tuple[Experiment, ...]] = ("sweep", "tail")
     absorbed: ClassVar[bool] = True

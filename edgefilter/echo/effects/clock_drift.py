@@ -31,6 +31,7 @@ class ClockDrift(Effect):
 
     name: ClassVar[str] = "clock_drift"
     stage: ClassVar[Stage] = "time"
+    family: ClassVar[str] = "time"
     run_note: ClassVar[str] = (
         "the running filter follows the clocks by itself, whatever they did in this recording: adding it changes nothing"
         " there"

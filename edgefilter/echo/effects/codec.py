@@ -46,6 +46,7 @@ class Codec(Effect):
 
     name: ClassVar[str] = "codec"
     stage: ClassVar[Stage] = "source"
+    family: ClassVar[str] = "additive noise"
     run_note: ClassVar[str] = (
         "the running filter follows by itself what noise the voice brings along: adding it changes nothing there"
     )

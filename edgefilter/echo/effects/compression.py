@@ -37,6 +37,7 @@ class Compression(Effect):
 
     name: ClassVar[str] = "compression"
     stage: ClassVar[Stage] = "source"
+    family: ClassVar[str] = "dynamics"
     title: ClassVar[str] = "compression"
     shown_by: ClassVar[tuple[Experiment, ...]] = ("levels",)
     complexity: ClassVar[int] = 2

@@ -44,6 +44,7 @@ class DelayJump(Effect):
 
     name: ClassVar[str] = "delay_jump"
     stage: ClassVar[Stage] = "source"
+    family: ClassVar[str] = "time"
     run_note: ClassVar[str] = (
         "the running filter finds jumps by itself, and these were of this recording: adding it changes nothing there"
     )

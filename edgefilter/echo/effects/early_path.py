@@ -27,6 +27,7 @@ class EarlyPath(Effect):
 
     name: ClassVar[str] = "early_path"
     stage: ClassVar[Stage] = "path"
+    family: ClassVar[str] = "linear path"
     title: ClassVar[str] = "another path from the start"
     shown_by: ClassVar[tuple[Experiment, ...]] = ("sweep", "place")
     absorbed: ClassVar[bool] = True

@@ -43,6 +43,7 @@ class Equaliser(Effect):
 
     name: ClassVar[str] = "equaliser"
     stage: ClassVar[Stage] = "path"
+    family: ClassVar[str] = "linear path"
     title: ClassVar[str] = "an equaliser or another loudspeaker"
     shown_by: ClassVar[tuple[Experiment, ...]] = ("sweep",)
     absorbed: ClassVar[bool] = True

@@ -32,6 +32,7 @@ class FanNoise(Effect):
 
     name: ClassVar[str] = "fan_noise"
     stage: ClassVar[Stage] = "noise"
+    family: ClassVar[str] = "additive noise"
     title: ClassVar[str] = "changed fan noise"
     memory: ClassVar[int | None] = 0
     parameters: ClassVar[tuple[Parameter, ...]] = (

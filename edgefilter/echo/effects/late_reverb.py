@@ -43,6 +43,7 @@ class LateReverb(Effect):
 
     name: ClassVar[str] = "late_reverb"
     stage: ClassVar[Stage] = "path"
+    family: ClassVar[str] = "linear path"
     title: ClassVar[str] = "late reverberation"
     shown_by: ClassVar[tuple[Experiment, ...]] = ("sweep", "tail", "place")
     absorbed: ClassVar[bool] = True

@@ -40,6 +40,7 @@ class Limiter(Effect):
 
     name: ClassVar[str] = "limiter"
     stage: ClassVar[Stage] = "source"
+    family: ClassVar[str] = "dynamics"
     title: ClassVar[str] = "a limiter"
     shown_by: ClassVar[tuple[Experiment, ...]] = ("levels",)
     complexity: ClassVar[int] = 2

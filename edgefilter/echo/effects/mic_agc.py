@@ -53,6 +53,7 @@ class MicAgc(Effect):
 
     name: ClassVar[str] = "mic_agc"
     stage: ClassVar[Stage] = "microphone"
+    family: ClassVar[str] = "dynamics"
     title: ClassVar[str] = "a microphone gain control"
     run_note: ClassVar[str] = (
         "its curve is of this recording; the running filter follows the gain by itself, as far and as fast as here"

@@ -24,6 +24,7 @@ class MicClipping(Effect):
 
     name: ClassVar[str] = "mic_clipping"
     stage: ClassVar[Stage] = "microphone"
+    family: ClassVar[str] = "static nonlinearity"
     title: ClassVar[str] = "microphone clipping"
     shown_by: ClassVar[tuple[Experiment, ...]] = ("levels", "tone")
     complexity: ClassVar[int] = 1

@@ -22,7 +22,7 @@ LOW_HZ, HIGH_HZ = np.geomspace(90.0, 900.0, 14), np.geomspace(1000.0, 6000.0, 12
 """Crossovers that are tried, so close that no band's phase is off by more than some 20 degrees."""
 FINER = np.array([0.91, 0.95, 1.0, 1.05, 1.1])
 """Times the best of these, which are tried next."""
-DELAYS = np.arange(-24.0, 25.0)
+DELAYS = np.arange(-40.0, 41.0)
 """Samples: the lag at which such a recording is found is that of its loudest band."""
 THRESHOLDS_DB, SLOPE = (-6.0, -15.0, -25.0), 0.5
 """Starting points, relative to the loudest 20 ms of the reference in each band, and dB per dB."""
@@ -55,6 +55,7 @@ class MultibandCompression(Effect):
 
     name: ClassVar[str] = "multiband_compression"
     stage: ClassVar[Stage] = "source"
+    family: ClassVar[str] = "dynamics"
     title: ClassVar[str] = "multi-band compression"
     shown_by: ClassVar[tuple[Experiment, ...]] = ("levels", "sweep")
     cost: ClassVar[int] = 4
@@ -71,7 +72,7 @@ class MultibandCompression(Effect):
 
     def apply(self, x: Samples, values: Values, sample_rate: int) -> Samples:
         """X (n,), each of its bands turned by its own level; where none is, x itself."""
-        return BandCompressor(values, sample_rate)(_moved(x, float(values["delay"])))
+        return BandCompressor(values, sample_rate)(moved(x, float(values["delay"])))
 
     def run(self, values: Values, sample_rate: int) -> Runner:
         """The compressors, which carry their levels and their filters on; where the voice is, the aligner says."""
@@ -90,7 +91,7 @@ class MultibandCompression(Effect):
 
         def parts(x: Samples, unknowns: Array) -> list[Samples]:
             values = complete(self, {**filters, **_values(unknowns)})
-            return BandCompressor(values, SAMPLE_RATE).bands(_moved(x, delay))
+            return BandCompressor(values, SAMPLE_RATE).bands(moved(x, delay))
 
         fit = GainFit(measurement, model, parts, REACH)
         still = fit.cost(_start(fit.loud_db, 0.0, 0.0))
@@ -129,7 +130,7 @@ class BandCompressor:
             for numbers in zip(*each, strict=True)
         ]
         self._crossovers = [
-            _Crossover(hz, sample_rate) for hz in np.broadcast_to(np.asarray(values["crossover_hz"], float), (2,))
+            Crossover(hz, sample_rate) for hz in np.broadcast_to(np.asarray(values["crossover_hz"], float), (2,))
         ]
         self._idle = bool(np.all(each[1] == 1.0) and np.all(each[2] == 0.0))
 
@@ -143,7 +144,7 @@ class BandCompressor:
         return [turn(band) for turn, band in zip(self._compressors, (low, *self._crossovers[1](rest)), strict=True)]
 
 
-class _Crossover:
+class Crossover:
     """What lies below and above a frequency, on a stream: Butterworth filters of second order, twice each."""
 
     def __init__(self, hz: float, sample_rate: int) -> None:
@@ -152,6 +153,7 @@ class _Crossover:
         self._memory = [np.zeros((2, 2)), np.zeros((2, 2))]
 
     def __call__(self, x: Samples) -> tuple[Samples, Samples]:
+        """The two bands of x (n,), which follows what came before, (n,) each."""
         outputs = []
         for side, sos in enumerate(self._filters):
             y, self._memory[side] = scipy.signal.sosfilt(sos, x, zi=self._memory[side])
@@ -189,7 +191,7 @@ def find_crossovers(found: Spectra) -> tuple[float, float, float] | None:
     return best
 
 
-def _moved(x: Samples, delay: float) -> Samples:
+def moved(x: Samples, delay: float) -> Samples:
     """X (n,) by that many whole samples later."""
     samples = round(delay)
     return np.pad(x, (max(samples, 0), max(-samples, 0)))[max(-samples, 0) :][: x.size]

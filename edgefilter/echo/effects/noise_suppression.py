@@ -59,6 +59,7 @@ class NoiseSuppression(Effect):
 
     name: ClassVar[str] = "noise_suppression"
     stage: ClassVar[Stage] = "microphone"
+    family: ClassVar[str] = "dynamics"
     run_note: ClassVar[str] = (
         "what it takes of the voice lies near the fan, and where it opens it lets the calibrated fan through: adding it"
         " changes nothing in the running filter"

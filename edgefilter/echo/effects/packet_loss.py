@@ -53,6 +53,7 @@ class PacketLoss(Effect):
 
     name: ClassVar[str] = "packet_loss"
     stage: ClassVar[Stage] = "source"
+    family: ClassVar[str] = "modulation"
     run_note: ClassVar[str] = (
         "these packets were lost in this recording, and no others will be the same: adding it changes nothing in the"
         " running filter"

@@ -34,6 +34,7 @@ class PathChange(Effect):
 
     name: ClassVar[str] = "path_change"
     stage: ClassVar[Stage] = "path"
+    family: ClassVar[str] = "linear path"
     run_note: ClassVar[str] = "the running filter begins with the path as it was after the change"
     title: ClassVar[str] = "a changed path"
     shown_by: ClassVar[tuple[Experiment, ...]] = ("sweep", "place")

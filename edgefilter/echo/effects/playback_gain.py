@@ -20,6 +20,7 @@ class PlaybackGain(Effect):
 
     name: ClassVar[str] = "playback_gain"
     stage: ClassVar[Stage] = "source"
+    family: ClassVar[str] = "linear path"
     title: ClassVar[str] = "a turned volume"
     absorbed: ClassVar[bool] = True
     followed: ClassVar[bool] = True

@@ -61,6 +61,7 @@ class Rattle(Effect):
 
     name: ClassVar[str] = "rattle"
     stage: ClassVar[Stage] = "source"
+    family: ClassVar[str] = "additive noise"
     title: ClassVar[str] = "a rattle"
     shown_by: ClassVar[tuple[Experiment, ...]] = ("levels", "tone")
     cost: ClassVar[int] = 8

@@ -39,6 +39,7 @@ class SpeakerNonlinearity(Effect):
 
     name: ClassVar[str] = "speaker_nonlinearity"
     stage: ClassVar[Stage] = "source"
+    family: ClassVar[str] = "static nonlinearity"
     title: ClassVar[str] = "loudspeaker nonlinearity"
     cost: ClassVar[int] = 4
     shown_by: ClassVar[tuple[Experiment, ...]] = ("levels", "tone")
