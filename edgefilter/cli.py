@@ -162,6 +162,8 @@ def _diagnose(commands: argparse._SubParsersAction) -> None:
     option("--apply", metavar="P2.npz", help=told)
     told = "leave out what makes the running filter worse on seconds that no fit has used; takes a little longer"
     option("--prove", action="store_true", help=told)
+    told = "share of names that may be given by chance, 0 to 1 (default: 0.01)"
+    option("--false-rate", type=rate, default=0.01, metavar="R", help=told)
     told = "write the law that explains most, of a curve, a gain by level or by time, as an effect of your own"
     option("--write-effect", metavar="MINE.py", help=told)
     _force(option)
@@ -245,6 +247,11 @@ def command(text: str) -> str:
     if not text.strip():
         raise argparse.ArgumentTypeError(f"'{text}' is not a command")
     return text
+
+
+def rate(text: str) -> float:
+    """A share between 0 and 1."""
+    return number(text, 0.0, 1.0, "a number between 0 and 1, such as 0.01")
 
 
 def positive(text: str) -> float:

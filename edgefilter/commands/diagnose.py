@@ -10,6 +10,7 @@ from pathlib import Path
 from edgefilter.commands.display import print_result, progress, report_part
 from edgefilter.commands.fitting import Fitted, Refused, fit, long_paths
 from edgefilter.commands.recordings import load
+from edgefilter.diagnosis.criteria import Criteria
 from edgefilter.diagnosis.diagnose import Diagnosis, diagnose
 from edgefilter.diagnosis.proven import diagnose_proven
 from edgefilter.diagnosis.write_effect import write_effect
@@ -29,7 +30,9 @@ def main(args: argparse.Namespace) -> int:
     html = report_part("html") if args.report else None
     profile, recording, reference = load(args)
     with progress("diagnosis") as step:
-        found = (diagnose_proven if args.prove else diagnose)(profile, recording, reference, progress=step)
+        judge = diagnose_proven if args.prove else diagnose
+        criteria = Criteria(false_rate=args.false_rate)
+        found = judge(profile, recording, reference, progress=step, criteria=criteria)
         if args.profile is None:
             warnings = (*profile.warnings, *found.comparison.warnings)
             found = replace(found, comparison=replace(found.comparison, warnings=warnings))

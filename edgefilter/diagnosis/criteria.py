@@ -98,6 +98,8 @@ class Criteria:
     says so."""
 
     # The verdict
+    false_rate: float = 0.01
+    """Share of names that may be there by chance (significance.py)."""
     explained_db: float = 0.8
     """Excess up to which nothing is missing: what the fan of another day and a faint distortion leave."""
     explained_share: float = 0.45

@@ -16,13 +16,14 @@ from edgefilter.diagnosis.findings import findings_of, share_of
 from edgefilter.diagnosis.follows_voice import noise_of_the_voice
 from edgefilter.diagnosis.joint import fit_jointly
 from edgefilter.diagnosis.leftover import left_in_words
-from edgefilter.diagnosis.noise_change import look_at_fan, without_doubtful
+from edgefilter.diagnosis.noise_change import in_steps, look_at_fan, without_doubtful
 from edgefilter.diagnosis.precision import precision
 from edgefilter.diagnosis.prepare import Prepared, prepare
 from edgefilter.diagnosis.proof import listed, with_fitted
 from edgefilter.diagnosis.result import Diagnosis, Finding, Interval, Verdict
 from edgefilter.diagnosis.score import Judge
 from edgefilter.diagnosis.select import search
+from edgefilter.diagnosis.significance import discovered, p_value
 from edgefilter.diagnosis.trials import Found
 from edgefilter.echo.effects.catalogue import find
 from edgefilter.profile.data import Profile
@@ -224,10 +225,15 @@ def conclude(
         verdict = "missing"
     elif not believed and (quiet or not _partly(prepared, found, criteria)):
         found = cut or without_doubtful(found)
+    p_values = {step.name: _p_value(prepared, found, step.name) for step in found.steps}
+    kept = discovered(p_values, len(searched.tried) or len(p_values), criteria.false_rate)
+    if len(kept) < len(p_values):
+        found = in_steps(found, (step for step in found.steps if step.name in kept))
+        verdict = verdict if kept or verdict != "missing" else "explained" if quiet else "unexplained"
     unpredictable = any(find(step.name).leaves_noise for step in found.steps)
     after = describe(found.prepared, found.model, found.final) if found.steps else comparison
     remaining = after.excess_db
-    findings, doubts = findings_of(found, progress)
+    findings, doubts = findings_of(found, p_values, progress)
     tried = candidates(searched, [finding.effect for finding in findings])
     return Diagnosis(
         verdict=verdict,
@@ -244,6 +250,12 @@ def conclude(
         precision=precision(found, findings),
         advice=advice(tried),
     )
+
+
+def _p_value(prepared: Prepared, found: Found, name: str) -> float:
+    """Of one of the effects that were found, beside the others; of a changed fan against the calibrated one."""
+    judge = Judge(prepared if find(name).stage == "noise" else found.prepared)
+    return p_value(judge, judge.of(found.model.without_effect(name)), found.final)
 
 
 def _enough(prepared: Prepared, found: Found, criteria: Criteria) -> bool:

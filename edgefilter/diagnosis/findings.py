@@ -27,7 +27,9 @@ def share_of(before_db: float, after_db: float) -> float:
     return float(np.clip(1.0 - after / before, 0.0, 1.0)) if before > 0.0 else 0.0
 
 
-def findings_of(found: Found, progress: Callable[[str], None] | None) -> tuple[tuple[Finding, ...], list[str]]:
+def findings_of(
+    found: Found, p_values: Mapping[str, float], progress: Callable[[str], None] | None
+) -> tuple[tuple[Finding, ...], list[str]]:
     """The one that is missed most first; each with the excess before and after it in the order of the steps.
 
     A change of the fan comes first only where it is more than all the rest.
@@ -46,6 +48,7 @@ def findings_of(found: Found, progress: Callable[[str], None] | None) -> tuple[t
                 effect=step.name,
                 excess_before_db=before,
                 excess_after_db=after,
+                p_value=p_values.get(step.name, 1.0),
                 share=max(share_of(found.base.excess_db, after) - share_of(found.base.excess_db, before), 0.0),
                 parameters=intervals,
                 evidence=find(step.name).sentence(step.values)

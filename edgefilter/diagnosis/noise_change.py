@@ -111,15 +111,15 @@ def _judged_anew(found: Found, without: Collection[str]) -> Found:
     held_down = next(_held_down(found.prepared, model, without), None)
     if held_down is None and kept == found.steps:
         return found
-    return _in_steps(found, (*(() if held_down is None else (held_down,)), *kept))
+    return in_steps(found, (*(() if held_down is None else (held_down,)), *kept))
 
 
 def without_doubtful(found: Found) -> Found:
     """The outcome of a search that explains too little, with nothing but what silences and voice both show."""
-    return _in_steps(found, tuple(step for step in found.steps if find(step.name).shows_in_silence))
+    return in_steps(found, tuple(step for step in found.steps if find(step.name).shows_in_silence))
 
 
-def _in_steps(found: Found, steps: Iterable[Trial]) -> Found:
+def in_steps(found: Found, steps: Iterable[Trial]) -> Found:
     """The outcome with those effects alone, each scored beside those before it."""
     judge, model, score, scored = Judge(found.prepared), found.start, found.base, []
     for step in steps:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Literal, TypeAlias
 
 from edgefilter.diagnosis.compare import Comparison
 from edgefilter.diagnosis.independence import Independence
+from edgefilter.echo.effects.catalogue import find
 from edgefilter.echo.measurement import Values
 from edgefilter.echo.model import EchoModel
 from edgefilter.types import Samples
@@ -21,7 +22,7 @@ Fate: TypeAlias = Literal["named", "explained by another", "below its bar", "fai
 """What became of an effect that was tried."""
 Source: TypeAlias = Literal["jacobian", "thirds", "at its bound", "none"]
 """Of a standard error: the prediction's derivatives, fits to a third of the recording each, or why there is none."""
-SCHEMA = 1
+SCHEMA = 2
 
 
 def _known(number: float) -> float | None:
@@ -53,6 +54,7 @@ class Interval:
 class Finding:
     """One effect whose presence the data supports, with the held-out excess before and after it was added.
 
+    p_value: how probable it is that chance explains as much on samples that no fit has seen.
     share: part of the excess power that it takes away, 0 to 1. values: as fitted, for EchoModel.with_effect.
     prediction: (n,) of the model with this and all earlier findings.
     """
@@ -60,6 +62,7 @@ class Finding:
     effect: str
     excess_before_db: float
     excess_after_db: float
+    p_value: float
     share: float
     parameters: Mapping[str, Interval]
     evidence: str
@@ -156,11 +159,13 @@ class Diagnosis:
         return self.after.excess_db
 
     def to_dict(self) -> dict[str, object]:
-        """The JSON that `diagnose --json` writes, schema 1."""
+        """The JSON that `diagnose --json` writes, schema 2."""
         compared = self.comparison.to_dict()
         ranking = [
             {
                 "effect": finding.effect,
+                "family": find(finding.effect).family,
+                "p_value": finding.p_value,
                 "excess_before_db": round(finding.excess_before_db, 3),
                 "excess_after_db": round(finding.excess_after_db, 3),
                 "share": round(finding.share, 4),

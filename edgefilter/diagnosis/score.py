@@ -101,7 +101,8 @@ class Judge:
         corrected = self.correct(prediction, white)
         residual = self.prepared.measurement.recording - corrected
         expected = (*unpredictable, *self.prepared.ordinary)
-        cells = self.cells(residual) / self._expected_cells(expected)
+        variance = self._expected_cells(expected)
+        cells = self.cells(residual) / variance
         weights = np.broadcast_to(self.freedom, cells.shape)
         plain = self.measurement.whiten(residual if gain is None else residual / gain).astype(np.float64) ** 2
         power = self._over_expected(plain, expected) if expected else plain
@@ -113,9 +114,20 @@ class Judge:
             silent_db=_db(power[held & ~active]),
             fitted_db=_db(power[self.prepared.fit & active]),
             irreducible_db=_db(plain[held]) if unpredictable else 0.0,
+            deviance=self._deviance(cells, variance),
             cells=cells,
             prediction=corrected,
         )
+
+    def _deviance(self, cells: Array, variance: Array | float) -> Array:
+        """(times, bands) of power over what is expected (times, bands), and that over the fan (Whittle 1953).
+
+        The variance of a cell is itself known to some decibels only: as a gamma prior of as many degrees of freedom as the cell has,
+        which makes the likelihood that of Student's t.
+        """
+        fan = np.add.reduceat(self._expected[: self._edges[-1]], self._edges[:-1]) / self.freedom
+        likely = np.log(fan * variance) + 2.0 * np.log(0.5 + 0.5 * cells)
+        return likely * self.freedom
 
     def floor_level(self, score: Score) -> float:
         """Level in dB of the cells in which the robot is silent, 0 where it never is: what is left when everything is explained."""

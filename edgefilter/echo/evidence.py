@@ -22,6 +22,7 @@ class Score:
     not. fitted_db: of the samples to fit on, while it is heard.
     What a model says that no waveform predicts counts as fan in these; irreducible_db: the excess over the fan alone
     then, else 0.
+    deviance: (times, bands) minus twice the log likelihood of each cell, but for a constant.
     cells: (times, bands) power over the fan. prediction: (n,) with the ordinary tolerances taken up.
     """
 
@@ -31,6 +32,7 @@ class Score:
     silent_db: float
     fitted_db: float
     irreducible_db: float
+    deviance: Array = field(repr=False)
     cells: Array = field(repr=False)
     prediction: Samples = field(repr=False)
 

@@ -81,6 +81,11 @@ def figure(value: float) -> str:
     return f"{value:.{max(0, 2 - math.floor(math.log10(abs(value))))}f}"
 
 
+def chance(p_value: float) -> str:
+    """How probable it is that chance explains as much."""
+    return f"by chance: {p_value:.1g}" if p_value >= 1e-6 else "by chance: below 1e-6"
+
+
 def interval_text(interval: Interval) -> str:
     """Say "0.61 s (0.56 to 0.66)"; several values one after the other, each with its own range."""
     values, lows, highs = (np.atleast_1d(x) for x in (interval.value, interval.low, interval.high))
@@ -179,7 +184,7 @@ def _finding(rank: int, finding: Finding) -> list[str]:
     lines = [
         (
             f"{rank:>2}. {title(finding.effect)} ({finding.effect}): {decibels(finding.excess_before_db)} to"
-            f" {decibels(finding.excess_after_db)} dB, {100 * finding.share:.0f} % of the excess"
+            f" {decibels(finding.excess_after_db)} dB, {100 * finding.share:.0f} % of the excess; {chance(finding.p_value)}"
         ),
         f"      {sentence(finding.evidence)}",
     ]

@@ -128,7 +128,7 @@ def test_an_interval_fit_that_fails_does_not_kill_a_finished_diagnosis(fragile, 
     step = bench.attempt("fragile", prepared.model)
     found = Found(prepared, prepared.model, step.model, bench.score(prepared.model), step.score, (step,))
     fragile.failures.extend([np.linalg.LinAlgError("Singular matrix")] * failing)
-    (finding,), doubts = findings_of(found, None)
+    (finding,), doubts = findings_of(found, {}, None)
     interval = finding.parameters["amount"]
     assert len(doubts) == failing and "Singular matrix" in doubts[0] and "fragile" in doubts[0]
     assert (

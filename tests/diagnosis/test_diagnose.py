@@ -161,9 +161,18 @@ def test_the_dictionary_has_the_published_keys_and_is_json() -> None:
     x = voice(SECONDS)
     found = diagnose(profile(), (echo(x) * 0.9 + fan()).astype(np.float32), x)
     said = json.loads(json.dumps(found.to_dict(), allow_nan=False))
-    assert said["schema"] == 1 and set(said["where"]) == {"bands", "times", "levels", "lags"}
+    assert said["schema"] == 2 and set(said["where"]) == {"bands", "times", "levels", "lags"}
     entry = said["ranking"][0]
-    assert set(entry) == {"effect", "excess_before_db", "excess_after_db", "share", "parameters", "evidence"}
+    assert set(entry) == {
+        "effect",
+        "excess_before_db",
+        "excess_after_db",
+        "share",
+        "family",
+        "p_value",
+        "parameters",
+        "evidence",
+    }
     assert entry["parameters"]["gain_db"]["value"] == pytest.approx(-0.915, abs=0.05)
 
 
@@ -181,7 +190,9 @@ def test_no_effect_is_chosen_where_none_lowers_the_level():
 
 
 def verdict(active_db: float, fitted_db: float) -> Score:
-    return Score(active_db, active_db, active_db, 0.0, fitted_db, 0.0, np.ones((4, 4)), np.zeros(16000, np.float32))
+    return Score(
+        active_db, active_db, active_db, 0.0, fitted_db, 0.0, np.zeros((4, 4)), np.ones((4, 4)), np.zeros(16000, np.float32)
+    )
 
 
 @pytest.mark.parametrize("fitted_db, stands", [(0.1, True), (-1.5, False)])

@@ -55,7 +55,7 @@ def pages(tmp_path_factory):
     assert [finding.effect for finding in found.ranking] == ["playback_gain", "speaker_nonlinearity"]
     write_page(folder / "missing.html", diagnosis_page(robot, found, y, x, NAMES))
     write_page(folder / "comparison.html", comparison_page(found.comparison, NAMES))
-    neutral = [Finding(name, 0.0, 0.0, 0.0, {}, "", {}, y) for name in ("compression", "clock_drift")]
+    neutral = [Finding(name, 0.0, 0.0, 1.0, 0.0, {}, "", {}, y) for name in ("compression", "clock_drift")]
     model = found.model.with_effect("compression", {}).with_effect("clock_drift", {})
     many = replace(found, ranking=(*found.ranking, *neutral), model=model)
     write_page(folder / "many.html", diagnosis_page(robot, many, y, x, NAMES))
