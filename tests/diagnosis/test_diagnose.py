@@ -191,7 +191,15 @@ def test_no_effect_is_chosen_where_none_lowers_the_level():
 
 def verdict(active_db: float, fitted_db: float) -> Score:
     return Score(
-        active_db, active_db, active_db, 0.0, fitted_db, 0.0, np.zeros((4, 4)), np.ones((4, 4)), np.zeros(16000, np.float32)
+        active_db,
+        active_db,
+        active_db,
+        0.0,
+        fitted_db,
+        0.0,
+        np.zeros((4, 4)),
+        np.ones((4, 4)),
+        np.zeros(16000, np.float32),
     )
 
 
