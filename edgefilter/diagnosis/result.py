@@ -15,6 +15,7 @@ from edgefilter.echo.model import EchoModel
 from edgefilter.types import Samples
 
 if TYPE_CHECKING:
+    from edgefilter.diagnosis.closer_look import CloserLook
     from edgefilter.diagnosis.proof import Proof
 
 Verdict: TypeAlias = Literal["missing", "explained", "unexplained"]
@@ -135,7 +136,8 @@ class Diagnosis:
 
     comparison, after: with the profile as it is, and with all that was found, by the same judge. tried: all effects that
     were tried. independence: of what is left with all that was found. precision: of the found numbers. advice: what to
-    record to tell candidates apart that explain nearly the same. proof: of what was found, in the running filter, where it
+    record to tell candidates apart that explain nearly the same. closer_look: at what is left,
+    where that is unexplained. proof: of what was found, in the running filter, where it
     was asked for; unproven: why there is none.
     """
 
@@ -150,6 +152,7 @@ class Diagnosis:
     independence: Independence | None = None
     precision: Precision = Precision()
     advice: tuple[str, ...] = ()
+    closer_look: CloserLook | None = None
     proof: Proof | None = None
     unproven: str = ""
 
@@ -194,6 +197,7 @@ class Diagnosis:
             },
             "precision": self.precision.to_dict(),
             "advice": list(self.advice),
+            "closer_look": self.closer_look.to_dict() if self.closer_look else None,
             "proof": self.proof.to_dict() if self.proof else None,
             "unproven": self.unproven,
         }

@@ -12,6 +12,7 @@ from typing import Any
 
 import jinja2
 
+from edgefilter.diagnosis.closer_look import CloserLook
 from edgefilter.diagnosis.compare import Comparison, describe
 from edgefilter.diagnosis.diagnose import Diagnosis, Finding
 from edgefilter.diagnosis.prepare import Prepared, prepare
@@ -57,7 +58,15 @@ def comparison_page(found: Comparison, names: Mapping[str, Any]) -> str:
     return _page(
         {(): found},
         (),
-        {"kind": "comparison", "headline": excess, "findings": [], "left": "", "command": [], **_statistics()},
+        {
+            "kind": "comparison",
+            "headline": excess,
+            "findings": [],
+            "left": "",
+            "look": None,
+            "command": [],
+            **_statistics(),
+        },
         names,
     )
 
@@ -87,6 +96,7 @@ def diagnosis_page(
         "headline": headline(found.verdict, [finding.effect for finding in found.ranking], bool(names["profile"])),
         "findings": [_finding(finding) for finding in found.ranking],
         "left": sentence(found.evidence) if found.evidence else "",
+        "look": _look(found.closer_look),
         "command": _command(found, names, written is not None),
         **_statistics(found),
     }
@@ -221,6 +231,31 @@ def _command(found: Diagnosis, names: Mapping[str, Any], done: bool) -> list[str
     """What to type to have all that was found in a new profile, as words between which its line may break; none where it is done."""
     effects = [finding.effect for finding in in_order(found.ranking)]
     return add_command(effects, names).split(" ") if effects and not done else []
+
+
+def _look(look: CloserLook | None) -> dict[str, object] | None:
+    """The curves of what is left as points of drawings 100 wide and 40 high, zero decibels where a line says so."""
+    if look is None:
+        return None
+    drawn = []
+    for curve in look.curves:
+        low, high = min(0.0, *curve.y_db), max(0.0, *curve.y_db)
+        logarithmic = curve.x_unit == "Hz"
+        x = [math.log(value) if logarithmic else value for value in curve.x]
+        across, up = max(x[-1] - x[0], 1e-9), max(high - low, 1.0)
+        place = [(100 * (a - x[0]) / across, 40 * (high - b) / up) for a, b in zip(x, curve.y_db, strict=True)]
+        drawn.append(
+            {
+                "name": curve.name,
+                "points": " ".join(f"{a:.2f},{b:.2f}" for a, b in place),
+                "zero": f"{40 * high / up:.2f}",
+                "from": f"{curve.x[0]:.3g}",
+                "to": f"{curve.x[-1]:.4g} {curve.x_unit}",
+                "range": f"{low:+.1f} to {high:+.1f} dB",
+                "share": f"{100 * curve.share:.0f} % of what is left",
+            }
+        )
+    return {"sentence": sentence(look.sentence), "curves": drawn}
 
 
 def _outcome(written: Comparison | None, proof: Proof | None) -> list[tuple[str, str, str]]:

@@ -234,6 +234,7 @@ boxes.forEach((box, i) =>
   }),
 );
 louder.addEventListener("change", setVolume);
+document.querySelector(".statistics").addEventListener("toggle", draw);
 let drawnWidth = document.body.clientWidth;
 addEventListener("resize", () => {
   if (document.body.clientWidth !== drawnWidth) draw();

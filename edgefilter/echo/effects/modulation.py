@@ -64,7 +64,8 @@ class Modulation(Effect):
         )
         if not energy.any():
             return neutral(self)
-        rate = _strongest(energy, cross)
+        rates, worth, _ = by_rate(energy, cross, LOWEST_HZ, HIGHEST_HZ)
+        rate = float(rates[int(np.argmax(worth))])
         angle = 2.0 * np.pi * rate * STEP / SAMPLE_RATE * (np.arange(energy.size) + 0.5)
         rows = np.concatenate((np.ones((1, energy.size)), waves(angle, HARMONICS)))
         matrix = (rows * energy) @ rows.T
@@ -127,12 +128,15 @@ def _weights(values: Values) -> Array:
     return np.concatenate([np.pad(part, (0, longer - part.size)) for part in (cosine, sine)])
 
 
-def _strongest(energy: Array, cross: Array) -> float:
-    """The rate in Hz of the gain 1 + a cos + b sin that explains most, from sums of voice times voice, and times recording, per step (k,)."""
+def by_rate(energy: Array, cross: Array, lowest_hz: float, highest_hz: float) -> tuple[Array, Array, Array]:
+    """Of each rate (k,) in Hz the energy that a gain 1 + a cos + b sin at it explains, (k,), and its depth, (k,).
+
+    From sums of voice times voice, and voice times recording, per step.
+    """
     size = FINER * energy.size
     per = SAMPLE_RATE / STEP / size
     own, other = np.fft.rfft(energy, size), np.fft.rfft(cross, size)
-    rates = np.arange(round(LOWEST_HZ / per), min(round(HIGHEST_HZ / per), own.size // 2))
+    rates = np.arange(max(round(lowest_hz / per), 1), min(round(highest_hz / per), own.size // 2))
     at, twice, seen = own[rates], own[2 * rates], other[rates]
     matrix = np.empty((rates.size, 3, 3))
     matrix[:, 0, 0] = own[0].real
@@ -141,6 +145,7 @@ def _strongest(energy: Array, cross: Array) -> float:
     matrix[:, 1, 1], matrix[:, 2, 2] = 0.5 * (own[0] + twice).real, 0.5 * (own[0] - twice).real
     matrix[:, 1, 2] = matrix[:, 2, 1] = -0.5 * twice.imag
     right = np.stack((np.full(rates.size, other[0].real), seen.real, -seen.imag), axis=1)
-    matrix += 1e-6 * own[0].real * np.eye(3)
+    matrix += (1e-6 * own[0].real + 1e-30) * np.eye(3)
     found = np.linalg.solve(matrix, right[:, :, None])[:, :, 0]
-    return float(rates[int(np.argmax(np.sum(found * right, axis=1)))] * per)
+    depth = np.hypot(found[:, 1], found[:, 2]) / np.maximum(np.abs(found[:, 0]), 1e-6)
+    return rates * per, np.sum(found * right, axis=1), depth
