@@ -48,7 +48,19 @@ def build_parser() -> Parser:
     parser.add_argument("--version", action="version", version=f"edgefilter {__version__}")
     parser.add_argument("--debug", action="store_true", help="show a traceback when something fails")
     commands = parser.add_subparsers(dest="command", metavar="COMMAND")
-    for add_command in (_demo, _run, _calibrate, _compare, _diagnose, _add, _remove, _devices, _doctor, _profile):
+    for add_command in (
+        _demo,
+        _run,
+        _calibrate,
+        _compare,
+        _diagnose,
+        _probe,
+        _add,
+        _remove,
+        _devices,
+        _doctor,
+        _profile,
+    ):
         add_command(commands)
     return parser
 
@@ -169,6 +181,24 @@ def _diagnose(commands: argparse._SubParsersAction) -> None:
     _force(option)
     _recording(option, profile_needed=False)
     _report(option)
+
+
+def _probe(commands: argparse._SubParsersAction) -> None:
+    told = "where several explanations of a recording remain: the sound that tells them apart, and the odds once it was heard"
+    option = commands.add_parser("probe", help=told).add_argument
+    option("--live", action="store_true", help="play the sounds here and record them")
+    option("--speaker", default="default", metavar="DEVICE", help="output device, with --live (default: %(default)s)")
+    option("--input", default="default", metavar="DEVICE", help="microphone, with --live (default: %(default)s)")
+    option(
+        "--seconds",
+        type=positive,
+        default=5.0,
+        metavar="S",
+        help="of sound at most, with --live (default: %(default)g)",
+    )
+    option("--excitation", metavar="S.wav", help="write the sound there, to be played and recorded elsewhere")
+    option("--answer", metavar="R.wav", help="the recording of that sound")
+    _recording(option, profile_needed=True)
 
 
 def _add(commands: argparse._SubParsersAction) -> None:

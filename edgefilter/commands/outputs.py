@@ -20,6 +20,7 @@ READ = (
     "profile",
     "model",
     "recording",
+    "answer",
     "effects",
     "sweep_reference",
     "sweep_recording",

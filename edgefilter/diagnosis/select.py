@@ -35,12 +35,46 @@ def search(
     if fan is not None:
         prepared, step = fan
         bench, model = Workbench(prepared, criteria, progress, without), step.model
-    best = _best(bench, model, list(_runs(bench, model)))
+    best = _freer(bench, model, _best(bench, model, list(_runs(bench, model))))
     steps = _in_steps(bench, model, best)
     full = len(added(model, best)) >= criteria.most_effects and not bench.explained(best)
     notes = (*bench.notes, FULL.format(criteria.most_effects)) if full else bench.notes
     steps = steps if fan is None else (step, *steps)
     return Found(prepared, start, best, base, bench.score(best), steps, notes, bench.tried(model, best))
+
+
+def _freer(bench: Workbench, start: EchoModel, best: EchoModel) -> EchoModel:
+    """What listed effects lead to, or what a free law does, alone or beside them, where that explains more than these can.
+
+    A free law takes up what several listed ones do; so it comes last, and only where they leave something.
+    """
+    if bench.left(best) <= bench.criteria.same_db or bench.explained(start):
+        return best
+    bench.free = True
+    firsts = [trial for name in names() if find(name).free_law and (trial := bench.attempt(name, start)) is not None]
+    least = max(bench.criteria.start_share * bench.left(start), bench.criteria.start_db)
+    first = max((t for t in firsts if t.gain_db >= least), key=lambda t: t.gain_db, default=None)
+    beside = (
+        forward(bench, best) if best is not start and len(added(start, best)) < bench.criteria.most_effects else None
+    )
+    runs = [] if first is None else [_stepwise(bench, start, first)]
+    runs += [] if beside is None else [refit(bench, start, beside.model)]
+    for run in (standing(bench, start, run) for run in runs):
+        if _explains_more(bench, start, run, best):
+            best = run
+    return best
+
+
+def _explains_more(bench: Workbench, start: EchoModel, run: EchoModel, listed: EchoModel) -> bool:
+    """Whether a run with a free law explains so much more than one without that the law is to be given instead of its names.
+
+    Where the names are of the same family they say as much with less than all of it (`nested`).
+    """
+    base = bench.score(start).level_db
+    more, known = (base - bench.score(model).level_db for model in (run, listed))
+    families = {find(name).family for name in added(start, listed)}
+    free = {find(name).family for name in added(start, run) if find(name).free_law}
+    return known < bench.criteria.nested * more if free <= families else known < more - bench.margin(more)
 
 
 def _runs(bench: Workbench, start: EchoModel) -> Iterator[EchoModel]:

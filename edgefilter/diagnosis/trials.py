@@ -71,7 +71,10 @@ class Found:
 
 
 class Workbench:
-    """Tries effects on models of one prepared recording and remembers what came of it."""
+    """Tries effects on models of one prepared recording and remembers what came of it.
+
+    free: whether effects whose law is free are tried as well.
+    """
 
     def __init__(
         self,
@@ -91,6 +94,7 @@ class Workbench:
         self._spared: set[str] = set()
         self._in_vain: dict[str, float] = {}
         self._refused = False
+        self.free = False
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -197,11 +201,10 @@ class Workbench:
         return found + [trial for trial in tried.values() if trial is not None]
 
     def _attempt_in_turn(self, names: list[str], model: EchoModel) -> list[Trial]:
-        """The simple ones first, free laws last; each where none before explains so much that no other could be preferred to it."""
+        """The simple ones first; the richer ones where none of those explains so much that no other could be preferred to it."""
         found: list[Trial] = []
-        ranks = {name: (find(name).free_law, find(name).complexity) for name in names}
-        for rank in sorted(set(ranks.values())):
-            level = [name for name in names if ranks[name] == rank]
+        for complexity in sorted({find(name).complexity for name in names}):
+            level = [name for name in names if find(name).complexity == complexity]
             if any(self._settles(trial, model) for trial in found):
                 self._spared.update(level)
             else:
@@ -273,6 +276,7 @@ class Workbench:
             if find(name).stage != "noise"
             and not find(name).shows_in_silence
             and not find(name).in_what_is_left
+            and (self.free or not find(name).free_law)
             and name not in out
             and find(name).complexity <= most
         ]

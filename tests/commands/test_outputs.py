@@ -21,7 +21,7 @@ from tests.diagnosis.robot_scene import profile
 
 NEITHER = {
     "help", "version", "debug", "command", "word", "engine", "budget_ms", "remeasure", "seconds", "quiet", "stepped_sine", "live",
-    "speaker", "level_db", "effect", "force", "prove", "no_learn", "on_barge_in", "barge_in", "setup", "load", "unload",
+    "speaker", "level_db", "effect", "force", "prove", "false_rate", "no_learn", "on_barge_in", "barge_in", "setup", "load", "unload",
     "hidden", "multisine",
 }  # fmt: skip
 
