@@ -256,8 +256,9 @@ def conclude(
 
 def _p_value(prepared: Prepared, found: Found, name: str) -> float:
     """Of one of the effects that were found, beside the others; of a changed fan against the calibrated one."""
-    judge = Judge(prepared if find(name).stage == "noise" else found.prepared)
-    return p_value(judge, judge.of(found.model.without_effect(name)), found.final)
+    of_noise = find(name).stage == "noise"
+    judge = Judge(prepared if of_noise else found.prepared)
+    return p_value(judge, judge.of(found.model.without_effect(name)), found.final, of_noise)
 
 
 def _enough(prepared: Prepared, found: Found, criteria: Criteria) -> bool:

@@ -11,7 +11,7 @@ from edgefilter.diagnosis.criteria import Criteria
 from edgefilter.diagnosis.leftover import Leftover, inspect
 from edgefilter.diagnosis.prepare import Prepared
 from edgefilter.diagnosis.score import Judge
-from edgefilter.diagnosis.trials import Found, Trial, beside
+from edgefilter.diagnosis.trials import Found, Trial, beside, fall
 from edgefilter.echo.effect import complete
 from edgefilter.echo.effects.catalogue import find, names
 from edgefilter.echo.evidence import Score
@@ -52,7 +52,13 @@ def changed_fan(
         after = Judge(now).of(model)
         if abs(after.silent_db) < 0.5 * abs(base.silent_db):
             return now, Trial(
-                name, values, model.with_effect(name, values), after, base.level_db - after.level_db, change
+                name,
+                values,
+                model.with_effect(name, values),
+                after,
+                base.level_db - after.level_db,
+                change,
+                fall(base, after),
             )
     return None
 
@@ -89,7 +95,8 @@ def look_at_fan(found: Found, criteria: Criteria, without: Collection[str] = ())
         ):
             continue
         changed = model.with_effect(name, values)
-        step = Trial(name, values, changed, after, found.final.level_db - after.level_db, change)
+        gain_db, likelier = found.final.level_db - after.level_db, fall(found.final, after)
+        step = Trial(name, values, changed, after, gain_db, change, likelier)
         return replace(found, prepared=now, model=changed, final=after, steps=(*found.steps, step)), behind
     return found, left
 
@@ -125,7 +132,8 @@ def in_steps(found: Found, steps: Iterable[Trial]) -> Found:
     for step in steps:
         model, before = model.with_effect(step.name, step.values), score
         score = judge.of(model)
-        scored.append(replace(step, model=model, score=score, gain_db=before.level_db - score.level_db))
+        gain_db = before.level_db - score.level_db
+        scored.append(replace(step, model=model, score=score, gain_db=gain_db, likelier=fall(before, score)))
     return replace(found, model=model, final=score, steps=tuple(scored))
 
 

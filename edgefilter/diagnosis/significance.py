@@ -15,22 +15,23 @@ SPAN = 256
 """Samples (16 ms) whose sums are taken for independent of each other: longer than what whitening leaves."""
 
 
-def p_value(judge: Judge, before: Score, after: Score) -> float:
+def p_value(judge: Judge, before: Score, after: Score, of_noise: bool = False) -> float:
     """With what probability a change of a prediction, or of the noise that is expected, explains as much by chance.
 
-    before, after: of a model without and with an effect that was fitted to the other half. The change of the prediction, whitened,
+    before, after: of a model without and with an effect that was fitted to the other half. of_noise: whether it leaves the
+    voice alone. The change of the prediction, whitened,
     times what was left without it is summed over spans of 16 ms; by chance these sums are as often below zero as above, so
     that their total over the root of their squares is a normal number (a score test whose variance is taken from the spans
     themselves: White 1980). An effect that changes the noise alone is judged by its log likelihood, cell by cell, in the same way.
     """
     change = after.prediction - before.prediction
-    if change.any():
+    if change.any() and not of_noise:
         measurement = judge.measurement
         left = measurement.white_recording - measurement.whiten(before.prediction)
         products = left * measurement.whiten(change) * judge.prepared.held_out
         sums = np.add.reduceat(products, np.arange(0, products.size, SPAN), dtype=np.float64)
     else:
-        sums = np.ravel(before.deviance - after.deviance)
+        sums = np.ravel((before.deviance - after.deviance) / judge.freedom)
     return _one_sided(sums)
 
 

@@ -23,7 +23,10 @@ Signature: TypeAlias = tuple[tuple[str | bytes, ...], ...]
 
 @dataclass(frozen=True, eq=False)
 class Trial:
-    """One effect added to a model: its values, the model with it, its score, the fall in level and the effect's size over the fan in dB."""
+    """One effect added to a model: its values, the model with it, its score, the fall in level and the effect's size over the fan in dB.
+
+    likelier: fall of the deviance, summed over all held-out cells.
+    """
 
     name: str
     values: Values
@@ -31,6 +34,7 @@ class Trial:
     score: Score
     gain_db: float
     size_db: float
+    likelier: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -168,7 +172,8 @@ class Workbench:
         """What the effect of that name explains that model has and others has not."""
         before, after = self.score(others), self.score(model)
         size = size_of_change(self.judge, name, model, before, after)
-        return Trial(name, dict(model.effects)[name], model, after, before.level_db - after.level_db, size)
+        likelier = fall(before, after)
+        return Trial(name, dict(model.effects)[name], model, after, before.level_db - after.level_db, size, likelier)
 
     def halves(self, trial: Trial, model: EchoModel) -> bool:
         """Whether a trial takes away about half of the power over the fan, though the level hardly falls.
@@ -302,7 +307,12 @@ def beside(judge: Judge, name: str, model: EchoModel, before: Score | None = Non
     if not effect.plausible(Evidence(values, model, judge, before, after)):
         return None
     size = size_of_change(judge, name, changed, before, after)
-    return Trial(name, values, changed, after, before.level_db - after.level_db, size)
+    return Trial(name, values, changed, after, before.level_db - after.level_db, size, fall(before, after))
+
+
+def fall(before: Score, after: Score) -> float:
+    """By how much the deviance falls, summed over all held-out cells."""
+    return float(np.sum(before.deviance) - np.sum(after.deviance))
 
 
 def size_of_change(judge: Judge, name: str, model: EchoModel, before: Score, after: Score) -> float:

@@ -65,3 +65,13 @@ def test_what_may_be_chance_is_not_named_at_a_rate_that_forbids_it() -> None:
     assert finding.effect == "playback_gain" and finding.p_value < 1e-6
     none = diagnose(profile(), y, x, criteria=Criteria(false_rate=1e-300))
     assert none.ranking == () and none.verdict == "unexplained" and none.remaining_db == none.comparison.excess_db
+
+
+def test_another_fan_that_is_named_is_likelier_than_the_calibrated_one() -> None:
+    """It had a worse criterion than anything else: its gain was that of the power over a fan that is another by then."""
+    x = np.insert(voice(6.0), 3 * 16_000, np.zeros(32_000, np.float32))
+    hiss = 0.004 * np.diff(np.random.default_rng(4).standard_normal(x.size + 1))
+    found = diagnose(profile(), (record(x) + hiss).astype(np.float32), x)
+    assert [finding.effect for finding in found.ranking] == ["fan_noise"]
+    (row,) = (row for row in found.tried if row.effect == "fan_noise")
+    assert row.delta_bic < -100 and found.ranking[0].p_value < 1e-6
