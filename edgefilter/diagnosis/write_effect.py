@@ -48,7 +48,7 @@ class {name_of_class}(Effect):
 
 
 def write_effect(path: str | Path, profile: Profile, found: Diagnosis, recording: Samples, reference: Samples) -> str:
-    """Write the law that explains most of what a diagnosis leaves, or the free one that it names, as an effect of the user's own.
+    """Write the free law that a diagnosis names, or else the one that explains most by itself, as an effect of the user's own.
 
     Parameters
     ----------
@@ -69,7 +69,7 @@ def write_effect(path: str | Path, profile: Profile, found: Diagnosis, recording
     UsageError
         Where the file's name cannot be an effect's.
     EdgefilterError
-        Where no family explains anything of what is left, or the file cannot be written.
+        Where no such law explains anything, or the file cannot be written.
     """
     path = Path(path)
     if path.suffix != ".py" or not path.stem.isidentifier() or path.stem in names():
@@ -100,16 +100,17 @@ def write_effect(path: str | Path, profile: Profile, found: Diagnosis, recording
 
 
 def _law(profile: Profile, found: Diagnosis, recording: Samples, reference: Samples) -> tuple[str, Values]:
-    """Name and values of the free law that was found, or of the one that explains most beside what was found."""
+    """Name and values of the free law that was found, or else of the one that explains most of what the profile leaves."""
     free = [name for name in names() if find(name).free_law]
     for finding in found.ranking:
         if finding.effect in free:
             return finding.effect, finding.values
-    judge = Judge(prepare(profile, recording, reference))
-    trials = [trial for name in free if (trial := beside(judge, name, found.model)) is not None]
+    prepared = prepare(profile, recording, reference)
+    judge = Judge(prepared)
+    trials = [trial for name in free if (trial := beside(judge, name, prepared.model)) is not None]
     best = max(trials, key=lambda trial: trial.gain_db, default=None)
     if best is None or best.gain_db < find(best.name).least_gain_db:
         raise EdgefilterError(
-            "no curve, no gain by level and no gain by time explains anything of what is left: no effect is written"
+            "no curve, no gain by level and no gain by time explains anything of what the profile leaves: no effect is written"
         )
     return best.name, best.values

@@ -41,7 +41,7 @@ def test_a_recording_that_is_explained_has_no_law_to_write(tmp_path: Path) -> No
     x = voice(6.0)
     y = record(x)
     found = diagnose(profile(), y, x)
-    with pytest.raises(EdgefilterError, match="explains anything of what is left: no effect is written"):
+    with pytest.raises(EdgefilterError, match="explains anything of what the profile leaves: no effect is written"):
         write_effect(tmp_path / "mine.py", profile(), found, y, x)
     assert not list(tmp_path.iterdir())
 
