@@ -7,6 +7,7 @@ latency    milliseconds of a hop, alone and beside a learner; CPU over a long ti
 live       trials on virtual devices: conversations, barge-in, learning over a day, an hour without a break
 diagnosis  how often hidden effects are named, and what naming them brings
 training   what chooses a network: words on validation speakers, the scale of the speech probability
+serve      streams that a core serves in real time
 fuzz       damaged profiles, models and recordings
 mutate     whether the tests notice a change in the code
 stale      which results are of another behaviour than today's; exit 1 if there are any
