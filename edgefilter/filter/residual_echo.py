@@ -119,7 +119,8 @@ class Residual:
         if fan is not None:
             noise = fan
         elif self._calibrated is not None:
-            noise = self._calibrated * np.float32(np.median(noise / self._calibrated))
+            over, middle = noise / self._calibrated, self._bins // 2
+            noise = self._calibrated * np.partition(over, middle)[middle]  # the median, since bins are odd
         noise_power = float(np.add.reduce(noise))
         self._below[:], self._above[:] = self._echo[0], self._echo[-1]
         brought = np.correlate(self._extended, self._spread, "valid")
