@@ -94,7 +94,10 @@ class Volume:
 
     @property
     def removed_db(self) -> float | None:
-        """How far the subtraction has lowered the microphone over the last FORGET_S of robot; None before ENOUGH_S of it."""
+        """How far the subtraction has lowered the microphone over the last FORGET_S of robot; None before ENOUGH_S of it.
+
+        Hops in which a factor is looked for do not count: the echo is too loud or too soft in them by any factor.
+        """
         if self._audible < self._enough or not self._lasting.mic:
             return None
         return -10.0 * math.log10(max(self._lasting.left() / self._lasting.mic, LEAST_LEFT))
@@ -105,7 +108,7 @@ class Volume:
         self._peak = max(now.echo, self._forget * self._peak)
         self._smoothed = self._smoothed.smoothed(now)
         audible = now.echo > AUDIBLE * self._peak
-        if audible:
+        if audible and not self.suspected:
             self._lasting = Moments(*(self._forget * before for before in self._lasting)).plus(now)
             self._audible += 1
         if not self._known:
