@@ -69,8 +69,8 @@ def test_an_echo_that_stays_too_loud_for_half_a_second_is_put_down_to_another_pa
     assert 0.45 < first * HOP / 16000 < 0.55 and 2 <= sum(changed) <= 4
 
 
-def factor_after(mic: np.ndarray, echo: np.ndarray, known: bool = True) -> float:
-    volume = Volume(HOP, known)
+def factor_after(mic: np.ndarray, echo: np.ndarray, path: str = "known") -> float:
+    volume = Volume(HOP, path)
     for m, e in zip(mic, echo, strict=True):
         volume.follow(m, np.float32(volume.gain) * e)
     return volume.gain
@@ -106,6 +106,6 @@ def test_a_microphone_that_does_not_hear_the_echo_turns_no_volume(scale: float) 
 
 def test_the_volume_of_a_path_that_is_unknown_yet_means_nothing() -> None:
     echo = hops(0.5, 0)
-    assert factor_after(2.0 * echo, echo, known=False) == 1.0
+    assert factor_after(2.0 * echo, echo, path="unknown") == 1.0
     learned = np.concatenate((echo, 2.0 * echo))
-    assert factor_after(learned, np.concatenate((echo, echo)), known=False) == pytest.approx(2.0, rel=0.01)
+    assert factor_after(learned, np.concatenate((echo, echo)), path="unknown") == pytest.approx(2.0, rel=0.01)
