@@ -32,7 +32,6 @@ ITERATIONS = 8
 """Of the power method where it has to come to its end at once; hop by hop one is enough, since it goes on where it was."""
 LEFT_OUT = 1e4
 """Noise over the mean that a microphone that is left out is taken to have."""
-TINY = 1e-30
 
 
 class SpatialFilter:
@@ -122,7 +121,7 @@ class SpatialFilter:
     def _best(self, gathered: Spectrum, noise: Spectrum, iterations: int = 1) -> Spectrum:
         """Weights for a human and against noise of these covariances; the power method goes on where it was."""
         at = self._reference
-        level = np.einsum("ccf->f", noise).real / len(noise) + np.float32(TINY)
+        level = np.einsum("ccf->f", noise).real / len(noise) + fourier.TINY
         human = gathered / level + self._prior
         loaded = noise / level + (np.float32(LOADING) + self._without) * self._ones
         found = self._direction
@@ -132,7 +131,7 @@ class SpatialFilter:
         self._direction = found
         cross = np.einsum("df,df->f", human[at], found)
         power = _form(found, human)
-        return found * (np.sqrt(human[at, at].real / power) * cross.conj() / (np.abs(cross) + np.float32(TINY)))
+        return found * (np.sqrt(human[at, at].real / power) * cross.conj() / (np.abs(cross) + fourier.TINY))
 
 
 def diffuse_coherence(stft: StftConfig, microphones: int) -> Samples:
