@@ -56,6 +56,16 @@ def test_of_a_reference_that_is_played_unheard_no_lag_is_believed():
         assert coarse.find() is None
 
 
+def test_where_the_range_has_no_wrong_lags_chance_is_no_lag_either():
+    """Seven lags are all beside one another: what wrong ones would have is known without them."""
+    rng = np.random.default_rng(0)
+    mic, ref = (rng.standard_normal(6 * 16_000).astype(np.float32) for _ in range(2))
+    coarse = CoarseLag(HOP, 6 * HOP)
+    for pair in zip(hops(mic), hops(ref), strict=True):
+        coarse.step(*pair)
+        assert coarse.find() is None
+
+
 def test_silence_on_either_side_says_nothing():
     coarse, x = CoarseLag(HOP, 8_000), robot_speech(2.0)
     for hop in hops(x):

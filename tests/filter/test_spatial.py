@@ -210,4 +210,21 @@ def test_the_level_of_an_array_that_is_not_calibrated_means_nothing(scale: float
         return spatial.weights
 
     usual = learned(1.0)
+    assert np.isfinite(usual).all()
     np.testing.assert_allclose(learned(scale), usual, atol=1e-2 * np.abs(usual).max())
+
+
+def test_the_weights_of_a_finished_turn_know_nothing_of_the_turn_before() -> None:
+    gain, noise = np.ones(STFT.bins, np.float32), fan_below()
+    talkers = [plane_wave(np.array(direction)) for direction in ((1.0, 0.0, 0.0), (-0.5, 0.6, 0.62))]
+
+    def finished(turns: list) -> np.ndarray:
+        rng, spatial = np.random.default_rng(9), SpatialFilter(STFT, 3, noise)
+        for talker in turns:
+            for _ in range(60):
+                spatial.learn((talker * rng.standard_normal(STFT.bins)).astype(np.complex64), gain, 0.9, True, True)
+            spatial.learn(np.zeros((3, STFT.bins), np.complex64), gain, 0.4, False, True)
+        return spatial.finished()
+
+    alone, after = finished(talkers[1:]), finished(talkers)
+    assert np.abs(after - alone).max() < 0.15 * np.abs(alone).max()
