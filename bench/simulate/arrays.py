@@ -19,7 +19,6 @@ recording: near sources below the microphones, a diffuse part and each microphon
 from __future__ import annotations
 
 import argparse
-import json
 import math
 import sys
 from dataclasses import replace
@@ -38,6 +37,7 @@ from bench.simulate.conversations import (
     read_speech,
     read_utterance,
     read_voices,
+    write_item,
 )
 from bench.simulate.simulated_robot import (
     RATE,
@@ -263,14 +263,6 @@ def _record(
     return {"sweep_ref": excitation, **signals}, scores
 
 
-def write(folder: Path, signals: dict[str, Array], meta: dict) -> None:
-    """The signals as FLAC and meta.json into a folder."""
-    folder.mkdir(parents=True, exist_ok=True)
-    for name, samples in signals.items():
-        sf.write(folder / f"{name}.flac", samples, RATE, subtype="PCM_16")
-    (folder / "meta.json").write_text(json.dumps(meta, indent=1) + "\n", encoding="utf-8")
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--speech", type=Path, required=True, metavar="DIR", help="human speech")
@@ -295,7 +287,7 @@ def main() -> None:
             options.seed, index, options.kind, room, speech, voices, covariances, options.microphones, options.turns,
             options.moving,
         )  # fmt: skip
-        write(options.output / f"{room}_{index:02d}", signals, meta)
+        write_item(options.output / f"{room}_{index:02d}", signals, "meta", meta)
 
 
 if __name__ == "__main__":

@@ -262,6 +262,14 @@ def record_all(
     return signals, {"snr_fan": snr_fan, "sisdr_mix": si_sdr(mic[span], clean[span])}, echo_gain
 
 
+def write_item(folder: Path, signals: dict[str, Array], name: str, about: dict) -> None:
+    """The signals (n,) or (n, channels) as FLAC and NAME.json into a folder."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for signal_name, samples in signals.items():
+        sf.write(folder / f"{signal_name}.flac", samples, RATE, subtype="PCM_16")
+    (folder / f"{name}.json").write_text(json.dumps(about, indent=1) + "\n", encoding="utf-8")
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--speech", type=Path, required=True, metavar="DIR", help="human speech")
@@ -276,11 +284,7 @@ def main() -> None:
     voices = read_voices(options.voices)
     for index in tqdm(range(options.count), unit="conversation", desc=str(options.output)):
         scene = make_scene(options.seed, index, options.kind, speech, voices, options.distortion)
-        folder = options.output / f"{scene.meta['room']}_{index:02d}"
-        folder.mkdir(parents=True, exist_ok=True)
-        for name, samples in scene.signals.items():
-            sf.write(folder / f"{name}.flac", samples, RATE, subtype="PCM_16")
-        (folder / "meta.json").write_text(json.dumps(scene.meta, indent=1) + "\n", encoding="utf-8")
+        write_item(options.output / f"{scene.meta['room']}_{index:02d}", scene.signals, "meta", scene.meta)
 
 
 if __name__ == "__main__":

@@ -17,14 +17,12 @@ real robot (hidden_robot.draw_scene).
 from __future__ import annotations
 
 import argparse
-import json
 from pathlib import Path
 
 import numpy as np
-import soundfile as sf
 from tqdm import tqdm
 
-from bench.simulate.conversations import Clip, read_clips, read_speech, read_voices
+from bench.simulate.conversations import Clip, read_clips, read_speech, read_voices, write_item
 from bench.simulate.hidden_effects import CATALOGUE, ENR_DB, NAMED, OUTSIDE, RANGES
 from bench.simulate.hidden_robot import Chain, Scene, decibels, draw_scene, power
 from bench.simulate.simulated_robot import RATE, Array
@@ -153,13 +151,6 @@ def scale(signals: dict[str, Array], parameters: dict) -> dict[str, Array]:
     return {name: gain * x if name in recorded else x for name, x in signals.items()}
 
 
-def write_case(folder: Path, signals: dict[str, Array], truth: dict) -> None:
-    folder.mkdir(parents=True, exist_ok=True)
-    for name, samples in signals.items():
-        sf.write(folder / f"{name}.flac", samples, RATE, subtype="PCM_16")
-    (folder / "truth.json").write_text(json.dumps(truth, indent=1) + "\n", encoding="utf-8")
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--voices", type=Path, required=True, nargs="+", metavar="DIR", help="the robot's voices")
@@ -176,7 +167,8 @@ def main() -> None:
     speech = read_clips(options.speech, (2.0, 12.0)) if "outside" in kinds else []
     for kind in kinds:
         for index in tqdm(range(options.count), unit="case", desc=kind):
-            write_case(options.output / f"{kind}_{index:03d}", *make_case(options.seed, index, kind, voices, speech))
+            signals, truth = make_case(options.seed, index, kind, voices, speech)
+            write_item(options.output / f"{kind}_{index:03d}", signals, "truth", truth)
 
 
 if __name__ == "__main__":

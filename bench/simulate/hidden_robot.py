@@ -271,7 +271,7 @@ def draw_scene(
 
     robot_over_fan_db: of the whole recording. Tolerances: offset -60..60 samples, fan +-0.4 dB, gain +-0.1 dB, the
     microphone moved by 0.1-0.9 mm, distortion of faint_db over the fan. All recordings together are scaled later, see
-    `hidden_cases.write_case`.
+    `hidden_cases.scale`.
     """
     place, shell, amplitude = draw_place(rng, rng.uniform(0.18, 0.32)), draw_shell(rng), draw_hiss(rng)
     move_m = rng.uniform(1e-4, 9e-4)

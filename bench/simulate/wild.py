@@ -30,8 +30,8 @@ import soundfile as sf
 from scipy import signal
 from tqdm import tqdm
 
-from bench.simulate.conversations import Clip, read_voices
-from bench.simulate.hidden_cases import read_reference, scale, write_case
+from bench.simulate.conversations import Clip, read_voices, write_item
+from bench.simulate.hidden_cases import read_reference, scale
 from bench.simulate.hidden_effects import Rng, log_uniform, put_back
 from bench.simulate.hidden_robot import Chain, Place, Scene, decibels, direction, draw_scene, power
 from bench.simulate.simulated_robot import RATE, Array
@@ -440,7 +440,8 @@ def main() -> None:
     options = parser.parse_args()
     half, voices = options.half, read_voices(options.voices)
     for index in tqdm(range(options.count), unit="case", desc=half):
-        write_case(options.output / f"{half}_{index:03d}", *make_case(options.seed, index, half, voices))
+        signals, truth = make_case(options.seed, index, half, voices)
+        write_item(options.output / f"{half}_{index:03d}", signals, "truth", truth)
 
 
 if __name__ == "__main__":

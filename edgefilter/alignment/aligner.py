@@ -88,7 +88,7 @@ class Aligner:
         self._to_search, self._to_measure, self._stage = SEARCH_STRIDE, STRIDE // 2, 0
         self._gain: float | None = None
         self._by_bands = None if self._calibrated is not None else CoarseLag(self.hop, self._max_lag)
-        self._coarse: int | None = None
+        self._coarse: int | None = None  # delay at which the reference is read as long as nothing sharper is known
         self._margin = PRE_ROLL
         self._known = self._refuted = self._trusted = self._measured = self._missed = False
         self._confidence, self._lost = 0.0, 0
@@ -126,25 +126,27 @@ class Aligner:
             self._expire()
         before = self._read_at
         self._measured = False
+        switched = False
         if self._known:
             self._drift.advance(self.hop)
+            switched = self._measure()
         elif self._by_bands:
-            self._coarse = self._look_coarsely(mic, ref, self._by_bands)
-        switched = self._measure() if self._known else False
+            switched = self._look_coarsely(mic, ref, self._by_bands)
         switched = self._search() or switched
         return self._deliver(mic, before, switched)
 
-    def _look_coarsely(self, mic: Samples, ref: Samples, by_bands: CoarseLag) -> int | None:
-        """Where the reference is to be read as long as nothing sharper is known: its delay in samples."""
+    def _look_coarsely(self, mic: Samples, ref: Samples, by_bands: CoarseLag) -> bool:
+        """Find where the reference is to be read as long as nothing sharper is known; True if that is elsewhere than before."""
         by_bands.step(mic, ref)
         found = by_bands.find()
         if found is None or (self._coarse is not None and abs(found - COARSE_MARGIN - self._coarse) <= self.hop):
-            return self._coarse
-        return max(found - COARSE_MARGIN, 0)
+            return False
+        before, self._coarse = self._coarse, max(found - COARSE_MARGIN, 0)
+        return self._coarse != before
 
     def history(self, count: int) -> Samples:
         """The last count aligned samples (count,) float32, the present hop included, as if the present delay had always held."""
-        if not self._known and self._coarse is not None:
+        if self._coarse is not None:
             return self._ref.read(self._ref.end - self._coarse - count, self._ref.end - self._coarse)
         if not self._known or self._refuted:
             return np.zeros(count, np.float32)
@@ -169,7 +171,7 @@ class Aligner:
         """What `Aligned` says of each."""
         if self._expected is not None:
             return "announced"
-        if not self._known and self._coarse is not None:
+        if self._coarse is not None:
             return "coarse" if self._audible() else "idle"
         begun = [utterance.start for utterance in self._open if not utterance.lost]
         if begun and (self._known or self._audible()):
@@ -268,13 +270,13 @@ class Aligner:
         return self._switch(float(AHEAD), 3.0)
 
     def _switch(self, delay: float, deviation: float) -> bool:
-        if not self._known and self._coarse is not None:  # the canceller has learned what arrives behind that lag
+        if self._coarse is not None:  # the canceller has learned what arrives behind that lag
             self._margin = max(round(delay) - self._coarse, PRE_ROLL)
         self._drift.restart(delay, deviation)
         return self._switched()
 
     def _switched(self) -> bool:
-        self._known = True
+        self._known, self._coarse = True, None
         self._counts["realignments"] += 1
         self._lost, self._refuted, self._missed = 0, False, False
         self._witness.forget()
@@ -351,10 +353,11 @@ class Aligner:
 
     def _deliver(self, mic: Samples, before: float, switched: bool) -> Aligned:
         if not self._known:
-            return self._deliver_coarsely(before)
+            delay = float("nan") if self._coarse is None else float(self._coarse + COARSE_MARGIN)
+            return Aligned(self.history(self.hop), delay, 0.0, 0.0, self._state(), switched)
         self._read_at = max(self._drift.delay - self._margin, 0.0)
         end = self._ref.end
-        start = self._read_at - self._drift.slope * self.hop if switched or before != before else before
+        start = self._read_at - self._drift.slope * self.hop if switched else before
         if self._read_at < HALF_WIDTH:
             start = self._read_at = float(round(self._read_at))
         if abs(start - self._read_at) > 0.5:
@@ -366,15 +369,6 @@ class Aligner:
             reference = np.zeros(self.hop, np.float32)
         ppm = -1e6 * self._drift.slope
         return Aligned(reference, self._drift.delay, ppm, self._confidence, self._state(), switched)
-
-    def _deliver_coarsely(self, before: float) -> Aligned:
-        """The reference at the coarse lag, early enough for all that may arrive; nothing where there is none."""
-        if self._coarse is None:
-            return Aligned(np.zeros(self.hop, np.float32), float("nan"), 0.0, 0.0, self._state(), False)
-        self._read_at = float(self._coarse)
-        reference = self._ref.read(self._ref.end - self._coarse - self.hop, self._ref.end - self._coarse)
-        delay = self._read_at + COARSE_MARGIN
-        return Aligned(reference, delay, 0.0, 0.0, self._state(), self._read_at != before)
 
     def _cannot_be(self, mic: Samples) -> bool:
         """Whether the microphone holds 10 dB less than the reference at the old delay would bring there."""

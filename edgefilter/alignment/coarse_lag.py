@@ -83,7 +83,7 @@ class CoarseLag:
         """The lag in samples, None where none is beyond doubt."""
         if self._frames * self._hop < ENOUGH_S * SAMPLE_RATE:
             return None
-        score = self._cross / np.sqrt(self._power * self._heard + np.finfo(np.float64).tiny)
+        score = self._cross / np.sqrt(self._power * self._heard + fourier.TINY)
         at = int(score.argmax())
         elsewhere = max(score[: max(at - SAME, 0)].max(initial=CHANCE), score[at + SAME + 1 :].max(initial=CHANCE))
         return at * self._hop if score[at] ** 2 > CERTAIN * elsewhere else None

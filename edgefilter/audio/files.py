@@ -50,6 +50,14 @@ def open_sink(path: str | Path) -> Sink:
     return PcmSink(open(path, "wb", buffering=0), f"output {path}") if Path(path).is_fifo() else FileSink(path)  # noqa: SIM115
 
 
+def make_folder(folder: Path, purpose: str) -> None:
+    """Make the folder for that purpose if it is not there; raises AudioFileError where it cannot be."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise AudioFileError(f"folder {folder} for {purpose} cannot be made: {error.strerror}; name another") from None
+
+
 class FileSource(Source):
     """A recording and, if there is one, the reference of what the robot said, as blocks of 16 kHz mono.
 

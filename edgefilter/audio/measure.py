@@ -115,7 +115,7 @@ class Channel:
     """What one microphone of an array delivered.
 
     number: of the device's channel. level_db, floor_db, peak_db: of full scale; the floor is the level that it has nine
-    tenths of the time at least. coherence: with the array's first microphone, mean over 200 Hz to 4 kHz, 0 to 1.
+    tenths of the time at least. coherence: with the first microphone that is not silent, mean over 200 Hz to 4 kHz, 0 to 1; 0 of silence.
     """
 
     number: int
@@ -181,15 +181,19 @@ def channels(sound: np.ndarray, numbers: Sequence[int]) -> tuple[Channel, ...]:
     """What each microphone delivered, of sound (n, microphones); numbers: of the device's channels."""
     hop = SAMPLE_RATE // 50
     power = np.square(sound[: len(sound) // hop * hop], dtype=np.float64).reshape(-1, hop, len(numbers)).mean(axis=1)
-    hz, alike = signal.coherence(sound[:, :1], sound, SAMPLE_RATE, nperseg=512, axis=0)
-    inside = (hz >= 200.0) & (hz <= 4000.0)
+    coherence, heard = np.zeros(len(numbers)), np.ptp(sound, axis=0) > 0.0
+    if heard.any():  # of a channel that stands still no coherence can be told
+        first = sound[:, heard.argmax()]
+        hz, alike = signal.coherence(first[:, None], sound[:, heard], SAMPLE_RATE, nperseg=512, axis=0)
+        inside = (hz >= 200.0) & (hz <= 4000.0)
+        coherence[heard] = np.sqrt(alike[inside]).mean(axis=0)
     return tuple(
         Channel(
             number,
             float(decibels(float(power[:, at].mean()))),
             float(decibels(float(np.percentile(power[:, at], 10)))),
             float(decibels(float(np.max(np.square(sound[:, at]), initial=0.0)))),
-            float(np.sqrt(np.nan_to_num(alike[inside, at])).mean()),
+            float(coherence[at]),
         )
         for at, number in enumerate(numbers)
     )

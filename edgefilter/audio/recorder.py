@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from edgefilter.audio.files import FileSink
+from edgefilter.audio.files import FileSink, make_folder
 from edgefilter.errors import AudioFileError
 from edgefilter.types import SAMPLE_RATE, Block, Samples
 
@@ -25,12 +25,7 @@ class Recorder:
     def __init__(self, folder: str | Path, microphones: int = 1) -> None:
         self.folder = Path(folder)
         self.failure: AudioFileError | None = None
-        try:
-            self.folder.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise AudioFileError(
-                f"folder {self.folder} for the recording cannot be made: {error.strerror}; name another"
-            ) from None
+        make_folder(self.folder, "the recording")
         self._files: list[FileSink] = []
         try:
             for name, channels in zip(NAMES, (microphones, 1, 1)):

@@ -28,6 +28,8 @@ PACE = 0.005
 """Error of a device's clock that passes: 3 s of listening tell no less, though the filter follows only far smaller ones."""
 TOO_SOFT_DB = -75.0
 """Level, dB of full scale, under which the gain is too low: the noise of 16 bit, -101 dB, is 26 dB below."""
+SILENT_DB = -120.0
+"""What digital silence is told as, dB of full scale."""
 CLIPPED_DB = -0.1
 """Peak, dB of full scale, over which a microphone counts as clipped: conversion to 16 kHz may lower a clipped peak a little."""
 APART_DB = 12.0
@@ -173,18 +175,20 @@ def _sound(ports: dict[str, InputPort]) -> Iterator[Check]:
 def array_checks(channels: Sequence[Channel]) -> Iterator[Check]:
     """A check for each microphone of an array, beside the others."""
     level = float(np.median([one.level_db for one in channels])) if channels else 0.0
+    silent = [one.peak_db <= SILENT_DB for one in channels]
+    first = silent.index(False) if False in silent else 0
     for at, one in enumerate(channels):
         found = f"{one.level_db:.0f} dB, floor {one.floor_db:.0f} dB, peak {one.peak_db:.0f} dB"
-        found += f", coherence {one.coherence:.2f} with channel {channels[0].number}" if at else ""
+        found += f", coherence {one.coherence:.2f} with channel {channels[first].number}" if at > first else ""
         why = ""
-        if one.peak_db <= -120.0:
+        if silent[at]:
             why = "it is silent"
         elif abs(one.level_db - level) > APART_DB:
             why = "it is of another kind, or has another gain"
-        elif at and one.coherence > SAME:
-            why = f"it is a copy of channel {channels[0].number}"
-        elif at and one.coherence < UNLIKE:
-            why = f"it has nothing in common with channel {channels[0].number}: processed, or what is played?"
+        elif at > first and one.coherence > SAME:
+            why = f"it is a copy of channel {channels[first].number}"
+        elif at > first and one.coherence < UNLIKE:
+            why = f"it has nothing in common with channel {channels[first].number}: processed, or what is played?"
         do = f"leave it out of --mic-channels: {why}" if why else ""
         yield Check(f"channel {one.number}", "warning" if why else "ok", found, do)
 
@@ -294,7 +298,7 @@ def _clock(role: str, trial: Trial) -> Check:
 
 def _level(trial: Trial) -> Check:
     found = f"{trial.level_db:.0f} dB of full scale, peak {trial.peak_db:.0f} dB"
-    if trial.peak_db <= -120.0:
+    if trial.peak_db <= SILENT_DB:
         return Check("level", "warning", "every sample is zero", "unmute the microphone, or name another with --input")
     if trial.level_db < TOO_SOFT_DB:
         return Check("level", "warning", found, "raise the microphone's gain")

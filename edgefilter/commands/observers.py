@@ -13,7 +13,7 @@ from functools import partial
 from pathlib import Path
 from typing import TextIO
 
-from edgefilter.audio.files import FileSink
+from edgefilter.audio.files import FileSink, make_folder
 from edgefilter.audio.protocols import Source
 from edgefilter.audio.recorder import Recorder
 from edgefilter.audio.speech import SpokenReference
@@ -103,12 +103,7 @@ class TurnWriter:
         self.failure: AudioFileError | None = None
         self.written = 0
         self._folder = Path(folder)
-        try:
-            self._folder.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise AudioFileError(
-                f"folder {folder} for the turns cannot be made: {error.strerror}; name another"
-            ) from None
+        make_folder(self._folder, "the turns")
 
     def hear(self, event: Event) -> None:
         """Write the turn that an event brings, if it brings one."""

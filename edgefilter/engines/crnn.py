@@ -119,7 +119,7 @@ class Crnn:
     def step(self, frame: Frame, state: CrnnState) -> tuple[Output, CrnnState]:
         tensors, mask, levels = state
         levels = levels.after(frame)
-        levelled, scale = at_training_level(frame._replace(noise_psd=self._noise * frame.noise_psd), levels.loudest)
+        levelled, scale = at_training_level(frame, levels.loudest, self._noise)
         places = self._run(levelled, tensors)
         human: Spectrum = places.spectrum * np.float32(1.0 / scale)
         if self._ss_helps:
@@ -160,16 +160,17 @@ class Crnn:
         return self._own.places
 
 
-def at_training_level(frame: Frame, loudest: Samples) -> tuple[Frame, np.float32]:
+def at_training_level(frame: Frame, loudest: Samples, noise: np.float32) -> tuple[Frame, np.float32]:
     """The frame with microphone and reference as loud as in training, and the factor on the microphone.
 
-    loudest: (2,) power of the loudest frames of each so far; a channel that was silent stays as it is.
+    loudest: (2,) power of the loudest frames of each so far; a channel that was silent stays as it is. noise: share of
+    its noise that is told.
     """
     mic, reference = (
         np.float32(math.sqrt(usual / most) if most else 1.0) for usual, most in zip(LOUD, loudest, strict=True)
     )
     spectra = mic * frame.mic, reference * frame.reference, mic * frame.echo, mic * frame.error
-    return Frame(*spectra, mic**2 * frame.noise_psd, mic**2 * frame.residual_psd, frame.idle), mic
+    return Frame(*spectra, mic**2 * (noise * frame.noise_psd), mic**2 * frame.residual_psd, frame.idle), mic
 
 
 def _with_what_is_sure(human: Spectrum, frame: Frame) -> Spectrum:

@@ -170,7 +170,7 @@ class Canceller:
         self._expected = np.zeros(shape, np.float32)
         self._padded = np.zeros((*lead, 2 * hop), np.float32)
         self._hops = self._active = 0
-        self.volume = Volume(hop, self._warm, scaled=False)
+        self.volume = Volume(hop, "unscaled" if self._warm else "unknown")
         self.volume.gain = self._initial_gain
         self._limiter = EchoLimiter(hop)
 

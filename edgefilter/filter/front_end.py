@@ -199,12 +199,12 @@ class FrontEnd:
         """
         if self.spatial is None or self.errors is None:
             return
-        power = fourier.power(frame.error) + np.float32(1e-20)
+        power = fourier.power(frame.error)
         if probability is None:
-            gain = np.maximum(1.0 - (frame.noise_psd + frame.residual_psd) / power, 0.0)
+            gain = np.maximum(power - (frame.noise_psd + frame.residual_psd), 0.0) / (power + fourier.TINY)
             probability = float(np.mean(gain))
         else:
-            gain = np.minimum(np.sqrt(fourier.power(output.spectrum) / power), 1.0)
+            gain = np.sqrt(np.minimum(fourier.power(output.spectrum), power) / (power + fourier.TINY))
         self.spatial.learn(self.errors, gain, probability, speaking, frame.idle)
 
     def _added(self, source: SourceChain) -> Samples | None:

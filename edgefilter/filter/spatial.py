@@ -32,7 +32,8 @@ ITERATIONS = 8
 """Of the power method where it has to come to its end at once; hop by hop one is enough, since it goes on where it was."""
 LEFT_OUT = 1e4
 """Noise over the mean that a microphone that is left out is taken to have."""
-TINY = 1e-30
+LEAST = 1e-9
+"""Noise over what was gathered of the human, -90 dB, that is reckoned with at least: none may have been heard yet."""
 
 
 class SpatialFilter:
@@ -64,8 +65,8 @@ class SpatialFilter:
         self._ones = np.eye(microphones, dtype=np.float32)[:, :, None]
         self._prior = np.float32(PRIOR) * diffuse_coherence(stft, microphones)
         self._known_hops = 0 if noise is None else KNOWN_HOPS
-        start = 1e-9 * np.repeat(self._ones, stft.bins, axis=2) if noise is None else noise
-        self._fan = start.astype(np.complex64)
+        shape = microphones, microphones, stft.bins
+        self._fan = np.zeros(shape, np.complex64) if noise is None else noise.astype(np.complex64)
         self._robot, self._robot_known = self._fan.copy(), False
         self._human, self._turn = np.zeros_like(self._fan), np.zeros_like(self._fan)
         self._against = self._fan
@@ -122,7 +123,8 @@ class SpatialFilter:
     def _best(self, gathered: Spectrum, noise: Spectrum, iterations: int = 1) -> Spectrum:
         """Weights for a human and against noise of these covariances; the power method goes on where it was."""
         at = self._reference
-        level = np.einsum("ccf->f", noise).real / len(noise) + np.float32(TINY)
+        mean = [np.einsum("ccf->f", each).real / len(noise) for each in (noise, gathered)]
+        level = np.maximum(mean[0], np.float32(LEAST) * mean[1]) + fourier.TINY
         human = gathered / level + self._prior
         loaded = noise / level + (np.float32(LOADING) + self._without) * self._ones
         found = self._direction
@@ -132,7 +134,7 @@ class SpatialFilter:
         self._direction = found
         cross = np.einsum("df,df->f", human[at], found)
         power = _form(found, human)
-        return found * (np.sqrt(human[at, at].real / power) * cross.conj() / (np.abs(cross) + np.float32(TINY)))
+        return found * (np.sqrt(human[at, at].real / power) * cross.conj() / (np.abs(cross) + fourier.TINY))
 
 
 def diffuse_coherence(stft: StftConfig, microphones: int) -> Samples:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -77,25 +77,33 @@ NOTHING = Moments(0.0, 0.0, 0.0)
 class Volume:
     """Follows the volume of the robot's voice: one factor on the whole echo path, believed only on evidence.
 
-    hop: samples per step. known: whether the path is, or has yet to be learnt. scaled: whether it has the scale of this
-    microphone and this reference; where not, that is found first, hop by hop. gain: product of all factors so far.
-    suspected: a factor is being looked for or tried, the path is better left as it is until then.
+    hop: samples per step. path: "known"; "unknown" where it has yet to be learnt; "unscaled" where it is known but for the
+    scale of this microphone and this reference, which is found first, hop by hop; and "tried" while a factor is. gain:
+    product of all factors so far.
     """
 
-    def __init__(self, hop: int, known: bool = True, scaled: bool = True) -> None:
+    def __init__(self, hop: int, path: Literal["known", "unknown", "unscaled"] = "known") -> None:
         self._forget = 0.1 ** (hop / (FORGET_S * SAMPLE_RATE))
         self._patience = round(PATIENCE_S * SAMPLE_RATE / hop)
-        self._known, self._scaled = known, scaled or not known
+        self._path: Literal["known", "unknown", "unscaled", "tried"] = path
         self._peak = 0.0
         self._smoothed = self._since = self._lasting = NOTHING
-        self._enough, self._audible = round(ENOUGH_S * SAMPLE_RATE / hop), 0
-        self.suspected, self._factor, self._count, self._age, self._rest = not self._scaled, 1.0, 0, 0, 0
+        self._wanted = round(ENOUGH_S * SAMPLE_RATE / hop)
+        self._factor, self._count, self._age, self._rest = 1.0, 0, 0, 0
         self.gain = self._first = 1.0
 
     @property
+    def suspected(self) -> bool:
+        """Whether a factor is being looked for or tried: the path is better left as it is until then."""
+        return self._path in ("unscaled", "tried")
+
+    @property
     def removed_db(self) -> float | None:
-        """How far the subtraction has lowered the microphone over the last FORGET_S of robot; None before ENOUGH_S of it."""
-        if self._audible < self._enough or not self._lasting.mic:
+        """How far the subtraction has lowered the microphone over the last FORGET_S of robot; None before ENOUGH_S of it.
+
+        Hops in which a factor is looked for do not count: the echo is too loud or too soft in them by any factor.
+        """
+        if self._wanted > 0 or not self._lasting.mic:
             return None
         return -10.0 * math.log10(max(self._lasting.left() / self._lasting.mic, LEAST_LEFT))
 
@@ -105,19 +113,20 @@ class Volume:
         self._peak = max(now.echo, self._forget * self._peak)
         self._smoothed = self._smoothed.smoothed(now)
         audible = now.echo > AUDIBLE * self._peak
-        if audible:
+        if audible and not self.suspected:
             self._lasting = Moments(*(self._forget * before for before in self._lasting)).plus(now)
-            self._audible += 1
-        if not self._known:
-            self._known = audible and self._smoothed.mic > MOST * self._smoothed.left()
-        elif not self._scaled:
+            self._wanted -= 1
+        if self._path == "unknown":
+            if audible and self._smoothed.mic > MOST * self._smoothed.left():
+                self._path = "known"
+        elif self._path == "unscaled":
             return self._scale(now) if audible and now.mic else 1.0
-        elif self.suspected:
+        elif self._path == "tried":
             return self._confirm(now, audible)
         elif self._rest:
             self._rest -= 1
         elif self._suspicious(self._smoothed):
-            self.suspected, self._since = True, NOTHING
+            self._path, self._since = "tried", NOTHING
         return 1.0
 
     def _scale(self, now: Moments) -> float:
@@ -134,7 +143,7 @@ class Volume:
             return 1.0
         factor = since.cross / since.echo
         factor = self._turn(factor) if agree and since.left() > EXCESS * since.left(factor) else 1.0
-        self._scaled, self._first = True, self.gain
+        self._first = self.gain
         self._drop()
         return factor
 
@@ -173,7 +182,7 @@ class Volume:
         return min(max(factor, 1.0 / (MOST * turned)), MOST / turned)
 
     def _drop(self) -> None:
-        self.suspected, self._count, self._age, self._smoothed = False, 0, 0, NOTHING
+        self._path, self._count, self._age, self._smoothed = "known", 0, 0, NOTHING
 
 
 class EchoLimiter:

@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
-from typing import Any
+from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
 from edgefilter.dsp.frames import decibels
 from edgefilter.dsp.psd import GRID_BINS, total_power
-from edgefilter.errors import ProfileError
-from edgefilter.profile.file import REMEDY
+from edgefilter.profile.file import ProfilePart, described
 from edgefilter.types import Array, Samples
 
-PREFIX = "approximation_"
-"""Before the names of its arrays in a profile's file."""
 STEEPEST = 2.0
 """dB by which a distortion grows over the voice for each dB of the voice: that of a cubic law; a square one has 1."""
 CLEARLY_DB = 3.0
@@ -22,7 +19,7 @@ CLEARLY_DB = 3.0
 
 
 @dataclass(frozen=True, eq=False)
-class LinearApproximation:
+class LinearApproximation(ProfilePart):
     """The best linear approximation of the robot at each of L levels, from multisines.
 
     The best linear approximation is the linear path that leaves the least power of sounds of this spectrum and level;
@@ -47,6 +44,8 @@ class LinearApproximation:
         Where an array has another shape or type, is not finite or out of range.
     """
 
+    PREFIX: ClassVar[str] = "approximation_"
+
     level_db: Array
     played: Samples
     linear: Samples
@@ -58,37 +57,18 @@ class LinearApproximation:
     def __post_init__(self) -> None:
         levels = np.asarray(self.level_db)
         if levels.dtype != np.float64 or levels.ndim != 1 or not levels.size:
-            _fail("level_db", f"{levels.dtype} of shape {levels.shape}", "float64 of one level or more")
+            self._refuse("level_db", described(levels), "float64 of one level or more")
         if not (np.all(np.abs(levels) <= 300.0) and np.all(np.diff(levels) > 0.0)):
-            _fail("level_db", levels.tolist(), "rising levels of -300 to 300 dB")
+            self._refuse("level_db", levels.tolist(), "rising levels of -300 to 300 dB")
         least = np.asarray(self.least_db)
         if least.dtype != np.float64 or least.shape != levels.shape or not np.all(np.abs(least) <= 300.0):
-            _fail("least_db", f"{least.dtype} {least.tolist()}", f"{levels.size} float64 of -300 to 300 dB")
+            self._refuse("least_db", f"{least.dtype} {least.tolist()}", f"{levels.size} float64 of -300 to 300 dB")
         for name in ("played", "linear", "noise", "even", "odd"):
             density = np.asarray(getattr(self, name))
             if density.shape != (levels.size, GRID_BINS) or density.dtype != np.float32:
-                _fail(
-                    name, f"{density.dtype} of shape {density.shape}", f"float32 of shape ({levels.size}, {GRID_BINS})"
-                )
+                self._refuse(name, described(density), f"float32 of shape ({levels.size}, {GRID_BINS})")
             if not np.all(np.abs(density) <= 1e6):
-                _fail(name, f"{density.min():g} to {density.max():g}", "-1e6 to 1e6 everywhere")
-
-    def arrays(self) -> dict[str, np.ndarray]:
-        """Its arrays by their names in a profile's file."""
-        return {PREFIX + field.name: np.asarray(getattr(self, field.name)) for field in fields(self)}
-
-    @classmethod
-    def taken_from(cls, arrays: dict[str, Any]) -> LinearApproximation | None:
-        """Of the arrays of a profile's file those that are its own, which are taken out; None where there are none.
-
-        Raises ProfileError where some are there and others are not.
-        """
-        names = [field.name for field in fields(cls)]
-        found = {name: arrays.pop(PREFIX + name) for name in names if PREFIX + name in arrays}
-        if found and len(found) < len(names):
-            missing = ", ".join(PREFIX + name for name in names if name not in found)
-            raise ProfileError(f"array fields missing: {missing}; {REMEDY}")
-        return cls(**found) if found else None
+                self._refuse(name, f"{density.min():g} to {density.max():g}", "-1e6 to 1e6 everywhere")
 
     @property
     def gain(self) -> Samples:
@@ -134,7 +114,3 @@ class LinearApproximation:
         at = decibels(power, 1e-20)
         beyond = np.maximum(at - level[-1], 0.0) + np.minimum(at - level[0], 0.0)
         return power * np.clip(10 ** ((np.interp(at, level, share) + slope * beyond) / 10), 0.0, 1.0)
-
-
-def _fail(name: str, found: object, expected: str) -> None:
-    raise ProfileError(f"{PREFIX}{name} is {str(found)[:80]}, expected {expected}; {REMEDY}")

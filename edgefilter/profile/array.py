@@ -2,23 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
-from typing import Any
+from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
 from edgefilter.dsp.psd import GRID_BINS, GRID_FFT
 from edgefilter.dsp.stft import StftConfig
 from edgefilter.errors import ProfileError
-from edgefilter.profile.file import REMEDY
+from edgefilter.profile.file import REMEDY, ProfilePart, described
 from edgefilter.types import MOST_MICROPHONES, SAMPLE_RATE, Samples, Spectrum
-
-PREFIX = "array_"
-"""Before the names of its arrays in a profile's file."""
 
 
 @dataclass(frozen=True, eq=False)
-class ArrayCalibration:
+class ArrayCalibration(ProfilePart):
     """Echo paths of the further microphones, and the noise of all as cross-spectral densities.
 
     Parameters
@@ -36,37 +33,22 @@ class ArrayCalibration:
         Where an array has another shape or type, is not finite or out of range.
     """
 
+    PREFIX: ClassVar[str] = "array_"
+
     responses: Samples
     noise: Samples
 
     def __post_init__(self) -> None:
         responses, noise = np.asarray(self.responses), np.asarray(self.noise)
         if responses.dtype != np.float32 or responses.ndim != 2 or not 1 <= len(responses) < MOST_MICROPHONES:
-            _fail("responses", responses, f"float32 of shape (1 to {MOST_MICROPHONES - 1}, taps)")
+            self._refuse("responses", described(responses), f"float32 of shape (1 to {MOST_MICROPHONES - 1}, taps)")
         if not np.all(np.abs(responses) <= 1e3):
-            raise ProfileError(f"{PREFIX}responses is not within -1000 to 1000 everywhere; {REMEDY}")
+            raise ProfileError(f"{self.PREFIX}responses is not within -1000 to 1000 everywhere; {REMEDY}")
         count = len(responses) + 1
         if noise.dtype != np.float32 or noise.shape != (GRID_BINS, count, count, 2):
-            _fail("noise", noise, f"float32 of shape ({GRID_BINS}, {count}, {count}, 2)")
+            self._refuse("noise", described(noise), f"float32 of shape ({GRID_BINS}, {count}, {count}, 2)")
         if not np.all(np.abs(noise) <= 1.0):
-            raise ProfileError(f"{PREFIX}noise is not within -1 to 1 everywhere; {REMEDY}")
-
-    def arrays(self) -> dict[str, np.ndarray]:
-        """Its arrays by their names in a profile's file."""
-        return {PREFIX + field.name: np.asarray(getattr(self, field.name)) for field in fields(self)}
-
-    @classmethod
-    def taken_from(cls, arrays: dict[str, Any]) -> ArrayCalibration | None:
-        """Of the arrays of a profile's file those that are its own, which are taken out; None where there are none.
-
-        Raises ProfileError where some are there and others are not.
-        """
-        names = [field.name for field in fields(cls)]
-        found = {name: arrays.pop(PREFIX + name) for name in names if PREFIX + name in arrays}
-        if found and len(found) < len(names):
-            missing = ", ".join(PREFIX + name for name in names if name not in found)
-            raise ProfileError(f"array fields missing: {missing}; {REMEDY}")
-        return cls(**found) if found else None
+            raise ProfileError(f"{self.PREFIX}noise is not within -1 to 1 everywhere; {REMEDY}")
 
     def noise_covariance(self, stft: StftConfig) -> Spectrum:
         """Expected X_i conj(X_j) of the fan in one frame of stft, (microphones, microphones, bins) complex64."""
@@ -77,7 +59,3 @@ class ArrayCalibration:
         found = (1.0 - share) * density[low] + share * density[low + 1]
         scale = 0.5 * SAMPLE_RATE * stft.noise_gain()
         return np.ascontiguousarray(found.transpose(1, 2, 0) * scale, np.complex64)
-
-
-def _fail(name: str, found: np.ndarray, expected: str) -> None:
-    raise ProfileError(f"{PREFIX}{name} is {found.dtype} of shape {found.shape}, expected {expected}; {REMEDY}")

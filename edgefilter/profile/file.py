@@ -11,8 +11,9 @@ import secrets
 import warnings
 import zipfile
 from collections.abc import Mapping
+from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 
@@ -24,6 +25,42 @@ MAX_MEMBERS = 256
 REMEDY = "give a profile written by 'edgefilter calibrate', or calibrate again"
 
 Effects = tuple[tuple[str, Mapping[str, Any]], ...]
+Part = TypeVar("Part", bound="ProfilePart")
+
+
+@dataclass(frozen=True, eq=False)
+class ProfilePart:
+    """What a profile may hold beside the rest: its fields are arrays, in the file all of them or none.
+
+    PREFIX: before the names of its arrays in a profile's file.
+    """
+
+    PREFIX: ClassVar[str]
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """Its arrays by their names in a profile's file."""
+        return {self.PREFIX + field.name: np.asarray(getattr(self, field.name)) for field in fields(self)}
+
+    @classmethod
+    def taken_from(cls: type[Part], arrays: dict[str, Any]) -> Part | None:
+        """Of the arrays of a profile's file those that are its own, which are taken out; None where there are none.
+
+        Raises ProfileError where some are there and others are not.
+        """
+        names = [field.name for field in fields(cls)]
+        found = {name: arrays.pop(cls.PREFIX + name) for name in names if cls.PREFIX + name in arrays}
+        if found and len(found) < len(names):
+            missing = ", ".join(cls.PREFIX + name for name in names if name not in found)
+            raise ProfileError(f"array fields missing: {missing}; {REMEDY}")
+        return cls(**found) if found else None
+
+    def _refuse(self, name: str, found: object, expected: str) -> None:
+        raise ProfileError(f"{self.PREFIX}{name} is {str(found)[:80]}, expected {expected}; {REMEDY}")
+
+
+def described(array: np.ndarray) -> str:
+    """Its type and shape."""
+    return f"{array.dtype} of shape {array.shape}"
 
 
 def write_fields(path: Path, arrays: Mapping[str, np.ndarray], header: Mapping[str, Any], effects: Effects) -> None:

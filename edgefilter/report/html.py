@@ -162,9 +162,14 @@ def _page(
 
 def _template(name: str = "page.html") -> jinja2.Template:
     """A page; what is put into it is text, escaped unless the page calls it safe, and all of it has to be there."""
-    page = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined, keep_trailing_newline=True)
+    page = jinja2.Environment(
+        loader=jinja2.FunctionLoader(_asset),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        keep_trailing_newline=True,
+    )
     page.policies["json.dumps_kwargs"] = {"allow_nan": False, "separators": (",", ":")}
-    return page.from_string(_asset(name))
+    return page.get_template(name)
 
 
 def _data(

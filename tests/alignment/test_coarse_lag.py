@@ -9,7 +9,7 @@ import pytest
 import soundfile
 
 import edgefilter
-from edgefilter.alignment.aligner import Aligner
+from edgefilter.alignment.aligner import COARSE_MARGIN, Aligner
 from edgefilter.alignment.coarse_lag import CoarseLag
 from edgefilter.engines.linear import Linear
 from edgefilter.filter.canceller import Canceller
@@ -56,6 +56,16 @@ def test_of_a_reference_that_is_played_unheard_no_lag_is_believed():
         assert coarse.find() is None
 
 
+def test_where_the_range_has_no_wrong_lags_chance_is_no_lag_either():
+    """Seven lags are all beside one another: what wrong ones would have is known without them."""
+    rng = np.random.default_rng(0)
+    mic, ref = (rng.standard_normal(6 * 16_000).astype(np.float32) for _ in range(2))
+    coarse = CoarseLag(HOP, 6 * HOP)
+    for pair in zip(hops(mic), hops(ref), strict=True):
+        coarse.step(*pair)
+        assert coarse.find() is None
+
+
 def test_silence_on_either_side_says_nothing():
     coarse, x = CoarseLag(HOP, 8_000), robot_speech(2.0)
     for hop in hops(x):
@@ -92,3 +102,17 @@ def test_the_state_says_that_the_lag_is_coarse_and_a_sharp_arrival_ends_it():
     sharp[:3_000] = 0.0
     states = [aligner.step(*pair).state for pair in zip(hops(sharp), hops(x), strict=True)]
     assert states[-1] == "locked"
+
+
+def test_after_a_coarse_lag_a_sharp_arrival_is_told_and_the_reference_is_read_where_it_was():
+    """The canceller's taps hold what arrives behind the coarse lag: read elsewhere, they would have to be learned anew."""
+    voice = robot_speech(6.0)
+    x, sharp = np.concatenate((voice, voice)), np.roll(np.concatenate((voice, voice)), 5_000)
+    mic = heard(x, diffuse(200, 5), 3_600, -30, 3)
+    mic[voice.size :] = sharp[voice.size :] * np.std(mic) / np.std(sharp)
+    aligner = Aligner(HOP)
+    found = [aligner.step(*pair) for pair in zip(hops(mic), hops(x), strict=True)]
+    coarse = round([one.delay for one in found if one.state == "coarse"][-1]) - COARSE_MARGIN
+    assert "locked" in {one.state for one in found[-200:]} and abs(found[-1].delay - 5_000) < 2
+    late, end = np.concatenate([one.reference for one in found[-90:]]), len(found) * HOP
+    np.testing.assert_allclose(late, x[end - late.size - coarse : end - coarse], atol=0.05 * np.abs(late).max())

@@ -147,3 +147,45 @@ def test_a_robot_that_is_not_seen_for_a_moment_is_lost_not_begun():
     assert all(
         abs(a.delay - hops[hidden.start // 256].delay) < 1.0 for a in hops[hidden.start // 256 : 5 * RATE // 256]
     )
+
+
+def test_a_robot_that_is_hidden_is_lost_after_three_looks_two_hops_apart():
+    rng = np.random.default_rng(32)
+    ref, _ = utterances(rng, [8], [1])
+    mic, _ = hear(ref, [(0, 4000)], room(rng, 0.3))
+    hidden = slice(4 * RATE, 6 * RATE)
+    mic[hidden] = np.std(mic[2 * RATE : 4 * RATE]) * rng.standard_normal(2 * RATE).astype(np.float32)
+    hops = run(Aligner(256), mic + fan(rng, mic.size), ref)
+    first = hidden.start // 256
+    lost = [a.state for a in hops].index("lost")
+    confidence = np.array([a.confidence for a in hops[first : lost + 1]])
+    missed = np.flatnonzero(np.isclose(confidence[1:], 0.9 * confidence[:-1], rtol=1e-9))
+    assert len(missed) == 3 and np.all(np.diff(missed) == 2) and first + 1 + missed[-1] == lost
+
+
+def after_a_pause(jump: float, slope: float) -> list[float]:
+    """What is believed of the clocks, ppm, look by look after 2 s unseen in which the delay has moved by jump samples."""
+    rng, aligner, truth = np.random.default_rng(2), Aligner(256), 1000.0
+    aligner._switch(truth, 3.0)
+    found = []
+    for at in range(184):
+        if at == 160:
+            aligner._drift.advance(2 * RATE)
+            truth += jump
+        aligner._drift.advance(STRIDE)
+        truth += slope * STRIDE if at >= 160 else 0.0
+        seen = truth + 0.05 * rng.standard_normal()
+        aligner._judge(look(seen - aligner._drift.delay, 45.0, 0.5))
+        found.append(aligner.stats()["ppm"])
+    assert aligner.stats()["jumps"] == 1
+    return found[160:]
+
+
+def test_a_small_jump_after_a_pause_may_be_the_clocks_which_are_then_followed_at_once():
+    ppm = after_a_pause(4.0, 125e-6)
+    assert np.abs(np.array(ppm[6:]) + 125.0).max() < 20.0  # half a second later
+
+
+def test_a_large_jump_after_a_pause_is_a_buffer_and_says_nothing_of_the_clocks():
+    ppm = after_a_pause(12.0, 0.0)
+    assert np.abs(ppm).max() < 3.0  # what jitter allows

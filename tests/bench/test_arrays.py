@@ -11,7 +11,7 @@ import soundfile as sf
 from bench import recordings, systems
 from bench.recordings import NotHere
 from bench.simulate import arrays
-from bench.simulate.conversations import read_clips, read_voices
+from bench.simulate.conversations import read_clips, read_voices, write_item
 from edgefilter.dsp.metrics import si_sdr
 
 RATE = 16000
@@ -39,7 +39,7 @@ def made(clips: Path, covariances: tuple, tmp_path_factory: pytest.TempPathFacto
     speech, voices = read_clips(clips, (0.5, 8.0)), read_voices([clips])
     signals, meta = arrays.make(1, 0, "paper", "lab", speech, voices, covariances, microphones=3, turns=1, moving=True)
     folder = tmp_path_factory.mktemp("arrays")
-    arrays.write(folder / "lab_00", signals, meta)
+    write_item(folder / "lab_00", signals, "meta", meta)
     return folder, signals, meta
 
 
@@ -104,7 +104,7 @@ def test_rows_with_several_microphones_run_where_there_are_so_many(made: tuple, 
 def test_each_turn_is_a_clip_of_its_own(tmp_path: Path, made: tuple) -> None:
     _, signals, meta = made
     later = meta["turns"][0] | {"start": meta["start"] + 100, "text": "another"}
-    arrays.write(tmp_path / "lab_00", signals, meta | {"turns": [*meta["turns"], later]})
+    write_item(tmp_path / "lab_00", signals, "meta", meta | {"turns": [*meta["turns"], later]})
     first, second = recordings.conversation_clips(tmp_path)
     assert (first.room, second.room) == ("lab, first turn", "lab, later turn")
     assert second.text == "another" and second.span.start == first.span.start + 100 and first.name != second.name

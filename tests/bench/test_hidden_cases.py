@@ -13,7 +13,7 @@ import soundfile as sf
 from scipy import signal
 
 from bench.simulate import hidden_cases, hidden_effects, hidden_robot
-from bench.simulate.conversations import Clip
+from bench.simulate.conversations import Clip, write_item
 from bench.simulate.hidden_effects import CATALOGUE, CODECS, ENR_DB, OUTSIDE, RANGES, incoherent_db, through_codec
 from bench.simulate.hidden_robot import Chain, Scene
 
@@ -214,7 +214,7 @@ def test_a_case_repeats_and_its_files_are_what_it_says(
     signals, truth = hidden_cases.make_case(9, 2, "singles", voices)
     again, _ = hidden_cases.make_case(9, 2, "singles", voices)
     np.testing.assert_array_equal(signals["mic"], again["mic"])
-    hidden_cases.write_case(tmp_path / "case", signals, truth)
+    write_item(tmp_path / "case", signals, "truth", truth)
     read = json.loads((tmp_path / "case" / "truth.json").read_text())
     assert read["effects"] == ["playback_gain"] and read["strength"] == "clear" and read["seed"] == [9, 2]
     assert abs(read["tolerances"]["offset_samples"]) <= 60 and abs(read["tolerances"]["fan_db"]) <= 0.4

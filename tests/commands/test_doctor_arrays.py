@@ -44,5 +44,21 @@ def test_a_channel_that_is_no_microphone_of_the_array_is_to_be_left_out(sound: n
     assert states[1].do.startswith("leave it out of --mic-channels") and why in states[1].do
 
 
+@pytest.mark.parametrize("silent", [0, 1])
+def test_a_silent_channel_is_divided_by_nowhere_and_no_other_one_is_blamed(sound: np.ndarray, silent: int) -> None:
+    sound[:, silent] = 0.0
+    with np.errstate(all="raise"):
+        found = channels(sound, [1, 2, 4])
+    states = list(array_checks(found))
+    assert [check.state for check in states] == ["warning" if at == silent else "ok" for at in range(3)]
+    assert "it is silent" in states[silent].do and found[silent].coherence == 0.0
+
+
+def test_an_array_that_is_all_silent_is_listed_as_such(sound: np.ndarray) -> None:
+    with np.errstate(all="raise"):
+        states = list(array_checks(channels(0.0 * sound, [1, 2, 4])))
+    assert all("it is silent" in check.do for check in states)
+
+
 def test_one_microphone_has_no_list() -> None:
     assert list(array_checks(())) == []

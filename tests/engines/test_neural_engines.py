@@ -55,7 +55,7 @@ def test_crnn_answers_what_onnxruntime_answers_for_the_same_frames():
         noise, residual = rng.random((2, engine.stft.bins)).astype(np.float32)
         heard = Frame(mic=mic, reference=reference, echo=echo, error=error, noise_psd=noise, residual_psd=residual)
         output, state = engine.step(heard, state)
-        levelled, scale = at_training_level(heard._replace(noise_psd=TRACKED_NOISE * noise), state[2].loudest)
+        levelled, scale = at_training_level(heard, state[2].loudest, TRACKED_NOISE)
         spectra = levelled.error, levelled.mic, levelled.reference, levelled.echo
         pairs = [np.stack((x.real, x.imag), axis=-1)[None] for x in spectra]
         powers = [levelled.noise_psd[None], levelled.residual_psd[None]]
@@ -65,6 +65,19 @@ def test_crnn_answers_what_onnxruntime_answers_for_the_same_frames():
         np.testing.assert_array_equal(output.spectrum, np.float32(1 / scale) * (found[0, :, 0] + 1j * found[0, :, 1]))
         assert output.speech_probability == probability[0] and 0 < probability[0] < 1
     assert any(tensor.any() for tensor in state[0])
+
+
+@pytest.mark.parametrize(("added", "told"), [(2.0, 1.0), (-2.0, 0.0)])
+def test_a_model_that_answers_a_probability_beyond_0_to_1_is_held_to_them(tmp_path, added, told):
+    model = onnx.load(EDGE)
+    for node in model.graph.node:
+        node.output[:] = ["raw" if name == "speech_probability" else name for name in node.output]
+    model.graph.initializer.append(onnx.numpy_helper.from_array(np.array([added], np.float32), "added"))
+    model.graph.node.append(onnx.helper.make_node("Add", ["raw", "added"], ["speech_probability"]))
+    onnx.save(model, tmp_path / "beyond.onnx")
+    engine, rng = Crnn(tmp_path / "beyond.onnx"), np.random.default_rng(2)
+    heard = Frame(*(spectrum(rng, 257) for _ in range(4)), *rng.random((2, 257)).astype(np.float32))
+    assert engine.step(heard, engine.initial_state())[0].speech_probability == told
 
 
 def test_of_a_calibrated_robot_ss_has_its_share_of_the_answer():

@@ -277,3 +277,15 @@ def test_bad_sizes_and_paths_are_refused() -> None:
         Canceller(0)
     with pytest.raises(SignalError, match="finite"):
         Canceller(impulse_response=np.full(64, np.nan, np.float32))
+
+
+def test_a_path_that_was_unknown_is_sure_of_itself_later_and_follows_noise_less() -> None:
+    """As uncertain for ever as at the start, it would stay 21 dB from the path."""
+    rng = np.random.default_rng(0)
+    reference = (0.1 * rng.standard_normal(96_000)).astype(np.float32)
+    true = np.random.default_rng(1).standard_normal(600) * np.exp(-np.arange(600) / 120)
+    mic = np.convolve(reference, true)[: reference.size]
+    mic += 0.3 * np.std(mic) * rng.standard_normal(mic.size)
+    canceller = Canceller(256, 1024)
+    run(canceller, mic.astype(np.float32), reference)
+    assert np.sum((canceller.impulse_response()[:600] - true) ** 2) < 10**-2.3 * np.sum(true**2)

@@ -120,3 +120,11 @@ def test_a_microphone_that_is_processed_is_said_and_a_good_one_is_not(robot):
     wrong = [event for event in events(ego, processed, ref) if event.kind in SET_UP_WRONG]
     assert [event.kind for event in wrong] == ["echo_unpredicted"] and "switch off" in wrong[0].detail
     assert ego.stats()["linear_stage"]["removed_db"] < 4.0
+
+
+def test_a_profile_of_another_scale_is_no_microphone_that_is_processed(robot):
+    """80 dB louder than the microphone until the first words have told the scale, the echo seemed to be unpredicted."""
+    mic, ref = robot
+    ego = EgoFilter(DEMO / "profile.npz", "linear")
+    assert not [event for event in events(ego, 0.01 * mic, 100 * ref) if event.kind in SET_UP_WRONG]
+    assert ego.stats()["linear_stage"]["removed_db"] > 20.0

@@ -195,3 +195,36 @@ def test_a_human_who_is_suddenly_elsewhere_loses_little_and_is_found_within_half
                     lost.append(-10 * np.log10(np.mean(np.abs(spatial.step(human[None])[0][6:250]) ** 2)))
     at_once, later = np.mean(np.reshape(lost, (4, 2)), axis=0)
     assert at_once < 2.0 and later < 1.0
+
+
+@pytest.mark.parametrize("scale", [1e-6, 1e-3, 1e3])
+@pytest.mark.parametrize("human_first", [False, True])
+def test_the_level_of_an_array_that_is_not_calibrated_means_nothing(scale: float, human_first: bool) -> None:
+    def learned(scale: float) -> np.ndarray:
+        rng, spatial = np.random.default_rng(8), SpatialFilter(STFT, 3)
+        human, gain = plane_wave(np.array([0.6, 0.64, 0.48])), np.ones(STFT.bins, np.float32)
+        for hop in range(60):
+            speaks = (hop < 30) == human_first
+            error = 0.05 * complex_noise(rng, 3, STFT.bins) + speaks * human * complex_noise(rng, STFT.bins)
+            spatial.learn(np.complex64(scale) * error, gain, 0.9 if speaks else 0.1, speaks, True)
+        return spatial.weights
+
+    usual = learned(1.0)
+    assert np.isfinite(usual).all()
+    np.testing.assert_allclose(learned(scale), usual, atol=1e-2 * np.abs(usual).max())
+
+
+def test_the_weights_of_a_finished_turn_know_nothing_of_the_turn_before() -> None:
+    gain, noise = np.ones(STFT.bins, np.float32), fan_below()
+    talkers = [plane_wave(np.array(direction)) for direction in ((1.0, 0.0, 0.0), (-0.5, 0.6, 0.62))]
+
+    def finished(turns: list) -> np.ndarray:
+        rng, spatial = np.random.default_rng(9), SpatialFilter(STFT, 3, noise)
+        for talker in turns:
+            for _ in range(60):
+                spatial.learn((talker * rng.standard_normal(STFT.bins)).astype(np.complex64), gain, 0.9, True, True)
+            spatial.learn(np.zeros((3, STFT.bins), np.complex64), gain, 0.4, False, True)
+        return spatial.finished()
+
+    alone, after = finished(talkers[1:]), finished(talkers)
+    assert np.abs(after - alone).max() < 0.15 * np.abs(alone).max()

@@ -69,8 +69,8 @@ def test_an_echo_that_stays_too_loud_for_half_a_second_is_put_down_to_another_pa
     assert 0.45 < first * HOP / 16000 < 0.55 and 2 <= sum(changed) <= 4
 
 
-def factor_after(mic: np.ndarray, echo: np.ndarray, known: bool = True) -> float:
-    volume = Volume(HOP, known)
+def factor_after(mic: np.ndarray, echo: np.ndarray, path: str = "known") -> float:
+    volume = Volume(HOP, path)
     for m, e in zip(mic, echo, strict=True):
         volume.follow(m, np.float32(volume.gain) * e)
     return volume.gain
@@ -106,6 +106,82 @@ def test_a_microphone_that_does_not_hear_the_echo_turns_no_volume(scale: float) 
 
 def test_the_volume_of_a_path_that_is_unknown_yet_means_nothing() -> None:
     echo = hops(0.5, 0)
-    assert factor_after(2.0 * echo, echo, known=False) == 1.0
+    assert factor_after(2.0 * echo, echo, path="unknown") == 1.0
     learned = np.concatenate((echo, 2.0 * echo))
-    assert factor_after(learned, np.concatenate((echo, echo)), known=False) == pytest.approx(2.0, rel=0.01)
+    assert factor_after(learned, np.concatenate((echo, echo)), path="unknown") == pytest.approx(2.0, rel=0.01)
+
+
+def turns(mic: np.ndarray, echo: np.ndarray, path: str = "known") -> tuple[Volume, list[int], list[int]]:
+    """What has followed them, in which hops it turned, and after which ones it was looking for a factor or trying one."""
+    volume, turned, suspected = Volume(HOP, path), [], []
+    for at, (m, e) in enumerate(zip(mic, echo, strict=True)):
+        if volume.follow(m, np.float32(volume.gain) * e) != 1.0:
+            turned.append(at)
+        if volume.suspected:
+            suspected.append(at)
+    return volume, turned, suspected
+
+
+def test_after_a_click_of_the_robot_the_volume_is_followed_once_its_peak_has_faded() -> None:
+    echo = hops(8.0, 0)
+    echo[5] *= 10 ** (25 / 20)  # audible is what lies within 20 dB, and 5 dB fade in 5 s
+    late = len(echo) * 3 // 4
+    mic = np.concatenate((echo[:late], 3.0 * echo[late:]))
+    assert factor_after(mic, echo) == pytest.approx(3.0, rel=0.01)
+
+
+def test_an_echo_of_unknown_scale_is_never_louder_than_the_microphone_and_right_after_six_hops_more() -> None:
+    echo = hops(0.5, 0)
+    volume, turned, suspected = turns(1e-4 * echo, echo, "unscaled")
+    assert turned[0] == 0 and suspected == list(range(6)) and volume.gain == pytest.approx(1e-4, rel=1e-3)
+
+
+def test_a_path_that_does_not_agree_keeps_the_scale_of_the_microphone_and_is_left_to_the_adaptation() -> None:
+    volume, turned, suspected = turns(0.5 * hops(0.5, 1), hops(0.5, 0), "unscaled")
+    assert volume.gain == pytest.approx(0.5, rel=0.1)
+    assert turned[-1] < 6 and suspected[-1] - turned[-1] <= 11  # twice the hops that prove a factor
+
+
+def test_a_scale_that_is_right_but_for_noise_is_not_touched() -> None:
+    assert factor_after(0.9 * hops(0.5, 0) + 0.5 * hops(0.5, 1), hops(0.5, 0), "unscaled") == 1.0
+
+
+def test_a_volume_is_bounded_by_the_scale_that_was_found_first() -> None:
+    echo = hops(0.5, 0)
+    mic = np.concatenate((30.0 * echo, 240.0 * echo))
+    assert factor_after(mic, np.concatenate((echo, echo)), "unscaled") == pytest.approx(240.0, rel=0.01)
+
+
+def test_a_volume_that_wavers_is_turned_at_most_every_half_second() -> None:
+    echo = hops(2.0, 0)
+    mic = echo * np.where(np.arange(len(echo)) // 12 % 2, 3.0, 1.0).astype(np.float32)[:, None]
+    _, turned, _ = turns(mic, echo)
+    assert len(turned) >= 2 and np.diff(turned).min() > 31
+
+
+def test_a_suspicion_that_silence_leaves_open_is_dropped() -> None:
+    echo = hops(1.0, 0)
+    echo[13:] = 0.0
+    volume, turned, suspected = turns(np.concatenate((echo[:10], 2.0 * echo[10:])), echo)
+    assert not turned and 25 < len(suspected) < 35 and volume.gain == 1.0
+
+
+def test_a_suspicion_that_the_next_hops_do_not_share_turns_nothing() -> None:
+    echo, other = hops(0.3, 0), hops(0.3, 1)
+    mic = 0.1 * np.concatenate((echo[:2], other[2:]))
+    volume, turned, suspected = turns(mic, echo)
+    assert suspected and not turned and volume.gain == 1.0
+
+
+def test_an_echo_that_fits_again_is_let_through_at_once() -> None:
+    echo = hops(0.5, 0)
+    mic = np.concatenate((0.02 * hops(0.5, 1)[:10], 0.7 * echo[10:]))
+    out, _ = limited(mic, echo)
+    assert np.array_equal(out[10:, 64:], echo[10:, 64:])
+
+
+def test_another_path_is_noticed_though_now_and_then_a_hop_fits() -> None:
+    echo = hops(2.0, 0)
+    mic = np.where(np.arange(len(echo))[:, None] % 4 == 3, echo, 0.1 * hops(2.0, 1))
+    _, changed = limited(mic, echo)
+    assert any(changed[:70])
