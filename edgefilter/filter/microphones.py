@@ -48,6 +48,8 @@ class Microphones:
         self.left_out: dict[int, str] = {}
         self._paths = None if paths is None else paths[:, :CALIBRATED_TAPS]
         self._exchanged: dict[int, str] = {}
+        self._played: set[int] = set()
+        self._asked: set[int] = set()
         self._hops = round(BLOCK_S * SAMPLE_RATE / hop)
         self._good = [GOOD_BLOCKS] * count
         self._block = [np.zeros((rows, self._hops * hop), np.float32) for rows in (count, 2)]
@@ -123,11 +125,10 @@ class Microphones:
 
     def _reasons(self, power: Array) -> dict[int, str]:
         """Why microphones of that power in the latest block should be left out."""
-        reasons = self._levels(power, set())
-        if reasons or self.left_out:
-            played = {at for at in range(self.count) if played_in(self._block[0][at], self._block[1][0])}
-            if played and len(played) < self.count:
-                reasons = dict.fromkeys(played, "what is played, not a microphone") | self._levels(power, played)
+        reasons = self._levels(power)
+        if self._find_played(power, {*reasons, *self.left_out}):
+            reasons = self._levels(power)
+        reasons |= dict.fromkeys(self._played, "what is played, not a microphone")
         fit = [at for at in range(self.count) if at not in reasons]
         clipped = [at for at in fit if self._clipped[at] >= MOST_CLIPPED]
         reasons |= dict.fromkeys(clipped if len(clipped) < len(fit) else (), "clipped")
@@ -146,9 +147,20 @@ class Microphones:
                 )
         return reasons
 
-    def _levels(self, power: Array, without: set[int]) -> dict[int, str]:
-        """Which of the others are silent or of another gain."""
-        kept = [at for at in range(self.count) if at not in without]
+    def _find_played(self, power: Array, doubted: set[int]) -> bool:
+        """Ask of those that are doubted, and then of the loudest, once each, whether they are the reference; whether one is."""
+        if not doubted or not self._block[1][0].any():
+            return False
+        asked = [at for at in {*doubted, int(np.argmax(power))} - self._asked if power[at] > 0.0]
+        found = {at for at in asked if played_in(self._block[0][at], self._block[1][0])}
+        self._asked |= set(asked)
+        if len(self._played | found) < self.count:
+            self._played |= found
+        return bool(found)
+
+    def _levels(self, power: Array) -> dict[int, str]:
+        """Which are silent or of another gain, of those that are not what is played."""
+        kept = [at for at in range(self.count) if at not in self._played]
         loudest = float(power[kept].max())
         reasons = {at: "silent" for at in kept if power[at] < SILENT * loudest}
         heard = [at for at in kept if at not in reasons]
