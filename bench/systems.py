@@ -21,6 +21,10 @@ import numpy as np
 from bench import denoisers, peers, results, voicefilter
 from bench.recordings import Clip, NotHere, Signals
 from edgefilter import EgoFilter, Event, PathLearner, Profile, calibrate
+from edgefilter.calibration.array import FARTHEST
+from edgefilter.dsp.fractional_delay import delayed
+from edgefilter.dsp.lag import correlation_near, flat_cross, highest, top
+from edgefilter.dsp.metrics import si_sdr
 from edgefilter.dsp.stft import StftConfig
 from edgefilter.engines import HAVE_MODEL, create
 from edgefilter.errors import EdgefilterError, UsageError
@@ -198,6 +202,14 @@ def _arrays() -> list[System]:
         title = f"crnn on the mean of {count} microphones, calibrated"
         mean = partial(_of_mean, count)
         found.append(System(f"crnn-mean-of-{count}", title, "own", mean, "calibration", _latency_ms("crnn"), code=code))
+        for name, run, told in (
+            ("sum", _of_sum, f"{count} microphones, delayed and summed towards the human"),
+            ("best", _of_best, f"the best of {count} microphones, by SI-SDR"),
+        ):
+            title, made = f"crnn on {told}, calibrated", partial(run, count)
+            found.append(
+                System(f"crnn-{name}-of-{count}", title, "own", made, "the truth", _latency_ms("crnn"), code=code)
+            )
     return found
 
 
@@ -233,6 +245,49 @@ def _of_mean(count: int, clip: Clip) -> Output:
     return run_engine(
         Row("crnn", True, False), Signals(mic, clip.ref), calibrate(clip.source.read("sweep_ref"), sweep, fan)
     )
+
+
+def _of_sum(count: int, clip: Clip) -> Output:
+    """What `crnn` makes of the microphones delayed and summed, so that the human of this clip is in step in all of them.
+
+    Where the human stands is taken from the truth; calibration and conversation go through the same sum.
+    """
+    clip.array(count)
+    clean = clip.source.read_all("clean")[clip.span, :count].T
+    cross = [flat_cross(clean[0], one, 2 * len(one)) for one in clean]
+    late = [
+        top(each, 2 * clean.shape[1], highest(correlation_near(each, 2 * clean.shape[1], FARTHEST))[0])
+        for each in cross
+    ]
+
+    def summed(name: str) -> Samples:
+        sound = clip.source.read_all(name)[:, :count].T
+        return np.mean([delayed(one, max(late) - its) for one, its in zip(sound, late)], axis=0).astype(np.float32)
+
+    signals = Signals(summed("mic"), clip.ref)
+    output = run_engine(
+        Row("crnn", True, False),
+        signals,
+        calibrate(clip.source.read("sweep_ref"), summed("sweep_mic"), summed("fan_only")),
+    )
+    back = round(max(late))  # in step with the first microphone again
+    return output._replace(samples=np.concatenate((output.samples[back:], np.zeros(back, np.float32))))
+
+
+def _of_best(count: int, clip: Clip) -> Output:
+    """What `crnn` makes of the one of the microphones, each calibrated, with the highest SI-SDR: the truth chooses."""
+    clip.array(count)
+    mic, sweep, fan = (clip.source.read_all(name)[:, :count].T for name in ("mic", "sweep_mic", "fan_only"))
+    clean, span = clip.source.read_all("clean").T, clip.span
+    outputs = [
+        run_engine(
+            Row("crnn", True, False),
+            Signals(mic[at], clip.ref),
+            calibrate(clip.source.read("sweep_ref"), sweep[at], fan[at]),
+        )
+        for at in range(count)
+    ]
+    return outputs[int(np.argmax([si_sdr(one.samples[span], clean[at, span]) for at, one in enumerate(outputs)]))]
 
 
 def _engine_code(engine: str, model: Path | None = None) -> str:

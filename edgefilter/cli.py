@@ -7,7 +7,7 @@ import importlib
 import io
 import os
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NoReturn
 
 from edgefilter import __version__
@@ -16,7 +16,7 @@ from edgefilter.commands.outputs import check_outputs
 from edgefilter.echo.user_effects import load_effect
 from edgefilter.engines import ENGINES, HAVE_MODEL
 from edgefilter.errors import EdgefilterError, UsageError
-from edgefilter.types import MOST_MICROPHONES
+from edgefilter.types import ALL_CHANNELS, MOST_MICROPHONES
 
 ENGINE = {
     "default": "auto",
@@ -27,8 +27,8 @@ MOST_CHANNELS = 64
 """Of a device or a file: interfaces of studios have so many."""
 MIC_CHANNELS = {
     "type": lambda text: channels(text),
-    "metavar": "N,N,...",
-    "help": "channels that are microphones, one to eight, from 0 (docs/arrays.md); otherwise the mean of all is taken",
+    "metavar": "N,N,...|all",
+    "help": "channels that are microphones, one to eight, from 0, or 'all' (docs/arrays.md); otherwise the mean is taken",
 }
 EFFECTS = {
     "action": "append",
@@ -184,6 +184,9 @@ def _diagnose(commands: argparse._SubParsersAction) -> None:
     option = commands.add_parser("diagnose", help=told).add_argument
     told = "write a profile with all that was found; without --profile, one made from the recording"
     option("--apply", metavar="P2.npz", help=told)
+    option("--mic-channels", **MIC_CHANNELS)
+    told = "the one of --mic-channels that is diagnosed (default: the first); all of them are looked at"
+    option("--channel", type=channel, metavar="N", help=told)
     told = "leave out what makes the running filter worse on seconds that no fit has used; takes a little longer"
     option("--prove", action="store_true", help=told)
     _force(option)
@@ -239,6 +242,7 @@ def _doctor(commands: argparse._SubParsersAction) -> None:
     option = commands.add_parser("doctor", help=told).add_argument
     option("--input", default="mic", metavar="DEVICE", help="microphone (default: %(default)s)")
     option("--mic-channels", **MIC_CHANNELS)
+    option("--profile", metavar="P.npz", help="calibrated robot: its microphones are held against it")
     told = "input that records what the loudspeaker plays (default: the one that 'run' takes)"
     option("--reference", metavar="DEVICE", help=told)
     told = "output that plays chirps, 5 s with a peak of -18 dB of full scale: where the robot plays (default: %(default)s)"
@@ -382,8 +386,10 @@ def channel(text: str) -> int:
     return int(text)
 
 
-def channels(text: str) -> list[int]:
-    """Numbers of channels, one to eight of them, none twice."""
+def channels(text: str) -> Sequence[int]:
+    """Numbers of channels, one to eight of them, none twice; or all."""
+    if text.strip() == "all":
+        return ALL_CHANNELS
     found = [channel(part) for part in text.split(",")]
     if len(set(found)) < len(found) or len(found) > MOST_MICROPHONES:
         raise argparse.ArgumentTypeError(f"'{text}' does not name one to {MOST_MICROPHONES} different channels")

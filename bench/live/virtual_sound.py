@@ -38,13 +38,17 @@ class Server:
 
 
 def start_server(
-    folder: Path, sinks: Sequence[str] = SINKS, sources: Sequence[str] = (), system: str = "pulseaudio"
+    folder: Path,
+    sinks: Sequence[str] = SINKS,
+    sources: Sequence[str] = (),
+    system: str = "pulseaudio",
+    channels: int = 1,
 ) -> Server:
     """Start a server whose files all lie in folder and wait until its devices are there.
 
     The first sink is the default output, the last one's monitor the default microphone. sources: microphones that hear
     what is written into folder/NAME, 16-bit at 16 kHz, when it is written; a sink has a clock of its own, which stands
-    still and jumps where programs come and go.
+    still and jumps where programs come and go. channels: of the sinks.
     """
     pulse = system == "pulseaudio"
     socket = f"unix:{folder}/{'socket' if pulse else 'pulse/native'}"
@@ -55,7 +59,7 @@ def start_server(
         "PULSE_RUNTIME_PATH": str(folder / "pulse"),
         "DBUS_SESSION_BUS_ADDRESS": f"unix:path={folder}/bus",
     }
-    modules = [f"module-null-sink sink_name={name} rate=16000 format=s16le channels=1" for name in sinks]
+    modules = [f"module-null-sink sink_name={name} rate=16000 format=s16le channels={channels}" for name in sinks]
     for name in sources:
         (folder / name).unlink(missing_ok=True)
         modules += [f"module-pipe-source source_name={name} file={folder / name} rate=16000 format=s16le channels=1"]
@@ -119,12 +123,12 @@ def _load(modules: Sequence[str], environment: dict, process: subprocess.Popen) 
 
 
 @contextmanager
-def server(sinks: Sequence[str] = SINKS, system: str = "pulseaudio") -> Iterator[Server]:
+def server(sinks: Sequence[str] = SINKS, system: str = "pulseaudio", channels: int = 1) -> Iterator[Server]:
     """A server of one's own for a while. Its folder is short: socket paths hold 107 bytes."""
     folder = Path(tempfile.mkdtemp(prefix="pulse"))
     started = None
     try:
-        started = start_server(folder, sinks, system=system)
+        started = start_server(folder, sinks, system=system, channels=channels)
         yield started
     finally:
         if started:

@@ -72,6 +72,17 @@ class Aligner:
         self._lags = LagSearch(self._max_lag, early, PRE_ROLL)
         self._meter = DelayMeter(response, PRE_ROLL)
 
+    def hear_by(self, past: Samples, calibrated: Samples | None) -> None:
+        """From now on the microphone is another one of the array; what is known of the delay holds.
+
+        past: (n,) of what it heard before. calibrated: its impulse response (taps,): those of an array have one beginning, so
+        that the delay is the same in each; None where nothing is calibrated.
+        """
+        self._mic.rewrite(self._mic.end - past.size, past)
+        known, self._calibrated = self._response is not None, calibrated
+        if known and calibrated is not None:
+            self._listen_for(calibrated)
+
     def reset(self) -> None:
         """Forget everything, as after construction."""
         self._listen_for(self._calibrated)

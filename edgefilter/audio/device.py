@@ -84,8 +84,11 @@ def monitor_of(output: str | int | Device | None = None) -> Device:
 def input_port(
     name: str | int | Device | None, latency_s: float = STREAM_LATENCY_S, channels: Sequence[int] | None = None
 ) -> InputPort:
-    """An input that can be opened, found by what people type; channels: numbers, from 0, of those that are wanted."""
-    return InputPort(_sounddevice(), find(name, "input"), latency_s, channels)
+    """An input that can be opened, found by what people type; channels: numbers, from 0, of those that are wanted, or ALL_CHANNELS."""
+    device = find(name, "input")
+    if device.name in STAND_INS or device.pulse_name:  # PortAudio says 32 of whatever the server has
+        device = replace(device, inputs=pulse.channels_of(device.pulse_name) or device.inputs)
+    return InputPort(_sounddevice(), device, latency_s, channels)
 
 
 def output_port(

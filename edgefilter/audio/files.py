@@ -80,7 +80,7 @@ class FileSource(Source):
         self._reference = None if reference_path is None else Reader(reference_path, "reference")
         if reference_channel is not None:
             self._reference = Reader(mic_path, "reference in", [reference_channel])
-        self.microphones = 1 if channels is None else len(channels)
+        self.microphones = 1 if self._mic.wanted is None else len(self._mic.wanted)
         self._block = block
         self.total = self._mic.total
         self.notes = list(self._mic.notes)

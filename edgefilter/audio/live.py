@@ -15,7 +15,7 @@ from edgefilter.audio.protocols import Sink, Source
 from edgefilter.audio.speech import SpokenReference
 from edgefilter.audio.steady import SteadyInput
 from edgefilter.errors import DeviceError
-from edgefilter.types import SAMPLE_RATE, Block, Samples
+from edgefilter.types import MOST_MICROPHONES, SAMPLE_RATE, Block, Samples
 
 MARGIN_S = 0.04
 """Silence ahead of a live output, on top of the declared latency: two callbacks of 20 ms, which come with jitter."""
@@ -45,12 +45,18 @@ class LiveSource(Source):
     ) -> None:
         self._both = reference_channel is not None
         taken = None if channels is None else [*channels, *([reference_channel] if self._both else ())]
-        self.microphones = 1 if channels is None else len(channels)
         self._mic = SteadyInput(_opener(mic, taken), patience_s)
+        opened = self._mic.port.wanted
+        self.microphones = 1 if opened is None else len(opened) - self._both
         self._reference = None if reference is None else SteadyInput(_opener(reference), patience_s)
         self._pairing = Pairing(late_is_lost=not isinstance(reference, SpokenReference))
         self.total = None if seconds is None else round(seconds * SAMPLE_RATE)
         self.notes = [f"microphone: {self._mic.port.device}", *self._mic.port.notes]
+        there = self._mic.port.device.inputs
+        if opened is None and 1 < there <= MOST_MICROPHONES:
+            self.notes.append(
+                f"the microphone has {there} channels and is one: name those of an array, or all, with --mic-channels"
+            )
         if self._reference is not None:
             how = "what is played on " if isinstance(reference, SpokenReference) else ""
             self.notes += [f"reference: {how}{self._reference.port.device}", *self._reference.port.notes]

@@ -21,7 +21,7 @@ from edgefilter.audio.pairing import Inlet, Outlet
 from edgefilter.audio.pulse import OPENING, leading_to
 from edgefilter.dsp.resample import Resampler
 from edgefilter.errors import DeviceError, UsageError
-from edgefilter.types import SAMPLE_RATE, Samples
+from edgefilter.types import SAMPLE_RATE, Samples, which_channels
 
 POLL_S = 0.004
 """Between two looks at a device: a quarter of a hop."""
@@ -77,7 +77,7 @@ class Port:
     """One PortAudio stream and how its rate and channels are brought to 16 kHz mono.
 
     latency_s: the buffer asked of the sound system, seconds. wanted: numbers of an input's channels, from 0, to be
-    delivered in that order in place of their mean.
+    delivered in that order in place of their mean; ALL_CHANNELS is all.
     """
 
     def __init__(
@@ -89,7 +89,7 @@ class Port:
         wanted: Sequence[int] | None = None,
     ) -> None:
         self._sd = sounddevice
-        self.wanted = None if wanted is None else list(wanted)
+        self.wanted = which_channels(wanted, device.channels(kind), f"{kind} device '{device}'")
         self.kind = kind
         self.device = device
         self.latency_s = latency_s
@@ -192,7 +192,7 @@ class InputPort(Port):
         wanted: Sequence[int] | None = None,
     ) -> None:
         super().__init__(sounddevice, device, "input", latency_s, wanted)
-        several = None if wanted is None or len(wanted) == 1 else len(wanted)
+        several = None if self.wanted is None or len(self.wanted) == 1 else len(self.wanted)
         self.inlet = Inlet(round(BUFFER_S * self.rate), several)
         self._resampler = Resampler(self.rate, SAMPLE_RATE, several or 1)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import subprocess
 import threading
 from collections.abc import Iterator
@@ -18,6 +19,14 @@ def names(kind: str) -> list[str]:
     """Names of all inputs (kind 'input', monitors included) or outputs of the running server; empty where there is none."""
     lines = _asked("list", "short", "sources" if kind == "input" else "sinks").splitlines()
     return [line.split("\t")[1] for line in lines if "\t" in line]
+
+
+def channels_of(name: str) -> int:
+    """Channels of the input of that name, '' for the default one; 0 where there is none."""
+    listed = (line.split("\t") for line in _asked("list", "short", "sources").splitlines())
+    name = name or default_name("input")
+    found = (re.search(r"\b(\d+)ch\b", line[3]) for line in listed if len(line) > 3 and line[1] == name)
+    return next((int(match[1]) for match in found if match), 0)
 
 
 def default_name(kind: str) -> str:

@@ -13,7 +13,7 @@ import soundfile
 import soxr
 
 from edgefilter.errors import AudioFileError
-from edgefilter.types import LOUDEST, SAMPLE_RATE, Array, Samples
+from edgefilter.types import LOUDEST, SAMPLE_RATE, Array, Samples, which_channels
 
 RATES = range(1000, 768001)
 """Hz that converters have; a header that says another is damaged."""
@@ -24,7 +24,7 @@ _ENDLESS = 0x7FFFF000
 class Reader:
     """A WAV, FLAC or Ogg file of any rate and channel count, delivered at 16 kHz with its channels averaged.
 
-    wanted: numbers of channels, from 0, to be delivered in that order in place of their mean. role: how messages name the
+    wanted: numbers of channels, from 0, to be delivered in that order in place of their mean; ALL_CHANNELS is all. role: how messages name the
     file ("recording"). The file is read once at opening, so that a damaged one is refused before anything is made from
     it. total: round(n * 16000 / rate) samples. silent: every sample is zero.
     Raises AudioFileError for a file that is missing, empty, truncated, not audio, or holds what no recording does.
@@ -33,13 +33,13 @@ class Reader:
     def __init__(self, path: str | Path, role: str = "recording", wanted: Sequence[int] | None = None) -> None:
         self.path = Path(path)
         self.role = role
-        self.wanted = None if wanted is None else list(wanted)
         self.notes: list[str] = []
         self.silent = True
         self._check_is_file()
         with self._open() as file:
             self.rate, self.channels = file.samplerate, file.channels
             self._check_header(file)
+            self.wanted = which_channels(wanted, self.channels, f"{role} {path}")
             self._check_channels()
             length = self._scan(file)
         self.total = (2 * length * SAMPLE_RATE + self.rate) // (2 * self.rate)

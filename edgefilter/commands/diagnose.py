@@ -8,10 +8,11 @@ from dataclasses import replace
 
 from edgefilter.commands.display import print_result, progress, report_part
 from edgefilter.commands.fitting import Fitted, Refused, fit, long_paths
-from edgefilter.commands.recordings import load
+from edgefilter.commands.recordings import load, load_array
 from edgefilter.diagnosis.diagnose import Diagnosis, diagnose
 from edgefilter.diagnosis.proven import diagnose_proven
 from edgefilter.errors import EdgefilterError, SignalError, UsageError
+from edgefilter.profile.array import ArrayCalibration
 from edgefilter.profile.data import Profile
 from edgefilter.report.text import add_command, diagnosis_lines, in_order
 from edgefilter.types import Samples
@@ -25,14 +26,25 @@ def main(args: argparse.Namespace) -> int:
             "found --prove without --profile: a profile made from the recording has used the seconds of the proof"
         )
     html = report_part("html") if args.report else None
-    profile, recording, reference = load(args)
+    doubts: dict[int, str] = {}
+    array: ArrayCalibration | None = None
+    if args.mic_channels is None:
+        if args.channel is not None:
+            raise UsageError("found --channel without --mic-channels, which names the microphones: give both")
+        profile, recording, reference = load(args)
+    else:
+        profile, recording, reference, array, doubts = load_array(args)
+        print_result(args, [f"channel {number}: {what}" for number, what in doubts.items()])
     with progress("diagnosis") as step:
         found = (diagnose_proven if args.prove else diagnose)(profile, recording, reference, progress=step)
         if args.profile is None:
             warnings = (*profile.warnings, *found.comparison.warnings)
             found = replace(found, comparison=replace(found.comparison, warnings=warnings))
-        applied, refused = _apply(profile, found, recording, reference, args, step) if args.apply else (None, None)
-    more = {"applied": {**applied.to_dict(), "output": args.apply}} if applied else {}
+        applied, refused = (
+            _apply(profile, found, recording, reference, args, step, array) if args.apply else (None, None)
+        )
+    more: dict[str, object] = {"channels": {str(number): what for number, what in doubts.items()}} if doubts else {}
+    more |= {"applied": {**applied.to_dict(), "output": args.apply}} if applied else {}
     told = [*applied.lines(), f"written to {args.apply}"] if applied else _next_step(found, args)
     print_result(args, [*diagnosis_lines(found, args.profile is not None), *told], {**found.to_dict(), **more})
     if html:
@@ -51,10 +63,12 @@ def _apply(
     reference: Samples,
     args: argparse.Namespace,
     step: Callable[[str], None],
+    array: ArrayCalibration | None,
 ) -> tuple[Fitted, None] | tuple[None, EdgefilterError]:
     """The profile with all that was found, written; or why it was not: the diagnosis is printed all the same.
 
-    A profile made from the recording gets the whole length of the room's response, from all of the recording.
+    A profile made from the recording gets the whole length of the room's response, from all of the recording. array: the
+    other microphones, which get the same effects on their own paths.
     """
     step("fit of what was found, and proof in the running filter")
     names = [finding.effect for finding in in_order(found.ranking)]
@@ -65,11 +79,17 @@ def _apply(
         applied = fit(start, profile, tuple(names), recording, reference, force=args.force, drop=True)
     except (Refused, SignalError) as error:
         return None, error
-    applied.profile.save(args.apply)
+    replace(applied.profile, array=array or applied.profile.array).save(args.apply)
     return applied, None
 
 
 def _next_step(found: Diagnosis, args: argparse.Namespace) -> list[str]:
     if not found.ranking or args.apply:
         return []
+    if args.mic_channels is not None:
+        return [
+            "next        the same with --apply P2.npz"
+            if args.channel is None
+            else "next        the same without --channel, and with --apply P2.npz"
+        ]
     return [f"next        {add_command([finding.effect for finding in in_order(found.ranking)], vars(args))}"]

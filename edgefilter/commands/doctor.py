@@ -13,12 +13,14 @@ import numpy as np
 from edgefilter.audio import pulse, virtual
 from edgefilter.calibration.chirps import LEVEL_DB, SOFTER_DB, Heard, chirps, judge
 from edgefilter.commands.display import print_result, say
+from edgefilter.diagnosis.channels import doubtful_channels
 from edgefilter.engines import create
 from edgefilter.errors import EdgefilterError
 from edgefilter.filter.budget import DEFAULT_MS
 from edgefilter.filter.ego_filter import EgoFilter
 from edgefilter.learning.background import cores
-from edgefilter.types import SAMPLE_RATE
+from edgefilter.profile.data import Profile
+from edgefilter.types import SAMPLE_RATE, Samples
 
 if TYPE_CHECKING:
     from edgefilter.audio.measure import Channel, Trial
@@ -43,6 +45,8 @@ MOST_LAG_S = 1.5
 LINEAR_DB = 15.0
 """Echo over what a linear filter leaves from which on the set-up is good: small loudspeakers at moderate volume have 20
 to 27 dB."""
+FARTHEST_S = 0.002
+"""Between the direct sound in two microphones of one robot, .7 m: a channel that is later went another way."""
 CHANGED_DB = 1.5
 """Difference of two gains, dB, that neither noise nor a small loudspeaker explains: they differ by some tenths."""
 
@@ -59,7 +63,9 @@ class Check:
 
 def main(args: argparse.Namespace) -> int:
     checks = []
-    for check in examine(args.input, args.reference, None if args.no_chirp else args.speaker, args.mic_channels):
+    profile = Profile.load(args.profile) if args.profile else None
+    speaker = None if args.no_chirp else args.speaker
+    for check in examine(args.input, args.reference, speaker, args.mic_channels, profile):
         checks.append(check)
         print_result(args, [f"{check.state:8} {check.name:13} {check.found}" + (f": {check.do}" if check.do else "")])
     failed = [check.name for check in checks if check.state == "failed"]
@@ -69,11 +75,15 @@ def main(args: argparse.Namespace) -> int:
 
 
 def examine(
-    microphone: str, reference: str | None, speaker: str | None, channels: Sequence[int] | None = None
+    microphone: str,
+    reference: str | None,
+    speaker: str | None,
+    channels: Sequence[int] | None = None,
+    profile: Profile | None = None,
 ) -> Iterator[Check]:
     """All checks, each as soon as it is done. speaker: what plays the chirps; None for none of them.
 
-    channels: of the microphone's device, where it is an array.
+    channels: of the microphone's device, where it is an array. profile: of as many microphones, to hold them against.
     """
     yield from _machine()
     yield from _guarded("model", _model)
@@ -85,7 +95,7 @@ def examine(
     if ports:
         yield from _guarded("sound", lambda: _sound(ports))
     if speaker is not None and len(ports) == 2:
-        yield from _guarded("set-up", lambda: _set_up(ports, speaker, channels))
+        yield from _guarded("set-up", lambda: _set_up(ports, speaker, channels, profile))
 
 
 def _guarded(name: str, look: Callable[[], Iterator[Check]]) -> Iterator[Check]:
@@ -183,6 +193,8 @@ def array_checks(channels: Sequence[Channel]) -> Iterator[Check]:
         why = ""
         if silent[at]:
             why = "it is silent"
+        elif one.peak_db > CLIPPED_DB:
+            why = "it is clipped (or lower its gain)"
         elif abs(one.level_db - level) > APART_DB:
             why = "it is of another kind, or has another gain"
         elif at > first and one.coherence > SAME:
@@ -193,8 +205,10 @@ def array_checks(channels: Sequence[Channel]) -> Iterator[Check]:
         yield Check(f"channel {one.number}", "warning" if why else "ok", found, do)
 
 
-def _set_up(ports: dict[str, InputPort], speaker: str, channels: Sequence[int] | None) -> Iterator[Check]:
-    """Play chirps and hear them as a run would, of an array in the first microphone."""
+def _set_up(
+    ports: dict[str, InputPort], speaker: str, channels: Sequence[int] | None, profile: Profile | None
+) -> Iterator[Check]:
+    """Play chirps and hear them as a run would, of an array in the first microphone; then hold the others beside it."""
     from edgefilter.audio.live import LiveSource
     from edgefilter.audio.measure import play_through
 
@@ -210,12 +224,37 @@ def _set_up(ports: dict[str, InputPort], speaker: str, channels: Sequence[int] |
         f"chirps for {sound.size / SAMPLE_RATE:.0f} s on output '{output}', peak {LEVEL_DB:.0f} dB of full scale"
         " (--no-chirp: without)"
     )
-    first = channels[:1] if channels else None
-    source = LiveSource(ports["microphone"].device, ports["reference"].device, channels=first)
+    source = LiveSource(ports["microphone"].device, ports["reference"].device, channels=channels)
     mic, ref, lost = play_through(output, source, sound)
-    yield from judge_set_up(judge(mic, ref), output, str(ports["reference"].device))
+    each = mic.reshape(len(mic), -1).T
+    yield from judge_set_up(judge(each[0], ref), output, str(ports["reference"].device))
+    yield from array_set_up(ports["microphone"].wanted or [0], each, ref, profile)
     if lost:
         yield Check("set-up load", "warning", f"{lost} samples lost while the chirps were heard", "end other programs")
+
+
+def array_set_up(numbers: Sequence[int], mics: Samples, ref: Samples, profile: Profile | None) -> Iterator[Check]:
+    """What the chirps have shown of the microphones mics (microphones, n) beside one another, and beside a profile."""
+    heard = [judge(one, ref) for one in mics] if len(mics) > 1 else []
+    lags = [one.lag_s for one in heard if one.lag_s is not None and not one.same]
+    told = set()
+    for number, one in zip(numbers, heard):
+        if one.same or one.lag_s is not None and abs(one.lag_s - float(np.median(lags))) > FARTHEST_S:
+            told.add(number)
+        if one.same:
+            yield Check(f"channel {number}", "warning", "it is what is played", "leave it out of --mic-channels")
+        elif number in told and one.lag_s is not None:
+            late = f"it hears the chirps {1000 * (one.lag_s - float(np.median(lags))):+.0f} ms beside the others"
+            yield Check(f"channel {number}", "warning", late, "leave it out of --mic-channels: it is processed")
+    if profile is None or not all(one.in_microphone for one in heard):
+        return
+    doubts = doubtful_channels(profile, mics, ref)
+    for at, what in doubts.items():
+        if numbers[at] not in told:
+            do = "put --mic-channels into the order in which they were calibrated, mend it, or calibrate again"
+            yield Check(f"channel {numbers[at]}", "warning", what, do)
+    if not doubts:
+        yield Check("profile", "ok", f"{profile.microphones} microphones as they were calibrated")
 
 
 def judge_set_up(heard: Heard, output: str, reference: str) -> Iterator[Check]:

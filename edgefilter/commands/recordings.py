@@ -10,7 +10,9 @@ import numpy as np
 from edgefilter.audio.reader import Reader
 from edgefilter.calibration.from_recording import self_calibrate
 from edgefilter.commands.display import say
-from edgefilter.errors import AudioFileError
+from edgefilter.diagnosis.channels import doubtful_channels
+from edgefilter.errors import AudioFileError, UsageError
+from edgefilter.profile.array import ArrayCalibration
 from edgefilter.profile.data import Profile
 from edgefilter.types import Samples
 
@@ -37,6 +39,35 @@ def load(args: argparse.Namespace) -> tuple[Profile, Samples, Samples]:
     profile = None if args.profile is None else Profile.load(args.profile)
     recording, reference = _voice(args.recording, "recording"), _voice(args.reference, "reference")
     return profile or self_calibrate(recording, reference), recording, reference
+
+
+def load_array(args: argparse.Namespace) -> tuple[Profile, Samples, Samples, ArrayCalibration | None, dict[int, str]]:
+    """As load, of the microphone --channel of the recording's --mic-channels; the profile is of this microphone alone.
+
+    And what the whole profile holds of the others, and what is wrong with any, by channel. Raises as load, SignalError for
+    a profile of other microphones, UsageError for a channel that is none of them.
+    """
+    wanted = Reader(args.recording, "recording", args.mic_channels).wanted or []
+    number = wanted[0] if args.channel is None else args.channel
+    if number not in wanted:
+        raise UsageError(
+            f"--channel {number} is none of the microphones {', '.join(map(str, wanted))} of --mic-channels"
+        )
+    at = wanted.index(number)
+    if at and getattr(args, "apply", None):
+        raise UsageError(
+            "--apply writes the profile of the first microphone and the others' beside it: leave --channel out"
+        )
+    reference = _voice(args.reference, "reference")
+    recordings = read(args.recording, "recording", wanted).reshape(-1, len(wanted)).T
+    if not recordings[at].any():
+        raise AudioFileError(f"channel {number} of {args.recording} is silent: every sample is zero, choose another")
+    if args.profile is None:
+        return self_calibrate(recordings[at], reference), recordings[at], reference, None, {}
+    profile = Profile.load(args.profile)
+    doubts = doubtful_channels(profile, np.ascontiguousarray(recordings), reference)
+    found = {wanted[index]: what for index, what in doubts.items()}
+    return profile.of_microphone(at), np.ascontiguousarray(recordings[at]), reference, profile.array, found
 
 
 def _voice(path: str, role: str) -> Samples:

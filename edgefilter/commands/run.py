@@ -7,7 +7,7 @@ import gc
 import math
 import signal
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
@@ -29,7 +29,7 @@ from edgefilter.filter.learner import Learner
 from edgefilter.learning.background import BackgroundLearner, cores
 from edgefilter.profile.data import Profile
 from edgefilter.session import RunReport, filter_blocks
-from edgefilter.types import SAMPLE_RATE, Block
+from edgefilter.types import ALL_CHANNELS, SAMPLE_RATE, Block
 
 FILE_ENDINGS = (".wav", ".flac", ".ogg", ".mp3", ".aiff", ".aif", ".w64", ".opus", ".txt", ".raw", ".pcm")
 TWICE_S = 0.5
@@ -37,8 +37,10 @@ TWICE_S = 0.5
 
 
 def main(args: argparse.Namespace) -> int:
-    speech = make_speech(args)
-    source = make_source(args.input, speech or args.reference, args.output, channels_of(args), args.reference_channel)
+    speech, channels = make_speech(args), channels_of(args)
+    source = make_source(args.input, speech or args.reference, args.output, channels, args.reference_channel)
+    if channels == ALL_CHANNELS and args.mic_channels is None:
+        source.notes.append(f"all {source.microphones} channels are microphones, since the profile is of an array")
     ego, choice = make_filter(args, source.live)
     check_request(args, ego, source)
     sink = make_sink(args.output, ego.latency, wait=not source.live)
@@ -72,7 +74,7 @@ def main(args: argparse.Namespace) -> int:
 
 def make_speech(args: argparse.Namespace) -> SpokenReference | None:
     """The speech that the run itself plays, None where no --play asks for it."""
-    live = args.input != "-" and not looks_like_file(args.input)
+    live = is_live(args.input)
     if args.play is None:
         if args.speaker is not None or args.barge_in:
             option = "--barge-in" if args.barge_in else "--speaker"
@@ -89,12 +91,18 @@ def make_speech(args: argparse.Namespace) -> SpokenReference | None:
     return speaker(args.speaker, Reader(args.play, "speech"))
 
 
-def channels_of(args: argparse.Namespace) -> list[int] | None:
-    """The microphones that --mic-channels names; raises UsageError for a reference channel without or among them."""
+def channels_of(args: argparse.Namespace) -> Sequence[int] | None:
+    """The microphones that --mic-channels names; raises UsageError for a reference channel without or among them.
+
+    Where none are named, live, and the profile is of several: all that the device has.
+    """
     if args.reference_channel is None:
+        file = profile_file(args)
+        if args.mic_channels is None and file and is_live(args.input) and Profile.load(file).microphones > 1:
+            return ALL_CHANNELS
         return args.mic_channels
-    if args.mic_channels is None or args.reference_channel in args.mic_channels:
-        found = "none" if args.mic_channels is None else f"channel {args.reference_channel} among them"
+    if not args.mic_channels or args.reference_channel in args.mic_channels:
+        found = "none" if not args.mic_channels else f"channel {args.reference_channel} among them"
         raise UsageError(f"--reference-channel goes with --mic-channels that name the others, found {found}")
     if args.reference is not None or args.play is not None:
         other = "--play" if args.play is not None else "--reference"
@@ -106,7 +114,7 @@ def make_source(
     name: str,
     reference: str | SpokenReference | None,
     output: str,
-    channels: list[int] | None = None,
+    channels: Sequence[int] | None = None,
     reference_channel: int | None = None,
 ) -> Source:
     """A file or pipe where name is one, else the live devices.
@@ -146,6 +154,11 @@ def make_sink(name: str, latency: int, wait: bool) -> Sink:
     return SteadySink(lambda: LiveSink(name, latency, wait=False))
 
 
+def is_live(name: str) -> bool:
+    """Whether an input is a device, neither a pipe nor a file."""
+    return name != "-" and not looks_like_file(name)
+
+
 def looks_like_file(name: str) -> bool:
     """Whether people who type this mean a file: it exists, has an audio ending, or has a folder in it."""
     return Path(name).exists() or name.lower().endswith(FILE_ENDINGS) or "/" in name
@@ -172,8 +185,7 @@ def make_filter(args: argparse.Namespace, live: bool) -> tuple[EgoFilter, Choice
     if args.remeasure:
         forget()
     choice, engine, reason, budget_ms = None, args.engine, "asked for", args.budget_ms
-    learned_before = args.learn and Path(args.learn).exists()
-    file = args.learn if learned_before else args.profile
+    file = profile_file(args)
     profile = Profile.load(file) if file else None
     if engine == "auto" and not args.model and (live or budget_ms):
         choice = choose(budget_ms or DEFAULT_MS, profile, say=say)
@@ -186,6 +198,11 @@ def make_filter(args: argparse.Namespace, live: bool) -> tuple[EgoFilter, Choice
             " ('edgefilter calibrate' measures them beforehand)"
         )
     return ego, choice
+
+
+def profile_file(args: argparse.Namespace) -> str | None:
+    """What the filter begins with: what was learned before, else the profile that is named."""
+    return args.learn if args.learn and Path(args.learn).exists() else args.profile
 
 
 def make_learner(args: argparse.Namespace, live: bool, profile: Profile | None) -> Learner | None:

@@ -18,6 +18,9 @@ LOWEST_HZ = 100.0
 LONGEST = 0.5
 """Samples of one Newton step: halfway between two samples a longer one jumps to and fro across the top."""
 
+SAME = 0.98
+"""Correlation of a copy with what it is a copy of, both cut from the same second at a lag of some ms."""
+
 
 def smoothed_power(spectrum: np.ndarray, width_hz: float) -> Array:
     """|spectrum|^2 (..., bins), averaged over width_hz."""
@@ -101,3 +104,17 @@ def climb(cross: np.ndarray, omega: Array, lag: float, steps: int = 8, tolerance
 def top(cross: np.ndarray, n: int, lag: float) -> float:
     """`climb` for a cross-spectrum (n // 2 + 1,) of n samples, to a ten-thousandth of a sample."""
     return climb(cross, 2 * np.pi * np.arange(cross.size) / n, lag, tolerance=1e-4)
+
+
+def played_in(heard: Samples, played: Samples) -> bool:
+    """Whether what was heard (n,) is what was played (n,), at another level and lag: no room is between them.
+
+    >>> sound = np.random.default_rng(0).standard_normal(4096)
+    >>> played_in(0.2 * np.roll(sound, 20), sound), played_in(np.convolve(sound, [1.0, 0.5])[:4096], sound)
+    (True, False)
+    """
+    size = fft.next_fast_len(2 * heard.size, real=True)
+    cross = fft.irfft(fft.rfft(heard, size) * fft.rfft(played, size).conj(), size)
+    return bool(
+        np.abs(cross).max() > SAME * np.sqrt(float(np.vdot(heard, heard)) * float(np.vdot(played, played))) > 0.0
+    )

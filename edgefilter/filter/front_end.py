@@ -105,7 +105,9 @@ class FrontEnd:
     ) -> None:
         stft = engine.stft
         self.hop, self._stft = stft.hop, stft
-        self.microphones = None if microphones is None else Microphones(microphones, stft.hop)
+        self.microphones: Microphones | None = None
+        if microphones:
+            self.microphones = Microphones(microphones, stft.hop, profile.running_responses() if profile else None)
         self.aligner = aligner
         self.spatial: SpatialFilter | None = None
         self.errors: Spectrum | None = None
@@ -122,6 +124,8 @@ class FrontEnd:
             path = starting_path(profile, stft.hop, microphones)
             self.linear_stage = LinearStage(tracking, path, Residual(stft, profile), learner)
             self._source: SourceChain | None = None
+            further = profile.array.responses if profile and profile.array else [None] * ((microphones or 1) - 1)
+            self._paths = [profile.echo.impulse_response if profile else None, *further]
             if microphones:
                 noise = profile.array.noise_covariance(stft) if profile and profile.array else None
                 self.spatial = SpatialFilter(stft, microphones, noise)
@@ -148,14 +152,15 @@ class FrontEnd:
             found = self.aligner.step(mic, ref) if self.aligner else None
             x, r = self._analyser.push(mic, found.reference if found else ref)
             return Frame(x, r, self._silence, x, self._noise, self._nothing), found
+        if self.microphones and stage.canceller.tell_by(self.microphones.first):
+            stage.aligner.hear_by(self.microphones.latest(), self._paths[self.microphones.first])
         aligned = stage.aligner.step(mic, ref)
-        if self.microphones:
-            stage.canceller.tell_by(self.microphones.first)
         self.linear = linear = stage.step(heard, aligned)
         gain = self.gate.step(mic, ref, aligned) if self.gate else None
         added = self._added(stage.path.source)
         if self.spatial and self.microphones:
-            if self.microphones.step(heard, linear.error):
+            located = aligned.state == "locked"
+            if self.microphones.step(heard, linear.error, ref, aligned.reference, located):
                 self.spatial.use(self.microphones.used)
             r, (x, e, error) = self._combined(self.spatial, heard, aligned.reference, linear.echo, gain)
             uncertainty, fan = self.spatial.independent(linear.uncertainty), self.spatial.fan_psd()

@@ -1,9 +1,11 @@
-"""Which microphones of an array can be used: silent, copied, far louder ones and those that hear another echo are left out."""
+"""Which microphones of an array can be used: silent, copied, clipped, exchanged ones and others that do not fit are left out."""
 
 from __future__ import annotations
 
 import numpy as np
 
+from edgefilter.dsp.exchange import order_of
+from edgefilter.dsp.lag import played_in
 from edgefilter.types import SAMPLE_RATE, Array, Samples
 
 BLOCK_S = 1.0
@@ -13,40 +15,51 @@ APART = 10**1.2
 """Power over the median microphone's, 12 dB either way: equal microphones of one array agree within 1 to 2 dB, one of
 another kind beside them was 12 to 18 dB louder (a real robot's noise on four microphones)."""
 SILENT = 1e-6
-"""Power over the median microphone's, -60 dB, below which a microphone is called silent and not soft."""
+"""Power over the loudest microphone's, -60 dB, below which a microphone is called silent and not soft."""
 EQUAL = 1e-3
 """Part of its power by which a channel may differ from one that it is a copy of: -30 dB."""
 CANCELLED, UNLIKE, LEFT = 0.1, 10.0, 0.3
 """Error over microphone where the robot is the loudest and is cancelled in the best microphone (-10 dB); how many times as
 much is left in one whose path is another than was calibrated: swapped, broken, or processed; and the least of it."""
+CLIPPED, MOST_CLIPPED = 10 ** (-0.1 / 20), 16
+"""Size from which a sample counts as clipped, as in doctor; so many, 1 ms of them in a block, are no single peak."""
+CALIBRATED_TAPS = 2048
+"""Of the calibrated paths that say which channel is which: the direct sound and what comes soon after it."""
 
 
 class Microphones:
     """Watches the microphones of one stream; step once a hop.
 
-    left_out: why, by number. first: the first one that is used.
+    left_out: why, by number. first: the first one that is used. paths: (microphones, taps) of the echo where they are
+    calibrated, which tell exchanged channels, once, in the first block that is full of the robot.
 
     >>> rng = np.random.default_rng(0)
     >>> watched = Microphones(3, 256)
     >>> for _ in range(62):
     ...     heard = rng.standard_normal((3, 256)).astype(np.float32)
     ...     heard[1] = 0.0
-    ...     changed = watched.step(heard, heard)
+    ...     changed = watched.step(heard, heard, 0 * heard[0], 0 * heard[0], True)
     >>> changed, watched.left_out, watched.first
     (True, {1: 'silent'}, 0)
     """
 
-    def __init__(self, count: int, hop: int) -> None:
+    def __init__(self, count: int, hop: int, paths: Samples | None = None) -> None:
         self.count = count
         self.left_out: dict[int, str] = {}
+        self._paths = None if paths is None else paths[:, :CALIBRATED_TAPS]
+        self._exchanged: dict[int, str] = {}
+        self._played: set[int] = set()
+        self._asked: set[int] = set()
         self._hops = round(BLOCK_S * SAMPLE_RATE / hop)
         self._good = [GOOD_BLOCKS] * count
+        self._block = [np.zeros((rows, self._hops * hop), np.float32) for rows in (count, 2)]
         self._begin()
 
     def _begin(self) -> None:
         self._moments = np.zeros((self.count, self.count))
         self._errors = np.zeros(self.count)
-        self._seen = 0
+        self._clipped = np.zeros(self.count, int)
+        self._seen, self._located = 0, True
 
     @property
     def first(self) -> int:
@@ -58,13 +71,27 @@ class Microphones:
         """(count,) bool."""
         return np.array([at not in self.left_out for at in range(self.count)])
 
-    def step(self, mic: Samples, error: Samples) -> bool:
-        """Take a hop of the microphones and of the linear stage's errors (count, hop); whether others are used from now on."""
+    def latest(self) -> Samples:
+        """(n,) of what the first one that is used heard in the latest block, up to where others came into use."""
+        return self._block[0][self.first]
+
+    def step(self, mic: Samples, error: Samples, ref: Samples, aligned: Samples, located: bool) -> bool:
+        """Take a hop; whether others are used from now on.
+
+        mic, error: (count, hop) of the microphones and of what the linear stage left of them. ref, aligned: (hop,) of the
+        reference as it came, and where the first microphone hears it. located: whether that is known.
+        """
+        at = self._seen * mic.shape[1]
+        here = slice(at, at + mic.shape[1])
+        self._block[0][:, here], self._block[1][0, here], self._block[1][1, here] = mic, ref, aligned
         self._moments += mic @ mic.T
         self._errors += np.einsum("ch,ch->c", error, error)
+        self._clipped += np.count_nonzero(np.abs(mic) >= CLIPPED, axis=1)
+        self._located &= located
         self._seen += 1
         if self._seen < self._hops:
             return False
+        self._find_exchanged()
         reasons = self._reasons(self._moments.diagonal().copy())
         self._begin()
         before = set(self.left_out)
@@ -74,28 +101,72 @@ class Microphones:
                 self.left_out[at] = reasons[at]
             elif self._good[at] >= GOOD_BLOCKS:
                 self.left_out.pop(at, None)
-        if len(self.left_out) == self.count:  # then nothing can be told
-            self.left_out.clear()
+        if len(self.left_out) == self.count:
+            if self._exchanged:
+                self.left_out.pop(0)  # any one by itself is right
+            else:  # then nothing can be told
+                self.left_out.clear()
         return set(self.left_out) != before
+
+    def _find_exchanged(self) -> None:
+        """See once, from a block in which the robot was found throughout, whether each channel is the calibrated one."""
+        if self._paths is None or not self._located or not self._block[1][1].any():
+            return
+        n = self._block[0].shape[1]
+        expected = np.fft.irfft(np.fft.rfft(self._block[1][1]) * np.fft.rfft(self._paths, n), n)
+        found = order_of(self._block[0], expected.astype(np.float32))
+        if found is not None:
+            self._paths = None
+            self._exchanged = {
+                at: f"exchanged: it hears the robot as channel {other} was calibrated to"
+                for at, other in enumerate(found[0])
+                if at != other
+            }
 
     def _reasons(self, power: Array) -> dict[int, str]:
         """Why microphones of that power in the latest block should be left out."""
-        reasons: dict[int, str] = {}
-        median = float(np.median(power)) if self.count > 2 else float(power.max())
-        for at in range(self.count) if median > 0.0 else ():
-            if power[at] < SILENT * median:
-                reasons[at] = "silent"
-            elif not median / APART < power[at] < APART * median:
-                apart = f"{abs(10 * np.log10(power[at] / median)):.0f} dB"
-                reasons[at] = f"{apart} {'louder' if power[at] > median else 'softer'} than the others"
+        reasons = self._levels(power)
+        if self._find_played(power, {*reasons, *self.left_out}):
+            reasons = self._levels(power)
+        reasons |= dict.fromkeys(self._played, "what is played, not a microphone")
+        fit = [at for at in range(self.count) if at not in reasons]
+        clipped = [at for at in fit if self._clipped[at] >= MOST_CLIPPED]
+        reasons |= dict.fromkeys(clipped if len(clipped) < len(fit) else (), "clipped")
         for at in range(self.count):
             for other in range(at):
                 differ = power[at] + power[other] - 2.0 * self._moments[at, other]
                 if at not in reasons and other not in reasons and power[at] > 0.0 and differ < EQUAL * power[at]:
                     reasons[at] = f"the same as channel {other}"
+        reasons |= self._exchanged
         left = {at: self._errors[at] / power[at] for at in range(self.count) if at not in reasons and power[at] > 0.0}
         least = min(left.values(), default=1.0)
         for at in left if least < CANCELLED else ():
             if left[at] > max(UNLIKE * least, LEFT):
-                reasons[at] = "hears the robot otherwise than it was calibrated, or than the others"
+                reasons[at] = (
+                    "hears the robot otherwise than it was calibrated, or than the others: processed, or broken"
+                )
+        return reasons
+
+    def _find_played(self, power: Array, doubted: set[int]) -> bool:
+        """Ask of those that are doubted, and then of the loudest, once each, whether they are the reference; whether one is."""
+        if not doubted or not self._block[1][0].any():
+            return False
+        asked = [at for at in {*doubted, int(np.argmax(power))} - self._asked if power[at] > 0.0]
+        found = {at for at in asked if played_in(self._block[0][at], self._block[1][0])}
+        self._asked |= set(asked)
+        if len(self._played | found) < self.count:
+            self._played |= found
+        return bool(found)
+
+    def _levels(self, power: Array) -> dict[int, str]:
+        """Which are silent or of another gain, of those that are not what is played."""
+        kept = [at for at in range(self.count) if at not in self._played]
+        loudest = float(power[kept].max())
+        reasons = {at: "silent" for at in kept if power[at] < SILENT * loudest}
+        heard = [at for at in kept if at not in reasons]
+        median = float(np.median(power[heard])) if len(heard) > 2 else loudest
+        for at in heard if loudest > 0.0 else ():
+            if not median / APART < power[at] < APART * median:
+                apart = f"{abs(10 * np.log10(power[at] / median)):.0f} dB"
+                reasons[at] = f"{apart} {'louder' if power[at] > median else 'softer'} than the others"
         return reasons

@@ -12,7 +12,7 @@ import logging
 import threading
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -21,6 +21,7 @@ from edgefilter.dsp.resample import Resampler
 from edgefilter.errors import SignalError, UsageError
 from edgefilter.filter.barge_in import BargeInSettings
 from edgefilter.filter.ego_filter import EgoFilter
+from edgefilter.integrations.channels import microphones, named
 from edgefilter.types import SAMPLE_RATE, SET_UP_WRONG, Event, Samples
 
 MOST_QUEUED_S = 600.0
@@ -54,9 +55,15 @@ class Duplex:
         Called with each `Event`, in the thread of `hear`. Without it the latest thousand are kept for `events()`.
     clock : callable
         Seconds, monotonic.
+    mic_channels : sequence of int, optional
+        Numbers, from 0, of the channels of what is heard that are microphones, one to eight; the first named is the one
+        that the answer sounds like. Without it `hear` takes all channels for microphones, and `hear_pcm16`, which is
+        handed what a device brings, the mean of them.
 
     Attributes
     ----------
+    listeners : list of callable
+        Called with each `Event` beside on_event, in the thread of `hear`.
     enabled : bool
         False passes the microphone on as it is. The filter goes on beside it, so that its events stay true and it knows
         the room when it is switched on again.
@@ -64,7 +71,7 @@ class Duplex:
     Raises
     ------
     UsageError
-        For an engine that answers only at the end of a recording.
+        For an engine that answers only at the end of a recording, and mic_channels that name no channels.
 
     Notes
     -----
@@ -86,7 +93,10 @@ class Duplex:
         patience_s: float = PATIENCE_S,
         on_event: Callable[[Event], None] | None = None,
         clock: Callable[[], float] = time.monotonic,
+        mic_channels: Sequence[int] | None = None,
     ) -> None:
+        self._wanted = named(mic_channels)
+        self.listeners: list[Callable[[Event], object]] = []
         self.ego = EgoFilter(barge_in=BargeInSettings(judge="network")) if ego is None else ego
         if self.ego.waits_for_end:
             raise UsageError(
@@ -105,7 +115,7 @@ class Duplex:
         self._pace = Pace(clock)
         self._kept: deque[Event] = deque(maxlen=1000)
         self.enabled = True
-        self._talking = self._paused = self._deaf = False
+        self._talking = self._paused = self._deaf = self._averaged = False
         self._talking_since = self._heard_at = clock()
 
     def play(self, samples: Samples, rate: int) -> None:
@@ -148,10 +158,12 @@ class Duplex:
     def hear(self, samples: Samples, rate: int) -> Samples:
         """Take the microphone's next samples at rate and return finished samples of the human (m,), at the same rate.
 
-        samples: (n,), of an array (n, channels), as many channels in each call. One call may return none or more than came
-        in. All together are as many as came in, later by the filter's latency and, at another rate than 16 kHz, by the
-        resamplers' 3.5 ms each way.
+        samples: (n,), of an array (n, channels), as many channels in each call, of which mic_channels are taken. One
+        call may return none or more than came in. All together are as many as came in, later by the filter's latency and,
+        at another rate than 16 kHz, by the resamplers' 3.5 ms each way.
         """
+        if self._wanted is not None:
+            samples = microphones(samples.reshape(len(samples), -1), self._wanted)
         with self._hear_lock:
             channels = 1 if samples.ndim == 1 else samples.shape[1]
             if self._from_mic.rates[0] != rate or self._from_mic.channels != channels:
@@ -173,7 +185,8 @@ class Duplex:
         for event in events:
             if event.kind in SET_UP_WRONG:
                 _LOGGER.warning("%s: %s", event.kind.replace("_", " "), event.detail)
-            (self._on_event or self._kept.append)(event)
+            for tell in (self._on_event or self._kept.append, *self.listeners):
+                tell(event)
         if self.enabled:
             return human
         return samples if samples.ndim == 1 else samples[:, 0]
@@ -182,9 +195,35 @@ class Duplex:
         """What happened since the last call, oldest first, where no on_event takes it."""
         return [self._kept.popleft() for _ in range(len(self._kept))]
 
-    def hear_pcm16(self, pcm: bytes | memoryview, rate: int, channels: int = 1) -> bytes:
-        """As `hear`, for 16-bit samples, interleaved; each channel of the answer is the human."""
-        return as_pcm16(self.hear(from_pcm16(pcm, channels), rate), channels)
+    def hear_pcm16(self, pcm: bytes | memoryview, rate: int, channels: int = 1, answers: int | None = None) -> bytes:
+        """As `hear`, for 16-bit samples, interleaved.
+
+        answers: channels of the answer, each of them the human; None: as many as came in.
+        """
+        return as_pcm16(self.hear(self._heard_of(pcm, channels), rate), answers or channels)
+
+    def _heard_of(self, pcm: bytes | memoryview, channels: int) -> Samples:
+        """All channels (n, channels) where some of them are named, else their mean (n,), which is said once."""
+        if self._wanted is not None:
+            return all_of_pcm16(pcm, channels)
+        if channels > 1 and not self._averaged:
+            self._averaged = True
+            _LOGGER.warning("%d channels averaged to one: name the microphones of an array (mic_channels)", channels)
+        return from_pcm16(pcm, channels)
+
+    @property
+    def heard(self) -> int:
+        """Samples of the microphone so far, at 16 kHz: what the samples of events and turns are counted by."""
+        return self._heard
+
+    def require_judge(self, what: str) -> None:
+        """Raise UsageError where an engine of the filter judges no speech: what would never notice the human."""
+        if not self.ego.judges_speech:
+            raise UsageError(
+                f"{what} got a filter whose engines ({', '.join(self.ego.stats()['engines'])}) do not all judge speech,"
+                " so that the human would not be noticed: leave out budget_ms, or give EgoFilter"
+                " barge_in=BargeInSettings(judge='network')"
+            )
 
     @property
     def queued_s(self) -> float:
@@ -309,10 +348,15 @@ class Pace:
 
 def from_pcm16(pcm: bytes | memoryview, channels: int = 1) -> Samples:
     """16-bit little-endian samples, interleaved, as one channel (n,) of +-1: their mean."""
+    stereo = all_of_pcm16(pcm, channels)
+    return stereo[:, 0].copy() if channels == 1 else stereo.mean(axis=1, dtype=np.float32)
+
+
+def all_of_pcm16(pcm: bytes | memoryview, channels: int) -> Samples:
+    """16-bit little-endian samples, interleaved, as (n, channels) of +-1."""
     if len(pcm) % (2 * channels):
         raise SignalError(f"found {len(pcm)} bytes, expected whole 16-bit samples of {channels} channels")
-    stereo = np.frombuffer(pcm, "<i2").reshape(-1, channels).astype(np.float32) / np.float32(FULL_SCALE)
-    return stereo[:, 0].copy() if channels == 1 else stereo.mean(axis=1, dtype=np.float32)
+    return np.frombuffer(pcm, "<i2").reshape(-1, channels).astype(np.float32) / np.float32(FULL_SCALE)
 
 
 def as_pcm16(samples: Samples, channels: int = 1) -> bytes:

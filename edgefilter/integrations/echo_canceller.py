@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import logging
 import math
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import TypeVar
@@ -16,13 +17,14 @@ from edgefilter.audio.raw import FULL_SCALE, to_pcm16
 from edgefilter.dsp.resample import Resampler
 from edgefilter.errors import SignalError, UsageError
 from edgefilter.filter.ego_filter import EgoFilter
+from edgefilter.integrations.channels import microphones, named
 from edgefilter.profile.data import Profile
 from edgefilter.types import SAMPLE_RATE, Event, Samples
 
 LOWEST_RATE, HIGHEST_RATE = 8000, 48000
 """Hz that a canceller may run at: what telephones and sound cards have."""
 MOST_CHANNELS = 8
-"""Microphones of one canceller; each has a filter of its own, and the time that this takes."""
+"""Channels of one canceller; unless they form an array, each has a filter of its own, and the time that this takes."""
 Sound = TypeVar("Sound", bytes, bytearray, NDArray[np.int16], NDArray[np.floating])
 _LOGGER = logging.getLogger(__name__)
 
@@ -35,11 +37,14 @@ class EchoCanceller:
     sample_rate : int
         Of microphone and reference, 8000 to 48000 Hz.
     channels : int
-        Microphones, 1 to 8. Each is filtered by itself, which takes its own time.
+        Of the microphone's sound, 1 to 8. Each is filtered by itself, which takes its own time.
     profile : Profile, str or Path, optional
         As of `EgoFilter`.
     engine : str
         As of `EgoFilter`.
+    mic_channels : sequence of int, optional
+        Numbers, from 0, of the channels that are microphones of one array; the answer then is one channel, which
+        sounds like the first that is named.
 
     Attributes
     ----------
@@ -49,7 +54,7 @@ class EchoCanceller:
     Raises
     ------
     UsageError
-        For a rate or a number of channels out of range, and an engine that answers only at the end of a recording.
+        For a rate, a number of channels or mic_channels out of range, and an engine that answers only at the end of a recording.
 
     Notes
     -----
@@ -71,6 +76,7 @@ class EchoCanceller:
         channels: int = 1,
         profile: Profile | str | Path | None = None,
         engine: str = "auto",
+        mic_channels: Sequence[int] | None = None,
     ) -> None:
         if not LOWEST_RATE <= sample_rate <= HIGHEST_RATE:
             raise UsageError(
@@ -78,8 +84,12 @@ class EchoCanceller:
             )
         if not 1 <= channels <= MOST_CHANNELS:
             raise UsageError(f"channels is {channels}, expected 1 to {MOST_CHANNELS}: leave some microphones out")
+        array = named(mic_channels)
+        if array and max(array) >= channels:
+            raise UsageError(f"mic_channels names channel {max(array)}, found {channels} channels, counted from 0")
         self.sample_rate, self.channels = sample_rate, channels
-        self._filters = [EgoFilter(profile, engine) for _ in range(channels)]
+        self._heard = [array] if array else [[number] for number in range(channels)]
+        self._filters = [EgoFilter(profile, engine) for _ in self._heard]
         first = self._filters[0]
         if first.waits_for_end:
             raise UsageError(
@@ -115,14 +125,15 @@ class EchoCanceller:
         rate = self.sample_rate
         for each in self._filters:
             each.reset()
-        self._to_filter = [Resampler(rate, SAMPLE_RATE) for _ in range(self.channels + 1)]
-        self._from_filter = [Resampler(SAMPLE_RATE, rate) for _ in range(self.channels)]
+        self._to_filter = [Resampler(rate, SAMPLE_RATE, len(heard)) for heard in self._heard]
+        self._of_ref = Resampler(rate, SAMPLE_RATE)
+        self._from_filter = [Resampler(SAMPLE_RATE, rate) for _ in self._heard]
         self.delay = self._filters[0].latency
         if rate != SAMPLE_RATE:
             # what both resamplers and the filter hold back, and a sample for each of the three that counts whole ones
-            held_s = self._to_filter[0].delay_s + self.delay / SAMPLE_RATE + self._from_filter[0].delay_s
+            held_s = self._of_ref.delay_s + self.delay / SAMPLE_RATE + self._from_filter[0].delay_s
             self.delay = math.ceil(held_s * rate + 2 * max(rate / SAMPLE_RATE, 1.0))
-        self._ready: Samples = np.zeros((self.channels, self.delay), np.float32)
+        self._ready: Samples = np.zeros((len(self._heard), self.delay), np.float32)
 
     @property
     def delay_ms(self) -> float:
@@ -152,7 +163,8 @@ class EchoCanceller:
         Returns
         -------
         the type of mic
-            As long as mic and in its shape, late by `delay`; integers beyond full scale are clipped.
+            As long as mic and in its shape, late by `delay`; of an array one channel, (n,). Integers beyond full scale
+            are clipped.
 
         Raises
         ------
@@ -170,14 +182,14 @@ class EchoCanceller:
             )
         if not count:
             return mic
-        said = self._to_filter[-1].push(played.reshape(count, -1).mean(axis=1, dtype=np.float32))
+        said = self._of_ref.push(played.reshape(count, -1).mean(axis=1, dtype=np.float32))
         new = []
         for number, ego in enumerate(self._filters):
-            human = ego.process(self._to_filter[number].push(np.ascontiguousarray(heard[:, number])), said)
+            human = ego.process(self._to_filter[number].push(microphones(heard, self._heard[number])), said)
             new.append(self._from_filter[number].push(human))
         ready = np.concatenate((self._ready, np.stack(new)), axis=1)
         self._ready = ready[:, count:]
-        return _like(ready[:, :count].T.reshape(form), mic)
+        return _like(ready[:, :count].T.reshape(form if len(ready) == self.channels else count), mic)
 
     async def process_async(self, mic: Sound, ref: Sound) -> Sound:
         """As `process`, in a thread of its own, so that the event loop goes on; calls are served in their order."""

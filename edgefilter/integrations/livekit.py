@@ -10,14 +10,18 @@ Needs `pip install '.[livekit]'` in a checkout.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import asyncio
+import time
+from collections.abc import Callable, Sequence
 
 from livekit import rtc
+from livekit.agents import vad
 from livekit.agents.voice import io
 
 from edgefilter.filter.ego_filter import EgoFilter
-from edgefilter.integrations.duplex import Duplex
-from edgefilter.types import Event
+from edgefilter.integrations.duplex import Duplex, as_pcm16, from_pcm16
+from edgefilter.integrations.turns import TurnByTurn
+from edgefilter.types import SAMPLE_RATE, Event
 
 ROOM_HOLDS_S = 0.2
 """Speech that a room's output holds ahead and throws away when it is paused (room_io: queue_size_ms). Behind a sink that
@@ -35,6 +39,8 @@ class EgoProcessor(rtc.FrameProcessor[rtc.AudioFrame]):
         As of `edgefilter.integrations.duplex.Duplex`.
     on_event : callable, optional
         Called with each `edgefilter.Event`, in the event loop: `session.interrupt()` may be called there.
+    mic_channels : sequence of int, optional
+        As of `Duplex`: those channels of the frames that are microphones of an array. Without it their mean is taken.
 
     Attributes
     ----------
@@ -42,13 +48,34 @@ class EgoProcessor(rtc.FrameProcessor[rtc.AudioFrame]):
         Shared by the processor and its tap: `duplex.stats()`, `duplex.ego`.
     """
 
-    def __init__(self, ego: EgoFilter | None = None, on_event: Callable[[Event], None] | None = None) -> None:
-        self.duplex = Duplex(ego, patience_s=0.0, on_event=on_event)  # the room holds speech ahead: none is late
+    def __init__(
+        self,
+        ego: EgoFilter | None = None,
+        on_event: Callable[[Event], None] | None = None,
+        mic_channels: Sequence[int] | None = None,
+    ) -> None:
+        # the room holds speech ahead: none is late
+        self.duplex = Duplex(ego, patience_s=0.0, on_event=on_event, mic_channels=mic_channels)
         self._ready = b""
 
     def tap(self, output: io.AudioOutput) -> io.AudioOutput:
         """Return an output, for `session.output.audio`, that hands speech on to this one and takes it as reference."""
         return _Tap(self.duplex, output)
+
+    def vad(self) -> vad.VAD:
+        """Return the filter's own voice activity detection, for `AgentSession` and for `stt.StreamAdapter`.
+
+        A recogniser behind that adapter gets the human's finished turns, one channel: with several microphones they are
+        understood better than what was streamed.
+
+        Raises
+        ------
+        UsageError
+            Where the filter's engine, or a cheaper one that may take over, judges no speech: the human would not be
+            noticed.
+        """
+        self.duplex.require_judge("vad()")
+        return _HumanVAD(self.duplex)
 
     @property
     def enabled(self) -> bool:
@@ -104,3 +131,54 @@ class _Tap(io.AudioOutput):
     def resume(self) -> None:
         self._duplex.resume(skipped_s=ROOM_HOLDS_S)
         super().resume()
+
+
+class _HumanVAD(vad.VAD):
+    """Speech is what the filter's human_speaks says: the thresholds are those of its BargeInSettings."""
+
+    def __init__(self, duplex: Duplex) -> None:
+        super().__init__(capabilities=vad.VADCapabilities(update_interval=duplex.ego.hop / SAMPLE_RATE))
+        self._duplex = duplex
+
+    def stream(self) -> vad.VADStream:
+        return _HumanStream(self, self._duplex)
+
+
+class _HumanStream(vad.VADStream):
+    def __init__(self, owner: vad.VAD, duplex: Duplex) -> None:
+        self._duplex, self._turns = duplex, TurnByTurn(duplex)
+        super().__init__(owner)
+
+    async def _main_task(self) -> None:
+        speaking, spoke_s, silent_s, samples = False, 0.0, 0.0, 0
+
+        def tell(kind: vad.VADEventType, frames: list[rtc.AudioFrame]) -> None:
+            event = vad.VADEvent(
+                type=kind, samples_index=samples, timestamp=time.time(), speech_duration=spoke_s,
+                silence_duration=silent_s, frames=frames, probability=float(speaking), speaking=speaking,
+                raw_accumulated_speech=spoke_s if speaking else 0.0, raw_accumulated_silence=silent_s,
+            )  # fmt: skip
+            self._event_ch.send_nowait(event)
+
+        try:
+            async for frame in self._input_ch:
+                if not isinstance(frame, rtc.AudioFrame):  # a hard end of the segment
+                    speaking, spoke_s = False, 0.0
+                    continue
+                samples += frame.samples_per_channel
+                self._turns.hear(from_pcm16(frame.data.cast("B"), frame.num_channels), frame.sample_rate)
+                before, speaking = speaking, self._duplex.ego.human_speaks
+                if speaking and not before:
+                    spoke_s = 0.0
+                    self._turns.start()
+                spoke_s += frame.duration if speaking else 0.0
+                silent_s = 0.0 if speaking else silent_s + frame.duration
+                if speaking and not before:
+                    tell(vad.VADEventType.START_OF_SPEECH, [frame])
+                tell(vad.VADEventType.INFERENCE_DONE, [frame])
+                if before and not speaking:
+                    whole, rate = await asyncio.to_thread(self._turns.take)
+                    tell(vad.VADEventType.END_OF_SPEECH, [rtc.AudioFrame(as_pcm16(whole), rate, 1, whole.size)])
+                    spoke_s = 0.0
+        finally:
+            self._turns.close()

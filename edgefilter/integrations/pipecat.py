@@ -9,16 +9,25 @@ Needs `pip install '.[pipecat]'` in a checkout.
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any
 
 from pipecat.audio.filters.base_audio_filter import BaseAudioFilter
 from pipecat.audio.vad.vad_analyzer import VADAnalyzer, VADParams
-from pipecat.frames.frames import FilterControlFrame, FilterEnableFrame
+from pipecat.frames.frames import (
+    FilterControlFrame,
+    FilterEnableFrame,
+    Frame,
+    InputAudioRawFrame,
+    VADUserStartedSpeakingFrame,
+    VADUserStoppedSpeakingFrame,
+)
+from pipecat.processors.frame_processor import FrameDirection, FrameProcessor
 
-from edgefilter.errors import UsageError
 from edgefilter.filter.ego_filter import EgoFilter
-from edgefilter.integrations.duplex import Duplex
+from edgefilter.integrations.duplex import Duplex, as_pcm16, from_pcm16
+from edgefilter.integrations.turns import TurnByTurn
 from edgefilter.types import SAMPLE_RATE, Event
 
 
@@ -37,6 +46,8 @@ class EgoFilters:
         transport: one that is given another number as well is refused by Python.
     on_event : callable, optional
         Called with each `edgefilter.Event`, in a thread of the event loop's executor.
+    mic_channels : sequence of int, optional
+        As of `Duplex`: those of the in_channels that are microphones of an array. Without it their mean is taken.
 
     Attributes
     ----------
@@ -53,8 +64,9 @@ class EgoFilters:
         in_channels: int = 1,
         out_channels: int = 1,
         on_event: Callable[[Event], None] | None = None,
+        mic_channels: Sequence[int] | None = None,
     ) -> None:
-        self.duplex = Duplex(ego, on_event=on_event)
+        self.duplex = Duplex(ego, on_event=on_event, mic_channels=mic_channels)
         self.params: dict[str, Any] = {
             "audio_in_filter": _Microphone(self.duplex, in_channels),
             "audio_in_channels": in_channels,
@@ -73,14 +85,17 @@ class EgoFilters:
             Where the filter's engine, or a cheaper one that may take over, judges no speech: the human would not be
             noticed.
         """
-        ego = self.duplex.ego
-        if not ego.judges_speech:
-            raise UsageError(
-                f"vad() got a filter whose engines ({', '.join(ego.stats()['engines'])}) do not all judge speech, so"
-                " that the human would not be noticed: leave out budget_ms, or give EgoFilter"
-                " barge_in=BargeInSettings(judge='network')"
-            )
-        return _HumanVAD(ego, params)
+        self.duplex.require_judge("vad()")
+        return _HumanVAD(self.duplex.ego, params)
+
+    def turns(self) -> FrameProcessor:
+        """Return a processor to put between voice activity detection and a segmented recogniser, which then gets turns.
+
+        It holds the microphone's sound back and hands on the human's finished turn, one channel, just before the frame
+        that says that the human has stopped: with several microphones it is understood better than what was streamed.
+        Processors that want the sound as it comes stand before it.
+        """
+        return _Turns(self.duplex)
 
 
 class _Filter(BaseAudioFilter):
@@ -129,3 +144,28 @@ class _HumanVAD(VADAnalyzer):
 
     def voice_confidence(self, buffer: bytes) -> float:
         return float(self._ego.human_speaks)
+
+
+class _Turns(FrameProcessor):
+    def __init__(self, duplex: Duplex) -> None:
+        super().__init__()
+        self._turns = TurnByTurn(duplex)
+        self._latest: InputAudioRawFrame | None = None
+
+    async def process_frame(self, frame: Frame, direction: FrameDirection) -> None:
+        await super().process_frame(frame, direction)
+        if isinstance(frame, InputAudioRawFrame):
+            self._latest = frame
+            self._turns.hear(from_pcm16(frame.audio, frame.num_channels), frame.sample_rate)
+            return
+        if isinstance(frame, VADUserStartedSpeakingFrame):
+            self._turns.start()
+        elif isinstance(frame, VADUserStoppedSpeakingFrame) and self._latest is not None:
+            samples, _ = await asyncio.to_thread(self._turns.take)
+            if samples.size:
+                await self.push_frame(replace(self._latest, audio=as_pcm16(samples), num_channels=1), direction)
+        await self.push_frame(frame, direction)
+
+    async def cleanup(self) -> None:
+        await super().cleanup()
+        self._turns.close()

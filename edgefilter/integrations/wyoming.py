@@ -4,7 +4,8 @@ r"""Wyoming: microphone and loudspeaker of a Home Assistant satellite, with the 
         --loudspeaker 'aplay -q -r 22050 -c 1 -f S16_LE -t raw' --profile robot.npz
     wyoming-satellite --mic-uri tcp://127.0.0.1:10600 --snd-uri tcp://127.0.0.1:10601 ...
 
-Needs `pip install '.[wyoming]'` in a checkout.
+Needs `pip install '.[wyoming]'` in a checkout. With `--recogniser tcp://...` it stands before a recogniser, too, and gives it
+the human's finished turns.
 """
 
 from __future__ import annotations
@@ -17,13 +18,15 @@ import shlex
 import signal
 import sys
 import time
-from collections.abc import AsyncIterator, Coroutine
+from collections.abc import AsyncIterator, Callable, Coroutine, Sequence
 from functools import partial
 from typing import Any, cast
 
 import numpy as np
+from wyoming.asr import Transcribe, Transcript
 from wyoming.audio import AudioChunk, AudioChunkConverter, AudioFormat, AudioStart, AudioStop
 from wyoming.client import AsyncClient
+from wyoming.error import Error
 from wyoming.event import Event as Message
 from wyoming.info import Attribution, Describe, Info, MicProgram, SndProgram
 from wyoming.mic import MicProcessAsyncClient
@@ -37,6 +40,7 @@ from edgefilter.errors import EdgefilterError, SignalError
 from edgefilter.filter.barge_in import BargeInSettings
 from edgefilter.filter.ego_filter import EgoFilter
 from edgefilter.integrations.duplex import ABSENT_S, MOST_QUEUED_S, Duplex, as_pcm16, from_pcm16
+from edgefilter.integrations.turns import TurnByTurn
 from edgefilter.types import SAMPLE_RATE, Event
 
 MOST_WAITING = 256
@@ -46,7 +50,12 @@ MOST_BYTES = round(MOST_QUEUED_S * SAMPLE_RATE) * np.int16().itemsize
 AHEAD_S = 0.5
 """Speech that the loudspeaker gets before its turn: the size of aplay's buffer. Speech further ahead is still here when
 it is dropped."""
-MIC_URI, SND_URI = "tcp://127.0.0.1:10600", "tcp://127.0.0.1:10601"
+UNDER_WAY_S = 1.0
+"""For how long a recogniser that is told that the human has ended waits for the filter's word: it takes half a second of
+pause, and the sound half as much to the filter."""
+WAY_S = 0.5
+"""How long after its sound the message may come with which a client begins: what was said before is not part of it."""
+MIC_URI, SND_URI, ASR_URI = (f"tcp://127.0.0.1:{10600 + at}" for at in range(3))
 ABOUT: dict[str, Any] = {
     "attribution": Attribution("edgefilter", url=""),
     "installed": True,
@@ -68,6 +77,11 @@ class EgoService:
         As of `edgefilter.integrations.duplex.Duplex`.
     mic_format, snd_format : AudioFormat
         What the commands write and read, of width 2.
+    mic_channels : sequence of int, optional
+        As of `Duplex`: those channels of the microphone that form an array. Without it their mean is taken.
+    recogniser : str, optional
+        URI of a Wyoming service that makes text of speech. A third service stands before it then: whoever has the
+        microphone's sound recognised there, as Home Assistant does, gets the words of the human's finished turn.
     stop_for_speech : bool
         Whether the loudspeaker is silenced when the human begins to speak. A satellite cannot do it: the protocol has
         no message for it.
@@ -88,9 +102,12 @@ class EgoService:
         mic_format: AudioFormat = AudioFormat(16_000, 2, 1),
         snd_format: AudioFormat = AudioFormat(22_050, 2, 1),
         stop_for_speech: bool = False,
+        mic_channels: Sequence[int] | None = None,
+        recogniser: str | None = None,
     ) -> None:
         self._events: list[Event] = []
-        self.duplex = Duplex(ego, on_event=self._events.append)
+        self.duplex = Duplex(ego, on_event=self._events.append, mic_channels=mic_channels)
+        self.recogniser = recogniser
         self.mic_format = mic_format
         self.player = Player(loudspeaker, snd_format)
         self._microphone = microphone
@@ -98,11 +115,13 @@ class EgoService:
         self.listeners: set[_Listener] = set()
         self.speakers: set[_Speaker] = set()
 
-    async def run(self, mic_uri: str = MIC_URI, snd_uri: str = SND_URI) -> None:
-        """Serve both until cancelled."""
-        servers = [AsyncServer.from_uri(uri) for uri in (mic_uri, snd_uri)]
+    async def run(self, mic_uri: str = MIC_URI, snd_uri: str = SND_URI, asr_uri: str = ASR_URI) -> None:
+        """Serve all until cancelled."""
+        uris = [mic_uri, snd_uri, *([asr_uri] if self.recogniser else ())]
+        servers = [AsyncServer.from_uri(uri) for uri in uris]
+        handlers: tuple[Callable[..., AsyncEventHandler], ...] = (_Listener, _Speaker, _Recogniser)
         try:
-            for server, handler in zip(servers, (_Listener, _Speaker)):
+            for server, handler in zip(servers, handlers):
                 await server.start(partial(handler, self))  # its run() would take SIGTERM for itself alone
             await self._listen()
         finally:
@@ -152,9 +171,9 @@ class EgoService:
             await asyncio.sleep(ABSENT_S)
 
     async def _hear(self, chunk: AudioChunk) -> None:
-        human = await asyncio.to_thread(self.duplex.hear, from_pcm16(chunk.audio, chunk.channels), chunk.rate)
-        if human.size:
-            self._tell(AudioChunk(chunk.rate, 2, 1, as_pcm16(human), chunk.timestamp).event())
+        human = await asyncio.to_thread(self.duplex.hear_pcm16, chunk.audio, chunk.rate, chunk.channels, 1)
+        if human:
+            self._tell(AudioChunk(chunk.rate, 2, 1, human, chunk.timestamp).event())
         while self._events:
             event = self._events.pop(0)
             if event.kind == "speech_started":
@@ -294,6 +313,57 @@ class _Speaker(_Client):
             self._said.put_nowait(None)
 
 
+class _Recogniser(_Client):
+    """A client that has sound recognised: the recogniser behind gets the human's finished turn in its place."""
+
+    def __init__(self, service: EgoService, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        super().__init__(service, reader, writer)
+        self._turns = TurnByTurn(service.duplex)
+        self._asked = Transcribe().event()
+
+    async def handle_event(self, event: Message) -> bool:
+        if Describe.is_type(event.type):
+            await self._relay([event], Info.is_type)
+        elif Transcribe.is_type(event.type):
+            self._asked = event
+        elif AudioStart.is_type(event.type):
+            self._turns.start(self._service.duplex.heard - round(WAY_S * SAMPLE_RATE))
+        elif AudioChunk.is_type(event.type):
+            chunk = _chunk_of(event)
+            self._turns.hear(from_pcm16(chunk.audio, chunk.channels), chunk.rate)
+        elif AudioStop.is_type(event.type):
+            await self._transcribe()
+        return True
+
+    async def _transcribe(self) -> None:
+        until = time.monotonic() + UNDER_WAY_S
+        while self._service.duplex.ego.human_speaks and time.monotonic() < until:
+            await asyncio.sleep(0.005)
+        samples, rate = await asyncio.to_thread(self._turns.take)
+        sound = AudioChunk(rate, 2, 1, as_pcm16(samples)).event()
+        await self._relay([self._asked, AudioStart(rate, 2, 1).event(), sound, AudioStop().event()], Transcript.is_type)
+
+    async def _relay(self, messages: list[Message], last: Callable[[str], bool]) -> None:
+        """Ask the recogniser and hand on what it answers, until the last of it, or that it cannot be reached."""
+        where = str(self._service.recogniser)
+        try:
+            async with AsyncClient.from_uri(where) as client:
+                for message in messages:
+                    await client.write_event(message)
+                while (answer := await client.read_event()) is not None:
+                    await self.write_event(answer)
+                    if last(answer.type) or Error.is_type(answer.type):
+                        return
+            why = "ended without an answer"
+        except OSError as error:
+            why = f"cannot be reached ({error})"
+        _LOGGER.warning("recogniser %s %s", where, why)
+        await self.write_event(Error(f"recogniser {where} {why}").event())
+
+    async def disconnect(self) -> None:
+        self._turns.close()
+
+
 class Player:
     """A loudspeaker, a command or the service at a URI, that can be silenced; it opens again with the next sound."""
 
@@ -384,12 +454,16 @@ def main(words: list[str] | None = None) -> int:
     parser.add_argument("--microphone", required=True, help="command that writes raw 16-bit samples, or a URI")
     parser.add_argument("--loudspeaker", required=True, help="command that reads raw 16-bit samples, or a URI")
     for end, rate in (("mic", 16_000), ("snd", 22_050)):
-        parser.add_argument(f"--{end}-rate", type=int, default=rate, help="of the command")
-        parser.add_argument(f"--{end}-channels", type=int, default=1, help="of the command")
+        parser.add_argument(f"--{end}-command-rate", type=int, default=rate, help="what the command's sound has")
+        parser.add_argument(f"--{end}-command-channels", type=int, default=1, help="what the command's sound has")
+    told = "channels of the microphone that form an array, from 0, as 1,2,3; otherwise the mean of all is taken"
+    parser.add_argument("--mic-channels", type=_numbers, help=told)
+    parser.add_argument("--recogniser", help="URI of a service that makes text of speech: it gets finished turns")
     parser.add_argument("--profile", help="the calibrated robot")
     parser.add_argument("--engine", default="auto", help="one beside which the network can judge speech")
     parser.add_argument("--mic-uri", default=MIC_URI, help="where satellites find the microphone")
     parser.add_argument("--snd-uri", default=SND_URI, help="where satellites find the loudspeaker")
+    parser.add_argument("--asr-uri", default=ASR_URI, help="where Home Assistant finds the recogniser")
     parser.add_argument("--stop-for-speech", action="store_true", help="fall silent when the human begins to speak")
     args = parser.parse_args(words)
     try:
@@ -397,11 +471,13 @@ def main(words: list[str] | None = None) -> int:
             args.microphone,
             args.loudspeaker,
             EgoFilter(args.profile, args.engine, barge_in=BargeInSettings(judge="network")),
-            AudioFormat(args.mic_rate, 2, args.mic_channels),
-            AudioFormat(args.snd_rate, 2, args.snd_channels),
+            AudioFormat(args.mic_command_rate, 2, args.mic_command_channels),
+            AudioFormat(args.snd_command_rate, 2, args.snd_command_channels),
             args.stop_for_speech,
+            args.mic_channels,
+            args.recogniser,
         )
-        asyncio.run(_until_sigterm(service.run(args.mic_uri, args.snd_uri)))
+        asyncio.run(_until_sigterm(service.run(args.mic_uri, args.snd_uri, args.asr_uri)))
     except KeyboardInterrupt:
         return 128 + signal.SIGINT
     except asyncio.CancelledError:
@@ -410,6 +486,11 @@ def main(words: list[str] | None = None) -> int:
         print(f"edgefilter: {error}", file=sys.stderr)
         return 1
     return 0
+
+
+def _numbers(text: str) -> list[int]:
+    """Whole numbers with commas between them."""
+    return [int(part) for part in text.split(",")]
 
 
 async def _until_sigterm(serving: Coroutine[None, None, None]) -> None:

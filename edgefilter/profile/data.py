@@ -194,6 +194,31 @@ class Profile:
         """How many it was calibrated with."""
         return 1 if self.array is None else 1 + len(self.array.responses)
 
+    def of_microphone(self, at: int) -> Profile:
+        """The robot as one microphone of the array hears it: its path and its fan.
+
+        Parameters
+        ----------
+        at : int
+            Which one, from 0.
+
+        Returns
+        -------
+        Profile
+            Of one microphone. What a calibration says beside path and fan is of the first one in all of them.
+
+        Raises
+        ------
+        ProfileError
+            Where there is no such microphone.
+        """
+        if not 0 <= at < self.microphones:
+            raise ProfileError(f"the profile holds {self.microphones} microphones, found microphone {at}, from 0")
+        if self.array is None or at == 0:
+            return replace(self, array=None)
+        noise = np.ascontiguousarray(self.array.noise[:, at, at, 0])
+        return replace(self, echo=self._models()[at], noise_psd=np.maximum(noise, 0.0), array=None)
+
     def running_responses(self) -> Samples:
         """The paths as the running filter begins with them, the effects that are filters in them.
 

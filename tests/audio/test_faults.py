@@ -1,5 +1,7 @@
 """What befalls sound devices while a run goes on, on virtual ones: it goes on, says so, and counts what is missing."""
 
+import json
+
 import numpy as np
 import pytest
 
@@ -8,10 +10,13 @@ from edgefilter.audio.live import LiveSink, LiveSource
 from edgefilter.audio.pairing import TOLERANCE, WINDOW
 from edgefilter.audio.steady import SampleClock, SteadySink
 from edgefilter.audio.troubles import Troubles
+from edgefilter.cli import main
 from edgefilter.errors import DeviceError, UsageError
 from edgefilter.filter.ego_filter import EgoFilter
 from edgefilter.session import filter_blocks
+from edgefilter.types import ALL_CHANNELS
 from tests.audio.virtual_portaudio import CALLBACK_S, VirtualDevice
+from tests.filter.test_arrays import calibration
 
 FOREVER = float("inf")
 STEP = round(CALLBACK_S * 16000)
@@ -230,3 +235,36 @@ def test_a_channel_that_a_device_lacks_is_one_line(plug):
     plug(VirtualDevice("array", "input", channels=4))
     with pytest.raises(UsageError, match="input device 'array' has 4 channels, found channel 4 asked for"):
         LiveSource("array", channels=[1, 4])
+
+
+def test_all_channels_of_a_device_are_opened_where_that_is_asked(plug):
+    plug(VirtualDevice("array", "input", channels=4), VirtualDevice("mixer", "input", channels=32))
+    source = LiveSource("array", seconds=1, channels=ALL_CHANNELS)
+    with source:
+        heard = np.concatenate([block.mic for block in source])
+    assert source.microphones == 4 and any("channels 0, 1, 2, 3 of 4" in note for note in source.notes)
+    np.testing.assert_allclose(heard[-1], [0.1, 0.2, 0.3, 0.4], atol=1e-6)
+    with pytest.raises(UsageError, match="'mixer' has 32 channels, expected at most 8 microphones: name them"):
+        LiveSource("mixer", channels=ALL_CHANNELS)
+
+
+@pytest.mark.parametrize("microphones", [3, 1])
+def test_a_run_opens_an_array_where_the_profile_is_of_one_and_says_what_it_does(plug, tmp_path, capsys, microphones):
+    plug(VirtualDevice("array", "input", channels=3), VirtualDevice("line", "input"))
+    calibration(microphones).save(tmp_path / "robot.npz")
+
+    def run(*more):
+        words = ["run", "--input", "array", "--reference", "line", "--profile", tmp_path / "robot.npz", "--quiet"]
+        words += ["--engine", "linear", "--no-learn", "--seconds", "1", "--output", tmp_path / "out.wav", *more]
+        return main([str(word) for word in words]), capsys.readouterr().err
+
+    code, said = run("--json", tmp_path / "run.json")
+    array = json.loads((tmp_path / "run.json").read_text())["array"]
+    if microphones == 3:
+        assert array["microphones"] == 3 and "all 3 channels are microphones, since the profile is of an array" in said
+        code, said = run("--mic-channels", "0,1")
+        assert code == 1 and "holds 3 microphones, found 2" in said
+    else:
+        assert array is None and "the microphone has 3 channels and is one: name those of an array" in said
+        code, said = run("--mic-channels", "all")
+        assert code == 1 and "holds 1 microphones, found 3" in said

@@ -16,7 +16,7 @@ from edgefilter.audio.disk import Disk
 from edgefilter.audio.files import FileSink, FileSource, open_source
 from edgefilter.audio.recorder import Recorder
 from edgefilter.errors import AudioFileError, UsageError
-from edgefilter.types import Block
+from edgefilter.types import ALL_CHANNELS, Block
 
 ROOT = Path(__file__).parents[2]
 
@@ -304,6 +304,17 @@ def test_channels_that_are_wanted_come_in_their_order(tmp_path):
     assert np.array_equal(np.concatenate([block.ref for block in blocks]), four[:, 3])
     alone = np.concatenate([block.mic for block in FileSource(tmp_path / "four.wav", channels=[1])])
     assert np.array_equal(alone, four[:, 1])
+
+
+def test_all_channels_of_a_file_are_microphones_where_that_is_asked(tmp_path):
+    soundfile.write(tmp_path / "four.wav", np.arange(400, dtype=np.int16).reshape(-1, 4), 16000, "PCM_16")
+    source = FileSource(tmp_path / "four.wav", channels=ALL_CHANNELS)
+    heard = np.concatenate([block.mic for block in source])
+    assert source.microphones == 4 and source.notes[0].endswith("channels 0, 1, 2, 3 of 4")
+    np.testing.assert_array_equal(heard * 32768, np.arange(400).reshape(-1, 4))
+    soundfile.write(tmp_path / "nine.wav", np.zeros((400, 9)), 16000, "PCM_16")
+    with pytest.raises(UsageError, match="nine.wav has 9 channels, expected at most 8 microphones"):
+        FileSource(tmp_path / "nine.wav", channels=ALL_CHANNELS)
 
 
 def test_channels_are_resampled_together(tmp_path):

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from edgefilter.audio.measure import channels
-from edgefilter.commands.doctor import array_checks
+from edgefilter.calibration.chirps import chirps
+from edgefilter.commands.doctor import array_checks, array_set_up
 
 
 @pytest.fixture
@@ -62,3 +63,28 @@ def test_an_array_that_is_all_silent_is_listed_as_such(sound: np.ndarray) -> Non
 
 def test_one_microphone_has_no_list() -> None:
     assert list(array_checks(())) == []
+
+
+def test_a_clipped_microphone_is_named(sound: np.ndarray) -> None:
+    sound[:, 1] = np.clip(200.0 * sound[:, 1], -1.0, 1.0)
+    assert "channel 2" in [check.name for check in array_checks(channels(sound, [1, 2, 4])) if "clipped" in check.do]
+
+
+def test_chirps_show_which_microphone_is_played_processed_exchanged_or_of_another_gain() -> None:
+    from tests.filter.test_arrays import PATHS, calibration, fan
+
+    ref = np.pad(chirps(), (4000, 12000)).astype(np.float32)
+    mics = np.stack([np.convolve(ref, path)[: ref.size] for path in PATHS[:3]]) + 1e-4 * fan(ref.size, 3, 3).T
+    mics = mics.astype(np.float32)
+    assert [(check.name, check.state) for check in array_set_up([1, 2, 4], mics, ref, calibration(3))] == [
+        ("profile", "ok")
+    ]
+    assert list(array_set_up([1, 2, 4], mics, ref, None)) == []
+
+    def told(changed: np.ndarray) -> dict[str, str]:
+        return {check.name: check.found for check in array_set_up([1, 2, 4], changed, ref, calibration(3))}
+
+    assert "exchanged" in told(mics[[1, 0, 2]])["channel 1"]
+    assert "another gain, +6.0 dB" in told(mics * np.array([1, 1, 2], np.float32)[:, None])["channel 4"]
+    assert told(np.stack((mics[0], mics[1], ref)))["channel 4"] == "it is what is played"
+    assert "ms beside the others" in told(np.stack((mics[0], mics[1], np.roll(mics[2], 800))))["channel 4"]

@@ -157,12 +157,16 @@ def test_what_was_announced_before_the_first_block_is_still_waited_for() -> None
         (lambda x: 10.0 * x, "20 dB louder"),
         (lambda x: 0.05 * x, "26 dB softer"),
         (lambda x: np.sqrt(np.mean(x**2)) * noise(x.size, 9), "hears the robot otherwise"),
+        (lambda x: np.clip(2.0 * x / np.abs(x).max(), -1.0, 1.0), "clipped"),
+        (lambda x: 0.5 * talk()[1], "what is played"),
     ],
 )
 def test_a_microphone_that_is_no_part_of_the_array_is_left_out(change, reason) -> None:
     mic, ref, _ = talk()
     mic = mic.copy()
     mic[:, 1] = change(mic[:, 1])
+    if reason == "clipped":  # beside others that are nearly as loud, and are not
+        mic[:, ::2] *= np.float32(0.9 / np.abs(mic[:, ::2]).max())
     ego = EgoFilter(calibration(3), "ss")
     ego.process(mic, ref)
     stats = ego.stats()["array"]
@@ -182,6 +186,19 @@ def test_equal_channels_count_as_one_and_another_takes_the_place_of_the_first() 
     assert EgoFilter(engine="ss").stats()["array"] is None
 
 
+@pytest.mark.parametrize(
+    ("order", "left_out"),
+    [([0, 2, 1], {"1": 2, "2": 1}), ([1, 0, 2], {"0": 1, "1": 0}), ([0, 1, 2], {}), ([1, 2, 0], {"1": 2, "2": 0})],
+)
+def test_channels_that_were_exchanged_since_the_calibration_are_left_out_by_name(order, left_out) -> None:
+    mic, ref, _ = talk()
+    ego = EgoFilter(calibration(3), "ss")
+    ego.process(mic[:, order], ref)
+    found = ego.stats()["array"]["left_out"]
+    told = {at: f"exchanged: it hears the robot as channel {other} was calibrated to" for at, other in left_out.items()}
+    assert found == told
+
+
 @pytest.mark.parametrize("factor", [1e-4, 0.05, 10.0])
 def test_a_first_microphone_that_is_left_out_has_set_the_volume_of_no_other(factor: float) -> None:
     mic, ref, _ = talk()
@@ -194,6 +211,25 @@ def test_a_first_microphone_that_is_left_out_has_set_the_volume_of_no_other(fact
     span = slice(round(1.1 * RATE), round(1.9 * RATE))
     left = np.mean(ego.robot_removed()[span, 1:] ** 2, axis=0)
     assert np.all(left < 0.05 * np.mean(mic[span, 1:] ** 2, axis=0))
+
+
+def test_a_loopback_beside_one_microphone_is_the_one_that_is_left_out() -> None:
+    mic, ref, _ = talk()
+    ego = EgoFilter(engine="ss")
+    ego.process(np.stack((20.0 * np.roll(ref, 40), mic[:, 0]), axis=1).astype(np.float32), ref)
+    assert ego.stats()["array"]["left_out"] == {"0": "what is played, not a microphone"}
+
+
+def test_where_another_microphone_takes_the_place_of_the_first_the_delay_stays_what_it_is() -> None:
+    mic, ref, _ = talk()
+    mic = mic.copy()
+    mic[:, :2] = 0.0  # the third hears the robot two samples later, by a path on the first one's clock
+    ego = EgoFilter(calibration(3), "linear", keep_channels=True)
+    ego.process(mic[: 3 * RATE], ref[: 3 * RATE])
+    assert ego.stats()["array"] == {"microphones": 3, "reference": 2, "left_out": {"0": "silent", "1": "silent"}}
+    assert ego.stats()["alignment"]["delay_samples"] == pytest.approx(calibration(3).delay, abs=0.2)
+    last = slice(2 * RATE, 3 * RATE - 256)
+    assert np.mean(ego.robot_removed()[last, 2] ** 2) < 0.02 * np.mean(mic[last, 2] ** 2)
 
 
 def test_a_turn_that_is_told_late_begins_no_later() -> None:

@@ -2,13 +2,16 @@
 
 import importlib
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from edgefilter import EgoFilter
+from edgefilter import EgoFilter, Profile
+from edgefilter.calibration.array import cross_density
 from edgefilter.integrations import duplex
+from edgefilter.profile.array import ArrayCalibration
 
 collect_ignore = [] if sys.version_info >= (3, 11) else ["test_pipecat.py"]  # for which Pipecat is not made
 EXAMPLES = Path(__file__).parents[2] / "docs/examples"
@@ -40,6 +43,30 @@ def example():
 @pytest.fixture(scope="session")
 def room_of(example):
     return example("room")
+
+
+@pytest.fixture(scope="session")
+def pair(room_of):
+    """A profile of two microphones, and what a device of three channels hears (n, 3) in 3.7 s: first another one, then
+    these two, while a human speaks from 1 s to 2.5 s."""
+    robot = Profile.load(room_of.PROFILE)
+    rng = np.random.default_rng(3)
+
+    def both(first):
+        own = 0.1 * np.std(room_of.Room().fan) * rng.standard_normal((2, first.size))
+        return (np.stack((first, np.roll(first, 3))) + own).astype(np.float32)
+
+    further = np.roll(robot.echo.impulse_response, 3)[None]
+    fan = both(np.tile(room_of.Room().fan, 20))
+    room = room_of.Room()
+    heard = [room.hear(room_of.RATE)]
+    room.speak()
+    heard.append(room.hear(24_000))
+    room.human_from = None
+    heard.append(room.hear(19_200))
+    mics = both(np.concatenate(heard))
+    sound = np.stack((0.3 * np.roll(mics[0], 50), *mics), axis=1)
+    return replace(robot, array=ArrayCalibration(further, cross_density(fan))), sound
 
 
 @pytest.fixture

@@ -9,6 +9,7 @@ import soxr
 from edgefilter import EgoFilter, SignalError, UsageError
 from edgefilter.integrations import duplex as module
 from edgefilter.integrations.duplex import Duplex, as_pcm16, from_pcm16
+from edgefilter.integrations.turns import TurnByTurn
 
 RATE = 16000
 VOICE = 0.1 * np.random.default_rng(0).standard_normal(2 * RATE).astype(np.float32)
@@ -317,3 +318,78 @@ def test_an_array_goes_through_to_the_filter_and_one_channel_comes_back(rate):
     assert sum(part.size for part in heard) == pytest.approx(rate, abs=0.13 * rate)
     duplex.enabled = False
     assert np.array_equal(duplex.hear(frame, rate), frame[:, 0])
+
+
+def test_named_channels_are_an_array_and_others_are_not_heard(pair):
+    profile, sound = pair
+    duplex = Duplex(EgoFilter(profile, "linear"), mic_channels=[1, 2])
+    alone = EgoFilter(profile, "linear")
+    pcm = np.rint(sound[:RATE] * 32768).astype("<i2")
+    out = from_pcm16(duplex.hear_pcm16(pcm.tobytes(), RATE, 3), 3)
+    assert duplex.ego.stats()["array"]["microphones"] == 2
+    expected = alone.process(pcm[:, 1:].astype(np.float32) / 32768, np.zeros(RATE, np.float32))
+    np.testing.assert_allclose(out, expected, atol=1 / 32768)
+    one = from_pcm16(duplex.hear_pcm16(pcm.tobytes(), RATE, 3, 1))
+    assert RATE <= one.size < RATE + 256, "one channel where it is asked for"
+
+
+def test_the_channel_that_is_named_first_is_what_is_heard_of_it():
+    duplex = Duplex(EgoFilter(engine="bypass"), mic_channels=[2])
+    sound = np.stack((0 * VOICE, 0 * VOICE, VOICE), axis=1)
+    out = duplex.hear(sound, RATE)
+    np.testing.assert_allclose(out, VOICE[: out.size], atol=1e-6)
+    duplex.enabled = False
+    np.testing.assert_array_equal(duplex.hear(sound, RATE), VOICE)
+
+
+def test_channels_that_are_not_there_are_one_line():
+    with pytest.raises(SignalError, match="brings 2 channels, found channel 2 in mic_channels"):
+        Duplex(EgoFilter(engine="bypass"), mic_channels=[0, 2]).hear_pcm16(bytes(40), RATE, 2)
+    for wrong in ([], [1, 1], [-1, 0], range(9)):
+        with pytest.raises(UsageError, match="expected the numbers of one to 8 different channels, from 0"):
+            Duplex(EgoFilter(engine="bypass"), mic_channels=wrong)
+
+
+def test_that_channels_are_averaged_is_said_once(caplog):
+    duplex = Duplex(EgoFilter(engine="bypass"))
+    for _ in range(2):
+        duplex.hear_pcm16(bytes(400), RATE, 2)
+    assert caplog.text.count("2 channels averaged to one") == 1 and "mic_channels" in caplog.text
+
+
+@pytest.mark.parametrize("rate", [16_000, 48_000])
+def test_a_recogniser_gets_the_finished_turn_and_where_there_is_none_what_was_streamed(pair, rate):
+    profile, sound = pair
+    ended = []
+    duplex = Duplex(EgoFilter(profile, "crnn"), on_event=ended.append, mic_channels=[1, 2])
+    turns, hop = TurnByTurn(duplex), 320
+    turns.start()
+    for at in range(0, len(sound), hop):
+        human = duplex.hear(sound[at : at + hop], RATE)
+        turns.hear(np.repeat(human, rate // RATE), rate)
+    (turn,) = [event.turn for event in ended if event.turn]
+    taken, its_rate = turns.take()
+    assert its_rate == rate and taken.size == turn.samples.size * rate // RATE
+    assert duplex.heard == len(sound)
+    if rate == RATE:
+        np.testing.assert_array_equal(taken, turn.samples)
+    duplex.enabled = False
+    turns.start()
+    streamed = [duplex.hear(sound[at : at + hop], RATE) for at in range(0, len(sound), hop)]
+    for part in streamed:
+        turns.hear(part, RATE)
+    np.testing.assert_array_equal(turns.take()[0], np.concatenate(streamed))
+
+
+def test_of_a_turn_only_what_belongs_to_the_recogniser_s_is_taken(pair):
+    profile, sound = pair
+    duplex = Duplex(EgoFilter(profile, "crnn"), mic_channels=[1, 2])
+    turns = TurnByTurn(duplex)
+    duplex.hear(sound[:24_000], RATE)
+    turns.start(duplex.heard)
+    duplex.hear(sound[24_000:], RATE)
+    (turn,) = [event.turn for event in duplex.events() if event.turn]
+    taken, _ = turns.take()
+    assert turn.start < 24_000 and taken.size == turn.start + turn.samples.size - 24_000
+    turns.close()
+    assert duplex.listeners == []

@@ -191,3 +191,27 @@ def test_it_says_whether_the_human_speaks_and_forgets_all_at_a_reset(conversatio
     canceller.reset()
     assert not canceller.speaking
     np.testing.assert_array_equal(canceller.process(mic[: 11 * 16000], ref[: 11 * 16000]), first)
+
+
+@pytest.mark.parametrize("form", ["int16", "interleaved", "bytes"])
+def test_named_channels_are_one_array_and_the_answer_is_one_channel(form):
+    rng = np.random.default_rng(1)
+    ref = (0.1 * rng.standard_normal(16000)).astype(np.float32)
+    echo = np.stack([np.roll(ref, 300 + 40 * number) for number in range(4)], axis=1)
+    echo += 1e-3 * rng.standard_normal(echo.shape)
+    pcm = np.rint(echo * 32768).astype("<i2")
+    given = {"int16": pcm, "interleaved": pcm.reshape(-1), "bytes": pcm.tobytes()}[form]
+    with EchoCanceller(16000, 4, engine="linear", mic_channels=[1, 2, 3]) as canceller:
+        out = canceller.process(given, np.rint(ref * 32768).astype("<i2"))
+    assert type(out) is type(given)
+    out = np.frombuffer(out, "<i2") if form == "bytes" else out
+    assert out.shape == (16000,) and out.dtype == np.int16
+    assert 10 * np.log10(np.mean((out[12000:] / 32768.0) ** 2) / np.mean(echo[12000:, 1] ** 2)) < -15
+
+
+def test_of_one_named_channel_the_others_are_not_heard():
+    canceller = EchoCanceller(16000, 2, engine="bypass", mic_channels=[1])
+    out = canceller.process(NOISE, NOISE)
+    np.testing.assert_allclose(out[canceller.delay :], NOISE[: -canceller.delay, 1], atol=1e-6)
+    with pytest.raises(UsageError, match="mic_channels names channel 2, found 2 channels"):
+        EchoCanceller(16000, 2, engine="bypass", mic_channels=[0, 2])

@@ -5,9 +5,10 @@ import asyncio
 import numpy as np
 import pytest
 from livekit import rtc
+from livekit.agents import stt
 from livekit.agents.voice import io, room_io
 
-from edgefilter import EgoFilter
+from edgefilter import EgoFilter, UsageError
 from edgefilter.integrations.duplex import as_pcm16, from_pcm16
 from edgefilter.integrations.livekit import EgoProcessor
 
@@ -133,3 +134,49 @@ def test_switched_off_it_gives_the_microphone_as_it_is(ears):
     ears.enabled = False
     assert not ears.enabled
     np.testing.assert_array_equal(ears._process(frame_of(NOISE[:1200])).data, frame_of(NOISE[:1200]).data)
+
+
+class Recogniser(stt.STT):
+    """Keeps what it is to transcribe."""
+
+    def __init__(self):
+        super().__init__(capabilities=stt.STTCapabilities(streaming=False, interim_results=False))
+        self.segments = []
+
+    async def _recognize_impl(self, buffer, *, language, conn_options):
+        self.segments.append(rtc.combine_audio_frames(buffer))
+        words = [stt.SpeechData(language="en", text="words")]
+        return stt.SpeechEvent(stt.SpeechEventType.FINAL_TRANSCRIPT, alternatives=words)
+
+
+@pytest.mark.parametrize("enabled", [True, False])
+def test_a_recogniser_behind_the_stream_adapter_gets_the_finished_turn_of_an_array(pair, enabled):
+    profile, sound = pair
+    events, recogniser = [], Recogniser()
+    ears = EgoProcessor(EgoFilter(profile, "crnn"), events.append, mic_channels=[1, 2])
+    ears.enabled = enabled
+
+    async def converse():
+        stream = stt.StreamAdapter(stt=recogniser, vad=ears.vad()).stream()
+        for at in range(0, len(sound) - 319, 320):
+            pcm = np.rint(sound[at : at + 320] * 32768).astype("<i2").tobytes()
+            stream.push_frame(ears._process(rtc.AudioFrame(pcm, 16_000, 3, 320)))
+            await asyncio.sleep(0.001)
+        stream.end_input()
+        return [event.type.value async for event in stream]
+
+    said = asyncio.run(asyncio.wait_for(converse(), 120))
+    assert said == ["start_of_speech", "end_of_speech", "final_transcript"]
+    (turn,) = [event.turn for event in events if event.turn]
+    (heard,) = recogniser.segments
+    assert heard.num_channels == 1 and ears.duplex.ego.stats()["array"]["microphones"] == 2
+    if enabled:
+        np.testing.assert_array_equal(from_pcm16(heard.data.cast("B")), from_pcm16(as_pcm16(turn.samples)))
+    else:
+        assert heard.samples_per_channel > 24_000, "the microphone as it was, from half a second before"
+    assert ears.duplex.listeners == []
+
+
+def test_a_voice_activity_that_would_not_notice_the_human_is_refused(ears):
+    with pytest.raises(UsageError, match="vad.. got a filter whose engines .linear. do not all judge speech"):
+        ears.vad()

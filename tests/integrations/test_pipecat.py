@@ -4,8 +4,15 @@ import asyncio
 
 import numpy as np
 import pytest
-from pipecat.frames.frames import FilterEnableFrame
+from pipecat.frames.frames import FilterEnableFrame, InputAudioRawFrame, TranscriptionFrame
+from pipecat.pipeline.pipeline import Pipeline
+from pipecat.pipeline.worker import PipelineWorker
+from pipecat.processors.audio.vad_processor import VADProcessor
+from pipecat.services.settings import STTSettings
+from pipecat.services.stt_service import SegmentedSTTService
+from pipecat.transports.base_input import BaseInputTransport
 from pipecat.transports.base_transport import TransportParams
+from pipecat.workers.runner import WorkerRunner
 
 from edgefilter import BargeInSettings, EgoFilter, UsageError
 from edgefilter.integrations.duplex import as_pcm16, from_pcm16
@@ -111,3 +118,67 @@ def test_with_the_network_as_judge_the_human_is_noticed_whatever_the_engine_and_
     ego = EgoFilter(room_of.PROFILE, **settings, barge_in=BargeInSettings(judge="network"))
     found = asyncio.run(confidences(room_of, EgoFilters(ego), 6.0))
     assert found[90:160].all() and not found[220:].any()
+
+
+class Microphones(BaseInputTransport):
+    """Three channels, as fast as the pipeline follows."""
+
+    def __init__(self, sound, params, over):
+        super().__init__(params)
+        self.sound, self.over = sound, over
+
+    async def start(self, frame):
+        await super().start(frame)
+        await self.set_transport_ready(frame)
+        self.create_task(self.listen())
+
+    async def listen(self):
+        for at in range(0, len(self.sound), 320):
+            pcm = np.rint(self.sound[at : at + 320] * 32768).astype("<i2").tobytes()
+            await self.push_audio_frame(InputAudioRawFrame(pcm, 16_000, 3))
+            await self._audio_in_queue.join()
+            await asyncio.sleep(0.002)
+        self.over.set()
+
+
+class Recogniser(SegmentedSTTService):
+    """Keeps what it is to transcribe."""
+
+    wants_wav_segments = False
+
+    def __init__(self):
+        super().__init__(sample_rate=16_000, trailing_silence_secs=0, settings=STTSettings(model=None, language=None))
+        self.segments = []
+
+    async def run_stt(self, audio):
+        self.segments.append(audio)
+        yield TranscriptionFrame("words", "", "")
+
+
+def test_a_segmented_recogniser_gets_the_finished_turn_of_an_array(pair):
+    profile, sound = pair
+    events = []
+    filters = EgoFilters(EgoFilter(profile, "crnn"), in_channels=3, mic_channels=[1, 2], on_event=events.append)
+    recogniser = Recogniser()
+
+    async def converse():
+        over = asyncio.Event()
+        params = TransportParams(audio_in_enabled=True, audio_in_sample_rate=16_000, **filters.params)
+        listens = VADProcessor(vad_analyzer=filters.vad())
+        worker = PipelineWorker(Pipeline([Microphones(sound, params, over), listens, filters.turns(), recogniser]))
+        runner = WorkerRunner(handle_sigint=False)
+        await runner.add_workers(worker)
+        running = asyncio.create_task(runner.run())
+        await over.wait()
+        for _ in range(200):
+            if recogniser.segments:
+                break
+            await asyncio.sleep(0.02)
+        await worker.cancel()
+        await running
+
+    asyncio.run(asyncio.wait_for(converse(), 120))
+    (turn,) = [event.turn for event in events if event.turn]
+    assert recogniser.segments == [as_pcm16(turn.samples)]
+    assert filters.duplex.ego.stats()["array"]["microphones"] == 2
+    assert filters.duplex.listeners == [], "the pipeline has ended"

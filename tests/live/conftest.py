@@ -22,7 +22,9 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
 def new_server(request):
     """A function that starts a server of its own, with other sinks where they are given; all are ended afterwards."""
     with ExitStack() as stack:
-        yield lambda *sinks: stack.enter_context(virtual_sound.server(sinks or virtual_sound.SINKS, request.param))
+        yield lambda *sinks, channels=1: stack.enter_context(
+            virtual_sound.server(sinks or virtual_sound.SINKS, request.param, channels)
+        )
 
 
 @pytest.fixture

@@ -10,6 +10,8 @@ import pytest
 import soundfile
 import soxr
 
+from tests.filter.test_arrays import calibration
+
 pytestmark = pytest.mark.slow
 
 SESSION = Path(__file__).with_name("session.py")
@@ -101,3 +103,21 @@ def test_devices_are_listed_and_the_monitor_is_found(server, tmp_path):
     result = run("devices", server, tmp_path)
     assert {"robot", "robot_mic", "robot_monitor", "robot_mic_monitor"} <= {d["name"] for d in result["devices"]}
     assert result["monitor"] == "robot_mic_monitor"
+
+
+@pytest.mark.parametrize("microphones", [2, 1])
+def test_all_channels_of_the_microphone_are_opened_where_the_profile_is_of_an_array(new_server, tmp_path, microphones):
+    server = new_server(channels=2)
+    calibration(microphones).save(tmp_path / "robot.npz")
+    asked = ["run", "--input", "mic", "--profile", tmp_path / "robot.npz", "--engine", "linear", "--no-learn"]
+    asked += ["--seconds", "2", "--output", tmp_path / "out.wav", "--json", tmp_path / "run.json", "--quiet"]
+    done = subprocess.run(
+        [sys.executable, "-m", "edgefilter.cli", *map(str, asked)],
+        env=server.environment, cwd=ROOT, capture_output=True, text=True, timeout=120,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    array = json.loads((tmp_path / "run.json").read_text())["array"]
+    if microphones == 2:
+        assert array["microphones"] == 2 and "all 2 channels are microphones" in done.stderr
+    else:
+        assert array is None and "the microphone has 2 channels and is one" in done.stderr

@@ -1,0 +1,73 @@
+"""Whether channels were exchanged: what each one hears is held against what every one is expected to hear."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import numpy as np
+from scipy import fft
+
+from edgefilter.dsp.fourier import power
+from edgefilter.types import SAMPLE_RATE, Array, Samples
+
+REACH = 16
+"""Samples of lag that all channels may have in common: what the reference's delay is known to, and more than .3 m."""
+BAND_HZ = (300.0, 7000.0)
+"""Where it is looked: below, microphones of one robot hear the same."""
+CLEARER = 0.1
+"""By how much more another order of the channels must agree with what is expected: in seconds of the robot in six simulated
+offices, microphones 4 cm around, the right order agrees to .75 to .92 with a calibration made elsewhere in the room,
+and is .15 to .7 ahead of two or three channels exchanged."""
+ALIKE = 0.3
+"""Least agreement, of 1, with which the best order says anything: the robot is heard at all."""
+
+
+def order_of(heard: Samples, expected: Samples) -> tuple[list[int], int] | None:
+    """For each channel of heard (channels, n) the one of expected (channels, n) that it is; None where that cannot be told.
+
+    Both with every frequency weighed the same, at the lag that all channels have in common (Knapp & Carter 1976), which is
+    returned, too: samples by which heard is later.
+
+    >>> rng = np.random.default_rng(0)
+    >>> one = rng.standard_normal(8192)
+    >>> expected = np.stack([np.roll(one, at) for at in (0, 2, 3)])
+    >>> order_of(expected[[0, 2, 1]], expected), order_of(0.1 * expected, expected)
+    (([0, 2, 1], 0), ([0, 1, 2], 0))
+    """
+    n = heard.shape[1]
+    band, turns = _lags(n)
+    ours, theirs = (fft.rfft(x.astype(np.float32), axis=1)[:, band] for x in (heard, expected))
+    flat = 1.0 / np.sqrt(power(ours).mean(axis=0) * power(theirs).mean(axis=0) + 1e-30)
+    cross = np.einsum("if,jf,f->ijf", ours, theirs.conj(), flat)
+    size = [np.sqrt(np.einsum("if,f->i", power(x), flat)) for x in (ours, theirs)]
+    alike = (cross.reshape(-1, cross.shape[2]) @ turns).real.reshape(*cross.shape[:2], -1)
+    alike = alike / (size[0][:, None, None] * size[1][None, :, None] + 1e-30)
+    kept = np.einsum("iil->l", alike) / len(heard)
+    own, lag, order = float(kept.max()), int(np.argmax(kept)), list(range(len(heard)))
+    best = own
+    for at in range(alike.shape[2]):
+        found, columns = _best_order(alike[:, :, at])
+        if found > max(best, own + CLEARER):
+            best, lag, order = found, at, columns
+    return (order, lag - REACH) if best > ALIKE else None
+
+
+def _best_order(alike: Array) -> tuple[float, list[int]]:
+    """The mean of alike (rows, columns) in the best order of the columns that exchanges of two lead to, and this order."""
+    order = np.arange(len(alike))
+    while True:
+        ordered = alike[:, order]
+        kept = ordered.diagonal()
+        gain = ordered + ordered.T - kept - kept[:, None]
+        first, second = np.unravel_index(int(np.argmax(gain)), gain.shape)
+        if not gain[first, second] > 1e-6:
+            return float(kept.mean()), [int(one) for one in order]
+        order[[first, second]] = order[[second, first]]
+
+
+@lru_cache(maxsize=4)
+def _lags(n: int) -> tuple[slice, Array]:
+    """The bins that count, and exp(j omega lag) (bins, 2 REACH + 1) of them, for n samples."""
+    band = slice(*(round(hz * n / SAMPLE_RATE) for hz in BAND_HZ))
+    omega = 2 * np.pi * np.arange(band.start, band.stop) / n
+    return band, np.exp(1j * omega[:, None] * np.arange(-REACH, REACH + 1)).astype(np.complex64)
