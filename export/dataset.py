@@ -46,7 +46,8 @@ def pack(conversation: Conversation, stft: StftConfig, rng: np.random.Generator)
     heard = listen(front, *signals, stft, conversation.before)
     signals = {name: getattr(heard, name) for name in ("mic", "error", "clean", "fan", "reference")}
     peak = max(float(np.abs(samples).max()) for name, samples in signals.items() if name != "reference")
-    told = max(float(np.abs(heard.reference).max()), 1e-6)
+    signals["reference"] = np.roll(signals["reference"], conversation.stage.displaced)
+    told = max(float(np.abs(signals["reference"]).max()), 1e-6)
     scales = {name: told if name == "reference" else max(peak, 1e-6) for name in signals}
     packed = {name: np.round(32767 * samples / scales[name]).astype(np.int16) for name, samples in signals.items()}
     powers = {"noise": heard.noise, "residual": heard.residual}

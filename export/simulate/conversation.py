@@ -77,7 +77,7 @@ def simulate(recipe: Recipe, seed: int, index: int, material: Material) -> Conve
     quiet = rng.random() < recipe.quiet_fan
     fan_rms = human_rms * 10 ** (-(rng.uniform(20, 45) if quiet else rng.uniform(*recipe.fan_db)) / 20)
     noise, psd = fan.noise(rng, material, samples, fan_rms, human_rms, recipe.wideness)
-    microphone = Microphone.draw(rng, recipe.wideness, recipe.seconds)
+    microphone = Microphone.draw(rng, recipe.wideness, recipe.seconds, recipe.processed)
     mic, clean, heard_fan, gain = _recorded(microphone, robot_gain * voice.echo, clean, noise)
     profile, known = _profile(rng, recipe, material, (room, colour), microphone, gain, (robot_gain, voice.path), psd)
     stage = recipe.setting.draw(rng, profile is not None)
@@ -89,6 +89,7 @@ def simulate(recipe: Recipe, seed: int, index: int, material: Material) -> Conve
         "human_over_robot_db": round(20 * float(np.log10(human_rms / level)), 1),
         "quiet_fan": bool(quiet),
         "learned": bool(before),
+        "processed": microphone.suppression is not None,
     }
     return Conversation(
         mic, clean, heard_fan, voice.reference, profile, stage, before, about | human.about | voice.about
@@ -127,6 +128,8 @@ def _recorded(
     """What the microphone makes of all three together, of the human, of the noise, and the gain at which it was recorded."""
     gain = microphone.gain(echo.size)
     mic, clean, noise = (gain * microphone.filtered(x) for x in (echo + clean + noise, clean, noise))
+    if microphone.suppression is not None:
+        mic, clean, noise = microphone.suppression.applied(mic, clean, noise)
     peak = float(np.abs(mic).max(initial=1e-9))
     level = min(1.0, LOUDEST / peak)
     limit = microphone.clip * peak * level

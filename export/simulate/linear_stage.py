@@ -16,7 +16,7 @@ from edgefilter.filter.front_end import FrontEnd, low_cut
 from edgefilter.filter.onset_gate import GATE
 from edgefilter.learning.path_learner import PathLearner
 from edgefilter.profile.data import Profile
-from edgefilter.types import Samples
+from edgefilter.types import SAMPLE_RATE, Samples
 
 LOUDNESS_STEP_DB, LEAST_DB = 0.5, -90.0
 """Power spectra are kept as one byte a bin: steps of so many dB from there on, to +37.5 dB."""
@@ -27,13 +27,15 @@ class Stage:
     """One linear stage. taps, adaptation: None for the running filter's own choice.
 
     missing_db: what is missing of its echo estimate, over that estimate, None for nothing; infinite where the reference
-    was never found: the error is then the microphone. missing_taps: of the filter that makes it.
+    was never found: the error is then the microphone. missing_taps: of the filter that makes it. displaced: samples by
+    which the reference that the engine is told of is late.
     """
 
     taps: int | None = None
     adaptation: Adaptation | None = None
     missing_db: float | None = None
     missing_taps: int = 64
+    displaced: int = 0
 
 
 class Setting(Protocol):
@@ -56,7 +58,7 @@ class WideSetting:
 
     own: as it is. products, posterior: of the others, each switched to the contrary. taps: (least, most), as powers of
     two. weakened: echo estimates of which missing_db is missing, so that ERLE is 3 to 25 dB. lost: the reference was
-    never found.
+    never found, or only to displaced_s.
     """
 
     own: float = 0.5
@@ -66,6 +68,7 @@ class WideSetting:
     weakened: float = 0.25
     missing_db: tuple[float, float] = (-25.0, -3.0)
     lost: float = 0.05
+    displaced_s: float = 0.0
 
     def draw(self, rng: np.random.Generator, warm: bool) -> Stage:
         stage = Stage()
@@ -79,7 +82,8 @@ class WideSetting:
             stage = Stage(int(2 ** rng.uniform(*np.log2(self.taps))), adaptation)
         drawn, missing = rng.random(), rng.uniform(*self.missing_db)
         if drawn < self.lost:
-            return replace(stage, missing_db=np.inf)
+            displaced = round(rng.uniform(-self.displaced_s, self.displaced_s) * SAMPLE_RATE)
+            return replace(stage, missing_db=np.inf, displaced=displaced)
         if drawn < self.lost + self.weakened:
             return replace(stage, missing_db=missing, missing_taps=int(2 ** rng.uniform(0, 9)))
         return stage

@@ -18,8 +18,9 @@ from export.simulate.effects import draw_effects, elsewhere
 from export.simulate.linear_stage import Stage, WideSetting, from_bytes, front_end, listen
 from export.simulate.loudspeaker import KINDS, active_rms, distorted
 from export.simulate.material import RESPONSES, Material, read_noises, read_responses
+from export.simulate.microphone import Suppression
 from export.simulate.path import draw_colour
-from export.simulate.recipe import PAPER, RECIPES, VOICES, WIDE
+from export.simulate.recipe import DEVICES, PAPER, RECIPES, VOICES, WIDE
 from tests.export.speech import RATE, babble, write_librispeech, write_table
 
 
@@ -203,6 +204,32 @@ def test_half_of_the_speakers_of_many_voices_are_given_another_voice():
     other = rates[rates != 100]
     assert 0.4 < other.size / rates.size < 0.6 and (other.min(), other.max()) == script.RATES
     assert {script.rate(rng, WIDE) for _ in range(20)} == {100}
+
+
+def test_a_device_that_suppresses_noise_has_one_gain_for_all_that_is_heard_and_no_linear_filter_follows_it():
+    rng = np.random.default_rng(0)
+    loud, soft = rng.standard_normal((2, 2 * RATE)).astype(np.float32) * np.float32([[0.1], [0.01]])
+    quiet = np.arange(loud.size) % 8000 >= 4000
+    loud[quiet] = 0.0
+    changed = Suppression(6.0, -20.0, 6.0, 20.0, 8, seed=1)
+    both, of_loud, of_soft = changed.applied(loud + soft, loud, soft)
+    assert both.size == loud.size and np.allclose(both, of_loud + of_soft, atol=1e-6)
+    assert np.mean(of_soft[quiet] ** 2) < 0.4 * np.mean(soft[quiet] ** 2)  # with what the jitter adds
+    spectra, after = (np.fft.rfft(x.reshape(-1, 800)) for x in (loud, of_loud))
+    left = after - spectra * np.sum(after * spectra.conj(), 0) / np.sum(np.abs(spectra) ** 2, 0)
+    assert np.sum(np.abs(left) ** 2) > 0.1 * np.sum(np.abs(after) ** 2)  # the best filter leaves more than -10 dB
+
+
+def test_where_the_reference_was_found_only_about_it_is_told_early_or_late(parts):
+    recipe = replace(DEVICES, plain=0.0, seconds=3.0, later=0.0, robot=1.0)
+    item = simulate(replace(recipe, setting=WideSetting(lost=1.0, displaced_s=0.06)), 7, 2, parts)
+    assert 0 < abs(item.stage.displaced) <= 960
+    there, displaced = (
+        pack(replace(item, stage=replace(item.stage, displaced=at)), StftConfig(), np.random.default_rng(0))
+        for at in (0, item.stage.displaced)
+    )
+    assert np.array_equal(np.roll(there["reference"], item.stage.displaced), displaced["reference"])
+    assert np.array_equal(there["mic"], displaced["mic"])
 
 
 def test_who_says_three_words_is_drawn_seldom():
