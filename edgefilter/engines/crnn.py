@@ -45,11 +45,6 @@ LOUD = 1.3e3, 6.3e3
 (medians): the loudest so far is brought there."""
 FADE = 0.1 ** (0.016 / 60.0)
 """Fall of the loudest power from frame to frame, 10 dB in a minute."""
-TRACKED_NOISE = np.float32(0.3)
-"""Share of a noise that is tracked, not calibrated, that the network is told of: in training it was told of less than there
-was. Told of all it notices the bundled recording's human 2.3 s late instead of at once; of nothing it lowers five real
-robots by 3 dB less.
-"""
 LASTING = 3
 """Frames that must be as loud, so that no click counts."""
 
@@ -90,7 +85,6 @@ class Crnn:
         self.model = open_model(path, EDGE_TYPE, EDGE_VERSION)
         self.stft = self.model.stft
         self.lookahead = 0
-        self._noise = np.float32(1.0) if profile is not None else TRACKED_NOISE
         self._ss, self._ss_helps = SpectralSubtraction(self.stft), profile is not None and not profile.learned
         states = dict(self.model.states)
         spectrum = (1, self.stft.bins, 2)
@@ -119,7 +113,7 @@ class Crnn:
     def step(self, frame: Frame, state: CrnnState) -> tuple[Output, CrnnState]:
         tensors, mask, levels = state
         levels = levels.after(frame)
-        levelled, scale = at_training_level(frame, levels.loudest, self._noise)
+        levelled, scale = at_training_level(frame, levels.loudest)
         places = self._run(levelled, tensors)
         human: Spectrum = places.spectrum * np.float32(1.0 / scale)
         if self._ss_helps:
@@ -160,17 +154,16 @@ class Crnn:
         return self._own.places
 
 
-def at_training_level(frame: Frame, loudest: Samples, noise: np.float32) -> tuple[Frame, np.float32]:
+def at_training_level(frame: Frame, loudest: Samples) -> tuple[Frame, np.float32]:
     """The frame with microphone and reference as loud as in training, and the factor on the microphone.
 
-    loudest: (2,) power of the loudest frames of each so far; a channel that was silent stays as it is. noise: share of
-    its noise that is told.
+    loudest: (2,) power of the loudest frames of each so far; a channel that was silent stays as it is.
     """
     mic, reference = (
         np.float32(math.sqrt(usual / most) if most else 1.0) for usual, most in zip(LOUD, loudest, strict=True)
     )
     spectra = mic * frame.mic, reference * frame.reference, mic * frame.echo, mic * frame.error
-    return Frame(*spectra, mic**2 * (noise * frame.noise_psd), mic**2 * frame.residual_psd, frame.idle), mic
+    return Frame(*spectra, mic**2 * frame.noise_psd, mic**2 * frame.residual_psd, frame.idle), mic
 
 
 def _with_what_is_sure(human: Spectrum, frame: Frame) -> Spectrum:

@@ -25,8 +25,8 @@ except Exception as error:  # a broken installation raises what its binary part 
 FOLDERS = (Path(__file__).parents[1] / "models", Path(__file__).parents[2] / "models")
 """Where models lie: inside the installed package, or at the top of a checkout."""
 SHIPPED = {
-    "crnn.onnx": "ab3b1c9ea0a1e5601f4942aa8ad161852121db9af3c2cad511e95df6a6ec571a",
-    "crnn_int8.onnx": "43b32629814fba62d568eb0162784cf4f8a1621643e64a69f109321e524c6872",
+    "crnn.onnx": "afe41e5c116cde75e1ebf4719c38fb8ef6d7e574410a2ac62a3355e6bd6f96ca",
+    "crnn_int8.onnx": "a89638878980c9c6d6e8b532663d8dca36b5549f941b1861a5be6498d3082bb8",
 }
 """sha256 of the files in models/, as MODELS.md lists them."""
 MOST_BYTES, MOST_STATE, MOST_FFT = 512 * 2**20, 1 << 22, 1 << 14

@@ -14,7 +14,7 @@ import soundfile
 
 from edgefilter.dsp.metrics import si_sdr
 from edgefilter.engines import create, onnx_session
-from edgefilter.engines.crnn import TRACKED_NOISE, Crnn, at_training_level
+from edgefilter.engines.crnn import Crnn, at_training_level
 from edgefilter.engines.paper_crnn import PaperCrnn
 from edgefilter.errors import ModelError, SignalError, UsageError
 from edgefilter.filter.ego_filter import EgoFilter
@@ -55,7 +55,7 @@ def test_crnn_answers_what_onnxruntime_answers_for_the_same_frames():
         noise, residual = rng.random((2, engine.stft.bins)).astype(np.float32)
         heard = Frame(mic=mic, reference=reference, echo=echo, error=error, noise_psd=noise, residual_psd=residual)
         output, state = engine.step(heard, state)
-        levelled, scale = at_training_level(heard, state[2].loudest, TRACKED_NOISE)
+        levelled, scale = at_training_level(heard, state[2].loudest)
         spectra = levelled.error, levelled.mic, levelled.reference, levelled.echo
         pairs = [np.stack((x.real, x.imag), axis=-1)[None] for x in spectra]
         powers = [levelled.noise_psd[None], levelled.residual_psd[None]]

@@ -12,7 +12,7 @@ import torch
 from scipy.special import logit
 
 from edgefilter import enhance
-from edgefilter.engines.crnn import FADE, LASTING, LOUD, TRACKED_NOISE, Crnn, Levels
+from edgefilter.engines.crnn import FADE, LASTING, LOUD, Crnn, Levels
 from edgefilter.engines.onnx_session import open_session
 from edgefilter.engines.paper_crnn import PaperCrnn as PaperEngine
 from edgefilter.errors import ModelError
@@ -121,7 +121,7 @@ def test_the_engine_computes_what_torch_computes(exported):
         powers = [torch.from_numpy(x)[None] for x in (noise, residual)]
         with torch.no_grad():
             spectrum, probability, ours = network.step(*pairs, *powers, ours)
-        heard = Frame(mic, reference, echo, error, noise / TRACKED_NOISE, residual)
+        heard = Frame(mic, reference, echo, error, noise, residual)
         theirs = theirs[:2] + (as_loud_as_in_training(),)
         output, theirs = engine.step(heard, theirs)
         # 1e-4: the bound of the export, on values of about 1
