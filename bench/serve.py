@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import argparse
 import asyncio
-import itertools
 import json
 import os
 import subprocess
@@ -31,6 +30,7 @@ from bench.recordings import progress, read
 from bench.stale import DEMO
 from edgefilter import engines
 from edgefilter.errors import UsageError
+from edgefilter.filter.budget import held_to
 from edgefilter.types import SAMPLE_RATE
 
 WARM_UP_S = 2.0
@@ -100,25 +100,18 @@ def processor_s(process: int) -> float:
 
 def climb(engine: str, seconds: float, rng: np.random.Generator) -> list[dict]:
     """A row for 1, 2, 4, 6, ... streams, up to the first at which the slowest hundredth of answers takes longer than a hop."""
-    core, *others = sorted(os.sched_getaffinity(0))
+    *others, core = sorted(os.sched_getaffinity(0))
     if not others:
         raise UsageError("this machine has one core, expected one for the service and one for its clients")
     hop, rows = engines.create(engine).stft.hop, []
-    before = os.sched_getaffinity(0)
-    os.sched_setaffinity(0, set(others))
-    try:
-        with service(engine, core) as (address, process):
-            for streams in progress(itertools.chain([1], range(2, MOST + 1, 2)), f"{engine}, streams"):
-                spent = processor_s(process)
-                took = asyncio.run(clients(address, streams, hop, seconds, rng))
-                share = (processor_s(process) - spent) / (streams * (seconds + WARM_UP_S))
-                rows.append(
-                    {"engine": engine, "streams": streams, **percentiles(took, 50, 95, 99, 100), "core_s": share}
-                )
-                if rows[-1]["p99"] > 1000 * hop / SAMPLE_RATE:
-                    break
-    finally:
-        os.sched_setaffinity(0, before)
+    with held_to(len(others)), service(engine, core) as (address, process):
+        for streams in progress([1, *range(2, MOST + 1, 2)], f"{engine}, streams"):
+            spent = processor_s(process)
+            took = asyncio.run(clients(address, streams, hop, seconds, rng))
+            share = (processor_s(process) - spent) / (streams * (seconds + WARM_UP_S))
+            rows.append({"engine": engine, "streams": streams, **percentiles(took, 50, 95, 99, 100), "core_s": share})
+            if rows[-1]["p99"] > 1000 * hop / SAMPLE_RATE:
+                break
     return rows
 
 

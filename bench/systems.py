@@ -242,6 +242,11 @@ def _of_mean(count: int, clip: Clip) -> Output:
     """What `crnn` makes of the mean of the microphones, calibrated with that mean: an array as a single channel."""
     clip.array(count)
     sweep, fan, mic = (clip.source.read_all(name)[:, :count].mean(axis=1) for name in ("sweep_mic", "fan_only", "mic"))
+    return _calibrated(clip, mic, sweep, fan)
+
+
+def _calibrated(clip: Clip, mic: Samples, sweep: Samples, fan: Samples) -> Output:
+    """What `crnn` makes of a microphone (n,), calibrated with what it heard of the sweep and of the fan."""
     return run_engine(
         Row("crnn", True, False), Signals(mic, clip.ref), calibrate(clip.source.read("sweep_ref"), sweep, fan)
     )
@@ -254,22 +259,15 @@ def _of_sum(count: int, clip: Clip) -> Output:
     """
     clip.array(count)
     clean = clip.source.read_all("clean")[clip.span, :count].T
-    cross = [flat_cross(clean[0], one, 2 * len(one)) for one in clean]
-    late = [
-        top(each, 2 * clean.shape[1], highest(correlation_near(each, 2 * clean.shape[1], FARTHEST))[0])
-        for each in cross
-    ]
+    size = 2 * clean.shape[1]
+    cross = [flat_cross(clean[0], one, size) for one in clean]
+    late = [top(each, size, highest(correlation_near(each, size, FARTHEST))[0]) for each in cross]
 
     def summed(name: str) -> Samples:
         sound = clip.source.read_all(name)[:, :count].T
         return np.mean([delayed(one, max(late) - its) for one, its in zip(sound, late)], axis=0).astype(np.float32)
 
-    signals = Signals(summed("mic"), clip.ref)
-    output = run_engine(
-        Row("crnn", True, False),
-        signals,
-        calibrate(clip.source.read("sweep_ref"), summed("sweep_mic"), summed("fan_only")),
-    )
+    output = _calibrated(clip, summed("mic"), summed("sweep_mic"), summed("fan_only"))
     back = round(max(late))  # in step with the first microphone again
     return output._replace(samples=np.concatenate((output.samples[back:], np.zeros(back, np.float32))))
 
@@ -279,14 +277,7 @@ def _of_best(count: int, clip: Clip) -> Output:
     clip.array(count)
     mic, sweep, fan = (clip.source.read_all(name)[:, :count].T for name in ("mic", "sweep_mic", "fan_only"))
     clean, span = clip.source.read_all("clean").T, clip.span
-    outputs = [
-        run_engine(
-            Row("crnn", True, False),
-            Signals(mic[at], clip.ref),
-            calibrate(clip.source.read("sweep_ref"), sweep[at], fan[at]),
-        )
-        for at in range(count)
-    ]
+    outputs = [_calibrated(clip, *heard) for heard in zip(mic, sweep, fan)]
     return outputs[int(np.argmax([si_sdr(one.samples[span], clean[at, span]) for at, one in enumerate(outputs)]))]
 
 

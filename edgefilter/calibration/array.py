@@ -6,6 +6,7 @@ import numpy as np
 from scipy import fft
 
 from edgefilter.calibration.sweep import Deconvolution, find_direct
+from edgefilter.dsp.exchange import EQUAL
 from edgefilter.dsp.frames import frames
 from edgefilter.dsp.psd import GRID_FFT, hann
 from edgefilter.errors import CalibrationError
@@ -16,8 +17,6 @@ APART_DB = 10.0
 the three of its array agree within 1 dB and the fourth, of another kind, is 12 to 18 dB louder."""
 FARTHEST = 32
 """Samples between the direct sound in two microphones of one robot: .7 m."""
-EQUAL = 1e-3
-"""Part of a microphone's power that two channels with the same sound may differ by: -30 dB, rounding and a converter."""
 
 
 def cross_density(noises: Samples) -> Samples:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from edgefilter.audio import pulse, virtual
+from edgefilter.calibration.array import FARTHEST
 from edgefilter.calibration.chirps import LEVEL_DB, SOFTER_DB, Heard, chirps, judge
 from edgefilter.commands.display import print_result, say
 from edgefilter.diagnosis.channels import doubtful_channels
@@ -45,8 +46,6 @@ MOST_LAG_S = 1.5
 LINEAR_DB = 15.0
 """Echo over what a linear filter leaves from which on the set-up is good: small loudspeakers at moderate volume have 20
 to 27 dB."""
-FARTHEST_S = 0.002
-"""Between the direct sound in two microphones of one robot, .7 m: a channel that is later went another way."""
 CHANGED_DB = 1.5
 """Difference of two gains, dB, that neither noise nor a small loudspeaker explains: they differ by some tenths."""
 
@@ -237,15 +236,16 @@ def array_set_up(numbers: Sequence[int], mics: Samples, ref: Samples, profile: P
     """What the chirps have shown of the microphones mics (microphones, n) beside one another, and beside a profile."""
     heard = [judge(one, ref) for one in mics] if len(mics) > 1 else []
     lags = [one.lag_s for one in heard if one.lag_s is not None and not one.same]
+    middle = float(np.median(lags)) if lags else 0.0
     told = set()
     for number, one in zip(numbers, heard):
-        if one.same or one.lag_s is not None and abs(one.lag_s - float(np.median(lags))) > FARTHEST_S:
-            told.add(number)
         if one.same:
+            told.add(number)
             yield Check(f"channel {number}", "warning", "it is what is played", "leave it out of --mic-channels")
-        elif number in told and one.lag_s is not None:
-            late = f"it hears the chirps {1000 * (one.lag_s - float(np.median(lags))):+.0f} ms beside the others"
-            yield Check(f"channel {number}", "warning", late, "leave it out of --mic-channels: it is processed")
+        elif one.lag_s is not None and abs(late := one.lag_s - middle) > FARTHEST / SAMPLE_RATE:
+            told.add(number)
+            found = f"it hears the chirps {1000 * late:+.0f} ms beside the others"
+            yield Check(f"channel {number}", "warning", found, "leave it out of --mic-channels: it is processed")
     if profile is None or not all(one.in_microphone for one in heard):
         return
     doubts = doubtful_channels(profile, mics, ref)

@@ -24,7 +24,10 @@ def read(path: str, role: str, channels: Sequence[int] | None = None) -> Samples
 
     Raises AudioFileError for a file that is unusable.
     """
-    reader = Reader(path, role, channels)
+    return _whole(Reader(path, role, channels))
+
+
+def _whole(reader: Reader) -> Samples:
     for note in reader.notes:
         say(note)
     return np.concatenate(list(reader.chunks()))
@@ -47,7 +50,8 @@ def load_array(args: argparse.Namespace) -> tuple[Profile, Samples, Samples, Arr
     And what the whole profile holds of the others, and what is wrong with any, by channel. Raises as load, SignalError for
     a profile of other microphones, UsageError for a channel that is none of them.
     """
-    wanted = Reader(args.recording, "recording", args.mic_channels).wanted or []
+    reader = Reader(args.recording, "recording", args.mic_channels)
+    wanted = reader.wanted or []
     number = wanted[0] if args.channel is None else args.channel
     if number not in wanted:
         raise UsageError(
@@ -59,7 +63,7 @@ def load_array(args: argparse.Namespace) -> tuple[Profile, Samples, Samples, Arr
             "--apply writes the profile of the first microphone and the others' beside it: leave --channel out"
         )
     reference = _voice(args.reference, "reference")
-    recordings = read(args.recording, "recording", wanted).reshape(-1, len(wanted)).T
+    recordings = _whole(reader).reshape(-1, len(wanted)).T
     if not recordings[at].any():
         raise AudioFileError(f"channel {number} of {args.recording} is silent: every sample is zero, choose another")
     if args.profile is None:

@@ -37,11 +37,12 @@ TWICE_S = 0.5
 
 
 def main(args: argparse.Namespace) -> int:
-    speech, channels = make_speech(args), channels_of(args)
+    speech, profile = make_speech(args), load_profile(args)
+    channels = channels_of(args, profile)
     source = make_source(args.input, speech or args.reference, args.output, channels, args.reference_channel)
     if channels == ALL_CHANNELS and args.mic_channels is None:
         source.notes.append(f"all {source.microphones} channels are microphones, since the profile is of an array")
-    ego, choice = make_filter(args, source.live)
+    ego, choice = make_filter(args, source.live, profile)
     check_request(args, ego, source)
     sink = make_sink(args.output, ego.latency, wait=not source.live)
     limit = None if args.seconds is None else round(args.seconds * SAMPLE_RATE)
@@ -91,14 +92,13 @@ def make_speech(args: argparse.Namespace) -> SpokenReference | None:
     return speaker(args.speaker, Reader(args.play, "speech"))
 
 
-def channels_of(args: argparse.Namespace) -> Sequence[int] | None:
+def channels_of(args: argparse.Namespace, profile: Profile | None) -> Sequence[int] | None:
     """The microphones that --mic-channels names; raises UsageError for a reference channel without or among them.
 
     Where none are named, live, and the profile is of several: all that the device has.
     """
     if args.reference_channel is None:
-        file = profile_file(args)
-        if args.mic_channels is None and file and is_live(args.input) and Profile.load(file).microphones > 1:
+        if args.mic_channels is None and profile and profile.microphones > 1 and is_live(args.input):
             return ALL_CHANNELS
         return args.mic_channels
     if not args.mic_channels or args.reference_channel in args.mic_channels:
@@ -176,7 +176,7 @@ def limited(source: Source, limit: int | None) -> Iterator[Block]:
         yield block
 
 
-def make_filter(args: argparse.Namespace, live: bool) -> tuple[EgoFilter, Choice | None]:
+def make_filter(args: argparse.Namespace, live: bool, profile: Profile | None) -> tuple[EgoFilter, Choice | None]:
     """The filter with the engine that was asked for, or with the one that the measurement chose.
 
     Live, or where a budget is given, "auto" is measured; a recording has no deadline and gets the strongest engine at
@@ -185,8 +185,6 @@ def make_filter(args: argparse.Namespace, live: bool) -> tuple[EgoFilter, Choice
     if args.remeasure:
         forget()
     choice, engine, reason, budget_ms = None, args.engine, "asked for", args.budget_ms
-    file = profile_file(args)
-    profile = Profile.load(file) if file else None
     if engine == "auto" and not args.model and (live or budget_ms):
         choice = choose(budget_ms or DEFAULT_MS, profile, say=say)
         engine, reason, budget_ms = choice.engine, choice.reason, choice.budget_ms
@@ -200,9 +198,10 @@ def make_filter(args: argparse.Namespace, live: bool) -> tuple[EgoFilter, Choice
     return ego, choice
 
 
-def profile_file(args: argparse.Namespace) -> str | None:
+def load_profile(args: argparse.Namespace) -> Profile | None:
     """What the filter begins with: what was learned before, else the profile that is named."""
-    return args.learn if args.learn and Path(args.learn).exists() else args.profile
+    file = args.learn if args.learn and Path(args.learn).exists() else args.profile
+    return Profile.load(file) if file else None
 
 
 def make_learner(args: argparse.Namespace, live: bool, profile: Profile | None) -> Learner | None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy import fft
 
-from edgefilter.dsp.exchange import order_of
+from edgefilter.dsp.exchange import EQUAL, exchanged, order_of
 from edgefilter.dsp.lag import flat_cross
 from edgefilter.errors import SignalError
 from edgefilter.profile.data import Profile
@@ -21,8 +21,6 @@ ALIKE = 0.3
 TOP, BELOW, MOST_PEAKS, CROWDED = 0.998, 0.99, 16, 3
 """Of its largest sample, above which a sample is at the top, and below which not even beside it; so many, a millisecond, are
 not there by chance, and so many times as many at the top as beside it no sound has: a sine has as many in both."""
-COPY = 1e-3
-"""Part of its power by which a channel may differ from one that it is a copy of: -30 dB."""
 
 
 def doubtful_channels(profile: Profile, recordings: Samples, reference: Samples) -> dict[int, str]:
@@ -57,7 +55,7 @@ def doubtful_channels(profile: Profile, recordings: Samples, reference: Samples)
     for at, one in enumerate(recordings):
         power = np.mean(np.square(one, dtype=np.float64))
         for other in range(at):
-            if at not in doubts and np.mean(np.square(one - recordings[other], dtype=np.float64)) < COPY * power:
+            if at not in doubts and np.mean(np.square(one - recordings[other], dtype=np.float64)) < EQUAL * power:
                 doubts[at] = f"the same sound as channel {other}"
     if len(doubts) == len(recordings):
         return doubts
@@ -66,11 +64,7 @@ def doubtful_channels(profile: Profile, recordings: Samples, reference: Samples)
     if found is None:
         return doubts
     order, lag = found
-    doubts |= {
-        at: f"exchanged: it hears the robot as channel {other} was calibrated to"
-        for at, other in enumerate(order)
-        if at != other
-    }
+    doubts |= exchanged(order)
     expected = np.roll(expected, lag, axis=1)
     gains = {}
     for at, one in enumerate(heard):

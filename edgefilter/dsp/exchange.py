@@ -1,7 +1,8 @@
-"""Whether channels were exchanged: what each one hears is held against what every one is expected to hear."""
+"""Whether channels were exchanged, what each one hears held against what every one is expected to hear, or are copies."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import lru_cache
 
 import numpy as np
@@ -18,6 +19,8 @@ CLEARER = 0.1
 """By how much more another order of the channels must agree with what is expected: in seconds of the robot in six simulated
 offices, microphones 4 cm around, the right order agrees to .75 to .92 with a calibration made elsewhere in the room,
 and is .15 to .7 ahead of two or three channels exchanged."""
+EQUAL = 1e-3
+"""Part of its power by which a channel may differ from one that it is a copy of: -30 dB, rounding and a converter."""
 ALIKE = 0.3
 """Least agreement, of 1, with which the best order says anything: the robot is heard at all."""
 
@@ -50,6 +53,15 @@ def order_of(heard: Samples, expected: Samples) -> tuple[list[int], int] | None:
         if found > max(best, own + CLEARER):
             best, lag, order = found, at, columns
     return (order, lag - REACH) if best > ALIKE else None
+
+
+def exchanged(order: Sequence[int]) -> dict[int, str]:
+    """What is to be said of those that are other channels than they should be, by number, of an order that `order_of` found."""
+    return {
+        at: f"exchanged: it hears the robot as channel {other} was calibrated to"
+        for at, other in enumerate(order)
+        if at != other
+    }
 
 
 def _best_order(alike: Array) -> tuple[float, list[int]]:

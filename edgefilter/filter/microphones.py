@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from edgefilter.dsp.exchange import order_of
+from edgefilter.dsp.exchange import EQUAL, exchanged, order_of
 from edgefilter.dsp.lag import played_in
 from edgefilter.types import SAMPLE_RATE, Array, Samples
 
@@ -16,8 +16,6 @@ APART = 10**1.2
 another kind beside them was 12 to 18 dB louder (a real robot's noise on four microphones)."""
 SILENT = 1e-6
 """Power over the loudest microphone's, -60 dB, below which a microphone is called silent and not soft."""
-EQUAL = 1e-3
-"""Part of its power by which a channel may differ from one that it is a copy of: -30 dB."""
 CANCELLED, UNLIKE, LEFT = 0.1, 10.0, 0.3
 """Error over microphone where the robot is the loudest and is cancelled in the best microphone (-10 dB); how many times as
 much is left in one whose path is another than was calibrated: swapped, broken, or processed; and the least of it."""
@@ -117,11 +115,7 @@ class Microphones:
         found = order_of(self._block[0], expected.astype(np.float32))
         if found is not None:
             self._paths = None
-            self._exchanged = {
-                at: f"exchanged: it hears the robot as channel {other} was calibrated to"
-                for at, other in enumerate(found[0])
-                if at != other
-            }
+            self._exchanged = exchanged(found[0])
 
     def _reasons(self, power: Array) -> dict[int, str]:
         """Why microphones of that power in the latest block should be left out."""

@@ -76,7 +76,7 @@ class Microphone:
 
     @classmethod
     def draw(cls, rng: np.random.Generator, wideness: float, seconds: float, processed: float = 0.0) -> Microphone:
-        """The same numbers are drawn whether a defect is there or not. processed: share with a noise suppression."""
+        """The same numbers are drawn whether a defect is there or not, but those of a suppression. processed: share with one."""
         high_pass, band_limit, gain_control, clipping = rng.random(4) < wideness * np.array(
             [HIGH_PASS, BAND_LIMIT, GAIN_CONTROL, CLIPPING]
         )
