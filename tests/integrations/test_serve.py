@@ -289,8 +289,8 @@ def test_more_clients_than_streams_are_sent_away_with_a_word():
             await first.close()
             while True:  # the place is free again once the server has noticed
                 async with connect(address) as third:
-                    await third.send("{}")
                     try:
+                        await third.send("{}")
                         return code, json.loads(await third.recv())["kind"]
                     except ConnectionClosed:
                         await asyncio.sleep(0.05)
