@@ -10,6 +10,7 @@ import soundfile as sf
 
 from bench import __main__ as program
 from bench import results
+from edgefilter.report.passport import ERROR_DB
 from tests.bench.conftest import RATE, babble
 
 
@@ -54,3 +55,11 @@ def test_recordings_without_a_robot_alone_are_said_in_one_line(
     assert program.main(["passport", str(tmp_path), "--speech", str(clips)]) == 1
     said = capsys.readouterr().err
     assert said.count("\n") == 1 and "no recording of a robot alone" in said
+
+
+def test_the_error_that_the_page_states_is_the_one_measured() -> None:
+    part = results.read(results.RESULTS / "passport.json")["parts"]["passport"]
+    rows = next(table for table in part["tables"] if table["name"] == "error")["rows"]
+    assert ERROR_DB == next(
+        (round(median, 1), round(worst, 1)) for of, by, _, median, worst, _ in rows if (of, by) == ("humans", "all")
+    )
