@@ -19,6 +19,7 @@ from edgefilter.engines import create
 from edgefilter.errors import EdgefilterError
 from edgefilter.filter.budget import DEFAULT_MS
 from edgefilter.filter.ego_filter import EgoFilter
+from edgefilter.filter.microphones import APART_DB, CLIPPED_DB
 from edgefilter.learning.background import cores
 from edgefilter.profile.data import Profile
 from edgefilter.types import SAMPLE_RATE, Samples
@@ -33,10 +34,6 @@ TOO_SOFT_DB = -75.0
 """Level, dB of full scale, under which the gain is too low: the noise of 16 bit, -101 dB, is 26 dB below."""
 SILENT_DB = -120.0
 """What digital silence is told as, dB of full scale."""
-CLIPPED_DB = -0.1
-"""Peak, dB of full scale, over which a microphone counts as clipped: conversion to 16 kHz may lower a clipped peak a little."""
-APART_DB = 12.0
-"""From the median microphone, as in filter/microphones.py: equal microphones agree within 1 to 2 dB."""
 SAME, UNLIKE = 0.999, 0.2
 """Coherence of a copy, and that below which a channel is no microphone of the array: the array of a real robot has .7 to
 .99 up to 4 kHz in its own noise, a microphone of another kind beside it .1."""

@@ -23,6 +23,7 @@ from edgefilter.filter.adaptation import COLD
 from edgefilter.filter.canceller import Canceller
 from edgefilter.filter.echo_path import TAPS, EchoPath, Effects, PathState, starting_path
 from edgefilter.filter.learner import FilteredHop, Lesson
+from edgefilter.filter.volume import AUDIBLE
 from edgefilter.learning.contest import Rival
 from edgefilter.learning.history import MINUTE, PAST, RECENT_S, HopHistory, emphasised
 from edgefilter.profile.array import ArrayCalibration
@@ -32,10 +33,8 @@ from edgefilter.types import SAMPLE_RATE, Samples
 FIRST_S, FACTOR = 2.0, 1.5
 """Seconds of audible robot until the first fit, and the factor to the next one. The wait is at most MINUTE, or RECENT_S
 after another path was taken over: then there is something to learn."""
-AUDIBLE = 1e-2
-"""The robot is audible where the reference's power is within 20 dB of its recent peak, which fades by ..."""
 FADE = 0.9995
-"""... this factor a hop."""
+"""The robot is AUDIBLE where the reference's power is that near to its recent peak, which fades by this factor a hop."""
 TIMES = 3
 """As little as RECENT_S teaches more where it is replayed several times."""
 BEFORE = "the path of before"
