@@ -8,9 +8,9 @@ from edgefilter.dsp.exchange import EQUAL, exchanged, order_of
 from edgefilter.dsp.lag import played_in
 from edgefilter.types import SAMPLE_RATE, Array, Samples
 
-BLOCK_S = 1.0
-"""Over which microphones are compared; one that was left out comes back after GOOD_BLOCKS in a row without a reason."""
 GOOD_BLOCKS = 3
+"""Blocks of a second, over which microphones are compared, in a row without a reason, after which one that was left out comes
+back."""
 APART_DB = 12.0
 """From the median microphone's level: equal microphones of one array agree within 1 to 2 dB, one of another kind beside them
 was 12 to 18 dB louder (a real robot's noise on four microphones)."""
@@ -49,7 +49,7 @@ class Microphones:
         self._exchanged: dict[int, str] = {}
         self._played: set[int] = set()
         self._asked: set[int] = set()
-        self._hops = round(BLOCK_S * SAMPLE_RATE / hop)
+        self._hops = round(SAMPLE_RATE / hop)
         self._good = [GOOD_BLOCKS] * count
         self._block = [np.zeros((rows, self._hops * hop), np.float32) for rows in (count, 2)]
         self._begin()

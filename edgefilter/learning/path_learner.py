@@ -12,6 +12,7 @@ from scipy import fft
 
 from edgefilter.alignment.utterances import Sustained
 from edgefilter.calibration.array import cross_density
+from edgefilter.calibration.calibrate import first
 from edgefilter.calibration.from_recording import bands_over_fan, fan_in_silences
 from edgefilter.dsp.psd import floored, periodograms
 from edgefilter.echo.effect import complete, vanishes
@@ -175,7 +176,7 @@ class PathLearner:
             return effects
         noise_psd = floored(periodograms(innovation[use], GRID_FFT).mean(axis=0)).astype(np.float32)
         measurement = Measurement(reference, mic, noise_psd, use)
-        path = _first(self._running.canceller.impulse_response())
+        path = first(self._running.canceller.impulse_response())
         for effect in EFFECTS:
             if effect.learned:
                 others = tuple(entry for entry in effects if entry[0] != effect.name)
@@ -247,8 +248,3 @@ def learned_profile(base: Profile | None, path: EchoPath, history: HopHistory) -
         source=LEARNED,
         array=array,
     )
-
-
-def _first(response: Samples) -> Samples:
-    """(taps,) of the first microphone, of a response (taps,) or (microphones, taps)."""
-    return response if response.ndim == 1 else response[0]
