@@ -65,7 +65,7 @@ class SpatialFilter:
         self._known_hops = 0 if noise is None else KNOWN_HOPS
         shape = microphones, microphones, stft.bins
         self._fan = np.zeros(shape, np.complex64) if noise is None else noise.astype(np.complex64)
-        self._robot, self._robot_known = self._fan.copy(), False
+        self._robot = self._fan.copy()
         self._human, self._turn = np.zeros_like(self._fan), np.zeros_like(self._fan)
         self._against = self._fan
         self._speaking = False
