@@ -21,24 +21,22 @@ from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
-from pathlib import Path
 
 import numpy as np
 
 from bench import peers, results
 from bench.metrics import percentiles
 from bench.recordings import progress, read
-from bench.stale import DEMO
 from edgefilter import Profile, engines
 from edgefilter.engines.ladder import CANDIDATES
 from edgefilter.errors import EdgefilterError, UsageError
-from edgefilter.filter.budget import held_to
+from edgefilter.filter.budget import CORES, DEMO, held_to
 from edgefilter.filter.learner import Learner
 from edgefilter.filter.stream import Stream
+from edgefilter.filter.timing import peak_memory_mb
 from edgefilter.learning.background import BackgroundLearner
 from edgefilter.types import SAMPLE_RATE
 
-CORES = 2
 WARM_UP_S = 0.5
 YARDSTICK = "speexdsp"
 """The contender whose paced hop the others are compared with; it has no gain from a second thread."""
@@ -125,12 +123,6 @@ def measure(contender: Contender, seconds: float, paced: bool) -> list[float]:
         contender.step(*hop)
         took.append(1000 * (time.perf_counter() - start))
     return took
-
-
-def peak_memory_mb() -> float:
-    """Largest resident memory of this process so far, MB (Linux; getrusage would count the parent's at the fork)."""
-    lines = Path("/proc/self/status").read_text().splitlines()
-    return next(float(line.split()[1]) for line in lines if line.startswith("VmHWM")) / 1024
 
 
 def child(name: str, seconds: float, paced: bool) -> dict:

@@ -18,10 +18,11 @@ import numpy as np
 from bench import recordings, results
 from bench.evaluate import names, numbers
 from bench.recordings import Recording
-from edgefilter.commands.demo import DATA, speaking
+from edgefilter.commands.demo import speaking
 from edgefilter.diagnosis.passport import ENGINES, LEAST_S, MOST_S, expected
 from edgefilter.dsp.metrics import si_sdr
 from edgefilter.errors import UsageError
+from edgefilter.filter.budget import DEMO
 from edgefilter.filter.enhance import enhance
 from edgefilter.types import SAMPLE_RATE
 
@@ -73,7 +74,7 @@ def summary(of: str, engine: str, some: list[dict]) -> list:
 
 def cases(options: argparse.Namespace) -> Iterator[dict]:
     """A row for each human, level and engine."""
-    voice = recordings.read(DATA / "human.flac")
+    voice = recordings.read(DEMO / "human.flac")
     voice = voice[speaking(voice)]
     alone = [one for one in recordings.find_recordings(options.recordings) if one.kind == "farend"]
     alone = alone[:: options.every][: options.limit]

@@ -353,7 +353,7 @@ def picture_name(output: Path | None, one: Mapping) -> str:
     return f"{output.name if output else 'result'}_{one['name']}.png"
 
 
-def picture(one: Mapping, dpi: int = 100) -> bytes:
+def picture(one: Mapping) -> bytes:
     """A plot of `plot` as PNG, by matplotlib's object interface, which needs no display."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -369,7 +369,7 @@ def picture(one: Mapping, dpi: int = 100) -> bytes:
         if len(panel_["lines"]) > 1:
             axes.legend(fontsize=8)
     out = BytesIO()
-    figure.savefig(out, dpi=dpi)
+    figure.savefig(out, dpi=100)
     return out.getvalue()
 
 

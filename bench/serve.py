@@ -27,10 +27,9 @@ from websockets.asyncio.client import connect
 from bench import results
 from bench.metrics import percentiles
 from bench.recordings import progress, read
-from bench.stale import DEMO
 from edgefilter import engines
 from edgefilter.errors import UsageError
-from edgefilter.filter.budget import held_to
+from edgefilter.filter.budget import DEMO, held_to
 from edgefilter.types import SAMPLE_RATE
 
 WARM_UP_S = 2.0

@@ -21,9 +21,9 @@ import edgefilter
 from bench import results
 from bench.recordings import Clip, Signals, read
 from edgefilter.errors import EdgefilterError, UsageError
+from edgefilter.filter.budget import DEMO
 from edgefilter.profile.data import Profile
 
-DEMO = Path(edgefilter.__file__).parent / "demo_data"
 DIAGNOSIS = "diagnosis"
 """Stands among the systems for the names and values that the diagnosis finds."""
 

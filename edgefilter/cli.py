@@ -23,8 +23,6 @@ ENGINE = {
     "metavar": "ENGINE",
     "help": f"auto, {', '.join(ENGINES)} (default: %(default)s); docs/cli.md says what each does",
 }
-MOST_CHANNELS = 64
-"""Of a device or a file: interfaces of studios have so many."""
 MIC_CHANNELS = {
     "type": lambda text: channels(text),
     "metavar": "N,N,...|all",
@@ -367,7 +365,7 @@ def whole(least: int, most: int, expected: str) -> Callable[[str], int]:
     """A function that reads a whole number from least to most, else raises an error that says what was expected."""
 
     def read(text: str) -> int:
-        if not text.isdecimal() or not least <= int(text) <= most:
+        if not text.strip().isdecimal() or not least <= int(text) <= most:
             raise argparse.ArgumentTypeError(f"'{text}' is not {expected}")
         return int(text)
 
@@ -379,11 +377,8 @@ def level(text: str) -> float:
     return number(text, -90.0, 0.0, "a level from -90 to 0 dB of full scale", closed=True)
 
 
-def channel(text: str) -> int:
-    """The number of a channel, counted from 0."""
-    if not text.strip().isdecimal() or int(text) >= MOST_CHANNELS:
-        raise argparse.ArgumentTypeError(f"'{text}' is not the number of a channel, 0 to {MOST_CHANNELS - 1}")
-    return int(text)
+channel = whole(0, 63, "the number of a channel, 0 to 63")
+"""Of a device or a file, counted from 0: interfaces of studios have so many."""
 
 
 def channels(text: str) -> Sequence[int]:

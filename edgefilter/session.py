@@ -20,8 +20,6 @@ from edgefilter.types import SAMPLE_RATE, Block, Event, Samples
 
 AUDIBLE_DB = -50.0
 """Level of the reference, dB of full scale, above which the robot counts as talking: of the residual that is shown."""
-MOST_EVENTS = 1000
-"""Events that a report keeps, the latest ones: a run may last for weeks."""
 
 
 @dataclass
@@ -59,7 +57,7 @@ class Progress:
 
 @dataclass
 class RunReport:
-    """What one run did; every figure measured in it."""
+    """What one run did; every figure measured in it. Of events it keeps the latest: a run may last for weeks."""
 
     samples_in: int = 0
     samples_out: int = 0
@@ -69,7 +67,7 @@ class RunReport:
     interrupted: bool = False
     failure: EdgefilterError | None = None
     filter: dict[str, Any] = field(default_factory=dict)
-    events: deque[Event] = field(default_factory=lambda: deque(maxlen=MOST_EVENTS))
+    events: deque[Event] = field(default_factory=lambda: deque(maxlen=1000))
 
     def to_dict(self) -> dict[str, object]:
         """Ready for JSON."""

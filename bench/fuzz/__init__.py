@@ -26,8 +26,9 @@ from pathlib import Path
 from tqdm import tqdm
 
 from bench import results
-from bench.fuzz.targets import DEMO, NETWORKS, TARGETS, Target, working_in
+from bench.fuzz.targets import NETWORKS, TARGETS, Target, working_in
 from edgefilter.errors import EdgefilterError, UsageError
+from edgefilter.filter.budget import DEMO
 
 PATIENCE_S = 10
 """Seconds of the processor after which an input hangs; a busy machine takes longer by the clock."""

@@ -14,7 +14,6 @@ from pathlib import Path
 import numpy as np
 import soundfile
 
-import edgefilter
 from bench.fuzz.damage import damaged, damaged_archive, damaged_json
 from edgefilter import EgoFilter, Profile
 from edgefilter.audio.files import FileSource
@@ -28,7 +27,6 @@ from edgefilter.profile.data import LEARNED
 from edgefilter.types import SAMPLE_RATE, Frame
 
 ROOT = Path(__file__).parents[2]
-DEMO = Path(edgefilter.__file__).parent / "demo_data"
 NETWORKS = ROOT / "tests" / "data"
 LOUDER_DB = 1.0
 """How much louder than the microphone an output may be over a second."""
@@ -64,7 +62,7 @@ def expect(holds: bool, promise: str) -> None:
 @lru_cache
 def profiles() -> list[bytes]:
     """The demo's profile, and three with effects: of all kinds, with arrays, and one that was learned."""
-    demo = Profile.load(DEMO / "profile.npz")
+    demo = Profile.load(budget.DEMO / "profile.npz")
     values = {
         effect.name: {p.name: (p.neutral + (p.low if p.neutral == p.high else p.high)) / 2 for p in effect.told}
         for effect in EFFECTS
@@ -111,7 +109,7 @@ def mutate_profile(data: bytes, rng: random.Random) -> bytes:
 @lru_cache
 def sound() -> tuple[np.ndarray, np.ndarray]:
     """Two seconds of the demo in which the robot speaks: microphone and reference."""
-    channels = [soundfile.read(DEMO / f"{name}.flac", dtype="float32")[0] for name in ("mic", "reference")]
+    channels = [soundfile.read(budget.DEMO / f"{name}.flac", dtype="float32")[0] for name in ("mic", "reference")]
     at = int(np.argmax(np.abs(channels[1]) > 0.05))
     return tuple(channel[at : at + 2 * SAMPLE_RATE] for channel in channels)
 

@@ -7,7 +7,6 @@ r"""Robots that talk, move and are interrupted: on virtual devices in real time,
     python -m bench live barge-in --voices ROBOT/test --speech HUMAN/test --count 24 --seed 17 \
         --whisper WHISPER --alone ROBOT/test SYNTHESIZERS --minutes 60 --real RECORDINGS
     python -m bench live day --voices ROBOT/test --speech HUMAN/test --minutes 60
-    python -m bench live rooms --voices ROBOT/test --count 16
 
 trial, hour and click need PulseAudio, whose private servers make no sound. What each part does stands at the head of its
 file in bench/live/. All parts write to the one file of --output.
@@ -18,7 +17,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from bench.live import barge_in, click, day, rooms, soak, trial
+from bench.live import barge_in, click, day, soak, trial
 from edgefilter.errors import UsageError
 
 PARTS = {
@@ -28,13 +27,11 @@ PARTS = {
     "click": click.run,
     "barge-in": barge_in.run,
     "day": day.run,
-    "rooms": rooms.run,
 }
 NEEDED = {
     "trial": ("voices", "speech"),
     "barge-in": ("voices", "speech"),
     "day": ("voices", "speech"),
-    "rooms": ("voices",),
 }
 
 
@@ -44,8 +41,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--voices", type=Path, nargs="+", metavar="DIR", help="folders of the robot's sentences")
     add("--speech", type=Path, metavar="DIR", help="folder of human speech")
     add("--minutes", type=float, default=10.0, help="of the run, or of robot speech (default: %(default)s)")
-    add("--count", type=int, default=16, help="conversations, rooms or clicks (default: %(default)s)")
-    add("--engine", help="default: auto; of barge-in crnn, of day and rooms linear")
+    add("--count", type=int, default=16, help="conversations or clicks (default: %(default)s)")
+    add("--engine", help="default: auto; of barge-in crnn, of day linear")
     add("--one-way", action="store_true", help="soak: the reference's clock is fast all the time")
     add(
         "--alone",

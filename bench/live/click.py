@@ -19,7 +19,7 @@ from scipy import signal
 
 from bench import results
 from bench.live import virtual_sound
-from bench.stale import DEMO
+from edgefilter.filter.budget import DEMO
 from edgefilter.types import SAMPLE_RATE
 
 COMMAND = [sys.executable, "-m", "edgefilter.cli", "run"]

@@ -28,9 +28,9 @@ from bench.live import virtual_sound
 from bench.live.virtual_sound import children_mb, memory_mb
 from bench.metrics import percentiles
 from bench.recordings import read
-from bench.stale import DEMO
 from edgefilter import EgoFilter
 from edgefilter.errors import UsageError
+from edgefilter.filter.budget import DEMO
 from edgefilter.types import SAMPLE_RATE
 
 SLICES = 20

@@ -1,10 +1,10 @@
-"""Long recordings of a simulated robot: a day of changes, one robot in two rooms, and a robot that speaks to nobody.
+"""Long recordings of a simulated robot: a day of changes, and a robot that speaks to nobody.
 
 A day: the robot speaks clip after clip, in random order and over and over. Five changes divide a day into six stages of equal
 length: it is calibrated and begins in a laboratory, then is carried into an office, turned down, driven to another
 place in that office, gets a playback clock of its own with another lag, and is carried into another office. The human
-talks over about every third utterance. Loudspeaker, shell and fan stay the same. Two rooms: the robot alone, yesterday
-in both and today in one, with a calibration in both. Alone: ever new robots in new rooms, which nobody interrupts.
+talks over about every third utterance. Loudspeaker, shell and fan stay the same. Alone: ever new robots in new
+rooms, which nobody interrupts.
 """
 
 from __future__ import annotations
@@ -221,60 +221,7 @@ def calibration(
     return excitation.astype(np.float32), echo + fan, alone
 
 
-ROOM_LAG_S = (0.05, 0.3)
 ROOMS = ("lab", "office")
-
-
-@dataclass(frozen=True)
-class Recording:
-    """Reference, echo and fan, (n,) float32 each."""
-
-    ref: Samples
-    echo: Samples
-    fan: Samples
-
-    @property
-    def mic(self) -> Samples:
-        """What the microphone hears."""
-        return self.echo + self.fan
-
-
-@dataclass(frozen=True)
-class TwoRooms:
-    """today, yesterday and calibration take place in this room (of that kind), the others in the other one."""
-
-    kind: str
-    today: Recording
-    yesterday: Recording
-    yesterday_elsewhere: Recording
-    calibration: tuple[Samples, Samples, Samples]
-    calibration_elsewhere: tuple[Samples, Samples, Samples]
-
-
-def make_rooms(seed: int, index: int, clips: list[Clip], today_s: float, yesterday_s: float) -> TwoRooms:
-    """Robot number index: today in the laboratory where index is even, else in the office.
-
-    today_s, yesterday_s: seconds of robot speech; no clip is heard in two of the recordings before all were heard.
-    """
-    rng = np.random.default_rng([seed, index])
-    kind, other = (ROOMS[(index + i) % 2] for i in (0, 1))
-    robot, human_m = draw_robot(rng), rng.uniform(1.0, 1.5)
-    here, elsewhere = (draw_room(rng, of, robot.distance_m, robot.direction, human_m) for of in (kind, other))
-    repertoire = Repertoire(shuffled(rng, clips))
-    robot, _ = with_distortion(robot, next(repertoire), here.robot, USUAL_DISTORTION_DB)
-    spoken = []
-    for room, seconds in ((here, today_s), (here, yesterday_s), (elsewhere, yesterday_s)):
-        stage = Stage(kind, room, round(rng.uniform(*ROOM_LAG_S) * RATE))
-        spoken.append(speak(rng, robot, repertoire, stage, seconds))
-    level = loudness(spoken[0][1], spoken[0][2])
-    microphone = draw_microphone(rng, robot, here, max(float(np.abs(echo).max()) for _, echo, _ in spoken), level)
-    recordings = [
-        Recording(np.float32(ref), np.float32(microphone.gain * echo), microphone.hears_fan(rng, ref.size))
-        for ref, echo, _ in spoken
-    ]
-    return TwoRooms(kind, *recordings, *(calibration(rng, robot, room, microphone) for room in (here, elsewhere)))
-
-
 STARTS, ALONE_LAG_S, ALONE_PPM = ("calibrated", "cold"), (0.02, 1.0), (10.0, 300.0)
 TRIAL_S = 6.0
 """Of the robot's voice, to which its distortion is set."""

@@ -217,10 +217,11 @@ def fan_noise(rng: np.random.Generator, amplitude: Array, n: int) -> Array:
     return signal.oaconvolve(rng.standard_normal(n + taps.size - 1), taps, mode="valid")
 
 
-def warp(x: Array, ppm: float, half_width: int = 32) -> Array:
-    """Samples x (n,) read at t (1 + ppm 1e-6) by a Kaiser-windowed sinc of 2 half_width taps (beta 9: -90 dB)."""
+def warp(x: Array, ppm: float) -> Array:
+    """Samples x (n,) read at t (1 + ppm 1e-6) by a Kaiser-windowed sinc of 64 taps (beta 9: -90 dB)."""
     if ppm == 0.0:
         return x.copy()
+    half_width = 32
     padded = np.concatenate([np.zeros(half_width), x, np.zeros(2 * half_width)])
     out = np.empty_like(x)
     offsets = np.arange(-half_width + 1, half_width + 1)

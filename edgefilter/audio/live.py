@@ -17,9 +17,6 @@ from edgefilter.audio.steady import SteadyInput
 from edgefilter.errors import DeviceError
 from edgefilter.types import MOST_MICROPHONES, SAMPLE_RATE, Block, Samples
 
-MARGIN_S = 0.04
-"""Silence ahead of a live output, on top of the declared latency: two callbacks of 20 ms, which come with jitter."""
-
 
 class LiveSource(Source):
     """Microphone and reference devices as blocks on the microphone's sample counter, until stop() or `seconds`.
@@ -169,14 +166,14 @@ def _join(first: Block, second: Block) -> Block:
 class LiveSink(Sink):
     """A loudspeaker or virtual device that first plays `latency` samples of silence, so that sound lags the input evenly.
 
-    MARGIN_S more silence comes before it as a reserve against jitter. wait: hold the writer up when enough is queued
+    Two callbacks of 20 ms more of silence come before it as a reserve against jitter. wait: hold the writer up when enough is queued
     (right for a file as source); otherwise, with a live source, what is too much is dropped and counted: more than a
     source holds back at most while it waits for the reference, and delivers at once. An underrun
     plays silence, is counted, and ends when the reserve is there again. Raises DeviceError when the device stops.
     """
 
     def __init__(self, device: str | int | Device | None, latency: int = 0, wait: bool = True) -> None:
-        self._port = output_port(device, latency, MARGIN_S)
+        self._port = output_port(device, latency, 2 * TOLERANCE / SAMPLE_RATE)
         self._lead = round(latency * self._port.rate / SAMPLE_RATE) + self._port.margin
         self._most = self._lead + round((MAX_WAIT + TOLERANCE) / SAMPLE_RATE * self._port.rate)
         self._wait, self._open = wait, False

@@ -31,12 +31,11 @@ def play_and_record(
     output: str | int | Device | None,
     microphone: str | int | Device | None,
     samples: Samples,
-    tail_s: float = 1.0,
     latency_s: float = STREAM_LATENCY_S,
     tell: Callable[[float], None] = lambda left_s: None,
     channels: Sequence[int] | None = None,
 ) -> Recording:
-    """Play samples (n,) at 16 kHz and return what the microphone picks up from the moment playing starts, (n + tail,).
+    """Play samples (n,) at 16 kHz and return what the microphone picks up from the moment playing starts until a second after it, (n + 16000,).
 
     Both are on one sample counter up to a constant: the devices' buffers appear as additional delay, so that the sound
     never seems to arrive before it is played. Silence goes first, since sound servers swallow a stream's start.
@@ -57,7 +56,7 @@ def play_and_record(
             begun.append(mic.inlet.received)
 
     parts: list[Samples] = []
-    wanted = samples.size + round(tail_s * SAMPLE_RATE)
+    wanted = samples.size + SAMPLE_RATE
     first, left = 0, wanted
     try:
         mic.open()
@@ -82,17 +81,15 @@ def play_and_record(
     return Recording(np.concatenate(parts)[first : first + wanted], holes)
 
 
-def play_through(
-    output: str | int | Device | None, source: Source, samples: Samples, tail_s: float = 2.0
-) -> tuple[Samples, Samples, int]:
-    """Play samples (n,) at 16 kHz while a live source runs, until tail_s after them.
+def play_through(output: str | int | Device | None, source: Source, samples: Samples) -> tuple[Samples, Samples, int]:
+    """Play samples (n,) at 16 kHz while a live source runs, until two seconds after them.
 
     Returns its microphone and reference (m,), and the samples that were lost. Raises DeviceError where a device cannot be opened or stops.
     """
     speaker = output_port(output, samples.size)
     speaker.outlet.ring.write(speaker.convert(samples.astype(np.float32), last=True))
     speaker.outlet.draining.set()
-    wanted = samples.size + round(tail_s * SAMPLE_RATE)
+    wanted = samples.size + 2 * SAMPLE_RATE
     blocks: list[Block] = []
     try:
         with source:

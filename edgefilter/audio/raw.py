@@ -18,8 +18,6 @@ from edgefilter.errors import AudioFileError, UsageError
 from edgefilter.types import SAMPLE_RATE, Block, Samples, as_samples
 
 FULL_SCALE = 32768.0
-_PATIENCE_S = 0.1
-"""How soon stop() is noticed while a pipe is silent."""
 _HEADERS = (b"RIFF", b"fLaC", b"OggS")
 
 
@@ -89,8 +87,8 @@ class PcmSource(Source):
             handle = None
         wait = handle is not None and sys.platform != "win32"
         while not self._stopped:
-            if handle is not None and wait and not select.select([handle], [], [], _PATIENCE_S)[0]:
-                continue
+            if handle is not None and wait and not select.select([handle], [], [], 0.1)[0]:
+                continue  # and look for stop() while the pipe is silent
             count = io.DEFAULT_BUFFER_SIZE
             data = self._stream.read(count) if handle is None else os.read(handle, count)
             if not data:

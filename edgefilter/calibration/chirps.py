@@ -27,8 +27,6 @@ LEAD = round(0.5 * SAMPLE_RATE)
 """Samples of silence before the first chirp, in which the room's noise is measured."""
 QUIET = round(0.1 * SAMPLE_RATE)
 """Samples of it, the quietest of which count: a stream may begin with a noise of its own."""
-RESPONSE = round(0.25 * SAMPLE_RATE)
-"""Samples of the echo path that are fitted."""
 STRETCHED_PPM = 5.0
 """Difference of two clocks from which on a chirp is stretched enough, by a fortieth of a sample, to cost 30 dB of 7 kHz:
 the microphone is straightened then."""
@@ -162,7 +160,7 @@ def _left(heard: np.ndarray, references: np.ndarray, band: slice, size: int) -> 
     half = len(heard) // 2
     total = np.sum(power(references[:half]), axis=0)
     response = fft.irfft(np.sum(heard[:half] * np.conj(references[:half]), axis=0) / (total + 1e-6 * total.max()), size)
-    response[RESPONSE:-FADE] = 0.0
+    response[SAMPLE_RATE // 4 : -FADE] = 0.0  # no echo path is longer than 250 ms
     left = heard[half:, band] - fft.rfft(response)[band] * references[half:, band]
     linear_db = float(decibels(np.sum(power(heard[half:, band])) / max(np.sum(power(left)), 1e-12)))
     largest = np.argmax(np.abs(response))

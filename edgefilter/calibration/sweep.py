@@ -21,8 +21,6 @@ EARLIEST_DIRECT, LATEST_DIRECT = -2000, int(1.6 * SAMPLE_RATE)
 """Samples by which the direct sound may come after it was played, on the recording's counter."""
 HOP = 160
 """Samples between the frames of the paper's spectrograms."""
-TWELFTH = 2 ** (1 / 12) - 1
-"""Half the width of a sixth of an octave around a frequency, over that frequency."""
 DRIFT_REACH = 400
 """Samples by which clocks that are apart may move a lag within a recording: 400 ppm in a minute."""
 
@@ -184,7 +182,7 @@ def smoothed(lines: Array, hz: Array, line_hz: float, least_hz: float) -> Array:
     """(..., hz.size) mean of lines (..., n), line_hz apart, over a sixth of an octave around each hz, at least 2 least_hz."""
     total = np.cumsum(lines, axis=-1)
     total = np.concatenate((np.zeros_like(total[..., :1]), total), axis=-1)
-    half = np.maximum(TWELFTH * hz, least_hz) / line_hz
+    half = np.maximum((2 ** (1 / 12) - 1) * hz, least_hz) / line_hz
     low = np.clip(np.floor(hz / line_hz - half), 0, None).astype(int)
     high = np.minimum(np.ceil(hz / line_hz + half) + 1, lines.shape[-1]).astype(int)
     return (total[..., high] - total[..., low]) / (high - low)

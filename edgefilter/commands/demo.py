@@ -20,6 +20,7 @@ from edgefilter.diagnosis.diagnose import Diagnosis, diagnose
 from edgefilter.dsp.metrics import si_sdr
 from edgefilter.engines import NEEDS_PROFILE
 from edgefilter.errors import UsageError
+from edgefilter.filter.budget import DEMO
 from edgefilter.filter.ego_filter import EgoFilter
 from edgefilter.filter.enhance import enhance
 from edgefilter.profile.data import Profile
@@ -27,7 +28,6 @@ from edgefilter.report.text import decibels, headline, in_order
 from edgefilter.session import filter_blocks
 from edgefilter.types import SAMPLE_RATE, Samples
 
-DATA = Path(__file__).parent.parent / "demo_data"
 CASES = ("one", "two")
 """Folders of demo_data/hidden: a robot to which one thing has happened, and one to which two have."""
 HUMAN_DB, HUMAN_AT_S = -20.0, 1.0
@@ -49,14 +49,14 @@ def _filter(args: argparse.Namespace) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     filtered = folder / "filtered.wav"
     with progress("demo: filtering the bundled conversation") as step:
-        ego = EgoFilter(DATA / "profile.npz", args.engine)
-        with FileSource(DATA / "mic.flac", DATA / "reference.flac") as source, FileSink(filtered) as sink:
+        ego = EgoFilter(DEMO / "profile.npz", args.engine)
+        with FileSource(DEMO / "mic.flac", DEMO / "reference.flac") as source, FileSink(filtered) as sink:
             report = filter_blocks(source, ego, sink)
         if report.failure:
             raise report.failure
         step("again without the robot's calibration")
-        sounds = {"microphone": _read(DATA / "mic.flac"), "filtered": _read(filtered)}
-        sounds["human"] = _read(DATA / "human.flac")
+        sounds = {"microphone": _read(DEMO / "mic.flac"), "filtered": _read(filtered)}
+        sounds["human"] = _read(DEMO / "human.flac")
         figures = report.to_dict() | scores(sounds["filtered"], args.engine)
         step("drawing")
         for name in ("microphone", "human"):
@@ -77,7 +77,7 @@ def _filter(args: argparse.Namespace) -> None:
 
 def scores(filtered: Samples, engine: str) -> dict[str, float | None]:
     """SI-SDR where the human speaks: before, after, and after without the calibration if the engine works without one."""
-    human, mic, ref = (_read(DATA / f"{name}.flac") for name in ("human", "mic", "reference"))
+    human, mic, ref = (_read(DEMO / f"{name}.flac") for name in ("human", "mic", "reference"))
     cold = None if engine in NEEDS_PROFILE else enhance(mic, ref, None, engine)
     return {
         "si_sdr_before_db": _si_sdr(mic, human),
@@ -104,12 +104,12 @@ class Case:
 
 def load(name: str) -> Case:
     """The bundled robot of that name; the demo's human is mixed into the last seconds of its recording."""
-    folder = DATA / "hidden" / name
+    folder = DEMO / "hidden" / name
     truth = json.loads((folder / "truth.json").read_text(encoding="utf-8"))
     mic, reference = (_read(folder / f"{file}.flac") for file in ("mic", "reference"))
     at, begin = round(truth["talk_s"] * SAMPLE_RATE), round(HUMAN_AT_S * SAMPLE_RATE)
     robot = mic[at:]
-    voice = _read(DATA / "human.flac")
+    voice = _read(DEMO / "human.flac")
     voice = voice[speaking(voice)][: robot.size - begin]
     level = np.sqrt(np.mean(robot[begin : begin + voice.size] ** 2) / np.mean(voice**2)) * 10 ** (HUMAN_DB / 20)
     human = np.zeros_like(robot)

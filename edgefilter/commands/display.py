@@ -188,9 +188,8 @@ def status_line(block: Progress, stats: Stats, source: Mapping[str, int], width:
     return (line if len(line) <= width else "  ".join((clock, plain, *parts)))[:width].ljust(width)
 
 
-def _bar_of(level_db: float, width: int = 10) -> str:
-    filled = round(width * min(max((level_db + 60) / 60, 0), 1))
-    return "#" * filled + "." * (width - filled)
+def _bar_of(level_db: float) -> str:
+    return ("#" * round(10 * min(max((level_db + 60) / 60, 0), 1))).ljust(10, ".")
 
 
 def report_part(name: str) -> ModuleType:

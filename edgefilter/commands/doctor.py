@@ -15,10 +15,12 @@ from edgefilter.calibration.array import FARTHEST
 from edgefilter.calibration.chirps import LEVEL_DB, SOFTER_DB, Heard, chirps, judge
 from edgefilter.commands.display import print_result, say
 from edgefilter.diagnosis.channels import doubtful_channels
+from edgefilter.dsp.frames import decibels
 from edgefilter.engines import create
 from edgefilter.errors import EdgefilterError
 from edgefilter.filter.budget import DEFAULT_MS
 from edgefilter.filter.ego_filter import EgoFilter
+from edgefilter.filter.microphones import APART_DB, CLIPPED_DB
 from edgefilter.learning.background import cores
 from edgefilter.profile.data import Profile
 from edgefilter.types import SAMPLE_RATE, Samples
@@ -31,12 +33,6 @@ PACE = 0.005
 """Error of a device's clock that passes: 3 s of listening tell no less, though the filter follows only far smaller ones."""
 TOO_SOFT_DB = -75.0
 """Level, dB of full scale, under which the gain is too low: the noise of 16 bit, -101 dB, is 26 dB below."""
-SILENT_DB = -120.0
-"""What digital silence is told as, dB of full scale."""
-CLIPPED_DB = -0.1
-"""Peak, dB of full scale, over which a microphone counts as clipped: conversion to 16 kHz may lower a clipped peak a little."""
-APART_DB = 12.0
-"""From the median microphone, as in filter/microphones.py: equal microphones agree within 1 to 2 dB."""
 SAME, UNLIKE = 0.999, 0.2
 """Coherence of a copy, and that below which a channel is no microphone of the array: the array of a real robot has .7 to
 .99 up to 4 kHz in its own noise, a microphone of another kind beside it .1."""
@@ -184,7 +180,7 @@ def _sound(ports: dict[str, InputPort]) -> Iterator[Check]:
 def array_checks(channels: Sequence[Channel]) -> Iterator[Check]:
     """A check for each microphone of an array, beside the others."""
     level = float(np.median([one.level_db for one in channels])) if channels else 0.0
-    silent = [one.peak_db <= SILENT_DB for one in channels]
+    silent = [one.peak_db <= float(decibels(0.0)) for one in channels]
     first = silent.index(False) if False in silent else 0
     for at, one in enumerate(channels):
         found = f"{one.level_db:.0f} dB, floor {one.floor_db:.0f} dB, peak {one.peak_db:.0f} dB"
@@ -337,7 +333,7 @@ def _clock(role: str, trial: Trial) -> Check:
 
 def _level(trial: Trial) -> Check:
     found = f"{trial.level_db:.0f} dB of full scale, peak {trial.peak_db:.0f} dB"
-    if trial.peak_db <= SILENT_DB:
+    if trial.peak_db <= float(decibels(0.0)):
         return Check("level", "warning", "every sample is zero", "unmute the microphone, or name another with --input")
     if trial.level_db < TOO_SOFT_DB:
         return Check("level", "warning", found, "raise the microphone's gain")

@@ -6,12 +6,13 @@ import argparse
 from collections.abc import Callable
 
 from edgefilter.calibration.from_recording import self_calibrate
-from edgefilter.commands.demo import DATA, speaking
+from edgefilter.commands.demo import speaking
 from edgefilter.commands.display import print_result, progress, report_part
 from edgefilter.commands.recordings import read
 from edgefilter.diagnosis.diagnose import Diagnosis, diagnose
 from edgefilter.diagnosis.passport import ENGINES, MOST_S, measure
 from edgefilter.errors import SignalError
+from edgefilter.filter.budget import DEMO
 from edgefilter.report.passport import expectation, lines
 from edgefilter.report.text import headline
 from edgefilter.types import SAMPLE_RATE, Samples
@@ -21,7 +22,7 @@ def main(args: argparse.Namespace) -> int:
     html = report_part("html") if args.report else None
     most = round(MOST_S * SAMPLE_RATE)
     recording, reference = read(args.recording, "recording")[:most], read(args.reference, "reference")[:most]
-    voice = read(str(DATA / "human.flac"), "human")
+    voice = read(str(DEMO / "human.flac"), "human")
     with progress("passport") as step:
         engines = args.engine or list(ENGINES)
         found = measure(recording, reference, voice[speaking(voice)], args.human_db, engines, step)

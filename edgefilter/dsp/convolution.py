@@ -8,9 +8,6 @@ from scipy import fft
 from edgefilter.dsp.frames import frames
 from edgefilter.types import Array
 
-LEAST_SIZE = 1024
-"""Samples of a block, of which the shortest filters need less."""
-
 
 def convolve(x: Array, taps: Array) -> Array:
     """The full convolution of x (n,) and taps (t,), (n + t - 1,), float32 where both are.
@@ -19,7 +16,7 @@ def convolve(x: Array, taps: Array) -> Array:
     lengths the first t - 1 samples are wrapped and left out. Takes half of the time of scipy.signal.oaconvolve.
     """
     before, whole = taps.size - 1, x.size + taps.size - 1
-    size = 1 << max(4 * taps.size, LEAST_SIZE).bit_length()
+    size = 1 << max(4 * taps.size, 1024).bit_length()
     if whole <= size:
         size = fft.next_fast_len(whole, real=True)
         return fft.irfft(fft.rfft(x, size) * fft.rfft(taps, size), size)[:whole]

@@ -21,6 +21,9 @@ except (ImportError, AttributeError, TypeError):
 
 TINY = np.float32(1e-30)
 """Power to add to a divisor that may be zero, far below that of any sound."""
+LEAST = 1e-9
+"""Least power, -90 dB, that something is taken to have beside what it is compared with, such as noise beside the loudest
+sound so far: of nothing at all, as a muted microphone brings it, no ratio could be told."""
 _SINGLE, _COMPLEX = np.dtype(np.float32), np.dtype(np.complex64)
 
 

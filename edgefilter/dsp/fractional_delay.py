@@ -16,9 +16,8 @@ HALF_WIDTH = 24
 PHASES = 256
 """Delays per sample at which the filters are tabulated; linear interpolation between them errs by less than -100 dB."""
 CHUNK = 2048
-"""Samples that are read at once: their filters stay in the cache."""
-MARGIN = 256
-"""Samples of silence between the end of a signal and its beginning, which the spectrum joins."""
+"""Samples that are made at once: their filters stay in the cache, and a sentence that comes in one piece needs no more memory
+than a frame."""
 
 
 def kernel(fraction: Array) -> Samples:
@@ -73,7 +72,9 @@ def delayed(x: Array, samples: float) -> Samples:
     """
     if abs(samples) >= x.size:
         return np.zeros(x.size, np.float32)
-    n = fft.next_fast_len(x.size + int(abs(samples)) + MARGIN, real=True)
+    n = fft.next_fast_len(
+        x.size + int(abs(samples)) + 256, real=True
+    )  # silence where the spectrum joins end and beginning
     spectrum = fft.rfft(x.astype(np.float64), n)
     spectrum *= turn(np.arange(n // 2 + 1) * (-2.0 * np.pi / n), samples)
     return fft.irfft(spectrum, n, overwrite_x=True)[: x.size].astype(np.float32)

@@ -15,9 +15,6 @@ LIKELY_HZ = 50.0
 """The same where the prediction's power weighs a cross-spectrum."""
 LOWEST_HZ = 100.0
 """A voice and its room begin here; what lies below is rumble."""
-LONGEST = 0.5
-"""Samples of one Newton step: halfway between two samples a longer one jumps to and fro across the top."""
-
 SAME = 0.98
 """Correlation of a copy with what it is a copy of, both cut from the same second at a lag of some ms."""
 
@@ -94,7 +91,8 @@ def climb(cross: np.ndarray, omega: Array, lag: float, steps: int = 8, tolerance
         curvature = -float(squared.dot(turned.real))
         if curvature >= 0.0:
             break
-        step = min(max(-slope / curvature, -LONGEST), LONGEST)
+        # halfway between two samples a longer step jumps to and fro across the top
+        step = min(max(-slope / curvature, -0.5), 0.5)
         moved = min(max(moved + step, -1.0), 1.0)
         if abs(step) < tolerance:
             break

@@ -7,6 +7,7 @@ from functools import lru_cache
 
 import numpy as np
 
+from edgefilter.dsp.fractional_delay import CHUNK
 from edgefilter.types import Samples
 
 HALF_S = 0.0035
@@ -18,8 +19,6 @@ BETA = 6.76
 """Shape of the Kaiser window for 70 dB: 0.1102 (A - 8.7), Oppenheim & Schafer, Discrete-Time Signal Processing, 7.5.3."""
 MOST_PHASES = 512
 """Kernels that are tabulated; where the rates have more, lines between two of them err by -80 dB at most."""
-PIECE = 2048
-"""Outputs that are made at once: a sentence that comes in one piece needs no more memory than a frame."""
 
 
 class Resampler:
@@ -55,9 +54,9 @@ class Resampler:
         kept = np.concatenate((self._kept, samples, end))
         count = max(0, -((self._at - (kept.size - 2 * self._reach + 1) * self._phases) // self._step))
         out = np.empty(count, np.float32)
-        for first in range(0, count, PIECE):
-            at = self._at + self._step * np.arange(first, min(first + PIECE, count))
-            out[first : first + PIECE] = self._interpolate(kept, at)
+        for first in range(0, count, CHUNK):
+            at = self._at + self._step * np.arange(first, min(first + CHUNK, count))
+            out[first : first + CHUNK] = self._interpolate(kept, at)
         self._at += count * self._step
         used = min(self._at // self._phases, kept.size)
         self._at -= used * self._phases

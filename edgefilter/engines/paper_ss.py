@@ -23,13 +23,13 @@ PAPER_STFT = StftConfig(n_fft=1200, hop=160, window_length=400, window="hann")
 L, I = 3, 1  # noqa: E741 - the paper's letters: half width of the smoothing window in frames and in bins
 
 
-def smoothing_window(half_frames: int = L, half_bins: int = I) -> Array:
+def smoothing_window() -> Array:
     """Hann window (2 L + 1, 2 I + 1) without its zero end points, normalised to sum 1."""
 
     def hann(half: int) -> Array:
         return signal.get_window("hann", 2 * half + 3, fftbins=False)[1:-1]
 
-    window = np.outer(hann(half_frames), hann(half_bins))
+    window = np.outer(hann(L), hann(I))
     return window / window.sum()
 
 

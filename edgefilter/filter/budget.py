@@ -29,12 +29,13 @@ from edgefilter.types import SAMPLE_RATE, Samples
 DEFAULT_MS = 8.0
 """Compute per hop that is allowed unless the user says otherwise: half of a 16 ms hop."""
 CORES = 2
-WARM_UP, PACED = 32, 300
-"""Hops that are not counted, and hops at the real pace."""
+PACED = 300
+"""Hops at the real pace."""
 LATE_S = 0.4
 """An engine that has fallen so far behind the real pace is not measured any longer."""
 AGAIN = " (measured before; --remeasure does it again)"
-SCENE = Path(__file__).parents[1] / "demo_data"
+DEMO = Path(__file__).parent.parent / "demo_data"
+"""The recordings and profiles that come with the package."""
 PACKAGES = ("edgefilter", "numpy", "scipy", "onnxruntime")
 """Those whose versions a measurement depends on."""
 
@@ -143,7 +144,7 @@ def measure(engine: Engine | ClipEngine, profile: Profile | None = None, paced: 
     hop = engine.stft.hop
     hops, stream = _scene(hop), Stream(engine, profile)
     with held_to(CORES):
-        pace(stream, hops, WARM_UP, period_s=0.0)
+        pace(stream, hops, 32, period_s=0.0)  # not counted
         took = pace(stream, hops, paced)
     times = (float(each) for each in np.percentile(took, (50, 95, 99, 100)))
     return Figures(engine.name, _model(engine), 1000 * hop / SAMPLE_RATE, len(took), len(took) == paced, *times)
@@ -188,7 +189,7 @@ def _allowed() -> set[int]:
 
 def _scene(hop: int) -> Iterator[tuple[Samples, Samples]]:
     """The bundled conversation hop by hop, over and over."""
-    mic, ref = (soundfile.read(SCENE / f"{name}.flac", dtype="float32")[0] for name in ("mic", "reference"))
+    mic, ref = (soundfile.read(DEMO / f"{name}.flac", dtype="float32")[0] for name in ("mic", "reference"))
     while True:
         for at in range(0, mic.size - hop + 1, hop):
             yield mic[at : at + hop], ref[at : at + hop]

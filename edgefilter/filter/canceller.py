@@ -14,7 +14,7 @@ from edgefilter.dsp.membrane import DISPLACEMENT_TAPS, displacement_taps
 from edgefilter.errors import SignalError
 from edgefilter.filter.adaptation import COLD, WARM, Adaptation
 from edgefilter.filter.volume import EchoLimiter, Volume
-from edgefilter.types import SAMPLE_RATE, LinearStageStats, Samples, Spectrum
+from edgefilter.types import LOUDEST, SAMPLE_RATE, LinearStageStats, Samples, Spectrum
 
 PRIOR_VARIANCE = 0.05
 """Variance of a calibrated path relative to its own power: the robot moved and the room is another."""
@@ -44,8 +44,6 @@ REOPEN = 0.3
 heard: kept whole, a variance that grows with it let it grow without end."""
 AGED_ROWS = 4
 """Partitions whose process noise is worked out anew in a hop, in turn: a path's power changes slowly."""
-LOUDEST = 1e12
-"""Mean square of a predicted echo, full scale 1, at which the filter has diverged and begins anew."""
 
 
 class CancellerOutput(NamedTuple):
@@ -181,7 +179,7 @@ class Canceller:
         """
         self._push(reference)
         path_echo = echo = self._predict()
-        if not np.vdot(path_echo, path_echo) < LOUDEST * self.hop:  # nor where it is no number
+        if not np.vdot(path_echo, path_echo) < LOUDEST**2 * self.hop:  # it has diverged, also where it is no number
             diverged = self._diverged + 1
             self.reset()  # of the reference's past, too: it may be what made it diverge
             self._diverged = diverged

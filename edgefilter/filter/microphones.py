@@ -8,19 +8,20 @@ from edgefilter.dsp.exchange import EQUAL, exchanged, order_of
 from edgefilter.dsp.lag import played_in
 from edgefilter.types import SAMPLE_RATE, Array, Samples
 
-BLOCK_S = 1.0
-"""Over which microphones are compared; one that was left out comes back after GOOD_BLOCKS in a row without a reason."""
 GOOD_BLOCKS = 3
-APART = 10**1.2
-"""Power over the median microphone's, 12 dB either way: equal microphones of one array agree within 1 to 2 dB, one of
-another kind beside them was 12 to 18 dB louder (a real robot's noise on four microphones)."""
+"""Blocks of a second, over which microphones are compared, in a row without a reason, after which one that was left out comes
+back."""
+APART_DB = 12.0
+"""From the median microphone's level: equal microphones of one array agree within 1 to 2 dB, one of another kind beside them
+was 12 to 18 dB louder (a real robot's noise on four microphones)."""
 SILENT = 1e-6
 """Power over the loudest microphone's, -60 dB, below which a microphone is called silent and not soft."""
 CANCELLED, UNLIKE, LEFT = 0.1, 10.0, 0.3
 """Error over microphone where the robot is the loudest and is cancelled in the best microphone (-10 dB); how many times as
 much is left in one whose path is another than was calibrated: swapped, broken, or processed; and the least of it."""
-CLIPPED, MOST_CLIPPED = 10 ** (-0.1 / 20), 16
-"""Size from which a sample counts as clipped, as in doctor; so many, 1 ms of them in a block, are no single peak."""
+CLIPPED_DB, MOST_CLIPPED = -0.1, 16
+"""Size from which a sample counts as clipped, dB of full scale: conversion to 16 kHz may lower a clipped peak a little; so
+many, 1 ms of them in a block, are no single peak."""
 CALIBRATED_TAPS = 2048
 """Of the calibrated paths that say which channel is which: the direct sound and what comes soon after it."""
 
@@ -48,7 +49,7 @@ class Microphones:
         self._exchanged: dict[int, str] = {}
         self._played: set[int] = set()
         self._asked: set[int] = set()
-        self._hops = round(BLOCK_S * SAMPLE_RATE / hop)
+        self._hops = round(SAMPLE_RATE / hop)
         self._good = [GOOD_BLOCKS] * count
         self._block = [np.zeros((rows, self._hops * hop), np.float32) for rows in (count, 2)]
         self._begin()
@@ -84,7 +85,7 @@ class Microphones:
         self._block[0][:, here], self._block[1][0, here], self._block[1][1, here] = mic, ref, aligned
         self._moments += mic @ mic.T
         self._errors += np.einsum("ch,ch->c", error, error)
-        self._clipped += np.count_nonzero(np.abs(mic) >= CLIPPED, axis=1)
+        self._clipped += np.count_nonzero(np.abs(mic) >= 10 ** (CLIPPED_DB / 20), axis=1)
         self._located &= located
         self._seen += 1
         if self._seen < self._hops:
@@ -159,8 +160,9 @@ class Microphones:
         reasons = {at: "silent" for at in kept if power[at] < SILENT * loudest}
         heard = [at for at in kept if at not in reasons]
         median = float(np.median(power[heard])) if len(heard) > 2 else loudest
+        apart = 10 ** (APART_DB / 10)
         for at in heard if loudest > 0.0 else ():
-            if not median / APART < power[at] < APART * median:
-                apart = f"{abs(10 * np.log10(power[at] / median)):.0f} dB"
-                reasons[at] = f"{apart} {'louder' if power[at] > median else 'softer'} than the others"
+            if not median / apart < power[at] < apart * median:
+                level_db = abs(10 * np.log10(power[at] / median))
+                reasons[at] = f"{level_db:.0f} dB {'louder' if power[at] > median else 'softer'} than the others"
         return reasons

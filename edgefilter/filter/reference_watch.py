@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from typing import Literal
 
 import numpy as np
@@ -31,8 +32,6 @@ converter, since there is nothing else to compare with. 16 bits by themselves ar
 LITTLE_DB = 4.0
 """Removed of the robot below which its echo counts as unpredicted. Of 36 simulated conversations the least was 9 dB, of six
 loudspeakers with humans as far below the echo as theirs 10; microphones that process their sound have -0.1 to 4."""
-NEVER = 10**9
-"""Samples, more than any stretch of speech has."""
 UNPREDICTED = (
     "the linear stage removes {:.1f} dB of the robot: the microphone seems to be processed, or the loudspeaker distorts;"
     " switch off noise suppression, gain control and echo cancellation of the device, and turn the volume down"
@@ -77,7 +76,7 @@ class ReferenceWatch:
         if self.verdict == "fits":
             return 0
         if not self._idle:  # what has begun is told once it is found that the reference fits, never if it is late
-            return NEVER
+            return sys.maxsize
         return max(DOUBT, self._late + SEARCH_STRIDE)
 
     def step(

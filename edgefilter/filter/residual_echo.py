@@ -33,9 +33,6 @@ TAIL_DECAY = 0.6
 MISALIGNMENT_WARM, MISALIGNMENT_COLD = 0.5, 2.0
 """Weight of the canceller's own estimate of its misalignment: too large for a calibrated path, too small for one that was
 learned from nothing."""
-NOISE_LEAST = 1e-9
-"""Lower bound of the estimated noise, relative to the loudest power of a bin heard so far, mean over the bins: of what a muted
-microphone has taken to zero no ratio could be told."""
 
 
 class NoiseTracker:
@@ -69,7 +66,7 @@ class NoiseTracker:
             self._present += (1.0 - self.STUCK_MEMORY) * (present - self._present)
             present = np.where(self._present > self.STUCK, np.minimum(present, self.STUCK), present)
             self.power += (1.0 - self.MEMORY) * (1.0 - present) * (observed - self.power)
-        np.maximum(self.power, np.float32(NOISE_LEAST * self._loudest + fourier.TINY), out=self.power)
+        np.maximum(self.power, np.float32(fourier.LEAST * self._loudest + fourier.TINY), out=self.power)
         return self.power
 
 

@@ -32,8 +32,6 @@ ITERATIONS = 8
 """Of the power method where it has to come to its end at once; hop by hop one is enough, since it goes on where it was."""
 LEFT_OUT = 1e4
 """Noise over the mean that a microphone that is left out is taken to have."""
-LEAST = 1e-9
-"""Noise over what was gathered of the human, -90 dB, that is reckoned with at least: none may have been heard yet."""
 
 
 class SpatialFilter:
@@ -67,7 +65,7 @@ class SpatialFilter:
         self._known_hops = 0 if noise is None else KNOWN_HOPS
         shape = microphones, microphones, stft.bins
         self._fan = np.zeros(shape, np.complex64) if noise is None else noise.astype(np.complex64)
-        self._robot, self._robot_known = self._fan.copy(), False
+        self._robot = self._fan.copy()
         self._human, self._turn = np.zeros_like(self._fan), np.zeros_like(self._fan)
         self._against = self._fan
         self._speaking = False
@@ -124,7 +122,7 @@ class SpatialFilter:
         """Weights for a human and against noise of these covariances; the power method goes on where it was."""
         at = self._reference
         mean = [np.einsum("ccf->f", each).real / len(noise) for each in (noise, gathered)]
-        level = np.maximum(mean[0], np.float32(LEAST) * mean[1]) + fourier.TINY
+        level = np.maximum(mean[0], np.float32(fourier.LEAST) * mean[1]) + fourier.TINY
         human = gathered / level + self._prior
         loaded = noise / level + (np.float32(LOADING) + self._without) * self._ones
         found = self._direction

@@ -10,9 +10,8 @@ from edgefilter.engines.ladder import Ladder
 from edgefilter.filter.timing import Histogram
 from edgefilter.types import SAMPLE_RATE, DeadlineStats, EventKind
 
-WINDOW_S = 1.0
 OVERLOADED = 0.25
-"""Part of the last WINDOW_S of hops over the budget at which the load counts as sustained; a single stall never reaches
+"""Part of the last second of hops over the budget at which the load counts as sustained; a single stall never reaches
 it."""
 CALM = 0.01
 """Part of the hops over the budget up to which the machine has recovered: the budget is promised for 99 of 100."""
@@ -41,7 +40,7 @@ class Stepping:
         self.budget_ms = self.hop_ms if budget_ms is None else min(budget_ms, self.hop_ms)
         self.ladder = ladder
         self.clock = clock
-        self._window = self._hops(WINDOW_S)
+        self._window = self._hops(1.0)
         self.reset()
 
     def reset(self) -> None:

@@ -18,8 +18,6 @@ STATUS = Path("/proc/self/status")
 
 WIDTH = 1.05
 """Upper over lower bound of a bin: finer than any two runs agree."""
-LOWEST_MS = 1e-3
-"""What takes less than 1 us counts as 1 us."""
 
 
 class Histogram:
@@ -41,7 +39,7 @@ class Histogram:
 
     def add(self, ms: float) -> None:
         """Note one time, ms >= 0."""
-        self._bins[math.floor(math.log(max(ms, LOWEST_MS), WIDTH))] += 1
+        self._bins[math.floor(math.log(max(ms, 1e-3), WIDTH))] += 1
         self.count += 1
         self.sum_ms += ms
         self.max_ms = max(self.max_ms, ms)

@@ -7,6 +7,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
+from edgefilter.dsp.fourier import LEAST
 from edgefilter.types import SAMPLE_RATE, Samples
 
 MEMORY = 0.8
@@ -23,8 +24,8 @@ NOTICED = 1e-3
 """Error power over the microphone's, -30 dB, from which on a volume is suspected; 0.3 dB of volume leave that."""
 AUDIBLE, FORGET_S = 0.01, 10.0
 """The robot is audible where the echo is within 20 dB of its recent peak, which fades by 10 dB in FORGET_S seconds."""
-ENOUGH_S, LEAST_LEFT = 3.0, 1e-9
-"""Seconds of audible robot from which on it is said how much is removed, and the least that is left of it, -90 dB."""
+ENOUGH_S = 3.0
+"""Seconds of audible robot from which on it is said how much is removed."""
 MOST = 10.0
 """Largest factor, 20 dB, by which the volume is followed from where it was at first, up or down; and the factor by which
 an echo path that began unknown must have lowered the microphone's power before its volume means anything."""
@@ -45,9 +46,9 @@ ABSENT = 0.1
 class Moments(NamedTuple):
     """Second moments of microphone and predicted echo: <mic, mic>, <mic, echo> and <echo, echo>."""
 
-    mic: float
-    cross: float
-    echo: float
+    mic: float = 0.0
+    cross: float = 0.0
+    echo: float = 0.0
 
     @classmethod
     def of(cls, mic: Samples, echo: Samples) -> Moments:
@@ -71,9 +72,6 @@ class Moments(NamedTuple):
         return self.mic - 2.0 * self.cross * factor + self.echo * factor * factor
 
 
-NOTHING = Moments(0.0, 0.0, 0.0)
-
-
 class Volume:
     """Follows the volume of the robot's voice: one factor on the whole echo path, believed only on evidence.
 
@@ -87,7 +85,7 @@ class Volume:
         self._patience = round(PATIENCE_S * SAMPLE_RATE / hop)
         self._path: Literal["known", "unknown", "unscaled", "tried"] = path
         self._peak = 0.0
-        self._smoothed = self._since = self._lasting = NOTHING
+        self._smoothed = self._since = self._lasting = Moments()
         self._wanted = round(ENOUGH_S * SAMPLE_RATE / hop)
         self._factor, self._count, self._age, self._rest = 1.0, 0, 0, 0
         self.gain = self._first = 1.0
@@ -105,7 +103,7 @@ class Volume:
         """
         if self._wanted > 0 or not self._lasting.mic:
             return None
-        return -10.0 * math.log10(max(self._lasting.left() / self._lasting.mic, LEAST_LEFT))
+        return -10.0 * math.log10(max(self._lasting.left() / self._lasting.mic, LEAST))
 
     def follow(self, mic: Samples, echo: Samples) -> float:
         """The factor by which the echo path is to be scaled now, 1 where nothing says so. mic, echo: (hop,)."""
@@ -126,7 +124,7 @@ class Volume:
         elif self._rest:
             self._rest -= 1
         elif self._suspicious(self._smoothed):
-            self._path, self._since = "tried", NOTHING
+            self._path, self._since = "tried", Moments()
         return 1.0
 
     def _scale(self, now: Moments) -> float:
@@ -174,7 +172,7 @@ class Volume:
     def _turn(self, factor: float) -> float:
         self._peak *= factor**2
         self.gain *= factor
-        self._since, self._count = NOTHING, 0
+        self._since, self._count = Moments(), 0
         return factor
 
     def _bounded(self, factor: float) -> float:
@@ -182,7 +180,7 @@ class Volume:
         return min(max(factor, 1.0 / (MOST * turned)), MOST / turned)
 
     def _drop(self) -> None:
-        self._path, self._count, self._age, self._smoothed = "known", 0, 0, NOTHING
+        self._path, self._count, self._age, self._smoothed = "known", 0, 0, Moments()
 
 
 class EchoLimiter:
@@ -196,7 +194,7 @@ class EchoLimiter:
         self._part = math.gcd(hop, PART)
         self._ramp: Samples = np.arange(1, self._part + 1, dtype=np.float32) / np.float32(self._part)
         self._patience = round(PATIENCE_S * SAMPLE_RATE / hop)
-        self._smoothed = NOTHING
+        self._smoothed = Moments()
         self._weights = np.ones(hop // self._part + 1, np.float32)
         self._limited = False
         self._waited = 0

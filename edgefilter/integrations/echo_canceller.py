@@ -18,13 +18,10 @@ from edgefilter.dsp.resample import Resampler
 from edgefilter.errors import SignalError, UsageError
 from edgefilter.filter.ego_filter import EgoFilter
 from edgefilter.integrations.channels import microphones, named
+from edgefilter.integrations.wire import RATES
 from edgefilter.profile.data import Profile
-from edgefilter.types import SAMPLE_RATE, Event, Samples
+from edgefilter.types import MOST_MICROPHONES, SAMPLE_RATE, Event, Samples
 
-LOWEST_RATE, HIGHEST_RATE = 8000, 48000
-"""Hz that a canceller may run at: what telephones and sound cards have."""
-MOST_CHANNELS = 8
-"""Channels of one canceller; unless they form an array, each has a filter of its own, and the time that this takes."""
 Sound = TypeVar("Sound", bytes, bytearray, NDArray[np.int16], NDArray[np.floating])
 _LOGGER = logging.getLogger(__name__)
 
@@ -78,12 +75,12 @@ class EchoCanceller:
         engine: str = "auto",
         mic_channels: Sequence[int] | None = None,
     ) -> None:
-        if not LOWEST_RATE <= sample_rate <= HIGHEST_RATE:
+        if sample_rate not in RATES:
             raise UsageError(
-                f"sample_rate is {sample_rate}, expected {LOWEST_RATE} to {HIGHEST_RATE} Hz: convert the sound before"
+                f"sample_rate is {sample_rate}, expected {RATES[0]} to {RATES[-1]} Hz: convert the sound before"
             )
-        if not 1 <= channels <= MOST_CHANNELS:
-            raise UsageError(f"channels is {channels}, expected 1 to {MOST_CHANNELS}: leave some microphones out")
+        if not 1 <= channels <= MOST_MICROPHONES:
+            raise UsageError(f"channels is {channels}, expected 1 to {MOST_MICROPHONES}: leave some microphones out")
         array = named(mic_channels)
         if array and max(array) >= channels:
             raise UsageError(f"mic_channels names channel {max(array)}, found {channels} channels, counted from 0")

@@ -35,15 +35,14 @@ class Decoder:
 
 
 class Encoder:
-    """One mono stream at `rate` as packets of 20 ms. bitrate: bits a second."""
+    """One mono stream at 16 kHz as packets of 20 ms. bitrate: bits a second."""
 
-    def __init__(self, bitrate: int = 24_000, rate: int = SAMPLE_RATE) -> None:
+    def __init__(self, bitrate: int = 24_000) -> None:
         self._codec = av.CodecContext.create("libopus", "w")
-        self._codec.sample_rate, self._codec.layout, self._codec.format = rate, "mono", "flt"
+        self._codec.sample_rate, self._codec.layout, self._codec.format = SAMPLE_RATE, "mono", "flt"
         self._codec.bit_rate = bitrate
         self._codec.options = {"application": "voip", "frame_duration": str(FRAME_MS)}
-        self._size = rate * FRAME_MS // 1000
-        self._rate = rate
+        self._size = SAMPLE_RATE * FRAME_MS // 1000
         self._waiting = np.zeros(0, np.float32)
 
     def push(self, samples: Samples, last: bool = False) -> list[bytes]:
@@ -56,6 +55,6 @@ class Encoder:
         packets: list[bytes] = []
         for at in range(0, whole, self._size):
             frame = av.AudioFrame.from_ndarray(waiting[None, at : at + self._size], format="flt", layout="mono")
-            frame.sample_rate = self._rate
+            frame.sample_rate = SAMPLE_RATE
             packets += [bytes(packet) for packet in self._codec.encode(frame)]
         return packets

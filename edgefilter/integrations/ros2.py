@@ -22,12 +22,6 @@ from edgefilter.filter.ego_filter import EgoFilter
 from edgefilter.integrations.duplex import Duplex
 from edgefilter.types import SET_UP_WRONG, Event
 
-POLL_S = 0.005
-"""Between two looks at the topics: a third of a hop."""
-REPORT_S = 1.0
-"""Between two messages of diagnostics, as ROS has them."""
-OK, WARN = 0, 1
-"""Levels of diagnostic_msgs/DiagnosticStatus."""
 QUEUE = 200
 """Messages of a topic that wait: 4 s of 20 ms."""
 
@@ -156,11 +150,11 @@ class Node:
         reported = 0.0
         while not self._stop.is_set():
             busy = self._look(say)
-            if time.monotonic() - reported >= REPORT_S:
+            if time.monotonic() - reported >= 1.0:  # as diagnostics come in ROS
                 reported = time.monotonic()
                 self._report()
             if not busy:
-                self._stop.wait(POLL_S)
+                self._stop.wait(0.005)  # a third of a hop
         self.duplex.close()
 
     def _look(self, say: Callable[[str], None]) -> bool:
@@ -203,7 +197,7 @@ class Node:
             values |= {"lag_samples": stats["alignment"]["delay_samples"], "alignment": stats["alignment"]["state"]}
         wrong = "; ".join(f"{kind.replace('_', ' ')}: {detail}" for kind, detail in self._wrong.items())
         status = DiagnosticStatus(
-            level=WARN if wrong else OK,
+            level=int(bool(wrong)),  # WARN or OK
             name="edgefilter",
             message=wrong or "filtering",
             hardware_id="",

@@ -22,14 +22,12 @@ from websockets.http11 import Request, Response
 from edgefilter.dsp.resample import Resampler
 from edgefilter.errors import EdgefilterError, SignalError
 from edgefilter.filter.ego_filter import EgoFilter
-from edgefilter.integrations.duplex import Pace, as_pcm16, from_pcm16
+from edgefilter.integrations.duplex import Pace, all_of_pcm16, as_pcm16, from_pcm16
 from edgefilter.integrations.wire import Form, TwoStreams, message_of
 from edgefilter.types import SAMPLE_RATE, SET_UP_WRONG, Event, Samples
 
 MOST_BYTES = 4_000_000
 """Size of a message: an announced utterance of 40 s at 48 kHz; of sound some 20 ms are usual."""
-MOST_QUEUED = 16
-"""Messages of a client that wait to be filtered; a client that sends faster is read no faster."""
 PATIENCE_S = 5.0
 """For how long a client may take for its first message, and for reading an answer."""
 _LOGGER = logging.getLogger(__name__)
@@ -102,12 +100,7 @@ class Session:
             self._two.push(message)
             mic, ref = self._two.take()
         else:
-            if len(message) % 4:
-                raise SignalError(
-                    f"found {len(message)} bytes, expected whole 16-bit samples of microphone and reference"
-                )
-            stereo = np.frombuffer(message, "<i2").reshape(-1, 2).astype(np.float32) / np.float32(32768)
-            mic, ref = np.ascontiguousarray(stereo[:, 0]), np.ascontiguousarray(stereo[:, 1])
+            mic, ref = np.ascontiguousarray(all_of_pcm16(message, 2).T)
         return self._filter(mic, ref, last=False), False
 
     def finish(self) -> list[Answer]:
@@ -193,7 +186,8 @@ class Service:
 
     async def run(self, host: str, port: int, ready: Callable[[int], None] = lambda port: None) -> None:
         """Serve until `stop`; ready: called with the port once clients may come. Raises OSError where that cannot be had."""
-        limits = partial(serve, max_size=MOST_BYTES, max_queue=MOST_QUEUED, compression=None, origins=[None])
+        # a client that sends faster than max_queue messages are filtered is read no faster
+        limits = partial(serve, max_size=MOST_BYTES, max_queue=16, compression=None, origins=[None])
         async with limits(self._greet, host, port, process_request=self._admit) as server:
             ready(_port(server))
             await self._stopping.wait()

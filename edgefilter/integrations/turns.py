@@ -11,14 +11,11 @@ from edgefilter.filter.turns import BEFORE_S, LONGEST_S
 from edgefilter.integrations.duplex import Duplex
 from edgefilter.types import SAMPLE_RATE, Event, Samples, Turn
 
-MOST_TURNS = 8
-"""Turns that wait for a recogniser at most; it is behind by as many, and gets the latest."""
-
 
 class TurnByTurn:
     """Collects what one recogniser is to get: `start` with a turn, `hear` what is streamed, `take` it at the end.
 
-    What it takes are the turns that the filter has finished meanwhile. Where there is none, since the filter is switched
+    What it takes are the turns that the filter has finished meanwhile, the latest eight. Where there is none, since the filter is switched
     off or another detector was sooner, it is what was streamed, with half a second before the start, 30 s at most.
 
     >>> import numpy as np
@@ -32,7 +29,7 @@ class TurnByTurn:
 
     def __init__(self, duplex: Duplex) -> None:
         self._duplex = duplex
-        self._finished: deque[Turn] = deque(maxlen=MOST_TURNS)
+        self._finished: deque[Turn] = deque(maxlen=8)
         self._streamed: deque[Samples] = deque()
         self._count, self._first, self._rate, self._open = 0, 0, SAMPLE_RATE, False
         duplex.listeners.append(self._note)

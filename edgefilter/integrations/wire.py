@@ -19,9 +19,7 @@ HEADER = struct.Struct("<BxHQ")
 MICROPHONE, REFERENCE = 0, 1
 """Labels."""
 RATES = range(8000, 48001)
-"""Hz that a device may have."""
-MOST_LATE_MS = 2000
-"""By how much the reference may come later than the microphone."""
+"""Hz that a device, or a program that calls a canceller, may have: what telephones and sound cards do."""
 JITTER_S = 0.06
 """For how long a message that is missing is waited for: three of 20 ms."""
 MOST_GAP_S = 10.0
@@ -57,7 +55,7 @@ class Form:
             "rate": RATES,
             "streams": ("stereo", "two"),
             "codec": ("pcm", "opus"),
-            "late_ms": range(MOST_LATE_MS + 1),
+            "late_ms": range(2001),
             "learn": (False, True),
             "bitrate": range(6000, 128001),
         }

@@ -55,7 +55,7 @@ UNDER_WAY_S = 1.0
 pause, and the sound half as much to the filter."""
 WAY_S = 0.5
 """How long after its sound the message may come with which a client begins: what was said before is not part of it."""
-MIC_URI, SND_URI, ASR_URI = (f"tcp://127.0.0.1:{10600 + at}" for at in range(3))
+MIC_URI, SND_URI, ASR_URI = "tcp://127.0.0.1:10600", "tcp://127.0.0.1:10601", "tcp://127.0.0.1:10602"
 ABOUT: dict[str, Any] = {
     "attribution": Attribution("edgefilter", url=""),
     "installed": True,

@@ -16,8 +16,6 @@ BLOCK = 6
 """Audible hops, 96 ms, whose errors are compared as one."""
 LEAST, MOST = 8, 60
 """Blocks after which a rival can win, and after which one that has not won is given up."""
-LATEST = 2 * LEAST
-"""Blocks, 1.5 s, by which a standing rival is compared: what was right a minute ago does not count."""
 GAIN_DB, CERTAIN = 0.15, 2.5
 """Mean fall of the error, and how many of its standard errors that must be."""
 
@@ -27,7 +25,7 @@ class Rival:
     """A path that is compared, hop by hop, with the one in use.
 
     was: what to call it. kind: of the event where it wins. stays: whether it is a standing one, compared by its latest
-    blocks and never given up. gains_db: (blocks,) by how much less it left.
+    1.5 s, since what was right a minute ago does not count, and never given up. gains_db: (blocks,) by how much less it left.
     """
 
     path: EchoPath
@@ -49,7 +47,7 @@ class Rival:
             self.gains_db.append(10.0 * math.log10(self._running / self._its))
             self._its, self._running, self._count = 1e-12, 1e-12, 0
             if self.stays:
-                del self.gains_db[:-LATEST]
+                del self.gains_db[: -2 * LEAST]
 
     def restart(self) -> None:
         """Another path is in use now: the comparisons so far say nothing any more."""

@@ -12,6 +12,7 @@ from scipy import fft
 
 from edgefilter.alignment.utterances import Sustained
 from edgefilter.calibration.array import cross_density
+from edgefilter.calibration.calibrate import first
 from edgefilter.calibration.from_recording import bands_over_fan, fan_in_silences
 from edgefilter.dsp.psd import floored, periodograms
 from edgefilter.echo.effect import complete, vanishes
@@ -23,6 +24,7 @@ from edgefilter.filter.adaptation import COLD
 from edgefilter.filter.canceller import Canceller
 from edgefilter.filter.echo_path import TAPS, EchoPath, Effects, PathState, starting_path
 from edgefilter.filter.learner import FilteredHop, Lesson
+from edgefilter.filter.volume import AUDIBLE
 from edgefilter.learning.contest import Rival
 from edgefilter.learning.history import MINUTE, PAST, RECENT_S, HopHistory, emphasised
 from edgefilter.profile.array import ArrayCalibration
@@ -32,10 +34,8 @@ from edgefilter.types import SAMPLE_RATE, Samples
 FIRST_S, FACTOR = 2.0, 1.5
 """Seconds of audible robot until the first fit, and the factor to the next one. The wait is at most MINUTE, or RECENT_S
 after another path was taken over: then there is something to learn."""
-AUDIBLE = 1e-2
-"""The robot is audible where the reference's power is within 20 dB of its recent peak, which fades by ..."""
 FADE = 0.9995
-"""... this factor a hop."""
+"""The robot is AUDIBLE where the reference's power is that near to its recent peak, which fades by this factor a hop."""
 TIMES = 3
 """As little as RECENT_S teaches more where it is replayed several times."""
 BEFORE = "the path of before"
@@ -176,7 +176,7 @@ class PathLearner:
             return effects
         noise_psd = floored(periodograms(innovation[use], GRID_FFT).mean(axis=0)).astype(np.float32)
         measurement = Measurement(reference, mic, noise_psd, use)
-        path = _first(self._running.canceller.impulse_response())
+        path = first(self._running.canceller.impulse_response())
         for effect in EFFECTS:
             if effect.learned:
                 others = tuple(entry for entry in effects if entry[0] != effect.name)
@@ -248,8 +248,3 @@ def learned_profile(base: Profile | None, path: EchoPath, history: HopHistory) -
         source=LEARNED,
         array=array,
     )
-
-
-def _first(response: Samples) -> Samples:
-    """(taps,) of the first microphone, of a response (taps,) or (microphones, taps)."""
-    return response if response.ndim == 1 else response[0]

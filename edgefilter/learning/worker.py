@@ -15,17 +15,13 @@ from edgefilter.filter.timing import peak_memory_mb
 from edgefilter.learning.background import LENGTH, Beginning, News
 from edgefilter.learning.path_learner import PathLearner
 
-NICE = 10
-REPORT_HOPS = 16
-"""Hops, a quarter of a second, after which it tells of itself."""
-
 
 def main() -> None:
     """Run until the other side closes standard input."""
     for number in (signal.SIGINT, signal.SIGTERM):  # meant for the filter, which then closes standard input
         signal.signal(number, signal.SIG_IGN)
     if hasattr(os, "nice"):
-        os.nice(NICE)
+        os.nice(10)
     answers = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)  # what a user's effect prints is no message
     try:
@@ -57,7 +53,7 @@ def learn(answers: BinaryIO) -> None:
             continue
         lesson = learner.observe(message)
         hops += 1
-        if lesson or hops % REPORT_HOPS == 0:
+        if lesson or hops % 16 == 0:  # of itself each quarter of a second
             tell(lesson)
     learner.close()
     tell()

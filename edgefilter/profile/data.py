@@ -257,10 +257,6 @@ class Profile:
         further = () if self.array is None else self.array.responses
         return [self.echo, *(replace(self.echo, impulse_response=response) for response in further)]
 
-    def with_impulse_response(self, impulse_response: Samples) -> Profile:
-        """The same robot with another path (taps,) float32, for example the one that the running filter has adapted."""
-        return replace(self, echo=replace(self.echo, impulse_response=impulse_response))
-
     def with_echo(self, echo: EchoModel) -> Profile:
         """The same robot with another model of its own voice, for example one with an effect added."""
         return replace(self, echo=echo)

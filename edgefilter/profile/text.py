@@ -9,18 +9,13 @@ from edgefilter.profile.approximation import LinearApproximation
 from edgefilter.profile.data import DISTORTION_ORDERS, Profile
 from edgefilter.types import PRE_ROLL, SAMPLE_RATE, Array, Samples
 
-SHOWN = 4
-"""Values of an effect's array that are shown."""
-HIDDEN_DB = -99.0
-"""Distortion at or below this was not above the fan."""
-
 
 def describe(profile: Profile) -> str:
     """Lines of text: path, decay, fan, distortion, a bar for each band's signal-to-noise ratio, effects, warnings."""
     path = profile.echo.impulse_response
     fan = 10 * np.log10(max(float(profile.noise_psd.sum()) * SAMPLE_RATE / 1200, 1e-20))
     distortion = ", ".join(
-        f"{order}: {'below the fan' if level <= HIDDEN_DB else f'{level:.1f} dB'}"
+        f"{order}: {'below the fan' if level <= -99.0 else f'{level:.1f} dB'}"
         for order, level in zip(DISTORTION_ORDERS, profile.distortion_db, strict=True)
     )
     lines = [
@@ -49,9 +44,9 @@ def describe(profile: Profile) -> str:
 
 def _figures(value: float | Array) -> str:
     """Three significant digits, which --json has whole; of a long array its length."""
-    rounded = [f"{float(f'{number:.3g}'):g}" for number in np.ravel(value)[:SHOWN]]
-    if np.size(value) > SHOWN:
+    if np.size(value) > 4:
         return f"{np.size(value)} values"
+    rounded = [f"{float(f'{number:.3g}'):g}" for number in np.ravel(value)]
     return rounded[0] if np.ndim(value) == 0 else f"({', '.join(rounded)})"
 
 

@@ -19,8 +19,6 @@ from edgefilter.echo.effects.catalogue import find, names
 
 UNITS = {"1": "", "1e-6": "ppm"}
 """Units of parameters that read better otherwise."""
-BAR_WIDTH = 30
-"""Columns of the longest bar; lines stay within 80."""
 WEIGHT = 0.01
 """Share of the residual from which a dependence gets its reason: half a minute of sound shows smaller ones, which nobody would mend."""
 HEADS = ("rank", "effect", "alone, dB", "added, dB", "numbers", "Delta BIC", "verdict")
@@ -193,7 +191,7 @@ def _table(heading: str, unit: str, rows: Sequence[tuple[float, float, float]]) 
 
 
 def _bar(part: float) -> str:
-    return "#" * round(BAR_WIDTH * min(max(part, 0.0), 1.0))
+    return "#" * round(30 * min(max(part, 0.0), 1.0))  # lines stay within 80 columns
 
 
 def independence_lines(found: Independence | None, what: str = "of what is left") -> list[str]:

@@ -11,13 +11,12 @@ import numpy as np
 import pytest
 
 from bench import __main__ as bench
-from bench.live import barge_in, click, day, rooms, soak, trial
+from bench.live import barge_in, click, day, soak, trial
 from bench.live.barge_in import Talk, early_errors, lasts, lowered, muted, silent_at, words
 from bench.metrics import first_sound
 from bench.recogniser import Recogniser
 from bench.simulate import robot_day
 from bench.simulate.conversations import Scene, make_scene, read_clips, read_voices
-from bench.simulate.robot_day import Recording
 from bench.simulate.simulated_robot import Room, draw_robot, draw_walls, stand
 from edgefilter import Event
 from tests.bench.conftest import RATE, babble
@@ -101,29 +100,6 @@ def test_a_day(clips: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
         left["calibrated"][:3].max() < -robot_day.FAN_DB - 8
     )  # the robot is 31.5 dB over the fan, and mostly cancelled
     assert (tmp_path / "live_day.png").stat().st_size > 10_000
-
-
-@pytest.mark.slow
-def test_rooms(clips: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(rooms, "YESTERDAY_S", 5.0)
-    monkeypatch.setattr(rooms, "TODAY_S", 6.0)
-    found, page = run(tmp_path / "live", "rooms", "--voices", clips, "--count", 1)
-    (room,) = found["rooms"]
-    curves = room["curves"]
-    assert room["room"] == "lab" and list(curves) == list(rooms.SYSTEMS)
-    assert curves["learning from nothing"][-1] < curves["cold"][-1] - 2
-    assert curves["next day, same room"][0] < curves["cold"][0] - 3
-    assert f"| cold | {np.mean(curves['cold'][1:3]):.1f} |" in page and "1 rooms, lab" in page
-
-
-def test_what_is_left_is_measured_against_the_echo_without_the_fan() -> None:
-    echo, fan = babble(4.0, 1), 0.01 * babble(4.0, 2)
-    recording = Recording(echo, echo, fan)
-    assert rooms.left(recording, recording.mic) == pytest.approx(0.0, abs=0.01)
-    assert rooms.left(recording, fan + 0.1 * echo) == pytest.approx(-20.0, abs=0.01)
-
-
-# ---------------------------------------------------------------- the long run
 
 
 @pytest.mark.slow

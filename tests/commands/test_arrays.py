@@ -97,10 +97,10 @@ def test_calibrate_takes_the_microphones_that_are_named(folder: Path) -> None:
 
 @pytest.mark.slow
 def test_turns_are_written_to_files_of_their_own(tmp_path: Path) -> None:
-    from edgefilter.commands.demo import DATA
+    from edgefilter.filter.budget import DEMO
 
     result = edgefilter(
-        "run", "--input", DATA / "mic.flac", "--reference", DATA / "reference.flac", "--profile", DATA / "profile.npz",
+        "run", "--input", DEMO / "mic.flac", "--reference", DEMO / "reference.flac", "--profile", DEMO / "profile.npz",
         "--engine", "crnn", "--no-learn", "--output", tmp_path / "out.wav", "--turns", tmp_path / "turns", "--quiet",
         "--json", tmp_path / "run.json",
     )  # fmt: skip

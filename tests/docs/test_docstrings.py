@@ -18,7 +18,6 @@ METHODS = [
 SHORT = {
     "EgoFilter.reset",
     "Profile.with_echo",
-    "Profile.with_impulse_response",
     "Profile.noise_bins",
     "Profile.response_bins",
 }

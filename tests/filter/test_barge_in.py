@@ -7,10 +7,10 @@ import pytest
 import soundfile
 
 from edgefilter import EgoFilter
-from edgefilter.commands.demo import DATA
 from edgefilter.commands.display import say_event
 from edgefilter.errors import UsageError
 from edgefilter.filter.barge_in import BargeIn, BargeInSettings, HumanJudge
+from edgefilter.filter.budget import DEMO
 from edgefilter.types import SAMPLE_RATE, Event
 
 HOP_S = 0.016
@@ -94,7 +94,7 @@ def test_while_an_utterance_is_looked_for_it_takes_a_surer_sign_and_a_sure_one_w
 
 @pytest.mark.slow
 def test_an_utterance_is_looked_for_from_its_first_sample_until_its_lag_is_found(monkeypatch):
-    mic, ref = (soundfile.read(DATA / f"{name}.flac", dtype="float32")[0] for name in ("mic", "reference"))
+    mic, ref = (soundfile.read(DEMO / f"{name}.flac", dtype="float32")[0] for name in ("mic", "reference"))
     usual, told = HumanJudge.step, []
 
     def step(self, probability, suspect=False, begun=False):
@@ -102,7 +102,7 @@ def test_an_utterance_is_looked_for_from_its_first_sample_until_its_lag_is_found
         return usual(self, probability, suspect, begun)
 
     monkeypatch.setattr(HumanJudge, "step", step)
-    ego = EgoFilter(DATA / "profile.npz", engine="crnn")
+    ego = EgoFilter(DEMO / "profile.npz", engine="crnn")
     ego.process(mic, ref)
     first = int(np.flatnonzero(np.abs(ref) > 1e-3)[0]) // ego.hop
     found = next(event.sample for event in ego.events() if event.kind == "realigned") // ego.hop
@@ -116,8 +116,8 @@ def test_probabilities_stay_in_0_to_1_whatever_comes(probability):
 
 
 def test_an_engine_without_a_network_gives_no_probability_and_no_events():
-    mic, ref = (soundfile.read(DATA / f"{name}.flac", dtype="float32")[0] for name in ("mic", "reference"))
-    ego = EgoFilter(DATA / "profile.npz", engine="ss")
+    mic, ref = (soundfile.read(DEMO / f"{name}.flac", dtype="float32")[0] for name in ("mic", "reference"))
+    ego = EgoFilter(DEMO / "profile.npz", engine="ss")
     ego.process(mic, ref)
     assert ego.speech_probability is None and not ego.human_speaks
     assert not [event for event in ego.events() if event.kind.startswith("speech")]
@@ -125,12 +125,12 @@ def test_an_engine_without_a_network_gives_no_probability_and_no_events():
 
 def test_the_network_can_judge_beside_an_engine_that_does_not_and_changes_nothing_of_its_sound():
     mic, ref = (
-        soundfile.read(DATA / f"{name}.flac", dtype="float32")[0][:SAMPLE_RATE] for name in ("mic", "reference")
+        soundfile.read(DEMO / f"{name}.flac", dtype="float32")[0][:SAMPLE_RATE] for name in ("mic", "reference")
     )
     network = BargeInSettings(judge="network")
     found = {}
     for name, engine, settings in (("ss", "ss", None), ("judged", "ss", network), ("crnn", "crnn", network)):
-        ego = EgoFilter(DATA / "profile.npz", engine=engine, barge_in=settings)
+        ego = EgoFilter(DEMO / "profile.npz", engine=engine, barge_in=settings)
         out = [ego.process(mic[at : at + 256], ref[at : at + 256]) for at in range(0, mic.size, 256)]
         found[name] = np.concatenate(out), ego.speech_probability, ego
     assert np.array_equal(found["judged"][0], found["ss"][0])
@@ -148,11 +148,11 @@ def test_engines_that_take_other_frames_cannot_judge_for_one_another():
 
 @pytest.mark.slow
 def test_the_settings_reach_the_stream_and_who_gives_a_callback_is_called_when_the_human_begins():
-    mic, ref = (soundfile.read(DATA / f"{name}.flac", dtype="float32")[0] for name in ("mic", "reference"))
+    mic, ref = (soundfile.read(DEMO / f"{name}.flac", dtype="float32")[0] for name in ("mic", "reference"))
     found = []
     for settings in (BargeInSettings(min_speech_s=0.2), BargeInSettings()):
         called: list[Event] = []
-        ego = EgoFilter(DATA / "profile.npz", engine="crnn", barge_in=settings, on_barge_in=called.append)
+        ego = EgoFilter(DEMO / "profile.npz", engine="crnn", barge_in=settings, on_barge_in=called.append)
         ego.process(mic, ref)
         assert called and called == [event for event in ego.events() if event.kind == "speech_started"]
         found.append(called[0].sample)
@@ -163,16 +163,16 @@ def test_the_settings_reach_the_stream_and_who_gives_a_callback_is_called_when_t
 @pytest.mark.slow
 def test_a_callback_that_raises_costs_no_sample(block):
     """256000 samples went in and 248320 came out."""
-    mic, ref = (soundfile.read(DATA / f"{name}.flac", dtype="float32")[0] for name in ("mic", "reference"))
+    mic, ref = (soundfile.read(DEMO / f"{name}.flac", dtype="float32")[0] for name in ("mic", "reference"))
     settings = BargeInSettings(min_silence_s=0.1)  # speech begins several times
-    usual = EgoFilter(DATA / "profile.npz", engine="crnn", barge_in=settings)
+    usual = EgoFilter(DEMO / "profile.npz", engine="crnn", barge_in=settings)
     wanted = np.concatenate((usual.process(mic, ref), usual.flush()))
     started = [event.sample for event in usual.events() if event.kind == "speech_started"]
 
     def fail(event: Event) -> None:
         raise RuntimeError(event.sample)
 
-    ego, out, raised = EgoFilter(DATA / "profile.npz", engine="crnn", barge_in=settings, on_barge_in=fail), [], []
+    ego, out, raised = EgoFilter(DEMO / "profile.npz", engine="crnn", barge_in=settings, on_barge_in=fail), [], []
     blocks = [(mic[at : at + block], ref[at : at + block]) for at in range(0, mic.size, block)]
     for call in (*(partial(ego.process, *each) for each in blocks), ego.flush, ego.flush):
         try:
@@ -187,8 +187,8 @@ def test_a_callback_that_raises_costs_no_sample(block):
 @pytest.mark.slow
 def test_in_the_demo_the_human_is_noticed_and_the_robot_is_not(alone):
     names = ("mic", "reference", "human")
-    mic, ref, human = (soundfile.read(DATA / f"{name}.flac", dtype="float32")[0] for name in names)
-    ego = EgoFilter(DATA / "profile.npz", engine="crnn")
+    mic, ref, human = (soundfile.read(DEMO / f"{name}.flac", dtype="float32")[0] for name in names)
+    ego = EgoFilter(DEMO / "profile.npz", engine="crnn")
     ego.process(mic - alone * human, ref)
     talk = [event for event in ego.events() if event.kind.startswith("speech")]
     if alone:
@@ -209,7 +209,7 @@ def test_a_live_run_says_when_somebody_speaks_and_a_recording_does_not(capsys):
 
 def test_a_human_beside_a_robot_that_plays_unheard_is_noticed_at_once():
     """Into headphones, say: the microphone is silent, digitally, until somebody speaks."""
-    robot, human = (soundfile.read(DATA / f"{name}.flac", dtype="float32")[0] for name in ("reference", "human"))
+    robot, human = (soundfile.read(DEMO / f"{name}.flac", dtype="float32")[0] for name in ("reference", "human"))
     robot = np.tile(robot[: 3 * SAMPLE_RATE], 2)
     first = int(np.argmax(np.abs(human) > 0.01))
     mic, begins = np.zeros_like(robot), 3 * SAMPLE_RATE

@@ -17,6 +17,7 @@ from platformdirs.macos import MacOS
 from platformdirs.unix import Unix
 from platformdirs.windows import Windows
 
+from edgefilter.echo.model import EchoModel
 from edgefilter.engines.bypass import Bypass
 from edgefilter.engines.spectral_subtraction import SpectralSubtraction
 from edgefilter.errors import UsageError
@@ -25,7 +26,7 @@ from edgefilter.filter.budget import Figures, choose, fits, held_to, measure, pa
 from edgefilter.filter.stream import Stream
 from edgefilter.profile.data import Profile
 
-DEMO = budget.SCENE
+DEMO = budget.DEMO
 
 
 @pytest.fixture(autouse=True)
@@ -127,7 +128,7 @@ def test_figures_are_remembered_for_the_same_path_only(measured):
     assert "--remeasure" in again.reason
     assert choose(3.0, profile, LADDER).engine == "linear" and asked == ["ss", "linear"]  # only what is missing
     assert choose(3.0, profile, LADDER).remembered
-    longer = profile.with_impulse_response(np.pad(profile.echo.impulse_response, (0, 256)))
+    longer = profile.with_echo(EchoModel(np.pad(profile.echo.impulse_response, (0, 256))))
     choose(8.0, longer, LADDER)
     choose(8.0, None, LADDER)
     assert asked == ["ss", "linear", "ss", "ss"]

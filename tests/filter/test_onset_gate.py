@@ -7,7 +7,7 @@ import soundfile
 from edgefilter import enhance
 from edgefilter.alignment.aligner import Aligner
 from edgefilter.alignment.delay_line import Aligned
-from edgefilter.commands.demo import DATA
+from edgefilter.filter.budget import DEMO
 from edgefilter.filter.onset_gate import GATE, LONGEST, SETTLE, OnsetGate
 from tests.alignment.scene import RATE, fan, hear, known_path, room, run, utterances
 
@@ -126,10 +126,10 @@ def test_the_robots_onset_in_the_demo_stays_below_the_human():
     It came through 10 dB louder than the human's peak with crnn.
     """
     mic, ref, human = (
-        soundfile.read(DATA / f"{name}.flac", dtype="float32")[0] for name in ("mic", "reference", "human")
+        soundfile.read(DEMO / f"{name}.flac", dtype="float32")[0] for name in ("mic", "reference", "human")
     )
     for engine, margin in (("crnn", 0.0), ("ss", 3.0), ("linear", 9.0)):
-        out = enhance(mic, ref, DATA / "profile.npz", engine)
+        out = enhance(mic, ref, DEMO / "profile.npz", engine)
         onset = np.abs(out[int(7.8 * RATE) : int(9.0 * RATE)]).max()
         assert onset < np.abs(human).max() * 10 ** (margin / 20), engine
 

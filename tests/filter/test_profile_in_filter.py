@@ -41,9 +41,8 @@ def test_an_effect_in_the_profile_lowers_the_residual_of_a_robot_that_has_it(ref
 
 def test_the_tail_is_the_profiles_within_128_and_512_ms(reference):
     for taps, expected in ((600, 2048), (2048, 2048), (5000, 5120), (20_000, 8192)):
-        profile = robot().with_impulse_response(
-            np.r_[np.zeros(PRE_ROLL), 0.5, np.zeros(taps - PRE_ROLL - 1)].astype(np.float32)
-        )
+        path = np.r_[np.zeros(PRE_ROLL), 0.5, np.zeros(taps - PRE_ROLL - 1)].astype(np.float32)
+        profile = robot().with_echo(EchoModel(path))
         ego = EgoFilter(profile, "linear")
         assert ego.stats()["linear_stage"]["partitions"] * ego.hop == expected
 
@@ -57,7 +56,7 @@ def test_the_adapted_path_written_into_a_profile_starts_better_than_the_old_one(
         * rng.standard_normal(moved.size - PRE_ROLL - 40).astype(np.float32)
         * np.exp(-np.arange(moved.size - PRE_ROLL - 40) / 400)
     )
-    mic = echo_of(old.with_impulse_response(moved), reference) + 1e-4 * rng.standard_normal(reference.size).astype(
+    mic = echo_of(old.with_echo(EchoModel(moved)), reference) + 1e-4 * rng.standard_normal(reference.size).astype(
         np.float32
     )
     ego = EgoFilter(old, "linear")

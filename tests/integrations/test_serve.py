@@ -250,7 +250,7 @@ def test_a_first_message_that_is_wrong_is_answered_in_one_line(hello, words):
 @pytest.mark.parametrize(
     ("form", "message", "words"),
     [
-        ({}, b"abc", "found 3 bytes, expected whole 16-bit samples of microphone and reference"),
+        ({}, b"abc", "found 3 bytes, expected whole 16-bit samples of 2 channels"),
         ({}, json.dumps({"kind": "dance"}), "kind 'dance', expected 'announce' or 'end'"),
         ({"streams": "two"}, b"abc", "expected a header of 12"),
         ({"streams": "two"}, HEADER.pack(7, 0, 0), "label 7"),

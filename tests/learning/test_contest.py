@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from edgefilter.learning.contest import LATEST, LEAST, MOST, Rival
+from edgefilter.learning.contest import LEAST, MOST, Rival
 
 
 def rival(gains):
@@ -32,7 +32,7 @@ def test_a_loss_never_wins_and_ends():
 def test_a_standing_rival_is_judged_by_its_latest_blocks_and_never_given_up():
     standing = Rival(None, "a test", stays=True, gains_db=[-1.0] * MOST)
     assert not standing.over
-    standing.gains_db = [0.4, 0.5] * (LATEST // 2)
+    standing.gains_db = [0.4, 0.5] * LEAST
     assert standing.won
     standing.restart()
     assert not standing.won

@@ -392,8 +392,8 @@ def test_the_silence_behind_a_room_takes_no_room_in_the_file(tmp_path):
     path = np.zeros(64_000, np.float32)
     path[PRE_ROLL] = 0.5
     profile = make()
-    profile.with_impulse_response(path).save(tmp_path / "long.npz")
-    profile.with_impulse_response(path[: 2 * PRE_ROLL]).save(tmp_path / "short.npz")
+    profile.with_echo(EchoModel(path)).save(tmp_path / "long.npz")
+    profile.with_echo(EchoModel(path[: 2 * PRE_ROLL])).save(tmp_path / "short.npz")
     sizes = [(tmp_path / name).stat().st_size for name in ("long.npz", "short.npz")]
     assert sizes[0] < sizes[1] + path.nbytes // 100
 
