@@ -153,6 +153,7 @@ def test_four_effects_give_five_comparisons_in_the_page():
         model = model.with_effect(one.effect, one.values)
     found = Diagnosis("missing", compare(robot, y, x), tuple(four), "", 0.1, 0.0, model)
     page = diagnosis_page(robot, found, y, x, {"profile": "p", "recording": "m", "reference": "r"})
+    assert page.count("<span>add</span>") == 1 and page.index("<span>add</span>") < page.index("Error budget")
     assert page.count('"excess_db"') == 5 and "switched with them" in page
     assert page.count("data:image/png") == 3, (
         "recording, prediction, residual: with neutral values all five comparisons share them"
@@ -165,6 +166,9 @@ def test_the_command_to_add_is_one_that_a_shell_reads():
         add_command(["tilt"], names)
         == "edgefilter add tilt --profile 'my robot.npz' --recording m.wav --reference r.wav --effects own.py --output"
         " 'my robot.tilt.npz'"
+    )
+    assert add_command(["tilt"], {**names, "mic_channels": (0, 2)}).endswith(
+        "--effects own.py --mic-channels 0,2 --apply 'my robot.tilt.npz'"
     )
 
 
