@@ -10,6 +10,7 @@ import numpy as np
 from edgefilter.diagnosis.advice import advice
 from edgefilter.diagnosis.band_edge import cut_by_power
 from edgefilter.diagnosis.candidates import candidates
+from edgefilter.diagnosis.closer_look import look_closer
 from edgefilter.diagnosis.compare import Comparison, compare, describe, independence_of
 from edgefilter.diagnosis.criteria import Criteria
 from edgefilter.diagnosis.findings import findings_of, share_of
@@ -281,6 +282,7 @@ def conclude(
         independence=independence_of(found.prepared, found.model, found.final) if findings else comparison.independence,
         precision=precision(found, findings),
         advice=advice(tried),
+        closer_look=look_closer(found) if verdict == "unexplained" else None,
     )
 
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Literal, TypeAlias
 
 import numpy as np
 
+from edgefilter.diagnosis.closer_look import CloserLook
 from edgefilter.diagnosis.compare import Comparison
 from edgefilter.diagnosis.independence import Independence
 from edgefilter.echo.measurement import Values
@@ -146,7 +147,7 @@ class Diagnosis:
     tried: all effects that were tried. independence: of what is left with all that was found. precision: of the found
     numbers. advice: what to record to tell candidates apart that explain nearly the same. proof: of what was found, in
     the running filter, where it was asked for; unproven: why there is none. written: the comparison with the profile that
-    was written of it, whose figures it then has.
+    was written of it, whose figures it then has. closer_look: at what is left, where that is unexplained.
     """
 
     verdict: Verdict
@@ -163,6 +164,7 @@ class Diagnosis:
     proof: Proof | None = None
     unproven: str = ""
     written: Comparison | None = None
+    closer_look: CloserLook | None = None
 
     def to_dict(self) -> dict[str, object]:
         """The JSON that `diagnose --json` writes, schema 1."""
@@ -200,6 +202,7 @@ class Diagnosis:
             "advice": list(self.advice),
             "proof": self.proof.to_dict() if self.proof else None,
             "unproven": self.unproven,
+            "closer_look": self.closer_look.to_dict() if self.closer_look else None,
         }
 
 

@@ -11,7 +11,9 @@ from pathlib import Path
 from typing import Any
 
 import jinja2
+import numpy as np
 
+from edgefilter.diagnosis.closer_look import CloserLook
 from edgefilter.diagnosis.compare import Comparison, describe
 from edgefilter.diagnosis.diagnose import Diagnosis, Finding
 from edgefilter.diagnosis.passport import Passport
@@ -57,7 +59,10 @@ def comparison_page(found: Comparison, names: Mapping[str, Any]) -> str:
     return _page(
         {(): found},
         (),
-        {"kind": "comparison", "headline": excess, "findings": [], "command": [], "left": "", **_statistics()},
+        {
+            **{"kind": "comparison", "headline": excess, "findings": [], "command": [], "left": "", "look": None},
+            **_statistics(),
+        },
         names,
     )
 
@@ -84,6 +89,7 @@ def diagnosis_page(
         "findings": [_finding(finding) for finding in found.ranking],
         "command": add_command([one.effect for one in steps], names).split(" ") if steps and not outcome else [],
         "left": sentence(found.evidence) if found.evidence else "",
+        "look": _look(found.closer_look),
         **_statistics(found),
     }
     return _page(variants, steps, text, names, found.irreducible_db, outcome)
@@ -258,6 +264,29 @@ def _facts(before: Comparison, after: Comparison | None, irreducible_db: float |
     if irreducible_db is not None:
         facts.append(("Irreducible", f"{decibels(irreducible_db)} dB", "that no model can predict"))
     return facts
+
+
+def _look(look: CloserLook | None) -> dict[str, object] | None:
+    """The curves of what is left as points of drawings 100 wide and 40 high; zero: the height of 0 dB."""
+    if look is None:
+        return None
+    drawn = []
+    for curve in look.curves:
+        low, high = min(0.0, *curve.y_db), max(0.0, *curve.y_db)
+        x = np.log(curve.x) if curve.x_unit == "Hz" else np.array(curve.x)
+        across, up = max(float(x[-1] - x[0]), 1e-9), max(high - low, 1.0)
+        points = zip(100 * (x - x[0]) / across, 40 * (high - np.array(curve.y_db)) / up, strict=True)
+        drawn.append(
+            {
+                "name": curve.name,
+                "points": " ".join(f"{a:.2f},{b:.2f}" for a, b in points),
+                "zero": f"{40 * high / up:.2f}",
+                "from": f"{curve.x[0]:.3g}",
+                "to": f"{curve.x[-1]:.4g} {curve.x_unit}",
+                "range": f"{low:+.1f} to {high:+.1f} dB".replace("-", "−"),
+            }
+        )
+    return {"sentence": sentence(look.sentence), "curves": drawn}
 
 
 def _finding(finding: Finding) -> dict[str, object]:

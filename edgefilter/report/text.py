@@ -139,6 +139,8 @@ def diagnosis_lines(found: Diagnosis, calibrated: bool = True) -> list[str]:
         lines += _finding(rank, finding)
     if found.evidence:
         lines.append(f"left        {sentence(found.evidence)}")
+    if found.closer_look:
+        lines.append(f"closer      {sentence(found.closer_look.sentence)}")
     if found.proof or found.unproven:
         lines.append(proof_line(found.proof, found.unproven))
     lines += precision_lines(found.precision)
