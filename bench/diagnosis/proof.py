@@ -26,13 +26,13 @@ from edgefilter.calibration.from_recording import self_calibrate
 from edgefilter.diagnosis.diagnose import diagnose
 from edgefilter.diagnosis.prepare import prepare
 from edgefilter.diagnosis.proof import WORSE_DB, HeldOut, lasts, proofs_until_kept
+from edgefilter.diagnosis.result import in_order
 from edgefilter.dsp.frames import blocks, decibels, frames
 from edgefilter.dsp.psd import floored, periodograms
 from edgefilter.echo.effects.catalogue import find
 from edgefilter.echo.model import EchoModel
 from edgefilter.errors import EdgefilterError
 from edgefilter.profile.data import Profile
-from edgefilter.report.text import in_order
 from edgefilter.types import SAMPLE_RATE, Samples
 
 PIECE_S, WHOLE_S = 10, 45

@@ -14,9 +14,10 @@ import soundfile
 
 from edgefilter.audio.files import FileSink, FileSource
 from edgefilter.commands.display import describe_latency, print_result, progress, report_part, say
-from edgefilter.commands.fitting import fit
+from edgefilter.commands.fitting import Fitted, fit
 from edgefilter.diagnosis.compare import compare
-from edgefilter.diagnosis.diagnose import Diagnosis, diagnose
+from edgefilter.diagnosis.diagnose import diagnose
+from edgefilter.diagnosis.result import in_order
 from edgefilter.dsp.metrics import si_sdr
 from edgefilter.engines import NEEDS_PROFILE
 from edgefilter.errors import UsageError
@@ -24,7 +25,7 @@ from edgefilter.filter.budget import DEMO
 from edgefilter.filter.ego_filter import EgoFilter
 from edgefilter.filter.enhance import enhance
 from edgefilter.profile.data import Profile
-from edgefilter.report.text import decibels, headline, in_order
+from edgefilter.report.text import decibels, headline
 from edgefilter.session import filter_blocks
 from edgefilter.types import SAMPLE_RATE, Samples
 
@@ -138,7 +139,7 @@ def _mend(name: str, folder: Path, args: argparse.Namespace) -> dict[str, Any]:
         found = diagnose(case.profile, case.mic, case.reference, progress=step)
         step("fit of what was found, and proof in the running filter")
         names = tuple(finding.effect for finding in in_order(found.ranking))
-        applied = fit(case.profile, case.profile, names, case.mic, case.reference, force=False, drop=True)
+        applied = fit(case.profile, case.profile, names, case.mic, case.reference, force=False, found=found)
         applied.profile.save(folder / "better.npz")
     told = [line for number, line in enumerate(applied.lines()) if number == 0 or line.startswith("proof")]
     print_result(
@@ -153,13 +154,13 @@ def _mend(name: str, folder: Path, args: argparse.Namespace) -> dict[str, Any]:
             filtered[kept] = enhance(case.talk, case.talk_reference, profile, args.engine)
             _write(folder / f"human_{kept}.wav", filtered[kept])
         step("drawing the page and the picture")
-        drawn = _draw_mended(folder, case, found, filtered)
+        drawn = _draw_mended(folder, case, applied, filtered)
     sdr = {"microphone": case.talk, **filtered}
     figures = {
         "hidden": case.truth["effects"],
         "named": [finding.effect for finding in found.ranking],
         "excess_before_db": excess_db,
-        "excess_after_db": found.remaining_db,
+        "excess_after_db": applied.after.excess_db,
         **{f"si_sdr_{kept}_db": _si_sdr(samples, case.human) for kept, samples in sdr.items()},
         "applied": applied.to_dict(),
     }
@@ -188,13 +189,13 @@ def _draw(folder: Path, sounds: dict[str, Samples]) -> list[Path]:
     return [folder / "before_after.png"]
 
 
-def _draw_mended(folder: Path, case: Case, found: Diagnosis, filtered: dict[str, Samples]) -> list[str]:
-    """The page of the diagnosis, and the conversation before and after."""
+def _draw_mended(folder: Path, case: Case, applied: Fitted, filtered: dict[str, Samples]) -> list[str]:
+    """The page of the diagnosis that was applied, and the conversation before and after."""
     html, plots = _drawer("html"), _drawer("plots")
     if html is None or plots is None:
         return []
     names = {"profile": "robot.npz", "recording": "mic.wav", "reference": "tts.wav", "effects": []}
-    page = html.diagnosis_page(case.profile, found, case.mic, case.reference, names)
+    page = html.diagnosis_page(case.profile, applied.found, case.mic, case.reference, names, applied.facts())
     html.write_page(folder / "report.html", page)
     sounds = {
         "microphone: the robot talks, and a human interrupts it": case.talk,

@@ -11,10 +11,11 @@ from edgefilter.commands.fitting import Fitted, Refused, fit, long_paths
 from edgefilter.commands.recordings import load, load_array
 from edgefilter.diagnosis.diagnose import Diagnosis, diagnose
 from edgefilter.diagnosis.proven import diagnose_proven
+from edgefilter.diagnosis.result import in_order
 from edgefilter.errors import EdgefilterError, SignalError, UsageError
 from edgefilter.profile.array import ArrayCalibration
 from edgefilter.profile.data import Profile
-from edgefilter.report.text import add_command, diagnosis_lines, in_order
+from edgefilter.report.text import add_command, diagnosis_lines
 from edgefilter.types import Samples
 
 
@@ -45,11 +46,18 @@ def main(args: argparse.Namespace) -> int:
         )
     more: dict[str, object] = {"channels": {str(number): what for number, what in doubts.items()}} if doubts else {}
     more |= {"applied": {**applied.to_dict(), "output": args.apply}} if applied else {}
-    told = [*applied.lines(), f"written to {args.apply}"] if applied else _next_step(found, args)
-    print_result(args, [*diagnosis_lines(found, args.profile is not None), *told], {**found.to_dict(), **more})
+    told: list[str] = []
+    if applied:
+        found = applied.found or found
+        told = [*applied.lines(), f"written to {args.apply}"]
+    elif args.apply and not refused:
+        told = [f"nothing was found to add: {args.apply} is not written"]
+    verdict, *rest = diagnosis_lines(found, args.profile is not None)
+    print_result(args, [verdict, *_next_step(found, args), *rest, *told], {**found.to_dict(), **more})
     if html:
         with progress("page of the diagnosis"):
-            html.write_page(args.report, html.diagnosis_page(profile, found, recording, reference, vars(args)))
+            outcome = applied.facts() if applied else ()
+            html.write_page(args.report, html.diagnosis_page(profile, found, recording, reference, vars(args), outcome))
         print_result(args, [f"report      {args.report}"])
     if refused:
         raise refused
@@ -64,8 +72,10 @@ def _apply(
     args: argparse.Namespace,
     step: Callable[[str], None],
     array: ArrayCalibration | None,
-) -> tuple[Fitted, None] | tuple[None, EdgefilterError]:
+) -> tuple[Fitted, None] | tuple[None, EdgefilterError | None]:
     """The profile with all that was found, written; or why it was not: the diagnosis is printed all the same.
+
+    Neither where nothing was found: a profile in which nothing has changed is not written.
 
     A profile made from the recording gets the whole length of the room's response, from all of the recording. array: the
     other microphones, which get the same effects on their own paths.
@@ -75,8 +85,10 @@ def _apply(
     start = None if args.profile is None else profile
     if start is None:
         names += long_paths()
+    if not names:
+        return None, None
     try:
-        applied = fit(start, profile, tuple(names), recording, reference, force=args.force, drop=True)
+        applied = fit(start, profile, tuple(names), recording, reference, force=args.force, found=found)
     except (Refused, SignalError) as error:
         return None, error
     replace(applied.profile, array=array or applied.profile.array).save(args.apply)
@@ -86,10 +98,4 @@ def _apply(
 def _next_step(found: Diagnosis, args: argparse.Namespace) -> list[str]:
     if not found.ranking or args.apply:
         return []
-    if args.mic_channels is not None:
-        return [
-            "next        the same with --apply P2.npz"
-            if args.channel is None
-            else "next        the same without --channel, and with --apply P2.npz"
-        ]
     return [f"next        {add_command([finding.effect for finding in in_order(found.ranking)], vars(args))}"]

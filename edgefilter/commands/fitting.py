@@ -8,14 +8,14 @@ from typing import Any
 import numpy as np
 
 from edgefilter.diagnosis.compare import Comparison
-from edgefilter.diagnosis.diagnose import add
+from edgefilter.diagnosis.diagnose import PROMISE_DB, Diagnosis, add, settle
 from edgefilter.diagnosis.proof import Proof, proofs_until_kept, prove
 from edgefilter.echo.effects.catalogue import find
 from edgefilter.echo.effects.catalogue import names as names_known
 from edgefilter.echo.running import reach
 from edgefilter.errors import EdgefilterError, SignalError
 from edgefilter.profile.data import Profile
-from edgefilter.report.text import UNITS, figure, joined, proof_line
+from edgefilter.report.text import UNITS, decibels, figure, joined, proof_line
 from edgefilter.types import Samples
 
 
@@ -25,7 +25,11 @@ class Refused(EdgefilterError):
 
 @dataclass(frozen=True, eq=False)
 class Fitted:
-    """A profile with effects, the comparisons before and after, and the proof; unproven: why there is none."""
+    """A profile with effects, the comparisons before and after, and the proof; unproven: why there is none.
+
+    found: the diagnosis that named them, with the figures of that profile where this has all that it named. promised_db: what
+    it left, the effects fitted to half of the recording, of the other half.
+    """
 
     names: tuple[str, ...]
     dropped: tuple[str, ...]
@@ -34,6 +38,8 @@ class Fitted:
     after: Comparison
     proof: Proof | None
     unproven: str = ""
+    found: Diagnosis | None = None
+    promised_db: float | None = None
 
     def to_dict(self) -> dict[str, Any]:
         """Ready for JSON."""
@@ -54,14 +60,40 @@ class Fitted:
             "excess_after_db": self.after.excess_db,
             "noise_floor_db": self.after.noise_floor_db,
             "proof": self.proof.to_dict() if self.proof else None,
+            **({} if self.promised_db is None else {"promised_db": self.promised_db}),
         }
+
+    def facts(self) -> list[tuple[str, str, str]]:
+        """For the top of the page: term, value, explanation."""
+        facts = []
+        if self.found is None or self.found.written is None:
+            facts.append(
+                ("Written", f"{decibels(self.after.excess_db)} dB", f"over the noise floor, with {joined(self.names)}")
+            )
+        if self.proof is not None:
+            erle = f"{decibels(self.proof.erle_before_db)} to {decibels(self.proof.erle_after_db)} dB"
+            facts.append(
+                (
+                    "Running filter",
+                    erle,
+                    f"of the robot taken away, on {self.proof.seconds:.1f} s that no fit has heard",
+                )
+            )
+        return facts
 
     def lines(self) -> list[str]:
         """For the terminal: the excess before and after, the values, the proof, what to beware of."""
         values = dict(self.profile.echo.effects)
         added = joined(self.names) or "nothing"
         before_db, after_db = self.before.excess_db, self.after.excess_db
-        lines = [f"{added} added: {before_db:.1f} dB over the noise floor before, {after_db:.1f} dB after"]
+        lines = [
+            f"{added} added: {decibels(before_db)} dB over the noise floor before, {decibels(after_db)} dB after,"
+            " fitted to all of the recording"
+        ]
+        if self.promised_db is not None:
+            lines.append(
+                f"promised    fitted to half of it they left {decibels(self.promised_db)} dB of the other half"
+            )
         for name in self.names:
             lines += _values(name, values[name], len(self.names) > 1)
         lines += [f"{'recording':<12}{text}" for text in self.before.warnings]
@@ -74,6 +106,9 @@ class Fitted:
             if find(name).event
         ]
         lines += [f"NOTE        {name}: {note}" for name in self.names if (note := reach(find(name), values[name]))]
+        if self.promised_db is not None and after_db > self.promised_db + PROMISE_DB:
+            missing = f"{joined(self.dropped)} is not in it" if self.dropped else "no fit to all of it explains as much"
+            lines.append(f"NOTE        what is written leaves more than the diagnosis did: {missing}")
         if self.names and round(after_db, 1) >= round(before_db, 1):  # as they are shown
             what = "this effect does" if len(self.names) == 1 else "these effects do"
             lines.append(f"WARNING     the error did not fall: {what} not explain the recording")
@@ -88,12 +123,13 @@ def fit(
     reference: Samples,
     *,
     force: bool,
-    drop: bool = False,
+    found: Diagnosis | None = None,
 ) -> Fitted:
     """The effects fitted to the recording on top of start, and proven against profile.
 
-    start: the profile, or one made from the recording where there is none. drop: whether an effect that makes the
-    filter worse is left out where the others help. Raises Refused where the filter would be worse, unless force.
+    start: the profile, or one made from the recording where there is none. found: the diagnosis that named them: then an
+    effect that makes the filter worse is left out where the others help. Raises Refused where the filter would be worse,
+    unless force.
     """
     proofs: tuple[Proof, ...] = ()
     unproven = "there is nothing to prove"
@@ -101,7 +137,7 @@ def fit(
         if names or profile is None:
             proofs = (
                 proofs_until_kept(profile, names, recording, reference)
-                if drop and not force
+                if found and not force
                 else (prove(profile, names, recording, reference),)
             )
     except SignalError as error:
@@ -113,7 +149,11 @@ def fit(
     names = tuple(name for name in names if name not in dropped)
     if proof and proof.worse and not force:
         raise Refused(_refusal(proof))
-    return Fitted(names, dropped, *add(start, names, recording, reference), proof, unproven)
+    if found and profile and names:
+        knowing, after, told = settle(profile, found, names, recording, reference)
+        before = found.comparison if told is found else told.comparison
+        return Fitted(names, dropped, knowing, before, after, proof, unproven, told, found.remaining_db)
+    return Fitted(names, dropped, *add(start, names, recording, reference), proof, unproven, found)
 
 
 def long_paths() -> list[str]:

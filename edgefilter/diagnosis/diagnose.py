@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -10,24 +10,29 @@ import numpy as np
 from edgefilter.diagnosis.advice import advice
 from edgefilter.diagnosis.band_edge import cut_by_power
 from edgefilter.diagnosis.candidates import candidates
+from edgefilter.diagnosis.closer_look import look_closer
 from edgefilter.diagnosis.compare import Comparison, compare, describe, independence_of
 from edgefilter.diagnosis.criteria import Criteria
 from edgefilter.diagnosis.findings import findings_of, share_of
 from edgefilter.diagnosis.follows_voice import noise_of_the_voice
+from edgefilter.diagnosis.joint import fit_jointly
 from edgefilter.diagnosis.leftover import left_in_words
 from edgefilter.diagnosis.noise_change import look_at_fan, without_doubtful
 from edgefilter.diagnosis.precision import precision
 from edgefilter.diagnosis.prepare import Prepared, prepare
 from edgefilter.diagnosis.proof import listed, with_fitted
-from edgefilter.diagnosis.result import Diagnosis, Finding, Interval, Verdict
+from edgefilter.diagnosis.result import Diagnosis, Finding, Interval, Verdict, in_order
 from edgefilter.diagnosis.score import Judge
 from edgefilter.diagnosis.select import search
 from edgefilter.diagnosis.trials import Found
 from edgefilter.echo.effects.catalogue import find
+from edgefilter.echo.measurement import Values
 from edgefilter.profile.data import Profile
 from edgefilter.types import SAMPLE_RATE, Samples
 
 __all__ = ["Diagnosis", "Finding", "Interval", "add", "diagnose"]
+PROMISE_DB = 0.5
+"""What is written may leave so much more than the diagnosis did, as it says, before it is asked why: intervals are as wide."""
 
 
 def diagnose(
@@ -165,9 +170,73 @@ def add(
     values, straight = dict(model.effects), prepared.model
     for name in straightened:
         straight = straight.with_effect(name, values[name])
+    was, now = (compare(each, recording, reference, sample_rate=sample_rate).excess_db for each in (profile, knowing))
     told = tuple(f"{name} is taken out first: {find(name).sentence(values[name])}" for name in straightened)
+    told += (f"with that left in, as compare has it: {was:.1f} dB over the noise floor before, {now:.1f} dB after",)
     told_of = replace(prepared, warnings=(*told, *prepared.warnings))
     return knowing, describe(told_of, straight), describe(told_of, model)
+
+
+def settle(
+    profile: Profile, found: Diagnosis, names: Sequence[str], recording: Samples, reference: Samples
+) -> tuple[Profile, Comparison, Diagnosis]:
+    """The profile with those findings of a diagnosis, its comparison, and the diagnosis with the figures of that profile.
+
+    recording, reference: what was diagnosed, at 16 kHz. The findings are fitted once more, to all of the recording; where
+    that leaves more than PROMISE_DB over what the diagnosis did, its own values are written. The diagnosis stays as it is
+    where not all of its findings are among the names.
+    """
+    prepared = prepare(profile, recording, reference)
+    start, values = prepared.model, dict(found.model.effects)
+    for name in names:
+        start = start.with_effect(name, values[name])
+    everywhere = replace(prepared.measurement, fit=prepared.usable)
+    choices: list[tuple[Comparison, Profile]] = []
+    for model in (fit_jointly(everywhere, start, names), start):
+        echo, values = profile.echo, dict(model.effects)
+        for name in names:
+            echo = echo.with_effect(name, values[name])
+        choices.append((compare(profile.with_echo(echo), recording, reference), profile.with_echo(echo)))
+        if choices[-1][0].excess_db <= found.remaining_db + PROMISE_DB:
+            break
+    after, knowing = min(choices, key=lambda choice: choice[0].excess_db)
+    if {finding.effect for finding in found.ranking} != set(names):
+        return knowing, after, found
+    return knowing, after, _as_written(found, prepared, dict(knowing.echo.effects), after)
+
+
+def _as_written(found: Diagnosis, prepared: Prepared, values: Mapping[str, Values], after: Comparison) -> Diagnosis:
+    """The diagnosis with the values of a profile that holds all its findings, and what each leaves then."""
+    before = replace(describe(prepared, prepared.model), warnings=found.comparison.warnings)
+    model, behind, excess_db = prepared.model, prepared, before.excess_db
+    findings: dict[str, Finding] = {}
+    for finding in in_order(found.ranking):
+        name, whole = finding.effect, before.excess_db
+        model = model.with_effect(name, values[name])
+        behind = behind.behind(find(name).noise_psd(values[name], behind.noise_psd))
+        last = len(findings) == len(found.ranking) - 1
+        left_db = after.excess_db if last else Judge(behind).of(model).excess_db
+        share = max(share_of(whole, left_db) - share_of(whole, excess_db), 0.0)
+        findings[name] = replace(
+            finding,
+            excess_before_db=excess_db,
+            excess_after_db=left_db,
+            share=share,
+            parameters={key: interval.at(values[name][key]) for key, interval in finding.parameters.items()},
+            evidence=find(name).sentence(values[name]) or finding.evidence,
+            values=values[name],
+        )
+        excess_db = left_db
+    return replace(
+        found,
+        comparison=before,
+        ranking=tuple(findings[finding.effect] for finding in found.ranking),
+        remaining_db=after.excess_db,
+        irreducible_db=min(found.irreducible_db, max(after.excess_db, 0.0)),
+        model=model,
+        precision=found.precision.at(values),
+        written=after,
+    )
 
 
 def conclude(
@@ -213,6 +282,7 @@ def conclude(
         independence=independence_of(found.prepared, found.model, found.final) if findings else comparison.independence,
         precision=precision(found, findings),
         advice=advice(tried),
+        closer_look=look_closer(found) if verdict == "unexplained" else None,
     )
 
 

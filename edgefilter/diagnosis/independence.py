@@ -32,7 +32,7 @@ the voice's own colour, which the whitened reference lacks and the residual has,
 as early."""
 MEANINGS = (
     "feedback or mis-alignment",
-    "another level, lag or first echo",
+    "the voice's first arrival, changed",
     "a path that the model has not got",
 )
 """Of a dependence in each."""

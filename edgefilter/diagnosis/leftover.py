@@ -109,4 +109,4 @@ def left_in_words(found: Found, left: Leftover, remaining_db: float, floor_db: f
         words += [find(name).noise_words for name, _ in found.model.effects if find(name).noise_words]
     if not words:
         words.append("a residual spread over the whole recording")
-    return f"{remaining_db:.1f} dB over the noise floor that no effect of the catalogue explains: " + "; ".join(words)
+    return "what no effect of the catalogue explains: " + "; ".join(words)

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
 from typing import TYPE_CHECKING, Literal, TypeAlias
 
+import numpy as np
+
+from edgefilter.diagnosis.closer_look import CloserLook
 from edgefilter.diagnosis.compare import Comparison
 from edgefilter.diagnosis.independence import Independence
 from edgefilter.echo.measurement import Values
@@ -34,6 +37,14 @@ class Interval:
     low: float | tuple[float, ...]
     high: float | tuple[float, ...]
     unit: str
+
+    def at(self, value: float | Samples) -> Interval:
+        """The same range around another value; as it is where there are not as many."""
+        if np.shape(value) != np.shape(self.value):
+            return self
+        low, high = (np.asarray(value) + end - self.value for end in (self.low, self.high))
+        plain = float if np.ndim(value) == 0 else lambda array: tuple(map(float, array))
+        return Interval(plain(value), plain(low), plain(high), self.unit)
 
     def to_dict(self) -> dict[str, object]:
         """Ready for JSON."""
@@ -112,6 +123,15 @@ class Precision:
     numbers: tuple[Known, ...] = ()
     correlations: tuple[tuple[str, str, float], ...] = ()
 
+    def at(self, values: Mapping[str, Values]) -> Precision:
+        """The same of other values, by effect."""
+        here = (np.ravel(values[known.effect][known.parameter]) for known in self.numbers)
+        found = zip(self.numbers, here, strict=True)
+        numbers = tuple(
+            replace(known, value=float(all_[known.index])) for known, all_ in found if known.index < all_.size
+        )
+        return replace(self, numbers=numbers)
+
     def to_dict(self) -> dict[str, object]:
         """Ready for JSON."""
         return {
@@ -126,7 +146,8 @@ class Diagnosis:
 
     tried: all effects that were tried. independence: of what is left with all that was found. precision: of the found
     numbers. advice: what to record to tell candidates apart that explain nearly the same. proof: of what was found, in
-    the running filter, where it was asked for; unproven: why there is none.
+    the running filter, where it was asked for; unproven: why there is none. written: the comparison with the profile that
+    was written of it, whose figures it then has. closer_look: at what is left, where that is unexplained.
     """
 
     verdict: Verdict
@@ -142,6 +163,8 @@ class Diagnosis:
     advice: tuple[str, ...] = ()
     proof: Proof | None = None
     unproven: str = ""
+    written: Comparison | None = None
+    closer_look: CloserLook | None = None
 
     def to_dict(self) -> dict[str, object]:
         """The JSON that `diagnose --json` writes, schema 1."""
@@ -179,4 +202,10 @@ class Diagnosis:
             "advice": list(self.advice),
             "proof": self.proof.to_dict() if self.proof else None,
             "unproven": self.unproven,
+            "closer_look": self.closer_look.to_dict() if self.closer_look else None,
         }
+
+
+def in_order(ranking: Sequence[Finding]) -> list[Finding]:
+    """The findings as one was added after the other, so that each starts where the one before it ended."""
+    return sorted(ranking, key=lambda finding: -finding.excess_before_db)

@@ -11,12 +11,14 @@ from pathlib import Path
 from typing import Any
 
 import jinja2
+import numpy as np
 
+from edgefilter.diagnosis.closer_look import CloserLook
 from edgefilter.diagnosis.compare import Comparison, describe
 from edgefilter.diagnosis.diagnose import Diagnosis, Finding
 from edgefilter.diagnosis.passport import Passport
 from edgefilter.diagnosis.prepare import Prepared, prepare
-from edgefilter.diagnosis.result import Precision
+from edgefilter.diagnosis.result import Precision, in_order
 from edgefilter.echo.effect import complete
 from edgefilter.echo.effects.catalogue import find
 from edgefilter.echo.model import EchoModel
@@ -30,7 +32,6 @@ from edgefilter.report.text import (
     correlograms,
     decibels,
     headline,
-    in_order,
     interval_text,
     precision_rows,
     sentence,
@@ -56,27 +57,42 @@ def comparison_page(found: Comparison, names: Mapping[str, Any]) -> str:
     profile = "The profile" if names["profile"] else "A stationary linear path made from the recording itself"
     excess = f"{profile} leaves {decibels(found.excess_db)} dB over the noise floor unexplained."
     return _page(
-        {(): found}, (), {"kind": "comparison", "headline": excess, "findings": [], "left": "", **_statistics()}, names
+        {(): found},
+        (),
+        {
+            **{"kind": "comparison", "headline": excess, "findings": [], "command": [], "left": "", "look": None},
+            **_statistics(),
+        },
+        names,
     )
 
 
 def diagnosis_page(
-    profile: Profile, found: Diagnosis, recording: Samples, reference: Samples, names: Mapping[str, Any]
+    profile: Profile,
+    found: Diagnosis,
+    recording: Samples,
+    reference: Samples,
+    names: Mapping[str, Any],
+    outcome: Sequence[tuple[str, str, str]] = (),
 ) -> str:
     """The page of a diagnosis, with a switch for each found effect.
 
-    recording (n,), reference (m,): what was diagnosed.
+    recording (n,), reference (m,): what was diagnosed. outcome: further figures at the top, where a profile was written.
     """
     steps = in_order(found.ranking)
     variants = compare_variants(profile, found.model, steps, recording, reference)
+    if found.written:
+        variants[(True,) * len(steps)] = found.written
     text = {
         "kind": "diagnosis",
         "headline": headline(found.verdict, [finding.effect for finding in found.ranking], bool(names["profile"])),
-        "findings": [_finding(finding, names) for finding in found.ranking],
+        "findings": [_finding(finding) for finding in found.ranking],
+        "command": add_command([one.effect for one in steps], names).split(" ") if steps and not outcome else [],
         "left": sentence(found.evidence) if found.evidence else "",
+        "look": _look(found.closer_look),
         **_statistics(found),
     }
-    return _page(variants, steps, text, names, found.irreducible_db)
+    return _page(variants, steps, text, names, found.irreducible_db, outcome)
 
 
 def passport_page(found: Passport, diagnosis: str, names: Mapping[str, Any]) -> str:
@@ -137,13 +153,14 @@ def _page(
     text: Mapping[str, object],
     names: Mapping[str, Any],
     irreducible_db: float | None = None,
+    outcome: Sequence[tuple[str, str, str]] = (),
 ) -> str:
     before, after = variants[(False,) * len(steps)], variants[(True,) * len(steps)]
     scale = colour_scale(before.recording)
     fields = {
         **text,
         **{role: Path(str(names[role] or "none: the recording itself")).name for role in ROLES},
-        "facts": _facts(before, after if steps else None, irreducible_db),
+        "facts": [*_facts(before, after if steps else None, irreducible_db), *outcome],
         "switches": [title(finding.effect) for finding in steps],
         "notes": _notes(before),
         "seconds": f"{before.recording.size / SAMPLE_RATE:.1f}",
@@ -249,8 +266,31 @@ def _facts(before: Comparison, after: Comparison | None, irreducible_db: float |
     return facts
 
 
-def _finding(finding: Finding, names: Mapping[str, object]) -> dict[str, object]:
-    """What the page says of one effect; the command as words, between which its line may break."""
+def _look(look: CloserLook | None) -> dict[str, object] | None:
+    """The curves of what is left as points of drawings 100 wide and 40 high; zero: the height of 0 dB."""
+    if look is None:
+        return None
+    drawn = []
+    for curve in look.curves:
+        low, high = min(0.0, *curve.y_db), max(0.0, *curve.y_db)
+        x = np.log(curve.x) if curve.x_unit == "Hz" else np.array(curve.x)
+        across, up = max(float(x[-1] - x[0]), 1e-9), max(high - low, 1.0)
+        points = zip(100 * (x - x[0]) / across, 40 * (high - np.array(curve.y_db)) / up, strict=True)
+        drawn.append(
+            {
+                "name": curve.name,
+                "points": " ".join(f"{a:.2f},{b:.2f}" for a, b in points),
+                "zero": f"{40 * high / up:.2f}",
+                "from": f"{curve.x[0]:.3g}",
+                "to": f"{curve.x[-1]:.4g} {curve.x_unit}",
+                "range": f"{low:+.1f} to {high:+.1f} dB".replace("-", "−"),
+            }
+        )
+    return {"sentence": sentence(look.sentence), "curves": drawn}
+
+
+def _finding(finding: Finding) -> dict[str, object]:
+    """What the page says of one effect."""
     return {
         "title": title(finding.effect),
         "effect": finding.effect,
@@ -259,7 +299,6 @@ def _finding(finding: Finding, names: Mapping[str, object]) -> dict[str, object]
         "share": f"{100 * finding.share:.0f}",
         "evidence": sentence(finding.evidence),
         "parameters": [(name, interval_text(interval)) for name, interval in finding.parameters.items()],
-        "command": add_command([finding.effect], names).split(" "),
     }
 
 

@@ -14,7 +14,7 @@ from edgefilter.diagnosis.compare import Comparison
 from edgefilter.diagnosis.diagnose import Diagnosis, Finding, Interval
 from edgefilter.diagnosis.independence import Correlogram, Independence
 from edgefilter.diagnosis.proof import Proof
-from edgefilter.diagnosis.result import Candidate, Known, Precision
+from edgefilter.diagnosis.result import Candidate, Known, Precision, in_order
 from edgefilter.echo.effects.catalogue import find, names
 
 UNITS = {"1": "", "1e-6": "ppm"}
@@ -137,6 +137,8 @@ def diagnosis_lines(found: Diagnosis, calibrated: bool = True) -> list[str]:
         lines += _finding(rank, finding)
     if found.evidence:
         lines.append(f"left        {sentence(found.evidence)}")
+    if found.closer_look:
+        lines.append(f"closer      {sentence(found.closer_look.sentence)}")
     if found.proof or found.unproven:
         lines.append(proof_line(found.proof, found.unproven))
     lines += precision_lines(found.precision)
@@ -147,18 +149,15 @@ def diagnosis_lines(found: Diagnosis, calibrated: bool = True) -> list[str]:
 
 
 def add_command(effects: Sequence[str], names: Mapping[str, Any]) -> str:
-    """What to type to have those effects in a new profile; without a profile, to have one at all."""
+    """What to type to have those effects in a new profile, of all microphones; without a profile, to have one at all."""
     if names["profile"] is None:
         return "edgefilter calibrate --live --output robot.npz"
     files = " ".join(f"--{role} {shlex.quote(str(names[role]))}" for role in ("profile", "recording", "reference"))
     own = "".join(f" --effects {shlex.quote(str(file))}" for file in names.get("effects") or ())
-    output = Path(str(names["profile"])).with_suffix(f".{'.'.join(effects)}.npz")
-    return f"edgefilter add {' '.join(effects)} {files}{own} --output {shlex.quote(str(output))}"
-
-
-def in_order(ranking: Sequence[Finding]) -> list[Finding]:
-    """The findings as one was added after the other, so that each starts where the one before it ended."""
-    return sorted(ranking, key=lambda finding: -finding.excess_before_db)
+    output = shlex.quote(str(Path(str(names["profile"])).with_suffix(f".{'.'.join(effects)}.npz")))
+    if channels := names.get("mic_channels"):
+        return f"edgefilter diagnose {files}{own} --mic-channels {','.join(map(str, channels))} --apply {output}"
+    return f"edgefilter add {' '.join(effects)} {files}{own} --output {output}"
 
 
 def coarser(times: Sequence[tuple[float, float, float]], rows: int) -> list[tuple[float, float, float]]:

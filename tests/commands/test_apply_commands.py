@@ -12,6 +12,7 @@ import soundfile
 from edgefilter.calibration.from_recording import SOURCE
 from edgefilter.cli import main
 from edgefilter.profile.data import Profile
+from edgefilter.report.text import decibels
 from tests.commands.test_diagnosis_commands import RATE, arguments, fails_in_one_line
 from tests.diagnosis.robot_scene import profile, record, voice
 from tests.diagnosis.test_apply import RESONANCE, office
@@ -82,9 +83,18 @@ def test_of_two_the_one_that_hurts_is_named(scene: Path, tmp_path: Path, capsys)
 
 @pytest.mark.slow
 def test_all_that_is_found_is_applied_in_one_step(scene: Path, tmp_path: Path, capsys) -> None:
-    better = tmp_path / "better.npz"
-    assert main(arguments(scene, "diagnose", "--apply", better, "--json", "-")) == 0
-    told = json.loads(capsys.readouterr().out)
+    """What is left is one figure in console, JSON and page, and `compare` has it of the profile that was written."""
+    better, page, figures = tmp_path / "better.npz", tmp_path / "r.html", tmp_path / "d.json"
+    assert main(arguments(scene, "diagnose", "--apply", better, "--report", page, "--json", figures)) == 0
+    out, told = capsys.readouterr().out, json.loads(figures.read_text())
+    left_db, last = told["applied"]["excess_after_db"], min(told["ranking"], key=lambda one: one["excess_before_db"])
+    assert told["remaining_db"] == last["excess_after_db"] == pytest.approx(left_db, abs=1e-3)
+    with_all = f"with {last['effect']}"
+    assert f"floor before, {decibels(left_db)} dB after" in out and f"  {with_all:<27} {decibels(left_db):>6}" in out
+    assert f"<dt>With what was found</dt><dd><b>{decibels(left_db)} dB</b>" in page.read_text()
+    assert main(arguments(scene, "compare", "--json", "-", profile=better)) == 0
+    assert json.loads(capsys.readouterr().out)["excess_db"] == pytest.approx(left_db, abs=1e-3)
+    assert left_db < told["applied"]["promised_db"] + 0.5
     found = {entry["effect"] for entry in told["ranking"]}
     assert found == {"chassis_resonance", "playback_gain"} == told["applied"]["effects"].keys()
     assert told["applied"]["output"] == str(better) and told["applied"]["proof"].keys() == PROOF
@@ -122,12 +132,13 @@ def test_without_a_profile_one_is_made_and_proven_against_none(scene: Path, tmp_
     assert after < 0.02 * before
 
 
-def test_nothing_found_leaves_the_profile_as_it_is(scene: Path, tmp_path: Path, capsys) -> None:
+def test_where_nothing_was_found_no_file_is_written_and_a_line_says_so(scene: Path, tmp_path: Path, capsys) -> None:
     soundfile.write(scene / "same.wav", record(voice(9.0)), RATE, "FLOAT")
-    assert main(arguments(scene, "diagnose", "--apply", tmp_path / "same.npz", mic="same.wav")) == 0
-    out = capsys.readouterr().out
-    assert "nothing added" in out and "there is nothing to prove" in out
-    assert Profile.load(tmp_path / "same.npz").echo.effects == ()
+    same, page, figures = tmp_path / "same.npz", tmp_path / "r.html", tmp_path / "d.json"
+    words = arguments(scene, "diagnose", "--apply", same, "--report", page, "--json", figures, mic="same.wav")
+    assert main(words) == 0
+    assert f"nothing was found to add: {same} is not written" in capsys.readouterr().out and not same.exists()
+    assert "applied" not in json.loads(figures.read_text()) and "edgefilter add" not in page.read_text()
 
 
 def test_a_diagnosis_that_is_refused_is_told_but_not_applied(scene: Path, tmp_path: Path, capsys) -> None:

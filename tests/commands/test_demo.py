@@ -80,7 +80,8 @@ def test_hidden_tells_the_story_from_a_robot_that_changed_to_a_filter_that_is_me
     assert main([str(word) for word in words]) == 0
     told, figures = capsys.readouterr().out, json.loads((tmp_path / "out.json").read_text())["one"]
     assert figures["named"] == figures["hidden"] == ["late_reverb"]
-    assert figures["excess_after_db"] < 2 < 14 < figures["excess_before_db"]  # 0.6 and 16.7
+    assert figures["excess_after_db"] < 2 < 14 < figures["excess_before_db"]  # 0.0 and 16.7
+    assert figures["excess_after_db"] == figures["applied"]["excess_after_db"]
     proof = figures["applied"]["proof"]
     assert proof["erle_after_db"] > proof["erle_before_db"] + 6  # 12.6 more
     before, after = (figures[f"si_sdr_{key}_db"] for key in ("before", "after"))

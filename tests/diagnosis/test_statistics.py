@@ -89,7 +89,7 @@ def test_the_text_says_all_of_it(diagnosed):
     assert "correlations with all that was found" in text and "correlations of what is left" in text
     assert "Delta BIC  verdict" in text
     left, profile_alone = (independence_lines(test)[3] for test in (found.independence, found.comparison.independence))
-    assert "another level, lag" in profile_alone and "another level, lag" not in left
+    assert "first arrival, changed" in profile_alone and "first arrival, changed" not in left
 
 
 def test_numbers_say_where_their_error_is_from():

@@ -10,6 +10,7 @@ import pytest
 import soundfile
 from PIL import Image
 
+from edgefilter.diagnosis.closer_look import CloserLook, Curve
 from edgefilter.diagnosis.compare import compare
 from edgefilter.diagnosis.diagnose import Diagnosis, Finding, Interval
 from edgefilter.echo.effects.catalogue import EFFECTS
@@ -153,10 +154,22 @@ def test_four_effects_give_five_comparisons_in_the_page():
         model = model.with_effect(one.effect, one.values)
     found = Diagnosis("missing", compare(robot, y, x), tuple(four), "", 0.1, 0.0, model)
     page = diagnosis_page(robot, found, y, x, {"profile": "p", "recording": "m", "reference": "r"})
+    assert page.count("<span>add</span>") == 1 and page.index("<span>add</span>") < page.index("Error budget")
     assert page.count('"excess_db"') == 5 and "switched with them" in page
     assert page.count("data:image/png") == 3, (
         "recording, prediction, residual: with neutral values all five comparisons share them"
     )
+
+
+def test_the_page_of_what_is_unexplained_draws_a_closer_look_and_says_where():
+    x, robot = voice(3.0), profile()
+    y = record(x)
+    look = CloserLook((Curve("time", "s", (0.1, 0.2, 0.3), (-3.0, 1.0, 0.0), 0.5),), "look at the gain by time")
+    found = Diagnosis("unexplained", compare(robot, y, x), (), "", 9.0, 0.0, robot.echo, closer_look=look)
+    page = diagnosis_page(robot, found, y, x, {"profile": "p", "recording": "m", "reference": "r"})
+    assert "<b>Look at the gain by time.</b>" in page and "By time</b> <small>−3.0 to +1.0 dB" in page
+    assert 'points="0.00,40.00 50.00,0.00 100.00,10.00"' in page and 'y1="10.00"' in page
+    assert "closer      Look at the gain by time." in diagnosis_lines(found)
 
 
 def test_the_command_to_add_is_one_that_a_shell_reads():
@@ -165,6 +178,9 @@ def test_the_command_to_add_is_one_that_a_shell_reads():
         add_command(["tilt"], names)
         == "edgefilter add tilt --profile 'my robot.npz' --recording m.wav --reference r.wav --effects own.py --output"
         " 'my robot.tilt.npz'"
+    )
+    assert add_command(["tilt"], {**names, "mic_channels": (0, 2)}).endswith(
+        "--effects own.py --mic-channels 0,2 --apply 'my robot.tilt.npz'"
     )
 
 

@@ -1,0 +1,193 @@
+"""A closer look at what no effect explains: the gain that the recording still asks for, over time, rate, level and frequency, and its silences."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+
+import numpy as np
+
+from edgefilter.diagnosis.prepare import Prepared
+from edgefilter.diagnosis.trials import Found
+from edgefilter.dsp.frames import block_power, blocks, decibels
+from edgefilter.dsp.psd import frequencies, periodograms
+from edgefilter.echo.wiener import spectra
+from edgefilter.types import SAMPLE_RATE, Array, Samples
+
+STEP = SAMPLE_RATE // 50
+BEAT = 16
+"""Samples over which the gain is summed where its rate is sought."""
+TIME_S, LEVEL_DB, RATES_HZ = 0.04, 5.0, (1.0, 30.0)
+"""Of one point of a curve: five in a period of a tremolo of 5 Hz."""
+FINER = 24
+"""Rates tried per cycle in the whole recording."""
+BANDS_HZ = np.geomspace(100.0, 7800.0, 20)
+RATE = "rate at which the gain comes and goes"
+SURE = 40.0
+"""Energy of the voice over the fan's variance from which on its gain is drawn."""
+TELLING = 0.1
+"""Share of what is left that a gain must explain to be pointed at: less is how any model errs."""
+
+
+@dataclass(frozen=True)
+class Curve:
+    """One look: x and y (k,); share: part of what is left while the robot talks that a gain of that kind would explain."""
+
+    name: str
+    x_unit: str
+    x: tuple[float, ...]
+    y_db: tuple[float, ...]
+    share: float
+
+    def to_dict(self) -> dict[str, object]:
+        """Ready for JSON."""
+        rounded = {"x": np.round(self.x, 3).tolist(), "y_db": np.round(self.y_db, 2).tolist()}
+        return {**asdict(self), **rounded, "share": round(self.share, 4)}
+
+
+@dataclass(frozen=True)
+class CloserLook:
+    """The curves, those of few numbers first, and one sentence on which of them to look at."""
+
+    curves: tuple[Curve, ...] = ()
+    sentence: str = ""
+
+    def to_dict(self) -> dict[str, object]:
+        """Ready for JSON."""
+        return {"sentence": self.sentence, "curves": [curve.to_dict() for curve in self.curves]}
+
+
+def look_closer(found: Found) -> CloserLook:
+    """What the final residual of a search looks like beside the prediction."""
+    prepared = found.prepared
+    voice = prepared.measurement.whiten(found.final.prediction) * prepared.usable
+    left = (
+        prepared.measurement.white_recording - prepared.measurement.whiten(found.final.prediction)
+    ) * prepared.usable
+    gains = _Gains(voice, left)
+    level = decibels(block_power(found.final.prediction, STEP))
+    time = np.arange(level.size) * STEP / SAMPLE_RATE
+    curves = [
+        _over_rate(voice, left, gains),
+        gains.over("level of the robot's voice", "dBFS", np.floor(level / LEVEL_DB), LEVEL_DB),
+        _over_frequency(prepared, voice, left, gains),
+        gains.over("time", "s", np.floor(time / TIME_S), TIME_S),
+        _silence(prepared, found.final.prediction),
+    ]
+    shown = tuple(curve for curve in curves if len(curve.x) > 1)
+    return CloserLook(shown, _told(shown))
+
+
+class _Gains:
+    """Least-squares gains of a voice (n,) in what is left of the recording (n,), both whitened, by groups of steps."""
+
+    def __init__(self, voice: Samples, left: Samples) -> None:
+        self.energy, self.cross = (
+            blocks(voice * other, STEP).sum(axis=1, dtype=np.float64) for other in (voice, voice + left)
+        )
+        self.whole = float(np.sum(blocks(left * left, STEP).sum(axis=1, dtype=np.float64)[self.energy > SURE]))
+        self.noise = max(self.whole / max(STEP * np.count_nonzero(self.energy > SURE), 1), 1.0)
+
+    def over(self, name: str, unit: str, group: Array, width: float) -> Curve:
+        """The gain of each group (steps,), at the group's middle, and the share that all of them explain beyond what chance does."""
+        keys, place = np.unique(group[: self.energy.size], return_inverse=True)
+        energy, cross = (np.bincount(place, part) for part in (self.energy, self.cross))
+        sure = energy > SURE
+        if sure.sum() < 2:
+            return Curve(name, unit, (), (), 0.0)
+        gain = cross[sure] / energy[sure]
+        away = float(np.sum(energy[sure] * (gain - 1.0) ** 2)) - sure.sum() * self.noise
+        x = (keys[sure] + 0.5) * width
+        return _curve(name, unit, x, 20.0 * np.log10(np.clip(gain, 0.03, 30.0)), away / max(self.whole, 1e-9))
+
+
+def _over_rate(voice: Samples, left: Samples, gains: _Gains) -> Curve:
+    energy, cross = (blocks(voice * other, BEAT).sum(axis=1, dtype=np.float64) for other in (voice, voice + left))
+    if not energy.any():
+        return Curve(RATE, "Hz", (), (), 0.0)
+    rates, worth, depth = by_rate(energy, cross, *RATES_HZ)
+    best = np.argmax(worth)
+    away = float(worth[best] - np.median(worth))
+    edges = np.geomspace(RATES_HZ[0], rates[-1], 61)
+    place = np.digitize(rates, edges)
+    x = [float(rates[place == k][np.argmax(depth[place == k])]) for k in np.unique(place)]
+    y = [float(20.0 * np.log10(1.0 + depth[place == k].max())) for k in np.unique(place)]
+    return _curve(RATE, "Hz", np.array(x), np.array(y), away / max(gains.whole, 1e-9))
+
+
+def by_rate(energy: Array, cross: Array, lowest_hz: float, highest_hz: float) -> tuple[Array, Array, Array]:
+    """Of each rate (k,) in Hz the energy that a gain 1 + a cos + b sin at it explains, (k,), and its depth, (k,).
+
+    From sums of voice times voice, and voice times recording, per step.
+    """
+    size = FINER * energy.size
+    per = SAMPLE_RATE / BEAT / size
+    own, other = np.fft.rfft(energy, size), np.fft.rfft(cross, size)
+    rates = np.arange(max(round(lowest_hz / per), 1), min(round(highest_hz / per), own.size // 2))
+    at, twice, seen = own[rates], own[2 * rates], other[rates]
+    matrix = np.empty((rates.size, 3, 3))
+    matrix[:, 0, 0] = own[0].real
+    matrix[:, 0, 1] = matrix[:, 1, 0] = at.real
+    matrix[:, 0, 2] = matrix[:, 2, 0] = -at.imag
+    matrix[:, 1, 1], matrix[:, 2, 2] = 0.5 * (own[0] + twice).real, 0.5 * (own[0] - twice).real
+    matrix[:, 1, 2] = matrix[:, 2, 1] = -0.5 * twice.imag
+    right = np.stack((np.full(rates.size, other[0].real), seen.real, -seen.imag), axis=1)
+    matrix += (1e-6 * own[0].real + 1e-30) * np.eye(3)
+    found = np.linalg.solve(matrix, right[:, :, None])[:, :, 0]
+    depth = np.hypot(found[:, 1], found[:, 2]) / np.maximum(np.abs(found[:, 0]), 1e-6)
+    return rates * per, np.sum(found * right, axis=1), depth
+
+
+def _over_frequency(prepared: Prepared, voice: Samples, left: Samples, gains: _Gains) -> Curve:
+    found = spectra(prepared.measurement, voice, 20.0)
+    place = np.digitize(found.hz, BANDS_HZ)
+    inside = (place > 0) & (place < BANDS_HZ.size)
+    power, cross = (
+        np.bincount(place[inside], part[inside], BANDS_HZ.size)[1:] for part in (found.predicted, found.cross.real)
+    )
+    sure = power > SURE
+    gain = cross[sure] / power[sure]
+    away = float(np.sum(power[sure] * (gain - 1.0) ** 2)) / max(float(np.sum(found.predicted)), 1e-9)
+    share = away * float(np.sum(gains.energy)) / max(gains.whole, 1e-9)
+    x = np.sqrt(BANDS_HZ[1:] * BANDS_HZ[:-1])[sure]
+    return _curve("frequency", "Hz", x, 20.0 * np.log10(np.clip(gain, 0.03, 30.0)), share)
+
+
+def _silence(prepared: Prepared, prediction: Samples) -> Curve:
+    """The spectrum of what is left while the robot is silent, over the fan's; its share is of no gain."""
+    left, quiet = prepared.measurement.recording - prediction, prepared.usable & ~prepared.active
+    whole = np.all(blocks(quiet, 600), axis=1)
+    frames_ = periodograms(left, 1200)
+    silent = (whole[:-1] & whole[1:])[: frames_.shape[0]]
+    if silent.sum() < 10:
+        return Curve("frequency, in the robot's silences", "Hz", (), (), 0.0)
+    ratio = frames_[: silent.size][silent].mean(axis=0) / prepared.noise_psd
+    place = np.digitize(frequencies(ratio.size), BANDS_HZ)
+    y = [float(decibels(ratio[place == k].mean())) for k in range(1, BANDS_HZ.size)]
+    return _curve("frequency, in the robot's silences", "Hz", np.sqrt(BANDS_HZ[1:] * BANDS_HZ[:-1]), np.array(y), 0.0)
+
+
+def _curve(name: str, unit: str, x: Array, y: Array, share: float) -> Curve:
+    return Curve(name, unit, tuple(map(float, x)), tuple(map(float, y)), float(np.clip(share, 0.0, 1.0)))
+
+
+def _told(curves: tuple[Curve, ...]) -> str:
+    """Which curve to look at: of those whose gain would explain half of what any would, the one of fewest numbers; else the silences, else none."""
+    most_share = max((curve.share for curve in curves), default=0.0)
+    if most_share >= TELLING:
+        telling = next(curve for curve in curves if curve.share >= 0.5 * most_share)
+        worth = f"would explain {100 * telling.share:.0f} % of what is left"
+        most, least = int(np.argmax(telling.y_db)), int(np.argmin(telling.y_db))
+        if telling.name == RATE:
+            return (
+                f"look at the gain over time: it comes and goes {telling.x[most]:.3g} times a second, and that {worth}"
+            )
+        high, low = (f"{telling.y_db[i]:+.1f} dB at {telling.x[i]:.3g} {telling.x_unit}" for i in (most, least))
+        return f"look at the gain by {telling.name}: highest, {high}, and lowest, {low}, it {worth}"
+    silence = next((curve for curve in curves if "silences" in curve.name), None)
+    if silence is not None and max(map(abs, silence.y_db)) > 3.0:
+        at = int(np.argmax(np.abs(silence.y_db)))
+        return (
+            f"look at the robot's silences: they are {silence.y_db[at]:+.1f} dB off the calibrated fan around"
+            f" {silence.x[at]:.0f} Hz"
+        )
+    return "no gain of the predicted voice explains it: what is left does not follow the voice's wave; listen to it"
