@@ -80,7 +80,7 @@ def test_a_model_that_answers_a_probability_beyond_0_to_1_is_held_to_them(tmp_pa
     assert engine.step(heard, engine.initial_state())[0].speech_probability == told
 
 
-@pytest.mark.parametrize(("below_db", "heard"), [(40.0, True), (50.0, False)])
+@pytest.mark.parametrize(("below_db", "heard"), [(36.0, True), (44.0, False)])
 def test_what_is_far_softer_than_the_robot_has_been_is_nobody_who_interrupts(below_db, heard):
     engine, rng = Crnn(EDGE), np.random.default_rng(3)
     frame = Frame(*(spectrum(rng, 257) for _ in range(4)), *np.full((2, 257), 1e-6, np.float32))
