@@ -287,6 +287,9 @@ def _ros2(commands: argparse._SubParsersAction) -> None:
     told = "of DDS (default: ROS_DOMAIN_ID, or 0)"
     option("--domain", type=whole(0, 232, "a domain, 0 to 232"), metavar="N", help=told)
     _form(option)
+    option("--mic-channels", **MIC_CHANNELS)
+    told = "of the reference (default: as many as the microphone has)"
+    option("--reference-channels", type=whole(1, 8, "1 to 8 channels"), metavar="N", help=told)
     words = ros2.add_subparsers(dest="word", metavar="extract")
     option = words.add_parser("extract", help="write two topics of a recording as WAV files").add_argument
     option("recording", metavar="ROBOT.mcap")

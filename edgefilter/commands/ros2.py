@@ -11,6 +11,7 @@ from edgefilter.commands.display import print_result, say
 from edgefilter.errors import UsageError
 from edgefilter.filter.barge_in import BargeInSettings
 from edgefilter.filter.ego_filter import EgoFilter
+from edgefilter.types import ALL_CHANNELS
 
 
 def main(args: argparse.Namespace) -> int:
@@ -39,7 +40,9 @@ def _node(args: argparse.Namespace) -> int:
         raise UsageError(f"ROS_DOMAIN_ID is '{named}', expected a number: set it, or give --domain")
     domain = int(named) if args.domain is None else args.domain
     ego = EgoFilter(args.profile, args.engine, barge_in=BargeInSettings(judge="network"))
-    node = Node(ego, Topics(args.mic, args.reference, args.silenced, args.human, args.rate, args.channels), domain)
+    names = args.mic, args.reference, args.silenced, args.human
+    wanted = range(args.channels) if args.mic_channels == ALL_CHANNELS else args.mic_channels
+    node = Node(ego, Topics(*names, args.rate, args.channels, wanted, args.reference_channels), domain)
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: node.stop())
     say(f"node /edgefilter, domain {domain}: {args.mic} and {args.reference} in, {args.human} out; Ctrl-C ends it")

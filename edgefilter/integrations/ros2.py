@@ -5,7 +5,7 @@ Needs `pip install '.[ros2]'` in a checkout.
 
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from cyclonedds.core import DDSException, Policy, Qos
@@ -92,7 +92,12 @@ class DiagnosticArray(IdlStruct, typename="diagnostic_msgs::msg::dds_::Diagnosti
 
 @dataclass(frozen=True)
 class Topics:
-    """Names of what comes in and goes out; rate and channels: of the microphone's and the reference's 16-bit samples."""
+    """Names of what comes in and goes out.
+
+    rate: Hz, of the microphone's and the reference's 16-bit samples. channels: of the microphone's. mic_channels: those that
+    are microphones of an array; the human is then one channel, otherwise as many as came in, of their mean.
+    reference_channels: None for as many as the microphone's.
+    """
 
     mic: str = "/audio"
     reference: str = "/speech"
@@ -100,6 +105,8 @@ class Topics:
     human: str = "/human"
     rate: int = 16000
     channels: int = 1
+    mic_channels: Sequence[int] | None = None
+    reference_channels: int | None = None
 
 
 class Node:
@@ -117,7 +124,7 @@ class Node:
 
     def __init__(self, ego: EgoFilter, topics: Topics = Topics(), domain: int = 0) -> None:
         self._topics = topics
-        self.duplex = Duplex(ego, on_event=self._tell)
+        self.duplex = Duplex(ego, on_event=self._tell, mic_channels=topics.mic_channels)
         self._wrong: dict[str, str] = {}
         self._stop = threading.Event()
         try:
@@ -173,13 +180,16 @@ class Node:
         return bool(came)
 
     def _say(self, message: AudioData) -> None:
-        self.duplex.play_pcm16(bytes(message.data), self._topics.rate, self._topics.channels)
+        channels = self._topics.reference_channels or self._topics.channels
+        self.duplex.play_pcm16(bytes(message.data), self._topics.rate, channels)
 
     def _silence(self, message: Empty) -> None:
         self.duplex.interrupt()
 
     def _hear(self, message: AudioData) -> None:
-        human = self.duplex.hear_pcm16(bytes(message.data), self._topics.rate, self._topics.channels)
+        topics = self._topics
+        answers = None if topics.mic_channels is None else 1
+        human = self.duplex.hear_pcm16(bytes(message.data), topics.rate, topics.channels, answers)
         if human:
             self._human.write(AudioData(data=list(human)))
 

@@ -48,7 +48,7 @@ class Session:
     def __init__(self, form: Form, ego: EgoFilter) -> None:
         self.form, self.ego = form, ego
         rate = form.rate
-        self._to_filter = [Resampler(rate, SAMPLE_RATE) for _ in range(2)]
+        self._to_filter = Resampler(rate, SAMPLE_RATE, form.microphones), Resampler(rate, SAMPLE_RATE)
         self._pace = Pace(asyncio.get_running_loop().time) if form.streams == "stereo" else None
         self._encode: Callable[[Samples, bool], list[bytes]]
         decoders: tuple[Callable[[bytes], Samples], ...]
@@ -59,7 +59,7 @@ class Session:
             self._encode = Encoder(form.bitrate).push
             codec_s = FRAME_MS / 1000
         else:
-            decoders = (from_pcm16, from_pcm16)
+            decoders = (partial(_channels_of, microphones=form.microphones), from_pcm16)
             self._encode, codec_s = self._as_pcm, 0.0
             self._from_filter = Resampler(SAMPLE_RATE, rate)
             codec_s = self._from_filter.delay_s
@@ -100,17 +100,19 @@ class Session:
             self._two.push(message)
             mic, ref = self._two.take()
         else:
-            mic, ref = np.ascontiguousarray(all_of_pcm16(message, 2).T)
+            both = all_of_pcm16(message, self.form.microphones + 1)
+            mic, ref = _microphones(both[:, :-1]), np.ascontiguousarray(both[:, -1])
         return self._filter(mic, ref, last=False), False
 
     def finish(self) -> list[Answer]:
         """The rest, and the last answer, with the figures."""
-        mic, ref = self._two.take(last=True) if self._two else (np.zeros(0, np.float32),) * 2
-        answers = self._filter(mic, ref, last=True)
+        nothing = _channels_of(b"", self.form.microphones), np.zeros(0, np.float32)
+        answers = self._filter(*(self._two.take(last=True) if self._two else nothing), last=True)
         stats = self.ego.stats()
         figures = {
             "samples": stats["samples"],
             "engine": stats["engine"],
+            "array": stats["array"],
             **self._counts(),
             "deadline": stats["deadline"],
         }
@@ -122,7 +124,7 @@ class Session:
         events = self.ego.events()
         if last:
             human = np.concatenate((human, self.ego.flush()))
-        if self._pace and (wrong := self._pace.note(mic.size, self.form.rate)):
+        if self._pace and (wrong := self._pace.note(len(mic), self.form.rate)):
             events.append(Event("rate_mismatch", self.ego.stats()["samples"], wrong))
         answers: list[Answer] = [part for part in self._encode(human, last) if part]
         return answers + [self._told(event) for event in [*events, *self._troubles()]]
@@ -287,6 +289,15 @@ class Service:
     def _let_go(self, connection: ServerConnection) -> None:
         _LOGGER.warning("client %s reads too slowly; its connection is closed", connection.remote_address)
         connection.transport.abort()
+
+
+def _channels_of(pcm: bytes, microphones: int) -> Samples:
+    return _microphones(all_of_pcm16(pcm, microphones))
+
+
+def _microphones(samples: Samples) -> Samples:
+    """(n,) of one microphone, (n, microphones) of several."""
+    return np.ascontiguousarray(samples[:, 0] if samples.shape[1] == 1 else samples)
 
 
 def _text(kind: str, **more: object) -> str:

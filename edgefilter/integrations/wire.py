@@ -11,7 +11,7 @@ from typing import Any, Literal
 import numpy as np
 
 from edgefilter.errors import SignalError
-from edgefilter.types import Samples
+from edgefilter.types import MOST_MICROPHONES, Samples
 
 HEADER = struct.Struct("<BxHQ")
 """Before the sound of a message of one of two streams: its label, an unused byte, the number of the message in its stream
@@ -31,13 +31,15 @@ class Form:
     """How a device sends: the first message.
 
     rate: Hz, of the samples and of the counters. streams: "stereo", microphone and reference interleaved, or "two",
-    each message of one stream, with a HEADER. codec: "pcm", 16 bit, or "opus", mono, at a rate of 48000 and in two streams.
+    each message of one stream, with a HEADER. microphones: of an array, interleaved, in "stereo" before the reference.
+    codec: "pcm", 16 bit, or "opus", mono, at a rate of 48000 and in two streams.
     late_ms: how long the microphone waits for a reference that comes later. learn: whether to learn the room. bitrate:
     bits a second of the answer in Opus.
     """
 
     rate: int = 16000
     streams: Literal["stereo", "two"] = "stereo"
+    microphones: int = 1
     codec: Literal["pcm", "opus"] = "pcm"
     late_ms: int = 0
     learn: bool = False
@@ -54,6 +56,7 @@ class Form:
         bounds: dict[str, Any] = {
             "rate": RATES,
             "streams": ("stereo", "two"),
+            "microphones": range(1, MOST_MICROPHONES + 1),
             "codec": ("pcm", "opus"),
             "late_ms": range(2001),
             "learn": (False, True),
@@ -69,10 +72,10 @@ class Form:
                 )
                 raise SignalError(f"the first message has {name} {value!r}, expected {expected}")
         form = cls(**given)
-        if form.codec == "opus" and (form.streams != "two" or form.rate != 48000):
+        if form.codec == "opus" and (form.streams != "two" or form.rate != 48000 or form.microphones > 1):
             raise SignalError(
-                "codec opus needs two streams and a rate of 48000: one packet of both would mix them, and its clock is"
-                " always 48 kHz"
+                "codec opus needs two streams, one microphone and a rate of 48000: one packet of both would mix them, and"
+                " its clock is always 48 kHz"
             )
         return form
 
@@ -127,7 +130,7 @@ class _Order:
 class TwoStreams:
     """Microphone and reference with counters of one clock, put together; every sample of the microphone comes out.
 
-    decoders: for each label, what makes samples of a message's sound. The microphone waits for its reference, up to
+    decoders: for each label, what makes samples of a message's sound, of an array's (n, microphones). The microphone waits for its reference, up to
     late samples of its own. lost: samples for which silence stands in, of the microphone and of messages of the reference
     that never came. late: samples of the reference that came too late, and were left out; lateness: by how many samples
     more than allowed the latest of them was.
@@ -138,7 +141,7 @@ class TwoStreams:
         gives = (self._take_mic, self._take_ref)
         self._orders = [_Order(give, round(JITTER_S * rate)) for give in gives]
         self._at: int | None = None
-        self._mic, self._ref = np.zeros(0, np.float32), np.zeros(0, np.float32)
+        self._mic, self._ref = decoders[MICROPHONE](b""), np.zeros(0, np.float32)
         self._early: list[tuple[int, Samples]] = []
         self._ref_end = 0
         self.lost = self.late = self.lateness = 0
@@ -153,11 +156,11 @@ class TwoStreams:
         self._orders[label].push(number, at, message[HEADER.size :])
 
     def take(self, last: bool = False) -> tuple[Samples, Samples]:
-        """What is complete of both, (n,) each; last: all."""
+        """What is complete of both, (n,) or (n, microphones), and (n,); last: all."""
         if self._at is None:
             return self._mic, self._ref
         known = max(self._ref_end, self._orders[MICROPHONE].newest - self._wait) - self._at
-        count = self._mic.size if last else min(max(known, 0), self._mic.size)
+        count = len(self._mic) if last else min(max(known, 0), len(self._mic))
         mic, self._mic = self._mic[:count], self._mic[count:]
         ref = self._ref[:count]
         self._ref = self._ref[count:]
@@ -171,12 +174,12 @@ class TwoStreams:
             early, self._early = self._early, []
             for start, part in early:
                 self._place(start, part)
-        end = self._at + self._mic.size
+        end = self._at + len(self._mic)
         gap = at - end
         self._check_gap(gap)
         if gap > 0:
             self.lost += gap
-            self._mic = np.concatenate((self._mic, np.zeros(gap, np.float32)))
+            self._mic = np.concatenate((self._mic, np.zeros((gap, *self._mic.shape[1:]), np.float32)))
         self._mic = np.concatenate((self._mic, samples[max(-gap, 0) :]))
 
     def _take_ref(self, at: int, sound: bytes, lost: int) -> None:

@@ -22,8 +22,10 @@ from cyclonedds.util import duration
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
+from edgefilter import EgoFilter
 from edgefilter.cli import main
 from edgefilter.dsp.metrics import si_sdr
+from edgefilter.filter.barge_in import BargeInSettings
 
 ROOT = Path(__file__).parents[2]
 PROFILE = ROOT / "edgefilter/demo_data/profile.npz"
@@ -117,9 +119,9 @@ class Robot:
         return np.frombuffer(b"".join(sound), "<i2") / 32768, told
 
 
-def node(domain, folder):
+def node(domain, folder, *more, profile=PROFILE):
     """The command as it is typed."""
-    words = ("ros2", "--profile", PROFILE, "--domain", domain)
+    words = ("ros2", "--profile", profile, "--domain", domain, *more)
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
     process = subprocess.Popen(
         [sys.executable, "-m", "edgefilter.cli", *map(str, words)], stderr=subprocess.PIPE, text=True, cwd=folder, env=environment
@@ -147,6 +149,30 @@ def test_the_node_gives_the_human_and_barge_in_also_after_it_was_killed_and_star
         assert reports[-1].name == "edgefilter" and reports[-1].level == 0
         assert {"engine", "samples", "played_s"} <= {pair.key for pair in reports[-1].values}
         robot.barge_in.take(100)
+
+
+def test_of_an_array_the_named_channels_are_its_microphones_and_the_human_is_one_channel(tmp_path, pair):
+    profile, sound = pair
+    profile.save(tmp_path / "pair.npz")
+    pcm = np.rint(sound * 32768).astype("<i2")
+    words = ("--channels", 3, "--mic-channels", "1,2", "--reference-channels", 1, "--engine", "ss")
+    robot = Robot(domain=89)
+    process = node(89, tmp_path, *words, profile=tmp_path / "pair.npz")
+    try:
+        robot.wait_for_node()
+        heard = b""
+        for at in range(0, len(pcm) - FRAME, FRAME):
+            robot.mic.write(Audio(data=list(pcm[at : at + FRAME].tobytes())))
+            time.sleep(0.005)
+            heard += b"".join(bytes(message.data) for message in robot.human.take(200))
+    finally:
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(20) == 0
+    human = np.frombuffer(heard, "<i2") / 32768
+    assert 2.5 * RATE < human.size < len(pcm)
+    ego = EgoFilter(profile, "ss", barge_in=BargeInSettings(judge="network"))
+    wanted = ego.process(pcm[:, 1:] / np.float32(32768), np.zeros(len(pcm), np.float32))
+    np.testing.assert_allclose(human, wanted[: human.size], atol=1 / 32768)
 
 
 def test_a_message_that_is_no_sound_is_a_line_and_the_node_goes_on(tmp_path):

@@ -91,7 +91,7 @@ async def heard(hello, messages, **words):
 
 
 def stereo_messages(mic, ref, size=320):
-    both = np.stack([mic, ref], axis=1)
+    both = np.column_stack([mic, ref])
     return [pcm(both[at : at + size]) for at in range(0, len(both), size)]
 
 
@@ -99,7 +99,7 @@ def labelled(mic, ref, size=320, ref_after=0, keep=lambda label, number: True):
     """Messages of two streams as a device sends them; the reference's come ref_after messages later than the microphone's."""
     packets = [[], []]
     for label, x in ((MICROPHONE, mic), (REFERENCE, ref)):
-        for number in range(x.size // size):
+        for number in range(len(x) // size):
             at = number * size
             packets[label].append(HEADER.pack(label, number % 65536, at) + pcm(x[at : at + size]))
     out = []
@@ -146,6 +146,26 @@ def test_two_streams_are_put_together_however_late_the_reference_comes(conversat
     straight, _ = run(heard({"rate": RATE}, stereo_messages(mic, ref)))
     np.testing.assert_array_equal(as_float(b"".join(sound)), as_float(b"".join(straight))[: mic.size // 320 * 320])
     assert told[-1]["lost"] == told[-1]["late"] == 0 and "speech_started" not in kinds(told)
+
+
+@pytest.mark.parametrize("streams", ["stereo", "two"])
+def test_the_microphones_of_an_array_are_filtered_as_they_are_in_a_file(pair, streams):
+    profile, sound = pair
+    mic, ref = sound[:, 1:], np.zeros(len(sound), np.float32)
+    mic, ref = (x[: len(x) // 320 * 320] for x in (mic, ref))
+    messages = labelled(mic, ref) if streams == "two" else stereo_messages(mic, ref)
+    hello = {"streams": streams, "microphones": 2}
+    answers, told = run(heard(hello, messages, engine="ss", profile=profile))
+    ego = EgoFilter(profile, "ss")
+    wanted = np.concatenate((ego.process(as_float(pcm(mic)).reshape(-1, 2), ref), ego.flush()))
+    np.testing.assert_allclose(as_float(b"".join(answers)), wanted, atol=1 / 32768)
+    assert told[-1]["kind"] == "ended" and told[-1]["array"] == ego.stats()["array"]
+
+
+def test_a_profile_of_another_number_of_microphones_is_one_line(pair):
+    profile, sound = pair
+    _, told = run(heard({"microphones": 3}, stereo_messages(sound, sound[:, 0]), engine="ss", profile=profile))
+    assert told[-1]["kind"] == "error" and "3 channels" in told[-1]["detail"]
 
 
 def test_a_reference_later_than_said_is_told_with_what_to_say(conversation):
