@@ -26,11 +26,11 @@ import numpy as np
 
 from bench import peers, results
 from bench.metrics import percentiles
-from bench.recordings import progress, read
+from bench.recordings import progress
 from edgefilter import Profile, engines
 from edgefilter.engines.ladder import CANDIDATES
 from edgefilter.errors import EdgefilterError, UsageError
-from edgefilter.filter.budget import CORES, DEMO, held_to
+from edgefilter.filter.budget import CORES, DEMO, held_to, scene
 from edgefilter.filter.learner import Learner
 from edgefilter.filter.stream import Stream
 from edgefilter.filter.timing import peak_memory_mb
@@ -100,10 +100,8 @@ def _timed(inner: Callable, times: list[float]) -> Callable:
 def sound(hop: int, dtype: type) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     """The bundled conversation, hop by hop, over and over."""
     scale = 32767 if dtype is np.int16 else 1
-    mic, ref = ((scale * read(DEMO / f"{name}.flac")).astype(dtype) for name in ("mic", "reference"))
-    while True:
-        for at in range(0, mic.size - hop + 1, hop):
-            yield np.ascontiguousarray(mic[at : at + hop]), np.ascontiguousarray(ref[at : at + hop])
+    for mic, ref in scene(hop):
+        yield (scale * mic).astype(dtype), (scale * ref).astype(dtype)
 
 
 def measure(contender: Contender, seconds: float, paced: bool) -> list[float]:

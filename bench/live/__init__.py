@@ -21,18 +21,11 @@ from bench.live import barge_in, click, day, soak, trial
 from edgefilter.errors import UsageError
 
 PARTS = {
-    "trial": trial.run,
-    "soak": soak.run,
-    "hour": soak.run,
-    "click": click.run,
-    "barge-in": barge_in.run,
-    "day": day.run,
+    **{"trial": trial.run, "barge-in": barge_in.run, "day": day.run},
+    **{"soak": soak.run, "hour": soak.run, "click": click.run},
 }
-NEEDED = {
-    "trial": ("voices", "speech"),
-    "barge-in": ("voices", "speech"),
-    "day": ("voices", "speech"),
-}
+SPOKEN = ("trial", "barge-in", "day")
+"""Parts in which robot and human speak."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -57,7 +50,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> str:
     """Run one part."""
-    for name in NEEDED.get(options.part, ()):
+    for name in ("voices", "speech") if options.part in SPOKEN else ():
         if getattr(options, name) is None:
             raise UsageError(f"the part '{options.part}' needs --{name}, a folder with a transcripts.tsv")
     return PARTS[options.part](options)

@@ -31,29 +31,25 @@ from tqdm import tqdm
 
 from bench.simulate.conversations import (
     DISTORTION_DB,
-    UNFILTERED_DB,
     Clip,
     read_clips,
     read_speech,
     read_utterance,
     read_voices,
+    record_all,
     write_item,
 )
 from bench.simulate.simulated_robot import (
     RATE,
     Array,
-    Robot,
-    Room,
     draw_body,
     draw_fan,
     draw_robot,
     draw_walls,
     stand,
-    sweep,
     warp,
     with_distortion,
 )
-from edgefilter.dsp.metrics import si_sdr
 
 SIZE = 512
 """Samples of a frame of the covariances: finer than the fan's coherence changes."""
@@ -212,55 +208,29 @@ def make(
         voiced = signal.oaconvolve(human[None], response, axes=-1)[:, : ref.size - start]
         clean[:, start : start + voiced.shape[1]] += voiced
         spans.append((start, min(start + human.size + RATE // 10, ref.size)))
-    signals, scores = _record(
-        rng, room_name, robot, (laboratory, room), sound, clean, spans, covariances, places, gains
-    )
+    inside = np.zeros(ref.size, bool)
+    for begin, end in spans:
+        inside[begin:end] = True
+
+    def fans(rng: np.random.Generator, sizes: tuple[int, int, int]) -> list[Array]:
+        spectrum, phase = draw_fan(rng), rng.uniform(-20, 20)
+        if covariances is None:
+            calibrated = conversing = parts_covariance(rng, places)
+        else:
+            calibrated, conversing = (with_microphones(one, microphones, phase) for one in covariances)
+        return [coloured(rng, of, spectrum, n) for of, n in zip((calibrated, calibrated, conversing), sizes)]
+
+    paths = (laboratory.robot, room.robot)
+    signals, scores, _ = record_all(rng, room_name, robot, paths, sound, clean, inside, fans)
+    signals.pop("fan")
+    excitation = signals.pop("sweep_ref")
+    signals = {"sweep_ref": excitation, **{name: (gains[:, None] * of).T for name, of in signals.items()}}
     meta = {"room": room_name, "rt60": room.rt60_s, "voice": voice, "speaker": speaker, "text": said[0].text}
     meta |= {"start": spans[0][0], "end": spans[0][1], "t_main": script["parts"][1]["at"], "kind": kind}
     meta |= {"turns": [{"start": a, "end": b, "text": clip.text, "moved": moving and i > 0}
                        for i, ((a, b), clip) in enumerate(zip(spans, said))]}  # fmt: skip
     meta |= {**script, **scores, "nl_db": nl_db, "places": places.tolist(), "seed": [seed, index]}
     return {"ref": ref, **signals}, meta
-
-
-def _record(
-    rng: np.random.Generator,
-    room_name: str,
-    robot: Robot,
-    rooms: tuple[Room, Room],
-    sound: Array,
-    clean: Array,
-    spans: list[tuple[int, int]],
-    covariances: tuple[Array, Array] | None,
-    places: Array,
-    gains: Array,
-) -> tuple[dict[str, Array], dict[str, float]]:
-    """Calibration in the first room, conversation in the second, levels set in channel 0 as record_all does."""
-    inside = np.zeros(clean.shape[1], bool)
-    for begin, end in spans:
-        inside[begin:end] = True
-    excitation = sweep()
-    sweep_echo = robot.record(excitation, rooms[0].robot)
-    gain = rng.uniform(0.22, 0.42) / np.abs(sweep_echo).max()
-    echo = robot.record(sound, rooms[1].robot)
-    echo *= gain * min(1.0, 0.9 / np.abs(gain * echo).max())
-    mean, deviation = UNFILTERED_DB[room_name]
-    target_db = mean + deviation * np.clip(rng.standard_normal(), -2, 2)
-    clean = clean * math.sqrt(np.mean(echo[0, inside] ** 2) / np.mean(clean[0, inside] ** 2)) * 10 ** (target_db / 20)
-    snr_fan = rng.uniform(4.5, 10.5)
-    level, spectrum = math.sqrt(np.mean(clean[0, inside] ** 2)) * 10 ** (-snr_fan / 20), draw_fan(rng)
-    phase = rng.uniform(-20, 20)
-    if covariances is None:
-        calibrated = conversing = parts_covariance(rng, places)
-    else:
-        calibrated, conversing = (with_microphones(one, len(places), phase) for one in covariances)
-    lengths = ((calibrated, excitation.size), (calibrated, 8 * RATE), (conversing, clean.shape[1]))
-    fan = [level * coloured(rng, covariance, spectrum, n) for covariance, n in lengths]
-    mic = echo + clean + fan[2]
-    signals = {"sweep_mic": gain * sweep_echo + fan[0], "fan_only": fan[1], "mic": mic, "clean": clean}
-    signals = {name: (gains[:, None] * of).T for name, of in signals.items()}
-    scores = {"snr_fan": snr_fan, "sisdr_mix": si_sdr(mic[0, inside], clean[0, inside])}
-    return {"sweep_ref": excitation, **signals}, scores
 
 
 def main() -> None:

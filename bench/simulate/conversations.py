@@ -34,6 +34,7 @@ import csv
 import json
 import math
 import sys
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -187,15 +188,8 @@ def make_scene(
     voiced = signal.oaconvolve(human, room.human)[: ref.size - start]
     clean = np.concatenate([np.zeros(start), voiced, np.zeros(ref.size - start - voiced.size)])
     end = min(start + human.size + RATE // 10, ref.size)
-    signals, scores, gain = record_all(
-        rng,
-        UNFILTERED_DB[room_name],
-        robot,
-        (laboratory.robot, room.robot),
-        voice_heard,
-        clean,
-        slice(start, end),
-    )
+    paths, span = (laboratory.robot, room.robot), slice(start, end)
+    signals, scores, gain = record_all(rng, room_name, robot, paths, voice_heard, clean, span, noises)
     impulse = np.eye(1, 4096)[0]
     delay = int(np.argmax(np.abs(robot.record(impulse, laboratory.robot, linear=True))))
     meta = {"room": room_name, "rt60": room.rt60_s, "voice": voice, "speaker": human_clip.speaker}
@@ -230,19 +224,27 @@ def played(ref: Array, script: dict) -> Array:
     return warp(out, script.get("ppm", 0.0))
 
 
+def noises(rng: np.random.Generator, sizes: tuple[int, int, int]) -> list[Array]:
+    """(n,) of each size of a drawn fan, of unit power."""
+    spectrum = draw_fan(rng)
+    return [fan_noise(rng, spectrum, n) for n in sizes]
+
+
 def record_all(
     rng: np.random.Generator,
-    unfiltered_db: tuple[float, float],
+    room_name: str,
     robot: Robot,
     paths: tuple[Array, Array],
     played: Array,
     clean: Array,
-    span: slice,
+    span: slice | Array,
+    fans: Callable[[np.random.Generator, tuple[int, int, int]], list[Array]],
 ) -> tuple[dict[str, Array], dict[str, float], float]:
     """Calibration in the first path's room, conversation in the second's, with all levels set; their figures; the gain.
 
     The gain makes the sweep peak at 0.22-0.42 of full scale; the human is scaled to the unfiltered SI-SDR, the fan to
-    4.5-10.5 dB below the human.
+    4.5-10.5 dB below the human; of an array (microphones, n) in the first microphone. fans: with the sweep, alone, and in
+    the conversation, of unit power. span: where the human speaks.
     """
     excitation = sweep()
     sweep_echo = robot.record(excitation, paths[0])
@@ -250,16 +252,18 @@ def record_all(
     echo = robot.record(played, paths[1])
     echo_gain = gain * min(1.0, 0.9 / np.abs(gain * echo).max())
     echo *= echo_gain
-    mean, deviation = unfiltered_db
+    mean, deviation = UNFILTERED_DB[room_name]
     target_db = mean + deviation * np.clip(rng.standard_normal(), -2, 2)
-    clean = clean * math.sqrt(np.mean(echo[span] ** 2) / np.mean(clean[span] ** 2)) * 10 ** (target_db / 20)
+    said, heard = (np.atleast_2d(x)[0, span] for x in (clean, echo))
+    clean = clean * math.sqrt(np.mean(heard**2) / np.mean(said**2)) * 10 ** (target_db / 20)
     snr_fan = rng.uniform(4.5, 10.5)
-    level, spectrum = math.sqrt(np.mean(clean[span] ** 2)) * 10 ** (-snr_fan / 20), draw_fan(rng)
-    fan = [level * fan_noise(rng, spectrum, n) for n in (excitation.size, 8 * RATE, clean.size)]
+    said = np.atleast_2d(clean)[0, span]
+    level = math.sqrt(np.mean(said**2)) * 10 ** (-snr_fan / 20)
+    fan = [level * noise for noise in fans(rng, (excitation.size, 8 * RATE, clean.shape[-1]))]
     mic = echo + clean + fan[2]
     signals = {"sweep_ref": excitation, "sweep_mic": gain * sweep_echo + fan[0], "fan_only": fan[1]}
     signals |= {"mic": mic, "clean": clean, "fan": fan[2]}
-    return signals, {"snr_fan": snr_fan, "sisdr_mix": si_sdr(mic[span], clean[span])}, echo_gain
+    return signals, {"snr_fan": snr_fan, "sisdr_mix": si_sdr(np.atleast_2d(mic)[0, span], said)}, echo_gain
 
 
 def write_item(folder: Path, signals: dict[str, Array], name: str, about: dict) -> None:

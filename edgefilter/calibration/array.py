@@ -19,6 +19,11 @@ FARTHEST = 32
 """Samples between the direct sound in two microphones of one robot: .7 m."""
 
 
+def first(recordings: Samples) -> Samples:
+    """(n,) of the first microphone, of recordings (n,) or (microphones, n)."""
+    return recordings if recordings.ndim == 1 else recordings[0]
+
+
 def cross_density(noises: Samples) -> Samples:
     """(601, microphones, microphones, 2) float32 of noises (microphones, n), as ArrayCalibration.noise."""
     window = hann(GRID_FFT)

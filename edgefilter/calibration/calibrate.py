@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy import signal
 
-from edgefilter.calibration.array import cross_density, doubts, refuse_silent
+from edgefilter.calibration.array import cross_density, doubts, first, refuse_silent
 from edgefilter.calibration.checks import check_found, check_lengths, collect_warnings
 from edgefilter.calibration.sweep import (
     Deconvolution,
@@ -135,11 +135,6 @@ def checked(reference: object, recording: object, noise: object) -> tuple[Sample
             " microphones in both"
         )
     return found
-
-
-def first(recordings: Samples) -> Samples:
-    """(n,) of the first microphone, of recordings (n,) or (microphones, n)."""
-    return recordings if recordings.ndim == 1 else recordings[0]
 
 
 def fan_psd(noise: Samples) -> Samples:

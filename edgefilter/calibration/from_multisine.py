@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
-from edgefilter.calibration.calibrate import calibrate, checked, fan_psd, first
+from edgefilter.calibration.array import first
+from edgefilter.calibration.calibrate import calibrate, checked, fan_psd
 from edgefilter.calibration.checks import check_lengths, clipped_samples
 from edgefilter.calibration.multisine import BLOCK, PERIOD, PERIODS, MultisineLaw, multisine_law, realisations
 from edgefilter.calibration.sweep import (

@@ -19,8 +19,6 @@ LOW_HZ, HIGH_HZ = 40.0, 7990.0
 """Of the generated sweep: from below what a robot's loudspeaker plays to the end of the band."""
 EARLIEST_DIRECT, LATEST_DIRECT = -2000, int(1.6 * SAMPLE_RATE)
 """Samples by which the direct sound may come after it was played, on the recording's counter."""
-HOP = 160
-"""Samples between the frames of the paper's spectrograms."""
 DRIFT_REACH = 400
 """Samples by which clocks that are apart may move a lag within a recording: 400 ppm in a minute."""
 
@@ -229,9 +227,9 @@ def response_from_sweep(reference: Samples, recording: Samples, noise: Samples, 
 
 
 def _frames(samples: Samples) -> NDArray[np.complex128]:
-    """(frames, 601) complex spectra."""
+    """(frames, 601) complex spectra, a frame every 160 samples, as the paper has them."""
     padded = np.pad(samples, (0, max(0, GRID_FFT - samples.size)))
-    return np.fft.rfft(frames(padded, GRID_FFT, HOP) * hann(GRID_FFT), axis=1)
+    return np.fft.rfft(frames(padded, GRID_FFT, 160) * hann(GRID_FFT), axis=1)
 
 
 def place_of(pattern: Array, reference: Samples) -> int | None:

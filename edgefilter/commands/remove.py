@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-from dataclasses import replace
 
 from edgefilter.commands.display import print_result
 from edgefilter.errors import UsageError
@@ -17,7 +16,7 @@ def main(args: argparse.Namespace) -> int:
         raise UsageError(
             f"{args.profile} holds no effect '{args.effect}', it holds {', '.join(held) or 'none'}: name one of those"
         )
-    without = replace(profile, echo=profile.echo.without_effect(args.effect))
+    without = profile.with_echo(profile.echo.without_effect(args.effect))
     without.save(args.output)
     left = [name for name, _ in without.echo.effects]
     line = f"{args.effect} removed, {', '.join(left) or 'no effect'} left; written to {args.output}"

@@ -142,7 +142,7 @@ def fits(figures: Figures, budget_ms: float) -> bool:
 def measure(engine: Engine | ClipEngine, profile: Profile | None = None, paced: int = PACED) -> Figures:
     """Run the bundled conversation through the whole path at the real pace, held to two cores."""
     hop = engine.stft.hop
-    hops, stream = _scene(hop), Stream(engine, profile)
+    hops, stream = scene(hop), Stream(engine, profile)
     with held_to(CORES):
         pace(stream, hops, 32, period_s=0.0)  # not counted
         took = pace(stream, hops, paced)
@@ -187,7 +187,7 @@ def _allowed() -> set[int]:
     return os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else set(range(os.cpu_count() or 1))
 
 
-def _scene(hop: int) -> Iterator[tuple[Samples, Samples]]:
+def scene(hop: int) -> Iterator[tuple[Samples, Samples]]:
     """The bundled conversation hop by hop, over and over."""
     mic, ref = (soundfile.read(DEMO / f"{name}.flac", dtype="float32")[0] for name in ("mic", "reference"))
     while True:

@@ -9,8 +9,7 @@ import numpy as np
 
 from edgefilter.echo.measurement import Values
 from edgefilter.echo.source_chain import SourceChain, VoiceChain
-from edgefilter.filter.adaptation import LEARNED, WARM
-from edgefilter.filter.canceller import Canceller, CancellerOutput, CancellerState
+from edgefilter.filter.canceller import LEARNED, WARM, Canceller, CancellerOutput, CancellerState
 from edgefilter.profile.data import Profile
 from edgefilter.types import Samples
 

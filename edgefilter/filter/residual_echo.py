@@ -45,9 +45,7 @@ class NoiseTracker:
 
     PRESENT = np.float32(10.0**1.5)
     """Power of speech over the noise where there is any, 15 dB."""
-    MEMORY, STUCK_MEMORY, STUCK = np.float32(0.8), np.float32(0.9), np.float32(0.99)
-    FIRST = 5
-    """Frames whose mean is the first estimate."""
+    STUCK = np.float32(0.99)
 
     def __init__(self, bins: int) -> None:
         self.power = np.zeros(bins, np.float32)
@@ -58,14 +56,14 @@ class NoiseTracker:
         """The noise's power (bins,) after a frame of the power observed (bins,)."""
         self._loudest = max(self._loudest, float(np.add.reduce(observed)) / observed.size)
         self._count += 1
-        if self._count <= self.FIRST:
+        if self._count <= 5:  # the mean of the first frames is the first estimate
             self.power += (observed - self.power) / np.float32(self._count)
         else:
             likelihood = np.minimum(observed / self.power, 100.0) * (self.PRESENT / (1.0 + self.PRESENT))
             present = 1.0 / (1.0 + (1.0 + self.PRESENT) * np.exp(-likelihood))
-            self._present += (1.0 - self.STUCK_MEMORY) * (present - self._present)
+            self._present += (1.0 - np.float32(0.9)) * (present - self._present)
             present = np.where(self._present > self.STUCK, np.minimum(present, self.STUCK), present)
-            self.power += (1.0 - self.MEMORY) * (1.0 - present) * (observed - self.power)
+            self.power += (1.0 - np.float32(0.8)) * (1.0 - present) * (observed - self.power)
         np.maximum(self.power, np.float32(fourier.LEAST * self._loudest + fourier.TINY), out=self.power)
         return self.power
 

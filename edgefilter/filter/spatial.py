@@ -23,7 +23,6 @@ PRIOR = 10.0
 less, and 1 dB less of the human."""
 SPACING_M = 0.05
 """Distance of the microphones by which that field is reckoned: 3 and 8 cm differ by .2 dB in arrays of 4 to 8 cm."""
-SPEED_OF_SOUND = 343.0
 KNOWN_HOPS = 75
 """Of the fan alone, 1.2 s, after which it counts as known without a calibration."""
 LIKELY, UNLIKELY = 0.5, 0.3
@@ -140,7 +139,7 @@ def diffuse_coherence(stft: StftConfig, microphones: int) -> Samples:
 
     Where it would be negative it is zero: more than five microphones cannot all differ from one another so.
     """
-    between = np.sinc(2.0 * stft.frequencies * SPACING_M / SPEED_OF_SOUND)
+    between = np.sinc(2.0 * stft.frequencies * SPACING_M / 343.0)  # m/s, the speed of sound
     ones = np.eye(microphones)[:, :, None]
     return (ones + (1.0 - ones) * np.maximum(between, 0.0)).astype(np.float32)
 

@@ -9,8 +9,6 @@ import numpy as np
 from edgefilter.errors import SignalError
 from edgefilter.types import SAMPLE_RATE, Samples
 
-RATE = 48_000
-"""Hz of what a decoder gives, whatever was encoded: the clock of Opus (RFC 6716, section 2)."""
 FRAME_MS = 20
 """Length of a packet that is made here."""
 
@@ -20,7 +18,8 @@ class Decoder:
 
     def __init__(self) -> None:
         self._codec = av.CodecContext.create("libopus", "r")
-        self._codec.sample_rate, self._codec.layout = RATE, "mono"
+        # the clock of Opus, whatever was encoded (RFC 6716, section 2)
+        self._codec.sample_rate, self._codec.layout = 48_000, "mono"
 
     def decode(self, packet: bytes) -> Samples:
         """The samples (n,) of a packet at 48 kHz; raises SignalError for bytes that are none."""

@@ -43,8 +43,6 @@ from edgefilter.integrations.duplex import ABSENT_S, MOST_QUEUED_S, Duplex, as_p
 from edgefilter.integrations.turns import TurnByTurn
 from edgefilter.types import SAMPLE_RATE, Event
 
-MOST_WAITING = 256
-"""Messages that a listener may be behind, 4 s of hops; of a slower listener the oldest are left out."""
 MOST_BYTES = round(MOST_QUEUED_S * SAMPLE_RATE) * np.int16().itemsize
 """Size of a message, and of all that a client has said and waits to be played: the queue's ten minutes, 19 MB."""
 AHEAD_S = 0.5
@@ -220,11 +218,11 @@ class _Client(AsyncEventHandler):
 
 
 class _Listener(_Client):
-    """A client of the microphone."""
+    """A client of the microphone; one that is more than 4 s of hops behind misses the oldest."""
 
     def __init__(self, service: EgoService, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         super().__init__(service, reader, writer)
-        self._waiting: asyncio.Queue[Message] = asyncio.Queue(MOST_WAITING)
+        self._waiting: asyncio.Queue[Message] = asyncio.Queue(256)
         self._task = asyncio.create_task(self._write())
         service.listeners.add(self)
 

@@ -11,8 +11,7 @@ import numpy as np
 from scipy import fft
 
 from edgefilter.alignment.utterances import Sustained
-from edgefilter.calibration.array import cross_density
-from edgefilter.calibration.calibrate import first
+from edgefilter.calibration.array import cross_density, first
 from edgefilter.calibration.from_recording import bands_over_fan, fan_in_silences
 from edgefilter.dsp.psd import floored, periodograms
 from edgefilter.echo.effect import complete, vanishes
@@ -20,8 +19,7 @@ from edgefilter.echo.effects.catalogue import EFFECTS, find
 from edgefilter.echo.measurement import Measurement, whiten
 from edgefilter.echo.model import EchoModel
 from edgefilter.errors import ProfileError
-from edgefilter.filter.adaptation import COLD
-from edgefilter.filter.canceller import Canceller
+from edgefilter.filter.canceller import COLD, Canceller
 from edgefilter.filter.echo_path import TAPS, EchoPath, Effects, PathState, starting_path
 from edgefilter.filter.learner import FilteredHop, Lesson
 from edgefilter.filter.volume import AUDIBLE

@@ -28,8 +28,6 @@ MAX_TAPS = 4 * SAMPLE_RATE
 """Samples, 4 s: longer than the reverberation of any room that a robot talks in, and than the lag of any player."""
 LEARNED = "what the running filter learned"
 """Source of a profile that no calibration made."""
-PROBE = 1600
-"""Samples of sound on which the effects of a loaded profile are tried."""
 
 _ARRAYS = ("response", "noise_psd", "band_hz", "band_snr_db", "distortion_db")
 
@@ -312,7 +310,7 @@ def _check_arrays(profile: Profile) -> None:
 
 def _check_effects(echo: EchoModel) -> None:
     """Raise ProfileError for an effect that is unknown, or whose values are not those that it can be applied with."""
-    probe = np.zeros(PROBE, np.float32)
+    probe = np.zeros(SAMPLE_RATE // 10, np.float32)
     probe[::40] = 0.1
     for name, values in echo.effects:
         if name not in known_effects():

@@ -9,8 +9,7 @@ import numpy as np
 
 from edgefilter.dsp.stft import Analyser, StftConfig, Synthesiser
 from edgefilter.engines.linear import Linear
-from edgefilter.filter.adaptation import COLD, WARM, Adaptation
-from edgefilter.filter.canceller import Canceller, CancellerOutput
+from edgefilter.filter.canceller import COLD, WARM, Adaptation, Canceller, CancellerOutput
 from edgefilter.filter.echo_path import EchoPath
 from edgefilter.filter.front_end import FrontEnd, low_cut
 from edgefilter.filter.onset_gate import GATE
