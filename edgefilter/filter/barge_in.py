@@ -21,8 +21,8 @@ CENTRE, SLOPE = 3.5, 1.25
 around it. By hand, near what a logistic fits to robots alone and to humans laid on them 0 to 26 dB below, steeper, so that
 few hops lie near the threshold. Checked without a profile, on validation speakers: of 39 humans in recordings of 6 real
 loudspeakers all are noticed, 20 within 0.5 s; of 24 in simulated conversations 23, 20 of them within 0.5 s. 7 minutes of
-the real robots alone start nothing but in one recording of a minute, in which something soft is heard in the robot's pauses
-too: 9 times; 8 minutes of the simulated ones start nothing."""
+the real robots alone start one, in a recording in which something soft is heard in the robot's pauses too; 8 minutes of the
+simulated ones start nothing."""
 CENTRE_CALIBRATED = 2.25
 """The same with a profile: the network was trained on what a calibrated path leaves, and is wrong less often."""
 CENTRE_BEGUN = 5.2

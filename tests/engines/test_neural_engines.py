@@ -80,6 +80,19 @@ def test_a_model_that_answers_a_probability_beyond_0_to_1_is_held_to_them(tmp_pa
     assert engine.step(heard, engine.initial_state())[0].speech_probability == told
 
 
+@pytest.mark.parametrize(("below_db", "heard"), [(40.0, True), (50.0, False)])
+def test_what_is_far_softer_than_the_robot_has_been_is_nobody_who_interrupts(below_db, heard):
+    engine, rng = Crnn(EDGE), np.random.default_rng(3)
+    frame = Frame(*(spectrum(rng, 257) for _ in range(4)), *np.full((2, 257), 1e-6, np.float32))
+    tensors, mask, levels = engine.initial_state()
+    answer = engine.step(frame, (tensors, mask, levels))[0].spectrum
+    for _ in range(3):  # the level of the robot changes what the network is told, and so its answer
+        loudest = np.array([np.sum(np.abs(answer) ** 2) * 10 ** (below_db / 10), 1.0], np.float32)
+        output, _ = engine.step(frame, (tensors, mask, levels._replace(loudest=loudest)))
+        answer = output.spectrum
+    assert (output.speech_probability > 0.0) == heard
+
+
 def test_of_a_calibrated_robot_ss_has_its_share_of_the_answer():
     profile = Profile.load(DEMO / "profile.npz")
     engines = create("crnn", profile, model=EDGE), create("crnn", model=EDGE), create("ss")
