@@ -8,11 +8,13 @@ import io
 import os
 import sys
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any, NoReturn
 
 from edgefilter import __version__
 from edgefilter.commands.display import STATUS_LEGEND
 from edgefilter.commands.outputs import check_outputs
+from edgefilter.echo.effects.catalogue import names
 from edgefilter.echo.user_effects import load_effect
 from edgefilter.engines import ENGINES, HAVE_MODEL
 from edgefilter.errors import EdgefilterError, UsageError
@@ -182,6 +184,8 @@ def _diagnose(commands: argparse._SubParsersAction) -> None:
     option = commands.add_parser("diagnose", help=told).add_argument
     told = "write a profile with all that was found; without --profile, one made from the recording"
     option("--apply", metavar="P2.npz", help=told)
+    told = "where no effect explains the recording: write the curve, gain or filter that does as an effect of your own"
+    option("--write-effect", type=effect_file, metavar="MINE.py", help=told)
     option("--mic-channels", **MIC_CHANNELS)
     told = "the one of --mic-channels that is diagnosed (default: the first); all of them are looked at"
     option("--channel", type=channel, metavar="N", help=told)
@@ -356,6 +360,15 @@ def command(text: str) -> str:
     """Words for a shell, not none."""
     if not text.strip():
         raise argparse.ArgumentTypeError(f"'{text}' is not a command")
+    return text
+
+
+def effect_file(text: str) -> str:
+    """A Python file whose stem can be the name of an effect."""
+    if not text.endswith(".py") or not Path(text).stem.isidentifier() or Path(text).stem in names():
+        raise argparse.ArgumentTypeError(
+            f"'{text}', expected a .py file whose stem is one word and no known effect's, such as mine.py"
+        )
     return text
 
 

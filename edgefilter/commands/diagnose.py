@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 
 from edgefilter.commands.display import print_result, progress, report_part
 from edgefilter.commands.fitting import Fitted, Refused, fit, long_paths
@@ -52,6 +53,8 @@ def main(args: argparse.Namespace) -> int:
         told = [*applied.lines(), f"written to {args.apply}"]
     elif args.apply and not refused:
         told = [f"nothing was found to add: {args.apply} is not written"]
+    if args.write_effect:
+        told += _written(args, found)
     verdict, *rest = diagnosis_lines(found, args.profile is not None)
     print_result(args, [verdict, *_next_step(found, args), *rest, *told], {**found.to_dict(), **more})
     if html:
@@ -93,6 +96,21 @@ def _apply(
         return None, error
     replace(applied.profile, array=array or applied.profile.array).save(args.apply)
     return applied, None
+
+
+def _written(args: argparse.Namespace, found: Diagnosis) -> list[str]:
+    """The free law of the diagnosis as an effect of the user's own; what to say of it."""
+    if found.law is None:
+        return [f"no law explains much more than what is named: {args.write_effect} is not written"]
+    path = Path(args.write_effect)
+    try:
+        path.write_text(found.law.file(path.stem), encoding="utf-8")
+    except OSError as error:
+        raise EdgefilterError(
+            f"{path} cannot be written ({error.strerror}); name a file in a folder that exists"
+        ) from None
+    own = {**vars(args), "effects": [*(args.effects or ()), args.write_effect]}
+    return [f"own effect  {path}", f"next        {add_command([*found.law.beside, path.stem], own)}"]
 
 
 def _next_step(found: Diagnosis, args: argparse.Namespace) -> list[str]:

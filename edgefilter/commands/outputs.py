@@ -27,7 +27,18 @@ READ = (
     "token",
 )
 """Options that may name a file to read; a name that is no file, such as a device's, cannot be overwritten."""
-WRITTEN = ("output", "excitation", "json", "report", "save_profile", "learn", "apply", "plot", "log_json")
+WRITTEN = (
+    "output",
+    "excitation",
+    "json",
+    "report",
+    "save_profile",
+    "learn",
+    "apply",
+    "write_effect",
+    "plot",
+    "log_json",
+)
 """Options that may name a file to write."""
 HIDDEN_FILES = (
     *("robot.npz", "mic.wav", "tts.wav", "talk.wav", "talk_tts.wav", "better.npz"),

@@ -13,16 +13,17 @@ from edgefilter.diagnosis.candidates import candidates
 from edgefilter.diagnosis.closer_look import look_closer
 from edgefilter.diagnosis.compare import Comparison, compare, describe, independence_of
 from edgefilter.diagnosis.criteria import Criteria
-from edgefilter.diagnosis.findings import findings_of, share_of
+from edgefilter.diagnosis.findings import findings_of
 from edgefilter.diagnosis.follows_voice import noise_of_the_voice
 from edgefilter.diagnosis.joint import fit_jointly
+from edgefilter.diagnosis.laws import free_law
 from edgefilter.diagnosis.leftover import left_in_words
 from edgefilter.diagnosis.noise_change import look_at_fan, without_doubtful
 from edgefilter.diagnosis.precision import precision
 from edgefilter.diagnosis.prepare import Prepared, prepare
 from edgefilter.diagnosis.proof import listed, with_fitted
 from edgefilter.diagnosis.result import Diagnosis, Finding, Interval, Verdict, in_order
-from edgefilter.diagnosis.score import Judge
+from edgefilter.diagnosis.score import Judge, share_of
 from edgefilter.diagnosis.select import search
 from edgefilter.diagnosis.trials import Found
 from edgefilter.echo.effects.catalogue import find
@@ -283,6 +284,7 @@ def conclude(
         precision=precision(found, findings),
         advice=advice(tried),
         closer_look=look_closer(found) if verdict == "unexplained" else None,
+        law=free_law(found, criteria, progress) if verdict == "unexplained" else None,
     )
 
 

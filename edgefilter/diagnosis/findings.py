@@ -9,6 +9,7 @@ import numpy as np
 
 from edgefilter.diagnosis.prepare import Prepared
 from edgefilter.diagnosis.result import Finding, Interval
+from edgefilter.diagnosis.score import share_of
 from edgefilter.diagnosis.trials import Found, Trial
 from edgefilter.echo.effect import complete
 from edgefilter.echo.effects.catalogue import find
@@ -19,12 +20,6 @@ from edgefilter.errors import UsageError
 THIRDS_T = 1.69
 """90 % quantile of Student's t with 2 degrees of freedom over the square root of 3: the interval from three fits to a
 third each."""
-
-
-def share_of(before_db: float, after_db: float) -> float:
-    """Part of the power over the fan that is gone."""
-    before, after = 10 ** (before_db / 10) - 1.0, 10 ** (after_db / 10) - 1.0
-    return float(np.clip(1.0 - after / before, 0.0, 1.0)) if before > 0.0 else 0.0
 
 
 def findings_of(found: Found, progress: Callable[[str], None] | None) -> tuple[tuple[Finding, ...], list[str]]:

@@ -11,6 +11,7 @@ import numpy as np
 from edgefilter.diagnosis.closer_look import CloserLook
 from edgefilter.diagnosis.compare import Comparison
 from edgefilter.diagnosis.independence import Independence
+from edgefilter.diagnosis.laws import Law
 from edgefilter.echo.measurement import Values
 from edgefilter.echo.model import EchoModel
 from edgefilter.types import Samples
@@ -147,7 +148,8 @@ class Diagnosis:
     tried: all effects that were tried. independence: of what is left with all that was found. precision: of the found
     numbers. advice: what to record to tell candidates apart that explain nearly the same. proof: of what was found, in
     the running filter, where it was asked for; unproven: why there is none. written: the comparison with the profile that
-    was written of it, whose figures it then has. closer_look: at what is left, where that is unexplained.
+    was written of it, whose figures it then has. closer_look: at what is left, where that is unexplained;
+    law: the free one that explains much more of it than what is named, where there is one.
     """
 
     verdict: Verdict
@@ -165,6 +167,7 @@ class Diagnosis:
     unproven: str = ""
     written: Comparison | None = None
     closer_look: CloserLook | None = None
+    law: Law | None = None
 
     def to_dict(self) -> dict[str, object]:
         """The JSON that `diagnose --json` writes, schema 1."""
@@ -203,6 +206,7 @@ class Diagnosis:
             "proof": self.proof.to_dict() if self.proof else None,
             "unproven": self.unproven,
             "closer_look": self.closer_look.to_dict() if self.closer_look else None,
+            "law": self.law.to_dict() if self.law else None,
         }
 
 

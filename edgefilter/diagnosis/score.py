@@ -168,5 +168,11 @@ class Judge:
         return prediction + convolve_from(prediction, np.roll(bounded, 96), 96 + TOLERANCE_LEAD)
 
 
+def share_of(before_db: float, after_db: float) -> float:
+    """Part of the power over the fan that is gone."""
+    before, after = 10 ** (before_db / 10) - 1.0, 10 ** (after_db / 10) - 1.0
+    return float(np.clip(1.0 - after / before, 0.0, 1.0)) if before > 0.0 else 0.0
+
+
 def _db(power: Array) -> float:
     return float(decibels(np.mean(power))) if power.size else 0.0

@@ -16,6 +16,7 @@ import numpy as np
 from edgefilter.diagnosis.closer_look import CloserLook
 from edgefilter.diagnosis.compare import Comparison, describe
 from edgefilter.diagnosis.diagnose import Diagnosis, Finding
+from edgefilter.diagnosis.laws import Law
 from edgefilter.diagnosis.passport import Passport
 from edgefilter.diagnosis.prepare import Prepared, prepare
 from edgefilter.diagnosis.result import Precision, in_order
@@ -89,7 +90,7 @@ def diagnosis_page(
         "findings": [_finding(finding) for finding in found.ranking],
         "command": add_command([one.effect for one in steps], names).split(" ") if steps and not outcome else [],
         "left": sentence(found.evidence) if found.evidence else "",
-        "look": _look(found.closer_look),
+        "look": _look(found.closer_look, found.law),
         **_statistics(found),
     }
     return _page(variants, steps, text, names, found.irreducible_db, outcome)
@@ -266,19 +267,21 @@ def _facts(before: Comparison, after: Comparison | None, irreducible_db: float |
     return facts
 
 
-def _look(look: CloserLook | None) -> dict[str, object] | None:
-    """The curves of what is left as points of drawings 100 wide and 40 high; zero: the height of 0 dB."""
+def _look(look: CloserLook | None, law: Law | None) -> dict[str, object] | None:
+    """The curves, of the law first, as points of drawings 100 wide and 40 high; zero: the height of 0 dB."""
     if look is None:
         return None
     drawn = []
-    for curve in look.curves:
+    for curve in (*((law.curve,) if law else ()), *look.curves):
         low, high = min(0.0, *curve.y_db), max(0.0, *curve.y_db)
         x = np.log(curve.x) if curve.x_unit == "Hz" else np.array(curve.x)
         across, up = max(float(x[-1] - x[0]), 1e-9), max(high - low, 1.0)
         points = zip(100 * (x - x[0]) / across, 40 * (high - np.array(curve.y_db)) / up, strict=True)
         drawn.append(
             {
-                "name": curve.name,
+                "name": f"{law.family}: the law's gain by {curve.name}"
+                if law and curve is law.curve
+                else f"by {curve.name}",
                 "points": " ".join(f"{a:.2f},{b:.2f}" for a, b in points),
                 "zero": f"{40 * high / up:.2f}",
                 "from": f"{curve.x[0]:.3g}",
@@ -286,7 +289,8 @@ def _look(look: CloserLook | None) -> dict[str, object] | None:
                 "range": f"{low:+.1f} to {high:+.1f} dB".replace("-", "−"),
             }
         )
-    return {"sentence": sentence(look.sentence), "curves": drawn}
+    said = f"{sentence(law.words)} It leaves {decibels(law.excess_db)} dB." if law else ""
+    return {"sentence": sentence(look.sentence), "law": said, "family": law.family if law else "", "curves": drawn}
 
 
 def _finding(finding: Finding) -> dict[str, object]:

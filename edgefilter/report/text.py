@@ -13,6 +13,7 @@ import numpy as np
 from edgefilter.diagnosis.compare import Comparison
 from edgefilter.diagnosis.diagnose import Diagnosis, Finding, Interval
 from edgefilter.diagnosis.independence import Correlogram, Independence
+from edgefilter.diagnosis.laws import Law
 from edgefilter.diagnosis.proof import Proof
 from edgefilter.diagnosis.result import Candidate, Known, Precision, in_order
 from edgefilter.echo.effects.catalogue import find, names
@@ -139,6 +140,8 @@ def diagnosis_lines(found: Diagnosis, calibrated: bool = True) -> list[str]:
         lines.append(f"left        {sentence(found.evidence)}")
     if found.closer_look:
         lines.append(f"closer      {sentence(found.closer_look.sentence)}")
+    if found.law:
+        lines.append(law_line(found.law))
     if found.proof or found.unproven:
         lines.append(proof_line(found.proof, found.unproven))
     lines += precision_lines(found.precision)
@@ -146,6 +149,15 @@ def diagnosis_lines(found: Diagnosis, calibrated: bool = True) -> list[str]:
         lines += independence_lines(found.independence, "with all that was found")
     lines += [*candidate_lines(found.tried), *(f"advice      {line}" for line in found.advice)]
     return [*lines, f"where       the excess is with {profile}:", *comparison_lines(found.comparison)]
+
+
+def law_line(law: Law) -> str:
+    """What kind of change it is that no effect explains, and how to have it as an effect of one's own."""
+    beside = f" beside {joined(law.beside)}" if law.beside else ""
+    return (
+        f"law         {law.family}: {law.words}; it leaves {decibels(law.excess_db)} dB{beside}; --write-effect MINE.py writes"
+        " it as an effect of your own"
+    )
 
 
 def add_command(effects: Sequence[str], names: Mapping[str, Any]) -> str:

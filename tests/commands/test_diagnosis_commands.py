@@ -125,6 +125,37 @@ def test_diagnose_finds_what_is_missing_and_writes_the_documented_json(scene, ca
 
 
 @pytest.mark.slow
+def test_what_no_effect_explains_is_written_as_one_of_my_own_which_add_takes(scene, tmp_path, capsys, own_registry):  # noqa: F811
+    x, mine, page = voice(6.0), tmp_path / "my_tremolo.py", tmp_path / "r.html"
+    shaken = x * (1.0 + 0.5 * np.sin(2 * np.pi * 5.0 * np.arange(x.size) / RATE))
+    for name, samples in (("said", x), ("shaken", record(shaken.astype(np.float32)))):
+        soundfile.write(scene / f"{name}.wav", samples, RATE, "FLOAT")
+    files = ["--recording", scene / "shaken.wav", "--reference", scene / "said.wav", "--profile", scene / "robot.npz"]
+    assert main([str(word) for word in ["diagnose", *files, "--write-effect", mine, "--report", page]]) == 0
+    out = capsys.readouterr().out
+    assert (
+        "law         modulation: a gain that moves between " in out and "next        edgefilter add my_tremolo " in out
+    )
+    assert "a law of the family <b>modulation</b>" in page.read_text()
+    output = ["--effects", mine, "--output", tmp_path / "better.npz", "--json", "-"]
+    assert main([str(word) for word in ["add", "my_tremolo", *files, *output]]) == 0
+    told = printed_json(capsys)
+    assert told["excess_after_db"] < 0.5 * told["excess_before_db"]
+    assert told["proof"]["erle_after_db"] > told["proof"]["erle_before_db"] + 3.0
+
+
+@pytest.mark.slow
+def test_where_the_listed_effects_explain_all_no_effect_of_my_own_is_written(scene, tmp_path, capsys):
+    mine = tmp_path / "mine.py"
+    assert main(arguments(scene, "diagnose", "--write-effect", mine)) == 0
+    assert f"{mine} is not written" in capsys.readouterr().out and not mine.exists()
+    for name in ("mine.txt", "my effect.py", "rattle.py"):
+        fails_in_one_line(
+            capsys, arguments(scene, "diagnose", "--write-effect", tmp_path / name), 2, ["one word and no"]
+        )
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("command", ["compare", "diagnose"])
 def test_the_report_is_one_file_that_loads_nothing(scene, tmp_path, command, capsys):
     assert main(arguments(scene, command, "--report", tmp_path / "r.html")) == 0
