@@ -20,7 +20,7 @@ from edgefilter.commands.outputs import FOLDERS, READ, WRITTEN
 from tests.diagnosis.robot_scene import profile
 
 NEITHER = {
-    "mic_channels", "reference_channel", "channel",
+    "mic_channels", "reference_channel", "reference_channels", "channel",
     "help", "version", "debug", "command", "word", "engine", "budget_ms", "remeasure", "seconds", "quiet", "live",
     "speaker", "level_db", "effect", "force", "prove", "no_learn", "on_barge_in", "barge_in", "setup", "load", "unload",
     "hidden", "multisine",

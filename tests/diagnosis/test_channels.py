@@ -109,6 +109,10 @@ def test_what_cannot_be_diagnosed_is_one_line(folder: Path) -> None:
 
 @pytest.mark.slow
 def test_what_was_found_is_written_for_all_microphones(folder: Path) -> None:
-    result = diagnose(folder, "--mic-channels", "1,2,3", "--apply", folder / "again.npz", "--force")
+    heard, rate = soundfile.read(folder / "five.wav", dtype="float32")
+    heard[:, 1:4] *= 2.0
+    soundfile.write(folder / "louder.wav", heard, rate, "FLOAT")
+    louder = ("--recording", folder / "louder.wav")  # the later option counts
+    result = diagnose(folder, *louder, "--mic-channels", "1,2,3", "--apply", folder / "again.npz")
     assert result.returncode == 0, result.stderr
     assert Profile.load(folder / "again.npz").microphones == 3
