@@ -31,6 +31,7 @@ if TYPE_CHECKING:
 
 PACE = 0.005
 """Error of a device's clock that passes: 3 s of listening tell no less, though the filter follows only far smaller ones."""
+SILENT_DB = float(decibels(0.0))
 TOO_SOFT_DB = -75.0
 """Level, dB of full scale, under which the gain is too low: the noise of 16 bit, -101 dB, is 26 dB below."""
 SAME, UNLIKE = 0.999, 0.2
@@ -180,7 +181,7 @@ def _sound(ports: dict[str, InputPort]) -> Iterator[Check]:
 def array_checks(channels: Sequence[Channel]) -> Iterator[Check]:
     """A check for each microphone of an array, beside the others."""
     level = float(np.median([one.level_db for one in channels])) if channels else 0.0
-    silent = [one.peak_db <= float(decibels(0.0)) for one in channels]
+    silent = [one.peak_db <= SILENT_DB for one in channels]
     first = silent.index(False) if False in silent else 0
     for at, one in enumerate(channels):
         found = f"{one.level_db:.0f} dB, floor {one.floor_db:.0f} dB, peak {one.peak_db:.0f} dB"
@@ -333,7 +334,7 @@ def _clock(role: str, trial: Trial) -> Check:
 
 def _level(trial: Trial) -> Check:
     found = f"{trial.level_db:.0f} dB of full scale, peak {trial.peak_db:.0f} dB"
-    if trial.peak_db <= float(decibels(0.0)):
+    if trial.peak_db <= SILENT_DB:
         return Check("level", "warning", "every sample is zero", "unmute the microphone, or name another with --input")
     if trial.level_db < TOO_SOFT_DB:
         return Check("level", "warning", found, "raise the microphone's gain")

@@ -8,7 +8,7 @@ import numpy as np
 
 from edgefilter.diagnosis.prepare import Prepared
 from edgefilter.diagnosis.trials import Found
-from edgefilter.dsp.frames import block_power, blocks, decibels
+from edgefilter.dsp.frames import block_power, block_sums, blocks, decibels
 from edgefilter.dsp.psd import frequencies, periodograms
 from edgefilter.echo.wiener import spectra
 from edgefilter.types import SAMPLE_RATE, Array, Samples
@@ -38,6 +38,11 @@ class Curve:
     y_db: tuple[float, ...]
     share: float
 
+    @classmethod
+    def of(cls, name: str, x_unit: str, x: Array, y_db: Array, share: float) -> Curve:
+        """From arrays (k,), the share held between 0 and 1."""
+        return cls(name, x_unit, tuple(map(float, x)), tuple(map(float, y_db)), float(np.clip(share, 0.0, 1.0)))
+
     def to_dict(self) -> dict[str, object]:
         """Ready for JSON."""
         rounded = {"x": np.round(self.x, 3).tolist(), "y_db": np.round(self.y_db, 2).tolist()}
@@ -59,10 +64,9 @@ class CloserLook:
 def look_closer(found: Found) -> CloserLook:
     """What the final residual of a search looks like beside the prediction."""
     prepared = found.prepared
-    voice = prepared.measurement.whiten(found.final.prediction) * prepared.usable
-    left = (
-        prepared.measurement.white_recording - prepared.measurement.whiten(found.final.prediction)
-    ) * prepared.usable
+    predicted = prepared.measurement.whiten(found.final.prediction)
+    voice = predicted * prepared.usable
+    left = (prepared.measurement.white_recording - predicted) * prepared.usable
     gains = _Gains(voice, left)
     level = decibels(block_power(found.final.prediction, STEP))
     time = np.arange(level.size) * STEP / SAMPLE_RATE
@@ -81,10 +85,8 @@ class _Gains:
     """Least-squares gains of a voice (n,) in what is left of the recording (n,), both whitened, by groups of steps."""
 
     def __init__(self, voice: Samples, left: Samples) -> None:
-        self.energy, self.cross = (
-            blocks(voice * other, STEP).sum(axis=1, dtype=np.float64) for other in (voice, voice + left)
-        )
-        self.whole = float(np.sum(blocks(left * left, STEP).sum(axis=1, dtype=np.float64)[self.energy > SURE]))
+        self.energy, self.cross = (block_sums(voice * other, STEP) for other in (voice, voice + left))
+        self.whole = float(np.sum(block_sums(left * left, STEP)[self.energy > SURE]))
         self.noise = max(self.whole / max(STEP * np.count_nonzero(self.energy > SURE), 1), 1.0)
 
     def over(self, name: str, unit: str, group: Array, width: float) -> Curve:
@@ -97,11 +99,11 @@ class _Gains:
         gain = cross[sure] / energy[sure]
         away = float(np.sum(energy[sure] * (gain - 1.0) ** 2)) - sure.sum() * self.noise
         x = (keys[sure] + 0.5) * width
-        return _curve(name, unit, x, 20.0 * np.log10(np.clip(gain, 0.03, 30.0)), away / max(self.whole, 1e-9))
+        return Curve.of(name, unit, x, 20.0 * np.log10(np.clip(gain, 0.03, 30.0)), away / max(self.whole, 1e-9))
 
 
 def _over_rate(voice: Samples, left: Samples, gains: _Gains) -> Curve:
-    energy, cross = (blocks(voice * other, BEAT).sum(axis=1, dtype=np.float64) for other in (voice, voice + left))
+    energy, cross = (block_sums(voice * other, BEAT) for other in (voice, voice + left))
     if not energy.any():
         return Curve(RATE, "Hz", (), (), 0.0)
     rates, worth, depth = by_rate(energy, cross, *RATES_HZ)
@@ -111,7 +113,7 @@ def _over_rate(voice: Samples, left: Samples, gains: _Gains) -> Curve:
     place = np.digitize(rates, edges)
     x = [float(rates[place == k][np.argmax(depth[place == k])]) for k in np.unique(place)]
     y = [float(20.0 * np.log10(1.0 + depth[place == k].max())) for k in np.unique(place)]
-    return _curve(RATE, "Hz", np.array(x), np.array(y), away / max(gains.whole, 1e-9))
+    return Curve.of(RATE, "Hz", np.array(x), np.array(y), away / max(gains.whole, 1e-9))
 
 
 def by_rate(energy: Array, cross: Array, lowest_hz: float, highest_hz: float) -> tuple[Array, Array, Array]:
@@ -149,7 +151,7 @@ def _over_frequency(prepared: Prepared, voice: Samples, left: Samples, gains: _G
     away = float(np.sum(power[sure] * (gain - 1.0) ** 2)) / max(float(np.sum(found.predicted)), 1e-9)
     share = away * float(np.sum(gains.energy)) / max(gains.whole, 1e-9)
     x = np.sqrt(BANDS_HZ[1:] * BANDS_HZ[:-1])[sure]
-    return _curve("frequency", "Hz", x, 20.0 * np.log10(np.clip(gain, 0.03, 30.0)), share)
+    return Curve.of("frequency", "Hz", x, 20.0 * np.log10(np.clip(gain, 0.03, 30.0)), share)
 
 
 def _silence(prepared: Prepared, prediction: Samples) -> Curve:
@@ -163,11 +165,7 @@ def _silence(prepared: Prepared, prediction: Samples) -> Curve:
     ratio = frames_[: silent.size][silent].mean(axis=0) / prepared.noise_psd
     place = np.digitize(frequencies(ratio.size), BANDS_HZ)
     y = [float(decibels(ratio[place == k].mean())) for k in range(1, BANDS_HZ.size)]
-    return _curve("frequency, in the robot's silences", "Hz", np.sqrt(BANDS_HZ[1:] * BANDS_HZ[:-1]), np.array(y), 0.0)
-
-
-def _curve(name: str, unit: str, x: Array, y: Array, share: float) -> Curve:
-    return Curve(name, unit, tuple(map(float, x)), tuple(map(float, y)), float(np.clip(share, 0.0, 1.0)))
+    return Curve.of("frequency, in the robot's silences", "Hz", np.sqrt(BANDS_HZ[1:] * BANDS_HZ[:-1]), np.array(y), 0.0)
 
 
 def _told(curves: tuple[Curve, ...]) -> str:

@@ -13,7 +13,7 @@ from edgefilter.diagnosis.closer_look import BEAT, Curve, by_rate
 from edgefilter.diagnosis.criteria import Criteria
 from edgefilter.diagnosis.score import Judge, share_of
 from edgefilter.diagnosis.trials import Found
-from edgefilter.dsp.frames import block_power, blocks, decibels
+from edgefilter.dsp.frames import block_power, block_sums, decibels
 from edgefilter.echo.evidence import Score
 from edgefilter.echo.least_squares import normal_equations
 from edgefilter.echo.model import EchoModel
@@ -255,7 +255,7 @@ def static_curve(ground: _Ground) -> Law | None:
         f"each sample goes through one curve, which gives {gain_db[-1]:+.1f} dB at its upper end and {gain_db[0]:+.1f} dB at"
         " its lower end of what it gives in its middle"
     )
-    curve = Curve("the sample's value", "of full scale", _told(np.delete(knots, SHARES.size)), _told(gain_db), 1.0)
+    curve = Curve.of("the sample's value", "of full scale", np.delete(knots, SHARES.size), gain_db, 1.0)
     return Law("static nonlinearity", words, ground.stage, curve, code)
 
 
@@ -267,7 +267,7 @@ def dynamics(ground: _Ground) -> Law | None:
     knots = np.ceil(loud_db) + 6.0 + SPACING_DB * np.arange(-KNOTS + 1.0, 1.0)
     bends = np.concatenate((np.diff(np.eye(KNOTS), 2, axis=0), 0.1 * np.diff(np.eye(KNOTS), axis=0)))
     energy, cross = (
-        blocks(np.roll(ground.heard * other * ground.weights, -ground.lag), STEP).sum(axis=1, dtype=np.float64)
+        block_sums(np.roll(ground.heard * other * ground.weights, -ground.lag), STEP)
         for other in (ground.heard, ground.target)
     )
 
@@ -293,17 +293,14 @@ def dynamics(ground: _Ground) -> Law | None:
         f"a gain that {'falls' if slopes[steepest] < 0 else 'rises'} {abs(10 * slopes[steepest]):.1f} dB per 10 dB of level"
         f" around {knots[steepest] + SPACING_DB / 2:.0f} dBFS within {attack:.2g} ms, and comes back in {release:.3g} ms"
     )
-    curve = Curve("level", "dBFS", _told(knots[reached]), _told(gain_db[reached]), 1.0)
+    curve = Curve.of("level", "dBFS", knots[reached], gain_db[reached], 1.0)
     code = DYNAMICS.format(level=_array(knots, 1), gain=_array(gain_db, 2), attack=attack, release=release, step=STEP)
     return Law("dynamics", words, ground.stage, curve, code)
 
 
 def modulation(ground: _Ground) -> Law | None:
     """A gain that moves with time by itself, again and again: a tremolo, blades in front of a loudspeaker, a contact that shakes."""
-    energy, cross = (
-        blocks(ground.heard * other * ground.weights, BEAT).sum(axis=1, dtype=np.float64)
-        for other in (ground.heard, ground.target)
-    )
+    energy, cross = (block_sums(ground.heard * other * ground.weights, BEAT) for other in (ground.heard, ground.target))
     if not energy.any():
         return None
     rates, worth, _ = by_rate(energy, cross, *RATES_HZ)
@@ -323,7 +320,7 @@ def modulation(ground: _Ground) -> Law | None:
         return None
     gain_db = 20.0 * np.log10(np.maximum(found @ waves(np.linspace(0.0, 2.0 * np.pi, 65)) / found[0], 1e-2))
     words = f"a gain that moves between {gain_db.min():.1f} and {gain_db.max():+.1f} dB, {rate:.3g} times a second"
-    curve = Curve("time in a period", "s", _told(np.linspace(0.0, 1.0 / rate, 65)), _told(gain_db), 1.0)
+    curve = Curve.of("time in a period", "s", np.linspace(0.0, 1.0 / rate, 65), gain_db, 1.0)
     code = MODULATION.format(rate=rate, mean=found[0], waves=_array(found[1:] / found[0], 4), count=HARMONICS + 1)
     return Law("modulation", words, ground.stage, curve, code, event=True)
 
@@ -341,7 +338,7 @@ def linear_path(ground: _Ground) -> Law | None:
         f"a filter of {TAPS // (SAMPLE_RATE // 1000)} ms, {gain_db[high]:+.1f} dB at {hz[high]:.0f} Hz and {gain_db[low]:+.1f} dB at"
         f" {hz[low]:.0f} Hz"
     )
-    curve = Curve("frequency", "Hz", _told(hz), _told(gain_db), 1.0)
+    curve = Curve.of("frequency", "Hz", hz, gain_db, 1.0)
     return Law("linear path", words, ground.stage, curve, FILTER.format(taps=_array(taps, 4), lead=LEAD))
 
 
@@ -356,7 +353,7 @@ STAGES: dict[Callable[[_Ground], Law | None], tuple[Literal["source", "path"], .
 
 def _levels(x: Samples, settings: list[tuple[float, float]]) -> Array:
     """(m, k) level in dB at the end of each step of x (n,), by m attacks and releases in ms."""
-    power = np.mean(np.pad(x, (0, -x.size % STEP)).reshape(-1, STEP).astype(np.float64) ** 2, axis=1)[: x.size // STEP]
+    power = block_power(x, STEP)
     rising, falling = (-np.expm1(-1.0 / np.array(ms)) for ms in zip(*settings, strict=True))
     level, now = np.empty((power.size, len(settings))), np.zeros(len(settings))
     for row, asked in zip(level, power, strict=True):
@@ -385,10 +382,6 @@ def _solved(matrix: Array, right: Array, bends: Array) -> tuple[Array, float]:
     held = (BEND * bends.T @ bends + 1e-6 * BEND * np.eye(right.size)) * (np.trace(matrix) / right.size + 1e-30)
     found = np.linalg.solve(matrix + held, right)
     return found, float(2.0 * found @ right - found @ matrix @ found)
-
-
-def _told(numbers: Array) -> tuple[float, ...]:
-    return tuple(map(float, numbers))
 
 
 def _array(numbers: Array | list[float], digits: int) -> str:

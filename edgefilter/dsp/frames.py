@@ -26,6 +26,11 @@ def block_power(x: Array, size: int) -> Array:
     return np.square(blocks(x, size), dtype=np.float64).mean(axis=1)
 
 
+def block_sums(x: NDArray, size: int) -> Array:
+    """(k,) float64, sum of x (n,) over each whole block."""
+    return blocks(x, size).sum(axis=1, dtype=np.float64)
+
+
 def all_block_power(x: Samples, size: int) -> Array:
     """(k,) float64, mean square in each block, the last one counted as if silence followed."""
     return np.add.reduceat(x.astype(np.float64) ** 2, np.arange(0, x.size, size)) / size

@@ -46,6 +46,10 @@ class NoiseTracker:
     PRESENT = np.float32(10.0**1.5)
     """Power of speech over the noise where there is any, 15 dB."""
     STUCK = np.float32(0.99)
+    FIRST = 5
+    """Frames whose mean is the first estimate."""
+    RENEWED, STUCK_RENEWED = np.float32(1.0) - np.float32(0.8), np.float32(1.0) - np.float32(0.9)
+    """Share of a new frame in the noise, and in the mean probability of speech by which it is found to be stuck."""
 
     def __init__(self, bins: int) -> None:
         self.power = np.zeros(bins, np.float32)
@@ -56,14 +60,14 @@ class NoiseTracker:
         """The noise's power (bins,) after a frame of the power observed (bins,)."""
         self._loudest = max(self._loudest, float(np.add.reduce(observed)) / observed.size)
         self._count += 1
-        if self._count <= 5:  # the mean of the first frames is the first estimate
+        if self._count <= self.FIRST:
             self.power += (observed - self.power) / np.float32(self._count)
         else:
             likelihood = np.minimum(observed / self.power, 100.0) * (self.PRESENT / (1.0 + self.PRESENT))
             present = 1.0 / (1.0 + (1.0 + self.PRESENT) * np.exp(-likelihood))
-            self._present += (1.0 - np.float32(0.9)) * (present - self._present)
+            self._present += self.STUCK_RENEWED * (present - self._present)
             present = np.where(self._present > self.STUCK, np.minimum(present, self.STUCK), present)
-            self.power += (1.0 - np.float32(0.8)) * (1.0 - present) * (observed - self.power)
+            self.power += self.RENEWED * (1.0 - present) * (observed - self.power)
         np.maximum(self.power, np.float32(fourier.LEAST * self._loudest + fourier.TINY), out=self.power)
         return self.power
 

@@ -22,6 +22,7 @@ from websockets.http11 import Request, Response
 from edgefilter.dsp.resample import Resampler
 from edgefilter.errors import EdgefilterError, SignalError
 from edgefilter.filter.ego_filter import EgoFilter
+from edgefilter.integrations.channels import microphones
 from edgefilter.integrations.duplex import Pace, all_of_pcm16, as_pcm16, from_pcm16
 from edgefilter.integrations.wire import Form, TwoStreams, message_of
 from edgefilter.types import SAMPLE_RATE, SET_UP_WRONG, Event, Samples
@@ -59,7 +60,7 @@ class Session:
             self._encode = Encoder(form.bitrate).push
             codec_s = FRAME_MS / 1000
         else:
-            decoders = (partial(_channels_of, microphones=form.microphones), from_pcm16)
+            decoders = (partial(_microphones_of, count=form.microphones), from_pcm16)
             self._encode, codec_s = self._as_pcm, 0.0
             self._from_filter = Resampler(SAMPLE_RATE, rate)
             codec_s = self._from_filter.delay_s
@@ -101,12 +102,12 @@ class Session:
             mic, ref = self._two.take()
         else:
             both = all_of_pcm16(message, self.form.microphones + 1)
-            mic, ref = _microphones(both[:, :-1]), np.ascontiguousarray(both[:, -1])
+            mic, ref = microphones(both, range(self.form.microphones)), np.ascontiguousarray(both[:, -1])
         return self._filter(mic, ref, last=False), False
 
     def finish(self) -> list[Answer]:
         """The rest, and the last answer, with the figures."""
-        nothing = _channels_of(b"", self.form.microphones), np.zeros(0, np.float32)
+        nothing = _microphones_of(b"", self.form.microphones), np.zeros(0, np.float32)
         answers = self._filter(*(self._two.take(last=True) if self._two else nothing), last=True)
         stats = self.ego.stats()
         figures = {
@@ -291,13 +292,9 @@ class Service:
         connection.transport.abort()
 
 
-def _channels_of(pcm: bytes, microphones: int) -> Samples:
-    return _microphones(all_of_pcm16(pcm, microphones))
-
-
-def _microphones(samples: Samples) -> Samples:
-    """(n,) of one microphone, (n, microphones) of several."""
-    return np.ascontiguousarray(samples[:, 0] if samples.shape[1] == 1 else samples)
+def _microphones_of(pcm: bytes, count: int) -> Samples:
+    """(n,) of one microphone, (n, count) of several."""
+    return microphones(all_of_pcm16(pcm, count), range(count))
 
 
 def _text(kind: str, **more: object) -> str:

@@ -50,7 +50,7 @@ def expectation(found: Passport) -> dict[str, object]:
         "headline": headline(found),
         "cause": sentence(CAUSES[found.cause]) if found.found else "",
         "changes": advice(found),
-        "uncertainty_db": dict(zip(("median", "worst"), ERROR_DB, strict=True)),
+        "uncertainty_db": {"median": ERROR_DB[0], "worst": ERROR_DB[1]},
     }
 
 

@@ -87,4 +87,5 @@ def test_what_is_explained_gets_no_law_and_what_is_not_one_beside_what_is_named(
     assert turned.verdict == "missing" and turned.law is None and turned.to_dict()["law"] is None
     shaken = diagnose(profile(), record(HIDDEN["modulation"].astype(np.float32)), X)
     assert shaken.verdict == "unexplained" and shaken.law is not None
+    assert shaken.law.excess_db < 0.5 * shaken.remaining_db and shaken.law.beside == ()
     assert shaken.to_dict()["law"]["family"] == "modulation"

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import signal
 
-from edgefilter.dsp.frames import all_block_power, block_power, blocks, decibels, frames
+from edgefilter.dsp.frames import all_block_power, block_power, block_sums, blocks, decibels, frames
 from edgefilter.dsp.psd import (
     NOTCH,
     ROUNDING_PSD,
@@ -28,6 +28,7 @@ def test_block_power_leaves_the_end_out_and_the_other_counts_it():
     np.testing.assert_array_equal(blocks(x, 2), [[1, 1], [2, 2]])
     np.testing.assert_allclose(block_power(x, 2), [1.0, 4.0])
     np.testing.assert_allclose(all_block_power(x, 2), [1.0, 4.0, 4.5])
+    np.testing.assert_array_equal(block_sums(x, 2), [2.0, 4.0])
     assert block_power(x, 2).dtype == np.float64
 
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from edgefilter.dsp.frames import blocks
+from edgefilter.dsp.frames import block_sums
 from edgefilter.types import SAMPLE_RATE, Array, Samples
 
 STEP = SAMPLE_RATE // 40
@@ -41,7 +41,7 @@ def follow(level_db: Array, voice: Samples, recording: Samples, weights: Samples
     7 and 16): it falls with the attack time, rises with the release time, and by slope dB per dB; a feed-back control
     with a linear law is the same with shorter times. None where too little of the voice is heard.
     """
-    energy, cross = (by_step(voice * other * weights) for other in (voice, recording))
+    energy, cross = (block_sums(voice * other * weights, STEP) for other in (voice, recording))
     sure = (energy > SURE) & (cross > 0.05 * energy)
     if sure.sum() < 20:
         return None
@@ -69,11 +69,6 @@ def follow(level_db: Array, voice: Samples, recording: Samples, weights: Samples
     finer = best(attack * around, release * around, hold + np.array([-5.0, 0.0, 5.0]), starts)
     misfit, curve, _ = min(found, finer, key=lambda law: law[0])
     return GainLaw(curve, misfit, float(trust @ (gain_db - middle) ** 2), int(sure.sum()))
-
-
-def by_step(x: Array) -> Array:
-    """(k,) sums of x (n,) over whole steps."""
-    return blocks(x, STEP).sum(axis=1, dtype=np.float64)
 
 
 def _driven(level_db: Array, attack_s: Array, release_s: Array, hold_db: Array, start_db: Array) -> Array:

@@ -8,9 +8,9 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from edgefilter.dsp.frames import block_power, blocks
+from edgefilter.dsp.frames import block_power, block_sums, blocks
 from edgefilter.echo.effect import Effect, Parameter, Runner, Stage
-from edgefilter.echo.effects.gain_law import STEP, by_step, follow
+from edgefilter.echo.effects.gain_law import STEP, follow
 from edgefilter.echo.evidence import Evidence
 from edgefilter.echo.least_squares import absorbed
 from edgefilter.echo.measurement import Measurement, Values, VoiceModel
@@ -136,8 +136,8 @@ class MicAgc(Effect):
         measurement = evidence.grid.measurement
         gain = self.apply(np.ones_like(measurement.recording), evidence.values, SAMPLE_RATE)
         white = measurement.whiten(measurement.recording - evidence.after.prediction).astype(np.float64) ** 2
-        square, power = (by_step(x) / STEP for x in (gain.astype(np.float64) ** 2, white))
-        low = (power < FAN_ALONE * square) & (by_step(evidence.grid.usable.astype(float)) == STEP)
+        square, power = (block_sums(x, STEP) / STEP for x in (gain.astype(np.float64) ** 2, white))
+        low = (power < FAN_ALONE * square) & (block_sums(evidence.grid.usable, STEP) == STEP)
         if low.sum() < 20:
             return False
         moving, still = (
@@ -187,7 +187,7 @@ def _law(heard: Samples, voice: Samples, recording: Samples, measurement: Measur
     if measurement.noise_psd is None:
         return ones
     fan = float(measurement.noise_psd.sum()) * SAMPLE_RATE / 2 / (measurement.noise_psd.size - 1)
-    level = 10.0 * np.log10(by_step(heard.astype(np.float64) ** 2) / STEP + fan + 1e-12)
+    level = 10.0 * np.log10(block_sums(heard.astype(np.float64) ** 2, STEP) / STEP + fan + 1e-12)
     law = follow(level, voice, recording, measurement.weights)
     if law is None or law.misfit > BENDS * law.plain:
         return ones

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from edgefilter.echo.effects.gain_law import STEP, by_step, follow
+from edgefilter.echo.effects.gain_law import STEP, follow
 
 STEPS = 600
 
@@ -44,4 +44,3 @@ def test_a_gain_that_does_not_follow_the_level_obeys_no_law():
 
 def test_too_little_voice_tells_nothing():
     assert follow(level(), *(x * s for x, s in zip(scene(np.zeros(STEPS)), (1e-3, 1.0, 1.0), strict=True))) is None
-    assert by_step(np.ones(3 * STEP + 5)).tolist() == [STEP] * 3
