@@ -292,6 +292,8 @@ def _ros2(commands: argparse._SubParsersAction) -> None:
     option("--domain", type=whole(0, 232, "a domain, 0 to 232"), metavar="N", help=told)
     _form(option)
     option("--mic-channels", **MIC_CHANNELS)
+    told = "channel of the microphone, from 0, that holds what is played, in place of the reference's topic"
+    option("--reference-channel", type=channel, metavar="N", help=told)
     told = "of the reference (default: as many as the microphone has)"
     option("--reference-channels", type=whole(1, 8, "1 to 8 channels"), metavar="N", help=told)
     words = ros2.add_subparsers(dest="word", metavar="extract")

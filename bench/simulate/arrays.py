@@ -8,7 +8,8 @@ the channels of one file: sweep_mic, fan_only, mic and clean are (n, microphones
 of 2.5 to 4.5 cm around the place of the one microphone there, with gains up to 1 dB apart and a shell of their own. The
 robot speaks --turns times after its first utterance, and the same human interrupts each time, from the same place;
 meta.json lists the turns (start, end, text, moved), and start, end and text are the first one's. --moving: the human
-speaks each turn from another place.
+speaks each turn from another place. --no-echo: the same conversations with a robot that is silent, ref of zeros, so that what is
+left beside the human is the fan.
 
 The fan: --noise is a folder of recordings of a robot's own noise with an array in channels 1 to 3; every second file is
 for the calibration, the others for the conversation. Their covariances, bin by bin, colour the noise of a drawn spectrum.
@@ -50,6 +51,7 @@ from bench.simulate.simulated_robot import (
     warp,
     with_distortion,
 )
+from edgefilter.dsp.metrics import si_sdr
 
 SIZE = 512
 """Samples of a frame of the covariances: finer than the fan's coherence changes."""
@@ -181,6 +183,7 @@ def make(
     turns: int = 2,
     moving: bool = False,
     distortion: str = "moderate",
+    echo: bool = True,
 ) -> tuple[dict[str, Array], dict]:
     """Item index of this seed: signals, (n, microphones) but for sweep_ref and ref, and the contents of meta.json."""
     rng = np.random.default_rng([seed, index, 36])
@@ -222,7 +225,10 @@ def make(
 
     paths = (laboratory.robot, room.robot)
     signals, scores, _ = record_all(rng, room_name, robot, paths, sound, clean, inside, fans)
-    signals.pop("fan")
+    fan = signals.pop("fan")
+    if not echo:
+        signals["mic"], ref = signals["clean"] + fan, np.zeros(ref.size)
+        scores["sisdr_mix"] = si_sdr(signals["mic"][0, inside], signals["clean"][0, inside])
     excitation = signals.pop("sweep_ref")
     signals = {"sweep_ref": excitation, **{name: (gains[:, None] * of).T for name, of in signals.items()}}
     meta = {"room": room_name, "rt60": room.rt60_s, "voice": voice, "speaker": speaker, "text": said[0].text}
@@ -240,6 +246,7 @@ def main() -> None:
     parser.add_argument(
         "--noise", type=Path, metavar="DIR", help="an array's own noise; without it the fan is of parts"
     )
+    parser.add_argument("--no-echo", action="store_true", help="the robot is silent")
     parser.add_argument("--output", type=Path, required=True, metavar="DIR")
     parser.add_argument("--kind", choices=("paper", "live"), required=True)
     parser.add_argument("--room", choices=("lab", "office", "both"), default="both", help="both: in turn")
@@ -255,7 +262,7 @@ def main() -> None:
         room = ("lab", "office")[index % 2] if options.room == "both" else options.room
         signals, meta = make(
             options.seed, index, options.kind, room, speech, voices, covariances, options.microphones, options.turns,
-            options.moving,
+            options.moving, echo=not options.no_echo,
         )  # fmt: skip
         write_item(options.output / f"{room}_{index:02d}", signals, "meta", meta)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -42,8 +43,9 @@ class Aligner:
 
     A new utterance is looked for over all lags; the old delay stays the hypothesis until it is confirmed or replaced,
     but where the microphone is far too quiet to hold it, nothing is delivered. Between utterances delay and drift are
-    carried on. hop: samples per step. profile: its impulse response tells the shape of the arrival. max_lag_s: of the
-    playback, seconds.
+    carried on. hop: samples per step. profile: its impulse responses tell the shape of the arrival. max_lag_s: of the
+    playback, seconds. Of an array that is calibrated the lag is looked for in all microphones together, and the delay is
+    measured in the first that is used.
 
     >>> rng = np.random.default_rng(0)
     >>> voice = rng.standard_normal(16384).astype(np.float32) / 10
@@ -58,36 +60,27 @@ class Aligner:
     def __init__(self, hop: int, profile: Profile | None = None, max_lag_s: float = 1.5) -> None:
         self.hop = hop
         self._max_lag = int((max_lag_s + 0.1) * SAMPLE_RATE)
-        self._calibrated = None if profile is None else profile.echo.impulse_response
+        further = profile.array.responses if profile and profile.array else ()
+        self._calibrated = None if profile is None else [profile.echo.impulse_response, *further]
         kernel_table()
         self.reset()
 
-    def _listen_for(self, response: Samples | None) -> None:
-        """What an arrival looks like from now on: impulse response (taps,); None: any.
+    def _listen_for(self, responses: Sequence[Samples] | None) -> None:
+        """What an arrival looks like from now on: the microphones' impulse responses (taps,); None: anything.
 
         Where no utterance was found the robot may stand elsewhere than where it was calibrated.
         """
-        self._response = response
-        early = None if response is None else response[: PRE_ROLL + 320]
+        self._responses = responses
+        early = None if responses is None else [one[: PRE_ROLL + 320] for one in responses]
         self._lags = LagSearch(self._max_lag, early, PRE_ROLL)
-        self._meter = DelayMeter(response, PRE_ROLL)
-
-    def hear_by(self, past: Samples, calibrated: Samples | None) -> None:
-        """From now on the microphone is another one of the array; what is known of the delay holds.
-
-        past: (n,) of what it heard before. calibrated: its impulse response (taps,): those of an array have one beginning, so
-        that the delay is the same in each; None where nothing is calibrated.
-        """
-        self._mic.rewrite(self._mic.end - past.size, past)
-        known, self._calibrated = self._response is not None, calibrated
-        if known and calibrated is not None:
-            self._listen_for(calibrated)
+        self._meter = DelayMeter(None if responses is None else responses[self._used[0]], PRE_ROLL)
 
     def reset(self) -> None:
         """Forget everything, as after construction."""
+        self._used = [0]
         self._listen_for(self._calibrated)
-        length = self._lags.span + SAMPLE_RATE
-        self._mic, self._ref = Tape(length), Tape(length)
+        self._ref = Tape(self._lags.span + SAMPLE_RATE)
+        self._mics = [Tape(self._ref.capacity)]
         self._onsets = OnsetDetector(self.hop)
         self._drift = DriftFilter()
         self._open: deque[Utterance] = deque(maxlen=32)
@@ -112,6 +105,16 @@ class Aligner:
             "announced_heard": 0,
         }
 
+    def hear_by(self, used: Sequence[int]) -> None:
+        """From now on these microphones of an array are listened to, in the beginning all; what is known of the delay holds.
+
+        Calibrated paths of an array have one beginning, so that the delay is the same in each microphone.
+        """
+        self._mics += [Tape(self._ref.capacity) for _ in range(len(self._mics), max(used) + 1)]
+        first, self._used = self._used[0], list(used)
+        if self._responses is not None and self._used[0] != first:
+            self._meter = DelayMeter(self._responses[self._used[0]], PRE_ROLL)
+
     def announce(self, utterance: Samples) -> None:
         """Say what will be played (n,); it may begin at any time or never, and several are played in the order of announcing.
 
@@ -123,9 +126,12 @@ class Aligner:
         self._announced.add(utterance)
 
     def step(self, mic: Samples, ref: Samples) -> Aligned:
-        """Take the next hop (hop,) of microphone and reference."""
+        """Take the next hop (hop,) of microphone and reference, of an array (microphones, hop)."""
         ref = self._announced.reference(ref, self._ref.end)
-        self._mic.push(mic)
+        heard = np.atleast_2d(mic)
+        for tape, samples in zip(self._mics, heard, strict=True):
+            tape.push(samples)
+        mic = heard[self._used[0]]
         self._ref.push(ref)
         started = self._onsets.step(ref)
         if started:
@@ -204,7 +210,7 @@ class Aligner:
         if self._ref.end > end + self._max_lag + SAMPLE_RATE // 4:
             self._resolve(found=False)
             self._missed = True
-            if not self._known and self._response is not None:
+            if not self._known and self._responses is not None:
                 self._listen_for(None)
 
     def _resolve(self, found: bool = True) -> None:
@@ -239,12 +245,14 @@ class Aligner:
         elif stage == 1:
             self._stage = 2
             heard_out = self._open[0].after + int(self._drift.delay) if self._open and self._trusted else 0
-            self._lags.listen(self._mic, now, heard_out)
+            together = self._used if self._responses is not None else self._used[:1]
+            self._lags.listen({at: self._mics[at] for at in together}, now, heard_out)
         elif stage == 2:
             self._found = self._lags.find()
             return self._found is not None and self._decide(self._found)
         elif found := self._found:
-            return self._lags.before(self._mic, self._expected or self._ref, found) > SEEN and self._take(found)
+            first, ref = self._used[0], self._expected or self._ref
+            return self._lags.before(first, self._mics[first], ref, found) > SEEN and self._take(found)
         return False
 
     def _decide(self, found: Candidate) -> bool:
@@ -252,14 +260,16 @@ class Aligner:
 
         True if the delay was switched.
         """
-        evidence = found.strength * found.ratio
-        if found.heard > WINDOW + BETWEEN + MINIMUM and evidence > CERTAIN_EARLY:
+        if found.heard > WINDOW + BETWEEN + MINIMUM and found.evidence > CERTAIN_EARLY:
             self._stage = 3
             return False
         place = found.lag + (self._expected.start if self._expected else 0)
-        again, self._doubted = abs(place - self._doubted) <= 2, place if evidence > CERTAIN_EARLY else float("nan")
+        again, self._doubted = (
+            abs(place - self._doubted) <= 2,
+            place if found.evidence > CERTAIN_EARLY else float("nan"),
+        )
         enough = CERTAIN_EARLY if again and found.heard <= EARLY else CERTAIN
-        return evidence > enough and found.heard <= WINDOW and self._take(found)
+        return found.evidence > enough and found.heard <= WINDOW and self._take(found)
 
     def _take(self, found: Candidate) -> bool:
         """Believe a candidate; True if the delay was switched."""
@@ -306,7 +316,7 @@ class Aligner:
             return False
         self._segments = 1 if self._lost or (self._open and self._open[0].nearby) else 0
         found = self._meter.measure(
-            self._mic, self._ref, self._ref.end, self._drift.delay, self._drift.slope, self._segments
+            self._mics[self._used[0]], self._ref, self._ref.end, self._drift.delay, self._drift.slope, self._segments
         )
         return found is not None and self._judge(found)
 

@@ -43,15 +43,15 @@ class Tape:
 
     def __init__(self, capacity: int) -> None:
         self._data = np.zeros(2 * capacity, np.float32)
-        self._capacity = capacity
+        self.capacity = capacity
         self._at = capacity
         self.end = 0
 
     def push(self, samples: Samples) -> None:
         """Append samples (n,), n <= capacity."""
         if self._at + samples.size > self._data.size:
-            self._data[: self._capacity] = self._data[self._at - self._capacity : self._at]
-            self._at = self._capacity
+            self._data[: self.capacity] = self._data[self._at - self.capacity : self._at]
+            self._at = self.capacity
         self._data[self._at : self._at + samples.size] = samples
         self._at += samples.size
         self.end += samples.size
@@ -63,7 +63,7 @@ class Tape:
 
     def read(self, start: int, stop: int) -> Samples:
         """Samples start..stop-1 (stop - start,), a view where possible; zeros after the end and before what is kept."""
-        oldest = self.end - self._capacity
+        oldest = self.end - self.capacity
         offset = self._at - self.end
         if start >= oldest and stop <= self.end:
             return self._data[start + offset : stop + offset]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -53,23 +54,30 @@ class Candidate:
     at: int
     heard: int
 
+    @property
+    def evidence(self) -> float:
+        """Strength times ratio: how far the peak stands out of chance."""
+        return self.strength * self.ratio
+
 
 class LagSearch:
     """Generalised cross-correlation (Knapp & Carter 1976) of the last WINDOW samples of mic with the reference before them.
 
-    Both spectra are divided by the square root of their smoothed power. response (taps,), if known, is the echo path
-    around its direct sound at index pre_roll: its phase is taken out, so that early reflections do not pull the peak.
+    Both spectra are divided by the square root of their smoothed power. responses, if known, are the echo paths (taps,) of
+    the microphones on one clock, around the direct sound in the first at index pre_roll: their phases are taken out, so
+    that early reflections do not pull the peak, and the peaks of all microphones lie at one lag, where they are summed.
     Chance peaks grow with the root of the energy that a lag lets overlap, so the correlation is divided by that.
-    `prepare`, `listen` and `find` are one search and cost one transform each, so that they can be spread over three
-    hops; while the reference to be looked at is short, so are the transforms.
+    `prepare`, `listen` and `find` are one search and cost one transform each, `listen` one a microphone, so that they
+    can be spread over three hops; while the reference to be looked at is short, so are the transforms.
     """
 
-    def __init__(self, max_lag: int, response: Samples | None = None, pre_roll: int = 0) -> None:
+    def __init__(self, max_lag: int, responses: Sequence[Samples] | None = None, pre_roll: int = 0) -> None:
         self.max_lag = max_lag
         self.span = self._size = COARSE * fft.next_fast_len(-(-(max_lag + WINDOW) // COARSE), real=True)
-        self._signed = response is not None
+        self._signed = responses is not None
         self._short = COARSE * fft.next_fast_len(-(-self.span // (2 * COARSE)), real=True)
-        self._phases = {size: _phase(response, pre_roll, size) for size in (self.span, self._short, WINDOW + 2 * ASIDE)}
+        sizes = (self.span, self._short, WINDOW + 2 * ASIDE)
+        self._phases = {size: [_phase(one, pre_roll, size) for one in responses or ()] for size in sizes}
 
     def prepare(self, ref: Tape | Playback, now: int, since: int) -> None:
         """Take the reference between the positions since and now."""
@@ -86,39 +94,56 @@ class LagSearch:
         self._reference = flattened(fft.rfft(r), 1e-5)
         self._prepared, self._since = now, since
 
-    def listen(self, mic: Tape, now: int, since: int) -> None:
-        """Take the microphone up to now, but none of it before since; at most WINDOW samples after `prepare`."""
+    def listen(self, mics: Mapping[int, Tape], now: int, since: int) -> None:
+        """Take the microphones up to now, but none of it before since; at most WINDOW samples after `prepare`.
+
+        mics: by number, where the responses are known several; their evidence is summed.
+        """
         skipped = min(max(max(since, self._since) - (now - WINDOW), 0), WINDOW)
         self._at, self._start = now, self._size - WINDOW + skipped
-        if skipped > WINDOW - MINIMUM:
-            self._cross = None
-            return
-        x = np.zeros(self._size, np.float32)
-        x[self._start :] = mic.read(now - WINDOW + skipped, now)
-        _soften(x[self._start :])
-        self._cross = flattened(fft.rfft(x), 1e-6) * np.conj(self._reference) if x.any() else None
-        if self._cross is not None:
-            self._cross[: int(LOWEST_HZ * self._size / SAMPLE_RATE)] = 0.0
-            self._cross *= self._phases[self._size]
+        self._crosses = []
+        for number, mic in mics.items() if skipped <= WINDOW - MINIMUM else ():
+            x = np.zeros(self._size, np.float32)
+            x[self._start :] = mic.read(now - WINDOW + skipped, now)
+            _soften(x[self._start :])
+            if x.any():
+                self._crosses.append(self._whitened(x, self._reference, number))
 
     def find(self) -> Candidate | None:
         """The best lag between what was prepared and what was listened to.
 
-        None where there is nothing to compare, or where less than MINIMUM of them would overlap at the best lag.
+        Of several microphones that of the first, or of all together where that is more evident; but not where it is seen
+        in one alone, which may be broken, or a loopback. None where there is nothing to compare, or where less than MINIMUM
+        of them would overlap at the best lag.
         """
-        if self._cross is None:
+        if not self._crosses:
             return None
+        first = self._best(*self._scored(self._crosses[0]))
+        if len(self._crosses) == 1:
+            return first
+        together = self._best(*self._scored(np.add.reduce(self._crosses)))
+        if together is None or together.evidence <= max(first.evidence if first else 0.0, CERTAIN_EARLY):
+            return first
+        near = slice(max(together.lag - NEAR, 0), together.lag + NEAR)
+        alone = [self._scored(cross) for cross in self._crosses]
+        return together if sum(score[near].max() > SEEN * spread for score, spread in alone) > 1 else first
+
+    def _scored(self, cross: np.ndarray) -> tuple[Samples, float]:
+        """The correlation (lags,) over what a lag lets overlap, and its rms, 0 where nothing overlaps."""
         late = self._at - self._prepared
         overlap = self._overlap(late)
         if overlap.max() <= 0.0:
-            return None
-        correlation = fft.irfft(self._cross, self._size)
+            return np.zeros(self._reach, np.float32), 0.0
+        correlation = fft.irfft(cross, self._size)
         score = np.concatenate((correlation[self._size - late :], correlation[: self._reach - late]))
         if not self._signed:
             np.abs(score, out=score)
         score *= np.repeat(1.0 / np.sqrt(overlap + 0.1 * overlap.max()), COARSE)[: self._reach]
         usable = np.repeat(overlap > 0.05 * overlap.max(), COARSE)[: self._reach]
-        spread = float(np.sqrt(np.dot(score, score * usable) / np.count_nonzero(usable)))
+        return score, float(np.sqrt(np.dot(score, score * usable) / np.count_nonzero(usable)))
+
+    def _best(self, score: Samples, spread: float) -> Candidate | None:
+        """The lag of the highest peak."""
         lag = int(np.argmax(score))
         heard = self._at - self._since - lag
         if spread <= 0.0 or heard < MINIMUM:
@@ -131,20 +156,27 @@ class LagSearch:
             lag, float(score[lag]) / spread, float(score[lag]) / max(float(second), 1e-12), self._at, heard
         )
 
-    def before(self, mic: Tape, ref: Tape | Playback, found: Candidate) -> float:
-        """Strength of the found lag in an earlier window of the microphone, BETWEEN samples before the one that it was found in."""
+    def before(self, number: int, mic: Tape, ref: Tape | Playback, found: Candidate) -> float:
+        """Strength of the found lag in an earlier window of a microphone, BETWEEN samples before the one that it was found in."""
         stop = found.at - WINDOW - BETWEEN
         x = np.zeros(WINDOW + 2 * ASIDE, np.float32)
         x[ASIDE:-ASIDE] = mic.read(stop - WINDOW, stop)
         _soften(x[ASIDE:-ASIDE])
         r = ref.read(stop - WINDOW - found.lag - ASIDE, stop - found.lag + ASIDE).copy()
         _soften(r)
-        cross = flattened(fft.rfft(x), 1e-6) * np.conj(flattened(fft.rfft(r), 1e-5)) * self._phases[x.size]
-        cross[: int(LOWEST_HZ * x.size / SAMPLE_RATE)] = 0.0
+        cross = self._whitened(x, flattened(fft.rfft(r), 1e-5), number)
         score = np.roll(fft.irfft(cross, x.size), ASIDE)[: 2 * ASIDE]
         if not self._signed:
             np.abs(score, out=score)
         return float(score[ASIDE - NEAR : ASIDE + NEAR].max()) / (float(np.sqrt(np.mean(np.square(score)))) + 1e-20)
+
+    def _whitened(self, heard: Samples, reference: np.ndarray, number: int) -> np.ndarray:
+        """Cross-spectrum of what a microphone heard (n,) with the flattened reference, without rumble and its response's phase."""
+        cross = flattened(fft.rfft(heard), 1e-6) * np.conj(reference)
+        cross[: int(LOWEST_HZ * heard.size / SAMPLE_RATE)] = 0.0
+        if self._signed:
+            cross *= self._phases[heard.size][number]
+        return cross
 
     def _overlap(self, late: int) -> Samples:
         """Energy of the reference, first difference, that falls under the microphone's window, at every COARSE-th lag."""
@@ -162,9 +194,7 @@ def _soften(x: Samples) -> None:
     x[x.size - rise.size :] *= rise[::-1]
 
 
-def _phase(response: Samples | None, pre_roll: int, size: int) -> np.ndarray | np.complex64:
+def _phase(response: Samples, pre_roll: int, size: int) -> np.ndarray:
     """What takes the response's phase out of a cross-spectrum."""
-    if response is None:
-        return np.complex64(1.0)
     spectrum = np.conj(fft.rfft(np.roll(np.pad(response, (0, size - response.size)), -pre_roll)))
     return (spectrum / np.maximum(np.abs(spectrum), 1e-12)).astype(np.complex64)

@@ -42,7 +42,8 @@ def _node(args: argparse.Namespace) -> int:
     ego = EgoFilter(args.profile, args.engine, barge_in=BargeInSettings(judge="network"))
     names = args.mic, args.reference, args.silenced, args.human
     wanted = range(args.channels) if args.mic_channels == ALL_CHANNELS else args.mic_channels
-    node = Node(ego, Topics(*names, args.rate, args.channels, wanted, args.reference_channels), domain)
+    topics = Topics(*names, args.rate, args.channels, wanted, args.reference_channels, args.reference_channel)
+    node = Node(ego, topics, domain)
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: node.stop())
     say(f"node /edgefilter, domain {domain}: {args.mic} and {args.reference} in, {args.human} out; Ctrl-C ends it")

@@ -242,16 +242,14 @@ class Canceller:
         echo = self._limiter.apply(echo)
         return CancellerOutput(echo, mic - echo, misalignment, innovation)
 
-    def tell_by(self, microphone: int) -> bool:
-        """Tell the volume, and whether the echo is there, in that microphone of an array from now on; whether it is another.
+    def tell_by(self, microphone: int) -> None:
+        """Tell the volume, and whether the echo is there, in that microphone of an array from now on.
 
         The path begins anew where it was told in another: a broken one has scaled or silenced the others, too.
         """
-        if microphone == self._teller:
-            return False
-        self._teller = microphone
-        self._begin()
-        return True
+        if microphone != self._teller:
+            self._teller = microphone
+            self._begin()
 
     def _predict(self) -> Samples:
         """(hop,) echo of the newest hop by the weights as they are."""

@@ -119,13 +119,13 @@ class FrontEnd:
         elif engine.front == "full":
             tracking = aligner if isinstance(aligner, Aligner) else Aligner(stft.hop, profile)
             self.aligner = tracking
+            if microphones:
+                tracking.hear_by(range(microphones))
             if profile:
                 self.gate = OnsetGate(stft.hop, float(np.sum(np.square(profile.echo.running_response()))))
             path = starting_path(profile, stft.hop, microphones)
             self.linear_stage = LinearStage(tracking, path, Residual(stft, profile), learner)
             self._source: SourceChain | None = None
-            further = profile.array.responses if profile and profile.array else [None] * ((microphones or 1) - 1)
-            self._paths = [profile.echo.impulse_response if profile else None, *further]
             if microphones:
                 noise = profile.array.noise_covariance(stft) if profile and profile.array else None
                 self.spatial = SpatialFilter(stft, microphones, noise)
@@ -152,9 +152,9 @@ class FrontEnd:
             found = self.aligner.step(mic, ref) if self.aligner else None
             x, r = self._analyser.push(mic, found.reference if found else ref)
             return Frame(x, r, self._silence, x, self._noise, self._nothing), found
-        if self.microphones and stage.canceller.tell_by(self.microphones.first):
-            stage.aligner.hear_by(self.microphones.latest(), self._paths[self.microphones.first])
-        aligned = stage.aligner.step(mic, ref)
+        if self.microphones:
+            stage.canceller.tell_by(self.microphones.first)
+        aligned = stage.aligner.step(heard, ref)
         self.linear = linear = stage.step(heard, aligned)
         gain = self.gate.step(mic, ref, aligned) if self.gate else None
         added = self._added(stage.path.source)
@@ -162,6 +162,7 @@ class FrontEnd:
             located = aligned.state == "locked"
             if self.microphones.step(heard, linear.error, ref, aligned.reference, located):
                 self.spatial.use(self.microphones.used)
+                stage.aligner.hear_by(np.flatnonzero(self.microphones.used).tolist())
             r, (x, e, error) = self._combined(self.spatial, heard, aligned.reference, linear.echo, gain)
             uncertainty, fan = self.spatial.independent(linear.uncertainty), self.spatial.fan_psd()
             noise, residual = stage.residual.step(e, error, uncertainty, added, fan)

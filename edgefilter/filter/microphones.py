@@ -70,10 +70,6 @@ class Microphones:
         """(count,) bool."""
         return np.array([at not in self.left_out for at in range(self.count)])
 
-    def latest(self) -> Samples:
-        """(n,) of what the first one that is used heard in the latest block, up to where others came into use."""
-        return self._block[0][self.first]
-
     def step(self, mic: Samples, error: Samples, ref: Samples, aligned: Samples, located: bool) -> bool:
         """Take a hop; whether others are used from now on.
 

@@ -119,7 +119,7 @@ class ReferenceWatch:
             self._search.prepare(self._mic, now, self._onsets.current.start - LATEST)
         elif stage == 1:
             self._stage = 2
-            self._search.listen(self._ref, now, max(self._onsets.current.start, now - WINDOW))
+            self._search.listen({0: self._ref}, now, max(self._onsets.current.start, now - WINDOW))
         elif stage == 2:
             return self._decide(aligned)
         return []

@@ -1,7 +1,8 @@
-"""Which channels of what a program is handed are the microphones of one array."""
+"""Which channels of what a program is handed are the microphones of one array, and which one is what is played."""
 
 from __future__ import annotations
 
+import argparse
 from collections.abc import Sequence
 
 import numpy as np
@@ -10,23 +11,47 @@ from edgefilter.errors import SignalError, UsageError
 from edgefilter.types import MOST_MICROPHONES, Samples
 
 
-def named(mic_channels: Sequence[int] | None) -> list[int] | None:
-    """Numbers of channels, from 0, as they were given; raises UsageError for none, more than eight, or one twice."""
+def named(
+    mic_channels: Sequence[int] | None, reference_channel: int | None = None, there: int | None = None
+) -> list[int] | None:
+    """Numbers of channels, from 0, as they were given: the microphones, and the reference, if it is one of them, last.
+
+    there: how many channels there are, where that is known. Raises UsageError for no microphones, more than eight, a channel
+    that is named twice or is not there, and a reference without microphones.
+    """
     if mic_channels is None:
+        if reference_channel is not None:
+            raise UsageError(f"reference_channel is {reference_channel}, expected mic_channels that name the others")
         return None
     found = list(mic_channels)
     if not 1 <= len(set(found)) == len(found) <= MOST_MICROPHONES or min(found) < 0:
         raise UsageError(
             f"mic_channels is {found}, expected the numbers of one to {MOST_MICROPHONES} different channels, from 0"
         )
+    if reference_channel is not None:
+        if reference_channel < 0 or reference_channel in found:
+            raise UsageError(
+                f"reference_channel is {reference_channel}, expected a channel, from 0, beside mic_channels {found}"
+            )
+        found.append(reference_channel)
+    if there is not None and max(found) >= there:
+        raise UsageError(f"channel {max(found)} is named, found {there} channels, counted from 0: name others")
     return found
 
 
-def microphones(samples: Samples, wanted: Sequence[int]) -> Samples:
+def taken(samples: Samples, wanted: Sequence[int]) -> Samples:
     """(n,) of the one channel that is wanted, else (n, wanted), of samples (n, channels); raises SignalError where one lacks."""
     if max(wanted) >= samples.shape[1]:
         raise SignalError(
-            f"the microphone brings {samples.shape[1]} channels, found channel {max(wanted)} in mic_channels, counted"
-            " from 0: name others"
+            f"the microphone brings {samples.shape[1]} channels, counted from 0, and channel {max(wanted)} is named:"
+            " name others"
         )
     return np.ascontiguousarray(samples[:, wanted[0]] if len(wanted) == 1 else samples[:, list(wanted)])
+
+
+def numbers(text: str) -> list[int]:
+    """Channels as a command line names them, with commas between them."""
+    try:
+        return [int(part) for part in text.split(",")]
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"'{text}' does not name channels, such as 1,2,3") from None

@@ -21,7 +21,7 @@ from edgefilter.dsp.resample import Resampler
 from edgefilter.errors import SignalError, UsageError
 from edgefilter.filter.barge_in import BargeInSettings
 from edgefilter.filter.ego_filter import EgoFilter
-from edgefilter.integrations.channels import microphones, named
+from edgefilter.integrations.channels import named, taken
 from edgefilter.types import SAMPLE_RATE, SET_UP_WRONG, Event, Samples
 
 MOST_QUEUED_S = 600.0
@@ -59,6 +59,10 @@ class Duplex:
         Numbers, from 0, of the channels of what is heard that are microphones, one to eight; the first named is the one
         that the answer sounds like. Without it `hear` takes all channels for microphones, and `hear_pcm16`, which is
         handed what a device brings, the mean of them.
+    reference_channel : int, optional
+        Number, beside mic_channels, of the channel of what is heard that holds what is played, for devices that record
+        it. It is the reference, on the microphones' own clock; what `play` takes is then counted and paced as ever, and
+        no reference.
 
     Attributes
     ----------
@@ -71,7 +75,8 @@ class Duplex:
     Raises
     ------
     UsageError
-        For an engine that answers only at the end of a recording, and mic_channels that name no channels.
+        For an engine that answers only at the end of a recording, and mic_channels or a reference_channel that name
+        no channels.
 
     Notes
     -----
@@ -94,15 +99,17 @@ class Duplex:
         on_event: Callable[[Event], None] | None = None,
         clock: Callable[[], float] = time.monotonic,
         mic_channels: Sequence[int] | None = None,
+        reference_channel: int | None = None,
     ) -> None:
-        self._wanted = named(mic_channels)
+        self._wanted = named(mic_channels, reference_channel)
+        self._both = reference_channel is not None
         self.listeners: list[Callable[[Event], object]] = []
         self.ego = EgoFilter(barge_in=BargeInSettings(judge="network")) if ego is None else ego
         if self.ego.waits_for_end:
             raise UsageError(
                 f"engine {self.ego.engine_name} needs the whole recording before it answers: an agent needs another"
             )
-        self._patience = round(patience_s * SAMPLE_RATE)
+        self._patience = 0 if self._both else round(patience_s * SAMPLE_RATE)
         self._on_event = on_event
         self._clock = clock
         self._queue_lock, self._hear_lock = threading.Lock(), threading.Lock()
@@ -163,7 +170,7 @@ class Duplex:
         at another rate than 16 kHz, by the resamplers' 3.5 ms each way.
         """
         if self._wanted is not None:
-            samples = microphones(samples.reshape(len(samples), -1), self._wanted)
+            samples = taken(samples.reshape(len(samples), -1), self._wanted)
         with self._hear_lock:
             channels = 1 if samples.ndim == 1 else samples.shape[1]
             if self._from_mic.rates[0] != rate or self._from_mic.channels != channels:
@@ -174,6 +181,8 @@ class Duplex:
                 self._forget_unheard(len(samples) / rate)
                 reference = self._reference()
             mic, self._mic = self._mic[: reference.size], self._mic[reference.size :]
+            if self._both:
+                mic, reference = mic[:, :-1], mic[:, -1]
             human = self.ego.process(mic, reference)
             if human.size:
                 self._warn_if_deaf()

@@ -17,7 +17,7 @@ from edgefilter.audio.raw import FULL_SCALE, to_pcm16
 from edgefilter.dsp.resample import Resampler
 from edgefilter.errors import SignalError, UsageError
 from edgefilter.filter.ego_filter import EgoFilter
-from edgefilter.integrations.channels import microphones, named
+from edgefilter.integrations.channels import named, taken
 from edgefilter.integrations.wire import RATES
 from edgefilter.profile.data import Profile
 from edgefilter.types import MOST_MICROPHONES, SAMPLE_RATE, Event, Samples
@@ -81,9 +81,7 @@ class EchoCanceller:
             )
         if not 1 <= channels <= MOST_MICROPHONES:
             raise UsageError(f"channels is {channels}, expected 1 to {MOST_MICROPHONES}: leave some microphones out")
-        array = named(mic_channels)
-        if array and max(array) >= channels:
-            raise UsageError(f"mic_channels names channel {max(array)}, found {channels} channels, counted from 0")
+        array = named(mic_channels, there=channels)
         self.sample_rate, self.channels = sample_rate, channels
         self._heard = [array] if array else [[number] for number in range(channels)]
         self._filters = [EgoFilter(profile, engine) for _ in self._heard]
@@ -182,7 +180,7 @@ class EchoCanceller:
         said = self._of_ref.push(played.reshape(count, -1).mean(axis=1, dtype=np.float32))
         new = []
         for number, ego in enumerate(self._filters):
-            human = ego.process(self._to_filter[number].push(microphones(heard, self._heard[number])), said)
+            human = ego.process(self._to_filter[number].push(taken(heard, self._heard[number])), said)
             new.append(self._from_filter[number].push(human))
         ready = np.concatenate((self._ready, np.stack(new)), axis=1)
         self._ready = ready[:, count:]

@@ -41,6 +41,8 @@ class EgoProcessor(rtc.FrameProcessor[rtc.AudioFrame]):
         Called with each `edgefilter.Event`, in the event loop: `session.interrupt()` may be called there.
     mic_channels : sequence of int, optional
         As of `Duplex`: those channels of the frames that are microphones of an array. Without it their mean is taken.
+    reference_channel : int, optional
+        As of `Duplex`: the channel of the frames that holds what is played; no tap is needed then.
 
     Attributes
     ----------
@@ -53,9 +55,12 @@ class EgoProcessor(rtc.FrameProcessor[rtc.AudioFrame]):
         ego: EgoFilter | None = None,
         on_event: Callable[[Event], None] | None = None,
         mic_channels: Sequence[int] | None = None,
+        reference_channel: int | None = None,
     ) -> None:
         # the room holds speech ahead: none is late
-        self.duplex = Duplex(ego, patience_s=0.0, on_event=on_event, mic_channels=mic_channels)
+        self.duplex = Duplex(
+            ego, patience_s=0.0, on_event=on_event, mic_channels=mic_channels, reference_channel=reference_channel
+        )
         self._ready = b""
 
     def tap(self, output: io.AudioOutput) -> io.AudioOutput:

@@ -26,6 +26,7 @@ from pipecat.frames.frames import (
 from pipecat.processors.frame_processor import FrameDirection, FrameProcessor
 
 from edgefilter.filter.ego_filter import EgoFilter
+from edgefilter.integrations.channels import named
 from edgefilter.integrations.duplex import Duplex, as_pcm16, from_pcm16
 from edgefilter.integrations.turns import TurnByTurn
 from edgefilter.types import SAMPLE_RATE, Event
@@ -48,6 +49,8 @@ class EgoFilters:
         Called with each `edgefilter.Event`, in a thread of the event loop's executor.
     mic_channels : sequence of int, optional
         As of `Duplex`: those of the in_channels that are microphones of an array. Without it their mean is taken.
+    reference_channel : int, optional
+        As of `Duplex`: the one of the in_channels that holds what is played.
 
     Attributes
     ----------
@@ -65,8 +68,10 @@ class EgoFilters:
         out_channels: int = 1,
         on_event: Callable[[Event], None] | None = None,
         mic_channels: Sequence[int] | None = None,
+        reference_channel: int | None = None,
     ) -> None:
-        self.duplex = Duplex(ego, on_event=on_event, mic_channels=mic_channels)
+        named(mic_channels, reference_channel, in_channels)
+        self.duplex = Duplex(ego, on_event=on_event, mic_channels=mic_channels, reference_channel=reference_channel)
         self.params: dict[str, Any] = {
             "audio_in_filter": _Microphone(self.duplex, in_channels),
             "audio_in_channels": in_channels,

@@ -19,6 +19,7 @@ from cyclonedds.util import duration
 
 from edgefilter.errors import DeviceError, SignalError, UsageError
 from edgefilter.filter.ego_filter import EgoFilter
+from edgefilter.integrations.channels import named
 from edgefilter.integrations.duplex import Duplex
 from edgefilter.types import SET_UP_WRONG, Event
 
@@ -96,7 +97,8 @@ class Topics:
 
     rate: Hz, of the microphone's and the reference's 16-bit samples. channels: of the microphone's. mic_channels: those that
     are microphones of an array; the human is then one channel, otherwise as many as came in, of their mean.
-    reference_channels: None for as many as the microphone's.
+    reference_channel: the one of the microphone's that holds what is played, with which the topic of the reference is none.
+    reference_channels: of that topic, None for as many as the microphone's.
     """
 
     mic: str = "/audio"
@@ -107,6 +109,7 @@ class Topics:
     channels: int = 1
     mic_channels: Sequence[int] | None = None
     reference_channels: int | None = None
+    reference_channel: int | None = None
 
 
 class Node:
@@ -124,7 +127,9 @@ class Node:
 
     def __init__(self, ego: EgoFilter, topics: Topics = Topics(), domain: int = 0) -> None:
         self._topics = topics
-        self.duplex = Duplex(ego, on_event=self._tell, mic_channels=topics.mic_channels)
+        microphones, reference = topics.mic_channels, topics.reference_channel
+        named(microphones, reference, topics.channels)
+        self.duplex = Duplex(ego, on_event=self._tell, mic_channels=microphones, reference_channel=reference)
         self._wrong: dict[str, str] = {}
         self._stop = threading.Event()
         try:

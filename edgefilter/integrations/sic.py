@@ -14,6 +14,8 @@ from __future__ import annotations
 import argparse
 import importlib
 import sys
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import redis
 from sic_framework import SICComponentManager
@@ -22,14 +24,15 @@ from sic_framework.core.connector import SICConnector
 from sic_framework.core.message_python2 import AudioMessage, AudioRequest, SICConfMessage, SICMessage, SICRequest
 from sic_framework.core.utils import is_sic_instance
 
-from edgefilter.errors import EdgefilterError
+from edgefilter.errors import EdgefilterError, UsageError
 from edgefilter.filter.barge_in import BargeInSettings
 from edgefilter.filter.ego_filter import EgoFilter
+from edgefilter.integrations.channels import named, numbers
 from edgefilter.integrations.duplex import Duplex
 from edgefilter.types import SAMPLE_RATE, Event
 
 SPEECH = {"speech_started": True, "speech_stopped": False}
-_default = {"profile": None, "engine": "auto"}
+_default: dict[str, Any] = {"profile": None, "engine": "auto", "channels": 1, "mic_channels": None}
 
 
 class HumanConf(SICConfMessage):
@@ -41,10 +44,35 @@ class HumanConf(SICConfMessage):
         File of the calibrated robot, where the component runs; unless given, what its command line says.
     engine : str, optional
         As of `EgoFilter`; likewise.
+    channels : int, optional
+        Of the microphone's sound, interleaved, of which a message does not tell how many it has; likewise.
+    mic_channels : sequence of int, optional
+        Those that are microphones of an array, as of `Duplex`; otherwise their mean is taken.
     """
 
-    def __init__(self, profile: str | None = None, engine: str | None = None) -> None:
-        self.profile, self.engine = profile, engine
+    def __init__(
+        self,
+        profile: str | None = None,
+        engine: str | None = None,
+        channels: int | None = None,
+        mic_channels: Sequence[int] | None = None,
+    ) -> None:
+        self.profile, self.engine, self.channels, self.mic_channels = profile, engine, channels, mic_channels
+
+
+def _ears(
+    profile: str | None,
+    engine: str,
+    channels: int,
+    mic_channels: Sequence[int] | None,
+    on_event: Callable[[Event], None] | None = None,
+) -> tuple[Duplex, int]:
+    """The filter for a microphone of so many channels, and their number; raises EdgefilterError where it cannot be made."""
+    if channels < 1:
+        raise UsageError(f"channels is {channels}, expected at least 1")
+    named(mic_channels, there=channels)
+    ego = EgoFilter(profile, engine, barge_in=BargeInSettings(judge="network"))
+    return Duplex(ego, on_event=on_event, mic_channels=mic_channels), channels
 
 
 class SpeechMessage(SICMessage):
@@ -72,10 +100,8 @@ class HumanComponent(SICComponent):
 
     def __init__(self, *words: object, **more: object) -> None:
         super().__init__(*words, **more)
-        profile = self.params.profile or _default["profile"]
-        engine = self.params.engine or _default["engine"] or "auto"
-        ego = EgoFilter(profile, engine, barge_in=BargeInSettings(judge="network"))
-        self._duplex = Duplex(ego, on_event=self._tell)
+        said = {name: value for name, value in vars(self.params).items() if name in _default and value is not None}
+        self._duplex, self._channels = _ears(**_default | said, on_event=self._tell)
 
     @staticmethod
     def get_conf() -> HumanConf:
@@ -100,7 +126,7 @@ class HumanComponent(SICComponent):
 
     def on_message(self, message: AudioMessage) -> None:
         """Filter what the microphone heard, and send what is finished."""
-        human = self._duplex.hear_pcm16(bytes(message.waveform), message.sample_rate)
+        human = self._duplex.hear_pcm16(bytes(message.waveform), message.sample_rate, self._channels, 1)
         if human:
             answer = AudioMessage(human, sample_rate=message.sample_rate)
             answer._timestamp = message._timestamp
@@ -137,12 +163,12 @@ def main(words: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m edgefilter.integrations.sic", description=__doc__.splitlines()[0])
     parser.add_argument("--profile", help="the calibrated robot")
     parser.add_argument("--engine", default="auto", help="one beside which the network can judge speech")
-    args = parser.parse_args(words)
+    parser.add_argument("--channels", type=int, default=1, help="of the microphone's sound, interleaved")
+    told = "those of them that form an array, from 0, as 0,1,2,3; otherwise the mean of all is taken"
+    parser.add_argument("--mic-channels", type=numbers, help=told)
+    _default.update(vars(parser.parse_args(words)))
     try:
-        EgoFilter(
-            args.profile, args.engine, barge_in=BargeInSettings(judge="network")
-        )  # what cannot be made is said now
-        _default.update(profile=args.profile, engine=args.engine)
+        _ears(**_default)  # what cannot be made is said now
         manager = SICComponentManager([HumanComponent], component_group=Human.component_group, auto_serve=False)
     except redis.exceptions.RedisError as error:
         print(f"edgefilter: the Redis server of DB_IP, DB_PORT and DB_PASS cannot be reached: {error}", file=sys.stderr)

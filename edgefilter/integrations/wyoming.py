@@ -39,6 +39,7 @@ from edgefilter.audio.reader import RATES
 from edgefilter.errors import EdgefilterError, SignalError
 from edgefilter.filter.barge_in import BargeInSettings
 from edgefilter.filter.ego_filter import EgoFilter
+from edgefilter.integrations.channels import named, numbers
 from edgefilter.integrations.duplex import ABSENT_S, MOST_QUEUED_S, Duplex, as_pcm16, from_pcm16
 from edgefilter.integrations.turns import TurnByTurn
 from edgefilter.types import SAMPLE_RATE, Event
@@ -77,6 +78,8 @@ class EgoService:
         What the commands write and read, of width 2.
     mic_channels : sequence of int, optional
         As of `Duplex`: those channels of the microphone that form an array. Without it their mean is taken.
+    reference_channel : int, optional
+        As of `Duplex`: the channel of the microphone that holds what is played.
     recogniser : str, optional
         URI of a Wyoming service that makes text of speech. A third service stands before it then: whoever has the
         microphone's sound recognised there, as Home Assistant does, gets the words of the human's finished turn.
@@ -102,9 +105,13 @@ class EgoService:
         stop_for_speech: bool = False,
         mic_channels: Sequence[int] | None = None,
         recogniser: str | None = None,
+        reference_channel: int | None = None,
     ) -> None:
+        named(mic_channels, reference_channel, None if "://" in microphone else mic_format.channels)
         self._events: list[Event] = []
-        self.duplex = Duplex(ego, on_event=self._events.append, mic_channels=mic_channels)
+        self.duplex = Duplex(
+            ego, on_event=self._events.append, mic_channels=mic_channels, reference_channel=reference_channel
+        )
         self.recogniser = recogniser
         self.mic_format = mic_format
         self.player = Player(loudspeaker, snd_format)
@@ -455,7 +462,9 @@ def main(words: list[str] | None = None) -> int:
         parser.add_argument(f"--{end}-command-rate", type=int, default=rate, help="what the command's sound has")
         parser.add_argument(f"--{end}-command-channels", type=int, default=1, help="what the command's sound has")
     told = "channels of the microphone that form an array, from 0, as 1,2,3; otherwise the mean of all is taken"
-    parser.add_argument("--mic-channels", type=_numbers, help=told)
+    parser.add_argument("--mic-channels", type=numbers, help=told)
+    told = "channel of the microphone, from 0, that holds what is played; goes with --mic-channels"
+    parser.add_argument("--reference-channel", type=int, help=told)
     parser.add_argument("--recogniser", help="URI of a service that makes text of speech: it gets finished turns")
     parser.add_argument("--profile", help="the calibrated robot")
     parser.add_argument("--engine", default="auto", help="one beside which the network can judge speech")
@@ -474,6 +483,7 @@ def main(words: list[str] | None = None) -> int:
             args.stop_for_speech,
             args.mic_channels,
             args.recogniser,
+            args.reference_channel,
         )
         asyncio.run(_until_sigterm(service.run(args.mic_uri, args.snd_uri, args.asr_uri)))
     except KeyboardInterrupt:
@@ -484,11 +494,6 @@ def main(words: list[str] | None = None) -> int:
         print(f"edgefilter: {error}", file=sys.stderr)
         return 1
     return 0
-
-
-def _numbers(text: str) -> list[int]:
-    """Whole numbers with commas between them."""
-    return [int(part) for part in text.split(",")]
 
 
 async def _until_sigterm(serving: Coroutine[None, None, None]) -> None:

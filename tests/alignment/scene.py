@@ -19,10 +19,18 @@ HEAD = 16
 
 
 @dataclass
+class KnownArray:
+    """Paths (microphones - 1, n) of the further microphones."""
+
+    responses: np.ndarray
+
+
+@dataclass
 class KnownPath:
-    """Stands for a profile: only the echo path is read by the aligner."""
+    """Stands for a profile: only the echo paths are read by the aligner."""
 
     echo: EchoModel
+    array: KnownArray | None = None
 
 
 def speech_like(rng: np.random.Generator, seconds: float) -> np.ndarray:
@@ -64,9 +72,10 @@ def robot_body(rng: np.random.Generator) -> np.ndarray:
     return np.concatenate(([1.0], 0.15 * rng.standard_normal(47) * np.exp(-np.arange(47) / 12)))
 
 
-def known_path(h: np.ndarray) -> KnownPath:
-    """A profile's view of an impulse response made by `room`."""
-    return KnownPath(EchoModel(np.pad(h, (PRE_ROLL - HEAD, 0)).astype(np.float32)))
+def known_path(*paths: np.ndarray) -> KnownPath:
+    """A profile's view of the microphones' impulse responses made by `room`."""
+    first, *further = (np.pad(h, (PRE_ROLL - HEAD, 0)).astype(np.float32) for h in paths)
+    return KnownPath(EchoModel(first), KnownArray(np.array(further)) if further else None)
 
 
 def hear(
@@ -156,8 +165,9 @@ def double_talk(
 
 
 def run(aligner, mic: np.ndarray, ref: np.ndarray) -> list:
-    """Every hop's Aligned."""
+    """Every hop's Aligned; mic: (n,), or (microphones, n)."""
     hop = aligner.hop
     return [
-        aligner.step(mic[at : at + hop], ref[at : at + hop]) for at in range(0, min(mic.size, ref.size) - hop + 1, hop)
+        aligner.step(mic[..., at : at + hop], ref[at : at + hop])
+        for at in range(0, min(mic.shape[-1], ref.size) - hop + 1, hop)
     ]

@@ -50,6 +50,57 @@ def test_every_utterance_gets_its_own_lag_in_an_office_beside_a_human_as_loud(ho
         assert time_to_align(hops, truth, onset + lag + HEAD, hop) <= WITHIN
 
 
+def of_an_array(rng):
+    """Three paths, the microphones (3, n) with a fan of their own, the reference, the true delay, and an utterance's arrival."""
+    paths = [np.roll(room(rng, 0.3), shift) for shift in (0, 2, 5)]
+    ref, onsets = utterances(rng, [2.0], [1.0])
+    heard = [hear(ref, [(0, 3000)], path) for path in paths]
+    mics = np.stack([mic + fan(rng, ref.size) for mic, _ in heard])
+    return paths, mics, ref, heard[0][1], onsets[0] + 3000 + HEAD
+
+
+def test_the_other_microphones_of_an_array_find_the_lag_where_the_first_hears_little_of_the_robot():
+    rng = np.random.default_rng(11)
+    paths, mics, ref, truth, arrival = of_an_array(rng)
+    mics[0] += 10 * np.std(mics[0]) * rng.standard_normal(ref.size)
+    alone = run(Aligner(256, known_path(paths[0])), mics[0].astype(np.float32), ref)
+    assert time_to_align(alone, truth, arrival, 256) > WITHIN
+    array = Aligner(256, known_path(*paths))
+    array.hear_by(range(3))
+    assert time_to_align(run(array, mics.astype(np.float32), ref), truth, arrival, 256) <= WITHIN
+
+
+@pytest.mark.parametrize("wrong", ["loopback", "noise", "silent", "another"])
+def test_a_channel_that_is_no_microphone_of_the_robot_does_not_mislead_the_others(wrong):
+    rng = np.random.default_rng(12)
+    paths, mics, ref, truth, arrival = of_an_array(rng)
+    level = np.std(mics[0])
+    mics[2] = {
+        "loopback": np.roll(ref, 40) * level / np.std(ref),
+        "noise": level * rng.standard_normal(ref.size),
+        "silent": 0 * ref,
+        "another": np.roll(mics[2], 9),
+    }[wrong]
+    array = Aligner(256, known_path(*paths))
+    array.hear_by(range(3))
+    hops = run(array, mics.astype(np.float32), ref)
+    assert time_to_align(hops, truth, arrival, 256) <= WITHIN
+    known = [one.delay for one in hops if np.isfinite(one.delay)]
+    assert max(known) - min(known) < CLOSE, "no other lag was believed before"
+
+
+@pytest.mark.parametrize("at", range(0, 18, 2))
+def test_another_microphone_takes_the_place_of_the_first_in_the_middle_of_a_search(at):
+    paths, mics, ref, truth, arrival = of_an_array(np.random.default_rng(13))
+    array, hops = Aligner(256, known_path(*paths)), []
+    array.hear_by(range(3))
+    for begin in range(0, ref.size - 255, 256):
+        if begin // 256 == arrival // 256 - 12 + at:
+            array.hear_by([1, 2])
+        hops.append(array.step(mics[:, begin : begin + 256].astype(np.float32), ref[begin : begin + 256]))
+    assert time_to_align(hops, truth, arrival, 256) <= WITHIN
+
+
 @pytest.mark.parametrize("click", [1e2, 1e4, 1e6])
 def test_utterances_after_one_loud_sample_of_the_reference_are_found(click):
     rng = np.random.default_rng(3)
@@ -198,7 +249,7 @@ def test_hard_cuts_of_two_windows_are_no_lag():
         ref.push((rumble[1] / np.std(rumble)).astype(np.float32))
         search = LagSearch(25600)
         search.prepare(ref, 20000, 17000)
-        search.listen(mic, 20000, 17500)
+        search.listen({0: mic}, 20000, 17500)
         found = search.find()
         worst = max(worst, found.strength * found.ratio if found else 0.0)
     assert worst < 0.8 * CERTAIN_EARLY  # unrelated sounds; cut hard, their edges reach 51 and more
@@ -309,5 +360,5 @@ def test_a_reference_shorter_than_its_fades_is_searched_too(known):
     search, tape = LagSearch(24_000), Tape(60_000)
     tape.push(np.random.default_rng(known).standard_normal(60_000).astype(np.float32))
     search.prepare(tape, 60_000, 60_000 - known)
-    search.listen(tape, 60_000, 60_000 - known)
+    search.listen({0: tape}, 60_000, 60_000 - known)
     assert search.find() is None

@@ -85,6 +85,21 @@ def test_a_channel_is_what_its_levels_say(made: tuple) -> None:
     assert signals["mic"].shape[1] == 3 and np.ptp(levels) < 12.0 and np.abs(signals["mic"]).max() < 1.2
 
 
+def test_without_an_echo_the_same_human_and_fan_are_left(clips: Path, covariances: tuple, made: tuple) -> None:
+    _, signals, meta = made
+    speech, voices = read_clips(clips, (0.5, 8.0)), read_voices([clips])
+    settings = {"microphones": 3, "turns": 1, "moving": True}
+    silent, told = arrays.make(1, 0, "paper", "lab", speech, voices, covariances, **settings, echo=False)
+    for name in ("sweep_ref", "sweep_mic", "fan_only", "clean"):
+        assert np.array_equal(silent[name], signals[name])
+    assert not silent["ref"].any() and told["turns"] == meta["turns"] and told["snr_fan"] == meta["snr_fan"]
+    (turn,) = told["turns"]
+    span = slice(turn["start"], turn["end"])
+    mic, clean = silent["mic"][span], silent["clean"][span]
+    over_fan = 10 * np.log10(np.mean(clean[:, 0] ** 2) / np.mean((mic - clean)[:, 0] ** 2))
+    assert over_fan == pytest.approx(meta["snr_fan"], abs=0.5) and told["sisdr_mix"] == pytest.approx(over_fan, abs=0.5)
+
+
 @pytest.mark.slow
 def test_rows_with_several_microphones_run_where_there_are_so_many(made: tuple, live: Path) -> None:
     folder, signals, meta = made

@@ -69,6 +69,20 @@ def pair(room_of):
     return replace(robot, array=ArrayCalibration(further, cross_density(fan))), sound
 
 
+@pytest.fixture(scope="session")
+def talking(room_of, pair):
+    """The same two microphones behind a loopback of what is played (n, 3): 3.5 s of a robot, a human from 2.5 s on."""
+    room = room_of.Room()
+    room.play(room_of.ROBOT[:56_000])
+    heard = [room.hear(40_000)]
+    room.speak()
+    heard.append(room.hear(16_000))
+    first = np.concatenate(heard)
+    own = 0.1 * np.std(room.fan) * np.random.default_rng(4).standard_normal((2, first.size))
+    mics = np.stack((first, np.roll(first, 3))) + own
+    return pair[0], np.stack((np.concatenate(room.played), *mics), axis=1).astype(np.float32)
+
+
 @pytest.fixture
 def ego(room_of, monkeypatch):
     """The room's time is not the machine's: a slow machine is no microphone that was off."""

@@ -7,6 +7,7 @@ import pytest
 import soxr
 
 from edgefilter import EgoFilter, SignalError, UsageError
+from edgefilter.dsp.resample import Resampler
 from edgefilter.integrations import duplex as module
 from edgefilter.integrations.duplex import Duplex, as_pcm16, from_pcm16
 from edgefilter.integrations.turns import TurnByTurn
@@ -30,9 +31,9 @@ class Witness:
         return np.concatenate(self.references)
 
     def process(self, mic, reference):
-        assert mic.size == reference.size
+        assert len(mic) == reference.size
         self.references.append(reference)
-        return mic
+        return mic if mic.ndim == 1 else mic[:, 0]
 
     def events(self):
         return []
@@ -343,11 +344,50 @@ def test_the_channel_that_is_named_first_is_what_is_heard_of_it():
 
 
 def test_channels_that_are_not_there_are_one_line():
-    with pytest.raises(SignalError, match="brings 2 channels, found channel 2 in mic_channels"):
+    with pytest.raises(SignalError, match="brings 2 channels, counted from 0, and channel 2 is named: name others"):
         Duplex(EgoFilter(engine="bypass"), mic_channels=[0, 2]).hear_pcm16(bytes(40), RATE, 2)
     for wrong in ([], [1, 1], [-1, 0], range(9)):
         with pytest.raises(UsageError, match="expected the numbers of one to 8 different channels, from 0"):
             Duplex(EgoFilter(engine="bypass"), mic_channels=wrong)
+
+
+@pytest.mark.parametrize("rate", [RATE, 48_000])
+@pytest.mark.parametrize("mics", [[1], [2, 1]])
+def test_a_channel_of_the_device_is_the_reference_and_what_is_said_is_none(witness, rate, mics):
+    duplex, heard = Duplex(witness, mic_channels=mics, reference_channel=0), []
+    duplex.play(VOICE, RATE)
+    sound = 0.1 * np.random.default_rng(1).standard_normal((rate // 2, 3)).astype(np.float32)
+    for at in range(0, len(sound), 333):
+        heard.append(duplex.hear(sound[at : at + 333], rate))
+    expected = Resampler(rate, RATE).push(sound[:, 0])
+    np.testing.assert_allclose(witness.reference, expected, atol=1e-6)
+    assert duplex.queued_s == pytest.approx(2.0 - expected.size / RATE), "what is said is still paced by the microphone"
+    if rate == RATE and len(mics) == 1:
+        np.testing.assert_array_equal(np.concatenate(heard), sound[:, 1])
+
+
+def test_an_array_with_a_loopback_beside_it_does_what_the_filter_does_with_both(talking):
+    profile, sound = talking
+    duplex = Duplex(EgoFilter(profile, "linear"), mic_channels=[1, 2], reference_channel=0)
+    pcm = np.rint(sound * 32768).astype("<i2")
+    out = np.concatenate(
+        [from_pcm16(duplex.hear_pcm16(pcm[at : at + 320].tobytes(), RATE, 3, 1)) for at in range(0, len(pcm), 320)]
+    )
+    both = pcm.astype(np.float32) / 32768
+    expected = EgoFilter(profile, "linear").process(both[:, 1:], both[:, 0])
+    np.testing.assert_allclose(out, expected, atol=1 / 32768)
+    part = slice(RATE, 2 * RATE)
+    assert np.mean(out[part] ** 2) < 0.01 * np.mean(both[part, 1] ** 2), "the robot alone"
+
+
+def test_a_reference_channel_that_cannot_be_one_is_one_line():
+    for wrong, mics in ((0, [1, 0]), (-1, [1])):
+        with pytest.raises(UsageError, match=f"reference_channel is {wrong}, expected a channel, from 0, beside"):
+            Duplex(EgoFilter(engine="bypass"), mic_channels=mics, reference_channel=wrong)
+    with pytest.raises(UsageError, match="reference_channel is 5, expected mic_channels that name the others"):
+        Duplex(EgoFilter(engine="bypass"), reference_channel=5)
+    with pytest.raises(SignalError, match="brings 2 channels, counted from 0, and channel 5 is named"):
+        Duplex(EgoFilter(engine="bypass"), mic_channels=[0], reference_channel=5).hear_pcm16(bytes(40), RATE, 2)
 
 
 def test_that_channels_are_averaged_is_said_once(caplog):

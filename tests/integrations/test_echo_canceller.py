@@ -213,5 +213,5 @@ def test_of_one_named_channel_the_others_are_not_heard():
     canceller = EchoCanceller(16000, 2, engine="bypass", mic_channels=[1])
     out = canceller.process(NOISE, NOISE)
     np.testing.assert_allclose(out[canceller.delay :], NOISE[: -canceller.delay, 1], atol=1e-6)
-    with pytest.raises(UsageError, match="mic_channels names channel 2, found 2 channels"):
+    with pytest.raises(UsageError, match="channel 2 is named, found 2 channels"):
         EchoCanceller(16000, 2, engine="bypass", mic_channels=[0, 2])

@@ -177,6 +177,18 @@ def test_a_recogniser_behind_the_stream_adapter_gets_the_finished_turn_of_an_arr
     assert ears.duplex.listeners == []
 
 
+def test_the_loopback_of_the_device_is_the_reference_where_it_is_named(talking):
+    profile, sound = talking
+    ears = EgoProcessor(EgoFilter(profile, "linear"), mic_channels=[1, 2], reference_channel=0)
+    pcm, out = np.rint(sound * 32768).astype("<i2"), []
+    for at in range(0, len(pcm), 320):
+        frame = ears._process(rtc.AudioFrame(pcm[at : at + 320].tobytes(), 16_000, 3, 320))
+        out.append(from_pcm16(frame.data.cast("B"), 3))
+    out, part = np.concatenate(out), slice(16_000, 32_000)
+    assert np.mean(out[part] ** 2) < 0.01 * np.mean(sound[part, 1] ** 2), "no tap is there"
+    assert ears.duplex.ego.stats()["array"]["microphones"] == 2
+
+
 def test_a_voice_activity_that_would_not_notice_the_human_is_refused(ears):
     with pytest.raises(UsageError, match="vad.. got a filter whose engines .linear. do not all judge speech"):
         ears.vad()

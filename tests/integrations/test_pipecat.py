@@ -8,6 +8,7 @@ from pipecat.frames.frames import FilterEnableFrame, InputAudioRawFrame, Transcr
 from pipecat.pipeline.pipeline import Pipeline
 from pipecat.pipeline.worker import PipelineWorker
 from pipecat.processors.audio.vad_processor import VADProcessor
+from pipecat.processors.frame_processor import FrameProcessor
 from pipecat.services.settings import STTSettings
 from pipecat.services.stt_service import SegmentedSTTService
 from pipecat.transports.base_input import BaseInputTransport
@@ -64,6 +65,40 @@ def test_a_stereo_microphone_stays_stereo(filters):
 
     out = np.frombuffer(asyncio.run(hear()), "<i2").reshape(-1, 2)
     assert 2500 < len(out) < 3200 and out.any() and (out[:, 0] == out[:, 1]).all()
+
+
+def test_the_loopback_of_the_device_is_the_reference_where_it_is_named(talking):
+    profile, sound = talking
+    ears = EgoFilters(EgoFilter(profile, "linear"), in_channels=3, mic_channels=[1, 2], reference_channel=0)
+    pcm = np.rint(sound * 32768).astype("<i2")
+    heard = []
+
+    class Listener(FrameProcessor):
+        async def process_frame(self, frame, direction):
+            await super().process_frame(frame, direction)
+            if isinstance(frame, InputAudioRawFrame):
+                heard.append(from_pcm16(frame.audio, frame.num_channels))
+            await self.push_frame(frame, direction)
+
+    async def listen():
+        over = asyncio.Event()
+        params = TransportParams(audio_in_enabled=True, audio_in_sample_rate=16_000, **ears.params)
+        worker = PipelineWorker(Pipeline([Microphones(sound, params, over), Listener()]))
+        runner = WorkerRunner(handle_sigint=False)
+        await runner.add_workers(worker)
+        running = asyncio.create_task(runner.run())
+        await over.wait()
+        await worker.cancel()
+        await running
+
+    asyncio.run(asyncio.wait_for(listen(), 120))
+    both, out = pcm.astype(np.float32) / 32768, np.concatenate(heard)
+    expected = EgoFilter(profile, "linear").process(both[:, 1:], both[:, 0])
+    np.testing.assert_allclose(out, expected[: out.size], atol=1 / 32768)
+    part = slice(16_000, 32_000)
+    assert np.mean(out[part] ** 2) < 0.01 * np.mean(both[part, 1] ** 2), "nothing was handed to the loudspeaker"
+    with pytest.raises(UsageError, match="channel 3 is named, found 3 channels"):
+        EgoFilters(EgoFilter(engine="linear"), in_channels=3, mic_channels=[1, 2], reference_channel=3)
 
 
 def test_it_can_be_switched_off_while_it_runs(filters):

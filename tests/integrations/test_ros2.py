@@ -151,11 +151,15 @@ def test_the_node_gives_the_human_and_barge_in_also_after_it_was_killed_and_star
         robot.barge_in.take(100)
 
 
-def test_of_an_array_the_named_channels_are_its_microphones_and_the_human_is_one_channel(tmp_path, pair):
-    profile, sound = pair
+@pytest.mark.parametrize("loopback", [False, True])
+def test_of_an_array_the_named_channels_are_its_microphones_and_the_human_is_one_channel(
+    tmp_path, pair, talking, loopback
+):
+    profile, sound = talking if loopback else pair
     profile.save(tmp_path / "pair.npz")
     pcm = np.rint(sound * 32768).astype("<i2")
-    words = ("--channels", 3, "--mic-channels", "1,2", "--reference-channels", 1, "--engine", "ss")
+    reference = ("--reference-channel", 0) if loopback else ("--reference-channels", 1)
+    words = ("--channels", 3, "--mic-channels", "1,2", *reference, "--engine", "ss")
     robot = Robot(domain=89)
     process = node(89, tmp_path, *words, profile=tmp_path / "pair.npz")
     try:
@@ -171,7 +175,8 @@ def test_of_an_array_the_named_channels_are_its_microphones_and_the_human_is_one
     human = np.frombuffer(heard, "<i2") / 32768
     assert 2.5 * RATE < human.size < len(pcm)
     ego = EgoFilter(profile, "ss", barge_in=BargeInSettings(judge="network"))
-    wanted = ego.process(pcm[:, 1:] / np.float32(32768), np.zeros(len(pcm), np.float32))
+    played = pcm[:, 0] / np.float32(32768) if loopback else np.zeros(len(pcm), np.float32)
+    wanted = ego.process(pcm[:, 1:] / np.float32(32768), played)
     np.testing.assert_allclose(human, wanted[: human.size], atol=1 / 32768)
 
 
@@ -199,6 +204,11 @@ def test_a_message_that_is_no_sound_is_a_line_and_the_node_goes_on(tmp_path):
         (["--mic", "audio"], "topic 'audio' does not begin with a slash"),
         (["--domain", "500"], "'500' is not a domain, 0 to 232"),
         (["--rate", "x"], "'x' is not a rate"),
+        (["--reference-channel", "5"], "reference_channel is 5, expected mic_channels that name the others"),
+        (
+            ["--channels", "4", "--mic-channels", "all", "--reference-channel", "4"],
+            "channel 4 is named, found 4 channels",
+        ),
     ],
 )
 def test_what_cannot_be_a_node_is_one_line(words, said, capsys):

@@ -6,15 +6,21 @@ import socket
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from edgefilter import Profile
+from edgefilter.calibration.array import cross_density
 from edgefilter.dsp.metrics import si_sdr
+from edgefilter.dsp.resample import Resampler
+from edgefilter.profile.array import ArrayCalibration
 
 ROOT = Path(__file__).parents[2]
 PROGRAM = Path(__file__).with_name("sic_program.py")
+PROFILE = ROOT / "edgefilter/demo_data/profile.npz"
 RATE = 16_000
 
 
@@ -45,9 +51,9 @@ class Cloud:
             time.sleep(0.05)
         raise RuntimeError("redis-server did not start")
 
-    def component(self):
+    def component(self, profile=PROFILE, *words):
         with open(self.folder / "component.log", "a") as log:
-            words = ("-m", "edgefilter.integrations.sic", "--profile", str(ROOT / "edgefilter/demo_data/profile.npz"))
+            words = ("-m", "edgefilter.integrations.sic", "--profile", str(profile), *words)
             started = self.start(sys.executable, *words, stdout=log, stderr=log)
         for _ in range(400):
             if "HumanComponent" in (self.folder / "component.log").read_text():
@@ -55,9 +61,9 @@ class Cloud:
             time.sleep(0.05)
         raise RuntimeError((self.folder / "component.log").read_text())
 
-    def run_program(self):
+    def run_program(self, *words):
         done = subprocess.run(
-            [sys.executable, PROGRAM, self.folder], env=self.environment, cwd=self.folder, capture_output=True, text=True, timeout=120
+            [sys.executable, PROGRAM, self.folder, *words], env=self.environment, cwd=self.folder, capture_output=True, text=True, timeout=120
         )  # fmt: skip
         told = self.folder / "told.json"
         assert told.exists(), done.stdout[-2000:] + done.stderr[-2000:]
@@ -90,6 +96,20 @@ def test_a_program_gets_the_human_and_is_told_when_he_interrupts_also_after_the_
     check(*cloud.run_program(), room_of)
 
 
+@pytest.mark.slow
+def test_the_four_microphones_of_a_robot_s_head_are_one_array(cloud, room_of):
+    robot, rng = Profile.load(PROFILE), np.random.default_rng(6)
+    fan = np.tile(room_of.Room().fan, 20)
+    heard = np.stack([np.roll(fan, 3 * at) for at in range(4)]) + 0.1 * np.std(fan) * rng.standard_normal((4, fan.size))
+    further = np.stack([np.roll(robot.echo.impulse_response, 3 * at) for at in range(1, 4)])
+    four = replace(robot, array=ArrayCalibration(further, cross_density(heard.astype(np.float32))))
+    four.save(cloud.folder / "four.npz")
+    cloud.redis()
+    cloud.component(cloud.folder / "four.npz", "--channels", "4")
+    sound, told = cloud.run_program("four")
+    check(Resampler(48_000, RATE).push(sound.astype(np.float32), last=True), told, room_of)
+
+
 def check(sound, told, room_of):
     """The room's human begins after 3 s, 23 dB below the robot, who talks until 5.7 s."""
     assert sound.size > 5.5 * RATE
@@ -108,7 +128,15 @@ def test_without_a_server_it_is_one_line(cloud):
     assert done.returncode == 1 and len(said) == 1 and "Redis" in said[0], done.stderr
 
 
-def test_a_profile_that_is_none_is_one_line(cloud):
-    words = ("-m", "edgefilter.integrations.sic", "--profile", str(PROGRAM))
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--profile", str(PROGRAM)], "profile"),
+        (["--engine", "linear", "--channels", "4", "--mic-channels", "1,2,4"], "channel 4 is named, found 4 channels"),
+        (["--engine", "linear", "--channels", "0"], "channels is 0, expected at least 1"),
+    ],
+)
+def test_what_cannot_be_a_component_is_one_line(cloud, words, said):
+    words = ("-m", "edgefilter.integrations.sic", *words)
     done = subprocess.run([sys.executable, *words], env=cloud.environment, capture_output=True, text=True, timeout=100)
-    assert done.returncode == 1 and len(done.stderr.splitlines()) == 1 and "profile" in done.stderr
+    assert done.returncode == 1 and len(done.stderr.splitlines()) == 1 and said in done.stderr

@@ -259,6 +259,56 @@ def test_a_microphone_that_sends_a_broken_chunk_is_opened_again(broken, player, 
     assert "cannot be read" in caplog.text and "expected" in caplog.text
 
 
+def test_the_loopback_of_the_device_is_the_reference_where_it_is_named(talking, player, tmp_path):
+    """As a command records it: three channels, the first of which is what is played."""
+    profile, sound = talking
+    (tmp_path / "six.raw").write_bytes(np.rint(sound * 32768).astype("<i2").tobytes())
+    code = (
+        f"import sys, time; data = open({str(tmp_path / 'six.raw')!r}, 'rb').read(); time.sleep(2)\n"
+        "for at in range(0, len(data), 1920): sys.stdout.buffer.write(data[at:at+1920]); sys.stdout.flush();"
+        " time.sleep(0.002)\n"
+        "time.sleep(60)"
+    )
+    ports = [f"tcp://127.0.0.1:{free_port(2) + at}" for at in range(2)]
+    heard, ego = [], EgoFilter(profile, "linear")
+    microphone = f'{sys.executable} -c "{code}"'
+    form = AudioFormat(RATE, 2, 3)
+
+    async def talk():
+        service = EgoService(microphone, player, ego, form, mic_channels=[1, 2], reference_channel=0)
+        serving = asyncio.create_task(service.run(*ports))
+        try:
+            client = await client_of(ports[0])
+            while sum(map(len, heard)) < 2.2 * RATE:
+                message = await client.read_event()
+                if AudioChunk.is_type(message.type):
+                    heard.append(from_pcm16(AudioChunk.from_event(message).audio))
+            await client.disconnect()
+        finally:
+            serving.cancel()
+            await asyncio.gather(serving, return_exceptions=True)
+
+    within_a_minute(talk)
+    out, part = np.concatenate(heard), slice(RATE, 2 * RATE)
+    assert np.mean(out[part] ** 2) < 0.01 * np.mean(sound[part, 1] ** 2)
+    assert ego.stats()["array"]["microphones"] == 2
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--reference-channel", "2"], "reference_channel is 2, expected mic_channels that name the others"),
+        (["--mic-channels", "0,1", "--reference-channel", "1"], "beside mic_channels [0, 1]"),
+        (["--mic-channels", "0", "--reference-channel", "6"], "channel 6 is named, found 3 channels"),
+    ],
+)
+def test_channels_that_a_command_does_not_have_are_one_line(words, said, capsys):
+    command = ["--microphone", "true", "--loudspeaker", "true", "--engine", "linear", "--mic-command-channels", "3"]
+    assert main([*command, *words]) == 1
+    told = capsys.readouterr().err
+    assert said in told and told.count("\n") == 1
+
+
 def test_one_sigterm_ends_it_with_its_commands(endless_noise, player):
     ports = free_port(2)
     mic_uri, snd_uri = (f"tcp://127.0.0.1:{ports + i}" for i in range(2))
