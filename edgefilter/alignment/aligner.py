@@ -28,6 +28,8 @@ from edgefilter.alignment.utterances import OnsetDetector, Utterance
 from edgefilter.profile.data import Profile
 from edgefilter.types import PRE_ROLL, SAMPLE_RATE, AlignmentCounts, AlignmentState, AlignmentStats, Samples
 
+MOST_LAG_S = 2.0
+"""Lag of the playback up to which it is found: of speech that comes in a burst and is played later, over a network."""
 SEARCH_STRIDE = 768
 """Samples between two searches of the whole range."""
 COARSE_MARGIN = 400
@@ -57,7 +59,7 @@ class Aligner:
     ('locked', 2000)
     """
 
-    def __init__(self, hop: int, profile: Profile | None = None, max_lag_s: float = 1.5) -> None:
+    def __init__(self, hop: int, profile: Profile | None = None, max_lag_s: float = MOST_LAG_S) -> None:
         self.hop = hop
         self._max_lag = int((max_lag_s + 0.1) * SAMPLE_RATE)
         further = profile.array.responses if profile and profile.array else ()

@@ -15,12 +15,13 @@ RANGE = 1e-5
 """A band's power is told down to so much of the loudest band's so far, -50 dB."""
 MEMORY_S = 3.0
 """Time constant of the correlation, and of the means that are removed."""
-CHANCE = 0.1
-"""Correlation that the best of a hundred wrong lags has at least: a smaller one says nothing more for the right lag."""
-ENOUGH_S, CERTAIN = 1.0, 0.6
-"""Seconds of both that must have been heard, and correlation times its ratio to the best elsewhere from which on it is believed.
-After 1.5 s of robot six of six unknown devices have 0.78 and more. Beside other speech, while the reference plays unheard,
-20 of 80 pairs of 10 s go beyond it once: a canceller that looks in vain takes nothing away.
+CHANCE = 0.05
+"""Correlation that the best wrong lag has at least: a smaller one says nothing more for the right lag."""
+ENOUGH_S = 0.75
+"""Seconds of both that must have been heard at that lag. Of 65 pairs with an echo (12 real devices without a calibration, and
+simulated ones of validation voices) all are found, half within 0.82 s and nine in ten within 1.46 s. Beside other speech,
+while the reference plays unheard, 2 of 80 pairs of 10 s are believed in once (4 at 0.6 s, none at 1.0): a canceller that
+looks in vain takes nothing away.
 """
 SAME = 3
 """Lags on each side, in hops, that are the same arrival."""
@@ -30,8 +31,9 @@ class CoarseLag:
     """Correlates the shapes of the spectra of microphone and reference at every lag, hop by hop.
 
     A shape is the log energies of BANDS bands, less their means over time and over the bands. No phase and no level are
-    in it, so that neither a diffuse path nor a microphone that was processed hides the lag. hop: samples per step, and
-    resolution. max_lag: samples.
+    in it, so that neither a diffuse path nor a microphone that was processed hides the lag. What a voice has in common with
+    itself a while ago shows beside the right lag as well, so the other lags count by what that leaves of theirs. hop:
+    samples per step, and resolution. max_lag: samples.
 
     >>> rng = np.random.default_rng(0)
     >>> voice = rng.standard_normal(64000).astype(np.float32) * (1 + np.sin(np.arange(64000) / 700))
@@ -54,7 +56,7 @@ class CoarseLag:
         self._loudest = np.zeros((2, 1), np.float32)
         self._means = np.zeros((2, self._edges.size), np.float32)
         self._past = np.zeros((lags, self._edges.size), np.float32)
-        self._cross, self._power = np.zeros(lags), np.zeros(lags)
+        self._cross, self._power, self._alike = np.zeros((3, lags))
         self._heard = 0.0
         self._frames = 0
 
@@ -76,17 +78,19 @@ class CoarseLag:
         self._past[1:] = self._past[:-1]
         self._past[0] = played
         self._cross = self._forget * self._cross + self._past @ heard
+        self._alike = self._forget * self._alike + self._past @ played
         self._power = self._forget * self._power + np.square(self._past).sum(axis=1)
         self._heard = self._forget * self._heard + float(heard @ heard)
 
     def find(self) -> int | None:
-        """The lag in samples, None where none is beyond doubt."""
-        if self._frames * self._hop < ENOUGH_S * SAMPLE_RATE:
-            return None
+        """The lag in samples, None where none is beyond doubt: its correlation times the ratio to the best elsewhere is below 1."""
         score = self._cross / np.sqrt(self._power * self._heard + fourier.TINY)
         at = int(score.argmax())
-        elsewhere = max(score[: max(at - SAME, 0)].max(initial=CHANCE), score[at + SAME + 1 :].max(initial=CHANCE))
-        return at * self._hop if score[at] ** 2 > CERTAIN * elsewhere else None
+        alike = self._alike / (self._alike[0] + fourier.TINY)
+        left = score - score[at] * np.concatenate((alike[at:0:-1], alike[: score.size - at]))
+        elsewhere = max(left[: max(at - SAME, 0)].max(initial=CHANCE), left[at + SAME + 1 :].max(initial=CHANCE))
+        heard = (self._frames - at) * self._hop >= ENOUGH_S * SAMPLE_RATE
+        return at * self._hop if heard and score[at] ** 2 > elsewhere else None
 
 
 def _mel(hz: float) -> float:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
+from edgefilter.alignment.aligner import MOST_LAG_S
 from edgefilter.audio import pulse, virtual
 from edgefilter.calibration.array import FARTHEST
 from edgefilter.calibration.chirps import LEVEL_DB, SOFTER_DB, Heard, chirps, judge
@@ -38,8 +39,6 @@ SAME, UNLIKE = 0.999, 0.2
 """Coherence of a copy, and that below which a channel is no microphone of the array: the array of a real robot has .7 to
 .99 up to 4 kHz in its own noise, a microphone of another kind beside it .1."""
 
-MOST_LAG_S = 1.5
-"""Lag that the filter searches."""
 LINEAR_DB = 15.0
 """Echo over what a linear filter leaves from which on the set-up is good: small loudspeakers at moderate volume have 20
 to 27 dB."""

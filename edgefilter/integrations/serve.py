@@ -22,7 +22,7 @@ from websockets.http11 import Request, Response
 from edgefilter.dsp.resample import Resampler
 from edgefilter.errors import EdgefilterError, SignalError
 from edgefilter.filter.ego_filter import EgoFilter
-from edgefilter.integrations.channels import microphones
+from edgefilter.integrations.channels import taken
 from edgefilter.integrations.duplex import Pace, all_of_pcm16, as_pcm16, from_pcm16
 from edgefilter.integrations.wire import Form, TwoStreams, message_of
 from edgefilter.types import SAMPLE_RATE, SET_UP_WRONG, Event, Samples
@@ -102,7 +102,7 @@ class Session:
             mic, ref = self._two.take()
         else:
             both = all_of_pcm16(message, self.form.microphones + 1)
-            mic, ref = microphones(both, range(self.form.microphones)), np.ascontiguousarray(both[:, -1])
+            mic, ref = taken(both, range(self.form.microphones)), np.ascontiguousarray(both[:, -1])
         return self._filter(mic, ref, last=False), False
 
     def finish(self) -> list[Answer]:
@@ -294,7 +294,7 @@ class Service:
 
 def _microphones_of(pcm: bytes, count: int) -> Samples:
     """(n,) of one microphone, (n, count) of several."""
-    return microphones(all_of_pcm16(pcm, count), range(count))
+    return taken(all_of_pcm16(pcm, count), range(count))
 
 
 def _text(kind: str, **more: object) -> str:

@@ -116,3 +116,12 @@ def test_after_a_coarse_lag_a_sharp_arrival_is_told_and_the_reference_is_read_wh
     assert "locked" in {one.state for one in found[-200:]} and abs(found[-1].delay - 5_000) < 2
     late, end = np.concatenate([one.reference for one in found[-90:]]), len(found) * HOP
     np.testing.assert_allclose(late, x[end - late.size - coarse : end - coarse], atol=0.05 * np.abs(late).max())
+
+
+@pytest.mark.parametrize("path", [np.ones(1), diffuse(100, 1)], ids=["sharp", "diffuse"])
+def test_a_lag_of_nearly_two_seconds_is_found(path):
+    x = robot_speech(8.0)
+    mic = heard(x, path, 31_000, -30, 3)
+    aligner = Aligner(HOP)
+    found = [aligner.step(*pair).delay for pair in zip(hops(mic), hops(x), strict=True)]
+    assert 31_000 - HOP < found[-1] < 31_000 + 600 + HOP
