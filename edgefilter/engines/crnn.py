@@ -53,25 +53,30 @@ are noticed as soon.
 """
 LASTING = 3
 """Frames that must be as loud, so that no click counts."""
+ONE = np.float32(1.0)
 
 
-class Levels(NamedTuple):
-    """How loud a stream's microphone and reference have been, as powers of frames.
+class Level(NamedTuple):
+    """How loud a stream's microphone, or its reference, has been, as powers of frames.
 
-    loudest: (2,). latest: (LASTING, 2).
+    loudest: so far. latest: of the last LASTING frames.
     """
 
-    loudest: Samples
-    latest: Samples
+    loudest: float = 0.0
+    latest: tuple[float, ...] = (0.0,) * LASTING
 
-    def after(self, frame: Frame) -> Levels:
-        """These, and one more frame."""
-        latest = np.vstack((self.latest[1:], (_power(frame.mic), _power(frame.reference))))
-        return Levels(np.maximum(latest.min(axis=0), FADE * self.loudest), latest)
+    def after(self, power: float) -> Level:
+        """The same, and one more frame."""
+        latest = (*self.latest[1:], power)
+        return Level(max(min(latest), FADE * self.loudest), latest)
+
+    def factor(self, usual: float) -> np.float32:
+        """What brings the loudest frame to the usual power, 1 of a channel that was silent."""
+        return np.float32(math.sqrt(usual / self.loudest) if self.loudest else 1.0)
 
 
-CrnnState: TypeAlias = tuple[tuple[Samples, ...], Samples, Levels]
-"""The network's state tensors, all zeros at the start, the state of `ss`, and the levels."""
+CrnnState: TypeAlias = tuple[tuple[Samples, ...], Samples, tuple[Level, Level]]
+"""The network's state tensors, all zeros at the start, the state of `ss`, and the levels of microphone and reference."""
 
 
 class Crnn:
@@ -109,18 +114,19 @@ class Crnn:
         noise = np.random.default_rng(0).standard_normal((4, self.stft.bins, 2), np.float32)
         mic, reference, echo, error = noise.view(np.complex64)[..., 0]
         power = np.ones(self.stft.bins, np.float32)
-        places = self._run(Frame(mic, reference, echo, error, power, power), self.initial_state()[0])
+        places = self._run(Frame(mic, reference, echo, error, power, power), self.initial_state()[0], ONE, ONE)
         return [places.spectrum, places.probability, *places.next_states]
 
     def initial_state(self) -> CrnnState:
         tensors = tuple(np.zeros(shape, np.float32) for _, shape in self.model.states)
-        return tensors, self._ss.initial_state(), Levels(*(np.zeros(shape, np.float32) for shape in (2, (LASTING, 2))))
+        return tensors, self._ss.initial_state(), (Level(), Level())
 
     def step(self, frame: Frame, state: CrnnState) -> tuple[Output, CrnnState]:
-        tensors, mask, levels = state
-        levels = levels.after(frame)
-        levelled, scale = at_training_level(frame, levels.loudest)
-        places = self._run(levelled, tensors)
+        tensors, mask, (mic, reference) = state
+        heard = _power(frame.mic)
+        mic, reference = mic.after(heard), reference.after(_power(frame.reference))
+        scale = mic.factor(LOUD[0])
+        places = self._run(frame, tensors, scale, reference.factor(LOUD[1]))
         human: Spectrum = places.spectrum * np.float32(1.0 / scale)
         if self._ss_helps:
             masked, mask = self._ss.step(frame, mask)
@@ -128,18 +134,19 @@ class Crnn:
         if frame.idle:
             human = _with_what_is_sure(human, frame)
         power = _power(human)
-        gain = _limited(power, LOUDEST * _power(frame.mic))
+        gain = _limited(power, LOUDEST * heard)
         if gain is None:  # numbers have grown beyond all bounds: begin anew, and until then the linear stage alone
             return Output(frame.error, 0.0), self.initial_state()
         following = tuple(place.copy() for place in places.next_states)
-        speaks = 0.0 if power < FAINT * levels.loudest[0] else min(max(places.probability.item(), 0.0), 1.0)
-        return Output(gain * human, speaks), (following, mask, levels)
+        speaks = 0.0 if power < FAINT * mic.loudest else min(max(places.probability.item(), 0.0), 1.0)
+        return Output(gain * human, speaks), (following, mask, (mic, reference))
 
-    def _run(self, frame: Frame, state: tuple[Samples, ...]) -> Places:
-        """The network on one frame; its answers stand in the places."""
+    def _run(self, frame: Frame, state: tuple[Samples, ...], mic: np.float32, reference: np.float32) -> Places:
+        """The network on one frame, microphone and reference multiplied by those factors; its answers stand in the places."""
         places = self._places()
+        factors = {"reference": reference, **dict.fromkeys(POWERS, mic**2)}
         for name, inputs in places.inputs:
-            inputs[:] = getattr(frame, name)
+            np.multiply(getattr(frame, name), factors.get(name, mic), out=inputs)
         for place, tensor in zip(places.states, state):
             place[...] = tensor
         places.slots.run()
@@ -160,18 +167,6 @@ class Crnn:
             probability = slots.outputs["speech_probability"]
             self._own.places = Places(slots, [*spectra, *powers], spectrum, probability, states, next_states)
         return self._own.places
-
-
-def at_training_level(frame: Frame, loudest: Samples) -> tuple[Frame, np.float32]:
-    """The frame with microphone and reference as loud as in training, and the factor on the microphone.
-
-    loudest: (2,) power of the loudest frames of each so far; a channel that was silent stays as it is.
-    """
-    mic, reference = (
-        np.float32(math.sqrt(usual / most) if most else 1.0) for usual, most in zip(LOUD, loudest, strict=True)
-    )
-    spectra = mic * frame.mic, reference * frame.reference, mic * frame.echo, mic * frame.error
-    return Frame(*spectra, mic**2 * frame.noise_psd, mic**2 * frame.residual_psd, frame.idle), mic
 
 
 def _with_what_is_sure(human: Spectrum, frame: Frame) -> Spectrum:

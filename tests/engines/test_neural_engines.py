@@ -14,7 +14,7 @@ import soundfile
 
 from edgefilter.dsp.metrics import si_sdr
 from edgefilter.engines import create, onnx_session
-from edgefilter.engines.crnn import Crnn, at_training_level
+from edgefilter.engines.crnn import LOUD, Crnn
 from edgefilter.engines.paper_crnn import PaperCrnn
 from edgefilter.errors import ModelError, SignalError, UsageError
 from edgefilter.filter.ego_filter import EgoFilter
@@ -55,10 +55,10 @@ def test_crnn_answers_what_onnxruntime_answers_for_the_same_frames():
         noise, residual = rng.random((2, engine.stft.bins)).astype(np.float32)
         heard = Frame(mic=mic, reference=reference, echo=echo, error=error, noise_psd=noise, residual_psd=residual)
         output, state = engine.step(heard, state)
-        levelled, scale = at_training_level(heard, state[2].loudest)
-        spectra = levelled.error, levelled.mic, levelled.reference, levelled.echo
+        scale, of_reference = (level.factor(usual) for usual, level in zip(LOUD, state[2], strict=True))
+        spectra = scale * error, scale * mic, of_reference * reference, scale * echo
         pairs = [np.stack((x.real, x.imag), axis=-1)[None] for x in spectra]
-        powers = [levelled.noise_psd[None], levelled.residual_psd[None]]
+        powers = [scale**2 * noise[None], scale**2 * residual[None]]
         found, probability, *theirs = session.run(
             None, dict(zip([slot.name for slot in session.get_inputs()], pairs + powers + theirs, strict=True))
         )
@@ -84,11 +84,11 @@ def test_a_model_that_answers_a_probability_beyond_0_to_1_is_held_to_them(tmp_pa
 def test_what_is_far_softer_than_the_robot_has_been_is_nobody_who_interrupts(below_db, heard):
     engine, rng = Crnn(EDGE), np.random.default_rng(3)
     frame = Frame(*(spectrum(rng, 257) for _ in range(4)), *np.full((2, 257), 1e-6, np.float32))
-    tensors, mask, levels = engine.initial_state()
-    answer = engine.step(frame, (tensors, mask, levels))[0].spectrum
+    tensors, mask, (mic, reference) = engine.initial_state()
+    answer = engine.step(frame, (tensors, mask, (mic, reference)))[0].spectrum
     for _ in range(3):  # the level of the robot changes what the network is told, and so its answer
-        loudest = np.array([np.sum(np.abs(answer) ** 2) * 10 ** (below_db / 10), 1.0], np.float32)
-        output, _ = engine.step(frame, (tensors, mask, levels._replace(loudest=loudest)))
+        loud = mic._replace(loudest=float(np.sum(np.abs(answer) ** 2)) * 10 ** (below_db / 10))
+        output, _ = engine.step(frame, (tensors, mask, (loud, reference._replace(loudest=1.0))))
         answer = output.spectrum
     assert (output.speech_probability > 0.0) == heard
 

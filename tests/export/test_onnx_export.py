@@ -12,7 +12,7 @@ import torch
 from scipy.special import logit
 
 from edgefilter import enhance
-from edgefilter.engines.crnn import FADE, LASTING, LOUD, Crnn, Levels
+from edgefilter.engines.crnn import FADE, LOUD, Crnn, Level
 from edgefilter.engines.onnx_session import open_session
 from edgefilter.engines.paper_crnn import PaperCrnn as PaperEngine
 from edgefilter.errors import ModelError
@@ -104,9 +104,9 @@ def test_the_graph_is_opset_17_and_its_gru_is_torchs(exported):
     assert exported[0].memory.bias_hh_l0.abs().min() > 0
 
 
-def as_loud_as_in_training() -> Levels:
+def as_loud_as_in_training() -> tuple[Level, ...]:
     """Levels after which the engine scales the next frame by 1."""
-    return Levels(np.array(LOUD, np.float32) / np.float32(FADE), np.zeros((LASTING, 2), np.float32))
+    return tuple(Level(usual / FADE) for usual in LOUD)
 
 
 def test_the_engine_computes_what_torch_computes(exported):
