@@ -66,7 +66,9 @@ def _inquiry(profile: Profile, wanted: list[tuple[str, ...]], recording: Samples
         )
     inquiry = Inquiry(profile, wanted, recording, reference)
     if len(inquiry.explanations) < 2:
-        raise SignalError(f"nothing to ask: {first} and the others predict the same, under other names")
+        raise SignalError(
+            f"nothing to ask: {joined('+'.join(one) for one in wanted)} predict the same, under other names"
+        )
     return inquiry
 
 
@@ -142,13 +144,16 @@ def _digest(path: str) -> str:
 def _tell(args: argparse.Namespace, answer: Answer, names: dict[str, Any]) -> None:
     """Which it is, or what is left and what to do then."""
     seconds = len(answer.sounds) * SOUND_S
-    ranked = sorted(zip(answer.likely, answer.explanations, strict=True), key=lambda pair: -pair[0])
-    shares = ", ".join(f"{one.name} {100 * weight:.3g} %" for weight, one in ranked)
+    shares = ", ".join(f"{one.name} {100 * weight:.3g} %" for one, weight in answer.ranked)
     lines = [f"played      {words}" for words in answer.sounds]
     if answer.settled:
         chance = f"{answer.odds:.0f}" if answer.odds < 1000 else "more than 1000"
         lines += [f"it is       {answer.first.name}, {chance} to 1 ({shares})"]
         lines += [f"next        {add_command(answer.first.effects, names)}"]
+    elif answer.likely[-1] == answer.likely.max():
+        lines += [
+            "none        of them predicts what was heard; was anything else heard, or is the path another by now?"
+        ]
     else:
         lines += [f"open        {shares}: not {ENOUGH:.0f} to 1 after {seconds:g} s; ask for more with --seconds"]
     print_result(args, lines, {"schema": SCHEMA, **answer.to_dict(), "seconds": seconds})

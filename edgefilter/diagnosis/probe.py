@@ -28,10 +28,16 @@ ENOUGH = 20.0
 """Odds at which a question is settled: the 5 % that a test is usually allowed."""
 SOUND_S = 2.5
 """Seconds of one sound: two are what a robot plays without anybody asking why."""
-MARK_S, GAP_S = 0.25, 0.15
-"""Each begins with a noise, by which its lag is found, and a gap: silence and lines have no lag of their own."""
+MARK_S, GAP_S, END_S = 0.25, 0.15, 0.1
+"""Each begins with a noise, by which its lag is found where it is silent itself, and a gap, and ends in silence, so that
+its reverberation is judged as well."""
+LINES = 150
+"""Of that sound: every 25th of the odd ones, so that products of two or three of them fall between."""
 ERROR_TAPS = 64
 """Of the path (4 ms) by which a simulated explanation is off: the direct sound and what is near."""
+NONE = 100.0
+"""Times the variance that the best explanation expects: with so much more nothing is known. By the likelihood that is
+nearer from ten times the expected power on; right explanations of simulated robots leave up to 3 times of it."""
 TWINS = 1e-5
 """Part of the voice's power (-50 dB) by which two explanations have to differ, to be two."""
 
@@ -65,7 +71,10 @@ class Sound:
 
 @dataclass(frozen=True, eq=False)
 class Answer:
-    """What was asked and answered: explanations with their probabilities likely (explanations,), after those sounds."""
+    """What was asked and answered: the explanations and their probabilities, after those sounds.
+
+    likely: (explanations + 1,), the last of none of them.
+    """
 
     explanations: tuple[Explanation, ...]
     likely: Array
@@ -73,13 +82,20 @@ class Answer:
 
     @property
     def first(self) -> Explanation:
-        """The most probable one."""
-        return self.explanations[int(np.argmax(self.likely))]
+        """The most probable one, none of them left aside."""
+        return self.explanations[int(np.argmax(self.likely[:-1]))]
 
     @property
     def odds(self) -> float:
-        """Of that against all others together; at most a million."""
-        return float(np.max(self.likely)) / max(1.0 - float(np.max(self.likely)), 1e-6)
+        """Of that against all else; at most a million."""
+        most = float(np.max(self.likely[:-1]))
+        return most / max(1.0 - most, 1e-6)
+
+    @property
+    def ranked(self) -> list[tuple[Explanation, float]]:
+        """Each explanation with its probability, the most probable first."""
+        pairs = zip(self.explanations, self.likely[:-1].tolist(), strict=True)
+        return sorted(pairs, key=lambda pair: -pair[1])
 
     @property
     def settled(self) -> bool:
@@ -88,11 +104,11 @@ class Answer:
 
     def to_dict(self) -> dict[str, object]:
         """Ready for JSON."""
-        ranked = sorted(zip(self.explanations, self.likely, strict=True), key=lambda pair: -float(pair[1]))
         return {
             "settled": self.settled,
             "odds": round(self.odds, 1),
-            "explanations": [{"effects": one.effects, "weight": round(float(p), 6)} for one, p in ranked],
+            "explanations": [{"effects": one.effects, "weight": round(weight, 6)} for one, weight in self.ranked],
+            "none": round(float(self.likely[-1]), 6),
             "sounds": self.sounds,
         }
 
@@ -100,8 +116,8 @@ class Answer:
 class Inquiry:
     """A recording (m,) of a reference (n,) and its explanations, each fitted to one half of it: what can be asked further.
 
-    wanted: the effects of each explanation; two that predict the same are one. Raises SignalError where the recording
-    does not contain the reference or a fit fails, UsageError for an event.
+    wanted: the effects of each explanation; two that predict the same are one. Raises SignalError where the recording does
+    not contain the reference or a fit fails, UsageError for an event.
     """
 
     def __init__(
@@ -127,11 +143,11 @@ class Inquiry:
         self.explanations = tuple(kept)
 
     def before(self) -> Array:
-        """(explanations,) the probability of each by the other half, before anything is asked."""
+        """(explanations + 1,) the probability of each, and of none, by the other half, before anything is asked."""
         return weights(_log_likelihood(self._first, self.explanations))
 
     def evidence(self, recording: Samples, sound: Samples) -> Array:
-        """(moments, explanations) log likelihood of what was recorded (m,) of a sound (n,).
+        """(moments, explanations + 1) log likelihood of what was recorded (m,) of a sound (n,), the last of none of them.
 
         All are fitted again, to the first recording and one half of this one, and judged by the other half; then the halves
         change places. What a clock does begins anew with each recording, so that a model of one stays as it is.
@@ -159,11 +175,12 @@ class Inquiry:
         """The menu, the best sound first: the one that is expected to tell most of the explanations that stand.
 
         Each sound is played to each explanation, as fitted, with its noise, and judged as what is recorded will be (Lindley
-        1956, "On a measure of the information provided by an experiment"). likely (explanations,): the weights so far; less
+        1956, "On a measure of the information provided by an experiment"). likely (explanations + 1,): so far; less
         than one in ENOUGH of the best does not stand, but two always do. Of the log odds that the true one gains over each
         other the mean logarithm counts, 1 added: twice as sure is worth less than another pair told. Raises SignalError
         where no sound tells those that stand apart.
         """
+        likely = likely[: len(self.explanations)]
         standing = max(int(np.count_nonzero(likely * ENOUGH >= likely.max())), 2)
         asked = [self.explanations[i] for i in np.argsort(-likely)[:standing]]
         found, most = [], 0.0
@@ -190,7 +207,7 @@ class Inquiry:
         apart, or what is recorded does not contain it.
         """
         heard: list[Array] = []
-        answer = Answer(self.explanations, np.full(len(self.explanations), 1.0 / len(self.explanations)), ())
+        answer = Answer(self.explanations, np.full(len(self.explanations) + 1, 1.0 / len(self.explanations)), ())
         while not answer.settled and (len(heard) + 1) * SOUND_S <= seconds:
             sounds = self.sounds(answer.likely, progress)
             sound = next((one for one in sounds if one.words not in answer.sounds), sounds[0])
@@ -200,7 +217,7 @@ class Inquiry:
 
 
 def weights(found: Array) -> Array:
-    """(explanations,) the probability of each, all as probable beforehand, from evidence (moments, explanations).
+    """(columns,) the probability of each, all as probable beforehand, from evidence (moments, columns).
 
     The explanations are approximations, so that their likelihoods, of thousands of samples, would be far too sure. Asked is
     which of two is closer to what was heard: by chance the difference of their log likelihoods has either sign from moment
@@ -217,14 +234,15 @@ def weights(found: Array) -> Array:
 def menu(reference: Samples) -> dict[str, Samples]:
     """Twelve sounds of SOUND_S, by what they are, none louder than a reference (n,), whose loudest words are among them."""
     rng = np.random.default_rng(35)
-    n = round((SOUND_S - MARK_S - GAP_S) * SAMPLE_RATE)
+    n = round((SOUND_S - MARK_S - GAP_S - END_S) * SAMPLE_RATE)
     peak, time = float(np.max(np.abs(reference))), np.arange(n) / SAMPLE_RATE
     hz = np.arange(n // 2 + 1) * SAMPLE_RATE / n
     even = ((hz >= BAND_HZ[0]) & (hz <= 7500.0)) / np.sqrt(np.maximum(hz, 500.0))
     lines = np.zeros(hz.size)
-    lines[np.rint(np.arange(75.0, BAND_HZ[1], 50.0) * n / SAMPLE_RATE).astype(int)] = 1.0
+    odd = np.flatnonzero((np.arange(hz.size) % 2 == 1) & (even > 0.0))
+    lines[rng.choice(odd, LINES, replace=False)] = 1.0
     speech = peak * _noise(rng, _like_speech(hz))
-    odd, words = peak * _noise(rng, lines * even), _loudest(reference, n)
+    sparse, words = peak * _noise(rng, lines * even), _loudest(reference, n)
     steps = 10.0 ** (-8.0 * np.floor(5.0 * np.arange(n) / n) / 20.0)
     sounds = {
         "silence": np.zeros(n),
@@ -237,13 +255,14 @@ def menu(reference: Samples) -> dict[str, Samples]:
         "five steps of level, downwards": steps * speech,
         "bursts of 50 ms with gaps": speech * (time % 0.4 < 0.05),
         "bursts of 0.3 s with gaps": speech * (time % 0.7 < 0.3),
-        "odd lines": odd,
-        "odd lines, 20 dB softer": 0.1 * odd,
+        "odd lines": sparse,
+        "odd lines, 20 dB softer": 0.1 * sparse,
     }
     mark = round(MARK_S * SAMPLE_RATE)
     front = 0.3 * peak * _noise(rng, _like_speech(np.arange(mark // 2 + 1) * SAMPLE_RATE / mark))
     front = np.concatenate((front, np.zeros(round(GAP_S * SAMPLE_RATE))))
-    return {what: np.concatenate((front, x)).astype(np.float32) for what, x in sounds.items()}
+    end = np.zeros(round(END_S * SAMPLE_RATE))
+    return {what: np.concatenate((front, x, end)).astype(np.float32) for what, x in sounds.items()}
 
 
 def _like_speech(hz: Array) -> Array:
@@ -311,7 +330,7 @@ def _cells(judge: Judge, model: EchoModel) -> tuple[Array, Array, Array]:
 
 
 def _log_likelihood(prepared: Prepared, explanations: Sequence[Explanation]) -> Array:
-    """(moments, explanations) of the cells that no fit has used.
+    """(moments, explanations + 1) of the cells that no fit has used, the last of none of the explanations.
 
     Of a residual that is Gaussian in each cell, with a variance that is expected to a factor: Student's t with as many
     degrees of freedom as the cell has (Lange, Little & Taylor 1989), so that what is louder than expected counts by its
@@ -319,11 +338,17 @@ def _log_likelihood(prepared: Prepared, explanations: Sequence[Explanation]) -> 
     """
     judge = Judge(prepared)
     freedom = judge.freedom * (HOP * FRAMES_PER_CELL / (HOP - 1))
-    columns = []
+
+    def likelihood(power: Array, expected: Array) -> Array:
+        return -0.5 * np.sum(freedom * (np.log(expected) + 2.0 * np.log1p(power / expected)), axis=1)
+
+    columns, vague = [], []
     for each in explanations:
         power, expected, voice = _cells(judge, each.model)
         expected = expected + each.error * voice
-        columns.append(-0.5 * np.sum(freedom * (np.log(expected) + 2.0 * np.log1p(power / expected)), axis=1))
-    if not columns or not columns[0].size:
+        columns.append(likelihood(power, expected))
+        vague.append(likelihood(power, NONE * expected))
+    if not judge.starts.size:
         raise SignalError("too little of the recording can be judged: expected two seconds in which nobody talks")
-    return np.stack(columns, axis=1)
+    best = int(np.argmax([column.sum() for column in columns]))
+    return np.stack([*columns, vague[best]], axis=1)

@@ -17,8 +17,8 @@ pytestmark = pytest.mark.slow
 
 @pytest.fixture
 def robot(tmp_path):
-    """A folder with a robot whose path is a gain of one, and a recording of it 6 dB down."""
-    x, turned = voice(5.0), {"gain_db": -6.0}
+    """A folder with a robot whose path is a gain of one, and a recording of it 1 dB down."""
+    x, turned = voice(5.0), {"gain_db": -1.0}
     straight = np.eye(1, 6400, PRE_ROLL, dtype=np.float32)[0]
     profile(straight).save(tmp_path / "robot.npz")
     soundfile.write(tmp_path / "ref.wav", x, SAMPLE_RATE, "FLOAT")
@@ -29,18 +29,16 @@ def robot(tmp_path):
 
 def probing(server, folder, *more):
     files = ("--profile", folder / "robot.npz", "--recording", folder / "mic.wav", "--reference", folder / "ref.wav")
-    command = edgefilter("probe", "playback_gain", "compression", *files, "--live", "--speaker", "robot", *more)
+    command = edgefilter("probe", "playback_gain", "chassis_resonance", *files, "--live", "--speaker", "robot", *more)
     return subprocess.Popen(
         command, env=server.environment, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     )
 
 
-def test_a_loudspeaker_that_was_turned_down_is_told_from_one_that_compresses(server, robot):
-    """What the sink plays is looped into the microphone 6 dB down."""
-    loop = ["load-module", "module-loopback", "source=robot.monitor", "sink=robot_mic", "latency_msec=30"]
-    for words in (loop, ["set-sink-input-volume", "0", "-6dB"]):
-        subprocess.run(["pactl", *words], env=server.environment, check=True, capture_output=True)
-    probe = probing(server, robot, "--input", "robot_mic_monitor", "--json", robot / "said.json")
+def test_a_loudspeaker_that_was_turned_down_is_told_from_one_whose_case_rings(server, robot):
+    """A sink that is heard itself, so that its clock is one, 1 dB down."""
+    subprocess.run(["pactl", "set-sink-volume", "robot", "-1dB"], env=server.environment, check=True)
+    probe = probing(server, robot, "--input", "robot_monitor", "--json", robot / "said.json")
     said, notes = probe.communicate(timeout=120)
     assert probe.returncode == 0, (said, notes)
     found = json.loads((robot / "said.json").read_text())
