@@ -23,6 +23,7 @@ from edgefilter.calibration.calibrate import calibrate
 from edgefilter.calibration.sweep import generate_sweep
 from edgefilter.diagnosis.probe import ENOUGH, SOUND_S, Inquiry, weights
 from edgefilter.errors import SignalError
+from edgefilter.types import Array
 
 PAIRS = (
     ("playback_gain", "compression"),
@@ -38,55 +39,59 @@ STRENGTHS = ("near", "moderate")
 RECORDING_S = ASKED_S = 5.0
 """Of speech to begin with, so short that explanations remain; and of sound that may be asked for."""
 WAYS = ("the recording alone", "a sweep", "further sentences", "probe")
-NOT_TOLD = 0.5
 TITLE = "What `probe` settles"
 
 
 @dataclass(frozen=True)
 class Row:
-    """One robot: the pair, which of it is true, how strong, the probability of that by each of WAYS, and what was asked."""
+    """One robot: the pair, which of it is true, how strong, what came of it by each of WAYS, and what was asked."""
 
     pair: tuple[str, str]
     truth: str
     strength: str
-    likely: tuple[float, ...]
-    sounds: tuple[str, ...]
+    outcomes: tuple[str, ...]
+    sounds: tuple[str, ...] = ()
 
     @property
     def ambiguous(self) -> bool:
         """Whether the recording alone does not settle what is true."""
-        return outcome(self.likely[0]) != "right"
+        return self.outcomes[0] != "right"
 
 
-def outcome(likely: float) -> str:
-    """Of the probability of what is true: right and wrong from ENOUGH to 1 on."""
-    sure = ENOUGH / (1.0 + ENOUGH)
-    return "right" if likely >= sure else "wrong" if likely <= 1.0 - sure else "open"
+def outcome(likely: Array, true: int) -> str:
+    """Of the probabilities of a pair, and of none of it: right or wrong where ENOUGH to 1 speaks for one, else open."""
+    best = int(np.argmax(likely[:2]))
+    if likely[best] < ENOUGH / (1.0 + ENOUGH):
+        return "open"
+    return "right" if best == true else "wrong"
 
 
 def examine(robot: AskedRobot, pair: tuple[str, str], strength: str) -> Row:
-    """The row of one robot; what cannot be told at all is as probable as not."""
+    """The row of one robot; open is also what cannot be asked, or was not heard."""
     inquiry = Inquiry(calibrate(*robot.calibration), [(name,) for name in pair], robot.recording, robot.reference)
     true, peak = pair.index(robot.truth), float(np.abs(robot.reference).max())
     if len(inquiry.explanations) < len(pair):
-        return Row(pair, robot.truth, strength, (NOT_TOLD,) * len(WAYS), ())
+        return Row(pair, robot.truth, strength, ("open",) * len(WAYS))
     sweep = generate_sweep(seconds=ASKED_S - 0.5, lead_s=0.25, tail_s=0.25, amplitude=peak)
-    likely = [float(inquiry.before()[true])]
+    found = [outcome(inquiry.before(), true)]
+    sounds: tuple[str, ...] = ()
     for sound in (sweep, robot.further):
         try:
-            likely.append(float(weights(inquiry.evidence(robot.ask(sound, 1), sound))[true]))
+            found.append(outcome(weights(inquiry.evidence(robot.ask(sound, 1), sound)), true))
         except SignalError:
-            likely.append(NOT_TOLD)
+            found.append("open")
     try:
         answer = inquiry.ask(lambda sound: robot.ask(sound.samples, 2), ASKED_S)
+        found.append(outcome(answer.likely, true))
+        sounds = answer.sounds
     except SignalError:
-        return Row(pair, robot.truth, strength, (*likely, NOT_TOLD), ())
-    return Row(pair, robot.truth, strength, (*likely, float(answer.likely[true])), answer.sounds)
+        found.append("open")
+    return Row(pair, robot.truth, strength, tuple(found), sounds)
 
 
 def share(rows: Sequence[Row], way: int) -> list:
     """How many are right, with its interval, how many open, how many wrong."""
-    found = [outcome(row.likely[way]) for row in rows]
+    found = [row.outcomes[way] for row in rows]
     low, high = wilson(found.count("right"), len(found))
     right = f"{found.count('right')} of {len(found)} [{100 * low:.0f}, {100 * high:.0f}] %"
     return [right, found.count("open"), found.count("wrong")]
