@@ -77,7 +77,7 @@ def examine(robot: AskedRobot, pair: tuple[str, str], strength: str) -> Row:
     sounds: tuple[str, ...] = ()
     for sound in (sweep, robot.further):
         try:
-            found.append(outcome(weights(inquiry.evidence(robot.ask(sound, 1), sound)), true))
+            found.append(outcome(weights(inquiry.evidence(robot.ask(sound, 1), sound), [inquiry.gains(sound)]), true))
         except SignalError:
             found.append("open")
     try:

@@ -110,7 +110,7 @@ def _judge(args: argparse.Namespace) -> int:
     with progress("the answer"):
         wanted = [tuple(text.split("+")) for text in question["explanations"]]
         inquiry = _inquiry(profile, wanted, recording, reference)
-        likely = weights(inquiry.evidence(answer, sound))
+        likely = weights(inquiry.evidence(answer, sound), [inquiry.gains(sound)])
     told = Answer(inquiry.explanations, likely, tuple(question["sounds"]))
     _tell(args, told, {**vars(args), **question, "profile": args.profile})
     return 0

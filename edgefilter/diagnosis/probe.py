@@ -16,7 +16,7 @@ from edgefilter.diagnosis.prepare import Prepared, prepare
 from edgefilter.diagnosis.score import FRAMES_PER_CELL, HOP, Judge
 from edgefilter.dsp.convolution import convolve
 from edgefilter.dsp.fractional_delay import delayed
-from edgefilter.dsp.psd import frequencies, variance_at
+from edgefilter.dsp.psd import GRID_BINS, frequencies, variance_at
 from edgefilter.echo.effects.catalogue import find
 from edgefilter.echo.measurement import Measurement
 from edgefilter.echo.model import EchoModel
@@ -33,8 +33,11 @@ MARK_S, GAP_S, END_S = 0.25, 0.15, 0.1
 its reverberation is judged as well."""
 LINES = 150
 """Of that sound: every 25th of the odd ones, so that products of two or three of them fall between."""
-ERROR_TAPS = 64
-"""Of the path (4 ms) by which a simulated explanation is off: the direct sound and what is near."""
+ERROR_TAPS, FLIP = 64, 256
+"""Of the filter that gives a simulated explanation's error its spectrum, and samples (16 ms) for which it keeps its sign."""
+LOOSE = 0.25
+"""Part of how far two explanations expect to be apart by which either may be off. Right ones of 16 simulated robots
+(bench/diagnosis/probe.py, voices of training) were off by a tenth to a half."""
 NONE = 100.0
 """Times the variance that the best explanation expects: with so much more nothing is known. By the likelihood that is
 nearer from ten times the expected power on; right explanations of simulated robots leave up to 3 times of it."""
@@ -46,13 +49,13 @@ TWINS = 1e-5
 class Explanation:
     """Effects beyond the profile's, and the model with them.
 
-    error: part of the voice's power that the model leaves over what it expects, of seconds that it was not fitted to: so
-    far it may be off elsewhere.
+    error (601,): part of the voice's power, 0 to 8 kHz, that the model leaves over what it expects, of seconds that it was not
+    fitted to: so far it may be off elsewhere.
     """
 
     effects: tuple[str, ...]
     model: EchoModel
-    error: float
+    error: Array
 
     @property
     def name(self) -> str:
@@ -133,11 +136,11 @@ class Inquiry:
         for effects in wanted:
             model = _fitted(measurement, self._first.model, effects)
             power, expected, voice = _cells(judge, model)
-            over = np.sum(np.maximum(power - expected, 0.0) * judge.freedom)
+            over = np.maximum(np.sum(power - expected, axis=0), 0.0) / np.maximum(np.sum(voice, axis=0), 1e-12)
             heard = measurement.heard(model)[1]
             noisy = model.unpredictable(measurement.reference) or any(find(name).stage == "noise" for name in effects)
             if noisy or all(np.sum((heard - other) ** 2) > TWINS * np.sum(other**2) for other in voices):
-                error = float(over / max(np.sum(voice * judge.freedom), 1e-12))
+                error = np.interp(frequencies(GRID_BINS), judge.band_hz.mean(axis=1), over)
                 kept.append(Explanation(effects, model.lasting(), error))
                 voices.append(heard)
         self.explanations = tuple(kept)
@@ -170,6 +173,13 @@ class Inquiry:
             ]
             found.append(_log_likelihood(part, again))
         return np.concatenate(found)
+
+    def gains(self, sound: Samples) -> Array:
+        """(explanations, explanations) the log odds over each other that are expected of a sound (n,) where the first is true."""
+        count = len(self.explanations)
+        heard = (_simulated(self.profile, true, sound) for true in self.explanations)
+        told = [self.evidence(recording, sound).sum(axis=0)[:count] for recording in heard]
+        return np.stack([told[i][i] - told[i] for i in range(count)])
 
     def sounds(self, likely: Array, progress: Callable[[str], None] | None = None) -> list[Sound]:
         """The menu, the best sound first: the one that is expected to tell most of the explanations that stand.
@@ -206,60 +216,74 @@ class Inquiry:
         play: gives what is recorded of a sound and for a second after it. Raises SignalError where no sound tells them
         apart, or what is recorded does not contain it.
         """
-        heard: list[Array] = []
-        answer = Answer(self.explanations, np.full(len(self.explanations) + 1, 1.0 / len(self.explanations)), ())
-        while not answer.settled and (len(heard) + 1) * SOUND_S <= seconds:
+        count = len(self.explanations)
+        heard, gains = np.zeros((0, count + 1)), []
+        answer = Answer(self.explanations, np.full(count + 1, 1.0 / count), ())
+        while not answer.settled and (len(answer.sounds) + 1) * SOUND_S <= seconds:
             sounds = self.sounds(answer.likely, progress)
             sound = next((one for one in sounds if one.words not in answer.sounds), sounds[0])
-            heard.append(self.evidence(play(sound), sound.samples))
-            answer = Answer(self.explanations, weights(np.concatenate(heard)), (*answer.sounds, sound.words))
+            heard = np.concatenate((heard, self.evidence(play(sound), sound.samples)))
+            gains.append(self.gains(sound.samples))
+            answer = Answer(self.explanations, weights(heard, gains), (*answer.sounds, sound.words))
         return answer
 
 
-def weights(found: Array) -> Array:
-    """(columns,) the probability of each, all as probable beforehand, from evidence (moments, columns).
+def weights(found: Array, gains: Sequence[Array] = ()) -> Array:
+    """(explanations + 1,) the probability of each and of none, all as probable beforehand, from evidence (moments, explanations + 1).
 
-    The explanations are approximations, so that their likelihoods, of thousands of samples, would be far too sure. Asked is
-    which of two is closer to what was heard: by chance the difference of their log likelihoods has either sign from moment
-    to moment; its sum over the root of the sum of its squares is a normal number (Vuong 1989, "Likelihood ratio tests for
-    model selection and non-nested hypotheses", eq. 4.2).
+    No explanation is exactly true, so that likelihoods of thousands of samples would be far too sure. Asked is which of two
+    is closer to what was heard: by chance the difference of their log likelihoods has either sign from moment to moment; its
+    sum over the root of the sum of its squares is a normal number (Vuong 1989, "Likelihood ratio tests for model selection and
+    non-nested hypotheses", eq. 4.2). gains: what was expected of each sound, as Inquiry.gains has it. The sum is counted
+    from the middle of what the two expect, since a flexible explanation is never far from a simple one that is true; and
+    what they expect is known to a part, LOOSE, of how far it is apart.
     """
-    best = int(np.argmax(found.sum(axis=0)))
-    less = found - found[:, best : best + 1]
-    z = less.sum(axis=0) / np.sqrt(np.maximum(np.sum(less**2, axis=0), 1e-12))
-    odds = np.exp(log_ndtr(z) - log_ndtr(-z))
+    count = found.shape[1] - 1
+    z = np.full((count, count), np.inf)
+    for i, j in permutations(range(count), 2):
+        less, middle = found[:, i] - found[:, j], sum(0.5 * (gain[i, j] - gain[j, i]) for gain in gains)
+        variance = np.sum(less**2) + sum((0.5 * LOOSE * (gain[i, j] + gain[j, i])) ** 2 for gain in gains)
+        z[i, j] = (np.sum(less) - middle) / np.sqrt(max(variance, 1e-12))
+    best = int(np.argmax(z.min(axis=1)))
+    z[best, best] = 0.0
+    vague = found[:, best] - found[:, -1]
+    z_of = np.append(z[best], np.sum(vague) / np.sqrt(max(float(np.sum(vague**2)), 1e-12)))
+    odds = np.exp(log_ndtr(-z_of) - log_ndtr(z_of))
     return np.asarray(odds / odds.sum())
 
 
 def menu(reference: Samples) -> dict[str, Samples]:
-    """Twelve sounds of SOUND_S, by what they are, none louder than a reference (n,), whose loudest words are among them."""
+    """Twelve sounds of SOUND_S, by what they are, the softest first, none louder than the loudest words of a reference (n,), which are among them.
+
+    So nothing is asked of a loudspeaker that the first recording does not tell of.
+    """
     rng = np.random.default_rng(35)
     n = round((SOUND_S - MARK_S - GAP_S - END_S) * SAMPLE_RATE)
-    peak, time = float(np.max(np.abs(reference))), np.arange(n) / SAMPLE_RATE
+    words, time = _loudest(reference, n), np.arange(n) / SAMPLE_RATE
+    level, peak = float(np.sqrt(np.mean(words**2))), float(np.max(np.abs(words)))
     hz = np.arange(n // 2 + 1) * SAMPLE_RATE / n
-    even = ((hz >= BAND_HZ[0]) & (hz <= 7500.0)) / np.sqrt(np.maximum(hz, 500.0))
+    even = ((hz >= BAND_HZ[0]) & (hz <= 7500.0)) / np.maximum(hz, 500.0)
     lines = np.zeros(hz.size)
     odd = np.flatnonzero((np.arange(hz.size) % 2 == 1) & (even > 0.0))
     lines[rng.choice(odd, LINES, replace=False)] = 1.0
-    speech = peak * _noise(rng, _like_speech(hz))
-    sparse, words = peak * _noise(rng, lines * even), _loudest(reference, n)
+    speech, flat, sparse = (_noise(rng, shape, level, peak) for shape in (_like_speech(hz), even, lines * even))
     steps = 10.0 ** (-8.0 * np.floor(5.0 * np.arange(n) / n) / 20.0)
     sounds = {
         "silence": np.zeros(n),
-        "the loudest words": words,
-        "the same words, 12 dB softer": 0.25 * words,
-        "noise": speech,
         "noise, 20 dB softer": 0.1 * speech,
-        "noise of all frequencies": peak * _noise(rng, even),
-        "five steps of level, upwards": steps[::-1] * speech,
-        "five steps of level, downwards": steps * speech,
+        "odd lines, 20 dB softer": 0.1 * sparse,
+        "the loudest words, 12 dB softer": 0.25 * words,
+        "the loudest words": words,
         "bursts of 50 ms with gaps": speech * (time % 0.4 < 0.05),
         "bursts of 0.3 s with gaps": speech * (time % 0.7 < 0.3),
+        "five steps of level, upwards": steps[::-1] * speech,
+        "five steps of level, downwards": steps * speech,
+        "noise": speech,
         "odd lines": sparse,
-        "odd lines, 20 dB softer": 0.1 * sparse,
+        "noise of all frequencies": flat,
     }
     mark = round(MARK_S * SAMPLE_RATE)
-    front = 0.3 * peak * _noise(rng, _like_speech(np.arange(mark // 2 + 1) * SAMPLE_RATE / mark))
+    front = _noise(rng, _like_speech(np.arange(mark // 2 + 1) * SAMPLE_RATE / mark), level, peak)
     front = np.concatenate((front, np.zeros(round(GAP_S * SAMPLE_RATE))))
     end = np.zeros(round(END_S * SAMPLE_RATE))
     return {what: np.concatenate((front, x, end)).astype(np.float32) for what, x in sounds.items()}
@@ -271,12 +295,12 @@ def _like_speech(hz: Array) -> Array:
     return inside * 10 ** (np.polynomial.Polynomial(SPEECH_DB)(np.log10(np.maximum(hz, BAND_HZ[0]))) / 20)
 
 
-def _noise(rng: np.random.Generator, magnitude: Array) -> Array:
-    """(n,) of random phases and that magnitude (n / 2 + 1,), peak 1, faded in and out over 10 ms."""
+def _noise(rng: np.random.Generator, magnitude: Array, level: float, peak: float) -> Array:
+    """(n,) of random phases and that magnitude (n / 2 + 1,), of a root mean square and a peak, faded in and out over 10 ms."""
     x = np.fft.irfft(magnitude * np.exp(2j * np.pi * rng.uniform(size=magnitude.size)))
     fade = np.minimum(np.arange(1, x.size + 1), 160) / 160
     x *= fade * fade[::-1]
-    return np.asarray(x / np.max(np.abs(x)))
+    return np.asarray(x * min(level / np.sqrt(np.mean(x**2)), peak / np.max(np.abs(x))))
 
 
 def _loudest(reference: Samples, n: int) -> Array:
@@ -304,12 +328,18 @@ def _halves(prepared: Prepared) -> Iterator[Prepared]:
 def _simulated(profile: Profile, true: Explanation, sound: Samples) -> Samples:
     """What would be recorded of a sound (n,), and for a second after it, were that explanation true: (n + SAMPLE_RATE,).
 
-    Its own error is a path that is off by so much at random.
+    Its own error is its voice, so much softer, with a sign that changes at random: no filter that is fitted takes it up.
     """
     rng, model = np.random.default_rng(1), true.model
     x = delayed(np.pad(sound, (0, SAMPLE_RATE)), profile.delay - PRE_ROLL)
-    voice, off = model.predict(x), np.sqrt(true.error / ERROR_TAPS) * rng.standard_normal(ERROR_TAPS)
-    heard = voice + convolve(voice, off)[: x.size] + _coloured(rng, x.size, model.expected_noise(profile.noise_psd))
+    bins = frequencies(ERROR_TAPS // 2 + 1)
+    off = np.fft.irfft(np.sqrt(np.interp(bins, frequencies(GRID_BINS), true.error)))
+    voice, signs = model.predict(x), np.repeat(rng.choice([-1.0, 1.0], x.size // FLIP + 1), FLIP)[: x.size]
+    heard = (
+        voice
+        + signs * convolve(voice, np.fft.fftshift(off))[ERROR_TAPS // 2 :][: x.size]
+        + _coloured(rng, x.size, model.expected_noise(profile.noise_psd))
+    )
     for square, colour in model.unpredictable(x):
         heard = heard + np.sqrt(square) * _coloured(rng, x.size, colour)
     return heard.astype(np.float32)
@@ -345,7 +375,8 @@ def _log_likelihood(prepared: Prepared, explanations: Sequence[Explanation]) -> 
     columns, vague = [], []
     for each in explanations:
         power, expected, voice = _cells(judge, each.model)
-        expected = expected + each.error * voice
+        error = np.interp(judge.band_hz.mean(axis=1), frequencies(GRID_BINS), each.error)
+        expected = expected + error * voice
         columns.append(likelihood(power, expected))
         vague.append(likelihood(power, NONE * expected))
     if not judge.starts.size:
