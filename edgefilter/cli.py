@@ -62,6 +62,7 @@ def build_parser() -> Parser:
         _calibrate,
         _compare,
         _diagnose,
+        _probe,
         _passport,
         _add,
         _remove,
@@ -194,6 +195,39 @@ def _diagnose(commands: argparse._SubParsersAction) -> None:
     _force(option)
     _recording(option, profile_needed=False)
     _report(option)
+
+
+def _probe(commands: argparse._SubParsersAction) -> None:
+    probe = commands.add_parser(
+        "probe",
+        help="play what tells apart the explanations that a diagnosis leaves, and say which it is",
+        description=(
+            "Play what tells apart the explanations that a diagnosis leaves, and say which it is.\n\n"
+            "  edgefilter probe --profile robot.npz --recording mic.wav --reference tts.wav --live\n\n"
+            "or on a robot that this program does not run on:\n\n"
+            "  edgefilter probe --profile robot.npz --recording mic.wav --reference tts.wav --excitation probe.wav\n"
+            "  edgefilter probe --profile robot.npz --recording answer.wav --excitation probe.wav"
+        ),
+    )
+    option = probe.add_argument
+    told = "effects, joined by + where several are one explanation (default: what the diagnosis leaves)"
+    option("explanation", nargs="*", metavar="EXPLANATION", help=told)
+    option("--profile", required=True, metavar="P.npz", help="calibrated robot, made by 'edgefilter calibrate'")
+    told = "the robot alone, of which several explanations remain; without --reference: what was heard of --excitation"
+    option("--recording", required=True, metavar="MIC", help=told)
+    option("--reference", metavar="REF", help="what the robot said there, as it was sent to the loudspeaker")
+    option("--live", action="store_true", help="play on --speaker and record on --input")
+    told = "device for --live (default: %(default)s)"
+    option("--speaker", default="default", metavar="DEVICE", help=f"output {told}")
+    option("--input", default="mic", metavar="DEVICE", help=f"input {told}")
+    told = "of sound at most (default: %(default)g)"
+    option("--seconds", type=positive, default=5.0, metavar="S", help=told)
+    told = (
+        "the sound to be played, written there, with what is asked in S.wav.json; without --reference: that was played"
+    )
+    option("--excitation", metavar="S.wav", help=told)
+    _json(option)
+    option("--effects", **EFFECTS)
 
 
 def _passport(commands: argparse._SubParsersAction) -> None:

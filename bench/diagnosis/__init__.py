@@ -4,9 +4,10 @@ r"""How often hidden effects are named, and whether what is named makes the runn
     python -m bench diagnosis proof --cases DIR ... --real DIR ... --output bench/results/diagnosis
     python -m bench diagnosis run-time --voices ROBOT/test --speech HUMAN/test --count 8 --seed 41 \
         --output bench/results/diagnosis
+    python -m bench diagnosis probe --voices ROBOT/test --count 4 --seed 35 --output bench/results/diagnosis
 
 names, proof: --cases are folders of cases as bench.simulate.hidden_cases and bench.simulate.wild write them; proof needs
-no labels, so that real recordings do as well. run-time simulates its own. What each part does stands at the head of its
+no labels, so that real recordings do as well. run-time and probe simulate their own. What each part does stands at the head of its
 file in bench/diagnosis/. All parts write to the one file of --output.
 """
 
@@ -15,11 +16,11 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from bench.diagnosis import names, proof, run_time
+from bench.diagnosis import names, probe, proof, run_time
 from bench.simulate.effect_conversations import EFFECTS
 from edgefilter.errors import UsageError
 
-PARTS = {"names": names.run, "proof": proof.run, "run-time": run_time.run}
+PARTS = {"names": names.run, "proof": proof.run, "run-time": run_time.run, "probe": probe.run}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -27,9 +28,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("part", choices=tuple(PARTS))
     add("--cases", type=Path, nargs="+", default=[], metavar="DIR", help="names, proof: folders of cases")
     add("--real", type=Path, nargs="+", default=[], metavar="DIR", help="proof: pairs NAME_lpb and NAME_mic")
-    add("--voices", type=Path, metavar="DIR", help="run-time: the robot's voices")
+    add("--voices", type=Path, metavar="DIR", help="run-time, probe: the robot's voices")
     add("--speech", type=Path, metavar="DIR", help="run-time: the humans")
-    add("--count", type=int, default=8, help="run-time: conversations of each effect (default: %(default)s)")
+    add(
+        "--count",
+        type=int,
+        default=8,
+        help="run-time: conversations of each effect; probe: robots of each pair and truth (default: %(default)s)",
+    )
     add("--effects", default=",".join(EFFECTS), metavar="A,B,...", help="run-time: which of them (default: all)")
     add("--engines", default=",".join(run_time.ENGINES), metavar="A,B,...", help="run-time (default: %(default)s)")
 
@@ -38,6 +44,8 @@ def run(options: argparse.Namespace) -> str:
     """Run one part."""
     if options.part == "run-time" and not (options.voices and options.speech):
         raise UsageError("the part 'run-time' needs --voices and --speech, folders with a transcripts.tsv")
-    if options.part != "run-time" and not (options.cases or (options.part == "proof" and options.real)):
+    if options.part == "probe" and not options.voices:
+        raise UsageError("the part 'probe' needs --voices, a folder with a transcripts.tsv")
+    if options.part in ("names", "proof") and not (options.cases or (options.part == "proof" and options.real)):
         raise UsageError(f"the part '{options.part}' needs --cases, folders of bench.simulate.hidden_cases")
     return PARTS[options.part](options)

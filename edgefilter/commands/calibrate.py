@@ -6,7 +6,7 @@ import argparse
 import datetime
 import shutil
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -97,20 +97,24 @@ def _record(args: argparse.Namespace, folder: Path) -> tuple[Samples, Samples, S
     name = "a sweep and multisines" if args.multisine else "a sweep"
     silence = np.zeros(NOISE_S * SAMPLE_RATE, np.float32)
     _keep(folder, "sweep_reference", sound)
-    noise = _take(args, folder, "noise_recording", silence, f"now quiet: {NOISE_S} s of the robot's noise alone")
-    seconds = round(sound.size / SAMPLE_RATE)
-    return sound, _take(args, folder, "sweep_recording", sound, f"now playing: {seconds} s of {name}"), noise
+    told = f"now quiet: {NOISE_S} s of the robot's noise alone"
+    noise = take(args, silence, told, lambda heard: _keep(folder, "noise_recording", heard))
+    told = f"now playing: {round(sound.size / SAMPLE_RATE)} s of {name}"
+    return sound, take(args, sound, told, lambda heard: _keep(folder, "sweep_recording", heard)), noise
 
 
-def _take(args: argparse.Namespace, folder: Path, name: str, sound: Samples, what: str) -> Samples:
-    """Play and record, again with larger buffers where something was lost: a calibration would measure the hole."""
+def take(
+    args: argparse.Namespace, sound: Samples, what: str, keep: Callable[[Samples], None] = lambda samples: None
+) -> Samples:
+    """Play on --speaker and record on --input, again with larger buffers where something was lost: the hole would be measured."""
     from edgefilter.audio.measure import play_and_record
 
     for latency_s in BUFFERS_S:
+        channels = getattr(args, "mic_channels", None)
         found = play_and_record(
-            args.speaker, args.input, sound, latency_s=latency_s, tell=countdown(what), channels=args.mic_channels
+            args.speaker, args.input, sound, latency_s=latency_s, tell=countdown(what), channels=channels
         )
-        _keep(folder, name, found.samples)
+        keep(found.samples)
         if not found.holes:
             return found.samples
         say(f"the recording has holes ({found.holes})")

@@ -150,12 +150,19 @@ def _written(args: argparse.Namespace) -> Iterator[Place]:
         if path is None:
             continue
         role = f"--{option.replace('_', '-')}"
+        if (args.command, option) == ("probe", "excitation"):
+            yield Place(f"{role}, its question", question_of(path), at_end=True)
         for name in FOLDERS.get((args.command, option), ()):
             yield Place(role, os.path.join(path, name))
         if (args.command, option) not in FOLDERS:
             sound = (args.command, option) == ("run", "output")
             to_stdout = path == "-" and (sound or option in ("json", "log_json"))
             yield Place(role, path, 1 if to_stdout else None, at_end=not sound and not to_stdout)
+
+
+def question_of(excitation: str) -> str:
+    """Where `probe` writes what it asks with a sound, beside it."""
+    return f"{excitation}.json"
 
 
 def _same(first: Place, second: Place) -> bool:

@@ -40,7 +40,7 @@ def load(args: argparse.Namespace) -> tuple[Profile, Samples, Samples]:
     only silence, ProfileError for a damaged profile, SignalError where no profile can be made from the recording.
     """
     profile = None if args.profile is None else Profile.load(args.profile)
-    recording, reference = _voice(args.recording, "recording"), _voice(args.reference, "reference")
+    recording, reference = read_voice(args.recording, "recording"), read_voice(args.reference, "reference")
     return profile or self_calibrate(recording, reference), recording, reference
 
 
@@ -62,7 +62,7 @@ def load_array(args: argparse.Namespace) -> tuple[Profile, Samples, Samples, Arr
         raise UsageError(
             "--apply writes the profile of the first microphone and the others' beside it: leave --channel out"
         )
-    reference = _voice(args.reference, "reference")
+    reference = read_voice(args.reference, "reference")
     recordings = _whole(reader).reshape(-1, len(wanted)).T
     if not recordings[at].any():
         raise AudioFileError(f"channel {number} of {args.recording} is silent: every sample is zero, choose another")
@@ -74,7 +74,8 @@ def load_array(args: argparse.Namespace) -> tuple[Profile, Samples, Samples, Arr
     return profile.of_microphone(at), np.ascontiguousarray(recordings[at]), reference, profile.array, found
 
 
-def _voice(path: str, role: str) -> Samples:
+def read_voice(path: str, role: str) -> Samples:
+    """A whole recording (n,) as `read` gives it; raises AudioFileError where every sample is zero."""
     samples = read(path, role)
     if not samples.any():
         raise AudioFileError(

@@ -1,4 +1,4 @@
-"""What would have to be recorded to tell two effects apart that explain a recording about as well."""
+"""Which explanations a diagnosis leaves, and what would have to be recorded to tell two effects apart that explain about as much."""
 
 from __future__ import annotations
 
@@ -12,6 +12,11 @@ from edgefilter.echo.effects.catalogue import find
 MARGIN = 0.15
 """Of the larger gain, by which two candidates may differ and lie close: as Criteria.nested, by which the simpler of two
 is named."""
+RIVAL = 0.7
+"""Part of the fall in level by what is named, from which on another explanation remains: twice the 15 % by which a simpler
+effect may be behind and is named all the same (Criteria.nested). Not tuned."""
+MOST = 4
+"""Explanations that remain at most: the best ones."""
 RULES: tuple[tuple[Experiment, str], ...] = (
     ("levels", "play the same sentences at two volumes, 6 dB apart: only {shows} grows or shrinks by another amount"),
     ("minute", "record a minute and more: only {shows} goes on growing"),
@@ -39,6 +44,27 @@ def advice(tried: Sequence[Candidate]) -> tuple[str, ...]:
             told = f"{first.effect} ({gains[0]:.2f} dB) or {second.effect} ({gains[1]:.2f} dB)"
             lines.append(f"{told}: {_difference(find(first.effect), find(second.effect))}")
     return tuple(lines)
+
+
+def asks(tried: Sequence[Candidate]) -> tuple[str, ...]:
+    """A line where several explanations remain: the robot can ask which it is."""
+    left = [" with ".join(effects) for effects in remaining(tried)]
+    told = f"{', '.join(left[:-1])} or {left[-1]}: edgefilter probe plays what tells them apart" if left[1:] else ""
+    return (told,) if told else ()
+
+
+def remaining(tried: Sequence[Candidate]) -> tuple[tuple[str, ...], ...]:
+    """The effects of each explanation that remains: all that are named, then each other one that explains nearly as much alone.
+
+    Events are left out, since no other recording has them.
+    """
+    named = [row for row in tried if row.verdict == "named"]
+    rivals = [row for row in tried if row.verdict in ("explained by another", "failed its proof")]
+    gains = [row.gain_db or 0.0 for row in rivals]
+    most = sum(max(row.beside_db or 0.0, row.gain_db or 0.0) for row in named) if named else max(gains, default=0.0)
+    near = sorted((r for r in rivals if (r.gain_db or 0.0) >= RIVAL * most > 0.0), key=lambda r: -(r.gain_db or 0.0))
+    sets = [[row.effect for row in rows if not find(row.effect).event] for rows in (named, *([row] for row in near))]
+    return tuple(dict.fromkeys(tuple(effects) for effects in sets if effects))[:MOST]
 
 
 def _difference(first: Effect, second: Effect) -> str:

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from edgefilter.diagnosis.advice import advice
+from edgefilter.diagnosis.advice import advice, asks
 from edgefilter.diagnosis.band_edge import cut_by_power
 from edgefilter.diagnosis.candidates import candidates
 from edgefilter.diagnosis.closer_look import look_closer
@@ -282,7 +282,7 @@ def conclude(
         tried=tried,
         independence=independence_of(found.prepared, found.model, found.final) if findings else comparison.independence,
         precision=precision(found, findings),
-        advice=advice(tried),
+        advice=(*advice(tried), *asks(tried)),
         closer_look=look_closer(found) if verdict == "unexplained" else None,
         law=free_law(found, criteria, progress) if verdict == "unexplained" else None,
     )

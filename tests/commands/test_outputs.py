@@ -27,6 +27,7 @@ NEITHER = {
     "no_chirp",
     "no_diagnosis",
     "human_db",
+    "explanation",
     "mic",
     "silenced",
     "human",

@@ -1,0 +1,159 @@
+"""`edgefilter probe`: where several explanations of a recording remain, what tells them apart is played, and they are judged by it."""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import json
+import shlex
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from edgefilter.audio.files import FileSink
+from edgefilter.commands.calibrate import take
+from edgefilter.commands.display import print_result, progress, write_json
+from edgefilter.commands.outputs import question_of
+from edgefilter.commands.recordings import load, read, read_voice
+from edgefilter.diagnosis.advice import RIVAL, remaining
+from edgefilter.diagnosis.diagnose import diagnose
+from edgefilter.diagnosis.probe import ENOUGH, SOUND_S, Answer, Inquiry, Sound, weights
+from edgefilter.echo.effects.catalogue import find
+from edgefilter.errors import AudioFileError, SignalError, UsageError
+from edgefilter.profile.data import Profile
+from edgefilter.report.text import add_command, joined
+from edgefilter.types import Samples
+
+SCHEMA = 1
+"""Of the question beside a sound."""
+
+
+def main(args: argparse.Namespace) -> int:
+    if args.live == bool(args.excitation):
+        raise UsageError("expected one of --live, to play here, and --excitation S.wav, to play elsewhere")
+    if args.seconds < SOUND_S:
+        raise UsageError(f"--seconds is {args.seconds:g}, expected at least {SOUND_S:g}, which is one sound")
+    wanted = [tuple(text.split("+")) for text in args.explanation]
+    for name in (name for effects in wanted for name in effects):
+        find(name)
+    if args.reference is None:
+        return _judge(args)
+    profile, recording, reference = load(args)
+    with progress("explanations that remain") as step:
+        if not wanted:
+            wanted = list(remaining(diagnose(profile, recording, reference, progress=step).tried))
+        inquiry = _inquiry(profile, wanted, recording, reference)
+    print_result(args, [f"asked       {joined(one.name for one in inquiry.explanations)}: which of them it is"])
+    if args.excitation:
+        return _write(args, inquiry)
+
+    def play(sound: Sound) -> Samples:
+        return take(args, sound.samples, f"now playing: {sound.words}")
+
+    _tell(args, inquiry.ask(play, args.seconds), vars(args))
+    return 0
+
+
+def _inquiry(profile: Profile, wanted: list[tuple[str, ...]], recording: Samples, reference: Samples) -> Inquiry:
+    """Two explanations or more, fitted. Raises SignalError where there is nothing to ask."""
+    if not wanted:
+        raise SignalError("nothing to ask: the diagnosis names nothing that another recording would show")
+    first = "+".join(wanted[0])
+    if len(wanted) < 2:
+        raise SignalError(
+            f"nothing to ask: {first} is named, and nothing else explains {100 * RIVAL:.0f} % of what it does"
+        )
+    inquiry = Inquiry(profile, wanted, recording, reference)
+    if len(inquiry.explanations) < 2:
+        raise SignalError(
+            f"nothing to ask: {joined('+'.join(one) for one in wanted)} predict the same, under other names"
+        )
+    return inquiry
+
+
+def _write(args: argparse.Namespace, inquiry: Inquiry) -> int:
+    """The best sounds one after the other, and beside them what is asked."""
+    with progress("the sounds that tell them apart") as step:
+        chosen = inquiry.sounds(np.ones(len(inquiry.explanations)), step)[: int(args.seconds / SOUND_S)]
+    with FileSink(args.excitation) as sink:
+        for sound in chosen:
+            sink.write(sound.samples)
+    question = {
+        "schema": SCHEMA,
+        "explanations": [one.name for one in inquiry.explanations],
+        "sounds": [sound.words for sound in chosen],
+        "recording": str(Path(args.recording).resolve()),
+        "reference": str(Path(args.reference).resolve()),
+        "excitation_sha256": _digest(args.excitation),
+        "profile_sha256": _digest(args.profile),
+    }
+    write_json(question, question_of(args.excitation))
+    files = "".join(f" --{role} {shlex.quote(getattr(args, role))}" for role in ("profile", "excitation"))
+    own = "".join(f" --effects {shlex.quote(file)}" for file in args.effects)
+    lines = [
+        f"play        {args.excitation}, {len(chosen) * SOUND_S:g} s: {joined(sound.words for sound in chosen)}",
+        "record      what the microphone hears of it, and a second more",
+        f"next        edgefilter probe{files}{own} --recording ANSWER.wav",
+    ]
+    print_result(args, lines, question)
+    return 0
+
+
+def _judge(args: argparse.Namespace) -> int:
+    """What was recorded of a sound that was written: which explanation it speaks for."""
+    if args.live or args.explanation:
+        raise UsageError("without --reference a recording of --excitation is judged: give --reference to ask anew")
+    profile, question = Profile.load(args.profile), _question(args)
+    sound, answer = read(args.excitation, "excitation"), read_voice(args.recording, "recording")
+    recording, reference = (read_voice(question[role], role) for role in ("recording", "reference"))
+    with progress("the answer"):
+        wanted = [tuple(text.split("+")) for text in question["explanations"]]
+        inquiry = _inquiry(profile, wanted, recording, reference)
+        likely = weights(inquiry.evidence(answer, sound), [inquiry.gains(sound)])
+    told = Answer(inquiry.explanations, likely, tuple(question["sounds"]))
+    _tell(args, told, {**vars(args), **question, "profile": args.profile})
+    return 0
+
+
+def _question(args: argparse.Namespace) -> dict[str, Any]:
+    """What was asked with the sound. Raises AudioFileError where this is not the sound, or the profile, that it was asked with."""
+    path, again = question_of(args.excitation), "write it again with --recording and --reference"
+    try:
+        question: dict[str, Any] = json.loads(Path(path).read_text(encoding="utf-8"))
+        schema, digests = question["schema"], {role: question[f"{role}_sha256"] for role in ("excitation", "profile")}
+    except (OSError, ValueError, TypeError, KeyError):
+        raise AudioFileError(
+            f"{path} is not there or holds no question: {args.excitation} is no sound that probe wrote; {again}"
+        ) from None
+    if schema != SCHEMA:
+        raise AudioFileError(f"{path} has schema {schema}, expected {SCHEMA}: {again}")
+    for role, digest in digests.items():
+        if _digest(getattr(args, role)) != digest:
+            raise AudioFileError(f"{role} {getattr(args, role)} is not the one that {path} was written with; {again}")
+    return question
+
+
+def _digest(path: str) -> str:
+    try:
+        return hashlib.sha256(Path(path).read_bytes()).hexdigest()
+    except OSError as error:
+        raise AudioFileError(f"{path} cannot be read: {error.strerror}") from None
+
+
+def _tell(args: argparse.Namespace, answer: Answer, names: dict[str, Any]) -> None:
+    """Which it is, or what is left and what to do then."""
+    seconds = len(answer.sounds) * SOUND_S
+    shares = ", ".join(f"{one.name} {100 * weight:.3g} %" for one, weight in answer.ranked)
+    lines = [f"played      {words}" for words in answer.sounds]
+    if answer.settled:
+        chance = f"{answer.odds:.0f}" if answer.odds < 1000 else "more than 1000"
+        lines += [f"it is       {answer.first.name}, {chance} to 1 ({shares})"]
+        lines += [f"next        {add_command(answer.first.effects, names)}"]
+    elif answer.likely[-1] == answer.likely.max():
+        lines += [
+            "none        of them predicts what was heard; was anything else heard, or is the path another by now?"
+        ]
+    else:
+        lines += [f"open        {shares}: not {ENOUGH:.0f} to 1 after {seconds:g} s; ask for more with --seconds"]
+    print_result(args, lines, {"schema": SCHEMA, **answer.to_dict(), "seconds": seconds})

@@ -1,0 +1,385 @@
+"""What to play where several explanations of a recording remain, and which of them holds once that was heard."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import permutations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import log_ndtr
+
+from edgefilter.calibration.multisine import BAND_HZ, SPEECH_DB
+from edgefilter.diagnosis.joint import fit_jointly
+from edgefilter.diagnosis.prepare import Prepared, prepare
+from edgefilter.diagnosis.score import FRAMES_PER_CELL, HOP, Judge
+from edgefilter.dsp.convolution import convolve
+from edgefilter.dsp.fractional_delay import delayed
+from edgefilter.dsp.psd import GRID_BINS, frequencies, variance_at
+from edgefilter.echo.effects.catalogue import find
+from edgefilter.echo.measurement import Measurement
+from edgefilter.echo.model import EchoModel
+from edgefilter.errors import SignalError, UsageError
+from edgefilter.profile.data import Profile
+from edgefilter.types import PRE_ROLL, SAMPLE_RATE, Array, Samples
+
+ENOUGH = 20.0
+"""Odds at which a question is settled: the 5 % that a test is usually allowed."""
+SOUND_S = 2.5
+"""Seconds of one sound: two are what a robot plays without anybody asking why."""
+MARK_S, GAP_S, END_S = 0.25, 0.15, 0.1
+"""Each begins with a noise, by which its lag is found where it is silent itself, and a gap, and ends in silence, so that
+its reverberation is judged as well."""
+LINES = 150
+"""Of that sound: every 25th of the odd ones, so that products of two or three of them fall between."""
+ERROR_TAPS, FLIP = 64, 256
+"""Of the filter that gives a simulated explanation's error its spectrum, and samples (16 ms) for which it keeps its sign."""
+LOOSE = 0.25
+"""Part of how far two explanations expect to be apart by which either may be off. Right ones of 16 simulated robots
+(bench/diagnosis/probe.py, voices of training) were off by a tenth to a half."""
+NONE = 100.0
+"""Times the variance that the best explanation expects: with so much more nothing is known. By the likelihood that is
+nearer from ten times the expected power on; right explanations of simulated robots leave up to 3 times of it."""
+TWINS = 1e-5
+"""Part of the voice's power (-50 dB) by which two explanations have to differ, to be two."""
+
+
+@dataclass(frozen=True, eq=False)
+class Explanation:
+    """Effects beyond the profile's, and the model with them.
+
+    error (601,): part of the voice's power, 0 to 8 kHz, that the model leaves over what it expects, of seconds that it was not
+    fitted to: so far it may be off elsewhere.
+    """
+
+    effects: tuple[str, ...]
+    model: EchoModel
+    error: Array
+
+    @property
+    def name(self) -> str:
+        """In one word."""
+        return "+".join(self.effects)
+
+
+@dataclass(frozen=True, eq=False)
+class Sound:
+    """One sound of the menu, in words and samples (n,), and what it is expected to tell (Inquiry.sounds)."""
+
+    words: str
+    samples: Samples
+    expected: float
+
+
+@dataclass(frozen=True, eq=False)
+class Answer:
+    """What was asked and answered: the explanations and their probabilities, after those sounds.
+
+    likely: (explanations + 1,), the last of none of them.
+    """
+
+    explanations: tuple[Explanation, ...]
+    likely: Array
+    sounds: tuple[str, ...]
+
+    @property
+    def first(self) -> Explanation:
+        """The most probable one, none of them left aside."""
+        return self.explanations[int(np.argmax(self.likely[:-1]))]
+
+    @property
+    def odds(self) -> float:
+        """Of that against all else; at most a million."""
+        most = float(np.max(self.likely[:-1]))
+        return most / max(1.0 - most, 1e-6)
+
+    @property
+    def ranked(self) -> list[tuple[Explanation, float]]:
+        """Each explanation with its probability, the most probable first."""
+        pairs = zip(self.explanations, self.likely[:-1].tolist(), strict=True)
+        return sorted(pairs, key=lambda pair: -pair[1])
+
+    @property
+    def settled(self) -> bool:
+        """Whether these are enough to name it."""
+        return self.odds >= ENOUGH
+
+    def to_dict(self) -> dict[str, object]:
+        """Ready for JSON."""
+        return {
+            "settled": self.settled,
+            "odds": round(self.odds, 1),
+            "explanations": [{"effects": one.effects, "weight": round(weight, 6)} for one, weight in self.ranked],
+            "none": round(float(self.likely[-1]), 6),
+            "sounds": self.sounds,
+        }
+
+
+class Inquiry:
+    """A recording (m,) of a reference (n,) and its explanations, each fitted to one half of it: what can be asked further.
+
+    wanted: the effects of each explanation; two that predict the same are one. Raises SignalError where the recording does
+    not contain the reference or a fit fails, UsageError for an event.
+    """
+
+    def __init__(
+        self, profile: Profile, wanted: Sequence[tuple[str, ...]], recording: Samples, reference: Samples
+    ) -> None:
+        for name in (name for effects in wanted for name in effects if find(name).event):
+            raise UsageError(f"{name} belongs to one recording, and no other can tell of it: ask without it")
+        self.profile, self.reference = profile, reference
+        self._first = prepare(profile, recording, reference)
+        judge, measurement = Judge(self._first), self._first.measurement
+        kept: list[Explanation] = []
+        voices: list[Samples] = []
+        for effects in wanted:
+            model = _fitted(measurement, self._first.model, effects)
+            power, expected, voice = _cells(judge, model)
+            over = np.maximum(np.sum(power - expected, axis=0), 0.0) / np.maximum(np.sum(voice, axis=0), 1e-12)
+            heard = measurement.heard(model)[1]
+            noisy = model.unpredictable(measurement.reference) or any(find(name).stage == "noise" for name in effects)
+            if noisy or all(np.sum((heard - other) ** 2) > TWINS * np.sum(other**2) for other in voices):
+                error = np.interp(frequencies(GRID_BINS), judge.band_hz.mean(axis=1), over)
+                kept.append(Explanation(effects, model.lasting(), error))
+                voices.append(heard)
+        self.explanations = tuple(kept)
+
+    def before(self) -> Array:
+        """(explanations + 1,) the probability of each, and of none, by the other half, before anything is asked."""
+        return weights(_log_likelihood(self._first, self.explanations))
+
+    def evidence(self, recording: Samples, sound: Samples) -> Array:
+        """(moments, explanations + 1) log likelihood of what was recorded (m,) of a sound (n,), the last of none of them.
+
+        All are fitted again, to the first recording and one half of this one, and judged by the other half; then the halves
+        change places. What a clock does begins anew with each recording, so that a model of one stays as it is.
+        Raises SignalError where the recording does not contain the sound.
+        """
+        found = []
+        for part in _halves(prepare(self.profile, recording, sound)):
+            first, new = self._first.measurement, part.measurement
+            both = Measurement(
+                np.concatenate((first.reference, new.reference)),
+                np.concatenate((first.recording, new.recording)),
+                first.noise_psd,
+                np.concatenate((self._first.usable, part.fit)),
+            )
+            again = [
+                one
+                if one.model.timed or self._first.model.timed
+                else replace(one, model=_fitted(both, part.model, one.effects))
+                for one in self.explanations
+            ]
+            found.append(_log_likelihood(part, again))
+        return np.concatenate(found)
+
+    def gains(self, sound: Samples) -> Array:
+        """(explanations, explanations) the log odds over each other that are expected of a sound (n,) where the first is true."""
+        count = len(self.explanations)
+        heard = (_simulated(self.profile, true, sound) for true in self.explanations)
+        told = [self.evidence(recording, sound).sum(axis=0)[:count] for recording in heard]
+        return np.stack([told[i][i] - told[i] for i in range(count)])
+
+    def sounds(self, likely: Array, progress: Callable[[str], None] | None = None) -> list[Sound]:
+        """The menu, the best sound first: the one that is expected to tell most of the explanations that stand.
+
+        Each sound is played to each explanation, as fitted, with its noise, and judged as what is recorded will be (Lindley
+        1956, "On a measure of the information provided by an experiment"). likely (explanations + 1,): so far; less
+        than one in ENOUGH of the best does not stand, but two always do. Of the log odds that the true one gains over each
+        other the mean logarithm counts, 1 added: twice as sure is worth less than another pair told. Raises SignalError
+        where no sound tells those that stand apart.
+        """
+        likely = likely[: len(self.explanations)]
+        standing = max(int(np.count_nonzero(likely * ENOUGH >= likely.max())), 2)
+        asked = [self.explanations[i] for i in np.argsort(-likely)[:standing]]
+        found, most = [], 0.0
+        for words, sound in menu(self.reference).items():
+            if progress:
+                progress(f"trying {words}")
+            heard = (prepare(self.profile, _simulated(self.profile, one, sound), sound) for one in asked)
+            told = [np.sum([_log_likelihood(h, asked).sum(axis=0) for h in _halves(x)], axis=0) for x in heard]
+            gains = [max(float(told[i][i] - told[i][j]), 0.0) for i, j in permutations(range(len(asked)), 2)]
+            found.append(Sound(words, sound, float(np.mean(np.log1p(gains)))))
+            most = max(most, *gains)
+        found.sort(key=lambda sound: -sound.expected)
+        if most < np.log(ENOUGH):
+            names = " and ".join(one.name for one in asked)
+            raise SignalError(f"no sound tells {names} apart: as fitted they predict the same; record in another place")
+        return found
+
+    def ask(
+        self, play: Callable[[Sound], Samples], seconds: float, progress: Callable[[str], None] | None = None
+    ) -> Answer:
+        """Play the best sound for what stands, and again, until the odds are ENOUGH or the seconds are over.
+
+        play: gives what is recorded of a sound and for a second after it. Raises SignalError where no sound tells them
+        apart, or what is recorded does not contain it.
+        """
+        count = len(self.explanations)
+        heard, gains = np.zeros((0, count + 1)), []
+        answer = Answer(self.explanations, np.full(count + 1, 1.0 / count), ())
+        while not answer.settled and (len(answer.sounds) + 1) * SOUND_S <= seconds:
+            sounds = self.sounds(answer.likely, progress)
+            sound = next((one for one in sounds if one.words not in answer.sounds), sounds[0])
+            heard = np.concatenate((heard, self.evidence(play(sound), sound.samples)))
+            gains.append(self.gains(sound.samples))
+            answer = Answer(self.explanations, weights(heard, gains), (*answer.sounds, sound.words))
+        return answer
+
+
+def weights(found: Array, gains: Sequence[Array] = ()) -> Array:
+    """(explanations + 1,) the probability of each and of none, all as probable beforehand, from evidence (moments, explanations + 1).
+
+    No explanation is exactly true, so that likelihoods of thousands of samples would be far too sure. Asked is which of two
+    is closer to what was heard: by chance the difference of their log likelihoods has either sign from moment to moment; its
+    sum over the root of the sum of its squares is a normal number (Vuong 1989, "Likelihood ratio tests for model selection and
+    non-nested hypotheses", eq. 4.2). gains: what was expected of each sound, as Inquiry.gains has it. The sum is counted
+    from the middle of what the two expect, since a flexible explanation is never far from a simple one that is true; and
+    what they expect is known to a part, LOOSE, of how far it is apart.
+    """
+    count = found.shape[1] - 1
+    z = np.full((count, count), np.inf)
+    for i, j in permutations(range(count), 2):
+        less, middle = found[:, i] - found[:, j], sum(0.5 * (gain[i, j] - gain[j, i]) for gain in gains)
+        variance = np.sum(less**2) + sum((0.5 * LOOSE * (gain[i, j] + gain[j, i])) ** 2 for gain in gains)
+        z[i, j] = (np.sum(less) - middle) / np.sqrt(max(variance, 1e-12))
+    best = int(np.argmax(z.min(axis=1)))
+    z[best, best] = 0.0
+    vague = found[:, best] - found[:, -1]
+    z_of = np.append(z[best], np.sum(vague) / np.sqrt(max(float(np.sum(vague**2)), 1e-12)))
+    odds = np.exp(log_ndtr(-z_of) - log_ndtr(z_of))
+    return np.asarray(odds / odds.sum())
+
+
+def menu(reference: Samples) -> dict[str, Samples]:
+    """Twelve sounds of SOUND_S, by what they are, the softest first, none louder than the loudest words of a reference (n,), which are among them.
+
+    So nothing is asked of a loudspeaker that the first recording does not tell of.
+    """
+    rng = np.random.default_rng(35)
+    n = round((SOUND_S - MARK_S - GAP_S - END_S) * SAMPLE_RATE)
+    words, time = _loudest(reference, n), np.arange(n) / SAMPLE_RATE
+    level, peak = float(np.sqrt(np.mean(words**2))), float(np.max(np.abs(words)))
+    hz = np.arange(n // 2 + 1) * SAMPLE_RATE / n
+    even = ((hz >= BAND_HZ[0]) & (hz <= 7500.0)) / np.maximum(hz, 500.0)
+    lines = np.zeros(hz.size)
+    odd = np.flatnonzero((np.arange(hz.size) % 2 == 1) & (even > 0.0))
+    lines[rng.choice(odd, LINES, replace=False)] = 1.0
+    speech, flat, sparse = (_noise(rng, shape, level, peak) for shape in (_like_speech(hz), even, lines * even))
+    steps = 10.0 ** (-8.0 * np.floor(5.0 * np.arange(n) / n) / 20.0)
+    sounds = {
+        "silence": np.zeros(n),
+        "noise, 20 dB softer": 0.1 * speech,
+        "odd lines, 20 dB softer": 0.1 * sparse,
+        "the loudest words, 12 dB softer": 0.25 * words,
+        "the loudest words": words,
+        "bursts of 50 ms with gaps": speech * (time % 0.4 < 0.05),
+        "bursts of 0.3 s with gaps": speech * (time % 0.7 < 0.3),
+        "five steps of level, upwards": steps[::-1] * speech,
+        "five steps of level, downwards": steps * speech,
+        "noise": speech,
+        "odd lines": sparse,
+        "noise of all frequencies": flat,
+    }
+    mark = round(MARK_S * SAMPLE_RATE)
+    front = _noise(rng, _like_speech(np.arange(mark // 2 + 1) * SAMPLE_RATE / mark), level, peak)
+    front = np.concatenate((front, np.zeros(round(GAP_S * SAMPLE_RATE))))
+    end = np.zeros(round(END_S * SAMPLE_RATE))
+    return {what: np.concatenate((front, x, end)).astype(np.float32) for what, x in sounds.items()}
+
+
+def _like_speech(hz: Array) -> Array:
+    """Magnitude of average speech at hz."""
+    inside: NDArray[np.bool_] = (hz >= BAND_HZ[0]) & (hz <= BAND_HZ[1])
+    return inside * 10 ** (np.polynomial.Polynomial(SPEECH_DB)(np.log10(np.maximum(hz, BAND_HZ[0]))) / 20)
+
+
+def _noise(rng: np.random.Generator, magnitude: Array, level: float, peak: float) -> Array:
+    """(n,) of random phases and that magnitude (n / 2 + 1,), of a root mean square and a peak, faded in and out over 10 ms."""
+    x = np.fft.irfft(magnitude * np.exp(2j * np.pi * rng.uniform(size=magnitude.size)))
+    fade = np.minimum(np.arange(1, x.size + 1), 160) / 160
+    x *= fade * fade[::-1]
+    return np.asarray(x * min(level / np.sqrt(np.mean(x**2)), peak / np.max(np.abs(x))))
+
+
+def _loudest(reference: Samples, n: int) -> Array:
+    """(n,) the loudest stretch of a reference, faded in and out, with silence behind a shorter one."""
+    x = np.pad(reference.astype(np.float64), (0, max(n + 1 - reference.size, 0)))
+    energy = np.concatenate(([0.0], np.cumsum(x**2)))
+    at = int(np.argmax(energy[n:] - energy[:-n]))
+    fade = np.minimum(np.arange(1, n + 1), 160) / 160
+    return x[at : at + n] * fade * fade[::-1]
+
+
+def _fitted(measurement: Measurement, model: EchoModel, effects: Sequence[str]) -> EchoModel:
+    try:
+        return fit_jointly(measurement, model, effects)
+    except (ArithmeticError, np.linalg.LinAlgError) as error:
+        raise SignalError(f"{'+'.join(effects)} cannot be fitted to the recording: {error}") from None
+
+
+def _halves(prepared: Prepared) -> Iterator[Prepared]:
+    """The same with one half to fit to and the other to judge by, then the other way round."""
+    for half in (prepared.fit, prepared.held_out):
+        yield replace(prepared, measurement=replace(prepared.measurement, fit=half))
+
+
+def _simulated(profile: Profile, true: Explanation, sound: Samples) -> Samples:
+    """What would be recorded of a sound (n,), and for a second after it, were that explanation true: (n + SAMPLE_RATE,).
+
+    Its own error is its voice, so much softer, with a sign that changes at random: no filter that is fitted takes it up.
+    """
+    rng, model = np.random.default_rng(1), true.model
+    x = delayed(np.pad(sound, (0, SAMPLE_RATE)), profile.delay - PRE_ROLL)
+    bins = frequencies(ERROR_TAPS // 2 + 1)
+    off = np.fft.irfft(np.sqrt(np.interp(bins, frequencies(GRID_BINS), true.error)))
+    voice, signs = model.predict(x), np.repeat(rng.choice([-1.0, 1.0], x.size // FLIP + 1), FLIP)[: x.size]
+    heard = (
+        voice
+        + signs * convolve(voice, np.fft.fftshift(off))[ERROR_TAPS // 2 :][: x.size]
+        + _coloured(rng, x.size, model.expected_noise(profile.noise_psd))
+    )
+    for square, colour in model.unpredictable(x):
+        heard = heard + np.sqrt(square) * _coloured(rng, x.size, colour)
+    return heard.astype(np.float32)
+
+
+def _coloured(rng: np.random.Generator, n: int, psd: Array) -> Array:
+    """(n,) noise of that PSD (601,)."""
+    amplitude = np.sqrt(variance_at(np.fft.rfftfreq(n, 1 / SAMPLE_RATE), psd))
+    return np.fft.irfft(np.fft.rfft(rng.standard_normal(n)) * amplitude, n)
+
+
+def _cells(judge: Judge, model: EchoModel) -> tuple[Array, Array, Array]:
+    """(moments, bands) each, over the known fan: the power that a model leaves, what it expects there, and its voice."""
+    score, psd = judge.of(model), judge.psd
+    power = judge.cells(judge.measurement.recording - score.prediction)
+    fan = np.interp(judge.band_hz.mean(axis=1), frequencies(psd.size), model.expected_noise(psd) / psd)
+    return power, power / score.cells + fan - 1.0, judge.cells(score.prediction)
+
+
+def _log_likelihood(prepared: Prepared, explanations: Sequence[Explanation]) -> Array:
+    """(moments, explanations + 1) of the cells that no fit has used, the last of none of the explanations.
+
+    Of a residual that is Gaussian in each cell, with a variance that is expected to a factor: Student's t with as many
+    degrees of freedom as the cell has (Lange, Little & Taylor 1989), so that what is louder than expected counts by its
+    level, and what was expected in vain counts as well.
+    """
+    judge = Judge(prepared)
+    freedom = judge.freedom * (HOP * FRAMES_PER_CELL / (HOP - 1))
+
+    def likelihood(power: Array, expected: Array) -> Array:
+        return -0.5 * np.sum(freedom * (np.log(expected) + 2.0 * np.log1p(power / expected)), axis=1)
+
+    columns, vague = [], []
+    for each in explanations:
+        power, expected, voice = _cells(judge, each.model)
+        error = np.interp(judge.band_hz.mean(axis=1), frequencies(GRID_BINS), each.error)
+        expected = expected + error * voice
+        columns.append(likelihood(power, expected))
+        vague.append(likelihood(power, NONE * expected))
+    if not judge.starts.size:
+        raise SignalError("too little of the recording can be judged: expected two seconds in which nobody talks")
+    best = int(np.argmax([column.sum() for column in columns]))
+    return np.stack([*columns, vague[best]], axis=1)

@@ -1,0 +1,248 @@
+"""Where two explanations remain a sound tells which is true, whichever it is; and what the command says of each mistake."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import soundfile
+
+from edgefilter.cli import main
+from edgefilter.diagnosis.advice import asks, remaining
+from edgefilter.diagnosis.probe import ENOUGH, SOUND_S, Inquiry, menu, weights
+from edgefilter.diagnosis.result import Candidate
+from edgefilter.echo.model import EchoModel
+from edgefilter.errors import SignalError, UsageError
+from edgefilter.types import SAMPLE_RATE
+from tests.diagnosis.robot_scene import path, profile, record, voice
+
+COMPRESSION = {"threshold_db": -45.0, "ratio": 1.5, "attack_ms": 8.0, "release_ms": 900.0, "makeup_db": 4.0}
+PAIRS = {
+    "compression against gain": (("compression", COMPRESSION), ("playback_gain", {"gain_db": -3.0})),
+    "ring against gain": (
+        ("chassis_resonance", {"frequency_hz": 640.0, "q": 8.0, "gain_db": -8.0}),
+        ("playback_gain", {"gain_db": -1.0}),
+    ),
+    "limiter against distortion": (
+        ("limiter", {"ceiling_db": -20.0, "release_ms": 100.0}),
+        ("speaker_nonlinearity", {"odd": np.array([-1.0, 0.2]), "knee": 0.3}),
+    ),
+    "fan against codec": (
+        ("fan_noise", {"spectrum_db": 6.0, "change_db": 6.0}),
+        ("codec", {"power": np.full(16, 2e-4), "decay_ms": 8.0, "exponent": 1.0}),
+    ),
+}
+
+
+def heard(x: np.ndarray, name: str, values: dict, seed: int) -> np.ndarray:
+    """(n + SAMPLE_RATE,) what the microphone records of a sound (n,), and a second more, with that effect."""
+    rng, model = np.random.default_rng(seed), EchoModel(path()).with_effect(name, values)
+    x = np.pad(x, (0, SAMPLE_RATE))
+    y = record(x, model, seed=seed)
+    for square, _ in model.unpredictable(x):
+        y = y + np.sqrt(square) * rng.standard_normal(x.size)
+    if name == "fan_noise":  # 6 dB louder: three more of the same power
+        y = y + np.sqrt(3.0) * 1e-3 * rng.standard_normal(x.size)
+    return y.astype(np.float32)
+
+
+@pytest.mark.parametrize("pair", PAIRS)
+@pytest.mark.parametrize("true", [0, 1])
+def test_five_seconds_settle_a_pair_whichever_is_true(pair: str, true: int) -> None:
+    x, (name, values) = voice(5.0), PAIRS[pair][true]
+    inquiry = Inquiry(profile(), [(one,) for one, _ in PAIRS[pair]], heard(x, name, values, 3), x)
+    answer = inquiry.ask(lambda sound: heard(sound.samples, name, values, 5), 5.0)
+    assert answer.settled and answer.first.name == name
+    assert answer.to_dict()["explanations"][0]["effects"] == (name,)
+    assert 1 <= len(answer.sounds) <= 2
+
+
+def test_the_menu_has_twelve_sounds_no_louder_than_what_the_robot_says() -> None:
+    x = voice(4.0)
+    sounds = menu(x)
+    assert len(sounds) == 12
+    for words, sound in sounds.items():
+        assert sound.dtype == np.float32 and sound.size == SOUND_S * SAMPLE_RATE, words
+        assert 0.0 < np.abs(sound).max() <= np.abs(x).max() * (1 + 1e-6), words
+    assert all(np.array_equal(sound, menu(x)[words]) for words, sound in sounds.items())
+    assert np.array_equal(menu(0.5 * x)["noise"], 0.5 * sounds["noise"])
+    part = sounds["odd lines"][round(0.4 * SAMPLE_RATE) : -round(0.1 * SAMPLE_RATE)]
+    spectrum = np.abs(np.fft.rfft(part))
+    assert np.sum(spectrum[::2] ** 2) < 0.02 * np.sum(spectrum**2)  # what the fades leave at even lines
+
+
+def test_weights_follow_the_evidence() -> None:
+    rng = np.random.default_rng(0)
+    found = rng.standard_normal((40, 3))
+    likely = weights(found)
+    assert likely.sum() == pytest.approx(1.0) and likely.argmax() == found.sum(axis=0).argmax()
+    assert weights(found + rng.standard_normal((40, 1))) == pytest.approx(likely)  # only differences count
+    assert weights(1000.0 * found) == pytest.approx(likely)  # and how steady they are
+    assert weights(np.tile(found[:, :1], 2)) == pytest.approx([0.5, 0.5])
+    steady = weights(np.stack((np.ones(40), np.zeros(40)), axis=1))
+    assert steady[0] > 1.0 - 1e-6
+    loud_once = weights(np.stack((np.eye(40)[0], np.zeros(40)), axis=1))
+    assert loud_once[0] < ENOUGH / (1 + ENOUGH)  # one moment settles nothing
+
+
+def test_by_chance_odds_of_twenty_to_one_come_as_seldom_as_they_should() -> None:
+    """Of two that are equally far off each is settled on in 5 % of 2000 draws of 20 moments, the law of the test; 1.5 % more or less are chance."""
+    rng = np.random.default_rng(1)
+    sure = [max(weights(np.stack((d, -d), axis=1))) >= ENOUGH / (1 + ENOUGH) for d in rng.standard_normal((2000, 20))]
+    assert np.mean(sure) == pytest.approx(0.095, abs=0.02)
+
+
+def test_what_predicts_the_same_is_one_explanation_and_an_event_is_none() -> None:
+    x = voice(4.0)
+    y = record(x, EchoModel(path(seed=2)))
+    assert len(Inquiry(profile(), [("early_path",), ("late_reverb",)], y, x).explanations) == 1
+    with pytest.raises(UsageError, match="delay_jump belongs to one recording"):
+        Inquiry(profile(), [("delay_jump",), ("playback_gain",)], y, x)
+
+
+def test_a_question_that_no_sound_answers_is_said() -> None:
+    x = voice(4.0)
+    y = heard(x, "compression", COMPRESSION, 3)
+    inquiry = Inquiry(profile(), [("playback_gain",), ("compression",)], y, x)
+    inquiry.explanations = (inquiry.explanations[0],) * 2
+    with pytest.raises(SignalError, match="no sound tells playback_gain and playback_gain apart"):
+        inquiry.sounds(np.ones(2))
+
+
+def row(effect: str, gain_db: float, verdict: str = "explained by another") -> Candidate:
+    return Candidate(effect, verdict, "", gain_db)
+
+
+def test_what_explains_nearly_as_much_remains_and_events_do_not() -> None:
+    named = row("compression", 5.0, "named")
+    rivals = [row("limiter", 4.0), row("playback_gain", 3.0), row("mic_agc", 4.9), row("rattle", 4.9, "below its bar")]
+    assert remaining([named, *rivals]) == (("compression",), ("limiter",))
+    assert remaining([named]) == (("compression",),) and asks([named]) == ()
+    both = remaining([named, row("late_reverb", 2.0, "named"), row("equaliser", 4.5), row("early_path", 6.0)])
+    assert both == (("compression", "late_reverb"), ("early_path",))
+    assert remaining([row("limiter", 1.0), row("rattle", 0.9)]) == (("limiter",), ("rattle",))
+    assert remaining([]) == ()
+    assert asks([named, *rivals]) == ("compression or limiter: edgefilter probe plays what tells them apart",)
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a robot that compresses, a recording of it, and what the command wrote for it."""
+    folder, x = tmp_path_factory.mktemp("probe"), voice(5.0)
+    profile().save(folder / "robot.npz")
+    soundfile.write(folder / "ref.wav", x, SAMPLE_RATE, "FLOAT")
+    soundfile.write(folder / "mic.wav", heard(x, "compression", COMPRESSION, 3), SAMPLE_RATE, "FLOAT")
+    assert main(asking(folder)) == 0
+    sound, _ = soundfile.read(folder / "probe.wav", dtype="float32")
+    soundfile.write(folder / "answer.wav", heard(sound, "compression", COMPRESSION, 5), SAMPLE_RATE, "FLOAT")
+    return folder
+
+
+def asking(folder: Path, *explanations: str) -> list[str]:
+    named = {"profile": "robot.npz", "recording": "mic.wav", "reference": "ref.wav", "excitation": "probe.wav"}
+    words = [word for role, file in named.items() for word in (f"--{role}", str(folder / file))]
+    return ["probe", *(explanations or ("playback_gain", "compression")), *words]
+
+
+def answering(
+    folder: Path, recording: str = "answer.wav", sound: str = "probe.wav", robot: str = "robot.npz"
+) -> list[str]:
+    named = {"profile": robot, "recording": recording, "excitation": sound}
+    return ["probe", *(word for role, file in named.items() for word in (f"--{role}", str(folder / file)))]
+
+
+def test_the_command_writes_the_sounds_and_judges_what_was_heard_of_them(written: Path, capsys) -> None:
+    info = soundfile.info(written / "probe.wav")
+    assert (info.samplerate, info.frames) == (SAMPLE_RATE, 2 * SOUND_S * SAMPLE_RATE)
+    question = json.loads((written / "probe.wav.json").read_text())
+    assert question["explanations"] == ["playback_gain", "compression"] and len(question["sounds"]) == 2
+    assert main([*answering(written), "--json", str(written / "said.json")]) == 0
+    said = capsys.readouterr().out
+    assert "it is       compression" in said and "edgefilter add compression --profile" in said
+    figures = json.loads((written / "said.json").read_text())
+    assert figures["schema"] == 1 and figures["settled"] and figures["odds"] >= ENOUGH and figures["seconds"] == 5.0
+    assert [one["effects"] for one in figures["explanations"]] == [["compression"], ["playback_gain"]]
+
+
+def test_what_nothing_predicts_is_said_and_named_by_none(written: Path, capsys) -> None:
+    """A vacuum cleaner runs, 26 dB over the fan: neither is closer in a way that matters."""
+    y, _ = soundfile.read(written / "answer.wav", dtype="float32")
+    y += 0.02 * np.random.default_rng(0).standard_normal(y.size).astype(np.float32)
+    soundfile.write(written / "strange.wav", y, SAMPLE_RATE, "FLOAT")
+    assert main([*answering(written, "strange.wav"), "--json", str(written / "strange.json")]) == 0
+    assert "none        of them predicts what was heard" in capsys.readouterr().out
+    figures = json.loads((written / "strange.json").read_text())
+    assert not figures["settled"] and figures["none"] > 0.5
+
+
+@pytest.mark.parametrize(
+    ("damage", "said"),
+    [
+        ("silent", "recording {folder}/silent.wav is silent"),
+        ("other", "does not contain the reference at any lag"),
+        ("sound", "excitation {folder}/probe.wav is not the one that {folder}/probe.wav.json was written with"),
+        ("profile", "profile {folder}/robot.npz is not the one"),
+        ("question", "{folder}/probe.wav.json is not there or holds no question"),
+        ("schema", "{folder}/probe.wav.json has schema 9, expected 1"),
+        ("moved", "mic.wav"),
+        ("version", "version is 99, expected"),
+    ],
+)
+def test_each_mistake_is_one_line_and_exit_code_1(
+    written: Path, tmp_path: Path, capsys, damage: str, said: str
+) -> None:
+    folder = tmp_path / "copy"
+    shutil.copytree(written, folder)
+    question = json.loads((folder / "probe.wav.json").read_text())
+    recording, robot = "answer.wav", "robot.npz"
+    if damage == "silent":
+        recording = "silent.wav"
+        soundfile.write(folder / recording, np.zeros(96_000), SAMPLE_RATE, "FLOAT")
+    elif damage == "other":
+        recording = "other.wav"
+        soundfile.write(folder / recording, record(voice(6.0, seed=9)), SAMPLE_RATE, "FLOAT")
+    elif damage == "sound":
+        soundfile.write(folder / "probe.wav", voice(5.0), SAMPLE_RATE, "FLOAT")
+    elif damage == "profile":
+        profile(path(seed=2)).save(folder / robot)
+    elif damage == "question":
+        (folder / "probe.wav.json").write_text("{}")
+    elif damage == "schema":
+        (folder / "probe.wav.json").write_text(json.dumps({**question, "schema": 9}))
+    elif damage == "moved":
+        (folder / "probe.wav.json").write_text(json.dumps({**question, "recording": str(folder / "gone/mic.wav")}))
+    else:
+        with np.load(folder / robot) as file:
+            fields = dict(file)
+        np.savez(folder / "old.npz", **{**fields, "version": np.array(99)})
+        robot = "old.npz"
+    capsys.readouterr()
+    assert main(answering(folder, recording, robot=robot)) == 1
+    lines = [line for line in capsys.readouterr().err.splitlines() if line.startswith("edgefilter: ")]
+    assert len(lines) == 1 and said.format(folder=folder) in lines[0], lines
+
+
+def test_nothing_to_ask_is_said_as_such(written: Path, capsys) -> None:
+    assert main(asking(written, "compression")) == 1
+    assert "nothing to ask: compression is named" in capsys.readouterr().err
+    assert main(asking(written, "early_path", "late_reverb")) == 1
+    assert "early_path and late_reverb predict the same, under other names" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ([], "expected one of --live"),
+        (["--live", "--excitation", "a.wav"], "expected one of --live"),
+        (["--excitation", "a.wav", "--seconds", "1"], "--seconds is 1, expected at least 2.5"),
+        (["limiter", "--excitation", "a.wav"], "give --reference"),
+        (["limitter", "--excitation", "a.wav"], "unknown effect 'limitter'"),
+        (["--live"], "give --reference"),
+    ],
+)
+def test_a_request_that_cannot_be_met_is_refused_before_any_work(words: list[str], said: str, capsys) -> None:
+    assert main(["probe", *words, "--profile", "p.npz", "--recording", "m.wav"]) == 2
+    assert said in capsys.readouterr().err
