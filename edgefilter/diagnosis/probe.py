@@ -40,7 +40,7 @@ LOOSE = 0.25
 (bench/diagnosis/probe.py, voices of training) were off by a tenth to a half."""
 NONE = 100.0
 """Times the variance that the best explanation expects: with so much more nothing is known. By the likelihood that is
-nearer from ten times the expected power on; right explanations of simulated robots leave up to 3 times of it."""
+nearer from ten times the expected power on. Chosen by hand, not tuned."""
 TWINS = 1e-5
 """Part of the voice's power (-50 dB) by which two explanations have to differ, to be two."""
 
