@@ -162,8 +162,8 @@ def frame(engine, scale=1.0):
 def answering(monkeypatch, engine, spectrum, probability=0.5):
     run = engine._run
 
-    def disturbed(frame, state):
-        places = run(frame, state)
+    def disturbed(frame, state, mic, reference):
+        places = run(frame, state, mic, reference)
         places.spectrum[:] = spectrum
         places.probability[:] = probability
         return places
