@@ -18,11 +18,11 @@ PICTURE = Path(__file__).with_name("arrays.png")
 WAYS = {"as it is spoken": "crnn-{}", "finished turns": "crnn-{}-turns"}
 COUNTS = (1, 2, 3, 4)
 PANES = {
-    "the robot talks, laboratory": (("paper", "live"), "lab"),
-    "the robot talks, office": (("paper", "live"), "office"),
-    "its fan alone, both rooms": (("no_echo",), ""),
+    "the robot talks, laboratory": ("paper/lab", "live/lab"),
+    "the robot talks, office": ("paper/office", "live/office"),
+    "its fan alone, both rooms": ("no_echo/",),
 }
-"""Sets and beginning of the clips' names of each pane."""
+"""How the names of each pane's clips begin."""
 
 
 def words_wrong(rows: list[dict], system: str) -> float:
@@ -36,8 +36,8 @@ def draw() -> None:
     found = results.read(results.RESULTS / "arrays.json")["parts"]["evaluation"]["rows"]
     every = [dict(zip(found["columns"], values, strict=True)) for values in found["values"]]
     figure, panes = plt.subplots(1, len(PANES), figsize=(10.4, 3.4), sharey=True, layout="constrained")
-    for pane, (title, (sets, room)) in zip(panes, PANES.items()):
-        rows = [row for row in every if row["set"] in sets and row["clip"].startswith(room)]
+    for pane, (title, begin) in zip(panes, PANES.items()):
+        rows = [row for row in every if row["clip"].startswith(begin)]
         for shift, (way, name), colour in zip((-0.2, 0.2), WAYS.items(), ("#1f77b4", "#c65102")):
             systems = [name.format(count) if count > 1 else "crnn" for count in COUNTS]
             heights = [words_wrong(rows, system) for system in systems]
