@@ -297,9 +297,7 @@ def _like_speech(hz: Array) -> Array:
 
 def _noise(rng: np.random.Generator, magnitude: Array, level: float, peak: float) -> Array:
     """(n,) of random phases and that magnitude (n / 2 + 1,), of a root mean square and a peak, faded in and out over 10 ms."""
-    x = np.fft.irfft(magnitude * np.exp(2j * np.pi * rng.uniform(size=magnitude.size)))
-    fade = np.minimum(np.arange(1, x.size + 1), 160) / 160
-    x *= fade * fade[::-1]
+    x = _faded(np.fft.irfft(magnitude * np.exp(2j * np.pi * rng.uniform(size=magnitude.size))))
     return np.asarray(x * min(level / np.sqrt(np.mean(x**2)), peak / np.max(np.abs(x))))
 
 
@@ -308,8 +306,13 @@ def _loudest(reference: Samples, n: int) -> Array:
     x = np.pad(reference.astype(np.float64), (0, max(n + 1 - reference.size, 0)))
     energy = np.concatenate(([0.0], np.cumsum(x**2)))
     at = int(np.argmax(energy[n:] - energy[:-n]))
-    fade = np.minimum(np.arange(1, n + 1), 160) / 160
-    return x[at : at + n] * fade * fade[::-1]
+    return _faded(x[at : at + n])
+
+
+def _faded(x: Array) -> Array:
+    """Samples (n,) faded in and out over 10 ms."""
+    fade = np.minimum(np.arange(1, x.size + 1), SAMPLE_RATE // 100) / (SAMPLE_RATE // 100)
+    return np.asarray(x * (fade * fade[::-1]))
 
 
 def _fitted(measurement: Measurement, model: EchoModel, effects: Sequence[str]) -> EchoModel:

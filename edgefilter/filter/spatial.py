@@ -133,7 +133,7 @@ class SpatialFilter:
         if heard:
             if not self._speaking:
                 self._human.fade(np.float32(CARRIED))
-                self._turn.fade(np.float32(0.0))
+                self._turn = Gathered(self._fan.shape)
             self._human.fade(self._human_keep)
             if probability > LIKELY:
                 passed = np.square(gain)
