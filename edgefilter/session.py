@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections import deque
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -57,7 +57,7 @@ class Progress:
 
 @dataclass
 class RunReport:
-    """What one run did; every figure measured in it. Of events it keeps the latest: a run may last for weeks."""
+    """What one run did; every figure measured in it. Of events it keeps the latest, without sound: a run may last for weeks."""
 
     samples_in: int = 0
     samples_out: int = 0
@@ -123,8 +123,8 @@ def filter_blocks(
 
     def tell_events(last: bool) -> None:
         for event in [*ego.events(), *troubles(report.samples_in, last)]:
-            report.events.append(event)
             tell(event)
+            report.events.append(replace(event, turn=None))
 
     def take(block: Block) -> None:
         if recorder is not None:

@@ -8,6 +8,10 @@ import numpy as np
 import pytest
 import soundfile
 
+from edgefilter.filter.ego_filter import EgoFilter
+from edgefilter.session import filter_blocks
+from edgefilter.types import Block, Event, Turn
+
 
 @pytest.mark.slow
 def test_every_command_starts_where_there_is_no_resource_module(tmp_path):
@@ -23,3 +27,23 @@ def test_every_command_starts_where_there_is_no_resource_module(tmp_path):
     done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     assert json.loads(done.stdout)["peak_memory_mb"] is None
+
+
+def test_the_report_of_a_run_keeps_what_happened_without_its_sound():
+    """A run may last for weeks, and each turn of the human holds seconds of sound: who is told may keep it."""
+    told: list[Event] = []
+    spoken = Event("speech_stopped", 320, "", Turn(0, np.ones(320, np.float32)))
+    silence = np.zeros(320, np.float32)
+
+    class Nowhere:
+        def write(self, out: np.ndarray) -> None: ...
+
+    report = filter_blocks(
+        [Block(silence, silence, 0)],
+        EgoFilter(engine="bypass"),
+        Nowhere(),
+        tell=told.append,
+        troubles=lambda sample, last: [] if last else [spoken],
+    )
+    assert told == [spoken] and told[0].turn is spoken.turn
+    assert list(report.events) == [spoken] and report.events[0].turn is None
