@@ -33,7 +33,8 @@ MOST_LAG_S = 2.0
 SEARCH_STRIDE = 768
 """Samples between two searches of the whole range."""
 COARSE_MARGIN = 400
-"""Samples, 25 ms, by which the reference is read earlier than at a coarse lag, so that a canceller holds all that arrives."""
+"""Samples, 25 ms, by which the reference is read earlier than at a coarse lag, so that a canceller holds all that arrives, and
+from which on a coarse lag is another one."""
 LOST_BLOCKS, NEARBY, NEARBY_SEARCHES = 3, 4096, 10
 """Measurements in speech without a credible peak after which all lags are searched again: at first as if the present
 delay had ceased NEARBY samples ago, which finds jumps of up to 200 ms, then as if the utterance had begun half a second
@@ -94,7 +95,7 @@ class Aligner:
         self._to_search, self._to_measure, self._stage = SEARCH_STRIDE, STRIDE // 2, 0
         self._gain: float | None = None
         self._by_bands = None if self._calibrated is not None else CoarseLag(self.hop, self._max_lag)
-        self._coarse: int | None = None  # delay at which the reference is read as long as nothing sharper is known
+        self._coarse = False  # whether a lag is followed at which nothing sharp arrives
         self._margin = PRE_ROLL
         self._known = self._refuted = self._trusted = self._measured = self._missed = False
         self._confidence, self._lost = 0.0, 0
@@ -146,11 +147,11 @@ class Aligner:
         before = self._read_at
         self._measured = False
         switched = False
-        if self._known:
+        if self._known or self._coarse:
             self._drift.advance(self.hop)
             switched = self._measure()
-        elif self._by_bands:
-            switched = self._look_coarsely(mic, ref, self._by_bands)
+        if self._by_bands and not self._known:
+            switched = self._look_coarsely(mic, ref, self._by_bands) or switched
         switched = self._search() or switched
         return self._deliver(mic, before, switched)
 
@@ -158,16 +159,16 @@ class Aligner:
         """Find where the reference is to be read as long as nothing sharper is known; True if that is elsewhere than before."""
         by_bands.step(mic, ref)
         found = by_bands.find()
-        if found is None or (self._coarse is not None and abs(found - COARSE_MARGIN - self._coarse) <= self.hop):
+        if found is None or (self._coarse and abs(found - self._drift.delay) <= COARSE_MARGIN):
             return False
-        before, self._coarse = self._coarse, max(found - COARSE_MARGIN, 0)
-        return self._coarse != before
+        self._coarse, self._margin = True, COARSE_MARGIN
+        self._meter = DelayMeter(None, PRE_ROLL)
+        self._drift.restart(float(found), 3.0)
+        return True
 
     def history(self, count: int) -> Samples:
         """The last count aligned samples (count,) float32, the present hop included, as if the present delay had always held."""
-        if self._coarse is not None:
-            return self._ref.read(self._ref.end - self._coarse - count, self._ref.end - self._coarse)
-        if not self._known or self._refuted:
+        if not (self._known or self._coarse) or self._refuted:
             return np.zeros(count, np.float32)
         return read_line(self._ref, self._ref.end, count, self._read_at, self._drift.slope, chunk=512)
 
@@ -190,7 +191,7 @@ class Aligner:
         """What `Aligned` says of each."""
         if self._expected is not None:
             return "announced"
-        if self._coarse is not None:
+        if self._coarse:
             return "coarse" if self._audible() else "idle"
         begun = [utterance.start for utterance in self._open if not utterance.lost]
         if begun and (self._known or self._audible()):
@@ -293,13 +294,15 @@ class Aligner:
         return self._switch(float(AHEAD), 3.0)
 
     def _switch(self, delay: float, deviation: float) -> bool:
-        if self._coarse is not None:  # the canceller has learned what arrives behind that lag
-            self._margin = max(round(delay) - self._coarse, PRE_ROLL)
+        if self._coarse:  # the canceller has learned what arrives behind that lag
+            self._margin = max(round(delay - self._read_at), PRE_ROLL)
+            self._meter = DelayMeter(None, PRE_ROLL)  # the other has learned what arrives around the coarse lag
+            self._gain = None
         self._drift.restart(delay, deviation)
         return self._switched()
 
     def _switched(self) -> bool:
-        self._known, self._coarse = True, None
+        self._known, self._coarse = True, False
         self._counts["realignments"] += 1
         self._lost, self._refuted, self._missed = 0, False, False
         self._witness.forget()
@@ -330,6 +333,9 @@ class Aligner:
             return self._accept(found)
         if verdict == "drowned":
             return False
+        if self._coarse:  # without an arrival there is nothing to see until what is heard around this delay is learned
+            self._meter.confirm(0.0)
+            return False
         if verdict == "elsewhere":
             if self._witness.convinced(found):
                 return self._accept(found) if abs(found.offset) < DRIFTED else self._jump(found.offset)
@@ -358,7 +364,8 @@ class Aligner:
             found.gain if self._gain is None else self._gain + 0.1 * (min(found.gain, 2 * self._gain) - self._gain)
         )
         was_refuted = self._refuted
-        if self._open and self._ref.end - self._drift.delay > self._open[0].start + STRIDE and found.dominance < 1.01:
+        heard_out = self._open and self._ref.end - self._drift.delay > self._open[0].start + STRIDE
+        if self._known and heard_out and found.dominance < 1.01:
             self._resolve()
         return was_refuted or abs(self._drift.delay - step) > 0.5
 
@@ -375,9 +382,8 @@ class Aligner:
             self._open.append(Utterance(self._ref.end, self._ref.end, nearby=NEARBY_SEARCHES, lost=True))
 
     def _deliver(self, mic: Samples, before: float, switched: bool) -> Aligned:
-        if not self._known:
-            delay = float("nan") if self._coarse is None else float(self._coarse + COARSE_MARGIN)
-            return Aligned(self.history(self.hop), delay, 0.0, 0.0, self._state(), switched)
+        if not (self._known or self._coarse):
+            return Aligned(self.history(self.hop), float("nan"), 0.0, 0.0, self._state(), switched)
         self._read_at = max(self._drift.delay - self._margin, 0.0)
         end = self._ref.end
         start = self._read_at - self._drift.slope * self.hop if switched else before
