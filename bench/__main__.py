@@ -4,7 +4,7 @@ evaluate   every system on conversations and on real recordings: words, SI-SDR, 
 devices    every real device in one table, a row a device
 passport   how far a passport's prediction is from what humans have on real devices
 latency    milliseconds of a hop, alone and beside a learner; CPU over a long time
-live       trials on virtual devices: conversations, barge-in, learning over a day, an hour without a break
+live       trials on virtual devices: conversations, barge-in, an hour without a break
 diagnosis  how often hidden effects are named, and what naming them brings
 training   what chooses a network: words on validation speakers, the scale of the speech probability
 serve      streams that a core serves in real time

@@ -280,7 +280,7 @@ class Cells:
 
 
 def lay(recordings: Sequence[Recording], speech: Path, cells: Cells, cases: int, seed: int) -> list[Laid]:
-    """Cases humans on the recordings in turn; case i of a seed has the same human and place in all cells."""
+    """So many cases of a human on the recordings in turn; case i of a seed has the same human and place in all cells."""
     spoken, rng = transcripts(speech), np.random.default_rng(seed)
     order = rng.permutation(len(spoken))
     laid = []
@@ -296,7 +296,7 @@ def lay(recordings: Sequence[Recording], speech: Path, cells: Cells, cases: int,
 def lay_once(
     recording: Recording, speech: Path, cases: int, sers: tuple[float, float], befores: tuple[float, float], seed: int
 ) -> list[Laid]:
-    """Cases humans, each on the whole recording from its beginning, at a SER (dB) and after a time (s) drawn in between.
+    """So many cases of a human on the whole recording from its beginning, at a SER (dB) and after a time (s) drawn in between.
 
     Where the recording is short the human begins earlier. The draw depends on the recording's name and the seed alone.
     """
@@ -511,6 +511,6 @@ def read(path: Path) -> Samples:
 
 
 def looped(x: Samples, at: int, n: int) -> Samples:
-    """N samples of x from `at` on, forwards and backwards in turn, so that no join is audible."""
+    """The n samples of x from `at` on, forwards and backwards in turn, so that no join is audible."""
     there_and_back = np.concatenate((x, x[::-1]))
     return there_and_back[(at + np.arange(n)) % there_and_back.size].astype(np.float64)

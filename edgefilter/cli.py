@@ -80,7 +80,7 @@ def _demo(commands: argparse._SubParsersAction) -> None:
     option = commands.add_parser("demo", help="filter the bundled recording and show before and after").add_argument
     folder = "folder for the WAV files and the picture (default: %(default)s)"
     option("--output", metavar="DIR", default="edgefilter-demo", help=folder)
-    told = "instead: two robots that have changed since their calibration, diagnosed and mended (about a minute)"
+    told = "instead: diagnose and correct two robots that have changed since their calibration (about a minute)"
     option("--hidden", action="store_true", help=told)
     option("--engine", **ENGINE)
     _json(option)
@@ -101,17 +101,19 @@ def _run(commands: argparse._SubParsersAction) -> None:
     option = run.add_argument
     told = "'mic', a recording, a microphone by its number or a part of its name, or '-': raw PCM on standard input"
     option("--input", required=True, metavar="mic|FILE|DEVICE|-", help=told)
-    told = "what the robot says; live, unless given, what the output device plays (its monitor)"
+    told = "what the robot says; a live run without it takes what the output device plays (its monitor)"
     option("--reference", metavar="FILE|DEVICE", help=told)
     option("--mic-channels", **MIC_CHANNELS)
-    told = "channel of --input, from 0, that holds what the robot says; goes with --mic-channels"
+    told = "channel of --input, counted from 0, that holds what the robot says; needs --mic-channels"
     option("--reference-channel", type=channel, metavar="N", help=told)
     option("--profile", metavar="P.npz", help="calibrated robot, made by 'edgefilter calibrate'")
     option("--engine", **ENGINE)
     option("--model", metavar="FILE.onnx", help=f"network for {' or '.join(HAVE_MODEL)} in place of its own")
-    told = "compute per hop (99 of 100 hops within) that auto may use and that a live run keeps to (live default: 8)"
+    told = (
+        "computing time for a hop, kept in 99 of 100 hops: auto and a live run choose engines by it (live default: 8)"
+    )
     option("--budget-ms", type=positive, metavar="B", help=told)
-    option("--remeasure", action="store_true", help="forget how fast the engines were on this machine")
+    option("--remeasure", action="store_true", help="measure the speed of the engines on this machine again")
     told = "WAV or FLAC file, output device, or '-': raw PCM on standard output"
     option("--output", required=True, metavar="FILE|DEVICE|-", help=told)
     _json(option)
@@ -119,7 +121,7 @@ def _run(commands: argparse._SubParsersAction) -> None:
     option("--record", metavar="FOLDER", help=told)
     option("--turns", metavar="FOLDER", help="write each finished turn of the human to a WAV file there")
     option("--log-json", metavar="FILE|-", help="write each event as a line of JSON when it happens")
-    told = "write the profile with the echo path as it was adapted in this run"
+    told = "write the profile with the echo path that this run has adapted"
     option("--save-profile", metavar="P2.npz", help=told)
     told = (
         "run this in a shell whenever the human begins to speak; EDGEFILTER_EVENT and EDGEFILTER_TIME say what and when"
@@ -128,7 +130,7 @@ def _run(commands: argparse._SubParsersAction) -> None:
     told = "live: play this speech of the robot, which then is the reference"
     option("--play", metavar="FILE", help=told)
     option("--speaker", metavar="DEVICE", help="output device for --play (default: default)")
-    told = "what --play does when the human begins to speak: end, or go on 10 dB lower until the human is quiet"
+    told = "when the human begins to speak, end what --play plays, or lower it by 10 dB until the human is quiet"
     option("--barge-in", choices=("stop", "duck"), help=told)
     learning = run.add_mutually_exclusive_group()
     told = "start from what earlier runs have learned if the file exists (else from --profile), and keep there what this one learns"
@@ -174,7 +176,7 @@ def _calibrate(commands: argparse._SubParsersAction) -> None:
 
 
 def _compare(commands: argparse._SubParsersAction) -> None:
-    told = "say how far the profile is from a recording of the robot, and where"
+    told = "say how much of a recording of the robot the profile does not explain, and where"
     option = commands.add_parser("compare", help=told).add_argument
     _recording(option, profile_needed=False)
     _report(option)
@@ -231,7 +233,7 @@ def _probe(commands: argparse._SubParsersAction) -> None:
 
 
 def _passport(commands: argparse._SubParsersAction) -> None:
-    told = "say what one recording of an unknown device tells, and what to expect of the filter there"
+    told = "describe an unknown device from one recording, and predict how well the filter works there"
     option = commands.add_parser("passport", help=told).add_argument
     told = "the robot alone, as the microphone recorded it, 10 s or more; the first 60 s are taken"
     option("--recording", required=True, metavar="MIC", help=told)
@@ -274,11 +276,11 @@ def _devices(commands: argparse._SubParsersAction) -> None:
 
 
 def _doctor(commands: argparse._SubParsersAction) -> None:
-    told = "check whether this machine is fit for a live run, and say what to do"
+    told = "check whether a live run works on this machine, and say what to change"
     option = commands.add_parser("doctor", help=told).add_argument
     option("--input", default="mic", metavar="DEVICE", help="microphone (default: %(default)s)")
     option("--mic-channels", **MIC_CHANNELS)
-    option("--profile", metavar="P.npz", help="calibrated robot: its microphones are held against it")
+    option("--profile", metavar="P.npz", help="calibrated robot, with whose microphones these are compared")
     told = "input that records what the loudspeaker plays (default: the one that 'run' takes)"
     option("--reference", metavar="DEVICE", help=told)
     told = "output that plays chirps, 5 s with a peak of -18 dB of full scale: where the robot plays (default: %(default)s)"
@@ -315,20 +317,20 @@ def _ros2(commands: argparse._SubParsersAction) -> None:
     option = ros2.add_argument
     sound = "16-bit samples in audio_common_msgs/AudioData"
     option("--mic", default="/audio", metavar="TOPIC", help=f"microphone, {sound} (default: %(default)s)")
-    told = "what is said, or what the output plays, the same (default: %(default)s)"
+    told = "what the robot says or the output plays, in the same form (default: %(default)s)"
     option("--reference", default="/speech", metavar="TOPIC", help=told)
     told = "std_msgs/Empty when the robot was silenced in mid-word (default: %(default)s)"
     option("--silenced", default="/speech_stopped", metavar="TOPIC", help=told)
     option("--human", default="/human", metavar="TOPIC", help="topic for the human (default: %(default)s)")
     option("--profile", metavar="P.npz", help="calibrated robot")
     option("--engine", **ENGINE)
-    told = "of DDS (default: ROS_DOMAIN_ID, or 0)"
+    told = "domain of DDS (default: ROS_DOMAIN_ID, or 0)"
     option("--domain", type=whole(0, 232, "a domain, 0 to 232"), metavar="N", help=told)
     _form(option)
     option("--mic-channels", **MIC_CHANNELS)
     told = "channel of the microphone, from 0, that holds what is played, in place of the reference's topic"
     option("--reference-channel", type=channel, metavar="N", help=told)
-    told = "of the reference (default: as many as the microphone has)"
+    told = "channels of the reference (default: as many as the microphone has)"
     option("--reference-channels", type=whole(1, 8, "1 to 8 channels"), metavar="N", help=told)
     words = ros2.add_subparsers(dest="word", metavar="extract")
     option = words.add_parser("extract", help="write two topics of a recording as WAV files").add_argument

@@ -63,7 +63,7 @@ class Batches:
         self._thread: threading.Thread | None = None
 
     def draw(self, step: int) -> dict[str, Tensor]:
-        """Spectra (batch, frames, bins, 2) by signal, powers (batch, frames, bins), "active", "heed" (batch, frames), "scale" (batch,).
+        """A batch: spectra (batch, frames, bins, 2) by signal, powers (batch, frames, bins), "active", "heed" (batch, frames), "scale" (batch,).
 
         scale: to TARGET_RMS.
         """
@@ -148,7 +148,7 @@ class Batches:
                     crops[power][row] = level
 
     def _spectra(self, crops: dict[str, Tensor]) -> dict[str, Tensor]:
-        """Signals (batch, samples) to spectra, with the echo's; powers as they are."""
+        """Turn signals (batch, samples) and the echo into spectra; powers stay as they are."""
         batch = {power: crops[power] for power in POWERS if power in crops}
         for signal, samples in (crops | {"echo": crops["mic"] - crops["error"]}).items():
             if signal not in POWERS:

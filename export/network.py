@@ -160,7 +160,7 @@ class EdgeCrnn(nn.Module):
         residual: Tensor,
         state: tuple[Tensor, ...],
     ) -> tuple[Tensor, Tensor, tuple[Tensor, ...]]:
-        """Spectra (batch, frames, bins, 2) and powers (batch, frames, bins) to the human's spectra, logits (batch, frames), and the next state."""
+        """The human's spectra, logits (batch, frames) and the next state, of spectra (batch, frames, bins, 2) and powers (batch, frames, bins)."""
         batch, frames = error.shape[:2]
         mic_x, mic_last = _with_previous(torch.cat((features(error), features(mic)), -1), state[0])
         ref_x, ref_last = _with_previous(torch.cat((features(reference), features(echo)), -1), state[1])
@@ -241,7 +241,7 @@ def _on_bands(x: Tensor, weights: Tensor) -> Tensor:
 
 
 def _with_previous(x: Tensor, previous: Tensor) -> tuple[Tensor, Tensor]:
-    """Features (batch, frames, bands, 6) beside those one frame earlier, (..., 12), and the last ones (batch, 6, bands)."""
+    """The features x (batch, frames, bands, 6) beside those one frame earlier, (..., 12), and the last ones (batch, 6, bands)."""
     earlier = torch.cat((previous.transpose(1, 2).unsqueeze(1), x[:, :-1]), 1)
     return torch.cat((x, earlier), -1), x[:, -1].transpose(1, 2)
 
@@ -269,7 +269,7 @@ def compressed(parts: Tensor, along: int) -> Tensor:
 
 
 def corrected(prior: Tensor, raw: Tensor, error: Tensor) -> Tensor:
-    """Error (..., 2) times the prior's gain (...), of which raw (..., 2) corrects logit and phase; zeros change nothing."""
+    """The error (..., 2) times the prior's gain (...), of which raw (..., 2) corrects logit and phase; zeros change nothing."""
     gain, turn = opened(prior, raw[..., 0]), raw[..., 1]
     real = gain * torch.rsqrt(1 + turn * turn)
     imaginary = turn * real

@@ -31,7 +31,7 @@ class RecogniserLoss:
         self._noise = torch.Generator().manual_seed(0)
 
     def __call__(self, human: Tensor, clean: Tensor) -> Tensor:
-        """Spectra (batch, frames, bins, 2); the first crops with a human, LISTENED_S together."""
+        """The loss of spectra (batch, frames, bins, 2), over the first crops with a human, LISTENED_S together."""
         speaking = torch.nonzero(clean.square().sum((1, 2, 3)) > 1e-3)[:, 0]
         count = max(1, round(LISTENED_S * SAMPLE_RATE / (human.shape[1] * self.stft.hop)))
         if not speaking.numel():

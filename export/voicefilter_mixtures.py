@@ -102,7 +102,7 @@ class Mixtures:
         self._window = torch.from_numpy(stft.analysis_window.copy())
 
     def draw(self, step: int, batch: int, seconds: float) -> dict[str, Tensor]:
-        """Batch of crops, see spectra()."""
+        """The next crops, `batch` of them: see spectra()."""
         rng = np.random.default_rng([self.seed, step])
         samples = int(seconds * SAMPLE_RATE) // self.stft.hop * self.stft.hop
         rows = [self._crop(rng, samples) for _ in range(batch)]

@@ -6,7 +6,6 @@ r"""Robots that talk, move and are interrupted: on virtual devices in real time,
     python -m bench live click                                from a click to the filtered click
     python -m bench live barge-in --voices ROBOT/test --speech HUMAN/test --count 24 --seed 17 \
         --whisper WHISPER --alone ROBOT/test SYNTHESIZERS --minutes 60 --real RECORDINGS
-    python -m bench live day --voices ROBOT/test --speech HUMAN/test --minutes 60
 
 trial, hour and click need PulseAudio, whose private servers make no sound. What each part does stands at the head of its
 file in bench/live/. All parts write to the one file of --output.
@@ -17,14 +16,14 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from bench.live import barge_in, click, day, soak, trial
+from bench.live import barge_in, click, soak, trial
 from edgefilter.errors import UsageError
 
 PARTS = {
-    **{"trial": trial.run, "barge-in": barge_in.run, "day": day.run},
+    **{"trial": trial.run, "barge-in": barge_in.run},
     **{"soak": soak.run, "hour": soak.run, "click": click.run},
 }
-SPOKEN = ("trial", "barge-in", "day")
+SPOKEN = ("trial", "barge-in")
 """Parts in which robot and human speak."""
 
 
@@ -35,7 +34,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--speech", type=Path, metavar="DIR", help="folder of human speech")
     add("--minutes", type=float, default=10.0, help="of the run, or of robot speech (default: %(default)s)")
     add("--count", type=int, default=16, help="conversations or clicks (default: %(default)s)")
-    add("--engine", help="default: auto; of barge-in crnn, of day linear")
+    add("--engine", help="default: auto; of barge-in crnn")
     add("--one-way", action="store_true", help="soak: the reference's clock is fast all the time")
     add(
         "--alone",

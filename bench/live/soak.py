@@ -102,7 +102,7 @@ def ahead(at: np.ndarray, one_way: bool) -> np.ndarray:
 
 
 def blocks(total: int, one_way: bool = False) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Total samples of the conversation in a loop, the reference on its own clock."""
+    """So many samples of the conversation in a loop, the reference on its own clock."""
     mic, ref = (read(DEMO / f"{name}.flac") for name in ("mic", "reference"))
     for start in range(0, total, BLOCK):
         at = np.arange(start, min(start + BLOCK, total))

@@ -63,19 +63,16 @@ class Day:
     """A day's signals, (n,) float32 each, and its calibration.
 
     mic = echo + clean + fan. stages: names. begins: sample of the microphone at which each of them begins. told: what
-    the human says, and where in clean. speech_s, distinct_s: seconds of robot speech, and of those without repetitions.
+    the human says, and where in clean.
     """
 
     ref: Samples
     mic: Samples
     clean: Samples
-    fan: Samples
     calibration: tuple[Samples, Samples, Samples]
     stages: tuple[str, ...]
     begins: tuple[int, ...]
     told: tuple[tuple[str, slice], ...]
-    speech_s: float
-    distinct_s: float
 
 
 class Repertoire(Iterator[Array]):
@@ -178,10 +175,7 @@ def make_day(seed: int, minutes: float, voices: list[Clip], speech: list[Clip]) 
     mic = np.float32(microphone.gain) * echo + clean + fan
     sweeps = calibration(rng, robot, stages[0].room, microphone)
     names = tuple(stage.name for stage in stages)
-    speech_s, distinct_s = (
-        sum(seconds for _, seconds in of) for of in (repertoire.said, dict.fromkeys(repertoire.said))
-    )
-    return Day(ref, mic, clean, fan, sweeps, names, tuple(begins), tuple(told), speech_s, distinct_s)
+    return Day(ref, mic, clean, sweeps, names, tuple(begins), tuple(told))
 
 
 def loudness(echo: Array, heard: list[slice]) -> float:

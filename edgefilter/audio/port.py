@@ -226,7 +226,7 @@ class OutputPort(Port):
         self._resampler = Resampler(SAMPLE_RATE, self.rate)
 
     def convert(self, samples: Samples, last: bool = False) -> Samples:
-        """Samples (n,) at 16 kHz as samples at the device's rate."""
+        """Convert samples (n,) from 16 kHz to the device's rate."""
         return self._resampler.push(samples, last)
 
     def open(self, before: Callable[[], None] = lambda: None) -> None:

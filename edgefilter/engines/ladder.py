@@ -103,7 +103,7 @@ class Ladder:
 
 
 def climbable(best: Engine, profile: Profile | None) -> list[Engine]:
-    """Best and the cheaper candidates that can take turns with it: those that can be made with its STFT and front."""
+    """The best candidate and the cheaper ones that can take turns with it: those that can be made with its STFT and front."""
     rungs = [best]
     for name in CANDIDATES[CANDIDATES.index(best.name) + 1 :] if best.name in CANDIDATES else ():
         try:

@@ -59,7 +59,7 @@ class OnsetGate:
         return 0 < self._shut <= LONGEST
 
     def step(self, mic: Samples, ref: Samples, aligned: Aligned) -> Samples | None:
-        """Gain (hop,) for this hop of mic and of all that is made of it, None for 1. ref: (hop,) as it was played.
+        """The gain (hop,) for this hop of mic and of all signals made of it; None stands for 1. ref: (hop,) as it was played.
 
         aligned: what the aligner made of both.
         """

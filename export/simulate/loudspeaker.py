@@ -18,7 +18,7 @@ SECOND = 0.4
 
 
 def distorted(rng: np.random.Generator, x: Samples, kinds: tuple[str, ...], level_db: float) -> Samples:
-    """X (n,) with one or two of these kinds of distortion added, level_db over x.
+    """Add one or two of these kinds of distortion to x (n,), level_db over x.
 
     What of it is x again, only louder, is taken out first, so that the level says what a canceller cannot reach.
     """

@@ -98,7 +98,7 @@ class Microphone:
         )
 
     def filtered(self, x: Samples) -> Samples:
-        """X (n,) after the linear filter."""
+        """Apply the linear filter to x (n,)."""
         return x if self.sections is None else signal.sosfilt(self.sections, x).astype(np.float32)
 
     def power(self) -> Samples:

@@ -108,8 +108,7 @@ def test_rows_with_several_microphones_run_where_there_are_so_many(made: tuple, 
     assert np.allclose(clip.mic, signals["mic"][:, 0], atol=1e-4)
     assert clip.text == meta["text"] and clip.span == slice(meta["start"], meta["end"])
     outputs = {
-        name: rows[name].run(clip)
-        for name in ("crnn", "crnn-3", "crnn-3-turns", "crnn-mean-of-2", "crnn-sum-of-2", "crnn-best-of-2")
+        name: rows[name].run(clip) for name in ("crnn", "crnn-3", "crnn-3-turns", "crnn-sum-of-2", "crnn-best-of-2")
     }
     assert all(output.samples.size == clip.mic.size for output in outputs.values())
     assert not np.array_equal(outputs["crnn"].samples, outputs["crnn-3"].samples)

@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 
 from bench import __main__ as program
-from bench import denoisers, devices, evaluate, results, systems
+from bench import devices, evaluate, results, systems
 from bench.facts import pitch_hz, talking_s
 from bench.recordings import NotHere, find_recordings, named, recorded_clip
 from edgefilter import PathLearner, enhance
 from edgefilter.dsp.metrics import si_sdr
 from edgefilter.engines import create
 from edgefilter.errors import UsageError
-from tests.bench.conftest import RATE, babble, rows_of
+from tests.bench.conftest import RATE, rows_of
 
 ROWS = "unfiltered,linear-uncalibrated,ideal-mask,clean,dtln-aec"
 RATES = {"unfiltered": 120, "paper-ss": 20, "crnn": 40, "aec3": 80, "clean": 0}
@@ -266,25 +266,6 @@ def test_pitch_and_talking() -> None:
 
 
 # ---------------------------------------------------------------- the catalogue
-
-
-def test_networks_of_others_are_run_aligned_and_one_that_is_missing_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    x = babble(1.0, 3)
-    passed = denoisers.run_dtln(np.ones_like, lambda block: block / 4, x)  # each sample lies in four blocks
-    np.testing.assert_allclose(passed, x, atol=1e-6)
-    np.testing.assert_allclose(denoisers.run_gtcrn(lambda frame: frame, x), x, atol=1e-6)
-    late = np.zeros(denoisers.DELAYS["rnnoise"], np.float32)
-
-    def step(fed: np.ndarray, out: np.ndarray) -> None:
-        nonlocal late
-        late = np.concatenate((late, fed))
-        out[:], late = late[: out.size], late[out.size :]
-
-    assert si_sdr(denoisers._full_band(step, x, 480, 960), x) > 30  # 16 to 48 kHz and back
-    monkeypatch.setitem(denoisers.PACKAGES, "gtcrn", ("nobody-has-this", "x.onnx"))
-    present, absent = systems.present(systems.chosen(["gtcrn", "clean"]))
-    assert [row.name for row in present] == ["clean"]
-    assert absent == {"linear, then GTCRN": "needs the package nobody-has-this: pip install --no-deps nobody-has-this"}
 
 
 def test_engines_that_tell_who_speaks_have_events_and_others_none(pairs: Path) -> None:

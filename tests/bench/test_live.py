@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from bench import __main__ as bench
-from bench.live import barge_in, click, day, soak, trial
+from bench.live import barge_in, click, soak, trial
 from bench.live.barge_in import Talk, early_errors, lasts, lowered, muted, silent_at, words
 from bench.metrics import first_sound
 from bench.recogniser import Recogniser
@@ -30,8 +30,8 @@ def run(output: Path, part: str, *arguments: object) -> tuple[dict, str]:
 
 
 def test_a_part_says_which_folder_it_needs(clips: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert bench.main(["live", "day", "--voices", str(clips)]) == 1
-    assert capsys.readouterr().err == "bench live: the part 'day' needs --speech, a folder with a transcripts.tsv\n"
+    assert bench.main(["live", "trial", "--voices", str(clips)]) == 1
+    assert capsys.readouterr().err == "bench live: the part 'trial' needs --speech, a folder with a transcripts.tsv\n"
 
 
 # ---------------------------------------------------------------- long recordings
@@ -83,23 +83,6 @@ def test_the_day_says_what_its_human_says_and_where(tmp_path: Path, monkeypatch:
         assert abs(np.mean(clean[place] ** 2) - 1) < 0.01
         silent[place] = False
     assert not clean[silent].any()
-
-
-@pytest.mark.slow
-def test_a_day(clips: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(robot_day, "END_S", 1.0)
-    found, page = run(tmp_path / "live", "day", "--voices", clips, "--speech", clips, "--minutes", 0.1)
-    assert found["speech_minutes"] == pytest.approx(found["distinct_minutes"])  # six clips, six stages
-    assert len(found["begins_s"]) == 6 and found["begins_s"][0] == 0 and found["begins_s"] == sorted(found["begins_s"])
-    left = {way: np.array(one["left_db"]) for way, one in found["runs"].items()}
-    assert list(left) == list(day.WAYS) and {one.size for one in left.values()} == {len(found["speaking"])}
-    more = left["calibrated, learning"] - left["calibrated"]
-    assert f"| calibrated | {more.max():.2f} | {np.argmax(more)} | {np.sum(more > 0.5)} of {more.size} |" in page
-    assert abs(np.median(left["uncalibrated"][~np.array(found["speaking"])])) < 3  # the fan alone
-    assert (
-        left["calibrated"][:3].max() < -robot_day.FAN_DB - 8
-    )  # the robot is 31.5 dB over the fan, and mostly cancelled
-    assert (tmp_path / "live_day.png").stat().st_size > 10_000
 
 
 @pytest.mark.slow

@@ -38,6 +38,7 @@ def test_microphones_as_they_were_calibrated_are_not_doubted_whatever_the_volume
         (lambda x: 2.0 * x, "another gain, +6.0 dB"),
         (lambda x: 0.5 * x, "another gain, -6.0 dB"),
         (lambda x: np.std(x) * noise(x.size, 9), "hears the robot otherwise"),
+        (lambda x: 0.15 * x + np.std(x) * noise(x.size, 9), "hears the robot otherwise"),
     ],
 )
 @pytest.mark.parametrize("at", [0, 2])

@@ -57,7 +57,7 @@ def operator_of_a_library(model):
 
 
 def library_of_many_lines(model):
-    """Found by bench.fuzz."""
+    """Found by random damage."""
     model.graph.node[0].domain = "\n\x0bhidden\x18"
 
 
@@ -116,7 +116,7 @@ def test_a_model_that_leads_out_of_its_file_or_gives_no_numbers_is_refused(tmp_p
 
 
 def test_text_in_the_graph_that_is_no_text_is_refused_without_a_word_on_standard_output(tmp_path, capfd):
-    """Found by bench.fuzz: onnxruntime printed that it tries again."""
+    """Found by random damage: onnxruntime printed that it tries again."""
     content = EDGE.read_bytes().replace(b"speech_probability", b"speech_probabilit\xff")
     (tmp_path / "m.onnx").write_bytes(content)
     refused(tmp_path / "m.onnx", "cannot be loaded", capfd)

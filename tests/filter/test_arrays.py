@@ -13,6 +13,7 @@ from edgefilter.engines.spectral_subtraction import SpectralSubtraction
 from edgefilter.errors import CalibrationError, SignalError
 from edgefilter.filter.barge_in import BargeIn
 from edgefilter.filter.canceller import Canceller
+from edgefilter.filter.microphones import Microphones
 from edgefilter.filter.stream import Stream
 from edgefilter.filter.turns import Turns, overlap_add
 from edgefilter.profile.data import Profile
@@ -184,6 +185,22 @@ def test_equal_channels_count_as_one_and_another_takes_the_place_of_the_first() 
         assert (stats["reference"], stats["left_out"]) == expected
         assert np.mean(out[2 * RATE : 3 * RATE] ** 2) < 0.05 * np.mean(mic[2 * RATE : 3 * RATE, 0] ** 2)
     assert EgoFilter(engine="ss").stats()["array"] is None
+
+
+def test_a_microphone_that_is_sound_again_is_used_again_after_three_seconds() -> None:
+    watched, rng, silence = Microphones(3, 256), np.random.default_rng(0), np.zeros(256, np.float32)
+    hops = round(RATE / 256)  # of a second
+
+    def listen(broken: bool) -> dict[int, str]:
+        for _ in range(hops):
+            heard = rng.standard_normal((3, 256)).astype(np.float32)
+            heard[1] *= not broken
+            watched.step(heard, heard, silence, silence, True)
+        return dict(watched.left_out)
+
+    assert listen(broken=True) == {1: "silent"}
+    assert [listen(broken=False) for _ in range(3)] == [{1: "silent"}, {1: "silent"}, {}]
+    assert [list(listen(broken)) for broken in (True, False, True, False, False)] == [[1]] * 5  # a loose contact
 
 
 @pytest.mark.parametrize(

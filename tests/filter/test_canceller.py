@@ -183,6 +183,15 @@ def test_silent_reference_neither_adapts_nor_ages() -> None:
     assert np.array_equal(canceller.impulse_response(), before)
 
 
+def test_the_noise_of_a_converters_last_bit_is_no_robot_to_learn_from() -> None:
+    """A sound card whose loudspeaker is silent delivers a reference of such noise, and the human is no echo of it."""
+    human, noise = speechlike(2.0), np.random.default_rng(4).standard_normal(32_000)
+    canceller = Canceller(HOP, 1600)
+    error = run(canceller, human, (2.0**-24 * noise).astype(np.float32))
+    assert np.array_equal(error, human[: error.size])
+    assert not canceller.impulse_response().any()
+
+
 def test_rewritten_reference_equals_a_reference_that_always_had_the_new_delay() -> None:
     h, x = path(), speechlike(2.0)
     moved = np.concatenate((np.zeros(300, np.float32), x))[: x.size]

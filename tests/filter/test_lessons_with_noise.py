@@ -44,7 +44,7 @@ class Teacher:
 
 @pytest.mark.parametrize(("before", "after"), [(WITH, ()), ((), WITH)], ids=["taken away", "brought"])
 def test_what_no_waveform_predicts_follows_the_path_in_use(before, after):
-    """Found by bench.fuzz: an effect that learning took away ended the run."""
+    """Found by random damage: an effect that learning took away ended the run."""
     profile = Profile.load(DEMO / "profile.npz")
     echo = profile.echo
     for name, values in before:

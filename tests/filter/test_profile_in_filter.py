@@ -5,7 +5,11 @@ import pytest
 from scipy import signal
 
 from edgefilter import EgoFilter, Profile, enhance
+from edgefilter.echo.effect import complete
+from edgefilter.echo.effects.catalogue import find
 from edgefilter.echo.model import EchoModel
+from edgefilter.filter.canceller import Canceller
+from edgefilter.filter.echo_path import EchoPath
 from edgefilter.types import PRE_ROLL
 from tests.engines.test_engines import robot
 
@@ -131,3 +135,24 @@ def test_the_longest_path_with_reverberation_behind_it_can_still_be_written_back
     assert old.echo.running_response().size > 64_000
     EgoFilter(old, "linear").adapted_profile().save(tmp_path / "adapted.npz")
     assert Profile.load(tmp_path / "adapted.npz").echo.impulse_response.size == 64_000
+
+
+def test_a_path_whose_delay_was_switched_goes_on_as_one_that_always_had_it() -> None:
+    """Ahead of the path stands an effect that remembers what the robot said: a limiter."""
+    effects = (("limiter", complete(find("limiter"), {"ceiling_db": -26.0, "release_ms": 400.0})),)
+    rng, hop, at = np.random.default_rng(2), 256, 100
+    moved = (0.1 * rng.standard_normal((at + 20) * hop) * np.repeat(rng.random(at + 20), hop)).astype(np.float32)
+    response = np.eye(1, 2048, 40, dtype=np.float32)[0]
+    silence = np.zeros(hop, np.float32)
+    switched, always = (EchoPath(Canceller(hop, 2048, response), effects) for _ in range(2))
+    for begin in range(0, at * hop, hop):
+        switched.step(silence, silence, False)
+        always.step(silence, moved[begin : begin + hop], False)
+    predicted = []
+    for hops in range(at, at + 20):
+        here = slice(hops * hop, (hops + 1) * hop)
+        past = moved[: here.stop] if hops == at else None
+        steps = switched.step(silence, moved[here], False, past), always.step(silence, moved[here], False)
+        predicted.append([-step.innovation for step in steps])
+    assert np.abs(moved[at * hop :]).max() > 0.1 > np.abs(predicted).max() > 0.01  # it limits
+    np.testing.assert_allclose(*np.swapaxes(predicted, 0, 1), atol=1e-5)

@@ -4,6 +4,8 @@ import numpy as np
 import pytest
 
 from edgefilter import EgoFilter, PathLearner, Profile, ProfileError, enhance
+from edgefilter.filter.echo_path import starting_path
+from edgefilter.learning.contest import Rival
 from edgefilter.types import SAMPLE_RATE
 from tests.learning.scenes import Scene
 
@@ -122,6 +124,23 @@ def test_in_another_room_what_was_learned_is_no_worse_than_nothing_for_long(alon
     known, _, _ = run(other, PathLearner(Profile.load(file)), profile=Profile.load(file))
     later = slice(8 * SAMPLE_RATE, None)
     assert db(known[later]) < db(cold[later]) + 1.0
+
+
+def test_before_a_stream_begins_nothing_was_tried_and_nothing_learned():
+    assert set(PathLearner().stats().values()) == {0}
+
+
+def test_however_often_a_path_is_taken_over_only_a_few_run_beside_the_one_in_use():
+    """A robot that is carried about all day has a lesson each time; each path that runs beside costs as much as the filter."""
+    learner = PathLearner()
+    learner.start(starting_path(None, 256).state(), 256)
+    for _ in range(5):
+        learner._rivals += [Rival(starting_path(None, 256), "path"), Rival(starting_path(None, 256), "another path")]
+        learner._adopt(learner._rivals[-1])
+        assert [rival.was for rival in learner._rivals] in (
+            ["no lesson at all"],
+            ["no lesson at all", "the path of before"],
+        )
 
 
 @pytest.mark.slow

@@ -219,7 +219,7 @@ def test_every_flipped_byte_is_refused_or_harmless(saved):
 
 
 def test_a_piece_cut_out_or_doubled_is_one_line(saved):
-    """Found by bench.fuzz: zipfile sought before the file's beginning, or quoted a page of its bytes."""
+    """Found by random damage: zipfile sought before the file's beginning, or quoted a page of its bytes."""
     content = saved.read_bytes()
     for at in (30, 200, 1500, len(content) // 2):
         for size in (1, 4, 64, 1000):
@@ -254,7 +254,7 @@ def test_pickled_objects_are_never_loaded(saved, tmp_path):
 
 
 def test_an_array_that_numpy_would_mend_is_refused_without_a_warning(saved, recwarn):
-    """Found by bench.fuzz: Python 2's (601L,) was read with a warning on standard error."""
+    """Found by random damage: Python 2's (601L,) was read with a warning on standard error."""
     name, content = next(entry for entry in members(saved).items() if b"(601,), }" in entry[1])
     rewrite(saved, **{name.removesuffix(".npy"): content.replace(b"(601,), }", b"(601L,),}")})
     refused(saved, "is no .npy array")

@@ -1,0 +1,65 @@
+"""Figures that a diagnosis quotes mean what its page says, and a fit that fails is one line."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from edgefilter.diagnosis import precision, probe
+from edgefilter.diagnosis.prepare import utterance_lags
+from edgefilter.diagnosis.score import share_of
+from edgefilter.echo.effects.catalogue import find
+from edgefilter.errors import SignalError, UsageError
+from edgefilter.types import SAMPLE_RATE
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "share"), [(1.0, 0.5, 0.5), (4.0, 1.0, 0.75), (30.0, 0.0, 1.0), (1.0, 3.0, 0.0)]
+)
+def test_the_explained_share_is_that_of_the_power_over_the_fan(before, after, share):
+    """before, after: power of what the robot's model leaves, in units of the fan's."""
+    assert share_of(*(10 * np.log10(1.0 + power) for power in (before, after))) == pytest.approx(share)
+
+
+def test_where_nothing_was_over_the_fan_nothing_is_explained():
+    assert share_of(0.0, 0.0) == share_of(-1.0, -2.0) == 0.0
+
+
+@pytest.mark.parametrize(
+    "error", [np.linalg.LinAlgError("singular matrix"), FloatingPointError("overflow"), ZeroDivisionError("by zero")]
+)
+def test_an_explanation_that_cannot_be_fitted_is_one_line_that_names_it(monkeypatch, error):
+    def fails(*arguments):
+        raise error
+
+    monkeypatch.setattr(probe, "fit_jointly", fails)
+    with pytest.raises(SignalError, match="late_reverb\\+codec cannot be fitted to the recording") as caught:
+        probe._fitted(None, None, ("late_reverb", "codec"))
+    assert str(error) in str(caught.value) and "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("error", [FloatingPointError("overflow"), UsageError("ratio is 1e9, expected 1 to 50")])
+def test_a_number_beside_which_the_effect_cannot_be_applied_has_no_standard_error_and_ends_nothing(error):
+    def fails(*arguments):
+        raise error
+
+    (parameter,) = (one for one in find("playback_gain").parameters if one.name == "gain_db")
+    known = SimpleNamespace(low=-3.0, high=-1.0)
+    finding = SimpleNamespace(effect="playback_gain", values={"gain_db": -2.0}, parameters={"gain_db": known})
+    found = SimpleNamespace(prepared=SimpleNamespace(measurement=None), model=SimpleNamespace(with_effect=fails))
+    assert precision._derivative(found, finding, parameter, 0) is None
+
+
+@pytest.mark.parametrize("later", [-1000, 0, 1000])
+def test_each_utterance_of_a_player_that_starts_anew_has_its_own_lag(later):
+    rng, second = np.random.default_rng(3), SAMPLE_RATE
+    said = np.zeros(10 * second, np.float32)
+    for begin in (1, 6):
+        said[begin * second : (begin + 3) * second] = 0.1 * rng.standard_normal(3 * second)
+    heard = 1e-4 * rng.standard_normal(said.size)
+    heard[100 : 5 * second] += said[: 5 * second - 100]
+    heard[5 * second :] += np.roll(said, 100 + later)[5 * second :]
+    found = utterance_lags(said, said, heard.astype(np.float32), np.full(601, 1e-12, np.float32), 100.0)
+    assert [round(lag) for _, _, lag in found] == ([100] if later == 0 else [100, 100 + later])
+    assert found[0][0] == 0 and found[-1][1] == said.size
+    assert all(6 * second - 1000 < first <= 6 * second for first, _, _ in found[1:])
