@@ -14,6 +14,7 @@ from typing import Any, NoReturn
 from edgefilter import __version__
 from edgefilter.commands.display import STATUS_LEGEND
 from edgefilter.commands.outputs import check_outputs
+from edgefilter.diagnosis.criteria import Criteria
 from edgefilter.echo.effects.catalogue import names
 from edgefilter.echo.user_effects import load_effect
 from edgefilter.engines import ENGINES, HAVE_MODEL
@@ -194,6 +195,8 @@ def _diagnose(commands: argparse._SubParsersAction) -> None:
     option("--channel", type=channel, metavar="N", help=told)
     told = "leave out what makes the running filter worse on seconds that no fit has used; takes a little longer"
     option("--prove", action="store_true", help=told)
+    told = "share of ordinary recordings in which an effect may be named by chance (default: %(default)g)"
+    option("--false-rate", type=rate, default=Criteria.false_rate, metavar="P", help=told)
     _force(option)
     _recording(option, profile_needed=False)
     _report(option)
@@ -413,6 +416,11 @@ def effect_file(text: str) -> str:
 def positive(text: str) -> float:
     """A number above 0."""
     return number(text, 0.0, 1e6, "a number above 0")
+
+
+def rate(text: str) -> float:
+    """A share of recordings, from one in a million to one half."""
+    return number(text, 1e-6, 0.5, "a share from 0.000001 to 0.5, such as 0.01 for 1 in 100")
 
 
 def whole(least: int, most: int, expected: str) -> Callable[[str], int]:

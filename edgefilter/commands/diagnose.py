@@ -10,6 +10,7 @@ from pathlib import Path
 from edgefilter.commands.display import print_result, progress, report_part
 from edgefilter.commands.fitting import Fitted, Refused, fit, long_paths
 from edgefilter.commands.recordings import load, load_array
+from edgefilter.diagnosis.criteria import Criteria
 from edgefilter.diagnosis.diagnose import Diagnosis, diagnose
 from edgefilter.diagnosis.proven import diagnose_proven
 from edgefilter.diagnosis.result import in_order
@@ -38,7 +39,9 @@ def main(args: argparse.Namespace) -> int:
         profile, recording, reference, array, doubts = load_array(args)
         print_result(args, [f"channel {number}: {what}" for number, what in doubts.items()])
     with progress("diagnosis") as step:
-        found = (diagnose_proven if args.prove else diagnose)(profile, recording, reference, progress=step)
+        criteria = Criteria(false_rate=args.false_rate)
+        diagnosed = diagnose_proven if args.prove else diagnose
+        found = diagnosed(profile, recording, reference, progress=step, criteria=criteria)
         if args.profile is None:
             warnings = (*profile.warnings, *found.comparison.warnings)
             found = replace(found, comparison=replace(found.comparison, warnings=warnings))

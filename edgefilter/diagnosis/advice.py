@@ -81,6 +81,6 @@ def _difference(first: Effect, second: Effect) -> str:
     for shown, other in ((first, second), (second, first)):
         if shown.stage == "microphone" and other.stage != "microphone":
             return f"let a telephone play beside the robot, as loud as it: only {shown.name} happens to that as well"
-        if shown.leaves_noise and not other.leaves_noise:
+        if shown.adds_noise and not other.adds_noise:
             return f"play one sentence three times: only {shown.name} is another each time"
     return "nothing else shows them apart than a longer recording"

@@ -54,7 +54,6 @@ def cut_by_power(found: Found, criteria: Criteria) -> Found | None:
         after = judge.of(model)
         gain = found.base.level_db - after.level_db
         if gain > 0.0:
-            size = judge.size_db(after.prediction - found.base.prediction)
-            step = Trial(name, dict(model.effects)[name], model, after, gain, size)
+            step = Trial(name, dict(model.effects)[name], model, after, gain)
             return Found(found.prepared, found.start, model, found.base, after, (step,), found.notes)
     return None

@@ -265,7 +265,7 @@ def conclude(
         verdict = "missing"
     elif not believed and (quiet or not _partly(prepared, found, criteria)):
         found = cut or without_doubtful(found)
-    unpredictable = any(find(step.name).leaves_noise for step in found.steps)
+    unpredictable = any(find(step.name).adds_noise for step in found.steps)
     remaining = found.final.excess_db
     findings, doubts = findings_of(found, progress)
     tried = candidates(searched, [finding.effect for finding in findings])
@@ -290,14 +290,14 @@ def conclude(
 
 def _enough(prepared: Prepared, found: Found, criteria: Criteria) -> bool:
     """Whether the findings explain so much that they are what happened."""
-    much = explained_level(prepared, found) >= criteria.explained_share
-    return much and found.final.excess_db < criteria.still_there * found.base.excess_db
+    much = explained_level(prepared, found) >= criteria.half
+    return much and found.final.excess_db < criteria.half * found.base.excess_db
 
 
 def _partly(prepared: Prepared, found: Found, criteria: Criteria) -> bool:
     """Whether the findings explain enough to be named beside something that none explains."""
     power = share_of(found.base.excess_db, found.final.excess_db)
-    return power >= criteria.part_share and explained_level(prepared, found) >= criteria.part_level
+    return power >= criteria.half and explained_level(prepared, found) >= criteria.part_level
 
 
 def _much_left(found: Found, criteria: Criteria) -> bool:

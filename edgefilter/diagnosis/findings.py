@@ -7,9 +7,10 @@ from dataclasses import replace
 
 import numpy as np
 
+from edgefilter.diagnosis.ordinary import p_value
 from edgefilter.diagnosis.prepare import Prepared
 from edgefilter.diagnosis.result import Finding, Interval
-from edgefilter.diagnosis.score import share_of
+from edgefilter.diagnosis.score import Judge, share_of
 from edgefilter.diagnosis.trials import Found, Trial
 from edgefilter.echo.effect import complete
 from edgefilter.echo.effects.catalogue import find
@@ -29,8 +30,9 @@ def findings_of(found: Found, progress: Callable[[str], None] | None) -> tuple[t
 
     And what is not known of them.
     """
-    findings, doubts, before = [], [], found.base.excess_db
+    findings, doubts, before, judge = [], [], found.base.excess_db, Judge(found.prepared)
     for step in found.steps:
+        without_db = judge.of(found.model.without_effect(step.name)).level_db
         after = found.final.excess_db if step is found.steps[-1] else step.score.excess_db
         if progress:
             progress(f"how well {step.name} is known")
@@ -39,6 +41,8 @@ def findings_of(found: Found, progress: Callable[[str], None] | None) -> tuple[t
         findings.append(
             Finding(
                 effect=step.name,
+                family=find(step.name).family,
+                p_value=min(step.p_value, p_value(step.name, without_db - found.final.level_db)),
                 excess_before_db=before,
                 excess_after_db=after,
                 share=max(share_of(found.base.excess_db, after) - share_of(found.base.excess_db, before), 0.0),

@@ -23,18 +23,18 @@ def noise_of_the_voice(
     of_the_fan = any(find(step.name).is_of_the_fan for step in found.steps)
     others = cut, found if found.steps else None, None if of_the_fan else start
     for name in (name for name in names() if find(name).in_what_is_left and name not in without):
-        with_cut, with_found, alone = (known and _with(judge, name, known) for known in others)
-        if with_found and alone and _share(alone, with_found) < criteria.second_share:
+        with_cut, with_found, alone = (known and _with(judge, name, known, criteria) for known in others)
+        if with_found and alone and _share(alone, with_found) < criteria.part:
             with_found = None
         end = with_cut or with_found or alone
-        if end and end.final.excess_db < max(criteria.explained_db, criteria.noise_left * found.base.excess_db):
+        if end and end.final.excess_db < max(criteria.explained_db, criteria.half * found.base.excess_db):
             return end
     return None
 
 
-def _with(judge: Judge, name: str, others: Found) -> Found | None:
+def _with(judge: Judge, name: str, others: Found, criteria: Criteria) -> Found | None:
     """An outcome with the effect as its last step; None where that is not to be named."""
-    step = beside(judge, name, others.model, others.final)
+    step = beside(judge, name, others.model, criteria, others.final)
     return replace(others, model=step.model, final=step.score, steps=(*others.steps, step)) if step else None
 
 

@@ -51,6 +51,7 @@ class {class_name}(Effect):
     """{title}: with amount 1 the law above, with 0 the voice as it is."""
 
     name = "{name}"
+    family = "{family}"
     stage = "{stage}"{more}
     parameters = (Parameter("amount", "1", 0.0, 0.0, 2.0),)
 
@@ -156,6 +157,7 @@ class Law:
             '\n    event = True\n    run_note = "its phase is of this recording; the running filter follows it"'
         )
         return FILE.format(
+            family=self.family,
             title=f"{self.family[:1].upper()}{self.family[1:]}",
             words=self.words,
             code=self.code,
@@ -188,7 +190,7 @@ def free_law(found: Found, criteria: Criteria, progress: Callable[[str], None] |
     law, score = max(tried, key=lambda each: -each[1].level_db, default=(None, base))
     most_db = base.level_db - score.level_db
     little = most_db < criteria.part_level * (base.level_db - judge.floor_level(base))
-    if law is None or little or share_of(base.excess_db, score.excess_db) < criteria.part_share:
+    if law is None or little or share_of(base.excess_db, score.excess_db) < criteria.half:
         return None
     return law if base.level_db - found.final.level_db < NAMED_SHARE * most_db else None
 

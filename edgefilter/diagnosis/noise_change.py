@@ -32,7 +32,7 @@ def changed_fan(
     Only where there are silences and the change has a colour of its own: before the voice is explained, a gain cannot
     be told from it. Where the fan is held down only while the robot is silent, the calibrated one stays; not so by an effect named in without.
     """
-    held_down = next(_held_down(prepared, model, without), None)
+    held_down = next(_held_down(prepared, model, criteria, without), None)
     if held_down is not None:
         return prepared, held_down
     residual = (prepared.measurement.recording - base.prediction) / model.microphone_gain(base.prediction.size)
@@ -49,11 +49,11 @@ def changed_fan(
             continue
         if not _steady(inspect(now, residual), criteria):
             continue
-        after = Judge(now).of(model)
-        if abs(after.silent_db) < 0.5 * abs(base.silent_db):
-            return now, Trial(
-                name, values, model.with_effect(name, values), after, base.level_db - after.level_db, change
-            )
+        judge = Judge(now)
+        after = judge.of(model)
+        step = Trial(name, values, model.with_effect(name, values), after, judge.fan_gain_db(base, after))
+        if abs(after.silent_db) < 0.5 * abs(base.silent_db) and step.p_value <= criteria.false_rate:
+            return now, step
     return None
 
 
@@ -63,7 +63,7 @@ def look_at_fan(found: Found, criteria: Criteria, without: Collection[str] = ())
     A microphone gain in the model is taken out of the residual first: the fan passed through it. without: names of effects
     that are not to be looked for beside the voice.
     """
-    found = _judged_anew(found, without)
+    found = _judged_anew(found, criteria, without)
     prepared = found.prepared
     measurement, model = prepared.measurement, found.model
     gain = model.microphone_gain(measurement.recording.size)
@@ -82,33 +82,36 @@ def look_at_fan(found: Found, criteria: Criteria, without: Collection[str] = ())
             or (heard and abs(left.quiet_mean_db) <= 0.5 * criteria.fan_change_db)
         ):
             continue
-        after = Judge(now).of(model)
+        judge = Judge(now)
+        after = judge.of(model)
         behind = inspect(now, residual)
         if not _steady(behind, criteria) or (
             (after.silent_db > 0.5 * found.final.silent_db) if heard else (after.excess_db > criteria.fan_change_db)
         ):
             continue
         changed = model.with_effect(name, values)
-        step = Trial(name, values, changed, after, found.final.level_db - after.level_db, change)
+        step = Trial(name, values, changed, after, judge.fan_gain_db(found.final, after))
+        if step.p_value > criteria.false_rate:
+            continue
         return replace(found, prepared=now, model=changed, final=after, steps=(*found.steps, step)), behind
     return found, left
 
 
-def _held_down(prepared: Prepared, model: EchoModel, without: Collection[str]) -> Iterator[Trial]:
+def _held_down(prepared: Prepared, model: EchoModel, criteria: Criteria, without: Collection[str]) -> Iterator[Trial]:
     """The effects that show in the robot's silences as well and that a model lacks, each as a step from it."""
     judge = Judge(prepared)
     for name in sorted(name for name in names() if find(name).shows_in_silence and name not in without):
-        if step := beside(judge, name, model):
+        if step := beside(judge, name, model, criteria):
             yield step
 
 
-def _judged_anew(found: Found, without: Collection[str]) -> Found:
+def _judged_anew(found: Found, criteria: Criteria, without: Collection[str]) -> Found:
     """The search's outcome with what shows in the silences fitted and judged beside all that was found, and only so kept."""
     kept = tuple(step for step in found.steps if not find(step.name).shows_in_silence)
     model = found.model
     for name in {step.name for step in found.steps} - {step.name for step in kept}:
         model = model.without_effect(name)
-    held_down = next(_held_down(found.prepared, model, without), None)
+    held_down = next(_held_down(found.prepared, model, criteria, without), None)
     if held_down is None and kept == found.steps:
         return found
     return _in_steps(found, (*(() if held_down is None else (held_down,)), *kept))
@@ -125,7 +128,8 @@ def _in_steps(found: Found, steps: Iterable[Trial]) -> Found:
     for step in steps:
         model, before = model.with_effect(step.name, step.values), score
         score = judge.of(model)
-        scored.append(replace(step, model=model, score=score, gain_db=before.level_db - score.level_db))
+        gain_db = step.gain_db if find(step.name).stage == "noise" else before.level_db - score.level_db
+        scored.append(replace(step, model=model, score=score, gain_db=gain_db))
     return replace(found, model=model, final=score, steps=tuple(scored))
 
 

@@ -12,6 +12,7 @@ from edgefilter.diagnosis.closer_look import CloserLook
 from edgefilter.diagnosis.compare import Comparison
 from edgefilter.diagnosis.independence import Independence
 from edgefilter.diagnosis.laws import Law
+from edgefilter.echo.effect import Family
 from edgefilter.echo.measurement import Values
 from edgefilter.echo.model import EchoModel
 from edgefilter.types import Samples
@@ -24,7 +25,7 @@ Fate: TypeAlias = Literal["named", "explained by another", "below its bar", "fai
 """What became of an effect that was tried."""
 Source: TypeAlias = Literal["jacobian", "thirds", "at its bound", "none"]
 """Of a standard error: the prediction's derivatives, fits to a third of the recording each, or why there is none."""
-SCHEMA = 1
+SCHEMA = 2
 
 
 @dataclass(frozen=True)
@@ -59,11 +60,14 @@ class Interval:
 class Finding:
     """One effect whose presence the data supports, with the held-out excess before and after it was added.
 
-    share: part of the excess power that it takes away, 0 to 1. values: as fitted, for EchoModel.with_effect.
-    prediction: (n,) of the model with this and all earlier findings.
+    family: what kind of change it is. p_value: of what it explains, by itself or beside the others (diagnosis/ordinary.py).
+    share: part of the excess power that it takes away, 0 to 1. values: as fitted, for EchoModel.with_effect. prediction:
+    (n,) of the model with this and all earlier findings.
     """
 
     effect: str
+    family: Family
+    p_value: float
     excess_before_db: float
     excess_after_db: float
     share: float
@@ -170,11 +174,13 @@ class Diagnosis:
     law: Law | None = None
 
     def to_dict(self) -> dict[str, object]:
-        """The JSON that `diagnose --json` writes, schema 1."""
+        """The JSON that `diagnose --json` writes, schema 2."""
         compared = self.comparison.to_dict()
         ranking = [
             {
                 "effect": finding.effect,
+                "family": finding.family,
+                "p_value": finding.p_value,
                 "excess_before_db": round(finding.excess_before_db, 3),
                 "excess_after_db": round(finding.excess_after_db, 3),
                 "share": round(finding.share, 4),

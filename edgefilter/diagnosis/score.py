@@ -124,6 +124,18 @@ class Judge:
             return 0.0
         return float(np.average(10 * np.log10(np.maximum(quiet, 1e-3)).mean(axis=0), weights=self.freedom))
 
+    def fan_gain_db(self, before: Score, after: Score) -> float:
+        """By how much better another fan explains the cells in which the robot is silent (all where it never is), dB.
+
+        The gain in the log likelihood of cells whose variance is known (Whittle 1953), in the unit of a level.
+        """
+        silent = ~self.active_cells if np.count_nonzero(~self.active_cells) >= 4 else slice(None)
+        misfits = []
+        for score in (before, after):
+            cells = np.maximum(score.cells[silent], 1e-3)
+            misfits.append(np.average((cells - np.log(cells)).mean(axis=0), weights=self.freedom))
+        return float(10.0 / np.log(10.0) * (misfits[0] - misfits[1]))
+
     def size_db(self, change: Samples) -> float:
         """Power of a change of the prediction (n,) over the fan in dB: as it is or whitened, whichever is more."""
         plain, white = (
@@ -131,11 +143,6 @@ class Judge:
             float(np.mean(self.measurement.whiten(change).astype(float) ** 2)),
         )
         return float(10 * np.log10(max(plain, white, 1e-12)))
-
-    def noise_size_db(self, model: EchoModel) -> float:
-        """Mean power over the fan, in dB, of what a model says that no waveform predicts."""
-        power = sum(float(np.mean(variance)) for variance, _ in model.unpredictable(self.measurement.reference))
-        return float(10 * np.log10(max(power / self._fan, 1e-12)))
 
     def _expected_cells(self, unpredictable: Sequence[tuple[Samples, Array]]) -> Array | float:
         """(times, bands) what is expected in the held-out cells, 1 where that is the fan alone."""

@@ -13,6 +13,7 @@ from itertools import pairwise
 
 from edgefilter.diagnosis.criteria import Criteria
 from edgefilter.diagnosis.noise_change import changed_fan
+from edgefilter.diagnosis.ordinary import p_value
 from edgefilter.diagnosis.prepare import Prepared
 from edgefilter.diagnosis.trials import Found, Trial, Workbench, added
 from edgefilter.echo.effects.catalogue import find, names
@@ -71,7 +72,7 @@ def _starts(bench: Workbench, start: EchoModel) -> Iterator[Trial]:
     first = bench.preferred(t for t in trials if bench.admissible(t, start))
     if first is not None:
         yield first
-    least = max(criteria.start_share * bench.left(start), criteria.start_db)
+    least = criteria.part * bench.left(start)
     others = [t for t in trials if t is not first and not find(t.name).last_resort and t.gain_db >= least]
     yield from sorted(others, key=lambda t: -t.gain_db)[: criteria.starts]
 
@@ -81,7 +82,7 @@ def _half_of_a_filter(bench: Workbench, start: EchoModel, run: EchoModel) -> lis
     found = added(start, run)
     if len(found) != 1 or find(found[0]).complexity < bench.criteria.long_filter:
         return []
-    least = bench.criteria.half_share * (bench.score(start).level_db - bench.score(run).level_db)
+    least = bench.criteria.part * (bench.score(start).level_db - bench.score(run).level_db)
     simple = [
         t for t in bench.attempt_all(start, bench.criteria.simple) if t.gain_db >= least and bench.admissible(t, start)
     ]
@@ -104,7 +105,7 @@ def _stepwise(bench: Workbench, start: EchoModel, first: Trial, most: int = 9) -
 
 def forward(bench: Workbench, model: EchoModel, most: int = 9) -> Trial | None:
     """The effect to accept next: it explains a good part of what is left, and looks like what it is."""
-    least = bench.criteria.second_share * bench.left(model)
+    least = bench.criteria.part * bench.left(model)
     much = [t for t in bench.attempt_all(model, most) if t.gain_db >= least or bench.halves(t, model)]
     return bench.preferred(t for t in much if bench.admissible(t, model))
 
@@ -134,7 +135,10 @@ def backward(bench: Workbench, start: EchoModel, model: EchoModel, newest: str) 
         model = _exchange(bench, start, model, name)
     for name in [name for name in earlier if name in dict(model.effects)]:
         alone = bench.attempt(newest, model.without_effect(name).without_effect(newest))
-        if alone is not None and alone.score.level_db - bench.score(model).level_db < find(name).least_gain_db:
+        if alone is None:
+            continue
+        gain_db = alone.score.level_db - bench.score(model).level_db
+        if p_value(name, gain_db) > bench.criteria.false_rate:
             model = alone.model
     return model
 
@@ -150,7 +154,7 @@ def _exchange(bench: Workbench, start: EchoModel, model: EchoModel, name: str) -
     changed = refit(bench, start, chosen.model)
     without = bench.score(others).level_db
     most = without - bench.score(model).level_db
-    return changed if without - bench.score(changed).level_db > bench.criteria.exchange_share * most else model
+    return changed if without - bench.score(changed).level_db > bench.criteria.nearly * most else model
 
 
 def split(bench: Workbench, start: EchoModel, model: EchoModel) -> EchoModel:
@@ -190,7 +194,7 @@ def _with_simpler(bench: Workbench, start: EchoModel, model: EchoModel, name: st
     simple = [
         t for key in wanted if (t := bench.attempt_alike(key, others)) is not None and bench.admissible(t, others)
     ]
-    least = max(criteria.confirmed_share * bench.left(model), criteria.confirmed_db)
+    least = criteria.part * bench.left(model)
     for trial in sorted(simple, key=lambda t: -t.gain_db)[:2]:
         both = bench.attempt(name, trial.model)
         if both is None or not bench.admissible(both, trial.model):
@@ -211,8 +215,8 @@ def _best(bench: Workbench, start: EchoModel, runs: list[EchoModel]) -> EchoMode
     valid = [standing(bench, start, run) for run in runs]
     best = start
     for run in sorted(valid, key=lambda run: sum(find(name).complexity for name in added(start, run))):
-        most = base - bench.score(best).level_db
-        if base - bench.score(run).level_db > most + bench.criteria.better * abs(most):
+        most = base - bench.score(run).level_db
+        if base - bench.score(best).level_db < bench.criteria.nearly * most:
             best = run
     return best
 

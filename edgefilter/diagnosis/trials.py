@@ -9,6 +9,7 @@ from typing import TypeAlias
 import numpy as np
 
 from edgefilter.diagnosis.criteria import Criteria
+from edgefilter.diagnosis.ordinary import p_value, percent
 from edgefilter.diagnosis.prepare import Prepared
 from edgefilter.diagnosis.score import Judge
 from edgefilter.echo.effect import fitted, vanishes
@@ -23,14 +24,21 @@ Signature: TypeAlias = tuple[tuple[str | bytes, ...], ...]
 
 @dataclass(frozen=True, eq=False)
 class Trial:
-    """One effect added to a model: its values, the model with it, its score, the fall in level and the effect's size over the fan in dB."""
+    """One effect added to a model: its values, the model with it, its score, and by how many dB the held-out level falls.
+
+    Of another fan gain_db is Judge.fan_gain_db.
+    """
 
     name: str
     values: Values
     model: EchoModel
     score: Score
     gain_db: float
-    size_db: float
+
+    @property
+    def p_value(self) -> float:
+        """By chance as much (diagnosis/ordinary.py)."""
+        return p_value(self.name, self.gain_db)
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,7 +122,7 @@ class Workbench:
 
     def explained(self, model: EchoModel) -> bool:
         """Whether a model leaves so little while the robot is heard that nothing further can be told in it."""
-        return self.heard(model) <= self.criteria.heard_db or self.score(model).active_db <= self.criteria.fan_db
+        return self.heard(model) <= self.criteria.heard_db or self.score(model).active_db <= self.criteria.silent_db
 
     def voiced(self, model: EchoModel) -> bool:
         """Whether a model predicts so much of a voice that effects on it can be told."""
@@ -123,7 +131,7 @@ class Workbench:
     def little(self, model: EchoModel, start: EchoModel) -> bool:
         """Whether a model leaves so little of what start leaves that the right effects may be in it."""
         share = _over_fan(self.score(model).active_db) / max(_over_fan(self.score(start).active_db), 1e-12)
-        return self.heard(model) <= self.criteria.little_db and share <= self.criteria.little_share
+        return self.heard(model) <= self.criteria.little_db and share <= self.criteria.nothing
 
     def left(self, model: EchoModel) -> float:
         """Level in dB over that of the silences."""
@@ -163,8 +171,7 @@ class Workbench:
     def beside(self, name: str, others: EchoModel, model: EchoModel) -> Trial:
         """What the effect of that name explains that model has and others has not."""
         before, after = self.score(others), self.score(model)
-        size = size_of_change(self.judge, name, model, before, after)
-        return Trial(name, dict(model.effects)[name], model, after, before.level_db - after.level_db, size)
+        return Trial(name, dict(model.effects)[name], model, after, before.level_db - after.level_db)
 
     def halves(self, trial: Trial, model: EchoModel) -> bool:
         """Whether a trial takes away about half of the power over the fan, though the level hardly falls.
@@ -173,7 +180,7 @@ class Workbench:
         so leaves no more
         than there is besides: of the held-out samples the filter itself leaves the most.
         """
-        before, after, most = self.score(model), trial.score, self.criteria.power_share
+        before, after, most = self.score(model), trial.score, self.criteria.half
         short = find(trial.name).complexity < self.criteria.long_filter
         where_fitted = short and _over_fan(after.fitted_db) < most * _over_fan(before.fitted_db)
         return where_fitted or _over_fan(after.active_db) < most * _over_fan(before.active_db)
@@ -187,8 +194,8 @@ class Workbench:
         left, absent = self.left(model), self.absent(model, most)
         found = self._attempt_in_turn([name for name in absent if not find(name).last_resort], model)
         resorts = [name for name in absent if find(name).last_resort and left < self._in_vain.get(name, np.inf)]
-        enough = self.criteria.last_resort_share * left
-        if not resorts or left < self.criteria.last_resort_db or self.little(model, self.prepared.model):
+        enough = self.criteria.half * left
+        if not resorts or self.little(model, self.prepared.model):
             return found
         if any((t.gain_db > enough or self.halves(t, model)) and self.admissible(t, model) for t in found):
             return found
@@ -209,7 +216,7 @@ class Workbench:
 
     def _settles(self, trial: Trial, model: EchoModel) -> bool:
         """Whether a trial on a model can be named and leaves next to nothing."""
-        little = self.left(trial.model) <= self.criteria.settled * self.left(model)
+        little = self.left(trial.model) <= self.criteria.nothing * self.left(model)
         return little and self.explained(trial.model) and self.admissible(trial, model)
 
     def admissible(self, trial: Trial, model: EchoModel) -> bool:
@@ -218,13 +225,10 @@ class Workbench:
 
     def short_of(self, trial: Trial, model: EchoModel) -> str:
         """The bar that a trial on a model does not reach, in words; empty where it is admissible."""
-        effect = find(trial.name)
-        if trial.gain_db < effect.least_gain_db:
-            return f"its gain is below {effect.least_gain_db:g} dB"
-        if trial.size_db < effect.least_size_db:
-            return f"what it changes is below {effect.least_size_db:g} dB over the fan"
+        if trial.p_value > self.criteria.false_rate:
+            return f"{percent(trial.p_value)} of ordinary recordings show as much of some effect"
         evidence = Evidence(trial.values, model, self.judge, self.score(model), trial.score)
-        return "" if effect.plausible(evidence) else "its values do not look like it"
+        return "" if find(trial.name).plausible(evidence) else "its values do not look like it"
 
     def tried(self, start: EchoModel, model: EchoModel) -> tuple[Tried, ...]:
         """All effects that were fitted, beside the start or elsewhere, with what came of them, and those that were spared; nothing is fitted anew."""
@@ -245,7 +249,7 @@ class Workbench:
         """
         trials = list(trials)
         most = max((trial.gain_db for trial in trials), default=0.0)
-        enough = [trial for trial in trials if most > 0.0 and trial.gain_db >= self.criteria.nested * most]
+        enough = [trial for trial in trials if most > 0.0 and trial.gain_db >= self.criteria.nearly * most]
         return min(enough, key=lambda trial: (find(trial.name).complexity, -trial.gain_db), default=None)
 
     def absent(self, model: EchoModel, most: int) -> list[str]:
@@ -262,10 +266,10 @@ class Workbench:
         ]
 
 
-def beside(judge: Judge, name: str, model: EchoModel, before: Score | None = None) -> Trial | None:
+def beside(judge: Judge, name: str, model: EchoModel, criteria: Criteria, before: Score | None = None) -> Trial | None:
     """An effect outside the search, fitted beside what a model has; before: that model's score, where it is known.
 
-    None where it is there, its fit finds nothing, or its values do not look like it.
+    None where it is there, its fit finds nothing, ordinary recordings show as much, or its values do not look like it.
     """
     effect = find(name)
     values = None if name in dict(model.effects) else fitted(effect, judge.measurement, model)
@@ -273,16 +277,9 @@ def beside(judge: Judge, name: str, model: EchoModel, before: Score | None = Non
         return None
     changed, before = model.with_effect(name, values), before or judge.of(model)
     after = judge.of(changed)
-    if not effect.plausible(Evidence(values, model, judge, before, after)):
-        return None
-    size = size_of_change(judge, name, changed, before, after)
-    return Trial(name, values, changed, after, before.level_db - after.level_db, size)
-
-
-def size_of_change(judge: Judge, name: str, model: EchoModel, before: Score, after: Score) -> float:
-    """Power over the fan, in dB, of what an effect that model has changes in the prediction, or of the noise that it adds."""
-    size = judge.size_db(after.prediction - before.prediction)
-    return max(size, judge.noise_size_db(model)) if find(name).adds_noise else size
+    found = Trial(name, values, changed, after, before.level_db - after.level_db)
+    by_chance = found.p_value > criteria.false_rate
+    return None if by_chance or not effect.plausible(Evidence(values, model, judge, before, after)) else found
 
 
 def added(start: EchoModel, model: EchoModel) -> list[str]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar, Literal, Protocol, TypeAlias
+from typing import ClassVar, Literal, Protocol, TypeAlias, get_args
 
 import numpy as np
 
@@ -15,6 +15,12 @@ from edgefilter.types import Array, Samples
 Stage: TypeAlias = Literal["source", "path", "time", "microphone", "noise"]
 STAGES: tuple[Stage, ...] = ("source", "path", "time", "microphone", "noise")
 """In the order in which sound meets them."""
+Family: TypeAlias = Literal[
+    "static nonlinearity", "dynamics", "linear path", "time", "modulation", "additive noise", "of your own"
+]
+"""What kind of change an effect is: a curve that each sample goes through, a gain by level, a filter, the clock, a gain by time,
+noise; an effect of the user's own need not say."""
+FAMILIES: tuple[Family, ...] = get_args(Family)
 Experiment: TypeAlias = Literal["levels", "tone", "tail", "sweep", "place", "minute"]
 """Another recording in which an effect shows itself: at two volumes, of a steady tone, of silence after a word, of a
 sweep, at another place, of a minute."""
@@ -64,24 +70,21 @@ class Effect:
     run_note: a sentence on what the running filter makes of the effect, where that is not what apply does.
     scales_fan: whether the fan gets the same gain as the voice. event: whether the values belong to one recording
     (moments, a gain's curve) rather than to the robot: they get a parameter RECORDING besides their own, and in other
-    recordings the effect is left out. absorbed: whether a linear path fitted to a recording holds the effect already.
-    lengthens: whether it is what makes a path longer than a recording teaches it at first.
-    followed: whether the running filter follows it by itself, as its aligner does a drift, so that a fit of others takes
+    recordings the effect is left out. lengthens: whether it is what makes a path longer than a recording teaches it at
+    first. followed: whether the running filter follows it by itself, as its aligner does a drift, so that a fit of others takes
     it out of the recording first (diagnosis/joint.py).
 
     What the diagnosis asks:
-    title: as it reads inside a sentence ("a turned volume"); by default the name. complexity: of two effects that
-    explain about as much the lower one is named; from 4 on it is a long filter, which half a minute does not teach.
-    least_gain_db: fall of the held-out level, and least_size_db: power over the fan of what changes, below which it is
-    not named. cost: of a fit, in quarters of a second. last_resort: whether it is tried only where no other explains
-    much. flexible: whether it has so many numbers that it takes up what a simpler effect beside it does. learned:
-    whether it is fitted anew to what the running filter hears. leaves_noise: whether it leaves noise in the residual
-    that no waveform predicts; noise_words: what is said of that where a residual is described. shown_by: recordings in
-    which it differs from effects without them (diagnosis/advice.py). shows_in_silence: whether the robot's silences tell
-    it together with the voice, so that it is looked for before the search and behind it (diagnosis/noise_change.py), not
-    in it. in_what_is_left: whether it is told only by what all others leave, so that it is looked for where a search has not
-    explained the recording (diagnosis/follows_voice.py); the running filter, which follows what any path leaves, asks for
-    no variance() of it.
+    family: what kind of change it is. title: as it reads inside a sentence ("a turned volume"); by default the name.
+    complexity: of two effects that explain about as much the lower one is named; from 4 on it is a long filter, which
+    half a minute does not teach. cost: of a fit, in quarters of a second. last_resort: whether it is tried only where no
+    other explains much. flexible: whether it has so many numbers that it takes up what a simpler effect beside it does.
+    learned: whether it is fitted anew to what the running filter hears. noise_words: what is said of the noise that it
+    leaves, where a residual is described. shown_by: recordings in which it differs from effects without them
+    (diagnosis/advice.py). shows_in_silence: whether the robot's silences tell it together with the voice, so that it is
+    looked for before the search and behind it (diagnosis/noise_change.py), not in it. in_what_is_left: whether it is told
+    only by what all others leave, so that it is looked for where a search has not explained the recording
+    (diagnosis/follows_voice.py); the running filter, which follows what any path leaves, asks for no variance() of it.
     """
 
     name: ClassVar[str]
@@ -92,19 +95,16 @@ class Effect:
     run_note: ClassVar[str] = ""
     scales_fan: ClassVar[bool] = False
     event: ClassVar[bool] = False
-    absorbed: ClassVar[bool] = False
     lengthens: ClassVar[bool] = False
     followed: ClassVar[bool] = False
 
+    family: ClassVar[Family] = "of your own"
     title: ClassVar[str] = ""
     complexity: ClassVar[int] = 3
-    least_gain_db: ClassVar[float] = 0.05
-    least_size_db: ClassVar[float] = -6.0
     cost: ClassVar[int] = 1
     last_resort: ClassVar[bool] = False
     flexible: ClassVar[bool] = False
     learned: ClassVar[bool] = False
-    leaves_noise: ClassVar[bool] = False
     noise_words: ClassVar[str] = ""
     shown_by: ClassVar[tuple[Experiment, ...]] = ()
     shows_in_silence: ClassVar[bool] = False
@@ -183,6 +183,11 @@ class Effect:
     def told(self) -> tuple[Parameter, ...]:
         """The parameters that say something to people."""
         return tuple(p for p in self.parameters if not p.given)
+
+    @property
+    def absorbed(self) -> bool:
+        """Whether a linear path that is fitted to a recording holds the effect already."""
+        return self.family == "linear path" and not self.event
 
     @property
     def adds_noise(self) -> bool:

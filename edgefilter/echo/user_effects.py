@@ -15,7 +15,7 @@ from typing import cast
 
 import numpy as np
 
-from edgefilter.echo.effect import STAGES, Effect, Parameter, complete, neutral
+from edgefilter.echo.effect import FAMILIES, STAGES, Effect, Parameter, complete, neutral
 from edgefilter.echo.effects.catalogue import names, register
 from edgefilter.errors import EdgefilterError, UsageError
 from edgefilter.types import SAMPLE_RATE
@@ -228,6 +228,8 @@ def _check(path: Path, effect: Effect) -> None:
         )
     if effect.stage not in STAGES:
         raise UsageError(f"{path}: stage is {effect.stage!r}, expected one of {', '.join(STAGES)}")
+    if effect.family not in FAMILIES:
+        raise UsageError(f"{path}: family is {effect.family!r}, expected one of {', '.join(FAMILIES)}")
     if not effect.parameters or not all(isinstance(p, Parameter) for p in effect.parameters):
         raise UsageError(f"{path}: parameters is not a tuple of Parameter(name, unit, neutral, low, high)")
     for p in effect.parameters:

@@ -32,6 +32,7 @@ from edgefilter.report.text import (
     candidate_rows,
     correlograms,
     decibels,
+    family_line,
     headline,
     interval_text,
     precision_rows,
@@ -302,6 +303,7 @@ def _finding(finding: Finding) -> dict[str, object]:
         "after": decibels(finding.excess_after_db),
         "share": f"{100 * finding.share:.0f}",
         "evidence": sentence(finding.evidence),
+        "family": sentence(family_line(finding)),
         "parameters": [(name, interval_text(interval)) for name, interval in finding.parameters.items()],
     }
 

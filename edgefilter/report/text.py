@@ -14,6 +14,7 @@ from edgefilter.diagnosis.compare import Comparison
 from edgefilter.diagnosis.diagnose import Diagnosis, Finding, Interval
 from edgefilter.diagnosis.independence import Correlogram, Independence
 from edgefilter.diagnosis.laws import Law
+from edgefilter.diagnosis.ordinary import percent
 from edgefilter.diagnosis.proof import Proof
 from edgefilter.diagnosis.result import Candidate, Known, Precision, in_order
 from edgefilter.echo.effects.catalogue import find, names
@@ -189,8 +190,14 @@ def _finding(rank: int, finding: Finding) -> list[str]:
             f" {decibels(finding.excess_after_db)} dB, {100 * finding.share:.0f} % of the excess"
         ),
         f"      {sentence(finding.evidence)}",
+        f"      {family_line(finding)}",
     ]
     return lines + [f"      {name} = {interval_text(interval)}" for name, interval in finding.parameters.items()]
+
+
+def family_line(finding: Finding) -> str:
+    """The family of a finding, and how often as much is found where nothing is missing."""
+    return f"{finding.family}; by chance in {percent(finding.p_value)} of recordings"
 
 
 def _table(heading: str, unit: str, rows: Sequence[tuple[float, float, float]]) -> list[str]:

@@ -24,7 +24,7 @@ NEITHER = {
     "help", "version", "debug", "command", "word", "engine", "budget_ms", "remeasure", "seconds", "quiet", "live",
     "speaker", "level_db", "effect", "force", "prove", "no_learn", "on_barge_in", "barge_in", "setup", "load", "unload",
     "hidden", "multisine",
-    "no_chirp",
+    "no_chirp", "false_rate",
     "no_diagnosis",
     "human_db",
     "explanation",

@@ -164,16 +164,19 @@ def test_the_dictionary_has_the_published_keys_and_is_json() -> None:
     x = voice(SECONDS)
     found = diagnose(profile(), (echo(x) * 0.9 + fan()).astype(np.float32), x)
     said = json.loads(json.dumps(found.to_dict(), allow_nan=False))
-    assert said["schema"] == 1 and set(said["where"]) == {"bands", "times", "levels", "lags"}
+    assert said["schema"] == 2 and set(said["where"]) == {"bands", "times", "levels", "lags"}
     entry = said["ranking"][0]
-    assert set(entry) == {"effect", "excess_before_db", "excess_after_db", "share", "parameters", "evidence"}
+    assert set(entry) == {
+        *("effect", "family", "p_value", "excess_before_db", "excess_after_db", "share", "parameters", "evidence")
+    }
+    assert entry["family"] == "linear path" and 0.0 < entry["p_value"] <= Criteria().false_rate
     assert entry["parameters"]["gain_db"]["value"] == pytest.approx(-0.915, abs=0.05)
 
 
 def test_no_effect_is_chosen_where_none_lowers_the_level():
     bench, score = Workbench(prepare(profile(), record(voice(4.0)), voice(4.0)), Criteria()), verdict(1.0, 1.0)
     trials = {
-        name: Trial(name, {}, EchoModel(path()), score, gain_db, 0.0)
+        name: Trial(name, {}, EchoModel(path()), score, gain_db)
         for name, gain_db in (("playback_gain", 0.9), ("late_reverb", 1.0))
     }
     assert bench.preferred([]) is None and bench.preferred([replace(trials["late_reverb"], gain_db=-0.1)]) is None
@@ -203,4 +206,4 @@ def test_half_of_what_a_long_filter_leaves_where_it_was_fitted_is_enough(name, f
     found = prepare(profile(), record(voice(4.0)), voice(4.0))
     bench, model = Workbench(found, Criteria()), EchoModel(path())
     bench.score = lambda asked: verdict(6.0, 2.5)
-    assert bench.halves(Trial(name, {}, model, verdict(5.0, fitted_db), 0.5, 3.0), model) is halved
+    assert bench.halves(Trial(name, {}, model, verdict(5.0, fitted_db), 0.5), model) is halved

@@ -21,7 +21,7 @@ from edgefilter.report.text import candidate_lines, diagnosis_lines, error_text,
 from tests.diagnosis.robot_scene import profile, record, voice
 
 GAIN_DB = -2.0
-THOROUGH = Criteria(settled=-1.0)
+THOROUGH = Criteria(nothing=-1.0)
 """Every effect is fitted, whatever a simpler one explains."""
 
 

@@ -9,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from edgefilter.diagnosis.criteria import Criteria
 from edgefilter.diagnosis.diagnose import Finding, diagnose
 from edgefilter.report.html import comparison_page, diagnosis_page, write_page
 from tests.diagnosis.robot_scene import profile, record, voice
@@ -51,11 +52,11 @@ def pages(tmp_path_factory):
     x, robot = voice(6.0), profile()
     wrong = robot.echo.with_effect("playback_gain", {"gain_db": -3.0}).with_effect("speaker_nonlinearity", {"odd": 4.0})
     y = record(x, wrong)
-    found = diagnose(robot, y, x)
+    found = diagnose(robot, y, x, criteria=Criteria(false_rate=0.05))  # a distortion that is near the floor
     assert [finding.effect for finding in found.ranking] == ["playback_gain", "speaker_nonlinearity"]
     write_page(folder / "missing.html", diagnosis_page(robot, found, y, x, NAMES))
     write_page(folder / "comparison.html", comparison_page(found.comparison, NAMES))
-    neutral = [Finding(name, 0.0, 0.0, 0.0, {}, "", {}, y) for name in ("compression", "clock_drift")]
+    neutral = [Finding(name, "dynamics", 1.0, 0.0, 0.0, 0.0, {}, "", {}, y) for name in ("compression", "clock_drift")]
     model = found.model.with_effect("compression", {}).with_effect("clock_drift", {})
     many = replace(found, ranking=(*found.ranking, *neutral), model=model)
     write_page(folder / "many.html", diagnosis_page(robot, many, y, x, NAMES))

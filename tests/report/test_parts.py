@@ -29,7 +29,8 @@ def content(address: str) -> io.BytesIO:
 
 def finding(name: str, values: dict, before: float = 9.0, after: float = 1.0) -> Finding:
     intervals = {key: Interval(value, value - 0.1, value + 0.1, "dB") for key, value in values.items()}
-    return Finding(name, before, after, 0.9, intervals, f"Evidence for {name}.", values, np.zeros(0, np.float32))
+    evidence = f"Evidence for {name}."
+    return Finding(name, "dynamics", 1e-5, before, after, 0.9, intervals, evidence, values, np.zeros(0, np.float32))
 
 
 @pytest.mark.parametrize(

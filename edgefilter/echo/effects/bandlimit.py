@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
-from edgefilter.echo.effect import Effect, Experiment, Parameter, Stage, first
+from edgefilter.echo.effect import Effect, Experiment, Family, Parameter, Stage, first
 from edgefilter.echo.evidence import Evidence
 from edgefilter.echo.measurement import Measurement, Values, VoiceModel
 from edgefilter.echo.wiener import convolve_from, fit_filter, spectra
@@ -36,12 +36,11 @@ class Bandlimit(Effect):
 
     name: ClassVar[str] = "bandlimit"
     stage: ClassVar[Stage] = "path"
+    family: ClassVar[Family] = "linear path"
     title: ClassVar[str] = "a band limit"
     shown_by: ClassVar[tuple[Experiment, ...]] = ("sweep",)
-    absorbed: ClassVar[bool] = True
     complexity: ClassVar[int] = 1
     flexible: ClassVar[bool] = True
-    leaves_noise: ClassVar[bool] = True
     noise_words: ClassVar[str] = "a codec that cuts the band leaves such noise"
     parameters: ClassVar[tuple[Parameter, ...]] = (
         Parameter("cutoff_hz", "Hz", 16000.0, 200.0, 16000.0),

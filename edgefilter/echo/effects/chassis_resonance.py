@@ -9,7 +9,7 @@ import scipy
 from numpy.typing import NDArray
 
 from edgefilter.dsp.lag import turn
-from edgefilter.echo.effect import Effect, Experiment, Parameter, Stage
+from edgefilter.echo.effect import Effect, Experiment, Family, Parameter, Stage
 from edgefilter.echo.evidence import Evidence
 from edgefilter.echo.measurement import Measurement, Values, VoiceModel
 from edgefilter.echo.wiener import Spectra, spectra
@@ -33,9 +33,9 @@ class ChassisResonance(Effect):
 
     name: ClassVar[str] = "chassis_resonance"
     stage: ClassVar[Stage] = "path"
+    family: ClassVar[Family] = "linear path"
     title: ClassVar[str] = "a chassis resonance"
     shown_by: ClassVar[tuple[Experiment, ...]] = ("sweep", "tail")
-    absorbed: ClassVar[bool] = True
     complexity: ClassVar[int] = 1
     parameters: ClassVar[tuple[Parameter, ...]] = (
         Parameter("frequency_hz", "Hz", 1000.0, 20.0, 8000.0),

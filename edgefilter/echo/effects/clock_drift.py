@@ -8,7 +8,7 @@ import numpy as np
 import scipy
 
 from edgefilter.dsp.fractional_delay import interpolate
-from edgefilter.echo.effect import Effect, Experiment, Parameter, Stage, first
+from edgefilter.echo.effect import Effect, Experiment, Family, Parameter, Stage, first
 from edgefilter.echo.evidence import Evidence
 from edgefilter.echo.lag_track import track_lag
 from edgefilter.echo.measurement import Measurement, Values, VoiceModel
@@ -31,6 +31,7 @@ class ClockDrift(Effect):
 
     name: ClassVar[str] = "clock_drift"
     stage: ClassVar[Stage] = "time"
+    family: ClassVar[Family] = "time"
     run_note: ClassVar[str] = (
         "the running filter follows the clocks by itself, whatever they did in this recording: adding it changes nothing"
         " there"

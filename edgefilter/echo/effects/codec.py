@@ -8,7 +8,7 @@ import numpy as np
 import scipy
 
 from edgefilter.dsp.frames import decibels
-from edgefilter.echo.effect import Effect, Experiment, Parameter, Stage, first, neutral
+from edgefilter.echo.effect import Effect, Experiment, Family, Parameter, Stage, first, neutral
 from edgefilter.echo.effects.codec_signs import signs_of
 from edgefilter.echo.effects.knock_power import (
     BAND_HZ,
@@ -46,6 +46,7 @@ class Codec(Effect):
 
     name: ClassVar[str] = "codec"
     stage: ClassVar[Stage] = "source"
+    family: ClassVar[Family] = "additive noise"
     run_note: ClassVar[str] = (
         "the running filter follows by itself what noise the voice brings along: adding it changes nothing there"
     )
@@ -53,7 +54,6 @@ class Codec(Effect):
     shown_by: ClassVar[tuple[Experiment, ...]] = ("levels", "tone")
     complexity: ClassVar[int] = 3
     cost: ClassVar[int] = 4
-    leaves_noise: ClassVar[bool] = True
     in_what_is_left: ClassVar[bool] = True
     parameters: ClassVar[tuple[Parameter, ...]] = (
         Parameter("power", "full scale^2", 0.0, 0.0, 1e3),

@@ -8,7 +8,7 @@ from typing import ClassVar
 import numpy as np
 import scipy
 
-from edgefilter.echo.effect import Effect, Experiment, Parameter, Runner, Stage, complete, first, neutral
+from edgefilter.echo.effect import Effect, Experiment, Family, Parameter, Runner, Stage, complete, first, neutral
 from edgefilter.echo.effects.gain_fit import GainFit, Reach
 from edgefilter.echo.evidence import Evidence
 from edgefilter.echo.measurement import Measurement, Values, VoiceModel
@@ -37,6 +37,7 @@ class Compression(Effect):
 
     name: ClassVar[str] = "compression"
     stage: ClassVar[Stage] = "source"
+    family: ClassVar[Family] = "dynamics"
     title: ClassVar[str] = "compression"
     shown_by: ClassVar[tuple[Experiment, ...]] = ("levels",)
     complexity: ClassVar[int] = 2

@@ -7,7 +7,7 @@ from typing import ClassVar
 import numpy as np
 
 from edgefilter.dsp.fractional_delay import delayed
-from edgefilter.echo.effect import Effect, Parameter, Stage, complete, neutral
+from edgefilter.echo.effect import Effect, Family, Parameter, Stage, complete, neutral
 from edgefilter.echo.effects.clock_drift import STEADY, robust_line
 from edgefilter.echo.evidence import Evidence
 from edgefilter.echo.lag_track import LagTrack, track_lag
@@ -44,6 +44,7 @@ class DelayJump(Effect):
 
     name: ClassVar[str] = "delay_jump"
     stage: ClassVar[Stage] = "source"
+    family: ClassVar[Family] = "time"
     run_note: ClassVar[str] = (
         "the running filter finds jumps by itself, and these were of this recording: adding it changes nothing there"
     )

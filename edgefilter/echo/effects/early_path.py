@@ -6,7 +6,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from edgefilter.echo.effect import Effect, Experiment, Parameter, Stage, first, neutral
+from edgefilter.echo.effect import Effect, Experiment, Family, Parameter, Stage, first, neutral
 from edgefilter.echo.effects.late_reverb import LEAD, fit_path, rings_longer
 from edgefilter.echo.evidence import Evidence
 from edgefilter.echo.measurement import Measurement, Values, VoiceModel
@@ -27,9 +27,9 @@ class EarlyPath(Effect):
 
     name: ClassVar[str] = "early_path"
     stage: ClassVar[Stage] = "path"
+    family: ClassVar[Family] = "linear path"
     title: ClassVar[str] = "another path from the start"
     shown_by: ClassVar[tuple[Experiment, ...]] = ("sweep", "place")
-    absorbed: ClassVar[bool] = True
     complexity: ClassVar[int] = 4
     flexible: ClassVar[bool] = True
     parameters: ClassVar[tuple[Parameter, ...]] = (

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy import fft
 
 from edgefilter.dsp.least_phase import log_response
-from edgefilter.echo.effect import Effect, Experiment, Parameter, Stage
+from edgefilter.echo.effect import Effect, Experiment, Family, Parameter, Stage
 from edgefilter.echo.evidence import Evidence
 from edgefilter.echo.measurement import Measurement, Values, VoiceModel
 from edgefilter.echo.wiener import Spectra, convolve_from, fit_filter, spectra
@@ -43,9 +43,9 @@ class Equaliser(Effect):
 
     name: ClassVar[str] = "equaliser"
     stage: ClassVar[Stage] = "path"
+    family: ClassVar[Family] = "linear path"
     title: ClassVar[str] = "an equaliser or another loudspeaker"
     shown_by: ClassVar[tuple[Experiment, ...]] = ("sweep",)
-    absorbed: ClassVar[bool] = True
     complexity: ClassVar[int] = 2
     flexible: ClassVar[bool] = True
     parameters: ClassVar[tuple[Parameter, ...]] = (

@@ -8,7 +8,7 @@ import numpy as np
 
 from edgefilter.dsp.frames import frames
 from edgefilter.dsp.psd import floored, periodograms
-from edgefilter.echo.effect import Effect, Parameter, Stage, first
+from edgefilter.echo.effect import Effect, Family, Parameter, Stage, first
 from edgefilter.echo.least_squares import absorbed
 from edgefilter.echo.measurement import Measurement, Values, VoiceModel
 from edgefilter.types import Array, Samples
@@ -32,6 +32,7 @@ class FanNoise(Effect):
 
     name: ClassVar[str] = "fan_noise"
     stage: ClassVar[Stage] = "noise"
+    family: ClassVar[Family] = "additive noise"
     title: ClassVar[str] = "changed fan noise"
     memory: ClassVar[int | None] = 0
     parameters: ClassVar[tuple[Parameter, ...]] = (

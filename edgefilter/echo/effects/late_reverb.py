@@ -8,7 +8,7 @@ import numpy as np
 
 from edgefilter.dsp.convolution import convolve
 from edgefilter.dsp.frames import blocks
-from edgefilter.echo.effect import Effect, Experiment, Parameter, Stage, first, neutral
+from edgefilter.echo.effect import Effect, Experiment, Family, Parameter, Stage, first, neutral
 from edgefilter.echo.evidence import Evidence
 from edgefilter.echo.measurement import Measurement, Values, VoiceModel
 from edgefilter.echo.wiener import convolve_from, fit_filter, fit_supported
@@ -43,9 +43,9 @@ class LateReverb(Effect):
 
     name: ClassVar[str] = "late_reverb"
     stage: ClassVar[Stage] = "path"
+    family: ClassVar[Family] = "linear path"
     title: ClassVar[str] = "late reverberation"
     shown_by: ClassVar[tuple[Experiment, ...]] = ("sweep", "tail", "place")
-    absorbed: ClassVar[bool] = True
     lengthens: ClassVar[bool] = True
     complexity: ClassVar[int] = 4
     flexible: ClassVar[bool] = True

@@ -7,7 +7,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from edgefilter.echo.effect import Effect, Experiment, Parameter, Runner, Stage, complete, first, neutral
+from edgefilter.echo.effect import Effect, Experiment, Family, Parameter, Runner, Stage, complete, first, neutral
 from edgefilter.echo.effects.compression import falling_peak
 from edgefilter.echo.effects.gain_fit import GainFit, Reach
 from edgefilter.echo.evidence import Evidence
@@ -40,6 +40,7 @@ class Limiter(Effect):
 
     name: ClassVar[str] = "limiter"
     stage: ClassVar[Stage] = "source"
+    family: ClassVar[Family] = "dynamics"
     title: ClassVar[str] = "a limiter"
     shown_by: ClassVar[tuple[Experiment, ...]] = ("levels",)
     complexity: ClassVar[int] = 2

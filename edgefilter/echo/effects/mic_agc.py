@@ -9,7 +9,7 @@ import scipy
 from numpy.typing import NDArray
 
 from edgefilter.dsp.frames import block_power, block_sums, blocks
-from edgefilter.echo.effect import Effect, Parameter, Runner, Stage
+from edgefilter.echo.effect import Effect, Family, Parameter, Runner, Stage
 from edgefilter.echo.effects.gain_law import STEP, follow
 from edgefilter.echo.evidence import Evidence
 from edgefilter.echo.least_squares import absorbed
@@ -53,6 +53,7 @@ class MicAgc(Effect):
 
     name: ClassVar[str] = "mic_agc"
     stage: ClassVar[Stage] = "microphone"
+    family: ClassVar[Family] = "dynamics"
     title: ClassVar[str] = "a microphone gain control"
     run_note: ClassVar[str] = (
         "its curve is of this recording; the running filter follows the gain by itself, as far and as fast as here"

@@ -6,7 +6,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from edgefilter.echo.effect import Effect, Experiment, Parameter, Stage, first
+from edgefilter.echo.effect import Effect, Experiment, Family, Parameter, Stage, first
 from edgefilter.echo.measurement import Measurement, Values, VoiceModel
 from edgefilter.types import SAMPLE_RATE, Samples
 
@@ -24,10 +24,10 @@ class MicClipping(Effect):
 
     name: ClassVar[str] = "mic_clipping"
     stage: ClassVar[Stage] = "microphone"
+    family: ClassVar[Family] = "static nonlinearity"
     title: ClassVar[str] = "microphone clipping"
     shown_by: ClassVar[tuple[Experiment, ...]] = ("levels", "tone")
     complexity: ClassVar[int] = 1
-    least_size_db: ClassVar[float] = -9.0
     memory: ClassVar[int | None] = 0
     parameters: ClassVar[tuple[Parameter, ...]] = (
         Parameter("level", "full scale", NO_LIMIT, 1e-4, NO_LIMIT),

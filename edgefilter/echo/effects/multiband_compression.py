@@ -9,7 +9,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from edgefilter.echo.effect import Effect, Experiment, Parameter, Runner, Stage, complete, neutral
+from edgefilter.echo.effect import Effect, Experiment, Family, Parameter, Runner, Stage, complete, neutral
 from edgefilter.echo.effects.compression import Compressor
 from edgefilter.echo.effects.gain_fit import GainFit, Reach
 from edgefilter.echo.evidence import Evidence
@@ -55,6 +55,7 @@ class MultibandCompression(Effect):
 
     name: ClassVar[str] = "multiband_compression"
     stage: ClassVar[Stage] = "source"
+    family: ClassVar[Family] = "dynamics"
     title: ClassVar[str] = "multi-band compression"
     shown_by: ClassVar[tuple[Experiment, ...]] = ("levels", "sweep")
     cost: ClassVar[int] = 4

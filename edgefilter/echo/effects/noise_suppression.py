@@ -11,7 +11,7 @@ from scipy.ndimage import uniform_filter1d
 
 from edgefilter.dsp.frames import decibels, frames
 from edgefilter.dsp.psd import ROUNDING_PSD, floored, frequencies, hann, variance_at
-from edgefilter.echo.effect import Effect, Parameter, Runner, Stage, first, neutral
+from edgefilter.echo.effect import Effect, Family, Parameter, Runner, Stage, first, neutral
 from edgefilter.echo.evidence import Evidence
 from edgefilter.echo.measurement import Measurement, Values, VoiceModel
 from edgefilter.types import Array, Samples
@@ -59,6 +59,7 @@ class NoiseSuppression(Effect):
 
     name: ClassVar[str] = "noise_suppression"
     stage: ClassVar[Stage] = "microphone"
+    family: ClassVar[Family] = "dynamics"
     run_note: ClassVar[str] = (
         "what it takes of the voice lies near the fan, and where it opens it lets the calibrated fan through: adding it"
         " changes nothing in the running filter"

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from edgefilter.dsp.frames import block_power
 from edgefilter.dsp.psd import total_power
-from edgefilter.echo.effect import Effect, Parameter, Stage, first, neutral
+from edgefilter.echo.effect import Effect, Family, Parameter, Stage, first, neutral
 from edgefilter.echo.evidence import Evidence
 from edgefilter.echo.measurement import Measurement, Values, VoiceModel, whiten
 from edgefilter.types import PRE_ROLL, SAMPLE_RATE, Array, Samples
@@ -53,6 +53,7 @@ class PacketLoss(Effect):
 
     name: ClassVar[str] = "packet_loss"
     stage: ClassVar[Stage] = "source"
+    family: ClassVar[Family] = "modulation"
     run_note: ClassVar[str] = (
         "these packets were lost in this recording, and no others will be the same: adding it changes nothing in the"
         " running filter"

@@ -7,7 +7,7 @@ from typing import ClassVar
 import numpy as np
 
 from edgefilter.dsp.frames import block_power
-from edgefilter.echo.effect import Effect, Experiment, Parameter, Stage, first, neutral
+from edgefilter.echo.effect import Effect, Experiment, Family, Parameter, Stage, first, neutral
 from edgefilter.echo.evidence import Evidence
 from edgefilter.echo.measurement import Measurement, Values, VoiceModel
 from edgefilter.echo.wiener import convolve_from, fit_supported
@@ -34,6 +34,7 @@ class PathChange(Effect):
 
     name: ClassVar[str] = "path_change"
     stage: ClassVar[Stage] = "path"
+    family: ClassVar[Family] = "linear path"
     run_note: ClassVar[str] = "the running filter begins with the path as it was after the change"
     title: ClassVar[str] = "a changed path"
     shown_by: ClassVar[tuple[Experiment, ...]] = ("sweep", "place")

@@ -6,7 +6,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from edgefilter.echo.effect import Effect, Parameter, Stage, first
+from edgefilter.echo.effect import Effect, Family, Parameter, Stage, first
 from edgefilter.echo.evidence import Evidence
 from edgefilter.echo.measurement import Measurement, Values, VoiceModel, level_ratio
 from edgefilter.types import Samples
@@ -20,8 +20,8 @@ class PlaybackGain(Effect):
 
     name: ClassVar[str] = "playback_gain"
     stage: ClassVar[Stage] = "source"
+    family: ClassVar[Family] = "linear path"
     title: ClassVar[str] = "a turned volume"
-    absorbed: ClassVar[bool] = True
     followed: ClassVar[bool] = True
     complexity: ClassVar[int] = 0
     memory: ClassVar[int | None] = 0

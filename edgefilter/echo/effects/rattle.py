@@ -11,7 +11,17 @@ import scipy
 from numpy.typing import NDArray
 
 from edgefilter.dsp.convolution import convolve
-from edgefilter.echo.effect import Effect, Experiment, Parameter, Stage, complete, first, neutral, number_or_taps
+from edgefilter.echo.effect import (
+    Effect,
+    Experiment,
+    Family,
+    Parameter,
+    Stage,
+    complete,
+    first,
+    neutral,
+    number_or_taps,
+)
 from edgefilter.echo.effects.knock_power import (
     DECAYS_MS,
     RESONANCES_HZ,
@@ -61,11 +71,11 @@ class Rattle(Effect):
 
     name: ClassVar[str] = "rattle"
     stage: ClassVar[Stage] = "source"
+    family: ClassVar[Family] = "additive noise"
     title: ClassVar[str] = "a rattle"
     shown_by: ClassVar[tuple[Experiment, ...]] = ("levels", "tone")
     cost: ClassVar[int] = 8
     last_resort: ClassVar[bool] = True
-    leaves_noise: ClassVar[bool] = True
     memory: ClassVar[int | None] = 2048
     parameters: ClassVar[tuple[Parameter, ...]] = (
         Parameter("threshold", "full scale", NEVER, 1e-5, NEVER),

@@ -7,7 +7,7 @@ from typing import ClassVar
 import numpy as np
 
 from edgefilter.dsp.membrane import MOTION_TAPS
-from edgefilter.echo.effect import Effect, Experiment, Parameter, Stage, first, neutral
+from edgefilter.echo.effect import Effect, Experiment, Family, Parameter, Stage, first, neutral
 from edgefilter.echo.effects.gain_fit import loudest
 from edgefilter.echo.effects.loudspeaker_fit import REACH_HZ, Laws, fit_laws
 from edgefilter.echo.effects.loudspeaker_laws import amplifier_terms, driver_terms
@@ -39,6 +39,7 @@ class SpeakerNonlinearity(Effect):
 
     name: ClassVar[str] = "speaker_nonlinearity"
     stage: ClassVar[Stage] = "source"
+    family: ClassVar[Family] = "static nonlinearity"
     title: ClassVar[str] = "loudspeaker nonlinearity"
     cost: ClassVar[int] = 4
     shown_by: ClassVar[tuple[Experiment, ...]] = ("levels", "tone")

@@ -1,0 +1,80 @@
+"""By chance: in how many ordinary recordings, of which nothing is missing, some effect explains as much.
+
+No robot is exactly as it was calibrated: its path has moved a little, its fan is yesterday's, its loudspeaker distorts
+faintly. So an effect is not held against nothing at all, but against what it explains in recordings with such tolerances
+and nothing else, which `python -m bench diagnosis ordinary --learn` has measured (ordinary.json).
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cache
+from importlib.resources import files
+from math import log10, prod
+from typing import NamedTuple
+
+from scipy.stats import norm
+
+LEAST_DB = -80.0
+"""What an effect explains is told down to so much: a likelihood of some thousand cells is not known better."""
+
+
+class Chance(NamedTuple):
+    """What an effect explains in ordinary recordings.
+
+    share: of the recordings, those in which its fit helps at all; there explained_db() is about normally distributed, with
+    this median and standard deviation in dB.
+    """
+
+    share: float
+    middle_db: float
+    spread_db: float
+
+    def of(self, explained: float) -> float:
+        """Share of ordinary recordings in which the effect explains more than that."""
+        return self.share * float(norm.sf(explained, self.middle_db, self.spread_db))
+
+
+def explained_db(gain_db: float) -> float:
+    """Power that a fall of the held-out level by gain_db takes away, over what is left, dB; LEAST_DB where it does not fall."""
+    return max(10.0 * log10(max(10.0 ** (gain_db / 10.0) - 1.0, 1e-12)), LEAST_DB)
+
+
+@dataclass(frozen=True)
+class Ordinary:
+    """What ordinary recordings show by chance, by effect; independent: which part of the effects' number counts as independent."""
+
+    effects: Mapping[str, Chance]
+    independent: float = 1.0
+
+    def p_value(self, name: str, gain_db: float) -> float:
+        """In which share of ordinary recordings any effect at all is as surprising as that one that lowers the level by gain_db.
+
+        Of independent effects (Sidak 1967), each of whose p-values is uniform up to the share of recordings in which its fit
+        helps at all; as they are not independent, they count as fewer. An effect that is not among them, one of the
+        user's own, is held against the one that explains most by chance.
+        """
+        chances, explained = self.effects, explained_db(gain_db)
+        if explained <= LEAST_DB:
+            return 1.0
+        known = (chances[name],) if name in chances else chances.values()
+        own = max(chance.of(explained) for chance in known)
+        return 1.0 - prod(1.0 - min(own, chance.share) for chance in chances.values()) ** self.independent
+
+
+def p_value(name: str, gain_db: float) -> float:
+    """`Ordinary.p_value` by the table that comes with the package."""
+    return _table().p_value(name, gain_db)
+
+
+def percent(p: float) -> str:
+    """A p-value as people read it: 'below 0.01 %', '0.3 %'."""
+    return "below 0.01 %" if p < 1e-4 else f"{100 * p:.2g} %"
+
+
+@cache
+def _table() -> Ordinary:
+    table = json.loads(files("edgefilter.diagnosis").joinpath("ordinary.json").read_text(encoding="utf-8"))
+    return Ordinary({name: Chance(**of) for name, of in table["effects"].items()}, table["independent"])
