@@ -22,14 +22,15 @@ PROOF = {"effects", "start_s", "seconds", "erle_before_db", "erle_after_db", "wi
 
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """robot.npz; mic.wav of a robot with a ring and a turned volume; back.wav of one that is carried out of the office."""
+    """robot.npz; mic.wav of a robot with a ring and a turned volume; back.wav of one that is carried out of the office; short.wav, turned down."""
     folder = tmp_path_factory.mktemp("apply")
     x, robot = voice(9.0), profile()
     robot.save(folder / "robot.npz")
     rings = robot.echo.with_effect("chassis_resonance", RESONANCE).with_effect("playback_gain", {"gain_db": -3.0})
     back = record(x, office())
     back[86_400:] = record(x)[86_400:]
-    sounds = {"ref": x, "mic": record(x, rings), "back": back, "short": record(x)[: RATE * 7 // 5]}
+    short = record(x, robot.echo.with_effect("playback_gain", {"gain_db": -3.0}))[: RATE * 7 // 5]
+    sounds = {"ref": x, "mic": record(x, rings), "back": back, "short": short}
     for name, samples in sounds.items():
         soundfile.write(folder / f"{name}.wav", samples, RATE, "FLOAT")
     return folder
