@@ -30,13 +30,17 @@ TELLING = 0.1
 
 @dataclass(frozen=True)
 class Curve:
-    """One look: x and y (k,); share: part of what is left while the robot talks that a gain of that kind would explain."""
+    """One look: x and y (k,), a gain unless y_unit says otherwise.
+
+    share: part of what is left while the robot talks that a change of that kind would explain.
+    """
 
     name: str
     x_unit: str
     x: tuple[float, ...]
     y_db: tuple[float, ...]
     share: float
+    y_unit: str = "dB"
 
     @classmethod
     def of(cls, name: str, x_unit: str, x: Array, y_db: Array, share: float) -> Curve:

@@ -72,14 +72,15 @@ def _forward(bench: Workbench, model: EchoModel, wanted: Sequence[str]) -> tuple
 def _followed(wanted: Sequence[str]) -> list[str]:
     """Names of the effects that the running filter follows, less those that are wanted and those that a wanted one holds.
 
-    A flexible effect on the path has the volume in it: beside it a gain is anything.
+    A flexible effect on the path has the volume in it: beside it a gain is anything. A lag by time of the user's own has the
+    clocks in it.
     """
-    holds_gain = any(find(name).stage == "path" and find(name).flexible for name in wanted)
-    return [
-        name
-        for name in names()
-        if find(name).followed and name not in wanted and not (find(name).absorbed and holds_gain)
-    ]
+    wished = [find(name) for name in wanted]
+    held = {
+        *("linear path" for effect in wished if effect.stage == "path" and effect.flexible),
+        *("time" for effect in wished if effect.family == "time" and not effect.followed),
+    }
+    return [name for name in names() if find(name).followed and name not in wanted and find(name).family not in held]
 
 
 def _without(model: EchoModel, dropped: Sequence[str]) -> EchoModel:

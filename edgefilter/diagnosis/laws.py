@@ -1,4 +1,4 @@
-"""Families with free laws, for what no listed effect explains: a curve, a gain by level, a gain by time, a filter; as an effect of one's own."""
+"""Families with free laws, for what no listed effect explains: a curve, a gain by level or by time, a filter, a lag; as one's own effect."""
 
 from __future__ import annotations
 
@@ -36,8 +36,11 @@ RATES_HZ = (0.5, 150.0)
 HARMONICS = 4
 TAPS, LEAD = 256, 32
 """Of the filter: an echo of 14 ms; longer ones are listed."""
-NAMED_SHARE = 0.85
-"""Of what a law explains, as much as this explained by what is named needs no law."""
+LAG_STEP = 1600
+"""Samples (100 ms) in which a lag is one number; its curve has a knot a second, so that blocks of half a second that no fit has used
+lie between two."""
+LAG_ROUNDS = 6
+"""Newton steps: each halves at least what is left of a lag of some samples."""
 FILE = '''"""{title}, as `edgefilter diagnose` found it: {words}."""
 
 import numpy as np
@@ -121,6 +124,18 @@ class Law:
     def __call__(self, x, heard=None):
         return np.convolve(x, TAPS)[LEAD:][: x.size] if x.size else x"""
 
+LAG = """from scipy.ndimage import map_coordinates
+
+LAG = {lag}  # samples, a second from one to the next
+
+
+class Law:
+    def __call__(self, x, heard=None):
+        if heard is not None:  # a stream: the running filter follows a lag by itself
+            return x
+        n = np.arange(x.size)
+        return map_coordinates(x, [n - np.interp(n / 16000, np.arange(LAG.size), LAG)], order=5, mode="nearest")"""
+
 
 @dataclass(frozen=True, eq=False)
 class Law:
@@ -154,7 +169,7 @@ class Law:
     def file(self, name: str) -> str:
         """The text of a Python file that defines an effect of that name."""
         of_recording = (
-            '\n    event = True\n    run_note = "its phase is of this recording; the running filter follows it"'
+            '\n    event = True\n    run_note = "it is of this recording; the running filter follows it by itself"'
         )
         return FILE.format(
             family=self.family,
@@ -192,7 +207,7 @@ def free_law(found: Found, criteria: Criteria, progress: Callable[[str], None] |
     little = most_db < criteria.part_level * (base.level_db - judge.floor_level(base))
     if law is None or little or share_of(base.excess_db, score.excess_db) < criteria.half:
         return None
-    return law if base.level_db - found.final.level_db < NAMED_SHARE * most_db else None
+    return law if base.level_db - found.final.level_db < criteria.nearly * most_db else None
 
 
 def _laws(
@@ -200,7 +215,7 @@ def _laws(
 ) -> Iterator[tuple[Law, Score]]:
     """The best law of each family beside a model, with its score on samples that its fit has not used."""
     before = judge.of(model)
-    for family in (static_curve, dynamics, modulation, linear_path):
+    for family in STAGES:
         for stage in STAGES[family]:
             if progress:
                 progress(f"trying {family.__name__.replace('_', ' ')}")
@@ -344,11 +359,31 @@ def linear_path(ground: _Ground) -> Law | None:
     return Law("linear path", words, ground.stage, curve, FILTER.format(taps=_array(taps, 4), lead=LEAD))
 
 
+def wander(ground: _Ground) -> Law | None:
+    """x(t - lag(t)), the lag a curve of time: a clock that is pulled, buffers that are filled again, a robot that moves."""
+    middle = LAG_STEP * (np.arange(ground.x.size // LAG_STEP) + 0.5) / SAMPLE_RATE
+    hats = _hats(middle, np.arange(2.0 + ground.x.size // SAMPLE_RATE))
+    lag, bends = np.zeros(len(hats)), np.diff(np.eye(len(hats)), 2, axis=0)
+    for _ in range(LAG_ROUNDS):
+        known: dict[str, Any] = {"np": np}
+        exec(LAG.format(lag=_array(lag, 4)), known)
+        moved = np.asarray(known["Law"]()(ground.x), np.float32)
+        slope, left = ground.part(np.gradient(moved).astype(np.float32)), ground.target - ground.part(moved)
+        energy, cross = (block_sums(slope * other * ground.weights, LAG_STEP) for other in (slope, -left))
+        lag += _solved((hats * energy) @ hats.T, hats @ cross, bends)[0]
+    if not np.isfinite(lag).all():
+        return None
+    words = f"a lag that moves between {lag.min():+.2f} and {lag.max():+.2f} samples in the course of the recording"
+    curve = Curve("time", "s", tuple(map(float, np.arange(lag.size))), tuple(map(float, lag)), 1.0, "samples")
+    return Law("time", words, ground.stage, curve, LAG.format(lag=_array(lag, 4)), event=True)
+
+
 STAGES: dict[Callable[[_Ground], Law | None], tuple[Literal["source", "path"], ...]] = {
     static_curve: ("source", "path"),
     dynamics: ("source", "path"),
     modulation: ("path",),
     linear_path: ("path",),
+    wander: ("path",),
 }
 """The families, and where each may stand: ahead of the path, or behind it."""
 

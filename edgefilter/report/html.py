@@ -280,14 +280,12 @@ def _look(look: CloserLook | None, law: Law | None) -> dict[str, object] | None:
         points = zip(100 * (x - x[0]) / across, 40 * (high - np.array(curve.y_db)) / up, strict=True)
         drawn.append(
             {
-                "name": f"{law.family}: the law's gain by {curve.name}"
-                if law and curve is law.curve
-                else f"by {curve.name}",
+                "name": f"{law.family}: the law by {curve.name}" if law and curve is law.curve else f"by {curve.name}",
                 "points": " ".join(f"{a:.2f},{b:.2f}" for a, b in points),
                 "zero": f"{40 * high / up:.2f}",
                 "from": f"{curve.x[0]:.3g}",
                 "to": f"{curve.x[-1]:.4g} {curve.x_unit}",
-                "range": f"{low:+.1f} to {high:+.1f} dB".replace("-", "−"),
+                "range": f"{low:+.1f} to {high:+.1f} {curve.y_unit}".replace("-", "−"),
             }
         )
     said = f"{sentence(law.words)} It leaves {decibels(law.excess_db)} dB." if law else ""

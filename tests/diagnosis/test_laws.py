@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy import signal
+from scipy import ndimage, signal
 
 from edgefilter import add, compare, load_effect
 from edgefilter.diagnosis.criteria import Criteria
@@ -29,6 +29,9 @@ HIDDEN = {
     "static nonlinearity": np.maximum(X, 0.25 * X),  # half of each wave
     "dynamics": X * np.clip((LEVEL / 0.1) ** 0.8, 0.0, 1.0),  # an expander: 8 dB per 10 dB below -20 dBFS
     "modulation": X * (1.0 + 0.5 * np.sin(2 * np.pi * 5.0 * np.arange(X.size) / SAMPLE_RATE)),
+    "time": ndimage.map_coordinates(  # a clock that is pulled to and fro, 1.5 samples in 5 s
+        X, [np.arange(X.size) - 1.5 * np.sin(2 * np.pi * 0.2 * np.arange(X.size) / SAMPLE_RATE)], order=5
+    ),
     "linear path": signal.lfilter([1.0] + 60 * [0.0] + [0.7], [1.0], X),
 }
 
