@@ -28,11 +28,14 @@ from edgefilter.diagnosis.prepare import prepare
 from edgefilter.diagnosis.score import Judge
 from edgefilter.echo.effect import fitted, vanishes
 from edgefilter.echo.effects.catalogue import find, names
+from edgefilter.errors import UsageError
 from edgefilter.types import Array
 
 UPPER = (0.75, 0.95)
 """Quantiles of what an effect explains that its normal distribution goes through: the tail counts, and above them are ten of
 200 recordings."""
+ENOUGH = 40
+"""Recordings to learn from: above the upper quantile lie two."""
 LEVELS = (0.01, 0.05, 0.1, 0.25, 0.5)
 
 
@@ -92,14 +95,16 @@ def _middle_and_spread(explained: Array) -> tuple[float, float]:
 
 def run(options: argparse.Namespace) -> str:
     """Measure, then learn or look."""
+    made_with = results.stamp({"CASES": options.cases}, [DIAGNOSIS])
     cases = [case for folder in options.cases for case in find_cases(folder, options.limit)]
+    if options.learn and len(cases) < ENOUGH:
+        raise UsageError(f"found {len(cases)} recordings to learn from, expected {ENOUGH} or more")
     with ProcessPoolExecutor(options.jobs) as pool:
         measured = pool.map(gains, cases)
         found = [next(measured) for _ in progress(cases, "case", "ordinary")]
     if options.learn:
         options.learn.write_text(json.dumps(learnt(found), indent=1) + "\n", encoding="utf-8")
         return str(options.learn)
-    made_with = results.stamp({"CASES": options.cases}, [DIAGNOSIS])
     p_values = least(p_value, found)
     test = kstest(p_values, "uniform")
     text = (
@@ -118,6 +123,6 @@ def _rows(p_values: Array) -> list[list[str]]:
     for level in LEVELS:
         count = int(np.sum(p_values < level))
         low, high = wilson(count, p_values.size)
-        share = f"{100 * count / least.size:.1f} % [{100 * low:.1f}, {100 * high:.1f}]"
+        share = f"{100 * count / p_values.size:.1f} % [{100 * low:.1f}, {100 * high:.1f}]"
         rows.append([f"{level:g}", f"{count} of {p_values.size}, {share}"])
     return rows

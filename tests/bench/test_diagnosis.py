@@ -133,6 +133,20 @@ def test_names_and_proof_of_a_sealed_control_stand_in_one_file(folder: Path, tmp
     assert "| sealed: the exact label |" in (tmp_path / "out.md").read_text()
 
 
+@pytest.mark.slow
+def test_what_a_control_explains_by_chance_is_a_row_and_one_teaches_nothing(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["diagnosis", "ordinary", "--cases", str(folder), "--jobs", "1"]
+    assert bench.main([*words, "--output", str(tmp_path / "d")]) == 0
+    page = (tmp_path / "d.md").read_text()
+    assert "| 0.01 | 0 of 1, 0.0 % [" in page or "| 0.01 | 1 of 1, 100.0 % [" in page
+    capsys.readouterr()
+    assert bench.main([*words, "--learn", str(tmp_path / "o.json")]) == 1
+    assert "found 1 recordings to learn from, expected 40" in capsys.readouterr().err
+    assert not (tmp_path / "o.json").exists()
+
+
 def test_folders_without_cases_or_labels_are_refused(
     folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
