@@ -30,10 +30,12 @@ NOT_CODE = {
     "edgefilter/demo_data/mic.flac",
     "edgefilter/demo_data/profile.npz",
     "edgefilter/demo_data/reference.flac",
+    "edgefilter/diagnosis/ordinary.json",
     "edgefilter/models/MODELS.md",
     "edgefilter/models/crnn_int8.onnx",
 }
-"""All that is neither Python nor a part of the report's page: the demo's recordings, the network, their licences."""
+"""All that is neither Python nor a part of the report's page: the demo's recordings, the network, their licences, and what the
+diagnosis finds by chance."""
 
 
 def clean_environment() -> dict[str, str]:
