@@ -70,9 +70,9 @@ def p_value(name: str, gain_db: float) -> float:
 
 
 def percent(p: float) -> str:
-    """A p-value as people read it: 'below 0.01 %', '0.3 %'."""
+    """A p-value as people read it: 'less than 0.01 %', '0.3 %'."""
     if p < 1e-4:
-        return "below 0.01 %"
+        return "less than 0.01 %"
     return f"{100 * p:.0f} %" if p > 0.1 else f"{100 * p:.2g} %"
 
 

@@ -197,7 +197,7 @@ def _finding(rank: int, finding: Finding) -> list[str]:
 
 def family_line(finding: Finding) -> str:
     """The family of a finding, and how often as much is found where nothing is missing."""
-    return f"{finding.family}; by chance in {percent(finding.p_value)} of recordings"
+    return f"{finding.family}; chance alone finds as much in {percent(finding.p_value)} of ordinary recordings"
 
 
 def _table(heading: str, unit: str, rows: Sequence[tuple[float, float, float]]) -> list[str]:

@@ -68,7 +68,13 @@ def test_the_table_that_comes_along_knows_every_effect_and_the_default_rate_lets
 
 
 def test_people_read_percent():
-    assert [percent(p) for p in (1e-9, 2e-4, 0.0123, 0.4, 1.0)] == ["below 0.01 %", "0.02 %", "1.2 %", "40 %", "100 %"]
+    assert [percent(p) for p in (1e-9, 2e-4, 0.0123, 0.4, 1.0)] == [
+        "less than 0.01 %",
+        "0.02 %",
+        "1.2 %",
+        "40 %",
+        "100 %",
+    ]
 
 
 @pytest.mark.slow
