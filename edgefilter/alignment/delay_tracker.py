@@ -180,7 +180,7 @@ class DelayMeter:
 
     def _start(self, power_m: Samples, power_a: Samples) -> None:
         smooth = uniform_filter1d(power_a, 65, mode="nearest")
-        scale = 0.7 * float(np.sqrt(power_m.sum() / power(self._prior).dot(power_a)))
+        scale = 0.7 * float(np.sqrt(power_m.sum() / (power(self._prior).dot(power_a) + 1e-20)))
         self._blocks = self._prior_blocks
         self._power = self._blocks * smooth
         self._total = np.add.reduce(self._power)
