@@ -24,8 +24,8 @@ LEAST_DB = -80.0
 class Chance(NamedTuple):
     """What an effect explains in ordinary recordings.
 
-    share: of the recordings, those in which its fit helps at all; there explained_db() is about normally distributed, with
-    this median and standard deviation in dB.
+    share: of the recordings, those in which its fit helps at all; the upper quarter of explained_db() there is that of a normal
+    distribution with this mean and standard deviation in dB.
     """
 
     share: float
