@@ -52,8 +52,7 @@ def cut_by_power(found: Found, criteria: Criteria) -> Found | None:
     for name, values in cuts:
         model = found.start.with_effect(name, values)
         after = judge.of(model)
-        gain = found.base.level_db - after.level_db
-        if gain > 0.0:
-            step = Trial(name, dict(model.effects)[name], model, after, gain)
+        step = Trial.of(name, model, found.base, after)
+        if step.gain_db > 0.0:
             return Found(found.prepared, found.start, model, found.base, after, (step,), found.notes)
     return None

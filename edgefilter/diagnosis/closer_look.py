@@ -43,9 +43,9 @@ class Curve:
     y_unit: str = "dB"
 
     @classmethod
-    def of(cls, name: str, x_unit: str, x: Array, y_db: Array, share: float) -> Curve:
+    def of(cls, name: str, x_unit: str, x: Array, y_db: Array, share: float, y_unit: str = "dB") -> Curve:
         """From arrays (k,), the share held between 0 and 1."""
-        return cls(name, x_unit, tuple(map(float, x)), tuple(map(float, y_db)), float(np.clip(share, 0.0, 1.0)))
+        return cls(name, x_unit, tuple(map(float, x)), tuple(map(float, y_db)), float(np.clip(share, 0.0, 1.0)), y_unit)
 
     def to_dict(self) -> dict[str, object]:
         """Ready for JSON."""

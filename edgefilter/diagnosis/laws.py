@@ -158,9 +158,7 @@ class Law:
 
     def __call__(self, x: Samples) -> Samples:
         """What the law makes of x (n,), (n,): by its lines, so that what is judged is what is written."""
-        known: dict[str, Any] = {"np": np}
-        exec(self.code, known)
-        return np.asarray(known["Law"]()(x), np.float32)
+        return _run(self.code, x)
 
     def predict(self, model: EchoModel, reference: Samples) -> Samples:
         """What a model with the law predicts for an aligned reference (n,), (n,)."""
@@ -195,6 +193,13 @@ class Law:
         }
 
 
+def _run(code: str, x: Samples) -> Samples:
+    """What a law's lines make of x (n,), (n,)."""
+    known: dict[str, Any] = {"np": np}
+    exec(code, known)
+    return np.asarray(known["Law"]()(x), np.float32)
+
+
 def free_law(found: Found, criteria: Criteria, progress: Callable[[str], None] | None = None) -> Law | None:
     """The law that explains most of what a search leaves, or of all that the profile does; None where what is named explains nearly as much."""
     judge = Judge(found.prepared)
@@ -215,8 +220,8 @@ def _laws(
 ) -> Iterator[tuple[Law, Score]]:
     """The best law of each family beside a model, with its score on samples that its fit has not used."""
     before = judge.of(model)
-    for family in STAGES:
-        for stage in STAGES[family]:
+    for family, stages in STAGES.items():
+        for stage in stages:
             if progress:
                 progress(f"trying {family.__name__.replace('_', ' ')}")
             law = family(_Ground(judge, model, stage))
@@ -365,16 +370,14 @@ def wander(ground: _Ground) -> Law | None:
     hats = _hats(middle, np.arange(2.0 + ground.x.size // SAMPLE_RATE))
     lag, bends = np.zeros(len(hats)), np.diff(np.eye(len(hats)), 2, axis=0)
     for _ in range(LAG_ROUNDS):
-        known: dict[str, Any] = {"np": np}
-        exec(LAG.format(lag=_array(lag, 4)), known)
-        moved = np.asarray(known["Law"]()(ground.x), np.float32)
+        moved = _run(LAG.format(lag=_array(lag, 4)), ground.x)
         slope, left = ground.part(np.gradient(moved).astype(np.float32)), ground.target - ground.part(moved)
         energy, cross = (block_sums(slope * other * ground.weights, LAG_STEP) for other in (slope, -left))
         lag += _solved((hats * energy) @ hats.T, hats @ cross, bends)[0]
     if not np.isfinite(lag).all():
         return None
     words = f"a lag that moves between {lag.min():+.2f} and {lag.max():+.2f} samples in the course of the recording"
-    curve = Curve("time", "s", tuple(map(float, np.arange(lag.size))), tuple(map(float, lag)), 1.0, "samples")
+    curve = Curve.of("time", "s", np.arange(float(lag.size)), lag, 1.0, "samples")
     return Law("time", words, ground.stage, curve, LAG.format(lag=_array(lag, 4)), event=True)
 
 

@@ -128,8 +128,8 @@ def _in_steps(found: Found, steps: Iterable[Trial]) -> Found:
     for step in steps:
         model, before = model.with_effect(step.name, step.values), score
         score = judge.of(model)
-        gain_db = step.gain_db if find(step.name).stage == "noise" else before.level_db - score.level_db
-        scored.append(replace(step, model=model, score=score, gain_db=gain_db))
+        again = Trial.of(step.name, model, before, score)
+        scored.append(replace(again, gain_db=step.gain_db) if find(step.name).stage == "noise" else again)
     return replace(found, model=model, final=score, steps=tuple(scored))
 
 

@@ -15,7 +15,7 @@ from importlib.resources import files
 from math import log10, prod
 from typing import NamedTuple
 
-from scipy.stats import norm
+from scipy.special import ndtr
 
 LEAST_DB = -80.0
 """What an effect explains is told down to so much: a likelihood of some thousand cells is not known better."""
@@ -34,12 +34,12 @@ class Chance(NamedTuple):
 
     def of(self, explained: float) -> float:
         """Share of ordinary recordings in which the effect explains more than that."""
-        return self.share * float(norm.sf(explained, self.middle_db, self.spread_db))
+        return self.share * float(ndtr((self.middle_db - explained) / self.spread_db))
 
 
 def explained_db(gain_db: float) -> float:
     """Power that a fall of the held-out level by gain_db takes away, over what is left, dB; LEAST_DB where it does not fall."""
-    return max(10.0 * log10(max(10.0 ** (gain_db / 10.0) - 1.0, 1e-12)), LEAST_DB)
+    return 10.0 * log10(max(10.0 ** (gain_db / 10.0) - 1.0, 10.0 ** (LEAST_DB / 10.0)))
 
 
 @dataclass(frozen=True)

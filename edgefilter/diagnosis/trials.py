@@ -35,6 +35,11 @@ class Trial:
     score: Score
     gain_db: float
 
+    @classmethod
+    def of(cls, name: str, model: EchoModel, before: Score, after: Score) -> Trial:
+        """The effect of that name in a model, from the scores without it and with it."""
+        return cls(name, dict(model.effects)[name], model, after, before.level_db - after.level_db)
+
     @property
     def p_value(self) -> float:
         """By chance as much (diagnosis/ordinary.py)."""
@@ -171,7 +176,7 @@ class Workbench:
     def beside(self, name: str, others: EchoModel, model: EchoModel) -> Trial:
         """What the effect of that name explains that model has and others has not."""
         before, after = self.score(others), self.score(model)
-        return Trial(name, dict(model.effects)[name], model, after, before.level_db - after.level_db)
+        return Trial.of(name, model, before, after)
 
     def halves(self, trial: Trial, model: EchoModel) -> bool:
         """Whether a trial takes away about half of the power over the fan, though the level hardly falls.
@@ -277,7 +282,7 @@ def beside(judge: Judge, name: str, model: EchoModel, criteria: Criteria, before
         return None
     changed, before = model.with_effect(name, values), before or judge.of(model)
     after = judge.of(changed)
-    found = Trial(name, values, changed, after, before.level_db - after.level_db)
+    found = Trial.of(name, changed, before, after)
     by_chance = found.p_value > criteria.false_rate
     return None if by_chance or not effect.plausible(Evidence(values, model, judge, before, after)) else found
 
