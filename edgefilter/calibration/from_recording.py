@@ -12,7 +12,7 @@ from edgefilter.dsp.fractional_delay import delayed, interpolate
 from edgefilter.dsp.frames import all_block_power, block_power, decibels, frames
 from edgefilter.dsp.lag import correlation_near, flat_cross, highest
 from edgefilter.dsp.psd import ROUNDING_PSD, periodograms, third_octave_bands
-from edgefilter.echo.effects.catalogue import find, names
+from edgefilter.echo.effects.catalogue import EFFECTS
 from edgefilter.echo.measurement import whiten
 from edgefilter.echo.model import EchoModel
 from edgefilter.echo.recording import BLOCK, MAX_OFFSET, fitted_blocks, paired
@@ -111,8 +111,10 @@ def self_calibrate(recording: Samples, reference: Samples) -> Profile:
 
 
 def _with_absorbed(echo: EchoModel) -> EchoModel:
-    for name in (name for name in names() if find(name).absorbed):
-        echo = echo.with_effect(name, {})
+    """The path with the effects that it holds already, of those that come with the package: whoever loads it knows no others."""
+    for effect in EFFECTS:
+        if effect.absorbed:
+            echo = echo.with_effect(effect.name, {})
     return echo
 
 
