@@ -1,5 +1,7 @@
 """A human talks from the first second on: drift is no jump, a look that errs costs no certainty, states are what they say."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -189,3 +191,19 @@ def test_a_small_jump_after_a_pause_may_be_the_clocks_which_are_then_followed_at
 def test_a_large_jump_after_a_pause_is_a_buffer_and_says_nothing_of_the_clocks():
     ppm = after_a_pause(12.0, 0.0)
     assert np.abs(ppm).max() < 3.0  # what jitter allows
+
+
+def test_somebody_far_louder_than_the_robot_has_been_hides_it_and_says_nothing_of_its_delay():
+    """Neither a jump, however clear its peak, nor a robot that is lost."""
+    aligner = follow(np.full(16, 1000.0), np.full(16, 45.0))
+    seen, before = look(300.0, 60.0), aligner.stats()
+    for _ in range(20):
+        aligner._drift.advance(STRIDE)
+        aligner._judge(replace(seen, gain=11.0 * seen.gain))
+    assert {name: aligner.stats()[name] for name in ("jumps", "searches", "confidence")} == {
+        name: before[name] for name in ("jumps", "searches", "confidence")
+    }
+    for _ in range(20):
+        aligner._drift.advance(STRIDE)
+        aligner._judge(replace(seen, offset=1300.0 - aligner._drift.delay))
+    assert aligner.stats()["jumps"] == 1
