@@ -33,8 +33,8 @@ class EdgeConfig:
     """Sizes of an EdgeCrnn.
 
     channels: of the four encoder stages, each halving the frequencies; the first two exist per branch. hidden, layers: of
-    the GRU. norm: "layer" over each frame, "batch", or "none". erb: bands that encoder and decoder work on, as wide as the ear's
-    (a multiple of 16; 64 take two fifths of the operations), 0 for every frequency.
+    the GRU. norm: "layer" over each frame, "batch", or "none". erb: bands that encoder and decoder work on, as wide as
+    the ear's (a multiple of 16; 64 take two fifths of the operations), 0 for every frequency.
     """
 
     n_fft: int = 512
