@@ -114,7 +114,8 @@ def _run(commands: argparse._SubParsersAction) -> None:
         "computing time for a hop, kept in 99 of 100 hops: auto and a live run choose engines by it (live default: 8)"
     )
     option("--budget-ms", type=positive, metavar="B", help=told)
-    option("--remeasure", action="store_true", help="measure the speed of the engines on this machine again")
+    told = "forget how fast the engines were on this machine; a live run, or --budget-ms, measures them again for auto"
+    option("--remeasure", action="store_true", help=told)
     told = "WAV or FLAC file, output device, or '-': raw PCM on standard output"
     option("--output", required=True, metavar="FILE|DEVICE|-", help=told)
     _json(option)

@@ -132,7 +132,8 @@ class Event:
     detail : str
         The same in words, with figures.
     turn : Turn, optional
-        Of "speech_stopped": what the human said, for a recogniser that takes a turn as a whole.
+        Of "speech_stopped": what the human said, for a recogniser that takes a turn as a whole. Not kept of long ago where
+        nobody asked for the event.
     """
 
     kind: EventKind

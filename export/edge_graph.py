@@ -17,7 +17,7 @@ from export.network import EdgeCrnn, compressed, corrected
 class EdgeGraph(nn.Module):
     """What onnx_export traces.
 
-    Products: the GRU as matrix products, which can be quantised, in place of ONNX's GRU operator, which cannot.
+    products: the GRU as matrix products, which can be quantised, in place of ONNX's GRU operator, which cannot.
     """
 
     def __init__(self, network: EdgeCrnn, products: bool = False) -> None:

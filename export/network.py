@@ -30,12 +30,11 @@ MOST_LOGITS = 8.0
 
 @dataclass(frozen=True)
 class EdgeConfig:
-    """channels: of the four encoder stages, each halving the frequencies; the first two exist per branch.
+    """Sizes of an EdgeCrnn.
 
-    Hidden, layers: of the GRU.
-
-    norm: "layer" over each frame, "batch", or "none". erb: bands that encoder and decoder work on, as wide as the ear's
-    (a multiple of 16; 64 take two fifths of the operations), 0 for every frequency.
+    channels: of the four encoder stages, each halving the frequencies; the first two exist per branch. hidden, layers: of
+    the GRU. norm: "layer" over each frame, "batch", or "none". erb: bands that encoder and decoder work on, as wide as
+    the ear's (a multiple of 16; 64 take two fifths of the operations), 0 for every frequency.
     """
 
     n_fft: int = 512
@@ -114,7 +113,7 @@ class Upward(nn.Module):
 class EdgeCrnn(nn.Module):
     """Spectra of error, mic, reference, echo, powers of noise and residual to the human's spectrum and the probability of speech.
 
-    State: the previous frame's features of either branch (batch, 6, bands), the power of the prior's previous answer
+    The state is the previous frame's features of either branch (batch, 6, bands), the power of the prior's previous answer
     (batch, bins) and the GRU's (layers, batch, hidden).
     """
 

@@ -54,7 +54,7 @@ changes its speed by more than that, and the bypass with it."""
 def run(options: argparse.Namespace) -> str:
     """Run, write, and raise UsageError with what drifted."""
     engine = options.engine or "auto"
-    made_with = results.stamp({"DEMO": [DEMO]}, [engine])
+    made_with = results.stamp({"DEMO": [DEMO]}, [options.engine or "crnn"])  # which "auto" is wherever it is fast enough
     found = (
         live(options.minutes, engine) if options.part == "hour" else from_file(options.minutes, engine, options.one_way)
     )

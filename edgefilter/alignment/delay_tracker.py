@@ -30,12 +30,12 @@ EARLY = (48, 400)
 
 @dataclass(frozen=True, slots=True)
 class DelayMeasurement:
-    """offset: delay error, samples (positive: the microphone is later).
+    """What one look at a delay found.
 
-    Variance: samples^2. strength: height of the peak over
-    the rms of all lags. ratio: height over the highest peak elsewhere. dominance: height over the best within 2 samples
-    of the expected delay. explained: share of the microphone's whitened power that the early response explains, 0 to 1.
-    gain: power ratio of microphone to reference; gain_there: the same if the offset is true.
+    offset: delay error, samples (positive: the microphone is later). variance: of the offset, samples^2. strength: height
+    of the peak over the rms of all lags. ratio: height over the highest peak elsewhere. dominance: height over the best
+    within 2 samples of the expected delay. explained: share of the microphone's whitened power that the early response
+    explains, 0 to 1. gain: power ratio of microphone to reference; gain_there: the same if the offset is true.
     """
 
     offset: float

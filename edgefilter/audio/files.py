@@ -211,7 +211,7 @@ class FileSink(Sink):
     def close(self, quiet: bool = False) -> None:
         """Finish the file; a second call does nothing.
 
-        Quiet: another error is under way, do not cover it with a full disk.
+        quiet: another error is under way, do not cover it with a full disk.
         """
         if self._file is None:
             return

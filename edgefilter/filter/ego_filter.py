@@ -237,7 +237,8 @@ class EgoFilter:
         Returns
         -------
         list of Event
-            Oldest first, at most the latest 1000; see `Event` for the kinds.
+            Oldest first, at most the latest 1000; see `Event` for the kinds. Turns have sound of ten minutes in all: where
+            nobody asked for longer, earlier ones are left out of their events.
         """
         happened = list(self._stream.events)
         self._stream.events.clear()

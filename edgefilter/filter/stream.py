@@ -16,7 +16,7 @@ from edgefilter.filter.front_end import FrontEnd
 from edgefilter.filter.learner import Learner
 from edgefilter.filter.reference_watch import ReferenceWatch
 from edgefilter.filter.stepping import Stepping
-from edgefilter.filter.turns import LONGEST_S, Turns
+from edgefilter.filter.turns import LONGEST_S, Turns, drop_sound
 from edgefilter.profile.data import Profile
 from edgefilter.types import SAMPLE_RATE, Event, EventKind, Frame, Samples, Turn, as_microphones, as_samples
 
@@ -249,6 +249,7 @@ class Stream:
         else:
             start, samples = self._turns.finish()
             self.events.append(Event(talk, self._stepped, detail, Turn(start, samples)))
+            drop_sound(self.events)
 
     def _collect(self, frame: Frame, engine: ClipEngine) -> None:
         self._clip.append(frame)

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections import deque
+from dataclasses import replace
+
 import numpy as np
 
 from edgefilter.dsp import fourier
 from edgefilter.dsp.stft import StftConfig
 from edgefilter.filter.spatial import SpatialFilter
-from edgefilter.types import SAMPLE_RATE, Samples, Spectrum
+from edgefilter.types import SAMPLE_RATE, Event, Samples, Spectrum
 
 LONGEST_S = 30.0
 """Of a turn that is kept; what a recogniser takes at once. Of a longer one the latest part."""
@@ -15,6 +18,9 @@ BEFORE_S = 0.5
 """Of sound before the human was noticed: they had begun to speak, and a recogniser wants some silence first."""
 LARGEST = 2.0
 """Most that an answer is taken to be over its error in a bin: engines add no sound, but an error can vanish."""
+
+WAITING_S = 600.0
+"""Of the turns in events that nobody has asked for yet, 38 MB in all; a thousand events could hold a gigabyte."""
 
 
 class Turns:
@@ -75,6 +81,16 @@ class Turns:
             after = np.zeros((rows, *before.shape[1:]), np.complex64)
             after[: len(before)] = before
             setattr(self, name, after)
+
+
+def drop_sound(events: deque[Event]) -> None:
+    """Keep the sound of the latest turns alone, WAITING_S in all, in events that wait to be asked for, the oldest first."""
+    left = round(WAITING_S * SAMPLE_RATE)
+    for at in reversed(range(len(events))):
+        if (turn := events[at].turn) is not None:
+            left -= turn.samples.size
+            if left < 0:
+                events[at] = replace(events[at], turn=None)
 
 
 def overlap_add(spectra: Spectrum, stft: StftConfig) -> Samples:

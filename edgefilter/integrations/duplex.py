@@ -21,6 +21,7 @@ from edgefilter.dsp.resample import Resampler
 from edgefilter.errors import SignalError, UsageError
 from edgefilter.filter.barge_in import BargeInSettings
 from edgefilter.filter.ego_filter import EgoFilter
+from edgefilter.filter.turns import drop_sound
 from edgefilter.integrations.channels import named, taken
 from edgefilter.types import SAMPLE_RATE, SET_UP_WRONG, Event, Samples
 
@@ -194,15 +195,22 @@ class Duplex:
         for event in events:
             if event.kind in SET_UP_WRONG:
                 _LOGGER.warning("%s: %s", event.kind.replace("_", " "), event.detail)
-            for tell in (self._on_event or self._kept.append, *self.listeners):
+            for tell in (self._on_event or self._keep, *self.listeners):
                 tell(event)
         if self.enabled:
             return human
         return samples if samples.ndim == 1 else samples[:, 0]
 
     def events(self) -> list[Event]:
-        """What happened since the last call, oldest first, where no on_event takes it."""
-        return [self._kept.popleft() for _ in range(len(self._kept))]
+        """What happened since the last call, oldest first, where no on_event takes it; turns as of `EgoFilter.events`."""
+        with self._queue_lock:
+            return [self._kept.popleft() for _ in range(len(self._kept))]
+
+    def _keep(self, event: Event) -> None:
+        with self._queue_lock:
+            self._kept.append(event)
+            if event.turn is not None:
+                drop_sound(self._kept)
 
     def hear_pcm16(self, pcm: bytes | memoryview, rate: int, channels: int = 1, answers: int | None = None) -> bytes:
         """As `hear`, for 16-bit samples, interleaved.

@@ -182,6 +182,8 @@ class EchoCanceller:
         for number, ego in enumerate(self._filters):
             human = ego.process(self._to_filter[number].push(taken(heard, self._heard[number])), said)
             new.append(self._from_filter[number].push(human))
+            if number:
+                ego.events()  # `events` tells of the first microphone
         ready = np.concatenate((self._ready, np.stack(new)), axis=1)
         self._ready = ready[:, count:]
         return _like(ready[:, :count].T.reshape(form if len(ready) == self.channels else count), mic)

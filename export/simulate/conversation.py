@@ -30,10 +30,11 @@ LOUDEST = 0.95
 
 @dataclass(frozen=True, eq=False)
 class Conversation:
-    """mic, clean, fan, reference: (n,) float32; clean is the human at the microphone, fan all that is neither human nor robot.
+    """One simulated conversation.
 
-    Profile: of a calibration elsewhere, or None. stage: the linear stage that is to run over it. before: samples at the
-    beginning that are only there to be learned from.
+    mic, clean, fan, reference: (n,) float32; clean is the human at the microphone, fan all that is neither human nor
+    robot. profile: of a calibration elsewhere, or None. stage: the linear stage that is to run over it. before: samples at
+    the beginning that are only there to be learned from.
     """
 
     mic: Samples

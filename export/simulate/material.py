@@ -19,7 +19,10 @@ RESPONSES = ("room", "loudspeaker", "microphone")
 
 @dataclass(frozen=True)
 class Material:
-    """Noises: recordings (n,) float32. responses: measured impulse responses (n,) by RESPONSES. Either may be empty."""
+    """What conversations are made of.
+
+    noises: recordings (n,) float32. responses: measured impulse responses (n,) by RESPONSES. Either may be empty.
+    """
 
     humans: Corpus
     robots: Corpus

@@ -21,10 +21,16 @@ from tests.alignment.scene import (
 CLOSE = 16  # the requirement: +-1 ms
 
 
-def look(offset, evidence=30.0, explained=0.1):
+def look(offset, evidence=30.0, explained=0.1, gain=0.3):
     """What the meter says in double talk: sure of its peak, which explains little of the microphone."""
     ratio = 2.5
-    return DelayMeasurement(offset, 0.05**2, evidence / ratio, ratio, 1.0, explained, 0.3, 0.3)
+    return DelayMeasurement(offset, 0.05**2, evidence / ratio, ratio, 1.0, explained, gain, 0.3)
+
+
+def see(aligner, delay, *more, **others):
+    """The aligner's next look, which sees this delay."""
+    aligner._drift.advance(STRIDE)
+    aligner._judge(look(delay - aligner._drift.delay, *more, **others))
 
 
 def follow(seen, evidence):
@@ -32,8 +38,7 @@ def follow(seen, evidence):
     aligner = Aligner(256)
     aligner._switch(1000.0, 3.0)
     for delay, weight in zip(seen, evidence, strict=True):
-        aligner._drift.advance(STRIDE)
-        aligner._judge(look(delay - aligner._drift.delay, weight))
+        see(aligner, delay, weight)
     return aligner
 
 
@@ -172,10 +177,8 @@ def after_a_pause(jump: float, slope: float) -> list[float]:
         if at == 160:
             aligner._drift.advance(2 * RATE)
             truth += jump
-        aligner._drift.advance(STRIDE)
         truth += slope * STRIDE if at >= 160 else 0.0
-        seen = truth + 0.05 * rng.standard_normal()
-        aligner._judge(look(seen - aligner._drift.delay, 45.0, 0.5))
+        see(aligner, truth + 0.05 * rng.standard_normal(), 45.0, 0.5)
         found.append(aligner.stats()["ppm"])
     assert aligner.stats()["jumps"] == 1
     return found[160:]
@@ -189,3 +192,17 @@ def test_a_small_jump_after_a_pause_may_be_the_clocks_which_are_then_followed_at
 def test_a_large_jump_after_a_pause_is_a_buffer_and_says_nothing_of_the_clocks():
     ppm = after_a_pause(12.0, 0.0)
     assert np.abs(ppm).max() < 3.0  # what jitter allows
+
+
+def test_somebody_far_louder_than_the_robot_has_been_hides_it_and_says_nothing_of_its_delay():
+    """Neither a jump, however clear its peak, nor a robot that is lost."""
+    aligner = follow(np.full(16, 1000.0), np.full(16, 45.0))
+    counts = "jumps", "searches", "confidence"
+    before = aligner.stats()
+    for _ in range(20):
+        see(aligner, 1300.0, 60.0, gain=11 * 0.3)
+    after = aligner.stats()
+    assert [after[name] for name in counts] == [before[name] for name in counts]
+    for _ in range(20):
+        see(aligner, 1300.0, 60.0)
+    assert aligner.stats()["jumps"] == 1

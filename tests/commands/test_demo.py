@@ -1,6 +1,7 @@
 """The demo as a newcomer runs it."""
 
 import json
+import re
 import subprocess
 import sys
 
@@ -78,7 +79,8 @@ def test_hidden_tells_the_story_from_a_robot_that_changed_to_a_filter_that_is_me
     monkeypatch.setattr(command, "CASES", ("one",))
     words = ["demo", "--hidden", "--engine", "linear", "--output", tmp_path / "out", "--json", tmp_path / "out.json"]
     assert main([str(word) for word in words]) == 0
-    told, figures = capsys.readouterr().out, json.loads((tmp_path / "out.json").read_text())["one"]
+    (told, doing), figures = capsys.readouterr(), json.loads((tmp_path / "out.json").read_text())["one"]
+    assert list(dict.fromkeys(re.findall(r"robot one: (\w+)", doing))) == ["comparison", "diagnosis", "conversation"]
     assert figures["named"] == figures["hidden"] == ["late_reverb"]
     assert figures["excess_after_db"] < 2 < 14 < figures["excess_before_db"]  # 0.0 and 16.7
     assert figures["excess_after_db"] == figures["applied"]["excess_after_db"]

@@ -75,6 +75,19 @@ def test_the_status_line_is_drawn_on_a_terminal_and_nowhere_else(monkeypatch, ca
     assert capsys.readouterr().err == ""
 
 
+def test_a_countdown_is_drawn_on_a_terminal_once_a_second_and_is_one_line_elsewhere(monkeypatch, capsys):
+    for terminal, told in (
+        (True, ["now quiet, 2 s left", "now quiet, 1 s left", "now quiet, 0 s left"]),
+        (False, ["now quiet"]),
+    ):
+        monkeypatch.setattr(sys.stderr, "isatty", lambda shown=terminal: shown, raising=False)
+        show = display.countdown("now quiet")
+        for left_s in (2.0, 1.5, 1.0, 0.4, 0.0):
+            show(left_s)
+        drawn = [part.strip() for part in re.split(r"[\r\n]", capsys.readouterr().err)]
+        assert [part for at, part in enumerate(drawn) if part and part != drawn[at - 1]] == told
+
+
 @pytest.mark.parametrize(("total", "told"), [(None, "2 s"), (160_000, "2 of 10 s")])
 def test_a_recording_gets_progress_that_counts_seconds(monkeypatch, capsys, total, told):
     monkeypatch.setattr(display, "LINE_PERIOD_S", 0.05)

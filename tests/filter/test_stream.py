@@ -6,7 +6,11 @@ import numpy as np
 import pytest
 
 from edgefilter import EgoFilter, enhance
+from edgefilter.dsp.stft import StftConfig
+from edgefilter.engines.bypass import Bypass
 from edgefilter.errors import SignalError
+from edgefilter.filter.stream import Stream
+from edgefilter.types import Output
 from tests import conformance
 
 
@@ -108,3 +112,32 @@ def test_enhance_lowers_a_purely_linear_echo_by_20_db():
 def test_adapted_profile_needs_a_linear_stage():
     with pytest.raises(SignalError, match="linear stage"):
         EgoFilter(engine="bypass").adapted_profile()
+
+
+class Talkative(Bypass):
+    """Says that somebody speaks for 32 s of each 34."""
+
+    name, hop_s = "talkative", 0.256
+
+    def __init__(self):
+        super().__init__(StftConfig(window_length=8192, hop=4096, n_fft=8192))
+        self._hop = 0
+
+    def step(self, frame, state):
+        output, state = super().step(frame, state)
+        self._hop += 1
+        speaks = self._hop * self.hop_s % 34.0 < 32.0
+        return Output(output.spectrum, 0.999 if speaks else 0.001), state
+
+
+def test_events_that_nobody_asks_for_hold_the_sound_of_the_latest_ten_minutes():
+    """A turn may have 30 s: of a thousand events it would have been a gigabyte."""
+    stream = Stream(Talkative())
+    minute = 0.1 * np.random.default_rng(0).standard_normal(60 * 16_000).astype(np.float32)
+    for _ in range(13):
+        stream.process(minute, minute)
+    ends = [event for event in stream.events if event.kind == "speech_stopped"]
+    kept = [event.turn is not None for event in ends]
+    assert len(ends) > 20 and kept == sorted(kept) and not kept[0]
+    held = sum(event.turn.samples.size for event in ends if event.turn)
+    assert 570 * 16_000 < held <= 600 * 16_000

@@ -11,6 +11,7 @@ from edgefilter.dsp.resample import Resampler
 from edgefilter.integrations import duplex as module
 from edgefilter.integrations.duplex import Duplex, as_pcm16, from_pcm16
 from edgefilter.integrations.turns import TurnByTurn
+from edgefilter.types import Event, Turn
 
 RATE = 16000
 VOICE = 0.1 * np.random.default_rng(0).standard_normal(2 * RATE).astype(np.float32)
@@ -25,6 +26,7 @@ class Witness:
 
     def __init__(self):
         self.references = [np.zeros(0, np.float32)]
+        self.happened = []
 
     @property
     def reference(self):
@@ -36,7 +38,7 @@ class Witness:
         return mic if mic.ndim == 1 else mic[:, 0]
 
     def events(self):
-        return []
+        return list(self.happened)
 
 
 class Clock:
@@ -251,6 +253,14 @@ def test_an_agent_whose_reference_is_late_does_not_interrupt_itself_and_the_log_
         duplex.hear(room.hear(320), RATE)
     assert [event.kind for event in events if event.kind != "realigned"] == ["reference_late"]
     assert "reference late: the reference comes" in caplog.text
+
+
+def test_events_that_nobody_asks_for_hold_the_sound_of_the_latest_ten_minutes(witness):
+    duplex, minute = Duplex(witness), np.zeros(60 * RATE, np.float32)
+    for number in range(13):
+        witness.happened = [Event("speech_stopped", number, "", Turn(0, minute))]
+        listen(duplex, 0.02)
+    assert [event.turn is not None for event in duplex.events()] == [False] * 3 + [True] * 10
 
 
 def test_the_filter_that_it_makes_itself_judges_speech():

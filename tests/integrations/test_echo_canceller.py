@@ -103,6 +103,14 @@ def test_each_microphone_is_filtered_by_itself_and_a_stereo_reference_is_its_mea
     assert (left < -15).all()  # of each; 25 dB and more were seen after 0.75 s
 
 
+def test_events_of_microphones_that_nobody_can_ask_for_do_not_pile_up():
+    """Each finished turn holds the human's sound."""
+    canceller, ref = EchoCanceller(16000, 3, engine="linear"), 0.1 * np.random.default_rng(1).standard_normal(16000)
+    canceller.process(np.tile(np.roll(ref, 300)[:, None], 3), ref)
+    first, *others = (ego.events() for ego in canceller._filters)
+    assert [event.kind for event in first] == ["realigned"] and others == [[], []]
+
+
 @pytest.mark.parametrize(
     ("mic", "ref", "words"),
     [

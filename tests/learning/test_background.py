@@ -5,6 +5,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 
 import numpy as np
@@ -178,9 +179,14 @@ def test_a_process_that_does_not_end_is_killed(monkeypatch):
     ego = EgoFilter(engine="linear", learn=learner)
     pid = learner.pid
     os.kill(pid, signal.SIGSTOP)
-    ego.close()
-    with pytest.raises(ProcessLookupError):
-        os.kill(pid, 0)
+    closing = threading.Thread(target=ego.close, daemon=True)
+    closing.start()
+    closing.join(10)
+    try:
+        with pytest.raises(ProcessLookupError):
+            os.kill(pid, signal.SIGKILL)  # so that nothing is left of a test that fails
+    finally:
+        closing.join(10)
 
 
 def test_the_process_ends_with_the_last_one_who_holds_its_learner():
