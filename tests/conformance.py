@@ -325,7 +325,11 @@ def effect_check_fit_explains_what_its_own_apply_made(name: str) -> None:
     if catalogue.find(name).stage == "noise":
         expected = catalogue.find(name).noise_psd(dict(fitted.effects)[name], measurement.noise_psd)
         measurement = Measurement(measurement.reference, measurement.recording, expected, measurement.fit)
-    noise = fitted.unpredictable(measurement.reference) if catalogue.find(name).in_what_is_left else ()
+    noise = (
+        fitted.unpredictable(measurement.reference)
+        if catalogue.find(name).adds_noise and catalogue.find(name).followed
+        else ()
+    )
     after = held_out_power(measurement, fitted.predict(measurement.reference), noise)
     assert before > 2.0, f"the case is too weak to show anything: {before:.2f} times the fan"
     assert abs(after - 1.0) < LEFT_OVER.get(name, 0.1) * (before - 1.0), (

@@ -18,9 +18,9 @@ from edgefilter.echo.measurement import Values
 def candidates(found: Found, named: Collection[str]) -> tuple[Candidate, ...]:
     """The table of a search, and of the changes of the fan that it has seen; named: the effects that the diagnosis gives.
 
-    The information criterion is that of a residual that is Gaussian with a variance of its own in each cell (Whittle
-    1953; Schwarz 1978): ln(N) for each number of the fit, less N times the fall of the mean log power, N the samples
-    held out. As these are held out the gain is not flattered; the penalty comes on top. An effect that was
+    The information criterion (Schwarz 1978) is that of Score.level_db's likelihood: ln(N) for each number of the fit, less
+    2 N times the fall of the level, N the samples held out. As these are held out the gain is not flattered; the penalty
+    comes on top. An effect that was
     tried beside others only is ranked by its gain there.
     """
     judge = Judge(found.prepared)
@@ -59,7 +59,7 @@ def _row(entry: Tried, found: Found, named: Collection[str], held: float) -> Can
     if trial is None:
         return row
     numbers = size_of(entry.name, trial.values)
-    bic = numbers * float(np.log(max(held, 2.0))) - held * np.log(10.0) / 10.0 * trial.gain_db
+    bic = numbers * float(np.log(max(held, 2.0))) - held * np.log(10.0) / 5.0 * trial.gain_db
     return replace(row, numbers=numbers, delta_bic=float(bic))
 
 

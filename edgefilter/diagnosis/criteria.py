@@ -24,10 +24,10 @@ class Criteria:
     """A simpler effect, or an earlier start, that explains this share of what the best one does is preferred: the richer model
     fits its noise as well."""
     half: float = 0.5
-    """What all findings together explain at least of the excess, in level and in power: less is not what happened. Where another
-    effect explains so much, a last resort is not tried, since its fit is long and its noise flexible."""
+    """What all findings together explain at least of the excess, in level and in power: less is not what happened."""
     part: float = 0.2
-    """What a further effect explains at least of what is left: less is how the first one's model errs."""
+    """What a further effect explains at least of what is left: less is how the first one's model errs. Where a waveform explains so
+    much, noise is not tried yet: it fits whatever is left."""
     nothing: float = 0.1
     """Where no more than this share is left, the right effects may be found already, and no richer one is tried."""
 
@@ -94,12 +94,3 @@ class Criteria:
     fan_flat_db: float = 2.0
     """and by less than this over all while it is steady: what is neither may be a gain as well, and waits until the
     voice is explained."""
-
-    # A band limit that shows in the power alone
-    edge_gone: float = 0.25
-    """Of the predicted power above an edge no more than this part is there."""
-    edge_sure: float = 4.0
-    """And what is missing is so many standard deviations: by chance at one edge in thirty thousand."""
-    edge_passed: tuple[float, float] = (0.8, 1.2)
-    """Between these times the predicted power is what lies well below the edge: the band is cut, not the volume
-    turned."""

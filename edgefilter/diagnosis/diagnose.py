@@ -8,13 +8,11 @@ from dataclasses import replace
 import numpy as np
 
 from edgefilter.diagnosis.advice import advice, asks
-from edgefilter.diagnosis.band_edge import cut_by_power
 from edgefilter.diagnosis.candidates import candidates
 from edgefilter.diagnosis.closer_look import look_closer
 from edgefilter.diagnosis.compare import Comparison, compare, describe, independence_of
 from edgefilter.diagnosis.criteria import Criteria
 from edgefilter.diagnosis.findings import findings_of
-from edgefilter.diagnosis.follows_voice import noise_of_the_voice
 from edgefilter.diagnosis.joint import fit_jointly
 from edgefilter.diagnosis.laws import free_law
 from edgefilter.diagnosis.leftover import left_in_words
@@ -258,13 +256,8 @@ def conclude(
     verdict: Verdict = (
         "missing" if believed and not _much_left(found, criteria) else "explained" if quiet else "unexplained"
     )
-    cut = cut_by_power(found, criteria) if verdict == "unexplained" else None
-    noise = noise_of_the_voice(found, cut, criteria, without) if verdict == "unexplained" else None
-    if noise is not None:
-        found = searched = noise
-        verdict = "missing"
-    elif not believed and (quiet or not _partly(prepared, found, criteria)):
-        found = cut or without_doubtful(found)
+    if not believed and (quiet or not _partly(prepared, found, criteria)):
+        found = without_doubtful(found)
     unpredictable = any(find(step.name).adds_noise for step in found.steps)
     remaining = found.final.excess_db
     findings, doubts = findings_of(found, progress)
@@ -313,8 +306,8 @@ def _much_left(found: Found, criteria: Criteria) -> bool:
 def explained_level(prepared: Prepared, found: Found) -> float:
     """Part of the level over the robot's silences that is gone, 0 to 1: of many cells rather than of the loudest."""
     judge = Judge(prepared)
-    above = found.base.level_db - judge.floor_level(found.base)
-    gone = above - (found.final.level_db - judge.floor_level(found.final))
+    above = found.base.over_db - judge.floor_level(found.base)
+    gone = above - (found.final.over_db - judge.floor_level(found.final))
     if any(find(name).stage == "noise" for name, _ in found.model.effects):
-        above, gone = found.base.level_db, found.base.level_db - found.final.level_db
+        above, gone = found.base.over_db, found.base.over_db - found.final.over_db
     return float(np.clip(gone / above, 0.0, 1.0)) if above > 0.0 else 0.0

@@ -80,7 +80,11 @@ def _followed(wanted: Sequence[str]) -> list[str]:
         *("linear path" for effect in wished if effect.stage == "path" and effect.flexible),
         *("time" for effect in wished if effect.family == "time" and not effect.followed),
     }
-    return [name for name in names() if find(name).followed and name not in wanted and find(name).family not in held]
+    return [
+        name
+        for name in names()
+        if find(name).followed and not find(name).adds_noise and name not in wanted and find(name).family not in held
+    ]
 
 
 def _without(model: EchoModel, dropped: Sequence[str]) -> EchoModel:

@@ -12,7 +12,6 @@ from edgefilter.diagnosis.score import Judge
 from edgefilter.diagnosis.trials import Found
 from edgefilter.dsp.frames import block_power, blocks, decibels
 from edgefilter.dsp.psd import frequencies, periodograms
-from edgefilter.echo.effects.catalogue import find
 from edgefilter.echo.measurement import whiten
 from edgefilter.types import SAMPLE_RATE, Array, Samples
 
@@ -106,7 +105,6 @@ def left_in_words(found: Found, left: Leftover, remaining_db: float, floor_db: f
         weights = 10 * np.log10(np.maximum(final.cells, 1e-3)).mean(axis=0)
         low, high = Judge(found.prepared).band_hz[int(np.argmax(weights))]
         words.append(f"a residual that follows the robot's voice, strongest around {low:.0f} to {high:.0f} Hz")
-        words += [find(name).noise_words for name, _ in found.model.effects if find(name).noise_words]
     if not words:
         words.append("a residual spread over the whole recording")
     return "what no effect of the catalogue explains: " + "; ".join(words)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +23,8 @@ from edgefilter.types import Array, Samples
 
 FRAME, HOP = 512, 256
 FRAMES_PER_CELL = 8
+FEWEST = 4
+"""Cells, half a second of them, that tell of what the robot's silences are."""
 TOLERANCE = 0.012
 """An ordinary robot's path differs from its calibration by this share at each frequency (0.1 dB, 0.7 degrees)."""
 TOLERANCE_TAPS, TOLERANCE_LEAD = 32, 16
@@ -30,9 +33,9 @@ TOLERANCE_TAPS, TOLERANCE_LEAD = 32, 16
 class Judge:
     """Holds a prepared recording against predictions.
 
-    The log likelihood of a residual that is Gaussian with an unknown variance in each cell of time and frequency is,
-    but for a constant, minus half the sum of the degrees of freedom times the log of the measured power (Whittle 1953):
-    what counts is that the residual sinks in many cells, not that one loud passage does.
+    In the cells of time and frequency that no fit has seen the residual is held to be Gaussian (Whittle 1953), with the variance
+    that the model expects times an unknown factor, since every model errs: Student's t. So what counts is that the residual
+    sinks in many cells, not that one loud passage does.
     """
 
     def __init__(self, prepared: Prepared) -> None:
@@ -52,10 +55,17 @@ class Judge:
         whole = held[starts + span] - held[starts] >= 0.9 * span
         self.starts = starts[whole]
         self.active_cells = (heard[self.starts + span] - heard[self.starts]) > 0.3 * span
+        silent = ~self.active_cells
+        self.silent_cells = silent & (np.count_nonzero(silent) >= FEWEST)
         edges = np.unique(np.concatenate(([2], np.round(np.geomspace(4, FRAME // 2 - 6, 26)).astype(int))))
         self._edges = edges
         self.band_hz = np.stack((hz[edges[:-1]], hz[edges[1:]]), axis=1)
         self.freedom = np.diff(edges).astype(float)
+
+    @cached_property
+    def _ordinary_cells(self) -> Array:
+        """(times, bands) what is expected over the fan where nothing is missing."""
+        return self._expected_cells(self.prepared.ordinary)
 
     @property
     def measurement(self) -> Measurement:
@@ -101,13 +111,16 @@ class Judge:
         corrected = self.correct(prediction, white)
         residual = self.prepared.measurement.recording - corrected
         expected = (*unpredictable, *self.prepared.ordinary)
-        cells = self.cells(residual) / self._expected_cells(expected)
-        weights = np.broadcast_to(self.freedom, cells.shape)
+        variance = self._expected_cells(expected)
+        cells = self.cells(residual) / variance
+        over_db = self._mean(decibels(0.5 + 0.5 * cells))
+        cost_db = self._mean(0.5 * decibels(variance / self._ordinary_cells)) if unpredictable else 0.0
         plain = self.measurement.whiten(residual if gain is None else residual / gain).astype(np.float64) ** 2
         power = self._over_expected(plain, expected) if expected else plain
         held, active = self.prepared.held_out, self.prepared.active
         return Score(
-            level_db=float(np.average(10 * np.log10(np.maximum(cells, 1e-3)), weights=weights)) if cells.size else 0.0,
+            level_db=over_db + cost_db,
+            over_db=over_db,
             excess_db=_db(power[held]),
             active_db=_db(power[held & active]),
             silent_db=_db(power[held & ~active]),
@@ -118,23 +131,21 @@ class Judge:
         )
 
     def floor_level(self, score: Score) -> float:
-        """Level in dB of the cells in which the robot is silent, 0 where it never is: what is left when everything is explained."""
-        quiet = score.cells[~self.active_cells]
-        if quiet.shape[0] < 4:
-            return 0.0
-        return float(np.average(10 * np.log10(np.maximum(quiet, 1e-3)).mean(axis=0), weights=self.freedom))
+        """Score.over_db of the cells in which the robot is silent, 0 where it never is: what is left when everything is explained."""
+        return self._mean(decibels(0.5 + 0.5 * score.cells[self.silent_cells]))
+
+    def _mean(self, cells: Array) -> float:
+        """Mean over cells (times, bands), each by its degrees of freedom; 0 where there is none."""
+        return float(np.average(cells.mean(axis=0), weights=self.freedom)) if cells.size else 0.0
 
     def fan_gain_db(self, before: Score, after: Score) -> float:
         """By how much better another fan explains the cells in which the robot is silent (all where it never is), dB.
 
-        The gain in the log likelihood of cells whose variance is known (Whittle 1953), in the unit of a level.
+        The same likelihood as Score.level_db: what is left over either fan falls, and the one that is louder costs half of its dB.
         """
-        silent = ~self.active_cells if np.count_nonzero(~self.active_cells) >= 4 else slice(None)
-        misfits = []
-        for score in (before, after):
-            cells = np.maximum(score.cells[silent], 1e-3)
-            misfits.append(np.average((cells - np.log(cells)).mean(axis=0), weights=self.freedom))
-        return float(10.0 / np.log(10.0) * (misfits[0] - misfits[1]))
+        silent = self.silent_cells if self.silent_cells.any() else slice(None)
+        was, now = (np.maximum(score.cells[silent], 1e-3) for score in (before, after))
+        return self._mean(decibels((1.0 + was) / (1.0 + now)) - 0.5 * decibels(was / now))
 
     def size_db(self, change: Samples) -> float:
         """Power of a change of the prediction (n,) over the fan in dB: as it is or whitened, whichever is more."""
@@ -144,9 +155,9 @@ class Judge:
         )
         return float(10 * np.log10(max(plain, white, 1e-12)))
 
-    def _expected_cells(self, unpredictable: Sequence[tuple[Samples, Array]]) -> Array | float:
+    def _expected_cells(self, unpredictable: Sequence[tuple[Samples, Array]]) -> Array:
         """(times, bands) what is expected in the held-out cells, 1 where that is the fan alone."""
-        expected: Array | float = 1.0
+        expected = np.ones((self.starts.size, self.freedom.size))
         span = FRAME + HOP * (FRAMES_PER_CELL - 1)
         for variance, colour in unpredictable:
             total = np.concatenate(([0.0], np.cumsum(variance, dtype=np.float64)))

@@ -8,6 +8,7 @@ where the best one does not lead to an explanation.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Collection, Iterator, Sequence
 from itertools import pairwise
 
@@ -50,8 +51,9 @@ def _runs(bench: Workbench, start: EchoModel) -> Iterator[EchoModel]:
     Then, where that is one long filter, what half of it may lead to.
     """
     criteria = bench.criteria
+    known: set[frozenset[str]] = set()
     for first in _starts(bench, start):
-        run = _stepwise(bench, start, first)
+        run = _stepwise(bench, start, first, known)
         yield run
         if (
             bench.explained(run)
@@ -59,12 +61,12 @@ def _runs(bench: Workbench, start: EchoModel) -> Iterator[EchoModel]:
             or bench.little(run, start)
         ):
             for simple in _half_of_a_filter(bench, start, run):
-                yield _stepwise(bench, start, simple, criteria.long_filter - 1)
+                yield _stepwise(bench, start, simple, known, criteria.long_filter - 1)
             return
 
 
 def _starts(bench: Workbench, start: EchoModel) -> Iterator[Trial]:
-    """The trial to begin with, then others that explain a good part, named or not, since what hides them may be found beside them."""
+    """The trial to begin with, then others that explain a good part of something else, named or not: what hides them may be found beside them."""
     criteria = bench.criteria
     if bench.heard(start) <= criteria.silent_db:
         return
@@ -74,7 +76,15 @@ def _starts(bench: Workbench, start: EchoModel) -> Iterator[Trial]:
         yield first
     least = criteria.part * bench.left(start)
     others = [t for t in trials if t is not first and not find(t.name).last_resort and t.gain_db >= least]
+    others = [t for t in others if first is None or not _same(bench, start, first, t)]
     yield from sorted(others, key=lambda t: -t.gain_db)[: criteria.starts]
+
+
+def _same(bench: Workbench, start: EchoModel, one: Trial, other: Trial) -> bool:
+    """Whether two effects are two names for the same: beside either of them the other explains next to nothing."""
+    least = bench.criteria.nothing * bench.left(start)
+    pairs = ((one, other.name), (other, one.name))
+    return all((again := bench.attempt_alike(name, t.model)) is None or again.gain_db < least for t, name in pairs)
 
 
 def _half_of_a_filter(bench: Workbench, start: EchoModel, run: EchoModel) -> list[Trial]:
@@ -89,17 +99,23 @@ def _half_of_a_filter(bench: Workbench, start: EchoModel, run: EchoModel) -> lis
     return sorted(simple, key=lambda t: -t.gain_db)[:1]
 
 
-def _stepwise(bench: Workbench, start: EchoModel, first: Trial, most: int = 9) -> EchoModel:
-    """The model with first and all of complexity up to `most` that can be named beside it."""
+def _stepwise(bench: Workbench, start: EchoModel, first: Trial, known: set[frozenset[str]], most: int = 9) -> EchoModel:
+    """The model with first and all of complexity up to `most` that can be named beside it.
+
+    known: the sets of effects that earlier runs have held, which those of this one join: where it meets an earlier run, it ends.
+    """
     model = split(bench, start, first.model)
+    known.add(frozenset(added(start, model)))
     while len(added(start, model)) < bench.criteria.most_effects and not bench.explained(model) and bench.voiced(model):
         newest = forward(bench, model, most)
-        if newest is None:
+        if newest is None or (held := frozenset(added(start, newest.model))) in known:
             break
+        known.add(held)
         grown = split(bench, start, backward(bench, start, refit(bench, start, newest.model), newest.name))
         if bench.score(grown).level_db >= bench.score(model).level_db:
             break
         model = grown
+        known.add(frozenset(added(start, model)))
     return model
 
 
@@ -110,8 +126,11 @@ def forward(bench: Workbench, model: EchoModel, most: int = 9) -> Trial | None:
     return bench.preferred(t for t in much if bench.admissible(t, model))
 
 
-def refit(bench: Workbench, start: EchoModel, model: EchoModel) -> EchoModel:
-    """Each effect beyond start fitted beside the others, in turn, as long as the held-out level falls."""
+def refit(bench: Workbench, start: EchoModel, model: EchoModel, goal_db: float = math.inf) -> EchoModel:
+    """Each effect beyond start fitted beside the others, in turn, as long as the held-out level falls and may come below goal_db.
+
+    The fall of a round is less than that of the one before: where that would not reach the goal, no further one does.
+    """
     listed, worth = added(start, model), bench.criteria.worth_db
     if len(listed) < 2:
         return model
@@ -122,7 +141,8 @@ def refit(bench: Workbench, start: EchoModel, model: EchoModel) -> EchoModel:
             again = bench.attempt(name, model.without_effect(name))
             if again is not None and again.score.level_db < bench.score(model).level_db - 0.5 * worth:
                 model = again.model
-        if before - bench.score(model).level_db < worth:
+        reached = bench.score(model).level_db
+        if before - reached < max(worth, reached - goal_db):
             break
         waiting = listed
     return model
@@ -191,15 +211,16 @@ def _with_simpler(bench: Workbench, start: EchoModel, model: EchoModel, name: st
     criteria, others = bench.criteria, model.without_effect(name)
     absent = bench.absent(others, max(find(name).complexity - 1, criteria.simple))
     wanted = [key for key in absent if not (find(key).flexible or find(key).last_resort)]
+    useful = [key for key in wanted if (t := bench.attempt(key, model)) is not None and t.gain_db > 0.0]
     simple = [
-        t for key in wanted if (t := bench.attempt_alike(key, others)) is not None and bench.admissible(t, others)
+        t for key in useful if (t := bench.attempt_alike(key, others)) is not None and bench.admissible(t, others)
     ]
     least = criteria.part * bench.left(model)
     for trial in sorted(simple, key=lambda t: -t.gain_db)[:2]:
         both = bench.attempt(name, trial.model)
         if both is None or not bench.admissible(both, trial.model):
             continue
-        joint = refit(bench, start, both.model)
+        joint = refit(bench, start, both.model, bench.score(model).level_db - least)
         confirmed = bench.beside(trial.name, model, joint)
         if confirmed.gain_db >= least and bench.admissible(confirmed, joint.without_effect(trial.name)):
             return joint

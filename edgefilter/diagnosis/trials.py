@@ -141,7 +141,7 @@ class Workbench:
     def left(self, model: EchoModel) -> float:
         """Level in dB over that of the silences."""
         score = self.score(model)
-        return max(score.level_db - self.judge.floor_level(score), 0.0)
+        return max(score.over_db - self.judge.floor_level(score), 0.0)
 
     def attempt(self, name: str, model: EchoModel) -> Trial | None:
         """The effect of that name fitted beside what the model has.
@@ -193,19 +193,20 @@ class Workbench:
     def attempt_all(self, model: EchoModel, most: int = 9) -> list[Trial]:
         """Each effect that the model has not and whose complexity is at most `most`.
 
-        The last resorts only where none of the others explains much of what is left, and not where they found nothing in
-        less.
+        The last resorts only where none of the others explains a good part of what is left, and not where they were not to be
+        named in less.
         """
         left, absent = self.left(model), self.absent(model, most)
         found = self._attempt_in_turn([name for name in absent if not find(name).last_resort], model)
         resorts = [name for name in absent if find(name).last_resort and left < self._in_vain.get(name, np.inf)]
-        enough = self.criteria.half * left
+        enough = self.criteria.part * left
         if not resorts or self.little(model, self.prepared.model):
             return found
         if any((t.gain_db > enough or self.halves(t, model)) and self.admissible(t, model) for t in found):
             return found
         tried = {name: self.attempt(name, model) for name in resorts}
-        self._in_vain |= {name: left for name, trial in tried.items() if trial is None}
+        vain = [name for name, trial in tried.items() if trial is None or not self.admissible(trial, model)]
+        self._in_vain |= dict.fromkeys(vain, left)
         return found + [trial for trial in tried.values() if trial is not None]
 
     def _attempt_in_turn(self, names: list[str], model: EchoModel) -> list[Trial]:
@@ -260,19 +261,12 @@ class Workbench:
     def absent(self, model: EchoModel, most: int) -> list[str]:
         """Names of the effects on the voice that a model has not, that may be tried and whose complexity is at most `most`."""
         out = {*dict(model.effects), *self._without}
-        return [
-            name
-            for name in names()
-            if find(name).stage != "noise"
-            and not find(name).shows_in_silence
-            and not find(name).in_what_is_left
-            and name not in out
-            and find(name).complexity <= most
-        ]
+        listed = [(name, find(name)) for name in names() if name not in out]
+        return [name for name, effect in listed if not effect.is_of_the_fan and effect.complexity <= most]
 
 
-def beside(judge: Judge, name: str, model: EchoModel, criteria: Criteria, before: Score | None = None) -> Trial | None:
-    """An effect outside the search, fitted beside what a model has; before: that model's score, where it is known.
+def beside(judge: Judge, name: str, model: EchoModel, criteria: Criteria) -> Trial | None:
+    """An effect outside the search, fitted beside what a model has.
 
     None where it is there, its fit finds nothing, ordinary recordings show as much, or its values do not look like it.
     """
@@ -280,8 +274,8 @@ def beside(judge: Judge, name: str, model: EchoModel, criteria: Criteria, before
     values = None if name in dict(model.effects) else fitted(effect, judge.measurement, model)
     if values is None or vanishes(effect, values):
         return None
-    changed, before = model.with_effect(name, values), before or judge.of(model)
-    after = judge.of(changed)
+    changed = model.with_effect(name, values)
+    before, after = judge.of(model), judge.of(changed)
     found = Trial.of(name, changed, before, after)
     by_chance = found.p_value > criteria.false_rate
     return None if by_chance or not effect.plausible(Evidence(values, model, judge, before, after)) else found

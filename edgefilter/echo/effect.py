@@ -72,19 +72,16 @@ class Effect:
     (moments, a gain's curve) rather than to the robot: they get a parameter RECORDING besides their own, and in other
     recordings the effect is left out. lengthens: whether it is what makes a path longer than a recording teaches it at
     first. followed: whether the running filter follows it by itself, as its aligner does a drift, so that a fit of others takes
-    it out of the recording first (diagnosis/joint.py).
+    it out of the recording first (diagnosis/joint.py); it does not ask for the variance() of one that it follows.
 
     What the diagnosis asks:
     family: what kind of change it is. title: as it reads inside a sentence ("a turned volume"); by default the name.
     complexity: of two effects that explain about as much the lower one is named; from 4 on it is a long filter, which
-    half a minute does not teach. cost: of a fit, in quarters of a second. last_resort: whether it is tried only where no
-    other explains much. flexible: whether it has so many numbers that it takes up what a simpler effect beside it does.
-    learned: whether it is fitted anew to what the running filter hears. noise_words: what is said of the noise that it
-    leaves, where a residual is described. shown_by: recordings in which it differs from effects without them
-    (diagnosis/advice.py). shows_in_silence: whether the robot's silences tell it together with the voice, so that it is
-    looked for before the search and behind it (diagnosis/noise_change.py), not in it. in_what_is_left: whether it is told
-    only by what all others leave, so that it is looked for where a search has not explained the recording
-    (diagnosis/follows_voice.py); the running filter, which follows what any path leaves, asks for no variance() of it.
+    half a minute does not teach. cost: of a fit, in quarters of a second. flexible: whether it has so many numbers that
+    it takes up what a simpler effect beside it does. learned: whether it is fitted anew to what the running filter hears.
+    shown_by: recordings in which it differs from effects without them (diagnosis/advice.py). shows_in_silence: whether the
+    robot's silences tell it together with the voice, so that it is looked for before the search and behind it
+    (diagnosis/noise_change.py), not in it.
     """
 
     name: ClassVar[str]
@@ -102,13 +99,10 @@ class Effect:
     title: ClassVar[str] = ""
     complexity: ClassVar[int] = 3
     cost: ClassVar[int] = 1
-    last_resort: ClassVar[bool] = False
     flexible: ClassVar[bool] = False
     learned: ClassVar[bool] = False
-    noise_words: ClassVar[str] = ""
     shown_by: ClassVar[tuple[Experiment, ...]] = ()
     shows_in_silence: ClassVar[bool] = False
-    in_what_is_left: ClassVar[bool] = False
 
     def apply(self, x: Samples, values: Values, sample_rate: int) -> Samples:
         """The signal (n,) after the effect; x is not written to.
@@ -155,13 +149,6 @@ class Effect:
         """Whether the values, and what they explain, look like this effect rather than another."""
         return True
 
-    def cutting_above(self, hz: float) -> Values | None:
-        """Values with which the effect takes away all that lies above hz.
-
-        None for an effect that does no such thing.
-        """
-        return None
-
     def passband_gain_db(self, values: Values) -> float | None:
         """The gain in dB that the effect gives to all of the voice that it passes.
 
@@ -195,9 +182,14 @@ class Effect:
         return type(self).variance is not Effect.variance
 
     @property
+    def last_resort(self) -> bool:
+        """Whether it is tried only where no other explains much: noise that no waveform predicts fits whatever is left."""
+        return self.adds_noise
+
+    @property
     def noise_is_asked(self) -> bool:
         """Whether the running filter asks for variance()."""
-        return self.adds_noise and not self.in_what_is_left
+        return self.adds_noise and not self.followed
 
     @property
     def is_of_the_fan(self) -> bool:

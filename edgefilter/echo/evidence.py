@@ -16,7 +16,12 @@ from edgefilter.types import Array, Samples
 class Score:
     """Of one prediction.
 
-    Level_db: mean over time-frequency cells of the residual's dB over the fan, each cell by its degrees of freedom.
+    level_db: negative log likelihood of the residual's cells of time and frequency, in dB for each degree of freedom:
+    Student's t of as many degrees as a cell has (Lange, Little & Taylor 1989, "Robust statistical modeling using the t
+    distribution"), around the noise that the model expects. Far over that it is the mean of the cells' dB: many cells count,
+    not the loudest. Noise that a model expects on top of the ordinary costs half of its dB: else anything could be called
+    noise.
+    over_db: the same without that cost: what is left over what is expected.
 
     excess_db: mean power of the held-out whitened residual, dB. active_db, silent_db: while the robot is heard, and is
     not. fitted_db: of the samples to fit on, while it is heard.
@@ -26,6 +31,7 @@ class Score:
     """
 
     level_db: float
+    over_db: float
     excess_db: float
     active_db: float
     silent_db: float

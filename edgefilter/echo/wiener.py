@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from scipy import fft
 
 from edgefilter.dsp.convolution import convolve
+from edgefilter.dsp.fourier import power as power_of
 from edgefilter.echo.measurement import Measurement
 from edgefilter.echo.recording import BLOCK
 from edgefilter.types import SAMPLE_RATE, Array, Samples
@@ -135,11 +136,17 @@ def _windowed(correlation: Array, taps: int, size: int) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Spectra:
-    """Of the whitened fit samples: frequencies (m,) Hz, auto-spectrum of the prediction (m,), cross-spectrum to the recording (m,) complex."""
+    """Of the whitened fit samples: frequencies (m,) Hz, auto-spectra of prediction and recording (m,), cross-spectrum (m,) complex.
+
+    fan: what the fan alone has in each on average. averaged: bins of the transform in each.
+    """
 
     hz: Array
     predicted: Array
     cross: NDArray[np.complex128]
+    heard: Array
+    fan: float
+    averaged: int
 
     def gain(self, response: NDArray[np.complex128]) -> float:
         """By how much the squared error falls when the prediction gets that response (m,) instead of 1."""
@@ -155,9 +162,8 @@ def spectra(measurement: Measurement, white: Samples, resolution_hz: float) -> S
     a, b = fft.rfft(p.astype(np.float64), n), fft.rfft(y.astype(np.float64), n)
     width = max(int(resolution_hz * n / SAMPLE_RATE), 1)
     count = a.size // width
-    auto, cross = (
-        (np.abs(a[: count * width]) ** 2).reshape(count, width),
-        (b * a.conj())[: count * width].reshape(count, width),
+    auto, cross, own = (
+        2.0 / n * x[: count * width].reshape(count, width).sum(axis=1) for x in (power_of(a), b * a.conj(), power_of(b))
     )
     hz = (np.arange(count) + 0.5) * width * SAMPLE_RATE / n - 0.5 * SAMPLE_RATE / n
-    return Spectra(hz, 2.0 * auto.sum(axis=1) / n, 2.0 * cross.sum(axis=1) / n)
+    return Spectra(hz, auto, cross, own, 2.0 * width / n * float(np.sum(measurement.weights)), width)

@@ -9,18 +9,18 @@ import numpy as np
 import pytest
 from scipy import signal
 
-from edgefilter.diagnosis.band_edge import band_edge
 from edgefilter.diagnosis.compare import compare
 from edgefilter.diagnosis.criteria import Criteria
 from edgefilter.diagnosis.diagnose import Diagnosis, add, diagnose
 from edgefilter.diagnosis.prepare import prepare
-from edgefilter.diagnosis.score import Judge
 from edgefilter.diagnosis.select import search
 from edgefilter.diagnosis.trials import Trial, Workbench
 from edgefilter.dsp.fractional_delay import delayed
+from edgefilter.echo.effects.bandlimit import band_edge
 from edgefilter.echo.effects.catalogue import find
 from edgefilter.echo.evidence import Evidence, Score
 from edgefilter.echo.model import EchoModel
+from edgefilter.echo.wiener import spectra
 from edgefilter.types import PRE_ROLL
 from tests.diagnosis.robot_scene import DELAY, FAN, path, profile, record, voice
 
@@ -146,9 +146,13 @@ def test_a_band_limit_shows_in_the_power_where_a_codecs_noise_hides_it() -> None
 
 
 def test_a_band_edge_is_not_seen_where_the_volume_was_turned() -> None:
-    x = voice(SECONDS)
-    judge = Judge(prepare(profile(), (0.4 * echo(x) + fan()).astype(np.float32), x))
-    assert band_edge(judge, judge.prepared.prediction, Criteria()) is None
+    x, low = voice(SECONDS), signal.butter(12, 4000.0, fs=16000, output="sos")
+    turned, cut = 0.4 * echo(x), signal.sosfiltfilt(low, echo(x))
+    edges = []
+    for heard in (turned, cut):
+        prepared = prepare(profile(), (heard + fan()).astype(np.float32), x)
+        edges.append(band_edge(spectra(prepared.measurement, prepared.measurement.heard(prepared.model)[1], 20.0)))
+    assert edges == [None, pytest.approx(4000.0, rel=0.05)]
 
 
 def test_an_added_effect_lowers_the_error_of_another_recording() -> None:
@@ -187,7 +191,9 @@ def test_no_effect_is_chosen_where_none_lowers_the_level():
 
 
 def verdict(active_db: float, fitted_db: float) -> Score:
-    return Score(active_db, active_db, active_db, 0.0, fitted_db, 0.0, np.ones((4, 4)), np.zeros(16000, np.float32))
+    return Score(
+        active_db, active_db, active_db, active_db, 0.0, fitted_db, 0.0, np.ones((4, 4)), np.zeros(16000, np.float32)
+    )
 
 
 @pytest.mark.parametrize("fitted_db, stands", [(0.1, True), (-1.5, False)])

@@ -12,7 +12,7 @@ from scipy import fft
 from edgefilter.echo.effect import Effect, Experiment, Family, Parameter, Stage, first
 from edgefilter.echo.evidence import Evidence
 from edgefilter.echo.measurement import Measurement, Values, VoiceModel
-from edgefilter.echo.wiener import convolve_from, fit_filter, spectra
+from edgefilter.echo.wiener import Spectra, convolve_from, fit_filter, spectra
 from edgefilter.types import SAMPLE_RATE, Array, Samples
 
 FFT = 1024
@@ -24,6 +24,13 @@ HIGHEST_HZ = 7700.0
 PASSED_HZ, FLAT_DB = 300.0, 0.3
 """From where on a band limit passes the voice, and the standard deviation of a gain over frequency that is one gain."""
 STEEP = 16.0
+"""Order of a cut that shows in the power alone."""
+GONE, KEPT = 0.25, 0.5
+"""Of the predicted power above a cut-off, no more than this part is there; less than the other is, where it is not said to be."""
+SURE = 4.0
+"""And what is missing is so many standard deviations: by chance at one edge in thirty thousand."""
+PASSED = (0.8, 1.2)
+"""Between these times the predicted power is what lies well below the edge: the band is cut, not the volume turned."""
 
 
 class Bandlimit(Effect):
@@ -41,7 +48,6 @@ class Bandlimit(Effect):
     shown_by: ClassVar[tuple[Experiment, ...]] = ("sweep",)
     complexity: ClassVar[int] = 1
     flexible: ClassVar[bool] = True
-    noise_words: ClassVar[str] = "a codec that cuts the band leaves such noise"
     parameters: ClassVar[tuple[Parameter, ...]] = (
         Parameter("cutoff_hz", "Hz", 16000.0, 200.0, 16000.0),
         Parameter("order", "1", 8.0, 1.0, 60.0),
@@ -62,9 +68,10 @@ class Bandlimit(Effect):
         return y + convolve_from(x, taps, LEAD) if taps.any() else y
 
     def fit(self, measurement: Measurement, model: VoiceModel) -> Values:
-        """The best of a grid of cut-offs, orders and phases, refined, each at its best delay.
+        """The best of a grid of cut-offs, orders and phases, refined, each at its best delay, judged in the whitened cross-spectrum. Then taps.
 
-        Judged in the whitened cross-spectrum. Then taps.
+        Where the power does not end there, what is common with the reference is hidden by something else, such as a codec's
+        noise: then the cut-off is where the power ends.
         """
         predicted, x = measurement.heard(model)
         found = spectra(measurement, x, 20.0)
@@ -88,6 +95,8 @@ class Bandlimit(Effect):
             )
             best = max(near, key=lambda values: gain(*values)[0])
             step = 1.0 + (step - 1.0) * 0.6
+        if not _ends_at(found, best[0]) and (edge := band_edge(found)) is not None:
+            return {"cutoff_hz": edge, "order": STEEP}
         values = {
             "cutoff_hz": float(np.clip(best[0], 200.0, 15999.0)),
             "order": float(best[1]),
@@ -121,15 +130,34 @@ class Bandlimit(Effect):
         fall = evidence.before.level_db - evidence.after.level_db
         return evidence.before.level_db - evidence.grid.level_db(plain) > 0.5 * fall
 
-    def cutting_above(self, hz: float) -> Values:
-        """A steep low-pass."""
-        return {"cutoff_hz": hz, "order": STEEP}
-
     def passband_gain_db(self, values: Values) -> float | None:
         """The gain that the fine taps have in the passband, where that is flat."""
         hz, gain_db = measured_response_db(values)
         passed = gain_db[(hz > PASSED_HZ) & (hz < 0.6 * float(values["cutoff_hz"]))]
         return float(np.median(passed)) if passed.size and float(np.std(passed)) <= FLAT_DB else None
+
+
+def band_edge(found: Spectra) -> float | None:
+    """Frequency in Hz above which the predicted voice is missing from the recording's power; None where it is all there.
+
+    The power over the fan's, summed over all frequencies above an edge, is held against the predicted one. The edge is where
+    more is there than half of the prediction on one side, and less on the other.
+    """
+    there, due = (np.cumsum(x[::-1])[::-1] for x in (found.heard - found.fan, found.predicted))
+    variance = (found.fan + found.predicted) ** 2 / found.averaged
+    error = np.sqrt(np.cumsum(variance[::-1])[::-1])
+    at = int(np.argmax(due - 2.0 * there))
+    edge = float(found.hz[at])
+    below = (found.hz >= 0.25 * edge) & (found.hz <= 0.7 * edge)
+    passed = float(np.sum(found.heard[below] - found.fan)) / max(float(np.sum(found.predicted[below])), 1e-12)
+    missing = there[at] < GONE * due[at] and due[at] - there[at] > SURE * error[at]
+    return edge if missing and PASSED[0] <= passed <= PASSED[1] else None
+
+
+def _ends_at(found: Spectra, cutoff_hz: float) -> bool:
+    """Whether the recording's power falls above a cut-off, where some was predicted."""
+    above = (found.hz > 1.1 * cutoff_hz) & (found.predicted > found.fan)
+    return bool(np.sum(found.heard[above] - found.fan) <= KEPT * np.sum(found.predicted[above]))
 
 
 def _dull_above(cutoff_hz: float, evidence: Evidence) -> bool:
@@ -141,7 +169,7 @@ def _dull_above(cutoff_hz: float, evidence: Evidence) -> bool:
     loud = expected > 3.0
     if loud.sum() < 10:
         return True
-    return float(np.sum(np.maximum(heard[loud] - 1.0, 0.0))) < 0.5 * float(np.sum(expected[loud]))
+    return float(np.sum(np.maximum(heard[loud] - 1.0, 0.0))) < KEPT * float(np.sum(expected[loud]))
 
 
 def low_pass(hz: Array, cutoff: float, order: float, phase: float) -> NDArray[np.complex128]:

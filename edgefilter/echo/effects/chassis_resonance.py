@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import ClassVar
 
 import numpy as np
@@ -106,7 +107,7 @@ def _without(found: Spectra, modes: list[tuple[float, float]], gains: Array) -> 
     cross = found.cross
     for (frequency, q), real, imaginary in zip(modes, gains[::2], gains[1::2], strict=True):
         cross = cross - (real + 1j * imaginary) * _shape(found.hz, np.array([frequency]), q)[0] * found.predicted
-    return Spectra(found.hz, found.predicted, cross)
+    return replace(found, cross=cross)
 
 
 def _pole(frequency: float | Array, q: float | Array, sample_rate: int) -> complex | NDArray[np.complex128]:

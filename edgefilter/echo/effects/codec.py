@@ -54,7 +54,7 @@ class Codec(Effect):
     shown_by: ClassVar[tuple[Experiment, ...]] = ("levels", "tone")
     complexity: ClassVar[int] = 3
     cost: ClassVar[int] = 4
-    in_what_is_left: ClassVar[bool] = True
+    followed: ClassVar[bool] = True
     parameters: ClassVar[tuple[Parameter, ...]] = (
         Parameter("power", "full scale^2", 0.0, 0.0, 1e3),
         Parameter("emphasis_db", "dB", 0.0, NONE_DB, 0.0),

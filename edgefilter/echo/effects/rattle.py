@@ -75,7 +75,6 @@ class Rattle(Effect):
     title: ClassVar[str] = "a rattle"
     shown_by: ClassVar[tuple[Experiment, ...]] = ("levels", "tone")
     cost: ClassVar[int] = 8
-    last_resort: ClassVar[bool] = True
     memory: ClassVar[int | None] = 2048
     parameters: ClassVar[tuple[Parameter, ...]] = (
         Parameter("threshold", "full scale", NEVER, 1e-5, NEVER),

@@ -1,0 +1,75 @@
+"""The likelihood by which everything is judged: noise that is expected is neither free nor forbidden."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from edgefilter.diagnosis.criteria import Criteria
+from edgefilter.diagnosis.prepare import prepare
+from edgefilter.diagnosis.score import Judge
+from edgefilter.diagnosis.select import _stepwise, refit
+from edgefilter.diagnosis.trials import Workbench, added
+from edgefilter.dsp.psd import total_power
+from tests.diagnosis.robot_scene import profile, record, voice
+
+
+@pytest.fixture(scope="module")
+def noisy():
+    """A robot with noise that its fan is not, as loud as ten fans and of their colour; the judge of it, and that noise as a model says it."""
+    x, robot = voice(6.0), profile()
+    noise = np.random.default_rng(7).standard_normal(x.size) * np.sqrt(9.0 * total_power(robot.noise_psd))
+    prepared = prepare(robot, (record(x) + noise).astype(np.float32), x)
+    prepared = replace(prepared, measurement=replace(prepared.measurement, noise_psd=robot.noise_psd), ordinary=())
+    psd = robot.noise_psd.astype(float)
+    variance = np.full(x.size, 9.0 * total_power(robot.noise_psd), np.float32)
+    return Judge(prepared), prepared.prediction, variance, psd / (np.sum(psd) * 8000 / (psd.size - 1))
+
+
+def scored(noisy, times):
+    judge, prediction, variance, colour = noisy
+    return judge.judge(prediction, judge.measurement.whiten(prediction), [(times * variance, colour)] if times else [])
+
+
+def test_noise_that_is_there_explains_and_more_or_less_of_it_explains_less(noisy):
+    levels = {times: scored(noisy, times).level_db for times in (0.0, 0.1, 0.3, 1.0, 3.0, 10.0)}
+    assert min(levels, key=levels.get) == 1.0
+    assert levels[0.0] > levels[0.1] > levels[0.3] > levels[1.0] < levels[3.0] < levels[10.0]
+
+
+def test_noise_that_is_expected_costs_half_of_its_decibels(noisy):
+    right = scored(noisy, 1.0)
+    assert right.level_db == pytest.approx(5.0, abs=0.4) and right.over_db == pytest.approx(0.0, abs=0.4)
+    far = scored(noisy, 0.0)
+    assert far.level_db == far.over_db == pytest.approx(10 * np.log10(11 / 2), abs=0.4)
+
+
+def test_a_refit_ends_where_no_round_can_reach_its_goal():
+    x, robot = voice(6.0), profile()
+    changed = robot.echo.with_effect("playback_gain", {"gain_db": -2.0}).with_effect("clock_drift", {"ppm": 40.0})
+    prepared = prepare(robot, record(x, changed), x)
+    bench = Workbench(prepared, Criteria())
+    model = prepared.model
+    for name in ("playback_gain", "clock_drift"):
+        model = bench.attempt(name, model).model
+    tried = []
+    attempt, bench.attempt = bench.attempt, lambda name, model: tried.append(name) or attempt(name, model)
+    refit(bench, prepared.model, model)
+    rounds = len(tried)
+    tried.clear()
+    refit(bench, prepared.model, model, goal_db=bench.score(model).level_db - 50.0)
+    assert len(tried) < rounds
+
+
+def test_a_run_that_meets_an_earlier_one_ends_there():
+    x, robot = voice(6.0), profile()
+    changed = robot.echo.with_effect("playback_gain", {"gain_db": -4.0}).with_effect("clock_drift", {"ppm": 40.0})
+    prepared = prepare(robot, record(x, changed), x)
+    bench, start = Workbench(prepared, Criteria()), prepared.model
+    known = set()
+    for name, others in (("clock_drift", {"playback_gain"}), ("playback_gain", set())):
+        run = _stepwise(bench, start, bench.attempt(name, start), known)
+        assert set(added(start, run)) == {name} | others
+    assert frozenset({"clock_drift", "playback_gain"}) in known
