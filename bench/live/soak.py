@@ -54,7 +54,8 @@ changes its speed by more than that, and the bypass with it."""
 def run(options: argparse.Namespace) -> str:
     """Run, write, and raise UsageError with what drifted."""
     engine = options.engine or "auto"
-    made_with = results.stamp({"DEMO": [DEMO]}, [options.engine or "crnn"])  # which "auto" is wherever it is fast enough
+    # "auto" is crnn wherever that is fast enough
+    made_with = results.stamp({"DEMO": [DEMO]}, [options.engine or "crnn"])
     found = (
         live(options.minutes, engine) if options.part == "hour" else from_file(options.minutes, engine, options.one_way)
     )
