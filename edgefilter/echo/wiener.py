@@ -16,6 +16,8 @@ from edgefilter.types import SAMPLE_RATE, Array, Samples
 
 SETTLED = 1e-6
 """A step that explains less than this part of what all before it have explained is the last."""
+DELAYS = np.arange(-8.0, 8.01, 0.1)
+"""Samples by which the lag of a filtered recording may be off: it is found as that of the loudest frequencies."""
 
 
 def convolve_from(x: Samples, taps: Array, lead: int) -> Samples:

@@ -12,13 +12,11 @@ from scipy import fft
 from edgefilter.echo.effect import Effect, Experiment, Family, Parameter, Stage, first
 from edgefilter.echo.evidence import Evidence
 from edgefilter.echo.measurement import Measurement, Values, VoiceModel
-from edgefilter.echo.wiener import Spectra, convolve_from, fit_filter, spectra
+from edgefilter.echo.wiener import DELAYS, Spectra, convolve_from, fit_filter, spectra
 from edgefilter.types import SAMPLE_RATE, Array, Samples
 
 FFT = 1024
 TAPS, LEAD = 192, 64
-DELAYS = np.arange(-8.0, 8.01, 0.1)
-"""Samples: the lag at which a band-limited recording is found is that of its loudest frequencies."""
 HIGHEST_HZ = 7700.0
 """Above it, too near the end of all bands, no cut-off can be seen."""
 PASSED_HZ, FLAT_DB = 300.0, 0.3

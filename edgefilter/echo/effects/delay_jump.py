@@ -12,7 +12,7 @@ from edgefilter.echo.effects.clock_drift import STEADY, robust_line
 from edgefilter.echo.evidence import Evidence
 from edgefilter.echo.lag_track import LagTrack, track_lag
 from edgefilter.echo.measurement import Measurement, Values, VoiceModel
-from edgefilter.types import SAMPLE_RATE, Array, Samples
+from edgefilter.types import PRE_ROLL, SAMPLE_RATE, Array, Samples
 
 BLOCK, REACH = 4000, 2400
 MOST_JUMPS = 8
@@ -24,10 +24,6 @@ OUTLIER = 25.0
 """A block adds at most this to the squared, normalised distance from the steps or the line."""
 COST = 12.0
 """What each number of a step function has to save in squared, normalised distance, per unit of log(blocks)."""
-
-
-DIRECT = 64
-"""Samples before the direct sound in the path's impulse response (model.PRE_ROLL)."""
 HISTORY, SETTLED, AFTERMATH = 8000, 640, 6400
 """Samples: what the path remembers of the time before a jump; what may be unsure of its moment; what shows the jump."""
 SEARCH = (range(-256, 257, 32), range(-24, 25, 8), range(-6, 7, 2), (-1, 0, 1))
@@ -110,7 +106,7 @@ class DelayJump(Effect):
         for gap_gain in (1.0, 0.0) if np.any(samples > 1.0) else (1.0,):
             moved, cost = times / SAMPLE_RATE, 0.0
             for i, time in enumerate(times):
-                around, at = int(time), time - DIRECT
+                around, at = int(time), time - PRE_ROLL
                 for steps in SEARCH:
                     tries = []
                     for step in steps:

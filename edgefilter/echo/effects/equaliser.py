@@ -13,14 +13,12 @@ from edgefilter.dsp.least_phase import log_response
 from edgefilter.echo.effect import Effect, Experiment, Family, Parameter, Stage
 from edgefilter.echo.evidence import Evidence
 from edgefilter.echo.measurement import Measurement, Values, VoiceModel
-from edgefilter.echo.wiener import Spectra, convolve_from, fit_filter, spectra
+from edgefilter.echo.wiener import DELAYS, Spectra, convolve_from, fit_filter, spectra
 from edgefilter.types import SAMPLE_RATE, Array, Samples
 
 KNOTS_HZ = np.geomspace(80.0, 7600.0, 27)
 """A quarter of an octave apart: what is narrower rings, and is a resonance."""
 FFT = 4096
-DELAYS = np.arange(-8.0, 8.01, 0.1)
-"""Samples: the lag at which a recording is found is that of its loudest frequencies."""
 TAPS, LEAD, EXPECTED = 48, 16, 1e-4
 """Of the filter that takes up what a smooth gain of least phase is not: 3 ms, and a hundredth for each tap."""
 STEPS, DAMPING, BEND = 12, 1e-3, 3e-3

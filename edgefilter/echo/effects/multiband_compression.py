@@ -10,7 +10,8 @@ import scipy
 from numpy.typing import NDArray
 
 from edgefilter.echo.effect import Effect, Experiment, Family, Parameter, Runner, Stage, complete, neutral
-from edgefilter.echo.effects.compression import Compressor
+from edgefilter.echo.effects.compression import STEEPEST, Compressor
+from edgefilter.echo.effects.equaliser import MOST_DB
 from edgefilter.echo.effects.gain_fit import GainFit, Reach
 from edgefilter.echo.evidence import Evidence
 from edgefilter.echo.measurement import Measurement, Values, VoiceModel
@@ -27,9 +28,7 @@ DELAYS = np.arange(-24.0, 25.0)
 THRESHOLDS_DB, SLOPE = (-6.0, -15.0, -25.0), 0.5
 """Starting points, relative to the loudest 20 ms of the reference in each band, and dB per dB."""
 RELEASE_MS = 150.0
-STEEPEST = 0.98
 RESOLUTION_HZ = 20.0
-MOST_DB = 40.0
 LEAST_RATIO = 1.15
 """Of at least two bands: a band that alone is compressed is another effect's."""
 WORTH = 0.05

@@ -40,12 +40,10 @@ from edgefilter.echo.effects.knock_power import (
 from edgefilter.echo.evidence import Evidence
 from edgefilter.echo.least_squares import absorbed, filtered
 from edgefilter.echo.measurement import Measurement, Values, VoiceModel
-from edgefilter.types import SAMPLE_RATE, Array, Samples
+from edgefilter.types import PRE_ROLL, SAMPLE_RATE, Array, Samples
 
 TAPS = 320
 """20 ms of ringing after a knock."""
-DIRECT = 64
-"""Samples before the direct sound in the path's impulse response (model.PRE_ROLL)."""
 NEVER = 100.0
 BOUND = 1e4
 RIDGE = 1e-2
@@ -102,7 +100,7 @@ class Rattle(Effect):
         """What knocks add to the expected square of each sample (n,) at the microphone, for an aligned reference (n,)."""
         power = float(np.sum(values["power"]))
         return power * ringing_of(
-            _heard(reference, values, sample_rate), float(values["decay_ms"]), DIRECT, sample_rate
+            _heard(reference, values, sample_rate), float(values["decay_ms"]), PRE_ROLL, sample_rate
         )
 
     def colour(self, values: Values) -> Array:
@@ -122,7 +120,7 @@ class Rattle(Effect):
         x = measurement.reference
         predicted, target = measurement.heard(model)[1], measurement.white_recording
         left = target - absorbed(predicted, target, measurement.fit)
-        trigger, told = find_trigger(x, left, predicted, measurement.fit, DIRECT)
+        trigger, told = find_trigger(x, left, predicted, measurement.fit, PRE_ROLL)
         if trigger is None:
             return neutral(self)
         rest, allowed = left * measurement.weights, _roomy(measurement)
@@ -171,7 +169,7 @@ class Rattle(Effect):
         target = measurement.white_recording
         left = target - absorbed(predicted, target, measurement.fit)
         fits = {
-            decay: colour_of_knocks(left, ringing_of(knocks, decay, DIRECT), measurement.fit) for decay in DECAYS_MS
+            decay: colour_of_knocks(left, ringing_of(knocks, decay, PRE_ROLL), measurement.fit) for decay in DECAYS_MS
         }
         decay = max(fits, key=lambda decay: fits[decay][0])
         power = fits[decay][1] * fan_in_bands(measurement.noise_psd)
