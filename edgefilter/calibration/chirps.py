@@ -8,8 +8,9 @@ import numpy as np
 import soxr
 from scipy import fft
 
+from edgefilter.calibration.sweep import STRETCHED_PPM
 from edgefilter.dsp.fourier import power
-from edgefilter.dsp.frames import decibels
+from edgefilter.dsp.frames import block_power, decibels
 from edgefilter.dsp.lag import flat_cross
 from edgefilter.types import SAMPLE_RATE, Samples
 
@@ -27,9 +28,6 @@ LEAD = round(0.5 * SAMPLE_RATE)
 """Samples of silence before the first chirp, in which the room's noise is measured."""
 QUIET = round(0.1 * SAMPLE_RATE)
 """Samples of it, the quietest of which count: a stream may begin with a noise of its own."""
-STRETCHED_PPM = 5.0
-"""Difference of two clocks from which on a chirp is stretched enough, by a fortieth of a sample, to cost 30 dB of 7 kHz:
-the microphone is straightened then."""
 CERTAIN = 12.0
 """Height of a correlation with the chirps over its root mean square from which they are there: noise has 5."""
 
@@ -103,8 +101,7 @@ def _judge(mic: Samples, ref: Samples) -> Heard:
     offsets, ppm = _drift(heard, references, starts, size)
     omega = 2 * np.pi * np.arange(heard.shape[1]) / size
     heard = heard * np.exp(1j * omega * offsets[:, None])
-    before = mic[max(at_mic, 0) : max(at_mic, 0) + (LEAD - FADE) // QUIET * QUIET].reshape(-1, QUIET)
-    noise = np.min(np.mean(np.square(before, dtype=np.float64), axis=1))
+    noise = block_power(mic[max(at_mic, 0) :][: LEAD - FADE], QUIET).min()
     band = slice(round(LOWEST_HZ * size / SAMPLE_RATE), round(HIGHEST_HZ * size / SAMPLE_RATE))
     loud = np.array([kind.isupper() for kind in ORDER])
     energy = np.sum(power(heard[:, band]), axis=1) - noise * SLOT * size / 2 * (HIGHEST_HZ - LOWEST_HZ) / (

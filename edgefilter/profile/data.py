@@ -24,6 +24,8 @@ from edgefilter.types import PRE_ROLL, SAMPLE_RATE, Array, Samples
 GRID_HZ = np.arange(GRID_BINS) * SAMPLE_RATE / GRID_FFT
 """(601,) Hz, 0 to 8000 in steps of 13.33."""
 DISTORTION_ORDERS = (2, 3, 4, 5)
+LOW_SNR_DB = 10.0
+"""Signal-to-noise ratio below which a band's path is wrong by more than 3 dB at times."""
 MAX_TAPS = 4 * SAMPLE_RATE
 """Samples, 4 s: longer than the reverberation of any room that a robot talks in, and than the lag of any player."""
 LEARNED = "what the running filter learned"
