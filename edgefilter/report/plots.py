@@ -14,6 +14,7 @@ from edgefilter.dsp.frames import decibels
 from edgefilter.errors import EdgefilterError
 from edgefilter.profile.approximation import LinearApproximation
 from edgefilter.profile.data import DISTORTION_ORDERS, GRID_HZ, LOW_SNR_DB, Profile
+from edgefilter.profile.text import to_come
 from edgefilter.report.media import spectrogram_db
 from edgefilter.types import PRE_ROLL, SAMPLE_RATE, Samples
 
@@ -39,7 +40,7 @@ def plot_profile(profile: Profile, path: str | Path) -> None:
     first = ms < 40
     axes[0, 0].plot(ms[first], taps[first], color=INK, linewidth=0.8)
     _label(axes[0, 0], "Impulse response, first 40 ms", "ms after the direct sound", "amplitude")
-    left = np.cumsum(taps[::-1] ** 2)[::-1]
+    left = to_come(taps)
     axes[0, 1].plot(
         ms,
         decibels(taps**2 / max(float(np.max(taps**2)), 1e-30), 1e-20),

@@ -450,8 +450,8 @@ def test_what_a_linear_path_leaves_is_kept_and_a_part_of_it_is_refused(tmp_path)
         ("level_db", np.array([-20.0, -26.0]), r"expected rising levels"),
         ("level_db", np.zeros(0), "expected float64 of one level or more"),
         ("noise", np.zeros((2, 600), np.float32), r"approximation_noise is float32 of shape \(2, 600\)"),
-        ("even", np.full((2, GRID_BINS), np.nan, np.float32), "approximation_even is nan to nan"),
-        ("least_db", np.array([-40.0]), "approximation_least_db is .* expected 2 float64"),
+        ("even", np.full((2, GRID_BINS), np.nan, np.float32), "approximation_even is nan at position 0, expected -1e"),
+        ("least_db", np.array([-40.0]), r"approximation_least_db is float64 of shape \(1,\)"),
     ],
 )
 def test_a_damaged_part_of_what_a_linear_path_leaves_is_one_line(tmp_path, name, array, match):
