@@ -76,7 +76,7 @@ def find(name: str | int | Device | None, kind: str) -> Device:
 def monitor_of(output: str | int | Device | None = None) -> Device:
     """The input that gets what output plays (default: the default output); UsageError where there is none."""
     device, devices = find(output, "output"), _devices()
-    source = pulse.default_monitor() if device.name in STAND_INS else None
+    source = pulse.monitor(pulse.default_name("output")) if device.name in STAND_INS else None
     found = [each for each in devices if source and each.pulse_name == source]
     return found[0] if found else monitor(devices, device)
 

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from edgefilter.audio.lookup import Device
-from edgefilter.audio.pairing import Inlet, Outlet
+from edgefilter.audio.pairing import BUFFER_S, Inlet, Outlet
 from edgefilter.audio.pulse import OPENING, leading_to
 from edgefilter.dsp.resample import Resampler
 from edgefilter.errors import DeviceError, UsageError
@@ -25,9 +25,6 @@ from edgefilter.types import SAMPLE_RATE, Samples, which_channels
 
 POLL_S = 0.004
 """Between two looks at a device: a quarter of a hop."""
-BUFFER_S = 2.0
-"""How much sound a ring holds while the filter is busy; beyond it samples are lost, and counted. A device that delivers
-nothing for as long has stopped."""
 START_S = 6.0
 """How long a device may take to its first samples: a virtual one can hold back its first 2 s."""
 STREAM_LATENCY_S = 0.05

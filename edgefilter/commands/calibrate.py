@@ -111,15 +111,13 @@ def take(
 
     for latency_s in BUFFERS_S:
         channels = getattr(args, "mic_channels", None)
-        found = play_and_record(
-            args.speaker, args.input, sound, latency_s=latency_s, tell=countdown(what), channels=channels
-        )
-        keep(found.samples)
-        if not found.holes:
-            return found.samples
-        say(f"the recording has holes ({found.holes})")
+        found, holes = play_and_record(args.speaker, args.input, sound, latency_s, countdown(what), channels)
+        keep(found)
+        if not holes:
+            return found
+        say(f"the recording has holes ({holes})")
     raise DeviceError(
-        f"the recording has holes ({found.holes}), also with buffers of {latency_s:g} s: close other programs and measure"
+        f"the recording has holes ({holes}), also with buffers of {latency_s:g} s: close other programs and measure"
         " again"
     )
 

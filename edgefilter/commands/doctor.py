@@ -159,7 +159,7 @@ def _open(
         virtual.refuse_own(str(name))
     from edgefilter.audio.device import input_port, monitor_of
 
-    device = name if name is not None else virtual.speaker_monitor() or monitor_of("default")
+    device = name if name is not None else pulse.monitor(virtual.SPEAKER) or monitor_of("default")
     port = input_port(device, channels=channels)
     ports[role] = port
     yield Check(role, "ok", ", ".join([f"{port.device}, {port.rate} Hz", *port.notes]))
@@ -213,7 +213,7 @@ def _set_up(
             "set-up", "failed", f"microphone and reference are both '{name}'", "name the real microphone with --input"
         )
         return
-    output = virtual.SPEAKER if speaker == "default" and virtual.speaker_monitor() else speaker
+    output = virtual.SPEAKER if speaker == "default" and pulse.monitor(virtual.SPEAKER) else speaker
     sound = chirps()
     say(
         f"chirps for {sound.size / SAMPLE_RATE:.0f} s on output '{output}', peak {LEVEL_DB:.0f} dB of full scale"

@@ -79,7 +79,7 @@ class Record(Recorder):
     The sound, events.jsonl, run.json with the figures, and profile.npz if the run had a profile to begin with.
     """
 
-    def __init__(self, folder: str | Path, profile: Profile | None, microphones: int = 1) -> None:
+    def __init__(self, folder: str | Path, profile: Profile | None, microphones: int) -> None:
         super().__init__(folder, microphones)
         self.log = EventLog(self.folder / "events.jsonl")
         if profile is not None:

@@ -78,7 +78,7 @@ def colours() -> np.ndarray:
     )
 
 
-def sound(samples: Samples, gain: float = 1.0) -> str:
+def sound(samples: Samples, gain: float) -> str:
     """The first MAX_SOUND_S of samples (n,) times gain, as an Opus data address, about 30 kbit/s."""
     buffer = io.BytesIO()
     loud = np.clip(samples[: MAX_SOUND_S * SAMPLE_RATE] * np.float32(gain), -1.0, 1.0)
