@@ -21,7 +21,7 @@ from edgefilter.errors import DeviceError, SignalError, UsageError
 from edgefilter.filter.ego_filter import EgoFilter
 from edgefilter.integrations.channels import named
 from edgefilter.integrations.duplex import Duplex
-from edgefilter.types import SET_UP_WRONG, Event
+from edgefilter.types import SAMPLE_RATE, SET_UP_WRONG, Event
 
 QUEUE = 200
 """Messages of a topic that wait: 4 s of 20 ms."""
@@ -105,7 +105,7 @@ class Topics:
     reference: str = "/speech"
     silenced: str = "/speech_stopped"
     human: str = "/human"
-    rate: int = 16000
+    rate: int = SAMPLE_RATE
     channels: int = 1
     mic_channels: Sequence[int] | None = None
     reference_channels: int | None = None
@@ -125,7 +125,7 @@ class Node:
         Of DDS: ROS_DOMAIN_ID.
     """
 
-    def __init__(self, ego: EgoFilter, topics: Topics = Topics(), domain: int = 0) -> None:
+    def __init__(self, ego: EgoFilter, topics: Topics, domain: int) -> None:
         self._topics = topics
         microphones, reference = topics.mic_channels, topics.reference_channel
         named(microphones, reference, topics.channels)

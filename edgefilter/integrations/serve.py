@@ -61,13 +61,13 @@ class Session:
             codec_s = FRAME_MS / 1000
         else:
             decoders = (partial(_microphones_of, count=form.microphones), from_pcm16)
-            self._encode, codec_s = self._as_pcm, 0.0
+            self._encode = self._as_pcm
             self._from_filter = Resampler(SAMPLE_RATE, rate)
             codec_s = self._from_filter.delay_s
         self._two = TwoStreams(decoders, rate, round(form.late_ms * rate / 1000)) if form.streams == "two" else None
         self.delay_ms = 1000 * (ego.latency / SAMPLE_RATE + self._to_filter[0].delay_s + codec_s)
         self._announced = False
-        self._counted = {"lost": 0, "late": 0}
+        self._counted = self._counts()
 
     def ready(self, learns: bool) -> str:
         """The first answer."""
@@ -180,7 +180,7 @@ class Service:
     """
 
     def __init__(
-        self, make_filter: Callable[[bool], EgoFilter], streams: int, learners: int = 0, token: str | None = None
+        self, make_filter: Callable[[bool], EgoFilter], streams: int, learners: int, token: str | None
     ) -> None:
         self._make, self._streams, self._learners, self._token = make_filter, streams, learners, token
         self._serving = self._learning = 0
