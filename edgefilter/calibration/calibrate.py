@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy import signal
 
-from edgefilter.calibration.array import cross_density, doubts, first, refuse_silent
+from edgefilter.calibration.array import cross_density, doubts, first
 from edgefilter.calibration.checks import check_found, check_lengths, collect_warnings
 from edgefilter.calibration.sweep import (
     MIN_TAPS,
@@ -91,7 +91,10 @@ def calibrate(
     warnings = collect_warnings(law, reference, recording, noise, result, path, direct, bands, snr)
     array = None
     if recordings.ndim > 1:
-        refuse_silent(recordings)
+        for at in np.flatnonzero(~recordings.any(axis=1)):
+            raise CalibrationError(
+                f"channel {at} of the sweep recording is silent, every sample 0: choose the microphones with --mic-channels"
+            )
         results = [
             deconvolve(reference, *of, GRID_HZ, MIN_TAPS) for of in zip(recordings[1:], map(fan_psd, noises[1:]))
         ]

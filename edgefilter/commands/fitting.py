@@ -11,7 +11,6 @@ from edgefilter.diagnosis.compare import Comparison
 from edgefilter.diagnosis.diagnose import PROMISE_DB, Diagnosis, add, settle
 from edgefilter.diagnosis.proof import Proof, proofs_until_kept, prove
 from edgefilter.echo.effects.catalogue import find
-from edgefilter.echo.effects.catalogue import names as names_known
 from edgefilter.echo.running import reach
 from edgefilter.errors import EdgefilterError, SignalError
 from edgefilter.profile.data import Profile
@@ -154,11 +153,6 @@ def fit(
         before = found.comparison if told is found else told.comparison
         return Fitted(names, dropped, knowing, before, after, proof, unproven, told, found.remaining_db)
     return Fitted(names, dropped, *add(start, names, recording, reference), proof, unproven, found)
-
-
-def long_paths() -> list[str]:
-    """Names of the effects that lengthen a path: a profile made from a recording has one of a quarter of a second."""
-    return [name for name in names_known() if find(name).lengthens]
 
 
 def _values(name: str, values: Any, named: bool) -> list[str]:

@@ -242,15 +242,9 @@ def _effects(listed: object, members: Mapping[str, np.ndarray]) -> Effects:
         name, values = entry.get("name"), entry.get("values")
         if not isinstance(name, str) or not isinstance(values, dict):
             raise _Damaged(f"effects[{i}] has no name or no values")
-        effects.append(
-            (
-                name,
-                {
-                    key: _value(value, f"effects[{i}] ({name[:40]}).{key[:40]}", members)
-                    for key, value in values.items()
-                },
-            )
-        )
+        where = f"effects[{i}] ({name[:40]})"
+        found = {key: _value(value, f"{where}.{key[:40]}", members) for key, value in values.items()}
+        effects.append((name, found))
     return tuple(effects)
 
 
