@@ -19,6 +19,7 @@ import numpy as np
 from edgefilter.audio.lookup import Device
 from edgefilter.audio.pairing import BUFFER_S, Inlet, Outlet
 from edgefilter.audio.pulse import OPENING, leading_to
+from edgefilter.audio.reader import delivered
 from edgefilter.dsp.resample import Resampler
 from edgefilter.errors import DeviceError, UsageError
 from edgefilter.types import SAMPLE_RATE, Samples, which_channels
@@ -195,14 +196,9 @@ class InputPort(Port):
 
     def open(self) -> None:
         inlet, wanted = self.inlet, self.wanted
-        taken = None if wanted is None else wanted[0] if len(wanted) == 1 else wanted
 
         def callback(indata: np.ndarray, _frames: int, _time: Any, status: Any) -> None:
-            if taken is not None:
-                samples = indata[:, taken]
-            else:
-                samples = indata[:, 0] if indata.shape[1] == 1 else indata.mean(axis=1)
-            inlet.receive(samples, bool(status.input_overflow))
+            inlet.receive(delivered(indata, wanted), bool(status.input_overflow))
 
         self.start(callback)
 

@@ -66,7 +66,7 @@ def collect_warnings(
         quiet(recording),
         disturbed(law, reference, recording, noise, result, direct),
         early_arrivals(result, path, direct),
-        *doubtful_noise(reference, noise, result, direct),
+        *doubtful_noise(reference, noise),
     ]
     return [text for text in found if text]
 
@@ -177,7 +177,7 @@ def early_arrivals(result: Deconvolution, path: Samples, direct: int) -> str | N
     )
 
 
-def doubtful_noise(reference: Samples, noise: Samples, result: Deconvolution, direct: int) -> list[str]:
+def doubtful_noise(reference: Samples, noise: Samples) -> list[str]:
     """A noise recording that is short, silent, unsteady, or contains the robot."""
     texts = []
     if noise.size < 2 * SAMPLE_RATE:

@@ -35,7 +35,7 @@ def extract(bag: Path, topics: dict[str, str], folder: Path, rate: int, channels
     store.register(get_types_from_msg("uint8[] data", "audio_common_msgs/msg/AudioData"))
     try:
         with AnyReader([bag], default_typestore=store) as reader:
-            sounds = {name: list(_messages(reader, topic, rate, channels)) for name, topic in topics.items()}
+            sounds = {name: list(_messages(reader, topic, channels)) for name, topic in topics.items()}
     except (AnyReaderError, OSError, ValueError) as error:
         raise AudioFileError(f"{bag} cannot be read as a recording of ROS 2: {' '.join(str(error).split())}") from None
     begin = min(time - samples.size / rate for parts in sounds.values() for time, samples in parts[:1])
@@ -58,7 +58,7 @@ def extract(bag: Path, topics: dict[str, str], folder: Path, rate: int, channels
     return seconds
 
 
-def _messages(reader: AnyReader, topic: str, rate: int, channels: int) -> Iterator[tuple[float, Samples]]:
+def _messages(reader: AnyReader, topic: str, channels: int) -> Iterator[tuple[float, Samples]]:
     """Each message's time of arrival, seconds, and its samples (n,)."""
     found = [each for each in reader.connections if each.topic == topic]
     if not found:

@@ -157,7 +157,7 @@ class Node:
         """End `run` soon; may be called from a signal handler."""
         self._stop.set()
 
-    def run(self, say: Callable[[str], None] = lambda text: None) -> None:
+    def run(self, say: Callable[[str], None]) -> None:
         """Serve until `stop`; say: told what cannot be read, a line each."""
         reported = 0.0
         while not self._stop.is_set():
