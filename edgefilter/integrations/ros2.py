@@ -21,7 +21,7 @@ from edgefilter.errors import DeviceError, SignalError, UsageError
 from edgefilter.filter.ego_filter import EgoFilter
 from edgefilter.integrations.channels import named
 from edgefilter.integrations.duplex import Duplex
-from edgefilter.types import SAMPLE_RATE, SET_UP_WRONG, Event
+from edgefilter.types import SET_UP_WRONG, Event
 
 QUEUE = 200
 """Messages of a topic that wait: 4 s of 20 ms."""
@@ -101,15 +101,15 @@ class Topics:
     reference_channels: of that topic, None for as many as the microphone's.
     """
 
-    mic: str = "/audio"
-    reference: str = "/speech"
-    silenced: str = "/speech_stopped"
-    human: str = "/human"
-    rate: int = SAMPLE_RATE
-    channels: int = 1
-    mic_channels: Sequence[int] | None = None
-    reference_channels: int | None = None
-    reference_channel: int | None = None
+    mic: str
+    reference: str
+    silenced: str
+    human: str
+    rate: int
+    channels: int
+    mic_channels: Sequence[int] | None
+    reference_channels: int | None
+    reference_channel: int | None
 
 
 class Node:
