@@ -113,11 +113,9 @@ def _length_notes(reference: Reader, total: int) -> list[str]:
         )
     difference = abs(reference.total - total)
     if difference:
-        how = (
-            "shorter than the recording; silence follows it"
-            if reference.total < total
-            else "longer than the recording; its end is not used"
-        )
+        how = "longer than the recording; its end is not used"
+        if reference.total < total:
+            how = "shorter than the recording; silence follows it"
         notes.append(f"reference {reference.path} is {difference} samples ({difference / SAMPLE_RATE:.3f} s) {how}")
     return notes
 

@@ -152,12 +152,8 @@ def _incomplete(what: str, counts: dict[str, int]) -> list[str]:
 
 
 def _join(first: Block, second: Block) -> Block:
-    return Block(
-        np.concatenate((first.mic, second.mic)),
-        np.concatenate((first.ref, second.ref)),
-        first.start,
-        first.lost + second.lost,
-    )
+    mic, ref = (np.concatenate((getattr(first, name), getattr(second, name))) for name in ("mic", "ref"))
+    return Block(mic, ref, first.start, first.lost + second.lost)
 
 
 class LiveSink(Sink):

@@ -97,26 +97,20 @@ def _judge(mic: Samples, ref: Samples) -> Heard:
     starts = [at_ref + LEAD + number * SLOT for number in range(len(ORDER))]
     lag = at_mic - at_ref
     size = fft.next_fast_len(2 * SLOT, real=True)
-    margin = FADE
-    references = np.stack([_spectrum(ref, start - margin, size) for start in starts])
-    heard = np.stack([_spectrum(mic, start + lag - margin, size) for start in starts])
+    references = np.stack([_spectrum(ref, start - FADE, size) for start in starts])
+    heard = np.stack([_spectrum(mic, start + lag - FADE, size) for start in starts])
     offsets, ppm = _drift(heard, references, starts, size)
     omega = 2 * np.pi * np.arange(heard.shape[1]) / size
     heard = heard * np.exp(1j * omega * offsets[:, None])
     noise = block_power(mic[max(at_mic, 0) :][: LEAD - FADE], QUIET).min()
     band = slice(round(LOWEST_HZ * size / SAMPLE_RATE), round(HIGHEST_HZ * size / SAMPLE_RATE))
     loud = np.array([kind.isupper() for kind in ORDER])
-    energy = np.sum(power(heard[:, band]), axis=1) - noise * SLOT * size / 2 * (HIGHEST_HZ - LOWEST_HZ) / (
-        SAMPLE_RATE / 2
-    )
+    in_noise = noise * SLOT * size / 2 * (HIGHEST_HZ - LOWEST_HZ) / (SAMPLE_RATE / 2)
+    energy = np.sum(power(heard[:, band]), axis=1) - in_noise
     given = np.sum(power(references[:, band]), axis=1)
     gain_db = [float(decibels(max(float(np.sum(energy[of]) / np.sum(given[of])), 1e-12))) for of in (loud, ~loud)]
-    over = np.mean(
-        [
-            np.mean(np.square(mic[start + lag : start + lag + CHIRP], dtype=np.float64))
-            for start in np.array(starts)[loud]
-        ]
-    )
+    begins = np.array(starts)[loud] + lag
+    over = np.mean([np.mean(np.square(mic[at : at + CHIRP], dtype=np.float64)) for at in begins])
     left_db, same = _left(heard, references, band, size)
     return Heard(
         in_ref, in_mic, peak_db, lag / SAMPLE_RATE, float(decibels(float(over / max(noise, 1e-12)))), ppm, left_db,

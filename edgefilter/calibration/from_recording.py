@@ -124,10 +124,8 @@ def find_lag(recording: Samples, reference: Samples) -> int:
     no lag stands out: the highest of independent values at all lags is 4 to 5 times their root mean square.
     """
     n = fft.next_fast_len(2 * recording.size, real=True)
-    near = np.abs(
-        correlation_near(flat_cross(reference, recording, n), n, min(int(MAX_OFFSET * SAMPLE_RATE), recording.size - 1))
-    )
-    lag, height = highest(near)
+    reach = min(int(MAX_OFFSET * SAMPLE_RATE), recording.size - 1)
+    lag, height = highest(np.abs(correlation_near(flat_cross(reference, recording, n), n, reach)))
     if not height > STANDS_OUT:
         level = decibels(np.mean(np.square(reference, dtype=np.float64)))
         raise SignalError(

@@ -64,20 +64,14 @@ class Fitted:
 
     def facts(self) -> list[tuple[str, str, str]]:
         """For the top of the page: term, value, explanation."""
-        facts = []
+        facts, proof = [], self.proof
         if self.found is None or self.found.written is None:
-            facts.append(
-                ("Written", f"{decibels(self.after.excess_db)} dB", f"over the noise floor, with {joined(self.names)}")
-            )
-        if self.proof is not None:
-            erle = f"{decibels(self.proof.erle_before_db)} to {decibels(self.proof.erle_after_db)} dB"
-            facts.append(
-                (
-                    "Running filter",
-                    erle,
-                    f"of the robot taken away, on {self.proof.seconds:.1f} s that no fit has heard",
-                )
-            )
+            what = f"over the noise floor, with {joined(self.names)}"
+            facts.append(("Written", f"{decibels(self.after.excess_db)} dB", what))
+        if proof is not None:
+            erle = f"{decibels(proof.erle_before_db)} to {decibels(proof.erle_after_db)} dB"
+            what = f"of the robot taken away, on {proof.seconds:.1f} s that no fit has heard"
+            facts.append(("Running filter", erle, what))
         return facts
 
     def lines(self) -> list[str]:

@@ -144,14 +144,8 @@ class Session:
             found.append(Event("lost", sample, f"{lost} samples never came: silence stands in"))
         if self._two and self._counted["late"] > before["late"] == 0:
             later = 1000 * self._two.lateness / self.form.rate
-            found.append(
-                Event(
-                    "reference_late",
-                    sample,
-                    f"the reference comes {later:.0f} ms later than the {self.form.late_ms} ms for which the microphone"
-                    " waits: say more in late_ms",
-                )
-            )
+            said = f"the reference comes {later:.0f} ms later than the {self.form.late_ms} ms for which the microphone waits"
+            found.append(Event("reference_late", sample, f"{said}: say more in late_ms"))
         return found
 
     def _told(self, event: Event) -> str:
@@ -227,9 +221,8 @@ class Service:
         _LOGGER.warning("client %s: %s; its connection is closed", connection.remote_address, why)
         try:
             await asyncio.wait_for(connection.send(_text("error", detail=why)), PATIENCE_S)
-            await connection.close(
-                1008, why.encode()[:120].decode(errors="ignore")
-            )  # RFC 6455, 5.5: 125 bytes with the code
+            # RFC 6455, 5.5: 125 bytes with the code
+            await connection.close(1008, why.encode()[:120].decode(errors="ignore"))
         except (ConnectionClosed, TimeoutError):
             connection.transport.abort()
 

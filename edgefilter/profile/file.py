@@ -123,9 +123,8 @@ def _replace(path: Path, members: Mapping[str, Any]) -> None:
     try:
         # not tempfile: its files are the owner's alone, and the umask that others have can only be read by changing it
         with open(temporary, "xb") as file:
-            np.savez_compressed(
-                file, **members
-            )  # numbers alone: nothing is pickled (numpy before 2.1 knows no allow_pickle)
+            # numbers alone: nothing is pickled (numpy before 2.1 knows no allow_pickle)
+            np.savez_compressed(file, **members)
             file.flush()
             os.fsync(file.fileno())
         os.replace(temporary, path)
