@@ -30,10 +30,13 @@ def _sounddevice() -> Any:
 
 def _of_portaudio() -> list[Device]:
     sd = _sounddevice()
-    systems = [api["name"] for api in sd.query_hostapis()]
-    told = ("name", "max_input_channels", "max_output_channels", "default_samplerate")
-    found = enumerate(sd.query_devices())
-    return [Device(index, *(each[key] for key in told), systems[each["hostapi"]]) for index, each in found]
+    apis = [api["name"] for api in sd.query_hostapis()]
+    return [
+        Device(
+            i, d["name"], d["max_input_channels"], d["max_output_channels"], d["default_samplerate"], apis[d["hostapi"]]
+        )
+        for i, d in enumerate(sd.query_devices())
+    ]
 
 
 def _of_server(found: list[Device]) -> Iterator[Device]:

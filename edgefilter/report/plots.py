@@ -40,7 +40,7 @@ def plot_profile(profile: Profile, path: str | Path) -> None:
     first = ms < 40
     axes[0, 0].plot(ms[first], taps[first], color=INK, linewidth=0.8)
     _label(axes[0, 0], "Impulse response, first 40 ms", "ms after the direct sound", "amplitude")
-    left = to_come(taps)
+    left = to_come(profile.echo.impulse_response)
     axes[0, 1].plot(
         ms,
         decibels(taps**2 / max(float(np.max(taps**2)), 1e-30), 1e-20),
