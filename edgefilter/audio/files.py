@@ -228,3 +228,9 @@ class FileSink(Sink):
         return AudioFileError(
             f"output {self.path} cannot be written on: {error.strerror}{kept}; free some space or write elsewhere"
         )
+
+
+def write_file(path: str | Path, samples: Samples, float32: bool = False) -> None:
+    """Write samples (n,), or as 32-bit float (n, channels), to a file of their own; raises as FileSink does."""
+    with FileSink(path, float32, 1 if samples.ndim == 1 else samples.shape[1]) as sink:
+        sink.write(samples)

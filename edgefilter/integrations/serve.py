@@ -15,7 +15,7 @@ from collections.abc import Callable
 from functools import partial
 
 import numpy as np
-from websockets.asyncio.server import Server, ServerConnection, serve
+from websockets.asyncio.server import ServerConnection, serve
 from websockets.exceptions import ConnectionClosed
 from websockets.http11 import Request, Response
 
@@ -186,7 +186,7 @@ class Service:
         # a client that sends faster than max_queue messages are filtered is read no faster
         limits = partial(serve, max_size=MOST_BYTES, max_queue=16, compression=None, origins=[None])
         async with limits(self._greet, host, port, process_request=self._admit) as server:
-            ready(_port(server))
+            ready(int(next(iter(server.sockets)).getsockname()[1]))
             await self._stopping.wait()
             if ending := [*self._conversing]:
                 for each in ending:
@@ -292,7 +292,3 @@ def _microphones_of(pcm: bytes, count: int) -> Samples:
 
 def _text(kind: str, **more: object) -> str:
     return json.dumps({"kind": kind, **more}, allow_nan=False, default=float)
-
-
-def _port(server: Server) -> int:
-    return int(next(iter(server.sockets)).getsockname()[1])
