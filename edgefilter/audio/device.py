@@ -30,15 +30,10 @@ def _sounddevice() -> Any:
 
 def _of_portaudio() -> list[Device]:
     sd = _sounddevice()
-    systems = [api["name"] for api in sd.query_hostapis()]
+    apis = [api["name"] for api in sd.query_hostapis()]
     return [
         Device(
-            i,
-            d["name"],
-            d["max_input_channels"],
-            d["max_output_channels"],
-            d["default_samplerate"],
-            systems[d["hostapi"]],
+            i, d["name"], d["max_input_channels"], d["max_output_channels"], d["default_samplerate"], apis[d["hostapi"]]
         )
         for i, d in enumerate(sd.query_devices())
     ]
@@ -76,7 +71,7 @@ def find(name: str | int | Device | None, kind: str) -> Device:
 def monitor_of(output: str | int | Device | None = None) -> Device:
     """The input that gets what output plays (default: the default output); UsageError where there is none."""
     device, devices = find(output, "output"), _devices()
-    source = pulse.default_monitor() if device.name in STAND_INS else None
+    source = pulse.monitor(pulse.default_name("output")) if device.name in STAND_INS else None
     found = [each for each in devices if source and each.pulse_name == source]
     return found[0] if found else monitor(devices, device)
 

@@ -113,11 +113,9 @@ def _length_notes(reference: Reader, total: int) -> list[str]:
         )
     difference = abs(reference.total - total)
     if difference:
-        how = (
-            "shorter than the recording; silence follows it"
-            if reference.total < total
-            else "longer than the recording; its end is not used"
-        )
+        how = "longer than the recording; its end is not used"
+        if reference.total < total:
+            how = "shorter than the recording; silence follows it"
         notes.append(f"reference {reference.path} is {difference} samples ({difference / SAMPLE_RATE:.3f} s) {how}")
     return notes
 
@@ -230,3 +228,9 @@ class FileSink(Sink):
         return AudioFileError(
             f"output {self.path} cannot be written on: {error.strerror}{kept}; free some space or write elsewhere"
         )
+
+
+def write_file(path: str | Path, samples: Samples, float32: bool = False) -> None:
+    """Write samples (n,), or as 32-bit float (n, channels), to a file of their own; raises as FileSink does."""
+    with FileSink(path, float32, 1 if samples.ndim == 1 else samples.shape[1]) as sink:
+        sink.write(samples)

@@ -80,14 +80,11 @@ class LiveSource(Source):
     def stats(self) -> dict[str, int]:
         """Samples at 16 kHz that were lost, filled or moved; callbacks marked as overrun; devices lost and found again."""
         counts = {f"reference_{name}": getattr(self._pairing, name) for name in ("filled", "dropped", "inserted")}
-        both = (("microphone", self._mic), ("reference", self._reference))
-        for name, each in both:
-            counts[f"{name}_lost"], counts[f"{name}_away"] = (each.lost, each.filled) if each else (0, 0)
-        found = {"lost": sum(counts.values()), **counts}
-        for name, each in both:
-            times = (each.overruns, each.gone, each.back) if each else (0, 0, 0)
-            found |= dict(zip((f"{name}_overruns", f"{name}_gone", f"{name}_back"), times))
-        return found
+        times: dict[str, int] = {}
+        for name, each in (("microphone", self._mic), ("reference", self._reference)):
+            counts |= {f"{name}_lost": each.lost if each else 0, f"{name}_away": each.filled if each else 0}
+            times |= {f"{name}_{what}": getattr(each, what, 0) for what in ("overruns", "gone", "back")}
+        return {"lost": sum(counts.values()), **counts, **times}
 
     def __iter__(self) -> Iterator[Block]:
         given = reported = 0
@@ -155,12 +152,8 @@ def _incomplete(what: str, counts: dict[str, int]) -> list[str]:
 
 
 def _join(first: Block, second: Block) -> Block:
-    return Block(
-        np.concatenate((first.mic, second.mic)),
-        np.concatenate((first.ref, second.ref)),
-        first.start,
-        first.lost + second.lost,
-    )
+    mic, ref = (np.concatenate((getattr(first, name), getattr(second, name))) for name in ("mic", "ref"))
+    return Block(mic, ref, first.start, first.lost + second.lost)
 
 
 class LiveSink(Sink):

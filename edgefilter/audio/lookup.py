@@ -36,7 +36,7 @@ class Device:
         return self.inputs if kind == "input" else self.outputs
 
 
-def match(devices: Sequence[Device], wanted: str | int | None, kind: str, default: int = -1) -> Device:
+def match(devices: Sequence[Device], wanted: str | int | None, kind: str, default: int) -> Device:
     """The device that wanted names: a number, a name, a part of a name, or None, 'default', 'mic' for the default one.
 
     A whole name goes before a part of one, and a part that only a monitor has in it is the last that is taken. Capitals,

@@ -10,21 +10,10 @@ from scipy import signal
 
 from edgefilter.audio.device import input_port, output_port
 from edgefilter.audio.lookup import Device
-from edgefilter.audio.port import START_S, STREAM_LATENCY_S, InputPort, clock, pause
+from edgefilter.audio.port import START_S, STREAM_LATENCY_S, InputPort, OutputPort, clock, pause
 from edgefilter.audio.protocols import Source
 from edgefilter.dsp.frames import decibels
 from edgefilter.types import SAMPLE_RATE, Block, Samples
-
-
-@dataclass(frozen=True)
-class Recording:
-    """What a microphone picked up while a sound was played.
-
-    samples: (n,), or (n, channels) of several, float32 at 16 kHz. holes: what was lost on the way, in words; empty where nothing was.
-    """
-
-    samples: Samples
-    holes: str = ""
 
 
 def play_and_record(
@@ -34,8 +23,10 @@ def play_and_record(
     latency_s: float = STREAM_LATENCY_S,
     tell: Callable[[float], None] = lambda left_s: None,
     channels: Sequence[int] | None = None,
-) -> Recording:
-    """Play samples (n,) at 16 kHz and return what the microphone picks up from the moment playing starts until a second after it, (n + 16000,).
+) -> tuple[Samples, str]:
+    """Play samples (n,) at 16 kHz and return what the microphone picks up from the moment playing starts until a second after it.
+
+    That is (n + 16000,), or (n + 16000, channels) of several, and what was lost on the way, in words; none where nothing was.
 
     Both are on one sample counter up to a constant: the devices' buffers appear as additional delay, so that the sound
     never seems to arrive before it is played. Silence goes first, since sound servers swallow a stream's start.
@@ -45,10 +36,8 @@ def play_and_record(
     """
     mic = input_port(microphone, latency_s, channels)
     lead = np.zeros(round((latency_s + STREAM_LATENCY_S) * SAMPLE_RATE), np.float32)
-    played = np.concatenate((lead, samples.astype(np.float32)))
-    speaker = output_port(output, played.size, latency_s=latency_s)
-    speaker.outlet.ring.write(speaker.convert(played, last=True))
-    speaker.outlet.draining.set()  # nothing follows: silence after the last sample is no underrun
+    played = np.concatenate((lead, samples))
+    speaker = _holding(output, played, latency_s)
     begun: list[int] = []
 
     def mark() -> None:
@@ -78,7 +67,15 @@ def play_and_record(
         speaker.close()
     lost = {"samples lost": mic.inlet.lost, "overruns": mic.inlet.flags, "underruns": speaker.flags}
     holes = ", ".join(f"{count} {what}" for what, count in lost.items() if count)
-    return Recording(np.concatenate(parts)[first : first + wanted], holes)
+    return np.concatenate(parts)[first : first + wanted], holes
+
+
+def _holding(output: str | int | Device | None, samples: Samples, latency_s: float = STREAM_LATENCY_S) -> OutputPort:
+    """An output that holds all samples (n,) and plays them as soon as it is opened."""
+    port = output_port(output, samples.size, latency_s=latency_s)
+    port.outlet.ring.write(port.convert(samples.astype(np.float32), last=True))
+    port.outlet.draining.set()  # nothing follows: silence after the last sample is no underrun
+    return port
 
 
 def play_through(output: str | int | Device | None, source: Source, samples: Samples) -> tuple[Samples, Samples, int]:
@@ -86,9 +83,7 @@ def play_through(output: str | int | Device | None, source: Source, samples: Sam
 
     Returns its microphone and reference (m,), and the samples that were lost. Raises DeviceError where a device cannot be opened or stops.
     """
-    speaker = output_port(output, samples.size)
-    speaker.outlet.ring.write(speaker.convert(samples.astype(np.float32), last=True))
-    speaker.outlet.draining.set()
+    speaker = _holding(output, samples)
     wanted = samples.size + 2 * SAMPLE_RATE
     blocks: list[Block] = []
     try:

@@ -14,8 +14,11 @@ MAX_WAIT = SAMPLE_RATE // 4
 """Samples for which the microphone waits for a reference that is late, before silence stands in for it."""
 TOLERANCE = SAMPLE_RATE // 50
 """Samples by which the two counters may differ for good: one callback of 20 ms, which come in any phase."""
-WINDOW = 2 * SAMPLE_RATE
-"""Samples: a difference counts as lasting when it was never smaller for 2 s; a busy machine catches up sooner."""
+BUFFER_S = 2.0
+"""How much sound a ring holds while the filter is busy; beyond it samples are lost, and counted. A device that delivers
+nothing for as long has stopped."""
+WINDOW = round(BUFFER_S * SAMPLE_RATE)
+"""Samples: a difference counts as lasting when it was never smaller for so long; a busy machine catches up sooner."""
 
 
 class Inlet:

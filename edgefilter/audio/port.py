@@ -17,17 +17,15 @@ from typing import Any
 import numpy as np
 
 from edgefilter.audio.lookup import Device
-from edgefilter.audio.pairing import Inlet, Outlet
+from edgefilter.audio.pairing import BUFFER_S, Inlet, Outlet
 from edgefilter.audio.pulse import OPENING, leading_to
+from edgefilter.audio.reader import delivered
 from edgefilter.dsp.resample import Resampler
 from edgefilter.errors import DeviceError, UsageError
 from edgefilter.types import SAMPLE_RATE, Samples, which_channels
 
 POLL_S = 0.004
 """Between two looks at a device: a quarter of a hop."""
-BUFFER_S = 2.0
-"""How much sound a ring holds while the filter is busy; beyond it samples are lost, and counted. A device that delivers
-nothing for as long has stopped."""
 START_S = 6.0
 """How long a device may take to its first samples: a virtual one can hold back its first 2 s."""
 STREAM_LATENCY_S = 0.05
@@ -198,14 +196,9 @@ class InputPort(Port):
 
     def open(self) -> None:
         inlet, wanted = self.inlet, self.wanted
-        taken = None if wanted is None else wanted[0] if len(wanted) == 1 else wanted
 
         def callback(indata: np.ndarray, _frames: int, _time: Any, status: Any) -> None:
-            if taken is not None:
-                samples = indata[:, taken]
-            else:
-                samples = indata[:, 0] if indata.shape[1] == 1 else indata.mean(axis=1)
-            inlet.receive(samples, bool(status.input_overflow))
+            inlet.receive(delivered(indata, wanted), bool(status.input_overflow))
 
         self.start(callback)
 

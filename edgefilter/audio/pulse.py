@@ -34,9 +34,9 @@ def default_name(kind: str) -> str:
     return _asked("get-default-source" if kind == "input" else "get-default-sink").strip()
 
 
-def default_monitor() -> str | None:
-    """Name of the monitor of the default output, None where there is no server or no such monitor."""
-    name = default_name("output") + ".monitor"
+def monitor(output: str) -> str | None:
+    """Name of the monitor of an output of the server, None where there is no server or no such monitor."""
+    name = f"{output}.monitor"
     return name if name in names("input") else None
 
 

@@ -27,8 +27,8 @@ def to_pcm16(samples: Samples) -> tuple[NDArray[np.int16], int]:
     Exact for values that came from 16-bit PCM (k / 32768). Raises SignalError for NaN and infinity.
     """
     scaled = np.rint(as_samples(samples, "output") * np.float32(FULL_SCALE))
-    clipped = int(np.count_nonzero((scaled > 32767.0) | (scaled < -32768.0)))
-    return np.clip(scaled, -32768.0, 32767.0).astype(np.int16), clipped
+    fitting = np.clip(scaled, -FULL_SCALE, FULL_SCALE - 1.0)
+    return fitting.astype(np.int16), int(np.count_nonzero(fitting != scaled))
 
 
 def clip_note(clipped: int, written: int) -> str:

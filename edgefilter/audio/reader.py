@@ -21,6 +21,13 @@ _ENDLESS = 0x7FFFF000
 """Writers to a pipe put sizes from here up into a WAV's header because they cannot know better."""
 
 
+def delivered(data: Array, wanted: Sequence[int] | None) -> Samples:
+    """Of data (n, channels) the wanted channels (n, wanted), (n,) where it is one, or the mean of all (n,) where it is None."""
+    if wanted is None:
+        return data[:, 0] if data.shape[1] == 1 else data.mean(axis=1, dtype=np.float32)
+    return data[:, wanted[0]] if len(wanted) == 1 else data[:, wanted]
+
+
 class Reader:
     """A WAV, FLAC or Ogg file of any rate and channel count, delivered at 16 kHz with its channels averaged.
 
@@ -57,7 +64,7 @@ class Reader:
         given = 0
         with self._open() as file:
             for data in self._blocks(file):
-                taken = self._taken(data)
+                taken = delivered(data, self.wanted)
                 if self.rate != SAMPLE_RATE:
                     taken = resampler.resample_chunk(np.ascontiguousarray(taken))
                 given += len(taken)
@@ -65,12 +72,6 @@ class Reader:
         if self.rate != SAMPLE_RATE:
             rest = np.zeros((0, count) if several else 0, np.float32)
             yield resampler.resample_chunk(rest, last=True)[: self.total - given]
-
-    def _taken(self, data: Array) -> Samples:
-        """What is delivered of data (n, channels)."""
-        if self.wanted is None:
-            return data[:, 0] if self.channels == 1 else data.mean(axis=1, dtype=np.float32)
-        return data[:, self.wanted[0]] if len(self.wanted) == 1 else data[:, self.wanted]
 
     def _error(self, what: str) -> AudioFileError:
         return AudioFileError(f"{self.role} {self.path} {what}")
@@ -166,7 +167,7 @@ class Reader:
             if np.abs(data).max() > LOUDEST:
                 loudest = data.flat[np.abs(data).argmax()]
                 raise self._error(f"holds {loudest:g}, expected samples of a full scale of 1: its scaling is wrong")
-            self.silent = self.silent and not self._taken(data).any()
+            self.silent = self.silent and not delivered(data, self.wanted).any()
             length += len(data)
         if length == 0:
             raise self._error("is empty (a header and 0 samples), expected sound: record it again")

@@ -22,7 +22,7 @@ class Recorder:
     `failure`. Raises AudioFileError where the folder or a file cannot be made.
     """
 
-    def __init__(self, folder: str | Path, microphones: int = 1) -> None:
+    def __init__(self, folder: str | Path, microphones: int) -> None:
         self.folder = Path(folder)
         self.failure: AudioFileError | None = None
         make_folder(self.folder, "the recording")

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from edgefilter.audio.lookup import Device
-from edgefilter.audio.pairing import Inlet
-from edgefilter.audio.port import BUFFER_S, Port
+from edgefilter.audio.pairing import BUFFER_S, Inlet
+from edgefilter.audio.port import Port
 from edgefilter.dsp.resample import Resampler
 from edgefilter.dsp.ring import Ring
 from edgefilter.types import SAMPLE_RATE, Samples

@@ -7,8 +7,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from edgefilter.audio.pairing import TOLERANCE, WINDOW
-from edgefilter.audio.port import BUFFER_S, START_S, InputPort, clock
+from edgefilter.audio.pairing import BUFFER_S, TOLERANCE, WINDOW
+from edgefilter.audio.port import START_S, InputPort, clock
 from edgefilter.audio.protocols import Sink
 from edgefilter.audio.speech import SpokenReference
 from edgefilter.errors import DeviceError
@@ -56,7 +56,7 @@ class SteadyInput:
     often the device was lost and found again.
     """
 
-    def __init__(self, make: Callable[[], InputPort | SpokenReference], patience_s: float = 0.0) -> None:
+    def __init__(self, make: Callable[[], InputPort | SpokenReference], patience_s: float) -> None:
         self._make, self._patience_s = make, patience_s
         self.port = make()
         self.filled = self.gone = self.back = 0

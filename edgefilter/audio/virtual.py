@@ -70,12 +70,6 @@ def unload() -> list[str]:
     return removed
 
 
-def speaker_monitor() -> str | None:
-    """The monitor of the virtual speaker, None where there is none."""
-    name = f"{SPEAKER}.monitor"
-    return name if name in pulse.names("input") else None
-
-
 def refuse_own(microphone: str) -> None:
     """Raise UsageError where the microphone is the filter's own output: it would hear itself, or nothing."""
     meant = pulse.default_name("input") if microphone in ("mic", "default", *STAND_INS) else microphone

@@ -9,7 +9,6 @@ from edgefilter.calibration.sweep import Deconvolution, find_direct
 from edgefilter.dsp.exchange import EQUAL
 from edgefilter.dsp.frames import frames
 from edgefilter.dsp.psd import GRID_FFT, hann
-from edgefilter.errors import CalibrationError
 from edgefilter.types import SAMPLE_RATE, Samples
 
 APART_DB = 10.0
@@ -31,15 +30,6 @@ def cross_density(noises: Samples) -> Samples:
     found = np.einsum("itk,jtk->kij", spectra, spectra.conj()) / (spectra.shape[1] * SAMPLE_RATE * np.sum(window**2))
     found[1:-1] *= 2.0
     return np.stack((found.real, found.imag), axis=-1).astype(np.float32)
-
-
-def refuse_silent(recordings: Samples) -> None:
-    """Raise CalibrationError for microphones (microphones, n) that are silent."""
-    for at, one in enumerate(recordings):
-        if not one.any():
-            raise CalibrationError(
-                f"channel {at} of the sweep recording is silent, every sample 0: choose the microphones with --mic-channels"
-            )
 
 
 def doubts(noises: Samples, results: list[Deconvolution], direct: int) -> list[str]:

@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 from scipy import signal
 
-from edgefilter.calibration.array import cross_density, doubts, first, refuse_silent
+from edgefilter.calibration.array import cross_density, doubts, first
 from edgefilter.calibration.checks import check_found, check_lengths, collect_warnings
 from edgefilter.calibration.sweep import (
+    MIN_TAPS,
     Deconvolution,
     deconvolve,
     find_direct,
@@ -23,8 +24,8 @@ from edgefilter.profile.array import ArrayCalibration
 from edgefilter.profile.data import DISTORTION_ORDERS, GRID_FFT, GRID_HZ, Profile
 from edgefilter.types import PRE_ROLL, SAMPLE_RATE, Array, Samples, as_microphones, as_samples
 
-MIN_TAPS, MAX_TAPS = 6400, SAMPLE_RATE
-"""400 ms and 1 s: what is kept of the impulse response at least and at most."""
+MAX_TAPS = SAMPLE_RATE
+"""Samples, 1 s: what is kept of the impulse response at most."""
 
 
 def calibrate(
@@ -90,7 +91,10 @@ def calibrate(
     warnings = collect_warnings(law, reference, recording, noise, result, path, direct, bands, snr)
     array = None
     if recordings.ndim > 1:
-        refuse_silent(recordings)
+        for at in np.flatnonzero(~recordings.any(axis=1)):
+            raise CalibrationError(
+                f"channel {at} of the sweep recording is silent, every sample 0: choose the microphones with --mic-channels"
+            )
         results = [
             deconvolve(reference, *of, GRID_HZ, MIN_TAPS) for of in zip(recordings[1:], map(fan_psd, noises[1:]))
         ]

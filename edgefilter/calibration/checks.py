@@ -6,18 +6,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import signal
 
-from edgefilter.calibration.sweep import EARLIEST_DIRECT, LATEST_DIRECT, Deconvolution, SweepLaw, deconvolve
+from edgefilter.calibration.sweep import EARLIEST_DIRECT, LATEST_DIRECT, MIN_TAPS, Deconvolution, SweepLaw, deconvolve
 from edgefilter.dsp.fourier import power
 from edgefilter.dsp.frames import block_power, blocks
+from edgefilter.dsp.lag import LOWEST_HZ
 from edgefilter.dsp.psd import frequencies, hann
 from edgefilter.errors import CalibrationError
+from edgefilter.profile.data import LOW_SNR_DB
 from edgefilter.types import PRE_ROLL, SAMPLE_RATE, Array, Samples
-
-LOW_SNR_DB = 10.0
-"""Below it a band's path is wrong by more than 3 dB at times."""
-SPEECH_HZ = (110.0, 7200.0)
-"""Bands that a warning is about; a small loudspeaker radiates nothing below them, and that is no fault of the
-calibration."""
 
 
 def check_lengths(law: SweepLaw, recording: Samples, noise: Samples) -> None:
@@ -70,7 +66,7 @@ def collect_warnings(
         quiet(recording),
         disturbed(law, reference, recording, noise, result, direct),
         early_arrivals(result, path, direct),
-        *doubtful_noise(reference, noise, result, direct),
+        *doubtful_noise(reference, noise),
     ]
     return [text for text in found if text]
 
@@ -78,7 +74,7 @@ def collect_warnings(
 def clipping(law: SweepLaw, recording: Samples, direct: int) -> str | None:
     """Samples at full scale, or flat tops below it, and the frequencies that the sweep had there."""
     clipped = clipped_samples(recording)
-    if clipped.size < 8:
+    if not clipped.size:
         return None
     level = float(np.max(np.abs(recording)))
     hz = law.frequency(clipped - direct)
@@ -90,7 +86,7 @@ def clipping(law: SweepLaw, recording: Samples, direct: int) -> str | None:
 
 
 def clipped_samples(recording: Samples) -> NDArray[np.intp]:
-    """Indices of samples (n,) at full scale or on a flat top below it."""
+    """Indices of samples (n,) at full scale or on a flat top below it; none where they are fewer than 8."""
     size = np.abs(recording)
     level = float(size.max())
     top = size >= 0.999 if level >= 0.999 else size > 0.995 * level
@@ -99,7 +95,8 @@ def clipped_samples(recording: Samples) -> NDArray[np.intp]:
     run = still[:-2] & still[1:-1] & still[2:] & top[:-3]
     for k in range(4):
         flat[k : size.size - 3 + k] |= run
-    return np.flatnonzero(flat | (size >= 0.9999))
+    found = np.flatnonzero(flat | (size >= 0.9999))
+    return found if found.size >= 8 else found[:0]
 
 
 def short_recording(law: SweepLaw, recording: Samples, direct: int) -> str | None:
@@ -115,10 +112,9 @@ def short_recording(law: SweepLaw, recording: Samples, direct: int) -> str | Non
 
 
 def low_snr(bands: Array, snr: Array) -> str | None:
-    """Bands of speech in which the fan hides the sweep."""
-    inside = (bands[:, 1] > SPEECH_HZ[0]) & (bands[:, 0] < SPEECH_HZ[1] - 100)
+    """Bands in which the fan hides the sweep; a small loudspeaker radiates no rumble, and that is no fault of the calibration."""
     runs: list[list[int]] = []
-    for i in np.flatnonzero(inside & (snr < LOW_SNR_DB)):
+    for i in np.flatnonzero((bands[:, 1] > LOWEST_HZ) & (snr < LOW_SNR_DB)):
         if runs and runs[-1][-1] == i - 1:
             runs[-1].append(int(i))
         else:
@@ -150,7 +146,7 @@ def disturbed(
     """
     early = int(law.lead(5.5))
     shift = direct - early
-    predicted = signal.oaconvolve(reference.astype(np.float64), result.cut(shift, early + 6400))
+    predicted = signal.oaconvolve(reference.astype(np.float64), result.cut(shift, early + MIN_TAPS))
     first, last = max(shift, 0), min(shift + predicted.size, recording.size)
     own = np.zeros(recording.size)
     own[first:last] = predicted[first - shift : last - shift]
@@ -181,7 +177,7 @@ def early_arrivals(result: Deconvolution, path: Samples, direct: int) -> str | N
     )
 
 
-def doubtful_noise(reference: Samples, noise: Samples, result: Deconvolution, direct: int) -> list[str]:
+def doubtful_noise(reference: Samples, noise: Samples) -> list[str]:
     """A noise recording that is short, silent, unsteady, or contains the robot."""
     texts = []
     if noise.size < 2 * SAMPLE_RATE:
@@ -194,7 +190,7 @@ def doubtful_noise(reference: Samples, noise: Samples, result: Deconvolution, di
             *texts,
             "the noise recording is silent, every sample 0: signal-to-noise ratios mean nothing, in all bands",
         ]
-    again = deconvolve(reference, noise, np.full(2, 1e-10), np.array([0.0, SAMPLE_RATE / 2]), 6400)
+    again = deconvolve(reference, noise, np.full(2, 1e-10), np.array([0.0, SAMPLE_RATE / 2]), MIN_TAPS)
     nearby = np.abs(again.cut(EARLIEST_DIRECT, LATEST_DIRECT - EARLIEST_DIRECT))
     if nearby.max() > 18.0 * np.sqrt(np.mean(nearby**2)):
         return [

@@ -8,8 +8,10 @@ import numpy as np
 import soxr
 from scipy import fft
 
+from edgefilter.calibration.multisine import BAND_HZ
+from edgefilter.calibration.sweep import STRETCHED_PPM
 from edgefilter.dsp.fourier import power
-from edgefilter.dsp.frames import decibels
+from edgefilter.dsp.frames import block_power, decibels
 from edgefilter.dsp.lag import flat_cross
 from edgefilter.types import SAMPLE_RATE, Samples
 
@@ -17,7 +19,8 @@ LEVEL_DB = -18.0
 """Peak of the louder chirps, dB of full scale: as loud as speech of the robot's, which peaks some dB above."""
 SOFTER_DB = 10.0
 """By how much every other pair is softer: what changes the level by itself makes less, or more, of it."""
-LOWEST_HZ, HIGHEST_HZ = 150.0, 7000.0
+LOWEST_HZ = 150.0
+_, HIGHEST_HZ = BAND_HZ
 SLOT, CHIRP, FADE = round(0.6 * SAMPLE_RATE), round(0.3 * SAMPLE_RATE), round(0.01 * SAMPLE_RATE)
 """Samples from one chirp to the next, of a chirp, and of its rise and fall: the rest of a slot is for the room's echo."""
 ORDER = "UDudDUdu"
@@ -27,9 +30,6 @@ LEAD = round(0.5 * SAMPLE_RATE)
 """Samples of silence before the first chirp, in which the room's noise is measured."""
 QUIET = round(0.1 * SAMPLE_RATE)
 """Samples of it, the quietest of which count: a stream may begin with a noise of its own."""
-STRETCHED_PPM = 5.0
-"""Difference of two clocks from which on a chirp is stretched enough, by a fortieth of a sample, to cost 30 dB of 7 kHz:
-the microphone is straightened then."""
 CERTAIN = 12.0
 """Height of a correlation with the chirps over its root mean square from which they are there: noise has 5."""
 
@@ -97,27 +97,20 @@ def _judge(mic: Samples, ref: Samples) -> Heard:
     starts = [at_ref + LEAD + number * SLOT for number in range(len(ORDER))]
     lag = at_mic - at_ref
     size = fft.next_fast_len(2 * SLOT, real=True)
-    margin = FADE
-    references = np.stack([_spectrum(ref, start - margin, size) for start in starts])
-    heard = np.stack([_spectrum(mic, start + lag - margin, size) for start in starts])
+    references = np.stack([_spectrum(ref, start - FADE, size) for start in starts])
+    heard = np.stack([_spectrum(mic, start + lag - FADE, size) for start in starts])
     offsets, ppm = _drift(heard, references, starts, size)
     omega = 2 * np.pi * np.arange(heard.shape[1]) / size
     heard = heard * np.exp(1j * omega * offsets[:, None])
-    before = mic[max(at_mic, 0) : max(at_mic, 0) + (LEAD - FADE) // QUIET * QUIET].reshape(-1, QUIET)
-    noise = np.min(np.mean(np.square(before, dtype=np.float64), axis=1))
+    noise = block_power(mic[max(at_mic, 0) :][: LEAD - FADE], QUIET).min()
     band = slice(round(LOWEST_HZ * size / SAMPLE_RATE), round(HIGHEST_HZ * size / SAMPLE_RATE))
     loud = np.array([kind.isupper() for kind in ORDER])
-    energy = np.sum(power(heard[:, band]), axis=1) - noise * SLOT * size / 2 * (HIGHEST_HZ - LOWEST_HZ) / (
-        SAMPLE_RATE / 2
-    )
+    in_noise = noise * SLOT * size / 2 * (HIGHEST_HZ - LOWEST_HZ) / (SAMPLE_RATE / 2)
+    energy = np.sum(power(heard[:, band]), axis=1) - in_noise
     given = np.sum(power(references[:, band]), axis=1)
     gain_db = [float(decibels(max(float(np.sum(energy[of]) / np.sum(given[of])), 1e-12))) for of in (loud, ~loud)]
-    over = np.mean(
-        [
-            np.mean(np.square(mic[start + lag : start + lag + CHIRP], dtype=np.float64))
-            for start in np.array(starts)[loud]
-        ]
-    )
+    begins = np.array(starts)[loud] + lag
+    over = np.mean([np.mean(np.square(mic[at : at + CHIRP], dtype=np.float64)) for at in begins])
     left_db, same = _left(heard, references, band, size)
     return Heard(
         in_ref, in_mic, peak_db, lag / SAMPLE_RATE, float(decibels(float(over / max(noise, 1e-12)))), ppm, left_db,

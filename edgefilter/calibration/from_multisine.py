@@ -16,6 +16,7 @@ from edgefilter.calibration.sweep import (
     DRIFT_REACH,
     LATEST_DIRECT,
     LOW_HZ,
+    STRETCHED_PPM,
     deconvolve,
     find_direct,
     smoothed,
@@ -34,8 +35,6 @@ from edgefilter.types import PRE_ROLL, SAMPLE_RATE, Array, Samples
 LINE_HZ = SAMPLE_RATE / PERIOD
 SMOOTHING_HZ = 30.0
 """Half the width over which lines are averaged at least: 30 lines, so that a density is good to 1 dB."""
-DOUBTFUL_PPM = 5.0
-"""Clocks that are further apart smear a sweep's path: by half a sample from its beginning to its end."""
 CERTAIN = 3.0
 """Standard deviations of the noise's own power from which on a distortion is told from it."""
 LEAST_SHARE = 0.1
@@ -220,7 +219,7 @@ def _doubts(profile: Profile, found: LinearApproximation, part: Samples, ppm: fl
     """What makes the approximation, or the sweep beside it, less than trustworthy."""
     texts = []
     clipped = clipped_samples(part)
-    if clipped.size >= 8:
+    if clipped.size:
         texts.append(
             f"clipped: {clipped.size} samples while the multisines sound, which looks like distortion of the loudspeaker,"
             " in all bands; lower the playback volume or the microphone gain and calibrate again"
@@ -232,7 +231,7 @@ def _doubts(profile: Profile, found: LinearApproximation, part: Samples, ppm: fl
             f"something else than the multisines sounds beside them, {np.max(louder):.0f} dB above the fan, in all bands;"
             " calibrate again in silence"
         )
-    if abs(ppm) > DOUBTFUL_PPM:
+    if abs(ppm) > STRETCHED_PPM:
         texts.append(
             f"the clocks of player and recorder are {abs(ppm):.0f} ppm apart: taken out of the multisines, but the sweep's"
             " path is smeared, in all bands; play and record with one device"

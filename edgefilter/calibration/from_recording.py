@@ -88,8 +88,7 @@ def self_calibrate(recording: Samples, reference: Samples) -> Profile:
     target = whiten(y, psd)
     fit = fitted_blocks(y.size).astype(np.float32)
     sound = whiten(_drifting(delayed(x, lag - REACH), ppm), psd)
-    even = fit / np.maximum(uniform_filter1d(target**2, MOMENT, mode="nearest"), 1.0)
-    rough = fit_filter(sound, target, even, 2 * REACH, 0, np.full(2 * REACH, 1e-2))
+    rough = fit_filter(sound, target, fit * disturbance(target), 2 * REACH, 0, np.full(2 * REACH, 1e-2))
     delay = lag - REACH + int(np.argmax(np.abs(rough)))
     weights = fit * disturbance(target - convolve_from(sound, rough, 0))
     sound = whiten(_drifting(delayed(x, delay - PRE_ROLL), ppm), psd)
@@ -125,10 +124,8 @@ def find_lag(recording: Samples, reference: Samples) -> int:
     no lag stands out: the highest of independent values at all lags is 4 to 5 times their root mean square.
     """
     n = fft.next_fast_len(2 * recording.size, real=True)
-    near = np.abs(
-        correlation_near(flat_cross(reference, recording, n), n, min(int(MAX_OFFSET * SAMPLE_RATE), recording.size - 1))
-    )
-    lag, height = highest(near)
+    reach = min(int(MAX_OFFSET * SAMPLE_RATE), recording.size - 1)
+    lag, height = highest(np.abs(correlation_near(flat_cross(reference, recording, n), n, reach)))
     if not height > STANDS_OUT:
         level = decibels(np.mean(np.square(reference, dtype=np.float64)))
         raise SignalError(
@@ -154,33 +151,25 @@ def find_drift(recording: Samples, reference: Samples) -> tuple[float, int]:
     size, part = 4 * SAMPLE_RATE, slice(2 * SAMPLE_RATE, 3 * SAMPLE_RATE)
     padded = np.pad(reference, (2 * SAMPLE_RATE, 2 * SAMPLE_RATE))
     starts = np.arange(0, recording.size - SAMPLE_RATE + 1, SAMPLE_RATE // 2)
-    near = np.arange(-DRIFT_REACH * UPSAMPLED, DRIFT_REACH * UPSAMPLED + 1)
-    rows = np.zeros((starts.size, near.size))
+    reach = DRIFT_REACH * UPSAMPLED
+    rows = np.zeros((starts.size, 2 * reach + 1))
     for row, start in zip(rows, starts, strict=True):
         heard = np.zeros(size)
         heard[part] = recording[start : start + SAMPLE_RATE]
         cross = flat_cross(padded[start : start + size], heard, size)
-        row[:] = np.take(
-            fft.irfft(np.pad(cross, (0, (UPSAMPLED - 1) * size // 2)), UPSAMPLED * size), near, mode="wrap"
-        )
+        row[:] = correlation_near(cross, UPSAMPLED * size, reach)
     grid = np.arange(-MAX_PPM, MAX_PPM + PPM_STEP, PPM_STEP)
     middles = starts + SAMPLE_RATE / 2
-    sums = []
-    for ppm in grid:
+    sums = np.empty((grid.size, rows.shape[1]))
+    for line, ppm in zip(sums, grid, strict=True):
         moves = np.round(-ppm * 1e-6 * middles * UPSAMPLED).astype(int)
-        sums.append(
-            np.abs(
-                sum(
-                    np.take(row, np.arange(near.size) + move, mode="wrap")
-                    for row, move in zip(rows, moves, strict=True)
-                )
-            )
-        )
-    heights = np.array([line.max() for line in sums])
+        at = (np.arange(rows.shape[1]) + moves[:, None]) % rows.shape[1]
+        line[:] = np.abs(np.take_along_axis(rows, at, axis=1).sum(axis=0))
+    heights = sums.max(axis=1)
     best = int(np.argmax(heights))
     if heights[best] < DRIFT_GAIN * heights[grid.size // 2]:
         best = grid.size // 2
-    return float(grid[best]), round((int(np.argmax(sums[best])) - DRIFT_REACH * UPSAMPLED) / UPSAMPLED)
+    return float(grid[best]), round((int(np.argmax(sums[best])) - reach) / UPSAMPLED)
 
 
 def silences(reference: Samples) -> NDArray[np.bool_]:

@@ -19,8 +19,13 @@ LOW_HZ, HIGH_HZ = 40.0, 7990.0
 """Of the generated sweep: from below what a robot's loudspeaker plays to the end of the band."""
 EARLIEST_DIRECT, LATEST_DIRECT = -2000, int(1.6 * SAMPLE_RATE)
 """Samples by which the direct sound may come after it was played, on the recording's counter."""
+MIN_TAPS = 6400
+"""Samples, 400 ms: what is kept of the impulse response at least."""
 DRIFT_REACH = 400
 """Samples by which clocks that are apart may move a lag within a recording: 400 ppm in a minute."""
+STRETCHED_PPM = 5.0
+"""Difference of two clocks from which on a sweep's path is smeared, by half a sample from its beginning to its end, and a
+chirp of 0.3 s is stretched by a fortieth of a sample, which costs 30 dB of 7 kHz."""
 
 
 def generate_sweep(seconds: float = 6.0, amplitude: float = 0.35, lead_s: float = 0.5, tail_s: float = 1.0) -> Samples:

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from edgefilter.audio.files import FileSink
+from edgefilter.audio.files import write_file
 from edgefilter.calibration.calibrate import calibrate
 from edgefilter.calibration.from_multisine import calibrate_multisine
 from edgefilter.calibration.multisine import SWEEP_PART, generate_multisine
@@ -72,8 +72,7 @@ def _write_sound(args: argparse.Namespace, given: list[str]) -> int:
     for name in (*given, *(word for word in ("live", "json") if getattr(args, word))):
         raise UsageError(f"--excitation only writes the sound to be played: leave --{name.replace('_', '-')} out")
     sound = _sound(args)
-    with FileSink(args.excitation) as sink:
-        sink.write(sound)
+    write_file(args.excitation, sound)
     print(f"{sound.size / SAMPLE_RATE:.0f} s of sound to be played written to {args.excitation}")
     return 0
 
@@ -96,11 +95,12 @@ def _record(args: argparse.Namespace, folder: Path) -> tuple[Samples, Samples, S
     sound = _sound(args)
     name = "a sweep and multisines" if args.multisine else "a sweep"
     silence = np.zeros(NOISE_S * SAMPLE_RATE, np.float32)
-    _keep(folder, "sweep_reference", sound)
+    write_file(folder / "sweep_reference.wav", sound, float32=True)
     told = f"now quiet: {NOISE_S} s of the robot's noise alone"
-    noise = take(args, silence, told, lambda heard: _keep(folder, "noise_recording", heard))
+    noise = take(args, silence, told, lambda heard: write_file(folder / "noise_recording.wav", heard, float32=True))
     told = f"now playing: {round(sound.size / SAMPLE_RATE)} s of {name}"
-    return sound, take(args, sound, told, lambda heard: _keep(folder, "sweep_recording", heard)), noise
+    swept = take(args, sound, told, lambda heard: write_file(folder / "sweep_recording.wav", heard, float32=True))
+    return sound, swept, noise
 
 
 def take(
@@ -111,23 +111,15 @@ def take(
 
     for latency_s in BUFFERS_S:
         channels = getattr(args, "mic_channels", None)
-        found = play_and_record(
-            args.speaker, args.input, sound, latency_s=latency_s, tell=countdown(what), channels=channels
-        )
-        keep(found.samples)
-        if not found.holes:
-            return found.samples
-        say(f"the recording has holes ({found.holes})")
+        found, holes = play_and_record(args.speaker, args.input, sound, latency_s, countdown(what), channels)
+        keep(found)
+        if not holes:
+            return found
+        say(f"the recording has holes ({holes})")
     raise DeviceError(
-        f"the recording has holes ({found.holes}), also with buffers of {latency_s:g} s: close other programs and measure"
+        f"the recording has holes ({holes}), also with buffers of {latency_s:g} s: close other programs and measure"
         " again"
     )
-
-
-def _keep(folder: Path, name: str, samples: Samples) -> None:
-    channels = 1 if samples.ndim == 1 else samples.shape[1]
-    with FileSink(folder / f"{name}.wav", float32=True, channels=channels) as sink:
-        sink.write(samples)
 
 
 @contextmanager

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import soundfile
 
-from edgefilter.audio.files import FileSink, FileSource
+from edgefilter.audio.files import FileSink, FileSource, write_file
 from edgefilter.commands.display import describe_latency, print_result, progress, report_part, say
 from edgefilter.commands.fitting import Fitted, fit
 from edgefilter.diagnosis.compare import compare
@@ -61,7 +61,7 @@ def _filter(args: argparse.Namespace) -> None:
         figures = report.to_dict() | scores(sounds["filtered"], args.engine)
         step("drawing")
         for name in ("microphone", "human"):
-            _write(folder / f"{name}.wav", sounds[name])
+            write_file(folder / f"{name}.wav", sounds[name])
         drawn = _draw(folder, sounds)
     files = [filtered, folder / "microphone.wav", folder / "human.wav", *drawn]
     cold = figures["si_sdr_after_uncalibrated_db"]
@@ -126,7 +126,7 @@ def _mend(name: str, folder: Path, args: argparse.Namespace) -> dict[str, Any]:
     case.profile.save(folder / "robot.npz")
     given = {"mic": case.mic, "tts": case.reference, "talk": case.talk, "talk_tts": case.talk_reference}
     for file, samples in given.items():
-        _write(folder / f"{file}.wav", samples)
+        write_file(folder / f"{file}.wav", samples)
     files = f"--profile {folder}/robot.npz --recording {folder}/mic.wav --reference {folder}/tts.wav"
     made = f"--apply {folder}/better.npz --report {folder}/report.html"
     print_result(args, [f"robot {name}: something about it has changed since its calibration (simulated)"])
@@ -152,7 +152,7 @@ def _mend(name: str, folder: Path, args: argparse.Namespace) -> dict[str, Any]:
         for kept, profile, which in (("before", case.profile, "old"), ("after", applied.profile, "mended")):
             step(f"filtering with the {which} profile")
             filtered[kept] = enhance(case.talk, case.talk_reference, profile, args.engine)
-            _write(folder / f"human_{kept}.wav", filtered[kept])
+            write_file(folder / f"human_{kept}.wav", filtered[kept])
         step("drawing the page and the picture")
         drawn = _draw_mended(folder, case, applied, filtered)
     sdr = {"microphone": case.talk, **filtered}
@@ -230,8 +230,3 @@ def _si_sdr(samples: Samples, human: Samples) -> float:
 
 def _read(path: Path) -> Samples:
     return soundfile.read(path, dtype="float32")[0]
-
-
-def _write(path: Path, samples: Samples) -> None:
-    with FileSink(path) as sink:
-        sink.write(samples)

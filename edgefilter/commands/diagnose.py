@@ -8,12 +8,14 @@ from dataclasses import replace
 from pathlib import Path
 
 from edgefilter.commands.display import print_result, progress, report_part
-from edgefilter.commands.fitting import Fitted, Refused, fit, long_paths
+from edgefilter.commands.fitting import Fitted, Refused, fit
 from edgefilter.commands.recordings import load, load_array
 from edgefilter.diagnosis.criteria import Criteria
 from edgefilter.diagnosis.diagnose import Diagnosis, diagnose
 from edgefilter.diagnosis.proven import diagnose_proven
 from edgefilter.diagnosis.result import in_order
+from edgefilter.echo.effects.catalogue import find
+from edgefilter.echo.effects.catalogue import names as known_effects
 from edgefilter.errors import EdgefilterError, SignalError, UsageError
 from edgefilter.profile.array import ArrayCalibration
 from edgefilter.profile.data import Profile
@@ -90,7 +92,8 @@ def _apply(
     names = [finding.effect for finding in in_order(found.ranking)]
     start = None if args.profile is None else profile
     if start is None:
-        names += long_paths()
+        # a path of a quarter of a second was made from the recording
+        names += [name for name in known_effects() if find(name).lengthens]
     if not names:
         return None, None
     try:

@@ -115,12 +115,8 @@ def _model() -> Iterator[Check]:
     if model.shipped:
         yield Check("model", "ok", f"{found}, as shipped")
     else:
-        yield Check(
-            "model",
-            "warning",
-            f"{found}, not the one of this package",
-            "unset EDGEFILTER_CRNN unless you set it on purpose",
-        )
+        do = "unset EDGEFILTER_CRNN unless you set it on purpose"
+        yield Check("model", "warning", f"{found}, not the one of this package", do)
 
 
 def _engine() -> Iterator[Check]:
@@ -159,7 +155,7 @@ def _open(
         virtual.refuse_own(str(name))
     from edgefilter.audio.device import input_port, monitor_of
 
-    device = name if name is not None else virtual.speaker_monitor() or monitor_of("default")
+    device = name if name is not None else pulse.monitor(virtual.SPEAKER) or monitor_of("default")
     port = input_port(device, channels=channels)
     ports[role] = port
     yield Check(role, "ok", ", ".join([f"{port.device}, {port.rate} Hz", *port.notes]))
@@ -208,12 +204,10 @@ def _set_up(
     from edgefilter.audio.measure import play_through
 
     if ports["microphone"].device == ports["reference"].device:
-        name = ports["microphone"].device
-        yield Check(
-            "set-up", "failed", f"microphone and reference are both '{name}'", "name the real microphone with --input"
-        )
+        found = f"microphone and reference are both '{ports['microphone'].device}'"
+        yield Check("set-up", "failed", found, "name the real microphone with --input")
         return
-    output = virtual.SPEAKER if speaker == "default" and virtual.speaker_monitor() else speaker
+    output = virtual.SPEAKER if speaker == "default" and pulse.monitor(virtual.SPEAKER) else speaker
     sound = chirps()
     say(
         f"chirps for {sound.size / SAMPLE_RATE:.0f} s on output '{output}', peak {LEVEL_DB:.0f} dB of full scale"
@@ -255,70 +249,54 @@ def array_set_up(numbers: Sequence[int], mics: Samples, ref: Samples, profile: P
 
 def judge_set_up(heard: Heard, output: str, reference: str) -> Iterator[Check]:
     """What the chirps have shown: whether the reference is right, then what the microphone makes of the robot."""
-    if not heard.in_reference:
-        found = f"reference '{reference}' is silent while something is played on output '{output}'"
-        yield Check(
-            "set-up", "failed", found, f"take the monitor of '{output}' (--reference), or play elsewhere (--speaker)"
-        )
-        return
-    if not heard.in_microphone:
-        found = f"the reference has the chirps, the microphone does not hear them (its peak: {heard.peak_db:.0f} dB)"
-        yield Check("set-up", "warning", found, "unmute loudspeaker and microphone, turn them up, or name others")
+    if wrong := _wrong(heard, output, reference):
+        yield Check("set-up", *wrong)
         return
     assert heard.lag_s is not None and heard.above_noise_db is not None and heard.ppm is not None
     assert heard.linear_db is not None and heard.softer_db is not None
-    if heard.same:
-        found = "the microphone is a copy of the reference, not a microphone"
-        yield Check("set-up", "failed", found, "name the real one with --input ('edgefilter devices')")
-        return
-    late_ms = -1000 * heard.lag_s
-    if late_ms > 1.0:
-        found = f"the reference comes {late_ms:.0f} ms after the microphone has heard it"
-        yield Check("set-up", "failed", found, "take a reference with less buffering, such as the output's own monitor")
-        return
-    if heard.lag_s > MOST_LAG_S:
-        found = (
-            f"the microphone hears the robot after {heard.lag_s:.2f} s, more than the {MOST_LAG_S} s that are searched"
-        )
-        yield Check("set-up", "failed", found, "use a loudspeaker or a microphone with less delay")
-        return
-    good = heard.linear_db >= LINEAR_DB or heard.linear_db > heard.above_noise_db - 6.0
     found = (
         f"the microphone hears the robot after {1000 * heard.lag_s:.0f} ms, {heard.above_noise_db:.0f} dB above the noise,"
         f" clocks {abs(heard.ppm):.0f} ppm apart; linear echo {heard.linear_db:.0f} dB"
     )
-    if good:
+    if heard.linear_db >= LINEAR_DB or heard.linear_db > heard.above_noise_db - 6.0:
         yield Check("set-up", "ok", f"{found}: good")
     else:
-        yield Check(
-            "set-up",
-            "warning",
-            found,
-            "turn the loudspeaker down, and end other programs: distortion and unsteady clocks are not predicted",
-        )
-    yield from _processed(heard)
-
-
-def _processed(heard: Heard) -> Iterator[Check]:
-    """What changes the sound on its way: a converter at its end, gain control, noise suppression."""
-    assert heard.softer_db is not None
+        do = "turn the loudspeaker down, and end other programs: distortion and unsteady clocks are not predicted"
+        yield Check("set-up", "warning", found, do)
+    # what changes the sound on its way: a converter at its end, gain control, noise suppression
+    softer = f"chirps {SOFTER_DB:.0f} dB softer come {abs(heard.softer_db):.1f} dB"
     if heard.peak_db > CLIPPED_DB:
-        yield Check(
-            "set-up", "warning", "the chirps are clipped at the microphone", "lower its gain or the loudspeaker"
-        )
+        found = "the chirps are clipped at the microphone"
+        yield Check("set-up", "warning", found, "lower its gain or the loudspeaker")
     elif heard.softer_db > CHANGED_DB:
-        found = f"chirps {SOFTER_DB:.0f} dB softer come {heard.softer_db:.1f} dB louder than they should"
-        yield Check(
-            "set-up",
-            "warning",
-            found,
-            "switch gain control off in device or sound server, or turn down the loudspeaker",
-        )
+        do = "switch gain control off in device or sound server, or turn down the loudspeaker"
+        yield Check("set-up", "warning", f"{softer} louder than they should", do)
     elif heard.softer_db < -CHANGED_DB:
-        found = f"chirps {SOFTER_DB:.0f} dB softer come {-heard.softer_db:.1f} dB softer than they should"
-        yield Check(
-            "set-up", "warning", found, "switch noise suppression and echo cancelling off in device or sound server"
+        do = "switch noise suppression and echo cancelling off in device or sound server"
+        yield Check("set-up", "warning", f"{softer} softer than they should", do)
+
+
+def _wrong(heard: Heard, output: str, reference: str) -> tuple[Literal["warning", "failed"], str, str] | None:
+    """State, finding and remedy where a run would not hear the robot as it should; None where it does."""
+    if not heard.in_reference:
+        found = f"reference '{reference}' is silent while something is played on output '{output}'"
+        return "failed", found, f"take the monitor of '{output}' (--reference), or play elsewhere (--speaker)"
+    if not heard.in_microphone:
+        found = f"the reference has the chirps, the microphone does not hear them (its peak: {heard.peak_db:.0f} dB)"
+        return "warning", found, "unmute loudspeaker and microphone, turn them up, or name others"
+    assert heard.lag_s is not None
+    if heard.same:
+        found = "the microphone is a copy of the reference, not a microphone"
+        return "failed", found, "name the real one with --input ('edgefilter devices')"
+    if heard.lag_s < -0.001:
+        found = f"the reference comes {-1000 * heard.lag_s:.0f} ms after the microphone has heard it"
+        return "failed", found, "take a reference with less buffering, such as the output's own monitor"
+    if heard.lag_s > MOST_LAG_S:
+        found = (
+            f"the microphone hears the robot after {heard.lag_s:.2f} s, more than the {MOST_LAG_S} s that are searched"
         )
+        return "failed", found, "use a loudspeaker or a microphone with less delay"
+    return None
 
 
 def _clock(role: str, trial: Trial) -> Check:

@@ -11,7 +11,6 @@ from edgefilter.diagnosis.compare import Comparison
 from edgefilter.diagnosis.diagnose import PROMISE_DB, Diagnosis, add, settle
 from edgefilter.diagnosis.proof import Proof, proofs_until_kept, prove
 from edgefilter.echo.effects.catalogue import find
-from edgefilter.echo.effects.catalogue import names as names_known
 from edgefilter.echo.running import reach
 from edgefilter.errors import EdgefilterError, SignalError
 from edgefilter.profile.data import Profile
@@ -65,20 +64,14 @@ class Fitted:
 
     def facts(self) -> list[tuple[str, str, str]]:
         """For the top of the page: term, value, explanation."""
-        facts = []
+        facts, proof = [], self.proof
         if self.found is None or self.found.written is None:
-            facts.append(
-                ("Written", f"{decibels(self.after.excess_db)} dB", f"over the noise floor, with {joined(self.names)}")
-            )
-        if self.proof is not None:
-            erle = f"{decibels(self.proof.erle_before_db)} to {decibels(self.proof.erle_after_db)} dB"
-            facts.append(
-                (
-                    "Running filter",
-                    erle,
-                    f"of the robot taken away, on {self.proof.seconds:.1f} s that no fit has heard",
-                )
-            )
+            what = f"over the noise floor, with {joined(self.names)}"
+            facts.append(("Written", f"{decibels(self.after.excess_db)} dB", what))
+        if proof is not None:
+            erle = f"{decibels(proof.erle_before_db)} to {decibels(proof.erle_after_db)} dB"
+            what = f"of the robot taken away, on {proof.seconds:.1f} s that no fit has heard"
+            facts.append(("Running filter", erle, what))
         return facts
 
     def lines(self) -> list[str]:
@@ -154,11 +147,6 @@ def fit(
         before = found.comparison if told is found else told.comparison
         return Fitted(names, dropped, knowing, before, after, proof, unproven, told, found.remaining_db)
     return Fitted(names, dropped, *add(start, names, recording, reference), proof, unproven, found)
-
-
-def long_paths() -> list[str]:
-    """Names of the effects that lengthen a path: a profile made from a recording has one of a quarter of a second."""
-    return [name for name in names_known() if find(name).lengthens]
 
 
 def _values(name: str, values: Any, named: bool) -> list[str]:

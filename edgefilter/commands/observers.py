@@ -13,7 +13,7 @@ from functools import partial
 from pathlib import Path
 from typing import TextIO
 
-from edgefilter.audio.files import FileSink, make_folder
+from edgefilter.audio.files import make_folder, write_file
 from edgefilter.audio.protocols import Source
 from edgefilter.audio.recorder import Recorder
 from edgefilter.audio.speech import SpokenReference
@@ -79,7 +79,7 @@ class Record(Recorder):
     The sound, events.jsonl, run.json with the figures, and profile.npz if the run had a profile to begin with.
     """
 
-    def __init__(self, folder: str | Path, profile: Profile | None, microphones: int = 1) -> None:
+    def __init__(self, folder: str | Path, profile: Profile | None, microphones: int) -> None:
         super().__init__(folder, microphones)
         self.log = EventLog(self.folder / "events.jsonl")
         if profile is not None:
@@ -110,8 +110,7 @@ class TurnWriter:
         if event.turn is None or self.failure:
             return
         try:
-            with FileSink(self._folder / f"turn_{self.written + 1:04d}.wav") as sink:
-                sink.write(event.turn.samples)
+            write_file(self._folder / f"turn_{self.written + 1:04d}.wav", event.turn.samples)
         except AudioFileError as error:
             self.failure = error
         else:

@@ -96,13 +96,9 @@ def check_outputs(args: argparse.Namespace) -> None:
     Raises UsageError for that, and for '-' where standard output cannot be meant; EdgefilterError where a result could
     not be written in the end.
     """
-    for option in (*READ, *WRITTEN, *IN_FOLDERS):
-        given = getattr(args, option, None)
-        for path in given if isinstance(given, list) else [given]:
-            if path is not None and (not path or "\0" in path):
-                raise UsageError(
-                    f"--{option.replace('_', '-')} is {path!r}, which names no file: give one or leave the option out"
-                )
+    for option, path in _given(args, *READ, *WRITTEN, *IN_FOLDERS):
+        if not path or "\0" in path:
+            raise UsageError(f"{_flag(option)} is {path!r}, which names no file: give one or leave the option out")
     read, written = list(_read(args)), list(_written(args))
     for number, output in enumerate(written):
         if output.path == "-" and output.stream is None:
@@ -122,20 +118,27 @@ def check_outputs(args: argparse.Namespace) -> None:
     for output in written:
         if output.at_end:
             _check_writable(output)
-    for command, option in FOLDERS:
-        if command == args.command and getattr(args, option, None) is not None:
-            _check_folder(f"--{option.replace('_', '-')}", getattr(args, option))
-    if getattr(args, "record", None) is not None:
-        _check_no_record(args.record)
+    for option, path in _given(args, *(option for command, option in FOLDERS if command == args.command)):
+        _check_folder(_flag(option), path)
+    for _, path in _given(args, "record"):
+        _check_no_record(path)
+
+
+def _given(args: argparse.Namespace, *options: str) -> Iterator[tuple[str, str]]:
+    """Each of the options that is given, and what it names; an option that may be given several times has a list."""
+    for option in options:
+        given = getattr(args, option, None)
+        yield from ((option, path) for path in (given if isinstance(given, list) else [given]) if path is not None)
+
+
+def _flag(option: str) -> str:
+    return f"--{option.replace('_', '-')}"
 
 
 def _read(args: argparse.Namespace) -> Iterator[Place]:
     """Every file that the command may read: those that options and the environment name, and the package's own."""
-    for option in READ:
-        given = getattr(args, option, None)
-        for path in given if isinstance(given, list) else [given]:
-            if path is not None:
-                yield Place(option.replace("_", " "), path, 0 if path == "-" and option == "input" else None)
+    for option, path in _given(args, *READ):
+        yield Place(option.replace("_", " "), path, 0 if path == "-" and option == "input" else None)
     for variable, path in os.environ.items():
         if variable.startswith("EDGEFILTER_"):
             yield Place(variable, path)
@@ -145,11 +148,8 @@ def _read(args: argparse.Namespace) -> Iterator[Place]:
 
 
 def _written(args: argparse.Namespace) -> Iterator[Place]:
-    for option in (*WRITTEN, *IN_FOLDERS):
-        path = getattr(args, option, None)
-        if path is None:
-            continue
-        role = f"--{option.replace('_', '-')}"
+    for option, path in _given(args, *WRITTEN, *IN_FOLDERS):
+        role = _flag(option)
         if (args.command, option) == ("probe", "excitation"):
             yield Place(f"{role}, its question", question_of(path), at_end=True)
         for name in FOLDERS.get((args.command, option), ()):

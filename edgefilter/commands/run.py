@@ -12,7 +12,7 @@ from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 
-from edgefilter.audio import virtual
+from edgefilter.audio import pulse, virtual
 from edgefilter.audio.files import open_sink, open_source
 from edgefilter.audio.protocols import Sink, Source
 from edgefilter.audio.reader import Reader
@@ -135,7 +135,7 @@ def make_source(
         )
     if reference is not None or reference_channel is not None:
         return LiveSource(name, reference, patience_s=math.inf, channels=channels, reference_channel=reference_channel)
-    own = virtual.speaker_monitor() if output == virtual.HUMAN else None
+    own = pulse.monitor(virtual.SPEAKER) if output == virtual.HUMAN else None
     played_on = "default" if output in ("-", virtual.HUMAN) or looks_like_file(output) else output
     return LiveSource(name, own or monitor_of(played_on), patience_s=math.inf, channels=channels)
 

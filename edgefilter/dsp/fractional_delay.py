@@ -72,9 +72,8 @@ def delayed(x: Array, samples: float) -> Samples:
     """
     if abs(samples) >= x.size:
         return np.zeros(x.size, np.float32)
-    n = fft.next_fast_len(
-        x.size + int(abs(samples)) + 256, real=True
-    )  # silence where the spectrum joins end and beginning
+    # silence where the spectrum joins end and beginning
+    n = fft.next_fast_len(x.size + int(abs(samples)) + 256, real=True)
     spectrum = fft.rfft(x.astype(np.float64), n)
     spectrum *= turn(np.arange(n // 2 + 1) * (-2.0 * np.pi / n), samples)
     return fft.irfft(spectrum, n, overwrite_x=True)[: x.size].astype(np.float32)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from functools import lru_cache
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import fft
 
 from edgefilter.dsp import fourier
@@ -20,23 +21,20 @@ MOTION_TAPS = 256
 """Samples in which a membrane of that Q and at least 160 Hz comes to rest, by 87 dB: 16 ms."""
 
 
-@lru_cache(maxsize=4)
-def displacement_taps(sample_rate: int = SAMPLE_RATE) -> Array:
+@lru_cache(maxsize=1)
+def displacement_taps() -> Array:
     """Impulse response (DISPLACEMENT_TAPS,) float64, not to be written to, of the low-pass; its gain is 1 at 0 Hz.
 
-    A Butterworth low-pass by the bilinear transform, sampled in frequency, so that the running filter needs no
-    scipy.signal.
+    A Butterworth low-pass, sampled in frequency, so that the running filter needs no scipy.signal.
     """
-    k = np.tan(np.pi * DISPLACEMENT_HZ / sample_rate)
-    z = np.exp(-2j * np.pi * np.arange(8 * DISPLACEMENT_TAPS // 2 + 1) / (8 * DISPLACEMENT_TAPS))
-    response = k**2 * (1 + z) ** 2 / (k**2 * (1 + z) ** 2 + np.sqrt(2) * k * (1 - z**2) + (1 - z) ** 2)
-    return fourier.irfft(response, 8 * DISPLACEMENT_TAPS)[:DISPLACEMENT_TAPS]
+    size = 8 * DISPLACEMENT_TAPS
+    return fourier.irfft(_responses(size, DISPLACEMENT_HZ, np.sqrt(0.5))[0], size)[:DISPLACEMENT_TAPS]
 
 
 def motion(x: Samples, resonance_hz: float, sample_rate: int = SAMPLE_RATE) -> Samples:
     """Displacement d and velocity d'/w of a membrane of that resonance and MOTION_Q that x (n,) drives: (2, n), in x's full scale.
 
-    Of w^2 / (s^2 + s w / Q + w^2) by the bilinear transform, multiplied in frequency: three transforms a hop.
+    Multiplied in frequency: three transforms a hop.
     """
     if not x.size:
         return np.zeros((2, 0), np.float32)
@@ -48,8 +46,12 @@ def motion(x: Samples, resonance_hz: float, sample_rate: int = SAMPLE_RATE) -> S
 
 @lru_cache(maxsize=4)
 def _motion(size: int, resonance_hz: float, sample_rate: int) -> Spectrum:
-    """(2, size // 2 + 1) complex64, the responses from drive to displacement and velocity."""
-    k = np.tan(np.pi * resonance_hz / sample_rate)
+    return _responses(size, resonance_hz, MOTION_Q, sample_rate).astype(np.complex64)
+
+
+def _responses(size: int, hz: float, q: float, sample_rate: int = SAMPLE_RATE) -> NDArray[np.complex128]:
+    """(2, size // 2 + 1) responses from drive to displacement and velocity: of w^2 / (s^2 + s w / Q + w^2) by the bilinear transform."""
+    k = np.tan(np.pi * hz / sample_rate)
     z = np.exp(-2j * np.pi * np.arange(size // 2 + 1) / size)
-    rest = k**2 * (1 + z) ** 2 + k / MOTION_Q * (1 - z**2) + (1 - z) ** 2
-    return np.stack((k**2 * (1 + z) ** 2 / rest, k * (1 - z**2) / rest)).astype(np.complex64)
+    rest = k**2 * (1 + z) ** 2 + k / q * (1 - z**2) + (1 - z) ** 2
+    return np.stack((k**2 * (1 + z) ** 2 / rest, k * (1 - z**2) / rest))

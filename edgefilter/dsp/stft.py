@@ -6,9 +6,9 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from scipy import fft
 
 from edgefilter.dsp import fourier
+from edgefilter.dsp.psd import hann
 from edgefilter.errors import StftError
 from edgefilter.types import SAMPLE_RATE, Array, Samples, Spectrum
 
@@ -67,8 +67,8 @@ class StftConfig:
     def _window64(self) -> Array:
         if self.window == "rectangular":
             return np.ones(self.window_length)
-        hann = 0.5 - 0.5 * np.cos(2 * np.pi * np.arange(self.window_length) / self.window_length)
-        return np.sqrt(hann) if self.window == "root-hann" else hann
+        window = hann(self.window_length)
+        return np.sqrt(window) if self.window == "root-hann" else window
 
     @property
     def _coverage(self) -> Array:
@@ -76,10 +76,6 @@ class StftConfig:
         padded = np.zeros(-(-self.window_length // self.hop) * self.hop)
         padded[: self.window_length] = self._window64**2
         return padded.reshape(-1, self.hop).sum(axis=0)
-
-    def analyse(self, window_samples: Samples) -> Spectrum:
-        """Spectrum (..., bins) complex64 of window_samples (..., window_length)."""
-        return fft.rfft(window_samples * self.analysis_window, self.n_fft)
 
     def noise_gain(self) -> float:
         """Expected |spectrum|^2 of white noise of unit variance: the sum of the squared window."""

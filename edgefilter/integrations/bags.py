@@ -13,13 +13,11 @@ from rosbags.highlevel import AnyReader, AnyReaderError
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from edgefilter.audio.files import open_sink
+from edgefilter.audio.pairing import MAX_WAIT
 from edgefilter.dsp.resample import Resampler
 from edgefilter.errors import AudioFileError, UsageError
 from edgefilter.integrations.duplex import from_pcm16
 from edgefilter.types import SAMPLE_RATE, Samples
-
-GAP_S = 0.25
-"""By how much a message's time must be behind what was written for silence to be put in: messages come with jitter."""
 
 
 def extract(bag: Path, topics: dict[str, str], folder: Path, rate: int, channels: int) -> dict[str, float]:
@@ -37,7 +35,7 @@ def extract(bag: Path, topics: dict[str, str], folder: Path, rate: int, channels
     store.register(get_types_from_msg("uint8[] data", "audio_common_msgs/msg/AudioData"))
     try:
         with AnyReader([bag], default_typestore=store) as reader:
-            sounds = {name: list(_messages(reader, topic, rate, channels)) for name, topic in topics.items()}
+            sounds = {name: list(_messages(reader, topic, channels)) for name, topic in topics.items()}
     except (AnyReaderError, OSError, ValueError) as error:
         raise AudioFileError(f"{bag} cannot be read as a recording of ROS 2: {' '.join(str(error).split())}") from None
     begin = min(time - samples.size / rate for parts in sounds.values() for time, samples in parts[:1])
@@ -49,7 +47,8 @@ def extract(bag: Path, topics: dict[str, str], folder: Path, rate: int, channels
             written = 0
             for time, samples in parts:
                 missing = round((time - begin) * rate) - samples.size - written
-                if missing > GAP_S * rate or (missing > 0 and not written):
+                # messages come with jitter, as a device's sound does
+                if missing > MAX_WAIT / SAMPLE_RATE * rate or (missing > 0 and not written):
                     sink.write(resampler.push(np.zeros(missing, np.float32)))
                     written += missing
                 sink.write(resampler.push(samples))
@@ -59,7 +58,7 @@ def extract(bag: Path, topics: dict[str, str], folder: Path, rate: int, channels
     return seconds
 
 
-def _messages(reader: AnyReader, topic: str, rate: int, channels: int) -> Iterator[tuple[float, Samples]]:
+def _messages(reader: AnyReader, topic: str, channels: int) -> Iterator[tuple[float, Samples]]:
     """Each message's time of arrival, seconds, and its samples (n,)."""
     found = [each for each in reader.connections if each.topic == topic]
     if not found:

@@ -18,6 +18,7 @@ from edgefilter.dsp.resample import Resampler
 from edgefilter.errors import SignalError, UsageError
 from edgefilter.filter.ego_filter import EgoFilter
 from edgefilter.integrations.channels import named, taken
+from edgefilter.integrations.duplex import as_pcm16
 from edgefilter.integrations.wire import RATES
 from edgefilter.profile.data import Profile
 from edgefilter.types import MOST_MICROPHONES, SAMPLE_RATE, Event, Samples
@@ -167,7 +168,11 @@ class EchoCanceller:
             For another type or shape, another length of ref, or samples that are not finite.
         """
         given, form = _samples(mic, "mic")
-        heard = _as_channels(given, self.channels, "mic")
+        if not (given.ndim == 1 and given.size % self.channels == 0) and given.shape[1:] != (self.channels,):
+            raise SignalError(
+                f"mic has shape {given.shape}, expected (n, {self.channels}) or {self.channels} channels interleaved"
+            )
+        heard = given.reshape(-1, self.channels)
         played, _ = _samples(ref, "ref")
         count = len(heard)
         if played.size % max(count, 1) or played.size < count:
@@ -227,19 +232,9 @@ def _samples(sound: object, name: str) -> tuple[Samples, tuple[int, ...]]:
     raise SignalError(f"{name} has dtype {array.dtype}, expected int16 or float in +-1")
 
 
-def _as_channels(samples: Samples, channels: int, name: str) -> Samples:
-    """Samples as (n, channels)."""
-    fits = samples.ndim == 1 and samples.size % channels == 0
-    if not fits and samples.shape[1:] != (channels,):
-        raise SignalError(
-            f"{name} has shape {samples.shape}, expected (n, {channels}) or {channels} channels interleaved"
-        )
-    return samples.reshape(-1, channels)
-
-
 def _like(samples: Samples, given: Sound) -> Sound:
     """Samples in the type of what was given."""
     if isinstance(given, np.ndarray):
         whole = given.dtype.kind != "f"
         return (to_pcm16(samples.reshape(-1))[0].reshape(samples.shape) if whole else samples).astype(given.dtype)
-    return type(given)(to_pcm16(samples.reshape(-1))[0].astype("<i2").tobytes())
+    return type(given)(as_pcm16(samples.reshape(-1)))

@@ -6,6 +6,7 @@ import av
 import av.error
 import numpy as np
 
+from edgefilter.audio.raw import FULL_SCALE
 from edgefilter.errors import SignalError
 from edgefilter.types import SAMPLE_RATE, Samples
 
@@ -30,13 +31,13 @@ class Decoder:
         parts = [frame.to_ndarray().reshape(-1, len(frame.layout.channels)) for frame in frames]
         if not parts:
             return np.zeros(0, np.float32)
-        return np.concatenate(parts)[:, 0].astype(np.float32) / np.float32(32768)
+        return np.concatenate(parts)[:, 0].astype(np.float32) / np.float32(FULL_SCALE)
 
 
 class Encoder:
     """One mono stream at 16 kHz as packets of 20 ms. bitrate: bits a second."""
 
-    def __init__(self, bitrate: int = 24_000) -> None:
+    def __init__(self, bitrate: int) -> None:
         self._codec = av.CodecContext.create("libopus", "w")
         self._codec.sample_rate, self._codec.layout, self._codec.format = SAMPLE_RATE, "mono", "flt"
         self._codec.bit_rate = bitrate

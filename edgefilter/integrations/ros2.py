@@ -101,15 +101,15 @@ class Topics:
     reference_channels: of that topic, None for as many as the microphone's.
     """
 
-    mic: str = "/audio"
-    reference: str = "/speech"
-    silenced: str = "/speech_stopped"
-    human: str = "/human"
-    rate: int = 16000
-    channels: int = 1
-    mic_channels: Sequence[int] | None = None
-    reference_channels: int | None = None
-    reference_channel: int | None = None
+    mic: str
+    reference: str
+    silenced: str
+    human: str
+    rate: int
+    channels: int
+    mic_channels: Sequence[int] | None
+    reference_channels: int | None
+    reference_channel: int | None
 
 
 class Node:
@@ -125,7 +125,7 @@ class Node:
         Of DDS: ROS_DOMAIN_ID.
     """
 
-    def __init__(self, ego: EgoFilter, topics: Topics = Topics(), domain: int = 0) -> None:
+    def __init__(self, ego: EgoFilter, topics: Topics, domain: int) -> None:
         self._topics = topics
         microphones, reference = topics.mic_channels, topics.reference_channel
         named(microphones, reference, topics.channels)
@@ -157,7 +157,7 @@ class Node:
         """End `run` soon; may be called from a signal handler."""
         self._stop.set()
 
-    def run(self, say: Callable[[str], None] = lambda text: None) -> None:
+    def run(self, say: Callable[[str], None]) -> None:
         """Serve until `stop`; say: told what cannot be read, a line each."""
         reported = 0.0
         while not self._stop.is_set():

@@ -15,7 +15,7 @@ from collections.abc import Callable
 from functools import partial
 
 import numpy as np
-from websockets.asyncio.server import Server, ServerConnection, serve
+from websockets.asyncio.server import ServerConnection, serve
 from websockets.exceptions import ConnectionClosed
 from websockets.http11 import Request, Response
 
@@ -61,13 +61,13 @@ class Session:
             codec_s = FRAME_MS / 1000
         else:
             decoders = (partial(_microphones_of, count=form.microphones), from_pcm16)
-            self._encode, codec_s = self._as_pcm, 0.0
+            self._encode = self._as_pcm
             self._from_filter = Resampler(SAMPLE_RATE, rate)
             codec_s = self._from_filter.delay_s
         self._two = TwoStreams(decoders, rate, round(form.late_ms * rate / 1000)) if form.streams == "two" else None
         self.delay_ms = 1000 * (ego.latency / SAMPLE_RATE + self._to_filter[0].delay_s + codec_s)
         self._announced = False
-        self._counted = {"lost": 0, "late": 0}
+        self._counted = self._counts()
 
     def ready(self, learns: bool) -> str:
         """The first answer."""
@@ -144,14 +144,8 @@ class Session:
             found.append(Event("lost", sample, f"{lost} samples never came: silence stands in"))
         if self._two and self._counted["late"] > before["late"] == 0:
             later = 1000 * self._two.lateness / self.form.rate
-            found.append(
-                Event(
-                    "reference_late",
-                    sample,
-                    f"the reference comes {later:.0f} ms later than the {self.form.late_ms} ms for which the microphone"
-                    " waits: say more in late_ms",
-                )
-            )
+            said = f"the reference comes {later:.0f} ms later than the {self.form.late_ms} ms for which the microphone waits"
+            found.append(Event("reference_late", sample, f"{said}: say more in late_ms"))
         return found
 
     def _told(self, event: Event) -> str:
@@ -180,7 +174,7 @@ class Service:
     """
 
     def __init__(
-        self, make_filter: Callable[[bool], EgoFilter], streams: int, learners: int = 0, token: str | None = None
+        self, make_filter: Callable[[bool], EgoFilter], streams: int, learners: int, token: str | None
     ) -> None:
         self._make, self._streams, self._learners, self._token = make_filter, streams, learners, token
         self._serving = self._learning = 0
@@ -192,7 +186,7 @@ class Service:
         # a client that sends faster than max_queue messages are filtered is read no faster
         limits = partial(serve, max_size=MOST_BYTES, max_queue=16, compression=None, origins=[None])
         async with limits(self._greet, host, port, process_request=self._admit) as server:
-            ready(_port(server))
+            ready(int(next(iter(server.sockets)).getsockname()[1]))
             await self._stopping.wait()
             if ending := [*self._conversing]:
                 for each in ending:
@@ -227,9 +221,8 @@ class Service:
         _LOGGER.warning("client %s: %s; its connection is closed", connection.remote_address, why)
         try:
             await asyncio.wait_for(connection.send(_text("error", detail=why)), PATIENCE_S)
-            await connection.close(
-                1008, why.encode()[:120].decode(errors="ignore")
-            )  # RFC 6455, 5.5: 125 bytes with the code
+            # RFC 6455, 5.5: 125 bytes with the code
+            await connection.close(1008, why.encode()[:120].decode(errors="ignore"))
         except (ConnectionClosed, TimeoutError):
             connection.transport.abort()
 
@@ -299,7 +292,3 @@ def _microphones_of(pcm: bytes, count: int) -> Samples:
 
 def _text(kind: str, **more: object) -> str:
     return json.dumps({"kind": kind, **more}, allow_nan=False, default=float)
-
-
-def _port(server: Server) -> int:
-    return int(next(iter(server.sockets)).getsockname()[1])

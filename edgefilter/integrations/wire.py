@@ -11,7 +11,7 @@ from typing import Any, Literal
 import numpy as np
 
 from edgefilter.errors import SignalError
-from edgefilter.types import MOST_MICROPHONES, Samples
+from edgefilter.types import MOST_MICROPHONES, SAMPLE_RATE, Samples
 
 HEADER = struct.Struct("<BxHQ")
 """Before the sound of a message of one of two streams: its label, an unused byte, the number of the message in its stream
@@ -37,7 +37,7 @@ class Form:
     bits a second of the answer in Opus.
     """
 
-    rate: int = 16000
+    rate: int = SAMPLE_RATE
     streams: Literal["stereo", "two"] = "stereo"
     microphones: int = 1
     codec: Literal["pcm", "opus"] = "pcm"

@@ -9,7 +9,7 @@ import numpy as np
 
 from edgefilter.dsp.frames import decibels
 from edgefilter.dsp.psd import GRID_BINS, total_power
-from edgefilter.profile.file import ProfilePart, described
+from edgefilter.profile.file import ProfilePart, described, refuse
 from edgefilter.types import Array, Samples
 
 STEEPEST = 2.0
@@ -57,18 +57,12 @@ class LinearApproximation(ProfilePart):
     def __post_init__(self) -> None:
         levels = np.asarray(self.level_db)
         if levels.dtype != np.float64 or levels.ndim != 1 or not levels.size:
-            self._refuse("level_db", described(levels), "float64 of one level or more")
+            refuse(f"{self.PREFIX}level_db", described(levels), "float64 of one level or more")
         if not (np.all(np.abs(levels) <= 300.0) and np.all(np.diff(levels) > 0.0)):
-            self._refuse("level_db", levels.tolist(), "rising levels of -300 to 300 dB")
-        least = np.asarray(self.least_db)
-        if least.dtype != np.float64 or least.shape != levels.shape or not np.all(np.abs(least) <= 300.0):
-            self._refuse("least_db", f"{least.dtype} {least.tolist()}", f"{levels.size} float64 of -300 to 300 dB")
+            refuse(f"{self.PREFIX}level_db", levels.tolist(), "rising levels of -300 to 300 dB")
+        self._check("least_db", levels.shape, np.float64, 300.0)
         for name in ("played", "linear", "noise", "even", "odd"):
-            density = np.asarray(getattr(self, name))
-            if density.shape != (levels.size, GRID_BINS) or density.dtype != np.float32:
-                self._refuse(name, described(density), f"float32 of shape ({levels.size}, {GRID_BINS})")
-            if not np.all(np.abs(density) <= 1e6):
-                self._refuse(name, f"{density.min():g} to {density.max():g}", "-1e6 to 1e6 everywhere")
+            self._check(name, (levels.size, GRID_BINS), np.float32, 1e6)
 
     @property
     def gain(self) -> Samples:

@@ -9,8 +9,7 @@ import numpy as np
 
 from edgefilter.dsp.psd import GRID_BINS, GRID_FFT
 from edgefilter.dsp.stft import StftConfig
-from edgefilter.errors import ProfileError
-from edgefilter.profile.file import REMEDY, ProfilePart, described
+from edgefilter.profile.file import ProfilePart, described, refuse
 from edgefilter.types import MOST_MICROPHONES, SAMPLE_RATE, Samples, Spectrum
 
 
@@ -39,16 +38,14 @@ class ArrayCalibration(ProfilePart):
     noise: Samples
 
     def __post_init__(self) -> None:
-        responses, noise = np.asarray(self.responses), np.asarray(self.noise)
-        if responses.dtype != np.float32 or responses.ndim != 2 or not 1 <= len(responses) < MOST_MICROPHONES:
-            self._refuse("responses", described(responses), f"float32 of shape (1 to {MOST_MICROPHONES - 1}, taps)")
-        if not np.all(np.abs(responses) <= 1e3):
-            raise ProfileError(f"{self.PREFIX}responses is not within -1000 to 1000 everywhere; {REMEDY}")
+        responses = np.asarray(self.responses)
+        if responses.ndim != 2 or not 1 <= len(responses) < MOST_MICROPHONES:
+            refuse(
+                f"{self.PREFIX}responses", described(responses), f"float32 of shape (1 to {MOST_MICROPHONES - 1}, taps)"
+            )
+        self._check("responses", responses.shape, np.float32, 1e3)
         count = len(responses) + 1
-        if noise.dtype != np.float32 or noise.shape != (GRID_BINS, count, count, 2):
-            self._refuse("noise", described(noise), f"float32 of shape ({GRID_BINS}, {count}, {count}, 2)")
-        if not np.all(np.abs(noise) <= 1.0):
-            raise ProfileError(f"{self.PREFIX}noise is not within -1 to 1 everywhere; {REMEDY}")
+        self._check("noise", (GRID_BINS, count, count, 2), np.float32, 1.0)
 
     def noise_covariance(self, stft: StftConfig) -> Spectrum:
         """Expected X_i conj(X_j) of the fan in one frame of stft, (microphones, microphones, bins) complex64."""

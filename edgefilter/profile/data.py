@@ -18,12 +18,14 @@ from edgefilter.echo.model import EchoModel
 from edgefilter.errors import ProfileError
 from edgefilter.profile.approximation import LinearApproximation
 from edgefilter.profile.array import ArrayCalibration
-from edgefilter.profile.file import REMEDY, Effects, read_fields, write_fields
+from edgefilter.profile.file import REMEDY, Effects, check_array, read_fields, refuse, write_fields
 from edgefilter.types import PRE_ROLL, SAMPLE_RATE, Array, Samples
 
 GRID_HZ = np.arange(GRID_BINS) * SAMPLE_RATE / GRID_FFT
 """(601,) Hz, 0 to 8000 in steps of 13.33."""
 DISTORTION_ORDERS = (2, 3, 4, 5)
+LOW_SNR_DB = 10.0
+"""Signal-to-noise ratio below which a band's path is wrong by more than 3 dB at times."""
 MAX_TAPS = 4 * SAMPLE_RATE
 """Samples, 4 s: longer than the reverberation of any room that a robot talks in, and than the lag of any player."""
 LEARNED = "what the running filter learned"
@@ -170,10 +172,10 @@ class Profile:
                     raise ProfileError(f"{kind} fields missing: {odd}; unknown: {extra}; {REMEDY}")
             pre_roll = header.pop("pre_roll")
             if pre_roll != PRE_ROLL:
-                raise ProfileError(f"pre_roll is {str(pre_roll)[:80]}, expected {PRE_ROLL} samples; {REMEDY}")
+                refuse("pre_roll", pre_roll, f"{PRE_ROLL} samples")
             warnings = header.pop("warnings")
             if not isinstance(warnings, list):
-                raise ProfileError(f"warnings is a JSON {type(warnings).__name__}, expected a list of texts; {REMEDY}")
+                refuse("warnings", f"a JSON {type(warnings).__name__}", "a list of texts")
             fields: dict[str, Any] = {**arrays, **header}  # what type each has is checked on construction
             echo = EchoModel(fields.pop("impulse_response"), effects)
             profile = cls(echo=echo, warnings=tuple(warnings), approximation=approximation, array=array, **fields)
@@ -278,10 +280,6 @@ def _stacked(paths: Sequence[Samples]) -> Samples:
     return np.stack([np.pad(path, (0, taps - path.size)) for path in paths])
 
 
-def _fail(name: str, found: object, expected: str) -> None:
-    raise ProfileError(f"{name} is {str(found)[:80]}, expected {expected}; {REMEDY}")
-
-
 def _check_arrays(profile: Profile) -> None:
     """Raise ProfileError at the first array that no calibration would have written: (shape, dtype, lowest, highest)."""
     taps = np.asarray(profile.echo.impulse_response).shape
@@ -295,17 +293,12 @@ def _check_arrays(profile: Profile) -> None:
         "distortion_db": ((len(DISTORTION_ORDERS),), np.float64, -300.0, 300.0),
     }
     if len(taps) != 1 or not 2 * PRE_ROLL <= taps[0] <= MAX_TAPS:
-        _fail("impulse_response", f"of shape {taps}", f"({2 * PRE_ROLL} to {MAX_TAPS},)")
+        refuse("impulse_response", f"of shape {taps}", f"({2 * PRE_ROLL} to {MAX_TAPS},)")
     if len(bands) != 1 or bands[0] > 100:
-        _fail("band_snr_db", f"of shape {bands}", "(number of bands,)")
+        refuse("band_snr_db", f"of shape {bands}", "(number of bands,)")
     for name, (shape, dtype, low, high) in rules.items():
         value = np.asarray(profile.echo.impulse_response if name == "impulse_response" else getattr(profile, name))
-        if value.shape != shape or value.dtype != dtype:
-            _fail(name, f"{value.dtype} of shape {value.shape}", f"{np.dtype(dtype)} of shape {shape}")
-        wrong = ~((value >= low) & (value <= high))
-        if wrong.any():
-            at = int(np.argmax(wrong))
-            _fail(name, f"{value.ravel()[at]:g} at position {at}", f"{low:g} to {high:g}")
+        check_array(name, value, shape, dtype, low, high)
 
 
 def _check_effects(echo: EchoModel) -> None:
@@ -332,15 +325,15 @@ def _check_effects(echo: EchoModel) -> None:
 def _check_numbers(profile: Profile) -> None:
     """Raise ProfileError for a header value of the wrong type or out of range."""
     if isinstance(profile.sample_rate, bool) or profile.sample_rate != SAMPLE_RATE:
-        _fail("sample_rate", repr(profile.sample_rate), f"{SAMPLE_RATE} Hz")
+        refuse("sample_rate", repr(profile.sample_rate), f"{SAMPLE_RATE} Hz")
     if (
         isinstance(profile.delay, bool)
         or not isinstance(profile.delay, int | float | np.number)
         or not abs(profile.delay) <= MAX_TAPS
     ):
-        _fail("delay", repr(profile.delay), f"-{MAX_TAPS} to {MAX_TAPS} samples")
+        refuse("delay", repr(profile.delay), f"-{MAX_TAPS} to {MAX_TAPS} samples")
     for name in ("created", "source"):
         if not isinstance(getattr(profile, name), str):
-            _fail(name, type(getattr(profile, name)).__name__, "a text")
+            refuse(name, type(getattr(profile, name)).__name__, "a text")
     if not all(isinstance(text, str) for text in profile.warnings):
-        _fail("warnings", "not all texts", "texts")
+        refuse("warnings", "not all texts", "texts")

@@ -13,7 +13,7 @@ import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any, ClassVar, TypeVar
+from typing import Any, ClassVar, NoReturn, TypeVar
 
 import numpy as np
 
@@ -54,8 +54,24 @@ class ProfilePart:
             raise ProfileError(f"array fields missing: {missing}; {REMEDY}")
         return cls(**found) if found else None
 
-    def _refuse(self, name: str, found: object, expected: str) -> None:
-        raise ProfileError(f"{self.PREFIX}{name} is {str(found)[:80]}, expected {expected}; {REMEDY}")
+    def _check(self, name: str, shape: tuple[int, ...], dtype: type, most: float) -> None:
+        """As check_array, for values of -most to most."""
+        check_array(self.PREFIX + name, np.asarray(getattr(self, name)), shape, dtype, -most, most)
+
+
+def refuse(name: str, found: object, expected: str) -> NoReturn:
+    """Raise ProfileError for a field."""
+    raise ProfileError(f"{name} is {str(found)[:80]}, expected {expected}; {REMEDY}")
+
+
+def check_array(name: str, array: np.ndarray, shape: tuple[int, ...], dtype: type, low: float, high: float) -> None:
+    """Raise ProfileError where the array has another shape or type, is not finite or not within low to high."""
+    if array.shape != shape or array.dtype != dtype:
+        refuse(name, described(array), f"{np.dtype(dtype)} of shape {shape}")
+    wrong = ~((array >= low) & (array <= high))
+    if wrong.any():
+        at = int(np.argmax(wrong))
+        refuse(name, f"{array.ravel()[at]:g} at position {at}", f"{low:g} to {high:g}")
 
 
 def described(array: np.ndarray) -> str:
@@ -107,9 +123,8 @@ def _replace(path: Path, members: Mapping[str, Any]) -> None:
     try:
         # not tempfile: its files are the owner's alone, and the umask that others have can only be read by changing it
         with open(temporary, "xb") as file:
-            np.savez_compressed(
-                file, **members
-            )  # numbers alone: nothing is pickled (numpy before 2.1 knows no allow_pickle)
+            # numbers alone: nothing is pickled (numpy before 2.1 knows no allow_pickle)
+            np.savez_compressed(file, **members)
             file.flush()
             os.fsync(file.fileno())
         os.replace(temporary, path)
@@ -226,15 +241,9 @@ def _effects(listed: object, members: Mapping[str, np.ndarray]) -> Effects:
         name, values = entry.get("name"), entry.get("values")
         if not isinstance(name, str) or not isinstance(values, dict):
             raise _Damaged(f"effects[{i}] has no name or no values")
-        effects.append(
-            (
-                name,
-                {
-                    key: _value(value, f"effects[{i}] ({name[:40]}).{key[:40]}", members)
-                    for key, value in values.items()
-                },
-            )
-        )
+        where = f"effects[{i}] ({name[:40]})"
+        found = {key: _value(value, f"{where}.{key[:40]}", members) for key, value in values.items()}
+        effects.append((name, found))
     return tuple(effects)
 
 

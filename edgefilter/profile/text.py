@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from edgefilter.dsp.frames import decibels
+from edgefilter.dsp.psd import total_power
 from edgefilter.echo.effects.catalogue import find
 from edgefilter.profile.approximation import LinearApproximation
 from edgefilter.profile.data import DISTORTION_ORDERS, Profile
@@ -13,7 +15,8 @@ from edgefilter.types import PRE_ROLL, SAMPLE_RATE, Array, Samples
 def describe(profile: Profile) -> str:
     """Lines of text: path, decay, fan, distortion, a bar for each band's signal-to-noise ratio, effects, warnings."""
     path = profile.echo.impulse_response
-    fan = 10 * np.log10(max(float(profile.noise_psd.sum()) * SAMPLE_RATE / 1200, 1e-20))
+    energy = to_come(path)
+    fan = decibels(total_power(profile.noise_psd), 1e-20)
     distortion = ", ".join(
         f"{order}: {'below the fan' if level <= -99.0 else f'{level:.1f} dB'}"
         for order, level in zip(DISTORTION_ORDERS, profile.distortion_db, strict=True)
@@ -22,9 +25,9 @@ def describe(profile: Profile) -> str:
         f"made        {profile.created or 'date unknown'}" + (f" from {profile.source}" if profile.source else ""),
         (
             f"path        {path.size} taps ({1000 * path.size / SAMPLE_RATE:.0f} ms), direct sound at"
-            f" {profile.delay:.0f} samples ({1000 * profile.delay / SAMPLE_RATE:.1f} ms), gain {_gain_db(path):.1f} dB"
+            f" {profile.delay:.0f} samples ({1000 * profile.delay / SAMPLE_RATE:.1f} ms), gain {decibels(energy[0], 1e-20):.1f} dB"
         ),
-        f"decay       {_decay(path)}",
+        f"decay       {_decay(energy)}",
         *([f"microphones {profile.microphones}; what is said here is of the first"] if profile.array else ()),
         f"fan         {fan:.1f} dB of full scale",
         f"distortion  orders {distortion}",
@@ -76,14 +79,14 @@ def _band_line(edges: Array, snr: float) -> str:
     return f"  {edges[0]:5.0f} - {edges[1]:4.0f} Hz {snr:6.1f} dB  {bar}".rstrip()
 
 
-def _gain_db(path: Samples) -> float:
-    return 10 * float(np.log10(max(np.sum(path.astype(np.float64) ** 2), 1e-20)))
+def to_come(path: Samples) -> Array:
+    """(taps,) energy of an impulse response (taps,) from each sample on (Schroeder 1965)."""
+    return np.cumsum(path[::-1].astype(np.float64) ** 2)[::-1]
 
 
-def _decay(path: Samples) -> str:
-    """Times at which the remaining energy (Schroeder 1965) has fallen by 10, 20 and 30 dB, counted from the direct sound."""
-    left = np.cumsum(path[::-1].astype(np.float64) ** 2)[::-1]
-    left = 10 * np.log10(np.maximum(left / max(left[0], 1e-30), 1e-20))
+def _decay(energy: Array) -> str:
+    """Times at which the energy that is still to come has fallen by 10, 20 and 30 dB, counted from the direct sound."""
+    left = decibels(energy / max(energy[0], 1e-30), 1e-20)
     times = [(db, int(np.argmax(left < -db))) for db in (10, 20, 30) if left.min() < -db]
     return (
         ", ".join(f"-{db} dB after {1000 * max(n - PRE_ROLL, 0) / SAMPLE_RATE:.0f} ms" for db, n in times)

@@ -17,7 +17,7 @@ from edgefilter.diagnosis.closer_look import CloserLook
 from edgefilter.diagnosis.compare import Comparison, describe
 from edgefilter.diagnosis.diagnose import Diagnosis, Finding
 from edgefilter.diagnosis.laws import Law
-from edgefilter.diagnosis.passport import Passport
+from edgefilter.diagnosis.passport import ENOUGH_DB, Passport
 from edgefilter.diagnosis.prepare import Prepared, prepare
 from edgefilter.diagnosis.result import Precision, in_order
 from edgefilter.echo.effect import complete
@@ -28,14 +28,15 @@ from edgefilter.profile.data import Profile
 from edgefilter.report import passport
 from edgefilter.report.media import MAX_SOUND_S, colour_scale, colours, sound, spectrogram_png
 from edgefilter.report.text import (
+    HEADS,
     add_command,
-    candidate_rows,
+    cells_of,
     correlograms,
     decibels,
+    error_text,
     family_line,
     headline,
     interval_text,
-    precision_rows,
     sentence,
     title,
 )
@@ -127,7 +128,7 @@ def passport_page(found: Passport, diagnosis: str, names: Mapping[str, Any]) -> 
         "engines": passport.engine_lines(found),
         "uncertainty": passport.uncertainty(found),
         "facts": passport.rows(found),
-        "enough": passport.enough(),
+        "enough": f"{ENOUGH_DB:.0f} dB are enough for a human 10 dB below the robot.",
         "series": series,
         "grid": [(200 - 190 * db / top, f"{db:.0f} dB") for db in (0.0, top / 2, top)],
         "bars": bars,
@@ -250,9 +251,13 @@ def _rounded(rows: Iterable[tuple[float, float, float]]) -> list[list[float]]:
 
 def _statistics(found: Diagnosis | None = None) -> dict[str, object]:
     """The tables of what was tried and of what is known; a comparison has none."""
+    tried, known = (found.tried, found.precision) if found else ((), Precision())
     return {
-        "tried": candidate_rows(found.tried if found else ()),
-        "known": precision_rows(found.precision if found else Precision()),
+        "tried": {"heads": HEADS, "rows": [{"cells": cells_of(one), "named": one.verdict == "named"} for one in tried]},
+        "known": {
+            "numbers": [(one.label, error_text(one)) for one in known.numbers],
+            "correlations": [(first, second, f"{r:+.2f}".replace("-", "−")) for first, second, r in known.correlations],
+        },
         "advice": [sentence(line) for line in found.advice] if found else [],
     }
 

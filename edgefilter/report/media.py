@@ -64,21 +64,18 @@ def colour_scale(samples: Samples) -> tuple[float, float]:
 def spectrogram_png(samples: Samples, scale: tuple[float, float]) -> str:
     """The spectrogram as a data address, low frequencies at the bottom, coloured on that scale."""
     bottom, top = scale
-    index = np.clip(np.round((spectrogram_db(samples) - bottom) / (top - bottom) * (LEVELS - 1)), 0, LEVELS - 1).astype(
-        np.uint8
-    )
-    return _address("image/png", _png(index.T[::-1], colours()))
+    index = np.clip(np.round((spectrogram_db(samples) - bottom) / (top - bottom) * (LEVELS - 1)), 0, LEVELS - 1)
+    return _address("image/png", _png(index.astype(np.uint8).T[::-1], colours()))
 
 
 def colours() -> np.ndarray:
     """(LEVELS, 3) uint8, darkest first."""
     at = np.linspace(0, len(_ANCHORS) - 1, LEVELS)
-    return np.stack([np.interp(at, np.arange(len(_ANCHORS)), channel) for channel in _ANCHORS.T], axis=1).astype(
-        np.uint8
-    )
+    channels = [np.interp(at, np.arange(len(_ANCHORS)), anchors) for anchors in _ANCHORS.T]
+    return np.stack(channels, axis=1).astype(np.uint8)
 
 
-def sound(samples: Samples, gain: float = 1.0) -> str:
+def sound(samples: Samples, gain: float) -> str:
     """The first MAX_SOUND_S of samples (n,) times gain, as an Opus data address, about 30 kbit/s."""
     buffer = io.BytesIO()
     loud = np.clip(samples[: MAX_SOUND_S * SAMPLE_RATE] * np.float32(gain), -1.0, 1.0)

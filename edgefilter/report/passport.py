@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from edgefilter.diagnosis.passport import ENOUGH_DB, Passport
+from edgefilter.diagnosis.passport import Passport
 from edgefilter.report.text import sentence
 
 ERROR_DB = 2.3, 8.6
@@ -151,8 +151,3 @@ def _against(human_db: float) -> str:
     if human_db == 0.0:
         return "as loud as the robot"
     return f"{abs(human_db):g} dB {'below' if human_db < 0.0 else 'above'} the robot"
-
-
-def enough() -> str:
-    """What the bars of the page are measured against."""
-    return f"{ENOUGH_DB:.0f} dB are enough for a human 10 dB below the robot."

@@ -13,7 +13,8 @@ from matplotlib.figure import Figure, SubFigure
 from edgefilter.dsp.frames import decibels
 from edgefilter.errors import EdgefilterError
 from edgefilter.profile.approximation import LinearApproximation
-from edgefilter.profile.data import DISTORTION_ORDERS, GRID_HZ, Profile
+from edgefilter.profile.data import DISTORTION_ORDERS, GRID_HZ, LOW_SNR_DB, Profile
+from edgefilter.profile.text import to_come
 from edgefilter.report.media import spectrogram_db
 from edgefilter.types import PRE_ROLL, SAMPLE_RATE, Samples
 
@@ -39,7 +40,7 @@ def plot_profile(profile: Profile, path: str | Path) -> None:
     first = ms < 40
     axes[0, 0].plot(ms[first], taps[first], color=INK, linewidth=0.8)
     _label(axes[0, 0], "Impulse response, first 40 ms", "ms after the direct sound", "amplitude")
-    left = np.cumsum(taps[::-1] ** 2)[::-1]
+    left = to_come(profile.echo.impulse_response)
     axes[0, 1].plot(
         ms,
         decibels(taps**2 / max(float(np.max(taps**2)), 1e-30), 1e-20),
@@ -125,16 +126,16 @@ def _draw_spectra(axis: Axes, profile: Profile) -> None:
 
 def _draw_bands(axis: Axes, profile: Profile) -> None:
     low, high = profile.band_hz.T
-    colours = [ACCENT if snr < 10 else SOFT for snr in profile.band_snr_db]
+    colours = [ACCENT if snr < LOW_SNR_DB else SOFT for snr in profile.band_snr_db]
     axis.bar(low, profile.band_snr_db, width=high - low, align="edge", color=colours, edgecolor="white")
-    axis.axhline(10, color=INK, linewidth=0.8, linestyle=":")
+    axis.axhline(LOW_SNR_DB, color=INK, linewidth=0.8, linestyle=":")
     axis.set_xscale("log")
     orders = ", ".join(
         f"{order}: {level:.0f}" for order, level in zip(DISTORTION_ORDERS, profile.distortion_db, strict=True)
     )
     _label(
         axis,
-        f"Signal-to-noise ratio of the sweep by third octave; red: below 10 dB, too noisy\nharmonic distortion by order, dB: {orders}",
+        f"Signal-to-noise ratio of the sweep by third octave; red: below {LOW_SNR_DB:.0f} dB, too noisy\nharmonic distortion by order, dB: {orders}",
         "Hz",
         "dB",
     )

@@ -1,4 +1,4 @@
-"""A comparison and a diagnosis in words: sentences, figures and lines for the terminal, rows for the page."""
+"""A comparison and a diagnosis as text: sentences and figures, and lines for the terminal."""
 
 from __future__ import annotations
 
@@ -20,19 +20,23 @@ from edgefilter.diagnosis.result import Candidate, Known, Precision, in_order
 from edgefilter.echo.effects.catalogue import find, names
 
 UNITS = {"1": "", "1e-6": "ppm"}
-"""Units of parameters that read better otherwise."""
+"""How a parameter's unit is printed, where that differs from its name."""
 WEIGHT = 0.01
-"""Share of the residual from which a dependence gets its reason: half a minute of sound shows smaller ones, which nobody would mend."""
+"""Least share of the residual's power for which the text names the cause of a dependence. Half a minute of sound also shows
+smaller dependences, which nobody would correct."""
 HEADS = ("rank", "effect", "alone, dB", "added, dB", "numbers", "Delta BIC", "verdict")
 
 
 def spoken(effect: str) -> str:
-    """The effect inside a sentence; one without a title, or whose file is not loaded, by its name without underscores."""
+    """Name an effect inside a sentence.
+
+    An effect without a title, or one whose file is not loaded, has its own name, without underscores.
+    """
     return (find(effect).title if effect in names() else "") or effect.replace("_", " ")
 
 
 def title(effect: str) -> str:
-    """The effect as a heading, without its article."""
+    """Name an effect in a heading, without its article."""
     words = spoken(effect).removeprefix("a ")
     return words[:1].upper() + words[1:]
 
@@ -44,37 +48,36 @@ def joined(words: Iterable[str]) -> str:
 
 
 def sentence(words: str) -> str:
-    """The words with a capital and a full stop, where they have none."""
+    """Make a sentence of the words: a capital letter begins it, a full stop ends it."""
     words = words.strip()
     return words and words[:1].upper() + words[1:] + ("" if words.endswith((".", "!", "?")) else ".")
 
 
 def headline(verdict: str, effects: Iterable[str], calibrated: bool = True) -> str:
-    """One sentence for the verdict of a diagnosis.
+    """Say the verdict of a diagnosis in a sentence or two.
 
-    calibrated: whether there was a profile that could lack something.
+    calibrated: False where the recording itself made the profile, which then cannot lack anything.
     """
     found = joined(spoken(effect) for effect in effects)
     if verdict == "missing" and not calibrated:
-        return f"Found in the recording, besides what is stationary and linear: {found}."
+        return f"The recording shows more than a stationary linear path: {found}."
     if verdict == "explained" and not calibrated:
-        return (
-            "A stationary linear path explains this recording; what it is made of cannot be told without a calibration."
-        )
+        return "A stationary linear path explains this recording. Only a calibration can tell which effects this path contains."
     if verdict == "missing":
-        return f"Missing from the profile: {found}."
+        return f"The profile lacks {found}."
     if verdict == "explained":
         return "The profile explains this recording."
-    return "Something is in this recording that no known effect explains" + (f", besides {found}." if found else ".")
+    beside = f" beside {found}" if found else ""
+    return f"This recording contains something{beside} that no known effect explains."
 
 
 def decibels(value: float) -> str:
-    """One decimal, and no minus before a zero."""
+    """Format a value in dB with one decimal; zero has no minus sign."""
     return f"{0.0 if abs(value) < 0.05 else value:.1f}"
 
 
 def figure(value: float) -> str:
-    """A number with three significant digits; without an exponent where people would not write one."""
+    """Format a number with three significant digits, and without an exponent from 1e-4 to 1e7."""
     value = float(value)
     if value == 0 or not 1e-4 <= abs(value) < 1e7:
         return f"{value:.3g}"
@@ -82,7 +85,7 @@ def figure(value: float) -> str:
 
 
 def interval_text(interval: Interval) -> str:
-    """Say "0.61 s (0.56 to 0.66)"; several values one after the other, each with its own range."""
+    """Format each value of a parameter with its unit and its range, such as "0.61 s (0.56 to 0.66)"."""
     values, lows, highs = (np.atleast_1d(x) for x in (interval.value, interval.low, interval.high))
     unit = UNITS.get(interval.unit, interval.unit)
     shown = [
@@ -93,10 +96,10 @@ def interval_text(interval: Interval) -> str:
 
 
 def comparison_lines(found: Comparison) -> list[str]:
-    """The excess, while the robot talks and while it is silent, then by frequency, time, level and lag, and whether it is noise."""
+    """Format a comparison: the excess as a whole, by frequency, by time, by level and by lag, and whether the residual is noise."""
     lines = [
-        f"excess      {decibels(found.excess_db)} dB, what is not predicted, over the noise floor of {decibels(found.noise_floor_db)} dBFS",
-        f"lag         {found.offset_samples:+.2f} samples against the calibration, compensated",
+        f"excess      {decibels(found.excess_db)} dB: unpredicted power over the noise floor of {decibels(found.noise_floor_db)} dBFS",
+        f"lag         {found.offset_samples:+.2f} samples relative to the calibration, compensated",
     ]
     if math.isfinite(found.silence_excess_db):
         lines.append(
@@ -104,12 +107,12 @@ def comparison_lines(found: Comparison) -> list[str]:
         )
     if found.human:
         spans = ", ".join(f"{start:.1f}-{end:.1f} s" for start, end in found.human)
-        lines.append(f"human       somebody talks at {spans}; left out of every figure")
+        lines.append(f"human       somebody talks at {spans}; no figure includes these times")
     lines += [f"WARNING     {text}" for text in found.warnings]
     lines += _table("by frequency", "Hz", found.bands)
     lines += _table("by time", "s", coarser(found.times, len(found.bands)))
     lines += _table("by level of the robot's voice", "dBFS", found.levels)
-    lines += ["by lag of the correlation with the reference"]
+    lines += ["by lag behind the reference"]
     lines += [
         f"  {low:5g} to {high:4g} ms  {100 * share:5.0f} %   {_bar(share)}".rstrip() for low, high, share in found.lags
     ]
@@ -117,9 +120,9 @@ def comparison_lines(found: Comparison) -> list[str]:
 
 
 def diagnosis_lines(found: Diagnosis, calibrated: bool = True) -> list[str]:
-    """The verdict in a sentence, the error budget step by step, each finding with its evidence, statistics, where the excess was.
+    """Format a diagnosis: the verdict, the error budget, each finding with its evidence, the statistics, and the comparison.
 
-    calibrated: False where the profile was made from the recording itself.
+    calibrated: False where the recording itself made the profile.
     """
     names = [finding.effect for finding in found.ranking]
     added = in_order(found.ranking)
@@ -133,7 +136,7 @@ def diagnosis_lines(found: Diagnosis, calibrated: bool = True) -> list[str]:
     ]
     lines += [f"  {name:<27} {decibels(db):>6}  {_bar(db / top)}".rstrip() for name, db in steps]
     lines.append(
-        f"  {'irreducible part of it':<27} {decibels(found.irreducible_db):>6}  {_bar(found.irreducible_db / top)}".rstrip()
+        f"  {'irreducible part':<27} {decibels(found.irreducible_db):>6}  {_bar(found.irreducible_db / top)}".rstrip()
     )
     for rank, finding in enumerate(found.ranking, start=1):
         lines += _finding(rank, finding)
@@ -147,22 +150,22 @@ def diagnosis_lines(found: Diagnosis, calibrated: bool = True) -> list[str]:
         lines.append(proof_line(found.proof, found.unproven))
     lines += precision_lines(found.precision)
     if found.ranking:
-        lines += independence_lines(found.independence, "with all that was found")
+        lines += independence_lines(found.independence, "with all findings")
     lines += [*candidate_lines(found.tried), *(f"advice      {line}" for line in found.advice)]
-    return [*lines, f"where       the excess is with {profile}:", *comparison_lines(found.comparison)]
+    return [*lines, f"where       the excess lies with {profile}:", *comparison_lines(found.comparison)]
 
 
 def law_line(law: Law) -> str:
-    """What kind of change it is that no effect explains, and how to have it as an effect of one's own."""
+    """Describe the change that no known effect explains, and say which option writes it to a file."""
     beside = f" beside {joined(law.beside)}" if law.beside else ""
     return (
         f"law         {law.family}: {law.words}; it leaves {decibels(law.excess_db)} dB{beside}; --write-effect MINE.py writes"
-        " it as an effect of your own"
+        " this law as your own effect"
     )
 
 
 def add_command(effects: Sequence[str], names: Mapping[str, Any]) -> str:
-    """What to type to have those effects in a new profile, of all microphones; without a profile, to have one at all."""
+    """Give the command that writes a profile with these effects, of all microphones; without a profile, the one that calibrates."""
     if names["profile"] is None:
         return "edgefilter calibrate --live --output robot.npz"
     files = " ".join(f"--{role} {shlex.quote(str(names[role]))}" for role in ("profile", "recording", "reference"))
@@ -174,7 +177,7 @@ def add_command(effects: Sequence[str], names: Mapping[str, Any]) -> str:
 
 
 def coarser(times: Sequence[tuple[float, float, float]], rows: int) -> list[tuple[float, float, float]]:
-    """Neighbouring (start_s, end_s, excess_db) joined, powers averaged, so that at most `rows` remain."""
+    """Join neighbours (start_s, end_s, excess_db) until at most `rows` remain; a joined row has the mean of their powers."""
     step = math.ceil(len(times) / rows) if times else 1
     groups = [times[at : at + step] for at in range(0, len(times), step)]
     return [
@@ -196,8 +199,8 @@ def _finding(rank: int, finding: Finding) -> list[str]:
 
 
 def family_line(finding: Finding) -> str:
-    """The family of a finding, and how often as much is found where nothing is missing."""
-    return f"{finding.family}; chance alone finds as much in {percent(finding.p_value)} of ordinary recordings"
+    """Name the family of a finding, and say how often a recording in which nothing is missing shows as much."""
+    return f"{finding.family}; {percent(finding.p_value)} of ordinary recordings show as much by chance"
 
 
 def _table(heading: str, unit: str, rows: Sequence[tuple[float, float, float]]) -> list[str]:
@@ -212,76 +215,66 @@ def _bar(part: float) -> str:
     return "#" * round(30 * min(max(part, 0.0), 1.0))  # lines stay within 80 columns
 
 
-def independence_lines(found: Independence | None, what: str = "of what is left") -> list[str]:
-    """How many correlations are beyond their bounds, and what that says; at most 80 columns."""
+def independence_lines(found: Independence | None, what: str = "of the residual") -> list[str]:
+    """Format which share of the correlations exceeds their bounds, and what follows from it; at most 80 columns."""
     if found is None:
         return []
-    head = f"correlations {what}: lags beyond 99 % bounds (of noise: 1 %)"
+    head = f"correlations {what}: lags beyond their 99 % bounds (noise: 1 %)"
     return [head] + [f"  {name:<17} {100 * part.outside:5.1f} %  {says}" for name, part, says in _verdicts(found)]
 
 
 def candidate_lines(tried: Sequence[Candidate]) -> list[str]:
-    """The table of all effects that were tried."""
+    """Format the table of all effects that the diagnosis has tried."""
     if not tried:
-        return ["tried       nothing: no more of the robot's voice is left than of its silences"]
+        return ["tried       nothing: the residual is no louder while the robot talks than while it is silent"]
     widths = (4, 20, 9, 10, 7, 9)
-    table = [HEADS, *(_cells(row) for row in tried)]
+    table = [HEADS, *(cells_of(row) for row in tried)]
     cells = (
         [text.ljust(w) if column == 1 else text.rjust(w) for column, (text, w) in enumerate(zip(row, widths))]
         for row in table
     )
-    return ["tried       by Delta BIC; gain on held-out samples"] + [
+    return ["tried       all effects, by Delta BIC; gains on held-out samples"] + [
         f"  {' '.join(row)}  {whole[-1]}" for row, whole in zip(cells, table, strict=True)
     ]
 
 
 def precision_lines(found: Precision) -> list[str]:
-    """Each number with its standard error, then what they share."""
+    """Format each fitted number with its standard error, then the correlations between these errors."""
     if not found.numbers:
         return []
     width = max(len(known.label) for known in found.numbers)
     lines = ["known       number +/- standard error"]
     lines += [f"  {known.label:<{width}}  {error_text(known)}" for known in found.numbers]
     if found.correlations:
-        lines.append("correlations of these")
+        lines.append("correlations of these errors")
         lines += [f"  {first}, {second}  {r:+.2f}" for first, second, r in found.correlations]
     return lines
 
 
 def error_text(known: Known) -> str:
-    """Say "-3.00 +/- 0.004 dB (0.1 %)", and where the error is from unless from the prediction's derivatives."""
+    """Format a number with its standard error, such as "-3.00 +/- 0.004 dB (0.1 %)".
+
+    The text names the source of the error where this is not the prediction's derivatives.
+    """
     unit = UNITS.get(known.unit, known.unit)
     if known.error is None:
         why = "at its bound" if known.source == "at its bound" else "no standard error: too few fits to tell"
         return f"{figure(known.value)} {unit}".rstrip() + f", {why}"
     share = known.error / abs(known.value) if known.value else 0.0
-    part = f" ({100 * share:.2g} %)" if 0.0 < share < 1.0 else " (unknown: more than itself)" if share else ""
+    part = f" ({100 * share:.2g} %)" if 0.0 < share < 1.0 else " (the error exceeds the number)" if share else ""
     by = ", from fits to thirds of the recording" if known.source == "thirds" else ""
     return f"{figure(known.value)} +/- {figure(known.error)} {unit}".rstrip() + part + by
 
 
-def candidate_rows(tried: Sequence[Candidate]) -> dict[str, object]:
-    """The table for the page; named: whether a row is to stand out."""
-    return {
-        "heads": HEADS,
-        "rows": [{"cells": _cells(row), "named": row.verdict == "named"} for row in tried],
-    }
-
-
-def precision_rows(found: Precision) -> dict[str, object]:
-    """Numbers and correlations for the page."""
-    return {
-        "numbers": [(known.label, error_text(known)) for known in found.numbers],
-        "correlations": [(first, second, f"{r:+.2f}".replace("-", "−")) for first, second, r in found.correlations],
-    }
-
-
 def correlograms(found: Independence | None) -> dict[str, object] | None:
-    """What the page draws of a residual's correlations, and says below."""
+    """Give the curves that the HTML page draws of a residual's correlations, and the sentences below them."""
     if found is None:
         return None
-    said = {name: f"{100 * part.outside:.1f} % of lags outside: {says}" for name, part, says in _verdicts(found)}
-    auto, *zones = (f"{name}, {text}" for name, text in said.items())
+    said = (
+        f"{name}, {100 * part.outside:.1f} % of lags exceed their bounds: {says}"
+        for name, part, says in _verdicts(found)
+    )
+    auto, *zones = said
     return {
         "auto": {**_drawn(found.autocorrelation), "says": [auto]},
         "cross": {**_drawn(found.cross_correlation), "says": zones},
@@ -289,12 +282,15 @@ def correlograms(found: Independence | None) -> dict[str, object] | None:
 
 
 def _verdicts(found: Independence) -> list[tuple[str, Correlogram, str]]:
-    """Name, correlogram and what it says: of the autocorrelation, then of each range of lags behind the direct sound."""
+    """Name and judge each correlogram: the autocorrelation, then the cross-correlation in each range of lags."""
     auto = found.autocorrelation
     at = auto.lags_ms[auto.largest]
-    rows = [("autocorrelation", auto, f"not white, largest at {at:.1f} ms" if auto.dependent else "white")]
+    rows = [("autocorrelation", auto, f"not white, largest value at {at:.1f} ms" if auto.dependent else "white")]
     for zone in found.zones:
-        heavy, light = f"{100 * zone.share:.0f} % of it: {zone.meaning}", "dependent, but less than 1 % of it"
+        heavy, light = (
+            f"{100 * zone.share:.0f} % of it: {zone.meaning}",
+            f"dependent, but below {100 * WEIGHT:.0f} % of it",
+        )
         says = (heavy if zone.share >= WEIGHT else light) if zone.part.dependent else "independent"
         rows.append((f"{zone.low_ms:g} to {zone.high_ms:g} ms", zone.part, says))
     return rows
@@ -308,7 +304,9 @@ def _drawn(part: Correlogram) -> dict[str, object]:
     return {"from_ms": float(part.lags_ms[0]), "step_ms": step, **arrays}
 
 
-def _cells(row: Candidate) -> tuple[str, ...]:
+def cells_of(row: Candidate) -> tuple[str, ...]:
+    """Format the columns HEADS of a tried effect."""
+
     def shown(value: float | None, digits: int) -> str:
         return "-" if value is None else f"{round(value, digits) + 0.0:.{digits}f}"
 
@@ -319,7 +317,7 @@ def _cells(row: Candidate) -> tuple[str, ...]:
 
 
 def proof_line(proof: Proof | None, unproven: str) -> str:
-    """What the running filter made of what was found, or why it was not asked."""
+    """Format the running filter's ERLE without and with the effects, or say why nobody has measured it."""
     if proof is None:
         return f"proof       none: {unproven}"
     return (

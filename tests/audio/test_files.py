@@ -215,7 +215,7 @@ def test_what_fitted_on_a_full_disk_stays_a_valid_file(tmp_path, suffix):
 
 def test_recorder_keeps_the_exact_blocks(tmp_path):
     mic, ref = noise(999, 1) * np.float32(3.3), noise(999, 2) / np.float32(7)
-    with Recorder(tmp_path / "deep" / "input") as recorder:
+    with Recorder(tmp_path / "deep" / "input", 1) as recorder:
         for at in (0, 500):
             recorder.write(Block(mic[at : at + 500], ref[at : at + 500], at))
             recorder.write_output(2 * mic[at : at + 500])
@@ -229,7 +229,7 @@ def test_recorder_keeps_the_exact_blocks(tmp_path):
 
 def test_a_recording_longer_than_a_wav_file_can_be_ends_and_what_is_there_stays_valid(tmp_path, monkeypatch):
     monkeypatch.setattr(recorder_module, "MOST", 1000)
-    with Recorder(tmp_path) as recorder:
+    with Recorder(tmp_path, 1) as recorder:
         for at in range(0, 2000, 400):
             recorder.write(Block(noise(400), noise(400), at))
             recorder.write_output(noise(400))

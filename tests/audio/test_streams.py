@@ -98,7 +98,7 @@ def test_a_device_is_found_by_number_name_or_part_of_it(wanted, kind, index):
 ])  # fmt: skip
 def test_a_device_that_is_not_clear_is_answered_with_names(wanted, kind, words):
     with pytest.raises(UsageError, match=words):
-        match(DEVICES, wanted, kind)
+        match(DEVICES, wanted, kind, -1)
 
 
 PHONE = "usb-Acme_Speakerphone-00"
@@ -128,16 +128,16 @@ def test_a_part_of_a_sound_servers_name_is_enough(wanted, kind, name):
 
 def test_an_unknown_device_is_answered_with_the_names_that_work_and_not_with_the_way_to_the_server():
     with pytest.raises(UsageError, match="expected one of 'alsa_input.usb-Acme_Speakerphone-00'") as caught:
-        match(SERVED, "trumpet", "input")
+        match(SERVED, "trumpet", "input", -1)
     assert "'pulse'" not in str(caught.value) and "'default'" not in str(caught.value)
     assert "2 'HDA Intel'" in str(caught.value)
     with pytest.raises(UsageError, match="ambiguous; it matches 'alsa_input.usb.*', 'alsa_input.pci"):
-        match(SERVED, "alsa_input", "input")
+        match(SERVED, "alsa_input", "input", -1)
 
 
 def test_no_device_at_all_is_said():
     with pytest.raises(DeviceError, match="no sound device with an input"):
-        match([], None, "input")
+        match([], None, "input", -1)
 
 
 def test_monitors_are_found_by_the_names_of_each_sound_system():

@@ -95,7 +95,7 @@ def test_what_is_stationary_is_not_claimed_and_what_moves_is(tmp_path, said, cap
     assert told["ranking"][0]["parameters"]["ppm"]["value"] == pytest.approx(-120.0, abs=5.0)
     assert any("cannot be told" in text for text in told["warnings"])
     page = (tmp_path / "d.html").read_text()
-    assert "none: the recording itself" in page and "besides what is stationary and linear" in page
+    assert "none: the recording itself" in page and "more than a stationary linear path" in page
     assert "edgefilter</span> <span>calibrate" in page and "edgefilter</span> <span>add" not in page
 
 

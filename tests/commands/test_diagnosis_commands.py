@@ -120,7 +120,7 @@ def test_diagnose_finds_what_is_missing_and_writes_the_documented_json(scene, ca
     assert set(found["where"]) == {"bands", "times", "levels", "lags"}
     assert main(arguments(scene, "diagnose")) == 0
     out = capsys.readouterr().out
-    assert "verdict     missing: Missing from the profile: a turned volume." in out
+    assert "verdict     missing: The profile lacks a turned volume." in out
     assert "next        edgefilter add playback_gain --profile " in out
 
 

@@ -86,7 +86,7 @@ def test_the_text_says_all_of_it(diagnosed):
     found = diagnosed[2]
     text = "\n".join(diagnosis_lines(found))
     assert "playback_gain.gain_db  -2.00 +/- 0.0" in text
-    assert "correlations with all that was found" in text and "correlations of what is left" in text
+    assert "correlations with all findings" in text and "correlations of the residual" in text
     assert "Delta BIC  verdict" in text
     left, profile_alone = (independence_lines(test)[3] for test in (found.independence, found.comparison.independence))
     assert "first arrival, changed" in profile_alone and "first arrival, changed" not in left
@@ -103,7 +103,7 @@ def test_numbers_say_where_their_error_is_from():
         "12.0 +/- 0.300 (2.5 %)",
         "2.00 +/- 0.100 s (5 %), from fits to thirds of the recording",
         "100, at its bound",
-        "0.00100 +/- 0.0100 (unknown: more than itself)",
+        "0.00100 +/- 0.0100 (the error exceeds the number)",
     ]
     lines = precision_lines(Precision(tuple(rows), (("a.q", "a.s[1]", -0.83),)))
     assert lines[-1] == "  a.q, a.s[1]  -0.83"

@@ -153,7 +153,7 @@ def test_frames_cut_from_the_stored_sound_are_the_engines_own(parts):
     front = front_end(item.stage, item.profile, stft, np.random.default_rng(0))
     heard = listen(front, item.mic, item.reference, item.clean, item.fan, stft)
     for t in (50, 120, 180):
-        found = stft.analyse(heard.error[(t - 1) * 256 : (t + 1) * 256])
+        found = np.fft.rfft(heard.error[(t - 1) * 256 : (t + 1) * 256] * stft.analysis_window)
         np.testing.assert_allclose(found, frames[t].error, atol=1e-5 * np.abs(frames[t].error).max() + 1e-7)
         told = from_bytes(heard.residual[t])
         assert np.abs(10 * np.log10(told / np.maximum(frames[t].residual_psd, 1e-9))).max() < 0.26

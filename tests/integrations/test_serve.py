@@ -48,7 +48,7 @@ def as_float(data):
 @asynccontextmanager
 async def serving(engine="crnn", profile=DEMO / "profile.npz", streams=4, token=None):
     """The address of a service, which is ended afterwards."""
-    service = Service(lambda learns: EgoFilter(profile, engine), streams, token=token)
+    service = Service(lambda learns: EgoFilter(profile, engine), streams, 0, token)
     found = asyncio.get_running_loop().create_future()
     task = asyncio.create_task(service.run("127.0.0.1", 0, found.set_result))
     try:

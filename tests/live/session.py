@@ -78,7 +78,7 @@ def sink():
 
 def measure():
     sound, _ = soundfile.read(folder / "robot.wav", dtype="float32")
-    np.savez(folder / "received.npz", mic=play_and_record("robot", "robot_monitor", sound).samples)
+    np.savez(folder / "received.npz", mic=play_and_record("robot", "robot_monitor", sound)[0])
     return {"size": sound.size}
 
 

@@ -181,7 +181,7 @@ def test_fan_power_on_the_stft_grid_is_what_white_noise_of_that_psd_has():
     profile = make(noise_psd=np.full(GRID_BINS, variance / 8000, np.float32))
     stft = StftConfig()
     frames = rng.standard_normal((4000, stft.window_length)).astype(np.float32) * np.sqrt(variance)
-    measured = np.mean(np.abs(stft.analyse(frames)) ** 2, axis=0)
+    measured = np.mean(np.abs(np.fft.rfft(frames * stft.analysis_window)) ** 2, axis=0)
     expected = profile.noise_bins(stft)
     assert expected.shape == (stft.bins,) and expected.dtype == np.float32
     # 4000 independent frames: one sigma is 1.6 % (2.2 % at the real-valued first and last bin)
@@ -450,8 +450,8 @@ def test_what_a_linear_path_leaves_is_kept_and_a_part_of_it_is_refused(tmp_path)
         ("level_db", np.array([-20.0, -26.0]), r"expected rising levels"),
         ("level_db", np.zeros(0), "expected float64 of one level or more"),
         ("noise", np.zeros((2, 600), np.float32), r"approximation_noise is float32 of shape \(2, 600\)"),
-        ("even", np.full((2, GRID_BINS), np.nan, np.float32), "approximation_even is nan to nan"),
-        ("least_db", np.array([-40.0]), "approximation_least_db is .* expected 2 float64"),
+        ("even", np.full((2, GRID_BINS), np.nan, np.float32), "approximation_even is nan at position 0, expected -1e"),
+        ("least_db", np.array([-40.0]), r"approximation_least_db is float64 of shape \(1,\)"),
     ],
 )
 def test_a_damaged_part_of_what_a_linear_path_leaves_is_one_line(tmp_path, name, array, match):
