@@ -19,10 +19,9 @@ from edgefilter.diagnosis.channels import doubtful_channels
 from edgefilter.dsp.frames import decibels
 from edgefilter.engines import create
 from edgefilter.errors import EdgefilterError
-from edgefilter.filter.budget import DEFAULT_MS
+from edgefilter.filter.budget import DEFAULT_MS, allowed_cores
 from edgefilter.filter.ego_filter import EgoFilter
 from edgefilter.filter.microphones import APART_DB, CLIPPED_DB
-from edgefilter.learning.background import cores
 from edgefilter.profile.data import Profile
 from edgefilter.types import SAMPLE_RATE, Samples
 
@@ -102,7 +101,7 @@ def _guarded(name: str, look: Callable[[], Iterator[Check]]) -> Iterator[Check]:
 
 
 def _machine() -> Iterator[Check]:
-    found = cores()
+    found = len(allowed_cores())
     few = "loudspeaker and room are not learned while running; allow another core"
     yield Check("cores", "ok", str(found)) if found > 1 else Check("cores", "warning", str(found), few)
 

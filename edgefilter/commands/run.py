@@ -23,10 +23,10 @@ from edgefilter.commands.display import describe_latency, say, write_json
 from edgefilter.commands.observers import Observers
 from edgefilter.engines import HAVE_LINEAR_STAGE
 from edgefilter.errors import EdgefilterError, SignalError, UsageError
-from edgefilter.filter.budget import DEFAULT_MS, Choice, choose, forget
+from edgefilter.filter.budget import DEFAULT_MS, Choice, allowed_cores, choose, forget
 from edgefilter.filter.ego_filter import EgoFilter
 from edgefilter.filter.learner import Learner
-from edgefilter.learning.background import BackgroundLearner, cores
+from edgefilter.learning.background import BackgroundLearner
 from edgefilter.profile.data import Profile
 from edgefilter.session import RunReport, filter_blocks
 from edgefilter.types import ALL_CHANNELS, SAMPLE_RATE, Block
@@ -213,7 +213,7 @@ def make_learner(args: argparse.Namespace, live: bool, profile: Profile | None) 
         from edgefilter.learning.path_learner import PathLearner
 
         return PathLearner(profile, remember)
-    if cores() == 1:
+    if len(allowed_cores()) == 1:
         say("one core only: loudspeaker and room are not learned while running")
         return None
     return BackgroundLearner(profile, remember)

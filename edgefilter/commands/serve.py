@@ -11,8 +11,9 @@ from pathlib import Path
 from edgefilter.commands.display import say
 from edgefilter.errors import EdgefilterError, UsageError
 from edgefilter.filter.barge_in import BargeInSettings
+from edgefilter.filter.budget import allowed_cores
 from edgefilter.filter.ego_filter import EgoFilter
-from edgefilter.learning.background import BackgroundLearner, cores
+from edgefilter.learning.background import BackgroundLearner
 from edgefilter.profile.data import Profile
 
 STREAMS_PER_CORE = 4
@@ -32,7 +33,8 @@ def main(args: argparse.Namespace) -> int:
             " --host out"
         )
     profile = Profile.load(args.profile) if args.profile else None
-    streams = args.streams or STREAMS_PER_CORE * cores()
+    cores = len(allowed_cores())
+    streams = args.streams or STREAMS_PER_CORE * cores
 
     def make_filter(learns: bool) -> EgoFilter:
         learner = BackgroundLearner(profile) if learns else None
@@ -45,7 +47,7 @@ def main(args: argparse.Namespace) -> int:
         say(f"serving ws://{args.host}:{port} to {whose}, {streams} streams at most; Ctrl-C ends it")
 
     async def run() -> None:
-        service = Service(make_filter, streams, cores() - 1, token)
+        service = Service(make_filter, streams, cores - 1, token)
         loop = asyncio.get_running_loop()
         for number in (signal.SIGINT, signal.SIGTERM):
             loop.add_signal_handler(number, service.stop)

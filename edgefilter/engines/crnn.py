@@ -53,7 +53,6 @@ are noticed as soon.
 """
 LASTING = 3
 """Frames that must be as loud, so that no click counts."""
-ONE = np.float32(1.0)
 
 
 class Level(NamedTuple):
@@ -114,7 +113,8 @@ class Crnn:
         noise = np.random.default_rng(0).standard_normal((4, self.stft.bins, 2), np.float32)
         mic, reference, echo, error = noise.view(np.complex64)[..., 0]
         power = np.ones(self.stft.bins, np.float32)
-        places = self._run(Frame(mic, reference, echo, error, power, power), self.initial_state()[0], ONE, ONE)
+        frame, one = Frame(mic, reference, echo, error, power, power), np.float32(1.0)
+        places = self._run(frame, self.initial_state()[0], one, one)
         return [places.spectrum, places.probability, *places.next_states]
 
     def initial_state(self) -> CrnnState:

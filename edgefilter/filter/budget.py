@@ -103,7 +103,7 @@ def choose(
     again; what is missing is measured, in less than 6 s an engine, and once more where it is too slow, for something else
     may have taken the cores. say: told what is going on. Raises UsageError where no candidate can be made.
     """
-    cores = min(CORES, len(_allowed()))
+    cores = min(CORES, len(allowed_cores()))
     about = _about(cores, profile)
     known = recall(about, say)
     found: list[Figures] = []
@@ -172,7 +172,7 @@ def pace(
 @contextmanager
 def held_to(cores: int) -> Iterator[None]:
     """Let this thread run on the first so many of its cores only, where the system can do that."""
-    before = _allowed()
+    before = allowed_cores()
     if not hasattr(os, "sched_setaffinity"):
         yield
         return
@@ -183,7 +183,8 @@ def held_to(cores: int) -> Iterator[None]:
         os.sched_setaffinity(0, before)
 
 
-def _allowed() -> set[int]:
+def allowed_cores() -> set[int]:
+    """Numbers of the cores that this process may use."""
     return os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else set(range(os.cpu_count() or 1))
 
 

@@ -13,11 +13,10 @@ from edgefilter.engines.ladder import CANDIDATES, Ladder, climbable
 from edgefilter.errors import EdgefilterError, SignalError, UsageError
 from edgefilter.filter.barge_in import BargeInSettings
 from edgefilter.filter.learner import Learner
-from edgefilter.filter.microphones import Microphones
 from edgefilter.filter.stepping import Stepping
 from edgefilter.filter.stream import Stream
 from edgefilter.profile.data import Profile
-from edgefilter.types import SAMPLE_RATE, ArrayStats, Event, Samples, Stats, as_samples
+from edgefilter.types import SAMPLE_RATE, Event, Samples, Stats, as_samples
 
 if TYPE_CHECKING:
     from edgefilter.engines.onnx_session import Model
@@ -294,7 +293,7 @@ class EgoFilter:
             "samples": self._stream.samples_in,
             "alignment": front.aligner.stats() if front.aligner else None,
             "linear_stage": front.linear_stage.canceller.stats() if front.linear_stage else None,
-            "array": _array_stats(front.microphones),
+            "array": front.microphones.stats() if front.microphones else None,
             "learning": self._stream.learner.stats() if self._stream.learner and front.linear_stage else None,
             "deadline": self._stream.stepping.stats() if self._stream.stepping else None,
         }
@@ -324,16 +323,6 @@ class EgoFilter:
             raise SignalError(f"nothing to write back: give a profile and an engine with a linear stage ({names})")
         canceller = stage.canceller
         return profile.with_running_responses(canceller.impulse_response(), canceller.volume.gain, stage.path.effects)
-
-
-def _array_stats(microphones: Microphones | None) -> ArrayStats | None:
-    if microphones is None:
-        return None
-    return {
-        "microphones": microphones.count,
-        "reference": microphones.first,
-        "left_out": {str(at): why for at, why in sorted(microphones.left_out.items())},
-    }
 
 
 def strongest(profile: Profile | None) -> tuple[Engine | ClipEngine, str]:

@@ -6,7 +6,7 @@ import numpy as np
 
 from edgefilter.dsp.exchange import EQUAL, exchanged, order_of
 from edgefilter.dsp.lag import played_in
-from edgefilter.types import SAMPLE_RATE, Array, Samples
+from edgefilter.types import SAMPLE_RATE, Array, ArrayStats, Samples
 
 GOOD_BLOCKS = 3
 """Blocks of a second, over which microphones are compared, in a row without a reason, after which one that was left out comes
@@ -69,6 +69,11 @@ class Microphones:
     def used(self) -> np.ndarray:
         """(count,) bool."""
         return np.array([at not in self.left_out for at in range(self.count)])
+
+    def stats(self) -> ArrayStats:
+        """Ready for JSON."""
+        left_out = {str(at): why for at, why in sorted(self.left_out.items())}
+        return {"microphones": self.count, "reference": self.first, "left_out": left_out}
 
     def step(self, mic: Samples, error: Samples, ref: Samples, aligned: Samples, located: bool) -> bool:
         """Take a hop; whether others are used from now on.

@@ -198,8 +198,3 @@ class _Worker:
             found.append(pickle.loads(self._received[LENGTH.size : stop]))
             del self._received[:stop]
         return found
-
-
-def cores() -> int:
-    """Cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

@@ -49,7 +49,7 @@ def test_what_is_missing_is_found_and_the_rest_still_checked(monkeypatch):
     from edgefilter.audio import device
 
     monkeypatch.setattr(doctor, "create", raises(ModelError("model x is not the one: reinstall edgefilter")))
-    monkeypatch.setattr(doctor, "cores", lambda: 1)
+    monkeypatch.setattr(doctor, "allowed_cores", lambda: {0})
     monkeypatch.setattr(pulse, "names", lambda kind: [])
     monkeypatch.setattr(pulse, "default_name", lambda kind: "")
     monkeypatch.setattr(device, "_sounddevice", raises(DeviceError("live audio needs the PortAudio library")))
