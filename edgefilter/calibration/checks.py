@@ -9,11 +9,14 @@ from scipy import signal
 from edgefilter.calibration.sweep import EARLIEST_DIRECT, LATEST_DIRECT, MIN_TAPS, Deconvolution, SweepLaw, deconvolve
 from edgefilter.dsp.fourier import power
 from edgefilter.dsp.frames import block_power, blocks
-from edgefilter.dsp.lag import LOWEST_HZ
 from edgefilter.dsp.psd import frequencies, hann
 from edgefilter.errors import CalibrationError
 from edgefilter.profile.data import LOW_SNR_DB
 from edgefilter.types import PRE_ROLL, SAMPLE_RATE, Array, Samples
+
+SPEECH_HZ = (110.0, 7100.0)
+"""A warning is about bands that end above the one and begin below the other; a small loudspeaker radiates nothing beyond them,
+and that is no fault of the calibration."""
 
 
 def check_lengths(law: SweepLaw, recording: Samples, noise: Samples) -> None:
@@ -112,9 +115,10 @@ def short_recording(law: SweepLaw, recording: Samples, direct: int) -> str | Non
 
 
 def low_snr(bands: Array, snr: Array) -> str | None:
-    """Bands in which the fan hides the sweep; a small loudspeaker radiates no rumble, and that is no fault of the calibration."""
+    """Bands of speech in which the fan hides the sweep."""
+    inside = (bands[:, 1] > SPEECH_HZ[0]) & (bands[:, 0] < SPEECH_HZ[1])
     runs: list[list[int]] = []
-    for i in np.flatnonzero((bands[:, 1] > LOWEST_HZ) & (snr < LOW_SNR_DB)):
+    for i in np.flatnonzero(inside & (snr < LOW_SNR_DB)):
         if runs and runs[-1][-1] == i - 1:
             runs[-1].append(int(i))
         else:

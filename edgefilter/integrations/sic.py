@@ -96,6 +96,8 @@ class SilencedRequest(SICRequest):
 class HumanComponent(SICComponent):
     """Takes AudioMessage of the microphone, AudioRequest of what is said, and sends AudioMessage and SpeechMessage."""
 
+    COMPONENT_STARTUP_TIMEOUT = 10
+
     def __init__(self, *words: object, **more: object) -> None:
         super().__init__(*words, **more)
         said = {name: value for name, value in vars(self.params).items() if name in _default and value is not None}
