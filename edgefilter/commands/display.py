@@ -39,7 +39,7 @@ The status line of a live run:
   mic, robot, out    level of microphone, reference and output, dB of full scale
   crnn 23 %          the engine at work, and its computing time in per cent of the duration of the sound
   late 5             hops whose computing took longer than the sound in them (16 ms)
-  lost 7             samples that no device delivered; silence stands in their place
+  lost 7             samples that no device delivered; silence replaces them
   overruns 3         blocks before which a device reported that it had dropped sound
   residual -25 dB    output against microphone while the robot talks and no human does: what is left of the robot
   lag 43.1 ms        delay of the robot's voice in the microphone after the reference ("-": not found yet)

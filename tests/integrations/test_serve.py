@@ -233,7 +233,7 @@ def test_opus_at_32_kbit_leaves_enough_of_the_echo_to_notice_the_human(conversat
     decoder = Decoder()
     out = soxr.resample(np.concatenate([decoder.decode(packet) for packet in sound]), 48000, RATE)
     (began,) = (each["time"] for each in told if each["kind"] == "speech_started")
-    assert 9.1 < began < 13.5  # docs/serve.md: at 12.96 s
+    assert 9.1 < began < 13.5
     span = slice(BOTH.start, min(BOTH.stop, out.size) - 800)
     found = max(si_sdr(out[span.start + late : span.stop + late], human[span]) for late in range(0, 800, 2))
     assert found > si_sdr(mic[BOTH], human[BOTH]) + 15
