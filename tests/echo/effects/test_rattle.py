@@ -8,7 +8,7 @@ from scipy import signal
 
 from edgefilter.echo.effect import complete
 from edgefilter.echo.effects import catalogue
-from edgefilter.echo.effects.rattle import DIRECT, find_knocks, resonated
+from edgefilter.echo.effects.rattle import find_knocks, resonated
 from edgefilter.types import PRE_ROLL
 from tests.conformance import fan, held_out_power, robot_alone, robot_model
 
@@ -66,14 +66,13 @@ def test_fit_finds_what_sets_it_off_and_how_it_sounds():
 
 
 def test_variance_rings_after_each_knock_when_it_is_heard():
-    assert DIRECT == PRE_ROLL
     x = np.zeros(8000, np.float32)
     x[1000:1400] = 0.5
     values = complete(RATTLE, {"threshold": 0.2, "power": 1e-4, "decay_ms": 5.0})
     variance = RATTLE.variance(x, values, 16_000)
     knock = int(np.flatnonzero(find_knocks(resonated(x, 200.0, 1.0), 0.2)[0])[0])
-    assert variance[: knock + DIRECT].max() == 0.0 and variance[knock + DIRECT] > 0.0
-    assert variance[knock + DIRECT + 80] / variance[knock + DIRECT] == pytest.approx(np.exp(-1), rel=0.01)
+    assert variance[: knock + PRE_ROLL].max() == 0.0 and variance[knock + PRE_ROLL] > 0.0
+    assert variance[knock + PRE_ROLL + 80] / variance[knock + PRE_ROLL] == pytest.approx(np.exp(-1), rel=0.01)
     assert not RATTLE.variance(x, complete(RATTLE, {}), 16_000).any()
 
 
