@@ -70,21 +70,18 @@ def _forward(bench: Workbench, model: EchoModel, wanted: Sequence[str]) -> tuple
 
 
 def _followed(wanted: Sequence[str]) -> list[str]:
-    """Names of the effects that the running filter follows, less those that are wanted and those that a wanted one holds.
+    """Names of the effects that the running filter follows, less those that are wanted, those that a wanted one holds, and noise.
 
     A flexible effect on the path has the volume in it: beside it a gain is anything. A lag by time of the user's own has the
-    clocks in it.
+    clocks in it. Noise moves no fit.
     """
     wished = [find(name) for name in wanted]
-    held = {
+    left = {
+        "additive noise",
         *("linear path" for effect in wished if effect.stage == "path" and effect.flexible),
         *("time" for effect in wished if effect.family == "time" and not effect.followed),
     }
-    return [
-        name
-        for name in names()
-        if find(name).followed and not find(name).adds_noise and name not in wanted and find(name).family not in held
-    ]
+    return [name for name in names() if find(name).followed and name not in wanted and find(name).family not in left]
 
 
 def _without(model: EchoModel, dropped: Sequence[str]) -> EchoModel:

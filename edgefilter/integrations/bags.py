@@ -13,11 +13,13 @@ from rosbags.highlevel import AnyReader, AnyReaderError
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from edgefilter.audio.files import open_sink
-from edgefilter.audio.pairing import MAX_WAIT
 from edgefilter.dsp.resample import Resampler
 from edgefilter.errors import AudioFileError, UsageError
 from edgefilter.integrations.duplex import from_pcm16
 from edgefilter.types import SAMPLE_RATE, Samples
+
+GAP_S = 0.25
+"""By how much a message's time must be behind what was written for silence to be put in: messages come with jitter."""
 
 
 def extract(bag: Path, topics: dict[str, str], folder: Path, rate: int, channels: int) -> dict[str, float]:
@@ -47,8 +49,7 @@ def extract(bag: Path, topics: dict[str, str], folder: Path, rate: int, channels
             written = 0
             for time, samples in parts:
                 missing = round((time - begin) * rate) - samples.size - written
-                # messages come with jitter, as a device's sound does
-                if missing > MAX_WAIT / SAMPLE_RATE * rate or (missing > 0 and not written):
+                if missing > GAP_S * rate or (missing > 0 and not written):
                     sink.write(resampler.push(np.zeros(missing, np.float32)))
                     written += missing
                 sink.write(resampler.push(samples))

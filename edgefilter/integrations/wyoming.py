@@ -39,7 +39,6 @@ from edgefilter.audio.reader import RATES
 from edgefilter.errors import EdgefilterError, SignalError
 from edgefilter.filter.barge_in import BargeInSettings
 from edgefilter.filter.ego_filter import EgoFilter
-from edgefilter.filter.turns import BEFORE_S
 from edgefilter.integrations.channels import named, numbers
 from edgefilter.integrations.duplex import ABSENT_S, MOST_QUEUED_S, Duplex, as_pcm16, from_pcm16
 from edgefilter.integrations.turns import TurnByTurn
@@ -53,6 +52,8 @@ it is dropped."""
 UNDER_WAY_S = 1.0
 """For how long a recogniser that is told that the human has ended waits for the filter's word: it takes half a second of
 pause, and the sound half as much to the filter."""
+WAY_S = 0.5
+"""How long after its sound the message may come with which a client begins: what was said before is not part of it."""
 MIC_URI, SND_URI, ASR_URI = "tcp://127.0.0.1:10600", "tcp://127.0.0.1:10601", "tcp://127.0.0.1:10602"
 ABOUT: dict[str, Any] = {
     "attribution": Attribution("edgefilter", url=""),
@@ -331,8 +332,7 @@ class _Recogniser(_Client):
         elif Transcribe.is_type(event.type):
             self._asked = event
         elif AudioStart.is_type(event.type):
-            # the message comes after its sound, as a notice of speech does; what was said before is not part of it
-            self._turns.start(self._service.duplex.heard - round(BEFORE_S * SAMPLE_RATE))
+            self._turns.start(self._service.duplex.heard - round(WAY_S * SAMPLE_RATE))
         elif AudioChunk.is_type(event.type):
             chunk = _chunk_of(event)
             self._turns.hear(from_pcm16(chunk.audio, chunk.channels), chunk.rate)

@@ -24,7 +24,8 @@ PASSED_HZ, FLAT_DB = 300.0, 0.3
 STEEP = 16.0
 """Order of a cut that shows in the power alone."""
 GONE, KEPT = 0.25, 0.5
-"""Of the predicted power above a cut-off, no more than this part is there; less than the other is, where it is not said to be."""
+"""Parts of the predicted power above a cut-off: no more than the first is there where the power alone shows the cut, less than the
+second where the waveform does."""
 SURE = 4.0
 """And what is missing is so many standard deviations: by chance at one edge in thirty thousand."""
 PASSED = (0.8, 1.2)
