@@ -102,7 +102,7 @@ class Listener:
         return ()
 
     def step(self, frame: Frame, state: EngineState) -> tuple[Output, EngineState]:
-        self.frames.append(Frame(*(part.copy() for part in frame[:-1]), frame.idle))
+        self.frames.append(Frame(*(part.copy() for part in frame[:6]), *frame[6:]))
         return Output(frame.error), state
 
 

@@ -12,6 +12,7 @@ from edgefilter.alignment.coarse_lag import CoarseLag
 from edgefilter.alignment.delay_line import HALF_WIDTH, Aligned, Tape, kernel_table, read_delayed, read_line
 from edgefilter.alignment.delay_tracker import REACH, STRIDE, DelayMeasurement, DelayMeter
 from edgefilter.alignment.drift_filter import DriftFilter
+from edgefilter.alignment.first_sounds import FirstSounds
 from edgefilter.alignment.jumps import DRIFTED, SMALL, JumpWitness, judge
 from edgefilter.alignment.lag_search import (
     BETWEEN,
@@ -63,8 +64,10 @@ class Aligner:
     def __init__(self, hop: int, profile: Profile | None = None, max_lag_s: float = MOST_LAG_S) -> None:
         self.hop = hop
         self._max_lag = int((max_lag_s + 0.1) * SAMPLE_RATE)
+        self._latest = self._max_lag + SAMPLE_RATE // 4  # samples from the begin of an utterance until it is heard
         further = profile.array.responses if profile and profile.array else ()
         self._calibrated = None if profile is None else [profile.echo.impulse_response, *further]
+        self._first = FirstSounds(hop, profile.echo.running_response()) if profile else None
         kernel_table()
         self.reset()
 
@@ -81,6 +84,8 @@ class Aligner:
     def reset(self) -> None:
         """Forget everything, as after construction."""
         self._used = [0]
+        if self._first:
+            self._first.reset()
         self._listen_for(self._calibrated)
         self._ref = Tape(self._lags.span + SAMPLE_RATE)
         self._mics = [Tape(self._ref.capacity)]
@@ -195,7 +200,7 @@ class Aligner:
             return "coarse" if self._audible() else "idle"
         begun = [utterance.start for utterance in self._open if not utterance.lost]
         if begun and (self._known or self._audible()):
-            return "begun" if self._ref.end <= begun[-1] + self._max_lag + SAMPLE_RATE // 4 else "unfound"
+            return "begun" if self._ref.end <= begun[-1] + self._latest else "unfound"
         if not self._audible():
             return "idle"
         if self._open and self._known:
@@ -210,7 +215,7 @@ class Aligner:
     def _expire(self) -> None:
         """Give up utterances that would have been heard by now."""
         end = self._open[1].start if len(self._open) > 1 else self._onsets.current.end
-        if self._ref.end > end + self._max_lag + SAMPLE_RATE // 4:
+        if self._ref.end > end + self._latest:
             self._resolve(found=False)
             self._missed = True
             if not self._known and self._responses is not None:
@@ -383,7 +388,8 @@ class Aligner:
 
     def _deliver(self, mic: Samples, before: float, switched: bool) -> Aligned:
         if not (self._known or self._coarse):
-            return Aligned(self.history(self.hop), float("nan"), 0.0, 0.0, self._state(), switched)
+            nothing = self.history(self.hop)
+            return Aligned(nothing, float("nan"), 0.0, 0.0, self._state(), switched, self._at_any_lag(mic, nothing))
         self._read_at = max(self._drift.delay - self._margin, 0.0)
         end = self._ref.end
         start = self._read_at - self._drift.slope * self.hop if switched else before
@@ -397,7 +403,20 @@ class Aligner:
         if self._refuted:
             reference = np.zeros(self.hop, np.float32)
         ppm = -1e6 * self._drift.slope
-        return Aligned(reference, self._drift.delay, ppm, self._confidence, self._state(), switched)
+        anywhere = self._at_any_lag(mic, reference)
+        return Aligned(reference, self._drift.delay, ppm, self._confidence, self._state(), switched, anywhere)
+
+    def _at_any_lag(self, mic: Samples, reference: Samples) -> bool:
+        """What `Aligned` says of it, for a hop of the microphone and the reference at the delay of before.
+
+        Never after an utterance that failed to arrive: the loudspeaker may be muted, or be headphones.
+        """
+        waits = False
+        if self._open and not self._missed and self._ref.end <= self._open[0].start + self._latest:
+            waits = self._refuted or not (self._coarse or self._open[0].lost)
+        if self._first is None:
+            return waits and (self._refuted or not self._known)
+        return self._first.step(mic, reference, self._onsets.peak, self._gain, waits or self._expected is not None)
 
     def _cannot_be(self, mic: Samples) -> bool:
         """Whether the microphone holds 10 dB less than the reference at the old delay would bring there."""

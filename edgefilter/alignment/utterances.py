@@ -51,13 +51,14 @@ class Sustained:
 class OnsetDetector:
     """Cuts the reference into utterances, hop by hop.
 
-    current: the last one that began; before the first, one that ended long ago.
+    current: the last one that began; before the first, one that ended long ago. peak: mean square of the loudest hop of the
+    last seconds.
     """
 
     def __init__(self, hop: int) -> None:
         self._hop = hop
         self._sustained = Sustained()
-        self._peak = 0.0
+        self.peak = 0.0
         self._decay = 0.1 ** (hop / (10.0 * SAMPLE_RATE))
         self.now = 0
         self.current = Utterance(NEVER, NEVER)
@@ -70,8 +71,8 @@ class OnsetDetector:
         """
         self.now += self._hop
         power = float(ref.dot(ref)) / self._hop
-        self._peak = max(self._sustained.step(power), self._peak * self._decay)
-        self.active = power > max(FLOOR, RANGE * self._peak)
+        self.peak = max(self._sustained.step(power), self.peak * self._decay)
+        self.active = power > max(FLOOR, RANGE * self.peak)
         if not self.active:
             return None
         fresh = self.now - self.current.end > PAUSE

@@ -104,10 +104,6 @@ class Analyser:
         np.multiply(recent, self._window, out=self._windowed)
         return fourier.rfft(self._padded)
 
-    def scale_past(self, gain: float) -> None:
-        """Scale what is held of all channels' earlier hops: the frames to come hear it with this gain."""
-        self._recent *= np.float32(gain)
-
 
 class Synthesiser:
     """Overlap-add; each frame finishes one hop of samples, which lag window_length - hop behind the frame's end."""

@@ -38,5 +38,12 @@ class SpectralSubtraction:
         unwanted = frame.noise_psd + frame.residual_psd + fourier.TINY
         observed = frame.error.real**2 + frame.error.imag**2
         wanted = MEMORY * state + (1.0 - MEMORY) * np.maximum(observed - unwanted, 0.0)
-        gain = np.maximum(wanted / (wanted + unwanted), FLOOR)
+        floor = noise_alone(frame) if frame.at_any_lag else FLOOR
+        gain = np.maximum(wanted / (wanted + unwanted), floor)
         return Output(gain * frame.error), gain * gain * observed
+
+
+def noise_alone(frame: Frame) -> Samples:
+    """(bins,) gain that leaves of the error no more than FLOOR of the noise."""
+    power = fourier.power(frame.error)
+    return FLOOR * np.sqrt(np.minimum(frame.noise_psd, power) / (power + fourier.TINY))

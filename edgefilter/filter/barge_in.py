@@ -24,9 +24,6 @@ loudspeakers all are noticed, 20 within 0.5 s; of 24 in simulated conversations 
 the real robots alone and 8 of the simulated ones start nothing."""
 CENTRE_CALIBRATED = 2.25
 """The same with a profile: the network was trained on what a calibrated path leaves, and is wrong less often."""
-CENTRE_BEGUN = 5.2
-"""The same while an utterance of the robot has begun and its lag is not found: its first sound comes without its reference,
-as a human does."""
 
 
 @dataclass(frozen=True)
@@ -72,18 +69,17 @@ class HumanJudge:
         self._follow = 1.0 - math.exp(-hop_s / ODDS_MEMORY_S)
         self._odds = 0.0
 
-    def step(self, probability: float, suspect: bool = False, begun: bool = False) -> float:
+    def step(self, probability: float, suspect: bool = False) -> float:
         """Probability that a human speaks, 0 to 1, from the engine's.
 
-        suspect: whether what sounds may well be an utterance of the robot that is not found yet; the answer is then 0.
-        begun: whether there is such an utterance, audible or not.
+        suspect: whether what sounds may well be the robot, whose reference comes later; the answer is then 0.
         """
         if suspect:
             self._odds = 0.0
             return 0.0
         odds = math.log(max(probability, 1e-9) / max(1.0 - probability, 1e-9))
         self._odds += self._follow * (min(max(odds, ODDS_RANGE[0]), ODDS_RANGE[1]) - self._odds)
-        return 1.0 / (1.0 + math.exp(-SLOPE * (self._odds - (CENTRE_BEGUN if begun else self._centre))))
+        return 1.0 / (1.0 + math.exp(-SLOPE * (self._odds - self._centre)))
 
 
 class BargeIn:

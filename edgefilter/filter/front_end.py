@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 
 from edgefilter.alignment.aligner import Aligner
@@ -17,7 +15,6 @@ from edgefilter.filter.canceller import Canceller, CancellerOutput
 from edgefilter.filter.echo_path import EchoPath, starting_path
 from edgefilter.filter.learner import FilteredHop, Learner, Lesson
 from edgefilter.filter.microphones import Microphones
-from edgefilter.filter.onset_gate import GATE, OnsetGate
 from edgefilter.filter.residual_echo import Residual, Unpredictable
 from edgefilter.filter.spatial import SpatialFilter
 from edgefilter.profile.data import Profile
@@ -89,7 +86,7 @@ class FrontEnd:
 
     What it does depends on the engine's `front`: "none" passes the microphone, "paper" only delays the reference, once per
     utterance, "full" tracks the delay and cancels the echo.
-    aligner: None for "none". linear_stage: None but for "full". gate: None but for "full" with a profile. microphones: of
+    aligner: None for "none". linear_stage: None but for "full". cut: (bins,) gain of every spectrum, None for 1. microphones: of
     an array, and None for a single one; the kinds without a linear stage hear its first. spatial: None but for "full" with
     an array. errors: (microphones, bins) of the latest frame of an array. linear: what the linear stage made of the latest
     hop.
@@ -112,7 +109,6 @@ class FrontEnd:
         self.spatial: SpatialFilter | None = None
         self.errors: Spectrum | None = None
         self.linear: CancellerOutput | None = None
-        self.gate: OnsetGate | None = None
         self.linear_stage: LinearStage | None = None
         if engine.front == "paper":
             self.aligner = aligner or PaperAligner(stft.hop)
@@ -121,8 +117,6 @@ class FrontEnd:
             self.aligner = tracking
             if microphones:
                 tracking.hear_by(range(microphones))
-            if profile:
-                self.gate = OnsetGate(stft.hop, float(np.sum(np.square(profile.echo.running_response()))))
             path = starting_path(profile, stft.hop, microphones)
             self.linear_stage = LinearStage(tracking, path, Residual(stft, profile), learner)
             self._source: SourceChain | None = None
@@ -131,10 +125,11 @@ class FrontEnd:
                 self.spatial = SpatialFilter(stft, microphones, noise)
         channels = 2 if self.linear_stage is None else 4 if microphones is None else 1 + 2 * microphones
         self._analyser = Analyser(stft, channels)
-        self._low_cut = None if profile or not self.linear_stage else low_cut(stft)
+        self.cut = None if profile or not self.linear_stage else low_cut(stft)
         self._nothing = np.zeros(stft.bins, np.float32)
         self._noise = profile.noise_bins(stft) if profile else self._nothing
         self._silence = np.zeros(stft.bins, np.complex64)
+        self._before = False
 
     @property
     def lesson(self) -> Lesson | None:
@@ -156,43 +151,40 @@ class FrontEnd:
             stage.canceller.tell_by(self.microphones.first)
         aligned = stage.aligner.step(heard, ref)
         self.linear = linear = stage.step(heard, aligned)
-        gain = self.gate.step(mic, ref, aligned) if self.gate else None
         added = self._added(stage.path.source)
         if self.spatial and self.microphones:
             located = aligned.state == "locked"
             if self.microphones.step(heard, linear.error, ref, aligned.reference, located):
                 self.spatial.use(self.microphones.used)
                 stage.aligner.hear_by(np.flatnonzero(self.microphones.used).tolist())
-            r, (x, e, error) = self._combined(self.spatial, heard, aligned.reference, linear.echo, gain)
+            r, (x, e, error) = self._combined(self.spatial, heard, aligned.reference, linear.echo)
             uncertainty, fan = self.spatial.independent(linear.uncertainty), self.spatial.fan_psd()
             noise, residual = stage.residual.step(e, error, uncertainty, added, fan)
         else:
-            x, r, e, error = self._spectra(gain, (0, 2, 3), mic, aligned.reference, linear.echo, linear.error)
+            x, r, e, error = self._spectra(mic, aligned.reference, linear.echo, linear.error)
             noise, residual = stage.residual.step(e, error, linear.uncertainty, added)
-        return Frame(x, r, e, error, noise, residual, aligned.state == "idle"), aligned
+        at_any_lag, self._before = aligned.at_any_lag or self._before, aligned.at_any_lag  # a frame is two hops
+        if at_any_lag:
+            residual = np.maximum(residual, fourier.power(error) - noise)
+        return Frame(x, r, e, error, noise, residual, aligned.state == "idle", at_any_lag), aligned
 
     def first_of(self, mic: Samples) -> Samples:
         """(hop,) of the microphone that the answer sounds like, of mic (hop,) or (microphones, hop)."""
         return mic if self.microphones is None else mic[self.microphones.first]
 
-    def _spectra(self, gain: Samples | None, heard: Sequence[int], *signals: Samples) -> Spectrum:
-        """(k, bins) of k signals (hop,); gain: the gate's, None for 1, on those that the microphone has heard."""
-        stacked = np.stack(signals)
-        if gain is not None and self.gate:
-            stacked[list(heard)] *= gain
-            if self.gate.shuts:
-                self._analyser.scale_past(GATE)
-        spectra = self._analyser.push(*stacked)
-        if self._low_cut is not None:
-            spectra *= self._low_cut
+    def _spectra(self, *signals: Samples) -> Spectrum:
+        """(k, bins) of k signals (hop,)."""
+        spectra = self._analyser.push(*signals)
+        if self.cut is not None:
+            spectra *= self.cut
         return spectra
 
     def _combined(
-        self, spatial: SpatialFilter, mic: Samples, reference: Samples, echo: Samples, gain: Samples | None
+        self, spatial: SpatialFilter, mic: Samples, reference: Samples, echo: Samples
     ) -> tuple[Spectrum, Spectrum]:
         """Spectra (bins,) of the reference, and (3, bins) of microphones, echo and error through the spatial filter."""
         count = len(mic)
-        spectra = self._spectra(gain, range(1, 1 + 2 * count), reference, *mic, *echo)
+        spectra = self._spectra(reference, *mic, *echo)
         self.errors = spectra[1 : 1 + count] - spectra[1 + count :]
         x, error = spatial.step(np.stack((spectra[1 : 1 + count], self.errors)))
         return spectra[0], np.stack((x, x - error, error))
@@ -201,9 +193,9 @@ class FrontEnd:
         """Tell the spatial filter of an array what the engine made of the latest frame, and whether a human speaks.
 
         probability: None from an engine that does not judge it; the share of what exceeds fan and residual echo then
-        stands for it, and for the mask.
+        stands for it, and for the mask. Frames that may hold the robot at any lag teach nothing: its echo is not subtracted.
         """
-        if self.spatial is None or self.errors is None:
+        if self.spatial is None or self.errors is None or frame.at_any_lag:
             return
         power = fourier.power(frame.error)
         if probability is None:

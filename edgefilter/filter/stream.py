@@ -219,21 +219,19 @@ class Stream:
             self._collect(frame, engine)
             return np.zeros(0, np.float32)
         output, self._state = engine.step(frame, self._state)
-        begun = aligned is not None and aligned.state == "begun"
         if output.speech_probability is not None:
             self._turns.step(output.spectrum, frame.error, self.front.errors)
-        self._judge_speech(output.speech_probability, begun)
+        self._judge_speech(output.speech_probability)
         self.front.hear(frame, output, self.speech_probability, self.human_speaks)
         return self._synthesiser.push(output.spectrum)
 
-    def _judge_speech(self, probability: float | None, begun: bool) -> None:
+    def _judge_speech(self, probability: float | None) -> None:
         self.speech_probability = probability
         wait = 0
         if probability is not None:
-            suspect = self.front.gate is not None and self.front.gate.suspect
-            if self._watch:
-                suspect, wait = suspect or self._watch.suspect, self._watch.wait // self.engine.stft.hop
-            self.speech_probability = self._judge.step(probability, suspect, begun)
+            suspect = self._watch is not None and self._watch.suspect
+            wait = self._watch.wait // self.engine.stft.hop if self._watch else 0
+            self.speech_probability = self._judge.step(probability, suspect)
         if talk := self._barge_in.note(self.speech_probability, wait):
             self._tell_of_speech(talk, f"probability {self.speech_probability or 0.0:.2f}")
             if self._on_barge_in and talk in INTERRUPTIONS:

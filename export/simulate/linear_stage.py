@@ -11,8 +11,7 @@ from edgefilter.dsp.stft import Analyser, StftConfig, Synthesiser
 from edgefilter.engines.linear import Linear
 from edgefilter.filter.canceller import COLD, WARM, Adaptation, Canceller, CancellerOutput
 from edgefilter.filter.echo_path import EchoPath
-from edgefilter.filter.front_end import FrontEnd, low_cut
-from edgefilter.filter.onset_gate import GATE
+from edgefilter.filter.front_end import FrontEnd
 from edgefilter.learning.path_learner import PathLearner
 from edgefilter.profile.data import Profile
 from edgefilter.types import SAMPLE_RATE, Samples
@@ -155,15 +154,14 @@ def listen(
     """
     hop, hops = stft.hop, mic.size // stft.hop
     own, voices = Analyser(stft, 2), [Synthesiser(stft) for _ in range(5)]
-    cut = low_cut(stft) if front.gate is None else np.ones(stft.bins, np.float32)
+    cut = np.float32(1.0) if front.cut is None else front.cut
     sound = np.zeros((5, (hops + 1) * hop), np.float32)
     noise, residual = np.zeros((2, hops, stft.bins), np.uint8)
     inputs = np.stack([np.append(x[: hops * hop], np.zeros(hop, np.float32)) for x in (mic, reference, clean, fan)])
     for t in range(hops + 1):
         at = slice(t * hop, (t + 1) * hop)
         frame, _ = front.step(inputs[0, at], inputs[1, at])
-        parts = inputs[2:, at] * np.float32(GATE if front.gate and front.gate.shut else 1.0)
-        spectra = frame.mic, frame.reference, frame.error, *(cut * own.push(*parts))
+        spectra = frame.mic, frame.reference, frame.error, *(cut * own.push(*inputs[2:, at]))
         for row, voice, spectrum in zip(sound, voices, spectra):
             row[at] = voice.push(spectrum)
         if t < hops:

@@ -1,0 +1,150 @@
+"""Before the lag of an utterance is known, what can only be the robot is taken for it; nobody else is."""
+
+import numpy as np
+import pytest
+import soundfile
+
+from edgefilter import EgoFilter, enhance
+from edgefilter.alignment.aligner import MOST_LAG_S, Aligner
+from edgefilter.alignment.delay_line import Aligned
+from edgefilter.alignment.first_sounds import LONGEST, FirstSounds
+from edgefilter.filter.budget import DEMO
+from tests.alignment.scene import RATE, fan, hear, known_path, room, run, utterances
+
+HOP = 256
+
+
+def spoken(rng: np.random.Generator, seconds: list[float], pauses: list[float]) -> tuple[np.ndarray, list[int]]:
+    """Utterances that begin loud, and their onsets."""
+    ref, onsets = utterances(rng, seconds, pauses)
+    for onset in onsets:
+        ref[onset : onset + RATE // 12] = 0.0
+    return 2.0 * ref, onsets
+
+
+def told(mic: np.ndarray, ref: np.ndarray, h: np.ndarray | None) -> tuple[np.ndarray, np.ndarray, list[Aligned]]:
+    """Power of each whole hop, whether it may hold the robot at any lag, and what the aligner found.
+
+    h: of a calibrated robot, None for one without a profile.
+    """
+    found = run(Aligner(HOP, None if h is None else known_path(h)), mic, ref)
+    power = np.square(mic[: len(found) * HOP].reshape(-1, HOP)).sum(1)
+    return power, np.array([aligned.at_any_lag for aligned in found]), found
+
+
+@pytest.mark.parametrize("calibrated", [True, False])
+@pytest.mark.parametrize("lags", [(3000, 9000), (9000, 2000)])
+def test_the_robot_is_recognised_until_its_lag_is_found(lags, calibrated):
+    rng = np.random.default_rng(1)
+    h = room(rng, 0.3)
+    ref, onsets = spoken(rng, [2.0, 2.0], [1.5, 1.0])
+    mic = hear(ref, [(0, lags[0]), (onsets[1] - 100, lags[1])], h)[0] + fan(rng, ref.size, 0.001)
+    power, anywhere, found = told(mic, ref, h if calibrated else None)
+    begun = np.array([aligned.state == "begun" for aligned in found])
+    explained = np.array([np.dot(aligned.reference, aligned.reference) for aligned in found])
+    burst = (power > 0.1 * power.max()) & (explained < 0.01 * explained.max()) & begun
+    second = np.arange(power.size) > power.size // 2
+    for part in (second, ~second) if calibrated or lags[1] > lags[0] else (~second,):
+        assert np.any(burst & part)
+        assert np.sum(power[burst & part & ~anywhere]) < 0.1 * np.sum(power[burst & part])
+    assert not np.any(anywhere & ~begun)
+
+
+def test_one_loud_sample_of_the_reference_makes_the_robot_loud_for_a_moment_only():
+    rng = np.random.default_rng(1)
+    h = room(rng, 0.3)
+    ref, onsets = spoken(rng, [2.0, 2.0], [1.5, 1.0])
+    mic = hear(ref, [(0, 3000), (onsets[1] - 100, 9000)], h)[0] + fan(rng, ref.size, 0.001)
+    clicked = ref.copy()
+    clicked[onsets[0] + RATE] = 1e6
+    _, anywhere, _ = told(mic, ref, h)
+    _, after_click, found = told(mic, clicked, h)
+    second = np.arange(len(found)) * HOP > onsets[1]
+    begun = np.array([aligned.state == "begun" for aligned in found])
+    assert np.count_nonzero(anywhere & second & begun) > 2
+    assert np.array_equal(after_click[anywhere & begun], anywhere[anywhere & begun])
+
+
+@pytest.mark.parametrize("level", [0.0, 0.1])
+def test_a_human_20_db_below_a_calibrated_robot_whose_loudspeaker_is_muted_is_untouched(level):
+    rng = np.random.default_rng(2)
+    h = room(rng, 0.3)
+    ref, _ = spoken(rng, [2.0, 2.0], [1.5, 1.0])
+    human = utterances(rng, [4.0], [ref.size / RATE])[0][: ref.size]
+    human *= level * hear(ref, [(0, 3000)], h)[0].std() / human.std()
+    _, anywhere, found = told(human + fan(rng, ref.size, 0.001), ref, h)
+    assert any(aligned.state == "begun" for aligned in found)
+    assert not anywhere.any()
+
+
+@pytest.mark.parametrize("calibrated", [True, False])
+def test_a_human_as_loud_as_a_robot_in_headphones_loses_the_first_utterance_at_most(calibrated):
+    rng = np.random.default_rng(4)
+    h = room(rng, 0.3)
+    ref, onsets = spoken(rng, [1.0, 2.0, 2.0], [3.0, 3.0, 3.0])
+    human = utterances(rng, [11.0], [2.0])[0][: ref.size]
+    human *= hear(ref, [(0, 3000)], h)[0].std() / human.std()
+    _, anywhere, _ = told(human, ref, h if calibrated else None)
+    at = np.flatnonzero(anywhere) * HOP
+    assert at.size and at.max() < onsets[0] + (MOST_LAG_S + 0.4) * RATE
+    assert at.max() < onsets[1] - 1000
+
+
+def test_a_human_as_loud_as_the_robot_who_begins_with_it_loses_a_quarter_second():
+    rng = np.random.default_rng(4)
+    h = room(rng, 0.3)
+    ref, onsets = spoken(rng, [2.0, 2.0], [1.5, 1.0])
+    mic, _ = hear(ref, [(0, 16000)], h)
+    human = utterances(rng, [4.0], [1.0])[0][: ref.size - onsets[1]]
+    mic[onsets[1] : onsets[1] + human.size] += human * mic.std() / human.std()
+    _, anywhere, found = told(mic, ref, h)
+    assert found[onsets[1] // HOP - 10].state in ("locked", "idle")
+    assert np.count_nonzero(anywhere[onsets[1] // HOP :]) * HOP <= LONGEST + HOP
+
+
+def test_soft_first_sounds_of_a_calibrated_voice_make_nobody_loud():
+    rng = np.random.default_rng(5)
+    ref = (1e-4 * rng.standard_normal(2 * RATE)).astype(np.float32)
+    _, anywhere, found = told(fan(rng, ref.size, 0.005), ref, room(rng, 0.3))
+    assert any(aligned.state == "begun" for aligned in found)
+    assert not anywhere.any()
+
+
+def test_from_the_first_sample_on_and_until_nothing_is_waited_for():
+    first, loud = FirstSounds(1, np.ones(1)), np.ones(1, np.float32)
+    assert [first.step(loud, 0 * loud, 0.0, None, waits) for waits in (True, False, True)] == [True, False, True]
+    assert not first.step(loud, loud, 0.0, 1.0, False)
+    assert not first.step(loud, loud, 1.0, 1.0, True)  # the present delay explains it
+
+
+@pytest.mark.parametrize(("engine", "least_db"), [("crnn", 20.0), ("ss", 15.0), ("linear", 10.0)])
+def test_the_first_sounds_of_a_robot_that_nobody_knows_are_lowered(engine, least_db):
+    """Its first words came through as they were, 0 to 10 dB lower with crnn, until the lag was found."""
+    rng = np.random.default_rng(6)
+    ref, _ = spoken(rng, [2.0], [1.0])
+    mic = hear(ref, [(0, 3000)], room(rng, 0.3))[0] + fan(rng, ref.size, 0.0005)
+    ego, states, out = EgoFilter(engine=engine), [], []
+    for at in range(0, ref.size - HOP + 1, HOP):
+        out.append(ego.process(mic[at : at + HOP], ref[at : at + HOP]))
+        states.append(ego.stats()["alignment"]["state"])
+    done = np.concatenate([*out, ego.flush()])
+    power, left = (np.square(x[: len(states) * HOP].reshape(-1, HOP)).sum(1) for x in (mic, done))
+    waiting = np.cumsum(np.array(states) == "locked") == 0
+    loud = waiting & (power > 0.05 * power.max())
+    assert np.count_nonzero(loud) > 2
+    assert 10 * np.log10(power[loud].sum() / left[loud].sum()) > least_db
+
+
+@pytest.mark.slow
+def test_the_robots_onset_in_the_demo_stays_below_the_human():
+    """At 8 s its second utterance begins with another lag.
+
+    It came through 10 dB louder than the human's peak with crnn.
+    """
+    mic, ref, human = (
+        soundfile.read(DEMO / f"{name}.flac", dtype="float32")[0] for name in ("mic", "reference", "human")
+    )
+    for engine, margin in (("crnn", 0.0), ("ss", 3.0), ("linear", 9.0)):
+        out = enhance(mic, ref, DEMO / "profile.npz", engine)
+        onset = np.abs(out[int(7.8 * RATE) : int(9.0 * RATE)]).max()
+        assert onset < np.abs(human).max() * 10 ** (margin / 20), engine
