@@ -2,19 +2,28 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from functools import lru_cache
 from itertools import product
-from typing import ClassVar
+from typing import ClassVar, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
+from edgefilter.dsp.fourier import power
 from edgefilter.echo.effect import Effect, Experiment, Family, Parameter, Stage, first
 from edgefilter.echo.evidence import Evidence
 from edgefilter.echo.measurement import Measurement, Values, VoiceModel
 from edgefilter.echo.wiener import DELAYS, Spectra, convolve_from, fit_filter, spectra
 from edgefilter.types import SAMPLE_RATE, Array, Samples
 
+Filter: TypeAlias = tuple[float, float, float]
+"""Cut-off in Hz, order, phase."""
+GRID: tuple[Filter, ...] = tuple(
+    product(np.geomspace(200.0, 7800.0, 60).tolist(), (1.0, 2.0, 4.0, 8.0, 16.0, 40.0), (0.0, 1.0))
+)
+"""Filters from the best of which the search goes on."""
 FFT = 1024
 TAPS, LEAD = 192, 64
 HIGHEST_HZ = 7700.0
@@ -74,25 +83,26 @@ class Bandlimit(Effect):
         """
         predicted, x = measurement.heard(model)
         found = spectra(measurement, x, 20.0)
-        turns = np.exp(-2j * np.pi * np.outer(found.hz, DELAYS) / SAMPLE_RATE)
-        turned = found.cross[:, None] * turns.conj()
+        turned = found.cross[:, None] * np.exp(2j * np.pi * np.outer(found.hz, DELAYS) / SAMPLE_RATE)
+        turned = np.concatenate((turned.real, turned.imag))
 
-        def gain(cutoff: float, order: float, phase: float) -> tuple[float, float]:
-            response = low_pass(found.hz, cutoff, order, phase)
-            along = 2.0 * (response.conj() @ turned).real
-            at = int(np.argmax(along))
-            return float(along[at] - np.abs(response) ** 2 @ found.predicted), float(DELAYS[at])
+        def best_of(filters: Sequence[Filter], responses: NDArray[np.complex128]) -> tuple[Filter, float]:
+            """The filter, and its delay, that makes the squared error least."""
+            along = 2.0 * np.concatenate((responses.real, responses.imag), axis=1) @ turned
+            at, late = divmod(int(np.argmax(along - (power(responses) @ found.predicted)[:, None])), DELAYS.size)
+            return filters[at], float(DELAYS[late])
 
-        grid = product(np.geomspace(200.0, 7800.0, 60), (1.0, 2.0, 4.0, 8.0, 16.0, 40.0), (0.0, 1.0))
-        best = max(grid, key=lambda values: gain(*values)[0])
+        best, late = best_of(GRID, _on_grid(found.hz.tobytes()))
         step = 1.03
         for _ in range(5):
-            near = product(
-                best[0] * np.array([1 / step, 1.0, step]),
-                np.clip(best[1] * np.array([1 / step**3, 1.0, step**3]), 1.0, 60.0),
-                (0.0, 0.5, 1.0),
+            near = list(
+                product(
+                    (best[0] / step, best[0], best[0] * step),
+                    np.clip((best[1] / step**3, best[1], best[1] * step**3), 1.0, 60.0).tolist(),
+                    (0.0, 0.5, 1.0),
+                )
             )
-            best = max(near, key=lambda values: gain(*values)[0])
+            best, late = best_of(near, np.stack([low_pass(found.hz, *values) for values in near]))
             step = 1.0 + (step - 1.0) * 0.6
         if not _ends_at(found, best[0]) and (edge := band_edge(found)) is not None:
             return {"cutoff_hz": edge, "order": STEEP}
@@ -100,7 +110,7 @@ class Bandlimit(Effect):
             "cutoff_hz": float(np.clip(best[0], 200.0, 15999.0)),
             "order": float(best[1]),
             "phase": float(best[2]),
-            "delay": gain(*best)[1],
+            "delay": late,
         }
         left = measurement.white_recording - self.apply(x, {**values, "taps": 0.0}, SAMPLE_RATE)
         taps = fit_filter(x, left, measurement.weights, TAPS, LEAD, prior=np.full(TAPS, 1e-3), steps=15)
@@ -169,6 +179,12 @@ def _dull_above(cutoff_hz: float, evidence: Evidence) -> bool:
     if loud.sum() < 10:
         return True
     return float(np.sum(np.maximum(heard[loud] - 1.0, 0.0))) < KEPT * float(np.sum(expected[loud]))
+
+
+@lru_cache(maxsize=2)
+def _on_grid(hz: bytes) -> NDArray[np.complex128]:
+    """(filters, m) responses of GRID at frequencies (m,) float64."""
+    return np.stack([low_pass(np.frombuffer(hz), *values) for values in GRID])
 
 
 def low_pass(hz: Array, cutoff: float, order: float, phase: float) -> NDArray[np.complex128]:
