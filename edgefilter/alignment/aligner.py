@@ -415,7 +415,7 @@ class Aligner:
         if self._open and not self._missed and self._ref.end <= self._open[0].start + self._latest:
             waits = self._refuted or not (self._coarse or self._open[0].lost)
         if self._first is None:
-            return waits and (self._refuted or not self._known)
+            return waits and self._onsets.varies and (self._refuted or not self._known)
         return self._first.step(mic, reference, self._onsets.peak, self._gain, waits or self._expected is not None)
 
     def _cannot_be(self, mic: Samples) -> bool:

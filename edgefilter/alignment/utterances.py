@@ -16,6 +16,8 @@ RANGE = 10**-4.5
 """A hop this far (45 dB) under the loudest of the last seconds is silence."""
 SUSTAINED = 3
 """Hops that a level must last to be the voice's: 48 ms, a short vowel. A click falls into two at most."""
+VARIES = 10**1.5
+"""A voice's loudest hop is so much louder than its softest, or than the silence before, 15 dB; those of a noise are alike."""
 NEVER = -(10**9)
 """A position long before the first sample."""
 
@@ -51,18 +53,23 @@ class Sustained:
 class OnsetDetector:
     """Cuts the reference into utterances, hop by hop.
 
-    current: the last one that began; before the first, one that ended long ago. peak: mean square of the loudest hop of the
-    last seconds.
+    current: the last one that began; before the first, one that ended long ago. peak, least: mean square of the loudest and of the
+    softest hop of the last seconds.
     """
 
     def __init__(self, hop: int) -> None:
         self._hop = hop
         self._sustained = Sustained()
-        self.peak = 0.0
+        self.peak, self.least = 0.0, float("inf")
         self._decay = 0.1 ** (hop / (10.0 * SAMPLE_RATE))
         self.now = 0
         self.current = Utterance(NEVER, NEVER)
         self.active = False
+
+    @property
+    def varies(self) -> bool:
+        """Whether the reference varies as a voice does, and is no mere noise of a loopback."""
+        return self.peak > VARIES * self.least
 
     def step(self, ref: Samples) -> Utterance | None:
         """Take a hop (hop,) and return the utterance that begins with it, if one does.
@@ -72,6 +79,7 @@ class OnsetDetector:
         self.now += self._hop
         power = float(ref.dot(ref)) / self._hop
         self.peak = max(self._sustained.step(power), self.peak * self._decay)
+        self.least = min(power, self.least / self._decay)
         self.active = power > max(FLOOR, RANGE * self.peak)
         if not self.active:
             return None

@@ -9,7 +9,7 @@ from edgefilter.alignment.aligner import MOST_LAG_S, Aligner
 from edgefilter.alignment.delay_line import Aligned
 from edgefilter.alignment.first_sounds import LONGEST, FirstSounds
 from edgefilter.filter.budget import DEMO
-from tests.alignment.scene import RATE, fan, hear, known_path, room, run, utterances
+from tests.alignment.scene import RATE, fan, hear, known_path, room, run, speech_like, utterances
 
 HOP = 256
 
@@ -100,6 +100,21 @@ def test_a_human_as_loud_as_the_robot_who_begins_with_it_loses_a_quarter_second(
     _, anywhere, found = told(mic, ref, h)
     assert found[onsets[1] // HOP - 10].state in ("locked", "idle")
     assert np.count_nonzero(anywhere[onsets[1] // HOP :]) * HOP <= LONGEST + HOP
+
+
+def test_the_noise_of_a_loopback_is_no_robot_until_a_voice_rises_above_it():
+    """A real recording without any robot begins so: the human was lost for two seconds."""
+    rng = np.random.default_rng(7)
+    noise = (3e-4 * rng.standard_normal(4 * RATE)).astype(np.float32)
+    human = utterances(rng, [4.0], [0.0])[0][: noise.size]
+    _, anywhere, found = told(human, noise, None)
+    assert found[20].state == "begun" and not anywhere.any()
+    voice = np.concatenate((np.zeros(RATE, np.float32), speech_like(rng, 3.0)))
+    mic = hear(voice, [(0, 3000)], room(rng, 0.3))[0] + fan(rng, voice.size, 0.0005)
+    power, anywhere, found = told(mic, voice + noise, None)
+    at = int(np.argmax([aligned.state == "locked" for aligned in found]))
+    heard = power[:at] > 0.1 * power.max()
+    assert heard.any() and anywhere[:at][heard].all() and not anywhere[: RATE // HOP - 1].any()
 
 
 def test_soft_first_sounds_of_a_calibrated_voice_make_nobody_loud():
