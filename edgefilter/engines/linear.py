@@ -6,15 +6,11 @@ from typing import ClassVar
 
 from edgefilter.dsp.stft import StftConfig
 from edgefilter.engines.base import EngineState, FrontEndKind
-from edgefilter.engines.spectral_subtraction import noise_alone
 from edgefilter.types import Frame, Output
 
 
 class Linear:
-    """Returns the linear stage's error: nothing is masked, so the human is not distorted and noise stays.
-
-    The first sounds of an utterance of the robot, whose lag is not found yet, are lowered.
-    """
+    """Returns the linear stage's error: nothing is masked, so the human is not distorted and noise stays."""
 
     name: ClassVar[str] = "linear"
     front: ClassVar[FrontEndKind] = "full"
@@ -27,4 +23,4 @@ class Linear:
         return None
 
     def step(self, frame: Frame, state: EngineState) -> tuple[Output, EngineState]:
-        return Output(noise_alone(frame) * frame.error if frame.at_any_lag else frame.error), state
+        return Output(frame.error), state

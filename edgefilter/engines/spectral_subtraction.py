@@ -9,7 +9,7 @@ import numpy as np
 from edgefilter.dsp import fourier
 from edgefilter.dsp.stft import StftConfig
 from edgefilter.engines.base import FrontEndKind
-from edgefilter.types import Frame, Output, Samples
+from edgefilter.types import Frame, Output, Samples, Spectrum
 
 FLOOR = 0.18
 """Least gain, -15 dB: it keeps the noise natural and loses no words."""
@@ -38,12 +38,11 @@ class SpectralSubtraction:
         unwanted = frame.noise_psd + frame.residual_psd + fourier.TINY
         observed = frame.error.real**2 + frame.error.imag**2
         wanted = MEMORY * state + (1.0 - MEMORY) * np.maximum(observed - unwanted, 0.0)
-        floor = noise_alone(frame) if frame.at_any_lag else FLOOR
-        gain = np.maximum(wanted / (wanted + unwanted), floor)
+        gain = np.maximum(wanted / (wanted + unwanted), FLOOR)
         return Output(gain * frame.error), gain * gain * observed
 
 
-def noise_alone(frame: Frame) -> Samples:
-    """(bins,) gain that leaves of the error no more than FLOOR of the noise."""
+def noise_alone(frame: Frame) -> Spectrum:
+    """(bins,) of the error no more than FLOOR of the noise."""
     power = fourier.power(frame.error)
-    return FLOOR * np.sqrt(np.minimum(frame.noise_psd, power) / (power + fourier.TINY))
+    return FLOOR * np.sqrt(np.minimum(frame.noise_psd, power) / (power + fourier.TINY)) * frame.error
