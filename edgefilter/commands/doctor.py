@@ -150,11 +150,11 @@ def _open(
     ports: dict[str, InputPort], role: str, name: str | None, channels: Sequence[int] | None = None
 ) -> Iterator[Check]:
     """Find the input and see at which rate it can be opened."""
-    if role == "microphone":
-        virtual.refuse_own(str(name))
-    from edgefilter.audio.device import input_port, monitor_of
+    from edgefilter.audio.device import find, input_port, monitor_of
 
-    device = name if name is not None else pulse.monitor(virtual.SPEAKER) or monitor_of("default")
+    device = find(name if name is not None else pulse.monitor(virtual.SPEAKER) or monitor_of("default"), "input")
+    if role == "microphone":
+        virtual.refuse_own(device)
     port = input_port(device, channels=channels)
     ports[role] = port
     yield Check(role, "ok", ", ".join([f"{port.device}, {port.rate} Hz", *port.notes]))
