@@ -44,7 +44,7 @@ class Judges:
     recogniser: Recogniser | None = None
 
     def words(self, text: str, out: Samples) -> dict | None:
-        """errors, words, deletions, insertions, capped (%) and the transcript; None without a recogniser."""
+        """Return errors, words, deletions, insertions, capped (%) and the transcript; None without a recogniser."""
         if self.recogniser is None:
             return None
         said = self.recogniser.transcribe(out)
@@ -53,7 +53,7 @@ class Judges:
         return counts | {"wer": 100 * found.rate, "capped": 100 * found.capped, "transcript": said}
 
     def mos(self, mic: Samples, ref: Samples, out: Samples, talk: str) -> dict[str, float]:
-        """echo_mos and human_mos, 1 to 5 (Purin et al. 2022, "AECMOS"); empty where speechmos is not installed."""
+        """Return echo_mos and human_mos, 1 to 5 (Purin et al. 2022, "AECMOS"); empty where speechmos is not installed."""
         judge = _aecmos()
         if judge is None:
             return {}
@@ -168,7 +168,7 @@ def first_sound(human: Samples) -> int:
 
 
 def noticed(events: Sequence[Event], onset: int) -> dict:
-    """delay_s from the onset to the first speech_started after it, None if there is none.
+    """Return delay_s, from the onset to the first speech_started after it, None if there is none.
 
     early: speech was on already, so nothing is noticed.
     """
@@ -208,7 +208,7 @@ def values(rows: Iterable[Mapping], key: str) -> tuple[list[Mapping], np.ndarray
 
 
 def mean(rows: Iterable[Mapping], key: str) -> dict | None:
-    """mean, low, high (95 %), median, std and count of a figure; None where no row has it.
+    """Return mean, low, high (95 %), median, std and count of a figure; None where no row has it.
 
     The interval is drawn over speakers and places (keys of a row, where it has them), not over recordings.
     """

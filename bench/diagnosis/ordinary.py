@@ -82,7 +82,7 @@ def learnt(found: Sequence[Mapping[str, float]]) -> dict[str, object]:
 
 
 def least(p_value: Callable[[str, float], float], found: Sequence[Mapping[str, float]]) -> Array:
-    """(n,) the least p-value of each recording over all effects."""
+    """The least p-value of each recording over all effects, (n,)."""
     return np.array([min(p_value(name, gain) for name, gain in one.items()) for one in found])
 
 

@@ -92,7 +92,7 @@ def noise_off_db(profile: Profile, model: EchoModel, y: Samples, x: Samples, cut
 
 
 def _bands_db(psd: Samples) -> np.ndarray:
-    """(bands,) dB of a PSD (601,)."""
+    """Level of a PSD (601,) in each band, dB, (bands,)."""
     return np.asarray(decibels(blocks(floored(psd), BAND).mean(axis=1)))
 
 

@@ -53,7 +53,7 @@ class Case(NamedTuple):
 
 
 class Contender(NamedTuple):
-    """make: the engine; identity: of the code and the network on which its answer depends."""
+    """An engine to be compared. make: the engine; identity: of the code and the network on which its answer depends."""
 
     make: Make
     identity: str
@@ -116,7 +116,7 @@ def frames(case: Case, stft: StftConfig, learning: bool) -> list[Frame]:
 
 
 def answer(engine: Engine, given: list[Frame], samples: int) -> Samples:
-    """(samples,) that a stream with this engine gives out."""
+    """Output of a stream with this engine, (samples,)."""
     state, voice, hops = engine.initial_state(), Synthesiser(engine.stft), []
     for frame in given:
         output, state = engine.step(frame, state)

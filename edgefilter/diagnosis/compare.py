@@ -128,7 +128,7 @@ def compare(profile: Profile, recording: Samples, reference: Samples, *, sample_
 def describe(prepared: Prepared, model: EchoModel, score: Score | None = None) -> Comparison:
     """The comparison of a prepared recording with what a model predicts.
 
-    Score: the judge's of that model, where it is known.
+    score: of that model, where it is known.
 
     A gain of the microphone is taken out of the residual before that is held against the fan, which passed it as well.
     """

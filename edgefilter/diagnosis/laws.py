@@ -249,7 +249,7 @@ class _Ground:
         return self._measurement.whiten(self._model.predict(x) if self.stage == "source" else x)
 
     def solve(self, parts: list[Samples], bends: Array) -> Array:
-        """Weights (k,) of least squares of x's parts (k, n), their bends (m, k) held small."""
+        """Least-squares weights of x's parts (k, n), their bends (m, k) held small; (k,)."""
         normal = normal_equations([self.part(part) for part in parts], self.target, 1, 0, self.weights > 0.0)
         return _solved(normal.matrix, normal.right, bends)[0]
 
@@ -392,7 +392,7 @@ STAGES: dict[Callable[[_Ground], Law | None], tuple[Literal["source", "path"], .
 
 
 def _levels(x: Samples, settings: list[tuple[float, float]]) -> Array:
-    """(m, k) level in dB at the end of each step of x (n,), by m attacks and releases in ms."""
+    """Level in dB at the end of each step of x (n,), by m attacks and releases in ms, (m, k)."""
     power = block_power(x, STEP)
     rising, falling = (-np.expm1(-1.0 / np.array(ms)) for ms in zip(*settings, strict=True))
     level, now = np.empty((power.size, len(settings))), np.zeros(len(settings))
@@ -404,7 +404,7 @@ def _levels(x: Samples, settings: list[tuple[float, float]]) -> Array:
 
 
 def _hats(x: Array, knots: Array, beyond: bool = False) -> Array:
-    """(k, n) float32, parts whose sum by heights at the knots (k,) is the curve through these at x (n,).
+    """Parts whose sum by heights at the knots (k,) is the curve through these at x (n,), (k, n) float32.
 
     beyond: whether it goes on as it ends outside of the knots, rather than level.
     """
@@ -418,7 +418,7 @@ def _hats(x: Array, knots: Array, beyond: bool = False) -> Array:
 
 
 def _solved(matrix: Array, right: Array, bends: Array) -> tuple[Array, float]:
-    """Weights (k,) of least squares, their bends (m, k) held small, and the energy that they explain."""
+    """Least-squares weights (k,), their bends (m, k) held small, and the energy that they explain."""
     held = (BEND * bends.T @ bends + 1e-6 * BEND * np.eye(right.size)) * (np.trace(matrix) / right.size + 1e-30)
     found = np.linalg.solve(matrix + held, right)
     return found, float(2.0 * found @ right - found @ matrix @ found)

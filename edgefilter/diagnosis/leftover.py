@@ -24,14 +24,12 @@ BLOCK = SAMPLE_RATE // 10
 
 @dataclass(frozen=True, eq=False)
 class Leftover:
-    """tones_hz: (k,) of the strongest tones, loudest first.
+    """Tones that are left. tones_hz: (k,) of the strongest, loudest first.
 
-    Mains_hz: 50 or 60 where most of their power lies on its multiples, else 0.
-
-    tone_share: of the residual's power over the fan, in tones. quiet_db: excess while the robot is silent, its median
-    over blocks of 0.1 s;
-    swing_db: by how much those blocks differ (90 % to 10 % quantile) beyond what noise does. level_slope: by how many
-    dB the excess grows per dB of the robot's level.
+    mains_hz: 50 or 60 where most of their power lies on its multiples, else 0. tone_share: of the residual's power over
+    the fan, in tones. quiet_db: excess while the robot is silent, its median over blocks of 0.1 s; swing_db: by how
+    much those blocks differ (90 % to 10 % quantile) beyond what noise does. level_slope: by how many dB the excess
+    grows per dB of the robot's level.
     """
 
     tones_hz: Array

@@ -266,7 +266,7 @@ def _lag(mic: Samples, ref: Samples) -> int | None:
 
 
 def _lags(mic: Samples, near: Samples) -> Array:
-    """(w,) samples by which the microphone lags behind the aligned reference, in those windows whose arrival is sharp."""
+    """Samples by which the microphone lags behind the aligned reference, in those windows whose arrival is sharp, (w,)."""
     size, found = round(WINDOW_S * SAMPLE_RATE), []
     for at in range(0, mic.size - size + 1, size):
         part = slice(at, at + size)
@@ -325,7 +325,7 @@ def octaves() -> list[tuple[float, float]]:
 
 
 def _filtered(mic: Samples, ref: Samples, engine: str) -> tuple[Samples, int | None]:
-    """(n,) the output without a profile, and how often speech of a human has started in it; None where that is not judged."""
+    """The output without a profile, (n,), and how often speech of a human has started in it; None where no engine detects speech."""
     with EgoFilter(engine=engine) as ego:
         output = np.concatenate((ego.process(mic, ref), ego.flush()))
         starts = sum(event.kind == "speech_started" for event in ego.events())

@@ -146,11 +146,11 @@ class Inquiry:
         self.explanations = tuple(kept)
 
     def before(self) -> Array:
-        """(explanations + 1,) the probability of each, and of none, by the other half, before anything is asked."""
+        """The probability of each, and of none, by the other half, before anything is asked, (explanations + 1,)."""
         return weights(_log_likelihood(self._first, self.explanations))
 
     def evidence(self, recording: Samples, sound: Samples) -> Array:
-        """(moments, explanations + 1) log likelihood of what was recorded (m,) of a sound (n,), the last of none of them.
+        """Log likelihood of what was recorded (m,) of a sound (n,), (moments, explanations + 1), the last of none of them.
 
         All are fitted again, to the first recording and one half of this one, and judged by the other half; then the halves
         change places. What a clock does begins anew with each recording, so that a model of one stays as it is.
@@ -175,7 +175,7 @@ class Inquiry:
         return np.concatenate(found)
 
     def gains(self, sound: Samples) -> Array:
-        """(explanations, explanations) the log odds over each other that are expected of a sound (n,) where the first is true."""
+        """The log odds over each other that are expected of a sound (n,) where the first is true, (explanations, explanations)."""
         count = len(self.explanations)
         heard = (_simulated(self.profile, true, sound) for true in self.explanations)
         told = [self.evidence(recording, sound).sum(axis=0)[:count] for recording in heard]
@@ -229,7 +229,7 @@ class Inquiry:
 
 
 def weights(found: Array, gains: Sequence[Array] = ()) -> Array:
-    """(explanations + 1,) the probability of each and of none, all as probable beforehand, from evidence (moments, explanations + 1).
+    """The probability of each and of none, (explanations + 1,), all as probable beforehand, from evidence (moments, explanations + 1).
 
     No explanation is exactly true, so that likelihoods of thousands of samples would be far too sure. Asked is which of two
     is closer to what was heard: by chance the difference of their log likelihoods has either sign from moment to moment; its
@@ -296,13 +296,13 @@ def _like_speech(hz: Array) -> Array:
 
 
 def _noise(rng: np.random.Generator, magnitude: Array, level: float, peak: float) -> Array:
-    """(n,) of random phases and that magnitude (n / 2 + 1,), of a root mean square and a peak, faded in and out over 10 ms."""
+    """A sound of random phases and that magnitude (n / 2 + 1,), (n,), of a root mean square and a peak, faded in and out over 10 ms."""
     x = _faded(np.fft.irfft(magnitude * np.exp(2j * np.pi * rng.uniform(size=magnitude.size))))
     return np.asarray(x * min(level / np.sqrt(np.mean(x**2)), peak / np.max(np.abs(x))))
 
 
 def _loudest(reference: Samples, n: int) -> Array:
-    """(n,) the loudest stretch of a reference, faded in and out, with silence behind a shorter one."""
+    """The loudest stretch of a reference, (n,), faded in and out, with silence behind a shorter one."""
     x = np.pad(reference.astype(np.float64), (0, max(n + 1 - reference.size, 0)))
     energy = np.concatenate(([0.0], np.cumsum(x**2)))
     at = int(np.argmax(energy[n:] - energy[:-n]))
@@ -310,7 +310,7 @@ def _loudest(reference: Samples, n: int) -> Array:
 
 
 def _faded(x: Array) -> Array:
-    """Samples (n,) faded in and out over 10 ms."""
+    """Samples faded in and out over 10 ms, (n,)."""
     fade = np.minimum(np.arange(1, x.size + 1), SAMPLE_RATE // 100) / (SAMPLE_RATE // 100)
     return np.asarray(x * (fade * fade[::-1]))
 
@@ -349,13 +349,13 @@ def _simulated(profile: Profile, true: Explanation, sound: Samples) -> Samples:
 
 
 def _coloured(rng: np.random.Generator, n: int, psd: Array) -> Array:
-    """(n,) noise of that PSD (601,)."""
+    """Noise of that PSD (601,), n samples."""
     amplitude = np.sqrt(variance_at(np.fft.rfftfreq(n, 1 / SAMPLE_RATE), psd))
     return np.fft.irfft(np.fft.rfft(rng.standard_normal(n)) * amplitude, n)
 
 
 def _cells(judge: Judge, model: EchoModel) -> tuple[Array, Array, Array]:
-    """(moments, bands) each, over the known fan: the power that a model leaves, what it expects there, and its voice."""
+    """The power that a model leaves, what it expects there, and its voice, over the known fan, (moments, bands) each."""
     score, psd = judge.of(model), judge.psd
     power = judge.cells(judge.measurement.recording - score.prediction)
     fan = np.interp(judge.band_hz.mean(axis=1), frequencies(psd.size), model.expected_noise(psd) / psd)
@@ -363,7 +363,7 @@ def _cells(judge: Judge, model: EchoModel) -> tuple[Array, Array, Array]:
 
 
 def _log_likelihood(prepared: Prepared, explanations: Sequence[Explanation]) -> Array:
-    """(moments, explanations + 1) of the cells that no fit has used, the last of none of the explanations.
+    """Log likelihood of the cells that no fit has used, (moments, explanations + 1), the last of none of the explanations.
 
     Of a residual that is Gaussian in each cell, with a variance that is expected to a factor: Student's t with as many
     degrees of freedom as the cell has (Lange, Little & Taylor 1989), so that what is louder than expected counts by its

@@ -66,7 +66,7 @@ class Tried:
 class Found:
     """The outcome of a search from a start model.
 
-    Steps: the accepted effects in their order. notes: what the reader must know of the search. tried: every effect that
+    steps: the accepted effects in their order. notes: what the reader must know of the search. tried: every effect that
     was fitted.
 
     prepared: what final was scored on; its fan is another than at the calibration where a changed fan is the first of
@@ -121,7 +121,7 @@ class Workbench:
         return self._scores[key]
 
     def heard(self, model: EchoModel) -> float:
-        """DB over the robot's silences, of half a dB either way, that a model leaves while the robot is heard."""
+        """Return the level, in dB over the robot's silences, of half a dB either way, that a model leaves while the robot is heard."""
         score = self.score(model)
         return score.active_db - float(np.clip(score.silent_db, -0.5, 0.5))
 
@@ -158,7 +158,7 @@ class Workbench:
         return self._trials[key]
 
     def attempt_alike(self, name: str, model: EchoModel) -> Trial | None:
-        """attempt(), or what came of it beside the same effects at other values: enough to choose what is worth a closer look."""
+        """Return attempt(), or what came of it beside the same effects at other values: enough to choose what is worth a closer look."""
         key = frozenset(dict(model.effects)), name
         return self._alike[key] if key in self._alike else self.attempt(name, model)
 

@@ -60,11 +60,11 @@ class Grid(Protocol):
 
     @property
     def usable(self) -> NDArray[np.bool_]:
-        """(n,) samples where nobody else talks."""
+        """Samples where nobody else talks, (n,)."""
         ...
 
     def cells(self, residual: Samples) -> Array:
-        """(times, bands) power of a signal (n,) over the fan's."""
+        """Power of a signal (n,) over the fan's, (times, bands)."""
         ...
 
     def level_db(self, prediction: Samples) -> float:

@@ -16,7 +16,7 @@ BLOCK = SAMPLE_RATE // 2
 
 
 def fitted_blocks(n: int) -> NDArray[np.bool_]:
-    """(n,) every other BLOCK, from the first on: what a fit may use, so that the rest can judge it."""
+    """Every other BLOCK, from the first on, (n,): what a fit may use, so that the rest can test it."""
     return np.arange(n) // BLOCK % 2 == 0
 
 

@@ -44,6 +44,6 @@ class SpectralSubtraction:
 
 
 def noise_alone(frame: Frame) -> Samples:
-    """(bins,) gain that leaves of the error no more than FLOOR of the noise."""
+    """Gain that leaves of the error no more than FLOOR of the noise, (bins,)."""
     power = fourier.power(frame.error)
     return FLOOR * np.sqrt(np.minimum(frame.noise_psd, power) / (power + fourier.TINY))

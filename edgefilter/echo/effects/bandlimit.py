@@ -56,7 +56,7 @@ class Bandlimit(Effect):
     )
 
     def apply(self, x: Samples, values: Values, sample_rate: int) -> Samples:
-        """X without what lies above the cut-off; a cut-off of 16 kHz is none."""
+        """Return x without what lies above the cut-off; a cut-off of 16 kHz is none."""
         if float(values["cutoff_hz"]) >= 16000.0:
             return x.copy()
         hz = np.arange(FFT // 2 + 1) * sample_rate / FFT
@@ -172,7 +172,7 @@ def _dull_above(cutoff_hz: float, evidence: Evidence) -> bool:
 
 
 def low_pass(hz: Array, cutoff: float, order: float, phase: float) -> NDArray[np.complex128]:
-    """(m,) complex response; the phase is that of a Butterworth filter less its delay at low frequencies, times `phase`."""
+    """Complex response, (m,); the phase is that of a Butterworth filter less its delay at low frequencies, times `phase`."""
     ratio = hz / cutoff
     magnitude = 1.0 / np.sqrt(1.0 + ratio ** (2.0 * order))
     if phase == 0.0:
