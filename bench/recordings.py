@@ -35,7 +35,7 @@ LENGTHS_S = 1.0
 UTTERANCE_S = (3.0, 10.0)
 """Length of the humans' utterances: some words, and over before the recording is."""
 TAIL_S = 0.5
-"""Robot after the human's end, so that no system is judged on its flushing."""
+"""Robot after the human's end, so that no system is scored on its flushing."""
 TRIES = 50
 """Places drawn for a human before the one with the most robot is taken."""
 ROBOT_SILENT = 0.25

@@ -53,7 +53,7 @@ def score(
         Seconds between which the hypothesis was heard; of pieces with times only those within `REACH_S` of it count.
     speech_probability : float, optional
         Probability that a human spoke meanwhile: the mean of `EgoFilter.speech_probability` over the time between
-        `heard`, or any other judge's.
+        `heard`, or by any other detector.
 
     Returns
     -------

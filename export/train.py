@@ -94,7 +94,9 @@ def arguments() -> argparse.Namespace:
         "--norm", choices=("layer", "batch", "none"), help="(default: layer; of the paper's network none)"
     )
     parser.add_argument("--erb", type=int, help="bands as wide as the ear's, 64 say, in place of all frequencies")
-    parser.add_argument("--recogniser", type=Path, metavar="WHISPER", help="folder whose encoder judges the answer too")
+    parser.add_argument(
+        "--recogniser", type=Path, metavar="WHISPER", help="folder whose encoder compares the answer too"
+    )
     parser.add_argument("--recogniser-weight", type=float, default=0.1)
     parser.add_argument(
         "--fan-kept",

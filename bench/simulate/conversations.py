@@ -1,4 +1,4 @@
-r"""Simulate whole conversations with a robot, to judge and tune the filter on.
+r"""Simulate whole conversations with a robot, to evaluate and tune the filter on.
 
 The robot speaks, pauses, speaks again, a human interrupts.
 

@@ -338,7 +338,7 @@ def draw_hiss(rng: np.random.Generator) -> Array:
 def with_distortion(loudspeaker: Loudspeaker, played: Array, path: Array, wanted: float) -> tuple[Loudspeaker, float]:
     """The driver turned until what its nonlinearity adds behind this path has the wanted power, and the power reached.
 
-    Judged on 5 s.
+    Measured over 5 s.
     """
     x = played[RATE : 6 * RATE]
     straight = loudspeaker.play(x, linear=True)

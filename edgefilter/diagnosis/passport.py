@@ -27,7 +27,7 @@ ENGINES = ("linear", "ss", "crnn")
 LEAST_S, MOST_S = 10.0, 60.0
 """What a recording has to last, and how much of it is looked at."""
 SETTLED_S = 5.0
-"""The filter has this long with the robot alone before it is judged, and before the human speaks."""
+"""The filter has this long with the robot alone before it is measured, and before the human speaks."""
 PAUSE_S = 2.0
 """Between two turns of the human."""
 WINDOW_S, STRETCH = 2.0, 1024

@@ -127,7 +127,7 @@ def prepare(profile: Profile, recording: Samples, reference: Samples, *, sample_
     if end - begin < n and end - begin > n // 2:
         usable[:begin], usable[end:] = False, False
         warnings += (
-            f"the reference is cut in mid-word: only {begin / SAMPLE_RATE:.1f} to {end / SAMPLE_RATE:.1f} s are judged",
+            f"the reference is cut in mid-word: only {begin / SAMPLE_RATE:.1f} to {end / SAMPLE_RATE:.1f} s are evaluated",
         )
     if len(pieces) > 1:
         lags = ", ".join(f"{lag:.1f} from {first / SAMPLE_RATE:.1f} s" for first, _, lag in pieces)

@@ -30,8 +30,8 @@ TOLERANCE = 0.012
 TOLERANCE_TAPS, TOLERANCE_LEAD = 32, 16
 
 
-class Judge:
-    """Holds a prepared recording against predictions.
+class Scorer:
+    """Scores predictions of a prepared recording.
 
     In the cells of time and frequency that no fit has seen the residual is held to be Gaussian (Whittle 1953), with the variance
     that the model expects times an unknown factor, since every model errs: Student's t. So what counts is that the residual
@@ -79,7 +79,7 @@ class Judge:
 
     def level_db(self, prediction: Samples) -> float:
         """Score.level_db of a prediction (n,)."""
-        return self.judge(prediction, self.measurement.whiten(prediction)).level_db
+        return self.score(prediction, self.measurement.whiten(prediction)).level_db
 
     def cells(self, residual: Samples) -> Array:
         """Power of the residual (n,) over the fan's, in the held-out cells, (times, bands)."""
@@ -92,9 +92,9 @@ class Judge:
         """The score of a model: on what it predicts, with what it says that no waveform predicts counted as fan."""
         measurement = self.prepared.measurement
         gain = model.microphone_gain(measurement.recording.size)
-        return self.judge(*measurement.heard(model), model.unpredictable(measurement.reference), gain)
+        return self.score(*measurement.heard(model), model.unpredictable(measurement.reference), gain)
 
-    def judge(
+    def score(
         self,
         prediction: Samples,
         white: Samples,

@@ -1,4 +1,4 @@
-"""A recording of the robot alone as a fit gets it, and the whitening by which it is judged."""
+"""A recording of the robot alone as a fit gets it, and the whitening in which it is compared."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ class Measurement:
 
     noise_psd: (601,) one-sided power spectral density of the fan, full scale^2/Hz, from 0 to 8 kHz; None where it is
     unknown.
-    fit: (n,) bool, the samples that a fit may use; the others are held out to judge it by. None: all.
+    fit: (n,) bool, the samples that a fit may use; the others are held out to test it on. None: all.
     """
 
     reference: Samples

@@ -12,7 +12,7 @@ MIN_SECONDS = 1.0
 MAX_OFFSET = 3.0
 """Seconds by which a recording may lag behind its reference or lead it."""
 BLOCK = SAMPLE_RATE // 2
-"""Samples of the blocks that are fitted on and judged by in turn."""
+"""Samples of the blocks that are fitted and tested on in turn."""
 
 
 def fitted_blocks(n: int) -> NDArray[np.bool_]:

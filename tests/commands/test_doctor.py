@@ -71,7 +71,7 @@ def test_what_is_missing_is_found_and_the_rest_still_checked(monkeypatch):
         (1.0, -10.0, 0.0, ["ok", "warning"], "clipped"),
     ],
 )
-def test_clock_and_level_are_judged(pace, level, peak, states, words):
+def test_clock_and_level_are_checked(pace, level, peak, states, words):
     heard = Trial(48_000, pace, level, peak, overruns=0)
     found = [doctor._clock("microphone", heard), doctor._level(heard)]
     assert [check.state for check in found] == states

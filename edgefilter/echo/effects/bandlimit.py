@@ -67,7 +67,7 @@ class Bandlimit(Effect):
         return y + convolve_from(x, taps, LEAD) if taps.any() else y
 
     def fit(self, measurement: Measurement, model: VoiceModel) -> Values:
-        """The best of a grid of cut-offs, orders and phases, refined, each at its best delay, judged in the whitened cross-spectrum. Then taps.
+        """The best of a grid of cut-offs, orders and phases, refined, each at its best delay, compared in the whitened cross-spectrum. Then taps.
 
         Where the power does not end there, what is common with the reference is hidden by something else, such as a codec's
         noise: then the cut-off is where the power ends.

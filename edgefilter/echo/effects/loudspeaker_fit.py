@@ -117,7 +117,7 @@ def fit_laws(
 
 
 class _Search:
-    """Settings of driver and amplifier, each judged by what is left with it on samples that it was not fitted to.
+    """Settings of driver and amplifier, each scored by what is left with it on samples that it was not fitted to.
 
     base: what the linear voice alone leaves there. peak: the highest sample that counts.
     """
@@ -183,7 +183,7 @@ def _peak(x: Samples) -> float:
 
 
 class _Halves:
-    """Weighted least squares on either half of the samples (BLOCKs, two by two), judged on the other.
+    """Weighted least squares on either half of the samples (BLOCKs, two by two), tested on the other.
 
     Beside the columns that are asked about stands the linear voice with NUISANCE_TAPS of a filter: another gain, a
     move by less than a millimetre.
