@@ -55,7 +55,7 @@ def smoke(options: argparse.Namespace) -> None:
     options.steps, options.every, options.batch, options.seconds = 4, 2, 2, 0.7
 
 
-def arguments() -> argparse.Namespace:
+def arguments(argv: list[str] | None = None) -> argparse.Namespace:
     """What the command line says."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--data", type=Path, required=True, metavar="DIR")
@@ -114,7 +114,7 @@ def arguments() -> argparse.Namespace:
     parser.add_argument(
         "--smoke", action="store_true", help="make a few seconds of data in --data and --validation and take four steps"
     )
-    return parser.parse_args()
+    return parser.parse_args(argv)
 
 
 def sizes_before(kind: str, *checkpoints: Path | None) -> dict[str, object]:
@@ -132,8 +132,8 @@ def sizes_before(kind: str, *checkpoints: Path | None) -> dict[str, object]:
     return {}
 
 
-def main() -> int:
-    options = arguments()
+def main(argv: list[str] | None = None) -> int:
+    options = arguments(argv)
     try:
         if options.smoke:
             smoke(options)

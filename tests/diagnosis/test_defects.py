@@ -21,7 +21,7 @@ from edgefilter.diagnosis.trials import Found, Workbench
 from edgefilter.dsp.fractional_delay import delayed
 from edgefilter.echo.effect import Effect, Parameter
 from edgefilter.echo.effects import catalogue
-from edgefilter.echo.effects.catalogue import find
+from edgefilter.echo.effects.catalogue import find, register
 from edgefilter.echo.model import EchoModel
 from edgefilter.profile.data import Profile
 from edgefilter.report.html import compare_variants
@@ -114,10 +114,10 @@ class Fragile(Effect):
 
 
 @pytest.fixture
-def fragile(monkeypatch) -> Fragile:
+def fragile(monkeypatch, own_catalogue) -> Fragile:
     effect = Fragile()
     monkeypatch.setattr(Fragile, "failures", [])
-    monkeypatch.setattr(catalogue, "_known", {**catalogue._known, "fragile": effect})
+    register(effect)
     return effect
 
 

@@ -47,9 +47,8 @@ def lawful(family: str) -> Law:
 
 
 @pytest.fixture
-def load(tmp_path: Path, monkeypatch) -> Callable[[Law, str], str]:
+def load(tmp_path: Path, own_catalogue) -> Callable[[Law, str], str]:
     """Write a law and load it, in a catalogue that is as before when the test is over."""
-    monkeypatch.setattr(catalogue, "_known", dict(catalogue._known))
 
     def loaded(law: Law, name: str) -> str:
         path = tmp_path / f"{name}.py"
