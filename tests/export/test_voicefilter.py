@@ -283,11 +283,10 @@ def _checkpoint(folder: Path) -> Path:
 
 
 def test_the_encoders_bands_are_slaneys_and_a_recording_ten_times_as_loud_is_two_decades_up():
+    peaks = d_vector._bands().argmax(axis=1) * 16000 / 512
     # centres of 40 bands from 0 to 8000 Hz on Slaney's scale, as librosa 0.11 has them
     for band, centre in ((0, 73.6), (9, 735.7), (20, 1754.2), (39, 7415.5)):
-        for hz in (centre - 31, centre, centre + 31):
-            tone = np.sin(2 * np.pi * hz / 16000 * np.arange(16000)).astype(np.float32)
-            assert set(d_vector.log_mel(tone).argmax(axis=1)) == {band}
+        assert peaks[band] == pytest.approx(centre, abs=32)
     noise = babble(np.random.default_rng(0), 1.0)
     mel = d_vector.log_mel(noise)
     assert mel.shape == (1 + (16000 - 512) // 160, 40)
