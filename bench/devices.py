@@ -6,7 +6,7 @@ RECORDINGS holds pairs NAME_lpb (what the loudspeaker was sent) and NAME_mic, 16
 humans of --speech are laid on: on a device's only recording at a level and after a time drawn from --ser and --before;
 on a device of many recordings (DEVICE_00, ...) at each of --levels, on the half that is kept to report on. The same
 recordings whole tell how far the robot alone is lowered, and every speech_started in them is false. Pairs in which both
-talk, or the human alone, are judged as recorded, by AECMOS. Devices that match --tuned-on were looked at while the
+talk, or the human alone, are scored as recorded, by AECMOS. Devices that match --tuned-on were looked at while the
 filter was made: they stand in tables of their own.
 """
 

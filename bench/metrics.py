@@ -37,14 +37,14 @@ TALK_TYPES = {"doubletalk": "dt", "farend": "st", "nearend": "nst"}
 
 
 @dataclass(frozen=True)
-class Judges:
-    """What costs seconds, kept under the sound that is judged: the recogniser's words, AECMOS, ESTOI."""
+class CachedMetrics:
+    """What costs seconds, kept under the sound that it is of: the recogniser's words, AECMOS, ESTOI."""
 
     cache: Cache
     recogniser: Recogniser | None = None
 
     def words(self, text: str, out: Samples) -> dict | None:
-        """errors, words, deletions, insertions, capped (%) and the transcript; None without a recogniser."""
+        """Return errors, words, deletions, insertions, capped (%) and the transcript; None without a recogniser."""
         if self.recogniser is None:
             return None
         said = self.recogniser.transcribe(out)
@@ -53,14 +53,14 @@ class Judges:
         return counts | {"wer": 100 * found.rate, "capped": 100 * found.capped, "transcript": said}
 
     def mos(self, mic: Samples, ref: Samples, out: Samples, talk: str) -> dict[str, float]:
-        """echo_mos and human_mos, 1 to 5 (Purin et al. 2022, "AECMOS"); empty where speechmos is not installed."""
-        judge = _aecmos()
-        if judge is None:
+        """Return echo_mos and human_mos, 1 to 5 (Purin et al. 2022, "AECMOS"); empty where speechmos is not installed."""
+        scorer = _aecmos()
+        if scorer is None:
             return {}
         signals = {name: np.clip(x, -1, 1) for name, x in (("lpb", ref), ("mic", mic), ("enh", out))}
 
         def made() -> dict[str, float]:
-            said = judge(signals, TALK_TYPES[talk])
+            said = scorer(signals, TALK_TYPES[talk])
             return {"echo_mos": float(said["echo_mos"]), "human_mos": float(said["deg_mos"])}
 
         return self.cache.get(made, "aecmos", talk, *signals.values())
@@ -92,7 +92,7 @@ def _aecmos() -> Callable | None:
     return AECMOS("aecmos_16kHz")
 
 
-def score(clip: Clip, output: Output, judges: Judges) -> dict:
+def score(clip: Clip, output: Output, cached: CachedMetrics) -> dict:
     """All figures of one system on one clip; "problem" in place of what an unusable output makes impossible.
 
     si_sdr, estoi and the words are over the span in which the human speaks; erle_db over the ALONE_S before it, or over
@@ -107,7 +107,7 @@ def score(clip: Clip, output: Output, judges: Judges) -> dict:
         return row | {"problem": "samples that are not finite"}
     row["excess_db"] = excess_db(out, mic)
     if clip.human is None:
-        row |= judges.mos(mic[-round(MOS_S * SAMPLE_RATE) :], ref[-round(MOS_S * SAMPLE_RATE) :],
+        row |= cached.mos(mic[-round(MOS_S * SAMPLE_RATE) :], ref[-round(MOS_S * SAMPLE_RATE) :],
                           out[-round(MOS_S * SAMPLE_RATE) :], clip.talk)  # fmt: skip
         if clip.talk == "farend":
             row["erle_db"] = lowered_db(mic, out)
@@ -119,13 +119,13 @@ def score(clip: Clip, output: Output, judges: Judges) -> dict:
     listened = slice(max(span.stop - round(MOS_S * SAMPLE_RATE), 0), span.stop)
     if not out[span].any():
         return row | {"problem": "silence where the human speaks"}
-    row |= judges.mos(mic[listened], ref[listened], out[listened], clip.talk)
+    row |= cached.mos(mic[listened], ref[listened], out[listened], clip.talk)
     row["erle_db"] = lowered_db(mic[before], out[before]) if before.start < before.stop else None
     human = clip.human[span]
     if not np.array_equal(out[span], human):  # the human alone has no distance from itself
-        row |= {"si_sdr": si_sdr(out[span], human), "estoi": judges.estoi(human, out[span])}
+        row |= {"si_sdr": si_sdr(out[span], human), "estoi": cached.estoi(human, out[span])}
     if clip.text:
-        row |= judges.words(clip.text, out[span]) or {}
+        row |= cached.words(clip.text, out[span]) or {}
     return row if output.events is None else row | noticed(output.events, first_sound(clip.human))
 
 
@@ -168,7 +168,7 @@ def first_sound(human: Samples) -> int:
 
 
 def noticed(events: Sequence[Event], onset: int) -> dict:
-    """delay_s from the onset to the first speech_started after it, None if there is none.
+    """Return delay_s, from the onset to the first speech_started after it, None if there is none.
 
     early: speech was on already, so nothing is noticed.
     """
@@ -208,7 +208,7 @@ def values(rows: Iterable[Mapping], key: str) -> tuple[list[Mapping], np.ndarray
 
 
 def mean(rows: Iterable[Mapping], key: str) -> dict | None:
-    """mean, low, high (95 %), median, std and count of a figure; None where no row has it.
+    """Return mean, low, high (95 %), median, std and count of a figure; None where no row has it.
 
     The interval is drawn over speakers and places (keys of a row, where it has them), not over recordings.
     """

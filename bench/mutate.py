@@ -199,7 +199,7 @@ def baseline_s(free: queue.Queue[Path], folder: str) -> float:
 
 
 def attempt(free: queue.Queue[Path], mutant: Mutant, limit_s: float) -> str:
-    """killed, timeout or survived."""
+    """What became of a mutant: killed, timeout or survived."""
     copy = free.get()
     path = copy / mutant.module
     source = path.read_text(encoding="utf-8")

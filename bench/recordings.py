@@ -35,7 +35,7 @@ LENGTHS_S = 1.0
 UTTERANCE_S = (3.0, 10.0)
 """Length of the humans' utterances: some words, and over before the recording is."""
 TAIL_S = 0.5
-"""Robot after the human's end, so that no system is judged on its flushing."""
+"""Robot after the human's end, so that no system is scored on its flushing."""
 TRIES = 50
 """Places drawn for a human before the one with the most robot is taken."""
 ROBOT_SILENT = 0.25
@@ -50,7 +50,7 @@ class NotHere(UsageError):
 
 
 class Signals(NamedTuple):
-    """mic, ref (n,) float32; human (n,) as it is inside mic and its span, where it is known."""
+    """The signals of a clip: mic, ref (n,) float32; human (n,) as it is inside mic and its span, where it is known."""
 
     mic: Samples
     ref: Samples
@@ -93,7 +93,7 @@ class Conversation:
         return json.loads((self.folder / "meta.json").read_text(encoding="utf-8"))
 
     def read(self, name: str) -> Samples:
-        """mic, ref, clean, sweep_ref, sweep_mic or fan_only, (n,); of an array the first microphone."""
+        """Read mic, ref, clean, sweep_ref, sweep_mic or fan_only, (n,); of an array the first microphone."""
         return self.read_all(name)[:, 0].copy()
 
     def read_all(self, name: str) -> Samples:
@@ -431,7 +431,7 @@ class Clip:
         return self.source.array(microphones)
 
     def known_human(self) -> Samples:
-        """(n,); raises NotHere where only the mixture was recorded."""
+        """The human alone, (n,); raises NotHere where only the mixture was recorded."""
         if self.human is None:
             raise NotHere("the human alone is not known here")
         return self.human
@@ -502,7 +502,7 @@ def named(clips: Iterable[Clip], name: str) -> list[Clip]:
 
 
 def read(path: Path) -> Samples:
-    """Samples (n,) of a file; raises UsageError for another rate or more channels."""
+    """Samples of a file, (n,); raises UsageError for another rate or more channels."""
     samples, rate = soundfile.read(path, dtype="float32")
     if rate != SAMPLE_RATE or samples.ndim != 1:
         channels = 1 if samples.ndim == 1 else samples.shape[1]

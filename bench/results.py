@@ -81,7 +81,7 @@ def stamp(
         "dirty": dirty,
         "data": [{"what": w, "folder": p.resolve().name, **digest(p)} for w, paths in data.items() for p in paths],
         "models": {name: digest(path) for name, path in files.items()},
-        "judged": stale.judged(systems),
+        "judged": stale.digests_of(systems),
         "machine": machine(),
         "date": datetime.now(timezone.utc).strftime("%Y-%m-%d %H:%M UTC"),
     }

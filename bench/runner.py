@@ -15,7 +15,7 @@ from bench import facts as facts_of
 from bench import metrics, recordings, results, systems
 from bench.cache import Cache
 from bench.facts import facts
-from bench.metrics import Judges
+from bench.metrics import CachedMetrics
 from bench.recogniser import Recogniser
 from bench.recordings import Clip, NotHere
 from edgefilter.errors import EdgefilterError
@@ -55,27 +55,27 @@ def run(
     return [row for clip in clips for row in done[clip.name]]
 
 
-def judges(setup: Setup) -> Judges:
-    """The recogniser and the other judges, with their caches."""
+def cached_metrics(setup: Setup) -> CachedMetrics:
+    """The recogniser's and the other slow metrics, with their cache."""
     kept = Cache(setup.cache, "by_sound")
-    return Judges(kept, Recogniser(setup.whisper, kept) if setup.whisper else None)
+    return CachedMetrics(kept, Recogniser(setup.whisper, kept) if setup.whisper else None)
 
 
 def _work(setup: Setup, task: tuple[Clip, tuple[str, ...]]) -> tuple[str, list[dict]]:
     """All rows of one clip."""
-    (clip, names), (known, kept, judging) = task, _opened(setup.cache, setup.whisper, tuple(setup.networks.items()))
-    asked = judging.recogniser.identity if judging.recogniser else "no recogniser"
+    (clip, names), (known, kept, cached) = task, _opened(setup.cache, setup.whisper, tuple(setup.networks.items()))
+    asked = cached.recogniser.identity if cached.recogniser else "no recogniser"
     about = {"set": clip.set, "room": clip.room, "clip": clip.name, "speaker": clip.speaker, "place": clip.place}
     about |= {"text": clip.text, "facts": kept.get(lambda: facts(clip), "facts", clip.fingerprint, _scoring())}
     rows = []
     for name in names:
         system = known[name]
         key = (clip.fingerprint, clip.talk, str(clip.text), str(clip.voices), name, _code(system), _scoring(), asked)
-        rows.append({**about, "system": name, **kept.get(lambda system=system: one(clip, system, judging), *key)})
+        rows.append({**about, "system": name, **kept.get(lambda system=system: one(clip, system, cached), *key)})
     return clip.name, rows
 
 
-def one(clip: Clip, system: systems.System, judging: Judges) -> dict:
+def one(clip: Clip, system: systems.System, cached: CachedMetrics) -> dict:
     """All figures of one output. Raises NotHere where it is the machine that lacks something: nothing is kept of that."""
     try:
         _ = clip.profile, clip.mic  # made and read here, so that their time is not the system's
@@ -89,14 +89,14 @@ def one(clip: Clip, system: systems.System, judging: Judges) -> dict:
         system.missing()
         return {"problem": str(error)}
     timed = {} if system.learns else {"seconds": seconds}  # a robot learns in another process
-    return timed | metrics.score(clip, output, judging)
+    return timed | metrics.score(clip, output, cached)
 
 
 @lru_cache(maxsize=1)
 def _opened(
     cache: Path | None, whisper: Path | None, networks: tuple[tuple[str, Path], ...]
-) -> tuple[dict[str, systems.System], Cache, Judges]:
-    return systems.catalogue(dict(networks)), Cache(cache, "rows"), judges(Setup(cache, whisper))
+) -> tuple[dict[str, systems.System], Cache, CachedMetrics]:
+    return systems.catalogue(dict(networks)), Cache(cache, "rows"), cached_metrics(Setup(cache, whisper))
 
 
 @lru_cache(maxsize=64)

@@ -1,6 +1,6 @@
 """Which results are of another behaviour than today's; exit 1 and their names, if there are any.
 
-Each result holds a digest of what every system that it judged makes of the bundled demonstrations; of the diagnosis, of
+Each result holds a digest of what every system that it measured makes of the bundled demonstrations; of the diagnosis, of
 the names and values that it finds there. A pure move of code leaves them equal. Make a stale result anew, or delete it
 with the sentences that quote it.
 """
@@ -85,7 +85,7 @@ def _of_diagnosis() -> str:
     return hashlib.sha256(repr((found.verdict, said)).encode()).hexdigest()[:16]
 
 
-def judged(systems: Iterable[str]) -> dict[str, str]:
+def digests_of(systems: Iterable[str]) -> dict[str, str]:
     """The digest of each of these that can run on the demonstrations."""
     return {name: digest for name in systems if (digest := digest_of(name)) is not None}
 

@@ -53,7 +53,7 @@ def score(
         Seconds between which the hypothesis was heard; of pieces with times only those within `REACH_S` of it count.
     speech_probability : float, optional
         Probability that a human spoke meanwhile: the mean of `EgoFilter.speech_probability` over the time between
-        `heard`, or any other judge's.
+        `heard`, or by any other detector.
 
     Returns
     -------
@@ -134,7 +134,7 @@ def explained(words: list[str], robot: str) -> float:
 
 
 def passages(heard: str, robot: str, least: int) -> NDArray[np.bool_]:
-    """(len(heard),) whether each letter is found in a passage of the robot's text that scores `least` or more.
+    """Whether each letter is found in a passage of the robot's text that scores `least` or more, (len(heard),).
 
     The best passage first, then what is left before and behind it.
     """
@@ -156,7 +156,7 @@ def passages(heard: str, robot: str, least: int) -> NDArray[np.bool_]:
 
 
 def best_until(equal: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """(n + 1, m + 1) score of the best alignment of letters that ends behind the first i and j; equal: (n, m)."""
+    """Score of the best alignment of letters that ends behind the first i and j, (n + 1, m + 1); equal: (n, m)."""
     steps = np.arange(equal.shape[1] + 1)
     best = np.zeros((equal.shape[0] + 1, equal.shape[1] + 1), np.int64)
     for row, same in enumerate(equal):

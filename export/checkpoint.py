@@ -54,13 +54,13 @@ def _read(path: Path) -> dict:
     return torch.load(path, map_location="cpu", weights_only=True)
 
 
-def main() -> int:
+def main(argv: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("checkpoint", type=Path, help="last.pt or best.pt of export/train.py")
     parser.add_argument("--output", type=Path, required=True, metavar="FILE.pt")
     parser.add_argument("--mean", type=Path, nargs="+", default=[], metavar="OTHER.pt", help="with these weights")
     parser.add_argument("--full", action="store_true", help="float32 instead of float16")
-    options = parser.parse_args()
+    options = parser.parse_args(argv)
     try:
         size = shrink(options.checkpoint, options.output, options.full, options.mean)
     except (EdgefilterError, OSError) as error:

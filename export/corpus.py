@@ -41,7 +41,7 @@ class Corpus:
     def draw(
         self, rng: np.random.Generator, speaker: str, seconds: float, said: list[Path] | None = None, rate: int = 100
     ) -> Samples:
-        """Utterances (n,) of that speaker, 0.1 to 0.5 s apart, cut at `seconds`; peak 0.5.
+        """Utterances of that speaker, 0.1 to 0.5 s apart, cut at `seconds`; (n,), peak 0.5.
 
         said: gets their paths. rate: at which they are played, percent; pitch and formants go with it, so that it is another
         voice.

@@ -178,7 +178,7 @@ class Batches:
 
 
 def colours(rng: np.random.Generator, count: int, stft: StftConfig) -> np.ndarray:
-    """(count, bins) gains of smooth frequency responses at random."""
+    """Gains of smooth frequency responses at random, (count, bins)."""
     place = erb_rate(stft.frequencies) / erb_rate(stft.frequencies[-1])
     depth, phase = rng.uniform(0, COLOUR_DB, (count, WAVES)), rng.uniform(0, 2 * np.pi, (count, WAVES))
     waves = np.cos(np.pi * np.arange(1, WAVES + 1)[:, None] * place + phase[..., None])

@@ -60,7 +60,7 @@ def log_mel(samples: Samples) -> Array:
 
 @lru_cache(maxsize=1)
 def _bands() -> Array:
-    """(BANDS, bins): triangles of equal area, evenly spaced on Slaney's mel scale (Slaney 1998, "Auditory Toolbox")."""
+    """Triangles of equal area, evenly spaced on Slaney's mel scale (Slaney 1998, "Auditory Toolbox"), (BANDS, bins)."""
     edges = _hz(np.linspace(0.0, _mel(SAMPLE_RATE / 2), BANDS + 2))
     low, centre, high = edges[:-2, None], edges[1:-1, None], edges[2:, None]
     bins = np.arange(N_FFT // 2 + 1) * SAMPLE_RATE / N_FFT

@@ -102,7 +102,7 @@ def make_dataset(
     yield from spread(_make, material, missing, jobs, scheduler)
 
 
-def arguments() -> argparse.Namespace:
+def arguments(argv: list[str] | None = None) -> argparse.Namespace:
     """What the command line says."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--humans", type=Path, nargs="+", required=True, metavar="DIR")
@@ -132,11 +132,11 @@ def arguments() -> argparse.Namespace:
         metavar="ADDRESS",
         help="of a Dask cluster that makes the items instead; its machines see the same folders",
     )
-    return parser.parse_args()
+    return parser.parse_args(argv)
 
 
-def main() -> int:
-    options = arguments()
+def main(argv: list[str] | None = None) -> int:
+    options = arguments(argv)
     try:
         simulate_all(options)
     except (EdgefilterError, OSError) as error:

@@ -81,7 +81,7 @@ class Items:
     def crops(
         self, places: list[tuple[str, int]], samples: int, signals: tuple[str, ...] = STORED
     ) -> dict[str, Tensor]:
-        """(places, samples) float32 of each of these stored signals, at their true scale; places: item and first sample."""
+        """Samples of each of these stored signals, at their true scale, (places, samples) float32; places: item and first sample."""
         found = {}
         for signal in signals:
             scale = "reference_scale" if signal == "reference" else "scale"
@@ -90,7 +90,7 @@ class Items:
         return found
 
     def powers(self, places: list[tuple[str, int]], samples: int, stft: StftConfig) -> dict[str, Tensor]:
-        """(places, frames, bins) float32 of both expected powers, for the frames that lie wholly in the crops.
+        """Both expected powers, for the frames that lie wholly in the crops, (places, frames, bins) float32 each.
 
         places: as for crops(), whole hops from the item's start. Empty where an item was simulated for another
         transform.

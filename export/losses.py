@@ -28,7 +28,7 @@ class LossWeights:
 
 
 def compressed(spectrum: Tensor, exponent: float) -> tuple[Tensor, Tensor]:
-    """|S|^exponent (...,) and S |S|^(exponent - 1) (..., 2) of a spectrum (..., 2)."""
+    """Return |S|^exponent (...,) and S |S|^(exponent - 1) (..., 2) of a spectrum S (..., 2)."""
     power = (spectrum * spectrum).sum(-1) + EPSILON
     return power ** (exponent / 2), spectrum * (power ** ((exponent - 1) / 2)).unsqueeze(-1)
 

@@ -215,7 +215,7 @@ def erb_rate(frequency_hz: np.ndarray) -> np.ndarray:
 
 
 def erb_bands(stft: StftConfig, count: int) -> Tensor:
-    """(count, bins - 1) weights that spread bands over the frequencies above 0 Hz, linearly between their centres.
+    """Weights that spread bands over the frequencies above 0 Hz, linearly between their centres, (count, bins - 1).
 
     Centres are evenly spaced on the ERB-rate scale, but at least a bin apart.
     """
@@ -231,7 +231,7 @@ def erb_bands(stft: StftConfig, count: int) -> Tensor:
 
 
 def _on_bands(x: Tensor, weights: Tensor) -> Tensor:
-    """(n, channels, 1, frequencies) times weights (frequencies, others), in the memory order in which x is.
+    """Return x (n, channels, 1, frequencies) times weights (frequencies, others), in the memory order in which x is.
 
     As one product: with the weights on the left, a copy of them is made for each of the n.
     """
@@ -246,12 +246,12 @@ def _with_previous(x: Tensor, previous: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _channels_last(x: Tensor) -> Tensor:
-    """(batch, frames, bands, features) as (batch * frames, features, 1, bands), the features innermost in memory."""
+    """Reshape (batch, frames, bands, features) to (batch * frames, features, 1, bands), the features innermost in memory."""
     return x.reshape(-1, 1, *x.shape[2:]).permute(0, 3, 1, 2)
 
 
 def features(spectrum: Tensor) -> Tensor:
-    """(batch, frames, bins, 2) to real, imaginary part and magnitude, all compressed, (batch, frames, bins - 1, 3).
+    """Turn spectra (batch, frames, bins, 2) into real, imaginary part and magnitude, all compressed, (batch, frames, bins - 1, 3).
 
     0 Hz is left out.
     """

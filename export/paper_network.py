@@ -61,7 +61,7 @@ class PaperCrnn(nn.Module):
         return self.dense[2]
 
     def forward(self, mic_magnitude: Tensor, reference_magnitude: Tensor) -> Tensor:
-        """Mask (batch, frames, bins) in 0-1 for the mixture's magnitude, from both magnitudes (batch, frames, bins)."""
+        """Mask in 0-1 for the mixture's magnitude, from both magnitudes, (batch, frames, bins) each."""
         branches = (self.mixture(mic_magnitude.unsqueeze(1)), self.reference(reference_magnitude.unsqueeze(1)))
         features = torch.cat(branches, dim=1).permute(0, 2, 1, 3).flatten(2)
         recurrent, _ = self.blstm(features)

@@ -12,7 +12,7 @@ from torch import distributed, nn
 
 @dataclass(frozen=True)
 class Processes:
-    """Each draws crops of its own; gradients are the mean over all. rank 0 judges and writes."""
+    """Each draws crops of its own; gradients are the mean over all. rank 0 validates and writes."""
 
     rank: int = 0
     world: int = 1

@@ -54,7 +54,7 @@ class RecogniserLoss:
             return [answer.float() for answer in self.encoder(mel)]
 
     def sound(self, spectra: Tensor) -> Tensor:
-        """(batch, frames, bins, 2) to (batch, (frames - 1) hop), overlapped and added, without the frame at either end that lacks a neighbour."""
+        """Overlap and add spectra (batch, frames, bins, 2) to samples (batch, (frames - 1) hop), without either end, which lacks a neighbour."""
         hop, size = self.stft.hop, self.stft.window_length
         frames = torch.fft.irfft(torch.view_as_complex(spectra.contiguous()), self.stft.n_fft)[..., :size]
         frames = (frames * self._window.to(frames)).transpose(1, 2)

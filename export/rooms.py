@@ -23,7 +23,7 @@ RANGES = {
 
 @dataclass(frozen=True, eq=False)
 class Room:
-    """robot: (n,) from the loudspeaker to the microphone; humans: HUMANS responses (n,) from as far as RANGES says.
+    """Impulse responses of a room. robot: (n,) from the loudspeaker to the microphone; humans: HUMANS responses (n,) from as far as RANGES says.
 
     Float32, 16 kHz.
     """

@@ -29,7 +29,10 @@ FIRST_MASK = 10 ** (-25 / 20)
 
 
 class Task(Protocol):
-    """kind: as the checkpoint names it. remedy: against another shape than asked for. stft: of the batches that loss() takes."""
+    """What is trained, and on which loss.
+
+    kind: as the checkpoint names it. remedy: against another shape than asked for. stft: of the batches that loss() takes.
+    """
 
     kind: ClassVar[str]
     remedy: ClassVar[str]

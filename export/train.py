@@ -55,7 +55,7 @@ def smoke(options: argparse.Namespace) -> None:
     options.steps, options.every, options.batch, options.seconds = 4, 2, 2, 0.7
 
 
-def arguments() -> argparse.Namespace:
+def arguments(argv: list[str] | None = None) -> argparse.Namespace:
     """What the command line says."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--data", type=Path, required=True, metavar="DIR")
@@ -94,7 +94,9 @@ def arguments() -> argparse.Namespace:
         "--norm", choices=("layer", "batch", "none"), help="(default: layer; of the paper's network none)"
     )
     parser.add_argument("--erb", type=int, help="bands as wide as the ear's, 64 say, in place of all frequencies")
-    parser.add_argument("--recogniser", type=Path, metavar="WHISPER", help="folder whose encoder judges the answer too")
+    parser.add_argument(
+        "--recogniser", type=Path, metavar="WHISPER", help="folder whose encoder compares the answer too"
+    )
     parser.add_argument("--recogniser-weight", type=float, default=0.1)
     parser.add_argument(
         "--fan-kept",
@@ -112,7 +114,7 @@ def arguments() -> argparse.Namespace:
     parser.add_argument(
         "--smoke", action="store_true", help="make a few seconds of data in --data and --validation and take four steps"
     )
-    return parser.parse_args()
+    return parser.parse_args(argv)
 
 
 def sizes_before(kind: str, *checkpoints: Path | None) -> dict[str, object]:
@@ -130,8 +132,8 @@ def sizes_before(kind: str, *checkpoints: Path | None) -> dict[str, object]:
     return {}
 
 
-def main() -> int:
-    options = arguments()
+def main(argv: list[str] | None = None) -> int:
+    options = arguments(argv)
     try:
         if options.smoke:
             smoke(options)

@@ -101,7 +101,7 @@ class Trainer:
                 if self.step % self.plan.every and not over:
                     continue
                 if board:
-                    self._judge(items, held_out, board, shown["total"])
+                    self._validate(items, held_out, board, shown["total"])
                 items.refresh()
                 if over or self.processes.agree(0 < self.plan.patience <= self.since, self._device()):
                     break
@@ -129,7 +129,7 @@ class Trainer:
                 self.average[name].copy_(value)
         return {name: float(value.detach()) for name, value in terms.items()}
 
-    def _judge(self, items: Items, held_out: Items, board: SummaryWriter, loss: float) -> None:
+    def _validate(self, items: Items, held_out: Items, board: SummaryWriter, loss: float) -> None:
         """Validate the averaged weights and write what training goes on from, and the weights where they are the best."""
         averaged = self.task.network().to(self._device())
         averaged.load_state_dict(self.average)

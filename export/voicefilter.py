@@ -32,7 +32,7 @@ from export.voicefilter_trainer import VoiceFilterTrainer, load, validate
 CACHE = "d_vectors.npz"
 
 
-def arguments() -> argparse.Namespace:
+def arguments(argv: list[str] | None = None) -> argparse.Namespace:
     """What the command line says."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--data", type=Path, required=True, metavar="DIR")
@@ -51,7 +51,7 @@ def arguments() -> argparse.Namespace:
     parser.add_argument("--hidden", type=int, default=VoiceFilterConfig.hidden)
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--full-precision", action="store_true", help="float32 instead of bfloat16 in the forward pass")
-    return parser.parse_args()
+    return parser.parse_args(argv)
 
 
 def mixtures(folder: Path, speech: list[Path], config: VoiceFilterConfig, seed: int, cache: Path) -> Mixtures:
@@ -83,8 +83,8 @@ def train(options: argparse.Namespace) -> list[str]:
     return [str(best.figures), export(best, options.output / "voicefilter.onnx")]
 
 
-def main() -> int:
-    options = arguments()
+def main(argv: list[str] | None = None) -> int:
+    options = arguments(argv)
     try:
         print("\n".join(train(options)))
     except (EdgefilterError, OSError) as error:

@@ -58,7 +58,7 @@ class VoiceFilter(nn.Module):
         )
 
     def forward(self, magnitude: Tensor, d_vector: Tensor) -> Tensor:
-        """Mask (batch, frames, bins) in 0 to 1, from magnitude (batch, frames, bins) and d_vector (batch, values)."""
+        """Mask in 0 to 1, (batch, frames, bins), from magnitude (batch, frames, bins) and d_vector (batch, values)."""
         level = magnitude.square().mean((1, 2), keepdim=True).sqrt() + 1e-9
         compressed = (magnitude / level + QUIET) ** COMPRESSION
         features = self.convolutions(compressed.unsqueeze(1)).transpose(1, 2).flatten(2)

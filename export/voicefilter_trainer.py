@@ -78,7 +78,7 @@ class VoiceFilterTrainer:
                 self.step, self.seconds = step + 1, time.perf_counter() - began
                 over = self.plan.done_at(self.step, self.seconds) >= 1.0
                 if over or self.step % self.plan.every == 0:
-                    self._judge(held_out, len(mixtures.items))
+                    self._validate(held_out, len(mixtures.items))
                 if over:
                     break
 
@@ -98,7 +98,7 @@ class VoiceFilterTrainer:
                 self.average[name].copy_(value)
         return float(difference.detach())
 
-    def _judge(self, held_out: Mixtures, items: int) -> None:
+    def _validate(self, held_out: Mixtures, items: int) -> None:
         """Validate the averaged weights and write them, as the best ones too where they are."""
         averaged = VoiceFilter(self.network.config)
         averaged.load_state_dict(self.average)

@@ -79,14 +79,14 @@ class WhisperEncoder(nn.Module):
         self.register_buffer("window", torch.hann_window(N_FFT))
 
     def log_mel(self, samples: Tensor) -> Tensor:
-        """(batch, n) at 16 kHz to (batch, mels, n / HOP), as Whisper is fed."""
+        """Turn samples (batch, n) at 16 kHz into log mel spectra (batch, mels, n / HOP), as Whisper is fed."""
         spectrum = torch.stft(samples, N_FFT, HOP, window=self.window, center=True, return_complex=True)[..., :-1]
         power = torch.view_as_real(spectrum).square().sum(-1)
         level = (self.mel @ power).clamp(min=1e-10).log10()
         return (torch.maximum(level, level.amax((1, 2), keepdim=True) - DYNAMIC) + 4.0) / 4.0
 
     def forward(self, log_mel: Tensor) -> list[Tensor]:
-        """(batch, mels, frames) to what each layer answers, (batch, frames / 2, width), that of the convolutions first."""
+        """Turn (batch, mels, frames) into what each layer answers, (batch, frames / 2, width), that of the convolutions first."""
         x = gelu(conv1d(log_mel, self.conv1_weight, self.conv1_bias, padding=1))
         x = gelu(conv1d(x, self.conv2_weight, self.conv2_bias, stride=2, padding=1)).transpose(1, 2)
         x = x + self.position_encodings_encodings[: x.shape[1]]
@@ -116,7 +116,7 @@ class WhisperEncoder(nn.Module):
 
 
 def mel_filters(count: int) -> np.ndarray:
-    """(count, N_FFT / 2 + 1) float32, triangles of equal area on the scale of Slaney's Auditory Toolbox (1998).
+    """Triangles of equal area on the scale of Slaney's Auditory Toolbox (1998), (count, N_FFT / 2 + 1) float32.
 
     That scale is linear below 1 kHz, 15 a kHz, and logarithmic above, 27 to a factor of 6.4.
     """

@@ -1,8 +1,10 @@
-"""Which tests share a process where several run at once (pytest -n 2), and which begin."""
+"""Which tests share a process where several run at once (pytest -n 2), and which begin; a catalogue that can be added to."""
 
 from pathlib import Path
 
 import pytest
+
+from edgefilter.echo.effects import catalogue
 
 HERE = Path(__file__).parent
 LONGEST = (
@@ -50,3 +52,9 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """The longest groups first."""
     groups = {item: group_of(item.path.relative_to(HERE).as_posix()) for item in items}
     items.sort(key=lambda item: LONGEST.index(groups[item]) if groups[item] in LONGEST else len(LONGEST))
+
+
+@pytest.fixture
+def own_catalogue(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What a test registers is forgotten when it is over."""
+    monkeypatch.setattr(catalogue, "_known", dict(catalogue._known))

@@ -186,7 +186,7 @@ def counts(found: Sequence[Outcome]) -> dict[str, dict]:
 
 
 def counted(flags: Iterable[bool]) -> dict:
-    """hits, n, and the percentage with its interval."""
+    """Number of hits, of n, and the percentage with its interval."""
     flags = list(flags)
     low, high = wilson(sum(flags), len(flags))
     return {

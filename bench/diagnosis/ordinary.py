@@ -3,7 +3,7 @@
 --cases are folders of controls (bench.simulate.hidden_cases --set controls). With --learn FILE their table is written as
 edgefilter/diagnosis/ordinary.json holds it; without, each recording's least p-value over all effects is held against the
 uniform distribution (Kolmogorov-Smirnov): learn on some controls, look at others. The table belongs to the code that fits
-and judges: learn it anew where that changes.
+and scores: learn it anew where that changes.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from bench.stale import DIAGNOSIS
 from edgefilter.calibration.calibrate import calibrate
 from edgefilter.diagnosis.ordinary import LEAST_DB, Chance, Ordinary, explained_db, p_value
 from edgefilter.diagnosis.prepare import prepare
-from edgefilter.diagnosis.score import Judge
+from edgefilter.diagnosis.score import Scorer
 from edgefilter.echo.effect import fitted, vanishes
 from edgefilter.echo.effects.catalogue import find, names
 from edgefilter.errors import UsageError
@@ -43,16 +43,16 @@ def gains(case: Path) -> dict[str, float]:
     """Trial.gain_db of each effect, fitted alone; 0 where its fit finds nothing."""
     recorded = signals(case)
     prepared = prepare(calibrate(*(recorded[name] for name in SIGNALS[:3])), recorded["mic"], recorded["ref"])
-    judge, model = Judge(prepared), prepared.model
-    base, found = judge.of(model), dict.fromkeys(names(), 0.0)
+    scorer, model = Scorer(prepared), prepared.model
+    base, found = scorer.of(model), dict.fromkeys(names(), 0.0)
     for name in found:
         effect = find(name)
-        values = fitted(effect, judge.measurement, model)
+        values = fitted(effect, scorer.measurement, model)
         if not vanishes(effect, values):
             behind = prepared.behind(effect.noise_psd(values, prepared.noise_psd))
-            after = Judge(behind).of(model.with_effect(name, values))
+            after = Scorer(behind).of(model.with_effect(name, values))
             of_fan = effect.stage == "noise"
-            found[name] = judge.fan_gain_db(base, after) if of_fan else base.level_db - after.level_db
+            found[name] = scorer.fan_gain_db(base, after) if of_fan else base.level_db - after.level_db
     return found
 
 
@@ -82,7 +82,7 @@ def learnt(found: Sequence[Mapping[str, float]]) -> dict[str, object]:
 
 
 def least(p_value: Callable[[str, float], float], found: Sequence[Mapping[str, float]]) -> Array:
-    """(n,) the least p-value of each recording over all effects."""
+    """The least p-value of each recording over all effects, (n,)."""
     return np.array([min(p_value(name, gain) for name, gain in one.items()) for one in found])
 
 

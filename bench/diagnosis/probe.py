@@ -2,7 +2,7 @@
 
 The robots (bench/simulate/asked_robot.py) have changed since their calibration; both effects of a pair are fitted to a
 few seconds of speech. Then the robot is asked: by sounds of the probe's own choice until the odds are 20 to 1, by a sweep
-of 5 s, by 5 s of further sentences. All are recorded by the same robot and judged in the same way.
+of 5 s, by 5 s of further sentences. All are recorded by the same robot and scored in the same way.
 """
 
 from __future__ import annotations

@@ -92,7 +92,7 @@ def noise_off_db(profile: Profile, model: EchoModel, y: Samples, x: Samples, cut
 
 
 def _bands_db(psd: Samples) -> np.ndarray:
-    """(bands,) dB of a PSD (601,)."""
+    """Level of a PSD (601,) in each band, dB, (bands,)."""
     return np.asarray(decibels(blocks(floored(psd), BAND).mean(axis=1)))
 
 
@@ -160,14 +160,14 @@ def tables(found: Mapping[str, Sequence[Row]]) -> list[dict]:
 
 def summary(rows: Sequence[Row]) -> list[list]:
     """A line for all that was named, and one for what was kept."""
-    judged = [row for row in rows if row.named_db is not None and row.kept_db is not None]
+    tested = [row for row in rows if row.named_db is not None and row.kept_db is not None]
     lines = []
     for way in ("named", "kept"):
-        change = [after - before for before, after in (getattr(row, f"{way}_db") for row in judged)]
+        change = [after - before for before, after in (getattr(row, f"{way}_db") for row in tested)]
         fell, rose = [db > WORSE_DB for db in change], sum(db < -WORSE_DB for db in change)
         figures = [float(np.median(change)), rose, min(change)] if change else [None, rose, None]
         declined = sum(bool(row.declined) for row in rows)
-        lines.append([len(rows), declined, len(judged), f"all that was {way}" if way == "named" else "what was kept",
+        lines.append([len(rows), declined, len(tested), f"all that was {way}" if way == "named" else "what was kept",
                       counted(fell) if change else None, *figures])  # fmt: skip
     return lines
 

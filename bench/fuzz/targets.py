@@ -36,7 +36,7 @@ FILTERED = 40
 
 @dataclass(frozen=True)
 class Target:
-    """seeds: real files. mutate: one of them damaged. attempt: load it, and use what was loaded; raises where that goes wrong.
+    """A loader under attack. seeds: real files. mutate: damages one. attempt: loads it and uses what was loaded; raises where that goes wrong.
 
     share: of all inputs. suffix: of the file. accepted: what attempt returns, whether the file was taken.
     """

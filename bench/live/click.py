@@ -80,7 +80,7 @@ def start(engine: str) -> tuple[float, float]:
 
 
 def click() -> np.ndarray:
-    """(CLICK,) int16, a windowed chirp from 300 to 3000 Hz."""
+    """A windowed chirp from 300 to 3000 Hz, (CLICK,) int16."""
     t = np.arange(CLICK) / SAMPLE_RATE
     return (16000 * signal.chirp(t, 300, t[-1], 3000) * np.hanning(CLICK)).astype(np.int16)
 

@@ -59,7 +59,7 @@ SPEED_OF_SOUND = 343.0
 
 
 def measured_covariances(folder: Path) -> tuple[Array, Array]:
-    """Covariances (bins, 3, 3) of the array's noise for the calibration and for the conversation, from different files."""
+    """Covariances of the array's noise for the calibration and for the conversation, from different files, (bins, 3, 3) each."""
     files = sorted(folder.glob("*.flac"))
     if len(files) < 2:
         sys.exit(f"{folder} holds {len(files)} FLAC files, expected at least two of an array's own noise")
@@ -79,7 +79,7 @@ def measured_covariances(folder: Path) -> tuple[Array, Array]:
 
 
 def with_microphones(covariance: Array, count: int, phase: float) -> Array:
-    """Covariances (bins, count, count) of one to four microphones from those of three; phase: of the fourth at 8 kHz."""
+    """Covariances of one to four microphones from those of three, (bins, count, count); phase: of the fourth at 8 kHz."""
     if count <= 3:
         return covariance[:, :count, :count]
     root = np.linalg.cholesky(
@@ -94,7 +94,7 @@ def with_microphones(covariance: Array, count: int, phase: float) -> Array:
 
 
 def parts_covariance(rng: np.random.Generator, places: Array) -> Array:
-    """Covariance (bins, m, m) of near sources, a diffuse field and the microphones' own noise. places: (m, 3) m."""
+    """Covariance of near sources, a diffuse field and the microphones' own noise, (bins, m, m). places: (m, 3) m."""
     hz = np.arange(SIZE // 2 + 1) * RATE / SIZE
     wave = 2 * np.pi * hz / SPEED_OF_SOUND
     count = len(places)
@@ -112,7 +112,7 @@ def parts_covariance(rng: np.random.Generator, places: Array) -> Array:
 
 
 def coloured(rng: np.random.Generator, covariance: Array, amplitude: Array, n: int) -> Array:
-    """(m, n) Gaussian noise of that covariance in each bin, amplitude (1025,) on 0 to 8 kHz, unit power in channel 0."""
+    """Gaussian noise of that covariance in each bin, amplitude (1025,) on 0 to 8 kHz, unit power in channel 0, (m, n)."""
     count = covariance.shape[1]
     scale = covariance / covariance[:, :1, :1].real  # channel 0 has the drawn spectrum
     root = np.linalg.cholesky(scale + 1e-6 * np.eye(count))
@@ -131,7 +131,7 @@ def coloured(rng: np.random.Generator, covariance: Array, amplitude: Array, n: i
 
 
 def draw_places(rng: np.random.Generator, count: int) -> Array:
-    """(count, 3) m, on a circle."""
+    """Places of microphones on a circle, (count, 3) in m."""
     radius, first = rng.uniform(0.025, 0.045), rng.uniform(0, 2 * np.pi)
     angles = first + 2 * np.pi * np.arange(count) / max(count, 3)
     return radius * np.stack((np.cos(angles), np.sin(angles), np.zeros(count)), axis=1)

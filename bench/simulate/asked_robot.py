@@ -55,13 +55,13 @@ class AskedRobot:
     _gain: float
 
     def ask(self, sound: Array, seed: int) -> Array:
-        """(n + RATE,) what the microphone records of a sound (n,) and for a second after it."""
+        """What the microphone records of a sound (n,) and for a second after it, (n + RATE,)."""
         x = np.pad(sound.astype(np.float64), (0, round(AFTER_S * RATE)))
         fan = self._fan(seed, x.size)
         return np.float32(self._gain * self._scene.record(replace(self._chain, played=self._player(x), fan=fan)))
 
     def _fan(self, seed: int, n: int) -> Array:
-        """(n,) other noise of the same spectrum as the end of the recording has."""
+        """Other noise of the same spectrum as the end of the recording has, (n,)."""
         end = self._chain.fan[self._chain.fan.size // 2 :]
         hz, psd = signal.welch(end, fs=RATE, nperseg=2048)
         noise = fan_noise(np.random.default_rng(seed), np.sqrt(psd), n)
@@ -84,7 +84,7 @@ def make(seed: list[int], truth: str, strength: str, voices: dict[str, list[Clip
 
 
 def _sentences(rng: np.random.Generator, clips: list[Clip], seconds: float) -> Array:
-    """(n,) so many seconds of sentences in random order, 0.1 to 0.5 s apart, peak 0.8, faded out."""
+    """So many seconds of sentences in random order, (n,), 0.1 to 0.5 s apart, peak 0.8, faded out."""
     parts: list[Array] = []
     for i in rng.permutation(len(clips)):
         parts += [read_speech(clips[i]), np.zeros(round(rng.uniform(0.1, 0.5) * RATE))]

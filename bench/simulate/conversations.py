@@ -1,4 +1,4 @@
-r"""Simulate whole conversations with a robot, to judge and tune the filter on.
+r"""Simulate whole conversations with a robot, to evaluate and tune the filter on.
 
 The robot speaks, pauses, speaks again, a human interrupts.
 
@@ -96,11 +96,11 @@ class Scene:
     fan: Array
 
     def echo(self, ref: Array) -> Array:
-        """(n,) of the robot at the microphone, for the reference (n,)."""
+        """The robot at the microphone for the reference (n,), (n,)."""
         return self.gain * self.robot.record(played(ref, self.meta), self.response)
 
     def mic(self, ref: Array) -> Array:
-        """(n,) of the microphone, for the reference (n,): human and fan are the same whatever the robot says."""
+        """What the microphone records for the reference (n,), (n,): human and fan are the same whatever the robot says."""
         return self.echo(ref) + self.signals["clean"] + self.fan
 
 
@@ -225,7 +225,7 @@ def played(ref: Array, script: dict) -> Array:
 
 
 def noises(rng: np.random.Generator, sizes: tuple[int, int, int]) -> list[Array]:
-    """(n,) of each size of a drawn fan, of unit power."""
+    """Noise of a drawn fan, of unit power, for each size (n,)."""
     spectrum = draw_fan(rng)
     return [fan_noise(rng, spectrum, n) for n in sizes]
 

@@ -400,7 +400,7 @@ def build(options: argparse.Namespace) -> int:
     return 1 if differences else 0
 
 
-def main() -> int:
+def main(argv: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     add = parser.add_argument
     add("--output", type=Path, required=True, metavar="DATA")
@@ -413,7 +413,7 @@ def main() -> int:
     add("--synthesizers", action="store_true", help="have espeak-ng and flite read the robot's sentences")
     add("--whisper", type=Path, metavar="DIR", help="a download of openai/whisper-base")
     add("--checksums", type=Path, metavar="FILE", help="compare with this checksums.tsv")
-    options = parser.parse_args()
+    options = parser.parse_args(argv)
     if not (options.archives or options.kokoro or options.renderings or options.synthesizers or options.whisper):
         parser.error("nothing to build from: give --archives, --kokoro, --renderings, --synthesizers or --whisper")
     try:

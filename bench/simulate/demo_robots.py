@@ -47,7 +47,7 @@ CASES = (
 
 
 def said(rng: np.random.Generator, clips: list[Clip]) -> tuple[Array, float]:
-    """(n,) sentences for ALONE_S, a pause, one more for at least TALK_S, peak 0.8; and the second before that one."""
+    """Sentences for ALONE_S, a pause, one more for at least TALK_S, peak 0.8, (n,); and the second before that one."""
     parts, order = [np.zeros(RATE // 2)], list(rng.permutation(len(clips)))
     while sum(part.size for part in parts) < ALONE_S * RATE:
         parts += [read_speech(clips[order.pop()]), np.zeros(int(rng.uniform(0.2, 0.6) * RATE))]

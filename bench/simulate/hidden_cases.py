@@ -55,7 +55,7 @@ SECONDS = (20.0, 30.0)
 
 
 def read_reference(rng: np.random.Generator, clips: list[Clip]) -> Array:
-    """(n,) 20-30 s of sentences of one voice, peak 0.8, with pauses of 0.1-2 s, silence at both ends."""
+    """Sentences of one voice for 20 to 30 s, (n,), peak 0.8, with pauses of 0.1-2 s, silence at both ends."""
     wanted = int(rng.uniform(*SECONDS) * RATE)
     parts, size = [np.zeros(int(rng.uniform(0.4, 1.0) * RATE))], 0
     for i in rng.permutation(len(clips)):

@@ -67,20 +67,20 @@ STEP_MS = 1
 
 
 def levels_db(x: Array, step_ms: int) -> Array:
-    """(m,) RMS level in dBFS of steps of so many ms."""
+    """RMS level in dBFS of steps of so many ms, (m,)."""
     step = RATE * step_ms // 1000
     blocks = np.pad(x, (0, -x.size % step)).reshape(-1, step)
     return 10 * np.log10(np.mean(blocks**2, axis=1) + 1e-10)
 
 
 def gain_curve(gain_db: Array, step_ms: int, n: int) -> Array:
-    """(n,) amplitude gain, interpolated in dB between the ends of the steps."""
+    """Amplitude gain, interpolated in dB between the ends of the steps, (n,)."""
     ends = (np.arange(gain_db.size) + 1) * (RATE * step_ms // 1000)
     return 10 ** (np.interp(np.arange(n), ends, gain_db) / 20)
 
 
 def smooth(x: Array, rise_ms: float, fall_ms: float, step_ms: int) -> Array:
-    """(m,) x followed by a first-order lag that rises with one time constant and falls with another."""
+    """Smooth x (m,) by a first-order lag that rises with one time constant and falls with another."""
     rise, fall = (1.0 - math.exp(-step_ms / constant) for constant in (rise_ms, fall_ms))
     out, state = [], float(x[0])
     for value in x.tolist():
@@ -92,7 +92,7 @@ def smooth(x: Array, rise_ms: float, fall_ms: float, step_ms: int) -> Array:
 def compressor_gain_db(
     x: Array, threshold_db: float, ratio: float, knee_db: float, attack_ms: float, release_ms: float
 ) -> Array:
-    """(m,) gain per ms of a feed-forward compressor (Giannoulis, Massberg & Reiss 2012, eq. (4) and (17))."""
+    """Gain per ms of a feed-forward compressor, (m,) (Giannoulis, Massberg & Reiss 2012, eq. (4) and (17))."""
     over = levels_db(x, STEP_MS) - threshold_db
     bend = np.clip(over + knee_db / 2, 0, knee_db) ** 2 / (2 * max(knee_db, 1e-6))
     reduction = (1.0 - 1.0 / ratio) * np.where(over > knee_db / 2, over, bend)
@@ -109,7 +109,7 @@ def agc_gain_db(
     hold_db: float,
     step_ms: int = 5,
 ) -> Array:
-    """(m,) gain of a feedback loop that steers the output's level towards target_db.
+    """Gain of a feedback loop that steers the output's level towards target_db, (m,).
 
     slope 0..1: how much of the deviation it takes away. Falls with attack_ms, rises with release_ms, within +-limit_db;
     stands still while the input is below hold_db.
@@ -549,7 +549,7 @@ def through_codec(x: Array, name: str, kbps: int) -> Array:
 
 
 def put_back(y: Array, x: Array) -> Array:
-    """(n,) y, of any length, at the lag of whole samples at which it is most like x (n,)."""
+    """Put y, of any length, at the lag of whole samples at which it is most like x (n,); (n,)."""
     lags = signal.correlate(y[: 1 << 18], x[: 1 << 18], method="fft")
     lag = int(np.argmax(np.abs(lags))) - min(x.size, 1 << 18) + 1
     y = y[lag:] if lag >= 0 else np.concatenate([np.zeros(-lag), y])

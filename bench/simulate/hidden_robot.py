@@ -35,7 +35,7 @@ class Place:
     loudspeaker: Array
 
     def response(self) -> Array:
-        """(m,) impulse response by image sources (Allen & Berkley 1979; pyroomacoustics), without its filter delay."""
+        """Impulse response by image sources, (m,) (Allen & Berkley 1979; pyroomacoustics), without its filter delay."""
         room = pra.ShoeBox(self.size, fs=RATE, materials=pra.Material(self.absorption), max_order=self.order)
         room.add_microphone(self.microphone)
         room.add_source(self.loudspeaker)
@@ -70,7 +70,7 @@ def draw_place(
 
 
 def direction(rng: np.random.Generator) -> Array:
-    """(3,) of length 1, anywhere."""
+    """A random direction of length 1, (3,)."""
     x = rng.standard_normal(3)
     return x / np.linalg.norm(x)
 
@@ -97,7 +97,7 @@ def reflector(rng: np.random.Generator, place: Place) -> Callable[[float], Array
 
 @functools.cache
 def _sinc_table() -> Array:
-    """(PHASES + 1, 2 HALF_WIDTH) Kaiser-windowed sincs (beta 9), row p for a position p / PHASES behind a sample."""
+    """Kaiser-windowed sincs (beta 9), row p for a position p / PHASES behind a sample, (PHASES + 1, 2 HALF_WIDTH)."""
     distance = np.arange(-HALF_WIDTH + 1, HALF_WIDTH + 1)[None] - np.arange(PHASES + 1)[:, None] / PHASES
     return np.sinc(distance) * np.i0(9.0 * np.sqrt(np.clip(1.0 - (distance / HALF_WIDTH) ** 2, 0.0, 1.0))) / np.i0(9.0)
 
@@ -214,7 +214,7 @@ class Scene:
     _pressure: list[tuple[Array, Loudspeaker, Array]] = field(default_factory=list)
 
     def pressure(self, chain: Chain) -> Array:
-        """(n,) in front of the loudspeaker; the last three are kept."""
+        """The signal in front of the loudspeaker, (n,); the last three are kept."""
         for played, loudspeaker, found in self._pressure:
             if played is chain.played and loudspeaker is chain.loudspeaker:
                 return found
@@ -223,7 +223,7 @@ class Scene:
         return found
 
     def echo(self, chain: Chain) -> Array:
-        """(n,) the robot at the microphone."""
+        """The robot at the microphone, (n,)."""
         source = self.pressure(chain) if chain.impacts is None else self.pressure(chain) + chain.impacts
         heard = np.zeros(source.size)
         for i, (start, fade, response) in enumerate(chain.paths):
@@ -240,7 +240,7 @@ class Scene:
         return read_at(heard, np.arange(source.size) - self.delay - self.offset - chain.lag)
 
     def record(self, chain: Chain) -> Array:
-        """(n,) the microphone's recording."""
+        """The microphone's recording, (n,)."""
         mic = self.echo(chain) + chain.fan
         mic = mic if chain.others is None else mic + chain.others
         for stage in chain.microphone:
@@ -251,7 +251,7 @@ class Scene:
         return decibels(power(difference) / self.fan_power)
 
     def linear_response(self) -> Array:
-        """(m,) from what is played to the microphone at small signals, 256 samples late for the converters' delay."""
+        """Impulse response from what is played to the microphone at small signals, (m,), 256 samples late for the converters' delay."""
         impulse = np.eye(1, 2048, 256)[0]
         path = signal.oaconvolve(self.usual.paths[0][2], self.shell)
         return self.gain_after * signal.oaconvolve(self.usual.loudspeaker.play(impulse, linear=True), path)
@@ -317,7 +317,7 @@ def draw_scene(
 
 
 def draw_shell(rng: np.random.Generator) -> Array:
-    """(128,) what the robot's own body does.
+    """Impulse response of the robot's own body, (128,).
 
     Reflections within 2 ms, and 4-10 dB less treble, as the microphone is not in front of the cone.
     """
@@ -328,7 +328,7 @@ def draw_shell(rng: np.random.Generator) -> Array:
 
 
 def draw_hiss(rng: np.random.Generator) -> Array:
-    """(1025,) amplitude response of fan, air flow and microphone together on 0-8000 Hz, of unit power.
+    """Amplitude response of fan, air flow and microphone together on 0-8000 Hz, of unit power, (1025,).
 
     The flow's hiss is 6-13 dB down and flat.
     """
@@ -338,7 +338,7 @@ def draw_hiss(rng: np.random.Generator) -> Array:
 def with_distortion(loudspeaker: Loudspeaker, played: Array, path: Array, wanted: float) -> tuple[Loudspeaker, float]:
     """The driver turned until what its nonlinearity adds behind this path has the wanted power, and the power reached.
 
-    Judged on 5 s.
+    Measured over 5 s.
     """
     x = played[RATE : 6 * RATE]
     straight = loudspeaker.play(x, linear=True)

@@ -120,7 +120,7 @@ def speak(
 def interrupt(
     rng: np.random.Generator, speech: list[Clip], room: Room, heard: list[slice], size: int
 ) -> tuple[Array, list[tuple[str, slice]]]:
-    """(size,) a human of unit power at the microphone, who talks over some of the utterances; what is said, and where."""
+    """A human of unit power at the microphone, (size,), who talks over some of the utterances; what is said, and where."""
     clean, told, free = np.zeros(size), [], 0
     for utterance in heard:
         begin = utterance.start + int(rng.uniform(0.3, 1.5) * RATE)
@@ -192,7 +192,7 @@ class Microphone:
     spectrum: Array
 
     def hears_fan(self, rng: np.random.Generator, size: int) -> Samples:
-        """(size,) of the fan."""
+        """Noise of the fan, (size,)."""
         return (self.fan * fan_noise(rng, self.spectrum, size)).astype(np.float32)
 
 

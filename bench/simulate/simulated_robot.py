@@ -95,7 +95,7 @@ def draw_loudspeaker(rng: np.random.Generator) -> Loudspeaker:
 
 
 def peak_filter(frequency_hz: float, q: float, gain_db: float) -> Array:
-    """(1, 6) peaking section (Bristow-Johnson, "Audio EQ cookbook", peakingEQ)."""
+    """Peaking section (Bristow-Johnson, "Audio EQ cookbook", peakingEQ), (1, 6)."""
     w, a = 2 * math.pi * frequency_hz / RATE, 10 ** (gain_db / 40)
     alpha = math.sin(w) / (2 * q)
     b = np.array([1 + alpha * a, -2 * math.cos(w), 1 - alpha * a])
@@ -188,7 +188,7 @@ def _image_sources(size: Array, rt60_s: float, microphone: Array, sources: tuple
 
 
 def draw_body(rng: np.random.Generator) -> Array:
-    """(32,) sound that the robot's own shell reflects within 2 ms, 10-20 dB below the direct sound."""
+    """Sound that the robot's own shell reflects within 2 ms, 10-20 dB below the direct sound, (32,)."""
     shell = np.zeros(32)
     shell[0] = 1.0
     for delay in rng.integers(3, 32, size=5):
@@ -197,7 +197,7 @@ def draw_body(rng: np.random.Generator) -> Array:
 
 
 def draw_fan(rng: np.random.Generator) -> Array:
-    """(1025,) amplitude response of a fan's noise on 0-8000 Hz, of unit total power.
+    """Amplitude response of a fan's noise on 0-8000 Hz, of unit total power, (1025,).
 
     Flat, then falling, with bumps and a blade line.
     """
@@ -212,7 +212,7 @@ def draw_fan(rng: np.random.Generator) -> Array:
 
 
 def fan_noise(rng: np.random.Generator, amplitude: Array, n: int) -> Array:
-    """(n,) Gaussian noise of unit power with that amplitude response."""
+    """Gaussian noise of unit power with that amplitude response, (n,)."""
     taps = signal.firwin2(2047, np.linspace(0, 1, amplitude.size), amplitude)
     return signal.oaconvolve(rng.standard_normal(n + taps.size - 1), taps, mode="valid")
 
@@ -236,7 +236,7 @@ def warp(x: Array, ppm: float) -> Array:
 
 
 def sweep(peak: float = 0.35) -> Array:
-    """(120000,) exponential sweep (Farina 2000, eq. (2)), 40-8000 Hz in 6 s, 0.5 s of silence before, 1 s behind."""
+    """Exponential sweep (Farina 2000, eq. (2)), 40-8000 Hz in 6 s, 0.5 s of silence before, 1 s behind, (120000,)."""
     t = np.arange(6 * RATE) / RATE
     rate = math.log(8000 / 40)
     x = peak * np.sin(2 * math.pi * 40 * 6 / rate * (np.exp(t * rate / 6) - 1.0))

@@ -54,7 +54,7 @@ class Command:
     run: Callable[[Array], Array]
 
     def __call__(self, x: Array) -> Array:
-        """(n,) x through the program, put back in time by whole samples."""
+        """Put x (n,) through the program, and back in time by whole samples."""
         return put_back(self.run(x), x)
 
 
@@ -155,7 +155,7 @@ def _filtered(x: Array, filters: str) -> Array:
 
 
 def _piped(command: list[str], x: Array) -> Array:
-    """(m,) what a program makes of 32-bit floats on its standard input; ends the program with its own words."""
+    """What a program makes of 32-bit floats on its standard input, (m,); ends the program with its own words."""
     raw, environment = x.astype(np.float32).tobytes(), os.environ | {"LADSPA_PATH": LADSPA}
     try:
         done = subprocess.run(command, input=raw, capture_output=True, env=environment)
@@ -172,12 +172,12 @@ def either(rng: Rng, low: float, high: float) -> float:
 
 
 def volume(rng: Rng) -> float:
-    """dB: much softer, or a little louder, as the headroom is."""
+    """Draw a gain in dB: much softer, or a little louder, as the headroom is."""
     return float(rng.choice([rng.uniform(-8.0, -1.5), rng.uniform(1.5, 2.5)]))
 
 
 def gains(rng: Rng, count: int, most: float = 9.0) -> list[float]:
-    """(count,) dB of neighbouring bands, none alike."""
+    """Levels of neighbouring bands, none alike, (count,) in dB."""
     return [float(round(value, 1)) for value in rng.uniform(-most, most, count)]
 
 

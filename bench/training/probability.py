@@ -52,7 +52,7 @@ FINE = tuple(round(0.5 + 0.01 * step, 2) for step in range(50))
 
 
 class Listened(NamedTuple):
-    """odds: averaged log-odds after each hop of so many samples; human: whether one sounds in it; ser: of a laid human, dB.
+    """What was heard. odds: averaged log-odds after each hop of so many samples; human: whether one sounds in it; ser: of a laid human, dB.
 
     audible: whether the human comes within AUDIBLE_DB of the loudest sound in time to be noticed.
     """

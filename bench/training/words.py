@@ -19,7 +19,7 @@ import torch
 
 from bench import recordings, results, runner
 from bench.cache import Cache
-from bench.metrics import Judges, difference, mean, pooled
+from bench.metrics import CachedMetrics, difference, mean, pooled
 from bench.recordings import Cells, Clip, progress
 from edgefilter import PathLearner
 from edgefilter.dsp.metrics import si_sdr
@@ -53,7 +53,7 @@ class Case(NamedTuple):
 
 
 class Contender(NamedTuple):
-    """make: the engine; identity: of the code and the network on which its answer depends."""
+    """An engine to be compared. make: the engine; identity: of the code and the network on which its answer depends."""
 
     make: Make
     identity: str
@@ -116,7 +116,7 @@ def frames(case: Case, stft: StftConfig, learning: bool) -> list[Frame]:
 
 
 def answer(engine: Engine, given: list[Frame], samples: int) -> Samples:
-    """(samples,) that a stream with this engine gives out."""
+    """Output of a stream with this engine, (samples,)."""
     state, voice, hops = engine.initial_state(), Synthesiser(engine.stft), []
     for frame in given:
         output, state = engine.step(frame, state)
@@ -164,17 +164,19 @@ def mix(engine: Engine, other: Callable[[StftConfig], Engine], share: float) -> 
     return Mixed(engine, other(engine.stft), share)
 
 
-def compare(case: Case, making: dict[str, Contender], learning: bool, judges: Judges, kept: Cache) -> Iterator[dict]:
+def compare(
+    case: Case, making: dict[str, Contender], learning: bool, cached: CachedMetrics, kept: Cache
+) -> Iterator[dict]:
     """SI-SDR and word errors of every contender."""
     given: dict[StftConfig, list[Frame]] = {}
-    clip, asked = case.clip, judges.recogniser.identity if judges.recogniser else ""
+    clip, asked = case.clip, cached.recogniser.identity if cached.recogniser else ""
 
     def made(contender: Contender) -> dict:
         engine = contender.make(case.profile)
         if engine.stft not in given:
             given[engine.stft] = frames(case, engine.stft, learning)
         out = answer(engine, given[engine.stft], clip.mic.size)[clip.span]
-        return {"si_sdr": si_sdr(out, clip.known_human()[clip.span])} | (judges.words(clip.text or "", out) or {})
+        return {"si_sdr": si_sdr(out, clip.known_human()[clip.span])} | (cached.words(clip.text or "", out) or {})
 
     about = {"kind": case.kind, "clip": f"{case.kind} {clip.name}", "speaker": clip.speaker, "place": clip.place}
     for name, contender in making.items():
@@ -241,10 +243,10 @@ def run(options: argparse.Namespace) -> str:
     )
     made_with = results.stamp(data, ["linear", BASE, "crnn"], {"WHISPER": options.whisper, **checkpoints})
     making = contenders(options.checkpoints, options.wiener, options.error, options.cache / "checkpoints")
-    judges, kept = runner.judges(runner.Setup(options.cache, options.whisper)), Cache(options.cache, "rows")
+    cached, kept = runner.cached_metrics(runner.Setup(options.cache, options.whisper)), Cache(options.cache, "rows")
     rows: list[dict] = []
     for case in progress(cases(options), "utterance"):
-        rows += compare(case, making, options.learning, judges, kept)
+        rows += compare(case, making, options.learning, cached, kept)
     notes = "Word errors at most 100 % an utterance; intervals over speakers and rooms."
     slim = [{key: value for key, value in row.items() if key not in ("transcript", "place", "speaker")} for row in rows]
     return results.write(options.output, "words", "Words on validation", made_with, tables(rows), notes=notes,

@@ -114,7 +114,7 @@ def read_delayed(tape: Tape, stop: int, count: int, delay_from: float, delay_to:
 
 @lru_cache(maxsize=8)
 def _parabola(count: int) -> Array:
-    """(3, count) weights of the values at the start, middle and end of count samples."""
+    """Weights of the values at the start, middle and end of count samples, (3, count)."""
     u = np.arange(1, count + 1, dtype=np.float32) / np.float32(count)
     return np.stack(((2 * u - 1) * (u - 1), 4 * u * (1 - u), u * (2 * u - 1)))
 

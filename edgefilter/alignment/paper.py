@@ -16,7 +16,7 @@ from edgefilter.types import SAMPLE_RATE, AlignmentState, AlignmentStats, Sample
 TEMPLATE = SAMPLE_RATE // 2
 """Samples of the utterance that are searched for: the paper's first 0.5 s."""
 STRIDE = 2048
-"""Lags that are judged at a time."""
+"""Lags that are evaluated at a time."""
 DECISIVE = 0.35
 """Normalised correlation above which the lag is taken at once: chance peaks of speech against other speech stay under
 0.3."""
@@ -129,7 +129,7 @@ class PaperAligner:
             self._scan(onset + self._scanned, self._template)
 
     def _scan(self, at: int, template: np.ndarray) -> None:
-        """Judge the next STRIDE lags, whose half second of microphone, from at on, is now complete (overlap-save)."""
+        """Evaluate the next STRIDE lags, whose half second of microphone, from at on, is now complete (overlap-save)."""
         mic = self._mic.read(at, at + STRIDE + TEMPLATE - 1)
         correlation = fft.irfft(fft.rfft(mic, self._size) * template, self._size)[:STRIDE]
         total = np.concatenate(([0.0], np.cumsum(np.square(mic, dtype=np.float64))))

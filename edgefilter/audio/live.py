@@ -203,7 +203,7 @@ class LiveSink(Sink):
     def stats(self) -> dict[str, int]:
         """Samples written (16 kHz), clipped; dropped and missing (at the device's rate).
 
-        Underruns: callbacks that found too little.
+        underruns: callbacks that found too little.
         """
         outlet = self._port.outlet
         lost = {"missing": outlet.missing, "dropped": self.dropped + outlet.ring.lost}

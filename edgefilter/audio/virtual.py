@@ -7,7 +7,7 @@ what `edgefilter run` writes can be listened to as a microphone.
 from __future__ import annotations
 
 from edgefilter.audio import pulse
-from edgefilter.audio.lookup import STAND_INS
+from edgefilter.audio.lookup import STAND_INS, Device
 from edgefilter.errors import DeviceError, UsageError
 
 SPEAKER, HUMAN, MICROPHONE = "edgefilter_speaker", "edgefilter_human", "edgefilter_mic"
@@ -70,9 +70,10 @@ def unload() -> list[str]:
     return removed
 
 
-def refuse_own(microphone: str) -> None:
+def refuse_own(microphone: Device) -> None:
     """Raise UsageError where the microphone is the filter's own output: it would hear itself, or nothing."""
-    meant = pulse.default_name("input") if microphone in ("mic", "default", *STAND_INS) else microphone
+    leads_to_default = microphone.name in STAND_INS and not microphone.pulse_name
+    meant = pulse.default_name("input") if leads_to_default else microphone.name
     if meant in (MICROPHONE, f"{HUMAN}.monitor"):
         raise UsageError(
             f"microphone '{meant}' is edgefilter's own output: name the real one with --input ('edgefilter devices'), or"

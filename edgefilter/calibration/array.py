@@ -19,12 +19,12 @@ FARTHEST = 32
 
 
 def first(recordings: Samples) -> Samples:
-    """(n,) of the first microphone, of recordings (n,) or (microphones, n)."""
+    """The first microphone of recordings (n,) or (microphones, n), (n,)."""
     return recordings if recordings.ndim == 1 else recordings[0]
 
 
 def cross_density(noises: Samples) -> Samples:
-    """(601, microphones, microphones, 2) float32 of noises (microphones, n), as ArrayCalibration.noise."""
+    """Spectral covariance of noises (microphones, n), as ArrayCalibration.noise, (601, microphones, microphones, 2) float32."""
     window = hann(GRID_FFT)
     spectra = fft.rfft([frames(one, GRID_FFT, GRID_FFT // 2) * window for one in noises.astype(np.float64)])
     found = np.einsum("itk,jtk->kij", spectra, spectra.conj()) / (spectra.shape[1] * SAMPLE_RATE * np.sum(window**2))

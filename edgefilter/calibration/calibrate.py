@@ -147,7 +147,7 @@ def fan_psd(noise: Samples) -> Samples:
 
 
 def impulse_response(result: Deconvolution, direct: int) -> Samples:
-    """(MIN_TAPS to MAX_TAPS,) float32 from PRE_ROLL before the direct sound to where the decay has sunk into the fan.
+    """Impulse response from PRE_ROLL before the direct sound to where the decay has sunk into the fan, (MIN_TAPS to MAX_TAPS,) float32.
 
     The knee is the first 20 ms in which the response is not 3 dB above what the fan leaves there. The response is kept
     to 50 ms beyond it, at least MIN_TAPS, and faded by half a cosine from the knee (at most the last quarter where
@@ -167,7 +167,7 @@ def impulse_response(result: Deconvolution, direct: int) -> Samples:
 
 
 def band_snr_db(result: Deconvolution, path: Samples, bands: Array) -> Array:
-    """(B,) dB, the energy of the sweep's coherent part in each band over that of the fan in a window as long as the response.
+    """The energy of the sweep's coherent part in each band over that of the fan in a window as long as the response, (B,) in dB.
 
     The coherent part is what the impulse response predicts, less what the fan itself put into it; limited to -20 to 120
     dB.

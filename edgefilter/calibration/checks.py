@@ -214,7 +214,7 @@ def doubtful_noise(reference: Samples, noise: Samples) -> list[str]:
 
 
 def _unsteady(noise: Samples) -> tuple[float, float, float]:
-    """(dB by which the loudest 100 ms stand out of the median in any octave, percent of such times above 3 dB, centre Hz)."""
+    """How far the loudest 100 ms stand out of the median in any octave, dB; percent of such times above 3 dB; centre of the octave, Hz."""
     block = SAMPLE_RATE // 10
     spectra = power(np.fft.rfft(blocks(noise, block) * hann(block), axis=1))
     hz = frequencies(spectra.shape[1])

@@ -1,4 +1,4 @@
-"""Chirps that tell whether microphone and reference are set up rightly: what was recorded of them, judged."""
+"""Chirps that tell whether microphone and reference are set up rightly: what was recorded of them, evaluated."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _, HIGHEST_HZ = BAND_HZ
 SLOT, CHIRP, FADE = round(0.6 * SAMPLE_RATE), round(0.3 * SAMPLE_RATE), round(0.01 * SAMPLE_RATE)
 """Samples from one chirp to the next, of a chirp, and of its rise and fall: the rest of a slot is for the room's echo."""
 ORDER = "UDudDUdu"
-"""Up and down, louder (capital) and softer; the first half is fitted and the second judges, so that what is no linear
+"""Up and down, louder (capital) and softer; the first half is fitted and the second tests that, so that what is no linear
 filter, and would explain one sweep, does not explain the other."""
 LEAD = round(0.5 * SAMPLE_RATE)
 """Samples of silence before the first chirp, in which the room's noise is measured."""
@@ -72,23 +72,23 @@ class Heard:
     same: bool = False
 
 
-def judge(mic: Samples, ref: Samples) -> Heard:
+def evaluate(mic: Samples, ref: Samples) -> Heard:
     """Look for the chirps in both channels (n,), which share a sample counter.
 
     >>> sound = np.pad(chirps(), (4000, 12000))
-    >>> heard = judge(0.1 * np.roll(sound, 800), sound)
+    >>> heard = evaluate(0.1 * np.roll(sound, 800), sound)
     >>> round(1000 * heard.lag_s), round(heard.ppm), heard.linear_db > 40, round(heard.softer_db)
     (50, 0, True, 0)
     """
-    heard = _judge(mic, ref)
+    heard = _evaluate_as_is(mic, ref)
     if heard.ppm is not None and abs(heard.ppm) > STRETCHED_PPM:
-        straight = _judge(soxr.resample(mic, 1e6 + heard.ppm, 1e6), ref)
+        straight = _evaluate_as_is(soxr.resample(mic, 1e6 + heard.ppm, 1e6), ref)
         if straight.ppm is not None:
             return replace(straight, ppm=heard.ppm + straight.ppm)
     return heard
 
 
-def _judge(mic: Samples, ref: Samples) -> Heard:
+def _evaluate_as_is(mic: Samples, ref: Samples) -> Heard:
     sound = chirps()
     peak_db = float(decibels(float(np.max(np.square(mic), initial=0.0))))
     (at_ref, in_ref), (at_mic, in_mic) = _find(ref, sound), _find(mic, sound)

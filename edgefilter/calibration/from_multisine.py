@@ -126,7 +126,7 @@ def approximate(
 
 
 def _measured(part: Samples, blocks: tuple[int, int]) -> Spectra:
-    """(levels, realisations, PERIODS - 1, lines) spectra of the periods that are measured."""
+    """Spectra of the periods that are measured, (levels, realisations, PERIODS - 1, lines)."""
     return fft.rfft(part.astype(np.float64).reshape(*blocks, PERIODS, PERIOD)[:, :, 1:])
 
 
@@ -197,12 +197,12 @@ class _Lines:
 
 
 def _density(total: Array, count: Array) -> Array:
-    """(levels, 601) full scale^2/Hz on GRID_HZ from sums of |line|^2 (levels, lines) over so many lines each."""
+    """Densities on GRID_HZ, full scale^2/Hz, from sums of |line|^2 (levels, lines) over so many lines each; (levels, 601)."""
     return 2.0 / PERIOD**2 / LINE_HZ * _smooth(total) / np.maximum(_smooth(count.astype(float)), 1e-12)
 
 
 def _chance(noise: Array) -> Array:
-    """(levels,) standard deviation of a distortion's power where there is noise of those densities (levels, 601) alone.
+    """Standard deviation of a distortion's power where there is noise of those densities (levels, 601) alone, (levels,).
 
     Of the sum over every other line of |line|^2 less its expectation, each the mean over all realisations.
     """
@@ -211,7 +211,7 @@ def _chance(noise: Array) -> Array:
 
 
 def _smooth(lines: Array) -> Array:
-    """(levels, 601) mean over the lines around each frequency of GRID_HZ."""
+    """Mean over the lines around each frequency of GRID_HZ, (levels, 601)."""
     return smoothed(lines, GRID_HZ, LINE_HZ, SMOOTHING_HZ)
 
 

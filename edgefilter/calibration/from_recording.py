@@ -143,7 +143,7 @@ def _drifting(x: Samples, ppm: float) -> Samples:
 
 
 def find_drift(recording: Samples, reference: Samples) -> tuple[float, int]:
-    """(ppm, lag): the line along which recording (n,) lags behind reference (n,), and where it starts, in parts of a million and samples.
+    """The line along which recording (n,) lags behind reference (n,): its slope in ppm, and the lag where it starts, in samples.
 
     Of all lines of up to MAX_PPM the one on which the correlations of windows of a second, spectra flattened, add up to
     most; 0 ppm where it brings less than DRIFT_GAIN of what no drift does. Lags of up to DRIFT_REACH.
@@ -173,7 +173,7 @@ def find_drift(recording: Samples, reference: Samples) -> tuple[float, int]:
 
 
 def silences(reference: Samples) -> NDArray[np.bool_]:
-    """(n,) where an aligned reference (n,) is silent and has been for TAIL_S."""
+    """Where an aligned reference (n,) is silent and has been for TAIL_S, (n,) bool."""
     block = SAMPLE_RATE // 10
     level = all_block_power(reference, block)
     loud = level > 10 ** (SILENT_DB / 10) * level.max(initial=1e-30)
@@ -183,7 +183,7 @@ def silences(reference: Samples) -> NDArray[np.bool_]:
 
 
 def fan_in_silences(recording: Samples, silent: NDArray[np.bool_]) -> tuple[Samples, float]:
-    """PSD (601,) float32 of the quieter half of the silent frames, and how many seconds those are.
+    """PSD of the quieter half of the silent frames, (601,) float32, and how many seconds those are.
 
     Where silent (n,) leaves fewer than LEAST_FRAMES, the quietest twentieth of all frames is taken, and 0 seconds are
     said.
@@ -200,12 +200,12 @@ def fan_in_silences(recording: Samples, silent: NDArray[np.bool_]) -> tuple[Samp
 
 
 def disturbance(residual: Samples) -> Samples:
-    """(n,) 0 to 1, one over the power of the whitened residual (n,) around each sample: what a fit should trust it."""
+    """Weights from 0 to 1 by which a fit should trust each sample, (n,): one over the power of the whitened residual (n,) around it."""
     return 1.0 / np.maximum(uniform_filter1d(residual**2, MOMENT, mode="nearest"), 1.0)
 
 
 def fit_path(sound: Samples, target: Samples, weights: Samples, peak: float) -> Samples:
-    """(TAPS,) path from sound to target (n,), both whitened, weights (n,), peak: the square of the direct sound's tap.
+    """Path from sound to target (n,), both whitened, (TAPS,). weights: (n,); peak: the square of the direct sound's tap.
 
     The penalty supposes a decay; the one of DECAYS_S is kept whose fit to three quarters of the weighted samples
     predicts the rest best.
@@ -223,7 +223,7 @@ def fit_path(sound: Samples, target: Samples, weights: Samples, peak: float) -> 
 
 
 def decay_prior(seconds: float, peak: float) -> Array:
-    """(TAPS,) expected squares: the direct sound's, and from 2 ms on 15 dB less, falling by 60 dB in that time.
+    """Expected squares, (TAPS,): the direct sound's, and from 2 ms on 15 dB less, falling by 60 dB in that time.
 
     Before it 25 dB less.
     """
@@ -255,7 +255,7 @@ def _check_learned(target: Samples, predicted: Samples, fit: Samples, delay: flo
 
 
 def others(target: Samples, predicted: Samples) -> list[tuple[float, float]]:
-    """(start_s, end_s) where what the prediction (n,) leaves of target (n,), both whitened, is OTHERS_DB above the prediction and the fan.
+    """Stretches (start_s, end_s) where what the prediction (n,) leaves of target (n,), both whitened, is OTHERS_DB above the prediction and the fan.
 
     Moments of a second or less between them belong to them.
     """

@@ -106,7 +106,7 @@ class MultisineLaw:
         return self.first + len(LEVELS_DB) * REALISATIONS * BLOCK
 
     def blocks(self) -> NDArray[np.intp]:
-        """(levels, realisations) first sample of each multisine."""
+        """First sample of each multisine, (levels, realisations)."""
         shape = (len(LEVELS_DB), REALISATIONS)
         return self.first + BLOCK * np.arange(shape[0] * shape[1]).reshape(shape)
 

@@ -134,21 +134,21 @@ class Deconvolution:
     noise_psd: Array
 
     def cut(self, start: int, length: int) -> Array:
-        """(length,) samples of the response from lag start on."""
+        """Samples of the response from lag start on, (length,)."""
         return np.take(self.response, np.arange(start, start + length), mode="wrap")
 
     def spectrum(self, part: Array) -> Array:
-        """(n // 2 + 1,) |H|^2 of a part of the response."""
+        """|H|^2 of a part of the response, (n // 2 + 1,)."""
         return np.abs(fft.rfft(part, self.response.size)) ** 2
 
     def noise(self, length: float) -> Array:
-        """(n // 2 + 1,) expected |H|^2 that the fan alone leaves in a part of that many samples."""
+        """Expected |H|^2 that the fan alone leaves in a part of that many samples, (n // 2 + 1,)."""
         gain = self.source_energy / np.maximum(self.source_energy + self.regularisation, 1e-30) ** 2
         return length * self.noise_psd * gain
 
     @property
     def frequencies(self) -> Array:
-        """(n // 2 + 1,) Hz."""
+        """Frequencies of the bins, (n // 2 + 1,) in Hz."""
         return np.arange(self.source_energy.size) * SAMPLE_RATE / self.response.size
 
 
@@ -182,7 +182,7 @@ def find_direct(response: Array) -> int:
 
 
 def smoothed(lines: Array, hz: Array, line_hz: float, least_hz: float) -> Array:
-    """(..., hz.size) mean of lines (..., n), line_hz apart, over a sixth of an octave around each hz, at least 2 least_hz."""
+    """Mean of lines (..., n), line_hz apart, over a sixth of an octave around each hz, at least 2 least_hz, (..., hz.size)."""
     total = np.cumsum(lines, axis=-1)
     total = np.concatenate((np.zeros_like(total[..., :1]), total), axis=-1)
     half = np.maximum((2 ** (1 / 12) - 1) * hz, least_hz) / line_hz
@@ -232,7 +232,7 @@ def response_from_sweep(reference: Samples, recording: Samples, noise: Samples, 
 
 
 def _frames(samples: Samples) -> NDArray[np.complex128]:
-    """(frames, 601) complex spectra, a frame every 160 samples, as the paper has them."""
+    """Complex spectra, a frame every 160 samples, as the paper has them, (frames, 601)."""
     padded = np.pad(samples, (0, max(0, GRID_FFT - samples.size)))
     return np.fft.rfft(frames(padded, GRID_FFT, 160) * hann(GRID_FFT), axis=1)
 

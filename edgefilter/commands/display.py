@@ -38,7 +38,7 @@ STATUS_LEGEND = """\
 The status line of a live run:
   mic, robot, out    level of microphone, reference and output, dB of full scale
   crnn 23 %          the engine at work, and its computing time in per cent of the duration of the sound
-  late 5             hops whose computing took longer than the sound in them (16 ms)
+  late 5             hops whose computing took longer than the hop lasts (16 ms with most engines)
   lost 7             samples that no device delivered; silence replaces them
   overruns 3         blocks before which a device reported that it had dropped sound
   residual -25 dB    output against microphone while the robot talks and no human does: what is left of the robot

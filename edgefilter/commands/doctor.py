@@ -13,7 +13,7 @@ import numpy as np
 from edgefilter.alignment.aligner import MOST_LAG_S
 from edgefilter.audio import pulse, virtual
 from edgefilter.calibration.array import FARTHEST
-from edgefilter.calibration.chirps import LEVEL_DB, SOFTER_DB, Heard, chirps, judge
+from edgefilter.calibration.chirps import LEVEL_DB, SOFTER_DB, Heard, chirps, evaluate
 from edgefilter.commands.display import print_result, say
 from edgefilter.diagnosis.channels import doubtful_channels
 from edgefilter.dsp.frames import decibels
@@ -150,11 +150,11 @@ def _open(
     ports: dict[str, InputPort], role: str, name: str | None, channels: Sequence[int] | None = None
 ) -> Iterator[Check]:
     """Find the input and see at which rate it can be opened."""
-    if role == "microphone":
-        virtual.refuse_own(str(name))
-    from edgefilter.audio.device import input_port, monitor_of
+    from edgefilter.audio.device import find, input_port, monitor_of
 
-    device = name if name is not None else pulse.monitor(virtual.SPEAKER) or monitor_of("default")
+    device = find(name if name is not None else pulse.monitor(virtual.SPEAKER) or monitor_of("default"), "input")
+    if role == "microphone":
+        virtual.refuse_own(device)
     port = input_port(device, channels=channels)
     ports[role] = port
     yield Check(role, "ok", ", ".join([f"{port.device}, {port.rate} Hz", *port.notes]))
@@ -215,7 +215,7 @@ def _set_up(
     source = LiveSource(ports["microphone"].device, ports["reference"].device, channels=channels)
     mic, ref, lost = play_through(output, source, sound)
     each = mic.reshape(len(mic), -1).T
-    yield from judge_set_up(judge(each[0], ref), output, str(ports["reference"].device))
+    yield from set_up_check(evaluate(each[0], ref), output, str(ports["reference"].device))
     yield from array_set_up(ports["microphone"].wanted or [0], each, ref, profile)
     if lost:
         yield Check("set-up load", "warning", f"{lost} samples lost while the chirps were heard", "end other programs")
@@ -223,7 +223,7 @@ def _set_up(
 
 def array_set_up(numbers: Sequence[int], mics: Samples, ref: Samples, profile: Profile | None) -> Iterator[Check]:
     """What the chirps have shown of the microphones mics (microphones, n) beside one another, and beside a profile."""
-    heard = [judge(one, ref) for one in mics] if len(mics) > 1 else []
+    heard = [evaluate(one, ref) for one in mics] if len(mics) > 1 else []
     lags = [one.lag_s for one in heard if one.lag_s is not None and not one.same]
     middle = float(np.median(lags)) if lags else 0.0
     told = set()
@@ -246,7 +246,7 @@ def array_set_up(numbers: Sequence[int], mics: Samples, ref: Samples, profile: P
         yield Check("profile", "ok", f"{profile.microphones} microphones as they were calibrated")
 
 
-def judge_set_up(heard: Heard, output: str, reference: str) -> Iterator[Check]:
+def set_up_check(heard: Heard, output: str, reference: str) -> Iterator[Check]:
     """What the chirps have shown: whether the reference is right, then what the microphone makes of the robot."""
     if wrong := _wrong(heard, output, reference):
         yield Check("set-up", *wrong)

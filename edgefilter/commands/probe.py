@@ -1,4 +1,4 @@
-"""`edgefilter probe`: where several explanations of a recording remain, what tells them apart is played, and they are judged by it."""
+"""`edgefilter probe`: where several explanations of a recording remain, what tells them apart is played, and its recording says which is right."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def main(args: argparse.Namespace) -> int:
     for name in (name for effects in wanted for name in effects):
         find(name)
     if args.reference is None:
-        return _judge(args)
+        return _evaluate(args)
     profile, recording, reference = load(args)
     with progress("explanations that remain") as step:
         if not wanted:
@@ -100,10 +100,10 @@ def _write(args: argparse.Namespace, inquiry: Inquiry) -> int:
     return 0
 
 
-def _judge(args: argparse.Namespace) -> int:
+def _evaluate(args: argparse.Namespace) -> int:
     """What was recorded of a sound that was written: which explanation it speaks for."""
     if args.live or args.explanation:
-        raise UsageError("without --reference a recording of --excitation is judged: give --reference to ask anew")
+        raise UsageError("without --reference a recording of --excitation is evaluated: give --reference to ask anew")
     profile, question = Profile.load(args.profile), _question(args)
     sound, answer = read(args.excitation, "excitation"), read_voice(args.recording, "recording")
     recording, reference = (read_voice(question[role], role) for role in ("recording", "reference"))

@@ -124,8 +124,7 @@ def make_source(
     """
     if isinstance(reference, str | None) and (name == "-" or looks_like_file(name)):
         return open_source(name, reference, channels, reference_channel)
-    virtual.refuse_own(name)
-    from edgefilter.audio.device import monitor_of
+    from edgefilter.audio.device import find, monitor_of
     from edgefilter.audio.live import LiveSource
 
     if isinstance(reference, str) and looks_like_file(reference):
@@ -133,11 +132,13 @@ def make_source(
             f"live, the reference is a device, found the file {reference}: leave --reference out or name a monitor"
             " ('edgefilter devices'); to play the file, --play"
         )
+    mic = find(name, "input")
+    virtual.refuse_own(mic)
     if reference is not None or reference_channel is not None:
-        return LiveSource(name, reference, patience_s=math.inf, channels=channels, reference_channel=reference_channel)
+        return LiveSource(mic, reference, patience_s=math.inf, channels=channels, reference_channel=reference_channel)
     own = pulse.monitor(virtual.SPEAKER) if output == virtual.HUMAN else None
     played_on = "default" if output in ("-", virtual.HUMAN) or looks_like_file(output) else output
-    return LiveSource(name, own or monitor_of(played_on), patience_s=math.inf, channels=channels)
+    return LiveSource(mic, own or monitor_of(played_on), patience_s=math.inf, channels=channels)
 
 
 def make_sink(name: str, latency: int, wait: bool) -> Sink:

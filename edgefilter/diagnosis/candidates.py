@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from edgefilter.diagnosis.result import Candidate, Fate
-from edgefilter.diagnosis.score import FRAMES_PER_CELL, HOP, Judge
+from edgefilter.diagnosis.score import FRAMES_PER_CELL, HOP, Scorer
 from edgefilter.diagnosis.trials import Found, Trial, Tried
 from edgefilter.echo.effect import neutral
 from edgefilter.echo.effects.catalogue import find
@@ -23,8 +23,8 @@ def candidates(found: Found, named: Collection[str]) -> tuple[Candidate, ...]:
     comes on top. An effect that was
     tried beside others only is ranked by its gain there.
     """
-    judge = Judge(found.prepared)
-    held = float(judge.starts.size * HOP * FRAMES_PER_CELL) * judge.freedom.sum() / (HOP - 1)
+    scorer = Scorer(found.prepared)
+    held = float(scorer.starts.size * HOP * FRAMES_PER_CELL) * scorer.freedom.sum() / (HOP - 1)
     tried = {entry.name: entry for entry in found.tried}
     seen = {step.name: Tried(step.name, None if place else step, step) for place, step in enumerate(found.steps)}
     rows = [_row(entry, found, named, held) for entry in {**seen, **tried}.values()]

@@ -10,7 +10,7 @@ from scipy import fft
 
 from edgefilter.diagnosis.independence import Independence, independence
 from edgefilter.diagnosis.prepare import Prepared, prepare
-from edgefilter.diagnosis.score import Judge
+from edgefilter.diagnosis.score import Scorer
 from edgefilter.dsp.frames import block_power, blocks, decibels, frames
 from edgefilter.dsp.psd import frequencies, periodograms, total_power
 from edgefilter.echo.effects.catalogue import chain
@@ -32,7 +32,7 @@ class Comparison:
 
     Decibels of excess are of the residual, whitened by the fan's PSD, over the fan.
 
-    excess_db: of the samples that no diagnosis fits on, every second half second, as Judge scores them: the one figure
+    excess_db: of the samples that no diagnosis fits on, every second half second, as Scorer scores them: the one figure
     that compare, add, diagnose and the report show; 0 means that nothing is unexplained. All else is of the whole.
     noise_floor_db: the fan, dB re full scale.
     bands: (low_hz, high_hz, excess_db). times: (start_s, end_s, excess_db). levels: (low_dbfs, high_dbfs, excess_db) by
@@ -128,11 +128,11 @@ def compare(profile: Profile, recording: Samples, reference: Samples, *, sample_
 def describe(prepared: Prepared, model: EchoModel, score: Score | None = None) -> Comparison:
     """The comparison of a prepared recording with what a model predicts.
 
-    Score: the judge's of that model, where it is known.
+    score: of that model, where it is known.
 
     A gain of the microphone is taken out of the residual before that is held against the fan, which passed it as well.
     """
-    score = score or Judge(prepared).of(model)
+    score = score or Scorer(prepared).of(model)
     measurement, prediction = prepared.measurement, score.prediction
     residual = measurement.recording - prediction
     psd = prepared.noise_psd
@@ -168,7 +168,7 @@ def describe(prepared: Prepared, model: EchoModel, score: Score | None = None) -
 
 
 def independence_of(prepared: Prepared, model: EchoModel, score: Score) -> Independence | None:
-    """Whether what a model leaves is noise, see `independence`; score: the judge's of that model."""
+    """Whether what a model leaves is noise, see `independence`; score: of that model."""
     measurement, use, active = prepared.measurement, prepared.usable, prepared.active
     flat = (measurement.recording - score.prediction) / model.microphone_gain(measurement.recording.size)
     said = _as_played(measurement.reference, model)

@@ -21,7 +21,7 @@ from edgefilter.diagnosis.precision import precision
 from edgefilter.diagnosis.prepare import Prepared, prepare
 from edgefilter.diagnosis.proof import listed, with_fitted
 from edgefilter.diagnosis.result import Diagnosis, Finding, Interval, Verdict, in_order
-from edgefilter.diagnosis.score import Judge, share_of
+from edgefilter.diagnosis.score import Scorer, share_of
 from edgefilter.diagnosis.select import search
 from edgefilter.diagnosis.trials import Found
 from edgefilter.echo.effects.catalogue import find
@@ -75,7 +75,7 @@ def diagnose(
 
     Notes
     -----
-    Stepwise selection: every effect is fitted on half of the recording, in blocks of half a second, and judged on the
+    Stepwise selection: every effect is fitted on half of the recording, in blocks of half a second, and tested on the
     other half (docs/diagnosis.md).
 
     Examples
@@ -142,7 +142,7 @@ def add(
     get them. Each effect is fitted with the others in place, in turn, until the error no longer falls.
 
     Fitted to all of the recording: that predicts other recordings of the robot better than the fit to half of it by
-    which `diagnose` judges. So the comparison after, of this recording, is of samples that the fit has used; `prove`
+    on which `diagnose` tests. So the comparison after, of this recording, is of samples that the fit has used; `prove`
     says what the effects are worth on others. An event (a jump, a moment's move) is kept with the recording in which it
     happened: of any other the profile predicts what it did before.
 
@@ -214,7 +214,7 @@ def _as_written(found: Diagnosis, prepared: Prepared, values: Mapping[str, Value
         model = model.with_effect(name, values[name])
         behind = behind.behind(find(name).noise_psd(values[name], behind.noise_psd))
         last = len(findings) == len(found.ranking) - 1
-        left_db = after.excess_db if last else Judge(behind).of(model).excess_db
+        left_db = after.excess_db if last else Scorer(behind).of(model).excess_db
         share = max(share_of(whole, left_db) - share_of(whole, excess_db), 0.0)
         findings[name] = replace(
             finding,
@@ -305,9 +305,9 @@ def _much_left(found: Found, criteria: Criteria) -> bool:
 
 def explained_level(prepared: Prepared, found: Found) -> float:
     """Part of the level over the robot's silences that is gone, 0 to 1: of many cells rather than of the loudest."""
-    judge = Judge(prepared)
-    above = found.base.over_db - judge.floor_level(found.base)
-    gone = above - (found.final.over_db - judge.floor_level(found.final))
+    scorer = Scorer(prepared)
+    above = found.base.over_db - scorer.floor_level(found.base)
+    gone = above - (found.final.over_db - scorer.floor_level(found.final))
     if any(find(name).stage == "noise" for name, _ in found.model.effects):
         above, gone = found.base.over_db, found.base.over_db - found.final.over_db
     return float(np.clip(gone / above, 0.0, 1.0)) if above > 0.0 else 0.0

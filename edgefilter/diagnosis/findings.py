@@ -10,7 +10,7 @@ import numpy as np
 from edgefilter.diagnosis.ordinary import p_value
 from edgefilter.diagnosis.prepare import Prepared
 from edgefilter.diagnosis.result import Finding, Interval
-from edgefilter.diagnosis.score import Judge, share_of
+from edgefilter.diagnosis.score import Scorer, share_of
 from edgefilter.diagnosis.trials import Found, Trial
 from edgefilter.echo.effect import complete
 from edgefilter.echo.effects.catalogue import find
@@ -30,9 +30,9 @@ def findings_of(found: Found, progress: Callable[[str], None] | None) -> tuple[t
 
     And what is not known of them.
     """
-    findings, doubts, before, judge = [], [], found.base.excess_db, Judge(found.prepared)
+    findings, doubts, before, scorer = [], [], found.base.excess_db, Scorer(found.prepared)
     for step in found.steps:
-        without_db = judge.of(found.model.without_effect(step.name)).level_db
+        without_db = scorer.of(found.model.without_effect(step.name)).level_db
         after = found.final.excess_db if step is found.steps[-1] else step.score.excess_db
         if progress:
             progress(f"how well {step.name} is known")

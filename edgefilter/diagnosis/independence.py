@@ -161,7 +161,7 @@ def independence(
 
 
 def whitener(psd: Samples) -> Samples:
-    """(1200,) the causal filter of least phase that makes noise of that PSD (bins,) white with variance 1, by its cepstrum."""
+    """The causal filter of least phase that makes noise of that PSD (bins,) white with variance 1, by its cepstrum, (1200,)."""
     n = 4096
     bins = np.linspace(0, psd.size - 1, n // 2 + 1)
     level = np.interp(bins, np.arange(psd.size), np.log(floored(psd) * SAMPLE_RATE / 2))
@@ -169,7 +169,7 @@ def whitener(psd: Samples) -> Samples:
 
 
 def lagged_sums(a: Samples, b: Samples, low: int, high: int) -> Array:
-    """(high - low,) the sum over n of a[n] b[n - lag] for each lag from low on, of a and b (n,)."""
+    """The sum over n of a[n] b[n - lag] for each lag from low on, of a and b (n,), (high - low,)."""
     width = high - low
     size = scipy.fft.next_fast_len(SPAN + width, real=True)
     count = -(-a.size // SPAN)

@@ -11,7 +11,7 @@ import numpy as np
 
 from edgefilter.diagnosis.closer_look import BEAT, Curve, by_rate
 from edgefilter.diagnosis.criteria import Criteria
-from edgefilter.diagnosis.score import Judge, share_of
+from edgefilter.diagnosis.score import Scorer, share_of
 from edgefilter.diagnosis.trials import Found
 from edgefilter.dsp.frames import block_power, block_sums, decibels
 from edgefilter.echo.evidence import Score
@@ -157,7 +157,7 @@ class Law:
     prediction: Samples = field(default_factory=lambda: np.zeros(0, np.float32), repr=False)
 
     def __call__(self, x: Samples) -> Samples:
-        """What the law makes of x (n,), (n,): by its lines, so that what is judged is what is written."""
+        """What the law makes of x (n,), (n,): by its lines, so that what is scored is what is written."""
         return _run(self.code, x)
 
     def predict(self, model: EchoModel, reference: Samples) -> Samples:
@@ -202,33 +202,33 @@ def _run(code: str, x: Samples) -> Samples:
 
 def free_law(found: Found, criteria: Criteria, progress: Callable[[str], None] | None = None) -> Law | None:
     """The law that explains most of what a search leaves, or of all that the profile does; None where what is named explains nearly as much."""
-    judge = Judge(found.prepared)
-    base = judge.of(found.start)
+    scorer = Scorer(found.prepared)
+    base = scorer.of(found.start)
     named = tuple(step.name for step in found.steps)
     starts = [(found.start, ()), (found.model, named)] if named else [(found.start, ())]
-    tried = [each for model, names in starts for each in _laws(judge, model, names, progress)]
+    tried = [each for model, names in starts for each in _laws(scorer, model, names, progress)]
     law, score = max(tried, key=lambda each: -each[1].level_db, default=(None, base))
     most_db = base.level_db - score.level_db
-    little = most_db < criteria.part_level * (base.over_db - judge.floor_level(base))
+    little = most_db < criteria.part_level * (base.over_db - scorer.floor_level(base))
     if law is None or little or share_of(base.excess_db, score.excess_db) < criteria.half:
         return None
     return law if base.level_db - found.final.level_db < criteria.nearly * most_db else None
 
 
 def _laws(
-    judge: Judge, model: EchoModel, names: tuple[str, ...], progress: Callable[[str], None] | None
+    scorer: Scorer, model: EchoModel, names: tuple[str, ...], progress: Callable[[str], None] | None
 ) -> Iterator[tuple[Law, Score]]:
     """The best law of each family beside a model, with its score on samples that its fit has not used."""
-    before = judge.of(model)
+    before = scorer.of(model)
     for family, stages in STAGES.items():
         for stage in stages:
             if progress:
                 progress(f"trying {family.__name__.replace('_', ' ')}")
-            law = family(_Ground(judge, model, stage))
+            law = family(_Ground(scorer, model, stage))
             if law is None:
                 continue
-            prediction = law.predict(model, judge.measurement.reference)
-            score = judge.judge(prediction, judge.measurement.whiten(prediction))
+            prediction = law.predict(model, scorer.measurement.reference)
+            score = scorer.score(prediction, scorer.measurement.whiten(prediction))
             told = {"beside": names, "gain_db": before.level_db - score.level_db, "excess_db": score.excess_db}
             yield Law(**{**vars(law), **told, "prediction": score.prediction}), score
 
@@ -236,9 +236,9 @@ def _laws(
 class _Ground:
     """What a law is fitted to: x (n,) that it acts on at its stage, heard (n,) whitened at the microphone, the recording, what counts."""
 
-    def __init__(self, judge: Judge, model: EchoModel, stage: Literal["source", "path"]) -> None:
+    def __init__(self, scorer: Scorer, model: EchoModel, stage: Literal["source", "path"]) -> None:
         self.stage = stage
-        self._measurement, self._model = judge.measurement, model
+        self._measurement, self._model = scorer.measurement, model
         plain, self.heard = self._measurement.heard(model)
         self.x = self._measurement.reference if stage == "source" else plain
         self.target, self.weights = self._measurement.white_recording, self._measurement.weights
@@ -249,7 +249,7 @@ class _Ground:
         return self._measurement.whiten(self._model.predict(x) if self.stage == "source" else x)
 
     def solve(self, parts: list[Samples], bends: Array) -> Array:
-        """Weights (k,) of least squares of x's parts (k, n), their bends (m, k) held small."""
+        """Least-squares weights of x's parts (k, n), their bends (m, k) held small; (k,)."""
         normal = normal_equations([self.part(part) for part in parts], self.target, 1, 0, self.weights > 0.0)
         return _solved(normal.matrix, normal.right, bends)[0]
 
@@ -392,7 +392,7 @@ STAGES: dict[Callable[[_Ground], Law | None], tuple[Literal["source", "path"], .
 
 
 def _levels(x: Samples, settings: list[tuple[float, float]]) -> Array:
-    """(m, k) level in dB at the end of each step of x (n,), by m attacks and releases in ms."""
+    """Level in dB at the end of each step of x (n,), by m attacks and releases in ms, (m, k)."""
     power = block_power(x, STEP)
     rising, falling = (-np.expm1(-1.0 / np.array(ms)) for ms in zip(*settings, strict=True))
     level, now = np.empty((power.size, len(settings))), np.zeros(len(settings))
@@ -404,7 +404,7 @@ def _levels(x: Samples, settings: list[tuple[float, float]]) -> Array:
 
 
 def _hats(x: Array, knots: Array, beyond: bool = False) -> Array:
-    """(k, n) float32, parts whose sum by heights at the knots (k,) is the curve through these at x (n,).
+    """Parts whose sum by heights at the knots (k,) is the curve through these at x (n,), (k, n) float32.
 
     beyond: whether it goes on as it ends outside of the knots, rather than level.
     """
@@ -418,7 +418,7 @@ def _hats(x: Array, knots: Array, beyond: bool = False) -> Array:
 
 
 def _solved(matrix: Array, right: Array, bends: Array) -> tuple[Array, float]:
-    """Weights (k,) of least squares, their bends (m, k) held small, and the energy that they explain."""
+    """Least-squares weights (k,), their bends (m, k) held small, and the energy that they explain."""
     held = (BEND * bends.T @ bends + 1e-6 * BEND * np.eye(right.size)) * (np.trace(matrix) / right.size + 1e-30)
     found = np.linalg.solve(matrix + held, right)
     return found, float(2.0 * found @ right - found @ matrix @ found)

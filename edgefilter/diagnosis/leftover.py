@@ -8,7 +8,7 @@ import numpy as np
 from scipy.ndimage import median_filter
 
 from edgefilter.diagnosis.prepare import Prepared
-from edgefilter.diagnosis.score import Judge
+from edgefilter.diagnosis.score import Scorer
 from edgefilter.diagnosis.trials import Found
 from edgefilter.dsp.frames import block_power, blocks, decibels
 from edgefilter.dsp.psd import frequencies, periodograms
@@ -24,14 +24,12 @@ BLOCK = SAMPLE_RATE // 10
 
 @dataclass(frozen=True, eq=False)
 class Leftover:
-    """tones_hz: (k,) of the strongest tones, loudest first.
+    """Tones that are left. tones_hz: (k,) of the strongest, loudest first.
 
-    Mains_hz: 50 or 60 where most of their power lies on its multiples, else 0.
-
-    tone_share: of the residual's power over the fan, in tones. quiet_db: excess while the robot is silent, its median
-    over blocks of 0.1 s;
-    swing_db: by how much those blocks differ (90 % to 10 % quantile) beyond what noise does. level_slope: by how many
-    dB the excess grows per dB of the robot's level.
+    mains_hz: 50 or 60 where most of their power lies on its multiples, else 0. tone_share: of the residual's power over
+    the fan, in tones. quiet_db: excess while the robot is silent, its median over blocks of 0.1 s; swing_db: by how
+    much those blocks differ (90 % to 10 % quantile) beyond what noise does. level_slope: by how many dB the excess
+    grows per dB of the robot's level.
     """
 
     tones_hz: Array
@@ -103,7 +101,7 @@ def left_in_words(found: Found, left: Leftover, remaining_db: float, floor_db: f
         )
     if active > 1.0:
         weights = 10 * np.log10(np.maximum(final.cells, 1e-3)).mean(axis=0)
-        low, high = Judge(found.prepared).band_hz[int(np.argmax(weights))]
+        low, high = Scorer(found.prepared).band_hz[int(np.argmax(weights))]
         words.append(f"a residual that follows the robot's voice, strongest around {low:.0f} to {high:.0f} Hz")
     if not words:
         words.append("a residual spread over the whole recording")

@@ -10,7 +10,7 @@ import numpy as np
 from edgefilter.diagnosis.criteria import Criteria
 from edgefilter.diagnosis.leftover import Leftover, inspect
 from edgefilter.diagnosis.prepare import Prepared
-from edgefilter.diagnosis.score import Judge
+from edgefilter.diagnosis.score import Scorer
 from edgefilter.diagnosis.trials import Found, Trial, beside
 from edgefilter.echo.effect import complete
 from edgefilter.echo.effects.catalogue import find, names
@@ -19,7 +19,7 @@ from edgefilter.echo.measurement import Measurement, Values
 from edgefilter.echo.model import EchoModel
 
 BAND = 20
-"""Bins of 13.3 Hz over which the change is averaged before that is judged."""
+"""Bins of 13.3 Hz over which the change is averaged before that is tested."""
 
 
 def changed_fan(
@@ -49,21 +49,21 @@ def changed_fan(
             continue
         if not _steady(inspect(now, residual), criteria):
             continue
-        judge = Judge(now)
-        after = judge.of(model)
-        step = Trial(name, values, model.with_effect(name, values), after, judge.fan_gain_db(base, after))
+        scorer = Scorer(now)
+        after = scorer.of(model)
+        step = Trial(name, values, model.with_effect(name, values), after, scorer.fan_gain_db(base, after))
         if abs(after.silent_db) < 0.5 * abs(base.silent_db) and step.p_value <= criteria.false_rate:
             return now, step
     return None
 
 
 def look_at_fan(found: Found, criteria: Criteria, without: Collection[str] = ()) -> tuple[Found, Leftover]:
-    """The search's outcome with the final residual judged against the fan as it is now, and with what changed the fan where it is another.
+    """The search's outcome with the final residual held against the fan as it is now, and with what changed the fan where it is another.
 
     A microphone gain in the model is taken out of the residual first: the fan passed through it. without: names of effects
     that are not to be looked for beside the voice.
     """
-    found = _judged_anew(found, criteria, without)
+    found = _scored_anew(found, criteria, without)
     prepared = found.prepared
     measurement, model = prepared.measurement, found.model
     gain = model.microphone_gain(measurement.recording.size)
@@ -82,15 +82,15 @@ def look_at_fan(found: Found, criteria: Criteria, without: Collection[str] = ())
             or (heard and abs(left.quiet_mean_db) <= 0.5 * criteria.fan_change_db)
         ):
             continue
-        judge = Judge(now)
-        after = judge.of(model)
+        scorer = Scorer(now)
+        after = scorer.of(model)
         behind = inspect(now, residual)
         if not _steady(behind, criteria) or (
             (after.silent_db > 0.5 * found.final.silent_db) if heard else (after.excess_db > criteria.fan_change_db)
         ):
             continue
         changed = model.with_effect(name, values)
-        step = Trial(name, values, changed, after, judge.fan_gain_db(found.final, after))
+        step = Trial(name, values, changed, after, scorer.fan_gain_db(found.final, after))
         if step.p_value > criteria.false_rate:
             continue
         return replace(found, prepared=now, model=changed, final=after, steps=(*found.steps, step)), behind
@@ -99,14 +99,14 @@ def look_at_fan(found: Found, criteria: Criteria, without: Collection[str] = ())
 
 def _held_down(prepared: Prepared, model: EchoModel, criteria: Criteria, without: Collection[str]) -> Iterator[Trial]:
     """The effects that show in the robot's silences as well and that a model lacks, each as a step from it."""
-    judge = Judge(prepared)
+    scorer = Scorer(prepared)
     for name in sorted(name for name in names() if find(name).shows_in_silence and name not in without):
-        if step := beside(judge, name, model, criteria):
+        if step := beside(scorer, name, model, criteria):
             yield step
 
 
-def _judged_anew(found: Found, criteria: Criteria, without: Collection[str]) -> Found:
-    """The search's outcome with what shows in the silences fitted and judged beside all that was found, and only so kept."""
+def _scored_anew(found: Found, criteria: Criteria, without: Collection[str]) -> Found:
+    """The search's outcome with what shows in the silences fitted and scored beside all that was found, and only so kept."""
     kept = tuple(step for step in found.steps if not find(step.name).shows_in_silence)
     model = found.model
     for name in {step.name for step in found.steps} - {step.name for step in kept}:
@@ -124,10 +124,10 @@ def without_doubtful(found: Found) -> Found:
 
 def _in_steps(found: Found, steps: Iterable[Trial]) -> Found:
     """The outcome with those effects alone, each scored beside those before it."""
-    judge, model, score, scored = Judge(found.prepared), found.start, found.base, []
+    scorer, model, score, scored = Scorer(found.prepared), found.start, found.base, []
     for step in steps:
         model, before = model.with_effect(step.name, step.values), score
-        score = judge.of(model)
+        score = scorer.of(model)
         again = Trial.of(step.name, model, before, score)
         scored.append(replace(again, gain_db=step.gain_db) if find(step.name).stage == "noise" else again)
     return replace(found, model=model, final=score, steps=tuple(scored))

@@ -27,7 +27,7 @@ ENGINES = ("linear", "ss", "crnn")
 LEAST_S, MOST_S = 10.0, 60.0
 """What a recording has to last, and how much of it is looked at."""
 SETTLED_S = 5.0
-"""The filter has this long with the robot alone before it is judged, and before the human speaks."""
+"""The filter has this long with the robot alone before it is measured, and before the human speaks."""
 PAUSE_S = 2.0
 """Between two turns of the human."""
 WINDOW_S, STRETCH = 2.0, 1024
@@ -266,7 +266,7 @@ def _lag(mic: Samples, ref: Samples) -> int | None:
 
 
 def _lags(mic: Samples, near: Samples) -> Array:
-    """(w,) samples by which the microphone lags behind the aligned reference, in those windows whose arrival is sharp."""
+    """Samples by which the microphone lags behind the aligned reference, in those windows whose arrival is sharp, (w,)."""
     size, found = round(WINDOW_S * SAMPLE_RATE), []
     for at in range(0, mic.size - size + 1, size):
         part = slice(at, at + size)
@@ -325,7 +325,7 @@ def octaves() -> list[tuple[float, float]]:
 
 
 def _filtered(mic: Samples, ref: Samples, engine: str) -> tuple[Samples, int | None]:
-    """(n,) the output without a profile, and how often speech of a human has started in it; None where that is not judged."""
+    """The output without a profile, (n,), and how often speech of a human has started in it; None where no engine detects speech."""
     with EgoFilter(engine=engine) as ego:
         output = np.concatenate((ego.process(mic, ref), ego.flush()))
         starts = sum(event.kind == "speech_started" for event in ego.events())

@@ -70,7 +70,7 @@ def _half_width(finding: Finding, parameter: Parameter, index: int) -> float | N
 
 
 def _derivative(found: Found, finding: Finding, parameter: Parameter, index: int) -> Array | None:
-    """(n,) the whitened prediction's derivative by a number; None at a bound, and where it does not move the prediction."""
+    """The whitened prediction's derivative by a number, (n,); None at a bound, and where it does not move the prediction."""
     value = np.array(finding.values[parameter.name], float)
     at = float(value.ravel()[index])
     if at in (parameter.low, parameter.high):
@@ -91,7 +91,7 @@ def _derivative(found: Found, finding: Finding, parameter: Parameter, index: int
 
 
 def _covariance(found: Found, derivatives: Array) -> Array | None:
-    """(k, k) of numbers with those derivatives (k, n); None where they cannot be told apart at all."""
+    """Covariance of numbers with those derivatives (k, n), (k, k); None where they cannot be told apart at all."""
     measurement = found.prepared.measurement
     residual = (measurement.white_recording - measurement.heard(found.model)[1]) * measurement.weights
     scale = np.sqrt(np.sum(derivatives**2, axis=1))

@@ -67,17 +67,17 @@ class Prepared:
 
     @property
     def held_out(self) -> NDArray[np.bool_]:
-        """(n,) samples that no fit has used."""
+        """Samples that no fit has used, (n,)."""
         return self.usable & ~self.fit
 
     @property
     def fit(self) -> NDArray[np.bool_]:
-        """(n,) the samples to fit on, which prepare() always marks."""
+        """The samples to fit on, which prepare() always marks, (n,)."""
         return cast("NDArray[np.bool_]", self.measurement.fit)
 
     @property
     def noise_psd(self) -> Samples:
-        """(601,) the fan's PSD, which prepare() always knows."""
+        """The fan's PSD, which prepare() always knows, (601,)."""
         return cast(Samples, self.measurement.noise_psd)
 
     def behind(self, noise_psd: Samples) -> Prepared:
@@ -127,7 +127,7 @@ def prepare(profile: Profile, recording: Samples, reference: Samples, *, sample_
     if end - begin < n and end - begin > n // 2:
         usable[:begin], usable[end:] = False, False
         warnings += (
-            f"the reference is cut in mid-word: only {begin / SAMPLE_RATE:.1f} to {end / SAMPLE_RATE:.1f} s are judged",
+            f"the reference is cut in mid-word: only {begin / SAMPLE_RATE:.1f} to {end / SAMPLE_RATE:.1f} s are evaluated",
         )
     if len(pieces) > 1:
         lags = ", ".join(f"{lag:.1f} from {first / SAMPLE_RATE:.1f} s" for first, _, lag in pieces)
@@ -150,7 +150,7 @@ def ordinary_distortion(profile: Profile, predicted: Samples) -> tuple[tuple[Sam
 
 
 def known_span(x: Samples, first_lag: float, last_lag: float) -> tuple[int, int]:
-    """(begin, end) samples of a recording (n,) of which the reference x (n,) knows what the robot says.
+    """First sample and end of the part of a recording (n,) of which the reference x (n,) knows what the robot says.
 
     first_lag, last_lag: of the recording behind x. What was said before a reference that begins in the middle of a
     word, and after one that ends there, is heard but unknown.
@@ -171,7 +171,7 @@ def known_span(x: Samples, first_lag: float, last_lag: float) -> tuple[int, int]
 def utterance_lags(
     x: Samples, predicted: Samples, recording: Samples, psd: Samples, offset: float
 ) -> list[tuple[int, int, float]]:
-    """(first sample, end, lag) of the stretches of the reference x (n,) that share a lag, the whole with `offset` where it is one.
+    """First sample, end and lag of the stretches of the reference x (n,) that share a lag, the whole with `offset` where it is one.
 
     predicted: for x without an offset. A player starts each utterance anew, so its lag may be another after a pause of
     PAUSE_S; a difference of less than LAG_STEP is no new start but left for the effects to explain.
@@ -201,7 +201,7 @@ def utterance_lags(
 
 
 def find_talk(square: Samples, active: NDArray[np.bool_]) -> tuple[tuple[float, float], ...]:
-    """(start_s, end_s) where somebody talks, from the whitened recording's square (n,) in the robot's silences.
+    """Stretches (start_s, end_s) where somebody talks, from the whitened recording's square (n,) in the robot's silences.
 
     Somebody talks where tenths of a second are TALK_DB over the fan while at least a third of the silence is at the
     fan: a fan that has changed is louder all the time. What lies between two such moments less than GAP_S apart belongs

@@ -13,7 +13,7 @@ from scipy.special import log_ndtr
 from edgefilter.calibration.multisine import BAND_HZ, SPEECH_DB
 from edgefilter.diagnosis.joint import fit_jointly
 from edgefilter.diagnosis.prepare import Prepared, prepare
-from edgefilter.diagnosis.score import FRAMES_PER_CELL, HOP, Judge
+from edgefilter.diagnosis.score import FRAMES_PER_CELL, HOP, Scorer
 from edgefilter.dsp.convolution import convolve
 from edgefilter.dsp.fractional_delay import delayed
 from edgefilter.dsp.psd import GRID_BINS, frequencies, variance_at
@@ -30,7 +30,7 @@ SOUND_S = 2.5
 """Seconds of one sound: two are what a robot plays without anybody asking why."""
 MARK_S, GAP_S, END_S = 0.25, 0.15, 0.1
 """Each begins with a noise, by which its lag is found where it is silent itself, and a gap, and ends in silence, so that
-its reverberation is judged as well."""
+its reverberation is evaluated as well."""
 LINES = 150
 """Of that sound: every 25th of the odd ones, so that products of two or three of them fall between."""
 ERROR_TAPS, FLIP = 64, 256
@@ -130,29 +130,29 @@ class Inquiry:
             raise UsageError(f"{name} belongs to one recording, and no other can tell of it: ask without it")
         self.profile, self.reference = profile, reference
         self._first = prepare(profile, recording, reference)
-        judge, measurement = Judge(self._first), self._first.measurement
+        scorer, measurement = Scorer(self._first), self._first.measurement
         kept: list[Explanation] = []
         voices: list[Samples] = []
         for effects in wanted:
             model = _fitted(measurement, self._first.model, effects)
-            power, expected, voice = _cells(judge, model)
+            power, expected, voice = _cells(scorer, model)
             over = np.maximum(np.sum(power - expected, axis=0), 0.0) / np.maximum(np.sum(voice, axis=0), 1e-12)
             heard = measurement.heard(model)[1]
             noisy = model.unpredictable(measurement.reference) or any(find(name).stage == "noise" for name in effects)
             if noisy or all(np.sum((heard - other) ** 2) > TWINS * np.sum(other**2) for other in voices):
-                error = np.interp(frequencies(GRID_BINS), judge.band_hz.mean(axis=1), over)
+                error = np.interp(frequencies(GRID_BINS), scorer.band_hz.mean(axis=1), over)
                 kept.append(Explanation(effects, model.lasting(), error))
                 voices.append(heard)
         self.explanations = tuple(kept)
 
     def before(self) -> Array:
-        """(explanations + 1,) the probability of each, and of none, by the other half, before anything is asked."""
+        """The probability of each, and of none, by the other half, before anything is asked, (explanations + 1,)."""
         return weights(_log_likelihood(self._first, self.explanations))
 
     def evidence(self, recording: Samples, sound: Samples) -> Array:
-        """(moments, explanations + 1) log likelihood of what was recorded (m,) of a sound (n,), the last of none of them.
+        """Log likelihood of what was recorded (m,) of a sound (n,), (moments, explanations + 1), the last of none of them.
 
-        All are fitted again, to the first recording and one half of this one, and judged by the other half; then the halves
+        All are fitted again, to the first recording and one half of this one, and tested on the other half; then the halves
         change places. What a clock does begins anew with each recording, so that a model of one stays as it is.
         Raises SignalError where the recording does not contain the sound.
         """
@@ -175,7 +175,7 @@ class Inquiry:
         return np.concatenate(found)
 
     def gains(self, sound: Samples) -> Array:
-        """(explanations, explanations) the log odds over each other that are expected of a sound (n,) where the first is true."""
+        """The log odds over each other that are expected of a sound (n,) where the first is true, (explanations, explanations)."""
         count = len(self.explanations)
         heard = (_simulated(self.profile, true, sound) for true in self.explanations)
         told = [self.evidence(recording, sound).sum(axis=0)[:count] for recording in heard]
@@ -184,7 +184,7 @@ class Inquiry:
     def sounds(self, likely: Array, progress: Callable[[str], None] | None = None) -> list[Sound]:
         """The menu, the best sound first: the one that is expected to tell most of the explanations that stand.
 
-        Each sound is played to each explanation, as fitted, with its noise, and judged as what is recorded will be (Lindley
+        Each sound is played to each explanation, as fitted, with its noise, and evaluated as what is recorded will be (Lindley
         1956, "On a measure of the information provided by an experiment"). likely (explanations + 1,): so far; less
         than one in ENOUGH of the best does not stand, but two always do. Of the log odds that the true one gains over each
         other the mean logarithm counts, 1 added: twice as sure is worth less than another pair told. Raises SignalError
@@ -229,7 +229,7 @@ class Inquiry:
 
 
 def weights(found: Array, gains: Sequence[Array] = ()) -> Array:
-    """(explanations + 1,) the probability of each and of none, all as probable beforehand, from evidence (moments, explanations + 1).
+    """The probability of each and of none, (explanations + 1,), all as probable beforehand, from evidence (moments, explanations + 1).
 
     No explanation is exactly true, so that likelihoods of thousands of samples would be far too sure. Asked is which of two
     is closer to what was heard: by chance the difference of their log likelihoods has either sign from moment to moment; its
@@ -296,13 +296,13 @@ def _like_speech(hz: Array) -> Array:
 
 
 def _noise(rng: np.random.Generator, magnitude: Array, level: float, peak: float) -> Array:
-    """(n,) of random phases and that magnitude (n / 2 + 1,), of a root mean square and a peak, faded in and out over 10 ms."""
+    """A sound of random phases and that magnitude (n / 2 + 1,), (n,), of a root mean square and a peak, faded in and out over 10 ms."""
     x = _faded(np.fft.irfft(magnitude * np.exp(2j * np.pi * rng.uniform(size=magnitude.size))))
     return np.asarray(x * min(level / np.sqrt(np.mean(x**2)), peak / np.max(np.abs(x))))
 
 
 def _loudest(reference: Samples, n: int) -> Array:
-    """(n,) the loudest stretch of a reference, faded in and out, with silence behind a shorter one."""
+    """The loudest stretch of a reference, (n,), faded in and out, with silence behind a shorter one."""
     x = np.pad(reference.astype(np.float64), (0, max(n + 1 - reference.size, 0)))
     energy = np.concatenate(([0.0], np.cumsum(x**2)))
     at = int(np.argmax(energy[n:] - energy[:-n]))
@@ -310,7 +310,7 @@ def _loudest(reference: Samples, n: int) -> Array:
 
 
 def _faded(x: Array) -> Array:
-    """Samples (n,) faded in and out over 10 ms."""
+    """Samples faded in and out over 10 ms, (n,)."""
     fade = np.minimum(np.arange(1, x.size + 1), SAMPLE_RATE // 100) / (SAMPLE_RATE // 100)
     return np.asarray(x * (fade * fade[::-1]))
 
@@ -323,7 +323,7 @@ def _fitted(measurement: Measurement, model: EchoModel, effects: Sequence[str]) 
 
 
 def _halves(prepared: Prepared) -> Iterator[Prepared]:
-    """The same with one half to fit to and the other to judge by, then the other way round."""
+    """The same with one half to fit to and the other to test on, then the other way round."""
     for half in (prepared.fit, prepared.held_out):
         yield replace(prepared, measurement=replace(prepared.measurement, fit=half))
 
@@ -349,40 +349,40 @@ def _simulated(profile: Profile, true: Explanation, sound: Samples) -> Samples:
 
 
 def _coloured(rng: np.random.Generator, n: int, psd: Array) -> Array:
-    """(n,) noise of that PSD (601,)."""
+    """Noise of that PSD (601,), n samples."""
     amplitude = np.sqrt(variance_at(np.fft.rfftfreq(n, 1 / SAMPLE_RATE), psd))
     return np.fft.irfft(np.fft.rfft(rng.standard_normal(n)) * amplitude, n)
 
 
-def _cells(judge: Judge, model: EchoModel) -> tuple[Array, Array, Array]:
-    """(moments, bands) each, over the known fan: the power that a model leaves, what it expects there, and its voice."""
-    score, psd = judge.of(model), judge.psd
-    power = judge.cells(judge.measurement.recording - score.prediction)
-    fan = np.interp(judge.band_hz.mean(axis=1), frequencies(psd.size), model.expected_noise(psd) / psd)
-    return power, power / score.cells + fan - 1.0, judge.cells(score.prediction)
+def _cells(scorer: Scorer, model: EchoModel) -> tuple[Array, Array, Array]:
+    """The power that a model leaves, what it expects there, and its voice, over the known fan, (moments, bands) each."""
+    score, psd = scorer.of(model), scorer.psd
+    power = scorer.cells(scorer.measurement.recording - score.prediction)
+    fan = np.interp(scorer.band_hz.mean(axis=1), frequencies(psd.size), model.expected_noise(psd) / psd)
+    return power, power / score.cells + fan - 1.0, scorer.cells(score.prediction)
 
 
 def _log_likelihood(prepared: Prepared, explanations: Sequence[Explanation]) -> Array:
-    """(moments, explanations + 1) of the cells that no fit has used, the last of none of the explanations.
+    """Log likelihood of the cells that no fit has used, (moments, explanations + 1), the last of none of the explanations.
 
     Of a residual that is Gaussian in each cell, with a variance that is expected to a factor: Student's t with as many
     degrees of freedom as the cell has (Lange, Little & Taylor 1989), so that what is louder than expected counts by its
     level, and what was expected in vain counts as well.
     """
-    judge = Judge(prepared)
-    freedom = judge.freedom * (HOP * FRAMES_PER_CELL / (HOP - 1))
+    scorer = Scorer(prepared)
+    freedom = scorer.freedom * (HOP * FRAMES_PER_CELL / (HOP - 1))
 
     def likelihood(power: Array, expected: Array) -> Array:
         return -0.5 * np.sum(freedom * (np.log(expected) + 2.0 * np.log1p(power / expected)), axis=1)
 
     columns, vague = [], []
     for each in explanations:
-        power, expected, voice = _cells(judge, each.model)
-        error = np.interp(judge.band_hz.mean(axis=1), frequencies(GRID_BINS), each.error)
+        power, expected, voice = _cells(scorer, each.model)
+        error = np.interp(scorer.band_hz.mean(axis=1), frequencies(GRID_BINS), each.error)
         expected = expected + error * voice
         columns.append(likelihood(power, expected))
         vague.append(likelihood(power, NONE * expected))
-    if not judge.starts.size:
-        raise SignalError("too little of the recording can be judged: expected two seconds in which nobody talks")
+    if not scorer.starts.size:
+        raise SignalError("too little of the recording can be evaluated: expected two seconds in which nobody talks")
     best = int(np.argmax([column.sum() for column in columns]))
     return np.stack([*columns, vague[best]], axis=1)

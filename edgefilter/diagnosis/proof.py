@@ -20,7 +20,7 @@ from edgefilter.profile.data import Profile
 from edgefilter.types import SAMPLE_RATE, Samples
 
 FIRST = 0.6
-"""Part of the robot's voice that the proof fits to: the rest is as short as judges a filter, since a fit to less than
+"""Part of the robot's voice that the proof fits to: the rest is as short as suffices to test a filter, since a fit to less than
 all is worse than the one that is written."""
 NEAR = 0.1
 """Of the recording, how far either way the cut may move to fall into a pause."""
@@ -36,7 +36,7 @@ AHEAD = SAMPLE_RATE // 10
 class Proof:
     """ERLE in dB of the running filter, engine linear, over seconds that the fit has not seen, without and with what was fitted.
 
-    seconds: of the robot alone that were judged, from start_s to the recording's end. without: of several effects, the
+    seconds: of the robot alone that were tested on, from start_s to the recording's end. without: of several effects, the
     ERLE with all but that one, where they make the filter worse; empty otherwise.
     """
 
@@ -74,8 +74,8 @@ class HeldOut:
         self._prepared = prepare(profile, recording, reference)
         robot = self._prepared.usable & self._prepared.active
         self.cut = _cut(self._prepared.prediction, robot)
-        self._judged = robot[self.cut :]
-        self.seconds = float(np.count_nonzero(self._judged)) / SAMPLE_RATE
+        self._tested = robot[self.cut :]
+        self.seconds = float(np.count_nonzero(self._tested)) / SAMPLE_RATE
         shortest = min(self.seconds, float(np.count_nonzero(robot[: self.cut])) / SAMPLE_RATE)
         if shortest < LEAST_S:
             raise SignalError(
@@ -84,7 +84,7 @@ class HeldOut:
             )
 
     def before(self, prepared: Prepared) -> Prepared:
-        """The prepared recording with nothing to fit to, or to judge by, from the cut on."""
+        """The prepared recording with nothing to fit to, or to test on, from the cut on."""
         first = np.arange(prepared.usable.size) < self.cut
         fit = replace(prepared.measurement, fit=prepared.fit & first)
         return replace(prepared, measurement=fit, usable=prepared.usable & first)
@@ -95,7 +95,7 @@ class HeldOut:
         heard = measurement.recording[self.cut :]
         said = np.pad(measurement.reference, (0, AHEAD))[self.cut + AHEAD :]
         left = enhance(heard, said, profile, "linear")
-        powers = (float(np.sum(np.square(x[self._judged], dtype=np.float64))) for x in (heard, left))
+        powers = (float(np.sum(np.square(x[self._tested], dtype=np.float64))) for x in (heard, left))
         return float(np.subtract(*(decibels(power) for power in powers)))
 
 

@@ -30,8 +30,8 @@ TOLERANCE = 0.012
 TOLERANCE_TAPS, TOLERANCE_LEAD = 32, 16
 
 
-class Judge:
-    """Holds a prepared recording against predictions.
+class Scorer:
+    """Scores predictions of a prepared recording.
 
     In the cells of time and frequency that no fit has seen the residual is held to be Gaussian (Whittle 1953), with the variance
     that the model expects times an unknown factor, since every model errs: Student's t. So what counts is that the residual
@@ -64,7 +64,7 @@ class Judge:
 
     @cached_property
     def _ordinary_cells(self) -> Array:
-        """(times, bands) what is expected over the fan where nothing is missing."""
+        """What is expected over the fan where nothing is missing, (times, bands)."""
         return self._expected_cells(self.prepared.ordinary)
 
     @property
@@ -74,15 +74,15 @@ class Judge:
 
     @property
     def usable(self) -> NDArray[np.bool_]:
-        """(n,) samples where nobody else talks."""
+        """Samples where nobody else talks, (n,)."""
         return self.prepared.usable
 
     def level_db(self, prediction: Samples) -> float:
         """Score.level_db of a prediction (n,)."""
-        return self.judge(prediction, self.measurement.whiten(prediction)).level_db
+        return self.score(prediction, self.measurement.whiten(prediction)).level_db
 
     def cells(self, residual: Samples) -> Array:
-        """(times, bands) power of the residual (n,) over the fan's, in the held-out cells."""
+        """Power of the residual (n,) over the fan's, in the held-out cells, (times, bands)."""
         at = self.starts[:, None] + np.arange(FRAMES_PER_CELL) * HOP
         read = frames(residual, FRAME, 1)[at] * self._window
         ratio = fourier.power(fft.rfft(read, axis=-1)).mean(axis=1) / self._expected
@@ -92,9 +92,9 @@ class Judge:
         """The score of a model: on what it predicts, with what it says that no waveform predicts counted as fan."""
         measurement = self.prepared.measurement
         gain = model.microphone_gain(measurement.recording.size)
-        return self.judge(*measurement.heard(model), model.unpredictable(measurement.reference), gain)
+        return self.score(*measurement.heard(model), model.unpredictable(measurement.reference), gain)
 
-    def judge(
+    def score(
         self,
         prediction: Samples,
         white: Samples,
@@ -156,7 +156,7 @@ class Judge:
         return float(10 * np.log10(max(plain, white, 1e-12)))
 
     def _expected_cells(self, unpredictable: Sequence[tuple[Samples, Array]]) -> Array:
-        """(times, bands) what is expected in the held-out cells, 1 where that is the fan alone."""
+        """What is expected in the held-out cells, 1 where that is the fan alone, (times, bands)."""
         expected = np.ones((self.starts.size, self.freedom.size))
         span = FRAME + HOP * (FRAMES_PER_CELL - 1)
         for variance, colour in unpredictable:
@@ -170,14 +170,14 @@ class Judge:
         return expected
 
     def _over_expected(self, power: Array, unpredictable: Sequence[tuple[Samples, Array]]) -> Array:
-        """Power (n,) of the whitened residual over what is expected, both smoothed over 16 ms: when a knock comes is known to some ms."""
+        """Return the power of the whitened residual over what is expected, (n,), both smoothed over 16 ms: when a knock comes is known to some ms."""
         expected = np.ones_like(power)
         for variance, colour in unpredictable:
             expected += variance * float(np.mean(colour / self.psd))
         return uniform_filter1d(power, HOP) / uniform_filter1d(expected, HOP)
 
     def correct(self, prediction: Samples, white: Samples) -> Samples:
-        """Prediction (n,), and whitened, through the short filter that brings it closest to the recording, no further from 1 than TOLERANCE."""
+        """Put a prediction, and it whitened, through the short filter that brings it closest to the recording, within TOLERANCE of 1."""
         measurement = self.prepared.measurement
         target = measurement.white_recording - white
         weights, _ = normal_equations([white], target, TOLERANCE_TAPS, TOLERANCE_LEAD, self._rows).solve(1e-5)

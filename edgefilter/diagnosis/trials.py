@@ -11,7 +11,7 @@ import numpy as np
 from edgefilter.diagnosis.criteria import Criteria
 from edgefilter.diagnosis.ordinary import p_value, percent
 from edgefilter.diagnosis.prepare import Prepared
-from edgefilter.diagnosis.score import Judge
+from edgefilter.diagnosis.score import Scorer
 from edgefilter.echo.effect import fitted, vanishes
 from edgefilter.echo.effects.catalogue import find, names
 from edgefilter.echo.evidence import Evidence, Score
@@ -26,7 +26,7 @@ Signature: TypeAlias = tuple[tuple[str | bytes, ...], ...]
 class Trial:
     """One effect added to a model: its values, the model with it, its score, and by how many dB the held-out level falls.
 
-    Of another fan gain_db is Judge.fan_gain_db.
+    Of another fan gain_db is Scorer.fan_gain_db.
     """
 
     name: str
@@ -66,7 +66,7 @@ class Tried:
 class Found:
     """The outcome of a search from a start model.
 
-    Steps: the accepted effects in their order. notes: what the reader must know of the search. tried: every effect that
+    steps: the accepted effects in their order. notes: what the reader must know of the search. tried: every effect that
     was fitted.
 
     prepared: what final was scored on; its fan is another than at the calibration where a changed fan is the first of
@@ -94,7 +94,7 @@ class Workbench:
         without: Collection[str] = (),
     ) -> None:
         self.prepared, self.criteria, self._without = prepared, criteria, without
-        self.judge = Judge(prepared)
+        self.scorer = Scorer(prepared)
         self._progress = progress
         self._scores: dict[Signature, Score] = {}
         self._trials: dict[tuple[Signature, str], Trial | None] = {}
@@ -114,14 +114,14 @@ class Workbench:
         return (*self._failed.values(), *((spent,) if self._refused else ()))
 
     def score(self, model: EchoModel) -> Score:
-        """The judge's score of a model."""
+        """The score of a model, worked out once."""
         key = signature(model)
         if key not in self._scores:
-            self._scores[key] = self.judge.of(model)
+            self._scores[key] = self.scorer.of(model)
         return self._scores[key]
 
     def heard(self, model: EchoModel) -> float:
-        """DB over the robot's silences, of half a dB either way, that a model leaves while the robot is heard."""
+        """Return the level, in dB over the robot's silences, of half a dB either way, that a model leaves while the robot is heard."""
         score = self.score(model)
         return score.active_db - float(np.clip(score.silent_db, -0.5, 0.5))
 
@@ -131,7 +131,7 @@ class Workbench:
 
     def voiced(self, model: EchoModel) -> bool:
         """Whether a model predicts so much of a voice that effects on it can be told."""
-        return self.judge.size_db(self.score(model).prediction) > self.criteria.voice_db
+        return self.scorer.size_db(self.score(model).prediction) > self.criteria.voice_db
 
     def little(self, model: EchoModel, start: EchoModel) -> bool:
         """Whether a model leaves so little of what start leaves that the right effects may be in it."""
@@ -141,7 +141,7 @@ class Workbench:
     def left(self, model: EchoModel) -> float:
         """Level in dB over that of the silences."""
         score = self.score(model)
-        return max(score.over_db - self.judge.floor_level(score), 0.0)
+        return max(score.over_db - self.scorer.floor_level(score), 0.0)
 
     def attempt(self, name: str, model: EchoModel) -> Trial | None:
         """The effect of that name fitted beside what the model has.
@@ -158,7 +158,7 @@ class Workbench:
         return self._trials[key]
 
     def attempt_alike(self, name: str, model: EchoModel) -> Trial | None:
-        """attempt(), or what came of it beside the same effects at other values: enough to choose what is worth a closer look."""
+        """Return attempt(), or what came of it beside the same effects at other values: enough to choose what is worth a closer look."""
         key = frozenset(dict(model.effects)), name
         return self._alike[key] if key in self._alike else self.attempt(name, model)
 
@@ -233,7 +233,7 @@ class Workbench:
         """The bar that a trial on a model does not reach, in words; empty where it is admissible."""
         if trial.p_value > self.criteria.false_rate:
             return f"{percent(trial.p_value)} of ordinary recordings show as much of some effect"
-        evidence = Evidence(trial.values, model, self.judge, self.score(model), trial.score)
+        evidence = Evidence(trial.values, model, self.scorer, self.score(model), trial.score)
         return "" if find(trial.name).plausible(evidence) else "its values do not look like it"
 
     def tried(self, start: EchoModel, model: EchoModel) -> tuple[Tried, ...]:
@@ -265,20 +265,20 @@ class Workbench:
         return [name for name, effect in listed if not effect.is_of_the_fan and effect.complexity <= most]
 
 
-def beside(judge: Judge, name: str, model: EchoModel, criteria: Criteria) -> Trial | None:
+def beside(scorer: Scorer, name: str, model: EchoModel, criteria: Criteria) -> Trial | None:
     """An effect outside the search, fitted beside what a model has.
 
     None where it is there, its fit finds nothing, ordinary recordings show as much, or its values do not look like it.
     """
     effect = find(name)
-    values = None if name in dict(model.effects) else fitted(effect, judge.measurement, model)
+    values = None if name in dict(model.effects) else fitted(effect, scorer.measurement, model)
     if values is None or vanishes(effect, values):
         return None
     changed = model.with_effect(name, values)
-    before, after = judge.of(model), judge.of(changed)
+    before, after = scorer.of(model), scorer.of(changed)
     found = Trial.of(name, changed, before, after)
     by_chance = found.p_value > criteria.false_rate
-    return None if by_chance or not effect.plausible(Evidence(values, model, judge, before, after)) else found
+    return None if by_chance or not effect.plausible(Evidence(values, model, scorer, before, after)) else found
 
 
 def added(start: EchoModel, model: EchoModel) -> list[str]:

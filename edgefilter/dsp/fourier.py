@@ -48,7 +48,7 @@ def irfft(spectrum: Spectrum, n: int, out: Samples | None = None) -> Samples:
 
 
 def power(spectrum: np.ndarray) -> np.ndarray:
-    """|spectrum|^2 without the square root of abs, real and of the same precision."""
+    """Return |spectrum|^2 without the square root of abs, real and of the same precision."""
     return spectrum.real**2 + spectrum.imag**2
 
 

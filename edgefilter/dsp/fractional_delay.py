@@ -44,7 +44,7 @@ def tabulated() -> tuple[Samples, Samples]:
 
 
 def interpolate(x: Samples, positions: Array) -> Samples:
-    """(m,) float32, the signal x (n,) at real positions (m,), samples; outside of x there is silence."""
+    """The signal x (n,) at real positions (m,), in samples; (m,) float32, outside of x there is silence."""
     table, slope = tabulated()
     out = np.zeros(positions.size, np.float32)
     padded = np.pad(x, (2 * HALF_WIDTH, 2 * HALF_WIDTH))
@@ -65,7 +65,7 @@ def interpolate(x: Samples, positions: Array) -> Samples:
 
 
 def delayed(x: Array, samples: float) -> Samples:
-    """(n,) float32, the signal x (n,) later by a constant number of samples, fractional or negative; silence moves in.
+    """The signal x (n,) later by a constant number of samples, fractional or negative; (n,) float32, silence moves in.
 
     By the phase of its spectrum, which keeps all of the band: above 7 kHz, where the kernel falls off, a voice may
     still be over the fan.

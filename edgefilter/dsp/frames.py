@@ -9,30 +9,30 @@ from edgefilter.types import Array, Samples
 
 
 def frames(x: NDArray, size: int, hop: int) -> NDArray:
-    """(f, size) frames of x (n,), hop samples apart, a view not to be written to; none where x is shorter."""
+    """Frames of x (n,), hop samples apart, (f, size), a view not to be written to; none where x is shorter."""
     if x.size < size:
         return np.zeros((0, size), x.dtype)
     return np.lib.stride_tricks.sliding_window_view(x, size)[::hop]
 
 
 def blocks(x: NDArray, size: int) -> NDArray:
-    """(k, size) the whole blocks of x (n,), a view; what is left at the end is left out."""
+    """The whole blocks of x (n,), (k, size), a view; what is left at the end is left out."""
     count = x.size // size
     return x[: count * size].reshape(count, size)
 
 
 def block_power(x: Array, size: int) -> Array:
-    """(k,) float64, mean square of x (n,) in each whole block."""
+    """Mean square of x (n,) in each whole block, (k,) float64."""
     return np.square(blocks(x, size), dtype=np.float64).mean(axis=1)
 
 
 def block_sums(x: NDArray, size: int) -> Array:
-    """(k,) float64, sum of x (n,) over each whole block."""
+    """Sum of x (n,) over each whole block, (k,) float64."""
     return blocks(x, size).sum(axis=1, dtype=np.float64)
 
 
 def all_block_power(x: Samples, size: int) -> Array:
-    """(k,) float64, mean square in each block, the last one counted as if silence followed."""
+    """Mean square in each block, the last one counted as if silence followed, (k,) float64."""
     return np.add.reduceat(x.astype(np.float64) ** 2, np.arange(0, x.size, size)) / size
 
 

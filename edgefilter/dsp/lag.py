@@ -20,7 +20,7 @@ SAME = 0.98
 
 
 def smoothed_power(spectrum: np.ndarray, width_hz: float) -> Array:
-    """|spectrum|^2 (..., bins), averaged over width_hz."""
+    """Return |spectrum|^2 (..., bins), averaged over width_hz."""
     raw = power(spectrum)
     width = max(round(width_hz * 2 * spectrum.shape[-1] / SAMPLE_RATE), 1)
     return uniform_filter1d(raw, width, output=np.empty_like(raw), mode="nearest")
@@ -38,7 +38,7 @@ def flattened(spectrum: np.ndarray, floor: float) -> np.ndarray:
 
 
 def flat_cross(a: Array, b: Array, n: int) -> np.ndarray:
-    """(n // 2 + 1,) cross-spectrum of b with a, both flattened, without rumble: for unknown signals."""
+    """Cross-spectrum of b with a, both flattened, without rumble, (n // 2 + 1,): for unknown signals."""
     first, second = (flattened(fft.rfft(x.astype(np.float64), n), 1e-6) for x in (a, b))
     cross = second * first.conj()
     cross[: int(LOWEST_HZ * n / SAMPLE_RATE)] = 0.0
@@ -46,7 +46,7 @@ def flat_cross(a: Array, b: Array, n: int) -> np.ndarray:
 
 
 def likely_cross(predicted: Samples, recording: Samples, n: int) -> np.ndarray:
-    """(n // 2 + 1,) cross-spectrum Y P* / (|P|^2 + N) of two signals in noise of variance 1.
+    """Cross-spectrum Y P* / (|P|^2 + N) of two signals in noise of variance 1, (n // 2 + 1,).
 
     Flat where the voice stands out of the noise, nothing elsewhere. The maximum-likelihood weighting of Knapp &
     Carter (1976) for an error in proportion to the voice.
@@ -57,7 +57,7 @@ def likely_cross(predicted: Samples, recording: Samples, n: int) -> np.ndarray:
 
 
 def correlation_near(cross: np.ndarray, n: int, reach: int) -> Array:
-    """(2 reach + 1,) the correlation at lags -reach to reach of which this is the spectrum, n samples long."""
+    """The correlation at lags -reach to reach of which this is the spectrum, n samples long, (2 reach + 1,)."""
     correlation = fft.irfft(cross, n)
     return np.concatenate((correlation[n - reach :], correlation[: reach + 1]))
 

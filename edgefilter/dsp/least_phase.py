@@ -10,7 +10,7 @@ from edgefilter.types import Array
 
 
 def log_response(log_gain: Array) -> NDArray[np.complex128]:
-    """(bins, ...) complex logarithm of the causal response of least phase with that gain, from its logarithm, 0 to Nyquist.
+    """Complex logarithm of the causal response of least phase with that gain, from its logarithm, 0 to Nyquist, (bins, ...).
 
     By its real cepstrum, folded onto positive times (Oppenheim & Schafer 2010, section 13.5).
     """

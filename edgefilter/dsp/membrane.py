@@ -50,7 +50,7 @@ def _motion(size: int, resonance_hz: float, sample_rate: int) -> Spectrum:
 
 
 def _responses(size: int, hz: float, q: float, sample_rate: int = SAMPLE_RATE) -> NDArray[np.complex128]:
-    """(2, size // 2 + 1) responses from drive to displacement and velocity: of w^2 / (s^2 + s w / Q + w^2) by the bilinear transform."""
+    """Responses from drive to displacement and velocity, of w^2 / (s^2 + s w / Q + w^2) by the bilinear transform, (2, size // 2 + 1)."""
     k = np.tan(np.pi * hz / sample_rate)
     z = np.exp(-2j * np.pi * np.arange(size // 2 + 1) / size)
     rest = k**2 * (1 + z) ** 2 + k / q * (1 - z**2) + (1 - z) ** 2

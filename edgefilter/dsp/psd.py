@@ -19,12 +19,12 @@ NOTCH = 1e-7
 
 
 def hann(size: int) -> Array:
-    """(size,) float64, the periodic Hann window, whose shifted copies add up to a constant."""
+    """The periodic Hann window, whose shifted copies add up to a constant, (size,) float64."""
     return np.hanning(size + 1)[:-1]
 
 
 def periodograms(x: Samples, size: int) -> Array:
-    """(f, size / 2 + 1) PSD of each half-overlapping Hann frame of x (n,): their mean is Welch's estimate (1967)."""
+    """PSD of each half-overlapping Hann frame of x (n,), (f, size / 2 + 1): their mean is Welch's estimate (1967)."""
     window = hann(size)
     found = power(fft.rfft(frames(x, size, size // 2) * window, axis=1)) / (SAMPLE_RATE * np.sum(window**2))
     found[:, 1:-1] *= 2.0
@@ -32,7 +32,7 @@ def periodograms(x: Samples, size: int) -> Array:
 
 
 def frequencies(bins: int) -> Array:
-    """(bins,) Hz, 0 to 8 kHz."""
+    """Frequencies of the bins, 0 to 8 kHz, (bins,) in Hz."""
     return np.arange(bins) * (0.5 * SAMPLE_RATE / (bins - 1))
 
 
@@ -55,7 +55,7 @@ def total_power(psd: Samples) -> float:
 
 
 def third_octave_bands() -> Array:
-    """(B, 2) Hz, third-octave bands of 50 Hz to 8 kHz (IEC 61260-1, 5.4, base ten), the last cut at 8 kHz."""
+    """Third-octave bands of 50 Hz to 8 kHz (IEC 61260-1, 5.4, base ten), the last cut at 8 kHz, (B, 2) in Hz."""
     centres = 1000.0 * 10 ** (np.arange(-13, 10) / 10)
     edges = np.stack((centres * 10**-0.05, centres * 10**0.05), axis=1)
     return np.minimum(edges, SAMPLE_RATE / 2)

@@ -50,17 +50,17 @@ class StftConfig:
 
     @cached_property
     def frequencies(self) -> Array:
-        """(bins,) Hz."""
+        """Frequencies of the bins, (bins,) in Hz."""
         return np.arange(self.bins) * SAMPLE_RATE / self.n_fft
 
     @cached_property
     def analysis_window(self) -> Samples:
-        """(window_length,) float32."""
+        """The analysis window, (window_length,) float32."""
         return self._window64.astype(np.float32)
 
     @cached_property
     def synthesis_window(self) -> Samples:
-        """(window_length,) float32, the canonical dual of the analysis window."""
+        """The synthesis window, canonical dual of the analysis window, (window_length,) float32."""
         return (self._window64 / self._coverage[np.arange(self.window_length) % self.hop]).astype(np.float32)
 
     @cached_property
@@ -72,7 +72,7 @@ class StftConfig:
 
     @property
     def _coverage(self) -> Array:
-        """(hop,) sum of the squared window over all frames that touch a sample, by position in the hop."""
+        """Sum of the squared window over all frames that touch a sample, by position in the hop, (hop,)."""
         padded = np.zeros(-(-self.window_length // self.hop) * self.hop)
         padded[: self.window_length] = self._window64**2
         return padded.reshape(-1, self.hop).sum(axis=0)

@@ -134,7 +134,7 @@ class Effect:
         return np.zeros(reference.size, np.float32)
 
     def colour(self, values: Values) -> Array:
-        """(601,) the spectral density of that, 0 to 8 kHz, per Hz: its integral is 1. By default white."""
+        """The spectral density of that, (601,), 0 to 8 kHz, per Hz: its integral is 1. By default white."""
         return np.full(601, 1.0 / 8000.0)
 
     def settled(self, values: Values) -> Values:
@@ -208,7 +208,7 @@ def neutral(effect: Effect) -> dict[str, float]:
 
 
 def complete(effect: Effect, values: Values) -> dict[str, float | Array]:
-    """Values with the neutral value for each that is missing.
+    """Return the values, with the neutral value for each that is missing.
 
     Raises UsageError for unknown names and values out of bounds.
     """

@@ -1,4 +1,4 @@
-"""What speaks for an effect: how well a recording is explained before and after it, and the cells in which that is judged."""
+"""What speaks for an effect: how well a recording is explained before and after it, and the cells in which that is scored."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class Score:
 
 
 class Grid(Protocol):
-    """The recording in cells of time and frequency, held-out ones alone, as the judge of a diagnosis cuts it.
+    """The recording in cells of time and frequency, held-out ones alone, as the scorer of a diagnosis cuts it.
 
     starts: (times,) first sample of each. active_cells: (times,) bool, where the robot is heard. band_hz: (bands, 2)
     edges. freedom: (bands,) degrees of freedom of a cell. usable: (n,) bool, samples where nobody else talks.
@@ -60,11 +60,11 @@ class Grid(Protocol):
 
     @property
     def usable(self) -> NDArray[np.bool_]:
-        """(n,) samples where nobody else talks."""
+        """Samples where nobody else talks, (n,)."""
         ...
 
     def cells(self, residual: Samples) -> Array:
-        """(times, bands) power of a signal (n,) over the fan's."""
+        """Power of a signal (n,) over the fan's, (times, bands)."""
         ...
 
     def level_db(self, prediction: Samples) -> float:

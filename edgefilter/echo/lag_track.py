@@ -17,7 +17,7 @@ LEAST_CORRELATION = 0.3
 
 @dataclass(frozen=True, eq=False)
 class LagTrack:
-    """starts (b,): first sample of each block of `size` samples.
+    """The lag block by block. starts (b,): first sample of each block of `size` samples.
 
     Lag (b,), sigma (b,): samples, the recording behind the prediction.
 
@@ -32,7 +32,7 @@ class LagTrack:
 
     @property
     def middle(self) -> Array:
-        """(b,) samples, the middle of each block."""
+        """The middle of each block, (b,) in samples."""
         return self.starts + self.size / 2
 
 

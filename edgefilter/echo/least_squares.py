@@ -96,6 +96,6 @@ def filtered(columns: Sequence[Samples], weights: Array, lead: int = 0) -> Sampl
 
 
 def absorbed(predicted: Samples, target: Samples, fit: np.ndarray | None = None) -> Samples:
-    """Predicted (n,) through the short filter that brings it closest to target (n,): what is left is no ordinary tolerance."""
+    """Put predicted (n,) through the short filter that brings it closest to target (n,): what is left is no ordinary tolerance."""
     weights, _ = normal_equations([predicted], target, NUISANCE_TAPS, NUISANCE_LEAD, fit).solve()
     return filtered([predicted], weights, NUISANCE_LEAD)

@@ -1,4 +1,4 @@
-"""A recording of the robot alone as a fit gets it, and the whitening by which it is judged."""
+"""A recording of the robot alone as a fit gets it, and the whitening in which it is compared."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ class VoiceModel(Protocol):
 
     @property
     def impulse_response(self) -> Samples:
-        """(taps,) the linear path, starting PRE_ROLL samples before the direct sound."""
+        """The linear path, starting PRE_ROLL samples before the direct sound, (taps,)."""
         ...
 
     @property
     def effects(self) -> tuple[tuple[str, Values], ...]:
-        """(name, values) of what the model has already."""
+        """Name and values of each effect that the model has already."""
         ...
 
     @property
@@ -51,7 +51,7 @@ class Measurement:
 
     noise_psd: (601,) one-sided power spectral density of the fan, full scale^2/Hz, from 0 to 8 kHz; None where it is
     unknown.
-    fit: (n,) bool, the samples that a fit may use; the others are held out to judge it by. None: all.
+    fit: (n,) bool, the samples that a fit may use; the others are held out to test it on. None: all.
     """
 
     reference: Samples
@@ -63,11 +63,11 @@ class Measurement:
 
     @property
     def weights(self) -> Samples:
-        """(n,) float32, 1 where a fit may use the sample, else 0."""
+        """Weights, 1 where a fit may use the sample, else 0, (n,) float32."""
         return np.ones(self.recording.size, np.float32) if self.fit is None else self.fit.astype(np.float32)
 
     def whiten(self, x: Samples) -> Samples:
-        """X (n,) through a zero-phase filter after which the fan is white with variance 1.
+        """Put x (n,) through a zero-phase filter after which the fan is white with variance 1.
 
         X itself where the fan is unknown.
         """
@@ -81,16 +81,16 @@ class Measurement:
 
     @cached_property
     def _whitening(self) -> Samples | None:
-        """(taps,) of the whitening filter."""
+        """Taps of the whitening filter, (taps,)."""
         return None if self.noise_psd is None else whitening_taps(self.noise_psd)
 
     @cached_property
     def white_recording(self) -> Samples:
-        """(n,) the recording, whitened."""
+        """The recording, whitened, (n,)."""
         return self.whiten(self.recording)
 
     def heard(self, model: VoiceModel) -> tuple[Samples, Samples]:
-        """(n,), (n,) what a model predicts for the reference, and that whitened.
+        """What a model predicts for the reference, and that whitened, (n,) each.
 
         Remembered for the latest few models, not to be written to.
         """
@@ -117,19 +117,19 @@ class Measurement:
 
 
 def whiten(x: Samples, noise_psd: Samples) -> Samples:
-    """X (n,) filtered by 1 / sqrt(noise_psd), floored, zero-phase, so that noise of that one-sided PSD gets variance 1."""
+    """Filter x (n,) by 1 / sqrt(noise_psd), floored, zero-phase, so that noise of that one-sided PSD gets variance 1."""
     return _centred(x, whitening_taps(noise_psd))
 
 
 def whitening_taps(noise_psd: Samples) -> Samples:
-    """(1199,) the filter of `whiten`, its middle at the 600th, for a PSD (601,)."""
+    """The filter of `whiten`, its middle at the 600th, for a PSD (601,), (1199,)."""
     taps = np.fft.fftshift(np.fft.irfft(1.0 / np.sqrt(floored(noise_psd) * SAMPLE_RATE / 2)))[1:]
     taps *= np.hanning(taps.size + 2)[1:-1] ** 0.25
     return taps.astype(np.float32)
 
 
 def _centred(x: Samples, taps: Samples) -> Samples:
-    """X (n,) through a filter whose middle tap is its moment 0."""
+    """Put x (n,) through a filter whose middle tap is its moment 0."""
     return convolve(x, taps)[taps.size // 2 :][: x.size].astype(np.float32, copy=False)
 
 

@@ -56,7 +56,7 @@ class EchoModel:
         return VoiceChain(self.effects)
 
     def running_response(self) -> Samples:
-        """(taps,) the path with the effects on it that are filters, as after the last change: what the running filter starts from."""
+        """The path with the effects on it that are filters, as after the last change, (taps,): what the running filter starts from."""
         linear = [(effect, values) for effect, values in chain(self.effects) if is_filter(effect, values)]
         if not linear:
             return self.impulse_response
@@ -91,7 +91,7 @@ class EchoModel:
         return parts
 
     def microphone_gain(self, size: int) -> Samples:
-        """(size,) the gain that an effect behind the microphone gives voice and fan alike at each moment.
+        """The gain that an effect behind the microphone gives voice and fan alike at each moment, (size,).
 
         Ones without one.
         """
@@ -102,7 +102,7 @@ class EchoModel:
         return gain
 
     def expected_noise(self, psd: Samples) -> Samples:
-        """(601,) PSD of the fan with the model's effects on it, from psd (601,) of the calibration."""
+        """PSD of the fan with the model's effects on it, (601,), from psd (601,) of the calibration."""
         for effect, values in chain(self.effects):
             psd = effect.noise_psd(values, psd)
         return psd

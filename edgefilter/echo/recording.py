@@ -12,11 +12,11 @@ MIN_SECONDS = 1.0
 MAX_OFFSET = 3.0
 """Seconds by which a recording may lag behind its reference or lead it."""
 BLOCK = SAMPLE_RATE // 2
-"""Samples of the blocks that are fitted on and judged by in turn."""
+"""Samples of the blocks that are fitted and tested on in turn."""
 
 
 def fitted_blocks(n: int) -> NDArray[np.bool_]:
-    """(n,) every other BLOCK, from the first on: what a fit may use, so that the rest can judge it."""
+    """Every other BLOCK, from the first on, (n,): what a fit may use, so that the rest can test it."""
     return np.arange(n) // BLOCK % 2 == 0
 
 

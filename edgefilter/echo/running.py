@@ -38,7 +38,7 @@ class Windowed:
         return whole
 
     def __call__(self, x: Samples, heard: Samples | None = None) -> Samples:
-        """X (n,) after the effect."""
+        """Return x (n,) after the effect."""
         return self._effect.apply(self.window(x), self._values, SAMPLE_RATE)[self._memory :]
 
 
@@ -46,7 +46,7 @@ class ExpectedSquare(Windowed):
     """What an effect that no waveform predicts adds to the expected square of each sample, on a stream."""
 
     def __call__(self, x: Samples, heard: Samples | None = None) -> Samples:
-        """(n,) of the samples x (n,) that set it off."""
+        """Return what the effect adds for the samples x (n,) that set it off, (n,)."""
         return self._effect.variance(self.window(x), self._values, SAMPLE_RATE)[self._memory :]
 
 
@@ -109,7 +109,7 @@ def _goes_by_windows(effect: Effect, values: Values, memory: int) -> bool:
 
 
 def _probe(seed: int) -> Samples:
-    """(2 ROOM,) noise of changing level in the middle of silence."""
+    """Noise of changing level in the middle of silence, (2 ROOM,)."""
     rng = np.random.default_rng(seed)
     x = np.zeros(2 * ROOM, np.float32)
     level = 0.2 * (1.0 + np.sin(np.arange(PROBE) / 100.0))

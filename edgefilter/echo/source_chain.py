@@ -43,7 +43,7 @@ class SourceChain:
         return [(noise() if noise else None, run() if run else None) for noise, run in self._makers if noise or run]
 
     def __call__(self, block: Samples) -> Samples:
-        """Block (n,) after the effects, (n,); it follows the last one."""
+        """Put a block (n,) through the effects; it follows the last one."""
         if self.colours:
             self.expected = []
         for noise, run in self._links:
@@ -54,7 +54,7 @@ class SourceChain:
         return block
 
     def restart(self, past: Samples) -> Samples:
-        """Past (n,) after the effects, (n,), when the past is another than it was; the next block follows it."""
+        """Put another past (n,) through the effects, in place of the one that was; the next block follows it."""
         self._links = self._new_links()
         return self(past)
 

@@ -21,7 +21,7 @@ DELAYS = np.arange(-8.0, 8.01, 0.1)
 
 
 def convolve_from(x: Samples, taps: Array, lead: int) -> Samples:
-    """sum_k taps[k] x(n - k + lead), (n,) float32."""
+    """Return sum_k taps[k] x(n - k + lead), (n,) float32."""
     y = convolve(x, taps.astype(np.float32))
     return np.pad(y, (0, max(lead + x.size - y.size, 0)))[lead : lead + x.size].astype(np.float32, copy=False)
 
@@ -29,7 +29,7 @@ def convolve_from(x: Samples, taps: Array, lead: int) -> Samples:
 def fit_filter(
     x: Samples, target: Samples, weights: Samples, taps: int, lead: int, prior: Array | None = None, steps: int = 12
 ) -> Array:
-    """(taps,) float64, the filter c that minimises sum w(n) (target(n) - sum_k c[k] x(n - k + lead))^2 + sum c^2 / prior.
+    """The filter c that minimises sum w(n) (target(n) - sum_k c[k] x(n - k + lead))^2 + sum c^2 / prior, (taps,) float64.
 
     x, target: (n,), whitened, so that the noise has variance 1. weights: (n,) 0 to 1. prior: (taps,) expected c^2;
     None: no penalty but a tiny one. Preconditioned conjugate gradients on the normal equations (Golub & Van Loan,
@@ -72,7 +72,7 @@ def fit_filter(
 def fit_supported(
     x: Samples, target: Samples, weights: Samples, taps: int, lead: int, prior: Array, steps: int
 ) -> Array:
-    """fit_filter's answer, or zeros where a filter from half of the weighted samples does not help on the other half (BLOCKs, two by two)."""
+    """Return fit_filter's answer, or zeros where a filter from half of the weighted samples does not help on the other half (BLOCKs, two by two)."""
     half = np.arange(x.size) // BLOCK % 4 < 2
     trial = convolve_from(x, fit_filter(x, target, weights * half, taps, lead, prior, steps // 2), lead)
     fall = float(np.dot(target * target - (target - trial) ** 2, weights * ~half))
@@ -80,7 +80,7 @@ def fit_supported(
 
 
 class _Blocks:
-    """x (n,) in the blocks of a weighted convolution, those without weight left out: overlap-save.
+    """Cut x (n,) into the blocks of a weighted convolution, those without weight left out: overlap-save.
 
     The blocks are those between two changes of the samples that are fitted on, so that half of them drop out; their
     transforms stay in the cache.
@@ -102,18 +102,18 @@ class _Blocks:
         self._moved = np.zeros((self._used.size, self._size), np.float32)
 
     def correlation(self) -> Array:
-        """(taps,) autocorrelation of x at lags from 0 on."""
+        """Autocorrelation of x at lags from 0 on, (taps,)."""
         n = fft.next_fast_len(self._x.size + self._taps, real=True)
         return fft.irfft(np.abs(fft.rfft(self._x, n)) ** 2, n)[: self._taps]
 
     def adjoint(self, target: Samples) -> Array:
-        """(taps,) sum w(n) target(n) x(n - k + lead)."""
+        """Return sum w(n) target(n) x(n - k + lead), (taps,)."""
         whole = np.zeros((int(self._used[-1]) + 1) * self._new if self._used.size else 0, np.float32)
         whole[: target.size] = target[: whole.size]
         return self._correlated(whole.reshape(-1, self._new)[self._used])
 
     def normal(self, c: Array) -> Array:
-        """(taps,) adjoint of x filtered by c (taps,)."""
+        """Adjoint of x filtered by c (taps,), (taps,)."""
         spectrum = fft.rfft(c.astype(np.float32), self._size)
         filtered = fft.irfft(self._source * spectrum, self._size, axis=1, overwrite_x=True)[
             :, self._taps - 1 : self._taps - 1 + self._new
@@ -121,7 +121,7 @@ class _Blocks:
         return self._correlated(filtered)
 
     def _correlated(self, signals: Samples) -> Array:
-        """(taps,) the sum over all blocks of signals (blocks, new) times their weights, correlated with x."""
+        """The sum over all blocks of signals (blocks, new) times their weights, correlated with x, (taps,)."""
         np.multiply(signals, self._weights, out=self._moved[:, self._taps - 1 : self._taps - 1 + self._new])
         both = np.einsum("bf,bf->f", fft.rfft(self._moved, axis=1), self._turned_back)
         return fft.irfft(both, self._size)[: self._taps].astype(np.float64)

@@ -43,6 +43,6 @@ class SpectralSubtraction:
 
 
 def noise_alone(frame: Frame) -> Spectrum:
-    """(bins,) of the error no more than FLOOR of the noise."""
+    """Of the error no more than FLOOR of the noise, (bins,)."""
     power = fourier.power(frame.error)
     return FLOOR * np.sqrt(np.minimum(frame.noise_psd, power) / (power + fourier.TINY)) * frame.error

@@ -252,12 +252,12 @@ class Canceller:
             self._begin()
 
     def _predict(self) -> Samples:
-        """(hop,) echo of the newest hop by the weights as they are."""
+        """Echo of the newest hop by the weights as they are, (hop,)."""
         np.multiply(self._weights, self._spectra, out=self._work)
         return fourier.irfft(np.add.reduce(self._work, axis=-2), 2 * self.hop)[..., self.hop :]
 
     def _first_of(self, x: Samples) -> Samples:
-        """(hop,) of the microphone that tells for all, of x (hop,) or (microphones, hop)."""
+        """The microphone that tells for all, (hop,), of x (hop,) or (microphones, hop)."""
         return x if self.microphones is None else x[self._teller]
 
     def _push(self, reference: Samples) -> None:
@@ -299,7 +299,7 @@ class Canceller:
         self._spectra, self._powers = self._all_spectra[rows], self._all_powers[rows]
 
     def _displacement(self, reference: Samples) -> Samples:
-        """(n,) of the membrane while it plays the next n samples of the reference; carries its state on."""
+        """Displacement of the membrane while it plays the next n samples of the reference, (n,); carries its state on."""
         moving = np.concatenate((self._moving, reference * np.float32(self._loudest**-0.5)))
         self._moving = moving[reference.size :]
         return np.clip(np.correlate(moving, self._lowpass_reversed, "valid"), -FURTHEST, FURTHEST)
@@ -330,7 +330,7 @@ class Canceller:
             np.maximum(row, variance, out=row)
 
     def _path_power(self) -> Samples:
-        """(bins,) |H|^2 of the path as it is, summed over partitions."""
+        """|H|^2 of the path as it is, summed over partitions, (bins,)."""
         return fourier.power(self._weights[..., : self.partitions, :]).sum(axis=-2)
 
     def _expect_what_is_heard(self) -> None:
@@ -341,7 +341,7 @@ class Canceller:
         self._expect(heard / (played + fourier.TINY), UNKNOWN_VARIANCE / decay.sum() * decay)
 
     def _decay(self) -> Samples:
-        """(partitions, 1) power of a room's response, from 1 on."""
+        """Power of a room's response, from 1 on, (partitions, 1)."""
         seconds = np.arange(self.partitions, dtype=np.float32) * self.hop / SAMPLE_RATE
         return np.power(np.float32(10.0), -6.0 * seconds / DECAY_RT60_S, dtype=np.float32)[:, None]
 

@@ -169,11 +169,11 @@ class FrontEnd:
         return Frame(x, r, e, error, noise, residual, aligned.state == "idle", at_any_lag), aligned
 
     def first_of(self, mic: Samples) -> Samples:
-        """(hop,) of the microphone that the answer sounds like, of mic (hop,) or (microphones, hop)."""
+        """The microphone that the answer sounds like, (hop,), of mic (hop,) or (microphones, hop)."""
         return mic if self.microphones is None else mic[self.microphones.first]
 
     def _spectra(self, *signals: Samples) -> Spectrum:
-        """(k, bins) of k signals (hop,)."""
+        """Spectra of k signals (hop,), (k, bins)."""
         spectra = self._analyser.push(*signals)
         if self.cut is not None:
             spectra *= self.cut
@@ -206,7 +206,7 @@ class FrontEnd:
         self.spatial.learn(self.errors, gain, probability, speaking, frame.idle)
 
     def _added(self, source: SourceChain) -> Samples | None:
-        """(bins,) expected power of the effects that no waveform predicts, for the path in use; a lesson can change it."""
+        """Expected power of the effects that no waveform predicts, for the path in use, (bins,); a lesson can change it."""
         if source is not self._source:
             self._source = source
             self._unpredictable = Unpredictable(self._stft, source.colours) if source.colours else None
@@ -214,5 +214,5 @@ class FrontEnd:
 
 
 def low_cut(stft: StftConfig) -> Samples:
-    """(bins,) gain without phase: RUMBLE below RUMBLE_HZ, 1 above."""
+    """Gain without phase, (bins,): RUMBLE below RUMBLE_HZ, 1 above."""
     return np.where(stft.frequencies < RUMBLE_HZ, np.float32(RUMBLE), np.float32(1.0))

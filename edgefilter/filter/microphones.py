@@ -67,7 +67,7 @@ class Microphones:
 
     @property
     def used(self) -> np.ndarray:
-        """(count,) bool."""
+        """Which microphones are used, (count,) bool."""
         return np.array([at not in self.left_out for at in range(self.count)])
 
     def stats(self) -> ArrayStats:

@@ -157,7 +157,7 @@ class Unpredictable:
         self._squares = np.zeros((len(colours), stft.window_length), np.float32)
 
     def step(self, squares: Sequence[Samples]) -> Samples:
-        """(bins,) of the frame that ends with this hop; squares: (hop,) of each effect."""
+        """Expected power of the frame that ends with this hop, (bins,); squares: (hop,) of each effect."""
         hop = squares[0].size
         self._squares[:, :-hop] = self._squares[:, hop:]
         self._squares[:, -hop:] = squares

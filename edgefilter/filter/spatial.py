@@ -110,15 +110,15 @@ class SpatialFilter:
         self._reference = int(np.argmax(used))
 
     def step(self, spectra: Spectrum) -> Spectrum:
-        """(k, bins) of spectra (k, microphones, bins): all through the same weights."""
+        """Combine the microphones of spectra (k, microphones, bins), all by the same weights, to (k, bins)."""
         return np.einsum("cf,kcf->kf", self.weights.conj(), spectra)
 
     def fan_psd(self) -> Samples | None:
-        """(bins,) expected |spectrum|^2 of the fan in what step makes; None where it was neither calibrated nor heard alone."""
+        """Expected |spectrum|^2 of the fan in what step makes, (bins,); None where it was neither calibrated nor heard alone."""
         return None if self._known_hops < KNOWN_HOPS else _form(self.weights, self._fan)
 
     def independent(self, powers: Samples) -> Samples:
-        """(bins,) of what is independent from microphone to microphone, powers (microphones, bins), in what step makes."""
+        """Power of what is independent from microphone to microphone, powers (microphones, bins), in what step makes; (bins,)."""
         return np.einsum("cf,cf->f", fourier.power(self.weights), powers)
 
     def learn(self, error: Spectrum, gain: Samples, probability: float, speaking: bool, idle: bool) -> None:
@@ -147,7 +147,7 @@ class SpatialFilter:
         self.weights = self._best(self._human, noise)
 
     def finished(self) -> Spectrum:
-        """Weights (microphones, bins) for the latest turn of the human as a whole: all of it weighs the same."""
+        """Weights for the latest turn of the human as a whole, (microphones, bins): all of it weighs the same."""
         return self._best(self._turn, self._against)
 
     def _best(self, gathered: Gathered, noise: Spectrum) -> Spectrum:
@@ -165,7 +165,7 @@ class SpatialFilter:
 
 
 def diffuse_coherence(stft: StftConfig, microphones: int) -> Samples:
-    """(microphones, microphones, bins) float32 of equal microphones SPACING_M apart in a field from all directions.
+    """Covariance of equal microphones SPACING_M apart in a field from all directions, (microphones, microphones, bins) float32.
 
     Where it would be negative it is zero: more than five microphones cannot all differ from one another so.
     """
@@ -203,5 +203,5 @@ def solve(matrix: Spectrum, right: Spectrum) -> Spectrum:
 
 
 def _form(vector: Spectrum, matrix: Spectrum) -> Samples:
-    """(bins,) of vector^H matrix vector, for vector (n, bins) and a Hermitian matrix (n, n, bins)."""
+    """Return vector^H matrix vector for vector (n, bins) and a Hermitian matrix (n, n, bins), (bins,)."""
     return np.einsum("cf,cf->f", vector.conj(), np.einsum("cdf,df->cf", matrix, vector)).real

@@ -54,7 +54,7 @@ class Histogram:
         return 0.0
 
     def to_dict(self) -> dict[str, float]:
-        """mean, p50, p95, p99 and max in ms, ready for JSON."""
+        """Return mean, p50, p95, p99 and max in ms, ready for JSON."""
         mean = self.sum_ms / self.count if self.count else 0.0
         return {"mean_ms": mean, **{f"p{p}_ms": self.percentile(p) for p in (50, 95, 99)}, "max_ms": self.max_ms}
 

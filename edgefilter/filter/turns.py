@@ -94,7 +94,7 @@ def drop_sound(events: deque[Event]) -> None:
 
 
 def overlap_add(spectra: Spectrum, stft: StftConfig) -> Samples:
-    """((frames - 1) hop + window_length,) float32 of the frames spectra (frames, bins)."""
+    """Samples of the frames spectra (frames, bins), ((frames - 1) hop + window_length,) float32."""
     pieces = -(-stft.window_length // stft.hop)
     frames = fourier.irfft(np.ascontiguousarray(spectra, np.complex64), stft.n_fft)[:, : stft.window_length]
     windowed = np.zeros((len(frames), pieces * stft.hop), np.float32)

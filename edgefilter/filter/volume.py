@@ -244,7 +244,7 @@ class EchoLimiter:
 
 
 def pre_emphasised(x: Samples) -> Samples:
-    """(..., n - 1) of x (..., n)."""
+    """Pre-emphasise x (..., n) to (..., n - 1)."""
     return x[..., 1:] - PRE_EMPHASIS * x[..., :-1]
 
 

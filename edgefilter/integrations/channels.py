@@ -40,7 +40,7 @@ def named(
 
 
 def taken(samples: Samples, wanted: Sequence[int]) -> Samples:
-    """(n,) of the one channel that is wanted, else (n, wanted), of samples (n, channels); raises SignalError where one lacks."""
+    """The one channel that is wanted, (n,), else (n, wanted), of samples (n, channels); raises SignalError where one lacks."""
     if max(wanted) >= samples.shape[1]:
         raise SignalError(
             f"the microphone brings {samples.shape[1]} channels, counted from 0, and channel {max(wanted)} is named:"

@@ -286,7 +286,7 @@ class Service:
 
 
 def _microphones_of(pcm: bytes, count: int) -> Samples:
-    """(n,) of one microphone, (n, count) of several."""
+    """Samples of one microphone, (n,), or of several, (n, count)."""
     return taken(all_of_pcm16(pcm, count), range(count))
 
 

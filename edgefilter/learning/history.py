@@ -60,14 +60,14 @@ class HopHistory:
         return mic, reference, innovation
 
     def noise(self) -> Samples:
-        """(microphones, n) of an array where nothing of the robot can be audible, everything where that is under a second."""
+        """Recording of an array where nothing of the robot can be audible, everything where that is under a second, (microphones, n)."""
         silent = [hop.mic for hop, _ in self._hops if hop.idle]
         return np.concatenate(
             silent if len(silent) > self._hops_of(1.0) else [hop.mic for hop, _ in self._hops], axis=-1
         )
 
     def usable(self) -> NDArray[np.bool_]:
-        """(n,) bool, where the robot may be audible and the reference lies as the microphone hears it.
+        """Where the robot may be audible and the reference lies as the microphone hears it, (n,) bool.
 
         For the length of a path after a switch of the delay, some of the echo was sent under the delay of before.
         """
@@ -77,7 +77,7 @@ class HopHistory:
         return np.repeat(usable, self._hop)
 
     def silent(self) -> NDArray[np.bool_]:
-        """(n,) bool, where nothing of the robot can be audible."""
+        """Where nothing of the robot can be audible, (n,) bool."""
         return np.repeat(np.array([hop.idle for hop, _ in self._hops]), self._hop)
 
     @property

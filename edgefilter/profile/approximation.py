@@ -66,18 +66,18 @@ class LinearApproximation(ProfilePart):
 
     @property
     def gain(self) -> Samples:
-        """(L, 601) magnitude of the best linear approximation, 0 where nothing was played."""
+        """Magnitude of the best linear approximation, 0 where nothing was played, (L, 601)."""
         heard = self.played > 1e-6 * self.played.max(axis=1, keepdims=True)
         return np.sqrt(np.maximum(self.linear, 0.0) / np.where(heard, self.played, 1.0)) * heard
 
     def over_linear_db(self, *names: str) -> Array:
-        """(L,) dB, power of "noise", "even" and "odd", those that are named, over that of the linear part."""
+        """Power of "noise", "even" and "odd", those that are named, over that of the linear part, (L,) in dB."""
         rest = [sum(total_power(getattr(self, name)[i]) for name in names) for i in range(len(self.level_db))]
         return decibels(np.array(rest) / self._linear_power, 1e-10)
 
     @property
     def _linear_power(self) -> Array:
-        """(L,) mean square of the linear part."""
+        """Mean square of the linear part, (L,)."""
         return np.array([max(total_power(psd), 1e-20) for psd in self.linear])
 
     @property
@@ -87,7 +87,7 @@ class LinearApproximation(ProfilePart):
 
     @property
     def colour(self) -> Array:
-        """(601,) spectral density of the distortion per Hz of integral 1, where it was played loudest."""
+        """Spectral density of the distortion per Hz of integral 1, where it was played loudest, (601,)."""
         density = np.maximum(self.even[-1] + self.odd[-1], 0.0).astype(np.float64)
         return density / max(total_power(density), 1e-30)
 

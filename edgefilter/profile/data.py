@@ -275,7 +275,7 @@ class Profile:
 
 
 def _stacked(paths: Sequence[Samples]) -> Samples:
-    """(paths, taps), the shorter ones with zeros at their ends."""
+    """All paths, the shorter ones with zeros at their ends, (paths, taps)."""
     taps = max(path.size for path in paths)
     return np.stack([np.pad(path, (0, taps - path.size)) for path in paths])
 

@@ -80,7 +80,7 @@ def _band_line(edges: Array, snr: float) -> str:
 
 
 def to_come(path: Samples) -> Array:
-    """(taps,) energy of an impulse response (taps,) from each sample on (Schroeder 1965)."""
+    """Energy of an impulse response (taps,) from each sample on (Schroeder 1965), (taps,)."""
     return np.cumsum(path[::-1].astype(np.float64) ** 2)[::-1]
 
 

@@ -40,7 +40,7 @@ _ANCHORS = np.array(
 
 
 def spectrogram_db(samples: Samples) -> np.ndarray:
-    """Level (columns, 257) in dB of full scale per bin, Hann frames of 32 ms, mean power where frames share a column."""
+    """Level in dB of full scale per bin, Hann frames of 32 ms, mean power where frames share a column, (columns, 257)."""
     size, hop = StftConfig().window_length, StftConfig().hop
     padded = np.pad(samples, (0, max(0, size - samples.size)))
     window = hann(size).astype(np.float32)
@@ -69,7 +69,7 @@ def spectrogram_png(samples: Samples, scale: tuple[float, float]) -> str:
 
 
 def colours() -> np.ndarray:
-    """(LEVELS, 3) uint8, darkest first."""
+    """Colours, darkest first, (LEVELS, 3) uint8."""
     at = np.linspace(0, len(_ANCHORS) - 1, LEVELS)
     channels = [np.interp(at, np.arange(len(_ANCHORS)), anchors) for anchors in _ANCHORS.T]
     return np.stack(channels, axis=1).astype(np.uint8)

@@ -282,7 +282,7 @@ def correlograms(found: Independence | None) -> dict[str, object] | None:
 
 
 def _verdicts(found: Independence) -> list[tuple[str, Correlogram, str]]:
-    """Name and judge each correlogram: the autocorrelation, then the cross-correlation in each range of lags."""
+    """Name each correlogram and say what it shows: the autocorrelation, then the cross-correlation in each range of lags."""
     auto = found.autocorrelation
     at = auto.lags_ms[auto.largest]
     rows = [("autocorrelation", auto, f"not white, largest value at {at:.1f} ms" if auto.dependent else "white")]

@@ -53,7 +53,7 @@ def draw_effects(rng: np.random.Generator, share: float, wideness: float, second
 
 
 def _decay(rng: np.random.Generator, rt60_s: float, level_db: float, samples: int) -> Array:
-    """(samples,) of noise that decays by 60 dB in rt60_s, its energy level_db over a unit impulse."""
+    """Noise that decays by 60 dB in rt60_s, its energy level_db over a unit impulse, (samples,)."""
     taps = rng.standard_normal(samples) * 10 ** (-3 * np.arange(samples) / (rt60_s * SAMPLE_RATE))
     return 10 ** (level_db / 20) * taps / np.linalg.norm(taps)
 

@@ -21,7 +21,7 @@ besides, and, of the last, those in which that is people."""
 def noise(
     rng: np.random.Generator, material: Material, samples: int, rms: float, human_rms: float, wideness: float
 ) -> tuple[Samples, Samples]:
-    """Noise (n,) with a fan of that RMS, and the fan's one-sided PSD (601,) on GRID_HZ as a calibration would find it."""
+    """Noise with a fan of that RMS, (n,), and the fan's one-sided PSD (601,) on GRID_HZ as a calibration would find it."""
     sound, psd = fan(rng, samples, rms)
     changing, recorded, background, talkers = rng.random(4)
     if recorded < wideness * RECORDED and material.noises:
@@ -56,7 +56,7 @@ def fan(rng: np.random.Generator, samples: int, rms: float) -> tuple[Samples, Sa
 
 
 def _speed(rng: np.random.Generator, samples: int) -> Samples:
-    """Gain (n,) of a fan that is turned up or down by as much as 8 dB within 0.3 to 4 s."""
+    """Gain of a fan that is turned up or down by as much as 8 dB within 0.3 to 4 s, (n,)."""
     at, lasts = rng.uniform(0.1, 0.8) * samples, rng.uniform(0.3, 4.0) * SAMPLE_RATE
     return 10 ** (rng.uniform(-8, 8) / 20 * np.clip((np.arange(samples) - at) / lasts, 0, 1))
 
@@ -72,6 +72,6 @@ def _people(rng: np.random.Generator, material: Material, samples: int) -> Sampl
 
 
 def _psd(sound: Samples) -> Samples:
-    """(601,) one-sided PSD of a recording on GRID_HZ."""
+    """One-sided PSD of a recording on GRID_HZ, (601,)."""
     density = signal.welch(sound, SAMPLE_RATE, nperseg=StftConfig().n_fft)
     return np.interp(GRID_HZ, *density).astype(np.float32)

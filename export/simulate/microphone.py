@@ -62,7 +62,7 @@ class Suppression:
 
 @dataclass(frozen=True)
 class Microphone:
-    """sections: of its linear filter, second order.
+    """A microphone. sections: of its linear filter, second order.
 
     gain_db, gain_hz: knots of its gain control, how many a second. clip: part of the peak that it passes. suppression: of
     noise.
@@ -102,13 +102,13 @@ class Microphone:
         return x if self.sections is None else signal.sosfilt(self.sections, x).astype(np.float32)
 
     def power(self) -> Samples:
-        """(601,) squared magnitude of the linear filter on GRID_HZ."""
+        """Squared magnitude of the linear filter on GRID_HZ, (601,)."""
         if self.sections is None:
             return np.ones(GRID_HZ.size)
         return np.abs(signal.sosfreqz(self.sections, GRID_HZ, fs=SAMPLE_RATE)[1]) ** 2
 
     def gain(self, samples: int) -> Samples:
-        """(n,) of the gain control."""
+        """Gain of the gain control, (n,)."""
         if self.gain_db is None:
             return np.ones(samples, np.float32)
         places = np.arange(samples) * self.gain_hz / SAMPLE_RATE

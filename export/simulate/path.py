@@ -18,7 +18,7 @@ MEASURED_DEVICE, MEASURED_MICROPHONE, MEASURED_ROOM = 0.35, 0.4, 0.25
 
 
 def device(rng: np.random.Generator, material: Material, wideness: float) -> Samples:
-    """(taps,) of loudspeaker, shell and microphone."""
+    """Response of loudspeaker, shell and microphone, (taps,)."""
     colour = draw_colour(rng)
     loudspeaker = material.response(rng, "loudspeaker")
     microphone = material.response(rng, "microphone")
@@ -31,7 +31,7 @@ def device(rng: np.random.Generator, material: Material, wideness: float) -> Sam
 
 
 def in_room(rng: np.random.Generator, material: Material, room: Room, wideness: float) -> Samples:
-    """(n,) from the robot's loudspeaker to its microphone: simulated, or with the tail of a measured room behind."""
+    """Response from the robot's loudspeaker to its microphone, (n,): simulated, or with the tail of a measured room behind."""
     measured = material.response(rng, "room")
     level, chosen = 10 ** (rng.uniform(-20, -4) / 20), rng.random() < wideness * MEASURED_ROOM
     if measured is None or not chosen:
@@ -47,14 +47,14 @@ def in_room(rng: np.random.Generator, material: Material, room: Room, wideness: 
 
 
 def to_human(rng: np.random.Generator, material: Material, room: Room, wideness: float) -> Samples:
-    """(n,) from a human's mouth to the microphone."""
+    """Response from a human's mouth to the microphone, (n,)."""
     measured, chosen = material.response(rng, "room"), rng.random() < wideness * MEASURED_ROOM
     simulated = room.humans[int(rng.integers(len(room.humans)))]
     return simulated if measured is None or not chosen else measured
 
 
 def draw_colour(rng: np.random.Generator) -> Samples:
-    """(taps,) of loudspeaker, shell and microphone: band limits, broad peaks, reflections of the shell within 2 ms."""
+    """Response of loudspeaker, shell and microphone, (taps,): band limits, broad peaks, reflections of the shell within 2 ms."""
     impulse = np.zeros(1024)
     impulse[0] = 1.0
     for delay in rng.integers(3, 40, size=6):

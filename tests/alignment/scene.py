@@ -1,4 +1,4 @@
-"""Scenes with a known truth for judging alignment.
+"""Scenes with a known truth for evaluating alignment.
 
 Speech-like sounds, rooms, drifting clocks, dropped buffers, a fan, a human.
 """

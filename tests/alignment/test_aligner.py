@@ -325,7 +325,7 @@ def test_paper_aligner_decides_every_utterance(hop):
     for onset, lag in zip(onsets, lags, strict=True):
         decided = hops[
             (onset + lag + 8000 + 2048 + 2 * hop) // hop
-        ]  # half a second, then the stride in which lags are judged
+        ]  # half a second, then the stride in which lags are evaluated
         assert abs(decided.delay - lag - HEAD) < CLOSE
     assert sum(a.realigned for a in hops) == 2
 

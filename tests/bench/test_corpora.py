@@ -89,16 +89,13 @@ def given(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[Path]:
     return made
 
 
-def run(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> int:
-    monkeypatch.setattr(sys, "argv", ["corpora", *map(str, arguments)])
-    return corpora.main()
+def run(*arguments: object) -> int:
+    return corpora.main([*map(str, arguments)])
 
 
-def test_human_has_the_selected_recordings_and_their_texts(
-    given: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_human_has_the_selected_recordings_and_their_texts(given: list[Path], tmp_path: Path) -> None:
     data = tmp_path / "data"
-    assert run(monkeypatch, "--output", data, "--archives", *given) == 0
+    assert run("--output", data, "--archives", *given) == 0
     told = {name: (data / "human" / name / "transcripts.tsv").read_text(encoding="utf-8") for name in corpora.SETS}
     assert told["train"].splitlines() == [
         "ls103/103-1240-0000.flac\t103\t0.50\tthe text of 0",
@@ -116,28 +113,28 @@ def test_human_has_the_selected_recordings_and_their_texts(
 
 
 def test_a_set_whose_archives_are_not_all_given_is_left_out_and_named(
-    given: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    given: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert run(monkeypatch, "--output", tmp_path / "data", "--archives", *given[:2]) == 0
+    assert run("--output", tmp_path / "data", "--archives", *given[:2]) == 0
     assert [path.name for path in (tmp_path / "data" / "human").iterdir()] == ["test"]
     error = capsys.readouterr().err
     assert "human/train needs speechocean762 as well" in error and "human/val needs test-other as well" in error
 
 
 def test_checksums_are_written_compared_and_added_to(
-    given: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    given: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     first, second = tmp_path / "first", tmp_path / "second"
-    assert run(monkeypatch, "--output", first, "--archives", *given[:2]) == 0
-    assert run(monkeypatch, "--output", first, "--archives", given[2]) == 0
+    assert run("--output", first, "--archives", *given[:2]) == 0
+    assert run("--output", first, "--archives", given[2]) == 0
     sums = (first / "checksums.tsv").read_text(encoding="utf-8")
     found = {row["what"]: row for row in csv.DictReader(io.StringIO(sums), delimiter="\t")}
     assert set(found) == {"human/test", "human/val", "test-clean.tar.gz", "test-other.tar.gz", "train-clean-100.tar.gz"}
     assert found["test-clean.tar.gz"]["sha256"] == hashlib.sha256(given[1].read_bytes()).hexdigest()
-    assert run(monkeypatch, "--output", second, "--archives", given[1], "--checksums", first / "checksums.tsv") == 0
+    assert run("--output", second, "--archives", given[1], "--checksums", first / "checksums.tsv") == 0
     capsys.readouterr()
     (first / "checksums.tsv").write_text(sums.replace(found["human/test"]["sha256"], "0" * 64), encoding="utf-8")
-    assert run(monkeypatch, "--output", second, "--archives", given[1], "--checksums", first / "checksums.tsv") == 1
+    assert run("--output", second, "--archives", given[1], "--checksums", first / "checksums.tsv") == 1
     error = capsys.readouterr().err.splitlines()[-1]
     assert error == f"human/test has the sha256 {found['human/test']['sha256']}, checksums.tsv says {'0' * 64}"
 
@@ -187,7 +184,7 @@ def test_an_archive_that_is_not_what_it_should_be_is_one_line(
         path.unlink()
     if damage not in ("other bytes", "gone", "other name"):
         monkeypatch.setitem(corpora.MD5, "test-clean", hashlib.md5(path.read_bytes()).hexdigest())
-    assert run(monkeypatch, "--output", tmp_path / "data", "--archives", path) == 1
+    assert run("--output", tmp_path / "data", "--archives", path) == 1
     error = capsys.readouterr().err
     assert error.startswith("corpora: ") and error.count("\n") == 1
     assert re.search(says, error)
@@ -204,18 +201,18 @@ def test_no_path_inside_an_archive_decides_where_anything_is_written(tmp_path: P
 
 
 def test_robot_takes_renderings_of_any_rate_and_says_which_is_missing(
-    given: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    given: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     folder = tmp_path / "renderings"
     tone = 0.5 * np.sin(2 * np.pi * 440 * np.arange(24000) / 24000)
     for place in ("af_one/000.wav", "val/bm_two/000.flac"):
         (folder / place).parent.mkdir(parents=True)
         sf.write(folder / place, tone, 24000)
-    assert run(monkeypatch, "--output", tmp_path / "data", "--renderings", folder) == 1
+    assert run("--output", tmp_path / "data", "--renderings", folder) == 1
     assert "holds no af_three/001.flac, .wav or .ogg, expected a rendering of 'the last'" in capsys.readouterr().err
     (folder / "af_three").mkdir()
     sf.write(folder / "af_three/001.wav", np.stack((tone, tone), axis=1), 24000)
-    assert run(monkeypatch, "--output", tmp_path / "data", "--renderings", folder) == 0
+    assert run("--output", tmp_path / "data", "--renderings", folder) == 0
     for name, row in (
         ("train", "af_one/000.flac\taf_one\t1.00\tthe first sentence"),
         ("test", "af_three/001.flac\taf_three\t1.00\tthe last"),
@@ -247,14 +244,14 @@ def test_whisper_is_converted_by_the_published_converter(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     source, programs = tmp_path / "whisper-base", tmp_path / "bin"
-    assert run(monkeypatch, "--output", tmp_path / "data", "--whisper", source) == 1
+    assert run("--output", tmp_path / "data", "--whisper", source) == 1
     assert "expected a download of openai/whisper-base" in capsys.readouterr().err
     source.mkdir()
     programs.mkdir()
     for name in ("config.json", "tokenizer.json"):
         (source / name).write_text("{}")
     monkeypatch.setenv("PATH", str(programs))
-    assert run(monkeypatch, "--output", tmp_path / "data", "--whisper", source) == 1
+    assert run("--output", tmp_path / "data", "--whisper", source) == 1
     assert "pip install ctranslate2 transformers torch" in capsys.readouterr().err
     program = programs / corpora.CONVERTER
     lines = [
@@ -266,11 +263,11 @@ def test_whisper_is_converted_by_the_published_converter(
         "\n".join([*lines, "folder.mkdir()", "(folder / 'model.bin').write_text(' '.join(sys.argv[1:3]))", ""])
     )
     program.chmod(program.stat().st_mode | stat.S_IXUSR)
-    assert run(monkeypatch, "--output", tmp_path / "data", "--whisper", source) == 0
+    assert run("--output", tmp_path / "data", "--whisper", source) == 0
     assert (tmp_path / "data/whisper/model.bin").read_text() == f"--model {source}"
     program.write_text(f"#!{sys.executable}\nraise SystemExit('not this model')\n")
     (tmp_path / "data/whisper/model.bin").unlink()
-    assert run(monkeypatch, "--output", tmp_path / "data", "--whisper", source) == 1
+    assert run("--output", tmp_path / "data", "--whisper", source) == 1
     assert "ct2-transformers-converter failed: not this model" in capsys.readouterr().err
 
 
@@ -287,6 +284,6 @@ def test_the_shipped_selection_keeps_test_speakers_and_voices_apart() -> None:
     )
 
 
-def test_nothing_to_do_is_wrong_usage(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_nothing_to_do_is_wrong_usage(tmp_path: Path) -> None:
     with pytest.raises(SystemExit, match="2"):
-        run(monkeypatch, "--output", tmp_path)
+        run("--output", tmp_path)

@@ -234,7 +234,7 @@ def test_slices_hold_every_clip_once_and_the_conclusions_follow_the_figures() ->
 
 
 @pytest.mark.parametrize(("decibels", "verdict"), [(-4.0, "seen here as well"), (4.0, "partly seen here")])
-def test_batch_normalisation_is_judged_in_words_and_in_decibels(decibels: float, verdict: str) -> None:
+def test_batch_normalisation_is_scored_in_words_and_in_decibels(decibels: float, verdict: str) -> None:
     rows = made()
     for row in [row for row in rows if row["system"] == "crnn"]:  # as many words, and so many dB more
         rows.append(row | {"system": "paper-crnn-narrow"})

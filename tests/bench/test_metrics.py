@@ -106,15 +106,15 @@ def test_pooled_rates_and_paired_differences() -> None:
 )
 def test_an_unusable_output_has_a_problem_and_no_score(spoil, said: str) -> None:
     clip = clip_of(3.0)
-    judges = metrics.Judges(Cache(None))
-    row = metrics.score(clip, Output(spoil(clip.mic)), judges)
+    cached = metrics.CachedMetrics(Cache(None))
+    row = metrics.score(clip, Output(spoil(clip.mic)), cached)
     assert row["problem"] == said and "si_sdr" not in row
     good = metrics.score(
-        clip, Output(clip.human + 0.01 * clip.mic, [Event("speech_started", clip.span.start + 800, "")]), judges
+        clip, Output(clip.human + 0.01 * clip.mic, [Event("speech_started", clip.span.start + 800, "")]), cached
     )
     assert good["si_sdr"] > 10 and good["erle_db"] == pytest.approx(40, abs=0.01)
     assert abs(good["delay_s"] - 0.05) <= 0.02 and not good["early"]
-    assert "si_sdr" not in metrics.score(clip, Output(clip.human), judges)  # the human alone
+    assert "si_sdr" not in metrics.score(clip, Output(clip.human), cached)  # the human alone
 
 
 def test_louder_than_the_microphone_is_found_in_one_second_of_ten():

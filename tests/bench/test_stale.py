@@ -41,5 +41,5 @@ def test_a_result_is_stale_where_a_system_gives_another_sound(
 
 def test_the_demonstrations_can_be_heard_by_every_engine() -> None:
     assert [clip.human is not None for clip in stale.demos()] == [True, False]
-    linear, again = stale.digest_of("linear"), stale.judged(["linear", "dtln-aec"])
+    linear, again = stale.digest_of("linear"), stale.digests_of(["linear", "dtln-aec"])
     assert linear and again == {"linear": linear} and stale.digest_of("linear-uncalibrated") != linear

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import soxr
 
-from edgefilter.calibration.chirps import CHIRP, LEAD, LEVEL_DB, chirps, judge
-from edgefilter.commands.doctor import judge_set_up
+from edgefilter.calibration.chirps import CHIRP, LEAD, LEVEL_DB, chirps, evaluate
+from edgefilter.commands.doctor import set_up_check
 
 SOUND = np.pad(chirps(), (8000, 32000))
 RANDOM = np.random.default_rng(1)
@@ -17,15 +17,15 @@ LEVEL = np.sqrt(np.convolve(ECHO**2, np.ones(800) / 800, "same")) + 1e-3
 
 
 def checks(mic, ref):
-    found = judge(np.asarray(mic, np.float32), np.asarray(ref, np.float32))
-    return list(judge_set_up(found, "robot", "robot.monitor"))
+    found = evaluate(np.asarray(mic, np.float32), np.asarray(ref, np.float32))
+    return list(set_up_check(found, "robot", "robot.monitor"))
 
 
 def test_a_right_set_up_is_told_in_one_line_with_its_figures():
     (found,) = checks(np.roll(ECHO, 1352) + NOISE, SOUND)
     assert found.state == "ok" and found.found.endswith(": good")
     assert "hears the robot after 87 ms" in found.found and "clocks 0 ppm apart" in found.found
-    heard = judge(np.roll(ECHO, 1352) + NOISE, SOUND)
+    heard = evaluate(np.roll(ECHO, 1352) + NOISE, SOUND)
     first = 8000 + LEAD
     alone = np.mean(np.square(ECHO[first : first + CHIRP])) / 1e-6
     assert heard.linear_db > 18 and abs(heard.softer_db) < 0.3
@@ -65,5 +65,5 @@ def test_what_is_wrong_is_said_and_what_to_do(mic, ref, state, words):
 @pytest.mark.parametrize("ppm", [-200, 50])
 def test_the_difference_of_the_clocks_is_measured(ppm):
     faster = soxr.resample(ECHO, 1e6, 1e6 + ppm, quality="VHQ")[: SOUND.size]
-    heard = judge(np.pad(faster, (0, SOUND.size - faster.size)) + NOISE, SOUND)
+    heard = evaluate(np.pad(faster, (0, SOUND.size - faster.size)) + NOISE, SOUND)
     assert heard.ppm == pytest.approx(ppm, abs=3) and heard.linear_db > 12

@@ -12,8 +12,7 @@ from edgefilter.calibration.from_recording import find_drift, self_calibrate
 from edgefilter.cli import main
 from edgefilter.dsp.fractional_delay import delayed
 from edgefilter.echo.effect import Effect, Parameter
-from edgefilter.echo.effects import catalogue
-from edgefilter.echo.effects.catalogue import EFFECTS
+from edgefilter.echo.effects.catalogue import EFFECTS, register
 from edgefilter.echo.model import EchoModel
 from edgefilter.errors import SignalError
 from tests.diagnosis.robot_scene import DELAY, FAN, path, record, voice
@@ -67,12 +66,12 @@ def test_without_a_robot_it_is_one_line(said):
         self_calibrate(0.1 * record(said) + voice(10.0, seed=5), said)
 
 
-def test_a_filter_of_the_users_own_is_not_in_a_profile_that_others_may_load(said, monkeypatch):
+def test_a_filter_of_the_users_own_is_not_in_a_profile_that_others_may_load(said, own_catalogue):
     class Own(Effect):
         name, stage, family = "my_filter", "path", "linear path"
         parameters = (Parameter("amount", "1", 0.0, 0.0, 2.0),)
 
-    monkeypatch.setattr(catalogue, "_known", {**catalogue._known, Own.name: Own()})
+    register(Own())
     held = {name for name, _ in self_calibrate(record(said), said).echo.effects}
     assert held == {effect.name for effect in EFFECTS if effect.absorbed} != set()
 

@@ -23,7 +23,7 @@ def scene(tmp_path_factory):
     x, robot = voice(8.0), profile()
     x[118_400:120_000] *= np.linspace(
         1, 0, 1600, dtype=np.float32
-    )  # the last word ends, else what follows it is not judged
+    )  # the last word ends, else what follows it is not evaluated
     robot.save(folder / "robot.npz")
     soundfile.write(folder / "ref.wav", x, RATE, "FLOAT")
     soundfile.write(

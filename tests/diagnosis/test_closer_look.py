@@ -7,7 +7,7 @@ import pytest
 
 from edgefilter.diagnosis.closer_look import look_closer
 from edgefilter.diagnosis.prepare import prepare
-from edgefilter.diagnosis.score import Judge
+from edgefilter.diagnosis.score import Scorer
 from edgefilter.diagnosis.trials import Found
 from edgefilter.types import SAMPLE_RATE
 from tests.diagnosis.robot_scene import profile, record, voice
@@ -18,7 +18,7 @@ SECONDS = 8.0
 def looked(recording: np.ndarray, reference: np.ndarray) -> tuple[str, dict]:
     """The sentence, and the curves by name, where nothing was found."""
     prepared = prepare(profile(), recording, reference)
-    score = Judge(prepared).of(prepared.model)
+    score = Scorer(prepared).of(prepared.model)
     look = look_closer(Found(prepared, prepared.model, prepared.model, score, score, ()))
     return look.sentence, {curve.name.split()[0]: curve for curve in look.curves}
 

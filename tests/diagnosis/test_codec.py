@@ -8,7 +8,7 @@ from scipy import signal
 
 from edgefilter.diagnosis.diagnose import diagnose
 from edgefilter.diagnosis.prepare import prepare
-from edgefilter.diagnosis.score import Judge
+from edgefilter.diagnosis.score import Scorer
 from edgefilter.echo.effects.catalogue import find
 from edgefilter.echo.effects.codec_signs import signs_of
 from edgefilter.echo.evidence import Evidence
@@ -21,14 +21,14 @@ SECONDS = 12.0
 def evidence(recording: np.ndarray, x: np.ndarray) -> Evidence:
     """The codec fitted to a recording beside nothing else."""
     prepared = prepare(profile(), recording, x)
-    judge, codec = Judge(prepared), find("codec")
+    scorer, codec = Scorer(prepared), find("codec")
     values = codec.fit(prepared.measurement, prepared.model)
     return Evidence(
         values,
         prepared.model,
-        judge,
-        judge.of(prepared.model),
-        judge.of(prepared.model.with_effect("codec", values)),
+        scorer,
+        scorer.of(prepared.model),
+        scorer.of(prepared.model.with_effect("codec", values)),
     )
 
 

@@ -16,12 +16,12 @@ from edgefilter.diagnosis.criteria import Criteria
 from edgefilter.diagnosis.diagnose import add, diagnose
 from edgefilter.diagnosis.findings import findings_of
 from edgefilter.diagnosis.prepare import prepare
-from edgefilter.diagnosis.score import Judge
+from edgefilter.diagnosis.score import Scorer
 from edgefilter.diagnosis.trials import Found, Workbench
 from edgefilter.dsp.fractional_delay import delayed
 from edgefilter.echo.effect import Effect, Parameter
 from edgefilter.echo.effects import catalogue
-from edgefilter.echo.effects.catalogue import find
+from edgefilter.echo.effects.catalogue import find, register
 from edgefilter.echo.model import EchoModel
 from edgefilter.profile.data import Profile
 from edgefilter.report.html import compare_variants
@@ -82,7 +82,7 @@ def test_a_fan_of_digital_zeros_gives_figures_and_no_infinities() -> None:
 
 
 @pytest.mark.slow
-def test_the_words_name_a_band_of_the_judge() -> None:
+def test_the_words_name_a_band_of_the_scorer() -> None:
     x = voice(10.0)
     clean = EchoModel(path()).predict(delayed(x, DELAY - PRE_ROLL))
     tone = signal.sosfilt(signal.butter(4, [1500, 2000], "band", fs=RATE, output="sos"), clean)
@@ -90,7 +90,7 @@ def test_the_words_name_a_band_of_the_judge() -> None:
     recording = (clean + 0.5 * ring + FAN * np.random.default_rng(3).standard_normal(x.size)).astype(np.float32)
     found = diagnose(profile(), recording, x)
     bands = {
-        f"strongest around {low:.0f} to {high:.0f} Hz" for low, high in Judge(prepare(profile(), recording, x)).band_hz
+        f"strongest around {low:.0f} to {high:.0f} Hz" for low, high in Scorer(prepare(profile(), recording, x)).band_hz
     }
     assert found.verdict == "unexplained" and any(band in found.evidence for band in bands), found.evidence
 
@@ -114,10 +114,10 @@ class Fragile(Effect):
 
 
 @pytest.fixture
-def fragile(monkeypatch) -> Fragile:
+def fragile(monkeypatch, own_catalogue) -> Fragile:
     effect = Fragile()
     monkeypatch.setattr(Fragile, "failures", [])
-    monkeypatch.setattr(catalogue, "_known", {**catalogue._known, "fragile": effect})
+    register(effect)
     return effect
 
 

@@ -24,7 +24,7 @@ SEALED_HITS = 1
 
 FALL_DB, SHARE = 1.0, 0.05
 """How far the fall may stay behind the promise, in dB and as a share of the excess power. The promise is held out, of a
-fit to half of the blocks and judged on the other half; the comparison is of all of them, and with other blocks the
+fit to half of the blocks and tested on the other half; the comparison is of all of them, and with other blocks the
 excess before is another one: by up to 0.9 dB."""
 
 
@@ -71,7 +71,7 @@ def test_a_robot_with_nothing_hidden_is_explained() -> None:
     ids=["fan_noise", "delay_jump", "late_reverb", "mic_clipping"],
 )
 def test_the_hidden_effect_is_named_and_its_adding_keeps_the_promise(name: str, lasting: bool) -> None:
-    """Of what lasts, the first part is diagnosed and fitted, and the second judged too, which no fit has seen.
+    """Of what lasts, the first part is diagnosed and fitted, and the second tested too, which no fit has seen.
 
     A jump belongs to its recording.
     """

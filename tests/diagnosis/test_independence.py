@@ -31,7 +31,7 @@ def said() -> np.ndarray:
     return voice(N / RATE, seed=2)
 
 
-def judged(residual: np.ndarray, said: np.ndarray, silences: bool = True):
+def independence_of(residual: np.ndarray, said: np.ndarray, silences: bool = True):
     talks = np.arange(N) % (2 * RATE) < 1.5 * RATE
     return independence(residual, said, psd(), talks, ~talks if silences else np.zeros(N, bool))
 
@@ -54,7 +54,7 @@ def test_the_fan_made_white_is_white_of_variance_one():
 
 @pytest.mark.parametrize("silences", [True, False])
 def test_what_is_independent_is_called_so_and_one_lag_in_a_hundred_is_outside(said, silences):
-    found = judged(fan(), said, silences)
+    found = independence_of(fan(), said, silences)
     assert not found.autocorrelation.dependent and not any(zone.part.dependent for zone in found.zones)
     assert found.cross_correlation.values.size == 16 * (CROSS_MS[1] - CROSS_MS[0])
     assert 0.002 < found.cross_correlation.outside < 0.02  # 0.01 of 2000 lags, neighbours not quite independent
@@ -65,7 +65,7 @@ def test_what_is_independent_is_called_so_and_one_lag_in_a_hundred_is_outside(sa
 @pytest.mark.parametrize(("lag_ms", "side"), [(-10.0, 0), (0.0, 1), (20.0, 2), (70.0, 2)])
 def test_a_dependence_is_found_at_its_lag_and_on_its_side_alone(said, lag_ms, side):
     late = PRE_ROLL + round(16 * lag_ms)
-    found = judged(fan() + 0.05 * np.roll(said, late), said)
+    found = independence_of(fan() + 0.05 * np.roll(said, late), said)
     zones = found.zones
     assert [zone.part.dependent for zone in zones] == [at == side for at in range(3)]
     assert zones[side].part.summary()["largest_at_ms"] == pytest.approx(lag_ms, abs=1 / 16)

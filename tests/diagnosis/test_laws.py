@@ -15,7 +15,7 @@ from edgefilter.diagnosis.criteria import Criteria
 from edgefilter.diagnosis.diagnose import diagnose
 from edgefilter.diagnosis.laws import Law, free_law
 from edgefilter.diagnosis.prepare import prepare
-from edgefilter.diagnosis.score import Judge
+from edgefilter.diagnosis.score import Scorer
 from edgefilter.diagnosis.trials import Found
 from edgefilter.echo.effects import catalogue
 from edgefilter.echo.running import stream_form
@@ -40,16 +40,15 @@ HIDDEN = {
 def lawful(family: str) -> Law:
     """The law that is found where nothing was named."""
     prepared = prepare(profile(), record(HIDDEN[family].astype(np.float32)), X)
-    score = Judge(prepared).of(prepared.model)
+    score = Scorer(prepared).of(prepared.model)
     law = free_law(Found(prepared, prepared.model, prepared.model, score, score, ()), Criteria())
     assert law is not None and law.family == family and law.excess_db < 0.4 * score.excess_db
     return law
 
 
 @pytest.fixture
-def load(tmp_path: Path, monkeypatch) -> Callable[[Law, str], str]:
+def load(tmp_path: Path, own_catalogue) -> Callable[[Law, str], str]:
     """Write a law and load it, in a catalogue that is as before when the test is over."""
-    monkeypatch.setattr(catalogue, "_known", dict(catalogue._known))
 
     def loaded(law: Law, name: str) -> str:
         path = tmp_path / f"{name}.py"

@@ -11,7 +11,7 @@ from edgefilter.diagnosis.criteria import Criteria
 from edgefilter.diagnosis.diagnose import add, diagnose
 from edgefilter.diagnosis.noise_change import changed_fan
 from edgefilter.diagnosis.prepare import prepare
-from edgefilter.diagnosis.score import Judge
+from edgefilter.diagnosis.score import Scorer
 from edgefilter.echo.effects.catalogue import find
 from edgefilter.echo.model import EchoModel
 from edgefilter.echo.running import reach
@@ -74,7 +74,7 @@ def _softer(factor: float) -> Callable[[np.ndarray], np.ndarray]:
 def test_what_is_soft_without_a_suppressor_is_not_called_one(change, silence_db: float) -> None:
     x = voice(SECONDS)
     prepared = prepare(profile(), change(x), x)
-    base = Judge(prepared).of(prepared.model)
+    base = Scorer(prepared).of(prepared.model)
     assert base.silent_db == pytest.approx(silence_db, abs=0.7)
     step = changed_fan(prepared, prepared.model, base, Criteria())
     assert step is None or step[1].name != "noise_suppression"
@@ -93,7 +93,7 @@ def test_a_suppressor_that_lets_weak_voice_through_less_is_seen_in_the_numbers()
 def test_what_the_running_filter_contradicts_is_not_looked_for() -> None:
     x = voice(SECONDS)
     prepared = prepare(profile(), suppressed(record(x), -12.0), x)
-    base = Judge(prepared).of(prepared.model)
+    base = Scorer(prepared).of(prepared.model)
     assert changed_fan(prepared, prepared.model, base, Criteria())[1].name == "noise_suppression"
     assert changed_fan(prepared, prepared.model, base, Criteria(), without=("noise_suppression",)) is None
 

@@ -154,7 +154,7 @@ def answering(
     return ["probe", *(word for role, file in named.items() for word in (f"--{role}", str(folder / file)))]
 
 
-def test_the_command_writes_the_sounds_and_judges_what_was_heard_of_them(written: Path, capsys) -> None:
+def test_the_command_writes_the_sounds_and_evaluates_what_was_heard_of_them(written: Path, capsys) -> None:
     info = soundfile.info(written / "probe.wav")
     assert (info.samplerate, info.frames) == (SAMPLE_RATE, 2 * SOUND_S * SAMPLE_RATE)
     question = json.loads((written / "probe.wav.json").read_text())

@@ -1,4 +1,4 @@
-"""The likelihood by which everything is judged: noise that is expected is neither free nor forbidden."""
+"""The likelihood by which everything is scored: noise that is expected is neither free nor forbidden."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import pytest
 
 from edgefilter.diagnosis.criteria import Criteria
 from edgefilter.diagnosis.prepare import prepare
-from edgefilter.diagnosis.score import Judge
+from edgefilter.diagnosis.score import Scorer
 from edgefilter.diagnosis.select import _stepwise, refit
 from edgefilter.diagnosis.trials import Workbench, added
 from edgefilter.dsp.psd import total_power
@@ -18,19 +18,21 @@ from tests.diagnosis.robot_scene import profile, record, voice
 
 @pytest.fixture(scope="module")
 def noisy():
-    """A robot with noise that its fan is not, as loud as ten fans and of their colour; the judge of it, and that noise as a model says it."""
+    """A robot with noise that its fan is not, as loud as ten fans and of their colour; the scorer of it, and that noise as a model says it."""
     x, robot = voice(6.0), profile()
     noise = np.random.default_rng(7).standard_normal(x.size) * np.sqrt(9.0 * total_power(robot.noise_psd))
     prepared = prepare(robot, (record(x) + noise).astype(np.float32), x)
     prepared = replace(prepared, measurement=replace(prepared.measurement, noise_psd=robot.noise_psd), ordinary=())
     psd = robot.noise_psd.astype(float)
     variance = np.full(x.size, 9.0 * total_power(robot.noise_psd), np.float32)
-    return Judge(prepared), prepared.prediction, variance, psd / (np.sum(psd) * 8000 / (psd.size - 1))
+    return Scorer(prepared), prepared.prediction, variance, psd / (np.sum(psd) * 8000 / (psd.size - 1))
 
 
 def scored(noisy, times):
-    judge, prediction, variance, colour = noisy
-    return judge.judge(prediction, judge.measurement.whiten(prediction), [(times * variance, colour)] if times else [])
+    scorer, prediction, variance, colour = noisy
+    return scorer.score(
+        prediction, scorer.measurement.whiten(prediction), [(times * variance, colour)] if times else []
+    )
 
 
 def test_noise_that_is_there_explains_and_more_or_less_of_it_explains_less(noisy):

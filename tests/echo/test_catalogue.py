@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from edgefilter.echo.effect import STAGES, Effect, neutral
-from edgefilter.echo.effects.catalogue import EFFECTS, chain
+from edgefilter.echo.effects.catalogue import EFFECTS, chain, register
 from tests.conformance import EFFECT_CASES, robot_model, robot_speech
 
 PACKAGE = Path(__file__).parents[2] / "edgefilter"
@@ -107,18 +107,10 @@ def test_the_order_in_which_effects_were_found_changes_no_prediction() -> None:
     assert all(np.array_equal(found, predictions[0]) for found in predictions)
 
 
-def test_a_users_effect_comes_after_those_of_its_stage() -> None:
+def test_a_users_effect_comes_after_those_of_its_stage(own_catalogue) -> None:
     class Late(Effect):
         name, stage, parameters = "aaa", "source", ()
 
-    from edgefilter.echo.effects import catalogue
-
-    catalogue._known["aaa"] = Late()
-    try:
-        assert [effect.name for effect, _ in chain((("aaa", {}), ("rattle", {}), ("clock_drift", {})))] == [
-            "rattle",
-            "aaa",
-            "clock_drift",
-        ]
-    finally:
-        del catalogue._known["aaa"]
+    register(Late())
+    named = [effect.name for effect, _ in chain((("aaa", {}), ("rattle", {}), ("clock_drift", {})))]
+    assert named == ["rattle", "aaa", "clock_drift"]

@@ -11,7 +11,6 @@ import pytest
 from edgefilter import enhance
 from edgefilter.diagnosis.prepare import prepare
 from edgefilter.echo import user_effects
-from edgefilter.echo.effects import catalogue
 from edgefilter.echo.effects.catalogue import find, names
 from edgefilter.echo.measurement import Measurement
 from edgefilter.echo.running import reach, stream_form
@@ -38,8 +37,7 @@ class Tilt:
 
 
 @pytest.fixture(autouse=True)
-def own_registry(monkeypatch):
-    monkeypatch.setattr(catalogue, "_known", dict(catalogue._known))
+def own_registry(monkeypatch, own_catalogue):
     monkeypatch.setattr(user_effects, "_loaded", {})
 
 

@@ -38,22 +38,20 @@ def test_a_task_that_fails_and_a_scheduler_that_is_not_there_are_said(cluster, m
         list(spread(power, 2, [1], 1, "tcp://127.0.0.1:1"))
 
 
-def test_a_cluster_simulates_the_same_items(cluster, tmp_path, monkeypatch, capsys):
+def test_a_cluster_simulates_the_same_items(cluster, tmp_path, capsys):
     humans, robots = write_librispeech(tmp_path / "humans", ("1", "2")), write_table(tmp_path / "robots", ("a",))
     shape = ["--count", "2", "--seed", "4", "--rooms", "3", "--jobs", "1"]
     folders = {"here": [], "there": ["--scheduler", cluster.scheduler_address]}
     for name, more in folders.items():
         given = ["--humans", humans, "--robots", robots, "--output", tmp_path / name, *shape, *more]
-        monkeypatch.setattr("sys.argv", ["dataset", *map(str, given)])
-        assert dataset.main() == 0
+        assert dataset.main([*map(str, given)]) == 0
     for number in range(2):
         ours, theirs = (np.load(tmp_path / name / f"{number:05d}.npz") for name in folders)
         assert json.loads(str(ours["about"])) == json.loads(str(theirs["about"]))
         assert all(np.array_equal(ours[part], theirs[part]) for part in ours)
 
 
-def test_a_folder_without_speech_is_one_line(tmp_path, monkeypatch, capsys):
+def test_a_folder_without_speech_is_one_line(tmp_path, capsys):
     given = ["--humans", str(tmp_path), "--robots", str(tmp_path), "--output", str(tmp_path / "out")]
-    monkeypatch.setattr("sys.argv", ["dataset", *given])
-    assert dataset.main() == 1
+    assert dataset.main(given) == 1
     assert "holds no speech" in capsys.readouterr().err.strip().splitlines()[-1]

@@ -46,12 +46,10 @@ def data(tmp_path_factory):
         "--rooms",
         "2",
     ]
-    patch = pytest.MonkeyPatch()
-    patch.setattr("sys.argv", ["dataset", *arguments, "--output", str(folder / "items")])
-    dataset.main()
+    arguments += ["--output", str(folder / "items")]
+    dataset.main(arguments)
     before = (folder / "items" / "00001.npz").stat().st_mtime_ns
-    dataset.main()
-    patch.undo()
+    dataset.main(arguments)
     assert (folder / "items" / "00001.npz").stat().st_mtime_ns == before  # a second run leaves what is there
     return folder / "items"
 
@@ -315,9 +313,8 @@ def test_a_share_of_the_fan_is_wanted_where_it_was_asked_for(data, monkeypatch):
     batch = Batches(Items(data), StftConfig(), Shape(2, 1.0), seed=1).draw(0)
 
     def loss(kept, answered):
-        given = ["train", "--data", "d", "--validation", "v", "--output", "r", "--fan-kept", str(kept)]
-        monkeypatch.setattr("sys.argv", given)
-        task, answer = EdgeTask(train.arguments()), batch["clean"] + answered * batch["fan"]
+        given = ["--data", "d", "--validation", "v", "--output", "r", "--fan-kept", str(kept)]
+        task, answer = EdgeTask(train.arguments(given)), batch["clean"] + answered * batch["fan"]
         monkeypatch.setattr(EdgeCrnn, "forward", lambda self, *_: (answer, torch.zeros(answer.shape[:2]), ()))
         return float(task.loss(task.network(), batch)[0]["magnitude"])
 
@@ -352,7 +349,7 @@ def test_the_papers_loss_vanishes_at_the_right_mask():
     assert float(power_law_loss(torch.ones_like(mixture), mixture, 0.5 * mixture)) > 0.01
 
 
-def test_training_runs_stops_and_goes_on(tmp_path, monkeypatch, capsys):
+def test_training_runs_stops_and_goes_on(tmp_path, capsys):
     small = ["--hop", "32", "--channels", "4", "4", "4", "4", "--hidden", "8"]
     arguments = [
         "--data",
@@ -364,12 +361,11 @@ def test_training_runs_stops_and_goes_on(tmp_path, monkeypatch, capsys):
         *small,
         "--smoke",
     ]
-    monkeypatch.setattr("sys.argv", ["train", *arguments])
-    train.main()
+    train.main(arguments)
     steps = [json.loads(line)["step"] for line in (tmp_path / "run" / "log.jsonl").read_text().splitlines()]
     assert steps == [2, 4]
     assert torch.load(tmp_path / "run" / "best.pt", weights_only=False)["config"]["n_fft"] == 64
-    train.main()
+    train.main(arguments)
     assert "from step 4" in capsys.readouterr().out
     assert list((tmp_path / "run").glob("events.*"))
 
@@ -384,14 +380,11 @@ def test_the_rate_rises_stays_and_falls():
     assert timed.done_at(1000, 10 * 60) == 1.0
 
 
-def test_training_starts_from_given_weights_of_the_same_shape(tmp_path, monkeypatch, capsys):
+def test_training_starts_from_given_weights_of_the_same_shape(tmp_path, capsys):
     def run(name, hidden, *more, hop="32"):
         folders = ["--data", str(tmp_path / "d"), "--validation", str(tmp_path / "v"), "--output", str(tmp_path / name)]
-        monkeypatch.setattr(
-            "sys.argv",
-            ["train", *folders, "--hop", hop, "--channels", "4", "4", "4", "4", "--hidden", hidden, "--smoke", *more],
-        )
-        return train.main()
+        small = ["--hop", hop, "--channels", "4", "4", "4", "4", "--hidden", hidden, "--smoke"]
+        return train.main([*folders, *small, *more])
 
     assert run("first", "8") == 0
     first = torch.load(tmp_path / "first" / "best.pt", weights_only=False)["network"]
@@ -418,13 +411,11 @@ def test_small_weights_are_half_of_the_average_and_training_goes_on_from_them(tm
     def run(name, *more):
         folders = ["--data", str(tmp_path / "d"), "--validation", str(tmp_path / "v"), "--output", str(tmp_path / name)]
         small = ["--hop", "32", "--channels", "4", "4", "4", "4", "--hidden", "8", "--smoke"]
-        monkeypatch.setattr("sys.argv", ["train", *folders, *small, *more])
-        return train.main()
+        return train.main([*folders, *small, *more])
 
     assert run("first") == 0
     last, weights = tmp_path / "first" / "last.pt", tmp_path / "weights.pt"
-    monkeypatch.setattr("sys.argv", ["checkpoint", str(last), "--output", str(weights)])
-    assert checkpoint.main() == 0
+    assert checkpoint.main([str(last), "--output", str(weights)]) == 0
     full, half = (torch.load(path, weights_only=True) for path in (last, weights))
     assert half["network"].keys() == full["network"].keys() and "resume" not in half and half["step"] == 4
     for name, value in half["network"].items():
@@ -432,33 +423,29 @@ def test_small_weights_are_half_of_the_average_and_training_goes_on_from_them(tm
     assert weights.stat().st_size < 0.3 * last.stat().st_size
     assert run("second", "--start", str(weights)) == 0
     second, mean = tmp_path / "second" / "last.pt", tmp_path / "mean.pt"
-    monkeypatch.setattr("sys.argv", ["checkpoint", str(second), "--output", str(mean), "--full", "--mean", str(last)])
-    assert checkpoint.main() == 0
+    assert checkpoint.main([str(second), "--output", str(mean), "--full", "--mean", str(last)]) == 0
     later, both = (torch.load(path, weights_only=True) for path in (second, mean))
     assert both["mean_of"] == [later["step"], 4] and both["stages"] == later["stages"]
     for name, value in both["network"].items():
         assert torch.allclose(value, (full["network"][name] + later["network"][name]) / 2, atol=1e-6)
     torch.save({**full, "config": {**full["config"], "hidden": 9}}, tmp_path / "wide.pt")
-    monkeypatch.setattr(
-        "sys.argv", ["checkpoint", str(last), "--output", str(mean), "--mean", str(tmp_path / "wide.pt")]
-    )
-    assert checkpoint.main() == 1 and "wide.pt" in capsys.readouterr().err
+    assert checkpoint.main([str(last), "--output", str(mean), "--mean", str(tmp_path / "wide.pt")]) == 1
+    assert "wide.pt" in capsys.readouterr().err
     monkeypatch.setattr(checkpoint, "MOST_BYTES", 1000)
-    monkeypatch.setattr("sys.argv", ["checkpoint", str(last), "--output", str(weights)])
-    assert checkpoint.main() == 1 and "expected at most" in capsys.readouterr().err and not weights.exists()
+    assert checkpoint.main([str(last), "--output", str(weights)]) == 1
+    assert "expected at most" in capsys.readouterr().err and not weights.exists()
 
 
 NARROW = ("--network", "paper", "--filters", "3", "2", "--lstm", "4", "--hidden", "5")
 
 
 @pytest.fixture
-def trained(tmp_path, monkeypatch):
+def trained(tmp_path):
     """Four steps of train.py into tmp_path / name; its exit code."""
 
     def run(name, *more):
         folders = ["--data", str(tmp_path / "d"), "--validation", str(tmp_path / "v"), "--output", str(tmp_path / name)]
-        monkeypatch.setattr("sys.argv", ["train", *folders, "--smoke", *more])
-        return train.main()
+        return train.main([*folders, "--smoke", *more])
 
     return run
 
@@ -472,17 +459,17 @@ def test_the_papers_network_trains_in_the_width_that_was_asked_for(trained, tmp_
     assert all(torch.isfinite(value).all() for value in saved["network"].values())
 
 
-def test_without_a_width_the_papers_network_is_that_of_table_1(monkeypatch):
-    monkeypatch.setattr("sys.argv", "train --data d --validation v --output r --network paper".split())
-    assert PaperTask(train.arguments()).config() == asdict(PaperConfig())
+def test_without_a_width_the_papers_network_is_that_of_table_1():
+    given = "--data d --validation v --output r --network paper".split()
+    assert PaperTask(train.arguments(given)).config() == asdict(PaperConfig())
     assert filters_of([16]) == (16,) * 7 + (2,) and filters_of([4]) == (4,) * 7 + (1,)
 
 
-def test_before_training_the_papers_network_lets_through_as_much_as_there_is_of_the_human(monkeypatch):
-    monkeypatch.setattr("sys.argv", ["train", "--data", "d", "--validation", "v", "--output", "r", *NARROW])
+def test_before_training_the_papers_network_lets_through_as_much_as_there_is_of_the_human():
+    given = ["--data", "d", "--validation", "v", "--output", "r", *NARROW]
     torch.manual_seed(0)
     with torch.no_grad():
-        mask = PaperTask(train.arguments()).network()(*torch.rand(2, 1, 20, 601))
+        mask = PaperTask(train.arguments(given)).network()(*torch.rand(2, 1, 20, 601))
     assert float(mask.log().mean().exp()) == pytest.approx(FIRST_MASK, rel=0.5)  # random weights turn it a little
     assert 20 * np.log10(FIRST_MASK) == pytest.approx(-25)
 
@@ -541,9 +528,8 @@ def test_where_the_time_of_a_step_goes(data, network, monkeypatch, capsys, tmp_p
     own = {"edge": ("--channels", "4", "4", "4", "4"), "paper": ("--filters", "3", "2", "--lstm", "4")}[network]
     folders = ("--data", str(data), "--validation", str(data), "--output", str(tmp_path))
     short = ("--hidden", "8", "--batch", "2", "--seconds", "0.5", "--long-every", "0", "--times")
-    monkeypatch.setattr("sys.argv", ["train", *folders, "--network", network, *own, *short])
     monkeypatch.setattr("export.step_times.TIMED", 2)
-    assert train.main() == 0
+    assert train.main([*folders, "--network", network, *own, *short]) == 0
     lines = [line.split(" ms")[0].rsplit(maxsplit=1) for line in capsys.readouterr().out.splitlines()]
     found = {name: float(milliseconds) for name, milliseconds in lines}
     assert sum(found[row] for row in ROWS) == pytest.approx(found["a step"], rel=0.02, abs=0.5)

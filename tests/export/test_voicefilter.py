@@ -70,10 +70,8 @@ def items(tmp_path_factory, speech):
     """Four items of 5 s in which somebody of the two speakers speaks."""
     folder = tmp_path_factory.mktemp("items")
     robots = write_table(folder / "robots", ("a",))
-    line = f"dataset --humans {speech} --robots {robots} --output {folder / 'items'} --count 4 --seed 2 --jobs 1"
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("sys.argv", [*line.split(), "--recipe", "paper", "--rooms", "2"])
-        assert dataset.main() == 0
+    line = f"--humans {speech} --robots {robots} --output {folder / 'items'} --count 4 --seed 2 --jobs 1"
+    assert dataset.main([*line.split(), "--recipe", "paper", "--rooms", "2"]) == 0
     return folder / "items"
 
 
@@ -206,12 +204,11 @@ def test_training_learns_which_bins_are_the_humans(items, speech, tmp_path):
 def test_one_command_leads_from_items_to_a_file_that_filters_a_clip(
     items, speech, encoder, live, clips, tmp_path, monkeypatch, capsys
 ):
-    line = f"voicefilter --data {items} --validation {items} --speech {speech} --validation-speech {speech}"
+    line = f"--data {items} --validation {items} --speech {speech} --validation-speech {speech}"
     line += f" --output {tmp_path / 'run'} --steps 2 --every 1 --batch 2 --seconds 0.5 --channels 2 --hidden 4"
-    monkeypatch.setattr("sys.argv", line.split())
     (speech / "1" / "7" / "1-7-0002.flac").write_bytes((speech / "1" / "7" / "1-7-0000.flac").read_bytes())
     (speech / "2" / "7" / "2-7-0002.flac").write_bytes((speech / "2" / "7" / "2-7-0000.flac").read_bytes())
-    assert program.main() == 0
+    assert program.main(line.split()) == 0
     model = tmp_path / "run" / "voicefilter.onnx"
     assert f"{model}: " in capsys.readouterr().out
     said = onnx.load(model).metadata_props

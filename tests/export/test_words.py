@@ -53,12 +53,11 @@ def conversation(tmp_path):
 
 
 @pytest.fixture
-def run(tmp_path, monkeypatch):
+def run(tmp_path):
     """A folder of export/train.py."""
     small = ["--channels", "2", "2", "2", "2", "--hidden", "4", "--smoke"]
     folders = ["--data", str(tmp_path / "d"), "--validation", str(tmp_path / "v"), "--output", str(tmp_path / "tiny")]
-    monkeypatch.setattr("sys.argv", ["train", *folders, *small])
-    assert train.main() == 0
+    assert train.main([*folders, *small]) == 0
     return tmp_path / "tiny"
 
 

@@ -116,10 +116,14 @@ def test_of_a_path_that_has_become_another_one_as_much_is_kept_as_is_heard(monke
     canceller = Canceller(HOP, 3200, h)
     run(canceller, signal.oaconvolve(x, h)[: x.size].astype(np.float32), x)  # until its scale is known
     monkeypatch.setattr(canceller, "_adapt", lambda *_: None)  # what adaptation repairs is not the question
-    before, variance = np.abs(canceller._weights).max(), canceller._covariance.max()
+    before = canceller.state()
+    loudest = np.abs(before.weights).max()
     run(canceller, 0.1 * speechlike(2.0, seed=5), x)  # nothing of an echo that is far louder than the microphone
-    assert np.abs(canceller._weights).max() < 0.01 * before
-    assert variance < canceller._covariance.max() < before**2  # once reopened, it does not grow with every doubt
+    after = canceller.state()
+    assert np.abs(after.weights).max() < 0.01 * loudest
+    assert (
+        before.covariance.max() < after.covariance.max() < loudest**2
+    )  # once reopened, it does not grow with every doubt
 
 
 def test_a_robot_that_was_calibrated_in_a_dead_room_learns_the_room_it_is_carried_to() -> None:

@@ -157,7 +157,7 @@ def test_the_profile_of_these_scenes_is_true():
 
 @pytest.mark.parametrize("click", [1e2, 1e6])
 def test_one_loud_sample_of_the_reference_costs_the_rest_next_to_nothing(click):
-    """It lies in the first of two utterances, the second of which has another lag and is judged."""
+    """It lies in the first of two utterances, the second of which has another lag and is evaluated."""
     ref, _, _, fan, path = scene()
     pause = slice(7 * SAMPLE_RATE // 2, 9 * SAMPLE_RATE // 2)
     ref[pause] = 0.0

@@ -49,6 +49,11 @@ def frame_of(samples, rate=24_000, channels=1):
     return rtc.AudioFrame(as_pcm16(samples, channels), rate, channels, samples.size)
 
 
+def through(ears, frame):
+    """What a room makes of a frame: LiveKit calls this method of its FrameProcessor."""
+    return ears._process(frame)
+
+
 def test_a_robot_that_talks_is_interrupted_and_its_reference_is_what_it_played(example, ego, check_conversation):
     log, room, _ = asyncio.run(asyncio.wait_for(example("agent_livekit").converse(ego), 120))
     check_conversation(room, ego, 3.0)
@@ -85,7 +90,7 @@ def test_the_room_s_options_take_it_for_noise_cancellation(ears):
 def test_frames_come_out_as_long_as_they_went_in_and_late_by_less_than_a_fifth_of_a_second(ears, rate, channels, ms):
     count, out = rate * ms // 1000, []
     for at in range(0, NOISE.size - count, count):
-        frame = ears._process(frame_of(NOISE[at : at + count], rate, channels))
+        frame = through(ears, frame_of(NOISE[at : at + count], rate, channels))
         assert (frame.samples_per_channel, frame.sample_rate, frame.num_channels) == (count, rate, channels)
         out.append(from_pcm16(frame.data.cast("B"), channels))
     out = np.concatenate(out)
@@ -103,7 +108,7 @@ def test_the_tap_hands_everything_on_and_notes_what_is_played_paused_and_dropped
         tap.flush()
         assert ears.duplex.queued_s == pytest.approx(1.0, abs=1e-3)
         tap.pause()
-        ears._process(frame_of(NOISE[:2400]))
+        through(ears, frame_of(NOISE[:2400]))
         assert ears.duplex.stats()["played_s"] == 0
         tap.resume()
         tap.clear_buffer()
@@ -133,7 +138,7 @@ def test_after_a_pause_the_speech_that_the_room_had_thrown_away_is_no_reference(
 def test_switched_off_it_gives_the_microphone_as_it_is(ears):
     ears.enabled = False
     assert not ears.enabled
-    np.testing.assert_array_equal(ears._process(frame_of(NOISE[:1200])).data, frame_of(NOISE[:1200]).data)
+    np.testing.assert_array_equal(through(ears, frame_of(NOISE[:1200])).data, frame_of(NOISE[:1200]).data)
 
 
 class Recogniser(stt.STT):
@@ -160,7 +165,7 @@ def test_a_recogniser_behind_the_stream_adapter_gets_the_finished_turn_of_an_arr
         stream = stt.StreamAdapter(stt=recogniser, vad=ears.vad()).stream()
         for at in range(0, len(sound) - 319, 320):
             pcm = np.rint(sound[at : at + 320] * 32768).astype("<i2").tobytes()
-            stream.push_frame(ears._process(rtc.AudioFrame(pcm, 16_000, 3, 320)))
+            stream.push_frame(through(ears, rtc.AudioFrame(pcm, 16_000, 3, 320)))
             await asyncio.sleep(0.001)
         stream.end_input()
         return [event.type.value async for event in stream]
@@ -182,7 +187,7 @@ def test_the_loopback_of_the_device_is_the_reference_where_it_is_named(talking):
     ears = EgoProcessor(EgoFilter(profile, "linear"), mic_channels=[1, 2], reference_channel=0)
     pcm, out = np.rint(sound * 32768).astype("<i2"), []
     for at in range(0, len(pcm), 320):
-        frame = ears._process(rtc.AudioFrame(pcm[at : at + 320].tobytes(), 16_000, 3, 320))
+        frame = through(ears, rtc.AudioFrame(pcm[at : at + 320].tobytes(), 16_000, 3, 320))
         out.append(from_pcm16(frame.data.cast("B"), 3))
     out, part = np.concatenate(out), slice(16_000, 32_000)
     assert np.mean(out[part] ** 2) < 0.01 * np.mean(sound[part, 1] ** 2), "no tap is there"

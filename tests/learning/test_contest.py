@@ -29,7 +29,7 @@ def test_a_loss_never_wins_and_ends():
     assert lost.over
 
 
-def test_a_standing_rival_is_judged_by_its_latest_blocks_and_never_given_up():
+def test_a_standing_rival_is_scored_by_its_latest_blocks_and_never_given_up():
     standing = Rival(None, "a test", stays=True, gains_db=[-1.0] * MOST)
     assert not standing.over
     standing.gains_db = [0.4, 0.5] * LEAST

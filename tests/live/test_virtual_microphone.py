@@ -76,8 +76,10 @@ def test_others_listen_to_the_virtual_microphone_and_the_robot_plays_into_the_vi
     assert arrived(reference, sounds["edgefilter_speaker"][8000:]) > 0.99
 
     subprocess.run(["pactl", "set-default-source", "edgefilter_mic"], check=True)
-    for name in ("mic", "edgefilter_human.monitor"):
-        assert main(["run", "--input", name, "--output", str(tmp_path / "x.wav")]) == 2
-        assert "edgefilter's own output" in capsys.readouterr().err
+    for name in ("mic", "filter mic", "edgefilter_human.monitor"):
+        done = subprocess.run(
+            edgefilter("run", "--input", name, "--output", tmp_path / "x.wav"), cwd=ROOT, capture_output=True, text=True
+        )
+        assert done.returncode == 2 and "edgefilter's own output" in done.stderr, done.stderr
     devices("--unload")
     assert "nothing to remove" in devices("--unload")

@@ -185,7 +185,7 @@ def test_the_command_to_add_is_one_that_a_shell_reads():
     )
 
 
-def test_a_switched_on_gain_control_is_judged_as_the_diagnosis_judges_it():
+def test_a_switched_on_gain_control_is_scored_as_the_diagnosis_scores_it():
     x, robot = voice(6.0), profile()
     gain_db = 6 * np.hanning(240)
     model = robot.echo.with_effect("mic_agc", {"gain_db": gain_db, "knots_hz": 40.0})

@@ -65,7 +65,7 @@ class Bandlimit(Effect):
     )
 
     def apply(self, x: Samples, values: Values, sample_rate: int) -> Samples:
-        """X without what lies above the cut-off; a cut-off of 16 kHz is none."""
+        """Return x without what lies above the cut-off; a cut-off of 16 kHz is none."""
         if float(values["cutoff_hz"]) >= 16000.0:
             return x.copy()
         hz = np.arange(FFT // 2 + 1) * sample_rate / FFT
@@ -76,7 +76,7 @@ class Bandlimit(Effect):
         return y + convolve_from(x, taps, LEAD) if taps.any() else y
 
     def fit(self, measurement: Measurement, model: VoiceModel) -> Values:
-        """The best of a grid of cut-offs, orders and phases, refined, each at its best delay, judged in the whitened cross-spectrum. Then taps.
+        """The best of a grid of cut-offs, orders and phases, refined, each at its best delay, compared in the whitened cross-spectrum. Then taps.
 
         Where the power does not end there, what is common with the reference is hidden by something else, such as a codec's
         noise: then the cut-off is where the power ends.
@@ -188,7 +188,7 @@ def _on_grid(hz: bytes) -> NDArray[np.complex128]:
 
 
 def low_pass(hz: Array, cutoff: float, order: float, phase: float) -> NDArray[np.complex128]:
-    """(m,) complex response; the phase is that of a Butterworth filter less its delay at low frequencies, times `phase`."""
+    """Complex response, (m,); the phase is that of a Butterworth filter less its delay at low frequencies, times `phase`."""
     ratio = hz / cutoff
     magnitude = 1.0 / np.sqrt(1.0 + ratio ** (2.0 * order))
     if phase == 0.0:

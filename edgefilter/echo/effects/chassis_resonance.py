@@ -46,7 +46,7 @@ class ChassisResonance(Effect):
     )
 
     def apply(self, x: Samples, values: Values, sample_rate: int) -> Samples:
-        """X and the ring."""
+        """Return x with the ringing added."""
         y = x.copy()
         for frequency, q, gain_db, phase in np.broadcast(
             *(np.atleast_1d(np.asarray(values[p.name], float)) for p in self.parameters)
@@ -115,19 +115,19 @@ def _pole(frequency: float | Array, q: float | Array, sample_rate: int) -> compl
 
 
 def _ring(x: Samples, frequency: float, q: float, sample_rate: int) -> NDArray[np.complex128]:
-    """(n,) complex, r * x."""
+    """The mode's response r * x, (n,) complex."""
     pole = complex(_pole(frequency, q, sample_rate))
     return scipy.signal.lfilter([2.0 * (1.0 - abs(pole))], [1.0, -pole], x.astype(complex))
 
 
 def _shape(hz: Array, frequency: Array, q: float) -> NDArray[np.complex128]:
-    """(modes, m) response of the mode at positive frequencies (its image at negative ones is left out)."""
+    """Response of the mode at positive frequencies (its image at negative ones is left out), (modes, m)."""
     pole = np.asarray(_pole(frequency, q, SAMPLE_RATE))
     return (1.0 - np.abs(pole))[:, None] / (1.0 - pole[:, None] * turn(hz, -2.0 * np.pi / SAMPLE_RATE))
 
 
 def _explained(found: Spectra, hz_slice: slice, frequency: Array, q: float) -> Array:
-    """(modes,) squared error that each mode with its best complex gain takes away."""
+    """Squared error that each mode with its best complex gain takes away, (modes,)."""
     shape = _shape(found.hz[hz_slice], frequency, q)
     left = found.cross[hz_slice] - found.predicted[hz_slice]
     return np.abs(shape.conj() @ left) ** 2 / np.maximum((np.abs(shape) ** 2) @ found.predicted[hz_slice], 1e-12)

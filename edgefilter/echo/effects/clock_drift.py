@@ -46,7 +46,7 @@ class ClockDrift(Effect):
     )
 
     def apply(self, x: Samples, values: Values, sample_rate: int) -> Samples:
-        """X (n,) read at the drifting clock; outside of x there is silence."""
+        """Return x (n,) read at the drifting clock; outside of x there is silence."""
         ppm, offset = float(values["ppm"]), float(values["offset"])
         if ppm == 0.0 and offset == 0.0:
             return x.copy()

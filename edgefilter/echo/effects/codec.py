@@ -69,7 +69,7 @@ class Codec(Effect):
         return (float(np.sum(values["power"])) * envelope ** float(values["exponent"])).astype(np.float32)
 
     def colour(self, values: Values) -> Array:
-        """(601,) the spectral density of that, 0 to 8 kHz, per Hz: its integral is 1."""
+        """The spectral density of that, (601,), 0 to 8 kHz, per Hz: its integral is 1."""
         return density_of(values["power"])
 
     def fit(self, measurement: Measurement, model: VoiceModel) -> Values:
@@ -121,7 +121,7 @@ class Codec(Effect):
 
 
 def _emphasised(x: Samples, emphasis_db: float | Array) -> Samples:
-    """X (n,) through a filter of that magnitude in bands of 500 Hz, delayed by half its taps."""
+    """Put x (n,) through a filter of that magnitude in bands of 500 Hz, delayed by half its taps."""
     gain_db = np.broadcast_to(np.asarray(emphasis_db, float), (BANDS,))
     centres = (np.arange(BANDS) + 0.5) * BAND_HZ
     taps = scipy.signal.firwin2(
@@ -134,7 +134,7 @@ def _emphasised(x: Samples, emphasis_db: float | Array) -> Samples:
 
 
 def _envelope(x: Samples, decay_ms: float, sample_rate: int = SAMPLE_RATE) -> Samples:
-    """(n,) mean square of x (n,), decaying by 1/e in decay_ms, as late as the direct sound."""
+    """Mean square of x (n,), (n,), decaying by 1/e in decay_ms, as late as the direct sound."""
     keep = np.exp(-1.0 / (decay_ms * 1e-3 * sample_rate))
     late = PRE_ROLL - EMPHASIS_TAPS // 2
     delayed = np.concatenate((np.zeros(late), x.astype(np.float64) ** 2))[: x.size]

@@ -86,7 +86,7 @@ def _spectra(x: Samples, size: int, hop: int) -> NDArray[np.complex64]:
 
 
 def _whole(heard: NDArray[np.bool_], size: int, hop: int) -> NDArray[np.bool_]:
-    """(frames,) whether the voice is heard in nearly all of each."""
+    """Whether the voice is heard in nearly all of each, (frames,)."""
     return frames(heard.astype(np.float32), size, hop).mean(axis=1) > 0.9
 
 

@@ -53,7 +53,7 @@ class Compression(Effect):
     )
 
     def apply(self, x: Samples, values: Values, sample_rate: int) -> Samples:
-        """X (n,) times the gain that its own level asks for, times the make-up gain."""
+        """Return x (n,) times the gain that its own level asks for, times the make-up gain."""
         return Compressor(values, sample_rate)(x)
 
     def run(self, values: Values, sample_rate: int) -> Runner:
@@ -103,7 +103,7 @@ class Compressor:
         self._level, self._held = np.zeros(1), 0.0
 
     def __call__(self, x: Samples, heard: Samples | None = None) -> Samples:
-        """X (n,), which follows what came before, times its gain."""
+        """Return x (n,), which follows what came before, times its gain."""
         if self._slope == 0.0:
             return x * np.float32(10.0 ** (self._makeup / 20.0))
         square = np.square(x, dtype=np.float64)

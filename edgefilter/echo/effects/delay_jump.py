@@ -56,7 +56,7 @@ class DelayJump(Effect):
     )
 
     def apply(self, x: Samples, values: Values, sample_rate: int) -> Samples:
-        """X (n,) read with the delay of each moment; outside of x there is silence."""
+        """Return x (n,) read with the delay of each moment; outside of x there is silence."""
         times, steps = (np.atleast_1d(np.asarray(values[name], float)) for name in ("times_s", "samples"))
         order = np.argsort(times, kind="stable")
         at = np.clip(np.round(times[order] * sample_rate), 0, x.size).astype(int)
@@ -131,7 +131,7 @@ class DelayJump(Effect):
 
 
 def _later(x: Samples, delay: float, start: int, stop: int) -> Samples:
-    """(stop - start,) delayed(x, delay)[start:stop] of x (n,), from that stretch and what is near it."""
+    """Return delayed(x, delay)[start:stop] of x (n,), from that stretch and what is near it, (stop - start,)."""
     whole = round(delay)
     first, last = (int(np.clip(at - whole, 0, x.size)) for at in (start - FADE, stop + FADE))
     near, fade = x[first:last].copy(), np.linspace(0.0, 1.0, FADE, dtype=np.float32)

@@ -39,7 +39,7 @@ class EarlyPath(Effect):
     )
 
     def apply(self, x: Samples, values: Values, sample_rate: int) -> Samples:
-        """X through the other path."""
+        """Put x through the other path."""
         taps = np.atleast_1d(np.asarray(values["taps"], float))
         return x.copy() if not taps.any() else x + convolve_from(x, taps, LEAD)
 

@@ -54,7 +54,7 @@ class Equaliser(Effect):
     )
 
     def apply(self, x: Samples, values: Values, sample_rate: int) -> Samples:
-        """X in its other colour."""
+        """Put x through the equaliser."""
         gain_db, delay = np.asarray(values["gain_db"], float), float(values["delay"])
         y = x.copy()
         if gain_db.any() or delay:
@@ -98,7 +98,7 @@ class Equaliser(Effect):
 
 @cache
 def _basis(bins: int, sample_rate: int) -> NDArray[np.complex128]:
-    """(bins, knots) complex logarithm of the response to a knot of 1 neper: the gain, and the least phase that goes with it."""
+    """Complex logarithm of the response to a knot of 1 neper, (bins, knots): the gain, and the least phase that goes with it."""
     hz = np.maximum(np.arange(bins) * sample_rate / (2 * (bins - 1)), 1.0)
     at = np.log(hz / KNOTS_HZ[0]) / np.log(KNOTS_HZ[1] / KNOTS_HZ[0])
     at = np.clip(at, 0.0, KNOTS_HZ.size - 1.0)
@@ -143,7 +143,7 @@ def _smooth_gain(found: Spectra) -> tuple[Array, float]:
 
 
 def _heard(found: Spectra) -> NDArray[np.bool_]:
-    """(knots,) bool: where the voice has energy enough to tell a gain."""
+    """Where the voice has energy enough to tell a gain, (knots,) bool."""
     at = np.clip(np.rint(found.hz * FFT / SAMPLE_RATE).astype(int), 0, FFT // 2)
     energy = found.predicted @ _basis(FFT // 2 + 1, SAMPLE_RATE).real[at]
     return np.asarray(energy > HEARD * energy.max())

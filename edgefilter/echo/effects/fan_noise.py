@@ -83,7 +83,7 @@ class FanNoise(Effect):
 
 
 def _quiet_mean(power: Array) -> Array:
-    """Mean (b,) of exponentially distributed power (f, b) from the lowest QUIET_SHARE of its values at each frequency."""
+    """Mean of exponentially distributed power (f, b) from the lowest QUIET_SHARE of its values at each frequency, (b,)."""
     kept = max(int(QUIET_SHARE * len(power)), 1)
     share = kept / len(power)
     bias = 1.0 + (1.0 - share) * np.log1p(-share) / share if share < 1.0 else 1.0

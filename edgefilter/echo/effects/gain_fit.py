@@ -73,7 +73,7 @@ class GainFit:
         return self._left(self._parts(unknowns))
 
     def gains(self, unknowns: Array) -> Array:
-        """(parts,) least-squares gain of each part over the whole recording."""
+        """Least-squares gain of each part over the whole recording, (parts,)."""
         measurement = self._measurement
         parts = [measurement.whiten(self._model.predict(part)) for part in self._make(measurement.reference, unknowns)]
         rows = np.stack(parts, axis=1) * measurement.weights[:, None]
@@ -87,7 +87,7 @@ class GainFit:
         return [self._heard(part) for part in self._make(self._x, unknowns)]
 
     def _rows(self, parts: Sequence[Samples]) -> Samples:
-        """(chosen, parts * TAPS) each part at its lags."""
+        """Each part at its lags, (chosen, parts * TAPS)."""
         padded = [np.pad(part, (TAPS - 1 - LEAD, LEAD)) for part in parts]
         return np.concatenate([sliding_window_view(p, TAPS)[:, ::-1][self._chosen] for p in padded], axis=1)
 
@@ -124,7 +124,7 @@ class GainFit:
 
 
 def _solved(rows: Samples, target: Samples, ridge: Array) -> Samples:
-    """(k,) least-squares weights of rows (m, k); ridge (k,) is relative to each one's own energy."""
+    """Least-squares weights of rows (m, k), (k,); ridge (k,) is relative to each one's own energy."""
     normal, right = (rows.T @ rows).astype(float), (rows.T @ target).astype(float)
     scale = np.sqrt(normal.diagonal()) + 1e-30
     return np.float32(np.linalg.solve(normal / scale[:, None] / scale + np.diag(ridge), right / scale) / scale)

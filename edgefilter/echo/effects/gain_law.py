@@ -22,10 +22,10 @@ MODEL_DB = 0.3
 
 @dataclass(frozen=True, eq=False)
 class GainLaw:
-    """curve_db: (k,) the gain at the middle of each step, relative to a constant.
+    """A gain that follows a level. curve_db: (k,) the gain at the middle of each step, relative to a constant.
 
-    Misfit, plain: weighted mean square of what is left of
-    the measured gains, dB^2, with the law and with a constant. measured: how many steps told their gain.
+    misfit, plain: weighted mean square of what is left of the measured gains, dB^2, with the law and with a
+    constant. measured: how many steps told their gain.
     """
 
     curve_db: Array
@@ -72,7 +72,7 @@ def follow(level_db: Array, voice: Samples, recording: Samples, weights: Samples
 
 
 def _driven(level_db: Array, attack_s: Array, release_s: Array, hold_db: Array, start_db: Array) -> Array:
-    """(k, m) gain in dB, for a slope of 1, of m controls that follow level (k,)."""
+    """Gain in dB, for a slope of 1, of m controls that follow level (k,), (k, m)."""
     fall, rise = (1.0 - np.exp(-STEP / SAMPLE_RATE / seconds) for seconds in (attack_s, release_s))
     gain, curve = start_db.astype(float), np.empty((level_db.size, start_db.size))
     for i, level in enumerate(level_db.tolist()):

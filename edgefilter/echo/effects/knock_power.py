@@ -96,7 +96,7 @@ def colour_of_knocks(residual: Samples, ringing: Samples, fit: NDArray[np.bool_]
 
 
 def fan_in_bands(noise_psd: Samples | None) -> Array:
-    """(BANDS,) power of the fan in each band, by which a whitened power is multiplied: of its density the harmonic mean.
+    """Power of the fan in each band, by which a whitened power is multiplied, (BANDS,): of its density the harmonic mean.
 
     noise_psd: (601,); None for a fan of variance 1, white.
     """
@@ -105,13 +105,13 @@ def fan_in_bands(noise_psd: Samples | None) -> Array:
 
 
 def density_of(power: float | Array) -> Array:
-    """(601,) spectral density per Hz, of integral 1, of noise with that power in each band, one number or (BANDS,)."""
+    """Spectral density per Hz, of integral 1, of noise with that power in each band, one number or (BANDS,), (601,)."""
     each = np.broadcast_to(np.asarray(power, float), (BANDS,)) + 1e-30
     return (each / each.sum() / BAND_HZ)[_BAND]
 
 
 def resonated(x: Samples, resonance_hz: float, q: float, sample_rate: int = SAMPLE_RATE) -> Samples:
-    """Displacement (n,) of a membrane with that resonance for the drive x (n,), in its full scale."""
+    """Displacement of a membrane with that resonance for the drive x (n,), in its full scale, (n,)."""
     return scipy.signal.lfilter(*_membrane(resonance_hz, q, sample_rate), x).astype(np.float32)
 
 
@@ -143,7 +143,7 @@ def knocks_at(moved: Samples, threshold: float) -> list[tuple[NDArray[np.integer
 
 
 def one_side(trains: tuple[Array, Array], side: float) -> Array:
-    """(n,) of the trains outward and inward what belongs to a side: 1, -1, or 0 for both."""
+    """What belongs to a side, of the trains outward and inward, (n,): 1, -1, or 0 for both."""
     outward, inward = trains
     return outward if side > 0.0 else inward if side < 0.0 else outward + inward
 
@@ -167,7 +167,7 @@ def ringing_of(knocks: Samples, decay_ms: float, late: int, sample_rate: int = S
 
 
 def band_power(x: Samples) -> Samples:
-    """(frames, BANDS) mean power of x (n,) in each band, 1 for white noise of variance 1.
+    """Mean power of x (n,) in each band, 1 for white noise of variance 1, (frames, BANDS).
 
     The lowest bin is left out.
     """
@@ -177,13 +177,13 @@ def band_power(x: Samples) -> Samples:
 
 
 def _hits(at: NDArray[np.integer], height: Samples, late: int, frames: int) -> Array:
-    """(frames + 1,) the squared heights (k,) of knocks at samples (k,) in each hop, `late` samples later."""
+    """The squared heights (k,) of knocks at samples (k,) in each hop, `late` samples later, (frames + 1,)."""
     hops = np.minimum((at + late) // HOP, frames)
     return np.asarray(np.bincount(hops, height.astype(np.float64) ** 2, frames + 1), float)
 
 
 def _roughly_ringing(hops: Array) -> Samples:
-    """(frames, 1) squared heights in each hop (frames + 1,), decaying, with a mean of 1."""
+    """Squared heights in each hop (frames + 1,), decaying, with a mean of 1, (frames, 1)."""
     keep = np.exp(-HOP / (DECAY_MS * 1e-3 * SAMPLE_RATE))
     rung = scipy.signal.lfilter([1.0], [1.0, -keep], hops)
     both = rung[:-1] + rung[1:]
@@ -191,7 +191,7 @@ def _roughly_ringing(hops: Array) -> Samples:
 
 
 def _colours(power: Samples, sources: Sequence[Samples], rounds: int) -> list[Samples]:
-    """(BANDS,) for each source (t, 1 or BANDS): how much of it is in each band of power (t, BANDS)."""
+    """How much of each source (t, 1 or BANDS) is in each band of power (t, BANDS), (BANDS,)."""
     colours = [
         np.full(BANDS, 1.0 if i == 0 else 0.3, np.float32) / max(float(source.mean()), 1e-12)
         for i, source in enumerate(sources)
@@ -205,7 +205,7 @@ def _colours(power: Samples, sources: Sequence[Samples], rounds: int) -> list[Sa
 
 
 def _over_time(source: Samples, power: Samples) -> Samples:
-    """(BANDS,) the sum of source (t, 1 or BANDS) times power (t, BANDS)."""
+    """The sum of source (t, 1 or BANDS) times power (t, BANDS), (BANDS,)."""
     return (source.T @ power)[0] if source.shape[1] == 1 else np.sum(source * power, axis=0)
 
 

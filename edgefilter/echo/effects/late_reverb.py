@@ -56,7 +56,7 @@ class LateReverb(Effect):
     )
 
     def apply(self, x: Samples, values: Values, sample_rate: int) -> Samples:
-        """X and its reverberation."""
+        """Return x with its reverberation added."""
         taps = np.atleast_1d(np.asarray(values["taps"], float))
         return x.copy() if not taps.any() else x + convolve_from(x, taps, LEAD)
 
@@ -95,7 +95,7 @@ class LateReverb(Effect):
 
 
 def fit_path(measurement: Measurement, model: VoiceModel) -> tuple[Array, float]:
-    """(k,) taps at lags -LEAD to k - LEAD behind the calibrated path, zeros where none hold on other samples; RT60 of the new path in s."""
+    """Taps at lags -LEAD to k - LEAD behind the calibrated path, (k,), zeros where none hold on other samples; RT60 of the new path in s."""
     x = measurement.heard(model)[1]
     residual = measurement.white_recording - x
     length = min(TAPS, measurement.recording.size // 4)
@@ -144,7 +144,7 @@ def decay(response: Array) -> int:
 
 
 def decaying(taps: Array, rt60_s: float) -> Array:
-    """(k,) expected squares of taps (k,) with the energy that these have above their noise, decaying with that reverberation time.
+    """Expected squares of taps (k,) with the energy that these have above their noise, decaying with that reverberation time, (k,).
 
     The first block, which holds what another room changes in the direct sound, is expected as it was found.
     """

@@ -53,7 +53,7 @@ class Limiter(Effect):
     )
 
     def apply(self, x: Samples, values: Values, sample_rate: int) -> Samples:
-        """X (n,) with its peaks held down, times the make-up gain."""
+        """Return x (n,) with its peaks held down, times the make-up gain."""
         return PeakLimiter(values, sample_rate)(x)
 
     def run(self, values: Values, sample_rate: int) -> Runner:
@@ -98,7 +98,7 @@ class PeakLimiter:
         self._peak = 0.0
 
     def __call__(self, x: Samples, heard: Samples | None = None) -> Samples:
-        """X (n,), which follows what came before, times its gain."""
+        """Return x (n,), which follows what came before, times its gain."""
         peak = falling_peak(np.abs(x, dtype=np.float64), self._release, self._peak)
         self._peak = float(peak[-1]) if peak.size else self._peak
         return (x * (self._makeup * self._ceiling / np.maximum(peak, self._ceiling))).astype(np.float32)

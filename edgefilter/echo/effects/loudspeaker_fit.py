@@ -117,7 +117,7 @@ def fit_laws(
 
 
 class _Search:
-    """Settings of driver and amplifier, each judged by what is left with it on samples that it was not fitted to.
+    """Settings of driver and amplifier, each scored by what is left with it on samples that it was not fitted to.
 
     base: what the linear voice alone leaves there. peak: the highest sample that counts.
     """
@@ -183,7 +183,7 @@ def _peak(x: Samples) -> float:
 
 
 class _Halves:
-    """Weighted least squares on either half of the samples (BLOCKs, two by two), judged on the other.
+    """Weighted least squares on either half of the samples (BLOCKs, two by two), tested on the other.
 
     Beside the columns that are asked about stands the linear voice with NUISANCE_TAPS of a filter: another gain, a
     move by less than a millimetre.
@@ -200,7 +200,7 @@ class _Halves:
         self._target = target[self.used, None] * self._root
 
     def columns(self, signals: Iterable[Samples], count: int) -> Samples:
-        """(used, count) signals (n,) at the samples that count, the first half's in front, weighted."""
+        """Signals (n,) at the samples that count, the first half's in front, weighted, (used, count)."""
         out = np.empty((self.used.size, count), np.float32)
         for column, signal in zip(out.T, signals, strict=True):
             np.multiply(signal[self.used], self._root[:, 0], out=column)
@@ -212,7 +212,7 @@ class _Halves:
         return _left(first, _solved(second)) + _left(second, _solved(first))
 
     def whole(self, columns: Samples) -> tuple[Array, float, float]:
-        """Weights (k,) of columns (used, k) re the linear voice's gain, fitted to all, the level of what they add, and that gain, dB."""
+        """Weights of columns (used, k) re the linear voice's gain, (k,), fitted to all; the level of what they add, and that gain, dB."""
         first, second = self._normal(columns)
         found = _solved(first + second)
         voice, filtered = self._voice(np.eye(NUISANCE_TAPS)[NUISANCE_LEAD]), self._voice(found[:NUISANCE_TAPS])
@@ -224,7 +224,7 @@ class _Halves:
         return weights, 10.0 * float(np.log10(level + 1e-12)), 20.0 * float(np.log10(max(abs(gain), 1e-3)))
 
     def _voice(self, taps: Array) -> Samples:
-        """(used,) of the linear voice through taps (NUISANCE_TAPS,), weighted."""
+        """The linear voice through taps (NUISANCE_TAPS,), weighted, (used,)."""
         return (self._linear @ taps.astype(np.float32))[self.used] * self._root[:, 0]
 
     def _normal(self, columns: Samples) -> tuple[Array, Array]:
@@ -245,7 +245,7 @@ class _Halves:
 
 
 def _solved(normal: Array) -> Array:
-    """Weights (k,) of normal equations (k + 1, k + 1), the target the last; the ridge is on all but the linear voice."""
+    """Solve normal equations (k + 1, k + 1), the target the last, for the weights (k,); the ridge is on all but the linear voice."""
     matrix, right = normal[:-1, :-1], normal[:-1, -1]
     scale = np.sqrt(matrix.diagonal()) + 1e-30
     ridge = np.full(scale.size, RIDGE)

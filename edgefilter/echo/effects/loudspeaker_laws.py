@@ -11,7 +11,7 @@ DRIVER_TERMS, AMPLIFIER_TERMS = 6, 4
 
 
 def driver_terms(x: Samples, resonance_hz: float, excursion: float, sample_rate: int = SAMPLE_RATE) -> Samples:
-    """(6, n) float32: s x, s^2 x, -s d, -s^2 d, -s d'/w, -s^2 d'/w for the drive x (n,).
+    """The terms s x, s^2 x, -s d, -s^2 d, -s d'/w, -s^2 d'/w for the drive x (n,), (6, n) float32.
 
     The equation of motion d'' + (w/Q) d' + w^2 d = w^2 x keeps its left side when force factor, stiffness and damping
     depend on the displacement d; what they change is a drive of its own on the right side (Klippel 2006, "Loudspeaker
@@ -28,7 +28,7 @@ def driver_terms(x: Samples, resonance_hz: float, excursion: float, sample_rate:
 
 
 def amplifier_terms(x: Samples, knee: float) -> Samples:
-    """(4, n) float32: s x, s^2 x, s^3 x, s^4 x with s = u / sqrt(1 + u^2), u = x / knee."""
+    """The terms s x, s^2 x, s^3 x, s^4 x with s = u / sqrt(1 + u^2), u = x / knee, (4, n) float32."""
     s = bent(x, knee)
     terms = np.empty((AMPLIFIER_TERMS, x.size), np.float32)
     np.multiply(x, s, out=terms[0])

@@ -70,7 +70,7 @@ class MicAgc(Effect):
     )
 
     def apply(self, x: Samples, values: Values, sample_rate: int) -> Samples:
-        """X (n,) times the gain of each moment."""
+        """Return x (n,) times the gain of each moment."""
         knots = np.atleast_1d(np.asarray(values["gain_db"], float))
         if not knots.any():
             return x.copy()
@@ -163,7 +163,7 @@ class GainFollower:
         self._gain, self._doubt, self._left = middle, self._variance, 0.0
 
     def __call__(self, x: Samples, heard: Samples | None = None) -> Samples:
-        """X (n,) times the gain, which runs from its last value to what heard (n,) makes of it."""
+        """Return x (n,) times the gain, which runs from its last value to what heard (n,) makes of it."""
         assert heard is not None, "a gain behind the path is followed by what the microphone hears"
         before = self._gain
         kept = float(np.exp(-x.size / (self._time_constant * self._rate)))
@@ -180,7 +180,7 @@ class GainFollower:
 
 
 def _law(heard: Samples, voice: Samples, recording: Samples, measurement: Measurement) -> Samples:
-    """(n,) the gain by the law, ones where no law explains a good part.
+    """The gain by the law, ones where no law explains a good part, (n,).
 
     Heard (n,): the predicted voice as the microphone gets it.
     """
@@ -197,7 +197,7 @@ def _law(heard: Samples, voice: Samples, recording: Samples, measurement: Measur
 
 
 def _at_samples(knots: Array, n: int) -> Array:
-    """(n,) linear between knots KNOTS_HZ a second."""
+    """A curve through knots, KNOTS_HZ a second, linear between them, (n,)."""
     return np.interp(np.arange(n) * (KNOTS_HZ / SAMPLE_RATE), np.arange(knots.size), knots)
 
 
@@ -239,12 +239,12 @@ def _from_fan(
 
 
 def _sums(at: NDArray[np.integer], weights: Array, count: int) -> Array:
-    """(count,) float64, the weights (n,) summed by the knot (n,) that they are at."""
+    """The weights (n,) summed by the knot (n,) that they are at, (count,) float64."""
     return np.asarray(np.bincount(at, weights, count), float)  # numpy's stub gives integers, weights or not
 
 
 def _smooth(matrix: Array, right: Array) -> Array:
-    """Gain (k,) around 1: solves the normal equations with a penalty on second differences (a pentadiagonal system)."""
+    """Solve the normal equations with a penalty on second differences (a pentadiagonal system) for a gain around 1, (k,)."""
     count = right.size
     bands = np.zeros((3, count))
     bands[1], bands[2] = matrix[0], matrix[1] + 1e-6

@@ -35,7 +35,7 @@ class MicClipping(Effect):
     )
 
     def apply(self, x: Samples, values: Values, sample_rate: int) -> Samples:
-        """X (n,), limited."""
+        """Return x (n,), limited."""
         level, hardness = float(values["level"]), float(values["hardness"])
         if level >= NO_LIMIT:
             return x.copy()

@@ -70,7 +70,7 @@ class MultibandCompression(Effect):
     )
 
     def apply(self, x: Samples, values: Values, sample_rate: int) -> Samples:
-        """X (n,), each of its bands turned by its own level; where none is, x itself."""
+        """Return x (n,) with each of its bands turned by its own level; where none is, x itself."""
         return BandCompressor(values, sample_rate)(_moved(x, float(values["delay"])))
 
     def run(self, values: Values, sample_rate: int) -> Runner:
@@ -134,7 +134,7 @@ class BandCompressor:
         self._idle = bool(np.all(each[1] == 1.0) and np.all(each[2] == 0.0))
 
     def __call__(self, x: Samples, heard: Samples | None = None) -> Samples:
-        """X (n,), which follows what came before, each band times its gain."""
+        """Return x (n,), which follows what came before, each band times its gain."""
         return x.copy() if self._idle or not x.size else np.sum(self.bands(x), axis=0, dtype=np.float32)
 
     def bands(self, x: Samples) -> list[Samples]:
@@ -190,13 +190,13 @@ def find_crossovers(found: Spectra) -> tuple[float, float, float] | None:
 
 
 def _moved(x: Samples, delay: float) -> Samples:
-    """X (n,) by that many whole samples later."""
+    """Delay x (n,) by that many whole samples."""
     samples = round(delay)
     return np.pad(x, (max(samples, 0), max(-samples, 0)))[max(-samples, 0) :][: x.size]
 
 
 def _halves(hz: Array, crossover_hz: float) -> tuple[NDArray[np.complex128], NDArray[np.complex128]]:
-    """(m,), (m,) responses below and above a crossover."""
+    """Responses below and above a crossover, (m,) each."""
     kinds = (scipy.signal.butter(2, crossover_hz, kind, fs=SAMPLE_RATE) for kind in ("low", "high"))
     low, high = (scipy.signal.freqz(b, a, hz, fs=SAMPLE_RATE)[1] ** 2 for b, a in kinds)
     return low, high

@@ -74,7 +74,7 @@ class NoiseSuppression(Effect):
     )
 
     def apply(self, x: Samples, values: Values, sample_rate: int) -> Samples:
-        """X (n,) with the gain of each cell."""
+        """Return x (n,) with the gain of each cell."""
         gain_db = np.broadcast_to(np.asarray(values["gain_db"], float), KNOTS_DB.shape)
         if not gain_db.any() or not x.size:
             return x.copy()
@@ -187,7 +187,7 @@ class Cells:
 
 
 def _as_it_is(x: Samples, heard: Samples | None = None) -> Samples:
-    """X (n,) itself."""
+    """Return x (n,) itself."""
     return x
 
 
@@ -201,11 +201,11 @@ def _quiet_db(x: NDArray[np.complex128], y: NDArray[np.complex128]) -> float:
 
 
 def _ratio(spectra: NDArray[np.complex128], fan: Array) -> Array:
-    """(frames, bins) the local ratio; fan: (bins,) density per sample."""
+    """The local ratio of the spectra to the fan, (frames, bins); fan: (bins,) density per sample."""
     near = uniform_filter1d(np.abs(spectra) ** 2, NEIGHBOURS, axis=1, mode="nearest")
     return scipy.signal.lfilter([1.0 - FORGETTING], [1.0, -FORGETTING], near, axis=0) / (HOP * fan)
 
 
 def _spectra(x: Samples) -> NDArray[np.complex128]:
-    """(frames, SIZE / 2 + 1) complex."""
+    """Short-time spectra, (frames, SIZE / 2 + 1) complex."""
     return np.fft.rfft(frames(x, SIZE, HOP) * WINDOW)

@@ -70,7 +70,7 @@ class PacketLoss(Effect):
     )
 
     def apply(self, x: Samples, values: Values, sample_rate: int) -> Samples:
-        """X (n,) without those frames."""
+        """Return x (n,) without those frames."""
         out = x.copy()
         length, fade = (round(float(values[name]) * 1e-3 * sample_rate) for name in ("length_ms", "fade_ms"))
         edge = np.clip((np.arange(length) + 0.5) / max(fade, 1e-9), 0.0, 1.0)

@@ -61,7 +61,7 @@ def fit_path_and_loudspeaker(
 
 
 def first_path(x: Samples, y: Samples, weights: Samples, taps: int) -> Array:
-    """(taps,) a path, both signals flattened by the recording's spectrum, with a decay that any room may have."""
+    """A path, both signals flattened by the recording's spectrum, with a decay that any room may have, (taps,)."""
     heard = _psd(y, weights)
     flat, target = whiten(x, heard), whiten(y, heard)
     gain = float(np.mean(np.square(target))) / max(float(np.mean(np.square(flat))), 1e-30)
@@ -84,5 +84,5 @@ def hearing(response: Array, noise: Samples) -> Callable[[Samples], Samples]:
 
 
 def _psd(x: Samples, weights: Samples) -> Samples:
-    """(601,) PSD of x (n,) where the weights are not 0, those samples set side by side."""
+    """PSD of x (n,) where the weights are not 0, those samples set side by side, (601,)."""
     return np.mean(periodograms(x[weights > 0.0], 1200), axis=0).astype(np.float32)

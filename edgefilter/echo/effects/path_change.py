@@ -48,7 +48,7 @@ class PathChange(Effect):
     )
 
     def apply(self, x: Samples, values: Values, sample_rate: int) -> Samples:
-        """X through the old path, then the new."""
+        """Put x through the old path, then the new one."""
         taps = np.atleast_1d(np.asarray(values["taps"], float))
         if not taps.any() or float(values["time_s"]) >= x.size / sample_rate:
             return x.copy()
@@ -111,7 +111,7 @@ class PathChange(Effect):
 
 
 def _fade(n: int, time: float, duration: float, sample_rate: int) -> Samples:
-    """(n,) 0 before, 1 after, a line in between."""
+    """A fade, 0 before, 1 after, a line in between, (n,)."""
     return np.clip((np.arange(n, dtype=np.float32) / sample_rate - time) / max(duration, 1e-4) + 0.5, 0.0, 1.0).astype(
         np.float32
     )

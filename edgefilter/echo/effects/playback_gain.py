@@ -28,7 +28,7 @@ class PlaybackGain(Effect):
     parameters: ClassVar[tuple[Parameter, ...]] = (Parameter("gain_db", "dB", 0.0, -60.0, 60.0),)
 
     def apply(self, x: Samples, values: Values, sample_rate: int) -> Samples:
-        """X times the gain."""
+        """Return x times the gain."""
         return x * np.float32(10.0 ** (float(values["gain_db"]) / 20.0))
 
     def fit(self, measurement: Measurement, model: VoiceModel) -> Values:

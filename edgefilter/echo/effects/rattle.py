@@ -87,7 +87,7 @@ class Rattle(Effect):
     )
 
     def apply(self, x: Samples, values: Values, sample_rate: int) -> Samples:
-        """X (n,) and its knocks."""
+        """Return x (n,) with its knocks added."""
         sounds = [np.atleast_1d(np.asarray(values[name], float)) for name in ("outward", "inward")]
         if not any(h.any() for h in sounds):
             return x.copy()
@@ -104,7 +104,7 @@ class Rattle(Effect):
         )
 
     def colour(self, values: Values) -> Array:
-        """(601,) the spectral density of that, 0 to 8 kHz, per Hz: its integral is 1."""
+        """The spectral density of that, (601,), 0 to 8 kHz, per Hz: its integral is 1."""
         return density_of(values["power"])
 
     def fit(self, measurement: Measurement, model: VoiceModel) -> Values:
@@ -162,7 +162,7 @@ class Rattle(Effect):
         return {**values, **self._unpredictable(measurement, model, values)}
 
     def _unpredictable(self, measurement: Measurement, model: VoiceModel, values: Values) -> dict[str, float | Array]:
-        """power, decay_ms and rate_hz from what the predictable knocks leave."""
+        """Fit power, decay_ms and rate_hz to what the predictable knocks leave."""
         x = measurement.reference
         knocks = _heard(x, values, SAMPLE_RATE)
         predicted = measurement.whiten(model.predict(self.apply(x, complete(self, values), SAMPLE_RATE)))
@@ -190,13 +190,13 @@ class Rattle(Effect):
 
 
 def _heard(x: Samples, values: Values, sample_rate: int) -> Samples:
-    """(n,) the knocks of a drive x (n,), on the side that knocks."""
+    """The knocks of a drive x (n,), on the side that knocks, (n,)."""
     moved = resonated(x, float(values["resonance_hz"]), float(values["q"]), sample_rate)
     return one_side(find_knocks(moved, float(values["threshold"])), float(values["side"]))
 
 
 def _roomy(measurement: Measurement) -> np.ndarray:
-    """(n,) bool: where a knock can ring for TAPS and on through the path within samples to fit on."""
+    """Where a knock can ring for TAPS and on through the path within samples to fit on, (n,) bool."""
     if measurement.fit is None:
         return np.ones(measurement.recording.size, bool)
     ring = 2 * TAPS
@@ -205,7 +205,7 @@ def _roomy(measurement: Measurement) -> np.ndarray:
 
 
 def _matched(sound: Array, rest: Samples, measurement: Measurement, model: VoiceModel) -> Samples:
-    """Correlation (n,) of the residual with the whitened sound of one knock at the microphone."""
+    """Correlation of the residual with the whitened sound of one knock at the microphone, (n,)."""
     length, at = 4096, 1024
     knock = np.zeros(length, np.float32)
     knock[at : at + sound.size] = sound

@@ -56,7 +56,7 @@ class SpeakerNonlinearity(Effect):
     )
 
     def apply(self, x: Samples, values: Values, sample_rate: int) -> Samples:
-        """X (n,) with its distortion; level_db only reports."""
+        """Return x (n,) with its distortion; level_db only reports."""
         out = x.copy()
         driving, bending = np.concatenate([_pair(values, name) for name in DRIVER]), _amplifier(values)
         if driving.any():
@@ -108,12 +108,12 @@ def as_values(laws: Laws) -> dict[str, float | Array]:
 
 
 def _pair(values: Values, name: str) -> Array:
-    """(2,) float32, zero behind a single number."""
+    """Two numbers, zero behind a single one, (2,) float32."""
     pair, given = np.zeros(2, np.float32), np.ravel(values[name])[:2]
     pair[: given.size] = given
     return pair
 
 
 def _amplifier(values: Values) -> Array:
-    """(4,) float32 in the order of amplifier_terms: even and odd in turn."""
+    """Weights in the order of amplifier_terms, (4,) float32: even and odd in turn."""
     return np.stack([_pair(values, name) for name in AMPLIFIER], axis=1).ravel()
