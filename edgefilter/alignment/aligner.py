@@ -416,7 +416,8 @@ class Aligner:
             waits = self._refuted or not (self._coarse or self._open[0].lost)
         if self._first is None:
             return waits and self._onsets.varies and (self._refuted or not self._known)
-        return self._first.step(mic, reference, self._onsets.peak, self._gain, waits or self._expected is not None)
+        waits = waits or self._expected is not None
+        return self._first.step(mic, reference, self._onsets.peak, self._state(), waits)
 
     def _cannot_be(self, mic: Samples) -> bool:
         """Whether the microphone holds 10 dB less than the reference at the old delay would bring there."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from edgefilter.types import SAMPLE_RATE, Samples
+from edgefilter.types import SAMPLE_RATE, AlignmentState, Samples
 
 LOUD, EXPLAINED = 0.05, 100.0
 """LOUD: microphone power, over the robot's loudest there, from which on it can only be the robot; a human 20-26 dB below
@@ -16,6 +16,8 @@ utterance does, loses no more."""
 USUAL = 1e-2
 """Mean square that the loudest hop of a voice is taken to have at first (-20 dB of full scale), so that a soft first
 sound makes nobody else loud."""
+LEARNING = 0.1
+"""Share of a loud hop in the running gain from the reference to the microphone."""
 
 
 class FirstSounds:
@@ -31,21 +33,21 @@ class FirstSounds:
 
     def reset(self) -> None:
         """As before the first hop."""
-        self._since = 0
+        self._gain, self._heard, self._since = self._calibrated, False, 0
 
-    def step(self, mic: Samples, explained: Samples, loudest: float, gain: float | None, waits: bool) -> bool:
-        """Take a hop (hop,) of the microphone and of the reference at the present delay, zeros where there is none.
+    def step(self, mic: Samples, explained: Samples, loudest: float, state: AlignmentState, waits: bool) -> bool:
+        """Take a hop of the microphone and of the reference at the present delay, zeros where there is none, (hop,) each.
 
-        loudest: mean square of the reference's loudest hop. gain: power at the microphone over the reference's, as it
-        was measured, None before. waits: whether there is an utterance that was not found yet.
+        loudest: mean square of the reference's loudest hop. waits: whether there is an utterance that was not found yet.
         """
+        power, brought = float(np.dot(mic, mic)), float(np.dot(explained, explained))
+        if state == "locked" and brought > 0.1 * self._hop * loudest:
+            self._heard = True
+            self._gain += LEARNING * (min(power / brought, 2.0 * self._gain) - self._gain)
         if not waits:
             self._since = 0
             return False
-        longest = LONGEST if gain is not None else np.inf
-        if gain is None:
-            gain, loudest = self._calibrated, max(loudest, USUAL)
-        least = max(LOUD * self._hop * loudest, EXPLAINED * float(np.dot(explained, explained)))
-        if self._since or float(np.dot(mic, mic)) > gain * least:
+        least = LOUD * self._hop * (loudest if self._heard else max(loudest, USUAL))
+        if self._since or power > self._gain * max(least, EXPLAINED * brought):
             self._since += self._hop
-        return 0 < self._since <= longest
+        return 0 < self._since <= (LONGEST if self._heard else np.inf)
