@@ -49,8 +49,8 @@ class Frame(NamedTuple):
     mic, reference, echo, error: (bins,) complex64. reference is delayed to where the robot's voice arrives at the
     microphone, echo is the linear stage's estimate of it, error = mic - echo. noise_psd, residual_psd: (bins,) float32,
     expected |spectrum|^2 of the noise and of the residual echo in error. idle: whether nothing of the robot can be
-    audible. at_any_lag: whether the robot may be audible at a lag that nobody knows, so that all that exceeds the noise may
-    be its voice.
+    audible. at_any_lag: whether the robot may be audible at a lag that nobody knows, so that nothing tells its voice
+    from a human's.
     """
 
     mic: Spectrum

@@ -126,10 +126,7 @@ class Crnn:
         heard = _power(frame.mic)
         mic, reference = mic.after(heard), reference.after(_power(frame.reference))
         scale = mic.factor(LOUD[0])
-        told, told_scale = frame.reference, reference.factor(LOUD[1])
-        if frame.at_any_lag:  # of all lags the one at which the robot explains all that is heard
-            told, told_scale = frame.mic, mic.factor(LOUD[1])
-        places = self._run(frame._replace(reference=told), tensors, scale, told_scale)
+        places = self._run(frame, tensors, scale, reference.factor(LOUD[1]))
         human: Spectrum = places.spectrum * np.float32(1.0 / scale)
         if self._ss_helps:
             masked, mask = self._ss.step(frame, mask)

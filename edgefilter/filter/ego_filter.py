@@ -153,8 +153,7 @@ class EgoFilter:
 
         None before the first hop and with engines that do not judge it (all but crnn, unless the settings of barge-in
         have judge="network"): what stands above the robot's rest is not yet a human, so they give no events of speech
-        either. 0 while the robot
-        is heard before its reference comes.
+        either. 0 while nothing tells them from the robot, whose lag is not found yet or whose reference comes later.
         """
         return self._stream.speech_probability
 

@@ -164,8 +164,6 @@ class FrontEnd:
             x, r, e, error = self._spectra(mic, aligned.reference, linear.echo, linear.error)
             noise, residual = stage.residual.step(e, error, linear.uncertainty, added)
         at_any_lag, self._before = aligned.at_any_lag or self._before, aligned.at_any_lag  # a frame is two hops
-        if at_any_lag:
-            residual = np.maximum(residual, fourier.power(error) - noise)
         return Frame(x, r, e, error, noise, residual, aligned.state == "idle", at_any_lag), aligned
 
     def first_of(self, mic: Samples) -> Samples:

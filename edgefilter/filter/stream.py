@@ -10,6 +10,7 @@ import numpy as np
 from edgefilter.dsp.ring import Ring
 from edgefilter.dsp.stft import Synthesiser
 from edgefilter.engines.base import ClipEngine, Engine
+from edgefilter.engines.judged import judges_speech
 from edgefilter.engines.spectral_subtraction import noise_alone
 from edgefilter.errors import SignalError
 from edgefilter.filter.barge_in import INTERRUPTIONS, BargeIn, BargeInSettings, HumanJudge
@@ -219,20 +220,21 @@ class Stream:
         if engine.lookahead is None:
             self._collect(frame, engine)
             return np.zeros(0, np.float32)
-        output, self._state = engine.step(frame, self._state)
         if frame.at_any_lag:  # nothing tells a human from the robot
-            output = Output(noise_alone(frame), output.speech_probability)
+            output = Output(noise_alone(frame), 0.0 if judges_speech(engine) else None)
+        else:
+            output, self._state = engine.step(frame, self._state)
         if output.speech_probability is not None:
             self._turns.step(output.spectrum, frame.error, self.front.errors)
-        self._judge_speech(output.speech_probability)
+        self._judge_speech(output.speech_probability, frame.at_any_lag)
         self.front.hear(frame, output, self.speech_probability, self.human_speaks)
         return self._synthesiser.push(output.spectrum)
 
-    def _judge_speech(self, probability: float | None) -> None:
+    def _judge_speech(self, probability: float | None, at_any_lag: bool) -> None:
         self.speech_probability = probability
         wait = 0
         if probability is not None:
-            suspect = self._watch is not None and self._watch.suspect
+            suspect = at_any_lag or (self._watch is not None and self._watch.suspect)
             wait = self._watch.wait // self.engine.stft.hop if self._watch else 0
             self.speech_probability = self._judge.step(probability, suspect)
         if talk := self._barge_in.note(self.speech_probability, wait):
