@@ -27,8 +27,9 @@ class Aligned(NamedTuple):
     or nan. "unfound": it should have been heard by now, whatever its lag, and was not found: the lag is uncertain,
     delay as in "begun". "coarse": no sharp arrival was found yet, the delay is known to within 25 ms; the reference
     is early by as much. "lost": it was found, but the last looks did not see it, beside a loud human or after a jump;
-    delay is carried on, with its drift. "locked": it was found and its delay is followed. at_any_lag: an utterance may
-    arrive now at a lag that nobody knows: it was not found so far, and no delay is known, or the one of before was refuted.
+    delay is carried on, with its drift. "locked": it was found and its delay is followed. at_any_lag: what is heard
+    may be an utterance at a lag that nobody knows: it was not found so far, and no delay is known, or the one of before was
+    refuted; of a calibrated robot, what is heard is too loud for anybody else (first_sounds.py).
     """
 
     reference: Samples
