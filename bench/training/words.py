@@ -29,6 +29,7 @@ from edgefilter.engines.base import Engine, EngineState, FrontEndKind
 from edgefilter.engines.crnn import Crnn
 from edgefilter.engines.linear import Linear
 from edgefilter.engines.spectral_subtraction import SpectralSubtraction
+from edgefilter.engines.step import step
 from edgefilter.errors import UsageError
 from edgefilter.filter.stream import Stream
 from edgefilter.profile.data import Profile
@@ -119,7 +120,7 @@ def answer(engine: Engine, given: list[Frame], samples: int) -> Samples:
     """Output of a stream with this engine, (samples,)."""
     state, voice, hops = engine.initial_state(), Synthesiser(engine.stft), []
     for frame in given:
-        output, state = engine.step(frame, state)
+        output, state = step(engine, frame, state)
         hops.append(voice.push(output.spectrum))
     return np.concatenate(hops)[engine.stft.window_length - engine.stft.hop :][:samples]
 

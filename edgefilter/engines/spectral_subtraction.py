@@ -9,7 +9,7 @@ import numpy as np
 from edgefilter.dsp import fourier
 from edgefilter.dsp.stft import StftConfig
 from edgefilter.engines.base import FrontEndKind
-from edgefilter.types import Frame, Output, Samples, Spectrum
+from edgefilter.types import Frame, Output, Samples
 
 FLOOR = 0.18
 """Least gain, -15 dB: it keeps the noise natural and loses no words."""
@@ -40,9 +40,3 @@ class SpectralSubtraction:
         wanted = MEMORY * state + (1.0 - MEMORY) * np.maximum(observed - unwanted, 0.0)
         gain = np.maximum(wanted / (wanted + unwanted), FLOOR)
         return Output(gain * frame.error), gain * gain * observed
-
-
-def noise_alone(frame: Frame) -> Spectrum:
-    """Of the error no more than FLOOR of the noise, (bins,)."""
-    power = fourier.power(frame.error)
-    return FLOOR * np.sqrt(np.minimum(frame.noise_psd, power) / (power + fourier.TINY)) * frame.error

@@ -10,8 +10,7 @@ import numpy as np
 from edgefilter.dsp.ring import Ring
 from edgefilter.dsp.stft import Synthesiser
 from edgefilter.engines.base import ClipEngine, Engine
-from edgefilter.engines.judged import judges_speech
-from edgefilter.engines.spectral_subtraction import noise_alone
+from edgefilter.engines.step import step
 from edgefilter.errors import SignalError
 from edgefilter.filter.barge_in import INTERRUPTIONS, BargeIn, BargeInSettings, HumanJudge
 from edgefilter.filter.front_end import FrontEnd
@@ -20,7 +19,7 @@ from edgefilter.filter.reference_watch import ReferenceWatch
 from edgefilter.filter.stepping import Stepping
 from edgefilter.filter.turns import LONGEST_S, Turns, drop_sound
 from edgefilter.profile.data import Profile
-from edgefilter.types import SAMPLE_RATE, Event, EventKind, Frame, Output, Samples, Turn, as_microphones, as_samples
+from edgefilter.types import SAMPLE_RATE, Event, EventKind, Frame, Samples, Turn, as_microphones, as_samples
 
 
 class Stream:
@@ -220,10 +219,7 @@ class Stream:
         if engine.lookahead is None:
             self._collect(frame, engine)
             return np.zeros(0, np.float32)
-        if frame.at_any_lag:  # nothing tells a human from the robot
-            output = Output(noise_alone(frame), 0.0 if judges_speech(engine) else None)
-        else:
-            output, self._state = engine.step(frame, self._state)
+        output, self._state = step(engine, frame, self._state)
         if output.speech_probability is not None:
             self._turns.step(output.spectrum, frame.error, self.front.errors)
         self._judge_speech(output.speech_probability, frame.at_any_lag)
