@@ -5,7 +5,7 @@ from __future__ import annotations
 from edgefilter.diagnosis.passport import Passport
 from edgefilter.report.text import sentence
 
-ERROR_DB = 2.3, 8.6
+ERROR_DB = 2.3, 8.4
 """Of the predicted SI-SDR, median and worst of 34 humans on 7 real devices, three engines: bench/results/passport.md."""
 DRIFTS_PPM = 50.0
 """Clocks further apart than this share no crystal: those of one sound card agree to 1 ppm, two cheap ones to 100."""
