@@ -64,7 +64,7 @@ class Aligner:
     def __init__(self, hop: int, profile: Profile | None = None, max_lag_s: float = MOST_LAG_S) -> None:
         self.hop = hop
         self._max_lag = int((max_lag_s + 0.1) * SAMPLE_RATE)
-        self._latest = self._max_lag + SAMPLE_RATE // 4  # samples from the begin of an utterance until it is heard
+        self._latest = self._max_lag + SAMPLE_RATE // 4  # samples from the beginning of an utterance until it is heard
         further = profile.array.responses if profile and profile.array else ()
         self._calibrated = None if profile is None else [profile.echo.impulse_response, *further]
         self._first = FirstSounds(hop, profile.echo.running_response()) if profile else None
@@ -387,9 +387,11 @@ class Aligner:
             self._open.append(Utterance(self._ref.end, self._ref.end, nearby=NEARBY_SEARCHES, lost=True))
 
     def _deliver(self, mic: Samples, before: float, switched: bool) -> Aligned:
+        state = self._state()
         if not (self._known or self._coarse):
             nothing = self.history(self.hop)
-            return Aligned(nothing, float("nan"), 0.0, 0.0, self._state(), switched, self._at_any_lag(mic, nothing))
+            anywhere = self._at_any_lag(mic, nothing, state)
+            return Aligned(nothing, float("nan"), 0.0, 0.0, state, switched, anywhere)
         self._read_at = max(self._drift.delay - self._margin, 0.0)
         end = self._ref.end
         start = self._read_at - self._drift.slope * self.hop if switched else before
@@ -403,10 +405,10 @@ class Aligner:
         if self._refuted:
             reference = np.zeros(self.hop, np.float32)
         ppm = -1e6 * self._drift.slope
-        anywhere = self._at_any_lag(mic, reference)
-        return Aligned(reference, self._drift.delay, ppm, self._confidence, self._state(), switched, anywhere)
+        anywhere = self._at_any_lag(mic, reference, state)
+        return Aligned(reference, self._drift.delay, ppm, self._confidence, state, switched, anywhere)
 
-    def _at_any_lag(self, mic: Samples, reference: Samples) -> bool:
+    def _at_any_lag(self, mic: Samples, reference: Samples, state: AlignmentState) -> bool:
         """What `Aligned` says of it, for a hop of the microphone and the reference at the delay of before.
 
         Never after an utterance that failed to arrive: the loudspeaker may be muted, or be headphones.
@@ -417,7 +419,7 @@ class Aligner:
         if self._first is None:
             return waits and self._onsets.varies and (self._refuted or not self._known)
         waits = waits or self._expected is not None
-        return self._first.step(mic, reference, self._onsets.peak, self._state(), waits)
+        return self._first.step(mic, reference, self._onsets.peak, state, waits)
 
     def _cannot_be(self, mic: Samples) -> bool:
         """Whether the microphone holds 10 dB less than the reference at the old delay would bring there."""

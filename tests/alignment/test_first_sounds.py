@@ -44,6 +44,7 @@ def test_the_robot_is_recognised_until_its_lag_is_found(lags, calibrated):
     explained = np.array([np.dot(aligned.reference, aligned.reference) for aligned in found])
     burst = (power > 0.1 * power.max()) & (explained < 0.01 * explained.max()) & begun
     second = np.arange(power.size) > power.size // 2
+    # without a calibration a shorter lag is not expected: what comes before the old delay may be a human as loud as the robot
     for part in (second, ~second) if calibrated or lags[1] > lags[0] else (~second,):
         assert np.any(burst & part)
         assert np.sum(power[burst & part & ~anywhere]) < 0.1 * np.sum(power[burst & part])
