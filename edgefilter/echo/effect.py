@@ -68,20 +68,17 @@ class Effect:
     memory: samples of the past that apply needs, 0 for none: on a stream it is given so many at every hop. None where
     that is not known, or too much: then the running filter asks run(), or tries how many are enough (echo/running.py).
     run_note: a sentence on what the running filter makes of the effect, where that is not what apply does.
-    scales_fan: whether the fan gets the same gain as the voice. event: whether the values belong to one recording
-    (moments, a gain's curve) rather than to the robot: they get a parameter RECORDING besides their own, and in other
-    recordings the effect is left out. lengthens: whether it is what makes a path longer than a recording teaches it at
-    first. followed: whether the running filter follows it by itself, as its aligner does a drift, so that a fit of others takes
-    it out of the recording first (diagnosis/joint.py); it does not ask for the variance() of one that it follows.
+    event: whether the values belong to one recording (moments, a gain's curve) rather than to the robot: they get a
+    parameter RECORDING besides their own, and in other recordings the effect is left out. followed: whether the running
+    filter follows it by itself, as its aligner does a drift, so that a fit of others takes it out of the recording first
+    (diagnosis/joint.py); it does not ask for the variance() of one that it follows.
 
     What the diagnosis asks:
     family: what kind of change it is. title: as it reads inside a sentence ("a turned volume"); by default the name.
     complexity: of two effects that explain about as much the lower one is named; from 4 on it is a long filter, which
     half a minute does not teach. cost: of a fit, in quarters of a second. flexible: whether it has so many numbers that
-    it takes up what a simpler effect beside it does. learned: whether it is fitted anew to what the running filter hears.
-    shown_by: recordings in which it differs from effects without them (diagnosis/advice.py). shows_in_silence: whether the
-    robot's silences tell it together with the voice, so that it is looked for before the search and behind it
-    (diagnosis/noise_change.py), not in it.
+    it takes up what a simpler effect beside it does. shown_by: recordings in which it differs from effects without them
+    (diagnosis/advice.py).
     """
 
     name: ClassVar[str]
@@ -90,9 +87,7 @@ class Effect:
 
     memory: ClassVar[int | None] = None
     run_note: ClassVar[str] = ""
-    scales_fan: ClassVar[bool] = False
     event: ClassVar[bool] = False
-    lengthens: ClassVar[bool] = False
     followed: ClassVar[bool] = False
 
     family: ClassVar[Family] = "of your own"
@@ -100,9 +95,7 @@ class Effect:
     complexity: ClassVar[int] = 3
     cost: ClassVar[int] = 1
     flexible: ClassVar[bool] = False
-    learned: ClassVar[bool] = False
     shown_by: ClassVar[tuple[Experiment, ...]] = ()
-    shows_in_silence: ClassVar[bool] = False
 
     def apply(self, x: Samples, values: Values, sample_rate: int) -> Samples:
         """The signal (n,) after the effect; x is not written to.
@@ -175,6 +168,29 @@ class Effect:
     def absorbed(self) -> bool:
         """Whether a linear path that is fitted to a recording holds the effect already."""
         return self.family == "linear path" and not self.event
+
+    @property
+    def scales_fan(self) -> bool:
+        """Whether the fan gets the same gain as the voice: what changes with time behind the microphone is a gain of all that it hears."""
+        return self.stage == "microphone" and self.event
+
+    @property
+    def shows_in_silence(self) -> bool:
+        """Whether the robot's silences tell it together with the voice: a gain by level behind the microphone, which the fan goes through as well.
+
+        It is looked for before the search and behind it (diagnosis/noise_change.py), not in it.
+        """
+        return self.stage == "microphone" and self.family == "dynamics" and not self.event
+
+    @property
+    def lengthens(self) -> bool:
+        """Whether it makes a path longer than a recording teaches it at first: a filter of many taps that shows in the silence after a word."""
+        return self.flexible and "tail" in self.shown_by
+
+    @property
+    def learned(self) -> bool:
+        """Whether the running filter fits it anew to what it hears: the curve of a loudspeaker."""
+        return self.stage == "source" and self.family == "static nonlinearity"
 
     @property
     def adds_noise(self) -> bool:

@@ -46,7 +46,6 @@ class LateReverb(Effect):
     family: ClassVar[Family] = "linear path"
     title: ClassVar[str] = "late reverberation"
     shown_by: ClassVar[tuple[Experiment, ...]] = ("sweep", "tail", "place")
-    lengthens: ClassVar[bool] = True
     complexity: ClassVar[int] = 4
     flexible: ClassVar[bool] = True
     parameters: ClassVar[tuple[Parameter, ...]] = (

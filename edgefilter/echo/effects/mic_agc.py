@@ -61,7 +61,6 @@ class MicAgc(Effect):
     event: ClassVar[bool] = True
     complexity: ClassVar[int] = 1
     flexible: ClassVar[bool] = True
-    scales_fan: ClassVar[bool] = True
     parameters: ClassVar[tuple[Parameter, ...]] = (
         Parameter("gain_db", "dB", 0.0, -60.0, 60.0),
         Parameter("knots_hz", "1/s", KNOTS_HZ, 0.01, 1000.0),

@@ -66,7 +66,6 @@ class NoiseSuppression(Effect):
     )
     title: ClassVar[str] = "noise suppression"
     complexity: ClassVar[int] = 2
-    shows_in_silence: ClassVar[bool] = True
     parameters: ClassVar[tuple[Parameter, ...]] = (
         Parameter("gain_db", "dB", 0.0, -60.0, 12.0),
         Parameter("fan_db", "dB re full scale^2/Hz", -200.0, -200.0, 0.0, given=True),

@@ -44,7 +44,6 @@ class SpeakerNonlinearity(Effect):
     cost: ClassVar[int] = 4
     shown_by: ClassVar[tuple[Experiment, ...]] = ("levels", "tone")
     flexible: ClassVar[bool] = True
-    learned: ClassVar[bool] = True
     memory: ClassVar[int | None] = MOTION_TAPS
     parameters: ClassVar[tuple[Parameter, ...]] = (
         *(Parameter(name, "1", 0.0, -BOUND, BOUND) for name in (*DRIVER, *AMPLIFIER)),
