@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import signal
 
+from edgefilter.audio import virtual
 from edgefilter.audio.device import input_port, output_port
 from edgefilter.audio.lookup import Device
 from edgefilter.audio.port import START_S, STREAM_LATENCY_S, InputPort, OutputPort, clock, pause
@@ -32,9 +33,10 @@ def play_and_record(
     never seems to arrive before it is played. Silence goes first, since sound servers swallow a stream's start.
     latency_s: the buffers asked of the sound system; the larger, the fewer holes. tell: called again and again with the
     seconds that are left. channels: numbers, from 0, of the microphone's channels that are wanted in place of their mean.
-    Raises DeviceError where a device cannot be opened or stops.
+    Raises DeviceError where a device cannot be opened or stops, UsageError for the virtual microphone, which hears nothing.
     """
     mic = input_port(microphone, latency_s, channels)
+    virtual.refuse_own(mic.device)
     lead = np.zeros(round((latency_s + STREAM_LATENCY_S) * SAMPLE_RATE), np.float32)
     played = np.concatenate((lead, samples))
     speaker = _holding(output, played, latency_s)

@@ -12,7 +12,7 @@ INPUTS = ["alsa_input.usb-Acme", "edgefilter_speaker.monitor", "edgefilter_human
 @pytest.fixture
 def served(plug, monkeypatch):
     """A sound server with the virtual devices, whose default microphone is the virtual one."""
-    plug(VirtualDevice("pulse", "input"), VirtualDevice("HDA Intel", "input"))
+    plug(VirtualDevice("pulse", "input"), VirtualDevice("HDA Intel", "input"), VirtualDevice("HDA Intel", "output"))
     monkeypatch.setattr(pulse, "names", lambda kind: INPUTS if kind == "input" else [])
     monkeypatch.setattr(pulse, "default_name", lambda kind: "edgefilter_mic")
 
@@ -27,6 +27,13 @@ def test_the_filters_own_output_is_refused_as_its_microphone_by_any_part_of_its_
     said = "".join(capsys.readouterr())
     assert "is edgefilter's own output" in said and "set-default-source" in said
     assert command == "run" or "failed   microphone" in said
+
+
+def test_a_measurement_is_not_recorded_from_the_filters_own_output(served, tmp_path, capsys):
+    live = ["calibrate", "--live", "--speaker", "hda", "--input", "filter mic", "--output", str(tmp_path / "robot.npz")]
+    assert main(live) != 0
+    assert "is edgefilter's own output" in "".join(capsys.readouterr())
+    assert not (tmp_path / "robot.npz").exists()
 
 
 @pytest.mark.parametrize("typed", ["acme", "hda", "1"])
