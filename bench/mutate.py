@@ -6,8 +6,9 @@ A mutant is a module of edgefilter/FOLDER with one operator, number, condition, 
 drawn at random, each as often as any other, then one of cosmic-ray's replacements there; annotations, which do nothing
 while a program runs, are left out. A mutant is killed where a test of tests/FOLDER fails, or takes longer than three
 times what all of them take; files of tests that name the module come first, slow tests last. Everything happens in
-copies of the checkout. The same seed draws the same mutants as long as the code is the same: `--again` tries those alone
-that survived in OUTPUT.json, after tests were added. Needs cosmic-ray: pip install cosmic-ray.
+copies of the checkout. A run that was stopped goes on where it was: outcomes are kept in --cache by code and tests. The
+same seed draws the same mutants as long as the code is the same: `--again` tries those alone that survived in OUTPUT.json,
+after tests were added. Needs cosmic-ray: pip install cosmic-ray.
 """
 
 from __future__ import annotations
@@ -30,6 +31,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from bench import results
+from bench.cache import Cache, key_of
 from bench.metrics import wilson
 from bench.recordings import progress
 from edgefilter.errors import UsageError
@@ -74,10 +76,17 @@ def run(options: argparse.Namespace) -> str:
     drawn = sample(folders, options.count, options.seed)
     outcomes = _survived(options.output, drawn) if options.again else {}
     missing = [mutant for mutant in drawn if outcomes.get(mutant, "survived") == "survived"]
+    cache, code = Cache(options.cache, "mutants"), {folder: code_of(folder) for folder in folders}
+
+    def limit_of(folder: str) -> float:
+        return cache.get(lambda: baseline_s(free, folder), "limit", code[folder])
+
+    def outcome_of(mutant: Mutant) -> str:
+        return cache.get(lambda: attempt(free, mutant, limits[mutant.folder]), "outcome", code[mutant.folder], mutant)
+
     with copies(options.jobs) as free, ThreadPoolExecutor(options.jobs) as pool:
-        limits = dict(zip(folders, pool.map(lambda folder: baseline_s(free, folder), folders), strict=True))
-        tried = pool.map(lambda mutant: attempt(free, mutant, limits[mutant.folder]), missing)
-        outcomes |= dict(zip(missing, progress_of(tried, len(missing)), strict=True))
+        limits = dict(zip(folders, pool.map(limit_of, folders), strict=True))
+        outcomes |= dict(zip(missing, progress_of(pool.map(outcome_of, missing), len(missing)), strict=True))
     rows = [{**asdict(mutant), "outcome": outcomes[mutant]} for mutant in drawn]
     survivors = [row for row in rows if row["outcome"] == "survived"]
     tables = [
@@ -183,6 +192,12 @@ def copies(count: int) -> Iterator[queue.Queue[Path]]:
             shutil.copytree(results.ROOT, copy, ignore=shutil.ignore_patterns(*LEFT_OUT), symlinks=True)
             free.put(copy)
         yield free
+
+
+def code_of(folder: str) -> str:
+    """What an outcome depends on: the package and the folder's tests."""
+    files = [path for part in ("edgefilter", f"tests/{folder}") for path in sorted((results.ROOT / part).rglob("*.py"))]
+    return key_of(*(path.read_bytes() for path in files))
 
 
 def baseline_s(free: queue.Queue[Path], folder: str) -> float:

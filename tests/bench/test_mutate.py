@@ -63,8 +63,13 @@ def test_what_a_test_notices_is_killed_and_what_none_does_survives(
     checkout: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     output = tmp_path / "mutate"
-    command = ["mutate", "--modules", "alignment", "--count", "4", "--jobs", "2", "--output", str(output)]
+    known = tmp_path / "cache" / "mutants.jsonl"
+    kept = ["--cache", str(known.parent), "--output", str(output)]
+    command = ["mutate", "--modules", "alignment", "--count", "4", "--jobs", "2", *kept]
     assert bench.main(command) == 0
+    tried = known.read_text()
+    assert bench.main(command) == 0
+    assert known.read_text() == tried  # nothing is tried twice: a run that was stopped goes on
     part = json.loads(output.with_suffix(".json").read_text())["parts"]["mutate"]
     assert {(row["line"], row["outcome"]) for row in part["mutants"]} == {(5, "killed"), (9, "survived")}
     page = output.with_suffix(".md").read_text()
