@@ -7,10 +7,11 @@ from typing import Literal
 
 import numpy as np
 
+from edgefilter.alignment.aligner import COARSE_MARGIN
 from edgefilter.alignment.delay_line import Aligned, Tape
 from edgefilter.alignment.lag_search import CERTAIN, WINDOW, LagSearch
 from edgefilter.alignment.utterances import FLOOR, OnsetDetector
-from edgefilter.types import SAMPLE_RATE, EventKind, Samples
+from edgefilter.types import PRE_ROLL, SAMPLE_RATE, EventKind, Samples
 
 LATEST = SAMPLE_RATE
 """Samples by which a reference may be late and is still recognised as such."""
@@ -43,7 +44,9 @@ class ReferenceWatch:
     """Looks at both channels beside the aligner, hop by hop, and says once what is wrong with the reference.
 
     The aligner finds echoes that come after the reference. Here each utterance that it has not found is looked for in
-    what the microphone heard before, in the same way with the channels exchanged. hop: samples a step.
+    what the microphone heard before, in the same way with the channels exchanged. A robot often says what resembles an
+    earlier utterance, whose echo the microphone may still hear: so what is found there must not be found as well, at the
+    same lag, in the reference that the aligner has delayed. hop: samples a step.
 
     verdict: "unknown" until an utterance was found by either, or by neither for long; "fits" and "late" then.
 
@@ -55,7 +58,7 @@ class ReferenceWatch:
     def __init__(self, hop: int) -> None:
         self._hop = hop
         self._search = LagSearch(LATEST)
-        self._mic, self._ref = Tape(self._search.span), Tape(self._search.span)
+        self._mic, self._ref, self._earlier = (Tape(self._search.span) for _ in range(3))
         self._onsets = OnsetDetector(hop)
         self.verdict: Verdict = "unknown"
         self._late = self._stage = self._looks = 0
@@ -88,6 +91,7 @@ class ReferenceWatch:
         """
         self._mic.push(mic)
         self._ref.push(ref)
+        self._earlier.push(aligned.reference)
         started = self._onsets.step(ref)
         if started:
             self._stage, self._to_search, self._looks = 0, SEARCH_STRIDE, 0
@@ -110,23 +114,24 @@ class ReferenceWatch:
         if not self._onsets.active:
             return []
         self._to_search -= self._hop
-        now, stage, self._stage = self._ref.end, self._stage, 0
+        stage, self._stage = self._stage, 0
         if stage == 0:
             found_by_aligner = aligned.state in ("locked", "coarse", "lost") and self.verdict == "fits"
             if self._to_search > 0 or found_by_aligner:
                 return []
             self._to_search, self._stage = SEARCH_STRIDE, 1
-            self._search.prepare(self._mic, now, self._onsets.current.start - LATEST)
+            self._prepare(self._mic)
         elif stage == 1:
             self._stage = 2
-            self._search.listen({0: self._ref}, now, max(self._onsets.current.start, now - WINDOW))
+            self._listen()
         elif stage == 2:
             return self._decide(aligned)
         return []
 
     def _decide(self, aligned: Aligned) -> list[tuple[EventKind, str]]:
         found = self._search.find()
-        if found is None or found.strength * found.ratio <= CERTAIN or found.lag < ARRIVES:
+        sure = found is not None and found.strength * found.ratio > CERTAIN and found.lag >= ARRIVES
+        if found is None or not sure or self._resembles_earlier(found.lag):
             self._looks += 1
             if self._looks >= IN_VAIN and (self.verdict == "unknown" or aligned.state == "locked"):
                 self.verdict = "fits"
@@ -143,6 +148,25 @@ class ReferenceWatch:
                 " microphone later",
             )
         ]
+
+    def _resembles_earlier(self, lag: int) -> bool:
+        """Whether the utterance resembles what the aligner says is heard of an earlier one, about that many samples before.
+
+        The aligned reference comes somewhat before its echo.
+        """
+        self._prepare(self._earlier)
+        self._listen()
+        found = self._search.find()
+        return found is not None and abs(found.lag - lag) <= COARSE_MARGIN + PRE_ROLL
+
+    def _prepare(self, tape: Tape) -> None:
+        """Look in what that holds from LATEST before the utterance on."""
+        self._search.prepare(tape, self._ref.end, self._onsets.current.start - LATEST)
+
+    def _listen(self) -> None:
+        """Look for the utterance."""
+        now = self._ref.end
+        self._search.listen({0: self._ref}, now, max(self._onsets.current.start, now - WINDOW))
 
     def _weigh(self, power: float, aligned: Aligned) -> str:
         """Compare the microphone while the reference is found nowhere with the microphone while it is silent."""

@@ -9,6 +9,7 @@ import soundfile
 import edgefilter
 from edgefilter import EgoFilter
 from edgefilter.filter.barge_in import BargeIn
+from edgefilter.profile.data import Profile
 from edgefilter.types import SET_UP_WRONG
 
 DEMO = Path(edgefilter.__file__).parent / "demo_data"
@@ -50,6 +51,19 @@ def test_a_reference_in_time_is_said_nothing_of_and_the_human_is_noticed_as_befo
     assert not {event.kind for event in found} & set(SET_UP_WRONG)
     (began,) = (event for event in found if event.kind == "speech_started")
     assert 9.1 < began.sample / RATE < 9.6
+
+
+def test_a_sentence_said_again_while_its_first_echo_still_sounds_is_no_late_reference(robot):
+    _, ref = robot
+    sentence, pause = ref[RATE : RATE + 25_600], np.zeros(6_400, np.float32)
+    said = np.concatenate(
+        (pause, *(part for _ in range(4) for part in (sentence, pause)), np.zeros(2 * RATE, np.float32))
+    )
+    fan = 1e-4 * np.random.default_rng(0).standard_normal(said.size).astype(np.float32)
+    profile = Profile.load(DEMO / "profile.npz")
+    found = events(EgoFilter(profile, "linear"), later(profile.echo.predict(said), 19_200) + fan, said)
+    assert "realigned" in {event.kind for event in found}
+    assert not {event.kind for event in found} & set(SET_UP_WRONG)
 
 
 def test_a_late_reference_that_is_mended_is_forgotten(robot):
