@@ -13,7 +13,7 @@ from edgefilter.alignment.delay_line import HALF_WIDTH, Aligned, Tape, kernel_ta
 from edgefilter.alignment.delay_tracker import REACH, STRIDE, DelayMeasurement, DelayMeter
 from edgefilter.alignment.drift_filter import DriftFilter
 from edgefilter.alignment.first_sounds import FirstSounds
-from edgefilter.alignment.jumps import DRIFTED, SMALL, JumpWitness, judge
+from edgefilter.alignment.jumps import DRIFTED, SMALL, JumpWitness, where_seen
 from edgefilter.alignment.lag_search import (
     BETWEEN,
     CERTAIN,
@@ -328,20 +328,20 @@ class Aligner:
         found = self._meter.measure(
             self._mics[self._used[0]], self._ref, self._ref.end, self._drift.delay, self._drift.slope, self._segments
         )
-        return found is not None and self._judge(found)
+        return found is not None and self._take_look(found)
 
-    def _judge(self, found: DelayMeasurement) -> bool:
+    def _take_look(self, found: DelayMeasurement) -> bool:
         """Take a look into account; True if the delay was switched."""
         reach = (2 * self._segments + 1) * REACH
-        verdict = judge(found, self._drift.surprise(found), found.gain if self._gain is None else self._gain, reach)
-        if verdict == "there":
+        seen = where_seen(found, self._drift.surprise(found), found.gain if self._gain is None else self._gain, reach)
+        if seen == "there":
             return self._accept(found)
-        if verdict == "drowned":
+        if seen == "drowned":
             return False
         if self._coarse:  # without an arrival there is nothing to see until what is heard around this delay is learned
             self._meter.confirm(0.0)
             return False
-        if verdict == "elsewhere":
+        if seen == "elsewhere":
             if self._witness.convinced(found):
                 return self._accept(found) if abs(found.offset) < DRIFTED else self._jump(found.offset)
             self._to_measure = STRIDE // 2

@@ -26,7 +26,7 @@ EXPECTED, UNLIKELY, TINY = 3.0, 5.0, 0.3
 samples of error that are drift whatever the surprise."""
 
 
-def judge(found: DelayMeasurement, surprise: float, gain: float, reach: int) -> str:
+def where_seen(found: DelayMeasurement, surprise: float, gain: float, reach: int) -> str:
     """Whether a look saw the robot where it was expected.
 
     "there": it did. "elsewhere": it saw it at another delay, if others agree. "unseen": not at all. "drowned": somebody

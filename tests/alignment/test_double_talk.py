@@ -30,7 +30,7 @@ def look(offset, evidence=30.0, explained=0.1, gain=0.3):
 def see(aligner, delay, *more, **others):
     """The aligner's next look, which sees this delay."""
     aligner._drift.advance(STRIDE)
-    aligner._judge(look(delay - aligner._drift.delay, *more, **others))
+    aligner._take_look(look(delay - aligner._drift.delay, *more, **others))
 
 
 def followed(aligner):
