@@ -183,6 +183,22 @@ def test_what_a_users_class_says_of_itself_is_kept(write):
     assert tilt.settled({"amount": 1.0}) == {"amount": 0.25} and tilt.sentence({"amount": 1.0}) == ""
 
 
+@pytest.mark.parametrize(
+    ("said", "follows"),
+    [
+        ("stage, event = 'microphone', True", "scales_fan"),
+        ("stage, family = 'microphone', 'dynamics'", "shows_in_silence"),
+        ("stage, family = 'source', 'static nonlinearity'", "learned"),
+        ("stage, flexible, shown_by = 'path', True, ('tail',)", "lengthens"),
+        ("stage = 'microphone'", ""),
+    ],
+)
+def test_what_follows_from_the_kind_of_a_users_effect(write, said, follows):
+    load_effect(write(GOOD.replace('stage = "path"', said)))
+    marks = ("scales_fan", "shows_in_silence", "learned", "lengthens")
+    assert [mark for mark in marks if getattr(find("tilt"), mark)] == [follows] * bool(follows)
+
+
 def documented_file(folder: Path) -> Path:
     """The example of the documentation, as a file of the name that it says."""
     (code,) = re.findall(r"```python\n(\"\"\"blade_chop.py.*?)```", DOCUMENT.read_text(), re.S)
