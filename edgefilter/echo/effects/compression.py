@@ -10,7 +10,6 @@ import scipy
 
 from edgefilter.echo.effect import Effect, Experiment, Family, Parameter, Runner, Stage, complete, first, neutral
 from edgefilter.echo.effects.gain_fit import GainFit, Reach
-from edgefilter.echo.evidence import Evidence
 from edgefilter.echo.measurement import Measurement, Values, VoiceModel
 from edgefilter.types import SAMPLE_RATE, Array, Samples
 
@@ -86,10 +85,6 @@ class Compression(Effect):
             f"the voice is turned down when it has been loud: above {first(values, 'threshold_db'):.0f} dB "
             f"by {first(values, 'ratio'):.1f} to 1, while the fan is as loud as ever"
         )
-
-    def plausible(self, evidence: Evidence) -> bool:
-        """The gain follows the level."""
-        return float(evidence.values["ratio"]) >= 1.1
 
 
 class Compressor:

@@ -9,7 +9,6 @@ import numpy as np
 from edgefilter.dsp.fractional_delay import delayed
 from edgefilter.echo.effect import Effect, Family, Parameter, Stage, complete, neutral
 from edgefilter.echo.effects.clock_drift import STEADY, robust_line
-from edgefilter.echo.evidence import Evidence
 from edgefilter.echo.lag_track import LagTrack, track_lag
 from edgefilter.echo.measurement import Measurement, Values, VoiceModel
 from edgefilter.types import PRE_ROLL, SAMPLE_RATE, Array, Samples
@@ -124,10 +123,6 @@ class DelayJump(Effect):
         times, samples = np.atleast_1d(values["times_s"]), np.atleast_1d(values["samples"])
         steps = ", ".join(f"{n:+.1f} samples at {t:.2f} s" for t, n in zip(times, samples, strict=True))
         return f"the lag is constant but for steps: {steps}"
-
-    def plausible(self, evidence: Evidence) -> bool:
-        """At least one step that is a step."""
-        return bool(np.any(np.abs(np.atleast_1d(np.asarray(evidence.values["samples"], float))) >= LEAST_JUMP))
 
 
 def _later(x: Samples, delay: float, start: int, stop: int) -> Samples:

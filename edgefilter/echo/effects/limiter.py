@@ -10,7 +10,6 @@ import numpy as np
 from edgefilter.echo.effect import Effect, Experiment, Family, Parameter, Runner, Stage, complete, first, neutral
 from edgefilter.echo.effects.compression import falling_peak
 from edgefilter.echo.effects.gain_fit import GainFit, Reach
-from edgefilter.echo.evidence import Evidence
 from edgefilter.echo.measurement import Measurement, Values, VoiceModel
 from edgefilter.types import SAMPLE_RATE, Array, Samples
 
@@ -26,8 +25,6 @@ REACH = Reach(
     highest=np.array([0.0, np.log(5000.0)]),
 )
 """Of ceiling in dB and release as a natural logarithm of ms."""
-LEAST_DB = 1.0
-"""By less a limiter that never lets go turns the volume."""
 
 
 class Limiter(Effect):
@@ -83,10 +80,6 @@ class Limiter(Effect):
             f" turned down by {first(values, 'taken_db'):.1f} dB, and the gain comes back in"
             f" {first(values, 'release_ms'):.0f} ms"
         )
-
-    def plausible(self, evidence: Evidence) -> bool:
-        """Some peaks are held down."""
-        return float(evidence.values["taken_db"]) >= LEAST_DB
 
 
 class PeakLimiter:

@@ -7,12 +7,8 @@ from typing import ClassVar
 import numpy as np
 
 from edgefilter.echo.effect import Effect, Family, Parameter, Stage, first
-from edgefilter.echo.evidence import Evidence
 from edgefilter.echo.measurement import Measurement, Values, VoiceModel, level_ratio
 from edgefilter.types import Samples
-
-LEAST_DB = 0.2
-"""A gain of less is no turned volume."""
 
 
 class PlaybackGain(Effect):
@@ -44,10 +40,6 @@ class PlaybackGain(Effect):
             f"the voice is {abs(gain_db):.2f} dB {'louder' if gain_db > 0 else 'softer'} at all frequencies and levels"
             " alike"
         )
-
-    def plausible(self, evidence: Evidence) -> bool:
-        """More than a gain differs from day to day."""
-        return abs(float(evidence.values["gain_db"])) >= LEAST_DB
 
     def plain_gain(self, gain_db: float) -> Values:
         """The effect is nothing else."""
