@@ -130,8 +130,12 @@ class ReferenceWatch:
 
     def _decide(self, aligned: Aligned) -> list[tuple[EventKind, str]]:
         found = self._search.find()
-        sure = found is not None and found.strength * found.ratio > CERTAIN and found.lag >= ARRIVES
-        if found is None or not sure or self._resembles_earlier(found.lag):
+        if (
+            found is None
+            or found.strength * found.ratio <= CERTAIN
+            or found.lag < ARRIVES
+            or self._resembles_earlier(found.lag)
+        ):
             self._looks += 1
             if self._looks >= IN_VAIN and (self.verdict == "unknown" or aligned.state == "locked"):
                 self.verdict = "fits"
