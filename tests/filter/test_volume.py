@@ -173,6 +173,13 @@ def test_a_suspicion_that_the_next_hops_do_not_share_turns_nothing() -> None:
     assert suspected and not turned and volume.gain == 1.0
 
 
+def test_a_suspicion_turns_nothing_where_the_next_hops_fit_the_old_volume_nearly() -> None:
+    echo = hops(0.3, 0)
+    loud = np.where(np.arange(len(echo)) < 2, 3.0, 1.1).astype(np.float32)[:, None]
+    volume, turned, suspected = turns(loud * echo, echo)
+    assert suspected and not turned and volume.gain == 1.0
+
+
 def test_an_echo_that_fits_again_is_let_through_at_once() -> None:
     echo = hops(0.5, 0)
     mic = np.concatenate((0.02 * hops(0.5, 1)[:10], 0.7 * echo[10:]))

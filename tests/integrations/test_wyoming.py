@@ -309,6 +309,12 @@ def test_channels_that_a_command_does_not_have_are_one_line(words, said, capsys)
     assert said in told and told.count("\n") == 1
 
 
+def test_a_microphones_command_is_mono_unless_it_says_otherwise(capsys):
+    command = ["--microphone", "true", "--loudspeaker", "true", "--engine", "linear", "--mic-channels", "1"]
+    assert main(command) == 1
+    assert "channel 1 is named, found 1" in capsys.readouterr().err
+
+
 def test_one_sigterm_ends_it_with_its_commands(endless_noise, player):
     ports = free_port(2)
     mic_uri, snd_uri = (f"tcp://127.0.0.1:{ports + i}" for i in range(2))
