@@ -72,7 +72,7 @@ def _fate(entry: Tried, found: Found, named: Collection[str]) -> tuple[Fate, str
     if entry.failed:
         return "not fitted", entry.failed
     if entry.spared:
-        return "not fitted", "a simpler effect leaves nothing to explain"
+        return "not fitted", "what is left is too little for it to be named"
     if entry.alone is None and entry.beside is None:
         return "below its bar", "its fit finds nothing"
     if entry.short:

@@ -21,8 +21,8 @@ class Criteria:
     # Shares of what there is to explain. 78 recordings of one or two hidden effects (52 and 26; voices of training and
     # validation) are named as well by these four as by fifteen numbers for a question each
     nearly: float = 0.85
-    """A simpler effect, or an earlier start, that explains this share of what the best one does is preferred: the richer model
-    fits its noise as well."""
+    """A simpler effect that explains this share of what a flexible one does is preferred, and so is an earlier start: a
+    flexible model takes up some of whatever is left."""
     half: float = 0.5
     """What all findings together explain at least of the excess, in level and in power: less is not what happened."""
     part: float = 0.2
@@ -66,8 +66,8 @@ class Criteria:
     heard_db: float = 0.6
     """Where it is no more than this above them, there is nothing beside the effects that were found, whose models err a
     little."""
-    most_cost: int = 480
-    """Sum of the costs of all fits, two minutes, after which no further one is made. Where that happens the diagnosis
+    most_cost: int = 100
+    """Sum of the costs of all fits, ten seconds, after which no further one is made. Where that happens the diagnosis
     says so."""
 
     # The verdict

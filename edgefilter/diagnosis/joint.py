@@ -54,7 +54,7 @@ def fit_straight(prepared: Prepared, wanted: Sequence[str]) -> tuple[EchoModel, 
 
 
 def _forward(bench: Workbench, model: EchoModel, wanted: Sequence[str]) -> tuple[EchoModel, list[str]]:
-    """The model with the wanted effects, and their order: always the simplest next of those that explain nearly most.
+    """The model with the wanted effects, and their order: always the simplest next of those that no other outdoes.
 
     In another order an effect settles on what the one after it should have explained. Last come those of which a fit to
     half of the recording finds nothing.

@@ -1,6 +1,6 @@
 """Stepwise selection of the effects that a profile lacks: forward, refit, backward, on held-out samples (Efroymson 1960).
 
-Forward: every effect is fitted beside those accepted so far, and the simplest of those that explain nearly most is
+Forward: every effect is fitted beside those accepted so far, and the simplest of those that no other outdoes is
 accepted. Refit: all are fitted beside each other. Backward: what the newest one has made superfluous is exchanged for
 something simpler, or dropped. Stepwise selection ends in local optima; so it is begun anew from the next best effects
 where the best one does not lead to an explanation.

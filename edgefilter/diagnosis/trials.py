@@ -51,7 +51,7 @@ class Tried:
     """What came of one effect in a search: beside the start alone, and beside what the search has found; None where it was not fitted.
 
     short: why it could not be named beside the start, empty where it could. failed: why its fit failed. spared: whether
-    it was not even fitted, since a simpler effect leaves nothing to explain.
+    it was not even fitted, since what is left is too little for it to be named.
     """
 
     name: str
@@ -109,7 +109,7 @@ class Workbench:
     def notes(self) -> tuple[str, ...]:
         """What could not be tried, and why."""
         spent = (
-            f"the search was stopped after fits of {self._cost / 4:.0f} s: something further may be in the recording"
+            f"the search was stopped after fits of {self._cost / 10:.0f} s: something further may be in the recording"
         )
         return (*self._failed.values(), *((spent,) if self._refused else ()))
 
@@ -146,8 +146,12 @@ class Workbench:
     def attempt(self, name: str, model: EchoModel) -> Trial | None:
         """The effect of that name fitted beside what the model has.
 
-        None where its fit finds nothing, or no further one may be made.
+        None where its fit finds nothing, where what the model leaves is too little for it to be named, or no further
+        fit may be made.
         """
+        if not self._in_reach(name, model):
+            self._spared.add(name)
+            return None
         key = signature(model), name
         if key not in self._trials:
             if self._cost >= self.criteria.most_cost:
@@ -156,6 +160,11 @@ class Workbench:
             self._trials[key] = self._alike[frozenset(dict(model.effects)), name] = self._attempt(name, model)
             self._cost += find(name).cost
         return self._trials[key]
+
+    def _in_reach(self, name: str, model: EchoModel) -> bool:
+        """Whether an effect could be named beside a model if it explained all that this leaves, over the silences or over the fan."""
+        most = max(self.left(model), self.score(model).over_db)
+        return p_value(name, most) <= self.criteria.false_rate
 
     def attempt_alike(self, name: str, model: EchoModel) -> Trial | None:
         """Return attempt(), or what came of it beside the same effects at other values: enough to choose what is worth a closer look."""
@@ -249,14 +258,16 @@ class Workbench:
         return (*found, *(Tried(name, None, None, spared=True) for name in spared))
 
     def preferred(self, trials: Iterable[Trial]) -> Trial | None:
-        """Of admissible trials the simplest of those that explain nearly as much as the best.
-
-        None where none lowers the level.
-        """
-        trials = list(trials)
-        most = max((trial.gain_db for trial in trials), default=0.0)
-        enough = [trial for trial in trials if most > 0.0 and trial.gain_db >= self.criteria.nearly * most]
+        """Of admissible trials the simplest of those that no other outdoes; None where none lowers the level."""
+        trials = [trial for trial in trials if trial.gain_db > 0.0]
+        enough = [one for one in trials if not any(self._outdoes(other, one) for other in trials)]
         return min(enough, key=lambda trial: (find(trial.name).complexity, -trial.gain_db), default=None)
+
+    def _outdoes(self, one: Trial, other: Trial) -> bool:
+        """Whether one explains more than another, by more than chance; a flexible one by more than it takes up of whatever is left."""
+        if find(one.name).flexible:
+            return other.gain_db < self.criteria.nearly * one.gain_db
+        return p_value(one.name, one.gain_db - other.gain_db) <= self.criteria.false_rate
 
     def absent(self, model: EchoModel, most: int) -> list[str]:
         """Names of the effects on the voice that a model has not, that may be tried and whose complexity is at most `most`."""

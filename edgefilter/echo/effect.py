@@ -76,7 +76,7 @@ class Effect:
     What the diagnosis asks:
     family: what kind of change it is. title: as it reads inside a sentence ("a turned volume"); by default the name.
     complexity: of two effects that explain about as much the lower one is named; from 4 on it is a long filter, which
-    half a minute does not teach. cost: of a fit, in quarters of a second. flexible: whether it has so many numbers that
+    half a minute does not teach. cost: of a fit, in tenths of a second. flexible: whether it has so many numbers that
     it takes up what a simpler effect beside it does. shown_by: recordings in which it differs from effects without them
     (diagnosis/advice.py).
     """

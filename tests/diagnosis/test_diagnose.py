@@ -190,6 +190,26 @@ def test_no_effect_is_chosen_where_none_lowers_the_level():
     )
 
 
+@pytest.mark.parametrize("by_db, chosen", [(0.002, "playback_gain"), (0.05, "limiter")])
+def test_an_effect_of_few_numbers_is_chosen_where_it_explains_more_than_by_chance(by_db, chosen):
+    bench, score = Workbench(prepare(profile(), record(voice(4.0)), voice(4.0)), Criteria()), verdict(1.0, 1.0)
+    simple, richer = (
+        Trial(name, {}, EchoModel(path()), score, gain_db)
+        for name, gain_db in (("playback_gain", 10.0), ("limiter", 10.0 + by_db))
+    )
+    assert bench.preferred([richer, simple]).name == chosen
+
+
+def test_what_ordinary_recordings_show_more_of_than_is_left_is_not_fitted():
+    bench = Workbench(prepare(profile(), record(voice(4.0)), voice(4.0)), Criteria())
+    left = replace(verdict(0.3, 0.3), cells=np.ones((bench.scorer.starts.size, bench.scorer.freedom.size)))
+    bench.score = lambda asked: left  # an ordinary loudspeaker's distortion explains twice as much
+    model = bench.prepared.model
+    assert bench.attempt("speaker_nonlinearity", model) is None
+    (row,) = bench.tried(model, model)
+    assert (row.name, row.spared, row.alone) == ("speaker_nonlinearity", True, None)
+
+
 def verdict(active_db: float, fitted_db: float) -> Score:
     return Score(
         active_db, active_db, active_db, active_db, 0.0, fitted_db, 0.0, np.ones((4, 4)), np.zeros(16000, np.float32)
@@ -213,3 +233,11 @@ def test_half_of_what_a_long_filter_leaves_where_it_was_fitted_is_enough(name, f
     bench, model = Workbench(found, Criteria()), EchoModel(path())
     bench.score = lambda asked: verdict(6.0, 2.5)
     assert bench.halves(Trial(name, {}, model, verdict(5.0, fitted_db), 0.5), model) is halved
+
+
+@pytest.mark.parametrize("active_db, halved", [(3.95, True), (3.98, False)])
+def test_half_of_the_power_over_the_fan_is_gone_from_6_dB_at_3_96(active_db, halved):
+    found = prepare(profile(), record(voice(4.0)), voice(4.0))
+    bench, model = Workbench(found, Criteria()), EchoModel(path())
+    bench.score = lambda asked: verdict(6.0, 2.0)
+    assert bench.halves(Trial("late_reverb", {}, model, verdict(active_db, 2.0), 0.5), model) is halved

@@ -87,4 +87,4 @@ def test_the_user_says_how_often_a_name_may_be_chance():
     assert (finding.effect, finding.family) == ("playback_gain", "linear path") and 1e-6 < finding.p_value < 0.05
     assert not strict.ranking
     why = {one.effect: one.why for one in strict.tried}["playback_gain"]
-    assert why.endswith("of ordinary recordings show as much of some effect")
+    assert why == "what is left is too little for it to be named"

@@ -54,7 +54,9 @@ def test_what_a_simpler_effect_leaves_nothing_to_is_spared_and_said(diagnosed):
     assert found.effect == known.effect == "playback_gain" and found.values == known.values
     assert quick.remaining_db == thorough.remaining_db
     fates = {row.effect: (row.verdict, row.why) for row in quick.tried}
-    assert fates["late_reverb"] == fates["compression"] == ("not fitted", "a simpler effect leaves nothing to explain")
+    assert (
+        fates["late_reverb"] == fates["compression"] == ("not fitted", "what is left is too little for it to be named")
+    )
     assert len(fates) == len(quick.tried) == len(thorough.tried)
 
 

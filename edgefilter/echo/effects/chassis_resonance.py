@@ -20,9 +20,9 @@ LOWEST_HZ, HIGHEST_HZ = 60.0, 7000.0
 QUALITIES = (4.0, 8.0, 16.0, 32.0, 64.0, 128.0)
 BROAD_HZ = 40.0
 """Bandwidth of a mode from which on a spectrum of 1 Hz shows all of it."""
-MODES, NEXT, CLEAR_Q = 2, 0.05, 8.0
-"""Modes that are looked for, the part of what the first explains that a further one must, and the least Q of that:
-broader ones are no modes."""
+MODES, NEXT, LEAST_Q = 2, 0.05, 8.0
+"""Modes that are looked for, the part of what the first explains that a further one must, and the least Q of each: what is
+broader, a fifth of an octave, is within what an equaliser's knots can follow."""
 
 
 class ChassisResonance(Effect):
@@ -69,7 +69,7 @@ class ChassisResonance(Effect):
         for _ in range(MODES):
             frequency, q = _search(_without(coarse, modes, gains))
             mode = _refine(_without(coarse if frequency / q > BROAD_HZ else fine, modes, gains), frequency, q)
-            if modes and mode[1] < CLEAR_Q:
+            if modes and mode[1] < LEAST_Q:
                 break
             ring = _ring(predicted, *mode, SAMPLE_RATE)
             added = (
@@ -99,7 +99,7 @@ class ChassisResonance(Effect):
     def plausible(self, evidence: Evidence) -> bool:
         """Sharp enough for a mode, and none that the search's bounds have cut off."""
         q, hz = (np.atleast_1d(evidence.values[name]) for name in ("q", "frequency_hz"))
-        return bool(np.all(q > 4.2) and np.all(hz >= 62.0) and np.all(hz <= 6800.0))
+        return bool(np.all(q >= LEAST_Q) and np.all(hz >= 62.0) and np.all(hz <= 6800.0))
 
 
 def _without(found: Spectra, modes: list[tuple[float, float]], gains: Array) -> Spectra:

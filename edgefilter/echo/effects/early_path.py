@@ -31,6 +31,7 @@ class EarlyPath(Effect):
     title: ClassVar[str] = "another path from the start"
     shown_by: ClassVar[tuple[Experiment, ...]] = ("sweep", "place")
     complexity: ClassVar[int] = 4
+    cost: ClassVar[int] = 4
     flexible: ClassVar[bool] = True
     parameters: ClassVar[tuple[Parameter, ...]] = (
         Parameter("level_db", "dB", -120.0, -120.0, 60.0),

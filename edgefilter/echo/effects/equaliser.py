@@ -16,8 +16,8 @@ from edgefilter.echo.measurement import Measurement, Values, VoiceModel
 from edgefilter.echo.wiener import DELAYS, Spectra, convolve_from, fit_filter, spectra
 from edgefilter.types import SAMPLE_RATE, Array, Samples
 
-KNOTS_HZ = np.geomspace(80.0, 7600.0, 27)
-"""A quarter of an octave apart: what is narrower rings, and is a resonance."""
+LOWEST_HZ, HIGHEST_HZ, KNOTS = 80.0, 7600.0, 40
+"""A sixth of an octave apart: what is narrower than they can follow rings, and is a resonance."""
 FFT = 4096
 TAPS, LEAD, EXPECTED = 48, 16, 1e-4
 """Of the filter that takes up what a smooth gain of least phase is not: 3 ms, and a hundredth for each tap."""
@@ -32,7 +32,7 @@ HEARD = 1e-3
 
 
 class Equaliser(Effect):
-    """y = h * x, |H| smooth over frequency: gain_db at KNOTS_HZ, linear in between in dB over the logarithm of frequency.
+    """y = h * x, |H| smooth over frequency: gain_db at so many knots_hz(), linear in between in dB over the logarithm of frequency.
 
     Its phase is the least that the gain allows (Oppenheim & Schafer 2010, eq. 12.35), as analogue filters, their
     digital likenesses and loudspeakers have it, but for a delay in samples. taps: (k,) lags -LEAD to k - LEAD, by which
@@ -58,9 +58,10 @@ class Equaliser(Effect):
         gain_db, delay = np.asarray(values["gain_db"], float), float(values["delay"])
         y = x.copy()
         if gain_db.any() or delay:
-            knots = np.broadcast_to(gain_db, KNOTS_HZ.shape) * (np.log(10.0) / 20.0)
+            gain_db = gain_db if gain_db.size > 1 else np.full(2, gain_db)
             hz = np.arange(FFT // 2 + 1) * sample_rate / FFT
-            response = np.exp(_basis(FFT // 2 + 1, sample_rate) @ knots - 2j * np.pi * hz / sample_rate * delay)
+            nepers = _basis(FFT // 2 + 1, sample_rate, gain_db.size) @ (gain_db * (np.log(10.0) / 20.0))
+            response = np.exp(nepers - 2j * np.pi * hz / sample_rate * delay)
             y = convolve_from(x, fft.fftshift(fft.irfft(response, FFT)), FFT // 2)
         taps = np.atleast_1d(np.asarray(values["taps"], float))
         return y + convolve_from(x, taps, LEAD) if taps.any() else y
@@ -79,11 +80,11 @@ class Equaliser(Effect):
 
     def sentence(self, values: Values) -> str:
         """Where it is loudest and where softest."""
-        gain_db = np.broadcast_to(np.asarray(values["gain_db"], float), KNOTS_HZ.shape)
-        high, low = int(np.argmax(gain_db)), int(np.argmin(gain_db))
+        gain_db = np.atleast_1d(np.asarray(values["gain_db"], float))
+        hz, high, low = knots_hz(gain_db.size), int(np.argmax(gain_db)), int(np.argmin(gain_db))
         return (
             f"the voice has another colour, smooth over frequency and the same at all levels: {gain_db[high]:+.1f} dB"
-            f" around {KNOTS_HZ[high]:.0f} Hz, {gain_db[low]:+.1f} dB around {KNOTS_HZ[low]:.0f} Hz"
+            f" around {hz[high]:.0f} Hz, {gain_db[low]:+.1f} dB around {hz[low]:.0f} Hz"
         )
 
     def plausible(self, evidence: Evidence) -> bool:
@@ -96,25 +97,29 @@ class Equaliser(Effect):
         return evidence.before.level_db - evidence.grid.level_db(plain) > 0.6 * fall
 
 
+def knots_hz(count: int) -> Array:
+    """So many frequencies, evenly spaced in their logarithm, at which a gain is given, (count,)."""
+    return np.geomspace(LOWEST_HZ, HIGHEST_HZ, count)
+
+
 @cache
-def _basis(bins: int, sample_rate: int) -> NDArray[np.complex128]:
+def _basis(bins: int, sample_rate: int, knots: int) -> NDArray[np.complex128]:
     """Complex logarithm of the response to a knot of 1 neper, (bins, knots): the gain, and the least phase that goes with it."""
     hz = np.maximum(np.arange(bins) * sample_rate / (2 * (bins - 1)), 1.0)
-    at = np.log(hz / KNOTS_HZ[0]) / np.log(KNOTS_HZ[1] / KNOTS_HZ[0])
-    at = np.clip(at, 0.0, KNOTS_HZ.size - 1.0)
-    return log_response(np.maximum(1.0 - np.abs(at[:, None] - np.arange(KNOTS_HZ.size)), 0.0))
+    at = np.interp(np.log(hz), np.log(knots_hz(knots)), np.arange(knots))
+    return log_response(np.maximum(1.0 - np.abs(at[:, None] - np.arange(knots)), 0.0))
 
 
 def _smooth_gain(found: Spectra) -> tuple[Array, float]:
     """Nepers at the knots (k,) and delay of the response that explains most of the cross-spectrum."""
     turns = np.exp(-2j * np.pi * np.outer(found.hz, DELAYS) / SAMPLE_RATE)
     delay = float(DELAYS[int(np.argmax((found.cross @ turns.conj()).real))])
-    whole = _basis(FFT // 2 + 1, SAMPLE_RATE)
+    whole = _basis(FFT // 2 + 1, SAMPLE_RATE, KNOTS)
     at = np.clip(np.rint(found.hz * FFT / SAMPLE_RATE).astype(int), 0, FFT // 2)
     basis = np.concatenate((whole[at], -2j * np.pi * found.hz[:, None] / SAMPLE_RATE), axis=1)
     energy = np.maximum(found.predicted, 1e-12)
     size = float(np.max(energy @ np.abs(basis[:, :-1]) ** 2))
-    bent = np.diff(np.eye(KNOTS_HZ.size), 2, axis=0)
+    bent = np.diff(np.eye(KNOTS), 2, axis=0)
     penalty = np.zeros((basis.shape[1],) * 2)
     penalty[:-1, :-1] = BEND * size * (bent.T @ bent)
 
@@ -123,7 +128,7 @@ def _smooth_gain(found: Spectra) -> tuple[Array, float]:
         own = float(np.sum(np.abs(response) ** 2 * energy - 2.0 * (response.conj() * found.cross).real))
         return own + float(a @ penalty @ a)
 
-    a = np.append(np.zeros(KNOTS_HZ.size), delay)
+    a = np.append(np.zeros(KNOTS), delay)
     now, damping = cost(a), DAMPING
     for _ in range(STEPS):
         response = np.exp(basis @ a)
@@ -145,5 +150,5 @@ def _smooth_gain(found: Spectra) -> tuple[Array, float]:
 def _heard(found: Spectra) -> NDArray[np.bool_]:
     """Where the voice has energy enough to tell a gain, (knots,) bool."""
     at = np.clip(np.rint(found.hz * FFT / SAMPLE_RATE).astype(int), 0, FFT // 2)
-    energy = found.predicted @ _basis(FFT // 2 + 1, SAMPLE_RATE).real[at]
+    energy = found.predicted @ _basis(FFT // 2 + 1, SAMPLE_RATE, KNOTS).real[at]
     return np.asarray(energy > HEARD * energy.max())
