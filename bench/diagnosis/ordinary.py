@@ -26,7 +26,7 @@ from edgefilter.calibration.calibrate import calibrate
 from edgefilter.diagnosis.ordinary import LEAST_DB, Chance, Ordinary, explained_db, p_value
 from edgefilter.diagnosis.prepare import prepare
 from edgefilter.diagnosis.score import Scorer
-from edgefilter.echo.effect import fitted, vanishes
+from edgefilter.echo.effect import vanishes
 from edgefilter.echo.effects.catalogue import find, names
 from edgefilter.errors import UsageError
 from edgefilter.types import Array
@@ -47,7 +47,7 @@ def gains(case: Path) -> dict[str, float]:
     base, found = scorer.of(model), dict.fromkeys(names(), 0.0)
     for name in found:
         effect = find(name)
-        values = fitted(effect, scorer.measurement, model)
+        values = model.fitted(name, scorer.measurement)
         if not vanishes(effect, values):
             behind = prepared.behind(effect.noise_psd(values, prepared.noise_psd))
             after = Scorer(behind).of(model.with_effect(name, values))

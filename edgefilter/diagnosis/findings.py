@@ -12,7 +12,6 @@ from edgefilter.diagnosis.prepare import Prepared
 from edgefilter.diagnosis.result import Finding, Interval
 from edgefilter.diagnosis.score import Scorer, share_of
 from edgefilter.diagnosis.trials import Found, Trial
-from edgefilter.echo.effect import complete
 from edgefilter.echo.effects.catalogue import find
 from edgefilter.echo.model import EchoModel
 from edgefilter.echo.recording import BLOCK
@@ -73,7 +72,7 @@ def _intervals(prepared: Prepared, model: EchoModel, step: Trial) -> tuple[Mappi
     fits, failed = [], []
     for third in thirds:
         try:
-            fits.append(complete(effect, effect.fit(third, others)))
+            fits.append(others.fitted(step.name, third))
         except (UsageError, ArithmeticError, np.linalg.LinAlgError) as error:
             failed.append(
                 f"how well {step.name} is known is told by fits to a third of the recording each, and one failed:"

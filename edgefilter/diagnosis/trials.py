@@ -12,7 +12,7 @@ from edgefilter.diagnosis.criteria import Criteria
 from edgefilter.diagnosis.ordinary import p_value, percent
 from edgefilter.diagnosis.prepare import Prepared
 from edgefilter.diagnosis.score import Scorer
-from edgefilter.echo.effect import fitted, vanishes
+from edgefilter.echo.effect import vanishes
 from edgefilter.echo.effects.catalogue import find, names
 from edgefilter.echo.evidence import Evidence, Score
 from edgefilter.echo.measurement import Values
@@ -176,7 +176,7 @@ class Workbench:
             self._progress(f"trying {name}")
         effect = find(name)
         try:
-            values = fitted(effect, self.prepared.measurement, model)
+            values = model.fitted(name, self.prepared.measurement)
         except (UsageError, ArithmeticError, np.linalg.LinAlgError) as error:
             self._failed[name] = f"{name} could not be fitted and was left out: {error}"
             return None
@@ -282,7 +282,7 @@ def beside(scorer: Scorer, name: str, model: EchoModel, criteria: Criteria) -> T
     None where it is there, its fit finds nothing, ordinary recordings show as much, or its values do not look like it.
     """
     effect = find(name)
-    values = None if name in dict(model.effects) else fitted(effect, scorer.measurement, model)
+    values = None if name in dict(model.effects) else model.fitted(name, scorer.measurement)
     if values is None or vanishes(effect, values):
         return None
     changed = model.with_effect(name, values)

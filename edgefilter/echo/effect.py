@@ -241,17 +241,6 @@ def complete(effect: Effect, values: Values) -> dict[str, float | Array]:
     }
 
 
-def fitted(effect: Effect, measurement: Measurement, model: VoiceModel) -> dict[str, float | Array]:
-    """All values of an effect fitted to a measurement.
-
-    Those of an event, unless it vanishes, say in which recording it happened.
-    """
-    values = complete(effect, effect.fit(measurement, model))
-    if effect.event and not vanishes(effect, values):
-        values[RECORDING.name] = measurement.fingerprint
-    return values
-
-
 def vanishes(effect: Effect, values: Values) -> bool:
     """Whether all values are the neutral ones."""
     return all(np.array_equal(values[name], value) for name, value in neutral(effect).items())

@@ -11,7 +11,7 @@ from typing import TypeAlias
 import numpy as np
 
 from edgefilter.dsp.convolution import convolve
-from edgefilter.echo.effect import RECORDING, Effect, complete, fitted
+from edgefilter.echo.effect import RECORDING, Effect, complete, vanishes
 from edgefilter.echo.effects.catalogue import chain, find
 from edgefilter.echo.measurement import Measurement, Values
 from edgefilter.echo.running import is_filter
@@ -40,13 +40,8 @@ class EchoModel:
     def predict(self, reference: Samples) -> Samples:
         """The robot's voice at the microphone (n,) for an aligned reference (n,), all effects applied."""
         ahead, path, behind = self._chain
-        x = reference
-        for effect, values in ahead:
-            x = effect.apply(x, values, SAMPLE_RATE)
-        x = convolve(x, path)[LEAD:][: reference.size].astype(np.float32, copy=False)
-        for effect, values in behind:
-            x = effect.apply(x, values, SAMPLE_RATE)
-        return x
+        played = convolve(_through(ahead, reference), path)[LEAD:][: reference.size]
+        return _through(behind, played.astype(np.float32, copy=False))
 
     @cached_property
     def _chain(self) -> tuple[Chain, Samples, Chain]:
@@ -155,7 +150,26 @@ class EchoModel:
 
     def fit(self, name: str, measurement: Measurement) -> EchoModel:
         """The model with that effect at the values that explain the measurement best."""
-        return self.with_effect(name, fitted(find(name), measurement, self.without_effect(name)))
+        return self.with_effect(name, self.without_effect(name).fitted(name, measurement))
+
+    def fitted(self, name: str, measurement: Measurement) -> dict[str, float | Array]:
+        """All values of an effect that the model has not, as they explain the measurement best.
+
+        It is fitted behind the effects that the catalogue puts ahead of it. The values of an event, unless it vanishes, say in
+        which recording it happened.
+        """
+        effect, model, whole = find(name), self, measurement
+        if effect.stage == "source":
+            order = [one.name for one, _ in chain((*self.effects, (name, {})))]
+            ahead = order[: order.index(name)]
+            if ahead:
+                reference = _through([pair for pair in chain(self.effects) if pair[0].name in ahead], whole.reference)
+                measurement = replace(whole, reference=reference)
+                model = replace(self, effects=tuple(entry for entry in self.effects if entry[0] not in ahead))
+        values = complete(effect, effect.fit(measurement, model))
+        if effect.event and not vanishes(effect, values):
+            values[RECORDING.name] = whole.fingerprint
+        return values
 
     def lasting(self) -> EchoModel:
         """The model without its events: what holds of the robot in any recording."""
@@ -170,3 +184,10 @@ class EchoModel:
             if not find(name).event or values.get(RECORDING.name, 0.0) in here
         )
         return self if len(kept) == len(self.effects) else replace(self, effects=kept)
+
+
+def _through(effects: Chain, x: Samples) -> Samples:
+    """A signal (n,) behind effects, (n,)."""
+    for effect, values in effects:
+        x = effect.apply(x, values, SAMPLE_RATE)
+    return x

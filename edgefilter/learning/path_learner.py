@@ -14,7 +14,7 @@ from edgefilter.alignment.utterances import Sustained
 from edgefilter.calibration.array import cross_density, first
 from edgefilter.calibration.from_recording import bands_over_fan, fan_in_silences
 from edgefilter.dsp.psd import floored, periodograms
-from edgefilter.echo.effect import complete, vanishes
+from edgefilter.echo.effect import vanishes
 from edgefilter.echo.effects.catalogue import EFFECTS, find
 from edgefilter.echo.measurement import Measurement, whiten
 from edgefilter.echo.model import EchoModel
@@ -180,7 +180,7 @@ class PathLearner:
                 others = tuple(entry for entry in effects if entry[0] != effect.name)
                 model = EchoModel(path, tuple(entry for entry in others if find(entry[0]).stage == "source"))
                 try:
-                    values = complete(effect, effect.fit(measurement, model))
+                    values = model.fitted(effect.name, measurement)
                 except (ArithmeticError, np.linalg.LinAlgError):  # what cannot be fitted is not learned
                     continue
                 effects = others if vanishes(effect, values) else (*others, (effect.name, values))

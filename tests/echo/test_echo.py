@@ -68,6 +68,15 @@ def test_fitted_compression_explains_most_of_a_compressor() -> None:
     assert rms(recording - gain * fitted) < 0.5 * rms(recording - plain_gain * plain)
 
 
+def test_a_compressor_behind_a_turned_volume_is_fitted_to_what_it_gets() -> None:
+    x, turned = speech(8.0), model().with_effect("playback_gain", {"gain_db": -12.0})
+    truth = turned.with_effect("compression", {"threshold_db": -36.0, "ratio": 4.0})
+    fitted = turned.fit("compression", Measurement(x, truth.predict(x)))
+    left = rms(truth.predict(x) - fitted.predict(x)) / rms(truth.predict(x) - turned.predict(x))
+    assert left < 0.3  # fitted to the voice as it was sent, it holds down what is 12 dB softer than its threshold: 1.0
+    assert dict(fitted.effects)["compression"]["threshold_db"] == pytest.approx(-36.0, abs=3.0)
+
+
 def test_compression_turns_down_the_loud_only() -> None:
     tone = np.sin(2 * np.pi * 500 * np.arange(32000) / 16000).astype(np.float32)
     compress = catalogue.find("compression")
@@ -103,6 +112,17 @@ def test_prediction_without_effects_is_the_convolution() -> None:
     x = speech(0.5)
     expected = np.convolve(x, model().impulse_response)[: x.size]
     np.testing.assert_allclose(model().predict(x), expected, atol=1e-6)  # float32 transform against direct sum
+
+
+def test_filters_behind_the_path_are_applied_as_one_with_it() -> None:
+    x = speech(2.0)
+    values = {"bandlimit": {"cutoff_hz": 3000.0, "order": 6.0}, "early_path": {"taps": np.eye(1, 900, 700)[0] * 0.3}}
+    whole, one_by_one = model(), model().predict(x)
+    for name, given in values.items():
+        whole = whole.with_effect(name, given)
+        one_by_one = catalogue.find(name).apply(one_by_one, complete(catalogue.find(name), given), 16000)
+    inside = slice(1000, -1000)  # at the end the one by one hear no echo of what the recording cuts off
+    assert rms((whole.predict(x) - one_by_one)[inside]) < 1e-4 * rms(one_by_one)
 
 
 def test_with_effect_replaces_and_without_removes() -> None:
