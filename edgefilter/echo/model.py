@@ -158,17 +158,15 @@ class EchoModel:
         It is fitted behind the effects that the catalogue puts ahead of it. The values of an event, unless it vanishes, say in
         which recording it happened.
         """
-        effect, model, whole = find(name), self, measurement
-        if effect.stage == "source":
-            order = [one.name for one, _ in chain((*self.effects, (name, {})))]
-            ahead = order[: order.index(name)]
-            if ahead:
-                reference = _through([pair for pair in chain(self.effects) if pair[0].name in ahead], whole.reference)
-                measurement = replace(whole, reference=reference)
-                model = replace(self, effects=tuple(entry for entry in self.effects if entry[0] not in ahead))
-        values = complete(effect, effect.fit(measurement, model))
+        effect, behind, model = find(name), measurement, self
+        ahead = list(takewhile(lambda pair: pair[0] is not effect, chain((*self.effects, (name, {})))))
+        if ahead and effect.stage == "source":
+            behind = replace(measurement, reference=_through(ahead, measurement.reference))
+            for other, _ in ahead:
+                model = model.without_effect(other.name)
+        values = complete(effect, effect.fit(behind, model))
         if effect.event and not vanishes(effect, values):
-            values[RECORDING.name] = whole.fingerprint
+            values[RECORDING.name] = measurement.fingerprint
         return values
 
     def lasting(self) -> EchoModel:
