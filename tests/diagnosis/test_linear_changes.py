@@ -92,3 +92,13 @@ def test_a_stationary_change_is_named_as_what_it_is(h: np.ndarray, named: str) -
     assert found.remaining_db < 1.0  # the product's promise for linear effects
     if h is SHELVED:
         assert_gain_of_the_shelf(found.ranking[0].values)
+
+
+@pytest.mark.slow
+def test_a_band_limit_is_named_where_knocks_are_louder_than_what_it_takes_away() -> None:
+    x = voice(12.0)
+    level = signal.lfilter([0.002], [1.0, -0.998], np.square(x, dtype=float))
+    knocks = 0.04 * level / level.max() * np.random.default_rng(7).standard_normal(x.size)
+    heard = through(signal.lfilter(*signal.butter(6, 2000.0, fs=RATE), path()), x) + knocks
+    found = diagnose(profile(), heard.astype(np.float32), x)
+    assert (found.verdict, {finding.effect for finding in found.ranking}) == ("missing", {"bandlimit", "rattle"})

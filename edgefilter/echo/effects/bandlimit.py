@@ -170,15 +170,19 @@ def _ends_at(found: Spectra, cutoff_hz: float) -> bool:
 
 
 def _dull_above(cutoff_hz: float, evidence: Evidence) -> bool:
-    """Whether the power above the cut-off falls with what is common with the reference: a codec's noise keeps it up."""
-    grid = evidence.grid
-    above = grid.band_hz[:, 0] > 1.1 * cutoff_hz
-    heard = grid.cells(grid.measurement.recording)[grid.active_cells][:, above]
-    expected = grid.cells(evidence.before.prediction)[grid.active_cells][:, above]
+    """Whether the power above the cut-off falls with what is common with the reference: a codec's noise keeps it up.
+
+    Noise that the model expects, as a rattle's, is no voice.
+    """
+    grid, before = evidence.grid, evidence.before
+    above = np.ix_(grid.active_cells, grid.band_hz[:, 0] > 1.1 * cutoff_hz)
+    recording = grid.measurement.recording
+    noise = (grid.cells(recording - before.prediction) / before.cells)[above]
+    heard, expected = grid.cells(recording)[above], grid.cells(before.prediction)[above]
     loud = expected > 3.0
     if loud.sum() < 10:
         return True
-    return float(np.sum(np.maximum(heard[loud] - 1.0, 0.0))) < KEPT * float(np.sum(expected[loud]))
+    return float(np.sum(np.maximum((heard - noise)[loud], 0.0))) < KEPT * float(np.sum(expected[loud]))
 
 
 @lru_cache(maxsize=2)
