@@ -39,13 +39,13 @@ class EchoModel:
 
     def predict(self, reference: Samples) -> Samples:
         """The robot's voice at the microphone (n,) for an aligned reference (n,), all effects applied."""
-        ahead, path, behind = self._chain
-        played = convolve(_through(ahead, reference), path)[LEAD:][: reference.size]
+        ahead, path, lead, behind = self._chain
+        played = convolve(_through(ahead, reference), path)[lead:][: reference.size]
         return _through(behind, played.astype(np.float32, copy=False))
 
     @cached_property
-    def _chain(self) -> tuple[Chain, Samples, Chain]:
-        """Effects ahead of the path; the path with the filters right behind it, begun LEAD samples early, (taps,); effects behind these.
+    def _chain(self) -> tuple[Chain, Samples, int, Chain]:
+        """Effects ahead of the path; the path with the filters right behind it, (taps,); the samples by which it begins early; effects behind.
 
         One convolution in place of several is what makes a search fast.
         """
@@ -53,11 +53,13 @@ class EchoModel:
         ahead = [pair for pair in applied if pair[0].stage == "source"]
         behind = applied[len(ahead) :]
         filters = list(takewhile(lambda pair: pair[0].absorbed, behind))
-        path = np.pad(self.impulse_response, (LEAD, TAIL if filters else 0))
+        if not filters:
+            return ahead, self.impulse_response, 0, behind
+        path = np.pad(self.impulse_response, (LEAD, TAIL))
         for effect, values in filters:
             path = effect.apply(path, values, SAMPLE_RATE)
         heard = np.flatnonzero(np.abs(path) > 1e-6 * np.abs(path).max(initial=0.0))
-        return ahead, path[: heard[-1] + 1] if heard.size else path, behind[len(filters) :]
+        return ahead, path[: heard[-1] + 1] if heard.size else path, LEAD, behind[len(filters) :]
 
     def unpredictable(self, reference: Samples) -> tuple[tuple[Samples, Array], ...]:
         """Of each effect that adds noise of its own: its expected square (n,) at the microphone, and its density (601,) per Hz of integral 1."""
