@@ -6,10 +6,9 @@ A mutant is a module of edgefilter/FOLDER with one operator, number, condition, 
 drawn at random, each as often as any other, then one of cosmic-ray's replacements there; annotations, which do nothing
 while a program runs, are left out. A mutant is killed where a test of tests/FOLDER fails, or one elsewhere in a file that
 has the module's name, or takes longer than three times what all of them take; files of tests that name the module come
-first, slow tests last. Everything happens in
-copies of the checkout. A run that was stopped goes on where it was: outcomes are kept in --cache by code and tests. The
-same seed draws the same mutants as long as the code is the same: `--again` tries those alone that survived in OUTPUT.json,
-after tests were added. Needs cosmic-ray: pip install cosmic-ray.
+first, slow tests last. Everything happens in copies of the checkout. A run that was stopped goes on where it was: outcomes
+are kept in --cache by code and tests. The same seed draws the same mutants as long as the code is the same: `--again` tries
+those alone that survived in OUTPUT.json, after tests were added. Needs cosmic-ray: pip install cosmic-ray.
 """
 
 from __future__ import annotations
@@ -237,7 +236,7 @@ def attempt(free: queue.Queue[Path], mutant: Mutant, limit_s: float) -> str:
 
 
 def tests(copy: Path, folder: str, module: str, limit_s: float | None) -> int:
-    """The exit code of the first tests of tests/FOLDER that fail, or of all: those that name the module first, slow ones last."""
+    """The exit code of the first tests that fail, or of all: those that name the module first, slow ones last."""
     files = sorted({*(copy / "tests" / folder).rglob("test_*.py"), *(copy / "tests").rglob(f"test_{module}.py")})
     files.sort(key=lambda path: not module or module not in path.stem + path.read_text(encoding="utf-8"))
     began, code = time.monotonic(), PASSED

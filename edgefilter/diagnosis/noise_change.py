@@ -12,7 +12,6 @@ from edgefilter.diagnosis.leftover import Leftover, inspect
 from edgefilter.diagnosis.prepare import Prepared
 from edgefilter.diagnosis.score import Scorer
 from edgefilter.diagnosis.trials import Found, Trial, beside
-from edgefilter.echo.effect import complete
 from edgefilter.echo.effects.catalogue import find, names
 from edgefilter.echo.evidence import Score
 from edgefilter.echo.measurement import Measurement, Values
@@ -148,7 +147,7 @@ def _steady(left: Leftover, criteria: Criteria) -> bool:
 
 def _with_fan(prepared: Prepared, name: str, measurement: Measurement, model: EchoModel) -> tuple[Prepared, Values]:
     """The recording with the fan's PSD as that effect, fitted to the measurement, has it; and the values of the fit."""
-    values = complete(find(name), find(name).fit(measurement, model))
+    values = model.fitted(name, measurement)
     return prepared.behind(find(name).noise_psd(values, prepared.noise_psd)), values
 
 

@@ -58,8 +58,8 @@ class EchoModel:
         path = np.pad(self.impulse_response, (LEAD, TAIL))
         for effect, values in filters:
             path = effect.apply(path, values, SAMPLE_RATE)
-        heard = np.flatnonzero(np.abs(path) > 1e-6 * np.abs(path).max(initial=0.0))
-        return ahead, path[: heard[-1] + 1] if heard.size else path, LEAD, behind[len(filters) :]
+        size = max(LEAD + self.impulse_response.size, _heard(path, 1e-6))
+        return ahead, path[:size], LEAD, behind[len(filters) :]
 
     def unpredictable(self, reference: Samples) -> tuple[tuple[Samples, Array], ...]:
         """Of each effect that adds noise of its own: its expected square (n,) at the microphone, and its density (601,) per Hz of integral 1."""
@@ -89,8 +89,7 @@ class EchoModel:
         response = np.pad(self.impulse_response, (0, TAIL))
         for effect, values in linear:
             response = effect.apply(response, effect.settled(values), SAMPLE_RATE)
-        heard = np.flatnonzero(np.abs(response) > 1e-4 * np.abs(response).max(initial=0.0))
-        return response[: max(self.impulse_response.size, int(heard[-1]) + 1 if heard.size else 0)]
+        return response[: max(self.impulse_response.size, _heard(response, 1e-4))]
 
     def with_running_response(self, response: Samples, gain: float = 1.0) -> EchoModel:
         """The model whose running_response() begins with response (taps,) and goes on as that of this one times gain.
@@ -161,9 +160,10 @@ class EchoModel:
         which recording it happened.
         """
         effect, behind, model = find(name), measurement, self
-        ahead = list(takewhile(lambda pair: pair[0] is not effect, chain((*self.effects, (name, {})))))
-        if ahead and effect.stage == "source":
-            behind = replace(measurement, reference=_through(ahead, measurement.reference))
+        if effect.stage == "source":
+            ahead = list(takewhile(lambda pair: pair[0] is not effect, chain((*self.effects, (name, {})))))
+            if ahead:
+                behind = replace(measurement, reference=_through(ahead, measurement.reference))
             for other, _ in ahead:
                 model = model.without_effect(other.name)
         values = complete(effect, effect.fit(behind, model))
@@ -191,3 +191,9 @@ def _through(effects: Chain, x: Samples) -> Samples:
     for effect, values in effects:
         x = effect.apply(x, values, SAMPLE_RATE)
     return x
+
+
+def _heard(response: Samples, share: float) -> int:
+    """Taps of a response up to the last that exceeds that share of its largest, 0 where all are zero."""
+    above = np.flatnonzero(np.abs(response) > share * np.abs(response).max(initial=0.0))
+    return int(above[-1]) + 1 if above.size else 0
