@@ -4,11 +4,12 @@
 
 A mutant is a module of edgefilter/FOLDER with one operator, number, condition, decorator or the like replaced. Places are
 drawn at random, each as often as any other, then one of cosmic-ray's replacements there; annotations, which do nothing
-while a program runs, are left out. A mutant is killed where a test of tests/FOLDER fails, or one elsewhere in a file that
-has the module's name, or takes longer than three times what all of them take; files of tests that name the module come
-first, slow tests last. Everything happens in copies of the checkout. A run that was stopped goes on where it was: outcomes
-are kept in --cache by code and tests. The same seed draws the same mutants as long as the code is the same: `--again` tries
-those alone that survived in OUTPUT.json, after tests were added. Needs cosmic-ray: pip install cosmic-ray.
+while a program runs, are left out. The tests of a mutant are those of tests/FOLDER, and of files elsewhere that have the
+name of one of its modules, that reach the line, measured once without a mutant; all of them where none reaches it, as on
+import or in a child process. It is killed where one fails, or where they take longer than three times what all of them
+take; slow tests come last. Everything happens in copies of the checkout. A run that was stopped goes on where it was:
+outcomes are kept in --cache by code and tests. The same seed draws the same mutants as long as the code is the same:
+`--again` tries those alone that survived in OUTPUT.json, after tests were added. Needs cosmic-ray and pytest-cov.
 """
 
 from __future__ import annotations
@@ -78,14 +79,14 @@ def run(options: argparse.Namespace) -> str:
     missing = [mutant for mutant in drawn if outcomes.get(mutant, "survived") == "survived"]
     cache, code = Cache(options.cache, "mutants"), {folder: code_of(folder) for folder in folders}
 
-    def limit_of(folder: str) -> float:
-        return cache.get(lambda: baseline_s(free, folder), "limit", code[folder])
+    def reach_of(folder: str) -> dict:
+        return cache.get(lambda: measured(free, folder), "reach", code[folder])
 
     def outcome_of(mutant: Mutant) -> str:
-        return cache.get(lambda: attempt(free, mutant, limits[mutant.folder]), "outcome", code[mutant.folder], mutant)
+        return cache.get(lambda: attempt(free, mutant, reach[mutant.folder]), "outcome", code[mutant.folder], mutant)
 
     with copies(options.jobs) as free, ThreadPoolExecutor(options.jobs) as pool:
-        limits = dict(zip(folders, pool.map(limit_of, folders), strict=True))
+        reach = dict(zip(folders, pool.map(reach_of, folders), strict=True))
         outcomes |= dict(zip(missing, progress_of(pool.map(outcome_of, missing), len(missing)), strict=True))
     rows = [{**asdict(mutant), "outcome": outcomes[mutant]} for mutant in drawn]
     survivors = [row for row in rows if row["outcome"] == "survived"]
@@ -176,13 +177,19 @@ def mutated(source: str, operator: str, occurrence: int) -> str:
 
 
 def _cosmic_ray() -> object:
+    # parso first: cosmic-ray's plugins otherwise find it half imported
+    for name in ("parso.python.tree", "cosmic_ray.ast", "cosmic_ray.mutating", "cosmic_ray.plugins"):
+        _library(name)
+    return _library("cosmic_ray")
+
+
+def _library(name: str) -> object:
     try:
-        # parso first: cosmic-ray's plugins otherwise find it half imported
-        for name in ("parso.python.tree", "cosmic_ray.ast", "cosmic_ray.mutating", "cosmic_ray.plugins"):
-            importlib.import_module(name)
+        return importlib.import_module(name)
     except ImportError as error:
-        raise UsageError(f"mutants need cosmic-ray ({error}): pip install cosmic-ray") from None
-    return importlib.import_module("cosmic_ray")
+        raise UsageError(
+            f"mutants need cosmic-ray and pytest-cov ({error}): pip install cosmic-ray pytest-cov"
+        ) from None
 
 
 # ---------------------------------------------------------------- tests
@@ -202,31 +209,80 @@ def copies(count: int) -> Iterator[queue.Queue[Path]]:
 
 def code_of(folder: str) -> str:
     """What an outcome depends on: the package and the folder's tests."""
-    files = [path for part in ("edgefilter", f"tests/{folder}") for path in sorted((results.ROOT / part).rglob("*.py"))]
-    return key_of(*(path.read_bytes() for path in files))
+    tests = [results.ROOT / name for name in files_of(results.ROOT, folder)]
+    return key_of(*(path.read_bytes() for path in [*sorted((results.ROOT / "edgefilter").rglob("*.py")), *tests]))
 
 
-def baseline_s(free: queue.Queue[Path], folder: str) -> float:
-    """Seconds that the folder's tests may take. Raises UsageError where they fail without any mutant."""
+def files_of(root: Path, folder: str) -> list[str]:
+    """Tests of a folder, and those elsewhere that have the name of one of its modules."""
+    modules = {f"test_{path.stem}" for path in (root / "edgefilter" / folder).rglob("*.py")}
+    every = sorted((root / "tests").rglob("test_*.py"))
+    return [
+        path.relative_to(root).as_posix()
+        for path in every
+        if root / "tests" / folder in path.parents or path.stem in modules
+    ]
+
+
+def measured(free: queue.Queue[Path], folder: str) -> dict:
+    """Which tests reach which lines of the folder's modules, and the seconds that a mutant's tests may take.
+
+    Raises UsageError where tests fail without any mutant.
+    """
     copy = free.get()
-    began = time.monotonic()
+    began, kept = time.monotonic(), copy / ".coverage"
+    kept.unlink(missing_ok=True)
     try:
-        code = tests(copy, folder, "", None)
+        options = (f"--cov=edgefilter/{folder}", "--cov-context=test", "--cov-report=", "--cov-append")
+        if tests(copy, files_of(copy, folder), None, *options) != PASSED:
+            raise UsageError(f"tests of {folder} fail without a mutant: mend that first")
+        limit_s = max(LEAST_S, PATIENCE * (time.monotonic() - began))
+        data = _library("coverage").CoverageData(str(kept))
+        data.read()
+        numbers: dict[str, int] = {"": 0}  # on import, for no test
+        lines = {
+            Path(path).relative_to(copy).as_posix(): {
+                str(line): sorted({numbers.setdefault(name, len(numbers)) for name in names} - {0})
+                for line, names in data.contexts_by_lineno(path).items()
+            }
+            for path in sorted(data.measured_files())
+        }
     finally:
         free.put(copy)
-    if code != PASSED:
-        raise UsageError(f"tests/{folder} fails without a mutant: mend that first")
-    return max(LEAST_S, PATIENCE * (time.monotonic() - began))
+    return {"limit_s": limit_s, "tests": list(numbers), "lines": lines}
 
 
-def attempt(free: queue.Queue[Path], mutant: Mutant, limit_s: float) -> str:
+def targets(copy: Path, mutant: Mutant, reach: Mapping) -> list[str]:
+    """What pytest is to run: the tests that reach the statement; whole files where their preparation does."""
+    by_line = reach["lines"].get(mutant.module, {})
+    first, last = statement((copy / mutant.module).read_text(encoding="utf-8"), mutant.line)
+    contexts = {reach["tests"][i] for line in range(first, last + 1) for i in by_line.get(str(line), ())}
+    whole = {name.partition("::")[0] for name in contexts if not name.endswith("|run")}
+    single = {name.removesuffix("|run").partition("[")[0] for name in contexts}
+    chosen = whole | {name for name in single if name.partition("::")[0] not in whole} or {
+        *files_of(copy, mutant.folder)
+    }
+    stem = Path(mutant.module).stem
+    return sorted(chosen, key=lambda name: (stem not in name.partition("::")[0], "::" not in name, name))
+
+
+def statement(source: str, line: int) -> tuple[int, int]:
+    """First and last line of the innermost statement there, without the statements inside it."""
+    around = [n for n in ast.walk(ast.parse(source)) if isinstance(n, ast.stmt) and n.lineno <= line <= n.end_lineno]
+    inner = min(around, key=lambda node: node.end_lineno - node.lineno)
+    body = getattr(inner, "body", None)
+    return inner.lineno, body[0].lineno - 1 if body else inner.end_lineno
+
+
+def attempt(free: queue.Queue[Path], mutant: Mutant, reach: Mapping) -> str:
     """What became of a mutant: killed, timeout or survived."""
     copy = free.get()
     path = copy / mutant.module
     source = path.read_text(encoding="utf-8")
     try:
+        chosen = targets(copy, mutant, reach)
         path.write_text(mutated(source, mutant.operator, mutant.occurrence), encoding="utf-8")
-        code = tests(copy, mutant.folder, path.stem, limit_s)
+        code = tests(copy, chosen, reach["limit_s"])
     except subprocess.TimeoutExpired:
         return "timeout"
     finally:
@@ -235,14 +291,25 @@ def attempt(free: queue.Queue[Path], mutant: Mutant, limit_s: float) -> str:
     return "survived" if code == PASSED else "killed"
 
 
-def tests(copy: Path, folder: str, module: str, limit_s: float | None) -> int:
-    """The exit code of the first tests that fail, or of all: those that name the module first, slow ones last."""
-    files = sorted({*(copy / "tests" / folder).rglob("test_*.py"), *(copy / "tests").rglob(f"test_{module}.py")})
-    files.sort(key=lambda path: not module or module not in path.stem + path.read_text(encoding="utf-8"))
-    began, code = time.monotonic(), PASSED
+def tests(copy: Path, chosen: Sequence[str], limit_s: float | None, *options: str) -> int:
+    """The exit code of the first chosen tests that fail, or of all; slow ones last."""
+    began = time.monotonic()
     environment = os.environ | {"PYTHONPATH": str(copy), "PYTHONDONTWRITEBYTECODE": "1"}
     for which in ("not slow", "slow"):
-        command = [sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", "-m", which, *map(str, files)]
+        command = [
+            sys.executable,
+            "-m",
+            "pytest",
+            "--rootdir=.",
+            "-x",
+            "-q",
+            "-p",
+            "no:cacheprovider",
+            "-m",
+            which,
+            *options,
+            *chosen,
+        ]
         left = None if limit_s is None else max(limit_s - (time.monotonic() - began), 1.0)
         process = subprocess.Popen(
             command,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -89,9 +90,36 @@ def test_a_mutant_that_never_ends_is_killed_by_the_clock(checkout: Path) -> None
     (checkout / "tests/alignment/test_twice.py").write_text("import time\n\n\ndef test_it():\n    time.sleep(60)\n")
     (mutant,) = mutate.sample(["alignment"], 1, 1)
     with mutate.copies(1) as free:
-        assert mutate.attempt(free, mutant, 2.0) == "timeout"
+        assert mutate.attempt(free, mutant, {"limit_s": 2.0, "tests": [], "lines": {}}) == "timeout"
         copy = free.get_nowait()
         assert (copy / mutant.module).read_text() == CODE and not (copy / "docs/results").exists()
+
+
+@pytest.mark.slow
+def test_a_mutant_meets_the_tests_that_reach_its_statement(checkout: Path) -> None:
+    """A test by its call, a file by what its fixtures prepare, every test where a line runs on import alone."""
+    tests = checkout / "tests/alignment"
+    (tests / "test_prepared.py").write_text(
+        "import pytest\n\nfrom edgefilter.alignment.twice import never_tested\n\n\n@pytest.fixture\ndef three():\n"
+        "    return never_tested(4)\n\n\ndef test_three(three):\n    assert three == 3\n"
+    )
+    (checkout / "tests/live").mkdir()
+    for package in (tests.parent, tests, checkout / "tests/live"):
+        (package / "__init__.py").write_text("")
+    (checkout / "tests/live/test_twice.py").write_text(TEST)
+    (checkout / "tests/live/test_other.py").write_text(TEST)
+    with mutate.copies(1) as free:
+        reach = mutate.measured(free, "alignment")
+        copy = free.get_nowait()
+    drawn = {mutant.line: mutant for mutant in mutate.sample(["alignment"], 3, 1)}
+    shutil.copytree(checkout, copy)
+    assert mutate.targets(copy, drawn[5], reach) == [
+        f"tests/{name}/test_twice.py::test_twice" for name in ("alignment", "live")
+    ]
+    assert mutate.targets(copy, drawn[9], reach) == ["tests/alignment/test_prepared.py"]
+    assert mutate.targets(copy, replace(drawn[9], line=8), reach) == [
+        "tests/alignment/test_twice.py", "tests/live/test_twice.py", "tests/alignment/test_prepared.py"
+    ]  # fmt: skip
 
 
 def test_tests_that_fail_anyway_and_folders_without_tests_are_one_line(
@@ -102,5 +130,5 @@ def test_tests_that_fail_anyway_and_folders_without_tests_are_one_line(
     assert "expected folders of edgefilter/ that tests/ has as well" in capsys.readouterr().err
     (checkout / "tests/alignment").mkdir()
     (checkout / "tests/alignment/test_twice.py").write_text(TEST.replace("6", "7"))
-    with mutate.copies(1) as free, pytest.raises(UsageError, match="tests/alignment fails without a mutant"):
-        mutate.baseline_s(free, "alignment")
+    with mutate.copies(1) as free, pytest.raises(UsageError, match="tests of alignment fail without a mutant"):
+        mutate.measured(free, "alignment")
