@@ -2,14 +2,15 @@
 
     OMP_NUM_THREADS=1 python -m bench mutate --count 200 --output bench/results/mutate      (hours; --jobs 2)
 
-A mutant is a module of edgefilter/FOLDER with one operator, number, condition, decorator or the like replaced. Places are
-drawn at random, each as often as any other, then one of cosmic-ray's replacements there; annotations, which do nothing
-while a program runs, are left out. The tests of a mutant are those of tests/FOLDER, and of files elsewhere that have the
-name of one of its modules, that reach the line, measured once without a mutant; all of them where none reaches it, as on
-import or in a child process. It is killed where one fails, or where they take longer than three times what all of them
-take; slow tests come last. Everything happens in copies of the checkout. A run that was stopped goes on where it was:
-outcomes are kept in --cache by code and tests. The same seed draws the same mutants as long as the code is the same:
-`--again` tries those alone that survived in OUTPUT.json, after tests were added. Needs cosmic-ray and pytest-cov.
+A mutant is a module of edgefilter/FOLDER with one operator, number, condition, decorator or the like replaced. Places
+are drawn at random, each as often as any other, then one of cosmic-ray's replacements there; annotations, which do
+nothing while a program runs, are left out. The tests of a mutant are those of tests/FOLDER, and of files outside
+tests/bench that have the name of one of its modules, that reach the line, measured once without a mutant; all of them
+where none reaches it, as on import or in a child process. It is killed where one fails, or where they take longer than
+three times what all of them take; slow tests come last. Everything happens in copies of the checkout. A run that was
+stopped goes on where it was: outcomes are kept in --cache by code and tests. The same seed draws the same mutants as
+long as the code is the same: `--again` tries those alone that survived in OUTPUT.json, after tests were added. Needs
+cosmic-ray and pytest-cov.
 """
 
 from __future__ import annotations
@@ -214,13 +215,14 @@ def code_of(folder: str) -> str:
 
 
 def files_of(root: Path, folder: str) -> list[str]:
-    """Tests of a folder, and those elsewhere that have the name of one of its modules."""
+    """Tests of a folder, and those elsewhere that have the name of one of its modules; the benchmarks' own read results, which copies lack."""
     modules = {f"test_{path.stem}" for path in (root / "edgefilter" / folder).rglob("*.py")}
     every = sorted((root / "tests").rglob("test_*.py"))
     return [
         path.relative_to(root).as_posix()
         for path in every
-        if root / "tests" / folder in path.parents or path.stem in modules
+        if root / "tests" / folder in path.parents
+        or (path.stem in modules and root / "tests" / "bench" not in path.parents)
     ]
 
 
