@@ -269,11 +269,15 @@ def targets(copy: Path, mutant: Mutant, reach: Mapping) -> list[str]:
 
 
 def statement(source: str, line: int) -> tuple[int, int]:
-    """First and last line of the innermost statement there, without the statements inside it."""
-    around = [n for n in ast.walk(ast.parse(source)) if isinstance(n, ast.stmt) and n.lineno <= line <= n.end_lineno]
-    inner = min(around, key=lambda node: node.end_lineno - node.lineno)
-    body = getattr(inner, "body", None)
-    return inner.lineno, body[0].lineno - 1 if body else inner.end_lineno
+    """First and last line of the innermost statement there, without the statements inside it; a decorator belongs to what it decorates."""
+    spans = {
+        (min([node.lineno, *(one.lineno for one in getattr(node, "decorator_list", ()))]), node.end_lineno): node
+        for node in ast.walk(ast.parse(source))
+        if isinstance(node, ast.stmt)
+    }
+    first, last = min((span for span in spans if span[0] <= line <= span[1]), key=lambda span: span[1] - span[0])
+    body = getattr(spans[first, last], "body", None)
+    return first, body[0].lineno - 1 if body else last
 
 
 def attempt(free: queue.Queue[Path], mutant: Mutant, reach: Mapping) -> str:

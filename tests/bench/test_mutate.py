@@ -122,6 +122,12 @@ def test_a_mutant_meets_the_tests_that_reach_its_statement(checkout: Path) -> No
     ]  # fmt: skip
 
 
+@pytest.mark.parametrize(("line", "span"), [(1, (1, 3)), (2, (1, 3)), (4, (4, 4)), (5, (5, 6)), (6, (5, 6))])
+def test_a_line_belongs_to_its_innermost_statement(line: int, span: tuple[int, int]) -> None:
+    source = "@cache\ndef f(\n    x):\n    if x:\n        return (\n            1)\n"
+    assert mutate.statement(source, line) == span
+
+
 def test_tests_that_fail_anyway_and_folders_without_tests_are_one_line(
     checkout: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
