@@ -55,9 +55,6 @@ class Criteria:
     # Backward: what the later effects have made superfluous
     simple: int = 1
     """Complexity up to which an effect is simple beside any flexible one."""
-    passband_db: float = 0.4
-    """A gain in a filter's passband that is more than an ordinary tolerance and the fit's error, and so a turned
-    volume."""
 
     # Where a search ends
     silent_db: float = 0.2

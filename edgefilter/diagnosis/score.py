@@ -77,9 +77,10 @@ class Scorer:
         """Samples where nobody else talks, (n,)."""
         return self.prepared.usable
 
-    def level_db(self, prediction: Samples) -> float:
-        """Score.level_db of a prediction (n,)."""
-        return self.score(prediction, self.measurement.whiten(prediction)).level_db
+    def over_db(self, prediction: Samples, noise: Array) -> float:
+        """Score.over_db of a prediction (n,), with noise (times, bands) over the fan's expected in the cells."""
+        residual = self.measurement.recording - self.correct(prediction, self.measurement.whiten(prediction))
+        return self._mean(decibels(0.5 + 0.5 * self.cells(residual) / noise))
 
     def cells(self, residual: Samples) -> Array:
         """Power of the residual (n,) over the fan's, in the held-out cells, (times, bands)."""

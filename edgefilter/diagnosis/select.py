@@ -17,7 +17,7 @@ from edgefilter.diagnosis.noise_change import changed_fan
 from edgefilter.diagnosis.ordinary import p_value
 from edgefilter.diagnosis.prepare import Prepared
 from edgefilter.diagnosis.trials import Found, Trial, Workbench, added
-from edgefilter.echo.effects.catalogue import find, names
+from edgefilter.echo.effects.catalogue import find
 from edgefilter.echo.model import EchoModel
 
 FULL = "the search ended at {} effects with some error left: something further may be in the recording"
@@ -179,7 +179,8 @@ def _exchange(bench: Workbench, start: EchoModel, model: EchoModel, name: str) -
 
 def split(bench: Workbench, start: EchoModel, model: EchoModel) -> EchoModel:
     """The model with a simpler effect beside a flexible one where both together explain more than the flexible one alone."""
-    model = _volume_beside(bench, model)
+    for name in added(start, model):
+        model = _apart(bench, model, name)
     for name in [name for name in added(start, model) if find(name).flexible]:
         others = model.without_effect(name)
         if len(added(start, model)) > 2 or bench.explained(others):
@@ -188,22 +189,28 @@ def split(bench: Workbench, start: EchoModel, model: EchoModel) -> EchoModel:
     return model
 
 
-def _volume_beside(bench: Workbench, model: EchoModel) -> EchoModel:
-    """The model with the gain that a filter has in its passband as a turned volume beside it, where that explains as much."""
-    for name, values in model.effects:
-        gain_db = find(name).passband_gain_db(values)
-        if gain_db is None or abs(gain_db) < bench.criteria.passband_db:
-            continue
-        gains = [
-            (other, plain)
-            for other in names()
-            if (plain := find(other).plain_gain(gain_db)) is not None and other not in dict(model.effects)
-        ]
-        for other, plain in gains:
-            both = bench.attempt(name, model.without_effect(name).with_effect(other, plain))
-            if both is not None and both.score.level_db < bench.score(model).level_db + bench.criteria.worth_db:
-                return both.model
-    return model
+def _apart(bench: Workbench, model: EchoModel, name: str) -> EchoModel:
+    """The model with a simple effect beside the one of that name, where its fit has taken that one up as well; or as it is."""
+    effect, values, others = find(name), dict(model.effects)[name], model.without_effect(name)
+    only = effect.only(values)
+    bare = others.with_effect(name, only)
+    simple = None if only is values else forward(bench, bare, bench.criteria.simple)
+    if simple is None:
+        return model
+    grown = both = simple.model
+    for _ in range(bench.criteria.rounds):
+        fitted = bench.attempt(name, grown.without_effect(name))
+        if fitted is None:
+            return model
+        both = fitted.model
+        again = bench.attempt(
+            simple.name, both.with_effect(name, effect.only(fitted.values)).without_effect(simple.name)
+        )
+        if again is None:
+            return model
+        grown = again.model
+    lost, left = (bench.score(m).level_db - bench.score(model).level_db for m in (bare, grown))
+    return both if left <= (1.0 - bench.criteria.nearly) * lost else model
 
 
 def _with_simpler(bench: Workbench, start: EchoModel, model: EchoModel, name: str) -> EchoModel:

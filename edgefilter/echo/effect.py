@@ -142,16 +142,9 @@ class Effect:
         """Whether the values, and what they explain, look like this effect rather than another."""
         return True
 
-    def passband_gain_db(self, values: Values) -> float | None:
-        """The gain in dB that the effect gives to all of the voice that it passes.
-
-        None where there is no one such gain.
-        """
-        return None
-
-    def plain_gain(self, gain_db: float) -> Values | None:
-        """Values with which the effect is that gain and nothing else; None for an effect that is more than a gain."""
-        return None
+    def only(self, values: Values) -> Values:
+        """Values without what a flexible fit has taken up of another effect; by default as they are."""
+        return values
 
     def __init_subclass__(cls, **named: object) -> None:
         super().__init_subclass__(**named)

@@ -8,7 +8,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from edgefilter.echo.measurement import Measurement, Values, VoiceModel
+from edgefilter.echo.measurement import Measurement, Values, VoiceModel, level_ratio
 from edgefilter.types import Array, Samples
 
 
@@ -67,8 +67,8 @@ class Grid(Protocol):
         """Power of a signal (n,) over the fan's, (times, bands)."""
         ...
 
-    def level_db(self, prediction: Samples) -> float:
-        """Score.level_db of another prediction (n,)."""
+    def over_db(self, prediction: Samples, noise: Array) -> float:
+        """Score.over_db of another prediction (n,), with noise (times, bands) over the fan's expected in the cells."""
         ...
 
 
@@ -81,3 +81,15 @@ class Evidence:
     grid: Grid
     before: Score
     after: Score
+
+    @property
+    def noise(self) -> Array:
+        """What the model without the effect expects besides a voice in each cell, over the fan's power, (times, bands)."""
+        return self.grid.cells(self.grid.measurement.recording - self.before.prediction) / self.before.cells
+
+    def share(self, prediction: Samples) -> float:
+        """Which part of what the effect explains another prediction (n,), a gain apart, does: that of its law without free taps, say."""
+        measurement, fall = self.grid.measurement, self.before.over_db - self.after.over_db
+        gain = level_ratio(measurement.white_recording, measurement.whiten(prediction) * measurement.weights)
+        by_itself = self.before.over_db - self.grid.over_db(np.float32(gain) * prediction, self.noise)
+        return by_itself / fall if fall > 0.0 else 0.0

@@ -76,13 +76,14 @@ SHELVED = signal.lfilter(*shelf(-4.0), path())
         (three_reflections(), "early_path"),
         (elsewhere(), "early_path"),
         (SHELVED, "equaliser"),
+        (signal.lfilter(*shelf(-13.0), path()), "equaliser"),
         (signal.lfilter(*bell(900.0, 3.0, 5.0), path()), "equaliser"),
         (signal.lfilter(*bell(900.0, 25.0, 12.0), path()), "chassis_resonance"),
         (longer_room(), "late_reverb"),
     ],
     ids=[
-        *("three reflections within 6 ms", "elsewhere in the room", "treble shelf of -4 dB", "a band of Q 3"),
-        *("a ring of Q 25", "a room of 0.5 s"),
+        *("three reflections within 6 ms", "elsewhere in the room", "treble shelf of -4 dB", "of -13 dB"),
+        *("a band of Q 3", "a ring of Q 25", "a room of 0.5 s"),
     ],
 )
 def test_a_stationary_change_is_named_as_what_it_is(h: np.ndarray, named: str) -> None:
@@ -92,6 +93,22 @@ def test_a_stationary_change_is_named_as_what_it_is(h: np.ndarray, named: str) -
     assert found.remaining_db < 1.0  # the product's promise for linear effects
     if h is SHELVED:
         assert_gain_of_the_shelf(found.ranking[0].values)
+
+
+@pytest.mark.parametrize("turned_db", [-2.0, 3.0])
+@pytest.mark.parametrize(
+    ("h", "beside"),
+    [(longer_room(), "late_reverb"), (signal.lfilter(*signal.butter(6, 2000.0, fs=RATE), path()), "bandlimit")],
+    ids=["a room of 0.5 s", "a band limit"],
+)
+def test_a_turned_volume_is_named_beside_a_filter_that_could_take_it_up(
+    h: np.ndarray, beside: str, turned_db: float
+) -> None:
+    x = voice(10.0)
+    found = diagnose(profile(), through(10 ** (turned_db / 20) * h, x), x)
+    assert (found.verdict, {finding.effect for finding in found.ranking}) == ("missing", {beside, "playback_gain"})
+    volume = next(finding for finding in found.ranking if finding.effect == "playback_gain")
+    assert volume.values["gain_db"] == pytest.approx(turned_db, abs=0.3)
 
 
 @pytest.mark.slow

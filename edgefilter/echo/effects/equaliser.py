@@ -93,8 +93,7 @@ class Equaliser(Effect):
         if gain_db.size < 2 or float(np.std(gain_db)) < LEAST_DB:
             return False
         plain = self.apply(evidence.before.prediction, {**evidence.values, "taps": 0.0}, SAMPLE_RATE)
-        fall = evidence.before.level_db - evidence.after.level_db
-        return evidence.before.level_db - evidence.grid.level_db(plain) > 0.6 * fall
+        return evidence.share(plain) > 0.6
 
 
 def knots_hz(count: int) -> Array:

@@ -24,6 +24,8 @@ SLOWER = 1.7
 """The squares that are expected once the room is known decay in this many times its reverberation time, so that none of
 it is cut away."""
 BLOCK = 320
+DIRECT = 48
+"""Samples up to which no reflection of a room comes: a detour of a metre. A change there is another effect's."""
 EARLY, LATE_SHARE = round(0.03 * SAMPLE_RATE), 0.1
 """Samples up to which reflections are early, and the share of the added energy that comes after those where the room is
 another."""
@@ -83,6 +85,12 @@ class LateReverb(Effect):
             "the recording goes on sounding after the calibrated response has died away: "
             f"a reverberation of {first(values, 'rt60_s'):.2f} s that holds from the first second to the last"
         )
+
+    def only(self, values: Values) -> Values:
+        """The direct sound as it was."""
+        taps = np.atleast_1d(np.asarray(values["taps"], float)).copy()
+        taps[: LEAD + DIRECT] = 0.0
+        return {**values, "taps": taps}
 
     def plausible(self, evidence: Evidence) -> bool:
         """Whether what it adds is reverberation: a good part comes later than early reflections do, and decays more slowly than at the calibration.

@@ -40,7 +40,3 @@ class PlaybackGain(Effect):
             f"the voice is {abs(gain_db):.2f} dB {'louder' if gain_db > 0 else 'softer'} at all frequencies and levels"
             " alike"
         )
-
-    def plain_gain(self, gain_db: float) -> Values:
-        """The effect is nothing else."""
-        return {"gain_db": gain_db}
