@@ -262,7 +262,7 @@ def static_curve(ground: _Ground) -> Law | None:
     knots = peak * np.concatenate((-SHARES[::-1], [0.0], SHARES))
     parts = _hats(ground.x, knots, beyond=True)
     slopes = np.diff(np.eye(knots.size), axis=0) / np.diff(knots)[:, None]
-    bends = np.delete(np.diff(slopes, axis=0) * knots[-1], SHARES.size, axis=1)
+    bends = np.delete(np.diff(slopes, axis=0), SHARES.size, axis=1)
     bends *= 1.0 / np.sqrt(np.trace(bends.T @ bends) / bends.shape[1])
     heights = np.insert(ground.solve(list(np.delete(parts, SHARES.size, axis=0)), bends), SHARES.size, 0.0)
     gain = heights / np.where(knots == 0.0, 1.0, knots)

@@ -32,7 +32,20 @@ from edgefilter.integrations.duplex import Duplex
 from edgefilter.types import SAMPLE_RATE, Event
 
 SPEECH = {"speech_started": True, "speech_stopped": False}
-_default: dict[str, Any] = {"profile": None, "engine": "auto", "channels": 1, "mic_channels": None}
+
+
+def _options(words: list[str] | None = None) -> dict[str, Any]:
+    """What a command line says of the filter, as keywords of _ears."""
+    parser = argparse.ArgumentParser(prog="python -m edgefilter.integrations.sic", description=__doc__.splitlines()[0])
+    parser.add_argument("--profile", help="the calibrated robot")
+    parser.add_argument("--engine", default="auto", help="one beside which the network can judge speech")
+    parser.add_argument("--channels", type=int, default=1, help="of the microphone's sound, interleaved")
+    told = "those of them that form an array, from 0, as 0,1,2,3; otherwise the mean of all is taken"
+    parser.add_argument("--mic-channels", type=numbers, help=told)
+    return vars(parser.parse_args(words))
+
+
+_default = _options([])
 
 
 class HumanConf(SICConfMessage):
@@ -160,13 +173,7 @@ class Human(SICConnector):
 
 def main(words: list[str] | None = None) -> int:
     """Serve the component where it is asked for; one line and exit code 1 where that fails."""
-    parser = argparse.ArgumentParser(prog="python -m edgefilter.integrations.sic", description=__doc__.splitlines()[0])
-    parser.add_argument("--profile", help="the calibrated robot")
-    parser.add_argument("--engine", default="auto", help="one beside which the network can judge speech")
-    parser.add_argument("--channels", type=int, default=1, help="of the microphone's sound, interleaved")
-    told = "those of them that form an array, from 0, as 0,1,2,3; otherwise the mean of all is taken"
-    parser.add_argument("--mic-channels", type=numbers, help=told)
-    _default.update(vars(parser.parse_args(words)))
+    _default.update(_options(words))
     try:
         _ears(**_default)  # what cannot be made is said now
         manager = SICComponentManager([HumanComponent], component_group=Human.component_group, auto_serve=False)

@@ -165,6 +165,7 @@ def test_nothing_is_realigned_where_nothing_is_heard(scene):
     hops = run(Aligner(256), mic + fan(rng, mic.size), ref)
     assert any(a.state == "locked" for a in hops)
     assert not any(a.realigned for a in hops[later // 256 :])
+    assert all(a.ppm == a.confidence == 0.0 for a in hops if np.isnan(a.delay))
 
 
 def test_a_human_who_for_a_moment_sounds_like_the_muted_robot_realigns_nothing():

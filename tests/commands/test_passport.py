@@ -60,6 +60,10 @@ def test_a_device_that_is_linear_is_told_as_it_is(passport, clean):
     for told in figures["engines"].values():
         assert told["si_sdr_before_db"] == pytest.approx(-10.0, abs=0.5)  # voice and robot are nearly uncorrelated
         assert told["si_sdr_db"] > told["si_sdr_before_db"] + 10 and told["removed_db"] > 15
+    of_all_octaves = sum(10 ** (band["mic_db"] / 10) for band in figures["bands"])
+    assert -2.0 < 10 * np.log10(of_all_octaves) - figures["mic_db"] < 0.0  # what lies below 88 Hz is in none
+    removed = [band["removed_db"]["linear"] for band in figures["bands"]]
+    assert removed[0] > removed[-1] + 8  # the fan is white, the voice is not
     for words in (figures["said"]["headline"], "other humans' SI-SDR differed", "Nothing needs to be changed."):
         assert words in out and words.replace("'", "&#39;") in page
     assert page.count("<rect") == 4 * len(figures["bands"]) and "://" not in page

@@ -10,7 +10,7 @@ import pytest
 import soundfile
 
 from edgefilter import Profile, ProfileError, SignalError
-from edgefilter.diagnosis.channels import doubtful_channels
+from edgefilter.diagnosis.channels import doubtful_channels, is_clipped
 from edgefilter.types import SAMPLE_RATE
 from tests.commands.test_cli import edgefilter, one_line
 from tests.filter.test_arrays import calibration, fan, noise, talk
@@ -46,6 +46,14 @@ def test_a_defect_is_named_at_its_channel(mics: np.ndarray, change, words: str, 
     mics[at] = change(mics[at])
     found = doubtful_channels(calibration(3), mics, talk()[1])
     assert list(found) == [at] and found[at].startswith(words)
+
+
+@pytest.mark.parametrize(("drive", "cut"), [(0.0, False), (4.2, False), (5.0, True)])
+def test_a_sound_that_lingers_at_its_top_is_not_cut_yet(drive: float, cut: bool) -> None:
+    """Of a sine there is as much at the top as beside it, bent so 2.5 times as much, and bent more 4 times."""
+    sine = np.sin(2 * np.pi * np.arange(SAMPLE_RATE) * 0.01237)
+    bent = np.abs(np.tanh(drive * sine) if drive else sine)
+    assert is_clipped(bent / bent.max()) is cut
 
 
 def test_exchanged_channels_and_copies_are_named(mics: np.ndarray) -> None:

@@ -173,6 +173,7 @@ def test_the_dictionary_has_the_published_keys_and_is_json() -> None:
     assert set(entry) == {
         *("effect", "family", "p_value", "excess_before_db", "excess_after_db", "share", "parameters", "evidence")
     }
+    assert found.independence is not None and said["independence"]["of_findings"] == found.independence.to_dict()
     assert entry["family"] == "linear path" and 0.0 < entry["p_value"] <= Criteria().false_rate
     assert entry["parameters"]["gain_db"]["value"] == pytest.approx(-0.915, abs=0.05)
 

@@ -43,6 +43,7 @@ def lawful(family: str) -> Law:
     score = Scorer(prepared).of(prepared.model)
     law = free_law(Found(prepared, prepared.model, prepared.model, score, score, ()), Criteria())
     assert law is not None and law.family == family and law.excess_db < 0.4 * score.excess_db
+    assert law.curve.share == 1.0 or law.curve.y_unit != "dB"  # a gain that is the law's own
     return law
 
 

@@ -22,7 +22,7 @@ from edgefilter.dsp.metrics import si_sdr
 from edgefilter.integrations import serve as module
 from edgefilter.integrations.opus import Decoder, Encoder
 from edgefilter.integrations.serve import Service
-from edgefilter.integrations.wire import HEADER, MICROPHONE, REFERENCE
+from edgefilter.integrations.wire import HEADER, MICROPHONE, REFERENCE, Form
 
 ROOT = Path(__file__).parents[2]
 DEMO = Path(edgefilter.__file__).parent / "demo_data"
@@ -237,6 +237,10 @@ def test_opus_at_32_kbit_leaves_enough_of_the_echo_to_notice_the_human(conversat
     span = slice(BOTH.start, min(BOTH.stop, out.size) - 800)
     found = max(si_sdr(out[span.start + late : span.stop + late], human[span]) for late in range(0, 800, 2))
     assert found > si_sdr(mic[BOTH], human[BOTH]) + 15
+
+
+def test_a_first_message_needs_to_say_nothing():
+    assert Form.of("{}") == Form(16000, "stereo", 1, "pcm", late_ms=0, learn=False, bitrate=24000)
 
 
 @pytest.mark.parametrize(

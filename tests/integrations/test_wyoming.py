@@ -357,11 +357,11 @@ def test_a_loudspeaker_that_is_not_there_silences_nothing_else(caplog):
 
 
 def test_stereo_speech_on_a_mono_loudspeaker_is_the_mean_of_its_channels_and_not_clipped(player, tmp_path):
-    loud = np.full(10_000, 0.8, np.float32)
+    loud, both = np.full(10_000, 0.8, np.float32), np.tile(np.float32([0.9, 0.7]), 10_000)
 
     async def talk():
         mono = Player(player, MONO)
-        await mono.write(AudioChunk(RATE, 2, 2, as_pcm16(loud, 2)))
+        await mono.write(AudioChunk(RATE, 2, 2, as_pcm16(both)))
         await until(lambda: (tmp_path / "played").exists() and (tmp_path / "played").stat().st_size == 20_000)
         await mono.stop()
 
