@@ -26,6 +26,7 @@ from bench.recordings import progress, read
 from bench.stale import DIAGNOSIS
 from edgefilter.calibration.calibrate import calibrate
 from edgefilter.diagnosis.diagnose import diagnose
+from edgefilter.echo.effects.catalogue import find
 from edgefilter.errors import UsageError
 from edgefilter.types import Samples
 
@@ -84,6 +85,11 @@ class Outcome:
     def right(self) -> tuple[str, ...]:
         """Of a single effect: the names that are right."""
         return (self.truth[0], *self.also)
+
+    @property
+    def family_hit(self) -> bool:
+        """Of a single effect: whether what is named first is of its family, or of that of another name that is right."""
+        return bool(self.named) and find(self.first).family in {find(name).family for name in self.right}
 
     @property
     def hit(self) -> bool:
@@ -168,6 +174,7 @@ def counts(found: Sequence[Outcome]) -> dict[str, dict]:
         [one for one in found if one.group == group] for group in ("singles", "controls", "pairs", "outside", "sealed")
     )
     flags: dict[str, Iterable[bool]] = {"one effect: named first": [one.hit for one in singles]}
+    flags["one effect: family right"] = [one.family_hit for one in singles]
     for strength in STRENGTHS:
         of = [one for one in singles if one.strength == strength]
         flags[f"named first, {strength}"] = [one.hit for one in of]

@@ -61,6 +61,12 @@ def test_what_counts_as_a_hit(case: Outcome, hit: bool, label: str) -> None:
     assert case.hit is hit and case.label == label
 
 
+def test_a_name_of_the_same_family_is_half_right() -> None:
+    assert outcome("equaliser", "missing", "bandlimit").family_hit and outcome("rattle", "missing", "rattle").family_hit
+    assert not outcome("equaliser", "missing", "rattle", "bandlimit").family_hit
+    assert not outcome("equaliser", "unexplained").family_hit
+
+
 def test_cases_are_counted_by_strength_and_kind() -> None:
     cases = [
         *(outcome("rattle", "missing", "rattle"), outcome("rattle", "missing", "mic_agc", "rattle")),
@@ -75,6 +81,7 @@ def test_cases_are_counted_by_strength_and_kind() -> None:
     ]
     assert {name: (count["hits"], count["n"]) for name, count in names.counts(cases).items()} == {
         "one effect: named first": (1, 3),
+        "one effect: family right": (1, 3),
         "named first, clear": (1, 2),
         "among the first two, clear": (2, 2),
         "named first, near": (0, 1),
