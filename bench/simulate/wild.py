@@ -5,11 +5,11 @@
 A case is a folder HALF_NUMBER as bench.simulate.hidden_cases writes them; truth.json besides says what other names are
 right (also), which program it was and its setting. Case i has program i mod their number, then comes a control for
 every ten; the setting is drawn again, at most six times, while it changes less than LEAST_DB over the fan. Robot, room
-and ordinary tolerances are those of hidden_robot. `--half reporting` is for figures, never for tuning: the two share no
-suite of programs, so that a suite's way to do things is not learned.
+and ordinary tolerances are those of hidden_robot. `--half reporting` and `--half unseen` are for figures, never for tuning:
+they share no suite of programs with the tuning half nor with each other, so that a suite's way to do things is not learned.
 
 Debian: sox ffmpeg swh-plugins tap-plugins cmt caps invada-studio-plugins-ladspa zam-plugins vlevel lame opus-tools speex
-libgsm-tools. PyPI: pedalboard noisereduce webrtc-noise-gain.
+libgsm-tools fil-plugins guitarix-ladspa blop vorbis-tools. PyPI: pedalboard noisereduce webrtc-noise-gain.
 """
 
 from __future__ import annotations
@@ -368,9 +368,49 @@ REPORTING: tuple[Program, ...] = (
             lambda r: pedalboard("Chorus", rate_hz=r.uniform(0.5, 3), depth=r.uniform(0.1, 0.3), mix=r.uniform(0.3, 0.5))),
 )
 """ffmpeg, tap, caps, cmt, invada, vlevel, LAME, Opus, GSM, pedalboard, noisereduce."""
+
+LATER: tuple[Program, ...] = (
+    Program("zam EQ2", "source", ("equaliser",),
+            lambda r: ladspa("ZamEQ2-ladspa", "ZamEQ2", either(r, 3, 9), r.uniform(0.5, 2), log_uniform(r, 300, 1200),
+                             either(r, 3, 9), r.uniform(0.5, 2), log_uniform(r, 1200, 5000), either(r, 1, 6), 200,
+                             either(r, 1, 6), 3000, 0, 0, rate=48000)),
+    Program("zam GEQ31", "source", ("equaliser",),
+            lambda r: ladspa("ZamGEQ31-ladspa", "ZamGEQ31", 0, *np.interp(np.arange(29), np.arange(0, 32, 4), gains(r, 8)), rate=48000)),
+    Program("fil Parametric1", "source", ("equaliser",),
+            lambda r: ladspa("filters", "Parametric1", 1, 0, *(v for low in (150, 400, 1000, 2500) for v in
+                             (1, low * r.uniform(1, 2), r.uniform(0.5, 2), either(r, 2, 9))), rate=48000)),
+    Program("guitarix echo", "room", ("early_path",),
+            lambda r: ladspa("guitarix_echo", "guitarix_echo", r.uniform(10, 40), r.uniform(1.5, 12))),
+    Program("guitarix freeverb", "room", ("late_reverb",),
+            lambda r: ladspa("guitarix_freeverb", "guitarix_freeverb", r.uniform(0.3, 0.8), r.uniform(0.2, 0.6), r.uniform(0.1, 0.3))),
+    Program("zita reverb", "room", ("late_reverb",),
+            lambda r: ladspa("zita-reverbs", "zita-reverb", 0.02, 200, 1, 1, 6000, 160, 0, 2500, 0, r.uniform(0.05, 0.3), channels=2)),
+    Program("zam AutoSat", "source", ("speaker_nonlinearity", "playback_gain"),  # it raises the level as well
+            lambda r: ladspa("ZamAutoSat-ladspa", "ZamAutoSat")),
+    Program("zam Comp", "source", ("compression",),
+            lambda r: ladspa("ZamComp-ladspa", "ZamComp", log_uniform(r, 1, 20), log_uniform(r, 60, 500), r.uniform(0, 6),
+                             r.uniform(2.5, 8), r.uniform(-34, -24), 0, 1, 0, channels=2)),
+    Program("guitarix compressor", "source", ("compression",),
+            lambda r: ladspa("guitarix_compressor", "guitarix_compressor", r.uniform(0, 6), r.uniform(2.5, 8), r.uniform(-34, -24),
+                             log_uniform(r, 0.001, 0.02), log_uniform(r, 0.06, 0.5), 0)),
+    Program("zam MaximX2", "source", ("limiter", "compression"),
+            lambda r: ladspa("ZaMaximX2-ladspa", "ZaMaximX2", log_uniform(r, 5, 80), *2 * [r.uniform(-20, -10)], channels=2)),
+    Program("zam MultiCompX2", "source", ("multiband_compression",),
+            lambda r: ladspa("ZaMultiCompX2-ladspa", "ZaMultiCompX2", *3 * [log_uniform(r, 2, 20)], *3 * [log_uniform(r, 60, 400)],
+                             0, 0, 0, *r.uniform(2, 8, 3), *r.uniform(-45, -25, 3), 0, 0, 0, log_uniform(r, 300, 1200),
+                             log_uniform(r, 1500, 4000), 1, 1, 1, 0, 0, 0, 1, 0, channels=2)),
+    Program("blop lp4pole", "source", ("bandlimit", "equaliser"),  # 24 dB an octave, and a colour below
+            lambda r: ladspa_by_rate("lp4pole_1671", "lp4pole_fcrcia_oa", r.uniform(2000, 4500), 0)),
+    Program("vorbis", "source", ("codec",), lambda r: coded(f"oggenc -q {r.integers(-1, 3)} -o {{packed}} {{wav}}", "oggdec -o {out} {packed}")),
+    Program("sbc", "source", ("codec",),
+            lambda r: coded(f"ffmpeg -y -i {{wav}} -c:a sbc -b:a {r.integers(24, 64)}k -f sbc {{packed}}", "ffmpeg -y -f sbc -i {packed} {out}")),
+    Program("aac", "source", ("codec",),
+            lambda r: coded(f"ffmpeg -y -i {{wav}} -c:a aac -b:a {r.integers(12, 32)}k -f adts {{packed}}", "ffmpeg -y -i {packed} {out}")),
+)
+"""zam, fil, guitarix, zita, blop, Vorbis, SBC, AAC: nothing was chosen on them."""
 # fmt: on
 
-HALVES = {"tuning": TUNING, "reporting": REPORTING}
+HALVES = {"tuning": TUNING, "reporting": REPORTING, "unseen": LATER}
 CONTROL = Program("none", "source", ("none",), None)
 
 

@@ -17,16 +17,15 @@ YET_WITHOUT_A_NAME = {"codec"}
 
 
 def test_the_halves_are_of_other_programs() -> None:
-    assert sum(map(len, wild.HALVES.values())) >= 25
-    assert min(map(len, wild.HALVES.values())) >= 25
-    assert not SUITES["tuning"] & SUITES["reporting"]
+    assert min(len(wild.TUNING), len(wild.REPORTING)) >= 25 and len(wild.LATER) >= 15
+    assert sum(map(len, SUITES.values())) == len(set.union(*SUITES.values()))
 
 
 @pytest.mark.parametrize("half", sorted(wild.HALVES))
 def test_every_right_name_is_one_that_the_diagnosis_may_say(half: str) -> None:
     right = {name for program in wild.HALVES[half] for name in program.right}
     assert right <= set(catalogue.names()) | YET_WITHOUT_A_NAME | {"unknown"}
-    assert len(right) >= 12
+    assert len(right) >= {"tuning": 12, "reporting": 12, "unseen": 9}[half]
 
 
 @pytest.mark.parametrize("half", sorted(wild.HALVES))
