@@ -9,7 +9,7 @@ and ordinary tolerances are those of hidden_robot. `--half reporting` and `--hal
 they share no suite of programs with the tuning half nor with each other, so that a suite's way to do things is not learned.
 
 Debian: sox ffmpeg swh-plugins tap-plugins cmt caps invada-studio-plugins-ladspa zam-plugins vlevel lame opus-tools speex
-libgsm-tools fil-plugins guitarix-ladspa blop vorbis-tools. PyPI: pedalboard noisereduce webrtc-noise-gain.
+libgsm-tools fil-plugins rev-plugins guitarix-ladspa blop vorbis-tools. PyPI: pedalboard noisereduce webrtc-noise-gain.
 """
 
 from __future__ import annotations
