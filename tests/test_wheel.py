@@ -87,6 +87,7 @@ def test_the_wheel_holds_every_module_and_nothing_that_is_not_read(wheel):
     assert licences == {"LICENSE", "NOTICE", "LICENSE.md"}
 
 
+@pytest.mark.slow
 def test_the_demo_runs_from_it(installed, tmp_path):
     run(installed / "edgefilter", "demo", "--output", tmp_path / "demo", "--json", tmp_path / "demo.json", cwd=tmp_path)
     figures = json.loads((tmp_path / "demo.json").read_text())

@@ -72,6 +72,7 @@ def test_parts_of_a_fan_are_less_alike_the_higher_they_sound() -> None:
     assert alike[5:15].mean() > 0.85 > alike[150:250].mean()
 
 
+@pytest.mark.slow
 def test_a_channel_is_what_its_levels_say(made: tuple) -> None:
     _, signals, meta = made
     (turn,) = meta["turns"]
@@ -85,6 +86,7 @@ def test_a_channel_is_what_its_levels_say(made: tuple) -> None:
     assert signals["mic"].shape[1] == 3 and np.ptp(levels) < 12.0 and np.abs(signals["mic"]).max() < 1.2
 
 
+@pytest.mark.slow
 def test_without_an_echo_the_same_human_and_fan_are_left(clips: Path, covariances: tuple, made: tuple) -> None:
     _, signals, meta = made
     speech, voices = read_clips(clips, (0.5, 8.0)), read_voices([clips])

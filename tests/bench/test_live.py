@@ -210,6 +210,7 @@ def echo(scene: Scene) -> np.ndarray:
     return scene.echo(scene.signals["ref"])
 
 
+@pytest.mark.slow
 def test_a_scene_recorded_again_is_the_same_up_to_the_stop_and_without_the_robot_behind_it(
     scene: Scene, echo: np.ndarray
 ) -> None:

@@ -26,6 +26,7 @@ def devices(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_the_error_is_that_of_humans_on_the_same_device(devices: Path, clips: Path, tmp_path: Path) -> None:
     words = ["passport", devices, "--speech", clips, "--engines", "bypass,linear", "--levels=-10,-5"]
     assert program.main([*map(str, words), "--output", str(tmp_path / "p")]) == 0

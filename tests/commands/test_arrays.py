@@ -55,6 +55,7 @@ def test_without_being_named_channels_are_averaged_and_it_is_said(folder: Path) 
     )
 
 
+@pytest.mark.slow
 def test_what_cannot_be_is_one_line_and_the_output_is_left_alone(folder: Path) -> None:
     (folder / "out.wav").write_bytes(b"kept")
     profile = ("--profile", folder / "three.npz")

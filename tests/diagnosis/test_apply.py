@@ -60,6 +60,7 @@ def test_the_order_of_the_names_changes_nothing_that_is_heard() -> None:
     assert one == pytest.approx(other, abs=0.1)
 
 
+@pytest.mark.slow
 def test_reverberation_is_learnt_from_a_recording_whose_clocks_differ(drifting) -> None:
     y, x = drifting
     knowing, before, after = add(profile(), "late_reverb", y, x)
@@ -141,6 +142,7 @@ def test_what_the_held_out_seconds_contradict_is_called_worse(carried_back) -> N
     assert 5.0 < proof.start_s < 7.0
 
 
+@pytest.mark.slow
 def test_of_several_effects_the_one_that_hurts_is_named(carried_back) -> None:
     y, x = carried_back
     proof = prove(profile(), ["late_reverb", "mic_clipping"], y, x)
@@ -161,6 +163,7 @@ def test_the_seconds_of_the_proof_choose_no_name() -> None:
     assert found.unproven == "nothing lasting was found"
 
 
+@pytest.mark.slow
 def test_a_name_that_fails_its_proof_is_not_given(monkeypatch) -> None:
     x = voice(6.0)
     y = record(x, EchoModel(path()).with_effect("playback_gain", {"gain_db": -3.0}))
@@ -179,6 +182,7 @@ def test_a_name_that_fails_its_proof_is_not_given(monkeypatch) -> None:
     assert row.verdict == "failed its proof" and "ERLE 12.0 dB without, 8.0 dB with" in row.why
 
 
+@pytest.mark.slow
 def test_a_profile_made_from_the_recording_is_proven_against_a_filter_without_any(drifting) -> None:
     y, x = drifting
     proof = prove(None, "late_reverb", y, x)

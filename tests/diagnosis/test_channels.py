@@ -97,6 +97,7 @@ def diagnose(folder: Path, *more: object):
     return edgefilter("diagnose", *recording, "--profile", folder / "three.npz", *more)
 
 
+@pytest.mark.slow
 def test_any_channel_is_diagnosed_and_all_are_looked_at(folder: Path) -> None:
     result = diagnose(folder, "--mic-channels", "1,2,3", "--channel", 3, "--json", folder / "found.json")
     assert result.returncode == 0, result.stderr

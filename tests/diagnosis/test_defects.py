@@ -236,6 +236,7 @@ def test_another_colour_of_the_loudspeaker_is_not_called_late_reverberation() ->
     assert found.comparison.excess_db > 3.0
 
 
+@pytest.mark.slow
 def test_a_room_that_sounds_longer_is_called_late_reverberation() -> None:
     x, rng = voice(12.0), np.random.default_rng(8)
     tail = np.arange(RATE // 2)

@@ -115,6 +115,7 @@ def test_things_that_slam_now_and_then_are_no_fan() -> None:
     assert "fan_noise" not in names(found) and found.verdict == "unexplained"
 
 
+@pytest.mark.slow
 def test_mains_hum_is_not_an_effect_and_is_described() -> None:
     x = voice(SECONDS)
     t = np.arange(x.size) / 16000

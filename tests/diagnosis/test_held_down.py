@@ -46,6 +46,7 @@ def in_bands(x: np.ndarray) -> np.ndarray:
     return 1.5 * feedback(low, 2.0, -35.0) + 1.8 * feedback(middle, 3.0, -45.0) + 2.2 * feedback(high, 2.5, -50.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("device", "expected"),
     [

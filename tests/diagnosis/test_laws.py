@@ -85,6 +85,7 @@ def test_the_law_is_said_in_words() -> None:
     assert "5 times a second" in lawful("modulation").words
 
 
+@pytest.mark.slow
 def test_what_is_explained_gets_no_law_and_what_is_not_one_beside_what_is_named() -> None:
     turned = diagnose(profile(), record(np.float32(0.7) * X), X)
     assert turned.verdict == "missing" and turned.law is None and turned.to_dict()["law"] is None

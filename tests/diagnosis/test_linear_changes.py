@@ -70,6 +70,7 @@ def assert_gain_of_the_shelf(values: Values) -> None:
 SHELVED = signal.lfilter(*shelf(-4.0), path())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("h", "named"),
     [
@@ -95,10 +96,13 @@ def test_a_stationary_change_is_named_as_what_it_is(h: np.ndarray, named: str) -
         assert_gain_of_the_shelf(found.ranking[0].values)
 
 
-@pytest.mark.parametrize("turned_db", [-2.0, 3.0])
+@pytest.mark.slow
 @pytest.mark.parametrize(
-    ("h", "beside"),
-    [(longer_room(), "late_reverb"), (signal.lfilter(*signal.butter(6, 2000.0, fs=RATE), path()), "bandlimit")],
+    ("h", "beside", "turned_db"),
+    [
+        (longer_room(), "late_reverb", 3.0),
+        (signal.lfilter(*signal.butter(6, 2000.0, fs=RATE), path()), "bandlimit", -2.0),
+    ],
     ids=["a room of 0.5 s", "a band limit"],
 )
 def test_a_turned_volume_is_named_beside_a_filter_that_could_take_it_up(

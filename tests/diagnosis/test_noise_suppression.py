@@ -98,6 +98,7 @@ def test_what_the_running_filter_contradicts_is_not_looked_for() -> None:
     assert changed_fan(prepared, prepared.model, base, Criteria(), without=("noise_suppression",)) is None
 
 
+@pytest.mark.slow
 def test_it_stays_named_beside_what_nothing_explains() -> None:
     x = voice(SECONDS)
     trembling = 0.7 + 0.3 * np.sin(2 * np.pi * 7.0 * np.arange(x.size) / 16000)

@@ -49,6 +49,7 @@ def heard(x: np.ndarray, name: str, values: dict, seed: int) -> np.ndarray:
     return y.astype(np.float32)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("pair", PAIRS)
 @pytest.mark.parametrize("true", [0, 1])
 def test_five_seconds_settle_a_pair_whichever_is_true(pair: str, true: int) -> None:
@@ -154,6 +155,7 @@ def answering(
     return ["probe", *(word for role, file in named.items() for word in (f"--{role}", str(folder / file)))]
 
 
+@pytest.mark.slow
 def test_the_command_writes_the_sounds_and_evaluates_what_was_heard_of_them(written: Path, capsys) -> None:
     info = soundfile.info(written / "probe.wav")
     assert (info.samplerate, info.frames) == (SAMPLE_RATE, 2 * SOUND_S * SAMPLE_RATE)
@@ -167,6 +169,7 @@ def test_the_command_writes_the_sounds_and_evaluates_what_was_heard_of_them(writ
     assert [one["effects"] for one in figures["explanations"]] == [["compression"], ["playback_gain"]]
 
 
+@pytest.mark.slow
 def test_what_nothing_predicts_is_said_and_named_by_none(written: Path, capsys) -> None:
     """A vacuum cleaner runs, 26 dB over the fan: neither is closer in a way that matters."""
     y, _ = soundfile.read(written / "answer.wav", dtype="float32")

@@ -65,6 +65,7 @@ def test_a_refit_ends_where_no_round_can_reach_its_goal():
     assert len(tried) < rounds
 
 
+@pytest.mark.slow
 def test_a_run_that_meets_an_earlier_one_ends_there():
     x, robot = voice(6.0), profile()
     changed = robot.echo.with_effect("playback_gain", {"gain_db": -4.0}).with_effect("clock_drift", {"ppm": 40.0})

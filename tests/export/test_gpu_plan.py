@@ -37,6 +37,7 @@ def plan(step, speech, tmp_path, **more):
     )
 
 
+@pytest.mark.slow
 def test_the_plan_runs_from_speech_to_small_files(speech, tmp_path):
     for step in ("simulate", "large", "edge"):
         done = plan([step], speech, tmp_path)

@@ -57,6 +57,7 @@ def exported(tmp_path_factory) -> tuple[EdgeCrnn, Path]:
     return network, folder / "crnn.onnx"
 
 
+@pytest.mark.slow
 def test_the_runtime_takes_the_file_and_knows_its_stft_training_and_figures(exported):
     engine = Crnn(exported[1])
     assert engine.stft == EDGE.stft
@@ -67,6 +68,7 @@ def test_the_runtime_takes_the_file_and_knows_its_stft_training_and_figures(expo
     ]
 
 
+@pytest.mark.slow
 def test_the_speech_head_is_scaled_as_asked_and_the_file_says_so(exported, tmp_path, capsys):
     network, path = exported
     words = [path.with_name("last.pt"), "--output", tmp_path / "crnn.onnx", "--platt", "0.5", "1.5"]
@@ -173,6 +175,7 @@ def test_parity_runs_a_thousand_frames_and_is_far_below_the_bound(exported):
     assert 0 < onnx_parity.edge(exported[0], exported[1], frames=200) < 2e-5
 
 
+@pytest.mark.slow
 def test_parity_sees_a_weight_that_is_off_by_a_little(exported):
     other = edge()
     with torch.no_grad():
@@ -194,6 +197,7 @@ def test_parity_compares_the_state_too(exported):
         onnx_parity.edge(network, exported[1], frames=1)
 
 
+@pytest.mark.slow
 def test_an_int8_variant_that_is_too_far_away_is_not_written(exported, monkeypatch, tmp_path):
     monkeypatch.setattr(onnx_parity, "FRAMES", 50)
     monkeypatch.setattr(onnx_parity, "LEAST_DB", 300.0)
@@ -250,6 +254,7 @@ def test_what_is_no_checkpoint_is_refused_in_one_line(tmp_path, capsys, content)
     assert not (tmp_path / "crnn.onnx").exists()
 
 
+@pytest.mark.slow
 def test_the_papers_network_is_exported_for_clips_of_any_length_and_with_an_int8_lstm(tmp_path):
     torch.manual_seed(2)
     network = PaperCrnn(PAPER).eval()

@@ -6,6 +6,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
 import torch
 
 from export import train
@@ -31,6 +32,7 @@ OPTIONS = argparse.Namespace(
 WORDS = "--hop 32 --channels 4 4 4 4 --hidden 8 --full-precision --steps 3 --every 3 --batch 2 --seconds 0.5".split()
 
 
+@pytest.mark.slow
 def test_two_processes_step_along_the_mean_of_their_gradients(tmp_path):
     folders = argparse.Namespace(data=tmp_path / "d", validation=tmp_path / "v", hop=32)
     train.smoke(folders)

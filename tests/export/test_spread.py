@@ -38,6 +38,7 @@ def test_a_task_that_fails_and_a_scheduler_that_is_not_there_are_said(cluster, m
         list(spread(power, 2, [1], 1, "tcp://127.0.0.1:1"))
 
 
+@pytest.mark.slow
 def test_a_cluster_simulates_the_same_items(cluster, tmp_path, capsys):
     humans, robots = write_librispeech(tmp_path / "humans", ("1", "2")), write_table(tmp_path / "robots", ("a",))
     shape = ["--count", "2", "--seed", "4", "--rooms", "3", "--jobs", "1"]

@@ -380,6 +380,7 @@ def test_the_rate_rises_stays_and_falls():
     assert timed.done_at(1000, 10 * 60) == 1.0
 
 
+@pytest.mark.slow
 def test_training_starts_from_given_weights_of_the_same_shape(tmp_path, capsys):
     def run(name, hidden, *more, hop="32"):
         folders = ["--data", str(tmp_path / "d"), "--validation", str(tmp_path / "v"), "--output", str(tmp_path / name)]

@@ -166,6 +166,7 @@ class Stopped(Mixtures):
         return super().draw(step, batch, seconds)
 
 
+@pytest.mark.slow
 def test_a_training_that_was_cut_off_goes_on_to_the_same_weights(items, speech, tmp_path):
     data = mixtures(items, speech)
     stopped = Stopped(data.items, data.voices, data.stft, data.seed)
@@ -189,6 +190,7 @@ def test_a_training_that_was_cut_off_goes_on_to_the_same_weights(items, speech, 
         VoiceFilterTrainer(replace(SMALL, channels=2), Plan(4, 1e-3, seed=3, every=2), tmp_path / "whole")
 
 
+@pytest.mark.slow
 def test_training_learns_which_bins_are_the_humans(items, speech, tmp_path):
     data = mixtures(items, speech)
     trainer = VoiceFilterTrainer(SMALL, Plan(60, 1e-2, seed=3, every=60), tmp_path, half=False)
@@ -201,6 +203,7 @@ def test_training_learns_which_bins_are_the_humans(items, speech, tmp_path):
     assert after["si_sdr_other_db"] != after["si_sdr_db"]
 
 
+@pytest.mark.slow
 def test_one_command_leads_from_items_to_a_file_that_filters_a_clip(
     items, speech, encoder, live, clips, tmp_path, monkeypatch, capsys
 ):

@@ -162,6 +162,7 @@ def test_the_microphones_of_an_array_are_filtered_as_they_are_in_a_file(pair, st
     assert told[-1]["kind"] == "ended" and told[-1]["array"] == ego.stats()["array"]
 
 
+@pytest.mark.slow
 def test_a_profile_of_another_number_of_microphones_is_one_line(pair):
     profile, sound = pair
     _, told = run(heard({"microphones": 3}, stereo_messages(sound, sound[:, 0]), engine="ss", profile=profile))

@@ -121,6 +121,7 @@ def check(sound, told, room_of):
     assert not [kind for kind, *_ in told if kind.startswith(("reference", "robot", "rate"))]
 
 
+@pytest.mark.slow
 def test_without_a_server_it_is_one_line(cloud):
     words = ("-m", "edgefilter.integrations.sic", "--engine", "linear")
     done = subprocess.run([sys.executable, *words], env=cloud.environment, capture_output=True, text=True, timeout=100)

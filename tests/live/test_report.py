@@ -80,6 +80,7 @@ def stored(folder) -> dict:
     return json.loads(re.search(r'id="data">(.*?)</script>', page, re.S)[1])
 
 
+@pytest.mark.slow
 def test_switches_move_the_figure_the_stairs_the_bars_the_picture_and_the_sound(browser, pages):
     folder, found = pages
     data = stored(folder)
