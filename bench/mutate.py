@@ -304,14 +304,7 @@ def tests(copy: Path, chosen: Sequence[str], limit_s: float | None, *options: st
     for which in ("not slow", "slow"):
         command = [
             sys.executable,
-            "-m",
-            "pytest",
-            "--rootdir=.",
-            "-x",
-            "-q",
-            "-p",
-            "no:cacheprovider",
-            "-m",
+            *"-m pytest --rootdir=. -x -q -p no:cacheprovider -m".split(),
             which,
             *options,
             *chosen,

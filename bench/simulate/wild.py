@@ -369,7 +369,7 @@ REPORTING: tuple[Program, ...] = (
 )
 """ffmpeg, tap, caps, cmt, invada, vlevel, LAME, Opus, GSM, pedalboard, noisereduce."""
 
-LATER: tuple[Program, ...] = (
+UNSEEN: tuple[Program, ...] = (
     Program("zam EQ2", "source", ("equaliser",),
             lambda r: ladspa("ZamEQ2-ladspa", "ZamEQ2", either(r, 3, 9), r.uniform(0.5, 2), log_uniform(r, 300, 1200),
                              either(r, 3, 9), r.uniform(0.5, 2), log_uniform(r, 1200, 5000), either(r, 1, 6), 200,
@@ -410,7 +410,7 @@ LATER: tuple[Program, ...] = (
 """zam, fil, guitarix, zita, blop, Vorbis, SBC, AAC: nothing was chosen on them."""
 # fmt: on
 
-HALVES = {"tuning": TUNING, "reporting": REPORTING, "unseen": LATER}
+HALVES = {"tuning": TUNING, "reporting": REPORTING, "unseen": UNSEEN}
 CONTROL = Program("none", "source", ("none",), None)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Protocol
 
 import numpy as np
@@ -82,7 +83,7 @@ class Evidence:
     before: Score
     after: Score
 
-    @property
+    @cached_property
     def noise(self) -> Array:
         """What the model without the effect expects besides a voice in each cell, over the fan's power, (times, bands)."""
         return self.grid.cells(self.grid.measurement.recording - self.before.prediction) / self.before.cells
