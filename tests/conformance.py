@@ -405,7 +405,6 @@ EFFECT_CASES: dict[str, dict[str, object]] = {
     "packet_loss": {"times_s": np.array([1.14, 1.16, 3.7, 5.2, 6.86, 8.9, 10.1]), "length_ms": 20.0, "fill": 0.5},
     "codec": {
         "power": 0.3 * np.exp(-np.arange(16) / 6),
-        "emphasis_db": -1.5 * np.arange(16),
         "decay_ms": 8.0,
         "exponent": 1.0,
         "below_voice_db": 10.0,

@@ -123,11 +123,14 @@ class Effect:
         return psd
 
     def variance(self, reference: Samples, values: Values, sample_rate: int) -> Samples:
-        """What the effect adds to the expected square of each sample (n,) at the microphone, for an aligned reference (n,)."""
+        """What the effect adds to the expected square of each sample (n,) at the microphone, for an aligned reference (n,).
+
+        (k, n) where it is the sum of k, each with a colour of its own.
+        """
         return np.zeros(reference.size, np.float32)
 
     def colour(self, values: Values) -> Array:
-        """The spectral density of that, (601,), 0 to 8 kHz, per Hz: its integral is 1. By default white."""
+        """The spectral density of that, (601,) or (k, 601), 0 to 8 kHz, per Hz: its integral is 1. By default white."""
         return np.full(601, 1.0 / 8000.0)
 
     def settled(self, values: Values) -> Values:

@@ -62,7 +62,7 @@ class EchoModel:
         return ahead, path[:size], LEAD, behind[len(filters) :]
 
     def unpredictable(self, reference: Samples) -> tuple[tuple[Samples, Array], ...]:
-        """Of each effect that adds noise of its own: its expected square (n,) at the microphone, and its density (601,) per Hz of integral 1."""
+        """Of each source of the noise that effects add: its expected square (n,) at the microphone, and its density (601,) per Hz of integral 1."""
         applied = chain(self.effects)
         noisy = [(effect, values) for effect, values in applied if effect.adds_noise]
         if not noisy:
@@ -71,7 +71,8 @@ class EchoModel:
         for effect, values in applied:
             if effect.stage == "time" or (effect.stage == "source" and not effect.adds_noise):
                 x = effect.apply(x, values, SAMPLE_RATE)
-        return tuple((effect.variance(x, values, SAMPLE_RATE), effect.colour(values)) for effect, values in noisy)
+        added = [(effect.variance(x, values, SAMPLE_RATE), effect.colour(values)) for effect, values in noisy]
+        return tuple(source for each in added for source in zip(*map(np.atleast_2d, each), strict=True))
 
     def source_chain(self) -> SourceChain:
         """What the running filter puts the reference through, hop by hop, before the path."""

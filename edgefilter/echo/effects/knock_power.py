@@ -83,14 +83,14 @@ def find_trigger(
     return best[1], by_knocks - nothing > max(BETTER * (by_voice - nothing), LEAST)
 
 
-def colour_of_knocks(residual: Samples, ringing: Samples, fit: NDArray[np.bool_] | None) -> tuple[float, Array]:
-    """Log likelihood and (BANDS,) the power in each band, over the fan, that ringing (n,) at 1 adds to a whitened residual (n,)."""
-    power, source = band_power(residual), frames(ringing, FRAME, HOP).mean(axis=1, keepdims=True)
+def colour_of(residual: Samples, source: Array, fit: NDArray[np.bool_] | None) -> tuple[float, Array]:
+    """Log likelihood and (BANDS,) the power in each band, over the fan, that a source (frames, 1 or BANDS) at 1 adds to a whitened residual (n,)."""
+    power = band_power(residual)
     use = slice(None) if fit is None else fit[np.arange(len(power)) * HOP + FRAME // 2]
-    scale = float(source.mean())
-    if scale <= 0.0:
+    scale = source.mean(axis=0)
+    if not scale.all():
         return -np.inf, np.zeros(BANDS)
-    sources = [np.ones_like(source)[use], (source / scale)[use].astype(np.float32)]
+    sources = [np.ones((len(power), 1), np.float32)[use], (source / scale)[use].astype(np.float32)]
     colours = _colours(power[use], sources, 4 * ROUNDS)
     return _likelihood(power[use], sources, colours), colours[1] / scale
 

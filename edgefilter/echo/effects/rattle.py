@@ -11,6 +11,7 @@ import scipy
 from numpy.typing import NDArray
 
 from edgefilter.dsp.convolution import convolve
+from edgefilter.dsp.frames import frames
 from edgefilter.echo.effect import (
     Effect,
     Experiment,
@@ -24,9 +25,11 @@ from edgefilter.echo.effect import (
 )
 from edgefilter.echo.effects.knock_power import (
     DECAYS_MS,
+    FRAME,
+    HOP,
     RESONANCES_HZ,
     Trigger,
-    colour_of_knocks,
+    colour_of,
     density_of,
     fan_in_bands,
     find_knocks,
@@ -168,9 +171,10 @@ class Rattle(Effect):
         predicted = measurement.whiten(model.predict(self.apply(x, complete(self, values), SAMPLE_RATE)))
         target = measurement.white_recording
         left = target - absorbed(predicted, target, measurement.fit)
-        fits = {
-            decay: colour_of_knocks(left, ringing_of(knocks, decay, PRE_ROLL), measurement.fit) for decay in DECAYS_MS
-        }
+        fits = {}
+        for decay in DECAYS_MS:
+            source = frames(ringing_of(knocks, decay, PRE_ROLL), FRAME, HOP).mean(axis=1, keepdims=True)
+            fits[decay] = colour_of(left, source, measurement.fit)
         decay = max(fits, key=lambda decay: fits[decay][0])
         power = fits[decay][1] * fan_in_bands(measurement.noise_psd)
         rate = np.count_nonzero(knocks) * SAMPLE_RATE / max(x.size, 1)
