@@ -265,9 +265,9 @@ class Workbench:
 
     def _outdoes(self, one: Trial, other: Trial) -> bool:
         """Whether one explains more than another, by more than chance; a flexible one by more than it takes up of whatever is left."""
-        if find(one.name).flexible:
-            return other.gain_db < self.criteria.nearly * one.gain_db
-        return p_value(one.name, one.gain_db - other.gain_db) <= self.criteria.false_rate
+        by_chance = p_value(one.name, one.gain_db - other.gain_db) > self.criteria.false_rate
+        taken_up = find(one.name).flexible and other.gain_db >= self.criteria.nearly * one.gain_db
+        return not (by_chance or taken_up)
 
     def absent(self, model: EchoModel, most: int) -> list[str]:
         """Names of the effects on the voice that a model has not, that may be tried and whose complexity is at most `most`."""
