@@ -224,7 +224,8 @@ def _laws(
         for stage in stages:
             if progress:
                 progress(f"trying {family.__name__.replace('_', ' ')}")
-            law = family(_Ground(scorer, model, stage))
+            ground = _Ground(scorer, model, stage)
+            law = family(ground) if ground.sounds else None
             if law is None:
                 continue
             prediction = law.predict(model, scorer.measurement.reference)
@@ -244,6 +245,11 @@ class _Ground:
         self.target, self.weights = self._measurement.white_recording, self._measurement.weights
         self.lag = PRE_ROLL if stage == "source" else 0
 
+    @property
+    def sounds(self) -> bool:
+        """Whether any of the voice is in the samples that a law is fitted to."""
+        return bool((self.x * self.weights).any())
+
     def part(self, x: Samples) -> Samples:
         """What a part (n,) of x becomes at the microphone, whitened."""
         return self._measurement.whiten(self._model.predict(x) if self.stage == "source" else x)
@@ -254,11 +260,9 @@ class _Ground:
         return _solved(normal.matrix, normal.right, bends)[0]
 
 
-def static_curve(ground: _Ground) -> Law | None:
+def static_curve(ground: _Ground) -> Law:
     """f(x), f straight between its knots, f(0) = 0: an amplifier, a valve, a rectifier, a converter."""
-    peak = float(np.max(np.abs(ground.x * (ground.weights > 0.0)), initial=0.0))
-    if peak <= 0.0:
-        return None
+    peak = float(np.max(np.abs(ground.x * (ground.weights > 0.0))))
     knots = peak * np.concatenate((-SHARES[::-1], [0.0], SHARES))
     parts = _hats(ground.x, knots, beyond=True)
     slopes = np.diff(np.eye(knots.size), axis=0) / np.diff(knots)[:, None]
@@ -281,11 +285,9 @@ def static_curve(ground: _Ground) -> Law | None:
     return Law("static nonlinearity", words, ground.stage, curve, code)
 
 
-def dynamics(ground: _Ground) -> Law | None:
+def dynamics(ground: _Ground) -> Law:
     """g(L) x, L the level of x, its power smoothed with an attack and a release: compressor, limiter, expander, gate, normaliser."""
-    loud_db = float(decibels(np.max(block_power(ground.x, SAMPLE_RATE // 50), initial=0.0)))
-    if loud_db < -80.0 or not ground.weights.any():
-        return None
+    loud_db = float(decibels(np.max(block_power(ground.x, SAMPLE_RATE // 50))))
     knots = np.ceil(loud_db) + 6.0 + SPACING_DB * np.arange(-KNOTS + 1.0, 1.0)
     bends = np.concatenate((np.diff(np.eye(KNOTS), 2, axis=0), 0.1 * np.diff(np.eye(KNOTS), axis=0)))
     energy, cross = (
@@ -323,8 +325,6 @@ def dynamics(ground: _Ground) -> Law | None:
 def modulation(ground: _Ground) -> Law | None:
     """A gain that moves with time by itself, again and again: a tremolo, blades in front of a loudspeaker, a contact that shakes."""
     energy, cross = (block_sums(ground.heard * other * ground.weights, BEAT) for other in (ground.heard, ground.target))
-    if not energy.any():
-        return None
     rates, worth, _ = by_rate(energy, cross, *RATES_HZ)
     most = float(rates[int(np.argmax(worth))])
     orders = np.arange(1, HARMONICS + 1)[:, None]
@@ -347,11 +347,9 @@ def modulation(ground: _Ground) -> Law | None:
     return Law("modulation", words, ground.stage, curve, code, event=True)
 
 
-def linear_path(ground: _Ground) -> Law | None:
+def linear_path(ground: _Ground) -> Law:
     """One more filter behind the path."""
     taps = fit_filter(ground.heard, ground.target, ground.weights, TAPS, LEAD)
-    if not taps.any():
-        return None
     hz = np.geomspace(100.0, 7500.0, 60)
     response = np.abs(np.exp(-2j * np.pi * np.outer(hz, np.arange(TAPS)) / SAMPLE_RATE) @ taps)
     gain_db = 20.0 * np.log10(np.maximum(response, 1e-2))

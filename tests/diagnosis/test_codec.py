@@ -9,6 +9,7 @@ from scipy import signal
 from edgefilter.diagnosis.diagnose import diagnose
 from edgefilter.diagnosis.prepare import prepare
 from edgefilter.diagnosis.score import Scorer
+from edgefilter.echo.effect import complete
 from edgefilter.echo.effects.catalogue import find
 from edgefilter.echo.effects.codec_signs import signs_of
 from edgefilter.echo.evidence import Evidence
@@ -58,6 +59,18 @@ def test_where_the_codec_cuts_the_band_both_are_named() -> None:
     x = voice(SECONDS)
     low = signal.sosfilt(signal.cheby2(10, 50, 4000, fs=16000, output="sos"), coded(x, -8.0)).astype(np.float32)
     assert {finding.effect for finding in diagnose(profile(), record(low), x).ranking} == {"bandlimit", "codec"}
+
+
+def test_the_noise_in_a_band_follows_the_voice_in_that_band() -> None:
+    n = 16_000
+    low, high = (np.sin(2 * np.pi * hz * np.arange(n) / 16_000).astype(np.float32) for hz in (750.0, 6250.0))
+    half = np.arange(n) < n // 2
+    values = complete(find("codec"), {"power": np.ones(16), "decay_ms": 4.0})
+    noise = find("codec").variance(np.where(half, low, high), values, 16_000)
+    assert noise.shape == (16, n)
+    first, second = noise[:, n // 4], noise[:, 3 * n // 4]
+    assert first.argmax() == 1 and second.argmax() == 12
+    assert first[12] < 1e-3 * first[1] and second[1] < 1e-3 * second[12]
 
 
 @pytest.mark.parametrize(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -93,3 +94,10 @@ def test_what_is_explained_gets_no_law_and_what_is_not_one_beside_what_is_named(
     assert shaken.verdict == "unexplained" and shaken.law is not None
     assert shaken.law.excess_db < 0.5 * shaken.remaining_db and shaken.law.beside == ()
     assert shaken.to_dict()["law"]["family"] == "modulation"
+
+
+def test_where_no_voice_is_there_to_fit_to_there_is_no_law() -> None:
+    prepared = prepare(profile(), record(HIDDEN["dynamics"].astype(np.float32)), X)
+    mute = replace(prepared, measurement=replace(prepared.measurement, fit=np.zeros(X.size, bool)))
+    score = Scorer(mute).of(mute.model)
+    assert free_law(Found(mute, mute.model, mute.model, score, score, ()), Criteria()) is None
