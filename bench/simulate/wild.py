@@ -3,10 +3,11 @@
     python -m bench.simulate.wild --voices robot/val robot/train --output DIR --seed 1 --half tuning --count 40
 
 A case is a folder HALF_NUMBER as bench.simulate.hidden_cases writes them; truth.json besides says what other names are
-right (also), which program it was and its setting. Case i has program i mod their number, then comes a control for
-every ten; the setting is drawn again, at most six times, while it changes less than LEAST_DB over the fan. Robot, room
-and ordinary tolerances are those of hidden_robot. `--half reporting` and `--half unseen` are for figures, never for tuning:
-they share no suite of programs with the tuning half nor with each other, so that a suite's way to do things is not learned.
+right (also; a volume, where at its setting the program does no more), which program it was and its setting. Case i has
+program i mod their number, then comes a control for every ten; the setting is drawn again, at most six times, while it
+changes less than LEAST_DB over the fan. Robot, room and ordinary tolerances are those of hidden_robot. `--half
+reporting` and `--half unseen` are for figures, never for tuning: they share no suite of programs with the tuning half
+nor with each other, so that a suite's way to do things is not learned.
 
 Debian: sox ffmpeg swh-plugins tap-plugins cmt caps invada-studio-plugins-ladspa zam-plugins vlevel lame opus-tools speex
 libgsm-tools fil-plugins rev-plugins guitarix-ladspa blop vorbis-tools. PyPI: pedalboard noisereduce webrtc-noise-gain.
@@ -449,6 +450,13 @@ def through(rng: Rng, scene: Scene, program: Program) -> tuple[Chain, str]:
     return replace(chain, paths=((start, fade, command(longer)),)), command.words
 
 
+def is_a_volume(scene: Scene, change: Array) -> bool:
+    """Whether a change of the recording (n,) is a turned volume but for less than LEAST_DB over the fan: a compressor that always works is one."""
+    voice = scene.echo(scene.usual)
+    turned = np.dot(change, voice) / np.dot(voice, voice) * voice
+    return scene.over_fan_db(change - turned) < LEAST_DB
+
+
 def make_case(seed: int, index: int, half: str, voices: dict[str, list[Clip]]) -> tuple[dict[str, Array], dict]:
     """Signals by name (n,) and the contents of truth.json, for case index of this seed and half."""
     rng = np.random.default_rng([seed, sorted(HALVES).index(half), index])
@@ -463,6 +471,8 @@ def make_case(seed: int, index: int, half: str, voices: dict[str, list[Clip]]) -
         if program is CONTROL or change_db >= LEAST_DB:
             break
     right = program.right
+    if program is not CONTROL and change_db >= LEAST_DB and is_a_volume(scene, put_back(mic, usual) - usual):
+        right = (*right, "playback_gain")
     strength = "control" if program is CONTROL else "clear" if change_db >= CLEAR_DB else "moderate"
     truth = {"effects": [right[0]], "also": list(right[1:]), "raw": [program.name], "strength": strength}
     truth |= {"setting": words, "effect_to_noise_db": change_db, "tolerances": scene.tolerances}
