@@ -28,7 +28,7 @@ from bench import peers, results
 from bench.metrics import percentiles
 from bench.recordings import progress
 from edgefilter import Profile, engines
-from edgefilter.engines.ladder import CANDIDATES
+from edgefilter.engines import CANDIDATES
 from edgefilter.errors import EdgefilterError, UsageError
 from edgefilter.filter.budget import CORES, DEMO, held_to, scene
 from edgefilter.filter.learner import Learner

@@ -23,7 +23,7 @@ from edgefilter.diagnosis.passport import ENGINES, LEAST_S, MOST_S, expected
 from edgefilter.dsp.metrics import si_sdr
 from edgefilter.errors import UsageError
 from edgefilter.filter.budget import DEMO
-from edgefilter.filter.enhance import enhance
+from edgefilter.filter.ego_filter import enhance
 from edgefilter.types import SAMPLE_RATE
 
 NOTES = """SI-SDR, dB, of humans laid on, against the prediction of `edgefilter passport` at the same level. Error: predicted less

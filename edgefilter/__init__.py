@@ -48,7 +48,7 @@ if TYPE_CHECKING:
     from edgefilter.errors import UsageError as UsageError
     from edgefilter.filter.barge_in import BargeInSettings as BargeInSettings
     from edgefilter.filter.ego_filter import EgoFilter as EgoFilter
-    from edgefilter.filter.enhance import enhance as enhance
+    from edgefilter.filter.ego_filter import enhance as enhance
     from edgefilter.integrations.echo_canceller import EchoCanceller as EchoCanceller
     from edgefilter.learning.background import BackgroundLearner as BackgroundLearner
     from edgefilter.learning.path_learner import PathLearner as PathLearner
@@ -88,8 +88,7 @@ _HOMES = {
         "UsageError",
     ),
     "filter.barge_in": ("BargeInSettings",),
-    "filter.ego_filter": ("EgoFilter",),
-    "filter.enhance": ("enhance",),
+    "filter.ego_filter": ("EgoFilter", "enhance"),
     "integrations.echo_canceller": ("EchoCanceller",),
     "learning.background": ("BackgroundLearner",),
     "learning.path_learner": ("PathLearner",),

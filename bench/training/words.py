@@ -29,9 +29,8 @@ from edgefilter.engines.base import Engine, EngineState, FrontEndKind
 from edgefilter.engines.crnn import Crnn
 from edgefilter.engines.linear import Linear
 from edgefilter.engines.spectral_subtraction import SpectralSubtraction
-from edgefilter.engines.step import step
 from edgefilter.errors import UsageError
-from edgefilter.filter.stream import Stream
+from edgefilter.filter.stream import Stream, step
 from edgefilter.profile.data import Profile
 from edgefilter.types import Frame, Output, Samples
 from export import onnx_export

@@ -22,8 +22,7 @@ from edgefilter.dsp.metrics import si_sdr
 from edgefilter.engines import NEEDS_PROFILE
 from edgefilter.errors import UsageError
 from edgefilter.filter.budget import DEMO
-from edgefilter.filter.ego_filter import EgoFilter
-from edgefilter.filter.enhance import enhance
+from edgefilter.filter.ego_filter import EgoFilter, enhance
 from edgefilter.profile.data import Profile
 from edgefilter.report.text import decibels, headline
 from edgefilter.session import filter_blocks

@@ -15,7 +15,7 @@ from edgefilter.dsp.frames import block_power, decibels
 from edgefilter.echo.effects.catalogue import find
 from edgefilter.echo.model import EchoModel
 from edgefilter.errors import SignalError
-from edgefilter.filter.enhance import enhance
+from edgefilter.filter.ego_filter import enhance
 from edgefilter.profile.data import Profile
 from edgefilter.types import SAMPLE_RATE, Samples
 

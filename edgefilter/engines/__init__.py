@@ -36,7 +36,7 @@ CATALOGUE = {
     "crnn": Entry("crnn", "Crnn", ("model", "profile"), automatic=True, linear_stage=True),
     "ss": Entry("spectral_subtraction", "SpectralSubtraction", ("stft",), automatic=True, linear_stage=True),
     "linear": Entry("linear", "Linear", ("stft",), automatic=True, linear_stage=True),
-    "bypass": Entry("bypass", "Bypass", ("stft",)),
+    "bypass": Entry("linear", "Bypass", ("stft",)),
     "paper-ss": Entry("paper_ss", "paper_ss", ("profile",)),
     "paper-ss-causal": Entry("paper_ss", "paper_ss_causal", ("profile",)),
     "paper-crnn": Entry("paper_crnn", "PaperCrnn", ("model",)),
@@ -46,38 +46,20 @@ ENGINES = tuple(CATALOGUE)
 NEEDS_PROFILE = tuple(name for name, entry in CATALOGUE.items() if entry.takes == ("profile",))
 HAVE_MODEL = tuple(name for name, entry in CATALOGUE.items() if "model" in entry.takes)
 HAVE_LINEAR_STAGE = tuple(name for name, entry in CATALOGUE.items() if entry.linear_stage)
+CANDIDATES = tuple(name for name, entry in CATALOGUE.items() if entry.automatic)
+"""What "auto" chooses from, best first."""
 
 
 def create(
     name: str, profile: Profile | None = None, stft: StftConfig = StftConfig(), model: str | Path | None = None
 ) -> Engine | ClipEngine:
-    """Make an engine by name.
+    """Make the engine of that name, one of `ENGINES`; it has no state, and streams can share it.
 
-    Parameters
-    ----------
-    name : str
-        One of `ENGINES`.
-    profile : Profile, optional
-        The calibrated robot; the engines of `NEEDS_PROFILE` do not work without, and `crnn` answers otherwise with one.
-    stft : StftConfig, optional
-        For the engines that work with any; the others have their own.
-    model : str or Path, optional
-        The file that an engine of `HAVE_MODEL` loads in place of its own.
+    profile: the calibrated robot; the engines of `NEEDS_PROFILE` do not work without, and `crnn` answers otherwise with
+    one. stft: for the engines that work with any. model: the file that an engine of `HAVE_MODEL` loads in place of its own.
+    Raises UsageError for an unknown name, a missing profile, or a model for an engine that has no use for it, and
+    ModelError for a model file that does not fit.
 
-    Returns
-    -------
-    Engine or ClipEngine
-        Without state: streams can share it.
-
-    Raises
-    ------
-    UsageError
-        For an unknown name, an engine that lacks its profile, or a model for one that has no use for it.
-    ModelError
-        For a model file that does not fit.
-
-    Examples
-    --------
     >>> create("linear").stft.hop
     256
     """

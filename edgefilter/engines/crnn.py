@@ -4,42 +4,36 @@ from __future__ import annotations
 
 import math
 import threading
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, ClassVar, NamedTuple, TypeAlias
+from typing import ClassVar, NamedTuple, TypeAlias
 
 import numpy as np
 
 from edgefilter.dsp import fourier
 from edgefilter.engines.base import FrontEndKind
-from edgefilter.engines.onnx_session import FixedPlaces, expect_answer, expect_slots, find_model, open_model
+from edgefilter.engines.onnx_session import FixedPlaces, Model, expect_answer, expect_slots, find_model, open_model
 from edgefilter.engines.spectral_subtraction import SpectralSubtraction
+from edgefilter.profile.data import Profile
 from edgefilter.types import Frame, Output, Samples, Spectrum
 
-if TYPE_CHECKING:
-    from edgefilter.profile.data import Profile
-
-EDGE_TYPE, EDGE_VERSION = "edgefilter-crnn", 2
+EDGE_TYPE = "edgefilter-crnn"
+EDGE_VERSION = 2
 SPECTRA = ("error", "mic", "reference", "echo")
 """The graph's first inputs, each (1, bins, 2) float32, real and imaginary part."""
 POWERS = ("noise_psd", "residual_psd")
 """Those that follow, each (1, bins) float32, as in Frame."""
 VARIABLE = "EDGEFILTER_CRNN"
-
 LOUDEST = 1.26
 """Most power of a frame of the answer, over the microphone's: 1 dB. The shipped network stays below; one that is not as it
 should be is turned down to it."""
-
 SURE = 100.0
 """Error power over the expected powers of noise and residual echo, 20 dB, from which on a bin is the human's while the robot
 is silent, whatever the network says: it takes parts of a loud human for noise. While the robot speaks this is not so sure."""
-
 SHARE_OF_SS = np.float32(0.4)
 """How much of the answer is that of `ss` where the robot is calibrated: it errs elsewhere than the network, and both
 together err less than either; half would be as good, and leave more of a robot alone (models/MODELS.md). Without a
 calibration, or with a path that the filter has learned, it saves no word and costs a real loudspeaker's humans up to
 2 dB."""
-
 LOUD = 1.3e3, 6.3e3
 """Power of the loudest frame of microphone and reference, 31 and 38 dB, in the recordings that the network was trained on
 (medians): the loudest so far is brought there."""
@@ -49,8 +43,7 @@ FAINT = 1e-4
 """Power of the answer over the loudest frame of the microphone so far, -40 dB, below which it is nobody who interrupts: nine in
 ten of the frames in which a human 20 to 26 dB below the robot is noticed are above it. What is left of one real loudspeaker,
 with something soft behind it, sounds human to the network at -46 to -40 dB (tuning half). With -45 and -40 dB the same humans
-are noticed as soon.
-"""
+are noticed as soon."""
 LASTING = 3
 """Frames that must be as loud, so that no click counts."""
 
@@ -98,11 +91,8 @@ class Crnn:
         self._ss, self._ss_helps = SpectralSubtraction(self.stft), profile is not None and not profile.learned
         states = dict(self.model.states)
         spectrum = (1, self.stft.bins, 2)
-        outputs = {
-            "spectrum": spectrum,
-            "speech_probability": (1,),
-            **{f"next_{name}": shape for name, shape in states.items()},
-        }
+        following = {f"next_{name}": shape for name, shape in states.items()}
+        outputs = {"spectrum": spectrum, "speech_probability": (1,), **following}
         powers = dict.fromkeys(POWERS, (1, self.stft.bins))
         expect_slots(self.model, {**dict.fromkeys(SPECTRA, spectrum), **powers, **states}, outputs)
         self._own = threading.local()
@@ -143,30 +133,33 @@ class Crnn:
 
     def _run(self, frame: Frame, state: tuple[Samples, ...], mic: np.float32, reference: np.float32) -> Places:
         """The network on one frame, microphone and reference multiplied by those factors; its answers stand in the places."""
-        places = self._places()
+        if not hasattr(self._own, "places"):  # of the calling thread: several streams may share the engine
+            self._own.places = Places(self.model)
+        places: Places = self._own.places
         factors = {"reference": reference, **dict.fromkeys(POWERS, mic**2)}
         for name, inputs in places.inputs:
             np.multiply(getattr(frame, name), factors.get(name, mic), out=inputs)
         for place, tensor in zip(places.states, state):
             place[...] = tensor
-        places.slots.run()
+        places.run()
         return places
 
-    def _places(self) -> Places:
-        """The places of the calling thread, since several streams may share the engine."""
-        if not hasattr(self._own, "places"):
-            slots = FixedPlaces(self.model.session)
-            names = [name for name, _ in self.model.states]
-            spectra = [(name, slots.inputs[name].view(np.complex64).reshape(-1)) for name in SPECTRA]
-            powers = [(name, slots.inputs[name].reshape(-1)) for name in POWERS]
-            states, next_states = (
-                [slots.inputs[name] for name in names],
-                [slots.outputs[f"next_{name}"] for name in names],
-            )
-            spectrum = slots.outputs["spectrum"].view(np.complex64).reshape(-1)
-            probability = slots.outputs["speech_probability"]
-            self._own.places = Places(slots, [*spectra, *powers], spectrum, probability, states, next_states)
-        return self._own.places
+
+class Places:
+    """Where one frame's inputs go and its outputs come, of one thread.
+
+    inputs: (bins,) by the name of the Frame's field that goes there. spectrum: (bins,) complex64.
+    """
+
+    def __init__(self, model: Model) -> None:
+        slots = FixedPlaces(model.session)
+        spectra = [(name, slots.inputs[name].view(np.complex64).reshape(-1)) for name in SPECTRA]
+        self.inputs = [*spectra, *((name, slots.inputs[name].reshape(-1)) for name in POWERS)]
+        self.spectrum: Spectrum = slots.outputs["spectrum"].view(np.complex64).reshape(-1)
+        self.probability = slots.outputs["speech_probability"]
+        self.states = [slots.inputs[name] for name, _ in model.states]
+        self.next_states = [slots.outputs[f"next_{name}"] for name, _ in model.states]
+        self.run = slots.run
 
 
 def _with_what_is_sure(human: Spectrum, frame: Frame) -> Spectrum:
@@ -189,18 +182,3 @@ def _limited(found: float, most: float) -> np.float32 | None:
     if found <= most:
         return np.float32(1.0)
     return np.float32(math.sqrt(most / found)) if math.isfinite(found) else None
-
-
-@dataclass(frozen=True)
-class Places:
-    """Where one frame's inputs go and its outputs come.
-
-    inputs: (bins,) by the name of the Frame's field that goes there. spectrum: (bins,) complex64.
-    """
-
-    slots: FixedPlaces
-    inputs: list[tuple[str, Spectrum | Samples]]
-    spectrum: Spectrum
-    probability: Samples
-    states: list[Samples]
-    next_states: list[Samples]

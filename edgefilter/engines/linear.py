@@ -1,4 +1,4 @@
-"""The engine that is the linear stage alone: the answer is what the canceller could not predict."""
+"""The engines without a mask: what the canceller could not predict, and the microphone as it is."""
 
 from __future__ import annotations
 
@@ -24,3 +24,13 @@ class Linear:
 
     def step(self, frame: Frame, state: EngineState) -> tuple[Output, EngineState]:
         return Output(frame.error), state
+
+
+class Bypass(Linear):
+    """Returns the microphone: it tests the stream, and is the unfiltered row of every table."""
+
+    name: ClassVar[str] = "bypass"
+    front: ClassVar[FrontEndKind] = "none"
+
+    def step(self, frame: Frame, state: EngineState) -> tuple[Output, EngineState]:
+        return Output(frame.mic), state

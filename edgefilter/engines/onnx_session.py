@@ -22,7 +22,8 @@ except Exception as error:  # a broken installation raises what its binary part 
     said = " ".join(f"{type(error).__name__}: {error}".split())[:160]
     raise ModelError(f"onnxruntime cannot be loaded ({said}): pip install --force-reinstall onnxruntime") from None
 
-FOLDERS = (Path(__file__).parents[1] / "models", Path(__file__).parents[2] / "models")
+_PACKAGE = Path(__file__).parent.parent
+FOLDERS = (_PACKAGE / "models", _PACKAGE.parent / "models")
 """Where models lie: inside the installed package, or at the top of a checkout."""
 SHIPPED = {
     "crnn.onnx": "afe41e5c116cde75e1ebf4719c38fb8ef6d7e574410a2ac62a3355e6bd6f96ca",
@@ -31,7 +32,6 @@ SHIPPED = {
 """sha256 of the files in models/, as MODELS.md lists them."""
 MOST_BYTES, MOST_STATE, MOST_FFT = 512 * 2**20, 1 << 22, 1 << 14
 """Bounds on what a file may ask for: its own size, the values in one state tensor (16 MiB), the longest transform (1 s)."""
-
 OTHER_FILES = b"location"
 """The key (ExternalDataProto of onnx.proto) without which no tensor can name another file; onnxruntime before 1.24 opens
 any path there, and 1.32 those below the working directory."""
@@ -62,8 +62,7 @@ class Model:
 class FixedPlaces:
     """A model's inputs and outputs as arrays that stay where they are: write the inputs, run, read the outputs.
 
-    Handing over new arrays at each call takes a tenth of a paced frame. All shapes have to be fixed; one thread at a
-    time.
+    Handing over new arrays at each call takes a tenth of a paced frame. All shapes are fixed; one thread at a time.
     """
 
     def __init__(self, session: onnxruntime.InferenceSession) -> None:
@@ -94,7 +93,7 @@ def find_model(given: str | Path | None, variable: str, name: str, remedy: str) 
     for folder in FOLDERS:
         path = folder / name
         if path.is_file():
-            if name in SHIPPED and _sha256(_read(path)) != SHIPPED[name]:
+            if name in SHIPPED and hashlib.sha256(_read(path)).hexdigest() != SHIPPED[name]:
                 raise ModelError(
                     f"model {path} is not the one that belongs to this edgefilter (its sha256 is another): reinstall"
                     " edgefilter, or name a model of your own with --model"
@@ -111,8 +110,6 @@ def open_session(path: Path, content: bytes | None = None) -> onnxruntime.Infere
     """
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = options.inter_op_num_threads = 1
-    options.execution_mode = onnxruntime.ExecutionMode.ORT_SEQUENTIAL
-    options.graph_optimization_level = onnxruntime.GraphOptimizationLevel.ORT_ENABLE_ALL
     options.log_severity_level = 4
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
     options.add_session_config_entry("session.inter_op.allow_spinning", "0")
@@ -136,9 +133,12 @@ def open_model(path: Path, kind: str, version: int) -> Model:
     content = _read(path)
     session = open_session(path, content)
     said = session.get_modelmeta().custom_metadata_map
-    _expect(path, "type", said.get("type"), kind)
-    _expect(path, "version", said.get("version"), str(version))
-    _expect(path, "sample_rate", said.get("sample_rate"), str(SAMPLE_RATE))
+    for key, wanted in (("type", kind), ("version", str(version)), ("sample_rate", str(SAMPLE_RATE))):
+        if (found := said.get(key)) != wanted:
+            raise ModelError(
+                f"model {path} has {key} {plain(found or 'unknown', 40)}, expected {wanted}: take the model that belongs"
+                " to this engine and version"
+            )
     try:
         n_fft, hop, window_length = (int(said[name]) for name in ("n_fft", "hop", "window_length"))
         if max(n_fft, hop) > MOST_FFT:
@@ -155,7 +155,7 @@ def open_model(path: Path, kind: str, version: int) -> Model:
         raise ModelError(f"model {path} does not say its {error.args[0]}: export it again") from None
     except (ValueError, TypeError, StftError, RecursionError, OverflowError) as error:
         raise ModelError(f"model {path} has unusable metadata ({plain(str(error))}): export it again") from None
-    return Model(path, _sha256(content), session, stft, training, figures, states)
+    return Model(path, hashlib.sha256(content).hexdigest(), session, stft, training, figures, states)
 
 
 def expect_slots(model: Model, inputs: Mapping[str, tuple], outputs: Mapping[str, tuple]) -> None:
@@ -202,20 +202,8 @@ def _read(path: Path) -> bytes:
         raise ModelError(f"model {path} cannot be read ({error.strerror}): check the path") from None
 
 
-def _sha256(content: bytes) -> str:
-    return hashlib.sha256(content).hexdigest()
-
-
 def _may_be(found: Sequence[int | str | None], wanted: Sequence[int | str]) -> bool:
     """Whether a graph's shape, in which what is not a number is free, can be the wanted one."""
     return len(found) == len(wanted) and all(
         not isinstance(size, int) or size == want for size, want in zip(found, wanted)
     )
-
-
-def _expect(path: Path, key: str, found: str | None, wanted: str) -> None:
-    if found != wanted:
-        raise ModelError(
-            f"model {path} has {key} {plain(found or 'unknown', 40)}, expected {wanted}: take the model that belongs to this"
-            " engine and version"
-        )

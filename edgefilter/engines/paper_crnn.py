@@ -14,7 +14,8 @@ from edgefilter.engines.paper_ss import PAPER_STFT
 from edgefilter.errors import ModelError
 from edgefilter.types import SAMPLE_RATE, Frame, Spectrum
 
-PAPER_TYPE, PAPER_VERSION = "edgefilter-paper-crnn", 1
+PAPER_TYPE = "edgefilter-paper-crnn"
+PAPER_VERSION = 1
 VARIABLE = "EDGEFILTER_PAPER_CRNN"
 MAX_SECONDS = 60
 """Longest clip; the convolutions hold about 50 MB for each second of it. The paper's clips have 5 s."""
@@ -45,9 +46,8 @@ class PaperCrnn:
             )
         clip = (1, "any", PAPER_STFT.bins)
         expect_slots(self.model, {"mic_magnitude": clip, "reference_magnitude": clip}, {"mask": clip})
-        frame = np.ones(PAPER_STFT.bins, np.complex64)
-        power = np.ones(PAPER_STFT.bins, np.float32)
-        expect_answer(self.model.path, lambda: self.answer([Frame(frame, frame, frame, frame, power, power)] * 2))
+        ones, power = np.ones(PAPER_STFT.bins, np.complex64), np.ones(PAPER_STFT.bins, np.float32)
+        expect_answer(self.model.path, lambda: self.answer([Frame(ones, ones, ones, ones, power, power)] * 2))
 
     def answer(self, frames: Sequence[Frame]) -> list[Spectrum]:
         """The human's spectrum for each frame of the clip."""

@@ -7,8 +7,7 @@ from typing import ClassVar
 import numpy as np
 
 from edgefilter.dsp import fourier
-from edgefilter.dsp.stft import StftConfig
-from edgefilter.engines.base import FrontEndKind
+from edgefilter.engines.linear import Linear
 from edgefilter.types import Frame, Output, Samples
 
 FLOOR = 0.18
@@ -17,7 +16,7 @@ MEMORY = 0.8
 """Decision-directed smoothing of the a-priori signal-to-noise ratio; the usual 0.98 smears onsets and costs words."""
 
 
-class SpectralSubtraction:
+class SpectralSubtraction(Linear):
     """Wiener gain xi / (1 + xi) with the decision-directed a-priori signal-to-noise ratio xi of Ephraim & Malah (1984).
 
     Eq. (51) there; xi is the human's power over that of noise and residual echo. The state is the power of the previous
@@ -25,18 +24,13 @@ class SpectralSubtraction:
     """
 
     name: ClassVar[str] = "ss"
-    front: ClassVar[FrontEndKind] = "full"
-
-    def __init__(self, stft: StftConfig = StftConfig()) -> None:
-        self.stft = stft
-        self.lookahead = 0
 
     def initial_state(self) -> Samples:
         return np.zeros(self.stft.bins, np.float32)
 
     def step(self, frame: Frame, state: Samples) -> tuple[Output, Samples]:
         unwanted = frame.noise_psd + frame.residual_psd + fourier.TINY
-        observed = frame.error.real**2 + frame.error.imag**2
+        observed = fourier.power(frame.error)
         wanted = MEMORY * state + (1.0 - MEMORY) * np.maximum(observed - unwanted, 0.0)
         gain = np.maximum(wanted / (wanted + unwanted), FLOOR)
         return Output(gain * frame.error), gain * gain * observed

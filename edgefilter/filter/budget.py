@@ -19,8 +19,8 @@ import platformdirs
 import soundfile
 
 from edgefilter import engines
+from edgefilter.engines import CANDIDATES
 from edgefilter.engines.base import ClipEngine, Engine
-from edgefilter.engines.ladder import CANDIDATES
 from edgefilter.errors import EdgefilterError, UsageError
 from edgefilter.filter.stream import Stream
 from edgefilter.profile.data import Profile
@@ -33,11 +33,8 @@ PACED = 300
 """Hops at the real pace."""
 LATE_S = 0.4
 """An engine that has fallen so far behind the real pace is not measured any longer."""
-AGAIN = " (measured before; --remeasure does it again)"
 DEMO = Path(__file__).parent.parent / "demo_data"
 """The recordings and profiles that come with the package."""
-PACKAGES = ("edgefilter", "numpy", "scipy", "onnxruntime")
-"""Those whose versions a measurement depends on."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -130,7 +127,8 @@ def choose(
     if fresh and (trouble := keep(about, known)):
         say(f"the measurement cannot be kept for the next time ({trouble})")
     best = found[-1] if fits(found[-1], budget_ms) else min(found, key=lambda figures: figures.paced_p99_ms)
-    reason = _reason(best, found, skipped, budget_ms, cores) + ("" if fresh else AGAIN)
+    again = "" if fresh else " (measured before; --remeasure does it again)"
+    reason = _reason(best, found, skipped, budget_ms, cores) + again
     return Choice(best.engine, fits(best, budget_ms), reason, budget_ms, cores, tuple(found), skipped, not fresh)
 
 
@@ -205,7 +203,7 @@ def _about(cores: int, profile: Profile | None) -> dict[str, object]:
     found: dict[str, object] = {"machine": platform.node(), "processor": processor(), "cores": os.cpu_count()}
     if profile:
         found |= {"taps": profile.echo.impulse_response.size, "effects": [name for name, _ in profile.echo.effects]}
-    return {**found, **versions(PACKAGES), "held_to": cores}
+    return {**found, **versions(("edgefilter", "numpy", "scipy", "onnxruntime")), "held_to": cores}
 
 
 def versions(packages: Iterable[str]) -> dict[str, str]:
@@ -233,7 +231,7 @@ def timings() -> Path:
     return platformdirs.user_cache_path("edgefilter", appauthor=False, opinion=False) / "timings.json"
 
 
-def recall(about: Mapping[str, object], say: Callable[[str], None] = lambda text: None) -> dict[str, Figures]:
+def recall(about: Mapping[str, object], say: Callable[[str], None]) -> dict[str, Figures]:
     """Engine -> figures as kept by `keep` for exactly this description; none where they are damaged, and say is told."""
     try:
         entry = _kept().get(_key(about), {})
@@ -293,16 +291,14 @@ def _reason(best: Figures, found: Sequence[Figures], skipped: dict[str, str], bu
     measured = f"p99 {_needs(best)} per {best.hop_ms:.0f} ms hop on {cores} cores (p50 {best.paced_p50_ms:.1f} ms)"
     if fits(best, budget_ms):
         return f"auto: best engine within {budget_ms:g} ms, {measured}{against}"
-    wish = (
-        f"--budget-ms {np.ceil(best.paced_p99_ms):.0f}"
-        if best.complete and best.paced_p99_ms < best.hop_ms
-        else "a faster processor"
-    )
+    wish = "a faster processor"
+    if best.complete and best.paced_p99_ms < best.hop_ms:
+        wish = f"--budget-ms {np.ceil(best.paced_p99_ms):.0f}"
     failure = f"auto: no engine keeps to {budget_ms:g} ms; {best.engine} is the cheapest, {measured}{against}"
     return f"{failure}; {wish}, a free core or fewer programs beside it would help"
 
 
 def _needs(figures: Figures) -> str:
-    return (
-        f"{figures.paced_p99_ms:.1f} ms" if figures.complete else f"more than the hop ({figures.paced_p50_ms:.0f} ms)"
-    )
+    if figures.complete:
+        return f"{figures.paced_p99_ms:.1f} ms"
+    return f"more than the hop ({figures.paced_p50_ms:.0f} ms)"

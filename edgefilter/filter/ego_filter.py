@@ -1,4 +1,4 @@
-"""What users of the library hold: EgoFilter, for blocks as they come."""
+"""What users of the library hold: EgoFilter, for blocks as they come, and enhance, for a whole recording."""
 
 from __future__ import annotations
 
@@ -6,10 +6,11 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from edgefilter import engines
 from edgefilter.engines.base import ClipEngine, Engine
-from edgefilter.engines.judged import judges_speech, with_network_as_judge
-from edgefilter.engines.ladder import CANDIDATES, Ladder, climbable
+from edgefilter.engines.combined import Ladder, climbable, judges_speech, with_network_as_judge
 from edgefilter.errors import EdgefilterError, SignalError, UsageError
 from edgefilter.filter.barge_in import BargeInSettings
 from edgefilter.filter.learner import Learner
@@ -75,18 +76,14 @@ class EgoFilter:
 
     Examples
     --------
+    `with` closes it at the end, and the learner with it.
+
     >>> import numpy as np
-    >>> ego = EgoFilter(engine="bypass")
     >>> human = np.sin(np.arange(1000) / 10).astype(np.float32)
-    >>> out = np.concatenate((ego.process(human, np.zeros_like(human)), ego.flush()))
+    >>> with EgoFilter(engine="bypass") as ego:
+    ...     out = np.concatenate((ego.process(human, np.zeros_like(human)), ego.flush()))
     >>> bool(np.allclose(out, human, atol=1e-6))
     True
-
-    As a context manager it is closed at the end, and the learner with it:
-
-    >>> with EgoFilter(engine="linear") as ego:
-    ...     ego.process(human, np.zeros_like(human)).size
-    512
     """
 
     def __init__(
@@ -112,15 +109,16 @@ class EgoFilter:
         network_judges = barge_in is not None and barge_in.judge == "network"
         if network_judges:
             best = with_network_as_judge(best, self.profile)
-        budget = None if network_judges else budget_ms
-        ladder = None if budget is None or best.lookahead is None else Ladder(climbable(best, self.profile))
+        ladder = None
+        if not (network_judges or budget_ms is None or best.lookahead is None):
+            ladder = Ladder(climbable(best, self.profile))
         stepping = Stepping(best.stft.hop, ladder, budget_ms)
         self._stream = Stream(ladder or best, self.profile, stepping, barge_in, learn, on_barge_in, keep_channels)
 
     @property
-    def engine_name(self) -> str:
-        """The engine at work; while another one takes over, that one."""
-        return self._engine.name
+    def _engines(self) -> Sequence[Engine | ClipEngine]:
+        engine = self._stream.engine
+        return engine.rungs if isinstance(engine, Ladder) else (engine,)
 
     @property
     def _engine(self) -> Engine | ClipEngine:
@@ -128,9 +126,9 @@ class EgoFilter:
         return engine.rungs[engine.wanted] if isinstance(engine, Ladder) else engine
 
     @property
-    def _engines(self) -> Sequence[Engine | ClipEngine]:
-        engine = self._stream.engine
-        return engine.rungs if isinstance(engine, Ladder) else (engine,)
+    def engine_name(self) -> str:
+        """The engine at work; while another one takes over, that one."""
+        return self._engine.name
 
     @property
     def latency(self) -> int:
@@ -140,7 +138,7 @@ class EgoFilter:
     @property
     def waits_for_end(self) -> bool:
         """Whether the engine needs the whole recording: process then returns nothing, flush everything."""
-        return self._stream.waits_for_end
+        return self._stream.engine.lookahead is None
 
     @property
     def hop(self) -> int:
@@ -151,18 +149,15 @@ class EgoFilter:
     def speech_probability(self) -> float | None:
         """Probability that the human speaks now, 0 to 1: the network's, smoothed over a hop or two.
 
-        None before the first hop and with engines that do not judge it (all but crnn, unless the settings of barge-in
-        have judge="network"): what stands above the robot's rest is not yet a human, so they give no events of speech
-        either. 0 while nothing tells them from the robot, whose lag is not found yet or whose reference comes later.
+        None before the first hop and with engines that do not judge it: all but crnn, unless the settings of barge-in
+        have judge="network"; they give no events of speech either. 0 while nothing tells a human from the robot, whose
+        lag is not found yet or whose reference comes later.
         """
         return self._stream.speech_probability
 
     @property
     def human_speaks(self) -> bool:
-        """Whether the human is speaking, pauses of half a second included.
-
-        Always False where the engine does not judge it.
-        """
+        """Whether the human is speaking, pauses of half a second included; False where the engine does not judge it."""
         return self._stream.human_speaks
 
     @property
@@ -327,9 +322,53 @@ class EgoFilter:
 def strongest(profile: Profile | None) -> tuple[Engine | ClipEngine, str]:
     """The best engine that can be made here, and a sentence about it that names those that cannot."""
     missing = ""
-    for name in CANDIDATES:
+    for name in engines.CANDIDATES:
         try:
             return engines.create(name, profile), f"auto: the strongest engine, not measured{missing}"
         except EdgefilterError as error:
             missing += f"; {name} cannot be used: {error}"
     raise UsageError(f"no engine can be made{missing}")
+
+
+def enhance(
+    mic: Samples,
+    ref: Samples,
+    profile: Profile | str | Path | None = None,
+    engine: str = "auto",
+    model: str | Path | None = None,
+    learn: Learner | None = None,
+) -> Samples:
+    """Filter a whole recording with its reference, by the same stream as live.
+
+    Parameters
+    ----------
+    mic : ndarray of float, shape (n,) or (n, channels)
+        What the microphone heard, or two to eight microphones on one clock; full scale +-1, 16 kHz.
+    ref : ndarray of float, shape (n,)
+        What the robot said, on the same sample counter.
+    profile, engine, model, learn
+        As of `EgoFilter`.
+
+    Returns
+    -------
+    ndarray of float32, shape (n,)
+        The human, aligned with the input.
+
+    Raises
+    ------
+    SignalError
+        For another shape or dtype, unequal lengths, or samples that are not finite or beyond 1e6.
+    UsageError, ProfileError, ModelError
+        As of `EgoFilter`.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> robot = 0.1 * np.random.default_rng(0).standard_normal(48_000)
+    >>> heard = np.convolve(robot, [0.0] * 500 + [0.5, 0.2])[:48_000]
+    >>> left = enhance(heard, robot, engine="linear")[-16_000:]
+    >>> bool(np.mean(left**2) < 0.01 * np.mean(heard[-16_000:] ** 2))
+    True
+    """
+    ego = EgoFilter(profile, engine, model=model, learn=learn)
+    return np.concatenate((ego.process(mic, ref), ego.flush()))

@@ -6,7 +6,7 @@ import time
 from collections import deque
 from collections.abc import Callable
 
-from edgefilter.engines.ladder import Ladder
+from edgefilter.engines.combined import Ladder
 from edgefilter.filter.timing import Histogram
 from edgefilter.types import SAMPLE_RATE, DeadlineStats, EventKind
 

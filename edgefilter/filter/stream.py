@@ -7,10 +7,11 @@ from collections.abc import Callable
 
 import numpy as np
 
+from edgefilter.dsp import fourier
 from edgefilter.dsp.ring import Ring
 from edgefilter.dsp.stft import Synthesiser
-from edgefilter.engines.base import ClipEngine, Engine
-from edgefilter.engines.step import step
+from edgefilter.engines.base import ClipEngine, Engine, EngineState
+from edgefilter.engines.spectral_subtraction import FLOOR
 from edgefilter.errors import SignalError
 from edgefilter.filter.barge_in import INTERRUPTIONS, BargeIn, BargeInSettings, HumanJudge
 from edgefilter.filter.front_end import FrontEnd
@@ -19,20 +20,16 @@ from edgefilter.filter.reference_watch import ReferenceWatch
 from edgefilter.filter.stepping import Stepping
 from edgefilter.filter.turns import LONGEST_S, Turns, drop_sound
 from edgefilter.profile.data import Profile
-from edgefilter.types import SAMPLE_RATE, Event, EventKind, Frame, Samples, Turn, as_microphones, as_samples
+from edgefilter.types import SAMPLE_RATE, Event, EventKind, Frame, Output, Samples, Turn, as_microphones, as_samples
 
 
 class Stream:
     """Runs one engine over blocks of any length; whatever the partition, the output is bit-identical.
 
-    process returns finished samples, aligned with the input: sample i of all outputs together belongs to sample i of
-    all inputs. Sample n is out once n + latency samples have come in. After flush as many samples are out as went in.
-    With an engine that waits for the end (waits_for_end) process returns nothing and flush everything. stepping: told
-    the compute time of every hop; what it answers becomes an event. barge_in: when speech counts as begun and ended,
-    None for the defaults. learner: of better echo paths, for engines with a linear stage. on_barge_in: called in the
-    hop in which speech has begun; what it raises is raised once the block is filtered, whose samples then come with the
-    next call. keep_channels: for robot_removed. speech_probability: of the last hop, smoothed; None
-    before the first hop and where the engine does not judge it.
+    `EgoFilter` says what process, flush, robot_removed and the properties give. With an engine that waits for the end,
+    process returns nothing and flush everything. stepping: told the compute time of every hop; what it answers becomes an
+    event. barge_in, on_barge_in, keep_channels: as of `EgoFilter`. learner: of better echo paths, for engines with a
+    linear stage.
     """
 
     def __init__(
@@ -45,27 +42,16 @@ class Stream:
         on_barge_in: Callable[[Event], object] | None = None,
         keep_channels: bool = False,
     ) -> None:
+        self.engine, self.profile = engine, profile
+        self.stepping, self.learner = stepping, learner
+        self._barge_in_settings, self._on_barge_in = barge_in, on_barge_in
         self._keep_channels = keep_channels
-        self.engine = engine
-        self.profile = profile
-        self.stepping = stepping
-        self.learner = learner
-        self._barge_in_settings = barge_in or BargeInSettings()
-        self._on_barge_in = on_barge_in
         self.reset()
 
     @property
     def latency(self) -> int:
-        """Algorithmic latency in samples: the window plus the engine's look-ahead.
-
-        Only the window where waits_for_end.
-        """
+        """Algorithmic latency in samples: the window, and the engine's look-ahead where it does not wait for the end."""
         return self.engine.stft.window_length + (self.engine.lookahead or 0) * self.engine.stft.hop
-
-    @property
-    def waits_for_end(self) -> bool:
-        """Whether the engine needs the whole recording before it answers."""
-        return self.engine.lookahead is None
 
     @property
     def human_speaks(self) -> bool:
@@ -185,18 +171,12 @@ class Stream:
 
     def _watched_step(self, mic: Samples, ref: Samples) -> Samples:
         """One hop; its compute time is watched, but not the learner's, which is another process in a live run."""
-        out = self._timed_step(mic, ref) if self.stepping else self._step(mic, ref)
+        began = self.stepping.clock() if self.stepping else 0.0
+        out = self._step(mic, ref)
+        if self.stepping and (happened := self.stepping.note(self.stepping.clock() - began)):
+            self._tell(*happened)
         if self.learner and self.front.linear_stage:
             self.front.linear_stage.learn()
-        return out
-
-    def _timed_step(self, mic: Samples, ref: Samples) -> Samples:
-        assert self.stepping is not None
-        began = self.stepping.clock()
-        out = self._step(mic, ref)
-        happened = self.stepping.note(self.stepping.clock() - began)
-        if happened:
-            self.events.append(Event(happened[0], self._stepped, happened[1]))
         return out
 
     def _step(self, mic: Samples, ref: Samples) -> Samples:
@@ -205,16 +185,13 @@ class Stream:
         if self._keep_channels and self.front.linear:
             self._removed.append(np.atleast_2d(self.front.linear.error).T)
         if aligned and aligned.realigned:
-            self.events.append(
-                Event("realigned", self._stepped, f"reference arrives after {aligned.delay:.1f} samples")
-            )
-        if self._watch and aligned:
-            stage = self.front.linear_stage
-            removed_db = stage.canceller.volume.removed_db if stage else None
-            said = self._watch.step(self.front.first_of(mic), ref, aligned, removed_db)
-            self.events.extend(Event(kind, self._stepped, detail) for kind, detail in said)
-        if lesson := self.front.lesson:
-            self.events.append(Event(lesson.kind, self._stepped, lesson.detail))
+            self._tell("realigned", f"reference arrives after {aligned.delay:.1f} samples")
+        if self._watch and aligned and (stage := self.front.linear_stage):
+            removed_db = stage.canceller.volume.removed_db
+            for kind, detail in self._watch.step(self.front.first_of(mic), ref, aligned, removed_db):
+                self._tell(kind, detail)
+            if stage.lesson:
+                self._tell(stage.lesson.kind, stage.lesson.detail)
         engine = self.engine
         if engine.lookahead is None:
             self._collect(frame, engine)
@@ -241,13 +218,15 @@ class Stream:
                 except BaseException as error:  # the rest of the block is filtered first
                     self._raised = self._raised or error
 
+    def _tell(self, kind: EventKind, detail: str, turn: Turn | None = None) -> None:
+        self.events.append(Event(kind, self._stepped, detail, turn))
+
     def _tell_of_speech(self, talk: EventKind, detail: str) -> None:
         if talk == "speech_started":
             self._turns.start(self._barge_in.waited)
-            self.events.append(Event(talk, self._stepped, detail))
+            self._tell(talk, detail)
         else:
-            start, samples = self._turns.finish()
-            self.events.append(Event(talk, self._stepped, detail, Turn(start, samples)))
+            self._tell(talk, detail, Turn(*self._turns.finish()))
             drop_sound(self.events)
 
     def _collect(self, frame: Frame, engine: ClipEngine) -> None:
@@ -258,3 +237,17 @@ class Stream:
                 f"the recording is longer than {seconds:.0f} s, which is all that engine {engine.name} takes at"
                 " once: cut it or take another engine"
             )
+
+
+def step(engine: Engine, frame: Frame, state: EngineState) -> tuple[Output, EngineState]:
+    """The engine's answer and its next state.
+
+    Where the robot may arrive at any lag nothing tells it from a human: the answer is noise, of the error no more than
+    FLOOR of the noise; nobody speaks, and the engine forgets the frame.
+    """
+    output, following = engine.step(frame, state)
+    if not frame.at_any_lag:
+        return output, following
+    power = fourier.power(frame.error)
+    noise = FLOOR * np.sqrt(np.minimum(frame.noise_psd, power) / (power + fourier.TINY)) * frame.error
+    return Output(noise, None if output.speech_probability is None else 0.0), state

@@ -8,8 +8,7 @@ import pytest
 from edgefilter import engines
 from edgefilter.echo.model import EchoModel
 from edgefilter.errors import SignalError, UsageError
-from edgefilter.filter.ego_filter import EgoFilter
-from edgefilter.filter.enhance import enhance
+from edgefilter.filter.ego_filter import EgoFilter, enhance
 from edgefilter.filter.stream import Stream
 from edgefilter.profile.data import Profile
 from edgefilter.types import PRE_ROLL

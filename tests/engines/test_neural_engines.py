@@ -17,8 +17,7 @@ from edgefilter.engines import create, onnx_session
 from edgefilter.engines.crnn import LOUD, Crnn
 from edgefilter.engines.paper_crnn import PaperCrnn
 from edgefilter.errors import ModelError, SignalError, UsageError
-from edgefilter.filter.ego_filter import EgoFilter
-from edgefilter.filter.enhance import enhance
+from edgefilter.filter.ego_filter import EgoFilter, enhance
 from edgefilter.filter.stream import Stream
 from edgefilter.profile.data import LEARNED, Profile
 from edgefilter.types import Frame

@@ -18,7 +18,7 @@ from platformdirs.unix import Unix
 from platformdirs.windows import Windows
 
 from edgefilter.echo.model import EchoModel
-from edgefilter.engines.bypass import Bypass
+from edgefilter.engines.linear import Bypass
 from edgefilter.engines.spectral_subtraction import SpectralSubtraction
 from edgefilter.errors import UsageError
 from edgefilter.filter import budget

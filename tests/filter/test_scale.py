@@ -10,8 +10,7 @@ import soundfile
 
 import edgefilter
 from edgefilter.dsp.metrics import si_sdr
-from edgefilter.filter.ego_filter import EgoFilter
-from edgefilter.filter.enhance import enhance
+from edgefilter.filter.ego_filter import EgoFilter, enhance
 from edgefilter.filter.volume import Volume
 from edgefilter.profile.data import Profile
 from tests.conformance import robot_speech

@@ -12,9 +12,8 @@ import pytest
 from edgefilter import EgoFilter
 from edgefilter.commands.run import garbage_of_this_run_only
 from edgefilter.dsp.stft import StftConfig
-from edgefilter.engines.bypass import Bypass
-from edgefilter.engines.ladder import DOWN, UP, Ladder, climbable
-from edgefilter.engines.linear import Linear
+from edgefilter.engines.combined import DOWN, UP, Ladder, climbable
+from edgefilter.engines.linear import Bypass, Linear
 from edgefilter.engines.paper_ss import PAPER_STFT
 from edgefilter.engines.spectral_subtraction import SpectralSubtraction
 from edgefilter.errors import UsageError

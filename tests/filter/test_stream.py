@@ -7,7 +7,7 @@ import pytest
 
 from edgefilter import EgoFilter, enhance
 from edgefilter.dsp.stft import StftConfig
-from edgefilter.engines.bypass import Bypass
+from edgefilter.engines.linear import Bypass
 from edgefilter.errors import SignalError
 from edgefilter.filter.stream import Stream
 from edgefilter.types import Output

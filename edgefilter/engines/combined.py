@@ -1,26 +1,24 @@
-"""Several engines as one, with a crossfade when another one takes over."""
+"""Engines made of engines: several that take turns with a crossfade, and one whose speech another one judges."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar, cast
+from typing import ClassVar, cast
 
 import numpy as np
 
 from edgefilter import engines
-from edgefilter.engines.base import Engine, EngineState, FrontEndKind
+from edgefilter.engines.base import ClipEngine, Engine, EngineState, FrontEndKind
 from edgefilter.errors import EdgefilterError, UsageError
+from edgefilter.profile.data import Profile
 from edgefilter.types import Frame, Output
 
-if TYPE_CHECKING:
-    from edgefilter.profile.data import Profile
-
-CANDIDATES = tuple(name for name, entry in engines.CATALOGUE.items() if entry.automatic)
-"""What "auto" chooses from, best first."""
 DOWN, UP = 4, 32
 """Frames of a crossfade to a cheaper engine (64 ms, since it has to bring relief), and to a better one (0.5 s, since an
 engine with a memory starts empty and has to settle while it is still quiet)."""
+JUDGE = "crnn"
+"""The engine whose network says for others whether a human speaks."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,7 +54,7 @@ class Ladder:
         if not rungs:
             raise UsageError("no engine to run: name at least one")
         for rung in rungs[1:]:
-            if (rung.stft, rung.front) != (rungs[0].stft, rungs[0].front):
+            if not _take_turns(rung, rungs[0]):
                 raise UsageError(
                     f"engines {rungs[0].name} and {rung.name} cannot take turns: their STFTs or fronts differ"
                 )
@@ -104,12 +102,60 @@ class Ladder:
 
 def climbable(best: Engine, profile: Profile | None) -> list[Engine]:
     """The best candidate and the cheaper ones that can take turns with it: those that can be made with its STFT and front."""
-    rungs = [best]
-    for name in CANDIDATES[CANDIDATES.index(best.name) + 1 :] if best.name in CANDIDATES else ():
+    rungs, names = [best], engines.CANDIDATES
+    for name in names[names.index(best.name) + 1 :] if best.name in names else ():
         try:
             engine = cast(Engine, engines.create(name, profile, best.stft))  # no candidate needs the whole recording
         except EdgefilterError:
             continue
-        if (engine.stft, engine.front) == (best.stft, best.front):
+        if _take_turns(engine, best):
             rungs.append(engine)
     return rungs
+
+
+def _take_turns(one: Engine, other: Engine) -> bool:
+    return (one.stft, one.front) == (other.stft, other.front)
+
+
+class Judged:
+    """Runs both on every frame: the answer of `engine`, whose name it has, with the probability of speech of `judge`.
+
+    Raises UsageError where the two do not take the same frames.
+    """
+
+    def __init__(self, engine: Engine, judge: Engine) -> None:
+        for what in ("stft", "front", "lookahead"):
+            own, other = getattr(engine, what), getattr(judge, what)
+            if own != other:
+                raise UsageError(
+                    f"engine {judge.name} cannot judge speech for {engine.name}: its {what} is {other}, expected {own}"
+                )
+        self.name = engine.name
+        self.stft = engine.stft
+        self.front: FrontEndKind = engine.front
+        self.lookahead = engine.lookahead
+        self.model = getattr(judge, "model", None)
+        self._engine, self._judge = engine, judge
+
+    def initial_state(self) -> EngineState:
+        return self._engine.initial_state(), self._judge.initial_state()
+
+    def step(self, frame: Frame, state: EngineState) -> tuple[Output, EngineState]:
+        output, own = self._engine.step(frame, state[0])
+        judged, other = self._judge.step(frame, state[1])
+        return Output(output.spectrum, judged.speech_probability), (own, other)
+
+
+def with_network_as_judge(engine: Engine | ClipEngine, profile: Profile | None = None) -> Engine | ClipEngine:
+    """The engine with the judgement of crnn's network; crnn as it is.
+
+    Raises UsageError for an engine that has no linear stage, ModelError where the network cannot be loaded.
+    """
+    if engine.name == JUDGE:
+        return engine
+    return cast(Engine, Judged(cast(Engine, engine), cast(Engine, engines.create(JUDGE, profile))))
+
+
+def judges_speech(engine: Engine | ClipEngine) -> bool:
+    """Whether the engine says how probable it is that a human speaks."""
+    return engine.name == JUDGE or isinstance(engine, Judged)
