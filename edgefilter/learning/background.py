@@ -56,8 +56,8 @@ class BackgroundLearner:
     Notes
     -----
     A hop costs the running filter a copy of three arrays into a pipe; it never waits for the other process. Where that
-    process falls behind by 15 s, it begins anew; where it ends, or cannot be started, the filter goes on without
-    lessons. `stats` tells of both.
+    one falls behind by 15 s, it begins anew; where it ends, or cannot be started, the filter goes on without lessons.
+    `stats` tells of both.
 
     Examples
     --------
@@ -136,18 +136,14 @@ class _Worker:
         # what this process imports from but the working directory, where anybody's numpy.py may lie; -m would look there
         path = [*filter(None, sys.path), str(Path(__file__).parents[2])]
         code = f"import sys; sys.path[:] = {path!r}; from edgefilter.learning.worker import main; main()"
-        environment = {
-            **os.environ,
-            "OMP_NUM_THREADS": "1",
-            "OPENBLAS_NUM_THREADS": "1",
-            "MALLOC_MMAP_THRESHOLD_": "262144",  # glibc: what a fit took goes back to the system after it
-        }
+        more = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
+        more["MALLOC_MMAP_THRESHOLD_"] = "262144"  # glibc: what a fit took goes back to the system after it
         self.process = subprocess.Popen(
             [sys.executable, "-c", code],
             bufsize=0,
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
-            env=environment,
+            env={**os.environ, **more},
             start_new_session=True,
         )
         assert self.process.stdin is not None and self.process.stdout is not None

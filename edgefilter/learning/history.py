@@ -62,9 +62,8 @@ class HopHistory:
     def noise(self) -> Samples:
         """Recording of an array where nothing of the robot can be audible, everything where that is under a second, (microphones, n)."""
         silent = [hop.mic for hop, _ in self._hops if hop.idle]
-        return np.concatenate(
-            silent if len(silent) > self._hops_of(1.0) else [hop.mic for hop, _ in self._hops], axis=-1
-        )
+        enough = len(silent) > self._hops_of(1.0)
+        return np.concatenate(silent if enough else [hop.mic for hop, _ in self._hops], axis=-1)
 
     def usable(self) -> NDArray[np.bool_]:
         """Where the robot may be audible and the reference lies as the microphone hears it, (n,) bool.

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import datetime
+import math
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -22,12 +23,11 @@ from edgefilter.errors import ProfileError
 from edgefilter.filter.canceller import COLD, Canceller
 from edgefilter.filter.echo_path import TAPS, EchoPath, Effects, PathState, starting_path
 from edgefilter.filter.learner import FilteredHop, Lesson
-from edgefilter.filter.volume import AUDIBLE
-from edgefilter.learning.contest import Rival
+from edgefilter.filter.volume import AUDIBLE, WITNESSES
 from edgefilter.learning.history import MINUTE, PAST, RECENT_S, HopHistory, emphasised
 from edgefilter.profile.array import ArrayCalibration
 from edgefilter.profile.data import DISTORTION_ORDERS, GRID_FFT, LEARNED, Profile
-from edgefilter.types import SAMPLE_RATE, Samples
+from edgefilter.types import SAMPLE_RATE, EventKind, Samples
 
 FIRST_S, FACTOR = 2.0, 1.5
 """Seconds of audible robot until the first fit, and the factor to the next one. The wait is at most MINUTE, or RECENT_S
@@ -37,6 +37,67 @@ FADE = 0.9995
 TIMES = 3
 """As little as RECENT_S teaches more where it is replayed several times."""
 BEFORE = "the path of before"
+BLOCKS = 8, 60
+"""Of WITNESSES hops each, whose errors are compared as one: after so many a rival can win, and is given up."""
+GAIN_DB, CERTAIN = 0.15, 2.5
+"""Mean fall of the error by which a rival wins, and how many of its standard errors that must be."""
+
+
+@dataclass
+class Rival:
+    """A path that is compared, hop by hop, with the one in use.
+
+    was: what to call it. kind: of the event where it wins. stays: whether it is a standing one, compared by its latest
+    1.5 s, since what was right a minute ago does not count, and never given up. gains_db: (blocks,) by how much less it left.
+    """
+
+    path: EchoPath
+    was: str
+    kind: EventKind = "learned"
+    stays: bool = False
+    gains_db: list[float] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        self._begin()
+
+    def _begin(self) -> None:
+        self._its = self._running = 1e-12
+        self._count = 0
+
+    def step(self, hop: FilteredHop, running: float, audible: bool) -> None:
+        """Step it through a hop, too. running: power, emphasised, of what the path in use left of the hop."""
+        left = emphasised(self.path.step(hop.mic, hop.reference, hop.located, hop.past).innovation)
+        if not audible:
+            return
+        self._its, self._running, self._count = self._its + left, self._running + running, self._count + 1
+        if self._count == WITNESSES:
+            self.gains_db.append(10.0 * math.log10(self._running / self._its))
+            self._begin()
+            if self.stays:
+                del self.gains_db[: -2 * BLOCKS[0]]
+
+    def restart(self) -> None:
+        """Another path is in use now: the comparisons so far say nothing any more."""
+        self.gains_db.clear()
+        self._begin()
+
+    @property
+    def gain_db(self) -> float:
+        """Mean of the gains, of which there must be one."""
+        return float(np.mean(self.gains_db))
+
+    @property
+    def won(self) -> bool:
+        """Whether it is clearly the better one."""
+        count = len(self.gains_db)
+        if count < BLOCKS[0] or self.gain_db < GAIN_DB:
+            return False
+        return self.gain_db > CERTAIN * float(np.std(self.gains_db, ddof=1)) / math.sqrt(count)
+
+    @property
+    def over(self) -> bool:
+        """Whether it had its time."""
+        return not self.stays and len(self.gains_db) >= BLOCKS[1]
 
 
 class PathLearner:
@@ -47,16 +108,14 @@ class PathLearner:
     profile : Profile, optional
         What the filter began with.
     remember : Path, optional
-        Where to keep what was learned, as a profile for the next time. It is written after a fit and at the end, where a
-        filter that begins with it clearly leaves less than one that begins with `profile`, on hops that came after it
-        was learned.
+        Where to keep what was learned, as a profile for the next time. It is written after a fit and at the end, where on
+        hops that came later a filter that begins with it clearly leaves less than one that begins with `profile`.
 
     Notes
     -----
     It keeps the last minute. Now and then it fits the loudspeaker's effects to it, replays the minute to a new path that
     has them, and then runs that path beside the one in use. Where it predicts new hops clearly better, it is the lesson;
-    the path that it replaces runs on, and comes back where it is the better one again. All follows from the hops alone:
-    the same recording teaches the same.
+    the path that it replaces runs on, and comes back where it is the better one again. The same recording teaches the same.
 
     Examples
     --------
@@ -78,10 +137,9 @@ class PathLearner:
     def start(self, path: PathState, hop: int) -> None:
         """A stream begins with that path."""
         self._hop, self._begin = hop, path
+        self._history, self._running = HopHistory(hop), self._resumed(path)
         known = path.canceller.weights.any()
-        self._response = Canceller.resumed(path.canceller, hop).impulse_response() if known else None
-        self._history = HopHistory(hop)
-        self._running = self._resumed(path)
+        self._response = self._running.canceller.impulse_response() if known else None
         self._rivals = [Rival(self._running, "no lesson at all", "unlearned", stays=True)]
         if known:
             self._rivals.append(Rival(self._fresh((), None, products=False), "a path from nothing", stays=True))

@@ -2,7 +2,9 @@
 
 import numpy as np
 
-from edgefilter.learning.contest import LEAST, MOST, Rival
+from edgefilter.learning.path_learner import BLOCKS, Rival
+
+LEAST, MOST = BLOCKS
 
 
 def rival(gains):

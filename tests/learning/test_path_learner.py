@@ -5,7 +5,7 @@ import pytest
 
 from edgefilter import EgoFilter, PathLearner, Profile, ProfileError, enhance
 from edgefilter.filter.echo_path import starting_path
-from edgefilter.learning.contest import Rival
+from edgefilter.learning.path_learner import Rival
 from edgefilter.types import SAMPLE_RATE
 from tests.learning.scenes import Scene
 
