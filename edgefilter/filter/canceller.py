@@ -29,13 +29,11 @@ DECAY_RT60_S = 1.0
 LATE_VARIANCE = 0.04
 """Power of the unknown room's decay at the direct sound, relative to the calibrated path."""
 DISPLACEMENT_SCALE = 0.7
-"""Displacement, relative to the rms that the reference has held at its loudest so far, at which the products have the size of the
-reference."""
+"""Displacement, relative to the loudest rms that the reference has held so far, at which the products have its size."""
 FURTHEST = 10.0
-"""Largest displacement, of that size: a voice stays below 5, and what begins or clicks before its level is known goes far beyond."""
-PRODUCT_PARTITIONS = 2
-PRODUCT_VARIANCE = 2e-3
-"""Variance of the paths of the nonlinear products relative to the linear path."""
+"""Largest displacement, of that size: a voice stays below 5, what begins or clicks before its level is known goes far beyond."""
+PRODUCT_PARTITIONS, PRODUCT_VARIANCE = 2, 2e-3
+"""Length of the paths of the nonlinear products, and their variance relative to the linear path."""
 VOLUME_REOPENS = 0.02
 """Variance of a path whose volume was turned, relative to its power: the factor is not known exactly."""
 REOPEN = 0.3
@@ -50,9 +48,9 @@ class Adaptation:
     """How the Kalman filter believes that the path moves and how its error is read.
 
     transition: A of the first-order Markov model of the path per hop of 16 ms. noise_memory: weight of the past in the
-    measurement-noise PSD. certainty: share of the gain by which a correction lowers the covariance; overlap-save in
-    theory has 1/2. products: whether d x and d^2 x are heard beside the reference. posterior: whether the error is
-    delivered after the hop's own correction.
+    measurement-noise PSD. certainty: share of the gain by which a correction lowers the covariance, in theory 1/2.
+    products: whether d x and d^2 x are heard beside the reference. posterior: whether the error is delivered after the
+    hop's own correction.
     """
 
     transition: float
@@ -73,10 +71,9 @@ LEARNED = replace(COLD, products=True)
 class CancellerOutput(NamedTuple):
     """One hop of the linear stage.
 
-    echo, error: (hop,) float32 with error = mic - echo exactly. uncertainty: (hop + 1,) float32, what the filter itself
-    expects of |error spectrum|^2 from its misalignment, for a rectangular frame of hop samples, on frequencies 0 to
-    Nyquist. innovation: (hop,), the error of the prediction that knew nothing of this hop of the microphone. Of an array
-    each has a leading axis of microphones.
+    echo, error: (hop,) float32 with error = mic - echo exactly. uncertainty: (hop + 1,) float32, |error spectrum|^2 that the
+    filter expects from its misalignment, in a rectangular frame of hop samples, 0 to Nyquist. innovation: (hop,), the error
+    of the prediction that knew nothing of this hop of the microphone. Of an array each has a leading axis of microphones.
     """
 
     echo: Samples
@@ -112,11 +109,11 @@ class Canceller:
     what force factor and stiffness that depend on the displacement add to a moving-coil loudspeaker (Klippel 2006,
     "Loudspeaker nonlinearities"). Their paths are PRODUCT_PARTITIONS long and start at zero. adaptation: WARM where
     impulse_response is given, COLD where not, unless said otherwise. impulse_response (n,) float32 starts the filter;
-    longer than taps it is cut, without it the start is cold. behind(echo, mic) (hop,): what the microphone makes of the
-    echo that the path brings, None for nothing. microphones: of an array, None for a single one: signals are then
-    (microphones, hop), the impulse response (microphones, n), and all that is said of a path holds of each; the volume,
-    and whether the echo is there at all, is told in one microphone (tell_by) for all of them. Raises SignalError where hop or
-    taps are not positive or the impulse response is not finite.
+    longer than taps it is cut, without it the start is cold. microphones: of an array, None for a single one: signals are
+    then (microphones, hop), the impulse response (microphones, n), and all that is said of a path holds of each; the volume,
+    and whether the echo is there at all, is told in one microphone (tell_by) for all of them. behind(echo, mic) (hop,): what
+    the microphone makes of the echo that the path brings, None for nothing. Raises SignalError where hop or taps are not
+    positive or the impulse response is not finite.
     """
 
     def __init__(
@@ -125,13 +122,12 @@ class Canceller:
         taps: int = 6400,
         impulse_response: Samples | None = None,
         adaptation: Adaptation | None = None,
-        behind: Callable[[Samples, Samples], Samples] | None = None,
         microphones: int | None = None,
     ) -> None:
         if hop < 1 or taps < 1:
             raise SignalError(f"canceller got hop={hop} and taps={taps}, expected both to be at least 1 sample")
         self.hop = hop
-        self.behind = behind
+        self.behind: Callable[[Samples, Samples], Samples] | None = None
         self.partitions = -(-taps // hop)
         self.taps = self.partitions * hop
         self.adaptation = adaptation or (COLD if impulse_response is None else WARM)
@@ -147,12 +143,8 @@ class Canceller:
         self._rows = self.partitions + PRODUCT_PARTITIONS * (self._channels - 1)
         self._first = [0, self.partitions, self.partitions + PRODUCT_PARTITIONS][: self._channels]
         self._lowpass_reversed = (displacement_taps() / DISPLACEMENT_SCALE).astype(np.float32)[::-1].copy()
+        self._diverged = 0
         self.reset()
-
-    @property
-    def _warm(self) -> bool:
-        """Whether anything is known of the path at the start."""
-        return bool(self._initial.any())
 
     @property
     def history(self) -> int:
@@ -163,13 +155,10 @@ class Canceller:
         """Back to the start: the calibrated path, or none, and nothing heard."""
         rows, bins = self._rows, self.hop + 1
         self._recent = np.zeros((self._channels, 2 * self.hop), np.float32)
-        self._all_spectra, self._all_powers = (
-            np.zeros((2 * rows, bins), np.complex64),
-            np.zeros((2 * rows, bins), np.float32),
-        )
+        self._all_spectra = np.zeros((2 * rows, bins), np.complex64)
+        self._all_powers = np.zeros((2 * rows, bins), np.float32)
         self._moving = np.zeros(DISPLACEMENT_TAPS - 1, np.float32)
         self._loudest, self._sustained = FLOOR, Sustained()
-        self._diverged = 0
         self._begin()
         self._slide(to=rows)
 
@@ -182,17 +171,19 @@ class Canceller:
         self._blocks[..., : self.partitions, :hop] = self._initial.reshape(*lead, self.partitions, hop)
         fourier.rfft(self._blocks, out=self._weights)
         self._covariance = np.zeros(shape, np.float32)
-        self._unknown = 0 if self._warm else UNKNOWN_HOPS
-        if self._warm:
-            known = np.float32(PRIOR_VARIANCE) * fourier.power(self._weights[..., : self.partitions, :])
-            self._expect(self._path_power(), np.float32(LATE_VARIANCE) * self._decay(), known)
+        warm = self._initial.any()
+        self._unknown = 0 if warm else UNKNOWN_HOPS
+        if warm:
+            power = fourier.power(self._weights[..., : self.partitions, :])
+            late = np.float32(LATE_VARIANCE) * self._decay()
+            self._expect(power.sum(axis=-2), late, np.float32(PRIOR_VARIANCE) * power)
         self._ageing, self._aged = (1.0 - self.adaptation.transition**2) * fourier.power(self._weights), 0
         self._noise = np.zeros((*lead, bins), np.float32)
         self._work = np.zeros(shape, np.complex64)
         self._expected = np.zeros(shape, np.float32)
         self._padded = np.zeros((*lead, 2 * hop), np.float32)
         self._hops = self._active = 0
-        self.volume = Volume(hop, "unscaled" if self._warm else "unknown")
+        self.volume = Volume(hop, "unscaled" if warm else "unknown")
         self.volume.gain = self._initial_gain
         self._limiter = EchoLimiter(hop)
 
@@ -204,9 +195,8 @@ class Canceller:
         self._push(reference)
         path_echo = echo = self._predict()
         if not np.vdot(path_echo, path_echo) < LOUDEST**2 * self.hop:  # it has diverged, also where it is no number
-            diverged = self._diverged + 1
+            self._diverged += 1
             self.reset()  # of the reference's past, too: it may be what made it diverge
-            self._diverged = diverged
             path_echo = echo = self._predict()
         if self.behind:
             echo = self.behind(echo, mic)
@@ -326,12 +316,8 @@ class Canceller:
         """Let the covariance be that of a path of this power (bins,) at least: decay (partitions, 1) of it, and known."""
         rows = self._covariance[..., : self.partitions, :], self._covariance[..., self.partitions :, :]
         expected = known + decay * path_power[..., None, :], PRODUCT_VARIANCE * path_power[..., None, :]
-        for row, variance in zip(rows, expected, strict=True):
+        for row, variance in zip(rows, expected):
             np.maximum(row, variance, out=row)
-
-    def _path_power(self) -> Samples:
-        """|H|^2 of the path as it is, summed over partitions, (bins,)."""
-        return fourier.power(self._weights[..., : self.partitions, :]).sum(axis=-2)
 
     def _expect_what_is_heard(self) -> None:
         """Set the covariance of an unknown path by the powers of microphone and reference, whose scales nobody knows."""
@@ -385,23 +371,18 @@ class Canceller:
         history: (n,) float32, the last n reference samples under the new delay, the hop that is about to be stepped
         included; what is missing of `self.history` samples counts as silence.
         """
-        wanted = self.history
-        known = np.zeros(wanted, np.float32)
-        count = min(wanted, history.size)
-        if count:
-            known[wanted - count :] = history[history.size - count :]
-        past = known[: wanted - self.hop]
+        known = np.concatenate((np.zeros(self.history), history), dtype=np.float32)[-self.history :]
+        past = known[: -self.hop]
         channels = [past]
         if self._channels > 1:
             self._moving = np.zeros(DISPLACEMENT_TAPS - 1, np.float32)
             moved = self._displacement(past)
             channels += [moved * past, moved * moved * past]
-        for first, channel in zip(self._first, channels, strict=True):
+        for first, channel in zip(self._first, channels):
             count = PRODUCT_PARTITIONS if first else self.partitions
             hops = channel.reshape(-1, self.hop)[::-1]
-            self._spectra[first : first + count] = fourier.rfft(
-                np.concatenate((hops[1 : count + 1], hops[:count]), axis=1)
-            )
+            both = np.concatenate((hops[1 : count + 1], hops[:count]), axis=1)
+            self._spectra[first : first + count] = fourier.rfft(both)
         self._powers[:] = fourier.power(self._spectra)
         self._recent[:] = [channel[-2 * self.hop :] for channel in channels]
 

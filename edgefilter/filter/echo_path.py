@@ -31,8 +31,8 @@ class PathState:
 class EchoPath:
     """Predicts and subtracts the echo: the effects ahead of the loudspeaker, the canceller, the microphone behind it.
 
-    effects: of the whole model; those that are filters on the path are left to the canceller's impulse response.
-    source: what they do ahead of the loudspeaker.
+    effects: of the whole model; those that are filters on the path are left to the canceller's impulse response. source:
+    what they do ahead of the loudspeaker.
     """
 
     def __init__(self, canceller: Canceller, effects: Effects = ()) -> None:

@@ -8,7 +8,7 @@ from edgefilter.alignment.aligner import Aligner
 from edgefilter.alignment.delay_line import UNLOCATED, Aligned
 from edgefilter.alignment.paper import PaperAligner
 from edgefilter.dsp import fourier
-from edgefilter.dsp.stft import Analyser, StftConfig
+from edgefilter.dsp.stft import Analyser
 from edgefilter.echo.source_chain import SourceChain
 from edgefilter.engines.base import ClipEngine, Engine
 from edgefilter.filter.canceller import Canceller, CancellerOutput
@@ -84,12 +84,10 @@ class LinearStage:
 class FrontEnd:
     """Finds the reference in the microphone and subtracts its linear echo.
 
-    What it does depends on the engine's `front`: "none" passes the microphone, "paper" only delays the reference, once per
-    utterance, "full" tracks the delay and cancels the echo.
-    aligner: None for "none". linear_stage: None but for "full". cut: (bins,) gain of every spectrum, None for 1. microphones: of
-    an array, and None for a single one; the kinds without a linear stage hear its first. spatial: None but for "full" with
-    an array. errors: (microphones, bins) of the latest frame of an array. linear: what the linear stage made of the latest
-    hop.
+    The engine's `front` says what it does (engines/base.py). aligner: None for "none". linear_stage: None but for "full".
+    cut: (bins,) gain of every spectrum, None for 1. microphones: of an array, and None for a single one; the kinds without a
+    linear stage hear its first. spatial: None but for "full" with an array. errors: (microphones, bins) of the latest frame
+    of an array. linear: what the linear stage made of the latest hop.
     """
 
     def __init__(
@@ -101,7 +99,7 @@ class FrontEnd:
         aligner: Aligner | PaperAligner | None = None,
     ) -> None:
         stft = engine.stft
-        self.hop, self._stft = stft.hop, stft
+        self._stft = stft
         self.microphones: Microphones | None = None
         if microphones:
             self.microphones = Microphones(microphones, stft.hop, profile.running_responses() if profile else None)
@@ -113,28 +111,23 @@ class FrontEnd:
         if engine.front == "paper":
             self.aligner = aligner or PaperAligner(stft.hop)
         elif engine.front == "full":
-            tracking = aligner if isinstance(aligner, Aligner) else Aligner(stft.hop, profile)
-            self.aligner = tracking
-            if microphones:
-                tracking.hear_by(range(microphones))
+            self.aligner = tracking = aligner if isinstance(aligner, Aligner) else Aligner(stft.hop, profile)
             path = starting_path(profile, stft.hop, microphones)
             self.linear_stage = LinearStage(tracking, path, Residual(stft, profile), learner)
             self._source: SourceChain | None = None
             if microphones:
+                tracking.hear_by(range(microphones))
                 noise = profile.array.noise_covariance(stft) if profile and profile.array else None
                 self.spatial = SpatialFilter(stft, microphones, noise)
         channels = 2 if self.linear_stage is None else 4 if microphones is None else 1 + 2 * microphones
         self._analyser = Analyser(stft, channels)
-        self.cut = None if profile or not self.linear_stage else low_cut(stft)
+        self.cut: Samples | None = None
+        if self.linear_stage and not profile:
+            self.cut = np.where(stft.frequencies < RUMBLE_HZ, np.float32(RUMBLE), np.float32(1.0))
         self._nothing = np.zeros(stft.bins, np.float32)
         self._noise = profile.noise_bins(stft) if profile else self._nothing
         self._silence = np.zeros(stft.bins, np.complex64)
         self._before = False
-
-    @property
-    def lesson(self) -> Lesson | None:
-        """The lesson that was adopted in the latest hop."""
-        return self.linear_stage.lesson if self.linear_stage else None
 
     def step(self, mic: Samples, ref: Samples) -> tuple[Frame, Aligned | None]:
         """One hop (hop,) of microphone and reference to one frame, with what the aligner found.
@@ -209,8 +202,3 @@ class FrontEnd:
             self._source = source
             self._unpredictable = Unpredictable(self._stft, source.colours) if source.colours else None
         return self._unpredictable.step(source.expected) if self._unpredictable else None
-
-
-def low_cut(stft: StftConfig) -> Samples:
-    """Gain without phase, (bins,): RUMBLE below RUMBLE_HZ, 1 above."""
-    return np.where(stft.frequencies < RUMBLE_HZ, np.float32(RUMBLE), np.float32(1.0))

@@ -6,6 +6,7 @@ import numpy as np
 
 from edgefilter.dsp.exchange import EQUAL, exchanged, order_of
 from edgefilter.dsp.lag import played_in
+from edgefilter.filter.echo_path import TAPS
 from edgefilter.types import SAMPLE_RATE, Array, ArrayStats, Samples
 
 GOOD_BLOCKS = 3
@@ -15,15 +16,13 @@ APART_DB = 12.0
 """From the median microphone's level: equal microphones of one array agree within 1 to 2 dB, one of another kind beside them
 was 12 to 18 dB louder (a real robot's noise on four microphones)."""
 SILENT = 1e-6
-"""Power over the loudest microphone's, -60 dB, below which a microphone is called silent and not soft."""
+"""Power, -60 dB, below which a microphone is called silent and not soft, over the loudest one's."""
 CANCELLED, UNLIKE, LEFT = 0.1, 10.0, 0.3
 """Error over microphone where the robot is the loudest and is cancelled in the best microphone (-10 dB); how many times as
 much is left in one whose path is another than was calibrated: swapped, broken, or processed; and the least of it."""
 CLIPPED_DB, MOST_CLIPPED = -0.1, 16
 """Size from which a sample counts as clipped, dB of full scale: conversion to 16 kHz may lower a clipped peak a little; so
 many, 1 ms of them in a block, are no single peak."""
-CALIBRATED_TAPS = 2048
-"""Of the calibrated paths that say which channel is which: the direct sound and what comes soon after it."""
 
 
 class Microphones:
@@ -31,21 +30,12 @@ class Microphones:
 
     left_out: why, by number. first: the first one that is used. paths: (microphones, taps) of the echo where they are
     calibrated, which tell exchanged channels, once, in the first block that is full of the robot.
-
-    >>> rng = np.random.default_rng(0)
-    >>> watched = Microphones(3, 256)
-    >>> for _ in range(62):
-    ...     heard = rng.standard_normal((3, 256)).astype(np.float32)
-    ...     heard[1] = 0.0
-    ...     changed = watched.step(heard, heard, 0 * heard[0], 0 * heard[0], True)
-    >>> changed, watched.left_out, watched.first
-    (True, {1: 'silent'}, 0)
     """
 
     def __init__(self, count: int, hop: int, paths: Samples | None = None) -> None:
         self.count = count
         self.left_out: dict[int, str] = {}
-        self._paths = None if paths is None else paths[:, :CALIBRATED_TAPS]
+        self._paths = None if paths is None else paths[:, : TAPS[0]]  # the direct sound and what comes soon after it
         self._exchanged: dict[int, str] = {}
         self._played: set[int] = set()
         self._asked: set[int] = set()
@@ -138,9 +128,8 @@ class Microphones:
         least = min(left.values(), default=1.0)
         for at in left if least < CANCELLED else ():
             if left[at] > max(UNLIKE * least, LEFT):
-                reasons[at] = (
-                    "hears the robot otherwise than it was calibrated, or than the others: processed, or broken"
-                )
+                told = "hears the robot otherwise than it was calibrated, or than the others: processed, or broken"
+                reasons[at] = told
         return reasons
 
     def _find_played(self, power: Array, doubted: set[int]) -> bool:

@@ -11,6 +11,7 @@ from edgefilter.alignment.aligner import COARSE_MARGIN
 from edgefilter.alignment.delay_line import Aligned, Tape
 from edgefilter.alignment.lag_search import CERTAIN, WINDOW, LagSearch
 from edgefilter.alignment.utterances import FLOOR, OnsetDetector
+from edgefilter.filter.microphones import SILENT
 from edgefilter.types import PRE_ROLL, SAMPLE_RATE, EventKind, Samples
 
 LATEST = SAMPLE_RATE
@@ -27,16 +28,12 @@ reference comes in time: an onset of the robot's is no human's if the reference 
 UNFOUND, LOUDER = 5 * SAMPLE_RATE, 10.0
 """Samples of a reference that is not found, and by how much more power the microphone must have then than while the
 reference is silent, for the robot to be heard: 10 dB, more than people who talk half of the time bring about."""
-MISSING, HEARD, SOFTEST = 60 * SAMPLE_RATE, 10 * SAMPLE_RATE, 1e-6
-"""Samples without any reference, of which so many were not silent at the microphone, -60 dB of full scale: a level of the
+MISSING, HEARD = 60 * SAMPLE_RATE, 10 * SAMPLE_RATE
+"""Samples without any reference, of which so many were not silent at the microphone, SILENT of full scale: a level of the
 converter, since there is nothing else to compare with. 16 bits by themselves are 41 dB softer."""
 LITTLE_DB = 4.0
 """Removed of the robot below which its echo counts as unpredicted. Of 36 simulated conversations the least was 9 dB, of six
 loudspeakers with humans as far below the echo as theirs 10; microphones that process their sound have -0.1 to 4."""
-UNPREDICTED = (
-    "the linear stage removes {:.1f} dB of the robot: the microphone seems to be processed, or the loudspeaker distorts;"
-    " switch off noise suppression, gain control and echo cancellation of the device, and turn the volume down"
-)
 Verdict = Literal["unknown", "fits", "late"]
 
 
@@ -46,9 +43,8 @@ class ReferenceWatch:
     The aligner finds echoes that come after the reference. Here each utterance that it has not found is looked for in
     what the microphone heard before, in the same way with the channels exchanged. A robot often says what resembles an
     earlier utterance, whose echo the microphone may still hear: so what is found there must not be found as well, at the
-    same lag, in the reference that the aligner has delayed. hop: samples a step.
-
-    verdict: "unknown" until an utterance was found by either, or by neither for long; "fits" and "late" then.
+    same lag, in the reference that the aligner has delayed. hop: samples a step. verdict: "unknown" until an utterance
+    was found by either, or by neither for long; "fits" and "late" then.
 
     >>> watch = ReferenceWatch(256)
     >>> watch.verdict, watch.wait
@@ -92,8 +88,7 @@ class ReferenceWatch:
         self._mic.push(mic)
         self._ref.push(ref)
         self._earlier.push(aligned.reference)
-        started = self._onsets.step(ref)
-        if started:
+        if self._onsets.step(ref):
             self._stage, self._to_search, self._looks = 0, SEARCH_STRIDE, 0
         self._idle = aligned.state in ("idle", "announced")  # what was announced is no reference before it is heard
         said = self._look(aligned)
@@ -102,7 +97,12 @@ class ReferenceWatch:
             said.append(("robot_unfound", unfound))
         if removed_db is not None and removed_db < LITTLE_DB and not self._unpredicted_said:
             self._unpredicted_said = True
-            said.append(("echo_unpredicted", UNPREDICTED.format(removed_db)))
+            told = (
+                f"the linear stage removes {removed_db:.1f} dB of the robot: the microphone seems to be processed, or the"
+                " loudspeaker distorts; switch off noise suppression, gain control and echo cancellation of the device,"
+                " and turn the volume down"
+            )
+            said.append(("echo_unpredicted", told))
         if missing := self._wait_for_any(power, float(ref.dot(ref))):
             said.append(("reference_missing", missing))
         return said
@@ -115,52 +115,37 @@ class ReferenceWatch:
             return []
         self._to_search -= self._hop
         stage, self._stage = self._stage, 0
-        if stage == 0:
-            found_by_aligner = aligned.state in ("locked", "coarse", "lost") and self.verdict == "fits"
-            if self._to_search > 0 or found_by_aligner:
-                return []
-            self._to_search, self._stage = SEARCH_STRIDE, 1
-            self._prepare(self._mic)
-        elif stage == 1:
+        if stage == 2:
+            return self._decide(aligned)
+        if stage == 1:
             self._stage = 2
             self._listen()
-        elif stage == 2:
-            return self._decide(aligned)
+        elif self._to_search <= 0 and not (aligned.state in ("locked", "coarse", "lost") and self.verdict == "fits"):
+            self._to_search, self._stage = SEARCH_STRIDE, 1
+            self._prepare(self._mic)
         return []
 
     def _decide(self, aligned: Aligned) -> list[tuple[EventKind, str]]:
         found = self._search.find()
-        if (
-            found is None
-            or found.strength * found.ratio <= CERTAIN
-            or found.lag < ARRIVES
-            or self._resembles_earlier(found.lag)
-        ):
+        certain = found is not None and found.evidence > CERTAIN and found.lag >= ARRIVES
+        if found is None or not certain or self._resembles_earlier(found.lag):
             self._looks += 1
             if self._looks >= IN_VAIN and (self.verdict == "unknown" or aligned.state == "locked"):
                 self.verdict = "fits"
             return []
         known = self.verdict == "late"
         self.verdict, self._late, self._looks = "late", found.lag, 0
-        if known:
-            return []
-        return [
-            (
-                "reference_late",
-                f"the reference comes {1000 * found.lag / SAMPLE_RATE:.0f} ms after the microphone has heard it: the"
-                " robot is not removed, and nobody is noticed while it talks; hand the reference over earlier, or the"
-                " microphone later",
-            )
-        ]
+        told = (
+            f"the reference comes {1000 * found.lag / SAMPLE_RATE:.0f} ms after the microphone has heard it: the robot is"
+            " not removed, and nobody is noticed while it talks; hand the reference over earlier, or the microphone later"
+        )
+        return [] if known else [("reference_late", told)]
 
     def _resembles_earlier(self, lag: int) -> bool:
-        """Whether the utterance resembles what the aligner says is heard of an earlier one, about that many samples before.
-
-        The aligned reference comes somewhat before its echo.
-        """
+        """Whether the utterance resembles what the aligner says is heard of an earlier one, about that many samples before."""
         self._prepare(self._earlier)
         self._listen()
-        found = self._search.find()
+        found = self._search.find()  # the aligned reference comes somewhat before its echo
         return found is not None and abs(found.lag - lag) <= COARSE_MARGIN + PRE_ROLL
 
     def _prepare(self, tape: Tape) -> None:
@@ -198,7 +183,7 @@ class ReferenceWatch:
         if self._ever or self._missing_said:
             return ""
         self._silent += self._hop
-        self._heard += self._hop if power > SOFTEST else 0
+        self._heard += self._hop if power > SILENT else 0
         if self._silent < MISSING or self._heard < HEARD:
             return ""
         self._missing_said = True

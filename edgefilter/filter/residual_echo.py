@@ -3,25 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from edgefilter.dsp import fourier
 from edgefilter.dsp.stft import StftConfig
+from edgefilter.profile.data import Profile
 from edgefilter.types import SAMPLE_RATE, Array, Samples, Spectrum
 
-if TYPE_CHECKING:
-    from edgefilter.profile.data import Profile
-
 LEAKAGE = 0.005
-"""Part of the echo's power that no linear path explains, -23 dB: a loudspeaker's distortion, at first, where the profile
-does not know it."""
-LEAST, MOST = 0.0024, 0.1
-"""Bounds on it once it is tracked."""
-LEAKAGE_MEMORY, LEAKAGE_RISE, LEAKAGE_FALL = 0.97, 1.005, 0.9
-"""The part is observed over half a second of the robot's speech; it falls at once and rises by 1.4 dB a second, so that
-a human's sentence hardly lifts it."""
+"""Part of the echo's power that no linear path explains, -23 dB, at first, where the profile does not know the distortion."""
+BOUNDS = 0.0024, 0.1
+"""Least and most of it, -26 and -10 dB, once it is tracked."""
+LEAKAGE_MEMORY, STEPS = 0.97, (0.9, 1.005)
+"""The part is observed over half a second of the robot's speech. In a frame it changes by these factors at most: it falls at
+once and rises by 1.4 dB a second, so that a human's sentence hardly lifts it."""
 MARGIN = 3.0
 """Leakage over what is tracked: a mask needs that of loud moments, which distort most, and quiet ones are tracked."""
 AUDIBLE = 60.0
@@ -88,16 +84,12 @@ class Residual:
         self._calibrated = fan if fan is not None and fan.all() else None
         self._misalignment = np.float32(MISALIGNMENT_COLD if profile is None else MISALIGNMENT_WARM)
         known = profile.approximation if profile is not None else None
-        self._first = LEAKAGE if known is None else min(max(known.share, LEAST), MOST)
-        self.reset()
-
-    def reset(self) -> None:
-        """As before the first frame."""
+        self._leakage = LEAKAGE if known is None else _within(BOUNDS, known.share)
+        self._left = self._brought = 0.0
         self._tracked = NoiseTracker(self._bins)
         before = self._spread.size // 2  # beyond its ends the echo counts as what it is there
         self._extended = np.zeros(self._bins + self._spread.size - 1, np.float32)
         self._below, self._echo, self._above = np.split(self._extended, (before, before + self._bins))
-        self._leakage, self._left, self._brought = self._first, 0.0, 0.0
 
     def step(
         self,
@@ -139,8 +131,11 @@ class Residual:
         self._left += (1.0 - LEAKAGE_MEMORY) * (left - self._left)
         self._brought += (1.0 - LEAKAGE_MEMORY) * (brought - self._brought)
         change = MARGIN * max(self._left, 0.0) / self._brought / self._leakage
-        change = min(max(change, LEAKAGE_FALL), LEAKAGE_RISE)
-        self._leakage = min(max(self._leakage * change, LEAST), MOST)
+        self._leakage = _within(BOUNDS, self._leakage * _within(STEPS, change))
+
+
+def _within(bounds: tuple[float, float], value: float) -> float:
+    return min(max(value, bounds[0]), bounds[1])
 
 
 class Unpredictable:

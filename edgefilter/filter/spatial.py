@@ -42,7 +42,7 @@ LEFT_OUT = 1e4
 class Gathered:
     """What a human was heard as in some hops. shape: (microphones, microphones, bins) of the covariance.
 
-    covariance: sum of outer products, each with the square of the mask. passed: (bins,) sum of those squares, which is how
+    covariance: sum of outer products, each times the square of the mask. passed: (bins,) sum of those squares, which is how
     often the noise is in it as well. hops: how many.
     """
 
@@ -67,8 +67,8 @@ class Gathered:
 class SpatialFilter:
     """Combines the microphones of one stream, bin by bin; step once a frame, then learn from what the engine made of it.
 
-    stft: of the frames. microphones: two or more. noise: (microphones, microphones, bins) covariance of the fan where it
-    is calibrated.
+    stft: of the frames. microphones: two or more. noise: (microphones, microphones, bins) covariance of the fan where it is
+    calibrated. weights: (microphones, bins), whose conjugates are multiplied with the spectra.
 
     The filter is the one whose answer is nearest to the human in the first microphone, where what is left of the noise weighs
     NOISE_WEIGHT times what is changed of the human: the multichannel Wiener filter weighted by distortion (Spriet, Moonen &
@@ -79,13 +79,6 @@ class SpatialFilter:
     engine's mask (Heymann et al. 2016), less the noise that the mask lets pass; a diffuse field stands for what is not known
     of it, so that a turn begins with a filter that hears every direction. It is scaled so that what is in the first
     microphone of a human of that covariance stays as loud: what of a bin is noise is for the engine to say.
-
-    weights: (microphones, bins), whose conjugates are multiplied with the spectra.
-
-    >>> from edgefilter.dsp.stft import StftConfig
-    >>> one = SpatialFilter(StftConfig(), 3)
-    >>> one.weights.shape, bool(abs(one.weights.sum(axis=0)[0] - 1.0) < 1e-3)
-    ((3, 257), True)
     """
 
     def __init__(self, stft: StftConfig, microphones: int, noise: Spectrum | None = None) -> None:
@@ -95,10 +88,10 @@ class SpatialFilter:
         self._ones = np.eye(microphones, dtype=np.float32)[:, :, None]
         self._prior = np.float32(PRIOR) * diffuse_coherence(stft, microphones)
         self._known_hops = 0 if noise is None else KNOWN_HOPS
-        shape = microphones, microphones, stft.bins
+        self._shape = shape = microphones, microphones, stft.bins
         self._fan = np.zeros(shape, np.complex64) if noise is None else noise.astype(np.complex64)
         self._robot = self._fan.copy()
-        self._human, self._turn = Gathered(self._fan.shape), Gathered(self._fan.shape)
+        self._human, self._turn = Gathered(shape), Gathered(shape)
         self._against = self._fan
         self._speaking = False
         self._without, self._reference = np.zeros((microphones, 1, 1), np.float32), 0
@@ -133,7 +126,7 @@ class SpatialFilter:
         if heard:
             if not self._speaking:
                 self._human.fade(np.float32(CARRIED))
-                self._turn = Gathered(self._fan.shape)
+                self._turn = Gathered(self._shape)
             self._human.fade(self._human_keep)
             if probability > LIKELY:
                 passed = np.square(gain)

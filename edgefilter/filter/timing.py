@@ -15,22 +15,12 @@ except ModuleNotFoundError:  # Windows has no such module
 
 STATUS = Path("/proc/self/status")
 """Where Linux tells what a process has had since it was started."""
-
 WIDTH = 1.05
 """Upper over lower bound of a bin: finer than any two runs agree."""
 
 
 class Histogram:
-    """Counts times in bins of 5 % width from 1 us up.
-
-    Mean and maximum are exact, percentiles to the width of a bin.
-
-    >>> times = Histogram()
-    >>> for ms in range(1, 101):
-    ...     times.add(ms)
-    >>> times.count, times.max_ms, abs(times.percentile(50) / 50 - 1) < 0.05
-    (100, 100, True)
-    """
+    """Counts times in bins of 5 % width from 1 us up: mean and maximum are exact, percentiles to the width of a bin."""
 
     def __init__(self) -> None:
         self._bins: Counter[int] = Counter()

@@ -18,7 +18,6 @@ BEFORE_S = 0.5
 """Of sound before the human was noticed: they had begun to speak, and a recogniser wants some silence first."""
 LARGEST = 2.0
 """Most that an answer is taken to be over its error in a bin: engines add no sound, but an error can vanish."""
-
 WAITING_S = 600.0
 """Of the turns in events that nobody has asked for yet, 38 MB in all; a thousand events could hold a gigabyte."""
 
@@ -66,8 +65,7 @@ class Turns:
         if self._spatial is None:
             spectra = errors[:, 0]
         else:
-            spectra = sum(weight.conj() * errors[:, at] for at, weight in enumerate(self._spatial.finished()))
-            spectra *= gains
+            spectra = sum(weight.conj() * errors[:, at] for at, weight in enumerate(self._spatial.finished())) * gains
         hop, window = self._stft.hop, self._stft.window_length
         late = window - hop
         # frame t ends with sample (t + 1) hop, and has window samples; the first and the last late samples lack a frame

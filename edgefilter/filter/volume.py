@@ -1,4 +1,7 @@
-"""How loud the predicted echo is in the microphone: a volume that was turned, and an echo that is too loud to be subtracted."""
+"""How loud the predicted echo is in the microphone: a volume that was turned, and an echo that is too loud to be subtracted.
+
+The numbers were checked with `linear` on 63 recordings, simulated and real, with and without a calibration.
+"""
 
 from __future__ import annotations
 
@@ -11,15 +14,15 @@ from edgefilter.dsp.fourier import LEAST
 from edgefilter.types import SAMPLE_RATE, Samples
 
 MEMORY = 0.8
-"""Weight of the past in the smoothed moments per hop of 16 ms; about 80 ms."""
+"""Weight of the past in the smoothed moments, per hop of 16 ms: about 80 ms."""
 EXCESS = 1.5
-"""Factor of power by which an error is too loud for a filter that is merely not exact: over the error that another volume
-leaves, or over the microphone."""
+"""Power of an error, over that which another volume leaves, or over the microphone, from which on it is too loud for a filter
+that is merely not exact."""
 PATIENCE_S = 0.5
 """Seconds in which a suspected volume must be confirmed, and for which none is suspected afterwards; seconds after which
 an echo that is too loud is put down to another path."""
 COHERENCE = 0.3
-"""Least squared correlation coefficient of echo and microphone at which a volume is suspected."""
+"""Least squared correlation coefficient of echo and microphone at which a volume is suspected: less may be chance."""
 NOTICED = 1e-3
 """Error power over the microphone's, -30 dB, from which on a volume is suspected; 0.3 dB of volume leave that."""
 AUDIBLE, FORGET_S = 0.01, 10.0
@@ -28,12 +31,13 @@ ENOUGH_S = 3.0
 """Seconds of audible robot from which on it is said how much is removed."""
 MOST = 10.0
 """Largest factor, 20 dB, by which the volume is followed from where it was at first, up or down; and the factor by which
-an echo path that began unknown must have lowered the microphone's power before its volume means anything."""
+a path that began unknown must have lowered the microphone's power before its volume means anything."""
 PRE_EMPHASIS = 0.95
 """First-order pre-emphasis before a volume is told and paths are compared: noise and rumble below the voice weigh less.
 Without it two of 63 recordings, simulated and real, lose 0.8 dB in the volume, and none wins."""
 WITNESSES = 6
-"""Hops of audible robot, about 100 ms, on which a suspected factor must prove itself; it was not found in them."""
+"""Audible hops, about 100 ms, that make one piece of evidence: a suspected factor must prove itself on so many that it was
+not found in."""
 PART = 64
 """Samples, 4 ms, of a hop that are limited by themselves: a loudspeaker can be cut off in mid-word."""
 GROSS = 4.0
@@ -59,9 +63,9 @@ class Moments(NamedTuple):
         """These, followed by those of the next hop."""
         return Moments(*(MEMORY * before + (1.0 - MEMORY) * new for before, new in zip(self, now)))
 
-    def plus(self, now: Moments) -> Moments:
-        """The sums of both."""
-        return Moments(*(before + new for before, new in zip(self, now)))
+    def plus(self, now: Moments, keep: float = 1.0) -> Moments:
+        """The sums of both, of these keep times as much."""
+        return Moments(*(keep * before + new for before, new in zip(self, now)))
 
     def scaled(self, factor: float) -> Moments:
         """Those of an echo that is factor times this one."""
@@ -99,7 +103,7 @@ class Volume:
     def removed_db(self) -> float | None:
         """How far the subtraction has lowered the microphone over the last FORGET_S of robot; None before ENOUGH_S of it.
 
-        Hops in which a factor is looked for do not count: the echo is too loud or too soft in them by any factor.
+        Hops in which a factor is looked for do not count.
         """
         if self._wanted > 0 or not self._lasting.mic:
             return None
@@ -112,7 +116,7 @@ class Volume:
         self._smoothed = self._smoothed.smoothed(now)
         audible = now.echo > AUDIBLE * self._peak
         if audible and not self.suspected:
-            self._lasting = Moments(*(self._forget * before for before in self._lasting)).plus(now)
+            self._lasting = self._lasting.plus(now, self._forget)
             self._wanted -= 1
         if self._path == "unknown":
             if audible and self._smoothed.mic > MOST * self._smoothed.left():
