@@ -31,7 +31,7 @@ from edgefilter import Profile, engines
 from edgefilter.engines import CANDIDATES
 from edgefilter.errors import EdgefilterError, UsageError
 from edgefilter.filter.budget import CORES, DEMO, held_to, scene
-from edgefilter.filter.learner import Learner
+from edgefilter.filter.echo_path import Learner
 from edgefilter.filter.stream import Stream
 from edgefilter.filter.timing import peak_memory_mb
 from edgefilter.learning.background import BackgroundLearner

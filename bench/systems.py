@@ -28,8 +28,7 @@ from edgefilter.dsp.metrics import si_sdr
 from edgefilter.dsp.stft import StftConfig
 from edgefilter.engines import HAVE_MODEL, create
 from edgefilter.errors import EdgefilterError, UsageError
-from edgefilter.filter.echo_path import PathState
-from edgefilter.filter.learner import FilteredHop, Learner, Lesson
+from edgefilter.filter.echo_path import FilteredHop, Learner, Lesson, PathState
 from edgefilter.types import SAMPLE_RATE, Samples
 
 OWN = ("linear", "ss", "crnn")

@@ -24,8 +24,8 @@ from edgefilter.commands.observers import Observers
 from edgefilter.engines import HAVE_LINEAR_STAGE
 from edgefilter.errors import EdgefilterError, SignalError, UsageError
 from edgefilter.filter.budget import DEFAULT_MS, Choice, allowed_cores, choose, forget
+from edgefilter.filter.echo_path import Learner
 from edgefilter.filter.ego_filter import EgoFilter
-from edgefilter.filter.learner import Learner
 from edgefilter.learning.background import BackgroundLearner
 from edgefilter.profile.data import Profile
 from edgefilter.session import RunReport, filter_blocks

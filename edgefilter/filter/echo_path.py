@@ -1,9 +1,10 @@
-"""The echo path as the filter models it: the effects ahead of the loudspeaker, and the adaptive filter behind them."""
+"""The echo path as the filter models it, from the effects ahead of the loudspeaker on, and what a learner hears and says of it."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
@@ -11,7 +12,7 @@ from edgefilter.echo.measurement import Values
 from edgefilter.echo.source_chain import SourceChain, VoiceChain
 from edgefilter.filter.canceller import LEARNED, WARM, Canceller, CancellerOutput, CancellerState
 from edgefilter.profile.data import Profile
-from edgefilter.types import Samples
+from edgefilter.types import EventKind, Samples
 
 TAPS = (2048, 8192)
 """Least and most taps of the linear stage, 128 to 512 ms; between them the profile's impulse response decides."""
@@ -31,8 +32,7 @@ class PathState:
 class EchoPath:
     """Predicts and subtracts the echo: the effects ahead of the loudspeaker, the canceller, the microphone behind it.
 
-    effects: of the whole model; those that are filters on the path are left to the canceller's impulse response. source:
-    what they do ahead of the loudspeaker.
+    effects: of the whole model; filters on the path are left to the canceller. source: what they do ahead of the loudspeaker.
     """
 
     def __init__(self, canceller: Canceller, effects: Effects = ()) -> None:
@@ -88,3 +88,57 @@ def _behind(effects: Effects, microphones: int | None) -> Callable[[Samples, Sam
     if not chains[0]:
         return None
     return lambda echo, mic: np.stack([chain(*own) for chain, *own in zip(chains, echo, mic)])
+
+
+class FilteredHop(NamedTuple):
+    """One hop of the running filter.
+
+    mic, reference, innovation: (hop,) float32, the microphone, the aligned reference, and the microphone less the echo
+    as predicted before the hop's own correction. located: whether the reference is known to lie where the microphone
+    hears it. idle: whether nothing of the robot can be audible. past: (n,) the aligned reference up to and with this
+    hop where its delay was switched in it, else None. delay: samples, of the direct sound; nan where unknown.
+    """
+
+    mic: Samples
+    reference: Samples
+    innovation: Samples
+    located: bool
+    idle: bool
+    past: Samples | None
+    delay: float
+
+
+class Lesson(NamedTuple):
+    """A path that predicts better than the one in use, to be taken over.
+
+    kind: "learned", or "unlearned" where an earlier path comes back. detail: in words, with figures.
+    """
+
+    path: PathState
+    kind: EventKind
+    detail: str
+
+
+class Learner(Protocol):
+    """Follows the hops of one stream and now and then knows a better path."""
+
+    @property
+    def past(self) -> int:
+        """Samples of the aligned reference that FilteredHop.past is to hold."""
+        ...
+
+    def start(self, path: PathState, hop: int) -> None:
+        """A stream begins with that path, in steps of hop samples."""
+        ...
+
+    def observe(self, hop: FilteredHop) -> Lesson | None:
+        """Take one hop; the lesson is adopted with the next one."""
+        ...
+
+    def stats(self) -> dict[str, object]:
+        """What was learned so far, ready for JSON."""
+        ...
+
+    def close(self) -> None:
+        """The stream is over."""
+        ...

@@ -13,7 +13,7 @@ from edgefilter.engines.base import ClipEngine, Engine
 from edgefilter.engines.combined import Ladder, climbable, judges_speech, with_network_as_judge
 from edgefilter.errors import EdgefilterError, SignalError, UsageError
 from edgefilter.filter.barge_in import BargeInSettings
-from edgefilter.filter.learner import Learner
+from edgefilter.filter.echo_path import Learner
 from edgefilter.filter.stepping import Stepping
 from edgefilter.filter.stream import Stream
 from edgefilter.profile.data import Profile
@@ -179,8 +179,7 @@ class EgoFilter:
         Returns
         -------
         ndarray of float32, shape (m,)
-            Aligned with the input: sample i of all outputs together belongs to sample i of all inputs. m is 0 to n +
-            latency.
+            Aligned with the input: sample i of all outputs belongs to sample i of all inputs. m is 0 to n + latency.
 
         Raises
         ------
@@ -218,8 +217,7 @@ class EgoFilter:
         -----
         For robots without a loopback: while the reference blocks are zeros, the utterance is looked for in the
         microphone for 30 s, and from about 0.1 s after its first sound on it is the reference. A reference channel that
-        carries sound is believed instead, and drops what was announced. Engines that only delay the reference
-        (paper-ss) count announcements.
+        carries sound is believed instead, and drops what was announced. paper-ss counts announcements.
         """
         if self._stream.front.aligner:
             self._stream.front.aligner.announce(as_samples(utterance, "utterance"))
@@ -303,8 +301,7 @@ class EgoFilter:
         Returns
         -------
         Profile
-            A new one; `self.profile` stays. What of its path is longer than the linear stage is the profile's own, as
-            loud as the volume was turned.
+            A new one. What of its path is longer than the linear stage is the profile's own, at the volume of now.
 
         Raises
         ------

@@ -12,8 +12,7 @@ from edgefilter.dsp.stft import Analyser
 from edgefilter.echo.source_chain import SourceChain
 from edgefilter.engines.base import ClipEngine, Engine
 from edgefilter.filter.canceller import Canceller, CancellerOutput
-from edgefilter.filter.echo_path import EchoPath, starting_path
-from edgefilter.filter.learner import FilteredHop, Learner, Lesson
+from edgefilter.filter.echo_path import EchoPath, FilteredHop, Learner, Lesson, starting_path
 from edgefilter.filter.microphones import Microphones
 from edgefilter.filter.residual_echo import Residual, Unpredictable
 from edgefilter.filter.spatial import SpatialFilter
@@ -27,8 +26,7 @@ RUMBLE_HZ, RUMBLE = 90.0, 0.05
 class LinearStage:
     """Tracked delay, echo path and residual echo: what only front ends of the kind "full" have.
 
-    learner: told of every hop; the lesson that it answers is adopted with the next one. lesson: the one that was adopted
-    in the latest hop.
+    learner: told of every hop; the lesson that it answers is adopted with the next one. lesson: adopted in the latest hop.
     """
 
     lesson: Lesson | None = None

@@ -14,8 +14,8 @@ from edgefilter.engines.base import ClipEngine, Engine, EngineState
 from edgefilter.engines.spectral_subtraction import FLOOR
 from edgefilter.errors import SignalError
 from edgefilter.filter.barge_in import INTERRUPTIONS, BargeIn, BargeInSettings, HumanJudge
+from edgefilter.filter.echo_path import Learner
 from edgefilter.filter.front_end import FrontEnd
-from edgefilter.filter.learner import Learner
 from edgefilter.filter.reference_watch import ReferenceWatch
 from edgefilter.filter.stepping import Stepping
 from edgefilter.filter.turns import LONGEST_S, Turns, drop_sound
@@ -28,8 +28,7 @@ class Stream:
 
     `EgoFilter` says what process, flush, robot_removed and the properties give. With an engine that waits for the end,
     process returns nothing and flush everything. stepping: told the compute time of every hop; what it answers becomes an
-    event. barge_in, on_barge_in, keep_channels: as of `EgoFilter`. learner: of better echo paths, for engines with a
-    linear stage.
+    event. barge_in, learner, on_barge_in, keep_channels: as of `EgoFilter`.
     """
 
     def __init__(

@@ -14,8 +14,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from edgefilter.echo.user_effects import loaded_files
-from edgefilter.filter.echo_path import PathState
-from edgefilter.filter.learner import FilteredHop, Lesson
+from edgefilter.filter.echo_path import FilteredHop, Lesson, PathState
 from edgefilter.learning.history import PAST, RECENT_S
 from edgefilter.profile.data import Profile
 from edgefilter.types import SAMPLE_RATE
@@ -55,9 +54,8 @@ class BackgroundLearner:
 
     Notes
     -----
-    A hop costs the running filter a copy of three arrays into a pipe; it never waits for the other process. Where that
-    one falls behind by 15 s, it begins anew; where it ends, or cannot be started, the filter goes on without lessons.
-    `stats` tells of both.
+    A hop costs the running filter a copy of three arrays into a pipe; it never waits. Where the other process falls behind
+    by 15 s, it begins anew; where it ends, or cannot be started, the filter goes on without lessons. `stats` tells of both.
 
     Examples
     --------

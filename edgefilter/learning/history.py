@@ -7,8 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from edgefilter.filter.echo_path import TAPS, EchoPath
-from edgefilter.filter.learner import FilteredHop
+from edgefilter.filter.echo_path import TAPS, EchoPath, FilteredHop
 from edgefilter.filter.volume import pre_emphasised
 from edgefilter.types import SAMPLE_RATE, Samples
 

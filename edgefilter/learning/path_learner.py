@@ -21,8 +21,7 @@ from edgefilter.echo.measurement import Measurement, whiten
 from edgefilter.echo.model import EchoModel
 from edgefilter.errors import ProfileError
 from edgefilter.filter.canceller import COLD, Canceller
-from edgefilter.filter.echo_path import TAPS, EchoPath, Effects, PathState, starting_path
-from edgefilter.filter.learner import FilteredHop, Lesson
+from edgefilter.filter.echo_path import TAPS, EchoPath, Effects, FilteredHop, Lesson, PathState, starting_path
 from edgefilter.filter.volume import AUDIBLE, WITNESSES
 from edgefilter.learning.history import MINUTE, PAST, RECENT_S, HopHistory, emphasised
 from edgefilter.profile.array import ArrayCalibration
@@ -204,8 +203,7 @@ class PathLearner:
     def _candidates(self) -> list[Rival]:
         """Paths that know the minute: from the beginning with what it teaches of the loudspeaker, and without.
 
-        And from nothing, with its newest seconds alone: the robot may stand elsewhere than at the beginning, or than a
-        minute ago.
+        And from nothing, with its newest seconds alone: the robot may stand elsewhere than before.
         """
         self._counts["rounds"] += 1
         known, fitted = self._begin.effects, self._fitted()

@@ -10,7 +10,7 @@ import time
 from typing import BinaryIO
 
 from edgefilter.echo.user_effects import load_effect
-from edgefilter.filter.learner import Lesson
+from edgefilter.filter.echo_path import Lesson
 from edgefilter.filter.timing import peak_memory_mb
 from edgefilter.learning.background import LENGTH, Beginning, News
 from edgefilter.learning.path_learner import PathLearner

@@ -10,8 +10,7 @@ import pytest
 import edgefilter
 from edgefilter import EgoFilter, Profile
 from edgefilter.echo.effects.catalogue import EFFECTS
-from edgefilter.filter.echo_path import EchoPath, PathState
-from edgefilter.filter.learner import FilteredHop, Lesson
+from edgefilter.filter.echo_path import EchoPath, FilteredHop, Lesson, PathState
 
 DEMO = Path(edgefilter.__file__).parent / "demo_data"
 NOISY = next(effect for effect in EFFECTS if effect.noise_is_asked)

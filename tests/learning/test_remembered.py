@@ -7,8 +7,7 @@ import pytest
 
 from edgefilter import PathLearner, Profile
 from edgefilter.echo.model import EchoModel
-from edgefilter.filter.echo_path import starting_path
-from edgefilter.filter.learner import FilteredHop
+from edgefilter.filter.echo_path import FilteredHop, starting_path
 from edgefilter.types import SAMPLE_RATE
 from tests.learning.scenes import Scene, room
 from tests.learning.test_path_learner import db, run
