@@ -24,16 +24,14 @@ POWERS = ("noise_psd", "residual_psd")
 """Those that follow, each (1, bins) float32, as in Frame."""
 VARIABLE = "EDGEFILTER_CRNN"
 LOUDEST = 1.26
-"""Most power of a frame of the answer, over the microphone's: 1 dB. The shipped network stays below; one that is not as it
-should be is turned down to it."""
+"""Most power of a frame of the answer, over the microphone's: 1 dB. The shipped network stays below; others are turned down."""
 SURE = 100.0
 """Error power over the expected powers of noise and residual echo, 20 dB, from which on a bin is the human's while the robot
 is silent, whatever the network says: it takes parts of a loud human for noise. While the robot speaks this is not so sure."""
 SHARE_OF_SS = np.float32(0.4)
 """How much of the answer is that of `ss` where the robot is calibrated: it errs elsewhere than the network, and both
 together err less than either; half would be as good, and leave more of a robot alone (models/MODELS.md). Without a
-calibration, or with a path that the filter has learned, it saves no word and costs a real loudspeaker's humans up to
-2 dB."""
+calibration, or with a learned path, it saves no word and costs a real loudspeaker's humans up to 2 dB."""
 LOUD = 1.3e3, 6.3e3
 """Power of the loudest frame of microphone and reference, 31 and 38 dB, in the recordings that the network was trained on
 (medians): the loudest so far is brought there."""

@@ -24,9 +24,8 @@ MAX_SECONDS = 60
 class PaperCrnn:
     """CRNN of Li, Hindriks & Kunneman 2024, section 3.3: a soft mask from both magnitudes, on the mixture, with the mixture's phase.
 
-    model: an ONNX file made by export/onnx_export.py from a PaperCrnn checkpoint; without one the file that the
-    environment variable EDGEFILTER_PAPER_CRNN names. The package brings none. Raises ModelError for a file that is not
-    such a model.
+    model: an ONNX file made by export/onnx_export.py from a PaperCrnn checkpoint; without one the file that
+    EDGEFILTER_PAPER_CRNN names. The package brings none. Raises ModelError for a file that is not such a model.
     """
 
     name: ClassVar[str] = "paper-crnn"

@@ -44,8 +44,7 @@ class PaperSpectralSubtraction:
     silence before and after the recording, for which eq. (6) gives SM = 1; alpha = 4, chosen for the lowest word errors
     on 24 simulated validation conversations; and beta = 1, the most that is never louder than the microphone.
 
-    lookahead is L frames. causal=True moves the window L frames back, so that it needs none (2 L + 1 frames of the
-    past).
+    lookahead is L frames. causal=True moves the window L frames back, so that it needs none.
     """
 
     name: ClassVar[str] = "paper-ss"

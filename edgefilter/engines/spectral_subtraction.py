@@ -19,8 +19,7 @@ MEMORY = 0.8
 class SpectralSubtraction(Linear):
     """Wiener gain xi / (1 + xi) with the decision-directed a-priori signal-to-noise ratio xi of Ephraim & Malah (1984).
 
-    Eq. (51) there; xi is the human's power over that of noise and residual echo. The state is the power of the previous
-    answer (bins,).
+    Eq. (51) there; xi: the human's power over that of noise and residual echo. State: power of the previous answer (bins,).
     """
 
     name: ClassVar[str] = "ss"

@@ -72,8 +72,7 @@ class HumanJudge:
     def step(self, probability: float, suspect: bool = False) -> float:
         """Probability that a human speaks, 0 to 1, from the engine's.
 
-        suspect: whether what sounds may well be the robot, whose lag is not found yet or whose reference comes later; the
-        answer is then 0.
+        suspect: whether what sounds may be the robot, whose lag is not found yet or whose reference comes later: then 0.
         """
         if suspect:
             self._odds = 0.0

@@ -49,8 +49,7 @@ class Adaptation:
 
     transition: A of the first-order Markov model of the path per hop of 16 ms. noise_memory: weight of the past in the
     measurement-noise PSD. certainty: share of the gain by which a correction lowers the covariance, in theory 1/2.
-    products: whether d x and d^2 x are heard beside the reference. posterior: whether the error is delivered after the
-    hop's own correction.
+    products: whether d x and d^2 x are heard beside the reference. posterior: whether the error comes after the correction.
     """
 
     transition: float

@@ -27,8 +27,7 @@ SPREAD, SPREAD_HZ = 0.1, 2000.0
 TAIL_DECAY = 0.6
 """Fall of the residual echo per hop, room for what lies beyond the canceller's tail and between its frames."""
 MISALIGNMENT_WARM, MISALIGNMENT_COLD = 0.5, 2.0
-"""Weight of the canceller's own estimate of its misalignment: too large for a calibrated path, too small for one that was
-learned from nothing."""
+"""Weight of the canceller's estimate of its misalignment: too large for a calibrated path, too small from nothing."""
 
 
 class NoiseTracker:
@@ -36,7 +35,6 @@ class NoiseTracker:
 
     Every frame counts with the probability that it holds nothing else: Gerkmann & Hendriks (2012), "Unbiased MMSE-based
     noise power estimation with low complexity and low tracking delay", eq. (18), (22) and (23), with their values.
-    bins: of a spectrum.
     """
 
     PRESENT = np.float32(10.0**1.5)

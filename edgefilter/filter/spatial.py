@@ -170,8 +170,7 @@ def diffuse_coherence(stft: StftConfig, microphones: int) -> Samples:
 def solve(matrix: Spectrum, right: Spectrum) -> Spectrum:
     """The x (n, bins) of matrix x = right, in each bin; matrix: (n, n, bins), Hermitian, positive definite.
 
-    A Cholesky factorisation without roots, matrix = L D L^H, in all bins at once: for a few microphones this takes a tenth
-    of what a call for each bin does.
+    A Cholesky factorisation without roots, matrix = L D L^H, in all bins at once: ten times as fast as bin by bin.
     """
     n = len(right)
     lower: list[list[Spectrum]] = [[] for _ in range(n)]

@@ -11,13 +11,11 @@ from edgefilter.filter.timing import Histogram
 from edgefilter.types import SAMPLE_RATE, DeadlineStats, EventKind
 
 OVERLOADED = 0.25
-"""Part of the last second of hops over the budget at which the load counts as sustained; a single stall never reaches
-it."""
+"""Part of the last second of hops over the budget at which the load counts as sustained: a single stall is shorter."""
 CALM = 0.01
 """Part of the hops over the budget up to which the machine has recovered: the budget is promised for 99 of 100."""
 PATIENCE_S, MOST_PATIENCE_S = 10.0, 160.0
-"""Calm seconds before a better engine is tried again; doubled, up to the most, each time that one had to be left before it
-had run as long again."""
+"""Calm seconds before a better engine is tried; doubled, up to the most, where one is left before it has run as long."""
 
 
 class Stepping:
@@ -25,8 +23,7 @@ class Stepping:
 
     A hop misses its deadline where its compute took longer than the hop lasts; it is over the budget where it took
     longer than budget_ms, or than the hop. Where OVERLOADED of the last second are over the budget, the ladder is asked
-    for the next cheaper engine, and after PATIENCE_S of calm for the next better one. ladder: the stream's engine, None
-    to count only. clock: seconds, monotonic.
+    for the next cheaper engine, and after PATIENCE_S of calm for the next better one. ladder: None to count only.
     """
 
     def __init__(

@@ -16,8 +16,7 @@ from edgefilter.types import SAMPLE_RATE, Samples
 MEMORY = 0.8
 """Weight of the past in the smoothed moments, per hop of 16 ms: about 80 ms."""
 EXCESS = 1.5
-"""Power of an error, over that which another volume leaves, or over the microphone, from which on it is too loud for a filter
-that is merely not exact."""
+"""Power of an error, over what another volume leaves or over the microphone, that no filter leaves by being inexact."""
 PATIENCE_S = 0.5
 """Seconds in which a suspected volume must be confirmed, and for which none is suspected afterwards; seconds after which
 an echo that is too loud is put down to another path."""
@@ -36,8 +35,7 @@ PRE_EMPHASIS = 0.95
 """First-order pre-emphasis before a volume is told and paths are compared: noise and rumble below the voice weigh less.
 Without it two of 63 recordings, simulated and real, lose 0.8 dB in the volume, and none wins."""
 WITNESSES = 6
-"""Audible hops, about 100 ms, that make one piece of evidence: a suspected factor must prove itself on so many that it was
-not found in."""
+"""Audible hops, about 100 ms, that make one piece of evidence; a suspected factor proves itself on later ones."""
 PART = 64
 """Samples, 4 ms, of a hop that are limited by themselves: a loudspeaker can be cut off in mid-word."""
 GROSS = 4.0
@@ -190,8 +188,7 @@ class Volume:
 class EchoLimiter:
     """Weighs the echo by gamma = <mic, echo> / <echo, echo>, in 0 to 1, while subtracting all of it would add power.
 
-    hop: samples per step. changed: the path must have become another one; told in one hop each time. heard: gamma over
-    about 80 ms.
+    hop: samples per step. changed: the path must have become another one, told in one hop each time.
     """
 
     def __init__(self, hop: int) -> None:
