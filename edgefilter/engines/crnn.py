@@ -11,7 +11,7 @@ import numpy as np
 
 from edgefilter.dsp import fourier
 from edgefilter.engines.base import FrontEndKind
-from edgefilter.engines.onnx_session import FixedPlaces, Model, expect_answer, expect_slots, find_model, open_model
+from edgefilter.engines.onnx_session import Model, expect_answer, expect_slots, find_model, open_model
 from edgefilter.engines.spectral_subtraction import SpectralSubtraction
 from edgefilter.profile.data import Profile
 from edgefilter.types import Frame, Output, Samples, Spectrum
@@ -144,20 +144,28 @@ class Crnn:
 
 
 class Places:
-    """Where one frame's inputs go and its outputs come, of one thread.
+    """Where one frame's inputs go and its outputs come, of one thread; new arrays in each call take a tenth of a paced frame.
 
     inputs: (bins,) by the name of the Frame's field that goes there. spectrum: (bins,) complex64.
     """
 
     def __init__(self, model: Model) -> None:
-        slots = FixedPlaces(model.session)
-        spectra = [(name, slots.inputs[name].view(np.complex64).reshape(-1)) for name in SPECTRA]
-        self.inputs = [*spectra, *((name, slots.inputs[name].reshape(-1)) for name in POWERS)]
-        self.spectrum: Spectrum = slots.outputs["spectrum"].view(np.complex64).reshape(-1)
-        self.probability = slots.outputs["speech_probability"]
-        self.states = [slots.inputs[name] for name, _ in model.states]
-        self.next_states = [slots.outputs[f"next_{name}"] for name, _ in model.states]
-        self.run = slots.run
+        self._session, self._binding = model.session, model.session.io_binding()
+        given = {slot.name: np.zeros(slot.shape, np.float32) for slot in self._session.get_inputs()}
+        made = {slot.name: np.zeros(slot.shape, np.float32) for slot in self._session.get_outputs()}
+        for bind, places in ((self._binding.bind_input, given), (self._binding.bind_output, made)):
+            for name, place in places.items():
+                bind(name, "cpu", 0, np.float32, place.shape, place.ctypes.data)
+        spectra = [(name, given[name].view(np.complex64).reshape(-1)) for name in SPECTRA]
+        self.inputs = [*spectra, *((name, given[name].reshape(-1)) for name in POWERS)]
+        self.spectrum: Spectrum = made["spectrum"].view(np.complex64).reshape(-1)
+        self.probability = made["speech_probability"]
+        self.states = [given[name] for name, _ in model.states]
+        self.next_states = [made[f"next_{name}"] for name, _ in model.states]
+
+    def run(self) -> None:
+        """From what stands in the places of the inputs to those of the outputs."""
+        self._session.run_with_iobinding(self._binding)
 
 
 def _with_what_is_sure(human: Spectrum, frame: Frame) -> Spectrum:

@@ -59,25 +59,6 @@ class Model:
         return {"file": str(self.path), "training": dict(self.training), "figures": dict(self.figures)}
 
 
-class FixedPlaces:
-    """A model's inputs and outputs as arrays that stay where they are: write the inputs, run, read the outputs.
-
-    Handing over new arrays at each call takes a tenth of a paced frame. All shapes are fixed; one thread at a time.
-    """
-
-    def __init__(self, session: onnxruntime.InferenceSession) -> None:
-        self._session, self._binding = session, session.io_binding()
-        self.inputs = {slot.name: np.zeros(slot.shape, np.float32) for slot in session.get_inputs()}
-        self.outputs = {slot.name: np.zeros(slot.shape, np.float32) for slot in session.get_outputs()}
-        for bind, places in ((self._binding.bind_input, self.inputs), (self._binding.bind_output, self.outputs)):
-            for name, place in places.items():
-                bind(name, "cpu", 0, np.float32, place.shape, place.ctypes.data)
-
-    def run(self) -> None:
-        """From what stands in inputs to outputs."""
-        self._session.run_with_iobinding(self._binding)
-
-
 def find_model(given: str | Path | None, variable: str, name: str, remedy: str) -> Path:
     """The model file to use: the given one, else the environment variable's, else the package's own.
 

@@ -21,7 +21,7 @@ once and rises by 1.4 dB a second, so that a human's sentence hardly lifts it.""
 MARGIN = 3.0
 """Leakage over what is tracked: a mask needs that of loud moments, which distort most, and quiet ones are tracked."""
 AUDIBLE = 60.0
-"""Power of the echo over the noise's from which on its leakage can be told."""
+"""Power of the echo over the noise's, 18 dB, from which on its leakage can be told from the noise."""
 SPREAD, SPREAD_HZ = 0.1, 2000.0
 """Distortion falls on other frequencies too: this part of the echo's mean over SPREAD_HZ counts as well."""
 TAIL_DECAY = 0.6

@@ -39,7 +39,8 @@ BEFORE = "the path of before"
 BLOCKS = 8, 60
 """Of WITNESSES hops each, whose errors are compared as one: after so many a rival can win, and is given up."""
 GAIN_DB, CERTAIN = 0.15, 2.5
-"""Mean fall of the error by which a rival wins, and how many of its standard errors that must be."""
+"""Mean fall of the error by which a rival wins, and how many of its standard errors that must be: a human adds the same error
+to both."""
 
 
 @dataclass
