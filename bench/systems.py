@@ -294,10 +294,6 @@ class _Kept:
         self._lessons: dict[int, Lesson] = {}
         self._at = 0
 
-    @property
-    def past(self) -> int:
-        return PathLearner.past
-
     def start(self, path: PathState, hop: int) -> None:
         if self._at:
             self._learner, self._at = None, 0

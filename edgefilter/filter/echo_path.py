@@ -12,10 +12,12 @@ from edgefilter.echo.measurement import Values
 from edgefilter.echo.source_chain import SourceChain, VoiceChain
 from edgefilter.filter.canceller import LEARNED, WARM, Canceller, CancellerOutput, CancellerState
 from edgefilter.profile.data import Profile
-from edgefilter.types import EventKind, Samples
+from edgefilter.types import SAMPLE_RATE, EventKind, Samples
 
 TAPS = (2048, 8192)
 """Least and most taps of the linear stage, 128 to 512 ms; between them the profile's impulse response decides."""
+PAST = SAMPLE_RATE
+"""Samples of the aligned reference, longer than any path, that a learner is told after a switch of the delay."""
 
 Effects = tuple[tuple[str, Values], ...]
 """(name, values) of effects."""
@@ -121,11 +123,6 @@ class Lesson(NamedTuple):
 
 class Learner(Protocol):
     """Follows the hops of one stream and now and then knows a better path."""
-
-    @property
-    def past(self) -> int:
-        """Samples of the aligned reference that FilteredHop.past is to hold."""
-        ...
 
     def start(self, path: PathState, hop: int) -> None:
         """A stream begins with that path, in steps of hop samples."""

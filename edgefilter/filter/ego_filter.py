@@ -158,7 +158,7 @@ class EgoFilter:
     @property
     def human_speaks(self) -> bool:
         """Whether the human is speaking, pauses of half a second included; False where the engine does not judge it."""
-        return self._stream.human_speaks
+        return self._stream.barge_in.speaking
 
     @property
     def judges_speech(self) -> bool:

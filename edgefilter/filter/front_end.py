@@ -12,7 +12,7 @@ from edgefilter.dsp.stft import Analyser
 from edgefilter.echo.source_chain import SourceChain
 from edgefilter.engines.base import ClipEngine, Engine
 from edgefilter.filter.canceller import Canceller, CancellerOutput
-from edgefilter.filter.echo_path import EchoPath, FilteredHop, Learner, Lesson, starting_path
+from edgefilter.filter.echo_path import PAST, EchoPath, FilteredHop, Learner, Lesson, starting_path
 from edgefilter.filter.microphones import Microphones
 from edgefilter.filter.residual_echo import Residual, Unpredictable
 from edgefilter.filter.spatial import SpatialFilter
@@ -75,8 +75,7 @@ class LinearStage:
         return CancellerOutput(echo, mic - echo, after.uncertainty, after.innovation)
 
     def _past(self) -> Samples:
-        wanted = self._learner.past if self._learner else 0
-        return self.aligner.history(max(self.path.history, wanted))
+        return self.aligner.history(max(self.path.history, PAST if self._learner else 0))
 
 
 class FrontEnd:

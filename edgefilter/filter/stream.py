@@ -52,11 +52,6 @@ class Stream:
         """Algorithmic latency in samples: the window, and the engine's look-ahead where it does not wait for the end."""
         return self.engine.stft.window_length + (self.engine.lookahead or 0) * self.engine.stft.hop
 
-    @property
-    def human_speaks(self) -> bool:
-        """Between the events speech_started and speech_stopped."""
-        return self._barge_in.speaking
-
     def reset(self) -> None:
         """Forget everything; the next sample is the first."""
         stft = self.engine.stft
@@ -68,7 +63,7 @@ class Stream:
         self.events: deque[Event] = deque(maxlen=1000)
         self.speech_probability: float | None = None
         self._judge = HumanJudge(stft.hop / SAMPLE_RATE, calibrated=self.profile is not None)
-        self._barge_in = BargeIn(stft.hop / SAMPLE_RATE, self._barge_in_settings)
+        self.barge_in = BargeIn(stft.hop / SAMPLE_RATE, self._barge_in_settings)
         self._turns = Turns(stft, self.front.spatial)
         self._removed: deque[Samples] = deque(maxlen=round(LONGEST_S * SAMPLE_RATE / stft.hop))
         self.samples_in = self.samples_out = self._stepped = 0
@@ -110,7 +105,7 @@ class Stream:
         rest = self._run(np.zeros((*lead, padding.size), np.float32), padding)
         if self.engine.lookahead is None:
             rest = self._finish([self._synthesiser.push(spectrum) for spectrum in self.engine.answer(self._clip)])
-        if self._barge_in.end():
+        if self.barge_in.end():
             self._tell_of_speech("speech_stopped", "the recording has ended")
         return self._deliver(rest[:missing])
 
@@ -199,7 +194,7 @@ class Stream:
         if output.speech_probability is not None:
             self._turns.step(output.spectrum, frame.error, self.front.errors)
         self._judge_speech(output.speech_probability, frame.at_any_lag)
-        self.front.hear(frame, output, self.speech_probability, self.human_speaks)
+        self.front.hear(frame, output, self.speech_probability, self.barge_in.speaking)
         return self._synthesiser.push(output.spectrum)
 
     def _judge_speech(self, probability: float | None, at_any_lag: bool) -> None:
@@ -209,7 +204,7 @@ class Stream:
             suspect = at_any_lag or (self._watch is not None and self._watch.suspect)
             wait = self._watch.wait // self.engine.stft.hop if self._watch else 0
             self.speech_probability = self._judge.step(probability, suspect)
-        if talk := self._barge_in.note(self.speech_probability, wait):
+        if talk := self.barge_in.note(self.speech_probability, wait):
             self._tell_of_speech(talk, f"probability {self.speech_probability or 0.0:.2f}")
             if self._on_barge_in and talk in INTERRUPTIONS:
                 try:
@@ -222,7 +217,7 @@ class Stream:
 
     def _tell_of_speech(self, talk: EventKind, detail: str) -> None:
         if talk == "speech_started":
-            self._turns.start(self._barge_in.waited)
+            self._turns.start(self.barge_in.waited)
             self._tell(talk, detail)
         else:
             self._tell(talk, detail, Turn(*self._turns.finish()))

@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 from edgefilter.echo.user_effects import loaded_files
 from edgefilter.filter.echo_path import FilteredHop, Lesson, PathState
-from edgefilter.learning.history import PAST, RECENT_S
+from edgefilter.learning.history import RECENT_S
 from edgefilter.profile.data import Profile
 from edgefilter.types import SAMPLE_RATE
 
@@ -64,8 +64,6 @@ class BackgroundLearner:
     >>> ego = edgefilter.EgoFilter(engine="linear", learn=learner)
     >>> learner.close()
     """
-
-    past = PAST
 
     def __init__(self, profile: Profile | None = None, remember: Path | None = None) -> None:
         self._profile, self._remember = profile, remember

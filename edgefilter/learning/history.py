@@ -15,8 +15,6 @@ MINUTE = 60.0
 """Seconds that are kept."""
 RECENT_S = 15.0
 """The newest of them, s: enough to fit a loudspeaker and a room to, and all of it from where the robot stands now."""
-PAST = SAMPLE_RATE
-"""Samples of the aligned reference, longer than any path, that a learner wants after a switch of the delay."""
 
 
 class HopHistory:

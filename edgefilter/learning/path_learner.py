@@ -21,9 +21,9 @@ from edgefilter.echo.measurement import Measurement, whiten
 from edgefilter.echo.model import EchoModel
 from edgefilter.errors import ProfileError
 from edgefilter.filter.canceller import COLD, Canceller
-from edgefilter.filter.echo_path import TAPS, EchoPath, Effects, FilteredHop, Lesson, PathState, starting_path
+from edgefilter.filter.echo_path import PAST, TAPS, EchoPath, Effects, FilteredHop, Lesson, PathState, starting_path
 from edgefilter.filter.volume import AUDIBLE, WITNESSES
-from edgefilter.learning.history import MINUTE, PAST, RECENT_S, HopHistory, emphasised
+from edgefilter.learning.history import MINUTE, RECENT_S, HopHistory, emphasised
 from edgefilter.profile.array import ArrayCalibration
 from edgefilter.profile.data import DISTORTION_ORDERS, GRID_FFT, LEARNED, Profile
 from edgefilter.types import SAMPLE_RATE, EventKind, Samples
@@ -125,8 +125,6 @@ class PathLearner:
     >>> learner.stats()["learned"]
     0
     """
-
-    past = PAST
 
     def __init__(self, profile: Profile | None = None, remember: Path | None = None) -> None:
         self._profile, self._remember = profile, remember
@@ -269,7 +267,7 @@ class PathLearner:
             self._counts["remembered"] += 1
 
     def _resumed(self, state: PathState) -> EchoPath:
-        return EchoPath.resumed(state, np.zeros(self.past, np.float32), self._hop)
+        return EchoPath.resumed(state, np.zeros(PAST, np.float32), self._hop)
 
 
 def learned_profile(base: Profile | None, path: EchoPath, history: HopHistory) -> Profile:

@@ -20,8 +20,6 @@ WITH = ((NOISY.name, {p.name: (p.neutral + p.high) / 2 for p in NOISY.told}),)
 class Teacher:
     """Hands over the path that it was given at the start, with other effects, after some hops."""
 
-    past = 16_000
-
     def __init__(self, effects):
         self.effects, self.hops = effects, 0
 
