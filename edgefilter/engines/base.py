@@ -10,7 +10,6 @@ from edgefilter.types import Frame, Output, Spectrum
 
 EngineState: TypeAlias = Any
 """Whatever an engine needs between frames; it is made by initial_state and never shared between streams."""
-
 FrontEndKind: TypeAlias = Literal["none", "paper", "full"]
 """What runs before the engine: nothing, the paper's alignment of each utterance, or tracking alignment and linear stage."""
 

@@ -17,7 +17,6 @@ from edgefilter.types import Array, Frame, Output, Samples, Spectrum
 
 PAPER_STFT = StftConfig(n_fft=1200, hop=160, window_length=400, window="hann")
 """601 bins as in the paper; hop and window from the implementation of VoiceFilter that the paper builds on."""
-
 L, I = 3, 1  # noqa: E741 - the paper's letters: half width of the smoothing window in frames and in bins
 
 

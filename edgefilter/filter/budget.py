@@ -29,20 +29,18 @@ from edgefilter.types import SAMPLE_RATE, Samples
 DEFAULT_MS = 8.0
 """Compute per hop that is allowed unless the user says otherwise: half of a 16 ms hop."""
 CORES = 2
+"""Most cores that a measurement may use."""
 PACED = 300
 """Hops at the real pace."""
 LATE_S = 0.4
-"""An engine that has fallen so far behind the real pace is not measured any longer."""
+"""Seconds behind the real pace after which an engine is not measured any longer."""
 DEMO = Path(__file__).parent.parent / "demo_data"
 """The recordings and profiles that come with the package."""
 
 
 @dataclass(frozen=True, slots=True)
 class Figures:
-    """One engine in the whole path: ms of compute per hop. complete: all PACED hops could be run in time.
-
-    model: SHA-256 of the engine's model file, empty where it has none.
-    """
+    """One engine in the whole path, ms of compute per hop. complete: whether all PACED hops were run. model: its file's SHA-256."""
 
     engine: str
     model: str
@@ -151,10 +149,7 @@ def measure(engine: Engine | ClipEngine, profile: Profile | None = None, paced: 
 def pace(
     stream: Stream, hops: Iterator[tuple[Samples, Samples]], count: int, period_s: float | None = None
 ) -> list[float]:
-    """Compute time in ms of each of count hops, one begun every period_s (None: the hop's own length).
-
-    Fewer where it falls LATE_S behind.
-    """
+    """Compute time, ms, of count hops, or fewer where it falls LATE_S behind; one begins every period_s, None: its length."""
     period_s = stream.engine.stft.hop / SAMPLE_RATE if period_s is None else period_s
     took: list[float] = []
     began = time.perf_counter()

@@ -23,8 +23,8 @@ IN_VAIN = 6
 ARRIVES = 32
 """Samples, 2 ms, by which a reference must be late to count as late: devices that share a buffer are as exact."""
 DOUBT = SAMPLE_RATE // 2
-"""Samples for which speech that begins while the reference is silent waits for it, as long as nobody knows that the
-reference comes in time: an onset of the robot's is no human's if the reference follows."""
+"""Samples for which speech that begins while the reference is silent waits for it, until it is known to come in time: an
+onset of the robot's is no human's if the reference follows."""
 UNFOUND, LOUDER = 5 * SAMPLE_RATE, 10.0
 """Samples of a reference that is not found, and by how much more power the microphone must have then than while the
 reference is silent, for the robot to be heard: 10 dB, more than people who talk half of the time bring about."""

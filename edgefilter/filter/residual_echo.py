@@ -40,6 +40,7 @@ class NoiseTracker:
     PRESENT = np.float32(10.0**1.5)
     """Power of speech over the noise where there is any, 15 dB."""
     STUCK = np.float32(0.99)
+    """Mean probability of speech from which on the tracker counts as stuck: a noise that has grown is no speech."""
     FIRST = 5
     """Frames whose mean is the first estimate."""
     RENEWED, STUCK_RENEWED = np.float32(1.0) - np.float32(0.8), np.float32(1.0) - np.float32(0.9)

@@ -9,8 +9,7 @@ from edgefilter.dsp.stft import StftConfig
 from edgefilter.types import SAMPLE_RATE, Array, Samples, Spectrum
 
 LOADING = 0.03
-"""Part of the mean noise power of the microphones that is added to each: they are never quite what was calibrated. .01 to
-.1 differ by .5 dB of what is left beside the human."""
+"""Part of the microphones' mean noise power that is added to each: none is quite as calibrated. .01 to .1: .5 dB of the rest."""
 NOISE_MEMORY_S = 1.2
 """Of the covariance of what is left while nobody speaks. The canceller adapts and its rest with it: 3 s and 8 s leave
 .9 and 1.7 dB more in a human's first turn, .5 s as much (eight simulated office conversations, validation speakers)."""
@@ -19,8 +18,7 @@ HUMAN_MEMORY_S = 3.2
 CARRIED = 0.1
 """Weight of what was known of the human before when a turn begins: the same one may speak again, or another."""
 PRIOR = 10.0
-"""Hops of a human as loud as the noise that the diffuse field counts for, of which nothing is known yet. 3 and 30: .4 dB
-less, and 1 dB less of the human."""
+"""Hops of a human as loud as the noise that the diffuse field counts for. 3 and 30: .4 dB less, and 1 dB less of the human."""
 SPACING_M = 0.05
 """Distance of the microphones by which that field is reckoned: 3 and 8 cm differ by .2 dB in arrays of 4 to 8 cm."""
 KNOWN_HOPS = 75

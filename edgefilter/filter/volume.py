@@ -77,9 +77,8 @@ class Moments(NamedTuple):
 class Volume:
     """Follows the volume of the robot's voice: one factor on the whole echo path, believed only on evidence.
 
-    hop: samples per step. path: "known"; "unknown" where it has yet to be learnt; "unscaled" where it is known but for the
-    scale of this microphone and this reference, which is found first, hop by hop; and "tried" while a factor is. gain:
-    product of all factors so far.
+    hop: samples per step. path: "known"; "unknown" where it has yet to be learnt; "unscaled" where the scale of microphone
+    and reference is found first, hop by hop; "tried" while a factor is. gain: product of all factors so far.
     """
 
     def __init__(self, hop: int, path: Literal["known", "unknown", "unscaled"] = "known") -> None:
