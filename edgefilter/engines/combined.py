@@ -118,10 +118,7 @@ def _take_turns(one: Engine, other: Engine) -> bool:
 
 
 class Judged:
-    """Runs both on every frame: the answer of `engine`, whose name it has, with the probability of speech of `judge`.
-
-    Raises UsageError where the two do not take the same frames.
-    """
+    """Answer and name of `engine` with the probability of speech of `judge`; raises UsageError where their frames differ."""
 
     def __init__(self, engine: Engine, judge: Engine) -> None:
         for what in ("stft", "front", "lookahead"):
@@ -147,10 +144,7 @@ class Judged:
 
 
 def with_network_as_judge(engine: Engine | ClipEngine, profile: Profile | None = None) -> Engine | ClipEngine:
-    """The engine with the judgement of crnn's network; crnn as it is.
-
-    Raises UsageError for an engine that has no linear stage, ModelError where the network cannot be loaded.
-    """
+    """The engine with the judgement of crnn's network; raises UsageError without a linear stage, ModelError without a network."""
     if engine.name == JUDGE:
         return engine
     return cast(Engine, Judged(cast(Engine, engine), cast(Engine, engines.create(JUDGE, profile))))

@@ -47,10 +47,7 @@ LASTING = 3
 
 
 class Level(NamedTuple):
-    """How loud a stream's microphone, or its reference, has been, as powers of frames.
-
-    loudest: so far. latest: of the last LASTING frames.
-    """
+    """How loud a stream's microphone, or its reference, has been: power of the loudest frame so far, and of the LASTING latest."""
 
     loudest: float = 0.0
     latest: tuple[float, ...] = (0.0,) * LASTING

@@ -59,10 +59,7 @@ class BargeInSettings:
 
 
 class HumanJudge:
-    """Smooths the network's probability that a human speaks: one stream's, step once a frame.
-
-    hop_s: seconds between two frames. calibrated: whether the stream has a profile.
-    """
+    """Smooths the network's probability that a human speaks, of one stream, with or without a profile; step once each hop_s."""
 
     def __init__(self, hop_s: float, calibrated: bool = False) -> None:
         self._centre = CENTRE_CALIBRATED if calibrated else CENTRE
@@ -70,10 +67,7 @@ class HumanJudge:
         self._odds = 0.0
 
     def step(self, probability: float, suspect: bool = False) -> float:
-        """Probability that a human speaks, 0 to 1, from the engine's.
-
-        suspect: whether what sounds may be the robot, whose lag is not found yet or whose reference comes later: then 0.
-        """
+        """Probability that a human speaks, 0 to 1; 0 where it may be the robot (suspect): its lag is not found yet, or it is late."""
         if suspect:
             self._odds = 0.0
             return 0.0
@@ -114,8 +108,6 @@ class BargeIn:
         """Take the probability of a hop, None where the engine does not judge it.
 
         wait: hops for which speech that has begun is not told yet; if it has ended by then it never is.
-
-        Returns 'speech_started' or 'speech_stopped' or None.
         """
         probability = probability or 0.0
         self._sure = self._sure + 1 if probability >= self.settings.threshold else 0

@@ -232,10 +232,7 @@ class Canceller:
         return CancellerOutput(echo, mic - echo, misalignment, innovation)
 
     def tell_by(self, microphone: int) -> None:
-        """Tell the volume, and whether the echo is there, in that microphone of an array from now on.
-
-        The path begins anew where it was told in another: a broken one has scaled or silenced the others, too.
-        """
+        """Tell volume and echo in that microphone from now on; the path begins anew: a broken one has scaled the others, too."""
         if microphone != self._teller:
             self._teller = microphone
             self._begin()
@@ -268,10 +265,7 @@ class Canceller:
             self._spectra[row], self._powers[row] = spectrum, power
 
     def _scale_products(self, loudness: float) -> None:
-        """Bring the products to the size of a reference that holds this mean square, if it never was as loud.
-
-        What was learned of their paths stays as it is: softer speech says little of what a louder one will distort.
-        """
+        """Bring the products to the size of a reference that holds this mean square, if it never was as loud; their paths stay."""
         if loudness <= self._loudest:
             return
         smaller, self._loudest = np.float32((self._loudest / loudness) ** 0.5), loudness
@@ -349,10 +343,7 @@ class Canceller:
 
     @classmethod
     def resumed(cls, state: CancellerState, hop: int) -> Canceller:
-        """A canceller that goes on from that state, and begins anew from its path where it diverges.
-
-        Its reference is to be rewritten before the next step.
-        """
+        """A canceller that goes on from that state, and anew from its path where it diverges; rewrite its reference first."""
         microphones = len(state.weights) if state.weights.ndim > 2 else None
         canceller = cls(hop, state.taps, adaptation=state.adaptation, microphones=microphones)
         canceller._weights[:], canceller._covariance[:] = state.weights, state.covariance

@@ -111,10 +111,7 @@ class FilteredHop(NamedTuple):
 
 
 class Lesson(NamedTuple):
-    """A path that predicts better than the one in use, to be taken over.
-
-    kind: "learned", or "unlearned" where an earlier path comes back. detail: in words, with figures.
-    """
+    """A path that predicts better, to be taken over: "learned", or "unlearned" where an earlier one comes back; detail: in words."""
 
     path: PathState
     kind: EventKind

@@ -127,10 +127,7 @@ class FrontEnd:
         self._before = False
 
     def step(self, mic: Samples, ref: Samples) -> tuple[Frame, Aligned | None]:
-        """One hop (hop,) of microphone and reference to one frame, with what the aligner found.
-
-        mic: of an array (microphones, hop).
-        """
+        """One hop (hop,) of microphone, of an array (microphones, hop), and reference to a frame, with what the aligner found."""
         stage = self.linear_stage
         heard, mic = mic, self.first_of(mic)
         if stage is None:

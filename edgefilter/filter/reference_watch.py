@@ -81,10 +81,7 @@ class ReferenceWatch:
     def step(
         self, mic: Samples, ref: Samples, aligned: Aligned, removed_db: float | None
     ) -> list[tuple[EventKind, str]]:
-        """Take a hop (hop,) of both channels, as they came, and what the aligner made of them; what is to be said.
-
-        removed_db: of the robot by the linear stage, None where that is not known yet.
-        """
+        """Take a hop (hop,) of both channels, what the aligner made of it, and what is removed of the robot; what is to be said."""
         self._mic.push(mic)
         self._ref.push(ref)
         self._earlier.push(aligned.reference)

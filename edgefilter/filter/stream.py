@@ -110,10 +110,7 @@ class Stream:
         return self._deliver(rest[:missing])
 
     def _expect(self, microphones: int | None) -> None:
-        """Be ready for that many microphones, None for a single one; raises SignalError where they have become others.
-
-        And where the profile was calibrated with another number of them.
-        """
+        """Be ready for that many microphones, None for one; raises SignalError where they, or the profile's, are others."""
         if self.samples_in == 0:
             known = 1 if self.profile is None else self.profile.microphones
             if self.profile and known != (microphones or 1):

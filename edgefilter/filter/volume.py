@@ -98,10 +98,7 @@ class Volume:
 
     @property
     def removed_db(self) -> float | None:
-        """How far the subtraction has lowered the microphone over the last FORGET_S of robot; None before ENOUGH_S of it.
-
-        Hops in which a factor is looked for do not count.
-        """
+        """How far the subtraction has lowered the microphone over the last FORGET_S of robot; None before ENOUGH_S of it."""
         if self._wanted > 0 or not self._lasting.mic:
             return None
         return -10.0 * math.log10(max(self._lasting.left() / self._lasting.mic, LEAST))

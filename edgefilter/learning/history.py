@@ -63,11 +63,9 @@ class HopHistory:
         return np.concatenate(silent if enough else [hop.mic for hop, _ in self._hops], axis=-1)
 
     def usable(self) -> NDArray[np.bool_]:
-        """Where the robot may be audible and the reference lies as the microphone hears it, (n,) bool.
-
-        For the length of a path after a switch of the delay, some of the echo was sent under the delay of before.
-        """
+        """Where the robot may be audible and the reference lies as the microphone hears it, (n,) bool."""
         usable = np.array([hop.located and not hop.idle for hop, _ in self._hops])
+        # for the length of a path after a switch of the delay some of the echo was sent under the delay of before
         for at in np.flatnonzero([hop.past is not None for hop, _ in self._hops]):
             usable[at : at + TAPS[1] // self._hop] = False
         return np.repeat(usable, self._hop)

@@ -171,13 +171,7 @@ class PathLearner:
         return {**self._counts, "heard_s": round(self._audible_s, 2)}
 
     def close(self) -> None:
-        """Keep what was learned, where it is to be remembered and worth it.
-
-        Raises
-        ------
-        ProfileError
-            Where the file cannot be written.
-        """
+        """Keep what was learned, where it is worth it; raises ProfileError where the file cannot be written."""
         self._keep()
 
     def _audible(self, hop: FilteredHop) -> bool:
@@ -200,10 +194,7 @@ class PathLearner:
         return Lesson(winner.path.state(), winner.kind, detail)
 
     def _candidates(self) -> list[Rival]:
-        """Paths that know the minute: from the beginning with what it teaches of the loudspeaker, and without.
-
-        And from nothing, with its newest seconds alone: the robot may stand elsewhere than before.
-        """
+        """Paths that know the minute, with its loudspeaker and without; and one from nothing: the robot may stand elsewhere."""
         self._counts["rounds"] += 1
         known, fitted = self._begin.effects, self._fitted()
         short = self._audible_s < RECENT_S
@@ -271,10 +262,7 @@ class PathLearner:
 
 
 def learned_profile(base: Profile | None, path: EchoPath, history: HopHistory) -> Profile:
-    """The profile of a robot that is heard through that path, with the stationary noise of the history's silences.
-
-    base: what the filter began with; its fields that only a calibration can measure are kept.
-    """
+    """The profile of a robot heard through that path, with the noise of its silences; base: keeps what a calibration alone measures."""
     canceller = path.canceller
     response = canceller.impulse_response()
     mic, reference, _ = history.signals()
