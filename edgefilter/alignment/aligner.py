@@ -7,25 +7,20 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from edgefilter.alignment.announced import AHEAD, Announcements, Playback
 from edgefilter.alignment.coarse_lag import CoarseLag
 from edgefilter.alignment.delay_line import HALF_WIDTH, Aligned, Tape, kernel_table, read_delayed, read_line
-from edgefilter.alignment.delay_tracker import REACH, STRIDE, DelayMeasurement, DelayMeter
-from edgefilter.alignment.drift_filter import DriftFilter
-from edgefilter.alignment.first_sounds import FirstSounds
-from edgefilter.alignment.jumps import DRIFTED, SMALL, JumpWitness, where_seen
-from edgefilter.alignment.lag_search import (
-    BETWEEN,
-    CERTAIN,
-    CERTAIN_EARLY,
-    EARLY,
-    MINIMUM,
-    SEEN,
-    WINDOW,
-    Candidate,
-    LagSearch,
+from edgefilter.alignment.delay_tracker import (
+    DRIFTED,
+    FAINT,
+    SIZE,
+    STRIDE,
+    DelayMeasurement,
+    DelayMeter,
+    DriftFilter,
+    JumpWitness,
 )
-from edgefilter.alignment.utterances import OnsetDetector, Utterance
+from edgefilter.alignment.lag_search import CERTAIN_EARLY, MINIMUM, REFLECTIONS, Candidate, LagSearch
+from edgefilter.alignment.utterances import AHEAD, Announcements, FirstSounds, OnsetDetector, Playback, Utterance
 from edgefilter.profile.data import Profile
 from edgefilter.types import PRE_ROLL, SAMPLE_RATE, AlignmentCounts, AlignmentState, AlignmentStats, Samples
 
@@ -36,10 +31,10 @@ SEARCH_STRIDE = 768
 COARSE_MARGIN = 400
 """Samples, 25 ms, by which the reference is read earlier than at a coarse lag, so that a canceller holds all that arrives, and
 from which on a coarse lag is another one."""
-LOST_BLOCKS, NEARBY, NEARBY_SEARCHES = 3, 4096, 10
+LOST_BLOCKS, NEARBY_SEARCHES = 3, 10
 """Measurements in speech without a credible peak after which all lags are searched again: at first as if the present
-delay had ceased NEARBY samples ago, which finds jumps of up to 200 ms, then as if the utterance had begun half a second
-before."""
+delay had ceased as many samples ago as one measurement reads, which finds jumps of up to 200 ms, then as if the utterance
+had begun half a second before."""
 
 
 class Aligner:
@@ -77,9 +72,9 @@ class Aligner:
         Where no utterance was found the robot may stand elsewhere than where it was calibrated.
         """
         self._responses = responses
-        early = None if responses is None else [one[: PRE_ROLL + 320] for one in responses]
-        self._lags = LagSearch(self._max_lag, early, PRE_ROLL)
-        self._meter = DelayMeter(None if responses is None else responses[self._used[0]], PRE_ROLL)
+        early = None if responses is None else [one[: PRE_ROLL + REFLECTIONS] for one in responses]
+        self._lags = LagSearch(self._max_lag, early)
+        self._meter = DelayMeter(None if responses is None else responses[self._used[0]])
 
     def reset(self) -> None:
         """Forget everything, as after construction."""
@@ -121,7 +116,7 @@ class Aligner:
         self._mics += [Tape(self._ref.capacity) for _ in range(len(self._mics), max(used) + 1)]
         first, self._used = self._used[0], list(used)
         if self._responses is not None and self._used[0] != first:
-            self._meter = DelayMeter(self._responses[self._used[0]], PRE_ROLL)
+            self._meter = DelayMeter(self._responses[self._used[0]])
 
     def announce(self, utterance: Samples) -> None:
         """Say what will be played (n,); it may begin at any time or never, and several are played in the order of announcing.
@@ -167,7 +162,7 @@ class Aligner:
         if found is None or (self._coarse and abs(found - self._drift.delay) <= COARSE_MARGIN):
             return False
         self._coarse, self._margin = True, COARSE_MARGIN
-        self._meter = DelayMeter(None, PRE_ROLL)
+        self._meter = DelayMeter()
         self._drift.restart(float(found), 3.0)
         return True
 
@@ -179,14 +174,11 @@ class Aligner:
 
     def stats(self) -> AlignmentStats:
         """Delay, drift, confidence, state and what happened so far, ready for JSON."""
-        delay, deviation = (
-            (round(self._drift.delay, 3), round(self._drift.deviation, 3)) if self._known else (None, None)
-        )
         return {
             "method": "tracking",
             "state": self._state(),
-            "delay_samples": delay,
-            "deviation_samples": deviation,
+            "delay_samples": round(self._drift.delay, 3) if self._known else None,
+            "deviation_samples": round(self._drift.deviation, 3) if self._known else None,
             **self._counts,
             "ppm": round(-1e6 * self._drift.slope, 2),
             "confidence": round(self._confidence, 3),
@@ -245,9 +237,8 @@ class Aligner:
             self._counts["searches"] += 1
             if self._open and self._open[0].nearby > 0:
                 self._open[0].nearby -= 1
-                self._open[0].start = (
-                    now - int(self._drift.delay) - (NEARBY if self._open[0].nearby else SAMPLE_RATE // 2)
-                )
+                before = SIZE if self._open[0].nearby else SAMPLE_RATE // 2
+                self._open[0].start = now - int(self._drift.delay) - before
             since = self._expected.start if self._expected else self._open[0].start
             self._lags.prepare(self._expected or self._ref, now, since)
         elif stage == 1:
@@ -260,7 +251,7 @@ class Aligner:
             return self._found is not None and self._decide(self._found)
         elif found := self._found:
             first, ref = self._used[0], self._expected or self._ref
-            return self._lags.before(first, self._mics[first], ref, found) > SEEN and self._take(found)
+            return self._lags.before(first, self._mics[first], ref, found) and self._take(found)
         return False
 
     def _decide(self, found: Candidate) -> bool:
@@ -268,16 +259,13 @@ class Aligner:
 
         True if the delay was switched.
         """
-        if found.heard > WINDOW + BETWEEN + MINIMUM and found.evidence > CERTAIN_EARLY:
+        if found.old:
             self._stage = 3
             return False
         place = found.lag + (self._expected.start if self._expected else 0)
-        again, self._doubted = (
-            abs(place - self._doubted) <= 2,
-            place if found.evidence > CERTAIN_EARLY else float("nan"),
-        )
-        enough = CERTAIN_EARLY if again and found.heard <= EARLY else CERTAIN
-        return found.evidence > enough and found.heard <= WINDOW and self._take(found)
+        again = abs(place - self._doubted) <= 2
+        self._doubted = place if found.evidence > CERTAIN_EARLY else float("nan")
+        return found.certain(again) and self._take(found)
 
     def _take(self, found: Candidate) -> bool:
         """Believe a candidate; True if the delay was switched."""
@@ -301,7 +289,7 @@ class Aligner:
     def _switch(self, delay: float, deviation: float) -> bool:
         if self._coarse:  # the canceller has learned what arrives behind that lag
             self._margin = max(round(delay - self._read_at), PRE_ROLL)
-            self._meter = DelayMeter(None, PRE_ROLL)  # the other has learned what arrives around the coarse lag
+            self._meter = DelayMeter()  # the other has learned what arrives around the coarse lag
             self._gain = None
         self._drift.restart(delay, deviation)
         return self._switched()
@@ -332,8 +320,7 @@ class Aligner:
 
     def _take_look(self, found: DelayMeasurement) -> bool:
         """Take a look into account; True if the delay was switched."""
-        reach = (2 * self._segments + 1) * REACH
-        seen = where_seen(found, self._drift.surprise(found), found.gain if self._gain is None else self._gain, reach)
+        seen = self._drift.where_seen(found, found.gain if self._gain is None else self._gain, self._segments)
         if seen == "there":
             return self._accept(found)
         if seen == "drowned":
@@ -353,8 +340,6 @@ class Aligner:
         self._counts["jumps"] += 1
         if self._open and self._ref.end - self._drift.delay > self._open[0].start + STRIDE:
             self._resolve()
-        if abs(offset) > SMALL:
-            return self._switch(self._drift.delay + offset, 0.3)
         self._drift.step(offset, 0.3)
         return self._switched()
 
@@ -365,9 +350,8 @@ class Aligner:
         self._lost, self._missed = 0, False
         self._witness.forget()
         self._confidence += 0.2 * (found.explained - self._confidence)
-        self._gain = (
-            found.gain if self._gain is None else self._gain + 0.1 * (min(found.gain, 2 * self._gain) - self._gain)
-        )
+        before = found.gain if self._gain is None else self._gain
+        self._gain = before + 0.1 * (min(found.gain, 2 * before) - before)
         was_refuted = self._refuted
         heard_out = self._open and self._ref.end - self._drift.delay > self._open[0].start + STRIDE
         if self._known and heard_out and found.dominance < 1.01:
@@ -376,7 +360,7 @@ class Aligner:
 
     def _note_loss(self, found: DelayMeasurement) -> None:
         """Speech of the robot should be heard but is not where it was expected: in the end, search everything."""
-        if self._open or self._gain is None or found.gain < 0.25 * self._gain:
+        if self._open or self._gain is None or found.gain < FAINT * self._gain:
             return
         self._lost += 1
         self._to_measure = STRIDE // 2

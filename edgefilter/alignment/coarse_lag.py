@@ -21,8 +21,7 @@ ENOUGH_S = 0.75
 """Seconds of both that must have been heard at that lag. Of 65 pairs with an echo (12 real devices without a calibration, and
 simulated ones of validation voices) all are found, half within 0.82 s and nine in ten within 1.46 s. Beside other speech,
 while the reference plays unheard, 2 of 80 pairs of 10 s are believed in once (4 at 0.6 s, none at 1.0): a canceller that
-looks in vain takes nothing away.
-"""
+looks in vain takes nothing away."""
 SAME = 3
 """Lags on each side, in hops, that are the same arrival."""
 

@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from edgefilter.dsp.fractional_delay import HALF_WIDTH, PHASES, tabulated
+from edgefilter.dsp.frames import stretch
 from edgefilter.types import AlignmentState, Array, Samples
 
 UNLOCATED: tuple[AlignmentState, ...] = ("begun", "announced")
@@ -70,16 +71,12 @@ class Tape:
         offset = self._at - self.end
         if start >= oldest and stop <= self.end:
             return self._data[start + offset : stop + offset]
-        out = np.zeros(stop - start, np.float32)
-        first, last = min(max(start, oldest), stop), max(min(stop, self.end), start)
-        if last > first:
-            out[first - start : last - start] = self._data[first + offset : last + offset]
-        return out
+        return stretch(self._data[self._at - self.capacity : self._at], start - oldest, stop - oldest)
 
 
 @lru_cache(maxsize=1)
 def kernel_table() -> tuple[list[Samples], list[Samples]]:
-    """The rows of the kernel table and of its slopes: one row of a list is found several times as fast as one of an array."""
+    """The kernel table and its slopes by rows: one of a list is found several times as fast as one of an array."""
     table, step = tabulated()
     return list(table), list(step)
 
@@ -96,13 +93,11 @@ def _kernels(*delays: float) -> Array:
 
 
 def read_delayed(tape: Tape, stop: int, count: int, delay_from: float, delay_to: float) -> Samples:
-    """Samples of the tape for the positions stop - count ..
+    """The tape at the positions stop - count to stop - 1, less a delay that moves, (count,) float32.
 
-    Stop - 1 less a delay that runs from delay_from to delay_to.
-
-    Returns (count,) float32. The delay is delay_from just before the first sample and delay_to at the last one. Filters
-    for the two ends and the middle are applied to the whole stretch and interpolated by a parabola, which for a stretch
-    of 256 samples at 300 ppm errs by less than -75 dB at any frequency. |delay_to - delay_from| < 1.
+    The delay is delay_from just before the first sample and delay_to, less than 1 away, at the last one. Filters for the two
+    ends and the middle are applied to the whole stretch and interpolated by a parabola, which for a stretch of 256 samples
+    at 300 ppm errs by less than -75 dB at any frequency.
     """
     middle = 0.5 * (delay_from + delay_to)
     whole = math.floor(middle)
@@ -121,7 +116,7 @@ def _parabola(count: int) -> Array:
 
 
 def read_line(tape: Tape, stop: int, count: int, delay: float, slope: float, chunk: int = 256) -> Samples:
-    """Like read_delayed over any count: the delay is `delay` at the last sample and grows by slope per sample, (count,) float32."""
+    """As read_delayed for any count, with a delay that is `delay` at the last sample and grows by slope per sample."""
     pieces = []
     for start in range(0, count, chunk):
         size = min(chunk, count - start)

@@ -1,4 +1,4 @@
-"""Looks at one delay: its sub-sample error from the cross-spectrum, and where else within reach the robot may be."""
+"""Looks at one delay, from the cross-spectrum, and what is believed after them: a delay that drifts or jumps."""
 
 from __future__ import annotations
 
@@ -9,11 +9,12 @@ import numpy as np
 from scipy.ndimage import uniform_filter1d
 
 from edgefilter.alignment.delay_line import Tape
+from edgefilter.alignment.lag_search import CERTAIN, CERTAIN_EARLY, NEAR
 from edgefilter.alignment.utterances import FLOOR
 from edgefilter.dsp import fourier
 from edgefilter.dsp.fourier import power
 from edgefilter.dsp.lag import climb, turn
-from edgefilter.types import Array, Samples
+from edgefilter.types import PRE_ROLL, Array, Samples
 
 FRAME = 2048
 """Samples of microphone in one measurement, Hann-weighted."""
@@ -22,10 +23,34 @@ STRIDE = 1024
 REACH = 1024
 """Largest jump that the tracker sees, samples; beyond it the whole range is searched."""
 SIZE = FRAME + 2 * REACH
-SAME = 12
-"""Lags on each side of a peak that are the same peak."""
 EARLY = (48, 400)
 """Samples before and after the direct sound that the learnt response keeps."""
+SMALL, FAR_JUMP = 8.0, 50.0
+"""A jump is believed from CERTAIN of evidence on, summed over looks that agree; one of up to SMALL samples from
+CERTAIN_EARLY on, and one beyond REACH from FAR_JUMP on, for chance has more to choose from. In 7 minutes each of human speech
+and of fan noise while the reference played unheard, looked at twice as densely as in use, the sums reached 19 and 14
+within REACH, 29 and 13 beyond. Their tails are exponential: 30 comes about once in 100 hours of such speech, 50 beyond REACH
+once in 5 if all looks went that far."""
+AGREE = 0.7
+"""Samples within which two looks see the same jump."""
+FORGET = 0.7
+"""What is left of a suspicion after a look that saw another jump."""
+HEARD = 6.0
+"""Strength of a look's peak over the rms of +-REACH lags from which it counts."""
+FAINT, STRANGE, EDGE = 0.25, 10.0, 64
+"""Power over what the robot brings below which and above which it is not the robot that is heard, so that no jump can
+be seen, and samples at the edge of the looks' reach at which none is believed."""
+DRIFTED = 1.5
+"""Samples of a sudden error up to which it is put down to the drift: buffers that are lost or repeated have more."""
+EXPECTED, UNEXPECTED, TINY = 3.0, 5.0, 0.3
+"""Surprise, in standard deviations, up to which an error of up to SMALL samples is drift, and one of up to DRIFTED, and from
+which on a look contradicts what is believed; samples of error that are drift whatever the surprise."""
+SLOPE_DEVIATION = 150e-6
+"""Standard deviation of two clocks' difference before anything is known, samples per sample."""
+STEEPEST = 600e-6
+"""Slope that is never exceeded; clocks differ by half of it."""
+BIAS = 0.1
+"""Samples by which looks err alike where the response that is supposed explains nothing of the microphone."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,16 +79,16 @@ class DelayMeasurement:
 
 
 class DelayMeter:
-    """Measures the delay of the microphone against the reference read at an expected delay.
+    """Measures the delay of the microphone against the reference read at an expected delay: its error, and other places in reach.
 
     The likelihood of an offset tau under M = H A exp(-j omega tau) + V is Re sum conj(H) G exp(j omega tau) / S_V with
     G = M conj(A) and S_V the smoothed power of what H A leaves unexplained (Hannan & Thomson 1973 weights). H, the
-    early response relative to the direct sound, starts from the profile (or from a pure delay) and is learnt; each
+    early response relative to the direct sound, starts from the profile's (taps,) or a pure delay and is learnt; each
     cross-spectrum is shifted by its own offset first, so that learning does not move the delay. Peaks are compared
     after division by the root of the energy that a lag lets overlap, with which chance peaks grow.
     """
 
-    def __init__(self, response: Samples | None, pre_roll: int) -> None:
+    def __init__(self, response: Samples | None = None) -> None:
         self._window = np.hanning(FRAME + 1)[:FRAME].astype(np.float32)
         self._omega = (2 * np.pi * np.arange(SIZE // 2 + 1) / SIZE).astype(np.float32)
         self._omega_squared = np.square(self._omega)
@@ -75,9 +100,9 @@ class DelayMeter:
         self._prior_blocks = 4.0
         if response is not None:
             early = np.zeros(SIZE, np.float32)
-            count = min(pre_roll + EARLY[1], response.size)
+            count = min(PRE_ROLL + EARLY[1], response.size)
             early[:count] = response[:count]
-            self._prior = fourier.rfft(np.roll(early, -pre_roll)).astype(np.complex64)
+            self._prior = fourier.rfft(np.roll(early, -PRE_ROLL)).astype(np.complex64)
             self._prior_blocks = 16.0
         self._blocks = 0.0  # 0 until the first measurement
         self._cross = np.zeros_like(self._prior)
@@ -109,9 +134,8 @@ class DelayMeter:
         if not self._blocks:
             self._start(power(m), power_a)
         self._last = (m * np.conj(a), power_a)
-        powers = power(
-            np.array((m - self.response * a, m))
-        )  # smoothed into an array of ours: to make its own takes scipy as long again
+        powers = power(np.array((m - self.response * a, m)))
+        # into an array of ours: to make its own takes scipy as long again
         left, power_m = uniform_filter1d(powers, 31, output=np.empty_like(powers), mode="nearest")
         weight = self._band / (left + 0.05 * power_m + (1e-6 * power_m.max() + 1e-20))
         m *= np.conj(self.response)
@@ -194,7 +218,7 @@ def _highest(likelihood: Samples, reach: int) -> tuple[int, float, float, float]
     inner = likelihood[first : first + 2 * reach]
     at = int(inner.argmax())
     peak = float(inner[at])
-    elsewhere = max(inner[: max(at - SAME, 0)].max(initial=0.0), inner[at + SAME :].max(initial=0.0))
+    elsewhere = max(inner[: max(at - NEAR, 0)].max(initial=0.0), inner[at + NEAR :].max(initial=0.0))
     rms = math.sqrt(float(inner.dot(inner)) / inner.size)
     return first + at, peak, peak / (rms + 1e-20), peak / max(float(elsewhere), 1e-20)
 
@@ -206,3 +230,134 @@ def _overlap(reference: Samples) -> Samples:
     change = reference[earliest + 2 : latest + 2] - reference[earliest + 1 : latest + 1]
     total = np.add.accumulate(np.square(change, out=change).astype(np.float64))
     return (total[half:] - total[:-half])[::-1].astype(np.float32)
+
+
+class DriftFilter:
+    """Kalman filter over the delay (samples) and its slope (samples per sample), constant-slope model.
+
+    What a look claims of its own accuracy does not hold while a human talks as well or the response is still being
+    learnt: looks close to one another then err alike. So they weigh less the less they explain, and where looks that
+    agree contradict what is believed, belief is widened until it can follow them (fading memory, Sorenson & Sacks
+    1971).
+    """
+
+    def __init__(self) -> None:
+        self.delay, self.slope = float("nan"), 0.0
+        self._variance, self._covariance, self._slope_variance = 4.0, 0.0, SLOPE_DEVIATION**2
+        self._since = 0
+
+    @property
+    def deviation(self) -> float:
+        """Standard deviation of the delay, samples."""
+        return math.sqrt(self._variance)
+
+    def restart(self, delay: float, deviation: float) -> None:
+        """Another delay, known to +-deviation samples; the slope stays, the clocks are the same."""
+        self.delay = delay
+        self._variance, self._covariance = deviation**2, 0.0
+        self._since = 0
+
+    def step(self, offset: float, deviation: float) -> None:
+        """The delay is another one by an offset; a small one may come from a wrong slope since the last look as well as from a jump."""
+        wrong = offset / max(self._since, STRIDE)
+        if abs(offset) <= SMALL and abs(self.slope + wrong) < STEEPEST:
+            self._slope_variance = min(self._slope_variance + wrong**2, SLOPE_DEVIATION**2)
+        self.restart(self.delay + offset, deviation)
+
+    def advance(self, samples: int) -> None:
+        """Let `samples` samples pass."""
+        self._since += samples
+        self.delay += self.slope * samples
+        self._variance += samples * (2.0 * self._covariance + samples * self._slope_variance) + 1e-6 * samples / STRIDE
+        self._covariance += samples * self._slope_variance
+        self._slope_variance += (0.15e-6) ** 2 * samples / STRIDE
+
+    def surprise(self, measurement: DelayMeasurement) -> float:
+        """The measured offset in standard deviations of what was to be expected."""
+        return abs(measurement.offset) / math.sqrt(self._expected()[2] + self._noise(measurement))
+
+    def where_seen(self, found: DelayMeasurement, gain: float, segments: int) -> str:
+        """Whether a look, at so many segments on each side, saw the robot where it was expected.
+
+        "there": it did. "elsewhere": it saw it at another delay, if others agree. "unseen": not at all. "drowned":
+        somebody louder hid it. gain: power that the robot has brought so far.
+        """
+        size, surprise = abs(found.offset), self.surprise(found)
+        if found.strength < HEARD:
+            return "unseen"
+        if (size < DRIFTED and (surprise < UNEXPECTED or size < TINY)) or (size < SMALL and surprise < EXPECTED):
+            return "there"
+        if found.gain > STRANGE * gain:
+            return "drowned"
+        if not FAINT < found.gain_there / gain < STRANGE or size > (2 * segments + 1) * REACH - EDGE:
+            return "unseen"
+        return "elsewhere"
+
+    def correct(self, measurement: DelayMeasurement) -> None:
+        """Take in a measured offset, which holds for the middle of its frame."""
+        noise = self._noise(measurement)
+        if self.surprise(measurement) > UNEXPECTED:
+            self._widen((measurement.offset**2 - noise) / self._expected()[2])
+        delay, slope, spread = self._expected()
+        spread += noise
+        gain = measurement.offset / spread
+        self.delay += delay * gain
+        self.slope = min(max(self.slope + slope * gain, -STEEPEST), STEEPEST)
+        self._variance -= delay * delay / spread
+        self._covariance -= delay * slope / spread
+        self._since = 0
+        self._slope_variance -= slope * slope / spread
+
+    def _noise(self, measurement: DelayMeasurement) -> float:
+        """Variance of a look, with what its error has in common with its neighbours', which their number does not average out.
+
+        While the delay is hardly known, a weak look may also have seen another peak than the direct sound's.
+        """
+        common = BIAS**2 * (1.0 - measurement.explained)
+        doubtful = self._variance > 0.25 and measurement.evidence < CERTAIN
+        return measurement.variance + common + (1.0 if doubtful else 0.0)
+
+    def _widen(self, factor: float) -> None:
+        """Believe less of delay and slope, by this factor of their covariance, but never less than at the start."""
+        factor = min(factor, 4.0 / self._variance, SLOPE_DEVIATION**2 / self._slope_variance)
+        if factor > 1.0:
+            self._variance *= factor
+            self._covariance *= factor
+            self._slope_variance *= factor
+
+    def _expected(self) -> tuple[float, float, float]:
+        """Covariance of the offset in the middle of the frame with the delay, with the slope, and its variance."""
+        half = FRAME / 2.0
+        delay = self._variance - half * self._covariance
+        slope = self._covariance - half * self._slope_variance
+        return delay, slope, delay - half * slope
+
+
+class JumpWitness:
+    """Remembers the most suspicious jump of late, and the evidence for it.
+
+    >>> look = DelayMeasurement(100.0, 0.01, strength=10.0, ratio=1.6, dominance=5.0, explained=0.5, gain=1.0, gain_there=1.0)
+    >>> witness = JumpWitness()
+    >>> witness.convinced(look), witness.convinced(look)
+    (False, True)
+    """
+
+    def __init__(self) -> None:
+        self.forget()
+
+    def forget(self) -> None:
+        """The delay was confirmed or replaced."""
+        self._offset, self._evidence = float("nan"), 0.0
+
+    def convinced(self, found: DelayMeasurement) -> bool:
+        """Take in a look at which the delay seems to have jumped by its offset; True if that is now beyond chance."""
+        if abs(found.offset - self._offset) < AGREE:
+            self._evidence += found.evidence
+        else:
+            self._evidence *= FORGET
+            if found.evidence <= self._evidence:
+                return False
+            self._evidence = found.evidence
+        self._offset = found.offset
+        size = abs(found.offset)
+        return self._evidence > (CERTAIN_EARLY if size <= SMALL else CERTAIN if size <= REACH else FAR_JUMP)

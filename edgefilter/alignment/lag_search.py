@@ -8,10 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import fft
 
-from edgefilter.alignment.announced import Playback
 from edgefilter.alignment.delay_line import Tape
+from edgefilter.alignment.utterances import Playback
+from edgefilter.dsp.frames import rise
 from edgefilter.dsp.lag import LOWEST_HZ, flattened
-from edgefilter.types import SAMPLE_RATE, Samples
+from edgefilter.types import PRE_ROLL, SAMPLE_RATE, Samples
 
 WINDOW = 7168
 """Samples of the microphone that one search looks at, 0.45 s."""
@@ -19,14 +20,13 @@ MINIMUM = 832
 """Samples (52 ms) of an utterance that must have been heard before its lag is believed: less of any two sounds may
 agree by chance."""
 FADE = 256
-_RISE = (0.5 - 0.5 * np.cos(np.pi * (np.arange(FADE) + 0.5) / FADE)).astype(np.float32)
+_RISE = rise(FADE).astype(np.float32)
 REFLECTIONS, REFLECTED = 320, 0.75
 """Peaks up to 20 ms behind an arrival may be its reflections and count only this much against it."""
 COARSE = 32
 """Samples over which the energies that lags let overlap are summed."""
 NEAR, ASIDE = 12, 512
 """Lags on each side of a peak that are the same peak, and those that an earlier window is compared at."""
-
 BETWEEN = 1024
 """Samples between the two windows, so that one short agreement does not reach into both."""
 CERTAIN, CERTAIN_EARLY, EARLY = 30.0, 20.0, 2432
@@ -59,25 +59,35 @@ class Candidate:
         """Strength times ratio: how far the peak stands out of chance."""
         return self.strength * self.ratio
 
+    @property
+    def old(self) -> bool:
+        """Whether it is likely, and an utterance that has sounded for so long that the window before must show it too."""
+        return self.heard > WINDOW + BETWEEN + MINIMUM and self.evidence > CERTAIN_EARLY
+
+    def certain(self, again: bool) -> bool:
+        """Whether it is beyond chance. again: the search before has found it as well."""
+        enough = CERTAIN_EARLY if again and self.heard <= EARLY else CERTAIN
+        return self.evidence > enough and self.heard <= WINDOW
+
 
 class LagSearch:
     """Generalised cross-correlation (Knapp & Carter 1976) of the last WINDOW samples of mic with the reference before them.
 
     Both spectra are divided by the square root of their smoothed power. responses, if known, are the echo paths (taps,) of
-    the microphones on one clock, around the direct sound in the first at index pre_roll: their phases are taken out, so
+    the microphones on one clock, around the direct sound in the first at index PRE_ROLL: their phases are taken out, so
     that early reflections do not pull the peak, and the peaks of all microphones lie at one lag, where they are summed.
     Chance peaks grow with the root of the energy that a lag lets overlap, so the correlation is divided by that.
     `prepare`, `listen` and `find` are one search and cost one transform each, `listen` one a microphone, so that they
     can be spread over three hops; while the reference to be looked at is short, so are the transforms.
     """
 
-    def __init__(self, max_lag: int, responses: Sequence[Samples] | None = None, pre_roll: int = 0) -> None:
+    def __init__(self, max_lag: int, responses: Sequence[Samples] | None = None) -> None:
         self.max_lag = max_lag
         self.span = self._size = COARSE * fft.next_fast_len(-(-(max_lag + WINDOW) // COARSE), real=True)
         self._signed = responses is not None
         self._short = COARSE * fft.next_fast_len(-(-self.span // (2 * COARSE)), real=True)
         sizes = (self.span, self._short, WINDOW + 2 * ASIDE)
-        self._phases = {size: [_phase(one, pre_roll, size) for one in responses or ()] for size in sizes}
+        self._phases = {size: [_phase(one, size) for one in responses or ()] for size in sizes}
 
     def prepare(self, ref: Tape | Playback, now: int, since: int) -> None:
         """Take the reference between the positions since and now."""
@@ -148,16 +158,13 @@ class LagSearch:
         heard = self._at - self._since - lag
         if spread <= 0.0 or heard < MINIMUM:
             return None
-        reflected = REFLECTED * score[lag + NEAR : lag + REFLECTIONS].max(initial=0.0)
-        second = max(
-            score[: max(lag - NEAR, 0)].max(initial=0.0), reflected, score[lag + REFLECTIONS :].max(initial=0.0)
-        )
-        return Candidate(
-            lag, float(score[lag]) / spread, float(score[lag]) / max(float(second), 1e-12), self._at, heard
-        )
+        earlier, later = score[: max(lag - NEAR, 0)].max(initial=0.0), score[lag + REFLECTIONS :].max(initial=0.0)
+        second = max(earlier, REFLECTED * score[lag + NEAR : lag + REFLECTIONS].max(initial=0.0), later)
+        height = float(score[lag])
+        return Candidate(lag, height / spread, height / max(float(second), 1e-12), self._at, heard)
 
-    def before(self, number: int, mic: Tape, ref: Tape | Playback, found: Candidate) -> float:
-        """Strength of the found lag in an earlier window of a microphone, BETWEEN samples before the one that it was found in."""
+    def before(self, number: int, mic: Tape, ref: Tape | Playback, found: Candidate) -> bool:
+        """Whether a microphone's window BETWEEN samples before the one that the lag was found in shows it as well."""
         stop = found.at - WINDOW - BETWEEN
         x = np.zeros(WINDOW + 2 * ASIDE, np.float32)
         x[ASIDE:-ASIDE] = mic.read(stop - WINDOW, stop)
@@ -168,7 +175,8 @@ class LagSearch:
         score = np.roll(fft.irfft(cross, x.size), ASIDE)[: 2 * ASIDE]
         if not self._signed:
             np.abs(score, out=score)
-        return float(score[ASIDE - NEAR : ASIDE + NEAR].max()) / (float(np.sqrt(np.mean(np.square(score)))) + 1e-20)
+        spread = float(np.sqrt(np.mean(np.square(score)))) + 1e-20
+        return float(score[ASIDE - NEAR : ASIDE + NEAR].max()) / spread > SEEN
 
     def _whitened(self, heard: Samples, reference: np.ndarray, number: int) -> np.ndarray:
         """Cross-spectrum of what a microphone heard (n,) with the flattened reference, without rumble and its response's phase."""
@@ -194,7 +202,7 @@ def _soften(x: Samples) -> None:
     x[x.size - rise.size :] *= rise[::-1]
 
 
-def _phase(response: Samples, pre_roll: int, size: int) -> np.ndarray:
+def _phase(response: Samples, size: int) -> np.ndarray:
     """What takes the response's phase out of a cross-spectrum."""
-    spectrum = np.conj(fft.rfft(np.roll(np.pad(response, (0, size - response.size)), -pre_roll)))
+    spectrum = np.conj(fft.rfft(np.roll(np.pad(response, (0, size - response.size)), -PRE_ROLL)))
     return (spectrum / np.maximum(np.abs(spectrum), 1e-12)).astype(np.complex64)

@@ -5,12 +5,10 @@ from __future__ import annotations
 from collections import deque
 
 import numpy as np
-import scipy
 from scipy import fft
 
 from edgefilter.alignment.delay_line import Aligned, Tape
 from edgefilter.alignment.utterances import OnsetDetector
-from edgefilter.errors import SignalError
 from edgefilter.types import SAMPLE_RATE, AlignmentState, AlignmentStats, Samples
 
 TEMPLATE = SAMPLE_RATE // 2
@@ -24,36 +22,12 @@ CREDIBLE = 0.1
 """Normalised correlation under which the utterance was not heard, and the last lag is kept."""
 
 
-def paper_lag(recording: Samples, reference: Samples) -> int:
-    """Samples by which reference (m,) arrives later in recording (n,): the peak of the cross-correlation of its first 0.5 s.
-
-    The 0.5 s begin where the reference rises over -40 dB of its peak. Negative where the recording is ahead. Raises
-    SignalError for a silent reference or a recording shorter than the template (Li et al. 2024, section on alignment).
-
-    >>> rng = np.random.default_rng(0)
-    >>> voice = rng.standard_normal(16000).astype(np.float32)
-    >>> paper_lag(np.concatenate((np.zeros(700, np.float32), voice)), voice)
-    700
-    """
-    loud = np.flatnonzero(np.abs(reference) > 0.01 * np.max(np.abs(reference), initial=0.0))
-    if loud.size == 0:
-        raise SignalError(
-            "the reference is silent, expected the robot's voice: check which channel or device it comes from"
-        )
-    onset = int(loud[0])
-    template = reference[onset : onset + TEMPLATE]
-    if recording.size < template.size:
-        raise SignalError(
-            f"the recording has {recording.size} samples, expected at least the {template.size} of the search"
-        )
-    return int(np.argmax(scipy.signal.correlate(recording, template, mode="valid", method="fft"))) - onset
-
-
 class PaperAligner:
     """Streams the paper's method: each utterance's lag from its first 0.5 s; until it is decided the last lag is kept.
 
     Same interface as Aligner, with whole-sample delays of the full lag (no pre-roll) and no tracking. A lag is decided
-    when its normalised correlation is above DECISIVE, at the latest 0.5 s + the longest lag after the onset.
+    when its normalised correlation is above DECISIVE, at the latest 0.5 s + the longest lag after the onset (Li et al.
+    2024, section on alignment).
     """
 
     def __init__(self, hop: int, max_lag_s: float = 1.5) -> None:

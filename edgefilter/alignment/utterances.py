@@ -1,25 +1,47 @@
-"""Where the robot's utterances begin and end in the reference."""
+"""The robot's utterances: where they begin in the reference, those announced before, and the sounds that come before their lag."""
 
 from __future__ import annotations
 
+import sys
 from collections import deque
 from dataclasses import dataclass
 
-from edgefilter.types import SAMPLE_RATE, Samples
+import numpy as np
+
+from edgefilter.dsp.frames import stretch
+from edgefilter.types import SAMPLE_RATE, AlignmentState, Samples
 
 PAUSE = SAMPLE_RATE // 5
 """Samples of silence after which the lag may be another one: shorter than any pause between two playbacks, longer than
 a plosive."""
 FLOOR = 2.0**-46
 """Mean square of a 24-bit converter's last bit, -138 dB of full scale: a reference that has less is silent."""
-RANGE = 10**-4.5
-"""A hop this far (45 dB) under the loudest of the last seconds is silence."""
+SILENT = 10**-4.5
+"""Power, 45 dB under the loudest of the last seconds, from which on a reference is silent."""
 SUSTAINED = 3
 """Hops that a level must last to be the voice's: 48 ms, a short vowel. A click falls into two at most."""
 VARIES = 10**1.5
 """A voice's loudest hop is so much louder than its softest, or than the silence before, 15 dB; those of a noise are alike."""
-NEVER = -(10**9)
+NEVER = -sys.maxsize
 """A position long before the first sample."""
+LEAD = SAMPLE_RATE
+"""Samples before now at which an announced utterance is supposed to have begun: it is recognised in its first second."""
+AHEAD = 4096
+"""Samples by which an utterance that was heard goes ahead of the microphone, so that the tracker sees to both sides."""
+PATIENCE = 30 * SAMPLE_RATE
+"""Samples of silence for which an announced utterance is waited for."""
+LOUD, EXPLAINED = 0.05, 100.0
+"""Microphone power from which on it can only be the robot, over the robot's loudest there; a human 20-26 dB below it is 7 to
+13 dB softer. Microphone power, over that of the echo at the present delay, from which on this delay is not the right one;
+single sounds pass a room up to 10 dB better than speech does."""
+LONGEST = SAMPLE_RATE // 4
+"""Samples for which that is believed at most once the robot was heard: a human as loud as the robot, who begins as its next
+utterance does, loses no more."""
+USUAL = 1e-2
+"""Mean square that the loudest hop of a voice is taken to have at first (-20 dB of full scale), so that a soft first
+sound makes nobody else loud."""
+LEARNING = 0.1
+"""Share of a loud hop in the running gain from the reference to the microphone."""
 
 
 @dataclass
@@ -72,15 +94,12 @@ class OnsetDetector:
         return self.peak > VARIES * self.least
 
     def step(self, ref: Samples) -> Utterance | None:
-        """Take a hop (hop,) and return the utterance that begins with it, if one does.
-
-        `current` grows while it lasts.
-        """
+        """Take a hop (hop,) and return the utterance that begins with it, if one does; `current` grows while it lasts."""
         self.now += self._hop
         power = float(ref.dot(ref)) / self._hop
         self.peak = max(self._sustained.step(power), self.peak * self._decay)
         self.least = min(power, self.least / self._decay)
-        self.active = power > max(FLOOR, RANGE * self.peak)
+        self.active = power > max(FLOOR, SILENT * self.peak)
         if not self.active:
             return None
         fresh = self.now - self.current.end > PAUSE
@@ -88,3 +107,99 @@ class OnsetDetector:
             self.current = Utterance(self.now - 2 * self._hop, self.now, self.current.end)
         self.current.end = self.now
         return self.current if fresh else None
+
+
+@dataclass(frozen=True, slots=True)
+class Playback:
+    """An utterance whose first sample lies at position start; it can be read like a tape."""
+
+    utterance: Samples
+    start: int
+
+    @property
+    def end(self) -> int:
+        """Position behind the last sample."""
+        return self.start + self.utterance.size
+
+    def read(self, start: int, stop: int) -> Samples:
+        """Samples start..stop-1 (stop - start,), zeros where the utterance is not."""
+        return stretch(self.utterance, start - self.start, stop - self.start)
+
+
+class Announcements:
+    """Utterances that the robot said it would play, in this order, for a reference channel that stays silent.
+
+    A channel that carries sound is believed instead: then all of them are dropped.
+    """
+
+    def __init__(self) -> None:
+        self._waiting: deque[Samples] = deque()
+        self._playing: Playback | None = None
+        self._since: int | None = None
+
+    def add(self, utterance: Samples) -> None:
+        """Queue an utterance (n,); the silence before its first sound does not count, and one without any sound is left out."""
+        loud = np.flatnonzero(np.abs(utterance) > max(0.01 * float(np.abs(utterance).max(initial=0.0)), FLOOR**0.5))
+        if loud.size:
+            self._waiting.append(np.array(utterance[max(loud[0] - 256, 0) : loud[-1] + 1], np.float32))
+
+    def reference(self, ref: Samples, now: int) -> Samples:
+        """The reference (n,) for the hop that begins at position now: the channel's own, or what is being played."""
+        if (self._waiting or self._playing) and float(ref.dot(ref)) > FLOOR * ref.size:
+            self._waiting.clear()
+            self._playing = None
+        if self._playing is None:
+            return ref
+        played = self._playing.read(now, now + ref.size)
+        if now + ref.size >= self._playing.end:
+            self._playing, self._since = None, None
+        return played
+
+    def expected(self, now: int) -> Playback | None:
+        """The utterance to look for in the microphone up to now, as if it had begun LEAD samples ago; None if there is none."""
+        if not self._waiting or self._playing is not None:
+            return None
+        self._since = now if self._since is None else self._since
+        if now - self._since > PATIENCE:
+            self._waiting.popleft()
+            self._since = None
+            return self.expected(now)
+        return Playback(self._waiting[0], now - LEAD)
+
+    def begin(self, heard_at: int) -> Playback:
+        """Where the first one waiting, which was heard to begin at heard_at, lies in the reference from now on."""
+        self._playing = Playback(self._waiting.popleft(), heard_at - AHEAD)
+        return self._playing
+
+
+class FirstSounds:
+    """Tells, by its level, whether the microphone holds a calibrated robot at another delay than the present one.
+
+    hop: samples per step. response: (taps,), calibrated impulse response from the reference to the microphone.
+    """
+
+    def __init__(self, hop: int, response: Samples) -> None:
+        self._hop = hop
+        self._calibrated = float(np.sum(np.square(response)))
+        self.reset()
+
+    def reset(self) -> None:
+        """As before the first hop."""
+        self._gain, self._heard, self._since = self._calibrated, False, 0
+
+    def step(self, mic: Samples, explained: Samples, loudest: float, state: AlignmentState, waits: bool) -> bool:
+        """Take a hop of the microphone and of the reference at the present delay, zeros where there is none, (hop,) each.
+
+        loudest: mean square of the reference's loudest hop. waits: whether there is an utterance that was not found yet.
+        """
+        power, brought = float(np.dot(mic, mic)), float(np.dot(explained, explained))
+        if state == "locked" and brought > 0.1 * self._hop * loudest:
+            self._heard = True
+            self._gain += LEARNING * (min(power / brought, 2.0 * self._gain) - self._gain)
+        if not waits:
+            self._since = 0
+            return False
+        least = LOUD * self._hop * (loudest if self._heard else max(loudest, USUAL))
+        if self._since or power > self._gain * max(least, EXPLAINED * brought):
+            self._since += self._hop
+        return 0 < self._since <= (LONGEST if self._heard else np.inf)

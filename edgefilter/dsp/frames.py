@@ -1,4 +1,4 @@
-"""A signal in pieces: overlapping frames, whole blocks, the power of each, in decibels."""
+"""A signal in pieces: a stretch of it, overlapping frames, whole blocks, the power of each, in decibels."""
 
 from __future__ import annotations
 
@@ -6,6 +6,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edgefilter.types import Array, Samples
+
+
+def stretch(x: NDArray, start: int, stop: int) -> NDArray:
+    """Samples start..stop-1 of x (n,), a new array (stop - start,), zeros where x has none."""
+    out = np.zeros(stop - start, x.dtype)
+    first, last = max(start, 0), min(stop, x.size)
+    if last > first:
+        out[first - start : last - start] = x[first:last]
+    return out
+
+
+def rise(size: int) -> Array:
+    """Half a cosine from 0 up to 1, (size,) float64: what a sound is faded in with."""
+    return 0.5 - 0.5 * np.cos(np.pi * (np.arange(size) + 0.5) / size)
 
 
 def frames(x: NDArray, size: int, hop: int) -> NDArray:

@@ -8,11 +8,9 @@ from scipy import signal
 
 from edgefilter.alignment.aligner import Aligner
 from edgefilter.alignment.delay_line import Tape, read_delayed, read_line
-from edgefilter.alignment.delay_tracker import DelayMeasurement
-from edgefilter.alignment.jumps import JumpWitness
+from edgefilter.alignment.delay_tracker import DelayMeasurement, JumpWitness
 from edgefilter.alignment.lag_search import CERTAIN_EARLY, Candidate, LagSearch
-from edgefilter.alignment.paper import PaperAligner, paper_lag
-from edgefilter.errors import SignalError
+from edgefilter.alignment.paper import PaperAligner
 from edgefilter.types import PRE_ROLL
 from tests.alignment.scene import HEAD, RATE, fan, hear, known_path, room, run, speech_like, utterances
 
@@ -303,17 +301,6 @@ def test_announcing_what_the_reference_carries_changes_nothing_and_reset_starts_
     assert (
         aligner.stats()["state"] in ("locked", "idle") and abs(aligner.stats()["delay_samples"] - truth[-1]) < 0.1
     )  # the jitter of a locked delay is far below
-
-
-def test_paper_lag_of_a_recording_and_its_errors():
-    rng = np.random.default_rng(8)
-    voice = speech_like(rng, 2)
-    recording = np.concatenate((np.zeros(4321, np.float32), voice)) + fan(rng, 4321 + voice.size)
-    assert paper_lag(recording, voice) == 4321
-    with pytest.raises(SignalError, match="reference is silent"):
-        paper_lag(recording, np.zeros(16000, np.float32))
-    with pytest.raises(SignalError, match="recording has 100 samples"):
-        paper_lag(recording[:100], voice)
 
 
 @pytest.mark.parametrize("hop", [256, 160])

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from edgefilter.alignment.aligner import Aligner
-from edgefilter.alignment.announced import AHEAD, PATIENCE, Announcements
+from edgefilter.alignment.utterances import AHEAD, PATIENCE, Announcements
 from edgefilter.filter.ego_filter import EgoFilter
 from tests.alignment.scene import HEAD, RATE, fan, hear, room, run, speech_like, utterances
 

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from edgefilter.alignment.aligner import Aligner
-from edgefilter.alignment.delay_tracker import STRIDE, DelayMeasurement
-from edgefilter.alignment.drift_filter import DriftFilter
+from edgefilter.alignment.delay_tracker import STRIDE, DelayMeasurement, DriftFilter
 from tests.alignment.scene import (
     RATE,
     double_talk,

@@ -7,7 +7,7 @@ import soundfile
 from edgefilter import EgoFilter, enhance
 from edgefilter.alignment.aligner import MOST_LAG_S, Aligner
 from edgefilter.alignment.delay_line import Aligned
-from edgefilter.alignment.first_sounds import LONGEST, FirstSounds
+from edgefilter.alignment.utterances import LONGEST, FirstSounds
 from edgefilter.filter.budget import DEMO
 from tests.alignment.scene import RATE, fan, hear, known_path, room, run, speech_like, utterances
 
