@@ -17,8 +17,8 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from edgefilter.calibration.calibrate import calibrate as calibrate
-    from edgefilter.calibration.from_multisine import calibrate_multisine as calibrate_multisine
     from edgefilter.calibration.from_recording import self_calibrate as self_calibrate
+    from edgefilter.calibration.multisine import calibrate_multisine as calibrate_multisine
     from edgefilter.calibration.multisine import generate_multisine as generate_multisine
     from edgefilter.calibration.sweep import generate_sweep as generate_sweep
     from edgefilter.diagnosis.compare import Comparison as Comparison
@@ -62,9 +62,8 @@ __version__ = "0.1.0"
 
 _HOMES = {
     "calibration.calibrate": ("calibrate",),
-    "calibration.from_multisine": ("calibrate_multisine",),
     "calibration.from_recording": ("self_calibrate",),
-    "calibration.multisine": ("generate_multisine",),
+    "calibration.multisine": ("calibrate_multisine", "generate_multisine"),
     "calibration.sweep": ("generate_sweep",),
     "diagnosis.compare": ("Comparison", "compare"),
     "diagnosis.diagnose": ("add", "diagnose"),

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy import fft
 
-from edgefilter.calibration.sweep import Deconvolution, find_direct
+from edgefilter.calibration.sweep import Deconvolution
 from edgefilter.dsp.exchange import EQUAL
 from edgefilter.dsp.frames import frames
 from edgefilter.dsp.psd import GRID_FFT, hann
@@ -32,7 +32,7 @@ def cross_density(noises: Samples) -> Samples:
     return np.stack((found.real, found.imag), axis=-1).astype(np.float32)
 
 
-def doubts(noises: Samples, results: list[Deconvolution], direct: int) -> list[str]:
+def doubts(noises: Samples, results: list[Deconvolution]) -> list[str]:
     """What is doubtful about microphones beside one another: noises (microphones, n), and what was deconvolved of each."""
     found = []
     power = np.mean(np.square(noises, dtype=np.float64), axis=1)
@@ -44,7 +44,7 @@ def doubts(noises: Samples, results: list[Deconvolution], direct: int) -> list[s
                 f"channel {at}: the fan is {abs(apart):.0f} dB {how} there than elsewhere; another gain or kind?"
             )
     for at, result in enumerate(results):
-        lag = find_direct(result.response) - direct
+        lag = result.direct - results[0].direct
         if abs(lag) > FARTHEST:
             found.append(
                 f"channel {at}: hears the robot {lag} samples after channel 0; another converter, or processed?"

@@ -11,7 +11,6 @@ from edgefilter.calibration.sweep import (
     MIN_TAPS,
     Deconvolution,
     deconvolve,
-    find_direct,
     harmonic_distortion,
     response_from_sweep,
     sweep_law,
@@ -21,7 +20,7 @@ from edgefilter.dsp.psd import third_octave_bands
 from edgefilter.echo.model import EchoModel
 from edgefilter.errors import CalibrationError, SignalError
 from edgefilter.profile.array import ArrayCalibration
-from edgefilter.profile.data import DISTORTION_ORDERS, GRID_FFT, GRID_HZ, Profile
+from edgefilter.profile.data import GRID_FFT, Profile
 from edgefilter.types import PRE_ROLL, SAMPLE_RATE, Array, Samples, as_microphones, as_samples
 
 MAX_TAPS = SAMPLE_RATE
@@ -29,12 +28,7 @@ MAX_TAPS = SAMPLE_RATE
 
 
 def calibrate(
-    sweep_reference: Samples,
-    sweep_recording: Samples,
-    noise_recording: Samples,
-    *,
-    created: str = "",
-    source: str = "",
+    sweep_reference: Samples, sweep_recording: Samples, noise_recording: Samples, *, created: str = "", source: str = ""
 ) -> Profile:
     """Measure the robot's own voice at its microphone.
 
@@ -82,36 +76,32 @@ def calibrate(
     law = sweep_law(reference)
     check_lengths(law, recording, noise)
     noise_psd = fan_psd(noise)
-    result = deconvolve(reference, recording, noise_psd, GRID_HZ, MIN_TAPS)
-    direct = find_direct(result.response)
-    check_found(result, direct)
-    path = impulse_response(result, direct)
-    bands = third_octave_bands()
-    snr = band_snr_db(result, path, bands)
-    warnings = collect_warnings(law, reference, recording, noise, result, path, direct, bands, snr)
+    result = deconvolve(reference, recording, noise_psd)
+    check_found(result)
+    path = impulse_response(result, result.direct)
+    snr = band_snr_db(result, path)
+    warnings = collect_warnings(law, reference, recording, noise, result, path, snr)
     array = None
     if recordings.ndim > 1:
         for at in np.flatnonzero(~recordings.any(axis=1)):
             raise CalibrationError(
                 f"channel {at} of the sweep recording is silent, every sample 0: choose the microphones with --mic-channels"
             )
-        results = [
-            deconvolve(reference, *of, GRID_HZ, MIN_TAPS) for of in zip(recordings[1:], map(fan_psd, noises[1:]))
-        ]
+        results = [deconvolve(reference, *of) for of in zip(recordings[1:], map(fan_psd, noises[1:]))]
         responses = np.zeros((len(results), MAX_TAPS), np.float32)
         for row, other in zip(responses, results):
-            further = impulse_response(other, direct)
+            further = impulse_response(other, result.direct)
             row[: further.size] = further
         array = ArrayCalibration(responses[:, : max(path.size, MIN_TAPS)], cross_density(noises))
-        warnings += doubts(noises, [result, *results], direct)
+        warnings += doubts(noises, [result, *results])
     return Profile(
         echo=EchoModel(path),
-        delay=float(direct),
-        response=response_from_sweep(reference, recording, noise, direct),
+        delay=float(result.direct),
+        response=response_from_sweep(reference, recording, noise, result.direct),
         noise_psd=noise_psd,
-        band_hz=bands,
+        band_hz=third_octave_bands(),
         band_snr_db=snr,
-        distortion_db=harmonic_distortion(result, direct, law, DISTORTION_ORDERS),
+        distortion_db=harmonic_distortion(result, law),
         warnings=tuple(warnings),
         created=created,
         source=source,
@@ -142,7 +132,7 @@ def checked(reference: object, recording: object, noise: object) -> tuple[Sample
 
 
 def fan_psd(noise: Samples) -> Samples:
-    """One-sided PSD (601,) float32, full scale^2/Hz, on GRID_HZ: Welch's mean over Hann frames of 1200 samples, half overlapping."""
+    """Welch's PSD (601,) float32, one-sided, full scale^2/Hz, on GRID_HZ: Hann frames of 1200 samples, half overlapping."""
     return signal.welch(noise, SAMPLE_RATE, nperseg=GRID_FFT, detrend=False)[1].astype(np.float32)
 
 
@@ -166,8 +156,8 @@ def impulse_response(result: Deconvolution, direct: int) -> Samples:
     return path.astype(np.float32)
 
 
-def band_snr_db(result: Deconvolution, path: Samples, bands: Array) -> Array:
-    """The energy of the sweep's coherent part in each band over that of the fan in a window as long as the response, (B,) in dB.
+def band_snr_db(result: Deconvolution, path: Samples) -> Array:
+    """The energy of the sweep's coherent part in each third octave over the fan's in a window as long as the response, (B,) dB.
 
     The coherent part is what the impulse response predicts, less what the fan itself put into it; limited to -20 to 120
     dB.
@@ -176,7 +166,7 @@ def band_snr_db(result: Deconvolution, path: Samples, bands: Array) -> Array:
     fan = path.size * result.noise_psd
     own = fan * (result.source_energy / (result.source_energy + result.regularisation + 1e-30)) ** 2
     levels = []
-    for low, high in bands:
+    for low, high in third_octave_bands():
         inside = (result.frequencies >= low) & (result.frequencies < high)
         ratio = (energy - own)[inside].sum() / fan[inside].sum()
         levels.append(10 * np.log10(np.clip(ratio, 1e-2, 1e12)))

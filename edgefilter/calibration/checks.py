@@ -9,9 +9,9 @@ from scipy import signal
 from edgefilter.calibration.sweep import EARLIEST_DIRECT, LATEST_DIRECT, MIN_TAPS, Deconvolution, SweepLaw, deconvolve
 from edgefilter.dsp.fourier import power
 from edgefilter.dsp.frames import block_power, blocks
-from edgefilter.dsp.psd import frequencies, hann
+from edgefilter.dsp.psd import frequencies, hann, third_octave_bands
 from edgefilter.errors import CalibrationError
-from edgefilter.profile.data import LOW_SNR_DB
+from edgefilter.profile.data import GRID_HZ, LOW_SNR_DB
 from edgefilter.types import PRE_ROLL, SAMPLE_RATE, Array, Samples
 
 SPEECH_HZ = (110.0, 7100.0)
@@ -31,18 +31,18 @@ def check_lengths(law: SweepLaw, recording: Samples, noise: Samples) -> None:
             f"the sweep recording is {recording.size / SAMPLE_RATE:.2f} s long and ends before the sweep reaches 1 kHz,"
             f" expected at least {law.stop / SAMPLE_RATE:.2f} s: record the whole sweep"
         )
-    if np.max(np.abs(recording)) == 0.0:
+    if not recording.any():
         raise CalibrationError("the sweep recording is silent, every sample 0: is the microphone muted?")
 
 
-def check_found(result: Deconvolution, direct: int) -> None:
+def check_found(result: Deconvolution) -> None:
     """Raise CalibrationError unless the deconvolved response has one clear arrival.
 
     Its peak over its root mean square in the range of lags: 30 to 160 measured where the recording holds the sweep,
     down to a sweep 15 dB below the fan; 2 to 10 for speech, noise, tones and other sweeps.
     """
     nearby = result.cut(EARLIEST_DIRECT, LATEST_DIRECT - EARLIEST_DIRECT)
-    contrast = abs(result.response[direct]) / max(float(np.sqrt(np.mean(nearby**2))), 1e-30)
+    contrast = abs(result.response[result.direct]) / max(float(np.sqrt(np.mean(nearby**2))), 1e-30)
     if not contrast > 18.0:
         raise CalibrationError(
             f"the sweep recording does not contain the sweep: the best match stands out {contrast:.0f} times, expected"
@@ -57,18 +57,16 @@ def collect_warnings(
     noise: Samples,
     result: Deconvolution,
     path: Samples,
-    direct: int,
-    bands: Array,
     snr: Array,
 ) -> list[str]:
     """All warnings about a calibration, the gravest first."""
     found = [
-        clipping(law, recording, direct),
-        short_recording(law, recording, direct),
-        low_snr(bands, snr),
+        clipping(law, recording, result.direct),
+        short_recording(law, recording, result.direct),
+        low_snr(snr),
         quiet(recording),
-        disturbed(law, reference, recording, noise, result, direct),
-        early_arrivals(result, path, direct),
+        disturbed(law, reference, recording, noise, result),
+        early_arrivals(result, path),
         *doubtful_noise(reference, noise),
     ]
     return [text for text in found if text]
@@ -114,8 +112,9 @@ def short_recording(law: SweepLaw, recording: Samples, direct: int) -> str | Non
     )
 
 
-def low_snr(bands: Array, snr: Array) -> str | None:
+def low_snr(snr: Array) -> str | None:
     """Bands of speech in which the fan hides the sweep."""
+    bands = third_octave_bands()
     inside = (bands[:, 1] > SPEECH_HZ[0]) & (bands[:, 0] < SPEECH_HZ[1])
     runs: list[list[int]] = []
     for i in np.flatnonzero(inside & (snr < LOW_SNR_DB)):
@@ -141,7 +140,7 @@ def quiet(recording: Samples) -> str | None:
 
 
 def disturbed(
-    law: SweepLaw, reference: Samples, recording: Samples, noise: Samples, result: Deconvolution, direct: int
+    law: SweepLaw, reference: Samples, recording: Samples, noise: Samples, result: Deconvolution
 ) -> str | None:
     """Something else in a sweep's recording: quarter seconds in which neither the path nor its harmonics explain the sound.
 
@@ -149,7 +148,7 @@ def disturbed(
     less 25 dB.
     """
     early = int(law.lead(5.5))
-    shift = direct - early
+    shift = result.direct - early
     predicted = signal.oaconvolve(reference.astype(np.float64), result.cut(shift, early + MIN_TAPS))
     first, last = max(shift, 0), min(shift + predicted.size, recording.size)
     own = np.zeros(recording.size)
@@ -161,18 +160,17 @@ def disturbed(
     bad = np.flatnonzero(rest > limit)
     if not bad.size:
         return None
-    hz = np.clip(law.frequency(bad * block + block / 2 - direct), law.low_hz, law.high_hz)
+    hz = np.clip(law.frequency(bad * block + block / 2 - result.direct), law.low_hz, law.high_hz)
     return (
         f"something else than the sweep sounds in {bad.size * 0.25:.2f} s of the recording (from {bad[0] * 0.25:.2f} s"
         f" on), while the sweep was at {hz.min():.0f}-{hz.max():.0f} Hz; calibrate again in silence"
     )
 
 
-def early_arrivals(result: Deconvolution, path: Samples, direct: int) -> str | None:
+def early_arrivals(result: Deconvolution, path: Samples) -> str | None:
     """Sound that reaches the microphone too far ahead of the strongest arrival to be kept."""
-    lost = float(np.sum(result.cut(direct - PRE_ROLL - 480, 480) ** 2)) / max(
-        float(np.sum(path.astype(np.float64) ** 2)), 1e-30
-    )
+    energy = max(float(np.sum(path.astype(np.float64) ** 2)), 1e-30)
+    lost = float(np.sum(result.cut(result.direct - PRE_ROLL - 480, 480) ** 2)) / energy
     if lost < 0.003:
         return None
     return (
@@ -189,21 +187,17 @@ def doubtful_noise(reference: Samples, noise: Samples) -> list[str]:
             f"the noise recording is only {noise.size / SAMPLE_RATE:.1f} s long, expected 5 s: the fan is known"
             " roughly, in all bands"
         )
-    if np.max(np.abs(noise)) == 0.0:
-        return [
-            *texts,
-            "the noise recording is silent, every sample 0: signal-to-noise ratios mean nothing, in all bands",
-        ]
-    again = deconvolve(reference, noise, np.full(2, 1e-10), np.array([0.0, SAMPLE_RATE / 2]), MIN_TAPS)
+    if not noise.any():
+        texts.append("the noise recording is silent, every sample 0: signal-to-noise ratios mean nothing, in all bands")
+        return texts
+    again = deconvolve(reference, noise, np.full(GRID_HZ.size, 1e-10))
     nearby = np.abs(again.cut(EARLIEST_DIRECT, LATEST_DIRECT - EARLIEST_DIRECT))
     if nearby.max() > 18.0 * np.sqrt(np.mean(nearby**2)):
-        return [
-            *texts,
-            (
-                "the noise recording contains the sweep: record the fan while the robot is silent; noise is overstated"
-                " in all bands"
-            ),
-        ]
+        texts.append(
+            "the noise recording contains the sweep: record the fan while the robot is silent; noise is overstated"
+            " in all bands"
+        )
+        return texts
     shape, share, high = _unsteady(noise)
     if shape > 6.0:
         texts.append(

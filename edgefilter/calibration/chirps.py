@@ -11,8 +11,8 @@ from scipy import fft
 from edgefilter.calibration.multisine import BAND_HZ
 from edgefilter.calibration.sweep import STRETCHED_PPM
 from edgefilter.dsp.fourier import power
-from edgefilter.dsp.frames import block_power, decibels
-from edgefilter.dsp.lag import flat_cross
+from edgefilter.dsp.frames import block_power, decibels, rise, stretch
+from edgefilter.dsp.lag import correlation_near, flat_cross
 from edgefilter.types import SAMPLE_RATE, Samples
 
 LEVEL_DB = -18.0
@@ -38,10 +38,9 @@ def chirps() -> Samples:
     """The sound to be played, (n,) float32 at 16 kHz, 5.3 s with the silence before."""
     time = np.arange(CHIRP) / SAMPLE_RATE
     phase = 2 * np.pi * (LOWEST_HZ * time + (HIGHEST_HZ - LOWEST_HZ) / (2 * time[-1]) * time**2)
-    edge = 0.5 - 0.5 * np.cos(np.pi * (np.arange(FADE) + 0.5) / FADE)
     up = np.sin(phase)
-    up[:FADE] *= edge
-    up[-FADE:] *= edge[::-1]
+    up[:FADE] *= rise(FADE)
+    up[-FADE:] *= rise(FADE)[::-1]
     sound = np.zeros(LEAD + SLOT * len(ORDER), np.float32)
     for number, kind in enumerate(ORDER):
         level_db = LEVEL_DB - (0.0 if kind.isupper() else SOFTER_DB)
@@ -94,11 +93,10 @@ def _evaluate_as_is(mic: Samples, ref: Samples) -> Heard:
     (at_ref, in_ref), (at_mic, in_mic) = _find(ref, sound), _find(mic, sound)
     if not (in_ref and in_mic):
         return Heard(in_ref, in_mic, peak_db)
-    starts = [at_ref + LEAD + number * SLOT for number in range(len(ORDER))]
+    starts = at_ref + LEAD + SLOT * np.arange(len(ORDER))
     lag = at_mic - at_ref
     size = fft.next_fast_len(2 * SLOT, real=True)
-    references = np.stack([_spectrum(ref, start - FADE, size) for start in starts])
-    heard = np.stack([_spectrum(mic, start + lag - FADE, size) for start in starts])
+    references, heard = _slots(ref, starts - FADE, size), _slots(mic, starts + lag - FADE, size)
     offsets, ppm = _drift(heard, references, starts, size)
     omega = 2 * np.pi * np.arange(heard.shape[1]) / size
     heard = heard * np.exp(1j * omega * offsets[:, None])
@@ -109,8 +107,7 @@ def _evaluate_as_is(mic: Samples, ref: Samples) -> Heard:
     energy = np.sum(power(heard[:, band]), axis=1) - in_noise
     given = np.sum(power(references[:, band]), axis=1)
     gain_db = [float(decibels(max(float(np.sum(energy[of]) / np.sum(given[of])), 1e-12))) for of in (loud, ~loud)]
-    begins = np.array(starts)[loud] + lag
-    over = np.mean([np.mean(np.square(mic[at : at + CHIRP], dtype=np.float64)) for at in begins])
+    over = np.mean([np.mean(np.square(mic[at : at + CHIRP], dtype=np.float64)) for at in starts[loud] + lag])
     left_db, same = _left(heard, references, band, size)
     return Heard(
         in_ref, in_mic, peak_db, lag / SAMPLE_RATE, float(decibels(float(over / max(noise, 1e-12)))), ppm, left_db,
@@ -128,24 +125,21 @@ def _find(heard: Samples, sound: Samples) -> tuple[int, bool]:
     return at if at < heard.size else at - size, bool(correlation[at] > CERTAIN * np.sqrt(np.mean(correlation**2)))
 
 
-def _spectrum(x: Samples, start: int, size: int) -> np.ndarray:
-    """Of a slot from start on; zeros where there is nothing."""
-    part = np.zeros(size)
-    first, last = max(start, 0), max(min(start + SLOT, x.size), max(start, 0))
-    part[first - start : last - start] = x[first:last]
-    return fft.rfft(part)
+def _slots(x: Samples, starts: np.ndarray, size: int) -> np.ndarray:
+    """Spectra of the slots of x (n,) from each start on, (slots, size // 2 + 1); zeros where there is nothing."""
+    return fft.rfft(np.array([stretch(x, at, at + SLOT) for at in starts], np.float64), size)
 
 
-def _drift(heard: np.ndarray, references: np.ndarray, starts: list[int], size: int) -> tuple[np.ndarray, float]:
+def _drift(heard: np.ndarray, references: np.ndarray, starts: np.ndarray, size: int) -> tuple[np.ndarray, float]:
     """By how many samples each slot is late, on a line through all of them, and the clock's difference, ppm."""
     lags = []
     for y, r in zip(heard, references):
-        near = np.roll(fft.irfft(y * np.conj(r), size), 16)[:33]  # +- 1 ms: 300 ppm of 5 s are 24 samples
+        near = correlation_near(y * np.conj(r), size, 16)  # +- 1 ms: 300 ppm of 5 s are 24 samples
         at = min(max(int(np.argmax(np.abs(near))), 1), 31)
         low, middle, high = np.abs(near[at - 1 : at + 2])
         lags.append(at - 16 + 0.5 * (low - high) / min(low - 2 * middle + high, -1e-20))
-    slope, offset = np.polyfit(np.array(starts) - starts[0], lags, 1)
-    return offset + slope * (np.array(starts) - starts[0]), float(1e6 * slope)
+    slope, offset = np.polyfit(starts - starts[0], lags, 1)
+    return offset + slope * (starts - starts[0]), float(1e6 * slope)
 
 
 def _left(heard: np.ndarray, references: np.ndarray, band: slice, size: int) -> tuple[float, bool]:

@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 from scipy import fft
 from scipy.ndimage import binary_closing, uniform_filter1d
 
+from edgefilter.alignment.utterances import SILENT
 from edgefilter.calibration.sweep import DRIFT_REACH
 from edgefilter.dsp.fractional_delay import delayed, interpolate
 from edgefilter.dsp.frames import all_block_power, block_power, decibels, frames
@@ -18,6 +19,7 @@ from edgefilter.echo.model import EchoModel
 from edgefilter.echo.recording import BLOCK, MAX_OFFSET, fitted_blocks, paired
 from edgefilter.echo.wiener import convolve_from, fit_filter
 from edgefilter.errors import SignalError
+from edgefilter.profile.approximation import CLEARLY_DB
 from edgefilter.profile.data import DISTORTION_ORDERS, GRID_FFT, GRID_HZ, Profile
 from edgefilter.types import PRE_ROLL, SAMPLE_RATE, Array, Samples
 
@@ -26,9 +28,8 @@ TAPS = 4096
 STANDS_OUT = 8.0
 """Times the root mean square of all lags that the true one reaches; 4.5 measured where there is no robot, 10 to 87
 where there is."""
-LEAST_DROP_DB, OTHERS_DB = 3.0, 6.0
-"""What the path must take away of its best fifth of unseen blocks, and how far above the robot something is that is not
-the robot's."""
+OTHERS_DB = 6.0
+"""How far above the robot something is that is not the robot's."""
 UPSAMPLED = 4
 MAX_PPM, PPM_STEP = 400.0, 2.0
 DRIFT_GAIN = 1.1
@@ -38,8 +39,6 @@ REACH = 512
 DECAYS_S = (0.15, 0.4)
 """Reverberation times that the penalty on the taps supposes; the one that predicts best is kept."""
 TAIL_S = 0.3
-SILENT_DB = -45.0
-"""The reference is silent this far under its loudest tenth of a second."""
 LEAST_FRAMES = 8
 MOMENT = SAMPLE_RATE // 20
 """Samples over which the disturbance is measured that the fit gives way to."""
@@ -96,8 +95,12 @@ def self_calibrate(recording: Samples, reference: Samples) -> Profile:
     predicted = convolve_from(sound, path, 0)
     _check_learned(target, predicted, fit, delay, ppm)
     bands, snr = bands_over_fan(predicted)
+    echo = EchoModel(path.astype(np.float32))
+    for effect in EFFECTS:  # those that come with the package: whoever loads the profile knows no others
+        if effect.absorbed:
+            echo = echo.with_effect(effect.name, {})
     return Profile(
-        echo=_with_absorbed(EchoModel(path.astype(np.float32))),
+        echo=echo,
         delay=float(delay),
         response=np.abs(fft.rfft(path, 16 * GRID_FFT))[::16].astype(np.float32),
         noise_psd=psd,
@@ -109,16 +112,8 @@ def self_calibrate(recording: Samples, reference: Samples) -> Profile:
     )
 
 
-def _with_absorbed(echo: EchoModel) -> EchoModel:
-    """The path with the effects that it holds already, of those that come with the package: whoever loads it knows no others."""
-    for effect in EFFECTS:
-        if effect.absorbed:
-            echo = echo.with_effect(effect.name, {})
-    return echo
-
-
 def find_lag(recording: Samples, reference: Samples) -> int:
-    """Samples by which recording (n,) lags behind reference (n,), from their generalised cross-correlation (Knapp & Carter 1976, PHAT).
+    """Samples by which recording (n,) lags behind reference (n,), by the phase transform (Knapp & Carter 1976).
 
     Both spectra are flattened, so that a talker who is louder than the robot does not hide it. Raises SignalError where
     no lag stands out: the highest of independent values at all lags is 4 to 5 times their root mean square.
@@ -143,7 +138,7 @@ def _drifting(x: Samples, ppm: float) -> Samples:
 
 
 def find_drift(recording: Samples, reference: Samples) -> tuple[float, int]:
-    """The line along which recording (n,) lags behind reference (n,): its slope in ppm, and the lag where it starts, in samples.
+    """The line along which recording (n,) lags behind reference (n,): its slope in ppm, and where it starts, in samples.
 
     Of all lines of up to MAX_PPM the one on which the correlations of windows of a second, spectra flattened, add up to
     most; 0 ppm where it brings less than DRIFT_GAIN of what no drift does. Lags of up to DRIFT_REACH.
@@ -176,17 +171,15 @@ def silences(reference: Samples) -> NDArray[np.bool_]:
     """Where an aligned reference (n,) is silent and has been for TAIL_S, (n,) bool."""
     block = SAMPLE_RATE // 10
     level = all_block_power(reference, block)
-    loud = level > 10 ** (SILENT_DB / 10) * level.max(initial=1e-30)
-    after = round(TAIL_S * 10)
-    near = np.convolve(loud, np.ones(after + 2))[1 : 1 + loud.size] > 0
+    loud = level > SILENT * level.max(initial=1e-30)
+    near = np.convolve(loud, np.ones(round(TAIL_S * 10) + 2))[1 : 1 + loud.size] > 0
     return ~np.repeat(near, block)[: reference.size]
 
 
 def fan_in_silences(recording: Samples, silent: NDArray[np.bool_]) -> tuple[Samples, float]:
     """PSD of the quieter half of the silent frames, (601,) float32, and how many seconds those are.
 
-    Where silent (n,) leaves fewer than LEAST_FRAMES, the quietest twentieth of all frames is taken, and 0 seconds are
-    said.
+    Where silent (n,) leaves fewer than LEAST_FRAMES, that of the quietest twentieth of all frames, and 0 seconds.
     """
     step = GRID_FFT // 2
     power = periodograms(recording, GRID_FFT)
@@ -200,7 +193,7 @@ def fan_in_silences(recording: Samples, silent: NDArray[np.bool_]) -> tuple[Samp
 
 
 def disturbance(residual: Samples) -> Samples:
-    """Weights from 0 to 1 by which a fit should trust each sample, (n,): one over the power of the whitened residual (n,) around it."""
+    """Weights, 0 to 1, by which a fit trusts each sample, (n,): one over the power of the whitened residual (n,) around it."""
     return 1.0 / np.maximum(uniform_filter1d(residual**2, MOMENT, mode="nearest"), 1.0)
 
 
@@ -223,10 +216,7 @@ def fit_path(sound: Samples, target: Samples, weights: Samples, peak: float) -> 
 
 
 def decay_prior(seconds: float, peak: float) -> Array:
-    """Expected squares, (TAPS,): the direct sound's, and from 2 ms on 15 dB less, falling by 60 dB in that time.
-
-    Before it 25 dB less.
-    """
+    """Expected squares, (TAPS,): the direct sound's; from 2 ms on 15 dB less, falling by 60 dB in that time; before it 25 dB less."""
     at = np.arange(TAPS) - PRE_ROLL
     late = 10**-1.5 * 10 ** (-6 * np.maximum(at, 0) / (seconds * SAMPLE_RATE))
     return peak * np.where(at < -16, 10**-2.5, np.where(at < 32, 1.0, late))
@@ -241,10 +231,10 @@ def bands_over_fan(predicted: Samples) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _check_learned(target: Samples, predicted: Samples, fit: Samples, delay: float, ppm: float) -> None:
-    """Raise SignalError unless the prediction takes LEAST_DROP_DB away in a fifth of the blocks that no fit has used."""
+    """Raise SignalError unless the prediction takes CLEARLY_DB away in a fifth of the blocks that no fit has used."""
     drop = decibels(block_power(target, BLOCK)) - decibels(block_power(target - predicted, BLOCK))
     held = drop[block_power(fit, BLOCK) == 0.0]
-    if held.size and float(np.quantile(held, 0.8)) >= LEAST_DROP_DB:
+    if held.size and float(np.quantile(held, 0.8)) >= CLEARLY_DB:
         return
     clocks = f", clocks {abs(ppm):.0f} ppm apart" if ppm else ""
     raise SignalError(
@@ -255,7 +245,7 @@ def _check_learned(target: Samples, predicted: Samples, fit: Samples, delay: flo
 
 
 def others(target: Samples, predicted: Samples) -> list[tuple[float, float]]:
-    """Stretches (start_s, end_s) where what the prediction (n,) leaves of target (n,), both whitened, is OTHERS_DB above the prediction and the fan.
+    """Stretches (start_s, end_s) where what the whitened prediction (n,) leaves of target (n,) is OTHERS_DB above it and the fan.
 
     Moments of a second or less between them belong to them.
     """

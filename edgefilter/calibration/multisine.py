@@ -1,22 +1,43 @@
-"""A sweep and then random-phase multisines at several levels: making the sound, and finding it in a reference."""
+"""Calibration by a sweep and then random-phase multisines at several levels: a Profile that also knows what no linear path explains."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import fft
+from scipy import fft, signal
 
-from edgefilter.calibration.sweep import generate_sweep, place_of
+from edgefilter.calibration.array import first
+from edgefilter.calibration.calibrate import calibrate, checked, fan_psd
+from edgefilter.calibration.checks import check_lengths, clipped_samples
+from edgefilter.calibration.sweep import (
+    DRIFT_REACH,
+    LATEST_DIRECT,
+    LOW_HZ,
+    STRETCHED_PPM,
+    deconvolve,
+    generate_sweep,
+    smoothed,
+    sweep_law,
+)
+from edgefilter.dsp.fourier import power
+from edgefilter.dsp.fractional_delay import interpolate
+from edgefilter.dsp.frames import decibels
+from edgefilter.dsp.lag import correlation_near, highest, top
+from edgefilter.dsp.psd import ROUNDING_PSD, total_power
 from edgefilter.errors import CalibrationError
-from edgefilter.types import SAMPLE_RATE, Array, Samples
+from edgefilter.profile.approximation import CLEARLY_DB, LinearApproximation
+from edgefilter.profile.data import GRID_HZ, Profile
+from edgefilter.types import PRE_ROLL, SAMPLE_RATE, Array, Samples
 
 PERIOD = 8192
 """Samples (0.51 s): the path has died away within one, and its lines are 2 Hz apart."""
+LINE_HZ = SAMPLE_RATE / PERIOD
 PERIODS = 3
 """Of each realisation: in the first the path swings in, the others are measured."""
+BLOCK = PERIOD * PERIODS
 REALISATIONS = 4
 LEVELS_DB = (-12.0, -6.0, 0.0)
 """Of the multisines, the softest first; all realisations at each."""
@@ -28,22 +49,22 @@ SWEEP_PART = 0.5
 """Peak of the sweep over that of the loudest multisines; it is the louder of the two all the same."""
 GROUP = 4
 """Of so many odd lines in a row one, drawn at random, is left out."""
-BLOCK = PERIOD * PERIODS
+SMOOTHING_HZ = 30.0
+"""Half the width over which lines are averaged at least: 30 lines, so that a density is good to 1 dB."""
+CERTAIN = 3.0
+"""Standard deviations of the noise's own power from which on a distortion is told from it."""
+LEAST_SHARE = 0.1
+"""The least share of the recorded power that the loudest multisines must explain; another sound explains none of it."""
 
-
-@dataclass(frozen=True, eq=False)
-class Realisations:
-    """One period of each (REALISATIONS, PERIOD), peak at most 1, all of the same power; which lines each has (., PERIOD / 2 + 1)."""
-
-    periods: Array
-    excited: NDArray[np.bool_]
+Spectra = NDArray[np.complex128]
 
 
 @lru_cache(maxsize=1)
-def realisations() -> Realisations:
+def realisations() -> tuple[Array, NDArray[np.bool_]]:
     """Odd-random multisines: only odd lines, so that an even distortion falls between them, some left out for the odd one.
 
-    Random phases and lines differ from realisation to realisation (Pintelon & Schoukens 2012, sec. 3.4 and 4.3).
+    Returns one period of each (REALISATIONS, PERIOD), peak at most 1, all of the same power, and which lines each has
+    (., PERIOD / 2 + 1). Random phases and lines differ (Pintelon & Schoukens 2012, sec. 3.4 and 4.3).
     """
     # RandomState: its numbers are the same in every release of numpy, and a recording may be older than the program
     rng = np.random.RandomState(2012)
@@ -57,7 +78,7 @@ def realisations() -> Realisations:
         lines[groups[np.arange(len(groups)), rng.randint(GROUP, size=len(groups))]] = False
         period[:] = fft.irfft(lines * amplitude * np.exp(2j * np.pi * rng.uniform(size=hz.size)), PERIOD)
         period /= np.sqrt(np.mean(period**2))
-    return Realisations(periods / np.max(np.abs(periods)), excited)
+    return periods / np.max(np.abs(periods)), excited
 
 
 def generate_multisine(amplitude: float = 0.7, lead_s: float = 0.5, tail_s: float = 1.0) -> Samples:
@@ -88,7 +109,7 @@ def generate_multisine(amplitude: float = 0.7, lead_s: float = 0.5, tail_s: floa
     ((430912,), 0.7)
     """
     sweep = generate_sweep(amplitude=SWEEP_PART * amplitude, lead_s=0.0)
-    levels = [10 ** (level / 20) * np.tile(realisations().periods, PERIODS).ravel() for level in LEVELS_DB]
+    levels = [10 ** (level / 20) * np.tile(realisations()[0], PERIODS).ravel() for level in LEVELS_DB]
     sound = np.concatenate((sweep, amplitude * np.concatenate(levels)))
     return np.pad(sound, (round(lead_s * SAMPLE_RATE), round(tail_s * SAMPLE_RATE))).astype(np.float32)
 
@@ -107,18 +128,184 @@ class MultisineLaw:
 
     def blocks(self) -> NDArray[np.intp]:
         """First sample of each multisine, (levels, realisations)."""
-        shape = (len(LEVELS_DB), REALISATIONS)
-        return self.first + BLOCK * np.arange(shape[0] * shape[1]).reshape(shape)
+        return self.first + BLOCK * np.arange(len(LEVELS_DB) * REALISATIONS).reshape(-1, REALISATIONS)
 
 
 def multisine_law(reference: Samples) -> MultisineLaw:
     """Recognise the sound of generate_multisine() at any level and place; raise CalibrationError where there is none."""
     pattern = generate_multisine(1.0, 0.0, 0.0).astype(np.float64)
-    start = place_of(pattern, reference)
-    if start is not None:
-        return MultisineLaw(start, start + pattern.size - len(LEVELS_DB) * REALISATIONS * BLOCK)
+    energy = float(np.sum(reference.astype(np.float64) ** 2))
+    if reference.size >= pattern.size and energy > 0:
+        match = signal.correlate(reference.astype(np.float64), pattern, "valid", "fft")
+        start = int(np.argmax(np.abs(match)))
+        if abs(match[start]) > 0.9 * np.sqrt(energy * np.sum(pattern**2)):
+            return MultisineLaw(start, start + pattern.size - len(LEVELS_DB) * REALISATIONS * BLOCK)
     seconds = f"{reference.size / SAMPLE_RATE:.1f} s long" if reference.any() else "silent"
     raise CalibrationError(
         f"the sweep reference ({seconds}) is not the sweep with multisines of {pattern.size / SAMPLE_RATE:.1f} s:"
         " play the one that 'calibrate --multisine --excitation FILE' writes, or leave --multisine out"
     )
+
+
+def calibrate_multisine(
+    sweep_reference: Samples, sweep_recording: Samples, noise_recording: Samples, *, created: str = "", source: str = ""
+) -> Profile:
+    """Measure the robot's own voice at its microphone, and what of it no linear path explains.
+
+    Parameters
+    ----------
+    sweep_reference : ndarray of float, shape (n,)
+        The sound of `generate_multisine` as it was played. All three at 16 kHz, full scale +-1.
+    sweep_recording, noise_recording, created, source
+        As of `calibrate`.
+
+    Returns
+    -------
+    Profile
+        That of `calibrate` for the sweep, and its `approximation`.
+
+    Raises
+    ------
+    CalibrationError
+        As of `calibrate`; also where the reference is another sound, or the recording does not hold the multisines.
+
+    Notes
+    -----
+    The robust method of Pintelon & Schoukens (2012), "System Identification: A Frequency Domain Approach", sec. 4.3.
+    Per level: differences between the periods of one realisation are noise; what is the same in all of its periods, but
+    not explained by the mean over all realisations, is distortion of odd order, and so is what falls on odd lines that
+    were not played; what falls on even lines, none of which is played, is distortion of even order. Clocks that drift
+    are straightened first.
+
+    Examples
+    --------
+    >>> from edgefilter import generate_multisine
+    >>> rng = np.random.default_rng(0)
+    >>> played = generate_multisine()
+    >>> heard = (played + 0.2 * played**2 + 1e-4 * rng.standard_normal(played.size)).astype(np.float32)
+    >>> profile = calibrate_multisine(played, heard, 1e-4 * rng.standard_normal(64000).astype(np.float32))
+    >>> even, odd = (profile.approximation.over_linear_db(name)[-1] for name in ("even", "odd"))
+    >>> bool(-30 < even < -20 and odd < -50)
+    True
+    """
+    reference, recordings, noises = checked(sweep_reference, sweep_recording, noise_recording)
+    recording, noise = first(recordings), first(noises)
+    law = multisine_law(reference)
+    sweep = reference[: law.first]
+    check_lengths(sweep_law(sweep), recording, noise)
+    near = deconvolve(sweep, recording[: law.first + LATEST_DIRECT], fan_psd(noise), PERIOD)
+    swept = recordings[..., : law.first + max(near.direct, 0)]
+    profile = calibrate(sweep, swept.T, noises.T, created=created, source=source)
+    approximation, warnings = _approximate(profile, law, reference, recording)
+    return replace(profile, approximation=approximation, warnings=(*profile.warnings, *warnings))
+
+
+def _approximate(
+    profile: Profile, law: MultisineLaw, reference: Samples, recording: Samples
+) -> tuple[LinearApproximation, list[str]]:
+    """What the multisines of a recording (m,) tell beyond the profile that its sweep gave, and what is doubtful about it."""
+    delay = round(profile.delay) - PRE_ROLL
+    if recording.size < law.stop + delay:
+        raise CalibrationError(
+            f"the sweep recording is {recording.size / SAMPLE_RATE:.1f} s long and ends before the multisines do,"
+            f" expected at least {(law.stop + delay) / SAMPLE_RATE:.1f} s: record all of the sound"
+        )
+    played = fft.rfft(reference[law.blocks()[..., None] + PERIOD + np.arange(PERIOD)].astype(np.float64))
+    part = recording[law.first + delay : law.stop + delay]
+    ppm = _drift_ppm(profile, played, part)
+    at = np.arange(part.size) + law.first
+    part = interpolate(recording, delay + at + 1e-6 * ppm * (at - law.first / 2))
+    found = _approximation(played, part)
+    loudest = part[part.size * 2 // 3 :].astype(np.float64)
+    share = total_power(found.linear[-1]) / max(float(np.mean(loudest**2)), 1e-30)
+    if not share > LEAST_SHARE:
+        raise CalibrationError(
+            f"the sweep recording holds the sweep but not the multisines behind it: they explain {100 * share:.0f} % of"
+            f" what is heard there, expected at least {100 * LEAST_SHARE:.0f} %; is it the recording of this reference?"
+        )
+    return found, _doubts(profile, found, part, ppm)
+
+
+def _measured(part: Samples, blocks: tuple[int, int]) -> Spectra:
+    """Spectra of the periods that are measured, (levels, realisations, PERIODS - 1, lines)."""
+    return fft.rfft(part.astype(np.float64).reshape(*blocks, PERIODS, PERIOD)[:, :, 1:])
+
+
+def _drift_ppm(profile: Profile, played: Spectra, part: Samples) -> float:
+    """By how many ppm the recording's clock is the faster: a line through the lags of the multisines behind the sweep's path."""
+    path = fft.rfft(profile.echo.impulse_response[:PERIOD].astype(np.float64), PERIOD)
+    heard = _measured(part, played.shape[:2]).mean(axis=2)
+    cross = (heard * np.conj(played * path)).reshape(-1, path.size)
+    lags = [top(line, PERIOD, highest(correlation_near(line, PERIOD, DRIFT_REACH))[0]) for line in cross]
+    loud = len(lags) // 3
+    return 1e6 * float(np.polyfit(BLOCK * np.arange(len(lags))[loud:], lags[loud:], 1)[0])
+
+
+def _approximation(played: Spectra, part: Samples) -> LinearApproximation:
+    """What the multisines, of spectra (levels, realisations, lines), and a recording aligned with them tell, on the profile's grid.
+
+    Powers of lines are summed over the realisations. The linear part is less what noise and distortion put into it.
+    """
+    _, excited = realisations()
+    every = np.full(excited.shape[1], REALISATIONS)
+    odd_lines = np.arange(every.size) % 2 == 1
+    silent = ~excited & (np.arange(every.size) * LINE_HZ >= LOW_HZ)
+    heard = _measured(part, played.shape[:2])
+    mean = heard.mean(axis=2)
+    changing = power(heard - mean[:, :, None]).sum(axis=2) / (PERIODS - 2)
+    own = changing / (PERIODS - 1)
+    x = played * excited
+    energy = power(x).sum(axis=1)
+    best = (mean * x.conj()).sum(axis=1) / np.maximum(energy, 1e-30)
+    known = np.maximum(excited.sum(axis=0) - 1, 0)
+    unexplained = np.where(excited, power(mean - best[:, None] * x), 0.0).sum(axis=1)
+    unexplained -= known * own.mean(axis=1)
+    between = ((power(mean) - own) * (silent & odd_lines)).sum(axis=1)
+    odd = _density(unexplained + between, 2 * (known + (silent & odd_lines).sum(axis=0)))
+    even = _density(((power(mean) - own) * (silent & ~odd_lines)).sum(axis=1), 2 * (silent & ~odd_lines).sum(axis=0))
+    noise, total = _density(changing.sum(axis=1), every), _density(energy, every)
+    counted = (energy > 0).astype(float)
+    added = (2 * odd + noise / (PERIODS - 1)) * _smooth(counted) / REALISATIONS
+    linear = _density(power(best) * energy, every) - added
+    level = decibels(np.array([total_power(psd) for psd in total]))
+    # standard deviation of a distortion's power where there is noise alone: of the sum over every other line of |line|^2
+    # less its expectation, each the mean over all realisations
+    chance = np.sqrt(np.sum(noise**2, axis=1) * GRID_HZ[1] * LINE_HZ / 2 / REALISATIONS) / (PERIODS - 1)
+    least = decibels(CERTAIN * chance / np.array([max(total_power(psd), 1e-30) for psd in linear]), 1e-10)
+    densities = {"played": total, "linear": linear, "noise": noise, "even": even, "odd": odd}
+    stored = {name: psd.astype(np.float32) for name, psd in densities.items()}
+    return LinearApproximation(level_db=level, **stored, least_db=least)
+
+
+def _density(total: Array, count: Array) -> Array:
+    """Densities on GRID_HZ, full scale^2/Hz, from sums of |line|^2 (levels, lines) over so many lines (lines,); (levels, 601)."""
+    return 2.0 / PERIOD**2 / LINE_HZ * _smooth(total) / np.maximum(_smooth(count.astype(float)), 1e-12)
+
+
+def _smooth(lines: Array) -> Array:
+    """Mean over the lines (..., lines) around each frequency of GRID_HZ, (..., 601)."""
+    return smoothed(lines, GRID_HZ, LINE_HZ, SMOOTHING_HZ)
+
+
+def _doubts(profile: Profile, found: LinearApproximation, part: Samples, ppm: float) -> list[str]:
+    """What makes the approximation, or the sweep beside it, less than trustworthy."""
+    texts = []
+    clipped = clipped_samples(part)
+    if clipped.size:
+        texts.append(
+            f"clipped: {clipped.size} samples while the multisines sound, which looks like distortion of the loudspeaker,"
+            " in all bands; lower the playback volume or the microphone gain and calibrate again"
+        )
+    alone = max(total_power(profile.noise_psd), ROUNDING_PSD * SAMPLE_RATE / 2)
+    louder = decibels(np.array([total_power(psd) for psd in found.noise]) / alone)
+    if np.max(louder) > CLEARLY_DB:
+        texts.append(
+            f"something else than the multisines sounds beside them, {np.max(louder):.0f} dB above the fan, in all bands;"
+            " calibrate again in silence"
+        )
+    if abs(ppm) > STRETCHED_PPM:
+        texts.append(
+            f"the clocks of player and recorder are {abs(ppm):.0f} ppm apart: taken out of the multisines, but the sweep's"
+            " path is smeared, in all bands; play and record with one device"
+        )
+    return texts

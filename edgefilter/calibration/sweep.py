@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import scipy
@@ -12,8 +13,8 @@ from scipy import fft
 from edgefilter.dsp.frames import frames
 from edgefilter.dsp.psd import hann
 from edgefilter.errors import CalibrationError
-from edgefilter.profile.data import GRID_FFT
-from edgefilter.types import SAMPLE_RATE, Array, Samples
+from edgefilter.profile.data import DISTORTION_ORDERS, GRID_FFT, GRID_HZ
+from edgefilter.types import PRE_ROLL, SAMPLE_RATE, Array, Samples
 
 LOW_HZ, HIGH_HZ = 40.0, 7990.0
 """Of the generated sweep: from below what a robot's loudspeaker plays to the end of the band."""
@@ -151,11 +152,17 @@ class Deconvolution:
         """Frequencies of the bins, (n // 2 + 1,) in Hz."""
         return np.arange(self.source_energy.size) * SAMPLE_RATE / self.response.size
 
+    @cached_property
+    def direct(self) -> int:
+        """Lag of the direct sound: of the largest |h| between EARLIEST_DIRECT and LATEST_DIRECT."""
+        lags = np.arange(EARLIEST_DIRECT, min(LATEST_DIRECT, self.response.size // 2))
+        return int(lags[np.argmax(np.abs(self.response[lags]))])
 
-def deconvolve(reference: Samples, recording: Samples, noise_psd: Array, noise_hz: Array, taps: int) -> Deconvolution:
+
+def deconvolve(reference: Samples, recording: Samples, noise_psd: Array, taps: int = MIN_TAPS) -> Deconvolution:
     """Divide recording by reference in frequency, as far as the fan allows.
 
-    noise_psd: one-sided PSD of the fan at noise_hz. lambda(f) = taps P_nn(f) / P_hh(f) is the Wiener solution for a
+    noise_psd: one-sided PSD of the fan on GRID_HZ. lambda(f) = taps P_nn(f) / P_hh(f) is the Wiener solution for a
     response of that many taps with the fan as the only noise; P_hh is a first estimate smoothed over a sixth of an
     octave (Kirkeby & Nelson 1999 give the regularised inverse, without the choice of lambda).
     """
@@ -164,21 +171,14 @@ def deconvolve(reference: Samples, recording: Samples, noise_psd: Array, noise_h
     cross = fft.rfft(recording.astype(np.float64), n) * source.conj()
     energy = np.abs(source) ** 2
     frequencies = np.arange(energy.size) * SAMPLE_RATE / n
-    fan = np.interp(frequencies, noise_hz, noise_psd) / 2 * SAMPLE_RATE + 1e-14
+    fan = np.interp(frequencies, GRID_HZ, noise_psd) / 2 * SAMPLE_RATE + 1e-14
     floor = np.full(energy.size, 1e-7 * energy.max())
     first = Deconvolution(fft.irfft(cross / (energy + floor), n), energy, floor, fan)
-    direct = find_direct(first.response)
-    raw = smoothed(first.spectrum(first.cut(direct - 64, taps)), frequencies, frequencies[1], 5.0)
+    raw = smoothed(first.spectrum(first.cut(first.direct - PRE_ROLL, taps)), frequencies, frequencies[1], 5.0)
     below = smoothed(first.noise(taps), frequencies, frequencies[1], 5.0)
     path = np.maximum(raw - below, 1e-3 * below) + 1e-12 * raw.max()
     weight = floor * 1e-3 + taps * fan / path
     return Deconvolution(fft.irfft(cross / (energy + weight), n), energy, weight, fan)
-
-
-def find_direct(response: Array) -> int:
-    """Lag of the largest |h| between EARLIEST_DIRECT and LATEST_DIRECT."""
-    lags = np.arange(EARLIEST_DIRECT, min(LATEST_DIRECT, response.size // 2))
-    return int(lags[np.argmax(np.abs(response[lags]))])
 
 
 def smoothed(lines: Array, hz: Array, line_hz: float, least_hz: float) -> Array:
@@ -191,20 +191,20 @@ def smoothed(lines: Array, hz: Array, line_hz: float, least_hz: float) -> Array:
     return (total[..., high] - total[..., low]) / (high - low)
 
 
-def harmonic_distortion(result: Deconvolution, direct: int, law: SweepLaw, orders: tuple[int, ...]) -> Array:
-    """Harmonic distortion (len(orders),) dB: energy of each order's response at k f over the linear one at f, the fan subtracted.
+def harmonic_distortion(result: Deconvolution, law: SweepLaw) -> Array:
+    """Energy of each of DISTORTION_ORDERS' response at k f over the linear one at f, the fan subtracted, (orders,) dB.
 
     The response of order k arrives T ln k before the linear one (Farina 2000, eq. 14). f runs from 100 Hz (or the
     sweep's start) to 95 % of the sweep's end over k. What the fan hides reads at most as the fan's own share, and at
     least -100 dB.
     """
-    linear = result.spectrum(result.cut(direct - 128, 4096))
+    linear = result.spectrum(result.cut(result.direct - 128, 4096))
     frequencies = result.frequencies
     levels = []
-    for order in orders:
+    for order in DISTORTION_ORDERS:
         gap = law.lead(order + 1) - law.lead(order)
         length = int(min(4096, 0.8 * gap))
-        part = result.cut(direct - int(round(law.lead(order))) - min(128, length // 4), length)
+        part = result.cut(result.direct - int(round(law.lead(order))) - min(128, length // 4), length)
         excess = result.spectrum(part) - result.noise(length)
         inside = (frequencies >= order * max(100.0, law.low_hz)) & (frequencies <= 0.95 * law.high_hz)
         fundamental = np.interp(frequencies[inside] / order, frequencies, linear)
@@ -235,13 +235,3 @@ def _frames(samples: Samples) -> NDArray[np.complex128]:
     """Complex spectra, a frame every 160 samples, as the paper has them, (frames, 601)."""
     padded = np.pad(samples, (0, max(0, GRID_FFT - samples.size)))
     return np.fft.rfft(frames(padded, GRID_FFT, 160) * hann(GRID_FFT), axis=1)
-
-
-def place_of(pattern: Array, reference: Samples) -> int | None:
-    """First sample of pattern (m,) in reference (n,), at any level; None where it is not there."""
-    energy = float(np.sum(reference.astype(np.float64) ** 2))
-    if reference.size < pattern.size or not energy > 0:
-        return None
-    match = scipy.signal.correlate(reference.astype(np.float64), pattern, "valid", "fft")
-    start = int(np.argmax(np.abs(match)))
-    return start if abs(match[start]) > 0.9 * np.sqrt(energy * np.sum(pattern**2)) else None

@@ -14,8 +14,7 @@ import numpy as np
 
 from edgefilter.audio.files import write_file
 from edgefilter.calibration.calibrate import calibrate
-from edgefilter.calibration.from_multisine import calibrate_multisine
-from edgefilter.calibration.multisine import SWEEP_PART, generate_multisine
+from edgefilter.calibration.multisine import SWEEP_PART, calibrate_multisine, generate_multisine
 from edgefilter.calibration.sweep import generate_sweep
 from edgefilter.commands.display import countdown, print_result, say
 from edgefilter.commands.profile import summary

@@ -15,7 +15,7 @@ from edgefilter.types import Array, Samples
 STEEPEST = 2.0
 """dB by which a distortion grows over the voice for each dB of the voice: that of a cubic law; a square one has 1."""
 CLEARLY_DB = 3.0
-"""Over the least that is told from the noise: what leads from one level to the next."""
+"""By which a power is clearly more than another that it is held against, and no chance."""
 
 
 @dataclass(frozen=True, eq=False)
