@@ -71,7 +71,7 @@ class LinearApproximation(ProfilePart):
         return np.sqrt(np.maximum(self.linear, 0.0) / np.where(heard, self.played, 1.0)) * heard
 
     def over_linear_db(self, *names: str) -> Array:
-        """Power of "noise", "even" and "odd", those that are named, over that of the linear part, (L,) in dB."""
+        """Power of those named of "noise", "even" and "odd", over that of the linear part, (L,) in dB."""
         rest = [sum(total_power(getattr(self, name)[i]) for name in names) for i in range(len(self.level_db))]
         return decibels(np.array(rest) / self._linear_power, 1e-10)
 
@@ -92,7 +92,7 @@ class LinearApproximation(ProfilePart):
         return density / max(total_power(density), 1e-30)
 
     def expected(self, power: Array) -> Array:
-        """Power of the distortion in sound whose linear part at the microphone has the power given, an array of any shape.
+        """Power of the distortion in sound whose linear part at the microphone has that power, an array of any shape.
 
         Its share of that power, in dB, lies on straight lines between the levels at which it is clearly told from the
         noise. Beyond them it follows the level as there on the whole, but no steeper than the distortion of a cubic law

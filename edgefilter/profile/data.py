@@ -111,24 +111,11 @@ class Profile:
         ------
         ProfileError
             Where it cannot be written.
-
-        Examples
-        --------
-        >>> import tempfile
-        >>> flat, path = np.ones(601, np.float32), np.zeros(6400, np.float32)
-        >>> bands = np.array([[900.0, 1100.0]])
-        >>> profile = Profile(EchoModel(path), 300.0, flat / 2, flat * 1e-9, bands, np.array([40.0]), np.full(4, -50.0))
-        >>> file = Path(tempfile.mkdtemp()) / "robot.npz"
-        >>> profile.save(file)
-        >>> Profile.load(file).delay
-        300.0
         """
         arrays = {name: np.asarray(getattr(self, name)) for name in _ARRAYS}
         arrays["impulse_response"] = np.asarray(self.echo.impulse_response)
-        if self.approximation is not None:
-            arrays |= self.approximation.arrays()
-        if self.array is not None:
-            arrays |= self.array.arrays()
+        for part in (self.approximation, self.array):
+            arrays |= part.arrays() if part else {}
         header = {
             "pre_roll": PRE_ROLL,
             "delay": float(self.delay),
@@ -161,11 +148,8 @@ class Profile:
         arrays, header, effects = read_fields(Path(path))
         try:
             approximation, array = LinearApproximation.taken_from(arrays), ArrayCalibration.taken_from(arrays)
-            expected = (
-                {*_ARRAYS, "impulse_response"},
-                {"pre_roll", "delay", "sample_rate", "warnings", "created", "source"},
-            )
-            for found, names, kind in zip((arrays, header), expected, ("array", "header"), strict=True):
+            known = {"pre_roll", "delay", "sample_rate", "warnings", "created", "source"}
+            for kind, found, names in (("array", arrays, {*_ARRAYS, "impulse_response"}), ("header", header, known)):
                 if set(found) != names:
                     odd = ", ".join(sorted(names - set(found))) or "nothing"
                     extra = ", ".join(sorted(name[:40] for name in set(found) - names)) or "nothing"
@@ -179,7 +163,7 @@ class Profile:
             fields: dict[str, Any] = {**arrays, **header}  # what type each has is checked on construction
             echo = EchoModel(fields.pop("impulse_response"), effects)
             profile = cls(echo=echo, warnings=tuple(warnings), approximation=approximation, array=array, **fields)
-            _check_effects(profile.echo)
+            _check_effects(echo)
             return profile
         except ProfileError as error:
             raise ProfileError(f"{path}: {error}") from None
@@ -262,15 +246,12 @@ class Profile:
         return replace(self, echo=echo)
 
     def noise_bins(self, stft: StftConfig) -> Samples:
-        """Expected |X|^2 (bins,) float32 of the fan, as it is now, in one frame of stft: PSD / 2 * sample rate * sum of the squared window."""
+        """Expected |X|^2 (bins,) float32 of the fan, as it is now, in one frame of stft."""
         psd = np.interp(stft.frequencies, GRID_HZ, self.echo.expected_noise(self.noise_psd))
         return (psd / 2 * SAMPLE_RATE * stft.noise_gain()).astype(np.float32)
 
     def response_bins(self, stft: StftConfig) -> Samples:
-        """The paper's |H_m(f) H_s(f)| (bins,) float32 at the frequencies of stft.
-
-        The stored values where n_fft is 1200.
-        """
+        """The paper's |H_m(f) H_s(f)| (bins,) float32 at the frequencies of stft; the stored values where n_fft is 1200."""
         return np.interp(stft.frequencies, GRID_HZ, self.response).astype(np.float32)
 
 
@@ -326,12 +307,9 @@ def _check_numbers(profile: Profile) -> None:
     """Raise ProfileError for a header value of the wrong type or out of range."""
     if isinstance(profile.sample_rate, bool) or profile.sample_rate != SAMPLE_RATE:
         refuse("sample_rate", repr(profile.sample_rate), f"{SAMPLE_RATE} Hz")
-    if (
-        isinstance(profile.delay, bool)
-        or not isinstance(profile.delay, int | float | np.number)
-        or not abs(profile.delay) <= MAX_TAPS
-    ):
-        refuse("delay", repr(profile.delay), f"-{MAX_TAPS} to {MAX_TAPS} samples")
+    delay = profile.delay
+    if isinstance(delay, bool) or not (isinstance(delay, int | float | np.number) and abs(delay) <= MAX_TAPS):
+        refuse("delay", repr(delay), f"-{MAX_TAPS} to {MAX_TAPS} samples")
     for name in ("created", "source"):
         if not isinstance(getattr(profile, name), str):
             refuse(name, type(getattr(profile, name)).__name__, "a text")

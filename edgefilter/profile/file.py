@@ -30,10 +30,7 @@ Part = TypeVar("Part", bound="ProfilePart")
 
 @dataclass(frozen=True, eq=False)
 class ProfilePart:
-    """What a profile may hold beside the rest: its fields are arrays, in the file all of them or none.
-
-    PREFIX: before the names of its arrays in a profile's file.
-    """
+    """What a profile may hold beside the rest: arrays, in the file all or none of them, their names behind PREFIX."""
 
     PREFIX: ClassVar[str]
 
@@ -43,10 +40,7 @@ class ProfilePart:
 
     @classmethod
     def taken_from(cls: type[Part], arrays: dict[str, Any]) -> Part | None:
-        """Of the arrays of a profile's file those that are its own, which are taken out; None where there are none.
-
-        Raises ProfileError where some are there and others are not.
-        """
+        """Take its own out of the arrays of a profile's file; None where there are none, ProfileError where some lack."""
         names = [field.name for field in fields(cls)]
         found = {name: arrays.pop(cls.PREFIX + name) for name in names if cls.PREFIX + name in arrays}
         if found and len(found) < len(names):
@@ -80,24 +74,23 @@ def described(array: np.ndarray) -> str:
 
 
 def write_fields(path: Path, arrays: Mapping[str, np.ndarray], header: Mapping[str, Any], effects: Effects) -> None:
-    """Write arrays, a header of JSON values and the effects to path, whole or not at all.
-
-    Raise ProfileError where that fails.
-    """
+    """Write arrays, a header of JSON values and the effects to path, whole or not at all; ProfileError where that fails."""
     members = dict(arrays)
     listed = []
     for i, (name, values) in enumerate(effects):
         entry: dict[str, Any] = {"name": name, "values": {}}
         for key, value in values.items():
+            where = f"the profile cannot be stored: effects[{i}].{key} is"
             if isinstance(value, np.ndarray) and value.ndim:
+                if value.dtype.kind not in "fiub" or not np.isfinite(value).all():
+                    raise ProfileError(f"{where} not an array of finite real numbers")
                 member = f"effect_{i}_{len(entry['values'])}"
-                members[member] = _plain(value, f"effects[{i}].{key}")
+                members[member] = value
                 entry["values"][key] = {"array": member}
             elif isinstance(value, bool | int | float | np.generic | np.ndarray):
                 entry["values"][key] = value.item() if isinstance(value, np.generic | np.ndarray) else value
             else:
-                found = f"effects[{i}].{key} is {type(value).__name__}"
-                raise ProfileError(f"the profile cannot be stored: {found}, expected a number or an array")
+                raise ProfileError(f"{where} {type(value).__name__}, expected a number or an array")
         listed.append(entry)
     try:
         text = json.dumps({**header, "effects": listed}, allow_nan=False)
@@ -106,12 +99,6 @@ def write_fields(path: Path, arrays: Mapping[str, np.ndarray], header: Mapping[s
     members["header"] = np.frombuffer(text.encode(), np.uint8)
     members["version"] = np.array(FORMAT_VERSION, np.int64)
     _replace(path, members)
-
-
-def _plain(value: np.ndarray, name: str) -> np.ndarray:
-    if value.dtype.kind not in "fiub" or not np.isfinite(value).all():
-        raise ProfileError(f"the profile cannot be stored: {name} is not an array of finite real numbers")
-    return value
 
 
 def _replace(path: Path, members: Mapping[str, Any]) -> None:
@@ -137,18 +124,13 @@ def _replace(path: Path, members: Mapping[str, Any]) -> None:
 
 
 def read_fields(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any], Effects]:
-    """Return (arrays, header, effects) of a file that write_fields wrote.
-
-    Raise ProfileError, in one line, for any other.
-    """
+    """(arrays, header, effects) of a file that write_fields wrote; ProfileError, in one line, for any other."""
     try:
         if path.is_dir():
             raise ProfileError(f"{path}: is a folder, expected a profile file; {REMEDY}")
         if path.stat().st_size > MAX_FILE_BYTES:
             raise ProfileError(f"{path}: {path.stat().st_size} bytes long, expected at most {MAX_FILE_BYTES}; {REMEDY}")
-        content = path.read_bytes()
-        members = _members(content)
-        return _decode(members)
+        return _decode(_members(path.read_bytes()))
     except FileNotFoundError:
         raise ProfileError(f"{path}: no such file; {REMEDY}") from None
     except OSError as error:
@@ -170,10 +152,8 @@ def _members(content: bytes) -> dict[str, np.ndarray]:
             infos = archive.infolist()
             total = sum(info.file_size for info in infos)
             if len(infos) > MAX_MEMBERS or total > MAX_FILE_BYTES:
-                raise _Damaged(
-                    f"unpacks to {total} bytes in {len(infos)} members, expected at most {MAX_FILE_BYTES} in"
-                    f" {MAX_MEMBERS}"
-                )
+                most = f"expected at most {MAX_FILE_BYTES} in {MAX_MEMBERS}"
+                raise _Damaged(f"unpacks to {total} bytes in {len(infos)} members, {most}")
             arrays = {}
             for info in infos:
                 if info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED) or info.flag_bits & 1:
@@ -242,8 +222,7 @@ def _effects(listed: object, members: Mapping[str, np.ndarray]) -> Effects:
         if not isinstance(name, str) or not isinstance(values, dict):
             raise _Damaged(f"effects[{i}] has no name or no values")
         where = f"effects[{i}] ({name[:40]})"
-        found = {key: _value(value, f"{where}.{key[:40]}", members) for key, value in values.items()}
-        effects.append((name, found))
+        effects.append((name, {key: _value(value, f"{where}.{key[:40]}", members) for key, value in values.items()}))
     return tuple(effects)
 
 

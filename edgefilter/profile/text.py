@@ -65,12 +65,9 @@ def _left_lines(known: LinearApproximation) -> list[str]:
             for name, db in parts.items()
         ]
         lines.append(f"  played at {known.level_db[i]:5.1f} dB of full scale {left[i]:6.1f} dB  ({', '.join(told)})")
-    softer = [
-        f"{known.level_db[-1] - known.level_db[i]:.0f} dB softer {left[i]:.0f}" for i in reversed(range(left.size - 1))
-    ]
-    lines.append(
-        f"volume      at this volume the path leaves {left[-1]:.0f} dB{'; ' if softer else ''}{', '.join(softer)}"
-    )
+    below = known.level_db[-1] - known.level_db
+    softer = ", ".join(f"{below[i]:.0f} dB softer {left[i]:.0f}" for i in reversed(range(left.size - 1)))
+    lines.append(f"volume      at this volume the path leaves {left[-1]:.0f} dB{'; ' if softer else ''}{softer}")
     return lines
 
 
@@ -88,7 +85,5 @@ def _decay(energy: Array) -> str:
     """Times at which the energy that is still to come has fallen by 10, 20 and 30 dB, counted from the direct sound."""
     left = decibels(energy / max(energy[0], 1e-30), 1e-20)
     times = [(db, int(np.argmax(left < -db))) for db in (10, 20, 30) if left.min() < -db]
-    return (
-        ", ".join(f"-{db} dB after {1000 * max(n - PRE_ROLL, 0) / SAMPLE_RATE:.0f} ms" for db, n in times)
-        or "less than 10 dB"
-    )
+    told = [f"-{db} dB after {1000 * max(n - PRE_ROLL, 0) / SAMPLE_RATE:.0f} ms" for db, n in times]
+    return ", ".join(told) or "less than 10 dB"
