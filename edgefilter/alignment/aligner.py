@@ -9,16 +9,7 @@ import numpy as np
 
 from edgefilter.alignment.coarse_lag import CoarseLag
 from edgefilter.alignment.delay_line import HALF_WIDTH, Aligned, Tape, kernel_table, read_delayed, read_line
-from edgefilter.alignment.delay_tracker import (
-    DRIFTED,
-    FAINT,
-    SIZE,
-    STRIDE,
-    DelayMeasurement,
-    DelayMeter,
-    DriftFilter,
-    JumpWitness,
-)
+from edgefilter.alignment.delay_tracker import DRIFTED, FAINT, SIZE, STRIDE, DelayMeasurement, DelayMeter, DriftFilter
 from edgefilter.alignment.lag_search import CERTAIN_EARLY, MINIMUM, REFLECTIONS, Candidate, LagSearch
 from edgefilter.alignment.utterances import AHEAD, Announcements, FirstSounds, OnsetDetector, Playback, Utterance
 from edgefilter.profile.data import Profile
@@ -67,10 +58,7 @@ class Aligner:
         self.reset()
 
     def _listen_for(self, responses: Sequence[Samples] | None) -> None:
-        """What an arrival looks like from now on: the microphones' impulse responses (taps,); None: anything.
-
-        Where no utterance was found the robot may stand elsewhere than where it was calibrated.
-        """
+        """What an arrival looks like from now on: the microphones' impulse responses (taps,); None: anything."""
         self._responses = responses
         early = None if responses is None else [one[: PRE_ROLL + REFLECTIONS] for one in responses]
         self._lags = LagSearch(self._max_lag, early)
@@ -91,22 +79,16 @@ class Aligner:
         self._expected: Playback | None = None
         self._found: Candidate | None = None
         self._doubted = self._read_at = float("nan")
-        self._witness, self._segments = JumpWitness(), 0
-        self._to_search, self._to_measure, self._stage = SEARCH_STRIDE, STRIDE // 2, 0
+        self._to_search, self._to_measure, self._stage, self._segments = SEARCH_STRIDE, STRIDE // 2, 0, 0
         self._gain: float | None = None
-        self._by_bands = None if self._calibrated is not None else CoarseLag(self.hop, self._max_lag)
+        self._by_bands = None if self._calibrated else CoarseLag(self.hop, self._max_lag)
         self._coarse = False  # whether a lag is followed at which nothing sharp arrives
         self._margin = PRE_ROLL
         self._known = self._refuted = self._trusted = self._measured = self._missed = False
         self._confidence, self._lost = 0.0, 0
-        self._counts: AlignmentCounts = {
-            "utterances": 0,
-            "realignments": 0,
-            "jumps": 0,
-            "searches": 0,
-            "announced": 0,
-            "announced_heard": 0,
-        }
+        self._counts = AlignmentCounts(
+            utterances=0, realignments=0, jumps=0, searches=0, announced=0, announced_heard=0
+        )
 
     def hear_by(self, used: Sequence[int]) -> None:
         """From now on these microphones of an array are listened to, in the beginning all; what is known of the delay holds.
@@ -210,7 +192,7 @@ class Aligner:
         if self._ref.end > end + self._latest:
             self._resolve(found=False)
             self._missed = True
-            if not self._known and self._responses is not None:
+            if not self._known and self._responses is not None:  # it may stand elsewhere than where it was calibrated
                 self._listen_for(None)
 
     def _resolve(self, found: bool = True) -> None:
@@ -220,10 +202,7 @@ class Aligner:
         self._refuted = self._missed = False
 
     def _search(self) -> bool:
-        """Look for the oldest unresolved utterance, or one that was announced, a step each hop.
-
-        True if the delay was switched.
-        """
+        """Look for the oldest unresolved utterance, or an announced one, a step each hop; True if the delay was switched."""
         self._to_search -= self.hop
         if self._measured or (self._stage == 0 and self._to_search > 0):
             return False
@@ -255,10 +234,7 @@ class Aligner:
         return False
 
     def _decide(self, found: Candidate) -> bool:
-        """Take the candidate if it is beyond chance, or have the window before looked at.
-
-        True if the delay was switched.
-        """
+        """Take the candidate if it is beyond chance, or have the window before looked at; True if the delay was switched."""
         if found.old:
             self._stage = 3
             return False
@@ -298,7 +274,6 @@ class Aligner:
         self._known, self._coarse = True, False
         self._counts["realignments"] += 1
         self._lost, self._refuted, self._missed = 0, False, False
-        self._witness.forget()
         self._to_measure = min(self._to_measure, 2 * self.hop)
         return True
 
@@ -328,9 +303,9 @@ class Aligner:
         if self._coarse:  # without an arrival there is nothing to see until what is heard around this delay is learned
             self._meter.confirm(0.0)
             return False
+        if seen == "jumped":
+            return self._accept(found) if abs(found.offset) < DRIFTED else self._jump(found.offset)
         if seen == "elsewhere":
-            if self._witness.convinced(found):
-                return self._accept(found) if abs(found.offset) < DRIFTED else self._jump(found.offset)
             self._to_measure = STRIDE // 2
         self._note_loss(found)
         return False
@@ -348,7 +323,6 @@ class Aligner:
         self._drift.correct(found)
         self._meter.confirm(found.offset)
         self._lost, self._missed = 0, False
-        self._witness.forget()
         self._confidence += 0.2 * (found.explained - self._confidence)
         before = found.gain if self._gain is None else self._gain
         self._gain = before + 0.1 * (min(found.gain, 2 * before) - before)

@@ -233,7 +233,7 @@ def _overlap(reference: Samples) -> Samples:
 
 
 class DriftFilter:
-    """Kalman filter over the delay (samples) and its slope (samples per sample), constant-slope model.
+    """Kalman filter over the delay (samples) and its slope (samples per sample), constant-slope model, and its jumps.
 
     What a look claims of its own accuracy does not hold while a human talks as well or the response is still being
     learnt: looks close to one another then err alike. So they weigh less the less they explain, and where looks that
@@ -244,7 +244,7 @@ class DriftFilter:
     def __init__(self) -> None:
         self.delay, self.slope = float("nan"), 0.0
         self._variance, self._covariance, self._slope_variance = 4.0, 0.0, SLOPE_DEVIATION**2
-        self._since = 0
+        self._since, self._witness = 0, JumpWitness()
 
     @property
     def deviation(self) -> float:
@@ -256,6 +256,7 @@ class DriftFilter:
         self.delay = delay
         self._variance, self._covariance = deviation**2, 0.0
         self._since = 0
+        self._witness.forget()
 
     def step(self, offset: float, deviation: float) -> None:
         """The delay is another one by an offset; a small one may come from a wrong slope since the last look as well as from a jump."""
@@ -279,8 +280,8 @@ class DriftFilter:
     def where_seen(self, found: DelayMeasurement, gain: float, segments: int) -> str:
         """Whether a look, at so many segments on each side, saw the robot where it was expected.
 
-        "there": it did. "elsewhere": it saw it at another delay, if others agree. "unseen": not at all. "drowned":
-        somebody louder hid it. gain: power that the robot has brought so far.
+        "there": it did. "elsewhere": it saw it at another delay, "jumped": and others agree. "unseen": not at all.
+        "drowned": somebody louder hid it. gain: power that the robot has brought so far.
         """
         size, surprise = abs(found.offset), self.surprise(found)
         if found.strength < HEARD:
@@ -291,7 +292,7 @@ class DriftFilter:
             return "drowned"
         if not FAINT < found.gain_there / gain < STRANGE or size > (2 * segments + 1) * REACH - EDGE:
             return "unseen"
-        return "elsewhere"
+        return "jumped" if self._witness.convinced(found) else "elsewhere"
 
     def correct(self, measurement: DelayMeasurement) -> None:
         """Take in a measured offset, which holds for the middle of its frame."""
@@ -307,6 +308,7 @@ class DriftFilter:
         self._covariance -= delay * slope / spread
         self._since = 0
         self._slope_variance -= slope * slope / spread
+        self._witness.forget()
 
     def _noise(self, measurement: DelayMeasurement) -> float:
         """Variance of a look, with what its error has in common with its neighbours', which their number does not average out.
