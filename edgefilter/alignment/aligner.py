@@ -23,19 +23,17 @@ COARSE_MARGIN = 400
 """Samples, 25 ms, by which the reference is read earlier than at a coarse lag, so that a canceller holds all that arrives, and
 from which on a coarse lag is another one."""
 LOST_BLOCKS, NEARBY_SEARCHES = 3, 10
-"""Measurements in speech without a credible peak after which all lags are searched again: at first as if the present
-delay had ceased as many samples ago as one measurement reads, which finds jumps of up to 200 ms, then as if the utterance
-had begun half a second before."""
+"""Measurements in speech without a credible peak after which all lags are searched again, so often as if the present delay
+had ceased SIZE samples ago, which finds jumps of up to 200 ms, then as if the utterance had begun half a second before."""
 
 
 class Aligner:
     """Finds the total delay of the robot's voice in the microphone and delivers the reference at that delay.
 
-    A new utterance is looked for over all lags; the old delay stays the hypothesis until it is confirmed or replaced,
-    but where the microphone is far too quiet to hold it, nothing is delivered. Between utterances delay and drift are
-    carried on. hop: samples per step. profile: its impulse responses tell the shape of the arrival. max_lag_s: of the
-    playback, seconds. Of an array that is calibrated the lag is looked for in all microphones together, and the delay is
-    measured in the first that is used.
+    A new utterance is looked for over all lags; the old delay holds until it is confirmed or replaced, but where the
+    microphone is far too quiet for it, nothing is delivered. Between utterances delay and drift are carried on. hop:
+    samples per step. profile: its impulse responses tell the shape of the arrival. max_lag_s: of the playback, seconds.
+    Of a calibrated array all microphones are searched together, and the delay is measured in the first that is used.
 
     >>> rng = np.random.default_rng(0)
     >>> voice = rng.standard_normal(16384).astype(np.float32) / 10
@@ -91,10 +89,7 @@ class Aligner:
         )
 
     def hear_by(self, used: Sequence[int]) -> None:
-        """From now on these microphones of an array are listened to, in the beginning all; what is known of the delay holds.
-
-        Calibrated paths of an array have one beginning, so that the delay is the same in each microphone.
-        """
+        """From now on these microphones of an array are used; the delay holds, since calibrated paths have one beginning."""
         self._mics += [Tape(self._ref.capacity) for _ in range(len(self._mics), max(used) + 1)]
         first, self._used = self._used[0], list(used)
         if self._responses is not None and self._used[0] != first:
@@ -103,9 +98,8 @@ class Aligner:
     def announce(self, utterance: Samples) -> None:
         """Say what will be played (n,); it may begin at any time or never, and several are played in the order of announcing.
 
-        While the reference channel carries sound, that is the reference and announcements are dropped. While it is
-        silent, the announced utterance is looked for in the microphone for 30 s, and from where it is heard on it is
-        the reference.
+        A sound in the reference channel is the reference, and drops announcements. While there is none, the announced
+        utterance is looked for in the microphone for 30 s, and from where it is heard on it is the reference.
         """
         self._counts["announced"] += 1
         self._announced.add(utterance)

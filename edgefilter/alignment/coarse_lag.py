@@ -29,10 +29,10 @@ SAME = 3
 class CoarseLag:
     """Correlates the shapes of the spectra of microphone and reference at every lag, hop by hop.
 
-    A shape is the log energies of BANDS bands, less their means over time and over the bands. No phase and no level are
-    in it, so that neither a diffuse path nor a microphone that was processed hides the lag. What a voice has in common with
-    itself a while ago shows beside the right lag as well, so the other lags count by what that leaves of theirs. hop:
-    samples per step, and resolution. max_lag: samples.
+    A shape is the log energies of BANDS bands, less their means over time and over the bands. It has no phase and no level,
+    so that neither a diffuse path nor a processed microphone hides the lag. What a voice has in common with itself a
+    while ago shows beside the right lag, so other lags count by what that leaves of theirs. hop: samples per step, and
+    resolution. max_lag: samples.
 
     >>> rng = np.random.default_rng(0)
     >>> voice = rng.standard_normal(64000).astype(np.float32) * (1 + np.sin(np.arange(64000) / 700))

@@ -27,10 +27,9 @@ EARLY = (48, 400)
 """Samples before and after the direct sound that the learnt response keeps."""
 SMALL, FAR_JUMP = 8.0, 50.0
 """A jump is believed from CERTAIN of evidence on, summed over looks that agree; one of up to SMALL samples from
-CERTAIN_EARLY on, and one beyond REACH from FAR_JUMP on, for chance has more to choose from. In 7 minutes each of human speech
-and of fan noise while the reference played unheard, looked at twice as densely as in use, the sums reached 19 and 14
-within REACH, 29 and 13 beyond. Their tails are exponential: 30 comes about once in 100 hours of such speech, 50 beyond REACH
-once in 5 if all looks went that far."""
+CERTAIN_EARLY on, and one beyond REACH from FAR_JUMP on, for chance has more to choose from. In 7 minutes of human speech
+while the reference played unheard, the sums reached 19 within REACH and 29 beyond. Their tails are exponential: 30 comes
+about once in 100 hours of such speech, 50 beyond REACH once in 5 if all looks went that far."""
 AGREE = 0.7
 """Samples within which two looks see the same jump."""
 FORGET = 0.7

@@ -30,22 +30,19 @@ NEAR, ASIDE = 12, 512
 BETWEEN = 1024
 """Samples between the two windows, so that one short agreement does not reach into both."""
 CERTAIN, CERTAIN_EARLY, EARLY = 30.0, 20.0, 2432
-"""A search's strength times ratio that decides, and what does when two searches in a row find it at one lag of which at
-most EARLY samples were heard, so that a third of them were new. Beside a human as loud as the robot the true lag has a
-median of 40 after 60 ms, and 150 after 150 ms; chance, in an hour of other speech while the reference played unheard,
-26, and 22 early."""
+"""Evidence that decides, and what does when two searches in a row find one lag at which at most EARLY samples were heard, so
+that a third of them were new. Beside a human as loud as the robot the true lag has a median of 40 after 60 ms, and 150
+after 150 ms; chance, in an hour of other speech while the reference played unheard, 26, and 22 early."""
 SEEN = 5.0
-"""Strength that a lag at which more than a window of the utterance must have been heard already has to show in the
-window before as well; then CERTAIN_EARLY is enough. True lags have 10 there, chance 3.3."""
+"""Strength in the window before with which CERTAIN_EARLY is enough. True lags have 10 there, chance 3.3."""
 
 
 @dataclass(frozen=True, slots=True)
 class Candidate:
     """Lag in samples of the highest peak, its height over the rms of all lags and over the highest peak elsewhere.
 
-    Two voices of like pitch agree at many lags, a period apart, the robot with itself at one.
-    at: sample counter of the microphone at the end of the window. heard: samples of the utterance that it holds if the
-    lag is true.
+    Two voices of like pitch agree at many lags, a period apart, the robot with itself at one. at: sample counter of the
+    microphone at the end of the window. heard: samples of the utterance that it holds if the lag is true.
     """
 
     lag: int
@@ -120,11 +117,10 @@ class LagSearch:
                 self._crosses.append(self._whitened(x, self._reference, number))
 
     def find(self) -> Candidate | None:
-        """The best lag between what was prepared and what was listened to.
+        """The best lag; None where there is nothing to compare, or less than MINIMUM of it would overlap.
 
         Of several microphones that of the first, or of all together where that is more evident; but not where it is seen
-        in one alone, which may be broken, or a loopback. None where there is nothing to compare, or where less than MINIMUM
-        of them would overlap at the best lag.
+        in one alone, which may be broken, or a loopback.
         """
         if not self._crosses:
             return None

@@ -35,11 +35,9 @@ LOUD, EXPLAINED = 0.05, 100.0
 13 dB softer. Microphone power, over that of the echo at the present delay, from which on this delay is not the right one;
 single sounds pass a room up to 10 dB better than speech does."""
 LONGEST = SAMPLE_RATE // 4
-"""Samples for which that is believed at most once the robot was heard: a human as loud as the robot, who begins as its next
-utterance does, loses no more."""
+"""Samples for which that is believed at most once the robot was heard: so much a human as loud, who begins with it, loses."""
 USUAL = 1e-2
-"""Mean square that the loudest hop of a voice is taken to have at first (-20 dB of full scale), so that a soft first
-sound makes nobody else loud."""
+"""Mean square that a voice's loudest hop is taken to have at first, -20 dB: a soft first sound makes nobody else loud."""
 LEARNING = 0.1
 """Share of a loud hop in the running gain from the reference to the microphone."""
 

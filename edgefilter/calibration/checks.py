@@ -15,8 +15,7 @@ from edgefilter.profile.data import GRID_HZ, LOW_SNR_DB
 from edgefilter.types import PRE_ROLL, SAMPLE_RATE, Array, Samples
 
 SPEECH_HZ = (110.0, 7100.0)
-"""A warning is about bands that end above the one and begin below the other; a small loudspeaker radiates nothing beyond them,
-and that is no fault of the calibration."""
+"""A warning is about bands that end above the one and begin below the other; small loudspeakers radiate nothing beyond."""
 
 
 def check_lengths(law: SweepLaw, recording: Samples, noise: Samples) -> None:
@@ -38,8 +37,8 @@ def check_lengths(law: SweepLaw, recording: Samples, noise: Samples) -> None:
 def check_found(result: Deconvolution) -> None:
     """Raise CalibrationError unless the deconvolved response has one clear arrival.
 
-    Its peak over its root mean square in the range of lags: 30 to 160 measured where the recording holds the sweep,
-    down to a sweep 15 dB below the fan; 2 to 10 for speech, noise, tones and other sweeps.
+    Its peak over its root mean square: 30 to 160 measured where there is the sweep, down to 15 dB below the fan; 2 to 10
+    for speech, noise, tones and other sweeps.
     """
     nearby = result.cut(EARLIEST_DIRECT, LATEST_DIRECT - EARLIEST_DIRECT)
     contrast = abs(result.response[result.direct]) / max(float(np.sqrt(np.mean(nearby**2))), 1e-30)
@@ -144,8 +143,7 @@ def disturbed(
 ) -> str | None:
     """Something else in a sweep's recording: quarter seconds in which neither the path nor its harmonics explain the sound.
 
-    What remains has to exceed the fan by 10 dB, a sixth of the explained power there, and the loudest quarter second
-    less 25 dB.
+    What remains exceeds the fan by 10 dB, a sixth of the explained power there, and the loudest quarter second less 25 dB.
     """
     early = int(law.lead(5.5))
     shift = result.direct - early
@@ -208,7 +206,7 @@ def doubtful_noise(reference: Samples, noise: Samples) -> list[str]:
 
 
 def _unsteady(noise: Samples) -> tuple[float, float, float]:
-    """How far the loudest 100 ms stand out of the median in any octave, dB; percent of such times above 3 dB; centre of the octave, Hz."""
+    """How far the loudest 100 ms stand out of an octave's median, dB; percent of times above 3 dB; the octave's centre, Hz."""
     block = SAMPLE_RATE // 10
     spectra = power(np.fft.rfft(blocks(noise, block) * hann(block), axis=1))
     hz = frequencies(spectra.shape[1])

@@ -24,8 +24,7 @@ _, HIGHEST_HZ = BAND_HZ
 SLOT, CHIRP, FADE = round(0.6 * SAMPLE_RATE), round(0.3 * SAMPLE_RATE), round(0.01 * SAMPLE_RATE)
 """Samples from one chirp to the next, of a chirp, and of its rise and fall: the rest of a slot is for the room's echo."""
 ORDER = "UDudDUdu"
-"""Up and down, louder (capital) and softer; the first half is fitted and the second tests that, so that what is no linear
-filter, and would explain one sweep, does not explain the other."""
+"""Up and down, louder (capital) and softer; the first half is fitted and the second tests that it was a linear filter."""
 LEAD = round(0.5 * SAMPLE_RATE)
 """Samples of silence before the first chirp, in which the room's noise is measured."""
 QUIET = round(0.1 * SAMPLE_RATE)
@@ -53,11 +52,10 @@ def chirps() -> Samples:
 class Heard:
     """What a microphone and a reference brought of the chirps.
 
-    in_reference, in_microphone: whether they are there at all; what follows is None where one of them lacks them.
-    lag_s: seconds by which the microphone hears them after the reference has them. above_noise_db: of the louder ones at
-    the microphone. ppm: by how much the microphone's clock is faster. linear_db: power of the echo over what a linear
-    filter, fitted to other chirps, leaves of it. softer_db: gain for the softer chirps over that for the louder ones, dB.
-    same: whether the microphone is a copy of the reference. peak_db: of the microphone, dB of full scale.
+    in_reference, in_microphone: whether they are there; where one lacks them, what follows is None. peak_db: of the
+    microphone, dB of full scale. lag_s: seconds by which it hears them later. above_noise_db: of the louder ones. ppm: by
+    how much its clock is faster. linear_db: power of the echo over what a linear filter, fitted to other chirps, leaves of it.
+    softer_db: gain for the softer chirps over that for the louder ones. same: whether it is a copy of the reference.
     """
 
     in_reference: bool

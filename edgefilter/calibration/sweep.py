@@ -26,7 +26,7 @@ DRIFT_REACH = 400
 """Samples by which clocks that are apart may move a lag within a recording: 400 ppm in a minute."""
 STRETCHED_PPM = 5.0
 """Difference of two clocks from which on a sweep's path is smeared, by half a sample from its beginning to its end, and a
-chirp of 0.3 s is stretched by a fortieth of a sample, which costs 30 dB of 7 kHz."""
+chirp of 0.3 s by a fortieth of one, which costs 30 dB of 7 kHz."""
 
 
 def generate_sweep(seconds: float = 6.0, amplitude: float = 0.35, lead_s: float = 0.5, tail_s: float = 1.0) -> Samples:
@@ -194,9 +194,8 @@ def smoothed(lines: Array, hz: Array, line_hz: float, least_hz: float) -> Array:
 def harmonic_distortion(result: Deconvolution, law: SweepLaw) -> Array:
     """Energy of each of DISTORTION_ORDERS' response at k f over the linear one at f, the fan subtracted, (orders,) dB.
 
-    The response of order k arrives T ln k before the linear one (Farina 2000, eq. 14). f runs from 100 Hz (or the
-    sweep's start) to 95 % of the sweep's end over k. What the fan hides reads at most as the fan's own share, and at
-    least -100 dB.
+    The response of order k arrives T ln k before the linear one (Farina 2000, eq. 14). f runs from 100 Hz (or the sweep's
+    start) to 95 % of the sweep's end over k. What the fan hides reads as its own share at most, and at least -100 dB.
     """
     linear = result.spectrum(result.cut(result.direct - 128, 4096))
     frequencies = result.frequencies
@@ -215,10 +214,9 @@ def harmonic_distortion(result: Deconvolution, law: SweepLaw) -> Array:
 def response_from_sweep(reference: Samples, recording: Samples, noise: Samples, delay: int) -> Samples:
     """The paper's |H_m(f) H_s(f)| (601,) float32, from any sweep: sum_t (|X_m(t,f)| - |N(f)|) / sum_t |A(t,f)|, eq. (3)-(5).
 
-    Hann frames of 1200 samples, hop 160; |N(f)| is the fan's mean magnitude in them. For each bin, those frames t in
-    which the reference, delayed by delay samples, is within 20 dB of its maximum in that bin. Negative sums are set to 0,
-    and so are bins in which the sweep has no energy (60 dB below its strongest bin). Reverberation that outlasts the frame
-    is not part of this reading.
+    Hann frames of 1200 samples, hop 160; |N(f)| is the fan's mean magnitude. For each bin, those frames t in which the
+    reference, later by delay, is within 20 dB of its maximum there. Negative sums are set to 0, and so are bins 60 dB below
+    the sweep's strongest. Reverberation that outlasts the frame is not part of this reading.
     """
     played = np.abs(_frames(np.pad(reference, (max(delay, 0), 0))[max(-delay, 0) :]))
     heard = np.abs(_frames(recording))

@@ -16,9 +16,8 @@ REACH = 16
 BAND_HZ = (300.0, 7000.0)
 """Where it is looked: below, microphones of one robot hear the same."""
 CLEARER = 0.1
-"""By how much more another order of the channels must agree with what is expected: in seconds of the robot in six simulated
-offices, microphones 4 cm around, the right order agrees to .75 to .92 with a calibration made elsewhere in the room,
-and is .15 to .7 ahead of two or three channels exchanged."""
+"""By how much more another order of the channels must agree with what is expected: in six simulated offices, microphones 4 cm
+around, the right order agrees to .75 to .92 with a calibration made elsewhere in the room, exchanged ones .15 to .7 less."""
 EQUAL = 1e-3
 """Part of its power by which a channel may differ from one that it is a copy of: -30 dB, rounding and a converter."""
 ALIKE = 0.3
@@ -26,10 +25,9 @@ ALIKE = 0.3
 
 
 def order_of(heard: Samples, expected: Samples) -> tuple[list[int], int] | None:
-    """For each channel of heard (channels, n) the one of expected (channels, n) that it is; None where that cannot be told.
+    """For each channel of heard (channels, n) the one of expected (channels, n) that it is, and by how many samples all are later.
 
-    Both with every frequency weighed the same, at the lag that all channels have in common (Knapp & Carter 1976), which is
-    returned, too: samples by which heard is later.
+    None where that cannot be told. Every frequency is weighed the same (Knapp & Carter 1976).
 
     >>> rng = np.random.default_rng(0)
     >>> one = rng.standard_normal(8192)

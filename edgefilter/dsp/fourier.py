@@ -1,8 +1,7 @@
 """Real Fourier transforms along the last axis, for code that runs once a hop.
 
-scipy.fft finds out anew at every call whose array it was given, through seven Python functions: 4 us, and 0.15 ms where
-a hop meets them with cold caches. So its kernel is called directly where scipy keeps it, and scipy.fft only where it is
-not there; the numbers are the same.
+scipy.fft finds out anew at every call whose array it was given: 4 us, and 0.15 ms with cold caches. So its kernel is called
+directly where scipy keeps it, and scipy.fft only where it is not there; the numbers are the same.
 """
 
 from __future__ import annotations
@@ -22,26 +21,19 @@ except (ImportError, AttributeError, TypeError):
 TINY = np.float32(1e-30)
 """Power to add to a divisor that may be zero, far below that of any sound."""
 LEAST = 1e-9
-"""Least power, -90 dB, that something is taken to have beside what it is compared with, such as noise beside the loudest
-sound so far: of nothing at all, as a muted microphone brings it, no ratio could be told."""
+"""Least power, -90 dB, of noise beside the loudest sound so far: of nothing, as of a muted microphone, no ratio could be told."""
 _SINGLE, _COMPLEX = np.dtype(np.float32), np.dtype(np.complex64)
 
 
 def rfft(x: Samples, out: Spectrum | None = None) -> Spectrum:
-    """Spectrum (..., n // 2 + 1) of x (..., n), float32 or float64.
-
-    Written to out where given, which then is returned.
-    """
+    """Spectrum (..., n // 2 + 1) of x (..., n), float32 or float64; written to out where given, which then is returned."""
     if _kernel is None or (x.dtype is not _SINGLE and x.dtype != np.float64):
         return _into(out, fft.rfft(x))
     return _kernel.r2c(x, (x.ndim - 1,), True, 0, out, 1)
 
 
 def irfft(spectrum: Spectrum, n: int, out: Samples | None = None) -> Samples:
-    """Samples (..., n) of a spectrum (..., n // 2 + 1), complex64 or complex128.
-
-    Written to out where given, which then is returned.
-    """
+    """Samples (..., n) of a spectrum (..., n // 2 + 1), complex64 or 128; written to out where given, which then is returned."""
     if _kernel is None or (spectrum.dtype is not _COMPLEX and spectrum.dtype != np.complex128):
         return _into(out, fft.irfft(spectrum, n))
     return _kernel.c2r(spectrum, (spectrum.ndim - 1,), n, False, 2, out, 1)

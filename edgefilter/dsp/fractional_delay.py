@@ -16,8 +16,7 @@ HALF_WIDTH = 24
 PHASES = 256
 """Delays per sample at which the filters are tabulated; linear interpolation between them errs by less than -100 dB."""
 CHUNK = 2048
-"""Samples that are made at once: their filters stay in the cache, and a sentence that comes in one piece needs no more memory
-than a frame."""
+"""Samples that are made at once: their filters stay in the cache, and a sentence needs no more memory than a frame."""
 
 
 def kernel(fraction: Array) -> Samples:
@@ -35,10 +34,7 @@ def kernel(fraction: Array) -> Samples:
 
 @lru_cache(maxsize=1)
 def tabulated() -> tuple[Samples, Samples]:
-    """The filters for delays of -1 to 2, every 1 / PHASES, last tap first, and their differences.
-
-    (3 * PHASES, 2 * HALF_WIDTH) each. Made at the first call, in some ms.
-    """
+    """The filters for delays of -1 to 2, every 1 / PHASES, last tap first, and their slopes, (3 PHASES, 2 HALF_WIDTH) each."""
     table = kernel(np.arange(3 * PHASES + 1) / PHASES - 1.0)[:, ::-1]
     return np.ascontiguousarray(table[:-1]), np.diff(table, axis=0)
 
@@ -67,8 +63,7 @@ def interpolate(x: Samples, positions: Array) -> Samples:
 def delayed(x: Array, samples: float) -> Samples:
     """The signal x (n,) later by a constant number of samples, fractional or negative; (n,) float32, silence moves in.
 
-    By the phase of its spectrum, which keeps all of the band: above 7 kHz, where the kernel falls off, a voice may
-    still be over the fan.
+    By the phase of its spectrum, which keeps the band above 7 kHz, where the kernel falls off.
     """
     if abs(samples) >= x.size:
         return np.zeros(x.size, np.float32)

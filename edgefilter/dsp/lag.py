@@ -29,8 +29,7 @@ def smoothed_power(spectrum: np.ndarray, width_hz: float) -> Array:
 def flattened(spectrum: np.ndarray, floor: float) -> np.ndarray:
     """The spectrum (bins,) over the root of its smoothed power, which counts as no less than floor times its maximum.
 
-    Two of these, one conjugated, make the cross-spectrum of the phase transform (Knapp & Carter 1976), but for
-    the smoothing.
+    Two of these, one conjugated, make the phase transform's cross-spectrum (Knapp & Carter 1976), but for the smoothing.
     """
     weight = smoothed_power(spectrum, SMOOTHING_HZ)
     weight += weight.dtype.type(floor * weight.max() + 1e-20)
@@ -46,10 +45,9 @@ def flat_cross(a: Array, b: Array, n: int) -> np.ndarray:
 
 
 def likely_cross(predicted: Samples, recording: Samples, n: int) -> np.ndarray:
-    """Cross-spectrum Y P* / (|P|^2 + N) of two signals in noise of variance 1, (n // 2 + 1,).
+    """Cross-spectrum Y P* / (|P|^2 + N) of two signals in noise of variance 1, (n // 2 + 1,): flat where the voice stands out.
 
-    Flat where the voice stands out of the noise, nothing elsewhere. The maximum-likelihood weighting of Knapp &
-    Carter (1976) for an error in proportion to the voice.
+    The maximum-likelihood weighting of Knapp & Carter (1976) for an error in proportion to the voice.
     """
     source = fft.rfft(predicted.astype(np.float64), n)
     heard = fft.rfft(recording.astype(np.float64), n)
@@ -80,8 +78,7 @@ def turn(omega: Array, delay: float) -> np.ndarray:
 def climb(cross: np.ndarray, omega: Array, lag: float, steps: int = 8, tolerance: float = 0.0) -> float:
     """The lag, at most one sample from `lag`, at the top of the correlation whose cross-spectrum (bins,) this is.
 
-    omega: (bins,) radians per sample. Newton's method on Re sum cross exp(j omega lag), up to `steps` steps or one
-    under the tolerance.
+    omega: (bins,) radians per sample. Newton's method on Re sum cross exp(j omega lag), to a step under the tolerance.
     """
     squared, moved = np.square(omega), 0.0
     for _ in range(steps):

@@ -42,10 +42,7 @@ def floored(psd: Samples) -> Array:
 
 
 def variance_at(hz: Array, psd: Samples) -> Array:
-    """Two-sided density per sample of the PSD (bins,) at hz.
-
-    |spectrum|^2 of such noise is that times the sum of the squared window.
-    """
+    """Two-sided density per sample of the PSD (bins,) at hz; |spectrum|^2 is that times the sum of the squared window."""
     return np.interp(hz, frequencies(psd.size), psd) / 2 * SAMPLE_RATE
 
 

@@ -11,10 +11,9 @@ from edgefilter.dsp.fractional_delay import CHUNK
 from edgefilter.types import Samples
 
 HALF_S = 0.0035
-"""Reach of the kernel into the future, seconds: a band of 630 Hz between what passes and what is stopped, so that all
-but the last tenth of 8 kHz passes. Twice as much is the delay of a way there and back."""
+"""Reach of the kernel into the future, seconds: a band of 630 Hz between what passes and what is stopped."""
 SPARED_HZ = 8000
-"""Lowest rate with this reach; below, it grows in proportion, so that a low rate loses no larger part of its band."""
+"""Lowest rate with this reach; below, it grows in proportion, so that no larger part of the band is lost."""
 BETA = 6.76
 """Shape of the Kaiser window for 70 dB: 0.1102 (A - 8.7), Oppenheim & Schafer, Discrete-Time Signal Processing, 7.5.3."""
 MOST_PHASES = 512
@@ -78,10 +77,7 @@ class Resampler:
 
 @lru_cache(maxsize=16)
 def _kernels(source: int, target: int) -> Samples:
-    """One kernel (taps,) a phase, as a table (phases, taps), or (MOST_PHASES + 1, taps) where there are more phases.
-
-    A row's sum is 1, so that a constant stays what it is.
-    """
+    """One kernel of sum 1 a phase, (phases, taps), or (MOST_PHASES + 1, taps) where there are more phases."""
     phases = target // math.gcd(source, target)
     fractions = np.arange(phases) / phases if phases <= MOST_PHASES else np.linspace(0.0, 1.0, MOST_PHASES + 1)
     low = min(source, target)

@@ -8,9 +8,7 @@ from edgefilter.types import Samples
 
 
 class Ring:
-    """First in, first out, fixed capacity, float32.
-
-    channels: samples are then (n, channels) in place of (n,), and counted once.
+    """First in, first out, float32. channels: samples are then (n, channels) in place of (n,), and counted once.
 
     Writing never blocks: what does not fit is not stored and is added to `lost`, so an audio callback can write and
     return. One thread may write while another reads; each side moves only its own counter.

@@ -93,10 +93,7 @@ class Analyser:
         self._windowed, self._window = self._padded[:, : config.window_length], config.analysis_window
 
     def push(self, *hop_samples: Samples) -> Spectrum:
-        """Take the next hop of samples (hop,) of each channel.
-
-        Return the frame that ends with them, (channels, bins) complex64.
-        """
+        """Take the next hop (hop,) of each channel; return the frame that ends with it, (channels, bins) complex64."""
         recent, hop = self._recent, self.config.hop
         recent[:, :-hop] = recent[:, hop:]
         for newest, samples in zip(self._newest, hop_samples, strict=True):
