@@ -21,7 +21,7 @@ import numpy as np
 from bench import peers, results, voicefilter
 from bench.recordings import Clip, NotHere, Signals
 from edgefilter import EgoFilter, Event, PathLearner, Profile, calibrate
-from edgefilter.calibration.array import FARTHEST
+from edgefilter.calibration.calibrate import FARTHEST
 from edgefilter.dsp.fractional_delay import delayed
 from edgefilter.dsp.lag import correlation_near, flat_cross, highest, top
 from edgefilter.dsp.metrics import si_sdr

@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft, signal
 
-from edgefilter.calibration.array import first
-from edgefilter.calibration.calibrate import calibrate, checked, fan_psd
+from edgefilter.calibration.calibrate import calibrate, checked, fan_psd, first
 from edgefilter.calibration.checks import check_lengths, clipped_samples
 from edgefilter.calibration.sweep import (
     DRIFT_REACH,

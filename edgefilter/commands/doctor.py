@@ -12,7 +12,7 @@ import numpy as np
 
 from edgefilter.alignment.aligner import MOST_LAG_S
 from edgefilter.audio import pulse, virtual
-from edgefilter.calibration.array import FARTHEST
+from edgefilter.calibration.calibrate import FARTHEST
 from edgefilter.calibration.chirps import LEVEL_DB, SOFTER_DB, Heard, chirps, evaluate
 from edgefilter.commands.display import print_result, say
 from edgefilter.diagnosis.channels import doubtful_channels

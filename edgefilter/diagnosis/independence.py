@@ -13,7 +13,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from edgefilter.dsp.convolution import convolve
-from edgefilter.dsp.least_phase import log_response
+from edgefilter.dsp.fourier import log_response
 from edgefilter.dsp.psd import floored
 from edgefilter.types import PRE_ROLL, SAMPLE_RATE, Array, Samples
 

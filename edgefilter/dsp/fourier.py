@@ -7,9 +7,10 @@ directly where scipy keeps it, and scipy.fft only where it is not there; the num
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import fft
 
-from edgefilter.types import Samples, Spectrum
+from edgefilter.types import Array, Samples, Spectrum
 
 try:
     from scipy.fft._pocketfft import pypocketfft as _kernel
@@ -42,6 +43,18 @@ def irfft(spectrum: Spectrum, n: int, out: Samples | None = None) -> Samples:
 def power(spectrum: np.ndarray) -> np.ndarray:
     """Return |spectrum|^2 without the square root of abs, real and of the same precision."""
     return spectrum.real**2 + spectrum.imag**2
+
+
+def log_response(log_gain: Array) -> NDArray[np.complex128]:
+    """Complex logarithm of the causal response of least phase with that gain, from its logarithm, 0 to Nyquist, (bins, ...).
+
+    By its real cepstrum, folded onto positive times (Oppenheim & Schafer 2010, section 13.5).
+    """
+    bins = log_gain.shape[0]
+    cepstrum = fft.irfft(log_gain, axis=0)
+    cepstrum[1 : bins - 1] *= 2.0
+    cepstrum[bins:] = 0.0
+    return fft.rfft(cepstrum, axis=0)
 
 
 def _into(out: np.ndarray | None, found: np.ndarray) -> np.ndarray:

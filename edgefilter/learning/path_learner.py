@@ -12,7 +12,7 @@ import numpy as np
 from scipy import fft
 
 from edgefilter.alignment.utterances import Sustained
-from edgefilter.calibration.array import cross_density, first
+from edgefilter.calibration.calibrate import cross_density, first
 from edgefilter.calibration.from_recording import bands_over_fan, fan_in_silences
 from edgefilter.dsp.psd import floored, periodograms
 from edgefilter.echo.effect import vanishes

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from edgefilter import EgoFilter, Profile
-from edgefilter.calibration.array import cross_density
+from edgefilter.calibration.calibrate import cross_density
 from edgefilter.integrations import duplex
 from edgefilter.profile.array import ArrayCalibration
 

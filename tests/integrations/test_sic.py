@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from edgefilter import Profile
-from edgefilter.calibration.array import cross_density
+from edgefilter.calibration.calibrate import cross_density
 from edgefilter.dsp.metrics import si_sdr
 from edgefilter.dsp.resample import Resampler
 from edgefilter.profile.array import ArrayCalibration

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
-from edgefilter.dsp.least_phase import log_response
+from edgefilter.dsp.fourier import log_response
 from edgefilter.echo.effect import Effect, Experiment, Family, Parameter, Stage
 from edgefilter.echo.evidence import Evidence
 from edgefilter.echo.measurement import Measurement, Values, VoiceModel
