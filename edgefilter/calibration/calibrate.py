@@ -89,9 +89,8 @@ def calibrate(
     array = None
     if recordings.ndim > 1:
         for at in np.flatnonzero(~recordings.any(axis=1)):
-            raise CalibrationError(
-                f"channel {at} of the sweep recording is silent, every sample 0: choose the microphones with --mic-channels"
-            )
+            silent = f"channel {at} of the sweep recording is silent, every sample 0"
+            raise CalibrationError(f"{silent}: choose the microphones with --mic-channels")
         results = [deconvolve(reference, *of) for of in zip(recordings[1:], map(fan_psd, noises[1:]))]
         responses = np.zeros((len(results), MAX_TAPS), np.float32)
         for row, other in zip(responses, results):
@@ -115,10 +114,7 @@ def calibrate(
 
 
 def checked(reference: object, recording: object, noise: object) -> tuple[Samples, Samples, Samples]:
-    """The three recordings of a calibration as float32, of an array the latter two (microphones, n).
-
-    Raises CalibrationError for another type, shape or NaN, and for other microphones in the noise than in the sweep.
-    """
+    """The recordings of a calibration as float32, of an array the latter two (microphones, n); CalibrationError for others."""
     try:
         found = (
             as_samples(reference, "the sweep reference"),
@@ -147,11 +143,10 @@ def fan_psd(noise: Samples) -> Samples:
 
 
 def impulse_response(result: Deconvolution, direct: int) -> Samples:
-    """Impulse response from PRE_ROLL before the direct sound to where the decay has sunk into the fan, (MIN_TAPS to MAX_TAPS,) float32.
+    """From PRE_ROLL before the direct sound to where the decay has sunk into the fan, (MIN_TAPS to MAX_TAPS,) float32.
 
-    The knee is the first 20 ms in which the response is not 3 dB above what the fan leaves there. The response is kept
-    to 50 ms beyond it, at least MIN_TAPS, and faded by half a cosine from the knee (at most the last quarter where
-    there is none) to the end.
+    The knee is the first 20 ms in which the response is not 3 dB above what the fan leaves there. It is kept to 50 ms
+    beyond, and faded by half a cosine from the knee (at most the last quarter where there is none) to the end.
     """
     path = result.cut(direct - PRE_ROLL, MAX_TAPS)
     block = SAMPLE_RATE // 50
@@ -169,8 +164,7 @@ def impulse_response(result: Deconvolution, direct: int) -> Samples:
 def band_snr_db(result: Deconvolution, path: Samples) -> Array:
     """The energy of the sweep's coherent part in each third octave over the fan's in a window as long as the response, (B,) dB.
 
-    The coherent part is what the impulse response predicts, less what the fan itself put into it; limited to -20 to 120
-    dB.
+    The coherent part is what the impulse response predicts, less what the fan put into it; limited to -20 to 120 dB.
     """
     energy = result.spectrum(path) * result.source_energy
     fan = path.size * result.noise_psd
@@ -199,16 +193,13 @@ def doubts(noises: Samples, results: list[Deconvolution]) -> list[str]:
     level = 10 * np.log10(power + 1e-20)
     for at, apart in enumerate(level - np.median(level)):
         if abs(apart) > APART_DB:
-            how = "louder" if apart > 0 else "softer"
-            found.append(
-                f"channel {at}: the fan is {abs(apart):.0f} dB {how} there than elsewhere; another gain or kind?"
-            )
+            how = f"{abs(apart):.0f} dB {'louder' if apart > 0 else 'softer'}"
+            found.append(f"channel {at}: the fan is {how} there than elsewhere; another gain or kind?")
     for at, result in enumerate(results):
         lag = result.direct - results[0].direct
         if abs(lag) > FARTHEST:
-            found.append(
-                f"channel {at}: hears the robot {lag} samples after channel 0; another converter, or processed?"
-            )
+            late = f"hears the robot {lag} samples after channel 0"
+            found.append(f"channel {at}: {late}; another converter, or processed?")
     found += [
         f"channel {j}: the same sound as channel {i}; leave one of them out"
         for j in range(len(noises))

@@ -115,14 +115,10 @@ def low_snr(snr: Array) -> str | None:
     """Bands of speech in which the fan hides the sweep."""
     bands = third_octave_bands()
     inside = (bands[:, 1] > SPEECH_HZ[0]) & (bands[:, 0] < SPEECH_HZ[1])
-    runs: list[list[int]] = []
-    for i in np.flatnonzero(inside & (snr < LOW_SNR_DB)):
-        if runs and runs[-1][-1] == i - 1:
-            runs[-1].append(int(i))
-        else:
-            runs.append([int(i)])
-    if not runs:
+    low = np.flatnonzero(inside & (snr < LOW_SNR_DB))
+    if not low.size:
         return None
+    runs = np.split(low, np.flatnonzero(np.diff(low) > 1) + 1)
     parts = ", ".join(f"{bands[run[0], 0]:.0f}-{bands[run[-1], 1]:.0f} Hz ({snr[run].min():.0f} dB)" for run in runs)
     return f"low signal-to-noise ratio, below {LOW_SNR_DB:.0f} dB, in {parts}: play the sweep louder or longer"
 

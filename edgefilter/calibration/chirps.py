@@ -8,6 +8,7 @@ import numpy as np
 import soxr
 from scipy import fft
 
+from edgefilter.alignment.coarse_lag import LOWEST_HZ
 from edgefilter.calibration.multisine import BAND_HZ
 from edgefilter.calibration.sweep import STRETCHED_PPM
 from edgefilter.dsp.fourier import power
@@ -19,7 +20,6 @@ LEVEL_DB = -18.0
 """Peak of the louder chirps, dB of full scale: as loud as speech of the robot's, which peaks some dB above."""
 SOFTER_DB = 10.0
 """By how much every other pair is softer: what changes the level by itself makes less, or more, of it."""
-LOWEST_HZ = 150.0
 _, HIGHEST_HZ = BAND_HZ
 SLOT, CHIRP, FADE = round(0.6 * SAMPLE_RATE), round(0.3 * SAMPLE_RATE), round(0.01 * SAMPLE_RATE)
 """Samples from one chirp to the next, of a chirp, and of its rise and fall: the rest of a slot is for the room's echo."""

@@ -55,11 +55,8 @@ def order_of(heard: Samples, expected: Samples) -> tuple[list[int], int] | None:
 
 def exchanged(order: Sequence[int]) -> dict[int, str]:
     """What is to be said of those that are other channels than they should be, by number, of an order that `order_of` found."""
-    return {
-        at: f"exchanged: it hears the robot as channel {other} was calibrated to"
-        for at, other in enumerate(order)
-        if at != other
-    }
+    wrong = {at: other for at, other in enumerate(order) if at != other}
+    return {at: f"exchanged: it hears the robot as channel {other} was calibrated to" for at, other in wrong.items()}
 
 
 def _best_order(alike: Array) -> tuple[float, list[int]]:

@@ -110,6 +110,5 @@ def played_in(heard: Samples, played: Samples) -> bool:
     """
     size = fft.next_fast_len(2 * heard.size, real=True)
     cross = fft.irfft(fft.rfft(heard, size) * fft.rfft(played, size).conj(), size)
-    return bool(
-        np.abs(cross).max() > SAME * np.sqrt(float(np.vdot(heard, heard)) * float(np.vdot(played, played))) > 0.0
-    )
+    whole = np.sqrt(float(np.vdot(heard, heard)) * float(np.vdot(played, played)))
+    return bool(np.abs(cross).max() > SAME * whole > 0.0)
