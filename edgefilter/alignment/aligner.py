@@ -77,7 +77,7 @@ class Aligner:
         self._expected: Playback | None = None
         self._found: Candidate | None = None
         self._doubted = self._read_at = float("nan")
-        self._to_search, self._to_measure, self._stage, self._segments = SEARCH_STRIDE, STRIDE // 2, 0, 0
+        self._to_search, self._to_measure, self._stage, self._far = SEARCH_STRIDE, STRIDE // 2, 0, False
         self._gain: float | None = None
         self._by_bands = None if self._calibrated else CoarseLag(self.hop, self._max_lag)
         self._coarse = False  # whether a lag is followed at which nothing sharp arrives
@@ -281,15 +281,14 @@ class Aligner:
         self._to_measure = STRIDE
         if self._ref.end - self._drift.delay - STRIDE > self._onsets.current.end:
             return False
-        self._segments = 1 if self._lost or (self._open and self._open[0].nearby) else 0
-        found = self._meter.measure(
-            self._mics[self._used[0]], self._ref, self._ref.end, self._drift.delay, self._drift.slope, self._segments
-        )
+        self._far = bool(self._lost or (self._open and self._open[0].nearby))
+        mic, drift = self._mics[self._used[0]], self._drift
+        found = self._meter.measure(mic, self._ref, self._ref.end, drift.delay, drift.slope, self._far)
         return found is not None and self._take_look(found)
 
     def _take_look(self, found: DelayMeasurement) -> bool:
         """Take a look into account; True if the delay was switched."""
-        seen = self._drift.where_seen(found, found.gain if self._gain is None else self._gain, self._segments)
+        seen = self._drift.where_seen(found, found.gain if self._gain is None else self._gain, self._far)
         if seen == "there":
             return self._accept(found)
         if seen == "drowned":

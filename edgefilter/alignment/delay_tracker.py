@@ -110,12 +110,10 @@ class DelayMeter:
         self._confirmed: float | None = None
         self.response = self._prior
 
-    def measure(
-        self, mic: Tape, ref: Tape, now: int, delay: float, slope: float, segments: int = 0
-    ) -> DelayMeasurement | None:
+    def measure(self, mic: Tape, ref: Tape, now: int, delay: float, slope: float, far: bool) -> DelayMeasurement | None:
         """Compare the last FRAME samples of mic with the reference at the expected delay; None where either is silent.
 
-        segments: so many times 2 REACH further lags on each side are looked at as well.
+        far: look at 2 REACH further lags on each side as well.
         """
         centre = delay - slope * (FRAME / 2)
         whole = round(centre)
@@ -140,11 +138,10 @@ class DelayMeter:
         m *= np.conj(self.response)
         m *= weight
         products, references = [m * np.conj(w)], [wide]
-        for segment in range(1, segments + 1):
-            for shift in (-2 * REACH * segment, 2 * REACH * segment):
-                wide = self._reference(ref, start - shift, slope, np.empty(SIZE, np.float32))
-                products.insert(0 if shift < 0 else len(products), m * np.conj(fourier.rfft(wide)))
-                references.insert(0 if shift < 0 else len(references), wide)
+        if far:
+            sides = [self._reference(ref, start + x, slope, np.empty_like(wide)) for x in (2 * REACH, -2 * REACH)]
+            before, after = (m * np.conj(fourier.rfft(side)) for side in sides)
+            products, references = [before, *products, after], [sides[0], wide, sides[1]]
         correlation = fourier.irfft(np.array(products), SIZE)
         likelihood = np.concatenate((correlation[:, -REACH:], correlation[:, :REACH]), axis=1).ravel()
         overlap = np.concatenate([_overlap(reference) for reference in references])
@@ -276,8 +273,8 @@ class DriftFilter:
         """The measured offset in standard deviations of what was to be expected."""
         return abs(measurement.offset) / math.sqrt(self._expected()[2] + self._noise(measurement))
 
-    def where_seen(self, found: DelayMeasurement, gain: float, segments: int) -> str:
-        """Whether a look, at so many segments on each side, saw the robot where it was expected.
+    def where_seen(self, found: DelayMeasurement, gain: float, far: bool) -> str:
+        """Whether a look, far or not, saw the robot where it was expected.
 
         "there": it did. "elsewhere": it saw it at another delay, "jumped": and others agree. "unseen": not at all.
         "drowned": somebody louder hid it. gain: power that the robot has brought so far.
@@ -289,7 +286,7 @@ class DriftFilter:
             return "there"
         if found.gain > STRANGE * gain:
             return "drowned"
-        if not FAINT < found.gain_there / gain < STRANGE or size > (2 * segments + 1) * REACH - EDGE:
+        if not FAINT < found.gain_there / gain < STRANGE or size > (3 if far else 1) * REACH - EDGE:
             return "unseen"
         return "jumped" if self._witness.convinced(found) else "elsewhere"
 

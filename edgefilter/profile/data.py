@@ -96,8 +96,34 @@ class Profile:
     array: ArrayCalibration | None = None
 
     def __post_init__(self) -> None:
-        _check_arrays(self)
-        _check_numbers(self)
+        arrays = self._arrays()
+        taps, bands = arrays["impulse_response"].shape, arrays["band_snr_db"].shape
+        if len(taps) != 1 or not 2 * PRE_ROLL <= taps[0] <= MAX_TAPS:
+            refuse("impulse_response", f"of shape {taps}", f"({2 * PRE_ROLL} to {MAX_TAPS},)")
+        if len(bands) != 1 or bands[0] > 100:
+            refuse("band_snr_db", f"of shape {bands}", "(number of bands,)")
+        check_array("impulse_response", arrays["impulse_response"], taps, np.float32, -1e3, 1e3)
+        check_array("response", arrays["response"], (GRID_BINS,), np.float32, 0.0, 1e6)
+        check_array("noise_psd", arrays["noise_psd"], (GRID_BINS,), np.float32, 0.0, 1.0)
+        check_array("band_hz", arrays["band_hz"], (*bands, 2), np.float64, 0.0, SAMPLE_RATE / 2)
+        check_array("band_snr_db", arrays["band_snr_db"], bands, np.float64, -300.0, 300.0)
+        orders = (len(DISTORTION_ORDERS),)
+        check_array("distortion_db", arrays["distortion_db"], orders, np.float64, -300.0, 300.0)
+        if isinstance(self.sample_rate, bool) or self.sample_rate != SAMPLE_RATE:
+            refuse("sample_rate", repr(self.sample_rate), f"{SAMPLE_RATE} Hz")
+        delay = self.delay
+        if isinstance(delay, bool) or not (isinstance(delay, int | float | np.number) and abs(delay) <= MAX_TAPS):
+            refuse("delay", repr(delay), f"-{MAX_TAPS} to {MAX_TAPS} samples")
+        for name in ("created", "source"):
+            if not isinstance(getattr(self, name), str):
+                refuse(name, type(getattr(self, name)).__name__, "a text")
+        if not all(isinstance(text, str) for text in self.warnings):
+            refuse("warnings", "not all texts", "texts")
+
+    def _arrays(self) -> dict[str, np.ndarray]:
+        """All that every profile has, by their names in its file."""
+        arrays = {name: np.asarray(getattr(self, name)) for name in _ARRAYS}
+        return arrays | {"impulse_response": np.asarray(self.echo.impulse_response)}
 
     def save(self, path: str | Path) -> None:
         """Write one .npz atomically: the file at path is the old one or the whole new one, also on a full disk.
@@ -112,8 +138,7 @@ class Profile:
         ProfileError
             Where it cannot be written.
         """
-        arrays = {name: np.asarray(getattr(self, name)) for name in _ARRAYS}
-        arrays["impulse_response"] = np.asarray(self.echo.impulse_response)
+        arrays = self._arrays()
         for part in (self.approximation, self.array):
             arrays |= part.arrays() if part else {}
         header = {
@@ -261,27 +286,6 @@ def _stacked(paths: Sequence[Samples]) -> Samples:
     return np.stack([np.pad(path, (0, taps - path.size)) for path in paths])
 
 
-def _check_arrays(profile: Profile) -> None:
-    """Raise ProfileError at the first array that no calibration would have written: (shape, dtype, lowest, highest)."""
-    taps = np.asarray(profile.echo.impulse_response).shape
-    bands = np.asarray(profile.band_snr_db).shape
-    rules = {
-        "impulse_response": (taps, np.float32, -1e3, 1e3),
-        "response": ((GRID_BINS,), np.float32, 0.0, 1e6),
-        "noise_psd": ((GRID_BINS,), np.float32, 0.0, 1.0),
-        "band_hz": ((*bands, 2), np.float64, 0.0, SAMPLE_RATE / 2),
-        "band_snr_db": (bands, np.float64, -300.0, 300.0),
-        "distortion_db": ((len(DISTORTION_ORDERS),), np.float64, -300.0, 300.0),
-    }
-    if len(taps) != 1 or not 2 * PRE_ROLL <= taps[0] <= MAX_TAPS:
-        refuse("impulse_response", f"of shape {taps}", f"({2 * PRE_ROLL} to {MAX_TAPS},)")
-    if len(bands) != 1 or bands[0] > 100:
-        refuse("band_snr_db", f"of shape {bands}", "(number of bands,)")
-    for name, (shape, dtype, low, high) in rules.items():
-        value = np.asarray(profile.echo.impulse_response if name == "impulse_response" else getattr(profile, name))
-        check_array(name, value, shape, dtype, low, high)
-
-
 def _check_effects(echo: EchoModel) -> None:
     """Raise ProfileError for an effect that is unknown, or whose values are not those that it can be applied with."""
     probe = np.zeros(SAMPLE_RATE // 10, np.float32)
@@ -301,17 +305,3 @@ def _check_effects(echo: EchoModel) -> None:
             raise ProfileError(f"the values of its effect {name} cannot be used ({told}); {REMEDY}") from None
         if not all(np.isfinite(part).all() for part in made):
             raise ProfileError(f"the values of its effect {name} cannot be used (the result is not finite); {REMEDY}")
-
-
-def _check_numbers(profile: Profile) -> None:
-    """Raise ProfileError for a header value of the wrong type or out of range."""
-    if isinstance(profile.sample_rate, bool) or profile.sample_rate != SAMPLE_RATE:
-        refuse("sample_rate", repr(profile.sample_rate), f"{SAMPLE_RATE} Hz")
-    delay = profile.delay
-    if isinstance(delay, bool) or not (isinstance(delay, int | float | np.number) and abs(delay) <= MAX_TAPS):
-        refuse("delay", repr(delay), f"-{MAX_TAPS} to {MAX_TAPS} samples")
-    for name in ("created", "source"):
-        if not isinstance(getattr(profile, name), str):
-            refuse(name, type(getattr(profile, name)).__name__, "a text")
-    if not all(isinstance(text, str) for text in profile.warnings):
-        refuse("warnings", "not all texts", "texts")
