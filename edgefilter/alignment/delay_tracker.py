@@ -293,8 +293,12 @@ class DriftFilter:
     def correct(self, measurement: DelayMeasurement) -> None:
         """Take in a measured offset, which holds for the middle of its frame."""
         noise = self._noise(measurement)
-        if self.surprise(measurement) > UNEXPECTED:
-            self._widen((measurement.offset**2 - noise) / self._expected()[2])
+        if self.surprise(measurement) > UNEXPECTED:  # believe less, but never less than at the start
+            factor = (measurement.offset**2 - noise) / self._expected()[2]
+            factor = max(min(factor, 4.0 / self._variance, SLOPE_DEVIATION**2 / self._slope_variance), 1.0)
+            self._variance *= factor
+            self._covariance *= factor
+            self._slope_variance *= factor
         delay, slope, spread = self._expected()
         spread += noise
         gain = measurement.offset / spread
@@ -314,14 +318,6 @@ class DriftFilter:
         common = BIAS**2 * (1.0 - measurement.explained)
         doubtful = self._variance > 0.25 and measurement.evidence < CERTAIN
         return measurement.variance + common + (1.0 if doubtful else 0.0)
-
-    def _widen(self, factor: float) -> None:
-        """Believe less of delay and slope, by this factor of their covariance, but never less than at the start."""
-        factor = min(factor, 4.0 / self._variance, SLOPE_DEVIATION**2 / self._slope_variance)
-        if factor > 1.0:
-            self._variance *= factor
-            self._covariance *= factor
-            self._slope_variance *= factor
 
     def _expected(self) -> tuple[float, float, float]:
         """Covariance of the offset in the middle of the frame with the delay, with the slope, and its variance."""

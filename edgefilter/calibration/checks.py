@@ -8,7 +8,7 @@ from scipy import signal
 
 from edgefilter.calibration.sweep import EARLIEST_DIRECT, LATEST_DIRECT, MIN_TAPS, Deconvolution, SweepLaw, deconvolve
 from edgefilter.dsp.fourier import power
-from edgefilter.dsp.frames import block_power, blocks
+from edgefilter.dsp.frames import block_power, blocks, stretch
 from edgefilter.dsp.psd import frequencies, hann, third_octave_bands
 from edgefilter.errors import CalibrationError
 from edgefilter.profile.data import GRID_HZ, LOW_SNR_DB
@@ -59,30 +59,36 @@ def collect_warnings(
     snr: Array,
 ) -> list[str]:
     """All warnings about a calibration, the gravest first."""
-    found = [
-        clipping(law, recording, result.direct),
-        short_recording(law, recording, result.direct),
-        low_snr(snr),
-        quiet(recording),
-        disturbed(law, reference, recording, noise, result),
-        early_arrivals(result, path),
-        *doubtful_noise(reference, noise),
-    ]
-    return [text for text in found if text]
-
-
-def clipping(law: SweepLaw, recording: Samples, direct: int) -> str | None:
-    """Samples at full scale, or flat tops below it, and the frequencies that the sweep had there."""
-    clipped = clipped_samples(recording)
-    if not clipped.size:
-        return None
-    level = float(np.max(np.abs(recording)))
-    hz = law.frequency(clipped - direct)
-    low, high = np.clip(np.percentile(hz, [2, 98]), law.low_hz, law.high_hz)
-    return (
-        f"clipped: {clipped.size} samples at {level:.2f} of full scale, {low:.0f}-{high:.0f} Hz; "
-        "lower the playback volume or the microphone gain and calibrate again"
-    )
+    direct, level = result.direct, float(np.max(np.abs(recording)))
+    found, clipped = [], clipped_samples(recording)
+    if clipped.size:
+        hz = law.frequency(clipped - direct)
+        low, high = np.clip(np.percentile(hz, [2, 98]), law.low_hz, law.high_hz)
+        found.append(
+            f"clipped: {clipped.size} samples at {level:.2f} of full scale, {low:.0f}-{high:.0f} Hz; "
+            "lower the playback volume or the microphone gain and calibrate again"
+        )
+    rung_out = direct + SAMPLE_RATE // 5
+    missing = law.stop + rung_out - recording.size
+    if missing > 0:
+        edge = min(float(law.frequency(recording.size - rung_out)), law.high_hz)
+        found.append(
+            f"too short: the recording ends {missing / SAMPLE_RATE:.2f} s early, {edge:.0f}-{law.high_hz:.0f} Hz is missing"
+            " or cut off"
+        )
+    found += low_snr(snr)
+    if level < 0.01:
+        peak = f"{20 * np.log10(level):.0f} dB of full scale"
+        found.append(f"too quiet: the recording peaks at {peak}, expected above -40 dB, in all bands")
+    found += disturbed(law, reference, recording, noise, result)
+    energy = max(float(np.sum(path.astype(np.float64) ** 2)), 1e-30)
+    lost = float(np.sum(result.cut(direct - PRE_ROLL - 480, 480) ** 2)) / energy
+    if lost >= 0.003:
+        found.append(
+            f"{10 * np.log10(lost):.0f} dB of the robot's voice, in all bands, arrives more than {PRE_ROLL} samples before"
+            " its strongest part and is not in the impulse response"
+        )
+    return found + doubtful_noise(reference, noise)
 
 
 def clipped_samples(recording: Samples) -> NDArray[np.intp]:
@@ -99,44 +105,21 @@ def clipped_samples(recording: Samples) -> NDArray[np.intp]:
     return found if found.size >= 8 else found[:0]
 
 
-def short_recording(law: SweepLaw, recording: Samples, direct: int) -> str | None:
-    """A recording that ends before the sweep has passed and rung out."""
-    missing = law.stop + direct + SAMPLE_RATE // 5 - recording.size
-    if missing <= 0:
-        return None
-    edge = min(float(law.frequency(recording.size - direct - SAMPLE_RATE // 5)), law.high_hz)
-    return (
-        f"too short: the recording ends {missing / SAMPLE_RATE:.2f} s early, {edge:.0f}-{law.high_hz:.0f} Hz is missing"
-        " or cut off"
-    )
-
-
-def low_snr(snr: Array) -> str | None:
+def low_snr(snr: Array) -> list[str]:
     """Bands of speech in which the fan hides the sweep."""
     bands = third_octave_bands()
     inside = (bands[:, 1] > SPEECH_HZ[0]) & (bands[:, 0] < SPEECH_HZ[1])
     low = np.flatnonzero(inside & (snr < LOW_SNR_DB))
     if not low.size:
-        return None
+        return []
     runs = np.split(low, np.flatnonzero(np.diff(low) > 1) + 1)
     parts = ", ".join(f"{bands[run[0], 0]:.0f}-{bands[run[-1], 1]:.0f} Hz ({snr[run].min():.0f} dB)" for run in runs)
-    return f"low signal-to-noise ratio, below {LOW_SNR_DB:.0f} dB, in {parts}: play the sweep louder or longer"
-
-
-def quiet(recording: Samples) -> str | None:
-    """A recording that uses so little of the converter's range that its steps matter."""
-    level = float(np.max(np.abs(recording)))
-    if level >= 0.01:
-        return None
-    return (
-        f"too quiet: the recording peaks at {20 * np.log10(level):.0f} dB of full scale, expected above -40 dB, in all"
-        " bands"
-    )
+    return [f"low signal-to-noise ratio, below {LOW_SNR_DB:.0f} dB, in {parts}: play the sweep louder or longer"]
 
 
 def disturbed(
     law: SweepLaw, reference: Samples, recording: Samples, noise: Samples, result: Deconvolution
-) -> str | None:
+) -> list[str]:
     """Something else in a sweep's recording: quarter seconds in which neither the path nor its harmonics explain the sound.
 
     What remains exceeds the fan by 10 dB, a sixth of the explained power there, and the loudest quarter second less 25 dB.
@@ -144,33 +127,18 @@ def disturbed(
     early = int(law.lead(5.5))
     shift = result.direct - early
     predicted = signal.oaconvolve(reference.astype(np.float64), result.cut(shift, early + MIN_TAPS))
-    first, last = max(shift, 0), min(shift + predicted.size, recording.size)
-    own = np.zeros(recording.size)
-    own[first:last] = predicted[first - shift : last - shift]
+    own = stretch(predicted, -shift, recording.size - shift)
     block = SAMPLE_RATE // 4
     rest, explained = block_power(recording - own, block), block_power(own, block)
     least = max(10 * float(np.mean(noise.astype(np.float64) ** 2)), explained.max() * 10**-2.5, 1e-9)
-    limit = np.maximum(explained / 6, least)
-    bad = np.flatnonzero(rest > limit)
+    bad = np.flatnonzero(rest > np.maximum(explained / 6, least))
     if not bad.size:
-        return None
+        return []
     hz = np.clip(law.frequency(bad * block + block / 2 - result.direct), law.low_hz, law.high_hz)
-    return (
+    return [
         f"something else than the sweep sounds in {bad.size * 0.25:.2f} s of the recording (from {bad[0] * 0.25:.2f} s"
         f" on), while the sweep was at {hz.min():.0f}-{hz.max():.0f} Hz; calibrate again in silence"
-    )
-
-
-def early_arrivals(result: Deconvolution, path: Samples) -> str | None:
-    """Sound that reaches the microphone too far ahead of the strongest arrival to be kept."""
-    energy = max(float(np.sum(path.astype(np.float64) ** 2)), 1e-30)
-    lost = float(np.sum(result.cut(result.direct - PRE_ROLL - 480, 480) ** 2)) / energy
-    if lost < 0.003:
-        return None
-    return (
-        f"{10 * np.log10(lost):.0f} dB of the robot's voice, in all bands, arrives more than {PRE_ROLL} samples before"
-        " its strongest part and is not in the impulse response"
-    )
+    ]
 
 
 def doubtful_noise(reference: Samples, noise: Samples) -> list[str]:
