@@ -7,10 +7,11 @@ import math
 import numpy as np
 
 from edgefilter.dsp import fourier
+from edgefilter.dsp.membrane import LOWEST_HZ
 from edgefilter.types import SAMPLE_RATE, Samples
 
-BANDS, LOWEST_HZ = 40, 150.0
-"""Bands, equally wide in mel from LOWEST_HZ, which any robot's loudspeaker plays, up to 8 kHz."""
+BANDS = 40
+"""Bands, equally wide in mel from LOWEST_HZ up to 8 kHz."""
 RANGE = 1e-5
 """A band's power is told down to so much of the loudest band's so far, -50 dB."""
 MEMORY_S = 3.0

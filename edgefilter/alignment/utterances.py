@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from edgefilter.dsp.frames import stretch
+from edgefilter.dsp.frames import SILENT, stretch
 from edgefilter.types import SAMPLE_RATE, AlignmentState, Samples
 
 PAUSE = SAMPLE_RATE // 5
@@ -16,8 +16,6 @@ PAUSE = SAMPLE_RATE // 5
 a plosive."""
 FLOOR = 2.0**-46
 """Mean square of a 24-bit converter's last bit, -138 dB of full scale: a reference that has less is silent."""
-SILENT = 10**-4.5
-"""Power, 45 dB under the loudest of the last seconds, from which on a reference is silent."""
 SUSTAINED = 3
 """Hops that a level must last to be the voice's: 48 ms, a short vowel. A click falls into two at most."""
 VARIES = 10**1.5

@@ -8,12 +8,12 @@ import numpy as np
 import soxr
 from scipy import fft
 
-from edgefilter.alignment.coarse_lag import LOWEST_HZ
 from edgefilter.calibration.multisine import BAND_HZ
 from edgefilter.calibration.sweep import STRETCHED_PPM
 from edgefilter.dsp.fourier import power
 from edgefilter.dsp.frames import block_power, decibels, rise, stretch
 from edgefilter.dsp.lag import correlation_near, flat_cross
+from edgefilter.dsp.membrane import LOWEST_HZ
 from edgefilter.types import SAMPLE_RATE, Samples
 
 LEVEL_DB = -18.0

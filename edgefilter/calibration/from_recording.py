@@ -7,10 +7,9 @@ from numpy.typing import NDArray
 from scipy import fft
 from scipy.ndimage import binary_closing, uniform_filter1d
 
-from edgefilter.alignment.utterances import SILENT
 from edgefilter.calibration.sweep import DRIFT_REACH
 from edgefilter.dsp.fractional_delay import delayed, interpolate
-from edgefilter.dsp.frames import all_block_power, block_power, decibels, frames
+from edgefilter.dsp.frames import SILENT, all_block_power, block_power, decibels, frames
 from edgefilter.dsp.lag import correlation_near, flat_cross, highest
 from edgefilter.dsp.psd import ROUNDING_PSD, periodograms, third_octave_bands
 from edgefilter.echo.effects.catalogue import EFFECTS

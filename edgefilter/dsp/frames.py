@@ -7,6 +7,9 @@ from numpy.typing import NDArray
 
 from edgefilter.types import Array, Samples
 
+SILENT = 10**-4.5
+"""Power, 45 dB under the loudest of a voice, under which it is silent."""
+
 
 def stretch(x: NDArray, start: int, stop: int) -> NDArray:
     """Samples start..stop-1 of x (n,), a new array (stop - start,), zeros where x has none."""

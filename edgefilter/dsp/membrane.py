@@ -11,6 +11,8 @@ from scipy import fft
 from edgefilter.dsp import fourier
 from edgefilter.types import SAMPLE_RATE, Array, Samples, Spectrum
 
+LOWEST_HZ = 150.0
+"""From here up any robot's loudspeaker plays."""
 DISPLACEMENT_HZ = 300.0
 """Corner of the second-order low-pass that turns what is played into the displacement of the membrane."""
 DISPLACEMENT_TAPS = 128
