@@ -7,7 +7,7 @@ from functools import cached_property
 
 import numpy as np
 import scipy
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy import fft
 
 from edgefilter.dsp.frames import frames
@@ -107,18 +107,17 @@ def sweep_law(reference: Samples) -> SweepLaw:
     middle = np.arange(step * 20, stop - start - step * 20, step)
     rate_hz = (phase[middle + step // 2] - phase[middle - step // 2]) / (step // 2 * 2) * SAMPLE_RATE / (2 * np.pi)
     usable = rate_hz > 1.0
-    if usable.mean() < 0.95:
-        raise CalibrationError(_not_a_sweep("its frequency does not rise"))
-    slope, offset = np.polyfit(middle[usable], np.log(rate_hz[usable]), 1)
-    misfit = float(np.sqrt(np.mean((slope * middle[usable] + offset - np.log(rate_hz[usable])) ** 2)))
-    if misfit > 0.03 or slope * (stop - start) < np.log(8.0):
-        raise CalibrationError(_not_a_sweep(f"its frequency departs by {100 * misfit:.0f} % from an exponential rise"))
-    high = min(float(np.exp(offset + slope * (stop - start))), SAMPLE_RATE / 2)
-    return SweepLaw(start, stop, float(np.exp(offset)), high, float(1 / slope))
-
-
-def _not_a_sweep(why: str) -> str:
-    return f"the sweep reference is not an exponential sweep: {why}; play the one that edgefilter generates"
+    why = "its frequency does not rise"
+    if usable.mean() >= 0.95:
+        slope, offset = np.polyfit(middle[usable], np.log(rate_hz[usable]), 1)
+        misfit = float(np.sqrt(np.mean((slope * middle[usable] + offset - np.log(rate_hz[usable])) ** 2)))
+        if misfit <= 0.03 and slope * (stop - start) >= np.log(8.0):
+            high = min(float(np.exp(offset + slope * (stop - start))), SAMPLE_RATE / 2)
+            return SweepLaw(start, stop, float(np.exp(offset)), high, float(1 / slope))
+        why = f"its frequency departs by {100 * misfit:.0f} % from an exponential rise"
+    raise CalibrationError(
+        f"the sweep reference is not an exponential sweep: {why}; play the one that edgefilter generates"
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -218,18 +217,17 @@ def response_from_sweep(reference: Samples, recording: Samples, noise: Samples, 
     reference, later by delay, is within 20 dB of its maximum there. Negative sums are set to 0, and so are bins 60 dB below
     the sweep's strongest. Reverberation that outlasts the frame is not part of this reading.
     """
-    played = np.abs(_frames(np.pad(reference, (max(delay, 0), 0))[max(-delay, 0) :]))
-    heard = np.abs(_frames(recording))
+    played, heard = _magnitudes(np.pad(reference, (max(delay, 0), 0))[max(-delay, 0) :]), _magnitudes(recording)
     count = min(len(played), len(heard))
     played, heard = played[:count], heard[:count]
     strongest = played.max(axis=0)
     use = played > 0.1 * strongest
-    excess = np.sum(use * (heard - np.abs(_frames(noise)).mean(axis=0)), axis=0)
+    excess = np.sum(use * (heard - _magnitudes(noise).mean(axis=0)), axis=0)
     response = np.maximum(excess, 0.0) / np.maximum(np.sum(use * played, axis=0), 1e-9)
     return np.where(strongest > 1e-3 * strongest.max(), response, 0.0).astype(np.float32)
 
 
-def _frames(samples: Samples) -> NDArray[np.complex128]:
-    """Complex spectra, a frame every 160 samples, as the paper has them, (frames, 601)."""
+def _magnitudes(samples: Samples) -> Array:
+    """Magnitudes of spectra, a frame every 160 samples, as the paper has them, (frames, 601)."""
     padded = np.pad(samples, (0, max(0, GRID_FFT - samples.size)))
-    return np.fft.rfft(frames(padded, GRID_FFT, 160) * hann(GRID_FFT), axis=1)
+    return np.abs(np.fft.rfft(frames(padded, GRID_FFT, 160) * hann(GRID_FFT), axis=1))
