@@ -6,14 +6,7 @@ import numpy as np
 from scipy import fft, signal
 
 from edgefilter.calibration.checks import check_found, check_lengths, collect_warnings
-from edgefilter.calibration.sweep import (
-    MIN_TAPS,
-    Deconvolution,
-    deconvolve,
-    harmonic_distortion,
-    response_from_sweep,
-    sweep_law,
-)
+from edgefilter.calibration.sweep import MIN_TAPS, Deconvolution, deconvolve, distortion_db, paper_response, sweep_law
 from edgefilter.dsp.exchange import EQUAL
 from edgefilter.dsp.frames import all_block_power, frames
 from edgefilter.dsp.psd import GRID_FFT, hann, third_octave_bands
@@ -101,11 +94,11 @@ def calibrate(
     return Profile(
         echo=EchoModel(path),
         delay=float(result.direct),
-        response=response_from_sweep(reference, recording, noise, result.direct),
+        response=paper_response(reference, recording, noise, result.direct),
         noise_psd=noise_psd,
         band_hz=third_octave_bands(),
         band_snr_db=snr,
-        distortion_db=harmonic_distortion(result, law),
+        distortion_db=distortion_db(result, law),
         warnings=tuple(warnings),
         created=created,
         source=source,

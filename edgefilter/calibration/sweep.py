@@ -190,7 +190,7 @@ def smoothed(lines: Array, hz: Array, line_hz: float, least_hz: float) -> Array:
     return (total[..., high] - total[..., low]) / (high - low)
 
 
-def harmonic_distortion(result: Deconvolution, law: SweepLaw) -> Array:
+def distortion_db(result: Deconvolution, law: SweepLaw) -> Array:
     """Energy of each of DISTORTION_ORDERS' response at k f over the linear one at f, the fan subtracted, (orders,) dB.
 
     The response of order k arrives T ln k before the linear one (Farina 2000, eq. 14). f runs from 100 Hz (or the sweep's
@@ -210,7 +210,7 @@ def harmonic_distortion(result: Deconvolution, law: SweepLaw) -> Array:
     return np.array(levels)
 
 
-def response_from_sweep(reference: Samples, recording: Samples, noise: Samples, delay: int) -> Samples:
+def paper_response(reference: Samples, recording: Samples, noise: Samples, delay: int) -> Samples:
     """The paper's |H_m(f) H_s(f)| (601,) float32, from any sweep: sum_t (|X_m(t,f)| - |N(f)|) / sum_t |A(t,f)|, eq. (3)-(5).
 
     Hann frames of 1200 samples, hop 160; |N(f)| is the fan's mean magnitude. For each bin, those frames t in which the
