@@ -8,6 +8,7 @@ import numpy as np
 
 from edgefilter.dsp import fourier
 from edgefilter.dsp.membrane import LOWEST_HZ
+from edgefilter.dsp.psd import hann
 from edgefilter.types import SAMPLE_RATE, Samples
 
 BANDS = 40
@@ -46,7 +47,7 @@ class CoarseLag:
 
     def __init__(self, hop: int, max_lag: int) -> None:
         self._hop = hop
-        self._window = np.hanning(2 * hop + 1)[: 2 * hop].astype(np.float32)
+        self._window = hann(2 * hop).astype(np.float32)
         mel = np.linspace(_mel(LOWEST_HZ), _mel(SAMPLE_RATE / 2), BANDS + 1)
         edges = 700.0 * (10.0 ** (mel / 2595.0) - 1.0) * 2 * hop / SAMPLE_RATE
         self._edges = np.unique(np.round(edges).astype(int))[:-1]

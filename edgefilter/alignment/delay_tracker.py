@@ -14,6 +14,7 @@ from edgefilter.alignment.utterances import FLOOR
 from edgefilter.dsp import fourier
 from edgefilter.dsp.fourier import power
 from edgefilter.dsp.lag import climb, turn
+from edgefilter.dsp.psd import hann
 from edgefilter.types import PRE_ROLL, Array, Samples
 
 FRAME = 2048
@@ -88,7 +89,7 @@ class DelayMeter:
     """
 
     def __init__(self, response: Samples | None = None) -> None:
-        self._window = np.hanning(FRAME + 1)[:FRAME].astype(np.float32)
+        self._window = hann(FRAME).astype(np.float32)
         self._omega = (2 * np.pi * np.arange(SIZE // 2 + 1) / SIZE).astype(np.float32)
         self._omega_squared = np.square(self._omega)
         band = (self._omega > 2 * np.pi * 120 / 16000) & (self._omega < 2 * np.pi * 7000 / 16000)
@@ -276,8 +277,8 @@ class DriftFilter:
     def where_seen(self, found: DelayMeasurement, gain: float, far: bool) -> str:
         """Whether a look, far or not, saw the robot where it was expected.
 
-        "there": it did. "elsewhere": it saw it at another delay, "jumped": and others agree. "unseen": not at all.
-        "drowned": somebody louder hid it. gain: power that the robot has brought so far.
+        "there": it did. "elsewhere": it saw it at another delay, which is remembered; "jumped": other looks agree.
+        "unseen": not at all. "drowned": somebody louder hid it. gain: power that the robot has brought so far.
         """
         size, surprise = abs(found.offset), self.surprise(found)
         if found.strength < HEARD:
