@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import signal
 
-from edgefilter.dsp.frames import all_block_power, block_power, block_sums, blocks, decibels, frames
+from edgefilter.dsp.frames import all_block_power, block_power, block_sums, blocks, decibels, frames, rise, stretch
 from edgefilter.dsp.psd import (
     NOTCH,
     ROUNDING_PSD,
@@ -60,3 +60,16 @@ def test_third_octaves_hold_a_thousand_hertz_and_end_at_eight():
     bands = third_octave_bands()
     np.testing.assert_allclose(bands[1:, 0], bands[:-1, 1])
     assert np.any((bands[:, 0] < 1000) & (bands[:, 1] > 1000)) and bands[-1, 1] == 8000.0
+
+
+def test_a_stretch_is_a_new_array_and_zero_where_the_signal_has_nothing():
+    x = np.arange(1, 6, dtype=np.float32)
+    assert stretch(x, -2, 3).tolist() == [0, 0, 1, 2, 3] and stretch(x, 3, 8).tolist() == [4, 5, 0, 0, 0]
+    assert stretch(x, 7, 9).tolist() == stretch(x, -9, -7).tolist() == [0, 0] and stretch(x, 2, 2).size == 0
+    inside = stretch(x, 1, 4)
+    assert inside.dtype == np.float32 and not np.shares_memory(inside, x)
+
+
+def test_a_rise_and_its_mirror_image_add_up_to_one():
+    np.testing.assert_allclose(rise(8) + rise(8)[::-1], 1.0, rtol=1e-12)
+    assert (np.diff(rise(8)) > 0).all()
