@@ -48,7 +48,8 @@ class CoarseLag:
     def __init__(self, hop: int, max_lag: int) -> None:
         self._hop = hop
         self._window = hann(2 * hop).astype(np.float32)
-        mel = np.linspace(_mel(LOWEST_HZ), _mel(SAMPLE_RATE / 2), BANDS + 1)
+        lowest, highest = (2595.0 * math.log10(1.0 + hz / 700.0) for hz in (LOWEST_HZ, SAMPLE_RATE / 2))
+        mel = np.linspace(lowest, highest, BANDS + 1)
         edges = 700.0 * (10.0 ** (mel / 2595.0) - 1.0) * 2 * hop / SAMPLE_RATE
         self._edges = np.unique(np.round(edges).astype(int))[:-1]
         self._sound = np.zeros((2, 2 * hop), np.float32)
@@ -92,7 +93,3 @@ class CoarseLag:
         elsewhere = max(left[: max(at - SAME, 0)].max(initial=CHANCE), left[at + SAME + 1 :].max(initial=CHANCE))
         heard = (self._frames - at) * self._hop >= ENOUGH_S * SAMPLE_RATE
         return at * self._hop if heard and score[at] ** 2 > elsewhere else None
-
-
-def _mel(hz: float) -> float:
-    return 2595.0 * math.log10(1.0 + hz / 700.0)

@@ -33,8 +33,10 @@ def describe(profile: Profile) -> str:
         f"distortion  orders {distortion}",
         *(_left_lines(profile.approximation) if profile.approximation else ()),
         "signal-to-noise ratio of the sweep, by third octave",
-        *(_band_line(edges, float(snr)) for edges, snr in zip(profile.band_hz, profile.band_snr_db, strict=True)),
     ]
+    for (low, high), snr in zip(profile.band_hz, profile.band_snr_db, strict=True):
+        bar = "#" * int(np.clip(round(float(snr) / 2), 0, 40))
+        lines.append(f"  {low:5.0f} - {high:4.0f} Hz {snr:6.1f} dB  {bar}".rstrip())
     for name, values in profile.echo.effects:
         told = [(p.name, values[p.name]) for p in find(name).told if p.name in values]
         figures = ", ".join(f"{key} = {_figures(value)}" for key, value in told)
@@ -69,11 +71,6 @@ def _left_lines(known: LinearApproximation) -> list[str]:
     softer = ", ".join(f"{below[i]:.0f} dB softer {left[i]:.0f}" for i in reversed(range(left.size - 1)))
     lines.append(f"volume      at this volume the path leaves {left[-1]:.0f} dB{'; ' if softer else ''}{softer}")
     return lines
-
-
-def _band_line(edges: Array, snr: float) -> str:
-    bar = "#" * int(np.clip(round(snr / 2), 0, 40))
-    return f"  {edges[0]:5.0f} - {edges[1]:4.0f} Hz {snr:6.1f} dB  {bar}".rstrip()
 
 
 def to_come(path: Samples) -> Array:
