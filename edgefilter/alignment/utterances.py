@@ -33,7 +33,7 @@ LOUD, EXPLAINED = 0.05, 100.0
 13 dB softer. Microphone power, over that of the echo at the present delay, from which on this delay is not the right one;
 single sounds pass a room up to 10 dB better than speech does."""
 LONGEST = SAMPLE_RATE // 4
-"""Samples for which that is believed at most once the robot was heard: so much a human as loud, who begins with it, loses."""
+"""Samples for which that is believed at most once the robot was heard: a human as loud who begins with it loses no more."""
 USUAL = 1e-2
 """Mean square that a voice's loudest hop is taken to have at first, -20 dB: a soft first sound makes nobody else loud."""
 LEARNING = 0.1
