@@ -17,8 +17,7 @@ from edgefilter.echo.effect import RECORDING, complete, neutral
 from edgefilter.echo.effects import catalogue
 from edgefilter.echo.measurement import Measurement
 from edgefilter.echo.model import EchoModel
-from edgefilter.echo.running import reach, stream_form
-from edgefilter.echo.source_chain import SourceChain
+from edgefilter.echo.running import SourceChain, reach, stream_form
 from edgefilter.filter.stream import Stream
 from edgefilter.types import PRE_ROLL, SAMPLE_RATE, Frame
 

@@ -15,7 +15,6 @@ from edgefilter.echo.effect import RECORDING, Effect, complete, vanishes
 from edgefilter.echo.effects.catalogue import chain, find
 from edgefilter.echo.measurement import Measurement, Values
 from edgefilter.echo.running import is_filter
-from edgefilter.echo.source_chain import SourceChain, VoiceChain
 from edgefilter.types import SAMPLE_RATE, Array, Samples
 
 LEAD, TAIL = 1024, 12800
@@ -73,14 +72,6 @@ class EchoModel:
                 x = effect.apply(x, values, SAMPLE_RATE)
         added = [(effect.variance(x, values, SAMPLE_RATE), effect.colour(values)) for effect, values in noisy]
         return tuple(source for each in added for source in zip(*map(np.atleast_2d, each), strict=True))
-
-    def source_chain(self) -> SourceChain:
-        """What the running filter puts the reference through, hop by hop, before the path."""
-        return SourceChain(self.effects)
-
-    def voice_chain(self) -> VoiceChain:
-        """What the running filter puts the predicted voice through, hop by hop, behind the path."""
-        return VoiceChain(self.effects)
 
     def running_response(self) -> Samples:
         """The path with the effects on it that are filters, as after the last change, (taps,): what the running filter starts from."""

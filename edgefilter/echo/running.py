@@ -1,16 +1,17 @@
-"""What of an effect reaches the running filter, and in which form: folded into the path, on windows of a stream, or its own way."""
+"""What of the effects reaches the running filter, hop by hop, ahead of the path and behind it: folded into it, on windows, or its own way."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import cast
 
 import numpy as np
 
 from edgefilter.echo.effect import Effect, Runner, vanishes
+from edgefilter.echo.effects.catalogue import chain
 from edgefilter.echo.measurement import Values
-from edgefilter.types import SAMPLE_RATE, Samples
+from edgefilter.types import SAMPLE_RATE, Array, Samples
 
 MEMORIES = (0, 64, 256, 1024)
 """Samples of the past that are tried for an effect that does not say how many it needs."""
@@ -20,6 +21,71 @@ SHIFTS = (131, 777)
 """Samples by which a filter's input is moved to see its output move along: no rate below 2 kHz has both as periods."""
 SAME = 1e-5
 """Difference, relative in power, up to which two outputs are the same: -50 dB are not heard in what a filter leaves."""
+LONG_MEMORY = SAMPLE_RATE
+"""Samples of the past from which an effect with its own way of running begins anew: two releases of a slow compressor."""
+
+
+class SourceChain:
+    """The reference, block by block, as the source effects of a model hand it to the path, and what no waveform predicts of it.
+
+    effects: (name, values). colours: of each effect that adds noise of its own, the spectral density (601,) per Hz of
+    integral 1. expected: of each of them the expected square (n,) at the microphone of the last block. memory: samples
+    of the past that restart() wants at least.
+    """
+
+    def __init__(self, effects: Sequence[tuple[str, Values]] = ()) -> None:
+        applied = chain(effects)
+        self._makers = [
+            (
+                partial(ExpectedSquare, effect, values, effect.memory or 0) if effect.noise_is_asked else None,
+                stream_form(effect, values) if effect.stage == "source" else None,
+            )
+            for effect, values in applied
+        ]
+        self.colours: list[Array] = [effect.colour(values) for effect, values in applied if effect.noise_is_asked]
+        self.expected: list[Samples] = []
+        self._links = self._new_links()
+        self.memory = LONG_MEMORY if any(run and not isinstance(run, Windowed) for _, run in self._links) else 0
+
+    def _new_links(self) -> list[tuple[ExpectedSquare | None, Runner | None]]:
+        """Of each effect the noise that it adds and what it does to the signal, as before the first sample."""
+        return [(noise() if noise else None, run() if run else None) for noise, run in self._makers if noise or run]
+
+    def __call__(self, block: Samples) -> Samples:
+        """Put a block (n,) through the effects; it follows the last one."""
+        if self.colours:
+            self.expected = []
+        for noise, run in self._links:
+            if noise:
+                self.expected.append(noise(block))
+            if run:
+                block = run(block)
+        return block
+
+    def restart(self, past: Samples) -> Samples:
+        """Put another past (n,) through the effects, in place of the one that was; the next block follows it."""
+        self._links = self._new_links()
+        return self(past)
+
+
+class VoiceChain:
+    """The predicted voice, hop by hop, behind what acts after the path and is no filter: the microphone, above all.
+
+    effects: (name, values); those that are filters are in the impulse response already.
+    """
+
+    def __init__(self, effects: Sequence[tuple[str, Values]] = ()) -> None:
+        behind = [pair for pair in chain(effects) if pair[0].stage in ("path", "microphone")]
+        self._runners = [make() for effect, values in behind if (make := stream_form(effect, values))]
+
+    def __bool__(self) -> bool:
+        return bool(self._runners)
+
+    def __call__(self, voice: Samples, heard: Samples) -> Samples:
+        """The voice (n,) that the path brings, as the microphone hands it on; heard (n,): all that it handed on."""
+        for run in self._runners:
+            voice = run(voice, heard)
+        return voice
 
 
 class Windowed:
@@ -46,15 +112,12 @@ class ExpectedSquare(Windowed):
     """What an effect that no waveform predicts adds to the expected square of each sample, on a stream."""
 
     def __call__(self, x: Samples, heard: Samples | None = None) -> Samples:
-        """Return what the effect adds for the samples x (n,) that set it off, (n,)."""
+        """Return what x (n,) sets off, (n,)."""
         return self._effect.variance(self.window(x), self._values, SAMPLE_RATE)[self._memory :]
 
 
 def stream_form(effect: Effect, values: Values) -> Callable[[], Runner] | None:
-    """What makes the effect for a stream, ahead of the path or behind it, as before the first sample.
-
-    None where it is no such effect, changes nothing, is a filter on the path, or has no such form.
-    """
+    """What makes the effect for a stream, as before the first sample; None where it changes nothing there or is a filter."""
     if effect.stage not in ("source", "path", "microphone") or vanishes(effect, values) or is_filter(effect, values):
         return None
     if effect.run(values, SAMPLE_RATE) is not None:
@@ -90,10 +153,7 @@ def is_filter(effect: Effect, values: Values) -> bool:
 
 
 def _memory(effect: Effect, values: Values) -> int | None:
-    """Samples of the past after which apply on a window is apply on all; None where more than MEMORIES would be needed.
-
-    An effect that says how many it needs is believed, unless it acts on moments of the recording.
-    """
+    """Samples of the past after which apply on a window is apply on all, as it says or by trial; None for more than MEMORIES."""
     if effect.memory is not None:
         return effect.memory
     return None if effect.timed else next((m for m in MEMORIES if _goes_by_windows(effect, values, m)), None)
@@ -110,10 +170,9 @@ def _goes_by_windows(effect: Effect, values: Values, memory: int) -> bool:
 
 def _probe(seed: int) -> Samples:
     """Noise of changing level in the middle of silence, (2 ROOM,)."""
-    rng = np.random.default_rng(seed)
     x = np.zeros(2 * ROOM, np.float32)
     level = 0.2 * (1.0 + np.sin(np.arange(PROBE) / 100.0))
-    x[ROOM // 2 : ROOM // 2 + PROBE] = level * rng.standard_normal(PROBE)
+    x[ROOM // 2 : ROOM // 2 + PROBE] = level * np.random.default_rng(seed).standard_normal(PROBE)
     return x
 
 

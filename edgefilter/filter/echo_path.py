@@ -9,7 +9,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 
 from edgefilter.echo.measurement import Values
-from edgefilter.echo.source_chain import SourceChain, VoiceChain
+from edgefilter.echo.running import SourceChain, VoiceChain
 from edgefilter.filter.canceller import LEARNED, WARM, Canceller, CancellerOutput, CancellerState
 from edgefilter.profile.data import Profile
 from edgefilter.types import SAMPLE_RATE, EventKind, Samples

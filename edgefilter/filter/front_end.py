@@ -9,7 +9,7 @@ from edgefilter.alignment.delay_line import UNLOCATED, Aligned
 from edgefilter.alignment.paper import PaperAligner
 from edgefilter.dsp import fourier
 from edgefilter.dsp.stft import Analyser
-from edgefilter.echo.source_chain import SourceChain
+from edgefilter.echo.running import SourceChain
 from edgefilter.engines.base import ClipEngine, Engine
 from edgefilter.filter.canceller import Canceller, CancellerOutput
 from edgefilter.filter.echo_path import PAST, EchoPath, FilteredHop, Learner, Lesson, starting_path

@@ -12,6 +12,7 @@ import pytest
 
 from edgefilter.echo.effect import STAGES, Effect, neutral
 from edgefilter.echo.effects.catalogue import EFFECTS, chain, register
+from edgefilter.echo.running import SourceChain
 from tests.conformance import EFFECT_CASES, robot_model, robot_speech
 
 PACKAGE = Path(__file__).parents[2] / "edgefilter"
@@ -103,7 +104,7 @@ def test_the_order_in_which_effects_were_found_changes_no_prediction() -> None:
         expected = x
         for effect, values in chain(model.effects):
             expected = effect.apply(expected, values, 16_000)
-        np.testing.assert_allclose(model.source_chain()(x), expected, atol=1e-6)
+        np.testing.assert_allclose(SourceChain(model.effects)(x), expected, atol=1e-6)
     assert all(np.array_equal(found, predictions[0]) for found in predictions)
 
 

@@ -13,7 +13,7 @@ from edgefilter.diagnosis.prepare import prepare
 from edgefilter.echo import user_effects
 from edgefilter.echo.effects.catalogue import find, names
 from edgefilter.echo.measurement import Measurement
-from edgefilter.echo.running import reach, stream_form
+from edgefilter.echo.running import SourceChain, VoiceChain, reach, stream_form
 from edgefilter.echo.user_effects import load_effect
 from edgefilter.errors import UsageError
 from tests.diagnosis.robot_scene import profile, record, voice
@@ -237,7 +237,7 @@ def test_a_path_effect_that_is_no_filter_is_applied_to_the_voice_and_not_to_the_
     bent = robot.with_effect("tilt", {"amount": 0.5})
     assert bent.running_response() is robot.impulse_response
     x = voice(0.5)
-    np.testing.assert_array_equal(bent.voice_chain()(x, x), (x + 0.5 * x * np.abs(x)).astype(np.float32))
+    np.testing.assert_array_equal(VoiceChain(bent.effects)(x, x), (x + 0.5 * x * np.abs(x)).astype(np.float32))
     assert bent.with_running_response(robot.impulse_response).effects == bent.effects
 
 
@@ -247,14 +247,14 @@ def test_a_path_effect_that_is_a_filter_goes_into_the_impulse_response(write):
     tilted = robot.with_effect("tilt", {"amount": 0.5})
     before, after = robot.impulse_response, tilted.running_response()
     np.testing.assert_allclose(after[1 : before.size], before[1:] + 0.5 * before[:-1], atol=1e-6)  # float32
-    assert not tilted.voice_chain() and tilted.with_running_response(after).effects == ()
+    assert not VoiceChain(tilted.effects) and tilted.with_running_response(after).effects == ()
 
 
 def test_a_source_effect_without_memory_runs_on_the_least_past_that_gives_the_same(write):
     echo = "np.concatenate((np.zeros(200, np.float32), x))[: x.size]"
     load_effect(write(GOOD.replace('"path"', '"source"').replace("np.append(0, x[:-1])", f"np.abs({echo})")))
     x, bent = voice(1.0), profile().echo.with_effect("tilt", {"amount": 0.5})
-    source = bent.source_chain()
+    source = SourceChain(bent.effects)
     hops = np.concatenate([source(x[at : at + 256]) for at in range(0, x.size - 255, 256)])
     np.testing.assert_array_equal(hops, find("tilt").apply(x, {"amount": 0.5}, 16000)[: hops.size])
 
@@ -278,4 +278,4 @@ def test_a_run_that_fails_is_one_line(write, result, words):
     odd = GOOD.replace("np.append(0, x[:-1])", "np.abs(x)")
     load_effect(write(f"{odd}\n    def run(self, values, sample_rate):\n        return {result}\n"))
     with pytest.raises(UsageError, match=re.escape(words)):
-        profile().echo.with_effect("tilt", {"amount": 0.5}).voice_chain()(voice(1.0), voice(1.0))
+        VoiceChain([("tilt", {"amount": 0.5})])(voice(1.0), voice(1.0))

@@ -9,6 +9,7 @@ from scipy import signal
 from edgefilter.dsp.stft import StftConfig
 from edgefilter.echo.effect import complete
 from edgefilter.echo.effects.catalogue import find
+from edgefilter.echo.running import SourceChain, VoiceChain
 from edgefilter.filter.canceller import Canceller
 from edgefilter.filter.residual_echo import Residual, Unpredictable
 from tests.conformance import robot_model, robot_speech, running_robot
@@ -66,7 +67,7 @@ def test_a_microphone_that_clips_does_not_teach_the_canceller_another_path() -> 
     model = robot_model().with_effect("mic_clipping", values)
     mic = effect.apply(voice, complete(effect, values), 16_000)
     plain, knowing = Canceller(256, 3072, h), Canceller(256, 3072, h)
-    knowing.behind = model.voice_chain()
+    knowing.behind = VoiceChain(model.effects)
     left = [db(run(canceller, mic, x)) for canceller in (plain, knowing)]
     assert left[1] < left[0] - 20  # the path is known exactly: nothing but rounding and the limiter's caution is left
     off = [db(canceller.impulse_response()[: h.size] - h) for canceller in (plain, knowing)]
@@ -91,7 +92,7 @@ def test_a_gain_control_is_followed_and_takes_nothing_of_the_human() -> None:
 
 
 def test_a_gain_control_that_stood_still_is_not_followed() -> None:
-    assert not robot_model().with_effect("mic_agc", {"gain_db": 2.0, "range_db": 0.1}).voice_chain()
+    assert not VoiceChain([("mic_agc", {"gain_db": 2.0, "range_db": 0.1})])
 
 
 def test_a_changed_fan_is_the_fan_that_is_expected() -> None:
@@ -104,7 +105,7 @@ def test_knocks_are_expected_where_the_reference_sets_them_off() -> None:
     x = robot_speech()[32_000:64_000]
     model = robot_model().with_effect("rattle", {"threshold": 0.02, "power": 1e-3, "decay_ms": 4.0})
     ((whole, colour),) = model.unpredictable(x)
-    source = model.source_chain()
+    source = SourceChain(model.effects)
     found = []
     for at in range(0, x.size, 256):
         source(x[at : at + 256])

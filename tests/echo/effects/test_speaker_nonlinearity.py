@@ -11,6 +11,7 @@ from edgefilter.echo.effects.loudspeaker_fit import fit_laws
 from edgefilter.echo.effects.path_and_loudspeaker import fit_path_and_loudspeaker
 from edgefilter.echo.measurement import Measurement
 from edgefilter.echo.model import EchoModel
+from edgefilter.echo.running import SourceChain
 from edgefilter.errors import UsageError
 from edgefilter.types import PRE_ROLL
 from tests.conformance import EFFECT_CASES, fan, robot_alone, robot_model, robot_speech
@@ -167,7 +168,7 @@ def test_driven_hop_by_hop_is_the_same_as_at_once(sizes):
     whole = x
     for effect, values in catalogue.chain(model.effects):
         whole = effect.apply(whole, values, 16_000)
-    driver, at, out = model.source_chain(), 0, []
+    driver, at, out = SourceChain(model.effects), 0, []
     while at < x.size:
         size = sizes[len(out) % len(sizes)]
         out.append(driver(x[at : at + size]))
@@ -182,10 +183,10 @@ def test_driver_goes_on_after_its_past_was_rewritten():
         robot_speech()[:8192],
         robot_model().with_effect("speaker_nonlinearity", CASE),
     )
-    driver = model.source_chain()
+    driver = SourceChain(model.effects)
     driver(np.full(256, 0.3, np.float32))
     history = driver.restart(x[:4096])
     again = [driver(x[at : at + 256]) for at in range(4096, x.size, 256)]
-    whole = model.source_chain()(x)
+    whole = SourceChain(model.effects)(x)
     np.testing.assert_allclose(history, whole[:4096], atol=1e-6)
     np.testing.assert_allclose(np.concatenate(again), whole[4096:], atol=1e-6)
