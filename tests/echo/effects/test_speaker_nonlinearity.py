@@ -8,12 +8,10 @@ from edgefilter.dsp.membrane import MOTION_Q, motion
 from edgefilter.echo.effect import complete, vanishes
 from edgefilter.echo.effects import catalogue
 from edgefilter.echo.effects.loudspeaker_fit import fit_laws
-from edgefilter.echo.effects.path_and_loudspeaker import fit_path_and_loudspeaker
 from edgefilter.echo.measurement import Measurement
 from edgefilter.echo.model import EchoModel
 from edgefilter.echo.running import SourceChain
 from edgefilter.errors import UsageError
-from edgefilter.types import PRE_ROLL
 from tests.conformance import EFFECT_CASES, fan, robot_alone, robot_model, robot_speech
 
 DISTORT = catalogue.find("speaker_nonlinearity")
@@ -130,28 +128,6 @@ def test_no_value_within_the_bounds_adds_more_than_in_proportion():
 def test_values_of_the_polynomial_that_this_effect_was_are_refused_by_name():
     with pytest.raises(UsageError, match="no parameter 'saturation': it takes force_factor, stiffness, damping"):
         complete(DISTORT, {"saturation": 0.0, "odd": -0.5})
-
-
-def test_path_and_loudspeaker_are_found_without_a_calibration():
-    x, truth = robot_speech(), robot_model().with_effect("speaker_nonlinearity", CASE)
-    recording = truth.predict(x) + fan(x.size)
-    weights = (np.arange(x.size) < 128_000).astype(np.float32)
-    response, values = fit_path_and_loudspeaker(x, recording, weights, taps=4000)
-    assert response.shape == (4000,) and int(np.argmax(np.abs(response))) == PRE_ROLL
-    later = slice(128_000, None)
-
-    def over_fan(model: EchoModel) -> float:
-        return float(np.mean((recording - fan(x.size) - model.predict(x))[later] ** 2))
-
-    alone = over_fan(EchoModel(response))
-    # what is left is the path's: eight seconds of a regular voice do not teach all of its 4000 taps
-    assert over_fan(EchoModel(response).with_effect("speaker_nonlinearity", values)) < 0.3 * alone
-
-
-def test_path_without_distortion_leaves_the_loudspeaker_neutral():
-    x = robot_speech()
-    _, values = fit_path_and_loudspeaker(x, robot_model().predict(x) + fan(x.size), taps=4000)
-    assert vanishes(DISTORT, values)
 
 
 @pytest.mark.parametrize("sizes", [[256], [1, 700, 13]])
