@@ -13,22 +13,24 @@ from edgefilter.errors import UsageError
 from edgefilter.types import Array, Samples
 
 Stage: TypeAlias = Literal["source", "path", "time", "microphone", "noise"]
-STAGES: tuple[Stage, ...] = ("source", "path", "time", "microphone", "noise")
+STAGES: tuple[Stage, ...] = get_args(Stage)
 """In the order in which sound meets them."""
 Family: TypeAlias = Literal[
     "static nonlinearity", "dynamics", "linear path", "time", "modulation", "additive noise", "of your own"
 ]
-"""What kind of change an effect is: a curve that each sample goes through, a gain by level, a filter, the clock, a gain by time,
-noise; an effect of the user's own need not say."""
+"""A curve that each sample goes through, a gain by level, a filter, the clock, a gain by time, noise; your own need not say."""
 FAMILIES: tuple[Family, ...] = get_args(Family)
 Experiment: TypeAlias = Literal["levels", "tone", "tail", "sweep", "place", "minute"]
-"""Another recording in which an effect shows itself: at two volumes, of a steady tone, of silence after a word, of a
-sweep, at another place, of a minute."""
+"""A recording that shows an effect: at two volumes, of a steady tone, of silence after a word, of a sweep, at another place, of a minute."""
+NEVER_S = 1e6
+"""Seconds: a moment that no recording reaches, ten days, as the value of an event that does not happen."""
+NEVER_REACHED = 100.0
+"""Full scale: an amplitude that no signal reaches, 40 dB over the largest sample, as the value of a bound that does nothing."""
 
 
 @dataclass(frozen=True, slots=True)
 class Parameter:
-    """One number of an effect, or an array of such numbers: unit, the value at which the effect vanishes, the values that are possible.
+    """One number of an effect, or an array of such numbers: unit, the value at which the effect vanishes, the least and the largest.
 
     given: whether it is taken over from elsewhere, such as the calibrated fan, rather than fitted.
     """
@@ -42,19 +44,14 @@ class Parameter:
 
 
 RECORDING = Parameter("recording", "fingerprint", 0.0, 0.0, 2.0**52, given=True)
-"""Every event's last parameter: the recording in which it happened (Measurement.fingerprint); 0 for whichever is looked
-at."""
+"""Every event's last parameter: the recording in which it happened (Measurement.fingerprint); 0 for any."""
 
 
 class Runner(Protocol):
     """One effect at work on a stream: what it remembers it carries on from one hop to the next."""
 
     def __call__(self, x: Samples, heard: Samples | None = None) -> Samples:
-        """What the effect makes of the next samples x (n,), (n,).
-
-        heard: the microphone's samples (n,) of the same moment, for an effect behind the path; None ahead of it.
-        """
-        ...
+        """The next samples x (n,) after the effect. heard: the microphone's (n,) of the same moment, None ahead of the path."""
 
 
 class Effect:
@@ -65,20 +62,19 @@ class Effect:
     voice at the microphone; "noise" changes the noise that is expected and leaves the voice alone.
 
     What the model asks:
-    memory: samples of the past that apply needs, 0 for none: on a stream it is given so many at every hop. None where
-    that is not known, or too much: then the running filter asks run(), or tries how many are enough (echo/running.py).
+    memory: samples of the past that apply needs on a stream at every hop, 0 for none. None where that is not known, or
+    too much: then the running filter asks run(), or tries how many are enough (echo/running.py).
     run_note: a sentence on what the running filter makes of the effect, where that is not what apply does.
     event: whether the values belong to one recording (moments, a gain's curve) rather than to the robot: they get a
     parameter RECORDING besides their own, and in other recordings the effect is left out. followed: whether the running
-    filter follows it by itself, as its aligner does a drift, so that a fit of others takes it out of the recording first
-    (diagnosis/joint.py); it does not ask for the variance() of one that it follows.
+    filter follows it by itself, as its aligner does a drift: it does not ask for variance(), and a fit of other effects
+    takes it out of the recording first (diagnosis/joint.py).
 
     What the diagnosis asks:
-    family: what kind of change it is. title: as it reads inside a sentence ("a turned volume"); by default the name.
-    complexity: of two effects that explain about as much the lower one is named; from 4 on it is a long filter, which
-    half a minute does not teach. cost: of a fit, in tenths of a second. flexible: whether it has so many numbers that
-    it takes up what a simpler effect beside it does. shown_by: recordings in which it differs from effects without them
-    (diagnosis/advice.py).
+    title: how it reads inside a sentence ("a turned volume"); by default the name. complexity: of two effects that
+    explain about as much the lower one is named; from 4 on it is a long filter, which half a minute does not teach.
+    cost: of a fit, in tenths of a second. flexible: whether it has so many numbers that it takes up what a simpler effect
+    beside it does. shown_by: recordings in which it differs from effects without them (diagnosis/advice.py).
     """
 
     name: ClassVar[str]
@@ -98,24 +94,15 @@ class Effect:
     shown_by: ClassVar[tuple[Experiment, ...]] = ()
 
     def apply(self, x: Samples, values: Values, sample_rate: int) -> Samples:
-        """The signal (n,) after the effect; x is not written to.
-
-        By default x itself, as for an effect of stage "noise".
-        """
+        """The signal (n,) after the effect; x is not written to. By default x itself, as for an effect of stage "noise"."""
         return x.copy()
 
     def run(self, values: Values, sample_rate: int) -> Runner | None:
-        """The effect on a stream, for one that remembers more than a few samples or follows what the microphone hears.
-
-        None: there is no such form, apply is what there is.
-        """
+        """The effect on a stream, for one that remembers much or follows what the microphone hears; None: apply is all there is."""
         return None
 
     def fit(self, measurement: Measurement, model: VoiceModel) -> Values:
-        """Values with which the model, this effect added, comes closest to the recording (least squares).
-
-        By default the neutral ones.
-        """
+        """Values with which the model, this effect added, comes closest to the recording; by default the neutral ones."""
         return neutral(self)
 
     def noise_psd(self, values: Values, psd: Samples) -> Samples:
@@ -138,7 +125,7 @@ class Effect:
         return values
 
     def sentence(self, values: Values) -> str:
-        """What in a recording speaks for the effect, with its figures; empty: nothing but that the residual falls."""
+        """What in a recording speaks for the effect, with figures; empty: nothing but that the residual falls."""
         return ""
 
     def plausible(self, evidence: Evidence) -> bool:
@@ -167,20 +154,17 @@ class Effect:
 
     @property
     def scales_fan(self) -> bool:
-        """Whether the fan gets the same gain as the voice: what changes with time behind the microphone is a gain of all that it hears."""
+        """Whether the fan gets the same gain as the voice: a gain by time behind the microphone."""
         return self.stage == "microphone" and self.event
 
     @property
     def shows_in_silence(self) -> bool:
-        """Whether the robot's silences tell it together with the voice: a gain by level behind the microphone, which the fan goes through as well.
-
-        It is looked for before the search and behind it (diagnosis/noise_change.py), not in it.
-        """
+        """Whether silences tell it together with the voice: a gain by level behind the microphone (diagnosis/noise_change.py)."""
         return self.stage == "microphone" and self.family == "dynamics" and not self.event
 
     @property
     def lengthens(self) -> bool:
-        """Whether it makes a path longer than a recording teaches it at first: a filter of many taps that shows in the silence after a word."""
+        """Whether it makes a path longer than a recording teaches at first: many taps that show in the silence after a word."""
         return self.flexible and "tail" in self.shown_by
 
     @property
@@ -242,11 +226,17 @@ def vanishes(effect: Effect, values: Values) -> bool:
     return all(np.array_equal(values[name], value) for name, value in neutral(effect).items())
 
 
+def within(effect: Effect, values: Values) -> dict[str, float | Array]:
+    """The values, each held within its bounds."""
+    held = {p.name: np.clip(values[p.name], p.low, p.high) for p in effect.parameters if p.name in values}
+    return {name: value if value.ndim else float(value) for name, value in held.items()}
+
+
 def first(values: Values, name: str) -> float:
     """A parameter as one number: the first where it holds several."""
     return float(np.ravel(values[name])[0])
 
 
-def number_or_taps(weights: Array) -> float | Array:
-    """A fitted filter (n,) as a parameter's value: the number itself where it has one tap only."""
-    return float(weights[0]) if weights.size == 1 else weights
+def numbers(values: Values, name: str) -> Array:
+    """A parameter as an array, also where it is one number, (k,) float64."""
+    return np.atleast_1d(np.asarray(values[name], float))

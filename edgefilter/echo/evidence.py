@@ -19,15 +19,12 @@ class Score:
 
     level_db: negative log likelihood of the residual's cells of time and frequency, in dB for each degree of freedom:
     Student's t of as many degrees as a cell has (Lange, Little & Taylor 1989, "Robust statistical modeling using the t
-    distribution"), around the noise that the model expects. Far over that it is the mean of the cells' dB: many cells count,
-    not the loudest. Noise that a model expects on top of the ordinary costs half of its dB: else anything could be called
-    noise.
-    over_db: the same without that cost: what is left over what is expected.
-
+    distribution"), around the noise that the model expects. Far over that it is the mean of the cells' dB: many cells
+    count, not the loudest. Noise that a model expects on top of the ordinary costs half of its dB: else anything could
+    be called noise. over_db: the same without that cost.
     excess_db: mean power of the held-out whitened residual, dB. active_db, silent_db: while the robot is heard, and is
-    not. fitted_db: of the samples to fit on, while it is heard.
-    What a model says that no waveform predicts counts as fan in these; irreducible_db: the excess over the fan alone
-    then, else 0.
+    not. fitted_db: of the samples to fit on, while it is heard. Noise that a model expects counts as fan in these;
+    irreducible_db: the excess over the fan alone then, else 0.
     cells: (times, bands) power over the fan. prediction: (n,) with the ordinary tolerances taken up.
     """
 
@@ -46,7 +43,7 @@ class Grid(Protocol):
     """The recording in cells of time and frequency, held-out ones alone, as the scorer of a diagnosis cuts it.
 
     starts: (times,) first sample of each. active_cells: (times,) bool, where the robot is heard. band_hz: (bands, 2)
-    edges. freedom: (bands,) degrees of freedom of a cell. usable: (n,) bool, samples where nobody else talks.
+    edges. freedom: (bands,) degrees of freedom of a cell.
     """
 
     starts: NDArray[np.signedinteger]
@@ -57,20 +54,16 @@ class Grid(Protocol):
     @property
     def measurement(self) -> Measurement:
         """The recording beside its reference."""
-        ...
 
     @property
     def usable(self) -> NDArray[np.bool_]:
         """Samples where nobody else talks, (n,)."""
-        ...
 
     def cells(self, residual: Samples) -> Array:
         """Power of a signal (n,) over the fan's, (times, bands)."""
-        ...
 
     def over_db(self, prediction: Samples, noise: Array) -> float:
         """Score.over_db of another prediction (n,), with noise (times, bands) over the fan's expected in the cells."""
-        ...
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,18 +12,18 @@ from edgefilter.dsp.convolution import convolve
 from edgefilter.types import Array, Samples
 
 NUISANCE_TAPS, NUISANCE_LEAD = 16, 8
-"""Of the filter on a prediction that takes up what is ordinary: a slightly other gain, a move of less than a
-millimetre."""
+"""Of the filter on a prediction that takes up what is ordinary: a slightly other gain, a move of less than a millimetre."""
 CHUNK = 8192
 """Rows that are multiplied at once, so that memory stays bounded."""
+RIDGE = 1e-6
+"""Of an unknown's own energy: keeps equations soluble, and changes no weight that is heard."""
 
 
 @dataclass(frozen=True, eq=False)
 class Normal:
     """Normal equations of target(n) = sum over c and k of w[c, k] column_c(n + lead - k), summed over the chosen n.
 
-    matrix: (C * taps, C * taps) float64. right: (C * taps,). energy: of the target over the chosen samples. count: how
-    many these are.
+    matrix: (C * taps, C * taps) float64. right: (C * taps,). energy: of the target over these samples. count: of them.
     """
 
     matrix: Array
@@ -32,34 +32,39 @@ class Normal:
     count: int
     taps: int
 
-    def solve(self, ridge: float = 1e-6, use: np.ndarray | None = None) -> tuple[Array, float]:
+    def solve(self, ridge: float = RIDGE, use: np.ndarray | None = None) -> tuple[Array, float]:
         """Weights (C, taps) float64 and the energy that they leave; ridge is relative to each column's own energy.
 
         use: (C, taps) bool, the taps that may differ from zero, None for all.
         """
         chosen = np.arange(self.right.size) if use is None else np.flatnonzero(use)
         matrix, right = self.matrix[np.ix_(chosen, chosen)], self.right[chosen]
-        scale = (
-            np.sqrt(np.repeat(self.matrix.diagonal().reshape(-1, self.taps).mean(axis=1), self.taps))[chosen] + 1e-30
-        )
-        scaled = matrix / scale[:, None] / scale
-        w = np.linalg.solve(scaled + ridge * np.eye(scale.size), right / scale) / scale
+        energy = np.repeat(self.matrix.diagonal().reshape(-1, self.taps).mean(axis=1), self.taps)[chosen]
+        w = ridge_solved(matrix, right, ridge, energy)
         left = self.energy - 2.0 * float(w @ right) + float(w @ matrix @ w)
         weights = np.zeros(self.right.size)
         weights[chosen] = w
         return weights.reshape(-1, self.taps), max(left, 0.0)
 
 
+def ridge_solved(matrix: Array, right: Array, ridge: Array | float, energy: Array | None = None) -> Array:
+    """Weights (k,) of normal equations (k, k), (k,); ridge, (k,) or one for all, is relative to energy (k,): by default each one's own."""
+    scale = np.sqrt(matrix.diagonal() if energy is None else energy) + 1e-30
+    scaled = matrix / scale[:, None] / scale
+    return np.linalg.solve(scaled + np.diag(np.broadcast_to(ridge, scale.shape)), right / scale) / scale
+
+
+def at_lags(x: Samples, taps: int, lead: int) -> Samples:
+    """The samples of x (n,) that a filter reads at each moment, (n, taps), a view: tap k a delay of k - lead, silence outside of x."""
+    return sliding_window_view(np.pad(x, (taps - 1 - lead, lead)), taps)[:, ::-1]
+
+
 def normal_equations(
     columns: Sequence[Samples], target: Samples, taps: int, lead: int = 0, fit: np.ndarray | None = None
 ) -> Normal:
-    """Normal equations for columns (C, n) and a target (n,); fit (n,) bool: the samples that count, None for all.
-
-    Tap k of a column is a delay of k - lead samples; outside of a column there is silence.
-    """
+    """Normal equations for columns (C, n), each at_lags(), and a target (n,); fit (n,) bool: the samples that count, None for all."""
     n, size = target.size, len(columns) * taps
-    padded = [np.concatenate((np.zeros(taps - 1 - lead, np.float32), c, np.zeros(lead, np.float32))) for c in columns]
-    windows = [sliding_window_view(c, taps)[:, ::-1] for c in padded]
+    windows = [at_lags(column, taps, lead) for column in columns]
     matrix, right, energy, count = np.zeros((size, size)), np.zeros(size), 0.0, 0
     used = None if fit is None else np.flatnonzero(fit)
     for at in range(0, n if used is None else used.size, CHUNK):
@@ -73,29 +78,19 @@ def normal_equations(
     return Normal(matrix, right, energy, count, taps)
 
 
-def short_filter(x: Samples, taps: Samples) -> Samples:
-    """The full convolution of x (n,) and taps (t,), (n + t - 1,): by the way that is faster for a hop, or for a recording."""
-    return (
-        convolve(x, taps).astype(np.float32, copy=False) if x.size > CHUNK and taps.size > 4 else np.convolve(x, taps)
-    )
-
-
 def filtered(columns: Sequence[Samples], weights: Array, lead: int = 0) -> Samples:
-    """Sum over c of column_c filtered by weights[c]: (n,) float32.
-
-    Weights (C, taps), tap k a delay of k - lead samples.
-    """
+    """Sum over c of column_c filtered by weights[c] (C, taps), tap k a delay of k - lead samples: (n,) float32."""
     n = columns[0].size
     out = np.zeros(n, np.float32)
-    for column, w in zip(columns, weights, strict=True):
+    for column, w in zip(columns, weights.astype(np.float32), strict=True):
         if n and w.any():
-            out += short_filter(np.concatenate((column, np.zeros(lead, np.float32))), w.astype(np.float32))[
-                lead : lead + n
-            ]
+            padded = np.pad(column, (0, lead))
+            many = padded.size > CHUNK and w.size > 4  # then transforms are faster than sums
+            out += (convolve if many else np.convolve)(padded, w)[lead : lead + n]
     return out
 
 
 def absorbed(predicted: Samples, target: Samples, fit: np.ndarray | None = None) -> Samples:
-    """Put predicted (n,) through the short filter that brings it closest to target (n,): what is left is no ordinary tolerance."""
+    """Put predicted (n,) through the short filter that brings it closest to target (n,): what is left is not ordinary."""
     weights, _ = normal_equations([predicted], target, NUISANCE_TAPS, NUISANCE_LEAD, fit).solve()
     return filtered([predicted], weights, NUISANCE_LEAD)

@@ -18,8 +18,12 @@ from edgefilter.types import SAMPLE_RATE, Array, Samples
 Values: TypeAlias = Mapping[str, "float | Array"]
 """The parameters of one effect by name."""
 Result = TypeVar("Result")
+SILENT = 0.1
+"""Part of the fan's power under which a predicted voice leaves the fan alone: the two are 0.4 dB louder than the fan."""
+ORDINARY_DB = 0.4
+"""By which a gain differs at most from day to day, or from the beginning to the end of a minute: less is none."""
 REMEMBERED = 6
-"""Models whose predictions a measurement keeps."""
+"""Models whose predictions a measurement keeps: one that a search goes on from, and some beside it."""
 
 
 class VoiceModel(Protocol):
@@ -28,21 +32,13 @@ class VoiceModel(Protocol):
     @property
     def impulse_response(self) -> Samples:
         """The linear path, starting PRE_ROLL samples before the direct sound, (taps,)."""
-        ...
-
-    @property
-    def effects(self) -> tuple[tuple[str, Values], ...]:
-        """Name and values of each effect that the model has already."""
-        ...
 
     @property
     def timed(self) -> bool:
         """Whether what the model predicts depends on when the recording began."""
-        ...
 
     def predict(self, reference: Samples) -> Samples:
         """The robot's voice at the microphone (n,) for an aligned reference (n,)."""
-        ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,10 +63,7 @@ class Measurement:
         return np.ones(self.recording.size, np.float32) if self.fit is None else self.fit.astype(np.float32)
 
     def whiten(self, x: Samples) -> Samples:
-        """Put x (n,) through a zero-phase filter after which the fan is white with variance 1.
-
-        X itself where the fan is unknown.
-        """
+        """The signal x (n,) through a zero-phase filter after which the fan is white with variance 1; x itself where the fan is unknown."""
         return x if self._whitening is None else _centred(x, self._whitening)
 
     @cached_property
@@ -81,7 +74,6 @@ class Measurement:
 
     @cached_property
     def _whitening(self) -> Samples | None:
-        """Taps of the whitening filter, (taps,)."""
         return None if self.noise_psd is None else whitening_taps(self.noise_psd)
 
     @cached_property
@@ -90,10 +82,7 @@ class Measurement:
         return self.whiten(self.recording)
 
     def heard(self, model: VoiceModel) -> tuple[Samples, Samples]:
-        """What a model predicts for the reference, and that whitened, (n,) each.
-
-        Remembered for the latest few models, not to be written to.
-        """
+        """What a model predicts for the reference, and that whitened, (n,) each; remembered, not to be written to."""
         known = self._heard.pop(model, None)
         if known is None:
             predicted = model.predict(self.reference)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import takewhile
@@ -15,10 +15,11 @@ from edgefilter.echo.effect import RECORDING, Effect, complete, vanishes
 from edgefilter.echo.effects.catalogue import chain, find
 from edgefilter.echo.measurement import Measurement, Values
 from edgefilter.echo.running import is_filter
+from edgefilter.echo.wiener import LONGEST
 from edgefilter.types import SAMPLE_RATE, Array, Samples
 
-LEAD, TAIL = 1024, 12800
-"""Samples (64 ms, 0.8 s) by which filters may begin before the impulse response does, and lengthen it."""
+LEAD = 1024
+"""Samples (64 ms) by which filters may begin before the impulse response does."""
 
 Chain: TypeAlias = Sequence[tuple[Effect, Values]]
 
@@ -28,9 +29,7 @@ class EchoModel:
     """A linear path and the effects around it.
 
     impulse_response: (taps,) float32 from the reference to the microphone, starting PRE_ROLL samples before the direct
-    sound.
-    effects: (name, values) in the order in which they were added; applied they are in the catalogue's, so that the
-    order in which effects were found changes nothing that is predicted.
+    sound. effects: (name, values) in the order in which they were added; they are applied in the catalogue's.
     """
 
     impulse_response: Samples
@@ -44,17 +43,14 @@ class EchoModel:
 
     @cached_property
     def _chain(self) -> tuple[Chain, Samples, int, Chain]:
-        """Effects ahead of the path; the path with the filters right behind it, (taps,); the samples by which it begins early; effects behind.
-
-        One convolution in place of several is what makes a search fast.
-        """
+        """Effects ahead; the path and the filters right behind it as one, (taps,); by how much it begins early; effects behind."""
         applied = chain(self.effects)
         ahead = [pair for pair in applied if pair[0].stage == "source"]
         behind = applied[len(ahead) :]
         filters = list(takewhile(lambda pair: pair[0].absorbed, behind))
         if not filters:
             return ahead, self.impulse_response, 0, behind
-        path = np.pad(self.impulse_response, (LEAD, TAIL))
+        path = np.pad(self.impulse_response, (LEAD, LONGEST))
         for effect, values in filters:
             path = effect.apply(path, values, SAMPLE_RATE)
         size = max(LEAD + self.impulse_response.size, _heard(path, 1e-6))
@@ -66,39 +62,33 @@ class EchoModel:
         noisy = [(effect, values) for effect, values in applied if effect.adds_noise]
         if not noisy:
             return ()
-        x = reference
-        for effect, values in applied:
-            if effect.stage == "time" or (effect.stage == "source" and not effect.adds_noise):
-                x = effect.apply(x, values, SAMPLE_RATE)
+        moved = [(e, v) for e, v in applied if e.stage == "time" or (e.stage == "source" and not e.adds_noise)]
+        x = _through(moved, reference)
         added = [(effect.variance(x, values, SAMPLE_RATE), effect.colour(values)) for effect, values in noisy]
         return tuple(source for each in added for source in zip(*map(np.atleast_2d, each), strict=True))
 
     def running_response(self) -> Samples:
         """The path with the effects on it that are filters, as after the last change, (taps,): what the running filter starts from."""
-        linear = [(effect, values) for effect, values in chain(self.effects) if is_filter(effect, values)]
+        linear = [
+            (effect, effect.settled(values)) for effect, values in chain(self.effects) if is_filter(effect, values)
+        ]
         if not linear:
             return self.impulse_response
-        response = np.pad(self.impulse_response, (0, TAIL))
-        for effect, values in linear:
-            response = effect.apply(response, effect.settled(values), SAMPLE_RATE)
+        response = _through(linear, np.pad(self.impulse_response, (0, LONGEST)))
         return response[: max(self.impulse_response.size, _heard(response, 1e-4))]
 
     def with_running_response(self, response: Samples, gain: float = 1.0) -> EchoModel:
         """The model whose running_response() begins with response (taps,) and goes on as that of this one times gain.
 
-        The effects that are filters have been applied to both parts and cannot be taken out again (a band limit has no
-        inverse); they are in the impulse response now, and listing them would apply them twice.
+        The effects that are filters are in its impulse response, and no longer listed.
         """
         rest = self.running_response()[response.size :] * np.float32(gain)
         folded = {effect.name for effect, values in chain(self.effects) if is_filter(effect, values)}
-        kept = tuple(entry for entry in self.effects if entry[0] not in folded)
-        return replace(self, impulse_response=np.concatenate((response, rest)).astype(np.float32), effects=kept)
+        kept = self._with_those(lambda name, values: name not in folded)
+        return replace(kept, impulse_response=np.concatenate((response, rest)).astype(np.float32))
 
     def components(self, reference: Samples) -> dict[str, Samples]:
-        """What each part contributes, (n,) each: "linear", the path alone, then by how much each effect in turn changes it.
-
-        The sum of all components is predict(reference).
-        """
+        """What each part contributes to predict(reference), (n,) each: "linear", the path alone, then the change by each effect in turn."""
         parts = {"linear": replace(self, effects=()).predict(reference)}
         before = parts["linear"]
         for count, (name, _) in enumerate(self.effects, start=1):
@@ -108,15 +98,9 @@ class EchoModel:
         return parts
 
     def microphone_gain(self, size: int) -> Samples:
-        """The gain that an effect behind the microphone gives voice and fan alike at each moment, (size,).
-
-        Ones without one.
-        """
-        gain = np.ones(size, np.float32)
-        for effect, values in chain(self.effects):
-            if effect.scales_fan:
-                gain = effect.apply(gain, values, SAMPLE_RATE)
-        return gain
+        """The gain that effects behind the microphone give voice and fan alike at each moment, (size,), ones without any."""
+        scaling = [(effect, values) for effect, values in chain(self.effects) if effect.scales_fan]
+        return _through(scaling, np.ones(size, np.float32))
 
     def expected_noise(self, psd: Samples) -> Samples:
         """PSD of the fan with the model's effects on it, (601,), from psd (601,) of the calibration."""
@@ -135,11 +119,14 @@ class EchoModel:
         Raises UsageError for an unknown effect, an unknown parameter or a value out of bounds.
         """
         entry = (name, complete(find(name), values))
-        return replace(self, effects=(*(kept for kept in self.effects if kept[0] != name), entry))
+        return replace(self, effects=(*self.without_effect(name).effects, entry))
 
     def without_effect(self, name: str) -> EchoModel:
         """The model without that effect."""
-        return replace(self, effects=tuple(kept for kept in self.effects if kept[0] != name))
+        return self._with_those(lambda other, _: other != name)
+
+    def _with_those(self, kept: Callable[[str, Values], bool]) -> EchoModel:
+        return replace(self, effects=tuple(entry for entry in self.effects if kept(*entry)))
 
     def fit(self, name: str, measurement: Measurement) -> EchoModel:
         """The model with that effect at the values that explain the measurement best."""
@@ -148,8 +135,7 @@ class EchoModel:
     def fitted(self, name: str, measurement: Measurement) -> dict[str, float | Array]:
         """All values of an effect that the model has not, as they explain the measurement best.
 
-        It is fitted behind the effects that the catalogue puts ahead of it. The values of an event, unless it vanishes, say in
-        which recording it happened.
+        It is fitted behind the effects that the catalogue puts ahead of it. An event's values say in which recording it happened.
         """
         effect, behind, model = find(name), measurement, self
         if effect.stage == "source":
@@ -165,17 +151,12 @@ class EchoModel:
 
     def lasting(self) -> EchoModel:
         """The model without its events: what holds of the robot in any recording."""
-        return replace(self, effects=tuple((name, values) for name, values in self.effects if not find(name).event))
+        return self._with_those(lambda name, _: not find(name).event)
 
     def during(self, measurement: Measurement) -> EchoModel:
-        """The model without the events of other recordings: a jump or a moment's move does not come again at the same second of another one."""
+        """The model without the events of other recordings: a jump does not come again at the same second of another one."""
         here = (0.0, measurement.fingerprint)
-        kept = tuple(
-            (name, values)
-            for name, values in self.effects
-            if not find(name).event or values.get(RECORDING.name, 0.0) in here
-        )
-        return self if len(kept) == len(self.effects) else replace(self, effects=kept)
+        return self._with_those(lambda name, values: not find(name).event or values.get(RECORDING.name, 0.0) in here)
 
 
 def _through(effects: Chain, x: Samples) -> Samples:

@@ -18,6 +18,8 @@ SETTLED = 1e-6
 """A step that explains less than this part of what all before it have explained is the last."""
 DELAYS = np.arange(-8.0, 8.01, 0.1)
 """Samples by which the lag of a filtered recording may be off: it is found as that of the loudest frequencies."""
+LONGEST = 12800
+"""Taps of the longest filter that is fitted, 0.8 s: the decay by 60 dB of an office, by 40 dB of a hall."""
 
 
 def convolve_from(x: Samples, taps: Array, lead: int) -> Samples:
@@ -34,13 +36,12 @@ def fit_filter(
     x, target: (n,), whitened, so that the noise has variance 1. weights: (n,) 0 to 1. prior: (taps,) expected c^2;
     None: no penalty but a tiny one. Preconditioned conjugate gradients on the normal equations (Golub & Van Loan,
     Matrix Computations, 11.5) with a circulant preconditioner; stopping after `steps` leaves out what the data hardly
-    speaks of. Not scipy's cg: what a step explains, by which this one stops, can be had from its iterates only as a
-    difference, which the transforms' float32 drowns.
+    speaks of. Not scipy's cg, whose iterates do not tell what a step explains: float32 drowns the difference.
     """
     blocks = _Blocks(x, weights, taps, lead)
     share = float(np.mean(weights))
     size = fft.next_fast_len(2 * taps, real=True)
-    power = np.maximum(fft.rfft(_windowed(blocks.correlation(), taps, size)).real, 0.0) * max(share, 1e-6)
+    power = np.maximum(fft.rfft(_circulant(x.astype(np.float32), taps, size)).real, 0.0) * max(share, 1e-6)
     penalty = np.full(taps, 1e-9 * float(power.max()) + 1e-12) if prior is None else 1.0 / np.maximum(prior, 1e-12)
     lightest = float(np.min(penalty))
     scale = np.sqrt(lightest / penalty)
@@ -69,76 +70,61 @@ def fit_filter(
     return c
 
 
-def fit_supported(
-    x: Samples, target: Samples, weights: Samples, taps: int, lead: int, prior: Array, steps: int
-) -> Array:
-    """Return fit_filter's answer, or zeros where a filter from half of the weighted samples does not help on the other half (BLOCKs, two by two)."""
-    half = np.arange(x.size) // BLOCK % 4 < 2
-    trial = convolve_from(x, fit_filter(x, target, weights * half, taps, lead, prior, steps // 2), lead)
+def fit_supported(x: Samples, target: Samples, weights: Samples, lead: int, prior: Array) -> Array:
+    """fit_filter's answer; zeros where a filter from half of the samples does not help on the other half (BLOCKs, two by two)."""
+    half, taps = np.arange(x.size) // BLOCK % 4 < 2, prior.size
+    trial = convolve_from(x, fit_filter(x, target, weights * half, taps, lead, prior, steps=20), lead)
     fall = float(np.dot(target * target - (target - trial) ** 2, weights * ~half))
-    return fit_filter(x, target, weights, taps, lead, prior, steps) if fall > 0.0 else np.zeros(taps)
+    return fit_filter(x, target, weights, taps, lead, prior, steps=40) if fall > 0.0 else np.zeros(taps)
 
 
 class _Blocks:
-    """Cut x (n,) into the blocks of a weighted convolution, those without weight left out: overlap-save.
-
-    The blocks are those between two changes of the samples that are fitted on, so that half of them drop out; their
-    transforms stay in the cache.
-    """
+    """x (n,) in the BLOCKs of a weighted convolution, overlap-save: those that are not fitted on drop out."""
 
     def __init__(self, x: Samples, weights: Samples, taps: int, lead: int) -> None:
-        self._taps = taps
-        self._size, self._new = fft.next_fast_len(taps - 1 + BLOCK, real=True), BLOCK
-        count = -(-x.size // self._new)
-        padded = np.pad(np.asarray(weights, np.float32), (0, count * self._new - x.size)).reshape(count, self._new)
+        self._taps, self._size = taps, fft.next_fast_len(taps - 1 + BLOCK, real=True)
+        self._new = slice(taps - 1, taps - 1 + BLOCK)
+        count = -(-x.size // BLOCK)
+        padded = np.pad(np.asarray(weights, np.float32), (0, count * BLOCK - x.size)).reshape(count, BLOCK)
         self._used = np.flatnonzero(padded.any(axis=1))
         self._weights = padded[self._used]
-        self._x = x.astype(np.float32)
-        after = lead + count * self._new - x.size + self._size
-        before = np.concatenate((np.zeros(taps - 1 - lead, np.float32), self._x, np.zeros(after, np.float32)))
-        pieces = before[self._used[:, None] * self._new + np.arange(self._size)]
-        self._source = fft.rfft(pieces, axis=1)
+        around = np.pad(x.astype(np.float32), (taps - 1 - lead, lead + count * BLOCK - x.size + self._size))
+        self._source = fft.rfft(around[self._used[:, None] * BLOCK + np.arange(self._size)], axis=1)
         self._turned_back = self._source.conj()
         self._moved = np.zeros((self._used.size, self._size), np.float32)
 
-    def correlation(self) -> Array:
-        """Autocorrelation of x at lags from 0 on, (taps,)."""
-        n = fft.next_fast_len(self._x.size + self._taps, real=True)
-        return fft.irfft(np.abs(fft.rfft(self._x, n)) ** 2, n)[: self._taps]
-
     def adjoint(self, target: Samples) -> Array:
         """Return sum w(n) target(n) x(n - k + lead), (taps,)."""
-        whole = np.zeros((int(self._used[-1]) + 1) * self._new if self._used.size else 0, np.float32)
+        whole = np.zeros((int(self._used[-1]) + 1) * BLOCK if self._used.size else 0, np.float32)
         whole[: target.size] = target[: whole.size]
-        return self._correlated(whole.reshape(-1, self._new)[self._used])
+        return self._correlated(whole.reshape(-1, BLOCK)[self._used])
 
     def normal(self, c: Array) -> Array:
         """Adjoint of x filtered by c (taps,), (taps,)."""
         spectrum = fft.rfft(c.astype(np.float32), self._size)
-        filtered = fft.irfft(self._source * spectrum, self._size, axis=1, overwrite_x=True)[
-            :, self._taps - 1 : self._taps - 1 + self._new
-        ]
-        return self._correlated(filtered)
+        filtered = fft.irfft(self._source * spectrum, self._size, axis=1, overwrite_x=True)
+        return self._correlated(filtered[:, self._new])
 
     def _correlated(self, signals: Samples) -> Array:
-        """The sum over all blocks of signals (blocks, new) times their weights, correlated with x, (taps,)."""
-        np.multiply(signals, self._weights, out=self._moved[:, self._taps - 1 : self._taps - 1 + self._new])
+        """The sum over all blocks of signals (blocks, BLOCK) times their weights, correlated with x, (taps,)."""
+        np.multiply(signals, self._weights, out=self._moved[:, self._new])
         both = np.einsum("bf,bf->f", fft.rfft(self._moved, axis=1), self._turned_back)
         return fft.irfft(both, self._size)[: self._taps].astype(np.float64)
 
 
-def _windowed(correlation: Array, taps: int, size: int) -> Array:
-    """The autocorrelation up to lag taps, tapered, as one period of a circulant (size,)."""
+def _circulant(x: Samples, taps: int, size: int) -> Array:
+    """Autocorrelation of x (n,) up to lag taps, tapered, as one period of a circulant (size,)."""
+    n = fft.next_fast_len(x.size + taps, real=True)
+    tapered = fft.irfft(np.abs(fft.rfft(x, n)) ** 2, n)[:taps] * (1.0 - np.arange(taps) / taps)
     kept = np.zeros(size)
-    taper = 1.0 - np.arange(taps) / taps
-    kept[:taps] = correlation[:taps] * taper
-    kept[size - taps + 1 :] = (correlation[1:taps] * taper[1:])[::-1]
+    kept[:taps] = tapered
+    kept[size - taps + 1 :] = tapered[:0:-1]
     return kept
 
 
 @dataclass(frozen=True, eq=False)
 class Spectra:
-    """Of the whitened fit samples: frequencies (m,) Hz, auto-spectra of prediction and recording (m,), cross-spectrum (m,) complex.
+    """Of the whitened fit samples: frequencies (m,) Hz, auto-spectra of prediction and recording and cross-spectrum, (m,).
 
     fan: what the fan alone has in each on average. averaged: bins of the transform in each.
     """
@@ -149,11 +135,6 @@ class Spectra:
     heard: Array
     fan: float
     averaged: int
-
-    def gain(self, response: NDArray[np.complex128]) -> float:
-        """By how much the squared error falls when the prediction gets that response (m,) instead of 1."""
-        own = np.abs(response) ** 2 * self.predicted - 2.0 * (response.conj() * self.cross).real
-        return float(np.sum(self.predicted - 2.0 * self.cross.real) - np.sum(own))
 
 
 def spectra(measurement: Measurement, white: Samples, resolution_hz: float) -> Spectra:

@@ -3,21 +3,20 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import ClassVar
 
 import numpy as np
 import scipy
 from numpy.typing import NDArray
 
 from edgefilter.dsp.lag import turn
-from edgefilter.echo.effect import Effect, Experiment, Family, Parameter, Stage
+from edgefilter.echo.effect import Effect, Parameter, numbers, within
 from edgefilter.echo.evidence import Evidence
 from edgefilter.echo.measurement import Measurement, Values, VoiceModel
 from edgefilter.echo.wiener import Spectra, spectra
 from edgefilter.types import SAMPLE_RATE, Array, Samples
 
-LOWEST_HZ, HIGHEST_HZ = 60.0, 7000.0
-QUALITIES = (4.0, 8.0, 16.0, 32.0, 64.0, 128.0)
+LOWEST_HZ, HIGHEST_HZ, QUALITIES = 60.0, 7000.0, (4.0, 8.0, 16.0, 32.0, 64.0, 128.0)
+"""Where modes are looked for."""
 BROAD_HZ = 40.0
 """Bandwidth of a mode from which on a spectrum of 1 Hz shows all of it."""
 MODES, NEXT, LEAST_Q = 2, 0.05, 8.0
@@ -32,13 +31,13 @@ class ChassisResonance(Effect):
     with one for each mode.
     """
 
-    name: ClassVar[str] = "chassis_resonance"
-    stage: ClassVar[Stage] = "path"
-    family: ClassVar[Family] = "linear path"
-    title: ClassVar[str] = "a chassis resonance"
-    shown_by: ClassVar[tuple[Experiment, ...]] = ("sweep", "tail")
-    complexity: ClassVar[int] = 1
-    parameters: ClassVar[tuple[Parameter, ...]] = (
+    name = "chassis_resonance"
+    stage = "path"
+    family = "linear path"
+    title = "a chassis resonance"
+    shown_by = ("sweep", "tail")
+    complexity = 1
+    parameters = (
         Parameter("frequency_hz", "Hz", 1000.0, 20.0, 8000.0),
         Parameter("q", "1", 30.0, 0.5, 2000.0),
         Parameter("gain_db", "dB", -120.0, -120.0, 60.0),
@@ -46,21 +45,15 @@ class ChassisResonance(Effect):
     )
 
     def apply(self, x: Samples, values: Values, sample_rate: int) -> Samples:
-        """Return x with the ringing added."""
         y = x.copy()
-        for frequency, q, gain_db, phase in np.broadcast(
-            *(np.atleast_1d(np.asarray(values[p.name], float)) for p in self.parameters)
-        ):
+        for frequency, q, gain_db, phase in np.broadcast(*(numbers(values, p.name) for p in self.parameters)):
             if gain_db > -120.0:
                 gain = 10.0 ** (gain_db / 20.0) * np.exp(1j * np.deg2rad(phase))
                 y += (gain * _ring(x, frequency, q, sample_rate)).real.astype(np.float32)
         return y
 
     def fit(self, measurement: Measurement, model: VoiceModel) -> Values:
-        """Frequency and Q by a search in the whitened cross-spectrum, gain and phase by least squares in time.
-
-        Then, if it pays, another mode.
-        """
+        """Frequency and Q by a search in the whitened cross-spectrum, gain and phase by least squares; if it pays, another mode."""
         predicted, white = measurement.heard(model)
         coarse, fine = (spectra(measurement, white, resolution_hz) for resolution_hz in (1.0, 0.1))
         residual = measurement.white_recording - white
@@ -72,33 +65,28 @@ class ChassisResonance(Effect):
             if modes and mode[1] < LEAST_Q:
                 break
             ring = _ring(predicted, *mode, SAMPLE_RATE)
-            added = (
-                np.stack([measurement.whiten(part.astype(np.float32)) for part in (ring.real, -ring.imag)], axis=1)
-                * measurement.weights[:, None]
-            )
-            tried = np.concatenate((columns, added), axis=1)
+            added = [measurement.whiten(part.astype(np.float32)) for part in (ring.real, -ring.imag)]
+            tried = np.concatenate((columns, np.stack(added, axis=1) * measurement.weights[:, None]), axis=1)
             right = (tried.T @ residual).astype(float)
             solved = np.linalg.lstsq((tried.T @ tried).astype(float), right, rcond=1e-12)[0]
             if modes and float(solved @ right) < (1.0 + NEXT) * explained:
                 break
             modes, columns, gains, explained = [*modes, mode], tried, solved, float(solved @ right)
         complex_gains = gains[::2] + 1j * gains[1::2]
-        level = np.clip(20.0 * np.log10(np.maximum(np.abs(complex_gains), 1e-6)), -120.0, 60.0)
+        level = 20.0 * np.log10(np.maximum(np.abs(complex_gains), 1e-6))
         found = np.array([*zip(*modes, strict=True), level, np.rad2deg(np.angle(complex_gains))])[:, np.argsort(-level)]
-        return {p.name: row if row.size > 1 else float(row[0]) for p, row in zip(self.parameters, found, strict=True)}
+        rows = {p.name: row if row.size > 1 else row[0] for p, row in zip(self.parameters, found, strict=True)}
+        return within(self, rows)
 
     def sentence(self, values: Values) -> str:
-        """Where it rings, and how sharply."""
-        modes = [
-            f"{hz:.0f} Hz with Q {q:.0f}"
-            for hz, q in zip(np.atleast_1d(values["frequency_hz"]), np.atleast_1d(values["q"]), strict=True)
-        ]
+        both = zip(numbers(values, "frequency_hz"), numbers(values, "q"), strict=True)
+        modes = [f"{hz:.0f} Hz with Q {q:.0f}" for hz, q in both]
         where = "one frequency" if len(modes) == 1 else "two frequencies"
         return f"the residual rings at {where}, {' and '.join(modes)}, whenever the voice excites it"
 
     def plausible(self, evidence: Evidence) -> bool:
         """Sharp enough for a mode, and none that the search's bounds have cut off."""
-        q, hz = (np.atleast_1d(evidence.values[name]) for name in ("q", "frequency_hz"))
+        q, hz = (numbers(evidence.values, name) for name in ("q", "frequency_hz"))
         return bool(np.all(q >= LEAST_Q) and np.all(hz >= 62.0) and np.all(hz <= 6800.0))
 
 
@@ -148,18 +136,16 @@ def _search(found: Spectra) -> tuple[float, float]:
 
 
 def _refine(found: Spectra, frequency: float, q: float) -> tuple[float, float]:
-    def cost(v: Array) -> float:
-        f, quality = (
-            float(np.clip(frequency * np.exp(v[0] / q), LOWEST_HZ, HIGHEST_HZ)),
-            float(np.clip(q * np.exp(v[1]), 4.0, 2000.0)),
-        )
-        width = 8.0 * frequency / q + 20.0
-        inside = slice(*np.searchsorted(found.hz, (frequency - width, frequency + width)))
-        return -float(_explained(found, inside, np.array([f]), quality)[0])
+    width = 8.0 * frequency / q + 20.0
+    inside = slice(*np.searchsorted(found.hz, (frequency - width, frequency + width)))
 
-    v = scipy.optimize.minimize(
-        cost, [0.0, 0.0], method="Nelder-Mead", options={"maxiter": 60, "initial_simplex": [[0, 0], [0.5, 0], [0, 0.5]]}
-    ).x
-    return float(np.clip(frequency * np.exp(v[0] / q), LOWEST_HZ, HIGHEST_HZ)), float(
-        np.clip(q * np.exp(v[1]), 4.0, 2000.0)
-    )
+    def moved(v: Array) -> tuple[float, float]:
+        hz, quality = frequency * np.exp(v[0] / q), q * np.exp(v[1])
+        return float(np.clip(hz, LOWEST_HZ, HIGHEST_HZ)), float(np.clip(quality, 4.0, 2000.0))
+
+    def cost(v: Array) -> float:
+        hz, quality = moved(v)
+        return -float(_explained(found, inside, np.array([hz]), quality)[0])
+
+    options = {"maxiter": 60, "initial_simplex": [[0, 0], [0.5, 0], [0, 0.5]]}
+    return moved(scipy.optimize.minimize(cost, [0.0, 0.0], method="Nelder-Mead", options=options).x)

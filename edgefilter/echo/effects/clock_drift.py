@@ -2,24 +2,22 @@
 
 from __future__ import annotations
 
-from typing import ClassVar
-
 import numpy as np
 import scipy
 
 from edgefilter.dsp.fractional_delay import interpolate
-from edgefilter.echo.effect import Effect, Experiment, Family, Parameter, Stage, first
+from edgefilter.echo.effect import Effect, Parameter, first, neutral, within
 from edgefilter.echo.evidence import Evidence
 from edgefilter.echo.lag_track import track_lag
 from edgefilter.echo.measurement import Measurement, Values, VoiceModel
 from edgefilter.types import Array, Samples
 
 PASSES = ((4000, 512), (8000, 16))
-"""Samples of a block and of lag either way: short blocks while the drift smears them, longer ones once it is taken
-out."""
+"""Samples of a block and of lag either way: short blocks while the drift smears them, longer ones once it is taken out."""
 STEADY = 0.05
 """Samples by which a block's lag may err for other reasons than noise."""
 LEAST_PPM = 0.5
+"""Clocks that differ by less, in 1e-6, are one: faint distortion alone makes as much in tests/echo/effects/test_timing.py."""
 
 
 class ClockDrift(Effect):
@@ -29,49 +27,44 @@ class ClockDrift(Effect):
     recording.
     """
 
-    name: ClassVar[str] = "clock_drift"
-    stage: ClassVar[Stage] = "time"
-    family: ClassVar[Family] = "time"
-    run_note: ClassVar[str] = (
+    name = "clock_drift"
+    stage = "time"
+    family = "time"
+    run_note = (
         "the running filter follows the clocks by itself, whatever they did in this recording: adding it changes nothing"
         " there"
     )
-    title: ClassVar[str] = "clock drift"
-    shown_by: ClassVar[tuple[Experiment, ...]] = ("minute",)
-    followed: ClassVar[bool] = True
-    complexity: ClassVar[int] = 1
-    parameters: ClassVar[tuple[Parameter, ...]] = (
+    title = "clock drift"
+    shown_by = ("minute",)
+    followed = True
+    complexity = 1
+    parameters = (
         Parameter("ppm", "1e-6", 0.0, -1000.0, 1000.0),
         Parameter("offset", "samples", 0.0, -32000.0, 32000.0),
     )
 
     def apply(self, x: Samples, values: Values, sample_rate: int) -> Samples:
-        """Return x (n,) read at the drifting clock; outside of x there is silence."""
-        ppm, offset = float(values["ppm"]), float(values["offset"])
-        if ppm == 0.0 and offset == 0.0:
-            return x.copy()
-        n = np.arange(x.size)
-        return interpolate(x, n - offset + 1e-6 * ppm * n)
+        ppm, offset, n = float(values["ppm"]), float(values["offset"]), np.arange(x.size)
+        return interpolate(x, n - offset + 1e-6 * ppm * n) if ppm or offset else x.copy()
 
     def fit(self, measurement: Measurement, model: VoiceModel) -> Values:
-        """A robust line through the lags of all blocks, twice: the second time on the prediction that the first has straightened."""
+        """A robust line through the lags of all blocks, then once more on the prediction that it has straightened."""
         predicted, recording = measurement.heard(model)[0], measurement.white_recording
         n = np.arange(predicted.size)
         lag: Array = np.zeros(predicted.size)
         for size, reach in PASSES:
-            track = track_lag(
-                measurement.whiten(interpolate(predicted, n - lag)), recording, measurement.fit, size, reach
-            )
+            straight = measurement.whiten(interpolate(predicted, n - lag))
+            track = track_lag(straight, recording, measurement.fit, size, reach)
             if track.lag.size < 3:
                 break
             total = track.lag + np.interp(track.middle, n, lag)
             slope, offset = robust_line(track.middle, total, track.sigma)
             lag = offset + slope * n
-        slope = float(np.clip(1e6 * (lag[-1] - lag[0]) / max(n.size - 1, 1), -1000.0, 1000.0)) if n.size else 0.0
-        return {"ppm": -slope, "offset": float(lag[0]) if n.size else 0.0}
+        if not n.size:
+            return neutral(self)
+        return within(self, {"ppm": -1e6 * (lag[-1] - lag[0]) / max(n.size - 1, 1), "offset": lag[0]})
 
     def sentence(self, values: Values) -> str:
-        """How fast the lag grows."""
         return f"the lag grows along a line, by {abs(first(values, 'ppm')):.1f} samples in a million"
 
     def plausible(self, evidence: Evidence) -> bool:

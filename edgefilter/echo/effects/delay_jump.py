@@ -2,61 +2,58 @@
 
 from __future__ import annotations
 
-from typing import ClassVar
-
 import numpy as np
 
 from edgefilter.dsp.fractional_delay import delayed
-from edgefilter.echo.effect import Effect, Family, Parameter, Stage, complete, neutral
+from edgefilter.echo.effect import NEVER_S, Effect, Parameter, complete, neutral, numbers
 from edgefilter.echo.effects.clock_drift import STEADY, robust_line
 from edgefilter.echo.lag_track import LagTrack, track_lag
 from edgefilter.echo.measurement import Measurement, Values, VoiceModel
 from edgefilter.types import PRE_ROLL, SAMPLE_RATE, Array, Samples
 
 BLOCK, REACH = 4000, 2400
+"""Samples of a block and of lag either way: a quarter of a second tells a lag, and 150 ms are the longest jump that is found."""
 MOST_JUMPS = 8
+"""More are another effect: a lag that moves all the time."""
 FADE = 512
 """Samples around a stretch between jumps that are shifted with it, and over which what lies further off fades away."""
 LEAST_JUMP = 0.3
 """Samples; less is no jump, but a block's lag that is not known better."""
 OUTLIER = 25.0
-"""A block adds at most this to the squared, normalised distance from the steps or the line."""
+"""A block adds at most this to the squared, normalised distance from the steps or the line: five standard deviations."""
 COST = 12.0
 """What each number of a step function has to save in squared, normalised distance, per unit of log(blocks)."""
 HISTORY, SETTLED, AFTERMATH = 8000, 640, 6400
 """Samples: what the path remembers of the time before a jump; what may be unsure of its moment; what shows the jump."""
 SEARCH = (range(-256, 257, 32), range(-24, 25, 8), range(-6, 7, 2), (-1, 0, 1))
+"""Samples by which its moment is moved, in turn, from the best so far."""
 
 
 class DelayJump(Effect):
-    """The reference is played later by samples[i] from times_s[i] on, and by offset from the start on.
+    """The reference is played later by samples[i], not always whole ones, from times_s[i] on, and by offset from the start on.
 
-    Piecewise constant, fractional.
-
-    What the player puts into the gap where the delay grows: the last samples once more (gap_gain 1) or silence
-    (gap_gain 0).
+    What the player puts into the gap where the delay grows: the last samples once more (gap_gain 1) or silence (0).
     """
 
-    name: ClassVar[str] = "delay_jump"
-    stage: ClassVar[Stage] = "source"
-    family: ClassVar[Family] = "time"
-    run_note: ClassVar[str] = (
+    name = "delay_jump"
+    stage = "source"
+    family = "time"
+    run_note = (
         "the running filter finds jumps by itself, and these were of this recording: adding it changes nothing there"
     )
-    title: ClassVar[str] = "a delay jump"
-    event: ClassVar[bool] = True
-    followed: ClassVar[bool] = True
-    complexity: ClassVar[int] = 1
-    parameters: ClassVar[tuple[Parameter, ...]] = (
-        Parameter("times_s", "s", 0.0, 0.0, 1e6),
+    title = "a delay jump"
+    event = True
+    followed = True
+    complexity = 1
+    parameters = (
+        Parameter("times_s", "s", 0.0, 0.0, NEVER_S),
         Parameter("samples", "samples", 0.0, -48000.0, 48000.0),
         Parameter("offset", "samples", 0.0, -32000.0, 32000.0),
         Parameter("gap_gain", "", 1.0, 0.0, 1.0),
     )
 
     def apply(self, x: Samples, values: Values, sample_rate: int) -> Samples:
-        """Return x (n,) read with the delay of each moment; outside of x there is silence."""
-        times, steps = (np.atleast_1d(np.asarray(values[name], float)) for name in ("times_s", "samples"))
+        times, steps = numbers(values, "times_s"), numbers(values, "samples")
         order = np.argsort(times, kind="stable")
         at = np.clip(np.round(times[order] * sample_rate), 0, x.size).astype(int)
         delays = float(values["offset"]) + np.concatenate(([0.0], np.cumsum(steps[order])))
@@ -72,8 +69,7 @@ class DelayJump(Effect):
     def fit(self, measurement: Measurement, model: VoiceModel) -> Values:
         """Steps through the lags of all blocks; none where a straight line, a drift, describes the lags as well.
 
-        How many steps and how high comes from the samples to fit on; where exactly each lies is then looked up in all
-        samples, since a jump may fall between the blocks to fit on.
+        How many and how high comes from the samples to fit on; where exactly each lies from all, since it may fall between these.
         """
         predicted, recording = measurement.heard(model)[1], measurement.white_recording
         track = track_lag(predicted, recording, measurement.fit, BLOCK, REACH)
@@ -88,7 +84,7 @@ class DelayJump(Effect):
     def _refined(
         self, measurement: Measurement, model: VoiceModel, times_s: Array, samples: Array, offset: float
     ) -> Values:
-        """The values with each jump at the moment in the reference, and the gap filled in the way, that predicts best around it."""
+        """The values with each jump at the moment in the reference that predicts best around it, and the gap filled so as to."""
 
         def left(moments: Array, gap_gain: float, around: int) -> float:
             part = slice(max(around - HISTORY, 0), around + AFTERMATH)
@@ -119,8 +115,7 @@ class DelayJump(Effect):
         return {"times_s": moved, "samples": samples, "offset": offset, "gap_gain": gap_gain}
 
     def sentence(self, values: Values) -> str:
-        """Each step and its moment."""
-        times, samples = np.atleast_1d(values["times_s"]), np.atleast_1d(values["samples"])
+        times, samples = numbers(values, "times_s"), numbers(values, "samples")
         steps = ", ".join(f"{n:+.1f} samples at {t:.2f} s" for t, n in zip(times, samples, strict=True))
         return f"the lag is constant but for steps: {steps}"
 
@@ -156,7 +151,7 @@ def find_steps(lag: Array, sigma: Array) -> tuple[Array, Array]:
     for stop in range(1, count + 1):
         for start in range(stop):
             part = slice(start, stop)
-            total = best[start] + penalty + _misfit(lag[part], np.median(lag[part]), sigma[part])
+            total = best[start] + penalty + _misfit(lag[part], float(np.median(lag[part])), sigma[part])
             if total < best[stop]:
                 best[stop], origin[stop] = total, start
     cuts = [count]
@@ -171,7 +166,7 @@ def find_steps(lag: Array, sigma: Array) -> tuple[Array, Array]:
         del cuts[small[0] + 1]
 
 
-def _misfit(lag: Array, level: Array | np.floating | float, sigma: Array) -> float:
+def _misfit(lag: Array, level: Array | float, sigma: Array) -> float:
     return float(np.minimum(((lag - level) / sigma) ** 2, OUTLIER).sum())
 
 
@@ -197,7 +192,6 @@ def _locate(predicted: Samples, recording: Samples, track: LagTrack, edge: int, 
     margin = int(np.abs(levels).max()) + 64
     low = max(start - margin, 0)
     around = predicted[low : stop + margin]
-    before, after = (
-        (recording[start:stop] - delayed(around, level)[start - low : stop - low]) ** 2 for level in levels
-    )
+    part = slice(start - low, stop - low)
+    before, after = ((recording[start:stop] - delayed(around, level)[part]) ** 2 for level in levels)
     return start + int(np.argmin(np.concatenate(([0.0], np.cumsum((before - after).astype(np.float64))))))

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from typing import ClassVar
-
 import numpy as np
 
-from edgefilter.echo.effect import Effect, Experiment, Family, Parameter, Stage, first, neutral
-from edgefilter.echo.effects.late_reverb import LEAD, fit_path, rings_longer
+from edgefilter.echo.effect import Effect, Parameter, first, neutral, within
+from edgefilter.echo.effects.late_reverb import LEAD, fit_path, rings_longer, with_taps
 from edgefilter.echo.evidence import Evidence
 from edgefilter.echo.measurement import Measurement, Values, VoiceModel
-from edgefilter.echo.wiener import convolve_from
 from edgefilter.types import SAMPLE_RATE, Samples
 
 WITHIN = 0.8
@@ -25,39 +22,34 @@ class EarlyPath(Effect):
     reflection.
     """
 
-    name: ClassVar[str] = "early_path"
-    stage: ClassVar[Stage] = "path"
-    family: ClassVar[Family] = "linear path"
-    title: ClassVar[str] = "another path from the start"
-    shown_by: ClassVar[tuple[Experiment, ...]] = ("sweep", "place")
-    complexity: ClassVar[int] = 4
-    cost: ClassVar[int] = 4
-    flexible: ClassVar[bool] = True
-    parameters: ClassVar[tuple[Parameter, ...]] = (
+    name = "early_path"
+    stage = "path"
+    family = "linear path"
+    title = "another path from the start"
+    shown_by = ("sweep", "place")
+    complexity = 4
+    cost = 4
+    flexible = True
+    parameters = (
         Parameter("level_db", "dB", -120.0, -120.0, 60.0),
         Parameter("within_ms", "ms", 0.0, -10.0, 1000.0),
         Parameter("taps", "1", 0.0, -10.0, 10.0),
     )
 
     def apply(self, x: Samples, values: Values, sample_rate: int) -> Samples:
-        """Put x through the other path."""
-        taps = np.atleast_1d(np.asarray(values["taps"], float))
-        return x.copy() if not taps.any() else x + convolve_from(x, taps, LEAD)
+        return with_taps(x, values)
 
     def fit(self, measurement: Measurement, model: VoiceModel) -> Values:
-        """As late_reverb's; neutral where nothing of it holds on other samples."""
+        """The taps that fit_path() finds, which late_reverb shares; neutral where none hold on other samples."""
         taps, _ = measurement.once(fit_path, model)
         if not taps.any():
             return neutral(self)
         grown = np.cumsum(taps**2)
-        return {
-            "level_db": float(np.clip(10.0 * np.log10(grown[-1] + 1e-12), -120.0, 60.0)),
-            "within_ms": 1e3 * (int(np.searchsorted(grown, WITHIN * grown[-1])) - LEAD) / SAMPLE_RATE,
-            "taps": np.clip(taps, -10.0, 10.0),
-        }
+        level_db = 10.0 * np.log10(grown[-1] + 1e-12)
+        within_ms = 1e3 * (int(np.searchsorted(grown, WITHIN * grown[-1])) - LEAD) / SAMPLE_RATE
+        return within(self, {"level_db": level_db, "within_ms": within_ms, "taps": taps})
 
     def sentence(self, values: Values) -> str:
-        """What changed, and what did not."""
         return (
             f"direct sound and reflections, most of them within {max(first(values, 'within_ms'), 0.0):.0f} ms, are"
             " others than at the calibration, from the first second to the last; the room dies away as it did"

@@ -2,23 +2,17 @@
 
 from __future__ import annotations
 
-from typing import ClassVar
-
 import numpy as np
 
 from edgefilter.dsp.frames import frames
 from edgefilter.dsp.psd import floored, periodograms
-from edgefilter.echo.effect import Effect, Family, Parameter, Stage, first
+from edgefilter.echo.effect import Effect, Parameter, first, neutral, within
 from edgefilter.echo.least_squares import absorbed
-from edgefilter.echo.measurement import Measurement, Values, VoiceModel
+from edgefilter.echo.measurement import SILENT, Measurement, Values, VoiceModel
 from edgefilter.types import Array, Samples
 
-SILENT_DB = -10.0
-"""A frame shows the fan alone where the predicted voice, whitened, is this far under it."""
-FEWEST_FRAMES = 12
-"""Half-overlapping frames of silence; with fewer, the quietest part of all frames at each frequency is taken."""
-QUIET_SHARE = 0.25
-LOWEST_DB, HIGHEST_DB = -60.0, 60.0
+FEWEST_FRAMES, QUIET_SHARE = 12, 0.25
+"""Half-overlapping frames of silence; with fewer, that part of all frames, the quietest at each frequency, is taken."""
 SMOOTH = np.array([0.25, 0.5, 0.25])
 """Over neighbouring bins of 13.3 Hz: a Hann frame's line is as wide."""
 
@@ -30,18 +24,17 @@ class FanNoise(Effect):
     fan's total power.
     """
 
-    name: ClassVar[str] = "fan_noise"
-    stage: ClassVar[Stage] = "noise"
-    family: ClassVar[Family] = "additive noise"
-    title: ClassVar[str] = "changed fan noise"
-    memory: ClassVar[int | None] = 0
-    parameters: ClassVar[tuple[Parameter, ...]] = (
-        Parameter("spectrum_db", "dB", 0.0, LOWEST_DB, HIGHEST_DB),
-        Parameter("change_db", "dB", 0.0, LOWEST_DB, HIGHEST_DB),
+    name = "fan_noise"
+    stage = "noise"
+    family = "additive noise"
+    title = "changed fan noise"
+    memory = 0
+    parameters = (
+        Parameter("spectrum_db", "dB", 0.0, -60.0, 60.0),
+        Parameter("change_db", "dB", 0.0, -60.0, 60.0),
     )
 
     def noise_psd(self, values: Values, psd: Samples) -> Samples:
-        """The fan's PSD (601,) after the change, from psd (601,) before it."""
         return (psd * 10.0 ** (np.asarray(values["spectrum_db"], float) / 10.0)).astype(np.float32)
 
     def fit(self, measurement: Measurement, model: VoiceModel) -> Values:
@@ -53,15 +46,15 @@ class FanNoise(Effect):
         """
         known = measurement.noise_psd
         if known is None:
-            return {"spectrum_db": 0.0, "change_db": 0.0}
+            return neutral(self)
         voice = absorbed(measurement.heard(model)[0], measurement.recording, measurement.fit)
         size = 2 * (known.size - 1)
         residual = periodograms(measurement.recording - voice, size)
         if not len(residual):
-            return {"spectrum_db": 0.0, "change_db": 0.0}
+            return neutral(self)
         whole = frames(measurement.weights, size, size // 2).all(axis=1)
         own = np.mean(frames(measurement.whiten(voice), size, size // 2) ** 2, axis=1)
-        silent = whole & (own < 10.0 ** (SILENT_DB / 10.0))
+        silent = whole & (own < SILENT)
         if silent.sum() >= FEWEST_FRAMES:
             found = residual[silent].mean(axis=0)
         else:
@@ -69,13 +62,9 @@ class FanNoise(Effect):
         floor = floored(known)
         smooth = np.convolve(np.pad(found / floor, 1, mode="edge"), SMOOTH, "valid")
         total = 10.0 * np.log10(np.sum(smooth * floor) / np.sum(floor) + 1e-30)
-        return {
-            "spectrum_db": np.clip(10.0 * np.log10(smooth + 1e-30), LOWEST_DB, HIGHEST_DB),
-            "change_db": float(np.clip(total, LOWEST_DB, HIGHEST_DB)),
-        }
+        return within(self, {"spectrum_db": 10.0 * np.log10(smooth + 1e-30), "change_db": total})
 
     def sentence(self, values: Values) -> str:
-        """By how much."""
         return (
             f"the noise is {first(values, 'change_db'):+.1f} dB off the calibrated fan, with the robot's voice and"
             " without it"

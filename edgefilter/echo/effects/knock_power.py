@@ -12,26 +12,28 @@ from numpy.typing import NDArray
 
 from edgefilter.dsp.fourier import power
 from edgefilter.dsp.frames import frames
-from edgefilter.dsp.psd import floored, hann
-from edgefilter.types import SAMPLE_RATE, Array, Samples
+from edgefilter.dsp.psd import GRID_BINS, floored, frequencies, hann
+from edgefilter.echo.effect import NEVER_REACHED
+from edgefilter.types import PRE_ROLL, SAMPLE_RATE, Array, Samples
 
 FRAME, HOP, BANDS = 128, 64, 16
 """Frames of 8 ms every 4 ms, in bands of 500 Hz: short enough for single knocks."""
 BAND_HZ = SAMPLE_RATE / 2 / BANDS
-GRID_HZ = np.linspace(0.0, SAMPLE_RATE / 2, 601)
-_BAND = np.minimum(GRID_HZ / BAND_HZ, BANDS - 1).astype(int)
 RESONANCES_HZ, Q = (120.0, 160.0, 210.0, 280.0, 370.0), 1.0
+"""Of the membranes whose displacement is tried as the trigger."""
 SHARES = (0.3, 0.45, 0.6, 0.7, 0.8, 0.88, 0.94)
 """Thresholds to try, as the share of the displacement's peaks that stay below."""
 SIDES = (1.0, -1.0, 0.0)
+"""Only pushes knock, only pulls, both."""
 DECAY_MS, DECAYS_MS = 4.0, (1.0, 2.0, 4.0, 8.0, 16.0, 32.0)
-BETTER = 3.0
-"""By how many times more of the log likelihood knocks must explain than noise that follows the voice's level."""
-LEAST = 150.0
-"""Log likelihood, in nats, that knocks must bring on samples that they were not learnt from."""
+"""Of what follows a knock: taken while the trigger is looked for, and tried then."""
+BETTER, LEAST = 3.0, 150.0
+"""By how many times more of the log likelihood knocks must explain than noise that follows the voice's level; and how much,
+in nats, on samples that they were not learnt from."""
 FOLD = SAMPLE_RATE
 """Samples of the stretches that take turns in that."""
 ROUNDS = 4
+"""Updates of the colours in the search for a trigger; thrice as many to compare, four times to report."""
 
 
 @dataclass(frozen=True)
@@ -45,15 +47,14 @@ class Trigger:
 
 
 def find_trigger(
-    x: Samples, residual: Samples, predicted: Samples, fit: NDArray[np.bool_] | None, late: int
+    x: Samples, residual: Samples, predicted: Samples, fit: NDArray[np.bool_] | None
 ) -> tuple[Trigger | None, bool]:
     """The trigger whose knocks explain best when the whitened residual (n,) is loud, and whether the voice's level explains it less well.
 
-    x (n,): the drive. predicted (n,): the whitened voice. late: samples until a knock is heard. The residual's power in
-    a cell of time and frequency is taken as exponentially distributed around a constant plus what each source adds, in
-    a colour of its own: maximum likelihood by the multiplicative updates of Fevotte, Bertin & Durrieu 2009
-    ("Nonnegative matrix factorization with the Itakura-Saito divergence", eq. 2.22, with the exponent 1/2 that makes
-    them monotonic).
+    x (n,): the drive. predicted (n,): the whitened voice. The residual's power in a cell of time and frequency is taken as
+    exponentially distributed around a constant plus what each source adds, in a colour of its own: maximum likelihood by
+    the multiplicative updates of Fevotte, Bertin & Durrieu 2009 ("Nonnegative matrix factorization with the
+    Itakura-Saito divergence", eq. 2.22, with the exponent 1/2 that makes them monotonic).
     """
     power, voice = band_power(residual), band_power(predicted)
     middle = np.arange(len(power)) * HOP + FRAME // 2
@@ -67,7 +68,7 @@ def find_trigger(
     for resonance in RESONANCES_HZ:
         moved = resonated(x, resonance, Q)
         for threshold in quantiles_of_peaks(moved):
-            outward, inward = (_hits(*knocks, late, len(power)) for knocks in knocks_at(moved, threshold))
+            outward, inward = (_hits(*knocks, len(power)) for knocks in knocks_at(moved, threshold))
             for side in SIDES:
                 source = _roughly_ringing(one_side((outward, inward), side))
                 sources = [one[use], source[use]]
@@ -100,14 +101,19 @@ def fan_in_bands(noise_psd: Samples | None) -> Array:
 
     noise_psd: (601,); None for a fan of variance 1, white.
     """
-    fan = np.full(GRID_HZ.size, 2.0 / SAMPLE_RATE) if noise_psd is None else floored(noise_psd)
-    return np.bincount(_BAND) / np.bincount(_BAND, 1.0 / fan) * BAND_HZ
+    fan = np.full(GRID_BINS, 2.0 / SAMPLE_RATE) if noise_psd is None else floored(noise_psd)
+    return np.bincount(_band_of_bins()) / np.bincount(_band_of_bins(), 1.0 / fan) * BAND_HZ
 
 
 def density_of(power: float | Array) -> Array:
     """Spectral density per Hz, of integral 1, of noise with that power in each band, one number or (BANDS,), (601,)."""
     each = np.broadcast_to(np.asarray(power, float), (BANDS,)) + 1e-30
-    return (each / each.sum() / BAND_HZ)[_BAND]
+    return (each / each.sum() / BAND_HZ)[_band_of_bins()]
+
+
+def _band_of_bins() -> NDArray[np.integer]:
+    """The band in which each bin of a density lies, (601,)."""
+    return np.minimum(frequencies(GRID_BINS) / BAND_HZ, BANDS - 1).astype(int)
 
 
 def resonated(x: Samples, resonance_hz: float, q: float, sample_rate: int = SAMPLE_RATE) -> Samples:
@@ -149,36 +155,31 @@ def one_side(trains: tuple[Array, Array], side: float) -> Array:
 
 
 def quantiles_of_peaks(moved: Samples) -> list[float]:
-    """The values that each of SHARES of the peaks of |moved| (n,) stays below.
-
-    Peaks under 5 % of the largest do not count.
-    """
+    """The values that each of SHARES of the peaks of |moved| (n,) stays below; peaks under 5 % of the largest do not count."""
     size = np.abs(moved)
     peaks = size[1:-1][(size[1:-1] > size[:-2]) & (size[1:-1] >= size[2:])]
     peaks = peaks[peaks > 0.05 * peaks.max()] if peaks.size else peaks
-    return np.clip(np.quantile(peaks, SHARES), 1e-5, 100.0).tolist() if peaks.size else [100.0] * len(SHARES)
+    heights = np.quantile(peaks, SHARES) if peaks.size else np.full(len(SHARES), NEVER_REACHED)
+    return np.clip(heights, 1e-5, NEVER_REACHED).tolist()
 
 
-def ringing_of(knocks: Samples, decay_ms: float, late: int, sample_rate: int = SAMPLE_RATE) -> Samples:
-    """Squared heights of knocks (n,), decaying by 1/e in decay_ms, `late` samples later; (n,)."""
+def ringing_of(knocks: Samples, decay_ms: float, sample_rate: int = SAMPLE_RATE) -> Samples:
+    """Squared heights of knocks (n,) as they are heard, PRE_ROLL samples later, decaying by 1/e in decay_ms; (n,)."""
     keep = np.exp(-1.0 / (decay_ms * 1e-3 * sample_rate))
-    delayed = np.concatenate((np.zeros(late), knocks.astype(np.float64) ** 2))[: knocks.size]
+    delayed = np.concatenate((np.zeros(PRE_ROLL), knocks.astype(np.float64) ** 2))[: knocks.size]
     return scipy.signal.lfilter([1.0], [1.0, -keep], delayed).astype(np.float32)
 
 
 def band_power(x: Samples) -> Samples:
-    """Mean power of x (n,) in each band, 1 for white noise of variance 1, (frames, BANDS).
-
-    The lowest bin is left out.
-    """
+    """Mean power of x (n,) in each band but for the lowest bin, 1 for white noise of variance 1, (frames, BANDS)."""
     window = hann(FRAME).astype(np.float32)
     bins = power(scipy.fft.rfft(frames(x, FRAME, HOP) * window, axis=1)[:, 1:]) / np.sum(window**2)
     return bins.reshape(len(bins), BANDS, -1).mean(axis=2).astype(np.float32)
 
 
-def _hits(at: NDArray[np.integer], height: Samples, late: int, frames: int) -> Array:
-    """The squared heights (k,) of knocks at samples (k,) in each hop, `late` samples later, (frames + 1,)."""
-    hops = np.minimum((at + late) // HOP, frames)
+def _hits(at: NDArray[np.integer], height: Samples, frames: int) -> Array:
+    """The squared heights (k,) of knocks at samples (k,) in the hop in which each is heard, (frames + 1,)."""
+    hops = np.minimum((at + PRE_ROLL) // HOP, frames)
     return np.asarray(np.bincount(hops, height.astype(np.float64) ** 2, frames + 1), float)
 
 

@@ -2,85 +2,65 @@
 
 from __future__ import annotations
 
-from typing import ClassVar
-
 import numpy as np
 
 from edgefilter.dsp.convolution import convolve
 from edgefilter.dsp.frames import blocks
-from edgefilter.echo.effect import Effect, Experiment, Family, Parameter, Stage, first, neutral
+from edgefilter.echo.effect import Effect, Parameter, first, neutral, numbers, within
 from edgefilter.echo.evidence import Evidence
 from edgefilter.echo.measurement import Measurement, Values, VoiceModel
-from edgefilter.echo.wiener import convolve_from, fit_filter, fit_supported
+from edgefilter.echo.wiener import LONGEST, convolve_from, fit_filter, fit_supported
 from edgefilter.types import SAMPLE_RATE, Array, Samples
 
 LEAD = 32
 """Taps before lag 0: what a room of other colour changes in the direct sound."""
-TAPS = 12800
-"""0.8 s: the decay by 60 dB of an office, by 40 dB of a hall."""
 EXPECTED = 1e-3
 """Expected square of a tap before anything is known of the room, the same at all lags."""
 SLOWER = 1.7
-"""The squares that are expected once the room is known decay in this many times its reverberation time, so that none of
-it is cut away."""
+"""Times the room's reverberation time in which the expected squares decay once it is known, so that none of it is cut away."""
 BLOCK = 320
+"""Samples (20 ms) over which the energy of taps is summed."""
 DIRECT = 48
 """Samples up to which no reflection of a room comes: a detour of a metre. A change there is another effect's."""
 EARLY, LATE_SHARE = round(0.03 * SAMPLE_RATE), 0.1
-"""Samples up to which reflections are early, and the share of the added energy that comes after those where the room is
-another."""
+"""Samples up to which reflections are early, and the least share of the added energy after those where the room is another."""
 LONGER, DECAYED = 1.3, 0.01
 """By this factor the time until DECAYED of the energy is left exceeds the calibration's: 2 to 20 in rooms of 0.4 to 0.8
-s, 0.9 to 1.1 where the change was another one. So far down a sweep's response is clear of its noise, as it need not be
-where a reverberation time is read off."""
+s, 0.9 to 1.1 where the change was another one. So far down a sweep's response is clear of its noise."""
 
 
 class LateReverb(Effect):
     """y = x + taps * x: a long filter behind the calibrated path. Its decay gives the reverberation time.
 
     rt60_s: from the backward-integrated energy of the whole new response (Schroeder 1965, eq. 5), the first 20 ms left
-    out, above the noise.
-    level_db: energy of the taps after 10 ms, re the direct path. taps: (k,) lags -LEAD to k - LEAD.
+    out, above the noise. level_db: energy of the taps after 10 ms, re the direct path. taps: (k,) lags -LEAD to k - LEAD.
     """
 
-    name: ClassVar[str] = "late_reverb"
-    stage: ClassVar[Stage] = "path"
-    family: ClassVar[Family] = "linear path"
-    title: ClassVar[str] = "late reverberation"
-    shown_by: ClassVar[tuple[Experiment, ...]] = ("sweep", "tail", "place")
-    complexity: ClassVar[int] = 4
-    flexible: ClassVar[bool] = True
-    parameters: ClassVar[tuple[Parameter, ...]] = (
+    name = "late_reverb"
+    stage = "path"
+    family = "linear path"
+    title = "late reverberation"
+    shown_by = ("sweep", "tail", "place")
+    complexity = 4
+    flexible = True
+    parameters = (
         Parameter("rt60_s", "s", 0.0, 0.0, 10.0),
         Parameter("level_db", "dB", -120.0, -120.0, 40.0),
         Parameter("taps", "1", 0.0, -10.0, 10.0),
     )
 
     def apply(self, x: Samples, values: Values, sample_rate: int) -> Samples:
-        """Return x with its reverberation added."""
-        taps = np.atleast_1d(np.asarray(values["taps"], float))
-        return x.copy() if not taps.any() else x + convolve_from(x, taps, LEAD)
+        return with_taps(x, values)
 
     def fit(self, measurement: Measurement, model: VoiceModel) -> Values:
-        """Least squares in the whitened domain, slightly regularised.
-
-        Neutral where nothing of it holds on other samples.
-
-        Then once more with taps expected to decay as the room that was found does: some seconds of speech do not teach
-        ten thousand.
-        """
+        """The taps that fit_path() finds, which early_path shares; neutral where none hold on other samples."""
         taps, rt60 = measurement.once(fit_path, model)
         if not taps.any():
             return neutral(self)
         late = float(np.sum(taps[LEAD + SAMPLE_RATE // 100 :] ** 2))
-        return {
-            "rt60_s": rt60,
-            "level_db": float(np.clip(10 * np.log10(late + 1e-12), -120.0, 40.0)),
-            "taps": np.clip(taps, -10.0, 10.0),
-        }
+        return within(self, {"rt60_s": rt60, "level_db": 10 * np.log10(late + 1e-12), "taps": taps})
 
     def sentence(self, values: Values) -> str:
-        """How long the room sounds."""
         return (
             "the recording goes on sounding after the calibrated response has died away: "
             f"a reverberation of {first(values, 'rt60_s'):.2f} s that holds from the first second to the last"
@@ -88,25 +68,31 @@ class LateReverb(Effect):
 
     def only(self, values: Values) -> Values:
         """The direct sound as it was."""
-        taps = np.atleast_1d(np.asarray(values["taps"], float)).copy()
+        taps = numbers(values, "taps").copy()
         taps[: LEAD + DIRECT] = 0.0
         return {**values, "taps": taps}
 
     def plausible(self, evidence: Evidence) -> bool:
-        """Whether what it adds is reverberation: a good part comes later than early reflections do, and decays more slowly than at the calibration.
-
-        A loudspeaker of another colour or a path that moved are stationary, too, and a filter this long takes up
-        either.
-        """
+        """Whether the room is longer: a loudspeaker of another colour or a path that moved fill a filter this long as well."""
         return rings_longer(evidence)
 
 
+def with_taps(x: Samples, values: Values) -> Samples:
+    """The signal x (n,) and what the taps at lags -LEAD to k - LEAD add to it."""
+    taps = numbers(values, "taps")
+    return x + convolve_from(x, taps, LEAD) if taps.any() else x.copy()
+
+
 def fit_path(measurement: Measurement, model: VoiceModel) -> tuple[Array, float]:
-    """Taps at lags -LEAD to k - LEAD behind the calibrated path, (k,), zeros where none hold on other samples; RT60 of the new path in s."""
+    """Taps at lags -LEAD to k - LEAD behind the calibrated path, (k,), zeros where none hold on other samples; RT60 of the new path in s.
+
+    Least squares in the whitened domain, slightly regularised, then once more with taps that are expected to decay as the
+    room that was found does: some seconds of speech do not teach ten thousand.
+    """
     x = measurement.heard(model)[1]
     residual = measurement.white_recording - x
-    length = min(TAPS, measurement.recording.size // 4)
-    taps = fit_supported(x, residual, measurement.weights, length, LEAD, prior=np.full(length, EXPECTED), steps=40)
+    length = min(LONGEST, measurement.recording.size // 4)
+    taps = fit_supported(x, residual, measurement.weights, LEAD, np.full(length, EXPECTED))
     if not taps.any():
         return taps, 0.0
     response = convolve(model.impulse_response.astype(np.float64), taps)[LEAD:]
@@ -115,20 +101,15 @@ def fit_path(measurement: Measurement, model: VoiceModel) -> tuple[Array, float]
     rt60 = reverberation_time(response[direct : taps.size - LEAD])
     rt60 = rt60 or reverberation_time(model.impulse_response[direct:].astype(np.float64))
     if rt60 > 0.0:
-        prior = decaying(taps, SLOWER * rt60)
-        taps = fit_filter(x, residual, measurement.weights, length, LEAD, prior=prior, steps=60)
+        taps = fit_filter(x, residual, measurement.weights, length, LEAD, decaying(taps, SLOWER * rt60), steps=60)
     return taps, rt60
 
 
 def rings_longer(evidence: Evidence) -> bool:
-    """Whether taps make the room longer: a good part of what they add, a gain apart, comes later than early reflections do.
-
-    And the whole decays more slowly.
-    """
-    taps = np.atleast_1d(np.asarray(evidence.values["taps"], float))
-    direct = int(np.argmax(np.abs(evidence.model.impulse_response)))
-    before = evidence.model.impulse_response[direct:].astype(np.float64)
-    added = convolve(evidence.model.impulse_response.astype(np.float64), taps)[LEAD + direct :]
+    """Whether a good part of what taps add, a gain apart, comes after early reflections, and the whole decays more slowly."""
+    path = evidence.model.impulse_response.astype(np.float64)
+    direct = int(np.argmax(np.abs(path)))
+    before, added = path[direct:], convolve(path, numbers(evidence.values, "taps"))[LEAD + direct :]
     after = added.copy()
     after[: before.size] += before[: added.size]
     known = np.pad(before, (0, max(added.size - before.size, 0)))[: added.size]
@@ -151,15 +132,10 @@ def decay(response: Array) -> int:
 
 
 def decaying(taps: Array, rt60_s: float) -> Array:
-    """Expected squares of taps (k,) with the energy that these have above their noise, decaying with that reverberation time, (k,).
-
-    The first block, which holds what another room changes in the direct sound, is expected as it was found.
-    """
+    """Expected squares (k,): the energy that taps (k,) have above their noise, decaying in rt60_s; the first block, the direct sound's, as it is."""
     energy, floor = block_energy(taps)
-    blocks = np.arange(energy.size)
-    total = float(np.sum(np.maximum(energy[1:] - floor, 0.0))) / float(
-        np.sum(10 ** (-6.0 * blocks[1:] * BLOCK / SAMPLE_RATE / rt60_s))
-    )
+    falling = 10 ** (-6.0 * np.arange(energy.size)[1:] * BLOCK / SAMPLE_RATE / rt60_s)
+    total = float(np.sum(np.maximum(energy[1:] - floor, 0.0))) / float(np.sum(falling))
     expected = total / BLOCK * 10 ** (-6.0 * (np.arange(taps.size) - BLOCK / 2) / SAMPLE_RATE / rt60_s)
     expected[:BLOCK] = np.maximum(expected[:BLOCK], energy[0] / BLOCK)
     return expected

@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-from typing import ClassVar
-
 import numpy as np
 
-from edgefilter.echo.effect import Effect, Experiment, Family, Parameter, Stage, first
+from edgefilter.echo.effect import NEVER_REACHED, Effect, Parameter, first, neutral
 from edgefilter.echo.measurement import Measurement, Values, VoiceModel
 from edgefilter.types import SAMPLE_RATE, Samples
 
-NO_LIMIT = 100.0
-HARD = 100.0
-HARDNESS = (HARD, 10.0, 5.0, 3.0, 2.0)
+HARD, HARDNESS = 100.0, (10.0, 5.0, 3.0, 2.0)
+"""The hardness from which on it is a clip, and the softer ones that are tried."""
 STEPS = 1.0 - np.array([0.0, 0.01, 0.02, 0.04, 0.07, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5])
+"""Levels that are tried, re the recording's largest sample."""
 
 
 class MicClipping(Effect):
@@ -22,22 +20,21 @@ class MicClipping(Effect):
     p = 2 is a soft limiter; from 100 on it is a hard clip. Level 100, far beyond any converter, stands for no limit.
     """
 
-    name: ClassVar[str] = "mic_clipping"
-    stage: ClassVar[Stage] = "microphone"
-    family: ClassVar[Family] = "static nonlinearity"
-    title: ClassVar[str] = "microphone clipping"
-    shown_by: ClassVar[tuple[Experiment, ...]] = ("levels", "tone")
-    complexity: ClassVar[int] = 1
-    memory: ClassVar[int | None] = 0
-    parameters: ClassVar[tuple[Parameter, ...]] = (
-        Parameter("level", "full scale", NO_LIMIT, 1e-4, NO_LIMIT),
+    name = "mic_clipping"
+    stage = "microphone"
+    family = "static nonlinearity"
+    title = "microphone clipping"
+    shown_by = ("levels", "tone")
+    complexity = 1
+    memory = 0
+    parameters = (
+        Parameter("level", "full scale", NEVER_REACHED, 1e-4, NEVER_REACHED),
         Parameter("hardness", "", HARD, 1.0, HARD),
     )
 
     def apply(self, x: Samples, values: Values, sample_rate: int) -> Samples:
-        """Return x (n,), limited."""
         level, hardness = float(values["level"]), float(values["hardness"])
-        if level >= NO_LIMIT:
+        if level >= NEVER_REACHED:
             return x.copy()
         if hardness >= HARD:
             return np.clip(x, -level, level)
@@ -45,43 +42,36 @@ class MicClipping(Effect):
         return (x / (1.0 + over**hardness) ** (1.0 / hardness)).astype(np.float32)
 
     def fit(self, measurement: Measurement, model: VoiceModel) -> Values:
-        """The level and hardness that leave the least of the whitened recording, a gain free in each.
-
-        Levels from the recording's largest value downwards; where none beats the prediction as it is, there is no
-        limit.
-        """
+        """The level and hardness that leave the least of the whitened recording, a gain free in each; neutral where none does."""
         predicted, recording = measurement.heard(model)[0], measurement.white_recording
         chosen = measurement.weights
         top = float(np.max(np.abs(measurement.recording), initial=0.0))
-        none = {"level": NO_LIMIT, "hardness": HARD}
         if top <= 1e-4:
-            return none
+            return neutral(self)
 
         def left(level: float, hardness: float) -> float:
-            white = (
-                measurement.whiten(self.apply(predicted, {"level": level, "hardness": hardness}, SAMPLE_RATE)) * chosen
-            )
+            limited = self.apply(predicted, {"level": level, "hardness": hardness}, SAMPLE_RATE)
+            white = measurement.whiten(limited) * chosen
             energy = float(np.dot(white, white))
             return total - float(np.dot(recording, white)) ** 2 / energy if energy > 0.0 else total
 
         total = float(np.dot(recording * chosen, recording * chosen))
-        plain = left(NO_LIMIT, HARD)
+        plain = left(NEVER_REACHED, HARD)
         levels = top * STEPS
         costs = [left(level, HARD) for level in levels]
         best = int(np.argmin(costs))
         found = (costs[best], float(levels[best]), HARD)
-        for hardness in HARDNESS[1:]:
+        for hardness in HARDNESS:
             for factor in (0.85, 1.0, 1.15):
-                level = min(found[1] * factor, 0.99 * NO_LIMIT)
+                level = min(found[1] * factor, 0.99 * NEVER_REACHED)
                 found = min(found, (left(level, hardness), level, hardness))
         for factor in (0.97, 0.985, 1.015, 1.03):
-            level = min(found[1] * factor, 0.99 * NO_LIMIT)
+            level = min(found[1] * factor, 0.99 * NEVER_REACHED)
             found = min(found, (left(level, found[2]), level, found[2]))
         variance = found[0] / max(chosen.sum(), 1.0)
         if plain - found[0] <= 2.0 * variance * np.log(max(chosen.sum(), 2.0)):
-            return none
+            return neutral(self)
         return {"level": found[1], "hardness": found[2]}
 
     def sentence(self, values: Values) -> str:
-        """The level that the recording does not exceed."""
         return f"the predicted peaks exceed {first(values, 'level'):.3f} of full scale and the recorded ones do not"

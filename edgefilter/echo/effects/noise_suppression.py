@@ -2,47 +2,40 @@
 
 from __future__ import annotations
 
-from typing import ClassVar
-
 import numpy as np
 import scipy
 from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter1d
 
 from edgefilter.dsp.frames import decibels, frames
-from edgefilter.dsp.psd import ROUNDING_PSD, floored, frequencies, hann, variance_at
-from edgefilter.echo.effect import Effect, Family, Parameter, Runner, Stage, first, neutral
+from edgefilter.dsp.psd import floored, frequencies, hann, variance_at
+from edgefilter.echo.effect import Effect, Parameter, Runner, first, neutral, numbers, within
 from edgefilter.echo.evidence import Evidence
-from edgefilter.echo.measurement import Measurement, Values, VoiceModel
+from edgefilter.echo.measurement import SILENT, Measurement, Values, VoiceModel
 from edgefilter.types import Array, Samples
 
 SIZE, HOP = 512, 256
 WINDOW = np.sqrt(hann(SIZE))
 """Analysis and synthesis: their product, half-overlapping, adds up to 1."""
 FORGETTING, NEIGHBOURS = 0.5, 3
-"""Of the local ratio, from one frame to the next, and the bins over which it is averaged: what explains most of the
-suppressors tried."""
-KNOTS_DB = np.arange(-10.0, 26.0, 5.0)
-"""Local ratio of voice to fan; from OPEN_DB on everything is let through."""
-OPEN_DB = 30.0
-SILENT_DB = -10.0
-"""Of the voice re the fan, over all frequencies."""
+"""Of the local ratio, from frame to frame, and the bins over which it is averaged: what explains most of the suppressors tried."""
+KNOTS_DB = np.arange(-10.0, 31.0, 5.0)
+"""Local ratios of voice to fan; from the last one on everything is let through."""
 LOUD_DB, WEAK_DB = 15.0, (-9.0, 3.0)
 """Where a suppressor lets nearly all through, and where it shows most: further down the fan drowns the voice."""
 TRUST = 0.3
-"""Standard deviation of a gain around that of the next knot, the last one's around 1, that is expected before anything was heard."""
+"""Standard deviation of a gain around that of the next knot, the last one's around 1, before anything was heard."""
 EDGES = np.unique(np.round(np.geomspace(4, SIZE // 2 - 10, 17)).astype(int))
 """Bins of the bands whose loud cells say what the path is off by."""
 FEWEST_LOUD, FEWEST_QUIET = 30, 16
 """Cells of a band, and frames of silence, that say something."""
 LEAST_SOFTER_DB = 2.0
 """By which the silences are under the calibrated fan at least: from day to day it is half a dB."""
-LEAST_HELD_DB = 2.5
-"""By which the weak cells of the voice are held down at least (a good codec that leaves some of them out takes 1.6 dB),"""
-SURE = 6.0
-"""and in standard deviations."""
+LEAST_HELD_DB, SURE = 2.5, 6.0
+"""By which the weak cells of the voice are held down at least (a good codec that leaves some of them out takes 1.6 dB), and
+in standard deviations."""
 DEEPER_DB = 3.0
-"""By which weak cells may be held down further than the silences are, which no suppressor does: its gain there is the least."""
+"""By which weak cells may be held down further than the silences: no suppressor does that, whose gain there is the least."""
 MISSED_DB = -4.5
 """Of the loud cells of the voice, which a suppressor lets through, three in four are predicted but for less: where they are
 not, a drift, a codec or what else is in the recording may take the weak cells away as well."""
@@ -57,30 +50,29 @@ class NoiseSuppression(Effect):
     formed, or one number. softer_db only reports: level of the robot's silences re that fan.
     """
 
-    name: ClassVar[str] = "noise_suppression"
-    stage: ClassVar[Stage] = "microphone"
-    family: ClassVar[Family] = "dynamics"
-    run_note: ClassVar[str] = (
+    name = "noise_suppression"
+    stage = "microphone"
+    family = "dynamics"
+    run_note = (
         "what it takes of the voice lies near the fan, and where it opens it lets the calibrated fan through: adding it"
         " changes nothing in the running filter"
     )
-    title: ClassVar[str] = "noise suppression"
-    complexity: ClassVar[int] = 2
-    parameters: ClassVar[tuple[Parameter, ...]] = (
+    title = "noise suppression"
+    complexity = 2
+    parameters = (
         Parameter("gain_db", "dB", 0.0, -60.0, 12.0),
         Parameter("fan_db", "dB re full scale^2/Hz", -200.0, -200.0, 0.0, given=True),
         Parameter("softer_db", "dB", 0.0, -120.0, 60.0),
     )
 
     def apply(self, x: Samples, values: Values, sample_rate: int) -> Samples:
-        """Return x (n,) with the gain of each cell."""
-        gain_db = np.broadcast_to(np.asarray(values["gain_db"], float), KNOTS_DB.shape)
+        gain_db = _gains(values)
         if not gain_db.any() or not x.size:
             return x.copy()
-        density = 10.0 ** (np.atleast_1d(np.asarray(values["fan_db"], float)) / 10.0)
+        density = 10.0 ** (numbers(values, "fan_db") / 10.0)
         fan = variance_at(frequencies(SIZE // 2 + 1), np.resize(density, 601).astype(np.float32))
         spectra = _spectra(np.pad(x, (HOP, SIZE)))
-        spectra *= np.interp(decibels(_ratio(spectra, fan)), [*KNOTS_DB, OPEN_DB], [*10.0 ** (gain_db / 20.0), 1.0])
+        spectra *= np.interp(decibels(_ratio(spectra, fan)), KNOTS_DB, [*10.0 ** (gain_db / 20.0), 1.0])
         pieces = np.fft.irfft(spectra, SIZE) * WINDOW
         whole = np.zeros((pieces.shape[0] + 1, HOP))
         whole[:-1] += pieces[:, :HOP]
@@ -89,7 +81,7 @@ class NoiseSuppression(Effect):
 
     def run(self, values: Values, sample_rate: int) -> Runner:
         """The voice as it is: a gain by frequency takes as long as a frame, which the running filter does not wait."""
-        return _as_it_is
+        return lambda x, heard=None: x
 
     def fit(self, measurement: Measurement, model: VoiceModel) -> Values:
         """Least squares over the cells, the fan's variance 1 in each: the gains at the knots times what the loud cells of the band have."""
@@ -97,27 +89,23 @@ class NoiseSuppression(Effect):
             return neutral(self)
         voice = measurement.heard(model)[0]
         cells = Cells(measurement, voice, measurement.weights > 0.0)
-        step = (np.eye(KNOTS_DB.size) - np.eye(KNOTS_DB.size, k=1)) / TRUST
-        left, right = step.T @ step, np.zeros(KNOTS_DB.size)
+        knots = KNOTS_DB.size - 1
+        step = (np.eye(knots) - np.eye(knots, k=1)) / TRUST
+        left, right = step.T @ step, np.zeros(knots)
         right[-1] = TRUST**-2
-        place = np.clip((cells.ratio_db - KNOTS_DB[0]) / (KNOTS_DB[1] - KNOTS_DB[0]), 0.0, KNOTS_DB.size)
-        hats = [np.maximum(0.0, 1.0 - np.abs(place - k)) for k in range(KNOTS_DB.size + 1)]
-        for i in range(KNOTS_DB.size):
+        place = np.clip((cells.ratio_db - KNOTS_DB[0]) / (KNOTS_DB[1] - KNOTS_DB[0]), 0.0, knots)
+        hats = [np.maximum(0.0, 1.0 - np.abs(place - k)) for k in range(knots + 1)]
+        for i in range(knots):
             right[i] += np.sum(hats[i] * (cells.cross - hats[-1] * cells.power))
-            for j in range(i, min(i + 2, KNOTS_DB.size)):
+            for j in range(i, min(i + 2, knots)):
                 left[i, j] += np.sum(hats[i] * hats[j] * cells.power)
                 left[j, i] = left[i, j]
-        gains = np.clip(np.linalg.solve(left, right), 1e-3, 3.9)
-        return {
-            "gain_db": 20.0 * np.log10(gains),
-            "fan_db": np.clip(10.0 * np.log10(np.maximum(floored(measurement.noise_psd), ROUNDING_PSD)), -199.0, 0.0),
-            "softer_db": float(np.clip(cells.quiet_db, -120.0, 60.0)),
-        }
+        gain_db = 20.0 * np.log10(np.clip(np.linalg.solve(left, right), 1e-3, 3.9))
+        fan_db = 10.0 * np.log10(floored(measurement.noise_psd))
+        return within(self, {"gain_db": gain_db, "fan_db": fan_db, "softer_db": cells.quiet_db})
 
     def sentence(self, values: Values) -> str:
-        """What the silences and the voice show."""
-        gains = np.broadcast_to(np.asarray(values["gain_db"], float), KNOTS_DB.shape)
-        at = {int(db): float(gains[int(np.argmin(np.abs(KNOTS_DB - db)))]) for db in (-5.0, 5.0, 15.0)}
+        at = dict(zip(KNOTS_DB.astype(int).tolist(), _gains(values), strict=False))
         return (
             f"while the robot is silent the fan is {-first(values, 'softer_db'):.0f} dB softer than calibrated, and of the"
             f" voice less is let through the less it stands out of the fan: {at[-5]:.0f} dB at -5 dB over it, {at[5]:.0f}"
@@ -125,10 +113,7 @@ class NoiseSuppression(Effect):
         )
 
     def plausible(self, evidence: Evidence) -> bool:
-        """Whether the silences are softer than the fan, and weak cells of the voice more so than loud ones, on held-out samples.
-
-        A slower fan leaves the voice as it is, and a gain that was turned moves all of it.
-        """
+        """Whether silences are softer than the fan, and weak cells of the voice more so than loud ones: a turned gain moves all of them."""
         measurement = evidence.grid.measurement
         if measurement.noise_psd is None or measurement.fit is None:
             return False
@@ -142,12 +127,11 @@ class NoiseSuppression(Effect):
 
 
 class Cells:
-    """A recording and its predicted voice in cells of time and frequency, over the fan, whose expected power in each is 1.
+    """A recording and its predicted voice in the cells that lie wholly in the samples `among` (n,) bool; the fan's power in each is 1.
 
-    Of those that lie wholly in the samples `among` (n,) bool. ratio_db: of voice to fan. power: of the voice as loud cells
-    of its band have it. cross: of that and the recording, real part; all (cells,). quiet_db: level of the recording while
-    the robot is silent, of all samples, 0 where that is too seldom. missed_db: what three in four loud cells differ by less
-    than from what is predicted, re that.
+    ratio_db: of voice to fan. power: of the voice as loud cells of its band have it. cross: of that and the recording, real
+    part; all (cells,). quiet_db: level of the recording while the robot is silent, of all samples, 0 where that is too
+    seldom. missed_db: what three in four loud cells differ by less than from what is predicted, re that.
     """
 
     def __init__(self, measurement: Measurement, voice: Samples, among: NDArray[np.bool_]) -> None:
@@ -185,15 +169,15 @@ class Cells:
         return float(self.cross[weak].sum()) / power, float(np.sqrt(0.5 / power))
 
 
-def _as_it_is(x: Samples, heard: Samples | None = None) -> Samples:
-    """Return x (n,) itself."""
-    return x
+def _gains(values: Values) -> Array:
+    """Gain in dB at each of KNOTS_DB but the last, (8,)."""
+    return np.broadcast_to(np.asarray(values["gain_db"], float), (KNOTS_DB.size - 1,))
 
 
 def _quiet_db(x: NDArray[np.complex128], y: NDArray[np.complex128]) -> float:
-    """Level of the recording y where the voice x is SILENT_DB re the fan: of a median, so that somebody who talks now and then is not heard."""
+    """Level of the recording y where the voice x is SILENT: of a median, so that somebody who talks now and then is not heard."""
     inner = slice(EDGES[0], EDGES[-1])
-    silent = decibels(np.mean(np.abs(x[:, inner]) ** 2, axis=1)) < SILENT_DB
+    silent = np.mean(np.abs(x[:, inner]) ** 2, axis=1) < SILENT
     if np.count_nonzero(silent) < FEWEST_QUIET:
         return 0.0
     return float(decibels(np.median(np.abs(y[silent, inner]) ** 2) / np.log(2.0)))

@@ -2,29 +2,29 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from edgefilter.dsp.frames import block_power
+from edgefilter.dsp.frames import block_power, frames
 from edgefilter.dsp.psd import total_power
-from edgefilter.echo.effect import Effect, Family, Parameter, Stage, first, neutral
+from edgefilter.echo.effect import NEVER_S, Effect, Parameter, first, neutral, numbers, within
 from edgefilter.echo.evidence import Evidence
 from edgefilter.echo.measurement import Measurement, Values, VoiceModel, whiten
 from edgefilter.types import PRE_ROLL, SAMPLE_RATE, Array, Samples
 
-NONE_S = 1e6
 STEP = 40
 """Samples (2.5 ms) of the finest grid on which frames are looked for."""
 LENGTHS = (4, 8, 12, 16, 24)
 """Steps of a frame: 10, 20, 30, 40, 60 ms, those of RTP's audio formats (RFC 3551, 6716)."""
 TAPS, SPREAD = 640, 600
 """Samples of the path behind the direct sound by which a frame is told, and of the whitening filter either way."""
-BLOCK = 160
+BLOCK = STEP * min(LENGTHS)
+"""Samples of the shortest frame."""
 LOUD, MISSING, PREDICTED = 30.0, 0.5, 0.1
 """Of the voice over the fan where a block says something; what is left of a block that is missing, of the voice there; and
 what is left at most of half of the blocks where the voice is predicted at all."""
@@ -39,9 +39,9 @@ FEWEST, ALONE, OFF_GRID = 4, 0.6, 0.9
 explain at most of what the found one does. What a codec takes away, or a compressor, keeps to no grid."""
 DROPPED = 0.3
 """Of the fan's variance that must be there where a frame is missing: what the microphone itself lost has none."""
-FILLS: tuple[float, ...] = tuple(np.linspace(0.0, 1.0, 11).tolist())
-FADES_MS: tuple[float, ...] = (0.0, 1.0, 2.0, 4.0)
+FILLS, FADES_MS = np.linspace(0.0, 1.0, 11), (0.0, 1.0, 2.0, 4.0)
 FINE = (np.arange(-32, 33, 8), np.arange(-6, 7, 2), np.array([-1, 0, 1]))
+"""Values that are tried; FINE: samples by which the grid is moved, in turn, from the best so far."""
 
 
 class PacketLoss(Effect):
@@ -51,18 +51,18 @@ class PacketLoss(Effect):
     into that, so that it fades. fade_ms: of the line by which one passes into the other, at both ends inside of the frame.
     """
 
-    name: ClassVar[str] = "packet_loss"
-    stage: ClassVar[Stage] = "source"
-    family: ClassVar[Family] = "modulation"
-    run_note: ClassVar[str] = (
+    name = "packet_loss"
+    stage = "source"
+    family = "modulation"
+    run_note = (
         "these packets were lost in this recording, and no others will be the same: adding it changes nothing in the"
         " running filter"
     )
-    title: ClassVar[str] = "lost packets"
-    event: ClassVar[bool] = True
-    complexity: ClassVar[int] = 2
-    parameters: ClassVar[tuple[Parameter, ...]] = (
-        Parameter("times_s", "s", NONE_S, 0.0, NONE_S),
+    title = "lost packets"
+    event = True
+    complexity = 2
+    parameters = (
+        Parameter("times_s", "s", NEVER_S, 0.0, NEVER_S),
         Parameter("length_ms", "ms", 20.0, 1.0, 200.0),
         Parameter("fill", "", 0.0, 0.0, 1.0),
         Parameter("fade_ms", "ms", 0.0, 0.0, 5.0),
@@ -70,12 +70,11 @@ class PacketLoss(Effect):
     )
 
     def apply(self, x: Samples, values: Values, sample_rate: int) -> Samples:
-        """Return x (n,) without those frames."""
         out = x.copy()
         length, fade = (round(float(values[name]) * 1e-3 * sample_rate) for name in ("length_ms", "fade_ms"))
         edge = np.clip((np.arange(length) + 0.5) / max(fade, 1e-9), 0.0, 1.0)
         lost = np.minimum(edge, edge[::-1]).astype(np.float32)
-        for time in np.sort(np.atleast_1d(np.asarray(values["times_s"], float))):
+        for time in np.sort(numbers(values, "times_s")):
             at = round(time * sample_rate)
             part = out[at : at + length] if at < x.size else out[:0]
             before = np.zeros(part.size, np.float32)
@@ -85,18 +84,16 @@ class PacketLoss(Effect):
         return out
 
     def fit(self, measurement: Measurement, model: VoiceModel) -> Values:
-        """The grid of frames, and those of them, without which the error falls most, of all samples: a frame is lost once.
-
-        Then the grid's moment to a sample, and how much of the last frame was put into the gap.
-        """
+        """The frames without which the error falls most, of all samples: a frame is lost once; their moment to a sample, and their fill."""
         steps = _steps(measurement, model)
         grid = None if steps is None else _best_grid(steps)
         if grid is None:
             return neutral(self)
-        times = (grid.first + np.flatnonzero(grid.lost) * grid.length) * STEP / SAMPLE_RATE
-        found = {"length_ms": 1e3 * grid.length * STEP / SAMPLE_RATE, "fill": 0.0, "fade_ms": 0.0}
+        length, start, lost = grid
+        times = (start + np.flatnonzero(lost) * length) * STEP / SAMPLE_RATE
+        found = {"length_ms": 1e3 * length * STEP / SAMPLE_RATE, "fill": 0.0, "fade_ms": 0.0}
 
-        def best(name: str, tried: Sequence[float | Array]) -> Any:
+        def best(name: str, tried: Iterable[float | Array]) -> Any:
             """Of the values tried that of the least error."""
 
             def error(value: float | Array) -> float:
@@ -110,11 +107,10 @@ class PacketLoss(Effect):
             times = best("times_s", [np.maximum(times + move / SAMPLE_RATE, 0.0) for move in moves])
         for name, tried in (("fill", FILLS), ("fade_ms", FADES_MS), ("fill", FILLS)):
             found[name] = float(best(name, tried))
-        return {**found, "times_s": np.clip(times, 0.0, NONE_S), "lost": float(times.size)}
+        return within(self, {**found, "times_s": times, "lost": times.size})
 
     def sentence(self, values: Values) -> str:
-        """How many, of which length, and the first of them."""
-        times = np.sort(np.atleast_1d(np.asarray(values["times_s"], float)))
+        times = np.sort(numbers(values, "times_s"))
         listed = ", ".join(f"{time:.2f}" for time in times[:4]) + (" s" if times.size <= 4 else " s, ...")
         fill = first(values, "fill")
         gap = "nothing" if fill < 0.1 else f"the one before, times {fill:.1f},"
@@ -129,7 +125,7 @@ class PacketLoss(Effect):
         if measurement.noise_psd is None or not evidence.values["lost"]:
             return False
         quarter = round(float(values["length_ms"]) * 1e-3 * SAMPLE_RATE / 4)
-        starts = np.round(np.atleast_1d(np.asarray(values["times_s"], float)) * SAMPLE_RATE).astype(int) + PRE_ROLL
+        starts = np.round(numbers(values, "times_s") * SAMPLE_RATE).astype(int) + PRE_ROLL
         middles = [measurement.recording[at + quarter : at + 3 * quarter] for at in starts]
         power = [float(np.mean(np.square(part, dtype=np.float64))) for part in middles if part.size]
         return bool(power) and float(np.median(power)) > DROPPED * total_power(measurement.noise_psd)
@@ -137,24 +133,14 @@ class PacketLoss(Effect):
 
 @dataclass(frozen=True, eq=False)
 class Steps:
-    """Least squares for the change of the voice's gain in each step of STEP samples of the reference.
+    """Least squares for the change of the voice's gain in each STEP of the reference.
 
-    normal: (lags, steps) diagonals of the normal equations. right: (steps,) their right side. noise: variance of the
-    residual, whitened, at most moments.
+    normal: (lags, steps) diagonals of the equations. right: (steps,) their right side. noise: variance of the residual, whitened.
     """
 
     normal: Array
     right: Array
     noise: float
-
-
-@dataclass(frozen=True, eq=False)
-class Grid:
-    """Frames of `length` steps from step `first` on, and which of them were lost (frames,) bool."""
-
-    length: int
-    first: int
-    lost: NDArray[np.bool_]
 
 
 def _steps(measurement: Measurement, model: VoiceModel) -> Steps | None:
@@ -172,7 +158,7 @@ def _steps(measurement: Measurement, model: VoiceModel) -> Steps | None:
     count, size = heard.size // STEP, STEP + path.size - 1
     pieces = measurement.reference[: count * STEP].reshape(count, STEP)
     driven = scipy.signal.fftconvolve(pieces, path[None], axes=1).astype(np.float32)
-    around = np.lib.stride_tricks.sliding_window_view(np.pad(left, (PRE_ROLL, size)), size)[::STEP][:count]
+    around = frames(np.pad(left, (PRE_ROLL, size)), size, STEP)[:count]
     lags = -(-size // STEP)
     normal = np.zeros((lags, count))
     for lag in range(lags):
@@ -182,8 +168,8 @@ def _steps(measurement: Measurement, model: VoiceModel) -> Steps | None:
     return Steps(normal, np.einsum("ij,ij->i", driven, around), noise)
 
 
-def _best_grid(steps: Steps) -> Grid | None:
-    """The grid whose lost frames explain most; None where they look like no packets."""
+def _best_grid(steps: Steps) -> tuple[int, int, NDArray[np.bool_]] | None:
+    """Steps of a frame, the first one's step, and which were lost, (frames,), of the grid that explains most; None for no packets."""
     tried = {(length, first): _without(steps, length, first) for length in LENGTHS for first in range(length)}
     most = max(worth for worth, *_ in tried.values())
     length, first = max(key for key, (worth, *_) in tried.items() if worth >= NEARLY * most)
@@ -193,15 +179,14 @@ def _best_grid(steps: Steps) -> Grid | None:
     if np.count_nonzero(lost & ~np.roll(lost, 1)) < FEWEST or beside > OFF_GRID * worth:
         return None
     played = clear & (gain > KEPT)
-    alone = sum(_next(played, lost, at, -1) and _next(played, lost, at, 1) for at in np.flatnonzero(lost).tolist())
-    return Grid(length, first, sure) if alone >= ALONE * np.count_nonzero(lost) else None
+    others = np.flatnonzero(~lost)
+    at, around = np.searchsorted(others, np.flatnonzero(lost)), np.pad(played[others], 1)
+    alone = np.count_nonzero(around[at] & around[at + 1])  # between two frames that were played
+    return (length, first, sure) if alone >= ALONE * np.count_nonzero(lost) else None
 
 
 def _without(steps: Steps, length: int, first: int) -> tuple[float, Array, NDArray[np.bool_], NDArray[np.bool_]]:
-    """What the lost frames of a grid explain, less the cost of saying which they are.
-
-    And (frames,) each: gain, whether lost for sure, whether loud enough to be clear.
-    """
+    """What the lost frames of a grid explain, less the cost of saying which; of each its gain, whether surely lost, whether loud enough."""
     count = (steps.right.size - first) // length
     part = slice(first, first + count * length)
     right = steps.right[part].reshape(count, length).sum(axis=1)
@@ -213,11 +198,3 @@ def _without(steps: Steps, length: int, first: int) -> tuple[float, Array, NDArr
     sure = fall > SURE
     cost = 2.0 * np.log(max(count, 2)) * np.count_nonzero(sure)
     return float(fall[sure].sum() - cost), 1.0 + right / np.maximum(energy, 1e-9), sure, clear
-
-
-def _next(played: NDArray[np.bool_], lost: NDArray[np.bool_], at: int, way: int) -> bool:
-    """Whether the next frame that is not lost, that way, was played."""
-    at += way
-    while 0 <= at < lost.size and lost[at]:
-        at += way
-    return bool(0 <= at < lost.size and played[at])

@@ -2,68 +2,58 @@
 
 from __future__ import annotations
 
-from typing import ClassVar
-
 import numpy as np
 
 from edgefilter.dsp.frames import block_power
-from edgefilter.echo.effect import Effect, Experiment, Family, Parameter, Stage, first, neutral
+from edgefilter.echo.effect import NEVER_S, Effect, Parameter, first, neutral, numbers, within
 from edgefilter.echo.evidence import Evidence
 from edgefilter.echo.measurement import Measurement, Values, VoiceModel
 from edgefilter.echo.wiener import convolve_from, fit_supported
-from edgefilter.types import SAMPLE_RATE, Samples
+from edgefilter.types import PRE_ROLL, SAMPLE_RATE, Samples
 
-LEAD = 64
-TAPS = 3072
-EXPECTED = 1e-2
-"""Expected square of a tap."""
+TAPS, EXPECTED = 3072, 1e-2
+"""Of the new path behind the old one, 0.2 s: what moves is near. And the expected square of each."""
 BLOCK = SAMPLE_RATE // 10
+"""Samples (100 ms) of the steps in which the moment is looked for at first."""
 MARGIN = 1.5
-"""Seconds at either end within which no change is looked for: there is no telling it from a path that was another all
-along."""
+"""Seconds at either end in which no change is looked for: it looks like a path that was another all along."""
 SLACK = 6.0
 """Squared error, in variances of the fan, by which moments and fades are told apart: less is chance."""
-NEVER = 1e6
 
 
 class PathChange(Effect):
     """y = x until time_s, then x + taps * x, faded over in duration_s around it.
 
-    taps: (k,) lags -LEAD to k - LEAD: the new path behind the calibrated one. A time_s of 1e6 s is never.
+    taps: (k,) lags -PRE_ROLL to k - PRE_ROLL: the new path behind the calibrated one. A time_s of 1e6 s is never.
     """
 
-    name: ClassVar[str] = "path_change"
-    stage: ClassVar[Stage] = "path"
-    family: ClassVar[Family] = "linear path"
-    run_note: ClassVar[str] = "the running filter begins with the path as it was after the change"
-    title: ClassVar[str] = "a changed path"
-    shown_by: ClassVar[tuple[Experiment, ...]] = ("sweep", "place")
-    event: ClassVar[bool] = True
-    complexity: ClassVar[int] = 4
-    flexible: ClassVar[bool] = True
-    parameters: ClassVar[tuple[Parameter, ...]] = (
-        Parameter("time_s", "s", NEVER, 0.0, NEVER),
+    name = "path_change"
+    stage = "path"
+    family = "linear path"
+    run_note = "the running filter begins with the path as it was after the change"
+    title = "a changed path"
+    shown_by = ("sweep", "place")
+    event = True
+    complexity = 4
+    flexible = True
+    parameters = (
+        Parameter("time_s", "s", NEVER_S, 0.0, NEVER_S),
         Parameter("duration_s", "s", 0.01, 0.0, 10.0),
         Parameter("taps", "1", 0.0, -10.0, 10.0),
     )
 
     def apply(self, x: Samples, values: Values, sample_rate: int) -> Samples:
-        """Put x through the old path, then the new one."""
-        taps = np.atleast_1d(np.asarray(values["taps"], float))
-        if not taps.any() or float(values["time_s"]) >= x.size / sample_rate:
+        taps, time = numbers(values, "taps"), float(values["time_s"])
+        if not taps.any() or time >= x.size / sample_rate:
             return x.copy()
-        return x + _fade(x.size, float(values["time_s"]), float(values["duration_s"]), sample_rate) * convolve_from(
-            x, taps, LEAD
-        )
+        return x + _fade(x.size, time, float(values["duration_s"]), sample_rate) * convolve_from(x, taps, PRE_ROLL)
 
     def settled(self, values: Values) -> Values:
         """Values with which the new path holds from the start."""
-        return {**values, "time_s": -1.0, "duration_s": 0.0} if float(values["time_s"]) < NEVER else values
+        return {**values, "time_s": -1.0, "duration_s": 0.0} if float(values["time_s"]) < NEVER_S else values
 
     def fit(self, measurement: Measurement, model: VoiceModel) -> Values:
-        """The time by the step in the residual, the new path by least squares after it, in turn.
-
-        Neutral where it does not help on other samples.
+        """The time by the step in the residual, the new path by least squares after it, in turn; neutral where that does not hold.
 
         The moment alone is chosen on all samples, since it may fall between those that the fit may use.
         """
@@ -72,10 +62,10 @@ class PathChange(Effect):
         time = _step(residual, x)
         for _ in range(2):
             after = measurement.weights * (np.arange(x.size) > (time + 0.3) * SAMPLE_RATE)
-            taps = fit_supported(x, residual, after, TAPS, LEAD, prior=np.full(TAPS, EXPECTED), steps=40)
+            taps = fit_supported(x, residual, after, PRE_ROLL, np.full(TAPS, EXPECTED))
             if not taps.any():
                 return neutral(self)
-            change = convolve_from(x, taps, LEAD)
+            change = convolve_from(x, taps, PRE_ROLL)
             time = _best_time(residual, change, measurement.weights)
         errors = {}
         for length in (0.01, 0.3, 0.6, 1.0):
@@ -85,14 +75,9 @@ class PathChange(Effect):
         most = min(errors.values()) + SLACK
         as_good = [found for found, error in errors.items() if error <= most]
         time, duration = min(as_good, key=lambda found: (found[1], abs(found[0] - time)))
-        return {
-            "time_s": float(np.clip(time, 0.0, x.size / SAMPLE_RATE)),
-            "duration_s": duration,
-            "taps": np.clip(taps, -10.0, 10.0),
-        }
+        return within(self, {"time_s": min(time, x.size / SAMPLE_RATE), "duration_s": duration, "taps": taps})
 
     def sentence(self, values: Values) -> str:
-        """When."""
         return f"until {first(values, 'time_s'):.2f} s the calibrated path holds, from then on another one"
 
     def plausible(self, evidence: Evidence) -> bool:
@@ -112,13 +97,12 @@ class PathChange(Effect):
 
 def _fade(n: int, time: float, duration: float, sample_rate: int) -> Samples:
     """A fade, 0 before, 1 after, a line in between, (n,)."""
-    return np.clip((np.arange(n, dtype=np.float32) / sample_rate - time) / max(duration, 1e-4) + 0.5, 0.0, 1.0).astype(
-        np.float32
-    )
+    seconds = np.arange(n, dtype=np.float32) / sample_rate
+    return np.clip((seconds - time) / max(duration, 1e-4) + 0.5, 0.0, 1.0).astype(np.float32)
 
 
 def _step(residual: Samples, x: Samples) -> float:
-    """Seconds at which the residual, in proportion to the prediction, rises most clearly: two means of its log in blocks of 100 ms."""
+    """Seconds at which the residual, in proportion to the prediction, rises most clearly: two means of its log in BLOCKs."""
     power, drive = block_power(residual, BLOCK), block_power(x, BLOCK)
     count = power.size
     loud = drive > 10.0

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import astuple, replace
+from dataclasses import asdict, replace
+from functools import lru_cache
 from itertools import product
-from typing import ClassVar
 
 import numpy as np
 import scipy
@@ -12,19 +12,10 @@ from numpy.typing import NDArray
 
 from edgefilter.dsp.convolution import convolve
 from edgefilter.dsp.frames import frames
-from edgefilter.echo.effect import (
-    Effect,
-    Experiment,
-    Family,
-    Parameter,
-    Stage,
-    complete,
-    first,
-    neutral,
-    number_or_taps,
-)
+from edgefilter.echo.effect import NEVER_REACHED, Effect, Parameter, complete, first, neutral, numbers, within
 from edgefilter.echo.effects.knock_power import (
     DECAYS_MS,
+    FOLD,
     FRAME,
     HOP,
     RESONANCES_HZ,
@@ -43,18 +34,16 @@ from edgefilter.echo.effects.knock_power import (
 from edgefilter.echo.evidence import Evidence
 from edgefilter.echo.least_squares import absorbed, filtered
 from edgefilter.echo.measurement import Measurement, Values, VoiceModel
-from edgefilter.types import PRE_ROLL, SAMPLE_RATE, Array, Samples
+from edgefilter.types import SAMPLE_RATE, Array, Samples
 
 TAPS = 320
 """20 ms of ringing after a knock."""
-NEVER = 100.0
-BOUND = 1e4
 RIDGE = 1e-2
-HALF = SAMPLE_RATE
-"""Samples of the stretches that take turns when the sounds are tried on knocks that they were not learnt from."""
+"""Of the sounds' taps, re the energy of the knocks: neighbouring taps of a voice's knocks are much alike."""
 WORTH = 2.5
 """What each tap has to explain, in units of the residual's variance, for the sounds to be real."""
 REFINED = 3
+"""Times at most that the trigger is looked for anew with the sounds found."""
 MISSING_DB = -0.3
 """Under the fan: where the residual is so little of what a model expects, some of what it expects is not there."""
 
@@ -70,50 +59,41 @@ class Rattle(Effect):
     for a height of 1, and decays in decay_ms. rate_hz, knocks per second, only reports.
     """
 
-    name: ClassVar[str] = "rattle"
-    stage: ClassVar[Stage] = "source"
-    family: ClassVar[Family] = "additive noise"
-    title: ClassVar[str] = "a rattle"
-    shown_by: ClassVar[tuple[Experiment, ...]] = ("levels", "tone")
-    cost: ClassVar[int] = 8
-    memory: ClassVar[int | None] = 2048
-    parameters: ClassVar[tuple[Parameter, ...]] = (
-        Parameter("threshold", "full scale", NEVER, 1e-5, NEVER),
+    name = "rattle"
+    stage = "source"
+    family = "additive noise"
+    title = "a rattle"
+    shown_by = ("levels", "tone")
+    cost = 8
+    memory = 2048
+    parameters = (
+        Parameter("threshold", "full scale", NEVER_REACHED, 1e-5, NEVER_REACHED),
         Parameter("resonance_hz", "Hz", 200.0, 20.0, 2000.0),
         Parameter("q", "", 1.0, 0.1, 20.0),
         Parameter("side", "", 0.0, -1.0, 1.0),
-        Parameter("outward", "", 0.0, -BOUND, BOUND),
-        Parameter("inward", "", 0.0, -BOUND, BOUND),
+        Parameter("outward", "", 0.0, -1e4, 1e4),
+        Parameter("inward", "", 0.0, -1e4, 1e4),
         Parameter("power", "full scale^2", 0.0, 0.0, 1.0),
         Parameter("decay_ms", "ms", 5.0, 0.1, 1000.0),
         Parameter("rate_hz", "1/s", 0.0, 0.0, 8000.0),
     )
 
     def apply(self, x: Samples, values: Values, sample_rate: int) -> Samples:
-        """Return x (n,) with its knocks added."""
-        sounds = [np.atleast_1d(np.asarray(values[name], float)) for name in ("outward", "inward")]
+        sounds = [numbers(values, name) for name in ("outward", "inward")]
         if not any(h.any() for h in sounds):
             return x.copy()
-        knocks = find_knocks(
-            resonated(x, float(values["resonance_hz"]), float(values["q"]), sample_rate), float(values["threshold"])
-        )
+        knocks = _trains(x, values, sample_rate)
         return x + sum(filtered([k], h[None]) for k, h in zip(knocks, sounds, strict=True))
 
     def variance(self, reference: Samples, values: Values, sample_rate: int) -> Samples:
-        """What knocks add to the expected square of each sample (n,) at the microphone, for an aligned reference (n,)."""
-        power = float(np.sum(values["power"]))
-        return power * ringing_of(
-            _heard(reference, values, sample_rate), float(values["decay_ms"]), PRE_ROLL, sample_rate
-        )
+        knocks = one_side(_trains(reference, values, sample_rate), float(values["side"]))
+        return float(np.sum(values["power"])) * ringing_of(knocks, float(values["decay_ms"]), sample_rate)
 
     def colour(self, values: Values) -> Array:
-        """The spectral density of that, (601,), 0 to 8 kHz, per Hz: its integral is 1."""
         return density_of(values["power"])
 
     def fit(self, measurement: Measurement, model: VoiceModel) -> Values:
-        """What sets the knocks off is found by when the residual is loud.
-
-        Then come the least-squares sounds, and the power of the rest.
+        """What sets the knocks off, by when the residual is loud; then the least-squares sounds, and the power of the rest.
 
         Where the sounds explain something, they serve as matched filters, which show how hard the robot was hit at each
         moment, and resonance, q and threshold are refined by these. Neutral where the residual follows the voice's
@@ -123,17 +103,14 @@ class Rattle(Effect):
         x = measurement.reference
         predicted, target = measurement.heard(model)[1], measurement.white_recording
         left = target - absorbed(predicted, target, measurement.fit)
-        trigger, told = find_trigger(x, left, predicted, measurement.fit, PRE_ROLL)
+        trigger, told = find_trigger(x, left, predicted, measurement.fit)
         if trigger is None:
             return neutral(self)
         rest, allowed = left * measurement.weights, _roomy(measurement)
 
         def knocks_of(at: Trigger) -> list[Samples]:
-            trains = find_knocks(resonated(x, at.resonance_hz, at.q), at.threshold)
-            return [
-                train * allowed if at.side * way >= 0.0 else np.zeros_like(train)
-                for train, way in zip(trains, (1.0, -1.0), strict=True)
-            ]
+            both = zip(_trains(x, asdict(at), SAMPLE_RATE), (1.0, -1.0), strict=True)
+            return [train * allowed if at.side * way >= 0.0 else np.zeros_like(train) for train, way in both]
 
         def explain(at: Trigger) -> tuple[float, Array]:
             return _explained([measurement.whiten(model.predict(k)) for k in knocks_of(at)], rest, TAPS)
@@ -149,39 +126,34 @@ class Rattle(Effect):
                 at, gain, sounds = other, gain_then, sounds_then
             elif again:
                 break
-        halves = np.arange(x.size) // HALF % 2 == 0
+        halves = np.arange(x.size) // FOLD % 2 == 0
         worth = WORTH * sounds.size * float(np.dot(rest, rest)) / max(float(measurement.weights.sum()), 1.0)
         if not told and gain <= _explained([predicted * measurement.weights], rest, 2 * TAPS)[0]:
             return neutral(self)
         if gain <= worth or not _predicts([(k * halves, k * ~halves) for k in knocks_of(at)], rest, measurement, model):
             if not told:
                 return neutral(self)
-            at, sounds = trigger, np.zeros((2, 1))
-        values = dict(zip(("resonance_hz", "q", "threshold", "side"), astuple(at), strict=True))
-        values |= {
-            name: number_or_taps(np.clip(sound, -BOUND, BOUND))
-            for name, sound in zip(("outward", "inward"), sounds, strict=True)
-        }
-        return {**values, **self._unpredictable(measurement, model, values)}
+            at, sounds = trigger, np.zeros(2)
+        values = within(self, {**asdict(at), "outward": sounds[0], "inward": sounds[1]})
+        return within(self, {**values, **self._unpredictable(measurement, model, values)})
 
-    def _unpredictable(self, measurement: Measurement, model: VoiceModel, values: Values) -> dict[str, float | Array]:
+    def _unpredictable(self, measurement: Measurement, model: VoiceModel, values: Values) -> Values:
         """Fit power, decay_ms and rate_hz to what the predictable knocks leave."""
         x = measurement.reference
-        knocks = _heard(x, values, SAMPLE_RATE)
+        knocks = one_side(_trains(x, values, SAMPLE_RATE), float(values["side"]))
         predicted = measurement.whiten(model.predict(self.apply(x, complete(self, values), SAMPLE_RATE)))
         target = measurement.white_recording
         left = target - absorbed(predicted, target, measurement.fit)
         fits = {}
         for decay in DECAYS_MS:
-            source = frames(ringing_of(knocks, decay, PRE_ROLL), FRAME, HOP).mean(axis=1, keepdims=True)
+            source = frames(ringing_of(knocks, decay), FRAME, HOP).mean(axis=1, keepdims=True)
             fits[decay] = colour_of(left, source, measurement.fit)
         decay = max(fits, key=lambda decay: fits[decay][0])
         power = fits[decay][1] * fan_in_bands(measurement.noise_psd)
         rate = np.count_nonzero(knocks) * SAMPLE_RATE / max(x.size, 1)
-        return {"power": np.clip(power, 0.0, 1.0), "decay_ms": decay, "rate_hz": rate}
+        return {"power": power, "decay_ms": decay, "rate_hz": rate}
 
     def sentence(self, values: Values) -> str:
-        """How often, and at which moments of the membrane's movement."""
         side = {1.0: "outward", -1.0: "inward"}.get(first(values, "side"), "far")
         return (
             f"short bursts, {first(values, 'rate_hz'):.0f} a second, follow the moments at which the membrane is driven"
@@ -193,10 +165,10 @@ class Rattle(Effect):
         return evidence.after.fitted_db >= MISSING_DB + min(evidence.after.silent_db, 0.0)
 
 
-def _heard(x: Samples, values: Values, sample_rate: int) -> Samples:
-    """The knocks of a drive x (n,), on the side that knocks, (n,)."""
+def _trains(x: Samples, values: Values, sample_rate: int) -> tuple[Samples, Samples]:
+    """The knocks of a drive x (n,), outward and inward, (n,) each."""
     moved = resonated(x, float(values["resonance_hz"]), float(values["q"]), sample_rate)
-    return one_side(find_knocks(moved, float(values["threshold"])), float(values["side"]))
+    return find_knocks(moved, float(values["threshold"]))
 
 
 def _roomy(measurement: Measurement) -> np.ndarray:
@@ -204,8 +176,8 @@ def _roomy(measurement: Measurement) -> np.ndarray:
     if measurement.fit is None:
         return np.ones(measurement.recording.size, bool)
     ring = 2 * TAPS
-    total = np.cumsum(np.concatenate((measurement.fit, np.zeros(ring, bool))))
-    return total[ring:] - total[:-ring] >= ring if total.size > ring else np.zeros(measurement.recording.size, bool)
+    total = np.cumsum(np.pad(measurement.fit, (0, ring)))
+    return np.asarray(total[ring:] - total[:-ring] >= ring)
 
 
 def _matched(sound: Array, rest: Samples, measurement: Measurement, model: VoiceModel) -> Samples:
@@ -233,14 +205,12 @@ def _fine(at: Trigger) -> list[Trigger]:
 
 def _best_agreement(x: Samples, hits: list[Samples], choices: list[Trigger]) -> Trigger:
     """The one whose knocks fit the matched filter's output best; neighbours in resonance and q follow each other."""
-    moved, best = {}, (-np.inf, choices[0])
-    for choice in choices:
-        key = choice.resonance_hz, choice.q
-        if key not in moved:
-            moved = {key: resonated(x, *key)}
-        agreement = _agreement(knocks_at(moved[key], choice.threshold), hits)
-        best = max(best, (agreement, choice), key=lambda pair: pair[0])
-    return best[1]
+
+    @lru_cache(maxsize=1)
+    def moved(resonance_hz: float, q: float) -> Samples:
+        return resonated(x, resonance_hz, q)
+
+    return max(choices, key=lambda at: _agreement(knocks_at(moved(at.resonance_hz, at.q), at.threshold), hits))
 
 
 def _agreement(knocks: list[tuple[NDArray[np.integer], Samples]], hits: list[Samples]) -> float:
@@ -254,10 +224,8 @@ def _predicts(
     halves: list[tuple[Samples, Samples]], residual: Samples, measurement: Measurement, model: VoiceModel
 ) -> bool:
     """Whether the sounds learnt from one half of the knocks explain some of the other half, both ways round."""
-    normals = [
-        _normal([measurement.whiten(model.predict(knocks[half])) for knocks in halves], residual, TAPS)
-        for half in (0, 1)
-    ]
+    heard = [[measurement.whiten(model.predict(knocks)) for knocks in half] for half in zip(*halves, strict=True)]
+    normals = [_normal(half, residual, TAPS) for half in heard]
     total = 0.0
     for (matrix, right), (other, wanted) in (normals, normals[::-1]):
         w = _solve(matrix, right)
@@ -280,13 +248,11 @@ def _solve(matrix: Array, right: Array) -> Array:
 
 
 def _normal(columns: list[Samples], residual: Samples, taps: int) -> tuple[Array, Array]:
-    """Normal equations (C taps, C taps), (C taps,) from correlations."""
+    """Normal equations (C taps, C taps), (C taps,) from correlations: for many taps faster than by normal_equations()."""
     n = scipy.fft.next_fast_len(residual.size + taps, real=True)
     spectra = [scipy.fft.rfft(c.astype(np.float64), n) for c in columns]
     target = scipy.fft.rfft(residual.astype(np.float64), n)
     right = np.concatenate([scipy.fft.irfft(np.conj(s) * target, n)[:taps] for s in spectra])
     lags = [[scipy.fft.irfft(np.conj(a) * b, n) for b in spectra] for a in spectra]
-    matrix = np.block(
-        [[scipy.linalg.toeplitz(r[:taps], np.concatenate((r[:1], r[:-taps:-1]))) for r in row] for row in lags]
-    )
-    return matrix, right
+    square = [[scipy.linalg.toeplitz(r[:taps], np.append(r[:1], r[:-taps:-1])) for r in row] for row in lags]
+    return np.block(square), right
