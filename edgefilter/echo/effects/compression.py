@@ -3,20 +3,19 @@
 from __future__ import annotations
 
 from itertools import product
-from typing import ClassVar
 
 import numpy as np
 import scipy
 
-from edgefilter.echo.effect import Effect, Experiment, Family, Parameter, Runner, Stage, complete, first, neutral
+from edgefilter.echo.effect import Effect, Parameter, Runner, complete, first, neutral, within
 from edgefilter.echo.effects.gain_fit import GainFit, Reach
 from edgefilter.echo.measurement import Measurement, Values, VoiceModel
 from edgefilter.types import SAMPLE_RATE, Array, Samples
 
-THRESHOLDS_DB, SLOPES = (1.0, -3.0, -8.0, -15.0), (0.2, 0.6)
-"""Starting points, relative to the loudest 20 ms of the reference, and dB per dB."""
-RELEASES_MS = (60.0, 300.0)
+STARTS = tuple(product((1.0, -3.0, -8.0, -15.0), (0.2, 0.6), (60.0, 300.0)))
+"""Thresholds in dB re the loudest 20 ms of the reference, slopes in dB per dB and releases in ms to start from."""
 STEEPEST = 0.98
+"""Slope, dB per dB: a ratio of 50 to 1 lets no more through than a limiter does."""
 REACH = Reach(
     nudge=np.array([0.5, 0.03, 0.15, 0.15]),
     longest=np.array([4.0, 0.3, 1.0, 1.0]),
@@ -34,15 +33,15 @@ class Compression(Effect):
     once and falls exponentially with the release time, as in their decoupled peak detector (eq. 17).
     """
 
-    name: ClassVar[str] = "compression"
-    stage: ClassVar[Stage] = "source"
-    family: ClassVar[Family] = "dynamics"
-    title: ClassVar[str] = "compression"
-    shown_by: ClassVar[tuple[Experiment, ...]] = ("levels",)
-    complexity: ClassVar[int] = 2
-    cost: ClassVar[int] = 2
-    flexible: ClassVar[bool] = True
-    parameters: ClassVar[tuple[Parameter, ...]] = (
+    name = "compression"
+    stage = "source"
+    family = "dynamics"
+    title = "compression"
+    shown_by = ("levels",)
+    complexity = 2
+    cost = 2
+    flexible = True
+    parameters = (
         Parameter("threshold_db", "dB re full scale", -20.0, -80.0, 0.0),
         Parameter("ratio", "dB/dB", 1.0, 1.0, 50.0),
         Parameter("attack_ms", "ms", 10.0, 0.1, 1000.0),
@@ -52,35 +51,31 @@ class Compression(Effect):
     )
 
     def apply(self, x: Samples, values: Values, sample_rate: int) -> Samples:
-        """Return x (n,) times the gain that its own level asks for, times the make-up gain."""
         return Compressor(values, sample_rate)(x)
 
     def run(self, values: Values, sample_rate: int) -> Runner:
-        """The compressor, which carries its level and its reduction on."""
         return Compressor(values, sample_rate)
 
     def fit(self, measurement: Measurement, model: VoiceModel) -> Values:
-        """Gauss-Newton in threshold, ratio, attack and release from the best of a coarse grid.
-
-        A short filter takes up the linear rest.
-
-        No compression where its four numbers do not pay for themselves by Bayes' information criterion.
-        """
+        """Gauss-Newton in threshold, ratio, attack and release from the best of a grid; neutral where they do not pay (GainFit)."""
 
         def compressed(x: Samples, unknowns: Array) -> tuple[Samples]:
-            return (self.apply(x, complete(self, _values(unknowns)), SAMPLE_RATE),)
+            return (self.apply(x, complete(self, self._values(unknowns)), SAMPLE_RATE),)
 
         fit = GainFit(measurement, model, compressed, REACH)
-        grid = product(THRESHOLDS_DB, SLOPES, RELEASES_MS)
-        starts = [np.array((fit.loud_db + above, slope, np.log(8.0), np.log(ms))) for above, slope, ms in grid]
+        starts = [np.array((fit.loud_db + above, slope, np.log(8.0), np.log(ms))) for above, slope, ms in STARTS]
         found = fit.best(starts)
         if found is None or found[0][1] < 0.01:
             return neutral(self)
-        makeup = float(fit.gains(found[0])[0])
-        return {**_values(found[0]), "makeup_db": float(np.clip(20.0 * np.log10(max(makeup, 1e-2)), -40.0, 40.0))}
+        makeup_db = 20.0 * np.log10(max(float(fit.gains(found[0])[0]), 1e-2))
+        return within(self, {**self._values(found[0]), "makeup_db": makeup_db})
+
+    def _values(self, unknowns: Array) -> Values:
+        threshold_db, slope, attack, release = unknowns
+        times = {"attack_ms": np.exp(attack), "release_ms": np.exp(release)}
+        return within(self, {"threshold_db": threshold_db, "ratio": 1.0 / (1.0 - slope), **times})
 
     def sentence(self, values: Values) -> str:
-        """From where on the level is held down, and by how much."""
         return (
             f"the voice is turned down when it has been loud: above {first(values, 'threshold_db'):.0f} dB "
             f"by {first(values, 'ratio'):.1f} to 1, while the fan is as loud as ever"
@@ -88,7 +83,7 @@ class Compression(Effect):
 
 
 class Compressor:
-    """One compressor on a stream: values as of Compression."""
+    """One compressor on a stream, (n,) -> (n,): values as of Compression."""
 
     def __init__(self, values: Values, sample_rate: int) -> None:
         self._slope, self._makeup = 1.0 - 1.0 / float(values["ratio"]), float(values["makeup_db"])
@@ -98,7 +93,6 @@ class Compressor:
         self._level, self._held = np.zeros(1), 0.0
 
     def __call__(self, x: Samples, heard: Samples | None = None) -> Samples:
-        """Return x (n,), which follows what came before, times its gain."""
         if self._slope == 0.0:
             return x * np.float32(10.0 ** (self._makeup / 20.0))
         square = np.square(x, dtype=np.float64)
@@ -117,9 +111,3 @@ def falling_peak(x: Array, samples: float, before: float) -> Array:
     if before > 0.0 and level.size:
         level[0] = max(float(level[0]), float(np.log(before)) - 1.0 / samples)
     return np.exp(np.maximum.accumulate(level) - rise)
-
-
-def _values(unknowns: Array) -> dict[str, float]:
-    threshold, slope, attack, release = (float(u) for u in unknowns)
-    attack_ms, release_ms = float(np.clip(np.exp(attack), 0.1, 1000.0)), float(np.clip(np.exp(release), 1.0, 5000.0))
-    return {"threshold_db": threshold, "ratio": 1.0 / (1.0 - slope), "attack_ms": attack_ms, "release_ms": release_ms}

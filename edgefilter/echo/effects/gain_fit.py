@@ -6,27 +6,25 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.lib.stride_tricks import sliding_window_view
 
 from edgefilter.dsp.frames import block_power, decibels
+from edgefilter.echo.least_squares import RIDGE, at_lags, ridge_solved
 from edgefilter.echo.measurement import Measurement, VoiceModel
 from edgefilter.types import SAMPLE_RATE, Array, Samples
 
 EXCERPT = 8 * SAMPLE_RATE
-"""The loudest stretch of that many samples is fitted."""
-TAPS, LEAD = 8, 4
-"""Of the nuisance filter on each part of the prediction: what is linear, the make-up gain included."""
-SILENT_DB = -80.0
-ITERATIONS = 6
-SETTLED = 1e-3
-"""A step that lowers the cost by less than this part of it is the last."""
+"""Samples of the stretch that is fitted."""
+TAPS = 8
+"""Of the nuisance filter on each part of the prediction, half of them ahead: what is linear, the make-up gain included."""
+ITERATIONS, SETTLED = 6, 1e-3
+"""Steps at most; one that lowers the cost by less than this part of it is the last."""
 DAMPINGS = (1e-4, 1e-2, 0.3)
-RIDGE = 1e-6
+"""Of a step, re the energy of what each unknown changes: tried until one lowers the cost."""
 
 
 @dataclass(frozen=True, eq=False)
 class Reach:
-    """Of each unknown (k,): the step of its numerical derivative, the longest step of the fit, and its bounds."""
+    """Of each unknown (k,), the first a level in dB: the step of its numerical derivative, the longest of the fit, its bounds."""
 
     nudge: Array
     longest: Array
@@ -48,7 +46,10 @@ class GainFit:
         reach: Reach,
     ) -> None:
         self._measurement, self._model, self._make, self._reach = measurement, model, make, reach
-        part, chosen = _excerpt(measurement, from_start=model.timed)
+        part = excerpt(measurement, model, EXCERPT)
+        chosen = measurement.weights[part] > 0.0
+        if part.start:
+            chosen[: SAMPLE_RATE // 2] = False  # in it the level settles
         self._x, self._chosen = measurement.reference[part], np.flatnonzero(chosen)
         self._target = measurement.whiten(measurement.recording[part])[self._chosen]
         self.loud_db = float(decibels(np.max(block_power(self._x, SAMPLE_RATE // 50), initial=0.0), 1e-9))
@@ -59,7 +60,7 @@ class GainFit:
         starts = [np.clip(start, self._reach.lowest, self._reach.highest) for start in starts]
         costs = [self.cost(start) for start in starts]
         best, cost = starts[int(np.argmin(costs))], min(costs)
-        for _ in range(ITERATIONS if self.loud_db > SILENT_DB and cost < self.without else 0):
+        for _ in range(ITERATIONS if self.loud_db > self._reach.lowest[0] and cost < self.without else 0):
             best, now = self._step(best, cost)
             settled, cost = now > cost * (1.0 - SETTLED), now
             if settled:
@@ -78,7 +79,7 @@ class GainFit:
         parts = [measurement.whiten(self._model.predict(part)) for part in self._make(measurement.reference, unknowns)]
         rows = np.stack(parts, axis=1) * measurement.weights[:, None]
         normal, right = (rows.T @ rows).astype(float), (rows.T @ measurement.white_recording).astype(float)
-        return np.linalg.solve(normal + 1e-6 * np.trace(normal) * np.eye(right.size) + 1e-30, right)
+        return np.linalg.solve(normal + RIDGE * np.trace(normal) * np.eye(right.size) + 1e-30, right)
 
     def _heard(self, sound: Samples) -> Samples:
         return self._measurement.whiten(self._model.predict(sound))
@@ -88,28 +89,35 @@ class GainFit:
 
     def _rows(self, parts: Sequence[Samples]) -> Samples:
         """Each part at its lags, (chosen, parts * TAPS)."""
-        padded = [np.pad(part, (TAPS - 1 - LEAD, LEAD)) for part in parts]
-        return np.concatenate([sliding_window_view(p, TAPS)[:, ::-1][self._chosen] for p in padded], axis=1)
+        return np.concatenate([at_lags(part, TAPS, TAPS // 2)[self._chosen] for part in parts], axis=1)
+
+    def _solved(self, rows: Samples, ridge: Array | float) -> Samples:
+        """Least-squares weights of rows (chosen, k), (k,); ridge is relative to each one's own energy."""
+        normal, right = (rows.T @ rows).astype(float), (rows.T @ self._target).astype(float)
+        return np.float32(ridge_solved(normal, right, ridge))
 
     def _left(self, parts: Sequence[Samples]) -> float:
         rows = self._rows(parts)
-        residual = self._target - rows @ _solved(rows, self._target, np.full(rows.shape[1], RIDGE))
+        residual = self._target - rows @ self._solved(rows, RIDGE)
         return float(np.dot(residual, residual))
 
     def _step(self, at: Array, cost: float) -> tuple[Array, float]:
         """One step, damped and shortened until it helps (Levenberg 1944); the unknowns and the cost that it reaches."""
         parts = self._parts(at)
         base = self._rows(parts)
-        weights = _solved(base, self._target, np.full(base.shape[1], RIDGE)).reshape(len(parts), TAPS)
-        gains = weights.sum(axis=1)
+        gains = self._solved(base, RIDGE).reshape(len(parts), TAPS).sum(axis=1)
         nudge = np.where(at + self._reach.nudge > self._reach.highest, -self._reach.nudge, self._reach.nudge)
-        whole = self._whole(self._make(self._x, at), gains)
-        moved = [self._whole(self._make(self._x, at + nudge * unit), gains) - whole for unit in np.eye(at.size)]
+
+        def whole(unknowns: Array) -> Samples:
+            return np.float32(gains) @ np.stack(self._make(self._x, unknowns))
+
+        here = whole(at)
+        moved = [whole(at + nudge * unit) - here for unit in np.eye(at.size)]
         changes = np.stack([self._heard(change)[self._chosen] for change in moved], axis=1)
         rows = np.concatenate((base, changes), axis=1)
         for damping in DAMPINGS:
             ridge = np.concatenate((np.full(base.shape[1], RIDGE), np.full(at.size, damping)))
-            wanted = _solved(rows, self._target, ridge)[base.shape[1] :] * nudge
+            wanted = self._solved(rows, ridge)[base.shape[1] :] * nudge
             step = np.clip(wanted, -self._reach.longest, self._reach.longest)
             for shorter in (1.0, 0.3):
                 there = np.clip(at + shorter * step, self._reach.lowest, self._reach.highest)
@@ -118,36 +126,12 @@ class GainFit:
                     return there, now
         return at, cost
 
-    @staticmethod
-    def _whole(parts: Sequence[Samples], gains: Array) -> Samples:
-        return np.float32(gains) @ np.stack(parts)
 
-
-def _solved(rows: Samples, target: Samples, ridge: Array) -> Samples:
-    """Least-squares weights of rows (m, k), (k,); ridge (k,) is relative to each one's own energy."""
-    normal, right = (rows.T @ rows).astype(float), (rows.T @ target).astype(float)
-    scale = np.sqrt(normal.diagonal()) + 1e-30
-    return np.float32(np.linalg.solve(normal / scale[:, None] / scale + np.diag(ridge), right / scale) / scale)
-
-
-def loudest(x: Samples, size: int) -> slice:
-    """The stretch of so many samples with most energy."""
-    if x.size <= size:
+def excerpt(measurement: Measurement, model: VoiceModel, size: int) -> slice:
+    """The loudest stretch of so many samples of the reference, or the first one where the model knows what time it is."""
+    x = measurement.reference
+    if model.timed or x.size <= size:
         return slice(0, size)
     energy = np.concatenate(([0.0], np.cumsum(x.astype(np.float64) ** 2)))
     start = int(np.argmax(energy[size:] - energy[:-size]))
     return slice(start, start + size)
-
-
-def _excerpt(measurement: Measurement, from_start: bool) -> tuple[slice, np.ndarray]:
-    """The loudest stretch, or the first one where the model knows what time it is; and its samples to fit on.
-
-    The first half second of a later stretch is left out: in it the level settles.
-    """
-    x = measurement.reference
-    fit = np.ones(x.size, bool) if measurement.fit is None else measurement.fit
-    part = slice(0, EXCERPT) if from_start else loudest(x, EXCERPT)
-    chosen = fit[part].copy()
-    if part.start:
-        chosen[: SAMPLE_RATE // 2] = False
-    return part, chosen

@@ -2,28 +2,42 @@
 
 from __future__ import annotations
 
-from typing import ClassVar
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from operator import attrgetter
 
 import numpy as np
 
-from edgefilter.dsp.membrane import MOTION_TAPS
-from edgefilter.echo.effect import Effect, Experiment, Family, Parameter, Stage, first, neutral
-from edgefilter.echo.effects.gain_fit import loudest
-from edgefilter.echo.effects.loudspeaker_fit import REACH_HZ, Laws, fit_laws
-from edgefilter.echo.effects.loudspeaker_laws import amplifier_terms, driver_terms
-from edgefilter.echo.measurement import Measurement, Values, VoiceModel
+from edgefilter.dsp.membrane import MOTION_TAPS, motion
+from edgefilter.echo.effect import Effect, Parameter, first, neutral, within
+from edgefilter.echo.effects.gain_fit import excerpt
+from edgefilter.echo.least_squares import CHUNK, NUISANCE_LEAD, NUISANCE_TAPS, RIDGE, at_lags, ridge_solved
+from edgefilter.echo.measurement import ORDINARY_DB, Measurement, Values, VoiceModel, level_ratio
+from edgefilter.echo.recording import BLOCK
 from edgefilter.types import SAMPLE_RATE, Array, Samples
 
 BOUND = 4.0
 """Of each weight: at the end of its excursion a law is off by no more than this, whatever is played."""
-SILENT_DB = -120.0
-ORDINARY_DB = 0.4
-"""A gain of less differs from day to day."""
-MOST_GAIN_DB = 60.0
 EXCERPT = 10 * SAMPLE_RATE
-"""On the loudest stretch of that many samples, or the first where the model knows what time it is, it is chosen where the
-laws bend; how much they do, on all."""
+"""Samples of the stretch on which it is chosen where the laws bend; how much they do, on all."""
 DRIVER, AMPLIFIER = ("force_factor", "stiffness", "damping"), ("even", "odd")
+"""The laws, with two weights each."""
+RESONANCES_HZ, REACH_HZ = (250.0, 180.0, 215.0, 300.0, 370.0), (160.0, 1000.0)
+"""Of small drivers, the usual one first, and the least and the highest that MOTION_TAPS are enough for."""
+BESIDE = 1.1
+"""Times the best of these resonances, either way, that are tried next."""
+EXCURSION, KNEES = 0.7, (0.3, 0.15, 0.6)
+"""Where the laws bend, re the largest displacement and the highest sample that the fit has seen; the usual ones first."""
+PEAK = 0.9999
+"""The largest is this quantile."""
+HELD = 1e-3
+"""Ridge of the laws' weights, which are more alike than the linear voice's taps."""
+LEAST = 0.01
+"""Share of what the linear voice leaves on samples that were not fitted to, by which laws lower it that are kept."""
+FURTHER = 0.02
+"""The same for driver and amplifier together, re the better of the two."""
+PROMISING = 0.003
+"""The same from which on other resonances and knees are tried."""
 
 
 class SpeakerNonlinearity(Effect):
@@ -33,31 +47,32 @@ class SpeakerNonlinearity(Effect):
     within -1 and 1 (driver_terms); what they add drives the linear membrane like x itself, and the path behind holds
     that membrane. even, odd: (2,) weights of s x, s^3 x and of s^2 x, s^4 x with s the bent drive (amplifier_terms).
     resonance_hz: of the membrane. excursion, knee: displacement and drive, full scale, at which s has reached 0.7.
-    gain_db: 20 log10 g, of an amplifier that is overdriven; the volume before it is `playback_gain`'s. What is added never
-    grows faster than x. Valid while it is well below x.
+    level_db only reports: of what is added, but for what is in proportion to the linear voice. gain_db: 20 log10 g, of an
+    amplifier that is overdriven; the volume before it is `playback_gain`'s. What is added never grows faster than x.
+    Valid while it is well below x.
     """
 
-    name: ClassVar[str] = "speaker_nonlinearity"
-    stage: ClassVar[Stage] = "source"
-    family: ClassVar[Family] = "static nonlinearity"
-    title: ClassVar[str] = "loudspeaker nonlinearity"
-    cost: ClassVar[int] = 4
-    shown_by: ClassVar[tuple[Experiment, ...]] = ("levels", "tone")
-    flexible: ClassVar[bool] = True
-    memory: ClassVar[int | None] = MOTION_TAPS
-    parameters: ClassVar[tuple[Parameter, ...]] = (
+    name = "speaker_nonlinearity"
+    stage = "source"
+    family = "static nonlinearity"
+    title = "loudspeaker nonlinearity"
+    cost = 4
+    shown_by = ("levels", "tone")
+    flexible = True
+    memory = MOTION_TAPS
+    parameters = (
         *(Parameter(name, "1", 0.0, -BOUND, BOUND) for name in (*DRIVER, *AMPLIFIER)),
         Parameter("resonance_hz", "Hz", 250.0, *REACH_HZ),
         Parameter("excursion", "full scale", 1.0, 1e-4, 100.0),
         Parameter("knee", "full scale", 1.0, 1e-4, 100.0),
-        Parameter("level_db", "dB re the linear voice at the microphone", SILENT_DB, SILENT_DB, 20.0),
-        Parameter("gain_db", "dB", 0.0, 0.0, MOST_GAIN_DB),
+        Parameter("level_db", "dB re the linear voice at the microphone", -120.0, -120.0, 20.0),
+        Parameter("gain_db", "dB", 0.0, 0.0, 60.0),
     )
 
     def apply(self, x: Samples, values: Values, sample_rate: int) -> Samples:
-        """Return x (n,) with its distortion; level_db only reports."""
         out = x.copy()
-        driving, bending = np.concatenate([_pair(values, name) for name in DRIVER]), _amplifier(values)
+        driving = np.concatenate([_pair(values, name) for name in DRIVER])
+        bending = np.stack([_pair(values, name) for name in AMPLIFIER], axis=1).ravel()
         if driving.any():
             out += driving @ driver_terms(x, first(values, "resonance_hz"), first(values, "excursion"), sample_rate)
         if bending.any():
@@ -68,42 +83,25 @@ class SpeakerNonlinearity(Effect):
     def fit(self, measurement: Measurement, model: VoiceModel) -> Values:
         """Least squares in the whitened domain; neutral where no law holds on samples that it was not fitted to."""
         linear, x = measurement.heard(model)[1], measurement.reference
-        part = slice(0, EXCERPT) if model.timed else loudest(x, EXCERPT)
         found = fit_laws(
             x,
             measurement.white_recording,
             measurement.weights,
             linear,
             lambda sound: measurement.whiten(model.predict(sound)),
-            excerpt=part if x.size >= 1.5 * EXCERPT else None,
+            excerpt=excerpt(measurement, model, EXCERPT) if x.size >= 1.5 * EXCERPT else None,
         )
         if found is None:
             return neutral(self)
-        louder = found.gain_db >= ORDINARY_DB  # a voice that is softer was turned down, whatever else happened to it
-        return {**as_values(found), "gain_db": min(found.gain_db, MOST_GAIN_DB) if louder else 0.0}
+        louder = first(found, "gain_db") >= ORDINARY_DB  # a softer voice was turned down, whatever else happened to it
+        return within(self, found if louder else {**found, "gain_db": 0.0})
 
     def sentence(self, values: Values) -> str:
-        """How strong the distortion is."""
         level_db = first(values, "level_db")
         return (
             f"products of the reference with itself, {level_db:.0f} dB re the voice, are in the residual: no linear"
             " path makes them"
         )
-
-
-def as_values(laws: Laws) -> dict[str, float | Array]:
-    """Laws as the effect's values."""
-    driving = np.clip(laws.driver, -BOUND, BOUND).reshape(len(DRIVER), 2)
-    bending = np.clip(laws.amplifier, -BOUND, BOUND)
-    return {
-        **dict(zip(DRIVER, driving, strict=True)),
-        "even": bending[::2],
-        "odd": bending[1::2],
-        "resonance_hz": laws.resonance_hz,
-        "excursion": float(np.clip(laws.excursion, 1e-4, 100.0)),
-        "knee": float(np.clip(laws.knee, 1e-4, 100.0)),
-        "level_db": float(np.clip(laws.level_db, SILENT_DB, 20.0)),
-    }
 
 
 def _pair(values: Values, name: str) -> Array:
@@ -113,6 +111,213 @@ def _pair(values: Values, name: str) -> Array:
     return pair
 
 
-def _amplifier(values: Values) -> Array:
-    """Weights in the order of amplifier_terms, (4,) float32: even and odd in turn."""
-    return np.stack([_pair(values, name) for name in AMPLIFIER], axis=1).ravel()
+def driver_terms(x: Samples, resonance_hz: float, excursion: float, sample_rate: int = SAMPLE_RATE) -> Samples:
+    """The terms s x, s^2 x, -s d, -s^2 d, -s d'/w, -s^2 d'/w for the drive x (n,), (6, n) float32.
+
+    The equation of motion d'' + (w/Q) d' + w^2 d = w^2 x keeps its left side when force factor, stiffness and damping
+    depend on the displacement d; what they change is a drive of its own on the right side (Klippel 2006, "Loudspeaker
+    nonlinearities", eq. (2) and (3)). Here to first order: d is the linear membrane's, and each law is a s + b s^2 of
+    s = u / sqrt(1 + u^2), u = d / excursion, as of a membrane that can go no farther: nothing grows faster than x.
+    """
+    moved = motion(x, resonance_hz, sample_rate)
+    s = _bent(moved[0], excursion)
+    driven = np.stack((x, -moved[0], -moved[1]))
+    terms = np.empty((len(DRIVER), 2, x.size), np.float32)
+    np.multiply(driven, s, out=terms[:, 0])
+    np.multiply(terms[:, 0], s, out=terms[:, 1])
+    return terms.reshape(2 * len(DRIVER), x.size)
+
+
+def amplifier_terms(x: Samples, knee: float) -> Samples:
+    """The terms s x, s^2 x, s^3 x, s^4 x with s = u / sqrt(1 + u^2), u = x / knee, (4, n) float32."""
+    s = _bent(x, knee)
+    terms = np.empty((2 * len(AMPLIFIER), x.size), np.float32)
+    np.multiply(x, s, out=terms[0])
+    for before, term in zip(terms, terms[1:], strict=False):
+        np.multiply(before, s, out=term)
+    return terms
+
+
+def _bent(x: Samples, scale: float) -> Samples:
+    """Return u / sqrt(1 + u^2) of u = x / scale (n,): as u where that is small, and never beyond 1."""
+    u = x / np.float32(scale)
+    return u / np.sqrt(np.float32(1.0) + u * u)
+
+
+@dataclass(frozen=True, eq=False)
+class _Part:
+    """Driver (setting: its resonance) or amplifier: where it bends, its terms at the microphone (used, k), what is left with them."""
+
+    setting: float
+    scale: float
+    columns: Samples
+    left: float
+
+
+_by_left = attrgetter("left")
+
+
+def fit_laws(
+    x: Samples,
+    target: Samples,
+    weights: Samples,
+    linear: Samples,
+    hear: Callable[[Samples], Samples],
+    excerpt: slice | None = None,
+) -> dict[str, float | Array] | None:
+    """The effect's values that explain a recording best, bounds aside; None where no law holds on samples that it was not fitted to.
+
+    x: (n,) what the amplifier is sent. target: (n,) the recording, whitened. weights: (n,) 0 to 1. linear: (n,) hear(x).
+    hear: what becomes of a signal (n,) at the loudspeaker up to the microphone, whitened. excerpt: the samples on which
+    resonance, excursion and knee are chosen; None: all.
+    """
+    search = _Search(x, hear, _Halves(linear, target, weights))
+    if search.silent:
+        return None
+    if excerpt is None:
+        bend, move = search.amplifier(), search.driver()
+    else:
+        part = _Search(x[excerpt], hear, _Halves(linear[excerpt], target[excerpt], weights[excerpt]))
+        if part.silent:
+            return None
+        bend, move = part.amplifier(), part.driver()
+        if not (part.promising(bend) or part.promising(move)):
+            return None
+        bend, move = (search.part(found.setting, found.scale) for found in (bend, move))
+    parts = [min(move, bend, key=_by_left)]
+    left, together = parts[0].left, search.halves.left(np.concatenate((move.columns, bend.columns), axis=1))
+    if together < (1.0 - FURTHER) * left:
+        parts, left = [move, bend], together
+    if left > (1.0 - LEAST) * search.base:
+        return None
+    found, level_db, gain_db = search.halves.whole(np.concatenate([part.columns for part in parts], axis=1))
+    driving = found[: 2 * len(DRIVER)] if move in parts else np.zeros(2 * len(DRIVER))
+    bending = found[-2 * len(AMPLIFIER) :] if bend in parts else np.zeros(2 * len(AMPLIFIER))
+    return {
+        **dict(zip(DRIVER, driving.reshape(len(DRIVER), 2), strict=True)),
+        "even": bending[::2],
+        "odd": bending[1::2],
+        "resonance_hz": move.setting,
+        "excursion": move.scale,
+        "knee": bend.scale,
+        "level_db": level_db,
+        "gain_db": gain_db,
+    }
+
+
+class _Search:
+    """Settings of driver and amplifier, each scored by what is left with it on samples that it was not fitted to.
+
+    base: what the linear voice alone leaves there. silent: whether nothing is left, or nothing was played.
+    """
+
+    def __init__(self, x: Samples, hear: Callable[[Samples], Samples], halves: _Halves) -> None:
+        self._x, self._hear, self.halves = x, hear, halves
+        self.base, self._peak = halves.left(np.zeros((halves.used.size, 0), np.float32)), _peak(x[halves.used])
+        self.silent = self.base <= 0.0 or self._peak <= 0.0
+
+    def amplifier(self) -> _Part:
+        """The best knee."""
+        return self._best(lambda knee: self.part(0.0, knee), [share * self._peak for share in KNEES])
+
+    def driver(self) -> _Part:
+        """The best resonance and excursion."""
+
+        def make(hz: float, share: float = EXCURSION) -> _Part:
+            return self.part(hz, share * _peak(motion(self._x, hz)[0][self.halves.used]))
+
+        best = self._best(make, RESONANCES_HZ)
+        if self.promising(best):
+            beside = [float(np.clip(best.setting * step, *REACH_HZ)) for step in (1.0 / BESIDE, BESIDE)]
+            best = min(best, *map(make, beside), key=_by_left)
+            best = min(best, make(best.setting, 0.5 * EXCURSION), key=_by_left)
+        return best
+
+    def _best(self, make: Callable[[float], _Part], settings: Sequence[float]) -> _Part:
+        """The first setting, or the best of all where that one is promising."""
+        first = make(settings[0])
+        return min((first, *map(make, settings[1:])), key=_by_left) if self.promising(first) else first
+
+    def promising(self, part: _Part) -> bool:
+        """Whether it lowers what the linear voice leaves enough for a closer look."""
+        return part.left < (1.0 - PROMISING) * self.base
+
+    def part(self, setting: float, scale: float) -> _Part:
+        """Driver of that resonance and excursion, or amplifier (setting 0) of that knee."""
+        terms = driver_terms(self._x, setting, scale) if setting else amplifier_terms(self._x, scale)
+        columns = self.halves.columns(map(self._hear, terms), len(terms))
+        return _Part(setting, scale, columns, self.halves.left(columns))
+
+
+def _peak(x: Samples) -> float:
+    return float(np.quantile(np.abs(x), PEAK)) if x.size else 0.0
+
+
+class _Halves:
+    """Weighted least squares on either half of the samples (BLOCKs, two by two), tested on the other.
+
+    Beside the columns that are asked about stands the linear voice with NUISANCE_TAPS of a filter.
+    """
+
+    def __init__(self, linear: Samples, target: Samples, weights: Samples) -> None:
+        used = np.flatnonzero(weights > 0.0)
+        first = used // BLOCK % 4 < 2
+        self.used = np.concatenate((used[first], used[~first]))
+        self._split = int(np.count_nonzero(first))
+        self._root = np.sqrt(weights[self.used, None].astype(np.float32))
+        self._linear = at_lags(linear, NUISANCE_TAPS, NUISANCE_LEAD)
+        self._target = target[self.used, None] * self._root
+
+    def columns(self, signals: Iterable[Samples], count: int) -> Samples:
+        """Signals (n,) at the samples that count, the first half's in front, weighted, (used, count)."""
+        out = np.empty((self.used.size, count), np.float32)
+        for column, signal in zip(out.T, signals, strict=True):
+            np.multiply(signal[self.used], self._root[:, 0], out=column)
+        return out
+
+    def left(self, columns: Samples) -> float:
+        """What the linear voice and columns (used, k), fitted to one half, leave on the other: the sum of both ways."""
+        first, second = self._normal(columns)
+        return _left(first, _solved(second)) + _left(second, _solved(first))
+
+    def whole(self, columns: Samples) -> tuple[Array, float, float]:
+        """Weights of columns (used, k) re the linear voice's gain, (k,), fitted to all; the level of what they add, and that gain, dB."""
+        first, second = self._normal(columns)
+        found = _solved(first + second)
+        voice, filtered = self._voice(np.eye(NUISANCE_TAPS)[NUISANCE_LEAD]), self._voice(found[:NUISANCE_TAPS])
+        gain = level_ratio(filtered, voice) or 1.0
+        weights = found[NUISANCE_TAPS:] / gain
+        added = columns @ weights.astype(np.float32)
+        added -= level_ratio(added, voice) * voice
+        level = float(np.dot(added, added)) / (float(np.dot(voice, voice)) + 1e-30)
+        return weights, 10.0 * float(np.log10(level + 1e-12)), 20.0 * float(np.log10(max(abs(gain), 1e-3)))
+
+    def _voice(self, taps: Array) -> Samples:
+        """The linear voice through taps (NUISANCE_TAPS,), weighted, (used,)."""
+        return (self._linear @ taps.astype(np.float32))[self.used] * self._root[:, 0]
+
+    def _normal(self, columns: Samples) -> list[Array]:
+        """Of each half the weighted products of linear voice, columns and target with each other."""
+        size = NUISANCE_TAPS + columns.shape[1] + 1
+        halves = [np.zeros((size, size)), np.zeros((size, size))]
+        edges = (0, self._split, self.used.size)
+        for total, start, stop in zip(halves, edges[:-1], edges[1:], strict=True):
+            for at in range(start, stop, CHUNK):
+                piece = slice(at, min(at + CHUNK, stop))
+                linear = self._linear[self.used[piece]] * self._root[piece]
+                rows = np.concatenate((linear, columns[piece], self._target[piece]), axis=1)
+                total += rows.T @ rows
+        return halves
+
+
+def _solved(normal: Array) -> Array:
+    """Weights (k,) that solve normal equations (k + 1, k + 1), the target the last."""
+    ridge = np.full(normal.shape[0] - 1, HELD)
+    ridge[:NUISANCE_TAPS] = RIDGE
+    return ridge_solved(normal[:-1, :-1], normal[:-1, -1], ridge)
+
+
+def _left(normal: Array, found: Array) -> float:
+    """Energy that weights (k,) leave of the target."""
+    residual = np.append(-found, 1.0)
+    return max(float(residual @ normal @ residual), 0.0)

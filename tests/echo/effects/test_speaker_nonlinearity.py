@@ -7,9 +7,8 @@ from scipy import integrate
 from edgefilter.dsp.membrane import MOTION_Q, motion
 from edgefilter.echo.effect import complete, vanishes
 from edgefilter.echo.effects import catalogue
-from edgefilter.echo.effects.loudspeaker_fit import fit_laws
+from edgefilter.echo.effects.speaker_nonlinearity import fit_laws
 from edgefilter.echo.measurement import Measurement
-from edgefilter.echo.model import EchoModel
 from edgefilter.echo.running import SourceChain
 from edgefilter.errors import UsageError
 from tests.conformance import EFFECT_CASES, fan, robot_alone, robot_model, robot_speech
