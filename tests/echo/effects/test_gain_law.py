@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from edgefilter.echo.effects.gain_law import STEP, follow
+from edgefilter.echo.effects.mic_agc import STEP, follow
 
 STEPS = 600
 
