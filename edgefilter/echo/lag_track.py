@@ -19,9 +19,7 @@ LEAST_CORRELATION = 0.3
 class LagTrack:
     """The lag block by block. starts (b,): first sample of each block of `size` samples.
 
-    Lag (b,), sigma (b,): samples, the recording behind the prediction.
-
-    correlation (b,): of the block with the prediction at that lag, 0 to 1.
+    lag, sigma (b,): samples, the recording behind the prediction. correlation (b,): with it at that lag, 0 to 1.
     """
 
     starts: NDArray[np.integer]
@@ -40,8 +38,8 @@ def track_lag(predicted: Samples, recording: Samples, fit: NDArray[np.bool_] | N
     """Lags of up to +-reach samples of all blocks of `size` samples, every size / 2, that lie in fit and where the robot is heard.
 
     predicted, recording: (n,), both whitened. The peak of each block's cross-correlation, then Newton's method on the
-    phase of its cross-spectrum: the maximum-likelihood lag in white noise (Knapp & Carter 1976). sigma is the
-    Cramer-Rao bound for what the block leaves unexplained, so it counts distortion and reverberation as noise.
+    phase of its cross-spectrum: the maximum-likelihood lag in white noise (Knapp & Carter 1976). sigma: the Cramer-Rao
+    bound, with distortion and reverberation as noise.
     """
     starts = np.arange(0, recording.size - size + 1, size // 2)
     if fit is not None and starts.size:

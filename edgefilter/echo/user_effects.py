@@ -15,6 +15,7 @@ from typing import cast
 
 import numpy as np
 
+from edgefilter.dsp.psd import GRID_BINS
 from edgefilter.echo.effect import FAMILIES, STAGES, Effect, Parameter, complete, neutral
 from edgefilter.echo.effects.catalogue import names, register
 from edgefilter.errors import EdgefilterError, UsageError
@@ -24,7 +25,7 @@ REQUIRED = ("name", "stage", "parameters", "fit")
 """What no effect can do without; the rest has the defaults of Effect."""
 HOOKS = tuple(name for name, value in vars(Effect).items() if callable(value) and not name.startswith("_"))
 PROBE_SAMPLES = 4000
-PSD_BINS = 601
+"""Of noise, on which neutral values must change nothing: a quarter of a second."""
 _loaded: dict[Path, str] = {}
 
 
@@ -63,7 +64,12 @@ def load_effect(path: str | Path) -> str:
     path = Path(path)
     if path.resolve() in _loaded:
         return _loaded[path.resolve()]
-    effect = _instance(path, _guarded(path, _effect_class(path, _run(path))))
+    mine = _guarded(path, _effect_class(path, _run(path)))
+    try:
+        effect = mine()
+    except Exception as error:
+        told = f"{path}: {mine.__name__}() stops with {_told(error)}; an effect is made without arguments"
+        raise UsageError(told) from error
     _check(path, effect)
     register(effect)
     _loaded[path.resolve()] = effect.name
@@ -94,11 +100,8 @@ def _in_one_line(path: Path, hook: Callable, check: Callable | None) -> Callable
         except EdgefilterError:
             raise
         except Exception as error:
-            lines = [
-                frame.lineno
-                for frame in traceback.extract_tb(error.__traceback__)
-                if frame.filename == str(path.resolve())
-            ]
+            frames = traceback.extract_tb(error.__traceback__)
+            lines = [frame.lineno for frame in frames if frame.filename == str(path.resolve())]
             where = f" at line {lines[-1]}" if lines else ""
             raise UsageError(f"{path}: {hook.__name__} stops{where} with {_told(error)}") from error
         if check is None:
@@ -111,13 +114,8 @@ def _in_one_line(path: Path, hook: Callable, check: Callable | None) -> Callable
     return call
 
 
-def _like_input(effect: Effect, result: object, x: np.ndarray) -> np.ndarray:
-    if (
-        not isinstance(result, np.ndarray)
-        or result.shape != x.shape
-        or result.dtype != np.float32
-        or not np.isfinite(result).all()
-    ):
+def _like_input(effect: Effect, result: object, x: np.ndarray) -> object:
+    if not _finite(result, x.shape) or getattr(result, "dtype", None) != np.float32:
         raise UsageError(f"gives {_kind(result)}, expected finite float32 of shape {x.shape}, the shape of its input")
     return result
 
@@ -131,29 +129,26 @@ def _values(effect: Effect, result: object, *_: object) -> Mapping[str, object]:
         raise UsageError(f"gives a wrong value: {error}") from None
 
 
-def _power(size: int | None) -> Callable:
-    """A check for finite numbers of at least 0, size of them, or as many as the input has."""
+def _power(effect: Effect, result: object, x: np.ndarray) -> object:
+    if not _finite(result, x.shape) or np.any(cast(np.ndarray, result) < 0):
+        raise UsageError(f"gives {_kind(result)}, expected finite numbers of shape {x.shape}, none below 0")
+    return result
 
-    def check(effect: Effect, result: object, given: object) -> np.ndarray:
-        shape = (PSD_BINS,) if size else np.asarray(given).shape
-        if (
-            not isinstance(result, np.ndarray)
-            or result.shape != shape
-            or not np.isfinite(result).all()
-            or (result < 0).any()
-        ):
-            raise UsageError(f"gives {_kind(result)}, expected finite numbers of shape {shape}, none below 0")
-        return result
 
-    return check
+def _density(effect: Effect, result: object, *_: object) -> object:
+    return _power(effect, result, np.empty(GRID_BINS))
+
+
+def _finite(result: object, shape: tuple[int, ...]) -> bool:
+    return isinstance(result, np.ndarray) and result.shape == shape and bool(np.isfinite(result).all())
 
 
 _RESULTS: dict[str, Callable] = {
     "apply": _like_input,
     "fit": _values,
-    "variance": _power(None),
-    "noise_psd": _power(PSD_BINS),
-    "colour": _power(PSD_BINS),
+    "variance": _power,
+    "noise_psd": _density,
+    "colour": _density,
 }
 
 
@@ -207,15 +202,6 @@ def _effect_class(path: Path, module: ModuleType) -> type[Effect]:
             f"{path}: class {mine.__name__} lacks {', '.join(missing)}; an effect has {', '.join(REQUIRED)}"
         )
     return mine if issubclass(mine, Effect) else type(mine.__name__, (mine, Effect), {})
-
-
-def _instance(path: Path, mine: type[Effect]) -> Effect:
-    try:
-        return mine()
-    except Exception as error:
-        raise UsageError(
-            f"{path}: {mine.__name__}() stops with {_told(error)}; an effect is made without arguments"
-        ) from error
 
 
 def _check(path: Path, effect: Effect) -> None:

@@ -1,8 +1,8 @@
 """The effects that the package knows: its own, in the order in which sound meets them, and those of the user.
 
-A new effect is a file in this folder and a line in EFFECTS. Where its line stands matters: within a stage effects do
-not commute (a compressor behind a turned volume is not one before it), so EchoModel applies them in the order of this
-list, whichever was found first. Effects of the user's own come after these within their stage, by name.
+A new effect is a file in this folder and a line in EFFECTS. Within a stage effects do not commute (a compressor behind a
+turned volume is not one before it), so EchoModel applies them in the order of this list, whichever was found first.
+Effects of the user's own come after these within their stage, by name.
 """
 
 from __future__ import annotations
@@ -62,12 +62,7 @@ _known: dict[str, Effect] = {effect.name: effect for effect in EFFECTS}
 
 
 def register(effect: Effect) -> None:
-    """Make an effect known by its name; raises UsageError where the name is taken or a neutral value is out of bounds."""
-    if effect.name in _known:
-        raise UsageError(f"effect '{effect.name}' is defined twice: rename one of them")
-    for p in effect.parameters:
-        if not p.low <= p.neutral <= p.high:
-            raise UsageError(f"effect {effect.name}: neutral {p.name}={p.neutral:g} is outside {p.low:g} to {p.high:g}")
+    """Make an effect known by its name; load_effect() has checked it."""
     _known[effect.name] = effect
 
 
