@@ -23,28 +23,20 @@ RIDGE = 1e-6
 class Normal:
     """Normal equations of target(n) = sum over c and k of w[c, k] column_c(n + lead - k), summed over the chosen n.
 
-    matrix: (C * taps, C * taps) float64. right: (C * taps,). energy: of the target over these samples. count: of them.
+    matrix: (C * taps, C * taps) float64. right: (C * taps,). energy: of the target over these samples.
     """
 
     matrix: Array
     right: Array
     energy: float
-    count: int
     taps: int
 
-    def solve(self, ridge: float = RIDGE, use: np.ndarray | None = None) -> tuple[Array, float]:
-        """Weights (C, taps) float64 and the energy that they leave; ridge is relative to each column's own energy.
-
-        use: (C, taps) bool, the taps that may differ from zero, None for all.
-        """
-        chosen = np.arange(self.right.size) if use is None else np.flatnonzero(use)
-        matrix, right = self.matrix[np.ix_(chosen, chosen)], self.right[chosen]
-        energy = np.repeat(self.matrix.diagonal().reshape(-1, self.taps).mean(axis=1), self.taps)[chosen]
-        w = ridge_solved(matrix, right, ridge, energy)
-        left = self.energy - 2.0 * float(w @ right) + float(w @ matrix @ w)
-        weights = np.zeros(self.right.size)
-        weights[chosen] = w
-        return weights.reshape(-1, self.taps), max(left, 0.0)
+    def solve(self, ridge: float = RIDGE) -> tuple[Array, float]:
+        """Weights (C, taps) float64 and the energy that they leave; ridge is relative to each column's own energy."""
+        own = np.repeat(self.matrix.diagonal().reshape(-1, self.taps).mean(axis=1), self.taps)
+        w = ridge_solved(self.matrix, self.right, ridge, own)
+        left = self.energy - 2.0 * float(w @ self.right) + float(w @ self.matrix @ w)
+        return w.reshape(-1, self.taps), max(left, 0.0)
 
 
 def ridge_solved(matrix: Array, right: Array, ridge: Array | float, energy: Array | None = None) -> Array:
@@ -65,7 +57,7 @@ def normal_equations(
     """Normal equations for columns (C, n), each at_lags(), and a target (n,); fit (n,) bool: the samples that count, None for all."""
     n, size = target.size, len(columns) * taps
     windows = [at_lags(column, taps, lead) for column in columns]
-    matrix, right, energy, count = np.zeros((size, size)), np.zeros(size), 0.0, 0
+    matrix, right, energy = np.zeros((size, size)), np.zeros(size), 0.0
     used = None if fit is None else np.flatnonzero(fit)
     for at in range(0, n if used is None else used.size, CHUNK):
         chosen = slice(at, at + CHUNK) if used is None else used[at : at + CHUNK]
@@ -74,23 +66,21 @@ def normal_equations(
         matrix += rows.T @ rows
         right += rows.T @ y
         energy += float(np.dot(y, y))
-        count += y.size
-    return Normal(matrix, right, energy, count, taps)
+    return Normal(matrix, right, energy, taps)
 
 
-def filtered(columns: Sequence[Samples], weights: Array, lead: int = 0) -> Samples:
-    """Sum over c of column_c filtered by weights[c] (C, taps), tap k a delay of k - lead samples: (n,) float32."""
-    n = columns[0].size
-    out = np.zeros(n, np.float32)
-    for column, w in zip(columns, weights.astype(np.float32), strict=True):
-        if n and w.any():
-            padded = np.pad(column, (0, lead))
-            many = padded.size > CHUNK and w.size > 4  # then transforms are faster than sums
-            out += (convolve if many else np.convolve)(padded, w)[lead : lead + n]
-    return out
+def filtered(x: Samples, taps: Array, lead: int = 0) -> Samples:
+    """The signal x (n,) through taps (t,), tap k a delay of k - lead samples, (n,) float32."""
+    taps = taps.astype(np.float32)
+    if not x.size or not taps.any():
+        return np.zeros(x.size, np.float32)
+    padded = np.pad(x, (0, lead)) if lead else x
+    many = padded.size > CHUNK and taps.size > 4  # then transforms are faster than sums
+    whole = convolve(padded, taps) if many else np.convolve(padded, taps)
+    return whole[lead : lead + x.size].astype(np.float32, copy=False)
 
 
 def absorbed(predicted: Samples, target: Samples, fit: np.ndarray | None = None) -> Samples:
     """Put predicted (n,) through the short filter that brings it closest to target (n,): what is left is not ordinary."""
     weights, _ = normal_equations([predicted], target, NUISANCE_TAPS, NUISANCE_LEAD, fit).solve()
-    return filtered([predicted], weights, NUISANCE_LEAD)
+    return filtered(predicted, weights[0], NUISANCE_LEAD)

@@ -83,7 +83,7 @@ class Rattle(Effect):
         if not any(h.any() for h in sounds):
             return x.copy()
         knocks = _trains(x, values, sample_rate)
-        return x + sum(filtered([k], h[None]) for k, h in zip(knocks, sounds, strict=True))
+        return x + sum(filtered(k, h) for k, h in zip(knocks, sounds, strict=True))
 
     def variance(self, reference: Samples, values: Values, sample_rate: int) -> Samples:
         knocks = one_side(_trains(reference, values, sample_rate), float(values["side"]))
