@@ -8,9 +8,8 @@ from numpy.typing import NDArray
 from edgefilter.errors import SignalError
 from edgefilter.types import SAMPLE_RATE, Samples, as_samples
 
-MIN_SECONDS = 1.0
-MAX_OFFSET = 3.0
-"""Seconds by which a recording may lag behind its reference or lead it."""
+MIN_SECONDS, MAX_OFFSET = 1.0, 3.0
+"""Seconds of the shortest recording, two BLOCKs, one to fit on and one to test; and by which it may lag behind or lead its reference."""
 BLOCK = SAMPLE_RATE // 2
 """Samples of the blocks that are fitted and tested on in turn."""
 

@@ -70,7 +70,8 @@ def load_effect(path: str | Path) -> str:
     except Exception as error:
         told = f"{path}: {mine.__name__}() stops with {_told(error)}; an effect is made without arguments"
         raise UsageError(told) from error
-    _check(path, effect)
+    if wrong := _wrong(effect):
+        raise UsageError(f"{path}: {wrong}")
     register(effect)
     _loaded[path.resolve()] = effect.name
     return effect.name
@@ -204,31 +205,26 @@ def _effect_class(path: Path, module: ModuleType) -> type[Effect]:
     return mine if issubclass(mine, Effect) else type(mine.__name__, (mine, Effect), {})
 
 
-def _check(path: Path, effect: Effect) -> None:
-    """Raise UsageError for what would fail later, in the middle of a diagnosis."""
+def _wrong(effect: Effect) -> str:
+    """What would fail later, in the middle of a diagnosis; empty where nothing would."""
     if not isinstance(effect.name, str) or not effect.name.isidentifier():
-        raise UsageError(f"{path}: name is {effect.name!r}, expected one word of letters, digits and underscores")
+        return f"name is {effect.name!r}, expected one word of letters, digits and underscores"
     if effect.name in names():
-        raise UsageError(
-            f"{path}: effect '{effect.name}' exists already: choose another name than {', '.join(sorted(names()))}"
-        )
+        return f"effect '{effect.name}' exists already: choose another name than {', '.join(sorted(names()))}"
     if effect.stage not in STAGES:
-        raise UsageError(f"{path}: stage is {effect.stage!r}, expected one of {', '.join(STAGES)}")
+        return f"stage is {effect.stage!r}, expected one of {', '.join(STAGES)}"
     if effect.family not in FAMILIES:
-        raise UsageError(f"{path}: family is {effect.family!r}, expected one of {', '.join(FAMILIES)}")
+        return f"family is {effect.family!r}, expected one of {', '.join(FAMILIES)}"
     if not effect.parameters or not all(isinstance(p, Parameter) for p in effect.parameters):
-        raise UsageError(f"{path}: parameters is not a tuple of Parameter(name, unit, neutral, low, high)")
+        return "parameters is not a tuple of Parameter(name, unit, neutral, low, high)"
     for p in effect.parameters:
         if not p.low <= p.neutral <= p.high:
-            raise UsageError(f"{path}: neutral {p.name}={p.neutral:g} is outside {p.low:g} to {p.high:g}")
+            return f"neutral {p.name}={p.neutral:g} is outside {p.low:g} to {p.high:g}"
     probe = np.random.default_rng(0).standard_normal(PROBE_SAMPLES).astype(np.float32) * np.float32(0.1)
     probe.flags.writeable = False
-    found = effect.apply(probe, neutral(effect), SAMPLE_RATE)
-    if float(np.max(np.abs(found - probe))) > 1e-5:
-        raise UsageError(
-            f"{path}: apply changes the signal at the neutral values of effect '{effect.name}', "
-            "expected the identity there"
-        )
+    if float(np.max(np.abs(effect.apply(probe, neutral(effect), SAMPLE_RATE) - probe))) > 1e-5:
+        return f"apply changes the signal at the neutral values of effect '{effect.name}', expected the identity there"
+    return ""
 
 
 def _told(error: BaseException) -> str:

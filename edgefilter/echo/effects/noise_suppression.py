@@ -16,7 +16,7 @@ from edgefilter.types import Array, Samples
 
 SIZE, HOP = 512, 256
 WINDOW = np.sqrt(hann(SIZE))
-"""Analysis and synthesis: their product, half-overlapping, adds up to 1."""
+"""Frames of 32 ms. Analysis and synthesis: their product, half-overlapping, adds up to 1."""
 FORGETTING, NEIGHBOURS = 0.5, 3
 """Of the local ratio, from frame to frame, and the bins over which it is averaged: what explains most of the suppressors tried."""
 KNOTS_DB = np.arange(-10.0, 31.0, 5.0)
