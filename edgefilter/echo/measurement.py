@@ -21,7 +21,7 @@ Result = TypeVar("Result")
 SILENT = 0.1
 """Part of the fan's power under which a predicted voice leaves the fan alone: the two are 0.4 dB louder than the fan."""
 ORDINARY_DB = 0.4
-"""By which a gain differs at most from day to day, or from the beginning to the end of a minute: less is none."""
+"""By which a gain differs at most from day to day, or moves while it stands still."""
 REMEMBERED = 6
 """Models whose predictions a measurement keeps: one that a search goes on from, and some beside it."""
 

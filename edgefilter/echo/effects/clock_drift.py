@@ -17,7 +17,7 @@ PASSES = ((4000, 512), (8000, 16))
 STEADY = 0.05
 """Samples by which a block's lag may err for other reasons than noise."""
 LEAST_PPM = 0.5
-"""Clocks that differ by less, in 1e-6, are one: faint distortion alone makes as much in tests/echo/effects/test_timing.py."""
+"""Least difference of two clocks, in 1e-6: what tests/echo/effects/test_timing.py lets a fit err by beside faint distortion."""
 
 
 class ClockDrift(Effect):

@@ -12,7 +12,7 @@ from edgefilter.echo.wiener import convolve_from, fit_supported
 from edgefilter.types import PRE_ROLL, SAMPLE_RATE, Samples
 
 TAPS, EXPECTED = 3072, 1e-2
-"""Of the new path behind the old one, 0.2 s: what moves is near. And the expected square of each."""
+"""Of the new path behind the old one, 0.2 s; and the expected square of each."""
 BLOCK = SAMPLE_RATE // 10
 """Samples (100 ms) of the steps in which the moment is looked for at first."""
 MARGIN = 1.5

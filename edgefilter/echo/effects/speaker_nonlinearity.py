@@ -23,7 +23,7 @@ EXCERPT = 10 * SAMPLE_RATE
 DRIVER, AMPLIFIER = ("force_factor", "stiffness", "damping"), ("even", "odd")
 """The laws, with two weights each."""
 RESONANCES_HZ, REACH_HZ = (250.0, 180.0, 215.0, 300.0, 370.0), (160.0, 1000.0)
-"""Of small drivers, the usual one first, and the least and the highest that MOTION_TAPS are enough for."""
+"""Of small drivers, the usual one first; how low is tried, where MOTION_TAPS are just enough, and how high."""
 BESIDE = 1.1
 """Times the best of these resonances, either way, that are tried next."""
 EXCURSION, KNEES = 0.7, (0.3, 0.15, 0.6)
