@@ -1,22 +1,20 @@
-"""Which explanations a diagnosis leaves, and what would have to be recorded to tell two effects apart that explain about as much."""
+"""Which explanations a diagnosis leaves, and what to record to tell two effects apart that explain about as much."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import combinations
+from itertools import combinations, permutations
 
+from edgefilter.diagnosis.criteria import Criteria
 from edgefilter.diagnosis.result import Candidate
 from edgefilter.echo.effect import Effect, Experiment
 from edgefilter.echo.effects.catalogue import find
 
-MARGIN = 0.15
-"""Of the larger gain, by which two candidates may differ and lie close: as Criteria.nested, by which the simpler of two
-is named."""
 RIVAL = 0.7
-"""Part of the fall in level by what is named, from which on another explanation remains: twice the 15 % by which a simpler
-effect may be behind and is named all the same (Criteria.nested). Not tuned."""
+"""Part of the fall in level by what is named, from which on another explanation remains: twice as far behind as a
+simpler effect may be and is named all the same (Criteria.nearly). Not tuned."""
 MOST = 4
-"""Explanations that remain at most: the best ones."""
+"""Explanations that remain at most, the best ones: each costs a fit for each sound that is tried."""
 RULES: tuple[tuple[Experiment, str], ...] = (
     ("levels", "play the same sentences at two volumes, 6 dB apart: only {shows} grows or shrinks by another amount"),
     ("minute", "record a minute and more: only {shows} goes on growing"),
@@ -29,7 +27,7 @@ RULES: tuple[tuple[Experiment, str], ...] = (
 
 
 def advice(tried: Sequence[Candidate]) -> tuple[str, ...]:
-    """A line for each named effect and each other candidate whose gain, alone, is within MARGIN of its own.
+    """A line for each named effect and each other effect where both, each alone, explain about as much.
 
     A flexible effect takes up what a simple one does and says nothing against it, so such a pair is no question; nor is
     one that does not reach its bar.
@@ -37,12 +35,13 @@ def advice(tried: Sequence[Candidate]) -> tuple[str, ...]:
     rivals = [c for c in tried if c.gain_db is not None and c.verdict in ("named", "explained by another")]
     lines = []
     for first, second in combinations(rivals, 2):
-        if "named" not in (first.verdict, second.verdict) or first.verdict == second.verdict:
+        if first.verdict == second.verdict:
             continue
         gains = first.gain_db or 0.0, second.gain_db or 0.0
-        if min(gains) >= (1.0 - MARGIN) * max(gains) and find(first.effect).flexible == find(second.effect).flexible:
+        one, other = find(first.effect), find(second.effect)
+        if min(gains) >= Criteria.nearly * max(gains) and one.flexible == other.flexible:
             told = f"{first.effect} ({gains[0]:.2f} dB) or {second.effect} ({gains[1]:.2f} dB)"
-            lines.append(f"{told}: {_difference(find(first.effect), find(second.effect))}")
+            lines.append(f"{told}: {_difference(one, other)}")
     return tuple(lines)
 
 
@@ -54,7 +53,7 @@ def asks(tried: Sequence[Candidate]) -> tuple[str, ...]:
 
 
 def remaining(tried: Sequence[Candidate]) -> tuple[tuple[str, ...], ...]:
-    """The effects of each explanation that remains: all that are named, then each other one that explains nearly as much alone.
+    """The effects of each explanation that remains: all that are named, then each that alone explains nearly as much.
 
     Events are left out, since no other recording has them.
     """
@@ -69,7 +68,7 @@ def remaining(tried: Sequence[Candidate]) -> tuple[tuple[str, ...], ...]:
 
 def _difference(first: Effect, second: Effect) -> str:
     """The experiment in which just one of two effects shows itself."""
-    for shown, other in ((first, second), (second, first)):
+    for shown, other in permutations((first, second)):
         if shown.scales_fan and not other.scales_fan:
             return f"record ten seconds of silence before the robot talks: only {shown.name} changes the fan as well"
         if shown.event and not other.event:
@@ -78,7 +77,7 @@ def _difference(first: Effect, second: Effect) -> str:
         shows = [effect.name for effect in (first, second) if kind in effect.shown_by]
         if len(shows) == 1:
             return rule.format(shows=shows[0])
-    for shown, other in ((first, second), (second, first)):
+    for shown, other in permutations((first, second)):
         if shown.stage == "microphone" and other.stage != "microphone":
             return f"let a telephone play beside the robot, as loud as it: only {shown.name} happens to that as well"
         if shown.adds_noise and not other.adds_noise:

@@ -7,9 +7,10 @@ from dataclasses import replace
 
 import numpy as np
 
+from edgefilter.diagnosis.prepare import HOP
 from edgefilter.diagnosis.result import Candidate, Fate
-from edgefilter.diagnosis.score import FRAMES_PER_CELL, HOP, Scorer
-from edgefilter.diagnosis.trials import Found, Trial, Tried
+from edgefilter.diagnosis.score import STEP, Scorer
+from edgefilter.diagnosis.trials import Found, Tried
 from edgefilter.echo.effect import neutral
 from edgefilter.echo.effects.catalogue import find
 from edgefilter.echo.measurement import Values
@@ -18,13 +19,12 @@ from edgefilter.echo.measurement import Values
 def candidates(found: Found, named: Collection[str]) -> tuple[Candidate, ...]:
     """The table of a search, and of the changes of the fan that it has seen; named: the effects that the diagnosis gives.
 
-    The information criterion (Schwarz 1978) is that of Score.level_db's likelihood: ln(N) for each number of the fit, less
-    2 N times the fall of the level, N the samples held out. As these are held out the gain is not flattered; the penalty
-    comes on top. An effect that was
+    The information criterion (Schwarz 1978) is that of Score.level_db's likelihood: ln(N) for each number of the fit,
+    less 2 N times the fall of the level, N the samples held out: the penalty comes on top of that. An effect that was
     tried beside others only is ranked by its gain there.
     """
     scorer = Scorer(found.prepared)
-    held = float(scorer.starts.size * HOP * FRAMES_PER_CELL) * scorer.freedom.sum() / (HOP - 1)
+    held = float(scorer.starts.size * STEP) * scorer.freedom.sum() / (HOP - 1)
     tried = {entry.name: entry for entry in found.tried}
     seen = {step.name: Tried(step.name, None if place else step, step) for place, step in enumerate(found.steps)}
     rows = [_row(entry, found, named, held) for entry in {**seen, **tried}.values()]
@@ -34,10 +34,10 @@ def candidates(found: Found, named: Collection[str]) -> tuple[Candidate, ...]:
 
 
 def size_of(name: str, values: Values) -> float:
-    """How many numbers carry an effect: one for each that is not neutral, and of a filter of many taps as many as hold its energy.
+    """How many numbers carry an effect: one for each that is not neutral, and of a filter as many as hold its energy.
 
-    The latter is the exponential of the entropy of how the energy is spread: a tail that dies away is not as many
-    numbers as it has taps, because what the fit holds it to is that it dies away.
+    The latter is the exponential of the entropy of how the energy is spread: a tail that dies away is fewer numbers
+    than it has taps.
     """
     plain, given = neutral(find(name)), {p.name for p in find(name).parameters if p.given}
     count = 0.0
@@ -56,7 +56,7 @@ def _row(entry: Tried, found: Found, named: Collection[str], held: float) -> Can
     alone_db, beside_db = (trial.gain_db if trial else None for trial in (entry.alone, beside))
     row = Candidate(entry.name, verdict, why, alone_db, beside_db)
     trial = entry.alone or beside
-    if trial is None:
+    if not trial:
         return row
     numbers = size_of(entry.name, trial.values)
     bic = numbers * float(np.log(max(held, 2.0))) - held * np.log(10.0) / 5.0 * trial.gain_db
@@ -79,8 +79,6 @@ def _fate(entry: Tried, found: Found, named: Collection[str]) -> tuple[Fate, str
         return "below its bar", entry.short
     if not named:
         return "failed its proof", "what it explains is too little to be what happened"
-    return "explained by another", _beside(entry.beside)
-
-
-def _beside(trial: Trial | None) -> str:
-    return f"beside what is named it adds {trial.gain_db:.2f} dB" if trial else "what is named leaves it nothing"
+    beside = entry.beside
+    added = f"beside what is named it adds {beside.gain_db:.2f} dB" if beside else "what is named leaves it nothing"
+    return "explained by another", added

@@ -1,44 +1,32 @@
-"""Whether the channels of a recording are the microphones that were calibrated: which is which, how loud, and how clean."""
+"""Whether the channels of a recording are the microphones that were calibrated: which is which, how loud, how clean."""
 
 from __future__ import annotations
 
 import numpy as np
 from scipy import fft
 
-from edgefilter.dsp.exchange import EQUAL, exchanged, order_of
+from edgefilter.dsp.exchange import ALIKE, EQUAL, exchanged, order_of
 from edgefilter.dsp.lag import flat_cross
 from edgefilter.errors import SignalError
+from edgefilter.filter.microphones import MOST_CLIPPED
 from edgefilter.profile.data import Profile
 from edgefilter.types import Samples
 
 SECOND = 16384
-"""Samples that are looked at, the loudest of the robot: a clock that differs moves nothing in so short a time."""
+"""Samples, about a second and a power of two: of the robot's loudest, in which a clock that differs moves nothing."""
 GAIN_DB = 2.0
-"""Beside the others, by which a gain is another one: in another room, or with a hand near it, one microphone of an array
-changes by less than 1 dB beside the others."""
-ALIKE = 0.3
-"""Least correlation with what the calibration expects of a channel that hears the robot by that path."""
-TOP, BELOW, MOST_PEAKS, CROWDED = 0.998, 0.99, 16, 3
-"""Of its largest sample, above which a sample is at the top, and below which not even beside it; so many, a millisecond, are
-not there by chance, and so many times as many at the top as beside it no sound has: a sine has as many in both."""
+"""Beside the others, by which a gain is another one: in another room, or with a hand near it, a microphone changes by less
+than 1 dB beside the others."""
+TOP, BELOW, CROWDED = 0.998, 0.99, 3
+"""Parts of the largest sample: above one a sample is at the top, above the other beside it; and how many times as many at
+the top as beside it no sound has: a sine has as many in both, one bent at its top 2.5 times."""
 
 
 def doubtful_channels(profile: Profile, recordings: Samples, reference: Samples) -> dict[int, str]:
     """What is wrong with microphones, by number, from 0; none where each is as it was calibrated.
 
-    Parameters
-    ----------
-    profile : Profile
-        Of as many microphones.
-    recordings : ndarray of float32, shape (microphones, n)
-        The robot alone at each, full scale +-1, 16 kHz.
-    reference : ndarray of float32, shape (m,)
-        What it said.
-
-    Raises
-    ------
-    SignalError
-        Where the profile holds another number of microphones.
+    recordings: (microphones, n) float32, the robot alone at each, 16 kHz. reference: (m,), what it said. Raises
+    SignalError where the profile holds another number of microphones.
     """
     if len(recordings) != profile.microphones:
         raise SignalError(
@@ -47,13 +35,11 @@ def doubtful_channels(profile: Profile, recordings: Samples, reference: Samples)
         )
     doubts = {}
     for at, one in enumerate(recordings):
-        peak = float(np.abs(one).max(initial=0.0))
+        peak, power = float(np.abs(one).max(initial=0.0)), np.mean(np.square(one, dtype=np.float64))
         if not peak:
             doubts[at] = "silent, every sample is 0"
         elif is_clipped(np.abs(one) / peak):
             doubts[at] = f"clipped at {20 * np.log10(peak):.1f} dB of full scale"
-    for at, one in enumerate(recordings):
-        power = np.mean(np.square(one, dtype=np.float64))
         for other in range(at):
             if at not in doubts and np.mean(np.square(one - recordings[other], dtype=np.float64)) < EQUAL * power:
                 doubts[at] = f"the same sound as channel {other}"
@@ -86,11 +72,11 @@ def doubtful_channels(profile: Profile, recordings: Samples, reference: Samples)
 def is_clipped(size: Samples) -> bool:
     """Whether a sound of which this is the size (n,), the largest of it 1, was cut at its top."""
     top, beside = np.count_nonzero(size > TOP), np.count_nonzero(size > BELOW)
-    return bool(top >= MOST_PEAKS and top > CROWDED * (beside - top))
+    return bool(top >= MOST_CLIPPED and top > CROWDED * (beside - top))
 
 
 def loudest_second(profile: Profile, recordings: Samples, reference: Samples) -> tuple[Samples, Samples]:
-    """What the microphones heard and what was to be expected of them, (microphones, SECOND) each, within some samples."""
+    """What the microphones heard and what was to be expected, (microphones, SECOND) each, within some samples."""
     paths, n = profile.running_responses(), recordings.shape[1]
     size = fft.next_fast_len(n + reference.size + paths.shape[1] + round(profile.delay), real=True)
     said = np.fft.rfft(reference, size)

@@ -1,4 +1,4 @@
-"""A closer look at what no effect explains: the gain that the recording still asks for, over time, rate, level and frequency, and its silences."""
+"""A closer look at what no effect explains: the gain that is missing by time, rate, level and frequency, and silences."""
 
 from __future__ import annotations
 
@@ -6,26 +6,26 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 
+from edgefilter.diagnosis.criteria import Criteria
+from edgefilter.diagnosis.independence import PER_MS
 from edgefilter.diagnosis.prepare import Prepared
 from edgefilter.diagnosis.trials import Found
-from edgefilter.dsp.frames import block_power, block_sums, blocks, decibels
-from edgefilter.dsp.psd import frequencies, periodograms
+from edgefilter.dsp.frames import block_power, block_sums, decibels, frames
+from edgefilter.dsp.psd import GRID_FFT, frequencies, periodograms
+from edgefilter.echo.effects.gain_law import SURE
 from edgefilter.echo.wiener import spectra
 from edgefilter.types import SAMPLE_RATE, Array, Samples
 
 STEP = SAMPLE_RATE // 50
-BEAT = 16
-"""Samples over which the gain is summed where its rate is sought."""
+"""Samples (20 ms) over which a gain is summed."""
+BEAT = PER_MS
+"""The same where its rate is sought."""
 TIME_S, LEVEL_DB, RATES_HZ = 0.04, 5.0, (1.0, 30.0)
-"""Of one point of a curve: five in a period of a tremolo of 5 Hz."""
+"""Of one point of a curve: five in a period of a tremolo of 5 Hz; and the rates that are looked at."""
 FINER = 24
 """Rates tried per cycle in the whole recording."""
 BANDS_HZ = np.geomspace(100.0, 7800.0, 20)
-RATE = "rate at which the gain comes and goes"
-SURE = 40.0
-"""Energy of the voice over the fan's variance from which on its gain is drawn."""
-TELLING = 0.1
-"""Share of what is left that a gain must explain to be pointed at: less is how any model errs."""
+RATE, SILENCES = "rate at which the gain comes and goes", "frequency, in the robot's silences"
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ class Curve:
 
     @classmethod
     def of(cls, name: str, x_unit: str, x: Array, y_db: Array, share: float, y_unit: str = "dB") -> Curve:
-        """From arrays (k,), the share held between 0 and 1."""
+        """From arrays (k,); the share is held between 0 and 1."""
         return cls(name, x_unit, tuple(map(float, x)), tuple(map(float, y_db)), float(np.clip(share, 0.0, 1.0)), y_unit)
 
     def to_dict(self) -> dict[str, object]:
@@ -94,7 +94,7 @@ class _Gains:
         self.noise = max(self.whole / max(STEP * np.count_nonzero(self.energy > SURE), 1), 1.0)
 
     def over(self, name: str, unit: str, group: Array, width: float) -> Curve:
-        """The gain of each group (steps,), at the group's middle, and the share that all of them explain beyond what chance does."""
+        """The gain of each group (steps,), at the group's middle, and the share that all explain beyond chance."""
         keys, place = np.unique(group[: self.energy.size], return_inverse=True)
         energy, cross = (np.bincount(place, part) for part in (self.energy, self.cross))
         sure = energy > SURE
@@ -102,8 +102,7 @@ class _Gains:
             return Curve(name, unit, (), (), 0.0)
         gain = cross[sure] / energy[sure]
         away = float(np.sum(energy[sure] * (gain - 1.0) ** 2)) - sure.sum() * self.noise
-        x = (keys[sure] + 0.5) * width
-        return Curve.of(name, unit, x, 20.0 * np.log10(np.clip(gain, 0.03, 30.0)), away / max(self.whole, 1e-9))
+        return Curve.of(name, unit, (keys[sure] + 0.5) * width, _gain_db(gain), away / max(self.whole, 1e-9))
 
 
 def _over_rate(voice: Samples, left: Samples, gains: _Gains) -> Curve:
@@ -111,13 +110,10 @@ def _over_rate(voice: Samples, left: Samples, gains: _Gains) -> Curve:
     if not energy.any():
         return Curve(RATE, "Hz", (), (), 0.0)
     rates, worth, depth = by_rate(energy, cross, *RATES_HZ)
-    best = np.argmax(worth)
-    away = float(worth[best] - np.median(worth))
-    edges = np.geomspace(RATES_HZ[0], rates[-1], 61)
-    place = np.digitize(rates, edges)
-    x = [float(rates[place == k][np.argmax(depth[place == k])]) for k in np.unique(place)]
-    y = [float(20.0 * np.log10(1.0 + depth[place == k].max())) for k in np.unique(place)]
-    return Curve.of(RATE, "Hz", np.array(x), np.array(y), away / max(gains.whole, 1e-9))
+    away = float(worth.max() - np.median(worth))
+    place = np.digitize(rates, np.geomspace(RATES_HZ[0], rates[-1], 61))
+    deepest = np.array([np.argmax(np.where(place == k, depth, -1.0)) for k in np.unique(place)])
+    return Curve.of(RATE, "Hz", rates[deepest], 20.0 * np.log10(1.0 + depth[deepest]), away / max(gains.whole, 1e-9))
 
 
 def by_rate(energy: Array, cross: Array, lowest_hz: float, highest_hz: float) -> tuple[Array, Array, Array]:
@@ -130,12 +126,10 @@ def by_rate(energy: Array, cross: Array, lowest_hz: float, highest_hz: float) ->
     own, other = np.fft.rfft(energy, size), np.fft.rfft(cross, size)
     rates = np.arange(max(round(lowest_hz / per), 1), min(round(highest_hz / per), own.size // 2))
     at, twice, seen = own[rates], own[2 * rates], other[rates]
-    matrix = np.empty((rates.size, 3, 3))
-    matrix[:, 0, 0] = own[0].real
-    matrix[:, 0, 1] = matrix[:, 1, 0] = at.real
-    matrix[:, 0, 2] = matrix[:, 2, 0] = -at.imag
-    matrix[:, 1, 1], matrix[:, 2, 2] = 0.5 * (own[0] + twice).real, 0.5 * (own[0] - twice).real
-    matrix[:, 1, 2] = matrix[:, 2, 1] = -0.5 * twice.imag
+    even, odd, both = 0.5 * (own[0] + twice).real, 0.5 * (own[0] - twice).real, -0.5 * twice.imag
+    whole = np.full(rates.size, own[0].real)
+    rows = ((whole, at.real, -at.imag), (at.real, even, both), (-at.imag, both, odd))
+    matrix = np.ascontiguousarray(np.moveaxis(np.array(rows), 2, 0))
     right = np.stack((np.full(rates.size, other[0].real), seen.real, -seen.imag), axis=1)
     matrix += (1e-6 * own[0].real + 1e-30) * np.eye(3)
     found = np.linalg.solve(matrix, right[:, :, None])[:, :, 0]
@@ -154,28 +148,38 @@ def _over_frequency(prepared: Prepared, voice: Samples, left: Samples, gains: _G
     gain = cross[sure] / power[sure]
     away = float(np.sum(power[sure] * (gain - 1.0) ** 2)) / max(float(np.sum(found.predicted)), 1e-9)
     share = away * float(np.sum(gains.energy)) / max(gains.whole, 1e-9)
-    x = np.sqrt(BANDS_HZ[1:] * BANDS_HZ[:-1])[sure]
-    return Curve.of("frequency", "Hz", x, 20.0 * np.log10(np.clip(gain, 0.03, 30.0)), share)
+    return Curve.of("frequency", "Hz", _middles_hz()[sure], _gain_db(gain), share)
 
 
 def _silence(prepared: Prepared, prediction: Samples) -> Curve:
     """The spectrum of what is left while the robot is silent, over the fan's; its share is of no gain."""
     left, quiet = prepared.measurement.recording - prediction, prepared.usable & ~prepared.active
-    whole = np.all(blocks(quiet, 600), axis=1)
-    frames_ = periodograms(left, 1200)
-    silent = (whole[:-1] & whole[1:])[: frames_.shape[0]]
+    silent = frames(quiet, GRID_FFT, GRID_FFT // 2).all(axis=1)
     if silent.sum() < 10:
-        return Curve("frequency, in the robot's silences", "Hz", (), (), 0.0)
-    ratio = frames_[: silent.size][silent].mean(axis=0) / prepared.noise_psd
+        return Curve(SILENCES, "Hz", (), (), 0.0)
+    ratio = periodograms(left, GRID_FFT)[silent].mean(axis=0) / prepared.noise_psd
     place = np.digitize(frequencies(ratio.size), BANDS_HZ)
     y = [float(decibels(ratio[place == k].mean())) for k in range(1, BANDS_HZ.size)]
-    return Curve.of("frequency, in the robot's silences", "Hz", np.sqrt(BANDS_HZ[1:] * BANDS_HZ[:-1]), np.array(y), 0.0)
+    return Curve.of(SILENCES, "Hz", _middles_hz(), np.array(y), 0.0)
+
+
+def _middles_hz() -> Array:
+    """The middle of each of BANDS_HZ."""
+    return np.sqrt(BANDS_HZ[1:] * BANDS_HZ[:-1])
+
+
+def _gain_db(gain: Array) -> Array:
+    """Decibels of a gain, at most 30 either way."""
+    return 20.0 * np.log10(np.clip(gain, 0.03, 30.0))
 
 
 def _told(curves: tuple[Curve, ...]) -> str:
-    """Which curve to look at: of those whose gain would explain half of what any would, the one of fewest numbers; else the silences, else none."""
+    """Which curve to look at: of those that would explain half of what any would the one of fewest numbers, or silences.
+
+    A gain that explains next to nothing (Criteria.nothing) is not pointed at: any model errs by so much.
+    """
     most_share = max((curve.share for curve in curves), default=0.0)
-    if most_share >= TELLING:
+    if most_share >= Criteria.nothing:
         telling = next(curve for curve in curves if curve.share >= 0.5 * most_share)
         worth = f"would explain {100 * telling.share:.0f} % of what is left"
         most, least = int(np.argmax(telling.y_db)), int(np.argmin(telling.y_db))
@@ -185,11 +189,9 @@ def _told(curves: tuple[Curve, ...]) -> str:
             )
         high, low = (f"{telling.y_db[i]:+.1f} dB at {telling.x[i]:.3g} {telling.x_unit}" for i in (most, least))
         return f"look at the gain by {telling.name}: highest, {high}, and lowest, {low}, it {worth}"
-    silence = next((curve for curve in curves if "silences" in curve.name), None)
+    silence = next((curve for curve in curves if curve.name == SILENCES), None)
     if silence is not None and max(map(abs, silence.y_db)) > 3.0:
         at = int(np.argmax(np.abs(silence.y_db)))
-        return (
-            f"look at the robot's silences: they are {silence.y_db[at]:+.1f} dB off the calibrated fan around"
-            f" {silence.x[at]:.0f} Hz"
-        )
+        off = f"{silence.y_db[at]:+.1f} dB off the calibrated fan around {silence.x[at]:.0f} Hz"
+        return f"look at the robot's silences: they are {off}"
     return "no gain of the predicted voice explains it: what is left does not follow the voice's wave; listen to it"

@@ -1,8 +1,10 @@
-"""Compare what the profile predicts of the robot's own voice with a recording of it: how much is left over, and where."""
+"""Compare what the profile predicts of the robot's own voice with a recording of it: how much is left, and where."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field, fields
+from itertools import pairwise
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,13 +19,16 @@ from edgefilter.echo.effects.catalogue import chain
 from edgefilter.echo.evidence import Score
 from edgefilter.echo.measurement import whiten
 from edgefilter.echo.model import EchoModel
+from edgefilter.echo.recording import BLOCK
 from edgefilter.profile.data import Profile
 from edgefilter.types import SAMPLE_RATE, Array, Samples
 
 BAND_EDGES = (60.0, 125.0, 250.0, 500.0, 1000.0, 1500.0, 2000.0, 3000.0, 4000.0, 5000.0, 6000.0, 7000.0, 7800.0)
-TIME_STEP = SAMPLE_RATE // 2
 LEVEL_STEP_DB = 6.0
 LAG_EDGES_MS = (-20.0, -4.0, 0.0, 4.0, 10.0, 30.0, 100.0, 200.0, 400.0, 800.0)
+
+Rows: TypeAlias = tuple[tuple[float, float, float], ...]
+"""Low, high and a value, one range after the other."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,23 +39,20 @@ class Comparison:
 
     excess_db: of the samples that no diagnosis fits on, every second half second, as Scorer scores them: the one figure
     that compare, add, diagnose and the report show; 0 means that nothing is unexplained. All else is of the whole.
-    noise_floor_db: the fan, dB re full scale.
-    bands: (low_hz, high_hz, excess_db). times: (start_s, end_s, excess_db). levels: (low_dbfs, high_dbfs, excess_db) by
-    the level of the predicted voice. lags: (low_ms, high_ms, share) of the residual's correlation with the reference,
-    by lag.
-    silence_excess_db: while the robot is silent; nan where it never is. human: (start_s, end_s) where somebody talks,
-    left out.
-    offset_samples: lag of the recording against the calibration, constant. recording, prediction, residual: (n,),
-    aligned. independence: whether the residual is white and independent of the reference; None for less than a second
-    of the robot.
+    noise_floor_db: the fan, dB re full scale. bands: (low_hz, high_hz, excess_db). times: (start_s, end_s, excess_db).
+    levels: (low_dbfs, high_dbfs, excess_db) by the level of the predicted voice. lags: (low_ms, high_ms, share) of the
+    residual's correlation with the reference, by lag. silence_excess_db: while the robot is silent; nan where it never
+    is. human: (start_s, end_s) where somebody talks, left out. offset_samples: lag of the recording against the
+    calibration, constant. recording, prediction, residual: (n,), aligned. independence: whether the residual is white
+    and independent of the reference; None for less than a second of the robot.
     """
 
     excess_db: float
     noise_floor_db: float
-    bands: tuple[tuple[float, float, float], ...]
-    times: tuple[tuple[float, float, float], ...]
-    levels: tuple[tuple[float, float, float], ...]
-    lags: tuple[tuple[float, float, float], ...]
+    bands: Rows
+    times: Rows
+    levels: Rows
+    lags: Rows
     silence_excess_db: float
     human: tuple[tuple[float, float], ...]
     offset_samples: float
@@ -61,19 +63,19 @@ class Comparison:
     independence: Independence | None = field(default=None, repr=False)
 
     def to_dict(self) -> dict[str, object]:
-        """All but the signals, ready for JSON; what is not a number becomes None."""
-        left_out = ("recording", "prediction", "residual", "independence")
-        told = {
-            key: _plain(getattr(self, key)) for key in (entry.name for entry in fields(self)) if key not in left_out
-        }
+        """All but the signals, ready for JSON."""
+        told = {entry.name: rounded(getattr(self, entry.name)) for entry in fields(self) if entry.repr}
         return {**told, "independence": self.independence.to_dict() if self.independence else None}
 
 
-def _plain(value: object) -> object:
+def rounded(value: Any, digits: int = 4) -> Any:
+    """A value, or all in it, ready for JSON: numbers to so many digits behind the point, None where one is not finite."""
+    if isinstance(value, dict):
+        return {key: rounded(one, digits) for key, one in value.items()}
     if isinstance(value, tuple | list):
-        return [_plain(item) for item in value]
+        return [rounded(one, digits) for one in value]
     if isinstance(value, float | np.floating):
-        return round(float(value), 4) if np.isfinite(value) else None
+        return round(float(value), digits) if np.isfinite(value) else None
     return value
 
 
@@ -111,10 +113,8 @@ def compare(profile: Profile, recording: Samples, reference: Samples, *, sample_
     --------
     >>> import numpy as np
     >>> from edgefilter import calibrate, generate_sweep
-    >>> rng = np.random.default_rng(0)
-    >>> def fan(n):
-    ...     return 1e-3 * rng.standard_normal(n).astype(np.float32)
-    >>> sweep = generate_sweep()
+    >>> rng, sweep = np.random.default_rng(0), generate_sweep()
+    >>> fan = lambda n: 1e-3 * rng.standard_normal(n).astype(np.float32)
     >>> profile = calibrate(sweep, 0.5 * np.roll(sweep, 300) + fan(sweep.size), fan(64_000))
     >>> said = (0.2 * rng.standard_normal(80_000) * np.repeat(rng.uniform(size=25) > 0.3, 3200)).astype(np.float32)
     >>> heard = 0.4 * np.roll(said, 300) + fan(said.size)
@@ -126,9 +126,7 @@ def compare(profile: Profile, recording: Samples, reference: Samples, *, sample_
 
 
 def describe(prepared: Prepared, model: EchoModel, score: Score | None = None) -> Comparison:
-    """The comparison of a prepared recording with what a model predicts.
-
-    score: of that model, where it is known.
+    """The comparison of a prepared recording with what a model predicts; score: of that model, where it is known.
 
     A gain of the microphone is taken out of the residual before that is held against the fan, which passed it as well.
     """
@@ -139,8 +137,8 @@ def describe(prepared: Prepared, model: EchoModel, score: Score | None = None) -
     flat = residual / model.microphone_gain(residual.size)
     white = whiten(flat, psd)
     use = prepared.usable
-    silent = use & ~prepared.active
     power = np.where(use, white.astype(np.float64) ** 2, np.nan)
+    silence = power[use & ~prepared.active]
     return Comparison(
         excess_db=score.excess_db,
         noise_floor_db=float(decibels(total_power(psd))),
@@ -148,15 +146,15 @@ def describe(prepared: Prepared, model: EchoModel, score: Score | None = None) -
         times=tuple(
             (
                 at / SAMPLE_RATE,
-                min(at + TIME_STEP, use.size) / SAMPLE_RATE,
-                float(decibels(np.nanmean(power[at : at + TIME_STEP]))),
+                min(at + BLOCK, use.size) / SAMPLE_RATE,
+                float(decibels(np.nanmean(power[at : at + BLOCK]))),
             )
-            for at in range(0, use.size, TIME_STEP)
-            if use[at : at + TIME_STEP].any()
+            for at in range(0, use.size, BLOCK)
+            if use[at : at + BLOCK].any()
         ),
         levels=_by_level(prediction, whiten(prediction, psd), power),
         lags=_by_lag(white * use, whiten(measurement.reference, psd)),
-        silence_excess_db=float(decibels(np.mean(power[silent]))) if silent.sum() > SAMPLE_RATE // 10 else float("nan"),
+        silence_excess_db=float(decibels(np.mean(silence))) if silence.size > SAMPLE_RATE // 10 else float("nan"),
         human=prepared.human,
         offset_samples=prepared.offset,
         warnings=prepared.warnings,
@@ -183,7 +181,7 @@ def _as_played(reference: Samples, model: EchoModel) -> Samples:
     return reference
 
 
-def _by_band(residual: Samples, psd: Samples, use: NDArray[np.bool_]) -> tuple[tuple[float, float, float], ...]:
+def _by_band(residual: Samples, psd: Samples, use: NDArray[np.bool_]) -> Rows:
     """Mean PSD of the residual in each band over the fan's."""
     size = 2 * (psd.size - 1)
     whole = frames(use, size, size // 2).all(axis=1)
@@ -191,15 +189,13 @@ def _by_band(residual: Samples, psd: Samples, use: NDArray[np.bool_]) -> tuple[t
         return ()
     hz = frequencies(psd.size)
     ratio = np.mean(periodograms(residual, size)[whole], axis=0) / psd
-    found = []
-    for low, high in zip(BAND_EDGES[:-1], BAND_EDGES[1:], strict=True):
-        inside = (hz >= low) & (hz < high)
-        found.append((low, high, float(decibels(np.mean(ratio[inside])))))
-    return tuple(found)
+    return tuple(
+        (low, high, float(decibels(np.mean(ratio[(hz >= low) & (hz < high)])))) for low, high in pairwise(BAND_EDGES)
+    )
 
 
-def _by_level(prediction: Samples, white: Samples, power: Array) -> tuple[tuple[float, float, float], ...]:
-    """Excess by the level of the predicted voice in blocks of 20 ms, those in which it, whitened, is no less than the fan."""
+def _by_level(prediction: Samples, white: Samples, power: Array) -> Rows:
+    """Excess by the level of the predicted voice in blocks of 20 ms in which it, whitened, is no less than the fan."""
     block = SAMPLE_RATE // 50
     level, excess = decibels(block_power(prediction, block)), blocks(power, block).mean(axis=1)
     steps = np.floor(level / LEVEL_STEP_DB)
@@ -208,30 +204,18 @@ def _by_level(prediction: Samples, white: Samples, power: Array) -> tuple[tuple[
     for step in np.unique(steps[audible]):
         inside = (steps == step) & audible
         if inside.sum() >= 5:
-            found.append(
-                (
-                    float(step * LEVEL_STEP_DB),
-                    float((step + 1) * LEVEL_STEP_DB),
-                    float(decibels(np.mean(excess[inside]))),
-                )
-            )
+            low, high = float(step * LEVEL_STEP_DB), float((step + 1) * LEVEL_STEP_DB)
+            found.append((low, high, float(decibels(np.mean(excess[inside])))))
     return tuple(found)
 
 
-def _by_lag(white: Samples, reference: Samples) -> tuple[tuple[float, float, float], ...]:
+def _by_lag(white: Samples, reference: Samples) -> Rows:
     """Share of the squared cross-correlation of residual and reference in each range of lags, both spectra flattened."""
     n = fft.next_fast_len(2 * white.size, real=True)
     a, b = fft.rfft(white, n), fft.rfft(reference, n)
     power = np.abs(b) ** 2
     cross = fft.irfft(a * np.conj(b) / (power + 1e-2 * np.mean(power)), n)
-    edges = [round(ms * SAMPLE_RATE / 1000) for ms in LAG_EDGES_MS]
-    parts = np.array(
-        [
-            np.sum(np.take(cross, np.arange(low, high), mode="wrap") ** 2)
-            for low, high in zip(edges[:-1], edges[1:], strict=True)
-        ]
-    )
+    edges = pairwise(round(ms * SAMPLE_RATE / 1000) for ms in LAG_EDGES_MS)
+    parts = np.array([np.sum(np.take(cross, np.arange(low, high), mode="wrap") ** 2) for low, high in edges])
     shares = parts / max(parts.sum(), 1e-30)
-    return tuple(
-        (low, high, float(share)) for low, high, share in zip(LAG_EDGES_MS[:-1], LAG_EDGES_MS[1:], shares, strict=True)
-    )
+    return tuple((low, high, float(share)) for (low, high), share in zip(pairwise(LAG_EDGES_MS), shares, strict=True))

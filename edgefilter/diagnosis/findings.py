@@ -1,9 +1,8 @@
-"""What a search has found, said of each effect by itself: its part of the excess, its parameters and how well these are known."""
+"""What a search has found, of each effect by itself: its part of the excess, its parameters and how well they are known."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import replace
 
 import numpy as np
 
@@ -23,11 +22,10 @@ third each."""
 
 
 def findings_of(found: Found, progress: Callable[[str], None] | None) -> tuple[tuple[Finding, ...], list[str]]:
-    """The one that is missed most first; each with the excess before and after it in the order of the steps.
+    """The findings, the one that is missed most first, and what is not known of them.
 
-    A change of the fan comes first only where it is more than all the rest.
-
-    And what is not known of them.
+    Each has the excess before and after it in the order of the steps. A change of the fan comes first only where it is
+    more than all the rest.
     """
     findings, doubts, before, scorer = [], [], found.base.excess_db, Scorer(found.prepared)
     for step in found.steps:
@@ -59,54 +57,39 @@ def findings_of(found: Found, progress: Callable[[str], None] | None) -> tuple[t
 
 
 def _intervals(prepared: Prepared, model: EchoModel, step: Trial) -> tuple[Mapping[str, Interval], list[str]]:
-    """Each scalar parameter, or short list, with the interval that three fits to a third of the recording each give.
-
-    And which fits failed.
+    """Each scalar parameter, or short list, with the interval from fits to a third of the recording each; which failed.
 
     Where fewer than two thirds can be fitted, a parameter may have any of its possible values.
     """
-    effect = find(step.name)
     block = np.arange(prepared.usable.size) // BLOCK
     others = model.without_effect(step.name)
-    thirds = [replace(prepared.measurement, fit=prepared.usable & (block % 3 == third)) for third in range(3)]
     fits, failed = [], []
-    for third in thirds:
+    for third in range(3):
         try:
-            fits.append(others.fitted(step.name, third))
+            part = prepared.fitted_to(prepared.usable & (block % 3 == third))
+            fits.append(others.fitted(step.name, part.measurement))
         except (UsageError, ArithmeticError, np.linalg.LinAlgError) as error:
             failed.append(
                 f"how well {step.name} is known is told by fits to a third of the recording each, and one failed:"
                 f" {error}"
             )
     found = {}
-    for parameter in effect.told:
+    for parameter in find(step.name).told:
         value = np.asarray(step.values[parameter.name], float)
         if value.size > 8:
             continue
         if len(fits) < 2:
-            spread = np.full_like(value, parameter.low), np.full_like(value, parameter.high)
+            low, high = np.full_like(value, parameter.low), np.full_like(value, parameter.high)
         else:
-            spread = _spread(value, [np.asarray(fit[parameter.name], float) for fit in fits])
-        found[parameter.name] = _interval(value, *spread, parameter.unit)
+            low, high = _spread(value, [np.asarray(fit[parameter.name], float) for fit in fits])
+        found[parameter.name] = Interval.of(value, low, high, parameter.unit)
     return found, failed
 
 
 def _spread(value: np.ndarray, fits: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Low and high from the scatter of the fits and from how far their mean is off.
-
-    What a third teaches otherwise than the half is known no better.
-    """
+    """Low and high from the scatter of the fits and from how far their mean is off: it is known no better than that."""
     alike = [fit for fit in fits if fit.shape == value.shape]
-    spread = (
-        np.hypot(THIRDS_T * np.std(alike, axis=0, ddof=1), np.mean(alike, axis=0) - value)
-        if len(alike) > 1
-        else np.zeros_like(value)
-    )
+    spread = np.zeros_like(value)
+    if len(alike) > 1:
+        spread = np.hypot(THIRDS_T * np.std(alike, axis=0, ddof=1), np.mean(alike, axis=0) - value)
     return value - spread, value + spread
-
-
-def _interval(value: np.ndarray, low: np.ndarray, high: np.ndarray, unit: str) -> Interval:
-    if value.ndim == 0:
-        return Interval(float(value), float(low), float(high), unit)
-    middle, least, most = (tuple(map(float, part)) for part in (value, low, high))
-    return Interval(middle, least, most, unit)

@@ -12,30 +12,28 @@ import scipy
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
+from edgefilter.diagnosis.criteria import Criteria
 from edgefilter.dsp.convolution import convolve
 from edgefilter.dsp.fourier import log_response
 from edgefilter.dsp.psd import floored
 from edgefilter.types import PRE_ROLL, SAMPLE_RATE, Array, Samples
 
 PER_MS = SAMPLE_RATE // 1000
+CHANCE = Criteria.false_rate
+"""Probability with which independent signals are called dependent: of a whole range of lags, as of one."""
 BOUND = 2.5758
 """Standard errors that 99 of 100 correlations of independent signals keep within."""
-CHANCE = 0.01
-"""Probability with which independent signals are called dependent: of a whole range of lags, as of one."""
-AUTO_MS = 25
-"""Longest lag of the autocorrelation: three periods of a deep voice."""
 CROSS_MS = (-25, 100)
-"""Lags of the cross-correlation behind the direct sound: what comes later is a room, told by the excess by lag."""
-ZONES_MS = ((CROSS_MS[0], -1.0), (-1.0, 3.0), (3.0, CROSS_MS[1]))
-"""Before the direct sound, at it, behind it. An error of less than a sample of its lag reaches 1 ms before it; behind it
-the voice's own colour, which the whitened reference lacks and the residual has, rings for some ms, and hides what comes
-as early."""
-MEANINGS = (
-    "feedback or mis-alignment",
-    "the voice's first arrival, changed",
-    "a path that the model has not got",
+"""Lags of the cross-correlation behind the direct sound: what comes later is a room, told by the excess by lag. The
+autocorrelation goes as far as it does ahead of the sound: three periods of a deep voice."""
+ZONES_MS = (
+    (CROSS_MS[0], -1.0, "feedback or mis-alignment"),
+    (-1.0, 3.0, "the voice's first arrival, changed"),
+    (3.0, CROSS_MS[1], "a path that the model has not got"),
 )
-"""Of a dependence in each."""
+"""Before the direct sound, at it, behind it, and what a dependence means there. An error of less than a sample of its lag
+reaches 1 ms before it; behind it the voice's own colour, which the whitened reference lacks and the residual has, rings
+for some ms, and hides what comes as early."""
 ORDER, RIDGE = 64, 0.03
 """Of the linear prediction that whitens the reference, 4 ms; and what is added to its power to invert what is left."""
 LEAST = SAMPLE_RATE
@@ -46,7 +44,7 @@ SPAN = 6144
 
 @dataclass(frozen=True, eq=False)
 class Correlogram:
-    """Correlation by lag; all (k,): lags_ms, values, what is expected of independent signals, and how far from it 99 of 100 are."""
+    """Correlation by lag, (k,) each: values, what independent signals have, and how far from it 99 of 100 are."""
 
     lags_ms: Array
     values: Array
@@ -72,10 +70,7 @@ class Correlogram:
 
     def to_dict(self) -> dict[str, object]:
         """Ready for JSON."""
-        arrays = {
-            name: np.round(getattr(self, name), 5).tolist() for name in ("lags_ms", "values", "expected", "bounds")
-        }
-        return {**arrays, **self.summary()}
+        return {**{name: np.round(array, 5).tolist() for name, array in vars(self).items()}, **self.summary()}
 
     def summary(self) -> dict[str, object]:
         """The figures that are said in words."""
@@ -90,7 +85,7 @@ class Correlogram:
 
 @dataclass(frozen=True, eq=False)
 class Zone:
-    """A range of lags of the cross-correlation; share: part of what is left that it explains, as a filter of the reference."""
+    """A range of lags of the cross-correlation; share: part of what is left that a filter of the reference explains."""
 
     low_ms: float
     high_ms: float
@@ -138,10 +133,9 @@ def independence(
     -----
     The residual goes through the causal filter that makes the calibrated fan white, the reference through its own
     linear prediction, and the cross-correlation is divided by what correlation the reference has left over the lags
-    shown: what comes before the direct sound is not smeared over by the vowels' pitch. Of two independent
-    series of which one is white, a correlation has the variance 1/N (Bartlett 1955; Box & Jenkins 1976, 11.1.3). Speech
-    is not stationary, so the products of the squares stand in its place (White 1980). The fan is not quite that of the
-    calibration: the residual's autocorrelation is held against that of the robot's silences, whose variance adds.
+    shown: pitch does not smear it. Of two independent series of which one is white, a correlation has the variance 1/N
+    (Bartlett 1955; Box & Jenkins 1976, 11.1.3). Speech is not stationary, so the products of the squares stand in its
+    place (White 1980). The residual's autocorrelation is held against that of the robot's silences, whose variance adds.
     """
     if np.count_nonzero(heard) < LEAST:
         return None
@@ -153,15 +147,15 @@ def independence(
     auto = _autocorrelation(spoken, quiet if np.count_nonzero(silent) >= LEAST and quiet.any() else None)
     cross, share = _cross_correlation(spoken, reference)
     zones = []
-    for (low, high), meaning in zip(ZONES_MS, MEANINGS, strict=True):
+    for low, high, meaning in ZONES_MS:
         inside = (cross.lags_ms >= low) & (cross.lags_ms < high)
-        part = Correlogram(*(getattr(cross, name)[inside] for name in ("lags_ms", "values", "expected", "bounds")))
+        part = Correlogram(*(array[inside] for array in vars(cross).values()))
         zones.append(Zone(float(low), float(high), meaning, float(np.clip(share[inside].sum(), 0.0, 1.0)), part))
-    return Independence(auto, cross, tuple(zones), float(np.count_nonzero(heard)) / SAMPLE_RATE)
+    return Independence(auto, cross, tuple(zones), np.count_nonzero(heard) / SAMPLE_RATE)
 
 
 def whitener(psd: Samples) -> Samples:
-    """The causal filter of least phase that makes noise of that PSD (bins,) white with variance 1, by its cepstrum, (1200,)."""
+    """The causal filter of least phase that makes noise of that PSD (bins,) white with variance 1, (1200,)."""
     n = 4096
     bins = np.linspace(0, psd.size - 1, n // 2 + 1)
     level = np.interp(bins, np.arange(psd.size), np.log(floored(psd) * SAMPLE_RATE / 2))
@@ -182,7 +176,7 @@ def lagged_sums(a: Samples, b: Samples, low: int, high: int) -> Array:
 
 
 def _autocorrelation(spoken: Samples, quiet: Samples | None) -> Correlogram:
-    lags = AUTO_MS * PER_MS
+    lags = -CROSS_MS[0] * PER_MS
     values, variance = _own(spoken, lags)
     expected, more = _own(quiet, lags) if quiet is not None else (np.zeros(lags), np.zeros(lags))
     return Correlogram(np.arange(1, lags + 1) / PER_MS, values, expected, BOUND * np.sqrt(variance + more))
@@ -196,7 +190,7 @@ def _own(x: Samples, lags: int) -> tuple[Array, Array]:
 
 
 def _cross_correlation(spoken: Samples, reference: Samples) -> tuple[Correlogram, Array]:
-    """Cross-correlation with the reference, whitened, and at each lag the part of the residual's power that it explains."""
+    """Cross-correlation with the whitened reference, and by lag the part of the residual's power that it explains."""
     low, high = (ms * PER_MS + PRE_ROLL for ms in CROSS_MS)
     said = _predicted_away(reference)
     energy = float(np.sum(said * said, dtype=np.float64))
@@ -218,7 +212,7 @@ def _positive(sums: Array) -> Array:
 
 
 def _predicted_away(reference: Samples) -> Samples:
-    """The reference (n,) less what its own last samples say of it: the input of its linear prediction, of mean square 1."""
+    """The reference (n,) less what its last samples say of it: the input of its linear prediction, of mean square 1."""
     own = lagged_sums(reference, reference, 0, ORDER + 1)
     own[0] = own[0] * (1.0 + 1e-6) + 1e-20
     taps = scipy.linalg.solve_toeplitz(own[:-1], own[1:])

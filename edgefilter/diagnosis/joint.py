@@ -13,20 +13,17 @@ from edgefilter.echo.effects.catalogue import find, names
 from edgefilter.echo.measurement import Measurement
 from edgefilter.echo.model import EchoModel
 
-ROUNDS = 3
-"""A bound on the work; two rounds settle what a long filter and a loudspeaker's distortion have in common."""
 WORTH = 0.02
-"""Part of the squared error (0.1 dB) by which a round has to lower it to be followed by another."""
+"""Part of the squared error (0.1 dB) by which a round has to lower it to be followed by another: less is not heard."""
 
 
 def fit_jointly(measurement: Measurement, model: EchoModel, wanted: Sequence[str]) -> EchoModel:
-    """The model with the effects of those names, each fitted with the others in place, in turn, until the error no longer falls.
+    """The model with those effects, each fitted with the others in place, in turn, until the error no longer falls.
 
-    measurement: whatever its reference is not straightened for has to be in the model already, or wanted: a long filter
-    fitted to a recording whose clocks differ fits nothing.
+    A drift or a jump of the measurement has to be in the model already, or wanted: else a long filter fits nothing.
     """
     best, least = model, float("inf")
-    for _ in range(ROUNDS if len(wanted) > 1 else 1):
+    for _ in range(Criteria.rounds if len(wanted) > 1 else 1):
         for name in wanted:
             model = model.fit(name, measurement)
         error = measurement.error(measurement.heard(model)[0])
@@ -39,18 +36,17 @@ def fit_jointly(measurement: Measurement, model: EchoModel, wanted: Sequence[str
 
 
 def fit_straight(prepared: Prepared, wanted: Sequence[str]) -> tuple[EchoModel, tuple[str, ...]]:
-    """The prepared recording's model with those effects, fitted jointly, and with what the running filter follows by itself.
+    """The prepared recording's model with those effects, fitted jointly, and with what the running filter follows.
 
-    The names of the latter are the second answer: a drift or a turned volume of this recording, which would spoil the
-    fit of the others and is none of theirs. Looked for twice, since beside the wrong room it may be hidden.
+    The names of the latter are the second answer: a drift or a turned volume of this recording would spoil the fit of the
+    others. Looked for twice, since beside the wrong room it may be hidden.
     """
     bench, followed = Workbench(prepared, Criteria()), _followed(wanted)
-    model = _straightened(bench, _without(prepared.model, followed), followed)
+    model = _straightened(bench, prepared.model, followed)
     fitted, order = _forward(bench, model, wanted)
-    model = _straightened(bench, _without(fitted, followed), followed)
+    model = _straightened(bench, fitted, followed)
     found = tuple(name for name in followed if name in dict(model.effects))
-    everywhere = replace(prepared.measurement, fit=prepared.usable)
-    return fit_jointly(everywhere, model, [*found, *order]), found
+    return fit_jointly(prepared.fitted_to(prepared.usable).measurement, model, [*found, *order]), found
 
 
 def _forward(bench: Workbench, model: EchoModel, wanted: Sequence[str]) -> tuple[EchoModel, list[str]]:
@@ -70,10 +66,10 @@ def _forward(bench: Workbench, model: EchoModel, wanted: Sequence[str]) -> tuple
 
 
 def _followed(wanted: Sequence[str]) -> list[str]:
-    """Names of the effects that the running filter follows, less those that are wanted, those that a wanted one holds, and noise.
+    """Names of the effects that the running filter follows, less noise, the wanted ones and what a wanted one holds.
 
-    A flexible effect on the path has the volume in it: beside it a gain is anything. A lag by time of the user's own has the
-    clocks in it. Noise moves no fit.
+    A flexible effect on the path has the volume in it: beside it a gain is anything. A lag by time of the user's own has
+    the clocks in it. Noise moves no fit.
     """
     wished = [find(name) for name in wanted]
     left = {
@@ -84,13 +80,9 @@ def _followed(wanted: Sequence[str]) -> list[str]:
     return [name for name in names() if find(name).followed and name not in wanted and find(name).family not in left]
 
 
-def _without(model: EchoModel, dropped: Sequence[str]) -> EchoModel:
-    return replace(model, effects=tuple(entry for entry in model.effects if entry[0] not in dropped))
-
-
-def _straightened(bench: Workbench, start: EchoModel, followed: Sequence[str]) -> EchoModel:
-    """The model with those of the followed effects that held-out samples show: forward, each refitted, backward."""
-    model = start
+def _straightened(bench: Workbench, model: EchoModel, followed: Sequence[str]) -> EchoModel:
+    """The model with only those of the followed effects that held-out samples show: forward, refitted, backward."""
+    start = model = replace(model, effects=tuple(entry for entry in model.effects if entry[0] not in followed))
     while True:
         absent = [name for name in followed if name not in dict(model.effects)]
         trials = [trial for name in absent if (trial := bench.attempt(name, model)) is not None]

@@ -1,4 +1,4 @@
-"""What is left of a recording when the robot's voice is taken out: the fan, tones, somebody talking, or something unknown, in words."""
+"""What is left of a recording without the robot's voice: the fan, tones, talk, or something unknown, in words."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.ndimage import median_filter
 
+from edgefilter.diagnosis.channels import SECOND
 from edgefilter.diagnosis.prepare import Prepared
 from edgefilter.diagnosis.score import Scorer
 from edgefilter.diagnosis.trials import Found
@@ -15,7 +16,6 @@ from edgefilter.dsp.psd import frequencies, periodograms
 from edgefilter.echo.measurement import whiten
 from edgefilter.types import SAMPLE_RATE, Array, Samples
 
-LINE_FFT = 16384
 LINE_OVER_FLOOR = 10.0
 """Times the median of its surroundings that a bin of a long spectrum must reach to be a tone (noise alone reaches 3 in
 1000 means of 30)."""
@@ -24,12 +24,12 @@ BLOCK = SAMPLE_RATE // 10
 
 @dataclass(frozen=True, eq=False)
 class Leftover:
-    """Tones that are left. tones_hz: (k,) of the strongest, loudest first.
+    """Tones that are left, and the robot's silences.
 
-    mains_hz: 50 or 60 where most of their power lies on its multiples, else 0. tone_share: of the residual's power over
-    the fan, in tones. quiet_db: excess while the robot is silent, its median over blocks of 0.1 s; swing_db: by how
-    much those blocks differ (90 % to 10 % quantile) beyond what noise does. level_slope: by how many dB the excess
-    grows per dB of the robot's level.
+    tones_hz: (k,) of the strongest, loudest first. mains_hz: 50 or 60 where most of their power lies on its multiples,
+    else 0. tone_share: of the residual's power over the fan, in tones. quiet_db: excess while the robot is silent, its
+    median over blocks of 0.1 s, and quiet_mean_db its mean, nan where it never is; swing_db: by how much those blocks
+    differ (90 % to 10 % quantile).
     """
 
     tones_hz: Array
@@ -43,41 +43,37 @@ class Leftover:
 def inspect(prepared: Prepared, residual: Samples) -> Leftover:
     """Look at what a model leaves of a prepared recording, residual (n,)."""
     psd = prepared.noise_psd
-    tones, mains, share = _tones(residual, psd)
-    quiet = prepared.usable & ~prepared.active
-    white = whiten(residual, psd)
-    power = block_power(white, BLOCK)[blocks(quiet, BLOCK).all(axis=1)]
+    tones = _tones(residual, psd)
+    quiet = blocks(prepared.usable & ~prepared.active, BLOCK).all(axis=1)
+    power = block_power(whiten(residual, psd), BLOCK)[quiet]
     if power.size < 5:
-        return Leftover(tones, mains, share, float("nan"), float("nan"), 0.0)
+        return Leftover(*tones, float("nan"), float("nan"), 0.0)
     low, middle, high = decibels(np.quantile(power, (0.1, 0.5, 0.9)))
-    return Leftover(tones, mains, share, float(middle), float(decibels(power.mean())), float(high - low))
+    return Leftover(*tones, float(middle), float(decibels(power.mean())), float(high - low))
 
 
 def _tones(residual: Samples, psd: Samples) -> tuple[Array, float, float]:
-    """Frequencies of tones, loudest first, the mains frequency they belong to (0: none), and their share of the power over the fan."""
-    if residual.size < 2 * LINE_FFT:
+    """Tones in Hz, loudest first, the mains frequency they belong to (0: none), their share of the power over the fan."""
+    if residual.size < 2 * SECOND:
         return np.zeros(0), 0.0, 0.0
-    power = np.median(periodograms(residual, LINE_FFT), axis=0)
+    power = np.median(periodograms(residual, SECOND), axis=0)
     hz = frequencies(power.size)
     floor = median_filter(power, 81, mode="nearest")
     expected = np.interp(hz, frequencies(psd.size), psd) * np.log(2)
-    peak = (
-        (power > LINE_OVER_FLOOR * floor)
-        & (power > LINE_OVER_FLOOR * expected)
-        & (power >= np.maximum(np.roll(power, 1), np.roll(power, -1)))
-    )
+    peak = power > LINE_OVER_FLOOR * np.maximum(floor, expected)
+    peak &= power >= np.maximum(np.roll(power, 1), np.roll(power, -1))
     peak[:20] = False
     at = np.flatnonzero(peak)
     at = at[np.argsort(-power[at])][:40]
     if not at.size:
         return np.zeros(0), 0.0, 0.0
-    over = float(np.maximum(power - expected, 0.0).sum())
+    over = np.maximum(power - expected, 0.0)
     near = np.unique(np.clip(at[:, None] + np.arange(-2, 3), 0, power.size - 1))
-    share = float(np.maximum(power - expected, 0.0)[near].sum()) / max(over, 1e-30)
+    share = float(over[near].sum()) / max(float(over.sum()), 1e-30)
     mains = 0.0
     for grid in (50.0, 60.0):
-        off = np.abs(hz[at] / grid - np.round(hz[at] / grid)) * grid
-        if power[at][off < 0.8].sum() > 0.8 * power[at].sum() and (off < 0.8).sum() >= 2:
+        on_grid = np.abs(hz[at] / grid - np.round(hz[at] / grid)) * grid < 0.8
+        if power[at][on_grid].sum() > 0.8 * power[at].sum() and on_grid.sum() >= 2:
             mains = grid
     return hz[at], mains, share
 
@@ -93,16 +89,14 @@ def left_in_words(found: Found, left: Leftover, remaining_db: float, floor_db: f
         words.append(f"tones at multiples of {left.mains_hz:.0f} Hz, also while the robot is silent")
     elif left.tone_share > 0.5:
         words.append("tones at " + ", ".join(f"{hz:.0f}" for hz in left.tones_hz[:4]) + " Hz")
-    final = found.final
-    active = final.active_db - max(left.quiet_mean_db if np.isfinite(left.quiet_mean_db) else 0.0, 0.0)
-    if np.isfinite(left.quiet_db) and left.quiet_mean_db > 1.0 and not words:
-        words.append(
-            "sound of its own while the robot is silent" + (", coming and going" if left.swing_db > 6.0 else "")
-        )
-    if active > 1.0:
-        weights = 10 * np.log10(np.maximum(final.cells, 1e-3)).mean(axis=0)
+    quiet_db = left.quiet_mean_db if np.isfinite(left.quiet_mean_db) else 0.0
+    if quiet_db > 1.0 and not words:
+        swings = ", coming and going" if left.swing_db > 6.0 else ""
+        words.append(f"sound of its own while the robot is silent{swings}")
+    if found.final.active_db - max(quiet_db, 0.0) > 1.0:
+        weights = 10 * np.log10(np.maximum(found.final.cells, 1e-3)).mean(axis=0)
         low, high = Scorer(found.prepared).band_hz[int(np.argmax(weights))]
         words.append(f"a residual that follows the robot's voice, strongest around {low:.0f} to {high:.0f} Hz")
-    if not words:
-        words.append("a residual spread over the whole recording")
-    return "what no effect of the catalogue explains: " + "; ".join(words)
+    return "what no effect of the catalogue explains: " + "; ".join(
+        words or ["a residual spread over the whole recording"]
+    )

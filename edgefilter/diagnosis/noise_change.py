@@ -1,4 +1,4 @@
-"""Whether the fan itself is another than at the calibration, or held down: before the search, and once the robot's voice is taken out."""
+"""Whether the fan is another than at the calibration, or held down: before the search, and without the robot's voice."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from edgefilter.diagnosis.leftover import Leftover, inspect
 from edgefilter.diagnosis.prepare import Prepared
 from edgefilter.diagnosis.score import Scorer
 from edgefilter.diagnosis.trials import Found, Trial, beside
+from edgefilter.dsp.frames import blocks
 from edgefilter.echo.effects.catalogue import find, names
 from edgefilter.echo.evidence import Score
 from edgefilter.echo.measurement import Measurement, Values
@@ -24,101 +25,86 @@ BAND = 20
 def changed_fan(
     prepared: Prepared, model: EchoModel, base: Score, criteria: Criteria, without: Collection[str] = ()
 ) -> tuple[Prepared, Trial] | None:
-    """The recording prepared with the fan as the robot's silences have it, and what changed it as a step.
+    """The recording prepared with the fan as the robot's silences have it, and what changed it as a step; else None.
 
-    None where it is the calibrated one.
-
-    Only where there are silences and the change has a colour of its own: before the voice is explained, a gain cannot
-    be told from it. Where the fan is held down only while the robot is silent, the calibrated one stays; not so by an effect named in without.
+    Only where there are silences and the change has a colour of its own: before the voice is explained, a gain cannot be
+    told from it. Where the fan is held down only while the robot is silent, the calibrated one stays; not so by an effect
+    named in without.
     """
-    held_down = next(_held_down(prepared, model, criteria, without), None)
+    held_down = _held_down(prepared, model, criteria, without)
     if held_down is not None:
         return prepared, held_down
     residual = (prepared.measurement.recording - base.prediction) / model.microphone_gain(base.prediction.size)
     left = inspect(prepared, residual)
     if not np.isfinite(left.quiet_mean_db) or left.mains_hz:
         return None
-    for name in _of_the_fan(model):
-        now, values = _with_fan(prepared, name, prepared.measurement, model)
-        change = _change_db(prepared, now)
-        most = max(change, left.quiet_mean_db)
-        if most < criteria.fan_change_db or (
-            _colour_db(prepared, now) < criteria.fan_coloured_db and most < criteria.fan_flat_db
-        ):
+    for name, values, now in _other_fans(prepared, prepared.measurement, model):
+        most = max(_change_db(prepared, now), left.quiet_mean_db)
+        may_be_gain = _colour_db(prepared, now) < criteria.fan_coloured_db and most < criteria.fan_flat_db
+        if most < criteria.fan_change_db or may_be_gain or not _steady(inspect(now, residual), criteria):
             continue
-        if not _steady(inspect(now, residual), criteria):
-            continue
-        scorer = Scorer(now)
-        after = scorer.of(model)
-        step = Trial(name, values, model.with_effect(name, values), after, scorer.fan_gain_db(base, after))
-        if abs(after.silent_db) < 0.5 * abs(base.silent_db) and step.p_value <= criteria.false_rate:
+        step = _step(now, name, values, model, base)
+        if abs(step.score.silent_db) < 0.5 * abs(base.silent_db) and step.p_value <= criteria.false_rate:
             return now, step
     return None
 
 
 def look_at_fan(found: Found, criteria: Criteria, without: Collection[str] = ()) -> tuple[Found, Leftover]:
-    """The search's outcome with the final residual held against the fan as it is now, and with what changed the fan where it is another.
+    """The search's outcome with the final residual held against the fan as it is now, and with what changed the fan.
 
-    A microphone gain in the model is taken out of the residual first: the fan passed through it. without: names of effects
-    that are not to be looked for beside the voice.
+    A microphone gain in the model is taken out of the residual first: the fan passed through it. without: names of
+    effects that are not to be looked for beside the voice.
     """
     found = _scored_anew(found, criteria, without)
-    prepared = found.prepared
-    measurement, model = prepared.measurement, found.model
-    gain = model.microphone_gain(measurement.recording.size)
-    residual = (measurement.recording - found.final.prediction) / gain
+    prepared, model = found.prepared, found.model
+    heard_as = prepared.measurement.recording
+    gain = model.microphone_gain(heard_as.size)
+    residual = (heard_as - found.final.prediction) / gain
     left = inspect(prepared, residual)
-    if any(find(name).is_of_the_fan for name, _ in model.effects):
+    if any(find(name).is_of_the_fan for name, _ in model.effects) or left.mains_hz:
         return found, left
     heard = bool(np.isfinite(left.quiet_mean_db))
-    for name in _of_the_fan(model):
-        now, values = _with_fan(prepared, name, replace(measurement, recording=measurement.recording / gain), model)
+    if heard and abs(left.quiet_mean_db) <= 0.5 * criteria.fan_change_db:
+        return found, left
+    for name, values, now in _other_fans(prepared, replace(prepared.measurement, recording=heard_as / gain), model):
         change = _change_db(prepared, now)
-        change = max(change, left.quiet_mean_db) if heard else change
-        if (
-            abs(change) < criteria.fan_change_db
-            or left.mains_hz
-            or (heard and abs(left.quiet_mean_db) <= 0.5 * criteria.fan_change_db)
-        ):
+        if abs(max(change, left.quiet_mean_db) if heard else change) < criteria.fan_change_db:
             continue
-        scorer = Scorer(now)
-        after = scorer.of(model)
         behind = inspect(now, residual)
-        if not _steady(behind, criteria) or (
-            (after.silent_db > 0.5 * found.final.silent_db) if heard else (after.excess_db > criteria.fan_change_db)
-        ):
+        if not _steady(behind, criteria):
             continue
-        changed = model.with_effect(name, values)
-        step = Trial(name, values, changed, after, scorer.fan_gain_db(found.final, after))
-        if step.p_value > criteria.false_rate:
+        step = _step(now, name, values, model, found.final)
+        after = step.score
+        if (after.silent_db > 0.5 * found.final.silent_db) if heard else (after.excess_db > criteria.fan_change_db):
             continue
-        return replace(found, prepared=now, model=changed, final=after, steps=(*found.steps, step)), behind
+        if step.p_value <= criteria.false_rate:
+            changed = replace(found, prepared=now, model=step.model, final=after, steps=(*found.steps, step))
+            return changed, behind
     return found, left
-
-
-def _held_down(prepared: Prepared, model: EchoModel, criteria: Criteria, without: Collection[str]) -> Iterator[Trial]:
-    """The effects that show in the robot's silences as well and that a model lacks, each as a step from it."""
-    scorer = Scorer(prepared)
-    for name in sorted(name for name in names() if find(name).shows_in_silence and name not in without):
-        if step := beside(scorer, name, model, criteria):
-            yield step
-
-
-def _scored_anew(found: Found, criteria: Criteria, without: Collection[str]) -> Found:
-    """The search's outcome with what shows in the silences fitted and scored beside all that was found, and only so kept."""
-    kept = tuple(step for step in found.steps if not find(step.name).shows_in_silence)
-    model = found.model
-    for name in {step.name for step in found.steps} - {step.name for step in kept}:
-        model = model.without_effect(name)
-    held_down = next(_held_down(found.prepared, model, criteria, without), None)
-    if held_down is None and kept == found.steps:
-        return found
-    return _in_steps(found, (*(() if held_down is None else (held_down,)), *kept))
 
 
 def without_doubtful(found: Found) -> Found:
     """The outcome of a search that explains too little, with nothing but what silences and voice both show."""
     return _in_steps(found, tuple(step for step in found.steps if find(step.name).shows_in_silence))
+
+
+def _held_down(prepared: Prepared, model: EchoModel, criteria: Criteria, without: Collection[str]) -> Trial | None:
+    """The first effect that shows in the robot's silences as well and that a model lacks, as a step from it."""
+    scorer = Scorer(prepared)
+    sought = sorted(name for name in names() if find(name).shows_in_silence and name not in without)
+    return next((step for name in sought if (step := beside(scorer, name, model, criteria))), None)
+
+
+def _scored_anew(found: Found, criteria: Criteria, without: Collection[str]) -> Found:
+    """The search's outcome with what shows in the silences fitted and scored beside all that was found."""
+    kept = tuple(step for step in found.steps if not find(step.name).shows_in_silence)
+    model = found.model
+    for name in {step.name for step in found.steps} - {step.name for step in kept}:
+        model = model.without_effect(name)
+    held_down = _held_down(found.prepared, model, criteria, without)
+    if held_down is None and kept == found.steps:
+        return found
+    return _in_steps(found, kept if held_down is None else (held_down, *kept))
 
 
 def _in_steps(found: Found, steps: Iterable[Trial]) -> Found:
@@ -132,23 +118,26 @@ def _in_steps(found: Found, steps: Iterable[Trial]) -> Found:
     return replace(found, model=model, final=score, steps=tuple(scored))
 
 
-def _of_the_fan(model: EchoModel) -> list[str]:
-    """Names of the effects on the noise that a model has not."""
-    return [name for name in names() if find(name).stage == "noise" and name not in dict(model.effects)]
+def _other_fans(
+    prepared: Prepared, measurement: Measurement, model: EchoModel
+) -> Iterator[tuple[str, Values, Prepared]]:
+    """Each effect on the noise that a model has not, fitted to a measurement, and the recording with that fan."""
+    for name in names():
+        if find(name).stage == "noise" and name not in dict(model.effects):
+            values = model.fitted(name, measurement)
+            yield name, values, prepared.behind(find(name).noise_psd(values, prepared.noise_psd))
+
+
+def _step(now: Prepared, name: str, values: Values, model: EchoModel, before: Score) -> Trial:
+    """An effect on the noise as a step from a model, scored with the fan as that has it."""
+    scorer = Scorer(now)
+    after = scorer.of(model)
+    return Trial(name, values, model.with_effect(name, values), after, scorer.fan_gain_db(before, after))
 
 
 def _steady(left: Leftover, criteria: Criteria) -> bool:
-    """Whether what is left of the silences, whitened by the new fan's spectrum, is a fan.
-
-    True where there are no silences.
-    """
+    """Whether what is left of the silences, whitened by the new fan's spectrum, is a fan; True where there are none."""
     return left.swing_db < criteria.fan_steady_db and not left.quiet_mean_db - left.quiet_db > criteria.fan_sparse_db
-
-
-def _with_fan(prepared: Prepared, name: str, measurement: Measurement, model: EchoModel) -> tuple[Prepared, Values]:
-    """The recording with the fan's PSD as that effect, fitted to the measurement, has it; and the values of the fit."""
-    values = model.fitted(name, measurement)
-    return prepared.behind(find(name).noise_psd(values, prepared.noise_psd)), values
 
 
 def _change_db(before: Prepared, after: Prepared) -> float:
@@ -160,6 +149,4 @@ def _change_db(before: Prepared, after: Prepared) -> float:
 def _colour_db(before: Prepared, after: Prepared) -> float:
     """Standard deviation over frequency of the fan's change, dB."""
     was, now = (prepared.noise_psd.astype(np.float64) for prepared in (before, after))
-    spectrum = 10.0 * np.log10(now / was)
-    count = spectrum.size // BAND
-    return float(np.std(spectrum[: count * BAND].reshape(count, BAND).mean(axis=1)))
+    return float(np.std(blocks(10.0 * np.log10(now / was), BAND).mean(axis=1)))

@@ -1,8 +1,8 @@
 """By chance: in how many ordinary recordings, of which nothing is missing, some effect explains as much.
 
 No robot is exactly as it was calibrated: its path has moved a little, its fan is yesterday's, its loudspeaker distorts
-faintly. So an effect is not held against nothing at all, but against what it explains in recordings with such tolerances
-and nothing else, which `python -m bench diagnosis ordinary --learn` has measured (ordinary.json).
+faintly. So an effect is held against what it explains in recordings with such tolerances and nothing else, which
+`python -m bench diagnosis ordinary --learn` has measured (ordinary.json).
 """
 
 from __future__ import annotations
@@ -18,14 +18,13 @@ from typing import NamedTuple
 from scipy.special import ndtr
 
 LEAST_DB = -80.0
-"""What an effect explains is told down to so much: a likelihood of some thousand cells is not known better."""
+"""Down to so much it is told what an effect explains: a likelihood of some thousand cells is not known better."""
 
 
 class Chance(NamedTuple):
-    """What an effect explains in ordinary recordings.
+    """What an effect explains in ordinary recordings; share: of these, the ones in which its fit helps at all.
 
-    share: of the recordings, those in which its fit helps at all; the upper quarter of explained_db() there is that of a normal
-    distribution with this mean and standard deviation in dB.
+    The upper quarter of explained_db() there is that of a normal distribution with this mean and standard deviation, dB.
     """
 
     share: float
@@ -38,22 +37,22 @@ class Chance(NamedTuple):
 
 
 def explained_db(gain_db: float) -> float:
-    """Power that a fall of the held-out level by gain_db takes away, over what is left, dB; LEAST_DB where it does not fall."""
+    """Power that a fall of the held-out level by gain_db takes away, over what is left, dB; LEAST_DB where none does."""
     return 10.0 * log10(max(10.0 ** (gain_db / 10.0) - 1.0, 10.0 ** (LEAST_DB / 10.0)))
 
 
 @dataclass(frozen=True)
 class Ordinary:
-    """What ordinary recordings show by chance, by effect; independent: which part of the effects' number counts as independent."""
+    """What ordinary recordings show by chance, by effect; independent: the part of their number that counts as such."""
 
     effects: Mapping[str, Chance]
     independent: float = 1.0
 
     def p_value(self, name: str, gain_db: float) -> float:
-        """In which share of ordinary recordings any effect at all is as surprising as that one that lowers the level by gain_db.
+        """Share of ordinary recordings in which any effect is as surprising as that one, which lowers the level by gain_db.
 
-        Of independent effects (Sidak 1967), each of whose p-values is uniform up to the share of recordings in which its fit
-        helps at all; as they are not independent, they count as fewer. An effect that is not among them, one of the
+        Of independent effects (Sidak 1967), each of whose p-values is uniform up to the share of recordings in which its
+        fit helps at all; as they are not independent, they count as fewer. An effect that is not among them, one of the
         user's own, is held against the one that explains most by chance.
         """
         chances, explained = self.effects, explained_db(gain_db)

@@ -1,4 +1,4 @@
-"""What one recording of an unknown device tells: how its robot reaches the microphone, and what to expect of the filter."""
+"""What one recording of an unknown device tells: how its robot reaches the microphone, what to expect of the filter."""
 
 from __future__ import annotations
 
@@ -10,10 +10,13 @@ import numpy as np
 from scipy import fft
 
 from edgefilter.alignment.coarse_lag import CoarseLag
-from edgefilter.calibration.from_recording import fan_in_silences, find_drift, find_lag, silences
+from edgefilter.calibration.from_recording import STANDS_OUT, fan_in_silences, find_drift, find_lag, silences
+from edgefilter.calibration.multisine import PERIOD
+from edgefilter.diagnosis.compare import rounded
+from edgefilter.diagnosis.prepare import FRAME, HOP
 from edgefilter.dsp.fourier import power
 from edgefilter.dsp.fractional_delay import delayed, interpolate
-from edgefilter.dsp.frames import all_block_power, block_power, decibels, frames
+from edgefilter.dsp.frames import block_power, blocks, decibels, frames
 from edgefilter.dsp.lag import correlation_near, flat_cross, highest
 from edgefilter.dsp.metrics import si_sdr
 from edgefilter.dsp.psd import frequencies, hann, third_octave_bands, total_power
@@ -29,24 +32,20 @@ LEAST_S, MOST_S = 10.0, 60.0
 SETTLED_S = 5.0
 """The filter has this long with the robot alone before it is measured, and before the human speaks."""
 PAUSE_S = 2.0
-"""Between two turns of the human."""
+"""Between two turns of the human; a turn that is cut shorter by the recording's end does not count."""
 WINDOW_S, STRETCH = 2.0, 1024
 """Windows in which the lag is looked for, that many samples around what the whole says."""
-SHARP = 8.0
-"""Times the root mean square of the window's correlation from which on an arrival is sharp, as of `find_lag`."""
-SIZE = 8192
-"""Samples of the frames whose coherence counts: half a second holds most of a room's response."""
 GATED = 1e-9
 """Mean square, -90 dBFS, which no microphone with a converter of 16 bit stays under in 20 ms, unless it was shut."""
 GATED_SHARE = 0.02
 """Share of such moments from which on the microphone is taken for gated: 0.20 on the one device of six (AEC challenge)
 that is, 0 on the others."""
 FULL, CLIPPED_SHARE = 0.999, 1e-4
-"""Of full scale: what reaches it may be cut off; and the share of samples from which on it was. One or two are a file that
-was made as loud as it can be, as two of the same six."""
+"""Of full scale: what reaches it may be cut off; and the share of samples from which on it was. One or two are a file
+that was made as loud as it can be, as two of the same six."""
 FOLLOWS = 0.5
-"""Correlation of band levels from which on the microphone holds the robot, however changed: 0.36 where noise covers it, 0.57
-where it is gated, 0.65 and more elsewhere, on the same six."""
+"""Correlation of band levels from which on the microphone holds the robot, however changed: 0.36 where noise covers it,
+0.57 where it is gated, 0.65 and more elsewhere, on the same six."""
 
 Cause = Literal["nothing", "noise", "gate", "clipping", "other", "change"]
 """What bounds a linear filter: nothing up to ENOUGH_DB, the noise, a microphone that shuts, one that is overdriven, a sound
@@ -57,7 +56,7 @@ ENOUGH_DB = 15.0
 
 @dataclass(frozen=True)
 class Band:
-    """An octave (Hz): how much linear filtering can remove, robot over noise, how well the levels follow the reference's.
+    """An octave (Hz): what linear filtering can remove, robot over noise, how well the levels follow the reference's.
 
     removable_db: from the magnitude-squared coherence, 10 lg 1 / (1 - C). removed_db: what each engine takes off the robot.
     """
@@ -73,7 +72,7 @@ class Band:
 
 @dataclass(frozen=True)
 class Expected:
-    """What an engine does: robot alone lowered, false starts of speech, SI-SDR of a human laid on, without and with it."""
+    """What an engine does: robot lowered, false starts of speech, SI-SDR of a human laid on, without and with it."""
 
     removed_db: float
     false_starts: int | None
@@ -83,13 +82,13 @@ class Expected:
 
 @dataclass(frozen=True)
 class Passport:
-    """All that one recording tells; levels in dB of full scale. found: whether the reference is in it; if not, the rest is empty.
+    """All that one recording tells; levels in dB of full scale. Where the reference is not found, the rest is empty.
 
-    lag_ms, lag_spread_ms: median of the windows with a sharp arrival and the span of their middle eight tenths; sharp: the
-    share of windows that have one; without any the lag is coarse, to a hop of 16 ms. drift_ppm: parts of a million by
+    lag_ms, lag_spread_ms: median of the windows with a sharp arrival, and the span of their middle eight tenths; sharp:
+    the share of windows that have one; without any the lag is coarse, to a hop of 16 ms. drift_ppm: parts of a million by
     which the reference's clock is faster (the lag shrinks), None where no arrival is sharp. change_db: what is neither
-    linear in the reference nor noise, against what is linear. pauses: whether the robot is silent for long enough to know the
-    noise; if not, the quietest moments stand for it, and it is at most that. gated, clipped: shares of time and of samples.
+    linear in the reference nor noise, against what is linear. pauses: whether the robot is silent for long enough to know
+    the noise; if not, it is at most that of the quietest moments. gated, clipped: shares of time and of samples.
     """
 
     seconds: float
@@ -117,7 +116,7 @@ class Passport:
 
     def to_dict(self) -> dict[str, Any]:
         """Ready for JSON, schema 1."""
-        return {"schema": 1, **_rounded(asdict(self))}
+        return {"schema": 1, **rounded(asdict(self))}
 
 
 def measure(
@@ -130,24 +129,16 @@ def measure(
 ) -> Passport:
     """The passport of a device from its robot alone.
 
-    Parameters
-    ----------
-    mic, ref : ndarray of float, shape (n,), (m,)
-        What the microphone heard and what the robot said, 16 kHz, full scale +-1; the first MOST_S are taken.
-    voice : ndarray of float, shape (v,)
-        A human without pauses at the ends, laid on at human_db of the microphone's power in the same seconds.
-    engines : sequence of str
-        Which are tried, without a profile and without learning.
-
-    Raises
-    ------
-    SignalError
-        Where there are fewer than LEAST_S, or the reference or the microphone is silent.
+    mic, ref: (n,), (m,), what the microphone heard and what the robot said, 16 kHz, full scale +-1; the first MOST_S are
+    taken. voice: (v,), a human without pauses at the ends, laid on at human_db of the microphone's power in the same
+    seconds. engines: which are tried, without a profile and without learning. Raises SignalError where there are fewer
+    than LEAST_S, or the reference or the microphone is silent.
 
     Notes
     -----
-    Coherence: Carter, Knapp & Nuttall 1973, over half-overlapping Hann frames, less its bias. What it calls linear bounds
-    any filter of that length; a longer echo counts as changed. Levels follow: correlation of log energies, frame by frame.
+    Coherence: Carter, Knapp & Nuttall 1973, over half-overlapping Hann frames of half a second, less its bias. What it
+    calls linear bounds any filter of that length, which holds most of a room's response; a longer echo counts as changed.
+    Levels follow: correlation of log energies, frame by frame.
 
     Examples
     --------
@@ -184,9 +175,8 @@ def measure(
         outputs[engine], starts = _filtered(mic, ref, engine)
         progress(f"{engine} with a human")
         told[engine] = Expected(_removed(mic, outputs[engine]), starts, *expected(mic, ref, voice, human_db, engine))
-    removable, over_noise, follows = (spectra.over(0.0, SAMPLE_RATE / 2)[i] for i in (0, 1, 2))
-    windows = int(mic.size / (WINDOW_S * SAMPLE_RATE))
-    spread = None if not lags.size else float(np.quantile(lags, 0.9) - np.quantile(lags, 0.1)) / SAMPLE_RATE * 1000
+    removable, over_noise, follows = spectra.over(0.0, SAMPLE_RATE / 2)
+    spread = float(np.quantile(lags, 0.9) - np.quantile(lags, 0.1)) / SAMPLE_RATE * 1000 if lags.size else None
     return Passport(
         **known,
         noise_db=float(decibels(total_power(fan))),
@@ -194,7 +184,7 @@ def measure(
         found=True,
         lag_ms=(lag + (float(np.median(lags)) if lags.size else 0.0)) / SAMPLE_RATE * 1000,
         lag_spread_ms=spread,
-        sharp=lags.size / windows,
+        sharp=lags.size / int(mic.size / (WINDOW_S * SAMPLE_RATE)),
         drift_ppm=ppm,
         removable_db=removable,
         over_noise_db=over_noise,
@@ -209,8 +199,8 @@ def measure(
 def expected(mic: Samples, ref: Samples, voice: Samples, human_db: float, engine: str) -> tuple[float, float]:
     """SI-SDR (dB) of a human who is laid on the robot alone, before and behind the engine: the mean of all turns.
 
-    mic, ref: (n,). The voice (v,) speaks from SETTLED_S on, again and again until the end, human_db over the microphone's
-    power in the same seconds.
+    mic, ref: (n,). The voice (v,) speaks from SETTLED_S on, again and again until the end, human_db over the
+    microphone's power in the same seconds.
     """
     human, spans = np.zeros(mic.size), []
     begin, pause = round(SETTLED_S * SAMPLE_RATE), round(PAUSE_S * SAMPLE_RATE)
@@ -243,15 +233,12 @@ def _check(mic: Samples, ref: Samples) -> None:
 
 
 def _levels(mic: Samples, ref: Samples) -> dict[str, Any]:
-    told: dict[str, Any] = {"seconds": mic.size / SAMPLE_RATE}
+    told: dict[str, Any] = {"seconds": mic.size / SAMPLE_RATE, "clipped": float(np.mean(np.abs(mic) >= FULL))}
     for name, x in (("mic", mic), ("ref", ref)):
         told[f"{name}_db"] = float(decibels(np.mean(np.square(x, dtype=np.float64))))
         told[f"{name}_peak_db"] = float(decibels(float(np.abs(x).max()) ** 2))
-    told["clipped"] = float(np.mean(np.abs(mic) >= FULL))
-    shut = block_power(mic, SAMPLE_RATE // 50) < GATED
-    played = all_block_power(ref, SAMPLE_RATE // 50)[: shut.size] > 0.0
-    told["gated"] = float(np.mean(shut & played))
-    return told
+    shut, played = (block_power(x, SAMPLE_RATE // 50) for x in (mic, ref))
+    return told | {"gated": float(np.mean((shut < GATED) & (played > 0.0)))}
 
 
 def _lag(mic: Samples, ref: Samples) -> int | None:
@@ -259,41 +246,39 @@ def _lag(mic: Samples, ref: Samples) -> int | None:
     try:
         return find_lag(mic, ref)
     except SignalError:
-        coarse, hop = CoarseLag(256, 2 * SAMPLE_RATE), 256
-        for at in range(0, mic.size - hop + 1, hop):
-            coarse.step(mic[at : at + hop], ref[at : at + hop])
+        coarse = CoarseLag(HOP, 2 * SAMPLE_RATE)
+        for part in zip(blocks(mic, HOP), blocks(ref, HOP)):
+            coarse.step(*part)
         return coarse.find()
 
 
 def _lags(mic: Samples, near: Samples) -> Array:
     """Samples by which the microphone lags behind the aligned reference, in those windows whose arrival is sharp, (w,)."""
     size, found = round(WINDOW_S * SAMPLE_RATE), []
-    for at in range(0, mic.size - size + 1, size):
-        part = slice(at, at + size)
-        if mic[part].any() and near[part].any():
-            cross = flat_cross(near[part], mic[part], 2 * size)
+    for heard, played in zip(blocks(mic, size), blocks(near, size)):
+        if heard.any() and played.any():
+            cross = flat_cross(played, heard, 2 * size)
             lag, height = highest(np.abs(correlation_near(cross, 2 * size, STRETCH)))
-            if height > SHARP:
+            if height > STANDS_OUT:
                 found.append(lag)
     return np.array(found, float)
 
 
 class _Spectra:
-    """Powers by bin of microphone, of what of it is incoherent with the aligned reference, and of the noise; levels frame by frame."""
+    """Powers by bin of the microphone, of its part that is incoherent with the aligned reference, and of the noise."""
 
     def __init__(self, mic: Samples, near: Samples, fan: Samples) -> None:
-        window = hann(SIZE)
-        x, y = (fft.rfft(frames(s, SIZE, SIZE // 2) * window, axis=1) for s in (near, mic))
+        window = hann(PERIOD)
+        x, y = (fft.rfft(frames(s, PERIOD, PERIOD // 2) * window, axis=1) for s in (near, mic))
         played, heard = power(x), power(y)
-        self.hz = frequencies(SIZE // 2 + 1)
+        self.hz = frequencies(PERIOD // 2 + 1)
         self.mic = heard.mean(axis=0)
         coherent = np.abs((x.conj() * y).mean(axis=0)) ** 2 / np.maximum(played.mean(axis=0), 1e-30)
         # a filter fitted to few frames explains some of anything: as much as the frames that count are few
         count = np.square(played.sum(axis=0)) / np.maximum(np.square(played).sum(axis=0), 1e-30)
         self.rest = np.clip((self.mic - coherent) / (1.0 - 1.0 / np.maximum(count, 1.5)), 0.0, self.mic)
         self.noise = np.interp(self.hz, frequencies(fan.size), fan) * SAMPLE_RATE / 2 * np.sum(window**2)
-        short = hann(512)
-        self._short = [power(fft.rfft(frames(s, 512, 256) * short, axis=1)) for s in (near, mic)]
+        self._short = [power(fft.rfft(frames(s, FRAME, HOP) * hann(FRAME), axis=1)) for s in (near, mic)]
 
     def over(self, low: float, high: float) -> tuple[float, float, float]:
         """Removable dB, microphone over noise in dB and correlation of the levels, from low to high Hz."""
@@ -303,10 +288,10 @@ class _Spectra:
         return ratios[0], ratios[1], self._follows(low, high)
 
     def _follows(self, low: float, high: float) -> float:
-        """Correlation of log energies down to 50 dB under the loudest; over all of the spectrum, the median of its bands."""
+        """Correlation of log energies down to 50 dB under the loudest; of the whole spectrum, the median of its bands."""
         if high - low > 5000.0:
             return float(np.median([self._follows(*band) for band in octaves()]))
-        hz = frequencies(257)
+        hz = frequencies(FRAME // 2 + 1)
         at = (hz >= low) & (hz < high)
         energies = [s[:, at].sum(axis=1) for s in self._short]
         levels = [np.log(e + 1e-5 * e.max() + 1e-20) for e in energies]
@@ -325,7 +310,7 @@ def octaves() -> list[tuple[float, float]]:
 
 
 def _filtered(mic: Samples, ref: Samples, engine: str) -> tuple[Samples, int | None]:
-    """The output without a profile, (n,), and how often speech of a human has started in it; None where no engine detects speech."""
+    """The output without a profile, (n,), and how often a human's speech has begun, None where no engine tells."""
     with EgoFilter(engine=engine) as ego:
         output = np.concatenate((ego.process(mic, ref), ego.flush()))
         starts = sum(event.kind == "speech_started" for event in ego.events())
@@ -334,30 +319,28 @@ def _filtered(mic: Samples, ref: Samples, engine: str) -> tuple[Samples, int | N
 
 def _removed(mic: Samples, output: Samples) -> float:
     """By how much the level falls once the filter has settled, dB."""
-    before, after = (
-        float(np.mean(np.square(x[round(SETTLED_S * SAMPLE_RATE) :], dtype=np.float64))) for x in (mic, output)
-    )
-    return float(decibels(before) - decibels(after))
+    begin = round(SETTLED_S * SAMPLE_RATE)
+    before, after = (decibels(np.mean(np.square(x[begin:], dtype=np.float64))) for x in (mic, output))
+    return float(before - after)
 
 
 def _bands(mic: Samples, spectra: _Spectra, outputs: dict[str, Samples]) -> list[Band]:
-    from_here = slice(round(SETTLED_S * SAMPLE_RATE), None)
+    begin, window, told = round(SETTLED_S * SAMPLE_RATE), hann(PERIOD), []
     density = {
-        name: power(fft.rfft(frames(x[from_here], SIZE, SIZE // 2) * hann(SIZE), axis=1)).mean(axis=0)
+        name: power(fft.rfft(frames(x[begin:], PERIOD, PERIOD // 2) * window, axis=1)).mean(axis=0)
         for name, x in {"": mic, **outputs}.items()
     }
-    told = []
     for low, high in octaves():
         at = (spectra.hz >= low) & (spectra.hz < high)
         level = {name: float(decibels(d[at].sum(), 1e-20)) for name, d in density.items()}
-        mic_db = float(decibels(spectra.mic[at].sum() * 2 / SIZE / np.sum(hann(SIZE) ** 2)))
+        mic_db = float(decibels(spectra.mic[at].sum() * 2 / PERIOD / np.sum(window**2)))
         removed = {name: level[""] - db for name, db in level.items() if name}
         told.append(Band(low, high, mic_db, *spectra.over(low, high), removed))
     return told
 
 
 def _cause(removable_db: float, over_noise_db: float, follows: float, gated: float, clipped: float) -> Cause:
-    """A microphone that shuts before all else, since its noise cannot be seen; noise where it alone explains what is not linear."""
+    """A gate before all else, since it hides the noise; noise where it alone explains what is not linear."""
     if removable_db >= ENOUGH_DB:
         return "nothing"
     if gated >= GATED_SHARE:
@@ -367,11 +350,3 @@ def _cause(removable_db: float, over_noise_db: float, follows: float, gated: flo
     if clipped >= CLIPPED_SHARE:
         return "clipping"
     return "change" if follows >= FOLLOWS else "other"
-
-
-def _rounded(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {key: _rounded(one) for key, one in value.items()}
-    if isinstance(value, list | tuple):
-        return [_rounded(one) for one in value]
-    return round(value, 4) if isinstance(value, float) else value

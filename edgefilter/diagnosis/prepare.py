@@ -1,4 +1,4 @@
-"""Bring a recording of the robot alone into a state in which it can be held against a prediction: rate, lag, silence."""
+"""Bring a recording of the robot alone into a state in which a prediction can be held against it: rate, lag, silence."""
 
 from __future__ import annotations
 
@@ -11,12 +11,16 @@ from numpy.typing import NDArray
 from scipy import fft
 from scipy.ndimage import maximum_filter1d, uniform_filter1d
 
-from edgefilter.diagnosis.offset import find_offset, starting_offset
+from edgefilter.calibration.from_recording import TAIL_S
+from edgefilter.diagnosis.criteria import Criteria
 from edgefilter.dsp.fourier import power
 from edgefilter.dsp.fractional_delay import delayed
 from edgefilter.dsp.frames import all_block_power, blocks, decibels
+from edgefilter.dsp.lag import correlation_near, highest, likely_cross, top
 from edgefilter.dsp.psd import floored, hann
+from edgefilter.dsp.stft import StftConfig
 from edgefilter.echo.effects.catalogue import find
+from edgefilter.echo.lag_track import track_lag
 from edgefilter.echo.measurement import Measurement, whiten
 from edgefilter.echo.model import EchoModel
 from edgefilter.echo.recording import MAX_OFFSET, fitted_blocks, paired
@@ -24,23 +28,26 @@ from edgefilter.errors import SignalError
 from edgefilter.profile.data import Profile
 from edgefilter.types import PRE_ROLL, SAMPLE_RATE, Array, Samples, as_samples
 
+FRAME, HOP = StftConfig.n_fft, StftConfig.hop
+"""Samples of the frames that a prediction is judged in, those of the running filter."""
+STANDS_OUT = 12.0
+"""Height of a correlation over the root mean square of all its lags from which a lag is true."""
+TRACK_REACH = 1600
+"""Samples (0.1 s) by which the lag may move away from that of the whole recording and still be followed."""
 SILENCE_DB = -15.0
-"""The robot is silent where its predicted voice, whitened, is this far under the fan."""
-FAN_TOLERANCE_DB = 1.0
-"""By which the fan of a robot differs from day to day."""
+"""The robot is silent where its predicted voice, whitened, is this far under the fan, and adds 3 % to its power."""
 TALK_DB = 8.0
-"""Over the fan: more than a reverberation tail in a pause, less than a soft voice at two metres."""
+"""Over the fan, somebody talks: more than a reverberation tail in a pause, less than a soft voice at two metres."""
 GAP_S, EDGE_S = 1.0, 0.2
-MOMENT = 512
-"""Samples over which the voice's power says how much the loudspeaker distorts."""
+"""Pauses of a talker that count as talk, and what is left out before and after talk."""
 ORDINARY = 2.0
 """Times the calibrated distortion: that of speech was up to 3.4 dB off what multisines of its spectrum had shown."""
-CUT, CUT_DB, TAIL_S = 32, -30.0, 0.3
-"""A reference begins or ends in the middle of a word where that many samples at its end are no further below its
-loudest 20 ms; what was said before still sounds for TAIL_S."""
+CUT, CUT_DB = 32, -30.0
+"""A reference begins or ends in the middle of a word where so many samples (2 ms) at its end are no further below its
+loudest 20 ms: pauses are softer."""
 PAUSE_S, LAG_STEP = 0.5, 480
 """Silence of the reference after which a player may have started anew, and samples (30 ms) by which the lag must differ
-then."""
+then: less is left for the effects to explain."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,11 +55,9 @@ class Prepared:
     """A recording beside what the profile predicts, on one sample counter; all arrays (n,).
 
     measurement: aligned reference, recording, the fan's PSD, the samples to fit on. model: the profile's, less the
-    events of other recordings. prediction: of that model.
-    usable: samples where nobody else talks. active: where the robot is heard. offset: samples of lag against the
-    calibration.
-    human: (start_s, end_s) of other talkers. ordinary: the robot's own distortion, as calibrated, in the form of
-    EchoModel.unpredictable.
+    events of other recordings. prediction: of that model. usable: samples where nobody else talks. active: where the
+    robot is heard. offset: samples of lag against the calibration. human: (start_s, end_s) of other talkers. ordinary:
+    the robot's own distortion, as calibrated, in the form of EchoModel.unpredictable.
     """
 
     measurement: Measurement
@@ -84,6 +89,10 @@ class Prepared:
         """The same with another fan, of PSD (601,)."""
         return replace(self, measurement=replace(self.measurement, noise_psd=floored(noise_psd).astype(np.float32)))
 
+    def fitted_to(self, fit: NDArray[np.bool_]) -> Prepared:
+        """The same with other samples to fit on, (n,)."""
+        return replace(self, measurement=replace(self.measurement, fit=fit))
+
 
 def prepare(profile: Profile, recording: Samples, reference: Samples, *, sample_rate: int = SAMPLE_RATE) -> Prepared:
     """Resample to 16 kHz, find the constant lag, mark silence and the blocks to fit on.
@@ -91,19 +100,20 @@ def prepare(profile: Profile, recording: Samples, reference: Samples, *, sample_
     recording (m,), reference (k,): float, full scale +-1, at sample_rate. Raises SignalError for less than a second or
     where the recording does not contain the reference.
     """
-    y, x = as_samples(recording, "recording"), as_samples(reference, "reference")
     if sample_rate != SAMPLE_RATE:
-        y, x = (soxr.resample(signal_, sample_rate, SAMPLE_RATE).astype(np.float32) for signal_ in (y, x))
-    y, x = paired(y, x)
-    n = y.size
-    start = profile.delay - PRE_ROLL
-    at_calibration = delayed(x, start)
+        recording, reference = (
+            soxr.resample(as_samples(x, name), sample_rate, SAMPLE_RATE)
+            for x, name in ((recording, "recording"), (reference, "reference"))
+        )
+    y, x = paired(recording, reference)
+    n, start = y.size, profile.delay - PRE_ROLL
     model = profile.echo.during(Measurement(x, y))
-    predicted = model.predict(at_calibration)
+    predicted = model.predict(delayed(x, start))
     known = floored(model.expected_noise(profile.noise_psd)).astype(np.float32)
-    offset = starting_offset(whiten(predicted, known), whiten(y, known))
+    white_y = whiten(y, known)
+    offset = starting_offset(whiten(predicted, known), white_y)
     if model.timed:  # a clock that drifts has drifted further, or less, by the time that the offset takes
-        offset += starting_offset(whiten(model.predict(delayed(x, start + offset)), known), whiten(y, known))
+        offset += starting_offset(whiten(model.predict(delayed(x, start + offset)), known), white_y)
     pieces = utterance_lags(x, predicted, y, known, offset)
     begin, end = known_span(x, start + pieces[0][2], start + pieces[-1][2])
     shifted = (
@@ -112,19 +122,16 @@ def prepare(profile: Profile, recording: Samples, reference: Samples, *, sample_
     )
     x = sum(shifted, np.zeros(n, np.float32))
     predicted = model.predict(x)
-    white = whiten(predicted, known)
     block = SAMPLE_RATE // 50
-    level = all_block_power(white, block)
+    level = all_block_power(whiten(predicted, known), block)
     active = np.repeat(maximum_filter1d(level, 11) > 10 ** (SILENCE_DB / 10), block)[:n]
-    fit = fitted_blocks(n)
-    quiet = whiten(y, known) ** 2
-    psd = known * np.float32(fan_scale(whiten(y, known)[~active]))
-    human = find_talk(quiet * (known[1] / psd[1]), active)
+    psd = known * np.float32(fan_scale(white_y[~active]))
+    human = find_talk(white_y**2 * (known[1] / psd[1]), active)
     usable = np.ones(n, bool)
     for first, last in human:
         usable[round(first * SAMPLE_RATE) : round(last * SAMPLE_RATE)] = False
     warnings = tuple(f"somebody talks at {first:.1f} to {last:.1f} s: left out" for first, last in human)
-    if end - begin < n and end - begin > n // 2:
+    if n // 2 < end - begin < n:
         usable[:begin], usable[end:] = False, False
         warnings += (
             f"the reference is cut in mid-word: only {begin / SAMPLE_RATE:.1f} to {end / SAMPLE_RATE:.1f} s are evaluated",
@@ -132,7 +139,7 @@ def prepare(profile: Profile, recording: Samples, reference: Samples, *, sample_
     if len(pieces) > 1:
         lags = ", ".join(f"{lag:.1f} from {first / SAMPLE_RATE:.1f} s" for first, _, lag in pieces)
         warnings += (f"the utterances lag by different numbers of samples: {lags}; aligned one by one",)
-    measurement, ordinary = Measurement(x, y, psd, fit & usable), ordinary_distortion(profile, predicted)
+    measurement, ordinary = Measurement(x, y, psd, fitted_blocks(n) & usable), ordinary_distortion(profile, predicted)
     return Prepared(measurement, model, predicted, usable, active, offset, human, warnings, ordinary)
 
 
@@ -145,15 +152,54 @@ def ordinary_distortion(profile: Profile, predicted: Samples) -> tuple[tuple[Sam
     known = profile.approximation
     if known is None or any(find(name).learned for name, _ in profile.echo.effects):
         return ()
-    power = uniform_filter1d(np.square(predicted, dtype=np.float64), MOMENT, mode="constant")
-    return (((ORDINARY * known.expected(power)).astype(np.float32), known.colour),)
+    voice = uniform_filter1d(np.square(predicted, dtype=np.float64), FRAME, mode="constant")
+    return (((ORDINARY * known.expected(voice)).astype(np.float32), known.colour),)
+
+
+def starting_offset(predicted: Samples, recording: Samples) -> float:
+    """Samples by which recording (n,) lags behind predicted (n,) at its beginning, both whitened.
+
+    Over the whole of it where the lag is constant; where it moves (drift, jumps, a changed path), over the first
+    seconds in which it holds still, so that what happens later is left in the residual. Raises SignalError where no lag
+    stands out.
+    """
+    whole, window = find_offset(predicted, recording), SAMPLE_RATE
+    track = track_lag(delayed(predicted, whole), recording, None, window, TRACK_REACH)
+    clear = track.correlation > 0.5 * track.correlation.max(initial=0.0)
+    if np.count_nonzero(clear) < 4:
+        return whole
+    starts, lags = track.starts[clear], whole + track.lag[clear]
+    first, middle = float(np.median(lags[:3])), float(np.median(lags))
+    if np.quantile(np.abs(lags - middle), 0.8) < 0.06 and abs(first - middle) < 0.06:
+        return whole
+    moved = np.flatnonzero(np.abs(lags - first) > 0.3)
+    stop = int(starts[moved[0] if moved.size else -1]) + window
+    stop = max(min(stop - window // 2, int(starts[0]) + 4 * window), int(starts[0]) + window)
+    still = slice(max(int(starts[0]) - window // 2, 0), stop)
+    part, n = delayed(predicted, first)[still], fft.next_fast_len(2 * (still.stop - still.start), real=True)
+    return first + top(likely_cross(part, recording[still], n), n, 0.0)
+
+
+def find_offset(predicted: Samples, recording: Samples) -> float:
+    """Samples, to a few thousandths, by which recording (n,) lags behind predicted (n,): the top of their correlation.
+
+    Raises SignalError where no lag stands out.
+    """
+    n = fft.next_fast_len(2 * recording.size, real=True)
+    cross = likely_cross(predicted, recording, n)
+    lag, height = highest(correlation_near(cross, n, min(int(MAX_OFFSET * SAMPLE_RATE), recording.size - 1)))
+    if height < STANDS_OUT:
+        raise SignalError(
+            "the recording does not contain the reference at any lag up to 3 s: are both of the same utterance?"
+        )
+    return top(cross, n, float(lag))
 
 
 def known_span(x: Samples, first_lag: float, last_lag: float) -> tuple[int, int]:
     """First sample and end of the part of a recording (n,) of which the reference x (n,) knows what the robot says.
 
     first_lag, last_lag: of the recording behind x. What was said before a reference that begins in the middle of a
-    word, and after one that ends there, is heard but unknown.
+    word, and after one that ends there, is heard for TAIL_S but unknown.
     """
     n, block = x.size, SAMPLE_RATE // 50
     loud = 10 ** (CUT_DB / 10) * float(np.max(all_block_power(x, block)))
@@ -171,10 +217,10 @@ def known_span(x: Samples, first_lag: float, last_lag: float) -> tuple[int, int]
 def utterance_lags(
     x: Samples, predicted: Samples, recording: Samples, psd: Samples, offset: float
 ) -> list[tuple[int, int, float]]:
-    """First sample, end and lag of the stretches of the reference x (n,) that share a lag, the whole with `offset` where it is one.
+    """First sample, end and lag of the stretches of x (n,) that share a lag; all of it with `offset` where all do.
 
-    predicted: for x without an offset. A player starts each utterance anew, so its lag may be another after a pause of
-    PAUSE_S; a difference of less than LAG_STEP is no new start but left for the effects to explain.
+    predicted: for the reference x without an offset. A player starts each utterance anew, so its lag may be another
+    after a pause of PAUSE_S; a difference of less than LAG_STEP is no new start but left for the effects to explain.
     """
     block, reach = SAMPLE_RATE // 50, int(MAX_OFFSET * SAMPLE_RATE)
     level = all_block_power(x, block)
@@ -201,7 +247,7 @@ def utterance_lags(
 
 
 def find_talk(square: Samples, active: NDArray[np.bool_]) -> tuple[tuple[float, float], ...]:
-    """Stretches (start_s, end_s) where somebody talks, from the whitened recording's square (n,) in the robot's silences.
+    """Stretches (start_s, end_s) where somebody talks in the robot's silences, from the whitened recording's square (n,).
 
     Somebody talks where tenths of a second are TALK_DB over the fan while at least a third of the silence is at the
     fan: a fan that has changed is louder all the time. What lies between two such moments less than GAP_S apart belongs
@@ -209,7 +255,6 @@ def find_talk(square: Samples, active: NDArray[np.bool_]) -> tuple[tuple[float, 
     working around that.
     """
     block = SAMPLE_RATE // 10
-    count = square.size // block
     silent = ~blocks(active, block).any(axis=1)
     level = blocks(square, block).mean(axis=1)
     loud = silent & (level > 10 ** (TALK_DB / 10))
@@ -221,20 +266,18 @@ def find_talk(square: Samples, active: NDArray[np.bool_]) -> tuple[tuple[float, 
             spans[-1][1] = at + 0.1
         else:
             spans.append([at, at + 0.1])
-    kept = [(max(begin - EDGE_S, 0.0), end + EDGE_S) for begin, end in spans if end - begin > 0.25]
-    total = sum(end - begin for begin, end in kept)
-    return tuple((float(begin), float(end)) for begin, end in kept) if 10 * total < 0.5 * count else ()
+    kept = [(float(max(begin - EDGE_S, 0.0)), float(end + EDGE_S)) for begin, end in spans if end - begin > 0.25]
+    return tuple(kept) if 10 * sum(end - begin for begin, end in kept) < 0.5 * level.size else ()
 
 
 def fan_scale(quiet: Samples) -> float:
-    """How much louder the fan is than in the calibration, in power, from the whitened recording while the robot is silent, (k,).
+    """How much louder the fan is than in the calibration, in power, from the whitened recording's silences, (k,).
 
-    1 where the difference is more than FAN_TOLERANCE_DB either way, and so no ordinary one, or where there is too
-    little silence.
+    1 where the difference is no ordinary one (Criteria.fan_change_db), or where there is too little silence.
     """
     if quiet.size < SAMPLE_RATE // 2:
         return 1.0
     window = hann(256)
     spectrum = np.mean(power(fft.rfft(blocks(quiet, 256) * window)), axis=0) / np.sum(window**2)
     scale = float(np.median(spectrum[3:-6]))
-    return scale if abs(decibels(scale)) <= FAN_TOLERANCE_DB else 1.0
+    return scale if abs(decibels(scale)) <= Criteria.fan_change_db else 1.0

@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import permutations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import log_ndtr
 
 from edgefilter.calibration.multisine import BAND_HZ, SPEECH_DB
 from edgefilter.diagnosis.joint import fit_jointly
-from edgefilter.diagnosis.prepare import Prepared, prepare
-from edgefilter.diagnosis.score import FRAMES_PER_CELL, HOP, Scorer
+from edgefilter.diagnosis.prepare import HOP, Prepared, prepare
+from edgefilter.diagnosis.score import STEP, Scorer
 from edgefilter.dsp.convolution import convolve
 from edgefilter.dsp.fractional_delay import delayed
 from edgefilter.dsp.psd import GRID_BINS, frequencies, variance_at
@@ -32,9 +31,9 @@ MARK_S, GAP_S, END_S = 0.25, 0.15, 0.1
 """Each begins with a noise, by which its lag is found where it is silent itself, and a gap, and ends in silence, so that
 its reverberation is evaluated as well."""
 LINES = 150
-"""Of that sound: every 25th of the odd ones, so that products of two or three of them fall between."""
-ERROR_TAPS, FLIP = 64, 256
-"""Of the filter that gives a simulated explanation's error its spectrum, and samples (16 ms) for which it keeps its sign."""
+"""Of that sound, drawn from the odd ones, so that products of two or three of them fall between."""
+ERROR_TAPS = 64
+"""Of the filter that gives a simulated explanation's error its spectrum; it keeps its sign for a HOP (16 ms)."""
 LOOSE = 0.25
 """Part of how far two explanations expect to be apart by which either may be off. Right ones of 16 simulated robots
 (bench/diagnosis/probe.py, voices of training) were off by a tenth to a half."""
@@ -42,15 +41,15 @@ NONE = 100.0
 """Times the variance that the best explanation expects: with so much more nothing is known. By the likelihood that is
 nearer from ten times the expected power on. Chosen by hand, not tuned."""
 TWINS = 1e-5
-"""Part of the voice's power (-50 dB) by which two explanations have to differ, to be two."""
+"""Part of the voice's power (-50 dB) by which two explanations differ, to be two: the fan hides what is less."""
 
 
 @dataclass(frozen=True, eq=False)
 class Explanation:
     """Effects beyond the profile's, and the model with them.
 
-    error (601,): part of the voice's power, 0 to 8 kHz, that the model leaves over what it expects, of seconds that it was not
-    fitted to: so far it may be off elsewhere.
+    error (601,): part of the voice's power, 0 to 8 kHz, that the model leaves over what it expects of seconds that it
+    was not fitted to: so far it may be off elsewhere.
     """
 
     effects: tuple[str, ...]
@@ -74,10 +73,7 @@ class Sound:
 
 @dataclass(frozen=True, eq=False)
 class Answer:
-    """What was asked and answered: the explanations and their probabilities, after those sounds.
-
-    likely: (explanations + 1,), the last of none of them.
-    """
+    """Explanations and their probabilities after those sounds, likely: (explanations + 1,), the last of none of them."""
 
     explanations: tuple[Explanation, ...]
     likely: Array
@@ -117,10 +113,10 @@ class Answer:
 
 
 class Inquiry:
-    """A recording (m,) of a reference (n,) and its explanations, each fitted to one half of it: what can be asked further.
+    """A recording (m,) of a reference (n,) and its explanations, each fitted to one half of it: what can be asked.
 
-    wanted: the effects of each explanation; two that predict the same are one. Raises SignalError where the recording does
-    not contain the reference or a fit fails, UsageError for an event.
+    wanted: the effects of each explanation; two that predict the same are one. Raises SignalError where the recording
+    does not contain the reference or a fit fails, UsageError for an event.
     """
 
     def __init__(
@@ -150,10 +146,10 @@ class Inquiry:
         return weights(_log_likelihood(self._first, self.explanations))
 
     def evidence(self, recording: Samples, sound: Samples) -> Array:
-        """Log likelihood of what was recorded (m,) of a sound (n,), (moments, explanations + 1), the last of none of them.
+        """Log likelihood of what was recorded (m,) of a sound (n,), (moments, explanations + 1), the last of none.
 
-        All are fitted again, to the first recording and one half of this one, and tested on the other half; then the halves
-        change places. What a clock does begins anew with each recording, so that a model of one stays as it is.
+        All are fitted again, to the first recording and one half of this one, and tested on the other half; then the
+        halves change places. What a clock does begins anew with each recording, so that a model of one stays as it is.
         Raises SignalError where the recording does not contain the sound.
         """
         found = []
@@ -165,17 +161,16 @@ class Inquiry:
                 first.noise_psd,
                 np.concatenate((self._first.usable, part.fit)),
             )
+            clocks = self._first.model.timed
             again = [
-                one
-                if one.model.timed or self._first.model.timed
-                else replace(one, model=_fitted(both, part.model, one.effects))
+                one if clocks or one.model.timed else replace(one, model=_fitted(both, part.model, one.effects))
                 for one in self.explanations
             ]
             found.append(_log_likelihood(part, again))
         return np.concatenate(found)
 
     def gains(self, sound: Samples) -> Array:
-        """The log odds over each other that are expected of a sound (n,) where the first is true, (explanations, explanations)."""
+        """The log odds over each other expected of a sound (n,), (explanations, explanations): the first is true."""
         count = len(self.explanations)
         heard = (_simulated(self.profile, true, sound) for true in self.explanations)
         told = [self.evidence(recording, sound).sum(axis=0)[:count] for recording in heard]
@@ -184,11 +179,11 @@ class Inquiry:
     def sounds(self, likely: Array, progress: Callable[[str], None] | None = None) -> list[Sound]:
         """The menu, the best sound first: the one that is expected to tell most of the explanations that stand.
 
-        Each sound is played to each explanation, as fitted, with its noise, and evaluated as what is recorded will be (Lindley
-        1956, "On a measure of the information provided by an experiment"). likely (explanations + 1,): so far; less
-        than one in ENOUGH of the best does not stand, but two always do. Of the log odds that the true one gains over each
-        other the mean logarithm counts, 1 added: twice as sure is worth less than another pair told. Raises SignalError
-        where no sound tells those that stand apart.
+        Each sound is played to each explanation, as fitted, with its noise, and evaluated as what is recorded will be
+        (Lindley 1956, "On a measure of the information provided by an experiment"). likely (explanations + 1,): so far;
+        less than one in ENOUGH of the best does not stand, but two always do. Of the log odds that the true one gains
+        over each other the mean logarithm counts, 1 added: twice as sure is worth less than another pair told. Raises
+        SignalError where no sound tells those that stand apart.
         """
         likely = likely[: len(self.explanations)]
         standing = max(int(np.count_nonzero(likely * ENOUGH >= likely.max())), 2)
@@ -229,14 +224,14 @@ class Inquiry:
 
 
 def weights(found: Array, gains: Sequence[Array] = ()) -> Array:
-    """The probability of each and of none, (explanations + 1,), all as probable beforehand, from evidence (moments, explanations + 1).
+    """The probability of each and of none, (explanations + 1,), from evidence (moments, explanations + 1), all alike before.
 
-    No explanation is exactly true, so that likelihoods of thousands of samples would be far too sure. Asked is which of two
-    is closer to what was heard: by chance the difference of their log likelihoods has either sign from moment to moment; its
-    sum over the root of the sum of its squares is a normal number (Vuong 1989, "Likelihood ratio tests for model selection and
-    non-nested hypotheses", eq. 4.2). gains: what was expected of each sound, as Inquiry.gains has it. The sum is counted
-    from the middle of what the two expect, since a flexible explanation is never far from a simple one that is true; and
-    what they expect is known to a part, LOOSE, of how far it is apart.
+    No explanation is exactly true, so that likelihoods of thousands of samples would be far too sure. Asked is which of
+    two is closer to what was heard: by chance the difference of their log likelihoods has either sign from moment to
+    moment; its sum over the root of the sum of its squares is a normal number (Vuong 1989, "Likelihood ratio tests for
+    model selection and non-nested hypotheses", eq. 4.2). gains: what was expected of each sound, as Inquiry.gains has
+    it. The sum is counted from the middle of what the two expect, since a flexible explanation is never far from a
+    simple one that is true; and what they expect is known to a part, LOOSE, of how far it is apart.
     """
     count = found.shape[1] - 1
     z = np.full((count, count), np.inf)
@@ -253,9 +248,9 @@ def weights(found: Array, gains: Sequence[Array] = ()) -> Array:
 
 
 def menu(reference: Samples) -> dict[str, Samples]:
-    """Twelve sounds of SOUND_S, by what they are, the softest first, none louder than the loudest words of a reference (n,), which are among them.
+    """Twelve sounds of SOUND_S, by what they are, the softest first, none louder than the loudest words of reference (n,).
 
-    So nothing is asked of a loudspeaker that the first recording does not tell of.
+    These are among them. So nothing is asked of a loudspeaker that the first recording does not tell of.
     """
     rng = np.random.default_rng(35)
     n = round((SOUND_S - MARK_S - GAP_S - END_S) * SAMPLE_RATE)
@@ -282,21 +277,21 @@ def menu(reference: Samples) -> dict[str, Samples]:
         "odd lines": sparse,
         "noise of all frequencies": flat,
     }
-    mark = round(MARK_S * SAMPLE_RATE)
+    mark, gap, end = (round(seconds * SAMPLE_RATE) for seconds in (MARK_S, GAP_S, END_S))
     front = _noise(rng, _like_speech(np.arange(mark // 2 + 1) * SAMPLE_RATE / mark), level, peak)
-    front = np.concatenate((front, np.zeros(round(GAP_S * SAMPLE_RATE))))
-    end = np.zeros(round(END_S * SAMPLE_RATE))
-    return {what: np.concatenate((front, x, end)).astype(np.float32) for what, x in sounds.items()}
+    return {
+        what: np.concatenate((front, np.zeros(gap), x, np.zeros(end))).astype(np.float32) for what, x in sounds.items()
+    }
 
 
 def _like_speech(hz: Array) -> Array:
     """Magnitude of average speech at hz."""
-    inside: NDArray[np.bool_] = (hz >= BAND_HZ[0]) & (hz <= BAND_HZ[1])
+    inside = np.asarray((hz >= BAND_HZ[0]) & (hz <= BAND_HZ[1]))
     return inside * 10 ** (np.polynomial.Polynomial(SPEECH_DB)(np.log10(np.maximum(hz, BAND_HZ[0]))) / 20)
 
 
 def _noise(rng: np.random.Generator, magnitude: Array, level: float, peak: float) -> Array:
-    """A sound of random phases and that magnitude (n / 2 + 1,), (n,), of a root mean square and a peak, faded in and out over 10 ms."""
+    """A sound (n,) of random phases and that magnitude (n / 2 + 1,), of a root mean square and a peak, faded in and out."""
     x = _faded(np.fft.irfft(magnitude * np.exp(2j * np.pi * rng.uniform(size=magnitude.size))))
     return np.asarray(x * min(level / np.sqrt(np.mean(x**2)), peak / np.max(np.abs(x))))
 
@@ -311,7 +306,8 @@ def _loudest(reference: Samples, n: int) -> Array:
 
 def _faded(x: Array) -> Array:
     """Samples faded in and out over 10 ms, (n,)."""
-    fade = np.minimum(np.arange(1, x.size + 1), SAMPLE_RATE // 100) / (SAMPLE_RATE // 100)
+    length = SAMPLE_RATE // 100
+    fade = np.minimum(np.arange(1, x.size + 1), length) / length
     return np.asarray(x * (fade * fade[::-1]))
 
 
@@ -322,10 +318,9 @@ def _fitted(measurement: Measurement, model: EchoModel, effects: Sequence[str]) 
         raise SignalError(f"{'+'.join(effects)} cannot be fitted to the recording: {error}") from None
 
 
-def _halves(prepared: Prepared) -> Iterator[Prepared]:
-    """The same with one half to fit to and the other to test on, then the other way round."""
-    for half in (prepared.fit, prepared.held_out):
-        yield replace(prepared, measurement=replace(prepared.measurement, fit=half))
+def _halves(prepared: Prepared) -> tuple[Prepared, Prepared]:
+    """The same with one half to fit to and the other to test on, and the other way round."""
+    return prepared, prepared.fitted_to(prepared.held_out)
 
 
 def _simulated(profile: Profile, true: Explanation, sound: Samples) -> Samples:
@@ -337,12 +332,9 @@ def _simulated(profile: Profile, true: Explanation, sound: Samples) -> Samples:
     x = delayed(np.pad(sound, (0, SAMPLE_RATE)), profile.delay - PRE_ROLL)
     bins = frequencies(ERROR_TAPS // 2 + 1)
     off = np.fft.irfft(np.sqrt(np.interp(bins, frequencies(GRID_BINS), true.error)))
-    voice, signs = model.predict(x), np.repeat(rng.choice([-1.0, 1.0], x.size // FLIP + 1), FLIP)[: x.size]
-    heard = (
-        voice
-        + signs * convolve(voice, np.fft.fftshift(off))[ERROR_TAPS // 2 :][: x.size]
-        + _coloured(rng, x.size, model.expected_noise(profile.noise_psd))
-    )
+    voice, signs = model.predict(x), np.repeat(rng.choice([-1.0, 1.0], x.size // HOP + 1), HOP)[: x.size]
+    wrong = signs * convolve(voice, np.fft.fftshift(off))[ERROR_TAPS // 2 :][: x.size]
+    heard = voice + wrong + _coloured(rng, x.size, model.expected_noise(profile.noise_psd))
     for square, colour in model.unpredictable(x):
         heard = heard + np.sqrt(square) * _coloured(rng, x.size, colour)
     return heard.astype(np.float32)
@@ -355,7 +347,7 @@ def _coloured(rng: np.random.Generator, n: int, psd: Array) -> Array:
 
 
 def _cells(scorer: Scorer, model: EchoModel) -> tuple[Array, Array, Array]:
-    """The power that a model leaves, what it expects there, and its voice, over the known fan, (moments, bands) each."""
+    """The power that a model leaves, what it expects, and its voice, over the known fan, (moments, bands) each."""
     score, psd = scorer.of(model), scorer.psd
     power = scorer.cells(scorer.measurement.recording - score.prediction)
     fan = np.interp(scorer.band_hz.mean(axis=1), frequencies(psd.size), model.expected_noise(psd) / psd)
@@ -363,14 +355,13 @@ def _cells(scorer: Scorer, model: EchoModel) -> tuple[Array, Array, Array]:
 
 
 def _log_likelihood(prepared: Prepared, explanations: Sequence[Explanation]) -> Array:
-    """Log likelihood of the cells that no fit has used, (moments, explanations + 1), the last of none of the explanations.
+    """Log likelihood of the cells that no fit has used, (moments, explanations + 1), the last of none of them.
 
-    Of a residual that is Gaussian in each cell, with a variance that is expected to a factor: Student's t with as many
-    degrees of freedom as the cell has (Lange, Little & Taylor 1989), so that what is louder than expected counts by its
-    level, and what was expected in vain counts as well.
+    Student's t with as many degrees of freedom as the cell has (Lange, Little & Taylor 1989): what is louder than
+    expected counts by its level, and what was expected in vain counts as well.
     """
     scorer = Scorer(prepared)
-    freedom = scorer.freedom * (HOP * FRAMES_PER_CELL / (HOP - 1))
+    freedom = scorer.freedom * (STEP / (HOP - 1))
 
     def likelihood(power: Array, expected: Array) -> Array:
         return -0.5 * np.sum(freedom * (np.log(expected) + 2.0 * np.log1p(power / expected)), axis=1)

@@ -9,22 +9,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edgefilter.calibration.from_recording import self_calibrate
+from edgefilter.diagnosis.compare import rounded
 from edgefilter.diagnosis.joint import fit_straight
 from edgefilter.diagnosis.prepare import Prepared, prepare
 from edgefilter.dsp.frames import block_power, decibels
 from edgefilter.echo.effects.catalogue import find
 from edgefilter.echo.model import EchoModel
+from edgefilter.echo.recording import BLOCK
 from edgefilter.errors import SignalError
 from edgefilter.filter.ego_filter import enhance
 from edgefilter.profile.data import Profile
 from edgefilter.types import SAMPLE_RATE, Samples
 
 FIRST = 0.6
-"""Part of the robot's voice that the proof fits to: the rest is as short as suffices to test a filter, since a fit to less than
-all is worse than the one that is written."""
+"""Part of the robot's voice that the proof fits to: the rest is as short as suffices to test a filter, since a fit to less
+than all is worse than the one that is written."""
 NEAR = 0.1
 """Of the recording, how far either way the cut may move to fall into a pause."""
-LEAST_S = 0.5
+LEAST_S = BLOCK / SAMPLE_RATE
 """Seconds of the robot alone that each part must hold."""
 WORSE_DB = 0.2
 """By less ERLE than this two runs of the filter differ for no reason."""
@@ -34,10 +36,10 @@ AHEAD = SAMPLE_RATE // 10
 
 @dataclass(frozen=True)
 class Proof:
-    """ERLE in dB of the running filter, engine linear, over seconds that the fit has not seen, without and with what was fitted.
+    """ERLE (dB) of the running filter, engine linear, over seconds that no fit has seen, without and with the effects.
 
-    seconds: of the robot alone that were tested on, from start_s to the recording's end. without: of several effects, the
-    ERLE with all but that one, where they make the filter worse; empty otherwise.
+    seconds: of the robot alone that were tested on, from start_s to the recording's end. without: of several effects,
+    the ERLE with all but that one, where they make the filter worse; empty otherwise.
     """
 
     effects: tuple[str, ...]
@@ -59,15 +61,14 @@ class Proof:
 
     def to_dict(self) -> dict[str, object]:
         """Ready for JSON."""
-        found = {key: round(v, 3) if isinstance(v, float) else v for key, v in asdict(self).items()}
-        return {**found, "without": {name: round(db, 3) for name, db in self.without}, "worse": self.worse}
+        return {**rounded(asdict(self), 3), "without": rounded(dict(self.without), 3), "worse": self.worse}
 
 
 class HeldOut:
-    """A recording cut in two at a pause: a part to fit to, and the robot alone of the rest, heard by a filter that has just begun.
+    """A recording cut in two at a pause: a part to fit to, and the robot alone of the rest, for a filter that begins.
 
-    profile: by which recording (n,) and reference (m,), both at 16 kHz, are aligned. Raises SignalError where
-    either part holds less than LEAST_S of the robot.
+    profile: by which recording (n,) and reference (m,), both at 16 kHz, are aligned. Raises SignalError where either
+    part holds less than LEAST_S of the robot.
     """
 
     def __init__(self, profile: Profile, recording: Samples, reference: Samples) -> None:
@@ -86,8 +87,7 @@ class HeldOut:
     def before(self, prepared: Prepared) -> Prepared:
         """The prepared recording with nothing to fit to, or to test on, from the cut on."""
         first = np.arange(prepared.usable.size) < self.cut
-        fit = replace(prepared.measurement, fit=prepared.fit & first)
-        return replace(prepared, measurement=fit, usable=prepared.usable & first)
+        return replace(prepared.fitted_to(prepared.fit & first), usable=prepared.usable & first)
 
     def erle_db(self, profile: Profile | None) -> float:
         """ERLE of the running filter with that profile over the held-out seconds of the robot alone, dB."""
@@ -95,16 +95,11 @@ class HeldOut:
         heard = measurement.recording[self.cut :]
         said = np.pad(measurement.reference, (0, AHEAD))[self.cut + AHEAD :]
         left = enhance(heard, said, profile, "linear")
-        powers = (float(np.sum(np.square(x[self._tested], dtype=np.float64))) for x in (heard, left))
-        return float(np.subtract(*(decibels(power) for power in powers)))
+        before, after = (decibels(np.sum(np.square(x[self._tested], dtype=np.float64))) for x in (heard, left))
+        return float(before - after)
 
 
-def prove(
-    profile: Profile | None,
-    names: str | Sequence[str],
-    recording: Samples,
-    reference: Samples,
-) -> Proof:
+def prove(profile: Profile | None, names: str | Sequence[str], recording: Samples, reference: Samples) -> Proof:
     """Say whether the running filter is better with effects than without them, on seconds that their fit has not seen.
 
     Parameters
@@ -139,10 +134,8 @@ def prove(
     --------
     >>> import numpy as np
     >>> from edgefilter import calibrate, generate_sweep
-    >>> rng = np.random.default_rng(0)
-    >>> def fan(n):
-    ...     return 1e-3 * rng.standard_normal(n).astype(np.float32)
-    >>> sweep = generate_sweep()
+    >>> rng, sweep = np.random.default_rng(0), generate_sweep()
+    >>> fan = lambda n: 1e-3 * rng.standard_normal(n).astype(np.float32)
     >>> profile = calibrate(sweep, 0.5 * np.roll(sweep, 300) + fan(sweep.size), fan(64_000))
     >>> said = (0.2 * rng.standard_normal(80_000) * np.repeat(rng.uniform(size=25) > 0.3, 3200)).astype(np.float32)
     >>> heard = 0.5 * np.roll(said, 300) + 0.2 * np.roll(said, 900) + fan(said.size)
@@ -169,7 +162,7 @@ def prove(
 def proofs_until_kept(
     profile: Profile | None, names: str | Sequence[str], recording: Samples, reference: Samples
 ) -> tuple[Proof, ...]:
-    """`prove` of all names, then each time without the one that does most harm, as long as there is one: the last names what is kept."""
+    """`prove` of all names, then without the one that does most harm, while there is one: the last names what is kept."""
     proofs = [prove(profile, names, recording, reference)]
     while proofs[-1].worse and (culprit := proofs[-1].culprit):
         kept = tuple(name for name in proofs[-1].effects if name != culprit)

@@ -1,4 +1,4 @@
-"""A diagnosis of the first part of a recording, proven on the rest: a name with which the running filter is worse there is not given."""
+"""A diagnosis of the first part of a recording, proven on the rest: no name with which the running filter is worse."""
 
 from __future__ import annotations
 
@@ -45,11 +45,10 @@ def diagnose_proven(
 
     Notes
     -----
-    The first three fifths of the robot's voice are diagnosed, so that names, as values, come from seconds on which they
-    are not proven. The running filter then takes the rest (`prove`). Where it is worse with what was found, the
-    diagnosis is made anew without the effect that does most harm, until it is not: another one may take its place. Not
-    proven are events, which do not come again, and changes of the stationary noise. Where a recording is too short to
-    be cut, all of it is diagnosed and nothing proven.
+    The first three fifths of the robot's voice are diagnosed, the running filter then takes the rest (`prove`). Where it
+    is worse with what was found, the diagnosis is made anew without the effect that does most harm, until it is not:
+    another one may take its place. Not proven are events, which do not come again, and changes of the stationary noise.
+    Where a recording is too short to be cut, all of it is diagnosed and nothing proven.
 
     Examples
     --------
@@ -57,10 +56,8 @@ def diagnose_proven(
 
     >>> import numpy as np
     >>> from edgefilter import calibrate, generate_sweep
-    >>> rng = np.random.default_rng(0)
-    >>> def fan(n):
-    ...     return 1e-3 * rng.standard_normal(n).astype(np.float32)
-    >>> sweep = generate_sweep()
+    >>> rng, sweep = np.random.default_rng(0), generate_sweep()
+    >>> fan = lambda n: 1e-3 * rng.standard_normal(n).astype(np.float32)
     >>> profile = calibrate(sweep, 0.5 * np.roll(sweep, 300) + fan(sweep.size), fan(64_000))
     >>> said = (0.2 * rng.standard_normal(80_000) * np.repeat(rng.uniform(size=25) > 0.3, 3200)).astype(np.float32)
     >>> found = diagnose_proven(profile, 0.4 * np.roll(said, 300) + fan(said.size), said)
@@ -77,10 +74,8 @@ def diagnose_proven(
             profile, recording[:stop], reference[:stop], progress=progress, criteria=criteria, without=disproved
         )
         names = tuple(finding.effect for finding in found.ranking if lasts(finding.effect))
-        if not names:
-            return _told(found, disproved, unproven="nothing lasting was found")
-        if too_short:
-            return _told(found, disproved, unproven=too_short)
+        if too_short or not names:
+            return _told(found, disproved, unproven=too_short if names else "nothing lasting was found")
         if progress:
             progress("the running filter without and with what was found")
         proof = prove(profile, names, recording, reference)

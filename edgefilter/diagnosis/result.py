@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING, Literal, TypeAlias
 import numpy as np
 
 from edgefilter.diagnosis.closer_look import CloserLook
-from edgefilter.diagnosis.compare import Comparison
+from edgefilter.diagnosis.compare import Comparison, rounded
 from edgefilter.diagnosis.independence import Independence
 from edgefilter.diagnosis.laws import Law
 from edgefilter.echo.effect import Family
 from edgefilter.echo.measurement import Values
 from edgefilter.echo.model import EchoModel
-from edgefilter.types import Samples
+from edgefilter.types import Array, Samples
 
 if TYPE_CHECKING:
     from edgefilter.diagnosis.proof import Proof
@@ -30,39 +30,38 @@ SCHEMA = 2
 
 @dataclass(frozen=True)
 class Interval:
-    """A fitted parameter with the range that 90 % of resampled recordings give.
-
-    A tuple where there are several (times of jumps).
-    """
+    """A fitted parameter with the range that 90 % of resampled recordings give; tuples of several (times of jumps)."""
 
     value: float | tuple[float, ...]
     low: float | tuple[float, ...]
     high: float | tuple[float, ...]
     unit: str
 
-    def at(self, value: float | Samples) -> Interval:
+    @classmethod
+    def of(cls, value: float | Array, low: float | Array, high: float | Array, unit: str) -> Interval:
+        """From numbers, or arrays (k,)."""
+        plain = float if np.ndim(value) == 0 else lambda array: tuple(map(float, array))
+        return cls(plain(value), plain(low), plain(high), unit)
+
+    def at(self, value: float | Array) -> Interval:
         """The same range around another value; as it is where there are not as many."""
         if np.shape(value) != np.shape(self.value):
             return self
         low, high = (np.asarray(value) + end - self.value for end in (self.low, self.high))
-        plain = float if np.ndim(value) == 0 else lambda array: tuple(map(float, array))
-        return Interval(plain(value), plain(low), plain(high), self.unit)
+        return Interval.of(value, low, high, self.unit)
 
     def to_dict(self) -> dict[str, object]:
         """Ready for JSON."""
-        numbers = {
-            key: list(v) if isinstance(v := getattr(self, key), tuple) else v for key in ("value", "low", "high")
-        }
-        return {**numbers, "unit": self.unit}
+        return asdict(self)
 
 
 @dataclass(frozen=True, eq=False)
 class Finding:
     """One effect whose presence the data supports, with the held-out excess before and after it was added.
 
-    family: what kind of change it is. p_value: of what it explains, by itself or beside the others (diagnosis/ordinary.py).
-    share: part of the excess power that it takes away, 0 to 1. values: as fitted, for EchoModel.with_effect. prediction:
-    (n,) of the model with this and all earlier findings.
+    p_value: of what it explains, by itself or beside the others (diagnosis/ordinary.py). share: part of the excess power
+    that it takes away, 0 to 1. values: as fitted, for EchoModel.with_effect. prediction: (n,) of the model with this and
+    all earlier findings.
     """
 
     effect: str
@@ -79,11 +78,11 @@ class Finding:
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """An effect that was tried, whatever came of it.
+    """An effect that was tried, whatever came of it; why: in words.
 
     gain_db: by which it lowers the held-out level beside nothing else; beside_db: beside the others that were found;
     None where it was not fitted there. numbers: how many of its own carry its fit. delta_bic: the change of the Bayesian
-    information criterion on the samples held out; the lower, the better. rank: by that, from 1. why: in words.
+    information criterion on the samples held out; the lower, the better. rank: by that, from 1.
     """
 
     effect: str
@@ -97,15 +96,12 @@ class Candidate:
 
     def to_dict(self) -> dict[str, object]:
         """Ready for JSON."""
-        return {key: round(v, 4) if isinstance(v, float) else v for key, v in asdict(self).items()}
+        return dict(rounded(asdict(self)))
 
 
 @dataclass(frozen=True)
 class Known:
-    """One number of a finding with its standard error; source: where that is from, or why there is none.
-
-    index: which of several numbers that one parameter holds.
-    """
+    """One number of a finding, by parameter and index, with its standard error; source: where that is from, or why none."""
 
     effect: str
     parameter: str
@@ -123,19 +119,16 @@ class Known:
 
 @dataclass(frozen=True)
 class Precision:
-    """How well the found numbers are known, and what of it they share: (label, label, correlation), the closest first."""
+    """How well the found numbers are known, and what they share of it: (label, label, correlation), the closest first."""
 
     numbers: tuple[Known, ...] = ()
     correlations: tuple[tuple[str, str, float], ...] = ()
 
     def at(self, values: Mapping[str, Values]) -> Precision:
         """The same of other values, by effect."""
-        here = (np.ravel(values[known.effect][known.parameter]) for known in self.numbers)
-        found = zip(self.numbers, here, strict=True)
-        numbers = tuple(
-            replace(known, value=float(all_[known.index])) for known, all_ in found if known.index < all_.size
-        )
-        return replace(self, numbers=numbers)
+        here = [(known, np.ravel(values[known.effect][known.parameter])) for known in self.numbers]
+        numbers = (replace(known, value=float(found[known.index])) for known, found in here if known.index < found.size)
+        return replace(self, numbers=tuple(numbers))
 
     def to_dict(self) -> dict[str, object]:
         """Ready for JSON."""
@@ -147,13 +140,13 @@ class Precision:
 
 @dataclass(frozen=True, eq=False)
 class Diagnosis:
-    """The verdict on a recording: which effects are missing (ranking, strongest first), what is left, what cannot be predicted.
+    """The verdict on a recording: which effects are missing (ranking, strongest first), what is left.
 
-    tried: all effects that were tried. independence: of what is left with all that was found. precision: of the found
-    numbers. advice: what to record to tell candidates apart that explain nearly the same. proof: of what was found, in
-    the running filter, where it was asked for; unproven: why there is none. written: the comparison with the profile that
-    was written of it, whose figures it then has. closer_look: at what is left, where that is unexplained;
-    law: the free one that explains much more of it than what is named, where there is one.
+    irreducible_db: of that, what cannot be predicted. tried: all effects that were tried. independence: of what is left
+    with all that was found. precision: of the found numbers. advice: what to record to tell candidates apart that
+    explain nearly the same. proof: of what was found, in the running filter, where it was asked for; unproven: why there
+    is none. written: the comparison with the profile that was written of it, whose figures it then has. closer_look: at
+    what is left, where that is unexplained; law: the free one that explains much more of it than what is named.
     """
 
     verdict: Verdict
@@ -203,19 +196,20 @@ class Diagnosis:
             "offset_samples": compared["offset_samples"],
             "warnings": compared["warnings"],
             "tried": [candidate.to_dict() for candidate in self.tried],
-            "independence": {
-                "of_profile": compared["independence"],
-                "of_findings": self.independence.to_dict() if self.independence else None,
-            },
+            "independence": {"of_profile": compared["independence"], "of_findings": _dict_of(self.independence)},
             "precision": self.precision.to_dict(),
             "advice": list(self.advice),
-            "proof": self.proof.to_dict() if self.proof else None,
+            "proof": _dict_of(self.proof),
             "unproven": self.unproven,
-            "closer_look": self.closer_look.to_dict() if self.closer_look else None,
-            "law": self.law.to_dict() if self.law else None,
+            "closer_look": _dict_of(self.closer_look),
+            "law": _dict_of(self.law),
         }
 
 
+def _dict_of(part: Independence | Proof | CloserLook | Law | None) -> dict[str, object] | None:
+    return part.to_dict() if part else None
+
+
 def in_order(ranking: Sequence[Finding]) -> list[Finding]:
-    """The findings as one was added after the other, so that each starts where the one before it ended."""
+    """The findings as one was added after the other: each starts where the one before it ended."""
     return sorted(ranking, key=lambda finding: -finding.excess_before_db)

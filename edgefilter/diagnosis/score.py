@@ -6,55 +6,54 @@ from collections.abc import Sequence
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import fft
 from scipy.ndimage import uniform_filter1d
 
-from edgefilter.diagnosis.prepare import Prepared
+from edgefilter.diagnosis.prepare import FRAME, HOP, Prepared
 from edgefilter.dsp import fourier
 from edgefilter.dsp.frames import decibels, frames
 from edgefilter.dsp.psd import frequencies, hann, total_power, variance_at
 from edgefilter.echo.evidence import Score
 from edgefilter.echo.least_squares import normal_equations
-from edgefilter.echo.measurement import Measurement
 from edgefilter.echo.model import EchoModel
+from edgefilter.echo.recording import BLOCK
 from edgefilter.echo.wiener import convolve_from
 from edgefilter.types import Array, Samples
 
-FRAME, HOP = 512, 256
 FRAMES_PER_CELL = 8
-FEWEST = 4
+STEP = HOP * FRAMES_PER_CELL
+"""Samples from one cell to the next."""
+SPAN = STEP - HOP + FRAME
+"""Samples of one cell."""
+FEWEST = round(BLOCK / STEP)
 """Cells, half a second of them, that tell of what the robot's silences are."""
 TOLERANCE = 0.012
 """An ordinary robot's path differs from its calibration by this share at each frequency (0.1 dB, 0.7 degrees)."""
-TOLERANCE_TAPS, TOLERANCE_LEAD = 32, 16
+TOLERANCE_TAPS = 32
+"""Of the filter, 2 ms, its middle at 0, that takes up so much."""
 
 
 class Scorer:
     """Scores predictions of a prepared recording.
 
-    In the cells of time and frequency that no fit has seen the residual is held to be Gaussian (Whittle 1953), with the variance
-    that the model expects times an unknown factor, since every model errs: Student's t. So what counts is that the residual
-    sinks in many cells, not that one loud passage does.
+    In the cells of time and frequency that no fit has seen the residual is held to be Gaussian (Whittle 1953), with the
+    variance that the model expects times an unknown factor, since every model errs: Student's t. So what counts is that
+    the residual sinks in many cells, not that one loud passage does.
     """
 
     def __init__(self, prepared: Prepared) -> None:
-        self.prepared = prepared
-        measurement = prepared.measurement
+        self.prepared, self.measurement, self.usable = prepared, prepared.measurement, prepared.usable
         self.psd = prepared.noise_psd
-        self._fan = total_power(self.psd)
-        n = measurement.recording.size
+        n = self.usable.size
         self._window = hann(FRAME).astype(np.float32)
         hz = frequencies(FRAME // 2 + 1)
         self._expected = variance_at(hz, self.psd) * float(np.sum(self._window**2))
         self._rows = prepared.fit & prepared.usable & prepared.active & (np.arange(n) % 3 == 0)
-        starts = np.arange(0, n - FRAME - HOP * (FRAMES_PER_CELL - 1) + 1, HOP * FRAMES_PER_CELL)
-        span = FRAME + HOP * (FRAMES_PER_CELL - 1)
+        starts = np.arange(0, n - SPAN + 1, STEP)
         held = np.concatenate(([0], np.cumsum(prepared.held_out)))
         heard = np.concatenate(([0], np.cumsum(prepared.active)))
-        whole = held[starts + span] - held[starts] >= 0.9 * span
-        self.starts = starts[whole]
-        self.active_cells = (heard[self.starts + span] - heard[self.starts]) > 0.3 * span
+        self.starts = starts[held[starts + SPAN] - held[starts] >= 0.9 * SPAN]
+        self.active_cells = (heard[self.starts + SPAN] - heard[self.starts]) > 0.3 * SPAN
         silent = ~self.active_cells
         self.silent_cells = silent & (np.count_nonzero(silent) >= FEWEST)
         edges = np.unique(np.concatenate(([2], np.round(np.geomspace(4, FRAME // 2 - 6, 26)).astype(int))))
@@ -67,16 +66,6 @@ class Scorer:
         """What is expected over the fan where nothing is missing, (times, bands)."""
         return self._expected_cells(self.prepared.ordinary)
 
-    @property
-    def measurement(self) -> Measurement:
-        """The recording beside its reference."""
-        return self.prepared.measurement
-
-    @property
-    def usable(self) -> NDArray[np.bool_]:
-        """Samples where nobody else talks, (n,)."""
-        return self.prepared.usable
-
     def over_db(self, prediction: Samples, noise: Array) -> float:
         """Score.over_db of a prediction (n,), with noise (times, bands) over the fan's expected in the cells."""
         residual = self.measurement.recording - self.correct(prediction, self.measurement.whiten(prediction))
@@ -86,14 +75,12 @@ class Scorer:
         """Power of the residual (n,) over the fan's, in the held-out cells, (times, bands)."""
         at = self.starts[:, None] + np.arange(FRAMES_PER_CELL) * HOP
         read = frames(residual, FRAME, 1)[at] * self._window
-        ratio = fourier.power(fft.rfft(read, axis=-1)).mean(axis=1) / self._expected
-        return np.add.reduceat(ratio[:, : self._edges[-1]], self._edges[:-1], axis=1) / self.freedom
+        return self._by_band(fourier.power(fft.rfft(read, axis=-1)).mean(axis=1) / self._expected)
 
     def of(self, model: EchoModel) -> Score:
         """The score of a model: on what it predicts, with what it says that no waveform predicts counted as fan."""
-        measurement = self.prepared.measurement
-        gain = model.microphone_gain(measurement.recording.size)
-        return self.score(*measurement.heard(model), model.unpredictable(measurement.reference), gain)
+        gain = model.microphone_gain(self.usable.size)
+        return self.score(*self.measurement.heard(model), model.unpredictable(self.measurement.reference), gain)
 
     def score(
         self,
@@ -110,7 +97,7 @@ class Scorer:
         the recording as it is.
         """
         corrected = self.correct(prediction, white)
-        residual = self.prepared.measurement.recording - corrected
+        residual = self.measurement.recording - corrected
         expected = (*unpredictable, *self.prepared.ordinary)
         variance = self._expected_cells(expected)
         cells = self.cells(residual) / variance
@@ -132,17 +119,13 @@ class Scorer:
         )
 
     def floor_level(self, score: Score) -> float:
-        """Score.over_db of the cells in which the robot is silent, 0 where it never is: what is left when everything is explained."""
+        """Score.over_db of the cells in which the robot is silent, 0 where it never is: what is left at best."""
         return self._mean(decibels(0.5 + 0.5 * score.cells[self.silent_cells]))
-
-    def _mean(self, cells: Array) -> float:
-        """Mean over cells (times, bands), each by its degrees of freedom; 0 where there is none."""
-        return float(np.average(cells.mean(axis=0), weights=self.freedom)) if cells.size else 0.0
 
     def fan_gain_db(self, before: Score, after: Score) -> float:
         """By how much better another fan explains the cells in which the robot is silent (all where it never is), dB.
 
-        The same likelihood as Score.level_db: what is left over either fan falls, and the one that is louder costs half of its dB.
+        The same likelihood as Score.level_db: what is left over either fan falls, and the louder one costs half of its dB.
         """
         silent = self.silent_cells if self.silent_cells.any() else slice(None)
         was, now = (np.maximum(score.cells[silent], 1e-3) for score in (before, after))
@@ -150,41 +133,42 @@ class Scorer:
 
     def size_db(self, change: Samples) -> float:
         """Power of a change of the prediction (n,) over the fan in dB: as it is or whitened, whichever is more."""
-        plain, white = (
-            float(np.mean(change.astype(float) ** 2)) / self._fan,
-            float(np.mean(self.measurement.whiten(change).astype(float) ** 2)),
-        )
-        return float(10 * np.log10(max(plain, white, 1e-12)))
+        plain, white = (float(np.mean(x.astype(float) ** 2)) for x in (change, self.measurement.whiten(change)))
+        return float(10 * np.log10(max(plain / total_power(self.psd), white, 1e-12)))
+
+    def correct(self, prediction: Samples, white: Samples) -> Samples:
+        """A prediction, also given whitened, through the filter, within TOLERANCE of 1, that brings it closest to the recording."""
+        target, lead = self.measurement.white_recording - white, TOLERANCE_TAPS // 2
+        weights, _ = normal_equations([white], target, TOLERANCE_TAPS, lead, self._rows).solve(1e-5)
+        response = np.fft.rfft(weights[0], 256)
+        bounded = np.fft.irfft(response * np.minimum(1.0, TOLERANCE / np.maximum(np.abs(response), 1e-12)), 256)
+        return prediction + convolve_from(prediction, np.roll(bounded, 96), 96 + lead)
+
+    def _mean(self, cells: Array) -> float:
+        """Mean over cells (times, bands), each by its degrees of freedom; 0 where there is none."""
+        return float(np.average(cells.mean(axis=0), weights=self.freedom)) if cells.size else 0.0
+
+    def _by_band(self, spectra: Array) -> Array:
+        """Means of spectra (..., FRAME / 2 + 1) over the bins of each band, (..., bands)."""
+        return np.add.reduceat(spectra[..., : self._edges[-1]], self._edges[:-1], axis=-1) / self.freedom
 
     def _expected_cells(self, unpredictable: Sequence[tuple[Samples, Array]]) -> Array:
         """What is expected in the held-out cells, 1 where that is the fan alone, (times, bands)."""
         expected = np.ones((self.starts.size, self.freedom.size))
-        span = FRAME + HOP * (FRAMES_PER_CELL - 1)
         for variance, colour in unpredictable:
             total = np.concatenate(([0.0], np.cumsum(variance, dtype=np.float64)))
-            mean = (total[self.starts + span] - total[self.starts]) / span
+            mean = (total[self.starts + SPAN] - total[self.starts]) / SPAN
             bins = np.arange(FRAME // 2 + 1) * (colour.size - 1) / (FRAME // 2)
             share = np.interp(bins, np.arange(colour.size), colour / self.psd)
-            expected = expected + mean[:, None] * (
-                np.add.reduceat(share[: self._edges[-1]], self._edges[:-1]) / self.freedom
-            )
+            expected = expected + mean[:, None] * self._by_band(share)
         return expected
 
     def _over_expected(self, power: Array, unpredictable: Sequence[tuple[Samples, Array]]) -> Array:
-        """Return the power of the whitened residual over what is expected, (n,), both smoothed over 16 ms: when a knock comes is known to some ms."""
+        """Power of the whitened residual over what is expected, (n,), smoothed over 16 ms: a knock is known to some ms."""
         expected = np.ones_like(power)
         for variance, colour in unpredictable:
             expected += variance * float(np.mean(colour / self.psd))
         return uniform_filter1d(power, HOP) / uniform_filter1d(expected, HOP)
-
-    def correct(self, prediction: Samples, white: Samples) -> Samples:
-        """Put a prediction, and it whitened, through the short filter that brings it closest to the recording, within TOLERANCE of 1."""
-        measurement = self.prepared.measurement
-        target = measurement.white_recording - white
-        weights, _ = normal_equations([white], target, TOLERANCE_TAPS, TOLERANCE_LEAD, self._rows).solve(1e-5)
-        response = np.fft.rfft(weights[0], 256)
-        bounded = np.fft.irfft(response * np.minimum(1.0, TOLERANCE / np.maximum(np.abs(response), 1e-12)), 256)
-        return prediction + convolve_from(prediction, np.roll(bounded, 96), 96 + TOLERANCE_LEAD)
 
 
 def share_of(before_db: float, after_db: float) -> float:
