@@ -132,10 +132,7 @@ class Precision:
 
     def to_dict(self) -> dict[str, object]:
         """Ready for JSON."""
-        return {
-            "numbers": [asdict(known) for known in self.numbers],
-            "correlations": [[first, second, round(r, 4)] for first, second, r in self.correlations],
-        }
+        return {"numbers": [asdict(known) for known in self.numbers], "correlations": rounded(self.correlations)}
 
 
 @dataclass(frozen=True, eq=False)
@@ -185,16 +182,13 @@ class Diagnosis:
         return {
             "schema": SCHEMA,
             "verdict": self.verdict,
-            "excess_db": compared["excess_db"],
-            "noise_floor_db": compared["noise_floor_db"],
+            **{key: compared[key] for key in ("excess_db", "noise_floor_db")},
             "ranking": ranking,
             "evidence": self.evidence,
             "remaining_db": round(self.remaining_db, 3),
             "irreducible_db": round(self.irreducible_db, 3),
             "where": {key: compared[key] for key in ("bands", "times", "levels", "lags")},
-            "human": compared["human"],
-            "offset_samples": compared["offset_samples"],
-            "warnings": compared["warnings"],
+            **{key: compared[key] for key in ("human", "offset_samples", "warnings")},
             "tried": [candidate.to_dict() for candidate in self.tried],
             "independence": {"of_profile": compared["independence"], "of_findings": _dict_of(self.independence)},
             "precision": self.precision.to_dict(),
