@@ -39,7 +39,7 @@ SILENCE_DB = -15.0
 TALK_DB = 8.0
 """Over the fan, somebody talks: more than a reverberation tail in a pause, less than a soft voice at two metres."""
 GAP_S, EDGE_S = 1.0, 0.2
-"""Pauses of a talker that count as talk, and what is left out before and after talk."""
+"""Pauses of a talker, between two sentences, that count as talk, and what is left out before and after talk. By hand."""
 ORDINARY = 2.0
 """Times the calibrated distortion: that of speech was up to 3.4 dB off what multisines of its spectrum had shown."""
 CUT, CUT_DB = 32, -30.0

@@ -27,7 +27,7 @@ than all is worse than the one that is written."""
 NEAR = 0.1
 """Of the recording, how far either way the cut may move to fall into a pause."""
 LEAST_S = BLOCK / SAMPLE_RATE
-"""Seconds of the robot alone that each part must hold."""
+"""Seconds of the robot alone that each part must hold: of less nothing is fitted and tested in turn."""
 WORSE_DB = 0.2
 """By less ERLE than this two runs of the filter differ for no reason."""
 AHEAD = SAMPLE_RATE // 10
