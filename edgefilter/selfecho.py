@@ -41,7 +41,7 @@ def score(
 ) -> float:
     """How much of what the recogniser heard are the robot's own recent words, 0 to 1.
 
-    Nothing is deleted: people do repeat the robot's words, and what to do is the application's decision.
+    Nothing is deleted: people do repeat the robot's words, so the application decides what to do.
 
     Parameters
     ----------
@@ -86,7 +86,10 @@ def score(
     >>> round(score("turn it off", said, speech_probability=0.9), 2)
     0.84
     """
-    _check(heard, speech_probability)
+    if heard is not None and not (math.isfinite(heard[0]) and heard[0] <= heard[1] < math.inf):
+        raise UsageError(f"heard is {heard}, expected (start, end) in seconds with start <= end")
+    if speech_probability is not None and not 0.0 <= speech_probability <= 1.0:
+        raise UsageError(f"speech_probability is {speech_probability}, expected 0 to 1")
     words = normalise(hypothesis).split()
     robot = normalise(recent(said, heard))
     if not words or not robot:
@@ -109,11 +112,10 @@ def normalise(text: str) -> str:
     return " ".join("".join(c if c.isalnum() else " " for c in plain if c not in "'\u2019").split())
 
 
-def recent(said: str | Iterable[str | Said], heard: tuple[float, float] | None = None) -> str:
+def recent(said: str | Iterable[str | Said], heard: tuple[float, float] | None) -> str:
     """The robot's words that can have been heard then."""
-    pieces = [said] if isinstance(said, str) else said
     texts = []
-    for piece in pieces:
+    for piece in [said] if isinstance(said, str) else said:
         if isinstance(piece, str):
             texts.append(piece)
         elif heard is None or (piece.start - REACH_S <= heard[1] and piece.end + REACH_S >= heard[0]):
@@ -134,14 +136,11 @@ def explained(words: list[str], robot: str) -> float:
 
 
 def passages(heard: str, robot: str, least: int) -> NDArray[np.bool_]:
-    """Whether each letter is found in a passage of the robot's text that scores `least` or more, (len(heard),).
-
-    The best passage first, then what is left before and behind it.
-    """
+    """Whether each letter is found in a passage of the robot's text that scores `least` or more, (len(heard),)."""
     found = np.zeros(len(heard), bool)
     a, b = (np.array([ord(c) for c in text]) for text in (heard, robot))
     parts = [(0, a.size)]
-    while parts:
+    while parts:  # the best passage first, then what is left before and behind it
         start, end = parts.pop()
         if end - start < least:
             continue
@@ -181,10 +180,3 @@ def traced(best: NDArray[np.int64], equal: NDArray[np.bool_], row: int, column: 
         else:
             column -= 1
     return same
-
-
-def _check(heard: tuple[float, float] | None, probability: float | None) -> None:
-    if heard is not None and not (math.isfinite(heard[0]) and heard[0] <= heard[1] < math.inf):
-        raise UsageError(f"heard is {heard}, expected (start, end) in seconds with start <= end")
-    if probability is not None and not 0.0 <= probability <= 1.0:
-        raise UsageError(f"speech_probability is {probability}, expected 0 to 1")

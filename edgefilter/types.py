@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Literal, NamedTuple, TypeAlias, TypedDict
+from typing import Literal, NamedTuple, TypeAlias, TypedDict, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,8 +33,7 @@ class Block:
     """Samples of both channels that belong to the same stretch of the sample counter.
 
     mic: (n,) float32, full scale +-1, any n >= 0; of an array (n, channels). ref: (n,). start: counter of the first
-    sample.
-    lost: samples that the source could not deliver since the previous block (their place is filled, never silently).
+    sample. lost: samples that the source could not deliver since the previous block (silence is in their place).
     """
 
     mic: Samples
@@ -48,9 +47,8 @@ class Frame(NamedTuple):
 
     mic, reference, echo, error: (bins,) complex64. reference is delayed to where the robot's voice arrives at the
     microphone, echo is the linear stage's estimate of it, error = mic - echo. noise_psd, residual_psd: (bins,) float32,
-    expected |spectrum|^2 of the noise and of the residual echo in error. idle: whether nothing of the robot can be
-    audible. at_any_lag: whether the robot may be audible at a lag that nobody knows, so that nothing tells its voice
-    from a human's.
+    expected |spectrum|^2 of the noise and of the residual echo in error. idle: nothing of the robot can be audible.
+    at_any_lag: the robot may be audible at a lag that nobody knows, so that nothing tells its voice from a human's.
     """
 
     mic: Spectrum
@@ -70,39 +68,18 @@ class Output(NamedTuple):
     speech_probability: float | None = None
 
 
-EventKind: TypeAlias = Literal[
-    "realigned",
-    "speech_started",
-    "speech_stopped",
-    "overloaded",
-    "stepped_down",
-    "stepped_up",
-    "learned",
-    "unlearned",
-    "reference_missing",
-    "reference_late",
-    "robot_unfound",
-    "echo_unpredicted",
-    "rate_mismatch",
-    "lost",
-    "overrun",
-    "underrun",
-    "device_gone",
-    "device_back",
-]
+_Speech: TypeAlias = Literal["speech_started", "speech_stopped"]
+_Filter: TypeAlias = Literal["realigned", "overloaded", "stepped_down", "stepped_up", "learned", "unlearned"]
+_SetUp: TypeAlias = Literal["reference_missing", "reference_late", "robot_unfound", "echo_unpredicted", "rate_mismatch"]
+_Device: TypeAlias = Literal["lost", "overrun", "underrun", "device_gone", "device_back"]
+EventKind: TypeAlias = Literal[_Speech, _Filter, _SetUp, _Device]
 
-SET_UP_WRONG: tuple[EventKind, ...] = (
-    "reference_missing",
-    "reference_late",
-    "robot_unfound",
-    "echo_unpredicted",
-    "rate_mismatch",
-)
+SET_UP_WRONG: tuple[EventKind, ...] = get_args(_SetUp)
 """Kinds that say that something was connected wrongly, once each time it begins."""
 
 
 class Turn(NamedTuple):
-    """What the human said from when they were noticed, and half a second before, until they had finished, 30 s at most.
+    """What the human said, from half a second before they were noticed until they had finished, 30 s at most.
 
     start: the first sample, of the microphone. samples: (n,) float32; of an array filtered once more with what is known
     at the end, with one microphone what was streamed.
@@ -123,19 +100,18 @@ class Event:
         "speech_stopped": of the human, from engines that judge it. "overloaded", "stepped_down", "stepped_up": what too
         little or enough time led to. "learned", "unlearned": a better echo path was taken over, or given back.
         "reference_missing", "reference_late", "robot_unfound": the reference was silent from the start, comes after its
-        echo, or carries sound that is not found in the microphone, though that is louder then. "echo_unpredicted": the echo is found, and hardly
-        any of it can be subtracted. "rate_mismatch": a
-        plugin's or a service's sound comes at another pace than its rate and channels say.
-        "lost", "overrun", "underrun": samples that the sound devices of `edgefilter run` lost, callbacks that came too
-        late, "device_gone", "device_back": one that stopped, for which silence stands in, and runs again; not from an
-        `EgoFilter` itself.
+        echo, or carries sound that is not found in the microphone, though that is louder then. "echo_unpredicted": the
+        echo is found, and hardly any of it can be subtracted. "rate_mismatch": a plugin's or a service's sound comes at
+        another pace than its rate and channels say. Only from `edgefilter run`: "lost", "overrun", "underrun" (samples
+        that the sound devices lost, callbacks that came too late), "device_gone", "device_back" (a device stopped, so
+        that silence stands in for it, and runs again).
     sample : int
         By which sample of the microphone, in whole hops.
     detail : str
         The same in words, with figures.
     turn : Turn, optional
-        Of "speech_stopped": what the human said, for a recogniser that takes a turn as a whole. Not kept of long ago where
-        nobody asked for the event.
+        Of "speech_stopped": what the human said, for a recogniser that takes a turn as a whole; dropped after some time
+        where nobody asks for the event.
     """
 
     kind: EventKind
@@ -217,8 +193,7 @@ class Stats(TypedDict):
     engine, engine_reason: the one at work, and why it was chosen. engines: those that can take turns. model: what a
     network's file says of itself, None without one. latency_ms: algorithmic, None for an engine that needs the whole
     recording. samples: taken in so far. alignment, linear_stage: None for engines that go without. array: None with one
-    microphone. learning: what the
-    learner did, None without one.
+    microphone. learning: what the learner did, None without one.
     """
 
     engine: str
