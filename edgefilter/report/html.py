@@ -18,31 +18,17 @@ from edgefilter.diagnosis.compare import Comparison, describe
 from edgefilter.diagnosis.diagnose import Diagnosis, Finding
 from edgefilter.diagnosis.laws import Law
 from edgefilter.diagnosis.passport import ENOUGH_DB, Passport
-from edgefilter.diagnosis.prepare import Prepared, prepare
+from edgefilter.diagnosis.prepare import prepare
 from edgefilter.diagnosis.result import Precision, in_order
 from edgefilter.echo.effect import complete
 from edgefilter.echo.effects.catalogue import find
 from edgefilter.echo.model import EchoModel
 from edgefilter.errors import EdgefilterError
 from edgefilter.profile.data import Profile
-from edgefilter.report import passport
+from edgefilter.report import passport, text
 from edgefilter.report.media import MAX_SOUND_S, colour_scale, colours, sound, spectrogram_png
-from edgefilter.report.text import (
-    HEADS,
-    add_command,
-    cells_of,
-    correlograms,
-    decibels,
-    error_text,
-    family_line,
-    headline,
-    interval_text,
-    sentence,
-    title,
-)
 from edgefilter.types import SAMPLE_RATE, Samples
 
-ROLES = ("profile", "recording", "reference")
 LOUDER = 10.0
 """How much louder than the recording the residual is stored; the page turns it down to its true level, or not (20
 dB)."""
@@ -58,16 +44,9 @@ def comparison_page(found: Comparison, names: Mapping[str, Any]) -> str:
     names: profile (None: the recording itself was taken for it), recording, reference, what the files are called.
     """
     profile = "The profile" if names["profile"] else "A stationary linear path made from the recording itself"
-    excess = f"{profile} leaves {decibels(found.excess_db)} dB over the noise floor unexplained."
-    return _page(
-        {(): found},
-        (),
-        {
-            **{"kind": "comparison", "headline": excess, "findings": [], "command": [], "left": "", "look": None},
-            **_statistics(),
-        },
-        names,
-    )
+    excess = f"{profile} leaves {text.decibels(found.excess_db)} dB over the noise floor unexplained."
+    none: dict[str, object] = {"findings": [], "command": [], "left": "", "look": None}
+    return _page({(): found}, (), {"kind": "comparison", "headline": excess, **none, **_statistics()}, names)
 
 
 def diagnosis_page(
@@ -86,16 +65,16 @@ def diagnosis_page(
     variants = compare_variants(profile, found.model, steps, recording, reference)
     if found.written:
         variants[(True,) * len(steps)] = found.written
-    text = {
+    fields = {
         "kind": "diagnosis",
-        "headline": headline(found.verdict, [finding.effect for finding in found.ranking], bool(names["profile"])),
+        "headline": text.headline(found.verdict, [finding.effect for finding in found.ranking], bool(names["profile"])),
         "findings": [_finding(finding) for finding in found.ranking],
-        "command": add_command([one.effect for one in steps], names).split(" ") if steps and not outcome else [],
-        "left": sentence(found.evidence) if found.evidence else "",
+        "command": text.add_command([one.effect for one in steps], names).split(" ") if steps and not outcome else [],
+        "left": text.sentence(found.evidence) if found.evidence else "",
         "look": _look(found.closer_look, found.law),
         **_statistics(found),
     }
-    return _page(variants, steps, text, names, found.irreducible_db, outcome)
+    return _page(variants, steps, fields, names, found.irreducible_db, outcome)
 
 
 def passport_page(found: Passport, diagnosis: str, names: Mapping[str, Any]) -> str:
@@ -120,10 +99,8 @@ def passport_page(found: Passport, diagnosis: str, names: Mapping[str, Any]) -> 
     ]  # fmt: skip
     told = passport.expectation(found)
     fields = {
-        "style": _asset("page.css"),
         **{role: Path(str(names[role])).name for role in ("recording", "reference")},
         "seconds": f"{found.seconds:.1f}",
-        "date": datetime.date.today().isoformat(),
         **{key: told[key] for key in ("headline", "cause", "changes")},
         "engines": passport.engine_lines(found),
         "uncertainty": passport.uncertainty(found),
@@ -137,7 +114,7 @@ def passport_page(found: Passport, diagnosis: str, names: Mapping[str, Any]) -> 
         "bands": [[label, *row] for label, row in zip(labels, figures, strict=True)],
         "diagnosis": diagnosis,
     }
-    return _template("passport.html").render(fields)
+    return _rendered("passport.html", fields)
 
 
 def write_page(path: str | Path, page: str) -> None:
@@ -153,35 +130,32 @@ def write_page(path: str | Path, page: str) -> None:
 def _page(
     variants: Mapping[Choice, Comparison],
     steps: Sequence[Finding],
-    text: Mapping[str, object],
+    fields: Mapping[str, object],
     names: Mapping[str, Any],
     irreducible_db: float | None = None,
     outcome: Sequence[tuple[str, str, str]] = (),
 ) -> str:
     before, after = variants[(False,) * len(steps)], variants[(True,) * len(steps)]
-    scale = colour_scale(before.recording)
+    scale, roles = colour_scale(before.recording), ("profile", "recording", "reference")
     fields = {
-        **text,
-        **{role: Path(str(names[role] or "none: the recording itself")).name for role in ROLES},
+        **fields,
+        **{role: Path(str(names[role] or "none: the recording itself")).name for role in roles},
         "facts": [*_facts(before, after if steps else None, irreducible_db), *outcome],
-        "switches": [title(finding.effect) for finding in steps],
+        "switches": [text.title(finding.effect) for finding in steps],
         "notes": _notes(before),
         "seconds": f"{before.recording.size / SAMPLE_RATE:.1f}",
         "floor": f"{before.noise_floor_db:.1f}",
-        "date": datetime.date.today().isoformat(),
         "gradient": ", ".join("rgb({},{},{})".format(*colour) for colour in colours()[::7].tolist()),
         "bottom": f"{scale[0]:.0f}",
         "top": f"{scale[1]:.0f}",
         "free": "" if len(steps) <= MAX_FREE else "Later effects build on earlier ones and are switched with them.",
-        "style": _asset("page.css"),
-        "program": _asset("page.js"),
         "data": _data(variants, before, irreducible_db or 0.0, scale),
     }
-    return _template().render(fields)
+    return _rendered("page.html", fields)
 
 
-def _template(name: str = "page.html") -> jinja2.Template:
-    """A page; what is put into it is text, escaped unless the page calls it safe, and all of it has to be there."""
+def _rendered(name: str, fields: Mapping[str, object]) -> str:
+    """A page with its fields, which are escaped and have to be there, and the date."""
     page = jinja2.Environment(
         loader=jinja2.FunctionLoader(_asset),
         autoescape=True,
@@ -189,7 +163,7 @@ def _template(name: str = "page.html") -> jinja2.Template:
         keep_trailing_newline=True,
     )
     page.policies["json.dumps_kwargs"] = {"allow_nan": False, "separators": (",", ":")}
-    return page.get_template(name)
+    return page.get_template(name).render(fields, date=datetime.date.today().isoformat())
 
 
 def _data(
@@ -199,10 +173,9 @@ def _data(
     gain = 10 ** (-1 / 20) / max(float(abs(before.recording).max()), 1e-6)
     media: dict[str, str] = {}
 
-    def keep(content: str) -> str:
-        name = f"m{list(media.values()).index(content)}" if content in media.values() else f"m{len(media)}"
-        media[name] = content
-        return name
+    def kept(samples: Samples, gain: float) -> dict[str, str]:
+        contents = {"picture": spectrogram_png(samples, scale), "sound": sound(samples, gain)}
+        return {kind: media.setdefault(content, f"m{len(media)}") for kind, content in contents.items()}
 
     return {
         "seconds": before.recording.size / SAMPLE_RATE,
@@ -210,10 +183,7 @@ def _data(
         "irreducible_db": irreducible_db,
         "louder": LOUDER,
         "human": before.human,
-        "recording": {
-            "picture": keep(spectrogram_png(before.recording, scale)),
-            "sound": keep(sound(before.recording, gain)),
-        },
+        "recording": kept(before.recording, gain),
         "variants": {
             "".join("01"[on] for on in choice): {
                 "excess_db": round(found.excess_db, 3),
@@ -224,19 +194,13 @@ def _data(
                 "lags": _rounded(
                     (low, high, share * _error(found) / max(_error(before), 1e-6)) for low, high, share in found.lags
                 ),
-                "correlations": correlograms(found.independence),
-                "prediction": {
-                    "picture": keep(spectrogram_png(found.prediction, scale)),
-                    "sound": keep(sound(found.prediction, gain)),
-                },
-                "residual": {
-                    "picture": keep(spectrogram_png(found.residual, scale)),
-                    "sound": keep(sound(found.residual, gain * LOUDER)),
-                },
+                "correlations": text.correlograms(found.independence),
+                "prediction": kept(found.prediction, gain),
+                "residual": kept(found.residual, gain * LOUDER),
             }
             for choice, found in variants.items()
         },
-        "media": media,
+        "media": {name: content for content, name in media.items()},
     }
 
 
@@ -253,23 +217,28 @@ def _statistics(found: Diagnosis | None = None) -> dict[str, object]:
     """The tables of what was tried and of what is known; a comparison has none."""
     tried, known = (found.tried, found.precision) if found else ((), Precision())
     return {
-        "tried": {"heads": HEADS, "rows": [{"cells": cells_of(one), "named": one.verdict == "named"} for one in tried]},
+        "tried": {
+            "heads": text.HEADS,
+            "rows": [{"cells": text.cells_of(one), "named": one.verdict == "named"} for one in tried],
+        },
         "known": {
-            "numbers": [(one.label, error_text(one)) for one in known.numbers],
+            "numbers": [(one.label, text.error_text(one)) for one in known.numbers],
             "correlations": [(first, second, f"{r:+.2f}".replace("-", "−")) for first, second, r in known.correlations],
         },
-        "advice": [sentence(line) for line in found.advice] if found else [],
+        "advice": [text.sentence(line) for line in found.advice] if found else [],
     }
 
 
 def _facts(before: Comparison, after: Comparison | None, irreducible_db: float | None) -> list[tuple[str, str, str]]:
     """The figures at the top: term, value, explanation."""
-    facts = [("Unexplained", f"{decibels(before.excess_db)} dB", "over the noise floor, with the profile as it is")]
+    facts = [
+        ("Unexplained", f"{text.decibels(before.excess_db)} dB", "over the noise floor, with the profile as it is")
+    ]
     if after is not None:
-        facts.append(("With what was found", f"{decibels(after.excess_db)} dB", "over the noise floor"))
+        facts.append(("With what was found", f"{text.decibels(after.excess_db)} dB", "over the noise floor"))
     facts.append(("Noise floor", f"{before.noise_floor_db:.1f} dBFS", "the fan, from the calibration"))
     if irreducible_db is not None:
-        facts.append(("Irreducible", f"{decibels(irreducible_db)} dB", "that no model can predict"))
+        facts.append(("Irreducible", f"{text.decibels(irreducible_db)} dB", "that no model can predict"))
     return facts
 
 
@@ -293,21 +262,21 @@ def _look(look: CloserLook | None, law: Law | None) -> dict[str, object] | None:
                 "range": f"{low:+.1f} to {high:+.1f} {curve.y_unit}".replace("-", "−"),
             }
         )
-    said = f"{sentence(law.words)} It leaves {decibels(law.excess_db)} dB." if law else ""
-    return {"sentence": sentence(look.sentence), "law": said, "family": law.family if law else "", "curves": drawn}
+    said = f"{text.sentence(law.words)} It leaves {text.decibels(law.excess_db)} dB." if law else ""
+    return {"sentence": text.sentence(look.sentence), "law": said, "family": law.family if law else "", "curves": drawn}
 
 
 def _finding(finding: Finding) -> dict[str, object]:
     """What the page says of one effect."""
     return {
-        "title": title(finding.effect),
+        "title": text.title(finding.effect),
         "effect": finding.effect,
-        "before": decibels(finding.excess_before_db),
-        "after": decibels(finding.excess_after_db),
+        "before": text.decibels(finding.excess_before_db),
+        "after": text.decibels(finding.excess_after_db),
         "share": f"{100 * finding.share:.0f}",
-        "evidence": sentence(finding.evidence),
-        "family": sentence(family_line(finding)),
-        "parameters": [(name, interval_text(interval)) for name, interval in finding.parameters.items()],
+        "evidence": text.sentence(finding.evidence),
+        "family": text.sentence(text.family_line(finding)),
+        "parameters": [(name, text.interval_text(interval)) for name, interval in finding.parameters.items()],
     }
 
 
@@ -349,20 +318,12 @@ def compare_variants(
     prepared = prepare(profile, recording, reference)
     found = {}
     for choice in choices(len(findings)):
-        chosen, partial = [], model
+        partial, psd = model, prepared.noise_psd
         for finding, on in zip(findings, choice, strict=True):
-            if on:
-                chosen.append(finding)
+            if on:  # the noise that is expected is the fan's with this effect on it
+                effect = find(finding.effect)
+                psd = effect.noise_psd(complete(effect, finding.values), psd)
             else:
                 partial = partial.without_effect(finding.effect)
-        found[choice] = describe(_with_noise(prepared, chosen), partial)
+        found[choice] = describe(prepared.behind(psd), partial)
     return found
-
-
-def _with_noise(prepared: Prepared, findings: Sequence[Finding]) -> Prepared:
-    """The same recording, the noise to be expected being that with the chosen effects on the fan."""
-    psd = prepared.noise_psd
-    for finding in findings:
-        effect = find(finding.effect)
-        psd = effect.noise_psd(complete(effect, finding.values), psd)
-    return prepared.behind(psd)

@@ -22,21 +22,8 @@ LEVELS = 64
 """How many colours there are."""
 MAX_SOUND_S = 60
 """How much of a recording a page carries as sound."""
-_ANCHORS = np.array(
-    [
-        (8, 8, 20),
-        (38, 22, 74),
-        (89, 32, 110),
-        (147, 44, 103),
-        (201, 62, 78),
-        (238, 104, 45),
-        (250, 164, 34),
-        (252, 222, 120),
-        (255, 252, 225),
-    ],
-    float,
-)
-"""Dark to bright, each step about as much lighter as the one before."""
+_ANCHORS = "080814 26164a 59206e 932c67 c93e4e ee682d faa422 fcde78 fffce1"
+"""Red, green and blue, dark to bright, each step about as much lighter as the one before."""
 
 
 def spectrogram_db(samples: Samples) -> np.ndarray:
@@ -70,8 +57,9 @@ def spectrogram_png(samples: Samples, scale: tuple[float, float]) -> str:
 
 def colours() -> np.ndarray:
     """Colours, darkest first, (LEVELS, 3) uint8."""
-    at = np.linspace(0, len(_ANCHORS) - 1, LEVELS)
-    channels = [np.interp(at, np.arange(len(_ANCHORS)), anchors) for anchors in _ANCHORS.T]
+    anchors = np.frombuffer(bytes.fromhex(_ANCHORS), np.uint8).reshape(-1, 3)
+    at = np.linspace(0, len(anchors) - 1, LEVELS)
+    channels = [np.interp(at, np.arange(len(anchors)), channel) for channel in anchors.T]
     return np.stack(channels, axis=1).astype(np.uint8)
 
 

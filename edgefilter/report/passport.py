@@ -63,9 +63,7 @@ def advice(found: Passport) -> list[str]:
         ]
     told = [FIRST[found.cause]] if found.cause in FIRST else []
     if not found.pauses:
-        told.append(
-            "let the robot pause for some seconds while it is recorded: the noise is not known, and may be less"
-        )
+        told += ["let the robot pause for some seconds while it is recorded: the noise is not known, and may be less"]
     if found.mic_peak_db < QUIET_DB:
         told.append(f"turn the microphone's gain up: its peaks reach only {found.mic_peak_db:.0f} dBFS")
     if found.lag_spread_ms is not None and found.lag_spread_ms > UNSTABLE_MS:
@@ -82,14 +80,11 @@ def advice(found: Passport) -> list[str]:
 
 def rows(found: Passport) -> list[tuple[str, str, str]]:
     """Name, value and what it means, of everything that is one number."""
+    noise = f"{found.noise_db:.0f} dBFS" if found.noise_db > -119.0 else "none"
     told = [
         ("microphone", f"{found.mic_db:.0f} dBFS", f"peak {found.mic_peak_db:.0f} dBFS"),
         ("reference", f"{found.ref_db:.0f} dBFS", f"peak {found.ref_peak_db:.0f} dBFS"),
-        (
-            "noise",
-            f"{found.noise_db:.0f} dBFS" if found.noise_db > -119.0 else "none",
-            "in the robot's pauses" if found.pauses else "at most: in the quietest moments",
-        ),
+        ("noise", noise, "in the robot's pauses" if found.pauses else "at most: in the quietest moments"),
     ]
     if not found.found:
         return told
@@ -113,13 +108,12 @@ def lines(found: Passport, diagnosis: str) -> list[str]:
     told += [f"{name:<12}{value:<10}{what}" for name, value, what in rows(found)]
     if found.found:
         told += [f"{'':<12}{sentence(CAUSES[found.cause])}", ""]
-        names = list(found.engines)
-        told.append(f"{'band, Hz':<12}" + "".join(f"{head:>10}" for head in ("linear", "noise", "follows", *names)))
-        told += [
-            f"{f'{band.low:.0f}-{band.high:.0f}':<12}{band.removable_db:>10.1f}{band.over_noise_db:>10.1f}{band.follows:>10.2f}"
-            + "".join(f"{band.removed_db[name]:>10.1f}" for name in names)
-            for band in found.bands
-        ]
+        heads = ("linear", "noise", "follows", *found.engines)
+        told.append(f"{'band, Hz':<12}" + "".join(f"{head:>10}" for head in heads))
+        for band in found.bands:
+            row = f"{f'{band.low:.0f}-{band.high:.0f}':<12}{band.removable_db:>10.1f}{band.over_noise_db:>10.1f}"
+            engines = "".join(f"{band.removed_db[name]:>10.1f}" for name in found.engines)
+            told.append(f"{row}{band.follows:>10.2f}{engines}")
         told += ["", *(f"{name:<12}{what}" for name, what in engine_lines(found)), f"{'':<12}{uncertainty(found)}"]
         told += ["", f"{'diagnosis':<12}{diagnosis}"]
     return [*told, "change first:", *(f"  {at}. {line}" for at, line in enumerate(advice(found), start=1))]
@@ -127,15 +121,12 @@ def lines(found: Passport, diagnosis: str) -> list[str]:
 
 def engine_lines(found: Passport) -> list[tuple[str, str]]:
     """What is expected of each engine."""
-    return [
-        (
-            name,
-            f"robot alone lowered by {one.removed_db:.1f} dB"
-            + ("" if one.false_starts is None else f", {one.false_starts} false starts of speech")
-            + f"; a human {_against(found.human_db)}: SI-SDR {one.si_sdr_before_db:.1f} -> {one.si_sdr_db:.1f} dB",
-        )
-        for name, one in found.engines.items()
-    ]
+    told = []
+    for name, one in found.engines.items():
+        starts = "" if one.false_starts is None else f", {one.false_starts} false starts of speech"
+        human = f"a human {_against(found.human_db)}: SI-SDR {one.si_sdr_before_db:.1f} -> {one.si_sdr_db:.1f} dB"
+        told.append((name, f"robot alone lowered by {one.removed_db:.1f} dB{starts}; {human}"))
+    return told
 
 
 def uncertainty(found: Passport) -> str:

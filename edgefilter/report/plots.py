@@ -16,7 +16,7 @@ from edgefilter.profile.approximation import LinearApproximation
 from edgefilter.profile.data import DISTORTION_ORDERS, GRID_HZ, LOW_SNR_DB, Profile
 from edgefilter.profile.text import to_come
 from edgefilter.report.media import spectrogram_db
-from edgefilter.types import PRE_ROLL, SAMPLE_RATE, Samples
+from edgefilter.types import PRE_ROLL, SAMPLE_RATE, Array, Samples
 
 INK, ACCENT, SOFT = "#222222", "#b5442c", "#5b7c99"
 
@@ -24,8 +24,7 @@ INK, ACCENT, SOFT = "#222222", "#b5442c", "#5b7c99"
 def plot_profile(profile: Profile, path: str | Path) -> None:
     """Draw impulse response, decay, both readings of the response with the fan, and the bands, to a PNG, SVG or PDF.
 
-    Below them, where the profile knows it, what the best linear path makes of the voice at each level, and what it
-    leaves.
+    Below them, where the profile knows it: what a linear path makes of the voice at each level, and what it leaves.
     """
     known = profile.approximation
     figure = _figure(11, 8 if known is None else 11.5)
@@ -40,26 +39,18 @@ def plot_profile(profile: Profile, path: str | Path) -> None:
     first = ms < 40
     axes[0, 0].plot(ms[first], taps[first], color=INK, linewidth=0.8)
     _label(axes[0, 0], "Impulse response, first 40 ms", "ms after the direct sound", "amplitude")
-    left = to_come(profile.echo.impulse_response)
-    axes[0, 1].plot(
-        ms,
-        decibels(taps**2 / max(float(np.max(taps**2)), 1e-30), 1e-20),
-        color=SOFT,
-        linewidth=0.3,
-        label="impulse response, squared",
-    )
-    axes[0, 1].plot(ms, decibels(left / max(left[0], 1e-30), 1e-20), color=ACCENT, label="energy that is still to come")
+    squared, left = taps**2, to_come(profile.echo.impulse_response)
+    decay = _db(squared / max(float(np.max(squared)), 1e-30))
+    axes[0, 1].plot(ms, decay, color=SOFT, linewidth=0.3, label="impulse response, squared")
+    axes[0, 1].plot(ms, _db(left / max(left[0], 1e-30)), color=ACCENT, label="energy that is still to come")
     axes[0, 1].set_ylim(-90, 3)
     axes[0, 1].legend(loc="upper right")
     _label(axes[0, 1], "Decay", "ms after the direct sound", "dB")
     _draw_spectra(axes[1, 0], profile)
     _draw_bands(axes[1, 1], profile)
     if profile.warnings:
-        figure.suptitle(
-            "not to be trusted: " + "; ".join(text.split(":")[0][:60] for text in profile.warnings)[:140],
-            color=ACCENT,
-            fontsize=9,
-        )
+        warnings = "; ".join(text.split(":")[0][:60] for text in profile.warnings)[:140]
+        figure.suptitle(f"not to be trusted: {warnings}", color=ACCENT, fontsize=9)
     _save(figure, path)
 
 
@@ -76,9 +67,8 @@ def plot_before_after(signals: Mapping[str, Samples], path: str | Path) -> None:
         axis.set_title(name, loc="left", fontsize=10)
         axis.set_ylabel("frequency, kHz")
     axes[-1].set_xlabel("time, s")
-    figure.colorbar(
-        picture, ax=list(axes), label="colour: level, dB relative to the loudest sound", aspect=40, pad=0.01
-    )
+    label = "colour: level, dB relative to the loudest sound"
+    figure.colorbar(picture, ax=list(axes), label=label, aspect=40, pad=0.01)
     _save(figure, path)
 
 
@@ -86,12 +76,12 @@ def _draw_levels(part: SubFigure, known: LinearApproximation) -> None:
     """Densities at the microphone, one picture a level, the softest first."""
     curves = (("linear", INK, "-"), ("even", ACCENT, "-"), ("odd", ACCENT, ":"), ("noise", SOFT, "-"))
     left = known.over_linear_db("noise", "even", "odd")
-    top = float(decibels(known.linear.max(), 1e-20))
+    top = float(_db(known.linear.max()))
     axes = part.subplots(1, left.size, sharey=True, squeeze=False)[0]
     for i, axis in enumerate(axes):
         for name, colour, style in curves:
             density = getattr(known, name)[i, 1:]
-            density = np.where(density > 0.0, decibels(density, 1e-20), np.nan)  # chance takes the noise off to below 0
+            density = np.where(density > 0.0, _db(density), np.nan)  # chance takes the noise off to below 0
             label = name if name in ("linear", "noise") else f"{name} distortion"
             axis.semilogx(GRID_HZ[1:], density, color=colour, linestyle=style, linewidth=1.0, label=label)
         axis.set_xlim(50, 8000)
@@ -105,21 +95,14 @@ def _draw_spectra(axis: Axes, profile: Profile) -> None:
     n = max(1 << 15, profile.echo.impulse_response.size)
     spectrum = np.abs(np.fft.rfft(profile.echo.impulse_response, n))
     hz = np.arange(spectrum.size) * SAMPLE_RATE / n
-    axis.semilogx(
-        hz[1:], decibels(spectrum[1:] ** 2, 1e-20), color=SOFT, linewidth=0.5, label="from the impulse response"
-    )
-    axis.semilogx(
-        GRID_HZ[1:],
-        decibels(profile.response[1:] ** 2, 1e-20),
-        color=INK,
-        linewidth=1.2,
-        label="smoothed: |Hm Hs|, eq. (5) of Li et al. 2024",
-    )
+    axis.semilogx(hz[1:], _db(spectrum[1:] ** 2), color=SOFT, linewidth=0.5, label="from the impulse response")
+    smoothed = "smoothed: |Hm Hs|, eq. (5) of Li et al. 2024"
+    axis.semilogx(GRID_HZ[1:], _db(profile.response[1:] ** 2), color=INK, linewidth=1.2, label=smoothed)
     fan = axis.twinx()
-    fan.semilogx(GRID_HZ[1:], decibels(profile.noise_psd[1:], 1e-20), color=ACCENT, linewidth=1.0)
+    fan.semilogx(GRID_HZ[1:], _db(profile.noise_psd[1:]), color=ACCENT, linewidth=1.0)
     fan.set_ylabel("fan, dB of full scale² / Hz", color=ACCENT)
     axis.set_xlim(50, 8000)
-    axis.set_ylim(-60, max(10.0, float(decibels(profile.response**2, 1e-20).max()) + 3))
+    axis.set_ylim(-60, max(10.0, float(_db(profile.response**2).max()) + 3))
     axis.legend(loc="lower center", fontsize=8)
     _label(axis, "Response and fan", "Hz", "dB")
 
@@ -130,15 +113,14 @@ def _draw_bands(axis: Axes, profile: Profile) -> None:
     axis.bar(low, profile.band_snr_db, width=high - low, align="edge", color=colours, edgecolor="white")
     axis.axhline(LOW_SNR_DB, color=INK, linewidth=0.8, linestyle=":")
     axis.set_xscale("log")
-    orders = ", ".join(
-        f"{order}: {level:.0f}" for order, level in zip(DISTORTION_ORDERS, profile.distortion_db, strict=True)
-    )
-    _label(
-        axis,
-        f"Signal-to-noise ratio of the sweep by third octave; red: below {LOW_SNR_DB:.0f} dB, too noisy\nharmonic distortion by order, dB: {orders}",
-        "Hz",
-        "dB",
-    )
+    title = f"Signal-to-noise ratio of the sweep by third octave; red: below {LOW_SNR_DB:.0f} dB, too noisy"
+    by_order = zip(DISTORTION_ORDERS, profile.distortion_db, strict=True)
+    orders = ", ".join(f"{order}: {level:.0f}" for order, level in by_order)
+    _label(axis, f"{title}\nharmonic distortion by order, dB: {orders}", "Hz", "dB")
+
+
+def _db(power: Array) -> Array:
+    return decibels(power, 1e-20)
 
 
 def _label(axis: Axes, title: str, x: str, y: str) -> None:

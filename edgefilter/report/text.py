@@ -13,7 +13,6 @@ import numpy as np
 from edgefilter.diagnosis.compare import Comparison
 from edgefilter.diagnosis.diagnose import Diagnosis, Finding, Interval
 from edgefilter.diagnosis.independence import Correlogram, Independence
-from edgefilter.diagnosis.laws import Law
 from edgefilter.diagnosis.ordinary import percent
 from edgefilter.diagnosis.proof import Proof
 from edgefilter.diagnosis.result import Candidate, Known, Precision, in_order
@@ -102,9 +101,8 @@ def comparison_lines(found: Comparison) -> list[str]:
         f"lag         {found.offset_samples:+.2f} samples relative to the calibration, compensated",
     ]
     if math.isfinite(found.silence_excess_db):
-        lines.append(
-            f"silence     {decibels(found.silence_excess_db)} dB over the noise floor while the robot is silent"
-        )
+        silence = decibels(found.silence_excess_db)
+        lines.append(f"silence     {silence} dB over the noise floor while the robot is silent")
     if found.human:
         spans = ", ".join(f"{start:.1f}-{end:.1f} s" for start, end in found.human)
         lines.append(f"human       somebody talks at {spans}; no figure includes these times")
@@ -112,10 +110,9 @@ def comparison_lines(found: Comparison) -> list[str]:
     lines += _table("by frequency", "Hz", found.bands)
     lines += _table("by time", "s", coarser(found.times, len(found.bands)))
     lines += _table("by level of the robot's voice", "dBFS", found.levels)
-    lines += ["by lag behind the reference"]
-    lines += [
-        f"  {low:5g} to {high:4g} ms  {100 * share:5.0f} %   {_bar(share)}".rstrip() for low, high, share in found.lags
-    ]
+    lines.append("by lag behind the reference")
+    for low, high, share in found.lags:
+        lines.append(f"  {low:5g} to {high:4g} ms  {100 * share:5.0f} %   {_bar(share)}".rstrip())
     return lines + independence_lines(found.independence)
 
 
@@ -130,22 +127,24 @@ def diagnosis_lines(found: Diagnosis, calibrated: bool = True) -> list[str]:
     steps = [(profile, added[0].excess_before_db if added else found.comparison.excess_db)]
     steps += [(f"with {finding.effect}", finding.excess_after_db) for finding in added]
     top = max(1.0, *(db for _, db in steps))
+    steps.append(("irreducible part", found.irreducible_db))
     lines = [
         f"verdict     {found.verdict}: {headline(found.verdict, names, calibrated)}",
         "budget      dB over the noise floor",
     ]
     lines += [f"  {name:<27} {decibels(db):>6}  {_bar(db / top)}".rstrip() for name, db in steps]
-    lines.append(
-        f"  {'irreducible part':<27} {decibels(found.irreducible_db):>6}  {_bar(found.irreducible_db / top)}".rstrip()
-    )
     for rank, finding in enumerate(found.ranking, start=1):
         lines += _finding(rank, finding)
     if found.evidence:
         lines.append(f"left        {sentence(found.evidence)}")
     if found.closer_look:
         lines.append(f"closer      {sentence(found.closer_look.sentence)}")
-    if found.law:
-        lines.append(law_line(found.law))
+    if law := found.law:
+        beside = f" beside {joined(law.beside)}" if law.beside else ""
+        lines.append(
+            f"law         {law.family}: {law.words}; it leaves {decibels(law.excess_db)} dB{beside}; --write-effect MINE.py"
+            " writes this law as your own effect"
+        )
     if found.proof or found.unproven:
         lines.append(proof_line(found.proof, found.unproven))
     lines += precision_lines(found.precision)
@@ -153,15 +152,6 @@ def diagnosis_lines(found: Diagnosis, calibrated: bool = True) -> list[str]:
         lines += independence_lines(found.independence, "with all findings")
     lines += [*candidate_lines(found.tried), *(f"advice      {line}" for line in found.advice)]
     return [*lines, f"where       the excess lies with {profile}:", *comparison_lines(found.comparison)]
-
-
-def law_line(law: Law) -> str:
-    """Describe the change that no known effect explains, and say which option writes it to a file."""
-    beside = f" beside {joined(law.beside)}" if law.beside else ""
-    return (
-        f"law         {law.family}: {law.words}; it leaves {decibels(law.excess_db)} dB{beside}; --write-effect MINE.py writes"
-        " this law as your own effect"
-    )
 
 
 def add_command(effects: Sequence[str], names: Mapping[str, Any]) -> str:
@@ -187,15 +177,13 @@ def coarser(times: Sequence[tuple[float, float, float]], rows: int) -> list[tupl
 
 
 def _finding(rank: int, finding: Finding) -> list[str]:
-    lines = [
-        (
-            f"{rank:>2}. {title(finding.effect)} ({finding.effect}): {decibels(finding.excess_before_db)} to"
-            f" {decibels(finding.excess_after_db)} dB, {100 * finding.share:.0f} % of the excess"
-        ),
+    fall = f"{decibels(finding.excess_before_db)} to {decibels(finding.excess_after_db)} dB"
+    return [
+        f"{rank:>2}. {title(finding.effect)} ({finding.effect}): {fall}, {100 * finding.share:.0f} % of the excess",
         f"      {sentence(finding.evidence)}",
         f"      {family_line(finding)}",
+        *(f"      {name} = {interval_text(interval)}" for name, interval in finding.parameters.items()),
     ]
-    return lines + [f"      {name} = {interval_text(interval)}" for name, interval in finding.parameters.items()]
 
 
 def family_line(finding: Finding) -> str:
@@ -227,15 +215,9 @@ def candidate_lines(tried: Sequence[Candidate]) -> list[str]:
     """Format the table of all effects that the diagnosis has tried."""
     if not tried:
         return ["tried       nothing: the residual is no louder while the robot talks than while it is silent"]
-    widths = (4, 20, 9, 10, 7, 9)
-    table = [HEADS, *(cells_of(row) for row in tried)]
-    cells = (
-        [text.ljust(w) if column == 1 else text.rjust(w) for column, (text, w) in enumerate(zip(row, widths))]
-        for row in table
-    )
-    return ["tried       all effects, by Delta BIC; gains on held-out samples"] + [
-        f"  {' '.join(row)}  {whole[-1]}" for row, whole in zip(cells, table, strict=True)
-    ]
+    columns = "  {:>4} {:<20} {:>9} {:>10} {:>7} {:>9}  {}"
+    table = [columns.format(*row) for row in (HEADS, *map(cells_of, tried))]
+    return ["tried       all effects, by Delta BIC; gains on held-out samples", *table]
 
 
 def precision_lines(found: Precision) -> list[str]:
@@ -270,11 +252,10 @@ def correlograms(found: Independence | None) -> dict[str, object] | None:
     """Give the curves that the HTML page draws of a residual's correlations, and the sentences below them."""
     if found is None:
         return None
-    said = (
+    auto, *zones = [
         f"{name}, {100 * part.outside:.1f} % of lags exceed their bounds: {says}"
         for name, part, says in _verdicts(found)
-    )
-    auto, *zones = said
+    ]
     return {
         "auto": {**_drawn(found.autocorrelation), "says": [auto]},
         "cross": {**_drawn(found.cross_correlation), "says": zones},
@@ -287,21 +268,19 @@ def _verdicts(found: Independence) -> list[tuple[str, Correlogram, str]]:
     at = auto.lags_ms[auto.largest]
     rows = [("autocorrelation", auto, f"not white, largest value at {at:.1f} ms" if auto.dependent else "white")]
     for zone in found.zones:
-        heavy, light = (
-            f"{100 * zone.share:.0f} % of it: {zone.meaning}",
-            f"dependent, but below {100 * WEIGHT:.0f} % of it",
-        )
-        says = (heavy if zone.share >= WEIGHT else light) if zone.part.dependent else "independent"
+        says = f"{100 * zone.share:.0f} % of it: {zone.meaning}"
+        if not zone.part.dependent:
+            says = "independent"
+        elif zone.share < WEIGHT:
+            says = f"dependent, but below {100 * WEIGHT:.0f} % of it"
         rows.append((f"{zone.low_ms:g} to {zone.high_ms:g} ms", zone.part, says))
     return rows
 
 
 def _drawn(part: Correlogram) -> dict[str, object]:
-    step = float(part.lags_ms[1] - part.lags_ms[0])
-    arrays = {
-        name: np.round(getattr(part, name).astype(float), 4).tolist() for name in ("values", "expected", "bounds")
-    }
-    return {"from_ms": float(part.lags_ms[0]), "step_ms": step, **arrays}
+    curves = {"values": part.values, "expected": part.expected, "bounds": part.bounds}
+    rounded = {name: np.round(curve.astype(float), 4).tolist() for name, curve in curves.items()}
+    return {"from_ms": float(part.lags_ms[0]), "step_ms": float(part.lags_ms[1] - part.lags_ms[0]), **rounded}
 
 
 def cells_of(row: Candidate) -> tuple[str, ...]:
