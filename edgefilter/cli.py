@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import importlib
 import io
+import math
 import os
 import sys
 from collections.abc import Callable, Sequence
@@ -57,22 +58,9 @@ def build_parser() -> Parser:
     parser.add_argument("--version", action="version", version=f"edgefilter {__version__}")
     parser.add_argument("--debug", action="store_true", help="show a traceback when something fails")
     commands = parser.add_subparsers(dest="command", metavar="COMMAND")
-    for add_command in (
-        _demo,
-        _run,
-        _calibrate,
-        _compare,
-        _diagnose,
-        _probe,
-        _passport,
-        _add,
-        _remove,
-        _devices,
-        _doctor,
-        _serve,
-        _ros2,
-        _profile,
-    ):
+    for add_command in (_demo, _run, _calibrate, _compare, _diagnose, _probe, _passport, _add, _remove):
+        add_command(commands)
+    for add_command in (_devices, _doctor, _serve, _ros2, _profile):
         add_command(commands)
     return parser
 
@@ -163,10 +151,8 @@ def _calibrate(commands: argparse._SubParsersAction) -> None:
     option("--mic-channels", **MIC_CHANNELS)
     told = "multisines at three levels follow the sweep: measure the robot's distortion too"
     option("--multisine", action="store_true", help=told)
-    option("--live", action="store_true", help="play the sweep on --speaker and record it on --input")
-    told = "device for --live (default: %(default)s)"
-    option("--speaker", default="default", metavar="DEVICE", help=f"output {told}")
-    option("--input", default="mic", metavar="DEVICE", help=f"input {told}")
+    _live(option, "play the sweep on --speaker and record it on --input")
+    level = number(-90.0, 0.0, "a level from -90 to 0 dB of full scale", closed=True)
     told = "peak of the played sweep, dB of full scale (default: %(default)s)"
     option("--level-db", type=level, default=-12.0, metavar="DB", help=told)
     option("--save-input", metavar="DIR", help="with --live: also keep the recordings")
@@ -196,6 +182,7 @@ def _diagnose(commands: argparse._SubParsersAction) -> None:
     option("--channel", type=channel, metavar="N", help=told)
     told = "leave out what makes the running filter worse on seconds that no fit has used; takes a little longer"
     option("--prove", action="store_true", help=told)
+    rate = number(1e-6, 0.5, "a share from 0.000001 to 0.5, such as 0.01 for 1 in 100")
     told = "share of ordinary recordings in which an effect may be named by chance (default: %(default)g)"
     option("--false-rate", type=rate, default=Criteria.false_rate, metavar="P", help=told)
     _force(option)
@@ -222,10 +209,7 @@ def _probe(commands: argparse._SubParsersAction) -> None:
     told = "the robot alone, of which several explanations remain; without --reference: what was heard of --excitation"
     option("--recording", required=True, metavar="MIC", help=told)
     option("--reference", metavar="REF", help="what the robot said there, as it was sent to the loudspeaker")
-    option("--live", action="store_true", help="play on --speaker and record on --input")
-    told = "device for --live (default: %(default)s)"
-    option("--speaker", default="default", metavar="DEVICE", help=f"output {told}")
-    option("--input", default="mic", metavar="DEVICE", help=f"input {told}")
+    _live(option, "play on --speaker and record on --input")
     told = "of sound at most (default: %(default)g)"
     option("--seconds", type=positive, default=5.0, metavar="S", help=told)
     told = (
@@ -245,8 +229,9 @@ def _passport(commands: argparse._SubParsersAction) -> None:
     option("--reference", required=True, metavar="REF", help=told)
     told = "which engine is tried; repeatable (default: all of them)"
     option("--engine", action="append", choices=("linear", "ss", "crnn"), help=told)
+    level = number(-40.0, 20.0, "a level from -40 to 20 dB", closed=True)
     told = "level of the human whose SI-SDR is predicted, against the robot's (default: %(default)s)"
-    option("--human-db", type=human_level, default=-10.0, metavar="DB", help=told)
+    option("--human-db", type=level, default=-10.0, metavar="DB", help=told)
     option("--no-diagnosis", action="store_true", help="do not look for physical effects, which takes longest")
     _json(option)
     _report(option)
@@ -298,22 +283,13 @@ def _serve(commands: argparse._SubParsersAction) -> None:
     option = commands.add_parser("serve", help=told).add_argument
     told = "address to serve (default: %(default)s, which only this machine reaches); any other needs --token"
     option("--host", default="127.0.0.1", metavar="ADDRESS", help=told)
-    option(
-        "--port",
-        type=whole(0, 65535, "a port, 0 to 65535"),
-        default=10620,
-        metavar="N",
-        help="0: any that is free (default: %(default)s)",
-    )
+    told = "0: any that is free (default: %(default)s)"
+    option("--port", type=whole(0, 65535, "a port, 0 to 65535"), default=10620, metavar="N", help=told)
     option("--token", metavar="FILE", help="file with the secret that a client has to send")
     option("--profile", metavar="P.npz", help="calibrated robot, of all clients")
     option("--engine", **ENGINE)
-    option(
-        "--streams",
-        type=whole(1, 10_000, "a number of streams, 1 or more"),
-        metavar="N",
-        help="clients at a time (default: 4 a core)",
-    )
+    streams = whole(1, 10_000, "a number of streams, 1 or more")
+    option("--streams", type=streams, metavar="N", help="clients at a time (default: 4 a core)")
 
 
 def _ros2(commands: argparse._SubParsersAction) -> None:
@@ -335,7 +311,7 @@ def _ros2(commands: argparse._SubParsersAction) -> None:
     told = "channel of the microphone, from 0, that holds what is played, in place of the reference's topic"
     option("--reference-channel", type=channel, metavar="N", help=told)
     told = "channels of the reference (default: as many as the microphone has)"
-    option("--reference-channels", type=whole(1, 8, "1 to 8 channels"), metavar="N", help=told)
+    option("--reference-channels", type=eight, metavar="N", help=told)
     words = ros2.add_subparsers(dest="word", metavar="extract")
     option = words.add_parser("extract", help="write two topics of a recording as WAV files").add_argument
     option("recording", metavar="ROBOT.mcap")
@@ -347,20 +323,9 @@ def _ros2(commands: argparse._SubParsersAction) -> None:
 
 
 def _form(option: Callable[..., object]) -> None:
-    option(
-        "--rate",
-        type=whole(8000, 48000, "a rate, 8000 to 48000 Hz"),
-        default=16000,
-        metavar="HZ",
-        help="of the samples (default: %(default)s)",
-    )
-    option(
-        "--channels",
-        type=whole(1, 8, "1 to 8 channels"),
-        default=1,
-        metavar="N",
-        help="interleaved (default: %(default)s)",
-    )
+    rate = whole(8000, 48000, "a rate, 8000 to 48000 Hz")
+    option("--rate", type=rate, default=16000, metavar="HZ", help="of the samples (default: %(default)s)")
+    option("--channels", type=eight, default=1, metavar="N", help="interleaved (default: %(default)s)")
 
 
 def _profile(commands: argparse._SubParsersAction) -> None:
@@ -384,6 +349,13 @@ def _recording(option: Callable[..., object], profile_needed: bool) -> None:
     option("--reference", required=True, metavar="REF", help=told)
     _json(option)
     option("--effects", **EFFECTS)
+
+
+def _live(option: Callable[..., object], what: str) -> None:
+    option("--live", action="store_true", help=what)
+    told = "device for --live (default: %(default)s)"
+    option("--speaker", default="default", metavar="DEVICE", help=f"output {told}")
+    option("--input", default="mic", metavar="DEVICE", help=f"input {told}")
 
 
 def _report(option: Callable[..., object]) -> None:
@@ -414,16 +386,6 @@ def effect_file(text: str) -> str:
     return text
 
 
-def positive(text: str) -> float:
-    """A number above 0."""
-    return number(text, 0.0, 1e6, "a number above 0")
-
-
-def rate(text: str) -> float:
-    """A share of recordings, from one in a million to one half."""
-    return number(text, 1e-6, 0.5, "a share from 0.000001 to 0.5, such as 0.01 for 1 in 100")
-
-
 def whole(least: int, most: int, expected: str) -> Callable[[str], int]:
     """A function that reads a whole number from least to most, else raises an error that says what was expected."""
 
@@ -435,11 +397,23 @@ def whole(least: int, most: int, expected: str) -> Callable[[str], int]:
     return read
 
 
-def level(text: str) -> float:
-    """Level of a peak: at most full scale, and above what 16 bit can hold."""
-    return number(text, -90.0, 0.0, "a level from -90 to 0 dB of full scale", closed=True)
+def number(least: float, most: float, expected: str, closed: bool = False) -> Callable[[str], float]:
+    """The same for any number between them, closed: or one of them."""
+
+    def read(text: str) -> float:
+        try:
+            value = float(text)
+        except ValueError:
+            value = math.nan
+        if not (least <= value <= most if closed else least < value < most):
+            raise argparse.ArgumentTypeError(f"'{text}' is not {expected}")
+        return value
+
+    return read
 
 
+positive = number(0.0, 1e6, "a number above 0")
+eight = whole(1, 8, "1 to 8 channels")
 channel = whole(0, 63, "the number of a channel, 0 to 63")
 """Of a device or a file, counted from 0: interfaces of studios have so many."""
 
@@ -452,22 +426,6 @@ def channels(text: str) -> Sequence[int]:
     if len(set(found)) < len(found) or len(found) > MOST_MICROPHONES:
         raise argparse.ArgumentTypeError(f"'{text}' does not name one to {MOST_MICROPHONES} different channels")
     return found
-
-
-def human_level(text: str) -> float:
-    """Level of a human against the robot."""
-    return number(text, -40.0, 20.0, "a level from -40 to 20 dB", closed=True)
-
-
-def number(text: str, low: float, high: float, expected: str, closed: bool = False) -> float:
-    """A number between low and high, closed: or one of them; else an error that says what was expected."""
-    try:
-        value = float(text)
-    except ValueError:
-        value = float("nan")
-    if not (low <= value <= high if closed else low < value < high):
-        raise argparse.ArgumentTypeError(f"'{text}' is not {expected}")
-    return value
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -505,7 +463,7 @@ def _call(arguments: list[str]) -> int:
     check_outputs(args)
     for file in getattr(args, "effects", []):
         load_effect(file)
-    return importlib.import_module(f"edgefilter.commands.{args.command}").main(args)
+    return importlib.import_module(f"edgefilter.commands.{args.command}").main(args) or 0
 
 
 def _forget_output() -> None:

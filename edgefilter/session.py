@@ -18,6 +18,8 @@ from edgefilter.filter.ego_filter import EgoFilter
 from edgefilter.filter.timing import peak_memory_mb
 from edgefilter.types import SAMPLE_RATE, Block, Event, Samples
 
+SILENT_DB = float(decibels(0.0))
+"""Level of digital silence, dB of full scale."""
 AUDIBLE_DB = -50.0
 """Level of the reference, dB of full scale, above which the robot counts as talking: of the residual that is shown."""
 
@@ -32,9 +34,9 @@ class Progress:
 
     samples: int = 0
     lost: int = 0
-    mic_db: float = -120.0
-    ref_db: float = -120.0
-    out_db: float = -120.0
+    mic_db: float = SILENT_DB
+    ref_db: float = SILENT_DB
+    out_db: float = SILENT_DB
     residual_db: float | None = None
     load: float = 0.0
     _out_power: float = 0.0
@@ -90,8 +92,8 @@ class RunReport:
 
 
 def level_db(x: Samples) -> float:
-    """RMS level of x (n,) in dB of full scale; -120 for silence."""
-    return float(decibels(float(np.mean(np.square(x, dtype=np.float64))))) if x.size else -120.0
+    """RMS level of x (n,) in dB of full scale."""
+    return float(decibels(float(np.mean(np.square(x, dtype=np.float64))))) if x.size else SILENT_DB
 
 
 def filter_blocks(
@@ -109,8 +111,7 @@ def filter_blocks(
     A source or sink that fails on the way (a device that vanished, a truncated file, a full disk) ends the run: what
     was received is filtered and flushed as far as the sink still takes it, and the error stands in report.failure.
 
-    show : called with the levels after each block.
-    tell : called with each event of the filter, and with what troubles(sample, last) reports of source and sink.
+    show: called after each block. tell: called with each event of the filter, and of source and sink by troubles(sample, last).
     """
     report, progress = RunReport(), Progress()
     began = time.perf_counter()

@@ -1,16 +1,29 @@
-"""`edgefilter add`: fit effects to a recording and write a profile that has them."""
+"""`edgefilter add`: fit effects to a recording, prove them in the running filter, and write a profile that has them."""
 
 from __future__ import annotations
 
 import argparse
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
 
 from edgefilter.commands.display import print_result, progress
-from edgefilter.commands.fitting import fit
 from edgefilter.commands.recordings import load
+from edgefilter.diagnosis.compare import Comparison
+from edgefilter.diagnosis.diagnose import PROMISE_DB, Diagnosis, add, settle
+from edgefilter.diagnosis.proof import Proof, proofs_until_kept, prove
+from edgefilter.echo.effect import Effect
 from edgefilter.echo.effects.catalogue import find
+from edgefilter.echo.measurement import Values
+from edgefilter.echo.running import reach
+from edgefilter.errors import EdgefilterError, SignalError
+from edgefilter.profile.data import Profile
+from edgefilter.report.text import UNITS, decibels, figure, joined, proof_line
+from edgefilter.types import Samples
 
 
-def main(args: argparse.Namespace) -> int:
+def main(args: argparse.Namespace) -> None:
     names = tuple(dict.fromkeys(args.effect))
     for name in names:
         find(name)
@@ -20,4 +33,149 @@ def main(args: argparse.Namespace) -> int:
     fitted.profile.save(args.output)
     lines = [*fitted.lines(), f"written to {args.output}"]
     print_result(args, lines, {"schema": 2, **fitted.to_dict(), "output": args.output})
-    return 0
+
+
+class Refused(EdgefilterError):
+    """What was fitted would make the running filter worse, so that nothing was written."""
+
+
+@dataclass(frozen=True, eq=False)
+class Fitted:
+    """A profile with effects, the comparisons before and after, and the proof; unproven: why there is none.
+
+    found: the diagnosis that named them, with the figures of that profile where this has all that it named. promised_db:
+    what it left of half of the recording, with the effects fitted to the other half.
+    """
+
+    names: tuple[str, ...]
+    dropped: tuple[str, ...]
+    profile: Profile
+    before: Comparison
+    after: Comparison
+    proof: Proof | None
+    unproven: str = ""
+    found: Diagnosis | None = None
+    promised_db: float | None = None
+
+    def to_dict(self) -> dict[str, Any]:
+        """Ready for JSON."""
+        values = dict(self.profile.echo.effects)
+        return {
+            "effects": {name: _figures(find(name), values[name]) for name in self.names},
+            "dropped": list(self.dropped),
+            "excess_before_db": self.before.excess_db,
+            "excess_after_db": self.after.excess_db,
+            "noise_floor_db": self.after.noise_floor_db,
+            "proof": self.proof.to_dict() if self.proof else None,
+            **({} if self.promised_db is None else {"promised_db": self.promised_db}),
+        }
+
+    def facts(self) -> list[tuple[str, str, str]]:
+        """For the top of the page: term, value, explanation."""
+        facts = []
+        if self.found is None or self.found.written is None:
+            what = f"over the noise floor, with {joined(self.names)}"
+            facts.append(("Written", f"{decibels(self.after.excess_db)} dB", what))
+        if proof := self.proof:
+            erle = f"{decibels(proof.erle_before_db)} to {decibels(proof.erle_after_db)} dB"
+            what = f"of the robot taken away, on {proof.seconds:.1f} s that no fit has heard"
+            facts.append(("Running filter", erle, what))
+        return facts
+
+    def lines(self) -> list[str]:
+        """For the terminal: the excess before and after, the values, the proof, what to beware of."""
+        values = dict(self.profile.echo.effects)
+        added = joined(self.names) or "nothing"
+        before_db, after_db = self.before.excess_db, self.after.excess_db
+        lines = [
+            f"{added} added: {decibels(before_db)} dB over the noise floor before, {decibels(after_db)} dB after,"
+            " fitted to all of the recording"
+        ]
+        if self.promised_db is not None:
+            lines.append(
+                f"promised    fitted to half of it they left {decibels(self.promised_db)} dB of the other half"
+            )
+        for name in self.names:
+            lines += _values(name, values[name], len(self.names) > 1)
+        lines += [f"{'recording':<12}{text}" for text in self.before.warnings]
+        lines.append(proof_line(self.proof, self.unproven))
+        lines += [f"{'dropped':<12}{name}: with it the running filter would be worse" for name in self.dropped]
+        lines += [
+            f"NOTE        {name} happened in this recording and is kept with it: of others the profile predicts what it"
+            " did before"
+            for name in self.names
+            if find(name).event
+        ]
+        lines += [f"NOTE        {name}: {note}" for name in self.names if (note := reach(find(name), values[name]))]
+        if self.promised_db is not None and after_db > self.promised_db + PROMISE_DB:
+            missing = f"{joined(self.dropped)} is not in it" if self.dropped else "no fit to all of it explains as much"
+            lines.append(f"NOTE        what is written leaves more than the diagnosis did: {missing}")
+        if self.names and round(after_db, 1) >= round(before_db, 1):  # as they are shown
+            what = "this effect does" if len(self.names) == 1 else "these effects do"
+            lines.append(f"WARNING     the error did not fall: {what} not explain the recording")
+        return lines
+
+
+def fit(
+    profile: Profile | None,
+    start: Profile,
+    names: tuple[str, ...],
+    recording: Samples,
+    reference: Samples,
+    *,
+    force: bool,
+    found: Diagnosis | None = None,
+) -> Fitted:
+    """The effects fitted to the recording on top of start, and proven against profile.
+
+    start: the profile, or one made from the recording where there is none. found: the diagnosis that named them: then an
+    effect that makes the filter worse is left out where the others help. Raises Refused where the filter would be worse,
+    unless force.
+    """
+    proofs: tuple[Proof, ...] = ()
+    unproven = "there is nothing to prove"
+    try:
+        if names or profile is None:
+            proofs = (
+                proofs_until_kept(profile, names, recording, reference)
+                if found and not force
+                else (prove(profile, names, recording, reference),)
+            )
+    except SignalError as error:
+        if not force:
+            raise
+        unproven = str(error)
+    proof, unproven = (proofs[-1], "") if proofs else (None, unproven)
+    dropped = tuple(earlier.culprit for earlier in proofs[:-1] if earlier.culprit)
+    names = tuple(name for name in names if name not in dropped)
+    if proof and proof.worse and not force:
+        raise Refused(_refusal(proof))
+    if found and profile and names:
+        knowing, after, told = settle(profile, found, names, recording, reference)
+        before = found.comparison if told is found else told.comparison
+        return Fitted(names, dropped, knowing, before, after, proof, unproven, told, found.remaining_db)
+    return Fitted(names, dropped, *add(start, names, recording, reference), proof, unproven, found)
+
+
+def _figures(effect: Effect, values: Values) -> dict[str, Any]:
+    told = {p.name: {"value": np.asarray(values[p.name]).tolist(), "unit": p.unit} for p in effect.told}
+    return {"this_recording_only": effect.event, "at_run_time": reach(effect, values), "parameters": told}
+
+
+def _values(name: str, values: Values, named: bool) -> list[str]:
+    lines = []
+    for p in find(name).told:
+        value = np.asarray(values[p.name])
+        shown = f"{value.size} values" if value.size > 6 else ", ".join(figure(v) for v in value.ravel())
+        lines.append(f"  {f'{name} ' if named else ''}{p.name} = {shown} {UNITS.get(p.unit, p.unit)}".rstrip())
+    return lines
+
+
+def _refusal(proof: Proof) -> str:
+    what = joined(proof.effects) or "a profile made from this recording"
+    others = f"; without {proof.culprit} it is {dict(proof.without)[proof.culprit]:.1f} dB" if proof.culprit else ""
+    return (
+        f"{what} would make the running filter worse: ERLE {proof.erle_before_db:.1f} dB before,"
+        f" {proof.erle_after_db:.1f} dB after, on {proof.seconds:.1f} s of the robot that the fit has not"
+        f" seen{others}; nothing is written (--force writes it)"
+    )

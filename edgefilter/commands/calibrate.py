@@ -6,17 +6,19 @@ import argparse
 import datetime
 import shutil
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 
 from edgefilter.audio.files import write_file
+from edgefilter.audio.measure import play_and_record
 from edgefilter.calibration.calibrate import calibrate
 from edgefilter.calibration.multisine import SWEEP_PART, calibrate_multisine, generate_multisine
 from edgefilter.calibration.sweep import generate_sweep
 from edgefilter.commands.display import countdown, print_result, say
+from edgefilter.commands.outputs import RECORDINGS, flag
 from edgefilter.commands.profile import summary
 from edgefilter.commands.recordings import read
 from edgefilter.errors import DeviceError, UsageError
@@ -29,51 +31,43 @@ BUFFERS_S = (0.2, 0.4, 0.6)
 """Asked of the sound system, the later ones where the first lost sound. 0.2 s lost nothing beside a client of 20 ms on a
 PulseAudio null sink, where 0.05 s did four times of four; with two of 0.6 s the delay is still below the 1.6 s in which a
 calibration looks for the sweep."""
-RECORDINGS = ("sweep_reference", "sweep_recording", "noise_recording")
 
 
-def main(args: argparse.Namespace) -> int:
-    given = [name for name in RECORDINGS if getattr(args, name)]
+def main(args: argparse.Namespace) -> None:
+    given = [flag(name) for name in RECORDINGS if getattr(args, name)]
+    missing = [flag(name) for name in RECORDINGS if not getattr(args, name)]
     if args.excitation:
-        return _write_sound(args, given)
-    if args.live and given:
-        raise UsageError(
-            f"--live makes its own recordings, found --{given[0].replace('_', '-')} too: leave one of them out"
-        )
-    if not args.live and len(given) < len(RECORDINGS):
-        missing = " ".join(f"--{name.replace('_', '-')} FILE" for name in RECORDINGS if name not in given)
-        raise UsageError(f"calibration needs three recordings, missing: {missing} (or --live to make them now)")
-    if args.live:
+        _write_sound(args, given)
+    elif args.live:
+        if given:
+            raise UsageError(f"--live makes its own recordings, found {given[0]} too: leave one of them out")
         with _folder(args.save_input) as folder:
-            return _calibrate(args, f"live: {args.speaker} to {args.input}", *_record(args, folder))
-    names = [getattr(args, name) for name in RECORDINGS]
-    wanted = (None, args.mic_channels, args.mic_channels)
-    recordings = (
-        read(path, role.replace("_", " "), channels) for path, role, channels in zip(names, RECORDINGS, wanted)
-    )
-    return _calibrate(args, ", ".join(names), *recordings)
-
-
-def _calibrate(args: argparse.Namespace, source: str, sweep: Samples, recording: Samples, noise: Samples) -> int:
-    """Make the profile and say what is in it."""
-    today = datetime.date.today().isoformat()
-    if args.multisine:
-        profile = calibrate_multisine(sweep, recording, noise, created=today, source=source)
+            _calibrate(args, f"live: {args.speaker} to {args.input}", *_record(args, folder))
+    elif missing:
+        files = " ".join(f"{name} FILE" for name in missing)
+        raise UsageError(f"calibration needs three recordings, missing: {files} (or --live to make them now)")
     else:
-        profile = calibrate(sweep, recording, noise, created=today, source=source)
+        names = [getattr(args, name) for name in RECORDINGS]
+        wanted = (None, args.mic_channels, args.mic_channels)
+        recordings = (read(path, role.replace("_", " "), only) for path, role, only in zip(names, RECORDINGS, wanted))
+        _calibrate(args, ", ".join(names), *recordings)
+
+
+def _calibrate(args: argparse.Namespace, source: str, sweep: Samples, recording: Samples, noise: Samples) -> None:
+    """Make the profile and say what is in it."""
+    make = calibrate_multisine if args.multisine else calibrate
+    profile = make(sweep, recording, noise, created=datetime.date.today().isoformat(), source=source)
     profile.save(args.output)
     print_result(args, [describe(profile), f"written to {args.output}"], summary(profile))
-    return 0
 
 
-def _write_sound(args: argparse.Namespace, given: list[str]) -> int:
+def _write_sound(args: argparse.Namespace, given: list[str]) -> None:
     """The sound that a calibration plays, to a file, for a robot that this program does not run on."""
-    for name in (*given, *(word for word in ("live", "json") if getattr(args, word))):
-        raise UsageError(f"--excitation only writes the sound to be played: leave --{name.replace('_', '-')} out")
+    for name in (*given, *(flag(word) for word in ("live", "json") if getattr(args, word))):
+        raise UsageError(f"--excitation only writes the sound to be played: leave {name} out")
     sound = _sound(args)
     write_file(args.excitation, sound)
     print(f"{sound.size / SAMPLE_RATE:.0f} s of sound to be played written to {args.excitation}")
-    return 0
 
 
 def _sound(args: argparse.Namespace) -> Samples:
@@ -96,22 +90,21 @@ def _record(args: argparse.Namespace, folder: Path) -> tuple[Samples, Samples, S
     silence = np.zeros(NOISE_S * SAMPLE_RATE, np.float32)
     write_file(folder / "sweep_reference.wav", sound, float32=True)
     told = f"now quiet: {NOISE_S} s of the robot's noise alone"
-    noise = take(args, silence, told, lambda heard: write_file(folder / "noise_recording.wav", heard, float32=True))
+    noise = take(args, silence, told, folder / "noise_recording.wav")
     told = f"now playing: {round(sound.size / SAMPLE_RATE)} s of {name}"
-    swept = take(args, sound, told, lambda heard: write_file(folder / "sweep_recording.wav", heard, float32=True))
-    return sound, swept, noise
+    return sound, take(args, sound, told, folder / "sweep_recording.wav"), noise
 
 
-def take(
-    args: argparse.Namespace, sound: Samples, what: str, keep: Callable[[Samples], None] = lambda samples: None
-) -> Samples:
-    """Play on --speaker and record on --input, again with larger buffers where something was lost: the hole would be measured."""
-    from edgefilter.audio.measure import play_and_record
+def take(args: argparse.Namespace, sound: Samples, what: str, file: Path | None = None) -> Samples:
+    """Play on --speaker and record on --input, again with larger buffers where something was lost: the hole would be measured.
 
+    file: keeps each recording, also one with holes.
+    """
     for latency_s in BUFFERS_S:
         channels = getattr(args, "mic_channels", None)
         found, holes = play_and_record(args.speaker, args.input, sound, latency_s, countdown(what), channels)
-        keep(found)
+        if file:
+            write_file(file, found, float32=True)
         if not holes:
             return found
         say(f"the recording has holes ({holes})")

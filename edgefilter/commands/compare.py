@@ -11,7 +11,7 @@ from edgefilter.diagnosis.compare import compare
 from edgefilter.report.text import comparison_lines
 
 
-def main(args: argparse.Namespace) -> int:
+def main(args: argparse.Namespace) -> None:
     html = report_part("html") if args.report else None
     profile, recording, reference = load(args)
     with progress("comparison"):
@@ -22,4 +22,3 @@ def main(args: argparse.Namespace) -> int:
     if html:
         html.write_page(args.report, html.comparison_page(found, vars(args)))
         print_result(args, [f"report      {args.report}"])
-    return 0

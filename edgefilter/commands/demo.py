@@ -13,8 +13,8 @@ import numpy as np
 import soundfile
 
 from edgefilter.audio.files import FileSink, FileSource, write_file
+from edgefilter.commands.add import Fitted, fit
 from edgefilter.commands.display import describe_latency, print_result, progress, report_part, say
-from edgefilter.commands.fitting import Fitted, fit
 from edgefilter.diagnosis.compare import compare
 from edgefilter.diagnosis.diagnose import diagnose
 from edgefilter.diagnosis.result import in_order
@@ -34,56 +34,55 @@ HUMAN_DB, HUMAN_AT_S = -20.0, 1.0
 """Level of the human over the robot in the same seconds, and when the human begins to interrupt it."""
 
 
-def main(args: argparse.Namespace) -> int:
+def main(args: argparse.Namespace) -> None:
     if args.hidden:
         figures = {name: _mend(name, Path(args.output) / name, args) for name in CASES}
         print_result(args, [], {"schema": 1, **figures})
     else:
         _filter(args)
-    return 0
 
 
 def _filter(args: argparse.Namespace) -> None:
     """Filter the bundled conversation, measure it, draw it, and print what came of it."""
     folder = Path(args.output)
     folder.mkdir(parents=True, exist_ok=True)
-    filtered = folder / "filtered.wav"
     with progress("demo: filtering the bundled conversation") as step:
         ego = EgoFilter(DEMO / "profile.npz", args.engine)
-        with FileSource(DEMO / "mic.flac", DEMO / "reference.flac") as source, FileSink(filtered) as sink:
+        output = folder / "filtered.wav"
+        with FileSource(DEMO / "mic.flac", DEMO / "reference.flac") as source, FileSink(output) as sink:
             report = filter_blocks(source, ego, sink)
         if report.failure:
             raise report.failure
         step("again without the robot's calibration")
-        sounds = {"microphone": _read(DEMO / "mic.flac"), "filtered": _read(filtered)}
-        sounds["human"] = _read(DEMO / "human.flac")
-        figures = report.to_dict() | scores(sounds["filtered"], args.engine)
+        mic, reference, human = (_read(DEMO / f"{name}.flac") for name in ("mic", "reference", "human"))
+        filtered = _read(output)
+        cold = None if args.engine in NEEDS_PROFILE else _si_sdr(enhance(mic, reference, None, args.engine), human)
+        figures = report.to_dict() | {
+            "si_sdr_before_db": _si_sdr(mic, human),
+            "si_sdr_after_db": _si_sdr(filtered, human),
+            "si_sdr_after_uncalibrated_db": cold,
+        }
         step("drawing")
-        for name in ("microphone", "human"):
-            write_file(folder / f"{name}.wav", sounds[name])
-        drawn = _draw(folder, sounds)
-    files = [filtered, folder / "microphone.wav", folder / "human.wav", *drawn]
-    cold = figures["si_sdr_after_uncalibrated_db"]
+        write_file(folder / "microphone.wav", mic)
+        write_file(folder / "human.wav", human)
+        files = ["filtered.wav", "microphone.wav", "human.wav"]
+        if plots := _drawer("plots"):
+            sounds = {
+                "microphone: the robot talks, its fan runs, a human interrupts": mic,
+                "filtered: what edgefilter leaves of it": filtered,
+                "the human alone, for comparison": human,
+            }
+            plots.plot_before_after(sounds, folder / "before_after.png")
+            files.append("before_after.png")
     without = "" if cold is None else f", {cold:.1f} dB without it"
     lines = [
         f"a simulated robot talks, a human interrupts; filtered with engine {ego.engine_name}"
         f" ({report.process_s / (report.samples_in / SAMPLE_RATE):.3f} of real time, {describe_latency(ego)})",
         f"SI-SDR of the human: {figures['si_sdr_before_db']:.1f} dB before, {figures['si_sdr_after_db']:.1f} dB after"
         f" with the robot's calibration{without}",
-        f"files: {', '.join(str(file) for file in files)}",
+        f"files: {', '.join(str(folder / file) for file in files)}",
     ]
     print_result(args, lines, figures)
-
-
-def scores(filtered: Samples, engine: str) -> dict[str, float | None]:
-    """SI-SDR where the human speaks: before, after, and after without the calibration if the engine works without one."""
-    human, mic, ref = (_read(DEMO / f"{name}.flac") for name in ("human", "mic", "reference"))
-    cold = None if engine in NEEDS_PROFILE else enhance(mic, ref, None, engine)
-    return {
-        "si_sdr_before_db": _si_sdr(mic, human),
-        "si_sdr_after_db": _si_sdr(filtered, human),
-        "si_sdr_after_uncalibrated_db": None if cold is None else _si_sdr(cold, human),
-    }
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,8 +107,7 @@ def load(name: str) -> Case:
     truth = json.loads((folder / "truth.json").read_text(encoding="utf-8"))
     mic, reference = (_read(folder / f"{file}.flac") for file in ("mic", "reference"))
     at, begin = round(truth["talk_s"] * SAMPLE_RATE), round(HUMAN_AT_S * SAMPLE_RATE)
-    robot = mic[at:]
-    voice = _read(DEMO / "human.flac")
+    robot, voice = mic[at:], _read(DEMO / "human.flac")
     voice = voice[speaking(voice)][: robot.size - begin]
     level = np.sqrt(np.mean(robot[begin : begin + voice.size] ** 2) / np.mean(voice**2)) * 10 ** (HUMAN_DB / 20)
     human = np.zeros_like(robot)
@@ -128,24 +126,23 @@ def _mend(name: str, folder: Path, args: argparse.Namespace) -> dict[str, Any]:
         write_file(folder / f"{file}.wav", samples)
     files = f"--profile {folder}/robot.npz --recording {folder}/mic.wav --reference {folder}/tts.wav"
     made = f"--apply {folder}/better.npz --report {folder}/report.html"
-    print_result(args, [f"robot {name}: something about it has changed since its calibration (simulated)"])
-    print_result(args, [f"$ edgefilter compare {files}"])
+    changed = f"robot {name}: something about it has changed since its calibration (simulated)"
+    print_result(args, [changed, f"$ edgefilter compare {files}"])
     with progress(f"robot {name}: comparison"):
         excess_db = compare(case.profile, case.mic, case.reference).excess_db
-    print_result(args, [f"  its own voice is {decibels(excess_db)} dB over the noise floor after the prediction"])
-    print_result(args, [f"$ edgefilter diagnose {files} {made}"])
+    excess = f"  its own voice is {decibels(excess_db)} dB over the noise floor after the prediction"
+    print_result(args, [excess, f"$ edgefilter diagnose {files} {made}"])
     with progress(f"robot {name}: diagnosis") as step:
         found = diagnose(case.profile, case.mic, case.reference, progress=step)
         step("fit of what was found, and proof in the running filter")
         names = tuple(finding.effect for finding in in_order(found.ranking))
         applied = fit(case.profile, case.profile, names, case.mic, case.reference, force=False, found=found)
         applied.profile.save(folder / "better.npz")
-    told = [line for number, line in enumerate(applied.lines()) if number == 0 or line.startswith("proof")]
-    print_result(
-        args, [f"  {line}" for line in (headline(found.verdict, [each.effect for each in found.ranking]), *told)]
-    )
+    named = [finding.effect for finding in found.ranking]
+    added, *more = applied.lines()
+    told = [headline(found.verdict, named), added, *(line for line in more if line.startswith("proof"))]
     run = f"edgefilter run --input {folder}/talk.wav --reference {folder}/talk_tts.wav --profile {folder}"
-    print_result(args, [f"$ {run}/better.npz --output {folder}/human_after.wav"])
+    print_result(args, [*(f"  {line}" for line in told), f"$ {run}/better.npz --output {folder}/human_after.wav"])
     filtered = {}
     with progress(f"robot {name}: conversation") as step:
         for kept, profile, which in (("before", case.profile, "old"), ("after", applied.profile, "mended")):
@@ -157,7 +154,7 @@ def _mend(name: str, folder: Path, args: argparse.Namespace) -> dict[str, Any]:
     sdr = {"microphone": case.talk, **filtered}
     figures = {
         "hidden": case.truth["effects"],
-        "named": [finding.effect for finding in found.ranking],
+        "named": named,
         "excess_before_db": excess_db,
         "excess_after_db": applied.after.excess_db,
         **{f"si_sdr_{kept}_db": _si_sdr(samples, case.human) for kept, samples in sdr.items()},
@@ -175,23 +172,10 @@ def _mend(name: str, folder: Path, args: argparse.Namespace) -> dict[str, Any]:
     return figures
 
 
-def _draw(folder: Path, sounds: dict[str, Samples]) -> list[Path]:
-    plots = _drawer("plots")
-    if plots is None:
-        return []
-    names = {
-        "microphone": "microphone: the robot talks, its fan runs, a human interrupts",
-        "filtered": "filtered: what edgefilter leaves of it",
-        "human": "the human alone, for comparison",
-    }
-    plots.plot_before_after({names[name]: samples for name, samples in sounds.items()}, folder / "before_after.png")
-    return [folder / "before_after.png"]
-
-
 def _draw_mended(folder: Path, case: Case, applied: Fitted, filtered: dict[str, Samples]) -> list[str]:
     """The page of the diagnosis that was applied, and the conversation before and after."""
     html, plots = _drawer("html"), _drawer("plots")
-    if html is None or plots is None:
+    if not html or not plots:
         return []
     names = {"profile": "robot.npz", "recording": "mic.wav", "reference": "tts.wav", "effects": []}
     page = html.diagnosis_page(case.profile, applied.found, case.mic, case.reference, names, applied.facts())

@@ -7,8 +7,8 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+from edgefilter.commands.add import Fitted, Refused, fit
 from edgefilter.commands.display import print_result, progress, report_part
-from edgefilter.commands.fitting import Fitted, Refused, fit
 from edgefilter.commands.recordings import load, load_array
 from edgefilter.diagnosis.criteria import Criteria
 from edgefilter.diagnosis.diagnose import Diagnosis, diagnose
@@ -23,7 +23,7 @@ from edgefilter.report.text import add_command, diagnosis_lines
 from edgefilter.types import Samples
 
 
-def main(args: argparse.Namespace) -> int:
+def main(args: argparse.Namespace) -> None:
     if args.force and not args.apply:
         raise UsageError("found --force without --apply, which is what it is for: give both or leave it out")
     if args.prove and args.profile is None:
@@ -47,12 +47,16 @@ def main(args: argparse.Namespace) -> int:
         if args.profile is None:
             warnings = (*profile.warnings, *found.comparison.warnings)
             found = replace(found, comparison=replace(found.comparison, warnings=warnings))
-        applied, refused = (
-            _apply(profile, found, recording, reference, args, step, array) if args.apply else (None, None)
-        )
+        applied, refused = None, None
+        if args.apply:
+            applied, refused = _apply(profile, found, recording, reference, args, step, array)
     more: dict[str, object] = {"channels": {str(number): what for number, what in doubts.items()}} if doubts else {}
-    more |= {"applied": {**applied.to_dict(), "output": args.apply}} if applied else {}
+    if applied:
+        more["applied"] = {**applied.to_dict(), "output": args.apply}
     told: list[str] = []
+    following: list[str] = []
+    if found.ranking and not args.apply:
+        following = [f"next        {add_command([one.effect for one in in_order(found.ranking)], vars(args))}"]
     if applied:
         found = applied.found or found
         told = [*applied.lines(), f"written to {args.apply}"]
@@ -61,7 +65,7 @@ def main(args: argparse.Namespace) -> int:
     if args.write_effect:
         told += _written(args, found)
     verdict, *rest = diagnosis_lines(found, args.profile is not None)
-    print_result(args, [verdict, *_next_step(found, args), *rest, *told], {**found.to_dict(), **more})
+    print_result(args, [verdict, *following, *rest, *told], {**found.to_dict(), **more})
     if html:
         with progress("page of the diagnosis"):
             outcome = applied.facts() if applied else ()
@@ -69,7 +73,6 @@ def main(args: argparse.Namespace) -> int:
         print_result(args, [f"report      {args.report}"])
     if refused:
         raise refused
-    return 0
 
 
 def _apply(
@@ -81,12 +84,10 @@ def _apply(
     step: Callable[[str], None],
     array: ArrayCalibration | None,
 ) -> tuple[Fitted, None] | tuple[None, EdgefilterError | None]:
-    """The profile with all that was found, written; or why it was not: the diagnosis is printed all the same.
+    """The profile with all that was found, written; or why it was not, since the diagnosis is printed all the same.
 
-    Neither where nothing was found: a profile in which nothing has changed is not written.
-
-    A profile made from the recording gets the whole length of the room's response, from all of the recording. array: the
-    other microphones, which get the same effects on their own paths.
+    Neither where nothing was found. A profile made from the recording gets the whole length of the room's response, from
+    all of the recording. array: the other microphones, which get the same effects on their own paths.
     """
     step("fit of what was found, and proof in the running filter")
     names = [finding.effect for finding in in_order(found.ranking)]
@@ -117,9 +118,3 @@ def _written(args: argparse.Namespace, found: Diagnosis) -> list[str]:
         ) from None
     own = {**vars(args), "effects": [*(args.effects or ()), args.write_effect]}
     return [f"own effect  {path}", f"next        {add_command([*found.law.beside, path.stem], own)}"]
-
-
-def _next_step(found: Diagnosis, args: argparse.Namespace) -> list[str]:
-    if not found.ranking or args.apply:
-        return []
-    return [f"next        {add_command([finding.effect for finding in in_order(found.ranking)], vars(args))}"]

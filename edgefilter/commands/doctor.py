@@ -6,41 +6,37 @@ import argparse
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
 
 from edgefilter.alignment.aligner import MOST_LAG_S
 from edgefilter.audio import pulse, virtual
+from edgefilter.audio.device import find, input_port, monitor_of
+from edgefilter.audio.live import LiveSource
+from edgefilter.audio.measure import Channel, Trial, listen, play_through
+from edgefilter.audio.port import InputPort
 from edgefilter.calibration.calibrate import FARTHEST
 from edgefilter.calibration.chirps import LEVEL_DB, SOFTER_DB, Heard, chirps, evaluate
 from edgefilter.commands.display import print_result, say
 from edgefilter.diagnosis.channels import doubtful_channels
-from edgefilter.dsp.frames import decibels
+from edgefilter.diagnosis.passport import ENOUGH_DB
 from edgefilter.engines import create
 from edgefilter.errors import EdgefilterError
 from edgefilter.filter.budget import DEFAULT_MS, allowed_cores
 from edgefilter.filter.ego_filter import EgoFilter
 from edgefilter.filter.microphones import APART_DB, CLIPPED_DB
 from edgefilter.profile.data import Profile
+from edgefilter.session import SILENT_DB
 from edgefilter.types import SAMPLE_RATE, Samples
-
-if TYPE_CHECKING:
-    from edgefilter.audio.measure import Channel, Trial
-    from edgefilter.audio.port import InputPort
 
 PACE = 0.005
 """Error of a device's clock that passes: 3 s of listening tell no less, though the filter follows only far smaller ones."""
-SILENT_DB = float(decibels(0.0))
 TOO_SOFT_DB = -75.0
 """Level, dB of full scale, under which the gain is too low: the noise of 16 bit, -101 dB, is 26 dB below."""
 SAME, UNLIKE = 0.999, 0.2
 """Coherence of a copy, and that below which a channel is no microphone of the array: the array of a real robot has .7 to
 .99 up to 4 kHz in its own noise, a microphone of another kind beside it .1."""
-
-LINEAR_DB = 15.0
-"""Echo over what a linear filter leaves from which on the set-up is good: small loudspeakers at moderate volume have 20
-to 27 dB."""
 CHANGED_DB = 1.5
 """Difference of two gains, dB, that neither noise nor a small loudspeaker explains: they differ by some tenths."""
 
@@ -53,6 +49,11 @@ class Check:
     state: Literal["ok", "warning", "failed"]
     found: str
     do: str = ""
+
+
+def judged(name: str, found: str, do: str = "") -> Check:
+    """A finding that is well where nothing is to be done."""
+    return Check(name, "warning" if do else "ok", found, do)
 
 
 def main(args: argparse.Namespace) -> int:
@@ -103,19 +104,17 @@ def _guarded(name: str, look: Callable[[], Iterator[Check]]) -> Iterator[Check]:
 def _machine() -> Iterator[Check]:
     found = len(allowed_cores())
     few = "loudspeaker and room are not learned while running; allow another core"
-    yield Check("cores", "ok", str(found)) if found > 1 else Check("cores", "warning", str(found), few)
+    yield judged("cores", str(found), few if found < 2 else "")
 
 
 def _model() -> Iterator[Check]:
     model = getattr(create("crnn"), "model", None)
     if model is None:
         return
-    found = f"{model.path}, sha256 {model.sha256[:12]}"
-    if model.shipped:
-        yield Check("model", "ok", f"{found}, as shipped")
-    else:
-        do = "unset EDGEFILTER_CRNN unless you set it on purpose"
-        yield Check("model", "warning", f"{found}, not the one of this package", do)
+    found, do = "as shipped", ""
+    if not model.shipped:
+        found, do = "not the one of this package", "unset EDGEFILTER_CRNN unless you set it on purpose"
+    yield judged("model", f"{model.path}, sha256 {model.sha256[:12]}, {found}", do)
 
 
 def _engine() -> Iterator[Check]:
@@ -128,48 +127,41 @@ def _engine() -> Iterator[Check]:
         took.append(1000 * (time.perf_counter() - began))
     typical = float(np.median(took))
     found = f"{ego.engine_name}, {typical:.1f} ms of computing for a hop of {1000 * ego.hop / SAMPLE_RATE:.0f} ms"
-    if typical <= DEFAULT_MS:
-        yield Check("engine", "ok", found)
-    else:
-        yield Check("engine", "warning", found, "'run --engine auto' will take a cheaper one; end other programs")
+    slow = "'run --engine auto' will take a cheaper one; end other programs"
+    yield judged("engine", found, slow if typical > DEFAULT_MS else "")
 
 
 def _server() -> Iterator[Check]:
     outputs = pulse.names("output")
     if not outputs:
         help_with = "start PulseAudio or PipeWire (and install pulseaudio-utils), or name an input that records the loudspeaker with --reference"
-        yield Check("sound server", "warning", "none answers", help_with)
+        yield judged("sound server", "none answers", help_with)
         return
-    yield Check("sound server", "ok", f"{len(outputs)} outputs, default {pulse.default_name('output') or 'none'}")
+    yield judged("sound server", f"{len(outputs)} outputs, default {pulse.default_name('output') or 'none'}")
     made = virtual.SPEAKER in outputs and virtual.HUMAN in outputs
-    how = "there" if made else "not made ('edgefilter devices --load' makes it)"
-    yield Check("virtual mic", "ok", how)
+    yield judged("virtual mic", "there" if made else "not made ('edgefilter devices --load' makes it)")
 
 
 def _open(
     ports: dict[str, InputPort], role: str, name: str | None, channels: Sequence[int] | None = None
 ) -> Iterator[Check]:
     """Find the input and see at which rate it can be opened."""
-    from edgefilter.audio.device import find, input_port, monitor_of
-
     device = find(name if name is not None else pulse.monitor(virtual.SPEAKER) or monitor_of("default"), "input")
     if role == "microphone":
         virtual.refuse_own(device)
     port = input_port(device, channels=channels)
     ports[role] = port
-    yield Check(role, "ok", ", ".join([f"{port.device}, {port.rate} Hz", *port.notes]))
+    yield judged(role, ", ".join([f"{port.device}, {port.rate} Hz", *port.notes]))
 
 
 def _sound(ports: dict[str, InputPort]) -> Iterator[Check]:
-    from edgefilter.audio.measure import listen
-
     for (role, _), trial in zip(ports.items(), listen(list(ports.values()))):
         yield _clock(role, trial)
         if role == "microphone":
             yield _level(trial)
             yield from array_checks(trial.channels)
         if trial.overruns:
-            yield Check(f"{role} load", "warning", f"{trial.overruns} overruns in 3 s", "end other programs")
+            yield judged(f"{role} load", f"{trial.overruns} overruns in 3 s", "end other programs")
 
 
 def array_checks(channels: Sequence[Channel]) -> Iterator[Check]:
@@ -191,19 +183,16 @@ def array_checks(channels: Sequence[Channel]) -> Iterator[Check]:
             why = f"it is a copy of channel {channels[first].number}"
         elif at > first and one.coherence < UNLIKE:
             why = f"it has nothing in common with channel {channels[first].number}: processed, or what is played?"
-        do = f"leave it out of --mic-channels: {why}" if why else ""
-        yield Check(f"channel {one.number}", "warning" if why else "ok", found, do)
+        yield judged(f"channel {one.number}", found, f"leave it out of --mic-channels: {why}" if why else "")
 
 
 def _set_up(
     ports: dict[str, InputPort], speaker: str, channels: Sequence[int] | None, profile: Profile | None
 ) -> Iterator[Check]:
     """Play chirps and hear them as a run would, of an array in the first microphone; then hold the others beside it."""
-    from edgefilter.audio.live import LiveSource
-    from edgefilter.audio.measure import play_through
-
-    if ports["microphone"].device == ports["reference"].device:
-        found = f"microphone and reference are both '{ports['microphone'].device}'"
+    microphone, reference = ports["microphone"], ports["reference"]
+    if microphone.device == reference.device:
+        found = f"microphone and reference are both '{microphone.device}'"
         yield Check("set-up", "failed", found, "name the real microphone with --input")
         return
     output = virtual.SPEAKER if speaker == "default" and pulse.monitor(virtual.SPEAKER) else speaker
@@ -212,13 +201,12 @@ def _set_up(
         f"chirps for {sound.size / SAMPLE_RATE:.0f} s on output '{output}', peak {LEVEL_DB:.0f} dB of full scale"
         " (--no-chirp: without)"
     )
-    source = LiveSource(ports["microphone"].device, ports["reference"].device, channels=channels)
-    mic, ref, lost = play_through(output, source, sound)
+    mic, ref, lost = play_through(output, LiveSource(microphone.device, reference.device, channels=channels), sound)
     each = mic.reshape(len(mic), -1).T
-    yield from set_up_check(evaluate(each[0], ref), output, str(ports["reference"].device))
-    yield from array_set_up(ports["microphone"].wanted or [0], each, ref, profile)
+    yield from set_up_check(evaluate(each[0], ref), output, str(reference.device))
+    yield from array_set_up(microphone.wanted or [0], each, ref, profile)
     if lost:
-        yield Check("set-up load", "warning", f"{lost} samples lost while the chirps were heard", "end other programs")
+        yield judged("set-up load", f"{lost} samples lost while the chirps were heard", "end other programs")
 
 
 def array_set_up(numbers: Sequence[int], mics: Samples, ref: Samples, profile: Profile | None) -> Iterator[Check]:
@@ -230,26 +218,26 @@ def array_set_up(numbers: Sequence[int], mics: Samples, ref: Samples, profile: P
     for number, one in zip(numbers, heard):
         if one.same:
             told.add(number)
-            yield Check(f"channel {number}", "warning", "it is what is played", "leave it out of --mic-channels")
+            yield judged(f"channel {number}", "it is what is played", "leave it out of --mic-channels")
         elif one.lag_s is not None and abs(late := one.lag_s - middle) > FARTHEST / SAMPLE_RATE:
             told.add(number)
             found = f"it hears the chirps {1000 * late:+.0f} ms beside the others"
-            yield Check(f"channel {number}", "warning", found, "leave it out of --mic-channels: it is processed")
+            yield judged(f"channel {number}", found, "leave it out of --mic-channels: it is processed")
     if profile is None or not all(one.in_microphone for one in heard):
         return
     doubts = doubtful_channels(profile, mics, ref)
     for at, what in doubts.items():
         if numbers[at] not in told:
             do = "put --mic-channels into the order in which they were calibrated, mend it, or calibrate again"
-            yield Check(f"channel {numbers[at]}", "warning", what, do)
+            yield judged(f"channel {numbers[at]}", what, do)
     if not doubts:
-        yield Check("profile", "ok", f"{profile.microphones} microphones as they were calibrated")
+        yield judged("profile", f"{profile.microphones} microphones as they were calibrated")
 
 
 def set_up_check(heard: Heard, output: str, reference: str) -> Iterator[Check]:
     """What the chirps have shown: whether the reference is right, then what the microphone makes of the robot."""
     if wrong := _wrong(heard, output, reference):
-        yield Check("set-up", *wrong)
+        yield wrong
         return
     assert heard.lag_s is not None and heard.above_noise_db is not None and heard.ppm is not None
     assert heard.linear_db is not None and heard.softer_db is not None
@@ -257,63 +245,61 @@ def set_up_check(heard: Heard, output: str, reference: str) -> Iterator[Check]:
         f"the microphone hears the robot after {1000 * heard.lag_s:.0f} ms, {heard.above_noise_db:.0f} dB above the noise,"
         f" clocks {abs(heard.ppm):.0f} ppm apart; linear echo {heard.linear_db:.0f} dB"
     )
-    if heard.linear_db >= LINEAR_DB or heard.linear_db > heard.above_noise_db - 6.0:
-        yield Check("set-up", "ok", f"{found}: good")
+    if heard.linear_db >= ENOUGH_DB or heard.linear_db > heard.above_noise_db - 6.0:
+        yield judged("set-up", f"{found}: good")
     else:
         do = "turn the loudspeaker down, and end other programs: distortion and unsteady clocks are not predicted"
-        yield Check("set-up", "warning", found, do)
+        yield judged("set-up", found, do)
     # what changes the sound on its way: a converter at its end, gain control, noise suppression
     softer = f"chirps {SOFTER_DB:.0f} dB softer come {abs(heard.softer_db):.1f} dB"
     if heard.peak_db > CLIPPED_DB:
-        found = "the chirps are clipped at the microphone"
-        yield Check("set-up", "warning", found, "lower its gain or the loudspeaker")
+        yield judged("set-up", "the chirps are clipped at the microphone", "lower its gain or the loudspeaker")
     elif heard.softer_db > CHANGED_DB:
         do = "switch gain control off in device or sound server, or turn down the loudspeaker"
-        yield Check("set-up", "warning", f"{softer} louder than they should", do)
+        yield judged("set-up", f"{softer} louder than they should", do)
     elif heard.softer_db < -CHANGED_DB:
         do = "switch noise suppression and echo cancelling off in device or sound server"
-        yield Check("set-up", "warning", f"{softer} softer than they should", do)
+        yield judged("set-up", f"{softer} softer than they should", do)
 
 
-def _wrong(heard: Heard, output: str, reference: str) -> tuple[Literal["warning", "failed"], str, str] | None:
-    """State, finding and remedy where a run would not hear the robot as it should; None where it does."""
+def _wrong(heard: Heard, output: str, reference: str) -> Check | None:
+    """What keeps a run from hearing the robot as it should; None where nothing does."""
+    if heard.in_reference and not heard.in_microphone:
+        found = f"the reference has the chirps, the microphone does not hear them (its peak: {heard.peak_db:.0f} dB)"
+        return judged("set-up", found, "unmute loudspeaker and microphone, turn them up, or name others")
     if not heard.in_reference:
         found = f"reference '{reference}' is silent while something is played on output '{output}'"
-        return "failed", found, f"take the monitor of '{output}' (--reference), or play elsewhere (--speaker)"
-    if not heard.in_microphone:
-        found = f"the reference has the chirps, the microphone does not hear them (its peak: {heard.peak_db:.0f} dB)"
-        return "warning", found, "unmute loudspeaker and microphone, turn them up, or name others"
-    assert heard.lag_s is not None
-    if heard.same:
+        do = f"take the monitor of '{output}' (--reference), or play elsewhere (--speaker)"
+    elif heard.same:
         found = "the microphone is a copy of the reference, not a microphone"
-        return "failed", found, "name the real one with --input ('edgefilter devices')"
-    if heard.lag_s < -0.001:
+        do = "name the real one with --input ('edgefilter devices')"
+    elif heard.lag_s is not None and heard.lag_s < -0.001:
         found = f"the reference comes {-1000 * heard.lag_s:.0f} ms after the microphone has heard it"
-        return "failed", found, "take a reference with less buffering, such as the output's own monitor"
-    if heard.lag_s > MOST_LAG_S:
-        found = (
-            f"the microphone hears the robot after {heard.lag_s:.2f} s, more than the {MOST_LAG_S} s that are searched"
-        )
-        return "failed", found, "use a loudspeaker or a microphone with less delay"
-    return None
+        do = "take a reference with less buffering, such as the output's own monitor"
+    elif heard.lag_s is not None and heard.lag_s > MOST_LAG_S:
+        late = f"{heard.lag_s:.2f} s, more than the {MOST_LAG_S} s that are searched"
+        found = f"the microphone hears the robot after {late}"
+        do = "use a loudspeaker or a microphone with less delay"
+    else:
+        return None
+    return Check("set-up", "failed", found, do)
 
 
 def _clock(role: str, trial: Trial) -> Check:
     name = f"{role[:3]} clock"
     found = f"{100 * (trial.pace - 1):+.2f} % of {trial.rate} Hz (to some 0.1 %)"
     if abs(trial.pace - 1) <= PACE:
-        return Check(name, "ok", found)
-    return Check(
-        name, "failed", found, f"the {role} loses samples or runs at another rate: end other programs, try another"
-    )
+        return judged(name, found)
+    do = f"the {role} loses samples or runs at another rate: end other programs, try another"
+    return Check(name, "failed", found, do)
 
 
 def _level(trial: Trial) -> Check:
-    found = f"{trial.level_db:.0f} dB of full scale, peak {trial.peak_db:.0f} dB"
+    found, do = f"{trial.level_db:.0f} dB of full scale, peak {trial.peak_db:.0f} dB", ""
     if trial.peak_db <= SILENT_DB:
-        return Check("level", "warning", "every sample is zero", "unmute the microphone, or name another with --input")
-    if trial.level_db < TOO_SOFT_DB:
-        return Check("level", "warning", found, "raise the microphone's gain")
-    if trial.peak_db > CLIPPED_DB:
-        return Check("level", "warning", found, "lower the microphone's gain: it is clipped")
-    return Check("level", "ok", found)
+        found, do = "every sample is zero", "unmute the microphone, or name another with --input"
+    elif trial.level_db < TOO_SOFT_DB:
+        do = "raise the microphone's gain"
+    elif trial.peak_db > CLIPPED_DB:
+        do = "lower the microphone's gain: it is clipped"
+    return judged("level", found, do)

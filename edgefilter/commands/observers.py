@@ -5,9 +5,14 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import signal
+import subprocess
 import sys
-from collections.abc import Callable
-from contextlib import ExitStack, suppress
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass, field
 from datetime import datetime, timezone
 from functools import partial
 from pathlib import Path
@@ -17,9 +22,9 @@ from edgefilter.audio.files import make_folder, write_file
 from edgefilter.audio.protocols import Source
 from edgefilter.audio.recorder import Recorder
 from edgefilter.audio.speech import SpokenReference
-from edgefilter.commands.barge_in import Availability, BargeInCommand, Lowering
 from edgefilter.commands.display import display, interject, say_event, write_json
 from edgefilter.errors import AudioFileError, EdgefilterError
+from edgefilter.filter.barge_in import INTERRUPTIONS
 from edgefilter.filter.ego_filter import EgoFilter
 from edgefilter.profile.data import Profile
 from edgefilter.session import Progress
@@ -30,6 +35,12 @@ ENDED = (
     *("alignment", "learning", "deadline"),
 )
 """Figures of the run that the last line of a log holds."""
+LOWERED = {"stop": 0.0, "duck": 10 ** (-10 / 20)}
+"""Gain of the robot's speech while the human speaks, by the word of --barge-in."""
+PATIENCE_S = 2.0
+"""How long a command may still run when the run has ended."""
+MOST_AT_ONCE = 8
+"""Commands that may run at the same time: those that never end must not fill the machine."""
 
 
 class EventLog:
@@ -117,78 +128,154 @@ class TurnWriter:
             self.written += 1
 
 
-class Observers:
-    """Tells all of them of each block and each event, those who react first; a context manager around the run.
+class BargeInCommand:
+    """Runs a shell command at each interruption, in a thread of its own, so that the sound does not wait for it.
 
-    notes: what the user was told before the run. record: where the sound is to be kept, if anywhere.
+    The command finds what happened in EDGEFILTER_EVENT, EDGEFILTER_TIME (seconds of the microphone) and
+    EDGEFILTER_DETAIL. What it prints goes to standard error. Whatever goes wrong is one line, given to say.
     """
 
-    def __init__(
-        self,
-        args: argparse.Namespace,
-        ego: EgoFilter,
-        source: Source,
-        speech: SpokenReference | None,
-        notes: list[str],
-    ) -> None:
-        self._args, self._ego, self._source, self._speech, self._notes = args, ego, source, speech, notes
-        self._stack = ExitStack()
-        self._of_events: list[Callable[[Event], None]] = []
-        self._of_blocks: list[Callable[[Progress], None]] = []
-        self._logs: list[EventLog] = []
-        self.record: Record | None = None
-        self._turns: TurnWriter | None = None
+    def __init__(self, command: str, say: Callable[[str], None]) -> None:
+        self._command, self._say = command, say
+        self._threads: list[threading.Thread] = []
+        self._running: set[subprocess.Popen[bytes]] = set()
 
-    def __enter__(self) -> Observers:
-        args = self._args
-        with ExitStack() as stack:
-            if args.barge_in and self._speech:
-                self._of_events.append(Lowering(self._speech, args.barge_in).hear)
-            if args.on_barge_in:
-                self._of_events.append(stack.enter_context(BargeInCommand(args.on_barge_in, interject)).hear)
-            if args.barge_in or args.on_barge_in:
-                self._of_blocks.append(Availability(self._ego, interject).show)
-            if args.record:
-                self.record = Record(args.record, self._ego.profile, self._source.microphones)
-                stack.enter_context(self.record)
-                self._logs.append(self.record.log)
-            if args.turns:
-                self._turns = TurnWriter(args.turns)
-                self._of_events.append(self._turns.hear)
-            if args.log_json:
-                self._logs.append(EventLog(args.log_json))
-            self._of_blocks.append(stack.enter_context(display(self._source, self._ego, args.quiet)))
-            self._stack = stack.pop_all()
-        latency_ms = self._ego.stats()["latency_ms"]
-        for log in self._logs:
-            log.write("started", 0, engine=self._ego.engine_name, latency_ms=latency_ms, notes=self._notes)
-            self._of_events.append(log.hear)
-        self._of_events.append(partial(say_event, live=self._source.live))
+    def __enter__(self) -> BargeInCommand:
         return self
 
+    def hear(self, event: Event) -> None:
+        """Start the command if the event is an interruption."""
+        if event.kind not in INTERRUPTIONS:
+            return
+        self._threads = [thread for thread in self._threads if thread.is_alive()]
+        if len(self._threads) >= MOST_AT_ONCE:
+            self._complain(f"not run, {MOST_AT_ONCE} earlier ones have not ended")
+            return
+        thread = threading.Thread(target=self._run, args=(event,), daemon=True)
+        try:
+            thread.start()
+        except RuntimeError as error:  # the system has no thread left
+            self._complain(f"cannot be run ({error})")
+        else:
+            self._threads.append(thread)
+
+    def _run(self, event: Event) -> None:
+        told = {"EVENT": event.kind, "TIME": f"{event.sample / SAMPLE_RATE:.3f}", "DETAIL": event.detail}
+        environment = {**os.environ, **{f"EDGEFILTER_{name}": value for name, value in told.items()}}
+        try:
+            process = subprocess.Popen(
+                self._command, shell=True, stdin=subprocess.DEVNULL, stdout=2, env=environment, start_new_session=True
+            )
+        except (OSError, ValueError) as error:
+            self._complain(f"cannot be run ({error})")
+            return
+        self._running.add(process)
+        code = process.wait()
+        self._running.discard(process)
+        if code:
+            self._complain(f"ended with {code}")
+
+    def _complain(self, what: str) -> None:
+        self._say(f"--on-barge-in: {what}: {self._command}")
+
     def __exit__(self, *exc: object) -> None:
-        self._stack.close()
+        """Wait a little for the commands that still run, then end them."""
+        until = time.monotonic() + PATIENCE_S
+        for thread in self._threads:
+            thread.join(max(until - time.monotonic(), 0.0))
+        for process in list(self._running):
+            self._complain(f"killed, since it ran {PATIENCE_S:.0f} s longer than the filter")
+            if hasattr(os, "killpg"):  # the shell's children, too; start_new_session made it the first of its group
+                os.killpg(process.pid, signal.SIGKILL)
+            else:
+                process.kill()
+
+
+def lower(speech: SpokenReference, how: str, event: Event) -> None:
+    """End the robot's speech at an interruption, or lower it by 10 dB for as long as the human speaks; how: a word of LOWERED."""
+    if event.kind in INTERRUPTIONS:
+        speech.fade(LOWERED[how])
+    elif event.kind == "speech_stopped" and how == "duck":
+        speech.fade(1.0)
+
+
+class Availability:
+    """Says, each time it begins, that the engine at work tells no speech probability, so that no human is noticed."""
+
+    def __init__(self, ego: EgoFilter, say: Callable[[str], None]) -> None:
+        self._ego, self._say, self._there = ego, say, True
+
+    def show(self, block: Progress) -> None:
+        """Look after a block."""
+        there = self._ego.speech_probability is not None or block.samples < self._ego.hop
+        if self._there and not there:
+            self._say(
+                f"barge-in is unavailable: engine {self._ego.engine_name} does not tell whether somebody speaks; take"
+                " another with --engine"
+            )
+        self._there = there
+
+
+@dataclass
+class Observers:
+    """Tells all of them of each block and each event, those who react first; record: where the sound is kept, if anywhere."""
+
+    of_events: list[Callable[[Event], None]] = field(default_factory=list)
+    of_blocks: list[Callable[[Progress], None]] = field(default_factory=list)
+    logs: list[EventLog] = field(default_factory=list)
+    record: Record | None = None
+    turns: TurnWriter | None = None
 
     def hear(self, event: Event) -> None:
         """An event of the filter, of the source or of the sink."""
-        for hear in self._of_events:
+        for hear in self.of_events:
             hear(event)
 
     def show(self, progress: Progress) -> None:
         """A block has been filtered."""
-        for show in self._of_blocks:
+        for show in self.of_blocks:
             show(progress)
 
     def finish(self, figures: dict[str, object]) -> None:
         """Write what only the end knows; raises the first reason why something of it, or before, could not be written."""
         failure: EdgefilterError | None = None
-        for log in self._logs:
+        for log in self.logs:
             log.write("ended", int(str(figures["samples_in"])), **{name: figures[name] for name in ENDED})
             log.close()
             failure = failure or log.failure
-        if self._turns:
-            failure = failure or self._turns.failure
+        if self.turns:
+            failure = failure or self.turns.failure
         if self.record:
             self.record.finish(figures)
         if failure:
             raise failure
+
+
+@contextmanager
+def observing(
+    args: argparse.Namespace, ego: EgoFilter, source: Source, speech: SpokenReference | None, notes: list[str]
+) -> Iterator[Observers]:
+    """All who are told of the run that the arguments ask for; notes: what the user was told before it."""
+    told = Observers()
+    with ExitStack() as stack:
+        if args.barge_in and speech:
+            told.of_events.append(partial(lower, speech, args.barge_in))
+        if args.on_barge_in:
+            told.of_events.append(stack.enter_context(BargeInCommand(args.on_barge_in, interject)).hear)
+        if args.barge_in or args.on_barge_in:
+            told.of_blocks.append(Availability(ego, interject).show)
+        if args.record:
+            told.record = Record(args.record, ego.profile, source.microphones)
+            stack.enter_context(told.record)
+            told.logs.append(told.record.log)
+        if args.turns:
+            told.turns = TurnWriter(args.turns)
+            told.of_events.append(told.turns.hear)
+        if args.log_json:
+            told.logs.append(EventLog(args.log_json))
+        told.of_blocks.append(stack.enter_context(display(source, ego, args.quiet)))
+        for log in told.logs:
+            log.write("started", 0, engine=ego.engine_name, latency_ms=ego.stats()["latency_ms"], notes=notes)
+            told.of_events.append(log.hear)
+        told.of_events.append(partial(say_event, live=source.live))
+        yield told

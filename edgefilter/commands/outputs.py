@@ -13,31 +13,13 @@ from pathlib import Path
 
 from edgefilter.errors import EdgefilterError, UsageError
 
-READ = (
-    "input",
-    "reference",
-    "play",
-    "profile",
-    "model",
-    "recording",
-    "effects",
-    "sweep_reference",
-    "sweep_recording",
-    "noise_recording",
-    "token",
-)
+RECORDINGS = ("sweep_reference", "sweep_recording", "noise_recording")
+"""Of a calibration: its options, and the files that it records."""
+READ = ("input", "reference", "play", "profile", "model", "recording", "effects", *RECORDINGS, "token")
 """Options that may name a file to read; a name that is no file, such as a device's, cannot be overwritten."""
 WRITTEN = (
-    "output",
-    "excitation",
-    "json",
-    "report",
-    "save_profile",
-    "learn",
-    "apply",
-    "write_effect",
-    "plot",
-    "log_json",
+    *("output", "excitation", "json", "report", "save_profile", "learn", "apply", "write_effect"),
+    *("plot", "log_json"),
 )
 """Options that may name a file to write."""
 HIDDEN_FILES = (
@@ -48,7 +30,7 @@ HIDDEN_FILES = (
 FOLDERS: dict[tuple[str, str], tuple[str, ...]] = {
     ("run", "record"): ("mic.wav", "reference.wav", "output.wav", "events.jsonl", "run.json", "profile.npz"),
     ("run", "turns"): ("turn_0001.wav",),
-    ("calibrate", "save_input"): ("sweep_reference.wav", "sweep_recording.wav", "noise_recording.wav"),
+    ("calibrate", "save_input"): tuple(f"{name}.wav" for name in RECORDINGS),
     ("ros2", "output"): ("mic.wav", "reference.wav"),
     ("demo", "output"): (
         *("filtered.wav", "microphone.wav", "human.wav", "before_after.png"),
@@ -98,7 +80,7 @@ def check_outputs(args: argparse.Namespace) -> None:
     """
     for option, path in _given(args, *READ, *WRITTEN, *IN_FOLDERS):
         if not path or "\0" in path:
-            raise UsageError(f"{_flag(option)} is {path!r}, which names no file: give one or leave the option out")
+            raise UsageError(f"{flag(option)} is {path!r}, which names no file: give one or leave the option out")
     read, written = list(_read(args)), list(_written(args))
     for number, output in enumerate(written):
         if output.path == "-" and output.stream is None:
@@ -119,9 +101,10 @@ def check_outputs(args: argparse.Namespace) -> None:
         if output.at_end:
             _check_writable(output)
     for option, path in _given(args, *(option for command, option in FOLDERS if command == args.command)):
-        _check_folder(_flag(option), path)
-    for _, path in _given(args, "record"):
-        _check_no_record(path)
+        _check_folder(flag(option), path)
+    for _, path in _given(args, "record"):  # what failed once may not come again, so an earlier record is kept
+        if found := [name for name in FOLDERS["run", "record"] if os.path.lexists(os.path.join(path, name))]:
+            raise UsageError(f"--record {path} holds {', '.join(found)} already: name a new folder")
 
 
 def _given(args: argparse.Namespace, *options: str) -> Iterator[tuple[str, str]]:
@@ -131,7 +114,7 @@ def _given(args: argparse.Namespace, *options: str) -> Iterator[tuple[str, str]]
         yield from ((option, path) for path in (given if isinstance(given, list) else [given]) if path is not None)
 
 
-def _flag(option: str) -> str:
+def flag(option: str) -> str:
     return f"--{option.replace('_', '-')}"
 
 
@@ -149,7 +132,7 @@ def _read(args: argparse.Namespace) -> Iterator[Place]:
 
 def _written(args: argparse.Namespace) -> Iterator[Place]:
     for option, path in _given(args, *WRITTEN, *IN_FOLDERS):
-        role = _flag(option)
+        role = flag(option)
         if (args.command, option) == ("probe", "excitation"):
             yield Place(f"{role}, its question", question_of(path), at_end=True)
         for name in FOLDERS.get((args.command, option), ()):
@@ -200,10 +183,3 @@ def _check_folder(role: str, path: str) -> None:
         raise EdgefilterError(f"{role} {path} cannot be made: {above} is no folder; name another")
     if not os.access(above, os.W_OK):
         raise EdgefilterError(f"{role} {path} cannot be made or written: {os.strerror(errno.EACCES)}; name another")
-
-
-def _check_no_record(path: str) -> None:
-    """Raise UsageError where a record lies already: what failed once may not come again."""
-    found = [name for name in FOLDERS["run", "record"] if os.path.lexists(os.path.join(path, name))]
-    if found:
-        raise UsageError(f"--record {path} holds {', '.join(found)} already: name a new folder")

@@ -18,7 +18,7 @@ from edgefilter.report.text import headline
 from edgefilter.types import SAMPLE_RATE, Samples
 
 
-def main(args: argparse.Namespace) -> int:
+def main(args: argparse.Namespace) -> None:
     html = report_part("html") if args.report else None
     most = round(MOST_S * SAMPLE_RATE)
     recording, reference = read(args.recording, "recording")[:most], read(args.reference, "reference")[:most]
@@ -37,7 +37,6 @@ def main(args: argparse.Namespace) -> int:
     if html:
         html.write_page(args.report, html.passport_page(found, verdict, vars(args)))
         print_result(args, [f"report      {args.report}"])
-    return 0
 
 
 def _diagnosed(recording: Samples, reference: Samples, step: Callable[[str], None]) -> tuple[Diagnosis | None, str]:

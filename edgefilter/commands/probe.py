@@ -18,7 +18,7 @@ from edgefilter.commands.outputs import question_of
 from edgefilter.commands.recordings import load, read, read_voice
 from edgefilter.diagnosis.advice import RIVAL, remaining
 from edgefilter.diagnosis.diagnose import diagnose
-from edgefilter.diagnosis.probe import ENOUGH, SOUND_S, Answer, Inquiry, Sound, weights
+from edgefilter.diagnosis.probe import ENOUGH, SOUND_S, Answer, Inquiry, weights
 from edgefilter.echo.effects.catalogue import find
 from edgefilter.errors import AudioFileError, SignalError, UsageError
 from edgefilter.profile.data import Profile
@@ -29,7 +29,7 @@ SCHEMA = 1
 """Of the question beside a sound."""
 
 
-def main(args: argparse.Namespace) -> int:
+def main(args: argparse.Namespace) -> None:
     if args.live == bool(args.excitation):
         raise UsageError("expected one of --live, to play here, and --excitation S.wav, to play elsewhere")
     if args.seconds < SOUND_S:
@@ -38,7 +38,8 @@ def main(args: argparse.Namespace) -> int:
     for name in (name for effects in wanted for name in effects):
         find(name)
     if args.reference is None:
-        return _evaluate(args)
+        _evaluate(args)
+        return
     profile, recording, reference = load(args)
     with progress("explanations that remain") as step:
         if not wanted:
@@ -46,33 +47,28 @@ def main(args: argparse.Namespace) -> int:
         inquiry = _inquiry(profile, wanted, recording, reference)
     print_result(args, [f"asked       {joined(one.name for one in inquiry.explanations)}: which of them it is"])
     if args.excitation:
-        return _write(args, inquiry)
-
-    def play(sound: Sound) -> Samples:
-        return take(args, sound.samples, f"now playing: {sound.words}")
-
-    _tell(args, inquiry.ask(play, args.seconds), vars(args))
-    return 0
+        _write(args, inquiry)
+    else:
+        answer = inquiry.ask(lambda sound: take(args, sound.samples, f"now playing: {sound.words}"), args.seconds)
+        _tell(args, answer, vars(args))
 
 
 def _inquiry(profile: Profile, wanted: list[tuple[str, ...]], recording: Samples, reference: Samples) -> Inquiry:
     """Two explanations or more, fitted. Raises SignalError where there is nothing to ask."""
     if not wanted:
         raise SignalError("nothing to ask: the diagnosis names nothing that another recording would show")
-    first = "+".join(wanted[0])
-    if len(wanted) < 2:
+    first, *others = ["+".join(effects) for effects in wanted]
+    if not others:
         raise SignalError(
             f"nothing to ask: {first} is named, and nothing else explains {100 * RIVAL:.0f} % of what it does"
         )
     inquiry = Inquiry(profile, wanted, recording, reference)
     if len(inquiry.explanations) < 2:
-        raise SignalError(
-            f"nothing to ask: {joined('+'.join(one) for one in wanted)} predict the same, under other names"
-        )
+        raise SignalError(f"nothing to ask: {joined([first, *others])} predict the same, under other names")
     return inquiry
 
 
-def _write(args: argparse.Namespace, inquiry: Inquiry) -> int:
+def _write(args: argparse.Namespace, inquiry: Inquiry) -> None:
     """The best sounds one after the other, and beside them what is asked."""
     with progress("the sounds that tell them apart") as step:
         chosen = inquiry.sounds(np.ones(len(inquiry.explanations)), step)[: int(args.seconds / SOUND_S)]
@@ -97,10 +93,9 @@ def _write(args: argparse.Namespace, inquiry: Inquiry) -> int:
         f"next        edgefilter probe{files}{own} --recording ANSWER.wav",
     ]
     print_result(args, lines, question)
-    return 0
 
 
-def _evaluate(args: argparse.Namespace) -> int:
+def _evaluate(args: argparse.Namespace) -> None:
     """What was recorded of a sound that was written: which explanation it speaks for."""
     if args.live or args.explanation:
         raise UsageError("without --reference a recording of --excitation is evaluated: give --reference to ask anew")
@@ -113,7 +108,6 @@ def _evaluate(args: argparse.Namespace) -> int:
         likely = weights(inquiry.evidence(answer, sound), [inquiry.gains(sound)])
     told = Answer(inquiry.explanations, likely, tuple(question["sounds"]))
     _tell(args, told, {**vars(args), **question, "profile": args.profile})
-    return 0
 
 
 def _question(args: argparse.Namespace) -> dict[str, Any]:

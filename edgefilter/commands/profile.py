@@ -12,14 +12,13 @@ from edgefilter.profile.data import Profile
 from edgefilter.profile.text import describe
 
 
-def main(args: argparse.Namespace) -> int:
+def main(args: argparse.Namespace) -> None:
     plots = report_part("plots") if args.plot else None
     profile = Profile.load(args.profile)
     print_result(args, [describe(profile)], summary(profile))
     if plots:
         plots.plot_profile(profile, args.plot)
         print_result(args, [f"drawn to {args.plot}"])
-    return 0
 
 
 def summary(profile: Profile) -> dict[str, object]:

@@ -9,7 +9,7 @@ from edgefilter.errors import UsageError
 from edgefilter.profile.data import Profile
 
 
-def main(args: argparse.Namespace) -> int:
+def main(args: argparse.Namespace) -> None:
     profile = Profile.load(args.profile)
     held = [name for name, _ in profile.echo.effects]
     if args.effect not in held:
@@ -21,4 +21,3 @@ def main(args: argparse.Namespace) -> int:
     left = [name for name, _ in without.echo.effects]
     line = f"{args.effect} removed, {', '.join(left) or 'no effect'} left; written to {args.output}"
     print_result(args, [line], {"schema": 1, "effect": args.effect, "effects_left": left, "output": args.output})
-    return 0

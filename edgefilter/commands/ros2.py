@@ -14,14 +14,14 @@ from edgefilter.filter.ego_filter import EgoFilter
 from edgefilter.types import ALL_CHANNELS
 
 
-def main(args: argparse.Namespace) -> int:
+def main(args: argparse.Namespace) -> None:
     try:
-        return _extract(args) if args.word == "extract" else _node(args)
+        (_extract if args.word == "extract" else _node)(args)
     except ModuleNotFoundError as error:
         raise UsageError(f"ros2 needs {error.name}, which is not installed: pip install '.[ros2]'") from None
 
 
-def _extract(args: argparse.Namespace) -> int:
+def _extract(args: argparse.Namespace) -> None:
     from edgefilter.integrations.bags import extract
 
     topics = {"mic": args.mic, "reference": args.reference}
@@ -29,10 +29,9 @@ def _extract(args: argparse.Namespace) -> int:
     seconds = extract(Path(args.recording), topics, folder, args.rate, args.channels)
     lines = [f"{folder / name}.wav: {length:.1f} s of {topics[name]}" for name, length in seconds.items()]
     print_result(args, lines, {"schema": 1, "seconds": seconds})
-    return 0
 
 
-def _node(args: argparse.Namespace) -> int:
+def _node(args: argparse.Namespace) -> None:
     from edgefilter.integrations.ros2 import Node, Topics
 
     named = os.environ.get("ROS_DOMAIN_ID") or "0"
@@ -48,4 +47,3 @@ def _node(args: argparse.Namespace) -> int:
         signal.signal(number, lambda *_: node.stop())
     say(f"node /edgefilter, domain {domain}: {args.mic} and {args.reference} in, {args.human} out; Ctrl-C ends it")
     node.run(say)
-    return 0

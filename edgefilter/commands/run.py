@@ -13,14 +13,16 @@ from functools import partial
 from pathlib import Path
 
 from edgefilter.audio import pulse, virtual
+from edgefilter.audio.device import find, monitor_of, speaker
 from edgefilter.audio.files import open_sink, open_source
+from edgefilter.audio.live import LiveSink, LiveSource
 from edgefilter.audio.protocols import Sink, Source
 from edgefilter.audio.reader import Reader
 from edgefilter.audio.speech import SpokenReference
 from edgefilter.audio.steady import SteadySink
 from edgefilter.audio.troubles import Troubles
 from edgefilter.commands.display import describe_latency, say, write_json
-from edgefilter.commands.observers import Observers
+from edgefilter.commands.observers import Observers, observing
 from edgefilter.engines import HAVE_LINEAR_STAGE
 from edgefilter.errors import EdgefilterError, SignalError, UsageError
 from edgefilter.filter.budget import DEFAULT_MS, Choice, allowed_cores, choose, forget
@@ -37,9 +39,11 @@ TWICE_S = 0.5
 
 
 def main(args: argparse.Namespace) -> int:
-    speech, profile = make_speech(args), load_profile(args)
+    speech = make_speech(args)
+    file = args.learn if args.learn and Path(args.learn).exists() else args.profile
+    profile = Profile.load(file) if file else None
     channels = channels_of(args, profile)
-    source = make_source(args.input, speech or args.reference, args.output, channels, args.reference_channel)
+    source = make_source(args, speech, channels)
     if channels == ALL_CHANNELS and args.mic_channels is None:
         source.notes.append(f"all {source.microphones} channels are microphones, since the profile is of an array")
     ego, choice = make_filter(args, source.live, profile)
@@ -50,17 +54,17 @@ def main(args: argparse.Namespace) -> int:
     for note in notes:
         say(note)
     told = len(source.notes)
-    observers = Observers(args, ego, source, speech, notes)
-    with stop_on_signal(source) as stopped, source, sink, observers, garbage_of_this_run_only():
+    observed = observing(args, ego, source, speech, notes)
+    with stop_on_signal(source) as stopped, source, sink, observed as observers, garbage_of_this_run_only():
         report = filter_blocks(
             limited(source, limit),
             ego,
             sink,
-            observers.record,
-            observers.show,
-            lambda: bool(stopped) or sink.finished,
-            observers.hear,
-            Troubles(source, sink),
+            recorder=observers.record,
+            show=observers.show,
+            stopped=lambda: bool(stopped) or sink.finished,
+            tell=observers.hear,
+            troubles=Troubles(source, sink),
         )
         report.interrupted |= bool(stopped)
     for note in [*source.notes[told:], *sink.notes]:
@@ -75,20 +79,18 @@ def main(args: argparse.Namespace) -> int:
 
 def make_speech(args: argparse.Namespace) -> SpokenReference | None:
     """The speech that the run itself plays, None where no --play asks for it."""
-    live = is_live(args.input)
     if args.play is None:
         if args.speaker is not None or args.barge_in:
             option = "--barge-in" if args.barge_in else "--speaker"
             raise UsageError(f"{option} concerns the speech that --play plays, found none: give --play FILE")
         return None
+    live = is_device(args.input)
     if not live or args.reference is not None:
         found = f"--reference {args.reference}" if live else f"--input {args.input}"
         raise UsageError(
             f"--play plays the robot's speech to a live microphone and is the reference itself, found {found}: give"
             " --input mic and no --reference"
         )
-    from edgefilter.audio.device import speaker
-
     return speaker(args.speaker, Reader(args.play, "speech"))
 
 
@@ -98,7 +100,7 @@ def channels_of(args: argparse.Namespace, profile: Profile | None) -> Sequence[i
     Where none are named, live, and the profile is of several: all that the device has.
     """
     if args.reference_channel is None:
-        if args.mic_channels is None and profile and profile.microphones > 1 and is_live(args.input):
+        if args.mic_channels is None and profile and profile.microphones > 1 and is_device(args.input):
             return ALL_CHANNELS
         return args.mic_channels
     if not args.mic_channels or args.reference_channel in args.mic_channels:
@@ -110,35 +112,26 @@ def channels_of(args: argparse.Namespace, profile: Profile | None) -> Sequence[i
     return args.mic_channels
 
 
-def make_source(
-    name: str,
-    reference: str | SpokenReference | None,
-    output: str,
-    channels: Sequence[int] | None = None,
-    reference_channel: int | None = None,
-) -> Source:
-    """A file or pipe where name is one, else the live devices.
+def make_source(args: argparse.Namespace, speech: SpokenReference | None, channels: Sequence[int] | None) -> Source:
+    """A file or pipe where --input is one, else the live devices.
 
     The reference defaults to the monitor of the output device, for the virtual microphone to that of its speaker.
-    channels, reference_channel: as of FileSource and LiveSource.
     """
-    if isinstance(reference, str | None) and (name == "-" or looks_like_file(name)):
-        return open_source(name, reference, channels, reference_channel)
-    from edgefilter.audio.device import find, monitor_of
-    from edgefilter.audio.live import LiveSource
-
-    if isinstance(reference, str) and looks_like_file(reference):
+    if not is_device(args.input):
+        return open_source(args.input, args.reference, channels, args.reference_channel)
+    if args.reference is not None and looks_like_file(args.reference):
         raise UsageError(
-            f"live, the reference is a device, found the file {reference}: leave --reference out or name a monitor"
+            f"live, the reference is a device, found the file {args.reference}: leave --reference out or name a monitor"
             " ('edgefilter devices'); to play the file, --play"
         )
-    mic = find(name, "input")
+    mic = find(args.input, "input")
     virtual.refuse_own(mic)
-    if reference is not None or reference_channel is not None:
-        return LiveSource(mic, reference, patience_s=math.inf, channels=channels, reference_channel=reference_channel)
-    own = pulse.monitor(virtual.SPEAKER) if output == virtual.HUMAN else None
-    played_on = "default" if output in ("-", virtual.HUMAN) or looks_like_file(output) else output
-    return LiveSource(mic, own or monitor_of(played_on), patience_s=math.inf, channels=channels)
+    reference = speech or args.reference
+    if reference is None and args.reference_channel is None:
+        own = pulse.monitor(virtual.SPEAKER) if args.output == virtual.HUMAN else None
+        played_on = args.output if is_device(args.output) and args.output != virtual.HUMAN else "default"
+        reference = own or monitor_of(played_on)
+    return LiveSource(mic, reference, patience_s=math.inf, channels=channels, reference_channel=args.reference_channel)
 
 
 def make_sink(name: str, latency: int, wait: bool) -> Sink:
@@ -146,17 +139,13 @@ def make_sink(name: str, latency: int, wait: bool) -> Sink:
 
     wait: let a device that plays slower hold back the source, which a recording can bear and a microphone cannot.
     """
-    if name == "-" or looks_like_file(name):
+    if not is_device(name):
         return open_sink(name)
-    from edgefilter.audio.live import LiveSink
-
-    if wait:
-        return LiveSink(name, latency, wait=True)
-    return SteadySink(lambda: LiveSink(name, latency, wait=False))
+    return LiveSink(name, latency, wait=True) if wait else SteadySink(lambda: LiveSink(name, latency, wait=False))
 
 
-def is_live(name: str) -> bool:
-    """Whether an input is a device, neither a pipe nor a file."""
+def is_device(name: str) -> bool:
+    """Whether an input or output is neither a pipe nor a file."""
     return name != "-" and not looks_like_file(name)
 
 
@@ -197,12 +186,6 @@ def make_filter(args: argparse.Namespace, live: bool, profile: Profile | None) -
             " ('edgefilter calibrate' measures them beforehand)"
         )
     return ego, choice
-
-
-def load_profile(args: argparse.Namespace) -> Profile | None:
-    """What the filter begins with: what was learned before, else the profile that is named."""
-    file = args.learn if args.learn and Path(args.learn).exists() else args.profile
-    return Profile.load(file) if file else None
 
 
 def make_learner(args: argparse.Namespace, live: bool, profile: Profile | None) -> Learner | None:

@@ -21,7 +21,7 @@ STREAMS_PER_CORE = 4
 `crnn` (docs/serve.md), since those whose hops come at once wait for one another."""
 
 
-def main(args: argparse.Namespace) -> int:
+def main(args: argparse.Namespace) -> None:
     try:
         from edgefilter.integrations.serve import Service
     except ModuleNotFoundError as error:
@@ -59,7 +59,6 @@ def main(args: argparse.Namespace) -> int:
         raise EdgefilterError(
             f"{args.host}:{args.port} cannot be served: {error.strerror or error}; choose another --host or --port"
         ) from None
-    return 0
 
 
 def read_token(path: str) -> str:

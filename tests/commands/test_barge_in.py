@@ -12,8 +12,8 @@ import soundfile
 
 from edgefilter import EgoFilter
 from edgefilter.cli import main
-from edgefilter.commands import barge_in
-from edgefilter.commands.barge_in import Availability, BargeInCommand, Lowering
+from edgefilter.commands import observers
+from edgefilter.commands.observers import Availability, BargeInCommand, lower
 from edgefilter.session import Progress
 from edgefilter.types import Event
 
@@ -47,8 +47,8 @@ def test_a_command_that_fails_is_one_line(command, code):
 
 
 def test_a_command_that_does_not_end_is_killed_with_its_children_and_not_multiplied(tmp_path, monkeypatch):
-    monkeypatch.setattr(barge_in, "PATIENCE_S", 0.3)
-    monkeypatch.setattr(barge_in, "MOST_AT_ONCE", 2)
+    monkeypatch.setattr(observers, "PATIENCE_S", 0.3)
+    monkeypatch.setattr(observers, "MOST_AT_ONCE", 2)
     said, alive = [], tmp_path / "alive"
     with BargeInCommand(f"(sleep 1; touch {alive}) & wait", said.append) as reaction:
         for _ in range(3):
@@ -70,9 +70,8 @@ def test_the_robot_is_stopped_for_good_or_lowered_while_the_human_speaks(how, ga
             self.gains.append(gain)
 
     speech = Speech()
-    lowering = Lowering(speech, how)
     for event in (STARTED, Event("learned", 0, ""), STARTED, STOPPED):
-        lowering.hear(event)
+        lower(speech, how, event)
     assert speech.gains == pytest.approx(gains)
 
 
