@@ -127,23 +127,20 @@ def filter_blocks(
             tell(event)
             report.events.append(replace(event, turn=None))
 
-    def take(block: Block) -> None:
-        if recorder is not None:
-            recorder.write(block)
-        start = time.perf_counter()
-        out = ego.process(block.mic, block.ref)
-        process_s = time.perf_counter() - start
-        report.process_s += process_s
-        report.samples_in += block.ref.size
-        report.lost += block.lost
-        push(out)
-        tell_events(last=False)
-        progress.note(block, out, ego.human_speaks, process_s)
-        show(progress)
-
     try:
         for block in source:
-            take(block)
+            if recorder is not None:
+                recorder.write(block)
+            start = time.perf_counter()
+            out = ego.process(block.mic, block.ref)
+            process_s = time.perf_counter() - start
+            report.process_s += process_s
+            report.samples_in += block.ref.size
+            report.lost += block.lost
+            push(out)
+            tell_events(last=False)
+            progress.note(block, out, ego.human_speaks, process_s)
+            show(progress)
             if stopped():
                 report.interrupted = True
                 break

@@ -15,6 +15,7 @@ import soundfile
 from edgefilter.audio.files import FileSink, FileSource, write_file
 from edgefilter.commands.add import Fitted, fit
 from edgefilter.commands.display import describe_latency, print_result, progress, report_part, say
+from edgefilter.commands.outputs import CASES
 from edgefilter.diagnosis.compare import compare
 from edgefilter.diagnosis.diagnose import diagnose
 from edgefilter.diagnosis.result import in_order
@@ -28,8 +29,6 @@ from edgefilter.report.text import decibels, headline
 from edgefilter.session import filter_blocks
 from edgefilter.types import SAMPLE_RATE, Samples
 
-CASES = ("one", "two")
-"""Folders of demo_data/hidden: a robot to which one thing has happened, and one to which two have."""
 HUMAN_DB, HUMAN_AT_S = -20.0, 1.0
 """Level of the human over the robot in the same seconds, and when the human begins to interrupt it."""
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from typing import Literal
 
@@ -80,31 +80,27 @@ def examine(
 
     channels: of the microphone's device, where it is an array. profile: of as many microphones, to hold them against.
     """
-    yield from _machine()
-    yield from _guarded("model", _model)
-    yield from _guarded("engine", _engine)
-    yield from _guarded("sound server", _server)
+    cores = len(allowed_cores())
+    few = "loudspeaker and room are not learned while running; allow another core"
+    yield judged("cores", str(cores), few if cores < 2 else "")
+    yield from _guarded("model", _model())
+    yield from _guarded("engine", _engine())
+    yield from _guarded("sound server", _server())
     ports: dict[str, InputPort] = {}
-    yield from _guarded("microphone", lambda: _open(ports, "microphone", microphone, channels))
-    yield from _guarded("reference", lambda: _open(ports, "reference", reference))
+    yield from _guarded("microphone", _open(ports, "microphone", microphone, channels))
+    yield from _guarded("reference", _open(ports, "reference", reference))
     if ports:
-        yield from _guarded("sound", lambda: _sound(ports))
+        yield from _guarded("sound", _sound(ports))
     if speaker is not None and len(ports) == 2:
-        yield from _guarded("set-up", lambda: _set_up(ports, speaker, channels, profile))
+        yield from _guarded("set-up", _set_up(ports, speaker, channels, profile))
 
 
-def _guarded(name: str, look: Callable[[], Iterator[Check]]) -> Iterator[Check]:
+def _guarded(name: str, checks: Iterator[Check]) -> Iterator[Check]:
     """The checks of one subject; an EdgefilterError is a check that failed, and says itself what to do."""
     try:
-        yield from look()
+        yield from checks
     except EdgefilterError as error:
         yield Check(name, "failed", " ".join(str(error).split()))
-
-
-def _machine() -> Iterator[Check]:
-    found = len(allowed_cores())
-    few = "loudspeaker and room are not learned while running; allow another core"
-    yield judged("cores", str(found), few if found < 2 else "")
 
 
 def _model() -> Iterator[Check]:

@@ -22,11 +22,13 @@ WRITTEN = (
     *("plot", "log_json"),
 )
 """Options that may name a file to write."""
+CASES = ("one", "two")
+"""The robots of `demo --hidden`, folders of demo_data/hidden: one thing has happened to the first, two to the second."""
 HIDDEN_FILES = (
     *("robot.npz", "mic.wav", "tts.wav", "talk.wav", "talk_tts.wav", "better.npz"),
     *("human_before.wav", "human_after.wav", "report.html", "before_after.png"),
 )
-"""What `demo --hidden` writes of each of its robots."""
+"""What it writes of each of them."""
 FOLDERS: dict[tuple[str, str], tuple[str, ...]] = {
     ("run", "record"): ("mic.wav", "reference.wav", "output.wav", "events.jsonl", "run.json", "profile.npz"),
     ("run", "turns"): ("turn_0001.wav",),
@@ -34,7 +36,7 @@ FOLDERS: dict[tuple[str, str], tuple[str, ...]] = {
     ("ros2", "output"): ("mic.wav", "reference.wav"),
     ("demo", "output"): (
         *("filtered.wav", "microphone.wav", "human.wav", "before_after.png"),
-        *(f"{case}/{name}" for case in ("one", "two") for name in HIDDEN_FILES),
+        *(f"{case}/{name}" for case in CASES for name in HIDDEN_FILES),
     ),
 }
 """By command and option: the files that are written into the folder which the option names."""

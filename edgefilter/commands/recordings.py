@@ -20,9 +20,8 @@ from edgefilter.types import Samples
 def read(path: str, role: str, channels: Sequence[int] | None = None) -> Samples:
     """A whole recording (n,), 16 kHz mono, which messages call by its role; conversions are said on standard error.
 
-    channels: numbers, from 0, of those that are wanted in place of the mean; (n, channels) of several.
-
-    Raises AudioFileError for a file that is unusable.
+    channels: numbers, from 0, of those that are wanted in place of the mean; (n, channels) of several. Raises
+    AudioFileError for a file that is unusable.
     """
     return _whole(Reader(path, role, channels))
 
@@ -54,11 +53,10 @@ def load_array(args: argparse.Namespace) -> tuple[Profile, Samples, Samples, Arr
     wanted = reader.wanted or []
     number = wanted[0] if args.channel is None else args.channel
     if number not in wanted:
-        raise UsageError(
-            f"--channel {number} is none of the microphones {', '.join(map(str, wanted))} of --mic-channels"
-        )
+        there = ", ".join(map(str, wanted))
+        raise UsageError(f"--channel {number} is none of the microphones {there} of --mic-channels")
     at = wanted.index(number)
-    if at and getattr(args, "apply", None):
+    if at and args.apply:
         raise UsageError(
             "--apply writes the profile of the first microphone and the others' beside it: leave --channel out"
         )
@@ -68,10 +66,10 @@ def load_array(args: argparse.Namespace) -> tuple[Profile, Samples, Samples, Arr
         raise AudioFileError(f"channel {number} of {args.recording} is silent: every sample is zero, choose another")
     if args.profile is None:
         return self_calibrate(recordings[at], reference), recordings[at], reference, None, {}
-    profile = Profile.load(args.profile)
-    doubts = doubtful_channels(profile, np.ascontiguousarray(recordings), reference)
+    profile, recordings = Profile.load(args.profile), np.ascontiguousarray(recordings)
+    doubts = doubtful_channels(profile, recordings, reference)
     found = {wanted[index]: what for index, what in doubts.items()}
-    return profile.of_microphone(at), np.ascontiguousarray(recordings[at]), reference, profile.array, found
+    return profile.of_microphone(at), recordings[at], reference, profile.array, found
 
 
 def read_voice(path: str, role: str) -> Samples:
