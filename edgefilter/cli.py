@@ -107,26 +107,22 @@ def _run(commands: argparse._SubParsersAction) -> None:
     told = "WAV or FLAC file, output device, or '-': raw PCM on standard output"
     option("--output", required=True, metavar="FILE|DEVICE|-", help=told)
     _json(option)
-    told = "keep microphone, reference, output, events and profile in a new folder"
-    option("--record", metavar="FOLDER", help=told)
+    option("--record", metavar="FOLDER", help="keep microphone, reference, output, events and profile in a new folder")
     option("--turns", metavar="FOLDER", help="write each finished turn of the human to a WAV file there")
     option("--log-json", metavar="FILE|-", help="write each event as a line of JSON when it happens")
-    told = "write the profile with the echo path that this run has adapted"
-    option("--save-profile", metavar="P2.npz", help=told)
+    option("--save-profile", metavar="P2.npz", help="write the profile with the echo path that this run has adapted")
     told = (
         "run this in a shell whenever the human begins to speak; EDGEFILTER_EVENT and EDGEFILTER_TIME say what and when"
     )
     option("--on-barge-in", type=command, metavar="COMMAND", help=told)
-    told = "live: play this speech of the robot, which then is the reference"
-    option("--play", metavar="FILE", help=told)
+    option("--play", metavar="FILE", help="live: play this speech of the robot, which then is the reference")
     option("--speaker", metavar="DEVICE", help="output device for --play (default: default)")
     told = "when the human begins to speak, end what --play plays, or lower it by 10 dB until the human is quiet"
     option("--barge-in", choices=("stop", "duck"), help=told)
     learning = run.add_mutually_exclusive_group()
     told = "start from what earlier runs have learned if the file exists (else from --profile), and keep there what this one learns"
     learning.add_argument("--learn", metavar="P.npz", help=told)
-    told = "do not learn loudspeaker and room while running"
-    learning.add_argument("--no-learn", action="store_true", help=told)
+    learning.add_argument("--no-learn", action="store_true", help="do not learn loudspeaker and room while running")
     option("--seconds", type=positive, metavar="S", help="stop after S seconds")
     option("--effects", **EFFECTS)
     option("--quiet", action="store_true", help="no progress, no status line")
@@ -146,8 +142,7 @@ def _calibrate(commands: argparse._SubParsersAction) -> None:
     option = calibrate.add_argument
     option("--sweep-reference", metavar="S.wav", help="the sweep as it was sent to the loudspeaker")
     option("--sweep-recording", metavar="R.wav", help="the sweep as the microphone recorded it")
-    told = "some seconds of the fan while the robot is silent"
-    option("--noise-recording", metavar="FAN.wav", help=told)
+    option("--noise-recording", metavar="FAN.wav", help="some seconds of the fan while the robot is silent")
     option("--mic-channels", **MIC_CHANNELS)
     told = "multisines at three levels follow the sweep: measure the robot's distortion too"
     option("--multisine", action="store_true", help=told)
@@ -158,8 +153,7 @@ def _calibrate(commands: argparse._SubParsersAction) -> None:
     option("--save-input", metavar="DIR", help="with --live: also keep the recordings")
     result = calibrate.add_mutually_exclusive_group(required=True)
     result.add_argument("--output", metavar="P.npz", help="profile to write")
-    told = "only write the sound that is to be played"
-    result.add_argument("--excitation", metavar="S.wav", help=told)
+    result.add_argument("--excitation", metavar="S.wav", help="only write the sound that is to be played")
     _json(option)
 
 
@@ -210,8 +204,7 @@ def _probe(commands: argparse._SubParsersAction) -> None:
     option("--recording", required=True, metavar="MIC", help=told)
     option("--reference", metavar="REF", help="what the robot said there, as it was sent to the loudspeaker")
     _live(option, "play on --speaker and record on --input")
-    told = "of sound at most (default: %(default)g)"
-    option("--seconds", type=positive, default=5.0, metavar="S", help=told)
+    option("--seconds", type=positive, default=5.0, metavar="S", help="of sound at most (default: %(default)g)")
     told = (
         "the sound to be played, written there, with what is asked in S.wav.json; without --reference: that was played"
     )
@@ -225,8 +218,7 @@ def _passport(commands: argparse._SubParsersAction) -> None:
     option = commands.add_parser("passport", help=told).add_argument
     told = "the robot alone, as the microphone recorded it, 10 s or more; the first 60 s are taken"
     option("--recording", required=True, metavar="MIC", help=told)
-    told = "what the robot said, as it was sent to the loudspeaker"
-    option("--reference", required=True, metavar="REF", help=told)
+    option("--reference", required=True, metavar="REF", help="what the robot said, as it was sent to the loudspeaker")
     told = "which engine is tried; repeatable (default: all of them)"
     option("--engine", action="append", choices=("linear", "ss", "crnn"), help=told)
     level = number(-40.0, 20.0, "a level from -40 to 20 dB", closed=True)
@@ -345,8 +337,7 @@ def _recording(option: Callable[..., object], profile_needed: bool) -> None:
     option("--profile", required=profile_needed, metavar="P.npz", help=told)
     told = "the robot alone, as the microphone recorded it, some seconds at least"
     option("--recording", required=True, metavar="MIC", help=told)
-    told = "what the robot said, as it was sent to the loudspeaker"
-    option("--reference", required=True, metavar="REF", help=told)
+    option("--reference", required=True, metavar="REF", help="what the robot said, as it was sent to the loudspeaker")
     _json(option)
     option("--effects", **EFFECTS)
 

@@ -30,10 +30,7 @@ from edgefilter.profile.data import Profile
 from edgefilter.session import Progress
 from edgefilter.types import SAMPLE_RATE, Event
 
-ENDED = (
-    *("samples_in", "samples_out", "samples_lost", "interrupted", "failure"),
-    *("alignment", "learning", "deadline"),
-)
+ENDED = ("samples_in", "samples_out", "samples_lost", "interrupted", "failure", "alignment", "learning", "deadline")
 """Figures of the run that the last line of a log holds."""
 LOWERED = {"stop": 0.0, "duck": 10 ** (-10 / 20)}
 """Gain of the robot's speech while the human speaks, by the word of --barge-in."""
