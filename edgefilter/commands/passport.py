@@ -24,11 +24,10 @@ def main(args: argparse.Namespace) -> None:
     recording, reference = read(args.recording, "recording")[:most], read(args.reference, "reference")[:most]
     voice = read(str(DEMO / "human.flac"), "human")
     with progress("passport") as step:
-        engines = args.engine or list(ENGINES)
-        found = measure(recording, reference, voice[speaking(voice)], args.human_db, engines, step)
-        named, verdict = (None, "not asked for") if args.no_diagnosis or not found.found else _diagnosed(
-            recording, reference, step
-        )  # fmt: skip
+        human = voice[speaking(voice)]
+        found = measure(recording, reference, human, args.human_db, args.engine or ENGINES, step)
+        wanted = found.found and not args.no_diagnosis
+        named, verdict = _diagnosed(recording, reference, step) if wanted else (None, "not asked for")
     figures = found.to_dict() | {
         "diagnosis": named.to_dict() if named else None,
         "said": {**expectation(found), "diagnosis": verdict},
