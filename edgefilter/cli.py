@@ -40,6 +40,11 @@ EFFECTS = {
 }
 
 
+JSON = {"metavar": "FILE", "help": "write the figures as JSON ('-': standard output)"}
+REPORT = {"metavar": "R.html", "help": "write a page with pictures and sound, in one file"}
+FORCE = {"action": "store_true", "help": "write the profile even if the running filter is worse with it"}
+
+
 class Parser(argparse.ArgumentParser):
     """argparse with one line per mistake and no abbreviated flags."""
 
@@ -72,7 +77,7 @@ def _demo(commands: argparse._SubParsersAction) -> None:
     told = "instead: diagnose and correct two robots that have changed since their calibration (about a minute)"
     option("--hidden", action="store_true", help=told)
     option("--engine", **ENGINE)
-    _json(option)
+    option("--json", **JSON)
 
 
 def _run(commands: argparse._SubParsersAction) -> None:
@@ -106,7 +111,7 @@ def _run(commands: argparse._SubParsersAction) -> None:
     option("--remeasure", action="store_true", help=told)
     told = "WAV or FLAC file, output device, or '-': raw PCM on standard output"
     option("--output", required=True, metavar="FILE|DEVICE|-", help=told)
-    _json(option)
+    option("--json", **JSON)
     option("--record", metavar="FOLDER", help="keep microphone, reference, output, events and profile in a new folder")
     option("--turns", metavar="FOLDER", help="write each finished turn of the human to a WAV file there")
     option("--log-json", metavar="FILE|-", help="write each event as a line of JSON when it happens")
@@ -154,14 +159,14 @@ def _calibrate(commands: argparse._SubParsersAction) -> None:
     result = calibrate.add_mutually_exclusive_group(required=True)
     result.add_argument("--output", metavar="P.npz", help="profile to write")
     result.add_argument("--excitation", metavar="S.wav", help="only write the sound that is to be played")
-    _json(option)
+    option("--json", **JSON)
 
 
 def _compare(commands: argparse._SubParsersAction) -> None:
     told = "say how much of a recording of the robot the profile does not explain, and where"
     option = commands.add_parser("compare", help=told).add_argument
     _recording(option, profile_needed=False)
-    _report(option)
+    option("--report", **REPORT)
 
 
 def _diagnose(commands: argparse._SubParsersAction) -> None:
@@ -179,9 +184,9 @@ def _diagnose(commands: argparse._SubParsersAction) -> None:
     rate = number(1e-6, 0.5, "a share from 0.000001 to 0.5, such as 0.01 for 1 in 100")
     told = "share of ordinary recordings in which an effect may be named by chance (default: %(default)g)"
     option("--false-rate", type=rate, default=Criteria.false_rate, metavar="P", help=told)
-    _force(option)
+    option("--force", **FORCE)
     _recording(option, profile_needed=False)
-    _report(option)
+    option("--report", **REPORT)
 
 
 def _probe(commands: argparse._SubParsersAction) -> None:
@@ -209,7 +214,7 @@ def _probe(commands: argparse._SubParsersAction) -> None:
         "the sound to be played, written there, with what is asked in S.wav.json; without --reference: that was played"
     )
     option("--excitation", metavar="S.wav", help=told)
-    _json(option)
+    option("--json", **JSON)
     option("--effects", **EFFECTS)
 
 
@@ -225,15 +230,15 @@ def _passport(commands: argparse._SubParsersAction) -> None:
     told = "level of the human whose SI-SDR is predicted, against the robot's (default: %(default)s)"
     option("--human-db", type=level, default=-10.0, metavar="DB", help=told)
     option("--no-diagnosis", action="store_true", help="do not look for physical effects, which takes longest")
-    _json(option)
-    _report(option)
+    option("--json", **JSON)
+    option("--report", **REPORT)
 
 
 def _add(commands: argparse._SubParsersAction) -> None:
     told = "fit effects to a recording and write a profile that has them"
     option = commands.add_parser("add", help=told).add_argument
     option("effect", nargs="+", metavar="EFFECT", help="names of effects, as 'diagnose' prints them")
-    _force(option)
+    option("--force", **FORCE)
     _recording(option, profile_needed=True)
     option("--output", required=True, metavar="P2.npz", help="profile to write")
 
@@ -243,14 +248,14 @@ def _remove(commands: argparse._SubParsersAction) -> None:
     option("effect", metavar="EFFECT", help="name of the effect, as 'profile show' prints it")
     option("--profile", required=True, metavar="P.npz", help="profile that holds the effect")
     option("--output", required=True, metavar="P2.npz", help="profile to write")
-    _json(option)
+    option("--json", **JSON)
     option("--effects", **EFFECTS)
 
 
 def _devices(commands: argparse._SubParsersAction) -> None:
     devices = commands.add_parser("devices", help="list sound devices and the reference that a live run would take")
     option = devices.add_mutually_exclusive_group().add_argument
-    _json(option)
+    option("--json", **JSON)
     option("--setup", action="store_true", help="print the commands that make a virtual speaker and microphone")
     option("--load", action="store_true", help="make them, until the sound server ends")
     option("--unload", action="store_true", help="remove them")
@@ -267,7 +272,7 @@ def _doctor(commands: argparse._SubParsersAction) -> None:
     told = "output that plays chirps, 5 s with a peak of -18 dB of full scale: where the robot plays (default: %(default)s)"
     option("--speaker", default="default", metavar="DEVICE", help=told)
     option("--no-chirp", action="store_true", help="play nothing")
-    _json(option)
+    option("--json", **JSON)
 
 
 def _serve(commands: argparse._SubParsersAction) -> None:
@@ -311,7 +316,7 @@ def _ros2(commands: argparse._SubParsersAction) -> None:
     option("--reference", required=True, metavar="TOPIC", help="what the robot said")
     option("--output", required=True, metavar="DIR", help="folder for mic.wav and reference.wav")
     _form(option)
-    _json(option)
+    option("--json", **JSON)
 
 
 def _form(option: Callable[..., object]) -> None:
@@ -326,7 +331,7 @@ def _profile(commands: argparse._SubParsersAction) -> None:
     option = show.add_parser("show", help="print what a profile holds").add_argument
     option("profile", metavar="P.npz")
     option("--plot", metavar="FILE.png", help="draw it")
-    _json(option)
+    option("--json", **JSON)
     option("--effects", **EFFECTS)
 
 
@@ -338,7 +343,7 @@ def _recording(option: Callable[..., object], profile_needed: bool) -> None:
     told = "the robot alone, as the microphone recorded it, some seconds at least"
     option("--recording", required=True, metavar="MIC", help=told)
     option("--reference", required=True, metavar="REF", help="what the robot said, as it was sent to the loudspeaker")
-    _json(option)
+    option("--json", **JSON)
     option("--effects", **EFFECTS)
 
 
@@ -347,18 +352,6 @@ def _live(option: Callable[..., object], what: str) -> None:
     told = "device for --live (default: %(default)s)"
     option("--speaker", default="default", metavar="DEVICE", help=f"output {told}")
     option("--input", default="mic", metavar="DEVICE", help=f"input {told}")
-
-
-def _report(option: Callable[..., object]) -> None:
-    option("--report", metavar="R.html", help="write a page with pictures and sound, in one file")
-
-
-def _force(option: Callable[..., object]) -> None:
-    option("--force", action="store_true", help="write the profile even if the running filter is worse with it")
-
-
-def _json(option: Callable[..., object]) -> None:
-    option("--json", metavar="FILE", help="write the figures as JSON ('-': standard output)")
 
 
 def command(text: str) -> str:
