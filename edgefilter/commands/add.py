@@ -92,20 +92,15 @@ class Fitted:
             " fitted to all of the recording"
         ]
         if self.promised_db is not None:
-            lines.append(
-                f"promised    fitted to half of it they left {decibels(self.promised_db)} dB of the other half"
-            )
+            left = decibels(self.promised_db)
+            lines.append(f"promised    fitted to half of it they left {left} dB of the other half")
         for name in self.names:
             lines += _values(name, values[name], len(self.names) > 1)
         lines += [f"{'recording':<12}{text}" for text in self.before.warnings]
         lines.append(proof_line(self.proof, self.unproven))
         lines += [f"{'dropped':<12}{name}: with it the running filter would be worse" for name in self.dropped]
-        lines += [
-            f"NOTE        {name} happened in this recording and is kept with it: of others the profile predicts what it"
-            " did before"
-            for name in self.names
-            if find(name).event
-        ]
+        kept = "happened in this recording and is kept with it: of others the profile predicts what it did before"
+        lines += [f"NOTE        {name} {kept}" for name in self.names if find(name).event]
         lines += [f"NOTE        {name}: {note}" for name in self.names if (note := reach(find(name), values[name]))]
         if self.promised_db is not None and after_db > self.promised_db + PROMISE_DB:
             missing = f"{joined(self.dropped)} is not in it" if self.dropped else "no fit to all of it explains as much"
@@ -135,12 +130,10 @@ def fit(
     proofs: tuple[Proof, ...] = ()
     unproven = "there is nothing to prove"
     try:
-        if names or profile is None:
-            proofs = (
-                proofs_until_kept(profile, names, recording, reference)
-                if found and not force
-                else (prove(profile, names, recording, reference),)
-            )
+        if (names or profile is None) and found and not force:
+            proofs = proofs_until_kept(profile, names, recording, reference)
+        elif names or profile is None:
+            proofs = (prove(profile, names, recording, reference),)
     except SignalError as error:
         if not force:
             raise
