@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
+from edgefilter.audio.files import Recorder
 from edgefilter.audio.protocols import Sink
-from edgefilter.audio.recorder import Recorder
 from edgefilter.dsp.frames import decibels
 from edgefilter.errors import EdgefilterError
 from edgefilter.filter.ego_filter import EgoFilter

@@ -7,7 +7,7 @@ from dataclasses import asdict, replace
 from typing import Any
 
 from edgefilter.audio import pulse
-from edgefilter.audio.lookup import STAND_INS, Device, match, monitor
+from edgefilter.audio.lookup import STAND_INS, Device, Named, match, monitor
 from edgefilter.audio.port import STREAM_LATENCY_S, InputPort, OutputPort, silence_alsa
 from edgefilter.audio.reader import Reader
 from edgefilter.audio.speech import SpokenReference
@@ -19,9 +19,8 @@ def _sounddevice() -> Any:
     try:
         import sounddevice
     except ImportError:
-        raise DeviceError(
-            "live audio needs the Python package sounddevice, which is missing: pip install sounddevice"
-        ) from None
+        missing = "the Python package sounddevice, which is missing: pip install sounddevice"
+        raise DeviceError(f"live audio needs {missing}") from None
     except OSError as error:
         raise DeviceError(f"live audio needs the PortAudio library ({error}): apt install libportaudio2") from None
     silence_alsa()
@@ -31,12 +30,11 @@ def _sounddevice() -> Any:
 def _of_portaudio() -> list[Device]:
     sd = _sounddevice()
     apis = [api["name"] for api in sd.query_hostapis()]
-    return [
-        Device(
-            i, d["name"], d["max_input_channels"], d["max_output_channels"], d["default_samplerate"], apis[d["hostapi"]]
-        )
-        for i, d in enumerate(sd.query_devices())
-    ]
+    found = []
+    for index, d in enumerate(sd.query_devices()):
+        channels = d["max_input_channels"], d["max_output_channels"]
+        found.append(Device(index, d["name"], *channels, d["default_samplerate"], apis[d["hostapi"]]))
+    return found
 
 
 def _of_server(found: list[Device]) -> Iterator[Device]:
@@ -58,17 +56,14 @@ def list_devices() -> list[dict[str, Any]]:
     return [asdict(device) for device in _of_portaudio()]
 
 
-def find(name: str | int | Device | None, kind: str) -> Device:
-    """The device called name, numbered so, or with name in its name; None, 'default' and 'mic' are the default one.
-
-    kind: 'input' or 'output'. Raises UsageError for an unknown or ambiguous name, DeviceError without any device.
-    """
+def find(name: Named, kind: str) -> Device:
+    """The device that is meant; kind: 'input' or 'output'. Raises as match."""
     if isinstance(name, Device):
         return name
     return match(_devices(), name, kind, _sounddevice().default.device[0 if kind == "input" else 1])
 
 
-def monitor_of(output: str | int | Device | None = None) -> Device:
+def monitor_of(output: Named = None) -> Device:
     """The input that gets what output plays (default: the default output); UsageError where there is none."""
     device, devices = find(output, "output"), _devices()
     source = pulse.monitor(pulse.default_name("output")) if device.name in STAND_INS else None
@@ -76,24 +71,20 @@ def monitor_of(output: str | int | Device | None = None) -> Device:
     return found[0] if found else monitor(devices, device)
 
 
-def input_port(
-    name: str | int | Device | None, latency_s: float = STREAM_LATENCY_S, channels: Sequence[int] | None = None
-) -> InputPort:
-    """An input that can be opened, found by what people type; channels: numbers, from 0, of those that are wanted, or ALL_CHANNELS."""
+def input_port(name: Named, latency_s: float = STREAM_LATENCY_S, channels: Sequence[int] | None = None) -> InputPort:
+    """An input that can be opened; channels: numbers, from 0, of those that are wanted, or ALL_CHANNELS."""
     device = find(name, "input")
     if device.name in STAND_INS or device.pulse_name:  # PortAudio says 32 of whatever the server has
         device = replace(device, inputs=pulse.channels_of(device.pulse_name) or device.inputs)
     return InputPort(_sounddevice(), device, latency_s, channels)
 
 
-def output_port(
-    name: str | int | Device | None, queued: int, margin_s: float = 0.0, latency_s: float = STREAM_LATENCY_S
-) -> OutputPort:
-    """An output that can be opened, with room for so many samples at 16 kHz, found by what people type."""
+def output_port(name: Named, queued: int, margin_s: float = 0.0, latency_s: float = STREAM_LATENCY_S) -> OutputPort:
+    """An output that can be opened, with room for so many queued samples at 16 kHz."""
     return OutputPort(_sounddevice(), find(name, "output"), queued, margin_s, latency_s)
 
 
-def speaker(output: str | int | Device | None, speech: Reader) -> SpokenReference:
+def speaker(output: Named, speech: Reader) -> SpokenReference:
     """Speech for an output device, to be the reference of a LiveSource."""
     spoken = SpokenReference(_sounddevice(), find(output, "output"), speech.chunks())
     spoken.notes += speech.notes

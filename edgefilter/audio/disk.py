@@ -8,27 +8,30 @@ import os
 import stat
 from pathlib import Path
 
+import numpy as np
+
 try:
     import fcntl
 except ModuleNotFoundError:  # Windows, which does not let two programs write one file anyway
     fcntl = None  # type: ignore[assignment]
 
 _FLAC_FRAME = b"\xff\xf8"  # sync code of a frame of fixed size, RFC 9639, 9.1
-_MOST = 0xFFFFFFFF
+_MOST = int(np.iinfo(np.uint32).max)
 """Bytes that a WAV's size fields can say: a longer one says so much, and readers go on to the end of the file."""
 
 
 class Disk(io.RawIOBase):
     """A file in the making, one program's alone, that stays whole on a full disk and where the program is killed.
 
-    The encoders' libraries turn a failed write into an unnamed error and then leave a torn last frame behind. Here a
-    write that does not fit is undone and remembered in `error`, and from then on only the header may still be changed.
+    Where an encoder's library would leave a torn last frame behind, a write that does not fit is undone and remembered
+    in `error`, and from then on only the header may still be changed.
     Raises BlockingIOError, and leaves the file alone, where another program is writing it.
     """
 
     def __init__(self, path: Path) -> None:
         super().__init__()
-        self._file: io.FileIO = open(path, "r+b", buffering=0, opener=_make_or_open)  # noqa: SIM115 (closed by close)
+        # the file as it is: emptied only once it is known that nobody else writes it
+        self._file = io.FileIO(path, "r+", opener=lambda name, flags: os.open(name, flags | os.O_CREAT, 0o666))
         if stat.S_ISREG(os.fstat(self._file.fileno()).st_mode):
             _take_alone(self._file)
             self._file.truncate(0)
@@ -66,7 +69,7 @@ class Disk(io.RawIOBase):
         return self._file.tell()
 
     def update_header(self) -> None:
-        """Make the header agree with what is there by now: an encoder does so at the end, which a killed program does not see."""
+        """Make the header agree with what is there by now; an encoder does so at the end, which a killed program misses."""
         at = self._file.tell()
         try:
             self._repair_header()
@@ -102,19 +105,13 @@ class Disk(io.RawIOBase):
     def _repair_flac(self, start: bytes) -> None:
         """Put the number of samples that reached the disk into STREAMINFO (RFC 9639, 8.2).
 
-        It starts at byte 8 with the block size, holds the total in the low 36 bits of bytes 18-25 and the MD5 of the
-        sound in bytes 26-41, where zero means unknown. The encoder writes one frame at a time, and every frame but a
-        stream's last has the full size.
+        It starts at byte 8 with the block size, and holds the total in the low 36 bits of bytes 18-25 and the MD5 of
+        the sound, zero where unknown, in bytes 26-41. The encoder writes one frame at a time, all but the last full.
         """
         total = self._flac_frames * int.from_bytes(start[8:10], "big")
         fields = int.from_bytes(start[18:26], "big") >> 36 << 36 | total
         self._file.seek(18)
         self._file.write(fields.to_bytes(8, "big") + bytes(16))
-
-
-def _make_or_open(path: str, flags: int) -> int:
-    """The file as it is: emptied only once it is known that nobody else writes it."""
-    return os.open(path, flags | os.O_CREAT, 0o666)
 
 
 def _take_alone(file: io.FileIO) -> None:

@@ -1,4 +1,4 @@
-"""Files as source and sink: a recording with its reference in, a WAV or FLAC out."""
+"""Files as source and sink: a recording with its reference in, a WAV or FLAC out, and all the sound of a run."""
 
 from __future__ import annotations
 
@@ -16,7 +16,8 @@ from edgefilter.audio.reader import Reader
 from edgefilter.errors import AudioFileError, UsageError
 from edgefilter.types import SAMPLE_RATE, Block, Samples, as_microphones
 
-_FORMATS = {".wav": "WAV", ".flac": "FLAC"}
+MOST_RECORDED = (2**32 - 2**16) // 4
+"""Samples of 32 bit that the size field of a WAV file can count: 18.6 hours."""
 
 
 def open_source(
@@ -62,9 +63,8 @@ class FileSource(Source):
     """A recording and, if there is one, the reference of what the robot said, as blocks of 16 kHz mono.
 
     The recording decides the length: a shorter reference is followed by silence, a longer one is cut, without one the
-    reference is silence. `notes` says each conversion and is complete after construction. channels: numbers, from 0, of
-    the recording's channels that are microphones, in place of the mean of all. reference_channel: the one that is the
-    reference.
+    reference is silence. `notes` is complete after construction. channels: numbers, from 0, of the recording's channels
+    that are microphones, in place of the mean of all. reference_channel: the one that is the reference.
     Raises AudioFileError for an unusable file (see Reader).
     """
 
@@ -80,7 +80,7 @@ class FileSource(Source):
         self._reference = None if reference_path is None else Reader(reference_path, "reference")
         if reference_channel is not None:
             self._reference = Reader(mic_path, "reference in", [reference_channel])
-        self.microphones = 1 if self._mic.wanted is None else len(self._mic.wanted)
+        self.microphones = self._mic.given
         self._block = block
         self.total = self._mic.total
         self.notes = list(self._mic.notes)
@@ -105,18 +105,14 @@ class FileSource(Source):
 
 def _length_notes(reference: Reader, total: int) -> list[str]:
     """What there is to say about a reference for a recording of total samples."""
-    notes = []
+    notes, named = [], f"reference {reference.path} is"
     if reference.silent:
-        notes.append(
-            f"reference {reference.path} is silent: every sample is zero, so nothing tells the robot's voice from the"
-            " human's"
-        )
-    difference = abs(reference.total - total)
-    if difference:
-        how = "longer than the recording; its end is not used"
-        if reference.total < total:
-            how = "shorter than the recording; silence follows it"
-        notes.append(f"reference {reference.path} is {difference} samples ({difference / SAMPLE_RATE:.3f} s) {how}")
+        notes.append(f"{named} silent: every sample is zero, so nothing tells the robot's voice from the human's")
+    if difference := abs(reference.total - total):
+        how = "shorter than the recording; silence follows it"
+        if reference.total > total:
+            how = "longer than the recording; its end is not used"
+        notes.append(f"{named} {difference} samples ({difference / SAMPLE_RATE:.3f} s) {how}")
     return notes
 
 
@@ -145,7 +141,7 @@ class FileSink(Sink):
     """A 16 kHz file, WAV or FLAC by suffix, 16-bit PCM (or 32-bit float for WAV), mono unless channels are more.
 
     Valid up to the last sample however the context is left, and where the program is killed: a WAV up to the last
-    write, a FLAC up to the last of its frames of a quarter of a second. `clipped` counts samples beyond full scale.
+    write, a FLAC up to the last of its frames of a quarter of a second.
     Raises UsageError for another suffix, AudioFileError where the file cannot be written, another program is writing
     it, or the disk is full; then what fitted remains, as a valid file.
 
@@ -160,8 +156,8 @@ class FileSink(Sink):
     def __init__(self, path: str | Path, float32: bool = False, channels: int = 1) -> None:
         self.path = Path(path)
         self.notes = []
-        form = _FORMATS.get(self.path.suffix.lower())
-        if form is None:
+        form = self.path.suffix[1:].upper()
+        if form not in ("WAV", "FLAC"):
             raise UsageError(f"output {self.path} ends in '{self.path.suffix}', expected .wav or .flac: rename it")
         if self.path.is_fifo():
             raise AudioFileError(
@@ -234,3 +230,57 @@ def write_file(path: str | Path, samples: Samples, float32: bool = False) -> Non
     """Write samples (n,), or as 32-bit float (n, channels), to a file of their own; raises as FileSink does."""
     with FileSink(path, float32, 1 if samples.ndim == 1 else samples.shape[1]) as sink:
         sink.write(samples)
+
+
+class Recorder:
+    """FOLDER/mic.wav, reference.wav and output.wav, 32-bit float: exactly the samples of the blocks, and the filter's.
+
+    microphones: channels of mic.wav. A disk that is full ends the recording and not the run: what was written stays
+    valid, and the error stands in `failure`. Raises AudioFileError where the folder or a file cannot be made.
+    """
+
+    def __init__(self, folder: str | Path, microphones: int) -> None:
+        self.folder = Path(folder)
+        self.failure: AudioFileError | None = None
+        make_folder(self.folder, "the recording")
+        self._files: list[FileSink] = []
+        try:
+            for name, channels in {"mic": microphones, "reference": 1, "output": 1}.items():
+                self._files.append(FileSink(self.folder / f"{name}.wav", float32=True, channels=channels))
+        except AudioFileError:
+            self.__exit__()
+            raise
+
+    def __enter__(self) -> Recorder:
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        for file in self._files:
+            try:
+                file.close()
+            except AudioFileError as error:
+                self.failure = self.failure or error
+
+    def write(self, block: Block) -> None:
+        """Keep a block of the input."""
+        self._keep(0, block.mic)
+        self._keep(1, block.ref)
+
+    def write_output(self, samples: Samples) -> None:
+        """Keep what the filter made, (n,)."""
+        self._keep(2, samples)
+
+    def _keep(self, number: int, samples: Samples) -> None:
+        if self.failure:
+            return
+        file = self._files[number]
+        try:
+            if file.written * samples[:1].size + samples.size > MOST_RECORDED:
+                hours = MOST_RECORDED / SAMPLE_RATE / 3600
+                raise AudioFileError(
+                    f"{file.path} holds {hours:.1f} hours, all that a WAV file can: the recording ends here"
+                )
+            file.write(samples)
+        except AudioFileError as error:
+            self.failure = error
+            self.__exit__()

@@ -8,7 +8,7 @@ from functools import partial
 import numpy as np
 
 from edgefilter.audio.device import find, input_port, output_port
-from edgefilter.audio.lookup import Device
+from edgefilter.audio.lookup import Named
 from edgefilter.audio.pairing import MAX_WAIT, TOLERANCE, Pairing
 from edgefilter.audio.port import START_S, InputPort, pause
 from edgefilter.audio.protocols import Sink, Source
@@ -23,18 +23,17 @@ class LiveSource(Source):
 
     patience_s: how long a device may be away; silence stands in meanwhile, by the clock, and it is opened again as soon
     as that can be done. Raises DeviceError, after everything received has been delivered, when a device is away for
-    longer. reference None: silence. channels: numbers, from 0, of the microphone device's channels that are microphones, in
-    place of their mean. reference_channel: the one of them that is the reference, with which no second device is opened
-    and no second clock has to be followed; it needs channels. lost: samples left out, filled or moved so far, see stats(): overruns are callbacks
-    that the driver marked, each of which may hide an unknown number of samples.
+    longer. reference None: silence. channels: numbers, from 0, of the microphone device's channels that are
+    microphones, in place of their mean. reference_channel: the one beside them that is the reference, in place of a
+    second device with a second clock.
     """
 
     live = True
 
     def __init__(
         self,
-        mic: str | int | Device | None,
-        reference: str | int | Device | SpokenReference | None = None,
+        mic: Named,
+        reference: Named | SpokenReference = None,
         seconds: float | None = None,
         patience_s: float = 0.0,
         channels: Sequence[int] | None = None,
@@ -78,7 +77,10 @@ class LiveSource(Source):
         return [self._mic] if self._reference is None else [self._reference, self._mic]
 
     def stats(self) -> dict[str, int]:
-        """Samples at 16 kHz that were lost, filled or moved; callbacks marked as overrun; devices lost and found again."""
+        """Samples at 16 kHz that were lost, filled or moved; callbacks marked as overrun; devices lost and found again.
+
+        lost: all those samples. An overrun may hide an unknown number of samples.
+        """
         counts = {f"reference_{name}": getattr(self._pairing, name) for name in ("filled", "dropped", "inserted")}
         times: dict[str, int] = {}
         for name, each in (("microphone", self._mic), ("reference", self._reference)):
@@ -88,27 +90,27 @@ class LiveSource(Source):
 
     def __iter__(self) -> Iterator[Block]:
         given = reported = 0
-        failure = None
+        failure: DeviceError | None = None
         self._synchronise()
-        while not self._stopped and failure is None:
-            block = self._take()
+        while not self._stopped:
+            blocks = [self._take()]
             try:
                 for each in self._inputs():
                     each.check()
             except DeviceError as error:
-                failure, rest = error, self._pairing.flush()
-                block = block if rest is None else rest if block is None else _join(block, rest)
-            if block is None:
+                failure = error
+                blocks.append(self._pairing.flush())
+            for block in filter(None, blocks):
+                left = block.ref.size if self.total is None else min(block.ref.size, self.total - given)
+                before, reported = reported, self.stats()["lost"]
+                yield Block(block.mic[:left], block.ref[:left], block.start, reported - before)
+                given += left
+                if given == self.total:
+                    return
+            if failure is not None:
+                raise failure
+            if blocks == [None]:
                 pause()
-                continue
-            left = block.ref.size if self.total is None else min(block.ref.size, self.total - given)
-            lost, reported = self.lost - reported, self.lost
-            yield Block(block.mic[:left], block.ref[:left], block.start, lost)
-            given += left
-            if given == self.total:
-                return
-        if failure is not None:
-            raise failure
 
     def _take(self) -> Block | None:
         """What came of both devices, as far as it can be paired."""
@@ -125,19 +127,18 @@ class LiveSource(Source):
     def _synchronise(self) -> None:
         """Wait until both devices run steadily, and begin with what arrives then: a stream may stall right after its start.
 
-        The reference is emptied last: one that is too new only adds delay, one that is too old would come before its
-        echo.
+        The reference is emptied last: one that is too old would come before its echo, one that is too new only adds delay.
         """
         while not self._stopped and not all(each.settled * SAMPLE_RATE >= MAX_WAIT for each in self._inputs()):
             for each in self._inputs():
                 each.port.check_alive(each.port.inlet.received, START_S)
             pause()
         for each in reversed(self._inputs()):
-            each.begin()
+            each.port.take()
 
 
 def _opener(
-    device: str | int | Device | SpokenReference | None, channels: Sequence[int] | None = None
+    device: Named | SpokenReference, channels: Sequence[int] | None = None
 ) -> Callable[[], InputPort | SpokenReference]:
     """What makes an input of a device, each time anew; what is spoken goes on where it was."""
     if isinstance(device, SpokenReference):
@@ -151,21 +152,16 @@ def _incomplete(what: str, counts: dict[str, int]) -> list[str]:
     return [f"live {what} was not complete: {words}"] if words else []
 
 
-def _join(first: Block, second: Block) -> Block:
-    mic, ref = (np.concatenate((getattr(first, name), getattr(second, name))) for name in ("mic", "ref"))
-    return Block(mic, ref, first.start, first.lost + second.lost)
-
-
 class LiveSink(Sink):
     """A loudspeaker or virtual device that first plays `latency` samples of silence, so that sound lags the input evenly.
 
-    Two callbacks of 20 ms more of silence come before it as a reserve against jitter. wait: hold the writer up when enough is queued
-    (right for a file as source); otherwise, with a live source, what is too much is dropped and counted: more than a
-    source holds back at most while it waits for the reference, and delivers at once. An underrun
+    Two callbacks of 20 ms more of silence come before it as a reserve against jitter. wait: hold the writer up when
+    enough is queued (right for a file as source); otherwise, with a live source, what is too much is dropped and
+    counted: more than a source holds back at most while it waits for the reference, and delivers at once. An underrun
     plays silence, is counted, and ends when the reserve is there again. Raises DeviceError when the device stops.
     """
 
-    def __init__(self, device: str | int | Device | None, latency: int = 0, wait: bool = True) -> None:
+    def __init__(self, device: Named, latency: int = 0, wait: bool = True) -> None:
         self._port = output_port(device, latency, 2 * TOLERANCE / SAMPLE_RATE)
         self._lead = round(latency * self._port.rate / SAMPLE_RATE) + self._port.margin
         self._most = self._lead + round((MAX_WAIT + TOLERANCE) / SAMPLE_RATE * self._port.rate)
@@ -201,10 +197,7 @@ class LiveSink(Sink):
             ring.write(data[at : at + piece])
 
     def stats(self) -> dict[str, int]:
-        """Samples written (16 kHz), clipped; dropped and missing (at the device's rate).
-
-        underruns: callbacks that found too little.
-        """
+        """Samples written (16 kHz), clipped; dropped, missing (at the device's rate); underruns: callbacks with too little."""
         outlet = self._port.outlet
         lost = {"missing": outlet.missing, "dropped": self.dropped + outlet.ring.lost}
         return {**super().stats(), "underruns": max(outlet.underruns, self._port.flags), **lost}

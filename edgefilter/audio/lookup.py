@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TypeAlias
 
 from edgefilter.errors import DeviceError, UsageError
 
@@ -36,8 +37,12 @@ class Device:
         return self.inputs if kind == "input" else self.outputs
 
 
+Named: TypeAlias = str | int | Device | None
+"""A device as it is asked for: a number, a name or a part of it; None, 'default' and 'mic' are the default one."""
+
+
 def match(devices: Sequence[Device], wanted: str | int | None, kind: str, default: int) -> Device:
-    """The device that wanted names: a number, a name, a part of a name, or None, 'default', 'mic' for the default one.
+    """The device that wanted names, as of Named.
 
     A whole name goes before a part of one, and a part that only a monitor has in it is the last that is taken. Capitals,
     dots, dashes and underlines do not matter in a part. kind: 'input' or 'output'; default: index of the system's
@@ -46,10 +51,8 @@ def match(devices: Sequence[Device], wanted: str | int | None, kind: str, defaul
     """
     usable = [device for device in devices if device.channels(kind)]
     if not usable:
-        raise DeviceError(
-            f"no sound device with an {kind} was found: connect one, or check that the sound server runs ('edgefilter"
-            " devices')"
-        )
+        todo = "connect one, or check that the sound server runs ('edgefilter devices')"
+        raise DeviceError(f"no sound device with an {kind} was found: {todo}")
     text = "default" if wanted is None else str(wanted).strip()
     own = [device for device in usable if not device.pulse_name]
     if text.isdigit():
@@ -64,9 +67,8 @@ def match(devices: Sequence[Device], wanted: str | int | None, kind: str, defaul
     if not found:
         raise UsageError(f"{kind} device '{text}' is unknown; expected one of {_names(usable)}")
     if len(found) > 1:
-        raise UsageError(
-            f"{kind} device '{text}' is ambiguous; it matches {_names(found)}: give the number or more of the name"
-        )
+        matches = f"{_names(found)}: give the number or more of the name"
+        raise UsageError(f"{kind} device '{text}' is ambiguous; it matches {matches}")
     return found[0]
 
 
@@ -84,9 +86,9 @@ def _rank(device: Device, text: str) -> int | None:
 def monitor(devices: Sequence[Device], output: Device) -> Device:
     """The input that gets what output plays, by the names that PulseAudio, PipeWire and Windows give it.
 
-    Understood are 'Monitor of NAME', NAME followed by 'monitor' ('.', '_', '-' or a space between) and 'NAME
-    [Loopback]'. For an output that only leads to the sound server, the single monitor there is. Raises UsageError, one
-    line, where there is none or more than one.
+    Those are 'Monitor of NAME', 'NAME.monitor' ('_', '-' or a space between as well) and 'NAME [Loopback]'. For an
+    output that only leads to the sound server, the single monitor there is. Raises UsageError where there is none or
+    more than one.
     """
     plain = _plain(output.name)
     names = {f"monitor of {plain}", f"{plain} monitor", f"{plain} loopback"}
@@ -98,9 +100,8 @@ def monitor(devices: Sequence[Device], output: Device) -> Device:
     if len(found) == 1:
         return found[0]
     if found:
-        raise UsageError(
-            f"output '{output}' has more than one possible monitor, {_names(found)}: choose one with --reference"
-        )
+        several = f"{_names(found)}: choose one with --reference"
+        raise UsageError(f"output '{output}' has more than one possible monitor, {several}")
     raise UsageError(
         f"output '{output}' has no monitor input that gets what the robot says: name an input with --reference, or"
         " define one for PulseAudio or PipeWire in ~/.asoundrc: pcm.robot_monitor { type pulse device SINK.monitor }"

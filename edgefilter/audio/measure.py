@@ -10,7 +10,7 @@ from scipy import signal
 
 from edgefilter.audio import virtual
 from edgefilter.audio.device import input_port, output_port
-from edgefilter.audio.lookup import Device
+from edgefilter.audio.lookup import Named
 from edgefilter.audio.port import START_S, STREAM_LATENCY_S, InputPort, OutputPort, clock, pause
 from edgefilter.audio.protocols import Source
 from edgefilter.dsp.frames import decibels
@@ -18,21 +18,20 @@ from edgefilter.types import SAMPLE_RATE, Block, Samples
 
 
 def play_and_record(
-    output: str | int | Device | None,
-    microphone: str | int | Device | None,
+    output: Named,
+    microphone: Named,
     samples: Samples,
     latency_s: float = STREAM_LATENCY_S,
     tell: Callable[[float], None] = lambda left_s: None,
     channels: Sequence[int] | None = None,
 ) -> tuple[Samples, str]:
-    """Play samples (n,) at 16 kHz and return what the microphone picks up from the moment playing starts until a second after it.
+    """Play samples (n,) at 16 kHz and return what the microphone hears until a second after them, and what was lost, in words.
 
-    That is (n + 16000,), or (n + 16000, channels) of several, and what was lost on the way, in words; none where nothing was.
-
-    Both are on one sample counter up to a constant: the devices' buffers appear as additional delay, so that the sound
-    never seems to arrive before it is played. Silence goes first, since sound servers swallow a stream's start.
+    That is (n + 16000,), or (n + 16000, channels), from the moment playing starts, on one sample counter up to a
+    constant: the devices' buffers appear as additional delay, so that the sound never seems to arrive before it is
+    played. Silence goes first, since sound servers swallow a stream's start.
     latency_s: the buffers asked of the sound system; the larger, the fewer holes. tell: called again and again with the
-    seconds that are left. channels: numbers, from 0, of the microphone's channels that are wanted in place of their mean.
+    seconds that are left. channels: numbers, from 0, of those that are wanted in place of their mean.
     Raises DeviceError where a device cannot be opened or stops, UsageError for the virtual microphone, which hears nothing.
     """
     mic = input_port(microphone, latency_s, channels)
@@ -51,7 +50,7 @@ def play_and_record(
     first, left = 0, wanted
     try:
         mic.open()
-        while not mic.inlet.calls:
+        while not mic.inlet.received:
             mic.check_alive(mic.inlet.received, START_S)
             pause()
         speaker.open(mark)
@@ -72,7 +71,7 @@ def play_and_record(
     return np.concatenate(parts)[first : first + wanted], holes
 
 
-def _holding(output: str | int | Device | None, samples: Samples, latency_s: float = STREAM_LATENCY_S) -> OutputPort:
+def _holding(output: Named, samples: Samples, latency_s: float = STREAM_LATENCY_S) -> OutputPort:
     """An output that holds all samples (n,) and plays them as soon as it is opened."""
     port = output_port(output, samples.size, latency_s=latency_s)
     port.outlet.ring.write(port.convert(samples.astype(np.float32), last=True))
@@ -80,10 +79,10 @@ def _holding(output: str | int | Device | None, samples: Samples, latency_s: flo
     return port
 
 
-def play_through(output: str | int | Device | None, source: Source, samples: Samples) -> tuple[Samples, Samples, int]:
+def play_through(output: Named, source: Source, samples: Samples) -> tuple[Samples, Samples, int]:
     """Play samples (n,) at 16 kHz while a live source runs, until two seconds after them.
 
-    Returns its microphone and reference (m,), and the samples that were lost. Raises DeviceError where a device cannot be opened or stops.
+    Returns its microphone and reference (m,), and how many samples were lost. Raises as play_and_record.
     """
     speaker = _holding(output, samples)
     wanted = samples.size + 2 * SAMPLE_RATE
@@ -109,7 +108,8 @@ class Channel:
     """What one microphone of an array delivered.
 
     number: of the device's channel. level_db, floor_db, peak_db: of full scale; the floor is the level that it has nine
-    tenths of the time at least. coherence: with the first microphone that is not silent, mean over 200 Hz to 4 kHz, 0 to 1; 0 of silence.
+    tenths of the time at least. coherence: with the first microphone that is not silent, mean over 200 Hz to 4 kHz, 0
+    to 1; 0 of silence.
     """
 
     number: int
@@ -166,9 +166,12 @@ def _trial(port: InputPort, sound: np.ndarray, steps: Sequence[tuple[float, int]
     settled = times > times[0] + 0.5
     slope = np.polyfit(times[settled] - times[0], received[settled], 1)[0]
     level = float(decibels(float(np.mean(np.square(sound, dtype=np.float64)))))
-    peak = float(decibels(float(np.max(np.square(sound), initial=0.0))))
     each = channels(sound, port.wanted) if port.wanted and sound.ndim > 1 else ()
-    return Trial(port.rate, float(slope / port.rate), level, peak, port.inlet.flags, each)
+    return Trial(port.rate, float(slope / port.rate), level, _peak_db(sound), port.inlet.flags, each)
+
+
+def _peak_db(sound: np.ndarray) -> float:
+    return float(decibels(float(np.max(np.square(sound), initial=0.0))))
 
 
 def channels(sound: np.ndarray, numbers: Sequence[int]) -> tuple[Channel, ...]:
@@ -181,13 +184,8 @@ def channels(sound: np.ndarray, numbers: Sequence[int]) -> tuple[Channel, ...]:
         hz, alike = signal.coherence(first[:, None], sound[:, heard], SAMPLE_RATE, nperseg=512, axis=0)
         inside = (hz >= 200.0) & (hz <= 4000.0)
         coherence[heard] = np.sqrt(alike[inside]).mean(axis=0)
-    return tuple(
-        Channel(
-            number,
-            float(decibels(float(power[:, at].mean()))),
-            float(decibels(float(np.percentile(power[:, at], 10)))),
-            float(decibels(float(np.max(np.square(sound[:, at]), initial=0.0)))),
-            float(coherence[at]),
-        )
-        for at, number in enumerate(numbers)
-    )
+    found = []
+    for number, each, one, similar in zip(numbers, power.T, sound.T, coherence):
+        level, floor = (float(decibels(float(value))) for value in (each.mean(), np.percentile(each, 10)))
+        found.append(Channel(number, level, floor, _peak_db(one), float(similar)))
+    return tuple(found)

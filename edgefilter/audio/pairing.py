@@ -36,7 +36,6 @@ class Inlet:
         self._stored = 0
         self._read = 0
         self.flags = 0
-        self.calls = 0
 
     @property
     def lost(self) -> int:
@@ -54,7 +53,6 @@ class Inlet:
         if count < len(samples):
             self._gaps.append((self._stored, len(samples) - count))
         self.flags += flagged
-        self.calls += 1
 
     def take(self) -> Samples:
         """Everything that arrived since the last call, (n,) float32, gaps filled with silence."""
@@ -70,16 +68,13 @@ class Inlet:
 
 
 class Pairing:
-    """Pairs microphone and reference samples.
+    """Pairs microphone and reference samples; every sample of the microphone, whose counter is the master, comes out.
 
-    The microphone's counter is the master and every one of its samples comes out.
-
-    A microphone sample waits for its reference. After MAX_WAIT samples silence stands in (`filled`), and what arrives
-    late for those places is discarded, so that a stall does not shift the reference. If the counters differ by more
-    than TOLERANCE throughout WINDOW, the clocks differ or a driver lost samples: the reference is cut (`dropped`) or
-    extended with silence (`inserted`) to meet the counter again. Depends on the samples alone, not on the time of day.
-    late_is_lost: False where the reference is what is played here: after a stall it is not late but played later, so
-    that nothing of it is discarded.
+    It waits for its reference. After MAX_WAIT samples silence stands in (`filled`), and what arrives late for those
+    places is discarded, so that a stall does not shift the reference. If the counters differ by more than TOLERANCE
+    throughout WINDOW, the clocks differ or a driver lost samples: the reference is cut (`dropped`) or extended with
+    silence (`inserted`) to meet the counter again. late_is_lost: False where the reference is what is played here:
+    after a stall it is not late but played later, so that nothing of it is discarded.
     """
 
     def __init__(self, late_is_lost: bool = True) -> None:
@@ -106,18 +101,21 @@ class Pairing:
         self._watch(len(mic))
         missing = len(self._mic) - self._ref.size - MAX_WAIT
         if missing > 0:
-            self._ref = np.concatenate((self._ref, np.zeros(missing, np.float32)))
             self._debt += missing * self._late_is_lost
-            self.filled += missing
+            self.filled += self._extend(missing)
         return self._emit(min(len(self._mic), self._ref.size), self.filled + self.dropped + self.inserted - lost)
 
     def flush(self) -> Block | None:
         """The microphone samples still waiting; silence stands in for their reference."""
         waiting = 0 if self._mic is None else len(self._mic)
-        missing = max(0, waiting - self._ref.size)
+        missing = self._extend(max(0, waiting - self._ref.size))
         self.filled += missing
-        self._ref = np.concatenate((self._ref, np.zeros(missing, np.float32)))
         return self._emit(waiting, missing)
+
+    def _extend(self, count: int) -> int:
+        """Put so much silence behind the reference."""
+        self._ref = np.concatenate((self._ref, np.zeros(count, np.float32)))
+        return count
 
     def _emit(self, count: int, lost: int) -> Block | None:
         if count == 0 or self._mic is None:
@@ -143,9 +141,7 @@ class Pairing:
         elif lasting < -TOLERANCE:
             forgiven = min(self._debt, -lasting)
             self._debt -= forgiven
-            more = -lasting - forgiven
-            self._ref = np.concatenate((self._ref, np.zeros(more, np.float32)))
-            self.inserted += more
+            self.inserted += self._extend(-lasting - forgiven)
 
 
 class Outlet:

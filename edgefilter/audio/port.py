@@ -75,7 +75,8 @@ class Port:
     """One PortAudio stream and how its rate and channels are brought to 16 kHz mono.
 
     latency_s: the buffer asked of the sound system, seconds. wanted: numbers of an input's channels, from 0, to be
-    delivered in that order in place of their mean; ALL_CHANNELS is all.
+    delivered in that order in place of their mean; ALL_CHANNELS is all. Raises DeviceError where the device cannot be
+    opened, UsageError where it lacks a channel.
     """
 
     def __init__(
@@ -87,53 +88,48 @@ class Port:
         wanted: Sequence[int] | None = None,
     ) -> None:
         self._sd = sounddevice
-        self.wanted = which_channels(wanted, device.channels(kind), f"{kind} device '{device}'")
-        self.kind = kind
-        self.device = device
-        self.latency_s = latency_s
+        self._name = f"{kind} device '{device}'"
+        self.wanted = which_channels(wanted, device.channels(kind), self._name)
+        self.kind, self.device, self.latency_s = kind, device, latency_s
         self.rate, self.channels = self._settings()
         self.notes: list[str] = []
         if self.rate != SAMPLE_RATE:
-            self.notes.append(
-                f"{kind} device '{self.device}' does not run at {SAMPLE_RATE} Hz: opened at {self.rate} Hz and"
-                " resampled"
-            )
+            how = f"does not run at {SAMPLE_RATE} Hz: opened at {self.rate} Hz and resampled"
+            self.notes.append(f"{self._name} {how}")
         if self.wanted is not None:
-            self.notes.append(
-                f"{kind} device '{self.device}': channels {', '.join(map(str, self.wanted))} of {self.channels}"
-            )
+            self.notes.append(f"{self._name}: channels {', '.join(map(str, self.wanted))} of {self.channels}")
         elif self.channels > 1:
             how = "averaged" if kind == "input" else "get the same"
-            self.notes.append(f"{kind} device '{self.device}' has no mono: {self.channels} channels {how}")
+            self.notes.append(f"{self._name} has no mono: {self.channels} channels {how}")
         self._stream: Any = None
         self._progress = 0
         self._still_s, self._asked = 0.0, clock()
 
     def _settings(self) -> tuple[int, int]:
+        """Rate and number of channels with which the device can be opened."""
         check = self._sd.check_input_settings if self.kind == "input" else self._sd.check_output_settings
-        most = max(2, self.device.channels(self.kind))
+        there = self.device.channels(self.kind)
         least = 1 if self.wanted is None else max(self.wanted) + 1
-        if least > self.device.channels(self.kind):
+        if least > there:
             raise UsageError(
-                f"{self.kind} device '{self.device}' has {self.device.channels(self.kind)} channels, found channel"
-                f" {least - 1} asked for, counted from 0: choose others ('edgefilter devices')"
+                f"{self._name} has {there} channels, found channel {least - 1} asked for, counted from 0: choose others"
+                " ('edgefilter devices')"
             )
-        counts = sorted({1, 2, most}) if self.wanted is None else sorted({least, most})
+        counts = {least, max(2, there)} if self.wanted else {1, 2, max(2, there)}
         refusal = ""
         for rate in (SAMPLE_RATE, round(self.device.rate)):
-            for channels in counts:
+            for channels in sorted(counts):
                 try:
                     with quiet():
                         check(device=self.device.index, channels=channels, dtype="float32", samplerate=rate)
                     return rate, channels
                 except (self._sd.PortAudioError, ValueError) as error:
                     refusal = refusal or _words(error)
-        raise DeviceError(
-            f"{self.kind} device '{self.device}' cannot be opened at {SAMPLE_RATE} Hz or {self.device.rate:.0f} Hz:"
-            f" {refusal}"
-        )
+        rates = f"{SAMPLE_RATE} Hz or {self.device.rate:.0f} Hz"
+        raise DeviceError(f"{self._name} cannot be opened at {rates}: {refusal}")
 
     def start(self, callback: Any) -> None:
+        """Open the stream with this callback; raises DeviceError."""
         make = self._sd.InputStream if self.kind == "input" else self._sd.OutputStream
         settings = {"device": self.device.index, "channels": self.channels, "samplerate": self.rate}
         try:
@@ -141,9 +137,8 @@ class Port:
                 self._stream = make(**settings, dtype="float32", latency=self.latency_s, callback=callback)
                 self._stream.start()
         except self._sd.PortAudioError as error:
-            raise DeviceError(
-                f"{self.kind} device '{self.device}' cannot be started: {_words(error)}; is another program using it?"
-            ) from None
+            why = f"{_words(error)}; is another program using it?"
+            raise DeviceError(f"{self._name} cannot be started: {why}") from None
 
     def check_alive(self, progress: int, patience_s: float = BUFFER_S) -> None:
         """Raise DeviceError once progress, samples or callbacks so far, has stood still for patience_s.
@@ -156,8 +151,8 @@ class Port:
         self._progress = progress
         if self._still_s > patience_s:
             raise DeviceError(
-                f"{self.kind} device '{self.device}' stopped (no sound for {patience_s:.0f} s: unplugged, or the sound"
-                " server ended); what came until then is kept: reconnect it and start again"
+                f"{self._name} stopped (no sound for {patience_s:.0f} s: unplugged, or the sound server ended); what"
+                " came until then is kept: reconnect it and start again"
             )
 
     def close(self, drain: bool = False) -> None:
@@ -190,9 +185,9 @@ class InputPort(Port):
         wanted: Sequence[int] | None = None,
     ) -> None:
         super().__init__(sounddevice, device, "input", latency_s, wanted)
-        several = None if self.wanted is None or len(self.wanted) == 1 else len(self.wanted)
-        self.inlet = Inlet(round(BUFFER_S * self.rate), several)
-        self._resampler = Resampler(self.rate, SAMPLE_RATE, several or 1)
+        count = len(self.wanted) if self.wanted else 1
+        self.inlet = Inlet(round(BUFFER_S * self.rate), count if count > 1 else None)
+        self._resampler = Resampler(self.rate, SAMPLE_RATE, count)
 
     def open(self) -> None:
         inlet, wanted = self.inlet, self.wanted
@@ -207,7 +202,7 @@ class InputPort(Port):
 
 
 class OutputPort(Port):
-    """An output whose callback empties an Outlet, fed with 16 kHz mono."""
+    """An output whose callback empties an Outlet; `convert` brings 16 kHz mono to its rate."""
 
     def __init__(
         self, sounddevice: Any, device: Device, queued: int, margin_s: float = 0.0, latency_s: float = STREAM_LATENCY_S
@@ -216,11 +211,7 @@ class OutputPort(Port):
         self.flags = 0
         self.margin = round(margin_s * self.rate)
         self.outlet = Outlet(round((BUFFER_S + queued / SAMPLE_RATE) * self.rate) + self.margin, self.margin)
-        self._resampler = Resampler(SAMPLE_RATE, self.rate)
-
-    def convert(self, samples: Samples, last: bool = False) -> Samples:
-        """Convert samples (n,) from 16 kHz to the device's rate."""
-        return self._resampler.push(samples, last)
+        self.convert = Resampler(SAMPLE_RATE, self.rate).push
 
     def open(self, before: Callable[[], None] = lambda: None) -> None:
         """Start the stream; before is called in each callback, ahead of the delivery, by the audio thread."""

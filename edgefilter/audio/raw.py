@@ -14,10 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edgefilter.audio.protocols import Sink, Source
-from edgefilter.errors import AudioFileError, UsageError
+from edgefilter.errors import AudioFileError, SignalError, UsageError
 from edgefilter.types import SAMPLE_RATE, Block, Samples, as_samples
 
-FULL_SCALE = 32768.0
+FULL_SCALE = -float(np.iinfo(np.int16).min)
 _HEADERS = (b"RIFF", b"fLaC", b"OggS")
 
 
@@ -29,6 +29,13 @@ def to_pcm16(samples: Samples) -> tuple[NDArray[np.int16], int]:
     scaled = np.rint(as_samples(samples, "output") * np.float32(FULL_SCALE))
     fitting = np.clip(scaled, -FULL_SCALE, FULL_SCALE - 1.0)
     return fitting.astype(np.int16), int(np.count_nonzero(fitting != scaled))
+
+
+def of_pcm16(pcm: bytes | memoryview, channels: int) -> Samples:
+    """16-bit little-endian samples, interleaved, as (n, channels) of +-1; SignalError where the last one is cut."""
+    if len(pcm) % (2 * channels):
+        raise SignalError(f"found {len(pcm)} bytes, expected whole 16-bit samples of {channels} channels")
+    return np.frombuffer(pcm, "<i2").reshape(-1, channels).astype(np.float32) / np.float32(FULL_SCALE)
 
 
 def clip_note(clipped: int, written: int) -> str:
@@ -65,7 +72,7 @@ class PcmSource(Source):
                 )
             whole = len(data) // 4 * 4
             rest = data[whole:]
-            stereo = np.frombuffer(data[:whole], "<i2").reshape(-1, 2).astype(np.float32) / np.float32(FULL_SCALE)
+            stereo = of_pcm16(data[:whole], 2)
             if len(stereo):
                 yield Block(stereo[:, 0].copy(), stereo[:, 1].copy(), start)
                 start += len(stereo)
@@ -81,10 +88,7 @@ class PcmSource(Source):
 
     def _pieces(self) -> Iterator[bytes]:
         """Yield what arrives, as it arrives, until the end or stop()."""
-        try:
-            handle: int | None = self._stream.fileno()
-        except (OSError, AttributeError):
-            handle = None
+        handle = _handle(self._stream)
         wait = handle is not None and sys.platform != "win32"
         while not self._stopped:
             if handle is not None and wait and not select.select([handle], [], [], 0.1)[0]:
@@ -130,10 +134,17 @@ class PcmSink(Sink):
 
     def _write_all(self, data: bytes) -> None:
         """Past Python's buffer where there is a file handle: nothing is left in it to fail at exit."""
-        try:
-            handle = self._stream.fileno()
-        except (OSError, AttributeError):
+        handle = _handle(self._stream)
+        if handle is None:
             self._stream.write(data)
             return
         while data:
             data = data[os.write(handle, data) :]
+
+
+def _handle(stream: BinaryIO) -> int | None:
+    """The file handle of a stream that has one."""
+    try:
+        return stream.fileno()
+    except (OSError, AttributeError):
+        return None

@@ -31,9 +31,10 @@ def delivered(data: Array, wanted: Sequence[int] | None) -> Samples:
 class Reader:
     """A WAV, FLAC or Ogg file of any rate and channel count, delivered at 16 kHz with its channels averaged.
 
-    wanted: numbers of channels, from 0, to be delivered in that order in place of their mean; ALL_CHANNELS is all. role: how messages name the
-    file ("recording"). The file is read once at opening, so that a damaged one is refused before anything is made from
-    it. total: round(n * 16000 / rate) samples. silent: every sample is zero.
+    wanted: numbers of channels, from 0, to be delivered in that order in place of their mean; ALL_CHANNELS is all.
+    role: how messages name the file ("recording"). The file is read once at opening, so that a damaged one is refused
+    before anything is made from it. total: round(n * 16000 / rate) samples. given: channels that are delivered. silent:
+    every sample is zero.
     Raises AudioFileError for a file that is missing, empty, truncated, not audio, or holds what no recording does.
     """
 
@@ -47,6 +48,7 @@ class Reader:
             self.rate, self.channels = file.samplerate, file.channels
             self._check_header(file)
             self.wanted = which_channels(wanted, self.channels, f"{role} {path}")
+            self.given = len(self.wanted) if self.wanted else 1
             self._check_channels()
             length = self._scan(file)
         self.total = (2 * length * SAMPLE_RATE + self.rate) // (2 * self.rate)
@@ -58,9 +60,7 @@ class Reader:
 
     def chunks(self) -> Iterator[Samples]:
         """Yield float32 arrays (n,), or (n, channels) of several that are wanted, of any length, `total` samples in all."""
-        several = self.wanted is not None and len(self.wanted) > 1
-        count = len(self.wanted) if several and self.wanted else 1
-        resampler = soxr.ResampleStream(self.rate, SAMPLE_RATE, count, dtype="float32", quality="VHQ")
+        resampler = soxr.ResampleStream(self.rate, SAMPLE_RATE, self.given, dtype="float32", quality="VHQ")
         given = 0
         with self._open() as file:
             for data in self._blocks(file):
@@ -70,7 +70,7 @@ class Reader:
                 given += len(taken)
                 yield taken
         if self.rate != SAMPLE_RATE:
-            rest = np.zeros((0, count) if several else 0, np.float32)
+            rest = np.zeros((0, self.given) if self.given > 1 else 0, np.float32)
             yield resampler.resample_chunk(rest, last=True)[: self.total - given]
 
     def _error(self, what: str) -> AudioFileError:
@@ -118,41 +118,30 @@ class Reader:
                 f"{self.role} {self.path}: its header gives no length (written to a pipe?); read to the end of the file"
             )
         elif promised:
-            raise self._error(
-                f"is truncated: it holds {promised[2]} of the {promised[1]} bytes of sound that its header promises; "
-                "copy it again, or re-save what is there"
-            )
+            held = f"it holds {promised[2]} of the {promised[1]} bytes of sound that its header promises"
+            raise self._error(f"is truncated: {held}; copy it again, or re-save what is there")
         elif "without an End-Of-Stream flag" in file.extra_info:
-            raise self._error(
-                "is truncated: the Ogg stream stops before its end mark; copy it again, or re-save what is there"
-            )
+            held = "the Ogg stream stops before its end mark"
+            raise self._error(f"is truncated: {held}; copy it again, or re-save what is there")
 
     def _check_channels(self) -> None:
-        for channel in self.wanted or ():
-            if channel >= self.channels:
-                has = (
-                    f"has {self.channels} channels, 0 to {self.channels - 1}"
-                    if self.channels > 1
-                    else "has channel 0 alone"
-                )
-                raise self._error(f"{has}, found channel {channel} asked for: choose others with --mic-channels")
+        lacking = [channel for channel in self.wanted or () if channel >= self.channels]
+        if lacking:
+            several = f"{self.channels} channels, 0 to {self.channels - 1}"
+            has = several if self.channels > 1 else "channel 0 alone"
+            raise self._error(f"has {has}, found channel {lacking[0]} asked for: choose others with --mic-channels")
 
     def _blocks(self, file: soundfile.SoundFile) -> Iterator[Array]:
         """Yield (n, channels) float32, SAMPLE_RATE values at a time; a decoder that gives up is an error with its place."""
         size = max(1, SAMPLE_RATE // self.channels)
         done = 0
-        while True:
-            try:
-                data = file.read(size, dtype="float32", always_2d=True)
-            except soundfile.LibsndfileError as error:
-                raise self._error(
-                    f"is truncated or damaged after {done / self.rate:.2f} s of {file.frames / self.rate:.2f} s"
-                    f" ({_reason(error)}): copy it again"
-                ) from None
-            if not len(data):
-                return
-            done += len(data)
-            yield data
+        try:
+            while len(data := file.read(size, dtype="float32", always_2d=True)):
+                done += len(data)
+                yield data
+        except soundfile.LibsndfileError as error:
+            where = f"after {done / self.rate:.2f} s of {file.frames / self.rate:.2f} s"
+            raise self._error(f"is truncated or damaged {where} ({_reason(error)}): copy it again") from None
 
     def _scan(self, file: soundfile.SoundFile) -> int:
         """Read the whole file for what makes it unusable; return its samples per channel."""
@@ -160,10 +149,9 @@ class Reader:
         for data in self._blocks(file):
             if not np.isfinite(data).all():
                 at, channel = (int(i) for i in np.argwhere(~np.isfinite(data))[0])
-                where = f"at sample {length + at} ({(length + at) / self.rate:.3f} s)" + (
-                    f" of channel {channel + 1}" if self.channels > 1 else ""
-                )
-                raise self._error(f"holds {data[at, channel]} {where}, expected finite samples: repair or cut it")
+                where = f"sample {length + at} ({(length + at) / self.rate:.3f} s)"
+                where += f" of channel {channel + 1}" if self.channels > 1 else ""
+                raise self._error(f"holds {data[at, channel]} at {where}, expected finite samples: repair or cut it")
             if np.abs(data).max() > LOUDEST:
                 loudest = data.flat[np.abs(data).argmax()]
                 raise self._error(f"holds {loudest:g}, expected samples of a full scale of 1: its scaling is wrong")
@@ -183,13 +171,11 @@ class Reader:
             above = f" (it has nothing above {self.rate / 2000:g} kHz)" if self.rate < SAMPLE_RATE else ""
             done.append(f"{self.rate} Hz resampled to {SAMPLE_RATE} Hz{above}")
         if self.wanted is not None:
-            done.append(
-                f"channel{'s' if len(self.wanted) > 1 else ''} {', '.join(map(str, self.wanted))} of {self.channels}"
-            )
+            named = "channels" if self.given > 1 else "channel"
+            done.append(f"{named} {', '.join(map(str, self.wanted))} of {self.channels}")
         elif self.channels > 1:
-            done.append(
-                f"{self.channels} channels averaged to one (microphones of an array: name them with --mic-channels)"
-            )
+            how = "microphones of an array: name them with --mic-channels"
+            done.append(f"{self.channels} channels averaged to one ({how})")
         if done:
             self.notes.append(f"{self.role} {self.path}: {', '.join(done)}")
 

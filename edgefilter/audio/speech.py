@@ -21,7 +21,7 @@ FADE_S = 0.02
 class SpokenReference(Port):
     """Plays speech, and is read like an input that delivers exactly what is played, gain changes included.
 
-    speech: arrays (n,) at 16 kHz, played from the first `take` on; before it, and after it has ended, there is silence.
+    speech: arrays (n,) at 16 kHz, played from the first `take` on; before and after it there is silence.
     The sound leaves the loudspeaker later than it is read here, by the device's latency.
     """
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable
+from contextlib import suppress
 
 import numpy as np
 
@@ -37,23 +38,19 @@ class SampleClock:
         if self._until is None:
             self._until = now + WINDOW / SAMPLE_RATE
         if now >= self._until:
-            self._compare()
+            before, self._base = self._base, self._least
+            if before is not None and abs(self._base - before) > TOLERANCE / SAMPLE_RATE:
+                self.missed = max(0.0, self.missed + self._base - before)
             self._least, self._until = np.inf, now + WINDOW / SAMPLE_RATE
         self._least = min(self._least, now - delivered_s)
-
-    def _compare(self) -> None:
-        before, self._base = self._base, self._least
-        if before is not None and abs(self._least - before) > TOLERANCE / SAMPLE_RATE:
-            self.missed = max(0.0, self.missed + self._least - before)
 
 
 class SteadyInput:
     """An input port that goes on without its device.
 
     make: makes the port; DeviceError where the device is away. patience_s: how long it may be away; with 0 its loss is
-    an error at once. While it is away, `take` gives silence by the clock. filled: samples of this silence so far. lost:
-    samples that did not fit into the ring or never came. overruns: callbacks that the driver marked. gone, back: how
-    often the device was lost and found again.
+    an error at once. While it is away, `take` gives silence by the clock. filled: samples of this silence so far.
+    gone, back: how often the device was lost and found again.
     """
 
     def __init__(self, make: Callable[[], InputPort | SpokenReference], patience_s: float) -> None:
@@ -83,18 +80,14 @@ class SteadyInput:
 
     @property
     def lost(self) -> int:
-        """Samples at 16 kHz."""
+        """Samples at 16 kHz that did not fit into the ring or never came."""
         seconds = self._clock.missed + self.port.inlet.lost / self.port.rate
         return self._earlier_lost + round(seconds * SAMPLE_RATE)
 
     @property
     def overruns(self) -> int:
-        """Of all streams so far."""
+        """Callbacks that the driver marked, of all streams so far."""
         return self._earlier_overruns + self.port.inlet.flags
-
-    def begin(self) -> None:
-        """Forget what came so far: the first block begins now."""
-        self.port.take()
 
     def take(self) -> Samples:
         """What came since the last call (n,) or (n, channels), or silence for as long as nothing can come."""
@@ -172,7 +165,7 @@ class SteadySink(Sink):
     def write(self, samples: Samples) -> None:
         """Play samples (n,), or drop them while there is no device."""
         if self._sink is None and clock() - self._tried_at >= RETRY_S:
-            self._sink = self._again()
+            self._open_again()
         if self._sink is None:
             self._own["output_away"] += samples.size
             return
@@ -184,26 +177,17 @@ class SteadySink(Sink):
             self._own["output_away"] += samples.size
             self._own["output_gone"] += not self._is_away
             self._is_away = True
-            self._retire(error)
+            self._earlier.update(self._sink.stats())  # what it counted stays
+            self._sink.__exit__(type(error), error, None)
+            self._sink, self._tried_at = None, clock()
             return
         self._own["output_back"] += self._is_away
         self._worked, self._is_away = True, False
 
-    def _again(self) -> Sink | None:
+    def _open_again(self) -> None:
         self._tried_at = clock()
-        try:
-            sink = self._make()
-        except DeviceError:
-            return None
-        sink.__enter__()
-        return sink
-
-    def _retire(self, error: DeviceError) -> None:
-        """Let go of a sink whose device stopped; what it counted stays."""
-        if self._sink:
-            self._earlier.update(self._sink.stats())
-            self._sink.__exit__(type(error), error, None)
-        self._sink, self._tried_at = None, clock()
+        with suppress(DeviceError):  # still away
+            self._sink = self._make().__enter__()
 
     def stats(self) -> dict[str, int]:
         """The sums over all its sinks so far; samples that found no device; how often the device was lost and found again."""
@@ -215,7 +199,5 @@ class SteadySink(Sink):
             self._sink.__exit__(*exc)
             self.notes = self._sink.notes
         if self._own["output_gone"]:
-            self.notes = [
-                *self.notes,
-                f"the output device was away for {self._own['output_away'] / SAMPLE_RATE:.1f} s of sound",
-            ]
+            away_s = self._own["output_away"] / SAMPLE_RATE
+            self.notes = [*self.notes, f"the output device was away for {away_s:.1f} s of sound"]

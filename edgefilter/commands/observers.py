@@ -18,9 +18,8 @@ from functools import partial
 from pathlib import Path
 from typing import TextIO
 
-from edgefilter.audio.files import make_folder, write_file
+from edgefilter.audio.files import Recorder, make_folder, write_file
 from edgefilter.audio.protocols import Source
-from edgefilter.audio.recorder import Recorder
 from edgefilter.audio.speech import SpokenReference
 from edgefilter.commands.display import display, interject, say_event, write_json
 from edgefilter.errors import AudioFileError, EdgefilterError

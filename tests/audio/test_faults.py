@@ -8,8 +8,8 @@ import pytest
 from edgefilter.audio.files import FileSink, FileSource
 from edgefilter.audio.live import LiveSink, LiveSource
 from edgefilter.audio.pairing import TOLERANCE, WINDOW
+from edgefilter.audio.protocols import Troubles
 from edgefilter.audio.steady import SampleClock, SteadySink
-from edgefilter.audio.troubles import Troubles
 from edgefilter.cli import main
 from edgefilter.errors import DeviceError, UsageError
 from edgefilter.filter.ego_filter import EgoFilter
@@ -214,7 +214,7 @@ def test_the_channels_of_a_device_that_are_named_are_taken_and_one_of_them_is_th
     mic, ref = (np.concatenate([getattr(block, name) for block in blocks]) for name in ("mic", "ref"))
     assert source.microphones == 3 and mic.shape == (16000, 3) and ref.shape == (16000,)
     assert mic[8000:] == pytest.approx(np.tile([0.2, 0.3, 0.5], (8000, 1)), abs=1e-3)
-    assert ref[8000:] == pytest.approx(0.6, abs=1e-3) and source.lost == 0
+    assert ref[8000:] == pytest.approx(0.6, abs=1e-3) and source.stats()["lost"] == 0
     assert any("channels 1, 2, 4, 5 of 6" in note for note in source.notes)
 
 

@@ -12,10 +12,9 @@ import numpy as np
 import pytest
 import soundfile
 
-from edgefilter.audio import recorder as recorder_module
+from edgefilter.audio import files
 from edgefilter.audio.disk import Disk
-from edgefilter.audio.files import FileSink, FileSource, open_source
-from edgefilter.audio.recorder import Recorder
+from edgefilter.audio.files import FileSink, FileSource, Recorder, open_source
 from edgefilter.errors import AudioFileError, UsageError
 from edgefilter.types import ALL_CHANNELS, Block
 
@@ -229,7 +228,7 @@ def test_recorder_keeps_the_exact_blocks(tmp_path):
 
 
 def test_a_recording_longer_than_a_wav_file_can_be_ends_and_what_is_there_stays_valid(tmp_path, monkeypatch):
-    monkeypatch.setattr(recorder_module, "MOST", 1000)
+    monkeypatch.setattr(files, "MOST_RECORDED", 1000)
     with Recorder(tmp_path, 1) as recorder:
         for at in range(0, 2000, 400):
             recorder.write(Block(noise(400), noise(400), at))

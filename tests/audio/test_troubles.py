@@ -2,7 +2,7 @@
 
 from types import SimpleNamespace
 
-from edgefilter.audio.troubles import Troubles
+from edgefilter.audio.protocols import Troubles
 
 
 def test_what_was_lost_since_is_one_event_of_a_kind_and_at_most_one_a_second():
