@@ -13,13 +13,11 @@ from rosbags.highlevel import AnyReader, AnyReaderError
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from edgefilter.audio.files import open_sink
+from edgefilter.audio.pairing import MAX_WAIT
 from edgefilter.dsp.resample import Resampler
 from edgefilter.errors import AudioFileError, UsageError
 from edgefilter.integrations.duplex import from_pcm16
 from edgefilter.types import SAMPLE_RATE, Samples
-
-GAP_S = 0.25
-"""By how much a message's time must be behind what was written for silence to be put in: messages come with jitter."""
 
 
 def extract(bag: Path, topics: dict[str, str], folder: Path, rate: int, channels: int) -> dict[str, float]:
@@ -44,12 +42,13 @@ def extract(bag: Path, topics: dict[str, str], folder: Path, rate: int, channels
     folder.mkdir(parents=True, exist_ok=True)
     seconds = {}
     for name, parts in sounds.items():
-        with open_sink(str(folder / f"{name}.wav")) as sink:
+        with open_sink(folder / f"{name}.wav") as sink:
             resampler = Resampler(rate, SAMPLE_RATE)
             written = 0
             for time, samples in parts:
                 missing = round((time - begin) * rate) - samples.size - written
-                if missing > GAP_S * rate or (missing > 0 and not written):
+                # messages come with jitter: silence stands in for what is as late as a device's
+                if missing > MAX_WAIT / SAMPLE_RATE * rate or (missing > 0 and not written):
                     sink.write(resampler.push(np.zeros(missing, np.float32)))
                     written += missing
                 sink.write(resampler.push(samples))

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from edgefilter.audio.reader import delivered
 from edgefilter.errors import SignalError, UsageError
 from edgefilter.types import MOST_MICROPHONES, Samples
 
@@ -14,7 +15,7 @@ from edgefilter.types import MOST_MICROPHONES, Samples
 def named(
     mic_channels: Sequence[int] | None, reference_channel: int | None = None, there: int | None = None
 ) -> list[int] | None:
-    """Numbers of channels, from 0, as they were given: the microphones, and the reference, if it is one of them, last.
+    """Numbers of channels, from 0: the microphones, and last the reference, if it is one of them.
 
     there: how many channels there are, where that is known. Raises UsageError for no microphones, more than eight, a channel
     that is named twice or is not there, and a reference without microphones.
@@ -25,14 +26,12 @@ def named(
         return None
     found = list(mic_channels)
     if not 1 <= len(set(found)) == len(found) <= MOST_MICROPHONES or min(found) < 0:
-        raise UsageError(
-            f"mic_channels is {found}, expected the numbers of one to {MOST_MICROPHONES} different channels, from 0"
-        )
+        expected = f"the numbers of one to {MOST_MICROPHONES} different channels, from 0"
+        raise UsageError(f"mic_channels is {found}, expected {expected}")
     if reference_channel is not None:
         if reference_channel < 0 or reference_channel in found:
-            raise UsageError(
-                f"reference_channel is {reference_channel}, expected a channel, from 0, beside mic_channels {found}"
-            )
+            expected = f"a channel, from 0, beside mic_channels {found}"
+            raise UsageError(f"reference_channel is {reference_channel}, expected {expected}")
         found.append(reference_channel)
     if there is not None and max(found) >= there:
         raise UsageError(f"channel {max(found)} is named, found {there} channels, counted from 0: name others")
@@ -46,7 +45,7 @@ def taken(samples: Samples, wanted: Sequence[int]) -> Samples:
             f"the microphone brings {samples.shape[1]} channels, counted from 0, and channel {max(wanted)} is named:"
             " name others"
         )
-    return np.ascontiguousarray(samples[:, wanted[0]] if len(wanted) == 1 else samples[:, list(wanted)])
+    return np.ascontiguousarray(delivered(samples, list(wanted)))
 
 
 def numbers(text: str) -> list[int]:

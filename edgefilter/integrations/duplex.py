@@ -16,9 +16,10 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from edgefilter.audio.raw import FULL_SCALE, to_pcm16
+from edgefilter.audio.raw import of_pcm16, to_pcm16
+from edgefilter.audio.reader import delivered
 from edgefilter.dsp.resample import Resampler
-from edgefilter.errors import SignalError, UsageError
+from edgefilter.errors import UsageError
 from edgefilter.filter.barge_in import BargeInSettings
 from edgefilter.filter.ego_filter import EgoFilter
 from edgefilter.filter.turns import drop_sound
@@ -49,40 +50,37 @@ class Duplex:
     ego : EgoFilter, optional
         The filter; by default one without a profile, which always judges speech.
     patience_s : float
-        How long the microphone waits for late speech while the robot talks. Agents that hand over speech just in time
-        hand it over with jitter, and a gap in the reference that the loudspeaker did not make costs an alignment. 0 for
-        agents that hand over early.
+        How long the microphone waits for late speech while the robot talks: a gap in the reference that the loudspeaker
+        did not make costs an alignment. 0 for agents that hand speech over early.
     on_event : callable, optional
         Called with each `Event`, in the thread of `hear`. Without it the latest thousand are kept for `events()`.
     clock : callable
         Seconds, monotonic.
     mic_channels : sequence of int, optional
-        Numbers, from 0, of the channels of what is heard that are microphones, one to eight; the first named is the one
-        that the answer sounds like. Without it `hear` takes all channels for microphones, and `hear_pcm16`, which is
-        handed what a device brings, the mean of them.
+        Numbers, from 0, of the channels that are microphones, one to eight; the answer sounds like the first named.
+        Without it `hear` takes all channels for microphones, and `hear_pcm16`, which gets what a device brings, their mean.
     reference_channel : int, optional
-        Number, beside mic_channels, of the channel of what is heard that holds what is played, for devices that record
-        it. It is the reference, on the microphones' own clock; what `play` takes is then counted and paced as ever, and
-        no reference.
+        Number, beside mic_channels, of the channel that holds what is played, for devices that record it. It is the
+        reference, on the microphones' own clock; what `play` takes is then only counted.
 
     Attributes
     ----------
+    heard : int
+        Samples of the microphone so far, at 16 kHz: what the samples of events and turns are counted by.
     listeners : list of callable
         Called with each `Event` beside on_event, in the thread of `hear`.
     enabled : bool
-        False passes the microphone on as it is. The filter goes on beside it, so that its events stay true and it knows
-        the room when it is switched on again.
+        False passes the microphone on as it is; the filter goes on, so that its events stay true.
 
     Raises
     ------
     UsageError
-        For an engine that answers only at the end of a recording, and mic_channels or a reference_channel that name
-        no channels.
+        For an engine that answers only at the end of a recording, and for channels that cannot be meant.
 
     Notes
     -----
-    An engine that judges no speech gives no events of speech. A warning is logged where such an engine is at work, so
-    also where a filter with a budget steps down to one, and for each event of a kind in `types.SET_UP_WRONG`.
+    A warning is logged when an engine is at work that judges no speech, from which no events of speech come, and for
+    each event of a kind in `types.SET_UP_WRONG`.
 
     Examples
     --------
@@ -115,7 +113,7 @@ class Duplex:
         self._clock = clock
         self._queue_lock, self._hear_lock = threading.Lock(), threading.Lock()
         self._queue: deque[Samples] = deque()
-        self._queued = self._gaps = self._heard = 0
+        self._queued = self._gaps = self.heard = 0
         self._samples = dict.fromkeys(("played", "dropped", "unheard", "refused"), 0)
         self._from_agent = Resampler(SAMPLE_RATE, SAMPLE_RATE)
         self._from_mic, self._to_agent = (Resampler(SAMPLE_RATE, SAMPLE_RATE) for _ in range(2))
@@ -166,9 +164,9 @@ class Duplex:
     def hear(self, samples: Samples, rate: int) -> Samples:
         """Take the microphone's next samples at rate and return finished samples of the human (m,), at the same rate.
 
-        samples: (n,), of an array (n, channels), as many channels in each call, of which mic_channels are taken. One
-        call may return none or more than came in. All together are as many as came in, later by the filter's latency and,
-        at another rate than 16 kHz, by the resamplers' 3.5 ms each way.
+        samples: (n,), of an array (n, channels), as many channels in each call. One call may return none or more than
+        came in. All together are as many as came in, later by the filter's latency and, at another rate than 16 kHz, by
+        the resamplers' 3.5 ms each way.
         """
         if self._wanted is not None:
             samples = taken(samples.reshape(len(samples), -1), self._wanted)
@@ -190,8 +188,8 @@ class Duplex:
             human = self._to_agent.push(human)
             events = self.ego.events()
             if wrong := self._pace.note(len(samples), rate):
-                events.append(Event("rate_mismatch", self._heard, wrong))
-            self._heard += len(mic)
+                events.append(Event("rate_mismatch", self.heard, wrong))
+            self.heard += len(mic)
         for event in events:
             if event.kind in SET_UP_WRONG:
                 _LOGGER.warning("%s: %s", event.kind.replace("_", " "), event.detail)
@@ -217,21 +215,11 @@ class Duplex:
 
         answers: channels of the answer, each of them the human; None: as many as came in.
         """
-        return as_pcm16(self.hear(self._heard_of(pcm, channels), rate), answers or channels)
-
-    def _heard_of(self, pcm: bytes | memoryview, channels: int) -> Samples:
-        """All channels (n, channels) where some of them are named, else their mean (n,), which is said once."""
-        if self._wanted is not None:
-            return all_of_pcm16(pcm, channels)
-        if channels > 1 and not self._averaged:
+        if channels > 1 and self._wanted is None and not self._averaged:
             self._averaged = True
             _LOGGER.warning("%d channels averaged to one: name the microphones of an array (mic_channels)", channels)
-        return from_pcm16(pcm, channels)
-
-    @property
-    def heard(self) -> int:
-        """Samples of the microphone so far, at 16 kHz: what the samples of events and turns are counted by."""
-        return self._heard
+        samples = from_pcm16(pcm, channels) if self._wanted is None else of_pcm16(pcm, channels)
+        return as_pcm16(self.hear(samples, rate), answers or channels)
 
     def require_judge(self, what: str) -> None:
         """Raise UsageError where an engine of the filter judges no speech: what would never notice the human."""
@@ -250,8 +238,7 @@ class Duplex:
     def stats(self) -> dict[str, float]:
         """Seconds of speech: played_s, queued_s, dropped_s, unheard_s (the microphone was off), refused_s; and gaps.
 
-        gaps counts how often speech ran out, at its end or within it: an agent that does not call `end` does not say
-        which. The filter's figures are in `ego.stats()`.
+        gaps: how often speech ran out, at its end unless the agent calls `end`, or within it.
         """
         seconds = {f"{what}_s": count / SAMPLE_RATE for what, count in self._samples.items()}
         return {**seconds, "queued_s": self.queued_s, "gaps": self._gaps}
@@ -290,8 +277,7 @@ class Duplex:
     def _forget_unheard(self, heard_s: float) -> None:
         """Skip what was played while the microphone was off.
 
-        A microphone that was only late now delivers what it missed. The reference is then early, which the aligner
-        finds; it could not find one that is late.
+        If it was only late after all, the reference is early, which the aligner finds; it could not find a late one.
         """
         now, since = self._clock(), max(self._heard_at, self._talking_since)
         self._heard_at = now
@@ -365,15 +351,7 @@ class Pace:
 
 def from_pcm16(pcm: bytes | memoryview, channels: int = 1) -> Samples:
     """16-bit little-endian samples, interleaved, as one channel (n,) of +-1: their mean."""
-    stereo = all_of_pcm16(pcm, channels)
-    return stereo[:, 0].copy() if channels == 1 else stereo.mean(axis=1, dtype=np.float32)
-
-
-def all_of_pcm16(pcm: bytes | memoryview, channels: int) -> Samples:
-    """16-bit little-endian samples, interleaved, as (n, channels) of +-1."""
-    if len(pcm) % (2 * channels):
-        raise SignalError(f"found {len(pcm)} bytes, expected whole 16-bit samples of {channels} channels")
-    return np.frombuffer(pcm, "<i2").reshape(-1, channels).astype(np.float32) / np.float32(FULL_SCALE)
+    return delivered(of_pcm16(pcm, channels), None)
 
 
 def as_pcm16(samples: Samples, channels: int = 1) -> bytes:

@@ -36,9 +36,7 @@ class EchoCanceller:
         Of microphone and reference, 8000 to 48000 Hz.
     channels : int
         Of the microphone's sound, 1 to 8. Each is filtered by itself, which takes its own time.
-    profile : Profile, str or Path, optional
-        As of `EgoFilter`.
-    engine : str
+    profile, engine : optional
         As of `EgoFilter`.
     mic_channels : sequence of int, optional
         Numbers, from 0, of the channels that are microphones of one array; the answer then is one channel, which
@@ -77,9 +75,8 @@ class EchoCanceller:
         mic_channels: Sequence[int] | None = None,
     ) -> None:
         if sample_rate not in RATES:
-            raise UsageError(
-                f"sample_rate is {sample_rate}, expected {RATES[0]} to {RATES[-1]} Hz: convert the sound before"
-            )
+            expected = f"{RATES[0]} to {RATES[-1]} Hz: convert the sound before"
+            raise UsageError(f"sample_rate is {sample_rate}, expected {expected}")
         if not 1 <= channels <= MOST_MICROPHONES:
             raise UsageError(f"channels is {channels}, expected 1 to {MOST_MICROPHONES}: leave some microphones out")
         array = named(mic_channels, there=channels)
@@ -88,9 +85,8 @@ class EchoCanceller:
         self._filters = [EgoFilter(profile, engine) for _ in self._heard]
         first = self._filters[0]
         if first.waits_for_end:
-            raise UsageError(
-                f"engine {first.engine_name} needs the whole recording before it answers: take another engine"
-            )
+            why = "needs the whole recording before it answers: take another engine"
+            raise UsageError(f"engine {first.engine_name} {why}")
         self._worker: ThreadPoolExecutor | None = None
         if sample_rate > SAMPLE_RATE:
             _LOGGER.warning("at %d Hz nothing above %d Hz survives", sample_rate, SAMPLE_RATE // 2)
@@ -105,14 +101,10 @@ class EchoCanceller:
         Parameters
         ----------
         frame_size, filter_length, speakers : int
-            Not needed: frames may have any length, the length of the echo path is the filter's own, and the
-            reference's channels are counted in each call.
+            Not needed: frames and the reference's channels are as each call has them, the echo path's length is the
+            filter's own.
         sample_rate, mics : int
             As `sample_rate` and `channels` of the class.
-
-        Returns
-        -------
-        EchoCanceller
         """
         return cls(sample_rate, mics)
 
@@ -159,8 +151,7 @@ class EchoCanceller:
         Returns
         -------
         the type of mic
-            As long as mic and in its shape, late by `delay`; of an array one channel, (n,). Integers beyond full scale
-            are clipped.
+            In its shape, late by `delay`; of an array one channel, (n,). Integers beyond full scale are clipped.
 
         Raises
         ------
@@ -184,10 +175,9 @@ class EchoCanceller:
             return mic
         said = self._of_ref.push(played.reshape(count, -1).mean(axis=1, dtype=np.float32))
         new = []
-        for number, ego in enumerate(self._filters):
-            human = ego.process(self._to_filter[number].push(taken(heard, self._heard[number])), said)
-            new.append(self._from_filter[number].push(human))
-            if number:
+        for ego, wanted, down, up in zip(self._filters, self._heard, self._to_filter, self._from_filter):
+            new.append(up.push(ego.process(down.push(taken(heard, wanted)), said)))
+            if ego is not self._filters[0]:
                 ego.events()  # `events` tells of the first microphone
         ready = np.concatenate((self._ready, np.stack(new)), axis=1)
         self._ready = ready[:, count:]

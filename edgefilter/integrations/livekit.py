@@ -35,14 +35,11 @@ class EgoProcessor(rtc.FrameProcessor[rtc.AudioFrame]):
 
     Parameters
     ----------
-    ego : EgoFilter, optional
-        As of `edgefilter.integrations.duplex.Duplex`.
+    ego, mic_channels, reference_channel : optional
+        As of `edgefilter.integrations.duplex.Duplex`, channels of the frames; a tap is not needed with a
+        reference_channel.
     on_event : callable, optional
         Called with each `edgefilter.Event`, in the event loop: `session.interrupt()` may be called there.
-    mic_channels : sequence of int, optional
-        As of `Duplex`: those channels of the frames that are microphones of an array. Without it their mean is taken.
-    reference_channel : int, optional
-        As of `Duplex`: the channel of the frames that holds what is played; no tap is needed then.
 
     Attributes
     ----------
@@ -71,13 +68,7 @@ class EgoProcessor(rtc.FrameProcessor[rtc.AudioFrame]):
         """Return the filter's own voice activity detection, for `AgentSession` and for `stt.StreamAdapter`.
 
         A recogniser behind that adapter gets the human's finished turns, one channel: with several microphones they are
-        understood better than what was streamed.
-
-        Raises
-        ------
-        UsageError
-            Where the filter's engine, or a cheaper one that may take over, judges no speech: the human would not be
-            noticed.
+        understood better than what was streamed. Raises UsageError where an engine of the filter judges no speech.
         """
         self.duplex.require_judge("vad()")
         return _HumanVAD(self.duplex)
@@ -107,12 +98,7 @@ class _Tap(io.AudioOutput):
     def __init__(self, duplex: Duplex, output: io.AudioOutput) -> None:
         able = io.AudioOutputCapabilities(pause=True)
         super().__init__(label="edgefilter", capabilities=able, next_in_chain=output, sample_rate=output.sample_rate)
-        self._duplex = duplex
-
-    @property
-    def _next(self) -> io.AudioOutput:
-        assert self.next_in_chain is not None
-        return self.next_in_chain
+        self._duplex, self._next = duplex, output
 
     async def capture_frame(self, frame: rtc.AudioFrame) -> None:
         """Hand on first: a room waits here until somebody listens."""

@@ -40,23 +40,18 @@ class EgoFilters:
 
     Parameters
     ----------
-    ego : EgoFilter, optional
-        As of `edgefilter.integrations.duplex.Duplex`.
+    ego, mic_channels, reference_channel : optional
+        As of `edgefilter.integrations.duplex.Duplex`, channels of the in_channels.
     in_channels, out_channels : int
-        Channels of the transport's microphone and loudspeaker. Pipecat tells a filter neither, so `params` tells the
-        transport: one that is given another number as well is refused by Python.
+        Channels of the transport's microphone and loudspeaker, of which Pipecat tells a filter nothing: `params` tells
+        the transport.
     on_event : callable, optional
         Called with each `edgefilter.Event`, in a thread of the event loop's executor.
-    mic_channels : sequence of int, optional
-        As of `Duplex`: those of the in_channels that are microphones of an array. Without it their mean is taken.
-    reference_channel : int, optional
-        As of `Duplex`: the one of the in_channels that holds what is played.
 
     Attributes
     ----------
     params : dict
-        For `TransportParams(**params)`: `audio_in_filter`, `audio_in_channels`, `audio_out_filter`,
-        `audio_out_channels`.
+        For `TransportParams(**params)`: filter and channels of the microphone and of the loudspeaker.
     duplex : Duplex
         Shared by both filters: `duplex.stats()`, `duplex.ego`.
     """
@@ -82,13 +77,8 @@ class EgoFilters:
     def vad(self, params: VADParams | None = None) -> VADAnalyzer:
         """Return the filter's own voice activity detection, as the `vad_analyzer` of Pipecat's user turns.
 
-        It replaces Silero, which takes what is left of the robot's voice for a human.
-
-        Raises
-        ------
-        UsageError
-            Where the filter's engine, or a cheaper one that may take over, judges no speech: the human would not be
-            noticed.
+        It replaces Silero, which takes what is left of the robot's voice for a human. Raises UsageError where an engine
+        of the filter judges no speech.
         """
         self.duplex.require_judge("vad()")
         return _HumanVAD(self.duplex.ego, params)
@@ -96,9 +86,8 @@ class EgoFilters:
     def turns(self) -> FrameProcessor:
         """Return a processor to put between voice activity detection and a segmented recogniser, which then gets turns.
 
-        It holds the microphone's sound back and hands on the human's finished turn, one channel, just before the frame
-        that says that the human has stopped: with several microphones it is understood better than what was streamed.
-        Processors that want the sound as it comes stand before it.
+        It holds the sound back and hands on the human's finished turn, one channel, just before the frame that says that
+        the human has stopped: with several microphones it is understood better than what was streamed.
         """
         return _Turns(self.duplex)
 
@@ -107,9 +96,7 @@ class _Filter(BaseAudioFilter):
     """The common part of both filters: the rate; a FilterEnableFrame for either of them concerns both."""
 
     def __init__(self, duplex: Duplex, channels: int) -> None:
-        self._duplex = duplex
-        self._channels = channels
-        self._rate = SAMPLE_RATE
+        self._duplex, self._channels, self._rate = duplex, channels, SAMPLE_RATE
 
     async def start(self, sample_rate: int) -> None:
         self._rate = sample_rate

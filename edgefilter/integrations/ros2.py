@@ -95,9 +95,9 @@ class DiagnosticArray(IdlStruct, typename="diagnostic_msgs::msg::dds_::Diagnosti
 class Topics:
     """Names of what comes in and goes out.
 
-    rate: Hz, of the microphone's and the reference's 16-bit samples. channels: of the microphone's. mic_channels: those that
-    are microphones of an array; the human is then one channel, otherwise as many as came in, of their mean.
-    reference_channel: the one of the microphone's that holds what is played, with which the topic of the reference is none.
+    rate: Hz, of the microphone's and the reference's 16-bit samples. channels: of the microphone's. mic_channels: those
+    that are microphones of an array; the human is then one channel, otherwise as many as came in, of their mean.
+    reference_channel: the one of the microphone's that holds what is played, in place of the topic of the reference.
     reference_channels: of that topic, None for as many as the microphone's.
     """
 
@@ -113,17 +113,7 @@ class Topics:
 
 
 class Node:
-    """The filter between topics: /human, /barge_in and /diagnostics out.
-
-    Parameters
-    ----------
-    ego : EgoFilter
-        The filter.
-    topics : Topics
-        What it listens to and sends to.
-    domain : int
-        Of DDS: ROS_DOMAIN_ID.
-    """
+    """The filter between topics: /human, /barge_in and /diagnostics out. domain: of DDS, ROS_DOMAIN_ID."""
 
     def __init__(self, ego: EgoFilter, topics: Topics, domain: int) -> None:
         self._topics = topics
@@ -145,9 +135,8 @@ class Node:
                 raise UsageError(f"topic '{name}' does not begin with a slash: give its whole name, such as /{name}")
             return Topic(participant, f"rt{name}", kind)
 
-        self._mic, self._reference = (
-            DataReader(participant, topic(name, AudioData), qos=hears) for name in (topics.mic, topics.reference)
-        )
+        self._mic = DataReader(participant, topic(topics.mic, AudioData), qos=hears)
+        self._reference = DataReader(participant, topic(topics.reference, AudioData), qos=hears)
         self._silenced = DataReader(participant, topic(topics.silenced, Empty), qos=hears)
         self._human = DataWriter(participant, topic(topics.human, AudioData), qos=says)
         self._barge_in = DataWriter(participant, topic("/barge_in", Bool), qos=says)

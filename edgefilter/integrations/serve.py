@@ -19,12 +19,13 @@ from websockets.asyncio.server import ServerConnection, serve
 from websockets.exceptions import ConnectionClosed
 from websockets.http11 import Request, Response
 
+from edgefilter.audio.raw import of_pcm16
 from edgefilter.dsp.resample import Resampler
 from edgefilter.errors import EdgefilterError, SignalError
 from edgefilter.filter.ego_filter import EgoFilter
 from edgefilter.integrations.channels import taken
-from edgefilter.integrations.duplex import Pace, all_of_pcm16, as_pcm16, from_pcm16
-from edgefilter.integrations.wire import Form, TwoStreams, message_of
+from edgefilter.integrations.duplex import Pace, as_pcm16, from_pcm16
+from edgefilter.integrations.wire import Decode, Form, TwoStreams, message_of
 from edgefilter.types import SAMPLE_RATE, SET_UP_WRONG, Event, Samples
 
 MOST_BYTES = 4_000_000
@@ -36,15 +37,7 @@ Answer = bytes | str
 
 
 class Session:
-    """One client's stream: its messages in, what is to be sent to it out; no network.
-
-    Parameters
-    ----------
-    form : Form
-        What its first message said.
-    ego : EgoFilter
-        Its own.
-    """
+    """One client's stream: its messages in, what is to be sent to it out; no network. form: its first message. ego: its own."""
 
     def __init__(self, form: Form, ego: EgoFilter) -> None:
         self.form, self.ego = form, ego
@@ -52,35 +45,27 @@ class Session:
         self._to_filter = Resampler(rate, SAMPLE_RATE, form.microphones), Resampler(rate, SAMPLE_RATE)
         self._pace = Pace(asyncio.get_running_loop().time) if form.streams == "stereo" else None
         self._encode: Callable[[Samples, bool], list[bytes]]
-        decoders: tuple[Callable[[bytes], Samples], ...]
+        decoders: tuple[Decode, Decode] = partial(_microphones_of, count=form.microphones), from_pcm16
         if form.codec == "opus":
             from edgefilter.integrations.opus import FRAME_MS, Decoder, Encoder
 
-            decoders = (Decoder().decode, Decoder().decode)
+            decoders = Decoder().decode, Decoder().decode
             self._encode = Encoder(form.bitrate).push
             codec_s = FRAME_MS / 1000
         else:
-            decoders = (partial(_microphones_of, count=form.microphones), from_pcm16)
             self._encode = self._as_pcm
             self._from_filter = Resampler(SAMPLE_RATE, rate)
             codec_s = self._from_filter.delay_s
-        self._two = TwoStreams(decoders, rate, round(form.late_ms * rate / 1000)) if form.streams == "two" else None
+        late = round(form.late_ms * rate / 1000)
+        self._two = TwoStreams(*decoders, rate, late) if form.streams == "two" else None
         self.delay_ms = 1000 * (ego.latency / SAMPLE_RATE + self._to_filter[0].delay_s + codec_s)
         self._announced = False
         self._counted = self._counts()
 
     def ready(self, learns: bool) -> str:
         """The first answer."""
-        form = self.form
-        return _text(
-            "ready",
-            rate=form.rate,
-            codec=form.codec,
-            engine=self.ego.engine_name,
-            delay_ms=round(self.delay_ms, 1),
-            late_ms=form.late_ms,
-            learn=learns,
-        )
+        told = {"rate": self.form.rate, "codec": self.form.codec, "engine": self.ego.engine_name}
+        return _text("ready", **told, delay_ms=round(self.delay_ms, 1), late_ms=self.form.late_ms, learn=learns)
 
     def take(self, message: bytes | str) -> tuple[list[Answer], bool]:
         """Take a message; what is to be answered, and whether it was the last one. Raises SignalError for one that is none."""
@@ -101,7 +86,7 @@ class Session:
             self._two.push(message)
             mic, ref = self._two.take()
         else:
-            both = all_of_pcm16(message, self.form.microphones + 1)
+            both = of_pcm16(message, self.form.microphones + 1)
             mic, ref = taken(both, range(self.form.microphones)), np.ascontiguousarray(both[:, -1])
         return self._filter(mic, ref, last=False), False
 
@@ -110,14 +95,8 @@ class Session:
         nothing = _microphones_of(b"", self.form.microphones), np.zeros(0, np.float32)
         answers = self._filter(*(self._two.take(last=True) if self._two else nothing), last=True)
         stats = self.ego.stats()
-        figures = {
-            "samples": stats["samples"],
-            "engine": stats["engine"],
-            "array": stats["array"],
-            **self._counts(),
-            "deadline": stats["deadline"],
-        }
-        return [*answers, _text("ended", **figures)]
+        figures = {name: stats[name] for name in ("samples", "engine", "array")}
+        return [*answers, _text("ended", **figures, **self._counts(), deadline=stats["deadline"])]
 
     def _filter(self, mic: Samples, ref: Samples, last: bool) -> list[Answer]:
         heard, played = (each.push(x, last) for each, x in zip(self._to_filter, (mic, ref)))
@@ -157,19 +136,8 @@ class Session:
 class Service:
     """Serves streams until it is told to stop.
 
-    Parameters
-    ----------
-    make_filter : callable
-        Makes a stream's filter; told whether it learns.
-    streams : int
-        Clients at a time; more are sent away with a word.
-    learners : int
-        Streams that may learn at a time.
-    token : str, optional
-        What a client has to send as `Authorization: Bearer TOKEN`.
-
-    Notes
-    -----
+    make_filter: makes a stream's filter; told whether it learns. streams: clients at a time; more are sent away with a
+    word. learners: streams that may learn at a time. token: what a client has to send as `Authorization: Bearer TOKEN`.
     Programs within web pages are sent away: a page that somebody opens must not listen to the robot.
     """
 
@@ -233,19 +201,15 @@ class Service:
         ego = None
         try:
             ego = await asyncio.to_thread(self._make, learns)
-            session = self._session(form, ego)
+            session = Session(form, ego)
             await self._send(connection, deque([session.ready(learns)]))
             await self._converse(connection, session)
+        except ModuleNotFoundError as error:
+            raise SignalError(f"codec {form.codec} needs {error.name} at the server: pip install '.[opus]'") from None
         finally:
             self._learning -= learns
             if ego is not None:
                 await asyncio.to_thread(ego.close)
-
-    def _session(self, form: Form, ego: EgoFilter) -> Session:
-        try:
-            return Session(form, ego)
-        except ModuleNotFoundError as error:
-            raise SignalError(f"codec {form.codec} needs {error.name} at the server: pip install '.[opus]'") from None
 
     async def _converse(self, connection: ServerConnection, session: Session) -> None:
         """Filter message by message, in the event loop: threads would only wait for one another's interpreter lock."""
@@ -287,7 +251,7 @@ class Service:
 
 def _microphones_of(pcm: bytes, count: int) -> Samples:
     """Samples of one microphone, (n,), or of several, (n, count)."""
-    return taken(all_of_pcm16(pcm, count), range(count))
+    return taken(of_pcm16(pcm, count), range(count))
 
 
 def _text(kind: str, **more: object) -> str:

@@ -31,8 +31,6 @@ from edgefilter.integrations.channels import named, numbers
 from edgefilter.integrations.duplex import Duplex
 from edgefilter.types import SAMPLE_RATE, Event
 
-SPEECH = {"speech_started": True, "speech_stopped": False}
-
 
 def _options(words: list[str] | None = None) -> dict[str, Any]:
     """What a command line says of the filter, as keywords of _ears."""
@@ -49,18 +47,18 @@ _default = _options([])
 
 
 class HumanConf(SICConfMessage):
-    """What `Human(conf=...)` may say.
+    """What `Human(conf=...)` may say; what it leaves out is as the component's command line says.
 
     Parameters
     ----------
     profile : str, optional
-        File of the calibrated robot, where the component runs; unless given, what its command line says.
+        File of the calibrated robot, where the component runs.
     engine : str, optional
-        As of `EgoFilter`; likewise.
+        As of `EgoFilter`.
     channels : int, optional
-        Of the microphone's sound, interleaved, of which a message does not tell how many it has; likewise.
+        Of the microphone's sound, interleaved: a message does not tell how many it has.
     mic_channels : sequence of int, optional
-        Those that are microphones of an array, as of `Duplex`; otherwise their mean is taken.
+        As of `Duplex`.
     """
 
     def __init__(
@@ -99,7 +97,7 @@ class SpeechMessage(SICMessage):
         super().__init__()
         self.kind, self.detail = event.kind, event.detail
         self.seconds = event.sample / SAMPLE_RATE
-        self.is_speaking = SPEECH.get(event.kind)
+        self.is_speaking = {"speech_started": True, "speech_stopped": False}.get(event.kind)
 
 
 class SilencedRequest(SICRequest):
@@ -177,11 +175,10 @@ def main(words: list[str] | None = None) -> int:
     try:
         _ears(**_default)  # what cannot be made is said now
         manager = SICComponentManager([HumanComponent], component_group=Human.component_group, auto_serve=False)
-    except redis.exceptions.RedisError as error:
-        print(f"edgefilter: the Redis server of DB_IP, DB_PORT and DB_PASS cannot be reached: {error}", file=sys.stderr)
-        return 1
-    except (EdgefilterError, OSError) as error:
-        print(f"edgefilter: {error}", file=sys.stderr)
+    except (redis.exceptions.RedisError, EdgefilterError, OSError) as error:
+        of_redis = isinstance(error, redis.exceptions.RedisError)
+        what = "the Redis server of DB_IP, DB_PORT and DB_PASS cannot be reached: " if of_redis else ""
+        print(f"edgefilter: {what}{error}", file=sys.stderr)
         return 1
     print(f"serving HumanComponent at {manager.ip}", file=sys.stderr)
     manager.serve()

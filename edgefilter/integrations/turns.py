@@ -15,7 +15,7 @@ from edgefilter.types import SAMPLE_RATE, Event, Samples, Turn
 class TurnByTurn:
     """Collects what one recogniser is to get: `start` with a turn, `hear` what is streamed, `take` it at the end.
 
-    What it takes are the turns that the filter has finished meanwhile, the latest eight. Where there is none, since the filter is switched
+    These are the turns that the filter has finished meanwhile, the latest eight. Where there is none, since the filter is
     off or another detector was sooner, it is what was streamed, with half a second before the start, 30 s at most.
 
     >>> import numpy as np

@@ -6,7 +6,7 @@ import json
 import struct
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, TypeAlias
 
 import numpy as np
 
@@ -14,10 +14,8 @@ from edgefilter.errors import SignalError
 from edgefilter.types import MOST_MICROPHONES, SAMPLE_RATE, Samples
 
 HEADER = struct.Struct("<BxHQ")
-"""Before the sound of a message of one of two streams: its label, an unused byte, the number of the message in its stream
-(from 65535 on to 0), and the counter of its first sample; little-endian."""
-MICROPHONE, REFERENCE = 0, 1
-"""Labels."""
+"""Before the sound of a message of one of two streams: its label, 0 for the microphone and 1 for the reference, an unused
+byte, the number of the message in its stream (from 65535 on to 0), and the counter of its first sample; little-endian."""
 RATES = range(8000, 48001)
 """Hz that a device, or a program that calls a canceller, may have: what telephones and sound cards do."""
 JITTER_S = 0.06
@@ -32,9 +30,8 @@ class Form:
 
     rate: Hz, of the samples and of the counters. streams: "stereo", microphone and reference interleaved, or "two",
     each message of one stream, with a HEADER. microphones: of an array, interleaved, in "stereo" before the reference.
-    codec: "pcm", 16 bit, or "opus", mono, at a rate of 48000 and in two streams.
-    late_ms: how long the microphone waits for a reference that comes later. learn: whether to learn the room. bitrate:
-    bits a second of the answer in Opus.
+    codec: "pcm", 16 bit, or "opus", mono. late_ms: how long the microphone waits for a late reference. learn: whether to
+    learn the room. bitrate: bits a second of the answer in Opus.
     """
 
     rate: int = SAMPLE_RATE
@@ -67,10 +64,10 @@ class Form:
             if allowed is None:
                 raise SignalError(f"the first message has '{name}', expected {', '.join(bounds)}")
             if isinstance(value, float) or value not in allowed or isinstance(value, bool) != (name == "learn"):
-                expected = (
-                    f"{allowed[0]} to {allowed[-1]}" if isinstance(allowed, range) else " or ".join(map(str, allowed))
+                words = (
+                    (allowed[0], "to", allowed[-1]) if isinstance(allowed, range) else (allowed[0], "or", allowed[1])
                 )
-                raise SignalError(f"the first message has {name} {value!r}, expected {expected}")
+                raise SignalError(f"the first message has {name} {value!r}, expected {' '.join(map(str, words))}")
         form = cls(**given)
         if form.codec == "opus" and (form.streams != "two" or form.rate != 48000 or form.microphones > 1):
             raise SignalError(
@@ -127,21 +124,24 @@ class _Order:
             lost = 0
 
 
+Decode: TypeAlias = Callable[[bytes], Samples]
+
+
 class TwoStreams:
     """Microphone and reference with counters of one clock, put together; every sample of the microphone comes out.
 
-    decoders: for each label, what makes samples of a message's sound, of an array's (n, microphones). The microphone waits for its reference, up to
-    late samples of its own. lost: samples for which silence stands in, of the microphone and of messages of the reference
-    that never came. late: samples of the reference that came too late, and were left out; lateness: by how many samples
-    more than allowed the latest of them was.
+    decode_mic, decode_ref: what makes samples of a message's sound, (n,), of an array (n, microphones). The microphone
+    waits for its reference, up to late samples of its own. lost: samples for which silence stands in, of the microphone
+    and of messages of the reference that never came. late: samples of the reference that came too late, and were left
+    out; lateness: by how many samples more than allowed the latest of them was.
     """
 
-    def __init__(self, decoders: tuple[Callable[[bytes], Samples], ...], rate: int, late: int) -> None:
-        self._decoders, self._rate, self._wait = decoders, rate, late
-        gives = (self._take_mic, self._take_ref)
-        self._orders = [_Order(give, round(JITTER_S * rate)) for give in gives]
+    def __init__(self, decode_mic: Decode, decode_ref: Decode, rate: int, late: int) -> None:
+        self._decode_mic, self._decode_ref, self._rate, self._wait = decode_mic, decode_ref, rate, late
+        jitter = round(JITTER_S * rate)
+        self._mic_order, self._ref_order = _Order(self._take_mic, jitter), _Order(self._take_ref, jitter)
         self._at: int | None = None
-        self._mic, self._ref = decoders[MICROPHONE](b""), np.zeros(0, np.float32)
+        self._mic, self._ref = decode_mic(b""), np.zeros(0, np.float32)
         self._early: list[tuple[int, Samples]] = []
         self._ref_end = 0
         self.lost = self.late = self.lateness = 0
@@ -151,31 +151,30 @@ class TwoStreams:
         if len(message) < HEADER.size:
             raise SignalError(f"found a message of {len(message)} bytes, expected a header of {HEADER.size} and sound")
         label, number, at = HEADER.unpack_from(message)
-        if label not in (MICROPHONE, REFERENCE):
-            raise SignalError(f"found label {label}, expected {MICROPHONE} (microphone) or {REFERENCE} (reference)")
-        self._orders[label].push(number, at, message[HEADER.size :])
+        orders = self._mic_order, self._ref_order
+        if label >= len(orders):
+            raise SignalError(f"found label {label}, expected 0 (microphone) or 1 (reference)")
+        orders[label].push(number, at, message[HEADER.size :])
 
     def take(self, last: bool = False) -> tuple[Samples, Samples]:
         """What is complete of both, (n,) or (n, microphones), and (n,); last: all."""
         if self._at is None:
             return self._mic, self._ref
-        known = max(self._ref_end, self._orders[MICROPHONE].newest - self._wait) - self._at
+        known = max(self._ref_end, self._mic_order.newest - self._wait) - self._at
         count = len(self._mic) if last else min(max(known, 0), len(self._mic))
         mic, self._mic = self._mic[:count], self._mic[count:]
-        ref = self._ref[:count]
-        self._ref = self._ref[count:]
+        ref, self._ref = self._ref[:count], self._ref[count:]
         self._at += count
         return mic, np.concatenate((ref, np.zeros(count - ref.size, np.float32)))
 
     def _take_mic(self, at: int, sound: bytes, lost: int) -> None:
-        samples = self._decoders[MICROPHONE](sound)
+        samples = self._decode_mic(sound)
         if self._at is None:
             self._at = at
             early, self._early = self._early, []
             for start, part in early:
                 self._place(start, part)
-        end = self._at + len(self._mic)
-        gap = at - end
+        gap = at - self._at - len(self._mic)
         self._check_gap(gap)
         if gap > 0:
             self.lost += gap
@@ -183,7 +182,7 @@ class TwoStreams:
         self._mic = np.concatenate((self._mic, samples[max(-gap, 0) :]))
 
     def _take_ref(self, at: int, sound: bytes, lost: int) -> None:
-        samples = self._decoders[REFERENCE](sound)
+        samples = self._decode_ref(sound)
         self.lost += max(at - self._ref_end, 0) if lost else 0
         self._ref_end = max(self._ref_end, at + samples.size)
         if self._at is None:

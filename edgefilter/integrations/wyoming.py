@@ -39,6 +39,7 @@ from edgefilter.audio.reader import RATES
 from edgefilter.errors import EdgefilterError, SignalError
 from edgefilter.filter.barge_in import BargeInSettings
 from edgefilter.filter.ego_filter import EgoFilter
+from edgefilter.filter.turns import BEFORE_S
 from edgefilter.integrations.channels import named, numbers
 from edgefilter.integrations.duplex import ABSENT_S, MOST_QUEUED_S, Duplex, as_pcm16, from_pcm16
 from edgefilter.integrations.turns import TurnByTurn
@@ -47,13 +48,10 @@ from edgefilter.types import SAMPLE_RATE, Event
 MOST_BYTES = round(MOST_QUEUED_S * SAMPLE_RATE) * np.int16().itemsize
 """Size of a message, and of all that a client has said and waits to be played: the queue's ten minutes, 19 MB."""
 AHEAD_S = 0.5
-"""Speech that the loudspeaker gets before its turn: the size of aplay's buffer. Speech further ahead is still here when
-it is dropped."""
-UNDER_WAY_S = 1.0
-"""For how long a recogniser that is told that the human has ended waits for the filter's word: it takes half a second of
-pause, and the sound half as much to the filter."""
-WAY_S = 0.5
-"""How long after its sound the message may come with which a client begins: what was said before is not part of it."""
+"""Speech that the loudspeaker gets before its turn: the size of aplay's buffer. The rest is still here when it is dropped."""
+UNDER_WAY_S = BargeInSettings.min_silence_s + BEFORE_S
+"""For how long a recogniser that is told that the human has ended waits for the filter's word, which takes the pause, and
+the sound's way to the filter."""
 MIC_URI, SND_URI, ASR_URI = "tcp://127.0.0.1:10600", "tcp://127.0.0.1:10601", "tcp://127.0.0.1:10602"
 ABOUT: dict[str, Any] = {
     "attribution": Attribution("edgefilter", url=""),
@@ -72,27 +70,23 @@ class EgoService:
     microphone, loudspeaker : str
         Source and destination of the sound: a command that writes or reads raw 16-bit samples, or the URI of another
         Wyoming service (`tcp://...`, `unix://...`).
-    ego : EgoFilter, optional
-        As of `edgefilter.integrations.duplex.Duplex`.
+    ego, mic_channels, reference_channel : optional
+        As of `edgefilter.integrations.duplex.Duplex`, channels of the microphone.
     mic_format, snd_format : AudioFormat
         What the commands write and read, of width 2.
-    mic_channels : sequence of int, optional
-        As of `Duplex`: those channels of the microphone that form an array. Without it their mean is taken.
-    reference_channel : int, optional
-        As of `Duplex`: the channel of the microphone that holds what is played.
     recogniser : str, optional
         URI of a Wyoming service that makes text of speech. A third service stands before it then: whoever has the
         microphone's sound recognised there, as Home Assistant does, gets the words of the human's finished turn.
     stop_for_speech : bool
-        Whether the loudspeaker is silenced when the human begins to speak. A satellite cannot do it: the protocol has
-        no message for it.
+        Whether the loudspeaker is silenced when the human begins to speak; the protocol has no message by which a
+        satellite could do it.
 
     Notes
     -----
-    The microphone is filtered whether somebody listens or not, so that the filter knows the room when somebody does.
-    Listeners also get `voice-started` and `voice-stopped` of the human. A client that disconnects from the loudspeaker
-    before its `audio-stop` interrupts: speech that is not played yet is dropped. A client that sends a message that
-    cannot be read is disconnected, with a line in the log.
+    The microphone is filtered whether somebody listens or not, so that the filter knows the room. Listeners also get
+    `voice-started` and `voice-stopped` of the human. A client that disconnects from the loudspeaker before its
+    `audio-stop` interrupts: speech that is not played yet is dropped. A client that sends a message that cannot be read
+    is disconnected, with a line in the log.
     """
 
     def __init__(
@@ -332,7 +326,7 @@ class _Recogniser(_Client):
         elif Transcribe.is_type(event.type):
             self._asked = event
         elif AudioStart.is_type(event.type):
-            self._turns.start(self._service.duplex.heard - round(WAY_S * SAMPLE_RATE))
+            self._turns.start(self._service.duplex.heard - round(BEFORE_S * SAMPLE_RATE))
         elif AudioChunk.is_type(event.type):
             chunk = _chunk_of(event)
             self._turns.hear(from_pcm16(chunk.audio, chunk.channels), chunk.rate)

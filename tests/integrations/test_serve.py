@@ -22,11 +22,12 @@ from edgefilter.dsp.metrics import si_sdr
 from edgefilter.integrations import serve as module
 from edgefilter.integrations.opus import Decoder, Encoder
 from edgefilter.integrations.serve import Service
-from edgefilter.integrations.wire import HEADER, MICROPHONE, REFERENCE, Form
+from edgefilter.integrations.wire import HEADER, Form
 
 ROOT = Path(__file__).parents[2]
 DEMO = Path(edgefilter.__file__).parent / "demo_data"
 RATE = 16_000
+MICROPHONE, REFERENCE = 0, 1
 BOTH = slice(9 * RATE, 15 * RATE)
 """Where human and robot talk at once in the bundled conversation."""
 
