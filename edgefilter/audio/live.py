@@ -8,11 +8,10 @@ from functools import partial
 import numpy as np
 
 from edgefilter.audio.device import find, input_port, output_port
-from edgefilter.audio.lookup import Named
 from edgefilter.audio.pairing import MAX_WAIT, TOLERANCE, Pairing
-from edgefilter.audio.port import START_S, InputPort, pause
+from edgefilter.audio.port import START_S, InputPort, SpokenReference, pause
 from edgefilter.audio.protocols import Sink, Source
-from edgefilter.audio.speech import SpokenReference
+from edgefilter.audio.pulse import Named
 from edgefilter.audio.steady import SteadyInput
 from edgefilter.errors import DeviceError
 from edgefilter.types import MOST_MICROPHONES, SAMPLE_RATE, Block, Samples

@@ -10,9 +10,9 @@ from scipy import signal
 
 from edgefilter.audio import virtual
 from edgefilter.audio.device import input_port, output_port
-from edgefilter.audio.lookup import Named
 from edgefilter.audio.port import START_S, STREAM_LATENCY_S, InputPort, OutputPort, clock, pause
 from edgefilter.audio.protocols import Source
+from edgefilter.audio.pulse import Named
 from edgefilter.dsp.frames import decibels
 from edgefilter.types import SAMPLE_RATE, Block, Samples
 

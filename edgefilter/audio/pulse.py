@@ -1,4 +1,4 @@
-"""PulseAudio's (and PipeWire's) own names for what PortAudio only sees as 'default' or 'pulse': above all, the monitors."""
+"""What sound devices are called: by PortAudio, and by PulseAudio (and PipeWire), of which PortAudio only sees 'default' or 'pulse'."""
 
 from __future__ import annotations
 
@@ -8,11 +8,42 @@ import subprocess
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import TypeAlias
 
 from edgefilter.errors import DeviceError
 
+STAND_INS = ("pulse", "default", "pipewire")
+"""PortAudio's devices that lead to the sound server, the most direct first."""
 OPENING = threading.RLock()
 """Held while a stream is opened: what that changes is the whole process's, and two at once would undo each other's."""
+
+
+@dataclass(frozen=True)
+class Device:
+    """A sound device as the audio system lists it: number, name, channels each way, its own rate in Hz, its audio system.
+
+    pulse_name: the sound server's own name of it, where PortAudio only has a device that leads to the server.
+    """
+
+    index: int
+    name: str
+    inputs: int
+    outputs: int
+    rate: float
+    system: str = ""
+    pulse_name: str = ""
+
+    def __str__(self) -> str:
+        return self.name
+
+    def channels(self, kind: str) -> int:
+        """Channels in the direction kind, 'input' or 'output'."""
+        return self.inputs if kind == "input" else self.outputs
+
+
+Named: TypeAlias = str | int | Device | None
+"""A device as it is asked for: a number, a name or a part of it; None, 'default' and 'mic' are the default one."""
 
 
 def names(kind: str) -> list[str]:

@@ -9,9 +9,8 @@ from contextlib import suppress
 import numpy as np
 
 from edgefilter.audio.pairing import BUFFER_S, TOLERANCE, WINDOW
-from edgefilter.audio.port import START_S, InputPort, clock
+from edgefilter.audio.port import START_S, InputPort, SpokenReference, clock
 from edgefilter.audio.protocols import Sink
-from edgefilter.audio.speech import SpokenReference
 from edgefilter.errors import DeviceError
 from edgefilter.types import SAMPLE_RATE, Samples
 

@@ -7,7 +7,7 @@ what `edgefilter run` writes can be listened to as a microphone.
 from __future__ import annotations
 
 from edgefilter.audio import pulse
-from edgefilter.audio.lookup import STAND_INS, Device
+from edgefilter.audio.pulse import STAND_INS, Device
 from edgefilter.errors import DeviceError, UsageError
 
 SPEAKER, HUMAN, MICROPHONE = "edgefilter_speaker", "edgefilter_human", "edgefilter_mic"

@@ -19,8 +19,8 @@ from pathlib import Path
 from typing import TextIO
 
 from edgefilter.audio.files import Recorder, make_folder, write_file
+from edgefilter.audio.port import SpokenReference
 from edgefilter.audio.protocols import Source
-from edgefilter.audio.speech import SpokenReference
 from edgefilter.commands.display import display, interject, say_event, write_json
 from edgefilter.errors import AudioFileError, EdgefilterError
 from edgefilter.filter.barge_in import INTERRUPTIONS

@@ -16,9 +16,9 @@ from edgefilter.audio import pulse, virtual
 from edgefilter.audio.device import find, monitor_of, speaker
 from edgefilter.audio.files import open_sink, open_source
 from edgefilter.audio.live import LiveSink, LiveSource
+from edgefilter.audio.port import SpokenReference
 from edgefilter.audio.protocols import Sink, Source, Troubles
 from edgefilter.audio.reader import Reader
-from edgefilter.audio.speech import SpokenReference
 from edgefilter.audio.steady import SteadySink
 from edgefilter.commands.display import describe_latency, say, write_json
 from edgefilter.commands.observers import Observers, observing

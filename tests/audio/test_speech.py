@@ -5,9 +5,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from edgefilter.audio.lookup import Device
 from edgefilter.audio.pairing import TOLERANCE, Pairing
-from edgefilter.audio.speech import FADE_S, SpokenReference
+from edgefilter.audio.port import FADE_S, SpokenReference
+from edgefilter.audio.pulse import Device
 
 SPEECH = 0.5 * np.random.default_rng(3).standard_normal(48_000).astype(np.float32).clip(-1, 1)
 FINE = SimpleNamespace(output_underflow=False)

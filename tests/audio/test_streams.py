@@ -9,8 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from edgefilter.audio.lookup import Device, match, monitor
+from edgefilter.audio.device import match, monitor
 from edgefilter.audio.pairing import MAX_WAIT, TOLERANCE, WINDOW, Inlet, Outlet, Pairing
+from edgefilter.audio.pulse import Device
 from edgefilter.audio.raw import PcmSink, PcmSource
 from edgefilter.errors import AudioFileError, DeviceError, SignalError, UsageError
 
