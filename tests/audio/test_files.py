@@ -13,8 +13,7 @@ import pytest
 import soundfile
 
 from edgefilter.audio import files
-from edgefilter.audio.disk import Disk
-from edgefilter.audio.files import FileSink, FileSource, Recorder, open_source
+from edgefilter.audio.files import Disk, FileSink, FileSource, Recorder, open_source
 from edgefilter.errors import AudioFileError, UsageError
 from edgefilter.types import ALL_CHANNELS, Block
 
