@@ -22,12 +22,12 @@ from edgefilter.dsp.resample import Resampler
 from edgefilter.errors import UsageError
 from edgefilter.filter.barge_in import BargeInSettings
 from edgefilter.filter.ego_filter import EgoFilter
-from edgefilter.filter.turns import drop_sound
+from edgefilter.filter.turns import WAITING_S, drop_sound
 from edgefilter.integrations.channels import named, taken
 from edgefilter.types import SAMPLE_RATE, SET_UP_WRONG, Event, Samples
 
-MOST_QUEUED_S = 600.0
-"""Speech that may wait to be played, 38 MB of float32: longer than any answer. The rest is refused and counted."""
+MOST_QUEUED_S = WAITING_S
+"""Speech that may wait to be played, as much as turns may wait: longer than any answer. The rest is refused and counted."""
 ABSENT_S = 1.0
 """A microphone that delivers nothing for so long was off: event loops stand still for tenths of a second, not more."""
 PATIENCE_S = 0.12
@@ -109,8 +109,7 @@ class Duplex:
                 f"engine {self.ego.engine_name} needs the whole recording before it answers: an agent needs another"
             )
         self._patience = 0 if self._both else round(patience_s * SAMPLE_RATE)
-        self._on_event = on_event
-        self._clock = clock
+        self._on_event, self._clock = on_event, clock
         self._queue_lock, self._hear_lock = threading.Lock(), threading.Lock()
         self._queue: deque[Samples] = deque()
         self._queued = self._gaps = self.heard = 0

@@ -18,7 +18,7 @@ import shlex
 import signal
 import sys
 import time
-from collections.abc import AsyncIterator, Callable, Coroutine, Sequence
+from collections.abc import Callable, Coroutine, Sequence
 from functools import partial
 from typing import Any, cast
 
@@ -106,11 +106,8 @@ class EgoService:
         self.duplex = Duplex(
             ego, on_event=self._events.append, mic_channels=mic_channels, reference_channel=reference_channel
         )
-        self.recogniser = recogniser
-        self.mic_format = mic_format
-        self.player = Player(loudspeaker, snd_format)
-        self._microphone = microphone
-        self._stop_for_speech = stop_for_speech
+        self.recogniser, self.mic_format, self.player = recogniser, mic_format, Player(loudspeaker, snd_format)
+        self._microphone, self._stop_for_speech = microphone, stop_for_speech
         self.listeners: set[_Listener] = set()
         self.speakers: set[_Speaker] = set()
 
@@ -156,10 +153,11 @@ class EgoService:
 
     async def _listen(self) -> None:
         """Read the microphone for ever; one that ends or fails is opened again."""
-        samples = self.duplex.ego.hop * self.mic_format.rate // SAMPLE_RATE
         while True:
             try:
-                async with _microphone_client(self._microphone, self.mic_format, samples) as client:
+                async with self._microphone_client() as client:
+                    if client._reader is not None:
+                        client._reader = _BoundedReader(client._reader)
                     while (message := await client.read_event()) is not None:
                         if AudioChunk.is_type(message.type):
                             await self._hear(_chunk_of(message))
@@ -168,6 +166,14 @@ class EgoService:
                 why = f"cannot be read ({type(error).__name__}: {error})"
             _LOGGER.warning("microphone %s %s: again in %.0f s", self._microphone, why, ABSENT_S)
             await asyncio.sleep(ABSENT_S)
+
+    def _microphone_client(self) -> AsyncClient:
+        """A client of the command, which is read by the hop, or of the service at a URI."""
+        if "://" in self._microphone:
+            return AsyncClient.from_uri(self._microphone)
+        form, (program, *words) = self.mic_format, shlex.split(self._microphone)
+        samples = self.duplex.ego.hop * form.rate // SAMPLE_RATE
+        return MicProcessAsyncClient(form.rate, 2, form.channels, samples, program, words)
 
     async def _hear(self, chunk: AudioChunk) -> None:
         human = await asyncio.to_thread(self.duplex.hear_pcm16, chunk.audio, chunk.rate, chunk.channels, 1)
@@ -415,19 +421,6 @@ class Player:
             await client.disconnect()
 
 
-@contextlib.asynccontextmanager
-async def _microphone_client(where: str, form: AudioFormat, samples: int) -> AsyncIterator[AsyncClient]:
-    """A client of a command, which is read by so many samples at once, or of the service at a URI."""
-    if "://" not in where:
-        program, *words = shlex.split(where)
-        async with MicProcessAsyncClient(form.rate, 2, form.channels, samples, program, words) as command:
-            yield command
-        return
-    async with AsyncClient.from_uri(where) as client:
-        client._reader = _BoundedReader(client._reader)
-        yield client
-
-
 def _chunk_of(message: Message) -> AudioChunk:
     """The sound in a message, at 16 bits; raises SignalError where the message does not say what it is or is cut."""
     rate, width, channels = (message.data.get(key) for key in ("rate", "width", "channels"))
@@ -468,17 +461,11 @@ def main(words: list[str] | None = None) -> int:
     parser.add_argument("--stop-for-speech", action="store_true", help="fall silent when the human begins to speak")
     args = parser.parse_args(words)
     try:
-        service = EgoService(
-            args.microphone,
-            args.loudspeaker,
-            EgoFilter(args.profile, args.engine, barge_in=BargeInSettings(judge="network")),
-            AudioFormat(args.mic_command_rate, 2, args.mic_command_channels),
-            AudioFormat(args.snd_command_rate, 2, args.snd_command_channels),
-            args.stop_for_speech,
-            args.mic_channels,
-            args.recogniser,
-            args.reference_channel,
-        )
+        ego = EgoFilter(args.profile, args.engine, barge_in=BargeInSettings(judge="network"))
+        mic_format = AudioFormat(args.mic_command_rate, 2, args.mic_command_channels)
+        snd_format = AudioFormat(args.snd_command_rate, 2, args.snd_command_channels)
+        more = args.stop_for_speech, args.mic_channels, args.recogniser, args.reference_channel
+        service = EgoService(args.microphone, args.loudspeaker, ego, mic_format, snd_format, *more)
         asyncio.run(_until_sigterm(service.run(args.mic_uri, args.snd_uri, args.asr_uri)))
     except KeyboardInterrupt:
         return 128 + signal.SIGINT
