@@ -220,14 +220,10 @@ class Disk(io.RawIOBase):
         if start[:4] == b"fLaC" and len(start) >= 42:
             self._repair_flac(start)
         elif start[:4] == b"RIFF" and b"data" in start:
-            self._repair_wav(start)
-
-    def _repair_wav(self, start: bytes) -> None:
-        """Put the bytes that reached the disk into the RIFF and the data chunk, whose sizes count from behind themselves."""
-        end = self._file.seek(0, os.SEEK_END)
-        for at in (4, start.index(b"data") + 4):
-            self._file.seek(at)
-            self._file.write(min(end - at - 4, _MOST).to_bytes(4, "little"))
+            end = self._file.seek(0, os.SEEK_END)
+            for at in (4, start.index(b"data") + 4):  # RIFF and data chunk: a size counts from behind itself
+                self._file.seek(at)
+                self._file.write(min(end - at - 4, _MOST).to_bytes(4, "little"))
 
     def _repair_flac(self, start: bytes) -> None:
         """Put the number of samples that reached the disk into STREAMINFO (RFC 9639, 8.2).
@@ -320,10 +316,7 @@ class FileSink(Sink):
         self.written += len(data)
 
     def close(self, quiet: bool = False) -> None:
-        """Finish the file; a second call does nothing.
-
-        quiet: another error is under way, do not cover it with a full disk.
-        """
+        """Finish the file; a second call does nothing. quiet: another error is under way, a full disk must not cover it."""
         if self._file is None:
             return
         try:

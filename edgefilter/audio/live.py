@@ -204,7 +204,7 @@ class LiveSink(Sink):
     def __exit__(self, *exc: object) -> None:
         try:
             if exc[0] is None and self._open:
-                self._port.outlet.draining.set()
+                self._port.outlet.draining = True
                 self._queue(self._port.convert(np.zeros(0, np.float32), last=True))
                 self._port.wait_until(0)
         finally:

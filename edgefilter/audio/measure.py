@@ -75,7 +75,7 @@ def _holding(output: Named, samples: Samples, latency_s: float = STREAM_LATENCY_
     """An output that holds all samples (n,) and plays them as soon as it is opened."""
     port = output_port(output, samples.size, latency_s=latency_s)
     port.outlet.ring.write(port.convert(samples.astype(np.float32), last=True))
-    port.outlet.draining.set()  # nothing follows: silence after the last sample is no underrun
+    port.outlet.draining = True
     return port
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 from collections import deque
 
 import numpy as np
@@ -147,26 +146,26 @@ class Pairing:
 class Outlet:
     """A ring that an audio callback empties; it starts, and starts again after an underrun, once `margin` samples wait.
 
-    underruns: callbacks that found too little; missing: samples of silence that they played instead.
+    underruns: callbacks that found too little; missing: samples of silence that they played instead. draining: nothing
+    follows, so that silence is no underrun.
     """
 
     def __init__(self, capacity: int, margin: int) -> None:
         self.ring = Ring(capacity)
         self._margin = margin
         self._waiting = True
-        self.draining = threading.Event()
-        self.started = False
+        self.draining = self._started = False
         self.underruns = self.missing = self.calls = 0
 
     def deliver(self, out: Samples) -> None:
         """Called by the audio thread to fill out (n,)."""
         self.calls += 1
-        if self._waiting and (len(self.ring) >= self._margin or self.draining.is_set()):
-            self._waiting, self.started = False, True
+        if self._waiting and (len(self.ring) >= self._margin or self.draining):
+            self._waiting, self._started = False, True
         data = out[:0] if self._waiting else self.ring.read(out.size)
         out[: data.size] = data
         out[data.size :] = 0.0
-        if data.size < out.size and self.started and not self.draining.is_set():
+        if data.size < out.size and self._started and not self.draining:
             self.underruns += not self._waiting
             self.missing += out.size - data.size
             self._waiting = True

@@ -82,12 +82,7 @@ class Port:
     """
 
     def __init__(
-        self,
-        sounddevice: Any,
-        device: Device,
-        kind: str,
-        latency_s: float = STREAM_LATENCY_S,
-        wanted: Sequence[int] | None = None,
+        self, sounddevice: Any, device: Device, kind: str, latency_s: float, wanted: Sequence[int] | None = None
     ) -> None:
         self._sd = sounddevice
         self._name = f"{kind} device '{device}'"
@@ -179,13 +174,7 @@ def _words(error: Exception) -> str:
 class InputPort(Port):
     """An input whose callback fills an Inlet, read as 16 kHz mono, or as the channels that are wanted."""
 
-    def __init__(
-        self,
-        sounddevice: Any,
-        device: Device,
-        latency_s: float = STREAM_LATENCY_S,
-        wanted: Sequence[int] | None = None,
-    ) -> None:
+    def __init__(self, sounddevice: Any, device: Device, latency_s: float, wanted: Sequence[int] | None) -> None:
         super().__init__(sounddevice, device, "input", latency_s, wanted)
         count = len(self.wanted) if self.wanted else 1
         self.inlet = Inlet(round(BUFFER_S * self.rate), count if count > 1 else None)
@@ -206,9 +195,7 @@ class InputPort(Port):
 class OutputPort(Port):
     """An output whose callback empties an Outlet; `convert` brings 16 kHz mono to its rate."""
 
-    def __init__(
-        self, sounddevice: Any, device: Device, queued: int, margin_s: float = 0.0, latency_s: float = STREAM_LATENCY_S
-    ) -> None:
+    def __init__(self, sounddevice: Any, device: Device, queued: int, margin_s: float, latency_s: float) -> None:
         super().__init__(sounddevice, device, "output", latency_s)
         self.flags = 0
         self.margin = round(margin_s * self.rate)
@@ -242,7 +229,7 @@ class SpokenReference(Port):
     """
 
     def __init__(self, sounddevice: Any, device: Device, speech: Iterator[Samples]) -> None:
-        super().__init__(sounddevice, device, "output")
+        super().__init__(sounddevice, device, "output", STREAM_LATENCY_S)
         self.inlet = Inlet(round(BUFFER_S * self.rate))
         self._ring = Ring(round(BUFFER_S * self.rate))
         self._pieces = self._converted(speech)

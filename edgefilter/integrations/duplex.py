@@ -210,10 +210,7 @@ class Duplex:
                 drop_sound(self._kept)
 
     def hear_pcm16(self, pcm: bytes | memoryview, rate: int, channels: int = 1, answers: int | None = None) -> bytes:
-        """As `hear`, for 16-bit samples, interleaved.
-
-        answers: channels of the answer, each of them the human; None: as many as came in.
-        """
+        """As `hear`, for 16-bit samples, interleaved; answers: channels of the answer, each of them the human, None: as came in."""
         if channels > 1 and self._wanted is None and not self._averaged:
             self._averaged = True
             _LOGGER.warning("%d channels averaged to one: name the microphones of an array (mic_channels)", channels)
@@ -311,9 +308,7 @@ class Duplex:
 
 
 class Pace:
-    """Whether sound comes as fast as its rate says: one that is told wrongly makes another voice of it.
-
-    Wrong rates and channels are off by a few known factors; a machine that is busy, or a file, is off by any.
+    """Whether sound comes as fast as its rate says: wrong ones are off by a few known factors, a busy machine by any.
 
     >>> now = iter(range(100))
     >>> pace = Pace(lambda: float(next(now)))
@@ -342,10 +337,8 @@ class Pace:
         if not wrong or factor in (1.0, self._said):
             return ""
         self._said = factor
-        return (
-            f"it brings {factor * rate:.0f} samples a second and is said to have {rate}: give the rate or the channels"
-            " that it has"
-        )
+        brings = f"it brings {factor * rate:.0f} samples a second and is said to have {rate}"
+        return f"{brings}: give the rate or the channels that it has"
 
 
 def from_pcm16(pcm: bytes | memoryview, channels: int = 1) -> Samples:
