@@ -18,7 +18,7 @@ from edgefilter.types import MOST_MICROPHONES, SAMPLE_RATE, Block, Samples
 
 
 class LiveSource(Source):
-    """Microphone and reference devices as blocks on the microphone's sample counter, until stop() or `seconds`.
+    """Microphone and reference devices as blocks on the microphone's sample counter, until stop().
 
     patience_s: how long a device may be away; silence stands in meanwhile, by the clock, and it is opened again as soon
     as that can be done. Raises DeviceError, after everything received has been delivered, when a device is away for
@@ -33,7 +33,6 @@ class LiveSource(Source):
         self,
         mic: Named,
         reference: Named | SpokenReference = None,
-        seconds: float | None = None,
         patience_s: float = 0.0,
         channels: Sequence[int] | None = None,
         reference_channel: int | None = None,
@@ -45,7 +44,6 @@ class LiveSource(Source):
         self.microphones = 1 if opened is None else len(opened) - self._both
         self._reference = None if reference is None else SteadyInput(_opener(reference), patience_s)
         self._pairing = Pairing(late_is_lost=not isinstance(reference, SpokenReference))
-        self.total = None if seconds is None else round(seconds * SAMPLE_RATE)
         self.notes = [f"microphone: {self._mic.port.device}", *self._mic.port.notes]
         there = self._mic.port.device.inputs
         if opened is None and 1 < there <= MOST_MICROPHONES:
@@ -68,8 +66,7 @@ class LiveSource(Source):
     def __exit__(self, *exc: object) -> None:
         for each in self._inputs():
             each.close()
-        counts = {name: count for name, count in self.stats().items() if name != "lost"}
-        self.notes += _incomplete("input", counts)
+        self.notes += _incomplete("input", self.stats())
 
     def _inputs(self) -> list[SteadyInput]:
         """The reference first, so that it is there when the microphone starts."""
@@ -88,7 +85,7 @@ class LiveSource(Source):
         return {"lost": sum(counts.values()), **counts, **times}
 
     def __iter__(self) -> Iterator[Block]:
-        given = reported = 0
+        reported = 0
         failure: DeviceError | None = None
         self._synchronise()
         while not self._stopped:
@@ -100,12 +97,8 @@ class LiveSource(Source):
                 failure = error
                 blocks.append(self._pairing.flush())
             for block in filter(None, blocks):
-                left = block.ref.size if self.total is None else min(block.ref.size, self.total - given)
                 before, reported = reported, self.stats()["lost"]
-                yield Block(block.mic[:left], block.ref[:left], block.start, reported - before)
-                given += left
-                if given == self.total:
-                    return
+                yield Block(block.mic, block.ref, block.start, reported - before)
             if failure is not None:
                 raise failure
             if blocks == [None]:
@@ -145,9 +138,10 @@ def _opener(
     return partial(input_port, find(device, "input"), channels=channels)
 
 
-def _incomplete(what: str, counts: dict[str, int]) -> list[str]:
-    """A note about the counters that are not zero, none where all are."""
-    words = ", ".join(f"{count} {name.replace('_', ' ')}" for name, count in counts.items() if count)
+def _incomplete(what: str, stats: dict[str, int]) -> list[str]:
+    """A note about the counters of what went wrong that are not zero, none where all are."""
+    counts = {name: count for name, count in stats.items() if count and name not in ("lost", "written")}
+    words = ", ".join(f"{count} {name.replace('_', ' ')}" for name, count in counts.items())
     return [f"live {what} was not complete: {words}"] if words else []
 
 
@@ -209,5 +203,4 @@ class LiveSink(Sink):
                 self._port.wait_until(0)
         finally:
             self._port.close(drain=exc[0] is None)
-            counts = {name: count for name, count in self.stats().items() if name != "written"}
-            self.notes += _incomplete("output", counts)
+            self.notes += _incomplete("output", self.stats())

@@ -28,7 +28,7 @@ class Source(Protocol):
     """
 
     notes: list[str]
-    total: int | None
+    total: int | None = None
     live: bool = False
     microphones: int = 1
     _stopped: bool = False

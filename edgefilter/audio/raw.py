@@ -59,7 +59,6 @@ class PcmSource(Source):
                 " into it"
             )
         self.notes = []
-        self.total: int | None = None
 
     def __iter__(self) -> Iterator[Block]:
         start, rest = 0, b""

@@ -164,7 +164,9 @@ class SteadySink(Sink):
     def write(self, samples: Samples) -> None:
         """Play samples (n,), or drop them while there is no device."""
         if self._sink is None and clock() - self._tried_at >= RETRY_S:
-            self._open_again()
+            self._tried_at = clock()
+            with suppress(DeviceError):  # still away
+                self._sink = self._make().__enter__()
         if self._sink is None:
             self._own["output_away"] += samples.size
             return
@@ -182,11 +184,6 @@ class SteadySink(Sink):
             return
         self._own["output_back"] += self._is_away
         self._worked, self._is_away = True, False
-
-    def _open_again(self) -> None:
-        self._tried_at = clock()
-        with suppress(DeviceError):  # still away
-            self._sink = self._make().__enter__()
 
     def stats(self) -> dict[str, int]:
         """The sums over all its sinks so far; samples that found no device; how often the device was lost and found again."""

@@ -11,6 +11,7 @@ from edgefilter.audio.pairing import TOLERANCE, WINDOW
 from edgefilter.audio.protocols import Troubles
 from edgefilter.audio.steady import SampleClock, SteadySink
 from edgefilter.cli import main
+from edgefilter.commands.run import limited
 from edgefilter.errors import DeviceError, UsageError
 from edgefilter.filter.ego_filter import EgoFilter
 from edgefilter.session import filter_blocks
@@ -28,12 +29,12 @@ def both(plug):
     return plug(mic, ref), mic, ref
 
 
-def run(source, path, sink=None):
+def run(source, path, sink=None, seconds=None):
     """A whole run into a file, or a device, as `edgefilter run` has it; report, events by kind, and the file's samples."""
     ego, told = EgoFilter(engine="bypass"), {}
     with source, sink or FileSink(path) as out:
         report = filter_blocks(
-            source,
+            limited(source, seconds and seconds * 16000),
             ego,
             out,
             tell=lambda event: told.setdefault(event.kind, []).append(event),
@@ -47,9 +48,9 @@ def test_a_microphone_that_is_unplugged_comes_back_and_the_file_keeps_its_time(b
     system, mic, _ = both
     system.at(4.0, lambda: setattr(mic, "plugged", False))
     system.at(11.0, lambda: setattr(mic, "plugged", True))
-    source = LiveSource("mic", "ref", seconds=20, patience_s=FOREVER)
+    source = LiveSource("mic", "ref", patience_s=FOREVER)
     began = system.now
-    report, told, heard = run(source, tmp_path / "x.wav")
+    report, told, heard = run(source, tmp_path / "x.wav", seconds=20)
     assert report.failure is None and heard.size == report.samples_in == report.samples_out == 20 * 16000
     assert system.now - began == pytest.approx(20, abs=0.6)  # settling, and what a callback and the pairing hold back
     stats = source.stats()
@@ -67,8 +68,8 @@ def test_a_reference_that_stops_is_silence_until_it_runs_again_and_fits_then(bot
     system, _, ref = both
     system.at(4.0, lambda: setattr(ref, "plugged", False))
     system.at(9.0, lambda: setattr(ref, "plugged", True))
-    with LiveSource("mic", "ref", seconds=14, patience_s=FOREVER) as source:
-        blocks = list(source)
+    with LiveSource("mic", "ref", patience_s=FOREVER) as source:
+        blocks = list(limited(source, 14 * 16000))
     heard = np.concatenate([block.ref for block in blocks])
     assert heard.size == 14 * 16000 and np.all(np.concatenate([block.mic for block in blocks]) == 0.25)
     silent, stats = int(np.count_nonzero(heard == 0.0)), source.stats()
@@ -81,8 +82,8 @@ def test_a_reference_that_stutters_stays_in_step_and_every_gap_is_counted(both):
     system, _, ref = both
     for second in range(1, 21, 4):
         system.at(second, lambda: setattr(ref, "swallows", 0.1))
-    with LiveSource("mic", "ref", seconds=26) as source:
-        blocks = list(source)
+    with LiveSource("mic", "ref") as source:
+        blocks = list(limited(source, 26 * 16000))
     stats = source.stats()
     silent = sum(int(np.count_nonzero(block.ref == 0.0)) for block in blocks)
     assert stats["reference_inserted"] + stats["reference_filled"] == silent
@@ -93,8 +94,8 @@ def test_a_reference_that_stutters_stays_in_step_and_every_gap_is_counted(both):
 def test_sound_that_a_driver_loses_without_a_word_is_counted(both):
     system, mic, ref = both
     system.at(6.0, lambda: [setattr(each, "swallows", 0.5) for each in (mic, ref)])
-    with LiveSource("mic", "ref", seconds=14) as source:
-        list(source)
+    with LiveSource("mic", "ref") as source:
+        list(limited(source, 14 * 16000))
     stats = source.stats()
     for name in ("microphone_lost", "reference_lost"):
         assert stats[name] == pytest.approx(0.5 * 16000, abs=2 * STEP)
@@ -103,8 +104,8 @@ def test_sound_that_a_driver_loses_without_a_word_is_counted(both):
 def test_after_a_suspend_the_run_goes_on_and_says_how_long_nothing_was_heard(both, tmp_path):
     system, _, _ = both
     system.at(6.0, lambda: system.pass_by(3600.0))
-    source = LiveSource("mic", "ref", seconds=14, patience_s=FOREVER)
-    report, told, heard = run(source, tmp_path / "x.wav")
+    source = LiveSource("mic", "ref", patience_s=FOREVER)
+    report, told, heard = run(source, tmp_path / "x.wav", seconds=14)
     assert report.failure is None and heard.size == 14 * 16000
     stats = source.stats()
     assert stats["microphone_lost"] == pytest.approx(3600 * 16000, rel=1e-3) and stats["microphone_gone"] == 0
@@ -114,9 +115,9 @@ def test_after_a_suspend_the_run_goes_on_and_says_how_long_nothing_was_heard(bot
 def test_a_filter_that_is_too_slow_loses_what_the_rings_cannot_hold_and_counts_it(both):
     system, _, _ = both
     slow = {10: 3.5}
-    with LiveSource("mic", "ref", seconds=14) as source:
+    with LiveSource("mic", "ref") as source:
         blocks = []
-        for block in source:
+        for block in limited(source, 14 * 16000):
             blocks.append(block)
             for _ in range(round(slow.pop(len(blocks), 0.0) / CALLBACK_S)):
                 system.sleep(CALLBACK_S)  # the filter computes; the devices go on
@@ -131,8 +132,8 @@ def test_a_filter_that_is_too_slow_loses_what_the_rings_cannot_hold_and_counts_i
 def test_devices_whose_clocks_differ_by_300_ppm_stay_together(plug, ppm):
     mic, ref = VirtualDevice("mic", "input"), VirtualDevice("ref", "input", ppm=ppm)
     plug(mic, ref)
-    with LiveSource("mic", "ref", seconds=100) as source:
-        size = sum(block.mic.size for block in source)
+    with LiveSource("mic", "ref") as source:
+        size = sum(block.mic.size for block in limited(source, 100 * 16000))
     stats = source.stats()
     moved = stats["reference_dropped" if ppm > 0 else "reference_inserted"]
     assert size == 100 * 16000 and stats["lost"] == moved
@@ -145,8 +146,8 @@ def test_a_device_of_another_rate_and_number_of_channels_is_converted_and_said(p
         VirtualDevice("ref", "input", 48000.0, takes=(48000, 1)),
         VirtualDevice("speaker", "output", 48000.0, takes=(48000, 2)),
     )
-    source, sink = LiveSource("mic", "ref", seconds=4), LiveSink("speaker", latency=512, wait=False)
-    report, _, _ = run(source, None, sink)
+    source, sink = LiveSource("mic", "ref"), LiveSink("speaker", latency=512, wait=False)
+    report, _, _ = run(source, None, sink, seconds=4)
     assert report.failure is None and report.samples_out == 4 * 16000 and not source.stats()["lost"]
     said = " ".join((*source.notes, *sink.notes))
     for words in ("opened at 44100 Hz", "2 channels averaged", "opened at 48000 Hz", "2 channels get the same"):
@@ -164,9 +165,9 @@ def test_an_output_device_that_is_unplugged_comes_back_and_what_was_not_played_i
     system = plug(mic, speaker)
     system.at(4.0, lambda: setattr(speaker, "plugged", False))
     system.at(12.0, lambda: setattr(speaker, "plugged", True))
-    source = LiveSource("mic", seconds=20, patience_s=FOREVER)
+    source = LiveSource("mic", patience_s=FOREVER)
     sink = SteadySink(lambda: LiveSink("speaker", latency=512, wait=False))
-    report, told, _ = run(source, None, sink)
+    report, told, _ = run(source, None, sink, seconds=20)
     stats = sink.stats()
     assert report.failure is None and (stats["output_gone"], stats["output_back"]) == (1, 1)
     assert [len(told[kind]) for kind in ("device_gone", "device_back")] == [1, 1]
@@ -208,9 +209,9 @@ def test_late_sound_is_not_lost_and_drift_is_no_loss():
 
 def test_the_channels_of_a_device_that_are_named_are_taken_and_one_of_them_is_the_reference(plug):
     plug(VirtualDevice("array", "input", rate=48000.0, takes=(48000, 6), channels=6))
-    source = LiveSource("array", seconds=1, channels=[1, 2, 4], reference_channel=5)
+    source = LiveSource("array", channels=[1, 2, 4], reference_channel=5)
     with source:
-        blocks = list(source)
+        blocks = list(limited(source, 16000))
     mic, ref = (np.concatenate([getattr(block, name) for block in blocks]) for name in ("mic", "ref"))
     assert source.microphones == 3 and mic.shape == (16000, 3) and ref.shape == (16000,)
     assert mic[8000:] == pytest.approx(np.tile([0.2, 0.3, 0.5], (8000, 1)), abs=1e-3)
@@ -223,9 +224,9 @@ def test_an_array_that_is_unplugged_comes_back_with_all_its_microphones(plug):
     system = plug(array, ref)
     system.at(3.0, lambda: setattr(array, "plugged", False))
     system.at(8.0, lambda: setattr(array, "plugged", True))
-    source = LiveSource("array", "ref", seconds=15, patience_s=FOREVER, channels=[0, 3])
+    source = LiveSource("array", "ref", patience_s=FOREVER, channels=[0, 3])
     with source:
-        mic = np.concatenate([block.mic for block in source])
+        mic = np.concatenate([block.mic for block in limited(source, 15 * 16000)])
     assert mic.shape == (15 * 16000, 2) and mic[-1] == pytest.approx([0.1, 0.4])
     silent = np.count_nonzero(mic[:, 0] == 0.0)
     assert silent > 4 * 16000 and source.stats()["microphone_away"] == pytest.approx(silent, abs=STEP)
@@ -239,9 +240,9 @@ def test_a_channel_that_a_device_lacks_is_one_line(plug):
 
 def test_all_channels_of_a_device_are_opened_where_that_is_asked(plug):
     plug(VirtualDevice("array", "input", channels=4), VirtualDevice("mixer", "input", channels=32))
-    source = LiveSource("array", seconds=1, channels=ALL_CHANNELS)
+    source = LiveSource("array", channels=ALL_CHANNELS)
     with source:
-        heard = np.concatenate([block.mic for block in source])
+        heard = np.concatenate([block.mic for block in limited(source, 16000)])
     assert source.microphones == 4 and any("channels 0, 1, 2, 3 of 4" in note for note in source.notes)
     np.testing.assert_allclose(heard[-1], [0.1, 0.2, 0.3, 0.4], atol=1e-6)
     with pytest.raises(UsageError, match="'mixer' has 32 channels, expected at most 8 microphones: name them"):

@@ -17,6 +17,7 @@ import soundfile
 from edgefilter.audio.device import list_devices, monitor_of
 from edgefilter.audio.live import LiveSink, LiveSource
 from edgefilter.audio.measure import play_and_record
+from edgefilter.commands.run import limited
 from edgefilter.errors import EdgefilterError
 
 folder = Path(sys.argv[2])
@@ -39,8 +40,8 @@ def receive():
             subprocess.Popen(["paplay", "-d", sink, str(folder / f"{sink}.wav")]) for sink in ("robot", "robot_mic")
         )
 
-    with LiveSource("robot_mic_monitor", monitor_of("robot"), seconds=6) as source:
-        mic, ref, blocks = collect(source, play)
+    with LiveSource("robot_mic_monitor", monitor_of("robot")) as source:
+        mic, ref, blocks = collect(limited(source, 6 * 16000), play)
     for player in players:
         player.wait()
     np.savez(folder / "received.npz", mic=mic, ref=ref)
@@ -64,9 +65,9 @@ def vanish():
 def sink():
     sound, _ = soundfile.read(folder / "robot.wav", dtype="float32")
     heard = []
-    source = LiveSource("robot_mic_monitor", seconds=6)
+    source = LiveSource("robot_mic_monitor")
     with source:
-        reader = threading.Thread(target=lambda: heard.extend(collect(source)[:1]))
+        reader = threading.Thread(target=lambda: heard.extend(collect(limited(source, 6 * 16000))[:1]))
         reader.start()
         with LiveSink("robot_mic", latency=512) as output:
             for start in range(0, sound.size, 256):
