@@ -43,7 +43,7 @@ class LiveSource(Source):
         opened = self._mic.port.wanted
         self.microphones = 1 if opened is None else len(opened) - self._both
         self._reference = None if reference is None else SteadyInput(_opener(reference), patience_s)
-        self._pairing = Pairing(late_is_lost=not isinstance(reference, SpokenReference))
+        self._pairing = Pairing(not isinstance(reference, SpokenReference), self.microphones)
         self.notes = [f"microphone: {self._mic.port.device}", *self._mic.port.notes]
         there = self._mic.port.device.inputs
         if opened is None and 1 < there <= MOST_MICROPHONES:

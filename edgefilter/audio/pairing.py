@@ -30,7 +30,6 @@ class Inlet:
 
     def __init__(self, capacity: int, channels: int | None = None) -> None:
         self._ring = Ring(capacity, channels)
-        self._shape = () if channels is None else (channels,)
         self._gaps: deque[tuple[int, int]] = deque()
         self._stored = 0
         self._read = 0
@@ -59,7 +58,8 @@ class Inlet:
         parts = []
         while self._gaps and self._gaps[0][0] <= upto:
             at, missing = self._gaps.popleft()
-            parts += [self._ring.read(at - self._read), np.zeros((missing, *self._shape), np.float32)]
+            there = self._ring.read(at - self._read)
+            parts += [there, np.zeros((missing, *there.shape[1:]), np.float32)]
             self._read = at
         parts.append(self._ring.read(upto - self._read))
         self._read = upto
@@ -76,9 +76,9 @@ class Pairing:
     after a stall it is not late but played later, so that nothing of it is discarded.
     """
 
-    def __init__(self, late_is_lost: bool = True) -> None:
+    def __init__(self, late_is_lost: bool = True, microphones: int = 1) -> None:
         self._late_is_lost = late_is_lost
-        self._mic: Samples | None = None
+        self._mic = np.zeros(0 if microphones == 1 else (0, microphones), np.float32)
         self._ref = np.zeros(0, np.float32)
         self._debt = 0
         self._next = 0
@@ -94,7 +94,7 @@ class Pairing:
         late = min(self._debt, ref.size)
         self._debt -= late
         self.filled -= min(late, silence)
-        self._mic = mic if self._mic is None else np.concatenate((self._mic, mic))
+        self._mic = np.concatenate((self._mic, mic))
         self._ref = np.concatenate((self._ref, ref[late:]))
         lost = self.filled + self.dropped + self.inserted
         self._watch(len(mic))
@@ -106,10 +106,9 @@ class Pairing:
 
     def flush(self) -> Block | None:
         """The microphone samples still waiting; silence stands in for their reference."""
-        waiting = 0 if self._mic is None else len(self._mic)
-        missing = self._extend(max(0, waiting - self._ref.size))
+        missing = self._extend(max(0, len(self._mic) - self._ref.size))
         self.filled += missing
-        return self._emit(waiting, missing)
+        return self._emit(len(self._mic), missing)
 
     def _extend(self, count: int) -> int:
         """Put so much silence behind the reference."""
@@ -117,7 +116,7 @@ class Pairing:
         return count
 
     def _emit(self, count: int, lost: int) -> Block | None:
-        if count == 0 or self._mic is None:
+        if count == 0:
             return None
         block = Block(self._mic[:count], self._ref[:count], self._next, lost)
         self._mic, self._ref = self._mic[count:], self._ref[count:]
@@ -126,7 +125,7 @@ class Pairing:
 
     def _watch(self, arrived: int) -> None:
         """Follow the smallest difference of the counters (reference ahead: positive), and act on one that lasts."""
-        skew = self._ref.size - (0 if self._mic is None else len(self._mic)) - self._debt
+        skew = self._ref.size - len(self._mic) - self._debt
         before = self._smallest
         if before is None or abs(skew) < abs(before) or (skew > 0) != (before > 0):
             self._smallest = skew if before is None or (skew > 0) == (before > 0) else 0

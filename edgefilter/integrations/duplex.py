@@ -66,7 +66,7 @@ class Duplex:
     Attributes
     ----------
     heard : int
-        Samples of the microphone so far, at 16 kHz: what the samples of events and turns are counted by.
+        Samples of the microphone so far, at 16 kHz, by which events and turns are counted.
     listeners : list of callable
         Called with each `Event` beside on_event, in the thread of `hear`.
     enabled : bool

@@ -33,18 +33,9 @@ class EgoProcessor(rtc.FrameProcessor[rtc.AudioFrame]):
 
     Frames come out as long as they went in: while the filter has too few samples for a frame, silence is put in front.
 
-    Parameters
-    ----------
-    ego, mic_channels, reference_channel : optional
-        As of `edgefilter.integrations.duplex.Duplex`, channels of the frames; a tap is not needed with a
-        reference_channel.
-    on_event : callable, optional
-        Called with each `edgefilter.Event`, in the event loop: `session.interrupt()` may be called there.
-
-    Attributes
-    ----------
-    duplex : Duplex
-        Shared by the processor and its tap: `duplex.stats()`, `duplex.ego`.
+    ego, mic_channels, reference_channel: as of `edgefilter.integrations.duplex.Duplex`, channels of the frames; with a
+    reference_channel no tap is needed. on_event: called with each `edgefilter.Event`, in the event loop:
+    `session.interrupt()` may be called there. duplex: shared by the processor and its tap: `duplex.stats()`, `duplex.ego`.
     """
 
     def __init__(

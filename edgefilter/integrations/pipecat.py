@@ -38,22 +38,11 @@ class EgoFilters:
     Two Pipecat filters share one EgoFilter: the one of the loudspeaker takes what is written to it as the reference and
     changes nothing, the one of the microphone filters.
 
-    Parameters
-    ----------
-    ego, mic_channels, reference_channel : optional
-        As of `edgefilter.integrations.duplex.Duplex`, channels of the in_channels.
-    in_channels, out_channels : int
-        Channels of the transport's microphone and loudspeaker, of which Pipecat tells a filter nothing: `params` tells
-        the transport.
-    on_event : callable, optional
-        Called with each `edgefilter.Event`, in a thread of the event loop's executor.
-
-    Attributes
-    ----------
-    params : dict
-        For `TransportParams(**params)`: filter and channels of the microphone and of the loudspeaker.
-    duplex : Duplex
-        Shared by both filters: `duplex.stats()`, `duplex.ego`.
+    ego, mic_channels, reference_channel: as of `edgefilter.integrations.duplex.Duplex`, channels of the in_channels.
+    in_channels, out_channels: of the transport's microphone and loudspeaker, of which Pipecat tells a filter nothing.
+    on_event: called with each `edgefilter.Event`, in a thread of the event loop's executor. params: for
+    `TransportParams(**params)`, filter and channels of the microphone and of the loudspeaker. duplex: shared by both
+    filters: `duplex.stats()`, `duplex.ego`.
     """
 
     def __init__(

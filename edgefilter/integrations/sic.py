@@ -49,16 +49,8 @@ _default = _options([])
 class HumanConf(SICConfMessage):
     """What `Human(conf=...)` may say; what it leaves out is as the component's command line says.
 
-    Parameters
-    ----------
-    profile : str, optional
-        File of the calibrated robot, where the component runs.
-    engine : str, optional
-        As of `EgoFilter`.
-    channels : int, optional
-        Of the microphone's sound, interleaved: a message does not tell how many it has.
-    mic_channels : sequence of int, optional
-        As of `Duplex`.
+    profile: file of the calibrated robot, where the component runs. engine: as of `EgoFilter`. channels: of the
+    microphone's sound, interleaved, of which a message does not tell how many it has. mic_channels: as of `Duplex`.
     """
 
     def __init__(

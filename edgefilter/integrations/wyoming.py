@@ -65,24 +65,14 @@ _LOGGER = logging.getLogger(__name__)
 class EgoService:
     """Two Wyoming services over one filter: a microphone for many listeners, and a loudspeaker.
 
-    Parameters
-    ----------
-    microphone, loudspeaker : str
-        Source and destination of the sound: a command that writes or reads raw 16-bit samples, or the URI of another
-        Wyoming service (`tcp://...`, `unix://...`).
-    ego, mic_channels, reference_channel : optional
-        As of `edgefilter.integrations.duplex.Duplex`, channels of the microphone.
-    mic_format, snd_format : AudioFormat
-        What the commands write and read, of width 2.
-    recogniser : str, optional
-        URI of a Wyoming service that makes text of speech. A third service stands before it then: whoever has the
-        microphone's sound recognised there, as Home Assistant does, gets the words of the human's finished turn.
-    stop_for_speech : bool
-        Whether the loudspeaker is silenced when the human begins to speak; the protocol has no message by which a
-        satellite could do it.
+    microphone, loudspeaker: source and destination of the sound, a command that writes or reads raw 16-bit samples, or
+    the URI of another Wyoming service (`tcp://...`, `unix://...`). ego, mic_channels, reference_channel: as of
+    `edgefilter.integrations.duplex.Duplex`, channels of the microphone. mic_format, snd_format: of the commands' sound,
+    of width 2. stop_for_speech: whether the loudspeaker is silenced when the human begins to speak; the protocol has no
+    message by which a satellite could do it. recogniser: URI of a Wyoming service that makes text of speech. A third
+    service stands before it then: whoever has the microphone's sound recognised there, as Home Assistant does, gets the
+    words of the human's finished turn.
 
-    Notes
-    -----
     The microphone is filtered whether somebody listens or not, so that the filter knows the room. Listeners also get
     `voice-started` and `voice-stopped` of the human. A client that disconnects from the loudspeaker before its
     `audio-stop` interrupts: speech that is not played yet is dropped. A client that sends a message that cannot be read
@@ -280,20 +270,17 @@ class _Speaker(_Client):
             self._speaking = False
             self._said.put_nowait(AudioStop())
         elif AudioChunk.is_type(event.type):
-            await self._take(_chunk_of(event))
+            chunk = _chunk_of(event)
+            while self._waiting_bytes > MOST_BYTES:  # meanwhile the connection is read no further
+                await asyncio.sleep(AHEAD_S)
+            if not self._ignored:
+                self._speaking = True
+                self._waiting_bytes += len(chunk.audio)
+                self._said.put_nowait(chunk)
         elif Describe.is_type(event.type):
             form = self._service.player.form
             await self.write_event(Info(snd=[SndProgram(name="edgefilter", snd_format=form, **ABOUT)]).event())
         return True
-
-    async def _take(self, chunk: AudioChunk) -> None:
-        """Let speech wait for its turn; while too much waits, the connection is read no further."""
-        while self._waiting_bytes > MOST_BYTES:
-            await asyncio.sleep(AHEAD_S)
-        if not self._ignored:
-            self._speaking = True
-            self._waiting_bytes += len(chunk.audio)
-            self._said.put_nowait(chunk)
 
     async def _speak(self) -> None:
         try:
@@ -381,7 +368,12 @@ class Player:
     async def write(self, chunk: AudioChunk) -> None:
         """Play a 16-bit chunk after what was written before; raises OSError where there is nothing to play it."""
         if "://" in self.where:
-            await self._write_to_service(chunk)
+            if self._client is None:
+                client = AsyncClient.from_uri(self.where)
+                await client.connect()
+                self._client = client
+                await client.write_event(AudioStart(chunk.rate, chunk.width, chunk.channels).event())
+            await self._client.write_event(chunk.event())
             return
         if self._process is None or self._process.returncode is not None:
             words = shlex.split(self.where)
@@ -392,14 +384,6 @@ class Player:
             chunk = AudioChunk(chunk.rate, 2, self.form.channels, pcm)
         self._process.stdin.write(self._convert.convert(chunk).audio)
         await self._process.stdin.drain()
-
-    async def _write_to_service(self, chunk: AudioChunk) -> None:
-        if self._client is None:
-            client = AsyncClient.from_uri(self.where)
-            await client.connect()
-            self._client = client
-            await client.write_event(AudioStart(chunk.rate, chunk.width, chunk.channels).event())
-        await self._client.write_event(chunk.event())
 
     async def end(self) -> None:
         """End the utterance: what was written is still played."""
@@ -423,14 +407,10 @@ class Player:
 
 def _chunk_of(message: Message) -> AudioChunk:
     """The sound in a message, at 16 bits; raises SignalError where the message does not say what it is or is cut."""
-    rate, width, channels = (message.data.get(key) for key in ("rate", "width", "channels"))
+    rate, width, channels = (cast(int, message.data.get(key)) for key in ("rate", "width", "channels"))
     size = len(message.payload or b"")
-    if (
-        rate not in RATES
-        or width not in (1, 2, 3, 4)
-        or channels not in range(1, size + 2)
-        or size % (width * channels)
-    ):
+    whole = rate in RATES and width in (1, 2, 3, 4) and channels in range(1, size + 2)
+    if not whole or size % (width * channels):
         raise SignalError(
             f"found a chunk of {size} bytes with rate {rate}, width {width} and channels {channels}, expected whole"
             f" samples with a rate of {RATES.start} to {RATES.stop - 1} Hz and a width of 1 to 4 bytes"
