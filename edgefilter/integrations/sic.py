@@ -15,6 +15,7 @@ import argparse
 import importlib
 import sys
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import redis
@@ -46,6 +47,7 @@ def _options(words: list[str] | None = None) -> dict[str, Any]:
 _default = _options([])
 
 
+@dataclass(eq=False, repr=False)
 class HumanConf(SICConfMessage):
     """What `Human(conf=...)` may say; what it leaves out is as the component's command line says.
 
@@ -53,14 +55,10 @@ class HumanConf(SICConfMessage):
     microphone's sound, interleaved, of which a message does not tell how many it has. mic_channels: as of `Duplex`.
     """
 
-    def __init__(
-        self,
-        profile: str | None = None,
-        engine: str | None = None,
-        channels: int | None = None,
-        mic_channels: Sequence[int] | None = None,
-    ) -> None:
-        self.profile, self.engine, self.channels, self.mic_channels = profile, engine, channels, mic_channels
+    profile: str | None = None
+    engine: str | None = None
+    channels: int | None = None
+    mic_channels: Sequence[int] | None = None
 
 
 def _ears(
