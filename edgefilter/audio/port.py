@@ -18,7 +18,7 @@ import numpy as np
 
 from edgefilter.audio.pairing import BUFFER_S, Inlet, Outlet
 from edgefilter.audio.pulse import OPENING, Device, leading_to
-from edgefilter.audio.reader import delivered
+from edgefilter.audio.raw import delivered
 from edgefilter.dsp.resample import Resampler
 from edgefilter.dsp.ring import Ring
 from edgefilter.errors import DeviceError, UsageError

@@ -1,4 +1,4 @@
-"""Sixteen-bit PCM: the conversion, and raw sound through pipes (standard input and output)."""
+"""Sixteen-bit PCM and its channels: the conversion, and raw sound through pipes (standard input and output)."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import io
 import os
 import select
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import BinaryIO
 
 import numpy as np
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from edgefilter.audio.protocols import Sink, Source
 from edgefilter.errors import AudioFileError, SignalError, UsageError
-from edgefilter.types import SAMPLE_RATE, Block, Samples, as_samples
+from edgefilter.types import SAMPLE_RATE, Array, Block, Samples, as_samples
 
 FULL_SCALE = -float(np.iinfo(np.int16).min)
 _HEADERS = (b"RIFF", b"fLaC", b"OggS")
@@ -36,6 +36,13 @@ def of_pcm16(pcm: bytes | memoryview, channels: int) -> Samples:
     if len(pcm) % (2 * channels):
         raise SignalError(f"found {len(pcm)} bytes, expected whole 16-bit samples of {channels} channels")
     return np.frombuffer(pcm, "<i2").reshape(-1, channels).astype(np.float32) / np.float32(FULL_SCALE)
+
+
+def delivered(data: Array, wanted: Sequence[int] | None) -> Samples:
+    """Of data (n, channels) the wanted channels (n, wanted), (n,) where it is one, or the mean of all (n,) where it is None."""
+    if wanted is None:
+        return data[:, 0] if data.shape[1] == 1 else data.mean(axis=1, dtype=np.float32)
+    return data[:, wanted[0]] if len(wanted) == 1 else data[:, wanted]
 
 
 def clip_note(clipped: int, written: int) -> str:

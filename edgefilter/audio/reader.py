@@ -12,6 +12,7 @@ import numpy as np
 import soundfile
 import soxr
 
+from edgefilter.audio.raw import delivered
 from edgefilter.errors import AudioFileError
 from edgefilter.types import LOUDEST, SAMPLE_RATE, Array, Samples, which_channels
 
@@ -19,13 +20,6 @@ RATES = range(1000, 768001)
 """Hz that converters have; a header that says another is damaged."""
 _ENDLESS = 0x7FFFF000
 """Writers to a pipe put sizes from here up into a WAV's header because they cannot know better."""
-
-
-def delivered(data: Array, wanted: Sequence[int] | None) -> Samples:
-    """Of data (n, channels) the wanted channels (n, wanted), (n,) where it is one, or the mean of all (n,) where it is None."""
-    if wanted is None:
-        return data[:, 0] if data.shape[1] == 1 else data.mean(axis=1, dtype=np.float32)
-    return data[:, wanted[0]] if len(wanted) == 1 else data[:, wanted]
 
 
 class Reader:

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from edgefilter.audio.reader import delivered
+from edgefilter.audio.raw import delivered
 from edgefilter.errors import SignalError, UsageError
 from edgefilter.types import MOST_MICROPHONES, Samples
 

@@ -16,8 +16,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from edgefilter.audio.raw import of_pcm16, to_pcm16
-from edgefilter.audio.reader import delivered
+from edgefilter.audio.raw import delivered, of_pcm16, to_pcm16
 from edgefilter.dsp.resample import Resampler
 from edgefilter.errors import UsageError
 from edgefilter.filter.barge_in import BargeInSettings
