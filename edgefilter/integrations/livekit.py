@@ -89,7 +89,13 @@ class _Tap(io.AudioOutput):
     def __init__(self, duplex: Duplex, output: io.AudioOutput) -> None:
         able = io.AudioOutputCapabilities(pause=True)
         super().__init__(label="edgefilter", capabilities=able, next_in_chain=output, sample_rate=output.sample_rate)
-        self._duplex, self._next = duplex, output
+        self._duplex = duplex
+
+    @property
+    def _next(self) -> io.AudioOutput:
+        """What the framework puts between: it may wrap the output that it was given."""
+        assert self.next_in_chain is not None
+        return self.next_in_chain
 
     async def capture_frame(self, frame: rtc.AudioFrame) -> None:
         """Hand on first: a room waits here until somebody listens."""
