@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, replace
 from typing import Any
 
@@ -37,18 +37,16 @@ def _of_portaudio() -> list[Device]:
     return found
 
 
-def _of_server(found: list[Device]) -> Iterator[Device]:
-    """The sound server's inputs and outputs, each behind the device of PortAudio's that leads to the server."""
+def _devices() -> list[Device]:
+    """PortAudio's, and the sound server's inputs and outputs, each behind the one that leads to the server."""
+    found = _of_portaudio()
+    served = []
     for kind in ("input", "output"):
         ways = [device for name in STAND_INS for device in found if device.name == name and device.channels(kind)]
         for name in pulse.names(kind) if ways else ():
             inputs, outputs = (ways[0].inputs, 0) if kind == "input" else (0, ways[0].outputs)
-            yield replace(ways[0], name=name, pulse_name=name, inputs=inputs, outputs=outputs)
-
-
-def _devices() -> list[Device]:
-    found = _of_portaudio()
-    return [*found, *_of_server(found)]
+            served.append(replace(ways[0], name=name, pulse_name=name, inputs=inputs, outputs=outputs))
+    return found + served
 
 
 def list_devices() -> list[dict[str, Any]]:
