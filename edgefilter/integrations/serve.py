@@ -53,9 +53,9 @@ class Session:
             self._encode = Encoder(form.bitrate).push
             codec_s = FRAME_MS / 1000
         else:
-            self._encode = self._as_pcm
-            self._from_filter = Resampler(SAMPLE_RATE, rate)
-            codec_s = self._from_filter.delay_s
+            from_filter = Resampler(SAMPLE_RATE, rate)
+            self._encode = lambda human, last: [as_pcm16(from_filter.push(human, last))]
+            codec_s = from_filter.delay_s
         late = round(form.late_ms * rate / 1000)
         self._two = TwoStreams(*decoders, rate, late) if form.streams == "two" else None
         self.delay_ms = 1000 * (ego.latency / SAMPLE_RATE + self._to_filter[0].delay_s + codec_s)
@@ -108,9 +108,6 @@ class Session:
             events.append(Event("rate_mismatch", self.ego.stats()["samples"], wrong))
         answers: list[Answer] = [part for part in self._encode(human, last) if part]
         return answers + [self._told(event) for event in [*events, *self._troubles()]]
-
-    def _as_pcm(self, human: Samples, last: bool) -> list[bytes]:
-        return [as_pcm16(self._from_filter.push(human, last))]
 
     def _counts(self) -> dict[str, int]:
         return {"lost": self._two.lost, "late": self._two.late} if self._two else {"lost": 0, "late": 0}

@@ -30,8 +30,8 @@ class Form:
 
     rate: Hz, of the samples and of the counters. streams: "stereo", microphone and reference interleaved, or "two",
     each message of one stream, with a HEADER. microphones: of an array, interleaved, in "stereo" before the reference.
-    codec: "pcm", 16 bit, or "opus", mono. late_ms: how long the microphone waits for a late reference. learn: whether to
-    learn the room. bitrate: bits a second of the answer in Opus.
+    codec: "pcm", 16 bit, or "opus", mono, at a rate of 48000 and in two streams. late_ms: how long the microphone waits
+    for a late reference. learn: whether to learn the room. bitrate: bits a second of the answer in Opus.
     """
 
     rate: int = SAMPLE_RATE
@@ -64,10 +64,9 @@ class Form:
             if allowed is None:
                 raise SignalError(f"the first message has '{name}', expected {', '.join(bounds)}")
             if isinstance(value, float) or value not in allowed or isinstance(value, bool) != (name == "learn"):
-                words = (
-                    (allowed[0], "to", allowed[-1]) if isinstance(allowed, range) else (allowed[0], "or", allowed[1])
-                )
-                raise SignalError(f"the first message has {name} {value!r}, expected {' '.join(map(str, words))}")
+                between = "to" if isinstance(allowed, range) else "or"
+                expected = f"{allowed[0]} {between} {allowed[-1]}"
+                raise SignalError(f"the first message has {name} {value!r}, expected {expected}")
         form = cls(**given)
         if form.codec == "opus" and (form.streams != "two" or form.rate != 48000 or form.microphones > 1):
             raise SignalError(
