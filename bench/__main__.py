@@ -28,10 +28,8 @@ SCENARIOS = tuple(line.split()[0] for line in str(__doc__).splitlines()[2:] if l
 
 
 def common(parser: argparse.ArgumentParser) -> None:
-    """Options that every scenario has."""
     group = parser.add_argument_group("of every scenario")
     group.add_argument("--output", type=Path, metavar="PATH", help="write PATH.json, PATH.md and its pictures")
-    group.add_argument("--html", action="store_true", help="write PATH.html as well")
     group.add_argument("--every", type=int, default=1, metavar="N", help="take every N-th recording of each set")
     group.add_argument("--limit", type=int, metavar="N", help="take at most N recordings of each set")
     group.add_argument("--seed", type=int, default=1, metavar="N", help="of everything that is drawn (default: 1)")
@@ -51,10 +49,8 @@ def main(arguments: list[str] | None = None) -> int:
     name, *rest = arguments
     try:
         scenario = importlib.import_module(f"bench.{name}")
-        shape = argparse.RawDescriptionHelpFormatter
-        parser = argparse.ArgumentParser(
-            prog=f"python -m bench {name}", description=scenario.__doc__, formatter_class=shape
-        )
+        parser = argparse.ArgumentParser(f"python -m bench {name}", description=scenario.__doc__)
+        parser.formatter_class = argparse.RawDescriptionHelpFormatter
         common(parser)
         scenario.add_arguments(parser)
         print(scenario.run(parser.parse_args(rest)))

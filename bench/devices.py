@@ -21,7 +21,7 @@ from pathlib import Path
 import numpy as np
 
 from bench import recordings, results, runner, systems
-from bench.evaluate import names, numbers, slim
+from bench.evaluate import names, numbers, of, slim
 from bench.metrics import difference, mean
 from bench.recordings import Cells, Clip, Recording
 from bench.systems import System
@@ -41,19 +41,16 @@ filter was made; the others stand apart. Peers get microphone and reference as t
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("recordings", type=Path, metavar="RECORDINGS")
-    parser.add_argument("--speech", type=Path, required=True, metavar="DIR", help="humans, with a transcripts.tsv")
-    parser.add_argument("--systems", type=names, default=list(DEFAULT), metavar="A,B,...", help="default: %(default)s")
-    parser.add_argument(
-        "--tuned-on", type=names, default=names(TUNED_ON), metavar="PATTERN,...", help="default: %(default)s"
-    )
-    parser.add_argument("--humans", type=int, default=2, metavar="N", help="on each device of one recording")
-    parser.add_argument("--ser", type=numbers, default=(-14.0, -6.0), metavar="LOW,HIGH", help="human against echo, dB")
-    parser.add_argument("--before", type=numbers, default=(5.0, 12.0), metavar="LOW,HIGH", help="robot alone before, s")
-    parser.add_argument(
-        "--levels", type=numbers, default=Cells.sers, metavar="DB,...", help="on a device of many recordings"
-    )
-    parser.add_argument("--cases", type=int, default=8, metavar="N", help="humans at each of the levels")
+    add = parser.add_argument
+    add("recordings", type=Path, metavar="RECORDINGS")
+    add("--speech", type=Path, required=True, metavar="DIR", help="humans, with a transcripts.tsv")
+    add("--systems", type=names, default=list(DEFAULT), metavar="A,B,...", help="default: %(default)s")
+    add("--tuned-on", type=names, default=names(TUNED_ON), metavar="A,B,...", help="default: %(default)s")
+    add("--humans", type=int, default=2, metavar="N", help="on each device of one recording")
+    add("--ser", type=numbers, default=(-14.0, -6.0), metavar="LOW,HIGH", help="human against echo, dB")
+    add("--before", type=numbers, default=(5.0, 12.0), metavar="LOW,HIGH", help="robot alone before, s")
+    add("--levels", type=numbers, default=Cells.sers, metavar="DB,...", help="on devices of many recordings")
+    add("--cases", type=int, default=8, metavar="N", help="humans at each of the levels")
 
 
 def run(options: argparse.Namespace) -> str:
@@ -64,18 +61,13 @@ def run(options: argparse.Namespace) -> str:
     setup = runner.Setup(options.cache, options.whisper)
     rows = runner.run(clips, here, setup, options.jobs, options.scheduler)
     tuned_on = {clip.room for clip in clips if any(fnmatch(clip.room, one) for one in options.tuned_on)}
-    kept = [row for row in rows if row["room"] not in tuned_on]
-    tuned = [row for row in rows if row["room"] in tuned_on]
-    tables = [
-        overview("headline", "Devices kept apart", kept, here),
-        overview("tuned-on", "Devices tuned on", tuned, here),
-    ]
-    for key, digits, title, part in (
-        ("si_sdr", 1, "SI-SDR of the human laid on, dB", "laid"),
-        ("capped", 0, "Words wrong, %", "laid"),
-        ("erle_db", 1, "The robot alone, lowered by dB", "alone"),
-    ):
-        tables.append(by_device(key, title, [row for row in rows if row["set"] == part], here, digits, tuned_on))
+    kept, tuned = ([row for row in rows if (row["room"] in tuned_on) == told] for told in (False, True))
+    parts = (("headline", "Devices kept apart", kept), ("tuned-on", "Devices tuned on", tuned))
+    tables = [overview(*part, here) for part in parts]
+    laid, alone = ([row for row in rows if row["set"] == part] for part in ("laid", "alone"))
+    tables += [by_device("si_sdr", "SI-SDR of the human laid on, dB", laid, here, 1, tuned_on),
+               by_device("capped", "Words wrong, %", laid, here, 0, tuned_on),
+               by_device("erle_db", "The robot alone, lowered by dB", alone, here, 1, tuned_on)]  # fmt: skip
     tables += [against_peers(rows, here, tuned_on), barge_in(rows, here, tuned_on), as_recorded(rows, here)]
     tables.append(results.absent(absent))
     return results.write(options.output, "devices", "Real devices", made_with, [one for one in tables if one["rows"]],
@@ -102,10 +94,6 @@ def find_clips(options: argparse.Namespace) -> list[Clip]:
         sets["pairs"] = (recordings.recorded_clip(one) for one in own if one.kind != "farend")
         clips += [replace(clip, set=part, room=device) for part, some in sets.items() for clip in some]
     return clips
-
-
-def of(rows: Sequence[dict], system: str, part: str = "") -> list[dict]:
-    return [row for row in rows if row["system"] == system and part in ("", row["set"])]
 
 
 def per_device(rows: Sequence[dict], key: str) -> list[dict]:
@@ -207,17 +195,14 @@ def barge_in(rows: Sequence[dict], here: Sequence[System], tuned_on: set[str]) -
 def as_recorded(rows: Sequence[dict], here: Sequence[System]) -> dict:
     """Pairs, and robots alone of one recording: AECMOS for echo and human; SI-SDR against the microphone for a human alone."""
     pairs = [row for row in rows if row["set"] in ("pairs", "alone") and row.get("echo_mos") is not None]
-    here = [one for one in here if one.attainable]
+    here = [one for one in here if one.kind != "bound" and not one.name.endswith(systems.TRUE_LAG)]
     cells = []
     for clip in dict.fromkeys(row["clip"] for row in pairs):
         own = {row["system"]: row for row in pairs if row["clip"] == clip}
         texts = []
-        for one in here:
-            row = own.get(one.name, {})
-            figures = [results.cell(row.get("echo_mos"), 2), results.cell(row.get("human_mos"), 2)]
-            texts.append(
-                " / ".join(figures) + (f"; {results.cell(row['si_sdr_mic'], 1)} dB" if row.get("si_sdr_mic") else "")
-            )
+        for row in (own.get(one.name, {}) for one in here):
+            text = " / ".join(results.cell(row.get(key), 2) for key in ("echo_mos", "human_mos"))
+            texts.append(text + (f"; {row['si_sdr_mic']:.1f} dB" if row.get("si_sdr_mic") else ""))
         device = next(row["room"] for row in pairs if row["clip"] == clip)
         cells.append([device[:8] + clip.partition(device)[2], *texts])
     title = "As recorded: AECMOS echo / human; where the human is alone, SI-SDR against the microphone"

@@ -11,40 +11,24 @@ itself. The same seed gives the same figures, computing times excepted.
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from fnmatch import fnmatch
 from pathlib import Path
 
 import numpy as np
+from scipy.stats import rankdata
 
 from bench import metrics, recordings, results, runner, systems
-from bench.facts import QUANTITIES
-from bench.metrics import difference, mean, pooled
+from bench.metrics import QUANTITIES, difference, mean, middle, pooled
 from bench.recordings import Cells, Clip
 from bench.systems import System
-from edgefilter.errors import EdgefilterError, UsageError
-from edgefilter.types import SAMPLE_RATE
+from edgefilter.errors import UsageError
 
-HEADLINE = (
-    "unfiltered",
-    "speexdsp-suppressed",
-    "linear-uncalibrated",
-    "crnn-uncalibrated-learning",
-    "crnn",
-    "crnn-learning",
-)
+HEADLINE = ("unfiltered", "speexdsp-suppressed", "linear-uncalibrated", "crnn-uncalibrated-learning", "crnn",
+            "crnn-learning")  # fmt: skip
 """Rows of the table that README.md quotes."""
-CUT = (
-    "unfiltered",
-    "paper-ss",
-    "linear",
-    "ss",
-    "crnn",
-    "crnn-learning",
-    "crnn-uncalibrated",
-    "speexdsp-suppressed",
-    "aec3",
-)
+CUT = ("unfiltered", "paper-ss", "linear", "ss", "crnn", "crnn-learning", "crnn-uncalibrated", "speexdsp-suppressed",
+       "aec3")  # fmt: skip
 """Rows that the slices show, where they ran."""
 PARTS = 3
 """A quantity is cut into so many slices of about as many clips each."""
@@ -53,9 +37,7 @@ FEW = 8
 NORMED = {systems.BATCH_NORM: "paper-crnn-narrow", "crnn:batch-norm": "crnn"}
 """Networks with batch normalisation, and the row that each is compared with."""
 WORST = 10
-"""Clips that the page names, and lets hear with --html."""
-LEAD_S = 2.0
-"""Robot alone before the human in what the page lets hear."""
+"""Clips that the page names."""
 NOTES = """Mean [95 % interval], drawn over speakers and rooms, not over utterances. WER: word errors over the span in which
 the human speaks, an utterance counted as at most 100 %; 'uncapped' and 'median' are of the utterances' own rates, 'pooled' is
 over all words, 'put in' and 'left out' are words over all words. ERLE: the last seconds of robot alone before the human.
@@ -65,16 +47,17 @@ differences on the same clips: below 0 is better in words, above 0 in dB."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("folders", type=Path, nargs="+", metavar="FOLDER")
-    parser.add_argument("--systems", type=names, default=[], metavar="A,B,...", help="rows by name (default: all)")
-    parser.add_argument("--network", type=named_file, action="append", default=[], metavar="NAME=FILE.onnx")
-    parser.add_argument("--against", type=names, default=["crnn", "crnn-uncalibrated"], metavar="A,B,...",
-                        help="rows are compared with the first of these that ran on the clips")  # fmt: skip
-    parser.add_argument("--speech", type=Path, metavar="DIR", help="humans to lay on real recordings")
-    parser.add_argument("--laid-on", default="device1", metavar="PATTERN", help="devices (default: %(default)s)")
-    parser.add_argument("--ser", type=numbers, default=Cells.sers, metavar="DB,...", help="human against echo, laid")
-    parser.add_argument("--before", type=numbers, default=(5.0,), metavar="S,...", help="robot alone before, laid")
-    parser.add_argument("--cases", type=int, default=8, metavar="N", help="humans laid at each level")
+    add = parser.add_argument
+    add("folders", type=Path, nargs="+", metavar="FOLDER")
+    add("--systems", type=names, default=[], metavar="A,B,...", help="rows by name (default: all)")
+    add("--network", type=named_file, action="append", default=[], metavar="NAME=FILE.onnx")
+    add("--against", type=names, default=["crnn", "crnn-uncalibrated"], metavar="A,B,...",
+        help="rows are compared with the first of these that ran on the clips")  # fmt: skip
+    add("--speech", type=Path, metavar="DIR", help="humans to lay on real recordings")
+    add("--laid-on", default="device1", metavar="PATTERN", help="devices (default: %(default)s)")
+    add("--ser", type=numbers, default=Cells.sers, metavar="DB,...", help="human against echo, laid")
+    add("--before", type=numbers, default=(5.0,), metavar="S,...", help="robot alone before, laid")
+    add("--cases", type=int, default=8, metavar="N", help="humans laid at each level")
 
 
 def names(text: str) -> list[str]:
@@ -98,26 +81,17 @@ def run(options: argparse.Namespace) -> str:
     data = {"recordings": options.folders} | ({"HUMAN": [options.speech]} if options.speech else {})
     models = {"WHISPER": options.whisper} | {one.name: one.model for one in here if one.model}
     made_with = results.stamp(data, [one.name for one in here], models)
-    setup = runner.Setup(options.cache, options.whisper, dict(options.network))
+    setup = runner.Setup(options.cache, options.whisper, tuple(options.network))
     rows = runner.run(clips, here, setup, options.jobs, options.scheduler)
     tables = [headline(rows), glance(rows, here), *groups(rows, here, options.against), *slices(rows, here)]
     tables += [worst_table(worst(rows, here), rows), results.absent(absent)]
     notes = "\n\n".join([NOTES, "What the source paper (Li, Hindriks & Kunneman 2024) concluded:", conclusions(rows)])
     parts = {"clips": results.columns(about(clips, rows)), "rows": results.columns(slim(rows))}
-    page = results.write(options.output, "evaluation", "Evaluation", made_with, tables, notes=notes, **parts)
-    if options.html and options.output:
-        heard = [sounds(clip, here) for clip in clips if clip.name in {row["clip"] for row in worst(rows, here)}]
-        path = options.output.parent / f"{options.output.name}.html"
-        whole = results.read(options.output.parent / f"{options.output.name}.json")
-        path.write_text(results.html_page(whole, heard), encoding="utf-8")
-    return page
+    return results.write(options.output, "evaluation", "Evaluation", made_with, tables, notes=notes, **parts)
 
 
 def find_clips(options: argparse.Namespace) -> list[Clip]:
-    """All clips below the folders, every n-th of each set, in sets that are named by their folder.
-
-    Raises UsageError where nothing is found.
-    """
+    """All clips below the folders, every n-th of each set, named by folder; raises UsageError without any."""
     sets: dict[str, list[Clip]] = {}
     for folder in options.folders:
         if not folder.is_dir():
@@ -130,10 +104,9 @@ def find_clips(options: argparse.Namespace) -> list[Clip]:
                 sets.setdefault(name, []).extend(recordings.named(found, name))
     clips = [clip for _, clip in recordings.every(sets, options.every, options.limit)]
     if not clips:
-        raise UsageError(
-            f"{', '.join(map(str, options.folders))}: no */meta.json and no *_lpb and *_mic files, expected conversations"
-            " (make some with bench.simulate.conversations) or recordings of a real device"
-        )
+        found = f"{', '.join(map(str, options.folders))}: no */meta.json and no *_lpb and *_mic files"
+        wanted = "conversations (make some with bench.simulate.conversations) or recordings of a real device"
+        raise UsageError(f"{found}, expected {wanted}")
     return clips
 
 
@@ -150,21 +123,18 @@ def _real(folder: Path, options: argparse.Namespace) -> Iterator[Clip]:
         yield from recordings.laid_clips(laid, options.speech, "real loudspeaker")
 
 
-# ---------------------------------------------------------------- tables
-
-
 def metric(rows: Sequence[dict]) -> tuple[str, int, str, int]:
     """By what rows are compared: key, digits, heading, and 1 where more is worse; words where there is a recogniser."""
     words = any(row.get("capped") is not None for row in rows)
     return ("capped", 0, "WER, %", 1) if words else ("si_sdr", 1, "SI-SDR, dB", -1)
 
 
-def of(rows: Sequence[dict], system: str) -> list[dict]:
-    return [row for row in rows if row["system"] == system]
+def of(rows: Sequence[dict], system: str, part: str = "") -> list[dict]:
+    """The rows of a system, of all sets or of one."""
+    return [row for row in rows if row["system"] == system and part in ("", row["set"])]
 
 
 def grouped(rows: Sequence[dict]) -> dict[tuple[str, str], list[dict]]:
-    """The rows of each set and room, in their order."""
     found: dict[tuple[str, str], list[dict]] = {}
     for row in rows:
         found.setdefault((row["set"], row["room"]), []).append(row)
@@ -181,10 +151,11 @@ def headline(rows: Sequence[dict]) -> dict:
     known = systems.catalogue()
     cells = []
     for name in HEADLINE:
-        both = [(mean(of(own, name), "si_sdr"), mean(of(own, name), "capped")) for own in parts.values()]
-        texts = [
-            f"{results.cell(a['mean'], 1)} / {results.cell(b, 0)}" if a and b else results.cell(a, 1) for a, b in both
-        ]
+        texts = []
+        for own in parts.values():
+            ratio, wrong = (mean(of(own, name), key) for key in ("si_sdr", "capped"))
+            both = ratio and wrong
+            texts.append(f"{ratio['mean']:.1f} / {results.cell(wrong, 0)}" if both else results.cell(ratio, 1))
         if any(texts):
             cells.append([known[name].title, known[name].knows, *texts])
     columns = ["SI-SDR, dB / words wrong, %", "knows", *(_title(key, own) for key, own in parts.items())]
@@ -201,13 +172,11 @@ def glance(rows: Sequence[dict], here: Sequence[System]) -> dict:
     parts = {name: own for name, own in grouped(rows).items() if mean(own, key)}
     cells = [[one.title, one.knows, *(mean(of(own, one.name), key) for own in parts.values())] for one in here]
     columns = ["system", "knows", *((_title(name, own), digits) for name, own in parts.items())]
-    return results.table(
-        "glance", "At a glance", columns, cells, f"{said}; of each set and room, with its number of clips."
-    )
+    text = f"{said}; of each set and room, with its number of clips."
+    return results.table("glance", "At a glance", columns, cells, text)
 
 
 def groups(rows: Sequence[dict], here: Sequence[System], against: Sequence[str]) -> list[dict]:
-    """All figures of each set and room."""
     found = []
     for (name, room), own in grouped(rows).items():
         other = next((one for one in against if any(row.get("si_sdr") is not None for row in of(own, one))), "")
@@ -228,12 +197,9 @@ def _cells(one: System, own: Sequence[dict], other: Sequence[dict]) -> list | No
     unusable = sum("problem" in row for row in ran)
     title = one.title + (f" ({unusable} outputs unusable)" if unusable else "")
     wer, ratio = mean(ran, "wer"), mean(ran, "si_sdr")
-    inserted, deleted = pooled(ran, "insertions", "words"), pooled(ran, "deletions", "words")
-    words = [mean(ran, "capped"), wer and wer["mean"], wer and wer["median"], pooled(ran, "errors", "words")]
-    words += [inserted and inserted["mean"], deleted and deleted["mean"]]
-    plain = [
-        found and found["mean"] for key in ("estoi", "erle_db", "echo_mos", "human_mos") for found in [mean(ran, key)]
-    ]
+    words = [mean(ran, "capped"), middle(wer), wer and wer["median"], pooled(ran, "errors", "words")]
+    words += [middle(pooled(ran, key, "words")) for key in ("insertions", "deletions")]
+    plain = [middle(mean(ran, key)) for key in ("estoi", "erle_db", "echo_mos", "human_mos")]
     timed = [row for row in ran if "seconds" in row and "duration" in row]
     compute = 5 * sum(row["seconds"] for row in timed) / sum(row["duration"] for row in timed) if timed else None
     late = ("" if one.kind == "bound" else "end") if one.latency_ms is None else f"{one.latency_ms:.0f}"
@@ -265,15 +231,11 @@ def slices(rows: Sequence[dict], here: Sequence[System]) -> list[dict]:
     return found
 
 
-# ---------------------------------------------------------------- worst clips
-
-
 def worst(rows: Sequence[dict], here: Sequence[System]) -> list[dict]:
     """The clips on which our best row does worst, worst first; equal ones by SI-SDR."""
     key, _, _, worse = metric(rows)
-    mine = next(
-        (of(rows, name) for name in ("crnn", "crnn-uncalibrated", *(one.name for one in here)) if of(rows, name)), []
-    )
+    candidates = ("crnn", "crnn-uncalibrated", *(one.name for one in here))
+    mine = next(filter(None, (of(rows, name) for name in candidates)), [])
     known = [row for row in mine if row.get(key) is not None]
     return sorted(known, key=lambda row: (-worse * row[key], row.get("si_sdr", 0.0)))[:WORST]
 
@@ -284,36 +246,16 @@ def worst_table(found: Sequence[dict], rows: Sequence[dict]) -> dict:
     cells = []
     for row in found:
         of_clip = {one["system"]: one.get("transcript", "") for one in rows if one["clip"] == row["clip"]}
-        said = row["text"] or ""
-        cells.append(
-            [row["clip"], row.get("capped"), row.get("si_sdr"), said, *(of_clip.get(name, "") for name in shown)]
-        )
+        heard = [of_clip.get(name, "") for name in shown]
+        cells.append([row["clip"], row.get("capped"), row.get("si_sdr"), row["text"] or "", *heard])
     columns = ["clip", ("WER, %", 0), ("SI-SDR, dB", 1), "said", *(f"recognised, {name}" for name in shown)]
     return results.table("worst", title, columns, cells)
-
-
-def sounds(clip: Clip, here: Sequence[System]) -> dict:
-    """What the HTML page lets hear and see of one clip, all at the same peak."""
-    from edgefilter.report.media import colour_scale, sound, spectrogram_png
-
-    seen = slice(max(clip.span.start - round(LEAD_S * SAMPLE_RATE), 0), clip.span.stop)
-    pieces = []
-    for one in [one for one in here if one.name in ("unfiltered", "crnn", "crnn-uncalibrated", "clean")]:
-        try:
-            samples = one.run(clip).samples[seen]
-        except EdgefilterError:
-            continue
-        peak = max(float(np.abs(samples).max(initial=0.0)), 1e-6)
-        picture = spectrogram_png(samples, colour_scale(samples))
-        pieces.append({"name": one.title, "picture": picture, "sound": sound(samples, 0.9 / peak)})
-    return {"title": clip.name, "text": clip.text or "", "pieces": pieces}
 
 
 # ---------------------------------------------------------------- the source paper's conclusions
 
 
 def conclusions(rows: Sequence[dict]) -> str:
-    """What the paper concluded, and whether these recordings say so as well."""
     return "\n".join(f"- {line}" for line in (_volume_and_pitch(rows), _reverberation(rows), _batch_norm(rows)))
 
 
@@ -344,22 +286,21 @@ def _reverberation(rows: Sequence[dict]) -> str:
         draws = {}
         for system in ("paper-ss", network):
             own = [row for row in of(rows, system) if row.get(key) is not None and row["room"] in ("lab", "office")]
-            weights = (
-                metrics.cluster_weights(*(tuple(row[part] for row in own) for part in ("speaker", "place")))
-                if own
-                else None
-            )
             rooms = {room: np.array([row["room"] == room for row in own]) for room in ("lab", "office")}
-            if weights is None or min(inside.sum() for inside in rooms.values()) < FEW // 2:
+            if min(inside.sum() for inside in rooms.values()) < FEW // 2:
                 return _verdict(title, [], "")
             found = np.array([row[key] for row in own], np.float64)
-            means = {room: _weighted(weights * inside, found) for room, inside in rooms.items()}
+            means = {room: _weighted(_weights(own) * inside, found) for room, inside in rooms.items()}
             draws[system] = means["office"] - means["lab"]
         low, high = np.nanpercentile(worse * (draws["paper-ss"] - draws[network]), [2.5, 97.5])
         signs.append(_sign(low, high))
         each = (f"{name} {np.nanmedian(rise):+.1f}" for name, rise in draws.items())
         told.append(f"{', '.join(each)} {unit} (apart [{low:+.1f}, {high:+.1f}])")
     return _verdict(title, signs, f"From the laboratory to the office: {'; '.join(told)}.")
+
+
+def _weights(rows: Sequence[dict]) -> np.ndarray:
+    return metrics.cluster_weights(*(tuple(row[part] for row in rows) for part in ("speaker", "place")))
 
 
 def _weighted(weights: np.ndarray, values: np.ndarray) -> np.ndarray:
@@ -376,9 +317,8 @@ def _batch_norm(rows: Sequence[dict]) -> str:
             if found and found["count"] >= FEW:
                 signs.append(1 if max(worse * found["low"], worse * found["high"]) >= 0 else -1)
                 told.append(f"{without} {found['mean']:+.1f} [{found['low']:+.1f}, {found['high']:+.1f}] {unit}")
-    return _verdict(
-        "Batch normalisation does not help", signs, f"With it less without: {'; '.join(told)}." if told else ""
-    )
+    figures = f"With it less without: {'; '.join(told)}." if told else ""
+    return _verdict("Batch normalisation does not help", signs, figures)
 
 
 def correlation(rows: Sequence[dict], fact: str, key: str) -> tuple[float, float, float] | None:
@@ -389,14 +329,13 @@ def correlation(rows: Sequence[dict], fact: str, key: str) -> tuple[float, float
     x, y, members = [], [], []
     for own in grouped([row for row in rows if row.get(key) is not None and fact in row["facts"]]).values():
         if len(own) > 1:
-            x.append(_ranks(np.array([row["facts"][fact] for row in own])) / len(own))
-            y.append(_ranks(np.array([row[key] for row in own])) / len(own))
+            x.append((rankdata([row["facts"][fact] for row in own]) - 1) / len(own))
+            y.append((rankdata([row[key] for row in own]) - 1) / len(own))
             members += own
     if len(members) < FEW:
         return None
     ranks = np.concatenate(x), np.concatenate(y)
-    weights = metrics.cluster_weights(*(tuple(row[part] for row in members) for part in ("speaker", "place")))
-    low, high = np.nanpercentile(_correlated(weights, *ranks), [2.5, 97.5])
+    low, high = np.nanpercentile(_correlated(_weights(members), *ranks), [2.5, 97.5])
     return float(_correlated(np.ones((1, len(members))), *ranks)[0]), float(low), float(high)
 
 
@@ -404,12 +343,6 @@ def _correlated(weights: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray
     mean_x, mean_y, mean_xy = (_weighted(weights, z) for z in (x, y, x * y))
     spread = (_weighted(weights, x**2) - mean_x**2) * (_weighted(weights, y**2) - mean_y**2)
     return np.where(spread > 1e-9, (mean_xy - mean_x * mean_y) / np.sqrt(np.maximum(spread, 1e-9)), np.nan)
-
-
-def _ranks(values: np.ndarray) -> np.ndarray:
-    """From 0, ties at their middle."""
-    _, inverse, counts = np.unique(values, return_inverse=True, return_counts=True)
-    return (np.cumsum(counts) - (counts + 1) / 2)[inverse]
 
 
 def _sign(low: float, high: float) -> int:
@@ -421,25 +354,18 @@ def _verdict(title: str, signs: Sequence[int], figures: str) -> str:
     """As concluded where every sign is for it, the opposite where every one is against it."""
     if not signs:
         return f"{title}: not tested, too few clips or systems."
-    tests: dict[str, Callable[[int], bool]] = {
-        "seen here as well": lambda s: s > 0,
-        "the opposite is seen here": lambda s: s < 0,
-    }
-    some = "partly seen here" if any(sign > 0 for sign in signs) else "not seen here"
-    verdict = next((said for said, test in tests.items() if all(map(test, signs))), some)
+    verdict = "partly seen here" if max(signs) > 0 else "not seen here"
+    if min(signs) > 0:
+        verdict = "seen here as well"
+    elif max(signs) < 0:
+        verdict = "the opposite is seen here"
     return f"{title}: {verdict}. {figures}"
 
 
-# ---------------------------------------------------------------- what the JSON file holds
-
-
 def about(clips: Sequence[Clip], rows: Sequence[dict]) -> list[dict]:
-    """Of each clip what it is."""
     known = {row["clip"]: row["facts"] for row in rows}
-    keys = [quantity.key for quantity in QUANTITIES]
-    told = [(clip, known[clip.name]) for clip in clips]
-    return [{"clip": clip.name, "room": clip.room, "speaker": clip.speaker, **{key: fact.get(key) for key in keys}}
-            for clip, fact in told]  # fmt: skip
+    told = ({quantity.key: known[clip.name].get(quantity.key) for quantity in QUANTITIES} for clip in clips)
+    return [{"clip": clip.name, "room": clip.room, "speaker": clip.speaker, **of} for clip, of in zip(clips, told)]
 
 
 def slim(rows: Sequence[dict]) -> list[dict]:

@@ -46,9 +46,7 @@ LEARNERS = ("linear", "crnn")
 """Engines that are also timed beside a learner: the one that leaves it most of the processor, and the one that leaves it least."""
 SLOWEST = 5
 PERCENTILES = ("p50", "p95", "p99", "max")
-
-
-# ---------------------------------------------------------------- one contender, in a process of its own
+PACE = {True: "paced", False: "back to back"}
 
 
 @dataclass
@@ -124,7 +122,6 @@ def measure(contender: Contender, seconds: float, paced: bool) -> list[float]:
 
 
 def child(name: str, seconds: float, paced: bool) -> dict:
-    """What `run_hops` returns, measured in this process."""
     base = name.removesuffix(LEARNING)
     with ExitStack() as stack:
         stack.enter_context(held_to(CORES))
@@ -147,9 +144,6 @@ def run_hops(name: str, seconds: float, paced: bool) -> dict:
     return json.loads(done.stdout)
 
 
-# ---------------------------------------------------------------- all of them
-
-
 def contenders() -> tuple[list[str], dict[str, str]]:
     """Whatever can run here, and why the rest cannot."""
     usable, missing = ["bypass"], {}
@@ -165,20 +159,14 @@ def contenders() -> tuple[list[str], dict[str, str]]:
 def summary(runs: Sequence[Mapping]) -> dict:
     """Several runs of one contender as one row: ms a hop, hops that took longer than they last, part of real time."""
     hop, took = runs[0]["hop"], np.concatenate([run["took"] for run in runs])
-    period = 1000 * hop / SAMPLE_RATE
+    period, mean = 1000 * hop / SAMPLE_RATE, float(took.mean())
     stages = {name: float(np.mean(np.concatenate([run["stages"][name] for run in runs]))) for name in runs[0]["stages"]}
-    return {
-        "hop_ms": period,
-        "hops": took.size,
-        **percentiles(took, 50, 95, 99, 100),
-        "mean": float(took.mean()),
-        "missed": int(np.sum(took > period)),
-        "real_time_factor": float(took.mean()) / period,
-        "stages": stages,
-        "slowest": sorted((row for run in runs for row in slowest(run)), key=lambda row: -row["ms"])[:SLOWEST],
-        "peak_memory_mb": max(run["peak_memory_mb"] for run in runs),
-        "learned": [run["learned"] for run in runs if run["learned"]],
-    }
+    worst = sorted((row for run in runs for row in slowest(run)), key=lambda row: -row["ms"])[:SLOWEST]
+    found = {"hop_ms": period, "hops": took.size, **percentiles(took, 50, 95, 99, 100), "mean": mean}
+    found |= {"missed": int(np.sum(took > period)), "real_time_factor": mean / period}
+    found |= {"stages": stages, "slowest": worst}
+    learned = [run["learned"] for run in runs if run["learned"]]
+    return found | {"peak_memory_mb": max(run["peak_memory_mb"] for run in runs), "learned": learned}
 
 
 def slowest(run: Mapping) -> list[dict]:
@@ -193,13 +181,13 @@ def slowest(run: Mapping) -> list[dict]:
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--contenders", metavar="A,B,...", help="default: all that can run here")
-    parser.add_argument("--seconds", type=float, default=12.0, help="of audio in each round (default: %(default)s)")
-    parser.add_argument("--rounds", type=int, default=2, help="default: %(default)s")
+    add = parser.add_argument
+    add("--contenders", metavar="A,B,...", help="default: all that can run here")
+    add("--seconds", type=float, default=12.0, help="of audio in each round (default: %(default)s)")
+    add("--rounds", type=int, default=2, help="default: %(default)s")
 
 
 def run(options: argparse.Namespace) -> str:
-    """Measure all, paced and back to back, and write the tables."""
     names, missing = contenders()
     names = options.contenders.split(",") if options.contenders else names
     load = os.getloadavg()[0]
@@ -211,98 +199,57 @@ def run(options: argparse.Namespace) -> str:
             runs[name, paced].append(run_hops(name, options.seconds, paced))
     rows = [{"contender": name, "paced": paced, **summary(runs[name, paced])} for name, paced in turns]
     conditions = f"{options.rounds} rounds of {options.seconds:g} s each, {CORES} of {os.cpu_count()} cores, one thread"
-    notes = [
-        f"{conditions}, load average before {load:.2f}. Milliseconds a hop; missed: hops that took longer than they last."
-    ]
+    said = "Milliseconds a hop; missed: hops that took longer than they last."
+    notes = [f"{conditions}, load average before {load:.2f}. {said}"]
     notes += [f"{name} is not in the table: {why}" for name, why in missing.items()]
     plots = [results.plot("hops", [_panel(runs, names, paced) for paced in (True, False)])]
-    return results.write(
-        options.output,
-        "latency",
-        "Latency and cost per hop",
-        made_with,
-        tables(rows),
-        plots,
-        "\n\n".join(notes),
-        rows=rows,
-    )
+    return results.write(options.output, "latency", "Latency and cost per hop", made_with, tables(rows), plots,
+                         "\n\n".join(notes), rows=rows)  # fmt: skip
 
 
 def tables(rows: Sequence[Mapping]) -> list[dict]:
     """Times, ratios to the yardstick, what a hop is made of, the slowest hops, and what a learner takes."""
     paced = {row["contender"]: row for row in rows if row["paced"]}
     yardstick = paced.get(YARDSTICK)
-    cells = [
-        [
-            row["contender"],
-            "paced" if row["paced"] else "back to back",
-            row["hop_ms"],
-            *(row[key] for key in PERCENTILES),
-            row["missed"],
-            row["real_time_factor"],
-            *(row[key] / yardstick[key] if yardstick and row["paced"] else None for key in ("p50", "p99")),
-        ]
-        for row in rows
-    ]
+    cells = []
+    for row in rows:
+        ratios = [row[key] / yardstick[key] if yardstick and row["paced"] else None for key in ("p50", "p99")]
+        kept = [row[key] for key in ("hop_ms", *PERCENTILES, "missed", "real_time_factor")]
+        cells.append([row["contender"], PACE[row["paced"]], *kept, *ratios])
     columns = ["", "pace", ("hop, ms", 0), *((key, 3) for key in PERCENTILES), "missed", ("real-time factor", 4)]
     columns += [(f"p50 over {YARDSTICK}'s", 2), ("p99", 2)]
     stages = list(dict.fromkeys(name for row in paced.values() for name in row["stages"]))
-    parts = [
-        [name, *(row["stages"].get(s) for s in stages), row["mean"]] for name, row in paced.items() if row["stages"]
-    ]
-    slow = [
-        [name, ", ".join(f"{hop['second']:.2f} s {hop['ms']:.1f} {hop['stage']}".strip() for hop in row["slowest"])]
-        for name, row in paced.items()
-    ]
-    made = [
-        results.table("latency", "Milliseconds a hop", columns, cells),
-        results.table(
-            "stages", "What a paced hop is made of, mean ms", ["", *((s, 3) for s in stages), ("whole", 3)], parts
-        ),
-        results.table(
-            "slowest", "The slowest paced hops", ["", "second of the sound, ms, the stage that took most"], slow
-        ),
-    ]
+    made = [results.table("latency", "Milliseconds a hop", columns, cells)]
+    cells = [[name, *map(row["stages"].get, stages), row["mean"]] for name, row in paced.items() if row["stages"]]
+    columns = ["", *((stage, 3) for stage in stages), ("whole", 3)]
+    made.append(results.table("stages", "What a paced hop is made of, mean ms", columns, cells))
+    told = {name: (f"{hop['second']:.2f} s {hop['ms']:.1f} {hop['stage']}".strip() for hop in row["slowest"])
+            for name, row in paced.items()}  # fmt: skip
+    columns = ["", "second of the sound, ms, the stage that took most"]
+    cells = [[name, ", ".join(hops)] for name, hops in told.items()]
+    made.append(results.table("slowest", "The slowest paced hops", columns, cells))
     if beside := [_learner(name, row, paced) for name, row in paced.items() if row["learned"]]:
-        columns = [
-            "",
-            ("p99 over that without", 2),
-            ("CPU, s a minute", 1),
-            ("memory, MB", 0),
-            ("fits a run", 1),
-            "fell behind",
-        ]
-        made.append(
-            results.table(
-                "learner", "A learner beside it, and what its process takes (its start included)", columns, beside
-            )
-        )
+        columns = ["", ("p99 over that without", 2), ("CPU, s a minute", 1), ("memory, MB", 0), ("fits a run", 1)]
+        title = "A learner beside it, and what its process takes (its start included)"
+        made.append(results.table("learner", title, [*columns, "fell behind"], beside))
     return made
 
 
 def _learner(name: str, row: Mapping, paced: Mapping[str, Mapping]) -> list:
-    """A row of the learner's table."""
     alone, learned = paced.get(name.removesuffix(LEARNING)), row["learned"]
     minutes = row["hops"] * row["hop_ms"] / 60_000
-    return [
-        name,
-        row["p99"] / alone["p99"] if alone else None,
-        sum(one["cpu_s"] for one in learned) / minutes,
-        max(one["memory_mb"] for one in learned),
-        float(np.mean([one["rounds"] for one in learned])),
-        sum(one["fell_behind"] for one in learned),
-    ]
+    keys = ("cpu_s", "memory_mb", "rounds", "fell_behind")
+    cpu_s, memory_mb, rounds, behind = ([one[key] for one in learned] for key in keys)
+    ratio = row["p99"] / alone["p99"] if alone else None
+    return [name, ratio, sum(cpu_s) / minutes, max(memory_mb), float(np.mean(rounds)), sum(behind)]
 
 
 def _panel(runs: Mapping[tuple[str, bool], Sequence[Mapping]], names: Sequence[str], paced: bool) -> dict:
     """How many hops are slower than so many ms."""
     slower = np.array([100, 50, 20, 10, 5, 2, 1, 0.5, 0.2])
-    lines = {
-        name: (slower, np.percentile(np.concatenate([run["took"] for run in runs[name, paced]]), 100 - slower))
-        for name in names
-    }
-    title = "paced" if paced else "back to back"
-    return results.panel(title, "hops slower than this, %", "ms a hop", lines, xscale="log", yscale="log")
+    took = {name: np.concatenate([run["took"] for run in runs[name, paced]]) for name in names}
+    lines = {name: (slower, np.percentile(times, 100 - slower)) for name, times in took.items()}
+    return results.panel(PACE[paced], "hops slower than this, %", "ms a hop", lines, xscale="log", yscale="log")
 
 
 if __name__ == "__main__":

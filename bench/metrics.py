@@ -1,23 +1,23 @@
-"""What is measured of an output, and what is said of many: means with intervals, paired differences, barge-in."""
+"""What is measured of an output, what is said of many (means, intervals, paired differences), what makes a clip hard."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from bench.cache import Cache
 from bench.recogniser import Recogniser, word_errors
+from bench.recordings import Clip, Conversation
 from edgefilter.dsp.metrics import erle, si_sdr
 from edgefilter.filter.barge_in import BargeIn, BargeInSettings
 from edgefilter.types import SAMPLE_RATE, Event, Samples
 
 if TYPE_CHECKING:
-    from bench.recordings import Clip
     from bench.systems import Output
 
 FRAME = SAMPLE_RATE // 50
@@ -49,8 +49,7 @@ class CachedMetrics:
             return None
         said = self.recogniser.transcribe(out)
         found = word_errors(text, said)
-        counts = {key: getattr(found, key) for key in ("errors", "words", "deletions", "insertions")}
-        return counts | {"wer": 100 * found.rate, "capped": 100 * found.capped, "transcript": said}
+        return asdict(found) | {"wer": 100 * found.rate, "capped": 100 * found.capped, "transcript": said}
 
     def mos(self, mic: Samples, ref: Samples, out: Samples, talk: str) -> dict[str, float]:
         """Return echo_mos and human_mos, 1 to 5 (Purin et al. 2022, "AECMOS"); empty where speechmos is not installed."""
@@ -107,8 +106,7 @@ def score(clip: Clip, output: Output, cached: CachedMetrics) -> dict:
         return row | {"problem": "samples that are not finite"}
     row["excess_db"] = excess_db(out, mic)
     if clip.human is None:
-        row |= cached.mos(mic[-round(MOS_S * SAMPLE_RATE) :], ref[-round(MOS_S * SAMPLE_RATE) :],
-                          out[-round(MOS_S * SAMPLE_RATE) :], clip.talk)  # fmt: skip
+        row |= cached.mos(*(x[-round(MOS_S * SAMPLE_RATE) :] for x in (mic, ref, out)), clip.talk)
         if clip.talk == "farend":
             row["erle_db"] = lowered_db(mic, out)
             row |= {} if output.events is None else {"false_starts": starts(output.events)}
@@ -168,10 +166,7 @@ def first_sound(human: Samples) -> int:
 
 
 def noticed(events: Sequence[Event], onset: int) -> dict:
-    """Return delay_s, from the onset to the first speech_started after it, None if there is none.
-
-    early: speech was on already, so nothing is noticed.
-    """
+    """delay_s: from the onset to the next speech_started, None without one; early: speech was on already."""
     talk = [event for event in events if event.kind.startswith("speech")]
     before = [event.kind for event in talk if event.sample < onset]
     after = [event.sample for event in talk if event.sample >= onset and event.kind == "speech_started"]
@@ -202,7 +197,6 @@ RESAMPLES = 2000
 
 
 def values(rows: Iterable[Mapping], key: str) -> tuple[list[Mapping], np.ndarray]:
-    """The rows that have this figure, and the figures."""
     kept = [row for row in rows if row.get(key) is not None]
     return kept, np.array([row[key] for row in kept], np.float64)
 
@@ -217,8 +211,13 @@ def mean(rows: Iterable[Mapping], key: str) -> dict | None:
         return None
     low, high = _bounds(kept, found)
     spread = float(np.std(found, ddof=1)) if found.size > 1 else None
-    middle = {"mean": float(found.mean()), "low": low, "high": high, "median": float(np.median(found))}
-    return middle | {"std": spread, "count": found.size}
+    median = float(np.median(found))
+    return {"mean": float(found.mean()), "low": low, "high": high, "median": median, "std": spread, "count": found.size}
+
+
+def middle(found: Mapping | None) -> float | None:
+    """The mean without its interval."""
+    return found and found["mean"]
 
 
 def pooled(rows: Iterable[Mapping], above: str, below: str) -> dict | None:
@@ -242,11 +241,14 @@ def difference(rows: Iterable[Mapping], others: Iterable[Mapping], key: str, sam
 def _bounds(
     rows: Sequence[Mapping], above: np.ndarray, below: np.ndarray | None = None
 ) -> tuple[float | None, float | None]:
-    """Of one row nobody can say."""
+    """95 % percentile interval of sum(above) / sum(below), (n,) each, or of a mean; None of one row."""
     if len(rows) < 2:
         return None, None
-    clusters = tuple(tuple(row.get(key, index) for index, row in enumerate(rows)) for key in ("speaker", "place"))
-    return ratio_interval(cluster_weights(*clusters), above, below)
+    clusters = (tuple(row.get(key, index) for index, row in enumerate(rows)) for key in ("speaker", "place"))
+    weights = cluster_weights(*clusters)
+    sums = weights @ (np.ones(len(above)) if below is None else below)
+    low, high = np.percentile((weights @ above)[sums > 0] / sums[sums > 0], [2.5, 97.5])
+    return float(low), float(high)
 
 
 @lru_cache(maxsize=64)
@@ -266,15 +268,12 @@ def cluster_weights(*factors: tuple[Hashable, ...]) -> np.ndarray:
     return weights
 
 
-def ratio_interval(
-    weights: np.ndarray, above: Sequence[float], below: Sequence[float] | None = None
-) -> tuple[float, float]:
-    """95 % percentile interval of sum(above) / sum(below), (n,) each, over draws of `cluster_weights`; a mean without below."""
-    below_array = np.ones(len(above)) if below is None else np.asarray(below, np.float64)
-    sums = weights @ below_array
-    ratios = (weights @ np.asarray(above, np.float64))[sums > 0] / sums[sums > 0]
-    low, high = np.percentile(ratios, [2.5, 97.5])
-    return float(low), float(high)
+def counted(flags: Iterable[bool]) -> dict:
+    """How many of how many flags are set, and the percentage with its interval (`wilson`)."""
+    flags = list(flags)
+    low, high = wilson(sum(flags), len(flags))
+    share = {"mean": 100 * sum(flags) / max(len(flags), 1), "low": 100 * low, "high": 100 * high}
+    return {"hits": sum(flags), "n": len(flags), **share}
 
 
 def wilson(hits: int, n: int) -> tuple[float, float]:
@@ -299,3 +298,77 @@ def percentiles(samples: Sequence[float], *percents: float) -> dict[str, float]:
     found = np.percentile(samples, percents)
     names = ("max" if percent == 100 else f"p{percent:g}" for percent in percents)
     return dict(zip(names, map(float, found), strict=True))
+
+
+# ---------------------------------------------------------------- what makes a clip hard
+
+PITCH_HZ = (60.0, 400.0)
+PITCH_FRAME = SAMPLE_RATE // 25
+"""40 ms: two periods of the deepest voice."""
+VOICED = 0.6
+"""A frame is voiced where the autocorrelation, corrected for the window, reaches so much of the power."""
+OCTAVE = 0.03
+"""A peak is taken to be so much lower for each octave of lag: a periodic sound has one at every multiple of its period."""
+TALKS_DB = 30.0
+"""The robot talks in frames within so much of its loudest."""
+
+
+class Quantity(NamedTuple):
+    """By what results are cut: its name in a clip's facts, as a heading, and its digits."""
+
+    key: str
+    title: str
+    digits: int = 0
+
+
+QUANTITIES = (
+    Quantity("level_db", "Human over everything else, dB", 1),
+    Quantity("pitch_hz", "Pitch of the human, Hz"),
+    Quantity("rt60_s", "Reverberation time, s", 2),
+    Quantity("fan_db", "Human over fan, dB", 1),
+    Quantity("distortion_db", "Distortion of the loudspeaker, dB", 1),
+    Quantity("before_s", "Robot talked before, s", 1),
+)
+
+
+def facts(clip: Clip) -> dict[str, float]:
+    found: dict[str, float] = {}
+    if clip.human is not None:
+        span, mic, human = clip.span, clip.mic, clip.human
+        rest = (mic - human)[span]
+        found["level_db"] = 10 * np.log10(np.mean(human[span] ** 2) / max(float(np.mean(rest**2)), 1e-12))
+        if (pitch := pitch_hz(human[span])) is not None:
+            found["pitch_hz"] = pitch
+        found["before_s"] = talking_s(clip.ref[: span.start])
+    if isinstance(clip.source, Conversation):
+        meta = clip.source.meta
+        found |= {"rt60_s": meta["rt60"], "fan_db": meta["snr_fan"], "distortion_db": meta["nl_db"]}
+    return {key: float(value) for key, value in found.items()}
+
+
+def talking_s(ref: Samples) -> float:
+    power = frame_power(ref)
+    return float(np.sum(power > 10 ** (-TALKS_DB / 10) * power.max(initial=0.0))) * FRAME / SAMPLE_RATE
+
+
+def pitch_hz(samples: Samples) -> float | None:
+    """Median pitch of samples (n,) where voiced, by autocorrelation over the window's (Boersma 1993), or None."""
+    starts = np.arange(0, samples.size - PITCH_FRAME + 1, PITCH_FRAME // 2)
+    if not starts.size:
+        return None
+    window = np.hanning(PITCH_FRAME)
+    frames = samples[starts[:, None] + np.arange(PITCH_FRAME)].astype(np.float64)
+    loud = np.mean(frames**2, axis=1)
+    frames = (frames - frames.mean(axis=1, keepdims=True))[loud > 0.1 * loud.max()] * window
+    low, high = (round(SAMPLE_RATE / hz) for hz in reversed(PITCH_HZ))
+    lags = _autocorrelation(frames)[:, low:high] / _autocorrelation(window[None])[:, low:high]
+    best = np.argmax(lags - OCTAVE * np.log2(np.arange(low, high)), axis=1)
+    voiced = lags[np.arange(best.size), best] > VOICED
+    return float(np.median(SAMPLE_RATE / (low + best[voiced]))) if voiced.any() else None
+
+
+def _autocorrelation(frames: np.ndarray) -> np.ndarray:
+    """Of each row, from lag 0 on, over that at lag 0."""
+    size = 2 * frames.shape[1]
+    found = np.fft.irfft(np.abs(np.fft.rfft(frames, size, axis=1)) ** 2, axis=1)
+    return found / np.maximum(found[:, :1], 1e-20)

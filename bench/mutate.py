@@ -6,11 +6,10 @@ A mutant is a module of edgefilter/FOLDER with one operator, number, condition, 
 are drawn at random, each as often as any other, then one of cosmic-ray's replacements there; annotations, which do
 nothing while a program runs, are left out. The tests of a mutant are those of tests/FOLDER, and of files outside
 tests/bench that have the name of one of its modules, that reach the line, measured once without a mutant; all of them
-where none reaches it, as on import or in a child process. It is killed where one fails, or where they take longer than
-three times what all of them take; slow tests come last. Everything happens in copies of the checkout. A run that was
-stopped goes on where it was: outcomes are kept in --cache by code and tests. The same seed draws the same mutants as
-long as the code is the same: `--again` tries those alone that survived in OUTPUT.json, after tests were added. Needs
-cosmic-ray and pytest-cov.
+where none reaches it, as on import or in a child process. It is killed where one fails, or where they take longer
+than three times what all of them take; slow tests come last. Everything happens in copies of the checkout. Outcomes
+are kept in --cache by code and tests. The same seed draws the same mutants as long as the code is the same: `--again`
+tries those alone that survived in OUTPUT.json, after tests were added.
 """
 
 from __future__ import annotations
@@ -34,7 +33,7 @@ from pathlib import Path
 
 from bench import results
 from bench.cache import Cache, key_of
-from bench.metrics import wilson
+from bench.metrics import counted
 from bench.recordings import progress
 from edgefilter.errors import UsageError
 
@@ -60,15 +59,13 @@ class Mutant:
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "--modules", default=",".join(FOLDERS), metavar="A,B,...", help="folders (default: %(default)s)"
-    )
-    parser.add_argument("--count", type=int, default=200, help="mutants (default: %(default)s)")
-    parser.add_argument("--again", action="store_true", help="only those that survived in OUTPUT.json")
+    add = parser.add_argument
+    add("--modules", default=",".join(FOLDERS), metavar="A,B,...", help="folders (default: %(default)s)")
+    add("--count", type=int, default=200, help="mutants (default: %(default)s)")
+    add("--again", action="store_true", help="only those that survived in OUTPUT.json")
 
 
 def run(options: argparse.Namespace) -> str:
-    """Draw mutants, run the tests on each, and count."""
     folders = options.modules.split(",")
     for folder in folders:
         for place in (results.ROOT / "edgefilter" / folder, results.ROOT / "tests" / folder):
@@ -88,7 +85,8 @@ def run(options: argparse.Namespace) -> str:
 
     with copies(options.jobs) as free, ThreadPoolExecutor(options.jobs) as pool:
         reach = dict(zip(folders, pool.map(reach_of, folders), strict=True))
-        outcomes |= dict(zip(missing, progress_of(pool.map(outcome_of, missing), len(missing)), strict=True))
+        tried = pool.map(outcome_of, missing)
+        outcomes |= {mutant: next(tried) for mutant in progress(missing, "mutant")}
     rows = [{**asdict(mutant), "outcome": outcomes[mutant]} for mutant in drawn]
     survivors = [row for row in rows if row["outcome"] == "survived"]
     tables = [
@@ -101,11 +99,9 @@ def run(options: argparse.Namespace) -> str:
 
 
 def _counts(name: str, rows: Sequence[Mapping]) -> list:
-    own = [row for row in rows if name in ("all", row["folder"])]
-    survived = sum(row["outcome"] == "survived" for row in own)
-    low, high = wilson(survived, len(own))
-    share = {"mean": 100 * survived / max(len(own), 1), "low": 100 * low, "high": 100 * high}
-    return [name, len(own), len(own) - survived, survived, {key: round(value) for key, value in share.items()}]
+    found = counted(row["outcome"] == "survived" for row in rows if name in ("all", row["folder"]))
+    share = {key: round(found[key]) for key in ("mean", "low", "high")}
+    return [name, found["n"], found["n"] - found["hits"], found["hits"], share]
 
 
 def _survived(output: Path | None, drawn: Sequence[Mutant]) -> dict[Mutant, str]:
@@ -114,13 +110,9 @@ def _survived(output: Path | None, drawn: Sequence[Mutant]) -> dict[Mutant, str]
     part = results.read(path)["parts"].get("mutate") if path and path.exists() else None
     known = {Mutant(**row): outcome for row in part["mutants"] if (outcome := row.pop("outcome"))} if part else {}
     if list(known) != list(drawn):
-        raise UsageError(
-            f"{path} is not of these {len(drawn)} mutants: run without --again, or with its --count and --seed"
-        )
+        remedy = "run without --again, or with its --count and --seed"
+        raise UsageError(f"{path} is not of these {len(drawn)} mutants: {remedy}")
     return known
-
-
-# ---------------------------------------------------------------- mutants
 
 
 def sample(folders: Sequence[str], count: int, seed: int) -> list[Mutant]:
@@ -138,11 +130,11 @@ def sample(folders: Sequence[str], count: int, seed: int) -> list[Mutant]:
             break
         operator, occurrence = rng.choice(found[folder, path, line, column])
         source = path.read_text(encoding="utf-8")
+        lines = source.splitlines()
         try:
             changed = mutated(source, operator, occurrence).splitlines()
         except AttributeError:  # cosmic-ray 8.7 cannot replace every exception that it lists
             continue
-        lines = source.splitlines()
         after = next((b for a, b in zip(lines, changed) if a != b), "")
         module = path.relative_to(results.ROOT).as_posix()
         mutants.append(Mutant(folder, module, operator, occurrence, line, lines[line - 1].strip(), after.strip()))
@@ -165,7 +157,6 @@ def places(cosmic: object, source: str) -> dict[tuple[int, int], list[tuple[str,
 
 
 def annotations(source: str) -> Iterator[tuple[tuple[int, int], tuple[int, int]]]:
-    """Where annotations begin and end."""
     for node in ast.walk(ast.parse(source)):
         for part in (getattr(node, "annotation", None), getattr(node, "returns", None)):
             if part is not None:
@@ -188,17 +179,12 @@ def _library(name: str) -> object:
     try:
         return importlib.import_module(name)
     except ImportError as error:
-        raise UsageError(
-            f"mutants need cosmic-ray and pytest-cov ({error}): pip install cosmic-ray pytest-cov"
-        ) from None
-
-
-# ---------------------------------------------------------------- tests
+        remedy = "pip install cosmic-ray pytest-cov"
+        raise UsageError(f"mutants need cosmic-ray and pytest-cov ({error}): {remedy}") from None
 
 
 @contextmanager
 def copies(count: int) -> Iterator[queue.Queue[Path]]:
-    """Copies of the checkout, to be taken and given back."""
     free: queue.Queue[Path] = queue.Queue()
     with tempfile.TemporaryDirectory() as folder:
         for number in range(count):
@@ -217,20 +203,13 @@ def code_of(folder: str) -> str:
 def files_of(root: Path, folder: str) -> list[str]:
     """Tests of a folder, and those elsewhere that have the name of one of its modules; the benchmarks' own read results, which copies lack."""
     modules = {f"test_{path.stem}" for path in (root / "edgefilter" / folder).rglob("*.py")}
-    every = sorted((root / "tests").rglob("test_*.py"))
-    return [
-        path.relative_to(root).as_posix()
-        for path in every
-        if root / "tests" / folder in path.parents
-        or (path.stem in modules and root / "tests" / "bench" not in path.parents)
-    ]
+    tests = root / "tests"
+    named = (path for path in tests.rglob("test_*.py") if path.stem in modules and tests / "bench" not in path.parents)
+    return [path.relative_to(root).as_posix() for path in sorted({*(tests / folder).rglob("test_*.py"), *named})]
 
 
 def measured(free: queue.Queue[Path], folder: str) -> dict:
-    """Which tests reach which lines of the folder's modules, and the seconds that a mutant's tests may take.
-
-    Raises UsageError where tests fail without any mutant.
-    """
+    """Which tests reach which lines, and the seconds that a mutant's may take; UsageError where they fail anyway."""
     copy = free.get()
     began, kept = time.monotonic(), copy / ".coverage"
     kept.unlink(missing_ok=True)
@@ -242,13 +221,12 @@ def measured(free: queue.Queue[Path], folder: str) -> dict:
         data = _library("coverage").CoverageData(str(kept))
         data.read()
         numbers: dict[str, int] = {"": 0}  # on import, for no test
-        lines = {
-            Path(path).relative_to(copy).as_posix(): {
+        lines: dict[str, dict[str, list[int]]] = {}
+        for path in sorted(data.measured_files()):
+            lines[Path(path).relative_to(copy).as_posix()] = {
                 str(line): sorted({numbers.setdefault(name, len(numbers)) for name in names} - {0})
                 for line, names in data.contexts_by_lineno(path).items()
             }
-            for path in sorted(data.measured_files())
-        }
     finally:
         free.put(copy)
     return {"limit_s": limit_s, "tests": list(numbers), "lines": lines}
@@ -261,20 +239,18 @@ def targets(copy: Path, mutant: Mutant, reach: Mapping) -> list[str]:
     contexts = {reach["tests"][i] for line in range(first, last + 1) for i in by_line.get(str(line), ())}
     whole = {name.partition("::")[0] for name in contexts if not name.endswith("|run")}
     single = {name.removesuffix("|run").partition("[")[0] for name in contexts}
-    chosen = whole | {name for name in single if name.partition("::")[0] not in whole} or {
-        *files_of(copy, mutant.folder)
-    }
+    chosen = whole | {name for name in single if name.partition("::")[0] not in whole}
     stem = Path(mutant.module).stem
+    chosen = chosen or set(files_of(copy, mutant.folder))
     return sorted(chosen, key=lambda name: (stem not in name.partition("::")[0], "::" not in name, name))
 
 
 def statement(source: str, line: int) -> tuple[int, int]:
     """First and last line of the innermost statement there, without the statements inside it; a decorator belongs to what it decorates."""
-    spans = {
-        (min([node.lineno, *(one.lineno for one in getattr(node, "decorator_list", ()))]), node.end_lineno): node
-        for node in ast.walk(ast.parse(source))
-        if isinstance(node, ast.stmt)
-    }
+    spans = {}
+    for node in (node for node in ast.walk(ast.parse(source)) if isinstance(node, ast.stmt)):
+        start = min([node.lineno, *(one.lineno for one in getattr(node, "decorator_list", ()))])
+        spans[start, node.end_lineno] = node
     first, last = min((span for span in spans if span[0] <= line <= span[1]), key=lambda span: span[1] - span[0])
     body = getattr(spans[first, last], "body", None)
     return first, body[0].lineno - 1 if body else last
@@ -302,21 +278,11 @@ def tests(copy: Path, chosen: Sequence[str], limit_s: float | None, *options: st
     began = time.monotonic()
     environment = os.environ | {"PYTHONPATH": str(copy), "PYTHONDONTWRITEBYTECODE": "1"}
     for which in ("not slow", "slow"):
-        command = [
-            sys.executable,
-            *"-m pytest --rootdir=. -x -q -p no:cacheprovider -m".split(),
-            which,
-            *options,
-            *chosen,
-        ]
+        pytest = "-m pytest --rootdir=. -x -q -p no:cacheprovider -m".split()
         left = None if limit_s is None else max(limit_s - (time.monotonic() - began), 1.0)
+        command, quiet = [sys.executable, *pytest, which, *options, *chosen], subprocess.DEVNULL
         process = subprocess.Popen(
-            command,
-            cwd=copy,
-            env=environment,
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.DEVNULL,
-            start_new_session=True,
+            command, cwd=copy, env=environment, stdout=quiet, stderr=quiet, start_new_session=True
         )
         try:
             code = process.wait(left)
@@ -327,8 +293,3 @@ def tests(copy: Path, chosen: Sequence[str], limit_s: float | None, *options: st
         if code not in (PASSED, NONE_CHOSEN):
             return code
     return PASSED
-
-
-def progress_of(items: Iterator[str], total: int) -> list[str]:
-    """All items, with a bar where somebody is looking."""
-    return [next(items) for _ in progress(range(total), "mutant")]

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Iterator
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -31,12 +32,13 @@ measured; a human is one case, a device the mean of its humans. Median and worst
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("recordings", type=Path, metavar="RECORDINGS")
-    parser.add_argument("--speech", type=Path, required=True, metavar="DIR", help="humans, with a transcripts.tsv")
-    parser.add_argument("--engines", type=names, default=list(ENGINES), metavar="A,B,...", help="default: %(default)s")
-    parser.add_argument("--humans", type=int, default=2, metavar="N", help="on each recording, at each level")
-    parser.add_argument("--levels", type=numbers, default=(-10.0,), metavar="DB,...", help="human against echo")
-    parser.add_argument("--before", type=numbers, default=(5.0, 12.0), metavar="LOW,HIGH", help="robot alone before, s")
+    add = parser.add_argument
+    add("recordings", type=Path, metavar="RECORDINGS")
+    add("--speech", type=Path, required=True, metavar="DIR", help="humans, with a transcripts.tsv")
+    add("--engines", type=names, default=list(ENGINES), metavar="A,B,...", help="default: %(default)s")
+    add("--humans", type=int, default=2, metavar="N", help="on each recording, at each level")
+    add("--levels", type=numbers, default=(-10.0,), metavar="DB,...", help="human against echo")
+    add("--before", type=numbers, default=(5.0, 12.0), metavar="LOW,HIGH", help="robot alone before, s")
 
 
 def run(options: argparse.Namespace) -> str:
@@ -44,9 +46,8 @@ def run(options: argparse.Namespace) -> str:
     made_with = results.stamp(data, [f"{engine}-uncalibrated" for engine in options.engines])
     found = list(cases(options))
     if not found:
-        raise UsageError(
-            f"{options.recordings} holds no recording of a robot alone of {LEAST_S:.0f} s or more, expected some"
-        )
+        lacks = f"no recording of a robot alone of {LEAST_S:.0f} s or more"
+        raise UsageError(f"{options.recordings} holds {lacks}, expected some")
     devices = list(dict.fromkeys(row["device"] for row in found))
     cells, errors = [], []
     for device in devices:
@@ -57,12 +58,11 @@ def run(options: argparse.Namespace) -> str:
             cells.append([device[:8], engine, len(own), predicted, measured, predicted - measured])
     columns = ["device", "engine", "humans", ("predicted, dB", 1), ("measured, dB", 1), ("error, dB", 1)]
     single = [{"engine": row["engine"], "error": row["predicted"] - row["measured"]} for row in found]
-    tables = [
-        results.table("error", "Error of the prediction", ["of", "engine", "cases", ("median, dB", 1), ("worst, dB", 1), ("mean, dB", 1)],
-                      [summary(of, engine, some) for of, some in (("devices", errors), ("humans", single))
-                       for engine in (*options.engines, "all")]),
-        results.table("devices", "By device", columns, cells),
-    ]  # fmt: skip
+    tables = [results.table("devices", "By device", columns, cells)]
+    columns = ["of", "engine", "cases", ("median, dB", 1), ("worst, dB", 1), ("mean, dB", 1)]
+    each = product((("devices", errors), ("humans", single)), (*options.engines, "all"))
+    cells = [summary(of, engine, some) for (of, some), engine in each]
+    tables.insert(0, results.table("error", "Error of the prediction", columns, cells))
     return results.write(options.output, "passport", "Passports", made_with, tables, notes=NOTES, rows=found)
 
 
@@ -73,7 +73,6 @@ def summary(of: str, engine: str, some: list[dict]) -> list:
 
 
 def cases(options: argparse.Namespace) -> Iterator[dict]:
-    """A row for each human, level and engine."""
     voice = recordings.read(DEMO / "human.flac")
     voice = voice[speaking(voice)]
     alone = [one for one in recordings.find_recordings(options.recordings) if one.kind == "farend"]
@@ -87,9 +86,8 @@ def cases(options: argparse.Namespace) -> Iterator[dict]:
             continue
         most = round(MOST_S * SAMPLE_RATE)
         for level in options.levels:
-            humans = recordings.lay_once(
-                one, options.speech, options.humans, (level, level), options.before, options.seed
-            )
+            about = options.humans, (level, level), options.before, options.seed
+            humans = recordings.lay_once(one, options.speech, *about)
             for engine in options.engines:
                 _, predicted = expected(seen.mic[:most], seen.ref[:most], voice, level, engine)
                 for human in humans:

@@ -1,13 +1,11 @@
-"""Two public echo cancellers as rows of the benchmark.
-
-SpeexDSP (the system's library, through ctypes) and WebRTC AEC3 (pywebrtc-audio).
-"""
+"""Two public echo cancellers: SpeexDSP (the system's library, through ctypes) and WebRTC AEC3 (pywebrtc-audio)."""
 
 from __future__ import annotations
 
 import ctypes
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 
 import numpy as np
 
@@ -23,37 +21,34 @@ SUPPRESSED_DELAY = FRAME
 """Samples by which SpeexDSP's preprocessor delays the signal (its windows overlap by one frame); removed here."""
 AEC3_FRAME = 160
 AEC3_DELAY = 128
-"""Samples by which AEC3 delays the signal (it regroups frames of 80 samples into blocks of 64 and back); removed
-here."""
+"""Samples by which AEC3 delays the signal (it regroups frames of 80 samples into blocks of 64); removed here."""
 
 
-def speexdsp(mic: Samples, ref: Samples) -> Samples:
-    """SpeexDSP's echo canceller alone (MDF, Valin 2007), (n,) float32 for mic and ref (n,).
+def speexdsp(mic: Samples, ref: Samples, suppress: bool = False) -> Samples:
+    """SpeexDSP's echo canceller (MDF, Valin 2007), (n,) float32 for mic and ref (n,), aligned with the input.
 
-    Output aligned with the input.
-
-    Raises UsageError where libspeexdsp.so.1 is missing.
+    suppress: with its preprocessor behind (residual echo, noise; default strengths), as in its manual. Raises
+    UsageError where libspeexdsp.so.1 is missing.
     """
-    return _speexdsp(mic, ref, suppress=False)
+    mic, ref = as_samples(mic, "mic"), as_samples(ref, "ref")
+    delay = SUPPRESSED_DELAY if suppress else 0
+    padding = (0, -(-(mic.size + delay) // FRAME) * FRAME - mic.size)
+    near, far = (np.rint(np.clip(np.pad(x, padding) * 32768.0, -32768, 32767)).astype(np.int16) for x in (mic, ref))
+    out = np.zeros_like(near)
+    with speexdsp_frames(suppress) as step:
+        for at in range(0, near.size, FRAME):
+            step(near[at : at + FRAME], far[at : at + FRAME], out[at : at + FRAME])
+    return out[delay : delay + mic.size].astype(np.float32) / 32768.0
 
 
-def speexdsp_suppressed(mic: Samples, ref: Samples) -> Samples:
-    """SpeexDSP's echo canceller and its preprocessor (residual echo, noise; default strengths), as in its manual."""
-    return _speexdsp(mic, ref, suppress=True)
+speexdsp_suppressed = partial(speexdsp, suppress=True)
 
 
 def aec3(mic: Samples, ref: Samples) -> Samples:
-    """WebRTC AEC3 with its own delay estimator and high-pass, (n,) float32 for mic and ref (n,).
-
-    Output aligned with the input.
-
-    Raises UsageError where pywebrtc-audio is missing.
-    """
-    step = aec3_frames()
-    mic, ref = (
-        np.append(as_samples(x, name), np.zeros(AEC3_DELAY, np.float32)) for x, name in ((mic, "mic"), (ref, "ref"))
-    )
-    return np.asarray(step(mic, ref), np.float32)[AEC3_DELAY:]
+    """WebRTC AEC3 with its own delay estimator and high-pass, (n,) float32 for mic and ref (n,), aligned."""
+    named = ((mic, "mic"), (ref, "ref"))
+    mic, ref = (np.append(as_samples(x, name), np.zeros(AEC3_DELAY, np.float32)) for x, name in named)
+    return np.asarray(aec3_frames()(mic, ref), np.float32)[AEC3_DELAY:]
 
 
 def aec3_frames() -> Callable[[Samples, Samples], object]:
@@ -65,43 +60,23 @@ def aec3_frames() -> Callable[[Samples, Samples], object]:
     return EchoCanceller(sample_rate=SAMPLE_RATE).process
 
 
-def _speexdsp(mic: Samples, ref: Samples, suppress: bool) -> Samples:
-    mic, ref = as_samples(mic, "mic"), as_samples(ref, "ref")
-    delay = SUPPRESSED_DELAY if suppress else 0
-    frames = -(-(mic.size + delay) // FRAME)
-    padding = (0, frames * FRAME - mic.size)
-    near, far = (np.rint(np.clip(np.pad(x, padding) * 32768.0, -32768, 32767)).astype(np.int16) for x in (mic, ref))
-    out = np.zeros_like(near)
-    with speexdsp_frames(suppress) as step:
-        for at in range(0, near.size, FRAME):
-            step(near[at : at + FRAME], far[at : at + FRAME], out[at : at + FRAME])
-    return out[delay : delay + mic.size].astype(np.float32) / 32768.0
-
-
 @contextmanager
 def speexdsp_frames(suppress: bool) -> Iterator[Callable[[np.ndarray, np.ndarray, np.ndarray], None]]:
     """A new canceller as a function of near, far and out, (FRAME,) contiguous int16 each, that fills out."""
-    with _echo_state(suppress) as (library, echo, preprocessor):
-
-        def step(near: np.ndarray, far: np.ndarray, out: np.ndarray) -> None:
-            library.speex_echo_cancellation(echo, near.ctypes.data, far.ctypes.data, out.ctypes.data)
-            if preprocessor:
-                library.speex_preprocess_run(preprocessor, out.ctypes.data)
-
-        yield step
-
-
-@contextmanager
-def _echo_state(suppress: bool) -> Iterator[tuple[ctypes.CDLL, ctypes.c_void_p, ctypes.c_void_p | None]]:
     library = _load()
-    rate = ctypes.c_int(SAMPLE_RATE)
     echo = ctypes.c_void_p(library.speex_echo_state_init(FRAME, TAIL))
-    library.speex_echo_ctl(echo, _SET_ECHO_RATE, ctypes.byref(rate))
+    library.speex_echo_ctl(echo, _SET_ECHO_RATE, ctypes.byref(ctypes.c_int(SAMPLE_RATE)))
     preprocessor = ctypes.c_void_p(library.speex_preprocess_state_init(FRAME, SAMPLE_RATE)) if suppress else None
-    try:
+    if preprocessor:
+        library.speex_preprocess_ctl(preprocessor, _SET_ECHO_STATE, echo)
+
+    def step(near: np.ndarray, far: np.ndarray, out: np.ndarray) -> None:
+        library.speex_echo_cancellation(echo, near.ctypes.data, far.ctypes.data, out.ctypes.data)
         if preprocessor:
-            library.speex_preprocess_ctl(preprocessor, _SET_ECHO_STATE, echo)
-        yield library, echo, preprocessor
+            library.speex_preprocess_run(preprocessor, out.ctypes.data)
+
+    try:
+        yield step
     finally:
         if preprocessor:
             library.speex_preprocess_state_destroy(preprocessor)
@@ -112,9 +87,8 @@ def _load() -> ctypes.CDLL:
     try:
         library = ctypes.CDLL("libspeexdsp.so.1")
     except OSError as error:
-        raise UsageError(
-            "libspeexdsp.so.1 cannot be loaded, expected SpeexDSP 1.2: apt-get install libspeexdsp1"
-        ) from error
+        remedy = "expected SpeexDSP 1.2: apt-get install libspeexdsp1"
+        raise UsageError(f"libspeexdsp.so.1 cannot be loaded, {remedy}") from error
     pointer, integer = ctypes.c_void_p, ctypes.c_int
     for name, result, arguments in (
         ("speex_echo_state_init", pointer, (integer, integer)),

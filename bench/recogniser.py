@@ -18,27 +18,15 @@ from bench.cache import Cache
 from edgefilter.errors import UsageError
 from edgefilter.types import Samples, as_samples
 
-SETTINGS = {
-    "language": "en",
-    "beam_size": 1,
-    "temperature": 0.0,
-    "condition_on_previous_text": False,
-    "without_timestamps": True,
-}
+SETTINGS = {"language": "en", "beam_size": 1, "temperature": 0.0, "condition_on_previous_text": False,
+            "without_timestamps": True}  # fmt: skip
 PEAK = 0.5
 """Every input is scaled to this peak, so that levels do not count."""
 _TEENS = "ten eleven twelve thirteen fourteen fifteen sixteen seventeen eighteen nineteen"
 _SMALL = f"zero one two three four five six seven eight nine {_TEENS}".split()
 _TENS = "_ _ twenty thirty forty fifty sixty seventy eighty ninety".split()
-_ORDINALS = {
-    "one": "first",
-    "two": "second",
-    "three": "third",
-    "five": "fifth",
-    "eight": "eighth",
-    "nine": "ninth",
-    "twelve": "twelfth",
-}
+_ORDINALS = {"one": "first", "two": "second", "three": "third", "five": "fifth", "eight": "eighth", "nine": "ninth",
+             "twelve": "twelfth"}  # fmt: skip
 _TITLES = {"mr": "mister", "mrs": "missus", "dr": "doctor", "st": "saint"}
 
 
@@ -67,18 +55,16 @@ def word_errors(text: str, recognised: str) -> WordErrors:
     text, recognised = normalise(text), normalise(recognised)
     if not text:
         raise UsageError("the text to compare with has no words, expected what the human says: check the transcript")
+    words = len(text.split())
     if not recognised:
-        return WordErrors(len(text.split()), len(text.split()), deletions=len(text.split()))
+        return WordErrors(words, words, deletions=words)
     counts = jiwer.process_words(text, recognised)
     errors = counts.substitutions + counts.deletions + counts.insertions
-    return WordErrors(errors, len(text.split()), counts.deletions, counts.insertions)
+    return WordErrors(errors, words, counts.deletions, counts.insertions)
 
 
 def normalise(text: str) -> str:
-    """Lower case; integers and ordinals as words (1100-1999 read as years).
-
-    Mr, mrs, dr, st spelt out; of the punctuation only apostrophes inside words stay. British and American spellings are
-    left alone (both are in the recordings).
+    """Lower case; integers (1100-1999 as years), ordinals, mr, mrs, dr, st as words; no punctuation but inner apostrophes.
 
     >>> normalise("Mr. Brown's 3rd dog, born in 1839 -- 21 years!")
     "mister brown's third dog born in eighteen thirty nine twenty one years"
@@ -114,18 +100,14 @@ def _spell(n: int) -> str:
 
 
 class Recogniser:
-    """Transcribes with the model in a folder; loads it only for sound that the cache does not know.
-
-    folder: of a CTranslate2 model. Raises UsageError where it holds none.
-    """
+    """Transcribes with the CTranslate2 model in a folder; loads it only for sound that the cache does not know."""
 
     def __init__(self, folder: Path, cache: Cache) -> None:
-        config = folder / "config.json"
-        if not (folder / "model.bin").is_file() or not config.is_file():
-            raise UsageError(
-                f"{folder} holds no model.bin and config.json; expected a CTranslate2 conversion of Whisper-base"
-            )
-        self.identity = f"{(folder / 'model.bin').stat().st_size} {config.read_text()} {SETTINGS} {PEAK}"
+        model, config = folder / "model.bin", folder / "config.json"
+        if not model.is_file() or not config.is_file():
+            wanted = "expected a CTranslate2 conversion of Whisper-base"
+            raise UsageError(f"{folder} holds no model.bin and config.json; {wanted}")
+        self.identity = f"{model.stat().st_size} {config.read_text()} {SETTINGS} {PEAK}"
         self._folder, self._cache = folder, cache
 
     def transcribe(self, samples: Samples) -> str:

@@ -16,6 +16,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
+from itertools import product
 from pathlib import Path
 from typing import NamedTuple, TypeVar
 
@@ -40,6 +41,8 @@ TRIES = 50
 """Places drawn for a human before the one with the most robot is taken."""
 ROBOT_SILENT = 0.25
 """No place is taken where the robot has less than this share of its mean power: the SER would mean nothing."""
+CALIBRATION = ("sweep_ref", "sweep_mic", "fan_only")
+"""Recordings of which a calibration is made, in the order of `calibrate`."""
 MARGIN = 32
 """Samples by which a true lag is given too short, so that a canceller's causal filter holds the direct sound's rise."""
 Item = TypeVar("Item")
@@ -63,10 +66,7 @@ class Signals(NamedTuple):
 
 @dataclass(frozen=True)
 class Conversation:
-    """A folder of bench/simulate/conversations.py or arrays.py; signals are read when asked for.
-
-    turn: which of the human's, where there are several.
-    """
+    """A folder of bench/simulate/conversations.py or arrays.py, read when asked for. turn: which of the human's."""
 
     folder: Path
     turn: int = 0
@@ -85,10 +85,6 @@ class Conversation:
         return self.turns[self.turn]["text"]
 
     @cached_property
-    def microphones(self) -> int:
-        return soundfile.info(self.folder / "mic.flac").channels
-
-    @cached_property
     def meta(self) -> dict:
         return json.loads((self.folder / "meta.json").read_text(encoding="utf-8"))
 
@@ -105,8 +101,9 @@ class Conversation:
 
     def array(self, microphones: int) -> tuple[Signals, Profile]:
         """Signals and calibration of the first so many microphones; raises NotHere where there are fewer."""
-        if self.microphones < microphones:
-            raise NotHere(f"{self.microphones} microphones, expected {microphones}")
+        there = soundfile.info(self.folder / "mic.flac").channels
+        if there < microphones:
+            raise NotHere(f"{there} microphones, expected {microphones}")
         mic, sweep, fan = (self.read_all(name)[:, :microphones] for name in ("mic", "sweep_mic", "fan_only"))
         return Signals(mic, self.read("ref")), calibrate(self.read("sweep_ref"), sweep, fan)
 
@@ -117,7 +114,7 @@ class Conversation:
 
     @cached_property
     def profile(self) -> Profile:
-        return calibrate(self.read("sweep_ref"), self.read("sweep_mic"), self.read("fan_only"))
+        return calibrate(*map(self.read, CALIBRATION))
 
     @property
     def span(self) -> slice:
@@ -125,7 +122,7 @@ class Conversation:
         return slice(turn["start"], turn["end"])
 
     def signals(self) -> Signals:
-        return Signals(self.read("mic"), self.read("ref"), self.read("clean"), self.span)
+        return Signals(*map(self.read, ("mic", "ref", "clean")), self.span)
 
     def delayed_reference(self) -> Samples:
         """The reference with each utterance delayed by its true lag and the converters' delay, less MARGIN, (n,)."""
@@ -152,21 +149,7 @@ def direct_delay(sweep_ref: Samples, sweep_mic: Samples) -> int:
     return int(np.argmax(np.abs(response[:SAMPLE_RATE])))
 
 
-def find_conversations(folders: Sequence[Path]) -> dict[str, list[Conversation]]:
-    """Conversations by the name of their set; raises UsageError for a folder without any."""
-    sets: dict[str, list[Conversation]] = {}
-    for folder in folders:
-        found = [Conversation(path.parent) for path in sorted(folder.glob("*/meta.json"))]
-        if not found:
-            raise UsageError(
-                f"{folder} holds no */meta.json, expected conversations: make some with bench.simulate.conversations"
-            )
-        sets[folder.resolve().name if folder.resolve().name not in sets else str(folder)] = found
-    return sets
-
-
 def every(sets: dict[str, list[Item]], n: int = 1, limit: int | None = None) -> list[tuple[str, Item]]:
-    """Set and item, every n-th of each set, at most limit of them."""
     return [(name, item) for name, found in sets.items() for item in found[::n][:limit]]
 
 
@@ -196,37 +179,29 @@ class Recording:
         mic, ref = read(self.mic_path), read(self.ref_path)
         if not mic.size or abs(mic.size - ref.size) > LENGTHS_S * SAMPLE_RATE:
             found = f"{mic.size / SAMPLE_RATE:.2f} s of microphone and {ref.size / SAMPLE_RATE:.2f} s of loopback"
-            raise UsageError(
-                f"{self.name}: {found}, expected within {LENGTHS_S:.0f} s as much: take the files of one recording"
-            )
+            wanted = f"within {LENGTHS_S:.0f} s as much: take the files of one recording"
+            raise UsageError(f"{self.name}: {found}, expected {wanted}")
         return Signals(mic, np.pad(ref, (0, max(mic.size - ref.size, 0)))[: mic.size])
 
 
 def find_recordings(folder: Path) -> list[Recording]:
-    """All pairs of a folder, *_lpb.* and *_mic.*, by name.
-
-    Raises UsageError for a folder without any, and for a file without its partner.
-    """
+    """All pairs of a folder, *_lpb.* and *_mic.*, by name; raises UsageError without any and for half a pair."""
     files = {p.stem: p for p in sorted(folder.glob("*")) if p.suffix in AUDIO and p.stem.endswith(("_lpb", "_mic"))}
     names = sorted({stem[:-4] for stem in files})
     if not names:
-        raise UsageError(
-            f"{folder} holds no *_lpb and *_mic files ({', '.join(AUDIO)}), expected pairs of loopback and microphone"
-        )
-    for name in names:
-        for ending in ("_lpb", "_mic"):
-            if name + ending not in files:
-                raise UsageError(
-                    f"{folder} holds {name} without its {ending} file, expected both: add it or remove the other"
-                )
+        wanted = "expected pairs of loopback and microphone"
+        raise UsageError(f"{folder} holds no *_lpb and *_mic files ({', '.join(AUDIO)}), {wanted}")
+    for name, ending in product(names, ("_lpb", "_mic")):
+        if name + ending not in files:
+            wanted = "expected both: add it or remove the other"
+            raise UsageError(f"{folder} holds {name} without its {ending} file, {wanted}")
     devices = {name: re.sub(rf"_(\d+|({'|'.join(KINDS)}).*)$", "", name) for name in names}
     found = []
     for name in names:
         numbered = [other for other in names if devices[other] == devices[name] and re.search(r"_\d+$", other)]
         kind = next((kind for kind in KINDS if kind in name), "farend")
         first_half = name in numbered[: (len(numbered) + 1) // 2] and len(numbered) > 1
-        pair = files[f"{name}_lpb"], files[f"{name}_mic"]
-        found.append(Recording(name, kind, *pair, devices[name], first_half))
+        found.append(Recording(name, kind, files[f"{name}_lpb"], files[f"{name}_mic"], devices[name], first_half))
     return found
 
 
@@ -287,9 +262,8 @@ def lay(recordings: Sequence[Recording], speech: Path, cells: Cells, cases: int,
     for case in range(cases):
         recording, one = recordings[case % len(recordings)], spoken[order[case % order.size]]
         at = place(recording, soundfile.info(one.path).frames, max(cells.befores), rng)
-        laid += [
-            Laid(case, recording, at, one.path, one.text, ser, before) for before in cells.befores for ser in cells.sers
-        ]
+        levels = product(cells.befores, cells.sers)
+        laid += [Laid(case, recording, at, one.path, one.text, ser, before) for before, ser in levels]
     return laid
 
 
@@ -333,8 +307,6 @@ def _too_short(recording: Recording, found: float, needed: float) -> UsageError:
 
 
 class Utterance(NamedTuple):
-    """A line of transcripts.tsv."""
-
     path: Path
     speaker: str
     seconds: float
@@ -345,18 +317,16 @@ def transcripts(folder: Path) -> list[Utterance]:
     """Utterances of a length in UTTERANCE_S with their texts, from transcripts.tsv (path, speaker, seconds, text)."""
     table = folder / "transcripts.tsv"
     if not table.is_file():
-        raise UsageError(
-            f"{folder} holds no transcripts.tsv (path, speaker, seconds, text), expected humans: see bench/README.md"
-        )
+        wanted = "expected humans: see bench/README.md"
+        raise UsageError(f"{folder} holds no transcripts.tsv (path, speaker, seconds, text), {wanted}")
     with table.open(encoding="utf-8", newline="") as lines:
         rows = [row for row in csv.reader(lines, delimiter="\t", quoting=csv.QUOTE_NONE) if len(row) == 4]
     low, high = UTTERANCE_S
     found = [Utterance(folder / path, who, float(s), text) for path, who, s, text in rows if text.strip()]
     found = [one for one in found if low <= one.seconds <= high]
     if not found:
-        raise UsageError(
-            f"{table} names no utterance of {low:.0f} to {high:.0f} s with a text, expected some: give another folder"
-        )
+        said = f"{table} names no utterance of {low:.0f} to {high:.0f} s with a text"
+        raise UsageError(f"{said}, expected some: give another folder")
     return found
 
 
@@ -424,11 +394,14 @@ class Clip:
         human = b"" if self.human is None else self.human.tobytes()
         return hashlib.sha256(self.mic.tobytes() + self.ref.tobytes() + human).hexdigest()
 
-    def array(self, microphones: int) -> tuple[Signals, Profile]:
-        """See Conversation.array; raises NotHere for a recording of one microphone."""
+    def conversation(self, lacks: str) -> Conversation:
+        """The source, where it was simulated; else NotHere with what a real device lacks."""
         if not isinstance(self.source, Conversation):
-            raise NotHere(f"1 microphone, expected {microphones}")
-        return self.source.array(microphones)
+            raise NotHere(lacks)
+        return self.source
+
+    def array(self, microphones: int) -> tuple[Signals, Profile]:
+        return self.conversation(f"1 microphone, expected {microphones}").array(microphones)
 
     def known_human(self) -> Samples:
         """The human alone, (n,); raises NotHere where only the mixture was recorded."""
@@ -437,16 +410,12 @@ class Clip:
         return self.human
 
     def delayed_reference(self) -> Samples:
-        """See Conversation.delayed_reference; raises NotHere for a real device."""
-        if not isinstance(self.source, Conversation):
-            raise NotHere("the true lag of a real device is not known")
-        return self.source.delayed_reference()
+        return self.conversation("the true lag of a real device is not known").delayed_reference()
 
     def fan(self) -> Samples:
-        """The robot's fan as calibrated, as long as the clip; raises NotHere where it was not recorded."""
-        if not isinstance(self.source, Conversation):
-            raise NotHere("the fan of a real device is not known")
-        return looped(self.source.read("fan_only"), 0, self.mic.size).astype(np.float32)
+        """The robot's fan as calibrated, as long as the clip: forwards and backwards in turn, without a join to hear."""
+        alone = self.conversation("the fan of a real device is not known").read("fan_only")
+        return np.resize(np.concatenate((alone, alone[::-1])), self.mic.size)
 
     def voice(self) -> Samples:
         """Another recording of the human, (n,); raises NotHere where there is none."""
@@ -480,12 +449,24 @@ def conversation_clips(folder: Path) -> Iterator[Clip]:
         yield Clip("", room, one, str(meta["speaker"]), place_, one.text, voices)
 
 
+def find_conversations(folders: Sequence[Path]) -> dict[str, list[Clip]]:
+    """Conversations by the name of their set; raises UsageError for a folder without any."""
+    sets: dict[str, list[Clip]] = {}
+    for folder in folders:
+        found = list(conversation_clips(folder))
+        if not found:
+            wanted = "expected conversations: make some with bench.simulate.conversations"
+            raise UsageError(f"{folder} holds no */meta.json, {wanted}")
+        name = folder.resolve().name if folder.resolve().name not in sets else str(folder)
+        sets[name] = named(found, name)
+    return sets
+
+
 def recorded_clip(recording: Recording) -> Clip:
     return Clip("", f"as recorded, {recording.kind}", recording, "", recording.name)
 
 
 def laid_clips(laid: Iterable[Laid], speech: Path, room: str) -> Iterator[Clip]:
-    """Humans of a folder of speech, laid on."""
     spoken = {one.path: one for one in transcripts(speech)}
     for one in laid:
         speaker = spoken[one.speech].speaker
@@ -494,11 +475,7 @@ def laid_clips(laid: Iterable[Laid], speech: Path, room: str) -> Iterator[Clip]:
 
 
 def named(clips: Iterable[Clip], name: str) -> list[Clip]:
-    """The clips as those of a set of that name."""
     return [replace(clip, set=name) for clip in clips]
-
-
-# ---------------------------------------------------------------- samples
 
 
 def read(path: Path) -> Samples:
@@ -508,9 +485,3 @@ def read(path: Path) -> Samples:
         channels = 1 if samples.ndim == 1 else samples.shape[1]
         raise UsageError(f"{path}: {rate} Hz, {channels} channels, expected {SAMPLE_RATE} Hz mono: convert it first")
     return samples
-
-
-def looped(x: Samples, at: int, n: int) -> Samples:
-    """The n samples of x from `at` on, forwards and backwards in turn, so that no join is audible."""
-    there_and_back = np.concatenate((x, x[::-1]))
-    return there_and_back[(at + np.arange(n)) % there_and_back.size].astype(np.float64)

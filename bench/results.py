@@ -1,4 +1,4 @@
-"""The one writer of results: a JSON file, from which the Markdown page, its pictures and an HTML page are generated.
+"""The one writer of results: a JSON file, from which the Markdown page and its pictures are generated.
 
 A file has parts, one for each program that wrote to it: {"schema", "parts": {NAME: {"title", "stamp", "notes", "tables",
 "plots", ...}}}. Take `stamp` before measuring, so that it is of what ran and not of what was edited meanwhile.
@@ -6,9 +6,7 @@ A file has parts, one for each program that wrote to it: {"schema", "parts": {NA
 
 from __future__ import annotations
 
-import base64
 import hashlib
-import html
 import json
 import math
 import os
@@ -19,7 +17,7 @@ import sys
 from collections.abc import Iterable, Mapping, Sequence
 from datetime import datetime, timezone
 from io import BytesIO
-from pathlib import Path, PurePath
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -49,26 +47,10 @@ def stamp(
 ) -> dict:
     """What a result is made with and from, ready for JSON; take it before measuring.
 
-    Parameters
-    ----------
-    data
-        Folders (or files) that are read, by what they are: ``{"HUMAN": [Path("human/val")]}``. Of a folder its last
-        part is written down, with the number and size of its files and their `digest`.
-    systems
-        Rows of bench/systems.py that are measured, or "diagnosis": `bench.stale` compares their digests with today's.
-    models
-        Files or folders by name: ``{"WHISPER": folder}``; None where none is used.
-
-    Returns
-    -------
-    dict
-        command, commit, dirty, data (what, folder, files, bytes, sha256), models (the same by name), judged (digest of
-        each system's behaviour), machine, date (UTC).
-
-    Raises
-    ------
-    UsageError
-        For a folder or file that is not there.
+    data: folders (or files) that are read, by what they are: {"HUMAN": [Path("human/val")]}; of a folder its last
+    part is written down, with its `digest`. systems: rows of bench/systems.py that are measured, or "diagnosis";
+    bench.stale compares what they do with today's. models: files or folders by name, None where none is used. Raises
+    UsageError for what is not there.
     """
     from bench import stale  # it runs the systems, which know of results
 
@@ -88,11 +70,7 @@ def stamp(
 
 
 def digest(path: Path) -> dict:
-    """files, bytes and sha256 of a folder over name, size and content of each file, or of one file's content.
-
-    Names are relative to the folder, so that a copy elsewhere has the same digest. Raises UsageError where there is
-    nothing.
-    """
+    """Number of files, bytes and sha256 of a folder (names and contents) or a file; raises UsageError for nothing."""
     if path.is_file():
         return {"files": 1, "bytes": path.stat().st_size, "sha256": _sha256(path).hexdigest()}
     files = sorted((p for p in path.rglob("*") if p.is_file()), key=lambda p: p.relative_to(path).as_posix())
@@ -127,13 +105,14 @@ def code_digest(files: Iterable[Path] | None = None) -> str:
 
 
 def revision() -> tuple[str, bool]:
-    """The commit that is checked out, and whether a file other than a result differs from it.
+    """The commit that is checked out, and whether a file other than a result differs from it; "unknown" without git."""
 
-    ("unknown", True) where this is no git checkout, or git is missing.
-    """
+    def git(*arguments: str) -> str:
+        done = subprocess.run(["git", "-C", str(ROOT), *arguments], capture_output=True, text=True, check=True)
+        return done.stdout.strip()
+
     try:
-        commit = _git("rev-parse", "HEAD").strip()
-        return commit, bool(_git("status", "--porcelain", "--", ".", ":(exclude)bench/results").strip())
+        return git("rev-parse", "HEAD"), bool(git("status", "--porcelain", "--", ".", ":(exclude)bench/results"))
     except (OSError, subprocess.CalledProcessError):
         return "unknown", True
 
@@ -145,28 +124,18 @@ def machine() -> dict[str, str]:
 
 
 def command(data: Mapping[str, Sequence[Path]], models: Mapping[str, Path]) -> str:
-    """The command line that runs now, without the folders of this machine.
-
-    Data and models by what they are, other paths by their last part.
-    """
+    """The command line that runs now: data and models by what they are, other paths by their last part."""
     known = {path.resolve(): f"{what}/{path.resolve().name}" for what, paths in data.items() for path in paths}
     known |= {path.resolve(): name for name, path in models.items()}
-    return " ".join(["python -m bench", *(_without_folders(argument, known) for argument in sys.argv[1:])])
 
+    def without_folders(argument: str) -> str:
+        if argument.startswith("-"):
+            option, equals, value = argument.partition("=")
+            return option + equals + without_folders(value) if value else argument
+        path = Path(argument)
+        return known.get(path.resolve()) or (path.name if path.is_absolute() or ".." in path.parts else argument)
 
-def _without_folders(argument: str, known: Mapping[Path, str]) -> str:
-    if argument.startswith("-") and "=" in argument:
-        option, value = argument.split("=", 1)
-        return f"{option}={_without_folders(value, known)}"
-    path = PurePath(argument)
-    if not argument.startswith("-") and (named := known.get(Path(argument).resolve())):
-        return named
-    return path.name if path.is_absolute() or ".." in path.parts else argument
-
-
-def _git(*arguments: str) -> str:
-    done = subprocess.run(["git", "-C", str(ROOT), *arguments], capture_output=True, text=True, check=True)
-    return done.stdout
+    return " ".join(["python -m bench", *map(without_folders, sys.argv[1:])])
 
 
 def _sha256(path: Path) -> hashlib._Hash:
@@ -192,13 +161,11 @@ def table(name: str, title: str, columns: Sequence, rows: Iterable[Sequence], te
     | lab | 3.0 |
     | office |  |
     """
-    pairs = [column if isinstance(column, tuple) else (column, None) for column in columns]
-    heads, digits = [pair[0] for pair in pairs], [pair[1] for pair in pairs]
+    heads, digits = map(list, zip(*(column if isinstance(column, tuple) else (column, None) for column in columns)))
     return {"name": name, "title": title, "text": text, "columns": heads, "digits": digits, "rows": list(rows)}
 
 
 def absent(reasons: Mapping[str, str]) -> dict:
-    """The table of systems that cannot run here."""
     return table("absent", "Rows that cannot be had here", ["system", "why"], list(reasons.items()))
 
 
@@ -208,7 +175,6 @@ def panel(title: str, x: str, y: str, lines: Mapping[str, tuple], marks: str = "
 
 
 def plot(name: str, panels: Sequence[dict]) -> dict:
-    """A picture of panels beside each other, ready for JSON."""
     return {"name": name, "panels": list(panels)}
 
 
@@ -224,23 +190,11 @@ def write(
 ) -> str:
     """Write the part NAME of OUTPUT.json, then OUTPUT.md and its pictures from the whole file; return the part's page.
 
-    Parameters
-    ----------
-    output
-        Where to, without suffix; its folder is made where it is missing. None: nothing is written.
-    name, title
-        Of the part. Parts of other names that the file holds already stay.
-    made_with
-        From `stamp`.
-    tables, plots
-        From `table` and `plot`; all that the page shows.
-    notes
-        Markdown below the part's title.
-    data
-        Whatever else the JSON file is to hold; numbers that are not finite become null.
+    output: without suffix; None: nothing is written. Parts of other names that the file holds already stay. made_with:
+    from `stamp`. tables, plots: from `table` and `plot`, all that the page shows besides the notes, in Markdown. data:
+    whatever else the JSON file is to hold; numbers that are not finite become null.
     """
-    part = {"title": title, "stamp": made_with, "notes": notes, "tables": tables, "plots": plots, **data}
-    part = plain(part)
+    part = plain({"title": title, "stamp": made_with, "notes": notes, "tables": tables, "plots": plots, **data})
     if output:
         path = output.parent / f"{output.name}.json"
         old = read(path)["parts"] if path.exists() else {}
@@ -256,12 +210,10 @@ def read(path: Path) -> dict:
 
 
 def save(output: Path, whole: Mapping) -> None:
-    """OUTPUT.json, OUTPUT.md and a picture for each plot."""
     (output.parent / f"{output.name}.json").write_text(to_json(whole), encoding="utf-8")
-    page = "\n\n".join([f"# {output.name.replace('_', ' ').capitalize()}"] + [
-        markdown_part(part, output) for part in whole["parts"].values()
-    ])  # fmt: skip
-    (output.parent / f"{output.name}.md").write_text(page + "\n", encoding="utf-8")
+    pages = [f"# {output.name.replace('_', ' ').capitalize()}"]
+    pages += [markdown_part(part, output) for part in whole["parts"].values()]
+    (output.parent / f"{output.name}.md").write_text("\n\n".join(pages) + "\n", encoding="utf-8")
     for part in whole["parts"].values():
         for one in part["plots"]:
             (output.parent / picture_name(output, one)).write_bytes(picture(one))
@@ -300,7 +252,7 @@ def plain(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-# ---------------------------------------------------------------- Markdown, pictures, HTML
+# ---------------------------------------------------------------- Markdown, pictures
 
 
 def cell(value: Any, digits: int | None = None) -> str:
@@ -321,7 +273,6 @@ def cell(value: Any, digits: int | None = None) -> str:
 
 
 def markdown_table(one: Mapping) -> str:
-    """A table of `table` as Markdown."""
     lines = ["| " + " | ".join(one["columns"]) + " |", "|" + " --- |" * len(one["columns"])]
     for row in one["rows"]:
         cells = (cell(value, digits).replace("|", "/") for value, digits in zip(row, one["digits"], strict=True))
@@ -330,7 +281,6 @@ def markdown_table(one: Mapping) -> str:
 
 
 def markdown_part(part: Mapping, output: Path | None = None) -> str:
-    """One part of a page."""
     blocks = [f"## {part['title']}", head(part["stamp"]), part["notes"]]
     for one in part["tables"]:
         blocks += [f"### {one['title']}", one["text"], markdown_table(one)]
@@ -373,48 +323,11 @@ def picture(one: Mapping) -> bytes:
     return out.getvalue()
 
 
-def html_page(whole: Mapping, clips: Sequence[Mapping] = ()) -> str:
-    """The results as one page that needs no network.
-
-    clips: {"title", "text", "pieces": [{"name", "sound", "picture"}]}, sounds and pictures as data addresses.
-    """
-    style = (
-        "body{font:15px sans-serif;margin:2em}td,th{padding:2px 8px;text-align:left}tr:nth-child(even){background:#eee}"
-    )
-    parts = [f"<!doctype html><meta charset=utf-8><title>bench</title><style>{style}</style>"]
-    for part in whole["parts"].values():
-        parts += [
-            f"<h1>{html.escape(part['title'])}</h1>",
-            _paragraphs(head(part["stamp"])),
-            _paragraphs(part["notes"]),
-        ]
-        for one in part["tables"]:
-            rows = [one["columns"], *([cell(v, d) for v, d in zip(row, one["digits"])] for row in one["rows"])]
-            lines = ["".join(f"<td>{html.escape(str(text))}</td>" for text in row) for row in rows]
-            body = "".join(f"<tr>{line}</tr>" for line in lines)
-            parts += [f"<h2>{html.escape(one['title'])}</h2>", _paragraphs(one["text"]), f"<table>{body}</table>"]
-        for one in part["plots"]:
-            parts.append(f'<img src="data:image/png;base64,{base64.b64encode(picture(one)).decode()}">')
-    for clip in clips:
-        parts += [f"<h2>{html.escape(clip['title'])}</h2>", _paragraphs(clip["text"])]
-        for piece in clip["pieces"]:
-            parts.append(f"<p>{html.escape(piece['name'])}<br><audio controls src='{piece['sound']}'></audio><br>")
-            parts.append(f"<img src='{piece['picture']}'></p>")
-    return "\n".join(parts) + "\n"
-
-
-def _paragraphs(text: str) -> str:
-    return "".join(f"<p>{html.escape(block)}</p>" for block in text.split("\n\n") if block)
-
-
 # ---------------------------------------------------------------- tables that other pages quote
 
 
 def quote(text: str, folder: Path = RESULTS) -> str:
-    """The text with each quoted table as the results have it now.
-
-    Raises UsageError for a table that no result has.
-    """
+    """The text with each quoted table as the results have it now; raises UsageError for one that no result has."""
 
     def made(found: re.Match) -> str:
         path = folder / f"{found[2]}.json"

@@ -4,21 +4,20 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 
 from tqdm import tqdm
 
-from bench import facts as facts_of
 from bench import metrics, recordings, results, systems
 from bench.cache import Cache
-from bench.facts import facts
-from bench.metrics import CachedMetrics
+from bench.metrics import CachedMetrics, facts
 from bench.recogniser import Recogniser
 from bench.recordings import Clip, NotHere
 from edgefilter.errors import EdgefilterError
+from edgefilter.filter.budget import versions
 
 SCORING = ("speechmos", "pystoi", "jiwer", "faster-whisper", "ctranslate2")
 """Packages whose versions change scores."""
@@ -30,40 +29,35 @@ class Setup:
 
     cache: Path | None
     whisper: Path | None = None
-    networks: Mapping[str, Path] = field(default_factory=dict)
+    networks: tuple[tuple[str, Path], ...] = ()
 
 
 def run(
     clips: Sequence[Clip], rows: Sequence[systems.System], setup: Setup, jobs: int = 1, scheduler: str | None = None
 ) -> list[dict]:
-    """A row of figures for each clip and system: set, room, clip, speaker, place, text, facts, system, and what `metrics.score` gives.
+    """A row for each clip and system: what the clip is, and what `metrics.score` gives.
 
     "absent" with the reason, or the "problem" that made an output unusable, in place of figures. What is done is kept at
-    once: a row under its clip and code, a transcript or AECMOS under the sound itself. So a run that was cut off goes on
-    where it stopped, and a change of code that leaves the sound equal costs the filters' time only.
+    once: a row under its clip and code, a transcript or AECMOS under the sound itself.
     """
     tasks = [(clip, tuple(one.name for one in rows)) for clip in clips]
-    done: dict[str, list[dict]] = {}
     if jobs == 1 and not scheduler:
         made = (_work(setup, task) for task in tasks)
     else:
         from export.spread import spread  # the training side is not installed everywhere
 
         made = spread(_work, setup, tasks, jobs, scheduler)
-    for name, found in tqdm(made, total=len(tasks), unit="clip", disable=not sys.stderr.isatty()):
-        done[name] = found
+    done = dict(tqdm(made, total=len(tasks), unit="clip", disable=not sys.stderr.isatty()))
     return [row for clip in clips for row in done[clip.name]]
 
 
 def cached_metrics(setup: Setup) -> CachedMetrics:
-    """The recogniser's and the other slow metrics, with their cache."""
     kept = Cache(setup.cache, "by_sound")
     return CachedMetrics(kept, Recogniser(setup.whisper, kept) if setup.whisper else None)
 
 
 def _work(setup: Setup, task: tuple[Clip, tuple[str, ...]]) -> tuple[str, list[dict]]:
-    """All rows of one clip."""
-    (clip, names), (known, kept, cached) = task, _opened(setup.cache, setup.whisper, tuple(setup.networks.items()))
+    (clip, names), (known, kept, cached) = task, _opened(setup)
     asked = cached.recogniser.identity if cached.recogniser else "no recogniser"
     about = {"set": clip.set, "room": clip.room, "clip": clip.name, "speaker": clip.speaker, "place": clip.place}
     about |= {"text": clip.text, "facts": kept.get(lambda: facts(clip), "facts", clip.fingerprint, _scoring())}
@@ -93,10 +87,8 @@ def one(clip: Clip, system: systems.System, cached: CachedMetrics) -> dict:
 
 
 @lru_cache(maxsize=1)
-def _opened(
-    cache: Path | None, whisper: Path | None, networks: tuple[tuple[str, Path], ...]
-) -> tuple[dict[str, systems.System], Cache, CachedMetrics]:
-    return systems.catalogue(dict(networks)), Cache(cache, "rows"), cached_metrics(Setup(cache, whisper))
+def _opened(setup: Setup) -> tuple[dict[str, systems.System], Cache, CachedMetrics]:
+    return systems.catalogue(dict(setup.networks)), Cache(setup.cache, "rows"), cached_metrics(setup)
 
 
 @lru_cache(maxsize=64)
@@ -106,6 +98,4 @@ def _code(system: systems.System) -> str:
 
 @lru_cache(maxsize=1)
 def _scoring() -> str:
-    return results.code_digest([Path(str(module.__file__)) for module in (metrics, facts_of)]) + " ".join(
-        map(systems.version, SCORING)
-    )
+    return results.code_digest([Path(str(metrics.__file__))]) + str(versions(SCORING))

@@ -25,6 +25,7 @@ import numpy as np
 from websockets.asyncio.client import connect
 
 from bench import results
+from bench.latency import PERCENTILES
 from bench.metrics import percentiles
 from bench.recordings import progress, read
 from edgefilter import engines
@@ -35,7 +36,6 @@ from edgefilter.types import SAMPLE_RATE
 WARM_UP_S = 2.0
 MOST = 64
 """Streams at which the search ends."""
-ANSWERS = ("p50", "p95", "p99", "max")
 
 
 @contextmanager
@@ -125,13 +125,12 @@ def run(options: argparse.Namespace) -> str:
     made_with = results.stamp({"DEMO": [DEMO]}, names)
     rng = np.random.default_rng(options.seed)
     rows = [row for name in names for row in climb(name, options.seconds, rng)]
-    columns = ["engine", "streams", *((f"{key}, ms", 1) for key in ANSWERS), ("core's time of a stream, s a second", 3)]
-    kept = [[row["engine"], row["streams"], *(row[key] for key in ANSWERS), row["core_s"]] for row in rows]
+    times = [(f"{key}, ms", 1) for key in PERCENTILES]
+    columns = ["engine", "streams", *times, ("core's time of a stream, s a second", 3)]
+    kept = [[row[key] for key in ("engine", "streams", *PERCENTILES, "core_s")] for row in rows]
     most = [[name, in_time(rows, name)] for name in names]
-    tables = [
-        results.table("headline", "Streams that a core serves in real time", ["engine", "streams"], most),
-        results.table("answers", "How long an answer takes", columns, kept),
-    ]
+    tables = [results.table("headline", "Streams that a core serves in real time", ["engine", "streams"], most),
+              results.table("answers", "How long an answer takes", columns, kept)]  # fmt: skip
     notes = f"{options.seconds:g} s of each, one core for the service, load average before {load:.2f}."
     return results.write(options.output, "serve", "Streams per core", made_with, tables, notes=notes, rows=rows)
 

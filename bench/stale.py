@@ -75,18 +75,14 @@ def digest_of(name: str) -> str | None:
 def _of_diagnosis() -> str:
     clip = demos()[1]
     found = edgefilter.diagnose(clip.source.profile, clip.mic, clip.ref)
-    said = [
-        (
-            one.effect,
-            sorted((key, [f"{x:.2g}" for x in np.atleast_1d(value.value)]) for key, value in one.parameters.items()),
-        )
-        for one in found.ranking
-    ]
+    said = []
+    for one in found.ranking:
+        values = {key: [f"{x:.2g}" for x in np.atleast_1d(value.value)] for key, value in one.parameters.items()}
+        said.append((one.effect, sorted(values.items())))
     return hashlib.sha256(repr((found.verdict, said)).encode()).hexdigest()[:16]
 
 
 def digests_of(systems: Iterable[str]) -> dict[str, str]:
-    """The digest of each of these that can run on the demonstrations."""
     return {name: digest for name in systems if (digest := digest_of(name)) is not None}
 
 
@@ -97,9 +93,7 @@ def stale(path: Path) -> list[str]:
         return [f"{path.name}: of an earlier form"]
     found = []
     for name, part in parts.items():
-        known = part["stamp"]["judged"]
-        changed = [one for one, digest in known.items() if digest_of(one) != digest]
-        if changed:
+        if changed := [one for one, digest in part["stamp"]["judged"].items() if digest_of(one) != digest]:
             found.append(f"{path.name}, {name}: {', '.join(changed)} behave differently now")
     return found
 
@@ -109,7 +103,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> str:
-    """One line where all results hold; raises UsageError with the others."""
     files = options.results or sorted(results.RESULTS.glob("*.json"))
     reasons = [reason for path in files for reason in stale(path)]
     if reasons:

@@ -12,7 +12,6 @@ import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, partial
-from importlib import metadata
 from pathlib import Path
 from typing import NamedTuple
 
@@ -28,6 +27,7 @@ from edgefilter.dsp.metrics import si_sdr
 from edgefilter.dsp.stft import StftConfig
 from edgefilter.engines import HAVE_MODEL, create
 from edgefilter.errors import EdgefilterError, UsageError
+from edgefilter.filter.budget import versions
 from edgefilter.filter.echo_path import FilteredHop, Learner, Lesson, PathState
 from edgefilter.types import SAMPLE_RATE, Samples
 
@@ -66,10 +66,9 @@ class Output(NamedTuple):
 class System:
     """A row.
 
-    kind: unfiltered, paper, own, peer or bound. knows: what it had besides microphone and reference.
-    latency_ms: from its windows, None where it answers only at the end. missing: raises NotHere where it cannot run
-    here. code: files and versions on which its output depends, beside the package. model: a network that no engine
-    brings.
+    kind: unfiltered, paper, own, peer or bound. knows: what it had besides microphone and reference. latency_ms: from
+    its windows, None where it answers only at the end. missing: raises NotHere where it cannot run here. code: files
+    and versions on which its output depends. model: a network that no engine brings.
     """
 
     name: str
@@ -85,11 +84,6 @@ class System:
     @property
     def learns(self) -> bool:
         return self.name.endswith("-learning")
-
-    @property
-    def attainable(self) -> bool:
-        """Whether a robot can have it."""
-        return self.kind != "bound" and not self.name.endswith(TRUE_LAG)
 
 
 class Row(NamedTuple):
@@ -112,7 +106,11 @@ def catalogue(networks: Mapping[str, Path] | None = None) -> dict[str, System]:
     rows += [*_paper(), *(_own(engine, way) for way in WAYS for engine in OWN), *_arrays(), *_peers()]
     rows += [_own("crnn", "", path, f"crnn:{name}") for name, path in (networks or {}).items()]
     rows += _bounds()
-    rows += [System(name, title, "peer", lambda clip: Output(clip.mic), missing=partial(_refuse, why))
+
+    def refuse(why: str) -> object:
+        raise NotHere(why)
+
+    rows += [System(name, title, "peer", lambda clip: Output(clip.mic), missing=partial(refuse, why))
              for name, (title, why) in ABSENT.items()]  # fmt: skip
     return {one.name: one for one in rows}
 
@@ -132,18 +130,10 @@ def present(rows: Iterable[System]) -> tuple[list[System], dict[str, str]]:
     for one in rows:
         try:
             one.missing()
+            here.append(one)
         except EdgefilterError as error:
             reasons[one.title] = str(error).replace(f"{results.ROOT}/", "")
-        else:
-            here.append(one)
     return here, reasons
-
-
-def _refuse(why: str) -> object:
-    raise NotHere(why)
-
-
-# ---------------------------------------------------------------- the package's engines
 
 
 def run_engine(
@@ -188,23 +178,22 @@ def _own(engine: str, way: str, model: Path | None = None, name: str = "", title
 
 def _arrays() -> list[System]:
     """Rows of `crnn` with several microphones: streamed, the finished turns, and what is made of them as one."""
-    found = []
+    found, late = [], _latency_ms("crnn")
+
+    def add(name: str, title: str, run: Callable[[Clip], Output], knows: str, latency_ms: float | None = late) -> None:
+        code = partial(_engine_code, "crnn")
+        found.append(System(f"crnn-{name}", f"crnn{title}", "own", run, knows, latency_ms, code=code))
+
     for count in ARRAYS:
         for way in ("", "-learning"):
-            told, code = f"{count} microphones, {WAYS[way]}", partial(_engine_code, "crnn")
-            knows, late = WAYS[way] if way else "calibration", _latency_ms("crnn")
+            told, knows = f", {count} microphones, {WAYS[way]}", WAYS[way] if way else "calibration"
             streamed, finished = (partial(_of_array, count, bool(way), turns) for turns in (False, True))
-            found.append(System(f"crnn-{count}{way}", f"crnn, {told}", "own", streamed, knows, late, code=code))
-            title = f"crnn, {told}, finished turns"
-            found.append(System(f"crnn-{count}-turns{way}", title, "own", finished, knows, None, code=code))
-        for name, run, told in (
-            ("sum", _of_sum, f"{count} microphones, delayed and summed towards the human"),
-            ("best", _of_best, f"the best of {count} microphones, by SI-SDR"),
-        ):
-            title, made = f"crnn on {told}, calibrated", partial(run, count)
-            found.append(
-                System(f"crnn-{name}-of-{count}", title, "own", made, "the truth", _latency_ms("crnn"), code=code)
-            )
+            add(f"{count}{way}", told, streamed, knows)
+            add(f"{count}-turns{way}", f"{told}, finished turns", finished, knows, None)
+        told = f" on {count} microphones, delayed and summed towards the human, calibrated"
+        add(f"sum-of-{count}", told, partial(_of_sum, count), "the truth")
+        told = f" on the best of {count} microphones, by SI-SDR, calibrated"
+        add(f"best-of-{count}", told, partial(_of_best, count), "the truth")
     return found
 
 
@@ -216,35 +205,31 @@ def _of_array(count: int, learning: bool, turns: bool, clip: Clip) -> Output:
     """What `crnn` makes of the first count microphones; turns: with the finished turns in place of what was streamed."""
     signals, profile = clip.array(count)
     key = clip.fingerprint, count, learning
-    if key not in _streamed:
-        while len(_streamed) >= 2 * len(ARRAYS):
+    if key in _streamed:
+        clip.lent_s += _streamed[key][1]
+    else:
+        if len(_streamed) == 2 * len(ARRAYS):
             _streamed.pop(next(iter(_streamed)))
         began, learner = time.perf_counter(), PathLearner(profile) if learning else None
         output = run_engine(Row("crnn", True, learning), signals, profile, learner)
         _streamed[key] = output, time.perf_counter() - began
-    else:
-        clip.lent_s += _streamed[key][1]
     found = _streamed[key][0]
-    if turns:
-        samples = found.samples.copy()
-        for turn in (event.turn for event in found.events or () if event.turn):
-            samples[turn.start : turn.start + turn.samples.size] = turn.samples
-        found = found._replace(samples=samples)
-    return found
+    if not turns:
+        return found
+    samples = found.samples.copy()
+    for turn in (event.turn for event in found.events or () if event.turn):
+        samples[turn.start : turn.start + turn.samples.size] = turn.samples
+    return found._replace(samples=samples)
 
 
 def _calibrated(clip: Clip, mic: Samples, sweep: Samples, fan: Samples) -> Output:
     """What `crnn` makes of a microphone (n,), calibrated with what it heard of the sweep and of the fan."""
-    return run_engine(
-        Row("crnn", True, False), Signals(mic, clip.ref), calibrate(clip.source.read("sweep_ref"), sweep, fan)
-    )
+    profile = calibrate(clip.source.read("sweep_ref"), sweep, fan)
+    return run_engine(Row("crnn", True, False), Signals(mic, clip.ref), profile)
 
 
 def _of_sum(count: int, clip: Clip) -> Output:
-    """What `crnn` makes of the microphones delayed and summed, so that the human of this clip is in step in all of them.
-
-    Where the human stands is taken from the truth; calibration and conversation go through the same sum.
-    """
+    """What `crnn` makes of the microphones' sum, the human (by the truth) in step in all of them."""
     clip.array(count)
     clean = clip.source.read_all("clean")[clip.span, :count].T
     size = 2 * clean.shape[1]
@@ -284,10 +269,9 @@ def _latency_ms(engine: str) -> float | None:
 
 
 class _Kept:
-    """A learner that learns a recording once, and then says again what it said; one stream only, from its first hop.
+    """Learns a recording once and says it again to the next engine, since no lesson depends on the engine."""
 
-    What is learned does not depend on the engine, so the engines of a recording share the work.
-    """
+    past = PathLearner.past
 
     def __init__(self, profile: Profile | None) -> None:
         self._learner: Learner | None = PathLearner(profile)
@@ -319,18 +303,15 @@ def _lessons(recording: str, profile: Profile | None) -> _Kept:
     """The learner that has taken this recording before, or a new one; at most four are kept."""
     key = (recording, profile is not None)
     if key not in _latest:
-        while len(_latest) >= 4:
+        if len(_latest) == 4:
             _latest.pop(next(iter(_latest)))
         _latest[key] = _Kept(profile)
     return _latest[key]
 
 
-# ---------------------------------------------------------------- the source paper, peers, bounds
-
-
 def _paper() -> list[System]:
-    rows = [_voicefilter(), _own("paper-ss", "", title="SS before post-filtering")]
-    rows.append(_own("paper-crnn", "", title="CRNN of the paper's shape"))
+    rows = [_voicefilter(), _own("paper-ss", "", title="SS before post-filtering"),
+            _own("paper-crnn", "", title="CRNN of the paper's shape")]  # fmt: skip
     for name, (differs, option) in NARROW.items():
         title = f"CRNN of the paper's shape, narrower (1.8 of 34 M parameters){differs}"
         train = f"python -m export.train --network paper --filters 16 2 --lstm 80 --hidden 150{option}"
@@ -346,11 +327,9 @@ def _voicefilter() -> System:
     model = voicefilter.MODEL if voicefilter.MODEL.is_file() else None
 
     def code() -> str:
-        return _files(voicefilter, model) + version(voicefilter.ENCODER)
+        return _files(voicefilter, model) + str(versions([voicefilter.ENCODER]))
 
-    return System(
-        "voicefilter", title, "paper", run, "the human's voice", missing=voicefilter.find, code=code, model=model
-    )
+    return System("voicefilter", title, "paper", run, "the human's voice", None, voicefilter.find, code, model)
 
 
 def _files(module: object, model: Path | None = None) -> str:
@@ -360,13 +339,9 @@ def _files(module: object, model: Path | None = None) -> str:
 
 
 def _peers() -> list[System]:
-    late = {
-        "speexdsp": peers.FRAME,
-        "speexdsp-suppressed": 2 * peers.FRAME,
-        "aec3": peers.AEC3_FRAME + peers.AEC3_DELAY,
-    }
+    late = (peers.FRAME, peers.FRAME + peers.SUPPRESSED_DELAY, peers.AEC3_FRAME + peers.AEC3_DELAY)
     found = []
-    for name, title in PEERS.items():
+    for (name, title), samples in zip(PEERS.items(), late, strict=True):
         process = getattr(peers, name.replace("-", "_"))
         probe = partial(process, *np.zeros((2, SAMPLE_RATE // 10), np.float32))
         for ending, told in (("", ""), (TRUE_LAG, ", told the true lag")):
@@ -374,7 +349,7 @@ def _peers() -> list[System]:
             def run(clip: Clip, process: Callable = process, lagged: bool = bool(ending)) -> Output:
                 return Output(process(clip.mic, clip.delayed_reference() if lagged else clip.ref))
 
-            knows, ms = ("the true lag" if ending else "neither"), 1000 * late[name] / SAMPLE_RATE
+            knows, ms = ("the true lag" if ending else "neither"), 1000 * samples / SAMPLE_RATE
             found.append(System(name + ending, title + told, "peer", run, knows, ms, probe, partial(_files, peers)))
     return found
 
@@ -400,10 +375,3 @@ def ideal_mask(clip: Clip) -> Output:
     error, human = (voicefilter.analysed(config, x) for x in (linear(clip), clip.known_human()))
     gain = np.minimum(np.abs(human) / np.maximum(np.abs(error), 1e-9), 1.0)
     return Output(voicefilter.synthesised(config, gain * error, clip.mic.size))
-
-
-def version(package: str) -> str:
-    try:
-        return f"{package} {metadata.version(package)}"
-    except metadata.PackageNotFoundError:
-        return f"{package} not installed"

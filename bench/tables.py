@@ -16,7 +16,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> str:
-    """Which pages changed."""
     changed = []
     for page in results.PAGES:
         old = page.read_text(encoding="utf-8")

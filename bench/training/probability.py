@@ -19,19 +19,8 @@ import numpy as np
 from scipy.optimize import minimize
 from scipy.special import expit, logit
 
-from bench import recordings, results, systems
-from bench.metrics import (
-    FIRST_DB,
-    FRAME,
-    IN_TIME_S,
-    THRESHOLDS,
-    first_sound,
-    frame_power,
-    in_time,
-    noticed,
-    replay,
-    starts,
-)
+from bench import metrics, recordings, results, systems
+from bench.metrics import FRAME, IN_TIME_S, THRESHOLDS
 from bench.recordings import Cells, Signals, progress
 from edgefilter.filter.barge_in import CENTRE, CENTRE_CALIBRATED, SLOPE, BargeInSettings
 from edgefilter.profile.data import Profile
@@ -74,15 +63,15 @@ def listened(kind: str, signals: Signals, profile: Profile | None) -> Listened:
     odds = logit(np.clip(said, SURE, 1 - SURE)) / SLOPE + centre
     if signals.human is None:
         return Listened(kind, odds, np.zeros(odds.size, bool), heard.hop)
-    power = frame_power(signals.human[: odds.size * heard.hop], heard.hop)
-    sounds = power > 10 ** (-FIRST_DB / 10) * power.max()
-    onset = first_sound(signals.human)
+    power = metrics.frame_power(signals.human[: odds.size * heard.hop], heard.hop)
+    sounds = power > 10 ** (-metrics.FIRST_DB / 10) * power.max()
+    onset = metrics.first_sound(signals.human)
     return Listened(kind, odds, sounds, heard.hop, onset, audible=audible(signals.human, onset))
 
 
 def audible(human: Samples, onset: int) -> bool:
     """Whether anything within AUDIBLE_DB of the human's loudest 20 ms sounds within IN_TIME_S of the onset."""
-    power = frame_power(human)
+    power = metrics.frame_power(human)
     soon = power[onset // FRAME :][: round(IN_TIME_S * SAMPLE_RATE / FRAME)]
     return bool(soon.max() > 10 ** (-AUDIBLE_DB / 10) * power.max())
 
@@ -97,9 +86,8 @@ def streams(options: argparse.Namespace) -> Iterator[Listened]:
             yield listened("real", one.signals(), None)._replace(ser=one.ser)
     sets = recordings.find_conversations(options.conversations)
     for _, one in progress(recordings.every(sets, options.every, options.limit), "conversation"):
-        both = one.signals()
-        yield listened("simulated", Signals(both.mic - both.human, both.ref), one.profile)
-        yield listened("simulated", both, one.profile)
+        yield listened("simulated", Signals(one.mic - one.human, one.ref), one.profile)
+        yield listened("simulated", one.signals, one.profile)
 
 
 def pooled(chosen_ones: Sequence[Listened]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -123,32 +111,24 @@ def fitted(chosen_ones: Sequence[Listened]) -> tuple[float, float]:
 
 def sparing(chosen_ones: Sequence[Listened], centre: float, slope: float, false_starts: float) -> float:
     """The lowest threshold on the fitted probability at which robots alone have at most so many false starts an hour."""
-    alone = robots_alone(chosen_ones)
-    few = (at for at in FINE if false_starts_an_hour(alone, centre, slope, at) <= false_starts)
+    few = (at for at in FINE if false_starts_an_hour(chosen_ones, centre, slope, at) <= false_starts)
     return next(few, FINE[-1])
 
 
-def robots_alone(chosen_ones: Sequence[Listened]) -> list[Listened]:
-    """Those in whom nobody speaks."""
-    return [one for one in chosen_ones if one.onset is None]
-
-
-def false_starts_an_hour(alone: Sequence[Listened], centre: float, slope: float, threshold: float) -> float:
-    """At that threshold on the fitted probability."""
+def false_starts_an_hour(chosen_ones: Sequence[Listened], centre: float, slope: float, threshold: float) -> float:
+    """Of those in whom nobody speaks, at that threshold on the fitted probability."""
+    alone = [one for one in chosen_ones if one.onset is None]
     hours = sum(one.odds.size * one.hop for one in alone) / SAMPLE_RATE / 3600
-    return sum(starts(replayed(one, centre, slope, threshold)) for one in alone) / hours
+    return sum(metrics.starts(replayed(one, centre, slope, threshold)) for one in alone) / hours
 
 
 def replayed(one: Listened, centre: float, slope: float, threshold: float) -> list[Event]:
     """What the filter would have said by the fitted probability."""
-    return replay(expit(slope * (one.odds - centre)).tolist(), one.hop, threshold)
+    return metrics.replay(expit(slope * (one.odds - centre)).tolist(), one.hop, threshold)
 
 
 def platt(centre: float, slope: float, threshold: float, usual: float) -> dict[str, float]:
-    """Scale and bias of the network's log-odds, by which the filter's threshold stands where this one does.
-
-    The slope becomes the filter's as well. usual: the filter's centre.
-    """
+    """Scale and bias of the network's log-odds that put the filter's threshold (usual: its centre, same slope) here."""
     scale = slope / SLOPE
     apart = float(logit(BargeInSettings().threshold) - logit(threshold)) / SLOPE
     return {"scale": scale, "bias": usual + apart - scale * centre}
@@ -170,11 +150,11 @@ def reliability(chosen_ones: Sequence[Listened], centre: float, slope: float) ->
 
 def curve(chosen_ones: Sequence[Listened], centre: float, slope: float) -> list[dict]:
     """For each threshold: false starts an hour on robots alone, and laid or conversing humans noticed in time."""
-    alone, heard = robots_alone(chosen_ones), told(chosen_ones)
     points = []
     for threshold in THRESHOLDS:
-        soon = [in_time(noticed(replayed(one, centre, slope, threshold), one.onset)) for one in heard]
-        false = false_starts_an_hour(alone, centre, slope, threshold)
+        heard = ((one.onset, replayed(one, centre, slope, threshold)) for one in told(chosen_ones))
+        soon = [metrics.in_time(metrics.noticed(events, onset)) for onset, events in heard]
+        false = false_starts_an_hour(chosen_ones, centre, slope, threshold)
         points.append({"threshold": threshold, "an_hour": false, "noticed": float(np.mean(soon))})
     return points
 
@@ -187,10 +167,8 @@ def told(chosen_ones: Sequence[Listened]) -> list[Listened]:
 def tables(kinds: dict[str, dict]) -> list[dict]:
     """The fits of all kinds; for each its reliability and its curve, as it is and fitted."""
     keys = ("centre", "slope", "threshold", "scale", "bias")
-    fits = [
-        [name, *(of[key] for key in keys), of["before"]["distance"], of["after"]["distance"]]
-        for name, of in kinds.items()
-    ]
+    fits = [[name, *(of[key] for key in keys), *(of[when]["distance"] for when in ("before", "after"))]
+            for name, of in kinds.items()]  # fmt: skip
     columns = ["", *((key, 2) for key in keys), ("distance as it is", 3), ("distance fitted", 3)]
     found = [results.table("fits", "Centre, slope, and the scale and bias for --platt", columns, fits)]
     for name, of in kinds.items():
@@ -210,9 +188,8 @@ def tables(kinds: dict[str, dict]) -> list[dict]:
 
 def run(options: argparse.Namespace) -> str:
     data = {"RECORDINGS": [options.real] if options.real else [], "conversations": options.conversations}
-    made_with = results.stamp(
-        data | {"HUMAN": [options.speech] if options.speech else []}, ["crnn", "crnn-uncalibrated"]
-    )
+    data["HUMAN"] = [options.speech] if options.speech else []
+    made_with = results.stamp(data, ["crnn", "crnn-uncalibrated"])
     found, kinds = list(streams(options)), {}
     for kind in dict.fromkeys(one.kind for one in found):
         own = [one for one in found if one.kind == kind]
@@ -226,6 +203,5 @@ def run(options: argparse.Namespace) -> str:
         humans = told(own)
         kinds[kind] |= {"humans": len(humans), "audible": sum(one.audible for one in humans)}
     notes = f"Of {ENGINE}'s network; a human in one hop of {1 / HUMAN_SHARE:.0f}."
-    return results.write(
-        options.output, "probability", "Probability of speech", made_with, tables(kinds), notes=notes, kinds=kinds
-    )
+    return results.write(options.output, "probability", "Probability of speech", made_with, tables(kinds), notes=notes,
+                         kinds=kinds)  # fmt: skip

@@ -11,6 +11,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -19,7 +20,7 @@ import torch
 
 from bench import recordings, results, runner
 from bench.cache import Cache
-from bench.metrics import CachedMetrics, difference, mean, pooled
+from bench.metrics import CachedMetrics, difference, mean, middle, pooled
 from bench.recordings import Cells, Clip, progress
 from edgefilter import PathLearner
 from edgefilter.dsp.metrics import si_sdr
@@ -40,8 +41,6 @@ REAL = Cells(sers=(-10.0, -20.0), befores=(0.0, 10.0))
 BASE = "ss"
 COLD, LAID = " cold", "real loudspeaker"
 """How the kind of a conversation without its profile ends, and the kind of humans laid on real loudspeakers."""
-Make = Callable[[Profile | None], Engine]
-"""Of the profile that the filter runs with."""
 
 
 class Case(NamedTuple):
@@ -53,9 +52,9 @@ class Case(NamedTuple):
 
 
 class Contender(NamedTuple):
-    """An engine to be compared. make: the engine; identity: of the code and the network on which its answer depends."""
+    """An engine, made of the filter's profile; identity: of the code and the network on which its answer depends."""
 
-    make: Make
+    make: Callable[[Profile | None], Engine]
     identity: str
 
 
@@ -81,9 +80,7 @@ class Mixed:
         return self.engine.initial_state(), self.other.initial_state()
 
     def step(self, frame: Frame, state: EngineState) -> tuple[Output, EngineState]:
-        (ours, mine), (theirs, its) = (
-            engine.step(frame, each) for engine, each in zip((self.engine, self.other), state, strict=True)
-        )
+        (ours, mine), (theirs, its) = self.engine.step(frame, state[0]), self.other.step(frame, state[1])
         spectrum = (1 - self.share) * ours.spectrum + self.share * theirs.spectrum
         return Output(spectrum.astype(np.complex64), ours.speech_probability), (mine, its)
 
@@ -129,10 +126,10 @@ def contenders(
 ) -> dict[str, Contender]:
     """What is compared, by name: linear, ss and crnn as they ship, each checkpoint's averaged weights, alone and mixed."""
     code = results.code_digest()
-    found = {"linear": Contender(lambda profile: create("linear", profile), code)}
+    found = {"linear": Contender(partial(create, "linear"), code)}
     for name in (BASE, "crnn"):
         shipped = "".join(results.digest(path)["sha256"] for path in results.models_of([name]).values())
-        found |= _with_error(name, lambda profile, name=name: create(name, profile), code + shipped, error)
+        found |= _with_error(name, Contender(partial(create, name), code + shipped), error)
     folder.mkdir(parents=True, exist_ok=True)
     for path in checkpoints:
         trained = onnx_export.load(path)
@@ -140,23 +137,20 @@ def contenders(
         model = folder / f"{path.parent.name}_{path.stem}.onnx"
         onnx_export.export(trained, model)
         identity = code + results.digest(path)["sha256"]
-        found |= _with_error(name, lambda _, model=model: Crnn(model), identity, error)
+        found |= _with_error(name, Contender(lambda _, model=model: Crnn(model), identity), error)
         for share in wiener:
-
-            def mixed(_: Profile | None, model: Path = model, share: float = share) -> Engine:
-                return mix(Crnn(model), SpectralSubtraction, share)
-
-            found |= _with_error(f"{name}, {share:g} {BASE}", mixed, identity, error)
+            mixed = Contender(lambda _, m=model, s=share: mix(Crnn(m), SpectralSubtraction, s), identity)
+            found |= _with_error(f"{name}, {share:g} {BASE}", mixed, error)
     return found
 
 
-def _with_error(name: str, make: Make, identity: str, shares: Sequence[float]) -> dict[str, Contender]:
+def _with_error(name: str, one: Contender, shares: Sequence[float]) -> dict[str, Contender]:
     """An engine as it is, and with each share of the linear stage's error."""
-    mixed = {
-        f"{name}, {share:g} error": Contender(lambda profile, s=share: mix(make(profile), Linear, s), identity)
-        for share in shares
-    }
-    return {name: Contender(make, identity), **mixed}
+    found = {name: one}
+    for share in shares:
+        mixed = Contender(lambda profile, s=share: mix(one.make(profile), Linear, s), one.identity)
+        found[f"{name}, {share:g} error"] = mixed
+    return found
 
 
 def mix(engine: Engine, other: Callable[[StftConfig], Engine], share: float) -> Mixed:
@@ -167,7 +161,6 @@ def mix(engine: Engine, other: Callable[[StftConfig], Engine], share: float) -> 
 def compare(
     case: Case, making: dict[str, Contender], learning: bool, cached: CachedMetrics, kept: Cache
 ) -> Iterator[dict]:
-    """SI-SDR and word errors of every contender."""
     given: dict[StftConfig, list[Frame]] = {}
     clip, asked = case.clip, cached.recogniser.identity if cached.recogniser else ""
 
@@ -186,18 +179,14 @@ def compare(
 
 def cases(options: argparse.Namespace) -> list[Case]:
     found = []
-    for name, conversations in recordings.find_conversations(options.conversations).items():
-        folder = conversations[0].folder.parent
-        clips = recordings.named(recordings.conversation_clips(folder), name)[:: options.every][: options.limit]
-        for clip in clips:
-            found.append(Case(f"{name} {clip.room}", clip, clip.profile))
-            found += [Case(f"{name} {clip.room}{COLD}", clip, None)] * options.cold
+    sets = recordings.find_conversations(options.conversations)
+    for name, clip in recordings.every(sets, options.every, options.limit):
+        found.append(Case(f"{name} {clip.room}", clip, clip.profile))
+        found += [Case(f"{name} {clip.room}{COLD}", clip, None)] * options.cold
     if options.alone:
         laid = recordings.lay(options.alone, options.speech, REAL, options.cases, options.seed)
-        clips = recordings.named(recordings.laid_clips(laid, options.speech, LAID), "real")[:: options.every][
-            : options.limit
-        ]
-        found += [Case(LAID, clip, None) for clip in clips]
+        clips = recordings.named(recordings.laid_clips(laid, options.speech, LAID), "real")
+        found += [Case(LAID, clip, None) for clip in clips[:: options.every][: options.limit]]
     return found
 
 
@@ -207,27 +196,17 @@ def tables(rows: Sequence[dict]) -> list[dict]:
     cold = [kind for kind in kinds if kind.endswith(COLD)]
     warm = [kind for kind in kinds if kind not in (*cold, LAID)]
     groups = {"with a calibration": warm, "without": cold, "all": list(kinds)}
-    together = {
-        name: [row for kind in group for row in kinds[kind]] for name, group in groups.items() if len(group) > 1
-    }
-    columns = [
-        "system",
-        ("WER, %", 0),
-        ("left out", 0),
-        ("put in", 0),
-        ("WER less that of ss, points", 1),
-        ("SI-SDR, dB", 1),
-    ]
+    together = {name: [row for kind in of for row in kinds[kind]] for name, of in groups.items() if len(of) > 1}
+    columns = ["system", ("WER, %", 0), ("left out", 0), ("put in", 0), ("WER less that of ss, points", 1)]
+    columns.append(("SI-SDR, dB", 1))
     found = []
     for kind, own in (kinds | together).items():
         cells = []
         for system in dict.fromkeys(row["system"] for row in own):
             mine, base = ([row for row in own if row["system"] == name] for name in (system, BASE))
-            kinds_of = [pooled(mine, key, "words") for key in ("deletions", "insertions")]
+            shares = [middle(pooled(mine, key, "words")) for key in ("deletions", "insertions")]
             less = difference(mine, base, "capped") if system != BASE else None
-            cells.append(
-                [system, mean(mine, "capped"), *(one and one["mean"] for one in kinds_of), less, mean(mine, "si_sdr")]
-            )
+            cells.append([system, mean(mine, "capped"), *shares, less, mean(mine, "si_sdr")])
         title = f"{kind}: {len({row['clip'] for row in own})} utterances"
         found.append(results.table(f"words-{kind}".replace(" ", "-"), title, columns, cells))
     return found
@@ -238,9 +217,8 @@ def run(options: argparse.Namespace) -> str:
         raise UsageError("words need a recogniser: give --whisper")
     torch.set_num_threads(1)
     checkpoints = {f"{path.parent.name}/{path.name}": path for path in options.checkpoints}
-    data = {"conversations": options.conversations} | (
-        {"RECORDINGS": [options.real], "HUMAN": [options.speech]} if options.real else {}
-    )
+    data = {"conversations": options.conversations}
+    data |= {"RECORDINGS": [options.real], "HUMAN": [options.speech]} if options.real else {}
     made_with = results.stamp(data, ["linear", BASE, "crnn"], {"WHISPER": options.whisper, **checkpoints})
     making = contenders(options.checkpoints, options.wiener, options.error, options.cache / "checkpoints")
     cached, kept = runner.cached_metrics(runner.Setup(options.cache, options.whisper)), Cache(options.cache, "rows")
