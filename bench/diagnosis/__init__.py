@@ -18,7 +18,7 @@ import argparse
 from pathlib import Path
 
 from bench.diagnosis import names, ordinary, probe, proof, run_time
-from bench.simulate.effect_conversations import EFFECTS
+from bench.simulate.hidden_cases import EFFECTS
 from edgefilter.errors import UsageError
 
 PARTS = {"names": names.run, "proof": proof.run, "run-time": run_time.run, "probe": probe.run, "ordinary": ordinary.run}
@@ -32,24 +32,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--real", type=Path, nargs="+", default=[], metavar="DIR", help="proof: pairs NAME_lpb and NAME_mic")
     add("--voices", type=Path, metavar="DIR", help="run-time, probe: the robot's voices")
     add("--speech", type=Path, metavar="DIR", help="run-time: the humans")
-    add(
-        "--count",
-        type=int,
-        default=8,
-        help="run-time: conversations of each effect; probe: robots of each pair and truth (default: %(default)s)",
-    )
+    counts = "run-time: conversations of each effect; probe: robots of each pair and truth (default: %(default)s)"
+    add("--count", type=int, default=8, help=counts)
     add("--effects", default=",".join(EFFECTS), metavar="A,B,...", help="run-time: which of them (default: all)")
     add("--engines", default=",".join(run_time.ENGINES), metavar="A,B,...", help="run-time (default: %(default)s)")
 
 
 def run(options: argparse.Namespace) -> str:
-    """Run one part."""
     if options.part == "run-time" and not (options.voices and options.speech):
         raise UsageError("the part 'run-time' needs --voices and --speech, folders with a transcripts.tsv")
     if options.part == "probe" and not options.voices:
         raise UsageError("the part 'probe' needs --voices, a folder with a transcripts.tsv")
-    if options.part in ("names", "proof", "ordinary") and not (
-        options.cases or (options.part == "proof" and options.real)
-    ):
+    given = options.cases or (options.part == "proof" and options.real)
+    if options.part in ("names", "proof", "ordinary") and not given:
         raise UsageError(f"the part '{options.part}' needs --cases, folders of bench.simulate.hidden_cases")
     return PARTS[options.part](options)

@@ -21,8 +21,8 @@ from pathlib import Path
 import numpy as np
 
 from bench import results
-from bench.metrics import wilson
-from bench.recordings import progress, read
+from bench.metrics import counted
+from bench.recordings import CALIBRATION, progress, read
 from bench.stale import DIAGNOSIS
 from edgefilter.calibration.calibrate import calibrate
 from edgefilter.diagnosis.diagnose import diagnose
@@ -30,7 +30,7 @@ from edgefilter.echo.effects.catalogue import find
 from edgefilter.errors import UsageError
 from edgefilter.types import Samples
 
-SIGNALS = ("sweep_ref", "sweep_mic", "fan_only", "ref", "mic")
+SIGNALS = (*CALIBRATION, "ref", "mic")
 STRENGTHS = ("clear", "moderate", "near")
 EXPLAINED_LIMIT_DB = 1.0
 """Excess above which a case from outside the catalogue must never be called explained."""
@@ -112,30 +112,22 @@ def find_cases(folder: Path, limit: int | None) -> list[Path]:
 
 
 def signals(case: Path) -> dict[str, Samples]:
-    """Its recordings by name, (n,) each."""
     return {name: read(case / f"{name}.flac") for name in SIGNALS}
 
 
 def diagnosed(case: Path, truth: Mapping | None) -> Outcome:
     """Diagnose one case; an error of the product is its answer."""
-    known = (
-        {"effects": [], "raw": [], "strength": "sealed"} if truth is None else {"raw": truth["effects"]} | dict(truth)
-    )
+    sealed = {"effects": [], "raw": [], "strength": "sealed"}
+    known = sealed if truth is None else {"raw": truth["effects"], **truth}
     of = (case.name, tuple(sorted(known["effects"])), tuple(known["raw"]), known["strength"])
     recorded, started, said = signals(case), time.process_time(), {}
     try:
         profile = calibrate(*(recorded[name] for name in SIGNALS[:3]))
         found = diagnose(profile, recorded["mic"], recorded["ref"])
-        said = {
-            "verdict": found.verdict,
-            "named": tuple(one.effect for one in found.ranking),
-            "before_db": tuple(one.excess_before_db for one in found.ranking),
-            "after_db": tuple(one.excess_after_db for one in found.ranking),
-            "share": tuple(one.share for one in found.ranking),
-            "excess_db": found.comparison.excess_db,
-            "remaining_db": found.remaining_db,
-            "evidence": found.evidence,
-        }
+        each = {"named": "effect", "before_db": "excess_before_db", "after_db": "excess_after_db", "share": "share"}
+        said = {key: tuple(getattr(one, of) for one in found.ranking) for key, of in each.items()}
+        said |= {"verdict": found.verdict, "evidence": found.evidence}
+        said |= {"excess_db": found.comparison.excess_db, "remaining_db": found.remaining_db}
     except Exception as error:  # whatever it is, it is a miss of this case, and the other cases are scored
         said = {"evidence": f"{type(error).__name__}: {error}"}
     return Outcome(*of, **said, seconds=time.process_time() - started, also=tuple(known.get("also", ())))
@@ -148,7 +140,6 @@ def check_seal(outcome: Outcome, seal: Mapping) -> Outcome:
 
 
 def outcome(case: Path, seal: Mapping | None) -> Outcome:
-    """What came of one case, by its truth or its seal."""
     if seal is not None:
         return check_seal(diagnosed(case, None), seal)
     return diagnosed(case, json.loads((case / "truth.json").read_text(encoding="utf-8")))
@@ -170,9 +161,8 @@ def outcomes(folder: Path, limit: int | None, jobs: int) -> list[Outcome]:
 
 def counts(found: Sequence[Outcome]) -> dict[str, dict]:
     """Hits, n and percent with its interval, by what is counted; what no case is there for is left out."""
-    singles, controls, pairs, outside, sealed = (
-        [one for one in found if one.group == group] for group in ("singles", "controls", "pairs", "outside", "sealed")
-    )
+    groups = ("singles", "controls", "pairs", "outside", "sealed")
+    singles, controls, pairs, outside, sealed = ([one for one in found if one.group == group] for group in groups)
     flags: dict[str, Iterable[bool]] = {"one effect: named first": [one.hit for one in singles]}
     flags["one effect: family right"] = [one.family_hit for one in singles]
     for strength in STRENGTHS:
@@ -185,24 +175,10 @@ def counts(found: Sequence[Outcome]) -> dict[str, dict]:
     flags["at least one named"] = [bool(set(one.truth) & set(one.named)) for one in pairs]
     flags["both and no other"] = [set(one.truth) == set(one.named) for one in pairs]
     flags["outside the catalogue: unexplained"] = [one.hit for one in outside]
-    flags["explained above 1 dB of excess"] = [
-        one.verdict == "explained" and one.excess_db > EXPLAINED_LIMIT_DB for one in outside
-    ]
+    wrong = [one.verdict == "explained" and one.excess_db > EXPLAINED_LIMIT_DB for one in outside]
+    flags["explained above 1 dB of excess"] = wrong
     flags["sealed: the exact label"] = [one.hit for one in sealed]
     return {name: counted(of) for name, of in flags.items() if of}
-
-
-def counted(flags: Iterable[bool]) -> dict:
-    """Number of hits, of n, and the percentage with its interval."""
-    flags = list(flags)
-    low, high = wilson(sum(flags), len(flags))
-    return {
-        "hits": sum(flags),
-        "n": len(flags),
-        "mean": 100 * sum(flags) / max(len(flags), 1),
-        "low": 100 * low,
-        "high": 100 * high,
-    }
 
 
 def run(options: argparse.Namespace) -> str:
@@ -210,40 +186,24 @@ def run(options: argparse.Namespace) -> str:
     made_with = results.stamp({"CASES": options.cases}, [DIAGNOSIS])
     found = {folder.resolve().name: outcomes(folder, options.limit, options.jobs) for folder in options.cases}
     cases = {name: [asdict(one) for one in of] for name, of in found.items()}
-    return results.write(
-        options.output, "names", "Hidden effects: what the diagnosis says", made_with, tables(found), cases=cases
-    )
+    title = "Hidden effects: what the diagnosis says"
+    return results.write(options.output, "names", title, made_with, tables(found), cases=cases)
 
 
 def tables(found: Mapping[str, Sequence[Outcome]]) -> list[dict]:
-    """Counts of all folders, and of each folder its effects and misses."""
     by_folder = {name: counts(of) for name, of in found.items()}
-    rows = [
-        [
-            what,
-            *(
-                (f"{c['hits']} of {c['n']}, {results.cell(c, 0)} %" if (c := of.get(what)) else None)
-                for of in by_folder.values()
-            ),
-        ]
-        for what in dict.fromkeys(what for of in by_folder.values() for what in of)
-    ]
+    rows: list[list] = []
+    for what in dict.fromkeys(what for of in by_folder.values() for what in of):
+        each = [of.get(what) for of in by_folder.values()]
+        rows.append([what, *(c and f"{c['hits']} of {c['n']}, {results.cell(c, 0)} %" for c in each)])
     times = [np.array([one.seconds for one in of]) for of in found.values()]
-    rows += [
-        ["seconds a case, median", *(float(np.median(of)) for of in times)],
-        ["longest", *(float(of.max()) for of in times)],
-    ]
+    rows.append(["seconds a case, median", *(float(np.median(of)) for of in times)])
+    rows.append(["longest", *(float(of.max()) for of in times)])
     made = [results.table("names", "How often it is right", ["", *((name, 1) for name in found)], rows)]
     for name, of in found.items():
         if effects := by_effect(of):
-            columns = [
-                "effect",
-                "named first",
-                ("excess before, dB", 1),
-                ("after", 1),
-                ("after, worst", 1),
-                ("share removed, %", 0),
-            ]
+            columns = ["effect", "named first", ("excess before, dB", 1), ("after", 1), ("after, worst", 1)]
+            columns.append(("share removed, %", 0))
             text = "Excess: held-out, whitened, over the fan; medians of the cases where the effect was named first."
             made.append(results.table(f"{name}-effects", f"{name}: effects", columns, effects, text))
         if misses := [_miss(one) for one in of if not one.hit]:
@@ -260,9 +220,7 @@ def by_effect(found: Sequence[Outcome]) -> list[list]:
         hits = [one for one in of if one.hit and one.named]
         row = [name, f"{sum(one.hit for one in of)} of {len(of)}", None, None, None, None]
         if hits:
-            before, after, share = (
-                [getattr(one, key)[0] for one in hits] for key in ("before_db", "after_db", "share")
-            )
+            before, after, share = zip(*((one.before_db[0], one.after_db[0], one.share[0]) for one in hits))
             row[2:] = [float(np.median(before)), float(np.median(after)), max(after), 100 * float(np.median(share))]
         rows.append(row)
     for kind in sorted({one.raw[0] for one in found if one.group == "outside"}):

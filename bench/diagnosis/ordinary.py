@@ -18,9 +18,9 @@ import numpy as np
 from scipy.stats import kstest, norm
 
 from bench import results
-from bench.diagnosis.names import SIGNALS, find_cases, signals
-from bench.metrics import wilson
-from bench.recordings import progress
+from bench.diagnosis.names import find_cases, signals
+from bench.metrics import counted
+from bench.recordings import CALIBRATION, progress
 from bench.stale import DIAGNOSIS
 from edgefilter.calibration.calibrate import calibrate
 from edgefilter.diagnosis.ordinary import LEAST_DB, Chance, Ordinary, explained_db, p_value
@@ -42,7 +42,7 @@ LEVELS = (0.01, 0.05, 0.1, 0.25, 0.5)
 def gains(case: Path) -> dict[str, float]:
     """Trial.gain_db of each effect, fitted alone; 0 where its fit finds nothing."""
     recorded = signals(case)
-    prepared = prepare(calibrate(*(recorded[name] for name in SIGNALS[:3])), recorded["mic"], recorded["ref"])
+    prepared = prepare(calibrate(*map(recorded.get, CALIBRATION)), recorded["mic"], recorded["ref"])
     scorer, model = Scorer(prepared), prepared.model
     base, found = scorer.of(model), dict.fromkeys(names(), 0.0)
     for name in found:
@@ -94,7 +94,6 @@ def _middle_and_spread(explained: Array) -> tuple[float, float]:
 
 
 def run(options: argparse.Namespace) -> str:
-    """Measure, then learn or look."""
     made_with = results.stamp({"CASES": options.cases}, [DIAGNOSIS])
     cases = [case for folder in options.cases for case in find_cases(folder, options.limit)]
     if options.learn and len(cases) < ENOUGH:
@@ -111,9 +110,8 @@ def run(options: argparse.Namespace) -> str:
         f"The least p-value of each of {p_values.size} recordings, over all effects; of uniform ones as many are below any"
         f" limit as it says. Kolmogorov-Smirnov: largest distance {test.statistic:.3f}, p = {test.pvalue:.2g}."
     )
-    table = results.table(
-        "ordinary", "Nothing is missing: p-values", ["p-value below", "recordings"], _rows(p_values), text
-    )
+    columns = ["p-value below", "recordings"]
+    table = results.table("ordinary", "Nothing is missing: p-values", columns, _rows(p_values), text)
     values = [{"case": case.name, "gains_db": one} for case, one in zip(cases, found, strict=True)]
     return results.write(options.output, "ordinary", "Chance", made_with, [table], cases={"controls": values})
 
@@ -121,8 +119,7 @@ def run(options: argparse.Namespace) -> str:
 def _rows(p_values: Array) -> list[list[str]]:
     rows = []
     for level in LEVELS:
-        count = int(np.sum(p_values < level))
-        low, high = wilson(count, p_values.size)
-        share = f"{100 * count / p_values.size:.1f} % [{100 * low:.1f}, {100 * high:.1f}]"
-        rows.append([f"{level:g}", f"{count} of {p_values.size}, {share}"])
+        found = counted((p_values < level).tolist())
+        share = f"{found['mean']:.1f} % [{found['low']:.1f}, {found['high']:.1f}]"
+        rows.append([f"{level:g}", f"{found['hits']} of {found['n']}, {share}"])
     return rows

@@ -8,13 +8,14 @@ of 5 s, by 5 s of further sentences. All are recorded by the same robot and scor
 from __future__ import annotations
 
 import argparse
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 
 import numpy as np
 
 from bench import results
-from bench.metrics import wilson
+from bench.metrics import counted
 from bench.recordings import progress
 from bench.simulate.asked_robot import AskedRobot, make
 from bench.simulate.conversations import read_voices
@@ -92,9 +93,9 @@ def examine(robot: AskedRobot, pair: tuple[str, str], strength: str) -> Row:
 def share(rows: Sequence[Row], way: int) -> list:
     """How many are right, with its interval, how many open, how many wrong."""
     found = [row.outcomes[way] for row in rows]
-    low, high = wilson(found.count("right"), len(found))
-    right = f"{found.count('right')} of {len(found)} [{100 * low:.0f}, {100 * high:.0f}] %"
-    return [right, found.count("open"), found.count("wrong")]
+    right = counted(one == "right" for one in found)
+    said = f"{right['hits']} of {right['n']} [{right['low']:.0f}, {right['high']:.0f}] %"
+    return [said, found.count("open"), found.count("wrong")]
 
 
 def tables(rows: Sequence[Row]) -> list[dict]:
@@ -110,14 +111,12 @@ def tables(rows: Sequence[Row]) -> list[dict]:
         of = [row for row in rows if row.pair == pair]
         cells += [[" or ".join(pair), *(share(of, at)[0] for at in range(len(WAYS)))]] if of else []
     made.append(results.table("probe-pairs", "Settled rightly, by pair", ["", *WAYS], cells))
-    asked = [sound for row in rows for sound in row.sounds]
-    chosen = sorted(((word, asked.count(word)) for word in set(asked)), key=lambda entry: -entry[1])
-    made.append(results.table("probe-sounds", "What was asked", ["sound", "times"], [list(one) for one in chosen]))
+    asked = Counter(sound for row in rows for sound in row.sounds).most_common()
+    made.append(results.table("probe-sounds", "What was asked", ["sound", "times"], map(list, asked)))
     return made
 
 
 def run(options: argparse.Namespace) -> str:
-    """--count robots of each pair and each truth."""
     made_with = results.stamp({"ROBOT": [options.voices]}, [DIAGNOSIS])
     voices, rows = read_voices([options.voices]), []
     asked = [(number, pair, truth) for number in range(options.count) for pair in PAIRS for truth in pair]
@@ -125,7 +124,5 @@ def run(options: argparse.Namespace) -> str:
         strength = STRENGTHS[number % len(STRENGTHS)]
         seed = [options.seed, PAIRS.index(pair), pair.index(truth), number]
         rows.append(examine(make(seed, truth, strength, voices, RECORDING_S), pair, strength))
-    notes = str(__doc__).partition("\n\n")[2].strip()
-    return results.write(
-        options.output, "probe", TITLE, made_with, tables(rows), notes=notes, rows=[asdict(row) for row in rows]
-    )
+    notes, kept = str(__doc__).partition("\n\n")[2].strip(), list(map(asdict, rows))
+    return results.write(options.output, "probe", TITLE, made_with, tables(rows), notes=notes, rows=kept)

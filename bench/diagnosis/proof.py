@@ -18,8 +18,9 @@ from pathlib import Path
 import numpy as np
 
 from bench import results
-from bench.diagnosis.names import SIGNALS, counted, find_cases, signals
-from bench.recordings import find_recordings
+from bench.diagnosis.names import find_cases, signals
+from bench.metrics import counted
+from bench.recordings import CALIBRATION, find_recordings
 from bench.stale import DIAGNOSIS
 from edgefilter.calibration.calibrate import calibrate
 from edgefilter.calibration.from_recording import self_calibrate
@@ -97,10 +98,9 @@ def _bands_db(psd: Samples) -> np.ndarray:
 
 
 def of_cases(folder: Path, limit: int | None) -> Iterator[Row]:
-    """A row for each case of a folder."""
     for case in find_cases(folder, limit):
         recorded = signals(case)
-        profile = calibrate(*(recorded[name] for name in SIGNALS[:3]))
+        profile = calibrate(*map(recorded.get, CALIBRATION))
         yield examine(case.name, profile, recorded["mic"], recorded["ref"])
 
 
@@ -116,45 +116,25 @@ def of_real(folder: Path, limit: int | None) -> Iterator[Row]:
 
 
 def run(options: argparse.Namespace) -> str:
-    """All folders of cases and of real recordings."""
     made_with = results.stamp({"CASES": options.cases, "REAL": options.real}, [DIAGNOSIS, "linear-uncalibrated"])
     found = {folder.resolve().name: list(of_cases(folder, options.limit)) for folder in options.cases}
     found |= {folder.resolve().name: list(of_real(folder, options.limit)) for folder in options.real}
     rows = {name: [asdict(row) for row in of] for name, of in found.items()}
-    return results.write(
-        options.output, "proof", "What was named, proven on the rest", made_with, tables(found), rows=rows
-    )
+    title = "What was named, proven on the rest"
+    return results.write(options.output, "proof", title, made_with, tables(found), rows=rows)
 
 
 def tables(found: Mapping[str, Sequence[Row]]) -> list[dict]:
     """How often the error fell, stayed and rose with all that was named, and with what was kept; then each recording."""
-    columns = [
-        "",
-        "recordings",
-        "declined",
-        "judged",
-        "with",
-        ("error fell, %", 0),
-        ("by, dB (median)", 1),
-        "rose",
-        ("worst, dB", 1),
-    ]
+    columns = ["", "recordings", "declined", "judged", "with", ("error fell, %", 0), ("by, dB (median)", 1), "rose",
+               ("worst, dB", 1)]  # fmt: skip
     rows = [[name, *line] for name, of in found.items() for line in summary(of)]
     noise = {name: [row.noise_db for row in of if row.noise_db is not None] for name, of in found.items()}
-    fans = ", ".join(
-        f"{sum(after < before for before, after in of)} of {len(of)} ({name})" for name, of in noise.items()
-    )
+    counts = {name: sum(after < before for before, after in of) for name, of in noise.items()}
+    fans = ", ".join(f"{count} of {len(noise[name])} ({name})" for name, count in counts.items())
     made = [results.table("proof", "On unseen seconds", columns, rows, f"Changes of the fan that were proven: {fans}.")]
-    head = [
-        "recording",
-        "named",
-        "kept",
-        ("ERLE before, dB", 1),
-        ("named", 1),
-        ("kept", 1),
-        ("noise off, dB", 1),
-        ("after", 1),
-    ]
+    head = ["recording", "named", "kept", ("ERLE before, dB", 1), ("named", 1), ("kept", 1), ("noise off, dB", 1),
+            ("after", 1)]  # fmt: skip
     return made + [results.table(f"{name}-proof", name, head, map(_cells, of)) for name, of in found.items()]
 
 

@@ -1,6 +1,6 @@
 """Run time: what `add` brings to the running filter, effect by effect, on simulated robots that have it.
 
-Each conversation (bench/simulate/effect_conversations.py): calibration, then the effect, the robot alone for 10 to 20 s,
+Each conversation (bench/simulate/hidden_cases.py): calibration, then the effect, the robot alone for 10 to 20 s,
 to which `add` fits; from the next pause on the filter starts anew, with the profile as calibrated and with the effect
 added: ERLE over 3.5 s of the robot alone, SI-SDR over the human who interrupts then.
 """
@@ -16,7 +16,7 @@ from bench import results
 from bench.metrics import mean
 from bench.recordings import progress
 from bench.simulate.conversations import read_clips, read_voices
-from bench.simulate.effect_conversations import EffectConversation, make
+from bench.simulate.hidden_cases import EffectConversation, make_conversation
 from bench.simulate.simulated_robot import RATE
 from bench.stale import DIAGNOSIS
 from edgefilter import Profile, calibrate, enhance
@@ -80,14 +80,13 @@ def tables(rows: Sequence[Mapping], engines: Sequence[str]) -> list[dict]:
     columns += [(f"{engine}: {what}", 1) for engine in engines for what in ("SI-SDR", "ERLE, dB more")]
     notes = [(effect.name, reach(effect, {p.name: p.high for p in effect.parameters})) for effect in EFFECTS]
     said = "What `add` says of an effect that the running filter does not take as it is"
-    return [
-        results.table("run-time", "Gain with the effect added, mean and 95 % interval", [*columns, "in a word"], cells),
-        results.table("run-time-notes", said, ["effect", "NOTE"], [[name, note] for name, note in notes if note]),
-    ]
+    title = "Gain with the effect added, mean and 95 % interval"
+    told = [[name, note] for name, note in notes if note]
+    return [results.table("run-time", title, [*columns, "in a word"], cells),
+            results.table("run-time-notes", said, ["effect", "NOTE"], told)]  # fmt: skip
 
 
 def run(options: argparse.Namespace) -> str:
-    """All effects, --count conversations each."""
     effects, engines = options.effects.split(","), options.engines.split(",")
     for name in effects:
         find(name)
@@ -97,6 +96,6 @@ def run(options: argparse.Namespace) -> str:
     turns = [(effect, turn) for turn in range(options.count) for effect in effects]
     rows = []
     for effect, turn in progress(turns, "conversation"):
-        rows += measure(make(options.seed, effect, turn, voices, people), engines)
+        rows += measure(make_conversation(options.seed, effect, turn, voices, people), engines)
     made = tables(rows, engines)
     return results.write(options.output, "run_time", TITLE, made_with, made, notes=INTRODUCTION, rows=rows)

@@ -30,27 +30,10 @@ import soundfile as sf
 from scipy import signal
 from tqdm import tqdm
 
-from bench.simulate.conversations import (
-    DISTORTION_DB,
-    Clip,
-    read_clips,
-    read_speech,
-    read_utterance,
-    read_voices,
-    record_all,
-    write_item,
-)
-from bench.simulate.simulated_robot import (
-    RATE,
-    Array,
-    draw_body,
-    draw_fan,
-    draw_robot,
-    draw_walls,
-    stand,
-    warp,
-    with_distortion,
-)
+from bench.simulate import conversations
+from bench.simulate import simulated_robot as physics
+from bench.simulate.conversations import Clip, Voices, read_speech, read_utterance, record_all, write_item
+from bench.simulate.simulated_robot import RATE, Array, Rng
 from edgefilter.dsp.metrics import si_sdr
 
 SIZE = 512
@@ -69,9 +52,8 @@ def measured_covariances(folder: Path) -> tuple[Array, Array]:
         for file in own:
             samples, rate = sf.read(file)
             if rate != RATE or samples.ndim != 2 or samples.shape[1] < 4:
-                sys.exit(
-                    f"{file} has {rate} Hz and shape {samples.shape}, expected {RATE} Hz and an array in channels 1-3"
-                )
+                wanted = f"expected {RATE} Hz and an array in channels 1-3"
+                sys.exit(f"{file} has {rate} Hz and shape {samples.shape}, {wanted}")
             x = samples.T[1:4] / samples[:, 1:4].std()
             found = found + signal.csd(x[None], x[:, None], fs=RATE, nperseg=SIZE)[1].transpose(2, 0, 1)
         halves.append(found / len(own))
@@ -82,9 +64,8 @@ def with_microphones(covariance: Array, count: int, phase: float) -> Array:
     """Covariances of one to four microphones from those of three, (bins, count, count); phase: of the fourth at 8 kHz."""
     if count <= 3:
         return covariance[:, :count, :count]
-    root = np.linalg.cholesky(
-        covariance + 1e-6 * np.trace(covariance, axis1=1, axis2=2)[:, None, None].real * np.eye(3)
-    )
+    total = np.trace(covariance, axis1=1, axis2=2)[:, None, None].real
+    root = np.linalg.cholesky(covariance + 1e-6 * total * np.eye(3))
     turn = np.exp(1j * phase * np.arange(len(covariance)) / len(covariance))
     mixed = root[:, 2, [2, 0, 1]] * turn[:, None]
     out = np.zeros((len(covariance), 4, 4), complex)
@@ -93,7 +74,7 @@ def with_microphones(covariance: Array, count: int, phase: float) -> Array:
     return out @ out.conj().transpose(0, 2, 1)
 
 
-def parts_covariance(rng: np.random.Generator, places: Array) -> Array:
+def parts_covariance(rng: Rng, places: Array) -> Array:
     """Covariance of near sources, a diffuse field and the microphones' own noise, (bins, m, m). places: (m, 3) m."""
     hz = np.arange(SIZE // 2 + 1) * RATE / SIZE
     wave = 2 * np.pi * hz / SPEED_OF_SOUND
@@ -111,7 +92,7 @@ def parts_covariance(rng: np.random.Generator, places: Array) -> Array:
     return (1 - share - own) * total + share * diffuse + own * np.eye(count)
 
 
-def coloured(rng: np.random.Generator, covariance: Array, amplitude: Array, n: int) -> Array:
+def coloured(rng: Rng, covariance: Array, amplitude: Array, n: int) -> Array:
     """Gaussian noise of that covariance in each bin, amplitude (1025,) on 0 to 8 kHz, unit power in channel 0, (m, n)."""
     count = covariance.shape[1]
     scale = covariance / covariance[:, :1, :1].real  # channel 0 has the drawn spectrum
@@ -130,14 +111,14 @@ def coloured(rng: np.random.Generator, covariance: Array, amplitude: Array, n: i
     return out / math.sqrt(np.mean(out[0] ** 2))
 
 
-def draw_places(rng: np.random.Generator, count: int) -> Array:
+def draw_places(rng: Rng, count: int) -> Array:
     """Places of microphones on a circle, (count, 3) in m."""
     radius, first = rng.uniform(0.025, 0.045), rng.uniform(0, 2 * np.pi)
     angles = first + 2 * np.pi * np.arange(count) / max(count, 3)
     return radius * np.stack((np.cos(angles), np.sin(angles), np.zeros(count)), axis=1)
 
 
-def make_script(rng: np.random.Generator, kind: str, voice: list[Clip], humans: list[Array]) -> tuple[dict, Array]:
+def make_script(rng: Rng, kind: str, voice: list[Clip], humans: list[Array]) -> tuple[dict, Array]:
     """Where everything happens, and ref (n,): an utterance alone, then one for each human's turn."""
     utterances, waits = [read_utterance(rng, voice, 4.0)[0]], []
     for human in humans:
@@ -168,7 +149,7 @@ def played(ref: Array, script: dict) -> Array:
     for part in script["parts"]:
         begin, size = part["at"], part["size"]
         out[begin + part["lag"] :][:size] += 10 ** (part["volume_db"] / 20) * ref[begin : begin + size]
-    return warp(out, script["ppm"])
+    return physics.warp(out, script["ppm"])
 
 
 def make(
@@ -177,12 +158,11 @@ def make(
     kind: str,
     room_name: str,
     speech: list[Clip],
-    voices: dict[str, list[Clip]],
+    voices: Voices,
     covariances: tuple[Array, Array] | None,
     microphones: int = 4,
     turns: int = 2,
     moving: bool = False,
-    distortion: str = "moderate",
     echo: bool = True,
 ) -> tuple[dict[str, Array], dict]:
     """Item index of this seed: signals, (n, microphones) but for sweep_ref and ref, and the contents of meta.json."""
@@ -193,17 +173,19 @@ def make(
     said = [own[i] for i in rng.permutation(len(own))[:turns]]
     humans = [read_speech(clip) for clip in said]
     voice = str(rng.choice(sorted(voices)))
-    robot, places, human_m = draw_robot(rng), draw_places(rng, microphones), rng.uniform(1.0, 1.5)
-    robot = replace(robot, shell=np.stack([draw_body(rng) for _ in range(microphones)]))
+    robot, places, human_m = physics.draw_robot(rng), draw_places(rng, microphones), rng.uniform(1.0, 1.5)
+    robot = replace(robot, shell=np.stack([physics.draw_body(rng) for _ in range(microphones)]))
     gains = 10 ** (np.concatenate(([0.0], rng.uniform(-1, 1, microphones - 1))) / 20)
-    laboratory = stand(rng, draw_walls(rng, "lab"), robot.distance_m, robot.direction, human_m, places)
+    about = robot.distance_m, robot.direction, human_m, places
+    laboratory = physics.stand(rng, physics.draw_walls(rng, "lab"), *about)
     moves = turns - 1 if moving else 0
-    room = stand(rng, draw_walls(rng, room_name), robot.distance_m, robot.direction, human_m, places, moves)
+    room = physics.stand(rng, physics.draw_walls(rng, room_name), *about, moves)
     heard = [room.human, *(room.elsewhere or [room.human] * (turns - 1))]
     script, ref = make_script(rng, kind, voices[voice], humans)
     sound = played(ref, script)
     one = replace(robot, shell=robot.shell[0])
-    driven, nl_db = with_distortion(one, sound, room.robot[0], rng.uniform(*DISTORTION_DB[distortion][room_name]))
+    wanted_db = rng.uniform(*conversations.DISTORTION_DB["moderate"][room_name])
+    driven, nl_db = physics.with_distortion(one, sound, room.robot[0], wanted_db)
     robot = replace(robot, loudspeaker=driven.loudspeaker)
     clean, spans = np.zeros((microphones, ref.size)), []
     for human, response, onset in zip(humans, heard, script.pop("onsets")):
@@ -215,8 +197,8 @@ def make(
     for begin, end in spans:
         inside[begin:end] = True
 
-    def fans(rng: np.random.Generator, sizes: tuple[int, int, int]) -> list[Array]:
-        spectrum, phase = draw_fan(rng), rng.uniform(-20, 20)
+    def fans(rng: Rng, sizes: tuple[int, int, int]) -> list[Array]:
+        spectrum, phase = physics.draw_fan(rng), rng.uniform(-20, 20)
         if covariances is None:
             calibrated = conversing = parts_covariance(rng, places)
         else:
@@ -241,29 +223,26 @@ def make(
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--speech", type=Path, required=True, metavar="DIR", help="human speech")
-    parser.add_argument("--voices", type=Path, required=True, nargs="+", metavar="DIR", help="the robot's voices")
-    parser.add_argument(
-        "--noise", type=Path, metavar="DIR", help="an array's own noise; without it the fan is of parts"
-    )
-    parser.add_argument("--no-echo", action="store_true", help="the robot is silent")
-    parser.add_argument("--output", type=Path, required=True, metavar="DIR")
-    parser.add_argument("--kind", choices=("paper", "live"), required=True)
-    parser.add_argument("--room", choices=("lab", "office", "both"), default="both", help="both: in turn")
-    parser.add_argument("--microphones", type=int, choices=(1, 2, 3, 4), default=4)
-    parser.add_argument("--turns", type=int, default=2, help="of the human")
-    parser.add_argument("--moving", action="store_true", help="the human speaks each turn from another place")
-    parser.add_argument("--count", type=int, default=12)
-    parser.add_argument("--seed", type=int, default=1)
+    add = parser.add_argument
+    add("--speech", type=Path, required=True, metavar="DIR", help="human speech")
+    add("--voices", type=Path, required=True, nargs="+", metavar="DIR", help="the robot's voices")
+    add("--noise", type=Path, metavar="DIR", help="an array's own noise; without it the fan is of parts")
+    add("--no-echo", action="store_true", help="the robot is silent")
+    add("--output", type=Path, required=True, metavar="DIR")
+    add("--kind", choices=("paper", "live"), required=True)
+    add("--room", choices=("lab", "office", "both"), default="both", help="both: in turn")
+    add("--microphones", type=int, choices=(1, 2, 3, 4), default=4)
+    add("--turns", type=int, default=2, help="of the human")
+    add("--moving", action="store_true", help="the human speaks each turn from another place")
+    add("--count", type=int, default=12)
+    add("--seed", type=int, default=1)
     options = parser.parse_args()
-    speech, voices = read_clips(options.speech, (3.0, 8.0)), read_voices(options.voices)
+    speech, voices = conversations.read_clips(options.speech, (3.0, 8.0)), conversations.read_voices(options.voices)
     covariances = measured_covariances(options.noise) if options.noise else None
     for index in tqdm(range(options.count), unit="conversation", desc=str(options.output)):
         room = ("lab", "office")[index % 2] if options.room == "both" else options.room
-        signals, meta = make(
-            options.seed, index, options.kind, room, speech, voices, covariances, options.microphones, options.turns,
-            options.moving, echo=not options.no_echo,
-        )  # fmt: skip
+        signals, meta = make(options.seed, index, options.kind, room, speech, voices, covariances, options.microphones,
+                             options.turns, options.moving, echo=not options.no_echo)  # fmt: skip
         write_item(options.output / f"{room}_{index:02d}", signals, "meta", meta)
 
 

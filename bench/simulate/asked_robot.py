@@ -15,20 +15,14 @@ import numpy as np
 import soundfile as sf
 from scipy import signal
 
-from bench.simulate.conversations import Clip, read_speech
+from bench.simulate import hidden_effects as effects
+from bench.simulate.conversations import Clip, Voices, read_speech
 from bench.simulate.hidden_cases import ROBOT_OVER_FAN_DB, hide
-from bench.simulate.hidden_effects import (
-    ENR_DB,
-    compressor_gain_db,
-    gain_curve,
-    incoherent_db,
-    put_back,
-    soft_clip,
-)
 from bench.simulate.hidden_robot import Chain, Scene, direction, draw_scene, power, solve
-from bench.simulate.simulated_robot import RATE, Array, fan_noise, peak_filter
+from bench.simulate.simulated_robot import RATE, Array, Rng, fan_noise, peak_filter
 
 Player = Callable[[Array], Array]
+Change = Callable[[Rng, Scene, str], tuple[Chain, Player]]
 AFTER_S = 1.0
 """For so long the recording goes on after a sound, as `play_and_record` does."""
 CODECS = (("OGG", "OPUS"), ("MP3", "MPEG_LAYER_III"))
@@ -39,10 +33,7 @@ HEADROOM = 0.97
 
 @dataclass(frozen=True, eq=False)
 class AskedRobot:
-    """What is recorded before anything is asked: calibration (sweep, its recording, the fan), reference and recording, float32.
-
-    truth: the effect that is hidden. further: other sentences of the same voice.
-    """
+    """Calibration (sweep, its recording, the fan), reference and recording, float32; truth: the hidden effect."""
 
     truth: str
     calibration: tuple[Array, Array, Array]
@@ -68,7 +59,7 @@ class AskedRobot:
         return noise * math.sqrt(power(end) / power(noise))
 
 
-def make(seed: list[int], truth: str, strength: str, voices: dict[str, list[Clip]], seconds: float) -> AskedRobot:
+def make(seed: list[int], truth: str, strength: str, voices: Voices, seconds: float) -> AskedRobot:
     """A robot with that effect (a name of CHANGES), a recording of so many seconds of its sentences, and as many further ones."""
     rng = np.random.default_rng(seed)
     clips = voices[str(rng.choice(sorted(voices)))]
@@ -83,7 +74,7 @@ def make(seed: list[int], truth: str, strength: str, voices: dict[str, list[Clip
     return AskedRobot(truth, calibration, reference, heard, np.float32(further), scene, chain, player, gain)
 
 
-def _sentences(rng: np.random.Generator, clips: list[Clip], seconds: float) -> Array:
+def _sentences(rng: Rng, clips: list[Clip], seconds: float) -> Array:
     """So many seconds of sentences in random order, (n,), 0.1 to 0.5 s apart, peak 0.8, faded out."""
     parts: list[Array] = []
     for i in rng.permutation(len(clips)):
@@ -99,10 +90,10 @@ def _same(x: Array) -> Array:
     return x
 
 
-def _hidden(name: str) -> Callable[[np.random.Generator, Scene, str], tuple[Chain, Player]]:
+def _hidden(name: str) -> Change:
     """An effect of hidden_effects, and what the player makes of any other sound with it."""
 
-    def change(rng: np.random.Generator, scene: Scene, strength: str) -> tuple[Chain, Player]:
+    def change(rng: Rng, scene: Scene, strength: str) -> tuple[Chain, Player]:
         chain, parameters, _ = hide(rng, scene, scene.usual, name, strength)
         return chain, PLAYERS.get(name, lambda told, x: _same)(parameters, scene.reference)
 
@@ -117,7 +108,7 @@ def _compressor(told: dict, reference: Array) -> Player:
     settings = {key: told[key] for key in ("threshold_db", "ratio", "knee_db", "attack_ms", "release_ms")}
 
     def squeezed(x: Array) -> Array:
-        return x * gain_curve(compressor_gain_db(x, **settings), 1, x.size)
+        return x * effects.gain_curve(effects.compressor_gain_db(x, **settings), 1, x.size)
 
     makeup = math.sqrt(power(reference) / power(squeezed(reference))) if told["makeup"] else 1.0
     return lambda x: makeup * squeezed(x)
@@ -127,22 +118,16 @@ def _amplifier(told: dict, reference: Array) -> Player:
     if told["kind"] == "driver":
         return _same  # the chain's loudspeaker has it
     level, skew, hardness = (told[key] for key in ("level", "skew", "hardness"))
-    return lambda x: soft_clip(x, level, skew * level, hardness)
+    return lambda x: effects.soft_clip(x, level, skew * level, hardness)
 
 
-PLAYERS: dict[str, Callable[[dict, Array], Player]] = {
-    "playback_gain": _volume,
-    "compression": _compressor,
-    "speaker_nonlinearity": _amplifier,
-}
+PLAYERS = {"playback_gain": _volume, "compression": _compressor, "speaker_nonlinearity": _amplifier}
 
 
-def equaliser(rng: np.random.Generator, scene: Scene, strength: str) -> tuple[Chain, Player]:
+def equaliser(rng: Rng, scene: Scene, strength: str) -> tuple[Chain, Player]:
     """Two or three broad peaks or dips in the player (Bristow-Johnson), as strong together as wanted."""
-    bands = [
-        (math.exp(rng.uniform(math.log(300), math.log(5000))), rng.uniform(0.6, 1.5), rng.choice([-1.0, 1.0]))
-        for _ in range(int(rng.integers(2, 4)))
-    ]
+    bands = [(effects.log_uniform(rng, 300, 5000), rng.uniform(0.6, 1.5), effects.sign(rng))
+             for _ in range(int(rng.integers(2, 4)))]  # fmt: skip
 
     def player(db: float) -> Player:
         sections = np.vstack([peak_filter(hz, q, sign * db) for hz, q, sign in bands])
@@ -153,22 +138,22 @@ def equaliser(rng: np.random.Generator, scene: Scene, strength: str) -> tuple[Ch
     def chain(db: float) -> Chain:
         return replace(scene.usual, played=player(db)(scene.reference))
 
-    db = solve(lambda db: scene.over_fan_db(scene.echo(chain(db)) - usual), ENR_DB[strength], 0.2, 15.0, 0.5)
+    db = solve(lambda db: scene.over_fan_db(scene.echo(chain(db)) - usual), effects.ENR_DB[strength], 0.2, 15.0, 0.5)
     return chain(db), player(db)
 
 
-def moved(rng: np.random.Generator, scene: Scene, strength: str) -> tuple[Chain, Player]:
+def moved(rng: Rng, scene: Scene, strength: str) -> tuple[Chain, Player]:
     """The microphone stands some millimetres or centimetres elsewhere from the start."""
     step, usual = direction(rng), scene.echo(scene.usual)
 
     def chain(metres: float) -> Chain:
         return replace(scene.usual, paths=((0, 0, scene.moved.microphone_moved(metres * step).response()),))
 
-    metres = solve(lambda m: scene.over_fan_db(scene.echo(chain(m)) - usual), ENR_DB[strength], 1e-3, 0.05, 0.5)
+    metres = solve(lambda m: scene.over_fan_db(scene.echo(chain(m)) - usual), effects.ENR_DB[strength], 1e-3, 0.05, 0.5)
     return chain(metres), _same
 
 
-def codec(rng: np.random.Generator, scene: Scene, strength: str) -> tuple[Chain, Player]:
+def codec(rng: Rng, scene: Scene, strength: str) -> tuple[Chain, Player]:
     """The player's sound through Opus or MP3, at the lowest rate whose noise does not exceed the strength."""
     form, subtype = CODECS[int(rng.integers(len(CODECS)))]
     response = scene.linear_response()
@@ -178,7 +163,7 @@ def codec(rng: np.random.Generator, scene: Scene, strength: str) -> tuple[Chain,
             packed = io.BytesIO()
             sf.write(packed, x.astype(np.float32), RATE, format=form, subtype=subtype, compression_level=share)
             packed.seek(0)
-            return put_back(sf.read(packed, dtype="float64")[0], x)
+            return effects.put_back(sf.read(packed, dtype="float64")[0], x)
 
         return through
 
@@ -186,20 +171,12 @@ def codec(rng: np.random.Generator, scene: Scene, strength: str) -> tuple[Chain,
         player = coder(float(share))
         played = player(scene.reference)
         heard, original = (signal.oaconvolve(x, response)[: x.size] for x in (played, scene.reference))
-        if incoherent_db(original, heard) + scene.over_fan_db(heard) < ENR_DB[strength]:
+        if effects.incoherent_db(original, heard) + scene.over_fan_db(heard) < effects.ENR_DB[strength]:
             break
     return replace(scene.usual, played=played), player
 
 
-CHANGES: dict[str, Callable[[np.random.Generator, Scene, str], tuple[Chain, Player]]] = {
-    **{
-        name: _hidden(name)
-        for name in (
-            *("playback_gain", "compression", "speaker_nonlinearity", "mic_clipping", "chassis_resonance"),
-            *("late_reverb", "fan_noise"),
-        )
-    },
-    "equaliser": equaliser,
-    "early_path": moved,
-    "codec": codec,
-}
+HIDDEN = ("playback_gain", "compression", "speaker_nonlinearity", "mic_clipping", "chassis_resonance", "late_reverb",
+          "fan_noise")  # fmt: skip
+CHANGES: dict[str, Change] = {name: _hidden(name) for name in HIDDEN}
+CHANGES |= {"equaliser": equaliser, "early_path": moved, "codec": codec}

@@ -19,11 +19,9 @@ place in the laboratory (RT60 0.20-0.26 s), odd ones in an office (0.50-0.75 s).
 How it compares with a set of ten `paper` conversations simulated by other hands (lab / office means: theirs; then 60 of
 these with --distortion strong):
 - unfiltered SI-SDR -21.6 / -26.3; -22.2 / -26.1 dB
-- human over fan (snr_fan) 6.0 / 6.7; 7.4 / 7.3 dB
-- robot over fan while it speaks alone 29 / 34; 30 / 34 dB
-- robot removed by the best linear filter of 300 ms, fitted to the first utterance, 19.7 / 15.8; 20.3 / 17.6 dB
-- robot removed by that filter at the onset of the second utterance 17.6 / 14.3; 18.6 / 15.4 dB
-- direct sound over reverberation of that filter 15.7 / 8.3; 15.9 / 10.9 dB
+- over the fan: human (snr_fan) 6.0 / 6.7; 7.4 / 7.3 dB, robot that speaks alone 29 / 34; 30 / 34 dB
+- robot removed by the best linear filter of 300 ms, fitted to the first utterance, 19.7 / 15.8; 20.3 / 17.6 dB,
+  at the onset of the second 17.6 / 14.3; 18.6 / 15.4 dB; its direct sound over reverberation 15.7 / 8.3; 15.9 / 10.9 dB
 Their nl_db is -22 / -24 dB, that of the strong set -19 / -15 dB, that of the moderate set as theirs.
 """
 
@@ -43,18 +41,8 @@ import soundfile as sf
 from scipy import signal
 from tqdm import tqdm
 
-from bench.simulate.simulated_robot import (
-    RATE,
-    Array,
-    Robot,
-    draw_fan,
-    draw_robot,
-    draw_room,
-    fan_noise,
-    sweep,
-    warp,
-    with_distortion,
-)
+from bench.simulate import simulated_robot as physics
+from bench.simulate.simulated_robot import RATE, Array, Rng, Robot
 from edgefilter.dsp.metrics import si_sdr
 
 UNFILTERED_DB = {"lab": (-22.0, 1.0), "office": (-26.2, 0.9)}
@@ -77,6 +65,8 @@ class Clip:
     text: str
 
 
+Voices = dict[str, list[Clip]]
+"""The robot's sentences by voice."""
 Sentence = tuple[str, int, int]
 """What the robot says, and its first and last sample."""
 
@@ -108,9 +98,8 @@ def read_clips(folder: Path, seconds: tuple[float, float]) -> list[Clip]:
     """The clips of a folder that have a text and a length between these bounds."""
     table = folder / "transcripts.tsv"
     if not table.is_file():
-        sys.exit(
-            f"{table} is missing; expected a folder of speech with its transcripts.tsv (path, speaker, seconds, text)"
-        )
+        wanted = "expected a folder of speech with its transcripts.tsv (path, speaker, seconds, text)"
+        sys.exit(f"{table} is missing; {wanted}")
     with table.open(encoding="utf-8", newline="") as lines:
         rows = [row for row in csv.reader(lines, delimiter="\t", quoting=csv.QUOTE_NONE) if len(row) == 4 and row[3]]
     clips = [Clip(folder / row[0], row[1], row[3]) for row in rows if seconds[0] <= float(row[2]) <= seconds[1]]
@@ -119,9 +108,8 @@ def read_clips(folder: Path, seconds: tuple[float, float]) -> list[Clip]:
     return clips
 
 
-def read_voices(folders: list[Path]) -> dict[str, list[Clip]]:
-    """The robot's sentences by voice."""
-    voices: dict[str, list[Clip]] = {}
+def read_voices(folders: list[Path]) -> Voices:
+    voices: Voices = {}
     for clip in (clip for folder in folders for clip in read_clips(folder, (1.0, 15.0))):
         voices.setdefault(clip.speaker, []).append(clip)
     return voices
@@ -135,7 +123,7 @@ def read_speech(clip: Clip) -> Array:
     return samples[loud[0] : loud[-1] + 1]
 
 
-def read_utterance(rng: np.random.Generator, clips: list[Clip], at_least: float) -> tuple[Array, list[Sentence]]:
+def read_utterance(rng: Rng, clips: list[Clip], at_least: float) -> tuple[Array, list[Sentence]]:
     """Sentences of one voice in random order until they last at_least seconds, 0.1-0.4 s apart, and where they are."""
     parts: list[Array] = []
     said: list[Sentence] = []
@@ -148,11 +136,8 @@ def read_utterance(rng: np.random.Generator, clips: list[Clip], at_least: float)
     return np.concatenate(parts[:-1]), said
 
 
-def draw_lags(rng: np.random.Generator, kind: str, pause: int) -> tuple[int, int, float, float]:
-    """Lag of either utterance in samples, ppm, volume change in dB.
-
-    The second never starts while the first is still heard.
-    """
+def draw_lags(rng: Rng, kind: str, pause: int) -> tuple[int, int, float, float]:
+    """Lag of either utterance in samples (the second begins when the first is over), ppm, volume change in dB."""
     if kind == "paper":
         lag = int(rng.uniform(0.05, 0.3) * RATE)
         return lag, lag, 0.0, 0.0
@@ -164,26 +149,22 @@ def draw_lags(rng: np.random.Generator, kind: str, pause: int) -> tuple[int, int
 
 
 def make_scene(
-    seed: int,
-    index: int,
-    kind: str,
-    speech: list[Clip],
-    voices: dict[str, list[Clip]],
-    distortion: str = "moderate",
+    seed: int, index: int, kind: str, speech: list[Clip], voices: Voices, distortion: str = "moderate"
 ) -> Scene:
     """Item index of this seed: signals (n,) float64 and the contents of meta.json."""
     rng = np.random.default_rng([seed, index])
     human_clip = speech[np.random.default_rng(seed).permutation(len(speech))[index % len(speech)]]
     voice = str(rng.choice(sorted(voices)))
     room_name = "lab" if index % 2 == 0 else "office"
-    robot, human_m = draw_robot(rng), rng.uniform(1.0, 1.5)
-    laboratory = draw_room(rng, "lab", robot.distance_m, robot.direction, human_m)
-    room = draw_room(rng, "office", robot.distance_m, robot.direction, human_m) if room_name == "office" else laboratory
+    robot, human_m = physics.draw_robot(rng), rng.uniform(1.0, 1.5)
+    about = robot.distance_m, robot.direction, human_m
+    laboratory = physics.draw_room(rng, "lab", *about)
+    room = physics.draw_room(rng, "office", *about) if room_name == "office" else laboratory
     human = read_speech(human_clip)
     script, ref = make_script(rng, kind, voices[voice], human.size)
     voice_heard = played(ref, script)
-    robot, nl_db = with_distortion(robot, voice_heard, room.robot, rng.uniform(*DISTORTION_DB[distortion][room_name]))
-
+    wanted_db = rng.uniform(*DISTORTION_DB[distortion][room_name])
+    robot, nl_db = physics.with_distortion(robot, voice_heard, room.robot, wanted_db)
     start = script.pop("onset") + robot.bulk
     voiced = signal.oaconvolve(human, room.human)[: ref.size - start]
     clean = np.concatenate([np.zeros(start), voiced, np.zeros(ref.size - start - voiced.size)])
@@ -199,7 +180,7 @@ def make_scene(
     return Scene({"ref": ref, **signals}, meta, robot, room.robot, gain, fan)
 
 
-def make_script(rng: np.random.Generator, kind: str, voice: list[Clip], human_size: int) -> tuple[dict, Array]:
+def make_script(rng: Rng, kind: str, voice: list[Clip], human_size: int) -> tuple[dict, Array]:
     """Meta entries (and the human's `onset` before converter delay) and ref (n,)."""
     wait, pause, lead = (int(s * RATE) for s in (rng.uniform(0.5, 1.6), rng.uniform(0.5, 1.1), 0.45))
     first, said = read_utterance(rng, voice, 4.0)
@@ -221,24 +202,24 @@ def played(ref: Array, script: dict) -> Array:
     lag, lag2 = script["lag"], script.get("lag2", script["lag"])
     out[lag : lag + at] = ref[:at][: ref.size - lag]
     out[at + lag2 :] += 10 ** (script.get("volume_db", 0.0) / 20) * ref[at : ref.size - lag2]
-    return warp(out, script.get("ppm", 0.0))
+    return physics.warp(out, script.get("ppm", 0.0))
 
 
-def noises(rng: np.random.Generator, sizes: tuple[int, int, int]) -> list[Array]:
+def noises(rng: Rng, sizes: tuple[int, int, int]) -> list[Array]:
     """Noise of a drawn fan, of unit power, for each size (n,)."""
-    spectrum = draw_fan(rng)
-    return [fan_noise(rng, spectrum, n) for n in sizes]
+    spectrum = physics.draw_fan(rng)
+    return [physics.fan_noise(rng, spectrum, n) for n in sizes]
 
 
 def record_all(
-    rng: np.random.Generator,
+    rng: Rng,
     room_name: str,
     robot: Robot,
     paths: tuple[Array, Array],
     played: Array,
     clean: Array,
     span: slice | Array,
-    fans: Callable[[np.random.Generator, tuple[int, int, int]], list[Array]],
+    fans: Callable[[Rng, tuple[int, int, int]], list[Array]],
 ) -> tuple[dict[str, Array], dict[str, float], float]:
     """Calibration in the first path's room, conversation in the second's, with all levels set; their figures; the gain.
 
@@ -246,7 +227,7 @@ def record_all(
     4.5-10.5 dB below the human; of an array (microphones, n) in the first microphone. fans: with the sweep, alone, and in
     the conversation, of unit power. span: where the human speaks.
     """
-    excitation = sweep()
+    excitation = physics.sweep()
     sweep_echo = robot.record(excitation, paths[0])
     gain = rng.uniform(0.22, 0.42) / np.abs(sweep_echo).max()
     echo = robot.record(played, paths[1])

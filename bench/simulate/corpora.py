@@ -7,18 +7,15 @@ r"""Build HUMAN, ROBOT and WHISPER, the folders that every benchmark and trainin
     python -m bench.simulate.corpora --output DATA --synthesizers
 
 Archives: LibriSpeech (openslr.org/12) and speechocean762 (openslr.org/101), as they were downloaded. DATA/human/train,
-val and test are each made when all archives of theirs were given; DATA/robot likewise has train, val and test, each
-with a transcripts.tsv (path, speaker, seconds, text). Which recordings and sentences: selection.tsv (set, archive,
-speaker, chapter, utterances such as "0-4,9") and robot_sentences.tsv (set, voice, number, text) beside this file, in
-the order of the transcripts: what is simulated from a folder draws by position. --whisper takes the folder of
-openai/whisper-base and converts it to DATA/whisper (needs ct2-transformers-converter). --synthesizers has Debian's
-espeak-ng and flite read the robot's sentences, three voices each, into DATA/synthesizers: voices that no network was
-trained on. Nothing is fetched.
+val and test are each made when all archives of theirs were given; DATA/robot has the same. Each has a transcripts.tsv
+(path, speaker, seconds, text). selection.tsv (set, archive, speaker, chapter, utterances such as "0-4,9") and
+robot_sentences.tsv (set, voice, number, text) beside this file say what is taken, in the order of the transcripts: what
+is simulated from a folder draws by position. --whisper converts a folder of openai/whisper-base to DATA/whisper.
+--synthesizers: espeak-ng and flite read the robot's sentences into DATA/synthesizers. Nothing is fetched.
 
-LibriSpeech's archives are compared with the checksums published with them. All that was read and made is written down
-in DATA/checksums.tsv (what, files, bytes, sha256); --checksums FILE, somebody else's such file, is compared with it:
-exit code 1 and a line for each difference. Renderings and Whisper's conversion depend on versions of their packages,
-recordings on nothing.
+All that was read and made is written down in DATA/checksums.tsv (what, files, bytes, sha256); --checksums FILE,
+somebody else's, is compared with it: exit code 1 and a line for each difference. Renderings and Whisper's conversion
+depend on versions of their packages, recordings on nothing.
 """
 
 from __future__ import annotations
@@ -34,7 +31,7 @@ import tarfile
 import tempfile
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import count
+from itertools import cycle
 from pathlib import Path, PurePosixPath
 
 import numpy as np
@@ -90,8 +87,6 @@ class Utterance:
 
 @dataclass(frozen=True)
 class Sentence:
-    """What one of the robot's voices reads."""
-
     folder: str
     voice: str
     number: int
@@ -108,24 +103,17 @@ Renderer = Callable[[Sentence], tuple[np.ndarray, int]]
 
 
 def read_selection(path: Path = SELECTION) -> list[Utterance]:
-    """Every utterance of every set, in order."""
-    return [
-        Utterance(row["set"], row["archive"], row["speaker"], utterance_name(row, number))
-        for row in _rows(path)
-        for number in numbers(row["utterances"])
-    ]
+    found = []
+    for row in _rows(path):
+        libri = row["archive"] != SPEECHOCEAN
+        stem = f"{row['speaker']}-{row['chapter']}-" if libri else f"{int(row['speaker']):05d}"
+        names = [f"{stem}{number:04d}" for number in numbers(row["utterances"])]
+        found += [Utterance(row["set"], row["archive"], row["speaker"], name) for name in names]
+    return found
 
 
 def read_sentences(path: Path = SENTENCES) -> list[Sentence]:
-    """Every sentence of every voice, in order."""
     return [Sentence(row["set"], row["voice"], int(row["number"]), row["text"]) for row in _rows(path)]
-
-
-def utterance_name(row: dict[str, str], number: int) -> str:
-    """LibriSpeech: SPEAKER-CHAPTER-NNNN; speechocean762: the speaker in five digits, the utterance in four."""
-    if row["archive"] == SPEECHOCEAN:
-        return f"{int(row['speaker']):05d}{number:04d}"
-    return f"{row['speaker']}-{row['chapter']}-{number:04d}"
 
 
 def numbers(text: str) -> list[int]:
@@ -171,21 +159,10 @@ def check(path: Path) -> dict[str, object]:
 def take(archive: Path, wanted: Mapping[str, Path]) -> dict[str, tuple[float, str]]:
     """Write recordings of a tar archive where they are wanted, as FLAC, and return their seconds and texts.
 
-    LibriSpeech keeps texts in SPEAKER-CHAPTER.trans.txt, speechocean762 in files called `text`; both have a name and
-    the words in a line. The archive is read once, from its beginning to its end; no path inside it decides where
-    anything is written.
-
-    Parameters
-    ----------
-    archive
-        .tar, .tar.gz, ...
-    wanted
-        The file to write by the recording's name without suffix.
-
-    Raises
-    ------
-    UsageError
-        For what is no tar archive, for a recording that is not 16 kHz mono, and where one or its text is missing.
+    wanted: the file to write by the recording's name without suffix; no path inside the archive decides where
+    anything is written. LibriSpeech keeps texts in SPEAKER-CHAPTER.trans.txt, speechocean762 in files called `text`;
+    both have a name and the words in a line. Raises UsageError for what is no tar archive, for a recording that is
+    not 16 kHz mono, and where one or its text is missing.
     """
     seconds: dict[str, float] = {}
     texts: dict[str, str] = {}
@@ -231,9 +208,8 @@ def human(given: Sequence[Path], output: Path) -> tuple[Sums, list[str]]:
     by_name = {archive_name(path): path for path in given}
     if strange := set(by_name) - {utterance.archive for utterance in selected}:
         known = ", ".join(sorted({utterance.archive for utterance in selected}))
-        raise UsageError(
-            f"nothing is taken from {', '.join(sorted(strange))}, expected archives called {known}: keep their names"
-        )
+        found = f"nothing is taken from {', '.join(sorted(strange))}"
+        raise UsageError(f"{found}, expected archives called {known}: keep their names")
     lacking = {name: sorted({u.archive for u in selected if u.folder == name} - set(by_name)) for name in SETS}
     complete = [name for name in SETS if not lacking[name]]
     left_out = [f"human/{name} needs {', '.join(lacking[name])} as well" for name in SETS if lacking[name]]
@@ -251,11 +227,7 @@ def human(given: Sequence[Path], output: Path) -> tuple[Sums, list[str]]:
 
 
 def kokoro(model: Path, voices: Path) -> Renderer:
-    """Renders with the package kokoro-onnx, British voices (b...) in British English.
-
-    model, voices: kokoro-v1.0.int8.onnx and voices-v1.0.bin of its release of model files. Raises UsageError without
-    the package.
-    """
+    """Renders with the package kokoro-onnx, British voices (b...) in British English; raises UsageError without it."""
     try:
         from kokoro_onnx import Kokoro
     except ImportError as error:
@@ -301,23 +273,15 @@ def read_aloud(sentence: Sentence) -> tuple[np.ndarray, int]:
 
 
 def robot(render: Renderer, output: Path) -> Sums:
-    """Write DATA/robot."""
-    sentences = read_sentences()
-    return {
-        f"robot/{name}": _render([s for s in sentences if s.folder == name], render, output / "robot" / name)
-        for name in SETS
-    }
+    of = {name: [sentence for sentence in read_sentences() if sentence.folder == name] for name in SETS}
+    return {f"robot/{name}": _render(sentences, render, output / "robot" / name) for name, sentences in of.items()}
 
 
 def synthesizers(output: Path) -> Sums:
     """Write DATA/synthesizers: the sentences of all sets, each READ times, by SYNTHESIZED in turn."""
-    texts, turn = dict.fromkeys(sentence.text for sentence in read_sentences()), count()
-    voices = [
-        (number, text, SYNTHESIZED[next(turn) % len(SYNTHESIZED)])
-        for number, text in enumerate(texts)
-        for _ in range(READ)
-    ]
-    sentences = [Sentence("synthesizers", voice, number, text) for number, text, voice in voices]
+    texts, voices = dict.fromkeys(sentence.text for sentence in read_sentences()), cycle(SYNTHESIZED)
+    each = ((number, text) for number, text in enumerate(texts) for _ in range(READ))
+    sentences = [Sentence("synthesizers", next(voices), number, text) for number, text in each]
     return {"synthesizers": _render(sentences, read_aloud, output / "synthesizers")}
 
 
@@ -343,11 +307,9 @@ def _transcribe(folder: Path, rows: Iterable[tuple[str, str, float, str]]) -> di
 
 
 def whisper(source: Path, output: Path) -> Sums:
-    """Convert the folder of openai/whisper-base to DATA/whisper."""
     if not (source / "config.json").is_file() or not (source / "tokenizer.json").is_file():
-        raise UsageError(
-            f"{source} holds no config.json and tokenizer.json, expected a download of openai/whisper-base"
-        )
+        wanted = "expected a download of openai/whisper-base"
+        raise UsageError(f"{source} holds no config.json and tokenizer.json, {wanted}")
     program = shutil.which(CONVERTER)
     if program is None:
         raise UsageError(f"there is no {CONVERTER}: pip install ctranslate2 transformers torch")
@@ -407,9 +369,8 @@ def main(argv: list[str] | None = None) -> int:
     add("--archives", type=Path, nargs="+", metavar="ARCHIVE", help="of LibriSpeech and speechocean762, as published")
     voices = parser.add_mutually_exclusive_group()
     voices.add_argument("--kokoro", type=Path, nargs=2, metavar=("MODEL", "VOICES"), help="render the robot's voices")
-    voices.add_argument(
-        "--renderings", type=Path, metavar="DIR", help="take them from DIR/VOICE/NNN.wav, .flac or .ogg"
-    )
+    rendered = "take them from DIR/VOICE/NNN.wav, .flac or .ogg"
+    voices.add_argument("--renderings", type=Path, metavar="DIR", help=rendered)
     add("--synthesizers", action="store_true", help="have espeak-ng and flite read the robot's sentences")
     add("--whisper", type=Path, metavar="DIR", help="a download of openai/whisper-base")
     add("--checksums", type=Path, metavar="FILE", help="compare with this checksums.tsv")

@@ -10,23 +10,21 @@ what parameters, and talk_s, the moment from which a human is mixed in when the 
 from __future__ import annotations
 
 import argparse
-import json
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import soundfile as sf
 
-from bench.simulate.conversations import Clip, read_clips, read_speech
+from bench.recordings import CALIBRATION
+from bench.simulate.conversations import Clip, read_clips, read_speech, write_item
 from bench.simulate.hidden_cases import hide, scale
 from bench.simulate.hidden_robot import draw_scene
-from bench.simulate.simulated_robot import RATE, Array
+from bench.simulate.simulated_robot import RATE, Array, Rng
 from edgefilter.calibration.calibrate import calibrate
 
 ALONE_S, PAUSE_S, TALK_S = 11.0, 1.2, 5.0
 """Seconds of the robot alone, of silence then, and of what it says, at least, while the human interrupts it."""
 ROBOT_OVER_FAN_DB = 27.0
-RECORDED = ("sweep_ref", "sweep_mic", "fan_only")
 
 
 @dataclass(frozen=True)
@@ -46,7 +44,7 @@ CASES = (
 )
 
 
-def said(rng: np.random.Generator, clips: list[Clip]) -> tuple[Array, float]:
+def said(rng: Rng, clips: list[Clip]) -> tuple[Array, float]:
     """Sentences for ALONE_S, a pause, one more for at least TALK_S, peak 0.8, (n,); and the second before that one."""
     parts, order = [np.zeros(RATE // 2)], list(rng.permutation(len(clips)))
     while sum(part.size for part in parts) < ALONE_S * RATE:
@@ -59,7 +57,6 @@ def said(rng: np.random.Generator, clips: list[Clip]) -> tuple[Array, float]:
 
 
 def make(case: Hidden, clips: list[Clip]) -> tuple[dict[str, Array], dict]:
-    """Signals by name (n,) and the contents of truth.json."""
     rng = np.random.default_rng([case.seed, 27])
     reference, talk_s = said(rng, [clip for clip in clips if clip.speaker == case.voice])
     scene = draw_scene(rng, reference, ROBOT_OVER_FAN_DB)
@@ -73,14 +70,10 @@ def make(case: Hidden, clips: list[Clip]) -> tuple[dict[str, Array], dict]:
 
 def write(folder: Path, signals: dict[str, Array], truth: dict) -> None:
     """The files of a case, 16 bit, the profile from what 16 bit leave of the calibration's recordings."""
-    folder.mkdir(parents=True, exist_ok=True)
     rounded = {name: (np.round(x * 32768) / 32768).astype(np.float32) for name, x in signals.items()}
-    calibrate(*(rounded[name] for name in RECORDED), source=f"simulated robot '{folder.name}'").save(
-        folder / "profile.npz"
-    )
-    for name, kept in (("mic", "mic"), ("ref", "reference")):
-        sf.write(folder / f"{kept}.flac", rounded[name], RATE, subtype="PCM_16")
-    (folder / "truth.json").write_text(json.dumps(truth, indent=1) + "\n", encoding="utf-8")
+    write_item(folder, {"mic": rounded["mic"], "reference": rounded["ref"]}, "truth", truth)
+    profile = calibrate(*map(rounded.get, CALIBRATION), source=f"simulated robot '{folder.name}'")
+    profile.save(folder / "profile.npz")
 
 
 def main() -> None:

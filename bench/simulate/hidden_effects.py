@@ -19,21 +19,11 @@ from dataclasses import replace
 import numpy as np
 from scipy import signal
 
-from bench.simulate.hidden_robot import (
-    Chain,
-    Scene,
-    decibels,
-    direction,
-    draw_place,
-    power,
-    read_at,
-    reflector,
-    solve,
-    with_distortion,
-)
-from bench.simulate.simulated_robot import RATE, Array, fan_noise
+from bench.simulate import hidden_robot as robot
+from bench.simulate import simulated_robot as physics
+from bench.simulate.hidden_robot import Chain, Scene, decibels, power, read_at, solve
+from bench.simulate.simulated_robot import RATE, Array, Rng
 
-Rng = np.random.Generator
 Effect = Callable[[Rng, Scene, Chain, str], tuple[Chain, dict]]
 Person = Callable[[Rng], Array]
 Disturbance = Callable[[Rng, Scene, Chain, str, Person], tuple[Chain, dict]]
@@ -62,10 +52,6 @@ def played_change_db(scene: Scene, chain: Chain) -> Callable[[Array], float]:
     return lambda played: scene.over_fan_db(signal.oaconvolve(played - chain.played, response)[: played.size])
 
 
-STEP_MS = 1
-"""Time step of the gain computers."""
-
-
 def levels_db(x: Array, step_ms: int) -> Array:
     """RMS level in dBFS of steps of so many ms, (m,)."""
     step = RATE * step_ms // 1000
@@ -79,9 +65,9 @@ def gain_curve(gain_db: Array, step_ms: int, n: int) -> Array:
     return 10 ** (np.interp(np.arange(n), ends, gain_db) / 20)
 
 
-def smooth(x: Array, rise_ms: float, fall_ms: float, step_ms: int) -> Array:
-    """Smooth x (m,) by a first-order lag that rises with one time constant and falls with another."""
-    rise, fall = (1.0 - math.exp(-step_ms / constant) for constant in (rise_ms, fall_ms))
+def smooth(x: Array, rise_ms: float, fall_ms: float) -> Array:
+    """Smooth x (m,), a value a ms, by a first-order lag that rises with one time constant and falls with another."""
+    rise, fall = (1.0 - math.exp(-1 / constant) for constant in (rise_ms, fall_ms))
     out, state = [], float(x[0])
     for value in x.tolist():
         state += (rise if value > state else fall) * (value - state)
@@ -93,31 +79,24 @@ def compressor_gain_db(
     x: Array, threshold_db: float, ratio: float, knee_db: float, attack_ms: float, release_ms: float
 ) -> Array:
     """Gain per ms of a feed-forward compressor, (m,) (Giannoulis, Massberg & Reiss 2012, eq. (4) and (17))."""
-    over = levels_db(x, STEP_MS) - threshold_db
+    over = levels_db(x, 1) - threshold_db
     bend = np.clip(over + knee_db / 2, 0, knee_db) ** 2 / (2 * max(knee_db, 1e-6))
     reduction = (1.0 - 1.0 / ratio) * np.where(over > knee_db / 2, over, bend)
-    return -smooth(reduction, attack_ms, release_ms, STEP_MS)
+    return -smooth(reduction, attack_ms, release_ms)
 
 
 def agc_gain_db(
-    mic: Array,
-    slope: float,
-    target_db: float,
-    attack_ms: float,
-    release_ms: float,
-    limit_db: float,
-    hold_db: float,
-    step_ms: int = 5,
+    mic: Array, slope: float, target_db: float, attack_ms: float, release_ms: float, limit_db: float, hold_db: float
 ) -> Array:
-    """Gain of a feedback loop that steers the output's level towards target_db, (m,).
+    """Gain per 5 ms of a feedback loop that steers the output's level towards target_db, (m,).
 
     slope 0..1: how much of the deviation it takes away. Falls with attack_ms, rises with release_ms, within +-limit_db;
     stands still while the input is below hold_db.
     """
-    fast, slow = (1.0 - math.exp(-step_ms / constant) for constant in (attack_ms, release_ms))
+    fast, slow = (1.0 - math.exp(-5 / constant) for constant in (attack_ms, release_ms))
     loop = slope / max(1.0 - slope, 0.05)
     gain, out = 0.0, []
-    for level in levels_db(mic, step_ms).tolist():
+    for level in levels_db(mic, 5).tolist():
         if level > hold_db:
             wanted = min(max(loop * (target_db - level - gain), -limit_db), limit_db)
             gain += (fast if wanted < gain else slow) * (wanted - gain)
@@ -184,7 +163,7 @@ def speaker_nonlinearity(rng: Rng, scene: Scene, chain: Chain, strength: str) ->
         path = scene.gain_after * signal.oaconvolve(chain.paths[0][2], scene.shell)
         wanted = scene.fan_power * 10 ** (ENR_DB[strength] / 10)
         for _ in range(4):
-            driver, _ = with_distortion(chain.loudspeaker, chain.played, path, wanted)
+            driver, _ = robot.with_distortion(chain.loudspeaker, chain.played, path, wanted)
             found_db = scene.over_fan_db(scene.echo(replace(chain, loudspeaker=driver)) - scene.echo(chain))
             if abs(found_db - ENR_DB[strength]) < 0.5:
                 break
@@ -199,10 +178,7 @@ def speaker_nonlinearity(rng: Rng, scene: Scene, chain: Chain, strength: str) ->
 
 
 def rattle(rng: Rng, scene: Scene, chain: Chain, strength: str) -> tuple[Chain, dict]:
-    """A loose part that the cone's displacement makes strike.
-
-    Ringing modes, each strike of another force and a little late.
-    """
+    """A loose part that the cone strikes: ringing modes, each strike of another force and a little late."""
     w = 2 * math.pi * chain.loudspeaker.resonance_hz
     displacement = signal.lfilter(*signal.bilinear([w * w], [1.0, w / chain.loudspeaker.q, w * w], RATE), chain.played)
     rate_hz = log_uniform(rng, 8, 60)
@@ -214,10 +190,8 @@ def rattle(rng: Rng, scene: Scene, chain: Chain, strength: str) -> tuple[Chain, 
     at = peaks[struck] + np.abs(rng.normal(0, 0.0004 * RATE, struck.sum())).astype(int)
     force = (heights[struck] / threshold - 0.8) * np.exp(rng.normal(0, 0.4, struck.sum()))
     blows = np.bincount(np.minimum(at, chain.played.size - 1), weights=force, minlength=chain.played.size)
-    modes = [
-        (log_uniform(rng, 900, 6000), log_uniform(rng, 0.001, 0.008), rng.uniform(0.3, 1.0))
-        for _ in range(int(rng.integers(2, 6)))
-    ]
+    modes = [(log_uniform(rng, 900, 6000), log_uniform(rng, 0.001, 0.008), rng.uniform(0.3, 1.0))
+             for _ in range(int(rng.integers(2, 6)))]  # fmt: skip
     t = np.arange(int(0.05 * RATE)) / RATE
     ring = sum(a * np.exp(-t / decay) * np.sin(2 * math.pi * f * t) for f, decay, a in modes)
     impacts = signal.oaconvolve(blows, ring)[: chain.played.size]
@@ -246,9 +220,9 @@ def late_reverb(rng: Rng, scene: Scene, chain: Chain, strength: str) -> tuple[Ch
     """The same robot carried to a more reverberant room, or its own room emptied of curtains and carpets."""
     rt60_s = rng.uniform(*RANGES["late_reverb"][strength])
     here = scene.moved
-    place = draw_place(rng, rt60_s, here.loudspeaker - here.microphone)
+    place = robot.draw_place(rng, rt60_s, here.loudspeaker - here.microphone)
     if same_room := bool(rng.random() < 0.4):
-        bare = draw_place(rng, rt60_s, size=here.size)
+        bare = robot.draw_place(rng, rt60_s, size=here.size)
         place = replace(here, absorption=bare.absorption, order=bare.order)
     parameters = {"rt60_s": rt60_s, "same_room": same_room, "room_m": place.size.tolist()}
     return replace(chain, paths=((0, 0, place.response()),)), parameters
@@ -258,8 +232,8 @@ def path_change(rng: Rng, scene: Scene, chain: Chain, strength: str) -> tuple[Ch
     """From some moment on the head has turned, the robot has moved, or a person stands by it."""
     n, before = chain.played.size, chain.paths[0][2]
     start, fade = int(rng.uniform(0.25, 0.7) * n), int(log_uniform(rng, 0.05, 0.8) * RATE)
-    kind, step = str(rng.choice(["head", "robot", "person"])), direction(rng)
-    mirror = reflector(rng, scene.moved)
+    kind, step = str(rng.choice(["head", "robot", "person"])), robot.direction(rng)
+    mirror = robot.reflector(rng, scene.moved)
 
     def after(metres: float) -> Array:
         if kind == "person":
@@ -289,9 +263,8 @@ def _padded(x: Array, size: int) -> Array:
 def clock_drift(rng: Rng, scene: Scene, chain: Chain, strength: str) -> tuple[Chain, dict]:
     """Converters of two clocks, one of which warms up a little."""
     ppm, t = sign(rng) * log_uniform(rng, *RANGES["clock_drift"][strength]), np.arange(chain.played.size)
-    wander = rng.uniform(0.01, 0.06) * np.sin(
-        2 * math.pi * t / (RATE * rng.uniform(15, 60)) + rng.uniform(0, 2 * math.pi)
-    )
+    samples, period = rng.uniform(0.01, 0.06), RATE * rng.uniform(15, 60)
+    wander = samples * np.sin(2 * math.pi * t / period + rng.uniform(0, 2 * math.pi))
     return replace(chain, lag=-ppm * 1e-6 * t + wander), {"ppm": ppm}
 
 
@@ -344,11 +317,8 @@ def mic_clipping(rng: Rng, scene: Scene, chain: Chain, strength: str) -> tuple[C
     return replace(chain, microphone=(*chain.microphone, lambda x: clipped(x, level))), parameters
 
 
-def fan_noise_change(rng: Rng, scene: Scene, chain: Chain, strength: str) -> tuple[Chain, dict]:
-    """The fan turns faster, is louder, or a bearing or a vent has begun to sing.
-
-    From the start or from some moment on.
-    """
+def fan_noise(rng: Rng, scene: Scene, chain: Chain, strength: str) -> tuple[Chain, dict]:
+    """From the start or later on the fan turns faster, is louder, or a bearing or a vent has begun to sing."""
     f, old = np.linspace(0, RATE / 2, 1025), scene.fan_amplitude
     kind = str(rng.choice(["louder", "faster", "band", "lines"]))
     speed = rng.uniform(1.05, 1.4)
@@ -369,7 +339,7 @@ def fan_noise_change(rng: Rng, scene: Scene, chain: Chain, strength: str) -> tup
 
     low = 1.0 if kind == "faster" else 0.01
     s = solve(lambda s: decibels(float(np.mean(np.abs(new(s) ** 2 - old**2)))), ENR_DB[strength], low, 1000.0)
-    noise = fan_noise(rng, new(s), n)
+    noise = physics.fan_noise(rng, new(s), n)
     noise *= math.sqrt(scene.fan_power * np.mean(new(s) ** 2) / power(noise))
     start = int(rng.uniform(0.15, 0.5) * n) if rng.random() < 0.25 else -RATE
     grown = np.clip((np.arange(n) - start) / (rng.uniform(0.3, 2) * RATE), 0, 1) if start > 0 else np.ones(n)
@@ -379,21 +349,10 @@ def fan_noise_change(rng: Rng, scene: Scene, chain: Chain, strength: str) -> tup
     return replace(chain, fan=fan), parameters | ({"speed": speed} if kind == "faster" else {})
 
 
-CATALOGUE: dict[str, Effect] = {
-    "late_reverb": late_reverb,
-    "chassis_resonance": chassis_resonance,
-    "playback_gain": playback_gain,
-    "bandlimit": bandlimit,
-    "clock_drift": clock_drift,
-    "delay_jump": delay_jump,
-    "path_change": path_change,
-    "compression": compression,
-    "mic_agc": mic_agc,
-    "speaker_nonlinearity": speaker_nonlinearity,
-    "mic_clipping": mic_clipping,
-    "rattle": rattle,
-    "fan_noise": fan_noise_change,
-}
+CATALOGUE: dict[str, Effect] = {effect.__name__: effect for effect in (
+    late_reverb, chassis_resonance, playback_gain, bandlimit, clock_drift, delay_jump, path_change, compression,
+    mic_agc, speaker_nonlinearity, mic_clipping, rattle, fan_noise,
+)}  # fmt: skip
 
 
 CODECS = {
@@ -480,10 +439,9 @@ def door_slams(rng: Rng, scene: Scene, chain: Chain, strength: str, _: Person) -
 
 def flutter(rng: Rng, scene: Scene, chain: Chain, strength: str, _: Person) -> tuple[Chain, dict]:
     """A clock that trembles (2-12 Hz), as a bad resampler or a loudspeaker on a spring makes it."""
-    rate_hz, t = math.exp(rng.uniform(math.log(2), math.log(12))), np.arange(chain.fan.size) / RATE
-    wave = np.sin(2 * math.pi * rate_hz * t + rng.uniform(0, 6)) + 0.3 * np.sin(
-        2 * math.pi * rate_hz * 2.3 * t + rng.uniform(0, 6)
-    )
+    rate_hz, t = log_uniform(rng, 2, 12), np.arange(chain.fan.size) / RATE
+    wave = np.sin(2 * math.pi * rate_hz * t + rng.uniform(0, 6))
+    wave = wave + 0.3 * np.sin(2 * math.pi * rate_hz * 2.3 * t + rng.uniform(0, 6))
     echo, usual = scene.echo(chain), np.zeros(t.size) if chain.lag is None else chain.lag
     slope = np.fft.irfft(np.fft.rfft(echo) * 2j * math.pi * np.fft.rfftfreq(echo.size), echo.size)
     samples = solve(lambda s: scene.over_fan_db(s * wave * slope), ENR_DB[strength], 1e-4, 30.0)
@@ -491,10 +449,7 @@ def flutter(rng: Rng, scene: Scene, chain: Chain, strength: str, _: Person) -> t
 
 
 def packet_loss(rng: Rng, scene: Scene, chain: Chain, strength: str, _: Person) -> tuple[Chain, dict]:
-    """The playback is streamed and packets of 10-40 ms are lost: silence, or the last packet again and fading.
-
-    The clock goes on.
-    """
+    """Streamed packets of 10-40 ms are lost: silence, or the last one again and fading; the clock goes on."""
     x, length = chain.played, int(rng.choice([10, 20, 40])) * RATE // 1000
     repeats, fade = bool(rng.random() < 0.5), np.linspace(0, 1, 32)
     order = rng.permutation(np.arange(8, x.size // length - 2))
@@ -564,23 +519,14 @@ def cuts_band(x: Array, y: Array) -> bool:
 
 
 def incoherent_db(x: Array, y: Array) -> float:
-    """Share of y's power (n,), in dB, that no linear filter of x (n,) explains.
-
-    Its spectrum times one minus the coherence (64 ms, Welch).
-    """
+    """Share of y's power (n,), dB, that no linear filter of x (n,) explains: one minus the coherence (64 ms, Welch)."""
     _, coherence = signal.coherence(x, y, fs=RATE, nperseg=1024)
     _, spectrum = signal.welch(y, fs=RATE, nperseg=1024)
     return decibels(float(np.sum((1.0 - coherence) * spectrum) / np.sum(spectrum)))
 
 
-OUTSIDE: dict[str, Disturbance] = {
-    "mains_hum": mains_hum,
-    "talker": talker,
-    "codec": codec,
-    "flutter": flutter,
-    "packet_loss": packet_loss,
-    "door_slams": door_slams,
-    "music": music,
-}
+OUTSIDE: dict[str, Disturbance] = {kind.__name__: kind for kind in (
+    mains_hum, talker, codec, flutter, packet_loss, door_slams, music
+)}  # fmt: skip
 NAMED = ("packet_loss", "codec")
 """Of these, what the diagnosis has a name for."""

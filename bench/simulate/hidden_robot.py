@@ -14,7 +14,8 @@ import numpy as np
 import pyroomacoustics as pra
 from scipy import signal
 
-from bench.simulate.simulated_robot import RATE, Array, Loudspeaker, draw_body, draw_fan, draw_loudspeaker, fan_noise
+from bench.simulate import simulated_robot as physics
+from bench.simulate.simulated_robot import RATE, Array, Loudspeaker, Rng
 
 SOUND_M_S = 343.0
 PHASES = 4096
@@ -23,10 +24,7 @@ HALF_WIDTH = 32
 
 @dataclass(frozen=True)
 class Place:
-    """A robot in a shoebox room.
-
-    Size (3,) in m, wall absorption, highest order of reflection, microphone and loudspeaker (3,) in m.
-    """
+    """A robot in a room: size (3,) in m, wall absorption, highest order of reflection, microphone, loudspeaker (3,)."""
 
     size: Array
     absorption: float
@@ -52,9 +50,7 @@ class Place:
         return replace(self, microphone=self.microphone + allowed, loudspeaker=self.loudspeaker + allowed)
 
 
-def draw_place(
-    rng: np.random.Generator, rt60_s: float, geometry: Array | None = None, size: Array | None = None
-) -> Place:
+def draw_place(rng: Rng, rt60_s: float, geometry: Array | None = None, size: Array | None = None) -> Place:
     """A room of this reverberation time (Sabine's formula, +-25 %).
 
     geometry (3,): from microphone to loudspeaker in m, else drawn, 0.1-0.3 m. size (3,) in m, else drawn.
@@ -69,17 +65,14 @@ def draw_place(
     return Place(size, absorption, min(order, 50), microphone, microphone + geometry)
 
 
-def direction(rng: np.random.Generator) -> Array:
+def direction(rng: Rng) -> Array:
     """A random direction of length 1, (3,)."""
     x = rng.standard_normal(3)
     return x / np.linalg.norm(x)
 
 
-def reflector(rng: np.random.Generator, place: Place) -> Callable[[float], Array]:
-    """Impulse response (m,) of one reflection from a person or a panel at a given distance in m.
-
-    A flat mirror that returns less treble the rougher it is: an image source and a low-pass of first order.
-    """
+def reflector(rng: Rng, place: Place) -> Callable[[float], Array]:
+    """Impulse response (m,) of one reflection (image source, low-pass of first order) at a given distance in m."""
     towards, loss, corner = direction(rng), rng.uniform(0.5, 0.9), rng.uniform(2500, 7000)
     towards[2] *= 0.2
     towards /= np.linalg.norm(towards)
@@ -103,10 +96,7 @@ def _sinc_table() -> Array:
 
 
 def read_at(x: Array, positions: Array) -> Array:
-    """Samples x (n,) at any positions (m,) in samples, 0 outside.
-
-    Positions rounded to 1/4096 of a sample (error below -74 dB at 4 kHz).
-    """
+    """Samples x (n,) at positions (m,), rounded to 1/4096 of a sample (error below -74 dB at 4 kHz), 0 outside."""
     table = _sinc_table()
     padded = np.pad(x, 2 * HALF_WIDTH)
     windows = np.lib.stride_tricks.sliding_window_view(padded, 2 * HALF_WIDTH)
@@ -128,7 +118,7 @@ def fractional_delay(x: Array, samples: float) -> Array:
     return np.concatenate([np.zeros(whole), late])[: x.size]
 
 
-def sweep(rng: np.random.Generator) -> Array:
+def sweep(rng: Rng) -> Array:
     """Exponential sweep, 40 to 8000 Hz (Farina 2000, eq. (2)), 5-8 s, peak 0.25-0.45, between silence."""
     seconds, peak = rng.uniform(5, 8), rng.uniform(0.25, 0.45)
     n = int(seconds * RATE)
@@ -149,10 +139,7 @@ def decibels(ratio: float) -> float:
 
 
 def solve(measure: Callable[[float], float], target: float, low: float, high: float, tolerance: float = 0.15) -> float:
-    """The x between low and high (both > 0) where measure (rising or falling in x) is target: bisection of log x.
-
-    An end if out of reach.
-    """
+    """The x in [low, high] (both > 0) where the monotonic measure is target, by bisection of log x; else an end."""
     rising = measure(high) > measure(low)
     a, b = math.log(low), math.log(high)
     for _ in range(14):
@@ -193,18 +180,16 @@ class Chain:
 class Scene:
     """One robot on one day: calibration, reference, tolerances; `usual` is the chain when nothing is hidden.
 
-    reference (n,). delay: of the converters in the sweep, samples; offset: what is added to it in the recording. gain:
-    from the room's pressure to full scale, gain_after: with its tolerance. fan_power: of the calibrated noise.
-    fan_amplitude (1025,): its spectrum on 0-8000 Hz, unit power.
+    moved: where it stands after the calibration. reference (n,). delay: of the converters in the sweep, samples;
+    offset: what is added to it in the recording. gain_after: from the room's pressure to full scale, with its
+    tolerance. fan_power: of the calibrated noise. fan_amplitude (1025,): its spectrum on 0-8000 Hz, unit power.
     """
 
-    place: Place
     moved: Place
     shell: Array
     reference: Array
     delay: float
     offset: float
-    gain: float
     gain_after: float
     fan_power: float
     fan_amplitude: Array
@@ -261,85 +246,51 @@ def _gate(n: int, start: int, fade: int) -> Array:
     return np.clip((np.arange(n) - start) / max(fade, 1), 0.0, 1.0)
 
 
-def draw_scene(
-    rng: np.random.Generator,
-    reference: Array,
-    robot_over_fan_db: float,
-    faint_db: tuple[float, float] = FAINT_DB,
-) -> Scene:
+def draw_scene(rng: Rng, reference: Array, robot_over_fan_db: float) -> Scene:
     """A robot, its calibration, and another day with the ordinary tolerances.
 
     robot_over_fan_db: of the whole recording. Tolerances: offset -60..60 samples, fan +-0.4 dB, gain +-0.1 dB, the
-    microphone moved by 0.1-0.9 mm, distortion of faint_db over the fan. All recordings together are scaled later, see
+    microphone moved by 0.1-0.9 mm, distortion of FAINT_DB over the fan. All recordings together are scaled later, see
     `hidden_cases.scale`.
     """
-    place, shell, amplitude = draw_place(rng, rng.uniform(0.18, 0.32)), draw_shell(rng), draw_hiss(rng)
+    place, shell = draw_place(rng, rng.uniform(0.18, 0.32)), draw_shell(rng)
+    turning, hiss = physics.draw_fan(rng), 10 ** (-rng.uniform(6, 13) / 10)  # the hiss of the air's flow is flat
+    amplitude = np.sqrt((turning**2 + hiss) / (1 + hiss))
     move_m = rng.uniform(1e-4, 9e-4)
     moved = place.microphone_moved(move_m * direction(rng))
     offset = rng.uniform(-60, 60)
-    tolerances = {
-        "offset_samples": offset,
-        "fan_db": rng.uniform(-0.4, 0.4),
-        "gain_db": rng.uniform(-0.1, 0.1),
-        "move_mm": 1e3 * move_m,
-    }
+    tolerances = {"offset_samples": offset, "fan_db": rng.uniform(-0.4, 0.4), "gain_db": rng.uniform(-0.1, 0.1)}
+    tolerances["move_mm"] = 1e3 * move_m
     excitation, delay = sweep(rng), rng.uniform(140, 700)
     paths = [signal.oaconvolve(p.response(), shell) for p in (place, moved)]
-    straight = draw_loudspeaker(rng)
+    straight = physics.draw_loudspeaker(rng)
     whole = signal.oaconvolve(straight.play(np.eye(1, 2048, 256)[0], linear=True), paths[0])
     echo = signal.oaconvolve(reference, whole)[: reference.size]
     peak = np.abs(signal.oaconvolve(excitation, whole)).max()
     gain = rng.uniform(0.25, 0.5) / peak
     fan_power = gain**2 * power(echo) * 10 ** (-robot_over_fan_db / 10)
-    wanted = fan_power / gain**2 * 10 ** (rng.uniform(*faint_db) / 10)
+    wanted = fan_power / gain**2 * 10 ** (rng.uniform(*FAINT_DB) / 10)
     loudspeaker, distortion = with_distortion(straight, reference, paths[0], wanted)
     tolerances["distortion_over_fan_db"] = decibels(distortion * gain**2 / fan_power)
     swept = gain * fractional_delay(signal.oaconvolve(loudspeaker.play(excitation), paths[0])[: excitation.size], delay)
-    noises = [math.sqrt(fan_power) * fan_noise(rng, amplitude, n) for n in (excitation.size, 8 * RATE, reference.size)]
+    sizes = excitation.size, 8 * RATE, reference.size
+    noises = [math.sqrt(fan_power) * physics.fan_noise(rng, amplitude, n) for n in sizes]
     signals = {"sweep_ref": excitation, "sweep_mic": swept + noises[0], "fan_only": noises[1], "ref": reference}
     usual = Chain(reference, loudspeaker, ((0, 0, moved.response()),), noises[2] * 10 ** (tolerances["fan_db"] / 20))
     gain_after = gain * 10 ** (tolerances["gain_db"] / 20)
-    return Scene(
-        place,
-        moved,
-        shell,
-        reference,
-        delay,
-        offset,
-        gain,
-        gain_after,
-        fan_power,
-        amplitude,
-        signals,
-        usual,
-        tolerances,
-    )
+    return Scene(moved, shell, reference, delay, offset, gain_after, fan_power, amplitude, signals, usual, tolerances)
 
 
-def draw_shell(rng: np.random.Generator) -> Array:
-    """Impulse response of the robot's own body, (128,).
-
-    Reflections within 2 ms, and 4-10 dB less treble, as the microphone is not in front of the cone.
-    """
+def draw_shell(rng: Rng) -> Array:
+    """Impulse response of the robot's body, (128,): reflections within 2 ms, and 4-10 dB less treble."""
     turn, loss_db = rng.uniform(1200, 3000), rng.uniform(4, 10)
     low = 10 ** (-loss_db / 20)
     b, a = signal.bilinear([low, 2 * math.pi * turn], [1.0, 2 * math.pi * turn], RATE)
-    return signal.lfilter(b, a, np.pad(draw_body(rng), (0, 96)))
-
-
-def draw_hiss(rng: np.random.Generator) -> Array:
-    """Amplitude response of fan, air flow and microphone together on 0-8000 Hz, of unit power, (1025,).
-
-    The flow's hiss is 6-13 dB down and flat.
-    """
-    return np.sqrt((draw_fan(rng) ** 2 + (hiss := 10 ** (-rng.uniform(6, 13) / 10))) / (1 + hiss))
+    return signal.lfilter(b, a, np.pad(physics.draw_body(rng), (0, 96)))
 
 
 def with_distortion(loudspeaker: Loudspeaker, played: Array, path: Array, wanted: float) -> tuple[Loudspeaker, float]:
-    """The driver turned until what its nonlinearity adds behind this path has the wanted power, and the power reached.
-
-    Measured over 5 s.
-    """
+    """The driver turned until what its nonlinearity adds behind this path in 5 s has the wanted power; that power."""
     x = played[RATE : 6 * RATE]
     straight = loudspeaker.play(x, linear=True)
 

@@ -17,22 +17,9 @@ from itertools import chain
 import numpy as np
 from scipy import signal
 
+from bench.simulate import simulated_robot as physics
 from bench.simulate.conversations import DISTORTION_DB, Clip, read_speech
-from bench.simulate.simulated_robot import (
-    RATE,
-    Array,
-    Robot,
-    Room,
-    draw_fan,
-    draw_robot,
-    draw_room,
-    draw_walls,
-    fan_noise,
-    stand,
-    sweep,
-    warp,
-    with_distortion,
-)
+from bench.simulate.simulated_robot import RATE, Array, Rng, Robot, Room
 from edgefilter.types import Samples
 
 PAUSE_S = (0.4, 2.0)
@@ -89,14 +76,14 @@ class Repertoire(Iterator[Array]):
         return 0.7 * samples / np.abs(samples).max()
 
 
-def shuffled(rng: np.random.Generator, clips: list[Clip]) -> Iterator[Clip]:
+def shuffled(rng: Rng, clips: list[Clip]) -> Iterator[Clip]:
     """The clips in random order, over and over."""
     while True:
         yield from (clips[number] for number in rng.permutation(len(clips)).tolist()[::-1])
 
 
 def speak(
-    rng: np.random.Generator, robot: Robot, repertoire: Iterator[Array], stage: Stage, speech_s: float
+    rng: Rng, robot: Robot, repertoire: Iterator[Array], stage: Stage, speech_s: float
 ) -> tuple[Array, Array, list[slice]]:
     """Reference (n,), echo (n,) without gain, and where in the echo each utterance is, of so many seconds of speech."""
     said: list[tuple[int, Array]] = []
@@ -114,11 +101,11 @@ def speak(
         place = echo[start + stage.lag : start + stage.lag + heard.size]
         place += heard[: place.size]
     later = stage.lag + robot.bulk
-    return ref, warp(echo, stage.ppm), [slice(start + later, start + later + x.size) for start, x in said]
+    return ref, physics.warp(echo, stage.ppm), [slice(start + later, start + later + x.size) for start, x in said]
 
 
 def interrupt(
-    rng: np.random.Generator, speech: list[Clip], room: Room, heard: list[slice], size: int
+    rng: Rng, speech: list[Clip], room: Room, heard: list[slice], size: int
 ) -> tuple[Array, list[tuple[str, slice]]]:
     """A human of unit power at the microphone, (size,), who talks over some of the utterances; what is said, and where."""
     clean, told, free = np.zeros(size), [], 0
@@ -133,12 +120,13 @@ def interrupt(
     return clean, told
 
 
-def draw_stages(rng: np.random.Generator, robot: Robot, stage_s: float) -> list[Stage]:
+def draw_stages(rng: Rng, robot: Robot, stage_s: float) -> list[Stage]:
     """The six stages of a day. stage_s: how long one of them lasts, about, for what the clocks lose in it."""
     human_m = rng.uniform(1.0, 1.5)
     about = robot.distance_m, robot.direction, human_m
-    walls = draw_walls(rng, "office")
-    laboratory, office, elsewhere = draw_room(rng, "lab", *about), stand(rng, walls, *about), stand(rng, walls, *about)
+    walls = physics.draw_walls(rng, "office")
+    laboratory = physics.draw_room(rng, "lab", *about)
+    office, elsewhere = (physics.stand(rng, walls, *about) for _ in range(2))
     early, late = (round(lag * RATE) for lag in LAGS_S)
     lost = round(-PPM * 1e-6 * stage_s * RATE)
     return [
@@ -147,18 +135,16 @@ def draw_stages(rng: np.random.Generator, robot: Robot, stage_s: float) -> list[
         Stage(f"volume {VOLUME_DB:+.0f} dB", office, early, VOLUME_DB),
         Stage("another place", elsewhere, early, VOLUME_DB),
         Stage(f"clock {PPM:+.0f} ppm, lag", elsewhere, late, VOLUME_DB, PPM),
-        Stage("another office", draw_room(rng, "office", *about), late + lost, VOLUME_DB, PPM),
+        Stage("another office", physics.draw_room(rng, "office", *about), late + lost, VOLUME_DB, PPM),
     ]
 
 
 def make_day(seed: int, minutes: float, voices: list[Clip], speech: list[Clip]) -> Day:
-    """A day of so many minutes of robot speech."""
     rng = np.random.default_rng(seed)
-    repertoire, robot = Repertoire(shuffled(rng, voices)), draw_robot(rng)
+    repertoire, robot = Repertoire(shuffled(rng, voices)), physics.draw_robot(rng)
     stages = draw_stages(rng, robot, 60 * minutes / STAGES)
-    robot, _ = with_distortion(
-        robot, next(Repertoire(shuffled(rng, voices))), stages[0].room.robot, USUAL_DISTORTION_DB
-    )
+    trial = next(Repertoire(shuffled(rng, voices)))
+    robot, _ = physics.with_distortion(robot, trial, stages[0].room.robot, USUAL_DISTORTION_DB)
     parts, begins, told, now, level = [], [], [], 0, 0.0
     for stage in stages:
         ref, echo, heard = speak(rng, robot, repertoire, stage, 60 * minutes / STAGES)
@@ -179,7 +165,6 @@ def make_day(seed: int, minutes: float, voices: list[Clip], speech: list[Clip]) 
 
 
 def loudness(echo: Array, heard: list[slice]) -> float:
-    """Root mean square of the utterances."""
     return math.sqrt(np.mean(np.concatenate([echo[utterance] for utterance in heard]) ** 2))
 
 
@@ -191,25 +176,22 @@ class Microphone:
     fan: float
     spectrum: Array
 
-    def hears_fan(self, rng: np.random.Generator, size: int) -> Samples:
-        """Noise of the fan, (size,)."""
-        return (self.fan * fan_noise(rng, self.spectrum, size)).astype(np.float32)
+    def hears_fan(self, rng: Rng, size: int) -> Samples:
+        return (self.fan * physics.fan_noise(rng, self.spectrum, size)).astype(np.float32)
 
 
-def draw_microphone(rng: np.random.Generator, robot: Robot, room: Room, peak: float, level: float) -> Microphone:
+def draw_microphone(rng: Rng, robot: Robot, room: Room, peak: float, level: float) -> Microphone:
     """With a gain at which a sweep in that room has a peak of 0.3 of full scale, or the voice one of 0.8.
 
     peak, level: largest sample and root mean square of the voice without gain.
     """
-    gain = float(min(0.3 / np.abs(robot.record(sweep(), room.robot)).max(), 0.8 / peak))
-    return Microphone(gain, gain * level * 10 ** (FAN_DB / 20), draw_fan(rng))
+    gain = float(min(0.3 / np.abs(robot.record(physics.sweep(), room.robot)).max(), 0.8 / peak))
+    return Microphone(gain, gain * level * 10 ** (FAN_DB / 20), physics.draw_fan(rng))
 
 
-def calibration(
-    rng: np.random.Generator, robot: Robot, room: Room, microphone: Microphone
-) -> tuple[Samples, Samples, Samples]:
+def calibration(rng: Rng, robot: Robot, room: Room, microphone: Microphone) -> tuple[Samples, Samples, Samples]:
     """A sweep, its recording in a room, and the fan alone."""
-    excitation = sweep()
+    excitation = physics.sweep()
     echo = np.float32(microphone.gain) * robot.record(excitation, room.robot).astype(np.float32)
     fan, alone = (microphone.hears_fan(rng, size) for size in (echo.size, 8 * RATE))
     return excitation.astype(np.float32), echo + fan, alone
@@ -240,17 +222,14 @@ class Monologue:
 
 
 def make_monologue(seed: int, index: int, voice: str, clips: Iterator[Clip], speech_s: float) -> Monologue:
-    """Number index of this seed, in which the voice says the next of its clips: rooms, distortions, starts in turn.
-
-    The lag is constant; in every other block of eight the clocks differ.
-    """
+    """Number index of this seed: rooms, distortions, starts in turn; clocks that differ in every other eight."""
     rng = np.random.default_rng([seed, index])
     kind, distortion, start = ROOMS[index % 2], tuple(DISTORTION_DB)[index // 2 % 2], STARTS[index // 4 % 2]
-    robot = draw_robot(rng)
-    room = draw_room(rng, kind, robot.distance_m, robot.direction, rng.uniform(1.0, 1.5))
+    robot = physics.draw_robot(rng)
+    room = physics.draw_room(rng, kind, robot.distance_m, robot.direction, rng.uniform(1.0, 1.5))
     first = next(clips)
     trial = read_speech(first)[: round(TRIAL_S * RATE)]
-    robot, _ = with_distortion(robot, trial, room.robot, rng.uniform(*DISTORTION_DB[distortion][kind]))
+    robot, _ = physics.with_distortion(robot, trial, room.robot, rng.uniform(*DISTORTION_DB[distortion][kind]))
     ppm = rng.choice([-1.0, 1.0]) * math.exp(rng.uniform(*np.log(ALONE_PPM))) if index // 8 % 2 else 0.0
     stage = Stage(kind, room, round(rng.uniform(*ALONE_LAG_S) * RATE), rng.uniform(-3, 3), ppm)
     said = Repertoire(chain([first], clips))

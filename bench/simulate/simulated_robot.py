@@ -18,6 +18,7 @@ from edgefilter.dsp.metrics import si_sdr
 RATE = 16000
 OVERSAMPLING = 4
 Array = NDArray[np.float64]
+Rng = np.random.Generator
 
 
 @dataclass(frozen=True)
@@ -72,26 +73,16 @@ class Loudspeaker:
         return tuple(signal.bilinear(numerator, denominator, high_rate) for numerator in numerators)
 
 
-def draw_loudspeaker(rng: np.random.Generator) -> Loudspeaker:
-    """A driver of a small robot.
-
-    Resonance 180-320 Hz, treble roll-off, broad peaks of the enclosure, the microphone's low cut.
-    """
+def draw_loudspeaker(rng: Rng) -> Loudspeaker:
+    """A driver of a small robot: resonance, treble roll-off, broad peaks of the enclosure, the microphone's low cut."""
     sections = [signal.butter(2, rng.uniform(6300, 7500), "low", fs=RATE, output="sos")]
     sections.append(signal.butter(2, rng.uniform(110, 210), "high", fs=RATE, output="sos"))
     for _ in range(4):
-        sections.append(
-            peak_filter(math.exp(rng.uniform(math.log(350), math.log(6000))), rng.uniform(1.0, 4.0), rng.uniform(-5, 5))
-        )
-    return Loudspeaker(
-        resonance_hz=rng.uniform(180, 320),
-        q=rng.uniform(0.6, 1.0),
-        stiffening=rng.uniform(0.1, 0.3),
-        softening_bl=rng.uniform(0.3, 0.5),
-        asymmetry=rng.choice([-1.0, 1.0]) * rng.uniform(0.4, 0.8),
-        drive=1.0,
-        filters=np.vstack(sections),
-    )
+        hz = math.exp(rng.uniform(math.log(350), math.log(6000)))
+        sections.append(peak_filter(hz, rng.uniform(1.0, 4.0), rng.uniform(-5, 5)))
+    linear, laws = (rng.uniform(180, 320), rng.uniform(0.6, 1.0)), (rng.uniform(0.1, 0.3), rng.uniform(0.3, 0.5))
+    asymmetry = rng.choice([-1.0, 1.0]) * rng.uniform(0.4, 0.8)
+    return Loudspeaker(*linear, *laws, asymmetry, 1.0, np.vstack(sections))
 
 
 def peak_filter(frequency_hz: float, q: float, gain_db: float) -> Array:
@@ -117,12 +108,12 @@ class Room:
     elsewhere: tuple[Array, ...] = ()
 
 
-def draw_room(rng: np.random.Generator, kind: str, robot_m: float, direction: Array, human_m: float) -> Room:
+def draw_room(rng: Rng, kind: str, robot_m: float, direction: Array, human_m: float) -> Room:
     """A room drawn by `draw_walls`, in which the robot stands somewhere (`stand`)."""
     return stand(rng, draw_walls(rng, kind), robot_m, direction, human_m)
 
 
-def draw_walls(rng: np.random.Generator, kind: str) -> tuple[Array, float]:
+def draw_walls(rng: Rng, kind: str) -> tuple[Array, float]:
     """Size in m (3,) and RT60 in s of an empty room. kind: "lab" (0.20-0.26 s) or "office" (0.50-0.75 s)."""
     low, high, scale = {"lab": (0.20, 0.26, 1.0), "office": (0.50, 0.75, 0.9)}[kind]
     size = scale * np.array([rng.uniform(5.0, 7.0), rng.uniform(4.0, 5.5), rng.uniform(2.6, 3.2) / scale])
@@ -130,7 +121,7 @@ def draw_walls(rng: np.random.Generator, kind: str) -> tuple[Array, float]:
 
 
 def stand(
-    rng: np.random.Generator,
+    rng: Rng,
     walls: tuple[Array, float],
     robot_m: float,
     direction: Array,
@@ -155,9 +146,8 @@ def stand(
 
     mouth = mouth_somewhere()
     asked = wanted
-    for _ in range(
-        3
-    ):  # Sabine's formula misses the decay of an absorbing room by a quarter: ask again for what came out short
+    # Sabine's formula misses the decay of an absorbing room by a quarter: ask again for what came out short
+    for _ in range(3):
         robot, human = _image_sources(size, asked, microphone, (microphone + robot_m * direction, mouth))
         found = float(pra.experimental.measure_rt60(human, fs=RATE, decay_db=30))
         asked, last = min(asked * wanted / found, 1.5), asked
@@ -187,7 +177,7 @@ def _image_sources(size: Array, rt60_s: float, microphone: Array, sources: tuple
     return found
 
 
-def draw_body(rng: np.random.Generator) -> Array:
+def draw_body(rng: Rng) -> Array:
     """Sound that the robot's own shell reflects within 2 ms, 10-20 dB below the direct sound, (32,)."""
     shell = np.zeros(32)
     shell[0] = 1.0
@@ -196,11 +186,8 @@ def draw_body(rng: np.random.Generator) -> Array:
     return shell
 
 
-def draw_fan(rng: np.random.Generator) -> Array:
-    """Amplitude response of a fan's noise on 0-8000 Hz, of unit total power, (1025,).
-
-    Flat, then falling, with bumps and a blade line.
-    """
+def draw_fan(rng: Rng) -> Array:
+    """Amplitude response of a fan on 0-8000 Hz, of unit power, (1025,): flat, then falling, bumps, a blade line."""
     f = np.linspace(0, RATE / 2, 1025)
     corner = math.exp(rng.uniform(math.log(250), math.log(2500)))
     level_db = -10 * rng.uniform(0.8, 1.3) * np.log10(1 + (f / corner) ** 2)
@@ -211,7 +198,7 @@ def draw_fan(rng: np.random.Generator) -> Array:
     return amplitude / math.sqrt(np.mean(amplitude**2))
 
 
-def fan_noise(rng: np.random.Generator, amplitude: Array, n: int) -> Array:
+def fan_noise(rng: Rng, amplitude: Array, n: int) -> Array:
     """Gaussian noise of unit power with that amplitude response, (n,)."""
     taps = signal.firwin2(2047, np.linspace(0, 1, amplitude.size), amplitude)
     return signal.oaconvolve(rng.standard_normal(n + taps.size - 1), taps, mode="valid")
@@ -257,17 +244,14 @@ class Robot:
     bulk: int
 
     def record(self, x: Array, response: Array, linear: bool = False) -> Array:
-        """Microphone samples (n,) of the played samples x (n,) for a room's impulse response, without fan or human.
-
-        Of an array (m, n), for responses (m, taps) and a shell (m, 32).
-        """
+        """Microphone samples (n,) of x (n,) for a room's response, of an array (m, n), without fan or human."""
         path = signal.oaconvolve(response, self.shell, axes=-1)
         sound = self.loudspeaker.play(x, linear)
         heard = signal.oaconvolve(sound if path.ndim == 1 else sound[None], path, axes=-1)[..., : x.size - self.bulk]
         return np.concatenate([np.zeros((*path.shape[:-1], self.bulk)), heard], axis=-1)
 
 
-def draw_robot(rng: np.random.Generator) -> Robot:
+def draw_robot(rng: Rng) -> Robot:
     direction = np.array([*rng.uniform(-1, 1, size=2), rng.uniform(-0.8, -0.1)])
     direction /= np.linalg.norm(direction)
     return Robot(draw_loudspeaker(rng), draw_body(rng), rng.uniform(0.1, 0.3), direction, int(rng.integers(250, 635)))

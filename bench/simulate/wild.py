@@ -2,12 +2,11 @@
 
     python -m bench.simulate.wild --voices robot/val robot/train --output DIR --seed 1 --half tuning --count 40
 
-A case is a folder HALF_NUMBER as bench.simulate.hidden_cases writes them; truth.json besides says what other names are
-right (also; a volume, where at its setting the program does no more), which program it was and its setting. Case i has
-program i mod their number, then comes a control for every ten; the setting is drawn again, at most six times, while it
-changes less than LEAST_DB over the fan. Robot, room and ordinary tolerances are those of hidden_robot. `--half
-reporting` and `--half unseen` are for figures, never for tuning: they share no suite of programs with the tuning half
-nor with each other, so that a suite's way to do things is not learned.
+A case is a folder HALF_NUMBER as bench.simulate.hidden_cases writes them; truth.json besides says what other names
+are right (also; a volume, where at its setting the program does no more), which program it was and its setting. The
+programs come in turn, every tenth case is a control; a setting is drawn again, at most six times, while it changes less
+than LEAST_DB over the fan. Robot, room and tolerances are those of hidden_robot. The halves `reporting` and `unseen` are
+for figures, never for tuning: no two halves share a suite.
 
 Debian: sox ffmpeg swh-plugins tap-plugins cmt caps invada-studio-plugins-ladspa zam-plugins vlevel lame opus-tools speex
 libgsm-tools fil-plugins rev-plugins guitarix-ladspa blop vorbis-tools. PyPI: pedalboard noisereduce webrtc-noise-gain.
@@ -31,11 +30,11 @@ import soundfile as sf
 from scipy import signal
 from tqdm import tqdm
 
-from bench.simulate.conversations import Clip, read_voices, write_item
+from bench.simulate.conversations import Voices, read_voices, write_item
 from bench.simulate.hidden_cases import read_reference, scale
-from bench.simulate.hidden_effects import Rng, log_uniform, put_back
+from bench.simulate.hidden_effects import log_uniform, put_back
 from bench.simulate.hidden_robot import Chain, Place, Scene, decibels, direction, draw_scene, power
-from bench.simulate.simulated_robot import RATE, Array
+from bench.simulate.simulated_robot import RATE, Array, Rng
 
 EVERY = 10
 ROBOT_OVER_FAN_DB = (20.0, 30.0)
@@ -74,22 +73,17 @@ class Program:
 
 
 def sox(*effect: object) -> Command:
-    """SoX with an effect and its arguments."""
     words = [str(word) for word in effect]
     raw = ["-t", "f32", "-r", str(RATE), "-c", "1", "-"]
     return Command("sox " + " ".join(words), lambda x: _piped(["sox", "-V1", "-R", *raw, *raw, *words], x))
 
 
 def ffmpeg(filters: str) -> Command:
-    """The audio filters of ffmpeg."""
     return Command(f"ffmpeg -af {filters}", lambda x: _filtered(x, filters))
 
 
 def ladspa(file: str, label: str, *controls: float, channels: int = 1, rate: int = RATE) -> Command:
-    """One channel through a LADSPA plugin with that many inputs, its controls in their order; ffmpeg is the host.
-
-    rate: at which it runs, for a plugin that works at the rates of studios only.
-    """
+    """One channel through a LADSPA plugin of so many inputs, at that rate, its controls in their order (by ffmpeg)."""
     values = "|".join(f"c{i}={value:g}" for i, value in enumerate(controls))
     spread = "pan=stereo|c0=c0|c1=c0," if channels == 2 else ""
     filters = f"aresample={rate},{spread}ladspa=f={file}:p={label}:c={values},pan=mono|c0=c0"
@@ -117,8 +111,6 @@ def coded(encode: str, decode: str, rate: int = RATE) -> Command:
 
 
 def pedalboard(name: str, **settings: float) -> Command:
-    """One of pedalboard's effects."""
-
     def run(x: Array) -> Array:
         plugin = getattr(importlib.import_module("pedalboard"), name)(**settings)
         return np.asarray(plugin(x.astype(np.float32), RATE), float)
@@ -127,8 +119,6 @@ def pedalboard(name: str, **settings: float) -> Command:
 
 
 def noisereduce(**settings: float) -> Command:
-    """The spectral gate of noisereduce."""
-
     def run(x: Array) -> Array:
         return np.asarray(importlib.import_module("noisereduce").reduce_noise(y=x, sr=RATE, **settings), float)
 
@@ -212,10 +202,6 @@ def _sox_multiband(r: Rng) -> Command:
     return sox("mcompand", band(), f"{r.uniform(300, 700):.0f}", band(), f"{r.uniform(1500, 3000):.0f}", band())
 
 
-def _tap_eq(r: Rng) -> Command:
-    return ladspa("tap_eq", "tap_equalizer", 0, *gains(r, 5), 0, 0, 100, 200, 450, 1000, 2200, 4500, 12000, 15000)
-
-
 def _firequalizer(r: Rng) -> Command:
     bands = zip((60, 250, 600, 1400, 3000, 7500), [0.0, *gains(r, 5)], strict=True)
     return ffmpeg("firequalizer=gain_entry='" + ";".join(f"entry({hz},{db})" for hz, db in bands) + "'")
@@ -233,30 +219,20 @@ def _limiter(r: Rng) -> Command:
 
 
 def _acompressor(r: Rng) -> Command:
-    level, ratio, attack, release = (
-        r.uniform(-34, -22),
-        r.uniform(2.5, 8),
-        log_uniform(r, 2, 30),
-        log_uniform(r, 60, 500),
-    )
+    level, ratio = r.uniform(-34, -22), r.uniform(2.5, 8)
+    attack, release = log_uniform(r, 2, 30), log_uniform(r, 60, 500)
     return ffmpeg(f"acompressor=threshold={level:.0f}dB:ratio={ratio:.1f}:attack={attack:.1f}:release={release:.0f}")
 
 
 def _mcompand(r: Rng) -> Command:
     curve, last = "6 -47/-40\\,-34/-34\\,-17/-33", "6 -47/-40\\,-34/-34\\,-15/-33 7900"
-    return ffmpeg(
-        f"mcompand=0.005\\,0.1 {curve} 300 | 0.003\\,0.05 {curve} 1400 | 0.000625\\,{r.uniform(0.01, 0.05):.4f} {last}"
-    )
+    highest = f"0.000625\\,{r.uniform(0.01, 0.05):.4f} {last}"
+    return ffmpeg(f"mcompand=0.005\\,0.1 {curve} 300 | 0.003\\,0.05 {curve} 1400 | {highest}")
 
 
 def _compressor(r: Rng) -> Command:
-    level, ratio, attack, release = (
-        r.uniform(-34, -24),
-        r.uniform(2.5, 8),
-        log_uniform(r, 1, 20),
-        log_uniform(r, 60, 500),
-    )
-    return pedalboard("Compressor", threshold_db=level, ratio=ratio, attack_ms=attack, release_ms=release)
+    level = {"threshold_db": r.uniform(-34, -24), "ratio": r.uniform(2.5, 8)}
+    return pedalboard("Compressor", **level, attack_ms=log_uniform(r, 1, 20), release_ms=log_uniform(r, 60, 500))
 
 
 # fmt: off
@@ -309,7 +285,8 @@ TUNING: tuple[Program, ...] = (
 """SoX, swh-plugins, pyroomacoustics, Speex, WebRTC."""
 
 REPORTING: tuple[Program, ...] = (
-    Program("tap equalizer", "source", ("equaliser",), _tap_eq),
+    Program("tap equalizer", "source", ("equaliser",), lambda r: ladspa(
+            "tap_eq", "tap_equalizer", 0, *gains(r, 5), 0, 0, 100, 200, 450, 1000, 2200, 4500, 12000, 15000)),
     Program("caps Eq10", "source", ("equaliser",), lambda r: ladspa("caps", "Eq10", 0, 0, 0, *gains(r, 6), 0)),
     Program("caps CabinetIII", "source", ("equaliser",),
             lambda r: ladspa("caps", "CabinetIII", int(r.integers(0, 17)), 0, r.uniform(-3, 3))),
@@ -457,7 +434,7 @@ def is_a_volume(scene: Scene, change: Array) -> bool:
     return scene.over_fan_db(change - turned) < LEAST_DB
 
 
-def make_case(seed: int, index: int, half: str, voices: dict[str, list[Clip]]) -> tuple[dict[str, Array], dict]:
+def make_case(seed: int, index: int, half: str, voices: Voices) -> tuple[dict[str, Array], dict]:
     """Signals by name (n,) and the contents of truth.json, for case index of this seed and half."""
     rng = np.random.default_rng([seed, sorted(HALVES).index(half), index])
     program = program_of(half, index)

@@ -15,7 +15,7 @@ from bench import __main__ as bench
 from bench.diagnosis import names, proof, run_time
 from bench.diagnosis.names import Outcome
 from bench.diagnosis.proof import Row
-from bench.simulate import effect_conversations
+from bench.simulate import hidden_cases
 from bench.simulate.conversations import read_clips
 from bench.simulate.hidden_robot import draw_scene
 from edgefilter.echo.model import EchoModel
@@ -244,7 +244,7 @@ def voices(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.slow
 def test_the_human_comes_late_and_before_the_microphone(voices: Path) -> None:
     clips = read_clips(voices, (1.0, 15.0))
-    scene = effect_conversations.make(5, "mic_clipping", 0, {"s0": clips}, clips)
+    scene = hidden_cases.make_conversation(5, "mic_clipping", 0, {"s0": clips}, clips)
     assert scene.effect == "mic_clipping" and scene.mic.shape == scene.ref.shape == scene.clean.shape
     assert np.abs(scene.clean[: scene.human.start]).max() < 1e-9  # rounding of a transform
     assert scene.early + 4 * RATE < scene.human.start
