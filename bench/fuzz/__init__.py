@@ -19,6 +19,7 @@ import resource
 import signal
 import tempfile
 import time
+import traceback
 from dataclasses import dataclass
 from multiprocessing.sharedctypes import Synchronized, SynchronizedArray
 from pathlib import Path
@@ -26,7 +27,7 @@ from pathlib import Path
 from tqdm import tqdm
 
 from bench import results
-from bench.fuzz.targets import NETWORKS, TARGETS, Target, working_in
+from bench.fuzz.targets import NETWORKS, TARGETS, Target
 from edgefilter.errors import EdgefilterError, UsageError
 from edgefilter.filter.budget import DEMO
 
@@ -70,11 +71,12 @@ class Work:
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--inputs", type=int, default=1_000_000, help="default: %(default)s")
-    parser.add_argument("--start", type=int, default=0, metavar="NUMBER", help="of the first input")
-    parser.add_argument("--minutes", type=float, default=1e6, help="stop after so many")
-    parser.add_argument("--only", choices=[target.name for target in TARGETS], help="one loader alone")
-    parser.add_argument("--keep", type=Path, metavar="DIR", help="keep the files that were finds")
+    add = parser.add_argument
+    add("--inputs", type=int, default=1_000_000, help="default: %(default)s")
+    add("--start", type=int, default=0, metavar="NUMBER", help="of the first input")
+    add("--minutes", type=float, default=1e6, help="stop after so many")
+    add("--only", choices=[target.name for target in TARGETS], help="one loader alone")
+    add("--keep", type=Path, metavar="DIR", help="keep the files that were finds")
 
 
 def run(options: argparse.Namespace) -> str:
@@ -100,25 +102,15 @@ def run(options: argparse.Namespace) -> str:
     finds = [*map(json.loads, lines), *deaths]
     width = len(COLUMNS)
     loaders = {t.name: dict(zip(COLUMNS, counts[i * width : (i + 1) * width])) for i, t in enumerate(TARGETS)}
-    page = results.write(
-        options.output,
-        "fuzz",
-        f"{at - options.start} damaged files",
-        made_with,
-        [
-            results.table("loaders", "What came of them", ["loader", "files", *COLUMNS],
-                          [[name, sum(row.values()), *row.values()] for name, row in loaders.items()]),
-            results.table("finds", f"{len(finds)} finds", ["input", "loader", "find"],
-                          [[find["number"], find["loader"], find["what"]] for find in finds[:50]]),
-        ],
-        notes=NOTES,
-        minutes=(time.time() - began) / 60,
-        inputs=at - options.start,
-        loaders=loaders,
-        finds=finds,
-    )  # fmt: skip
+    files = at - options.start
+    rows = [[name, sum(row.values()), *row.values()] for name, row in loaders.items()]
+    first = [[find[key] for key in ("number", "loader", "what")] for find in finds[:50]]
+    tables = [results.table("loaders", "What came of them", ["loader", "files", *COLUMNS], rows),
+              results.table("finds", f"{len(finds)} finds", ["input", "loader", "find"], first)]  # fmt: skip
+    page = results.write(options.output, "fuzz", f"{files} damaged files", made_with, tables, notes=NOTES,
+                         minutes=(time.time() - began) / 60, inputs=files, loaders=loaders, finds=finds)  # fmt: skip
     if finds:
-        raise UsageError(f"{len(finds)} finds in {at - options.start} files, {finds[0]['what']} first")
+        raise UsageError(f"{len(finds)} finds in {files} files, {finds[0]['what']} first")
     return page
 
 
@@ -138,22 +130,21 @@ def load_all(work: Work) -> None:
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     signal.signal(signal.SIGPROF, _hang)
     choice = drawn(work.only)
-    with working_in(work.folder):
-        seeds = {target.name: target.seeds() for target in dict.fromkeys(choice)}
-        for number in tqdm(range(work.start, work.end), disable=None, mininterval=10.0):
-            if time.time() > work.until:
-                break
-            work.number.value = number
-            rng = generator(work.seed, number)
-            target = rng.choice(choice)
-            data = target.mutate(rng.choice(seeds[target.name]), rng)
-            path = work.folder / f"input{target.suffix}"
-            path.write_bytes(data)
-            outcome = attempt(target, path, rng)
-            work.count(target, outcome)
-            if outcome not in COLUMNS and work.keep:
-                work.keep.mkdir(parents=True, exist_ok=True)
-                (work.keep / f"{target.name}_{number}{target.suffix}").write_bytes(data)
+    seeds = {target.name: target.seeds(work.folder) for target in dict.fromkeys(choice)}
+    for number in tqdm(range(work.start, work.end), disable=None, mininterval=10.0):
+        if time.time() > work.until:
+            break
+        work.number.value = number
+        rng = generator(work.seed, number)
+        target = rng.choice(choice)
+        data = target.mutate(rng.choice(seeds[target.name]), rng)
+        path = work.folder / f"input{target.suffix}"
+        path.write_bytes(data)
+        outcome = attempt(target, path, rng)
+        work.count(target, outcome)
+        if outcome not in COLUMNS and work.keep:
+            work.keep.mkdir(parents=True, exist_ok=True)
+            (work.keep / f"{target.name}_{number}{target.suffix}").write_bytes(data)
 
 
 def attempt(target: Target, path: Path, rng: random.Random) -> str:
@@ -168,10 +159,8 @@ def attempt(target: Target, path: Path, rng: random.Random) -> str:
     except Hang:
         return f"more than {PATIENCE_S} s"
     except Exception as error:
-        trace = error.__traceback__
-        while trace and trace.tb_next:
-            trace = trace.tb_next
-        where = f"{Path(trace.tb_frame.f_code.co_filename).name}:{trace.tb_lineno}" if trace else ""
+        last = traceback.extract_tb(error.__traceback__)[-1]
+        where = f"{Path(last.filename).name}:{last.lineno}"
         return f"{type(error).__name__}: {' '.join(str(error).split())[:200]} ({where})"
     finally:
         signal.setitimer(signal.ITIMER_PROF, 0)

@@ -5,8 +5,9 @@ from __future__ import annotations
 import io
 import json
 import random
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+import warnings
+import zipfile
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -14,7 +15,6 @@ from pathlib import Path
 import numpy as np
 import soundfile
 
-from bench.fuzz.damage import damaged, damaged_archive, damaged_json
 from edgefilter import EgoFilter, Profile
 from edgefilter.audio.files import FileSource
 from edgefilter.echo.effect import complete
@@ -38,13 +38,13 @@ FILTERED = 40
 class Target:
     """A loader under attack. seeds: real files. mutate: damages one. attempt: loads it and uses what was loaded; raises where that goes wrong.
 
-    share: of all inputs. suffix: of the file. accepted: what attempt returns, whether the file was taken.
+    share: of all inputs. suffix: of the file. seeds gets a folder that it may write into.
     """
 
     name: str
     share: int
     suffix: str
-    seeds: Callable[[], list[bytes]]
+    seeds: Callable[[Path], list[bytes]]
     mutate: Callable[[bytes, random.Random], bytes]
     attempt: Callable[[Path, random.Random], None]
 
@@ -54,52 +54,26 @@ class Broken(AssertionError):
 
 
 def expect(holds: bool, promise: str) -> None:
-    """Raise Broken, with what was promised."""
     if not holds:
         raise Broken(promise)
 
 
 @lru_cache
-def profiles() -> list[bytes]:
+def profiles(folder: Path) -> list[bytes]:
     """The demo's profile, and three with effects: of all kinds, with arrays, and one that was learned."""
     demo = Profile.load(budget.DEMO / "profile.npz")
-    values = {
-        effect.name: {p.name: (p.neutral + (p.low if p.neutral == p.high else p.high)) / 2 for p in effect.told}
-        for effect in EFFECTS
-    }
-    chains = [
-        [effect for effect in EFFECTS if effect.stage == stage] for stage in dict.fromkeys(e.stage for e in EFFECTS)
-    ]
     made = [demo, replace(demo, source=LEARNED)]
-    for chain in chains:
+    for stage in dict.fromkeys(effect.stage for effect in EFFECTS):
         echo = demo.echo
-        for effect in chain:
-            echo = replace(echo, effects=(*echo.effects, (effect.name, complete(effect, values[effect.name]))))
+        for effect in (one for one in EFFECTS if one.stage == stage):
+            values = {p.name: (p.neutral + (p.low if p.neutral == p.high else p.high)) / 2 for p in effect.told}
+            echo = replace(echo, effects=(*echo.effects, (effect.name, complete(effect, values))))
         made.append(demo.with_echo(echo))
-    return [_saved(profile) for profile in made]
-
-
-def _saved(profile: Profile) -> bytes:
-    path = folder() / "seed.npz"
-    profile.save(path)
-    return path.read_bytes()
-
-
-_folder: list[Path] = []
-
-
-@contextmanager
-def working_in(path: Path) -> Iterator[None]:
-    """Where seeds are made."""
-    _folder.append(path)
-    try:
-        yield
-    finally:
-        _folder.pop()
-
-
-def folder() -> Path:
-    return _folder[-1]
+    seeds = []
+    for profile in made:
+        profile.save(folder / "seed.npz")
+        seeds.append((folder / "seed.npz").read_bytes())
+    return seeds
 
 
 def mutate_profile(data: bytes, rng: random.Random) -> bytes:
@@ -119,9 +93,8 @@ def check_output(mic: np.ndarray, out: np.ndarray) -> None:
     expect(bool(np.isfinite(out).all()), "an output sample is not finite")
     for at in range(0, mic.size - SAMPLE_RATE + 1, SAMPLE_RATE // 8):
         before, after = (float(np.mean(np.square(x[at : at + SAMPLE_RATE], dtype=np.float64))) for x in (mic, out))
-        expect(
-            after <= 10 ** (LOUDER_DB / 10) * before + 1e-9, f"output louder than the microphone from sample {at} on"
-        )
+        most = 10 ** (LOUDER_DB / 10) * before + 1e-9
+        expect(after <= most, f"output louder than the microphone from sample {at} on")
 
 
 def filter_with(profile: Profile, engine: str, learn: bool) -> None:
@@ -144,7 +117,7 @@ def attempt_learning(path: Path, rng: random.Random) -> None:
         filter_with(profile, "linear", learn=True)
 
 
-def caches() -> list[bytes]:
+def caches(folder: Path) -> list[bytes]:
     trouble = budget.keep(ABOUT, {"ss": budget.Figures("ss", "", 16.0, 300, True, 1.0, 2.0, 3.0, 4.0)})
     expect(trouble is None, str(trouble))
     return [budget.timings().read_bytes()]
@@ -164,18 +137,16 @@ def attempt_cache(path: Path, rng: random.Random) -> None:
     expect(not any("\n" in line for line in told), "more than one line")
 
 
-@lru_cache
-def recordings() -> list[bytes]:
+def recordings(folder: Path) -> list[bytes]:
     """A fifth of a second as people have it: rates, channels, codecs."""
     mic, ref = (x[:3200] for x in sound())
     stereo = np.stack((mic, ref), 1)
-    forms = (
+    files = []
+    for form, subtype, samples, rate in (
         *(("WAV", "PCM_16", mic, 16000), ("WAV", "FLOAT", stereo, 48000), ("WAV", "PCM_24", stereo, 44100)),
         *(("WAV", "IMA_ADPCM", mic, 16000), ("WAVEX", "PCM_32", stereo, 8000), ("FLAC", "PCM_16", mic, 16000)),
         *(("OGG", "VORBIS", mic, 16000), ("AIFF", "PCM_16", mic, 22050)),
-    )
-    files = []
-    for form, subtype, samples, rate in forms:
+    ):
         file = io.BytesIO()
         soundfile.write(file, samples, rate, subtype, format=form)
         files.append(file.getvalue())
@@ -193,8 +164,7 @@ def attempt_audio(path: Path, rng: random.Random) -> None:
     expect(total == source.total, f"{source.total} samples promised, {total} given")
 
 
-@lru_cache
-def networks() -> list[bytes]:
+def networks(folder: Path) -> list[bytes]:
     return [(NETWORKS / name).read_bytes() for name in ("crnn.onnx", "paper_crnn.onnx")]
 
 
@@ -213,10 +183,8 @@ def attempt_model(path: Path, rng: random.Random) -> None:
         expect(bool(np.isfinite(output.spectrum).all()), "a spectrum is not finite")
         expect(0.0 <= (output.speech_probability or 0.0) <= 1.0, f"probability {output.speech_probability}")
         before, after = (float(np.vdot(x, x).real) for x in (frame.mic, output.spectrum))
-        expect(
-            after <= 10 ** (LOUDER_DB / 10) * before,
-            f"a spectrum {after / before:.3g} times as loud as the microphone's",
-        )
+        louder = f"a spectrum {after / before:.3g} times as loud as the microphone's"
+        expect(after <= 10 ** (LOUDER_DB / 10) * before, louder)
 
 
 def _frame(rng: np.random.Generator, bins: int) -> Frame:
@@ -224,6 +192,130 @@ def _frame(rng: np.random.Generator, bins: int) -> Frame:
     powers = rng.random((2, bins)).astype(np.float32)
     mic, reference, echo = spectra
     return Frame(mic, reference, 0.5 * echo, mic - 0.5 * echo, powers[0], powers[1])
+
+
+LARGE = (1e-300, 1e300, -1e300, 2**31, 2**63, -(2**63), 10**400, float("nan"), float("inf"))
+NUMBERS = (0, 1, -1, 0.5, *LARGE, 16000, 601)
+VALUES = (*NUMBERS, "", "\0", "x" * 5000, "../../etc/passwd", None, True, [], {}, [[[]]], {"array": "response"})
+WORDS = (b"\0" * 4, b"\xff" * 4, b"\xff\xff\xff\x7f", b"\0\0\0\x80", b"\0\0\xc0\x7f", b"\x80" * 9 + b"\x01", b"{", b"]")
+
+
+def damaged(data: bytes, rng: random.Random) -> bytes:
+    """The bytes with 1 to 8 changes: bits turned, words put in, pieces cut out, doubled or moved, the end cut off."""
+    content = bytearray(data)
+    for _ in range(rng.choice((1, 1, 1, 2, 4, 8))):
+        if not content:
+            break
+        # half of the changes hit the first 256 bytes, where headers are
+        at = rng.randrange(min(len(content), 256) if rng.random() < 0.5 else len(content))
+        size = rng.choice((1, 2, 4, 16, 64, 1000))
+        kind = rng.randrange(7)
+        if kind == 0:
+            content[at] ^= 1 << rng.randrange(8)
+        elif kind == 1:
+            content[at] = rng.randrange(256)
+        elif kind == 2:
+            word = rng.choice(WORDS)
+            content[at : at + len(word)] = word
+        elif kind == 3:
+            del content[at : at + size]
+        elif kind == 4:
+            content[at:at] = content[at : at + size]
+        elif kind == 5:
+            there = rng.randrange(len(content))
+            content[there : there + size] = content[at : at + size]
+        else:
+            del content[at + 1 :]
+    return bytes(content)
+
+
+def damaged_json(text: bytes, rng: random.Random) -> bytes:
+    """JSON text in which a value somewhere is another, a key is gone or new; sometimes damaged as bytes."""
+    if rng.random() < 0.2:
+        return damaged(text, rng)
+    whole = json.loads(text)
+    places = list(_places(whole))
+    for _ in range(rng.choice((1, 1, 2, 5))):
+        inside, key = rng.choice(places)
+        deed = rng.randrange(8)
+        if isinstance(inside, dict) and deed == 0:
+            inside.pop(key, None)
+        elif isinstance(inside, dict) and deed == 1:
+            inside[rng.choice(("surprise", "values", "array", ""))] = rng.choice(VALUES)
+        elif key in inside if isinstance(inside, dict) else key < len(inside):
+            inside[key] = _changed(inside[key], rng)
+    return json.dumps(whole).encode()
+
+
+def _places(value: object) -> list[tuple[object, object]]:
+    """Every (container, key) in a JSON value."""
+    keys = list(value) if isinstance(value, dict) else range(len(value)) if isinstance(value, list) else ()
+    return [(value, key) for key in keys] + [place for key in keys for place in _places(value[key])]
+
+
+def _changed(value: object, rng: random.Random) -> object:
+    if isinstance(value, int | float) and abs(value) < 2**63 and not isinstance(value, bool) and rng.random() < 0.5:
+        return rng.choice((value * rng.uniform(-3, 3), value + rng.choice((-1, 1)), value * 10.0 ** rng.randint(-9, 9)))
+    return rng.choice(VALUES)
+
+
+def damaged_archive(data: bytes, rng: random.Random) -> bytes:
+    """An .npz of which one or two members are other arrays, other JSON or other bytes, packed so that its checksums agree."""
+    with zipfile.ZipFile(io.BytesIO(data)) as archive:
+        members = [(name, archive.read(name)) for name in archive.namelist()]
+    for _ in range(rng.choice((1, 1, 2))):
+        at = rng.randrange(len(members))
+        name, content = members[at]
+        kind = rng.randrange(10)
+        if kind == 0:
+            members[at] = (name, damaged(content, rng))
+        elif kind == 1:
+            members.append((rng.choice((name, "more.npy", "effect_0_0.npy", "../x.npy")), content))
+        elif kind == 2:
+            members[at] = (name, members[rng.randrange(len(members))][1])
+        else:
+            try:
+                array = np.load(io.BytesIO(content), allow_pickle=False)
+            except Exception:  # it was damaged by the change before
+                continue
+            file = io.BytesIO()
+            np.save(file, _other(name, array, rng), allow_pickle=False)
+            members[at] = (name, file.getvalue())
+    packed = io.BytesIO()
+    way = rng.choice((zipfile.ZIP_STORED, zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED))
+    with zipfile.ZipFile(packed, "w", way) as archive, warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # that a name comes twice is meant
+        for name, content in members:
+            archive.writestr(zipfile.ZipInfo(name), content)
+    return packed.getvalue()
+
+
+def _other(name: str, array: np.ndarray, rng: random.Random) -> np.ndarray:
+    """Another array in place of this one: other values, shape, type; of the header, other JSON."""
+    if name == "header.npy" and array.dtype == np.uint8 and array.ndim == 1 and array.size:
+        try:
+            return np.frombuffer(damaged_json(array.tobytes(), rng), np.uint8)
+        except (ValueError, IndexError):  # it was damaged before
+            return array[: rng.randrange(array.size)]
+    kind = rng.randrange(6)
+    if kind == 0 and array.dtype.kind != "c":
+        with np.errstate(all="ignore"):
+            return array.astype(rng.choice(("<f8", "<f4", "<f2", "<i8", "|u1", "|b1", "<c8")))
+    if kind == 1:
+        return array.reshape(-1)[: rng.randrange(array.size + 1)]
+    if kind == 2:
+        return np.resize(array, rng.choice(((0,), (1,), (601,), (2, 601), (128,), (70000,), (5, 5, 5))))
+    changed = np.array(array, ndmin=1)
+    if not changed.size or changed.dtype.kind not in "fiu":
+        return changed
+    with np.errstate(all="ignore"):
+        if kind == 3 or array.dtype.itemsize == 1:
+            changed = (changed * 10.0 ** rng.randint(-40, 40)).astype(array.dtype)
+        else:
+            places = [rng.randrange(changed.size) for _ in range(rng.choice((1, 3, 100)))]
+            value = rng.choice([number for number in NUMBERS if abs(number) < 2**31 or number != number])
+            changed.reshape(-1)[places] = value if array.dtype.kind == "f" else 7
+    return changed.reshape(array.shape)
 
 
 TARGETS = (
