@@ -19,12 +19,7 @@ from pathlib import Path
 from bench.live import barge_in, click, soak, trial
 from edgefilter.errors import UsageError
 
-PARTS = {
-    **{"trial": trial.run, "barge-in": barge_in.run},
-    **{"soak": soak.run, "hour": soak.run, "click": click.run},
-}
-SPOKEN = ("trial", "barge-in")
-"""Parts in which robot and human speak."""
+PARTS = {"trial": trial.run, "barge-in": barge_in.run, "soak": soak.run, "hour": soak.run, "click": click.run}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -36,20 +31,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--count", type=int, default=16, help="conversations or clicks (default: %(default)s)")
     add("--engine", help="default: auto; of barge-in crnn")
     add("--one-way", action="store_true", help="soak: the reference's clock is fast all the time")
-    add(
-        "--alone",
-        type=Path,
-        nargs="*",
-        default=[],
-        metavar="DIR",
-        help="barge-in: voices of robots that nobody interrupts",
-    )
+    uninterrupted = "barge-in: voices of robots that nobody interrupts"
+    add("--alone", type=Path, nargs="*", default=[], metavar="DIR", help=uninterrupted)
     add("--real", type=Path, metavar="DIR", help="barge-in: recordings of a real loudspeaker alone")
 
 
 def run(options: argparse.Namespace) -> str:
-    """Run one part."""
-    for name in ("voices", "speech") if options.part in SPOKEN else ():
+    for name in ("voices", "speech") if options.part in ("trial", "barge-in") else ():
         if getattr(options, name) is None:
             raise UsageError(f"the part '{options.part}' needs --{name}, a folder with a transcripts.tsv")
     return PARTS[options.part](options)

@@ -10,8 +10,7 @@ sound. The recogniser gets the human's span of what each of them leaves.
 Backchannels: the same scenes, with a short word or a cough in the place of the interruption. False stops: the robot
 alone for --minutes of its speech (--alone: its voices), in new rooms all the time, half of them with loudspeakers of
 strong distortion and half without a calibration, and recordings of a real loudspeaker (--real) that nothing was tuned
-on. Rows are kept in --cache as they are made: a run that was cut off, or is asked for more minutes, goes on where it
-stopped. Of one core half a minute for each conversation and 12 s for each minute of the robot alone.
+on. Rows are kept in --cache as they are made: a run that was cut off, or is asked for more minutes, goes on there.
 """
 
 from __future__ import annotations
@@ -23,7 +22,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import cycle, islice
 from pathlib import Path
-from typing import NamedTuple
 
 import jiwer
 import numpy as np
@@ -31,16 +29,17 @@ from scipy import stats
 
 from bench import results
 from bench.cache import Cache
-from bench.metrics import IN_TIME_S, THRESHOLDS, first_sound, in_time, mean, noticed, replay, starts, wilson
+from bench.metrics import IN_TIME_S, THRESHOLDS, counted, first_sound, in_time, mean, noticed, replay, starts
 from bench.recogniser import Recogniser, normalise, word_errors
-from bench.recordings import find_recordings, progress
+from bench.recordings import CALIBRATION, find_recordings, progress
 from bench.simulate.conversations import Scene, make_scene, read_clips, read_voices
-from bench.simulate.robot_day import Monologue, make_monologue
+from bench.simulate.robot_day import STARTS, Monologue, make_monologue
+from bench.systems import Output
 from edgefilter import EgoFilter
 from edgefilter.calibration.calibrate import calibrate
 from edgefilter.filter.barge_in import BargeIn, BargeInSettings
 from edgefilter.profile.data import Profile
-from edgefilter.types import SAMPLE_RATE, Event, Samples
+from edgefilter.types import SAMPLE_RATE, Samples
 
 KINDS = ("paper", "live")
 REACTION_S, FADE_S = 0.05, 0.02
@@ -71,34 +70,21 @@ POLICIES = {
 SHORT = {"word": "a word of 0.3-0.5 s", "cough": "a cough"}
 
 
-class Talk(NamedTuple):
-    """What one run of the filter gave: samples, events of speech, the probability after each hop, None where it has none."""
-
-    out: Samples
-    events: list[Event]
-    probability: list[float | None]
-    hop: int
-
-
-def listen(mic: Samples, ref: Samples, profile: Profile | None, engine: str) -> Talk:
-    """The filter over a recording, hop by hop."""
+def listen(mic: Samples, ref: Samples, profile: Profile | None, engine: str) -> Output:
     ego, probability, done = EgoFilter(profile, engine), [], []
     mic, ref = mic.astype(np.float32), ref.astype(np.float32)
     for at in range(0, mic.size, ego.hop):
         done.append(ego.process(mic[at : at + ego.hop], ref[at : at + ego.hop]))
         probability.append(ego.speech_probability)
     events = [event for event in ego.events() if event.kind.startswith("speech")]
-    return Talk(np.concatenate((*done, ego.flush())), events, probability, ego.hop)
-
-
-# ---------------------------------------------------------------- interruptions
+    return Output(np.concatenate((*done, ego.flush())), events, probability, ego.hop)
 
 
 def measure(scene: Scene, engine: str, recogniser: Recogniser | None) -> dict:
     """Ready for JSON: noticed with a calibration and without, words under each policy, backchannels."""
     signals, meta = scene.signals, scene.meta
     ref, onset = signals["ref"], first_sound(signals["clean"].astype(np.float32))
-    profile = calibrate(*(signals[name].astype(np.float32) for name in ("sweep_ref", "sweep_mic", "fan_only")))
+    profile = calibrate(*(signals[name].astype(np.float32) for name in CALIBRATION))
     talk = listen(signals["mic"], ref, profile, engine)
     row = {name: meta[name] for name in ("room", "voice", "speaker", "text", "sisdr_mix")}
     row["calibrated"] = when(talk, onset)
@@ -109,14 +95,14 @@ def measure(scene: Scene, engine: str, recogniser: Recogniser | None) -> dict:
     return row
 
 
-def when(talk: Talk, onset: int) -> dict:
+def when(talk: Output, onset: int) -> dict:
     """When the human was noticed, at the default threshold and at each of THRESHOLDS, and how long speech lasted."""
     found = noticed(talk.events, onset)
     at_each = [in_time(noticed(replay(talk.probability, talk.hop, at), onset)) for at in THRESHOLDS]
     return {**found, "in_time": in_time(found), "in_time_at": at_each, "lasts": lasts(talk, onset)}
 
 
-def lasts(talk: Talk, onset: int) -> list[bool] | None:
+def lasts(talk: Output, onset: int) -> list[bool] | None:
     """Whether speech is still on after each of HOLDS_S from its first beginning behind the onset; None without one."""
     rule = BargeIn(talk.hop / SAMPLE_RATE, replace(BargeInSettings(), min_silence_s=PAUSE_S))
     speaking = []
@@ -130,15 +116,14 @@ def lasts(talk: Talk, onset: int) -> list[bool] | None:
     return [all(speaking[begun : begun + n + 1]) for n in hops]
 
 
-def backchannel(scene: Scene, kind: str, profile: Profile, engine: str, onset: int) -> Talk:
+def backchannel(scene: Scene, kind: str, profile: Profile, engine: str, onset: int) -> Output:
     """The filter over the scene with the human's first syllables alone, or with noise that bursts and dies away."""
     rng = np.random.default_rng(scene.meta["seed"])
     clean = scene.signals["clean"]
     n = round(rng.uniform(*SHORT_S) * SAMPLE_RATE)
     if kind == "word":
-        sound = (
-            clean[onset : onset + n] * np.minimum(1.0, np.arange(n)[::-1] / (0.05 * SAMPLE_RATE))[: clean.size - onset]
-        )
+        fade = np.minimum(1.0, np.arange(n)[::-1] / (0.05 * SAMPLE_RATE))
+        sound = clean[onset : onset + n] * fade[: clean.size - onset]
     else:
         level = np.sqrt(np.mean(clean[scene.meta["start"] : scene.meta["end"]] ** 2))
         times = np.arange(n) / SAMPLE_RATE
@@ -151,23 +136,21 @@ def backchannel(scene: Scene, kind: str, profile: Profile, engine: str, onset: i
 
 
 def policies(
-    scene: Scene, talk: Talk, profile: Profile, engine: str, onset: int, recogniser: Recogniser
+    scene: Scene, talk: Output, profile: Profile, engine: str, onset: int, recogniser: Recogniser
 ) -> dict[str, dict]:
     """Words under each policy; with an event the recording is made anew from there on."""
     start = next((e.sample for e in talk.events if e.kind == "speech_started"), None)
     after = None if start is None else start + round(REACTION_S * SAMPLE_RATE)
     turned = {"stop": (after, 0.0), "duck": (after, 10 ** (DUCK_DB / 20)), "oracle": (silent_at(scene, onset), 0.0)}
-    outs = {"open": talk.out, "muted": muted(scene)}
+    outs = {"open": talk.samples, "muted": muted(scene)}
     for name, (at, gain) in turned.items():
         ref = scene.signals["ref"] if at is None else lowered(scene.signals["ref"], at, gain)
-        outs[name] = talk.out if at is None else listen(scene.mic(ref), ref, profile, engine).out
+        outs[name] = talk.samples if at is None else listen(scene.mic(ref), ref, profile, engine).out
     outs["alone"] = scene.signals["clean"].astype(np.float32)
     span = slice(scene.meta["start"], scene.meta["end"])
     share = SAMPLE_RATE / (span.stop - span.start)
-    return {
-        name: words(scene.meta["text"], recogniser.transcribe(out[span].astype(np.float32)), share)
-        for name, out in outs.items()
-    }
+    heard = {name: recogniser.transcribe(out[span].astype(np.float32)) for name, out in outs.items()}
+    return {name: words(scene.meta["text"], said, share) for name, said in heard.items()}
 
 
 def lowered(ref: np.ndarray, at: int, gain: float) -> np.ndarray:
@@ -219,9 +202,6 @@ def early_errors(spoken: Sequence[str], recognised: Sequence[str], first: int) -
     return errors
 
 
-# ---------------------------------------------------------------- the robot alone
-
-
 def monologues(folders: list[Path], minutes: float, seed: int, engine: str, kept: Cache, of: object) -> list[dict]:
     """A row for each robot, until they have spoken for so many minutes; each voice goes on where it stopped."""
     voices = read_voices(folders) if folders else {}
@@ -242,11 +222,10 @@ def monologues(folders: list[Path], minutes: float, seed: int, engine: str, kept
 
 
 def monologue(made: Monologue, engine: str) -> dict:
-    """What the filter notices of one robot alone."""
     talk = listen(made.mic, made.ref, calibrate(*made.calibration) if made.start == "calibrated" else None, engine)
     said = [[f"{clip.path.parent.name}/{clip.path.stem}", seconds] for clip, seconds in made.said]
-    of = {"room": made.room, "distortion": made.distortion, "start": made.start, "voice": made.voice, "said": said}
-    return of | stops(talk, sum(seconds for _, seconds in said))
+    of = {key: getattr(made, key) for key in ("room", "distortion", "start", "voice")}
+    return of | {"said": said} | stops(talk, sum(seconds for _, seconds in said))
 
 
 def real_minutes(folder: Path, engine: str) -> list[dict]:
@@ -263,17 +242,13 @@ def real_minutes(folder: Path, engine: str) -> list[dict]:
     return rows
 
 
-def stops(talk: Talk, speech_s: float) -> dict:
+def stops(talk: Output, speech_s: float) -> dict:
     """How often the robot was stopped by itself, and how often it would have been at each of THRESHOLDS."""
     at_each = [starts(replay(talk.probability, talk.hop, at)) for at in THRESHOLDS]
     return {"speech_s": speech_s, "stops": starts(talk.events), "stops_at": at_each}
 
 
-# ---------------------------------------------------------------- what came out
-
-
 def run(options: argparse.Namespace) -> str:
-    """Interruptions, backchannels, false stops."""
     engine = options.engine or "crnn"
     data = {"HUMAN": [options.speech], "ROBOT": options.voices, "ALONE": options.alone}
     data |= {"RECORDINGS": [options.real]} if options.real else {}
@@ -293,10 +268,8 @@ def run(options: argparse.Namespace) -> str:
         rows.append(kept.get(made, of, "conversation", index))
     alone = monologues(options.alone, options.minutes, options.seed, engine, kept, of)
     alone += real_minutes(options.real, engine) if options.real else []
-    points = {start: curve([row[start] for row in rows], alone, start) for start in ("calibrated", "cold")}
-    lines = {
-        start: ([p["per_hour"] for p in found], [100 * p["in_time"] for p in found]) for start, found in points.items()
-    }
+    points = {start: curve([row[start] for row in rows], alone, start) for start in STARTS}
+    lines = {start: ([p["per_hour"] for p in of], [100 * p["in_time"] for p in of]) for start, of in points.items()}
     panel = results.panel(f"threshold {THRESHOLDS[0]} to {THRESHOLDS[-1]}", "false stops an hour of robot speech",
                           f"noticed within {IN_TIME_S} s, %", lines, "o-", ylim=(0, 102))  # fmt: skip
     notes = f"Engine `{engine}`, default threshold. Humans 20-28 dB below the robot that talks meanwhile."
@@ -312,7 +285,7 @@ def tables(rows: Sequence[Mapping], alone: Sequence[Mapping], points: Mapping[st
     made = [
         results.table("barge-in", "Interruptions noticed",
                       ["filter", "n", (f"within {IN_TIME_S} s, %", 0), p50, p90, "speech was on already", "never"],
-                      [[start, *noticing([row[start] for row in rows])] for start in ("calibrated", "cold")]),
+                      [[start, *noticing([row[start] for row in rows])] for start in STARTS]),
         results.table("backchannels", "Backchannels", ["", "n", "an event", f"within {IN_TIME_S} s", *holds],
                       [["an interruption", *lasting([row["calibrated"] for row in rows])],
                        *([what, *lasting([row["short"][kind] for row in rows])] for kind, what in SHORT.items())],
@@ -327,17 +300,11 @@ def tables(rows: Sequence[Mapping], alone: Sequence[Mapping], points: Mapping[st
                        for start, found in points.items() for point in found]),
     ]  # fmt: skip
     if rows and "words" in rows[0]:
-        cells = [
-            [text, *(mean([row["words"][name] for row in rows], part) for part in ("whole", "first"))]
-            for name, text in POLICIES.items()
-        ]
+        found = {text: [row["words"][name] for row in rows] for name, text in POLICIES.items()}
+        cells = [[text, mean(of, "whole"), mean(of, "first")] for text, of in found.items()]
+        columns = ["", ("whole, %", 0), ("first second, %", 0)]
         text = f"Calibrated, {len(rows)} interruptions; mean of the utterances' rates, each at most 100 %."
-        made.insert(
-            1,
-            results.table(
-                "words", "Words of the interruption wrong", ["", ("whole, %", 0), ("first second, %", 0)], cells, text
-            ),
-        )
+        made.insert(1, results.table("words", "Words of the interruption wrong", columns, cells, text))
     return made
 
 
@@ -345,9 +312,7 @@ def noticing(found: Sequence[Mapping]) -> list:
     """n, share in time, delays, how many early (speech was on already), how many never noticed."""
     delays = [math.inf if one["delay_s"] is None else one["delay_s"] for one in found if not one["early"]]
     p50, p90 = (float(np.quantile(delays, q, method="higher")) if delays else None for q in (0.5, 0.9))
-    hits = sum(one["in_time"] for one in found)
-    low, high = wilson(hits, len(found))
-    share = {"mean": 100 * hits / max(len(found), 1), "low": 100 * low, "high": 100 * high}
+    share = counted(one["in_time"] for one in found)
     return [len(found), share, p50, p90, len(found) - len(delays), sum(map(math.isinf, delays))]
 
 

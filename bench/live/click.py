@@ -30,46 +30,31 @@ CLICK = 160
 
 
 def run(options: argparse.Namespace) -> str:
-    """Medians over --count starts and clicks of each engine."""
     names = [options.engine] if options.engine else list(ENGINES)
     made_with = results.stamp({"DEMO": [DEMO]}, names)
     starts = {name: [start(name) for _ in range(options.count)] for name in names}
     clicks = {name: round_trip(name, options.count) for name in (ALONE, *names)}
     devices = float(np.nanmedian(clicks[ALONE]))
-    rows = [
-        [
-            name,
-            float(np.median([seconds for seconds, _ in starts[name]])) if name in starts else None,
-            float(np.median([memory for _, memory in starts[name]])) if name in starts else None,
-            *(float(of(times)) for of in (np.nanmedian, np.nanmin, np.nanmax)),
-            float(np.nanmedian(times)) - devices,
-        ]
-        for name, times in clicks.items()
-    ]
-    columns = [
-        "",
-        ("start to first samples, s", 2),
-        ("memory then, MB", 0),
-        ("click to click, ms", 0),
-        ("least", 0),
-        ("most", 0),
-    ]
+    rows = []
+    for name, times in clicks.items():
+        seconds, memory = np.median(starts[name], axis=0).tolist() if name in starts else (None, None)
+        middle, least, most = (float(of(times)) for of in (np.nanmedian, np.nanmin, np.nanmax))
+        rows.append([name, seconds, memory, middle, least, most, middle - devices])
+    columns = ["", ("start to first samples, s", 2), ("memory then, MB", 0), ("click to click, ms", 0), ("least", 0),
+               ("most", 0), ("beyond the devices", 0)]  # fmt: skip
     text = "Through virtual devices (PulseAudio, PortAudio over ALSA); medians. A hop has to be complete before it is filtered."
-    table = results.table("click", "What a user waits for", [*columns, ("beyond the devices", 0)], rows, text)
-    return results.write(
-        options.output, "click", "From a click to the filtered click", made_with, [table], clicks=clicks
-    )
+    table = results.table("click", "What a user waits for", columns, rows, text)
+    title = "From a click to the filtered click"
+    return results.write(options.output, "click", title, made_with, [table], clicks=clicks)
 
 
 def start(engine: str) -> tuple[float, float]:
     """Seconds from process start to the first samples on a pipe, and the memory (MB) at that moment."""
     mic, ref = (soundfile.read(DEMO / f"{name}.flac", dtype="int16", frames=8192)[0] for name in ("mic", "reference"))
     command = [*COMMAND, "--input", "-", "--output", "-", "--engine", engine, "--quiet"]
-    began = time.perf_counter()
-    process = subprocess.Popen(
-        [*command, "--profile", str(DEMO / "profile.npz")],
-        stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
-    )  # fmt: skip
+    command += ["--profile", str(DEMO / "profile.npz")]
+    pipe, began = subprocess.PIPE, time.perf_counter()
+    process = subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=pipe)
     process.stdin.write(np.stack((mic, ref), axis=1).tobytes())
     process.stdin.flush()
     process.stdout.read(2)
@@ -86,10 +71,7 @@ def click() -> np.ndarray:
 
 
 def round_trip(engine: str, clicks: int = 3) -> list[float]:
-    """Milliseconds from click to click, one a click, through `edgefilter run` live.
-
-    ALONE: through the same devices without a filter.
-    """
+    """Milliseconds from click to click through `edgefilter run` live; ALONE: through the devices without a filter."""
     devices = ["robot_mic_monitor", "robot_monitor", "robot_mic"]
     command = [*COMMAND, "--input", devices[0], "--reference", devices[1], "--output", devices[2], "--engine", engine]
     command = [sys.executable, "-m", "bench.live.click", *devices] if engine == ALONE else [*command, "--quiet"]

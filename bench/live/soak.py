@@ -52,48 +52,42 @@ changes its speed by more than that, and the bypass with it."""
 
 
 def run(options: argparse.Namespace) -> str:
-    """Run, write, and raise UsageError with what drifted."""
     engine = options.engine or "auto"
     # "auto" is crnn wherever that is fast enough
     made_with = results.stamp({"DEMO": [DEMO]}, [options.engine or "crnn"])
-    found = (
-        live(options.minutes, engine) if options.part == "hour" else from_file(options.minutes, engine, options.one_way)
-    )
+    is_live, one_way = options.part == "hour", options.one_way
+    found = live(options.minutes, engine) if is_live else from_file(options.minutes, engine, one_way)
     found["load_average"] = os.getloadavg()[0]
     troubles, slices = drifts(found), found["slices"]
     minutes = found["samples_in"] / SAMPLE_RATE / 60
-    beyond = ", a lag that grows all the time" if options.one_way else ""
-    title = f"{minutes:.0f} minutes of `{found['engine']}`, {'live' if options.part == 'hour' else 'faster than real time'}{beyond}"
+    how = ("live" if is_live else "faster than real time") + (", a lag that grows all the time" if one_way else "")
+    title = f"{minutes:.0f} minutes of `{found['engine']}`, {how}"
     facts = [(key.replace("_", " "), value) for key, value in found.items() if isinstance(value, int | float | str)]
-    if "deadline" in found:
-        deadline = found["deadline"]
-        facts += [
-            ("hops late", f"{deadline['missed_deadlines']} of {deadline['hops']}"),
-            ("steps between engines", deadline["steps"]),
-        ]
-        facts += [("ms a hop, p50 / p99", f"{deadline['compute']['p50_ms']:.1f} / {deadline['compute']['p99_ms']:.1f}")]
+    if deadline := found.get("deadline"):
+        facts += late(deadline).items()
     keys = [key for key in slices[0] if key != "seconds"]
     columns = [("minute", 1), *((key.replace("_", " "), 3 if key.endswith("_ms") else 1) for key in keys)]
     rows = [[one["seconds"] / 60, *(one[key] for key in keys)] for one in slices]
-    curves = [
-        results.panel(
-            key.replace("_", " "), "minutes", "", {key: ([row[0] for row in rows], [one[key] for one in slices])}, "o-"
-        )
-        for key in keys
-    ]
-    page = results.write(
-        options.output,
-        options.part + ("_one_way" if options.one_way else ""),
-        title,
-        made_with,
-        [results.table(options.part, f"Verdict: {'; '.join(troubles) or 'nothing drifted'}", ["", ""], facts),
-         results.table(f"{options.part}-slices", "By time", columns, rows)],
-        [results.plot(options.part, curves)],
-        **found,
-    )  # fmt: skip
+    at, *values = zip(*rows)
+    lines = {key: (at, of) for key, of in zip(keys, values)}
+    curves = [results.panel(key.replace("_", " "), "minutes", "", {key: line}, "o-") for key, line in lines.items()]
+    part, verdict = options.part, f"Verdict: {'; '.join(troubles) or 'nothing drifted'}"
+    tables = [results.table(part, verdict, ["", ""], facts), results.table(f"{part}-slices", "By time", columns, rows)]
+    name = part + ("_one_way" if one_way else "")
+    page = results.write(options.output, name, title, made_with, tables, [results.plot(part, curves)], **found)
     if troubles:
         raise UsageError("; ".join(troubles))
     return page
+
+
+def late(deadline: Mapping) -> dict[str, object]:
+    """What `edgefilter run` counts: hops that took too long, steps to another engine, what a hop took."""
+    took = deadline["compute"]
+    return {
+        "hops late": f"{deadline['missed_deadlines']} of {deadline['hops']}",
+        "steps between engines": deadline["steps"],
+        "ms a hop, p50 / p99": f"{took['p50_ms']:.1f} / {took['p99_ms']:.1f}",
+    }
 
 
 def ahead(at: np.ndarray, one_way: bool) -> np.ndarray:
@@ -195,29 +189,20 @@ def drifts(found: dict) -> list[str]:
         if second - first > LEARNER_GROWTH_MB:
             troubles.append(f"the learner's memory grew by {second - first:.1f} MB")
     if "bypass_ms" in settled[0]:
-        first, second = (_over_bypass(half) for half in _halves(settled))
+        # the mean, since a slice of silence costs two thirds of another; a bypassed block always costs the same
+        took, bypass = ([[one[key] for one in half] for half in _halves(settled)] for key in ("p50_ms", "bypass_ms"))
+        first, second = (float(np.mean(ours) / np.median(its)) for ours, its in zip(took, bypass))
         found["slower"] = second / first
         if second > SLOWER * first:
-            troubles.append(
-                f"a block took {first:.1f} times as long as a bypassed one, in the second half {second:.1f} times"
-            )
+            said = f"a block took {first:.1f} times as long as a bypassed one"
+            troubles.append(f"{said}, in the second half {second:.1f} times")
     return troubles
 
 
 def _settled(slices: Sequence[Mapping], least_s: float) -> Sequence[Mapping]:
-    """The slices behind the warm-up."""
     after = max(0.1 * slices[-1]["seconds"], least_s)
     return [one for one in slices if one["seconds"] >= after]
 
 
 def _halves(slices: Sequence[Mapping]) -> tuple[Sequence[Mapping], Sequence[Mapping]]:
     return slices[: len(slices) // 2], slices[len(slices) // 2 :]
-
-
-def _over_bypass(slices: Sequence[Mapping]) -> float:
-    """A block's time over a bypassed one's.
-
-    The mean, since a slice in which the robot is mostly silent costs two thirds of another; of the bypassed block,
-    which costs the same whatever is heard, the median.
-    """
-    return float(np.mean([one["p50_ms"] for one in slices]) / np.median([one["bypass_ms"] for one in slices]))

@@ -29,6 +29,7 @@ import numpy as np
 from bench import results
 from bench.cache import Cache
 from bench.live import virtual_sound
+from bench.live.soak import late
 from bench.metrics import IN_TIME_S, first_sound
 from bench.recogniser import Recogniser, word_errors
 from bench.recordings import read
@@ -139,9 +140,8 @@ def live(day: Day, engine: str, folder: Path) -> list[Mishap]:
     command += ["--output", folder / "out.wav", "--json", folder / "stats.json", "--seconds", round(seconds + AFTER_S)]
     with Device("loopback", day.ref) as loopback, Device("robot_mic", day.mic) as microphone:
         loopback.server.add(microphone.server)
-        process = subprocess.Popen(
-            list(map(str, command)), env=loopback.server.environment, stderr=subprocess.PIPE, text=True
-        )
+        environment = loopback.server.environment
+        process = subprocess.Popen(list(map(str, command)), env=environment, stderr=subprocess.PIPE, text=True)
         try:
             while not (folder / "kept/mic.wav").exists() and process.poll() is None:
                 time.sleep(0.05)
@@ -212,7 +212,6 @@ def sentences(
 
 
 def run(options: argparse.Namespace) -> str:
-    """A day of --minutes of robot speech, live; pauses make it a quarter longer."""
     engine = options.engine or "auto"
     data = {"ROBOT": options.voices, "HUMAN": [options.speech]}
     made_with = results.stamp(data, [engine], {"WHISPER": options.whisper})
@@ -239,21 +238,16 @@ def run(options: argparse.Namespace) -> str:
 def tables(found: Mapping) -> list[dict]:
     """What was done, what the run counted, words by what was going on, every interruption, other events."""
     stats, told = found["stats"], found["sentences"]
-    deadline = stats["deadline"]
     counts = [["samples in, out", f"{stats['samples_in']}, {stats['samples_out']}"]]
     counts += [[key.replace("_", " "), value] for key, value in stats["source"].items() if value]
-    counts += [["hops late", f"{deadline['missed_deadlines']} of {deadline['hops']}"]]
-    counts += [["ms a hop, p50 / p99", f"{deadline['compute']['p50_ms']:.1f} / {deadline['compute']['p99_ms']:.1f}"]]
-    counts += [["steps between engines", deadline["steps"]], ["engine at the end", stats["engine"]]]
+    counts += [*map(list, late(stats["deadline"]).items()), ["engine at the end", stats["engine"]]]
     kept = [event for event in found["events"] if not event["kind"].startswith("speech")]
     often = Counter(event["kind"] for event in kept)
     rare = [[clock(e["time"]), e["kind"], e.get("detail", "")] for e in kept if often[e["kind"]] <= OFTEN]
     rare += [[f"{count} times", kind, ""] for kind, count in often.items() if count > OFTEN]
     names = [*dict.fromkeys(one["during"] for one in told), "all"]
     wrong = [(f"{sound}, words wrong, %", 0) for sound in SOUNDS]
-    each = [
-        [clock(one["begin_s"]), one["noticed_s"], one["during"], one["text"], one.get("recognised")] for one in told
-    ]
+    each = [[clock(one["begin_s"]), *map(one.get, ("noticed_s", "during", "text", "recognised"))] for one in told]
     return [
         results.table("trial-done", "What was done to it", ["at", "what"], [[clock(at), what] for at, what in found["doings"]]),
         results.table("trial-counts", "What the run counted", ["", ""], counts),
@@ -271,9 +265,8 @@ def _by(name: str, told: Sequence[Mapping]) -> list:
     soon = sum(one["noticed_s"] is not None and one["noticed_s"] <= IN_TIME_S for one in told)
     known = [one for one in told if "wrong" in one]
     words = [one["words"] for one in known]
-    wrong = [
-        100 * float(np.average([one["wrong"][s] for one in known], weights=words)) if known else None for s in SOUNDS
-    ]
+    errors = ([one["wrong"][sound] for one in known] for sound in SOUNDS)
+    wrong = [100 * float(np.average(of, weights=words)) if known else None for of in errors]
     return [name, len(told), f"{soon} of {len(told)}", *wrong]
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import shutil
 import subprocess
 import tempfile
 import time
@@ -38,11 +37,7 @@ class Server:
 
 
 def start_server(
-    folder: Path,
-    sinks: Sequence[str] = SINKS,
-    sources: Sequence[str] = (),
-    system: str = "pulseaudio",
-    channels: int = 1,
+    folder: Path, sinks: Sequence[str] = SINKS, sources: Sequence[str] = (), system: str = SYSTEMS[0], channels: int = 1
 ) -> Server:
     """Start a server whose files all lie in folder and wait until its devices are there.
 
@@ -52,13 +47,8 @@ def start_server(
     """
     pulse = system == "pulseaudio"
     socket = f"unix:{folder}/{'socket' if pulse else 'pulse/native'}"
-    environment = {
-        **os.environ,
-        "HOME": str(folder),
-        "XDG_RUNTIME_DIR": str(folder),
-        "PULSE_RUNTIME_PATH": str(folder / "pulse"),
-        "DBUS_SESSION_BUS_ADDRESS": f"unix:path={folder}/bus",
-    }
+    environment = {**os.environ, "HOME": str(folder), "XDG_RUNTIME_DIR": str(folder)}
+    environment |= {"PULSE_RUNTIME_PATH": str(folder / "pulse"), "DBUS_SESSION_BUS_ADDRESS": f"unix:path={folder}/bus"}
     modules = [f"module-null-sink sink_name={name} rate=16000 format=s16le channels={channels}" for name in sinks]
     for name in sources:
         (folder / name).unlink(missing_ok=True)
@@ -68,7 +58,7 @@ def start_server(
     environment |= {"PULSE_SERVER": socket, "ALSA_CONFIG_PATH": str(folder / "asound.conf"), "OMP_NUM_THREADS": "1"}
     if not pulse:
         _load(modules, environment, process)
-    names = {**{name: name for name in (*sinks, *sources)}, **{f"{name}_monitor": f"{name}.monitor" for name in sinks}}
+    names = {name: name for name in (*sinks, *sources)} | {f"{name}_monitor": f"{name}.monitor" for name in sinks}
     entries = [f'pcm.{pcm} {{ type pulse\n server "{socket}"\n device "{device}" }}\n' for pcm, device in names.items()]
     usual = [f'pcm.{pcm} {{ type pulse\n server "{socket}" }}\n' for pcm in ("!default", "pulse")]
     (folder / "asound.conf").write_text("</usr/share/alsa/alsa.conf>\n" + "".join(entries + usual))
@@ -97,12 +87,11 @@ def _start_pulseaudio(folder: Path, environment: dict, modules: Sequence[str]) -
 def _start_pipewire(folder: Path, environment: dict, modules: Sequence[str]) -> list[subprocess.Popen]:
     """PipeWire, its session manager, what speaks PulseAudio's protocol, and the bus that they meet on."""
     (folder / "bus").unlink(missing_ok=True)
-    programs = (["dbus-daemon", "--session", "--nofork", f"--address=unix:path={folder}/bus"], *(
-        [name] for name in ("pipewire", "wireplumber", "pipewire-pulse")
-    ))  # fmt: skip
+    bus_daemon = ["dbus-daemon", "--session", "--nofork", f"--address=unix:path={folder}/bus"]
+    programs = ((bus_daemon, "bus"), (["pipewire"], "pipewire-0"), (["wireplumber"], ""), (["pipewire-pulse"], ""))
     started = []
     with open(folder / "log", "w") as log:
-        for program, socket in zip(programs, ("bus", "pipewire-0", "", "")):
+        for program, socket in programs:
             started.append(subprocess.Popen(program, env=environment, stdout=log, stderr=log))
             for _ in range(100):
                 if not socket or (folder / socket).exists():
@@ -125,15 +114,12 @@ def _load(modules: Sequence[str], environment: dict, process: subprocess.Popen) 
 @contextmanager
 def server(sinks: Sequence[str] = SINKS, system: str = "pulseaudio", channels: int = 1) -> Iterator[Server]:
     """A server of one's own for a while. Its folder is short: socket paths hold 107 bytes."""
-    folder = Path(tempfile.mkdtemp(prefix="pulse"))
-    started = None
-    try:
-        started = start_server(folder, sinks, system=system, channels=channels)
-        yield started
-    finally:
-        if started:
+    with tempfile.TemporaryDirectory(prefix="pulse", ignore_cleanup_errors=True) as folder:
+        started = start_server(Path(folder), sinks, system=system, channels=channels)
+        try:
+            yield started
+        finally:
             started.stop()
-        shutil.rmtree(folder, ignore_errors=True)
 
 
 def memory_mb(pid: int | str = "self") -> float:

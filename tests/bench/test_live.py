@@ -12,12 +12,13 @@ import pytest
 
 from bench import __main__ as bench
 from bench.live import barge_in, click, soak, trial
-from bench.live.barge_in import Talk, early_errors, lasts, lowered, muted, silent_at, words
+from bench.live.barge_in import early_errors, lasts, lowered, muted, silent_at, words
 from bench.metrics import first_sound
 from bench.recogniser import Recogniser
 from bench.simulate import robot_day
 from bench.simulate.conversations import Scene, make_scene, read_clips, read_voices
 from bench.simulate.simulated_robot import Room, draw_robot, draw_walls, stand
+from bench.systems import Output
 from edgefilter import Event
 from tests.bench.conftest import RATE, babble
 
@@ -256,9 +257,9 @@ def test_errors_are_counted_in_the_first_words_alone() -> None:
 
 
 def test_speech_lasts_until_a_pause_of_a_fifth_of_a_second() -> None:
-    def talk(*parts: tuple[float, float]) -> Talk:
+    def talk(*parts: tuple[float, float]) -> Output:
         hops = [[probability] * round(seconds * RATE / 256) for seconds, probability in parts]
-        return Talk(np.zeros(0, np.float32), [], sum(hops, []), 256)
+        return Output(np.zeros(0, np.float32), [], sum(hops, []), 256)
 
     assert lasts(talk((2.0, 0.1)), RATE) is None
     assert lasts(talk((1.0, 0.1), (0.2, 1.0), (1.0, 0.1)), RATE) == [True, False, False, False]
@@ -272,12 +273,12 @@ def test_interruptions_and_false_stops_from_end_to_end(
 ) -> None:
     asked = []
 
-    def listen(mic: np.ndarray, ref: np.ndarray, profile: object, engine: str) -> Talk:
+    def listen(mic: np.ndarray, ref: np.ndarray, profile: object, engine: str) -> Output:
         """A filter that notices the human after 0.1 s if the robot is as loud as ever, and passes the microphone."""
         asked.append(ref)
         onset = first_sound(scene.signals["clean"].astype(np.float32)) + RATE // 10
         probability = [float(at > onset) for at in range(256, mic.size, 256)]
-        return Talk(mic.astype(np.float32), [Event("speech_started", onset, "sure")], probability, 256)
+        return Output(mic.astype(np.float32), [Event("speech_started", onset, "sure")], probability, 256)
 
     class Listener(Recogniser):
         """Understands whatever is not silent."""
