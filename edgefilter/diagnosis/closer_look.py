@@ -12,7 +12,7 @@ from edgefilter.diagnosis.prepare import Prepared
 from edgefilter.diagnosis.trials import Found
 from edgefilter.dsp.frames import block_power, block_sums, decibels, frames
 from edgefilter.dsp.psd import GRID_FFT, frequencies, periodograms
-from edgefilter.echo.effects.gain_law import SURE
+from edgefilter.echo.effects.mic_agc import SURE
 from edgefilter.echo.wiener import spectra
 from edgefilter.types import SAMPLE_RATE, Array, Samples
 
