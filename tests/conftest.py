@@ -1,11 +1,12 @@
-"""Which tests share a process where several run at once (pytest -n 2), and which begin; a catalogue that can be added to."""
+"""Which tests share a process where several run at once (pytest -n 3), and which begin; a catalogue that can be added to."""
 
+import os
 from pathlib import Path
 
 import pytest
 
-from edgefilter.echo.effects import catalogue
-
+# of each process, before numpy asks for it; three share two cores, since tests that play sound wait most of the time
+os.environ.setdefault("OMP_NUM_THREADS", "1")
 HERE = Path(__file__).parent
 LONGEST = (
     "live",
@@ -57,4 +58,6 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 @pytest.fixture
 def own_catalogue(monkeypatch: pytest.MonkeyPatch) -> None:
     """What a test registers is forgotten when it is over."""
+    from edgefilter.echo.effects import catalogue
+
     monkeypatch.setattr(catalogue, "_known", dict(catalogue._known))

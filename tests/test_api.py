@@ -49,6 +49,7 @@ def test_stats_have_the_keys_of_their_type(engine):
     )
 
 
+@pytest.mark.slow
 def test_events_are_of_the_kinds_of_their_type():
     mic, ref = (soundfile.read(DEMO / f"{name}.flac", dtype="float32")[0] for name in ("mic", "reference"))
     ego = EgoFilter(DEMO / "profile.npz", "crnn")

@@ -21,6 +21,7 @@ def test_examples_were_found():
     } <= set(EXAMPLES)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", EXAMPLES)
 def test_docstring_examples_run(name):
     result = doctest.testmod(importlib.import_module(name))

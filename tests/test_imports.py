@@ -193,6 +193,7 @@ def test_files_and_arrows_were_found():
     assert Arrow("edgefilter.engines", "edgefilter.profile.data", True) in ARROWS
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("heavy", LEAVES)
 def test_heavy_packages_are_imported_in_their_leaf_only(heavy):
     users = {

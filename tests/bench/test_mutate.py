@@ -128,6 +128,7 @@ def test_a_line_belongs_to_its_innermost_statement(line: int, span: tuple[int, i
     assert mutate.statement(source, line) == span
 
 
+@pytest.mark.slow
 def test_tests_that_fail_anyway_and_folders_without_tests_are_one_line(
     checkout: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -48,6 +48,7 @@ def test_the_error_is_that_of_humans_on_the_same_device(devices: Path, clips: Pa
     ]
 
 
+@pytest.mark.slow
 def test_recordings_without_a_robot_alone_are_said_in_one_line(
     devices: Path, clips: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

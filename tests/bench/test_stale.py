@@ -39,6 +39,7 @@ def test_a_result_is_stale_where_a_system_gives_another_sound(
     stale.digest_of.cache_clear()
 
 
+@pytest.mark.slow
 def test_the_demonstrations_can_be_heard_by_every_engine() -> None:
     assert [clip.human is not None for clip in stale.demos()] == [True, False]
     linear, again = stale.digest_of("linear"), stale.digests_of(["linear", "dtln-aec"])

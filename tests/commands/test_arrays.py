@@ -29,6 +29,7 @@ def run(folder: Path, *more: object) -> object:
     return edgefilter("run", "--input", folder / "five.wav", "--output", folder / "out.wav", "--quiet", *more)
 
 
+@pytest.mark.slow
 def test_a_device_with_its_reference_among_its_channels(folder: Path) -> None:
     result = run(
         folder, "--mic-channels", "1,2,3", "--reference-channel", 4, "--profile", folder / "three.npz", "--engine", "ss",
@@ -75,6 +76,7 @@ def test_what_cannot_be_is_one_line_and_the_output_is_left_alone(folder: Path) -
     assert (folder / "out.wav").read_bytes() == b"kept"
 
 
+@pytest.mark.slow
 def test_calibrate_takes_the_microphones_that_are_named(folder: Path) -> None:
     from edgefilter import generate_sweep
     from tests.filter.test_arrays import PATHS, fan

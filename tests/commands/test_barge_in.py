@@ -128,6 +128,7 @@ def test_a_machine_that_starts_no_more_threads_is_one_line_and_the_sound_goes_on
     assert said == ["--on-barge-in: cannot be run (can't start new thread): true"]
 
 
+@pytest.mark.slow
 def test_a_terminal_that_goes_away_does_not_cost_the_run_a_sample(tmp_path):
     """Nobody reads standard error any more, and an event is to be told there."""
     rng = np.random.default_rng(1)

@@ -83,6 +83,7 @@ def test_samples_far_beyond_full_scale_are_refused_with_their_value(folder, comm
     assert not (folder / "o.wav").exists()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("where", "why"), [("mic.wav", "no folder"), ("mic.wav/below", "no folder")])
 def test_a_folder_that_cannot_be_made_leaves_the_output_of_an_earlier_run_alone(folder, where, why):
     (folder / "out.wav").write_bytes(b"of an earlier run")
@@ -92,6 +93,7 @@ def test_a_folder_that_cannot_be_made_leaves_the_output_of_an_earlier_run_alone(
     assert (folder / "out.wav").read_bytes() == b"of an earlier run"
 
 
+@pytest.mark.slow
 def test_a_reader_that_goes_away_ends_the_program_without_a_traceback(folder):
     for words in (("profile", "show", "p.npz"), ("profile", "show", "p.npz", "--json", "-")):
         child = subprocess.Popen(
@@ -120,6 +122,7 @@ def test_a_name_that_the_terminal_cannot_show_does_not_stop_the_program(folder, 
     )
 
 
+@pytest.mark.slow
 def test_a_file_name_that_is_no_text_does_not_stop_the_report(tmp_path):
     name = b"\xff.wav"
     x = voice(3.0)

@@ -200,6 +200,7 @@ def test_two_outputs_that_are_one_file_are_refused(heard, capsys, monkeypatch, w
     refused(heard, capsys, words, "same file", *parts)
 
 
+@pytest.mark.slow
 def test_standard_input_and_output_are_seen_through(heard):
     def program(*words, **streams):
         return subprocess.run(

@@ -47,6 +47,7 @@ def passport(tmp_path, capsys):
     return run
 
 
+@pytest.mark.slow
 def test_a_device_that_is_linear_is_told_as_it_is(passport, clean):
     said, heard = clean
     code, figures, out, page = passport(heard, said, engine=None)
@@ -69,6 +70,7 @@ def test_a_device_that_is_linear_is_told_as_it_is(passport, clean):
     assert page.count("<rect") == 4 * len(figures["bands"]) and "://" not in page
 
 
+@pytest.mark.slow
 def test_what_is_removable_is_what_distortion_and_noise_leave(passport, clean):
     said, heard = clean
     noise = np.random.default_rng(5).standard_normal(heard.size) * np.sqrt(np.mean(heard**2) / 10**0.5)
@@ -95,6 +97,7 @@ def test_a_microphone_that_shuts_is_named_as_processed(passport, clean):
     )
 
 
+@pytest.mark.slow
 def test_clocks_that_drift_are_told_and_straightened(passport, clean):
     said, _ = clean
     drifting = record(interpolate(said, np.arange(said.size) * (1 + 150e-6)))
@@ -110,6 +113,7 @@ def test_a_reference_that_is_not_in_the_recording_is_a_finding(passport, clean):
     assert "The reference is not found in the recording." in out and "is not found" in page and "<svg" not in page
 
 
+@pytest.mark.slow
 def test_a_robot_that_never_pauses_is_asked_for_a_pause(passport):
     said = (0.05 * np.random.default_rng(2).standard_normal(round(SECONDS * RATE))).astype(np.float32)
     _, figures, out, _ = passport(record(said), said)
@@ -117,6 +121,7 @@ def test_a_robot_that_never_pauses_is_asked_for_a_pause(passport):
     assert any("pause" in change for change in figures["said"]["changes"])
 
 
+@pytest.mark.slow
 def test_the_level_of_the_human_is_the_one_asked_for(passport, clean):
     said, heard = clean
     _, figures, out, _ = passport(heard, said, "--human-db", "0")

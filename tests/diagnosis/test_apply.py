@@ -37,6 +37,7 @@ def drifting() -> tuple[np.ndarray, np.ndarray]:
     return record(x, office().with_effect("clock_drift", DRIFT)), x
 
 
+@pytest.mark.slow
 def test_two_effects_are_fitted_beside_each_other() -> None:
     x = voice(8.0)
     robot = EchoModel(path()).with_effect("chassis_resonance", RESONANCE)
@@ -50,6 +51,7 @@ def test_two_effects_are_fitted_beside_each_other() -> None:
     assert abs(dict(alone.echo.effects)["playback_gain"]["gain_db"] + 3.0) > 0.05  # fitted alone it takes the ring in
 
 
+@pytest.mark.slow
 def test_the_order_of_the_names_changes_nothing_that_is_heard() -> None:
     x = voice(8.0)
     y = record(
@@ -71,6 +73,7 @@ def test_reverberation_is_learnt_from_a_recording_whose_clocks_differ(drifting) 
     assert compare(knowing, straight, other).excess_db < compare(profile(), straight, other).excess_db - 8.0
 
 
+@pytest.mark.slow
 def test_reverberation_learnt_across_a_drift_helps_the_running_filter(drifting) -> None:
     y, x = drifting
     proof = prove(profile(), "late_reverb", y, x)
@@ -79,6 +82,7 @@ def test_reverberation_learnt_across_a_drift_helps_the_running_filter(drifting) 
     assert not proof.worse and proof.seconds > 1.5
 
 
+@pytest.mark.slow
 def test_a_jump_is_taken_out_before_another_effect_is_fitted() -> None:
     x = voice(9.0)
     jumped = EchoModel(path()).with_effect("chassis_resonance", RESONANCE)
@@ -88,6 +92,7 @@ def test_a_jump_is_taken_out_before_another_effect_is_fitted() -> None:
     assert dict(knowing.echo.effects)["chassis_resonance"]["frequency_hz"] == pytest.approx(640.0, rel=0.01)
 
 
+@pytest.mark.slow
 def test_a_turned_volume_is_taken_out_but_beside_a_filter_that_holds_it() -> None:
     x = voice(8.0)
     turned = (
@@ -100,6 +105,7 @@ def test_a_turned_volume_is_taken_out_but_beside_a_filter_that_holds_it() -> Non
     assert fit_straight(prepared, ["late_reverb"])[1] == ()
 
 
+@pytest.mark.slow
 def test_nothing_is_taken_out_of_a_straight_recording() -> None:
     x = voice(8.0)
     prepared = prepare(profile(), record(x, EchoModel(path()).with_effect("chassis_resonance", RESONANCE)), x)
@@ -110,6 +116,7 @@ def test_nothing_is_taken_out_of_a_straight_recording() -> None:
     assert everywhere.error(model.predict(x)) <= everywhere.error(alone.predict(x)) * 1.001
 
 
+@pytest.mark.slow
 def test_rounds_lower_the_error_of_what_was_fitted_in_turn() -> None:
     x = voice(6.0)
     robot = (
@@ -134,6 +141,7 @@ def carried_back() -> tuple[np.ndarray, np.ndarray]:
     return y, x
 
 
+@pytest.mark.slow
 def test_what_the_held_out_seconds_contradict_is_called_worse(carried_back) -> None:
     y, x = carried_back
     proof = prove(profile(), "late_reverb", y, x)
@@ -203,6 +211,7 @@ def test_an_unknown_name_among_several_is_refused(drifting) -> None:
         add(profile(), ["playback_gain", "late_reverbs"], y, x)
 
 
+@pytest.mark.slow
 def test_a_drift_in_the_profile_is_predicted_whatever_the_lag() -> None:
     """A profile that holds a drift predicted a recording 0.8 s later with a lag that was off by a fraction of a sample."""
     x = voice(9.0)

@@ -107,6 +107,7 @@ def test_any_channel_is_diagnosed_and_all_are_looked_at(folder: Path) -> None:
     assert "playback_gain" in [one["effect"] for one in found["ranking"]], "6 dB louder than its own path"
 
 
+@pytest.mark.slow
 def test_what_cannot_be_diagnosed_is_one_line(folder: Path) -> None:
     one_line(diagnose(folder, "--channel", 1), 2, "--channel without --mic-channels")
     one_line(

@@ -103,6 +103,7 @@ def test_a_turned_volume_is_found_beside_a_fan_that_hides_it() -> None:
     assert found.remaining_db < 0.5
 
 
+@pytest.mark.slow
 def test_things_that_slam_now_and_then_are_no_fan() -> None:
     x = voice(SECONDS)
     slams = np.zeros(x.size)
@@ -125,6 +126,7 @@ def test_mains_hum_is_not_an_effect_and_is_described() -> None:
     assert "multiples of 50 Hz" in found.evidence and "silent" in found.evidence
 
 
+@pytest.mark.slow
 def test_what_no_effect_makes_is_unexplained() -> None:
     x = voice(SECONDS)
     ring = echo(x) * (1.0 + 0.15 * np.sin(2 * np.pi * 170 * np.arange(x.size) / 16000))

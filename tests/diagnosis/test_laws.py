@@ -61,6 +61,7 @@ def load(tmp_path: Path, own_catalogue) -> Callable[[Law, str], str]:
     return loaded
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("family", HIDDEN)
 def test_add_takes_the_law_that_is_written_and_the_error_falls(family: str, load) -> None:
     y, law = record(HIDDEN[family].astype(np.float32)), lawful(family)

@@ -36,6 +36,7 @@ def suppressed(y: np.ndarray, depth_db: float) -> np.ndarray:
     return out.astype(np.float32)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("depth_db", [-5.0, -12.0, -30.0])
 def test_a_suppressor_is_named_however_deep_it_is(depth_db: float) -> None:
     x = voice(SECONDS)
@@ -47,6 +48,7 @@ def test_a_suppressor_is_named_however_deep_it_is(depth_db: float) -> None:
     assert "softer than calibrated" in found.ranking[0].evidence
 
 
+@pytest.mark.slow
 def test_it_is_named_beside_what_the_loudspeaker_does() -> None:
     x = voice(SECONDS)
     found = diagnose(profile(), suppressed(0.8 * record(x) + 0.2 * record(0.0 * x), -12.0), x)
@@ -80,6 +82,7 @@ def test_what_is_soft_without_a_suppressor_is_not_called_one(change, silence_db:
     assert step is None or step[1].name != "noise_suppression"
 
 
+@pytest.mark.slow
 def test_a_suppressor_that_lets_weak_voice_through_less_is_seen_in_the_numbers() -> None:
     x = voice(SECONDS)
     better, before, after = add(profile(), "noise_suppression", suppressed(record(x), -12.0), x)

@@ -72,6 +72,7 @@ def test_every_lost_frame_is_found_with_its_length_and_what_was_played_instead(l
     assert np.abs(found - loud_frames(x, length, 14) * length).max() <= 2
 
 
+@pytest.mark.slow
 def test_lost_packets_are_named_and_nothing_else() -> None:
     x = voice(SECONDS)
     found = diagnose(profile(), record(lossy(x, 320, 0.0)), x)
@@ -102,6 +103,7 @@ def test_what_is_missing_without_packets_is_not_called_so(change) -> None:
     assert trial is None or not bench.admissible(trial, prepared.model)
 
 
+@pytest.mark.slow
 def test_the_fan_stays_in_a_lost_frame() -> None:
     """What tells a packet from a gap in the recording: the same frames, with and without the fan."""
     x = voice(SECONDS)

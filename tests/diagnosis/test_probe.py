@@ -104,6 +104,7 @@ def test_what_predicts_the_same_is_one_explanation_and_an_event_is_none() -> Non
         Inquiry(profile(), [("delay_jump",), ("playback_gain",)], y, x)
 
 
+@pytest.mark.slow
 def test_a_question_that_no_sound_answers_is_said() -> None:
     x = voice(4.0)
     y = heard(x, "compression", COMPRESSION, 3)

@@ -33,6 +33,7 @@ def diagnosed():
     return x, prepared, conclude(prepared, search(prepared, prepared.model, THOROUGH), THOROUGH)
 
 
+@pytest.mark.slow
 def test_every_effect_that_was_fitted_is_in_the_table_with_its_fate(diagnosed):
     tried = diagnosed[2].tried
     by_name = {row.effect: row for row in tried}

@@ -68,6 +68,7 @@ def test_fitted_compression_explains_most_of_a_compressor() -> None:
     assert rms(recording - gain * fitted) < 0.5 * rms(recording - plain_gain * plain)
 
 
+@pytest.mark.slow
 def test_a_compressor_behind_a_turned_volume_is_fitted_to_what_it_gets() -> None:
     x, turned = speech(8.0), model().with_effect("playback_gain", {"gain_db": -12.0})
     truth = turned.with_effect("compression", {"threshold_db": -36.0, "ratio": 4.0})

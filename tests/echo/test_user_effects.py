@@ -218,6 +218,7 @@ def test_the_documented_effect_finds_its_own_parameters(tmp_path):
     )  # 8 s of a voice with pauses
 
 
+@pytest.mark.slow
 def test_the_documented_effect_lowers_what_the_running_filter_leaves(tmp_path):
     load_effect(documented_file(tmp_path))
     x, robot = voice(12.0), profile()

@@ -30,6 +30,7 @@ def program(request, tmp_path):
     return run
 
 
+@pytest.mark.slow
 def test_auto_steps_down_to_ss_and_says_why(program):
     done = program()
     assert done.returncode == 0, done.stderr

@@ -133,6 +133,7 @@ def test_the_engine_computes_what_torch_computes(exported):
         np.testing.assert_allclose(found, mine.numpy(), atol=1e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("norm", "erb"), [("layer", 0), ("batch", 0), ("none", 0), ("layer", 32)])
 @pytest.mark.parametrize("products", [False, True])
 def test_the_rewritten_graph_answers_like_the_network_whatever_its_shape(norm, erb, products):

@@ -1,5 +1,6 @@
 """The paper's network has the paper's layers, sizes and reach."""
 
+import pytest
 import torch
 from torch import nn
 
@@ -8,6 +9,7 @@ from export.paper_network import PaperConfig, PaperCrnn, macs_per_second, parame
 TINY = PaperConfig(bins=9, filters=(6,) * 8, lstm=8, hidden=16)
 
 
+@pytest.mark.slow
 def test_parameters_and_operations_are_those_of_table_1():
     with torch.device("meta"):
         network = PaperCrnn()

@@ -84,6 +84,7 @@ def test_the_wide_recipe_has_every_kind():
     assert set(WIDE.kinds) == set(KINDS)
 
 
+@pytest.mark.slow
 def test_wide_items_hold_loud_humans_silent_robots_and_every_kind_of_start(parts):
     items = [simulate(replace(WIDE, plain=0.0, seconds=3.0), 8, index, parts) for index in range(60)]
     assert {item.about["profile"] for item in items} == {"none", "right", "level", "device", "path"}
@@ -113,6 +114,7 @@ def test_a_robot_that_says_nothing_leaves_the_human_and_the_fan(parts):
     np.testing.assert_allclose(heard.error, heard.clean + heard.fan, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_an_item_of_a_filter_that_ran_before_holds_what_came_after(parts):
     stft, said = StftConfig(), {}
     for later in (0.0, 1.0):
@@ -122,6 +124,7 @@ def test_an_item_of_a_filter_that_ran_before_holds_what_came_after(parts):
         assert said[later]["mic"].shape == (2 * RATE,) and said[later]["noise"].shape[0] == 2 * RATE // 256
 
 
+@pytest.mark.slow
 def test_a_front_that_learns_leaves_less_of_a_loudspeaker_that_distorts(parts):
     recipe = replace(RECIPES["edge"], moving=0.0, warm=0.0, human=0.0, seconds=9.0, distortion_db=(-14.0, -14.0))
     item, stft, left = simulate(recipe, 3, 1, parts), StftConfig(), {}

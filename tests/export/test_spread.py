@@ -24,6 +24,7 @@ def power(shared, task):
     return task**shared
 
 
+@pytest.mark.slow
 def test_processes_and_cluster_answer_the_same(cluster):
     tasks = list(range(12))
     assert set(spread(power, 3, tasks, 2)) == set(spread(power, 3, tasks, 1, cluster.scheduler_address))

@@ -54,6 +54,7 @@ def data(tmp_path_factory):
     return folder / "items"
 
 
+@pytest.mark.slow
 def test_the_dataset_holds_what_the_linear_stage_left(data):
     items = Items(data)
     assert items.names == ["00000.npz", "00001.npz"]
@@ -349,6 +350,7 @@ def test_the_papers_loss_vanishes_at_the_right_mask():
     assert float(power_law_loss(torch.ones_like(mixture), mixture, 0.5 * mixture)) > 0.01
 
 
+@pytest.mark.slow
 def test_training_runs_stops_and_goes_on(tmp_path, capsys):
     small = ["--hop", "32", "--channels", "4", "4", "4", "4", "--hidden", "8"]
     arguments = [
@@ -408,6 +410,7 @@ def test_training_starts_from_given_weights_of_the_same_shape(tmp_path, capsys):
     assert "erb=16" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_small_weights_are_half_of_the_average_and_training_goes_on_from_them(tmp_path, monkeypatch, capsys):
     def run(name, *more):
         folders = ["--data", str(tmp_path / "d"), "--validation", str(tmp_path / "v"), "--output", str(tmp_path / name)]
@@ -451,6 +454,7 @@ def trained(tmp_path):
     return run
 
 
+@pytest.mark.slow
 def test_the_papers_network_trains_in_the_width_that_was_asked_for(trained, tmp_path):
     assert trained("run", *NARROW) == 0
     saved = torch.load(tmp_path / "run" / "best.pt", weights_only=True)
@@ -475,6 +479,7 @@ def test_before_training_the_papers_network_lets_through_as_much_as_there_is_of_
     assert 20 * np.log10(FIRST_MASK) == pytest.approx(-25)
 
 
+@pytest.mark.slow
 def test_a_training_of_the_papers_network_goes_on_in_its_own_width(trained, tmp_path, capsys):
     assert trained("run", *NARROW, "--norm", "batch") == 0
     assert trained("run", "--network", "paper") == 0
@@ -504,6 +509,7 @@ def test_sizes_that_a_network_cannot_have_are_refused_in_one_line(trained, capsy
     assert lines[-1].startswith(f"train: {said}") and "Traceback" not in "".join(lines)
 
 
+@pytest.mark.slow
 def test_a_folder_of_another_training_is_left_alone(trained, tmp_path, capsys):
     assert trained("run", *NARROW) == 0
     before = (tmp_path / "run" / "last.pt").read_bytes()
@@ -524,6 +530,7 @@ def test_every_weight_has_one_optimiser_and_every_matrix_the_one_for_matrices():
     assert {id(network.mask.weight), id(network.speech.weight), id(network.inward.bias)} <= held[1]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("network", ["edge", "paper"])
 def test_where_the_time_of_a_step_goes(data, network, monkeypatch, capsys, tmp_path):
     own = {"edge": ("--channels", "4", "4", "4", "4"), "paper": ("--filters", "3", "2", "--lstm", "4")}[network]

@@ -95,6 +95,7 @@ def test_gradients_reach_every_weight():
     assert all(weight.grad is not None and weight.grad.any() for weight in network.parameters())
 
 
+@pytest.mark.slow
 def test_the_mask_follows_the_voice_and_not_the_level():
     torch.manual_seed(0)
     network = VoiceFilter(SMALL).eval()
@@ -112,6 +113,7 @@ def test_the_mask_follows_the_voice_and_not_the_level():
     assert torch.isfinite(silence).all()
 
 
+@pytest.mark.slow
 def test_a_human_is_told_by_a_recording_that_the_item_does_not_hold(items, speech):
     voices = Voices(read_corpus(speech), spread, ["1"])
     names = sorted(path.name for path in read_corpus(speech).speakers["1"])

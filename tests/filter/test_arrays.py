@@ -94,6 +94,7 @@ def test_one_channel_as_a_column_is_the_signal_itself() -> None:
     assert np.array_equal(enhance(mic[:, None], ref, engine="ss"), enhance(mic, ref, engine="ss"))
 
 
+@pytest.mark.slow
 def test_any_partition_of_an_array_gives_the_same_bits() -> None:
     mic, ref, _ = talk()
     profile, whole = calibration(3), []
@@ -174,6 +175,7 @@ def test_a_microphone_that_is_no_part_of_the_array_is_left_out(change, reason) -
     assert stats["microphones"] == 3 and list(stats["left_out"]) == ["1"] and reason in stats["left_out"]["1"]
 
 
+@pytest.mark.slow
 def test_equal_channels_count_as_one_and_another_takes_the_place_of_the_first() -> None:
     mic, ref, _ = talk()
     twice, silent = mic.copy(), mic.copy()
@@ -285,6 +287,7 @@ def test_a_turn_of_an_array_lies_where_it_was_streamed() -> None:
     assert not np.array_equal(turn.samples, streamed)
 
 
+@pytest.mark.slow
 def test_of_a_turn_longer_than_30_s_the_latest_part_is_kept() -> None:
     mic, ref = np.tile(conversation(4 * RATE), 9)
     stream = Stream(Told(RATE, 35 * RATE), None)
@@ -340,6 +343,7 @@ def test_a_calibration_says_what_is_doubtful_about_a_channel() -> None:
         calibrate(sweep, heard.astype(np.float32), quiet[:, :2].astype(np.float32))
 
 
+@pytest.mark.slow
 def test_an_array_learns_and_its_profile_is_adapted_in_all_microphones() -> None:
     mic, ref, _ = talk()
     profile = calibration(3)
@@ -351,6 +355,7 @@ def test_an_array_learns_and_its_profile_is_adapted_in_all_microphones() -> None
     np.testing.assert_allclose(after / before, 0.5, atol=0.1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("microphones", [1, 3])
 def test_each_microphone_is_given_with_the_robot_removed_where_asked(microphones: int) -> None:
     mic, ref, _ = talk()

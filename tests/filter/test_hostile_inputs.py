@@ -129,6 +129,7 @@ def loudest_over_mic_db(mic: np.ndarray, out: np.ndarray) -> float:
     return float((10 * np.log10(powers[1] / powers[0])).max())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize("make", SCENES, ids=lambda make: make.__name__)
 def test_never_louder_than_the_microphone(make, engine, calibrated):
@@ -155,6 +156,7 @@ def test_the_profile_of_these_scenes_is_true():
     assert 10 * np.log10(np.mean(echo[-SAMPLE_RATE:] ** 2) / np.mean(out[-SAMPLE_RATE:] ** 2)) > 20
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("click", [1e2, 1e6])
 def test_one_loud_sample_of_the_reference_costs_the_rest_next_to_nothing(click):
     """It lies in the first of two utterances, the second of which has another lag and is evaluated."""

@@ -62,6 +62,7 @@ def filtered(ego: EgoFilter, mic: np.ndarray, ref: np.ndarray, sizes: list[int])
     return np.concatenate((*out, ego.flush()))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", FILTERS)
 def test_output_is_finite_as_long_as_the_input_never_louder_and_the_same_in_any_blocks(name):
     ego = FILTERS[name]()

@@ -34,6 +34,7 @@ def events(ego, mic, ref, block=256):
     return ego.events()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("profile", [None, DEMO / "profile.npz"], ids=["no profile", "profile"])
 @pytest.mark.parametrize("late_ms", [60, 157, 300])
 def test_a_robot_whose_reference_is_late_is_not_taken_for_somebody_and_the_lateness_is_said(robot, profile, late_ms):
@@ -45,6 +46,7 @@ def test_a_robot_whose_reference_is_late_is_not_taken_for_somebody_and_the_laten
     assert late.sample < 1.5 * RATE  # half a second after the reference has begun, the latest of which does at 0.9 s
 
 
+@pytest.mark.slow
 def test_a_reference_in_time_is_said_nothing_of_and_the_human_is_noticed_as_before():
     mic, ref = (soundfile.read(DEMO / f"{name}.flac", dtype="float32")[0] for name in ("mic", "reference"))
     found = events(EgoFilter(DEMO / "profile.npz", "crnn"), mic, ref)
@@ -66,6 +68,7 @@ def test_a_sentence_said_again_while_its_first_echo_still_sounds_is_no_late_refe
     assert not {event.kind for event in found} & set(SET_UP_WRONG)
 
 
+@pytest.mark.slow
 def test_a_late_reference_that_is_mended_is_forgotten(robot):
     mic, ref = robot
     ego = EgoFilter(DEMO / "profile.npz", "crnn")
@@ -87,6 +90,7 @@ def test_somebody_who_speaks_before_the_robot_ever_did_is_noticed_half_a_second_
     assert len(found) == 1 and 1.5 * RATE < found[0].sample < 2.5 * RATE
 
 
+@pytest.mark.slow
 def test_another_sound_than_the_loudspeaker_s_is_said(robot):
     mic, ref = robot
     quiet = (1e-4 * np.random.default_rng(2).standard_normal(2 * RATE)).astype(np.float32)
@@ -97,6 +101,7 @@ def test_another_sound_than_the_loudspeaker_s_is_said(robot):
     assert [event.kind for event in wrong] == ["robot_unfound"] and "dB louder" in wrong[0].detail
 
 
+@pytest.mark.slow
 def test_a_robot_that_plays_unheard_is_no_mistake(robot):
     _, ref = robot
     rng = np.random.default_rng(2)
@@ -105,6 +110,7 @@ def test_a_robot_that_plays_unheard_is_no_mistake(robot):
     assert not [event for event in events(EgoFilter(engine="linear"), mic, other) if event.kind in SET_UP_WRONG]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("level", "said"), [(0.1, 1), (1e-5, 0)], ids=["sound", "silence"])
 def test_a_reference_that_never_comes_is_said_once_where_something_is_heard(level, said):
     mic = (level * np.random.default_rng(3).standard_normal(100 * RATE)).astype(np.float32)

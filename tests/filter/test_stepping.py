@@ -303,6 +303,7 @@ def test_histogram_percentiles_are_true_to_a_bin():
     assert Histogram().to_dict()["p99_ms"] == 0.0
 
 
+@pytest.mark.slow
 def test_a_full_garbage_collection_during_a_run_is_a_matter_of_microseconds():
     """Without setting aside what was loaded before it takes many milliseconds, a missed deadline."""
 

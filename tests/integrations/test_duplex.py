@@ -407,6 +407,7 @@ def test_that_channels_are_averaged_is_said_once(caplog):
     assert caplog.text.count("2 channels averaged to one") == 1 and "mic_channels" in caplog.text
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rate", [16_000, 48_000])
 def test_a_recogniser_gets_the_finished_turn_and_where_there_is_none_what_was_streamed(pair, rate):
     profile, sound = pair

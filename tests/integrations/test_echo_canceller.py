@@ -161,6 +161,7 @@ def hear(canceller, rate, mic, ref):
     ])  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("make", [EchoCanceller, lambda rate: EchoCanceller.create(rate // 100, 2048, rate)])
 @pytest.mark.parametrize("rate", [16000, 48000])
 def test_a_program_changes_one_import_and_hears_the_human(conversation, make, rate):
@@ -191,6 +192,7 @@ def test_the_event_loop_goes_on_while_it_filters_and_calls_are_served_in_their_o
     np.testing.assert_array_equal(asyncio.run(talk()), expected)
 
 
+@pytest.mark.slow
 def test_it_says_whether_the_human_speaks_and_forgets_all_at_a_reset(conversation):
     mic, ref, _ = conversation
     canceller = EchoCanceller(16000, profile=DEMO / "profile.npz")

@@ -54,6 +54,7 @@ def through(ears, frame):
     return ears._process(frame)
 
 
+@pytest.mark.slow
 def test_a_robot_that_talks_is_interrupted_and_its_reference_is_what_it_played(example, ego, check_conversation):
     log, room, _ = asyncio.run(asyncio.wait_for(example("agent_livekit").converse(ego), 120))
     check_conversation(room, ego, 3.0)

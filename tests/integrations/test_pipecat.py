@@ -27,6 +27,7 @@ def filters():
     return EgoFilters(EgoFilter(engine="linear"), in_channels=2)
 
 
+@pytest.mark.slow
 def test_a_robot_that_talks_is_interrupted_and_its_reference_is_what_it_played(example, ego, check_conversation):
     log, room, _ = asyncio.run(asyncio.wait_for(example("agent_pipecat").converse(ego), 120))
     check_conversation(room, ego, 3.0)

@@ -151,6 +151,7 @@ def test_the_node_gives_the_human_and_barge_in_also_after_it_was_killed_and_star
         robot.barge_in.take(100)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("loopback", [False, True])
 def test_of_an_array_the_named_channels_are_its_microphones_and_the_human_is_one_channel(
     tmp_path, pair, talking, loopback

@@ -116,6 +116,7 @@ def kinds(told):
     return [each["kind"] for each in told]
 
 
+@pytest.mark.slow
 def test_a_stereo_stream_is_filtered_as_a_file_is_and_the_human_is_told(conversation):
     mic, ref, human = conversation
     sound, told = run(heard({"rate": RATE}, stereo_messages(mic, ref)))
@@ -139,6 +140,7 @@ def test_other_rates_give_as_many_samples_as_came_and_8_ms_more_of_delay(convers
     assert 10 * np.log10(np.mean(out[late] ** 2) / np.mean(mic[late] ** 2)) < -15
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("late", [0, 5, 100], ids=["in time", "0.1 s late", "2 s late"])
 def test_two_streams_are_put_together_however_late_the_reference_comes(conversation, late):
     mic, ref = (x[: 8 * RATE] for x in conversation[:2])
@@ -177,6 +179,7 @@ def test_a_reference_later_than_said_is_told_with_what_to_say(conversation):
     assert len(wrong) == 1 and "later than the 100 ms" in wrong[0] and "late_ms" in wrong[0] and told[-1]["late"] > 0
 
 
+@pytest.mark.slow
 def test_messages_that_are_lost_doubled_or_out_of_order_leave_the_rest_in_its_place(conversation):
     mic, ref = (x[: 8 * RATE] for x in conversation[:2])
     gone = {60, 61, 150}
@@ -193,6 +196,7 @@ def test_messages_that_are_lost_doubled_or_out_of_order_leave_the_rest_in_its_pl
     np.testing.assert_array_equal(as_float(b"".join(sound)), as_float(b"".join(straight)))
 
 
+@pytest.mark.slow
 def test_a_reference_that_is_only_sent_while_the_robot_talks_is_silence_meanwhile(conversation):
     mic, ref = (x[: 8 * RATE] for x in conversation[:2])
     ref = np.where(np.repeat(np.abs(ref).reshape(-1, 320).max(axis=1) > 0, 320), ref, 0)
@@ -211,6 +215,7 @@ def test_a_reference_that_is_only_sent_while_the_robot_talks_is_silence_meanwhil
     assert told[-1]["lost"] == 0
 
 
+@pytest.mark.slow
 def test_an_announced_utterance_needs_no_reference(conversation):
     mic, ref = conversation[0][: 7 * RATE], conversation[1]
     said = pcm(ref[round(0.42 * RATE) : round(6.1 * RATE)])
@@ -221,6 +226,7 @@ def test_an_announced_utterance_needs_no_reference(conversation):
     assert 10 * np.log10(np.mean(out[alone] ** 2) / np.mean(mic[alone] ** 2)) < -20
 
 
+@pytest.mark.slow
 def test_opus_at_32_kbit_leaves_enough_of_the_echo_to_notice_the_human(conversation):
     """Microphone, reference and the answer go through the codec; docs/serve.md has the figures, and those of less."""
     mic, ref, human = conversation
@@ -362,6 +368,7 @@ def test_a_message_that_is_too_large_is_not_read(monkeypatch):
     assert run(talk()) == 1009
 
 
+@pytest.mark.slow
 def test_a_client_that_does_not_read_is_let_go_and_others_go_on(monkeypatch, caplog):
     monkeypatch.setattr(module, "PATIENCE_S", 0.5)
 
@@ -422,6 +429,7 @@ def service(tmp_path):
     process.communicate()
 
 
+@pytest.mark.slow
 def test_the_satellite_of_the_page_hears_the_human(service, conversation):
     _, address = service
     mic, ref, human = conversation
@@ -435,6 +443,7 @@ def test_the_satellite_of_the_page_hears_the_human(service, conversation):
     assert "speech_started" in kinds(told) and told[-1]["kind"] == "ended"
 
 
+@pytest.mark.slow
 def test_sigterm_ends_every_stream_with_its_rest_and_the_service_once(service):
     process, address = service
 
@@ -476,6 +485,7 @@ def test_what_cannot_be_served_is_one_line_and_exit_code_2(words, said, tmp_path
     assert len(told) == 1 and said in told[0]
 
 
+@pytest.mark.slow
 def test_a_port_that_is_taken_is_one_line(service, capsys):
     _, address = service
     assert main(["serve", "--port", address.rpartition(":")[2], "--engine", "linear"]) == 1

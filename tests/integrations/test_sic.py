@@ -129,6 +129,7 @@ def test_without_a_server_it_is_one_line(cloud):
     assert done.returncode == 1 and len(said) == 1 and "Redis" in said[0], done.stderr
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("words", "said"),
     [

@@ -106,6 +106,7 @@ def within_a_minute(talk):
     asyncio.run(asyncio.wait_for(talk(), 60))
 
 
+@pytest.mark.slow
 def test_a_satellite_is_interrupted_and_its_reference_is_what_was_played(example, ego, check_conversation):
     converse = example("agent_wyoming").converse
     log, room, _ = asyncio.run(asyncio.wait_for(converse(ego, port=free_port(4)), 120))
@@ -315,6 +316,7 @@ def test_a_microphones_command_is_mono_unless_it_says_otherwise(capsys):
     assert "channel 1 is named, found 1" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_one_sigterm_ends_it_with_its_commands(endless_noise, player):
     ports = free_port(2)
     mic_uri, snd_uri = (f"tcp://127.0.0.1:{ports + i}" for i in range(2))

@@ -189,6 +189,7 @@ def test_a_process_that_does_not_end_is_killed(monkeypatch):
         closing.join(10)
 
 
+@pytest.mark.slow
 def test_the_process_ends_with_the_last_one_who_holds_its_learner():
     learner = BackgroundLearner()
     ego = EgoFilter(engine="linear", learn=learner)
@@ -199,6 +200,7 @@ def test_the_process_ends_with_the_last_one_who_holds_its_learner():
         os.kill(pid, 0)
 
 
+@pytest.mark.slow
 def test_the_process_imports_nothing_that_it_does_not_need():
     """Each of these takes 5 to 50 MB and up to a second of a small machine, and none is used to learn."""
     code = "import sys; import edgefilter.learning.worker; print(*sys.modules)"

@@ -84,6 +84,7 @@ def test_a_tone_is_bright_where_it_sounds(tmp_path):
     assert columns.min() > 0.45 * image.shape[1] and np.ptp(rows) < 12
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["absent/p.png", "p.nonsense"])
 def test_unwritable_picture_is_one_line(tmp_path, name):
     with pytest.raises(EdgefilterError, match="the picture cannot be written") as caught:

@@ -87,6 +87,7 @@ def test_fit_finds_the_part_that_bends_and_leaves_the_other_neutral(parts):
     assert not any(np.any(found[name]) for name in (*DRIVER, *AMPLIFIER) if name not in parts)
 
 
+@pytest.mark.slow
 def test_level_is_that_of_the_distortion_at_the_microphone():
     values = {"odd": -0.3, "knee": 0.3}
     measurement, model = robot_alone("speaker_nonlinearity", values, gain_db=0.0)
@@ -105,6 +106,7 @@ def test_what_the_reference_does_not_explain_is_no_distortion():
     assert vanishes(DISTORT, DISTORT.fit(measurement, model))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("louder_db", [20.0, 60.0])
 def test_a_reference_that_is_louder_than_the_fit_does_not_make_the_distortion_explode(louder_db):
     measurement, model = robot_alone("speaker_nonlinearity", CASE)
