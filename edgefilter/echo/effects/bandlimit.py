@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from functools import lru_cache
 from itertools import product
-from typing import ClassVar, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
 from edgefilter.dsp.fourier import power
-from edgefilter.echo.effect import Effect, Experiment, Family, Parameter, Stage, first
+from edgefilter.echo.effect import Effect, Parameter, first, numbers
 from edgefilter.echo.evidence import Evidence
 from edgefilter.echo.measurement import Measurement, Values, VoiceModel
 from edgefilter.echo.wiener import DELAYS, Spectra, convolve_from, fit_filter, spectra
@@ -55,14 +55,14 @@ class Bandlimit(Effect):
     - LEAD, by which the real filter differs from that one.
     """
 
-    name: ClassVar[str] = "bandlimit"
-    stage: ClassVar[Stage] = "path"
-    family: ClassVar[Family] = "linear path"
-    title: ClassVar[str] = "a band limit"
-    shown_by: ClassVar[tuple[Experiment, ...]] = ("sweep",)
-    complexity: ClassVar[int] = 1
-    flexible: ClassVar[bool] = True
-    parameters: ClassVar[tuple[Parameter, ...]] = (
+    name = "bandlimit"
+    stage = "path"
+    family = "linear path"
+    title = "a band limit"
+    shown_by = ("sweep",)
+    complexity = 1
+    flexible = True
+    parameters = (
         Parameter("cutoff_hz", "Hz", 16000.0, 200.0, 16000.0),
         Parameter("order", "1", 8.0, 1.0, 60.0),
         Parameter("phase", "1", 0.0, 0.0, 1.0),
@@ -78,7 +78,7 @@ class Bandlimit(Effect):
         response = low_pass(hz, float(values["cutoff_hz"]), float(values["order"]), float(values["phase"]))
         response = response * np.exp(-2j * np.pi * hz / sample_rate * float(values["delay"]))
         y = convolve_from(x, fft.fftshift(fft.irfft(response, FFT)), FFT // 2)
-        taps = np.atleast_1d(np.asarray(values["taps"], float))
+        taps = numbers(values, "taps")
         return y + convolve_from(x, taps, LEAD) if taps.any() else y
 
     def fit(self, measurement: Measurement, model: VoiceModel) -> Values:
@@ -143,7 +143,7 @@ class Bandlimit(Effect):
         passed = gain_db[(hz > PASSED_HZ) & (hz < 0.6 * float(values["cutoff_hz"]))]
         if not passed.size or float(np.std(passed)) > FLAT_DB:
             return values
-        taps, gain = np.atleast_1d(np.asarray(values["taps"], float)), 10 ** (float(np.median(passed)) / 20)
+        taps, gain = numbers(values, "taps"), 10 ** (float(np.median(passed)) / 20)
         plain = np.zeros(TAPS, np.float32)
         plain[LEAD] = 1.0
         plain = self.apply(plain, {**values, "taps": 0.0}, SAMPLE_RATE)

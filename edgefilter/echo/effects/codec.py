@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from itertools import product
-from typing import ClassVar
 
 import numpy as np
 import scipy
 
 from edgefilter.dsp.frames import decibels
-from edgefilter.echo.effect import Effect, Experiment, Family, Parameter, Stage, first, neutral
-from edgefilter.echo.effects.codec_signs import signs_of
+from edgefilter.echo.effect import Effect, Parameter, first, neutral, within
+from edgefilter.echo.effects.codec_signs import HEARD, signs_of
 from edgefilter.echo.effects.knock_power import BANDS, FRAME, HOP, band_power, colour_of, density_of, fan_in_bands
 from edgefilter.echo.evidence import Evidence
 from edgefilter.echo.measurement import Measurement, Values, VoiceModel
@@ -18,8 +17,6 @@ from edgefilter.types import PRE_ROLL, SAMPLE_RATE, Array, Samples
 
 DECAYS_MS, EXPONENTS = (4.0, 8.0, 16.0, 32.0), (0.5, 0.7, 1.0)
 """Tried, by likelihood: a codec's frames and the room; and how the noise grows with the voice."""
-VOICED = 2.0
-"""Times the fan that the voice must be, where its noise is measured."""
 
 
 class Codec(Effect):
@@ -32,18 +29,16 @@ class Codec(Effect):
     is a `bandlimit` beside it.
     """
 
-    name: ClassVar[str] = "codec"
-    stage: ClassVar[Stage] = "source"
-    family: ClassVar[Family] = "additive noise"
-    run_note: ClassVar[str] = (
-        "the running filter follows by itself what noise the voice brings along: adding it changes nothing there"
-    )
-    title: ClassVar[str] = "a codec"
-    shown_by: ClassVar[tuple[Experiment, ...]] = ("levels", "tone")
-    complexity: ClassVar[int] = 3
-    cost: ClassVar[int] = 4
-    followed: ClassVar[bool] = True
-    parameters: ClassVar[tuple[Parameter, ...]] = (
+    name = "codec"
+    stage = "source"
+    family = "additive noise"
+    run_note = "the running filter follows by itself what noise the voice brings along: adding it changes nothing there"
+    title = "a codec"
+    shown_by = ("levels", "tone")
+    complexity = 3
+    cost = 4
+    followed = True
+    parameters = (
         Parameter("power", "full scale^2", 0.0, 0.0, 1e3),
         Parameter("decay_ms", "ms", 8.0, 0.1, 100.0),
         Parameter("exponent", "1", 1.0, 0.1, 2.0),
@@ -72,7 +67,7 @@ class Codec(Effect):
         left = target - predicted
         over, voice = band_power(left), band_power(predicted)
         use = np.ones(target.size, bool) if measurement.fit is None else measurement.fit
-        loud = use[np.arange(len(over)) * HOP + FRAME // 2] & (voice.mean(axis=1) > VOICED)
+        loud = use[np.arange(len(over)) * HOP + FRAME // 2] & (voice.mean(axis=1) > HEARD)
         if not loud.any():
             return neutral(self)
         levels = {decay: _levels(measurement.reference, decay) for decay in DECAYS_MS}
@@ -84,15 +79,10 @@ class Codec(Effect):
         below = decibels(float(np.mean(voice[loud]))) - decibels(
             float(np.mean(np.maximum(over[loud] - 1.0, 0.0))) + 1e-9
         )
-        return {
-            "power": np.clip(power * fan_in_bands(measurement.noise_psd), 0.0, 1e3),
-            "decay_ms": decay,
-            "exponent": exponent,
-            "below_voice_db": float(np.clip(below, -60.0, 200.0)),
-        }
+        power = power * fan_in_bands(measurement.noise_psd)
+        return within(self, {"power": power, "decay_ms": decay, "exponent": exponent, "below_voice_db": below})
 
     def sentence(self, values: Values) -> str:
-        """How loud the noise is, and what it is not."""
         return (
             f"noise {first(values, 'below_voice_db'):.0f} dB below the voice follows it in every band, but neither its phase nor"
             " its harmonics: what a codec leaves, and no waveform predicts; it is shown as irreducible"

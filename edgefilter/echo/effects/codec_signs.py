@@ -26,7 +26,7 @@ gain that changes, a clock that trembles."""
 SHIFTS, SHIFTED = range(3, 17), (1, 41)
 """Bins by which a sound that is modulated comes back beside itself, either way, and the place around a cell for that."""
 HEARD = 2.0
-"""Times the fan that the residual around a cell must have to say something."""
+"""Times the fan that the residual around a cell, or the voice, must have to say something."""
 FOLLOWS = 0.4
 """Correlation, over time in bands, of the residual's level with the voice's: what sounds by itself has none, knocks less than
 0.35."""

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from functools import cache
-from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
 from edgefilter.dsp.fourier import log_response
-from edgefilter.echo.effect import Effect, Experiment, Family, Parameter, Stage
+from edgefilter.echo.effect import Effect, Parameter, numbers
 from edgefilter.echo.evidence import Evidence
 from edgefilter.echo.measurement import Measurement, Values, VoiceModel
 from edgefilter.echo.wiener import DELAYS, Spectra, convolve_from, fit_filter, spectra
@@ -39,14 +38,14 @@ class Equaliser(Effect):
     the real filter differs from that one. range_db only reports: from the least to the largest gain that is heard.
     """
 
-    name: ClassVar[str] = "equaliser"
-    stage: ClassVar[Stage] = "path"
-    family: ClassVar[Family] = "linear path"
-    title: ClassVar[str] = "an equaliser or another loudspeaker"
-    shown_by: ClassVar[tuple[Experiment, ...]] = ("sweep",)
-    complexity: ClassVar[int] = 2
-    flexible: ClassVar[bool] = True
-    parameters: ClassVar[tuple[Parameter, ...]] = (
+    name = "equaliser"
+    stage = "path"
+    family = "linear path"
+    title = "an equaliser or another loudspeaker"
+    shown_by = ("sweep",)
+    complexity = 2
+    flexible = True
+    parameters = (
         Parameter("gain_db", "dB", 0.0, -MOST_DB, MOST_DB),
         Parameter("delay", "samples", 0.0, -100.0, 100.0),
         Parameter("taps", "1", 0.0, -10.0, 10.0),
@@ -63,7 +62,7 @@ class Equaliser(Effect):
             nepers = _basis(FFT // 2 + 1, sample_rate, gain_db.size) @ (gain_db * (np.log(10.0) / 20.0))
             response = np.exp(nepers - 2j * np.pi * hz / sample_rate * delay)
             y = convolve_from(x, fft.fftshift(fft.irfft(response, FFT)), FFT // 2)
-        taps = np.atleast_1d(np.asarray(values["taps"], float))
+        taps = numbers(values, "taps")
         return y + convolve_from(x, taps, LEAD) if taps.any() else y
 
     def fit(self, measurement: Measurement, model: VoiceModel) -> Values:
@@ -80,7 +79,7 @@ class Equaliser(Effect):
 
     def sentence(self, values: Values) -> str:
         """Where it is loudest and where softest."""
-        gain_db = np.atleast_1d(np.asarray(values["gain_db"], float))
+        gain_db = numbers(values, "gain_db")
         hz, high, low = knots_hz(gain_db.size), int(np.argmax(gain_db)), int(np.argmin(gain_db))
         return (
             f"the voice has another colour, smooth over frequency and the same at all levels: {gain_db[high]:+.1f} dB"

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from itertools import product
-from typing import ClassVar
 
 import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from edgefilter.echo.effect import Effect, Experiment, Family, Parameter, Runner, Stage, complete, neutral
+from edgefilter.echo.effect import Effect, Parameter, Runner, complete, neutral
 from edgefilter.echo.effects.compression import STEEPEST, Compressor
 from edgefilter.echo.effects.equaliser import MOST_DB
 from edgefilter.echo.effects.gain_fit import GainFit, Reach
@@ -52,14 +51,14 @@ class MultibandCompression(Effect):
     samples, re the lag at which a recording is found, which is that of its loudest band.
     """
 
-    name: ClassVar[str] = "multiband_compression"
-    stage: ClassVar[Stage] = "source"
-    family: ClassVar[Family] = "dynamics"
-    title: ClassVar[str] = "multi-band compression"
-    shown_by: ClassVar[tuple[Experiment, ...]] = ("levels", "sweep")
-    cost: ClassVar[int] = 4
-    flexible: ClassVar[bool] = True
-    parameters: ClassVar[tuple[Parameter, ...]] = (
+    name = "multiband_compression"
+    stage = "source"
+    family = "dynamics"
+    title = "multi-band compression"
+    shown_by = ("levels", "sweep")
+    cost = 4
+    flexible = True
+    parameters = (
         Parameter("crossover_hz", "Hz", 1000.0, 20.0, 7500.0),
         Parameter("threshold_db", "dB re full scale", -20.0, -80.0, 0.0),
         Parameter("ratio", "dB/dB", 1.0, 1.0, 50.0),
