@@ -271,8 +271,6 @@ def _latency_ms(engine: str) -> float | None:
 class _Kept:
     """Learns a recording once and says it again to the next engine, since no lesson depends on the engine."""
 
-    past = PathLearner.past
-
     def __init__(self, profile: Profile | None) -> None:
         self._learner: Learner | None = PathLearner(profile)
         self._lessons: dict[int, Lesson] = {}
