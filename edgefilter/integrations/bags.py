@@ -12,7 +12,7 @@ import numpy as np
 from rosbags.highlevel import AnyReader, AnyReaderError
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from edgefilter.audio.files import open_sink
+from edgefilter.audio.files import make_folder, open_sink
 from edgefilter.audio.pairing import MAX_WAIT
 from edgefilter.dsp.resample import Resampler
 from edgefilter.errors import AudioFileError, UsageError
@@ -39,7 +39,7 @@ def extract(bag: Path, topics: dict[str, str], folder: Path, rate: int, channels
     except (AnyReaderError, OSError, ValueError) as error:
         raise AudioFileError(f"{bag} cannot be read as a recording of ROS 2: {' '.join(str(error).split())}") from None
     begin = min(time - samples.size / rate for parts in sounds.values() for time, samples in parts[:1])
-    folder.mkdir(parents=True, exist_ok=True)
+    make_folder(folder, "the sounds of the recording")
     seconds = {}
     for name, parts in sounds.items():
         with open_sink(folder / f"{name}.wav") as sink:

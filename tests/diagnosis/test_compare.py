@@ -9,6 +9,7 @@ import pytest
 import soxr
 
 from edgefilter.diagnosis.compare import compare
+from edgefilter.diagnosis.prepare import find_talk
 from edgefilter.errors import SignalError
 from tests.diagnosis.robot_scene import FAN, profile, record, voice
 
@@ -117,3 +118,12 @@ def test_a_microphone_gain_in_the_profile_is_that_of_the_fan_as_well() -> None:
     assert abs(found.excess_db) < 0.3 and abs(found.silence_excess_db) < 0.3
     assert max(abs(excess) for _, _, excess in found.bands) < 1.0
     np.testing.assert_allclose(found.recording - found.prediction, found.residual, atol=1e-6)
+
+
+@pytest.mark.parametrize(("level_db", "talks"), [(7.5, False), (8.5, True)])
+def test_a_talker_is_eight_decibels_over_the_fan(level_db: float, talks: bool) -> None:
+    square = np.ones(10 * 16_000)
+    square[3 * 16_000 : 4 * 16_000] = 10 ** (level_db / 10)
+    found = find_talk(square, np.zeros(square.size, bool))
+    assert found == (((pytest.approx(2.8), pytest.approx(4.2)),) if talks else ())
+    assert find_talk(square, np.ones(square.size, bool)) == ()  # it is the robot
