@@ -145,7 +145,7 @@ def policies(
     outs = {"open": talk.samples, "muted": muted(scene)}
     for name, (at, gain) in turned.items():
         ref = scene.signals["ref"] if at is None else lowered(scene.signals["ref"], at, gain)
-        outs[name] = talk.samples if at is None else listen(scene.mic(ref), ref, profile, engine).out
+        outs[name] = talk.samples if at is None else listen(scene.mic(ref), ref, profile, engine).samples
     outs["alone"] = scene.signals["clean"].astype(np.float32)
     span = slice(scene.meta["start"], scene.meta["end"])
     share = SAMPLE_RATE / (span.stop - span.start)

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy import fft, signal
+import scipy
+from scipy import fft
 
 from edgefilter.calibration.checks import check_found, check_lengths, collect_warnings
 from edgefilter.calibration.sweep import MIN_TAPS, Deconvolution, deconvolve, distortion_db, paper_response, sweep_law
@@ -132,7 +133,7 @@ def first(recordings: Samples) -> Samples:
 
 def fan_psd(noise: Samples) -> Samples:
     """Welch's PSD (601,) float32, one-sided, full scale^2/Hz, on GRID_HZ: Hann frames of 1200 samples, half overlapping."""
-    return signal.welch(noise, SAMPLE_RATE, nperseg=GRID_FFT, detrend=False)[1].astype(np.float32)
+    return scipy.signal.welch(noise, SAMPLE_RATE, nperseg=GRID_FFT, detrend=False)[1].astype(np.float32)
 
 
 def impulse_response(result: Deconvolution, direct: int) -> Samples:

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy import signal
 
 from edgefilter.calibration.sweep import EARLIEST_DIRECT, LATEST_DIRECT, MIN_TAPS, Deconvolution, SweepLaw, deconvolve
 from edgefilter.dsp.fourier import power
@@ -126,7 +126,7 @@ def disturbed(
     """
     early = int(law.lead(5.5))
     shift = result.direct - early
-    predicted = signal.oaconvolve(reference.astype(np.float64), result.cut(shift, early + MIN_TAPS))
+    predicted = scipy.signal.oaconvolve(reference.astype(np.float64), result.cut(shift, early + MIN_TAPS))
     own = stretch(predicted, -shift, recording.size - shift)
     block = SAMPLE_RATE // 4
     rest, explained = block_power(recording - own, block), block_power(own, block)

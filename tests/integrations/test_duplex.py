@@ -251,7 +251,8 @@ def test_an_agent_whose_reference_is_late_does_not_interrupt_itself_and_the_log_
         if step == 20:  # 0.4 s after the loudspeaker
             duplex.play(room_of.ROBOT, RATE)
         duplex.hear(room.hear(320), RATE)
-    assert [event.kind for event in events if event.kind != "realigned"] == ["reference_late"]
+    besides = ("realigned", "overloaded")  # the latter where other tests keep the machine busy
+    assert [event.kind for event in events if event.kind not in besides] == ["reference_late"]
     assert "reference late: the reference comes" in caplog.text
 
 
