@@ -231,7 +231,6 @@ def _as_written(found: Diagnosis, prepared: Prepared, values: Mapping[str, Value
         comparison=before,
         ranking=tuple(findings[finding.effect] for finding in found.ranking),
         remaining_db=after.excess_db,
-        irreducible_db=min(found.irreducible_db, max(after.excess_db, 0.0)),
         model=model,
         precision=found.precision.at(values),
         written=after,

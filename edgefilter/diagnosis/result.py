@@ -139,11 +139,12 @@ class Precision:
 class Diagnosis:
     """The verdict on a recording: which effects are missing (ranking, strongest first), what is left.
 
-    irreducible_db: of that, what cannot be predicted. tried: all effects that were tried. independence: of what is left
-    with all that was found. precision: of the found numbers. advice: what to record to tell candidates apart that
-    explain nearly the same. proof: of what was found, in the running filter, where it was asked for; unproven: why there
-    is none. written: the comparison with the profile that was written of it, whose figures it then has. closer_look: at
-    what is left, where that is unexplained; law: the free one that explains much more of it than what is named.
+    irreducible_db: what no waveform predicts, over the fan alone. tried: all effects that were tried. independence: of
+    what is left with all that was found. precision: of the found numbers. advice: what to record to tell candidates
+    apart that explain nearly the same. proof: of what was found, in the running filter, where it was asked for;
+    unproven: why there is none. written: the comparison with the profile that was written of it, whose figures it then
+    has. closer_look: at what is left, where that is unexplained; law: the free one that explains much more of it than
+    what is named.
     """
 
     verdict: Verdict

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import signal
 
-from edgefilter.diagnosis.diagnose import diagnose
+from edgefilter.diagnosis.diagnose import diagnose, settle
 from edgefilter.diagnosis.prepare import prepare
 from edgefilter.diagnosis.score import Scorer
 from edgefilter.echo.effect import complete
@@ -46,7 +46,9 @@ def talked_into(x: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("step_db", [-8.0, -14.0])
 def test_a_codec_is_named_with_how_loud_its_noise_is(step_db: float) -> None:
     x = voice(SECONDS)
-    found = diagnose(profile(), record(coded(x, step_db)), x)
+    recording = record(coded(x, step_db))
+    found = diagnose(profile(), recording, x)
+    assert settle(profile(), found, ["codec"], recording, x)[2].irreducible_db == found.irreducible_db
     assert [finding.effect for finding in found.ranking] == ["codec"] and found.verdict == "missing"
     finding = found.ranking[0]
     assert finding.excess_after_db < 0.5 * finding.excess_before_db and found.irreducible_db > 2.0
