@@ -61,6 +61,12 @@ def test_five_seconds_settle_a_pair_whichever_is_true(pair: str, true: int) -> N
     assert 1 <= len(answer.sounds) <= 2
 
 
+def _levels_db(sound: np.ndarray) -> np.ndarray:
+    """Of the five parts between the mark and the end."""
+    parts = np.array_split(sound[round(0.4 * SAMPLE_RATE) : -round(0.1 * SAMPLE_RATE)], 5)
+    return np.array([10 * np.log10(np.mean(part.astype(float) ** 2)) for part in parts])
+
+
 def test_the_menu_has_twelve_sounds_no_louder_than_what_the_robot_says() -> None:
     x = voice(4.0)
     sounds = menu(x)
@@ -70,6 +76,9 @@ def test_the_menu_has_twelve_sounds_no_louder_than_what_the_robot_says() -> None
         assert 0.0 < np.abs(sound).max() <= np.abs(x).max() * (1 + 1e-6), words
     assert all(np.array_equal(sound, menu(x)[words]) for words, sound in sounds.items())
     assert np.array_equal(menu(0.5 * x)["noise"], 0.5 * sounds["noise"])
+    steps = {way: _levels_db(sounds[f"five steps of level, {way}"]) for way in ("upwards", "downwards")}
+    assert np.diff(steps["upwards"]) == pytest.approx(np.full(4, 8.0), abs=1.5)
+    assert np.diff(steps["downwards"]) == pytest.approx(np.full(4, -8.0), abs=1.5)
     part = sounds["odd lines"][round(0.4 * SAMPLE_RATE) : -round(0.1 * SAMPLE_RATE)]
     spectrum = np.abs(np.fft.rfft(part))
     assert np.sum(spectrum[::2] ** 2) < 0.02 * np.sum(spectrum**2)  # what the fades leave at even lines
