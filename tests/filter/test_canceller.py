@@ -86,6 +86,18 @@ def test_a_filter_that_was_resumed_recovers_after_a_divergence(taught_s: float) 
     assert db(error[-16000:]) < db(mic[-16000:]) - 20
 
 
+def test_a_filter_that_was_resumed_is_as_sure_of_its_path_as_one_that_was_not() -> None:
+    h, x = path(), speechlike(4.0)
+    mic = signal.oaconvolve(x, h)[: x.size].astype(np.float32)
+    canceller = Canceller(HOP, 3200, h)
+    run(canceller, mic[:32_000], x[:32_000])
+    resumed = Canceller.resumed(canceller.state(), HOP)
+    for one in (canceller, resumed):
+        run(one, mic[32_000:], x[32_000:])
+    sure, as_sure = canceller.state().covariance, resumed.state().covariance
+    assert as_sure.min() >= 0.0 and as_sure.sum() == pytest.approx(sure.sum(), rel=0.2)
+
+
 def test_a_filter_that_was_resumed_knows_how_far_the_volume_was_turned() -> None:
     """Otherwise a profile that is written later has the turned volume twice in what lies beyond the adapted taps."""
     h, x = path(), speechlike(4.0)

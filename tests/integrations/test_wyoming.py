@@ -317,7 +317,8 @@ def test_a_microphones_command_is_mono_unless_it_says_otherwise(capsys):
 
 
 @pytest.mark.slow
-def test_one_sigterm_ends_it_with_its_commands(endless_noise, player):
+@pytest.mark.parametrize("stop", [signal.SIGTERM, signal.SIGINT], ids=["sigterm", "ctrl-c"])
+def test_one_signal_ends_it_with_its_commands(endless_noise, player, stop):
     ports = free_port(2)
     mic_uri, snd_uri = (f"tcp://127.0.0.1:{ports + i}" for i in range(2))
     words = [
@@ -345,8 +346,8 @@ def test_one_sigterm_ends_it_with_its_commands(endless_noise, player):
         within_a_minute(hear)
         commands = Path(f"/proc/{service.pid}/task/{service.pid}/children").read_text().split()
         assert commands, "the microphone's command runs"
-        service.send_signal(signal.SIGTERM)
-        assert service.wait(10) == 143 and service.stderr.read() == ""
+        service.send_signal(stop)
+        assert service.wait(10) == 128 + stop and service.stderr.read() == ""
         assert not [command for command in commands if Path(f"/proc/{command}").exists()]
     finally:
         service.kill()
