@@ -157,7 +157,7 @@ def measure(
     lag = _lag(mic, ref)
     if lag is None:
         quietest = np.sort(block_power(mic, SAMPLE_RATE // 10))
-        noise_db = float(decibels(quietest[: max(quietest.size // 20, 1)].mean()))
+        noise_db = float(decibels(quietest[: quietest.size // 20].mean()))
         return Passport(**known, noise_db=noise_db, found=False)
     near, ppm = delayed(ref, lag), None
     lags = _lags(mic, near)
