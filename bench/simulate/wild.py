@@ -444,11 +444,12 @@ def make_case(seed: int, index: int, half: str, voices: Voices) -> tuple[dict[st
     for _ in range(TRIES):
         chain, words = through(rng, scene, program)
         mic = scene.record(chain)
-        change_db = scene.over_fan_db(put_back(mic, usual) - usual)
+        change = put_back(mic, usual) - usual
+        change_db = scene.over_fan_db(change)
         if program is CONTROL or change_db >= LEAST_DB:
             break
     right = program.right
-    if program is not CONTROL and change_db >= LEAST_DB and is_a_volume(scene, put_back(mic, usual) - usual):
+    if program is not CONTROL and change_db >= LEAST_DB and is_a_volume(scene, change):
         right = (*right, "playback_gain")
     strength = "control" if program is CONTROL else "clear" if change_db >= CLEAR_DB else "moderate"
     truth = {"effects": [right[0]], "also": list(right[1:]), "raw": [program.name], "strength": strength}

@@ -10,7 +10,16 @@ import scipy
 from edgefilter.dsp.frames import decibels
 from edgefilter.echo.effect import Effect, Parameter, first, neutral, within
 from edgefilter.echo.effects.codec_signs import HEARD, signs_of
-from edgefilter.echo.effects.knock_power import BANDS, FRAME, HOP, band_power, colour_of, density_of, fan_in_bands
+from edgefilter.echo.effects.knock_power import (
+    BANDS,
+    FRAME,
+    HOP,
+    band_power,
+    colour_of,
+    density_of,
+    fan_in_bands,
+    frames_to_fit,
+)
 from edgefilter.echo.evidence import Evidence
 from edgefilter.echo.measurement import Measurement, Values, VoiceModel
 from edgefilter.types import PRE_ROLL, SAMPLE_RATE, Array, Samples
@@ -64,15 +73,14 @@ class Codec(Effect):
         if measurement.noise_psd is None:
             return neutral(self)
         predicted, target = measurement.heard(model)[1], measurement.white_recording
-        left = target - predicted
-        over, voice = band_power(left), band_power(predicted)
-        use = np.ones(target.size, bool) if measurement.fit is None else measurement.fit
-        loud = use[np.arange(len(over)) * HOP + FRAME // 2] & (voice.mean(axis=1) > HEARD)
+        over, voice = band_power(target - predicted), band_power(predicted)
+        use = frames_to_fit(measurement.fit, len(over))
+        loud = use & (voice.mean(axis=1) > HEARD)
         if not loud.any():
             return neutral(self)
         levels = {decay: _levels(measurement.reference, decay) for decay in DECAYS_MS}
         tried = [
-            (*colour_of(left, levels[decay] ** exponent, measurement.fit), decay, exponent)
+            (*colour_of(over, levels[decay] ** exponent, use), decay, exponent)
             for decay, exponent in product(DECAYS_MS, EXPONENTS)
         ]
         _, power, decay, exponent = max(tried, key=lambda entry: entry[0])

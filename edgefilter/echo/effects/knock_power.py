@@ -57,9 +57,8 @@ def find_trigger(
     Itakura-Saito divergence", eq. 2.22, with the exponent 1/2 that makes them monotonic).
     """
     power, voice = band_power(residual), band_power(predicted)
-    middle = np.arange(len(power)) * HOP + FRAME // 2
-    use = np.ones(len(power), bool) if fit is None else fit[middle]
-    folds = [use & (middle // FOLD % 2 == parity) for parity in (0, 1)]
+    use = frames_to_fit(fit, len(power))
+    folds = [use & (_middles(len(power)) // FOLD % 2 == parity) for parity in (0, 1)]
     if min(fold.sum() for fold in folds) < 4 * BANDS:
         return None, False
     one = np.ones((len(power), 1), np.float32)
@@ -84,10 +83,17 @@ def find_trigger(
     return best[1], by_knocks - nothing > max(BETTER * (by_voice - nothing), LEAST)
 
 
-def colour_of(residual: Samples, source: Array, fit: NDArray[np.bool_] | None) -> tuple[float, Array]:
-    """Log likelihood and (BANDS,) the power in each band, over the fan, that a source (frames, 1 or BANDS) at 1 adds to a whitened residual (n,)."""
-    power = band_power(residual)
-    use = slice(None) if fit is None else fit[np.arange(len(power)) * HOP + FRAME // 2]
+def frames_to_fit(fit: NDArray[np.bool_] | None, count: int) -> NDArray[np.bool_]:
+    """Which of so many frames have their middle among the samples to fit on (n,), None for all; (count,)."""
+    return np.ones(count, bool) if fit is None else fit[_middles(count)]
+
+
+def _middles(count: int) -> NDArray[np.integer]:
+    return np.arange(count) * HOP + FRAME // 2
+
+
+def colour_of(power: Samples, source: Array, use: NDArray[np.bool_]) -> tuple[float, Array]:
+    """How likely a residual's band_power() is over frames to use, and (BANDS,) what a source (frames, 1 or BANDS) adds to each band of it, at 1."""
     scale = source.mean(axis=0)
     if not scale.all():
         return -np.inf, np.zeros(BANDS)

@@ -20,11 +20,13 @@ from edgefilter.echo.effects.knock_power import (
     HOP,
     RESONANCES_HZ,
     Trigger,
+    band_power,
     colour_of,
     density_of,
     fan_in_bands,
     find_knocks,
     find_trigger,
+    frames_to_fit,
     knocks_at,
     one_side,
     quantiles_of_peaks,
@@ -143,11 +145,11 @@ class Rattle(Effect):
         knocks = one_side(_trains(x, values, SAMPLE_RATE), float(values["side"]))
         predicted = measurement.whiten(model.predict(self.apply(x, complete(self, values), SAMPLE_RATE)))
         target = measurement.white_recording
-        left = target - absorbed(predicted, target, measurement.fit)
-        fits = {}
+        over = band_power(target - absorbed(predicted, target, measurement.fit))
+        use, fits = frames_to_fit(measurement.fit, len(over)), {}
         for decay in DECAYS_MS:
             source = frames(ringing_of(knocks, decay), FRAME, HOP).mean(axis=1, keepdims=True)
-            fits[decay] = colour_of(left, source, measurement.fit)
+            fits[decay] = colour_of(over, source, use)
         decay = max(fits, key=lambda decay: fits[decay][0])
         power = fits[decay][1] * fan_in_bands(measurement.noise_psd)
         rate = np.count_nonzero(knocks) * SAMPLE_RATE / max(x.size, 1)
