@@ -27,15 +27,13 @@ class Leftover:
     """Tones that are left, and the robot's silences.
 
     tones_hz: (k,) of the strongest, loudest first. mains_hz: 50 or 60 where most of their power lies on its multiples,
-    else 0. tone_share: of the residual's power over the fan, in tones. quiet_db: excess while the robot is silent, its
-    median over blocks of 0.1 s, and quiet_mean_db its mean, nan where it never is; swing_db: by how much those blocks
-    differ (90 % to 10 % quantile).
+    else 0. tone_share: of the residual's power over the fan, in tones. quiet_mean_db: mean excess while the robot is
+    silent, nan where it never is. swing_db: by how much blocks of 0.1 s differ then (90 % to 10 % quantile).
     """
 
     tones_hz: Array
     mains_hz: float
     tone_share: float
-    quiet_db: float
     quiet_mean_db: float
     swing_db: float
 
@@ -47,9 +45,9 @@ def inspect(prepared: Prepared, residual: Samples) -> Leftover:
     quiet = blocks(prepared.usable & ~prepared.active, BLOCK).all(axis=1)
     power = block_power(whiten(residual, psd), BLOCK)[quiet]
     if power.size < 5:
-        return Leftover(*tones, float("nan"), float("nan"), 0.0)
-    low, middle, high = decibels(np.quantile(power, (0.1, 0.5, 0.9)))
-    return Leftover(*tones, float(middle), float(decibels(power.mean())), float(high - low))
+        return Leftover(*tones, float("nan"), 0.0)
+    low, high = decibels(np.quantile(power, (0.1, 0.9)))
+    return Leftover(*tones, float(decibels(power.mean())), float(high - low))
 
 
 def _tones(residual: Samples, psd: Samples) -> tuple[Array, float, float]:

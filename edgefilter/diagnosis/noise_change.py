@@ -12,14 +12,10 @@ from edgefilter.diagnosis.leftover import Leftover, inspect
 from edgefilter.diagnosis.prepare import Prepared
 from edgefilter.diagnosis.score import Scorer
 from edgefilter.diagnosis.trials import Found, Trial, beside
-from edgefilter.dsp.frames import blocks
 from edgefilter.echo.effects.catalogue import find, names
 from edgefilter.echo.evidence import Score
 from edgefilter.echo.measurement import Measurement, Values
 from edgefilter.echo.model import EchoModel
-
-BAND = 20
-"""Bins of 13.3 Hz over which the change is averaged before that is tested."""
 
 
 def changed_fan(
@@ -27,9 +23,8 @@ def changed_fan(
 ) -> tuple[Prepared, Trial] | None:
     """The recording prepared with the fan as the robot's silences have it, and what changed it as a step; else None.
 
-    Only where there are silences and the change has a colour of its own: before the voice is explained, a gain cannot be
-    told from it. Where the fan is held down only while the robot is silent, the calibrated one stays; not so by an effect
-    named in without.
+    Only where there are silences and the fan is steady in them, which it is not behind a gain that moves. Where the fan is
+    held down only while the robot is silent, the calibrated one stays; not so by an effect named in without.
     """
     held_down = _held_down(prepared, model, criteria, without)
     if held_down is not None:
@@ -40,8 +35,7 @@ def changed_fan(
         return None
     for name, values, now in _other_fans(prepared, prepared.measurement, model):
         most = max(_change_db(prepared, now), left.quiet_mean_db)
-        may_be_gain = _colour_db(prepared, now) < criteria.fan_coloured_db and most < criteria.fan_flat_db
-        if most < criteria.fan_change_db or may_be_gain or not _steady(inspect(now, residual), criteria):
+        if most < criteria.fan_change_db or not _steady(inspect(now, residual), criteria):
             continue
         step = _step(now, name, values, model, base)
         if abs(step.score.silent_db) < 0.5 * abs(base.silent_db) and step.p_value <= criteria.false_rate:
@@ -137,16 +131,10 @@ def _step(now: Prepared, name: str, values: Values, model: EchoModel, before: Sc
 
 def _steady(left: Leftover, criteria: Criteria) -> bool:
     """Whether what is left of the silences, whitened by the new fan's spectrum, is a fan; True where there are none."""
-    return left.swing_db < criteria.fan_steady_db and not left.quiet_mean_db - left.quiet_db > criteria.fan_sparse_db
+    return left.swing_db < criteria.fan_steady_db
 
 
 def _change_db(before: Prepared, after: Prepared) -> float:
     """Change of the fan's whole power."""
     was, now = (float(np.sum(prepared.noise_psd, dtype=np.float64)) for prepared in (before, after))
     return 10.0 * np.log10(now / was)
-
-
-def _colour_db(before: Prepared, after: Prepared) -> float:
-    """Standard deviation over frequency of the fan's change, dB."""
-    was, now = (prepared.noise_psd.astype(np.float64) for prepared in (before, after))
-    return float(np.std(blocks(10.0 * np.log10(now / was), BAND).mean(axis=1)))

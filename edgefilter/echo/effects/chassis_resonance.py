@@ -87,7 +87,7 @@ class ChassisResonance(Effect):
     def plausible(self, evidence: Evidence) -> bool:
         """Sharp enough for a mode, and none that the search's bounds have cut off."""
         q, hz = (numbers(evidence.values, name) for name in ("q", "frequency_hz"))
-        return bool(np.all(q >= LEAST_Q) and np.all(hz >= 62.0) and np.all(hz <= 6800.0))
+        return bool(np.all(q >= LEAST_Q) and np.all((hz > LOWEST_HZ) & (hz < HIGHEST_HZ)))
 
 
 def _without(found: Spectra, modes: list[tuple[float, float]], gains: Array) -> Spectra:

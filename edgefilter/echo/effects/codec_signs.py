@@ -1,4 +1,4 @@
-"""What tells a codec's noise from all else that follows the voice: it has neither the voice's phase nor its harmonics."""
+"""What tells a codec's noise from all else that follows the voice: it follows its level and has neither its phase nor harmonics."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from edgefilter.dsp.frames import decibels, frames
 from edgefilter.dsp.psd import hann
 from edgefilter.echo.evidence import Evidence
 from edgefilter.echo.wiener import convolve_from, fit_filter
-from edgefilter.types import Array, Samples
+from edgefilter.types import Samples
 
 TAPS, LEAD = 256, 64
 """Of the filter by which the path may differ, and a band be cut."""
 SHORT, LONG = (512, 128), (1024, 256)
-"""Frame and hop, for what is coherent with the voice and for its harmonics."""
+"""Frame and hop, for what is coherent with the voice and for harmonics."""
 PLACES = ((7, 15), (13, 7), (3, 41))
 """Frames of 8 ms and bins of 31 Hz around a cell within which a change of the voice is one complex gain: a path that moves, a
 gain that changes, a clock that trembles."""
@@ -30,38 +30,28 @@ HEARD = 2.0
 FOLLOWS = 0.4
 """Correlation, over time in bands, of the residual's level with the voice's: what sounds by itself has none, knocks less than
 0.35."""
-CLEAR, STANDS_OUT, BROAD = 30.0, 1.25, 0.4
-"""Times the fan that the voice must be in a band for its noise to be expected there, that the residual must be to be there,
-and the part of such bands in which it is: what happens in a narrow band alone is no codec's."""
 COHERENT = 0.24
 """Of the residual's power around a cell, what one gain of the voice explains at most: chance is 0.05, codecs are up to 0.22,
 distortions from 0.25 on and all that moves from 0.4 on."""
-HARMONIC, PEAKED = 0.4, 1.26
-"""Correlation of the residual's fine structure over frequency with the voice's, and its spread re that of noise, at most: a
-loudspeaker's distortion has the voice's harmonics (of 72 pieces of a real one the least are 0.32 and 1.32), a talker his
-own; nine codecs in ten are below 0.36 and 1.22."""
+PEAKED = 1.26
+"""Spread of the residual's fine structure over frequency re that of noise, at most: a loudspeaker's distortion has the voice's
+harmonics (of 72 pieces of a real one the least is 1.32), a talker his own; nine codecs in ten are below 1.22."""
 AROUND, OF_NOISE = 17, 1.1
 """Bins of 16 Hz over which that is smoothed, and the standard deviation of the log of a periodogram of noise around it."""
-FEWEST = 2000
-"""Cells of the fine structure that say something."""
 
 
 @dataclass(frozen=True)
 class Signs:
-    """Of a whitened residual beside the voice that a model predicts: see FOLLOWS, BROAD, COHERENT, HARMONIC, PEAKED; cells: how many fine ones."""
+    """Of a whitened residual beside the voice that a model predicts: see FOLLOWS, COHERENT, PEAKED."""
 
     follows: float
-    broad: float
     coherent: float
-    harmonic: float
     peaked: float
-    cells: int
 
     @property
     def of_a_codec(self) -> bool:
         """Whether all of them are."""
-        alike = self.follows > FOLLOWS and self.broad > BROAD and self.coherent < COHERENT
-        return alike and self.harmonic < HARMONIC and self.peaked < PEAKED and self.cells >= FEWEST
+        return self.follows > FOLLOWS and self.coherent < COHERENT and self.peaked < PEAKED
 
 
 def signs_of(evidence: Evidence) -> Signs:
@@ -74,8 +64,7 @@ def signs_of(evidence: Evidence) -> Signs:
     voice, left = voice + fine, left - fine
     heard = evidence.grid.usable & (uniform_filter1d(voice * voice, LONG[0]) > HEARD)
     said, rest, use = _spectra(voice, *SHORT), _spectra(left, *SHORT), _whole(heard, *SHORT)
-    follows, broad = _follows(said, rest, use)
-    return Signs(follows, broad, _coherent(said, rest, use), *_fine(voice, left, heard))
+    return Signs(_follows(said, rest, use), _coherent(said, rest, use), _peaked(left, heard))
 
 
 def _spectra(x: Samples, size: int, hop: int) -> NDArray[np.complex64]:
@@ -90,8 +79,8 @@ def _whole(heard: NDArray[np.bool_], size: int, hop: int) -> NDArray[np.bool_]:
     return frames(heard.astype(np.float32), size, hop).mean(axis=1) > 0.9
 
 
-def _follows(said: NDArray[np.complex64], rest: NDArray[np.complex64], whole: NDArray[np.bool_]) -> tuple[float, float]:
-    """Correlation of the levels of both (frames, bins) in dB, within bands over time, where both are over the fan; and Signs.broad."""
+def _follows(said: NDArray[np.complex64], rest: NDArray[np.complex64], whole: NDArray[np.bool_]) -> float:
+    """Correlation of the levels of both (frames, bins) in dB, within bands over time, where both are over the fan."""
     edges = np.unique(np.geomspace(1, SHORT[0] // 2 - 12, 16).astype(int))
     over, loud = (
         np.add.reduceat(uniform_filter(power_of(spectra), (5, 1)), edges[:-1], axis=1)[:, :-1] / np.diff(edges)[:-1]
@@ -102,13 +91,8 @@ def _follows(said: NDArray[np.complex64], rest: NDArray[np.complex64], whole: ND
     swings = []
     for level in (decibels(np.maximum(over - 1.0, 0.1)), decibels(np.maximum(loud, 0.1))):
         swings.append(use * (level - (use * level).sum(axis=0) / count))
-    return _correlation(*swings), _breadth(over[whole], loud[whole])
-
-
-def _breadth(over: Array, loud: Array) -> float:
-    """Part of the bands in which the voice (frames, bands) is well over the fan where the residual (frames, bands) stands out of it."""
-    clear = loud.mean(axis=0) > CLEAR
-    return float(np.mean(over.mean(axis=0)[clear] > STANDS_OUT)) if clear.any() else 0.0
+    a, b = swings
+    return float(np.sum(a * b) / np.sqrt(np.sum(a * a) * np.sum(b * b) + 1e-12))
 
 
 def _coherent(said: NDArray[np.complex64], rest: NDArray[np.complex64], use: NDArray[np.bool_]) -> float:
@@ -133,16 +117,10 @@ def _explained(
     return float(explained[cells].sum()) / max(float(around[cells].sum()), 1e-9)
 
 
-def _fine(voice: Samples, left: Samples, heard: NDArray[np.bool_]) -> tuple[float, float, int]:
-    """Signs.harmonic, peaked and cells."""
-    powers = [power_of(_spectra(x, *LONG))[:, : LONG[0] * 3 // 16] for x in (voice, left)]
-    logs = [np.log(power + 1e-6) for power in powers]
-    fine = [log - uniform_filter1d(log, AROUND, axis=1) for log in logs]
-    use = _whole(heard, *LONG)[:, None] & (uniform_filter1d(powers[1], AROUND, axis=1) > 2.0 * HEARD)
-    count = int(np.count_nonzero(use))
-    peaked = float(np.sqrt(np.sum(np.square(fine[1] * use)) / max(count, 1))) / OF_NOISE
-    return _correlation(*(x * use for x in fine)), peaked, count
-
-
-def _correlation(a: Array, b: Array) -> float:
-    return float(np.sum(a * b) / np.sqrt(np.sum(a * a) * np.sum(b * b) + 1e-12))
+def _peaked(left: Samples, heard: NDArray[np.bool_]) -> float:
+    """Signs.peaked."""
+    power = power_of(_spectra(left, *LONG))[:, : LONG[0] * 3 // 16]
+    log = np.log(power + 1e-6)
+    use = _whole(heard, *LONG)[:, None] & (uniform_filter1d(power, AROUND, axis=1) > 2.0 * HEARD)
+    fine = (log - uniform_filter1d(log, AROUND, axis=1)) * use
+    return float(np.sqrt(np.sum(fine * fine) / max(np.count_nonzero(use), 1))) / OF_NOISE

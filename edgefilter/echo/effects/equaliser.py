@@ -11,7 +11,7 @@ from scipy import fft
 from edgefilter.dsp.fourier import log_response
 from edgefilter.echo.effect import Effect, Parameter, numbers
 from edgefilter.echo.evidence import Evidence
-from edgefilter.echo.measurement import Measurement, Values, VoiceModel
+from edgefilter.echo.measurement import ORDINARY_DB, Measurement, Values, VoiceModel
 from edgefilter.echo.wiener import DELAYS, Spectra, convolve_from, fit_filter, spectra
 from edgefilter.types import SAMPLE_RATE, Array, Samples
 
@@ -24,8 +24,6 @@ STEPS, DAMPING, BEND = 12, 1e-3, 3e-3
 """Of the fit: how often it is made linear anew, how strongly it is held, and how strongly the gain is kept smooth, both
 re the energy of a knot."""
 MOST_DB = 40.0
-LEAST_DB = 0.4
-"""Standard deviation over frequency by which a gain differs from day to day at most."""
 HEARD = 1e-3
 """Part of the loudest knot's energy from which on a knot is heard."""
 
@@ -87,12 +85,8 @@ class Equaliser(Effect):
         )
 
     def plausible(self, evidence: Evidence) -> bool:
-        """Whether the smooth gain, without the taps, does most of it, and is more than a turned volume."""
-        gain_db = np.asarray(evidence.values["gain_db"], float)
-        if gain_db.size < 2 or float(np.std(gain_db)) < LEAST_DB:
-            return False
-        plain = self.apply(evidence.before.prediction, {**evidence.values, "taps": 0.0}, SAMPLE_RATE)
-        return evidence.share(plain) > 0.6
+        """Whether it is more than a turned volume."""
+        return float(np.std(evidence.values["gain_db"])) >= ORDINARY_DB
 
 
 def knots_hz(count: int) -> Array:

@@ -12,7 +12,6 @@ from edgefilter.echo.effect import Effect, Parameter, Runner, complete, neutral
 from edgefilter.echo.effects.compression import STEEPEST, Compressor
 from edgefilter.echo.effects.equaliser import MOST_DB
 from edgefilter.echo.effects.gain_fit import GainFit, Reach
-from edgefilter.echo.evidence import Evidence
 from edgefilter.echo.measurement import Measurement, Values, VoiceModel
 from edgefilter.echo.wiener import Spectra, spectra
 from edgefilter.types import SAMPLE_RATE, Array, Samples
@@ -28,8 +27,6 @@ THRESHOLDS_DB, SLOPE = (-6.0, -15.0, -25.0), 0.5
 """Starting points, relative to the loudest 20 ms of the reference in each band, and dB per dB."""
 RELEASE_MS = 150.0
 RESOLUTION_HZ = 20.0
-LEAST_RATIO = 1.15
-"""Of at least two bands: a band that alone is compressed is another effect's."""
 WORTH = 0.05
 """Of what the bands leave that are each only turned, so much less has to be left by bands that follow their level."""
 _EACH = np.ones(BANDS)
@@ -107,13 +104,6 @@ class MultibandCompression(Effect):
             f"bands below {low:.0f} Hz, up to {high:.0f} Hz and above are each turned down when they have been loud, by"
             f" {ratios} to 1"
         )
-
-    def plausible(self, evidence: Evidence) -> bool:
-        """Two bands or more follow their level, and each is heard: a band that the fit mutes is none."""
-        ratio, makeup_db = (
-            np.broadcast_to(np.asarray(evidence.values[name], float), (BANDS,)) for name in ("ratio", "makeup_db")
-        )
-        return int(np.count_nonzero(ratio >= LEAST_RATIO)) >= 2 and float(makeup_db.min()) > -MOST_DB
 
 
 class BandCompressor:

@@ -21,8 +21,8 @@ FORGETTING, NEIGHBOURS = 0.5, 3
 """Of the local ratio, from frame to frame, and the bins over which it is averaged: what explains most of the suppressors tried."""
 KNOTS_DB = np.arange(-10.0, 31.0, 5.0)
 """Local ratios of voice to fan; from the last one on everything is let through."""
-LOUD_DB, WEAK_DB = 15.0, (-9.0, 3.0)
-"""Where a suppressor lets nearly all through, and where it shows most: further down the fan drowns the voice."""
+LOUD_DB = 15.0
+"""Where a suppressor lets nearly all through."""
 TRUST = 0.3
 """Standard deviation of a gain around that of the next knot, the last one's around 1, before anything was heard."""
 EDGES = np.unique(np.round(np.geomspace(4, SIZE // 2 - 10, 17)).astype(int))
@@ -31,14 +31,9 @@ FEWEST_LOUD, FEWEST_QUIET = 30, 16
 """Cells of a band, and frames of silence, that say something."""
 LEAST_SOFTER_DB = 2.0
 """By which the silences are under the calibrated fan at least: from day to day it is half a dB."""
-LEAST_HELD_DB, SURE = 2.5, 6.0
-"""By which the weak cells of the voice are held down at least (a good codec that leaves some of them out takes 1.6 dB), and
-in standard deviations."""
-DEEPER_DB = 3.0
-"""By which weak cells may be held down further than the silences: no suppressor does that, whose gain there is the least."""
 MISSED_DB = -4.5
 """Of the loud cells of the voice, which a suppressor lets through, three in four are predicted but for less: where they are
-not, a drift, a codec or what else is in the recording may take the weak cells away as well."""
+not, a drift or what else is in the recording may take the weak cells away as well."""
 
 
 class NoiseSuppression(Effect):
@@ -113,17 +108,12 @@ class NoiseSuppression(Effect):
         )
 
     def plausible(self, evidence: Evidence) -> bool:
-        """Whether silences are softer than the fan, and weak cells of the voice more so than loud ones: a turned gain moves all of them."""
+        """Whether silences are softer than the calibrated fan, and the loud cells of the voice as predicted."""
         measurement = evidence.grid.measurement
-        if measurement.noise_psd is None or measurement.fit is None:
+        if first(evidence.values, "softer_db") > -LEAST_SOFTER_DB or measurement.fit is None:
             return False
         held = evidence.grid.usable & ~measurement.fit
-        cells = Cells(measurement, evidence.before.prediction, held)
-        if not cells.quiet_db <= -LEAST_SOFTER_DB or cells.missed_db > MISSED_DB:
-            return False
-        gain, error = cells.weak_gain()
-        deepest = 10.0 ** ((cells.quiet_db - DEEPER_DB) / 20.0)
-        return deepest < gain + error and gain < 10.0 ** (-LEAST_HELD_DB / 20.0) and 1.0 - gain > SURE * error
+        return Cells(measurement, evidence.before.prediction, held).missed_db <= MISSED_DB
 
 
 class Cells:
@@ -159,14 +149,6 @@ class Cells:
         self.ratio_db, self.power, self.cross = (
             np.concatenate(parts) if parts else np.zeros(0) for parts in (ratio_db, power, cross)
         )
-
-    def weak_gain(self) -> tuple[float, float]:
-        """Gain of the weak cells re the loud ones of their band, and its standard error: half the fan is in phase with the voice."""
-        weak = (self.ratio_db > WEAK_DB[0]) & (self.ratio_db < WEAK_DB[1])
-        power = float(self.power[weak].sum())
-        if power <= 0.0:
-            return 1.0, 1.0
-        return float(self.cross[weak].sum()) / power, float(np.sqrt(0.5 / power))
 
 
 def _gains(values: Values) -> Array:

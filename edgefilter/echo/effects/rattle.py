@@ -33,7 +33,6 @@ from edgefilter.echo.effects.knock_power import (
     resonated,
     ringing_of,
 )
-from edgefilter.echo.evidence import Evidence
 from edgefilter.echo.least_squares import absorbed, filtered
 from edgefilter.echo.measurement import Measurement, Values, VoiceModel
 from edgefilter.types import SAMPLE_RATE, Array, Samples
@@ -46,8 +45,6 @@ WORTH = 2.5
 """What each tap has to explain, in units of the residual's variance, for the sounds to be real."""
 REFINED = 3
 """Times at most that the trigger is looked for anew with the sounds found."""
-MISSING_DB = -0.3
-"""Under the fan: where the residual is so little of what a model expects, some of what it expects is not there."""
 
 
 class Rattle(Effect):
@@ -161,10 +158,6 @@ class Rattle(Effect):
             f"short bursts, {first(values, 'rate_hz'):.0f} a second, follow the moments at which the membrane is driven"
             f" {side}, and not the voice's level; what of them no waveform predicts is shown as irreducible"
         )
-
-    def plausible(self, evidence: Evidence) -> bool:
-        """Whether the knocks' noise is there on the samples fitted to as well: what a long filter errs by is on the held-out ones alone."""
-        return evidence.after.fitted_db >= MISSING_DB + min(evidence.after.silent_db, 0.0)
 
 
 def _trains(x: Samples, values: Values, sample_rate: int) -> tuple[Samples, Samples]:
