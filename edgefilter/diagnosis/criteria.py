@@ -37,8 +37,6 @@ class Criteria:
     to says little."""
     most_effects: int = 3
     """A bound on the work: what the search is checked on holds two at once, and a third to be taken back."""
-    voice_db: float = -6.0
-    """Over the fan: where a model predicts less of a voice, no effect on it shows."""
     starts: int = 2
     """Further effects to begin with where the best one has not led to an explanation: of two at once the louder may
     hide the other."""
@@ -73,10 +71,9 @@ class Criteria:
     part_level: float = 0.3
     """Share of the excess level that findings, besides half of its power, must explain to be named beside what none explains:
     power alone may be that of one loud passage."""
+
     much_db: float = 3.0
     """Over the silences: what the model of an effect that is really there does not leave."""
-    nearly_all: float = 0.99
-    """Share of the excess power with which what is left may be the imprecision of the model itself."""
 
     # The fan
     fan_change_db: float = 1.5

@@ -12,7 +12,7 @@ from scipy.ndimage import uniform_filter1d
 from edgefilter.diagnosis.prepare import FRAME, HOP, Prepared
 from edgefilter.dsp import fourier
 from edgefilter.dsp.frames import decibels, frames
-from edgefilter.dsp.psd import frequencies, hann, total_power, variance_at
+from edgefilter.dsp.psd import frequencies, hann, variance_at
 from edgefilter.echo.evidence import Score
 from edgefilter.echo.least_squares import normal_equations
 from edgefilter.echo.model import EchoModel
@@ -130,11 +130,6 @@ class Scorer:
         silent = self.silent_cells if self.silent_cells.any() else slice(None)
         was, now = (np.maximum(score.cells[silent], 1e-3) for score in (before, after))
         return self._mean(decibels((1.0 + was) / (1.0 + now)) - 0.5 * decibels(was / now))
-
-    def size_db(self, change: Samples) -> float:
-        """Power of a change of the prediction (n,) over the fan in dB: as it is or whitened, whichever is more."""
-        plain, white = (float(np.mean(x.astype(float) ** 2)) for x in (change, self.measurement.whiten(change)))
-        return float(10 * np.log10(max(plain / total_power(self.psd), white, 1e-12)))
 
     def correct(self, prediction: Samples, white: Samples) -> Samples:
         """A prediction, also given whitened, through the filter, within TOLERANCE of 1, that brings it closest to the recording."""

@@ -127,11 +127,7 @@ class Workbench:
 
     def explained(self, model: EchoModel) -> bool:
         """Whether a model leaves so little while the robot is heard that nothing further can be told in it."""
-        return self.heard(model) <= self.criteria.heard_db or self.score(model).active_db <= self.criteria.silent_db
-
-    def voiced(self, model: EchoModel) -> bool:
-        """Whether a model predicts so much of a voice that effects on it can be told."""
-        return self.scorer.size_db(self.score(model).prediction) > self.criteria.voice_db
+        return self.heard(model) <= self.criteria.heard_db
 
     def little(self, model: EchoModel, start: EchoModel) -> bool:
         """Whether a model leaves so little of what start leaves that the right effects may be in it."""
