@@ -19,10 +19,9 @@ from edgefilter.echo.recording import BLOCK, MAX_OFFSET, fitted_blocks, paired
 from edgefilter.echo.wiener import convolve_from, fit_filter
 from edgefilter.errors import SignalError
 from edgefilter.profile.approximation import CLEARLY_DB
-from edgefilter.profile.data import DISTORTION_ORDERS, GRID_FFT, GRID_HZ, Profile
+from edgefilter.profile.data import DISTORTION_ORDERS, GRID_FFT, GRID_HZ, PROVISIONAL, Profile
 from edgefilter.types import PRE_ROLL, SAMPLE_RATE, Array, Samples
 
-SOURCE = "made from the recording itself: what is stationary and linear is taken for the robot"
 TAPS = 4096
 STANDS_OUT = 8.0
 """Times the root mean square of all lags that the true one reaches; 4.5 measured where there is no robot, 10 to 87
@@ -107,7 +106,7 @@ def self_calibrate(recording: Samples, reference: Samples) -> Profile:
         band_snr_db=snr,
         distortion_db=np.zeros(len(DISTORTION_ORDERS)),
         warnings=tuple(_warnings(seconds, others(target, predicted))),
-        source=SOURCE,
+        source=PROVISIONAL,
     )
 
 

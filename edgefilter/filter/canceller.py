@@ -64,7 +64,7 @@ COLD = Adaptation(transition=0.9999, noise_memory=0.95, certainty=0.25, products
 WARM = Adaptation(transition=0.99997, noise_memory=0.9, certainty=0.5, products=True, posterior=False)
 """From a calibrated path."""
 LEARNED = replace(COLD, products=True)
-"""From a path that an earlier run has learned, and for one that is learned beside the filter."""
+"""From a path that speech has taught, in an earlier run or as a recording, and for one that is learned beside the filter."""
 
 
 class CancellerOutput(NamedTuple):

@@ -29,7 +29,8 @@ LOW_SNR_DB = 10.0
 MAX_TAPS = 4 * SAMPLE_RATE
 """Samples, 4 s: longer than the reverberation of any room that a robot talks in, and than the lag of any player."""
 LEARNED = "what the running filter learned"
-"""Source of a profile that no calibration made."""
+PROVISIONAL = "made from the recording itself: what is stationary and linear is taken for the robot"
+"""Sources of profiles that no calibration made: their paths are known as well as speech can teach them, not as a sweep can."""
 
 _ARRAYS = ("response", "noise_psd", "band_hz", "band_snr_db", "distortion_db")
 
@@ -195,8 +196,8 @@ class Profile:
 
     @property
     def learned(self) -> bool:
-        """Whether the running filter wrote it: its path is known as well as speech can teach it, not as a sweep can."""
-        return self.source == LEARNED
+        """Whether speech has taught its path, to the running filter or as a whole recording, and no calibration."""
+        return self.source in (LEARNED, PROVISIONAL)
 
     @property
     def microphones(self) -> int:

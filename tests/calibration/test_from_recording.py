@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from edgefilter.echo.effect import Effect, Parameter
 from edgefilter.echo.effects.catalogue import EFFECTS, register
 from edgefilter.echo.model import EchoModel
 from edgefilter.errors import SignalError
+from edgefilter.filter.ego_filter import enhance
 from tests.diagnosis.robot_scene import DELAY, FAN, path, record, voice
 
 RATE = 16000
@@ -106,3 +108,15 @@ def test_add_needs_a_profile(tmp_path, capsys):
         == 2
     )
     assert "--profile" in capsys.readouterr().err
+
+
+def test_a_filter_adapts_from_the_path_made_here_as_fast_as_from_a_learned_one(said, alone):
+    """A sweep's path is held to be nearly right, and is left slowly: a recording of speech does not teach it so well."""
+    moved = record(said, EchoModel(path()).with_effect("early_path", {"taps": 0.3 * np.roll(path(), 40)[:300]}))
+    heard = np.arange(said.size) > 3 * RATE
+    left = {
+        source: np.mean(np.square(enhance(moved, said, replace(alone, source=source), "linear")[heard]))
+        for source in (alone.source, "")
+    }
+    assert alone.learned and not replace(alone, source="").learned
+    assert left[alone.source] < 0.8 * left[""]
