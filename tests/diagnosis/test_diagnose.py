@@ -17,8 +17,7 @@ from edgefilter.diagnosis.select import search
 from edgefilter.diagnosis.trials import Trial, Workbench
 from edgefilter.dsp.fractional_delay import delayed
 from edgefilter.echo.effects.bandlimit import band_edge
-from edgefilter.echo.effects.catalogue import find
-from edgefilter.echo.evidence import Evidence, Score
+from edgefilter.echo.evidence import Score
 from edgefilter.echo.model import EchoModel
 from edgefilter.echo.wiener import spectra
 from edgefilter.types import PRE_ROLL
@@ -217,14 +216,6 @@ def test_what_ordinary_recordings_show_more_of_than_is_left_is_not_fitted():
 def verdict(active_db: float, fitted_db: float) -> Score:
     return Score(
         active_db, active_db, active_db, active_db, 0.0, fitted_db, 0.0, np.ones((4, 4)), np.zeros(16000, np.float32)
-    )
-
-
-@pytest.mark.parametrize("fitted_db, stands", [(0.1, True), (-1.5, False)])
-def test_knocks_that_are_missing_where_a_filter_was_fitted_are_that_filters_error(fitted_db, stands):
-    assert (
-        find("rattle").plausible(Evidence({}, EchoModel(path()), None, verdict(5.0, 1.0), verdict(2.0, fitted_db)))
-        is stands
     )
 
 

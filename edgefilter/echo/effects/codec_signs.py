@@ -14,7 +14,7 @@ from edgefilter.dsp.frames import decibels, frames
 from edgefilter.dsp.psd import hann
 from edgefilter.echo.evidence import Evidence
 from edgefilter.echo.wiener import convolve_from, fit_filter
-from edgefilter.types import Samples
+from edgefilter.types import Array, Samples
 
 TAPS, LEAD = 256, 64
 """Of the filter by which the path may differ, and a band be cut."""
@@ -30,6 +30,9 @@ HEARD = 2.0
 FOLLOWS = 0.4
 """Correlation, over time in bands, of the residual's level with the voice's: what sounds by itself has none, knocks less than
 0.35."""
+CLEAR, STANDS_OUT, BROAD = 30.0, 1.25, 0.4
+"""Times the fan that the voice must be in a band for its noise to be expected there, that the residual must be to be there,
+and the part of such bands in which it is: what happens in a narrow band alone is no codec's."""
 COHERENT = 0.24
 """Of the residual's power around a cell, what one gain of the voice explains at most: chance is 0.05, codecs are up to 0.22,
 distortions from 0.25 on and all that moves from 0.4 on."""
@@ -42,16 +45,18 @@ AROUND, OF_NOISE = 17, 1.1
 
 @dataclass(frozen=True)
 class Signs:
-    """Of a whitened residual beside the voice that a model predicts: see FOLLOWS, COHERENT, PEAKED."""
+    """Of a whitened residual beside the voice that a model predicts: see FOLLOWS, BROAD, COHERENT, PEAKED."""
 
     follows: float
+    broad: float
     coherent: float
     peaked: float
 
     @property
     def of_a_codec(self) -> bool:
         """Whether all of them are."""
-        return self.follows > FOLLOWS and self.coherent < COHERENT and self.peaked < PEAKED
+        alike = self.follows > FOLLOWS and self.broad > BROAD
+        return alike and self.coherent < COHERENT and self.peaked < PEAKED
 
 
 def signs_of(evidence: Evidence) -> Signs:
@@ -64,7 +69,7 @@ def signs_of(evidence: Evidence) -> Signs:
     voice, left = voice + fine, left - fine
     heard = evidence.grid.usable & (uniform_filter1d(voice * voice, LONG[0]) > HEARD)
     said, rest, use = _spectra(voice, *SHORT), _spectra(left, *SHORT), _whole(heard, *SHORT)
-    return Signs(_follows(said, rest, use), _coherent(said, rest, use), _peaked(left, heard))
+    return Signs(*_follows(said, rest, use), _coherent(said, rest, use), _peaked(left, heard))
 
 
 def _spectra(x: Samples, size: int, hop: int) -> NDArray[np.complex64]:
@@ -79,8 +84,8 @@ def _whole(heard: NDArray[np.bool_], size: int, hop: int) -> NDArray[np.bool_]:
     return frames(heard.astype(np.float32), size, hop).mean(axis=1) > 0.9
 
 
-def _follows(said: NDArray[np.complex64], rest: NDArray[np.complex64], whole: NDArray[np.bool_]) -> float:
-    """Correlation of the levels of both (frames, bins) in dB, within bands over time, where both are over the fan."""
+def _follows(said: NDArray[np.complex64], rest: NDArray[np.complex64], whole: NDArray[np.bool_]) -> tuple[float, float]:
+    """Correlation of the levels of both (frames, bins) in dB, within bands over time, where both are over the fan; and Signs.broad."""
     edges = np.unique(np.geomspace(1, SHORT[0] // 2 - 12, 16).astype(int))
     over, loud = (
         np.add.reduceat(uniform_filter(power_of(spectra), (5, 1)), edges[:-1], axis=1)[:, :-1] / np.diff(edges)[:-1]
@@ -92,7 +97,14 @@ def _follows(said: NDArray[np.complex64], rest: NDArray[np.complex64], whole: ND
     for level in (decibels(np.maximum(over - 1.0, 0.1)), decibels(np.maximum(loud, 0.1))):
         swings.append(use * (level - (use * level).sum(axis=0) / count))
     a, b = swings
-    return float(np.sum(a * b) / np.sqrt(np.sum(a * a) * np.sum(b * b) + 1e-12))
+    correlation = float(np.sum(a * b) / np.sqrt(np.sum(a * a) * np.sum(b * b) + 1e-12))
+    return correlation, _breadth(over[whole], loud[whole])
+
+
+def _breadth(over: Array, loud: Array) -> float:
+    """Part of the bands in which the voice (frames, bands) is well over the fan where the residual (frames, bands) stands out of it."""
+    clear = loud.mean(axis=0) > CLEAR
+    return float(np.mean(over.mean(axis=0)[clear] > STANDS_OUT)) if clear.any() else 0.0
 
 
 def _coherent(said: NDArray[np.complex64], rest: NDArray[np.complex64], use: NDArray[np.bool_]) -> float:
