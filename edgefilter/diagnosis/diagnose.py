@@ -298,7 +298,8 @@ def _much_left(found: Found, criteria: Criteria) -> bool:
     What they leave of the others alone is how well a recording of that length teaches them.
     """
     silent = float(np.clip(found.final.silent_db, -0.5, 0.5))
-    return min(found.final.fitted_db, found.final.active_db) - silent > criteria.much_db
+    left = min(found.final.fitted_db, found.final.active_db) - silent
+    return left > criteria.much_db and share_of(found.base.excess_db, found.final.excess_db) < criteria.nearly_all
 
 
 def explained_level(prepared: Prepared, found: Found) -> float:
