@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pyroomacoustics as pra
 from numpy.typing import NDArray
-from scipy import signal
+from scipy import signal, special
 
 from edgefilter.dsp.metrics import si_sdr
 
@@ -54,13 +54,19 @@ class Loudspeaker:
         up = signal.resample_poly(x, OVERSAMPLING, 1)
         position, velocity, acceleration = self._mechanics()
         excess = np.zeros_like(up)
-        for _ in range(0 if linear else 6):
-            u = signal.lfilter(*position, up + excess)
-            v = self.drive * u
-            bound = 1.0 / (1.0 + v * v)
-            force = 1.0 - self.softening_bl * v * v * bound - self.asymmetry * v * bound
-            braking = 0.5 / self.q * (force**2 - 1.0) * signal.lfilter(*velocity, up + excess)
-            excess = (force - 1.0) * up - self.stiffening * v * v * bound * u - braking
+        memory = np.zeros((0 if linear else 6, 2, 2))  # of either filter in each round
+        for at in range(0, up.size, 1 << 14):  # as much as a processor's cache holds
+            x, more = up[at : at + (1 << 14)], excess[at : at + (1 << 14)]
+            for kept in memory:
+                driven = x + more
+                u, kept[0] = signal.lfilter(*position, driven, zi=kept[0])
+                speed, kept[1] = signal.lfilter(*velocity, driven, zi=kept[1])
+                v = self.drive * u
+                bound = 1.0 / (1.0 + v * v)
+                force = 1.0 - self.softening_bl * v * v * bound - self.asymmetry * v * bound
+                braking = 0.5 / self.q * (force**2 - 1.0) * speed
+                more = (force - 1.0) * x - self.stiffening * v * v * bound * u - braking
+            excess[at : at + (1 << 14)] = more
         pressure = signal.lfilter(*acceleration, up + excess)
         return signal.sosfilt(self.filters, signal.resample_poly(pressure, 1, OVERSAMPLING))
 
@@ -216,7 +222,7 @@ def warp(x: Array, ppm: float) -> Array:
         position = np.arange(start, min(start + (1 << 14), x.size)) * (1.0 + ppm * 1e-6)
         whole = np.minimum(np.floor(position).astype(int), x.size)
         distance = offsets[None] - (position - whole)[:, None]
-        window = np.i0(9.0 * np.sqrt(np.clip(1.0 - (distance / half_width) ** 2, 0.0, 1.0))) / np.i0(9.0)
+        window = special.i0(9.0 * np.sqrt(np.clip(1.0 - (distance / half_width) ** 2, 0.0, 1.0))) / special.i0(9.0)
         samples = padded[whole[:, None] + offsets[None] + half_width]
         out[start : start + position.size] = np.sum(samples * np.sinc(distance) * window, axis=1)
     return out
