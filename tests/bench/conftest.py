@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import fcntl
+import os
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -60,9 +62,15 @@ def make(clips: Path, output: Path, kind: str, count: int) -> None:
 
 @pytest.fixture(scope="session")
 def live(clips: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    output = tmp_path_factory.mktemp("made") / "live"
-    make(clips, output, "live", 2)
-    return output
+    """Made by the first of several processes that needs them; the others wait for it."""
+    base = tmp_path_factory.getbasetemp()
+    folder = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "conversations"
+    with open(folder.with_suffix(".lock"), "w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if not folder.exists():
+            make(clips, folder.with_suffix(".part") / "live", "live", 2)
+            folder.with_suffix(".part").rename(folder)
+    return folder / "live"
 
 
 def bursts(seed: int, seconds: int) -> np.ndarray:

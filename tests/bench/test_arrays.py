@@ -123,6 +123,7 @@ def test_rows_with_several_microphones_run_where_there_are_so_many(made: tuple, 
         rows["crnn-2"].run(next(iter(recordings.conversation_clips(live))))
 
 
+@pytest.mark.slow
 def test_each_turn_is_a_clip_of_its_own(tmp_path: Path, made: tuple) -> None:
     _, signals, meta = made
     later = meta["turns"][0] | {"start": meta["start"] + 100, "text": "another"}

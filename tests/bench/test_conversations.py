@@ -35,6 +35,7 @@ def lag_between(mic: np.ndarray, ref: np.ndarray) -> float:
     return k + 0.5 * (left - right) / (left - 2 * top + right)
 
 
+@pytest.mark.slow
 def test_live_conversation_has_the_delays_that_its_meta_says(live: Path) -> None:
     folders = sorted(live.iterdir())
     assert [folder.name for folder in folders] == ["lab_00", "office_01"]
@@ -51,6 +52,7 @@ def test_live_conversation_has_the_delays_that_its_meta_says(live: Path) -> None
             assert lag_between(mic[: stop + lag + RATE // 2], arriving) == pytest.approx(meta["delay"], abs=1)
 
 
+@pytest.mark.slow
 def test_conversation_levels_and_spans(live: Path) -> None:
     for folder in sorted(live.iterdir()):
         meta = json.loads((folder / "meta.json").read_text())
@@ -80,6 +82,7 @@ def test_folder_without_transcripts_is_refused(tmp_path: Path) -> None:
         conversations.read_clips(tmp_path, (3.0, 12.0))
 
 
+@pytest.mark.slow
 def test_true_lag_puts_both_utterances_where_they_are_heard(live: Path) -> None:
     for folder in sorted(live.iterdir()):
         talk = recordings.Conversation(folder)

@@ -226,6 +226,7 @@ def test_a_scene_recorded_again_is_the_same_up_to_the_stop_and_without_the_robot
     assert np.abs(echo[behind]).max() > 0.05 and np.abs(stopped[behind]).max() < 1e-4
 
 
+@pytest.mark.slow
 def test_a_ducked_robot_is_quieter_by_so_much(scene: Scene) -> None:
     ref = scene.signals["ref"]
     ducked = lowered(ref, RATE, 10 ** (-10 / 20))
@@ -233,6 +234,7 @@ def test_a_ducked_robot_is_quieter_by_so_much(scene: Scene) -> None:
     np.testing.assert_allclose(ducked[RATE + RATE // 10 :], 10**-0.5 * ref[RATE + RATE // 10 :])
 
 
+@pytest.mark.slow
 def test_the_oracle_is_silent_when_the_human_begins(scene: Scene, echo: np.ndarray) -> None:
     onset = first_sound(scene.signals["clean"].astype(np.float32))
     left = scene.echo(lowered(scene.signals["ref"], silent_at(scene, onset), 0.0))
@@ -240,6 +242,7 @@ def test_the_oracle_is_silent_when_the_human_begins(scene: Scene, echo: np.ndarr
     assert np.abs(left[onset + RATE // 4 :]).max() < 0.01 * np.abs(echo[onset:]).max()
 
 
+@pytest.mark.slow
 def test_a_muted_microphone_is_silent_while_the_robot_speaks(scene: Scene, echo: np.ndarray) -> None:
     found = muted(scene)
     assert not found[np.abs(echo) > 0.1 * np.abs(echo).max()].any() and found[-RATE // 10 :].any()
