@@ -64,7 +64,7 @@ class Scene:
         played = loudspeaker(np.where(later, self.volume * x, x))
         paths = [room(2), room(2 if self.moved is None else self.moved)]
         echo = sum(
-            np.convolve(np.concatenate((np.zeros(DELAY + late, np.float32), played * part)), path)[:n]
+            signal.fftconvolve(np.concatenate((np.zeros(DELAY + late, np.float32), played * part)), path)[:n]
             for part, path, late in ((~later, paths[0], 0), (later, paths[1], self.lag))
         )
         if self.ppm:
@@ -72,7 +72,7 @@ class Scene:
         self.human = np.zeros(n, np.float32)
         if self.human_db is not None:
             self.human = np.roll(x, SAMPLE_RATE) if self.repeats else voice(7, self.seconds + 1.7)[-n:]
-            self.human = np.convolve(self.human, room(11))[:n].astype(np.float32)
+            self.human = signal.fftconvolve(self.human, room(11))[:n].astype(np.float32)
             self.human *= 10 ** (self.human_db / 20) * np.std(echo) / np.std(self.human)
         fan = 1e-4 * np.random.default_rng(3).standard_normal(n)
         self.mic = (echo + self.human + fan).astype(np.float32)
