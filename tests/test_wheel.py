@@ -72,7 +72,7 @@ def installed(wheel, tmp_path_factory):
     """The folder of an environment's programs, with the wheel and what its extra `report` asks for."""
     folder = tmp_path_factory.mktemp("environment")
     venv.create(folder, with_pip=True)
-    run(folder / "bin/python", "-m", "pip", "install", "--quiet", f"{wheel}[report]")
+    run(folder / "bin/python", "-m", "pip", "install", "--quiet", "--no-compile", f"{wheel}[report]")
     return folder / "bin"
 
 
@@ -100,6 +100,7 @@ def test_the_demo_runs_from_it(installed, tmp_path):
     assert Path(where).is_relative_to(installed.parent)
 
 
+@pytest.mark.slow
 def test_every_public_name_can_be_had_from_it(installed, tmp_path):
     code = (
         "from edgefilter import *; import edgefilter; print(sum(name in globals() for name in edgefilter.__all__) -"
@@ -108,6 +109,7 @@ def test_every_public_name_can_be_had_from_it(installed, tmp_path):
     assert run(installed / "python", "-c", code, cwd=tmp_path).strip() == "0"
 
 
+@pytest.mark.slow
 def test_edgefilter_alone_shows_what_there_is(installed, tmp_path):
     help_ = run(installed / "edgefilter", cwd=tmp_path)
     assert help_ == run(installed / "edgefilter", "--help", cwd=tmp_path) and "calibrate" in help_
