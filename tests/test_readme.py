@@ -25,6 +25,7 @@ LEAST_COMMANDS = {
 README = (ROOT / "README.md").read_text()
 
 
+@pytest.mark.slow
 def test_what_the_short_test_line_runs_needs_nothing_of_the_training_side():
     whole, short = (line for line in README.splitlines() if "-m pytest" in line)
     assert (

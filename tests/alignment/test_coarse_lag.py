@@ -98,6 +98,7 @@ def test_the_linear_stage_follows_a_path_without_an_arrival(width, lag, noise_db
     assert lowered[0] > 0.8 * lowered[1] > 5.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ppm", [80.0, -80.0])
 @pytest.mark.parametrize("drifting", ["reference", "microphone"])
 def test_clocks_that_drift_are_followed_while_the_lag_is_coarse(drifting, ppm):

@@ -53,6 +53,7 @@ def die(work: fuzz.Work) -> None:
     work.number.value = work.end - 1
 
 
+@pytest.mark.slow
 def test_where_a_process_dies_is_a_find_and_another_goes_on_behind_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -86,6 +86,7 @@ def test_what_a_test_notices_is_killed_and_what_none_does_survives(
     assert "is not of these 3 mutants" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_a_mutant_that_never_ends_is_killed_by_the_clock(checkout: Path) -> None:
     (checkout / "tests/alignment/test_twice.py").write_text("import time\n\n\ndef test_it():\n    time.sleep(60)\n")
     (mutant,) = mutate.sample(["alignment"], 1, 1)

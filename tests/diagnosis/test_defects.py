@@ -37,6 +37,7 @@ def gained(recording: np.ndarray, gain_db: np.ndarray) -> np.ndarray:
     return (recording * 10 ** (np.interp(n, np.arange(gain_db.size), gain_db) / 20)).astype(np.float32)
 
 
+@pytest.mark.slow
 def test_one_recording_has_one_excess_in_compare_add_diagnose_and_report_when_the_profile_holds_a_microphone_gain() -> (
     None
 ):

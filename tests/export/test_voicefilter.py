@@ -231,6 +231,7 @@ def test_one_command_leads_from_items_to_a_file_that_filters_a_clip(
         row.run(replace(clip, voices=()))
 
 
+@pytest.mark.slow
 def test_the_shipped_network_filters_a_clip_by_the_voice_that_it_is_told(encoder, live, clips):
     mic = next(iter(conversation_clips(live))).mic
     first, again, other = (voicefilter.keep(mic, babble(np.random.default_rng(seed), 3.0)) for seed in (1, 1, 2))

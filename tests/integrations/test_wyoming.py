@@ -260,6 +260,7 @@ def test_a_microphone_that_sends_a_broken_chunk_is_opened_again(broken, player, 
     assert "cannot be read" in caplog.text and "expected" in caplog.text
 
 
+@pytest.mark.slow
 def test_the_loopback_of_the_device_is_the_reference_where_it_is_named(talking, player, tmp_path):
     """As a command records it: three channels, the first of which is what is played."""
     profile, sound = talking

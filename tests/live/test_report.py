@@ -15,6 +15,8 @@ from edgefilter.report.html import comparison_page, diagnosis_page, write_page
 from tests.diagnosis.robot_scene import profile, record, voice
 from tests.live.browser import Browser
 
+pytestmark = pytest.mark.slow
+
 NAMES = {
     "profile": "a robot with a rather long name.npz",
     "recording": "the office <on> Monday.wav",
@@ -80,7 +82,6 @@ def stored(folder) -> dict:
     return json.loads(re.search(r'id="data">(.*?)</script>', page, re.S)[1])
 
 
-@pytest.mark.slow
 def test_switches_move_the_figure_the_stairs_the_bars_the_picture_and_the_sound(browser, pages):
     folder, found = pages
     data = stored(folder)
