@@ -19,7 +19,7 @@ import matplotlib.pyplot as plt
 from matplotlib.axes import Axes
 from matplotlib.patches import FancyBboxPatch
 
-from tests.test_imports import ARROWS, LAYERS, between_rooms, summary
+from tests.test_imports import LAYERS, all_arrows, between_rooms, summary
 
 PICTURE = Path(__file__).with_name("imports.png")
 DPI = 100
@@ -125,7 +125,7 @@ def draw_legend(axes: Axes, arrows: Counter[tuple[str, str]], bottom: float) -> 
 
 def main() -> None:
     """Write the picture and print the line that docs/architecture.md quotes."""
-    arrows = between_rooms(ARROWS)
+    arrows = between_rooms(all_arrows())
     rooms = staircase(arrows)
     wide, high = LEFT + COLUMN * len(rooms) + 14, 2 * TOP + ROW * len(rooms)
     figure = plt.figure(figsize=(wide / DPI, high / DPI), dpi=DPI)
