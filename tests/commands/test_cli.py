@@ -1,4 +1,4 @@
-"""The command line as people use it: the installed program in a process of its own, good input and every kind of bad one."""
+"""The command line as people use it, good input and every kind of bad one; in a process of its own where that matters."""
 
 import json
 import resource
@@ -11,10 +11,13 @@ import numpy as np
 import pytest
 import soundfile
 
+from tests.commands.program import here
+
 RATE = 16000
 
 
 def edgefilter(*arguments, **options):
+    """The program in a process of its own."""
     return subprocess.run(
         [sys.executable, "-m", "edgefilter.cli", *map(str, arguments)],
         capture_output=True,
@@ -44,12 +47,12 @@ def speech(tmp_path):
     return tmp_path
 
 
-def run(folder, *more, mic="mic.wav", engine="bypass", output="out.wav"):
-    return edgefilter("run", "--input", folder / mic, "--engine", engine, "--output", folder / output, *more)
+def run(folder, *more, mic="mic.wav", engine="bypass", output="out.wav", program=here):
+    return program("run", "--input", folder / mic, "--engine", engine, "--output", folder / output, *more)
 
 
 def test_run_writes_as_many_samples_as_it_read_and_says_what_it_did(speech):
-    result = run(speech, "--reference", speech / "ref.wav", "--json", speech / "stats.json")
+    result = run(speech, "--reference", speech / "ref.wav", "--json", speech / "stats.json", program=edgefilter)
     assert result.returncode == 0, result.stderr
     out, rate = soundfile.read(speech / "out.wav")
     mic, _ = soundfile.read(speech / "mic.wav")
@@ -83,7 +86,6 @@ def test_a_pipe_gives_the_same_samples_as_a_file(speech):
         assert np.array_equal(np.frombuffer(piped.stdout, "<i2"), soundfile.read(speech / "out.wav", dtype="int16")[0])
 
 
-@pytest.mark.slow
 def test_other_rates_and_channels_are_converted_and_said_so(speech):
     rng = np.random.default_rng(1)
     for rate, channels in ((8000, 1), (44100, 2), (48000, 1)):
@@ -95,20 +97,10 @@ def test_other_rates_and_channels_are_converted_and_said_so(speech):
         )
 
 
-@pytest.mark.slow
 def test_a_recorded_run_again_gives_the_identical_output(speech):
     assert run(speech, "--reference", speech / "ref.wav", "--record", speech / "heard", engine="ss").returncode == 0
-    again = edgefilter(
-        "run",
-        "--input",
-        speech / "heard/mic.wav",
-        "--reference",
-        speech / "heard/reference.wav",
-        "--engine",
-        "ss",
-        "--output",
-        speech / "again.wav",
-    )
+    heard = speech / "heard"
+    again = run(speech, "--reference", heard / "reference.wav", mic="heard/mic.wav", engine="ss", output="again.wav")
     assert again.returncode == 0
     assert (speech / "again.wav").read_bytes() == (speech / "out.wav").read_bytes()
 
@@ -145,7 +137,6 @@ def test_a_recording_of_one_sample_gives_one_sample(speech):
     assert soundfile.info(speech / "out.wav").frames == 1
 
 
-@pytest.mark.slow
 def test_a_short_reference_is_padded_and_a_silent_one_is_said(speech):
     soundfile.write(speech / "short.wav", np.full(100, 0.1), RATE)
     soundfile.write(speech / "silent.wav", np.zeros(2 * RATE), RATE)
@@ -156,7 +147,6 @@ def test_a_short_reference_is_padded_and_a_silent_one_is_said(speech):
     assert silent.returncode == 0 and "silent" in silent.stderr
 
 
-@pytest.mark.slow
 def test_an_output_that_cannot_be_written_is_one_line(speech):
     one_line(run(speech, output="no/such/folder/out.wav"), 1, "out.wav")
     one_line(run(speech, output="out.xyz/out"), 2, ".wav")
@@ -199,13 +189,13 @@ def test_a_full_disk_is_one_line_and_leaves_a_valid_file(speech):
 )
 def test_wrong_usage_is_one_line_and_exit_2(speech, arguments, words):
     files = ["--input", speech / "mic.wav", "--output", speech / "out.wav"] if arguments[:1] == ["run"] else []
-    one_line(edgefilter(*arguments, *files), 2, *words)
+    one_line(here(*arguments, *files), 2, *words)
     assert not (speech / "out.wav").exists()
 
 
 def test_output_over_an_input_is_refused(speech):
     before = (speech / "mic.wav").read_bytes()
-    one_line(run(speech, output="mic.wav"), 2, "overwritten")
+    one_line(run(speech, output="mic.wav", program=edgefilter), 2, "overwritten")
     assert (speech / "mic.wav").read_bytes() == before
 
 

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import soundfile
 
+from tests.commands.program import here
 from tests.diagnosis.robot_scene import profile, record, voice
 
 
@@ -34,7 +35,9 @@ def one_line(done, code, *expected):
 
 
 @pytest.fixture
-def folder(tmp_path):
+def folder(tmp_path, monkeypatch):
+    """The working directory, with a recording and a profile."""
+    monkeypatch.chdir(tmp_path)
     soundfile.write(tmp_path / "mic.wav", np.full(1600, 0.1), 16000)
     profile().save(tmp_path / "p.npz")
     return tmp_path
@@ -47,14 +50,14 @@ RUN = ("run", "--input", "mic.wav", "--engine", "bypass", "--output", "out.wav")
     "option", ["--json", "--profile", "--reference", "--model", "--record", "--save-profile", "--effects"]
 )
 def test_an_empty_name_as_an_unset_shell_variable_gives_is_not_taken_for_no_option(folder, option):
-    one_line(program(folder, *RUN, option, ""), 2, option, "names no file")
+    one_line(here(*RUN, option, ""), 2, option, "names no file")
     assert not (folder / "out.wav").exists()
 
 
 @pytest.mark.parametrize("value", ["nan", "inf", "1e5", "3", "-500", "loud", ""])
 def test_a_level_that_no_sweep_can_have_is_refused(folder, value):
     one_line(
-        program(folder, "calibrate", "--live", "--output", "new.npz", "--level-db", value),
+        here("calibrate", "--live", "--output", "new.npz", "--level-db", value),
         2,
         "--level-db",
         "from -90 to 0 dB",
@@ -63,7 +66,7 @@ def test_a_level_that_no_sweep_can_have_is_refused(folder, value):
 
 @pytest.mark.parametrize("value", ["abc", "", "nan", "0", "1e9"])
 def test_a_number_that_is_none_is_said_in_words_of_the_user(folder, value):
-    done = program(folder, *RUN, "--seconds", value)
+    done = here(*RUN, "--seconds", value)
     one_line(done, 2, "--seconds", f"'{value}' is not a number above 0")
     assert "_positive" not in done.stderr
 
@@ -74,7 +77,7 @@ def test_samples_far_beyond_full_scale_are_refused_with_their_value(folder, comm
     soundfile.write(folder / "big.wav", np.full(48000, level), 16000, "FLOAT")
     named = {"run": ("--input", "--output", "o.wav"), "compare": ("--recording", "--profile", "p.npz")}[command]
     one_line(
-        program(folder, command, named[0], "big.wav", "--reference", "mic.wav", *named[1:]),
+        here(command, named[0], "big.wav", "--reference", "mic.wav", *named[1:]),
         1,
         "big.wav",
         f"{level:g}",
@@ -83,13 +86,12 @@ def test_samples_far_beyond_full_scale_are_refused_with_their_value(folder, comm
     assert not (folder / "o.wav").exists()
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(("where", "why"), [("mic.wav", "no folder"), ("mic.wav/below", "no folder")])
 def test_a_folder_that_cannot_be_made_leaves_the_output_of_an_earlier_run_alone(folder, where, why):
     (folder / "out.wav").write_bytes(b"of an earlier run")
     (folder / "other").write_text("a file")
-    one_line(program(folder, *RUN, "--record", where.replace("mic.wav", "other")), 1, "--record", why)
-    one_line(program(folder, "demo", "--output", where), 1, "--output", why)
+    one_line(here(*RUN, "--record", where.replace("mic.wav", "other")), 1, "--record", why)
+    one_line(here("demo", "--output", where), 1, "--output", why)
     assert (folder / "out.wav").read_bytes() == b"of an earlier run"
 
 
@@ -148,7 +150,8 @@ def test_a_file_name_that_is_no_text_does_not_stop_the_report(tmp_path):
     assert "\\udcff.wav" in (tmp_path / "r.html").read_text()
 
 
-def test_a_json_file_that_fails_does_not_cost_the_adapted_profile(tmp_path):
+def test_a_json_file_that_fails_does_not_cost_the_adapted_profile(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
     x = voice(2.0)
     soundfile.write(tmp_path / "ref.wav", x, 16000, "FLOAT")
     profile().save(tmp_path / "p.npz")
@@ -167,11 +170,12 @@ def test_a_json_file_that_fails_does_not_cost_the_adapted_profile(tmp_path):
         "--quiet",
     ]
     soundfile.write(tmp_path / "ref2.wav", x, 16000, "FLOAT")
-    done = program(tmp_path, *words, "--save-profile", "new.npz", "--json", "/dev/full")
+    done = here(*words, "--save-profile", "new.npz", "--json", "/dev/full")
     assert done.returncode == 1 and "No space left" in done.stderr and (tmp_path / "new.npz").exists()
 
 
-def test_the_effects_that_became_part_of_the_adapted_path_are_said(tmp_path):
+def test_the_effects_that_became_part_of_the_adapted_path_are_said(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
     x = voice(2.0)
     soundfile.write(tmp_path / "ref.wav", x, 16000, "FLOAT")
     echo = profile().echo.with_effect("bandlimit", {"cutoff_hz": 4000.0}).with_effect("playback_gain", {"gain_db": 1.0})
@@ -189,7 +193,7 @@ def test_the_effects_that_became_part_of_the_adapted_path_are_said(tmp_path):
         "--save-profile",
         "new.npz",
     ]
-    done = program(tmp_path, *words)
+    done = here(*words)
     assert (
         done.returncode == 0
         and "the adapted path is in new.npz; bandlimit is part of it now and no longer listed" in done.stderr
