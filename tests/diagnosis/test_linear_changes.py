@@ -88,7 +88,7 @@ SHELVED = signal.lfilter(*shelf(-4.0), path())
     ],
 )
 def test_a_stationary_change_is_named_as_what_it_is(h: np.ndarray, named: str) -> None:
-    x = voice(10.0)
+    x = voice(8.0)
     found = diagnose(profile(), through(h, x), x)
     assert (found.verdict, [finding.effect for finding in found.ranking]) == ("missing", [named])
     assert found.remaining_db < 1.0  # the product's promise for linear effects
@@ -108,7 +108,7 @@ def test_a_stationary_change_is_named_as_what_it_is(h: np.ndarray, named: str) -
 def test_a_turned_volume_is_named_beside_a_filter_that_could_take_it_up(
     h: np.ndarray, beside: str, turned_db: float
 ) -> None:
-    x = voice(10.0)
+    x = voice(8.0)
     found = diagnose(profile(), through(10 ** (turned_db / 20) * h, x), x)
     assert (found.verdict, {finding.effect for finding in found.ranking}) == ("missing", {beside, "playback_gain"})
     volume = next(finding for finding in found.ranking if finding.effect == "playback_gain")
