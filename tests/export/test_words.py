@@ -52,9 +52,10 @@ def conversation(tmp_path):
     return folder.parent
 
 
-@pytest.fixture
-def run(tmp_path):
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
     """A folder of export/train.py."""
+    tmp_path = tmp_path_factory.mktemp("run")
     small = ["--channels", "2", "2", "2", "2", "--hidden", "4", "--smoke"]
     folders = ["--data", str(tmp_path / "d"), "--validation", str(tmp_path / "v"), "--output", str(tmp_path / "tiny")]
     assert train.main([*folders, *small]) == 0
