@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 import soundfile
 
-from edgefilter.calibration.from_recording import SOURCE
 from edgefilter.cli import main
-from edgefilter.profile.data import Profile
+from edgefilter.profile.data import PROVISIONAL, Profile
 from edgefilter.report.text import decibels
 from tests.commands.test_diagnosis_commands import RATE, arguments, fails_in_one_line
 from tests.diagnosis.robot_scene import profile, record, voice
@@ -125,7 +124,7 @@ def test_without_a_profile_one_is_made_and_proven_against_none(scene: Path, tmp_
     assert f"written to {made}" in out and "next " not in out
     proof = json.loads((tmp_path / "a.json").read_text())["applied"]["proof"]
     assert proof["erle_after_db"] > proof["erle_before_db"] + 3.0
-    assert Profile.load(made).source == SOURCE
+    assert Profile.load(made).source == PROVISIONAL
     human = tmp_path / "human.wav"
     run = ["run", "--input", files[1], "--reference", files[3], "--profile", str(made), "--output", str(human)]
     assert main([*run, "--engine", "linear", "--quiet"]) == 0
