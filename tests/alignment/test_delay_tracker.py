@@ -1,0 +1,81 @@
+"""What is believed after a look at the delay: that it drifts, that it has jumped, or nothing."""
+
+from __future__ import annotations
+
+import pytest
+
+from edgefilter.alignment.delay_tracker import DelayMeasurement, DriftFilter, JumpWitness
+
+
+def look(offset: float, strength: float = 10.0, ratio: float = 2.0, gain: float = 1.0, gain_there: float = 1.0):
+    """One that is sure of its offset."""
+    return DelayMeasurement(offset, 1e-6, strength, ratio, 5.0, 1.0, gain, gain_there)
+
+
+def seen(found: DelayMeasurement, deviation: float = 0.1, far: bool = False) -> str:
+    """Where a look sees the robot whose delay is known to that deviation and that has brought a power of 1."""
+    drift = DriftFilter()
+    drift.restart(1000.0, deviation)
+    return drift.where_seen(found, 1.0, far)
+
+
+# the delay half a frame ago is less sure by what the clocks may differ: 0.15 samples
+@pytest.mark.parametrize(
+    ("deviation", "drift", "jump"),
+    [
+        (0.05, 0.75, 0.85),  # 5 standard deviations
+        (0.7, 3.6, 3.8),  # 3 of them, and of a sample that a weak look may be wrong by
+        (0.4, 1.45, 1.55),  # 1.5 samples, beyond 3 of them
+        (3.0, 7.9, 8.1),  # 8 samples
+    ],
+)
+def test_an_error_is_put_down_to_the_drift_where_it_is_small_or_to_be_expected(deviation, drift, jump):
+    assert seen(look(drift), deviation) == seen(look(-drift), deviation) == "there"
+    assert seen(look(jump), deviation) == seen(look(-jump), deviation) == "elsewhere"
+
+
+@pytest.mark.parametrize(
+    ("found", "what"),
+    [
+        (look(100.0, strength=5.9), "unseen"),
+        (look(0.0, strength=5.9), "unseen"),
+        (look(100.0, strength=6.1), "elsewhere"),
+        (look(100.0, gain=9.9), "elsewhere"),
+        (look(100.0, gain=10.1), "drowned"),
+        (look(0.0, gain=10.1), "there"),
+        (look(100.0, gain_there=0.26), "elsewhere"),
+        (look(100.0, gain_there=0.24), "unseen"),
+        (look(100.0, gain_there=10.1), "unseen"),
+        (look(959.0), "elsewhere"),
+        (look(-961.0), "unseen"),
+        (look(100.0, ratio=3.1), "jumped"),
+    ],
+)
+def test_a_look_counts_where_its_peak_stands_out_and_the_robot_is_as_loud_as_it_was(found, what):
+    assert seen(found) == what
+
+
+def test_a_far_look_sees_three_times_as_far():
+    assert seen(look(3007.0), far=True) == "elsewhere" and seen(look(3009.0), far=True) == "unseen"
+
+
+@pytest.mark.parametrize(("offset", "enough"), [(8.0, 20.0), (8.1, 30.0), (1024.0, 30.0), (-1025.0, 50.0)])
+def test_a_jump_is_believed_from_so_much_evidence_on_as_chance_has_places(offset, enough):
+    assert not JumpWitness().convinced(look(offset, 1.0, 0.99 * enough))
+    assert JumpWitness().convinced(look(offset, 1.0, 1.01 * enough))
+
+
+@pytest.mark.parametrize(("further", "believed"), [(0.69, True), (0.71, False), (-0.69, True)])
+def test_the_evidence_of_looks_at_the_same_jump_is_added(further, believed):
+    witness = JumpWitness()
+    assert not witness.convinced(look(100.0, 1.0, 0.6 * 30.0))
+    assert witness.convinced(look(100.0 + further, 1.0, 0.6 * 30.0)) is believed
+
+
+@pytest.mark.parametrize(("other", "replaced"), [(0.69, False), (0.71, True)])
+def test_a_suspicion_is_replaced_by_another_that_says_more_than_seven_tenths_of_it(other, replaced):
+    witness = JumpWitness()
+    witness.convinced(look(100.0, 1.0, 0.9 * 30.0))
+    witness.convinced(look(-50.0, 1.0, 0.9 * 30.0 * other))
+    assert witness.convinced(look(-50.0, 1.0, 0.5 * 30.0)) is replaced
+    assert JumpWitness().convinced(look(-50.0, 1.0, 0.5 * 30.0)) is False
