@@ -206,6 +206,21 @@ def test_a_microphone_that_is_sound_again_is_used_again_after_three_seconds() ->
 
 
 @pytest.mark.parametrize(
+    ("level_db", "often", "left_out"), [(-0.05, 16, {1: "clipped"}), (-0.05, 15, {}), (-0.15, 62, {})]
+)
+def test_a_microphone_is_clipped_where_16_samples_of_a_second_reach_full_scale_nearly(
+    level_db, often, left_out
+) -> None:
+    watched, rng, silence = Microphones(3, 256), np.random.default_rng(0), np.zeros(256, np.float32)
+    for hop in range(round(RATE / 256)):
+        heard = (0.1 * rng.standard_normal((3, 256))).astype(np.float32)
+        if hop < often:
+            heard[1, 7] = -(10 ** (level_db / 20))
+        watched.step(heard, heard, silence, silence, True)
+    assert watched.left_out == left_out
+
+
+@pytest.mark.parametrize(
     ("order", "left_out"),
     [([0, 2, 1], {"1": 2, "2": 1}), ([1, 0, 2], {"0": 1, "1": 0}), ([0, 1, 2], {}), ([1, 2, 0], {"1": 2, "2": 0})],
 )

@@ -212,3 +212,12 @@ def test_a_human_beside_a_robot_that_plays_unheard_is_noticed_at_once():
     ego.process(mic, robot)
     noticed = [event.sample for event in ego.events() if event.kind == "speech_started"]
     assert len(noticed) == 1 and 0 <= noticed[0] - begins < SAMPLE_RATE // 4
+
+
+@pytest.mark.parametrize(("calibrated", "unlikely"), [(False, 0.0036), (True, 0.00075)])
+def test_however_long_it_was_sure_the_network_is_heard_when_it_changes_its_mind(calibrated, unlikely):
+    """No second of certainty is more than the odds of one bounded hop: the rest would have to be outweighed."""
+    judge = HumanJudge(HOP_S, calibrated)
+    assert 1.0 - [judge.step(1.0) for _ in range(60)][-1] == pytest.approx(unlikely, rel=0.05)
+    said = [judge.step(0.0) for _ in range(60)]
+    assert said[2] < 0.5 and said[-1] == pytest.approx(0.00103 if not calibrated else 0.0049, rel=0.05)

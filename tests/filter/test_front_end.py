@@ -1,9 +1,13 @@
 """What the front end does to every spectrum."""
 
+from dataclasses import replace
+
 import numpy as np
+import pytest
 
 from edgefilter import enhance
 from edgefilter.engines.linear import Linear
+from edgefilter.filter.echo_path import Lesson, PathState
 from edgefilter.filter.front_end import RUMBLE, FrontEnd
 from edgefilter.filter.residual_echo import Residual
 from edgefilter.types import SAMPLE_RATE
@@ -56,3 +60,75 @@ def test_the_noise_is_found_again_after_a_microphone_was_muted():
     before = expected(2000, 1e-4)
     assert expected(4000, 0.0) < 1e-4 * before
     assert expected(6000, 1e-4) > 0.5 * before
+
+
+class Forgetting:
+    """Hands over a path that holds nothing, after twenty hops."""
+
+    def __init__(self):
+        self.hops = 0
+
+    def start(self, path, hop):
+        nothing = replace(path.canceller, weights=0 * path.canceller.weights)
+        self.lesson = Lesson(PathState(path.effects, nothing), "learned", "nothing")
+
+    def observe(self, hop):
+        self.hops += 1
+        return self.lesson if self.hops == 20 else None
+
+
+def test_a_lesson_is_faded_in_over_the_hop_in_which_it_is_adopted():
+    plain, taught = FrontEnd(Linear(), robot()), FrontEnd(Linear(), robot(), Forgetting())
+    ref = (0.1 * np.random.default_rng(0).standard_normal((40, 256))).astype(np.float32)
+    mic = 0.5 * np.roll(ref.ravel(), 900).reshape(ref.shape)
+    for hop in zip(mic, ref, strict=True):
+        for front in (plain, taught):
+            front.step(*hop)
+            front.linear_stage.learn()
+        if taught.linear_stage.lesson:
+            break
+        np.testing.assert_allclose(taught.linear.echo, plain.linear.echo, atol=1e-6)  # the past is read in other pieces
+    assert np.abs(plain.linear.echo).max() > 0.05
+    np.testing.assert_allclose(taught.linear.echo, np.linspace(1.0, 0.0, 256) * plain.linear.echo, atol=1e-6)
+    assert np.array_equal(taught.linear.error, hop[0] - taught.linear.echo)
+
+
+class Leaking:
+    """A linear stage whose error holds so much of the echo's power, the same in all bins; the noise is known."""
+
+    def __init__(self, profile=None, noise=1e-6):
+        self.stft = Linear().stft
+        self.residual, self.noise = Residual(self.stft, profile), np.full(self.stft.bins, noise, np.float32)
+
+    def expected(self, error=0.0, frames=1, echo=1.0, uncertainty=0.0):
+        """The residual echo that is expected after so many frames."""
+        whole = np.ones(self.stft.bins, np.complex64)
+        for _ in range(frames):
+            uncertain = np.full(self.stft.bins, uncertainty, np.float32)
+            _, found = self.residual.step(echo**0.5 * whole, error**0.5 * whole, uncertain, fan=self.noise)
+        assert np.ptp(found) <= 1e-5 * found.max()
+        return float(found[0])
+
+
+def test_what_leaks_of_the_echo_falls_at_once_rises_slowly_and_is_held_within_bounds():
+    stage, whole = Leaking(), 1.1  # of what falls on other frequencies a tenth more is expected
+    assert stage.expected(frames=1) == pytest.approx(whole * 0.005 * 0.9, rel=1e-3)
+    assert stage.expected(frames=100) == pytest.approx(whole * 0.0024, rel=1e-3)
+    assert stage.expected(error=1.0, frames=62) == pytest.approx(whole * 0.0024 * 1.005**62, rel=0.01)  # 1.3 dB in 1 s
+    assert stage.expected(error=1.0, frames=1000) == pytest.approx(whole * 0.1, rel=1e-3)
+    assert stage.expected(error=0.01 * whole, frames=1000) == pytest.approx(whole * 0.03, rel=1e-3)  # three times
+
+
+@pytest.mark.parametrize(("over_noise", "left"), [(58.0, 0.005), (62.0, 0.0024)])
+def test_leakage_is_only_told_where_the_echo_is_18_db_over_the_noise(over_noise, left):
+    assert Leaking(noise=1.1 / over_noise).expected(frames=100) == pytest.approx(1.1 * left, rel=1e-3)
+
+
+@pytest.mark.parametrize(("profile", "weight"), [(None, 2.0), (robot(), 0.5)], ids=["unknown", "calibrated"])
+def test_the_canceller_s_doubt_of_its_path_is_expected_as_echo_and_the_room_falls_by_two_decibels_a_hop(
+    profile, weight
+):
+    stage = Leaking(profile)
+    assert stage.expected(echo=0.0, uncertainty=3.0) == pytest.approx(3.0 * weight)
+    before = stage.expected()
+    assert [stage.expected(echo=0.0) / before for _ in range(2)] == pytest.approx([0.6, 0.36], rel=0.2)

@@ -8,7 +8,9 @@ import soundfile
 
 import edgefilter
 from edgefilter import EgoFilter
+from edgefilter.alignment.delay_line import Aligned
 from edgefilter.filter.barge_in import BargeIn
+from edgefilter.filter.reference_watch import ReferenceWatch
 from edgefilter.profile.data import Profile
 from edgefilter.types import SET_UP_WRONG
 
@@ -148,3 +150,46 @@ def test_a_profile_of_another_scale_is_no_microphone_that_is_processed(robot):
     ego = EgoFilter(DEMO / "profile.npz", "linear")
     assert not [event for event in events(ego, 0.01 * mic, 100 * ref) if event.kind in SET_UP_WRONG]
     assert ego.stats()["linear_stage"]["removed_db"] > 20.0
+
+
+def watched(*parts, removed_db=None):
+    """What is said, and when, s, of a silent reference; parts: (seconds, rms of the microphone, state of the aligner)."""
+    watch, silence, now, said = ReferenceWatch(1600), np.zeros(1600, np.float32), 0.0, []
+    for seconds, rms, state in parts:
+        aligned = Aligned(silence, float("nan"), 0.0, 0.0, state, False)
+        for _ in range(round(10 * seconds)):
+            now += 0.1
+            found = watch.step(np.full(1600, rms, np.float32), silence, aligned, removed_db)
+            said += [(kind, round(now, 1)) for kind, _ in found]
+    return said
+
+
+@pytest.mark.parametrize(
+    ("parts", "at"),
+    [
+        ([(70.0, 1.1e-3)], 60.0),
+        ([(70.0, 0.9e-3)], None),
+        ([(10.0, 1.1e-3), (60.0, 0.0)], 60.0),
+        ([(9.9, 1.1e-3), (60.0, 0.0)], None),
+        ([(61.0, 0.0), (10.0, 1.1e-3)], 71.0),
+    ],
+)
+def test_a_reference_is_missing_after_a_minute_in_which_ten_seconds_were_louder_than_60_db_below_full_scale(parts, at):
+    assert watched(*((*part, "idle") for part in parts)) == ([("reference_missing", at)] if at else [])
+
+
+@pytest.mark.parametrize(
+    ("quiet_s", "unfound_s", "louder_db", "said"),
+    [(1.0, 5.1, 10.1, True), (0.9, 5.1, 10.1, False), (1.0, 4.9, 10.1, False), (1.0, 5.1, 9.9, False)],
+)
+def test_a_robot_is_heard_that_is_not_found_where_five_seconds_are_10_db_louder_than_one_of_its_silence(
+    quiet_s, unfound_s, louder_db, said
+):
+    found = watched((quiet_s, 1e-3, "idle"), (unfound_s, 1e-3 * 10 ** (louder_db / 20), "unfound"))
+    assert found == ([("robot_unfound", 6.0)] if said else [])
+
+
+@pytest.mark.parametrize(("removed_db", "times"), [(3.9, 1), (4.0, 0), (None, 0)])
+def test_less_than_4_db_of_the_robot_removed_is_said_once(removed_db, times):
+    said = [kind for kind, _ in watched((1.0, 1e-2, "locked"), removed_db=removed_db)]
+    assert said == ["echo_unpredicted"] * times
