@@ -14,7 +14,7 @@ import soundfile
 
 from edgefilter.dsp.metrics import si_sdr
 from edgefilter.engines import create, onnx_session
-from edgefilter.engines.crnn import LOUD, Crnn
+from edgefilter.engines.crnn import LOUD, Crnn, Level
 from edgefilter.engines.paper_crnn import PaperCrnn
 from edgefilter.errors import ModelError, SignalError, UsageError
 from edgefilter.filter.ego_filter import EgoFilter, enhance
@@ -325,3 +325,13 @@ def test_a_budget_does_not_replace_an_engine_that_waits_for_the_end():
     ego = EgoFilter(engine="paper-crnn", model=PAPER, budget_ms=0.001)
     assert ego.waits_for_end and ego.process(mic, ref).size == 0 and ego.flush().shape == mic.shape
     assert ego.stats()["latency_ms"] is None
+
+
+def test_the_loudest_frame_is_one_of_three_as_loud_and_is_forgotten_by_10_db_in_a_minute():
+    level = Level().after(1.0).after(0.25)
+    assert level.loudest == 0.0 and level.factor(4.0) == 1.0, "a click is no level"
+    level = level.after(2.0)
+    assert level.loudest == 0.25 and level.factor(4.0) == 4.0
+    for _ in range(round(60.0 / 0.016)):
+        level = level.after(0.0)
+    assert level.loudest == pytest.approx(0.025, rel=1e-3)
