@@ -9,7 +9,7 @@ import pytest
 import soundfile
 
 from edgefilter.cli import main
-from edgefilter.diagnosis.passport import expected
+from edgefilter.diagnosis.passport import expected, measure
 from edgefilter.dsp.fractional_delay import interpolate
 from tests.diagnosis.robot_scene import DELAY, record, voice
 
@@ -84,6 +84,18 @@ def test_what_is_removable_is_what_distortion_and_noise_leave(passport, clean):
     _, changed, _, _ = passport(distorted.astype(np.float32), said)
     assert changed["change_db"] == pytest.approx(20 * np.log10(0.4), abs=1.5) and changed["cause"] == "change"
     assert changed["follows"] > noisy["follows"]
+
+
+@pytest.mark.slow
+def test_what_is_removable_is_not_overrated_where_the_robot_says_little():
+    """Two seconds of ten, beside a sound as loud that follows nothing: so few frames agree with anything by chance."""
+    rng = np.random.default_rng(0)
+    said, other = 0.05 * rng.standard_normal((2, 10 * RATE)).astype(np.float32)
+    said[2 * RATE :] = 0.0
+    heard = np.roll(said, DELAY)
+    heard += other * (heard != 0.0)
+    found = measure(heard, said, said[:RATE], engines=[])
+    assert found.removable_db == pytest.approx(10 * np.log10(2.0), abs=0.8)  # 4.5 dB with what chance explains
 
 
 def test_a_microphone_that_shuts_is_named_as_processed(passport, clean):

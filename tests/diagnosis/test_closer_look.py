@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from edgefilter.diagnosis.closer_look import look_closer
+from edgefilter.diagnosis.closer_look import Curve, look_closer
 from edgefilter.diagnosis.prepare import prepare
 from edgefilter.diagnosis.score import Scorer
 from edgefilter.diagnosis.trials import Found
@@ -49,3 +49,11 @@ def test_another_sound_in_the_silences_is_pointed_at_and_noise_is_no_gain() -> N
     sentence, curves = looked((record(x) + hiss).astype(np.float32), x)
     assert "silences" in sentence and max(curves["frequency,"].y_db) > 3.0
     assert all(curve.share < 0.1 for curve in curves.values())
+
+
+def test_a_curve_is_written_with_as_many_digits_as_mean_something():
+    curve = Curve.of("gain by level", "dB", np.array([1 / 3]), np.array([2 / 3]), 1 / 7)
+    assert curve.to_dict() == {
+        **{"name": "gain by level", "x_unit": "dB", "x": [0.333], "y_db": [0.67], "share": 0.1429, "y_unit": "dB"}
+    }
+    assert [Curve.of("", "", np.zeros(1), np.zeros(1), share).share for share in (-0.1, 1.1)] == [0.0, 1.0]

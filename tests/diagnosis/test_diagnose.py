@@ -178,6 +178,9 @@ def test_the_dictionary_has_the_published_keys_and_is_json() -> None:
     assert found.independence is not None and said["independence"]["of_findings"] == found.independence.to_dict()
     assert entry["family"] == "linear path" and 0.0 < entry["p_value"] <= Criteria().false_rate
     assert entry["parameters"]["gain_db"]["value"] == pytest.approx(-0.915, abs=0.05)
+    figures = {name: getattr(found.ranking[0], name) for name in ("excess_before_db", "excess_after_db", "share")}
+    for name, value in {**figures, "remaining_db": found.remaining_db, "irreducible_db": found.irreducible_db}.items():
+        assert {**said, **entry}[name] == round(value, 4 if name == "share" else 3)  # digits that mean something
 
 
 def test_no_effect_is_chosen_where_none_lowers_the_level():

@@ -6,7 +6,15 @@ import numpy as np
 import pytest
 from scipy import signal
 
-from edgefilter.diagnosis.independence import CROSS_MS, independence, lagged_sums, whitener
+from edgefilter.diagnosis.independence import (
+    CROSS_MS,
+    Correlogram,
+    Independence,
+    Zone,
+    independence,
+    lagged_sums,
+    whitener,
+)
 from edgefilter.dsp.psd import frequencies
 from edgefilter.types import PRE_ROLL
 from tests.diagnosis.robot_scene import voice
@@ -79,3 +87,17 @@ def test_a_dependence_is_found_at_its_lag_and_on_its_side_alone(said, lag_ms, si
 def test_too_little_voice_gives_no_answer(said):
     nowhere = np.zeros(N, bool)
     assert independence(fan(), said, psd(), nowhere, ~nowhere) is None
+
+
+def test_figures_are_written_with_as_many_digits_as_mean_something():
+    at = np.array([0.0, 1 / 3, 2 / 3])
+    part = Correlogram(at, np.array([0.1, -2 / 3, 0.0]), np.zeros(3), np.full(3, 1 / 7))
+    summary = {"outside": 0.3333, "dependent": True, "largest": -0.66667, "largest_at_ms": 0.3333}
+    arrays = {"lags_ms": [0.0, 0.33333, 0.66667], "values": [0.1, -0.66667, 0.0]}
+    whole = {**arrays, "expected": [0.0] * 3, "bounds": [0.14286] * 3, **summary}
+    assert part.to_dict() == whole
+    zone = Zone(1.0, 2.0, "early", 1 / 7, part)
+    told = {"low_ms": 1.0, "high_ms": 2.0, "meaning": "early", "share": 0.1429, **summary}
+    assert Independence(part, part, (zone,), 2 / 3).to_dict() == {
+        **{"seconds": 0.667, "autocorrelation": whole, "cross_correlation": whole, "zones": [told]}
+    }

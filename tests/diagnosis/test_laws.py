@@ -94,7 +94,10 @@ def test_what_is_explained_gets_no_law_and_what_is_not_one_beside_what_is_named(
     shaken = diagnose(profile(), record(HIDDEN["modulation"].astype(np.float32)), X)
     assert shaken.verdict == "unexplained" and shaken.law is not None
     assert shaken.law.excess_db < 0.5 * shaken.remaining_db and shaken.law.beside == ()
-    assert shaken.to_dict()["law"]["family"] == "modulation"
+    told = shaken.to_dict()
+    assert told["law"]["family"] == "modulation"
+    assert told["law"]["gain_db"] == round(shaken.law.gain_db, 3)
+    assert told["law"]["excess_db"] == round(shaken.law.excess_db, 3)
 
 
 def test_where_no_voice_is_there_to_fit_to_there_is_no_law() -> None:

@@ -12,7 +12,7 @@ import soundfile
 
 from edgefilter.cli import main
 from edgefilter.diagnosis.advice import asks, remaining
-from edgefilter.diagnosis.probe import ENOUGH, SOUND_S, Inquiry, menu, weights
+from edgefilter.diagnosis.probe import ENOUGH, SOUND_S, Answer, Explanation, Inquiry, menu, weights
 from edgefilter.diagnosis.result import Candidate
 from edgefilter.echo.model import EchoModel
 from edgefilter.errors import SignalError, UsageError
@@ -59,6 +59,23 @@ def test_five_seconds_settle_a_pair_whichever_is_true(pair: str, true: int) -> N
     assert answer.settled and answer.first.name == name
     assert answer.to_dict()["explanations"][0]["effects"] == (name,)
     assert 1 <= len(answer.sounds) <= 2
+
+
+def test_explanations_are_told_the_most_probable_first_with_the_odds_of_that():
+    few, many = (Explanation((name,), None, None) for name in ("few", "many"))
+    answer = Answer((few, many), np.array([1 / 30, 2 / 3, 0.3]), ("a sound",))
+    assert answer.first is many and answer.odds == pytest.approx(2.0) and not answer.settled
+    assert answer.to_dict() == {
+        "settled": False,
+        "odds": 2.0,
+        "explanations": [{"effects": ("many",), "weight": 0.666667}, {"effects": ("few",), "weight": 0.033333}],
+        "none": 0.3,
+        "sounds": ("a sound",),
+    }
+    sure = Answer((few, many), np.array([1.0, 0.0, 0.0]), ())
+    assert sure.first is few and sure.settled and sure.odds == pytest.approx(1e6)
+    thirds = Answer((few, many), np.array([7 / 9, 1 / 9, 1 / 9]), ()).to_dict()
+    assert (thirds["odds"], thirds["none"]) == (3.5, 0.111111)
 
 
 def _levels_db(sound: np.ndarray) -> np.ndarray:
