@@ -69,12 +69,12 @@ def _half_width(finding: Finding, parameter: Parameter, index: int) -> float | N
 def _derivative(found: Found, finding: Finding, parameter: Parameter, index: int) -> Array | None:
     """The whitened prediction's derivative by a number, (n,); None at a bound, and where that stays as it is."""
     value = np.array(finding.values[parameter.name], float)
-    at = float(value.ravel()[index])
+    at = float(value.flat[index])
     if at in (parameter.low, parameter.high):
         return None
     step = max(STEP * (_half_width(finding, parameter, index) or 0.0), LEAST_STEP * abs(at), 1e-9)
     step = step if at + step <= parameter.high else -step
-    value.reshape(-1)[index] = at + step
+    value.flat[index] = at + step
     measurement = found.prepared.measurement
     values = {**finding.values, parameter.name: value if value.ndim else float(value)}
     try:

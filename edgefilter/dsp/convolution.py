@@ -24,4 +24,4 @@ def convolve(x: Array, taps: Array) -> Array:
     count = -(-whole // new)
     padded = np.pad(x, (before, count * new - x.size))
     filtered = fft.rfft(frames(padded, size, new)) * fft.rfft(taps, size)
-    return fft.irfft(filtered, size)[:, before:].reshape(-1)[:whole]
+    return fft.irfft(filtered, size)[:, before:].ravel()[:whole]

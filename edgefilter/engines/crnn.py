@@ -153,9 +153,9 @@ class Places:
         for bind, places in ((self._binding.bind_input, given), (self._binding.bind_output, made)):
             for name, place in places.items():
                 bind(name, "cpu", 0, np.float32, place.shape, place.ctypes.data)
-        spectra = [(name, given[name].view(np.complex64).reshape(-1)) for name in SPECTRA]
-        self.inputs = [*spectra, *((name, given[name].reshape(-1)) for name in POWERS)]
-        self.spectrum: Spectrum = made["spectrum"].view(np.complex64).reshape(-1)
+        spectra = [(name, given[name].view(np.complex64).ravel()) for name in SPECTRA]
+        self.inputs = [*spectra, *((name, given[name].ravel()) for name in POWERS)]
+        self.spectrum: Spectrum = made["spectrum"].view(np.complex64).ravel()
         self.probability = made["speech_probability"]
         self.states = [given[name] for name, _ in model.states]
         self.next_states = [made[f"next_{name}"] for name, _ in model.states]

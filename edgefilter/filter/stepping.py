@@ -87,7 +87,7 @@ class Stepping:
         }
 
     def _hops(self, seconds: float) -> int:
-        return max(1, round(1000 * seconds / self.hop_ms))
+        return round(1000 * seconds / self.hop_ms)
 
     def _down(self) -> tuple[EventKind, str] | None:
         why = f"{self._late} of the last {len(self._recent)} hops took more than {self.budget_ms:.1f} ms"

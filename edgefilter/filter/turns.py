@@ -100,4 +100,4 @@ def overlap_add(spectra: Spectrum, stft: StftConfig) -> Samples:
     out = np.zeros((len(frames) + pieces - 1, stft.hop), np.float32)
     for piece in range(pieces):
         out[piece : piece + len(frames)] += windowed[:, piece * stft.hop : (piece + 1) * stft.hop]
-    return out.reshape(-1)[: (len(frames) - 1) * stft.hop + stft.window_length]
+    return out.ravel()[: (len(frames) - 1) * stft.hop + stft.window_length]

@@ -237,7 +237,7 @@ class EchoLimiter:
         target = self._weights[1:]
         start = np.minimum(self._weights[:-1], target)
         gain = start[:, None] + (target - start)[:, None] * self._ramp
-        return gain.reshape(-1) * echo
+        return gain.ravel() * echo
 
 
 def pre_emphasised(x: Samples) -> Samples:

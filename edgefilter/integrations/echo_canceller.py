@@ -226,5 +226,5 @@ def _like(samples: Samples, given: Sound) -> Sound:
     """Samples in the type of what was given."""
     if isinstance(given, np.ndarray):
         whole = given.dtype.kind != "f"
-        return (to_pcm16(samples.reshape(-1))[0].reshape(samples.shape) if whole else samples).astype(given.dtype)
-    return type(given)(as_pcm16(samples.reshape(-1)))
+        return (to_pcm16(samples.ravel())[0].reshape(samples.shape) if whole else samples).astype(given.dtype)
+    return type(given)(as_pcm16(samples.ravel()))

@@ -45,7 +45,7 @@ class Encoder:
         self._size = SAMPLE_RATE * FRAME_MS // 1000
         self._waiting = np.zeros(0, np.float32)
 
-    def push(self, samples: Samples, last: bool = False) -> list[bytes]:
+    def push(self, samples: Samples, last: bool) -> list[bytes]:
         """Take samples (n,) and return the packets that are complete; after `last`, filled up with silence, nothing follows."""
         waiting = np.concatenate((self._waiting, samples))
         if last:

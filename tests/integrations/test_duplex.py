@@ -9,7 +9,7 @@ import soxr
 from edgefilter import EgoFilter, SignalError, UsageError
 from edgefilter.dsp.resample import Resampler
 from edgefilter.integrations import duplex as module
-from edgefilter.integrations.duplex import Duplex, as_pcm16, from_pcm16
+from edgefilter.integrations.duplex import Duplex, Pace, as_pcm16, from_pcm16
 from edgefilter.integrations.turns import TurnByTurn
 from edgefilter.types import Event, Turn
 
@@ -445,3 +445,52 @@ def test_of_a_turn_only_what_belongs_to_the_recogniser_s_is_taken(pair):
     assert turn.start < 24_000 and taken.size == turn.start + turn.samples.size - 24_000
     turns.close()
     assert duplex.listeners == []
+
+
+def test_of_what_was_streamed_half_a_second_before_the_turn_and_30_s_of_it_are_kept_and_nothing_twice():
+    turns, other = (TurnByTurn(Duplex(EgoFilter(engine="bypass"))) for _ in range(2))
+    nothing, rate = other.take()
+    assert nothing.size == 0 and rate == RATE
+    rate = 1000
+    parts = [np.full(500, at, np.float32) for at in range(64)]
+    for _ in range(2):
+        for part in parts[:3]:
+            turns.hear(part, rate)
+        turns.start()
+        turns.hear(parts[3], rate)
+        taken, its_rate = turns.take()
+        assert its_rate == rate
+        # the part that the half second ends in is kept as a whole
+        np.testing.assert_array_equal(taken, np.concatenate(parts[1:4]))
+    turns.start()
+    for part in parts:
+        turns.hear(part, rate)
+    np.testing.assert_array_equal(turns.take()[0], np.concatenate(parts[-61:]))
+
+
+def said_of(rate, seconds):
+    """What is said of a stream that brings so many samples in each second, and is said to have that rate."""
+    now = iter(range(1000))
+    pace = Pace(lambda: float(next(now)))
+    return [said for said in (pace.note(samples, rate) for samples in seconds) if said]
+
+
+@pytest.mark.parametrize(
+    ("rate", "brings"),
+    [
+        *((48_000, brings) for brings in (8000, 16_000, 24_000, 44_100)),
+        *((16_000, brings) for brings in (24_000, 32_000, 44_100, 48_000)),
+        *((8000, brings) for brings in (32_000, 48_000)),
+        (24_000, 16_000),
+        (44_100, 48_000),
+    ],
+)
+def test_sound_that_comes_at_the_pace_of_another_rate_or_of_more_channels_is_said_once(rate, brings):
+    (said,) = said_of(rate, [brings] * 40)
+    assert f"brings {brings} samples a second and is said to have {rate}" in said
+
+
+@pytest.mark.parametrize("brings", [[16_000], [31_600], [32_400], [20_000], [32_000] * 5 + [33_000] * 5])
+def test_a_pace_that_no_wrong_rate_explains_or_that_wavers_is_not_said(brings):
+    """The first second came before, so that its sum counts nowhere."""
+    assert not said_of(16_000, [16_000, *brings * (40 // len(brings))])

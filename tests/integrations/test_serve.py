@@ -16,13 +16,13 @@ from websockets.asyncio.client import connect
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 
 import edgefilter
-from edgefilter import EgoFilter
+from edgefilter import EgoFilter, SignalError
 from edgefilter.cli import main
 from edgefilter.dsp.metrics import si_sdr
 from edgefilter.integrations import serve as module
 from edgefilter.integrations.opus import Decoder, Encoder
 from edgefilter.integrations.serve import Service
-from edgefilter.integrations.wire import HEADER, Form
+from edgefilter.integrations.wire import HEADER, Form, TwoStreams
 
 ROOT = Path(__file__).parents[2]
 DEMO = Path(edgefilter.__file__).parent / "demo_data"
@@ -135,7 +135,8 @@ def test_other_rates_give_as_many_samples_as_came_and_8_ms_more_of_delay(convers
     mic, ref = (soxr.resample(x[: 4 * RATE], RATE, rate) for x in conversation[:2])
     sound, told = run(heard({"rate": rate}, stereo_messages(mic, ref, rate // 50), engine="linear"))
     out = as_float(b"".join(sound))
-    assert abs(out.size - mic.size) <= 3 and told[0]["delay_ms"] <= 40
+    assert abs(out.size - mic.size) <= 3 and 32 < told[0]["delay_ms"] <= 40
+    assert told[0]["delay_ms"] == round(told[0]["delay_ms"], 1)
     late = slice(rate * 2, rate * 3)
     assert 10 * np.log10(np.mean(out[late] ** 2) / np.mean(mic[late] ** 2)) < -15
 
@@ -233,7 +234,8 @@ def test_opus_at_32_kbit_leaves_enough_of_the_echo_to_notice_the_human(conversat
     mic, ref, human = conversation
     encoders = [Encoder(32_000), Encoder(32_000)]
     messages = [
-        HEADER.pack(label, number, number * 960) + encoders[label].push(x[number * 320 : number * 320 + 320])[0]
+        HEADER.pack(label, number, number * 960)
+        + encoders[label].push(x[number * 320 : number * 320 + 320], last=False)[0]
         for number in range(mic.size // 320)
         for label, x in ((MICROPHONE, mic), (REFERENCE, ref))
     ]
@@ -302,6 +304,78 @@ def test_a_message_that_cannot_be_read_ends_its_connection_and_no_other(form, me
     told, answer = run(talk())
     assert told[-1]["kind"] == "error" and words in told[-1]["detail"]
     assert len(answer) > 0
+
+
+def two_streams(late=0):
+    """At 1000 samples a second, whose sound is float32."""
+    return TwoStreams(*(lambda sound: np.frombuffer(sound, np.float32),) * 2, 1000, late)
+
+
+SAID = np.random.default_rng(0).standard_normal(4000).astype(np.float32)
+
+
+def part(label, number, at, size=20):
+    """A message with that part of SAID."""
+    return HEADER.pack(label, number % 65536, at) + SAID[at : at + size].tobytes()
+
+
+def test_a_message_that_is_missing_is_given_up_after_60_ms():
+    two = two_streams()
+    for number in (0, 2, 3, 4, 5):
+        two.push(part(MICROPHONE, number, 20 * number))
+    np.testing.assert_array_equal(two.take()[0], SAID[:20])
+    assert two.lost == 0
+    two.push(part(MICROPHONE, 6, 120))
+    np.testing.assert_array_equal(two.take()[0], np.concatenate((np.zeros(20, np.float32), SAID[40:120])))
+    assert two.lost == 20 and two.take(last=True)[0].size == 20
+
+
+def test_messages_are_counted_on_from_65535_to_0_and_one_that_comes_twice_counts_once():
+    two = two_streams()
+    for number in (65_534, 65_535, 65_535, 65_537, 65_536, 65_538, 65_535):
+        two.push(part(MICROPHONE, number, 20 * (number - 65_534)))
+    np.testing.assert_array_equal(two.take(last=True)[0], SAID[:100])
+    assert two.lost == 0
+
+
+def test_of_a_reference_before_the_microphone_the_latest_64_messages_are_kept():
+    two = two_streams()
+    for number in range(70):
+        two.push(part(REFERENCE, number, 20 * number))
+    assert two.take()[0].size == two.take()[1].size == 0
+    for number in range(6, 70):
+        two.push(part(MICROPHONE, number, 20 * number))
+    mic, ref = two.take()
+    np.testing.assert_array_equal(mic, SAID[120:1400])
+    np.testing.assert_array_equal(ref, mic)
+    assert two.late == two.lost == 0
+
+
+def test_the_microphone_waits_for_its_reference_as_long_as_was_said():
+    two = two_streams(late=50)
+    for number in range(5):
+        two.push(part(MICROPHONE, number, 20 * number))
+    mic, ref = two.take()
+    assert mic.size == 80 - 50 and not ref.any()
+    two.push(part(REFERENCE, 0, 20, size=30))
+    mic, ref = two.take()
+    np.testing.assert_array_equal(ref, SAID[30:50])
+    assert two.late == 10 and two.lateness == 10
+
+
+@pytest.mark.parametrize(("label", "gap"), [(MICROPHONE, 10_000), (REFERENCE, 10_000)])
+def test_a_gap_of_ten_seconds_is_filled_and_a_longer_one_is_another_stream(label, gap):
+    for more, at in ((0, 20), (1, 21)):
+        two = two_streams()
+        two.push(part(MICROPHONE, 0, 0))
+        two.push(part(REFERENCE, 0, 0))
+        message = HEADER.pack(label, 1, gap + at) + SAID[:20].tobytes()
+        if more:
+            with pytest.raises(SignalError, match="jumps by 10.0 s, expected 10 s at most"):
+                two.push(message)
+        else:
+            two.push(message)
+            assert two.take(last=True)[label].size == (gap + 40 if label == MICROPHONE else 20)
 
 
 def test_a_counter_that_jumps_by_hours_ends_the_connection_and_fills_no_memory():

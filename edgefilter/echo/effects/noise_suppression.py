@@ -72,7 +72,7 @@ class NoiseSuppression(Effect):
         whole = np.zeros((pieces.shape[0] + 1, HOP))
         whole[:-1] += pieces[:, :HOP]
         whole[1:] += pieces[:, HOP:]
-        return whole.reshape(-1)[HOP : HOP + x.size].astype(np.float32)
+        return whole.ravel()[HOP : HOP + x.size].astype(np.float32)
 
     def run(self, values: Values, sample_rate: int) -> Runner:
         """The voice as it is: a gain by frequency takes as long as a frame, which the running filter does not wait."""
