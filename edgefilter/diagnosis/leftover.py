@@ -66,7 +66,7 @@ def _tones(residual: Samples, psd: Samples) -> tuple[Array, float, float]:
     if not at.size:
         return np.zeros(0), 0.0, 0.0
     over = np.maximum(power - expected, 0.0)
-    near = np.unique(np.clip(at[:, None] + np.arange(-2, 3), 0, power.size - 1))
+    near = np.unique(np.minimum(at[:, None] + np.arange(-2, 3), power.size - 1))
     share = float(over[near].sum()) / max(float(over.sum()), 1e-30)
     mains = 0.0
     for grid in (50.0, 60.0):

@@ -61,7 +61,7 @@ class BargeInSettings:
 class HumanJudge:
     """Smooths the network's probability that a human speaks, of one stream, with or without a profile; step once each hop_s."""
 
-    def __init__(self, hop_s: float, calibrated: bool = False) -> None:
+    def __init__(self, hop_s: float, calibrated: bool) -> None:
         self._centre = CENTRE_CALIBRATED if calibrated else CENTRE
         self._follow = 1.0 - math.exp(-hop_s / ODDS_MEMORY_S)
         self._odds = 0.0

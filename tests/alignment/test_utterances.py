@@ -82,14 +82,14 @@ def first_sounds(power, explained=0.0, loudest=0.0, state="begun", waits=True, f
 )
 def test_a_robot_whose_lag_is_unknown_is_told_by_its_level_13_db_below_its_loudest(loudest, explained, least):
     """At first a voice is taken to reach -20 dB; at a delay that explains some of it, 20 dB more than that."""
-    assert first_sounds(1.01 * least, explained, loudest) and not first_sounds(0.99 * least, explained, loudest)
+    assert first_sounds(1.005 * least, explained, loudest) and not first_sounds(0.995 * least, explained, loudest)
     assert not first_sounds(1.01 * least, explained, loudest, waits=False)
 
 
 def test_once_the_robot_was_heard_its_level_is_known_and_believed_for_a_quarter_of_a_second():
     first = FirstSounds(1000, np.ones(1))
-    for _ in range(2):  # 3 dB more than calibrated, of which a tenth is believed at once
-        assert not first_sounds(2.0, 1.0, 1.0, "locked", False, first)
-    least = 0.05 * (1.1 + 0.1 * (2.0 - 1.1))
+    for _ in range(2):  # 6 dB more than calibrated: a tenth of 3 dB is believed at once
+        assert not first_sounds(4.0, 1.0, 1.0, "locked", False, first)
+    least = 0.05 * 1.1**2
     assert not first_sounds(0.99 * least, 0.0, 1.0, first=first)
     assert [first_sounds(1.01 * least, 0.0, 1.0, first=first) for _ in range(6)] == [True] * 4 + [False] * 2

@@ -45,6 +45,7 @@ def test_an_engine_that_stops_judging_ends_the_speech():
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
+        ({"min_speech_s": -1.0}, "min_speech_s -1.0 and min_silence_s 0.5, expected seconds"),
         ({"threshold": 1.0}, "release 0.4 and threshold 1.0, expected probabilities"),
         ({"release": 0.98}, "release 0.98 and threshold 0.97"),
         ({"release": 0.0}, "release 0.0"),
@@ -74,7 +75,7 @@ def test_one_sure_hop_does_not_interrupt_a_robot_that_nobody_calibrated():
 
 
 def test_who_interrupts_again_and_again_is_noticed_each_time_as_soon():
-    judge, delays = HumanJudge(HOP_S), []
+    judge, delays = HumanJudge(HOP_S, False), []
     for _ in range(12):
         for _ in range(125):
             judge.step(UNSURE)
@@ -84,7 +85,7 @@ def test_who_interrupts_again_and_again_is_noticed_each_time_as_soon():
 
 
 def test_what_may_be_an_utterance_that_is_not_found_yet_is_nobody_and_leaves_nothing_behind():
-    judge = HumanJudge(HOP_S)
+    judge = HumanJudge(HOP_S, False)
     assert [judge.step(1.0, suspect=True) for _ in range(30)] == [0.0] * 30
     assert judge.step(UNSURE) < 0.1
 
@@ -221,3 +222,23 @@ def test_however_long_it_was_sure_the_network_is_heard_when_it_changes_its_mind(
     assert 1.0 - [judge.step(1.0) for _ in range(60)][-1] == pytest.approx(unlikely, rel=0.05)
     said = [judge.step(0.0) for _ in range(60)]
     assert said[2] < 0.5 and said[-1] == pytest.approx(0.00103 if not calibrated else 0.0049, rel=0.05)
+
+
+def test_without_a_least_silence_the_first_silent_hop_ends_the_speech():
+    assert noted([0.99, 0.0, 0.99], BargeInSettings(min_silence_s=0.0)) == [
+        *("speech_started", "speech_stopped", "speech_started")
+    ]
+
+
+def test_at_the_end_of_a_recording_speech_is_over_and_the_next_begins_anew():
+    talk = BargeIn(HOP_S, BargeInSettings(min_speech_s=2 * HOP_S, min_silence_s=2 * HOP_S))
+    assert [talk.note(0.99) for _ in range(2)] == [None, "speech_started"]
+    assert talk.end() is True and not talk.speaking and talk.end() is False
+    assert [talk.note(each) for each in (0.99, 0.99, 0.0, 0.0)] == [None, "speech_started", None, "speech_stopped"]
+
+
+def test_how_long_a_beginning_was_not_told_is_known_when_it_is():
+    talk = BargeIn(HOP_S)
+    assert [talk.note(0.99, wait=3) for _ in range(4)][-1] == "speech_started" and talk.waited == 3
+    talk.end()
+    assert talk.note(0.99) == "speech_started" and talk.waited == 0

@@ -262,3 +262,25 @@ def test_the_weights_of_a_finished_turn_know_nothing_of_the_turn_before() -> Non
 
     alone, after = finished(talkers[1:]), finished(talkers)
     assert np.abs(after - alone).max() < 0.15 * np.abs(alone).max()
+
+
+@pytest.mark.parametrize(("probability", "changed"), [(0.29, True), (0.31, False), (0.49, False), (0.51, True)])
+def test_a_hop_tells_of_the_noise_or_of_the_human_where_it_is_likely_and_of_neither_between(probability, changed):
+    rng = np.random.default_rng(0)
+    spatial, ones = SpatialFilter(STFT, 3, fan_below()), np.ones(STFT.bins, np.float32)
+    before = spatial.weights.copy()
+    spatial.learn(complex_noise(rng, 3, STFT.bins), ones, probability, False, True)
+    assert np.array_equal(spatial.weights, before) is not changed
+
+
+def test_a_fan_that_was_not_calibrated_is_known_after_1_2_s_and_followed_over_as_long():
+    spatial, ones = SpatialFilter(STFT, 3), np.ones(STFT.bins, np.float32)
+    rng = np.random.default_rng(0)
+    errors = [np.exp(2j * np.pi * rng.random((3, STFT.bins))).astype(np.complex64) for _ in range(75)]
+    for error in errors:
+        assert spatial.fan_psd() is None
+        spatial.learn(error, ones, 0.0, False, True)
+    first = spatial.fan_psd()
+    for error in 4 * errors:
+        spatial.learn(error, ones, 0.0, False, True)
+    assert np.median(first) / np.median(spatial.fan_psd()) == pytest.approx(1 - np.exp(-1.0), rel=0.03)
