@@ -15,7 +15,7 @@ from edgefilter.errors import DeviceError, UsageError
 
 
 def _sounddevice() -> Any:
-    """Import sounddevice; raise DeviceError, one line, where it or the PortAudio library is missing."""
+    """Import sounddevice; raise DeviceError, one line, where it or the PortAudio library is missing or cannot be started."""
     try:
         import sounddevice
     except ImportError:
@@ -23,6 +23,9 @@ def _sounddevice() -> Any:
         raise DeviceError(f"live audio needs {missing}") from None
     except OSError as error:
         raise DeviceError(f"live audio needs the PortAudio library ({error}): apt install libportaudio2") from None
+    except Exception as error:  # PortAudioError, which that module alone could name
+        why = " ".join(str(error).split())
+        raise DeviceError(f"PortAudio cannot be started ({why}): check the configuration of the sound system") from None
     silence_alsa()
     return sounddevice
 

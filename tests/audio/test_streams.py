@@ -150,18 +150,30 @@ def test_monitors_are_found_by_the_names_of_each_sound_system():
         monitor(DEVICES[:3], DEVICES[1])
 
 
-def test_missing_portaudio_names_the_package(tmp_path):
-    (tmp_path / "sounddevice.py").write_text("raise OSError('PortAudio library not found')")
+@pytest.mark.parametrize(
+    ("module", "said"),
+    [
+        (
+            "raise OSError('PortAudio library not found')",
+            "live audio needs the PortAudio library (PortAudio library not found): apt install libportaudio2",
+        ),
+        (
+            "class PortAudioError(Exception): pass\nraise PortAudioError('Error initializing PortAudio:\\n host error')",
+            "PortAudio cannot be started (Error initializing PortAudio: host error): check the configuration of the"
+            " sound system",
+        ),
+    ],
+    ids=["is not there", "cannot be started"],
+)
+def test_a_portaudio_that_is_missing_or_cannot_be_started_is_one_line(tmp_path, module, said):
+    (tmp_path / "sounddevice.py").write_text(module)
     code = (
         "from edgefilter.audio.device import list_devices\ntry: list_devices()\nexcept Exception as e:"
         " print(type(e).__name__, e)"
     )
     environment = os.environ | {"PYTHONPATH": f"{tmp_path}:{Path(__file__).parents[2]}"}
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment)
-    assert (
-        done.stdout == "DeviceError live audio needs the PortAudio library (PortAudio library not found): apt install"
-        " libportaudio2\n"
-    )
+    assert done.stdout == f"DeviceError {said}\n"
 
 
 def test_inlet_keeps_the_place_of_what_it_lost():
