@@ -122,8 +122,10 @@ def _folder(path: str | None) -> Iterator[Path]:
     try:
         yield folder
     except BaseException:
-        if any(folder.iterdir()):
+        if any(folder.glob("*_recording.wav")):
             say(f"what was recorded is kept in {folder}")
+        elif not path:
+            shutil.rmtree(folder)
         raise
     if not path:
         shutil.rmtree(folder)

@@ -41,6 +41,12 @@ def test_recordings_of_a_calibration_that_failed_are_kept_and_their_place_is_sai
     assert soundfile.info(folder / "noise_recording.wav").frames == 6 * 16000
 
 
+def test_of_a_calibration_that_recorded_nothing_nothing_is_left(calibrate, tmp_path):
+    code, said = calibrate(0.0, "--speaker", "nobody")
+    assert code == 2 and "output device 'nobody' is unknown" in said[-1]
+    assert not any("is kept in" in line for line in said) and not list(tmp_path.iterdir())
+
+
 def test_recordings_go_where_the_user_wants_them(calibrate, tmp_path):
     code, _ = calibrate(0.0, "--save-input", tmp_path / "kept")
     assert code == 0 and len(list((tmp_path / "kept").glob("*.wav"))) == 3
