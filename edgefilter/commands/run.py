@@ -68,6 +68,8 @@ def main(args: argparse.Namespace) -> int:
         report.interrupted |= bool(stopped)
     for note in [*source.notes[told:], *sink.notes]:
         say(note)
+    if (report.filter["learning"] or {}).get("process") == "ended":
+        say("the learner's process ended before the run: from then on nothing was learned")
     figures = report.to_dict() | {"choice": choice.to_dict() if choice else None}
     figures |= {"source": source.stats(), "sink": sink.stats(), "notes": [*source.notes, *sink.notes]}
     _write_results(args, ego, observers, report, figures)

@@ -1,9 +1,11 @@
 """What befalls sound devices while a run goes on, on virtual ones: it goes on, says so, and counts what is missing."""
 
 import json
+import sys
 
 import numpy as np
 import pytest
+import soundfile
 
 from edgefilter.audio.files import FileSink, FileSource
 from edgefilter.audio.live import LiveSink, LiveSource
@@ -247,6 +249,15 @@ def test_all_channels_of_a_device_are_opened_where_that_is_asked(plug):
     np.testing.assert_allclose(heard[-1], [0.1, 0.2, 0.3, 0.4], atol=1e-6)
     with pytest.raises(UsageError, match="'mixer' has 32 channels, expected at most 8 microphones: name them"):
         LiveSource("mixer", channels=ALL_CHANNELS)
+
+
+def test_a_run_whose_learner_cannot_be_started_says_so_and_filters_all(both, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(sys, "executable", "/nowhere/python")
+    monkeypatch.setattr("edgefilter.commands.run.allowed_cores", lambda: {0, 1})  # on one core nothing is learned
+    words = ["run", "--input", "mic", "--reference", "ref", "--engine", "linear", "--seconds", "1", "--quiet"]
+    assert main([*words, "--output", str(tmp_path / "out.wav")]) == 0
+    assert "the learner's process ended before the run" in capsys.readouterr().err
+    assert soundfile.info(tmp_path / "out.wav").frames == 16000
 
 
 @pytest.mark.parametrize("microphones", [3, 1])
