@@ -1,7 +1,9 @@
-"""Docstrings of the public entry points have numpydoc's sections, for what their signatures have."""
+"""Docstrings of the public entry points have numpydoc's sections, for what their signatures have; none names its arguments wrongly."""
 
+import ast
 import inspect
 import re
+from pathlib import Path
 
 import pytest
 
@@ -55,3 +57,18 @@ def test_docstring_describes(name):
     raised = re.findall(r"^(\w+Error(?:, \w+Error)*)$", parts.get("Raises", ""), re.M)
     assert all(hasattr(edgefilter, error) for line in raised for error in line.split(", "))
     assert raised or "Raises" not in parts
+
+
+def test_no_docstring_begins_with_an_argument_that_got_a_capital():
+    """Not "Mic (n,) and its reference", where the argument is called mic."""
+    found, seen = [], 0
+    for folder in ("edgefilter", "bench", "export"):
+        for path in sorted((Path(__file__).parents[2] / folder).rglob("*.py")):
+            for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+                if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef) and (text := ast.get_docstring(node)):
+                    seen += 1
+                    first = re.match(r"([A-Z]\w*)(?: \(|:)", text)
+                    names = (*node.args.posonlyargs, *node.args.args, *node.args.kwonlyargs)
+                    if first and first[1].lower() in {name.arg.lower() for name in names}:
+                        found.append(f"{path.name}, {node.name}: {text.splitlines()[0]}")
+    assert seen > 1000 and not found

@@ -269,7 +269,7 @@ class _Halves:
         self._target = target[self.used, None] * self._root
 
     def columns(self, signals: Iterable[Samples], count: int) -> Samples:
-        """Signals (n,) at the samples that count, the first half's in front, weighted, (used, count)."""
+        """The signals, count of them, (n,), at the samples that count, the first half's in front, weighted, (used, count)."""
         out = np.empty((self.used.size, count), np.float32)
         for column, signal in zip(out.T, signals, strict=True):
             np.multiply(signal[self.used], self._root[:, 0], out=column)
