@@ -190,6 +190,7 @@ class _BoundedReader:
 
     def __init__(self, reader: asyncio.StreamReader) -> None:
         self._reader, self.readline, self.feed_eof = reader, reader.readline, reader.feed_eof
+        self.at_eof = reader.at_eof
 
     async def readexactly(self, count: int) -> bytes:
         if count > MOST_BYTES:
@@ -207,6 +208,8 @@ class _Client(AsyncEventHandler):
     async def run(self) -> None:
         try:
             await super().run()
+            if not self.reader.at_eof():
+                raise SignalError("found what is no message, expected one in JSON")
         except (ConnectionError, EOFError):
             pass  # it has gone
         except Exception as error:

@@ -227,6 +227,8 @@ def test_a_client_that_speaks_another_language_is_disconnected(endless_noise, pl
 
     within_a_minute(talk)
     assert not [record for record in caplog.records if record.exc_info], "no traceback"
+    told = logged(caplog)
+    assert len(told) == 4 and all("connection is closed" in line for line in told), told
 
 
 class BrokenMicrophone(AsyncEventHandler):
