@@ -2,6 +2,7 @@
 
 import gc
 import os
+import pickle
 import signal
 import subprocess
 import sys
@@ -135,6 +136,26 @@ def test_the_filter_goes_on_where_the_learner_has_died(short):
     out = np.concatenate((ego.process(short.mic, short.reference), ego.flush()))
     np.testing.assert_allclose(out, plain(short), atol=1e-5)
     assert ego.stats()["learning"]["process"] == "ended"
+    ego.close()
+
+
+def test_a_message_of_which_half_has_come_is_taken_when_it_is_whole(tmp_path, monkeypatch):
+    data = pickle.dumps(background.News(0, {"hops": 7}, None))
+    (tmp_path / "message").write_bytes(background.LENGTH.pack(len(data)) + data)
+    (tmp_path / "program").write_text(
+        f"#!/bin/sh\ncd {tmp_path}\nhead -c 20 message\ntouch half\nwhile [ ! -e go ]; do sleep 0.01; done\n"
+        "tail -c +21 message\ncat >heard\n"
+    )
+    (tmp_path / "program").chmod(0o755)
+    monkeypatch.setattr(sys, "executable", str(tmp_path / "program"))
+    learner, deadline = BackgroundLearner(), time.monotonic() + 60
+    ego = EgoFilter(engine="linear", learn=learner)
+    while not (tmp_path / "half").exists():
+        assert time.monotonic() < deadline
+    assert "hops" not in learner.stats()
+    (tmp_path / "go").touch()
+    while learner.stats().get("hops") != 7:
+        assert time.monotonic() < deadline, learner.stats()
     ego.close()
 
 
