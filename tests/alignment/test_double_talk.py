@@ -2,9 +2,10 @@
 
 import numpy as np
 import pytest
+from scipy import signal
 
 from edgefilter.alignment.aligner import Aligner
-from edgefilter.alignment.delay_tracker import STRIDE, DelayMeasurement, DriftFilter
+from edgefilter.alignment.delay_tracker import DRIFTED, STRIDE, DelayMeasurement, DriftFilter
 from tests.alignment.scene import (
     RATE,
     double_talk,
@@ -26,35 +27,31 @@ def look(offset, evidence=30.0, explained=0.1, gain=0.3):
     return DelayMeasurement(offset, 0.05**2, evidence / ratio, ratio, 1.0, explained, gain, 0.3)
 
 
-def see(aligner, delay, *more, **others):
-    """The aligner's next look, which sees this delay."""
-    aligner._drift.advance(STRIDE)
-    aligner._take_look(look(delay - aligner._drift.delay, *more, **others))
-
-
-def followed(aligner):
-    """The delay in samples, and by how much it grows a sample, that an aligner tells."""
-    stats = aligner.stats()
-    return stats["delay_samples"], -1e-6 * stats["ppm"]
+def see(drift, delay, evidence=30.0):
+    """Take the next look, which sees this delay, and return by how much it has jumped: what is less is the drift."""
+    drift.advance(STRIDE)
+    found = look(delay - drift.delay, evidence)
+    where = drift.where_seen(found, found.gain, far=False)
+    if where == "there" or (where == "jumped" and abs(found.offset) < DRIFTED):
+        drift.correct(found)
+        return 0.0
+    return found.offset if where == "jumped" else 0.0
 
 
 def follow(seen, evidence):
-    """An aligner that found a lag of 1000 and then looks 16 times a second, each look seeing the delay of `seen`."""
-    aligner = Aligner(256)
-    aligner._switch(1000.0, 3.0)
-    for delay, weight in zip(seen, evidence, strict=True):
-        see(aligner, delay, weight)
-    return aligner
+    """What is believed after a lag of 1000 and then 16 looks a second, each seeing the delay of `seen`; none sees a jump."""
+    drift = DriftFilter()
+    drift.restart(1000.0, 3.0)
+    assert not any([see(drift, delay, weight) for delay, weight in zip(seen, evidence, strict=True)])
+    return drift
 
 
 def test_first_looks_that_err_alike_are_no_drift_which_jumps_then_have_to_undo():
     rng = np.random.default_rng(1)
     seen = 1000.0 + 0.04 * rng.standard_normal(80)
     seen[:5] += (0.0, 0.3, 0.5, 0.7, 0.8)  # while the response is learnt: taken at its word, a slope of 200 ppm
-    aligner = follow(seen, np.full(80, 30.0))
-    assert aligner.stats()["jumps"] == 0
-    delay, slope = followed(aligner)
-    assert abs(delay - 1000.0) < 0.2 and abs(slope) < 10e-6  # 10 ppm: 0.2 samples in a second
+    drift = follow(seen, np.full(80, 30.0))
+    assert abs(drift.delay - 1000.0) < 0.2 and abs(drift.slope) < 10e-6  # 10 ppm: 0.2 samples in a second
 
 
 @pytest.mark.parametrize("ppm", [40.0, -300.0])
@@ -63,27 +60,23 @@ def test_a_weak_first_look_at_a_reflection_gives_no_slope_that_later_looks_refut
     evidence = np.full(64, 32.0)
     seen[0] -= 2.5
     evidence[0] = 17.6
-    aligner = follow(seen, evidence)
-    assert aligner.stats()["jumps"] == 0
-    delay, slope = followed(aligner)
-    assert abs(delay - seen[-1]) < 0.3 and abs(slope + ppm * 1e-6) < 10e-6
+    drift = follow(seen, evidence)
+    assert abs(drift.delay - seen[-1]) < 0.3 and abs(drift.slope + ppm * 1e-6) < 10e-6
 
 
 def test_drift_that_builds_up_unseen_while_the_human_is_louder_is_no_jump():
-    slope, aligner = 150e-6, Aligner(256)
-    aligner._switch(1000.0, 0.3)
-    truth = 1000.0
+    slope, truth, drift, jumps = 150e-6, 1000.0, DriftFilter(), []
+    drift.restart(truth, 0.3)
     for second in range(14):
         for number in range(16):
             truth += slope * STRIDE
             bias = 0.25 * (-1) ** second  # looks of one sentence err alike
             if number < 6:
-                see(aligner, truth + bias)
+                jumps.append(see(drift, truth + bias))
             else:
-                aligner._drift.advance(STRIDE)
-    assert aligner.stats()["jumps"] == 0
-    delay, found = followed(aligner)
-    assert abs(delay - truth) < 1.0 and abs(found - slope) < 30e-6
+                drift.advance(STRIDE)
+    assert not any(jumps)
+    assert abs(drift.delay - truth) < 1.0 and abs(drift.slope - slope) < 30e-6
 
 
 def test_a_look_that_contradicts_what_is_believed_is_followed_once_it_is_taken():
@@ -99,19 +92,20 @@ def test_a_look_that_contradicts_what_is_believed_is_followed_once_it_is_taken()
 
 
 def test_a_jump_just_after_a_look_says_nothing_of_the_clocks_and_one_after_a_pause_does():
-    def certainty_after(pause):
+    def deviation_after(pause):
+        """Of the delay, 10 s after the jump in which nothing is seen."""
         drift = DriftFilter()
         drift.restart(1000.0, 0.3)
         for _ in range(160):
             drift.advance(STRIDE)
             drift.correct(look(1000.0 - drift.delay))
         drift.advance(pause)
-        before = drift._slope_variance
         drift.step(3.0, 0.3)
-        return drift._slope_variance / before
+        drift.advance(10 * RATE)
+        return drift.deviation
 
-    assert certainty_after(STRIDE) == 1.0  # 3 samples in 64 ms are no clocks
-    assert certainty_after(2 * RATE) > 100.0  # in 2 s they are 94 ppm
+    assert deviation_after(STRIDE) < 0.4  # 3 samples in 64 ms are no clocks
+    assert deviation_after(2 * RATE) == pytest.approx(15.0, abs=0.1)  # in 2 s they are 94 ppm
 
 
 @pytest.mark.parametrize(("level_db", "ppm"), [(-10, 150.0), (-10, -300.0), (0, -150.0), (26, 300.0)])
@@ -175,41 +169,55 @@ def test_a_robot_that_is_hidden_is_lost_after_three_looks_two_hops_apart():
     assert len(missed) == 3 and np.all(np.diff(missed) == 2) and first + 1 + missed[-1] == lost
 
 
-def after_a_pause(jump: float, slope: float) -> list[float]:
-    """What is believed of the clocks, ppm, look by look after 2 s unseen in which the delay has moved by jump samples."""
-    rng, aligner, truth = np.random.default_rng(2), Aligner(256), 1000.0
-    aligner._switch(truth, 3.0)
-    found = []
-    for at in range(184):
-        if at == 160:
-            aligner._drift.advance(2 * RATE)
-            truth += jump
-        truth += slope * STRIDE if at >= 160 else 0.0
-        see(aligner, truth + 0.05 * rng.standard_normal(), 45.0, 0.5)
-        found.append(aligner.stats()["ppm"])
-    assert aligner.stats()["jumps"] == 1
-    return found[160:]
+def delayed(ref, delay):
+    """The reference (n,), heard at the delay of each sample (n,)."""
+    fine = signal.resample_poly(ref, 8, 1)
+    return np.interp((np.arange(ref.size) - delay) * 8, np.arange(fine.size), fine, left=0.0, right=0.0)
+
+
+def after_a_pause(jump: float, slope: float = 0.0):
+    """The hops after 2 s unseen in which the delay has moved by jump samples, from 1000 on, and the aligner's stats."""
+    rng, back = np.random.default_rng(2), 4 * RATE
+    ref = speech_like(rng, 6.0)
+    since = np.arange(ref.size) - back
+    mic = 0.5 * delayed(ref, 1000.0 + np.where(since < 0, 0.0, jump + slope * since)) + fan(rng, ref.size)
+    mic[back - 2 * RATE : back] = 3.0 * np.std(mic) * rng.standard_normal(2 * RATE)
+    aligner = Aligner(256)
+    return run(aligner, mic.astype(np.float32), ref)[back // 256 :], aligner.stats()
 
 
 def test_a_small_jump_after_a_pause_may_be_the_clocks_which_are_then_followed_at_once():
-    ppm = after_a_pause(4.0, 125e-6)
-    assert np.abs(np.array(ppm[6:]) + 125.0).max() < 20.0  # half a second later
+    hops, stats = after_a_pause(4.0, 125e-6)
+    assert stats["jumps"] == 1
+    assert all(abs(hop.ppm + 125.0) < 20.0 for hop in hops[RATE // 2 // 256 :])
 
 
 def test_a_large_jump_after_a_pause_is_a_buffer_and_says_nothing_of_the_clocks():
-    ppm = after_a_pause(12.0, 0.0)
-    assert np.abs(ppm).max() < 3.0  # what jitter allows
+    hops, stats = after_a_pause(12.0)
+    assert stats["jumps"] == 1
+    assert all(abs(hop.ppm) < 3.0 for hop in hops)  # what jitter allows
+
+
+def test_an_error_of_a_sample_after_a_pause_is_followed_and_no_jump():
+    hops, stats = after_a_pause(1.3)
+    assert stats["jumps"] == 0 and stats["realignments"] == 1
+    assert all(abs(hop.delay - 1001.3) < 0.2 for hop in hops[RATE // 2 // 256 :])
 
 
 def test_somebody_far_louder_than_the_robot_has_been_hides_it_and_says_nothing_of_its_delay():
     """Neither a jump, however clear its peak, nor a robot that is lost."""
-    aligner = follow(np.full(16, 1000.0), np.full(16, 45.0))
+    ref = speech_like(np.random.default_rng(3), 5.0)
+    mic, later = 0.5 * delayed(ref, 1000.0), 0.5 * delayed(ref, 1300.0)
+    loud, soft = 2 * RATE, 4 * RATE
+    mic[loud:soft], mic[soft:] = 10 * later[loud:soft], later[soft:]
+    aligner = Aligner(256)
+
+    def after(begin, end):
+        run(aligner, mic[begin:end].astype(np.float32), ref[begin:end])
+        return aligner.stats()
+
     counts = "jumps", "searches", "confidence"
-    before = aligner.stats()
-    for _ in range(20):
-        see(aligner, 1300.0, 60.0, gain=11 * 0.3)
-    after = aligner.stats()
-    assert [after[name] for name in counts] == [before[name] for name in counts]
-    for _ in range(20):
-        see(aligner, 1300.0, 60.0)
-    assert aligner.stats()["jumps"] == 1
+    before, hidden = after(0, loud + 12 * 256), after(loud + 12 * 256, soft)
+    assert before["state"] == hidden["state"] == "locked"
+    assert [hidden[name] for name in counts] == [before[name] for name in counts]
+    assert after(soft, ref.size)["jumps"] == 1
