@@ -225,13 +225,15 @@ def test_an_early_lag_that_chance_can_reach_has_to_be_found_twice_in_a_row():
     assert aligner.stats()["realignments"] == 1
 
 
-def test_no_step_of_a_search_comes_twice_in_a_hop():
+def test_no_step_of_a_search_comes_twice_in_a_hop(monkeypatch):
     rng = np.random.default_rng(13)
     ref, _ = utterances(rng, [3, 3], [1.5, 1.5])
     aligner, steps = Aligner(256), []
     for name in ("prepare", "listen", "find", "before"):
-        inner = getattr(aligner._lags, name)
-        setattr(aligner._lags, name, lambda *given, name=name, inner=inner: (steps.append(name), inner(*given))[1])
+        inner = getattr(LagSearch, name)
+        monkeypatch.setattr(
+            LagSearch, name, lambda *given, name=name, inner=inner: (steps.append(name), inner(*given))[1]
+        )
     counts = []
     for at in range(0, ref.size - 255, 256):
         aligner.step(fan(rng, 256), ref[at : at + 256])

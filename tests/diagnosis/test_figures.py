@@ -5,12 +5,16 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from edgefilter.diagnosis import precision, probe
+from edgefilter.diagnosis.precision import precision
 from edgefilter.diagnosis.prepare import utterance_lags
+from edgefilter.diagnosis.probe import Inquiry
 from edgefilter.diagnosis.score import share_of
-from edgefilter.echo.effects.catalogue import find
+from edgefilter.echo.effects.catalogue import register
+from edgefilter.echo.effects.playback_gain import PlaybackGain
+from edgefilter.echo.model import EchoModel
 from edgefilter.errors import SignalError, UsageError
 from edgefilter.types import SAMPLE_RATE
+from tests.diagnosis.robot_scene import path, profile, record, voice
 
 
 @pytest.mark.parametrize(
@@ -28,26 +32,30 @@ def test_where_nothing_was_over_the_fan_nothing_is_explained():
 @pytest.mark.parametrize(
     "error", [np.linalg.LinAlgError("singular matrix"), FloatingPointError("overflow"), ZeroDivisionError("by zero")]
 )
-def test_an_explanation_that_cannot_be_fitted_is_one_line_that_names_it(monkeypatch, error):
-    def fails(*arguments):
-        raise error
+def test_an_explanation_that_cannot_be_fitted_is_one_line_that_names_it(own_catalogue, error):
+    class Unfit(PlaybackGain):
+        name = "unfit"
 
-    monkeypatch.setattr(probe, "fit_jointly", fails)
-    with pytest.raises(SignalError, match="late_reverb\\+codec cannot be fitted to the recording") as caught:
-        probe._fitted(None, None, ("late_reverb", "codec"))
+        def fit(self, measurement, model):
+            raise error
+
+    register(Unfit())
+    x = voice(2.0)
+    with pytest.raises(SignalError, match="late_reverb\\+unfit cannot be fitted to the recording") as caught:
+        Inquiry(profile(), [("late_reverb", "unfit")], record(x, EchoModel(path())), x)
     assert str(error) in str(caught.value) and "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize("error", [FloatingPointError("overflow"), UsageError("ratio is 1e9, expected 1 to 50")])
-def test_a_number_beside_which_the_effect_cannot_be_applied_has_no_standard_error_and_ends_nothing(error):
+def test_a_number_beside_which_the_effect_cannot_be_applied_has_the_scatter_of_the_thirds_alone_and_ends_nothing(error):
     def fails(*arguments):
         raise error
 
-    (parameter,) = (one for one in find("playback_gain").parameters if one.name == "gain_db")
-    known = SimpleNamespace(low=-3.0, high=-1.0)
+    known = SimpleNamespace(value=-2.0, low=-3.0, high=-1.0)
     finding = SimpleNamespace(effect="playback_gain", values={"gain_db": -2.0}, parameters={"gain_db": known})
     found = SimpleNamespace(prepared=SimpleNamespace(measurement=None), model=SimpleNamespace(with_effect=fails))
-    assert precision._derivative(found, finding, parameter, 0) is None
+    (number,) = precision(found, [finding]).numbers
+    assert number.source == "thirds"
 
 
 @pytest.mark.parametrize("later", [-1000, 0, 1000])
