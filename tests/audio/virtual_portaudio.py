@@ -19,8 +19,8 @@ class VirtualDevice:
     """One device. takes: (rate, channels) that it can be opened with, None for any. plugged: whether it is there.
 
     ppm: by how much its clock is fast. swallows: seconds of sound that its driver loses without a word. needs_s: buffer
-    below which each callback is marked as late. channels: how many it has; of more than two the k-th, from 0, sounds as
-    loud as k + 1 tenths. hears: the output whose sound this input gets, a callback later.
+    below which each callback is marked as late. level: every sample of an input. channels: how many it has; of more than
+    two the k-th, from 0, sounds as loud as k + 1 tenths. hears: the output whose sound this input gets, a callback later.
     """
 
     name: str
@@ -31,6 +31,7 @@ class VirtualDevice:
     ppm: float = 0.0
     swallows: float = 0.0
     needs_s: float = 0.0
+    level: float = 0.25
     channels: int = 2
     hears: VirtualDevice | None = None
     played: list = field(default_factory=list)
@@ -70,7 +71,7 @@ class Stream:
             self.count += 1
             status = SimpleNamespace(input_overflow=self.late, output_underflow=self.late)
             if self.device.kind == "input":
-                sound = np.full((size, self.channels), 0.25, np.float32)
+                sound = np.full((size, self.channels), self.device.level, np.float32)
                 if self.device.channels > 2:
                     sound = np.tile(0.1 * np.arange(1, self.channels + 1, dtype=np.float32), (size, 1))
                 if heard := self.device.hears:
