@@ -2,7 +2,6 @@
 
 import pytest
 
-from edgefilter.audio import pulse
 from edgefilter.cli import main
 from tests.audio.virtual_portaudio import VirtualDevice
 
@@ -10,11 +9,16 @@ INPUTS = ["alsa_input.usb-Acme", "edgefilter_speaker.monitor", "edgefilter_human
 
 
 @pytest.fixture
-def served(plug, monkeypatch):
-    """A sound server with the virtual devices, whose default microphone is the virtual one."""
+def served(plug, tmp_path, monkeypatch):
+    """A sound server with the virtual devices, whose default microphone is the virtual one, and which a program tells of."""
     plug(VirtualDevice("pulse", "input"), VirtualDevice("HDA Intel", "input"), VirtualDevice("HDA Intel", "output"))
-    monkeypatch.setattr(pulse, "names", lambda kind: INPUTS if kind == "input" else [])
-    monkeypatch.setattr(pulse, "default_name", lambda kind: "edgefilter_mic")
+    listed = "".join(f"{number}\\t{name}\\n" for number, name in enumerate(INPUTS))
+    program = tmp_path / "pactl"
+    program.write_text(
+        f"#!/bin/sh\ncase \"$*\" in\n'list short sources') printf '{listed}' ;;\nget-default-*) echo edgefilter_mic ;;\nesac\n"
+    )
+    program.chmod(0o755)
+    monkeypatch.setenv("PATH", str(tmp_path))
 
 
 @pytest.mark.parametrize("command", ["run", "doctor"])
