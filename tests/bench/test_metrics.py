@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -49,11 +51,15 @@ def test_transcripts_are_kept_by_sound_and_survive_a_cut_line(tmp_path: Path, mo
     (tmp_path / "config.json").write_text("{}")
     peaks: list[float] = []
 
-    def listen(self: Recogniser, samples: np.ndarray) -> str:
-        peaks.append(float(np.abs(samples).max()))
-        return f"said {len(peaks)}"
+    class WhisperModel:
+        def __init__(self, folder: str, **options: object) -> None:
+            assert folder == str(tmp_path)
 
-    monkeypatch.setattr(Recogniser, "_recognise", listen)
+        def transcribe(self, samples: np.ndarray, **options: object) -> tuple[list[SimpleNamespace], None]:
+            peaks.append(float(np.abs(samples).max()))
+            return [SimpleNamespace(text=" said"), SimpleNamespace(text=f" {len(peaks)} ")], None
+
+    monkeypatch.setitem(sys.modules, "faster_whisper", SimpleNamespace(WhisperModel=WhisperModel))
     first, other = babble(0.5, 1), babble(0.5, 2)
     one = Recogniser(tmp_path, Cache(tmp_path / "kept"))
     assert [one.transcribe(x) for x in (first, other, 0.5 * first)] == ["said 1", "said 2", "said 1"]

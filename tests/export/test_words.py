@@ -1,6 +1,8 @@
 """The comparisons of trained networks, on a network of four steps."""
 
 import json
+import sys
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -8,7 +10,6 @@ import soundfile as sf
 
 from bench import __main__ as program
 from bench import results
-from bench.recogniser import Recogniser
 from bench.recordings import Clip, Conversation, Signals
 from bench.training import words
 from edgefilter.engines import create
@@ -20,7 +21,8 @@ from tests.bench.conftest import rows_of
 @pytest.fixture
 def whisper(tmp_path, monkeypatch):
     """A recogniser that gets one word right."""
-    monkeypatch.setattr(Recogniser, "_recognise", lambda self, samples: "one")
+    model = SimpleNamespace(transcribe=lambda samples, **options: ([SimpleNamespace(text=" one")], None))
+    monkeypatch.setitem(sys.modules, "faster_whisper", SimpleNamespace(WhisperModel=lambda *_, **options: model))
     monkeypatch.setattr(Conversation, "profile", None)
     (tmp_path / "whisper").mkdir()
     (tmp_path / "whisper" / "model.bin").write_bytes(b"whisper")
