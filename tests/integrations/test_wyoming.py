@@ -336,7 +336,10 @@ def test_one_signal_ends_it_with_its_commands(endless_noise, player, stop):
     ]
     words += ["--engine", "linear", "--mic-uri", mic_uri, "--snd-uri", snd_uri]
     service = subprocess.Popen(
-        [sys.executable, "-m", "edgefilter.integrations.wyoming", *words], stderr=subprocess.PIPE, text=True
+        [sys.executable, "-m", "edgefilter.integrations.wyoming", *words],
+        stderr=subprocess.PIPE,
+        text=True,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # a shell has its background jobs ignore it
     )
     try:
 
