@@ -99,4 +99,5 @@ def test_devices_are_listed_where_no_output_exists(plug, no_server, capsys):  # 
     plug(VirtualDevice("USB microphone", "input"))
     assert main(["devices"]) == 0
     listed = capsys.readouterr().out.splitlines()
-    assert "USB microphone" in listed[0] and "none (no sound device with an output was found" in listed[-1]
+    why = "no sound device with an output was found: connect one, or check that the sound server runs ('edgefilter devices')"
+    assert "USB microphone" in listed[0] and listed[-1].endswith(f"none ({why})")

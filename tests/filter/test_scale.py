@@ -13,7 +13,6 @@ from edgefilter.dsp.metrics import si_sdr
 from edgefilter.filter.ego_filter import EgoFilter, enhance
 from edgefilter.filter.volume import Volume
 from edgefilter.profile.data import Profile
-from edgefilter.types import SAMPLE_RATE
 from tests.conformance import robot_speech
 
 DEMO = Path(edgefilter.__file__).parent / "demo_data"
@@ -27,22 +26,13 @@ def demo(name: str) -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def recording() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Until the human has spoken for four seconds."""
-    return tuple(demo(name)[: 13 * SAMPLE_RATE] for name in ("mic", "reference", "human"))
-
-
-ONE_AND_BOTH = ((0.01, 1.0), (100.0, 1.0), (1.0, 0.01), (1.0, 100.0), (0.01, 100.0), (100.0, 0.01))
+    return demo("mic"), demo("reference"), demo("human")
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("known", [False, True], ids=["cold", "profile"])
-@pytest.mark.parametrize(
-    ("engine", "factors"), [("linear", ONE_AND_BOTH), ("ss", ONE_AND_BOTH[4:]), ("crnn", ONE_AND_BOTH[4:])]
-)
-def test_neither_the_level_of_the_reference_nor_that_of_the_microphone_changes_the_answer(
-    recording, engine, factors, known
-):
-    """Of one of them alone the part that all engines have in common is asked."""
+@pytest.mark.parametrize("engine", ["linear", "ss", "crnn"])
+def test_neither_the_level_of_the_reference_nor_that_of_the_microphone_changes_the_answer(recording, engine, known):
     mic, ref, human = recording
     profile = Profile.load(DEMO / "profile.npz") if known else None
     spoken = np.abs(human) > 0
@@ -54,7 +44,7 @@ def test_neither_the_level_of_the_reference_nor_that_of_the_microphone_changes_t
         return si_sdr(out, human[late:]), level
 
     usual = quality(1.0, 1.0)
-    for heard, played in factors:
+    for heard, played in ((0.01, 1.0), (100.0, 1.0), (1.0, 0.01), (1.0, 100.0), (0.01, 100.0), (100.0, 0.01)):
         assert quality(heard, played) == pytest.approx(usual, abs=SAME_DB), (heard, played)
 
 
