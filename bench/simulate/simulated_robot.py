@@ -17,6 +17,8 @@ from edgefilter.dsp.metrics import si_sdr
 
 RATE = 16000
 OVERSAMPLING = 4
+PIECE = 1 << 14
+"""Samples that are worked on at once: they stay in a processor's cache."""
 Array = NDArray[np.float64]
 Rng = np.random.Generator
 
@@ -55,8 +57,8 @@ class Loudspeaker:
         position, velocity, acceleration = self._mechanics()
         excess = np.zeros_like(up)
         memory = np.zeros((0 if linear else 6, 2, 2))  # of either filter in each round
-        for at in range(0, up.size, 1 << 14):  # as much as a processor's cache holds
-            x, more = up[at : at + (1 << 14)], excess[at : at + (1 << 14)]
+        for at in range(0, up.size, PIECE):
+            x, more = up[at : at + PIECE], excess[at : at + PIECE]
             for kept in memory:
                 driven = x + more
                 u, kept[0] = signal.lfilter(*position, driven, zi=kept[0])
@@ -66,7 +68,7 @@ class Loudspeaker:
                 force = 1.0 - self.softening_bl * v * v * bound - self.asymmetry * v * bound
                 braking = 0.5 / self.q * (force**2 - 1.0) * speed
                 more = (force - 1.0) * x - self.stiffening * v * v * bound * u - braking
-            excess[at : at + (1 << 14)] = more
+            excess[at : at + PIECE] = more
         pressure = signal.lfilter(*acceleration, up + excess)
         return signal.sosfilt(self.filters, signal.resample_poly(pressure, 1, OVERSAMPLING))
 
@@ -218,8 +220,8 @@ def warp(x: Array, ppm: float) -> Array:
     padded = np.concatenate([np.zeros(half_width), x, np.zeros(2 * half_width)])
     out = np.empty_like(x)
     offsets = np.arange(-half_width + 1, half_width + 1)
-    for start in range(0, x.size, 1 << 14):
-        position = np.arange(start, min(start + (1 << 14), x.size)) * (1.0 + ppm * 1e-6)
+    for start in range(0, x.size, PIECE):
+        position = np.arange(start, min(start + PIECE, x.size)) * (1.0 + ppm * 1e-6)
         whole = np.minimum(np.floor(position).astype(int), x.size)
         distance = offsets[None] - (position - whole)[:, None]
         window = special.i0(9.0 * np.sqrt(np.clip(1.0 - (distance / half_width) ** 2, 0.0, 1.0))) / special.i0(9.0)

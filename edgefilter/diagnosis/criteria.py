@@ -71,7 +71,6 @@ class Criteria:
     part_level: float = 0.3
     """Share of the excess level that findings, besides half of its power, must explain to be named beside what none explains:
     power alone may be that of one loud passage."""
-
     much_db: float = 3.0
     """Over the silences: what the model of an effect that is really there does not leave."""
     nearly_all: float = 0.99
