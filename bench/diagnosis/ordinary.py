@@ -49,10 +49,7 @@ def gains(case: Path) -> dict[str, float]:
         effect = find(name)
         values = model.fitted(name, scorer.measurement)
         if not vanishes(effect, values):
-            behind = prepared.behind(effect.noise_psd(values, prepared.noise_psd))
-            after = Scorer(behind).of(model.with_effect(name, values))
-            of_fan = effect.stage == "noise"
-            found[name] = scorer.fan_gain_db(base, after) if of_fan else base.level_db - after.level_db
+            found[name] = base.level_db - scorer.of(model.with_effect(name, values)).level_db
     return found
 
 

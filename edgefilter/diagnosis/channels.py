@@ -7,13 +7,12 @@ from scipy import fft
 
 from edgefilter.dsp.exchange import ALIKE, EQUAL, exchanged, order_of
 from edgefilter.dsp.lag import flat_cross
+from edgefilter.dsp.tones import SECOND
 from edgefilter.errors import SignalError
 from edgefilter.filter.microphones import MOST_CLIPPED
 from edgefilter.profile.data import Profile
 from edgefilter.types import Samples
 
-SECOND = 16384
-"""Samples, about a second and a power of two: of the robot's loudest, in which a clock that differs moves nothing."""
 GAIN_DB = 2.0
 """Beside the others, by which a gain is another one: in another room, or with a hand near it, a microphone changes by less
 than 1 dB beside the others."""

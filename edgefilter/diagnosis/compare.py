@@ -130,7 +130,7 @@ def describe(prepared: Prepared, model: EchoModel, score: Score | None = None) -
 
     A gain of the microphone is taken out of the residual before that is held against the fan, which passed it as well.
     """
-    score = score or Scorer(prepared).of(model)
+    score, prepared = score or Scorer(prepared).of(model), prepared.behind(model)
     measurement, prediction = prepared.measurement, score.prediction
     residual = measurement.recording - prediction
     psd = prepared.noise_psd
@@ -167,6 +167,7 @@ def describe(prepared: Prepared, model: EchoModel, score: Score | None = None) -
 
 def independence_of(prepared: Prepared, model: EchoModel, score: Score) -> Independence | None:
     """Whether what a model leaves is noise, see `independence`; score: of that model."""
+    prepared = prepared.behind(model)
     measurement, use, active = prepared.measurement, prepared.usable, prepared.active
     flat = (measurement.recording - score.prediction) / model.microphone_gain(measurement.recording.size)
     said = _as_played(measurement.reference, model)

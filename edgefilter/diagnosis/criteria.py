@@ -79,6 +79,3 @@ class Criteria:
     # The fan
     fan_change_db: float = 1.5
     """By less than this a fan differs from day to day."""
-    fan_steady_db: float = 1.5
-    """Whitened by its own spectrum, the loud and the quiet tenth of a second of a fan differ by less (three real ones by 0.9 to
-    1.0, a running tap by 1.2), those of what a gain moves, of a talker or of something that slams by more."""

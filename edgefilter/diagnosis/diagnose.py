@@ -15,15 +15,14 @@ from edgefilter.diagnosis.criteria import Criteria
 from edgefilter.diagnosis.findings import findings_of
 from edgefilter.diagnosis.joint import fit_jointly
 from edgefilter.diagnosis.laws import free_law
-from edgefilter.diagnosis.leftover import left_in_words
-from edgefilter.diagnosis.noise_change import look_at_fan, without_doubtful
+from edgefilter.diagnosis.leftover import left_in_words, leftover
 from edgefilter.diagnosis.precision import precision
 from edgefilter.diagnosis.prepare import Prepared, prepare
 from edgefilter.diagnosis.proof import listed, with_fitted
 from edgefilter.diagnosis.result import Diagnosis, Finding, Interval, Verdict, in_order
 from edgefilter.diagnosis.score import Scorer, share_of
 from edgefilter.diagnosis.select import search
-from edgefilter.diagnosis.trials import Found
+from edgefilter.diagnosis.trials import Found, Trial
 from edgefilter.echo.effects.catalogue import find
 from edgefilter.echo.measurement import Values
 from edgefilter.profile.data import Profile
@@ -97,9 +96,7 @@ def diagnose(
     """
     prepared = prepare(profile, recording, reference, sample_rate=sample_rate)
     criteria = criteria or Criteria()
-    return conclude(
-        prepared, search(prepared, prepared.model, criteria, progress, without), criteria, progress, without
-    )
+    return conclude(prepared, search(prepared, prepared.model, criteria, progress, without), criteria, progress)
 
 
 def add(
@@ -207,14 +204,13 @@ def settle(
 def _as_written(found: Diagnosis, prepared: Prepared, values: Mapping[str, Values], after: Comparison) -> Diagnosis:
     """The diagnosis with the values of a profile that holds all its findings, and what each leaves then."""
     before = replace(describe(prepared, prepared.model), warnings=found.comparison.warnings)
-    model, behind, excess_db = prepared.model, prepared, before.excess_db
+    model, scorer, excess_db = prepared.model, Scorer(prepared), before.excess_db
     findings: dict[str, Finding] = {}
     for finding in in_order(found.ranking):
         name, whole = finding.effect, before.excess_db
         model = model.with_effect(name, values[name])
-        behind = behind.behind(find(name).noise_psd(values[name], behind.noise_psd))
         last = len(findings) == len(found.ranking) - 1
-        left_db = after.excess_db if last else Scorer(behind).of(model).excess_db
+        left_db = after.excess_db if last else scorer.of(model).excess_db
         share = max(share_of(whole, left_db) - share_of(whole, excess_db), 0.0)
         findings[name] = replace(
             finding,
@@ -242,12 +238,10 @@ def conclude(
     found: Found,
     criteria: Criteria,
     progress: Callable[[str], None] | None = None,
-    without: Collection[str] = (),
 ) -> Diagnosis:
-    """The diagnosis that a search, without those effects, leads to; the fan is looked at behind what that has taken out of the voice."""
+    """The diagnosis that a search leads to."""
     comparison = describe(prepared, found.start, found.base)
-    found, left = look_at_fan(found, criteria, without)
-    searched = found
+    searched, left = found, leftover(found)
     believed = bool(found.steps) and (
         found.final.excess_db < criteria.explained_db or _enough(prepared, found, criteria)
     )
@@ -256,7 +250,7 @@ def conclude(
         "missing" if believed and not _much_left(found, criteria) else "explained" if quiet else "unexplained"
     )
     if not believed and (quiet or not _partly(prepared, found, criteria)):
-        found = without_doubtful(found)
+        found = _without_doubtful(found)
     unpredictable = any(find(step.name).adds_noise for step in found.steps)
     remaining = found.final.excess_db
     findings, doubts = findings_of(found, progress)
@@ -302,11 +296,19 @@ def _much_left(found: Found, criteria: Criteria) -> bool:
     return left > criteria.much_db and share_of(found.base.excess_db, found.final.excess_db) < criteria.nearly_all
 
 
+def _without_doubtful(found: Found) -> Found:
+    """The outcome of a search that explains too little, with nothing but what silences and voice both show."""
+    scorer, model, score, kept = Scorer(found.prepared), found.start, found.base, []
+    for step in found.steps:
+        if find(step.name).shows_in_silence:
+            model, before = model.with_effect(step.name, step.values), score
+            score = scorer.of(model)
+            kept.append(Trial.of(step.name, model, before, score))
+    return replace(found, model=model, final=score, steps=tuple(kept))
+
+
 def explained_level(prepared: Prepared, found: Found) -> float:
     """Part of the level over the robot's silences that is gone, 0 to 1: of many cells rather than of the loudest."""
-    scorer = Scorer(prepared)
-    above = found.base.over_db - scorer.floor_level(found.base)
-    gone = above - (found.final.over_db - scorer.floor_level(found.final))
-    if any(find(name).stage == "noise" for name, _ in found.model.effects):
-        above, gone = found.base.over_db, found.base.over_db - found.final.over_db
+    above = found.base.over_db - Scorer(prepared).floor_level(found.final)
+    gone = found.base.over_db - found.final.over_db
     return float(np.clip(gone / above, 0.0, 1.0)) if above > 0.0 else 0.0

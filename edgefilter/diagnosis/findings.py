@@ -66,7 +66,7 @@ def _intervals(prepared: Prepared, model: EchoModel, step: Trial) -> tuple[Mappi
     fits, failed = [], []
     for third in range(3):
         try:
-            part = prepared.fitted_to(prepared.usable & (block % 3 == third))
+            part = prepared.behind(others).fitted_to(prepared.usable & (block % 3 == third))
             fits.append(others.fitted(step.name, part.measurement))
         except (UsageError, ArithmeticError, np.linalg.LinAlgError) as error:
             failed.append(

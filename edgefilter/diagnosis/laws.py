@@ -224,12 +224,12 @@ def _laws(
         for stage in stages:
             if progress:
                 progress(f"trying {family.__name__.replace('_', ' ')}")
-            ground = _Ground(scorer, model, stage)
+            ground = _Ground(scorer.behind(model), model, stage)
             law = family(ground) if ground.sounds else None
             if law is None:
                 continue
             prediction = law.predict(model, scorer.measurement.reference)
-            score = scorer.score(prediction, scorer.measurement.whiten(prediction))
+            score = scorer.of(model, prediction)
             told = {"beside": names, "gain_db": before.level_db - score.level_db, "excess_db": score.excess_db}
             yield Law(**{**vars(law), **told, "prediction": score.prediction}), score
 

@@ -5,20 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.ndimage import median_filter
 
-from edgefilter.diagnosis.channels import SECOND
-from edgefilter.diagnosis.prepare import Prepared
 from edgefilter.diagnosis.score import Scorer
 from edgefilter.diagnosis.trials import Found
 from edgefilter.dsp.frames import block_power, blocks, decibels
-from edgefilter.dsp.psd import frequencies, periodograms
+from edgefilter.dsp.tones import tones
 from edgefilter.echo.measurement import whiten
-from edgefilter.types import SAMPLE_RATE, Array, Samples
+from edgefilter.types import SAMPLE_RATE, Array
 
-LINE_OVER_FLOOR = 10.0
-"""Times the median of its surroundings that a bin of a long spectrum must reach to be a tone (noise alone reaches 3 in
-1000 means of 30)."""
 BLOCK = SAMPLE_RATE // 10
 
 
@@ -38,42 +32,17 @@ class Leftover:
     swing_db: float
 
 
-def inspect(prepared: Prepared, residual: Samples) -> Leftover:
-    """Look at what a model leaves of a prepared recording, residual (n,)."""
-    psd = prepared.noise_psd
-    tones = _tones(residual, psd)
+def leftover(found: Found) -> Leftover:
+    """Look at what the model that was found leaves; a gain of the microphone, which the fan passed as well, is taken out."""
+    prepared, heard = found.heard, found.prepared.measurement.recording
+    residual, psd = (heard - found.final.prediction) / found.model.microphone_gain(heard.size), prepared.noise_psd
+    strongest = tones(residual, psd)
     quiet = blocks(prepared.usable & ~prepared.active, BLOCK).all(axis=1)
     power = block_power(whiten(residual, psd), BLOCK)[quiet]
     if power.size < 5:
-        return Leftover(*tones, float("nan"), 0.0)
+        return Leftover(*strongest, float("nan"), 0.0)
     low, high = decibels(np.quantile(power, (0.1, 0.9)))
-    return Leftover(*tones, float(decibels(power.mean())), float(high - low))
-
-
-def _tones(residual: Samples, psd: Samples) -> tuple[Array, float, float]:
-    """Tones in Hz, loudest first, the mains frequency they belong to (0: none), their share of the power over the fan."""
-    if residual.size < 2 * SECOND:
-        return np.zeros(0), 0.0, 0.0
-    power = np.median(periodograms(residual, SECOND), axis=0)
-    hz = frequencies(power.size)
-    floor = median_filter(power, 81, mode="nearest")
-    expected = np.interp(hz, frequencies(psd.size), psd) * np.log(2)
-    peak = power > LINE_OVER_FLOOR * np.maximum(floor, expected)
-    peak &= power >= np.maximum(np.roll(power, 1), np.roll(power, -1))
-    peak[:20] = False
-    at = np.flatnonzero(peak)
-    at = at[np.argsort(-power[at])][:40]
-    if not at.size:
-        return np.zeros(0), 0.0, 0.0
-    over = np.maximum(power - expected, 0.0)
-    near = np.unique(np.minimum(at[:, None] + np.arange(-2, 3), power.size - 1))
-    share = float(over[near].sum()) / max(float(over.sum()), 1e-30)
-    mains = 0.0
-    for grid in (50.0, 60.0):
-        on_grid = np.abs(hz[at] / grid - np.round(hz[at] / grid)) * grid < 0.8
-        if power[at][on_grid].sum() > 0.8 * power[at].sum() and on_grid.sum() >= 2:
-            mains = grid
-    return hz[at], mains, share
+    return Leftover(*strongest, float(decibels(power.mean())), float(high - low))
 
 
 def left_in_words(found: Found, left: Leftover, remaining_db: float, floor_db: float) -> str:

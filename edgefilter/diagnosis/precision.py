@@ -75,7 +75,7 @@ def _derivative(found: Found, finding: Finding, parameter: Parameter, index: int
     step = max(STEP * (_half_width(finding, parameter, index) or 0.0), LEAST_STEP * abs(at), 1e-9)
     step = step if at + step <= parameter.high else -step
     value.flat[index] = at + step
-    measurement = found.prepared.measurement
+    measurement = found.heard.measurement
     values = {**finding.values, parameter.name: value if value.ndim else float(value)}
     try:
         changed = found.model.with_effect(finding.effect, values).predict(measurement.reference)
@@ -89,7 +89,7 @@ def _derivative(found: Found, finding: Finding, parameter: Parameter, index: int
 
 def _covariance(found: Found, derivatives: Array) -> Array | None:
     """Covariance of numbers with those derivatives (k, n), (k, k); None where they cannot be told apart at all."""
-    measurement = found.prepared.measurement
+    measurement = found.heard.measurement
     residual = (measurement.white_recording - measurement.heard(found.model)[1]) * measurement.weights
     scale = np.sqrt(np.sum(derivatives**2, axis=1))
     unit = derivatives / scale[:, None]

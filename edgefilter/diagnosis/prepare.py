@@ -85,9 +85,13 @@ class Prepared:
         """The fan's PSD, which prepare() always knows, (601,)."""
         return cast(Samples, self.measurement.noise_psd)
 
-    def behind(self, noise_psd: Samples) -> Prepared:
-        """The same with another fan, of PSD (601,)."""
-        return replace(self, measurement=replace(self.measurement, noise_psd=floored(noise_psd).astype(np.float32)))
+    def behind(self, model: EchoModel) -> Prepared:
+        """The same with the fan that a model expects; itself where that is the profile's."""
+        was, now = (each.expected_noise(self.noise_psd) for each in (self.model, model))
+        if np.array_equal(was, now):
+            return self
+        psd = floored(self.noise_psd * (now / was)).astype(np.float32)
+        return replace(self, measurement=replace(self.measurement, noise_psd=psd), model=model)
 
     def fitted_to(self, fit: NDArray[np.bool_]) -> Prepared:
         """The same with other samples to fit on, (n,)."""

@@ -15,7 +15,7 @@ from edgefilter.diagnosis.prepare import HOP, Prepared, prepare
 from edgefilter.diagnosis.score import STEP, Scorer
 from edgefilter.dsp.convolution import convolve
 from edgefilter.dsp.fractional_delay import delayed
-from edgefilter.dsp.psd import GRID_BINS, frequencies, variance_at
+from edgefilter.dsp.psd import GRID_BINS, coloured, frequencies
 from edgefilter.echo.effects.catalogue import find
 from edgefilter.echo.measurement import Measurement
 from edgefilter.echo.model import EchoModel
@@ -334,24 +334,18 @@ def _simulated(profile: Profile, true: Explanation, sound: Samples) -> Samples:
     off = np.fft.irfft(np.sqrt(np.interp(bins, frequencies(GRID_BINS), true.error)))
     voice, signs = model.predict(x), np.repeat(rng.choice([-1.0, 1.0], x.size // HOP + 1), HOP)[: x.size]
     wrong = signs * convolve(voice, np.fft.fftshift(off))[ERROR_TAPS // 2 :][: x.size]
-    heard = voice + wrong + _coloured(rng, x.size, model.expected_noise(profile.noise_psd))
+    fan = coloured(rng, x.size, model.expected_noise(profile.noise_psd)).astype(np.float32)
+    heard = voice + wrong + model.passed(fan, x)
     for square, colour in model.unpredictable(x):
-        heard = heard + np.sqrt(square) * _coloured(rng, x.size, colour)
+        heard = heard + np.sqrt(square) * coloured(rng, x.size, colour)
     return heard.astype(np.float32)
-
-
-def _coloured(rng: np.random.Generator, n: int, psd: Array) -> Array:
-    """Noise of that PSD (601,), n samples."""
-    amplitude = np.sqrt(variance_at(np.fft.rfftfreq(n, 1 / SAMPLE_RATE), psd))
-    return np.fft.irfft(np.fft.rfft(rng.standard_normal(n)) * amplitude, n)
 
 
 def _cells(scorer: Scorer, model: EchoModel) -> tuple[Array, Array, Array]:
     """The power that a model leaves, what it expects, and its voice, over the known fan, (moments, bands) each."""
-    score, psd = scorer.of(model), scorer.psd
+    score = scorer.of(model)
     power = scorer.cells(scorer.measurement.recording - score.prediction)
-    fan = np.interp(scorer.band_hz.mean(axis=1), frequencies(psd.size), model.expected_noise(psd) / psd)
-    return power, power / score.cells + fan - 1.0, scorer.cells(score.prediction)
+    return power, power / score.cells, scorer.cells(score.prediction)
 
 
 def _log_likelihood(prepared: Prepared, explanations: Sequence[Explanation]) -> Array:

@@ -12,7 +12,7 @@ from scipy.ndimage import uniform_filter1d
 from edgefilter.diagnosis.prepare import FRAME, HOP, Prepared
 from edgefilter.dsp import fourier
 from edgefilter.dsp.frames import decibels, frames
-from edgefilter.dsp.psd import frequencies, hann, variance_at
+from edgefilter.dsp.psd import GRID_BINS, ROUNDING_PSD, coloured, frequencies, hann, variance_at
 from edgefilter.echo.evidence import Score
 from edgefilter.echo.least_squares import normal_equations
 from edgefilter.echo.model import EchoModel
@@ -60,6 +60,22 @@ class Scorer:
         self._edges = edges
         self.band_hz = np.stack((hz[edges[:-1]], hz[edges[1:]]), axis=1)
         self.freedom = np.diff(edges).astype(float)
+        self._others: dict[bytes, Scorer] = {}
+
+    @cached_property
+    def _fan(self) -> Samples:
+        """A sound like the fan, (n,)."""
+        return coloured(np.random.default_rng(0), self.usable.size, self.psd).astype(np.float32)
+
+    @cached_property
+    def _rounding(self) -> Samples:
+        """What the rounding to 16 bit leaves where nothing else is heard, (n,)."""
+        return coloured(np.random.default_rng(1), self.usable.size, np.full(GRID_BINS, ROUNDING_PSD)).astype(np.float32)
+
+    @cached_property
+    def _fan_cells(self) -> Array:
+        """Power of that in the held-out cells, (times, bands)."""
+        return self.cells(self._fan)
 
     @cached_property
     def _ordinary_cells(self) -> Array:
@@ -77,34 +93,55 @@ class Scorer:
         read = frames(residual, FRAME, 1)[at] * self._window
         return self._by_band(fourier.power(fft.rfft(read, axis=-1)).mean(axis=1) / self._expected)
 
-    def of(self, model: EchoModel) -> Score:
-        """The score of a model: on what it predicts, with what it says that no waveform predicts counted as fan."""
-        gain = model.microphone_gain(self.usable.size)
-        return self.score(*self.measurement.heard(model), model.unpredictable(self.measurement.reference), gain)
+    def behind(self, model: EchoModel) -> Scorer:
+        """The scorer with the fan that a model expects; itself where that is the profile's."""
+        prepared = self.prepared.behind(model)
+        if prepared is self.prepared:
+            return self
+        key = prepared.noise_psd.tobytes()
+        if key not in self._others:
+            self._others[key] = Scorer(prepared)
+        return self._others[key]
 
-    def score(
+    def of(self, model: EchoModel, prediction: Samples | None = None) -> Score:
+        """The score of a model: of what it predicts, or of another prediction (n,), in the noise that it expects.
+
+        That is the fan, as what is at the microphone lets it through, and what no waveform predicts. The ordinary
+        tolerances are taken up first.
+        """
+        here, reference = self.behind(model), self.measurement.reference
+        heard = (
+            here.measurement.heard(model) if prediction is None else (prediction, here.measurement.whiten(prediction))
+        )
+        passed, gain = model.passed(here._fan, reference), model.microphone_gain(self.usable.size)
+        return here._score(*heard, model.unpredictable(reference), passed, gain, self)
+
+    def _score(
         self,
         prediction: Samples,
         white: Samples,
-        unpredictable: Sequence[tuple[Samples, Array]] = (),
-        gain: Samples | None = None,
+        unpredictable: Sequence[tuple[Samples, Array]],
+        passed: Samples,
+        gain: Samples,
+        known: Scorer,
     ) -> Score:
-        """The score of a prediction (n,), also given whitened, with the ordinary tolerances taken up first.
+        """The score of a prediction (n,), also given whitened, in what passed (n,) of this fan; known: of the profile's.
 
-        unpredictable: as EchoModel.unpredictable gives it, noise that is expected on top of the fan, as the robot's
-        ordinary distortion is. gain: (n,) of the microphone, which the fan passed as well: it is taken out of the
-        residual before that is held against the fan. The cells keep it: as a likelihood their level has to be that of
-        the recording as it is.
+        gain: (n,) of the microphone, which the fan passed as well: it is taken out of the residual before that is held
+        against the fan. The cells keep it: as a likelihood their level has to be that of the recording as it is.
         """
         corrected = self.correct(prediction, white)
         residual = self.measurement.recording - corrected
         expected = (*unpredictable, *self.prepared.ordinary)
         variance = self._expected_cells(expected)
+        plain = self.measurement.whiten(residual / gain).astype(np.float64) ** 2
+        power = self._over_expected(plain, expected) if expected else plain
+        if passed is not self._fan:
+            variance = variance * (self.cells(passed + self._rounding) / self._fan_cells)
         cells = self.cells(residual) / variance
         over_db = self._mean(decibels(0.5 + 0.5 * cells))
-        cost_db = self._mean(0.5 * decibels(variance / self._ordinary_cells)) if unpredictable else 0.0
-        plain = self.measurement.whiten(residual if gain is None else residual / gain).astype(np.float64) ** 2
-        power = self._over_expected(plain, expected) if expected else plain
+        louder = self._by_band(self._expected / known._expected)
+        cost_db = self._mean(0.5 * decibels(variance * louder / known._ordinary_cells))
         held, active = self.prepared.held_out, self.prepared.active
         return Score(
             level_db=over_db + cost_db,
@@ -122,14 +159,10 @@ class Scorer:
         """Score.over_db of the cells in which the robot is silent, 0 where it never is: what is left at best."""
         return self._mean(decibels(0.5 + 0.5 * score.cells[self.silent_cells]))
 
-    def fan_gain_db(self, before: Score, after: Score) -> float:
-        """By how much better another fan explains the cells in which the robot is silent (all where it never is), dB.
-
-        The same likelihood as Score.level_db: what is left over either fan falls, and the louder one costs half of its dB.
-        """
-        silent = self.silent_cells if self.silent_cells.any() else slice(None)
-        was, now = (np.maximum(score.cells[silent], 1e-3) for score in (before, after))
-        return self._mean(decibels((1.0 + was) / (1.0 + now)) - 0.5 * decibels(was / now))
+    def silent_db(self, score: Score) -> float:
+        """By how much the noise of the robot's silences is above what is expected of it, 0 where it is never silent, dB."""
+        power = self._mean(score.cells[self.silent_cells])
+        return float(decibels(power)) if power > 0.0 else 0.0
 
     def correct(self, prediction: Samples, white: Samples) -> Samples:
         """A prediction, also given whitened, through the filter, within TOLERANCE of 1, that brings it closest to the recording."""

@@ -13,7 +13,6 @@ from collections.abc import Callable, Collection, Iterator, Sequence
 from itertools import pairwise
 
 from edgefilter.diagnosis.criteria import Criteria
-from edgefilter.diagnosis.noise_change import changed_fan
 from edgefilter.diagnosis.ordinary import p_value
 from edgefilter.diagnosis.prepare import Prepared
 from edgefilter.diagnosis.trials import Found, Trial, Workbench, added
@@ -31,18 +30,12 @@ def search(
     without: Collection[str] = (),
 ) -> Found:
     """Add effects, others than those named in without, to model as long as held-out samples say that they are there."""
-    bench, start = Workbench(prepared, criteria, progress, without), model
-    base = bench.score(model)
-    fan = changed_fan(prepared, model, base, criteria, without)
-    if fan is not None:
-        prepared, step = fan
-        bench, model = Workbench(prepared, criteria, progress, without), step.model
+    bench = Workbench(prepared, criteria, progress, without)
     best = _best(bench, model, list(_runs(bench, model)))
     steps = _in_steps(bench, model, best)
     full = len(added(model, best)) >= criteria.most_effects and not bench.explained(best)
     notes = (*bench.notes, FULL.format(criteria.most_effects)) if full else bench.notes
-    steps = steps if fan is None else (step, *steps)
-    return Found(prepared, start, best, base, bench.score(best), steps, notes, bench.tried(model, best))
+    return Found(prepared, model, best, bench.score(model), bench.score(best), steps, notes, bench.tried(model, best))
 
 
 def _runs(bench: Workbench, start: EchoModel) -> Iterator[EchoModel]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TypeAlias
 
 import numpy as np
@@ -24,10 +25,7 @@ Signature: TypeAlias = tuple[tuple[str | bytes, ...], ...]
 
 @dataclass(frozen=True, eq=False)
 class Trial:
-    """One effect added to a model: its values, the model with it, its score, and by how many dB the held-out level falls.
-
-    Of another fan gain_db is Scorer.fan_gain_db.
-    """
+    """One effect added to a model: its values, the model with it, its score, and by how many dB the held-out level falls."""
 
     name: str
     values: Values
@@ -68,9 +66,6 @@ class Found:
 
     steps: the accepted effects in their order. notes: what the reader must know of the search. tried: every effect that
     was fitted.
-
-    prepared: what final was scored on; its fan is another than at the calibration where a changed fan is the first of
-    the steps.
     """
 
     prepared: Prepared
@@ -81,6 +76,11 @@ class Found:
     steps: tuple[Trial, ...]
     notes: tuple[str, ...] = ()
     tried: tuple[Tried, ...] = ()
+
+    @cached_property
+    def heard(self) -> Prepared:
+        """The recording prepared with the fan that was found."""
+        return self.prepared.behind(self.model)
 
 
 class Workbench:
@@ -121,9 +121,14 @@ class Workbench:
         return self._scores[key]
 
     def heard(self, model: EchoModel) -> float:
-        """Return the level, in dB over the robot's silences, of half a dB either way, that a model leaves while the robot is heard."""
+        """How far what a model leaves is from the noise that it expects, dB.
+
+        While the robot is heard, over its silences, of half a dB either way; or in these, less by what a fan differs
+        from day to day.
+        """
         score = self.score(model)
-        return score.active_db - float(np.clip(score.silent_db, -0.5, 0.5))
+        told = score.active_db - float(np.clip(score.silent_db, -0.5, 0.5))
+        return max(told, abs(self.scorer.silent_db(score)) - self.criteria.fan_change_db)
 
     def explained(self, model: EchoModel) -> bool:
         """Whether a model leaves so little while the robot is heard that nothing further can be told in it."""
@@ -159,7 +164,7 @@ class Workbench:
 
     def _in_reach(self, name: str, model: EchoModel) -> bool:
         """Whether an effect could be named beside a model if it explained all that this leaves, over the silences or over the fan."""
-        most = max(self.left(model), self.score(model).over_db)
+        most = max(self.left(model), abs(self.score(model).over_db))
         return p_value(name, most) <= self.criteria.false_rate
 
     def attempt_alike(self, name: str, model: EchoModel) -> Trial | None:
@@ -172,7 +177,7 @@ class Workbench:
             self._progress(f"trying {name}")
         effect = find(name)
         try:
-            values = model.fitted(name, self.prepared.measurement)
+            values = model.fitted(name, self.scorer.behind(model).measurement)
         except (UsageError, ArithmeticError, np.linalg.LinAlgError) as error:
             self._failed[name] = f"{name} could not be fitted and was left out: {error}"
             return None
@@ -266,26 +271,9 @@ class Workbench:
         return not (by_chance or taken_up)
 
     def absent(self, model: EchoModel, most: int) -> list[str]:
-        """Names of the effects on the voice that a model has not, that may be tried and whose complexity is at most `most`."""
+        """Names of the effects that a model has not, that may be tried and whose complexity is at most `most`."""
         out = {*dict(model.effects), *self._without}
-        listed = [(name, find(name)) for name in names() if name not in out]
-        return [name for name, effect in listed if not effect.is_of_the_fan and effect.complexity <= most]
-
-
-def beside(scorer: Scorer, name: str, model: EchoModel, criteria: Criteria) -> Trial | None:
-    """An effect outside the search, fitted beside what a model has.
-
-    None where it is there, its fit finds nothing, ordinary recordings show as much, or its values do not look like it.
-    """
-    effect = find(name)
-    values = None if name in dict(model.effects) else model.fitted(name, scorer.measurement)
-    if values is None or vanishes(effect, values):
-        return None
-    changed = model.with_effect(name, values)
-    before, after = scorer.of(model), scorer.of(changed)
-    found = Trial.of(name, changed, before, after)
-    by_chance = found.p_value > criteria.false_rate
-    return None if by_chance or not effect.plausible(Evidence(values, model, scorer, before, after)) else found
+        return [name for name in names() if name not in out and find(name).complexity <= most]
 
 
 def added(start: EchoModel, model: EchoModel) -> list[str]:

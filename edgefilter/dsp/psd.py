@@ -46,6 +46,12 @@ def variance_at(hz: Array, psd: Samples) -> Array:
     return np.interp(hz, frequencies(psd.size), psd) / 2 * SAMPLE_RATE
 
 
+def coloured(rng: np.random.Generator, size: int, psd: Samples) -> Array:
+    """Gaussian noise of that PSD (bins,), (size,)."""
+    amplitude = np.sqrt(variance_at(np.fft.rfftfreq(size, 1 / SAMPLE_RATE), psd))
+    return np.fft.irfft(np.fft.rfft(rng.standard_normal(size)) * amplitude, size)
+
+
 def total_power(psd: Samples) -> float:
     """Mean square of noise of that PSD (bins,)."""
     return float(np.sum(psd)) * (SAMPLE_RATE / 2) / (psd.size - 1)

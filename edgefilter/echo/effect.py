@@ -120,6 +120,10 @@ class Effect:
         """The spectral density of that, (601,) or (k, 601), 0 to 8 kHz, per Hz: its integral is 1. By default white."""
         return np.full(601, 1.0 / 8000.0)
 
+    def passed(self, noise: Samples, voice: Samples, values: Values, sample_rate: int) -> Samples:
+        """What a gain by level behind the microphone lets through of the fan's sound (n,) beside a voice (n,); by default all of it."""
+        return noise
+
     def settled(self, values: Values) -> Values:
         """Values with which the effect is from the start what it is at a recording's end: what the running filter begins with."""
         return values
@@ -159,7 +163,7 @@ class Effect:
 
     @property
     def shows_in_silence(self) -> bool:
-        """Whether silences tell it together with the voice: a gain by level behind the microphone (diagnosis/noise_change.py)."""
+        """Whether silences tell it together with the voice: a gain by level behind the microphone (passed())."""
         return self.stage == "microphone" and self.family == "dynamics" and not self.event
 
     @property
@@ -186,11 +190,6 @@ class Effect:
     def noise_is_asked(self) -> bool:
         """Whether the running filter asks for variance()."""
         return self.adds_noise and not self.followed
-
-    @property
-    def is_of_the_fan(self) -> bool:
-        """Whether the robot's silences tell it."""
-        return self.stage == "noise" or self.shows_in_silence
 
     @property
     def timed(self) -> bool:

@@ -9,6 +9,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from edgefilter.dsp.frames import decibels
 from edgefilter.echo.measurement import Measurement, Values, VoiceModel, level_ratio
 from edgefilter.types import Array, Samples
 
@@ -80,6 +81,21 @@ class Evidence:
     def noise(self) -> Array:
         """What the model without the effect expects besides a voice in each cell, over the fan's power, (times, bands)."""
         return self.grid.cells(self.grid.measurement.recording - self.before.prediction) / self.before.cells
+
+    @cached_property
+    def _silences(self) -> Array:
+        """Power over what is expected with the effect in the moments in which the robot is silent, (times,)."""
+        return np.average(self.after.cells[~self.grid.active_cells], axis=1, weights=self.grid.freedom)
+
+    @property
+    def silent_db(self) -> float:
+        """Level of the robot's silences over what is expected with the effect, 0 where it is never silent."""
+        return float(decibels(self._silences.mean())) if self._silences.size else 0.0
+
+    @property
+    def swing_db(self) -> float:
+        """By how much the loud and the quiet tenth of the silences differ, 0 where they are too few."""
+        return float(np.ptp(decibels(np.quantile(self._silences, (0.1, 0.9))))) if self._silences.size else 0.0
 
     def share(self, prediction: Samples) -> float:
         """Which part of what the effect explains another prediction (n,), a gain apart, does: that of its law without free taps, say."""

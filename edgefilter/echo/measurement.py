@@ -22,6 +22,10 @@ SILENT = 0.1
 """Part of the fan's power under which a predicted voice leaves the fan alone: the two are 0.4 dB louder than the fan."""
 ORDINARY_DB = 0.4
 """By which a gain differs at most from day to day, or moves while it stands still."""
+STEADY_DB = 1.5
+"""By which a fan's level differs at most from what is expected of it, and from one tenth of a second to another, whitened by
+its own spectrum (the loud and the quiet tenth of three real ones by 0.9 to 1.0, of a running tap by 1.2; of a talker, or of
+something that slams, by more)."""
 REMEMBERED = 6
 """Models whose predictions a measurement keeps: one that a search goes on from, and some beside it."""
 

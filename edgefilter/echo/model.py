@@ -102,6 +102,17 @@ class EchoModel:
         scaling = [(effect, values) for effect, values in chain(self.effects) if effect.scales_fan]
         return _through(scaling, np.ones(size, np.float32))
 
+    def passed(self, noise: Samples, reference: Samples) -> Samples:
+        """What the effects let through of the fan's sound (n,) beside the voice of an aligned reference (n,); noise itself where that is all."""
+        applied = chain(self.effects)
+        for place, (effect, values) in enumerate(applied):
+            if effect.scales_fan:
+                noise = effect.apply(noise, values, SAMPLE_RATE)
+            elif effect.shows_in_silence:
+                ahead = replace(self, effects=tuple((other.name, known) for other, known in applied[:place]))
+                noise = effect.passed(noise, ahead.predict(reference), values, SAMPLE_RATE)
+        return noise
+
     def expected_noise(self, psd: Samples) -> Samples:
         """PSD of the fan with the model's effects on it, (601,), from psd (601,) of the calibration."""
         for effect, values in chain(self.effects):

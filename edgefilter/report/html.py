@@ -20,8 +20,6 @@ from edgefilter.diagnosis.laws import Law
 from edgefilter.diagnosis.passport import ENOUGH_DB, Passport
 from edgefilter.diagnosis.prepare import prepare
 from edgefilter.diagnosis.result import Precision, in_order
-from edgefilter.echo.effect import complete
-from edgefilter.echo.effects.catalogue import find
 from edgefilter.echo.model import EchoModel
 from edgefilter.errors import EdgefilterError
 from edgefilter.profile.data import Profile
@@ -318,12 +316,8 @@ def compare_variants(
     prepared = prepare(profile, recording, reference)
     found = {}
     for choice in choices(len(findings)):
-        partial, psd = model, prepared.noise_psd
+        partial = model
         for finding, on in zip(findings, choice, strict=True):
-            if on:  # the noise that is expected is the fan's with this effect on it
-                effect = find(finding.effect)
-                psd = effect.noise_psd(complete(effect, finding.values), psd)
-            else:
-                partial = partial.without_effect(finding.effect)
-        found[choice] = describe(prepared.behind(psd), partial)
+            partial = partial if on else partial.without_effect(finding.effect)
+        found[choice] = describe(prepared, partial)
     return found

@@ -9,9 +9,9 @@ import pytest
 
 from edgefilter.diagnosis.criteria import Criteria
 from edgefilter.diagnosis.diagnose import add, diagnose
-from edgefilter.diagnosis.noise_change import changed_fan
 from edgefilter.diagnosis.prepare import prepare
 from edgefilter.diagnosis.score import Scorer
+from edgefilter.diagnosis.select import search
 from edgefilter.echo.effects.catalogue import find
 from edgefilter.echo.model import EchoModel
 from edgefilter.echo.running import reach
@@ -78,8 +78,7 @@ def test_what_is_soft_without_a_suppressor_is_not_called_one(change, silence_db:
     prepared = prepare(profile(), change(x), x)
     base = Scorer(prepared).of(prepared.model)
     assert base.silent_db == pytest.approx(silence_db, abs=0.7)
-    step = changed_fan(prepared, prepared.model, base, Criteria())
-    assert step is None or step[1].name != "noise_suppression"
+    assert "noise_suppression" not in [step.name for step in search(prepared, prepared.model, Criteria()).steps]
 
 
 @pytest.mark.slow
@@ -96,9 +95,11 @@ def test_a_suppressor_that_lets_weak_voice_through_less_is_seen_in_the_numbers()
 def test_what_the_running_filter_contradicts_is_not_looked_for() -> None:
     x = voice(SECONDS)
     prepared = prepare(profile(), suppressed(record(x), -12.0), x)
-    base = Scorer(prepared).of(prepared.model)
-    assert changed_fan(prepared, prepared.model, base, Criteria())[1].name == "noise_suppression"
-    assert changed_fan(prepared, prepared.model, base, Criteria(), without=("noise_suppression",)) is None
+    named, others = (
+        [step.name for step in search(prepared, prepared.model, Criteria(), without=without).steps]
+        for without in ((), ("noise_suppression",))
+    )
+    assert named == ["noise_suppression"] and "noise_suppression" not in others
 
 
 @pytest.mark.slow

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -13,6 +13,7 @@ from edgefilter.diagnosis.score import Scorer
 from edgefilter.diagnosis.select import _stepwise, refit
 from edgefilter.diagnosis.trials import Workbench, added
 from edgefilter.dsp.psd import total_power
+from edgefilter.echo.model import EchoModel
 from tests.diagnosis.robot_scene import profile, record, voice
 
 
@@ -25,14 +26,23 @@ def noisy():
     prepared = replace(prepared, measurement=replace(prepared.measurement, noise_psd=robot.noise_psd), ordinary=())
     psd = robot.noise_psd.astype(float)
     variance = np.full(x.size, 9.0 * total_power(robot.noise_psd), np.float32)
-    return Scorer(prepared), prepared.prediction, variance, psd / (np.sum(psd) * 8000 / (psd.size - 1))
+    return Scorer(prepared), prepared.model, variance, psd / (np.sum(psd) * 8000 / (psd.size - 1))
+
+
+@dataclass(frozen=True, eq=False)
+class Noisy(EchoModel):
+    """A model that says of itself what noise it adds."""
+
+    sources: tuple = ()
+
+    def unpredictable(self, reference):
+        return self.sources
 
 
 def scored(noisy, times):
-    scorer, prediction, variance, colour = noisy
-    return scorer.score(
-        prediction, scorer.measurement.whiten(prediction), [(times * variance, colour)] if times else []
-    )
+    scorer, model, variance, colour = noisy
+    sources = ((times * variance, colour),) if times else ()
+    return scorer.of(Noisy(model.impulse_response, sources=sources))
 
 
 def test_noise_that_is_there_explains_and_more_or_less_of_it_explains_less(noisy):
@@ -46,6 +56,33 @@ def test_noise_that_is_expected_costs_half_of_its_decibels(noisy):
     assert right.level_db == pytest.approx(5.0, abs=0.4) and right.over_db == pytest.approx(0.0, abs=0.4)
     far = scored(noisy, 0.0)
     assert far.level_db == far.over_db == pytest.approx(10 * np.log10(11 / 2), abs=0.4)
+
+
+@pytest.mark.parametrize(("louder_db", "gain_db"), [(6.0, 1.0), (-10.0, 2.4)])
+def test_another_fan_is_paid_or_charged_half_of_its_decibels(louder_db, gain_db):
+    """Of a robot that keeps silent: what the level is with the calibrated fan, and with the one that is heard."""
+    x, robot = voice(6.0), profile()
+    fan = 10 ** (louder_db / 20) * record(0.0 * x)
+    prepared = prepare(robot, record(x) - record(0.0 * x) + fan, x)
+    prepared = replace(prepared, measurement=replace(prepared.measurement, noise_psd=robot.noise_psd))
+    scorer, changed = Scorer(prepared), prepared.model.with_effect("fan_noise", {"spectrum_db": louder_db})
+    before, after = scorer.of(prepared.model), scorer.of(changed)
+    assert after.over_db == pytest.approx(0.0, abs=0.3) and after.silent_db == pytest.approx(0.0, abs=0.3)
+    assert before.silent_db == pytest.approx(louder_db, abs=0.3)
+    assert before.level_db - after.level_db == pytest.approx(gain_db, abs=0.3)
+
+
+def test_a_gain_behind_the_microphone_is_expected_on_the_fan_as_well():
+    x, robot = voice(6.0), profile()
+    gain = 10 ** (np.interp(np.arange(x.size), [0, x.size], [6.0, -12.0]) / 20).astype(np.float32)
+    prepared = prepare(robot, gain * record(x), x)
+    curve = np.interp(np.arange(0.0, 6.1, 0.25), [0.0, 6.0], [6.0, -12.0])
+    model, scorer = prepared.model.with_effect("mic_agc", {"gain_db": curve}), Scorer(prepared)
+    turned = model.passed(np.ones(x.size, np.float32), x)
+    assert turned == pytest.approx(gain, rel=0.02)
+    score = scorer.of(model)
+    assert np.ptp(10 * np.log10(score.cells.mean(axis=1))) < 3.0 and abs(score.over_db) < 0.5
+    assert score.level_db < scorer.of(prepared.model).level_db - 2.0
 
 
 def test_a_refit_ends_where_no_round_can_reach_its_goal():

@@ -6,9 +6,11 @@ import numpy as np
 
 from edgefilter.dsp.frames import frames
 from edgefilter.dsp.psd import floored, periodograms
+from edgefilter.dsp.tones import tones
 from edgefilter.echo.effect import Effect, Parameter, first, neutral, within
+from edgefilter.echo.evidence import Evidence
 from edgefilter.echo.least_squares import absorbed
-from edgefilter.echo.measurement import SILENT, Measurement, Values, VoiceModel
+from edgefilter.echo.measurement import SILENT, STEADY_DB, Measurement, Values, VoiceModel
 from edgefilter.types import Array, Samples
 
 FEWEST_FRAMES, QUIET_SHARE = 12, 0.25
@@ -69,6 +71,12 @@ class FanNoise(Effect):
             f"the noise is {first(values, 'change_db'):+.1f} dB off the calibrated fan, with the robot's voice and"
             " without it"
         )
+
+    def plausible(self, evidence: Evidence) -> bool:
+        """Whether the robot's silences are as steady as a fan, and no hum of the mains is in them."""
+        measurement = evidence.grid.measurement
+        known, residual = measurement.noise_psd, measurement.recording - evidence.after.prediction
+        return evidence.swing_db < STEADY_DB and known is not None and not tones(residual, known)[1]
 
 
 def _quiet_mean(power: Array) -> Array:

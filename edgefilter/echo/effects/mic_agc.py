@@ -13,7 +13,7 @@ from edgefilter.dsp.psd import total_power
 from edgefilter.echo.effect import Effect, Parameter, Runner, numbers, within
 from edgefilter.echo.evidence import Evidence
 from edgefilter.echo.least_squares import absorbed
-from edgefilter.echo.measurement import ORDINARY_DB, SILENT, Measurement, Values, VoiceModel, level_ratio
+from edgefilter.echo.measurement import ORDINARY_DB, SILENT, STEADY_DB, Measurement, Values, VoiceModel, level_ratio
 from edgefilter.types import SAMPLE_RATE, Array, Samples
 
 KNOTS_HZ = 4.0
@@ -124,7 +124,7 @@ class MicAgc(Effect):
 
         By the likelihood of the residual's power in steps where little but the fan is left, at one level or times the gain's square.
         """
-        if float(evidence.values["range_db"]) < ORDINARY_DB:
+        if float(evidence.values["range_db"]) < ORDINARY_DB or abs(evidence.silent_db) > STEADY_DB:
             return False
         measurement = evidence.grid.measurement
         gain = self.apply(np.ones_like(measurement.recording), evidence.values, SAMPLE_RATE)

@@ -21,6 +21,8 @@ FORGETTING, NEIGHBOURS = 0.5, 3
 """Of the local ratio, from frame to frame, and the bins over which it is averaged: what explains most of the suppressors tried."""
 KNOTS_DB = np.arange(-10.0, 31.0, 5.0)
 """Local ratios of voice to fan; from the last one on everything is let through."""
+ALONE_DB = -20.0
+"""Ratio up to which the fan is alone."""
 LOUD_DB = 15.0
 """Where a suppressor lets nearly all through."""
 TRUST = 0.3
@@ -42,7 +44,7 @@ class NoiseSuppression(Effect):
     Every suppressor of the family of Wiener's filter (Lim & Oppenheim 1979, Ephraim & Malah 1984, and the spectral
     gates) is a gain that rises with the local ratio, and differs in how steeply; so that is fitted: gain_db (8,) at ratios
     of -10 to 25 dB, 0 dB from 30 dB on. fan_db: (601,) dB re full scale^2/Hz, the calibrated fan on which the ratio is
-    formed, or one number. softer_db only reports: level of the robot's silences re that fan.
+    formed, or one number. softer_db: the gain of the fan alone, level of the robot's silences re the calibrated one.
     """
 
     name = "noise_suppression"
@@ -61,18 +63,22 @@ class NoiseSuppression(Effect):
     )
 
     def apply(self, x: Samples, values: Values, sample_rate: int) -> Samples:
+        return self.passed(x, x, values, sample_rate)
+
+    def passed(self, noise: Samples, voice: Samples, values: Values, sample_rate: int) -> Samples:
         gain_db = _gains(values)
-        if not gain_db.any() or not x.size:
-            return x.copy()
+        if not gain_db.any() or not noise.size:
+            return noise.copy()
         density = 10.0 ** (numbers(values, "fan_db") / 10.0)
         fan = variance_at(frequencies(SIZE // 2 + 1), np.resize(density, 601).astype(np.float32))
-        spectra = _spectra(np.pad(x, (HOP, SIZE)))
-        spectra *= np.interp(decibels(_ratio(spectra, fan)), KNOTS_DB, [*10.0 ** (gain_db / 20.0), 1.0])
+        spectra, own = (_spectra(np.pad(x, (HOP, SIZE))) for x in (noise, voice))
+        gain_db = np.array([first(values, "softer_db"), *gain_db, 0.0])
+        spectra *= np.interp(decibels(_ratio(own, fan)), (ALONE_DB, *KNOTS_DB), 10.0 ** (gain_db / 20.0))
         pieces = np.fft.irfft(spectra, SIZE) * WINDOW
         whole = np.zeros((pieces.shape[0] + 1, HOP))
         whole[:-1] += pieces[:, :HOP]
         whole[1:] += pieces[:, HOP:]
-        return whole.ravel()[HOP : HOP + x.size].astype(np.float32)
+        return whole.ravel()[HOP : HOP + noise.size].astype(np.float32)
 
     def run(self, values: Values, sample_rate: int) -> Runner:
         """The voice as it is: a gain by frequency takes as long as a frame, which the running filter does not wait."""
