@@ -242,14 +242,10 @@ def conclude(
     """The diagnosis that a search leads to."""
     comparison = describe(prepared, found.start, found.base)
     searched, left = found, leftover(found)
-    believed = bool(found.steps) and (
-        found.final.excess_db < criteria.explained_db or _enough(prepared, found, criteria)
-    )
+    believed = bool(found.steps) and _believed(found, criteria)
     quiet = found.base.excess_db < criteria.explained_db and not prepared.human
-    verdict: Verdict = (
-        "missing" if believed and not _much_left(found, criteria) else "explained" if quiet else "unexplained"
-    )
-    if not believed and (quiet or not _partly(prepared, found, criteria)):
+    verdict: Verdict = "missing" if found.steps and holds(found, criteria) else "explained" if quiet else "unexplained"
+    if not believed and (quiet or not _partly(found, criteria)):
         found = _without_doubtful(found)
     unpredictable = any(find(step.name).adds_noise for step in found.steps)
     remaining = found.final.excess_db
@@ -274,16 +270,21 @@ def conclude(
     )
 
 
-def _enough(prepared: Prepared, found: Found, criteria: Criteria) -> bool:
-    """Whether the findings explain so much that they are what happened."""
-    much = explained_level(prepared, found) >= criteria.half
-    return much and found.final.excess_db < criteria.half * found.base.excess_db
+def holds(found: Found, criteria: Criteria) -> bool:
+    """Whether the effects that a model has beyond its start are what happened, and all that did."""
+    return _believed(found, criteria) and not _much_left(found, criteria)
 
 
-def _partly(prepared: Prepared, found: Found, criteria: Criteria) -> bool:
+def _believed(found: Found, criteria: Criteria) -> bool:
+    """Whether the findings leave next to nothing, or explain so much that they are what happened."""
+    much = found.final.excess_db < criteria.half * found.base.excess_db
+    return found.final.excess_db < criteria.explained_db or (much and explained_level(found) >= criteria.half)
+
+
+def _partly(found: Found, criteria: Criteria) -> bool:
     """Whether the findings explain enough to be named beside something that none explains."""
     power = share_of(found.base.excess_db, found.final.excess_db)
-    return power >= criteria.half and explained_level(prepared, found) >= criteria.part_level
+    return power >= criteria.half and explained_level(found) >= criteria.part_level
 
 
 def _much_left(found: Found, criteria: Criteria) -> bool:
@@ -307,8 +308,8 @@ def _without_doubtful(found: Found) -> Found:
     return replace(found, model=model, final=score, steps=tuple(kept))
 
 
-def explained_level(prepared: Prepared, found: Found) -> float:
+def explained_level(found: Found) -> float:
     """Part of the level over the robot's silences that is gone, 0 to 1: of many cells rather than of the loudest."""
-    above = found.base.over_db - Scorer(prepared).floor_level(found.final)
+    above = found.base.over_db - Scorer(found.prepared).floor_level(found.final)
     gone = found.base.over_db - found.final.over_db
     return float(np.clip(gone / above, 0.0, 1.0)) if above > 0.0 else 0.0
