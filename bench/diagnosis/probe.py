@@ -22,7 +22,7 @@ from bench.simulate.conversations import read_voices
 from bench.stale import DIAGNOSIS
 from edgefilter.calibration.calibrate import calibrate
 from edgefilter.calibration.sweep import generate_sweep
-from edgefilter.diagnosis.probe import ENOUGH, SOUND_S, Inquiry, weights
+from edgefilter.diagnosis.probe import ENOUGH, SOUND_S, Inquiry
 from edgefilter.errors import SignalError
 from edgefilter.types import Array
 
@@ -59,10 +59,10 @@ class Row:
         return self.outcomes[0] != "right"
 
 
-def outcome(likely: Array, true: int) -> str:
-    """Of the probabilities of a pair, and of none of it: right or wrong where ENOUGH to 1 speaks for one, else open."""
+def outcome(likely: Array, true: int, holds: bool = True) -> str:
+    """Of the probabilities of a pair, and of none of it: right or wrong where ENOUGH to 1 speaks for one that holds, else open."""
     best = int(np.argmax(likely[:2]))
-    if likely[best] < ENOUGH / (1.0 + ENOUGH):
+    if likely[best] < ENOUGH / (1.0 + ENOUGH) or not holds:
         return "open"
     return "right" if best == true else "wrong"
 
@@ -78,12 +78,13 @@ def examine(robot: AskedRobot, pair: tuple[str, str], strength: str) -> Row:
     sounds: tuple[str, ...] = ()
     for sound in (sweep, robot.further):
         try:
-            found.append(outcome(weights(inquiry.evidence(robot.ask(sound, 1), sound), [inquiry.gains(sound)]), true))
+            answer = inquiry.answer([inquiry.hear(robot.ask(sound, 1), sound)], [inquiry.gains(sound)])
+            found.append(outcome(answer.likely, true, answer.holds))
         except SignalError:
             found.append("open")
     try:
         answer = inquiry.ask(lambda sound: robot.ask(sound.samples, 2), ASKED_S)
-        found.append(outcome(answer.likely, true))
+        found.append(outcome(answer.likely, true, answer.holds))
         sounds = answer.sounds
     except SignalError:
         found.append("open")

@@ -18,11 +18,11 @@ from edgefilter.commands.outputs import question_of
 from edgefilter.commands.recordings import load, read, read_voice
 from edgefilter.diagnosis.advice import RIVAL, remaining
 from edgefilter.diagnosis.diagnose import diagnose
-from edgefilter.diagnosis.probe import ENOUGH, SOUND_S, Answer, Inquiry, weights
+from edgefilter.diagnosis.probe import ENOUGH, SOUND_S, Answer, Inquiry
 from edgefilter.echo.effects.catalogue import find
 from edgefilter.errors import AudioFileError, SignalError, UsageError
 from edgefilter.profile.data import Profile
-from edgefilter.report.text import add_command, joined
+from edgefilter.report.text import add_command, files_given, joined
 from edgefilter.types import Samples
 
 SCHEMA = 1
@@ -105,8 +105,8 @@ def _evaluate(args: argparse.Namespace) -> None:
     with progress("the answer"):
         wanted = [tuple(text.split("+")) for text in question["explanations"]]
         inquiry = _inquiry(profile, wanted, recording, reference)
-        likely = weights(inquiry.evidence(answer, sound), [inquiry.gains(sound)])
-    told = Answer(inquiry.explanations, likely, tuple(question["sounds"]))
+        heard = inquiry.hear(answer, sound)
+        told = inquiry.answer([heard], [inquiry.gains(sound)], tuple(question["sounds"]))
     _tell(args, told, {**vars(args), **question, "profile": args.profile})
 
 
@@ -138,12 +138,18 @@ def _digest(path: str) -> str:
 def _tell(args: argparse.Namespace, answer: Answer, names: dict[str, Any]) -> None:
     """Which it is, or what is left and what to do then."""
     seconds = len(answer.sounds) * SOUND_S
+    chance = f"{answer.odds:.0f}" if answer.odds < 1000 else "more than 1000"
     shares = ", ".join(f"{one.name} {100 * weight:.3g} %" for one, weight in answer.ranked)
     lines = [f"played      {words}" for words in answer.sounds]
     if answer.settled:
-        chance = f"{answer.odds:.0f}" if answer.odds < 1000 else "more than 1000"
         lines += [f"it is       {answer.first.name}, {chance} to 1 ({shares})"]
         lines += [f"next        {add_command(answer.first.effects, names)}"]
+    elif answer.odds >= ENOUGH:
+        left = f"{answer.left_db:.1f} dB over the noise floor"
+        where = "of what was heard of the sounds" if answer.in_answer else "of the recording"
+        lines += [f"nearest     {answer.first.name}, {chance} to 1 ({shares})"]
+        lines += [f"but         it leaves {left} {where}: something else is there, or is it none of these?"]
+        lines += [f"next        {_closer_look(args, answer, names)}"]
     elif answer.likely[-1] == answer.likely.max():
         lines += [
             "none        of them predicts what was heard; was anything else heard, or is the path another by now?"
@@ -151,3 +157,13 @@ def _tell(args: argparse.Namespace, answer: Answer, names: dict[str, Any]) -> No
     else:
         lines += [f"open        {shares}: not {ENOUGH:.0f} to 1 after {seconds:g} s; ask for more with --seconds"]
     print_result(args, lines, {"schema": SCHEMA, **answer.to_dict(), "seconds": seconds})
+
+
+def _closer_look(args: argparse.Namespace, answer: Answer, names: dict[str, Any]) -> str:
+    """The command that looks at the recording in which the nearest explanation leaves most; one that was not kept is made again."""
+    if not answer.in_answer:
+        return f"edgefilter diagnose {files_given(names)}"
+    if args.live:
+        explanations = " ".join(one.name for one in answer.explanations)
+        return f"edgefilter probe {explanations} {files_given(names)} --excitation probe.wav"
+    return f"edgefilter diagnose {files_given({**names, 'recording': args.recording, 'reference': args.excitation})}"

@@ -4,15 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import permutations
 
 import numpy as np
 from scipy.special import log_ndtr
 
 from edgefilter.calibration.multisine import BAND_HZ, SPEECH_DB
+from edgefilter.diagnosis.criteria import Criteria
+from edgefilter.diagnosis.diagnose import holds
 from edgefilter.diagnosis.joint import fit_jointly
 from edgefilter.diagnosis.prepare import HOP, Prepared, prepare
 from edgefilter.diagnosis.score import STEP, Scorer
+from edgefilter.diagnosis.trials import Found
 from edgefilter.dsp.convolution import convolve
 from edgefilter.dsp.fractional_delay import delayed
 from edgefilter.dsp.psd import GRID_BINS, coloured, frequencies
@@ -73,11 +77,18 @@ class Sound:
 
 @dataclass(frozen=True, eq=False)
 class Answer:
-    """Explanations and their probabilities after those sounds, likely: (explanations + 1,), the last of none of them."""
+    """Explanations and their probabilities after those sounds, likely: (explanations + 1,), the last of none of them.
+
+    holds: whether the first is what happened, and all that did, as a diagnosis judges it, in the recording and in what was
+    heard of each sound. left_db: excess that it leaves in the worst of them; in_answer: whether that is a sound's.
+    """
 
     explanations: tuple[Explanation, ...]
     likely: Array
     sounds: tuple[str, ...]
+    holds: bool
+    left_db: float
+    in_answer: bool
 
     @property
     def first(self) -> Explanation:
@@ -98,18 +109,35 @@ class Answer:
 
     @property
     def settled(self) -> bool:
-        """Whether these are enough to name it."""
-        return self.odds >= ENOUGH
+        """Whether these are enough to name it: what is nearer need not hold."""
+        return self.holds and self.odds >= ENOUGH
 
     def to_dict(self) -> dict[str, object]:
         """Ready for JSON."""
         return {
             "settled": self.settled,
             "odds": round(self.odds, 1),
+            "holds": self.holds,
+            "left_db": round(self.left_db, 2),
             "explanations": [{"effects": one.effects, "weight": round(weight, 6)} for one, weight in self.ranked],
             "none": round(float(self.likely[-1]), 6),
             "sounds": self.sounds,
         }
+
+
+@dataclass(frozen=True, eq=False)
+class Heard:
+    """What was recorded of a sound: one half of it to fit to and the other to test on, then the other way round.
+
+    Each with the explanations as fitted to the first recording and to that half.
+    """
+
+    halves: tuple[tuple[Prepared, list[Explanation]], ...]
+
+    @cached_property
+    def evidence(self) -> Array:
+        """Log likelihood of what was tested on, (moments, explanations + 1), the last of none."""
+        return np.concatenate([_log_likelihood(*half) for half in self.halves])
 
 
 class Inquiry:
@@ -145,35 +173,38 @@ class Inquiry:
         """The probability of each, and of none, by the other half, before anything is asked, (explanations + 1,)."""
         return weights(_log_likelihood(self._first, self.explanations))
 
-    def evidence(self, recording: Samples, sound: Samples) -> Array:
-        """Log likelihood of what was recorded (m,) of a sound (n,), (moments, explanations + 1), the last of none.
+    def hear(self, recording: Samples, sound: Samples) -> Heard:
+        """What was recorded (m,) of a sound (n,), and all explanations fitted again: to the first recording and half of this one.
 
-        All are fitted again, to the first recording and one half of this one, and tested on the other half; then the
-        halves change places. What a clock does begins anew with each recording, so that a model of one stays as it is.
         Raises SignalError where the recording does not contain the sound.
         """
-        found = []
-        for part in _halves(prepare(self.profile, recording, sound)):
-            first, new = self._first.measurement, part.measurement
-            both = Measurement(
-                np.concatenate((first.reference, new.reference)),
-                np.concatenate((first.recording, new.recording)),
-                first.noise_psd,
-                np.concatenate((self._first.usable, part.fit)),
-            )
-            clocks = self._first.model.timed
-            again = [
-                one if clocks or one.model.timed else replace(one, model=_fitted(both, part.model, one.effects))
-                for one in self.explanations
-            ]
-            found.append(_log_likelihood(part, again))
-        return np.concatenate(found)
+        first = self._first.fitted_to(self._first.usable)
+        halves = _halves(prepare(self.profile, recording, sound))
+        return Heard(
+            tuple((half, [self._again(one, half.model, first, half) for one in self.explanations]) for half in halves)
+        )
+
+    def _again(self, one: Explanation, start: EchoModel, *parts: Prepared) -> Explanation:
+        """The same fitted to the first recording and others, as one.
+
+        What a clock does begins anew with each recording, so that a model of one stays as it is.
+        """
+        if self._first.model.timed or one.model.timed:
+            return one
+        known = [part.measurement for part in parts]
+        joined = Measurement(
+            np.concatenate([each.reference for each in known]),
+            np.concatenate([each.recording for each in known]),
+            self._first.noise_psd,
+            np.concatenate([part.fit for part in parts]),
+        )
+        return replace(one, model=_fitted(joined, start, one.effects))
 
     def gains(self, sound: Samples) -> Array:
         """The log odds over each other expected of a sound (n,), (explanations, explanations): the first is true."""
         count = len(self.explanations)
         heard = (_simulated(self.profile, true, sound) for true in self.explanations)
-        told = [self.evidence(recording, sound).sum(axis=0)[:count] for recording in heard]
+        told = [self.hear(recording, sound).evidence.sum(axis=0)[:count] for recording in heard]
         return np.stack([told[i][i] - told[i] for i in range(count)])
 
     def sounds(self, likely: Array, progress: Callable[[str], None] | None = None) -> list[Sound]:
@@ -211,16 +242,36 @@ class Inquiry:
         play: gives what is recorded of a sound and for a second after it. Raises SignalError where no sound tells them
         apart, or what is recorded does not contain it.
         """
-        count = len(self.explanations)
-        heard, gains = np.zeros((0, count + 1)), []
-        answer = Answer(self.explanations, np.full(count + 1, 1.0 / count), ())
-        while not answer.settled and (len(answer.sounds) + 1) * SOUND_S <= seconds:
+        heard: list[Heard] = []
+        gains: list[Array] = []
+        answer = self.answer(heard, gains)
+        while answer.odds < ENOUGH and (len(answer.sounds) + 1) * SOUND_S <= seconds:
             sounds = self.sounds(answer.likely, progress)
             sound = next((one for one in sounds if one.words not in answer.sounds), sounds[0])
-            heard = np.concatenate((heard, self.evidence(play(sound), sound.samples)))
+            heard.append(self.hear(play(sound), sound.samples))
             gains.append(self.gains(sound.samples))
-            answer = Answer(self.explanations, weights(heard, gains), (*answer.sounds, sound.words))
+            answer = self.answer(heard, gains, (*answer.sounds, sound.words))
         return answer
+
+    def answer(self, heard: Sequence[Heard], gains: Sequence[Array], sounds: tuple[str, ...] = ()) -> Answer:
+        """Which is nearer to what was heard of those sounds, with what was expected of them (gains), and whether it holds.
+
+        That is judged on what no fit has seen: for one half of the first recording it is fitted to the other half and to
+        all that was heard, since a few seconds of speech do not teach a long filter.
+        """
+        nothing = np.zeros((0, len(self.explanations) + 1))
+        likely = weights(np.concatenate([nothing, *(one.evidence for one in heard)]), gains)
+        best = int(np.argmax(likely[:-1]))
+        new = (part.fitted_to(part.usable) for each in heard for part, _ in each.halves[:1])
+        first = self._again(self.explanations[best], self._first.model, self._first, *new)
+        judged = [(self._first, first), *((part, them[best]) for each in heard for part, them in each.halves)]
+        found = [_found(part, one.model) for part, one in judged]
+        criteria = Criteria()
+        worst = max(found, key=lambda one: (not holds(one, criteria), one.final.excess_db))
+        left_db = worst.final.excess_db
+        return Answer(
+            self.explanations, likely, sounds, holds(worst, criteria), left_db, in_answer=worst is not found[0]
+        )
 
 
 def weights(found: Array, gains: Sequence[Array] = ()) -> Array:
@@ -339,6 +390,12 @@ def _simulated(profile: Profile, true: Explanation, sound: Samples) -> Samples:
     for square, colour in model.unpredictable(x):
         heard = heard + np.sqrt(square) * coloured(rng, x.size, colour)
     return heard.astype(np.float32)
+
+
+def _found(prepared: Prepared, model: EchoModel) -> Found:
+    """What a model leaves of a recording, as a search says it that ends with that model."""
+    scorer, start = Scorer(prepared), prepared.model
+    return Found(prepared, start, model, scorer.of(start), scorer.of(model), ())
 
 
 def _cells(scorer: Scorer, model: EchoModel) -> tuple[Array, Array, Array]:

@@ -158,12 +158,18 @@ def add_command(effects: Sequence[str], names: Mapping[str, Any]) -> str:
     """Give the command that writes a profile with these effects, of all microphones; without a profile, the one that calibrates."""
     if names["profile"] is None:
         return "edgefilter calibrate --live --output robot.npz"
-    files = " ".join(f"--{role} {shlex.quote(str(names[role]))}" for role in ("profile", "recording", "reference"))
-    own = "".join(f" --effects {shlex.quote(str(file))}" for file in names.get("effects") or ())
+    files = files_given(names)
     output = shlex.quote(str(Path(str(names["profile"])).with_suffix(f".{'.'.join(effects)}.npz")))
     if channels := names.get("mic_channels"):
-        return f"edgefilter diagnose {files}{own} --mic-channels {','.join(map(str, channels))} --apply {output}"
-    return f"edgefilter add {' '.join(effects)} {files}{own} --output {output}"
+        return f"edgefilter diagnose {files} --mic-channels {','.join(map(str, channels))} --apply {output}"
+    return f"edgefilter add {' '.join(effects)} {files} --output {output}"
+
+
+def files_given(names: Mapping[str, Any]) -> str:
+    """The options that name profile, recording, reference and own effects, as words of a command."""
+    files = [(role, names[role]) for role in ("profile", "recording", "reference")]
+    files += [("effects", file) for file in names.get("effects") or ()]
+    return " ".join(f"--{role} {shlex.quote(str(file))}" for role, file in files)
 
 
 def coarser(times: Sequence[tuple[float, float, float]], rows: int) -> list[tuple[float, float, float]]:

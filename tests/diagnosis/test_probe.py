@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
+import shlex
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -49,6 +52,55 @@ def heard(x: np.ndarray, name: str, values: dict, seed: int) -> np.ndarray:
     return y.astype(np.float32)
 
 
+def trembling(x: np.ndarray, seed: int) -> np.ndarray:
+    """(n + SAMPLE_RATE,) the same of a loudspeaker whose gain goes up and down five times a second, which no effect is."""
+    x = np.pad(x, (0, SAMPLE_RATE))
+    gain = 0.7 + 0.3 * np.cos(2 * np.pi * 5.0 * np.arange(x.size) / SAMPLE_RATE)
+    return record((gain * x).astype(np.float32), seed=seed)
+
+
+def softer(x: np.ndarray, seed: int) -> np.ndarray:
+    """(n + SAMPLE_RATE,) the same of a loudspeaker that was turned down by 3 dB."""
+    return heard(x, "playback_gain", {"gain_db": -3.0}, seed)
+
+
+VOLUME_OR_RING = (("playback_gain",), ("chassis_resonance",))
+
+
+def beside_a_tap(x: np.ndarray, seed: int) -> np.ndarray:
+    """The same again while water runs, 10 dB over the fan."""
+    noise = np.random.default_rng(seed + 1).standard_normal(x.size + SAMPLE_RATE)
+    return softer(x, seed) + (3e-3 * noise).astype(np.float32)
+
+
+@pytest.mark.parametrize(("happened", "holds"), [(softer, True), (trembling, False)])
+def test_what_is_nearer_is_named_only_where_it_holds(happened, holds: bool) -> None:
+    """Of a volume and a ring the volume is nearer to a volume and to a tremolo, 20 to 1."""
+    x, sound = voice(4.0), menu(voice(4.0))["noise"]
+    inquiry = Inquiry(profile(), VOLUME_OR_RING, happened(x, 3), x)
+    answer = inquiry.answer([inquiry.hear(happened(sound, 5), sound)], [inquiry.gains(sound)], ("noise",))
+    assert answer.first.name == "playback_gain" and answer.odds >= ENOUGH
+    assert answer.holds == answer.settled == holds
+    assert answer.left_db < 0.8 if holds else answer.left_db > 3.0  # what a diagnosis calls explained, and much
+
+
+@pytest.mark.slow
+def test_what_does_not_hold_is_not_asked_further() -> None:
+    x = voice(4.0)
+    inquiry = Inquiry(profile(), VOLUME_OR_RING, trembling(x, 3), x)
+    answer = inquiry.ask(lambda sound: trembling(sound.samples, 5), 60.0)
+    assert answer.odds >= ENOUGH and not answer.settled and len(answer.sounds) < 24
+
+
+def test_a_long_filter_that_the_recording_did_not_teach_holds_where_the_sounds_teach_it() -> None:
+    """Two seconds of soft speech teach nothing of another path, as much of loud noise does."""
+    x, sound, elsewhere = 0.12 * voice(4.0), menu(voice(4.0))["noise"], EchoModel(path(seed=2))
+    inquiry = Inquiry(profile(), [("playback_gain",), ("early_path",)], record(x, elsewhere), x)
+    heard = inquiry.hear(record(np.pad(sound, (0, SAMPLE_RATE)), elsewhere, seed=5), sound)
+    answer = inquiry.answer([heard], [], ("noise",))
+    assert answer.first.name == "early_path" and answer.settled and answer.left_db < 1.0  # no more than half of 3.6 dB
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("pair", PAIRS)
 @pytest.mark.parametrize("true", [0, 1])
@@ -63,18 +115,22 @@ def test_five_seconds_settle_a_pair_whichever_is_true(pair: str, true: int) -> N
 
 def test_explanations_are_told_the_most_probable_first_with_the_odds_of_that():
     few, many = (Explanation((name,), None, None) for name in ("few", "many"))
-    answer = Answer((few, many), np.array([1 / 30, 2 / 3, 0.3]), ("a sound",))
+    answer = Answer((few, many), np.array([1 / 30, 2 / 3, 0.3]), ("a sound",), True, 0.25, in_answer=False)
     assert answer.first is many and answer.odds == pytest.approx(2.0) and not answer.settled
     assert answer.to_dict() == {
         "settled": False,
         "odds": 2.0,
+        "holds": True,
+        "left_db": 0.25,
         "explanations": [{"effects": ("many",), "weight": 0.666667}, {"effects": ("few",), "weight": 0.033333}],
         "none": 0.3,
         "sounds": ("a sound",),
     }
-    sure = Answer((few, many), np.array([1.0, 0.0, 0.0]), ())
+    sure = replace(answer, likely=np.array([1.0, 0.0, 0.0]))
     assert sure.first is few and sure.settled and sure.odds == pytest.approx(1e6)
-    thirds = Answer((few, many), np.array([7 / 9, 1 / 9, 1 / 9]), ()).to_dict()
+    nearest = replace(sure, holds=False)
+    assert nearest.first is few and nearest.odds == sure.odds and not nearest.settled
+    thirds = replace(answer, likely=np.array([7 / 9, 1 / 9, 1 / 9])).to_dict()
     assert (thirds["odds"], thirds["none"]) == (3.5, 0.111111)
 
 
@@ -194,6 +250,52 @@ def test_the_command_writes_the_sounds_and_evaluates_what_was_heard_of_them(writ
     figures = json.loads((written / "said.json").read_text())
     assert figures["schema"] == 1 and figures["settled"] and figures["odds"] >= ENOUGH and figures["seconds"] == 5.0
     assert [one["effects"] for one in figures["explanations"]] == [["compression"], ["playback_gain"]]
+
+
+def a_question(folder: Path, before, asked) -> list[str]:
+    """The words that evaluate an answer to "a volume or a ring?", with the files that they need."""
+    x, sound = voice(4.0), menu(voice(4.0))["noise"]
+    profile().save(folder / "robot.npz")
+    sounds = {"ref": x, "mic": before(x, 3), "probe": sound, "answer": asked(sound, 5)}
+    for name, samples in sounds.items():
+        soundfile.write(folder / f"{name}.wav", samples, SAMPLE_RATE, "FLOAT")
+    digests = {
+        f"{role}_sha256": hashlib.sha256((folder / file).read_bytes()).hexdigest()
+        for role, file in (("profile", "robot.npz"), ("excitation", "probe.wav"))
+    }
+    files = {"recording": str(folder / "mic.wav"), "reference": str(folder / "ref.wav")}
+    question = {"schema": 1, "explanations": ["playback_gain", "chassis_resonance"], "sounds": ["noise"]}
+    (folder / "probe.wav.json").write_text(json.dumps({**question, **files, **digests}))
+    return answering(folder)
+
+
+@pytest.mark.parametrize(
+    ("before", "asked", "nearest", "where", "recording", "reference"),
+    [
+        (trembling, softer, "playback_gain", "of the recording", "mic.wav", "ref.wav"),
+        (softer, beside_a_tap, "chassis_resonance", "of what was heard of the sounds", "answer.wav", "probe.wav"),
+    ],
+)
+def test_what_is_nearer_and_does_not_hold_is_told_with_what_it_leaves_and_where_to_look_closer(
+    tmp_path: Path, capsys, before, asked, nearest: str, where: str, recording: str, reference: str
+) -> None:
+    assert main([*a_question(tmp_path, before, asked), "--json", str(tmp_path / "said.json")]) == 0
+    _, which, but, next_ = capsys.readouterr().out.splitlines()
+    figures = json.loads((tmp_path / "said.json").read_text())
+    assert not figures["settled"] and not figures["holds"] and figures["odds"] >= ENOUGH
+    assert which.startswith(f"nearest     {nearest}, ") and f" to 1 ({nearest} " in which
+    assert but.startswith(f"but         it leaves {figures['left_db']:.1f} dB over the noise floor {where}: ")
+    command = ["edgefilter", "diagnose", "--profile", str(tmp_path / "robot.npz")]
+    command += ["--recording", str(tmp_path / recording), "--reference", str(tmp_path / reference)]
+    assert next_.startswith("next        ") and shlex.split(next_)[1:] == command
+
+
+@pytest.mark.slow
+def test_the_closer_look_finds_what_neither_explanation_is(tmp_path: Path, capsys) -> None:
+    assert main(a_question(tmp_path, trembling, trembling)) == 0
+    next_ = capsys.readouterr().out.splitlines()[-1]
+    assert main(shlex.split(next_)[2:]) == 0
+    assert "verdict     unexplained" in capsys.readouterr().out
 
 
 @pytest.mark.slow
