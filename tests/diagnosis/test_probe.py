@@ -17,10 +17,11 @@ from edgefilter.cli import main
 from edgefilter.diagnosis.advice import asks, remaining
 from edgefilter.diagnosis.probe import ENOUGH, SOUND_S, Answer, Explanation, Inquiry, menu, weights
 from edgefilter.diagnosis.result import Candidate
+from edgefilter.dsp.fractional_delay import delayed
 from edgefilter.echo.model import EchoModel
 from edgefilter.errors import SignalError, UsageError
-from edgefilter.types import SAMPLE_RATE
-from tests.diagnosis.robot_scene import path, profile, record, voice
+from edgefilter.types import PRE_ROLL, SAMPLE_RATE
+from tests.diagnosis.robot_scene import DELAY, path, profile, record, voice
 
 COMPRESSION = {"threshold_db": -45.0, "ratio": 1.5, "attack_ms": 8.0, "release_ms": 900.0, "makeup_db": 4.0}
 PAIRS = {
@@ -184,6 +185,17 @@ def test_what_predicts_the_same_is_one_explanation_and_an_event_is_none() -> Non
     assert len(Inquiry(profile(), [("early_path",), ("late_reverb",)], y, x).explanations) == 1
     with pytest.raises(UsageError, match="delay_jump belongs to one recording"):
         Inquiry(profile(), [("delay_jump",), ("playback_gain",)], y, x)
+
+
+def test_a_louder_fan_that_the_profile_knows_is_expected_once() -> None:
+    """A profile with a fan 6 dB louder as an effect says the same as one that was calibrated beside that fan."""
+    x, calibrated = voice(4.0), profile()
+    noise = 2e-3 * np.random.default_rng(5).standard_normal(x.size)
+    y = EchoModel(path()).with_effect("playback_gain", {"gain_db": -1.0}).predict(delayed(x, DELAY - PRE_ROLL)) + noise
+    louder = calibrated.with_echo(EchoModel(path()).with_effect("fan_noise", {"spectrum_db": 20 * np.log10(2.0)}))
+    beside_it = replace(calibrated, noise_psd=4 * calibrated.noise_psd)
+    told, expected = (Inquiry(each, VOLUME_OR_RING, y.astype(np.float32), x).before() for each in (louder, beside_it))
+    assert told == pytest.approx(expected, rel=1e-4)
 
 
 @pytest.mark.slow
