@@ -145,17 +145,18 @@ def _tell(args: argparse.Namespace, answer: Answer, names: dict[str, Any]) -> No
         lines += [f"it is       {answer.first.name}, {chance} to 1 ({shares})"]
         lines += [f"next        {add_command(answer.first.effects, names)}"]
     elif answer.odds >= ENOUGH:
-        left = f"{answer.left_db:.1f} dB over the noise floor"
-        where = "of what was heard of the sounds" if answer.in_answer else "of the recording"
         lines += [f"nearest     {answer.first.name}, {chance} to 1 ({shares})"]
-        lines += [f"but         it leaves {left} {where}: something else is there, or is it none of these?"]
-        lines += [f"next        {_closer_look(args, answer, names)}"]
     elif answer.likely[-1] == answer.likely.max():
         lines += [
             "none        of them predicts what was heard; was anything else heard, or is the path another by now?"
         ]
     else:
         lines += [f"open        {shares}: not {ENOUGH:.0f} to 1 after {seconds:g} s; ask for more with --seconds"]
+    if not answer.holds:
+        left = f"{answer.first.name} leaves {answer.left_db:.1f} dB over the noise floor"
+        where = "of what was heard of the sounds" if answer.in_answer else "of the recording"
+        lines += [f"but         {left} {where}: something else is there, or is it none of these?"]
+        lines += [f"next        {_closer_look(args, answer, names)}"]
     print_result(args, lines, {"schema": SCHEMA, **answer.to_dict(), "seconds": seconds})
 
 

@@ -296,7 +296,7 @@ def test_what_is_nearer_and_does_not_hold_is_told_with_what_it_leaves_and_where_
     figures = json.loads((tmp_path / "said.json").read_text())
     assert not figures["settled"] and not figures["holds"] and figures["odds"] >= ENOUGH
     assert which.startswith(f"nearest     {nearest}, ") and f" to 1 ({nearest} " in which
-    assert but.startswith(f"but         it leaves {figures['left_db']:.1f} dB over the noise floor {where}: ")
+    assert but.startswith(f"but         {nearest} leaves {figures['left_db']:.1f} dB over the noise floor {where}: ")
     command = ["edgefilter", "diagnose", "--profile", str(tmp_path / "robot.npz")]
     command += ["--recording", str(tmp_path / recording), "--reference", str(tmp_path / reference)]
     assert next_.startswith("next        ") and shlex.split(next_)[1:] == command
@@ -317,7 +317,12 @@ def test_what_nothing_predicts_is_said_and_named_by_none(written: Path, capsys) 
     y += 0.02 * np.random.default_rng(0).standard_normal(y.size).astype(np.float32)
     soundfile.write(written / "strange.wav", y, SAMPLE_RATE, "FLOAT")
     assert main([*answering(written, "strange.wav"), "--json", str(written / "strange.json")]) == 0
-    assert "none        of them predicts what was heard" in capsys.readouterr().out
+    _, _, none, but, next_ = capsys.readouterr().out.splitlines()
+    assert (
+        none.startswith("none        of them predicts what was heard")
+        and " dB over the noise floor of what was heard" in but
+    )
+    assert next_.startswith("next        edgefilter diagnose ") and str(written / "strange.wav") in next_
     figures = json.loads((written / "strange.json").read_text())
     assert not figures["settled"] and figures["none"] > 0.5
 
