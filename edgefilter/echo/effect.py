@@ -184,7 +184,7 @@ class Effect:
     @property
     def last_resort(self) -> bool:
         """Whether it is tried only where no other explains much: noise that no waveform predicts fits whatever is left."""
-        return self.adds_noise
+        return self.adds_noise or self.stage == "noise"
 
     @property
     def noise_is_asked(self) -> bool:

@@ -93,6 +93,20 @@ class Evidence:
         return float(decibels(self._silences.mean())) if self._silences.size else 0.0
 
     @property
+    def silent_gain_db(self) -> float:
+        """By how much the effect lowers Score.level_db of the robot's silences alone; nan where it is never silent."""
+        if not self._silences.size:
+            return float("nan")
+        silent, freedom = ~self.grid.active_cells, self.grid.freedom
+        fall = self._level(self.before) - self._level(self.after)
+        return float(np.average(fall[silent].mean(axis=0), weights=freedom))
+
+    def _level(self, score: Score) -> Array:
+        """Score.level_db of each cell, (times, bands)."""
+        power = self.grid.cells(self.grid.measurement.recording - score.prediction)
+        return decibels(0.5 + 0.5 * score.cells) + 0.5 * decibels(power / score.cells)
+
+    @property
     def swing_db(self) -> float:
         """By how much the loud and the quiet tenth of the silences differ, 0 where they are too few."""
         return float(np.ptp(decibels(np.quantile(self._silences, (0.1, 0.9))))) if self._silences.size else 0.0

@@ -7,8 +7,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from edgefilter.diagnosis.channels import SECOND
-from edgefilter.diagnosis.leftover import Leftover, inspect, left_in_words
+from edgefilter.diagnosis.leftover import Leftover, left_in_words, leftover
+from edgefilter.dsp.tones import SECOND
 
 RATE = 16_000
 FAN = 1e-3
@@ -59,12 +59,17 @@ def fan(seconds: float = SECONDS) -> np.ndarray:
     return FAN * np.random.default_rng(0).standard_normal(round(seconds * RATE)).astype(np.float32)
 
 
-def prepared(size: int, silent_from_s: float = 6.0) -> SimpleNamespace:
-    """A robot that speaks until then, with a white fan."""
-    active = np.arange(size) < silent_from_s * RATE
-    return SimpleNamespace(
-        noise_psd=np.full(601, 2 * FAN**2 / RATE, np.float32), usable=np.ones(size, bool), active=active
+def inspect(residual: np.ndarray, silent_from_s: float = 6.0) -> Leftover:
+    """What is left of a robot that speaks until then, with a white fan."""
+    n = residual.size
+    heard = SimpleNamespace(
+        noise_psd=np.full(601, 2 * FAN**2 / RATE, np.float32),
+        usable=np.ones(n, bool),
+        active=np.arange(n) < silent_from_s * RATE,
+        measurement=SimpleNamespace(recording=residual),
     )
+    model, final = SimpleNamespace(microphone_gain=np.ones), SimpleNamespace(prediction=np.zeros(n, np.float32))
+    return leftover(SimpleNamespace(heard=heard, model=model, final=final))
 
 
 def tones(size: int, *hertz: float) -> np.ndarray:
@@ -87,7 +92,7 @@ def tones(size: int, *hertz: float) -> np.ndarray:
 )
 def test_tones_are_found_loudest_first_with_the_mains_they_belong_to(hertz, mains):
     noise = fan()
-    found = inspect(prepared(noise.size), noise + tones(noise.size, *hertz))
+    found = inspect(noise + tones(noise.size, *hertz))
     assert found.tones_hz.tolist() == pytest.approx(hertz, abs=1.0) and found.mains_hz == mains  # half a bin
     # the louder half of chance lies over the fan, too: a tenth of the power here
     assert found.tone_share > 0.7
@@ -96,20 +101,20 @@ def test_tones_are_found_loudest_first_with_the_mains_they_belong_to(hertz, main
 @pytest.mark.parametrize(("hertz", "found"), [(18.5, []), (19.5, [19.53125])])
 def test_below_19_hz_it_is_no_tone(hertz, found):
     noise = fan()
-    assert inspect(prepared(noise.size), noise + tones(noise.size, hertz)).tones_hz.tolist() == found
+    assert inspect(noise + tones(noise.size, hertz)).tones_hz.tolist() == found
 
 
 @pytest.mark.parametrize("hertz", [439.9, 440.0])
 def test_a_tone_between_two_bins_is_one_tone_as_a_whole(hertz):
-    found = inspect(prepared(12 * RATE), 300.0 * tones(12 * RATE, hertz) + fan())
+    found = inspect(300.0 * tones(12 * RATE, hertz) + fan())
     assert found.tones_hz[0] == pytest.approx(hertz, abs=0.6) and found.tone_share > 0.999
 
 
 def test_a_fan_has_no_tones_nor_have_two_seconds():
     noise, most = fan(), 2 * SECOND
-    assert inspect(prepared(most), noise[:most] + tones(most, 440)).tones_hz.size == 1
+    assert inspect(noise[:most] + tones(most, 440)).tones_hz.size == 1
     for heard in (noise, (noise + tones(noise.size, 440))[: most - 1]):
-        found = inspect(prepared(heard.size), heard)
+        found = inspect(heard)
         assert found.tones_hz.size == 0 and (found.mains_hz, found.tone_share) == (0.0, 0.0)
 
 
@@ -119,7 +124,7 @@ def test_what_the_silences_hold_over_the_fan_is_told_in_db():
     noise[: 6 * RATE] *= 100.0
     noise[6 * RATE : 9 * RATE + 1600] *= np.float32(np.sqrt(2.0))
     noise[9 * RATE + 1600 :] *= np.float32(np.sqrt(10.0))
-    found = inspect(prepared(noise.size), noise)
+    found = inspect(noise)
     assert found.quiet_mean_db == pytest.approx(10 * np.log10((31 * 2 + 29 * 10) / 60), abs=0.2)
     assert found.swing_db == pytest.approx(10 * np.log10(5.0), abs=0.6)
 
@@ -127,6 +132,6 @@ def test_what_the_silences_hold_over_the_fan_is_told_in_db():
 @pytest.mark.parametrize(("silent_s", "told"), [(0.4, False), (0.5, True)])
 def test_of_less_than_half_a_second_of_silence_nothing_is_told(silent_s, told):
     noise = fan()
-    found = inspect(prepared(noise.size, SECONDS - silent_s), noise)
+    found = inspect(noise, SECONDS - silent_s)
     assert np.isfinite(found.quiet_mean_db) == told
     assert found.swing_db > 0.0 if told else found.swing_db == 0.0

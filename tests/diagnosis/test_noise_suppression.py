@@ -106,7 +106,7 @@ def test_what_the_running_filter_contradicts_is_not_looked_for() -> None:
 def test_it_stays_named_beside_what_nothing_explains() -> None:
     x = voice(SECONDS)
     trembling = 0.7 + 0.3 * np.sin(2 * np.pi * 7.0 * np.arange(x.size) / 16000)
-    quick = Criteria(most_effects=1, starts=0)
+    quick = Criteria(most_effects=2, starts=0)
     found = diagnose(profile(), suppressed(record((trembling * x).astype(np.float32)), -12.0), x, criteria=quick)
     assert found.verdict == "unexplained" and [f.effect for f in found.ranking][:1] == ["noise_suppression"]
     row = next(row for row in found.tried if row.effect == "noise_suppression")

@@ -73,10 +73,12 @@ class FanNoise(Effect):
         )
 
     def plausible(self, evidence: Evidence) -> bool:
-        """Whether the robot's silences are as steady as a fan, and no hum of the mains is in them."""
+        """Whether the robot's silences, or all where it is never silent, sound like that fan, and no hum of the mains is in them."""
         measurement = evidence.grid.measurement
         known, residual = measurement.noise_psd, measurement.recording - evidence.after.prediction
-        return evidence.swing_db < STEADY_DB and known is not None and not tones(residual, known)[1]
+        heard, left_db = evidence.silent_gain_db, evidence.after.excess_db
+        steady = left_db < STEADY_DB if np.isnan(heard) else heard > 0.0 and evidence.swing_db < STEADY_DB
+        return steady and known is not None and not tones(residual, known)[1]
 
 
 def _quiet_mean(power: Array) -> Array:

@@ -32,7 +32,8 @@ EDGES = np.unique(np.round(np.geomspace(4, SIZE // 2 - 10, 17)).astype(int))
 FEWEST_LOUD, FEWEST_QUIET = 30, 16
 """Cells of a band, and frames of silence, that say something."""
 LEAST_SOFTER_DB = 2.0
-"""By which the silences are under the calibrated fan at least: from day to day it is half a dB."""
+"""By which the silences are under the calibrated fan at least, from day to day it is half a dB, and by which the weakest
+voice is let through less: behind a softer fan that is as predicted to half a dB."""
 MISSED_DB = -4.5
 """Of the loud cells of the voice, which a suppressor lets through, three in four are predicted but for less: where they are
 not, a drift or what else is in the recording may take the weak cells away as well."""
@@ -114,9 +115,9 @@ class NoiseSuppression(Effect):
         )
 
     def plausible(self, evidence: Evidence) -> bool:
-        """Whether silences are softer than the calibrated fan, and the loud cells of the voice as predicted."""
-        measurement = evidence.grid.measurement
-        if first(evidence.values, "softer_db") > -LEAST_SOFTER_DB or measurement.fit is None:
+        """Whether silences and weak voice are softer than calibrated, and the loud cells of the voice as predicted."""
+        measurement, values = evidence.grid.measurement, evidence.values
+        if max(first(values, "softer_db"), _gains(values)[0]) > -LEAST_SOFTER_DB or measurement.fit is None:
             return False
         held = evidence.grid.usable & ~measurement.fit
         return Cells(measurement, evidence.before.prediction, held).missed_db <= MISSED_DB
