@@ -160,8 +160,8 @@ class Scorer:
         return self._mean(decibels(0.5 + 0.5 * score.cells[self.silent_cells]))
 
     def silent_db(self, score: Score) -> float:
-        """By how much the noise of the robot's silences is above what is expected of it, 0 where it is never silent, dB."""
-        power = self._mean(score.cells[self.silent_cells])
+        """By how much the robot's silences, or all where it is never silent, are louder than expected, dB."""
+        power = self._mean(score.cells[self.silent_cells] if self.silent_cells.any() else score.cells)
         return float(decibels(power)) if power > 0.0 else 0.0
 
     def correct(self, prediction: Samples, white: Samples) -> Samples:
