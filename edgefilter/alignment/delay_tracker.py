@@ -239,9 +239,9 @@ class DriftFilter:
     """
 
     def __init__(self) -> None:
-        self.delay, self.slope = float("nan"), 0.0
-        self._variance, self._covariance, self._slope_variance = 4.0, 0.0, SLOPE_DEVIATION**2
-        self._since, self._witness = 0, JumpWitness()
+        self.slope, self._slope_variance = 0.0, SLOPE_DEVIATION**2
+        self._witness = JumpWitness()
+        self.restart(float("nan"), float("nan"))  # nothing is known of a delay
 
     @property
     def deviation(self) -> float:

@@ -250,7 +250,7 @@ class Canceller:
         """Take the reference's next hop into the spectra and powers (partitions, bins), the newest first in each channel."""
         self._recent[:, : self.hop] = self._recent[:, self.hop :]
         self._recent[0, self.hop :] = reference
-        if self._channels > 1:
+        if self.adaptation.products:
             self._scale_products(self._sustained.step(float(reference.dot(reference)) / self.hop))
             moved = self._displacement(reference)
             first = np.multiply(moved, reference, out=self._recent[1, self.hop :])
@@ -364,7 +364,7 @@ class Canceller:
         known = np.concatenate((np.zeros(self.history), history), dtype=np.float32)[-self.history :]
         past = known[: -self.hop]
         channels = [past]
-        if self._channels > 1:
+        if self.adaptation.products:
             self._moving = np.zeros(DISPLACEMENT_TAPS - 1, np.float32)
             moved = self._displacement(past)
             channels += [moved * past, moved * moved * past]

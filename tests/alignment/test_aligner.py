@@ -318,6 +318,10 @@ def test_paper_aligner_decides_every_utterance(hop):
         ]  # half a second, then the stride in which lags are evaluated
         assert abs(decided.delay - lag - HEAD) < CLOSE
     assert sum(a.realigned for a in hops) == 2
+    late = np.concatenate([a.reference for a in hops])[-4 * RATE :]
+    at = len(hops) * hop - int(hops[-1].delay)
+    assert np.abs(late).max() > 0.1
+    np.testing.assert_array_equal(late, ref[at - late.size : at])
 
 
 def test_a_delay_line_delays_a_sine_by_a_moving_fraction():

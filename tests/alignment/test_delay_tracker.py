@@ -2,14 +2,22 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 
 from edgefilter.alignment.delay_tracker import DelayMeasurement, DriftFilter, JumpWitness
 
 
-def look(offset: float, strength: float = 10.0, ratio: float = 2.0, gain: float = 1.0, gain_there: float = 1.0):
+def look(
+    offset: float,
+    strength: float = 10.0,
+    ratio: float = 2.0,
+    gain: float = 1.0,
+    gain_there: float = 1.0,
+    explained: float = 1.0,
+) -> DelayMeasurement:
     """One that is sure of its offset."""
-    return DelayMeasurement(offset, 1e-6, strength, ratio, 5.0, 1.0, gain, gain_there)
+    return DelayMeasurement(offset, 1e-6, strength, ratio, 5.0, explained, gain, gain_there)
 
 
 def seen(found: DelayMeasurement, deviation: float = 0.1, far: bool = False) -> str:
@@ -32,6 +40,16 @@ def seen(found: DelayMeasurement, deviation: float = 0.1, far: bool = False) -> 
 def test_an_error_is_put_down_to_the_drift_where_it_is_small_or_to_be_expected(deviation, drift, jump):
     assert seen(look(drift), deviation) == seen(look(-drift), deviation) == "there"
     assert seen(look(jump), deviation) == seen(look(-jump), deviation) == "elsewhere"
+
+
+@pytest.mark.parametrize(("explained", "deviation"), [(0.0, 0.1), (0.75, 0.05), (1.0, 0.0)])
+def test_a_look_may_err_by_a_tenth_of_a_sample_where_it_explains_nothing(explained, deviation):
+    """As looks close to one another do together, so that their number says nothing."""
+    drift = DriftFilter()
+    drift.restart(1000.0, 0.05)
+    expected = np.hypot(0.05, 0.1536)  # the delay's, and 150 ppm of half a frame
+    wanted = 0.3 / np.hypot(expected, deviation)
+    assert drift.surprise(look(0.3, explained=explained)) == pytest.approx(wanted, rel=1e-3)
 
 
 @pytest.mark.parametrize(
