@@ -72,6 +72,53 @@ def test_where_the_range_has_no_wrong_lags_chance_is_no_lag_either():
         assert coarse.find() is None
 
 
+def flicker() -> np.ndarray:
+    """Noise whose level and colour are others in every hop, so that it has nothing in common with itself a while ago."""
+    rng = np.random.default_rng(0)
+    gains = 10 ** rng.uniform(-1, 1, (300, HOP // 2 + 1))
+    return np.fft.irfft(np.fft.rfft(rng.standard_normal((300, HOP))) * gains).ravel().astype(np.float32)
+
+
+def told(arrivals: dict[int, float], max_lag: int = 25_600) -> list[int | None]:
+    """The lag in hops that is told after each hop of a voice that arrives after so many hops, so strong."""
+    voice, coarse, lags = flicker(), CoarseLag(HOP, max_lag), []
+    mic = sum(gain * np.roll(voice, HOP * lag) for lag, gain in arrivals.items())
+    for pair in zip(hops(mic), hops(voice), strict=True):
+        coarse.step(*pair)
+        lags.append(coarse.find())
+    return [None if lag is None else lag // HOP for lag in lags]
+
+
+@pytest.mark.parametrize(
+    ("arrivals", "lag"),
+    [
+        ({20: 1.0, 23: 0.9}, 20),
+        ({20: 0.9, 23: 1.0}, 23),
+        ({0: 0.9, 3: 1.0}, 3),
+        ({20: 1.0, 24: 0.9}, None),
+        ({20: 0.9, 24: 1.0}, None),
+    ],
+)
+def test_arrivals_up_to_three_hops_apart_are_the_same_one(arrivals, lag):
+    assert told(arrivals)[-1] == lag
+
+
+@pytest.mark.parametrize(("other", "lag"), [(0.7, 20), (0.8, None)])  # 0.48 against 0.39, 0.41 against 0.45
+def test_a_lag_is_told_where_its_correlation_squared_is_above_that_of_the_best_elsewhere(other, lag):
+    assert told({20: 1.0, 24: other})[-1] == lag
+
+
+def test_a_lag_is_told_once_both_were_heard_at_it_for_three_quarters_of_a_second():
+    lags = told({20: 1.0})
+    enough = 20 + 47  # 12 000 samples
+    assert lags == (enough - 1) * [None] + (300 - enough + 1) * [20]
+
+
+@pytest.mark.parametrize(("lag", "found"), [(0, 0), (24, 24), (26, None)])
+def test_the_longest_lag_is_still_found(lag, found):
+    assert told({lag: 1.0}, 24 * HOP)[-1] == found
+
+
 def test_silence_on_either_side_says_nothing():
     coarse, x = CoarseLag(HOP, 8_000), robot_speech(2.0)
     for hop in hops(x):

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from edgefilter.alignment.delay_tracker import DelayMeasurement, DriftFilter, JumpWitness
+from edgefilter.alignment.delay_tracker import FRAME, STRIDE, DelayMeasurement, DriftFilter, JumpWitness
 
 
 def look(
@@ -97,3 +99,79 @@ def test_a_suspicion_is_replaced_by_another_that_says_more_than_seven_tenths_of_
     witness.convinced(look(-50.0, 1.0, 0.9 * 30.0 * other))
     assert witness.convinced(look(-50.0, 1.0, 0.5 * 30.0)) is replaced
     assert JumpWitness().convinced(look(-50.0, 1.0, 0.5 * 30.0)) is False
+
+
+def test_delay_and_drift_are_those_of_a_kalman_filter_with_a_look_at_the_middle_of_its_frame():
+    """The textbook's, in matrices: the delay at the frame's end moves by the slope, and a look sees it half a frame earlier."""
+    rng, drift = np.random.default_rng(0), DriftFilter()
+    drift.restart(1000.0, 1.0)
+    state, belief = np.array([1000.0, 0.0]), np.diag([1.0, 150e-6**2])
+    for variance, hop in zip(rng.uniform(0.01, 1.0, 40), rng.integers(100, 3000, 40), strict=True):
+        moved = np.array([[1.0, hop], [0.0, 1.0]])
+        state, belief = moved @ state, moved @ belief @ moved.T + hop / STRIDE * np.diag([1e-6, 0.15e-6**2])
+        drift.advance(int(hop))
+        seen = np.array([1.0, -FRAME / 2])
+        offset = 1.5 * rng.standard_normal() * np.sqrt(seen @ belief @ seen + variance)
+        drift.correct(replace(look(offset, strength=20.0), variance=variance))
+        gain = belief @ seen / (seen @ belief @ seen + variance)
+        state, belief = state + gain * offset, belief - np.outer(gain, seen @ belief)
+        assert drift.delay == pytest.approx(state[0], abs=1e-6) and drift.slope == pytest.approx(state[1], abs=1e-9)
+        assert drift.deviation == pytest.approx(np.sqrt(belief[0, 0]), rel=1e-6)
+
+
+@pytest.mark.parametrize(("offset", "ppm"), [(3.0, 600.0), (-3.0, -600.0)])
+def test_no_clock_is_believed_to_drift_by_more_than_600_ppm(offset, ppm):
+    drift = DriftFilter()
+    drift.restart(1000.0, 1.0)
+    for _ in range(20):
+        drift.advance(STRIDE)
+        drift.correct(look(offset, strength=20.0))
+    assert drift.slope == pytest.approx(1e-6 * ppm)
+
+
+def steady() -> DriftFilter:
+    """After a minute of looks at a delay that holds, so that the clocks are known to agree."""
+    drift = DriftFilter()
+    drift.restart(1000.0, 1.0)
+    for _ in range(1000):
+        drift.advance(STRIDE)
+        drift.correct(look(0.0, strength=20.0))
+    return drift
+
+
+@pytest.mark.parametrize(
+    ("make", "deviation", "offset", "variance", "share"),
+    [
+        (steady, 1.5, 3.0, 4.0, 2.25 / 6.25),  # no contradiction
+        (steady, 1.5, 30.0, 4.0, 4.0 / 8.0),  # up to the uncertainty of the start, 2 samples
+        (steady, 0.1, 1.0, 0.01, 0.99),  # until the offset is one standard deviation
+        (DriftFilter, 1.5, 30.0, 4.0, 2.27 / 6.27),  # the clocks are as unsure as at the start, and so half a frame
+    ],
+)
+def test_belief_is_widened_where_a_look_contradicts_it_but_not_beyond_that_of_the_start(
+    make, deviation, offset, variance, share
+):
+    drift = make()
+    drift.restart(1000.0, deviation)
+    drift.correct(replace(look(offset, strength=20.0), variance=variance))
+    assert drift.delay - 1000.0 == pytest.approx(share * offset, rel=1e-2)
+
+
+@pytest.mark.parametrize(
+    ("after", "offset", "wrong_ppm"),
+    [
+        (10, 0.5, 0.5 / 10 / STRIDE * 1e6),
+        (10, -0.5, 0.5 / 10 / STRIDE * 1e6),
+        (0, 0.1, 0.1 / STRIDE * 1e6),  # a look comes each STRIDE samples at least
+        (10, 2.0, 150.0),  # no less sure than at the start
+        (10, 9.0, 0.0),  # buffers
+        (0, 2.0, 0.0),  # beyond what clocks differ by
+    ],
+)
+def test_a_small_jump_may_come_from_a_wrong_slope_since_the_last_look(after, offset, wrong_ppm):
+    drift = steady()
+    drift.advance(after * STRIDE)
+    drift.step(offset, 0.3)
+    drift.advance(16 * STRIDE)
+    assert drift.delay == pytest.approx(1000.0 + offset, abs=0.01)
+    assert drift.deviation == pytest.approx(np.hypot(0.3, 16 * STRIDE * 1e-6 * wrong_ppm), rel=0.02)
