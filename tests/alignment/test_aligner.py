@@ -145,6 +145,18 @@ def test_dropped_buffers_are_healed_within_200_ms(jump):
     assert any(a.realigned for a in hops[at // 256 : healed + 1])
 
 
+def test_an_utterance_at_the_lag_of_the_one_before_is_known_within_150_ms_beside_a_human_twice_as_loud():
+    """A look at the old delay tells it: the search of all lags takes 200 ms longer."""
+    rng = np.random.default_rng(1)
+    ref, onsets = utterances(rng, [2, 2], [1, 1])
+    mic, _ = hear(ref, [(0, 6000)], room(rng, 0.5))
+    human = speech_like(rng, ref.size / RATE + 0.1)[: ref.size]
+    mic = mic + fan(rng, ref.size) + 2 * human * np.std(mic) / np.std(human)
+    states = [a.state for a in run(Aligner(256), mic.astype(np.float32), ref)]
+    arrival = onsets[1] + 6000 + HEAD
+    assert states[(arrival - 256) // 256] == "begun" and states[(arrival + int(0.15 * RATE)) // 256] == "locked"
+
+
 @pytest.mark.parametrize("scene", ["silence", "human", "noise", "unheard robot and human", "gain and human in a pause"])
 def test_nothing_is_realigned_where_nothing_is_heard(scene):
     rng = np.random.default_rng(11)
