@@ -8,10 +8,12 @@ import numpy as np
 import pytest
 import soxr
 
+from edgefilter.calibration.from_recording import TAIL_S
 from edgefilter.diagnosis.compare import compare
-from edgefilter.diagnosis.prepare import find_talk
+from edgefilter.diagnosis.prepare import find_talk, prepare
 from edgefilter.errors import SignalError
-from tests.diagnosis.robot_scene import FAN, profile, record, voice
+from edgefilter.types import PRE_ROLL
+from tests.diagnosis.robot_scene import DELAY, FAN, profile, record, voice
 
 
 def test_nothing_is_left_of_the_robot_that_was_calibrated() -> None:
@@ -78,6 +80,20 @@ def test_a_reference_cut_in_the_middle_of_words_is_only_believed_in_between() ->
     assert found.excess_db < 0.5  # 10 dB and more where what was said before and after it counts
     assert found.times[0][1] > 0.3 and found.times[-1][0] < (end - begin) / 16000 + 0.5
     assert any("mid-word" in text for text in found.warnings)
+
+
+def test_where_a_cut_reference_lags_by_two_numbers_its_beginning_counts_by_the_first_and_its_end_by_the_last() -> None:
+    lags, cut = (1600.0, -2400.0), slice(18_000, 112_000)  # both inside a word
+    whole = voice(9.0)
+    whole[4 * 16_000 : 5 * 16_000] = 0.0
+    early = np.arange(whole.size) < 4.5 * 16_000
+    heard = sum(record(part, lag=lag) for part, lag in zip((whole * early, whole * ~early), lags, strict=True))
+    x = whole[cut]
+    prepared = prepare(profile(), heard[cut].astype(np.float32), x)
+    first, last = (DELAY - PRE_ROLL + lag for lag in lags)
+    known = np.flatnonzero(prepared.usable)[[0, -1]]
+    assert known == pytest.approx([first + TAIL_S * 16000, x.size + last - 1], abs=1.0)  # of a fraction of a sample
+    assert any("mid-word" in text for text in prepared.warnings)
 
 
 def test_levels_are_those_at_which_the_voice_is_heard_over_the_fan() -> None:
