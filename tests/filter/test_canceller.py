@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy import signal
 
 from edgefilter.errors import SignalError
-from edgefilter.filter.canceller import COLD, LEARNED, Canceller
+from edgefilter.filter.canceller import COLD, LEARNED, Canceller, CancellerOutput
 from tests.learning.scenes import loudspeaker, voice
 
 HOP = 256
@@ -240,6 +242,115 @@ def test_rewritten_reference_equals_a_reference_that_always_had_the_new_delay() 
     # identical spectra up to float32 rounding
     assert np.abs(b).max() > 1e-3
     np.testing.assert_allclose(a, b, atol=1e-6)
+
+
+def anything(loudest: float = 0.0) -> Canceller:
+    """One whose paths of the reference and of its nonlinear products, and what it expects of their error, are all drawn at random.
+
+    loudest: mean square that its reference has held at its loudest.
+    """
+    rng, state = np.random.default_rng(0), Canceller(HOP, 1024, adaptation=LEARNED).state()
+    weights = rng.standard_normal((*state.weights.shape, 2)) @ [1.0, 1.0j]
+    covariance = rng.uniform(0.0, 1.0, state.covariance.shape)
+    return Canceller.resumed(
+        replace(
+            state,
+            weights=weights.astype(np.complex64),
+            covariance=covariance.astype(np.float32),
+            loudest=max(loudest, state.loudest),
+        ),
+        HOP,
+    )
+
+
+def heard_of(canceller: Canceller, x: np.ndarray) -> list[CancellerOutput]:
+    """What it makes of the reference, to which nothing adapts it."""
+    silence = np.zeros(HOP, np.float32)
+    return [canceller.step(silence, hop, located=False) for hop in x.reshape(-1, HOP)]
+
+
+def test_the_past_of_a_voice_that_grows_louder_is_what_it_would_be_had_its_level_been_known() -> None:
+    """Nonlinear products have the size of the voice at its loudest, also those of the hops before it was as loud."""
+    x, streamed = speechlike(0.8)[: 40 * HOP], anything()
+    x[24 * HOP :] *= 2.0
+    levels = set()
+    for at in range(0, x.size, HOP):
+        (a,) = heard_of(streamed, x[at : at + HOP])
+        levels.add(streamed.state().loudest)
+        if at >= 24 * HOP:
+            knowing = anything(streamed.state().loudest)
+            knowing.rewrite_reference(x[: at + HOP])
+            (b,) = heard_of(knowing, x[at : at + HOP])
+            # float32, and a low-pass of the history that begins at its first sample
+            np.testing.assert_allclose(a.innovation, b.innovation, atol=1e-5 * np.abs(b.innovation).max())
+            np.testing.assert_allclose(a.uncertainty, b.uncertainty, atol=1e-5 * b.uncertainty.max())
+    assert len(levels) > 5
+
+
+def test_a_voice_louder_by_itself_has_products_of_the_same_size() -> None:
+    """Of a voice twice as loud, the reference and both products are twice as loud, and so is what they bring."""
+    x = speechlike(0.8)[: 40 * HOP]
+    soft, loud = (np.array([out.innovation for out in heard_of(anything(), gain * x)][8:]) for gain in (1.0, 2.0))
+    np.testing.assert_allclose(loud, 2.0 * soft, atol=1e-4 * np.abs(loud).max())
+
+
+def test_the_error_that_is_expected_is_that_of_paths_as_wrong_as_the_covariance_says() -> None:
+    rng = np.random.default_rng(3)
+    x = (0.1 * rng.standard_normal(80 * HOP)).astype(np.float32)
+    state = Canceller(HOP, 1024).state()
+    wrong = np.zeros((*state.weights.shape[:-1], 2 * HOP))
+    wrong[:, :HOP] = 0.1 * rng.standard_normal((state.weights.shape[0], HOP))
+    weights = np.fft.rfft(wrong).astype(np.complex64)
+    drawn = replace(state, weights=weights, covariance=np.full(weights.shape, 0.1**2 * HOP, np.float32))
+    canceller = Canceller.resumed(drawn, HOP)
+    outputs = heard_of(canceller, x)[8:]
+    expected = np.mean([out.uncertainty for out in outputs])
+    found = np.mean([np.abs(np.fft.rfft(out.innovation, 2 * HOP)) ** 2 for out in outputs])
+    assert found == pytest.approx(expected, rel=0.15)  # 1024 taps drawn once: 4 %
+    assert canceller.state().noise.mean() == pytest.approx(found, rel=0.15)  # of the last third of a second
+
+
+@pytest.mark.parametrize("microphones", [None, 2])
+def test_a_filter_that_was_resumed_goes_on_as_one_that_was_not(microphones: int | None) -> None:
+    h, x = path(), speechlike(2.0)[: 120 * HOP]
+    mic = signal.oaconvolve(x, h)[: x.size].astype(np.float32)
+    mic += 1e-3 * np.random.default_rng(2).standard_normal(x.size).astype(np.float32)
+    if microphones:
+        h, mic = np.stack((h, path(1))), np.stack((mic, np.roll(mic, 5)))
+    at, end = 100 * HOP, 101 * HOP
+    canceller = Canceller(HOP, 3200, h, LEARNED, microphones)
+    for i in range(0, at, HOP):
+        canceller.step(mic[..., i : i + HOP], x[i : i + HOP])
+    resumed = Canceller.resumed(canceller.state(), HOP)
+    resumed.rewrite_reference(x[:end])
+    assert resumed.impulse_response().shape == (*mic.shape[:-1], canceller.taps)
+    for one in (canceller, resumed):
+        out = one.step(mic[..., at:end], x[at:end])
+    before, after = canceller.state(), resumed.state()
+    # what ages it is worked out anew, and not in turn
+    for name, off in (("weights", 1e-4), ("covariance", 1e-2), ("noise", 1e-3)):
+        known = getattr(before, name)
+        np.testing.assert_allclose(getattr(after, name), known, atol=off * np.abs(known).max(), err_msg=name)
+    assert after.loudest == before.loudest and out.innovation.shape == mic[..., :HOP].shape
+
+
+def test_the_path_begins_anew_where_another_microphone_of_an_array_tells_and_only_there() -> None:
+    h, x = np.stack((path(), path(1))), speechlike(1.0)
+    mic = np.stack([signal.oaconvolve(x, other)[: x.size] for other in (path(2), path(3))]).astype(np.float32)
+    canceller = Canceller(HOP, 3200, h, microphones=2)
+
+    def taught() -> bool:
+        for i in range(0, 20 * HOP, HOP):
+            canceller.step(mic[:, i : i + HOP], x[i : i + HOP])
+        return known()
+
+    def known() -> bool:
+        return not np.allclose(canceller.impulse_response()[:, :3000], h, atol=1e-4)
+
+    for microphone, goes_on in ((0, True), (1, False), (1, True), (0, False)):
+        assert taught()
+        canceller.tell_by(microphone)
+        assert known() is goes_on
 
 
 def test_a_turned_volume_is_followed_within_a_fifth_of_a_second() -> None:
