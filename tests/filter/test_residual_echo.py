@@ -1,0 +1,182 @@
+"""What is expected of noise and residual echo in the linear stage's error."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+
+from edgefilter.dsp.stft import StftConfig
+from edgefilter.filter.residual_echo import NoiseTracker, Residual, Unpredictable
+from tests.diagnosis.robot_scene import profile
+
+STFT = StftConfig()
+NOTHING = np.zeros(STFT.bins, np.float32)
+WIDTH = 64
+"""Bins in 2 kHz."""
+
+
+def spectrum(power: np.ndarray | float) -> np.ndarray:
+    return np.sqrt(np.broadcast_to(power, STFT.bins)).astype(np.complex64)
+
+
+def spread(power: np.ndarray) -> np.ndarray:
+    """The echo's power with a tenth of its mean over 2 kHz about each bin; beyond the ends it is what it is there."""
+    wide = np.pad(power, (WIDTH // 2, WIDTH // 2 - 1), mode="edge")
+    return power + 0.1 * np.lib.stride_tricks.sliding_window_view(wide, WIDTH).mean(axis=1)
+
+
+@pytest.mark.parametrize("power", [np.linspace(1.0, 5.0, STFT.bins) ** 2, np.linspace(5.0, 1.0, STFT.bins) ** 2])
+def test_a_part_of_the_echo_is_left_there_and_on_the_frequencies_around(power) -> None:
+    _, left = Residual(STFT).step(spectrum(power), spectrum(power), NOTHING)
+    np.testing.assert_allclose(left, 0.005 * spread(power), rtol=1e-4)  # float32
+
+
+def test_what_is_left_fades_by_2_db_a_hop_once_the_echo_is_over() -> None:
+    residual = Residual(STFT)
+    first, second, third = (residual.step(spectrum(p), spectrum(1.0), NOTHING)[1] for p in (1.0, 0.0, 0.1))
+    np.testing.assert_allclose(second, 0.6 * first, rtol=1e-5)
+    np.testing.assert_allclose(third, 0.36 * first, rtol=1e-5)
+
+
+@pytest.mark.parametrize(("known", "weight"), [(None, 2.0), (profile(), 0.5)], ids=["unknown", "calibrated"])
+def test_the_misalignment_counts_twice_where_the_path_is_unknown_and_half_where_it_is_calibrated(known, weight) -> None:
+    uncertainty, added = np.linspace(0.0, 1.0, STFT.bins, dtype=np.float32), np.full(STFT.bins, 0.25, np.float32)
+    _, left = Residual(STFT, known).step(spectrum(0.0), spectrum(1.0), uncertainty)
+    np.testing.assert_allclose(left, weight * uncertainty, rtol=1e-6)
+    _, more = Residual(STFT, known).step(spectrum(0.0), spectrum(1.0), uncertainty, added)
+    np.testing.assert_allclose(more, weight * uncertainty + added, rtol=1e-6)
+
+
+def leakage(residual: Residual, share: float, frames: int, noise: float = 1e-6, unknown: float = 0.0) -> list[float]:
+    """The part of the echo that is expected to stay, frame by frame, where this share of its power does."""
+    told = []
+    for _ in range(frames):
+        error, uncertainty = spectrum(share * 1.1 + noise + unknown), np.full(STFT.bins, unknown / 2.0, np.float32)
+        fan = np.full(STFT.bins, noise, np.float32)
+        _, left = residual.step(spectrum(1.0), error, uncertainty, fan=fan)
+        told.append(float((left - unknown).mean()) / 1.1)
+    return told
+
+
+@pytest.mark.parametrize(("noise", "unknown"), [(1e-6, 0.0), (1e-6, 0.1), (0.015, 0.0)])
+def test_what_stays_of_the_echo_is_three_times_what_is_seen_to_stay_in_half_a_second_and_rises_slowly(
+    noise, unknown
+) -> None:
+    residual = Residual(STFT)
+    told = leakage(residual, 0.01, 500, noise, unknown)
+    assert told[100] == pytest.approx(0.005 * 1.005**101, rel=1e-3)
+    assert told[-1] == pytest.approx(0.03, rel=1e-3)
+    assert leakage(residual, 0.0, 10, noise, unknown)[-1] == pytest.approx(0.03 * 0.97**10, rel=1e-3)
+
+
+def test_what_stays_of_the_echo_falls_at_once_and_by_no_more_than_26_db() -> None:
+    told = leakage(Residual(STFT), 0.0, 20)
+    assert told[:3] == pytest.approx([0.0045, 0.00405, 0.003645], rel=1e-3)
+    assert told[-1] == pytest.approx(0.0024, rel=1e-3)
+
+
+def test_of_what_is_louder_than_a_tenth_no_more_than_a_tenth_is_put_down_to_the_echo() -> None:
+    assert leakage(Residual(STFT), 0.5, 700)[-1] == pytest.approx(0.1, rel=1e-3)
+
+
+@pytest.mark.parametrize(("noise", "followed"), [(1.1 / 59.0, False), (1.1 / 61.0, True)])
+def test_it_is_followed_where_the_echo_is_18_db_over_the_noise(noise, followed) -> None:
+    told = leakage(Residual(STFT), 0.05, 10, noise=noise)
+    assert (told[-1] > told[0] * 1.01) is followed
+
+
+@dataclass
+class Known:
+    """Of a profile: what is calibrated of the loudspeaker's distortion and of the fan."""
+
+    share: float
+    fan: np.ndarray
+
+    @property
+    def approximation(self) -> Known:
+        return self
+
+    def noise_bins(self, stft: StftConfig) -> np.ndarray:
+        return self.fan
+
+
+@pytest.mark.parametrize(("share", "taken"), [(0.02, 0.02), (0.001, 0.0024), (0.5, 0.1)])
+def test_it_begins_with_the_calibrated_distortion(share, taken) -> None:
+    _, left = Residual(STFT, Known(share, NOTHING)).step(spectrum(1.0), spectrum(1.0), NOTHING)
+    np.testing.assert_allclose(left, taken * 1.1, rtol=1e-5)
+
+
+def test_a_calibrated_fan_keeps_its_shape_at_the_level_of_the_median_bin() -> None:
+    shape = np.linspace(1.0, 3.0, STFT.bins).astype(np.float32)
+    heard = 2.0 * shape
+    heard[:126] *= 100.0
+    heard[-100:] /= 100.0  # so that 31 of 257 are as the fan, those in the middle
+    noise, _ = Residual(STFT, Known(0.01, shape)).step(spectrum(0.0), spectrum(heard), NOTHING)
+    np.testing.assert_allclose(noise, 2.0 * shape, rtol=1e-5)
+    noise, _ = Residual(STFT, Known(0.01, NOTHING)).step(spectrum(0.0), spectrum(heard), NOTHING)
+    np.testing.assert_allclose(noise, heard, rtol=1e-5)  # of a fan that is nothing in some bins no shape is known
+
+
+def powers(frames: int, level: float = 1.0, seed: int = 0) -> np.ndarray:
+    """Of a stationary noise, (frames, bins)."""
+    return (level * np.random.default_rng(seed).exponential(1.0, (frames, STFT.bins))).astype(np.float32)
+
+
+def test_the_noise_is_at_first_the_mean_of_five_frames() -> None:
+    tracker, seen = NoiseTracker(STFT.bins), powers(5)
+    for count, power in enumerate(seen, 1):
+        np.testing.assert_allclose(tracker.step(power), seen[:count].mean(axis=0), rtol=1e-5)
+
+
+def rising() -> np.ndarray:
+    """A noise, the same beside a voice with pauses, and a noise that is 30 dB louder."""
+    voice = 1000.0 * (np.arange(100) % 20 < 15)
+    return np.concatenate((powers(100), powers(100, seed=1) + voice[:, None], powers(300, 1000.0, seed=2)))
+
+
+def test_the_noise_is_told_beside_a_voice_and_follows_one_that_grows() -> None:
+    tracker = NoiseTracker(STFT.bins)
+    told = [10.0 * np.log10(tracker.step(power).mean()) for power in rising()]
+    # with frames that do not overlap the method is 1.2 dB too low
+    assert told[99] == pytest.approx(0.0, abs=1.5) and max(told[100:200]) < 1.5
+    assert told[210] < 3.0 and told[-1] == pytest.approx(30.0, abs=1.5)  # what lasts for a second is no voice
+
+
+def test_the_noise_is_that_of_the_published_method() -> None:
+    """Gerkmann & Hendriks (2012), eq. (18), (22) and (23), as they are printed."""
+    tracker, ratio = NoiseTracker(STFT.bins), 10.0**1.5
+    seen = rising().astype(np.float64)
+    noise, mean = seen[:5].mean(axis=0), np.zeros(STFT.bins)
+    for number, power in enumerate(seen):
+        told = tracker.step(power.astype(np.float32))
+        if number >= 5:
+            present = 1.0 / (1.0 + (1.0 + ratio) * np.exp(-power / noise * ratio / (1.0 + ratio)))
+            mean = 0.9 * mean + 0.1 * present
+            present = np.where(mean > 0.99, np.minimum(present, 0.99), present)
+            noise = 0.8 * noise + 0.2 * ((1.0 - present) * power + present * noise)
+        if number >= 4:
+            np.testing.assert_allclose(told, noise, rtol=1e-2)  # float32, 500 frames
+
+
+def test_no_bins_noise_is_further_below_the_loudest_than_numbers_reach() -> None:
+    tracker = NoiseTracker(STFT.bins)
+    tracker.step(np.full(STFT.bins, 1.0, np.float32))
+    for _ in range(200):
+        power = tracker.step(NOTHING)
+    assert 0.0 < power.max() < 1e-5
+
+
+def test_what_no_waveform_predicts_is_expected_as_the_windowed_frame_holds_it() -> None:
+    colours = np.ones((2, 601)) / 8000.0
+    colours[1] *= np.linspace(0.0, 2.0, 601)
+    step, hop = Unpredictable(STFT, colours), STFT.hop
+    rng = np.random.default_rng(0)
+    squares = rng.uniform(0.0, 1.0, (2, 4 * hop)).astype(np.float32)
+    for at in range(0, 4 * hop, hop):
+        found = step.step(squares[:, at : at + hop])
+    window = np.square(STFT.analysis_window)
+    energy = squares[:, -window.size :] @ window
+    tilt = np.linspace(0.0, 2.0, STFT.bins)
+    np.testing.assert_allclose(found, energy[0] + energy[1] * tilt, rtol=1e-3)  # a grid of 601
