@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -16,7 +17,7 @@ from edgefilter.diagnosis.criteria import Criteria
 from edgefilter.diagnosis.diagnose import diagnose
 from edgefilter.diagnosis.laws import Law, free_law
 from edgefilter.diagnosis.prepare import prepare
-from edgefilter.diagnosis.score import Scorer
+from edgefilter.diagnosis.score import Scorer, share_of
 from edgefilter.diagnosis.trials import Found
 from edgefilter.echo.effects import catalogue
 from edgefilter.echo.running import stream_form
@@ -37,15 +38,27 @@ HIDDEN = {
 }
 
 
-@functools.cache
-def lawful(family: str) -> Law:
-    """The law that is found where nothing was named."""
-    prepared = prepare(profile(), record(HIDDEN[family].astype(np.float32)), X)
+def searched(family: str, seconds: float = 6.0) -> Found:
+    """A search that has named nothing."""
+    x = X[: round(seconds * SAMPLE_RATE)]
+    prepared = prepare(profile(), record(HIDDEN[family][: x.size].astype(np.float32)), x)
     score = Scorer(prepared).of(prepared.model)
-    law = free_law(Found(prepared, prepared.model, prepared.model, score, score, ()), Criteria())
-    assert law is not None and law.family == family and law.excess_db < 0.4 * score.excess_db
+    return Found(prepared, prepared.model, prepared.model, score, score, ())
+
+
+@functools.cache
+def lawful(family: str, seconds: float = 6.0) -> Law:
+    """The law that is found where nothing was named."""
+    found = searched(family, seconds)
+    law = free_law(found, Criteria())
+    assert law is not None and law.family == family and law.excess_db < 0.4 * found.base.excess_db
     assert law.curve.share == 1.0 or law.curve.y_unit != "dB"  # a gain that is the law's own
     return law
+
+
+def numbers(law: Law) -> list[float]:
+    """Those in its words."""
+    return [float(number) for number in re.findall(r"[-+]?[0-9]+(?:[.][0-9]+)?", law.words)]
 
 
 @pytest.fixture
@@ -87,6 +100,76 @@ def test_the_law_is_said_in_words() -> None:
     assert "5 times a second" in lawful("modulation").words
 
 
+def test_the_two_halves_of_a_curve_are_told_against_its_middle_and_it_goes_on_as_it_ends() -> None:
+    law = lawful("static nonlinearity", 3.0)
+    assert law.stage == "source"
+    upper, lower = 20 * np.log10(np.array([1.0, 0.25]) / 0.625)
+    assert numbers(law) == pytest.approx([upper, lower], abs=0.2)
+    for peak, gain in ((law.curve.x[-1], 1.0), (law.curve.x[0], 0.25)):
+        inside, end, beyond, furthest = law(peak * np.array([0.7, 1.0, 2.0, 4.0]))
+        assert end == pytest.approx(gain * peak, rel=0.03)
+        assert [beyond - end, furthest - end] == pytest.approx((end - inside) / 0.3 * np.array([1.0, 3.0]), rel=0.01)
+
+
+def test_a_gain_over_the_level_is_told_where_it_is_steepest() -> None:
+    law = lawful("dynamics", 3.0)
+    level, gain_db = np.array(law.curve.x), np.array(law.curve.y_db)
+    steepness = 10.0 * np.diff(gain_db) / np.diff(level)
+    at = int(np.argmax(np.abs(steepness)))
+    rise, per, around, attack_ms, _ = numbers(law)
+    assert (rise, per) == (pytest.approx(steepness[at], abs=0.06), 10.0) and rise == pytest.approx(8.0, abs=1.5)
+    assert around == pytest.approx((level[at] + level[at + 1]) / 2.0, abs=0.6) and 3.0 < attack_ms < 40.0
+
+
+def test_a_gain_that_moves_with_time_is_told_over_its_period() -> None:
+    law = lawful("modulation", 3.0)
+    assert numbers(law) == pytest.approx([20 * np.log10(0.5), 20 * np.log10(1.5), 5.0], abs=0.4)
+    assert np.diff(law.curve.x) == pytest.approx(0.2 / 64, rel=0.01) and law.curve.x[0] == 0.0
+
+
+def test_a_filter_is_told_where_it_gives_most_and_least() -> None:
+    law = lawful("linear path", 3.0)
+    milliseconds, most_db, most_hz, least_db, least_hz = numbers(law)
+    assert (milliseconds, most_db, least_db) == (16.0, pytest.approx(4.6, abs=0.3), pytest.approx(-10.5, abs=1.0))
+    phases = 2 * np.pi * 61 / SAMPLE_RATE * np.array([most_hz, least_hz])  # an echo 61 samples later
+    assert np.cos(phases) == pytest.approx([1.0, -1.0], abs=0.1)
+
+
+def test_a_lag_that_moves_is_told_by_its_extremes() -> None:
+    law = lawful("time", 3.0)
+    assert numbers(law) == pytest.approx([min(law.curve.y_db), max(law.curve.y_db)], abs=0.006) and law.event
+    assert law.curve.x == (0.0, 1.0, 2.0, 3.0, 4.0)
+
+
+@pytest.mark.parametrize(
+    ("family", "event"), [("static nonlinearity", False), ("linear path", False), ("modulation", True)]
+)
+def test_what_is_of_one_recording_is_written_as_an_event_of_it(family: str, event: bool, load) -> None:
+    law = lawful(family, 3.0)
+    effect = catalogue.find(load(law, "found"))
+    assert (law.event, effect.event, "this recording" in effect.run_note) == (event, event, event)
+    assert (effect.family, effect.stage) == (family, law.stage)
+
+
+@pytest.mark.parametrize("factor", [0.99, 1.01])
+@pytest.mark.parametrize("least", ["part_level", "half"])
+def test_a_law_is_told_where_it_explains_enough_of_the_level_and_of_the_power(least: str, factor: float) -> None:
+    found, law = searched("modulation", 3.0), lawful("modulation", 3.0)
+    explained = {
+        "part_level": law.gain_db / (found.base.over_db - Scorer(found.prepared).floor_level(found.base)),
+        "half": share_of(found.base.excess_db, law.excess_db),
+    }[least]
+    told = free_law(found, replace(Criteria(), **{least: factor * explained}))
+    assert (told is not None) is (factor < 1.0)
+
+
+@pytest.mark.parametrize("share", [0.84, 0.86])
+def test_no_law_is_told_where_what_is_named_explains_nearly_as_much(share: float) -> None:
+    found, law = searched("modulation", 3.0), lawful("modulation", 3.0)
+    named = replace(found, final=replace(found.base, level_db=found.base.level_db - share * law.gain_db))
+    assert (free_law(named, Criteria()) is not None) is (share < Criteria.nearly)
+
+
 @pytest.mark.slow
 def test_what_is_explained_gets_no_law_and_what_is_not_one_beside_what_is_named() -> None:
     turned = diagnose(profile(), record(np.float32(0.7) * X), X)
@@ -101,7 +184,7 @@ def test_what_is_explained_gets_no_law_and_what_is_not_one_beside_what_is_named(
 
 
 def test_where_no_voice_is_there_to_fit_to_there_is_no_law() -> None:
-    prepared = prepare(profile(), record(HIDDEN["dynamics"].astype(np.float32)), X)
+    prepared = searched("dynamics").prepared
     mute = replace(prepared, measurement=replace(prepared.measurement, fit=np.zeros(X.size, bool)))
     score = Scorer(mute).of(mute.model)
     assert free_law(Found(mute, mute.model, mute.model, score, score, ()), Criteria()) is None
