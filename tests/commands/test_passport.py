@@ -103,7 +103,9 @@ def test_a_microphone_that_shuts_is_named_as_processed(passport, clean):
     level = np.sqrt(np.convolve(heard**2, np.ones(320) / 320, "same"))
     gain = 0.05 / np.maximum(level, 0.05) * (level > 0.02)
     code, figures, out, page = passport((heard * gain).astype(np.float32), said)
+    shut, played = (np.any(x.reshape(-1, RATE // 50), axis=1) for x in (heard * gain, said))
     assert code == 0 and figures["cause"] == "gate" and figures["gated"] > 0.05
+    assert figures["gated"] == pytest.approx(np.mean(~shut & played), abs=0.005)  # not where the robot itself is silent
     assert (
         "it is processed" in out and "noise suppression" in figures["said"]["changes"][0] and "it is processed" in page
     )
@@ -118,10 +120,19 @@ def test_clocks_that_drift_are_told_and_straightened(passport, clean):
     assert any("clocks" in change for change in figures["said"]["changes"])
 
 
+@pytest.mark.slow
+def test_a_microphone_that_is_overdriven_is_named_where_that_is_what_bounds_the_filter(clean):
+    said, heard = clean
+    found = measure(np.clip(heard / 0.02, -1.0, 1.0).astype(np.float32), said, said[:RATE], engines=[])
+    assert found.cause == "clipping" and found.mic_peak_db == 0.0
+    assert found.clipped == pytest.approx(np.mean(np.abs(heard) >= 0.02), abs=0.001)
+
+
 def test_a_reference_that_is_not_in_the_recording_is_a_finding(passport, clean):
     said, _ = clean
     code, figures, out, page = passport(record(voice(SECONDS, seed=9)), said)
     assert code == 0 and figures["found"] is False and figures["engines"] == {} and figures["lag_ms"] is None
+    assert figures["seconds"] == SECONDS and figures["noise_db"] == pytest.approx(-60.0, abs=1.0)  # robot_scene.FAN
     assert "The reference is not found in the recording." in out and "is not found" in page and "<svg" not in page
 
 
@@ -140,6 +151,28 @@ def test_the_level_of_the_human_is_the_one_asked_for(passport, clean):
     assert figures["engines"]["linear"]["si_sdr_before_db"] == pytest.approx(0.0, abs=0.5) and "as loud as" in out
     before, after = expected(heard, said, voice(2.0, seed=7), -6.0, "bypass")
     assert before == pytest.approx(-6.0, abs=0.5) and after == pytest.approx(before, abs=1e-3)  # float32
+
+
+def spoken_over(mic: np.ndarray, human: np.ndarray) -> float:
+    """SI-SDR, dB, of a human laid on at -6 dB, before any engine."""
+    return expected(mic.astype(np.float32), 0 * mic, human.astype(np.float32), -6.0, "bypass")[0]
+
+
+@pytest.mark.parametrize(("left_s", "counts"), [(2.0, True), (2.0 - 1 / RATE, False)])
+def test_a_turn_that_the_end_leaves_less_than_two_seconds_of_does_not_count(left_s, counts):
+    """The first three seconds are from 5 s on, the next from 10 s on: there the microphone holds the same, which raises the mean."""
+    rng = np.random.default_rng(0)
+    human, mic = rng.standard_normal(3 * RATE), 0.1 * rng.standard_normal(13 * RATE)
+    mic[10 * RATE :] = 0.1 * human
+    found = spoken_over(mic[: round((10.0 + left_s) * RATE)], human)
+    assert found > 20.0 if counts else found == pytest.approx(-6.0, abs=0.5)  # two noises of 3 s
+
+
+def test_a_turn_in_which_the_microphone_is_silent_does_not_count():
+    rng = np.random.default_rng(0)
+    human, mic = rng.standard_normal(3 * RATE), 0.1 * rng.standard_normal(13 * RATE)
+    mic[: 9 * RATE] = 0.0
+    assert spoken_over(mic, human) == pytest.approx(-6.0, abs=0.5)
 
 
 @pytest.mark.slow

@@ -8,11 +8,13 @@ import os
 import subprocess
 import sys
 import time
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
 import platformdirs
 import pytest
+import soundfile
 from platformdirs.macos import MacOS
 from platformdirs.unix import Unix
 from platformdirs.windows import Windows
@@ -22,7 +24,7 @@ from edgefilter.engines.linear import Bypass
 from edgefilter.engines.spectral_subtraction import SpectralSubtraction
 from edgefilter.errors import UsageError
 from edgefilter.filter import budget
-from edgefilter.filter.budget import Figures, choose, fits, held_to, measure, pace, timings
+from edgefilter.filter.budget import Figures, choose, fits, held_to, measure, pace, scene, timings
 from edgefilter.filter.stream import Stream
 from edgefilter.profile.data import Profile
 
@@ -235,6 +237,35 @@ def test_measuring_runs_the_whole_path_at_the_real_pace():
     assert time.perf_counter() - began >= 39 * 0.016
     assert (figures.engine, figures.hop_ms, figures.hops, figures.complete) == ("ss", 16.0, 40, True)
     assert 0 < figures.paced_p50_ms <= figures.paced_p95_ms <= figures.paced_p99_ms <= figures.paced_max_ms
+
+
+def test_the_figures_are_percentiles_of_what_the_hops_took(monkeypatch):
+    asked = []
+
+    def pretend(stream, hops, count, period_s=None):
+        asked.append((count, period_s))
+        return [float(took) for took in range(count)]
+
+    monkeypatch.setattr(budget, "pace", pretend)
+    figures = measure(Bypass(), paced=101)
+    assert (figures.paced_p50_ms, figures.paced_p95_ms, figures.paced_p99_ms, figures.paced_max_ms) == (50, 95, 99, 100)
+    assert (figures.hops, figures.complete, asked) == (101, True, [(32, 0.0), (101, None)])  # the first are not counted
+
+
+@pytest.mark.parametrize(("allowed", "cores"), [({3}, 1), ({0, 2, 5}, 2)])
+def test_the_choice_says_on_how_many_cores_it_was_measured(measured, monkeypatch, allowed, cores):
+    monkeypatch.setattr(budget, "allowed_cores", lambda: allowed)
+    choice = choose(8.0, candidates=LADDER)
+    assert choice.cores == cores and f"on {cores} cores" in choice.reason
+
+
+@pytest.mark.parametrize("hop", [160, 256])
+def test_the_conversation_comes_from_its_first_sample_on_whole_hops_of_it_over_and_over(hop):
+    mic, ref = (soundfile.read(DEMO / f"{name}.flac", dtype="float32")[0] for name in ("mic", "reference"))
+    count, hops = mic.size // hop, scene(hop)
+    for _ in range(2):
+        for channel, heard in zip((mic, ref), zip(*islice(hops, count), strict=True), strict=True):
+            np.testing.assert_array_equal(np.concatenate(heard), channel[: count * hop])
 
 
 def test_pace_begins_a_hop_each_period_and_counts_only_the_work():
