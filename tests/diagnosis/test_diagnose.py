@@ -11,10 +11,11 @@ from scipy import signal
 
 from edgefilter.diagnosis.compare import compare
 from edgefilter.diagnosis.criteria import Criteria
-from edgefilter.diagnosis.diagnose import Diagnosis, add, diagnose
+from edgefilter.diagnosis.diagnose import Diagnosis, add, conclude, diagnose
 from edgefilter.diagnosis.prepare import prepare
+from edgefilter.diagnosis.score import Scorer
 from edgefilter.diagnosis.select import search
-from edgefilter.diagnosis.trials import Trial, Workbench
+from edgefilter.diagnosis.trials import Found, Trial, Workbench
 from edgefilter.dsp.fractional_delay import delayed
 from edgefilter.echo.effects.bandlimit import band_edge
 from edgefilter.echo.evidence import Score
@@ -181,6 +182,14 @@ def test_the_dictionary_has_the_published_keys_and_is_json() -> None:
     figures = {name: getattr(found.ranking[0], name) for name in ("excess_before_db", "excess_after_db", "share")}
     for name, value in {**figures, "remaining_db": found.remaining_db, "irreducible_db": found.irreducible_db}.items():
         assert {**said, **entry}[name] == round(value, 4 if name == "share" else 3)  # digits that mean something
+
+
+@pytest.mark.parametrize(("excess_db", "told"), [(0.75, "explained"), (0.85, "unexplained")])
+def test_where_nothing_is_named_up_to_eight_tenths_of_a_decibel_are_left_by_the_fan_of_another_day(excess_db, told):
+    prepared = prepare(profile(), record(voice(4.0)), voice(4.0))
+    score = replace(Scorer(prepared).of(prepared.model), excess_db=excess_db)
+    found = conclude(prepared, Found(prepared, prepared.model, prepared.model, score, score, ()), Criteria())
+    assert (found.verdict, found.ranking) == (told, ())
 
 
 def test_no_effect_is_chosen_where_none_lowers_the_level():
